@@ -1,0 +1,134 @@
+"""Frames, units and rotations of the project, stated once and used everywhere.
+
+Pixel frame
+    (0, 0) is the centre of the top-left pixel, x = column to the right, y = row down, unit px.
+    (COLMAP counts from the corner of that pixel; adapters/colmap.py alone adds the half pixel.)
+Image frame
+    mm, origin at the centre of the sensor, x right, y up; the camera looks along -z.
+Object frame
+    right-handed, in the object unit that the survey declares.
+Rotation
+    R = Rx(omega) Ry(phi) Rz(kappa) turns image axes into object axes, M = R^T the other way.
+    (U, V, W) = M (X - X0); tangents u = -U/W, v = -V/W; ideal image point x = c u, y = c v.
+Angles are radians inside and degrees in files and reports. A `sigma` is one standard deviation.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+BoolArray = NDArray[np.bool_]
+AnyArray = NDArray[Any]
+
+
+def rotation_from_angles(omega: float, phi: float, kappa: float) -> FloatArray:
+    """Return R = Rx(omega) Ry(phi) Rz(kappa), which turns image axes into object axes.
+
+    Args:
+        omega, phi, kappa: rotation angles about x, y' and z'', rad.
+
+    Returns:
+        Rotation matrix, shape (3, 3).
+
+    Source: Kraus, Photogrammetry (2007), sec. 2.1.2; Mikhail, Bethel, McGlone (2001), app. E (there
+    M = R^T).
+    """
+    so, co = np.sin(omega), np.cos(omega)
+    sp, cp = np.sin(phi), np.cos(phi)
+    sk, ck = np.sin(kappa), np.cos(kappa)
+    return np.array(
+        [
+            [cp * ck, -cp * sk, sp],
+            [co * sk + so * sp * ck, co * ck - so * sp * sk, -so * cp],
+            [so * sk - co * sp * ck, so * ck + co * sp * sk, co * cp],
+        ]
+    )
+
+
+def angles_from_rotation(rotation: FloatArray) -> FloatArray:
+    """Return (omega, phi, kappa) in rad of R = Rx(omega) Ry(phi) Rz(kappa).
+
+    Args:
+        rotation: R, image to object axes, shape (..., 3, 3).
+
+    Returns:
+        Angles, shape (..., 3); at phi = +-90 deg, where omega and kappa are not separable, omega
+        is 0.
+    """
+    R = np.asarray(rotation, dtype=float)
+    sin_phi = np.clip(R[..., 0, 2], -1.0, 1.0)
+    singular = np.abs(sin_phi) > 1 - 1e-14
+    omega = np.where(singular, 0.0, np.arctan2(-R[..., 1, 2], R[..., 2, 2]))
+    kappa = np.where(
+        singular,
+        np.arctan2(R[..., 1, 0], R[..., 1, 1]),
+        np.arctan2(-R[..., 0, 1], R[..., 0, 0]),
+    )
+    phi = np.arctan2(sin_phi, np.hypot(R[..., 0, 0], R[..., 0, 1]))
+    return np.stack([omega, phi, kappa], axis=-1)
+
+
+def image_from_pixel(xy_px: FloatArray, size_px: tuple[int, int], pixel_mm: FloatArray) -> FloatArray:
+    """Return image-frame coordinates (mm, y up, origin at the sensor centre) of pixel coordinates.
+
+    Args:
+        xy_px: pixel coordinates, shape (..., 2), px.
+        size_px: width and height of the photograph, px.
+        pixel_mm: width and height of a pixel, shape (2,), mm.
+
+    Returns:
+        Image coordinates, shape (..., 2), mm.
+    """
+    centre = (np.asarray(size_px, dtype=float) - 1) / 2
+    return (np.asarray(xy_px, dtype=float) - centre) * np.asarray(pixel_mm) * (1.0, -1.0)
+
+
+def pixel_from_image(xy_mm: FloatArray, size_px: tuple[int, int], pixel_mm: FloatArray) -> FloatArray:
+    """Return pixel coordinates of image-frame coordinates; inverse of `image_from_pixel`.
+
+    Args:
+        xy_mm: image coordinates, shape (..., 2), mm.
+        size_px: width and height of the photograph, px.
+        pixel_mm: width and height of a pixel, shape (2,), mm.
+
+    Returns:
+        Pixel coordinates, shape (..., 2), px.
+    """
+    centre = (np.asarray(size_px, dtype=float) - 1) / 2
+    return np.asarray(xy_mm, dtype=float) / (np.asarray(pixel_mm) * (1.0, -1.0)) + centre
+
+
+def rotation_from_vector(vector: FloatArray) -> FloatArray:
+    """Return exp([vector]x), the rotation by |vector| rad about the direction of the vector.
+
+    Args:
+        vector: rotation vectors, shape (..., 3), rad.
+
+    Returns:
+        Rotation matrices, shape (..., 3, 3).
+
+    Source: Rodrigues' formula, written with sin(t)/t and (1 - cos t)/t^2 so that it is exact at 0.
+    """
+    w = np.asarray(vector, dtype=float)
+    t2 = np.sum(w * w, axis=-1)[..., None, None]
+    t = np.sqrt(t2)
+    small = t < 1e-4
+    safe = np.where(small, 1.0, t)
+    a = np.where(small, 1 - t2 / 6, np.sin(safe) / safe)
+    b = np.where(small, 0.5 - t2 / 24, (1 - np.cos(safe)) / safe**2)
+    W = skew(w)
+    return np.eye(3) + a * W + b * (W @ W)
+
+
+def skew(vector: FloatArray) -> FloatArray:
+    """Return [vector]x, the matrix of the cross product from the left, shape (..., 3, 3)."""
+    w = np.asarray(vector, dtype=float)
+    zero = np.zeros(w.shape[:-1])
+    x, y, z = w[..., 0], w[..., 1], w[..., 2]
+    rows = [zero, -z, y, z, zero, -x, -y, x, zero]
+    return np.stack(rows, axis=-1).reshape(*w.shape[:-1], 3, 3)

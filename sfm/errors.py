@@ -1,0 +1,35 @@
+"""The exceptions of Kolinear.
+
+    KolinearError               anything that a person can put right; the command line prints one line
+    |-- SurveyFileError         the survey file or a table it names cannot be used
+    |-- PhotographError         a photograph cannot be read or does not fit its camera
+    |-- GeometryError           the points or photographs do not determine what is asked for
+    |-- OutputError             a result cannot be written
+    `-- BackendError            an external program or library is missing or refuses
+
+Rank, convergence and rejected observations are results, not exceptions.
+"""
+
+
+class KolinearError(Exception):
+    """Base of all errors whose message is one line that says what was found and what was needed."""
+
+
+class SurveyFileError(KolinearError):
+    """The survey file, or a table that it names, cannot be used as it stands."""
+
+
+class PhotographError(KolinearError):
+    """A photograph cannot be read or does not fit the camera it is listed under."""
+
+
+class GeometryError(KolinearError):
+    """The given points or photographs do not determine what is asked for."""
+
+
+class OutputError(KolinearError):
+    """A result cannot be written where it was asked for."""
+
+
+class BackendError(KolinearError):
+    """An external library is missing, of the wrong version, or refuses the problem."""
