@@ -1,0 +1,143 @@
+"""Network (what was measured) and Estimate (what is solved for), with the arrays they are made of.
+
+Everything is counted by index: image i is `network.images[i]`, point j is `network.points[j]`. A
+function that changes something returns a new object.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from sfm.camera import Camera
+from sfm.conventions import BoolArray, FloatArray, IntArray
+
+
+def _empty(*shape: int) -> FloatArray:
+    return np.zeros((0, *shape))
+
+
+def _no_index() -> IntArray:
+    return np.zeros(0, dtype=np.int64)
+
+
+@dataclass(frozen=True)
+class ImagePoints:
+    """Measured image points of all photographs."""
+
+    image: IntArray  # index of the photograph, (k,)
+    point: IntArray  # index of the object point, (k,)
+    xy: FloatArray  # measured position in the pixel frame, px, (k, 2)
+    covariance: FloatArray  # of xy, px^2, (k, 2, 2)
+
+    def __len__(self) -> int:
+        return len(self.image)
+
+    def select(self, mask: BoolArray | IntArray) -> ImagePoints:
+        """Return the image points that a mask or an index names."""
+        return ImagePoints(self.image[mask], self.point[mask], self.xy[mask], self.covariance[mask])
+
+
+@dataclass(frozen=True)
+class ObjectPoints:
+    """Object points whose coordinates are known beforehand (control)."""
+
+    point: IntArray = field(default_factory=_no_index)  # index of the point, (n,)
+    xyz: FloatArray = field(default_factory=lambda: _empty(3))  # object unit, (n, 3)
+    covariance: FloatArray = field(
+        default_factory=lambda: _empty(3, 3)
+    )  # object unit^2, 0 = fixed, (n, 3, 3)
+
+    def __len__(self) -> int:
+        return len(self.point)
+
+
+@dataclass(frozen=True)
+class ScaleBars:
+    """Measured distances between object points."""
+
+    start: IntArray = field(default_factory=_no_index)  # index of the first point, (b,)
+    end: IntArray = field(default_factory=_no_index)  # index of the second point, (b,)
+    length: FloatArray = field(default_factory=lambda: np.zeros(0))  # object unit, (b,)
+    sigma: FloatArray = field(default_factory=lambda: np.zeros(0))  # object unit, (b,)
+
+    def __len__(self) -> int:
+        return len(self.start)
+
+
+@dataclass(frozen=True)
+class Network:
+    """All that was measured in a survey."""
+
+    images: tuple[str, ...]  # names of the photographs, m of them
+    camera: IntArray  # index of the camera of each photograph in Estimate.cameras, (m,)
+    points: tuple[str, ...]  # names of the object points, n of them
+    image_points: ImagePoints
+    control: ObjectPoints = field(default_factory=ObjectPoints)
+    scale_bars: ScaleBars = field(default_factory=ScaleBars)
+
+    def rays(self) -> IntArray:
+        """Return in how many photographs each point was measured, (n,)."""
+        return np.bincount(self.image_points.point, minlength=len(self.points))
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """Interior and exterior orientation and object points; NaN where not yet determined."""
+
+    cameras: tuple[Camera, ...]
+    position: FloatArray  # projection centres X0, object unit, (m, 3)
+    rotation: FloatArray  # R of each photograph, image to object axes, (m, 3, 3)
+    points: FloatArray  # object points, object unit, (n, 3)
+
+    @property
+    def oriented(self) -> BoolArray:
+        """Which photographs have an exterior orientation, (m,)."""
+        return np.asarray(np.isfinite(self.position).all(axis=1))
+
+    @property
+    def determined(self) -> BoolArray:
+        """Which points have coordinates, (n,)."""
+        return np.asarray(np.isfinite(self.points).all(axis=1))
+
+
+def reduce_network(
+    network: Network, estimate: Estimate, images: BoolArray, points: BoolArray, image_points: BoolArray
+) -> tuple[Network, Estimate]:
+    """Return the network and estimate of some photographs, points and image points only.
+
+    Args:
+        network, estimate: of m photographs, n points and k image points.
+        images: photographs to keep, (m,).
+        points: points to keep, (n,).
+        image_points: image points to keep (those of dropped photographs and points go anyway), (k,).
+
+    Returns:
+        Reduced network and estimate, counted anew; control and scale bars of dropped points are gone.
+    """
+    image_index = np.cumsum(images) - 1
+    point_index = np.cumsum(points) - 1
+    seen = network.image_points.select(
+        image_points & images[network.image_points.image] & points[network.image_points.point]
+    )
+    control, bars = network.control, network.scale_bars
+    c = points[control.point]
+    b = points[bars.start] & points[bars.end]
+    reduced = replace(
+        network,
+        images=tuple(name for name, keep in zip(network.images, images, strict=True) if keep),
+        camera=network.camera[images],
+        points=tuple(name for name, keep in zip(network.points, points, strict=True) if keep),
+        image_points=replace(seen, image=image_index[seen.image], point=point_index[seen.point]),
+        control=ObjectPoints(point_index[control.point[c]], control.xyz[c], control.covariance[c]),
+        scale_bars=ScaleBars(
+            point_index[bars.start[b]], point_index[bars.end[b]], bars.length[b], bars.sigma[b]
+        ),
+    )
+    return reduced, replace(
+        estimate,
+        position=estimate.position[images],
+        rotation=estimate.rotation[images],
+        points=estimate.points[points],
+    )

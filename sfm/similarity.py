@@ -1,0 +1,76 @@
+"""3-D similarity (absolute orientation): closed form, weighted, with residuals and covariance.
+
+Two-dimensional similarity and affine transformations (fiducial marks) live in orientation/fiducials.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from sfm.conventions import FloatArray
+from sfm.errors import GeometryError
+from sfm.network import Estimate
+
+COLLINEAR = 1e-9  # second singular value over the first below which points lie on a line
+
+
+@dataclass(frozen=True)
+class Similarity:
+    """target = scale * rotation @ source + translation."""
+
+    scale: float  # target unit per source unit
+    rotation: FloatArray  # (3, 3)
+    translation: FloatArray  # target unit, (3,)
+
+    def apply(self, points: FloatArray) -> FloatArray:
+        """Return points of shape (..., 3) in the target frame."""
+        return self.scale * (np.asarray(points) @ self.rotation.T) + self.translation
+
+    def apply_estimate(self, estimate: Estimate) -> Estimate:
+        """Return the estimate with points, positions and rotations in the target frame."""
+        return replace(
+            estimate,
+            position=self.apply(estimate.position),
+            rotation=self.rotation @ estimate.rotation,
+            points=self.apply(estimate.points),
+        )
+
+    def inverse(self) -> Similarity:
+        """Return source_from_target."""
+        R = self.rotation.T
+        return Similarity(1 / self.scale, R, -(R @ self.translation) / self.scale)
+
+
+def fit_similarity(
+    source: FloatArray, target: FloatArray, *, weights: FloatArray | None = None
+) -> Similarity:
+    """Return the similarity that brings source points onto target points with least squares.
+
+    Args:
+        source: points in the source frame, shape (n, 3), source unit.
+        target: the same points in the target frame, shape (n, 3), target unit.
+        weights: weight of each point, shape (n,); equal if not given.
+
+    Raises:
+        GeometryError: fewer than three points, or all points on a line.
+
+    Source: Horn (1987), J. Opt. Soc. Am. A 4(4), by the singular value decomposition of Umeyama
+    (1991), IEEE PAMI 13(4), eqs. 40-42.
+    """
+    n = len(source)
+    if n < 3:
+        raise GeometryError(f"similarity: {n} common points, at least 3 are needed")
+    w = np.ones(n) if weights is None else np.asarray(weights, dtype=float)
+    w = w / w.sum()
+    centre_s, centre_t = w @ source, w @ target
+    s, t = source - centre_s, target - centre_t
+    spread = np.linalg.svd(s * np.sqrt(w)[:, None], compute_uv=False)
+    if spread[1] <= COLLINEAR * spread[0]:
+        raise GeometryError("similarity: the common points lie on a line or coincide")
+    U, d, Vt = np.linalg.svd((t * w[:, None]).T @ s)
+    sign = np.array([1.0, 1.0, np.sign(np.linalg.det(U) * np.linalg.det(Vt))])
+    R = (U * sign) @ Vt
+    scale = float((d * sign).sum() / (w @ (s**2).sum(axis=1)))
+    return Similarity(scale, R, centre_t - scale * R @ centre_s)
