@@ -1,0 +1,58 @@
+"""What an adjustment returns: the solution, its statistics and its covariance."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from sfm.conventions import BoolArray, FloatArray
+from sfm.network import Estimate, Network
+
+
+@dataclass(frozen=True)
+class Covariance:
+    """Marginal covariance of the unknowns, scaled by sigma0^2 a posteriori, in the datum adjusted in."""
+
+    points: FloatArray  # of X, Y, Z of each object point, object unit^2, (n, 3, 3)
+    exterior: FloatArray  # of X0, Y0, Z0 (object unit) and omega, phi, kappa (rad), (m, 6, 6)
+    interior: tuple[FloatArray, ...]  # of the free parameters of each camera, in order, (f, f)
+    points_limiting: FloatArray  # of points with the cameras held fixed, object unit^2, (n, 3, 3)
+
+
+@dataclass(frozen=True)
+class Adjustment:
+    """Result of a least-squares adjustment of a network."""
+
+    network: Network  # as adjusted, rejected image points included
+    estimate: Estimate  # adjusted interior and exterior orientation and points
+    converged: bool  # whether the criterion of convergence was met
+    iterations: int  # steps taken
+    datum: str  # free | minimal | control
+    defect: int  # rank defect of the normal equations without datum, found numerically
+    expected_defect: int  # the defect that the kind of datum leaves to it
+    undetermined: tuple[str, ...]  # parameters that cannot be determined, in words; empty if none
+    residuals: FloatArray  # v = computed - measured, px, pixel frame, rejected ones included, (k, 2)
+    rejected: BoolArray  # image points that took no part, (k,)
+    redundancy_numbers: FloatArray  # of each image coordinate, 0 to 1; NaN where rejected, (k, 2)
+    sigma_px: float  # a priori standard deviation of unit weight, px
+    sigma0: float  # a posteriori over a priori standard deviation of unit weight
+    redundancy: int  # observations and constraints minus unknowns
+    unknowns: int  # all adjusted parameters
+    observations: int  # scalar observations used: image coordinates, weighted parameters, scale bars
+    covariance: Covariance
+
+    @property
+    def sigma0_px(self) -> float:
+        """A posteriori standard deviation of an image coordinate of unit weight, px."""
+        return self.sigma0 * self.sigma_px
+
+    @property
+    def rms_px(self) -> float:
+        """Root mean square residual per coordinate over the accepted image points, px."""
+        used = self.residuals[~self.rejected]
+        return float((used**2).mean() ** 0.5)
+
+    @property
+    def max_residual_px(self) -> float:
+        """Longest residual vector among the accepted image points, px."""
+        used = self.residuals[~self.rejected]
+        return float((used**2).sum(axis=1).max() ** 0.5)
