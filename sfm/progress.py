@@ -1,0 +1,28 @@
+"""Progress: how a long run tells whoever watches which stage it is in and how far it got."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+
+class Progress(Protocol):
+    """What a run calls while it works; implementations draw it, count it or ignore it."""
+
+    def stage(self, name: str, total: int | None = None) -> None:
+        """A stage of that name begins; `total` steps will be announced, None if nobody knows."""
+
+    def advance(self, step: str = "") -> None:
+        """One step of the stage, such as a photograph of that name, is done."""
+
+
+class Silent:
+    """Progress that nobody watches."""
+
+    def stage(self, name: str, total: int | None = None) -> None:
+        """Take note of nothing."""
+
+    def advance(self, step: str = "") -> None:
+        """Take note of nothing."""
+
+
+SILENT: Progress = Silent()

@@ -1,0 +1,302 @@
+"""What a survey starts from: its photographs, cameras, and the network of given observations."""
+
+from __future__ import annotations
+
+import fnmatch
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from sfm.camera import Camera, camera_from_values
+from sfm.conventions import FloatArray, IntArray, pixel_from_image
+from sfm.errors import PhotographError, SurveyFileError
+from sfm.network import Estimate, ImagePoints, Network, ObjectPoints, ScaleBars
+from sfm.project import CameraSettings, Survey
+from sfm.survey_tables import (
+    read_control,
+    read_exterior,
+    read_image_points,
+    read_points,
+)
+from sfm.targets.photograph import Metadata
+
+
+@dataclass(frozen=True)
+class PhotographList:
+    """The photographs of a survey in order of camera and name."""
+
+    names: tuple[str, ...]  # file names, by which tables and reports know them, (m,)
+    paths: tuple[Path, ...]  # (m,)
+    camera: IntArray  # index into Survey.cameras, (m,)
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+
+def find_photographs(survey: Survey, *, images_dir: Path | None = None) -> PhotographList:
+    """Return the photographs that the globs of the cameras name.
+
+    Args:
+        survey: a survey with photographs.
+        images_dir: folder of the photographs in place of the survey file's own.
+
+    Raises:
+        SurveyFileError: no such folder, a camera without photographs, or a photograph of two cameras.
+    """
+    folder = Path(images_dir) if images_dir is not None else survey.path.parent
+    if not folder.is_dir():
+        raise SurveyFileError(f"{folder}: no such folder; photographs of survey {survey.name} were needed")
+    owner: list[tuple[str, Path, int]] = []
+    for index, camera in enumerate(survey.cameras):
+        pattern = camera.images or ""
+        try:
+            found = sorted(path for path in folder.glob(pattern) if path.is_file())
+        except (ValueError, NotImplementedError, IndexError) as error:
+            raise SurveyFileError(
+                f"{survey.path}: camera {camera.name}: images = '{pattern}' is no glob relative to {folder}"
+            ) from error
+        if not found:
+            raise SurveyFileError(
+                f"no photographs found: camera {camera.name} needs '{pattern}' in {folder}, {_holds(folder)}"
+            )
+        owner += [(path.relative_to(folder).as_posix(), path, index) for path in found]
+    seen: dict[str, int] = {}
+    for name, _, index in owner:
+        if name in seen:
+            first, second = survey.cameras[seen[name]].name, survey.cameras[index].name
+            raise SurveyFileError(
+                f"{survey.path}: photograph '{name}' matches the globs of cameras {first} and {second}"
+            )
+        seen[name] = index
+    names, paths, cameras = zip(*owner, strict=True)
+    return PhotographList(names, paths, np.array(cameras, dtype=np.int64))
+
+
+def camera_of_image(survey: Survey, image: str) -> int:
+    """Return the index of the camera whose glob an image name matches.
+
+    Raises:
+        SurveyFileError: no camera, or more than one.
+    """
+    if len(survey.cameras) == 1 and survey.cameras[0].images is None:
+        return 0
+    matches = [
+        index
+        for index, camera in enumerate(survey.cameras)
+        if camera.images is not None and fnmatch.fnmatchcase(image, camera.images)
+    ]
+    if len(matches) != 1:
+        globs = ", ".join(f"{c.name} '{c.images}'" for c in survey.cameras)
+        many = "no camera" if not matches else f"{len(matches)} cameras"
+        raise SurveyFileError(f"{survey.path}: image '{image}' matches the glob of {many}: {globs}")
+    return matches[0]
+
+
+def start_cameras(
+    survey: Survey,
+    metadata: tuple[Metadata, ...] = (),
+    camera: IntArray | None = None,
+    names: tuple[str, ...] = (),
+) -> tuple[Camera, ...]:
+    """Return the cameras with their start values, in the order of the survey file.
+
+    Args:
+        survey: says what is known; what it leaves out is taken from the photographs.
+        metadata: size and EXIF data of the readable photographs, (m,); none with [observations].
+        camera: index of the camera of each photograph, (m,).
+        names: names of the photographs, (m,).
+
+    Raises:
+        PhotographError: photographs of one camera differ in size from one another or from size_px.
+        SurveyFileError: size, pixel size or principal distance is not known from anywhere.
+    """
+    index = np.zeros(0, dtype=np.int64) if camera is None else camera
+    cameras = []
+    for number, settings in enumerate(survey.cameras):
+        own = [k for k in range(len(metadata)) if index[k] == number]
+        size = _common_size(settings, [(names[k], metadata[k].size_px) for k in own])
+        where = f"{survey.path}: camera {settings.name}"
+        if size is None:
+            raise SurveyFileError(f"{where}: size_px = [width, height] is needed, there is no photograph")
+        pixel, focal = settings.pixel_mm, settings.c_mm
+        if settings.sensor_mm is not None:
+            pixel = settings.sensor_mm[0] / size[0], settings.sensor_mm[1] / size[1]
+        fixed = dict(settings.fixed)
+        if pixel is None:
+            pixel = next((metadata[k].pixel_mm for k in own if metadata[k].pixel_mm), None)
+        if focal is None:
+            focal = fixed.get("c") or next((metadata[k].focal_mm for k in own if metadata[k].focal_mm), None)
+        if pixel is None:
+            raise SurveyFileError(
+                f"{where}: no photograph's EXIF data tell the pixel size, pixel_mm or sensor_mm is needed"
+            )
+        if focal is None and "fx" in fixed:
+            focal = fixed["fx"] * pixel[0]
+        if focal is None:
+            raise SurveyFileError(f"{where}: no photograph's EXIF data tell the focal length, c_mm is needed")
+        cameras.append(
+            camera_from_values(
+                settings.name,
+                settings.model,
+                size,
+                pixel,
+                c_mm=focal,
+                free=settings.free,
+                values=settings.fixed,
+            )
+        )
+    return tuple(cameras)
+
+
+def network_from_observations(survey: Survey) -> tuple[Network, Estimate]:
+    """Return the network and start values of a survey that gives [observations].
+
+    Photographs and points are counted in the order in which the observations name them first. The control
+    is part of the network in every datum; the adjustment uses it only where the datum is `control`.
+
+    Args:
+        survey: a survey with [observations]; [approximate] and fixed control fill the estimate, everything
+            else in it is NaN.
+
+    Raises:
+        SurveyFileError: a table is unreadable, or the cameras' start values are incomplete.
+    """
+    if survey.observations is None:
+        raise SurveyFileError(f"{survey.path}: [observations] with a file of image points is needed")
+    cameras = start_cameras(survey)
+    table = read_image_points(survey.beside(survey.observations.file))
+    images, image = _numbered(table.image)
+    points, point = _numbered(table.point)
+    owner = np.array([camera_of_image(survey, name) for name in images], dtype=np.int64)
+    xy, covariance = _in_pixels(
+        table.xy, table.sigma, table.unit, cameras, owner[image], survey.adjust.sigma_px
+    )
+    control, _ = control_points(survey, points)
+    bars, _ = scale_bars(survey, points)
+    network = Network(
+        images, owner, points, ImagePoints(image, point, xy, covariance), control=control, scale_bars=bars
+    )
+    return network, _approximate(survey, network, cameras)
+
+
+def control_points(survey: Survey, points: tuple[str, ...]) -> tuple[ObjectPoints, tuple[str, ...]]:
+    """Return the control among the points of a network.
+
+    Args:
+        survey: names the table of control, or none.
+        points: names of the object points.
+
+    Returns:
+        The control, and the names of control points that were not measured.
+    """
+    if survey.control is None:
+        return ObjectPoints(), ()
+    table = read_control(survey.beside(survey.control.file))
+    index = {name: k for k, name in enumerate(points)}
+    known = np.array([name in index for name in table.names], dtype=bool)
+    covariance = np.zeros((len(table.names), 3, 3))
+    covariance[:, range(3), range(3)] = table.sigma**2
+    return (
+        ObjectPoints(
+            np.array([index[name] for name in table.names if name in index], dtype=np.int64),
+            table.xyz[known],
+            covariance[known],
+        ),
+        tuple(name for name in table.names if name not in index),
+    )
+
+
+def scale_bars(survey: Survey, points: tuple[str, ...]) -> tuple[ScaleBars, tuple[str, ...]]:
+    """Return the scale bars between points of a network, and in words those whose ends were not measured."""
+    index = {name: k for k, name in enumerate(points)}
+    bars = [bar for bar in survey.scale_bars if bar.start in index and bar.end in index]
+    missing = tuple(
+        f"{bar.start} - {bar.end}"
+        for bar in survey.scale_bars
+        if bar.start not in index or bar.end not in index
+    )
+    return (
+        ScaleBars(
+            np.array([index[bar.start] for bar in bars], dtype=np.int64),
+            np.array([index[bar.end] for bar in bars], dtype=np.int64),
+            np.array([bar.length for bar in bars], dtype=float),
+            np.array([bar.sigma for bar in bars], dtype=float),
+        ),
+        missing,
+    )
+
+
+def _numbered(names: tuple[str, ...]) -> tuple[tuple[str, ...], IntArray]:
+    """Return the different names in order of first appearance and the number of each entry."""
+    number: dict[str, int] = {}
+    index = np.array([number.setdefault(name, len(number)) for name in names], dtype=np.int64)
+    return tuple(number), index
+
+
+def _in_pixels(
+    xy: FloatArray,
+    sigma: FloatArray | None,
+    unit: str,
+    cameras: tuple[Camera, ...],
+    camera: IntArray,
+    sigma_px: float,
+) -> tuple[FloatArray, FloatArray]:
+    """Return positions (k, 2) in px and their covariance (k, 2, 2) in px^2 of rows in px or mm."""
+    xy_px = xy.copy()
+    s = np.full(xy.shape, sigma_px) if sigma is None else sigma.copy()
+    if unit == "mm":
+        for index, own in enumerate(cameras):
+            rows = camera == index
+            xy_px[rows] = pixel_from_image(xy[rows], own.size_px, own.pixel_mm)
+            if sigma is not None:
+                s[rows] = sigma[rows] / own.pixel_mm
+    covariance = np.zeros((len(xy), 2, 2))
+    covariance[:, range(2), range(2)] = s**2
+    return xy_px, covariance
+
+
+def _approximate(survey: Survey, network: Network, cameras: tuple[Camera, ...]) -> Estimate:
+    """Return start values from [approximate] and the control; NaN for what nothing is said about."""
+    m, n = len(network.images), len(network.points)
+    position, rotation = np.full((m, 3), np.nan), np.full((m, 3, 3), np.nan)
+    points = np.full((n, 3), np.nan)
+    if survey.approximate.images is not None:
+        exterior = read_exterior(survey.beside(survey.approximate.images))
+        row = {name: k for k, name in enumerate(exterior.names)}
+        for i, name in enumerate(network.images):
+            if name in row:
+                position[i], rotation[i] = exterior.position[row[name]], exterior.rotation[row[name]]
+    if survey.approximate.points is not None:
+        table = read_points(survey.beside(survey.approximate.points))
+        row = {name: k for k, name in enumerate(table.names)}
+        for j, name in enumerate(network.points):
+            if name in row:
+                points[j] = table.xyz[row[name]]
+    if survey.datum.kind == "control":
+        points[network.control.point] = network.control.xyz
+    return Estimate(cameras, position, rotation, points)
+
+
+def _common_size(
+    settings: CameraSettings, sizes: list[tuple[str, tuple[int, int]]]
+) -> tuple[int, int] | None:
+    """Return the size of all photographs of one camera, None if nothing tells it."""
+    size, source = settings.size_px, "size_px"
+    for name, found in sizes:
+        if size is None:
+            size, source = found, f"'{name}'"
+        elif found != size:
+            raise PhotographError(
+                f"camera {settings.name}: photograph '{name}' has {found[0]} x {found[1]} px, {source} "
+                f"{size[0]} x {size[1]} px; photographs of one camera have one size"
+            )
+    return size
+
+
+def _holds(folder: Path) -> str:
+    """Say in a few words which files a folder holds."""
+    files = sorted(path.name for path in folder.iterdir() if path.is_file())
+    if not files:
+        return "which holds no files (--images names another folder)"
+    return f"which holds {len(files)} files such as '{files[0]}' (--images names another folder)"
