@@ -10,7 +10,8 @@ import numpy as np
 from sfm.adjustment.result import Adjustment
 from sfm.analysis.comparison import Comparison
 from sfm.conventions import FloatArray, IntArray
-from sfm.targets.flags import Flag
+from sfm.targets.detect import Targets
+from sfm.targets.flags import count_flags
 
 
 @dataclass(frozen=True)
@@ -35,20 +36,11 @@ class PhotographTargets:
 
     image: str  # name of the photograph
     path: Path  # its file
-    xy: FloatArray  # centres of the measured targets, pixel frame, px, (k, 2)
-    semi_axes: FloatArray  # of their outlines, larger first, px, (k, 2)
-    direction: FloatArray  # of the larger semi-axis from x towards y (clockwise in the picture), rad, (k,)
-    rejected_xy: FloatArray  # centres of the rejected candidates, px, (r, 2)
-    rejected_flags: IntArray  # reason for each rejection, targets.flags.Flag, (r,)
+    targets: Targets  # measured targets and rejected candidates
 
     def reasons(self) -> list[tuple[str, int]]:
         """Return (reason, number of candidates) of this photograph, most frequent first."""
-        counts = [
-            (words_of_flag(flag), int(((self.rejected_flags & flag.value) != 0).sum()))
-            for flag in Flag
-            if flag.value
-        ]
-        return sorted((c for c in counts if c[1]), key=lambda c: (-c[1], c[0]))
+        return [(in_words(name), count) for name, count in count_flags(self.targets.rejected_flag)]
 
 
 @dataclass(frozen=True)
@@ -82,6 +74,6 @@ class SurveyResult:
     seconds: tuple[StageTime, ...] = field(default_factory=tuple)  # in the order of the stages
 
 
-def words_of_flag(flag: Flag) -> str:
+def in_words(flag_name: str) -> str:
     """Return the name of a flag in words, such as `cut by border`."""
-    return str(flag.name).lower().replace("_", " ")
+    return flag_name.replace("_", " ")
