@@ -8,9 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from sfm.adjustment.result import Adjustment
-from sfm.analysis.comparison import Comparison
+from sfm.analysis.comparison import AdjusterComparison
 from sfm.conventions import FloatArray, IntArray
-from sfm.targets.detect import Targets
 from sfm.targets.flags import count_flags
 
 
@@ -36,11 +35,15 @@ class PhotographTargets:
 
     image: str  # name of the photograph
     path: Path  # its file
-    targets: Targets  # measured targets and rejected candidates
+    xy: FloatArray  # centres of the measured targets, pixel frame, px, (k, 2)
+    semi_axes: FloatArray  # of their outlines, larger first, px, (k, 2)
+    angle: FloatArray  # of the larger semi-axis from x towards y, rad, (k,)
+    rejected_xy: FloatArray  # centres of the rejected candidates, px, (r, 2)
+    rejected_flag: IntArray  # reason for each rejection, see sfm.targets.flags.Flag, (r,)
 
     def reasons(self) -> list[tuple[str, int]]:
         """Return (reason, number of candidates) of this photograph, most frequent first."""
-        return [(in_words(name), count) for name, count in count_flags(self.targets.rejected_flag)]
+        return [(in_words(name), count) for name, count in count_flags(self.rejected_flag)]
 
 
 @dataclass(frozen=True)
@@ -67,7 +70,7 @@ class SurveyResult:
     failed: tuple[FailedImage, ...]  # those that could not be read or oriented, with the reason
     adjustment: Adjustment  # in the datum and on the control that the survey asks for
     code: IntArray  # code number of each point of adjustment.network, -1 = uncoded, (n,)
-    comparison: Comparison | None  # None if the survey asks for none
+    comparison: AdjusterComparison | None  # with the other adjuster; None if the survey asks for none
     photographs: tuple[PhotographTargets, ...] = ()  # of every readable photograph; none with [observations]
     control_check: ControlCheck | None = None  # None without control, or where the datum is control
     warnings: tuple[str, ...] = ()  # one line each, in words
