@@ -104,7 +104,7 @@ def test_epipolar_distance_vanishes_for_one_point_and_is_a_distance():
 
 
 def mistaken(targets, tolerance, *, missing=0.2):
-    """The part of rays that must go wrong: the target is missing and another lies in its place, mean density."""
+    """The part of rays that must go wrong: the target is missing and another is near (mean density)."""
     density = np.mean([len(t) / np.prod(np.ptp(t, axis=0)) for t in targets])
     return missing * density * np.pi * tolerance**2
 
