@@ -1,0 +1,48 @@
+"""Quality flags of targets and of rejected candidates: the one list of reasons.
+
+A measured target may carry several remarks (`SATURATED`, `CODE_UNREADABLE`, ...); a candidate that is not
+measured carries the first reason that excluded it.
+"""
+
+from __future__ import annotations
+
+from enum import IntFlag
+
+from sfm.conventions import IntArray
+
+
+class Flag(IntFlag):
+    """Remarks on a target (kept) and reasons for a rejection, one bit each."""
+
+    NONE = 0
+    # remarks: the target is measured and kept
+    SATURATED = 1 << 0  # pixels at the end of the scale were censored
+    CODE_UNREADABLE = 1 << 1  # something like a code surrounds the dot, but no valid code was read
+    SHADED = 1 << 2  # the gain changes by more than its own 3 sigma across the target
+    CLOSE_NEIGHBOUR = 1 << 3  # part of the background was left out because something else is there
+    # reasons for a rejection
+    CUT_BY_BORDER = 1 << 8  # the border of the photograph cuts the target or its background
+    TOO_SMALL = 1 << 9  # below min_diameter_px
+    TOO_LARGE = 1 << 10  # above max_diameter_px
+    TOO_OBLIQUE = 1 << 11  # axis ratio below that of a circle seen at 75 degrees
+    NOT_ELLIPTIC = 1 << 12  # the outline is not an ellipse
+    LOW_CONTRAST = 1 << 13  # the step of intensity is too small for the noise
+    UNEVEN_EDGE = 1 << 14  # the edge is missing or different on part of the circumference
+    POOR_FIT = 1 << 15  # the picture differs from the model of a blurred ellipse
+    BLURRED = 1 << 16  # the edge is too soft for the size
+    NO_CONVERGENCE = 1 << 17  # the least squares fit did not converge on this outline
+    DUPLICATE = 1 << 18  # the same target was found twice
+    PART_OF_CODE = 1 << 19  # inside the code ring of another target
+
+
+def count_flags(flags: IntArray) -> list[tuple[str, int]]:
+    """Return (name of flag, number of entries that carry it), most frequent first, without zeros.
+
+    Args:
+        flags: flags of targets or of rejected candidates, shape (k,).
+
+    Returns:
+        Pairs of lower-case name and count.
+    """
+    counts = [(str(f.name).lower(), int(((flags & f.value) != 0).sum())) for f in Flag if f.value]
+    return sorted((c for c in counts if c[1]), key=lambda c: (-c[1], c[0]))
