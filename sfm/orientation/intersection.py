@@ -1,0 +1,303 @@
+"""Intersection: object points from rays of several photographs, linear, robust and by least squares."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+
+from sfm.conventions import BoolArray, FloatArray, IntArray
+from sfm.orientation.resection.least_squares import solve_scaled
+
+MAX_STEPS = 20
+CONVERGED = 1e-13  # step relative to the distance of the point
+MAX_PAIRS = 400  # pairs of rays tried for one point
+
+
+@dataclass(frozen=True)
+class Intersection:
+    """Object points from their rays; NaN where rays do not determine a point."""
+
+    points: FloatArray  # object points, object unit, (n, 3)
+    cofactors: FloatArray  # Qxx of each point for rays of weight 1, object unit^2, (n, 3, 3)
+    covariance: FloatArray  # sigma0^2 Qxx with the sigma0 of all points together, (n, 3, 3)
+    residuals: FloatArray  # v = computed - measured of every ray, tangents, NaN if behind, (k, 2)
+    used: BoolArray  # rays that took part, (k,)
+    rays: IntArray  # rays that took part at each point, (n,)
+    angle: FloatArray  # largest angle between two of the rays that took part, rad, (n,)
+    sigma0: float  # a posteriori standard deviation of unit weight; tangents if weights are not given
+    redundancy: int  # 2 (rays used) - 3 (points)
+
+
+def intersect(
+    tangents: FloatArray,
+    image: IntArray,
+    point: IntArray,
+    positions: FloatArray,
+    rotations: FloatArray,
+    *,
+    n_points: int | None = None,
+    weights: FloatArray | None = None,
+    tolerance: float = np.inf,
+    min_angle_deg: float = 0.0,
+) -> Intersection:
+    """Return the object points that many rays determine, each by least squares on its image residuals.
+
+    Args:
+        tangents: u = -U/W, v = -V/W of each measured ray, shape (k, 2).
+        image: index of the photograph of each ray, shape (k,).
+        point: index of the object point of each ray, shape (k,).
+        positions, rotations: of the photographs, shapes (m, 3) and (m, 3, 3); rays of photographs with
+            NaN are left out.
+        n_points: number of object points; the largest index + 1 if not given.
+        weights: weight matrix of each ray, shape (k, 2, 2); unit matrices if not given.
+        tolerance: largest residual vector of a ray that takes part, tangents. With a finite tolerance
+            the point is the one that most rays support.
+        min_angle_deg: smallest ray angle of a determined point, deg.
+
+    Returns:
+        Points with covariance; a point needs two rays and lies in front of all photographs that see it.
+
+    Source: Foerstner, Wrobel (2016), sec. 13.4: the point nearest to the rays, then Gauss-Newton on
+    the collinearity equations. The two-ray candidates are weighed against all other rays as in RANSAC.
+    """
+    uv = np.ascontiguousarray(tangents, dtype=float).reshape(-1, 2)
+    n = int(np.max(point, initial=-1)) + 1 if n_points is None else n_points
+    P = np.broadcast_to(np.eye(2), (len(uv), 2, 2)) if weights is None else weights
+    usable = np.isfinite(positions).all(axis=1)[image] & np.isfinite(uv).all(axis=1)
+    order = np.argsort(point[usable], kind="stable")
+    ray = np.flatnonzero(usable)[order]
+    start = np.searchsorted(point[ray], np.arange(n + 1))
+    xyz, Q, rays, angle = (
+        np.full((n, 3), np.nan),
+        np.full((n, 3, 3), np.nan),
+        np.zeros(n, dtype=np.int64),
+        np.full(n, np.nan),
+    )
+    residuals, used = np.full((len(uv), 2), np.nan), np.zeros(len(uv), dtype=np.bool_)
+    cost = _intersect_all(
+        uv,
+        np.ascontiguousarray(image, dtype=np.int64),
+        ray,
+        start,
+        np.ascontiguousarray(positions, dtype=float),
+        np.ascontiguousarray(rotations, dtype=float),
+        np.ascontiguousarray(P, dtype=float),
+        tolerance * tolerance,
+        np.cos(np.radians(min_angle_deg)),
+        xyz,
+        Q,
+        rays,
+        angle,
+        residuals,
+        used,
+    )
+    redundancy = int(2 * used.sum() - 3 * np.isfinite(xyz).all(axis=1).sum())
+    sigma0 = float(np.sqrt(cost / redundancy)) if redundancy > 0 else np.nan
+    return Intersection(xyz, Q, sigma0**2 * Q, residuals, used, rays, angle, sigma0, redundancy)
+
+
+@njit(cache=True)
+def _intersect_all(
+    tangents, image, ray, start, positions, rotations, weights, limit, cos_limit,
+    xyz, Q, rays, angle, residuals, used,
+):  # type: ignore[no-untyped-def]  # fmt: skip
+    """Intersect point by point; returns the sum of v'Pv over all of them."""
+    longest = 0
+    for j in range(len(xyz)):
+        longest = max(longest, start[j + 1] - start[j])
+    direction = np.empty((longest, 3))
+    X, best_X = np.empty(3), np.empty(3)
+    N, b, dx = np.empty((3, 3)), np.empty(3), np.empty(3)
+    total = 0.0
+    for j in range(len(xyz)):
+        own = ray[start[j] : start[j + 1]]
+        m = len(own)
+        if m < 2:
+            continue
+        for i in range(m):
+            _direction(tangents[own[i]], rotations[image[own[i]]], direction[i])
+        if np.isinf(limit) or m == 2:
+            for i in range(m):
+                used[own[i]] = True
+            if not _nearest_to_rays(own, image, positions, direction, used, N, b, X):
+                _drop(own, used)
+                continue
+        else:
+            score = _best_pair(own, tangents, image, positions, rotations, direction, limit, used, N, b, X, best_X)
+            if np.isinf(score):
+                continue
+            X[:] = best_X
+        ok = False
+        for _ in range(3):
+            if not np.isinf(limit):
+                count = 0
+                for i in range(m):
+                    k = own[i]
+                    used[k] = _square(tangents[k], positions[image[k]], rotations[image[k]], X) <= limit
+                    count += used[k]
+                if count < 2:
+                    ok = False
+                    break
+            best_X[:] = X
+            ok = _least_squares(own, tangents, image, positions, rotations, weights, used, X, N, b, dx)
+            if not ok:
+                X[:] = best_X
+                break
+        smallest = 1.0
+        count = 0
+        if ok:
+            for i in range(m):
+                k = own[i]
+                square = _square(tangents[k], positions[image[k]], rotations[image[k]], X)
+                if np.isinf(square) and used[k]:
+                    ok = False
+                used[k] = used[k] and square <= limit
+                if not used[k]:
+                    continue
+                count += 1
+                for h in range(i):
+                    if used[own[h]]:
+                        c = 0.0
+                        for d in range(3):
+                            c += direction[i, d] * direction[h, d]
+                        smallest = min(smallest, c)
+        if not ok or count < 2 or smallest > cos_limit:
+            _drop(own, used)
+            continue
+        for i in range(m):
+            k = own[i]
+            _residual(tangents[k], positions[image[k]], rotations[image[k]], X, residuals[k])
+            if used[k]:
+                ru, rv = residuals[k, 0], residuals[k, 1]
+                P = weights[k]
+                total += P[0, 0] * ru * ru + 2.0 * P[0, 1] * ru * rv + P[1, 1] * rv * rv
+        xyz[j] = X
+        Q[j] = np.linalg.inv(N)
+        rays[j] = count
+        angle[j] = np.arccos(max(-1.0, smallest))
+    return total
+
+
+@njit(cache=True)
+def _drop(own, used):  # type: ignore[no-untyped-def]
+    for i in range(len(own)):
+        used[own[i]] = False
+
+
+@njit(cache=True)
+def _direction(uv, R, out):  # type: ignore[no-untyped-def]
+    """Unit vector of a ray in object axes."""
+    norm = np.sqrt(uv[0] * uv[0] + uv[1] * uv[1] + 1.0)
+    for d in range(3):
+        out[d] = (R[d, 0] * uv[0] + R[d, 1] * uv[1] - R[d, 2]) / norm
+
+
+@njit(cache=True)
+def _nearest_to_rays(own, image, positions, direction, used, N, b, X):  # type: ignore[no-untyped-def]
+    """The point with the least sum of squared distances from the rays in use: linear equations."""
+    N[:] = 0.0
+    b[:] = 0.0
+    for i in range(len(own)):
+        if not used[own[i]]:
+            continue
+        C = positions[image[own[i]]]
+        along = direction[i, 0] * C[0] + direction[i, 1] * C[1] + direction[i, 2] * C[2]
+        for a in range(3):
+            for c in range(3):
+                N[a, c] -= direction[i, a] * direction[i, c]
+            N[a, a] += 1.0
+            b[a] += C[a] - along * direction[i, a]
+    return solve_scaled(N, b, X)
+
+
+@njit(cache=True)
+def _best_pair(own, tangents, image, positions, rotations, direction, limit, used, N, b, X, best_X):  # type: ignore[no-untyped-def]
+    """The two-ray point with the least truncated squares over all rays; returns that sum (inf: none)."""
+    m = len(own)
+    best = np.inf
+    stride = max(1, (m * (m - 1) // 2) // MAX_PAIRS)
+    pair = -1
+    for i in range(m):
+        for h in range(i):
+            pair += 1
+            if pair % stride:
+                continue
+            _drop(own, used)
+            used[own[i]] = used[own[h]] = True
+            if not _nearest_to_rays(own, image, positions, direction, used, N, b, X):
+                continue
+            score = 0.0
+            fits = 0
+            for k in own:
+                square = _square(tangents[k], positions[image[k]], rotations[image[k]], X)
+                fits += square <= limit
+                score += min(square, limit)
+                if score >= best:
+                    break
+            if score < best and fits >= 2:
+                best = score
+                best_X[:] = X
+    _drop(own, used)
+    return best
+
+
+@njit(cache=True)
+def _square(uv, C, R, X):  # type: ignore[no-untyped-def]
+    """Squared image residual; inf for a point behind the camera."""
+    dx, dy, dz = X[0] - C[0], X[1] - C[1], X[2] - C[2]
+    W = R[0, 2] * dx + R[1, 2] * dy + R[2, 2] * dz
+    if not W < 0.0:
+        return np.inf
+    ru = (R[0, 0] * dx + R[1, 0] * dy + R[2, 0] * dz) / W + uv[0]
+    rv = (R[0, 1] * dx + R[1, 1] * dy + R[2, 1] * dz) / W + uv[1]
+    return ru * ru + rv * rv
+
+
+@njit(cache=True)
+def _residual(uv, C, R, X, r):  # type: ignore[no-untyped-def]
+    dx, dy, dz = X[0] - C[0], X[1] - C[1], X[2] - C[2]
+    W = R[0, 2] * dx + R[1, 2] * dy + R[2, 2] * dz
+    if W < 0.0:
+        r[0] = -(R[0, 0] * dx + R[1, 0] * dy + R[2, 0] * dz) / W - uv[0]
+        r[1] = -(R[0, 1] * dx + R[1, 1] * dy + R[2, 1] * dz) / W - uv[1]
+
+
+@njit(cache=True)
+def _least_squares(own, tangents, image, positions, rotations, weights, used, X, N, b, dx):  # type: ignore[no-untyped-def]
+    """Gauss-Newton on the image residuals of the rays in use; leaves N; False if it fails."""
+    A = np.empty((2, 3))
+    for _ in range(MAX_STEPS):
+        N[:] = 0.0
+        b[:] = 0.0
+        distance = 0.0
+        for i in range(len(own)):
+            k = own[i]
+            if not used[k]:
+                continue
+            C, R, P = positions[image[k]], rotations[image[k]], weights[k]
+            x, y, z = X[0] - C[0], X[1] - C[1], X[2] - C[2]
+            W = R[0, 2] * x + R[1, 2] * y + R[2, 2] * z
+            if not W < 0.0:
+                return False
+            u = -(R[0, 0] * x + R[1, 0] * y + R[2, 0] * z) / W
+            v = -(R[0, 1] * x + R[1, 1] * y + R[2, 1] * z) / W
+            ru, rv = u - tangents[k, 0], v - tangents[k, 1]
+            distance = max(distance, abs(W))
+            for d in range(3):
+                A[0, d] = -(R[d, 0] + u * R[d, 2]) / W
+                A[1, d] = -(R[d, 1] + v * R[d, 2]) / W
+            for a in range(3):
+                pa = P[0, 0] * A[0, a] + P[0, 1] * A[1, a]
+                qa = P[0, 1] * A[0, a] + P[1, 1] * A[1, a]
+                b[a] -= pa * ru + qa * rv
+                for c in range(3):
+                    N[a, c] += pa * A[0, c] + qa * A[1, c]
+        if not solve_scaled(N, b, dx):
+            return False
+        for d in range(3):
+            X[d] += dx[d]
+        if abs(dx[0]) + abs(dx[1]) + abs(dx[2]) < CONVERGED * distance:
+            return True
+    return True

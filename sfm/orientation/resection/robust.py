@@ -1,0 +1,277 @@
+"""Space resection from many points of which some are wrong: P3P in RANSAC, then least squares."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numba import njit
+
+from sfm.conventions import BoolArray, FloatArray
+from sfm.orientation.resection.fischler_bolles import MAX_SOLUTIONS, rays_from_tangents, solve_triple
+from sfm.orientation.resection.least_squares import (
+    DONE,
+    LIMIT,
+    UNKNOWNS,
+    adjust_pose,
+    cofactors_in_angles,
+    pose_normals,
+)
+
+SAMPLE = 3  # points of a trial
+MARGIN_SD = 3  # standard deviations of the number of trials that are added to its expectation
+MAX_TRIALS = 20_000
+LOCAL_STEPS = 4  # Gauss-Newton steps of the local improvement of a candidate
+FINAL_STEPS = 30
+ROUNDS = 10  # of least squares and new choice of the fitting points
+FEW_POINTS = 8  # up to here every triple is tried and every candidate improved
+_NOWHERE = np.full(3, np.nan)
+
+
+@dataclass(frozen=True)
+class RobustResection:
+    """Exterior orientation from points of which some do not fit; NaN with a reason if there is none."""
+
+    position: FloatArray  # projection centre X0, object unit, (3,)
+    rotation: FloatArray  # R, image to object axes, (3, 3)
+    inliers: BoolArray  # points that fit, (n,)
+    residuals: FloatArray  # v = computed - measured of all points, tangents, NaN if behind, (n, 2)
+    rms: float  # per coordinate over the fitting points, tangents
+    sigma0: float  # a posteriori standard deviation of a coordinate, tangents; NaN without redundancy
+    covariance: FloatArray  # of X0 (object unit) and omega, phi, kappa (rad), (6, 6)
+    trials: int  # triples tried
+    reason: str  # why there is no orientation; empty if there is one
+
+    @property
+    def found(self) -> bool:
+        """Whether there is an orientation."""
+        return not self.reason
+
+
+def resect_robust(
+    tangents: FloatArray,
+    points: FloatArray,
+    *,
+    tolerance: float,
+    seed: int = 0,
+    min_inliers: int = 4,
+    max_trials: int = MAX_TRIALS,
+    sigma: float | None = None,
+) -> RobustResection:
+    """Return the exterior orientation that most of the points support.
+
+    Args:
+        tangents: u = -U/W, v = -V/W of the measured rays, shape (n, 2).
+        points: object points, shape (n, 3), object unit.
+        tolerance: largest residual vector of a fitting point, tangents.
+        seed: of the choice of triples; the same seed gives the same result.
+        min_inliers: fewest fitting points, at least 4 (three always fit).
+        max_trials: most triples tried.
+        sigma: a priori standard deviation of a coordinate for the covariance, tangents; the
+            a posteriori one if not given.
+
+    Returns:
+        The orientation with the smallest truncated sum of squared residuals, refined by least squares
+        over the fitting points; or the reason why there is none.
+
+    Source: Fischler, Bolles (1981), secs. II-IV: trials until E(k) + 3 SD(k) for the share w of fitting
+    points found so far. The truncated squares are those of Torr, Zisserman (2000), CVIU 78 (MSAC); the
+    improvement of every new best candidate by least squares is that of Chum et al. (2003), LO-RANSAC.
+    """
+    n = len(points)
+    needed = max(min_inliers, SAMPLE + 1)
+    uv = np.ascontiguousarray(tangents, dtype=float).reshape(-1, 2)
+    xyz = np.ascontiguousarray(points, dtype=float).reshape(-1, 3)
+    if n < needed:
+        return _failure(n, f"{n} points, resection needs {needed}")
+    weights = np.zeros((n, 2, 2))
+    weights[:, 0, 0] = weights[:, 1, 1] = 1.0
+    X0, R, used, residuals, N = np.empty(3), np.empty((3, 3)), np.zeros(n, dtype=np.bool_), np.empty((n, 2)), np.empty((6, 6))
+    trials = _search(
+        uv, rays_from_tangents(uv), xyz, weights, tolerance, max_trials, seed, X0, R, used, residuals, N
+    )
+    count = int(used.sum())
+    if trials < 0:
+        return _failure(n, f"no orientation fits any triple of its {n} points (collinear or coincident)")
+    if count < needed:
+        return replace(
+            _failure(n, f"only {count} of {n} points fit within the tolerance, resection needs {needed}"),
+            trials=trials,
+        )
+    fitting = residuals[used]
+    square = float(np.sum(fitting**2))
+    redundancy = 2 * count - UNKNOWNS
+    sigma0 = np.sqrt(square / redundancy)
+    covariance = (sigma0 if sigma is None else sigma) ** 2 * cofactors_in_angles(np.linalg.inv(N), R)
+    return RobustResection(
+        X0, R, used, residuals, float(np.sqrt(square / (2 * count))), float(sigma0), covariance, trials, ""
+    )
+
+
+def expected_trials(w: float, n: int) -> tuple[float, float]:
+    """Return expectation E(k) and standard deviation SD(k) of the trials until a sample is free of errors.
+
+    Args:
+        w: probability that a point is right.
+        n: points in a sample.
+
+    Source: Fischler, Bolles (1981), sec. II.B: E(k) = w^-n, SD(k) = sqrt(1 - w^n) w^-n.
+    """
+    good = w**n
+    return 1.0 / good, float(np.sqrt(1.0 - good)) / good
+
+
+def _failure(n: int, reason: str) -> RobustResection:
+    nan = np.full((n, 2), np.nan)
+    return RobustResection(
+        _NOWHERE.copy(), np.full((3, 3), np.nan), np.zeros(n, dtype=bool), nan, np.nan, np.nan,
+        np.full((6, 6), np.nan), 0, reason,
+    )  # fmt: skip
+
+
+@njit(cache=True)
+def _search(tangents, rays, points, weights, tolerance, max_trials, seed, X0, R, used, residuals, N):  # type: ignore[no-untyped-def]
+    """Fill the best pose, the points that fit it, residuals and normal matrix; return trials (-1: none)."""
+    n = len(points)
+    position, rotation = np.empty((MAX_SOLUTIONS, 3)), np.empty((MAX_SOLUTIONS, 3, 3))
+    legs, work = np.empty((MAX_SOLUTIONS, 3)), np.empty(32)
+    ray3, point3, pick = np.empty((3, 3)), np.empty((3, 3)), np.zeros(3, dtype=np.int64)
+    try_X0, try_R = np.empty(3), np.empty((3, 3))
+    history = np.empty((0, 6))
+    n_vector = np.empty(6)
+    limit = tolerance * tolerance
+    best, best_raw = np.inf, np.inf
+    exhaustive = n <= FEW_POINTS
+    state = np.uint64(seed) * np.uint64(0x9E3779B97F4A7C15) + np.uint64(0x2545F4914F6CDD1D)
+    wanted = float(max_trials)
+    trial = 0
+    pick[2] = -1
+    while True:
+        if exhaustive:
+            if not _next_triple(pick, n):
+                break
+        else:
+            if trial >= wanted:
+                break
+            state = _random_triple(state, n, pick)
+        trial += 1
+        for k in range(3):
+            ray3[k], point3[k] = rays[pick[k]], points[pick[k]]
+        for s in range(solve_triple(ray3, point3, position, rotation, legs, work)):
+            raw = truncated_squares(tangents, points, position[s], rotation[s], limit, best_raw)
+            if raw >= best_raw and not exhaustive:
+                continue
+            best_raw = min(raw, best_raw)
+            try_X0[:], try_R[:] = position[s], rotation[s]
+            score = raw
+            for _ in range(2):
+                if exhaustive and n == SAMPLE + 1:
+                    used[:] = True
+                elif select(tangents, points, try_X0, try_R, limit, used) < SAMPLE + 1:
+                    break
+                adjust_pose(
+                    tangents, points, weights, used, try_X0, try_R, LOCAL_STEPS, history, N, residuals
+                )
+                new = truncated_squares(tangents, points, try_X0, try_R, limit, np.inf)
+                if new >= score:
+                    break
+                score = new
+            if raw < score or score >= best:
+                if raw >= best:
+                    continue
+                try_X0[:], try_R[:] = position[s], rotation[s]
+                score = raw
+            best = score
+            X0[:], R[:] = try_X0, try_R
+            w = max(select(tangents, points, X0, R, limit, used), SAMPLE) / n
+            good = w**SAMPLE
+            wanted = min(float(max_trials), (1.0 + MARGIN_SD * np.sqrt(1.0 - good)) / good)
+    if best == np.inf:
+        return -1
+    for _ in range(ROUNDS):
+        before = select(tangents, points, X0, R, limit, used)
+        if before < SAMPLE + 1:
+            break
+        try_X0[:], try_R[:] = X0, R
+        _, _, end = adjust_pose(
+            tangents, points, weights, used, try_X0, try_R, FINAL_STEPS, history, N, residuals
+        )
+        score = truncated_squares(tangents, points, try_X0, try_R, limit, np.inf)
+        if (end != DONE and end != LIMIT) or score > best * (1.0 + 1e-12):
+            break
+        same = abs(score - best) <= 1e-12 * best
+        X0[:], R[:] = try_X0, try_R
+        best = score
+        if same:
+            break
+    select(tangents, points, X0, R, limit, used)
+    pose_normals(tangents, points, weights, used, X0, R, N, n_vector, residuals)
+    return trial
+
+
+@njit(cache=True)
+def truncated_squares(tangents, points, X0, R, limit, stop):  # type: ignore[no-untyped-def]
+    """Sum of min(squared residual, limit); given up as soon as it exceeds `stop`."""
+    total = 0.0
+    for i in range(len(points)):
+        dx, dy, dz = points[i, 0] - X0[0], points[i, 1] - X0[1], points[i, 2] - X0[2]
+        W = R[0, 2] * dx + R[1, 2] * dy + R[2, 2] * dz
+        if W < 0.0:
+            ru = (R[0, 0] * dx + R[1, 0] * dy + R[2, 0] * dz) / W + tangents[i, 0]
+            rv = (R[0, 1] * dx + R[1, 1] * dy + R[2, 1] * dz) / W + tangents[i, 1]
+            total += min(ru * ru + rv * rv, limit)
+        else:
+            total += limit
+        if total >= stop:
+            return np.inf
+    return total
+
+
+@njit(cache=True)
+def select(tangents, points, X0, R, limit, used):  # type: ignore[no-untyped-def]
+    """Mark the points in front of the camera whose squared residual is at most `limit`; return how many."""
+    count = 0
+    for i in range(len(points)):
+        dx, dy, dz = points[i, 0] - X0[0], points[i, 1] - X0[1], points[i, 2] - X0[2]
+        W = R[0, 2] * dx + R[1, 2] * dy + R[2, 2] * dz
+        used[i] = False
+        if W < 0.0:
+            ru = (R[0, 0] * dx + R[1, 0] * dy + R[2, 0] * dz) / W + tangents[i, 0]
+            rv = (R[0, 1] * dx + R[1, 1] * dy + R[2, 1] * dz) / W + tangents[i, 1]
+            used[i] = ru * ru + rv * rv <= limit
+        if used[i]:
+            count += 1
+    return count
+
+
+@njit(cache=True)
+def _next_triple(pick, n):  # type: ignore[no-untyped-def]
+    """Step to the next i < j < k in lexical order; pick[2] = -1 starts."""
+    if pick[2] < 0:
+        pick[0], pick[1], pick[2] = 0, 1, 2
+        return True
+    for k in (2, 1, 0):
+        if pick[k] < n - 3 + k:
+            pick[k] += 1
+            for j in range(k + 1, 3):
+                pick[j] = pick[j - 1] + 1
+            return True
+    return False
+
+
+@njit(cache=True)
+def _random_triple(state, n, pick):  # type: ignore[no-untyped-def]
+    """Draw three different indices; returns the new state (splitmix64, Steele et al. 2014)."""
+    k = 0
+    while k < 3:
+        state += np.uint64(0x9E3779B97F4A7C15)
+        z = state
+        z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+        z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+        z = z ^ (z >> np.uint64(31))
+        index = np.int64(z % np.uint64(n))
+        if (k > 0 and index == pick[0]) or (k > 1 and index == pick[1]):
+            continue
+        pick[k] = index
+        k += 1
+    return state

@@ -1,0 +1,379 @@
+"""Orient a whole network from nothing but image points: a start, then photograph by photograph.
+
+The start is control or given approximate values where there are some, else the pair of photographs
+whose model most other photographs can be resected on. Planar pairs have two solutions; the one
+is taken that the other photographs confirm. After that: resection of every photograph that sees enough
+points, intersection of all points, and adjustment by a function of the caller, so that the interior
+orientation is learnt while the network grows.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from sfm.camera import Camera, project, tangents_from_pixel
+from sfm.conventions import BoolArray, FloatArray
+from sfm.errors import GeometryError
+from sfm.network import Estimate, Network, reduce_network
+from sfm.orientation.intersection import intersect
+from sfm.orientation.resection.robust import resect_robust
+from sfm.orientation.start import Start, best_start
+from sfm.similarity import fit_similarity
+
+MIN_POINTS = 4  # of a photograph: three are always fitted by P3P, the fourth checks it
+MIN_ANGLE_DEG = 2.0  # smallest ray angle of a point that others are oriented on
+START_TOLERANCE = 0.03  # of the photograph's diagonal: what an unknown distortion leaves after resection
+FINAL_TOLERANCE_PX = 4.0  # below this no image point is put aside here; the adjustment tests further
+TOLERANCE_FACTOR = 6.0  # times the robust spread of the residuals
+GROWTH = 1.25  # the network is adjusted when it has this many times the photographs of last time
+FIRST_ADJUSTMENT = 4  # photographs
+EARLY = ("c", "fx", "fy", "K1", "k1")  # parameters that few photographs determine
+ALL_FREE_PHOTOGRAPHS = 8  # of a camera, from which on all its parameters are adjusted
+ALL_FREE_REDUNDANCY = 20
+MAD_TO_SIGMA = 1.4826  # median absolute deviation of a normal distribution
+MAX_ROUNDS = 200
+
+Refine = Callable[[Network, Estimate], Estimate]
+
+
+@dataclass(frozen=True)
+class Orientation:
+    """Approximate values of a whole network and what could not be had."""
+
+    estimate: Estimate  # NaN for photographs and points that are not determined
+    failures: tuple[tuple[str, str], ...]  # (name of the photograph, reason)
+    pair: tuple[str, str] | None  # photographs it started from; None: from control or given values
+    kind: str  # start: spatial | planar | control | given
+    fits: BoolArray  # image points within the tolerance, (k,)
+    rms_px: float  # over these, per coordinate, px
+    tolerance_px: FloatArray  # last tolerance of each camera, px, one per camera
+
+
+def orient(
+    network: Network,
+    estimate: Estimate,
+    *,
+    seed: int = 0,
+    refine: Refine | None = None,
+    start_tolerance: float = START_TOLERANCE,
+    final_tolerance_px: float = FINAL_TOLERANCE_PX,
+    min_points: int = MIN_POINTS,
+) -> Orientation:
+    """Return exterior orientations and points of a network, from its image points.
+
+    Args:
+        network: measured facts; image points without a known object point belong out of it.
+        estimate: cameras with start values; exterior orientation and points NaN, or given where known.
+        seed: of all random choices.
+        refine: adjusts a fully determined part of the network (no NaN in it) and returns it adjusted; the
+            cameras it is given have as many free parameters as the part can determine. Its result
+            is taken only if the image points fit better with it.
+        start_tolerance: largest residual at the beginning, as a fraction of the photograph's diagonal.
+        final_tolerance_px: the tolerance follows the residuals down to this, px.
+        min_points: points that a photograph must share with the network, at least 4.
+
+    Raises:
+        GeometryError: no two photographs could be oriented.
+    """
+    cameras = estimate.cameras
+    diagonal = np.array([np.hypot(*camera.size_px) for camera in cameras])
+    growth = _Growth(network, estimate, seed, start_tolerance * diagonal, max(min_points, MIN_POINTS))
+    start = growth.begin()
+    if refine is not None:
+        growth.refined(refine)
+    adjusted = growth.estimate.oriented.sum()
+    for _ in range(MAX_ROUNDS):
+        added = growth.resect_next()
+        growth.intersect()
+        now = growth.estimate.oriented.sum()
+        due = now >= FIRST_ADJUSTMENT and (now >= GROWTH * adjusted or now == len(network.images))
+        if refine is not None and now > adjusted and (due or not added):
+            growth.refined(refine)
+            growth.adapt_tolerance(final_tolerance_px)
+            growth.intersect()
+            adjusted = now
+        elif not added:
+            break
+    growth.resect_all()
+    if refine is not None:
+        growth.refined(refine)
+    growth.adapt_tolerance(final_tolerance_px)
+    growth.resect_all()
+    growth.intersect()
+    return growth.finish(start, cameras)
+
+
+class _Growth:
+    """The state of a growing network: one estimate that is replaced step by step."""
+
+    def __init__(
+        self, network: Network, estimate: Estimate, seed: int, tolerance_px: FloatArray, min_points: int
+    ) -> None:
+        self.network = network
+        self.estimate = estimate
+        self.seed = seed
+        self.tolerance_px = tolerance_px
+        self.start_tolerance_px = tolerance_px
+        self.min_points = min_points
+        self.reasons: dict[int, str] = {}
+        points = network.control.point
+        self.fixed = np.zeros(len(network.points), dtype=bool)
+        self.fixed[points] = True
+
+    # --- views of the measured image points --------------------------------------------------------
+
+    def tangents(self) -> FloatArray:
+        """Tangents of all image points with the present interior orientations, (k, 2)."""
+        seen = self.network.image_points
+        camera = self.network.camera[seen.image]
+        uv = np.full((len(seen), 2), np.nan)
+        for index, one in enumerate(self.estimate.cameras):
+            own = camera == index
+            uv[own] = tangents_from_pixel(one, seen.xy[own])
+        return uv
+
+    def tolerance(self) -> FloatArray:
+        """Tolerance of every photograph, tangents, (m,)."""
+        c = np.array([camera.c_px for camera in self.estimate.cameras])
+        return (self.tolerance_px / c)[self.network.camera]
+
+    def residuals_px(self) -> FloatArray:
+        """Length of the reprojection residual of every image point, px, inf where undetermined, (k,)."""
+        return residual_lengths(self.network, self.estimate)
+
+    # --- steps -------------------------------------------------------------------------------------
+
+    def begin(self) -> Start:
+        """Find a start and take it over."""
+        network, control = self.network, self.network.control
+        if self.estimate.oriented.any() or self.estimate.determined.any():
+            kind = "given"
+        elif len(control) >= 3:
+            kind = "control"
+            points = self.estimate.points.copy()
+            points[control.point] = control.xyz
+            self.estimate = replace(self.estimate, points=points)
+        else:
+            kind = ""
+        if kind:
+            self.resect_all(only_new=True)
+            if self.estimate.oriented.any():
+                self.intersect()
+                if self.estimate.oriented.sum() >= 2 or kind == "given":
+                    return Start(None, kind, self.estimate.position, self.estimate.rotation, self.estimate.points)
+            # too little of it in any photograph: a free start, brought onto control when there is enough
+            nan = np.full_like(self.estimate.points, np.nan)
+            self.estimate = Estimate(
+                self.estimate.cameras,
+                np.full_like(self.estimate.position, np.nan),
+                np.full_like(self.estimate.rotation, np.nan),
+                nan,
+            )
+            self.fixed[:] = False
+        start = best_start(network, self.tangents(), self.tolerance(), seed=self.seed)
+        self.estimate = replace(
+            self.estimate, position=start.position, rotation=start.rotation, points=start.points
+        )
+        return start
+
+    def resect_next(self) -> int:
+        """Orient the photographs that see enough determined points; return how many were added.
+
+        Those with the most points come first; a photograph with less than half as many as the best
+        waits for the points that the others bring.
+        """
+        waiting = np.flatnonzero(~self.estimate.oriented)
+        seen = self.network.image_points
+        known = self.estimate.determined[seen.point]
+        count = np.bincount(seen.image[known], minlength=len(self.network.images))
+        if not len(waiting) or count[waiting].max() < self.min_points:
+            for i in waiting:
+                self.reasons[i] = _too_few(int(count[i]), self.min_points)
+            return 0
+        best = count[waiting].max()
+        order = waiting[np.argsort(-count[waiting], kind="stable")]
+        added = self._resect([i for i in order if count[i] >= max(self.min_points, best / 2)])
+        if not added:
+            added = self._resect([i for i in order if count[i] < best / 2])
+        return added
+
+    def resect_all(self, *, only_new: bool = False) -> None:
+        """Resect the photographs anew on the present points; oriented ones keep what fits better."""
+        oriented = self.estimate.oriented
+        self._resect([i for i in range(len(self.network.images)) if not (only_new and oriented[i])])
+
+    def _resect(self, images: list[int]) -> int:
+        uv, tolerance = self.tangents(), self.tolerance()
+        position, rotation = self.estimate.position.copy(), self.estimate.rotation.copy()
+        seen = self.network.image_points
+        known = self.estimate.determined[seen.point] & np.isfinite(uv).all(axis=1)
+        residuals = self.residuals_px()
+        added = 0
+        for i in images:
+            own = np.flatnonzero((seen.image == i) & known)
+            result = resect_robust(
+                uv[own],
+                self.estimate.points[seen.point[own]],
+                tolerance=tolerance[i],
+                seed=self.seed + i,
+                min_inliers=self.min_points,
+            )
+            camera = self.estimate.cameras[self.network.camera[i]]
+            if not result.found:
+                if not np.isfinite(position[i]).all():
+                    self.reasons[i] = result.reason
+                continue
+            if np.isfinite(position[i]).all():
+                limit = self.tolerance_px[self.network.camera[i]] ** 2
+                old = np.minimum(residuals[own] ** 2, limit).sum()
+                new = np.minimum(np.sum((result.residuals * camera.c_px) ** 2, axis=1), limit)
+                if not np.nansum(np.where(np.isnan(new), limit, new)) < old:
+                    continue
+            else:
+                added += 1
+            position[i], rotation[i] = result.position, result.rotation
+            self.reasons.pop(i, None)
+        self.estimate = replace(self.estimate, position=position, rotation=rotation)
+        return added
+
+    def intersect(self) -> None:
+        """Intersect all points that are not control anew from the oriented photographs."""
+        seen = self.network.image_points
+        result = intersect(
+            self.tangents(),
+            seen.image,
+            seen.point,
+            self.estimate.position,
+            self.estimate.rotation,
+            n_points=len(self.network.points),
+            tolerance=float(self.tolerance().max()),
+            min_angle_deg=MIN_ANGLE_DEG,
+        )
+        points = np.where(self.fixed[:, None], self.estimate.points, result.points)
+        self.estimate = replace(self.estimate, points=points)
+
+    def refined(self, refine: Refine) -> None:
+        """Let the caller adjust what is determined; keep the result if the image points fit better."""
+        seen = self.network.image_points
+        residuals = self.residuals_px()
+        limit = self.tolerance_px[self.network.camera[seen.image]]
+        fits = residuals <= limit
+        rays = np.bincount(seen.point[fits], minlength=len(self.network.points))
+        points = self.estimate.determined & ((rays >= 2) | self.fixed)
+        count = np.bincount(seen.image[fits & points[seen.point]], minlength=len(self.network.images))
+        images = self.estimate.oriented & (count >= 3)
+        if images.sum() < 2:
+            return
+        part, start = reduce_network(self.network, self.estimate, images, points, fits)
+        staged = tuple(
+            _staged(camera, part, start, index) for index, camera in enumerate(start.cameras)
+        )
+        try:
+            result = refine(part, replace(start, cameras=staged))
+        except (GeometryError, np.linalg.LinAlgError):
+            return
+        if not (result.oriented.all() and result.determined.all()):
+            return
+        cameras = tuple(
+            replace(new, free=old.free) for new, old in zip(result.cameras, self.estimate.cameras, strict=True)
+        )
+        position, rotation, xyz = (
+            self.estimate.position.copy(),
+            self.estimate.rotation.copy(),
+            self.estimate.points.copy(),
+        )
+        position[images], rotation[images], xyz[points] = result.position, result.rotation, result.points
+        candidate = Estimate(cameras, position, rotation, xyz)
+        capped = np.minimum(residuals, limit)[fits]
+        new = np.minimum(residual_lengths(self.network, candidate), limit)[fits]
+        if np.sum(new**2) < np.sum(capped**2):
+            self.estimate = candidate
+
+    def adapt_tolerance(self, final_px: float) -> None:
+        """Let the tolerance of each camera follow the spread of its residuals."""
+        camera = self.network.camera[self.network.image_points.image]
+        residuals = self.residuals_px()
+        tolerance = self.tolerance_px.copy()
+        for index in range(len(tolerance)):
+            own = residuals[(camera == index) & np.isfinite(residuals)]
+            if len(own):
+                spread = MAD_TO_SIGMA * float(np.median(own))
+                tolerance[index] = np.clip(
+                    TOLERANCE_FACTOR * spread, final_px, self.start_tolerance_px[index]
+                )
+        self.tolerance_px = tolerance
+
+    def finish(self, start: Start, cameras: tuple[Camera, ...]) -> Orientation:
+        """Bring the network onto control if it started free, drop what does not hold, and report."""
+        network, control = self.network, self.network.control
+        seen = network.image_points
+        residuals = self.residuals_px()
+        fits = residuals <= self.tolerance_px[network.camera[seen.image]]
+        count = np.bincount(seen.image[fits], minlength=len(network.images))
+        weak = self.estimate.oriented & (count < self.min_points)
+        for i in np.flatnonzero(weak):
+            self.reasons[i] = f"only {count[i]} of its points fit the network, {self.min_points} are needed"
+        drop = weak[:, None]
+        self.estimate = replace(
+            self.estimate,
+            position=np.where(drop, np.nan, self.estimate.position),
+            rotation=np.where(drop[:, :, None], np.nan, self.estimate.rotation),
+        )
+        fits &= ~weak[seen.image]
+        if self.estimate.oriented.sum() < 2:
+            raise GeometryError(
+                f"orientation: {self.estimate.oriented.sum()} of {len(network.images)} photographs could be "
+                "oriented, at least 2 are needed"
+            )
+        if start.pair is not None and len(control) >= 3:
+            known = self.estimate.determined[control.point]
+            if known.sum() >= 3:
+                model = self.estimate.points[control.point[known]]
+                self.estimate = fit_similarity(model, control.xyz[known]).apply_estimate(self.estimate)
+        failures = tuple(
+            (network.images[i], self.reasons.get(int(i), "shares too few points with the others"))
+            for i in np.flatnonzero(~self.estimate.oriented)
+        )
+        pair = None if start.pair is None else (network.images[start.pair[0]], network.images[start.pair[1]])
+        used = residuals[fits]
+        rms = float(np.sqrt(np.mean(used**2) / 2)) if len(used) else np.nan
+        restored = tuple(
+            replace(new, free=old.free) for new, old in zip(self.estimate.cameras, cameras, strict=True)
+        )
+        estimate = replace(self.estimate, cameras=restored)
+        return Orientation(estimate, failures, pair, start.kind, fits, rms, self.tolerance_px)
+
+
+def residual_lengths(network: Network, estimate: Estimate) -> FloatArray:
+    """Return the length of every image residual in px, inf where it is not determined, shape (k,)."""
+    seen = network.image_points
+    out = np.full(len(seen), np.inf)
+    order = np.argsort(seen.image, kind="stable")
+    bounds = np.searchsorted(seen.image[order], np.arange(len(network.images) + 1))
+    for i in np.flatnonzero(estimate.oriented):
+        own = order[bounds[i] : bounds[i + 1]]
+        camera = estimate.cameras[network.camera[i]]
+        xy = project(camera, estimate.position[i], estimate.rotation[i], estimate.points[seen.point[own]])
+        length = np.linalg.norm(xy - seen.xy[own], axis=1)
+        out[own] = np.where(np.isfinite(length), length, np.inf)
+    return out
+
+
+def _staged(camera: Camera, network: Network, estimate: Estimate, index: int) -> Camera:
+    """Free as many interior parameters as the photographs determine: none, the first few, or all."""
+    photographs = int(np.sum(network.camera == index))
+    n, m = len(network.points), len(network.images)
+    redundancy = 2 * len(network.image_points) - 6 * m - 3 * n + 7
+    early = np.array([name in EARLY for name in camera.names])
+    if photographs >= ALL_FREE_PHOTOGRAPHS and redundancy - camera.free.sum() >= ALL_FREE_REDUNDANCY:
+        return camera
+    if photographs >= FIRST_ADJUSTMENT and redundancy - (early & camera.free).sum() >= 2:
+        return replace(camera, free=camera.free & early)
+    return replace(camera, free=np.zeros_like(camera.free))
+
+
+def _too_few(count: int, needed: int) -> str:
+    return f"{count} point{'' if count == 1 else 's'} of the network seen, resection needs {needed}"

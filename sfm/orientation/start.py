@@ -1,0 +1,172 @@
+"""The pair of photographs that a network starts from, and which of its solutions is the true one."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sfm.conventions import FloatArray, IntArray
+from sfm.errors import GeometryError
+from sfm.network import Network
+from sfm.orientation.intersection import intersect
+from sfm.orientation.relative import PLANAR_POINTS, RelativeOrientation, model_points, relative_orientations
+from sfm.orientation.resection.robust import resect_robust
+
+MAX_PAIRS = 60  # pairs whose solutions are tried on the other photographs
+MIN_MEDIAN_ANGLE_DEG = 5.0  # median ray angle of a pair that is worth starting from
+SCREEN_TRIALS = 200  # triples per photograph while solutions are compared
+CONFIRMED = 1e-3  # of a tolerance: what a pair's score gains by a wide ray angle, to break ties
+
+
+@dataclass(frozen=True)
+class Start:
+    """First photographs and points of a network, NaN for all others."""
+
+    pair: tuple[int, int] | None  # photographs it started from
+    kind: str  # spatial | planar | control | given
+    position: FloatArray  # (m, 3)
+    rotation: FloatArray  # (m, 3, 3)
+    points: FloatArray  # (n, 3)
+
+
+def best_start(network: Network, tangents: FloatArray, tolerance: FloatArray, *, seed: int = 0) -> Start:
+    """Return the pair solution on which most image points of all other photographs can be resected.
+
+    Args:
+        network: measured facts.
+        tangents: of all image points, shape (k, 2).
+        tolerance: largest residual in each photograph, tangents, shape (m,).
+        seed: of the random samples.
+
+    Raises:
+        GeometryError: no two photographs have four points in common, or none of their geometries holds.
+
+    Source: the two solutions of a plane (Ma et al. 2004, sec. 5.3.3) cannot be told apart in a pair; in
+    a third photograph the false plane does not fit. All solutions of all promising pairs are tried and
+    compared by the truncated squares over all photographs.
+    """
+    own = _sorted_rows(network, tangents)
+    pairs = _promising_pairs(network, own)
+    if not pairs:
+        raise GeometryError(
+            f"orientation: no two of the {len(network.images)} photographs have {PLANAR_POINTS} points in common"
+        )
+    best: tuple[float, Start] | None = None
+    for i, j in pairs:
+        points, first, second = _common(network, tangents, own[i], own[j])
+        limit = float(max(tolerance[i], tolerance[j]))
+        try:
+            solutions = relative_orientations(first, second, tolerance=limit, seed=seed)
+        except GeometryError:
+            continue
+        for solution in solutions:
+            if solution.kind == "infinite":
+                continue
+            candidate = _model(network, (i, j), points, first, second, solution)
+            if candidate is None:
+                continue
+            score = _score(network, tangents, tolerance, own, candidate, seed)
+            if best is None or score < best[0]:
+                best = (score, candidate)
+    if best is None:
+        raise GeometryError("orientation: no pair of photographs has a base, or rays that intersect well")
+    return best[1]
+
+
+def _sorted_rows(network: Network, tangents: FloatArray) -> list[IntArray]:
+    """Rows of the usable image points of each photograph."""
+    seen = network.image_points
+    usable = np.isfinite(tangents).all(axis=1)
+    return [np.flatnonzero((seen.image == i) & usable) for i in range(len(network.images))]
+
+
+def _promising_pairs(network: Network, own: list[IntArray]) -> list[tuple[int, int]]:
+    """Pairs with at least four common points, those with most first, spread over the photographs."""
+    m = len(own)
+    sees = np.zeros((m, len(network.points)), dtype=np.int64)
+    for i, rows in enumerate(own):
+        sees[i, network.image_points.point[rows]] = 1
+    common = sees @ sees.T
+    pairs = [(i, j) for i in range(m) for j in range(i + 1, m) if common[i, j] >= PLANAR_POINTS]
+    # equal counts in the order of j - i, so that a cut takes pairs from all over the survey
+    pairs.sort(key=lambda pair: (-common[pair], (pair[1] - pair[0]) % max(2, m // 3), pair))
+    if len(pairs) <= MAX_PAIRS:
+        return pairs
+    floor = common[pairs[MAX_PAIRS - 1]]
+    sure = [pair for pair in pairs if common[pair] > floor]
+    tied = [pair for pair in pairs if common[pair] == floor]
+    step = len(tied) / (MAX_PAIRS - len(sure))
+    return sure + [tied[int(k * step)] for k in range(MAX_PAIRS - len(sure))]
+
+
+def _common(
+    network: Network, tangents: FloatArray, a: IntArray, b: IntArray
+) -> tuple[IntArray, FloatArray, FloatArray]:
+    """Points that two photographs have in common, and their tangents in both."""
+    seen = network.image_points
+    points, rows_a, rows_b = np.intersect1d(seen.point[a], seen.point[b], return_indices=True)
+    return points, tangents[a[rows_a]], tangents[b[rows_b]]
+
+
+def _model(
+    network: Network,
+    pair: tuple[int, int],
+    points: IntArray,
+    first: FloatArray,
+    second: FloatArray,
+    solution: RelativeOrientation,
+) -> Start | None:
+    """Pair and its model points as a start; None if too few rays intersect, or at too small angles."""
+    xyz = model_points(first, second, solution)
+    usable = np.isfinite(xyz).all(axis=1)
+    if usable.sum() < PLANAR_POINTS:
+        return None
+    to_first, to_second = xyz[usable], xyz[usable] - solution.base
+    cosine = np.sum(to_first * to_second, axis=1) / (
+        np.linalg.norm(to_first, axis=1) * np.linalg.norm(to_second, axis=1)
+    )
+    if np.degrees(np.arccos(np.clip(np.median(cosine), -1, 1))) < MIN_MEDIAN_ANGLE_DEG:
+        return None
+    m, n = len(network.images), len(network.points)
+    position, rotation, model = np.full((m, 3), np.nan), np.full((m, 3, 3), np.nan), np.full((n, 3), np.nan)
+    position[pair[0]], rotation[pair[0]] = 0.0, np.eye(3)
+    position[pair[1]], rotation[pair[1]] = solution.base, solution.rotation
+    model[points] = xyz
+    return Start(pair, solution.kind, position, rotation, model)
+
+
+def _score(
+    network: Network,
+    tangents: FloatArray,
+    tolerance: FloatArray,
+    own: list[IntArray],
+    start: Start,
+    seed: int,
+) -> float:
+    """Truncated squares over all image points, in squared tolerances: 1 for each that does not fit."""
+    seen = network.image_points
+    m = len(network.images)
+    position, rotation = start.position.copy(), start.rotation.copy()
+    determined = np.isfinite(start.points).all(axis=1)
+    for i in range(m):
+        if i in (start.pair or ()):
+            continue
+        rows = own[i][determined[seen.point[own[i]]]]
+        result = resect_robust(
+            tangents[rows],
+            start.points[seen.point[rows]],
+            tolerance=tolerance[i],
+            seed=seed,
+            max_trials=SCREEN_TRIALS,
+        )
+        if result.found:
+            position[i], rotation[i] = result.position, result.rotation
+    # with all photographs the points are intersected again, which tells a true plane from a bent one
+    image, point = seen.image, seen.point
+    finite = np.isfinite(tangents).all(axis=1)
+    again = intersect(
+        tangents, image, point, position, rotation, n_points=len(network.points), tolerance=float(tolerance.max())
+    )
+    squares = np.sum(again.residuals**2, axis=1) / tolerance[image] ** 2
+    return float(np.where(np.isfinite(squares), np.minimum(squares, 1.0), 1.0)[finite].sum())
