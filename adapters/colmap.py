@@ -1,0 +1,457 @@
+"""COLMAP through pycolmap: models written and read, and its Ceres bundle adjustment of our networks.
+
+The only module that imports pycolmap. What differs from Kolinear is turned here and nowhere else:
+
+    pixel origin   COLMAP counts from the corner of the top-left pixel, Kolinear from its centre: +0.5 px
+    camera axes    COLMAP looks along +z with y down: R_colmap = diag(1, -1, -1) M, t = -R_colmap X0
+    weights        COLMAP's adjuster gives every image coordinate the same weight
+    constants      COLMAP frees focal lengths, principal points and distortion in groups, for all cameras
+
+Source: COLMAP 4.2 documentation, "Output Format" and "Camera Models".
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+
+from sfm.camera import Camera
+from sfm.conventions import BoolArray, FloatArray, IntArray
+from sfm.errors import BackendError, OutputError, SurveyFileError
+from sfm.network import Estimate, ImagePoints, Network
+
+NEEDED_VERSION = (4, 2)
+HALF_PIXEL = 0.5  # COLMAP's pixel coordinates minus ours, px
+AXES = np.diag([1.0, -1.0, -1.0])  # COLMAP's camera axes in ours
+COLMAP_NAMES = {"opencv": "OPENCV", "full_opencv": "FULL_OPENCV"}
+# COLMAP's simpler models as ours: where each of its parameters goes, in its order
+READABLE = {
+    "SIMPLE_PINHOLE": ("opencv", ("fx fy", "cx", "cy")),
+    "PINHOLE": ("opencv", ("fx", "fy", "cx", "cy")),
+    "SIMPLE_RADIAL": ("opencv", ("fx fy", "cx", "cy", "k1")),
+    "RADIAL": ("opencv", ("fx fy", "cx", "cy", "k1", "k2")),
+    "OPENCV": ("opencv", ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")),
+    "FULL_OPENCV": (
+        "full_opencv",
+        ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
+    ),
+}
+SIDE_FILE = "kolinear.json"  # names and pixel sizes, which COLMAP's model has no place for
+
+# The default start radius of 1e4 crawls (46 steps on 400 photographs, 6 with 1e8); the steps are then
+# Gauss-Newton's. Ceres' own tolerances stop long before the last digits.
+START_RADIUS = 1e8
+MAX_RADIUS = 1e32
+MIN_LM_DIAGONAL = 1e-30
+STILL = 1e-13  # relative decrease of the cost below which another run of Ceres has nothing to add
+MAX_RUNS = 8
+DENSE_LIMIT = 200  # photographs up to which the reduced normal matrix is factorised densely
+
+
+@dataclass(frozen=True)
+class ColmapAdjustment:
+    """What COLMAP's bundle adjuster made of a network."""
+
+    estimate: Estimate  # adjusted, in the gauge that COLMAP was left with
+    residuals: FloatArray  # computed - measured, px, pixel frame, (k, 2)
+    rms_px: float  # root mean square residual per coordinate, px
+    cost: float  # half the sum of squared residuals, px^2
+    iterations: int  # steps of Ceres, unsuccessful ones included
+    converged: bool  # whether Ceres met a criterion of convergence
+    message: str  # Ceres' reason to stop
+    seconds: float  # time in Ceres, s; without building the problem
+    threads: int  # threads that Ceres was given
+
+
+def adjust_with_colmap(
+    network: Network,
+    estimate: Estimate,
+    *,
+    gauge: str = "two_cameras",
+    threads: int = 1,
+    max_iterations: int = 200,
+    polish: bool = True,
+) -> ColmapAdjustment:
+    """Adjust a network with COLMAP's Ceres adjuster, all image coordinates with unit weight.
+
+    Free are the parameters that the cameras of the estimate declare; see `colmap_free`.
+
+    Args:
+        network: photographs, points and image points, all of which take part.
+        estimate: start values, complete, cameras in an opencv model.
+        gauge: two_cameras | free | control; with control the control points are held fixed.
+        threads: threads of Ceres.
+        max_iterations: steps per run of Ceres.
+        polish: run Ceres again from its own result until the cost stands still.
+
+    Raises:
+        BackendError: pycolmap is missing or of another version, a camera model or a set of free
+            parameters that COLMAP cannot express, weighted control, or Ceres fails.
+    """
+    pycolmap = _pycolmap()
+    refine = colmap_free(estimate.cameras)
+    options = _options(pycolmap, refine, len(network.images), threads, max_iterations)
+    with _quiet(pycolmap):
+        scene = _reconstruction(pycolmap, network, estimate)
+        config = _config(pycolmap, network, estimate, gauge)
+        iterations, seconds, converged, message = 0, 0.0, False, ""
+        cost = np.inf
+        for _ in range(MAX_RUNS if polish else 1):
+            adjuster = pycolmap.create_default_ceres_bundle_adjuster(options, config, scene)
+            started = time.perf_counter()
+            summary = adjuster.solve().ceres_summary
+            seconds += time.perf_counter() - started
+            iterations += summary.num_successful_steps + summary.num_unsuccessful_steps
+            converged = summary.termination_type.name == "CONVERGENCE"
+            message = summary.message
+            if not summary.IsSolutionUsable():
+                raise BackendError(f"COLMAP's adjuster failed: {summary.message}")
+            still = abs(cost - summary.final_cost) <= STILL * summary.final_cost
+            cost = summary.final_cost
+            if still:
+                converged = True
+                break
+        adjusted = _estimate(scene, estimate)
+        residuals = _residuals(scene, network)
+    return ColmapAdjustment(
+        adjusted,
+        residuals,
+        float(np.sqrt((residuals**2).mean())),
+        float((residuals**2).sum() / 2),
+        iterations,
+        converged,
+        message,
+        seconds,
+        threads,
+    )
+
+
+def colmap_free(cameras: tuple[Camera, ...]) -> tuple[bool, bool, bool]:
+    """Return whether focal lengths, principal points and distortion are free, as COLMAP knows it.
+
+    Raises:
+        BackendError: a group is free in part, or in some of the cameras that are not fixed as a whole.
+    """
+    found: set[tuple[bool, bool, bool]] = set()
+    for camera in cameras:
+        if not camera.free.any():
+            continue
+        groups = camera.free[:2], camera.free[2:4], camera.free[4:]
+        for name, group in zip(("focal length", "principal point", "distortion"), groups, strict=True):
+            if group.any() and not group.all():
+                raise BackendError(
+                    f"camera {camera.name}: its {name} is free in part, COLMAP frees all of it or nothing"
+                )
+        found.add((bool(groups[0][0]), bool(groups[1][0]), bool(groups[2][0])))
+    if len(found) > 1:
+        raise BackendError("cameras with different free parameters: COLMAP frees the same in all of them")
+    return found.pop() if found else (False, False, False)
+
+
+def write_model(
+    folder: Path,
+    network: Network,
+    estimate: Estimate,
+    *,
+    rejected: BoolArray | None = None,
+    text: bool = False,
+) -> None:
+    """Write a network and its solution as a COLMAP model: cameras, rigs, frames, images and points.
+
+    Image points keep their order in each photograph; rejected ones are written without a point.
+
+    Args:
+        folder: made if it is not there.
+        network, estimate: cameras in an opencv model; photographs without orientation are left out.
+        rejected: image points that no point shall claim, (k,).
+        text: text files instead of binary ones.
+
+    Raises:
+        BackendError: pycolmap is missing, or a camera is in a model that COLMAP does not know.
+        OutputError: the folder cannot be written.
+    """
+    pycolmap = _pycolmap()
+    with _quiet(pycolmap):
+        scene = _reconstruction(pycolmap, network, estimate, rejected=rejected)
+        scene.update_point_3d_errors()
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            if text:
+                scene.write_text(str(folder))
+            else:
+                scene.write_binary(str(folder))
+            side = {
+                "cameras": [
+                    {"name": c.name, "pixel_mm": [float(p) for p in c.pixel_mm], "free": c.free.tolist()}
+                    for c in estimate.cameras
+                ],
+                "images": {str(i + 1): name for i, name in enumerate(network.images)},
+                "points": {str(j + 1): name for j, name in enumerate(network.points)},
+            }
+            (folder / SIDE_FILE).write_text(
+                json.dumps(side, ensure_ascii=False, indent=1) + "\n", encoding="utf-8"
+            )
+        except (OSError, ValueError) as error:
+            raise OutputError(f"{folder}: the COLMAP model cannot be written ({error})") from error
+
+
+def read_model(folder: Path) -> tuple[Network, Estimate]:
+    """Read a COLMAP model, binary or text, as a network and its solution.
+
+    Cameras in COLMAP's pinhole and radial models become `opencv` ones. Points are named by their number
+    in COLMAP, cameras too, and a pixel is 1 mm, unless the model was written by `write_model`. The
+    covariance of every image point is 1 px^2, since COLMAP keeps none.
+
+    Raises:
+        SurveyFileError: no model in the folder, or one that cannot be read.
+        BackendError: pycolmap is missing, a camera model that Kolinear has no equal of, or photographs
+            in rigs of several cameras without an orientation of their own.
+    """
+    pycolmap = _pycolmap()
+    if not any((folder / f"cameras.{kind}").is_file() for kind in ("bin", "txt")):
+        raise SurveyFileError(f"{folder}: no COLMAP model (cameras.bin or cameras.txt) in this folder")
+    with _quiet(pycolmap):
+        try:
+            scene = pycolmap.Reconstruction(str(folder))
+        except (ValueError, RuntimeError, IndexError, OSError) as error:
+            raise SurveyFileError(f"{folder}: not a readable COLMAP model ({_line(error)})") from error
+    side_path = folder / SIDE_FILE
+    side = json.loads(side_path.read_text(encoding="utf-8")) if side_path.is_file() else {}
+    camera_ids = sorted(scene.cameras)
+    cameras = tuple(_camera(scene.camera(i)) for i in camera_ids)
+    if len(side.get("cameras", ())) == len(cameras):
+        cameras = tuple(
+            replace(
+                camera,
+                name=extra["name"],
+                pixel_mm=np.array(extra["pixel_mm"], dtype=float),
+                free=np.array(extra["free"], dtype=bool),
+            )
+            for camera, extra in zip(cameras, side["cameras"], strict=True)
+        )
+    image_ids = sorted(scene.images)
+    images = [scene.image(i) for i in image_ids]
+    point_ids = sorted(scene.point3D_ids())
+    names = side.get("points", {})
+    index = {j: k for k, j in enumerate(point_ids)}
+    seen = [
+        (i, index[p.point3D_id], p.x() - HALF_PIXEL, p.y() - HALF_PIXEL)
+        for i, image in enumerate(images)
+        for p in image.points2D
+        if p.has_point3D()
+    ]
+    table = np.array(seen, dtype=float).reshape(-1, 4)
+    poses = [
+        image.cam_from_world().matrix() if image.has_pose else np.full((3, 4), np.nan) for image in images
+    ]
+    M = np.array([AXES @ pose[:, :3] for pose in poses]).reshape(-1, 3, 3)
+    position = np.array([-pose[:, :3].T @ pose[:, 3] for pose in poses]).reshape(-1, 3)
+    # COLMAP's text format loses what follows a space in the name of a photograph.
+    full = {i: side.get("images", {}).get(str(i), "") for i in image_ids}
+    network = Network(
+        tuple(
+            full[i] if full[i].split()[:1] == [image.name] else image.name
+            for i, image in zip(image_ids, images, strict=True)
+        ),
+        np.array([camera_ids.index(image.camera_id) for image in images], dtype=np.int64),
+        tuple(names.get(str(j), str(j)) for j in point_ids),
+        ImagePoints(
+            table[:, 0].astype(np.int64),
+            table[:, 1].astype(np.int64),
+            table[:, 2:].copy(),
+            np.tile(np.eye(2), (len(table), 1, 1)),
+        ),
+    )
+    points = np.array([scene.point3D(j).xyz for j in point_ids]).reshape(-1, 3)
+    return network, Estimate(cameras, position, M.transpose(0, 2, 1).copy(), points)
+
+
+def _pycolmap() -> ModuleType:
+    """Import pycolmap, or say what is needed."""
+    needed = ".".join(str(part) for part in NEEDED_VERSION)
+    try:
+        import pycolmap
+        import pycolmap.pyceres  # registers the types of the Ceres options
+    except ImportError as error:
+        raise BackendError(
+            f"pycolmap cannot be imported ({_line(error)}): pip install 'pycolmap=={needed}.*'"
+        ) from error
+    found = tuple(int(part) for part in pycolmap.__version__.split(".")[:2])
+    if found != NEEDED_VERSION:
+        raise BackendError(
+            f"pycolmap {pycolmap.__version__} is installed, {needed} is needed: "
+            f"pip install 'pycolmap=={needed}.*'"
+        )
+    return pycolmap
+
+
+@contextmanager
+def _quiet(pycolmap: ModuleType) -> Iterator[None]:
+    """Keep the log of COLMAP and Ceres out of the terminal, and give it back as it was."""
+    log = pycolmap.logging
+    before = log.minloglevel, log.stderrthreshold
+    log.minloglevel = log.stderrthreshold = int(log.Level.FATAL)
+    try:
+        yield
+    finally:
+        log.minloglevel, log.stderrthreshold = before
+
+
+def _options(
+    pycolmap: ModuleType, refine: tuple[bool, bool, bool], images: int, threads: int, max_iterations: int
+) -> Any:
+    """Ceres run to the end of double precision, with nearly undamped steps."""
+    options = pycolmap.BundleAdjustmentOptions()
+    options.refine_focal_length, options.refine_principal_point, options.refine_extra_params = refine
+    options.refine_sensor_from_rig = False
+    options.print_summary = False
+    options.ceres.auto_select_solver_type = False
+    options.ceres.min_num_residuals_for_cpu_multi_threading = 0
+    solver = options.ceres.solver_options
+    kinds = pycolmap.pyceres.LinearSolverType
+    solver.linear_solver_type = kinds.DENSE_SCHUR if images <= DENSE_LIMIT else kinds.SPARSE_SCHUR
+    solver.num_threads = threads
+    solver.max_num_iterations = max_iterations
+    solver.initial_trust_region_radius = START_RADIUS
+    solver.max_trust_region_radius = MAX_RADIUS
+    solver.min_lm_diagonal = MIN_LM_DIAGONAL
+    solver.function_tolerance = solver.gradient_tolerance = solver.parameter_tolerance = 1e-16
+    return options
+
+
+def _config(pycolmap: ModuleType, network: Network, estimate: Estimate, gauge: str) -> Any:
+    """Which photographs take part and what is held."""
+    config = pycolmap.BundleAdjustmentConfig()
+    for i in range(len(network.images)):
+        config.add_image(i + 1)
+    for k, camera in enumerate(estimate.cameras):
+        if not camera.free.any():
+            config.set_constant_cam_intrinsics(k + 1)
+    if gauge == "two_cameras":
+        config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    elif gauge == "control":
+        if network.control.covariance.any():
+            raise BackendError(
+                "control with standard deviations: COLMAP's adjuster holds points or frees them"
+            )
+        for j in network.control.point:
+            config.add_constant_point(int(j) + 1)
+    elif gauge != "free":
+        raise BackendError(f"gauge '{gauge}' is none of two_cameras, free, control")
+    return config
+
+
+def _reconstruction(
+    pycolmap: ModuleType, network: Network, estimate: Estimate, *, rejected: BoolArray | None = None
+) -> Any:
+    """Return a pycolmap.Reconstruction; cameras, photographs and points are numbered from 1."""
+    scene = pycolmap.Reconstruction()
+    for k, camera in enumerate(estimate.cameras):
+        scene.add_camera_with_trivial_rig(_colmap_camera(pycolmap, camera, k + 1))
+    seen = network.image_points
+    claimed = np.ones(len(seen), dtype=bool) if rejected is None else ~rejected
+    claimed &= estimate.oriented[seen.image] & estimate.determined[seen.point]
+    slot = np.zeros(len(seen), dtype=np.int64)  # number of each image point in its photograph
+    for i, rows in enumerate(_groups(seen.image, len(network.images))):
+        if not estimate.oriented[i]:
+            continue
+        slot[rows] = np.arange(len(rows))
+        R = AXES @ estimate.rotation[i].T
+        pose = pycolmap.Rigid3d(pycolmap.Rotation3d(R), -R @ estimate.position[i])
+        keypoints = seen.xy[rows] + HALF_PIXEL
+        image = pycolmap.Image(
+            name=network.images[i], keypoints=keypoints, camera_id=int(network.camera[i]) + 1, image_id=i + 1
+        )
+        scene.add_image_with_trivial_frame(image, pose)
+    for j, rows in enumerate(_groups(seen.point, len(network.points))):
+        if not estimate.determined[j]:
+            continue
+        track = pycolmap.Track(
+            [pycolmap.TrackElement(int(seen.image[r]) + 1, int(slot[r])) for r in rows if claimed[r]]
+        )
+        point = pycolmap.Point3D(xyz=estimate.points[j], track=pycolmap.Track())
+        scene.add_point3D_with_id(j + 1, point)
+        for element in track.elements:
+            scene.add_observation(j + 1, element)
+    return scene
+
+
+def _colmap_camera(pycolmap: ModuleType, camera: Camera, number: int) -> Any:
+    if camera.model not in COLMAP_NAMES:
+        raise BackendError(
+            f"camera {camera.name}: COLMAP has no model {camera.model}, convert it to opencv or full_opencv"
+        )
+    width, height = camera.size_px
+    params = camera.parameters.copy()
+    params[2:4] += HALF_PIXEL
+    return pycolmap.Camera(
+        model=COLMAP_NAMES[camera.model], width=width, height=height, params=params, camera_id=number
+    )
+
+
+def _camera(found: Any) -> Camera:
+    """Return a COLMAP camera as ours, pixel size 1."""
+    if found.model_name not in READABLE:
+        raise BackendError(
+            f"camera {found.camera_id}: COLMAP's model {found.model_name} is none of {', '.join(READABLE)}"
+        )
+    model, places = READABLE[found.model_name]
+    camera = Camera(
+        str(found.camera_id),
+        model,
+        (int(found.width), int(found.height)),
+        np.ones(2),
+        np.zeros(8 if model == "opencv" else 12),
+    )
+    parameters = camera.parameters
+    for place, value in zip(places, found.params, strict=True):
+        for name in place.split():
+            parameters[camera.names.index(name)] = value
+    parameters[2:4] -= HALF_PIXEL
+    return camera
+
+
+def _estimate(scene: Any, start: Estimate) -> Estimate:
+    """Read the adjusted values back, counted as in the start values."""
+    cameras = []
+    for k, camera in enumerate(start.cameras):
+        params = np.array(scene.camera(k + 1).params, dtype=float)
+        params[2:4] -= HALF_PIXEL
+        cameras.append(camera.with_parameters(params))
+    poses = [scene.image(i + 1).cam_from_world().matrix() for i in range(len(start.position))]
+    R = np.array([(AXES @ pose[:, :3]).T for pose in poses])
+    position = np.array([-pose[:, :3].T @ pose[:, 3] for pose in poses])
+    points = np.array([scene.point3D(j + 1).xyz for j in range(len(start.points))])
+    return Estimate(tuple(cameras), position, R, points)
+
+
+def _residuals(scene: Any, network: Network) -> FloatArray:
+    """Computed minus measured by COLMAP's own projection, (k, 2), px."""
+    seen = network.image_points
+    xy = np.empty((len(seen), 2))
+    for i, rows in enumerate(_groups(seen.image, len(network.images))):
+        image = scene.image(i + 1)
+        pose = image.cam_from_world().matrix()
+        points = np.array([scene.point3D(int(j) + 1).xyz for j in seen.point[rows]]).reshape(-1, 3)
+        if len(rows):
+            xy[rows] = scene.camera(image.camera_id).img_from_cam(points @ pose[:, :3].T + pose[:, 3])
+    return xy - HALF_PIXEL - seen.xy
+
+
+def _groups(index: IntArray, count: int) -> list[IntArray]:
+    """Rows of each index value, in order."""
+    order = np.argsort(index, kind="stable")
+    return np.split(order, np.searchsorted(index[order], np.arange(1, count)))
+
+
+def _line(error: BaseException) -> str:
+    """The message of an error on one line."""
+    return " ".join(str(error).split()) or type(error).__name__

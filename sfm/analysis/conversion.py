@@ -1,0 +1,198 @@
+"""Conversion of a camera from one distortion model to another, by a fit over the photograph.
+
+`brown` corrects the measured point and the other models distort the ideal one, so no conversion is exact:
+the parameters of the target model are fitted to the rays of the source over a grid of pixels, and what is
+left is stated. Principal distance and principal point take part in the fit, the rays do not turn.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numba import njit
+from scipy.optimize import least_squares
+
+from sfm.camera import (
+    MAX_PARAMETERS,
+    MODELS,
+    Camera,
+    camera_from_values,
+    observe,
+    pixel_from_tangents,
+    tangents_from_pixel,
+)
+from sfm.conventions import BoolArray, FloatArray
+from sfm.errors import GeometryError, SurveyFileError
+
+GRID_STEPS = 32  # fit points along the longer side: the misfit varies as r^9 at most, four of them per period
+FIT_TOLERANCE = 1e-15  # relative; the fit is small, so it runs to the end of double precision
+
+# What stands for what: a parameter of the target is free when one of these of the source is.
+_RADIAL = ("K1", "K2", "K3", "K4", "k1", "k2", "k3", "k4", "k5", "k6")
+_DECENTRING = ("P1", "P2", "p1", "p2")
+_FOCAL = ("c", "fx", "fy", "b1")
+_KIN = {
+    **dict.fromkeys(_RADIAL, _RADIAL),
+    **dict.fromkeys(_DECENTRING, _DECENTRING),
+    **dict.fromkeys(("fx", "fy"), _FOCAL),
+    "c": ("c", "fx", "fy"),
+    "b1": ("b1", "fx", "fy"),
+    "b2": ("b2",),
+    **dict.fromkeys(("x0", "cx"), ("x0", "cx")),
+    **dict.fromkeys(("y0", "cy"), ("y0", "cy")),
+}
+
+
+@dataclass(frozen=True)
+class Conversion:
+    """A camera in another model, and how well that model can say the same."""
+
+    camera: Camera  # in the target model; free where the source was
+    source_model: str  # model converted from
+    rms_px: float  # root mean square misfit per coordinate over the region, px
+    max_px: float  # longest misfit vector over the region, px
+
+
+def convert_camera(camera: Camera, model: str, *, region_px: FloatArray | None = None) -> Conversion:
+    """Return the camera in another model, fitted over the photograph or a region of it.
+
+    Args:
+        camera: interior orientation to convert.
+        model: one of sfm.camera.MODELS.
+        region_px: x_min, y_min, x_max, y_max of the region that matters, px, shape (4,); the whole
+            photograph if not given.
+
+    Raises:
+        SurveyFileError: unknown model.
+        GeometryError: the distortion of the camera cannot be inverted over the region.
+
+    Source: start values by series reversal, Luhmann et al., Close-Range Photogrammetry and 3D Imaging
+    (2020), sec. 3.3; the fit is by least squares.
+    """
+    if model not in MODELS:
+        raise SurveyFileError(f"camera {camera.name}: model '{model}' is none of {', '.join(MODELS)}")
+    if model == camera.model:
+        return Conversion(camera, model, 0.0, 0.0)
+    xy = _grid(camera, region_px)
+    uv = tangents_from_pixel(camera, xy)
+    if not np.isfinite(uv).all():
+        raise GeometryError(
+            f"camera {camera.name}: its {camera.model} distortion cannot be inverted at "
+            f"{(~np.isfinite(uv[:, 0])).sum()} of {len(uv)} places of the photograph"
+        )
+    start = start_values(camera, model)
+    # The start is scaled by the effect of each parameter in px, so that the tolerance means the same to all.
+    fit = least_squares(
+        lambda p: _residuals(start.index, start.frame, p, xy, uv)[0].ravel(),
+        start.parameters,
+        jac=lambda p: _residuals(start.index, start.frame, p, xy, uv)[1].reshape(2 * len(xy), -1),
+        method="lm",
+        x_scale="jac",
+        ftol=FIT_TOLERANCE,
+        xtol=FIT_TOLERANCE,
+        gtol=FIT_TOLERANCE,
+        max_nfev=1000,
+    )
+    converted = replace(start.with_parameters(fit.x), free=corresponding_free(camera, model))
+    misfit = pixel_from_tangents(converted, uv) - xy
+    if not np.isfinite(misfit).all():
+        raise GeometryError(
+            f"camera {camera.name}: model {model} folds over inside the photograph when fitted to "
+            f"{camera.model}"
+        )
+    return Conversion(
+        converted,
+        camera.model,
+        float(np.sqrt((misfit**2).mean())),
+        float(np.sqrt((misfit**2).sum(axis=1).max())),
+    )
+
+
+def start_values(camera: Camera, model: str) -> Camera:
+    """Return the camera in another model by the first terms of the reversed series.
+
+    Between `brown` and the opencv models they are p1 = c P2, p2 = -c P1, k1 = -c^2 K1,
+    k2 = c^4 (3 K1^2 - K2), k3 = c^6 (8 K1 K2 - 12 K1^3 - K3), and the same read the other way;
+    between other models distortion starts at 0.
+    """
+    pixel = (float(camera.pixel_mm[0]), float(camera.pixel_mm[1]))
+    backward = camera.model == "brown"
+    to_opencv = not model.startswith("brown")
+    centre = (np.asarray(camera.size_px) - 1) / 2
+    values: dict[str, float] = {}
+    if camera.model.startswith("brown"):
+        c, x0, y0, b1 = (camera.value(name) for name in ("c", "x0", "y0", "b1"))
+        if to_opencv:
+            # brown multiplies the measured x by 1 + b1, brown_forward the ideal one
+            fx = c / pixel[0] * (1 - b1 if backward else 1 + b1)
+            values |= {"fx": fx, "fy": c / pixel[1]}
+            values |= {"cx": centre[0] + x0 / pixel[0], "cy": centre[1] - y0 / pixel[1]}
+        else:
+            values |= {"x0": x0, "y0": y0, "b1": -b1}
+        if backward and to_opencv:
+            k1, k2, k3 = _reversed(*(camera.value(f"K{i}") * c ** (2 * i) for i in (1, 2, 3)))
+            values |= {"k1": k1, "k2": k2, "p1": c * camera.value("P2"), "p2": -c * camera.value("P1")}
+            values |= {"k3": k3} if model == "full_opencv" else {}
+    else:
+        c = camera.value("fy") * pixel[1]
+        if to_opencv:
+            values |= {name: camera.value(name) for name in camera.names if name in MODELS[model].names}
+        else:
+            stretch = camera.value("fx") * pixel[0] / c
+            values |= {"x0": (camera.value("cx") - centre[0]) * pixel[0]}
+            values |= {"y0": -(camera.value("cy") - centre[1]) * pixel[1]}
+            values |= {"b1": 1 - stretch if model == "brown" else stretch - 1}
+        if model == "brown":
+            K = _reversed(*_power_series(camera))
+            values |= {f"K{i}": K[i - 1] / c ** (2 * i) for i in (1, 2, 3)}
+            values |= {"P1": -camera.value("p2") / c, "P2": camera.value("p1") / c}
+    return camera_from_values(camera.name, model, camera.size_px, pixel, c_mm=c, values=tuple(values.items()))
+
+
+def corresponding_free(camera: Camera, model: str) -> BoolArray:
+    """Return which parameters of another model take over the part of the free ones of the camera, (n,).
+
+    A parameter is free when one that it stands for is: a free K1 frees every radial term, since a series
+    cut short on one side is not cut short on the other.
+    """
+    free = {name for name, is_free in zip(camera.names, camera.free, strict=True) if is_free}
+    return np.array([bool(free.intersection(_KIN[name])) for name in MODELS[model].names])
+
+
+def _reversed(a: float, b: float, c: float) -> tuple[float, float, float]:
+    """Coefficients of the inverse of r (1 + a r^2 + b r^4 + c r^6) to the same order."""
+    return -a, 3 * a**2 - b, 8 * a * b - 12 * a**3 - c
+
+
+def _power_series(camera: Camera) -> tuple[float, float, float]:
+    """First three coefficients of the radial term of an opencv model, the fraction divided out."""
+    k = {name: camera.value(name) for name in camera.names if name.startswith("k")}
+    d1, d2, d3 = k.get("k4", 0.0), k.get("k5", 0.0), k.get("k6", 0.0)
+    s1 = k["k1"] - d1
+    s2 = k["k2"] - d2 - d1 * s1
+    return s1, s2, k.get("k3", 0.0) - d3 - d2 * s1 - d1 * s2
+
+
+def _grid(camera: Camera, region_px: FloatArray | None) -> FloatArray:
+    """Pixels spread evenly over the region, its border included, (k, 2)."""
+    width, height = camera.size_px
+    region = np.array([-0.5, -0.5, width - 0.5, height - 0.5]) if region_px is None else region_px
+    extent = region[2:] - region[:2]
+    steps = np.maximum(np.rint(GRID_STEPS * extent / extent.max()).astype(int), 8) + 1
+    x = np.linspace(region[0], region[2], steps[0])
+    y = np.linspace(region[1], region[3], steps[1])
+    return np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+
+
+@njit(cache=True)
+def _residuals(model, frame, p, xy, uv):  # type: ignore[no-untyped-def]
+    """Residuals (k, 2) and their derivatives by the parameters (k, 2, n) at given pixels and rays."""
+    r, Ju, Jp = np.empty(2), np.empty((2, 2)), np.zeros((2, MAX_PARAMETERS))
+    residuals = np.empty((len(xy), 2))
+    jacobian = np.empty((len(xy), 2, len(p)))
+    for i in range(len(xy)):
+        observe(model, frame, p, xy[i, 0], xy[i, 1], uv[i, 0], uv[i, 1], r, Ju, Jp)
+        residuals[i] = r
+        jacobian[i] = Jp[:, : len(p)]
+    return residuals, jacobian

@@ -1,0 +1,144 @@
+"""Conversion between distortion models: directions, signs, the stated misfit, and back."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from sfm.analysis.conversion import convert_camera, corresponding_free, start_values
+from sfm.camera import MODELS, Camera, camera_from_values, pixel_from_tangents, tangents_from_pixel
+from sfm.errors import SurveyFileError
+from tests.synthetic import seed_of
+
+SIZE_PX = (2272, 1704)
+HEIGHT_MM = 5.43764
+PIXEL_MM = HEIGHT_MM / 1704
+# camcal, free network: the values of an independent adjustment of 2074 image points (datasets/camcal)
+CAMCAL = (
+    ("x0", 3.615025 - 1136 * PIXEL_MM),
+    ("y0", HEIGHT_MM / 2 - 2.613659),
+    ("K1", 4.599155e-3),
+    ("K2", -4.599046e-5),
+    ("K3", -2.023446e-6),
+    ("P1", -6.102879e-5),
+    ("P2", -4.589405e-5),
+    ("b1", 3.916193e-4),
+)
+
+
+def camcal() -> Camera:
+    return camera_from_values(
+        "olympus",
+        "brown",
+        SIZE_PX,
+        (PIXEL_MM, PIXEL_MM),
+        c_mm=7.456893,
+        free=("c", "x0", "y0", "K1", "K2", "K3", "P1", "P2", "b1"),
+        values=CAMCAL,
+    )
+
+
+def everywhere() -> np.ndarray:
+    """Pixels of a finer grid than the one that conversion fits to."""
+    x, y = np.meshgrid(np.linspace(0, SIZE_PX[0] - 1, 61), np.linspace(0, SIZE_PX[1] - 1, 47))
+    return np.stack([x, y], axis=-1).reshape(-1, 2)
+
+
+def misfit(a: Camera, b: Camera) -> np.ndarray:
+    xy = everywhere()
+    return pixel_from_tangents(b, tangents_from_pixel(a, xy)) - xy
+
+
+def test_camcal_to_full_opencv_and_back_stays_within_three_hundredths_of_a_pixel() -> None:
+    there = convert_camera(camcal(), "full_opencv")
+    back = convert_camera(there.camera, "brown")
+    assert there.rms_px * np.sqrt(2) == pytest.approx(0.0090, abs=2e-4)  # of the length; another grid
+    assert there.max_px < 0.03
+    assert back.max_px < 0.03
+    np.testing.assert_allclose(back.camera.parameters[0], 7.456893, atol=2e-6)
+    assert there.camera.free.all()
+    assert dict(zip(back.camera.names, back.camera.free, strict=True)) == {
+        **dict.fromkeys(back.camera.names, True),
+        "b2": False,
+    }
+
+
+@pytest.mark.parametrize("model", ["full_opencv", "opencv", "brown_forward"])
+def test_stated_misfit_is_what_an_independent_grid_finds(model: str) -> None:
+    converted = convert_camera(camcal(), model)
+    found = misfit(camcal(), converted.camera)
+    assert np.sqrt((found**2).mean()) == pytest.approx(converted.rms_px, rel=0.25)
+    assert np.hypot(*found.T).max() <= converted.max_px * 1.01
+
+
+def test_series_alone_gives_the_signs() -> None:
+    """On a weak lens the neglected terms vanish: 10 px of distortion leave less than 0.1 px."""
+    weak = camera_from_values(
+        "weak",
+        "brown",
+        SIZE_PX,
+        (PIXEL_MM, PIXEL_MM),
+        c_mm=7.4,
+        values=(("x0", 0.05), ("y0", -0.03), ("K1", 2e-4), ("K2", -1e-6), ("P1", 3e-5), ("P2", -4e-5)),
+    )
+    for model in ("opencv", "full_opencv"):
+        there = start_values(weak, model)
+        assert np.abs(misfit(weak, there)).max() < 0.1
+        back = start_values(there, "brown")
+        np.testing.assert_allclose(back.parameters[:3], weak.parameters[:3], atol=1e-12)
+        np.testing.assert_allclose(back.parameters[6:8], weak.parameters[6:8], rtol=1e-9)
+        assert back.parameters[3] == pytest.approx(2e-4, rel=1e-9)
+    undistorted = camera_from_values("ideal", "opencv", SIZE_PX, (PIXEL_MM, PIXEL_MM), c_mm=7.4)
+    assert np.abs(misfit(weak, undistorted)).max() > 5  # so that the 0.1 px above mean something
+
+
+@pytest.mark.parametrize("source", list(MODELS))
+@pytest.mark.parametrize("target", list(MODELS))
+def test_mild_lens_converts_between_all_models(source: str, target: str) -> None:
+    rng = seed_of(f"mild {source} {target}")
+    opencv = camera_from_values(
+        "mild",
+        "opencv",
+        SIZE_PX,
+        (PIXEL_MM, 1.001 * PIXEL_MM),
+        c_mm=7.4,
+        values=(
+            ("k1", rng.uniform(-0.02, 0.02)),
+            ("k2", rng.uniform(-0.01, 0.01)),
+            ("p1", rng.uniform(-2e-4, 2e-4)),
+            ("p2", rng.uniform(-2e-4, 2e-4)),
+            ("cx", 1150.0),
+        ),
+    )
+    camera = convert_camera(opencv, source).camera
+    there = convert_camera(camera, target)
+    back = convert_camera(there.camera, source)
+    # Second-order terms of the reversed decentring, |p| * |k| * c_px ~ 2e-4 * 0.02 * 2300 px, remain.
+    assert there.max_px < 0.02
+    assert back.max_px < 0.02
+
+
+def test_region_is_fitted_better_than_the_whole() -> None:
+    region = np.array([600.0, 400.0, 1700.0, 1300.0])
+    whole, part = convert_camera(camcal(), "opencv"), convert_camera(camcal(), "opencv", region_px=region)
+    assert part.max_px < 0.2 * whole.max_px
+
+
+def test_free_parameters_follow_their_meaning() -> None:
+    camera = camera_from_values("a", "brown", SIZE_PX, (PIXEL_MM, PIXEL_MM), c_mm=7.4, free=("x0", "K1"))
+    names = np.array(MODELS["full_opencv"].names)
+    assert list(names[corresponding_free(camera, "full_opencv")]) == [
+        "cx",
+        "k1",
+        "k2",
+        "k3",
+        "k4",
+        "k5",
+        "k6",
+    ]
+
+
+def test_same_model_is_left_alone_and_unknown_ones_are_refused() -> None:
+    assert convert_camera(camcal(), "brown").camera.parameters == pytest.approx(camcal().parameters, abs=0)
+    with pytest.raises(SurveyFileError, match="model 'fisheye' is none of brown"):
+        convert_camera(camcal(), "fisheye")
