@@ -65,7 +65,8 @@ def intersect(
     uv = np.ascontiguousarray(tangents, dtype=float).reshape(-1, 2)
     n = int(np.max(point, initial=-1)) + 1 if n_points is None else n_points
     P = np.broadcast_to(np.eye(2), (len(uv), 2, 2)) if weights is None else weights
-    usable = np.isfinite(positions).all(axis=1)[image] & np.isfinite(uv).all(axis=1)
+    oriented = np.asarray(np.isfinite(positions).all(axis=1))
+    usable = oriented[image] & np.isfinite(uv).all(axis=1)
     order = np.argsort(point[usable], kind="stable")
     ray = np.flatnonzero(usable)[order]
     start = np.searchsorted(point[ray], np.arange(n + 1))
@@ -99,10 +100,25 @@ def intersect(
 
 
 @njit(cache=True)
-def _intersect_all(
-    tangents, image, ray, start, positions, rotations, weights, limit, cos_limit,
-    xyz, Q, rays, angle, residuals, used,
-):  # type: ignore[no-untyped-def]  # fmt: skip
+# fmt: off
+def _intersect_all(  # type: ignore[no-untyped-def]
+    tangents,
+    image,
+    ray,
+    start,
+    positions,
+    rotations,
+    weights,
+    limit,
+    cos_limit,
+    xyz,
+    Q,
+    rays,
+    angle,
+    residuals,
+    used,
+):
+    # fmt: on
     """Intersect point by point; returns the sum of v'Pv over all of them."""
     longest = 0
     for j in range(len(xyz)):
@@ -125,7 +141,9 @@ def _intersect_all(
                 _drop(own, used)
                 continue
         else:
-            score = _best_pair(own, tangents, image, positions, rotations, direction, limit, used, N, b, X, best_X)
+            score = _best_pair(
+                own, tangents, image, positions, rotations, direction, limit, used, N, b, X, best_X
+            )
             if np.isinf(score):
                 continue
             X[:] = best_X

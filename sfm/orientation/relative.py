@@ -94,7 +94,7 @@ def relative_orientations(
 def refine_coplanarity(
     first: FloatArray, second: FloatArray, base: FloatArray, rotation: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Return base, rotation, residuals and cofactors of the least-squares solution of the coplanarity condition.
+    """Return base, rotation, residuals and cofactors by least squares on the coplanarity condition.
 
     Args:
         first, second: tangents of conjugate rays, shape (n, 2) each, n >= 5.
@@ -116,7 +116,7 @@ def refine_coplanarity(
     residuals, N = np.empty(len(uv1)), np.empty((UNKNOWNS, UNKNOWNS))
     if not _adjust_coplanarity(uv1, uv2, b, R, residuals, N):
         raise GeometryError(f"relative orientation: the {len(uv1)} pairs do not determine five parameters")
-    return b, R, residuals, np.linalg.inv(N)
+    return b, R, residuals, _inverse(N)
 
 
 def fit_homography(
@@ -215,8 +215,8 @@ def _spatial(uv1: FloatArray, uv2: FloatArray, tolerance: float, seed: int) -> R
     _, R, t, front = cv2.recoverPose(E, uv1[used] * down, uv2[used] * down, np.eye(3), distanceThresh=1e9)[:4]
     if (front > 0).sum() < SPATIAL_POINTS:
         return None
-    rotation = (D @ R @ D).T
-    base = -rotation @ D @ t.ravel()
+    rotation = (D @ np.asarray(R, dtype=np.float64) @ D).T
+    base = -rotation @ D @ np.asarray(t, dtype=np.float64).ravel()
     nan = np.full(3, np.nan)
     best = _evaluate("spatial", base / np.linalg.norm(base), rotation, nan, uv1, uv2, used)
     for _ in range(5):
@@ -257,7 +257,7 @@ def _evaluate(
     own = np.empty(n)
     cost = _coplanarity_normals(all1[inliers], all2[inliers], base, rotation, own, N, b)
     sigma0 = float(np.sqrt(cost / redundancy))
-    covariance = sigma0**2 * np.linalg.inv(N)
+    covariance = sigma0**2 * _inverse(N)
     return replace(empty, residuals=residuals, sigma0=sigma0, covariance=covariance)
 
 
@@ -268,6 +268,10 @@ def _direct_homography(first: FloatArray, second: FloatArray) -> FloatArray:
     rows = np.einsum("nij,nk->nijk", skew(r2), r1).reshape(-1, 9)
     h = np.linalg.svd(rows)[2][-1].reshape(3, 3)
     return np.linalg.inv(T2) @ h @ T1
+
+
+def _inverse(N: FloatArray) -> FloatArray:
+    return np.asarray(np.linalg.inv(N), dtype=float)
 
 
 def _conditioner(uv: FloatArray) -> FloatArray:

@@ -31,8 +31,8 @@ TOLERANCE_FACTOR = 6.0  # times the robust spread of the residuals
 GROWTH = 1.25  # the network is adjusted when it has this many times the photographs of last time
 FIRST_ADJUSTMENT = 4  # photographs
 EARLY = ("c", "fx", "fy", "K1", "k1")  # parameters that few photographs determine
-ALL_FREE_PHOTOGRAPHS = 8  # of a camera, from which on all its parameters are adjusted
-ALL_FREE_REDUNDANCY = 20
+ALL_FREE_PHOTOGRAPHS = 6  # from which on all parameters are adjusted
+SURPLUS_PER_PARAMETER = 3  # observations beyond the exterior orientations for each free parameter
 MAD_TO_SIGMA = 1.4826  # median absolute deviation of a normal distribution
 MAX_ROUNDS = 200
 
@@ -118,7 +118,7 @@ class _Growth:
         self.tolerance_px = tolerance_px
         self.start_tolerance_px = tolerance_px
         self.min_points = min_points
-        self.reasons: dict[int, str] = {}
+        self.reasons: dict[int, str] = {}  # why a photograph is not oriented
         points = network.control.point
         self.fixed = np.zeros(len(network.points), dtype=bool)
         self.fixed[points] = True
@@ -163,7 +163,9 @@ class _Growth:
             if self.estimate.oriented.any():
                 self.intersect()
                 if self.estimate.oriented.sum() >= 2 or kind == "given":
-                    return Start(None, kind, self.estimate.position, self.estimate.rotation, self.estimate.points)
+                    return Start(
+                        None, kind, self.estimate.position, self.estimate.rotation, self.estimate.points
+                    )
             # too little of it in any photograph: a free start, brought onto control when there is enough
             nan = np.full_like(self.estimate.points, np.nan)
             self.estimate = Estimate(
@@ -190,11 +192,11 @@ class _Growth:
         known = self.estimate.determined[seen.point]
         count = np.bincount(seen.image[known], minlength=len(self.network.images))
         if not len(waiting) or count[waiting].max() < self.min_points:
-            for i in waiting:
+            for i in waiting.tolist():
                 self.reasons[i] = _too_few(int(count[i]), self.min_points)
             return 0
         best = count[waiting].max()
-        order = waiting[np.argsort(-count[waiting], kind="stable")]
+        order = waiting[np.argsort(-count[waiting], kind="stable")].tolist()
         added = self._resect([i for i in order if count[i] >= max(self.min_points, best / 2)])
         if not added:
             added = self._resect([i for i in order if count[i] < best / 2])
@@ -268,9 +270,7 @@ class _Growth:
         if images.sum() < 2:
             return
         part, start = reduce_network(self.network, self.estimate, images, points, fits)
-        staged = tuple(
-            _staged(camera, part, start, index) for index, camera in enumerate(start.cameras)
-        )
+        staged = tuple(_staged(camera, part, index) for index, camera in enumerate(start.cameras))
         try:
             result = refine(part, replace(start, cameras=staged))
         except (GeometryError, np.linalg.LinAlgError):
@@ -278,7 +278,8 @@ class _Growth:
         if not (result.oriented.all() and result.determined.all()):
             return
         cameras = tuple(
-            replace(new, free=old.free) for new, old in zip(result.cameras, self.estimate.cameras, strict=True)
+            replace(new, free=old.free)
+            for new, old in zip(result.cameras, self.estimate.cameras, strict=True)
         )
         position, rotation, xyz = (
             self.estimate.position.copy(),
@@ -314,7 +315,7 @@ class _Growth:
         fits = residuals <= self.tolerance_px[network.camera[seen.image]]
         count = np.bincount(seen.image[fits], minlength=len(network.images))
         weak = self.estimate.oriented & (count < self.min_points)
-        for i in np.flatnonzero(weak):
+        for i in np.flatnonzero(weak).tolist():
             self.reasons[i] = f"only {count[i]} of its points fit the network, {self.min_points} are needed"
         drop = weak[:, None]
         self.estimate = replace(
@@ -362,16 +363,21 @@ def residual_lengths(network: Network, estimate: Estimate) -> FloatArray:
     return out
 
 
-def _staged(camera: Camera, network: Network, estimate: Estimate, index: int) -> Camera:
-    """Free as many interior parameters as the photographs determine: none, the first few, or all."""
-    photographs = int(np.sum(network.camera == index))
+def _staged(camera: Camera, network: Network, index: int) -> Camera:
+    """Free as many interior parameters as the photographs can determine: none, the first few, or all.
+
+    What the image points of the camera leave after the exterior orientations must exceed its free parameters
+    several times, and so must the redundancy of the network.
+    """
+    own = network.camera == index
     n, m = len(network.points), len(network.images)
     redundancy = 2 * len(network.image_points) - 6 * m - 3 * n + 7
-    early = np.array([name in EARLY for name in camera.names])
-    if photographs >= ALL_FREE_PHOTOGRAPHS and redundancy - camera.free.sum() >= ALL_FREE_REDUNDANCY:
+    surplus = min(2 * int(own[network.image_points.image].sum()) - 6 * int(own.sum()), redundancy)
+    early = camera.free & np.array([name in EARLY for name in camera.names])
+    if m >= ALL_FREE_PHOTOGRAPHS and surplus >= SURPLUS_PER_PARAMETER * camera.free.sum():
         return camera
-    if photographs >= FIRST_ADJUSTMENT and redundancy - (early & camera.free).sum() >= 2:
-        return replace(camera, free=camera.free & early)
+    if m >= FIRST_ADJUSTMENT and surplus >= SURPLUS_PER_PARAMETER * early.sum():
+        return replace(camera, free=early)
     return replace(camera, free=np.zeros_like(camera.free))
 
 

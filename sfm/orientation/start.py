@@ -16,7 +16,6 @@ from sfm.orientation.resection.robust import resect_robust
 MAX_PAIRS = 60  # pairs whose solutions are tried on the other photographs
 MIN_MEDIAN_ANGLE_DEG = 5.0  # median ray angle of a pair that is worth starting from
 SCREEN_TRIALS = 200  # triples per photograph while solutions are compared
-CONFIRMED = 1e-3  # of a tolerance: what a pair's score gains by a wide ray angle, to break ties
 
 
 @dataclass(frozen=True)
@@ -50,7 +49,8 @@ def best_start(network: Network, tangents: FloatArray, tolerance: FloatArray, *,
     pairs = _promising_pairs(network, own)
     if not pairs:
         raise GeometryError(
-            f"orientation: no two of the {len(network.images)} photographs have {PLANAR_POINTS} points in common"
+            f"orientation: no two of the {len(network.images)} photographs have {PLANAR_POINTS} points in "
+            "common"
         )
     best: tuple[float, Start] | None = None
     for i, j in pairs:
@@ -148,7 +148,7 @@ def _score(
     seen = network.image_points
     m = len(network.images)
     position, rotation = start.position.copy(), start.rotation.copy()
-    determined = np.isfinite(start.points).all(axis=1)
+    determined = np.asarray(np.isfinite(start.points).all(axis=1))
     for i in range(m):
         if i in (start.pair or ()):
             continue
@@ -166,7 +166,13 @@ def _score(
     image, point = seen.image, seen.point
     finite = np.isfinite(tangents).all(axis=1)
     again = intersect(
-        tangents, image, point, position, rotation, n_points=len(network.points), tolerance=float(tolerance.max())
+        tangents,
+        image,
+        point,
+        position,
+        rotation,
+        n_points=len(network.points),
+        tolerance=float(tolerance.max()),
     )
     squares = np.sum(again.residuals**2, axis=1) / tolerance[image] ** 2
     return float(np.where(np.isfinite(squares), np.minimum(squares, 1.0), 1.0)[finite].sum())

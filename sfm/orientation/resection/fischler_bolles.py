@@ -202,9 +202,8 @@ def _polish(abc, sides, gaps):  # type: ignore[no-untyped-def]
 @njit(cache=True)
 def _is_known(abc, legs, n):  # type: ignore[no-untyped-def]
     for i in range(n):
-        if (
-            abs(abc[0] - legs[i, 0]) + abs(abc[1] - legs[i, 1]) + abs(abc[2] - legs[i, 2])
-            < SAME * (abc[0] + abc[1] + abc[2])
+        if abs(abc[0] - legs[i, 0]) + abs(abc[1] - legs[i, 1]) + abs(abc[2] - legs[i, 2]) < SAME * (
+            abc[0] + abc[1] + abc[2]
         ):
             return True
     return False

@@ -81,10 +81,18 @@ def resect_least_squares(
             f"resection: the {n} points do not determine position and rotation (collinear or coincident)"
         )
     redundancy = 2 * n - UNKNOWNS
-    cofactors = cofactors_in_angles(np.linalg.inv(N), R)
+    cofactors = cofactors_in_angles(np.asarray(np.linalg.inv(N), dtype=float), R)
     sigma0 = float(np.sqrt(cost / redundancy)) if redundancy > 0 else np.nan
     return Resection(
-        X0, R, residuals, sigma0, redundancy, cofactors, sigma0**2 * cofactors, history[: steps + 1], state == DONE
+        X0,
+        R,
+        residuals,
+        sigma0,
+        redundancy,
+        cofactors,
+        sigma0**2 * cofactors,
+        history[: steps + 1],
+        state == DONE,
     )
 
 

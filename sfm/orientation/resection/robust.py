@@ -86,7 +86,13 @@ def resect_robust(
         return _failure(n, f"{n} points, resection needs {needed}")
     weights = np.zeros((n, 2, 2))
     weights[:, 0, 0] = weights[:, 1, 1] = 1.0
-    X0, R, used, residuals, N = np.empty(3), np.empty((3, 3)), np.zeros(n, dtype=np.bool_), np.empty((n, 2)), np.empty((6, 6))
+    X0, R, used, residuals, N = (
+        np.empty(3),
+        np.empty((3, 3)),
+        np.zeros(n, dtype=np.bool_),
+        np.empty((n, 2)),
+        np.empty((6, 6)),
+    )
     trials = _search(
         uv, rays_from_tangents(uv), xyz, weights, tolerance, max_trials, seed, X0, R, used, residuals, N
     )
@@ -102,7 +108,9 @@ def resect_robust(
     square = float(np.sum(fitting**2))
     redundancy = 2 * count - UNKNOWNS
     sigma0 = np.sqrt(square / redundancy)
-    covariance = (sigma0 if sigma is None else sigma) ** 2 * cofactors_in_angles(np.linalg.inv(N), R)
+    covariance = (sigma0 if sigma is None else sigma) ** 2 * cofactors_in_angles(
+        np.asarray(np.linalg.inv(N), dtype=float), R
+    )
     return RobustResection(
         X0, R, used, residuals, float(np.sqrt(square / (2 * count))), float(sigma0), covariance, trials, ""
     )
