@@ -100,7 +100,6 @@ def intersect(
 
 
 @njit(cache=True)
-# fmt: off
 def _intersect_all(  # type: ignore[no-untyped-def]
     tangents,
     image,
@@ -118,7 +117,6 @@ def _intersect_all(  # type: ignore[no-untyped-def]
     residuals,
     used,
 ):
-    # fmt: on
     """Intersect point by point; returns the sum of v'Pv over all of them."""
     longest = 0
     for j in range(len(xyz)):
