@@ -23,13 +23,13 @@ from sfm.targets.codes import (
 from sfm.targets.measure import shape_from_axes
 
 PUBLISHED = Path(__file__).parents[1].parent / "shared" / "data" / "retro-panel"
-SUPER = 8
+SUPER = 5
 
 
 def draw(
-    family: CodeFamily, bits: list[tuple[float, float]], affine: FloatArray, size: int = 160
+    family: CodeFamily, bits: list[tuple[float, float]], affine: FloatArray, size: int = 120
 ) -> AnyArray:
-    """Draw a dot of radius 1 and ring sectors (from, to in degrees, clockwise) through an affine map in px."""
+    """Draw a dot of radius 1 and ring sectors (from, to, degrees clockwise) through an affine map in px."""
     y, x = (np.mgrid[: size * SUPER, : size * SUPER] + 0.5) / SUPER - 0.5
     centre = (size - 1) / 2
     u, v = np.einsum("ij,jkl->ikl", np.linalg.inv(affine), np.stack([x - centre, y - centre]))
@@ -106,7 +106,7 @@ def test_rings_are_read_at_any_rotation_and_tilt(name: str, dark: float, bright:
         k = rng.integers(len(family.pattern))
         tilt, turn = rng.uniform(0, np.radians(60)), rng.uniform(0, np.pi)
         rotation = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
-        affine = 14 * rotation @ np.diag([1, np.cos(tilt)])
+        affine = 12 * rotation @ np.diag([1, np.cos(tilt)])
         picture = draw(family, sectors(int(family.pattern[k]), family.cells, rng.uniform(0, 360)), affine)
         assert read(picture, family, affine, dark, bright) == family.number[k]
 
@@ -116,14 +116,14 @@ def test_a_mirrored_ring_is_another_code() -> None:
     assert family is not None
     mirrored = [smallest_rotation(np.array([int(f"{p:014b}"[::-1], 2)]), 14)[0] for p in family.pattern]
     k = int(np.flatnonzero(np.array(mirrored) != family.pattern)[0])
-    affine = 14.0 * np.eye(2)
+    affine = 12.0 * np.eye(2)
     picture = draw(family, sectors(int(family.pattern[k]), 14, 10), affine)
     assert read(picture, family, affine, 20, 200) == family.number[k]
     assert read(picture[:, ::-1], family, affine, 20, 200) != family.number[k]
 
 
 def test_a_dot_without_a_ring_is_uncoded() -> None:
-    affine = 14.0 * np.eye(2)
+    affine = 12.0 * np.eye(2)
     for name in ("arcs", "ring14"):
         family = code_family(name)
         assert family is not None
@@ -133,7 +133,7 @@ def test_a_dot_without_a_ring_is_uncoded() -> None:
 def test_a_shadow_across_the_ring_does_no_harm() -> None:
     family = code_family("ring14")
     assert family is not None
-    affine = 14.0 * np.eye(2)
+    affine = 12.0 * np.eye(2)
     picture = draw(family, sectors(int(family.pattern[77]), 14, 33), affine)
     shade = np.linspace(0.5, 1.3, picture.shape[1])[None, :]
     assert read(picture * shade, family, affine, 10, 160) == 78
@@ -143,7 +143,7 @@ def test_a_shadow_across_the_ring_does_no_harm() -> None:
 def test_damaged_rings_are_rejected(damage: str) -> None:
     family = code_family("ring14")
     assert family is not None
-    affine = 14.0 * np.eye(2)
+    affine = 12.0 * np.eye(2)
     bits = sectors(int(family.pattern[100]), 14, 0)
     cell = 360 / 14
     if damage == "half cell":  # one more cell is half set
@@ -177,7 +177,7 @@ def test_tables_are_read_from_files(tmp_path: Path) -> None:
     family = code_family(str(path))
     assert family is not None
     assert (family.cells, family.number.tolist(), family.pattern.tolist()) == (14, [3, 7], [129, 135])
-    affine = 14.0 * np.eye(2)
+    affine = 12.0 * np.eye(2)
     assert read(draw(family, sectors(135, 14, 5), affine), family, affine, 20, 200) == 7
 
 

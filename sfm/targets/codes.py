@@ -250,8 +250,8 @@ def _read_arcs(polar: FloatArray) -> tuple[IntArray, FloatArray]:
 def _read_cells(polar: FloatArray, family: CodeFamily) -> tuple[IntArray, FloatArray]:
     """Return the code numbers of rings of cells and the confidence.
 
-    Set and clear cells are separated at the widest gap between their sorted intensities, so that a shadow across
-    the ring does no harm; the position of the cells is the one with the least variation inside them.
+    Set and clear cells are separated at the widest gap between their sorted intensities, so that a shadow
+    across the ring does no harm; the position of the cells is the one with the least variation inside them.
     """
     code = np.full(len(polar), UNCODED, dtype=np.int64)
     confidence = np.zeros(len(polar))

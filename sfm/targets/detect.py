@@ -14,7 +14,7 @@ from sfm.targets.codes import UNCODED, UNREADABLE, CodeFamily, code_family, read
 from sfm.targets.flags import Flag
 from sfm.targets.measure import EllipseFit, axes_from_shape, fit_ellipse_model
 
-# Side of the window of the local mean, px: an edge is seen up to half of it, independent of the target's size.
+# Side of the window of the local mean, px: an edge is seen up to half of it, whatever the target's size.
 MEAN_WINDOW_PX = 15
 # The local step of intensity that makes a candidate: this many sigma of the smoothed noise, at least ...
 STEP_SIGMAS = 6.0
@@ -24,7 +24,7 @@ LEAST_STEP = 4 / 255
 LEAST_AXIS_RATIO = 0.9 * math.cos(math.radians(75))
 # Outlines farther than this from their ellipse (in radii, plus 1.5 px for the pixel grid) are not elliptic.
 OUTLINE_TOLERANCE = 0.2
-# Largest root mean square of the residuals and largest mean residual on an eighth of the edge, over the contrast.
+# Largest RMS of the residuals and largest mean residual on an eighth of the edge, over the contrast.
 POOR_FIT = 0.12
 UNEVEN_EDGE = 0.18
 # Parts of an unreadable code are smaller than this share of its dot.
@@ -81,8 +81,8 @@ def find_targets(
 ) -> Targets:
     """Find, measure and decode the circular targets of one photograph.
 
-    Candidates are the outlines of what differs from its local mean; those that resemble ellipses are fitted with
-    the model of a blurred ellipse, and what the model does not explain is rejected with a reason.
+    Candidates are the outlines of what differs from its local mean; those that resemble ellipses are fitted
+    with the model of a blurred ellipse, and what the model does not explain is rejected with a reason.
 
     Args:
         photograph: intensities, shape (H, W), uint8 or uint16.
@@ -146,8 +146,8 @@ def find_targets(
 def estimate_noise(photograph: AnyArray) -> float:
     """Return the standard deviation of the noise of a photograph in its own units.
 
-    Source: Immerkaer, "Fast noise variance estimation" (1996): the mask 1 -2 1 x 1 -2 1 annuls planes; its median
-    over every eighth row is used, so that edges do not count.
+    Source: Immerkaer, "Fast noise variance estimation" (1996): the mask 1 -2 1 x 1 -2 1 annuls planes;
+    its median over every eighth row is used, so that edges do not count.
     """
     rows = photograph.astype(np.float32) if photograph.shape[0] < 24 else None
     if rows is None:
@@ -170,9 +170,9 @@ def find_outlines(
 ) -> tuple[FloatArray, FloatArray, IntArray, FloatArray, IntArray]:
     """Find outlines that resemble ellipses.
 
-    A pixel belongs to a candidate if the smoothed photograph there differs from the local mean. Along the edge
-    of a target this gives a closed band just inside of it, whatever the size of the target and the level of the
-    light, and the outer contour of the band is the edge itself.
+    A pixel belongs to a candidate if the smoothed photograph there differs from the local mean. Along the
+    edge of a target this gives a closed band just inside of it, whatever the size of the target and the level
+    of the light, and the outer contour of the band is the edge itself.
 
     Args:
         photograph: intensities, shape (H, W), uint8 or uint16.
@@ -181,8 +181,8 @@ def find_outlines(
         min_diameter_px, max_diameter_px: limits of the minor and major axis.
 
     Returns:
-        Centres, px, shape (k, 2); (p, q, r) of the ellipses, 1/px, shape (k, 3); signs, shape (k,); positions,
-        px, shape (m, 2), and reasons, shape (m,), of the outlines that were rejected.
+        Centres, px, shape (k, 2); (p, q, r) of the ellipses, 1/px, shape (k, 3); signs, shape (k,);
+        positions, px, shape (m, 2), and reasons, shape (m,), of the outlines that were rejected.
     """
     smooth = cv2.GaussianBlur(photograph, (3, 3), 0)
     mean = cv2.boxFilter(photograph, -1, (MEAN_WINDOW_PX, MEAN_WINDOW_PX))
@@ -201,7 +201,7 @@ def find_outlines(
         if not outer:
             continue
         first = np.cumsum([0, *(len(c) for c in outer)])
-        points = np.concatenate(outer).reshape(-1, 2)
+        points = np.concatenate(outer).reshape(-1, 2).astype(np.int64)
         ellipse, reason = _ellipses_of_outlines(
             points,
             first,
@@ -330,7 +330,7 @@ def _judge(fit: EllipseFit, noise: float, scale: float, smallest: float, largest
 
 
 def _duplicates(fit: EllipseFit, reason: IntArray) -> BoolArray:
-    """Return which of the good candidates lie in a better one: the smaller ellipse of two concentric ones is kept.
+    """Return which of the good candidates surround another one: of concentric ellipses the smallest is kept.
 
     A retro-reflective dot with a dark rim in glare is seen as bright dot and, larger, as the dark rim.
     """

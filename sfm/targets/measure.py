@@ -1,4 +1,4 @@
-"""Measurement of targets: least squares fit of a blurred ellipse to the intensities, all of a photograph at once.
+"""Measurement of targets: least squares fit of a blurred ellipse, all targets of a photograph at once.
 
 Model of the intensity at pixel (x, y), with d the signed distance from the edge of the ellipse (negative
 inside), s the blur of the edge, B the background, A the step to the target, g the gradient of the gain:
@@ -17,14 +17,15 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
-from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
+from sfm.conventions import AnyArray, FloatArray, IntArray
 from sfm.targets.flags import Flag
 
 RAYS = 32
+MAX_STEPS = 30
 PARAMETERS = 10
 # Number of unknowns of the fit: x0, y0, p, q, r, B, A, s, gx, gy.
 GAIN_SIGMA = 0.3
-"""A priori sigma of the change of gain over the length L, far above shading and just enough to keep the fit regular"""
+"""A priori sigma of the change of gain over the length L: far above shading, it only keeps the fit regular"""
 
 
 @dataclass(frozen=True)
@@ -130,7 +131,7 @@ def axes_from_shape(shape: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def shape_from_axes(semi_axes: FloatArray, angle: FloatArray) -> FloatArray:
-    """Return (p, q, r) of S, shape (k, 3), of ellipses given by semi-axes (k, 2) in px and angle (k,) in rad."""
+    """Return (p, q, r) of S, shape (k, 3), of ellipses with semi-axes (k, 2) in px and angle (k,) in rad."""
     a, b = 1 / np.asarray(semi_axes, dtype=float).reshape(-1, 2).T
     c, s = np.cos(angle), np.sin(angle)
     return np.column_stack([a * c * c + b * s * s, (a - b) * c * s, a * s * s + b * c * c])
@@ -138,7 +139,7 @@ def shape_from_axes(semi_axes: FloatArray, angle: FloatArray) -> FloatArray:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _bilinear(image: AnyArray, x: float, y: float) -> float:
-    i, j = int(math.floor(y)), int(math.floor(x))
+    i, j = int(y), int(x)
     fy, fx = y - i, x - j
     top = image[i, j] * (1 - fx) + image[i, j + 1] * fx
     bottom = image[i + 1, j] * (1 - fx) + image[i + 1, j + 1] * fx
@@ -319,7 +320,7 @@ def _collect(
                 d = rho * (rho - 1) / math.sqrt((p * u + q * v) ** 2 + (q * u + r * v) ** 2)
                 if d > margin:
                     continue
-                k = int(math.floor(math.atan2(v, u) * (RAYS / (2 * math.pi)) + RAYS))
+                k = int(math.atan2(v, u) * (RAYS / (2 * math.pi)) + RAYS)
                 if d > limit[k % RAYS] or d > limit[(k + 1) % RAYS]:
                     continue
             elif inner < 1e6 and rho2 > 1e-6:
@@ -423,7 +424,7 @@ def _normal_equations(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _unevenness(data: FloatArray, n: int, theta: FloatArray, length: float) -> float:
-    """Return the largest mean residual of an eighth of the edge (2 px and 1.5 blurs to both sides) over |A|."""
+    """Return the largest mean residual of an eighth of the edge, in- or outside, over the contrast."""
     p, q, r = theta[2], theta[3], theta[4]
     B, A, s = theta[5], theta[6], theta[7]
     band = 1.0 + 1.5 * s
@@ -438,7 +439,7 @@ def _unevenness(data: FloatArray, n: int, theta: FloatArray, length: float) -> f
             continue
         gain = 1 + (theta[8] * dx + theta[9] * dy) / length
         model = (B + A * 0.5 * math.erfc(d / s * 0.7071067811865476)) * gain
-        k = int(math.floor(math.atan2(v, u) * (8 / (2 * math.pi)) + 8)) % 8
+        k = int(math.atan2(v, u) * (8 / (2 * math.pi)) + 8) % 8
         side = 1 if d > 0 else 0
         total[side, k] += data[i, 2] - model
         count[side, k] += 1
@@ -514,7 +515,8 @@ def _fit_one(
     done = False
     steps = 0
     L = np.empty((PARAMETERS, PARAMETERS))
-    for steps in range(1, 31):
+    while steps < MAX_STEPS:
+        steps += 1
         for i in range(PARAMETERS):
             for j in range(i + 1):
                 L[i, j] = N[i, j]

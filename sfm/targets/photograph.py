@@ -40,7 +40,7 @@ class Metadata:
     focal_35mm: float | None
     """focal length of the same angle of view on 36 mm x 24 mm film, mm"""
     pixel_mm: tuple[float, float] | None
-    """width and height of a pixel: from the resolution of the focal plane, else from the 35 mm equivalent, mm"""
+    """width and height of a pixel, from the resolution of the focal plane or the 35 mm equivalent, mm"""
     orientation: int
     """EXIF orientation, 1 = as stored; never applied to the pixels"""
 
