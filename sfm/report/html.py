@@ -1,0 +1,117 @@
+"""report.html: one page, readable with no manual, with everything it shows inside it.
+
+In the order of a surveyor's questions: did it work, how good is it, what was thrown out and why, does the
+other adjuster agree, where are my coordinates. Every text that came from a file is escaped.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from html import escape
+from importlib.resources import files
+
+import numpy as np
+
+from sfm.conventions import FloatArray
+from sfm.report.markup import figure, significant
+from sfm.report.overlays import Overlay
+from sfm.report.result import SurveyResult
+from sfm.report.sections import (
+    comparison_section,
+    coordinates_section,
+    photographs_section,
+    process_section,
+    quality_section,
+    rejected_section,
+    worked_section,
+)
+from sfm.report.tables import point_sigmas, root_mean_square
+from sfm.report.verdict import Verdict, verdict_of
+
+
+def render_html(
+    result: SurveyResult, plots: Sequence[tuple[str, str, bytes]], overlays: Sequence[Overlay]
+) -> str:
+    """Return the report as one HTML page.
+
+    Args:
+        result: the result.
+        plots: (stem, caption, PNG) of each picture.
+        overlays: the drawn photographs; their thumbnails are embedded, links lead to the overlays folder.
+    """
+    verdict = verdict_of(result)
+    pictures = {stem: figure(data, caption) for stem, caption, data in plots}
+    sections = (
+        ("worked", "Did it work?", worked_section(result, verdict) + pictures.get("network", "")),
+        ("quality", "How good is it?", quality_section(result, pictures)),
+        ("rejected", "What was thrown out, and why?", rejected_section(result)),
+        ("comparison", "Does the other adjuster agree?", comparison_section(result)),
+        ("coordinates", "Where are my coordinates?", coordinates_section(result)),
+        ("photographs", "The photographs", photographs_section(result, overlays)),
+        ("process", "How it was done", process_section(result)),
+    )
+    title = escape(result.survey)
+    style = files("sfm.report").joinpath("report.css").read_text(encoding="utf-8")
+    links = "".join(f'<a href="#{key}">{escape(name)}</a>' for key, name, _ in sections)
+    body = "".join(
+        f'<section id="{key}"><h2>{escape(name)}</h2>{text}</section>' for key, name, text in sections
+    )
+    return (
+        '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">'
+        f"<title>{title} - Kolinear</title><style>{style}</style></head><body>"
+        f"<header><p class=kind>Survey report</p><h1>{title}</h1>{_banner(verdict)}{_tiles(result)}</header>"
+        f"<nav>{links}</nav><main>{body}</main></body></html>\n"
+    )
+
+
+def _banner(verdict: Verdict) -> str:
+    remarks = "".join(f"<li>{escape(line)}</li>" for line in verdict.remarks)
+    return (
+        f'<div class="banner {verdict.level}"><strong>{escape(verdict.headline)}</strong>'
+        + (f"<ul>{remarks}</ul>" if remarks else "")
+        + "</div>"
+    )
+
+
+def _tiles(result: SurveyResult) -> str:
+    """Return the figures that are asked for first."""
+    a = result.adjustment
+    sigma = point_sigmas(a)
+    size = _object_size(a.estimate.points)
+    typical = root_mean_square(sigma)
+    tiles = [
+        ("Photographs oriented", f"{len(a.network.images)} of {result.images_total}", ""),
+        ("Object points", str(len(a.network.points)), _coded_of(result)),
+        (
+            "Precision of a point",
+            f"{significant(typical)} {result.unit}",
+            f"RMS of sX, sY, sZ; 1 : {size / typical:,.0f} of the object" if typical > 0 else "",
+        ),
+        ("RMS residual", f"{a.rms_px:.4f} px", "per image coordinate"),
+        (
+            "Sigma0",
+            f"{a.sigma0_px:.4f} px",
+            f"{a.sigma0:.3f} times the {a.sigma_px:g} px expected, redundancy {a.redundancy}",
+        ),
+    ]
+    both = result.comparison
+    if both is not None:
+        tiles.append((both.backend, "agrees" if both.agree else "differs", "same optimum in the same model"))
+    return (
+        "<div class=tiles>"
+        + "".join(
+            f"<div><span>{escape(name)}</span><b>{escape(value)}</b><small>{escape(note)}</small></div>"
+            for name, value, note in tiles
+        )
+        + "</div>"
+    )
+
+
+def _coded_of(result: SurveyResult) -> str:
+    coded = int((result.code >= 0).sum())
+    return f"{coded} coded, {len(result.code) - coded} uncoded"
+
+
+def _object_size(points: FloatArray) -> float:
+    return float(np.linalg.norm(np.ptp(points, axis=0)))

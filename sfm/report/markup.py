@@ -1,0 +1,85 @@
+"""Pieces of HTML and numbers as people read them."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Iterable, Sequence
+from html import escape
+from urllib.parse import quote
+
+import numpy as np
+
+
+def table(
+    header: Sequence[str],
+    rows: Iterable[Sequence[str]],
+    *,
+    head: bool = True,
+    plain_first: bool = False,
+    last_bold: bool = False,
+) -> str:
+    """Return a table of escaped texts; columns of numbers are set to the right by the style sheet."""
+    rows = list(rows)
+    text = "<div class=scroll><table" + (" class=facts" if plain_first else "") + ">"
+    if head:
+        text += "<thead><tr>" + "".join(f"<th>{escape(name)}</th>" for name in header) + "</tr></thead>"
+    text += "<tbody>"
+    for k, row in enumerate(rows):
+        bold = " class=sum" if last_bold and k == len(rows) - 1 else ""
+        cells = "".join(
+            f"<td{' class=n' if _is_number(cell) else ''}>{escape(cell)}</td>" for cell in row[1:]
+        )
+        text += f"<tr{bold}><th scope=row>{escape(row[0])}</th>{cells}</tr>"
+    return text + "</tbody></table></div>"
+
+
+def figure(data: bytes, caption: str) -> str:
+    return (
+        f'<figure class=plot><img alt="{escape(caption)}" src="{data_url(data, "png")}">'
+        f"<figcaption>{escape(caption)}</figcaption></figure>"
+    )
+
+
+def data_url(data: bytes, kind: str) -> str:
+    return f"data:image/{kind};base64,{base64.b64encode(data).decode()}"
+
+
+def file_url(name: str) -> str:
+    """Return a file name as it may stand in a link."""
+    return escape(quote(name))
+
+
+def significant(value: float, digits: int = 3) -> str:
+    """Write a number with so many significant digits and no exponent where that is short."""
+    value = float(value)
+    if not np.isfinite(value):
+        return "not known"
+    if value == 0:
+        return "0"
+    exponent = int(np.floor(np.log10(abs(value))))
+    if -6 <= exponent < 7:
+        return f"{value:.{max(0, digits - 1 - exponent)}f}"
+    return f"{value:.{digits - 1}e}"
+
+
+def signed(value: float) -> str:
+    return ("+" if value >= 0 else "") + significant(value)
+
+
+def to_precision(value: object, sigma: object) -> str:
+    """Write a coordinate to the second digit of its standard deviation, six decimals if that is not known."""
+    v, s = float(str(value)), float(str(sigma))
+    if not np.isfinite(v):
+        return "not known"
+    decimals = 6 if not (np.isfinite(s) and s > 0) else int(np.clip(1 - np.floor(np.log10(s)), 0, 12))
+    return f"{v:.{decimals}f}"
+
+
+def yes_or_no(value: bool) -> str:
+    return "yes" if value else "no"
+
+
+def _is_number(cell: str) -> bool:
+    return (
+        bool(cell) and cell.lstrip("+-")[:1].isdigit() and not any(c.isalpha() for c in cell.replace("e", ""))
+    )

@@ -1,0 +1,139 @@
+"""The folder of a result: written beside its place, then put there by one rename, or not at all."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+from sfm.errors import OutputError
+from sfm.progress import SILENT, Progress
+from sfm.report.html import render_html
+from sfm.report.overlays import draw_overlays
+from sfm.report.plots import all_plots
+from sfm.report.result import StageTime, SurveyResult
+from sfm.report.tables import write_tables
+
+WRITTEN = (
+    "summary.json",
+    "points.csv",
+    "images.csv",
+    "cameras.csv",
+    "image_points.csv",
+    "points.ply",
+    "report.html",
+    "colmap",
+    "overlays",
+    "plots",
+)
+
+
+def write_result(
+    result: SurveyResult,
+    out: Path,
+    *,
+    write_colmap: Callable[[Path], None] | None = None,
+    jobs: int = 1,
+    progress: Progress = SILENT,
+) -> Path:
+    """Write everything that a survey gives into one folder, whole or not at all.
+
+    Args:
+        result: the result.
+        out: the folder; an earlier result in it is replaced, anything else in it is an error.
+        write_colmap: fills the folder `colmap`, which it is given; None leaves it out.
+        jobs: photographs drawn at the same time.
+        progress: is told of every photograph.
+
+    Returns:
+        The path of report.html.
+
+    Raises:
+        OutputError: the folder cannot be written, or holds something else than an earlier result.
+    """
+    out = Path(out)
+    refuse_foreign_folder(out)
+    started = time.perf_counter()
+    progress.stage("report", len(result.photographs))
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        folder = Path(tempfile.mkdtemp(prefix=f".{out.name}.", suffix=".part", dir=out.parent))
+    except OSError as error:
+        raise OutputError(f"{out}: the result cannot be written here: {error.strerror}") from error
+    try:
+        folder.chmod(0o755)  # mkdtemp makes it for the owner alone
+        overlays = draw_overlays(result, jobs=jobs, progress=progress)
+        if overlays:
+            (folder / "overlays").mkdir()
+        for overlay in overlays:
+            (folder / "overlays" / overlay.file_name).write_bytes(overlay.jpeg)
+        plots = all_plots(result.adjustment, result.unit)
+        (folder / "plots").mkdir()
+        for stem, _, data in plots:
+            (folder / "plots" / f"{stem}.png").write_bytes(data)
+        if write_colmap is not None:
+            (folder / "colmap").mkdir()
+            write_colmap(folder / "colmap")
+        timed = replace(result, seconds=(*result.seconds, StageTime("report", time.perf_counter() - started)))
+        write_tables(timed, folder)
+        page = render_html(timed, plots, overlays)
+        (folder / "report.html").write_text(page, encoding="utf-8")
+        _put_in_place(folder, out)
+    except OSError as error:
+        raise OutputError(f"{out}: the result cannot be written: {error.strerror or error}") from error
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+    return out / "report.html"
+
+
+def refuse_foreign_folder(out: Path) -> None:
+    """Raise OutputError unless the folder is absent, empty, or holds an earlier result and nothing else.
+
+    It is called before a survey starts, too, so that nobody waits for a result that has no place.
+    """
+    out = Path(out)
+    if not out.exists() and not out.is_symlink():
+        return
+    if not out.is_dir():
+        raise OutputError(f"{out}: a file is in the way, --out needs a folder")
+    try:
+        names = sorted(path.name for path in out.iterdir())
+        foreign = [name for name in names if name not in WRITTEN]
+        if not foreign and (not names or _is_summary(out / "summary.json")):
+            return
+    except OSError as error:
+        raise OutputError(f"{out}: the folder cannot be read: {error.strerror}") from error
+    found = f"'{foreign[0]}'" if foreign else "no summary.json of an earlier result"
+    raise OutputError(
+        f"{out}: the folder holds {found}; --out needs a new or empty folder or an earlier result"
+    )
+
+
+def _is_summary(path: Path) -> bool:
+    """Whether a file is the summary.json of a result."""
+    try:
+        text = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError):
+        return False
+    return isinstance(text, dict) and {"survey", "images", "points", "observations"} <= text.keys()
+
+
+def _put_in_place(folder: Path, out: Path) -> None:
+    """Rename the finished folder to its place; an earlier result is kept until the new one is there."""
+    if not out.exists():
+        folder.rename(out)
+        return
+    old = Path(tempfile.mkdtemp(prefix=f".{out.name}.", suffix=".old", dir=out.parent))
+    try:
+        out.rename(old / "result")
+        try:
+            folder.rename(out)
+        except OSError:
+            (old / "result").rename(out)
+            raise
+    finally:
+        shutil.rmtree(old, ignore_errors=True)

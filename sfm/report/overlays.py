@@ -1,0 +1,256 @@
+"""Overlays: each photograph with its targets, ids, residual vectors and rejected candidates."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from sfm.adjustment.result import Adjustment
+from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
+from sfm.errors import PhotographError
+from sfm.progress import SILENT, Progress
+from sfm.report.result import PhotographTargets, SurveyResult, in_words
+from sfm.targets.flags import Flag
+from sfm.targets.photograph import read_photograph
+
+MAX_SIDE_PX = 2400  # longer photographs are drawn smaller
+THUMBNAIL_SIDE_PX = 720
+JPEG_QUALITY = 82
+ARROW_PX = 22.0  # length in the picture of a residual of the size of the RMS
+SHIFT = 4  # fractional bits of the coordinates that OpenCV draws at
+
+# Colours in OpenCV's order blue, green, red.
+USED, DROPPED, UNUSED, ARROW, INK, PAPER = (
+    (90, 200, 60),
+    (40, 40, 230),
+    (200, 160, 40),
+    (0, 200, 255),
+    (30, 30, 30),
+    (245, 245, 245),
+)
+REASON_COLOURS = (
+    (Flag.CUT_BY_BORDER, (255, 90, 200)),
+    (Flag.TOO_SMALL, (170, 170, 170)),
+    (Flag.TOO_LARGE, (120, 120, 120)),
+    (Flag.TOO_OBLIQUE, (255, 200, 90)),
+    (Flag.NOT_ELLIPTIC, (200, 120, 120)),
+    (Flag.LOW_CONTRAST, (210, 210, 120)),
+    (Flag.UNEVEN_EDGE, (60, 140, 255)),
+    (Flag.POOR_FIT, (60, 80, 200)),
+    (Flag.BLURRED, (160, 200, 160)),
+    (Flag.NO_CONVERGENCE, (150, 60, 150)),
+    (Flag.DUPLICATE, (200, 200, 60)),
+    (Flag.PART_OF_CODE, (230, 150, 230)),
+)
+
+
+@dataclass(frozen=True)
+class Overlay:
+    """One drawn photograph."""
+
+    image: str  # name of the photograph
+    file_name: str  # of the overlay in its folder
+    jpeg: bytes  # the overlay
+    thumbnail: bytes  # a small one, JPEG
+
+
+def draw_overlays(result: SurveyResult, *, jobs: int = 1, progress: Progress = SILENT) -> tuple[Overlay, ...]:
+    """Draw all readable photographs of a survey.
+
+    Args:
+        result: the result; its photographs are read again from their files.
+        jobs: photographs drawn at the same time.
+        progress: is told of every photograph.
+
+    Returns:
+        The overlays in the order of the photographs; those that can no longer be read are left out.
+    """
+    factor = arrow_factor(result.adjustment)
+    names = overlay_names(tuple(photograph.image for photograph in result.photographs))
+
+    def draw(index: int) -> Overlay | None:
+        photograph = result.photographs[index]
+        try:
+            picture = draw_photograph(photograph, result.adjustment, factor)
+        except PhotographError:
+            return None
+        return Overlay(
+            photograph.image, names[index], _jpeg(picture), _jpeg(_fit(picture, THUMBNAIL_SIDE_PX))
+        )
+
+    drawn = []
+    with ThreadPoolExecutor(max_workers=max(1, jobs)) as pool:
+        for overlay in pool.map(draw, range(len(result.photographs))):
+            if overlay is not None:
+                drawn.append(overlay)
+                progress.advance(overlay.image)
+    return tuple(drawn)
+
+
+def draw_photograph(photograph: PhotographTargets, adjustment: Adjustment, factor: float) -> AnyArray:
+    """Draw one photograph.
+
+    Args:
+        photograph: its file and photograph.
+        adjustment: gives ids, residuals and rejections of its image points.
+        factor: how many times as long as they are the residual vectors are drawn.
+
+    Returns:
+        Picture, shape (H, W, 3), uint8, blue, green, red.
+
+    Raises:
+        PhotographError: the file can no longer be read.
+    """
+    grey = read_photograph(photograph.path)
+    if grey.dtype == np.uint16:
+        grey = (grey >> 8).astype(np.uint8)
+    scale = min(1.0, MAX_SIDE_PX / max(grey.shape))
+    picture = cv2.cvtColor(_fit(grey, MAX_SIDE_PX), cv2.COLOR_GRAY2BGR)
+
+    rows, names = _image_points(photograph.image, adjustment)
+    seen = adjustment.network.image_points
+    owner = _nearest(photograph.xy, seen.xy[rows])
+    for k in range(len(photograph.xy)):
+        row = owner[k]
+        colour = UNUSED if row < 0 else DROPPED if adjustment.rejected[rows[row]] else USED
+        _ellipse(
+            picture, photograph.xy[k], photograph.semi_axes[k] + 2 / scale, photograph.angle[k], scale, colour
+        )
+    for xy, flag in zip(photograph.rejected_xy, photograph.rejected_flag, strict=True):
+        _cross(picture, xy, scale, _colour_of(int(flag)))
+    # The vector points from the measured to the adjusted position: v = computed - measured.
+    for row, name in zip(rows, names, strict=True):
+        xy = seen.xy[row]
+        _arrow(picture, xy, xy + factor / scale * adjustment.residuals[row], scale)
+        _label(picture, name, xy, scale, DROPPED if adjustment.rejected[row] else USED)
+    return np.vstack([picture, _legend(picture.shape[1], factor, photograph.rejected_flag)])
+
+
+def arrow_factor(adjustment: Adjustment) -> float:
+    """Return by what residual vectors are enlarged: 1, 2 or 5 times a power of ten."""
+    rms = adjustment.rms_px
+    if not np.isfinite(rms) or rms <= 0:
+        return 1.0
+    power = 10.0 ** np.floor(np.log10(ARROW_PX / rms))
+    return float(max(step * power for step in (1, 2, 5) if step * power <= ARROW_PX / rms))
+
+
+def overlay_names(images: tuple[str, ...]) -> tuple[str, ...]:
+    """Return a file name for the overlay of each photograph; no two are equal, in small letters either."""
+    names: list[str] = []
+    taken: set[str] = set()
+    for image in images:
+        base = image.replace("/", "_").replace("\\", "_")
+        stem = base.rsplit(".", 1)[0] or base
+        name, number = f"{stem}.jpg", 2
+        while name.lower() in taken:
+            name, number = f"{stem}_{number}.jpg", number + 1
+        taken.add(name.lower())
+        names.append(name)
+    return tuple(names)
+
+
+def _image_points(image: str, adjustment: Adjustment) -> tuple[IntArray, tuple[str, ...]]:
+    """Return rows of the image points of one photograph, and the names of their points."""
+    network = adjustment.network
+    if image not in network.images:
+        return np.zeros(0, dtype=np.int64), ()
+    rows = np.flatnonzero(network.image_points.image == network.images.index(image))
+    return rows, tuple(network.points[j] for j in network.image_points.point[rows])
+
+
+def _nearest(xy: FloatArray, measured: FloatArray) -> IntArray:
+    """Return for each target the image point that was made of it, -1 for none, (k,)."""
+    if len(xy) == 0 or len(measured) == 0:
+        return np.full(len(xy), -1, dtype=np.int64)
+    distance = np.linalg.norm(xy[:, None] - measured[None], axis=2)
+    nearest = distance.argmin(axis=1)
+    close: BoolArray = distance[np.arange(len(xy)), nearest] < 0.5  # half a pixel: re-measuring may move it
+    return np.where(close, nearest, -1)
+
+
+def _colour_of(flag: int) -> tuple[int, int, int]:
+    return next((colour for reason, colour in REASON_COLOURS if flag & reason.value), INK)
+
+
+def _drawn(xy: FloatArray, scale: float) -> tuple[int, int]:
+    """Return a position as OpenCV takes it with SHIFT fractional bits; half pixels move with the scale."""
+    at = ((np.asarray(xy) + 0.5) * scale - 0.5) * (1 << SHIFT)
+    at = np.clip(at, -(2**28), 2**28)
+    return round(float(at[0])), round(float(at[1]))
+
+
+def _ellipse(
+    picture: AnyArray, xy: FloatArray, semi: FloatArray, angle: float, scale: float, colour: tuple[int, ...]
+) -> None:
+    axes = round(float(semi[0]) * scale * (1 << SHIFT)), round(float(semi[1]) * scale * (1 << SHIFT))
+    degrees = float(np.degrees(angle))
+    cv2.ellipse(picture, _drawn(xy, scale), axes, degrees, 0, 360, colour, 1, cv2.LINE_AA, SHIFT)
+
+
+def _cross(picture: AnyArray, xy: FloatArray, scale: float, colour: tuple[int, ...]) -> None:
+    x, y = _drawn(xy, scale)
+    arm = 4 << SHIFT
+    cv2.line(picture, (x - arm, y - arm), (x + arm, y + arm), colour, 1, cv2.LINE_AA, SHIFT)
+    cv2.line(picture, (x - arm, y + arm), (x + arm, y - arm), colour, 1, cv2.LINE_AA, SHIFT)
+
+
+def _arrow(picture: AnyArray, start: FloatArray, end: FloatArray, scale: float) -> None:
+    cv2.line(picture, _drawn(start, scale), _drawn(end, scale), ARROW, 2, cv2.LINE_AA, SHIFT)
+
+
+def _label(picture: AnyArray, name: str, xy: FloatArray, scale: float, colour: tuple[int, ...]) -> None:
+    x, y = _drawn(xy, scale)
+    at = (x >> SHIFT) + 7, (y >> SHIFT) - 7
+    text = name.encode("ascii", "replace").decode()
+    cv2.putText(picture, text, at, cv2.FONT_HERSHEY_SIMPLEX, 0.45, INK, 3, cv2.LINE_AA)
+    cv2.putText(picture, text, at, cv2.FONT_HERSHEY_SIMPLEX, 0.45, colour, 1, cv2.LINE_AA)
+
+
+def _legend(width: int, factor: float, flags: IntArray) -> AnyArray:
+    """Return the strip below the photograph that explains the colours and the scale of the vectors."""
+    entries: list[tuple[str, tuple[int, int, int]]] = [
+        ("accepted", USED),
+        ("rejected in the adjustment", DROPPED),
+        ("measured, not part of the result", UNUSED),
+        (f"residual, {factor:g} times as long", ARROW),
+    ]
+    entries += [
+        (f"x {in_words(str(reason.name).lower())}", colour)
+        for reason, colour in REASON_COLOURS
+        if (flags & reason.value).any()
+    ]
+    size, row_height = 0.5, 24
+    rows: list[list[tuple[str, tuple[int, int, int], int]]] = [[]]
+    x = 10
+    for text, colour in entries:
+        needed = 26 + cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, size, 1)[0][0] + 18
+        if x + needed > width and rows[-1]:
+            rows.append([])
+            x = 10
+        rows[-1].append((text, colour, x))
+        x += needed
+    strip = np.full((row_height * len(rows) + 8, width, 3), PAPER, dtype=np.uint8)
+    for k, row in enumerate(rows):
+        y = 8 + k * row_height
+        for text, colour, x in row:
+            cv2.rectangle(strip, (x, y), (x + 16, y + 12), colour, -1)
+            cv2.putText(strip, text, (x + 22, y + 11), cv2.FONT_HERSHEY_SIMPLEX, size, INK, 1, cv2.LINE_AA)
+    return strip
+
+
+def _fit(picture: AnyArray, side: int) -> AnyArray:
+    """Return a picture whose longer side is at most `side` px, averaged over areas."""
+    scale = side / max(picture.shape[:2])
+    if scale >= 1:
+        return picture
+    size = round(picture.shape[1] * scale), round(picture.shape[0] * scale)
+    return np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA))
+
+
+def _jpeg(picture: AnyArray) -> bytes:
+    _, data = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
+    return bytes(data.tobytes())

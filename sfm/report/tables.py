@@ -1,0 +1,267 @@
+"""The tables of a result: summary.json, points.csv, images.csv, cameras.csv, image_points.csv, points.ply.
+
+Degrees in files, the object unit of the survey, sigmas are standard deviations a posteriori (those of image
+points: as measured). Numbers are written with enough digits to give the same number back.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sfm.adjustment.result import Adjustment
+from sfm.conventions import FloatArray, angles_from_rotation
+from sfm.report.result import SurveyResult
+
+UNCODED = -1
+
+
+def write_tables(result: SurveyResult, folder: Path) -> None:
+    """Write all tables of a result into a folder.
+
+    Args:
+        result: the result.
+        folder: an existing folder.
+    """
+    adjustment = result.adjustment
+    _write_csv(folder / "points.csv", "id,X,Y,Z,sX,sY,sZ,rays,code", point_rows(result))
+    _write_csv(
+        folder / "images.csv",
+        "image,X,Y,Z,omega_deg,phi_deg,kappa_deg,sX,sY,sZ,somega_deg,sphi_deg,skappa_deg,camera,points,rms_px",
+        image_rows(adjustment),
+    )
+    _write_csv(folder / "cameras.csv", "camera,parameter,value,sigma,unit", camera_rows(adjustment))
+    _write_csv(
+        folder / "image_points.csv",
+        "image,point,x_px,y_px,sx_px,sy_px,vx_px,vy_px,rejected",
+        image_point_rows(adjustment),
+    )
+    write_ply(folder / "points.ply", result)
+    text = json.dumps(summary(result), indent=2, ensure_ascii=False, allow_nan=False)
+    (folder / "summary.json").write_text(text + "\n", encoding="utf-8")
+
+
+def summary(result: SurveyResult) -> dict[str, Any]:
+    """Return what summary.json holds: plain values only, None for what is not known."""
+    adjustment = result.adjustment
+    coded = int((result.code != UNCODED).sum())
+    return {
+        "survey": result.survey,
+        "unit": result.unit,
+        "converged": adjustment.converged,
+        "iterations": adjustment.iterations,
+        "images": {
+            "used": len(adjustment.network.images),
+            "total": result.images_total,
+            "failed": [{"image": f.image, "reason": f.reason} for f in result.failed],
+        },
+        "points": {"total": len(result.code), "coded": coded, "uncoded": len(result.code) - coded},
+        "observations": {
+            "used": int((~adjustment.rejected).sum()),
+            "rejected": int(adjustment.rejected.sum()),
+        },
+        "unknowns": adjustment.unknowns,
+        "redundancy": adjustment.redundancy,
+        "datum": {
+            "kind": adjustment.datum,
+            "defect": adjustment.defect,
+            "expected_defect": adjustment.expected_defect,
+            "undetermined": list(adjustment.undetermined),
+        },
+        "sigma0_px": _number(adjustment.sigma0_px),
+        "rms_px": _number(adjustment.rms_px),
+        "max_residual_px": _number(adjustment.max_residual_px),
+        "cameras": [
+            {
+                "name": camera.name,
+                "model": camera.model,
+                "parameters": {
+                    name: {"value": _number(value), "sigma": _number(sigma), "unit": unit}
+                    for name, value, sigma, unit in zip(
+                        camera.names,
+                        camera.parameters,
+                        parameter_sigmas(adjustment, index),
+                        camera.units,
+                        strict=True,
+                    )
+                },
+            }
+            for index, camera in enumerate(adjustment.estimate.cameras)
+        ],
+        "control": _control(result),
+        "comparison": _comparison(result),
+        "warnings": list(result.warnings),
+        "seconds": {time.stage: round(time.seconds, 3) for time in result.seconds},
+    }
+
+
+def point_rows(result: SurveyResult) -> Iterable[Sequence[object]]:
+    """Return id, X, Y, Z, sX, sY, sZ, accepted rays and code number of every point."""
+    adjustment = result.adjustment
+    seen = adjustment.network.image_points.select(~adjustment.rejected)
+    rays = np.bincount(seen.point, minlength=len(adjustment.network.points))
+    sigma = point_sigmas(adjustment)
+    for j, name in enumerate(adjustment.network.points):
+        code = "" if result.code[j] == UNCODED else int(result.code[j])
+        yield (name, *adjustment.estimate.points[j], *sigma[j], int(rays[j]), code)
+
+
+def image_rows(adjustment: Adjustment) -> Iterable[Sequence[object]]:
+    """Return exterior orientation, sigmas, camera, number of points and RMS of every photograph."""
+    network, estimate = adjustment.network, adjustment.estimate
+    angles = np.degrees(angles_from_rotation(estimate.rotation))
+    sigma = _sqrt_diagonal(adjustment.covariance.exterior)
+    rms, count = image_rms(adjustment)
+    for i, name in enumerate(network.images):
+        yield (
+            name,
+            *estimate.position[i],
+            *angles[i],
+            *sigma[i, :3],
+            *np.degrees(sigma[i, 3:]),
+            estimate.cameras[network.camera[i]].name,
+            int(count[i]),
+            rms[i],
+        )
+
+
+def camera_rows(adjustment: Adjustment) -> Iterable[Sequence[object]]:
+    """Return camera, parameter, value, sigma (empty where it was not adjusted) and unit."""
+    for index, camera in enumerate(adjustment.estimate.cameras):
+        sigma = parameter_sigmas(adjustment, index)
+        for name, value, s, unit in zip(camera.names, camera.parameters, sigma, camera.units, strict=True):
+            yield (camera.name, name, value, s, unit)
+
+
+def image_point_rows(adjustment: Adjustment) -> Iterable[Sequence[object]]:
+    """Return image, point, position, sigmas as measured, residuals and 0 or 1 for rejected."""
+    network = adjustment.network
+    seen = network.image_points
+    sigma = _sqrt_diagonal(seen.covariance)
+    for k in range(len(seen)):
+        yield (
+            network.images[seen.image[k]],
+            network.points[seen.point[k]],
+            *seen.xy[k],
+            *sigma[k],
+            *adjustment.residuals[k],
+            int(adjustment.rejected[k]),
+        )
+
+
+def point_sigmas(adjustment: Adjustment) -> FloatArray:
+    """Return the standard deviations of X, Y, Z, object unit, (n, 3)."""
+    return _sqrt_diagonal(adjustment.covariance.points)
+
+
+def parameter_sigmas(adjustment: Adjustment, camera: int) -> FloatArray:
+    """Return the standard deviation of each parameter of a camera, NaN for those held fixed, (p,)."""
+    free = adjustment.estimate.cameras[camera].free
+    sigma = np.full(len(free), np.nan)
+    sigma[free] = _sqrt_diagonal(adjustment.covariance.interior[camera])
+    return sigma
+
+
+def image_rms(adjustment: Adjustment) -> tuple[FloatArray, FloatArray]:
+    """Return RMS residual per coordinate (px) and number of the accepted image points by photograph, (m,)."""
+    m = len(adjustment.network.images)
+    image = adjustment.network.image_points.image[~adjustment.rejected]
+    squares = (adjustment.residuals[~adjustment.rejected] ** 2).sum(axis=1)
+    count = np.bincount(image, minlength=m).astype(float)
+    total = np.bincount(image, weights=squares, minlength=m)
+    rms = np.sqrt(np.divide(total, 2 * count, out=np.full(m, np.nan), where=count > 0))
+    return rms, count
+
+
+def root_mean_square(values: FloatArray) -> float:
+    """Return the root mean square of the values that are known."""
+    return float(np.sqrt(np.nanmean(values**2)))
+
+
+def write_ply(path: Path, result: SurveyResult) -> None:
+    """Write the object points as a PLY point cloud in text form: coded green, uncoded grey.
+
+    Source: Turk, The PLY polygon file format (1994).
+    """
+    points = result.adjustment.estimate.points
+    lines = [
+        "ply",
+        "format ascii 1.0",
+        f"comment kolinear, object unit {_ascii(result.unit)}",
+        f"element vertex {len(points)}",
+        *(f"property double {axis}" for axis in "xyz"),
+        *(f"property uchar {colour}" for colour in ("red", "green", "blue")),
+        "end_header",
+    ]
+    for xyz, code in zip(points, result.code, strict=True):
+        colour = "120 120 120" if code == UNCODED else "20 140 60"
+        lines.append(" ".join(f"{value:.17g}" for value in xyz) + " " + colour)
+    path.write_text("\n".join(lines) + "\n", encoding="ascii")
+
+
+def _control(result: SurveyResult) -> dict[str, Any] | None:
+    check = result.control_check
+    if check is None:
+        return None
+    return {
+        "scale": _number(check.scale),
+        "rms": [_number(value) for value in check.rms],
+        "differences": {
+            name: [_number(value) for value in difference]
+            for name, difference in zip(check.points, check.differences, strict=True)
+        },
+    }
+
+
+def _comparison(result: SurveyResult) -> dict[str, Any] | None:
+    both = result.comparison
+    if both is None:
+        return None
+    difference = both.comparison
+    return {
+        "backend": both.backend,
+        "agree": both.agree,
+        "model": both.model,
+        "max_position": _number(difference.max_position),
+        "max_rotation_deg": _number(difference.max_rotation_deg),
+        "max_point": _number(difference.max_point),
+        "max_interior_px": _number(float(np.nanmax(difference.interior_px, initial=0.0))),
+        "object_size": _number(difference.object_size),
+        "rms_px": {"kolinear": difference.rms_px[0], both.backend: difference.rms_px[1]},
+        "cost": {"kolinear": difference.cost[0], both.backend: difference.cost[1]},
+        "exceeded": list(difference.exceeded),
+    }
+
+
+def _write_csv(path: Path, header: str, rows: Iterable[Sequence[object]]) -> None:
+    with path.open("w", encoding="utf-8", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(header.split(","))
+        writer.writerows([_text(value) for value in row] for row in rows)
+
+
+def _text(value: object) -> str:
+    """Write a number with the digits that give it back, an unknown one as an empty cell."""
+    if isinstance(value, float | np.floating):
+        return repr(float(value)) if math.isfinite(value) else ""
+    return str(value)
+
+
+def _number(value: float) -> float | None:
+    return float(value) if math.isfinite(value) else None
+
+
+def _ascii(text: str) -> str:
+    return text.encode("ascii", "replace").decode().replace("\n", " ").replace("\r", " ")
+
+
+def _sqrt_diagonal(covariance: FloatArray) -> FloatArray:
+    """Return standard deviations of covariance matrices (..., d, d), shape (..., d)."""
+    diagonal = np.einsum("...ii->...i", covariance)
+    return np.asarray(np.sqrt(np.where(diagonal >= 0, diagonal, np.nan)))
