@@ -47,7 +47,7 @@ class ObjectPoints:
     xyz: FloatArray = field(default_factory=lambda: _empty(3))  # object unit, (n, 3)
     covariance: FloatArray = field(
         default_factory=lambda: _empty(3, 3)
-    )  # object unit^2, 0 = fixed, (n, 3, 3)
+    )  # object unit^2; variance 0 = fixed, infinite = not known, (n, 3, 3)
 
     def __len__(self) -> int:
         return len(self.point)
@@ -67,6 +67,34 @@ class ScaleBars:
 
 
 @dataclass(frozen=True)
+class ExteriorObservations:
+    """Exterior orientation known beforehand (satellite positions, a calibrated rig)."""
+
+    image: IntArray = field(default_factory=_no_index)  # index of the photograph, (e,)
+    position: FloatArray = field(default_factory=lambda: _empty(3))  # X0, object unit, (e, 3)
+    angles: FloatArray = field(default_factory=lambda: _empty(3))  # omega, phi, kappa, rad, (e, 3)
+    covariance: FloatArray = field(
+        default_factory=lambda: _empty(6, 6)
+    )  # of X0, Y0, Z0, omega, phi, kappa; variance 0 = fixed, infinite = not observed, (e, 6, 6)
+
+    def __len__(self) -> int:
+        return len(self.image)
+
+
+@dataclass(frozen=True)
+class InteriorObservations:
+    """Parameters of interior orientation known beforehand, as from a calibration certificate."""
+
+    camera: IntArray = field(default_factory=_no_index)  # index of the camera, (p,)
+    parameter: IntArray = field(default_factory=_no_index)  # index among the camera's names, (p,)
+    value: FloatArray = field(default_factory=lambda: np.zeros(0))  # in the parameter's unit, (p,)
+    sigma: FloatArray = field(default_factory=lambda: np.zeros(0))  # in the parameter's unit, (p,)
+
+    def __len__(self) -> int:
+        return len(self.camera)
+
+
+@dataclass(frozen=True)
 class Network:
     """All that was measured in a survey."""
 
@@ -76,6 +104,8 @@ class Network:
     image_points: ImagePoints
     control: ObjectPoints = field(default_factory=ObjectPoints)
     scale_bars: ScaleBars = field(default_factory=ScaleBars)
+    exterior: ExteriorObservations = field(default_factory=ExteriorObservations)
+    interior: InteriorObservations = field(default_factory=InteriorObservations)
 
     def rays(self) -> IntArray:
         """Return in how many photographs each point was measured, (n,)."""
@@ -121,8 +151,9 @@ def reduce_network(
     seen = network.image_points.select(
         image_points & images[network.image_points.image] & points[network.image_points.point]
     )
-    control, bars = network.control, network.scale_bars
+    control, bars, exterior = network.control, network.scale_bars, network.exterior
     c = points[control.point]
+    e = images[exterior.image]
     b = points[bars.start] & points[bars.end]
     reduced = replace(
         network,
@@ -134,6 +165,9 @@ def reduce_network(
         scale_bars=ScaleBars(
             point_index[bars.start[b]], point_index[bars.end[b]], bars.length[b], bars.sigma[b]
         ),
+        exterior=ExteriorObservations(
+            image_index[exterior.image[e]], exterior.position[e], exterior.angles[e], exterior.covariance[e]
+        ),
     )
     return reduced, replace(
         estimate,
@@ -141,3 +175,9 @@ def reduce_network(
         rotation=estimate.rotation[images],
         points=estimate.points[points],
     )
+
+
+def empty_estimate(network: Network, cameras: tuple[Camera, ...]) -> Estimate:
+    """Return an estimate of which only the start values of the cameras are known."""
+    m, n = len(network.images), len(network.points)
+    return Estimate(cameras, np.full((m, 3), np.nan), np.full((m, 3, 3), np.nan), np.full((n, 3), np.nan))

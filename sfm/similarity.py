@@ -44,7 +44,11 @@ class Similarity:
 
 
 def fit_similarity(
-    source: FloatArray, target: FloatArray, *, weights: FloatArray | None = None
+    source: FloatArray,
+    target: FloatArray,
+    *,
+    weights: FloatArray | None = None,
+    scale: float | None = None,
 ) -> Similarity:
     """Return the similarity that brings source points onto target points with least squares.
 
@@ -52,6 +56,7 @@ def fit_similarity(
         source: points in the source frame, shape (n, 3), source unit.
         target: the same points in the target frame, shape (n, 3), target unit.
         weights: weight of each point, shape (n,); equal if not given.
+        scale: scale to keep, target unit per source unit; fitted too if not given.
 
     Raises:
         GeometryError: fewer than three points, or all points on a line.
@@ -72,5 +77,5 @@ def fit_similarity(
     U, d, Vt = np.linalg.svd((t * w[:, None]).T @ s)
     sign = np.array([1.0, 1.0, np.sign(np.linalg.det(U) * np.linalg.det(Vt))])
     R = (U * sign) @ Vt
-    scale = float((d * sign).sum() / (w @ (s**2).sum(axis=1)))
-    return Similarity(scale, R, centre_t - scale * R @ centre_s)
+    fitted = float((d * sign).sum() / (w @ (s**2).sum(axis=1))) if scale is None else scale
+    return Similarity(fitted, R, centre_t - fitted * R @ centre_s)

@@ -1,0 +1,213 @@
+"""The solution of a survey: matching and adjusting in turn, then the final adjustment in its datum."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sfm.adjustment.datum import Datum
+from sfm.adjustment.result import Adjustment
+from sfm.adjustment.solve import adjust
+from sfm.conventions import BoolArray, IntArray
+from sfm.errors import GeometryError
+from sfm.network import Estimate, Network, reduce_network
+from sfm.project import Survey
+from sfm.report.result import ControlCheck
+from sfm.similarity import Similarity, fit_similarity
+from sfm.survey_network import Naming, build_network, match_uncoded, min_rays
+from sfm.survey_targets import MeasuredPhotographs
+
+ROUNDS = 3  # matching with the orientation at hand, with the adjusted one, and once more to confirm
+TOLERANCE_FACTOR = 6.0  # of the robust spread of the residuals
+MIN_TOLERANCE_PX = 1.0  # below it a difference is for the statistical test, not for the matching
+MIN_IMAGE_POINTS = 4  # of a photograph in the final adjustment: three determine it, the fourth checks
+MAD_TO_SIGMA = 1.4826  # of a normal distribution; Hampel (1974), J. Am. Stat. Assoc. 69
+
+
+@dataclass(frozen=True)
+class Solution:
+    """The final adjustment, and what happened on the way to it."""
+
+    adjustment: Adjustment
+    control_check: ControlCheck | None  # None without control or where the datum is control
+    dropped_images: tuple[tuple[str, str], ...]  # photographs that lost their points, with the reason
+    warnings: tuple[str, ...]  # one line each
+
+
+def refine(network: Network, estimate: Estimate) -> Estimate:
+    """Adjust a growing network for its approximate values only; see `orientation.sequence.orient`."""
+    return adjust(network, estimate, datum=Datum("free"), reject="huber", covariance=False).estimate
+
+
+def match_and_adjust(
+    survey: Survey,
+    photographs: MeasuredPhotographs,
+    naming: Naming,
+    estimate: Estimate,
+    *,
+    tolerance_px: float,
+) -> tuple[Naming, Network, Estimate]:
+    """Name the uncoded targets and adjust in turn, with a tolerance that shrinks with the residuals.
+
+    Args:
+        survey: what to do.
+        photographs: all measured targets.
+        naming: the coded targets by name.
+        estimate: orientation from the coded targets.
+        tolerance_px: how far a target may be from its projected point at the beginning.
+
+    Returns:
+        The naming, its network, and the adjusted estimate.
+    """
+    for _ in range(ROUNDS):
+        naming, estimate = match_uncoded(photographs, naming, estimate, tolerance_px=tolerance_px)
+        network = build_network(survey, photographs, naming)
+        everything = np.ones(len(network.image_points), dtype=bool)
+        images, points = determined(network, estimate, everything, min_rays(naming))
+        part, start = reduce_network(network, estimate, images, points, everything)
+        adjusted = adjust(part, start, datum=Datum("free"), reject="huber", covariance=False)
+        estimate = put_back(estimate, adjusted.estimate, images, points)
+        spread = MAD_TO_SIGMA * float(np.median(np.abs(adjusted.residuals)))
+        tolerance_px = float(np.clip(TOLERANCE_FACTOR * spread, MIN_TOLERANCE_PX, tolerance_px))
+    return naming, network, estimate
+
+
+def solve(
+    survey: Survey, network: Network, estimate: Estimate, *, min_rays: IntArray | None = None
+) -> Solution:
+    """Adjust the network in the datum of the survey, with rejection of outliers and full covariance.
+
+    Points that keep too few rays and photographs that keep too few points leave the network, and the rest
+    is adjusted again. A free network is placed on the scale bars and the control, where there are some,
+    without changing its shape.
+
+    Args:
+        survey: says the datum and the a priori sigma.
+        network: all image points.
+        estimate: approximate values of all that is to be adjusted.
+        min_rays: rays that each point needs to stay, 2 if not given, (n,).
+
+    Raises:
+        GeometryError: too little is left to adjust, or control is asked for and not seen.
+    """
+    datum = Datum(survey.datum.kind)
+    if datum.kind == "control" and len(network.control) == 0:
+        raise GeometryError(f"survey {survey.name}: datum 'control', but no control point was measured")
+    needed = np.full(len(network.points), 2) if min_rays is None else min_rays
+    if datum.kind == "control":
+        needed[network.control.point] = 1
+    accepted = np.ones(len(network.image_points), dtype=bool)
+    oriented = estimate.oriented
+    estimate = _rescaled(network, estimate, datum)
+    while True:
+        images, points = determined(network, estimate, accepted, needed)
+        part, start = reduce_network(network, estimate, images, points, np.ones_like(accepted))
+        adjustment = adjust(
+            part, start, datum=datum, sigma_px=survey.adjust.sigma_px, reject="tau", covariance=False
+        )
+        estimate = put_back(estimate, adjustment.estimate, images, points)
+        accepted = _accepted(network, adjustment, images, points)
+        left_images, left_points = determined(network, estimate, accepted, needed)
+        if (left_images == images).all() and (left_points == points).all():
+            break
+    check = None
+    if datum.kind != "control" and len(part.control) >= 3:
+        estimate, check = _placed_on_control(part, adjustment.estimate)
+    else:
+        estimate = adjustment.estimate
+    final = adjust(part, estimate, datum=datum, sigma_px=survey.adjust.sigma_px, reject="tau")
+    dropped = tuple(
+        (name, f"fewer than {MIN_IMAGE_POINTS} accepted image points of the network")
+        for name, was, is_in in zip(network.images, oriented, images, strict=True)
+        if was and not is_in
+    )
+    return Solution(final, check, dropped, _warnings(survey, part, final))
+
+
+def determined(
+    network: Network, estimate: Estimate, accepted: BoolArray, min_rays: IntArray
+) -> tuple[BoolArray, BoolArray]:
+    """Return the photographs (m,) and points (n,) that accepted image points determine.
+
+    Raises:
+        GeometryError: fewer than two photographs are left.
+    """
+    seen = network.image_points
+    images, points = estimate.oriented, estimate.determined
+    while True:
+        used = accepted & images[seen.image] & points[seen.point]
+        rays = np.bincount(seen.point[used], minlength=len(points))
+        count = np.bincount(seen.image[used], minlength=len(images))
+        still_images, still_points = images & (count >= MIN_IMAGE_POINTS), points & (rays >= min_rays)
+        if (still_images == images).all() and (still_points == points).all():
+            break
+        images, points = still_images, still_points
+    if images.sum() < 2:
+        raise GeometryError(
+            f"{images.sum()} of {len(images)} photographs see at least {MIN_IMAGE_POINTS} points of the "
+            "network, at least 2 photographs are needed"
+        )
+    return images, points
+
+
+def put_back(estimate: Estimate, part: Estimate, images: BoolArray, points: BoolArray) -> Estimate:
+    """Return the estimate of all photographs and points with an adjusted part of it put in; NaN elsewhere."""
+    position, rotation = np.full_like(estimate.position, np.nan), np.full_like(estimate.rotation, np.nan)
+    xyz = np.full_like(estimate.points, np.nan)
+    position[images], rotation[images], xyz[points] = part.position, part.rotation, part.points
+    return Estimate(part.cameras, position, rotation, xyz)
+
+
+def _accepted(network: Network, adjustment: Adjustment, images: BoolArray, points: BoolArray) -> BoolArray:
+    """Return which image points of the whole network the adjustment of a part of it accepted."""
+    seen = network.image_points
+    part = images[seen.image] & points[seen.point]
+    accepted = part.copy()
+    accepted[part] = ~adjustment.rejected
+    return accepted
+
+
+def _rescaled(network: Network, estimate: Estimate, datum: Datum) -> Estimate:
+    """Bring a network that control does not hold to the length of its scale bars, which start it near."""
+    bars = network.scale_bars
+    if datum.kind == "control" or not len(bars):
+        return estimate
+    length = np.linalg.norm(estimate.points[bars.end] - estimate.points[bars.start], axis=1)
+    usable = np.isfinite(length) & (length > 0)
+    if not usable.any():
+        return estimate
+    scale = float(np.median(bars.length[usable] / length[usable]))
+    return Similarity(scale, np.eye(3), np.zeros(3)).apply_estimate(estimate)
+
+
+def _placed_on_control(network: Network, estimate: Estimate) -> tuple[Estimate, ControlCheck]:
+    """Place an adjusted network on its control; scale bars, where there are some, keep its scale."""
+    control = network.control
+    points = estimate.points[control.point]
+    fitted = fit_similarity(points, control.xyz)
+    placing = fit_similarity(points, control.xyz, scale=1.0) if len(network.scale_bars) else fitted
+    scale = fitted.scale if len(network.scale_bars) else 1.0
+    names = tuple(network.points[j] for j in control.point)
+    return placing.apply_estimate(estimate), ControlCheck(names, placing.apply(points) - control.xyz, scale)
+
+
+def _warnings(survey: Survey, network: Network, adjustment: Adjustment) -> tuple[str, ...]:
+    """Return what a person must know beyond the numbers."""
+    lines = []
+    if not adjustment.converged:
+        lines.append(f"the adjustment did NOT converge within {adjustment.iterations} iterations")
+    if adjustment.undetermined:
+        lines.append(f"not determined by the observations: {', '.join(adjustment.undetermined)}")
+    if survey.datum.kind != "control" and not len(network.scale_bars) and len(network.control) < 3:
+        lines.append(
+            f"the survey holds no scale: lengths are not in {survey.unit} until a scale bar or control "
+            "is added"
+        )
+    if survey.datum.kind != "control" and len(network.scale_bars) and survey.scale_bars:
+        missing = len(survey.scale_bars) - len(network.scale_bars)
+        if missing:
+            lines.append(
+                f"{missing} of {len(survey.scale_bars)} scale bars have an end that was not measured"
+            )
+    return tuple(lines)

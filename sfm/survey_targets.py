@@ -1,0 +1,117 @@
+"""The targets of all photographs of a survey, measured side by side."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from sfm.camera import Camera
+from sfm.conventions import FloatArray, IntArray
+from sfm.errors import GeometryError, PhotographError
+from sfm.progress import SILENT, Progress
+from sfm.project import Survey
+from sfm.report.result import FailedImage, PhotographTargets
+from sfm.survey_start import PhotographList, start_cameras
+from sfm.targets.codes import CodeFamily, code_family
+from sfm.targets.detect import Targets, find_targets
+from sfm.targets.photograph import Metadata, read_metadata, read_photograph
+
+MIN_PHOTOGRAPHS = 2
+
+
+@dataclass(frozen=True)
+class MeasuredPhotographs:
+    """The readable photographs of a survey with their targets, and those that could not be read."""
+
+    names: tuple[str, ...]  # (m,)
+    paths: tuple[Path, ...]  # (m,)
+    camera: IntArray  # index into cameras, (m,)
+    cameras: tuple[Camera, ...]  # with start values of the interior orientation
+    targets: tuple[Targets, ...]  # (m,)
+    failed: tuple[FailedImage, ...]  # photographs that could not be read
+
+    def overlays(self) -> tuple[PhotographTargets, ...]:
+        """Return what the report draws into each photograph."""
+        return tuple(
+            PhotographTargets(
+                name, path, found.xy, found.semi_axes, found.angle, found.rejected_xy, found.rejected_flag
+            )
+            for name, path, found in zip(self.names, self.paths, self.targets, strict=True)
+        )
+
+
+def measure_photographs(
+    survey: Survey, photographs: PhotographList, *, jobs: int = 1, progress: Progress = SILENT
+) -> MeasuredPhotographs:
+    """Read the photographs, find, measure and decode their targets.
+
+    A photograph that cannot be read does not stop the others; it is named with the reason.
+
+    Args:
+        survey: says what the targets look like and what is known of the cameras.
+        photographs: the files.
+        jobs: how many photographs are worked on at a time.
+        progress: told of every photograph.
+
+    Raises:
+        GeometryError: fewer than two readable photographs.
+        PhotographError: photographs of different size under one camera.
+        SurveyFileError: the code table or the start values of a camera are unusable.
+    """
+    family = code_family(survey.codes)
+    found: dict[int, tuple[Metadata, Targets]] = {}
+    failed: dict[int, FailedImage] = {}
+    with ThreadPoolExecutor(max_workers=max(1, jobs)) as pool:
+        running = {
+            pool.submit(_measure_photograph, path, survey, family): k
+            for k, path in enumerate(photographs.paths)
+        }
+        for done in as_completed(running):
+            k = running[done]
+            try:
+                found[k] = done.result()
+            except PhotographError as error:
+                failed[k] = FailedImage(photographs.names[k], str(error))
+            progress.advance(photographs.names[k])
+    if len(found) < MIN_PHOTOGRAPHS:
+        first = next(iter(failed.values()), None)
+        why = f" ({first.reason})" if first else ""
+        raise GeometryError(
+            f"survey {survey.name}: {len(found)} readable photographs, "
+            f"at least {MIN_PHOTOGRAPHS} are needed{why}"
+        )
+    order = sorted(found)
+    names = tuple(photographs.names[k] for k in order)
+    camera = photographs.camera[order]
+    return MeasuredPhotographs(
+        names,
+        tuple(photographs.paths[k] for k in order),
+        camera,
+        start_cameras(survey, tuple(found[k][0] for k in order), camera, names),
+        tuple(found[k][1] for k in order),
+        tuple(failed[k] for k in sorted(failed)),
+    )
+
+
+def _measure_photograph(path: Path, survey: Survey, family: CodeFamily | None) -> tuple[Metadata, Targets]:
+    """Measure one photograph; its pixels are let go at once."""
+    metadata = read_metadata(path)
+    targets = find_targets(
+        read_photograph(path),
+        polarity=survey.targets.polarity,
+        codes=family if family is not None else "none",
+        min_diameter_px=survey.targets.min_diameter_px,
+    )
+    return metadata, targets
+
+
+def image_point_covariance(targets: Targets, sigma_px: float) -> FloatArray:
+    """Return the covariance of image points for the adjustment, px^2, shape (k, 2, 2).
+
+    The fit of a target knows the noise of the photograph only. What it cannot know (JPEG, print, lens,
+    a sheet that is not flat) comes on top with the survey's sigma of an image coordinate.
+    """
+    return np.asarray(targets.covariance + sigma_px**2 * np.eye(2))
