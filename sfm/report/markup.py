@@ -9,6 +9,9 @@ from urllib.parse import quote
 
 import numpy as np
 
+METRIC = (("km", 1e3), ("m", 1.0), ("mm", 1e-3), ("µm", 1e-6))
+"""metric units and their length in metres, largest first"""
+
 
 def table(
     header: Sequence[str],
@@ -83,3 +86,17 @@ def _is_number(cell: str) -> bool:
     return (
         bool(cell) and cell.lstrip("+-")[:1].isdigit() and not any(c.isalpha() for c in cell.replace("e", ""))
     )
+
+
+def finer_unit(unit: str, value: float) -> tuple[float, str]:
+    """Return by what to multiply lengths of about this size, and the metric unit in which they read well.
+
+    Args:
+        unit: object unit of the survey; lengths in a unit that is not metric stay as they are.
+        value: the largest of the lengths, in that unit.
+    """
+    metres = dict((*METRIC, ("cm", 1e-2), ("dm", 1e-1))).get(unit)
+    if metres is None or not np.isfinite(value) or value <= 0:
+        return 1.0, unit
+    name, size = next(((n, s) for n, s in METRIC if value * metres >= s), METRIC[-1])
+    return metres / size, name

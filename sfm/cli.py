@@ -1,0 +1,294 @@
+"""The commands of Kolinear, and the one line that a person reads when something is wrong."""
+
+from __future__ import annotations
+
+import os
+import re
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
+from rich.table import Table
+from rich.text import Text
+from threadpoolctl import threadpool_limits
+
+from sfm.errors import KolinearError
+from sfm.pipeline import Backend, adjust_survey, run_survey
+from sfm.project import Survey, read_survey
+from sfm.report.markup import finer_unit, significant
+from sfm.report.output import refuse_foreign_folder, write_result
+from sfm.report.result import SurveyResult
+from sfm.report.tables import point_sigmas, root_mean_square
+from sfm.report.verdict import verdict_of
+
+BAD_INPUT = 2  # exit code where a person must put something right
+INTERRUPTED = 130  # exit code after Ctrl-C, as a shell expects it
+COLOURS = {"good": "green", "fair": "yellow", "bad": "red"}
+
+app = typer.Typer(
+    name="kolinear",
+    help="Close-range photogrammetry: targets, orientation, bundle adjustment, and COLMAP beside it.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+)
+
+SurveyFile = Annotated[
+    Path, typer.Argument(metavar="SURVEY.toml", help="The survey file; its paths are relative to it.")
+]
+Out = Annotated[
+    Path | None,
+    typer.Option(
+        "--out",
+        metavar="DIR",
+        help="Folder of the result, written whole or not at all; an earlier result is replaced.  "
+        "[default: out/NAME OF THE SURVEY]",
+    ),
+]
+Jobs = Annotated[
+    int | None,
+    typer.Option("--jobs", metavar="N", min=1, help="Photographs worked on at a time.  [default: all cores]"),
+]
+Verbose = Annotated[bool, typer.Option("--verbose", "-v", help="Tell more: every photograph and warning.")]
+
+
+@app.callback()
+def _commands() -> None:
+    """Keep `kolinear` a command with subcommands."""
+
+
+@app.command()
+def run(
+    survey_file: SurveyFile,
+    images: Annotated[
+        Path | None,
+        typer.Option(
+            "--images", metavar="DIR", help="Folder of the photographs, in place of that of the survey file."
+        ),
+    ] = None,
+    out: Out = None,
+    jobs: Jobs = None,
+    verbose: Verbose = False,
+) -> None:
+    """Run a survey from its photographs to the report."""
+    survey = read_survey(survey_file)
+    if survey.observations is not None:
+        raise KolinearError(
+            f"{survey_file}: it has [observations] in place of photographs: kolinear adjust {survey_file}"
+        )
+    backend = _backend(survey)
+    folder = _folder(survey, out)
+    workers = jobs or _cores()
+    with _drawn_progress() as progress, _threads():
+        result = run_survey(survey, images_dir=images, jobs=workers, backend=backend, progress=progress)
+        page = write_result(
+            result, folder, write_colmap=_colmap_writer(result), jobs=workers, progress=progress
+        )
+    _tell(result, page, verbose=verbose)
+
+
+@app.command()
+def adjust(survey_file: SurveyFile, out: Out = None, verbose: Verbose = False) -> None:
+    """Run the part after the photographs, on the image points of [observations]."""
+    survey = read_survey(survey_file)
+    if survey.observations is None:
+        raise KolinearError(
+            f"{survey_file}: it has no [observations]; with photographs: kolinear run {survey_file}"
+        )
+    backend = _backend(survey)
+    folder = _folder(survey, out)
+    with _drawn_progress() as progress, _threads():
+        result = adjust_survey(survey, backend=backend, progress=progress)
+        page = write_result(result, folder, write_colmap=_colmap_writer(result), progress=progress)
+    _tell(result, page, verbose=verbose)
+
+
+def main() -> None:
+    """Run the command line; errors that a person can put right are one line and exit code 2."""
+    try:
+        app()
+    except KolinearError as error:
+        print(f"kolinear: {_one_line(str(error))}", file=sys.stderr)
+        raise SystemExit(BAD_INPUT) from None
+    except KeyboardInterrupt:
+        print("kolinear: interrupted, nothing was written", file=sys.stderr)
+        raise SystemExit(INTERRUPTED) from None
+
+
+def _backend(survey: Survey) -> Backend | None:
+    """Return the other adjuster that the survey asks for; its library is imported only then."""
+    if survey.compare.backend == "none":
+        return None
+    from adapters.colmap import adjust_with_colmap
+
+    return adjust_with_colmap
+
+
+def _colmap_writer(result: SurveyResult) -> Callable[[Path], None] | None:
+    """Return what writes the result in COLMAP's model, the solution that was compared; None without one."""
+    both = result.comparison
+    if both is None:
+        return None
+    from adapters.colmap import write_model
+
+    return lambda folder: write_model(folder, both.network, both.adjustment.estimate)
+
+
+def _folder(survey: Survey, out: Path | None) -> Path:
+    """Return the folder of the result, before any work is done for one that cannot be used."""
+    if out is None:
+        name = re.sub(r"[^\w.\-]+", "_", survey.name).strip("._") or "survey"
+        out = Path("out") / name
+    refuse_foreign_folder(out)
+    return out
+
+
+def _cores() -> int:
+    """Return how many processor cores this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+@contextmanager
+def _threads() -> Iterator[None]:
+    """Hold BLAS to one thread: photographs are worked on side by side, and two BLAS pools in turn fight."""
+    with threadpool_limits(limits=1, user_api="blas"):
+        yield
+
+
+class _Drawn:
+    """Progress as a bar on the terminal: the stage, and the photographs done."""
+
+    def __init__(self, bar: Progress) -> None:
+        self._bar = bar
+        self._task: TaskID | None = None
+
+    def stage(self, name: str, total: int | None = None) -> None:
+        """Begin a line for the stage; a second call for the same stage tells its total."""
+        if self._task is not None:
+            task = self._bar.tasks[-1]
+            if task.description == name:
+                self._bar.update(self._task, total=total)
+                return
+            self._bar.update(self._task, total=task.total or 1, completed=task.total or 1, step="")
+            self._bar.stop_task(self._task)
+        self._task = self._bar.add_task(name, total=total, step="")
+
+    def advance(self, step: str = "") -> None:
+        """Count one step and name it."""
+        if self._task is not None:
+            self._bar.update(self._task, advance=1, step=step)
+
+
+@contextmanager
+def _drawn_progress() -> Iterator[_Drawn]:
+    """Show a progress bar on stderr while it is a terminal; nothing else ever goes there but an error."""
+    console = Console(stderr=True)
+    with Progress(
+        TextColumn("{task.description:12}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TextColumn("{task.fields[step]}", style="dim"),
+        console=console,
+        disable=not console.is_terminal,
+    ) as bar:
+        drawn = _Drawn(bar)
+        yield drawn
+        drawn.stage("done", 1)
+        bar.remove_task(bar.task_ids[-1])
+
+
+def _tell(result: SurveyResult, page: Path, *, verbose: bool) -> None:
+    """Print the summary: verdict, figures with their units, what failed, where the report is."""
+    a = result.adjustment
+    verdict = verdict_of(result)
+    console = Console(highlight=False)
+    console.print(Text(verdict.headline, style=f"bold {COLOURS[verdict.level]}"), soft_wrap=True)
+    table = Table(show_header=False, box=None, padding=(0, 2, 0, 0))
+    for name, value in _figures(result):
+        table.add_row(Text(name, style="dim"), Text(value))
+    console.print(table)
+    for line in verdict.remarks:
+        console.print(Text(f"! {line}", style="yellow"), soft_wrap=True)
+    for failed in result.failed:
+        console.print(Text(f"  {failed.image}: {failed.reason}"), soft_wrap=True)
+    if verbose:
+        for warning in result.warnings:
+            console.print(Text(f"  {warning}"), soft_wrap=True)
+        console.print(_photograph_table(result))
+        for camera in a.estimate.cameras:
+            values = ", ".join(
+                f"{name} {significant(value, 6)} {unit}"
+                for name, value, unit, free in zip(
+                    camera.names, camera.parameters, camera.units, camera.free, strict=True
+                )
+                if free
+            )
+            console.print(Text(f"  camera {camera.name} ({camera.model}): {values}"))
+    console.print(Text(f"Report: {page}", style="bold"), soft_wrap=True)
+
+
+def _figures(result: SurveyResult) -> tuple[tuple[str, str], ...]:
+    """Return the figures of the summary, each with its unit."""
+    a = result.adjustment
+    coded = int((result.code >= 0).sum())
+    rejected = int(a.rejected.sum())
+    sigma = point_sigmas(a)
+    typical, largest = root_mean_square(sigma), float(sigma.max())
+    factor, unit = finer_unit(result.unit, largest)
+    rows = [
+        ("photographs", f"{len(a.network.images)} of {result.images_total} oriented"),
+        (
+            "object points",
+            f"{len(a.network.points)} ({coded} coded, {len(a.network.points) - coded} uncoded)",
+        ),
+        ("image points", f"{len(a.rejected) - rejected} accepted, {rejected} rejected"),
+        ("adjustment", f"{'converged' if a.converged else 'NOT converged'}, {a.iterations} iterations"),
+        ("datum", f"{a.datum}, rank defect {a.defect} (expected {a.expected_defect})"),
+        ("sigma0", f"{a.sigma0_px:.4f} px (redundancy {a.redundancy})"),
+        ("residuals", f"RMS {a.rms_px:.4f} px per coordinate, largest {a.max_residual_px:.3f} px"),
+        (
+            "point precision",
+            f"{significant(typical * factor)} {unit} RMS, {significant(largest * factor)} {unit} at most",
+        ),
+    ]
+    check = result.control_check
+    if check is not None:
+        factor, unit = finer_unit(result.unit, float(abs(check.differences).max()))
+        dx, dy, dz = (significant(value * factor) for value in check.rms)
+        rows.append(
+            ("check at control", f"RMS {dx}, {dy}, {dz} {unit} in X, Y, Z at {len(check.points)} points")
+        )
+    both = result.comparison
+    if both is not None:
+        word = "agrees" if both.agree else "DIFFERS"
+        rms = both.comparison.rms_px
+        rows.append(
+            (both.backend, f"{word}: RMS {rms[0]:.7f} px (kolinear), {rms[1]:.7f} px ({both.backend})")
+        )
+    rows.append(("time", f"{sum(time.seconds for time in result.seconds):.1f} s"))
+    return tuple(rows)
+
+
+def _photograph_table(result: SurveyResult) -> Table:
+    """Return measured targets and rejected candidates of each photograph."""
+    table = Table(box=None, padding=(0, 2, 0, 0))
+    for name in ("photograph", "targets", "rejected candidates"):
+        table.add_column(name, justify="left" if name != "targets" else "right")
+    for photograph in result.photographs:
+        reasons = ", ".join(f"{count} {reason}" for reason, count in photograph.reasons())
+        table.add_row(Text(photograph.image), str(len(photograph.xy)), Text(reasons))
+    return table
+
+
+def _one_line(text: str) -> str:
+    """Return a message on one line, without control characters that a file name may carry."""
+    return "".join(c if c.isprintable() else " " for c in text)
