@@ -1,0 +1,192 @@
+"""The collinearity equations of one image point: weighted residual and derivatives.
+
+    (U, V, W) = M (X - X0),  u = -U/W,  v = -V/W,  r = model(u, v, p) - measured
+
+The unknowns of a photograph are its projection centre X0 and a small rotation w in its own image
+axes, R <- R exp([w]x), so that d(U, V, W)/dw = [(U, V, W)]x and no angle is singular.
+
+Source: Kraus, Photogrammetry (2007), sec. 5.3; small rotations as in Foerstner and Wrobel (2016),
+sec. 8.1 and 12.2.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from sfm.camera import MAX_PARAMETERS, observe
+from sfm.conventions import BoolArray, FloatArray, IntArray
+
+
+class Observations(NamedTuple):
+    """Image points in the order of their object points, as compiled code takes them."""
+
+    start: IntArray  # first image point of each object point, and the end, (n + 1,)
+    image: IntArray  # photograph of each image point, (k,)
+    point: IntArray  # object point of each image point, (k,)
+    xy: FloatArray  # measured pixel, px, (k, 2)
+    whitening: FloatArray  # a, b, c of F = (a 0; b c) with F'F = inverse covariance, 1/px, (k, 3)
+    camera: IntArray  # camera of each photograph, (m,)
+    model: IntArray  # number of the distortion model of each camera, (a,)
+    frame: FloatArray  # photograph centre (px) and pixel size (mm) of each camera, (a, 4)
+    free_count: IntArray  # how many parameters of each camera are free, (a,)
+    free_index: IntArray  # which they are, (a, MAX_PARAMETERS)
+    exterior_free: FloatArray  # 1 where an exterior unknown is free, else 0, (m, 6)
+    point_free: FloatArray  # 1 where an object coordinate is free, else 0, (n, 3)
+
+
+class State(NamedTuple):
+    """Values of all parameters, as compiled code takes them."""
+
+    position: FloatArray  # X0, (m, 3)
+    M: FloatArray  # object to image axes, (m, 3, 3)
+    parameters: FloatArray  # interior orientation, (a, MAX_PARAMETERS)
+    points: FloatArray  # X, (n, 3)
+
+
+class Scratch(NamedTuple):
+    """Space of one image point for the compiled functions."""
+
+    r: FloatArray  # residual, px, (2,)
+    Ju: FloatArray  # (2, 2)
+    Jp: FloatArray  # (2, MAX_PARAMETERS)
+    A: FloatArray  # weighted d r / d (X0, w), (2, 6)
+    Ai: FloatArray  # weighted d r / d free interior parameters, (2, MAX_PARAMETERS)
+    B: FloatArray  # weighted d r / d X, (2, 3)
+
+
+@njit(cache=True)
+def scratch():  # type: ignore[no-untyped-def]
+    """Return space for one image point."""
+    return Scratch(
+        np.empty(2),
+        np.empty((2, 2)),
+        np.zeros((2, MAX_PARAMETERS)),
+        np.empty((2, 6)),
+        np.zeros((2, MAX_PARAMETERS)),
+        np.empty((2, 3)),
+    )
+
+
+@njit(cache=True)
+def collinearity(o, obs, state, weight, t):  # type: ignore[no-untyped-def]
+    """Fill the weighted residual and derivatives of image point o; False if it is behind the camera."""
+    i, j = obs.image[o], obs.point[o]
+    a = obs.camera[i]
+    M = state.M[i]
+    dX = state.points[j, 0] - state.position[i, 0]
+    dY = state.points[j, 1] - state.position[i, 1]
+    dZ = state.points[j, 2] - state.position[i, 2]
+    U = M[0, 0] * dX + M[0, 1] * dY + M[0, 2] * dZ
+    V = M[1, 0] * dX + M[1, 1] * dY + M[1, 2] * dZ
+    W = M[2, 0] * dX + M[2, 1] * dY + M[2, 2] * dZ
+    if not W < 0.0:
+        return False
+    inverse = -1.0 / W
+    u, v = U * inverse, V * inverse
+    observe(
+        obs.model[a], obs.frame[a], state.parameters[a], obs.xy[o, 0], obs.xy[o, 1], u, v, t.r, t.Ju, t.Jp
+    )
+    root = np.sqrt(weight)
+    f00, f10, f11 = root * obs.whitening[o, 0], root * obs.whitening[o, 1], root * obs.whitening[o, 2]
+    t.r[1] = f10 * t.r[0] + f11 * t.r[1]
+    t.r[0] = f00 * t.r[0]
+    x_u, x_v = f00 * t.Ju[0, 0] * inverse, f00 * t.Ju[0, 1] * inverse
+    y_u = (f10 * t.Ju[0, 0] + f11 * t.Ju[1, 0]) * inverse
+    y_v = (f10 * t.Ju[0, 1] + f11 * t.Ju[1, 1]) * inverse
+    for row in range(2):
+        # G = d r / d (U, V, W); du/d(U, V, W) = -(1, 0, u)/W because u = -U/W
+        G0, G1 = (x_u, x_v) if row == 0 else (y_u, y_v)
+        G2 = G0 * u + G1 * v
+        for b in range(3):
+            d = G0 * M[0, b] + G1 * M[1, b] + G2 * M[2, b]
+            t.B[row, b] = d * obs.point_free[j, b]
+            t.A[row, b] = -d * obs.exterior_free[i, b]
+        t.A[row, 3] = (G1 * W - G2 * V) * obs.exterior_free[i, 3]
+        t.A[row, 4] = (G2 * U - G0 * W) * obs.exterior_free[i, 4]
+        t.A[row, 5] = (G0 * V - G1 * U) * obs.exterior_free[i, 5]
+    for q in range(obs.free_count[a]):
+        s = obs.free_index[a, q]
+        t.Ai[0, q] = f00 * t.Jp[0, s]
+        t.Ai[1, q] = f10 * t.Jp[0, s] + f11 * t.Jp[1, s]
+    return True
+
+
+@njit(cache=True)
+def sum_of_squares(obs, state, weight):  # type: ignore[no-untyped-def]
+    """Return v'Pv of the image points; infinite where one of weight > 0 lies behind its camera."""
+    t = scratch()
+    total = 0.0
+    for o in range(len(obs.image)):
+        if weight[o] == 0.0:
+            continue
+        if not _residual(o, obs, state, t):
+            return np.inf
+        x = obs.whitening[o, 0] * t.r[0]
+        y = obs.whitening[o, 1] * t.r[0] + obs.whitening[o, 2] * t.r[1]
+        total += weight[o] * (x * x + y * y)
+    return total
+
+
+@njit(cache=True)
+def residuals(obs, state):  # type: ignore[no-untyped-def]
+    """Return v = computed - measured of all image points, px, (k, 2); NaN behind the camera."""
+    t = scratch()
+    v = np.empty((len(obs.image), 2))
+    for o in range(len(obs.image)):
+        in_front = _residual(o, obs, state, t)
+        v[o, 0] = t.r[0] if in_front else np.nan
+        v[o, 1] = t.r[1] if in_front else np.nan
+    return v
+
+
+@njit(cache=True)
+def _residual(o, obs, state, t):  # type: ignore[no-untyped-def]
+    """Fill the unweighted residual of image point o; False if it is behind the camera."""
+    i, j = obs.image[o], obs.point[o]
+    a = obs.camera[i]
+    M = state.M[i]
+    dX = state.points[j, 0] - state.position[i, 0]
+    dY = state.points[j, 1] - state.position[i, 1]
+    dZ = state.points[j, 2] - state.position[i, 2]
+    U = M[0, 0] * dX + M[0, 1] * dY + M[0, 2] * dZ
+    V = M[1, 0] * dX + M[1, 1] * dY + M[1, 2] * dZ
+    W = M[2, 0] * dX + M[2, 1] * dY + M[2, 2] * dZ
+    if not W < 0.0:
+        return False
+    observe(
+        obs.model[a],
+        obs.frame[a],
+        state.parameters[a],
+        obs.xy[o, 0],
+        obs.xy[o, 1],
+        -U / W,
+        -V / W,
+        t.r,
+        t.Ju,
+        t.Jp,
+    )
+    return True
+
+
+def whitening_of(covariance: FloatArray) -> FloatArray:
+    """Return a, b, c of F = (a 0; b c) with F'F = inverse covariance, shape (k, 3).
+
+    Args:
+        covariance: of image points, px^2, shape (k, 2, 2).
+
+    The inverse of the Cholesky factor of the covariance.
+    """
+    sx = np.sqrt(covariance[:, 0, 0])
+    slope = covariance[:, 0, 1] / sx
+    sy = np.sqrt(covariance[:, 1, 1] - slope**2)
+    return np.stack([1 / sx, -slope / (sx * sy), 1 / sy], axis=1)
+
+
+def behind_camera(obs: Observations, state: State) -> BoolArray:
+    """Return which image points belong to object points behind their camera or undetermined, (k,)."""
+    d = state.points[obs.point] - state.position[obs.image]
+    W = (state.M[obs.image, 2] * d).sum(axis=1)
+    return np.asarray(~(W < 0))

@@ -1,0 +1,74 @@
+"""Rank defect of the normal equations, found numerically, and what it leaves undetermined, in words."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+import numpy as np
+
+from sfm.adjustment.iterate import Optimum
+from sfm.adjustment.parameters import Unknowns
+from sfm.conventions import FloatArray
+from sfm.network import Estimate, Network
+
+LEADING = 0.1  # share of the largest component of a null vector from which a parameter is named
+EXTERIOR = ("X0", "Y0", "Z0", "x rotation", "y rotation", "z rotation")
+
+
+def rank_defect(optimum: Optimum, layout: Unknowns) -> int:
+    """Return the rank defect of the normal equations without datum.
+
+    It counts the motions that the normal matrix maps to zero, its further null vectors, directions of
+    object points that their rays leave open, and the unknowns held for want of image points.
+    """
+    found = optimum.factor.verified + optimum.factor.further.shape[1]
+    return found + int(optimum.normals.blocks.held.sum()) + layout.held_defect
+
+
+def undetermined_of(
+    optimum: Optimum, layout: Unknowns, network: Network, estimate: Estimate, *, allowed_motions: int
+) -> tuple[str, ...]:
+    """Return what cannot be determined, in words; empty if everything can.
+
+    Args:
+        optimum: undamped normal equations and their factor.
+        layout: order of the unknowns.
+        network, estimate: for the names.
+        allowed_motions: defect that the kind of datum is meant to fix.
+    """
+    words = list(layout.held)
+    words += [
+        f"point {network.points[j]}: its rays are parallel"
+        for j in np.flatnonzero(optimum.normals.blocks.held)
+    ]
+    if optimum.motions.defect > allowed_motions:
+        words.append(
+            f"datum: {optimum.motions.defect - allowed_motions} of the seven of position, attitude and scale "
+            "are not determined by the control"
+        )
+    words += [_name(vector, layout, network, estimate) for vector in optimum.factor.further.T]
+    return tuple(words)
+
+
+def reduced_names(layout: Unknowns, network: Network, estimate: Estimate) -> list[tuple[str, str]]:
+    """Return (parameter, of what) of each reduced unknown."""
+    names = [(part, f"photograph {image}") for image in network.images for part in EXTERIOR]
+    for camera, free in zip(estimate.cameras, layout.interior_free, strict=True):
+        names += [(camera.names[s], f"camera {camera.name}") for s in free]
+    names += [(axis, f"point {network.points[j]}") for j in layout.kept for axis in "XYZ"]
+    return names
+
+
+def _name(vector: FloatArray, layout: Unknowns, network: Network, estimate: Estimate) -> str:
+    """Return the leading parameters of a null vector: "c, y0 of camera A with Z0 of 12 photographs"."""
+    size = np.abs(vector)
+    names = reduced_names(layout, network, estimate)
+    leading = [names[r] for r in np.argsort(-size) if size[r] >= LEADING * size.max()]
+    interior = [f"{part} of {owner}" for part, owner in leading if owner.startswith("camera")]
+    others = Counter(part for part, owner in leading if not owner.startswith("camera"))
+    single = {part: owner for part, owner in leading if not owner.startswith("camera")}
+    parts = interior + [
+        f"{part} of {single[part]}" if count == 1 else f"{part} of {count} photographs"
+        for part, count in others.items()
+    ]
+    return "not separable: " + ", ".join(parts)

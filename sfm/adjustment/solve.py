@@ -1,0 +1,234 @@
+"""Adjustment of a network by least squares: from measurements and start values to the solution,
+its statistics and its covariance.
+
+Unified least squares on the collinearity equations with self-calibration; gross errors by iterative
+data snooping; rank defect found numerically; nothing is damped where the result is taken.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from sfm.adjustment.collinearity import behind_camera, residuals
+from sfm.adjustment.covariance import Cofactors, cofactors, hat_complement, marginal_covariance
+from sfm.adjustment.datum import Datum
+from sfm.adjustment.iterate import TOLERANCE, Optimum, iterate
+from sfm.adjustment.parameters import Unknowns, estimate_of, start_weights, unknowns_of
+from sfm.adjustment.rank import rank_defect, undetermined_of
+from sfm.adjustment.reliability import redundancy_numbers
+from sfm.adjustment.result import Adjustment, Covariance
+from sfm.adjustment.robust import huber_weights, snoop
+from sfm.adjustment.weighted import Weighted, weighted_of
+from sfm.conventions import FloatArray
+from sfm.errors import GeometryError
+from sfm.network import Estimate, Network
+
+MAX_ROUNDS = 200  # of data snooping
+HUBER_ROUNDS = 30
+HUBER_SETTLED = 1e-3  # largest change of a weight at which reweighting ends
+NORMAL_MAD = 1.4826  # standard deviation of a normal variable over its median absolute deviation
+REJECTS = ("tau", "huber", "none")
+
+
+def adjust(
+    network: Network,
+    estimate: Estimate,
+    *,
+    datum: Datum,
+    sigma_px: float = 0.1,
+    reject: str = "tau",
+    alpha: float = 0.001,
+    method: str = "levenberg-marquardt",
+    max_iterations: int = 50,
+    tolerance: float = TOLERANCE,
+    covariance: bool = True,
+) -> Adjustment:
+    """Return the least-squares adjustment of a network.
+
+    Weights are the inverse covariances of the observations. Which interior parameters are free is
+    said by the cameras of the estimate.
+
+    Args:
+        network: what was measured.
+        estimate: start values; NaN where a photograph or point has none (it is held out and named).
+        datum: how position, attitude and scale are decided.
+        sigma_px: standard deviation of unit weight, in which sigma0_px is told, px.
+        reject: "tau" (data snooping by Pope's test), "huber" (reweighting) or "none".
+        alpha: probability with which the test of one image coordinate rejects a good one.
+        method: "gauss-newton" (line search) or "levenberg-marquardt" (ends in undamped Gauss-Newton).
+        max_iterations: steps at most, in each round of the robust test.
+        tolerance: |A dx| / |v| at which the iteration has converged.
+        covariance: whether covariance and redundancy numbers are wanted; NaN otherwise.
+
+    Raises:
+        GeometryError: nothing to adjust, an unknown option, or datum points that cannot carry the datum.
+    """
+    if reject not in REJECTS:
+        raise GeometryError(f"adjustment: reject '{reject}' is none of {', '.join(REJECTS)}")
+    use_control = datum.kind == "control"
+    layout, state = unknowns_of(network, estimate, use_control=use_control)
+    weighted = weighted_of(network, layout, use_control=use_control)
+    weight = start_weights(layout, state)
+    run = _Run(layout, weighted, datum, method, max_iterations, tolerance)
+    optimum, weight = run.minimise(run.start(state, weight), weight)
+    if reject == "tau":
+        optimum, weight = _snoop_all(run, optimum, weight, alpha)
+    elif reject == "huber":
+        optimum, weight = _huber(run, optimum, weight)
+    Q = cofactors(optimum, layout) if covariance else None
+    return _result(network, estimate, run, optimum, weight, Q, sigma_px)
+
+
+@dataclass
+class _Run:
+    """What stays the same over the rounds of one adjustment, and the steps taken so far."""
+
+    layout: Unknowns
+    weighted: Weighted
+    datum: Datum
+    method: str
+    max_iterations: int
+    tolerance: float
+    iterations: int = 0
+
+    def start(self, state, weight: FloatArray) -> Optimum:  # type: ignore[no-untyped-def]
+        """Return the optimum from start values by the method asked for."""
+        return self._iterate(state, weight, self.method)
+
+    def minimise(self, optimum: Optimum, weight: FloatArray) -> tuple[Optimum, FloatArray]:
+        """Return the optimum with image points that were behind their camera at the start back in."""
+        ready = self.layout.active & ~behind_camera(self.layout.obs, optimum.state)
+        if (ready & (weight == 0)).any():
+            weight = np.where(ready, 1.0, weight)
+            optimum = self._iterate(optimum.state, weight, self.method)
+        return optimum, weight
+
+    def again(self, optimum: Optimum, weight: FloatArray) -> Optimum:
+        """Return the optimum with other weights, from a near one."""
+        return self._iterate(optimum.state, weight, "gauss-newton")
+
+    def redundancy(self, optimum: Optimum, weight: FloatArray) -> int:
+        """Observations and constraints minus unknowns."""
+        held = optimum.motions.defect + optimum.factor.further.shape[1]
+        held += int(optimum.normals.blocks.held.sum())
+        observations = 2 * int((weight > 0).sum()) + self.weighted.count
+        return observations - self.layout.count + held
+
+    def _iterate(self, state, weight: FloatArray, method: str) -> Optimum:  # type: ignore[no-untyped-def]
+        optimum = iterate(
+            self.layout,
+            self.weighted,
+            state,
+            weight,
+            self.datum,
+            method=method,
+            max_iterations=self.max_iterations,
+            tolerance=self.tolerance,
+        )
+        self.iterations += optimum.iterations
+        return optimum
+
+
+def _snoop_all(run: _Run, optimum: Optimum, weight: FloatArray, alpha: float) -> tuple[Optimum, FloatArray]:
+    """Return the optimum without the image points that fail Pope's test."""
+    layout = run.layout
+    returned = np.zeros(len(weight), dtype=bool)
+    for _ in range(MAX_ROUNDS):
+        redundancy = run.redundancy(optimum, weight)
+        if redundancy < 2 or not optimum.converged:
+            break
+        v = residuals(layout.obs, optimum.state)
+        complement = hat_complement(optimum, layout, cofactors(optimum, layout), weight)
+        out, back = snoop(
+            layout.obs, v, complement, weight > 0, vPv=optimum.vPv, redundancy=redundancy, alpha=alpha
+        )
+        back &= layout.active & ~returned
+        if not (out.any() or back.any()):
+            break
+        if out.any():
+            weight = np.where(out, 0.0, weight)
+        else:  # take back only once nothing large is left
+            weight = np.where(back, 1.0, weight)
+            returned |= back
+        optimum = run.again(optimum, weight)
+    return optimum, weight
+
+
+def _huber(run: _Run, optimum: Optimum, weight: FloatArray) -> tuple[Optimum, FloatArray]:
+    """Return the optimum of Huber's estimator by reweighting."""
+    base = (weight > 0).astype(float)
+    for _ in range(HUBER_ROUNDS):
+        v = residuals(run.layout.obs, optimum.state)
+        a, b, c = run.layout.obs.whitening[base > 0].T
+        used = v[base > 0]
+        whitened = np.abs(np.concatenate([a * used[:, 0], b * used[:, 0] + c * used[:, 1]]))
+        sigma0 = max(NORMAL_MAD * float(np.median(whitened)), np.finfo(float).tiny)
+        new = base * np.nan_to_num(huber_weights(run.layout.obs, v, sigma0=sigma0))
+        change = float(np.abs(new - weight).max())
+        weight = new
+        optimum = run.again(optimum, weight)
+        if change <= HUBER_SETTLED:
+            break
+    return optimum, weight
+
+
+def _result(
+    network: Network,
+    estimate: Estimate,
+    run: _Run,
+    optimum: Optimum,
+    weight: FloatArray,
+    Q: Cofactors | None,
+    sigma_px: float,
+) -> Adjustment:
+    layout = run.layout
+    redundancy = run.redundancy(optimum, weight)
+    sigma0 = float(np.sqrt(optimum.vPv / redundancy)) if redundancy > 0 else float("nan")
+    k, n, m = len(weight), len(network.points), len(network.images)
+    numbers = np.full((k, 2), np.nan)
+    if Q is None:
+        empty = np.full((n, 3, 3), np.nan)
+        interior = tuple(np.full((len(free), len(free)), np.nan) for free in layout.interior_free)
+        result = Covariance(empty, np.full((m, 6, 6), np.nan), interior, empty)
+    else:
+        result = marginal_covariance(optimum, layout, Q, sigma0**2)
+        result = _without_held(result, layout)
+        complement = hat_complement(optimum, layout, Q, weight)
+        numbers = redundancy_numbers(complement, layout.obs.whitening)
+        numbers[weight == 0] = np.nan
+    unsorted = np.empty(k, dtype=np.int64)
+    unsorted[layout.order] = np.arange(k)
+    allowed = 0 if run.datum.kind == "control" else 7
+    return Adjustment(
+        network=network,
+        estimate=estimate_of(optimum.state, estimate),
+        converged=optimum.converged,
+        iterations=run.iterations,
+        datum=run.datum.kind,
+        defect=rank_defect(optimum, layout),
+        expected_defect=optimum.motions.defect,
+        undetermined=undetermined_of(optimum, layout, network, estimate, allowed_motions=allowed),
+        residuals=residuals(layout.obs, optimum.state)[unsorted],
+        rejected=(weight == 0)[unsorted],
+        redundancy_numbers=numbers[unsorted],
+        sigma_px=sigma_px,
+        sigma0=sigma0,
+        redundancy=redundancy,
+        unknowns=layout.count,
+        observations=2 * int((weight > 0).sum()) + run.weighted.count,
+        covariance=result,
+    )
+
+
+def _without_held(covariance: Covariance, layout: Unknowns) -> Covariance:
+    """Return the covariance with NaN for photographs and points that took no part."""
+    n, m = len(layout.point_free), len(layout.exterior_free)
+    idle_point = ~np.isin(np.arange(n), layout.obs.point[layout.active])
+    idle_image = ~np.isin(np.arange(m), layout.obs.image[layout.active])
+    points, limiting = covariance.points.copy(), covariance.points_limiting.copy()
+    exterior = covariance.exterior.copy()
+    points[idle_point] = limiting[idle_point] = np.nan
+    exterior[idle_image] = np.nan
+    return replace(covariance, points=points, exterior=exterior, points_limiting=limiting)
