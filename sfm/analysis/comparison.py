@@ -1,0 +1,352 @@
+"""Comparison of two solutions of one network, and of two adjusters on one network.
+
+The datum is no part of a solution: one is brought onto the other by a 7-parameter similarity over the
+object points before anything is subtracted. Two adjusters are compared on what both can do: the accepted
+image points with equal weights, no control and no scale bars, and one functional model, which for a
+survey in `brown` is `full_opencv`.
+
+With all twelve parameters free, full_opencv is near to singular: a factor common to the numerator and
+the denominator of its radial term changes nothing, and COLMAP frees the distortion as a whole or not at
+all. Where the image points cannot tell k1-k3 from k4-k6, the distortion is therefore held at the survey's
+result in both adjusters, and the comparison says so.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+import numpy as np
+
+from sfm.adjustment.datum import Datum
+from sfm.adjustment.result import Adjustment
+from sfm.adjustment.solve import adjust
+from sfm.analysis.conversion import Conversion, convert_camera
+from sfm.camera import Camera, pixel_from_tangents, project, tangents_from_pixel
+from sfm.conventions import BoolArray, FloatArray, IntArray
+from sfm.errors import GeometryError
+from sfm.network import Estimate, ImagePoints, Network, reduce_network
+from sfm.similarity import Similarity, fit_similarity
+
+EFFECT_STEPS = 9  # places along each side of the photograph where interior orientations are compared
+MAX_ITERATIONS = 200  # the weak directions of full_opencv take more steps than a survey
+MIN_RAYS = 2  # photographs that a point must be in to be determined by them
+MIN_POINTS = 3  # points that a photograph must show to be determined by them
+GROUPS = (slice(0, 2), slice(2, 4), slice(4, None))  # focal lengths, principal point, distortion
+
+
+@dataclass(frozen=True)
+class Thresholds:
+    """Largest differences with which two solutions are the same optimum."""
+
+    rms_px: float = 1e-6  # px
+    rotation_deg: float = 1e-6  # deg
+    position: float = 1e-7  # of the object size
+    point: float = 1e-7  # of the object size
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Differences b - a of two solutions of one network after a similarity of b onto a."""
+
+    names: tuple[str, str]  # of a and b
+    a: Estimate  # first solution
+    b: Estimate  # second solution, in the datum of the first
+    a_from_b: Similarity
+    object_size: float  # diagonal of the box around the object points, object unit
+    position: FloatArray  # of the projection centres, object unit, (m, 3)
+    rotation_deg: FloatArray  # angle between the two rotations of each photograph, deg, (m,)
+    points: FloatArray  # of the object points, object unit, (n, 3)
+    interior: tuple[FloatArray, ...]  # of the parameters of each camera, their units; NaN across models
+    interior_px: FloatArray  # largest shift of a ray in the photograph, px, (cameras,)
+    rms_px: tuple[float, float]  # root mean square residual per coordinate of a and b, px
+    cost: tuple[float, float]  # half the sum of squared residuals of a and b, px^2
+    exceeded: tuple[str, ...]  # thresholds that were exceeded, in words; empty if they agree
+
+    @property
+    def agree(self) -> bool:
+        """Whether both are the same optimum within all thresholds."""
+        return not self.exceeded
+
+    @property
+    def max_position(self) -> float:
+        """Largest difference of a projection centre, object unit."""
+        return _longest(self.position)
+
+    @property
+    def max_rotation_deg(self) -> float:
+        """Largest angle between two rotations, deg."""
+        return float(np.max(self.rotation_deg, initial=0.0))
+
+    @property
+    def max_point(self) -> float:
+        """Largest difference of an object point, object unit."""
+        return _longest(self.points)
+
+
+@dataclass(frozen=True)
+class AdjusterComparison:
+    """Two adjusters on the same network, model, weights and start values."""
+
+    backend: str  # the other adjuster
+    model: str  # functional model of both
+    conversions: tuple[Conversion, ...]  # of each camera from the survey's model; misfit 0 if it is the same
+    freed: tuple[str, ...]  # cameras with more free parameters than the survey's, in words
+    held: tuple[
+        str, ...
+    ]  # why the distortion was held at the survey's result, in words; empty if it was free
+    network: Network  # accepted image points with unit weights, as both had them
+    adjustment: Adjustment  # the in-house one in that model
+    backend_iterations: int  # steps of the other adjuster
+    backend_converged: bool
+    backend_seconds: float  # s
+    comparison: Comparison
+
+    @property
+    def agree(self) -> bool:
+        """Whether both converged to the same optimum."""
+        return self.comparison.agree and self.adjustment.converged and self.backend_converged
+
+
+class BackendAdjustment(Protocol):
+    """What another adjuster must return."""
+
+    @property
+    def estimate(self) -> Estimate: ...
+    @property
+    def iterations(self) -> int: ...
+    @property
+    def converged(self) -> bool: ...
+    @property
+    def seconds(self) -> float: ...
+
+
+def compare(
+    a: Estimate,
+    b: Estimate,
+    network: Network,
+    *,
+    names: tuple[str, str] = ("kolinear", "colmap"),
+    thresholds: Thresholds | None = None,
+) -> Comparison:
+    """Compare two solutions of the same network, whatever datum each is in.
+
+    Args:
+        a, b: the solutions; photographs and points that only one of them has are not compared.
+        network: the image points for the residuals of both.
+        names: what to call a and b.
+        thresholds: differences up to which they agree.
+
+    Raises:
+        GeometryError: fewer than three points in common, or all of them on a line.
+    """
+    limits = Thresholds() if thresholds is None else thresholds
+    both = a.determined & b.determined
+    a_from_b = fit_similarity(b.points[both], a.points[both])
+    moved = a_from_b.apply_estimate(b)
+    images = a.oriented & b.oriented
+    size = float(np.linalg.norm(np.ptp(a.points[both], axis=0)))
+    position = np.where(images[:, None], moved.position - a.position, np.nan)
+    points = np.where(both[:, None], moved.points - a.points, np.nan)
+    angle = np.full(len(images), np.nan)
+    angle[images] = rotation_angle_deg(a.rotation[images], moved.rotation[images])
+    squares = [(reprojection(network, estimate) ** 2).ravel() for estimate in (a, b)]
+    rms = tuple(float(np.sqrt(np.mean(s))) if len(s) else 0.0 for s in squares)
+    found = (
+        ("RMS", abs(rms[0] - rms[1]), limits.rms_px, "px"),
+        ("rotation", float(np.nanmax(angle, initial=0.0)), limits.rotation_deg, "deg"),
+        ("position", _longest(position) / size, limits.position, "of the object size"),
+        ("point", _longest(points) / size, limits.point, "of the object size"),
+    )
+    return Comparison(
+        names,
+        a,
+        moved,
+        a_from_b,
+        size,
+        position,
+        angle,
+        points,
+        tuple(_difference(p, q) for p, q in zip(a.cameras, b.cameras, strict=True)),
+        np.array([interior_effect_px(p, q) for p, q in zip(a.cameras, b.cameras, strict=True)]),
+        (rms[0], rms[1]),
+        (float(squares[0].sum() / 2), float(squares[1].sum() / 2)),
+        tuple(
+            f"{what} differs by {value:.2g} {unit}, {limit:.2g} is allowed"
+            for what, value, limit, unit in found
+            if not value <= limit
+        ),
+    )
+
+
+def compare_adjusters(
+    adjustment: Adjustment,
+    backend: Callable[[Network, Estimate], BackendAdjustment],
+    *,
+    name: str = "colmap",
+    model: str | None = None,
+    thresholds: Thresholds | None = None,
+) -> AdjusterComparison:
+    """Run the in-house adjuster and another one on the accepted image points of a survey.
+
+    Both start from the survey's result with its cameras converted, all image coordinates have the same
+    weight, and the datum is free.
+
+    Args:
+        adjustment: of the survey.
+        backend: the other adjuster, a function of network and start values.
+        name: of the backend.
+        model: functional model of both; that of the survey if it is an opencv one, else full_opencv.
+        thresholds: differences up to which they agree.
+
+    Raises:
+        GeometryError: nothing is left to compare.
+        BackendError: the backend refuses.
+    """
+    network, start, conversions, freed = common_problem(adjustment, model=model)
+    ours = _adjusted(network, start, adjustment.sigma_px)
+    held: tuple[str, ...] = ()
+    if start.cameras[0].model == "full_opencv" and (ours.undetermined or not ours.converged):
+        held = ours.undetermined or ("the in-house adjuster does not converge with the distortion free",)
+        start = replace(start, cameras=tuple(_distortion_held(camera) for camera in start.cameras))
+        ours = _adjusted(network, start, adjustment.sigma_px)
+    theirs = backend(network, start)
+    return AdjusterComparison(
+        name,
+        start.cameras[0].model,
+        conversions,
+        freed,
+        held,
+        network,
+        ours,
+        theirs.iterations,
+        theirs.converged,
+        theirs.seconds,
+        compare(ours.estimate, theirs.estimate, network, names=("kolinear", name), thresholds=thresholds),
+    )
+
+
+def _adjusted(network: Network, start: Estimate, sigma_px: float) -> Adjustment:
+    return adjust(
+        network,
+        start,
+        datum=Datum("free"),
+        sigma_px=sigma_px,
+        reject="none",
+        max_iterations=MAX_ITERATIONS,
+    )
+
+
+def _distortion_held(camera: Camera) -> Camera:
+    free = camera.free.copy()
+    free[GROUPS[2]] = False
+    return replace(camera, free=free)
+
+
+def common_problem(
+    adjustment: Adjustment, *, model: str | None = None
+) -> tuple[Network, Estimate, tuple[Conversion, ...], tuple[str, ...]]:
+    """Return the network, start values, conversions and changes of free parameters of a comparison.
+
+    Left are photographs that are oriented and show three points, points in two photographs, and accepted
+    image points, each with the covariance sigma_px^2 I. Parameters of a group that COLMAP frees as a
+    whole (focal lengths, principal point, distortion) are all free if one of them is, and in all cameras
+    that are not fixed.
+    """
+    estimate = adjustment.estimate
+    cameras = estimate.cameras
+    if model is None:
+        forward = {camera.model for camera in cameras if not camera.model.startswith("brown")}
+        all_opencv = forward == {"opencv"} and not any(c.model.startswith("brown") for c in cameras)
+        model = "opencv" if all_opencv else "full_opencv"
+    conversions = tuple(convert_camera(camera, model) for camera in cameras)
+    converted = tuple(conversion.camera for conversion in conversions)
+    grouped = grouped_free(converted)
+    freed = tuple(
+        f"{camera.name}: " + ", ".join(np.array(camera.names)[now.free & ~camera.free])
+        for camera, now in zip(converted, grouped, strict=True)
+        if (now.free & ~camera.free).any()
+    )
+    images, points = estimate.oriented, estimate.determined
+    accepted = ~adjustment.rejected
+    seen = adjustment.network.image_points
+    while True:
+        use = accepted & images[seen.image] & points[seen.point]
+        rays = np.bincount(seen.point[use], minlength=len(points))
+        shown = np.bincount(seen.image[use], minlength=len(images))
+        kept_images, kept_points = images & (shown >= MIN_POINTS), points & (rays >= MIN_RAYS)
+        if (kept_images == images).all() and (kept_points == points).all():
+            break
+        images, points = kept_images, kept_points
+    if images.sum() < 2:
+        raise GeometryError("comparison: fewer than two photographs with accepted image points are left")
+    network, start = reduce_network(
+        adjustment.network, replace(estimate, cameras=grouped), images, points, use
+    )
+    seen = network.image_points
+    unit = np.tile(np.eye(2) * adjustment.sigma_px**2, (len(seen), 1, 1))
+    # Nothing but image points: no control, scale bars or other observations.
+    network = Network(
+        network.images, network.camera, network.points, ImagePoints(seen.image, seen.point, seen.xy, unit)
+    )
+    return network, start, conversions, freed
+
+
+def grouped_free(cameras: tuple[Camera, ...]) -> tuple[Camera, ...]:
+    """Return opencv cameras whose free parameters are whole groups, the same in all that are not fixed."""
+    free = [any(camera.free[group].any() for camera in cameras) for group in GROUPS]
+    out = []
+    for camera in cameras:
+        flags: BoolArray = np.zeros(len(camera.names), dtype=bool)
+        if camera.free.any():
+            for group, is_free in zip(GROUPS, free, strict=True):
+                flags[group] = is_free
+        out.append(replace(camera, free=flags))
+    return tuple(out)
+
+
+def reprojection(network: Network, estimate: Estimate) -> FloatArray:
+    """Return computed minus measured pixels of the image points that the estimate determines, (k, 2)."""
+    seen = network.image_points
+    use = estimate.oriented[seen.image] & estimate.determined[seen.point]
+    v = np.zeros((len(seen), 2))
+    for i in np.unique(seen.image[use]):
+        rows: IntArray = np.flatnonzero(use & (seen.image == i))
+        computed = project(
+            estimate.cameras[network.camera[i]],
+            estimate.position[i],
+            estimate.rotation[i],
+            estimate.points[seen.point[rows]],
+        )
+        v[rows] = computed - seen.xy[rows]
+    return v[use]
+
+
+def rotation_angle_deg(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Return the angle between rotations, shape (k, 3, 3) each, deg; exact to rounding near 0."""
+    D = np.einsum("kji,kjl->kil", a, b)
+    sine = np.stack([D[:, 2, 1] - D[:, 1, 2], D[:, 0, 2] - D[:, 2, 0], D[:, 1, 0] - D[:, 0, 1]], axis=1) / 2
+    cosine = (np.trace(D, axis1=1, axis2=2) - 1) / 2
+    return np.rad2deg(np.arctan2(np.linalg.norm(sine, axis=1), cosine))
+
+
+def interior_effect_px(a: Camera, b: Camera) -> float:
+    """Return the largest shift between two interior orientations of a ray in the photograph, px."""
+    width, height = a.size_px
+    x = np.linspace(-0.5, width - 0.5, EFFECT_STEPS)
+    y = np.linspace(-0.5, height - 0.5, EFFECT_STEPS)
+    xy = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+    shift = pixel_from_tangents(b, tangents_from_pixel(a, xy)) - xy
+    return _longest(shift)
+
+
+def _difference(a: Camera, b: Camera) -> FloatArray:
+    if a.model != b.model:
+        return np.full(len(a.parameters), np.nan)
+    return b.parameters - a.parameters
+
+
+def _longest(vectors: FloatArray) -> float:
+    """Length of the longest vector; those with NaN do not count."""
+    return float(np.nanmax(np.linalg.norm(vectors, axis=1), initial=0.0))
