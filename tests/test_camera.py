@@ -1,0 +1,123 @@
+"""Camera models: derivatives against differences, inverse, signs."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from synthetic import DISTORTION, FREE, PIXEL_MM, SIZE_PX, seed_of
+
+from sfm.camera import (
+    MAX_PARAMETERS,
+    MODELS,
+    Camera,
+    camera_from_values,
+    inside_model,
+    observe,
+    pixel_from_tangents,
+    project,
+    tangent_jacobian,
+    tangents_from_pixel,
+)
+from sfm.errors import SurveyFileError
+
+
+def lens(model: str) -> Camera:
+    """A camera with every parameter of its model different from 0."""
+    rng = seed_of(model)
+    camera = camera_from_values(
+        "lens", model, SIZE_PX, PIXEL_MM, c_mm=10.0, free=FREE[model], values=DISTORTION[model]
+    )
+    size = {"K1": 1e-4, "K2": 1e-6, "K3": 1e-8, "K4": 1e-10, "b1": 1e-3, "b2": 1e-3}
+    small = np.array([size.get(name, 1e-4) for name in camera.names])
+    return camera.with_parameters(camera.parameters + small * rng.uniform(0.2, 1.0, len(small)))
+
+
+def residual(camera: Camera, p: np.ndarray, xy: np.ndarray, uv: np.ndarray) -> tuple[np.ndarray, ...]:
+    r, Ju, Jp = np.empty(2), np.empty((2, 2)), np.empty((2, MAX_PARAMETERS))
+    observe(camera.index, camera.frame, p, xy[0], xy[1], uv[0], uv[1], r, Ju, Jp)
+    return r, Ju, Jp[:, : len(p)]
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_derivatives_equal_differences(model: str) -> None:
+    camera = lens(model)
+    rng = seed_of(model + " derivatives")
+    for xy in rng.uniform(100, 1400, (20, 2)):
+        uv = tangents_from_pixel(camera, xy[None])[0] + rng.normal(0, 1e-3, 2)
+        _, Ju, Jp = residual(camera, camera.parameters, xy, uv)
+        for s in range(2):
+            h = 1e-4
+            steps = [
+                residual(camera, camera.parameters, xy, uv + f * h * np.eye(2)[s])[0] for f in (-2, -1, 1, 2)
+            ]
+            assert_derivative(Ju[:, s], steps, h)
+        for s in range(len(camera.parameters)):
+            h = 1e-3 * max(abs(camera.parameters[s]), 1e-3)
+            steps = [
+                residual(camera, camera.parameters + f * h * np.eye(len(camera.parameters))[s], xy, uv)[0]
+                for f in (-2, -1, 1, 2)
+            ]
+            assert_derivative(Jp[:, s], steps, h)
+
+
+def assert_derivative(derivative: np.ndarray, steps: list[np.ndarray], h: float) -> None:
+    """Five-point differences are good to h^4 and to the rounding of the residual over h."""
+    difference = (steps[0] - 8 * steps[1] + 8 * steps[2] - steps[3]) / (12 * h)
+    rounding = 1e-12 / h  # residuals are of the order of 1000 px
+    assert np.abs(derivative - difference).max() <= 1e-8 * np.abs(derivative).max() + rounding
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_rays_and_pixels_are_inverse(model: str) -> None:
+    camera = lens(model)
+    xy = seed_of("inverse").uniform((0, 0), SIZE_PX, (200, 2))
+    uv = tangents_from_pixel(camera, xy)
+    assert np.abs(pixel_from_tangents(camera, uv) - xy).max() < 1e-9
+
+
+def test_ray_to_the_right_and_up_is_seen_right_and_up() -> None:
+    for model in MODELS:
+        camera = camera_from_values("ideal", model, SIZE_PX, PIXEL_MM, c_mm=10.0)
+        x, y = pixel_from_tangents(camera, np.array([[0.1, 0.05]]))[0]
+        assert x == pytest.approx((SIZE_PX[0] - 1) / 2 + 0.1 * 10.0 / PIXEL_MM[0])
+        assert y == pytest.approx((SIZE_PX[1] - 1) / 2 - 0.05 * 10.0 / PIXEL_MM[1])
+
+
+def test_points_behind_the_camera_are_not_seen() -> None:
+    camera = camera_from_values("ideal", "brown", SIZE_PX, PIXEL_MM, c_mm=10.0)
+    xy = project(camera, np.zeros(3), np.eye(3), np.array([[0, 0, -2.0], [0, 0, 2.0]]))
+    assert np.isfinite(xy[0]).all()
+    assert np.isnan(xy[1]).all()
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_tangent_jacobian_is_the_scale_of_the_photograph(model: str) -> None:
+    camera = lens(model)
+    J = tangent_jacobian(camera, np.zeros((1, 2)))[0]
+    assert np.abs(np.diag(J) * (1, -1) - camera.c_px).max() < 0.01 * camera.c_px
+
+
+def test_trust_ends_a_little_beyond_the_corners() -> None:
+    camera = camera_from_values("ideal", "brown", SIZE_PX, PIXEL_MM, c_mm=10.0)
+    corner = np.hypot(*(np.array(SIZE_PX) / 2 * PIXEL_MM[0])) / 10.0
+    assert corner < inside_model(camera) < 1.2 * corner
+
+
+@pytest.mark.parametrize(
+    ("model", "free", "values", "message"),
+    [
+        ("fisheye", (), (), "model 'fisheye' is none of brown"),
+        ("brown", ("f",), (), "has no parameter 'f'"),
+        ("opencv", (), (("K1", 0.1),), "has no parameter 'K1'"),
+    ],
+)
+def test_unknown_names_are_refused(
+    model: str, free: tuple[str, ...], values: tuple[tuple[str, float], ...], message: str
+) -> None:
+    with pytest.raises(SurveyFileError, match=message):
+        camera_from_values("A", model, SIZE_PX, PIXEL_MM, c_mm=10.0, free=free, values=values)
+
+
+def test_a_camera_needs_all_parameters_of_its_model() -> None:
+    with pytest.raises(SurveyFileError, match="3 parameters, model brown has 10"):
+        Camera("A", "brown", SIZE_PX, np.array(PIXEL_MM), np.zeros(3))

@@ -1,0 +1,70 @@
+"""Similarity in space: exact on exact points, least squares on noisy ones, refusals."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from synthetic import make_network, seed_of
+
+from sfm.camera import project
+from sfm.conventions import rotation_from_angles
+from sfm.errors import GeometryError
+from sfm.similarity import Similarity, fit_similarity
+
+TRUE = Similarity(2.5, rotation_from_angles(0.3, -1.1, 2.9), np.array([10.0, -4.0, 7.0]))
+
+
+@pytest.mark.parametrize("planar", [False, True])
+def test_exact_points_give_the_exact_similarity(planar: bool) -> None:
+    source = seed_of("exact").normal(size=(6, 3)) * (1, 1, 0 if planar else 1)
+    found = fit_similarity(source, TRUE.apply(source))
+    assert found.scale == pytest.approx(TRUE.scale, rel=1e-12)
+    assert np.abs(found.rotation - TRUE.rotation).max() < 1e-12
+    assert np.abs(found.translation - TRUE.translation).max() < 1e-11
+
+
+def test_no_other_similarity_fits_noisy_points_better() -> None:
+    rng = seed_of("least squares")
+    source = rng.normal(size=(12, 3))
+    target = TRUE.apply(source) + rng.normal(0, 0.05, (12, 3))
+    weights = rng.uniform(0.2, 2.0, 12)
+    found = fit_similarity(source, target, weights=weights)
+
+    def cost(s: Similarity) -> float:
+        return float(weights @ ((s.apply(source) - target) ** 2).sum(axis=1))
+
+    best = cost(found)
+    for _ in range(50):
+        turn = rotation_from_angles(*rng.normal(0, 1e-3, 3))
+        other = Similarity(
+            found.scale * (1 + rng.normal(0, 1e-3)),
+            turn @ found.rotation,
+            found.translation + rng.normal(0, 1e-3, 3),
+        )
+        assert cost(other) > best
+
+
+def test_inverse_undoes() -> None:
+    points = seed_of("inverse").normal(size=(5, 3))
+    assert np.abs(TRUE.inverse().apply(TRUE.apply(points)) - points).max() < 1e-13
+
+
+def test_a_transformed_network_takes_the_same_photographs() -> None:
+    network, truth = make_network(seed_of("photographs"), images=3, points=10)
+    moved = TRUE.apply_estimate(truth)
+    camera = truth.cameras[network.camera[0]]
+    before = project(camera, truth.position[0], truth.rotation[0], truth.points)
+    after = project(camera, moved.position[0], moved.rotation[0], moved.points)
+    assert np.abs(before - after).max() < 1e-9
+
+
+@pytest.mark.parametrize(
+    ("points", "message"),
+    [
+        (np.zeros((2, 3)), "2 common points, at least 3"),
+        (np.outer(np.arange(4.0), [1, 2, 3]), "lie on a line"),
+    ],
+)
+def test_too_little_is_refused(points: np.ndarray, message: str) -> None:
+    with pytest.raises(GeometryError, match=message):
+        fit_similarity(points, points)
