@@ -13,7 +13,7 @@ from importlib.resources import files
 import numpy as np
 
 from sfm.conventions import FloatArray
-from sfm.report.markup import figure, significant
+from sfm.report.markup import figure, finer_unit, significant
 from sfm.report.overlays import Overlay
 from sfm.report.result import SurveyResult
 from sfm.report.sections import (
@@ -80,12 +80,13 @@ def _tiles(result: SurveyResult) -> str:
     sigma = point_sigmas(a)
     size = _object_size(a.estimate.points)
     typical = root_mean_square(sigma)
+    factor, unit = finer_unit(result.unit, typical)
     tiles = [
         ("Photographs oriented", f"{len(a.network.images)} of {result.images_total}", ""),
         ("Object points", str(len(a.network.points)), _coded_of(result)),
         (
             "Precision of a point",
-            f"{significant(typical)} {result.unit}",
+            f"{significant(typical * factor)} {unit}",
             f"RMS of sX, sY, sZ; 1 : {size / typical:,.0f} of the object" if typical > 0 else "",
         ),
         ("RMS residual", f"{a.rms_px:.4f} px", "per image coordinate"),
@@ -97,7 +98,7 @@ def _tiles(result: SurveyResult) -> str:
     ]
     both = result.comparison
     if both is not None:
-        tiles.append((both.backend, "agrees" if both.agree else "differs", "same optimum in the same model"))
+        tiles.append((both.backend, "agrees" if both.agree else "differs", "both in the same camera model"))
     return (
         "<div class=tiles>"
         + "".join(

@@ -11,6 +11,9 @@ import numpy as np
 
 METRIC = (("km", 1e3), ("m", 1.0), ("mm", 1e-3), ("µm", 1e-6))
 """metric units and their length in metres, largest first"""
+SMALL = 1e-3
+"""parameters below it are written with an exponent"""
+SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 def table(
@@ -25,7 +28,14 @@ def table(
     rows = list(rows)
     text = "<div class=scroll><table" + (" class=facts" if plain_first else "") + ">"
     if head:
-        text += "<thead><tr>" + "".join(f"<th>{escape(name)}</th>" for name in header) + "</tr></thead>"
+        numeric = [
+            k > 0 and any(len(row) > k and _is_number(row[k]) for row in rows) for k in range(len(header))
+        ]
+        cells = "".join(
+            f"<th{' class=n' if right else ''}>{escape(name)}</th>"
+            for name, right in zip(header, numeric, strict=True)
+        )
+        text += f"<thead><tr>{cells}</tr></thead>"
     text += "<tbody>"
     for k, row in enumerate(rows):
         bold = " class=sum" if last_bold and k == len(rows) - 1 else ""
@@ -63,6 +73,31 @@ def significant(value: float, digits: int = 3) -> str:
     if -6 <= exponent < 7:
         return f"{value:.{max(0, digits - 1 - exponent)}f}"
     return f"{value:.{digits - 1}e}"
+
+
+def with_exponent(value: float, sigma: float) -> tuple[str, str]:
+    """Write a parameter to the second digit of its standard deviation, and the latter; small ones as m e-n.
+
+    Args:
+        value: the parameter.
+        sigma: its standard deviation, NaN if it was held fixed.
+    """
+    if not (np.isfinite(sigma) and sigma > 0):
+        return (f"{value:.6g}", "held fixed")
+    if abs(value) >= SMALL or value == 0:
+        return to_precision(value, sigma), significant(sigma, 2)
+    power = int(np.floor(np.log10(abs(value))))
+    decimals = int(np.clip(1 - np.floor(np.log10(sigma)) + power, 0, 12))
+    mantissa = value / 10.0**power
+    return f"{mantissa:.{decimals}f}e{power}", f"{sigma / 10.0**power:.{decimals}f}e{power}"
+
+
+def raised(unit: str) -> str:
+    """Write the exponent of a unit such as mm^-2 above the line, nothing for a pure number."""
+    if unit == "1":
+        return ""
+    base, _, power = unit.partition("^")
+    return base + power.translate(SUPERSCRIPTS) if power else unit
 
 
 def signed(value: float) -> str:

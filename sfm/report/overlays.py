@@ -20,12 +20,13 @@ MAX_SIDE_PX = 2400  # longer photographs are drawn smaller
 THUMBNAIL_SIDE_PX = 720
 JPEG_QUALITY = 82
 ARROW_PX = 22.0  # length in the picture of a residual of the size of the RMS
+LABEL_SIZE = 0.5  # of OpenCV's Hershey font
 SHIFT = 4  # fractional bits of the coordinates that OpenCV draws at
 
 # Colours in OpenCV's order blue, green, red.
 USED, DROPPED, UNUSED, ARROW, INK, PAPER = (
-    (90, 200, 60),
-    (40, 40, 230),
+    (110, 255, 110),
+    (70, 70, 255),
     (200, 160, 40),
     (0, 200, 255),
     (30, 30, 30),
@@ -113,6 +114,7 @@ def draw_photograph(photograph: PhotographTargets, adjustment: Adjustment, facto
     rows, names = _image_points(photograph.image, adjustment)
     seen = adjustment.network.image_points
     owner = _nearest(photograph.xy, seen.xy[rows])
+    reach = np.zeros(len(rows))  # of the outline of each image point to the right, px
     for k in range(len(photograph.xy)):
         row = owner[k]
         colour = UNUSED if row < 0 else DROPPED if adjustment.rejected[rows[row]] else USED
@@ -120,12 +122,13 @@ def draw_photograph(photograph: PhotographTargets, adjustment: Adjustment, facto
             picture, photograph.xy[k], photograph.semi_axes[k] + 2 / scale, photograph.angle[k], scale, colour
         )
     for xy, flag in zip(photograph.rejected_xy, photograph.rejected_flag, strict=True):
-        _cross(picture, xy, scale, _colour_of(int(flag)))
+        _cross(picture, xy, scale, 2 if flag & Flag.TOO_SMALL else 4, _colour_of(int(flag)))
     # The vector points from the measured to the adjusted position: v = computed - measured.
-    for row, name in zip(rows, names, strict=True):
+    for row, name, right in zip(rows, names, reach, strict=True):
         xy = seen.xy[row]
         _arrow(picture, xy, xy + factor / scale * adjustment.residuals[row], scale)
-        _label(picture, name, xy, scale, DROPPED if adjustment.rejected[row] else USED)
+        colour = DROPPED if adjustment.rejected[row] else USED
+        _label(picture, name, xy + np.array([right, -right / 2]), scale, colour)
     return np.vstack([picture, _legend(picture.shape[1], factor, photograph.rejected_flag)])
 
 
@@ -191,9 +194,9 @@ def _ellipse(
     cv2.ellipse(picture, _drawn(xy, scale), axes, degrees, 0, 360, colour, 1, cv2.LINE_AA, SHIFT)
 
 
-def _cross(picture: AnyArray, xy: FloatArray, scale: float, colour: tuple[int, ...]) -> None:
+def _cross(picture: AnyArray, xy: FloatArray, scale: float, arm_px: int, colour: tuple[int, ...]) -> None:
     x, y = _drawn(xy, scale)
-    arm = 4 << SHIFT
+    arm = arm_px << SHIFT
     cv2.line(picture, (x - arm, y - arm), (x + arm, y + arm), colour, 1, cv2.LINE_AA, SHIFT)
     cv2.line(picture, (x - arm, y + arm), (x + arm, y - arm), colour, 1, cv2.LINE_AA, SHIFT)
 
@@ -204,10 +207,10 @@ def _arrow(picture: AnyArray, start: FloatArray, end: FloatArray, scale: float) 
 
 def _label(picture: AnyArray, name: str, xy: FloatArray, scale: float, colour: tuple[int, ...]) -> None:
     x, y = _drawn(xy, scale)
-    at = (x >> SHIFT) + 7, (y >> SHIFT) - 7
+    at = (x >> SHIFT) + 5, (y >> SHIFT) - 5
     text = name.encode("ascii", "replace").decode()
-    cv2.putText(picture, text, at, cv2.FONT_HERSHEY_SIMPLEX, 0.45, INK, 3, cv2.LINE_AA)
-    cv2.putText(picture, text, at, cv2.FONT_HERSHEY_SIMPLEX, 0.45, colour, 1, cv2.LINE_AA)
+    for shade, thickness in ((INK, 3), (colour, 1)):
+        cv2.putText(picture, text, at, cv2.FONT_HERSHEY_SIMPLEX, LABEL_SIZE, shade, thickness, cv2.LINE_AA)
 
 
 def _legend(width: int, factor: float, flags: IntArray) -> AnyArray:

@@ -7,7 +7,18 @@ from html import escape
 
 import numpy as np
 
-from sfm.report.markup import data_url, file_url, signed, significant, table, to_precision, yes_or_no
+from sfm.report.markup import (
+    data_url,
+    file_url,
+    finer_unit,
+    raised,
+    signed,
+    significant,
+    table,
+    to_precision,
+    with_exponent,
+    yes_or_no,
+)
 from sfm.report.overlays import Overlay
 from sfm.report.result import SurveyResult
 from sfm.report.tables import (
@@ -25,6 +36,7 @@ MAX_POINT_ROWS = 2000
 
 
 def worked_section(result: SurveyResult, verdict: Verdict) -> str:
+    """Did it work: what was oriented, whether it converged, what failed, warnings."""
     a = result.adjustment
     rows = [
         (
@@ -56,25 +68,25 @@ def worked_section(result: SurveyResult, verdict: Verdict) -> str:
 
 
 def quality_section(result: SurveyResult, pictures: dict[str, str]) -> str:
+    """How good is it: precision of points, check at control, image coordinates, cameras."""
     a = result.adjustment
-    unit = result.unit
     sigma = point_sigmas(a)
     limiting = np.sqrt(np.einsum("nii->ni", a.covariance.points_limiting))
+    factor, unit = finer_unit(result.unit, float(np.nanmax(sigma)))
     text = "<h3>Object points</h3>"
     text += table(
         (f"standard deviation [{unit}]", "X", "Y", "Z", "all"),
         [
-            (
-                "RMS",
-                *(significant(v) for v in np.sqrt(np.nanmean(sigma**2, axis=0))),
-                significant(root_mean_square(sigma)),
-            ),
-            ("largest", *(significant(v) for v in np.nanmax(sigma, axis=0)), significant(np.nanmax(sigma))),
-            (
-                "RMS if the cameras were free of error",
-                *(significant(v) for v in np.sqrt(np.nanmean(limiting**2, axis=0))),
-                significant(root_mean_square(limiting)),
-            ),
+            (name, *(significant(value * factor) for value in (*columns, over_all)))
+            for name, columns, over_all in (
+                ("RMS", np.sqrt(np.nanmean(sigma**2, axis=0)), root_mean_square(sigma)),
+                ("largest", np.nanmax(sigma, axis=0), np.nanmax(sigma)),
+                (
+                    "RMS if the cameras were free of error",
+                    np.sqrt(np.nanmean(limiting**2, axis=0)),
+                    root_mean_square(limiting),
+                ),
+            )
         ],
     )
     text += (
@@ -100,12 +112,11 @@ def quality_section(result: SurveyResult, pictures: dict[str, str]) -> str:
         rows = [
             (
                 name,
-                significant(value, 7),
-                significant(s[k]) if np.isfinite(s[k]) else "held fixed",
-                unit_,
+                *with_exponent(value, s[k]),
+                raised(unit),
                 f"{abs(value) / s[k]:.1f}" if np.isfinite(s[k]) and s[k] > 0 else "",
             )
-            for k, (name, value, unit_) in enumerate(
+            for k, (name, value, unit) in enumerate(
                 zip(camera.names, camera.parameters, camera.units, strict=True)
             )
             if camera.free[k] or value != 0
@@ -121,15 +132,17 @@ def quality_section(result: SurveyResult, pictures: dict[str, str]) -> str:
 
 
 def _control(result: SurveyResult) -> str:
+    """Return the differences at control that took no part, nothing if there is none."""
     check = result.control_check
     if check is None:
         return ""
-    unit = result.unit
+    factor, unit = finer_unit(result.unit, float(np.abs(check.differences).max()))
     rows = [
         (name, *(signed(v) for v in d), significant(float(np.linalg.norm(d))))
-        for name, d in zip(check.points, check.differences, strict=True)
+        for name, d in zip(check.points, check.differences * factor, strict=True)
     ]
-    rows.append(("RMS", *(significant(v) for v in check.rms), significant(float(np.linalg.norm(check.rms)))))
+    rms = check.rms * factor
+    rows.append(("RMS", *(significant(v) for v in rms), significant(float(np.linalg.norm(rms)))))
     return (
         "<h3>Check at the control</h3><p class=note>The control took no part in the adjustment. The result "
         f"was placed on it afterwards by shift, rotation and scale ({check.scale:.9g}); what remains at each "
@@ -139,6 +152,7 @@ def _control(result: SurveyResult) -> str:
 
 
 def rejected_section(result: SurveyResult) -> str:
+    """What was thrown out and why: image points by the test, candidates by their looks."""
     a = result.adjustment
     rejected = np.flatnonzero(a.rejected)
     total = len(a.rejected)
@@ -207,6 +221,7 @@ def _rejected_candidates(result: SurveyResult) -> str:
 
 
 def comparison_section(result: SurveyResult) -> str:
+    """Does the other adjuster agree: the verdict first, then both in numbers."""
     both = result.comparison
     if both is None:
         return "<p>The survey asked for no comparison.</p>"
@@ -266,6 +281,7 @@ def comparison_section(result: SurveyResult) -> str:
 
 
 def coordinates_section(result: SurveyResult) -> str:
+    """Where are my coordinates: the files, and the coordinates themselves."""
     unit = result.unit
     listed = [
         ("points.csv", f"object points: X, Y, Z and standard deviations [{unit}], number of rays, code"),
@@ -321,6 +337,7 @@ def coordinates_section(result: SurveyResult) -> str:
 
 
 def photographs_section(result: SurveyResult, overlays: Sequence[Overlay]) -> str:
+    """The photographs with what was found in them."""
     if not overlays:
         return "<p>The survey began with image points, there are no photographs to show.</p>"
     rms, count = image_rms(result.adjustment)
@@ -347,6 +364,7 @@ def photographs_section(result: SurveyResult, overlays: Sequence[Overlay]) -> st
 
 
 def process_section(result: SurveyResult) -> str:
+    """How it was done: time of each stage, and the conventions of all numbers."""
     total = sum(time.seconds for time in result.seconds)
     rows = [(time.stage, f"{time.seconds:.2f}") for time in result.seconds]
     rows.append(("all", f"{total:.2f}"))
