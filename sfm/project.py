@@ -114,6 +114,7 @@ class AdjustSettings(Section):
     """[adjust]: the stochastic model."""
 
     sigma_px: Length = 0.1  # a priori standard deviation of an image coordinate, px
+    reject: Literal["tau", "huber", "none"] | None = None  # else tau, and none where [observations] are given
 
 
 class CompareSettings(Section):
@@ -151,6 +152,11 @@ class Survey(Section):
     def unit(self) -> str:
         """Object unit."""
         return self.head.unit
+
+    @property
+    def reject(self) -> str:
+        """How outliers are treated; given observations are adjusted as they are unless the file says so."""
+        return self.adjust.reject or ("tau" if self.observations is None else "none")
 
     @property
     def codes(self) -> str:

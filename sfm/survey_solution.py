@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -21,6 +21,7 @@ from sfm.survey_targets import MeasuredPhotographs
 ROUNDS = 3  # matching with the orientation at hand, with the adjusted one, and once more to confirm
 TOLERANCE_FACTOR = 6.0  # of the robust spread of the residuals
 MIN_TOLERANCE_PX = 1.0  # below it a difference is for the statistical test, not for the matching
+FALSE_ALARM = 0.05  # chance that a survey without any outlier loses an image coordinate; Pope (1976)
 MIN_IMAGE_POINTS = 4  # of a photograph in the final adjustment: three determine it, the fourth checks
 MAD_TO_SIGMA = 1.4826  # of a normal distribution; Hampel (1974), J. Am. Stat. Assoc. 69
 
@@ -100,12 +101,12 @@ def solve(
     accepted = np.ones(len(network.image_points), dtype=bool)
     oriented = estimate.oriented
     estimate = _rescaled(network, estimate, datum)
+    iterations = 0
     while True:
         images, points = determined(network, estimate, accepted, needed)
         part, start = reduce_network(network, estimate, images, points, np.ones_like(accepted))
-        adjustment = adjust(
-            part, start, datum=datum, sigma_px=survey.adjust.sigma_px, reject="tau", covariance=False
-        )
+        adjustment = _tested(survey, part, start, datum, covariance=False)
+        iterations += adjustment.iterations
         estimate = put_back(estimate, adjustment.estimate, images, points)
         accepted = _accepted(network, adjustment, images, points)
         left_images, left_points = determined(network, estimate, accepted, needed)
@@ -116,13 +117,30 @@ def solve(
         estimate, check = _placed_on_control(part, adjustment.estimate)
     else:
         estimate = adjustment.estimate
-    final = adjust(part, estimate, datum=datum, sigma_px=survey.adjust.sigma_px, reject="tau")
+    final = _tested(survey, part, estimate, datum, covariance=True)
     dropped = tuple(
         (name, f"fewer than {MIN_IMAGE_POINTS} accepted image points of the network")
         for name, was, is_in in zip(network.images, oriented, images, strict=True)
         if was and not is_in
     )
+    final = replace(final, iterations=iterations + final.iterations)
     return Solution(final, check, dropped, _warnings(survey, part, final))
+
+
+def _tested(
+    survey: Survey, network: Network, estimate: Estimate, datum: Datum, *, covariance: bool
+) -> Adjustment:
+    """Adjust with data snooping, the level of the single test shared out among all image coordinates."""
+    tests = 2 * len(network.image_points)
+    return adjust(
+        network,
+        estimate,
+        datum=datum,
+        sigma_px=survey.adjust.sigma_px,
+        reject=survey.reject,
+        alpha=1 - (1 - FALSE_ALARM) ** (1 / tests),
+        covariance=covariance,
+    )
 
 
 def determined(
