@@ -35,6 +35,7 @@ ALL_FREE_PHOTOGRAPHS = 6  # from which on all parameters are adjusted
 SURPLUS_PER_PARAMETER = 3  # observations beyond the exterior orientations for each free parameter
 MAD_TO_SIGMA = 1.4826  # median absolute deviation of a normal distribution
 MAX_ROUNDS = 200
+FINAL_ROUNDS = 3  # of resection, intersection and adjustment of all, while image points come or go
 
 Refine = Callable[[Network, Estimate], Estimate]
 
@@ -82,27 +83,24 @@ def orient(
     diagonal = np.array([np.hypot(*camera.size_px) for camera in cameras])
     growth = _Growth(network, estimate, seed, start_tolerance * diagonal, max(min_points, MIN_POINTS))
     start = growth.begin()
-    if refine is not None:
-        growth.refined(refine)
-    adjusted = growth.estimate.oriented.sum()
+    adjusted = 0
     for _ in range(MAX_ROUNDS):
         added = growth.resect_next()
         growth.intersect()
-        now = growth.estimate.oriented.sum()
-        due = now >= FIRST_ADJUSTMENT and (now >= GROWTH * adjusted or now == len(network.images))
-        if refine is not None and now > adjusted and (due or not added):
+        now = int(growth.estimate.oriented.sum())
+        if now >= FIRST_ADJUSTMENT and (now >= GROWTH * adjusted or (not added and now > adjusted)):
             growth.refined(refine)
             growth.adapt_tolerance(final_tolerance_px)
             growth.intersect()
             adjusted = now
         elif not added:
             break
-    growth.resect_all()
-    if refine is not None:
-        growth.refined(refine)
-    growth.adapt_tolerance(final_tolerance_px)
-    growth.resect_all()
-    growth.intersect()
+    for _ in range(FINAL_ROUNDS):
+        growth.adapt_tolerance(final_tolerance_px)
+        growth.resect_all()
+        growth.intersect()
+        if not growth.refined(refine):
+            break
     return growth.finish(start, cameras)
 
 
@@ -122,6 +120,7 @@ class _Growth:
         points = network.control.point
         self.fixed = np.zeros(len(network.points), dtype=bool)
         self.fixed[points] = True
+        self.adjusted = np.zeros(0, dtype=bool)  # image points of the last adjustment, (k,)
 
     # --- views of the measured image points --------------------------------------------------------
 
@@ -257,8 +256,13 @@ class _Growth:
         points = np.where(self.fixed[:, None], self.estimate.points, result.points)
         self.estimate = replace(self.estimate, points=points)
 
-    def refined(self, refine: Refine) -> None:
-        """Let the caller adjust what is determined; keep the result if the image points fit better."""
+    def refined(self, refine: Refine | None) -> bool:
+        """Let the caller adjust what is determined; keep the result if the image points fit better.
+
+        Returns whether there was anything new to adjust.
+        """
+        if refine is None:
+            return False
         seen = self.network.image_points
         residuals = self.residuals_px()
         limit = self.tolerance_px[self.network.camera[seen.image]]
@@ -267,16 +271,18 @@ class _Growth:
         points = self.estimate.determined & ((rays >= 2) | self.fixed)
         count = np.bincount(seen.image[fits & points[seen.point]], minlength=len(self.network.images))
         images = self.estimate.oriented & (count >= 3)
-        if images.sum() < 2:
-            return
+        used = fits & images[seen.image] & points[seen.point]
+        if images.sum() < 2 or np.array_equal(used, self.adjusted):
+            return False
+        self.adjusted = used
         part, start = reduce_network(self.network, self.estimate, images, points, fits)
         staged = tuple(_staged(camera, part, index) for index, camera in enumerate(start.cameras))
         try:
             result = refine(part, replace(start, cameras=staged))
         except (GeometryError, np.linalg.LinAlgError):
-            return
+            return True
         if not (result.oriented.all() and result.determined.all()):
-            return
+            return True
         cameras = tuple(
             replace(new, free=old.free)
             for new, old in zip(result.cameras, self.estimate.cameras, strict=True)
@@ -292,6 +298,7 @@ class _Growth:
         new = np.minimum(residual_lengths(self.network, candidate), limit)[fits]
         if np.sum(new**2) < np.sum(capped**2):
             self.estimate = candidate
+        return True
 
     def adapt_tolerance(self, final_px: float) -> None:
         """Let the tolerance of each camera follow the spread of its residuals."""

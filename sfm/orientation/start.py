@@ -16,6 +16,8 @@ from sfm.orientation.resection.robust import resect_robust
 MAX_PAIRS = 60  # pairs whose solutions are tried on the other photographs
 MIN_MEDIAN_ANGLE_DEG = 5.0  # median ray angle of a pair that is worth starting from
 SCREEN_TRIALS = 200  # triples per photograph while solutions are compared
+SCREEN_POINTS = 30  # points per photograph, and photographs per solution, that take part in it
+SCREEN_PHOTOGRAPHS = 40
 
 
 @dataclass(frozen=True)
@@ -43,7 +45,7 @@ def best_start(network: Network, tangents: FloatArray, tolerance: FloatArray, *,
 
     Source: the two solutions of a plane (Ma et al. 2004, sec. 5.3.3) cannot be told apart in a pair; in
     a third photograph the false plane does not fit. All solutions of all promising pairs are tried and
-    compared by the truncated squares over all photographs.
+    compared by the truncated squares over the photographs that share most points with them.
     """
     own = _sorted_rows(network, tangents)
     pairs = _promising_pairs(network, own)
@@ -66,8 +68,8 @@ def best_start(network: Network, tangents: FloatArray, tolerance: FloatArray, *,
             candidate = _model(network, (i, j), points, first, second, solution)
             if candidate is None:
                 continue
-            score = _score(network, tangents, tolerance, own, candidate, seed)
-            if best is None or score < best[0]:
+            score = _support(network, tangents, tolerance, own, candidate, seed)
+            if best is None or score > best[0]:
                 best = (score, candidate)
     if best is None:
         raise GeometryError("orientation: no pair of photographs has a base, or rays that intersect well")
@@ -136,7 +138,7 @@ def _model(
     return Start(pair, solution.kind, position, rotation, model)
 
 
-def _score(
+def _support(
     network: Network,
     tangents: FloatArray,
     tolerance: FloatArray,
@@ -144,35 +146,37 @@ def _score(
     start: Start,
     seed: int,
 ) -> float:
-    """Truncated squares over all image points, in squared tolerances: 1 for each that does not fit."""
+    """Number of image points that fit a start, each counted 1 - squared residual in tolerances.
+
+    The photographs that share most points with the model are resected on it, then the points are
+    intersected again from all of them, which tells a true plane from a bent one.
+    """
     seen = network.image_points
-    m = len(network.images)
-    position, rotation = start.position.copy(), start.rotation.copy()
     determined = np.asarray(np.isfinite(start.points).all(axis=1))
-    for i in range(m):
-        if i in (start.pair or ()):
-            continue
-        rows = own[i][determined[seen.point[own[i]]]]
+    rows = [one[determined[seen.point[one]]][:SCREEN_POINTS] for one in own]
+    sharing = sorted(range(len(own)), key=lambda i: (-len(rows[i]), i))
+    position, rotation = start.position.copy(), start.rotation.copy()
+    for i in [i for i in sharing if i not in (start.pair or ())][:SCREEN_PHOTOGRAPHS]:
         result = resect_robust(
-            tangents[rows],
-            start.points[seen.point[rows]],
+            tangents[rows[i]],
+            start.points[seen.point[rows[i]]],
             tolerance=tolerance[i],
             seed=seed,
             max_trials=SCREEN_TRIALS,
         )
         if result.found:
             position[i], rotation[i] = result.position, result.rotation
-    # with all photographs the points are intersected again, which tells a true plane from a bent one
-    image, point = seen.image, seen.point
-    finite = np.isfinite(tangents).all(axis=1)
+    some = np.concatenate(rows)
+    oriented = np.asarray(np.isfinite(position).all(axis=1))
+    some = some[oriented[seen.image[some]]]
     again = intersect(
-        tangents,
-        image,
-        point,
+        tangents[some],
+        seen.image[some],
+        seen.point[some],
         position,
         rotation,
         n_points=len(network.points),
         tolerance=float(tolerance.max()),
     )
-    squares = np.sum(again.residuals**2, axis=1) / tolerance[image] ** 2
-    return float(np.where(np.isfinite(squares), np.minimum(squares, 1.0), 1.0)[finite].sum())
+    squares = np.sum(again.residuals**2, axis=1) / tolerance[seen.image[some]] ** 2
+    return float(np.sum(1 - np.minimum(squares[np.isfinite(squares)], 1.0)))
