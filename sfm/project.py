@@ -252,8 +252,12 @@ _NEEDED = (
 
 
 def _one_line(path: Path, text: str, error: ValidationError) -> str:
-    """Return the first error of pydantic as one line with file, line, key, found and needed."""
-    first = error.errors(include_url=False)[0]
+    """Return the first error of pydantic as one line with file, line, key, found and needed.
+
+    Unknown keys come first: a misspelt key is unknown, and missing under its right name.
+    """
+    errors = error.errors(include_url=False)
+    first = next((one for one in errors if one["type"] == "extra_forbidden"), errors[0])
     location = first["loc"]
     kind, context = first["type"], first.get("ctx", {})
     line = _line_of(text, location)

@@ -126,6 +126,10 @@ class _Table:
         for value, line in zip(values, self.lines, strict=True):
             if not value:
                 raise SurveyFileError(f"{self.path}, line {line}: column {column} is empty, a name is needed")
+            if not value.isprintable():
+                raise SurveyFileError(
+                    f"{self.path}, line {line}: column {column} holds {value!r:.60}, needed plain characters"
+                )
         return values
 
     def keys(self, column: str) -> tuple[str, ...]:

@@ -1,0 +1,104 @@
+"""The layers of the house: every module imports only what stands to its left."""
+
+from __future__ import annotations
+
+import ast
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+LAYERS = (
+    ("sfm.conventions", "sfm.errors", "sfm.progress"),
+    ("sfm.camera", "sfm.network", "sfm.similarity"),
+    ("sfm.targets", "sfm.matching", "sfm.orientation", "sfm.adjustment"),
+    ("sfm.analysis",),
+    ("sfm.report", "sfm.pipeline", "sfm.project", "sfm.survey_"),
+    ("sfm.batch", "sfm.cli"),
+)
+CV2_ROOMS = ("sfm.targets", "sfm.matching", "sfm.report", "sfm.orientation")
+# Within a layer of rooms, siblings know nothing of one another.
+ROOMS = LAYERS[2]
+
+
+def module_name(path: Path) -> str:
+    parts = path.relative_to(ROOT).with_suffix("").parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+MODULES = {module_name(path): path for folder in ("sfm", "adapters") for path in (ROOT / folder).rglob("*.py")}
+
+
+def imported(path: Path) -> set[str]:
+    """Return the modules that a module imports anywhere in it, functions and type checking included."""
+    names: set[str] = set()
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            names.update(alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path}: relative import"
+            module = node.module or ""
+            names.add(module)
+            names.update(f"{module}.{a.name}" for a in node.names if f"{module}.{a.name}" in MODULES)
+    return names
+
+
+def belongs(name: str, group: str) -> bool:
+    return name.startswith(group) if group.endswith("_") else name == group or name.startswith(group + ".")
+
+
+def layer_of(name: str) -> int | None:
+    return next((k for k, groups in enumerate(LAYERS) if any(belongs(name, g) for g in groups)), None)
+
+
+@pytest.mark.parametrize("name", sorted(name for name in MODULES if name.startswith("sfm.")))
+def test_modules_import_only_to_the_left(name: str) -> None:
+    own = layer_of(name)
+    assert own is not None, f"{name} is in no layer: give it a place in DESIGN's order and in this test"
+    for other in imported(MODULES[name]):
+        if not other.startswith("sfm."):
+            continue
+        assert layer_of(other) is not None, f"{name} imports {other}, which is in no layer"
+        assert layer_of(other) <= own, f"{name} imports {other}, which stands to its right"  # type: ignore[operator]
+
+
+@pytest.mark.parametrize("room", ROOMS)
+def test_siblings_do_not_import_one_another(room: str) -> None:
+    for name, path in MODULES.items():
+        if belongs(name, room):
+            strangers = {o for o in imported(path) for r in ROOMS if r != room and belongs(o, r)}
+            assert not strangers, f"{name} imports {sorted(strangers)} of a sibling room"
+
+
+def test_only_the_command_line_imports_adapters() -> None:
+    for name, path in MODULES.items():
+        if name.startswith("sfm") and name != "sfm.cli":
+            assert not [o for o in imported(path) if o.split(".")[0] == "adapters"], name
+
+
+def test_adapters_know_the_types_of_sfm_only() -> None:
+    types = (*LAYERS[0], *LAYERS[1])
+    for name, path in MODULES.items():
+        if name.startswith("adapters."):
+            own = [o for o in imported(path) if o.startswith("sfm.")]
+            assert all(any(belongs(o, t) for t in types) for o in own), f"{name} imports {own}"
+
+
+def test_libraries_stay_in_their_rooms() -> None:
+    for name, path in MODULES.items():
+        libraries = {o.split(".")[0] for o in imported(path)}
+        if "pycolmap" in libraries or "pyceres" in libraries:
+            assert name == "adapters.colmap", f"{name} imports pycolmap"
+        if "cv2" in libraries:
+            assert any(belongs(name, room) for room in CV2_ROOMS), f"{name} imports cv2"
+        if libraries & {"matplotlib"}:
+            assert name.startswith("sfm.report"), f"{name} imports matplotlib"
+        if libraries & {"typer", "rich"}:
+            assert name == "sfm.cli", f"{name} imports the command line's libraries"
+
+
+def test_the_rules_would_notice() -> None:
+    assert layer_of("sfm.targets.detect") == 2
+    assert layer_of("sfm.survey_start") == layer_of("sfm.pipeline") == 4
+    assert layer_of("sfm.surveying") is None
+    assert "sfm.errors" in imported(MODULES["sfm.cli"])
