@@ -66,6 +66,9 @@ def write_result(
         raise OutputError(f"{out}: the result cannot be written here: {error.strerror}") from error
     try:
         folder.chmod(0o755)  # mkdtemp makes it for the owner alone
+        if write_colmap is not None:
+            (folder / "colmap").mkdir()
+            write_colmap(folder / "colmap")
         overlays = draw_overlays(result, jobs=jobs, progress=progress)
         if overlays:
             (folder / "overlays").mkdir()
@@ -75,9 +78,6 @@ def write_result(
         (folder / "plots").mkdir()
         for stem, _, data in plots:
             (folder / "plots" / f"{stem}.png").write_bytes(data)
-        if write_colmap is not None:
-            (folder / "colmap").mkdir()
-            write_colmap(folder / "colmap")
         timed = replace(result, seconds=(*result.seconds, StageTime("report", time.perf_counter() - started)))
         write_tables(timed, folder)
         page = render_html(timed, plots, overlays)
