@@ -19,7 +19,7 @@ from sfm.conventions import BoolArray, FloatArray
 from sfm.errors import GeometryError
 from sfm.network import Estimate, Network, reduce_network
 from sfm.orientation.intersection import intersect
-from sfm.orientation.resection.robust import resect_robust
+from sfm.orientation.resection.robust import fewest_fitting, resect_robust
 from sfm.orientation.start import Start, best_start
 from sfm.similarity import fit_similarity
 
@@ -117,6 +117,8 @@ class _Growth:
         self.start_tolerance_px = tolerance_px
         self.min_points = min_points
         self.reasons: dict[int, str] = {}  # why a photograph is not oriented
+        area = [np.prod(camera.size_px) / camera.c_px**2 for camera in estimate.cameras]
+        self.field = np.array(area)[network.camera]  # area of each photograph, squared tangents, (m,)
         points = network.control.point
         self.fixed = np.zeros(len(network.points), dtype=bool)
         self.fixed[points] = True
@@ -221,6 +223,7 @@ class _Growth:
                 tolerance=tolerance[i],
                 seed=self.seed + i,
                 min_inliers=self.min_points,
+                field=self.field[i],
             )
             camera = self.estimate.cameras[self.network.camera[i]]
             if not result.found:
@@ -321,9 +324,18 @@ class _Growth:
         residuals = self.residuals_px()
         fits = residuals <= self.tolerance_px[network.camera[seen.image]]
         count = np.bincount(seen.image[fits], minlength=len(network.images))
-        weak = self.estimate.oriented & (count < self.min_points)
+        known = self.estimate.determined[seen.point]
+        total = np.bincount(seen.image[known], minlength=len(network.images))
+        tolerance = self.tolerance()
+        needed = [
+            fewest_fitting(int(n), tolerance[i], self.field[i], minimum=self.min_points)
+            for i, n in enumerate(total)
+        ]
+        weak = self.estimate.oriented & (count < needed)
         for i in np.flatnonzero(weak).tolist():
-            self.reasons[i] = f"only {count[i]} of its points fit the network, {self.min_points} are needed"
+            self.reasons[i] = (
+                f"only {count[i]} of its {total[i]} points fit the network, {needed[i]} are needed"
+            )
         drop = weak[:, None]
         self.estimate = replace(
             self.estimate,

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from math import comb
 
 import numpy as np
 from numba import njit
+from scipy.special import bdtrc
 
 from sfm.conventions import BoolArray, FloatArray
 from sfm.orientation.resection.fischler_bolles import MAX_SOLUTIONS, rays_from_tangents, solve_triple
@@ -24,6 +26,7 @@ MAX_TRIALS = 20_000
 LOCAL_STEPS = 4  # Gauss-Newton steps of the local improvement of a candidate
 FINAL_STEPS = 30
 ROUNDS = 10  # of least squares and new choice of the fitting points
+CHANCE = 0.5  # poses that random points may be expected to support
 FEW_POINTS = 8  # up to here every triple is tried and every candidate improved
 _NOWHERE = np.full(3, np.nan)
 
@@ -57,6 +60,7 @@ def resect_robust(
     min_inliers: int = 4,
     max_trials: int = MAX_TRIALS,
     sigma: float | None = None,
+    field: float = np.inf,
 ) -> RobustResection:
     """Return the exterior orientation that most of the points support.
 
@@ -69,6 +73,8 @@ def resect_robust(
         max_trials: most triples tried.
         sigma: a priori standard deviation of a coordinate for the covariance, tangents; the
             a posteriori one if not given.
+        field: area of the photograph, squared tangents; if given, more points must fit than chance
+            would bring together (`fewest_fitting`).
 
     Returns:
         The orientation with the smallest truncated sum of squared residuals, refined by least squares
@@ -79,10 +85,10 @@ def resect_robust(
     improvement of every new best candidate by least squares is that of Chum et al. (2003), LO-RANSAC.
     """
     n = len(points)
-    needed = max(min_inliers, SAMPLE + 1)
+    needed = fewest_fitting(n, tolerance, field, minimum=min_inliers)
     uv = np.ascontiguousarray(tangents, dtype=float).reshape(-1, 2)
     xyz = np.ascontiguousarray(points, dtype=float).reshape(-1, 3)
-    if n < needed:
+    if n < max(min_inliers, SAMPLE + 1):
         return _failure(n, f"{n} points, resection needs {needed}")
     weights = np.zeros((n, 2, 2))
     weights[:, 0, 0] = weights[:, 1, 1] = 1.0
@@ -114,6 +120,26 @@ def resect_robust(
     return RobustResection(
         X0, R, used, residuals, float(np.sqrt(square / (2 * count))), float(sigma0), covariance, trials, ""
     )
+
+
+def fewest_fitting(n: int, tolerance: float, field: float, *, minimum: int = SAMPLE + 1) -> int:
+    """Return how many of n points must fit before the fit means anything.
+
+    Args:
+        n: points.
+        tolerance: largest residual of a fitting point, tangents.
+        field: area of the photograph, squared tangents.
+        minimum: never fewer than these, nor than four.
+
+    Source: Moisan, Stival (2004), Int. J. Comput. Vision 57(3): among all poses of all triples, poses that
+    so many points at random places would fit must be expected less than CHANCE times.
+    """
+    needed = max(minimum, SAMPLE + 1)
+    chance = min(1.0, np.pi * tolerance**2 / field)
+    tests = MAX_SOLUTIONS * comb(n, SAMPLE)
+    while needed < n and tests * bdtrc(needed - SAMPLE - 1, n - SAMPLE, chance) > CHANCE:
+        needed += 1
+    return needed
 
 
 def expected_trials(w: float, n: int) -> tuple[float, float]:
