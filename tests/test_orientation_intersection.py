@@ -26,7 +26,9 @@ def test_document_002():
     assert result.redundancy == 10
     assert result.sigma0 * C == pytest.approx(0.05108, abs=5e-6)
     # the document takes the radians of its angles for degrees: its printed So follows from that
-    wrong = np.stack([rotation_from_angles(*np.radians(LEFT[3:])), rotation_from_angles(*np.radians(RIGHT[3:]))])
+    wrong = np.stack(
+        [rotation_from_angles(*np.radians(LEFT[3:])), rotation_from_angles(*np.radians(RIGHT[3:]))]
+    )
     printed = intersect(tangents, image, point, positions, wrong)
     assert np.isnan(printed.sigma0) or printed.sigma0 * C > 1
 

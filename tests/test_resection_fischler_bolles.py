@@ -24,7 +24,9 @@ def _random_triples(rng, k, *, field=1.0, near=0.1, far=100.0):
     uv = rng.uniform(-field, field, (k, 3, 2))
     depth = np.exp(rng.uniform(np.log(near), np.log(far), (k, 3, 1)))
     axis = rng.standard_normal((k, 3))
-    R = rotation_from_vector(axis / np.linalg.norm(axis, axis=1, keepdims=True) * rng.uniform(0, np.pi, (k, 1)))
+    R = rotation_from_vector(
+        axis / np.linalg.norm(axis, axis=1, keepdims=True) * rng.uniform(0, np.pi, (k, 1))
+    )
     X0 = rng.normal(size=(k, 3))
     in_image = np.concatenate([uv, -np.ones((k, 3, 1))], axis=2) * depth
     return rays_from_tangents(uv), X0[:, None] + np.einsum("kij,knj->kni", R, in_image), X0, R
@@ -39,7 +41,11 @@ def test_both_solutions_of_document_001():
     expected = [[0.778546, 0.770247, 0.615352], [0.773059, 0.722135, 0.863515]]
     np.testing.assert_allclose(legs, expected, atol=5e-7)
     M = poses.rotation[0][order[0]].T
-    printed = [[-0.998033, 0.051274, 0.036079], [0.034382, -0.033600, 0.998844], [0.052427, 0.998119, 0.031771]]
+    printed = [
+        [-0.998033, 0.051274, 0.036079],
+        [0.034382, -0.033600, 0.998844],
+        [0.052427, 0.998119, 0.031771],
+    ]
     np.testing.assert_allclose(M, printed, atol=1e-6)
     # the fourth point tells them apart: 0.0000 mm, and (-2.40, 0.20) mm
     for k, misfit in zip(order, ((0, 0), (-2.40, 0.20)), strict=True):

@@ -25,6 +25,7 @@ from sfm.similarity import fit_similarity
 
 MIN_POINTS = 4  # of a photograph: three are always fitted by P3P, the fourth checks it
 MIN_ANGLE_DEG = 2.0  # smallest ray angle of a point that others are oriented on
+MIN_SHARE = 0.5  # of the rays of a point must meet in it
 START_TOLERANCE = 0.03  # of the photograph's diagonal: what an unknown distortion leaves after resection
 FINAL_TOLERANCE_PX = 4.0  # below this no image point is put aside here; the adjustment tests further
 TOLERANCE_FACTOR = 6.0  # times the robust spread of the residuals
@@ -256,7 +257,10 @@ class _Growth:
             tolerance=float(self.tolerance().max()),
             min_angle_deg=MIN_ANGLE_DEG,
         )
-        points = np.where(self.fixed[:, None], self.estimate.points, result.points)
+        # rays of a point that is somewhere else in every photograph meet by twos, here and there
+        rays = np.bincount(seen.point[self.estimate.oriented[seen.image]], minlength=len(self.network.points))
+        points = np.where((result.rays >= MIN_SHARE * rays)[:, None], result.points, np.nan)
+        points = np.where(self.fixed[:, None], self.estimate.points, points)
         self.estimate = replace(self.estimate, points=points)
 
     def refined(self, refine: Refine | None) -> bool:
