@@ -25,6 +25,7 @@ from sfm.survey_network import build_network, min_rays, name_coded
 from sfm.survey_solution import Solution, match_and_adjust, refine, solve
 from sfm.survey_start import find_photographs, network_from_observations
 from sfm.survey_targets import measure_photographs
+from sfm.targets.store import TargetStore
 
 Backend = Callable[[Network, Estimate], BackendAdjustment]
 
@@ -35,6 +36,7 @@ def run_survey(
     images_dir: Path | None = None,
     jobs: int = 1,
     backend: Backend | None = None,
+    store: TargetStore | None = None,
     progress: Progress = SILENT,
 ) -> SurveyResult:
     """Run a survey from its photographs.
@@ -44,6 +46,7 @@ def run_survey(
         images_dir: folder of the photographs in place of the survey file's own.
         jobs: photographs measured at a time.
         backend: the other adjuster to compare with, none if not given.
+        store: of measured targets, so that a photograph is not measured twice.
         progress: told of stages and photographs.
 
     Raises:
@@ -52,7 +55,7 @@ def run_survey(
     clock = _Clock(progress)
     files = find_photographs(survey, images_dir=images_dir)
     with clock.stage("targets"):
-        photographs = measure_photographs(survey, files, jobs=jobs, progress=progress)
+        photographs = measure_photographs(survey, files, jobs=jobs, store=store, progress=progress)
     with clock.stage("orientation"):
         naming = name_coded(photographs)
         network = build_network(survey, photographs, naming)

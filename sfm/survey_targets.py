@@ -12,12 +12,13 @@ from sfm.camera import Camera
 from sfm.conventions import FloatArray, IntArray
 from sfm.errors import GeometryError, PhotographError
 from sfm.progress import SILENT, Progress
-from sfm.project import Survey
+from sfm.project import Survey, TargetSettings
 from sfm.report.result import FailedImage, PhotographTargets
 from sfm.survey_start import PhotographList, start_cameras
 from sfm.targets.codes import CodeFamily, code_family
 from sfm.targets.detect import Targets, find_targets
 from sfm.targets.photograph import Metadata, read_metadata, read_photograph
+from sfm.targets.store import TargetStore, target_key
 
 MIN_PHOTOGRAPHS = 2
 
@@ -44,7 +45,12 @@ class MeasuredPhotographs:
 
 
 def measure_photographs(
-    survey: Survey, photographs: PhotographList, *, jobs: int = 1, progress: Progress = SILENT
+    survey: Survey,
+    photographs: PhotographList,
+    *,
+    jobs: int = 1,
+    store: TargetStore | None = None,
+    progress: Progress = SILENT,
 ) -> MeasuredPhotographs:
     """Read the photographs, find, measure and decode their targets.
 
@@ -54,6 +60,7 @@ def measure_photographs(
         survey: says what the targets look like and what is known of the cameras.
         photographs: the files.
         jobs: how many photographs are worked on at a time.
+        store: keeps what is measured and spares measuring it again; None to measure everything.
         progress: told of every photograph.
 
     Raises:
@@ -66,7 +73,7 @@ def measure_photographs(
     failed: dict[int, FailedImage] = {}
     with ThreadPoolExecutor(max_workers=max(1, jobs)) as pool:
         running = {
-            pool.submit(_measure_photograph, path, survey, family): k
+            pool.submit(_read_and_measure, path, survey.targets, family, store): k
             for k, path in enumerate(photographs.paths)
         }
         for done in as_completed(running):
@@ -96,16 +103,41 @@ def measure_photographs(
     )
 
 
-def _measure_photograph(path: Path, survey: Survey, family: CodeFamily | None) -> tuple[Metadata, Targets]:
-    """Measure one photograph; its pixels are let go at once."""
-    metadata = read_metadata(path)
+def _read_and_measure(
+    path: Path, settings: TargetSettings, family: CodeFamily | None, store: TargetStore | None
+) -> tuple[Metadata, Targets]:
+    return read_metadata(path), measure_photograph(path, settings, family, store)[0]
+
+
+def measure_photograph(
+    path: Path, settings: TargetSettings, family: CodeFamily | None, store: TargetStore | None = None
+) -> tuple[Targets, bool]:
+    """Return the targets of one photograph and whether they came from the store.
+
+    The pixels are let go at once.
+
+    Args:
+        path: the photograph.
+        settings: what the targets look like.
+        family: their codes, None where they have none.
+        store: is asked first, and keeps what had to be measured.
+
+    Raises:
+        PhotographError: the photograph cannot be read.
+    """
+    key = "" if store is None else target_key(path, settings.model_dump_json(exclude={"codes"}), family)
+    kept = None if store is None else store.load(key)
+    if kept is not None:
+        return kept, True
     targets = find_targets(
         read_photograph(path),
-        polarity=survey.targets.polarity,
+        polarity=settings.polarity,
         codes=family if family is not None else "none",
-        min_diameter_px=survey.targets.min_diameter_px,
+        min_diameter_px=settings.min_diameter_px,
     )
-    return metadata, targets
+    if store is not None:
+        store.save(key, targets)
+    return targets, False
 
 
 def image_point_covariance(targets: Targets, sigma_px: float) -> FloatArray:

@@ -1,0 +1,130 @@
+"""The lock of a folder: one run at a time writes into it, and everybody can read who.
+
+The operating system holds the lock and lets go of it when the process ends, however it ends. So a lock file
+that nobody holds is stale by that alone, and no process number has to be trusted.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+
+from sfm.errors import OutputError
+
+MAX_OWNER_BYTES = 10_000  # of the text in a lock file
+
+
+@dataclass(frozen=True)
+class Owner:
+    """Who holds a lock, or held it when it was left behind."""
+
+    process: int  # number of the process
+    computer: str
+    since: str  # date and time, UTC
+
+    def __str__(self) -> str:
+        return f"process {self.process} on {self.computer}, since {self.since}"
+
+
+@contextmanager
+def locked(path: Path) -> Iterator[Owner | None]:
+    """Hold the lock file `path`, which is gone afterwards.
+
+    Args:
+        path: the lock file; its folder is made if it is not there.
+
+    Yields:
+        The owner of a stale lock that was taken over, a run that was killed; None if there was none.
+
+    Raises:
+        OutputError: another run holds the lock, or the file cannot be written.
+    """
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        handle = _open_and_lock(path)
+    except OSError as error:
+        raise OutputError(f"{path}: the lock cannot be written: {error.strerror or error}") from error
+    try:
+        try:
+            before = _owner(handle)
+            _write_owner(handle)
+        except OSError as error:
+            raise OutputError(f"{path}: the lock cannot be written: {error.strerror or error}") from error
+        yield before
+    finally:
+        _release(handle, path)
+
+
+def _open_and_lock(path: Path) -> int:
+    """Open and lock the file that stands at `path` now, not one that its owner has just removed."""
+    while True:
+        handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
+        if not _try_lock(handle):
+            owner = _owner(handle)
+            os.close(handle)
+            who = f" ({owner})" if owner else ""
+            raise OutputError(f"{path.parent}: another run is writing into this folder{who}; wait or end it")
+        try:
+            if os.path.samestat(os.fstat(handle), os.stat(path)):
+                return handle
+        except FileNotFoundError:
+            pass
+        os.close(handle)
+
+
+def _write_owner(handle: int) -> None:
+    now = datetime.now(UTC).isoformat(timespec="seconds")
+    text = json.dumps(asdict(Owner(os.getpid(), platform.node(), now)))
+    os.ftruncate(handle, 0)
+    os.lseek(handle, 0, os.SEEK_SET)
+    os.write(handle, text.encode())
+    os.fsync(handle)
+
+
+def _owner(handle: int) -> Owner | None:
+    """Read who holds a lock; None if nobody says so."""
+    try:
+        os.lseek(handle, 0, os.SEEK_SET)
+        found = json.loads(os.read(handle, MAX_OWNER_BYTES))
+        return Owner(int(found["process"]), str(found["computer"]), str(found["since"]))
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+        return None
+
+
+if sys.platform == "win32":
+    import msvcrt
+
+    LOCKED_AT = 1 << 30  # Windows keeps others from reading the locked byte, so it lies behind the text
+
+    def _try_lock(handle: int) -> bool:
+        os.lseek(handle, LOCKED_AT, os.SEEK_SET)
+        try:
+            msvcrt.locking(handle, msvcrt.LK_NBLCK, 1)
+        except OSError:
+            return False
+        return True
+
+    def _release(handle: int, path: Path) -> None:
+        os.ftruncate(handle, 0)  # an open file cannot be removed here; an empty one is nobody's
+        os.close(handle)
+
+else:
+    import fcntl
+
+    def _try_lock(handle: int) -> bool:
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return False
+        return True
+
+    def _release(handle: int, path: Path) -> None:
+        path.unlink(missing_ok=True)  # while it is still held: whoever waits for it opens a new one
+        os.close(handle)

@@ -1,0 +1,147 @@
+"""Small survey folders for the tests: rendered photographs of coded targets, or image points."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from sfm.camera import Camera, camera_from_values
+from sfm.conventions import AnyArray, FloatArray
+from sfm.targets.codes import code_family
+from sfm.targets.render import render_photographs
+from sfm.targets.scene import CircularTargets, Faces, Marks, Optics, Scene, coded_ring, join_marks
+from tests.synthetic import make_network, seed_of
+
+SIZE_PX = (640, 480)
+PIXEL_MM = 0.01
+C_MM = 8.0
+NOISE = 2.0  # standard deviation of the intensities, of 255
+
+SURVEY = """\
+[survey]
+name = "{name}"
+unit = "mm"
+[[camera]]
+name = "small"
+images = "*.png"
+pixel_mm = [0.01, 0.01]
+c_mm = 8.0
+free = ["c"]
+[targets]
+polarity = "dark"
+codes = "ring14"
+[compare]
+backend = "{backend}"
+"""
+
+OBSERVED = """\
+[survey]
+name = "{name}"
+unit = "m"
+[[camera]]
+name = "synthetic"
+size_px = [2000, 1500]
+pixel_mm = [0.005, 0.005]
+c_mm = 10.0
+free = ["c"]
+fixed = {{x0 = 0.03, y0 = -0.02, K1 = 8e-4, K2 = -4e-6, P1 = 3e-5, P2 = -2e-5, b1 = 2e-4}}
+[observations]
+file = "image_points.csv"
+[compare]
+backend = "{backend}"
+"""
+
+
+def write_photograph_survey(
+    folder: Path, name: str, *, photographs: int = 6, backend: str = "none", suffix: str = ".png"
+) -> Path:
+    """Write a survey of rendered photographs, with noise that depends on the name; return its file."""
+    folder.mkdir(parents=True)
+    rng = seed_of(name)
+    for number, picture in enumerate(pictures()[:photographs], 1):
+        noisy = np.rint(picture + NOISE * rng.standard_normal(picture.shape))
+        grey = np.clip(noisy, 0, 255).astype(np.uint8)
+        cv2.imwrite(str(folder / f"photo {number}{suffix}"), grey, [cv2.IMWRITE_PNG_COMPRESSION, 1])
+    path = folder / "survey.toml"
+    text = SURVEY.format(name=name, backend=backend).replace("*.png", f"*{suffix}")
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def write_observed_survey(
+    folder: Path, name: str, *, images: int = 6, points: int = 20, backend: str = "none"
+) -> Path:
+    """Write a survey of synthetic image points, a network that depends on the name; return its file."""
+    folder.mkdir(parents=True)
+    network, _ = make_network(seed_of(name), images=images, points=points, free=("c",))
+    seen = network.image_points
+    lines = ["image,point,x_px,y_px"]
+    lines += [
+        f"{network.images[i]},{network.points[j]},{x!r},{y!r}"
+        for i, j, (x, y) in zip(seen.image, seen.point, seen.xy.tolist(), strict=True)
+    ]
+    (folder / "image_points.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    path = folder / "survey.toml"
+    path.write_text(OBSERVED.format(name=name, backend=backend), encoding="utf-8")
+    return path
+
+
+@lru_cache
+def pictures() -> tuple[AnyArray, ...]:
+    """Render six convergent photographs of two plates with coded targets, without noise."""
+    positions, rotations = _stations(6)
+    optics = Optics(blur_px=0.7, exposure=0.9)
+    found, _ = render_photographs(_scene(), _camera(), positions, rotations, optics=optics, seed=1)
+    return tuple(found)
+
+
+def _camera() -> Camera:
+    return camera_from_values("small", "brown", SIZE_PX, (PIXEL_MM, PIXEL_MM), c_mm=C_MM)
+
+
+def _stations(count: int) -> tuple[FloatArray, FloatArray]:
+    """Return positions and rotations of cameras on a ring, 500 mm above the plates, rolled by turns."""
+    azimuth = 2 * np.pi * np.arange(count) / count
+    position = np.stack([330 * np.cos(azimuth), 330 * np.sin(azimuth), np.full(count, 520.0)], axis=1)
+    rotation = np.empty((count, 3, 3))
+    for i in range(count):
+        z = position[i] / np.linalg.norm(position[i])
+        x = np.cross([0.0, 0.0, 1.0], z)
+        x /= np.linalg.norm(x)
+        turn = np.pi / 2 * (i % 4)
+        roll = np.array([[np.cos(turn), -np.sin(turn), 0], [np.sin(turn), np.cos(turn), 0], [0, 0, 1]])
+        rotation[i] = np.stack([x, np.cross(z, x), z], axis=1) @ roll
+    return position, rotation
+
+
+def _scene() -> Scene:
+    family = code_family("ring14")
+    assert family is not None
+    axes = np.tile(np.eye(3)[:2], (2, 1, 1))
+    faces = Faces(
+        np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 60.0]]),
+        axes,
+        np.array([[210.0, 160.0], [60.0, 50.0]]),
+        np.array([0.8, 0.85]),
+        np.zeros(2),
+        np.ones(2),
+    )
+    marks: list[Marks] = []
+    places: list[tuple[int, float, float]] = [
+        (0, x, y) for x in (-165.0, -105.0, 105.0, 165.0) for y in (-115.0, 0.0, 115.0)
+    ]
+    places += [(0, x, y) for x in (-35.0, 35.0) for y in (-120.0, 120.0)]
+    places += [(1, x, y) for x in (-32.0, 32.0) for y in (-25.0, 25.0)]
+    for k, (face, x, y) in enumerate(places):
+        marks.append(coded_ring(face, np.array([x, y]), 7.0, 5 + 3 * k, family, 0.08, turn=0.3 * k))
+    where = np.array(places)
+    targets = CircularTargets(
+        where[:, 0].astype(np.int64),
+        where[:, 1:],
+        np.full(len(places), 7.0),
+        5 + 3 * np.arange(len(places)),
+    )
+    return Scene(faces, join_marks(marks), targets)
