@@ -28,6 +28,7 @@ from sfm.report.verdict import verdict_of
 
 BAD_INPUT = 2  # exit code where a person must put something right
 INTERRUPTED = 130  # exit code after Ctrl-C, as a shell expects it
+MAX_WARNINGS = 5  # without --verbose
 COLOURS = {"good": "green", "fair": "yellow", "bad": "red"}
 
 app = typer.Typer(
@@ -220,9 +221,12 @@ def _tell(result: SurveyResult, page: Path, *, verbose: bool) -> None:
         console.print(Text(f"! {line}", style="yellow"), soft_wrap=True)
     for failed in result.failed:
         console.print(Text(f"  {failed.image}: {failed.reason}"), soft_wrap=True)
+    shown = result.warnings if verbose else result.warnings[:MAX_WARNINGS]
+    for warning in shown:
+        console.print(Text(f"  {warning}"), soft_wrap=True)
+    if len(shown) < len(result.warnings):
+        console.print(Text(f"  ... and {len(result.warnings) - len(shown)} more, in the report"))
     if verbose:
-        for warning in result.warnings:
-            console.print(Text(f"  {warning}"), soft_wrap=True)
         console.print(_photograph_table(result))
         for camera in a.estimate.cameras:
             values = ", ".join(

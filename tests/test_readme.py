@@ -1,0 +1,66 @@
+"""The README keeps its word: its survey file is read, its commands exist, its folder is what is written."""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from pathlib import Path
+
+from sfm.cli import app
+from sfm.project import Section, Survey, read_survey
+from sfm.report.output import WRITTEN
+
+ROOT = Path(__file__).resolve().parents[1]
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+FIRST_SCREEN = "\n".join(README.splitlines()[:30])
+
+
+def keys_of(section: type[Section]) -> set[str]:
+    return {field.alias or name for name, field in section.model_fields.items()}
+
+
+def test_first_screen_has_both_commands_and_the_plain_lines() -> None:
+    for line in ("make demo", "make test", "py -m venv .venv", "pip install -c constraints.txt -e .[dev]"):
+        assert line in FIRST_SCREEN, line
+
+
+def test_survey_file_of_the_readme_is_read_and_shows_every_key(tmp_path: Path) -> None:
+    block = re.search(r"```toml\n(.*?)```", README, re.S)
+    assert block is not None
+    path = tmp_path / "survey.toml"
+    path.write_text(block[1], encoding="utf-8")
+    survey = read_survey(path)
+    table = tomllib.loads(block[1])
+    assert table.keys() == keys_of(Survey)
+    for name, field in Survey.model_fields.items():
+        value = getattr(survey, name)
+        section = value[0] if isinstance(value, tuple) else value
+        given = table[field.alias or name]
+        shown = set(given[0] if isinstance(given, list) else given)
+        assert keys_of(type(section)) - shown <= {"sensor_mm"}, name
+
+
+def test_commands_of_the_readme_exist() -> None:
+    commands = {command.callback.__name__ for command in app.registered_commands if command.callback}
+    assert set(re.findall(r"^kolinear ([a-z]+) ", README, re.M)) == commands
+
+
+def test_everything_that_is_written_is_explained() -> None:
+    explained = set(re.findall(r"^\| `([\w.]+)/?` \|", README, re.M))
+    assert explained == set(WRITTEN)
+
+
+def test_make_targets_of_the_readme_exist() -> None:
+    makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
+    for target in set(re.findall(r"make (demo|test|study|bench)\b", README)):
+        assert re.search(rf"^{target}:", makefile, re.M), target
+
+
+def test_constraints_pin_every_requirement() -> None:
+    lines = (ROOT / "constraints.txt").read_text(encoding="utf-8").splitlines()
+    pins = {line.split("==")[0].lower().replace("_", "-") for line in lines}
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    required = [*project["dependencies"], *project["optional-dependencies"]["dev"]]
+    for requirement in required:
+        name = re.split(r"[\[<>=~! ]", requirement)[0].lower().replace("_", "-")
+        assert name in pins, name
