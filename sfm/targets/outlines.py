@@ -1,0 +1,238 @@
+"""Outlines in a photograph that resemble ellipses: the candidates for targets."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numba import njit
+
+from sfm.conventions import AnyArray, FloatArray, IntArray
+from sfm.targets.flags import Flag
+
+# The local mean is that of 3 x 3 cells of the photograph reduced to a quarter, about 14 px: an edge is seen
+# up to half of it, whatever the target's size.
+REDUCTION = 4
+MEAN_CELLS = 3
+# The local step of intensity that makes a candidate: this many sigma of the smoothed noise (the mask
+# 1 2 1 x 1 2 1 leaves 3/8 of it), at least this share of the scale.
+STEP_SIGMAS = 6.0
+SMOOTHED_NOISE = 3 / 8
+LEAST_STEP = 4 / 255
+# Minor over major axis: 75 degrees of tilt give 0.26; room for perspective, and for blobs that are ellipses.
+LEAST_AXIS_RATIO = 0.14
+# Outlines farther than this from their ellipse (in radii, plus so many px for the grid) are not elliptic.
+OUTLINE_TOLERANCE, GRID_TOLERANCE_PX = 0.2, 1.5
+# The noise is estimated from about so many rows.
+NOISE_ROWS = 100
+
+
+@dataclass(frozen=True)
+class Outlines:
+    """Outlines that resemble ellipses, and the reasons against the others."""
+
+    xy: FloatArray
+    """centres, px, shape (k, 2)"""
+    shape: FloatArray
+    """(p, q, r) of S, which turns image vectors into radii, 1/px, shape (k, 3)"""
+    sign: IntArray
+    """+1 brighter, -1 darker than the surroundings, shape (k,)"""
+    rejected_xy: FloatArray
+    """positions of the other outlines, px, shape (m, 2)"""
+    rejected_flag: IntArray
+    """reasons against them, see Flag, shape (m,)"""
+
+
+def find_outlines(
+    photograph: AnyArray,
+    signs: tuple[int, ...],
+    *,
+    noise: float,
+    scale: float,
+    min_diameter_px: float,
+    max_diameter_px: float,
+) -> Outlines:
+    """Find outlines that resemble ellipses.
+
+    A pixel belongs to a candidate if the smoothed photograph there differs from the local mean. Along the
+    edge of a target this gives a closed band just inside of it, whatever the size of the target and the level
+    of the light, and the outer contour of the band is the edge itself.
+
+    Args:
+        photograph: intensities, shape (H, W), uint8 or uint16.
+        signs: +1 to look for bright, -1 for dark targets.
+        noise: standard deviation of the intensities.
+        scale: largest intensity that the photograph can hold.
+        min_diameter_px, max_diameter_px: limits of the minor and major axis.
+
+    Returns:
+        The outlines.
+    """
+    # Outlines need no more than 8 bits; the measurement uses all of them.
+    image = photograph if photograph.dtype == np.uint8 else cv2.convertScaleAbs(photograph, alpha=255 / scale)
+    step = 255 / scale * max(STEP_SIGMAS * SMOOTHED_NOISE * noise, LEAST_STEP * scale)
+    mean = _local_mean(image)
+    band = np.zeros_like(image)
+    ellipses, kept_signs, rejected_xy, rejected_flag = [], [], [], []
+    for sign in signs:
+        _mark_band(image, mean, step, sign, band)
+        points, first = _trace_contours(band)
+        ellipse, reason = _ellipses_of_contours(
+            points, first, image.shape[0], image.shape[1], float(min_diameter_px), float(max_diameter_px)
+        )
+        good = reason == 0
+        ellipses.append(ellipse[good])
+        kept_signs.append(np.full(int(good.sum()), sign))
+        rejected_xy.append(ellipse[~good, :2])
+        rejected_flag.append(reason[~good])
+    found = np.concatenate(ellipses)
+    return Outlines(
+        xy=found[:, :2],
+        shape=found[:, 2:],
+        sign=np.concatenate(kept_signs),
+        rejected_xy=np.concatenate(rejected_xy),
+        rejected_flag=np.concatenate(rejected_flag),
+    )
+
+
+def estimate_noise(photograph: AnyArray) -> float:
+    """Return the standard deviation of the noise of a photograph in its own units.
+
+    Source: Immerkaer, "Fast noise variance estimation" (1996): the mask 1 -2 1 x 1 -2 1 annuls planes; the
+    median over a part of the rows is used, so that edges do not count.
+    """
+    height = photograph.shape[0]
+    if min(photograph.shape) < 3:
+        return 0.0
+    at = np.arange(1, height - 1, max(1, height // NOISE_ROWS))
+    above, here, below = (photograph[at + k].astype(np.float32) for k in (-1, 0, 1))
+    v = above - 2 * here + below
+    mask = np.abs(v[:, :-2] - 2 * v[:, 1:-1] + v[:, 2:])
+    # 6 = norm of the mask, 0.6745 = median of |N(0, 1)|
+    return float(np.median(mask)) / (0.6745 * 6)
+
+
+def scale_of(photograph: AnyArray) -> float:
+    """Return the largest intensity a photograph can hold: 255, or 2^bits - 1 of the bits that are in use."""
+    if photograph.dtype == np.uint8:
+        return 255.0
+    return float((1 << max(8, int(photograph.max()).bit_length())) - 1)
+
+
+def _local_mean(image: AnyArray) -> AnyArray:
+    """Return the mean intensity around each pixel, shape (H, W), uint8."""
+    height, width = image.shape
+    small = image
+    for k in (2, REDUCTION):
+        size = max(1, width // k), max(1, height // k)
+        small = cv2.resize(small, size, interpolation=cv2.INTER_AREA)
+    small = cv2.blur(small, (MEAN_CELLS, MEAN_CELLS))
+    return cv2.resize(small, (width, height), interpolation=cv2.INTER_LINEAR)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _mark_band(image: AnyArray, mean: AnyArray, step: float, sign: int, band: AnyArray) -> None:
+    """Set band to 1 where the photograph, smoothed by 1 2 1 x 1 2 1, is beyond the local mean by the step.
+
+    All sums are of 16 bit, so that many pixels are worked on at once; the border of one pixel stays 0.
+    """
+    height, width = image.shape
+    column = np.empty(width, np.int16)
+    limit, direction, one, four = np.int16(16 * step), np.int16(sign), np.int16(1), np.int16(4)
+    for i in range(1, height - 1):
+        above, here, below, local, out = image[i - 1], image[i], image[i + 1], mean[i], band[i]
+        for j in range(width):
+            column[j] = np.int16(above[j]) + (np.int16(here[j]) << one) + np.int16(below[j])
+        for j in range(1, width - 1):
+            smooth = np.int16(column[j - 1] + column[j + 1]) + np.int16(column[j] << one)
+            difference = np.int16(np.int16(smooth) - (np.int16(local[j]) << four))
+            out[j] = np.int16(direction * difference) > limit
+
+
+def _trace_contours(band: AnyArray) -> tuple[IntArray, IntArray]:
+    """Return the points of the outer contours, shape (n, 2), and where each begins, shape (k + 1,)."""
+    contours: Any
+    contours, hierarchy = cv2.findContours(band, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
+    parent = np.zeros(0) if hierarchy is None else np.asarray(hierarchy).reshape(-1, 4)[:, 3]
+    outer = [contours[k] for k in np.flatnonzero(parent < 0) if len(contours[k]) >= 4]
+    if not outer:
+        return np.zeros((0, 2), np.int64), np.zeros(1, np.int64)
+    first = np.cumsum([0, *(len(c) for c in outer)])
+    return np.concatenate(outer).reshape(-1, 2).astype(np.int64), first
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _ellipses_of_contours(
+    points: IntArray, first: IntArray, height: int, width: int, smallest: float, largest: float
+) -> tuple[FloatArray, IntArray]:
+    """Return x, y, p, q, r of the ellipse with the moments of each contour, and the reason against it.
+
+    The contour runs through the outermost pixels, so half a pixel is added to the semi-axes.
+    """
+    k = len(first) - 1
+    ellipse = np.zeros((k, 5))
+    reason = np.zeros(k, np.int64)
+    for c in range(k):
+        i0, i1 = first[c], first[c + 1]
+        ox, oy = points[i0, 0], points[i0, 1]
+        left, right, top, bottom = ox, ox, oy, oy
+        m00, m10, m01, m20, m11, m02 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+        for i in range(i0, i1):
+            j = i + 1 if i + 1 < i1 else i0
+            left, right = min(left, points[i, 0]), max(right, points[i, 0])
+            top, bottom = min(top, points[i, 1]), max(bottom, points[i, 1])
+            ax, ay = float(points[i, 0] - ox), float(points[i, 1] - oy)
+            bx, by = float(points[j, 0] - ox), float(points[j, 1] - oy)
+            cross = ax * by - bx * ay  # Green's theorem
+            m00 += cross
+            m10 += cross * (ax + bx)
+            m01 += cross * (ay + by)
+            m20 += cross * (ax * ax + ax * bx + bx * bx)
+            m11 += cross * (2 * ax * ay + ax * by + bx * ay + 2 * bx * by)
+            m02 += cross * (ay * ay + ay * by + by * by)
+        ellipse[c, 0], ellipse[c, 1] = (left + right) / 2, (top + bottom) / 2
+        if max(right - left, bottom - top) + 1 > 1.5 * largest + 4:
+            reason[c] = Flag.TOO_LARGE.value
+            continue
+        if max(right - left, bottom - top) + 3 < smallest or m00 == 0.0:
+            reason[c] = Flag.TOO_SMALL.value
+            continue
+        if left < 2 or top < 2 or right > width - 3 or bottom > height - 3:
+            reason[c] = Flag.CUT_BY_BORDER.value
+            continue
+        area = m00 / 2
+        x, y = m10 / (6 * area), m01 / (6 * area)
+        xx = m20 / (12 * area) - x * x
+        xy = m11 / (24 * area) - x * y
+        yy = m02 / (12 * area) - y * y
+        half = math.sqrt((xx - yy) ** 2 / 4 + xy * xy)
+        a = 2 * math.sqrt(max((xx + yy) / 2 + half, 0.0)) + 0.5
+        b = 2 * math.sqrt(max((xx + yy) / 2 - half, 0.0)) + 0.5
+        ellipse[c, 0], ellipse[c, 1] = ox + x, oy + y
+        # The outline is shrunk by less than a pixel; the limits are applied exactly after the fit.
+        if 2 * b + 2 < smallest:
+            reason[c] = Flag.TOO_SMALL.value
+            continue
+        if 2 * a - 2 > largest:
+            reason[c] = Flag.TOO_LARGE.value
+            continue
+        if (b + 0.5) / a < LEAST_AXIS_RATIO:
+            reason[c] = Flag.TOO_OBLIQUE.value
+            continue
+        angle = 0.5 * math.atan2(2 * xy, xx - yy)
+        cos, sin = math.cos(angle), math.sin(angle)
+        p = cos * cos / a + sin * sin / b
+        q = cos * sin * (1 / a - 1 / b)
+        r = sin * sin / a + cos * cos / b
+        ellipse[c, 2], ellipse[c, 3], ellipse[c, 4] = p, q, r
+        tolerance = OUTLINE_TOLERANCE + GRID_TOLERANCE_PX / b
+        for i in range(i0, i1):
+            dx, dy = points[i, 0] - ellipse[c, 0], points[i, 1] - ellipse[c, 1]
+            rho = math.sqrt((p * dx + q * dy) ** 2 + (q * dx + r * dy) ** 2)
+            if abs(rho - 1) > tolerance:
+                reason[c] = Flag.NOT_ELLIPTIC.value
+                break
+    return ellipse, reason

@@ -1,0 +1,353 @@
+"""Least squares template of a circular target: a blurred ellipse on a background, compiled.
+
+Model of the intensity at pixel (x, y), with d the signed distance from the edge of the ellipse (negative
+inside), s the blur of the edge, B the background, A the step to the target, g the change of the gain over L:
+
+    I = (B + A Phi(-d / s)) (1 + gx (x - x0) / L + gy (y - y0) / L)
+
+The ellipse is |S (x - x0, y - y0)| = 1 with a symmetric S = (p q; q r), which is regular for circles too, and
+rho = |S dx|, d = rho (rho - 1) / |S S dx|. The box of the pixel is part of s: it adds 1/12 to s^2.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+from sfm.conventions import AnyArray, FloatArray, IntArray
+from sfm.targets.edge_rays import RAYS, improve_outline, solve_spd, trace_rays
+from sfm.targets.flags import Flag
+
+# Unknowns of the fit: x0, y0, p, q, r, B, A, s, gx, gy.
+PARAMETERS = 10
+# A priori sigma of the change of gain over L: far above shading, it only keeps the fit regular.
+GAIN_SIGMA = 0.3
+MAX_STEPS = 30
+# A step below this is the last one; as Gauss-Newton steps shrink by a factor of ten or more, what is left is
+# far below the precision of any target.
+LAST_STEP_PX = 2e-3
+# Background taken into the fit: so many px and this share of the mean semi-axis, at most.
+MARGIN_PX, MARGIN_SHARE, MARGIN_MAX_PX = 3.5, 0.25, 10.0
+# Of targets larger than this (mean semi-axis) only a band inside the edge is used: the rest tells nothing.
+LARGE_PX, BAND_PX = 25.0, 15.0
+# Blur of the edge at the start and its limits.
+BLUR_START, BLUR_LEAST = 0.9, 0.25
+# The outline is traced again if it changed by more than this share of the radius; so many rays must agree.
+MAX_TRACES, SMALL_CHANGE, LEAST_AGREEMENT = 2, 0.08, 0.7
+_BLOCK = 256
+_SQRT_HALF = math.sqrt(0.5)
+_DENSITY_0 = 1 / math.sqrt(2 * math.pi)
+_NONE = int(Flag.NONE)
+_SATURATED = int(Flag.SATURATED)
+_CLOSE_NEIGHBOUR = int(Flag.CLOSE_NEIGHBOUR)
+_CUT_BY_BORDER = int(Flag.CUT_BY_BORDER)
+_NOT_ELLIPTIC = int(Flag.NOT_ELLIPTIC)
+_NO_CONVERGENCE = int(Flag.NO_CONVERGENCE)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def fit_templates(
+    image: AnyArray, start: FloatArray, sign: IntArray, noise: float, saturation: float
+) -> tuple[FloatArray, FloatArray, FloatArray, IntArray]:
+    """Fit the template to every target.
+
+    Args:
+        image: intensities, shape (H, W).
+        start: x0, y0, p, q, r, shape (k, 5).
+        sign: +1 bright, -1 dark target, shape (k,).
+        noise: approximate standard deviation of the intensities.
+        saturation: intensities from here on are censored.
+
+    Returns:
+        Unknowns, shape (k, 10); normal matrices J'J without the prior on the gain, shape (k, 10, 10);
+        pixels used, sum of squared residuals, unevenness of the edge, L in px and steps, shape (k, 5);
+        flags, shape (k,).
+    """
+    k = len(start)
+    theta = np.zeros((k, PARAMETERS))
+    normal = np.zeros((k, PARAMETERS, PARAMETERS))
+    statistics = np.ones((k, 5))
+    flag = np.zeros(k, np.int64)
+    J = np.zeros((PARAMETERS + 1, _BLOCK))
+    for i in range(k):
+        theta[i, :5] = start[i]
+        flag[i] = _fit_one(image, theta[i], sign[i], noise, saturation, J, normal[i], statistics[i])
+    return theta, normal, statistics, flag
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _fit_one(
+    image: AnyArray,
+    theta: FloatArray,
+    sign: int,
+    noise: float,
+    saturation: float,
+    J: FloatArray,
+    N: FloatArray,
+    statistics: FloatArray,
+) -> int:
+    """Fit one target; theta, N and statistics are filled, the flag is returned."""
+    flag = _NONE
+    edge, limit = np.empty(RAYS), np.empty(RAYS)
+    mean, margin = 0.0, 0.0
+    for _ in range(MAX_TRACES):
+        mean = 1 / math.sqrt(max(theta[2] * theta[4] - theta[3] ** 2, 1e-12))
+        margin = min(MARGIN_MAX_PX, MARGIN_PX + MARGIN_SHARE * mean)
+        step = trace_rays(image, theta, sign, noise, margin, edge, limit)
+        agree, change = improve_outline(theta, edge)
+        if agree < LEAST_AGREEMENT or step <= 0:
+            return _NOT_ELLIPTIC
+        if change < SMALL_CHANGE:
+            break
+    if limit.min() < 0:
+        return _CUT_BY_BORDER
+    if limit.min() < margin:
+        flag |= _CLOSE_NEIGHBOUR
+    det = theta[2] * theta[4] - theta[3] ** 2
+    mean = 1 / math.sqrt(det)
+    length = mean + margin
+    statistics[3] = length
+    half_x = math.sqrt(theta[4] ** 2 + theta[3] ** 2) / det + margin + 1
+    half_y = math.sqrt(theta[2] ** 2 + theta[3] ** 2) / det + margin + 1
+    data = np.empty((3, int((2 * half_x + 3) * (2 * half_y + 3))))
+    n = _collect(image, theta, limit, margin, half_x, half_y, 1e9 if mean < LARGE_PX else BAND_PX, data)
+    flag |= _start_levels(data, n, theta, saturation)
+    if theta[6] * sign <= 0 or n < 2 * PARAMETERS:
+        return flag | _NO_CONVERGENCE
+    prior = (noise / GAIN_SIGMA) ** 2
+    L, N_trial = np.empty((PARAMETERS, PARAMETERS)), np.empty((PARAMETERS, PARAMETERS))
+    g, g_trial, trial = np.empty(PARAMETERS), np.empty(PARAMETERS), np.empty(PARAMETERS)
+    total, used = _normal_equations(data, n, theta, length, saturation, J, N, g)
+    damping = 1e-3
+    done = False
+    steps = 0
+    while steps < MAX_STEPS and damping < 1e6 and not done:
+        steps += 1
+        for i in range(PARAMETERS):
+            for j in range(i + 1):
+                L[i, j] = N[i, j]
+            if i >= 8:
+                L[i, i] += prior
+            L[i, i] *= 1 + damping
+            trial[i] = g[i] - (prior * theta[i] if i >= 8 else 0.0)
+        if not solve_spd(L, trial):
+            return flag | _NO_CONVERGENCE
+        shift = max(abs(trial[0]), abs(trial[1]))
+        for i in range(PARAMETERS):
+            trial[i] += theta[i]
+        trial[7] = min(max(trial[7], BLUR_LEAST), 2 * mean)
+        if trial[2] * trial[4] - trial[3] ** 2 <= 0 or trial[2] <= 0 or shift > mean + 2:
+            damping = max(damping, 1e-3) * 10
+            continue
+        if shift < LAST_STEP_PX and damping < 1e-3:
+            theta[:] = trial
+            done = True
+            break
+        squares, used_trial = _normal_equations(data, n, trial, length, saturation, J, N_trial, g_trial)
+        before = total + prior * (theta[8] ** 2 + theta[9] ** 2)
+        after = squares + prior * (trial[8] ** 2 + trial[9] ** 2)
+        if after <= before * (1 + 1e-9) or used_trial != used:
+            theta[:], N[:], g[:] = trial, N_trial, g_trial
+            total, used = squares, used_trial
+            damping *= 0.1
+        else:
+            damping = max(damping, 1e-3) * 10
+    for i in range(PARAMETERS):
+        for j in range(i):
+            N[j, i] = N[i, j]
+    _residual_statistics(data, n, theta, length, saturation, statistics)
+    statistics[4] = steps
+    if not done or theta[6] * sign <= 0 or statistics[0] <= PARAMETERS:
+        flag |= _NO_CONVERGENCE
+    return flag
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _collect(
+    image: AnyArray,
+    theta: FloatArray,
+    limit: FloatArray,
+    margin: float,
+    half_x: float,
+    half_y: float,
+    inner: float,
+    data: FloatArray,
+) -> int:
+    """Collect x, y and intensity of the target and its undisturbed background; return how many."""
+    h, w = image.shape
+    x0, y0, p, q, r = theta[0], theta[1], theta[2], theta[3], theta[4]
+    disturbed = limit.min() < margin
+    n = 0
+    for i in range(max(0, int(y0 - half_y)), min(h, int(y0 + half_y) + 2)):
+        dy = i - y0
+        for j in range(max(0, int(x0 - half_x)), min(w, int(x0 + half_x) + 2)):
+            dx = j - x0
+            u, v = p * dx + q * dy, q * dx + r * dy
+            rho = math.sqrt(u * u + v * v)
+            d = rho * (rho - 1) / (math.sqrt((p * u + q * v) ** 2 + (q * u + r * v) ** 2) + 1e-12)
+            if d > margin or d < -inner:
+                continue
+            if disturbed and d > 0:
+                k = int(math.atan2(v, u) * (RAYS / (2 * math.pi)) + RAYS)
+                if d > limit[k % RAYS] or d > limit[(k + 1) % RAYS]:
+                    continue
+            if n == data.shape[1]:
+                return n
+            data[0, n], data[1, n], data[2, n] = j, i, image[i, j]
+            n += 1
+    return n
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _start_levels(data: FloatArray, n: int, theta: FloatArray, saturation: float) -> int:
+    """Set B and A to the mean intensities out- and inside the outline, s and g to their start values."""
+    outside, inside, n_out, n_in = 0.0, 0.0, 0, 0
+    flag = _NONE
+    for i in range(n):
+        dx, dy = data[0, i] - theta[0], data[1, i] - theta[1]
+        u, v = theta[2] * dx + theta[3] * dy, theta[3] * dx + theta[4] * dy
+        if u * u + v * v > 1:
+            outside += data[2, i]
+            n_out += 1
+        else:
+            inside += data[2, i]
+            n_in += 1
+        if data[2, i] >= saturation:
+            flag |= _SATURATED
+    theta[5], theta[6] = 0.0, 0.0
+    if n_out > 0 and n_in > 0:
+        theta[5], theta[6] = outside / n_out, inside / n_in - outside / n_out
+    theta[7], theta[8], theta[9] = BLUR_START, 0.0, 0.0
+    return flag
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=True, inline="always")
+def _edge_profile(t: float) -> tuple[float, float]:
+    """Return Phi(t), the normal distribution, and exp(-t^2 / 2).
+
+    Source: Abramowitz and Stegun (1964), 7.1.26, error below 1e-7.
+    """
+    z = abs(t) * _SQRT_HALF
+    if z > 4.0:
+        return (1.0 if t > 0 else 0.0), 0.0
+    e = math.exp(-z * z)
+    k = 1 / (1 + 0.3275911 * z)
+    tail = 0.254829592 + k * (-0.284496736 + k * (1.421413741 + k * (-1.453152027 + k * 1.061405429)))
+    tail *= 0.5 * e * k
+    return (1 - tail if t > 0 else tail), e
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
+def _normal_equations(
+    data: FloatArray,
+    n: int,
+    theta: FloatArray,
+    length: float,
+    saturation: float,
+    J: FloatArray,
+    N: FloatArray,
+    g: FloatArray,
+) -> tuple[float, int]:
+    """Sum up N = J'J (lower triangle) and g = J'v of one target; return v'v and the number of pixels used.
+
+    The pixels are taken in blocks, so that the sums run over contiguous numbers in the cache.
+    """
+    x0, y0, p, q, r = theta[0], theta[1], theta[2], theta[3], theta[4]
+    B, A, s, gx, gy = theta[5], theta[6], theta[7], theta[8] / length, theta[9] / length
+    N[:] = 0.0
+    g[:] = 0.0
+    total = 0.0
+    used = 0
+    for first in range(0, n, _BLOCK):
+        m = 0
+        for i in range(first, min(n, first + _BLOCK)):
+            dx, dy, value = data[0, i] - x0, data[1, i] - y0, data[2, i]
+            u, v = p * dx + q * dy, q * dx + r * dy
+            rho = math.sqrt(u * u + v * v) + 1e-12
+            wx, wy = p * u + q * v, q * u + r * v  # S S dx
+            nw = 1 / (math.sqrt(wx * wx + wy * wy) + 1e-12)
+            d = rho * (rho - 1) * nw
+            phi, e = _edge_profile(-d / s)
+            gain = 1 + gx * dx + gy * dy
+            level = B + A * phi
+            model = level * gain
+            if (value >= saturation and model >= saturation) or (value <= 0 and model <= 0):
+                continue  # censored: all that is known is that the model lies beyond the scale, and it does
+            residual = value - model
+            total += residual * residual
+            J[5, m] = gain
+            J[6, m] = phi * gain
+            J[8, m] = level * dx / length
+            J[9, m] = level * dy / length
+            J[10, m] = residual
+            # d' = (2 rho - 1) rho' / |w| - d |w|' / |w| with rho' = u.u' / rho, |w|' = w.w' / |w|,
+            # w' = S u' + S' u
+            slope = A * _DENSITY_0 * e * gain / s  # -dI/dd
+            J[7, m] = slope * d / s
+            f1 = -slope * (2 * rho - 1) * nw / rho
+            f2 = slope * d * nw * nw
+            ax, ay = p * wx + q * wy, q * wx + r * wy  # S w
+            J[0, m] = -f1 * (u * p + v * q) - f2 * (ax * p + ay * q) - level * gx
+            J[1, m] = -f1 * (u * q + v * r) - f2 * (ax * q + ay * r) - level * gy
+            J[2, m] = f1 * (u * dx) + f2 * (ax * dx + wx * u)
+            J[3, m] = f1 * (u * dy + v * dx) + f2 * (ax * dy + ay * dx + wx * v + wy * u)
+            J[4, m] = f1 * (v * dy) + f2 * (ay * dy + wy * v)
+            m += 1
+        used += m
+        for j in range(PARAMETERS):
+            for k in range(j + 1):
+                product = 0.0
+                for i in range(m):
+                    product += J[j, i] * J[k, i]
+                N[j, k] += product
+            product = 0.0
+            for i in range(m):
+                product += J[j, i] * J[10, i]
+            g[j] += product
+    return total, used
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _residual_statistics(
+    data: FloatArray, n: int, theta: FloatArray, length: float, saturation: float, statistics: FloatArray
+) -> None:
+    """Set the number of pixels, the sum of squared residuals and the unevenness of the edge.
+
+    The unevenness is the largest mean residual of an eighth of the edge, in- or outside, over the contrast.
+    """
+    p, q, r = theta[2], theta[3], theta[4]
+    B, A, s = theta[5], theta[6], theta[7]
+    band = 1.0 + 1.5 * s
+    mean, count = np.zeros(16), np.zeros(16)
+    squares, used = 0.0, 0
+    for i in range(n):
+        dx, dy, value = data[0, i] - theta[0], data[1, i] - theta[1], data[2, i]
+        u, v = p * dx + q * dy, q * dx + r * dy
+        rho = math.sqrt(u * u + v * v) + 1e-12
+        d = rho * (rho - 1) / (math.sqrt((p * u + q * v) ** 2 + (q * u + r * v) ** 2) + 1e-12)
+        phi, _ = _edge_profile(-d / s)
+        model = (B + A * phi) * (1 + (theta[8] * dx + theta[9] * dy) / length)
+        if (value >= saturation and model >= saturation) or (value <= 0 and model <= 0):
+            residual = 0.0
+        else:
+            residual = value - model
+            squares += residual * residual
+            used += 1
+        if abs(d) < band:
+            k = (
+                (8 if d > 0 else 0)
+                + (4 if u > 0 else 0)
+                + (2 if v > 0 else 0)
+                + (1 if abs(u) > abs(v) else 0)
+            )
+            mean[k] += residual
+            count[k] += 1
+    worst = 0.0
+    for k in range(16):
+        if count[k] > 0:
+            worst = max(worst, abs(mean[k]) / count[k])
+        elif k >= 8:
+            worst = abs(A)  # no background at all on this side
+    statistics[0], statistics[1], statistics[2] = used, squares, worst / abs(A)
