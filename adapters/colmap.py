@@ -61,9 +61,9 @@ class ColmapAdjustment:
     """What COLMAP's bundle adjuster made of a network."""
 
     estimate: Estimate  # adjusted, in the gauge that COLMAP was left with
-    residuals: FloatArray  # computed - measured, px, pixel frame, (k, 2)
-    rms_px: float  # root mean square residual per coordinate, px
-    cost: float  # half the sum of squared residuals, px^2
+    residuals: FloatArray  # computed - measured, px, pixel frame, NaN behind the camera, (k, 2)
+    rms_px: float  # root mean square residual per coordinate, px; NaN if points ended behind cameras
+    cost: float  # half the sum of squared residuals, px^2; NaN likewise
     iterations: int  # steps of Ceres, unsuccessful ones included
     converged: bool  # whether Ceres met a criterion of convergence
     message: str  # Ceres' reason to stop
@@ -75,7 +75,7 @@ def adjust_with_colmap(
     network: Network,
     estimate: Estimate,
     *,
-    gauge: str = "two_cameras",
+    gauge: str = "free",
     threads: int = 1,
     max_iterations: int = 200,
     polish: bool = True,
@@ -87,7 +87,9 @@ def adjust_with_colmap(
     Args:
         network: photographs, points and image points, all of which take part.
         estimate: start values, complete, cameras in an opencv model.
-        gauge: two_cameras | free | control; with control the control points are held fixed.
+        gauge: free | two_cameras | control. Free leaves the datum to Ceres' damping, which moves little;
+            two_cameras holds the first two photographs in 7 elements, from where a poor start can lose
+            points behind cameras; control holds the control points.
         threads: threads of Ceres.
         max_iterations: steps per run of Ceres.
         polish: run Ceres again from its own result until the cost stands still.
@@ -121,6 +123,10 @@ def adjust_with_colmap(
                 break
         adjusted = _estimate(scene, estimate)
         residuals = _residuals(scene, network)
+    behind = int(np.isnan(residuals[:, 0]).sum())
+    if behind:
+        # Ceres gives them no residual, so that losing a point behind a camera lowers its cost.
+        converged, message = False, f"{behind} image points ended behind their camera"
     return ColmapAdjustment(
         adjusted,
         residuals,
@@ -132,6 +138,70 @@ def adjust_with_colmap(
         seconds,
         threads,
     )
+
+
+@dataclass(frozen=True)
+class ColmapCovariance:
+    """Covariances as COLMAP estimates them, for image coordinates of standard deviation 1 px."""
+
+    interior: tuple[FloatArray, ...]  # marginal, of the free parameters of each camera, in order, (f, f)
+    points: FloatArray  # with cameras and photographs held fixed (conditional), object unit^2, (n, 3, 3)
+
+
+def covariance_with_colmap(
+    network: Network, estimate: Estimate, *, gauge: str = "two_cameras"
+) -> ColmapCovariance | None:
+    """Return COLMAP's covariances at a solution, None where COLMAP finds it singular.
+
+    What COLMAP calls the covariance of a point is conditional on all photographs and cameras, too small
+    by the share that these contribute. That of the interior orientation is marginal and does not depend
+    on the gauge.
+
+    Args:
+        network: photographs, points and image points.
+        estimate: the solution, cameras in an opencv model.
+        gauge: two_cameras | control; COLMAP has no covariance without a gauge.
+
+    Raises:
+        BackendError: as for `adjust_with_colmap`.
+    """
+    pycolmap = _pycolmap()
+    options = _options(pycolmap, colmap_free(estimate.cameras), len(network.images), 1, 1)
+    with _quiet(pycolmap):
+        scene = _reconstruction(pycolmap, network, estimate)
+        config = _config(pycolmap, network, estimate, gauge)
+        # estimate_ba_covariance wants this adjuster and no other; it need not have been run
+        adjuster = pycolmap.create_default_ceres_bundle_adjuster(options, config, scene)
+        wanted = pycolmap.BACovarianceOptions()
+        wanted.damping = 0.0
+        found = pycolmap.estimate_ba_covariance(wanted, scene, adjuster)
+        if found is None:
+            return None
+        interior = []
+        for k, camera in enumerate(estimate.cameras):
+            block = found.get_other_params_cov(scene.camera(k + 1).params) if camera.free.any() else None
+            interior.append(np.zeros((0, 0)) if block is None else np.array(block))
+        points = np.zeros((len(network.points), 3, 3))  # held points have none
+        for j in range(len(network.points)):
+            block = found.get_point_cov(j + 1)
+            if block is not None:
+                points[j] = block
+    return ColmapCovariance(tuple(interior), points)
+
+
+@dataclass(frozen=True)
+class ColmapBackend:
+    """COLMAP as the other adjuster of a validation (sfm.analysis.validation)."""
+
+    name: str = "colmap"
+
+    def adjust(self, network: Network, start: Estimate, *, control: bool) -> ColmapAdjustment:
+        """Adjust with control points held or the datum free."""
+        return adjust_with_colmap(network, start, gauge="control" if control else "free")
+
+    def covariance(self, network: Network, estimate: Estimate, *, control: bool) -> ColmapCovariance | None:
+        """Return COLMAP's covariances at a solution."""
+        return covariance_with_colmap(network, estimate, gauge="control" if control else "two_cameras")
 
 
 def colmap_free(cameras: tuple[Camera, ...]) -> tuple[bool, bool, bool]:
