@@ -57,7 +57,7 @@ def leg_quartic(rays: FloatArray, points: FloatArray) -> FloatArray:
     """
     g = np.empty(5)
     sides, gaps = np.empty(3), np.empty(3)
-    _sides_and_gaps(np.asarray(rays, dtype=float), np.asarray(points, dtype=float), sides, gaps)
+    sides_and_gaps(np.asarray(rays, dtype=float), np.asarray(points, dtype=float), sides, gaps)
     _quartic(sides, gaps, g)
     return g[::-1].copy()
 
@@ -89,8 +89,8 @@ def solve_triple(rays, points, position, rotation, legs, work):  # type: ignore[
     `work` is scratch space of at least 32 numbers, so that a batch allocates nothing.
     """
     sides, gaps, g, roots, abc = work[:3], work[3:6], work[6:11], work[11 : 11 + MAX_ROOTS], work[20:23]
-    _sides_and_gaps(rays, points, sides, gaps)
-    if not _is_triangle(sides) or not (gaps[0] > 0.0 and gaps[1] > 0.0 and gaps[2] > 0.0):
+    sides_and_gaps(rays, points, sides, gaps)
+    if not is_triangle(sides) or not (gaps[0] > 0.0 and gaps[1] > 0.0 and gaps[2] > 0.0):
         return 0
     Rab2, Rac2 = sides[0], sides[1]
     gab, gac, gbc = gaps[0], gaps[1], gaps[2]
@@ -114,7 +114,7 @@ def solve_triple(rays, points, position, rotation, legs, work):  # type: ignore[
             if y <= 0.0 or (misfit > other and misfit > NEAR):
                 continue
             abc[0], abc[1], abc[2] = a, a * x, a * y
-            if not _polish(abc, sides, gaps) or n == MAX_SOLUTIONS or _is_known(abc, legs, n):
+            if not polish_legs(abc, sides, gaps) or n == MAX_SOLUTIONS or is_known(abc, legs, n):
                 continue
             legs[n, 0], legs[n, 1], legs[n, 2] = abc[0], abc[1], abc[2]
             _pose_from_legs(rays, points, abc, position[n], rotation[n])
@@ -123,7 +123,7 @@ def solve_triple(rays, points, position, rotation, legs, work):  # type: ignore[
 
 
 @njit(cache=True)
-def _sides_and_gaps(rays, points, sides, gaps):  # type: ignore[no-untyped-def]
+def sides_and_gaps(rays, points, sides, gaps):  # type: ignore[no-untyped-def]
     """Squared sides Rab^2, Rac^2, Rbc^2 and 1 - cos of the face angles, exact also for small angles."""
     for k in range(3):
         i = 0 if k < 2 else 1
@@ -137,7 +137,7 @@ def _sides_and_gaps(rays, points, sides, gaps):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _is_triangle(sides):  # type: ignore[no-untyped-def]
+def is_triangle(sides):  # type: ignore[no-untyped-def]
     """Whether the squared sides are those of a triangle with an area (Heron)."""
     ab, ac, bc = sides[0], sides[1], sides[2]
     area16 = 2.0 * (ab * ac + ac * bc + bc * ab) - (ab * ab + ac * ac + bc * bc)
@@ -168,7 +168,7 @@ def _quartic(sides, gaps, g):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _polish(abc, sides, gaps):  # type: ignore[no-untyped-def]
+def polish_legs(abc, sides, gaps):  # type: ignore[no-untyped-def]
     """Newton's method on R^2 = (a - b)^2 + 2 a b (1 - cos); returns whether the legs fit."""
     largest = max(sides[0], max(sides[1], sides[2]))
     gab, gac, gbc = gaps[0], gaps[1], gaps[2]
@@ -200,7 +200,7 @@ def _polish(abc, sides, gaps):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _is_known(abc, legs, n):  # type: ignore[no-untyped-def]
+def is_known(abc, legs, n):  # type: ignore[no-untyped-def]
     for i in range(n):
         if abs(abc[0] - legs[i, 0]) + abs(abc[1] - legs[i, 1]) + abs(abc[2] - legs[i, 2]) < SAME * (
             abc[0] + abc[1] + abc[2]

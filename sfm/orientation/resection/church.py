@@ -1,0 +1,114 @@
+"""Space resection by Church: the face angles of image and object pyramid are equal, iterated."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sfm.conventions import FloatArray
+from sfm.errors import GeometryError
+from sfm.orientation.resection.fischler_bolles import rays_from_tangents
+from sfm.orientation.resection.solution import Solution, checked_points, solution_of
+
+MIN_POINTS = 3
+MAX_STEPS = 100
+CONVERGED = 1e-12  # step relative to the distance of the points
+HALVINGS = 10
+NO_PYRAMID = 1e-12  # determinant of three unit vectors below which they lie in a plane
+_I, _J = np.array([0, 1, 2]), np.array([1, 2, 0])
+
+
+@dataclass(frozen=True)
+class ChurchResection:
+    """The solution that Church's iteration reaches from its start, and the way there."""
+
+    solution: Solution
+    history: FloatArray  # projection centre before the first and after every step, object unit, (s + 1, 3)
+
+
+def resect_church(tangents: FloatArray, points: FloatArray, start: FloatArray) -> ChurchResection:
+    """Return the exterior orientation that Church's method converges to from a start position.
+
+    Args:
+        tangents: u = -U/W, v = -V/W of the measured rays, shape (n, 2), n >= 3; the first three
+            are used, the others only judge.
+        points: object points, shape (n, 3), object unit.
+        start: approximate projection centre, shape (3,), object unit.
+
+    Raises:
+        GeometryError: fewer than three points, points on one line, a start that coincides with a point, or
+            no convergence.
+
+    Source: Church (1945) as in document 001, eqs. 2.47-2.63: cos AOB = cos aOb for the three pairs, linearised
+    for the position (I, J, A, B, C); the equations are solved as a system, a step halved while it
+    makes the angles worse. The rotation is the product of the two matrices of direction cosines.
+    """
+    uv, xyz = checked_points("church", tangents, points, needed=MIN_POINTS)
+    X = xyz[:MIN_POINTS]
+    lmn = rays_from_tangents(uv[:MIN_POINTS])
+    k = np.sum(lmn[_I] * lmn[_J], axis=1)
+    position = np.array(start, dtype=float).reshape(3)
+    history = [position]
+    misfit = np.abs(k - _cosines(X, position)).sum()
+    for _ in range(MAX_STEPS):
+        step = _step(X, position, k)
+        factor = 1.0
+        for _half in range(HALVINGS):
+            new = np.abs(k - _cosines(X, position + factor * step)).sum()
+            if new <= misfit or new < 1e-15:
+                break
+            factor /= 2
+        position = position + factor * step
+        misfit = new
+        history.append(position)
+        distance = np.linalg.norm(X - position, axis=1).mean()
+        if np.linalg.norm(factor * step) <= CONVERGED * distance:
+            break
+        if not np.isfinite(position).all() or distance > 1e12 * np.linalg.norm(X - X.mean(axis=0)):
+            raise GeometryError("church: the position runs away from this start, a nearer one is needed")
+    if misfit > 1e-9:
+        raise GeometryError(
+            f"church: no convergence in {MAX_STEPS} steps from this start, a nearer one is needed"
+        )
+    LMN = _directions(X, position)
+    if abs(np.linalg.det(lmn)) < NO_PYRAMID:
+        raise GeometryError("church: the three rays lie in one plane, direction cosines give no rotation")
+    # R l = L for the three rays; the factor beside the nearest rotation is rounding
+    U, _, Vt = np.linalg.svd(LMN.T @ np.linalg.inv(lmn.T))
+    if np.linalg.det(U @ Vt) < 0:
+        raise GeometryError(
+            "church: the iteration ended on the mirror side of the points, a start on the other side is needed"
+        )
+    return ChurchResection(solution_of(position, U @ Vt, uv, xyz), np.array(history))
+
+
+def _directions(X: FloatArray, position: FloatArray) -> FloatArray:
+    """Direction cosines L, M, N of the rays to the object points, eq. 2.51, one per row."""
+    D = np.linalg.norm(X - position, axis=1, keepdims=True)
+    if D.min() == 0:
+        raise GeometryError("church: the start coincides with an object point")
+    return (X - position) / D
+
+
+def _cosines(X: FloatArray, position: FloatArray) -> FloatArray:
+    LMN = _directions(X, position)
+    return np.asarray(np.sum(LMN[_I] * LMN[_J], axis=1))
+
+
+def _step(X: FloatArray, position: FloatArray, k: FloatArray) -> FloatArray:
+    """Correction of the position: eqs. 2.52-2.58 with K in the place of k in I and J.
+
+    d cos / d X0 = L_i (K/D_i - 1/D_j) + L_j (K/D_j - 1/D_i).
+    """
+    D = np.linalg.norm(X - position, axis=1)
+    L = _directions(X, position)
+    K = np.sum(L[_I] * L[_J], axis=1)
+    along_i, along_j = K / D[_I] - 1 / D[_J], K / D[_J] - 1 / D[_I]
+    ABC = L[_I] * along_i[:, None] + L[_J] * along_j[:, None]
+    try:
+        return np.asarray(np.linalg.solve(ABC, k - K))
+    except np.linalg.LinAlgError:
+        raise GeometryError(
+            "church: the start lies on the danger cylinder or in the plane of the points"
+        ) from None

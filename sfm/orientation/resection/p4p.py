@@ -1,0 +1,93 @@
+"""Space resection from coplanar points by Fischler and Bolles (P4P): collineation and vanishing lines."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sfm.conventions import FloatArray, skew
+from sfm.errors import GeometryError
+from sfm.orientation.resection.solution import (
+    Solution,
+    checked_points,
+    rotation_from_position,
+    solution_of,
+    thickness,
+)
+
+MIN_POINTS = 4
+COPLANAR = 0.01  # thickness up to which points are taken as a plane; the residuals tell what it costs
+PARALLEL = 1e-12  # |(a1, a2)| of the vanishing line over |a3| below which image and object are parallel
+
+
+def resect_p4p(tangents: FloatArray, points: FloatArray) -> tuple[Solution, ...]:
+    """Return the exterior orientation from four or more points in one plane.
+
+    Args:
+        tangents: u = -U/W, v = -V/W of the measured rays, shape (n, 2), n >= 4.
+        points: coplanar object points, shape (n, 3), object unit; no three of four on a line.
+
+    Returns:
+        The one solution. It is exact for four exact points; errors of the image points go into it without
+        adjustment (the collineation has two parameters more than the exterior orientation).
+
+    Raises:
+        GeometryError: fewer than four points, points that are not in one plane or three of four on a line.
+
+    Source: Fischler, Bolles (1981), appendix B; document 001, eqs. 2.19-2.30, with f = 1 (tangents).
+    """
+    uv, xyz = checked_points("p4p", tangents, points, needed=MIN_POINTS)
+    if thickness(xyz) > COPLANAR:
+        raise GeometryError(
+            f"p4p: the points are not in one plane (thickness {thickness(xyz):.2g} of their extent), "
+            "use robust, or dlt from six points on"
+        )
+    origin = xyz.mean(axis=0)
+    axes = np.linalg.svd(xyz - origin)[2]
+    axes[2] = np.cross(axes[0], axes[1])
+    Q = (xyz - origin) @ axes[:2].T
+    T = _collineation(Q, uv)
+    depth = np.concatenate([Q, np.ones((len(Q), 1))], axis=1) @ T[2]
+    if not ((depth > 0).all() or (depth < 0).all()):
+        raise GeometryError("p4p: the points lie on both sides of the camera, or three of them on one line")
+    if np.linalg.det(T) * depth[0] < 0:  # the camera sees the plane from behind: turn the normal
+        axes[1:], Q = -axes[1:], Q * (1, -1)
+        T = T * (1.0, -1.0, 1.0)
+    position = origin + _position_over_plane(T) @ axes
+    R = rotation_from_position(uv, xyz, position)
+    return (solution_of(position, R, uv, xyz),)
+
+
+def _collineation(Q: FloatArray, uv: FloatArray) -> FloatArray:
+    """T with k (u, v, 1) = T (X, Y, 1), of unit norm: direct linear solution, eqs. 2.19-2.20."""
+    scale = np.sqrt(np.mean(Q**2))
+    q = np.concatenate([Q / scale, np.ones((len(Q), 1))], axis=1)
+    spread = np.sqrt(np.mean((uv - uv.mean(axis=0)) ** 2))
+    N = np.array([[1, 0, -uv[:, 0].mean()], [0, 1, -uv[:, 1].mean()], [0, 0, spread]]) / spread
+    p = np.concatenate([uv, np.ones((len(uv), 1))], axis=1) @ N.T
+    rows = np.einsum("nij,nk->nijk", skew(p), q).reshape(-1, 9)
+    _, s, Vt = np.linalg.svd(rows)
+    if s[7] <= 1e-9 * s[0]:
+        raise GeometryError("p4p: three of the four points lie on one line")
+    T = np.linalg.inv(N) @ Vt[8].reshape(3, 3) @ np.diag([1 / scale, 1 / scale, 1.0])
+    return np.asarray(T / np.linalg.norm(T))
+
+
+def _position_over_plane(T: FloatArray) -> FloatArray:
+    """Projection centre in the axes of the plane, eqs. 2.21-2.30."""
+    inverse = np.linalg.inv(T)
+    a = inverse[2]  # vanishing line of the plane in the image
+    b = T[2]  # vanishing line of the image in the plane
+    c = inverse[:, 2]  # point of the plane on the optical axis
+    DI_inverse = np.hypot(a[0], a[1]) / abs(a[2])
+    foot = c[:2] / c[2]
+    if DI_inverse < PARALLEL:
+        # parallel planes: the distance is the scale, the square root of the ratio of areas
+        scale = np.sqrt(abs(np.linalg.det(T[:2, :2]))) / abs(T[2, 2])
+        return np.array([foot[0], foot[1], 1 / scale])
+    theta = np.arctan(DI_inverse)
+    DO = abs(b @ c) / (abs(c[2]) * np.hypot(b[0], b[1]))
+    DCP = DO * np.sin(theta)
+    # the camera stands between the foot of its axis and the vanishing line (eqs. 2.28, 2.29)
+    towards = -np.sign((b @ c) / c[2]) * b[:2] / np.hypot(b[0], b[1])
+    xy = foot + towards * DCP * np.sin(theta)
+    return np.array([xy[0], xy[1], DCP * np.cos(theta)])

@@ -1,0 +1,247 @@
+"""Space resection by Zeng and Wang: quartic in n, trilateration, direction test, Pope-Hinsken rotation."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from sfm.conventions import FloatArray
+from sfm.errors import GeometryError
+from sfm.orientation.resection.fischler_bolles import (
+    MAX_SOLUTIONS,
+    NEAR,
+    Poses,
+    is_known,
+    is_triangle,
+    polish_legs,
+    rays_from_tangents,
+    sides_and_gaps,
+)
+from sfm.orientation.resection.quartic import MAX_ROOTS, find_positive_roots
+from sfm.orientation.resection.solution import Solution, checked_points, ordered, solution_of
+
+MIN_POINTS = 3
+
+
+def resect_zeng_wang(tangents: FloatArray, points: FloatArray) -> tuple[Solution, ...]:
+    """Return the exterior orientations by Zeng and Wang, the one that the further points confirm first.
+
+    Args:
+        tangents: u = -U/W, v = -V/W of the measured rays, shape (n, 2), n >= 3.
+        points: object points, shape (n, 3), object unit. The first three give the solutions; from four
+            points on the order of the solutions is meaningful.
+
+    Raises:
+        GeometryError: fewer than three points, points on one line, or no solution.
+
+    Source: Zeng, Wang (1992), A general solution of a closed-form space resection, PE&RS 58(3);
+    document 001, eqs. 2.64-2.93.
+    """
+    uv, xyz = checked_points("zeng-wang", tangents, points, needed=MIN_POINTS)
+    poses = resect_triples_zeng_wang(rays_from_tangents(uv[:MIN_POINTS])[None], xyz[None, :MIN_POINTS])
+    found = [solution_of(poses.position[0, s], poses.rotation[0, s], uv, xyz) for s in range(poses.count[0])]
+    if not found:
+        raise GeometryError("zeng-wang: no camera sees the first three points under these angles")
+    return ordered(found)
+
+
+def resect_triples_zeng_wang(rays: FloatArray, points: FloatArray) -> Poses:
+    """Return all exterior orientations of many triples by Zeng and Wang.
+
+    Args:
+        rays: unit vectors in the image frame, shape (k, 3, 3).
+        points: object points, shape (k, 3, 3), object unit.
+    """
+    rays = np.ascontiguousarray(rays, dtype=float).reshape(-1, 3, 3)
+    points = np.ascontiguousarray(points, dtype=float).reshape(-1, 3, 3)
+    return Poses(*_resect_batch(rays, points))
+
+
+def distance_quartic(rays: FloatArray, points: FloatArray) -> FloatArray:
+    """Return N1 to N5 of the quartic in n = R3/R1 of one triple, shape (5,); document 001, eq. 2.72."""
+    sides, gaps, N = np.empty(3), np.empty(3), np.empty(5)
+    sides_and_gaps(np.asarray(rays, dtype=float), np.asarray(points, dtype=float), sides, gaps)
+    _quartic(sides, gaps, N)
+    return N[::-1].copy()
+
+
+@njit(cache=True)
+def _resect_batch(rays, points):  # type: ignore[no-untyped-def]
+    k = len(rays)
+    count = np.zeros(k, dtype=np.int64)
+    position = np.full((k, MAX_SOLUTIONS, 3), np.nan)
+    rotation = np.full((k, MAX_SOLUTIONS, 3, 3), np.nan)
+    distances = np.full((k, MAX_SOLUTIONS, 3), np.nan)
+    for i in range(k):
+        count[i] = _solve(rays[i], points[i], position[i], rotation[i], distances[i])
+    return count, position, rotation, distances
+
+
+@njit(cache=True)
+def _solve(rays, points, position, rotation, distances):  # type: ignore[no-untyped-def]
+    sides, gaps, N = np.empty(3), np.empty(3), np.empty(5)
+    roots, R123, S = np.empty(MAX_ROOTS), np.empty(3), np.empty(3)
+    sides_and_gaps(rays, points, sides, gaps)
+    if not is_triangle(sides) or not (gaps[0] > 0.0 and gaps[1] > 0.0 and gaps[2] > 0.0):
+        return 0
+    _quartic(sides, gaps, N)
+    n = 0
+    for k in range(find_positive_roots(N, roots)):
+        x = roots[k]
+        p2 = sides[1] / ((x - 1.0) ** 2 + 2.0 * x * gaps[1])  # R1^2, from side 13 = L2
+        p = np.sqrt(p2)
+        # R2 from side 12 = L3 (eq. 2.77 with L3, which the document misprints as L2), side 23 decides
+        radicand = sides[0] / p2 - gaps[0] * (2.0 - gaps[0])
+        root = np.sqrt(radicand) if radicand > 0.0 else 0.0
+        high, low = 1.0 - gaps[0] + root, 1.0 - gaps[0] - root
+        off_high = abs(((high - x) ** 2 + 2.0 * high * x * gaps[2]) * p2 / sides[2] - 1.0)
+        off_low = abs(((low - x) ** 2 + 2.0 * low * x * gaps[2]) * p2 / sides[2] - 1.0)
+        for side in range(2):
+            m, off, other = (high, off_high, off_low) if side == 0 else (low, off_low, off_high)
+            if m <= 0.0 or (off > other and off > NEAR):
+                continue
+            R123[0], R123[1], R123[2] = p, m * p, x * p
+            if not polish_legs(R123, sides, gaps) or n == MAX_SOLUTIONS or is_known(R123, distances, n):
+                continue
+            trilaterate(points, R123, direction_test(rays), S)
+            distances[n] = R123
+            position[n] = S
+            pope_hinsken(rays, points, S, rotation[n])
+            n += 1
+    return n
+
+
+@njit(cache=True)
+def _quartic(sides, gaps, N):  # type: ignore[no-untyped-def]
+    """N[i], the coefficient of n^i, from A^2 - D1 A B + B^2 C = 0.
+
+    m = R2/R1 = A/B by the difference of the equations of sides 12 and 23, with q = n^2 - F1 n + 1:
+    A = (K32 - K12) q + n^2 - 1, B = E1 n - D1, C = 1 - K32 q.
+    """
+    D1, F1, E1 = 2.0 * (1.0 - gaps[0]), 2.0 * (1.0 - gaps[1]), 2.0 * (1.0 - gaps[2])
+    K12, K32 = sides[2] / sides[1], sides[0] / sides[1]
+    K = K32 - K12
+    a2, a1, a0 = K + 1.0, -K * F1, K - 1.0
+    c2, c1, c0 = -K32, K32 * F1, 1.0 - K32
+    N[4] = a2 * a2 + E1 * E1 * c2
+    N[3] = 2.0 * a2 * a1 - D1 * E1 * a2 + E1 * E1 * c1 - 2.0 * E1 * D1 * c2
+    N[2] = (
+        a1 * a1 + 2.0 * a2 * a0 - D1 * (E1 * a1 - D1 * a2) + E1 * E1 * c0 - 2.0 * E1 * D1 * c1 + D1 * D1 * c2
+    )
+    N[1] = 2.0 * a1 * a0 - D1 * (E1 * a0 - D1 * a1) - 2.0 * E1 * D1 * c0 + D1 * D1 * c1
+    N[0] = a0 * a0 + D1 * D1 * a0 + D1 * D1 * c0
+
+
+@njit(cache=True)
+def direction_test(rays):  # type: ignore[no-untyped-def]
+    """Sign that T = 1S . (12 x 13) must have: 1S = -R1 r1 and 12 x 13 turn with the image points.
+
+    Source: document 001, eq. 2.82, where the image points are taken clockwise and T > 0; here the
+    order of the points is free.
+    """
+    det = 0.0
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        det += rays[0, i] * (rays[1, j] * rays[2, k] - rays[1, k] * rays[2, j])
+    return -1.0 if det > 0.0 else 1.0
+
+
+@njit(cache=True)
+def trilaterate(points, distances, T, S):  # type: ignore[no-untyped-def]
+    """Fill the point S at three distances from three points, on the side of their plane that T says.
+
+    Source: Awange, Grafarend (2004), after eqs. 2.79-2.81 of document 001. Their elimination divides by
+    differences of Y and Z; in the axes of the triangle itself (x along 12, z along 12 x 13) nothing
+    that can vanish is divided by.
+    """
+    e, f, g, q = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
+    for d in range(3):
+        e[d] = points[1, d] - points[0, d]
+        q[d] = points[2, d] - points[0, d]
+    length = np.sqrt(e[0] ** 2 + e[1] ** 2 + e[2] ** 2)
+    for d in range(3):
+        e[d] /= length
+    for d in range(3):
+        i, j = (d + 1) % 3, (d + 2) % 3
+        g[d] = e[i] * q[j] - e[j] * q[i]
+    height = np.sqrt(g[0] ** 2 + g[1] ** 2 + g[2] ** 2)
+    for d in range(3):
+        g[d] /= height
+    for d in range(3):
+        i, j = (d + 1) % 3, (d + 2) % 3
+        f[d] = g[i] * e[j] - g[j] * e[i]
+    q_e = e[0] * q[0] + e[1] * q[1] + e[2] * q[2]
+    R1, R2, R3 = distances[0], distances[1], distances[2]
+    x = 0.5 * ((R1 - R2) * (R1 + R2) / length + length)
+    y = 0.5 * ((R1 - R3) * (R1 + R3) + q_e * q_e + height * height - 2.0 * q_e * x) / height
+    z2 = R1 * R1 - x * x - y * y
+    z = T * np.sqrt(z2) if z2 > 0.0 else 0.0
+    for d in range(3):
+        S[d] = points[0, d] + x * e[d] + y * f[d] + z * g[d]
+
+
+@njit(cache=True)
+def pope_hinsken(rays, points, S, rotation):  # type: ignore[no-untyped-def]
+    """Fill R from unit vectors to the points in object and image axes by the parameters d, a, b, c.
+
+    The differences of corresponding vectors are at right angles to the rotation axis g, so g is the cross
+    product of two of them. Of the three rays and their cross products the pair with the longest product is
+    taken, so that rays near the axis do no harm.
+
+    Source: Hinsken (1988), PE&RS 54(7), and Zeng, Wang (1992); document 001, eqs. 2.83-2.93. The sign of
+    the angle, which eq. 2.91 leaves open, is taken from g . (image x object).
+    """
+    p, l, diff = np.empty((6, 3)), np.empty((6, 3)), np.empty((6, 3))
+    for i in range(3):
+        norm = np.sqrt((points[i, 0] - S[0]) ** 2 + (points[i, 1] - S[1]) ** 2 + (points[i, 2] - S[2]) ** 2)
+        for d in range(3):
+            p[i, d] = rays[i, d]
+            l[i, d] = (points[i, d] - S[d]) / norm
+    for i in range(3):
+        j = (i + 1) % 3
+        for d in range(3):
+            m, n = (d + 1) % 3, (d + 2) % 3
+            p[3 + i, d] = p[i, m] * p[j, n] - p[i, n] * p[j, m]
+            l[3 + i, d] = l[i, m] * l[j, n] - l[i, n] * l[j, m]
+        np_, nl = np.sqrt((p[3 + i] ** 2).sum()), np.sqrt((l[3 + i] ** 2).sum())
+        p[3 + i] /= np_
+        l[3 + i] /= nl
+    for i in range(6):
+        diff[i] = p[i] - l[i]
+    best, g, h = 0.0, np.zeros(3), np.empty(3)
+    for i in range(6):
+        for j in range(i):
+            square = 0.0
+            for d in range(3):
+                m, n = (d + 1) % 3, (d + 2) % 3
+                h[d] = diff[i, m] * diff[j, n] - diff[i, n] * diff[j, m]
+                square += h[d] * h[d]
+            if square > best:
+                best = square
+                g[:] = h
+    if best == 0.0:  # all vectors equal: no rotation
+        rotation[:] = 0.0
+        rotation[0, 0] = rotation[1, 1] = rotation[2, 2] = 1.0
+        return
+    g /= np.sqrt(best)
+    # angle from image to object vectors about g, by the sums of sines and cosines over all vectors
+    sine, cosine = 0.0, 0.0
+    for i in range(6):
+        along_p = g[0] * p[i, 0] + g[1] * p[i, 1] + g[2] * p[i, 2]
+        along_l = g[0] * l[i, 0] + g[1] * l[i, 1] + g[2] * l[i, 2]
+        cosine += p[i, 0] * l[i, 0] + p[i, 1] * l[i, 1] + p[i, 2] * l[i, 2] - along_p * along_l
+        for d in range(3):
+            m, n = (d + 1) % 3, (d + 2) % 3
+            sine += g[d] * (p[i, m] * l[i, n] - p[i, n] * l[i, m])
+    half = 0.5 * np.arctan2(sine, cosine)
+    d0, s = np.cos(half), np.sin(half)
+    a, b, c = s * g[0], s * g[1], s * g[2]
+    rotation[0, 0] = d0 * d0 + a * a - b * b - c * c
+    rotation[0, 1] = 2.0 * (a * b - c * d0)
+    rotation[0, 2] = 2.0 * (a * c + b * d0)
+    rotation[1, 0] = 2.0 * (a * b + c * d0)
+    rotation[1, 1] = d0 * d0 - a * a + b * b - c * c
+    rotation[1, 2] = 2.0 * (b * c - a * d0)
+    rotation[2, 0] = 2.0 * (a * c - b * d0)
+    rotation[2, 1] = 2.0 * (b * c + a * d0)
+    rotation[2, 2] = d0 * d0 - a * a - b * b + c * c
