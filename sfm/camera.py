@@ -245,7 +245,7 @@ def inside_model(camera: Camera) -> FloatArray:
     return 1.1 * np.nanmax(radius)
 
 
-@njit(cache=True)
+@njit(cache=True, inline="always", error_model="numpy")
 def brown(frame, p, x, y, u, v, r, Ju, Jp):  # type: ignore[no-untyped-def]
     """Corrections of the measured point: c, x0, y0, K1-K3, P1, P2, affinity b1, shear b2.
 
@@ -298,7 +298,7 @@ def brown(frame, p, x, y, u, v, r, Ju, Jp):  # type: ignore[no-untyped-def]
     Jp[1, 9] = -fy * xy * yb
 
 
-@njit(cache=True)
+@njit(cache=True, inline="always", error_model="numpy")
 def brown_forward(frame, p, x, y, u, v, r, Ju, Jp):  # type: ignore[no-untyped-def]
     """Distortion of the ideal point in mm: c, x0, y0, K1-K4, P1, P2, affinity b1, shear b2.
 
@@ -353,7 +353,7 @@ def brown_forward(frame, p, x, y, u, v, r, Ju, Jp):  # type: ignore[no-untyped-d
     Jp[1, 10] = 0.0
 
 
-@njit(cache=True)
+@njit(cache=True, inline="always", error_model="numpy")
 def opencv(frame, p, x, y, u, v, r, Ju, Jp):  # type: ignore[no-untyped-def]
     """Distortion of the ideal point in units of the focal length: fx, fy, cx, cy, k1, k2, p1, p2.
 
@@ -375,7 +375,7 @@ def opencv(frame, p, x, y, u, v, r, Ju, Jp):  # type: ignore[no-untyped-def]
     _tangential(fx, fy, a, b, r2, Jp)
 
 
-@njit(cache=True)
+@njit(cache=True, inline="always", error_model="numpy")
 def full_opencv(frame, p, x, y, u, v, r, Ju, Jp):  # type: ignore[no-untyped-def]
     """As `opencv` with the rational radial term (1 + k1 r2 + k2 r4 + k3 r6)/(1 + k4 r2 + k5 r4 + k6 r6).
 
@@ -406,7 +406,7 @@ def full_opencv(frame, p, x, y, u, v, r, Ju, Jp):  # type: ignore[no-untyped-def
     _tangential(fx, fy, a, b, r2, Jp)
 
 
-@njit(cache=True)
+@njit(cache=True, inline="always", error_model="numpy")
 def _pinhole(p, x, y, a, b, ad, bd, radial, slope, p1, p2, r, Ju, Jp):  # type: ignore[no-untyped-def]
     """The part common to both OpenCV models: residual, d/d(u, v), d/d(fx, fy, cx, cy)."""
     fx, fy = p[0], p[1]
@@ -427,7 +427,7 @@ def _pinhole(p, x, y, a, b, ad, bd, radial, slope, p1, p2, r, Ju, Jp):  # type: 
     Jp[1, 3] = 1.0
 
 
-@njit(cache=True)
+@njit(cache=True, inline="always", error_model="numpy")
 def _tangential(fx, fy, a, b, r2, Jp):  # type: ignore[no-untyped-def]
     """d r / d (p1, p2), common to both OpenCV models."""
     Jp[0, 6] = fx * 2.0 * a * b
@@ -436,7 +436,7 @@ def _tangential(fx, fy, a, b, r2, Jp):  # type: ignore[no-untyped-def]
     Jp[1, 7] = fy * 2.0 * a * b
 
 
-@njit(cache=True)
+@njit(cache=True, inline="always", error_model="numpy")
 def observe(model, frame, p, x, y, u, v, r, Ju, Jp):  # type: ignore[no-untyped-def]
     """Fill r, Ju and Jp by the model of that number (Model.index)."""
     if model == 0:
@@ -449,7 +449,7 @@ def observe(model, frame, p, x, y, u, v, r, Ju, Jp):  # type: ignore[no-untyped-
         full_opencv(frame, p, x, y, u, v, r, Ju, Jp)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _tangents(model, frame, p, xy):  # type: ignore[no-untyped-def]
     """Newton's method on r(u, v) = 0; exact after one step for `brown`, where r is linear in u, v."""
     r, Ju, Jp = np.empty(2), np.empty((2, 2)), np.empty((2, MAX_PARAMETERS))
@@ -472,7 +472,7 @@ def _tangents(model, frame, p, xy):  # type: ignore[no-untyped-def]
     return uv
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _pixels(model, frame, p, uv):  # type: ignore[no-untyped-def]
     """Fixed point x <- x + r(x): r is computed minus measured, so distortion gradients contract it."""
     r, Ju, Jp = np.empty(2), np.empty((2, 2)), np.empty((2, MAX_PARAMETERS))
@@ -492,7 +492,7 @@ def _pixels(model, frame, p, uv):  # type: ignore[no-untyped-def]
     return xy
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _tangent_jacobians(model, frame, p, uv):  # type: ignore[no-untyped-def]
     r, Ju, Jp = np.empty(2), np.empty((2, 2)), np.empty((2, MAX_PARAMETERS))
     out = np.empty((len(uv), 2, 2))

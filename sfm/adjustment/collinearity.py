@@ -31,10 +31,9 @@ class Observations(NamedTuple):
     camera: IntArray  # camera of each photograph, (m,)
     model: IntArray  # number of the distortion model of each camera, (a,)
     frame: FloatArray  # photograph centre (px) and pixel size (mm) of each camera, (a, 4)
+    interior: IntArray  # how many parameters the model of each camera has, 0 if none is free, (a,)
     free_count: IntArray  # how many parameters of each camera are free, (a,)
     free_index: IntArray  # which they are, (a, MAX_PARAMETERS)
-    exterior_free: FloatArray  # 1 where an exterior unknown is free, else 0, (m, 6)
-    point_free: FloatArray  # 1 where an object coordinate is free, else 0, (n, 3)
 
 
 class State(NamedTuple):
@@ -49,41 +48,39 @@ class State(NamedTuple):
 class Scratch(NamedTuple):
     """Space of one image point for the compiled functions."""
 
-    r: FloatArray  # residual, px, (2,)
-    Ju: FloatArray  # (2, 2)
-    Jp: FloatArray  # (2, MAX_PARAMETERS)
-    A: FloatArray  # weighted d r / d (X0, w), (2, 6)
-    Ai: FloatArray  # weighted d r / d free interior parameters, (2, MAX_PARAMETERS)
+    r: FloatArray  # weighted residual, (2,)
+    Ju: FloatArray  # d r / d (u, v), px, (2, 2)
+    Jp: FloatArray  # d r / d all interior parameters, (2, MAX_PARAMETERS)
+    A: FloatArray  # weighted d r / d (X0, w, all interior parameters), (2, 6 + MAX_PARAMETERS)
     B: FloatArray  # weighted d r / d X, (2, 3)
 
 
-@njit(cache=True)
+@njit(cache=True, inline="always", error_model="numpy")
 def scratch():  # type: ignore[no-untyped-def]
     """Return space for one image point."""
     return Scratch(
         np.empty(2),
         np.empty((2, 2)),
         np.zeros((2, MAX_PARAMETERS)),
-        np.empty((2, 6)),
-        np.zeros((2, MAX_PARAMETERS)),
+        np.zeros((2, 6 + MAX_PARAMETERS)),
         np.empty((2, 3)),
     )
 
 
-@njit(cache=True)
+@njit(cache=True, inline="always", error_model="numpy")
 def collinearity(o, obs, state, weight, t):  # type: ignore[no-untyped-def]
     """Fill the weighted residual and derivatives of image point o; False if it is behind the camera."""
     i, j = obs.image[o], obs.point[o]
     a = obs.camera[i]
-    M = state.M[i]
+    m00, m01, m02 = state.M[i, 0, 0], state.M[i, 0, 1], state.M[i, 0, 2]
+    m10, m11, m12 = state.M[i, 1, 0], state.M[i, 1, 1], state.M[i, 1, 2]
+    m20, m21, m22 = state.M[i, 2, 0], state.M[i, 2, 1], state.M[i, 2, 2]
     dX = state.points[j, 0] - state.position[i, 0]
     dY = state.points[j, 1] - state.position[i, 1]
     dZ = state.points[j, 2] - state.position[i, 2]
-    U = M[0, 0] * dX + M[0, 1] * dY + M[0, 2] * dZ
-    V = M[1, 0] * dX + M[1, 1] * dY + M[1, 2] * dZ
-    W = M[2, 0] * dX + M[2, 1] * dY + M[2, 2] * dZ
-    if not W < 0.0:
-        return False
+    U = m00 * dX + m01 * dY + m02 * dZ
+    V = m10 * dX + m11 * dY + m12 * dZ
+    W = m20 * dX + m21 * dY + m22 * dZ
     inverse = -1.0 / W
     u, v = U * inverse, V * inverse
     observe(
@@ -93,44 +90,46 @@ def collinearity(o, obs, state, weight, t):  # type: ignore[no-untyped-def]
     f00, f10, f11 = root * obs.whitening[o, 0], root * obs.whitening[o, 1], root * obs.whitening[o, 2]
     t.r[1] = f10 * t.r[0] + f11 * t.r[1]
     t.r[0] = f00 * t.r[0]
-    x_u, x_v = f00 * t.Ju[0, 0] * inverse, f00 * t.Ju[0, 1] * inverse
-    y_u = (f10 * t.Ju[0, 0] + f11 * t.Ju[1, 0]) * inverse
-    y_v = (f10 * t.Ju[0, 1] + f11 * t.Ju[1, 1]) * inverse
-    for row in range(2):
-        # G = d r / d (U, V, W); du/d(U, V, W) = -(1, 0, u)/W because u = -U/W
-        G0, G1 = (x_u, x_v) if row == 0 else (y_u, y_v)
-        G2 = G0 * u + G1 * v
-        for b in range(3):
-            d = G0 * M[0, b] + G1 * M[1, b] + G2 * M[2, b]
-            t.B[row, b] = d * obs.point_free[j, b]
-            t.A[row, b] = -d * obs.exterior_free[i, b]
-        t.A[row, 3] = (G1 * W - G2 * V) * obs.exterior_free[i, 3]
-        t.A[row, 4] = (G2 * U - G0 * W) * obs.exterior_free[i, 4]
-        t.A[row, 5] = (G0 * V - G1 * U) * obs.exterior_free[i, 5]
-    for q in range(obs.free_count[a]):
-        s = obs.free_index[a, q]
-        t.Ai[0, q] = f00 * t.Jp[0, s]
-        t.Ai[1, q] = f10 * t.Jp[0, s] + f11 * t.Jp[1, s]
-    return True
+    # weighted d r / d (U, V, W): du/d(U, V, W) = -(1, 0, u)/W because u = -U/W
+    xU, xV = f00 * t.Ju[0, 0] * inverse, f00 * t.Ju[0, 1] * inverse
+    yU = (f10 * t.Ju[0, 0] + f11 * t.Ju[1, 0]) * inverse
+    yV = (f10 * t.Ju[0, 1] + f11 * t.Ju[1, 1]) * inverse
+    xW, yW = xU * u + xV * v, yU * u + yV * v
+    # d (U, V, W)/d X = M = -d (U, V, W)/d X0
+    t.B[0, 0] = xU * m00 + xV * m10 + xW * m20
+    t.B[0, 1] = xU * m01 + xV * m11 + xW * m21
+    t.B[0, 2] = xU * m02 + xV * m12 + xW * m22
+    t.B[1, 0] = yU * m00 + yV * m10 + yW * m20
+    t.B[1, 1] = yU * m01 + yV * m11 + yW * m21
+    t.B[1, 2] = yU * m02 + yV * m12 + yW * m22
+    for b in range(3):
+        t.A[0, b] = -t.B[0, b]
+        t.A[1, b] = -t.B[1, b]
+    # d (U, V, W)/d w = [(U, V, W)]x
+    t.A[0, 3], t.A[0, 4], t.A[0, 5] = xV * W - xW * V, xW * U - xU * W, xU * V - xV * U
+    t.A[1, 3], t.A[1, 4], t.A[1, 5] = yV * W - yW * V, yW * U - yU * W, yU * V - yV * U
+    for s in range(obs.interior[a]):  # all, not only free ones: gathering them here would cost more
+        t.A[0, 6 + s] = f00 * t.Jp[0, s]
+        t.A[1, 6 + s] = f10 * t.Jp[0, s] + f11 * t.Jp[1, s]
+    return W < 0.0
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def sum_of_squares(obs, state, weight):  # type: ignore[no-untyped-def]
     """Return v'Pv of the image points; infinite where one of weight > 0 lies behind its camera."""
     t = scratch()
     total = 0.0
     for o in range(len(obs.image)):
-        if weight[o] == 0.0:
-            continue
-        if not _residual(o, obs, state, t):
-            return np.inf
-        x = obs.whitening[o, 0] * t.r[0]
-        y = obs.whitening[o, 1] * t.r[0] + obs.whitening[o, 2] * t.r[1]
-        total += weight[o] * (x * x + y * y)
+        if weight[o] > 0.0:
+            if not _residual(o, obs, state, t):
+                return np.inf
+            x = obs.whitening[o, 0] * t.r[0]
+            y = obs.whitening[o, 1] * t.r[0] + obs.whitening[o, 2] * t.r[1]
+            total += weight[o] * (x * x + y * y)
     return total
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def residuals(obs, state):  # type: ignore[no-untyped-def]
     """Return v = computed - measured of all image points, px, (k, 2); NaN behind the camera."""
     t = scratch()
@@ -142,33 +141,31 @@ def residuals(obs, state):  # type: ignore[no-untyped-def]
     return v
 
 
-@njit(cache=True)
+@njit(cache=True, inline="always", error_model="numpy")
 def _residual(o, obs, state, t):  # type: ignore[no-untyped-def]
     """Fill the unweighted residual of image point o; False if it is behind the camera."""
     i, j = obs.image[o], obs.point[o]
     a = obs.camera[i]
-    M = state.M[i]
     dX = state.points[j, 0] - state.position[i, 0]
     dY = state.points[j, 1] - state.position[i, 1]
     dZ = state.points[j, 2] - state.position[i, 2]
-    U = M[0, 0] * dX + M[0, 1] * dY + M[0, 2] * dZ
-    V = M[1, 0] * dX + M[1, 1] * dY + M[1, 2] * dZ
-    W = M[2, 0] * dX + M[2, 1] * dY + M[2, 2] * dZ
-    if not W < 0.0:
-        return False
+    U = state.M[i, 0, 0] * dX + state.M[i, 0, 1] * dY + state.M[i, 0, 2] * dZ
+    V = state.M[i, 1, 0] * dX + state.M[i, 1, 1] * dY + state.M[i, 1, 2] * dZ
+    W = state.M[i, 2, 0] * dX + state.M[i, 2, 1] * dY + state.M[i, 2, 2] * dZ
+    inverse = -1.0 / W
     observe(
         obs.model[a],
         obs.frame[a],
         state.parameters[a],
         obs.xy[o, 0],
         obs.xy[o, 1],
-        -U / W,
-        -V / W,
+        U * inverse,
+        V * inverse,
         t.r,
         t.Ju,
         t.Jp,
     )
-    return True
+    return W < 0.0  # one way out: with an early return the compiler keeps the unused derivatives
 
 
 def whitening_of(covariance: FloatArray) -> FloatArray:

@@ -171,8 +171,8 @@ def _points_product(Li: FloatArray, Z: FloatArray) -> FloatArray:
 def _complement(obs, state, weight, interior_start, Qcc, cross, points):  # type: ignore[no-untyped-def]
     t = scratch()
     out = np.empty((len(obs.image), 2, 2))
-    column = np.empty(6 + t.Ai.shape[1], dtype=np.int64)
-    J = np.empty((2, 6 + t.Ai.shape[1]))
+    column = np.empty(t.A.shape[1], dtype=np.int64)
+    J = np.empty(t.A.shape)
     for o in range(len(obs.image)):
         i, j = obs.image[o], obs.point[o]
         a = obs.camera[i]
@@ -186,7 +186,8 @@ def _complement(obs, state, weight, interior_start, Qcc, cross, points):  # type
             J[0, p], J[1, p] = t.A[0, p], t.A[1, p]
         for p in range(f):
             column[6 + p] = interior_start[a] + p
-            J[0, 6 + p], J[1, 6 + p] = t.Ai[0, p], t.Ai[1, p]
+            s = 6 + obs.free_index[a, p]
+            J[0, 6 + p], J[1, 6 + p] = t.A[0, s], t.A[1, s]
         h00, h01, h11 = 0.0, 0.0, 0.0
         for p in range(6 + f):
             s0, s1 = 0.0, 0.0

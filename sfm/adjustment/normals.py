@@ -29,9 +29,9 @@ STIFF = 1e10  # factor on the pivot that holds such a direction of a point
 class Blocks(NamedTuple):
     """Parts of the normal equations that one pass over the image points fills."""
 
-    U: FloatArray  # X0, w of each photograph, (m, 6, 6)
-    C: FloatArray  # X0, w of each photograph by its interior parameters, (m, 6, MAX_PARAMETERS)
-    D: FloatArray  # interior parameters of each camera, (a, MAX_PARAMETERS, MAX_PARAMETERS)
+    U: FloatArray  # X0, w of each photograph by themselves and all its interior parameters, upper
+    # triangle, (m, 6, 6 + MAX_PARAMETERS)
+    D: FloatArray  # all interior parameters of each camera, upper triangle, (a, MAX_PARAMETERS, same)
     g: FloatArray  # right side of X0, w, (m, 6)
     gi: FloatArray  # right side of interior parameters, (a, MAX_PARAMETERS)
     V: FloatArray  # object points before elimination, (n, 3, 3)
@@ -78,22 +78,34 @@ def normal_equations(
     slot = np.full(len(state.points), -1, dtype=np.int64)
     slot[layout.kept] = np.arange(len(layout.kept))
     vPv = _accumulate(
-        layout.obs, state, weight, layout.interior_start, Np, gp, slot, layout.kept_start, 1 + damping, blocks
+        layout.obs,
+        state,
+        weight,
+        layout.interior_start,
+        Np,
+        gp,
+        layout.point_free,
+        slot,
+        layout.kept_start,
+        1 + damping,
+        blocks,
     )
     for e, i in enumerate(weighted.image):
-        blocks.U[i] += terms.exterior[e]
+        blocks.U[i, :, :6] += terms.exterior[e]
         blocks.g[i] += terms.exterior_g[e]
     S = np.zeros((layout.reduced, layout.reduced), order="F")
     g = np.zeros(layout.reduced)
-    _assemble(
-        layout.obs.camera, layout.obs.free_count, layout.interior_start, layout.kept_start, blocks, S, g
-    )
+    _assemble(layout.obs, layout.interior_start, layout.kept_start, blocks, S, g)
     S[weighted.column, weighted.column] += weighted.interior_weight
     np.add.at(g, weighted.column, terms.interior_g)
     S[layout.kept_start :, layout.kept_start :] += terms.kept
     g[layout.kept_start :] += terms.kept_g + blocks.gp[layout.kept].ravel()
     fixed = np.flatnonzero(~layout.reduced_free())
-    S[fixed, fixed] = 1.0
+    if len(fixed):
+        S[fixed] = S[:, fixed] = 0.0
+        S[fixed, fixed] = 1.0
+        g[fixed] = 0.0
+        blocks.Yt[:, fixed] = 0.0
     diagonal = S.diagonal().copy()
     np.einsum("aa->a", S)[:] *= 1 + damping
     S = dsyrk(-1.0, blocks.Yt.T, beta=1.0, c=S, overwrite_c=1)
@@ -116,8 +128,7 @@ def new_blocks(layout: Unknowns) -> Blocks:
     m, n, a = len(layout.exterior_free), len(layout.point_free), len(layout.interior_free)
     q = MAX_PARAMETERS
     return Blocks(
-        U=np.empty((m, 6, 6)),
-        C=np.empty((m, 6, q)),
+        U=np.empty((m, 6, 6 + q)),
         D=np.empty((a, q, q)),
         g=np.empty((m, 6)),
         gi=np.empty((a, q)),
@@ -131,113 +142,99 @@ def new_blocks(layout: Unknowns) -> Blocks:
     )
 
 
-@njit(cache=True)
-def _accumulate(obs, state, weight, interior_start, Np, gp0, slot, kept_start, stretch, b):  # type: ignore[no-untyped-def]
+@njit(cache=True, error_model="numpy")
+def _accumulate(obs, state, weight, interior_start, Np, gp0, point_free, slot, kept_start, stretch, b):  # type: ignore[no-untyped-def]
     """Fill the blocks in one pass, point by point; return v'Pv, infinite with points behind cameras."""
     t = scratch()
+    first_interior = 6 * len(obs.camera)
     b.U[:] = 0.0
-    b.C[:] = 0.0
     b.D[:] = 0.0
     b.g[:] = 0.0
     b.gi[:] = 0.0
+    E = np.zeros((3, t.Jp.shape[1]))
     vPv = 0.0
     for j in range(len(state.points)):
-        V = b.V[j]
-        gp = b.gp[j]
-        V[:] = Np[j]
-        gp[:] = gp0[j]
-        kept = slot[j] >= 0
-        rows = b.K[3 * slot[j] : 3 * slot[j] + 3] if kept else b.Yt[3 * j : 3 * j + 3]
-        _clear(obs, interior_start, j, rows)
-        if kept:
-            rows[:, kept_start:] = 0.0
+        row = 3 * slot[j] if slot[j] >= 0 else 3 * j
+        rows = b.K if slot[j] >= 0 else b.Yt
+        rows[row : row + 3, first_interior:] = 0.0
+        b.V[j] = Np[j]
+        b.gp[j] = gp0[j]
+        last_image, last_camera = -1, -1
         for o in range(obs.start[j], obs.start[j + 1]):
-            if weight[o] == 0.0:
-                continue
-            if not collinearity(o, obs, state, weight[o], t):
-                vPv = np.inf
-                continue
-            vPv += t.r[0] * t.r[0] + t.r[1] * t.r[1]
             i = obs.image[o]
-            a = obs.camera[i]
-            _add_image_point(i, a, obs.free_count[a], interior_start[a], t, b, V, gp, rows)
+            if i != last_image:
+                rows[row : row + 3, 6 * i : 6 * i + 6] = 0.0
+                last_image = i
+            if weight[o] > 0.0:
+                a = obs.camera[i]
+                if a != last_camera:
+                    _add_interior(E, last_camera, obs, interior_start, rows, row)
+                    last_camera = a
+                if not collinearity(o, obs, state, weight[o], t):
+                    vPv = np.inf
+                vPv += t.r[0] * t.r[0] + t.r[1] * t.r[1]
+                _add_image_point(i, a, obs.interior[a], j, t, b, rows, row, E)
+        _add_interior(E, last_camera, obs, interior_start, rows, row)
         for p in range(3):
-            if obs.point_free[j, p] == 0.0:
-                V[p, :] = 0.0
-                V[:, p] = 0.0
-                V[p, p] = 1.0
-                gp[p] = 0.0
-        if kept:
-            for p in range(3):
-                for q in range(3):
-                    rows[p, kept_start + 3 * slot[j] + q] = V[p, q]
+            if not point_free[j, p]:
+                b.V[j, p, :] = 0.0
+                b.V[j, :, p] = 0.0
+                b.V[j, p, p] = 1.0
+                b.gp[j, p] = 0.0
+                rows[row + p] = 0.0
+        if slot[j] >= 0:
+            rows[row : row + 3, kept_start + row : kept_start + row + 3] = b.V[j]
             b.L[j] = np.eye(3)
             b.y[j] = 0.0
             b.held[j] = 0
         else:
-            b.held[j] = _factor(V, stretch, b.L[j])
-            _forward(b.L[j], gp, b.y[j])
-            last = -1
+            b.held[j] = _factor(b.V[j], stretch, b.L[j])
+            _forward(b.L[j], b.gp[j], b.y[j])
+            last_image = -1
             for o in range(obs.start[j], obs.start[j + 1]):
-                if obs.image[o] != last:
-                    _forward_columns(b.L[j], rows, 6 * obs.image[o], 6)
-                last = obs.image[o]
-            last = -1
-            for o in range(obs.start[j], obs.start[j + 1]):
-                a = obs.camera[obs.image[o]]
-                if a != last and _first_of_camera(obs, o, j):
-                    _forward_columns(b.L[j], rows, interior_start[a], obs.free_count[a])
-                last = a
+                i = obs.image[o]
+                if i != last_image:
+                    _forward_columns(b.L[j], rows, row, 6 * i, 6 * i + 6)
+                    last_image = i
+            _forward_columns(b.L[j], rows, row, first_interior, kept_start)
     return vPv
 
 
-@njit(cache=True)
-def _add_image_point(i, a, f, first, t, b, V, gp, rows):  # type: ignore[no-untyped-def]
-    """Add one weighted image point to the blocks; rows are those of its object point in W'."""
-    U, C, D = b.U[i], b.C[i], b.D[a]
-    A, Ai, B, r = t.A, t.Ai, t.B, t.r
+@njit(cache=True, inline="always", error_model="numpy")
+def _add_image_point(i, a, f, j, t, b, rows, row, E):  # type: ignore[no-untyped-def]
+    """Add one weighted image point to the blocks; rows holds W' of its object point, E its interior part."""
     for p in range(6):
-        for q in range(p, 6):
-            U[p, q] += A[0, p] * A[0, q] + A[1, p] * A[1, q]
-        for q in range(f):
-            C[p, q] += A[0, p] * Ai[0, q] + A[1, p] * Ai[1, q]
-        b.g[i, p] += A[0, p] * r[0] + A[1, p] * r[1]
+        x, y = t.A[0, p], t.A[1, p]
+        for q in range(p, 6 + f):
+            b.U[i, p, q] += x * t.A[0, q] + y * t.A[1, q]
+        b.g[i, p] += x * t.r[0] + y * t.r[1]
     for p in range(f):
+        x, y = t.A[0, 6 + p], t.A[1, 6 + p]
         for q in range(p, f):
-            D[p, q] += Ai[0, p] * Ai[0, q] + Ai[1, p] * Ai[1, q]
-        b.gi[a, p] += Ai[0, p] * r[0] + Ai[1, p] * r[1]
+            b.D[a, p, q] += x * t.A[0, 6 + q] + y * t.A[1, 6 + q]
+        b.gi[a, p] += x * t.r[0] + y * t.r[1]
     for p in range(3):
+        x, y = t.B[0, p], t.B[1, p]
         for q in range(3):
-            V[p, q] += B[0, p] * B[0, q] + B[1, p] * B[1, q]
+            b.V[j, p, q] += x * t.B[0, q] + y * t.B[1, q]
+        b.gp[j, p] += x * t.r[0] + y * t.r[1]
         for q in range(6):
-            rows[p, 6 * i + q] += B[0, p] * A[0, q] + B[1, p] * A[1, q]
+            rows[row + p, 6 * i + q] += x * t.A[0, q] + y * t.A[1, q]
         for q in range(f):
-            rows[p, first + q] += B[0, p] * Ai[0, q] + B[1, p] * Ai[1, q]
-        gp[p] += B[0, p] * r[0] + B[1, p] * r[1]
+            E[p, q] += x * t.A[0, 6 + q] + y * t.A[1, 6 + q]
 
 
-@njit(cache=True)
-def _clear(obs, interior_start, j, rows):  # type: ignore[no-untyped-def]
-    """Set to 0 the entries of the rows of point j that its image points will fill."""
-    for o in range(obs.start[j], obs.start[j + 1]):
-        i = obs.image[o]
-        a = obs.camera[i]
+@njit(cache=True, inline="always", error_model="numpy")
+def _add_interior(E, a, obs, interior_start, rows, row):  # type: ignore[no-untyped-def]
+    """Add the free interior columns of camera a to the rows of a point and clear E."""
+    if a >= 0:
         for p in range(3):
-            rows[p, 6 * i : 6 * i + 6] = 0.0
-            rows[p, interior_start[a] : interior_start[a] + obs.free_count[a]] = 0.0
+            for q in range(obs.free_count[a]):
+                rows[row + p, interior_start[a] + q] += E[p, obs.free_index[a, q]]
+        E[:] = 0.0
 
 
-@njit(cache=True)
-def _first_of_camera(obs, o, j):  # type: ignore[no-untyped-def]
-    """Whether image point o is the first of point j taken with its camera."""
-    a = obs.camera[obs.image[o]]
-    earlier = obs.start[j]
-    while obs.camera[obs.image[earlier]] != a:
-        earlier += 1
-    return earlier == o
-
-
-@njit(cache=True)
+@njit(cache=True, inline="always", error_model="numpy")
 def _factor(V, stretch, L):  # type: ignore[no-untyped-def]
     """Cholesky factor of V with its diagonal times stretch; holds directions that the rays leave open."""
     held = 0
@@ -259,7 +256,7 @@ def _factor(V, stretch, L):  # type: ignore[no-untyped-def]
     return held
 
 
-@njit(cache=True)
+@njit(cache=True, inline="always", error_model="numpy")
 def _forward(L, g, y):  # type: ignore[no-untyped-def]
     """y = L^-1 g."""
     y[0] = g[0] / L[0, 0]
@@ -267,16 +264,20 @@ def _forward(L, g, y):  # type: ignore[no-untyped-def]
     y[2] = (g[2] - L[2, 0] * y[0] - L[2, 1] * y[1]) / L[2, 2]
 
 
-@njit(cache=True)
-def _forward_columns(L, rows, first, count):  # type: ignore[no-untyped-def]
-    """Replace columns of the three rows W' by L^-1 W'."""
-    for q in range(first, first + count):
-        rows[0, q] = rows[0, q] / L[0, 0]
-        rows[1, q] = (rows[1, q] - L[1, 0] * rows[0, q]) / L[1, 1]
-        rows[2, q] = (rows[2, q] - L[2, 0] * rows[0, q] - L[2, 1] * rows[1, q]) / L[2, 2]
+@njit(cache=True, inline="always", error_model="numpy")
+def _forward_columns(L, rows, row, first, end):  # type: ignore[no-untyped-def]
+    """Replace columns of the three rows W' of a point by L^-1 W'."""
+    i0, i1, i2 = 1.0 / L[0, 0], 1.0 / L[1, 1], 1.0 / L[2, 2]
+    l10, l20, l21 = L[1, 0], L[2, 0], L[2, 1]
+    for q in range(first, end):
+        y0 = rows[row, q] * i0
+        y1 = (rows[row + 1, q] - l10 * y0) * i1
+        rows[row, q] = y0
+        rows[row + 1, q] = y1
+        rows[row + 2, q] = (rows[row + 2, q] - l20 * y0 - l21 * y1) * i2
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _solve_transposed(L, h):  # type: ignore[no-untyped-def]
     """Return L^-T h for every point, (n, 3)."""
     x = np.empty_like(h)
@@ -287,22 +288,23 @@ def _solve_transposed(L, h):  # type: ignore[no-untyped-def]
     return x
 
 
-@njit(cache=True)
-def _assemble(camera, free_count, interior_start, kept_start, b, S, g):  # type: ignore[no-untyped-def]
+@njit(cache=True, error_model="numpy")
+def _assemble(obs, interior_start, kept_start, b, S, g):  # type: ignore[no-untyped-def]
     """Write the blocks into the upper triangle of S and into g."""
-    for i in range(len(camera)):
-        a = camera[i]
+    for i in range(len(obs.camera)):
+        a = obs.camera[i]
         for p in range(6):
             g[6 * i + p] = b.g[i, p]
             for q in range(p, 6):
                 S[6 * i + p, 6 * i + q] = b.U[i, p, q]
-            for q in range(free_count[a]):
-                S[6 * i + p, interior_start[a] + q] = b.C[i, p, q]
-    for a in range(len(free_count)):
-        for p in range(free_count[a]):
-            g[interior_start[a] + p] = b.gi[a, p]
-            for q in range(p, free_count[a]):
-                S[interior_start[a] + p, interior_start[a] + q] = b.D[a, p, q]
+            for q in range(obs.free_count[a]):
+                S[6 * i + p, interior_start[a] + q] = b.U[i, p, 6 + obs.free_index[a, q]]
+    for a in range(len(obs.free_count)):
+        for p in range(obs.free_count[a]):
+            s = obs.free_index[a, p]
+            g[interior_start[a] + p] = b.gi[a, s]
+            for q in range(p, obs.free_count[a]):
+                S[interior_start[a] + p, interior_start[a] + q] = b.D[a, s, obs.free_index[a, q]]
     for p in range(len(b.K)):
         for q in range(kept_start + p + 1):
             S[q, kept_start + p] = b.K[p, q]

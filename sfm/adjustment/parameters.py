@@ -114,10 +114,9 @@ def unknowns_of(network: Network, estimate: Estimate, *, use_control: bool) -> t
         camera=np.ascontiguousarray(network.camera, dtype=np.int64),
         model=np.array([camera.index for camera in estimate.cameras], dtype=np.int64),
         frame=np.array([camera.frame for camera in estimate.cameras]),
+        interior=np.where(counts > 0, [len(camera.names) for camera in estimate.cameras], 0),
         free_count=counts,
         free_index=free_index,
-        exterior_free=exterior_free.astype(float),
-        point_free=point_free.astype(float),
     )
     layout = Unknowns(
         obs=obs,
