@@ -247,7 +247,7 @@ def _figures(result: SurveyResult) -> tuple[tuple[str, str], ...]:
     rejected = int(a.rejected.sum())
     sigma = point_sigmas(a)
     typical, largest = root_mean_square(sigma), float(sigma.max())
-    factor, unit = finer_unit(result.unit, largest)
+    factor, unit = finer_unit(result.length_unit, largest)
     rows = [
         ("photographs", f"{len(a.network.images)} of {result.images_total} oriented"),
         (
@@ -266,7 +266,7 @@ def _figures(result: SurveyResult) -> tuple[tuple[str, str], ...]:
     ]
     check = result.control_check
     if check is not None:
-        factor, unit = finer_unit(result.unit, float(abs(check.differences).max()))
+        factor, unit = finer_unit(result.length_unit, float(abs(check.differences).max()))
         dx, dy, dz = (significant(value * factor) for value in check.rms)
         rows.append(
             ("check at control", f"RMS {dx}, {dy}, {dz} {unit} in X, Y, Z at {len(check.points)} points")

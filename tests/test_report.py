@@ -18,7 +18,7 @@ from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.conventions import angles_from_rotation
 from sfm.errors import OutputError
-from sfm.network import Network
+from sfm.network import Network, ScaleBars
 from sfm.report.html import render_html
 from sfm.report.markup import finer_unit, significant, table, to_precision, with_exponent
 from sfm.report.output import WRITTEN, refuse_foreign_folder, write_result
@@ -236,6 +236,16 @@ def test_page_is_whole_escaped_and_self_contained(result: SurveyResult) -> None:
     assert f"{result.adjustment.sigma0_px:.4f} px" in tags.text
 
 
+def test_a_network_without_scale_has_no_metric_unit(result: SurveyResult) -> None:
+    assert result.length_unit == "m"
+    free = replace(result, control_check=None)
+    assert not free.has_scale
+    assert "network units" in render_html(free, (), ())
+    bars = ScaleBars(np.array([0]), np.array([1]), np.array([1.0]), np.array([0.1]))
+    network = replace(free.adjustment.network, scale_bars=bars)
+    assert replace(free, adjustment=replace(free.adjustment, network=network)).length_unit == "m"
+
+
 def test_verdict(result: SurveyResult) -> None:
     assert verdict_of(result).level == "fair"
     fine = replace(result, images_total=8, failed=(), warnings=())
@@ -278,7 +288,9 @@ def test_result_appears_whole_and_replaces_an_earlier_one(result: SurveyResult, 
     out = tmp_path / "deep" / "out"
     page = write_result(result, out, write_colmap=lambda folder: (folder / "x.bin").touch(), jobs=2)
     assert page == out / "report.html"
-    assert {path.name for path in out.iterdir()} == set(WRITTEN)
+    assert {path.name for path in out.iterdir()} == set(WRITTEN) - {
+        "log.jsonl"
+    }  # the run itself adds the log
     assert len(list((out / "overlays").iterdir())) == 8
     assert [path.name for path in out.parent.iterdir()] == ["out"]
     before = (out / "points.csv").read_bytes()

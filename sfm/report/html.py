@@ -80,7 +80,7 @@ def _tiles(result: SurveyResult) -> str:
     sigma = point_sigmas(a)
     size = _object_size(a.estimate.points)
     typical = root_mean_square(sigma)
-    factor, unit = finer_unit(result.unit, typical)
+    factor, unit = finer_unit(result.length_unit, typical)
     tiles = [
         ("Photographs oriented", f"{len(a.network.images)} of {result.images_total}", ""),
         ("Object points", str(len(a.network.points)), _coded_of(result)),

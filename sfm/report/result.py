@@ -12,6 +12,8 @@ from sfm.analysis.comparison import AdjusterComparison
 from sfm.conventions import FloatArray, IntArray
 from sfm.targets.flags import count_flags
 
+NO_SCALE = "network units"
+
 
 @dataclass(frozen=True)
 class FailedImage:
@@ -75,6 +77,17 @@ class SurveyResult:
     control_check: ControlCheck | None = None  # None without control, or where the datum is control
     warnings: tuple[str, ...] = ()  # one line each, in words
     seconds: tuple[StageTime, ...] = field(default_factory=tuple)  # in the order of the stages
+
+    @property
+    def has_scale(self) -> bool:
+        """Whether lengths are in the object unit: from control, from scale bars, or placed on control."""
+        a = self.adjustment
+        return a.datum == "control" or len(a.network.scale_bars) > 0 or self.control_check is not None
+
+    @property
+    def length_unit(self) -> str:
+        """What lengths are measured in: the object unit, or nothing that anybody knows."""
+        return self.unit if self.has_scale else NO_SCALE
 
 
 def in_words(flag_name: str) -> str:

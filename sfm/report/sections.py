@@ -72,7 +72,7 @@ def quality_section(result: SurveyResult, pictures: dict[str, str]) -> str:
     a = result.adjustment
     sigma = point_sigmas(a)
     limiting = np.sqrt(np.einsum("nii->ni", a.covariance.points_limiting))
-    factor, unit = finer_unit(result.unit, float(np.nanmax(sigma)))
+    factor, unit = finer_unit(result.length_unit, float(np.nanmax(sigma)))
     text = "<h3>Object points</h3>"
     text += table(
         (f"standard deviation [{unit}]", "X", "Y", "Z", "all"),
@@ -136,7 +136,7 @@ def _control(result: SurveyResult) -> str:
     check = result.control_check
     if check is None:
         return ""
-    factor, unit = finer_unit(result.unit, float(np.abs(check.differences).max()))
+    factor, unit = finer_unit(result.length_unit, float(np.abs(check.differences).max()))
     rows = [
         (name, *(signed(v) for v in d), significant(float(np.linalg.norm(d))))
         for name, d in zip(check.points, check.differences * factor, strict=True)
@@ -226,7 +226,7 @@ def comparison_section(result: SurveyResult) -> str:
     if both is None:
         return "<p>The survey asked for no comparison.</p>"
     d = both.comparison
-    unit = result.unit
+    unit = result.length_unit
     name = both.backend
     verdict = (
         f"Yes: kolinear and {name} end at the same optimum."
@@ -282,7 +282,7 @@ def comparison_section(result: SurveyResult) -> str:
 
 def coordinates_section(result: SurveyResult) -> str:
     """Where are my coordinates: the files, and the coordinates themselves."""
-    unit = result.unit
+    unit = result.length_unit
     listed = [
         ("points.csv", f"object points: X, Y, Z and standard deviations [{unit}], number of rays, code"),
         (

@@ -193,7 +193,7 @@ def write_ply(path: Path, result: SurveyResult) -> None:
     lines = [
         "ply",
         "format ascii 1.0",
-        f"comment kolinear, object unit {_ascii(result.unit)}",
+        f"comment kolinear, {_ascii(result.length_unit)}",
         f"element vertex {len(points)}",
         *(f"property double {axis}" for axis in "xyz"),
         *(f"property uchar {colour}" for colour in ("red", "green", "blue")),
