@@ -137,6 +137,7 @@ class Survey(Section):
     adjust: AdjustSettings = AdjustSettings()
     compare: CompareSettings = CompareSettings()
     _path: Path = PrivateAttr(default=Path("survey.toml"))
+    _allow_outside: bool = PrivateAttr(default=False)
 
     @property
     def path(self) -> Path:
@@ -164,16 +165,66 @@ class Survey(Section):
         codes = self.targets.codes
         return codes if codes in FAMILIES else str(self.beside(codes))
 
+    @property
+    def allow_outside(self) -> bool:
+        """Whether the survey may name files outside its own folder."""
+        return self._allow_outside
+
     def beside(self, name: str) -> Path:
-        """Return the path of a file that is named relative to the survey file."""
-        return self._path.parent / name
+        """Return the path of a file that is named relative to the survey file.
+
+        Raises:
+            SurveyFileError: it leaves the survey's folder, which only the person who runs it can allow.
+        """
+        folder = self._path.parent
+        return folder / name if self._allow_outside else inside(folder, name, str(self._path))
+
+    def tables(self) -> tuple[Path, ...]:
+        """Return the paths of all tables that the survey names.
+
+        Raises:
+            SurveyFileError: one of them leaves the survey's folder.
+        """
+        names = [
+            self.control.file if self.control else None,
+            self.observations.file if self.observations else None,
+            self.approximate.images,
+            self.approximate.points,
+            None if self.targets.codes in FAMILIES else self.targets.codes,
+        ]
+        return tuple(self.beside(name) for name in names if name is not None)
 
 
-def read_survey(path: Path) -> Survey:
+def inside(folder: Path, name: str, where: str) -> Path:
+    """Return the path of a file in a folder, links followed.
+
+    Args:
+        folder: the folder.
+        name: a path relative to it.
+        where: the file that names it, for the error.
+
+    Raises:
+        SurveyFileError: the path leaves the folder.
+    """
+    try:
+        path = folder / name
+        left = not path.resolve().is_relative_to(folder.resolve())
+    except (OSError, ValueError, RuntimeError) as error:  # a circle of links, a null byte
+        raise SurveyFileError(f"{where}: {name!r:.100} is no path of a file") from error
+    if left:
+        raise SurveyFileError(
+            f"{where}: {name!r:.100} leaves the survey's folder; --allow-outside allows that, "
+            "for survey files that you trust"
+        )
+    return path
+
+
+def read_survey(path: Path, *, allow_outside: bool = False) -> Survey:
     """Read and check a survey file.
 
     Args:
         path: the TOML file; every path in it is relative to it.
+        allow_outside: whether these paths may lead out of its folder; a file from a stranger should not.
 
     Raises:
         SurveyFileError: unreadable, no TOML, an unknown key, a wrong type, or settings that contradict one
@@ -181,6 +232,8 @@ def read_survey(path: Path) -> Survey:
     """
     path = Path(path)
     try:
+        if path.exists() and not path.is_file():
+            raise SurveyFileError(f"{path}: not a file, a survey file (TOML) is needed")
         if path.stat().st_size > MAX_SURVEY_BYTES:
             raise SurveyFileError(
                 f"{path}: {path.stat().st_size} bytes, a survey file has at most {MAX_SURVEY_BYTES}"
@@ -192,13 +245,13 @@ def read_survey(path: Path) -> Survey:
         raise SurveyFileError(f"{path}: not a text file in UTF-8 (byte {error.start})") from error
     try:
         table = tomllib.loads(text)
-    except (tomllib.TOMLDecodeError, RecursionError) as error:
+    except (ValueError, RecursionError) as error:  # ValueError: a whole number of thousands of digits
         raise SurveyFileError(f"{path}: not a TOML file: {error}") from error
     try:
         survey = Survey.model_validate(table)
     except ValidationError as error:
         raise SurveyFileError(_one_line(path, text, error)) from error
-    survey._path = path
+    survey._path, survey._allow_outside = path, allow_outside
     _refuse_contradictions(survey)
     return survey
 

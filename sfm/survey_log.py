@@ -31,7 +31,7 @@ class SurveyLog:
     Steps are counted from several threads, hence the lock.
     """
 
-    def __init__(self, path: Path | None = None) -> None:
+    def __init__(self, path: Path | None = None, *, append: bool = False) -> None:
         self._lines: list[str] = []
         self._lock = threading.Lock()
         self._path = path
@@ -42,7 +42,7 @@ class SurveyLog:
         if path is not None:
             try:
                 path.parent.mkdir(parents=True, exist_ok=True)
-                self._file = path.open("w", encoding="utf-8")
+                self._file = path.open("a" if append else "w", encoding="utf-8")
             except OSError as error:
                 raise OutputError(f"{path}: the log cannot be written: {error.strerror}") from error
 

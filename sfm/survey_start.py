@@ -12,7 +12,7 @@ from sfm.camera import Camera, camera_from_values
 from sfm.conventions import FloatArray, IntArray, pixel_from_image
 from sfm.errors import PhotographError, SurveyFileError
 from sfm.network import Estimate, ImagePoints, Network, ObjectPoints, ScaleBars
-from sfm.project import CameraSettings, Survey
+from sfm.project import CameraSettings, Survey, inside
 from sfm.survey_tables import (
     read_control,
     read_exterior,
@@ -51,11 +51,16 @@ def find_photographs(survey: Survey, *, images_dir: Path | None = None) -> Photo
     for index, camera in enumerate(survey.cameras):
         pattern = camera.images or ""
         try:
+            if ".." in Path(pattern).parts and not survey.allow_outside:
+                inside(folder, pattern, str(survey.path))
             found = sorted(path for path in folder.glob(pattern) if path.is_file())
         except (ValueError, NotImplementedError, IndexError) as error:
             raise SurveyFileError(
                 f"{survey.path}: camera {camera.name}: images = '{pattern}' is no glob relative to {folder}"
             ) from error
+        if not survey.allow_outside:
+            for path in found:
+                inside(folder, path.relative_to(folder).as_posix(), str(survey.path))
         if not found:
             raise SurveyFileError(
                 f"no photographs found: camera {camera.name} needs '{pattern}' in {folder}, {_holds(folder)}"

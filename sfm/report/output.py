@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import glob
 import json
+import os
 import shutil
 import tempfile
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -29,6 +32,7 @@ WRITTEN = (
     "colmap",
     "overlays",
     "plots",
+    "log.jsonl",
 )
 
 
@@ -37,6 +41,7 @@ def write_result(
     out: Path,
     *,
     write_colmap: Callable[[Path], None] | None = None,
+    finish: Callable[[Path], None] | None = None,
     jobs: int = 1,
     progress: Progress = SILENT,
 ) -> Path:
@@ -46,6 +51,7 @@ def write_result(
         result: the result.
         out: the folder; an earlier result in it is replaced, anything else in it is an error.
         write_colmap: fills the folder `colmap`, which it is given; None leaves it out.
+        finish: is given the folder when all else is in it, and may add log.jsonl.
         jobs: photographs drawn at the same time.
         progress: is told of every photograph.
 
@@ -74,7 +80,7 @@ def write_result(
             (folder / "overlays").mkdir()
         for overlay in overlays:
             (folder / "overlays" / overlay.file_name).write_bytes(overlay.jpeg)
-        plots = all_plots(result.adjustment, result.unit)
+        plots = all_plots(result.adjustment, result.length_unit)
         (folder / "plots").mkdir()
         for stem, _, data in plots:
             (folder / "plots" / f"{stem}.png").write_bytes(data)
@@ -82,6 +88,9 @@ def write_result(
         write_tables(timed, folder)
         page = render_html(timed, plots, overlays)
         (folder / "report.html").write_text(page, encoding="utf-8")
+        if finish is not None:
+            finish(folder)
+        _make_durable(folder)
         _put_in_place(folder, out)
     except OSError as error:
         raise OutputError(f"{out}: the result cannot be written: {error.strerror or error}") from error
@@ -122,10 +131,42 @@ def _is_summary(path: Path) -> bool:
     return isinstance(text, dict) and {"survey", "images", "points", "observations"} <= text.keys()
 
 
+def remove_leftovers(out: Path) -> None:
+    """Remove what killed runs have left beside the place of a result, and put an earlier result back.
+
+    Only for who knows that nobody is writing there, by a lock.
+    """
+    name = glob.escape(out.name)
+    for old in out.parent.glob(f".{name}.*.old"):
+        if (old / "result").is_dir() and not out.exists():
+            with suppress(OSError):
+                (old / "result").rename(out)
+        shutil.rmtree(old, ignore_errors=True)
+    for part in out.parent.glob(f".{name}.*.part"):
+        shutil.rmtree(part, ignore_errors=True)
+
+
+def _make_durable(folder: Path) -> None:
+    """Have all files on the disk before the folder has its name, so that a power cut leaves none empty."""
+    for path in (*folder.rglob("*"), folder):
+        _sync(path)
+
+
+def _sync(path: Path) -> None:
+    if path.is_dir() and os.name == "nt":
+        return  # Windows knows no handles of folders
+    handle = os.open(path, os.O_RDONLY if path.is_dir() else os.O_RDWR)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
 def _put_in_place(folder: Path, out: Path) -> None:
     """Rename the finished folder to its place; an earlier result is kept until the new one is there."""
     if not out.exists():
         folder.rename(out)
+        _sync(out.parent)
         return
     old = Path(tempfile.mkdtemp(prefix=f".{out.name}.", suffix=".old", dir=out.parent))
     try:
@@ -135,5 +176,6 @@ def _put_in_place(folder: Path, out: Path) -> None:
         except OSError:
             (old / "result").rename(out)
             raise
+        _sync(out.parent)
     finally:
         shutil.rmtree(old, ignore_errors=True)

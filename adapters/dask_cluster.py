@@ -1,0 +1,224 @@
+"""Dask as the engine of batches: a cluster of this computer's own, or any scheduler that is running.
+
+Source: dask.distributed, Client futures API (https://distributed.dask.org/en/stable/client.html).
+"""
+
+from __future__ import annotations
+
+import logging
+import queue
+import time
+import uuid
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from itertools import count
+from typing import Any
+
+import dask
+from dask.distributed import Client, Future, KilledWorker, LocalCluster, get_worker
+from threadpoolctl import threadpool_limits
+
+from sfm.engine import Call, Done, Event, Lost, Told, Work
+from sfm.errors import BackendError, KolinearError
+
+# Deaths of workers that a call may be near before Dask gives it up: once is bad luck, and is tried elsewhere.
+ALLOWED_FAILURES = 1
+CONNECT_SECONDS = 15.0
+NOBODY_SECONDS = 60.0  # without a single worker before a run gives up; a new one takes some 3 s
+LOOK_SECONDS = 2.0
+CLOSE_SECONDS = 5.0
+# Numerical libraries that read how many threads they may start, at the start of a process.
+ONE_THREAD = dict.fromkeys(
+    (
+        "OMP_NUM_THREADS",
+        "OPENBLAS_NUM_THREADS",
+        "MKL_NUM_THREADS",
+        "NUMBA_NUM_THREADS",
+        "OPENCV_FOR_THREADS_NUM",
+    ),
+    "1",
+)
+
+
+@contextmanager
+def local_engine(workers: int, *, memory_bytes: int | None = None) -> Iterator[DaskEngine]:
+    """Start worker processes on this computer, each with one thread.
+
+    Args:
+        workers: how many.
+        memory_bytes: of each worker, which is ended beyond it; else an equal share of the computer's.
+
+    Raises:
+        BackendError: they do not start.
+    """
+    logging.getLogger("distributed").setLevel(logging.CRITICAL)
+    settings = {
+        "distributed.scheduler.allowed-failures": ALLOWED_FAILURES,
+        "distributed.scheduler.work-stealing": True,
+        "distributed.nanny.pre-spawn-environ": {**ONE_THREAD, "MALLOC_TRIM_THRESHOLD_": "65536"},
+        "distributed.comm.timeouts.connect": "60s",  # new workers compile and import on a busy computer
+    }
+    with dask.config.set(settings):
+        try:
+            cluster = LocalCluster(
+                n_workers=workers,
+                threads_per_worker=1,
+                processes=True,
+                memory_limit=memory_bytes or "auto",
+                host="127.0.0.1",
+                dashboard_address=None,
+                silence_logs=logging.CRITICAL,
+            )
+        except (OSError, RuntimeError, TimeoutError) as error:
+            raise BackendError(f"{workers} worker processes cannot be started: {_line(error)}") from error
+        try:
+            with cluster, Client(cluster) as client:
+                yield DaskEngine(client)
+        finally:
+            with suppress(Exception):
+                cluster.close(timeout=CLOSE_SECONDS)
+
+
+@contextmanager
+def remote_engine(address: str) -> Iterator[DaskEngine]:
+    """Use a scheduler that is running; its workers must have Kolinear and see the same folders.
+
+    Args:
+        address: such as tcp://192.168.1.5:8786; whoever reaches a scheduler can run programs on its
+            workers, so it belongs in a network of trust.
+
+    Raises:
+        BackendError: no scheduler answers.
+    """
+    logging.getLogger("distributed").setLevel(logging.CRITICAL)
+    try:
+        client = Client(address, timeout=CONNECT_SECONDS, set_as_default=False)
+    except (OSError, ValueError, TypeError, TimeoutError) as error:
+        raise BackendError(f"--cluster {address}: no Dask scheduler answers ({_line(error)})") from error
+    with client:
+        yield DaskEngine(client)
+
+
+@dataclass(frozen=True)
+class DaskEngine:
+    """Work in the processes of a Dask cluster."""
+
+    client: Client
+
+    @property
+    def workers(self) -> int:
+        """How many calls run at a time, at least 1 while workers are still to come."""
+        return max(1, sum(self.client.nthreads().values()))
+
+    def run(self, works: Iterable[Work], *, at_a_time: int) -> Iterator[Event]:
+        """Run all work and yield what happens, see sfm.engine.Engine.
+
+        Raises:
+            BackendError: the scheduler or all workers are gone, or the workers have no Kolinear.
+            KolinearError: what a called function raised.
+        """
+        events: queue.SimpleQueue[tuple[str, Any]] = queue.SimpleQueue()
+        run = f"kolinear-{uuid.uuid4().hex}"
+        running: dict[str, list[Future]] = {}  # the future of the whole comes first
+        left, turn = iter(works), count()
+
+        def start(work: Work) -> None:
+            futures = self._submit(work, run, priority=-next(turn))
+            running[work.key] = futures
+            futures[0].add_done_callback(lambda _, key=work.key: events.put(("done", key)))
+
+        self.client.subscribe_topic(run, lambda event: events.put(("told", event[1])))
+        someone = time.monotonic()
+        try:
+            while True:
+                while len(running) < at_a_time and (work := next(left, None)) is not None:
+                    start(work)
+                if not running:
+                    return
+                try:
+                    kind, what = events.get(timeout=LOOK_SECONDS)
+                except queue.Empty:
+                    someone = self._look(someone)
+                    continue
+                if kind == "told":
+                    yield Told(what["key"], what["message"])
+                else:
+                    yield _event(what, running.pop(what)[0])
+        finally:
+            with suppress(Exception):  # a scheduler that is gone cannot be told to stop
+                self.client.cancel([future for futures in running.values() for future in futures], force=True)
+                self.client.unsubscribe_topic(run)
+
+    def _submit(self, work: Work, run: str, *, priority: int) -> list[Future]:
+        """Submit the parts of a piece of work and then its whole, which comes first in the list."""
+
+        def submit(call: Call, name: str, *more: Any) -> Future:
+            return self.client.submit(
+                _call,
+                call,
+                *more,
+                topic=run,
+                work=work.key,
+                key=f"{name}-{work.key}-{uuid.uuid4().hex}",
+                priority=priority,
+                pure=False,
+            )
+
+        parts = [submit(part, "part") for part in work.parts]
+        return [submit(work.whole, "whole", parts), *parts]
+
+    def _look(self, someone: float) -> float:
+        """Return when a worker was last seen; raise BackendError if that is too long ago."""
+        try:
+            if self.client.status not in ("running", "connecting"):
+                raise BackendError("the Dask scheduler is gone; run again with --resume")
+            if self.client.nthreads():
+                return time.monotonic()
+        except OSError as error:
+            raise BackendError("the Dask scheduler is gone; run again with --resume") from error
+        if time.monotonic() - someone > NOBODY_SECONDS:
+            raise BackendError(f"the Dask scheduler has had no worker for {NOBODY_SECONDS:.0f} s")
+        return someone
+
+
+def _call(call: Call, parts: list[Any] | None = None, *, topic: str, work: str) -> Any:
+    """Run a call in a worker, its libraries held to one thread each."""
+    worker = get_worker()
+
+    def tell(message: dict[str, Any]) -> None:
+        worker.log_event(topic, {"key": work, "message": message})
+
+    more = () if parts is None else (parts,)
+    with _one_thread():
+        return call.function(*call.arguments, *more, tell=tell)
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """Hold BLAS and OpenCV to one thread, in workers that others have started, too."""
+    import cv2
+
+    cv2.setNumThreads(1)
+    with threadpool_limits(limits=1):
+        yield
+
+
+def _event(key: str, future: Future) -> Event:
+    """Return how a piece of work ended, or raise what it raised."""
+    if future.status == "finished":
+        return Done(key, future.result())
+    if future.status == "cancelled":
+        raise BackendError("the Dask scheduler is gone or has dropped the work; run again with --resume")
+    error = future.exception()
+    if isinstance(error, KilledWorker):
+        return Lost(key, "worker processes died, out of memory or by a fault in a library")
+    if isinstance(error, KolinearError):
+        raise error
+    if isinstance(error, ImportError):
+        raise BackendError(f"the workers of the cluster lack what Kolinear needs: {_line(error)}") from error
+    raise BackendError(f"the cluster failed: {type(error).__name__}: {_line(error)}") from error
+
+
+def _line(error: BaseException | None) -> str:
+    return (str(error).strip().splitlines() or ["no reason given"])[0]

@@ -1,0 +1,256 @@
+"""Many surveys in one go: run by an engine in other processes, continued after any end, told in tables.
+
+A survey's folder appears whole or not at all and carries the fingerprint of what it was computed from. So
+what is finished can be read from the folders alone, whatever ended the run before.
+"""
+
+from __future__ import annotations
+
+import glob
+import hashlib
+import re
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+from sfm.batch_pages import write_batch_pages
+from sfm.batch_survey import (
+    LOGS,
+    STORE,
+    Adjusters,
+    SurveyJob,
+    SurveyRow,
+    fingerprint,
+    finished_row,
+    measure_one,
+    reconstruct,
+)
+from sfm.engine import Call, Done, Engine, Lost, Told, Work
+from sfm.errors import KolinearError, SurveyFileError
+from sfm.folder_lock import locked
+from sfm.project import Survey, read_survey
+from sfm.report.output import refuse_foreign_folder, remove_leftovers
+from sfm.survey_log import SurveyLog
+from sfm.survey_start import find_photographs
+from sfm.targets.store import TargetStore
+
+LOCK = ".kolinear/lock"
+PAGES = ("batch.csv", "batch.json", "index.html")
+SURVEY_NAME = "survey.toml"  # what a folder is searched for
+
+
+class Watch(Protocol):
+    """Whoever looks on while a batch runs."""
+
+    def planned(self, names: Sequence[str]) -> None:
+        """These surveys are part of the batch, by the names of their folders."""
+
+    def told(self, name: str, message: dict[str, Any]) -> None:
+        """A survey has {"photographs": count}, begins {"stage": name}, has measured {"photograph": name}."""
+
+    def finished(self, name: str, row: SurveyRow, *, kept: bool) -> None:
+        """A survey is at its end; `kept` where an earlier run finished it."""
+
+    def remark(self, text: str) -> None:
+        """Something that a person may want to know."""
+
+
+@dataclass(frozen=True)
+class _Plan:
+    """A survey of the batch before it runs."""
+
+    file: Path
+    folder: str
+    survey: Survey | None  # None if its file cannot be read
+    reason: str = ""  # why not
+
+
+def run_batch(
+    files: Sequence[Path],
+    out: Path,
+    engine: Engine,
+    adjusters: Adjusters,
+    watch: Watch,
+    *,
+    resume: bool = False,
+    allow_outside: bool = False,
+) -> tuple[SurveyRow, ...]:
+    """Run surveys and write batch.csv, batch.json and index.html beside their results.
+
+    Args:
+        files: survey files.
+        out: folder of the batch; every survey gets a folder in it.
+        engine: runs the work.
+        adjusters: the other adjuster.
+        watch: is told what happens.
+        resume: keep what an earlier run finished from the same inputs; else everything is run, and only
+            measured targets are taken from an earlier run.
+        allow_outside: whether survey files may name files outside their folders.
+
+    Returns:
+        One row per survey in the order of the files.
+
+    Raises:
+        OutputError: the folder cannot be written, or another run is writing into it.
+        BackendError: there is nobody left to work.
+    """
+    out = Path(out).resolve()
+    plans = _plan(files, allow_outside=allow_outside)
+    with locked(out / LOCK) as before:
+        if before is not None:
+            watch.remark(f"an earlier run was cut off ({before}); what it had finished is safe")
+        _clean(out, plans)
+        watch.planned([plan.folder for plan in plans])
+        try:
+            rows = _run(plans, out, engine, adjusters, watch, resume=resume, allow_outside=allow_outside)
+        finally:
+            _clean(out, plans)
+        ordered = tuple(rows[plan.folder] for plan in plans)
+        write_batch_pages(ordered, out)
+    return ordered
+
+
+def find_surveys(names: Sequence[str]) -> tuple[Path, ...]:
+    """Return the survey files that names on the command line stand for, each once.
+
+    Args:
+        names: files; folders, which stand for every survey.toml in and below them or else for the *.toml
+            files in them; globs, for shells that leave them as they are.
+
+    Raises:
+        SurveyFileError: a name stands for nothing.
+    """
+    found: dict[Path, None] = {}
+    for name in names:
+        path = Path(name)
+        if path.is_dir():
+            below = sorted(path.rglob(SURVEY_NAME)) or sorted(path.glob("*.toml"))
+            if not below:
+                raise SurveyFileError(
+                    f"{path}: no {SURVEY_NAME} in or below this folder, nor any *.toml in it"
+                )
+        elif path.exists() or not glob.has_magic(name):
+            below = [path]
+        else:
+            below = sorted(Path(match) for match in glob.glob(name, recursive=True))
+            if not below:
+                raise SurveyFileError(f"{name}: no file matches")
+        found.update(dict.fromkeys(file.resolve() for file in below if not file.is_dir()))
+    return tuple(found)
+
+
+def _plan(files: Sequence[Path], *, allow_outside: bool) -> tuple[_Plan, ...]:
+    """Read all survey files and give each a folder of its own."""
+    read: list[tuple[Path, Survey | None, str]] = []
+    for file in files:
+        try:
+            read.append((file, read_survey(file, allow_outside=allow_outside), ""))
+        except KolinearError as error:
+            read.append((file, None, str(error)))
+    names = [_folder_name(file, survey) for file, survey, _ in read]
+    often = Counter(name.casefold() for name in names)
+    plans = []
+    for (file, survey, reason), name in zip(read, names, strict=True):
+        reserved = name.casefold() in (LOGS, *PAGES)
+        if often[name.casefold()] > 1 or reserved:  # told apart by what stays the same from run to run
+            name = f"{name}-{hashlib.sha256(str(file).encode()).hexdigest()[:8]}"
+        plans.append(_Plan(file, name, survey, reason))
+    return tuple(plans)
+
+
+def _folder_name(file: Path, survey: Survey | None) -> str:
+    name = survey.name if survey is not None else file.parent.name if file.name == SURVEY_NAME else file.stem
+    return re.sub(r"[^\w.\-]+", "_", name).strip("._")[:80] or "survey"
+
+
+def _run(
+    plans: Sequence[_Plan],
+    out: Path,
+    engine: Engine,
+    adjusters: Adjusters,
+    watch: Watch,
+    *,
+    resume: bool,
+    allow_outside: bool,
+) -> dict[str, SurveyRow]:
+    """Run what is not finished; what was near dying workers is run again alone, to see whose fault it is."""
+    rows: dict[str, SurveyRow] = {}
+    works: dict[str, Work] = {}
+
+    def finish(name: str, row: SurveyRow, *, kept: bool = False) -> None:
+        rows[name] = row
+        works.pop(name, None)
+        watch.finished(name, row, kept=kept)
+
+    def begin() -> Iterator[Work]:
+        for plan in plans:
+            try:
+                if plan.survey is None:
+                    raise SurveyFileError(plan.reason)
+                refuse_foreign_folder(out / plan.folder)
+                job = SurveyJob(plan.file, out, plan.folder, fingerprint(plan.survey), allow_outside)
+                earlier = finished_row(job) if resume else None
+                if earlier is None:
+                    works[plan.folder] = _work(job, plan.survey, adjusters)
+            except (KolinearError, OSError) as error:
+                finish(plan.folder, _without_result(plan, out, "failed", str(error)))
+                continue
+            if earlier is not None:
+                finish(plan.folder, earlier, kept=True)
+                continue
+            work = works[plan.folder]
+            watch.told(plan.folder, {"photographs": len(work.parts)})
+            yield work
+
+    suspects: list[Lost] = []
+    for event in engine.run(begin(), at_a_time=engine.workers + 1):
+        if isinstance(event, Told):
+            watch.told(event.key, event.message)
+        elif isinstance(event, Done):
+            finish(event.key, event.value)
+        else:
+            watch.told(event.key, {"stage": "waiting for a second try, alone"})
+            suspects.append(event)
+    by_name = {plan.folder: plan for plan in plans}
+    for suspect in suspects:
+        for event in engine.run([works[suspect.key]], at_a_time=1):
+            if isinstance(event, Told):
+                watch.told(event.key, event.message)
+            elif isinstance(event, Done):
+                finish(event.key, event.value)
+            else:
+                reason = f"set aside: {event.reason}, alone as well as beside others"
+                finish(event.key, _without_result(by_name[event.key], out, "set aside", reason))
+    return rows
+
+
+def _work(job: SurveyJob, survey: Survey, adjusters: Adjusters) -> Work:
+    """Return a survey as the engine takes it: a part for each photograph, and the rest."""
+    parts: tuple[Call, ...] = ()
+    if survey.observations is None:
+        found = find_photographs(survey)
+        parts = tuple(
+            Call(measure_one, (job, survey, name, path))
+            for name, path in zip(found.names, found.paths, strict=True)
+        )
+    return Work(job.folder, parts, Call(reconstruct, (job, adjusters)))
+
+
+def _without_result(plan: _Plan, out: Path, status: str, reason: str) -> SurveyRow:
+    """Return the row of a survey that no worker has brought to its end, and write its log."""
+    name = plan.survey.name if plan.survey is not None else plan.folder
+    with SurveyLog(out / LOGS / f"{plan.folder}.jsonl", append=True) as log:
+        log.note("failed", survey=name, file=str(plan.file), reason=reason)
+    return SurveyRow(name, str(plan.file), plan.folder, status, reason=reason)
+
+
+def _clean(out: Path, plans: Sequence[_Plan]) -> None:
+    """Remove what killed workers left half-written, and logs of surveys whose results have theirs."""
+    TargetStore(out / STORE).remove_parts()
+    for plan in plans:
+        remove_leftovers(out / plan.folder)
+    for page in PAGES:
+        for part in out.glob(f".{page}.*.part"):
+            part.unlink(missing_ok=True)

@@ -1,0 +1,264 @@
+"""One survey of a batch, as a worker runs it: its photographs one by one, then the rest, into one folder."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import time
+import traceback
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, fields, replace
+from pathlib import Path
+from typing import Any
+
+from sfm.engine import Tell
+from sfm.errors import KolinearError, OutputError
+from sfm.pipeline import Backend, adjust_survey, run_survey
+from sfm.project import Survey, read_survey
+from sfm.report.output import write_result
+from sfm.report.result import SurveyResult
+from sfm.report.verdict import verdict_of
+from sfm.survey_log import SurveyLog, read_log
+from sfm.survey_start import find_photographs
+from sfm.survey_targets import measure_photograph
+from sfm.targets.codes import code_family
+from sfm.targets.photograph import hold_decoder_threads
+from sfm.targets.store import TargetStore
+
+LOG = "log.jsonl"  # in the folder of a result
+LOGS = "logs"  # folder of the logs of surveys that have no result
+STORE = ".kolinear/targets"  # beside the folders of results
+
+
+@dataclass(frozen=True)
+class SurveyJob:
+    """What a worker must know to run a survey."""
+
+    file: Path  # the survey file
+    out: Path  # folder of the batch
+    folder: str  # name of the survey's folder in it
+    inputs: str  # fingerprint of everything that the survey reads
+    allow_outside: bool  # whether the survey file may name files outside its folder
+
+    @property
+    def store(self) -> TargetStore:
+        """Where targets are kept."""
+        return TargetStore(self.out / STORE)
+
+
+@dataclass(frozen=True)
+class Adjusters:
+    """The other adjuster: functions of a module, so that they travel to workers."""
+
+    backend_of: Callable[[Survey], Backend | None]  # the one that a survey asks for
+    writer_of: Callable[[SurveyResult], Callable[[Path], None] | None]  # writes its model
+
+
+@dataclass(frozen=True)
+class PhotographNote:
+    """What came of a photograph, for the log."""
+
+    image: str
+    targets: int = 0
+    rejected: int = 0  # candidates
+    stored: bool = False  # measured in an earlier run
+    seconds: float = 0.0
+    failed: str = ""  # why it could not be read
+
+
+@dataclass(frozen=True)
+class SurveyRow:
+    """A survey in the tables of a batch; None where there is no result."""
+
+    survey: str  # its name
+    file: str  # survey file
+    folder: str  # folder of the result or of the log
+    status: str  # done | failed | set aside
+    verdict: str = ""  # good | fair | bad
+    sigma0_px: float | None = None
+    rms_px: float | None = None
+    photographs: int | None = None  # oriented
+    photographs_total: int | None = None
+    points: int | None = None
+    comparison: str = ""  # agrees | differs | none
+    seconds: float = 0.0  # of computing, photographs included
+    reason: str = ""  # why there is no result, one line
+
+    @property
+    def succeeded(self) -> bool:
+        """Whether there is a result that can be depended on."""
+        return self.status == "done" and self.verdict != "bad"
+
+
+def measure_one(job: SurveyJob, survey: Survey, image: str, path: Path, *, tell: Tell) -> PhotographNote:
+    """Measure one photograph into the store; why it cannot be read is part of what is returned."""
+    hold_decoder_threads()
+    begun = time.perf_counter()
+    try:
+        family = code_family(survey.codes)
+        targets, stored = measure_photograph(path, survey.targets, family, job.store)
+    except KolinearError as error:
+        note = PhotographNote(image, failed=str(error))
+    else:
+        note = PhotographNote(image, len(targets), len(targets.rejected_xy), stored)
+    tell({"photograph": image})
+    return replace(note, seconds=round(time.perf_counter() - begun, 4))
+
+
+def reconstruct(
+    job: SurveyJob, adjusters: Adjusters, photographs: list[PhotographNote], *, tell: Tell
+) -> SurveyRow:
+    """Run a survey whose photographs are measured, and write its result.
+
+    Args:
+        job: the survey.
+        adjusters: the other adjuster.
+        photographs: what came of its photographs.
+        tell: is told the stages.
+
+    Returns:
+        Its row, with a reason if there is no result.
+
+    Raises:
+        OutputError: the result or the log cannot be written.
+    """
+    hold_decoder_threads()
+    begun = time.perf_counter()
+    name = job.folder
+    live = job.out / LOGS / f"{job.folder}.jsonl"
+    with _ToldLog(live, tell) as log:
+        log.note("start", survey=name, file=str(job.file), inputs=job.inputs)
+        for note in photographs:
+            log.note("photograph", **asdict(note))
+        before = sum(note.seconds for note in photographs)
+        try:
+            survey = read_survey(job.file, allow_outside=job.allow_outside)
+            name = survey.name
+            row = _run(job, survey, adjusters, log, lambda: before + time.perf_counter() - begun)
+        except OutputError as error:
+            log.note("failed", reason=str(error))
+            raise
+        except Exception as error:
+            reason = str(error) if isinstance(error, KolinearError) else _fault(error)
+            log.note("failed", reason=reason, **_trace(error))
+            seconds = round(before + time.perf_counter() - begun, 3)
+            return SurveyRow(name, str(job.file), job.folder, "failed", reason=reason, seconds=seconds)
+    live.unlink(missing_ok=True)  # the result has it
+    return row
+
+
+def fingerprint(survey: Survey) -> str:
+    """Return a SHA-256 of what a survey reads: tables by content, photographs by name, size and date.
+
+    Raises:
+        KolinearError: photographs are missing.
+        OSError: a table cannot be read.
+    """
+    digest = hashlib.sha256(survey.path.read_bytes())
+    for table in survey.tables():
+        with table.open("rb") as file:
+            digest.update(hashlib.file_digest(file, "sha256").digest())
+    if survey.observations is None:
+        found = find_photographs(survey)
+        for name, path in zip(found.names, found.paths, strict=True):
+            status = path.stat()
+            digest.update(f"{name}\0{status.st_size}\0{status.st_mtime_ns}\0".encode())
+    return digest.hexdigest()
+
+
+def finished_row(job: SurveyJob) -> SurveyRow | None:
+    """Return the row of a result that an earlier run has written from the same inputs, None without one."""
+    try:
+        entries = read_log(job.out / job.folder / LOG)
+    except OSError:
+        return None
+    same = [entry for entry in entries if entry.get("event") == "start" and entry.get("inputs") == job.inputs]
+    results = [entry for entry in entries if entry.get("event") == "result"]
+    if not same or not results:
+        return None
+    names = {field.name for field in fields(SurveyRow)}
+    try:
+        row = SurveyRow(**{key: value for key, value in results[-1].items() if key in names})
+    except TypeError:
+        return None
+    return replace(row, file=str(job.file), folder=job.folder)
+
+
+def _run(
+    job: SurveyJob, survey: Survey, adjusters: Adjusters, log: SurveyLog, seconds: Callable[[], float]
+) -> SurveyRow:
+    backend = adjusters.backend_of(survey)
+    if survey.observations is not None:
+        result = adjust_survey(survey, backend=backend, progress=log)
+    else:
+        result = run_survey(survey, backend=backend, store=job.store, progress=log)
+    log.stage("report")
+    row: list[SurveyRow] = []
+
+    def close_log(folder: Path) -> None:
+        """Put the log into the folder of the result, just before the folder appears."""
+        log.end_stage()
+        for warning in result.warnings:
+            log.note("warning", text=warning)
+        row.append(_row(job, result, round(seconds(), 3)))
+        log.note("result", **asdict(row[0]), **_counts(result))
+        (folder / LOG).write_text(log.text(), encoding="utf-8")
+
+    write_result(result, job.out / job.folder, write_colmap=adjusters.writer_of(result), finish=close_log)
+    return row[0]
+
+
+def _row(job: SurveyJob, result: SurveyResult, seconds: float) -> SurveyRow:
+    a = result.adjustment
+    both = result.comparison
+    return SurveyRow(
+        survey=result.survey,
+        file=str(job.file),
+        folder=job.folder,
+        status="done",
+        verdict=verdict_of(result).level,
+        sigma0_px=float(a.sigma0_px) if math.isfinite(a.sigma0_px) else None,
+        rms_px=float(a.rms_px) if math.isfinite(a.rms_px) else None,
+        photographs=len(a.network.images),
+        photographs_total=result.images_total,
+        points=len(a.network.points),
+        comparison="none" if both is None else "agrees" if both.agree else "differs",
+        seconds=seconds,
+    )
+
+
+def _counts(result: SurveyResult) -> dict[str, Any]:
+    a = result.adjustment
+    return {
+        "observations": int((~a.rejected).sum()),
+        "rejected": int(a.rejected.sum()),
+        "iterations": a.iterations,
+        "converged": a.converged,
+        "failed_photographs": [{"image": f.image, "reason": f.reason} for f in result.failed],
+    }
+
+
+class _ToldLog(SurveyLog):
+    """A log that also tells whoever watches the batch which stage begins."""
+
+    def __init__(self, path: Path, tell: Tell) -> None:
+        super().__init__(path)
+        self._tell = tell
+
+    def stage(self, name: str, total: int | None = None) -> None:
+        super().stage(name, total)
+        self._tell({"stage": name})
+
+
+def _fault(error: Exception) -> str:
+    """Say that the program is wrong, not the survey, and where."""
+    at = traceback.extract_tb(error.__traceback__)
+    place = f" ({Path(at[-1].filename).name}, line {at[-1].lineno})" if at else ""
+    said = " ".join(str(error).split())
+    return f"a fault of Kolinear: {type(error).__name__}: {said:.200}{place}"
+
+
+def _trace(error: Exception) -> dict[str, Any]:
+    if isinstance(error, KolinearError):
+        return {}
+    return {"trace": traceback.format_exception(error)}
