@@ -40,9 +40,9 @@ def resect_church(tangents: FloatArray, points: FloatArray, start: FloatArray) -
         GeometryError: fewer than three points, points on one line, a start that coincides with a point, or
             no convergence.
 
-    Source: Church (1945) as in document 001, eqs. 2.47-2.63: cos AOB = cos aOb for the three pairs, linearised
-    for the position (I, J, A, B, C); the equations are solved as a system, a step halved while it
-    makes the angles worse. The rotation is the product of the two matrices of direction cosines.
+    Source: Church (1945) as in document 001, eqs. 2.47-2.63: cos AOB = cos aOb for the three pairs,
+    linearised for the position (I, J, A, B, C); the equations are solved as a system, a step halved while
+    it makes the angles worse. The rotation is the product of the two matrices of direction cosines.
     """
     uv, xyz = checked_points("church", tangents, points, needed=MIN_POINTS)
     X = xyz[:MIN_POINTS]
@@ -78,7 +78,7 @@ def resect_church(tangents: FloatArray, points: FloatArray, start: FloatArray) -
     U, _, Vt = np.linalg.svd(LMN.T @ np.linalg.inv(lmn.T))
     if np.linalg.det(U @ Vt) < 0:
         raise GeometryError(
-            "church: the iteration ended on the mirror side of the points, a start on the other side is needed"
+            "church: the iteration ended on the mirror side of the points, start on the other side"
         )
     return ChurchResection(solution_of(position, U @ Vt, uv, xyz), np.array(history))
 

@@ -194,6 +194,7 @@ def _decompose(
     scale = np.linalg.norm(J, axis=0)
     cofactors = np.linalg.pinv((J / scale).T @ (J / scale), hermitian=True) / np.outer(scale, scale)
     return DirectLinearTransformation(
-        L, cy, cx / cy - 1, float(np.arctan2(s, cy)), np.array([x0, y0]), k, position, M.T,
+        L, cy, cx / cy - 1, float(np.arctan2(s, cy)), np.array([x0, y0]), k,
+        np.asarray(position, dtype=float), M.T,
         np.asarray(residuals), sigma0, redundancy, np.asarray(cofactors),
     )  # fmt: skip

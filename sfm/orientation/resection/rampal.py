@@ -1,4 +1,4 @@
-"""Space resection by Rampal: corrections of the face angles, linearised, then linear equations of position."""
+"""Space resection by Rampal: corrections of the face angles, linearised, then linear equations."""
 
 from __future__ import annotations
 
