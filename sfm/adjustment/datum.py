@@ -90,8 +90,8 @@ def motions_of(layout: Unknowns, weighted: Weighted, state: State, datum: Datum)
         open_motions = Vt[rank:].T
     else:
         open_motions = np.eye(7)
-    H = H @ open_motions
-    points = points @ open_motions
+    H = H @ open_motions * layout.reduced_free()[:, None]
+    points = points @ open_motions * layout.point_free[:, :, None]
     d = open_motions.shape[1]
     B, on_reduced = np.zeros_like(points), np.zeros_like(H)
     if d == 0:

@@ -26,6 +26,7 @@ from sfm.errors import GeometryError
 from sfm.network import Estimate, Network
 
 MAX_ROUNDS = 200  # of data snooping
+ROUND_TOLERANCE = 1e-3  # |A dx| / |v| that is near enough to judge gross errors
 HUBER_ROUNDS = 30
 HUBER_SETTLED = 1e-3  # largest change of a weight at which reweighting ends
 NORMAL_MAD = 1.4826  # standard deviation of a normal variable over its median absolute deviation
@@ -71,12 +72,16 @@ def adjust(
     layout, state = unknowns_of(network, estimate, use_control=use_control)
     weighted = weighted_of(network, layout, use_control=use_control)
     weight = start_weights(layout, state)
-    run = _Run(layout, weighted, datum, method, max_iterations, tolerance)
+    near = tolerance if reject == "none" else max(tolerance, ROUND_TOLERANCE)
+    run = _Run(layout, weighted, datum, method, max_iterations, near)
     optimum, weight = run.minimise(run.start(state, weight), weight)
     if reject == "tau":
         optimum, weight = _snoop_all(run, optimum, weight, alpha)
     elif reject == "huber":
         optimum, weight = _huber(run, optimum, weight)
+    if near > tolerance:
+        run.tolerance = tolerance
+        optimum = run.again(optimum, weight)
     Q = cofactors(optimum, layout) if covariance else None
     return _result(network, estimate, run, optimum, weight, Q, sigma_px)
 
@@ -137,7 +142,7 @@ def _snoop_all(run: _Run, optimum: Optimum, weight: FloatArray, alpha: float) ->
     returned = np.zeros(len(weight), dtype=bool)
     for _ in range(MAX_ROUNDS):
         redundancy = run.redundancy(optimum, weight)
-        if redundancy < 2 or not optimum.converged:
+        if redundancy < 2:
             break
         v = residuals(layout.obs, optimum.state)
         complement = hat_complement(optimum, layout, cofactors(optimum, layout), weight)
