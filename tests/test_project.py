@@ -182,7 +182,7 @@ def test_datum_control_needs_control(tmp_path: Path) -> None:
 def test_unreadable_survey_files(tmp_path: Path) -> None:
     with pytest.raises(SurveyFileError, match="cannot be read: No such file"):
         read_survey(tmp_path / "none.toml")
-    with pytest.raises(SurveyFileError, match="cannot be read: Is a directory"):
+    with pytest.raises(SurveyFileError, match="not a file, a survey file"):
         read_survey(tmp_path)
     (tmp_path / "latin.toml").write_bytes(b'[survey]\nname = "M\xfcnchen"\n')
     with pytest.raises(SurveyFileError, match=r"not a text file in UTF-8 \(byte 18\)"):
