@@ -18,7 +18,6 @@ from typing import Any, Protocol
 from sfm.batch_pages import write_batch_pages
 from sfm.batch_survey import (
     LOGS,
-    STORE,
     Adjusters,
     SurveyJob,
     SurveyRow,
@@ -34,7 +33,7 @@ from sfm.project import Survey, read_survey
 from sfm.report.output import refuse_foreign_folder, remove_leftovers
 from sfm.survey_log import SurveyLog
 from sfm.survey_start import find_photographs
-from sfm.targets.store import TargetStore
+from sfm.targets.store import STORE, TargetStore
 
 LOCK = ".kolinear/lock"
 PAGES = ("batch.csv", "batch.json", "index.html")
@@ -125,20 +124,25 @@ def find_surveys(names: Sequence[str]) -> tuple[Path, ...]:
     found: dict[Path, None] = {}
     for name in names:
         path = Path(name)
-        if path.is_dir():
-            below = sorted(path.rglob(SURVEY_NAME)) or sorted(path.glob("*.toml"))
-            if not below:
-                raise SurveyFileError(
-                    f"{path}: no {SURVEY_NAME} in or below this folder, nor any *.toml in it"
-                )
-        elif path.exists() or not glob.has_magic(name):
-            below = [path]
-        else:
-            below = sorted(Path(match) for match in glob.glob(name, recursive=True))
-            if not below:
-                raise SurveyFileError(f"{name}: no file matches")
-        found.update(dict.fromkeys(file.resolve() for file in below if not file.is_dir()))
+        if path.exists() or not glob.has_magic(name):
+            found.update(dict.fromkeys(_below(path)))
+            continue
+        matches = sorted(Path(match) for match in glob.glob(name, recursive=True))
+        if not matches:
+            raise SurveyFileError(f"{name}: no file matches")
+        for match in matches:
+            found.update(dict.fromkeys(_below(match)))
     return tuple(found)
+
+
+def _below(path: Path) -> list[Path]:
+    """Return the survey files of a folder, or a file itself."""
+    if not path.is_dir():
+        return [path.resolve()]
+    below = sorted(path.rglob(SURVEY_NAME)) or sorted(path.glob("*.toml"))
+    if not below:
+        raise SurveyFileError(f"{path}: no {SURVEY_NAME} in or below this folder, nor any *.toml in it")
+    return [file.resolve() for file in below]
 
 
 def _plan(files: Sequence[Path], *, allow_outside: bool) -> tuple[_Plan, ...]:

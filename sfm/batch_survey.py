@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import math
 import time
 import traceback
 from collections.abc import Callable
@@ -17,17 +16,13 @@ from sfm.pipeline import Backend, adjust_survey, run_survey
 from sfm.project import Survey, read_survey
 from sfm.report.output import write_result
 from sfm.report.result import SurveyResult
-from sfm.report.verdict import verdict_of
-from sfm.survey_log import SurveyLog, read_log
+from sfm.survey_log import LOG, SurveyLog, read_log, result_entries
 from sfm.survey_start import find_photographs
 from sfm.survey_targets import measure_photograph
 from sfm.targets.codes import code_family
-from sfm.targets.photograph import hold_decoder_threads
-from sfm.targets.store import TargetStore
+from sfm.targets.store import STORE, TargetStore
 
-LOG = "log.jsonl"  # in the folder of a result
 LOGS = "logs"  # folder of the logs of surveys that have no result
-STORE = ".kolinear/targets"  # beside the folders of results
 
 
 @dataclass(frozen=True)
@@ -92,7 +87,6 @@ class SurveyRow:
 
 def measure_one(job: SurveyJob, survey: Survey, image: str, path: Path, *, tell: Tell) -> PhotographNote:
     """Measure one photograph into the store; why it cannot be read is part of what is returned."""
-    hold_decoder_threads()
     begun = time.perf_counter()
     try:
         family = code_family(survey.codes)
@@ -122,11 +116,10 @@ def reconstruct(
     Raises:
         OutputError: the result or the log cannot be written.
     """
-    hold_decoder_threads()
     begun = time.perf_counter()
     name = job.folder
     live = job.out / LOGS / f"{job.folder}.jsonl"
-    with _ToldLog(live, tell) as log:
+    with SurveyLog(live, watch=_Telling(tell)) as log:
         log.note("start", survey=name, file=str(job.file), inputs=job.inputs)
         for note in photographs:
             log.note("photograph", **asdict(note))
@@ -176,12 +169,10 @@ def finished_row(job: SurveyJob) -> SurveyRow | None:
     results = [entry for entry in entries if entry.get("event") == "result"]
     if not same or not results:
         return None
-    names = {field.name for field in fields(SurveyRow)}
     try:
-        row = SurveyRow(**{key: value for key, value in results[-1].items() if key in names})
-    except TypeError:
+        return _row(job, results[-1], float(results[-1].get("seconds", 0.0)))
+    except (TypeError, ValueError):
         return None
-    return replace(row, file=str(job.file), folder=job.folder)
 
 
 def _run(
@@ -196,58 +187,31 @@ def _run(
     row: list[SurveyRow] = []
 
     def close_log(folder: Path) -> None:
-        """Put the log into the folder of the result, just before the folder appears."""
-        log.end_stage()
-        for warning in result.warnings:
-            log.note("warning", text=warning)
-        row.append(_row(job, result, round(seconds(), 3)))
-        log.note("result", **asdict(row[0]), **_counts(result))
-        (folder / LOG).write_text(log.text(), encoding="utf-8")
+        row.append(_row(job, result_entries(result), round(seconds(), 3)))
+        log.close_into(folder, result, seconds=row[0].seconds)
 
     write_result(result, job.out / job.folder, write_colmap=adjusters.writer_of(result), finish=close_log)
     return row[0]
 
 
-def _row(job: SurveyJob, result: SurveyResult, seconds: float) -> SurveyRow:
-    a = result.adjustment
-    both = result.comparison
-    return SurveyRow(
-        survey=result.survey,
-        file=str(job.file),
-        folder=job.folder,
-        status="done",
-        verdict=verdict_of(result).level,
-        sigma0_px=float(a.sigma0_px) if math.isfinite(a.sigma0_px) else None,
-        rms_px=float(a.rms_px) if math.isfinite(a.rms_px) else None,
-        photographs=len(a.network.images),
-        photographs_total=result.images_total,
-        points=len(a.network.points),
-        comparison="none" if both is None else "agrees" if both.agree else "differs",
-        seconds=seconds,
-    )
+def _row(job: SurveyJob, entries: dict[str, Any], seconds: float) -> SurveyRow:
+    """Return the row of a survey from the last line of its log; TypeError if that is something else."""
+    names = {field.name for field in fields(SurveyRow)} - {"file", "folder", "status", "seconds"}
+    known = {key: value for key, value in entries.items() if key in names}
+    return SurveyRow(file=str(job.file), folder=job.folder, status="done", seconds=seconds, **known)
 
 
-def _counts(result: SurveyResult) -> dict[str, Any]:
-    a = result.adjustment
-    return {
-        "observations": int((~a.rejected).sum()),
-        "rejected": int(a.rejected.sum()),
-        "iterations": a.iterations,
-        "converged": a.converged,
-        "failed_photographs": [{"image": f.image, "reason": f.reason} for f in result.failed],
-    }
+@dataclass(frozen=True)
+class _Telling:
+    """Progress that tells whoever watches the batch which stage begins."""
 
-
-class _ToldLog(SurveyLog):
-    """A log that also tells whoever watches the batch which stage begins."""
-
-    def __init__(self, path: Path, tell: Tell) -> None:
-        super().__init__(path)
-        self._tell = tell
+    tell: Tell
 
     def stage(self, name: str, total: int | None = None) -> None:
-        super().stage(name, total)
-        self._tell({"stage": name})
+        self.tell({"stage": name})
+
+    def advance(self, step: str = "") -> None:
+        """Photographs are told where they are measured."""
 
 
 def _fault(error: Exception) -> str:

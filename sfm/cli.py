@@ -17,16 +17,23 @@ from rich.table import Table
 from rich.text import Text
 from threadpoolctl import threadpool_limits
 
+from sfm.batch import find_surveys, run_batch
+from sfm.batch_survey import Adjusters
+from sfm.batch_table import BatchTable, print_batch, stopping_at_terminate
 from sfm.errors import KolinearError
+from sfm.folder_lock import locked
 from sfm.pipeline import Backend, adjust_survey, run_survey
 from sfm.project import Survey, read_survey
 from sfm.report.markup import finer_unit, significant
-from sfm.report.output import refuse_foreign_folder, write_result
+from sfm.report.output import refuse_foreign_folder, remove_leftovers, write_result
 from sfm.report.result import SurveyResult
 from sfm.report.tables import point_sigmas, root_mean_square
 from sfm.report.verdict import verdict_of
+from sfm.survey_log import SurveyLog
+from sfm.targets.store import STORE, TargetStore
 
 BAD_INPUT = 2  # exit code where a person must put something right
+FAILED = 1  # exit code where a survey of a batch failed
 INTERRUPTED = 130  # exit code after Ctrl-C, as a shell expects it
 MAX_WARNINGS = 5  # without --verbose
 COLOURS = {"good": "green", "fair": "yellow", "bad": "red"}
@@ -57,6 +64,13 @@ Jobs = Annotated[
     typer.Option("--jobs", metavar="N", min=1, help="Photographs worked on at a time.  [default: all cores]"),
 ]
 Verbose = Annotated[bool, typer.Option("--verbose", "-v", help="Tell more: every photograph and warning.")]
+AllowOutside = Annotated[
+    bool,
+    typer.Option(
+        "--allow-outside",
+        help="Let the survey file name files outside its own folder; only for survey files that you trust.",
+    ),
+]
 
 
 @app.callback()
@@ -75,10 +89,11 @@ def run(
     ] = None,
     out: Out = None,
     jobs: Jobs = None,
+    allow_outside: AllowOutside = False,
     verbose: Verbose = False,
 ) -> None:
     """Run a survey from its photographs to the report."""
-    survey = read_survey(survey_file)
+    survey = read_survey(survey_file, allow_outside=allow_outside)
     if survey.observations is not None:
         raise KolinearError(
             f"{survey_file}: it has [observations] in place of photographs: kolinear adjust {survey_file}"
@@ -86,28 +101,105 @@ def run(
     backend = _backend(survey)
     folder = _folder(survey, out)
     workers = jobs or _cores()
-    with _drawn_progress() as progress, _threads():
-        result = run_survey(survey, images_dir=images, jobs=workers, backend=backend, progress=progress)
+    store = TargetStore(folder.parent / STORE)
+    with _drawn_progress() as drawn, _threads(), _written(folder), SurveyLog(watch=drawn) as log:
+        log.note("start", survey=survey.name, file=str(survey_file))
+        result = run_survey(
+            survey, images_dir=images, jobs=workers, backend=backend, store=store, progress=log
+        )
         page = write_result(
-            result, folder, write_colmap=_colmap_writer(result), jobs=workers, progress=progress
+            result,
+            folder,
+            write_colmap=_colmap_writer(result),
+            finish=lambda part: log.close_into(part, result),
+            jobs=workers,
+            progress=log,
         )
     _tell(result, page, verbose=verbose)
 
 
 @app.command()
-def adjust(survey_file: SurveyFile, out: Out = None, verbose: Verbose = False) -> None:
+def adjust(
+    survey_file: SurveyFile, out: Out = None, allow_outside: AllowOutside = False, verbose: Verbose = False
+) -> None:
     """Run the part after the photographs, on the image points of [observations]."""
-    survey = read_survey(survey_file)
+    survey = read_survey(survey_file, allow_outside=allow_outside)
     if survey.observations is None:
         raise KolinearError(
             f"{survey_file}: it has no [observations]; with photographs: kolinear run {survey_file}"
         )
     backend = _backend(survey)
     folder = _folder(survey, out)
-    with _drawn_progress() as progress, _threads():
-        result = adjust_survey(survey, backend=backend, progress=progress)
-        page = write_result(result, folder, write_colmap=_colmap_writer(result), progress=progress)
+    with _drawn_progress() as drawn, _threads(), _written(folder), SurveyLog(watch=drawn) as log:
+        log.note("start", survey=survey.name, file=str(survey_file))
+        result = adjust_survey(survey, backend=backend, progress=log)
+        page = write_result(
+            result,
+            folder,
+            write_colmap=_colmap_writer(result),
+            finish=lambda part: log.close_into(part, result),
+            progress=log,
+        )
     _tell(result, page, verbose=verbose)
+
+
+@app.command()
+def batch(
+    surveys: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="SURVEYS...",
+            help="Survey files; folders (every survey.toml in and below, else the *.toml in them); globs.",
+        ),
+    ],
+    out: Annotated[
+        Path, typer.Option("--out", metavar="DIR", help="Folder of the batch, with a folder per survey.")
+    ] = Path("out/batch"),
+    jobs: Annotated[
+        int | None,
+        typer.Option("--jobs", metavar="N", min=1, help="Worker processes.  [default: all cores]"),
+    ] = None,
+    cluster: Annotated[
+        str | None,
+        typer.Option(
+            "--cluster",
+            metavar="ADDRESS",
+            help="A Dask scheduler, such as tcp://192.168.1.5:8786, in place of processes on this computer; "
+            "its workers need Kolinear and see the same folders.",
+        ),
+    ] = None,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Keep what an earlier run finished, if its inputs are the same.")
+    ] = False,
+    allow_outside: AllowOutside = False,
+    verbose: Verbose = False,
+) -> None:
+    """Run many surveys side by side, each to its own report, and tell them in one table."""
+    from adapters.dask_cluster import local_engine, remote_engine
+
+    if cluster is not None and jobs is not None:
+        raise KolinearError("--jobs is for processes on this computer, --cluster brings its own workers")
+    files = find_surveys(surveys)
+    engine = (
+        remote_engine(cluster) if cluster is not None else local_engine(jobs or min(_cores(), len(files)))
+    )
+    with (
+        stopping_at_terminate(),
+        BatchTable(Console(stderr=True), verbose=verbose) as table,
+        engine as running,
+    ):
+        rows = run_batch(
+            files,
+            out,
+            running,
+            Adjusters(_backend, _colmap_writer),
+            table,
+            resume=resume,
+            allow_outside=allow_outside,
+        )
+    print_batch(Console(highlight=False), rows, out / "index.html")
+    if not all(row.succeeded for row in rows):
+        raise SystemExit(FAILED)
 
 
 def main() -> None:
@@ -118,7 +210,9 @@ def main() -> None:
         print(f"kolinear: {_one_line(str(error))}", file=sys.stderr)
         raise SystemExit(BAD_INPUT) from None
     except KeyboardInterrupt:
-        print("kolinear: interrupted, nothing was written", file=sys.stderr)
+        print(
+            "kolinear: interrupted, nothing half-done was written (batch --resume goes on)", file=sys.stderr
+        )
         raise SystemExit(INTERRUPTED) from None
 
 
@@ -155,6 +249,14 @@ def _cores() -> int:
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
+
+
+@contextmanager
+def _written(folder: Path) -> Iterator[None]:
+    """Keep other runs from writing the same folder, and clear away what killed ones have left there."""
+    with locked(folder.parent / f".{folder.name}.lock"):
+        remove_leftovers(folder)
+        yield
 
 
 @contextmanager

@@ -232,7 +232,7 @@ def read_survey(path: Path, *, allow_outside: bool = False) -> Survey:
     """
     path = Path(path)
     try:
-        if path.exists() and not path.is_file():
+        if path.exists() and not path.is_file():  # reading a pipe would never end
             raise SurveyFileError(f"{path}: not a file, a survey file (TOML) is needed")
         if path.stat().st_size > MAX_SURVEY_BYTES:
             raise SurveyFileError(

@@ -6,13 +6,14 @@ Every line has `time` (UTC) and `event`:
     photograph  image, targets, rejected, stored (measured in an earlier run), seconds; or failed, a reason
     stage       stage, seconds, steps
     warning     text
-    result      photographs, points, observations, sigma0_px, rms_px, verdict, seconds, ...
+    result      verdict, sigma0_px, rms_px, photographs, points, observations, ...
     failed      reason
 """
 
 from __future__ import annotations
 
 import json
+import math
 import threading
 import time
 from datetime import UTC, datetime
@@ -21,7 +22,11 @@ from types import TracebackType
 from typing import Any, Self
 
 from sfm.errors import OutputError
+from sfm.progress import SILENT, Progress
+from sfm.report.result import SurveyResult
+from sfm.report.verdict import verdict_of
 
+LOG = "log.jsonl"  # in the folder of a result
 MAX_LOG_BYTES = 50_000_000  # of a log that is read back
 
 
@@ -31,10 +36,11 @@ class SurveyLog:
     Steps are counted from several threads, hence the lock.
     """
 
-    def __init__(self, path: Path | None = None, *, append: bool = False) -> None:
+    def __init__(self, path: Path | None = None, *, append: bool = False, watch: Progress = SILENT) -> None:
         self._lines: list[str] = []
         self._lock = threading.Lock()
         self._path = path
+        self._watch = watch
         self._file = None
         self._stage: str | None = None
         self._begun = 0.0
@@ -75,6 +81,7 @@ class SurveyLog:
 
     def stage(self, name: str, total: int | None = None) -> None:
         """Write down the stage that ends with this one; a second call for a stage tells its total."""
+        self._watch.stage(name, total)
         if name == self._stage:
             return
         self.end_stage()
@@ -82,6 +89,7 @@ class SurveyLog:
 
     def advance(self, step: str = "") -> None:
         """Count one step of the stage."""
+        self._watch.advance(step)
         with self._lock:
             self._steps += 1
 
@@ -93,10 +101,39 @@ class SurveyLog:
             self.note("stage", stage=self._stage, seconds=seconds, **steps)
             self._stage = None
 
-    def text(self) -> str:
-        """Return all lines so far."""
-        with self._lock:
-            return "\n".join(self._lines) + "\n"
+    def close_into(self, folder: Path, result: SurveyResult, **more: Any) -> None:
+        """Write the end of a survey that worked, and all lines into the folder of the result.
+
+        Args:
+            folder: the folder, before it appears in its place.
+            result: what the survey ended with.
+            more: further entries of the last line.
+        """
+        self.end_stage()
+        for warning in result.warnings:
+            self.note("warning", text=warning)
+        self.note("result", **result_entries(result), **more)
+        (folder / LOG).write_text("\n".join(self._lines) + "\n", encoding="utf-8")
+
+
+def result_entries(result: SurveyResult) -> dict[str, Any]:
+    """Return the figures of a result by which a log or a table of surveys tells it; None where unknown."""
+    a, both = result.adjustment, result.comparison
+    return {
+        "survey": result.survey,
+        "verdict": verdict_of(result).level,
+        "sigma0_px": float(a.sigma0_px) if math.isfinite(a.sigma0_px) else None,
+        "rms_px": float(a.rms_px) if math.isfinite(a.rms_px) else None,
+        "photographs": len(a.network.images),
+        "photographs_total": result.images_total,
+        "points": len(a.network.points),
+        "observations": int((~a.rejected).sum()),
+        "rejected": int(a.rejected.sum()),
+        "iterations": a.iterations,
+        "converged": a.converged,
+        "comparison": "none" if both is None else "agrees" if both.agree else "differs",
+        "failed_photographs": [{"image": f.image, "reason": f.reason} for f in result.failed],
+    }
 
 
 def read_log(path: Path) -> tuple[dict[str, Any], ...]:

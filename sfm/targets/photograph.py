@@ -113,11 +113,6 @@ def read_metadata(path: str | Path) -> Metadata:
     )
 
 
-def hold_decoder_threads() -> None:
-    """Keep OpenCV to one thread in this process, where many processes share the computer."""
-    cv2.setNumThreads(1)
-
-
 def _pixel_from_exif(
     size: tuple[int, int], camera: Any, focal: float | None, equivalent: float | None
 ) -> tuple[float, float] | None:

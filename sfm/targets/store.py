@@ -24,6 +24,7 @@ from sfm.targets.codes import CodeFamily
 from sfm.targets.detect import Targets
 
 MAX_ENTRY_BYTES = 100_000_000  # some 400,000 targets; bounded before any memory is taken
+STORE = ".kolinear/targets"  # folder of the store, beside the folders of results
 PART = ".part"  # ends the name of an entry that is being written
 
 

@@ -1,0 +1,155 @@
+"""The table of a batch on the terminal: who is at what, how far, and how long it will take."""
+
+from __future__ import annotations
+
+import signal
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from types import FrameType, TracebackType
+from typing import Any, Self
+
+from rich.console import Console, RenderableType
+from rich.live import Live
+from rich.table import Table
+from rich.text import Text
+
+from sfm.batch_pages import totals
+from sfm.batch_survey import SurveyRow
+
+COLOURS = {"good": "green", "fair": "yellow", "bad": "red", "": "red"}
+RECENT = 8  # finished surveys that stay in sight
+REFRESHES_PER_SECOND = 4
+
+
+@dataclass
+class _Line:
+    """A survey under way."""
+
+    begun: float  # time.monotonic()
+    stage: str = "targets"
+    photographs: int = 0  # measured
+    total: int = 0  # to be measured
+
+
+class BatchTable:
+    """Looks on while a batch runs; a live table on a terminal, else a line for every finished survey."""
+
+    def __init__(self, console: Console, *, verbose: bool = False) -> None:
+        self._console = console
+        self._verbose = verbose
+        self._lines: dict[str, _Line] = {}
+        self._recent: list[SurveyRow] = []
+        self._left = self._done = self._kept = self._failed = 0
+        self._begun = time.monotonic()
+        self._live = Live(
+            console=console, get_renderable=self._render, refresh_per_second=REFRESHES_PER_SECOND
+        )
+
+    def __enter__(self) -> Self:
+        if self._console.is_terminal:
+            self._live.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._live.stop()
+
+    def planned(self, names: Sequence[str]) -> None:
+        """Begin: so many surveys are to be run."""
+        self._left, self._begun = len(names), time.monotonic()
+
+    def told(self, name: str, message: dict[str, Any]) -> None:
+        """Note what a survey is at."""
+        line = self._lines.setdefault(name, _Line(time.monotonic()))
+        if "photographs" in message:
+            line.total = int(message["photographs"])
+        if "photograph" in message:
+            line.photographs += 1
+        if "stage" in message:
+            line.stage = str(message["stage"])
+        if self._verbose:
+            what = ", ".join(f"{key} {value}" for key, value in message.items())
+            self._console.print(Text(f"  {name}: {what}"), soft_wrap=True)
+
+    def finished(self, name: str, row: SurveyRow, *, kept: bool) -> None:
+        """Note the end of a survey."""
+        self._lines.pop(name, None)
+        self._left -= 1
+        self._done += row.succeeded
+        self._failed += not row.succeeded
+        self._kept += kept
+        self._recent = [*self._recent, row][-RECENT:]
+        if (not self._console.is_terminal or self._verbose) and not kept:
+            self._console.print(Text(f"{name}: {told_of(row)}", style=COLOURS[row.verdict]), soft_wrap=True)
+
+    def remark(self, text: str) -> None:
+        """Print a remark above the table."""
+        self._console.print(Text(text), soft_wrap=True)
+
+    def _render(self) -> RenderableType:
+        """Return the table as it is now."""
+        now = time.monotonic()
+        table = Table(box=None, padding=(0, 2, 0, 0), caption=self._sum(now), caption_justify="left")
+        for name in ("survey", "stage", "photographs", "seconds"):
+            table.add_column(name, justify="right" if name in ("photographs", "seconds") else "left")
+        for row in self._recent:
+            style = COLOURS[row.verdict]
+            table.add_row(
+                Text(row.survey, style=style), Text(told_of(row), style=style), "", f"{row.seconds:.1f}"
+            )
+        for name, line in list(self._lines.items()):
+            count = f"{line.photographs} of {line.total}" if line.total else ""
+            table.add_row(Text(name), Text(line.stage), count, f"{now - line.begun:.0f}")
+        return table
+
+    def _sum(self, now: float) -> str:
+        run = self._done + self._failed - self._kept
+        text = f"{self._done + self._failed} of {self._done + self._failed + self._left} surveys"
+        if self._failed:
+            text += f", {self._failed} failed"
+        if run and self._left:
+            text += f", {_duration((now - self._begun) / run * self._left)} left"
+        return text
+
+
+def told_of(row: SurveyRow) -> str:
+    """Return how a survey ended, in a few words."""
+    if row.status != "done":
+        return f"{row.status}: {row.reason}"
+    sigma0 = "" if row.sigma0_px is None else f", sigma0 {row.sigma0_px:.4f} px"
+    return f"{row.verdict}, {row.photographs} of {row.photographs_total} photographs{sigma0}"
+
+
+def print_batch(console: Console, rows: Sequence[SurveyRow], page: Path) -> None:
+    """Print the outcome of a batch: how many worked, which did not and why, and where the page is."""
+    count = totals(rows)
+    console.print(Text(", ".join(f"{n} {name}" for name, n in count.items() if n or name == "done"), "bold"))
+    for row in rows:
+        if not row.succeeded:
+            told = told_of(row) if row.status != "done" else f"{told_of(row)}: see its report"
+            console.print(Text(f"  {row.survey} ({row.file}): {told}", style="red"), soft_wrap=True)
+    console.print(Text(f"Index: {page}", style="bold"), soft_wrap=True)
+
+
+@contextmanager
+def stopping_at_terminate() -> Iterator[None]:
+    """Take a request to terminate, as computers make before they shut down, like Ctrl-C."""
+
+    def stop(number: int, frame: FrameType | None) -> None:
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGTERM, stop)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def _duration(seconds: float) -> str:
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours} h {minutes} min" if hours else f"{minutes} min {rest} s" if minutes else f"{rest} s"
