@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from numba import njit
 
 from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
 from sfm.targets.codes import UNCODED, UNREADABLE, CodeFamily, code_family, read_codes
@@ -23,6 +24,8 @@ from sfm.targets.outlines import (
 # Largest RMS of the residuals and largest mean residual on an eighth of the edge, over the contrast.
 POOR_FIT = 0.12
 UNEVEN_EDGE = 0.18
+# Centres nearer than this share of the smaller radius belong to concentric targets.
+CONCENTRIC = 0.5
 # Parts of an unreadable code are smaller than this share of its dot.
 PART_OF_DOT = 0.75
 # Softest edge: this share of the minor semi-axis, or this blur in px where that is more.
@@ -180,20 +183,26 @@ def _duplicates(fit: EllipseFit, reason: IntArray) -> BoolArray:
     """
     duplicate = np.zeros(len(fit.xy), dtype=bool)
     good = np.flatnonzero(reason == 0)
-    size = fit.shape[good, 0] * fit.shape[good, 2] - fit.shape[good, 1] ** 2  # 1 / (a b)^2
-    order = good[np.argsort(-size, kind="stable")]
-    xy, shape = fit.xy[order], fit.shape[order]
-    by_x = np.argsort(xy[:, 0], kind="stable")
-    for i, k in enumerate(order):
-        if duplicate[k]:
-            continue
-        # centres of larger ellipses near this centre
-        reach = 0.5 / math.sqrt(max(shape[i, 0] * shape[i, 2] - shape[i, 1] ** 2, 1e-12))
-        lo, hi = np.searchsorted(xy[by_x, 0], (xy[i, 0] - reach, xy[i, 0] + reach))
-        for j in by_x[lo:hi]:
-            if j > i and np.hypot(*(xy[j] - xy[i])) < reach:
-                duplicate[order[j]] = True
+    p, q, r = fit.shape[good].T
+    radius = (p * r - q * q) ** -0.5
+    order = np.argsort(fit.xy[good, 0], kind="stable")
+    duplicate[good[order]] = _surrounds(fit.xy[good][order], radius[order])
     return duplicate
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _surrounds(xy: FloatArray, radius: FloatArray) -> BoolArray:
+    """Return which of the circles, in order of x, have the centre of a smaller one near their own."""
+    outer = np.zeros(len(xy), dtype=np.bool_)
+    widest = radius.max() if len(radius) else 0.0
+    for i in range(len(xy)):
+        for j in range(i + 1, len(xy)):
+            if xy[j, 0] - xy[i, 0] > widest:
+                break
+            small, large = (i, j) if radius[i] <= radius[j] else (j, i)
+            if math.hypot(xy[j, 0] - xy[i, 0], xy[j, 1] - xy[i, 1]) < CONCENTRIC * radius[small]:
+                outer[large] = True
+    return outer
 
 
 def _inside_codes(fit: EllipseFit, code: IntArray, family: CodeFamily) -> BoolArray:

@@ -55,6 +55,43 @@ def solve_spd(N: FloatArray, g: FloatArray) -> bool:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
+def invert_spd(N: FloatArray) -> bool:
+    """Replace a symmetric matrix by its inverse (Cholesky); False if it is not positive definite.
+
+    Only the lower triangle is read; the whole inverse is written.
+    """
+    n = len(N)
+    for i in range(n):
+        for j in range(i + 1):
+            t = N[i, j]
+            for k in range(j):
+                t -= N[i, k] * N[j, k]
+            if i == j:
+                if not t > 0:
+                    return False
+                N[i, i] = math.sqrt(t)
+            else:
+                N[i, j] = t / N[j, j]
+    for j in range(n):  # L becomes its inverse
+        N[j, j] = 1 / N[j, j]
+        for i in range(j + 1, n):
+            t = 0.0
+            for k in range(j, i):
+                t -= N[i, k] * N[k, j]
+            N[i, j] = t / N[i, i]
+    for i in range(n):
+        for j in range(i + 1):
+            t = 0.0
+            for k in range(i, n):
+                t += N[k, i] * N[k, j]
+            N[j, i] = t  # rows above are no longer read
+    for i in range(n):
+        for j in range(i):
+            N[i, j] = N[j, i]
+    return True
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def trace_rays(
     image: AnyArray,
     theta: FloatArray,

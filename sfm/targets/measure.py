@@ -3,19 +3,23 @@
 from __future__ import annotations
 
 import math
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 
 from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
 from sfm.targets.flags import Flag
-from sfm.targets.template import GAIN_SIGMA, PARAMETERS, fit_templates
+from sfm.targets.template import PARAMETERS, fit_templates
 
 # Variance of rounding to whole intensities.
 QUANTISATION = 1 / 12
 # From so many targets on, the shading of a photograph is estimated from them; a target whose own gain is more
 # than so many sigma away from that keeps its own.
 LEAST_FOR_SHADING, OWN_GAIN_SIGMAS = 10, 3.0
+# Fewer targets than this are not worth a thread.
+TARGETS_PER_THREAD = 100
 # A gain per px below this is none.
 NO_GAIN = 1e-7
 
@@ -80,7 +84,7 @@ def fit_ellipse_model(
         saturation = float(np.iinfo(photograph.dtype).max) if integers else math.inf
     k = len(xy)
     start = np.column_stack([np.asarray(xy, float).reshape(k, 2), np.asarray(shape, float).reshape(k, 3)])
-    theta, normal, statistics, flag = fit_templates(
+    theta, cofactor, statistics, flag = _fit_in_threads(
         photograph, start, np.asarray(sign, np.int64), float(noise), float(saturation)
     )
     pixels, squares, unevenness, length, steps = statistics.T
@@ -92,7 +96,7 @@ def fit_ellipse_model(
     good = np.flatnonzero((flag & failed) == 0)
     if len(good):
         theta[good], covariance[good], shaded = _shrink_gain(
-            theta[good], normal[good], variance[good], length[good]
+            theta[good], cofactor[good], variance[good], length[good]
         )
         flag[good[shaded]] |= Flag.SHADED.value
     return EllipseFit(
@@ -111,15 +115,29 @@ def fit_ellipse_model(
     )
 
 
+def _fit_in_threads(
+    photograph: AnyArray, start: FloatArray, sign: IntArray, noise: float, saturation: float
+) -> tuple[FloatArray, FloatArray, FloatArray, IntArray]:
+    """Fit the templates in as many threads as OpenCV may use; the results do not depend on their number."""
+    parts = max(1, min(cv2.getNumThreads(), len(start) // TARGETS_PER_THREAD))
+    if parts == 1:
+        return fit_templates(photograph, start, sign, noise, saturation)
+    chunks = np.array_split(np.arange(len(start)), parts)
+    with ThreadPoolExecutor(parts) as pool:
+        fits = pool.map(lambda c: fit_templates(photograph, start[c], sign[c], noise, saturation), chunks)
+        theta, cofactor, statistics, flag = zip(*fits, strict=True)
+    return np.concatenate(theta), np.concatenate(cofactor), np.concatenate(statistics), np.concatenate(flag)
+
+
 def _shrink_gain(
-    theta: FloatArray, normal: FloatArray, variance: FloatArray, length: FloatArray
+    theta: FloatArray, cofactor: FloatArray, variance: FloatArray, length: FloatArray
 ) -> tuple[FloatArray, FloatArray, BoolArray]:
-    """Replace the weak prior on the gain by the shading that the targets of the photograph show together.
+    """Use the shading that the targets of a photograph show together as prior for that of each target.
 
     A gradient of the gain inside a target and a shift of its centre look alike, so that estimating the gain
-    costs up to half of the precision of a bright target. The variance tau^2 of the gains over the targets is
-    estimated (minus that of their own errors, weighted), and each target is adjusted with the prior
-    N(0, tau^2): without shading this is the fit without gain, with shading the fit with it.
+    costs up to a third of the precision of a bright target. The variance tau^2 of the gains over the targets
+    is estimated (minus that of their own errors, weighted), and "gain = 0 with variance tau^2" is added to
+    each target as an observation: without shading this is the fit without gain, with shading the fit with it.
 
     Source: DerSimonian and Laird (1986), moment estimate of the variance between units; empirical Bayes.
 
@@ -127,23 +145,18 @@ def _shrink_gain(
         Unknowns, shape (k, 10); covariance of the centre, px^2, shape (k, 2, 2); which gains are not zero.
     """
     gains = slice(8, PARAMETERS)
-    weak = variance / GAIN_SIGMA**2
-    weight = np.zeros((len(theta), PARAMETERS))
-    weight[:, gains] = weak[:, None]
-    cofactor = np.linalg.inv(normal + weight[:, :, None] * np.eye(PARAMETERS))
     gain = theta[:, gains] / length[:, None]
     gain_variance = (variance / length**2)[:, None] * np.diagonal(cofactor, axis1=1, axis2=2)[:, gains]
     shaded = np.any(gain**2 > OWN_GAIN_SIGMAS**2 * gain_variance, axis=1)
     if len(theta) >= LEAST_FOR_SHADING:
         w = gain_variance**-2
         tau2 = max(float((w * (gain**2 - gain_variance)).sum() / w.sum()), NO_GAIN**2)
-        own = (gain**2 > OWN_GAIN_SIGMAS**2 * (gain_variance + tau2)).any(axis=1)
-        strong = np.where(own, weak, np.maximum(variance / (tau2 * length**2), weak))
-        weight[:, gains] = strong[:, None]
-        cofactor = np.linalg.inv(normal + weight[:, :, None] * np.eye(PARAMETERS))
-        pull = np.zeros_like(theta)
-        pull[:, gains] = (strong - weak)[:, None] * theta[:, gains]
-        theta = theta - np.einsum("kij,kj->ki", cofactor, pull)
+        own = np.any(gain**2 > OWN_GAIN_SIGMAS**2 * (gain_variance + tau2), axis=1)
+        prior = (tau2 * length**2 / variance)[:, None, None] * np.eye(2)
+        K = cofactor[:, :, gains] @ np.linalg.inv(prior + cofactor[:, gains, gains])
+        K[own] = 0.0
+        theta = theta - np.einsum("kij,kj->ki", K, theta[:, gains])
+        cofactor = cofactor[:, :2, :2] - K[:, :2] @ cofactor[:, gains, :2]
     return theta, variance[:, None, None] * cofactor[:, :2, :2], shaded
 
 

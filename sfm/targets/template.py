@@ -17,7 +17,7 @@ import numpy as np
 from numba import njit
 
 from sfm.conventions import AnyArray, FloatArray, IntArray
-from sfm.targets.edge_rays import RAYS, improve_outline, solve_spd, trace_rays
+from sfm.targets.edge_rays import RAYS, improve_outline, invert_spd, solve_spd, trace_rays
 from sfm.targets.flags import Flag
 
 # Unknowns of the fit: x0, y0, p, q, r, B, A, s, gx, gy.
@@ -27,7 +27,7 @@ GAIN_SIGMA = 0.3
 MAX_STEPS = 30
 # A step below this is the last one; as Gauss-Newton steps shrink by a factor of ten or more, what is left is
 # far below the precision of any target.
-LAST_STEP_PX = 2e-3
+LAST_STEP_PX = 5e-3
 # Background taken into the fit: so many px and this share of the mean semi-axis, at most.
 MARGIN_PX, MARGIN_SHARE, MARGIN_MAX_PX = 3.5, 0.25, 10.0
 # Of targets larger than this (mean semi-axis) only a band inside the edge is used: the rest tells nothing.
@@ -61,20 +61,20 @@ def fit_templates(
         saturation: intensities from here on are censored.
 
     Returns:
-        Unknowns, shape (k, 10); normal matrices J'J without the prior on the gain, shape (k, 10, 10);
+        Unknowns, shape (k, 10); their cofactor matrices, shape (k, 10, 10), nan where the fit failed;
         pixels used, sum of squared residuals, unevenness of the edge, L in px and steps, shape (k, 5);
         flags, shape (k,).
     """
     k = len(start)
     theta = np.zeros((k, PARAMETERS))
-    normal = np.zeros((k, PARAMETERS, PARAMETERS))
+    cofactor = np.full((k, PARAMETERS, PARAMETERS), math.nan)
     statistics = np.ones((k, 5))
     flag = np.zeros(k, np.int64)
-    J = np.zeros((PARAMETERS + 1, _BLOCK))
+    J = np.zeros((PARAMETERS + 2) * _BLOCK)
     for i in range(k):
         theta[i, :5] = start[i]
-        flag[i] = _fit_one(image, theta[i], sign[i], noise, saturation, J, normal[i], statistics[i])
-    return theta, normal, statistics, flag
+        flag[i] = _fit_one(image, theta[i], sign[i], noise, saturation, J, cofactor[i], statistics[i])
+    return theta, cofactor, statistics, flag
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -85,10 +85,10 @@ def _fit_one(
     noise: float,
     saturation: float,
     J: FloatArray,
-    N: FloatArray,
+    cofactor: FloatArray,
     statistics: FloatArray,
 ) -> int:
-    """Fit one target; theta, N and statistics are filled, the flag is returned."""
+    """Fit one target; theta, cofactor and statistics are filled, the flag is returned."""
     flag = _NONE
     edge, limit = np.empty(RAYS), np.empty(RAYS)
     mean, margin = 0.0, 0.0
@@ -112,12 +112,13 @@ def _fit_one(
     half_x = math.sqrt(theta[4] ** 2 + theta[3] ** 2) / det + margin + 1
     half_y = math.sqrt(theta[2] ** 2 + theta[3] ** 2) / det + margin + 1
     data = np.empty((3, int((2 * half_x + 3) * (2 * half_y + 3))))
-    n = _collect(image, theta, limit, margin, half_x, half_y, 1e9 if mean < LARGE_PX else BAND_PX, data)
+    n = _collect(image, theta, limit, margin, half_x, half_y, mean < LARGE_PX, data)
     flag |= _start_levels(data, n, theta, saturation)
     if theta[6] * sign <= 0 or n < 2 * PARAMETERS:
         return flag | _NO_CONVERGENCE
     prior = (noise / GAIN_SIGMA) ** 2
-    L, N_trial = np.empty((PARAMETERS, PARAMETERS)), np.empty((PARAMETERS, PARAMETERS))
+    N, N_trial = np.empty((PARAMETERS, PARAMETERS)), np.empty((PARAMETERS, PARAMETERS))
+    L = np.empty((PARAMETERS, PARAMETERS))
     g, g_trial, trial = np.empty(PARAMETERS), np.empty(PARAMETERS), np.empty(PARAMETERS)
     total, used = _normal_equations(data, n, theta, length, saturation, J, N, g)
     damping = 1e-3
@@ -154,13 +155,13 @@ def _fit_one(
             damping *= 0.1
         else:
             damping = max(damping, 1e-3) * 10
-    for i in range(PARAMETERS):
-        for j in range(i):
-            N[j, i] = N[i, j]
-    _residual_statistics(data, n, theta, length, saturation, statistics)
+    _residual_statistics(data, n, theta, length, saturation, J, statistics)
     statistics[4] = steps
-    if not done or theta[6] * sign <= 0 or statistics[0] <= PARAMETERS:
-        flag |= _NO_CONVERGENCE
+    N[8, 8] += prior
+    N[9, 9] += prior
+    if not done or theta[6] * sign <= 0 or statistics[0] <= PARAMETERS or not invert_spd(N):
+        return flag | _NO_CONVERGENCE
+    cofactor[:] = N
     return flag
 
 
@@ -172,7 +173,7 @@ def _collect(
     margin: float,
     half_x: float,
     half_y: float,
-    inner: float,
+    whole: bool,
     data: FloatArray,
 ) -> int:
     """Collect x, y and intensity of the target and its undisturbed background; return how many."""
@@ -186,10 +187,11 @@ def _collect(
             dx = j - x0
             u, v = p * dx + q * dy, q * dx + r * dy
             rho = math.sqrt(u * u + v * v)
-            d = rho * (rho - 1) / (math.sqrt((p * u + q * v) ** 2 + (q * u + r * v) ** 2) + 1e-12)
-            if d > margin or d < -inner:
-                continue
-            if disturbed and d > 0:
+            if rho > 1 or not whole:
+                d = rho * (rho - 1) / (math.sqrt((p * u + q * v) ** 2 + (q * u + r * v) ** 2) + 1e-12)
+                if d > margin or d < -BAND_PX:
+                    continue
+            if disturbed and rho > 1:
                 k = int(math.atan2(v, u) * (RAYS / (2 * math.pi)) + RAYS)
                 if d > limit[k % RAYS] or d > limit[(k + 1) % RAYS]:
                     continue
@@ -225,18 +227,63 @@ def _start_levels(data: FloatArray, n: int, theta: FloatArray, saturation: float
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=True, inline="always")
 def _edge_profile(t: float) -> tuple[float, float]:
-    """Return Phi(t), the normal distribution, and exp(-t^2 / 2).
+    """Return Phi(t), the normal distribution, and exp(-t^2 / 2), without branches.
 
-    Source: Abramowitz and Stegun (1964), 7.1.26, error below 1e-7.
+    Source: Abramowitz and Stegun (1964), 7.1.26, error below 1.5e-7; exp(y) = exp(y / 64)^64 by its series.
     """
-    z = abs(t) * _SQRT_HALF
-    if z > 4.0:
-        return (1.0 if t > 0 else 0.0), 0.0
-    e = math.exp(-z * z)
+    z = min(abs(t) * _SQRT_HALF, 4.0)
+    y = z * z / -64
+    e = 1 + y * (1 + y * (1 / 2 + y * (1 / 6 + y * (1 / 24 + y / 120))))
+    for _ in range(6):
+        e *= e
     k = 1 / (1 + 0.3275911 * z)
     tail = 0.254829592 + k * (-0.284496736 + k * (1.421413741 + k * (-1.453152027 + k * 1.061405429)))
     tail *= 0.5 * e * k
     return (1 - tail if t > 0 else tail), e
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
+def _linearise(
+    data: FloatArray, first: int, m: int, theta: FloatArray, length: float, saturation: float, J: FloatArray
+) -> None:
+    """Write the derivatives, the residuals and the weights of a block of pixels, one unknown after the other.
+
+    The loop has no branches, so that it runs on several pixels at a time. A pixel at the end of the scale has
+    no weight where the model lies beyond the scale, too: no more is known of it (censored observation).
+    """
+    x0, y0, p, q, r = theta[0], theta[1], theta[2], theta[3], theta[4]
+    B, A, s, gx, gy = theta[5], theta[6], theta[7], theta[8] / length, theta[9] / length
+    for i in range(m):
+        dx, dy, value = data[0, first + i] - x0, data[1, first + i] - y0, data[2, first + i]
+        u, v = p * dx + q * dy, q * dx + r * dy
+        rho = math.sqrt(u * u + v * v) + 1e-12
+        wx, wy = p * u + q * v, q * u + r * v  # S S dx
+        nw = 1 / (math.sqrt(wx * wx + wy * wy) + 1e-12)
+        d = rho * (rho - 1) * nw
+        phi, e = _edge_profile(-d / s)
+        gain = 1 + gx * dx + gy * dy
+        level = B + A * phi
+        model = level * gain
+        censored = (value >= saturation and model >= saturation) or (value <= 0 and model <= 0)
+        weight = 0.0 if censored else 1.0
+        level *= weight
+        # d' = (2 rho - 1) rho' / |w| - d |w|' / |w|, rho' = u.u' / rho, |w|' = w.w' / |w|, w' = S u' + S' u
+        slope = weight * A * _DENSITY_0 * e * gain / s  # -dI/dd
+        f1 = -slope * (2 * rho - 1) * nw / rho
+        f2 = slope * d * nw * nw
+        ax, ay = p * wx + q * wy, q * wx + r * wy  # S w
+        J[0 * _BLOCK + i] = -f1 * (u * p + v * q) - f2 * (ax * p + ay * q) - level * gx
+        J[1 * _BLOCK + i] = -f1 * (u * q + v * r) - f2 * (ax * q + ay * r) - level * gy
+        J[2 * _BLOCK + i] = f1 * (u * dx) + f2 * (ax * dx + wx * u)
+        J[3 * _BLOCK + i] = f1 * (u * dy + v * dx) + f2 * (ax * dy + ay * dx + wx * v + wy * u)
+        J[4 * _BLOCK + i] = f1 * (v * dy) + f2 * (ay * dy + wy * v)
+        J[5 * _BLOCK + i] = weight * gain
+        J[6 * _BLOCK + i] = weight * phi * gain
+        J[7 * _BLOCK + i] = slope * d / s
+        J[8 * _BLOCK + i] = level * dx / length
+        J[9 * _BLOCK + i] = level * dy / length
+        J[10 * _BLOCK + i] = weight * (value - model)
+        J[11 * _BLOCK + i] = weight
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
@@ -254,96 +301,63 @@ def _normal_equations(
 
     The pixels are taken in blocks, so that the sums run over contiguous numbers in the cache.
     """
-    x0, y0, p, q, r = theta[0], theta[1], theta[2], theta[3], theta[4]
-    B, A, s, gx, gy = theta[5], theta[6], theta[7], theta[8] / length, theta[9] / length
     N[:] = 0.0
     g[:] = 0.0
-    total = 0.0
-    used = 0
+    squares, used = 0.0, 0.0
     for first in range(0, n, _BLOCK):
-        m = 0
-        for i in range(first, min(n, first + _BLOCK)):
-            dx, dy, value = data[0, i] - x0, data[1, i] - y0, data[2, i]
-            u, v = p * dx + q * dy, q * dx + r * dy
-            rho = math.sqrt(u * u + v * v) + 1e-12
-            wx, wy = p * u + q * v, q * u + r * v  # S S dx
-            nw = 1 / (math.sqrt(wx * wx + wy * wy) + 1e-12)
-            d = rho * (rho - 1) * nw
-            phi, e = _edge_profile(-d / s)
-            gain = 1 + gx * dx + gy * dy
-            level = B + A * phi
-            model = level * gain
-            if (value >= saturation and model >= saturation) or (value <= 0 and model <= 0):
-                continue  # censored: all that is known is that the model lies beyond the scale, and it does
-            residual = value - model
-            total += residual * residual
-            J[5, m] = gain
-            J[6, m] = phi * gain
-            J[8, m] = level * dx / length
-            J[9, m] = level * dy / length
-            J[10, m] = residual
-            # d' = (2 rho - 1) rho' / |w| - d |w|' / |w| with rho' = u.u' / rho, |w|' = w.w' / |w|,
-            # w' = S u' + S' u
-            slope = A * _DENSITY_0 * e * gain / s  # -dI/dd
-            J[7, m] = slope * d / s
-            f1 = -slope * (2 * rho - 1) * nw / rho
-            f2 = slope * d * nw * nw
-            ax, ay = p * wx + q * wy, q * wx + r * wy  # S w
-            J[0, m] = -f1 * (u * p + v * q) - f2 * (ax * p + ay * q) - level * gx
-            J[1, m] = -f1 * (u * q + v * r) - f2 * (ax * q + ay * r) - level * gy
-            J[2, m] = f1 * (u * dx) + f2 * (ax * dx + wx * u)
-            J[3, m] = f1 * (u * dy + v * dx) + f2 * (ax * dy + ay * dx + wx * v + wy * u)
-            J[4, m] = f1 * (v * dy) + f2 * (ay * dy + wy * v)
-            m += 1
-        used += m
+        m = min(_BLOCK, n - first)
+        _linearise(data, first, m, theta, length, saturation, J)
         for j in range(PARAMETERS):
             for k in range(j + 1):
                 product = 0.0
                 for i in range(m):
-                    product += J[j, i] * J[k, i]
+                    product += J[j * _BLOCK + i] * J[k * _BLOCK + i]
                 N[j, k] += product
             product = 0.0
             for i in range(m):
-                product += J[j, i] * J[10, i]
+                product += J[j * _BLOCK + i] * J[10 * _BLOCK + i]
             g[j] += product
-    return total, used
+        for i in range(m):
+            squares += J[10 * _BLOCK + i] ** 2
+            used += J[11 * _BLOCK + i]
+    return squares, int(used)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _residual_statistics(
-    data: FloatArray, n: int, theta: FloatArray, length: float, saturation: float, statistics: FloatArray
+    data: FloatArray,
+    n: int,
+    theta: FloatArray,
+    length: float,
+    saturation: float,
+    J: FloatArray,
+    statistics: FloatArray,
 ) -> None:
     """Set the number of pixels, the sum of squared residuals and the unevenness of the edge.
 
     The unevenness is the largest mean residual of an eighth of the edge, in- or outside, over the contrast.
     """
     p, q, r = theta[2], theta[3], theta[4]
-    B, A, s = theta[5], theta[6], theta[7]
+    A, s = theta[6], theta[7]
     band = 1.0 + 1.5 * s
     mean, count = np.zeros(16), np.zeros(16)
-    squares, used = 0.0, 0
-    for i in range(n):
-        dx, dy, value = data[0, i] - theta[0], data[1, i] - theta[1], data[2, i]
-        u, v = p * dx + q * dy, q * dx + r * dy
-        rho = math.sqrt(u * u + v * v) + 1e-12
-        d = rho * (rho - 1) / (math.sqrt((p * u + q * v) ** 2 + (q * u + r * v) ** 2) + 1e-12)
-        phi, _ = _edge_profile(-d / s)
-        model = (B + A * phi) * (1 + (theta[8] * dx + theta[9] * dy) / length)
-        if (value >= saturation and model >= saturation) or (value <= 0 and model <= 0):
-            residual = 0.0
-        else:
-            residual = value - model
+    squares, used = 0.0, 0.0
+    for first in range(0, n, _BLOCK):
+        m = min(_BLOCK, n - first)
+        _linearise(data, first, m, theta, length, saturation, J)
+        for i in range(m):
+            residual = J[10 * _BLOCK + i]
             squares += residual * residual
-            used += 1
-        if abs(d) < band:
-            k = (
-                (8 if d > 0 else 0)
-                + (4 if u > 0 else 0)
-                + (2 if v > 0 else 0)
-                + (1 if abs(u) > abs(v) else 0)
-            )
-            mean[k] += residual
-            count[k] += 1
+            used += J[11 * _BLOCK + i]
+            dx, dy = data[0, first + i] - theta[0], data[1, first + i] - theta[1]
+            u, v = p * dx + q * dy, q * dx + r * dy
+            rho = math.sqrt(u * u + v * v)
+            d = rho * (rho - 1) / (math.sqrt((p * u + q * v) ** 2 + (q * u + r * v) ** 2) + 1e-12)
+            if abs(d) < band:
+                side, right, down = (8 if d > 0 else 0), (4 if u > 0 else 0), (2 if v > 0 else 0)
+                k = side + right + down + (1 if abs(u) > abs(v) else 0)
+                mean[k] += residual
+                count[k] += 1
     worst = 0.0
     for k in range(16):
         if count[k] > 0:
