@@ -9,8 +9,9 @@ import numpy as np
 from sfm.conventions import FloatArray, IntArray
 from sfm.errors import GeometryError
 from sfm.network import Network
+from sfm.orientation.homography import PLANAR_POINTS
 from sfm.orientation.intersection import intersect
-from sfm.orientation.relative import PLANAR_POINTS, RelativeOrientation, model_points, relative_orientations
+from sfm.orientation.relative import RelativeOrientation, model_points, relative_orientations
 from sfm.orientation.resection.robust import resect_robust
 
 MAX_PAIRS = 60  # pairs whose solutions are tried on the other photographs

@@ -1,0 +1,207 @@
+"""Photo coordinates: corrections in their order, each with its inverse, and simulated photographs.
+
+All corrections are radial or nearly so and are applied one after the other, from the measured point to
+the collinearity equations: principal point, radial distortion, decentring, refraction, earth curvature.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from sfm.conventions import FloatArray
+from sfm.errors import GeometryError
+from sfm.orientation.resection.solution import tangents_of
+
+EARTH_RADIUS_KM = 6372.2  # of the sphere of document 004
+INVERSE_STEPS = 100
+INVERSE_TOLERANCE_MM = 1e-13
+
+
+@dataclass(frozen=True)
+class RadialTable:
+    """Radial distortion from a calibration certificate."""
+
+    radius_mm: FloatArray  # ascending, from 0, (k,)
+    distortion_mm: FloatArray  # dr at these radii, positive outwards, (k,)
+
+
+@dataclass(frozen=True)
+class PhotoCorrections:
+    """What is corrected; what is left at its default is switched off."""
+
+    principal_point_mm: FloatArray = field(default_factory=lambda: np.zeros(2))  # x0, y0, (2,)
+    radial_table: RadialTable | None = None  # subtracted: the measured point is displaced outwards
+    radial: FloatArray = field(default_factory=lambda: np.zeros(3))  # K1, K2, K3 as in `brown` (added), (3,)
+    decentring: FloatArray = field(default_factory=lambda: np.zeros(2))  # P1, P2 as in `brown` (added), (2,)
+    flying_height_km: float | None = None  # H of projection centre over the sea: refraction if given
+    terrain_height_km: float = 0.0  # h over the sea
+    curvature_height_km: float | None = None  # H over ground: earth curvature if given
+
+
+def correct_photo_coordinates(xy_mm: FloatArray, corrections: PhotoCorrections, *, c_mm: float) -> FloatArray:
+    """Return photo coordinates to which the collinearity equations apply.
+
+    Args:
+        xy_mm: measured photo coordinates (y up), shape (n, 2), mm.
+        corrections: what is to be corrected.
+        c_mm: principal distance, mm.
+
+    Source: document 004, "Corrections of photo coordinates": principal point, radial distortion, refraction,
+    earth curvature; decentring after the radial part, as in Brown (1971).
+    """
+    xy = np.asarray(xy_mm, dtype=float) - corrections.principal_point_mm
+    for step in _steps(corrections, c_mm):
+        xy = step(xy)
+    return xy
+
+
+def distort_photo_coordinates(xy_mm: FloatArray, corrections: PhotoCorrections, *, c_mm: float) -> FloatArray:
+    """Return the measured photo coordinates of ideal ones; inverse of `correct_photo_coordinates`."""
+    xy = np.asarray(xy_mm, dtype=float)
+    for step in reversed(_steps(corrections, c_mm)):
+        xy = _inverse(step, xy)
+    return xy + corrections.principal_point_mm
+
+
+def photo_coordinates(
+    points: FloatArray,
+    position: FloatArray,
+    rotation: FloatArray,
+    *,
+    c_mm: float,
+    corrections: PhotoCorrections | None = None,
+) -> FloatArray:
+    """Return the photo coordinates at which object points are seen, for simulation.
+
+    Args:
+        points: object points, shape (n, 3), object unit.
+        position, rotation: X0 and R of the photograph, shapes (3,) and (3, 3).
+        c_mm: principal distance, mm.
+        corrections: effects that the photograph has.
+
+    Returns:
+        Shape (n, 2), mm; NaN for points behind the camera.
+    """
+    ideal = c_mm * tangents_of(position, rotation, points)
+    return distort_photo_coordinates(ideal, corrections or PhotoCorrections(), c_mm=c_mm)
+
+
+def photo_from_pixel(
+    pixel: FloatArray, size_px: tuple[int, int], pixel_mm: FloatArray, *, rows: str = "down"
+) -> FloatArray:
+    """Return photo coordinates (origin at the sensor centre, y up) of pixel coordinates (column, row).
+
+    Args:
+        pixel: column and row from the centre of the first pixel, shape (n, 2), px.
+        size_px: columns and rows of the photograph.
+        pixel_mm: width and height of a pixel, shape (2,), mm.
+        rows: "down" as in eqs. 2.3-2.4 of document 002, "up" as in its table of points.
+
+    Raises:
+        GeometryError: rows is neither.
+    """
+    centre = np.array(size_px) / 2 - 0.5
+    return (np.asarray(pixel, dtype=float) - centre) * np.asarray(pixel_mm) * (1.0, _sign(rows))
+
+
+def pixel_from_photo(
+    photo_mm: FloatArray, size_px: tuple[int, int], pixel_mm: FloatArray, *, rows: str = "down"
+) -> FloatArray:
+    """Return pixel coordinates of photo coordinates; inverse of `photo_from_pixel` (eq. 2.5)."""
+    centre = np.array(size_px) / 2 - 0.5
+    return np.asarray(photo_mm, dtype=float) / (np.asarray(pixel_mm) * (1.0, _sign(rows))) + centre
+
+
+def radial_from_table(table: RadialTable, radius_mm: FloatArray) -> FloatArray:
+    """Return the distortion dr at given radii by linear interpolation, mm.
+
+    Raises:
+        GeometryError: radii of the table that do not ascend from 0, or a radius beyond its end.
+    """
+    r, dr = np.asarray(table.radius_mm, dtype=float), np.asarray(table.distortion_mm, dtype=float)
+    if len(r) < 2 or len(r) != len(dr) or r[0] != 0 or (np.diff(r) <= 0).any():
+        raise GeometryError("radial distortion: the radii of the table must ascend from 0, one value at each")
+    if np.nanmax(radius_mm, initial=0.0) > r[-1]:
+        raise GeometryError(
+            f"radial distortion: a point at {np.nanmax(radius_mm):.3f} mm, the table ends at {r[-1]:.3f} mm"
+        )
+    return np.interp(radius_mm, r, dr)
+
+
+def refraction_coefficient(flying_height_km: float, terrain_height_km: float) -> float:
+    """Return K of dr = K (r + r^3 / c^2), dimensionless.
+
+    Source: document 004 (US Air Force model of the atmosphere): K = (2410 H / (H^2 - 6 H + 250)
+    - 2410 h^2 / ((h^2 - 6 h + 250) H)) 1e-6 with H and h in km.
+
+    Raises:
+        GeometryError: the photograph is not above the terrain.
+    """
+    H, h = flying_height_km, terrain_height_km
+    if h >= H or H <= 0:
+        raise GeometryError(f"refraction: flying height {H:g} km, it must be above the terrain at {h:g} km")
+    return (2410 * H / (H**2 - 6 * H + 250) - 2410 * h**2 / ((h**2 - 6 * h + 250) * H)) * 1e-6
+
+
+def curvature_displacement(radius_mm: FloatArray, *, height_km: float, c_mm: float) -> FloatArray:
+    """Return the displacement towards the centre by the curvature of the earth, mm.
+
+    Source: document 004: dr = H r^3 / (2 R c^2), R = 6372.2 km.
+    """
+    return height_km * np.asarray(radius_mm) ** 3 / (2 * EARTH_RADIUS_KM * c_mm**2)
+
+
+def _steps(corrections: PhotoCorrections, c: float) -> list[Callable[[FloatArray], FloatArray]]:
+    """The corrections that are switched on, in their order."""
+    steps: list[Callable[[FloatArray], FloatArray]] = []
+    table = corrections.radial_table
+    if table is not None:
+        steps.append(lambda xy: _radially(xy, lambda r: -radial_from_table(table, r)))
+    if np.any(corrections.radial):
+        K = corrections.radial
+        steps.append(lambda xy: _radially(xy, lambda r: r**3 * (K[0] + r**2 * (K[1] + r**2 * K[2]))))
+    if np.any(corrections.decentring):
+        P1, P2 = corrections.decentring
+        steps.append(lambda xy: xy + _decentring(xy, P1, P2))
+    if corrections.flying_height_km is not None:
+        K_air = refraction_coefficient(corrections.flying_height_km, corrections.terrain_height_km)
+        # rays are bent so that points appear outwards
+        steps.append(lambda xy: _radially(xy, lambda r: -K_air * (r + r**3 / c**2)))
+    if corrections.curvature_height_km is not None:
+        H = corrections.curvature_height_km
+        # points of a curved earth appear inwards of their place on the tangential plane
+        steps.append(lambda xy: _radially(xy, lambda r: curvature_displacement(r, height_km=H, c_mm=c)))
+    return steps
+
+
+def _radially(xy: FloatArray, displacement: Callable[[FloatArray], FloatArray]) -> FloatArray:
+    """Move points outwards by a displacement that depends on their radius."""
+    r = np.hypot(xy[..., 0], xy[..., 1])
+    factor = displacement(r) / np.where(r > 0, r, 1.0)
+    return xy * (1 + factor)[..., None]
+
+
+def _decentring(xy: FloatArray, P1: float, P2: float) -> FloatArray:
+    x, y = xy[..., 0], xy[..., 1]
+    r2 = x * x + y * y
+    return np.stack([P1 * (r2 + 2 * x * x) + 2 * P2 * x * y, P2 * (r2 + 2 * y * y) + 2 * P1 * x * y], axis=-1)
+
+
+def _inverse(step: Callable[[FloatArray], FloatArray], target: FloatArray) -> FloatArray:
+    """Solve step(xy) = target by fixed-point iteration; corrections are small against the coordinates."""
+    xy = target
+    for _ in range(INVERSE_STEPS):
+        miss = target - step(xy)
+        xy = xy + miss
+        if np.nanmax(np.abs(miss), initial=0.0) < INVERSE_TOLERANCE_MM:
+            return xy
+    raise GeometryError("photo coordinates: a correction is too strong to be inverted")
+
+
+def _sign(rows: str) -> float:
+    if rows not in ("down", "up"):
+        raise GeometryError(f"pixel coordinates: rows '{rows}' is neither down nor up")
+    return -1.0 if rows == "down" else 1.0
