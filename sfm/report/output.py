@@ -94,6 +94,8 @@ def write_result(
         _put_in_place(folder, out)
     except OSError as error:
         raise OutputError(f"{out}: the result cannot be written: {error.strerror or error}") from error
+    except OutputError as error:  # of the folder that nobody will find
+        raise OutputError(str(error).replace(str(folder), str(out))) from error
     finally:
         shutil.rmtree(folder, ignore_errors=True)
     return out / "report.html"
