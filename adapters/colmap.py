@@ -12,6 +12,7 @@ Source: COLMAP 4.2 documentation, "Output Format" and "Camera Models".
 
 from __future__ import annotations
 
+import errno
 import json
 import time
 from collections.abc import Iterator
@@ -258,6 +259,7 @@ def write_model(
                 scene.write_text(str(folder))
             else:
                 scene.write_binary(str(folder))
+            _refuse_short(pycolmap, folder, scene)
             side = {
                 "cameras": [
                     {"name": c.name, "pixel_mm": [float(p) for p in c.pixel_mm], "free": c.free.tolist()}
@@ -271,6 +273,20 @@ def write_model(
             )
         except (OSError, ValueError) as error:
             raise OutputError(f"{folder}: the COLMAP model cannot be written ({error})") from error
+
+
+def _refuse_short(pycolmap: ModuleType, folder: Path, scene: Any) -> None:
+    """Raise OSError unless a model can be read back as it was written: COLMAP ignores that a disk is full."""
+    try:
+        written = pycolmap.Reconstruction(str(folder))
+        whole = all(
+            getattr(written, count)() == getattr(scene, count)()
+            for count in ("num_images", "num_points3D", "compute_num_observations")
+        )
+    except (ValueError, RuntimeError, IndexError, OSError):
+        whole = False
+    if not whole:
+        raise OSError(errno.ENOSPC, "the files are not whole, as on a full disk")
 
 
 def read_model(folder: Path) -> tuple[Network, Estimate]:
