@@ -22,7 +22,7 @@ def files(tmp_path: Path) -> dict[str, Path]:
     X = seed_of("sba").uniform(-0.5, 0.5, (4, 3))
     K = np.array([[800.0, 0, 320], [0, 808, 240], [0, 0, 1]])
     turn = np.array([[0.28, 0, 0.96], [0, 1, 0], [-0.96, 0, 0.28]])  # of the quaternion 0.8, 0, 0.6, 0
-    rays = np.stack([X + [0, 0, 4], X @ turn.T + [1, 0, 4]]) @ K.T
+    rays = np.stack([X + np.array([0, 0, 4]), X @ turn.T + np.array([1, 0, 4])]) @ K.T
     xy = rays[..., :2] / rays[..., 2:]
     lines = [
         " ".join(map(str, [*X[j].tolist(), 2, 0, *xy[0, j].tolist(), 1, *xy[1, j].tolist()]))

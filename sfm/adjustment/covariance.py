@@ -10,7 +10,7 @@ Photogramm. Eng. Remote Sens. 53(5).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numba import njit
@@ -127,6 +127,18 @@ def hat_complement(
         cofactors.cross,
         cofactors.points,
     )
+
+
+def without_held(covariance: Covariance, layout: Unknowns) -> Covariance:
+    """Return the covariance with NaN for photographs and points that took no part."""
+    n, m = len(layout.point_free), len(layout.exterior_free)
+    idle_point = ~np.isin(np.arange(n), layout.obs.point[layout.active])
+    idle_image = ~np.isin(np.arange(m), layout.obs.image[layout.active])
+    points, limiting = covariance.points.copy(), covariance.points_limiting.copy()
+    exterior = covariance.exterior.copy()
+    points[idle_point] = limiting[idle_point] = np.nan
+    exterior[idle_image] = np.nan
+    return replace(covariance, points=points, exterior=exterior, points_limiting=limiting)
 
 
 def _in_datum(Q: FloatArray, H: FloatArray, F: FloatArray, G: FloatArray) -> FloatArray:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+
+import numpy as np
 
 from sfm.conventions import BoolArray, FloatArray
 from sfm.network import Estimate, Network
@@ -39,6 +41,20 @@ class Adjustment:
     unknowns: int  # all adjusted parameters
     observations: int  # scalar observations used: image coordinates, weighted parameters, scale bars
     covariance: Covariance
+    standardised: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))  # Baarda's w of each image
+    # coordinate, v over its a priori standard deviation; of rejected ones as predicted, (k, 2)
+    weights: FloatArray = field(default_factory=lambda: np.zeros(0))  # factor on the weight of each image
+    # point: 0 where rejected, between 0 and 1 by reweighting, else 1, (k,)
+
+    @property
+    def vPv(self) -> float:
+        """Weighted sum of squared residuals of all observations, a priori unit weight."""
+        return self.sigma0**2 * self.redundancy
+
+    @property
+    def tau(self) -> FloatArray:
+        """Pope's tau of each image coordinate: Baarda's w over sigma0 a posteriori, (k, 2)."""
+        return self.standardised / self.sigma0
 
     @property
     def sigma0_px(self) -> float:

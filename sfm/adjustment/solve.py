@@ -7,17 +7,23 @@ data snooping; rank defect found numerically; nothing is damped where the result
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from sfm.adjustment.collinearity import behind_camera, residuals
-from sfm.adjustment.covariance import Cofactors, cofactors, hat_complement, marginal_covariance
+from sfm.adjustment.covariance import (
+    Cofactors,
+    cofactors,
+    hat_complement,
+    marginal_covariance,
+    without_held,
+)
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.iterate import TOLERANCE, Optimum, iterate
 from sfm.adjustment.parameters import Unknowns, estimate_of, start_weights, unknowns_of
 from sfm.adjustment.rank import rank_defect, undetermined_of
-from sfm.adjustment.reliability import redundancy_numbers
+from sfm.adjustment.reliability import redundancy_numbers, standardised_residuals
 from sfm.adjustment.result import Adjustment, Covariance
 from sfm.adjustment.robust import huber_weights, snoop
 from sfm.adjustment.weighted import Weighted, weighted_of
@@ -193,16 +199,19 @@ def _result(
     sigma0 = float(np.sqrt(optimum.vPv / redundancy)) if redundancy > 0 else float("nan")
     k, n, m = len(weight), len(network.points), len(network.images)
     numbers = np.full((k, 2), np.nan)
+    standardised = np.full((k, 2), np.nan)
+    v = residuals(layout.obs, optimum.state)
     if Q is None:
         empty = np.full((n, 3, 3), np.nan)
         interior = tuple(np.full((len(free), len(free)), np.nan) for free in layout.interior_free)
         result = Covariance(empty, np.full((m, 6, 6), np.nan), interior, empty)
     else:
         result = marginal_covariance(optimum, layout, Q, sigma0**2)
-        result = _without_held(result, layout)
+        result = without_held(result, layout)
         complement = hat_complement(optimum, layout, Q, weight)
         numbers = redundancy_numbers(complement, layout.obs.whitening)
         numbers[weight == 0] = np.nan
+        standardised = standardised_residuals(v, complement, layout.obs.whitening)
     unsorted = np.empty(k, dtype=np.int64)
     unsorted[layout.order] = np.arange(k)
     allowed = 0 if run.datum.kind == "control" else 7
@@ -215,7 +224,7 @@ def _result(
         defect=rank_defect(optimum, layout),
         expected_defect=optimum.motions.defect,
         undetermined=undetermined_of(optimum, layout, network, estimate, allowed_motions=allowed),
-        residuals=residuals(layout.obs, optimum.state)[unsorted],
+        residuals=v[unsorted],
         rejected=(weight == 0)[unsorted],
         redundancy_numbers=numbers[unsorted],
         sigma_px=sigma_px,
@@ -224,16 +233,6 @@ def _result(
         unknowns=layout.count,
         observations=2 * int((weight > 0).sum()) + run.weighted.count,
         covariance=result,
+        standardised=standardised[unsorted],
+        weights=weight[unsorted],
     )
-
-
-def _without_held(covariance: Covariance, layout: Unknowns) -> Covariance:
-    """Return the covariance with NaN for photographs and points that took no part."""
-    n, m = len(layout.point_free), len(layout.exterior_free)
-    idle_point = ~np.isin(np.arange(n), layout.obs.point[layout.active])
-    idle_image = ~np.isin(np.arange(m), layout.obs.image[layout.active])
-    points, limiting = covariance.points.copy(), covariance.points_limiting.copy()
-    exterior = covariance.exterior.copy()
-    points[idle_point] = limiting[idle_point] = np.nan
-    exterior[idle_image] = np.nan
-    return replace(covariance, points=points, exterior=exterior, points_limiting=limiting)

@@ -159,14 +159,19 @@ def bar_directions(weighted: Weighted, layout: Unknowns, state: State) -> tuple[
     return d / np.maximum(length, np.finfo(float).tiny)[:, None], length - weighted.length
 
 
-def _bar_terms(weighted: Weighted, layout: Unknowns, state: State) -> tuple[FloatArray, FloatArray, float]:
+def bar_rows(weighted: Weighted, layout: Unknowns, state: State) -> tuple[FloatArray, FloatArray]:
+    """Return derivatives of the lengths by the kept points (b, 3 s) and computed minus measured (b,)."""
     s = len(layout.kept)
     direction, misclosure = bar_directions(weighted, layout, state)
     a = np.zeros((len(misclosure), s, 3))
     bar = np.arange(len(misclosure))
     a[bar, weighted.end] = direction
     a[bar, weighted.start] = -direction
-    rows = a.reshape(len(bar), 3 * s) * layout.point_free[layout.kept].ravel()
+    return a.reshape(len(bar), 3 * s) * layout.point_free[layout.kept].ravel(), misclosure
+
+
+def _bar_terms(weighted: Weighted, layout: Unknowns, state: State) -> tuple[FloatArray, FloatArray, float]:
+    rows, misclosure = bar_rows(weighted, layout, state)
     Pa = weighted.length_weight[:, None] * rows
     return rows.T @ Pa, Pa.T @ misclosure, float(weighted.length_weight @ misclosure**2)
 

@@ -1,0 +1,121 @@
+"""Covariance of any subset of the unknowns of a finished adjustment, in any datum, without adjusting again.
+
+The normal equations are formed once more at the solution. The coordinates stay; a change of datum is an
+S-transformation of their covariance.
+
+Source: Baarda (1973), S-transformations and criterion matrices.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from sfm.adjustment.covariance import Cofactors, cofactors, marginal_covariance, without_held
+from sfm.adjustment.datum import Datum, motions_of
+from sfm.adjustment.iterate import Optimum
+from sfm.adjustment.normals import normal_equations
+from sfm.adjustment.parameters import Unknowns, unknowns_of
+from sfm.adjustment.rank import reduced_names
+from sfm.adjustment.reduced import factor
+from sfm.adjustment.result import Adjustment
+from sfm.adjustment.weighted import Weighted, weighted_of
+from sfm.conventions import FloatArray, IntArray
+from sfm.errors import GeometryError
+
+
+@dataclass(frozen=True)
+class Marginal:
+    """A finished adjustment with its normal equations at hand."""
+
+    adjustment: Adjustment
+    layout: Unknowns
+    weighted: Weighted
+    optimum: Optimum
+    cofactors: Cofactors
+
+    def names(self) -> list[tuple[str, str]]:
+        """Return (parameter, of what) of each reduced unknown: X0 ... of photographs, then interior ones."""
+        return reduced_names(self.layout, self.adjustment.network, self.adjustment.estimate)
+
+    def joint(self, unknowns: IntArray, points: IntArray) -> FloatArray:
+        """Return the joint covariance of some reduced unknowns and some object points.
+
+        Args:
+            unknowns: indices into `names`; of a photograph X0 and the small rotation in its axes.
+            points: indices of object points.
+
+        Returns:
+            Covariance in this order, X Y Z of each point, shape (u + 3 p, u + 3 p).
+        """
+        Q, b, motions = self.cofactors, self.optimum.normals.blocks, self.optimum.motions
+        rows = (3 * np.asarray(points)[:, None] + np.arange(3)).ravel()
+        Li = np.linalg.inv(b.L[points])
+        YL = (np.swapaxes(Li, 1, 2) @ b.Yt[rows].reshape(len(points), 3, -1)).reshape(len(rows), -1)
+        between = -YL @ Q.cross[rows].T  # L^-T Y' S^-1 Y L^-1
+        for s, j in enumerate(points):
+            own = slice(3 * s, 3 * s + 3)
+            kept = np.flatnonzero(self.layout.kept == j)
+            if len(kept):
+                first = self.layout.kept_start + 3 * int(kept[0])
+                between[own] = Q.cross[rows][:, first : first + 3].T
+                between[:, own] = between[own].T
+            between[own, own] = Q.points[j]
+        cofactor = np.block(
+            [
+                [Q.reduced[np.ix_(unknowns, unknowns)], Q.cross[np.ix_(rows, unknowns)].T],
+                [Q.cross[np.ix_(rows, unknowns)], between],
+            ]
+        )
+        H = np.vstack([motions.reduced[unknowns], motions.points[points].reshape(len(rows), motions.defect)])
+        F = np.hstack(
+            [
+                Q.F_reduced[:, unknowns],
+                np.moveaxis(Q.F_points[points], 1, 0).reshape(motions.defect, len(rows)),
+            ]
+        )
+        half = H @ F
+        return np.asarray(self.adjustment.sigma0**2 * (cofactor - half - half.T + H @ Q.G @ H.T))
+
+
+def marginal_of(adjustment: Adjustment, *, datum: Datum | None = None) -> Marginal:
+    """Return a finished adjustment with its normal equations at hand.
+
+    Args:
+        adjustment: what `adjust` returned.
+        datum: another datum of the same kinds (control stays control); its own on all points if None.
+
+    Raises:
+        GeometryError: a change between control and a datum without.
+    """
+    use_control = adjustment.datum == "control"
+    if datum is None:
+        datum = Datum(adjustment.datum)
+    if (datum.kind == "control") != use_control:
+        raise GeometryError("datum: with or without control is another adjustment, not an S-transformation")
+    layout, state = unknowns_of(adjustment.network, adjustment.estimate, use_control=use_control)
+    weighted = weighted_of(adjustment.network, layout, use_control=use_control)
+    weight = np.ascontiguousarray(adjustment.weights[layout.order])
+    normals = normal_equations(layout, weighted, state, weight)
+    motions = motions_of(layout, weighted, state, datum)
+    factored = factor(normals, motions)
+    if factored is None:
+        raise GeometryError("adjustment: its normal equations cannot be solved")
+    optimum = Optimum(state, normals, factored, motions, adjustment.converged, 0, normals.vPv)
+    return Marginal(adjustment, layout, weighted, optimum, cofactors(optimum, layout))
+
+
+def change_datum(adjustment: Adjustment, datum: Datum) -> Adjustment:
+    """Return the adjustment with its covariance carried into another datum; coordinates stay.
+
+    Args:
+        adjustment: what `adjust` returned.
+        datum: free or minimal, on all or some points.
+
+    Raises:
+        GeometryError: a change between control and a datum without, or points that cannot carry it.
+    """
+    m = marginal_of(adjustment, datum=datum)
+    covariance = marginal_covariance(m.optimum, m.layout, m.cofactors, adjustment.sigma0**2)
+    return replace(adjustment, datum=datum.kind, covariance=without_held(covariance, m.layout))
