@@ -29,11 +29,14 @@ def refine_coplanarity(
         turns of b about axes across it and of w in R exp([w]x).
 
     Raises:
-        GeometryError: the pairs do not determine the orientation.
+        GeometryError: fewer than five pairs, or pairs that do not determine the orientation.
 
     Source: b . (r1 x R r2) = 0, each equation divided by the norm of its gradient with respect to the
     image coordinates (Foerstner, Wrobel 2016, sec. 13.3.5); Gauss-Newton with five unknowns.
     """
+    n = len(first)
+    if n < UNKNOWNS or len(second) != n:
+        raise GeometryError(f"relative orientation: {n} pairs, at least {UNKNOWNS} are needed")
     b, R = np.array(base, dtype=float), np.array(rotation, dtype=float)
     uv1 = np.ascontiguousarray(first, dtype=float)
     uv2 = np.ascontiguousarray(second, dtype=float)
