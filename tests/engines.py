@@ -1,0 +1,77 @@
+"""An engine for tests without processes, and adjusters that travel to workers."""
+
+from __future__ import annotations
+
+import os
+import signal
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+from threadpoolctl import threadpool_limits
+
+from sfm.batch_survey import Adjusters, SurveyRow
+from sfm.engine import Done, Event, Told, Work
+from sfm.pipeline import Backend
+from sfm.project import Survey
+from sfm.report.result import SurveyResult
+
+KILLER = "killer"  # a survey of this name kills whoever works on it
+
+
+class Here:
+    """Runs one piece of work after the other in this process."""
+
+    workers = 1
+
+    def run(self, works: Iterable[Work], *, at_a_time: int) -> Iterator[Event]:
+        for work in works:
+            said: list[dict[str, Any]] = []
+            with threadpool_limits(
+                limits=1
+            ):  # as in a worker: sums of several threads differ in the last bit
+                notes = [part.function(*part.arguments, tell=said.append) for part in work.parts]
+                value = work.whole.function(*work.whole.arguments, notes, tell=said.append)
+            yield from (Told(work.key, message) for message in said)
+            yield Done(work.key, value)
+
+
+class Notes:
+    """Looks on and remembers."""
+
+    def __init__(self) -> None:
+        self.names: Sequence[str] = ()
+        self.messages: list[tuple[str, dict[str, Any]]] = []
+        self.finished_rows: list[tuple[SurveyRow, bool]] = []
+        self.remarks: list[str] = []
+
+    def planned(self, names: Sequence[str]) -> None:
+        self.names = names
+
+    def told(self, name: str, message: dict[str, Any]) -> None:
+        self.messages.append((name, message))
+
+    def finished(self, name: str, row: SurveyRow, *, kept: bool) -> None:
+        self.finished_rows.append((row, kept))
+
+    def remark(self, text: str) -> None:
+        self.remarks.append(text)
+
+
+def no_backend(survey: Survey) -> Backend | None:
+    """Compare with nobody, and kill the worker where the survey asks for it."""
+    if survey.name == KILLER:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return None
+
+
+def no_writer(result: SurveyResult) -> None:
+    return None
+
+
+ALONE = Adjusters(no_backend, no_writer)
+
+
+def points_of(out: Path) -> dict[str, bytes]:
+    """Return the bytes of points.csv of every survey of a batch."""
+    return {path.parent.name: path.read_bytes() for path in sorted(out.glob("*/points.csv"))}

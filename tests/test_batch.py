@@ -1,0 +1,294 @@
+"""Batches: which surveys, what is kept and what is run again, the tables, and how it ends on Dask."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from adapters.dask_cluster import DaskEngine, local_engine, remote_engine
+from sfm.batch import find_surveys, run_batch
+from sfm.batch_pages import render_index
+from sfm.batch_survey import SurveyRow
+from sfm.errors import BackendError, KolinearError, OutputError, SurveyFileError
+from sfm.folder_lock import locked
+from sfm.survey_log import read_log
+from tests.engines import ALONE, KILLER, Here, Notes, points_of
+from tests.surveys import write_observed_survey, write_photograph_survey
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+@pytest.fixture(scope="module")
+def surveys(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, ...]:
+    """Two surveys of photographs and one of image points."""
+    folder = tmp_path_factory.mktemp("surveys")
+    return (
+        write_photograph_survey(folder / "a", "first"),
+        write_photograph_survey(folder / "b", "second"),
+        write_observed_survey(folder / "c", "third"),
+    )
+
+
+@pytest.fixture(scope="module")
+def finished(surveys: tuple[Path, ...], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A batch of them, run in this process."""
+    out = tmp_path_factory.mktemp("batch") / "out"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("sfm.report.output.all_plots", lambda *_: [])
+        rows = run_batch(surveys, out, Here(), ALONE, Notes())
+    assert [row.status for row in rows] == ["done"] * 3
+    return out
+
+
+@pytest.fixture(autouse=True)
+def no_plots(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Spare the drawing in this process, which takes most of the time of a small survey."""
+    monkeypatch.setattr("sfm.report.output.all_plots", lambda *_: [])
+
+
+@pytest.fixture(scope="module")
+def two_workers() -> Iterator[DaskEngine]:
+    with local_engine(2) as engine:
+        yield engine
+
+
+def test_surveys_are_found_by_file_folder_and_glob(tmp_path: Path) -> None:
+    for name in ("a/survey.toml", "b/c/survey.toml", "b/other.toml", "d/one.toml", "d/two.toml", "e/x.csv"):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).touch()
+
+    def names(*given: str) -> list[str]:
+        found = find_surveys([str(tmp_path / one) for one in given])
+        return [path.relative_to(tmp_path.resolve()).as_posix() for path in found]
+
+    assert names("a/survey.toml", "a") == ["a/survey.toml"]
+    assert names("b", "d") == ["b/c/survey.toml", "d/one.toml", "d/two.toml"]
+    assert names("d/*.toml", "[ab]") == ["d/one.toml", "d/two.toml", "a/survey.toml", "b/c/survey.toml"]
+    assert names("none.toml") == ["none.toml"]  # it fails as a survey, the others go on
+    with pytest.raises(SurveyFileError, match=r"no survey\.toml in or below"):
+        names("e")
+    with pytest.raises(SurveyFileError, match="no file matches"):
+        names("*.none")
+
+
+def test_batch_gives_folders_tables_and_logs(finished: Path) -> None:
+    with (finished / "batch.csv").open(encoding="utf-8", newline="") as file:
+        table = list(csv.DictReader(file))
+    data = json.loads((finished / "batch.json").read_text(encoding="utf-8"))
+    assert [row["survey"] for row in table] == ["first", "second", "third"]
+    assert [row["survey"] for row in data["surveys"]] == ["first", "second", "third"]
+    assert data["totals"] == {"surveys": 3, "done": 3, "failed": 0, "set aside": 0, "not dependable": 0}
+    page = (finished / "index.html").read_text(encoding="utf-8")
+    for row in table:
+        folder = finished / row["folder"]
+        summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
+        assert float(row["sigma0_px"]) == summary["sigma0_px"]
+        assert float(row["rms_px"]) == summary["rms_px"]
+        assert int(row["photographs"]) == int(row["photographs_total"]) == summary["images"]["used"] == 6
+        assert int(row["points"]) == summary["points"]["total"] == 20
+        assert f'href="{row["folder"]}/report.html"' in page
+        log = read_log(folder / "log.jsonl")
+        assert log[0]["event"] == "start"
+        assert log[-1]["event"] == "result"
+        stages = [entry["stage"] for entry in log if entry["event"] == "stage"]
+        assert stages[-3:] == ["adjustment", "comparison", "report"]
+        photographs = [entry for entry in log if entry["event"] == "photograph"]
+        assert len(photographs) == (0 if row["survey"] == "third" else 6)
+        assert all(entry["targets"] >= 10 and not entry["stored"] for entry in photographs)
+    assert sorted(p.name for p in finished.iterdir()) == [
+        *(".kolinear", "batch.csv", "batch.json", "first", "index.html", "logs", "second", "third"),
+    ]
+    assert not list((finished / "logs").iterdir())
+    assert not (finished / ".kolinear" / "lock").exists()
+
+
+def test_resume_keeps_what_is_finished_and_runs_what_has_changed(
+    surveys: tuple[Path, ...], tmp_path: Path
+) -> None:
+    own = [write_photograph_survey(tmp_path / "a", "one", backend="none"), surveys[2]]
+    out = tmp_path / "out"
+    run_batch(own, out, Here(), ALONE, Notes())
+    before = {folder: os.stat(out / folder).st_ino for folder in ("one", "third")}
+    again = Notes()
+    run_batch(own, out, Here(), ALONE, again, resume=True)
+    assert [kept for _, kept in again.finished_rows] == [True, True]
+    assert {folder: os.stat(out / folder).st_ino for folder in before} == before
+
+    own[0].write_text(own[0].read_text(encoding="utf-8").replace('"c"', '"c", "K1"'), encoding="utf-8")
+    changed = Notes()
+    rows = run_batch(own, out, Here(), ALONE, changed, resume=True)
+    assert [kept for _, kept in changed.finished_rows] == [False, True]
+    assert [row.survey for row in rows] == ["one", "third"]
+    log = read_log(out / "one" / "log.jsonl")
+    assert all(entry["stored"] for entry in log if entry["event"] == "photograph")  # only adjusted again
+
+
+def test_photographs_are_measured_again_only_where_they_changed(tmp_path: Path) -> None:
+    survey = write_photograph_survey(tmp_path / "a", "one")
+    other = write_photograph_survey(tmp_path / "b", "two")
+    out = tmp_path / "out"
+    run_batch([survey], out, Here(), ALONE, Notes())
+    measured = points_of(out)
+    (tmp_path / "a" / "photo 2.png").write_bytes((tmp_path / "b" / "photo 2.png").read_bytes())
+    (tmp_path / "a" / "photo 5.png").rename(tmp_path / "a" / "photo 7.png")
+    run_batch([survey, other], out, Here(), ALONE, Notes())
+    log = read_log(out / "one" / "log.jsonl")
+    stored = {entry["image"]: entry["stored"] for entry in log if entry["event"] == "photograph"}
+    assert stored == {f"photo {k}.png": k != 2 for k in (1, 2, 3, 4, 6, 7)}
+    assert points_of(out)["one"] != measured["one"]
+
+
+def test_failures_are_rows_and_the_others_go_on(surveys: tuple[Path, ...], tmp_path: Path) -> None:
+    broken = write_photograph_survey(tmp_path / "broken", "<b>broken</b>")
+    for photograph in broken.parent.glob("*.png"):
+        photograph.write_bytes(photograph.read_bytes()[:5000])
+    wrong = tmp_path / "wrong.toml"
+    wrong.write_text("[survey]\nname = 3\n", encoding="utf-8")
+    taken = write_observed_survey(tmp_path / "taken", "taken")
+    out = tmp_path / "out"
+    (out / "taken").mkdir(parents=True)
+    (out / "taken" / "letter.txt").touch()
+    rows = run_batch([wrong, broken, taken, tmp_path / "no.toml", surveys[2]], out, Here(), ALONE, Notes())
+    assert [row.status for row in rows] == ["failed", "failed", "failed", "failed", "done"]
+    assert "survey.name: found 3" in rows[0].reason
+    assert "0 readable photographs" in rows[1].reason
+    assert "letter.txt" in rows[2].reason
+    assert "cannot be read" in rows[3].reason
+    assert (out / "taken" / "letter.txt").exists()
+    page = (out / "index.html").read_text(encoding="utf-8")
+    assert "<b>" not in page
+    assert "&lt;b&gt;broken&lt;/b&gt;" in page
+    for row in rows[:4]:
+        log = read_log(out / "logs" / f"{row.folder}.jsonl")
+        assert log[-1]["event"] == "failed"
+        assert log[-1]["reason"] == row.reason
+    assert not [path for path in out.rglob("*.part")]
+
+
+def test_surveys_of_one_name_get_folders_of_their_own(tmp_path: Path) -> None:
+    files = [write_observed_survey(tmp_path / folder, "same") for folder in ("a", "b")]
+    files.append(write_observed_survey(tmp_path / "c", "logs"))
+    notes = Notes()
+    rows = run_batch(files, tmp_path / "out", Here(), ALONE, notes)
+    assert len({row.folder for row in rows}) == 3
+    assert all(row.folder.startswith(("same-", "logs-")) for row in rows)
+    assert list(notes.names) == [row.folder for row in rows]
+
+
+def test_index_escapes_everything() -> None:
+    nasty = "\"><script>alert('1')</script>&"
+    row = SurveyRow(nasty, nasty, nasty, nasty, nasty, comparison=nasty, reason=nasty)
+    for status in ("failed", "done"):
+        page = render_index([SurveyRow(**{**row.__dict__, "status": status})])
+        assert "<script" not in page
+        assert 'href="' + nasty not in page
+
+
+def test_a_second_batch_in_the_same_folder_is_refused(finished: Path, surveys: tuple[Path, ...]) -> None:
+    with (
+        locked(finished / ".kolinear" / "lock"),
+        pytest.raises(
+            OutputError, match=f"another run is writing into this folder .process {os.getpid()} on"
+        ),
+    ):
+        run_batch(surveys, finished, Here(), ALONE, Notes(), resume=True)
+
+
+def test_a_fault_of_ours_is_a_row_with_a_trace(
+    surveys: tuple[Path, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("sfm.batch_survey.adjust_survey", lambda *_, **__: [][0])
+    (row,) = run_batch([surveys[2]], tmp_path / "out", Here(), ALONE, Notes())
+    assert row.reason.startswith("a fault of Kolinear: IndexError")
+    (log,) = (tmp_path / "out" / "logs").iterdir()
+    assert "trace" in read_log(log)[-1]
+
+
+def test_two_workers_give_the_same_bytes(
+    two_workers: DaskEngine, surveys: tuple[Path, ...], finished: Path, tmp_path: Path
+) -> None:
+    notes = Notes()
+    rows = run_batch(surveys, tmp_path / "out", two_workers, ALONE, notes)
+    assert [row.status for row in rows] == ["done"] * 3
+    assert points_of(tmp_path / "out") == points_of(finished)
+    told = [message for name, message in notes.messages if name == "first"]
+    assert {"photographs": 6} in told
+    assert sum("photograph" in message for message in told) == 6
+    assert {"stage": "adjustment"} in told
+
+
+def test_a_survey_that_kills_workers_is_set_aside(
+    two_workers: DaskEngine, surveys: tuple[Path, ...], finished: Path, tmp_path: Path
+) -> None:
+    killer = write_observed_survey(tmp_path / "killer", KILLER)
+    out = tmp_path / "out"
+    rows = run_batch([surveys[2], killer, surveys[0]], out, two_workers, ALONE, Notes())
+    assert [row.status for row in rows] == ["done", "set aside", "done"]
+    assert "worker processes died" in rows[1].reason
+    same = points_of(finished)
+    assert points_of(out) == {name: same[name] for name in ("first", "third")}
+    assert not [path for path in out.iterdir() if path.name.endswith((".part", ".old"))]
+
+
+def test_a_disk_problem_ends_the_batch_with_one_line(surveys: tuple[Path, ...], tmp_path: Path) -> None:
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "logs").write_text("in the way", encoding="utf-8")
+    with pytest.raises(OutputError, match="the log cannot be written"):
+        run_batch(surveys, tmp_path / "out", Here(), ALONE, Notes())
+
+
+def test_nobody_at_the_address_of_a_cluster() -> None:
+    with (
+        pytest.raises(BackendError, match=r"--cluster .*: no Dask scheduler answers"),
+        remote_engine("nonsense"),
+    ):
+        pass
+
+
+@pytest.mark.slow
+def test_a_scheduler_started_separately_gives_the_same_bytes(
+    surveys: tuple[Path, ...], finished: Path, tmp_path: Path
+) -> None:
+    dask = [sys.executable, "-m", "distributed.cli.dask_scheduler"]
+    worker = [sys.executable, "-m", "distributed.cli.dask_worker"]
+    address = tmp_path / "scheduler.json"
+    running = [
+        subprocess.Popen(
+            [*dask, "--host", "127.0.0.1", "--port", "0", "--no-dashboard", "--scheduler-file", str(address)],
+            cwd=ROOT,
+            stderr=subprocess.DEVNULL,
+        )
+    ]
+    try:
+        while not address.exists():
+            time.sleep(0.1)
+        scheduler = json.loads(address.read_text(encoding="utf-8"))["address"]
+        running.append(
+            subprocess.Popen(
+                [*worker, scheduler, "--nworkers", "2", "--nthreads", "1", "--no-dashboard"],
+                cwd=ROOT,
+                stderr=subprocess.DEVNULL,
+            )
+        )
+        with remote_engine(scheduler) as engine:
+            engine.client.wait_for_workers(2, timeout=60)
+            assert engine.workers == 2
+            rows = run_batch(surveys, tmp_path / "out", engine, ALONE, Notes())
+        assert [row.status for row in rows] == ["done"] * 3
+        assert points_of(tmp_path / "out") == points_of(finished)
+    finally:
+        for process in reversed(running):
+            process.terminate()
+            process.wait(timeout=20)
+
+
+def test_errors_of_a_batch_are_errors_of_kolinear() -> None:
+    assert issubclass(BackendError, KolinearError)
