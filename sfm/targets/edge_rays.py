@@ -11,7 +11,7 @@ from sfm.conventions import AnyArray, FloatArray
 
 RAYS = 32
 # Spacing of the samples on a ray.
-_STEP_PX = 0.5
+STEP_PX = 0.5
 # A rise behind the edge by this share of the step, and by so many sigma of the noise, is no background.
 _DISTURBANCE, _DISTURBANCE_SIGMAS = 0.3, 5.0
 _PHI = 2 * math.pi * np.arange(RAYS) / RAYS
@@ -100,16 +100,19 @@ def trace_rays(
     margin: float,
     edge: FloatArray,
     limit: FloatArray,
+    window: int = 0,
 ) -> float:
     """Find the steepest edge on rays from the centre and how far out the background reaches.
 
+    The edge is the vertex of a parabola through the slopes at the steepest point or, where the caller takes
+    the surroundings for clean, the mean position of the slope over a window of samples to both sides.
     Writes the normalised radius of the edge (nan: none) and the reach beyond it in px for each ray; returns
     the median step of intensity.
     """
     h, w = image.shape
     x0, y0, p, q, r = theta[0], theta[1], theta[2], theta[3], theta[4]
     det = p * r - q * q
-    step = _STEP_PX
+    step = STEP_PX
     profile = np.empty(4096)
     steps = np.empty(RAYS)
     for k in range(RAYS):
@@ -138,7 +141,15 @@ def trace_rays(
             edge[k], limit[k], steps[k] = math.nan, 0.0, 0.0
             continue
         offset = 0.0
-        if at > 2 and at < m - 3:
+        if 0 < window <= min(at, m - 1 - at):
+            ends = profile[at - window] + profile[at + window]
+            area = 0.5 * ends
+            for i in range(at - window + 1, at + window):
+                area += profile[i]
+            fall = profile[at - window] - profile[at + window]
+            if fall > 0:  # integral of t dI over that of dI, by parts
+                offset = (area - window * ends) / fall
+        elif at > 2 and at < m - 3:
             before, after = profile[at - 3] - profile[at + 1], profile[at - 1] - profile[at + 3]
             curvature = before - 2 * best + after
             if curvature < 0:

@@ -1,0 +1,128 @@
+"""Centroids of targets: binary, weighted with the intensity, weighted with its square."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+from sfm.conventions import AnyArray, FloatArray, IntArray
+from sfm.errors import KolinearError
+
+WEIGHTS = ("binary", "intensity", "squared")
+# The window reaches this far beyond the outline, px; the background is the mean of what lies outside of the
+# first part, where the blur of the edge has died away.
+MARGIN_PX, BLURRED_PX = 4.0, 2.5
+# Intensities that differ from the background by less than so many sigma are background.
+THRESHOLD_SIGMAS = 3.0
+# Variance of the position of an edge in its pixel, px^2: uniformly distributed.
+EDGE_VARIANCE = 1 / 12
+
+
+def measure_centroids(
+    photograph: AnyArray,
+    xy: FloatArray,
+    shape: FloatArray,
+    sign: IntArray,
+    *,
+    noise: float,
+    weights: str = "intensity",
+) -> tuple[FloatArray, FloatArray]:
+    """Measure the centroid of each target.
+
+    With g the intensity above the background (below it for dark targets), the weights are 1 where g exceeds
+    half of the step to the target (binary), or g - 3 sigma or its square where that is positive. A shaded
+    background, a neighbour in the window or a start that is off by more than 2 px shifts a centroid; the fit
+    of an ellipse bears all of them.
+
+    Args:
+        photograph: intensities, shape (H, W).
+        xy: approximate centres, px, shape (k, 2).
+        shape: approximate (p, q, r) of the outlines, 1/px, shape (k, 3).
+        sign: +1 bright, -1 dark target, shape (k,).
+        noise: standard deviation of the intensities.
+        weights: binary, intensity or squared.
+
+    Returns:
+        Centroids, px, shape (k, 2), and their covariance from noise (binary: the pixel grid), px^2, shape
+        (k, 2, 2); nan where the window is not inside the photograph or nothing rises above the background.
+
+    Raises:
+        KolinearError: unknown weights.
+
+    Source: Luhmann et al., Close-Range Photogrammetry and 3D Imaging (2014), sec. 5.4.2.
+    """
+    if weights not in WEIGHTS:
+        raise KolinearError(f"weights {weights!r} are none of {', '.join(WEIGHTS)}")
+    outline = np.column_stack([np.asarray(xy, float).reshape(-1, 2), np.asarray(shape, float).reshape(-1, 3)])
+    result = _centroids(photograph, outline, np.asarray(sign, np.int64), float(noise), WEIGHTS.index(weights))
+    return result[:, :2], result[:, [2, 3, 3, 4]].reshape(-1, 2, 2)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _centroids(image: AnyArray, outline: FloatArray, sign: IntArray, noise: float, power: int) -> FloatArray:
+    """Return x, y and their variances and covariance (xx, xy, yy) for each target, shape (k, 5)."""
+    h, w = image.shape
+    out = np.full((len(outline), 5), math.nan)
+    for t in range(len(outline)):
+        x0, y0, p, q, r = outline[t]
+        det = p * r - q * q
+        half_x = math.sqrt(r * r + q * q) / det + MARGIN_PX
+        half_y = math.sqrt(p * p + q * q) / det + MARGIN_PX
+        left, right = math.ceil(x0 - half_x), math.floor(x0 + half_x)
+        top, bottom = math.ceil(y0 - half_y), math.floor(y0 + half_y)
+        if left < 0 or top < 0 or right >= w or bottom >= h:
+            continue
+        n = (right - left + 1) * (bottom - top + 1)
+        X, Y, G = np.empty(n), np.empty(n), np.empty(n)
+        background, outside, target, inside, m = 0.0, 0, 0.0, 0, 0
+        for i in range(top, bottom + 1):
+            for j in range(left, right + 1):
+                dx, dy = j - x0, i - y0
+                u, v = p * dx + q * dy, q * dx + r * dy
+                rho = math.sqrt(u * u + v * v) + 1e-12
+                d = rho * (rho - 1) / (math.sqrt((p * u + q * v) ** 2 + (q * u + r * v) ** 2) + 1e-12)
+                if d > MARGIN_PX:
+                    continue
+                value = sign[t] * float(image[i, j])
+                if d > BLURRED_PX:
+                    background += value
+                    outside += 1
+                elif rho < 0.5:
+                    target += value
+                    inside += 1
+                X[m], Y[m], G[m] = j, i, value
+                m += 1
+        if outside == 0 or inside == 0:
+            continue
+        background /= outside
+        half = (target / inside - background) / 2
+        threshold = half if power == 0 else THRESHOLD_SIGMAS * noise
+        total, sx, sy = 0.0, 0.0, 0.0
+        for i in range(m):
+            g = G[i] - background
+            if g > threshold:
+                weight = 1.0 if power == 0 else (g - threshold) ** power
+                total += weight
+                sx += weight * X[i]
+                sy += weight * Y[i]
+        if total <= 0:
+            continue
+        x, y = sx / total, sy / total
+        xx, xy, yy = 0.0, 0.0, 0.0
+        slope = half / 2  # intensity changes by half of the step within about 2 px of the edge
+        for i in range(m):
+            g = G[i] - background
+            if power == 0:
+                variance = EDGE_VARIANCE if abs(g - threshold) < slope else 0.0
+            elif g > threshold:
+                variance = (power * (g - threshold) ** (power - 1) * noise) ** 2
+            else:
+                continue
+            xx += variance * (X[i] - x) ** 2
+            xy += variance * (X[i] - x) * (Y[i] - y)
+            yy += variance * (Y[i] - y) ** 2
+        out[t, 0], out[t, 1] = x, y
+        out[t, 2], out[t, 3], out[t, 4] = xx / total**2, xy / total**2, yy / total**2
+    return out
