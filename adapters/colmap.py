@@ -24,6 +24,7 @@ from typing import Any
 
 import numpy as np
 
+from adapters.colmap_files import check_model_files
 from sfm.camera import Camera
 from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.errors import BackendError, OutputError, SurveyFileError
@@ -99,10 +100,10 @@ def adjust_with_colmap(
         BackendError: pycolmap is missing or of another version, a camera model or a set of free
             parameters that COLMAP cannot express, weighted control, or Ceres fails.
     """
-    pycolmap = _pycolmap()
+    pycolmap = load_pycolmap()
     refine = colmap_free(estimate.cameras)
     options = _options(pycolmap, refine, len(network.images), threads, max_iterations)
-    with _quiet(pycolmap):
+    with quiet(pycolmap):
         scene = _reconstruction(pycolmap, network, estimate)
         config = _config(pycolmap, network, estimate, gauge)
         iterations, seconds, converged, message = 0, 0.0, False, ""
@@ -166,9 +167,9 @@ def covariance_with_colmap(
     Raises:
         BackendError: as for `adjust_with_colmap`.
     """
-    pycolmap = _pycolmap()
+    pycolmap = load_pycolmap()
     options = _options(pycolmap, colmap_free(estimate.cameras), len(network.images), 1, 1)
-    with _quiet(pycolmap):
+    with quiet(pycolmap):
         scene = _reconstruction(pycolmap, network, estimate)
         config = _config(pycolmap, network, estimate, gauge)
         # estimate_ba_covariance wants this adjuster and no other; it need not have been run
@@ -249,8 +250,8 @@ def write_model(
         BackendError: pycolmap is missing, or a camera is in a model that COLMAP does not know.
         OutputError: the folder cannot be written.
     """
-    pycolmap = _pycolmap()
-    with _quiet(pycolmap):
+    pycolmap = load_pycolmap()
+    with quiet(pycolmap):
         scene = _reconstruction(pycolmap, network, estimate, rejected=rejected)
         scene.update_point_3d_errors()
         try:
@@ -301,18 +302,19 @@ def read_model(folder: Path) -> tuple[Network, Estimate]:
         BackendError: pycolmap is missing, a camera model that Kolinear has no equal of, or photographs
             in rigs of several cameras without an orientation of their own.
     """
-    pycolmap = _pycolmap()
+    pycolmap = load_pycolmap()
     if not any((folder / f"cameras.{kind}").is_file() for kind in ("bin", "txt")):
         raise SurveyFileError(f"{folder}: no COLMAP model (cameras.bin or cameras.txt) in this folder")
-    with _quiet(pycolmap):
+    check_model_files(folder)
+    with quiet(pycolmap):
         try:
             scene = pycolmap.Reconstruction(str(folder))
-        except (ValueError, RuntimeError, IndexError, OSError) as error:
-            raise SurveyFileError(f"{folder}: not a readable COLMAP model ({_line(error)})") from error
+        except (ValueError, RuntimeError, LookupError, OSError, MemoryError) as error:
+            raise SurveyFileError(f"{folder}: not a readable COLMAP model ({one_line(error)})") from error
     side_path = folder / SIDE_FILE
     side = json.loads(side_path.read_text(encoding="utf-8")) if side_path.is_file() else {}
     camera_ids = sorted(scene.cameras)
-    cameras = tuple(_camera(scene.camera(i)) for i in camera_ids)
+    cameras = tuple(camera_of(scene.camera(i)) for i in camera_ids)
     if len(side.get("cameras", ())) == len(cameras):
         cameras = tuple(
             replace(
@@ -360,7 +362,7 @@ def read_model(folder: Path) -> tuple[Network, Estimate]:
     return network, Estimate(cameras, position, M.transpose(0, 2, 1).copy(), points)
 
 
-def _pycolmap() -> ModuleType:
+def load_pycolmap() -> ModuleType:
     """Import pycolmap, or say what is needed."""
     needed = ".".join(str(part) for part in NEEDED_VERSION)
     try:
@@ -368,7 +370,7 @@ def _pycolmap() -> ModuleType:
         import pycolmap.pyceres  # registers the types of the Ceres options
     except ImportError as error:
         raise BackendError(
-            f"pycolmap cannot be imported ({_line(error)}): pip install 'pycolmap=={needed}.*'"
+            f"pycolmap cannot be imported ({one_line(error)}): pip install 'pycolmap=={needed}.*'"
         ) from error
     found = tuple(int(part) for part in pycolmap.__version__.split(".")[:2])
     if found != NEEDED_VERSION:
@@ -380,7 +382,7 @@ def _pycolmap() -> ModuleType:
 
 
 @contextmanager
-def _quiet(pycolmap: ModuleType) -> Iterator[None]:
+def quiet(pycolmap: ModuleType) -> Iterator[None]:
     """Keep the log of COLMAP and Ceres out of the terminal, and give it back as it was."""
     log = pycolmap.logging
     before = log.minloglevel, log.stderrthreshold
@@ -441,7 +443,7 @@ def _reconstruction(
     """Return a pycolmap.Reconstruction; cameras, photographs and points are numbered from 1."""
     scene = pycolmap.Reconstruction()
     for k, camera in enumerate(estimate.cameras):
-        scene.add_camera_with_trivial_rig(_colmap_camera(pycolmap, camera, k + 1))
+        scene.add_camera_with_trivial_rig(colmap_camera(pycolmap, camera, k + 1))
     seen = network.image_points
     claimed = np.ones(len(seen), dtype=bool) if rejected is None else ~rejected
     claimed &= estimate.oriented[seen.image] & estimate.determined[seen.point]
@@ -470,7 +472,8 @@ def _reconstruction(
     return scene
 
 
-def _colmap_camera(pycolmap: ModuleType, camera: Camera, number: int) -> Any:
+def colmap_camera(pycolmap: ModuleType, camera: Camera, number: int) -> Any:
+    """Return a camera as a pycolmap.Camera of that number."""
     if camera.model not in COLMAP_NAMES:
         raise BackendError(
             f"camera {camera.name}: COLMAP has no model {camera.model}, convert it to opencv or full_opencv"
@@ -483,7 +486,7 @@ def _colmap_camera(pycolmap: ModuleType, camera: Camera, number: int) -> Any:
     )
 
 
-def _camera(found: Any) -> Camera:
+def camera_of(found: Any) -> Camera:
     """Return a COLMAP camera as ours, pixel size 1."""
     if found.model_name not in READABLE:
         raise BackendError(
@@ -538,6 +541,6 @@ def _groups(index: IntArray, count: int) -> list[IntArray]:
     return np.split(order, np.searchsorted(index[order], np.arange(1, count)))
 
 
-def _line(error: BaseException) -> str:
+def one_line(error: BaseException) -> str:
     """The message of an error on one line."""
     return " ".join(str(error).split()) or type(error).__name__

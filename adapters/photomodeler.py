@@ -27,14 +27,14 @@ Source: the format as read by loadpm.m of DBAT (Borlin and Grussenmeyer), checke
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+from adapters.lines import Lines, write_lines
 from sfm.camera import Camera, camera_from_values
-from sfm.conventions import FloatArray, rotation_from_angles
-from sfm.errors import SurveyFileError
+from sfm.conventions import FloatArray, angles_from_rotation, rotation_from_angles
+from sfm.errors import OutputError, SurveyFileError
 from sfm.network import Estimate, ImagePoints, Network, ObjectPoints
 
 HALF_PIXEL = 0.5  # PhotoModeler's pixel coordinates minus ours, px
@@ -59,7 +59,7 @@ def read_photomodeler(
     Raises:
         SurveyFileError: what is wrong, with file and line number.
     """
-    text = _Lines.of(path)
+    text = Lines.of(path)
     text.line()  # title
     header = text.numbers(2, 4)
     if len(header) == 4:
@@ -175,7 +175,7 @@ def _cameras(
 def _read_control(path: Path) -> list[tuple[str, str, FloatArray]]:
     """Rows of a control file as (where, id, X Y Z sX sY sZ)."""
     rows = []
-    text = _Lines.of(path)
+    text = Lines.of(path)
     for number, line in enumerate(text.lines, start=1):
         if not line.strip() or line.lstrip().startswith("#"):
             continue
@@ -188,58 +188,69 @@ def _read_control(path: Path) -> list[tuple[str, str, FloatArray]]:
     return rows
 
 
-@dataclass
-class _Lines:
-    """The lines of a file and how far they are read."""
+def write_photomodeler(path: Path, network: Network, estimate: Estimate, *, title: str = "Kolinear") -> None:
+    """Write a network and its solution as a PhotoModeler text export, with the digits of double precision.
 
-    path: Path
-    lines: list[str]
-    number: int = 0  # of the line read last, from 1
+    PhotoModeler numbers its points: names that are whole numbers are kept, any other is refused.
+    Photographs without orientation are refused, points without coordinates have image points only.
 
-    @classmethod
-    def of(cls, path: Path) -> _Lines:
-        try:
-            return cls(path, path.read_text(encoding="utf-8", errors="replace").splitlines())
-        except OSError as error:
-            raise SurveyFileError(f"{path}: cannot be read ({error.strerror})") from error
+    Raises:
+        OutputError: what the export has no place for, or the file cannot be written.
+    """
+    for camera in estimate.cameras:
+        if camera.model != "brown" or camera.value("b1") or camera.value("b2"):
+            raise OutputError(
+                f"camera {camera.name}: PhotoModeler has no place for model {camera.model} with affinity; "
+                "convert it to brown and put b1 into the pixel size"
+            )
+    sizes = {camera.size_px for camera in estimate.cameras}
+    if len(sizes) > 1:
+        raise OutputError("photographs of different sizes: the export gives one for all")
+    if not estimate.oriented.all():
+        i = int(np.argmin(estimate.oriented))
+        raise OutputError(f"photograph {network.images[i]} has no orientation, the export wants one")
+    for name in network.points:
+        if not name.isdecimal() or str(int(name)) != name:
+            raise OutputError(f"point '{name}': PhotoModeler numbers its points")
+    width, height = sizes.pop()
+    inner = [_text(*_inner(camera)) for camera in estimate.cameras]
+    none = _text(*[0.0] * INNER)
+    lines = [title.replace("\n", " "), f" 0.0005 20 {width} {height}", _text(*[1.0] * 9), inner[0], none]
+    angles = np.rad2deg(angles_from_rotation(estimate.rotation))[:, ::-1]
+    for i, name in enumerate(network.images):
+        lines += [
+            f"{i} {name}",
+            f"{i} {_text(*estimate.position[i], *angles[i])}",
+            f"{i} {_text(*[0.0] * 6)}",
+            "",
+            f"{i} {inner[network.camera[i]]}",
+            f"{i} {none}",
+        ]
+    lines.append("")
+    control = network.control
+    for j, xyz, C in zip(control.point, control.xyz, control.covariance, strict=True):
+        lines.append(f"{network.points[j]} {_text(*xyz, *np.sqrt(np.diagonal(C)))}")
+    lines.append("")
+    lines += [
+        f"{network.points[j]} {_text(*estimate.points[j], 0.0, 0.0, 0.0)}"
+        for j in np.flatnonzero(estimate.determined)
+    ]
+    lines.append("")
+    seen = network.image_points
+    sigma = np.sqrt(np.diagonal(seen.covariance, axis1=1, axis2=2))
+    lines += [
+        f"{i} {network.points[j]} {_text(*(xy + HALF_PIXEL), *s)}"
+        for i, j, xy, s in zip(seen.image, seen.point, seen.xy, sigma, strict=True)
+    ]
+    write_lines(path, [*lines, "", ""])
 
-    @property
-    def where(self) -> str:
-        return f"{self.path}, line {self.number}"
 
-    def error(self, message: str) -> SurveyFileError:
-        return SurveyFileError(f"{self.where}: {message}")
+def _inner(camera: Camera) -> list[float]:
+    """c xp yp xs ys K1 K2 K3 P1 P2 of a camera."""
+    xs, ys = np.array(camera.size_px) * camera.pixel_mm
+    c, x0, y0, *distortion = camera.parameters[:8]
+    return [c, xs / 2 + x0, ys / 2 - y0, xs, ys, *distortion]
 
-    def line(self) -> str:
-        self.number += 1
-        if self.number > len(self.lines):
-            raise self.error("the file ends here, more was due")
-        return self.lines[self.number - 1]
 
-    def number_of(self, text: str) -> float:
-        try:
-            value = float(text)
-        except ValueError:
-            value = np.nan
-        if not np.isfinite(value):
-            raise self.error(f"'{text[:40]}' is not a number")
-        return value
-
-    def numbers(self, fewest: int, most: int, *, photograph: str | None = None) -> FloatArray:
-        """Read a line of numbers, whose first one is that of the photograph if given."""
-        parts = self.line().split()
-        if not fewest <= len(parts) <= most:
-            needed = f"{fewest}" if fewest == most else f"{fewest} to {most}"
-            raise self.error(f"{len(parts)} numbers, needed {needed}")
-        if photograph is not None and parts[0] != photograph:
-            raise self.error(f"'{parts[0]}' at the start, needed the number {photograph} of the photograph")
-        return np.array([self.number_of(part) for part in parts])
-
-    def block(self, count: int) -> list[tuple[str, str, FloatArray]]:
-        """Read lines of so many numbers up to an empty one, as (where, first, others)."""
-        rows = []
-        while self.line().strip():
-            self.number -= 1
-            row = self.numbers(count, count)
-            rows.append((self.where, f"{row[0]:.0f}", row[1:]))
-        return rows
+def _text(*values: float) -> str:
+    return " ".join(repr(float(value)) for value in values)

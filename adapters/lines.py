@@ -1,0 +1,126 @@
+"""Reading text files line by line, so that whatever is wrong is named with file and line."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from sfm.conventions import FloatArray
+from sfm.errors import OutputError, SurveyFileError
+
+SHOWN = 40  # characters of a bad piece that a message repeats
+
+
+@dataclass
+class Lines:
+    """The lines of a file and how far they are read."""
+
+    path: Path
+    lines: list[str]
+    number: int = 0  # of the line read last, from 1
+
+    @classmethod
+    def of(cls, path: Path) -> Lines:
+        """Read a file."""
+        try:
+            return cls(path, Path(path).read_text(encoding="utf-8", errors="replace").splitlines())
+        except OSError as error:
+            raise SurveyFileError(f"{path}: cannot be read ({error.strerror})") from error
+
+    @property
+    def where(self) -> str:
+        """File and number of the line read last."""
+        return f"{self.path}, line {self.number}"
+
+    def error(self, message: str) -> SurveyFileError:
+        """Return the error of the line read last."""
+        return SurveyFileError(f"{self.where}: {message}")
+
+    def line(self) -> str:
+        """Return the next line."""
+        self.number += 1
+        if self.number > len(self.lines):
+            raise self.error("the file ends here, more was due")
+        return self.lines[self.number - 1]
+
+    def row(self) -> list[str] | None:
+        """Return the words of the next line that is neither empty nor a # comment, None at the end."""
+        while self.number < len(self.lines):
+            words = self.line().split("#")[0].split()
+            if words:
+                return words
+        return None
+
+    def due_row(self, what: str) -> list[str]:
+        """Return the words of the next row, which must be there."""
+        words = self.row()
+        if words is None:
+            self.number += 1
+            raise self.error(f"the file ends here, {what} was due")
+        return words
+
+    def end(self) -> None:
+        """Refuse anything that follows."""
+        words = self.row()
+        if words is not None:
+            raise self.error(f"'{' '.join(words)[:SHOWN]}' after the end of the data")
+
+    def number_of(self, text: str) -> float:
+        """Return a finite number."""
+        try:
+            value = float(text)
+        except ValueError:
+            value = np.nan
+        if not np.isfinite(value):
+            raise self.error(f"'{text[:SHOWN]}' is not a number")
+        return value
+
+    def index_of(self, text: str, count: int, what: str) -> int:
+        """Return an index from 0 to count - 1."""
+        if not text.isdecimal() or int(text) >= count:
+            raise self.error(f"{what} '{text[:SHOWN]}', needed a number from 0 to {count - 1}")
+        return int(text)
+
+    def count_of(self, text: str, what: str) -> int:
+        """Return a number of things, 1 or more."""
+        if not text.isdecimal() or int(text) < 1:
+            raise self.error(f"'{text[:SHOWN]}' where the number of {what} was due")
+        return int(text)
+
+    def numbers(self, fewest: int, most: int, *, photograph: str | None = None) -> FloatArray:
+        """Return a line of numbers, the first of which is that of the photograph if given."""
+        parts = self.line().split()
+        if not fewest <= len(parts) <= most:
+            needed = f"{fewest}" if fewest == most else f"{fewest} to {most}"
+            raise self.error(f"{len(parts)} numbers, needed {needed}")
+        if photograph is not None and parts[0] != photograph:
+            raise self.error(
+                f"'{parts[0][:SHOWN]}' at the start, needed the number {photograph} of the photograph"
+            )
+        return np.array([self.number_of(part) for part in parts])
+
+    def block(self, count: int) -> list[tuple[str, str, FloatArray]]:
+        """Return lines of so many numbers up to an empty one, as (where, first, others)."""
+        rows = []
+        while self.line().strip():
+            self.number -= 1
+            row = self.numbers(count, count)
+            rows.append((self.where, f"{row[0]:.0f}", row[1:]))
+        return rows
+
+
+def write_lines(path: Path, lines: list[str]) -> None:
+    """Write a text file, whole or not at all.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    part = Path(path).with_name(Path(path).name + ".part")
+    try:
+        part.write_text("\n".join(lines) + "\n", encoding="utf-8")
+        part.replace(path)
+    except OSError as error:
+        part.unlink(missing_ok=True)
+        raise OutputError(f"{path}: cannot be written ({error.strerror})") from error
