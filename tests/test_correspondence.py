@@ -2,7 +2,6 @@
 
 import zlib
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,7 +13,6 @@ from sfm.matching.correspondence import match_targets
 from sfm.matching.epipolar import epipolar_distance, essential_matrices
 from sfm.network import Estimate
 
-CAMCAL = Path(__file__).parents[1] / "../shared/data/camcal/camcal-pmexport.txt"
 SIZE = (2000, 1500)
 CAMERA = camera_from_values(
     "synthetic", "brown", SIZE, (0.005, 0.005), c_mm=10.0, values=(("K1", 1e-3), ("P1", 1e-4), ("x0", 0.05))
@@ -247,11 +245,10 @@ def test_bad_input_is_named():
         match_targets(network, np.zeros(3, dtype=int), [np.zeros((0, 2))] * 3, tolerance_px=1, min_rays=1)
 
 
-@pytest.mark.skipif(not CAMCAL.exists(), reason="reference data ../shared/data/camcal is absent")
 @pytest.mark.parametrize("tolerance", [2.0, 10.0])
-def test_camcal_dots_from_the_reference_orientation(tolerance):
+def test_camcal_dots_from_the_reference_orientation(shared_data, tolerance):
     """All 96 dots of a regular grid in 21 photographs, their reference numbers unknown to the matching."""
-    rows = [line.split() for line in CAMCAL.read_text().splitlines()]
+    rows = [line.split() for line in (shared_data / "camcal/camcal-pmexport.txt").read_text().splitlines()]
     station = [k for k, row in enumerate(rows) if len(row) == 2 and row[1].endswith("JPG")]
     eo = np.array([rows[k + 1][1:] for k in station], dtype=float)
     marks = np.array(
