@@ -1,0 +1,167 @@
+"""Radiometry: mean and contrast of patches, histograms and their equalisation, brightness matching."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from sfm.conventions import AnyArray, FloatArray, IntArray
+from sfm.errors import GeometryError, PhotographError
+
+LEVELS_8, LEVELS_16 = 256, 65536
+# Rec. 601, as cv2 turns colour into grey; photographs in memory are red, green, blue here.
+LUMINANCE = (0.299, 0.587, 0.114)
+SMALLEST_WINDOW_PX = 3
+
+
+@dataclass(frozen=True)
+class Radiometry:
+    """Brightness and contrast of a patch or photograph."""
+
+    mean: float  # mean intensity
+    deviation: float  # standard deviation of the intensities, divisor n - 1
+    lowest: float
+    highest: float
+
+
+@dataclass(frozen=True)
+class LinearRadiometry:
+    """target = offset + gain * source, by least squares over the pixels of two patches."""
+
+    offset: float  # target units
+    gain: float  # target units per source unit
+    correlation: float  # coefficient r of the two patches, 0 where one is flat
+
+
+def grey_of(photograph: AnyArray) -> AnyArray:
+    """Return a photograph as one channel of float32, its intensities kept (0-255, 0-65535 or as they are).
+
+    Args:
+        photograph: shape (H, W), or (H, W, 3) in the order red, green, blue; 8 or 16 bit or float.
+
+    Raises:
+        PhotographError: other types or shapes, no pixels, or intensities that are not finite.
+    """
+    array = np.asarray(photograph)
+    if array.dtype not in (np.uint8, np.uint16, np.float32, np.float64):
+        raise PhotographError(f"found {array.dtype} intensities, needed 8 or 16 bit or float")
+    if array.ndim == 3 and array.shape[2] == 3:
+        array = array.astype(np.float32) @ np.array(LUMINANCE, dtype=np.float32)
+    if array.ndim != 2 or array.size == 0:
+        raise PhotographError(f"found a photograph of shape {array.shape}, needed (H, W) or (H, W, 3)")
+    if array.dtype.kind == "f" and not np.isfinite(array).all():
+        raise PhotographError(
+            "found intensities that are not finite, needed numbers in all of the photograph"
+        )
+    return np.ascontiguousarray(array, dtype=np.float32)
+
+
+def odd_window(what: str, side_px: int) -> int:
+    """Return the side of a window that has a pixel in its middle.
+
+    Raises:
+        GeometryError: an even side, or less than 3.
+    """
+    if side_px < SMALLEST_WINDOW_PX or side_px % 2 == 0:
+        raise GeometryError(
+            f"{what}: a window of {side_px} px, needed an odd number of at least {SMALLEST_WINDOW_PX}"
+        )
+    return int(side_px)
+
+
+def patch_around(photograph: AnyArray, centre: tuple[int, int], side_px: int) -> AnyArray:
+    """Return the square of pixels around a pixel, a view of the photograph.
+
+    Args:
+        photograph: shape (H, W) or (H, W, 3).
+        centre: column and row of the pixel in the middle.
+        side_px: odd side.
+
+    Raises:
+        GeometryError: even side, or a window that reaches beyond the photograph.
+    """
+    half = odd_window("patch", side_px) // 2
+    (col, row), (height, width) = centre, photograph.shape[:2]
+    if not (half <= col <= width - 1 - half and half <= row <= height - 1 - half):
+        raise GeometryError(
+            f"patch: a window of {side_px} px around column {col}, row {row} reaches beyond the photograph "
+            f"of {width} x {height} px"
+        )
+    return photograph[row - half : row + half + 1, col - half : col + half + 1]
+
+
+def radiometry_of(patch: AnyArray) -> Radiometry:
+    """Return mean, standard deviation and extremes of a patch or photograph.
+
+    Source: document 002, eq. 2.1 (mean and standard deviation of the grey values).
+    """
+    values = grey_of(patch).astype(float)
+    deviation = float(values.std(ddof=1)) if values.size > 1 else 0.0
+    return Radiometry(float(values.mean()), deviation, float(values.min()), float(values.max()))
+
+
+def histogram(photograph: AnyArray) -> IntArray:
+    """Return the number of pixels at each intensity, (256,) or (65536,) for 16 bit; colour is turned grey."""
+    levels = LEVELS_16 if photograph.dtype == np.uint16 else LEVELS_8
+    values = np.rint(grey_of(photograph)).astype(np.int64).ravel()
+    if values.min() < 0 or values.max() >= levels:
+        raise PhotographError(
+            f"intensities from {values.min()} to {values.max()}, a histogram needs 0 to {levels - 1}"
+        )
+    return np.bincount(values, minlength=levels)
+
+
+def equalise_histogram(photograph: AnyArray) -> AnyArray:
+    """Return the photograph with the intensities spread so that all are equally frequent, same type.
+
+    The lowest intensity becomes 0, the highest the end of the scale; a photograph of one intensity is
+    returned as it is.
+
+    Source: Gonzalez and Woods, Digital Image Processing, sec. 3.3.1; 8 bit is cv2.equalizeHist.
+    """
+    if photograph.dtype == np.uint8 and photograph.ndim == 2:
+        return np.asarray(cv2.equalizeHist(photograph))
+    counts = histogram(photograph)
+    kind = np.uint16 if photograph.dtype == np.uint16 else np.uint8
+    values = np.rint(grey_of(photograph)).astype(np.int64)
+    first = int(values.min())
+    rest = values.size - counts[first]
+    if rest == 0:
+        return values.astype(kind)
+    share = (np.cumsum(counts) - counts[first]) / rest
+    return np.rint(np.clip(share, 0, 1) * (len(counts) - 1)).astype(kind)[values]
+
+
+def fit_radiometry(source: AnyArray, target: AnyArray) -> LinearRadiometry:
+    """Return offset and gain that bring the intensities of one patch nearest to another, pixel by pixel.
+
+    Args:
+        source, target: patches of the same shape.
+
+    Raises:
+        GeometryError: patches of different shape.
+    """
+    a, b = grey_of(source).astype(float), grey_of(target).astype(float)
+    if a.shape != b.shape:
+        raise GeometryError(f"radiometry: patches of shape {a.shape} and {b.shape}, needed the same shape")
+    da, db = a - a.mean(), b - b.mean()
+    aa, bb, ab = float((da * da).sum()), float((db * db).sum()), float((da * db).sum())
+    if aa == 0.0:
+        return LinearRadiometry(float(b.mean()), 0.0, 0.0)
+    gain = ab / aa
+    r = ab / np.sqrt(aa * bb) if bb > 0.0 else 0.0
+    return LinearRadiometry(float(b.mean() - gain * a.mean()), gain, float(r))
+
+
+def match_brightness(source: AnyArray, target: AnyArray) -> FloatArray:
+    """Return the source with mean and standard deviation of the target; the two need not show the same.
+
+    A flat source is given the mean only.
+
+    Source: Kraus (2007), sec. 3.5 (contrast and brightness transfer).
+    """
+    a, b = radiometry_of(source), radiometry_of(target)
+    gain = b.deviation / a.deviation if a.deviation > 0 else 0.0
+    return np.asarray(b.mean + gain * (grey_of(source).astype(float) - a.mean))

@@ -1,0 +1,174 @@
+"""Correlation: known shifts, its precision, pyramid, epipolar path, back-matching and failures."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+from sfm.camera import project
+from sfm.conventions import FloatArray
+from sfm.errors import GeometryError
+from sfm.matching.conjugate import match_points
+from sfm.matching.epipolar_path import epipolar_paths
+from sfm.matching.ncc import NccFlag, match_along_line, match_ncc, match_pyramid
+from tests.synthetic import make_network
+from tests.textures import random_texture, with_noise
+
+SHIFT = np.array([7.3, -4.6])
+SIGMA = 2.0
+
+
+@cache
+def _photographs() -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Two photographs of one texture, the second shifted and of other brightness, and points in the first."""
+    rng = np.random.default_rng(1)
+    texture = random_texture(rng, 2.0)
+    y, x = np.mgrid[0:260, 0:260].astype(float)
+    left = with_noise(texture.value(x, y), SIGMA, 1)
+    right = with_noise(20 + 0.8 * texture.value(x - SHIFT[0], y - SHIFT[1]), SIGMA, 2)
+    at = np.stack(np.meshgrid(np.arange(50, 210, 16), np.arange(50, 210, 16)), axis=-1).reshape(-1, 2)
+    return left, right, at.astype(float)
+
+
+def test_peak_and_regression() -> None:
+    left, right, at = _photographs()
+    matches = match_ncc(left, right, at, at, search_px=61)
+    assert matches.good.all()
+    e = matches.xy - at - SHIFT
+    assert np.abs(e).max() < 0.25
+    assert matches.gain == pytest.approx(np.full(len(at), 0.8), abs=0.1)
+    assert matches.offset == pytest.approx(np.full(len(at), 20), abs=16)
+    assert (matches.second < matches.correlation).all()
+    # the parabola is biased towards whole pixels, which the precision of the peak cannot know
+    sigma = np.sqrt(matches.covariance[:, 0, 0].mean())
+    assert 0.2 < sigma / np.sqrt((e**2).mean()) < 5
+
+
+def test_coefficient_is_that_of_the_definition() -> None:
+    left, right, at = _photographs()
+    matches = match_ncc(left, right, at[:5], at[:5], template_px=9, search_px=41)
+    for k in range(5):
+        x, y = at[k].astype(int)
+        u, v = matches.peak[k].astype(int)
+        a, b = left[y - 4 : y + 5, x - 4 : x + 5].ravel(), right[v - 4 : v + 5, u - 4 : u + 5].ravel()
+        assert matches.correlation[k] == pytest.approx(
+            np.corrcoef(a.astype(float), b.astype(float))[0, 1], abs=1e-9
+        )
+
+
+def test_pyramid_agrees_with_the_whole_search() -> None:
+    left, right, at = _photographs()
+    whole, steps = (
+        match_ncc(left, right, at, at, search_px=81),
+        match_pyramid(left, right, at, at, search_px=81),
+    )
+    assert steps.good.mean() > 0.95
+    both = steps.good & whole.good
+    assert steps.xy[both] == pytest.approx(whole.xy[both], abs=1e-3)  # float32 sums
+
+
+def test_back_matching_confirms_and_refutes() -> None:
+    left, right, at = _photographs()
+    assert match_ncc(left, right, at, at, search_px=61, back_px=0.5).good.all()
+    hidden = right.copy()
+    hidden[90:170, 90:170] = right[10:90, 10:90]  # what was there is gone
+    matches = match_ncc(left, hidden, at, at, search_px=61, back_px=0.5, min_correlation=0.0)
+    gone = (np.abs(at + SHIFT - 129.5) < 25).all(axis=1)
+    assert gone.any() and not matches.good[gone].any()
+
+
+def test_along_a_line() -> None:
+    left, right, at = _photographs()
+    direction = np.array([np.cos(0.5), np.sin(0.5)])
+    lines = [p + SHIFT + 0.7 + direction * np.array([[-60], [60]]) for p in at]
+    matches = match_along_line(left, right, at, lines)
+    assert np.linalg.norm(matches.xy - at - SHIFT, axis=1).max() < 0.5
+    beside = [line + 20 * np.array([-direction[1], direction[0]]) for line in lines]
+    assert not match_along_line(left, right, at, beside, min_correlation=0.8).good.any()
+
+
+def test_epipolar_paths_pass_through_the_conjugate_points() -> None:
+    network, estimate = make_network(np.random.default_rng(3), images=3, points=12)
+    xy = [
+        project(
+            estimate.cameras[network.camera[i]], estimate.position[i], estimate.rotation[i], estimate.points
+        )
+        for i in range(2)
+    ]
+    distance = np.linalg.norm(estimate.position[0] - estimate.points, axis=1)
+    paths = epipolar_paths(
+        estimate, network.camera, 0, 1, xy[0], nearest=0.5 * distance.min(), farthest=2 * distance.max()
+    )
+    for path, q in zip(paths, xy[1], strict=True):
+        a, d = path[:-1], np.diff(path, axis=0)
+        t = np.clip(((q - a) * d).sum(axis=1) / (d * d).sum(axis=1), 0, 1)
+        assert np.linalg.norm(a + t[:, None] * d - q, axis=1).min() < 0.5
+
+
+def test_failures_are_flagged() -> None:
+    left, right, at = _photographs()
+    one = at[:1]
+    flat = np.full((100, 100), 90, np.uint8)
+    assert match_ncc(flat, right, one, one).flag[0] == NccFlag.FLAT_TEXTURE
+    assert match_ncc(left, right, np.array([[4.0, 50.0]]), one).flag[0] == NccFlag.OUTSIDE
+    assert match_ncc(left, right, one, np.array([[-90.0, 50.0]])).flag[0] == NccFlag.OUTSIDE
+    assert match_ncc(left, right, one * np.nan, one).flag[0] == NccFlag.OUTSIDE
+    noise = np.random.default_rng(1).normal(128, 30, (260, 260))
+    assert match_ncc(left, noise, one, one).flag[0] == NccFlag.LOW_CORRELATION
+    stripes = np.tile(128 + 60 * np.sin(np.arange(260) * 2 * np.pi / 8), (260, 1))
+    twice = match_ncc(stripes, stripes, one, one, max_second=0.9)
+    assert twice.flag[0] in (NccFlag.AMBIGUOUS, NccFlag.AT_BORDER)
+    cut = match_ncc(left, right, one, np.array([[40.0, 30.0]]), search_px=121)  # window cut by the corner
+    assert cut.xy[0] == pytest.approx(one[0] + SHIFT, abs=0.25)
+
+
+def test_bad_windows_are_refused_in_one_line() -> None:
+    left, right, at = _photographs()
+    with pytest.raises(GeometryError, match="window of 20 px, needed an odd number"):
+        match_ncc(left, right, at, at, template_px=20)
+    with pytest.raises(GeometryError, match="search window of 19 px for a template of 21 px"):
+        match_ncc(left, right, at, at, template_px=21, search_px=19)
+    with pytest.raises(GeometryError, match="100 points in the left photograph, 1 windows"):
+        match_ncc(left, right, at, at[:1])
+
+
+@pytest.mark.parametrize(
+    ("method", "tolerance"), [("ncc", 0.25), ("lsm", 0.05), ("lsm8", 0.05), ("shift", 0.05)]
+)
+def test_conjugate_points(method: str, tolerance: float) -> None:
+    left, right, at = _photographs()
+    found = match_points(left, right, at, method=method, search_px=61)
+    assert found.good.all()
+    assert found.right == pytest.approx(at + SHIFT, abs=tolerance)
+    eight_bit = [np.rint(p).clip(0, 255).astype(np.uint8) for p in (left, right)]
+    equalised = match_points(*eight_bit, at, method=method, search_px=61, equalise=True)
+    assert equalised.right == pytest.approx(at + SHIFT, abs=2 * tolerance)
+
+
+def test_windows_of_document_002() -> None:
+    left, right, at = _photographs()
+    eight_bit = [np.rint(p).clip(0, 255).astype(np.uint8) for p in (left, right)]
+    found = match_points(
+        *eight_bit, at, xy_right=at + np.rint(SHIFT), template_px=19, search_px=21, equalise=True
+    )
+    assert found.good.all()
+    assert found.right == pytest.approx(at + SHIFT, abs=0.1)
+
+
+def test_a_point_that_is_not_found_says_why() -> None:
+    left, right, _ = _photographs()
+    found = match_points(left, right, np.array([[2.0, 2.0], [100.0, 100.0]]), search_px=61)
+    assert found.reason == ("outside", "")
+    assert np.isnan(found.right[0]).all()
+
+
+def test_float_and_flat_regions_do_not_disturb_the_peak() -> None:
+    left, right, at = _photographs()
+    dark = right.copy()
+    dark[:, 230:] = 0.0
+    dark[:40] = 0.0
+    inside = (at + SHIFT < 215).all(axis=1) & (at + SHIFT > 55).all(axis=1)
+    matches = match_ncc(left, dark, at[inside], at[inside], search_px=101)
+    assert np.linalg.norm(matches.xy - at[inside] - SHIFT, axis=1).max() < 0.5
