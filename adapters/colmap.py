@@ -263,7 +263,12 @@ def write_model(
             _refuse_short(pycolmap, folder, scene)
             side = {
                 "cameras": [
-                    {"name": c.name, "pixel_mm": [float(p) for p in c.pixel_mm], "free": c.free.tolist()}
+                    {
+                        "name": c.name,
+                        "size_px": list(c.size_px),
+                        "pixel_mm": [float(p) for p in c.pixel_mm],
+                        "free": c.free.tolist(),
+                    }
                     for c in estimate.cameras
                 ],
                 "images": {str(i + 1): name for i, name in enumerate(network.images)},
