@@ -131,9 +131,7 @@ def hat_complement(
 
 def without_held(covariance: Covariance, layout: Unknowns) -> Covariance:
     """Return the covariance with NaN for photographs and points that took no part."""
-    n, m = len(layout.point_free), len(layout.exterior_free)
-    idle_point = ~np.isin(np.arange(n), layout.obs.point[layout.active])
-    idle_image = ~np.isin(np.arange(m), layout.obs.image[layout.active])
+    idle_point, idle_image = ~layout.point_on, ~layout.image_on
     points, limiting = covariance.points.copy(), covariance.points_limiting.copy()
     exterior = covariance.exterior.copy()
     points[idle_point] = limiting[idle_point] = np.nan

@@ -90,8 +90,9 @@ def motions_of(layout: Unknowns, weighted: Weighted, state: State, datum: Datum)
         open_motions = Vt[rank:].T
     else:
         open_motions = np.eye(7)
-    H = H @ open_motions * layout.reduced_free()[:, None]
-    points = points @ open_motions * layout.point_free[:, :, None]
+    if len(seen) or not layout.all_free:
+        H = H @ open_motions * layout.reduced_free()[:, None]
+        points = points @ open_motions * layout.point_free[:, :, None]
     d = open_motions.shape[1]
     B, on_reduced = np.zeros_like(points), np.zeros_like(H)
     if d == 0:
@@ -120,8 +121,7 @@ def free_motions(layout: Unknowns, state: State) -> tuple[FloatArray, FloatArray
     Shifts, turns and scale about the centre of the network, the latter two over its size, so that all
     seven are of the same order.
     """
-    on = layout.point_free.any(axis=1) | np.isin(np.arange(len(state.points)), layout.obs.point)
-    cloud = state.points[on & np.isfinite(state.points).all(axis=1)]
+    cloud = state.points[layout.point_on]
     centre = cloud.mean(axis=0)
     size = max(float(np.sqrt(((cloud - centre) ** 2).sum(axis=1).mean())), np.finfo(float).tiny)
 
@@ -168,11 +168,11 @@ def _seen_by_datum(
     points: FloatArray,
 ) -> FloatArray:
     """Return what each motion does to fixed and observed unknowns and distances, one row for each."""
-    involved = np.isin(np.arange(len(state.points)), layout.obs.point[layout.active])
-    photographs = np.isin(np.arange(len(state.position)), layout.obs.image[layout.active])
+    if layout.all_free and weighted.count == 0:
+        return np.zeros((0, 7))
     rows = [
-        points[~layout.point_free & involved[:, None]],
-        exterior[~layout.exterior_free & photographs[:, None]],
+        points[~layout.point_free & layout.point_on[:, None]],
+        exterior[~layout.exterior_free & layout.image_on[:, None]],
     ]
     for p, j in enumerate(weighted.point):
         rows.append(points[j][np.diagonal(weighted.point_weight[p]) > 0])

@@ -33,6 +33,8 @@ class Unknowns:
     interior_free: tuple[IntArray, ...]  # indices of the free parameters of each camera
     interior_start: IntArray  # first interior column of each camera among the reduced unknowns, (a,)
     point_free: BoolArray  # (n, 3)
+    image_on: BoolArray  # photographs that take part, (m,)
+    point_on: BoolArray  # object points that take part, (n,)
     kept: IntArray  # object points that stay among the reduced unknowns, (s,)
     bars: IntArray  # scale bars of the network whose ends take part, (b,)
     reduced: int  # number of reduced unknowns, fixed ones included
@@ -49,6 +51,11 @@ class Unknowns:
         """Number of free unknowns."""
         interior = sum(len(free) for free in self.interior_free)
         return int(self.exterior_free.sum()) + interior + int(self.point_free.sum())
+
+    @property
+    def all_free(self) -> bool:
+        """Whether nothing is fixed or held."""
+        return bool(self.exterior_free.all() and self.point_free.all())
 
     def reduced_free(self) -> BoolArray:
         """Return which of the reduced unknowns are free, (reduced,)."""
@@ -126,6 +133,8 @@ def unknowns_of(network: Network, estimate: Estimate, *, use_control: bool) -> t
         interior_free=interior_free,
         interior_start=6 * m + np.cumsum(counts) - counts,
         point_free=point_free,
+        image_on=np.bincount(k.image[active], minlength=m) > 0,
+        point_on=np.bincount(k.point[active], minlength=n) > 0,
         kept=kept,
         bars=bars,
         reduced=6 * m + int(counts.sum()) + 3 * len(kept),

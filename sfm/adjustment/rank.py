@@ -21,7 +21,7 @@ def rank_defect(optimum: Optimum, layout: Unknowns) -> int:
     It counts the motions that the normal matrix maps to zero, its further null vectors, directions of
     object points that their rays leave open, and the unknowns held for want of image points.
     """
-    found = optimum.factor.verified + optimum.factor.further.shape[1]
+    found = optimum.factor.verified(optimum.normals) + optimum.factor.further.shape[1]
     return found + int(optimum.normals.blocks.held.sum()) + layout.held_defect
 
 

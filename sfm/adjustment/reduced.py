@@ -33,13 +33,18 @@ class Factor:
     cholesky: FloatArray  # upper factor of scale S scale + QQ', (reduced, reduced)
     motions: FloatArray  # Q, null vectors that the datum explains, scaled, orthonormal, (reduced, d)
     further: FloatArray  # null vectors that it does not, scaled, orthonormal, (reduced, e)
-    verified: int  # how many columns of Q the matrix indeed maps to 0
 
     def solve(self, right: FloatArray) -> FloatArray:
         """Return S^+ right for one or several right sides, (reduced,) or (reduced, r)."""
         s = self.scale if right.ndim == 1 else self.scale[:, None]
         x, _ = dpotrs(self.cholesky, s * right)
         return np.asarray(s * x)
+
+    def verified(self, normals: Normals) -> int:
+        """Return how many of the null vectors that the datum explains the normal matrix maps to 0."""
+        S = normals.S * self.scale[:, None] * self.scale
+        SQ = np.triu(S) @ self.motions + np.triu(S, 1).T @ self.motions
+        return int((np.linalg.norm(SQ, axis=0) < np.sqrt(NULL)).sum())
 
     def inverse(self) -> FloatArray:
         """Return the inverse with its null space filled, in the units of the unknowns, (reduced, reduced)."""
@@ -59,17 +64,13 @@ def factor(normals: Normals, motions: Motions, *, damped: bool = False) -> Facto
     scale = 1 / np.sqrt(np.maximum(normals.diagonal, np.finfo(float).tiny))
     S = np.asfortranarray(normals.S * scale[:, None] * scale)
     Q = np.linalg.qr(motions.reduced / scale[:, None])[0] if motions.defect else motions.reduced
-    verified = 0
-    if motions.defect and not damped:
-        SQ = np.triu(S) @ Q + np.triu(S, 1).T @ Q
-        verified = int((np.linalg.norm(SQ, axis=0) < np.sqrt(NULL)).sum())
     if motions.defect:
         S = dsyrk(1.0, Q, beta=1.0, c=S, overwrite_c=1)
     further = np.zeros((len(S), 0))
     cholesky, info = dpotrf(S)
     weak = info != 0 or float(np.diagonal(cholesky).min()) ** 2 < WEAK_PIVOT
     if weak and damped:
-        return None if info != 0 else Factor(scale, cholesky, Q, further, verified)
+        return None if info != 0 else Factor(scale, cholesky, Q, further)
     if weak:
         values, vectors = eigh(S, lower=False)
         further = np.asfortranarray(vectors[:, values < NULL])
@@ -78,4 +79,4 @@ def factor(normals: Normals, motions: Motions, *, damped: bool = False) -> Facto
             cholesky, info = dpotrf(S)
         if info != 0:
             return None
-    return Factor(scale, cholesky, Q, further, verified)
+    return Factor(scale, cholesky, Q, further)

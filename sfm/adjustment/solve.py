@@ -26,6 +26,7 @@ from sfm.adjustment.rank import rank_defect, undetermined_of
 from sfm.adjustment.reliability import redundancy_numbers, standardised_residuals
 from sfm.adjustment.result import Adjustment, Covariance
 from sfm.adjustment.robust import huber_weights, snoop
+from sfm.adjustment.threads import blas_threads
 from sfm.adjustment.weighted import Weighted, weighted_of
 from sfm.conventions import FloatArray
 from sfm.errors import GeometryError
@@ -78,18 +79,19 @@ def adjust(
     layout, state = unknowns_of(network, estimate, use_control=use_control)
     weighted = weighted_of(network, layout, use_control=use_control)
     weight = start_weights(layout, state)
-    near = tolerance if reject == "none" else max(tolerance, ROUND_TOLERANCE)
-    run = _Run(layout, weighted, datum, method, max_iterations, near)
-    optimum, weight = run.minimise(run.start(state, weight), weight)
-    if reject == "tau":
-        optimum, weight = _snoop_all(run, optimum, weight, alpha)
-    elif reject == "huber":
-        optimum, weight = _huber(run, optimum, weight)
-    if near > tolerance:
-        run.tolerance = tolerance
-        optimum = run.again(optimum, weight)
-    Q = cofactors(optimum, layout) if covariance else None
-    return _result(network, estimate, run, optimum, weight, Q, sigma_px)
+    with blas_threads(layout.reduced):
+        near = tolerance if reject == "none" else max(tolerance, ROUND_TOLERANCE)
+        run = _Run(layout, weighted, datum, method, max_iterations, near)
+        optimum, weight = run.minimise(run.start(state, weight), weight)
+        if reject == "tau":
+            optimum, weight = _snoop_all(run, optimum, weight, alpha)
+        elif reject == "huber":
+            optimum, weight = _huber(run, optimum, weight)
+        if near > tolerance:
+            run.tolerance = tolerance
+            optimum = run.again(optimum, weight)
+        Q = cofactors(optimum, layout) if covariance else None
+        return _result(network, estimate, run, optimum, weight, Q, sigma_px)
 
 
 @dataclass

@@ -142,11 +142,9 @@ def variance_components(
     used = ~adjustment.rejected
     v = adjustment.residuals[used]
     P = np.linalg.inv(adjustment.network.image_points.covariance[used])
-    weights = adjustment.weights[used] if len(adjustment.weights) else np.ones(len(v))
-    vPv = np.bincount(group[used], weights * np.einsum("ka,kab,kb->k", v, P, v), minlength=g)
-    redundancy: FloatArray = np.bincount(
-        group[used], adjustment.redundancy_numbers[used].sum(axis=1), minlength=g
-    )
+    vPv, redundancy = np.zeros(g), np.zeros(g)
+    np.add.at(vPv, group[used], adjustment.weights[used] * np.einsum("ka,kab,kb->k", v, P, v))
+    np.add.at(redundancy, group[used], adjustment.redundancy_numbers[used].sum(axis=1))
     enough = redundancy > FEW
     sigma0 = np.where(enough, np.sqrt(vPv / np.where(enough, redundancy, 1.0)), np.nan)
     return VarianceComponents(names, sigma0, redundancy, 2 * np.bincount(group[used], minlength=g))

@@ -109,6 +109,10 @@ def weighted_terms(weighted: Weighted, layout: Unknowns, state: State) -> Weight
 
     Object points are not in it but in `point_terms`.
     """
+    if weighted.count == 0:
+        s = 3 * len(layout.kept)
+        none = np.zeros(0)
+        return WeightedTerms(np.zeros((0, 6, 6)), np.zeros((0, 6)), none, np.zeros((s, s)), np.zeros(s), 0.0)
     e, J = exterior_misclosure(weighted, state)
     e *= layout.exterior_free[weighted.image]
     J = J * layout.exterior_free[weighted.image][:, None, :]
