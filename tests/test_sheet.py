@@ -1,0 +1,139 @@
+"""Sheets of coded targets: read back by the detector, true scale, files whole or not at all."""
+
+import re
+from xml.etree import ElementTree
+
+import cv2
+import numpy as np
+import pytest
+
+from sfm.camera import camera_from_values
+from sfm.errors import GeometryError, OutputError, SurveyFileError
+from sfm.targets.codes import code_family
+from sfm.targets.detect import find_targets
+from sfm.targets.render import render_photograph
+from sfm.targets.scene import CircularTargets, Faces, Optics, Scene
+from sfm.targets.sheet import MARGIN_MM, RULER_MM, lay_out_sheet, write_sheet
+
+PX_PER_MM = 8
+
+
+def drawn(svg, size_mm):
+    """Rasterise the outlines of an SVG page by flattening its curves, y down."""
+    picture = np.full((round(size_mm[1] * PX_PER_MM), round(size_mm[0] * PX_PER_MM)), 255, dtype=np.uint8)
+    t = np.linspace(0, 1, 17)[1:, None]
+    for path in ElementTree.parse(svg).getroot().iter("{http://www.w3.org/2000/svg}path"):
+        points = []
+        for letter, words in re.findall(r"([MLC])([^MLCZ]*)", path.get("d")):
+            xy = np.array(words.split(), dtype=float).reshape(-1, 2)
+            if letter == "C":
+                a, (b, c, d) = points[-1], xy
+                points.extend((1 - t) ** 3 * a + 3 * (1 - t) ** 2 * t * b + 3 * (1 - t) * t**2 * c + t**3 * d)
+            else:
+                points.append(xy[0])
+        polygon = np.round((np.array(points) * PX_PER_MM - 0.5) * 16).astype(np.int32)
+        ink = 255 if path.get("fill") == "#fff" else 0
+        cv2.fillPoly(picture, [polygon], ink, lineType=cv2.LINE_AA, shift=4)
+    return cv2.GaussianBlur(picture, (0, 0), 0.8)
+
+
+@pytest.mark.parametrize("family", ["ring12", "ring14", "ring20"])
+@pytest.mark.parametrize("dark", [True, False])
+def test_the_printed_page_is_read_back(tmp_path, family, dark):
+    numbers = code_family(family).number[:12]
+    sheet = lay_out_sheet(family, numbers, diameter_mm=8.0, dark=dark)
+    (file,) = write_sheet(sheet, tmp_path / "sheet.svg")
+    picture = drawn(file, sheet.size_mm)
+    found = find_targets(picture, polarity="dark" if dark else "bright", codes=family, min_diameter_px=40)
+    read = found.code >= 0
+    assert sorted(found.code[read]) == numbers.tolist()
+    page = sheet.pages[0]
+    for xy, axes, code in zip(found.xy[read], found.semi_axes[read], found.code[read], strict=True):
+        at = page.centre[np.flatnonzero(page.number == code)[0]]
+        expected = np.array([at[0], sheet.size_mm[1] - at[1]]) * PX_PER_MM - 0.5
+        assert xy == pytest.approx(expected, abs=0.1)
+        # OpenCV fills the pixels of the outline as well, so dots come out larger by up to a pixel.
+        assert axes == pytest.approx(4.0 * PX_PER_MM, abs=1.0)
+
+
+def test_a_dot_has_its_diameter_on_paper(tmp_path):
+    (file,) = write_sheet(lay_out_sheet("ring14", np.array([1]), diameter_mm=8.0), tmp_path / "one.svg")
+    root = ElementTree.parse(file).getroot()
+    assert (root.get("width"), root.get("height"), root.get("viewBox")) == ("210mm", "297mm", "0 0 210 297")
+    dot = next(root.iter("{http://www.w3.org/2000/svg}path")).get("d")
+    ends = np.array([words.split()[-2:] for words in re.findall(r"[MLC]([^MLCZ]*)", dot)], dtype=float)
+    centre = ends[:-1].mean(axis=0)
+    assert np.linalg.norm(ends - centre, axis=1) == pytest.approx(4.0, abs=1e-4)
+
+
+def test_the_layout_photographed_gives_its_ids():
+    sheet = lay_out_sheet("ring14", np.arange(1, 13), diameter_mm=10.0)
+    width, height = sheet.size_mm
+    page = sheet.pages[0]
+    marks = page.marks.__class__(
+        page.marks.face, page.marks.kind, page.marks.centre - (width / 2, height / 2), page.marks.shape,
+        0.05 * page.marks.value,
+    )  # fmt: skip
+    face = Faces(
+        np.zeros((1, 3)), np.array([[[1.0, 0, 0], [0, 1, 0]]]), np.array([[width / 2, height / 2]]),
+        np.array([0.9]), np.zeros(1), np.ones(1),
+    )  # fmt: skip
+    none = np.zeros(0, dtype=np.int64)
+    scene = Scene(face, marks, CircularTargets(none, np.zeros((0, 2)), np.zeros(0), none))
+    camera = camera_from_values("c", "brown", (600, 800), (0.01, 0.01), c_mm=10.0)
+    photograph, _ = render_photograph(
+        scene, camera, np.array([0.0, 0.0, 400.0]), np.eye(3), optics=Optics(noise=0.005),
+        rng=np.random.default_rng(0),
+    )  # fmt: skip
+    found = find_targets(photograph, codes="ring14", min_diameter_px=10)
+    assert sorted(found.code[found.code >= 0]) == list(range(1, 13))
+
+
+def test_all_numbers_are_on_pages_that_they_fit_on():
+    sheet = lay_out_sheet("ring14", np.arange(1, 101), diameter_mm=10.0)
+    assert np.concatenate([p.number for p in sheet.pages]).tolist() == list(range(1, 101))
+    for page in sheet.pages:
+        reach = sheet.ring_mm / 2
+        assert (page.centre - reach >= MARGIN_MM).all()
+        assert (page.centre + reach <= np.array(sheet.size_mm) - MARGIN_MM).all()
+        apart = np.linalg.norm(page.centre[:, None] - page.centre, axis=2) + 1e9 * np.eye(len(page.centre))
+        assert apart.min() > 1.3 * sheet.ring_mm
+
+
+def test_a_pdf_has_the_size_of_its_page_and_a_whole_table(tmp_path):
+    sheet = lay_out_sheet("ring14", np.arange(1, 101), diameter_mm=10.0)
+    (file,) = write_sheet(sheet, tmp_path / "new" / "sheet.pdf")
+    content = file.read_bytes()
+    boxes = re.findall(rb"/MediaBox \[0 0 ([\d.]+) ([\d.]+)\]", content)
+    assert len(boxes) == len(sheet.pages) > 1
+    assert [float(v) for v in boxes[0]] == pytest.approx([595.2756, 841.8898], abs=1e-3)
+    start = int(re.search(rb"startxref\n(\d+)", content)[1])
+    assert content[start:].startswith(b"xref")
+    for k, offset in enumerate(re.findall(rb"(\d{10}) 00000 n", content)):
+        assert content[int(offset) :].startswith(b"%d 0 obj" % (k + 1))
+    lengths = re.findall(rb"/Length (\d+) >>\nstream\n(.*?)\nendstream", content, re.DOTALL)
+    assert all(int(length) == len(stream) for length, stream in lengths)
+    ruler = f"{MARGIN_MM + RULER_MM:.5f} {MARGIN_MM:.5f} l".encode()
+    assert ruler in content
+    assert [p.name for p in (tmp_path / "new").iterdir()] == ["sheet.pdf"]
+
+
+def test_svg_pages_are_numbered(tmp_path):
+    sheet = lay_out_sheet("ring14", np.arange(1, 60), diameter_mm=14.0)
+    files = write_sheet(sheet, tmp_path / "t.svg")
+    assert [f.name for f in files] == [f"t-{k + 1}.svg" for k in range(len(sheet.pages))]
+
+
+def test_what_cannot_be_printed_is_named(tmp_path):
+    with pytest.raises(SurveyFileError, match="page 'b5' is none of a4"):
+        lay_out_sheet("ring14", np.array([1]), diameter_mm=10.0, page="b5")
+    with pytest.raises(SurveyFileError, match=r"ring of 300\.0 mm .* does not fit on a4"):
+        lay_out_sheet("ring14", np.array([1]), diameter_mm=100.0)
+    with pytest.raises(SurveyFileError, match="diameter is 0 mm"):
+        lay_out_sheet("ring14", np.array([1]), diameter_mm=0)
+    with pytest.raises(SurveyFileError, match="has no codes"):
+        lay_out_sheet("none", np.array([1]), diameter_mm=10.0)
+    with pytest.raises(GeometryError, match="code 9999"):
+        lay_out_sheet("ring14", np.array([9999]), diameter_mm=10.0)
+    with pytest.raises(OutputError, match=r"written as \.pdf or \.svg"):
+        write_sheet(lay_out_sheet("ring14", np.array([1]), diameter_mm=10.0), tmp_path / "t.doc")
