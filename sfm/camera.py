@@ -20,7 +20,7 @@ import numpy as np
 from numba import njit
 
 from sfm.conventions import BoolArray, FloatArray
-from sfm.errors import GeometryError, SurveyFileError
+from sfm.errors import SurveyFileError
 
 MAX_PARAMETERS = 12
 FIXED_POINT_STEPS = 100
@@ -222,27 +222,21 @@ def project(camera: Camera, position: FloatArray, rotation: FloatArray, points: 
     return pixel_from_tangents(camera, -UVW[:, :2] / W[:, None])
 
 
-def tangent_jacobian(camera: Camera, uv: FloatArray) -> FloatArray:
-    """Return d (pixel residual) / d (u, v) at the given rays, shape (k, 2, 2), px.
+def pixel_jacobian(camera: Camera, xy_px: FloatArray) -> FloatArray:
+    """Return d (x, y) / d (u, v), how pixels move with the tangents of their rays.
 
-    For models that distort the ideal point it is the derivative of the pixel itself.
+    Args:
+        camera: interior orientation.
+        xy_px: pixel coordinates, shape (k, 2), px.
+
+    Returns:
+        Derivatives, shape (k, 2, 2), px; the inverse of central differences over two pixels.
     """
-    rays = np.ascontiguousarray(uv, dtype=float).reshape(-1, 2)
-    return _tangent_jacobians(camera.index, camera.frame, camera.parameters, rays)
-
-
-def inside_model(camera: Camera) -> FloatArray:
-    """Return the largest tangent radius for which the distortion of the photograph can be trusted.
-
-    The corners of the photograph, widened by a tenth, bound it; polynomials mean nothing beyond.
-    """
-    width, height = camera.size_px
-    corners = np.array([[0, 0], [width, 0], [0, height], [width, height]], dtype=float)
-    uv = tangents_from_pixel(camera, corners)
-    radius = np.hypot(uv[:, 0], uv[:, 1])
-    if not np.isfinite(radius).any():
-        raise GeometryError(f"camera {camera.name}: its distortion cannot be inverted at the corners")
-    return 1.1 * np.nanmax(radius)
+    columns = []
+    for step in np.eye(2):
+        ahead = tangents_from_pixel(camera, xy_px + step)
+        columns.append((ahead - tangents_from_pixel(camera, xy_px - step)) / 2)
+    return np.linalg.inv(np.stack(columns, axis=-1))
 
 
 @njit(cache=True, inline="always", error_model="numpy")
@@ -490,13 +484,3 @@ def _pixels(model, frame, p, uv):  # type: ignore[no-untyped-def]
         xy[i, 0] = x if solved else np.nan
         xy[i, 1] = y if solved else np.nan
     return xy
-
-
-@njit(cache=True, error_model="numpy")
-def _tangent_jacobians(model, frame, p, uv):  # type: ignore[no-untyped-def]
-    r, Ju, Jp = np.empty(2), np.empty((2, 2)), np.empty((2, MAX_PARAMETERS))
-    out = np.empty((len(uv), 2, 2))
-    for i in range(len(uv)):
-        observe(model, frame, p, frame[0], frame[1], uv[i, 0], uv[i, 1], r, Ju, Jp)
-        out[i] = Ju
-    return out

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Protocol
 
 
@@ -26,3 +29,19 @@ class Silent:
 
 
 SILENT: Progress = Silent()
+
+
+class StageClock:
+    """Announces stages and keeps how long each took."""
+
+    def __init__(self, progress: Progress) -> None:
+        self.progress = progress
+        self.seconds: list[tuple[str, float]] = []
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        """Announce a stage and time what is done in it."""
+        self.progress.stage(name)
+        begun = time.perf_counter()
+        yield
+        self.seconds.append((name, time.perf_counter() - begun))

@@ -74,6 +74,8 @@ class TargetSettings(Section):
     polarity: Literal["dark", "bright", "auto"] = "auto"
     codes: Name = "none"  # a code family, or a table file relative to the survey file
     min_diameter_px: Length = 6.0
+    eccentricity: bool = True  # whether to correct it
+    diameter: Length | None = None  # of all targets, object unit; else of each from its ellipses
 
 
 class DatumSettings(Section):

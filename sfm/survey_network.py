@@ -32,6 +32,12 @@ def min_rays(naming: Naming) -> IntArray:
     return np.where(naming.code >= 0, 2, MIN_RAYS)
 
 
+def codes_of(naming: Naming, network: Network) -> IntArray:
+    """Return the code number of each point of a network, -1 where uncoded, (n,)."""
+    code = dict(zip(naming.names, naming.code, strict=True))
+    return np.array([code[name] for name in network.points], dtype=np.int64)
+
+
 def name_coded(photographs: MeasuredPhotographs) -> Naming:
     """Name the coded targets by their code; a code read twice in one photograph names nothing there."""
     codes = [found.code for found in photographs.targets]

@@ -12,6 +12,7 @@ from sfm.adjustment.solve import adjust
 from sfm.conventions import BoolArray, IntArray
 from sfm.errors import GeometryError
 from sfm.network import Estimate, Network, reduce_network
+from sfm.orientation.sequence import Orientation
 from sfm.project import Survey
 from sfm.report.result import ControlCheck
 from sfm.similarity import Similarity, fit_similarity
@@ -45,9 +46,7 @@ def match_and_adjust(
     survey: Survey,
     photographs: MeasuredPhotographs,
     naming: Naming,
-    estimate: Estimate,
-    *,
-    tolerance_px: float,
+    start: Orientation,
 ) -> tuple[Naming, Network, Estimate]:
     """Name the uncoded targets and adjust in turn, with a tolerance that shrinks with the residuals.
 
@@ -55,19 +54,19 @@ def match_and_adjust(
         survey: what to do.
         photographs: all measured targets.
         naming: the coded targets by name.
-        estimate: orientation from the coded targets.
-        tolerance_px: how far a target may be from its projected point at the beginning.
+        start: orientation from the coded targets, with the tolerance it has left.
 
     Returns:
         The naming, its network, and the adjusted estimate.
     """
+    estimate, tolerance_px = start.estimate, float(start.tolerance_px.max())
     for _ in range(ROUNDS):
         naming, estimate = match_uncoded(photographs, naming, estimate, tolerance_px=tolerance_px)
         network = build_network(survey, photographs, naming)
         everything = np.ones(len(network.image_points), dtype=bool)
         images, points = determined(network, estimate, everything, min_rays(naming))
-        part, start = reduce_network(network, estimate, images, points, everything)
-        adjusted = adjust(part, start, datum=Datum("free"), reject="huber", covariance=False)
+        part, values = reduce_network(network, estimate, images, points, everything)
+        adjusted = adjust(part, values, datum=Datum("free"), reject="huber", covariance=False)
         estimate = put_back(estimate, adjusted.estimate, images, points)
         spread = MAD_TO_SIGMA * float(np.median(np.abs(adjusted.residuals)))
         tolerance_px = float(np.clip(TOLERANCE_FACTOR * spread, MIN_TOLERANCE_PX, tolerance_px))
@@ -186,17 +185,25 @@ def _accepted(network: Network, adjustment: Adjustment, images: BoolArray, point
     return accepted
 
 
-def _rescaled(network: Network, estimate: Estimate, datum: Datum) -> Estimate:
-    """Bring a network that control does not hold to the length of its scale bars, which start it near."""
-    bars = network.scale_bars
-    if datum.kind == "control" or not len(bars):
-        return estimate
+def object_scale(network: Network, estimate: Estimate) -> float:
+    """Return object units per unit of an estimate by its scale bars, else its control, else NaN."""
+    bars, control = network.scale_bars, network.control
     length = np.linalg.norm(estimate.points[bars.end] - estimate.points[bars.start], axis=1)
     usable = np.isfinite(length) & (length > 0)
-    if not usable.any():
+    if usable.any():
+        return float(np.median(bars.length[usable] / length[usable]))
+    known = estimate.determined[control.point]
+    if known.sum() >= 3:
+        return fit_similarity(estimate.points[control.point[known]], control.xyz[known]).scale
+    return float("nan")
+
+
+def _rescaled(network: Network, estimate: Estimate, datum: Datum) -> Estimate:
+    """Bring a network that control does not hold to the length of its scale bars, so that it starts near."""
+    if datum.kind == "control" or not len(network.scale_bars):
         return estimate
-    scale = float(np.median(bars.length[usable] / length[usable]))
-    return Similarity(scale, np.eye(3), np.zeros(3)).apply_estimate(estimate)
+    scale = object_scale(network, estimate)
+    return Similarity(scale, np.eye(3), np.zeros(3)).apply_estimate(estimate) if scale > 0 else estimate
 
 
 def _placed_on_control(network: Network, estimate: Estimate) -> tuple[Estimate, ControlCheck]:

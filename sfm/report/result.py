@@ -63,6 +63,15 @@ class ControlCheck:
 
 
 @dataclass(frozen=True)
+class Eccentricity:
+    """By how much image points were corrected because a circle's centre is not its ellipse's centre."""
+
+    largest_px: float  # longest correction, px
+    rms_px: float  # root mean square per coordinate, px
+    sigma_px: float  # root mean square of the standard deviations of a corrected coordinate, px
+
+
+@dataclass(frozen=True)
 class SurveyResult:
     """Result of a survey: the adjustment and what a person must know to judge it."""
 
@@ -76,6 +85,8 @@ class SurveyResult:
     photographs: tuple[PhotographTargets, ...] = ()  # of every readable photograph; none with [observations]
     control_check: ControlCheck | None = None  # None without control, or where the datum is control
     warnings: tuple[str, ...] = ()  # one line each, in words
+    eccentricity: Eccentricity | None = None  # None where it was not corrected
+    no_circles: tuple[str, ...] = ()  # uncoded points left out: their outlines are not images of one circle
     seconds: tuple[StageTime, ...] = field(default_factory=tuple)  # in the order of the stages
 
     @property

@@ -1,0 +1,108 @@
+"""The targets of a survey as circles in space: what is none, and the eccentricity of what is one."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from sfm.camera import pixel_jacobian
+from sfm.conventions import BoolArray, IntArray
+from sfm.network import Estimate, ImagePoints, Network
+from sfm.project import Survey
+from sfm.report.result import Eccentricity
+from sfm.survey_network import UNNAMED, Naming
+from sfm.survey_solution import object_scale
+from sfm.survey_targets import MeasuredPhotographs
+from sfm.targets.eccentricity import CircleViews, ellipse_shape, fit_circles
+
+NOT_A_CIRCLE = (
+    0.1  # relative misfit of the semi-axes; targets have 0.003 to 0.03, letters and leaves over 0.2
+)
+
+
+@dataclass(frozen=True)
+class CircleCheck:
+    """The network after its targets were compared with circles in space."""
+
+    network: Network  # image points of the circles' centres
+    estimate: Estimate  # without the points that are no circles
+    no_circles: tuple[str, ...]  # uncoded points left out: their outlines are not images of one circle
+    eccentricity: Eccentricity | None  # what was corrected; None where nothing was
+
+
+def check_circles(
+    survey: Survey, photographs: MeasuredPhotographs, naming: Naming, network: Network, estimate: Estimate
+) -> CircleCheck:
+    """Leave out uncoded points that are no circles, and correct the others for eccentricity.
+
+    Radius and normal of every target come from its ellipses; a diameter that the survey gives replaces the
+    radius. The covariance of the correction is added to that of the image point.
+
+    Args:
+        survey: says whether to correct the eccentricity, and the diameter if it is known.
+        photographs, naming: the targets that `network` was built from.
+        network: all image points.
+        estimate: adjusted, in any datum and scale.
+
+    """
+    seen = network.image_points
+    rows = estimate.oriented[seen.image] & estimate.determined[seen.point]
+    rays = np.bincount(seen.point[rows], minlength=len(network.points))
+    rows &= rays[seen.point] >= 2
+    numbers, point = np.unique(seen.point[rows], return_inverse=True)
+    if not len(numbers):
+        return CircleCheck(network, estimate, (), None)
+    views = _views(photographs, naming, network, estimate, rows, point)
+    circles = fit_circles(views, len(numbers))
+    no_circle = numbers[(circles.misfit > NOT_A_CIRCLE) & (naming.code[numbers] < 0)]
+    points = estimate.points.copy()
+    points[no_circle] = np.nan
+    estimate = replace(estimate, points=points)
+    names = tuple(network.points[j] for j in no_circle)
+    if not survey.targets.eccentricity:
+        return CircleCheck(network, estimate, names, None)
+    if survey.targets.diameter is not None:
+        scale = object_scale(network, estimate)
+        if np.isnan(scale):  # then the targets themselves tell the scale
+            scale = survey.targets.diameter / 2 / float(np.median(circles.radius))
+        known = np.full(len(numbers), survey.targets.diameter / 2 / scale)
+        circles = fit_circles(views, len(numbers), radius=known)
+    xy, covariance = seen.xy.copy(), seen.covariance.copy()
+    xy[rows] -= circles.shift
+    covariance[rows] += circles.shift_covariance
+    corrected = replace(network, image_points=ImagePoints(seen.image, seen.point, xy, covariance))
+    kept = np.isin(numbers, no_circle, invert=True)[point]
+    length = np.linalg.norm(circles.shift[kept], axis=1)
+    sigma = np.trace(circles.shift_covariance[kept], axis1=1, axis2=2) / 2
+    summary = Eccentricity(
+        float(length.max(initial=0.0)),
+        float(np.sqrt(np.sum(length**2) / max(2 * len(length), 1))),
+        float(np.sqrt(np.sum(sigma) / max(len(sigma), 1))),
+    )
+    return CircleCheck(corrected, estimate, names, summary)
+
+
+def _views(
+    photographs: MeasuredPhotographs,
+    naming: Naming,
+    network: Network,
+    estimate: Estimate,
+    rows: BoolArray,
+    point: IntArray,
+) -> CircleViews:
+    """Return the ellipses of some image points with the rays they were seen along."""
+    shape = np.concatenate(
+        [
+            ellipse_shape(found.semi_axes, found.angle)[named != UNNAMED]
+            for found, named in zip(photographs.targets, naming.point, strict=True)
+        ]
+    )[rows]
+    seen = network.image_points.select(rows)
+    rotation = estimate.rotation[seen.image]
+    outward = estimate.points[seen.point] - estimate.position[seen.image]
+    jacobian = np.empty((len(seen), 2, 2))
+    for index, camera in enumerate(estimate.cameras):
+        own = network.camera[seen.image] == index
+        jacobian[own] = pixel_jacobian(camera, seen.xy[own])
+    return CircleViews(point, shape, np.einsum("kji,kj->ki", rotation, outward), rotation, jacobian)

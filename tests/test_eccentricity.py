@@ -1,0 +1,104 @@
+"""Eccentricity against circles projected point by point."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from sfm.camera import Camera, camera_from_values, pixel_jacobian, project
+from sfm.conventions import FloatArray, rotation_from_vector
+from sfm.targets.eccentricity import CircleViews, ellipse_shape, fit_circles
+
+CAMERA = camera_from_values(
+    "c", "brown", (4000, 3000), (0.005, 0.005), c_mm=20.0, values=(("K1", 1e-5), ("P1", 1e-6))
+)
+RADIUS = np.array([4.0, 6.0, 5.0])  # mm
+NORMALS = np.array([[0.0, 0.0, 1.0], [0.5, 0.0, np.sqrt(0.75)], [-0.3, 0.4, np.sqrt(0.75)]])
+CENTRES = np.array([[0.0, 0.0, 0.0], [60.0, -40.0, 10.0], [-50.0, 45.0, -20.0]])  # mm
+POSITIONS = np.array(
+    [[0.0, -250.0, 400.0], [300.0, 50.0, 350.0], [-260.0, 120.0, 380.0], [40.0, 280.0, 360.0]]
+)  # mm
+
+
+def looking_at_origin(position: FloatArray) -> FloatArray:
+    z = position / np.linalg.norm(position)
+    x = np.cross([0.0, 1.0, 0.0], z)
+    x /= np.linalg.norm(x)
+    return np.column_stack([x, np.cross(z, x), z])
+
+
+def drawn_ellipse(
+    camera: Camera, position: FloatArray, R: FloatArray, j: int
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Centre, shape (of the ellipse through projected circle points) and image of the circle's centre."""
+    n = NORMALS[j]
+    e1 = np.cross(n, [1.0, 0.2, 0.1])
+    e1 /= np.linalg.norm(e1)
+    t = np.linspace(0, 2 * np.pi, 721)[:-1, None]
+    circle = CENTRES[j] + RADIUS[j] * (np.cos(t) * e1 + np.sin(t) * np.cross(n, e1))
+    xy = project(camera, position, R, circle)
+    offset = xy.mean(axis=0)
+    centre, axes, angle = cv2.fitEllipseDirect(((xy - offset) * 16).astype(np.float32))
+    semi = np.array(axes)[None] / 32
+    shape = ellipse_shape(semi, np.deg2rad([angle]))[0]
+    return np.array(centre) / 16 + offset, shape, project(camera, position, R, CENTRES[j : j + 1])[0]
+
+
+def scene() -> tuple[CircleViews, FloatArray]:
+    rows = []
+    for position in POSITIONS:
+        R = looking_at_origin(position) @ rotation_from_vector(np.array([0.0, 0.0, 0.7]))
+        for j in range(len(RADIUS)):
+            centre, shape, image = drawn_ellipse(CAMERA, position, R, j)
+            ray = R.T @ (CENTRES[j] - position)
+            rows.append((j, shape, ray, R, pixel_jacobian(CAMERA, image[None])[0], centre - image))
+    point, shape, rays, R, J, shift = (np.array(column) for column in zip(*rows, strict=True))
+    return CircleViews(point, shape, rays, R, J), shift
+
+
+def test_radius_normal_and_shift_of_drawn_circles() -> None:
+    views, shift = scene()
+    circles = fit_circles(views, len(RADIUS))
+    assert circles.radius == pytest.approx(RADIUS, rel=2e-3)
+    angle = np.arccos(np.clip(np.sum(circles.normal * NORMALS, axis=1), -1, 1))
+    assert np.rad2deg(angle).max() < 0.3
+    assert np.abs(shift).max() > 0.3  # px: there is something to correct
+    # what is left is the curvature of the distortion over the target and the drawn ellipse's rounding
+    assert np.abs(circles.shift - shift).max() < 0.01 * np.abs(shift).max()
+
+
+def test_known_radius_is_kept() -> None:
+    views, shift = scene()
+    circles = fit_circles(views, len(RADIUS), radius=np.array([4.0, np.nan, 5.0]))
+    assert circles.radius[[0, 2]] == pytest.approx([4.0, 5.0], abs=1e-12)
+    assert (circles.covariance[0, 2] == 0).all()
+    assert np.abs(circles.shift - shift).max() < 0.01 * np.abs(shift).max()
+
+
+def test_one_wrong_ellipse_does_not_turn_the_target() -> None:
+    views, shift = scene()
+    views.shape[0] *= 1.5
+    circles = fit_circles(views, len(RADIUS))
+    good = np.arange(len(shift)) != 0
+    assert np.abs(circles.shift - shift)[good].max() < 0.15 * np.abs(shift).max()
+
+
+def test_sigma_of_the_shift_follows_the_scatter() -> None:
+    views, _ = scene()
+    rng = np.random.default_rng(7)
+    truth = fit_circles(views, len(RADIUS)).shift
+    noise = 0.004  # relative, of the semi-axes
+    errors, sigmas = [], []
+    for _ in range(200):
+        E = noise * rng.standard_normal((len(truth), 3)) * [1, 1, 1 / np.sqrt(2)]
+        L = np.linalg.cholesky(views.shape)
+        W = np.eye(2) + np.stack([2 * E[:, [0, 2]], np.stack([2 * E[:, 2], 2 * E[:, 1]], axis=1)], axis=1)
+        noisy = CircleViews(
+            views.point, L @ W @ np.swapaxes(L, 1, 2), views.rays, views.rotation, views.pixel_jacobian
+        )
+        circles = fit_circles(noisy, len(RADIUS))
+        errors.append(circles.shift - truth)
+        sigmas.append(np.diagonal(circles.shift_covariance, axis1=1, axis2=2))
+    ratio = np.mean(np.square(errors)) / np.mean(sigmas)
+    assert 0.7 < ratio < 1.4
