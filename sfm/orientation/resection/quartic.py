@@ -1,8 +1,9 @@
-"""Real positive roots of a quartic, found between its turning points so that no root is missed.
+"""Real positive roots of a quartic, none of which is missed.
 
-Closed formulas (Ferrari) lose the near-double roots that occur when the camera is near the danger
-cylinder of three points. Here every interval between turning points is searched by bracketed Newton
-steps, and a turning point that touches zero within rounding counts as a double root.
+Ferrari's two quadratic factors give the roots where they multiply back to the quartic and no two roots
+are near each other. Closed formulas lose the near-double roots that occur when the camera is near the
+danger cylinder of three points; there every interval between turning points is searched by bracketed
+Newton steps, and a turning point that touches zero within rounding counts as a double root.
 """
 
 from __future__ import annotations
@@ -15,6 +16,8 @@ from sfm.conventions import FloatArray
 MAX_ROOTS = 8  # four roots, each of which may be reported once more as a touching turning point
 TOUCH = 1e-9  # |f| at a turning point over sum |coefficient| below which it counts as a double root
 STEPS = 60
+FACTORED = 1e-11  # misfit of the product of the factors over sum |coefficient| that is accepted
+APART = 1e-5  # discriminant of a factor over p^2 + 4 |q| above which its roots are real or complex for sure
 CONVERGED = 1e-9  # relative step; the error after it is its square, or what rounding allows
 
 
@@ -28,24 +31,94 @@ def positive_roots(coefficients: FloatArray) -> FloatArray:
         Roots in ascending order; near-double roots may appear as two close values, shape (r,).
     """
     roots = np.empty(MAX_ROOTS)
-    n = find_positive_roots(np.ascontiguousarray(coefficients[::-1], dtype=float), roots)
+    G4, G3, G2, G1, G0 = np.asarray(coefficients, dtype=float)
+    n = find_positive_roots(G0, G1, G2, G3, G4, roots)
     return np.sort(roots[:n])
 
 
-@njit(cache=True)
-def find_positive_roots(g, roots):  # type: ignore[no-untyped-def]
-    """Fill the positive roots of g[0] + g[1] x + ... + g[4] x^4 and return their number.
-
-    Roots up to 1 are found in x and those above 1 in 1/x, so that every search is in (0, 1].
-    """
-    n = _roots_in_unit_interval(g[0], g[1], g[2], g[3], g[4], roots, 0)
-    m = _roots_in_unit_interval(g[4], g[3], g[2], g[1], g[0], roots, n)
+@njit(cache=True, error_model="numpy", fastmath={"contract"})
+def find_positive_roots(g0, g1, g2, g3, g4, roots):  # type: ignore[no-untyped-def]
+    """Fill the positive roots of g0 + g1 x + ... + g4 x^4 and return their number."""
+    n = _roots_by_factors(g0, g1, g2, g3, g4, roots)
+    if n >= 0:
+        return n
+    # up to 1 in x, above 1 in 1/x, so that every search is in (0, 1]
+    n = _roots_in_unit_interval(g0, g1, g2, g3, g4, roots, 0)
+    m = _roots_in_unit_interval(g4, g3, g2, g1, g0, roots, n)
     for i in range(n, m):
         roots[i] = 1.0 / roots[i]
     return m
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy", fastmath={"contract"})
+def _roots_by_factors(g0, g1, g2, g3, g4, roots):  # type: ignore[no-untyped-def]
+    """Ferrari: x^4 + a x^3 + b x^2 + c x + d = (x^2 + p x + q)(x^2 + r x + s); -1 if it is not safe."""
+    reverse = abs(g0) > abs(g4)
+    if reverse:
+        g0, g1, g3, g4 = g4, g3, g1, g0
+    if g4 == 0.0:
+        return -1
+    a, b, c, d = g3 / g4, g2 / g4, g1 / g4, g0 / g4
+    y = _largest_cubic_root(-b, a * c - 4.0 * d, d * (4.0 * b - a * a) - c * c)
+    under_p, under_q = 0.25 * a * a - b + y, 0.25 * y * y - d
+    if under_p < 0.0 or under_q < 0.0:
+        return -1
+    half_p, half_q = np.sqrt(under_p), np.sqrt(under_q)
+    # p s + r q = a y / 2 - 2 half_p half_q must be c; the larger of the two roots gives the smaller
+    if under_p * d * d > under_q * b * b:
+        half_q = 0.25 * (a * y - 2.0 * c) / half_p
+    elif half_q > 0.0:
+        half_p = 0.25 * (a * y - 2.0 * c) / half_q
+    p, r = 0.5 * a + half_p, 0.5 * a - half_p
+    q, s = 0.5 * y + half_q, 0.5 * y - half_q
+    misfit = abs(p + r - a) + abs(q + s + p * r - b) + abs(p * s + q * r - c) + abs(q * s - d)
+    if not misfit < FACTORED * (1.0 + abs(a) + abs(b) + abs(c) + abs(d)):
+        return -1
+    n = 0
+    for factor in range(2):
+        e, f = (p, q) if factor == 0 else (r, s)
+        disc = e * e - 4.0 * f
+        if abs(disc) < APART * (e * e + 4.0 * abs(f)):
+            return -1
+        if disc < 0.0:
+            continue
+        far = -0.5 * (e + (np.sqrt(disc) if e >= 0.0 else -np.sqrt(disc)))
+        near = f / far
+        for x in (far, near):
+            if not x > 0.0:
+                continue
+            # a root shared by both factors is a double root of the quartic
+            t = x * x + (r * x + s if factor == 0 else p * x + q)
+            if abs(t) < APART * (x * x + abs(r * x) + abs(s) if factor == 0 else x * x + abs(p * x) + abs(q)):
+                return -1
+            slope = ((4.0 * x + 3.0 * a) * x + 2.0 * b) * x + c
+            x -= ((((x + a) * x + b) * x + c) * x + d) / slope
+            roots[n] = 1.0 / x if reverse else x
+            n += 1
+    return n
+
+
+@njit(cache=True, error_model="numpy", fastmath={"contract"})
+def _largest_cubic_root(b, c, d):  # type: ignore[no-untyped-def]
+    """Largest real root of y^3 + b y^2 + c y + d (Cardano, Vieta), polished by one Newton step."""
+    shift = b / 3.0
+    p = c / 3.0 - shift * shift
+    q = shift * (shift * shift - 0.5 * c) + 0.5 * d
+    square = q * q + p * p * p
+    if square >= 0.0:
+        w = np.cbrt(abs(q) + np.sqrt(square))
+        t = (w - p / w if w > 0.0 else 0.0) * (-1.0 if q > 0.0 else 1.0)
+    else:
+        root = np.sqrt(-p)
+        t = 2.0 * root * np.cos(np.arccos(max(-1.0, min(1.0, -q / (root * root * root)))) / 3.0)
+    y = t - shift
+    slope = (3.0 * y + 2.0 * b) * y + c
+    if slope != 0.0:
+        y -= (((y + b) * y + c) * y + d) / slope
+    return y
+
+
+@njit(cache=True, error_model="numpy", fastmath={"contract"})
 def _roots_in_unit_interval(g0, g1, g2, g3, g4, roots, n):  # type: ignore[no-untyped-def]
     """Append the roots of the quartic in (0, 1] behind the first n and return the new number."""
     # turning points of the quartic are the roots of its derivative, whose turning points are those of
@@ -95,7 +168,7 @@ def _roots_in_unit_interval(g0, g1, g2, g3, g4, roots, n):  # type: ignore[no-un
     return n
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy", fastmath={"contract"})
 def _bracketed(g0, g1, g2, g3, g4, low, high, f_low):  # type: ignore[no-untyped-def]
     """Newton's method kept inside a bracket by bisection."""
     x = 0.5 * (low + high)

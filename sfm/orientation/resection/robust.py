@@ -10,7 +10,7 @@ from numba import njit
 from scipy.special import bdtrc
 
 from sfm.conventions import BoolArray, FloatArray
-from sfm.orientation.resection.fischler_bolles import MAX_SOLUTIONS, rays_from_tangents, solve_triple
+from sfm.orientation.resection.fischler_bolles import MAX_SOLUTIONS, WORK, rays_from_tangents, solve_triple
 from sfm.orientation.resection.least_squares import (
     DONE,
     LIMIT,
@@ -168,7 +168,7 @@ def _search(tangents, rays, points, weights, tolerance, max_trials, seed, X0, R,
     """Fill the best pose, the points that fit it, residuals and normal matrix; return trials (-1: none)."""
     n = len(points)
     position, rotation = np.empty((MAX_SOLUTIONS, 3)), np.empty((MAX_SOLUTIONS, 3, 3))
-    legs, work = np.empty((MAX_SOLUTIONS, 3)), np.empty(32)
+    legs, work = np.empty((MAX_SOLUTIONS, 3)), np.empty(WORK)
     ray3, point3, pick = np.empty((3, 3)), np.empty((3, 3)), np.zeros(3, dtype=np.int64)
     try_X0, try_R = np.empty(3), np.empty((3, 3))
     history = np.empty((0, 6))

@@ -15,7 +15,7 @@ from sfm.orientation.resection.fischler_bolles import (
     is_triangle,
     polish_legs,
     rays_from_tangents,
-    sides_and_gaps,
+    squared_sides,
 )
 from sfm.orientation.resection.quartic import MAX_ROOTS, find_positive_roots
 from sfm.orientation.resection.solution import Solution, checked_points, ordered, solution_of
@@ -59,10 +59,9 @@ def resect_triples_zeng_wang(rays: FloatArray, points: FloatArray) -> Poses:
 
 def distance_quartic(rays: FloatArray, points: FloatArray) -> FloatArray:
     """Return N1 to N5 of the quartic in n = R3/R1 of one triple, shape (5,); document 001, eq. 2.72."""
-    sides, gaps, N = np.empty(3), np.empty(3), np.empty(5)
-    sides_and_gaps(np.asarray(rays, dtype=float), np.asarray(points, dtype=float), sides, gaps)
-    _quartic(sides, gaps, N)
-    return N[::-1].copy()
+    ab, ac, bc = squared_sides(np.asarray(points, dtype=float))
+    gab, gac, gbc = squared_sides(np.asarray(rays, dtype=float))
+    return np.array(_quartic(ab, ac, bc, gab / 2, gac / 2, gbc / 2)[::-1])
 
 
 @njit(cache=True)
@@ -79,30 +78,32 @@ def _resect_batch(rays, points):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def _solve(rays, points, position, rotation, distances):  # type: ignore[no-untyped-def]
-    sides, gaps, N = np.empty(3), np.empty(3), np.empty(5)
     roots, R123, S = np.empty(MAX_ROOTS), np.empty(3), np.empty(3)
-    sides_and_gaps(rays, points, sides, gaps)
-    if not is_triangle(sides) or not (gaps[0] > 0.0 and gaps[1] > 0.0 and gaps[2] > 0.0):
+    L3, L2, L1 = squared_sides(points)
+    g12, g13, g23 = squared_sides(rays)
+    g12, g13, g23 = 0.5 * g12, 0.5 * g13, 0.5 * g23  # 1 - cos, exact also for small angles
+    if not is_triangle(L3, L2, L1) or not (g12 > 0.0 and g13 > 0.0 and g23 > 0.0):
         return 0
-    _quartic(sides, gaps, N)
+    N5, N4, N3, N2, N1 = _quartic(L3, L2, L1, g12, g13, g23)
     n = 0
-    for k in range(find_positive_roots(N, roots)):
+    for k in range(find_positive_roots(N5, N4, N3, N2, N1, roots)):
         x = roots[k]
-        p2 = sides[1] / ((x - 1.0) ** 2 + 2.0 * x * gaps[1])  # R1^2, from side 13 = L2
+        p2 = L2 / ((x - 1.0) ** 2 + 2.0 * x * g13)  # R1^2, from side 13
         p = np.sqrt(p2)
-        # R2 from side 12 = L3 (eq. 2.77 with L3, which the document misprints as L2), side 23 decides
-        radicand = sides[0] / p2 - gaps[0] * (2.0 - gaps[0])
+        # R2 from side 12 (eq. 2.77 with L3, which the document misprints as L2), side 23 decides
+        radicand = L3 / p2 - g12 * (2.0 - g12)
         root = np.sqrt(radicand) if radicand > 0.0 else 0.0
-        high, low = 1.0 - gaps[0] + root, 1.0 - gaps[0] - root
-        off_high = abs(((high - x) ** 2 + 2.0 * high * x * gaps[2]) * p2 / sides[2] - 1.0)
-        off_low = abs(((low - x) ** 2 + 2.0 * low * x * gaps[2]) * p2 / sides[2] - 1.0)
+        high, low = 1.0 - g12 + root, 1.0 - g12 - root
+        off_high = abs(((high - x) ** 2 + 2.0 * high * x * g23) * p2 / L1 - 1.0)
+        off_low = abs(((low - x) ** 2 + 2.0 * low * x * g23) * p2 / L1 - 1.0)
         for side in range(2):
             m, off, other = (high, off_high, off_low) if side == 0 else (low, off_low, off_high)
             if m <= 0.0 or (off > other and off > NEAR):
                 continue
-            R123[0], R123[1], R123[2] = p, m * p, x * p
-            if not polish_legs(R123, sides, gaps) or n == MAX_SOLUTIONS or is_known(R123, distances, n):
+            fits, R1, R2, R3 = polish_legs(p, m * p, x * p, L3, L2, L1, g12, g13, g23)
+            if not fits or n == MAX_SOLUTIONS or is_known(R1, R2, R3, distances, n):
                 continue
+            R123[0], R123[1], R123[2] = R1, R2, R3
             trilaterate(points, R123, direction_test(rays), S)
             distances[n] = R123
             position[n] = S
@@ -112,24 +113,23 @@ def _solve(rays, points, position, rotation, distances):  # type: ignore[no-unty
 
 
 @njit(cache=True)
-def _quartic(sides, gaps, N):  # type: ignore[no-untyped-def]
-    """N[i], the coefficient of n^i, from A^2 - D1 A B + B^2 C = 0.
+def _quartic(L3, L2, L1, g12, g13, g23):  # type: ignore[no-untyped-def]
+    """N5 to N1, the coefficients of 1 to n^4, from A^2 - D1 A B + B^2 C = 0; sides squared, gaps 1 - cos.
 
     m = R2/R1 = A/B by the difference of the equations of sides 12 and 23, with q = n^2 - F1 n + 1:
     A = (K32 - K12) q + n^2 - 1, B = E1 n - D1, C = 1 - K32 q.
     """
-    D1, F1, E1 = 2.0 * (1.0 - gaps[0]), 2.0 * (1.0 - gaps[1]), 2.0 * (1.0 - gaps[2])
-    K12, K32 = sides[2] / sides[1], sides[0] / sides[1]
+    D1, F1, E1 = 2.0 * (1.0 - g12), 2.0 * (1.0 - g13), 2.0 * (1.0 - g23)
+    K12, K32 = L1 / L2, L3 / L2
     K = K32 - K12
     a2, a1, a0 = K + 1.0, -K * F1, K - 1.0
     c2, c1, c0 = -K32, K32 * F1, 1.0 - K32
-    N[4] = a2 * a2 + E1 * E1 * c2
-    N[3] = 2.0 * a2 * a1 - D1 * E1 * a2 + E1 * E1 * c1 - 2.0 * E1 * D1 * c2
-    N[2] = (
-        a1 * a1 + 2.0 * a2 * a0 - D1 * (E1 * a1 - D1 * a2) + E1 * E1 * c0 - 2.0 * E1 * D1 * c1 + D1 * D1 * c2
-    )
-    N[1] = 2.0 * a1 * a0 - D1 * (E1 * a0 - D1 * a1) - 2.0 * E1 * D1 * c0 + D1 * D1 * c1
-    N[0] = a0 * a0 + D1 * D1 * a0 + D1 * D1 * c0
+    N1 = a2 * a2 + E1 * E1 * c2
+    N2 = 2.0 * a2 * a1 - D1 * E1 * a2 + E1 * E1 * c1 - 2.0 * E1 * D1 * c2
+    N3 = a1 * a1 + 2.0 * a2 * a0 - D1 * (E1 * a1 - D1 * a2) + E1 * E1 * c0 - 2.0 * E1 * D1 * c1 + D1 * D1 * c2
+    N4 = 2.0 * a1 * a0 - D1 * (E1 * a0 - D1 * a1) - 2.0 * E1 * D1 * c0 + D1 * D1 * c1
+    N5 = a0 * a0 + D1 * D1 * a0 + D1 * D1 * c0
+    return N5, N4, N3, N2, N1
 
 
 @njit(cache=True)
