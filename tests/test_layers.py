@@ -14,7 +14,7 @@ LAYERS = (
     ("sfm.targets", "sfm.matching", "sfm.orientation", "sfm.adjustment"),
     ("sfm.analysis",),
     ("sfm.report", "sfm.pipeline", "sfm.project", "sfm.survey_"),
-    ("sfm.batch", "sfm.batch_", "sfm.cli"),
+    ("sfm.batch", "sfm.batch_", "sfm.cli", "sfm.warm_up"),
 )
 CV2_ROOMS = ("sfm.targets", "sfm.matching", "sfm.report", "sfm.orientation")
 CV2_THREADS = "adapters.dask_cluster"  # holds OpenCV to one thread per worker, as it does BLAS

@@ -1,0 +1,124 @@
+"""Compile the kernels of a survey ahead of the first one: python -m sfm.warm_up
+
+Numba keeps compiled kernels on disk; the first run of each would take most of a minute otherwise. Every part
+works on a small made-up problem in a process of its own, since numba compiles one function at a time.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+
+import numpy as np
+
+from sfm.adjustment.datum import Datum
+from sfm.adjustment.solve import adjust
+from sfm.analysis.comparison import common_problem, reprojection
+from sfm.camera import camera_from_values, project
+from sfm.conventions import AnyArray
+from sfm.matching.correspondence import match_targets
+from sfm.network import Estimate, ImagePoints, Network, empty_estimate
+from sfm.orientation.sequence import orient
+from sfm.targets.codes import code_family
+from sfm.targets.detect import find_targets
+
+IMAGES, POINTS = 8, 40
+SIZE_PX, PIXEL_MM, C_MM = (1000, 800), (0.01, 0.01), 10.0
+DISTANCE = 4.0  # of the cameras, the points lie within 1 of the origin
+NOISE_PX = 0.05
+FREE = ("c", "x0", "y0", "K1", "P1", "P2")
+
+
+def compile_targets() -> None:
+    """Find dark and bright targets in a drawn photograph, with rings of cells and with arcs."""
+    for bright in (False, True):
+        for codes in ("ring14", "arcs"):
+            find_targets(_photograph(bright), polarity="auto", codes=codes)
+
+
+def compile_orientation() -> None:
+    """Orient a network from nothing but its image points, and match them without their names."""
+    network, truth = _network()
+    orient(network, empty_estimate(network, truth.cameras), refine=lambda _, estimate: estimate)
+    seen = network.image_points
+    match_targets(
+        truth,
+        network.camera,
+        [seen.xy[seen.image == i] for i in range(IMAGES)],
+        tolerance_px=1.0,
+        diameters_px=[np.full(int((seen.image == i).sum()), 10.0) for i in range(IMAGES)],
+    )
+
+
+def compile_adjustment() -> None:
+    """Adjust a network in every way that a survey does, and prepare its comparison."""
+    network, truth = _network()
+    adjust(network, truth, datum=Datum("free"), reject="huber", covariance=False)
+    adjustment = adjust(network, truth, datum=Datum("free"), reject="tau")
+    part, start, _, _ = common_problem(adjustment)
+    compared = adjust(part, start, datum=Datum("free"), reject="none")
+    reprojection(part, compared.estimate)
+
+
+PARTS = (compile_orientation, compile_adjustment, compile_targets)  # the longest first
+
+
+def main() -> None:
+    """Compile all parts, as many at a time as there are cores."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    with ProcessPoolExecutor(min(cores, len(PARTS)), mp_context=get_context("spawn")) as pool:
+        for done in [pool.submit(part) for part in PARTS]:
+            done.result()
+
+
+def _network() -> tuple[Network, Estimate]:
+    """Return a convergent network with a little noise, and its truth."""
+    rng = np.random.default_rng(1)
+    camera = camera_from_values(
+        "camera", "brown", SIZE_PX, PIXEL_MM, c_mm=C_MM, free=FREE, values=(("K1", 1e-4),)
+    )
+    points = rng.uniform(-0.7, 0.7, (POINTS, 3))
+    angle = 2 * np.pi * np.arange(IMAGES) / IMAGES
+    position = DISTANCE * np.stack([0.7 * np.cos(angle), 0.7 * np.sin(angle), np.full(IMAGES, 0.7)], axis=1)
+    back = position / np.linalg.norm(position, axis=1)[:, None]
+    right = np.stack([-np.sin(angle), np.cos(angle), np.zeros(IMAGES)], axis=1)
+    rotation = np.stack([right, np.cross(back, right), back], axis=2)
+    xy = np.stack(
+        [project(camera, X0, R, points) for X0, R in zip(position, rotation, strict=True)]
+    ) + rng.normal(0, NOISE_PX, (IMAGES, POINTS, 2))
+    k = IMAGES * POINTS
+    network = Network(
+        tuple(f"photograph {i}" for i in range(IMAGES)),
+        np.zeros(IMAGES, dtype=np.int64),
+        tuple(str(j) for j in range(POINTS)),
+        ImagePoints(
+            np.repeat(np.arange(IMAGES), POINTS),
+            np.tile(np.arange(POINTS), IMAGES),
+            xy.reshape(k, 2),
+            np.tile(np.eye(2) * NOISE_PX**2, (k, 1, 1)),
+        ),
+    )
+    return network, Estimate((camera,), position, rotation, points)
+
+
+def _photograph(bright: bool) -> AnyArray:
+    """Return a small photograph with four dots, one of them in a ring of cells."""
+    family = code_family("ring14")
+    assert family is not None
+    pattern = int(family.pattern[20])
+    y, x = np.mgrid[:240, :240]
+    light = np.zeros((240, 240))
+    for cx, cy in ((60.3, 60.7), (180.1, 60.2), (60.4, 180.5), (180.6, 180.3)):
+        light += np.clip(8.5 - np.hypot(x - cx, y - cy), 0, 1)
+    r, angle = np.hypot(x - 60.3, y - 60.7), np.arctan2(y - 60.7, x - 60.3) % (2 * math.pi)
+    cell = (angle / (2 * math.pi) * family.cells).astype(int)
+    ring = np.clip(r - 8.5 * family.inner, 0, 1) * np.clip(8.5 * family.outer - r, 0, 1)
+    light += ring * ((pattern >> (family.cells - 1 - cell)) & 1)
+    noise = np.random.default_rng(2).normal(0, 2, light.shape)
+    return np.clip((40 + 160 * light if bright else 200 - 160 * light) + noise, 0, 255).astype(np.uint8)
+
+
+if __name__ == "__main__":
+    main()
