@@ -23,7 +23,6 @@ from typing import Any
 
 import numpy as np
 
-from sfm.analysis.significance import Result
 from sfm.camera import MODELS, Camera
 from sfm.conventions import FloatArray, angles_from_rotation, rotation_from_angles
 from sfm.errors import OutputError, SurveyFileError
@@ -33,7 +32,20 @@ SIGMAS = ("sX", "sY", "sZ")
 COLMAP_SIDE_FILE = "colmap/kolinear.json"  # as written by adapters.colmap
 
 
-def read_result(folder: Path) -> Result:
+@dataclass(frozen=True)
+class TableResult:
+    """A result as its tables tell it."""
+
+    name: str  # of the survey
+    network: Network
+    estimate: Estimate
+    point_covariance: FloatArray | None = None  # diagonal: of sX, sY, sZ, object unit^2, (n, 3, 3)
+    position_covariance: FloatArray | None = None  # likewise of the projection centres, (m, 3, 3)
+    interior_sigma: tuple[FloatArray, ...] | None = None  # of each parameter, NaN where fixed
+    redundancy: int | None = None
+
+
+def read_result(folder: Path) -> TableResult:
     """Read the tables of a result, rejected image points left out.
 
     Raises:
@@ -57,7 +69,7 @@ def read_result(folder: Path) -> Result:
     points = table.keys("id")
     xyz, point_sigma = table.numbers(("X", "Y", "Z")), table.maybe_numbers(SIGMAS)
     network = Network(images, camera, points, _image_points(folder, images, points))
-    return Result(
+    return TableResult(
         str(summary.get("survey", folder.name)),
         network,
         Estimate(cameras, exterior[:, :3].copy(), rotation, xyz),
@@ -68,7 +80,7 @@ def read_result(folder: Path) -> Result:
     )
 
 
-def write_tables(folder: Path, result: Result) -> None:
+def write_tables(folder: Path, result: TableResult) -> None:
     """Write a result as tables with named columns.
 
     Raises:

@@ -19,13 +19,15 @@ from adapters.bundle_text import (
 )
 from adapters.colmap import read_model, write_model
 from adapters.colmap_database import read_database, write_database
+from adapters.formats import FORMATS as FILE_FORMATS
+from adapters.formats import format_named, format_of, read_any, write_any
 from adapters.metashape import read_metashape, write_metashape
 from adapters.photomodeler import read_photomodeler, write_photomodeler
 from adapters.ply import read_ply, write_ply
 from sfm.analysis.comparison import reprojection
-from sfm.analysis.conversion import convert_camera
+from sfm.analysis.conversion import convert_camera, convert_cameras
 from sfm.camera import Camera, camera_from_values
-from sfm.errors import OutputError, SurveyFileError
+from sfm.errors import KolinearError, OutputError, SurveyFileError
 from sfm.network import Estimate, Network, ObjectPoints
 from tests.synthetic import DISTORTION, make_network, seed_of
 
@@ -388,3 +390,40 @@ def test_conversion_opens_the_way_between_formats(tmp_path: Path) -> None:
     shift = reprojection(again, estimate)[b] - reprojection(network, truth)[a]
     # b1 of 2e-4 times a distortion of 40 px is the 0.008 px that Metashape's affinity differs by
     assert np.hypot(*shift.T).max() <= conversion.max_px + 0.008
+
+
+@pytest.mark.parametrize(
+    "name", [form.name for form in FILE_FORMATS if form.readable and form.name != "colmap-database"]
+)
+def test_formats_are_recognised_and_go_round_by_name(name: str, tmp_path: Path) -> None:
+    """From brown through any format: converted where it must be, read back by what is there."""
+    values = () if name.startswith("bundle") else _no_affinity()
+    network, truth = network_in("brown", values=values, full=True)
+    if name == "bal":  # one focal length, no decentring
+        network, truth = network_in("opencv", values=(("k1", -0.08), ("k2", 0.04)))
+    estimate, conversions = convert_cameras(truth, format_named(name).models)
+    path = tmp_path / "out"
+    write_any(path, name, spaceless(network), estimate)
+    assert format_of(path.rename(tmp_path / "x.xml") if name == "metashape" else path).name == name
+    again, read = read_any(tmp_path / "x.xml" if name == "metashape" else path)
+    a, b = by_position(network), by_position(again)
+    shift = reprojection(again, read)[b] - reprojection(network, truth)[a]
+    # BAL's photographs have no size, so only differences of pixels survive; those are residuals.
+    assert np.abs(shift).max() <= max(one.max_px for one in conversions) + 1e-6
+
+
+def test_formats_refuse_by_name(tmp_path: Path) -> None:
+    network, truth = network_in("brown")
+    with pytest.raises(SurveyFileError, match="format 'dxf' is none of colmap"):
+        format_named("dxf")
+    with pytest.raises(KolinearError, match="format bal holds models opencv, not brown"):
+        write_any(tmp_path / "x", "bal", network, truth)
+    (tmp_path / "note.txt").write_text("hello\n")
+    with pytest.raises(SurveyFileError, match=r"note\.txt, line 1: this is no format that is known"):
+        format_of(tmp_path / "note.txt")
+    with pytest.raises(SurveyFileError, match="neither a COLMAP model nor tables"):
+        format_of(tmp_path)
+    with pytest.raises(OutputError, match="needs a new or empty folder"):
+        write_any(tmp_path, "tables", network, truth)
+    with pytest.raises(OutputError, match="needs a new file"):
+        write_any(tmp_path, "photomodeler", network, truth)

@@ -24,6 +24,7 @@ from sfm.camera import (
 )
 from sfm.conventions import BoolArray, FloatArray
 from sfm.errors import GeometryError, SurveyFileError
+from sfm.network import Estimate
 
 GRID_STEPS = 32  # fit points along the longer side: the misfit varies as r^9 at most, four of them per period
 FIT_TOLERANCE = 1e-15  # relative; the fit is small, so it runs to the end of double precision
@@ -107,6 +108,22 @@ def convert_camera(camera: Camera, model: str, *, region_px: FloatArray | None =
         float(np.sqrt((misfit**2).mean())),
         float(np.sqrt((misfit**2).sum(axis=1).max())),
     )
+
+
+def convert_cameras(estimate: Estimate, models: tuple[str, ...]) -> tuple[Estimate, tuple[Conversion, ...]]:
+    """Return the estimate with every camera in one of some models, and what that cost.
+
+    A camera that is in one of them already stays as it is; any other goes into the first.
+
+    Args:
+        estimate: a solution.
+        models: models that are wanted, the best first.
+    """
+    conversions = tuple(
+        convert_camera(camera, camera.model if camera.model in models else models[0])
+        for camera in estimate.cameras
+    )
+    return replace(estimate, cameras=tuple(one.camera for one in conversions)), conversions
 
 
 def start_values(camera: Camera, model: str) -> Camera:

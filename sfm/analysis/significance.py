@@ -14,6 +14,7 @@ Concepts of network and deformation analysis, sec. 7.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
 from scipy.stats import chi2, f
@@ -41,6 +42,23 @@ class Result:
     position_covariance: FloatArray | None = None  # of projection centres, object unit^2, (m, 3, 3)
     interior_sigma: tuple[FloatArray, ...] | None = None  # of each parameter, NaN where fixed
     redundancy: int | None = None  # of the adjustment, for the test's degrees of freedom
+
+
+class ResultLike(Protocol):
+    """What is compared: a Result, or what an adapter read that has the same fields."""
+
+    @property
+    def name(self) -> str: ...
+    @property
+    def network(self) -> Network: ...
+    @property
+    def estimate(self) -> Estimate: ...
+    @property
+    def point_covariance(self) -> FloatArray | None: ...
+    @property
+    def interior_sigma(self) -> tuple[FloatArray, ...] | None: ...
+    @property
+    def redundancy(self) -> int | None: ...
 
 
 @dataclass(frozen=True)
@@ -84,7 +102,12 @@ class ResultComparison:
 
 
 def compare_results(
-    a: Result, b: Result, *, align: str = "points", control: tuple[str, ...] = (), alpha: float = ALPHA
+    a: ResultLike,
+    b: ResultLike,
+    *,
+    align: str = "points",
+    control: tuple[str, ...] = (),
+    alpha: float = ALPHA,
 ) -> ResultComparison:
     """Align b to a and test the differences.
 
@@ -138,8 +161,8 @@ def _common(
 
 
 def _align(
-    a: Result,
-    b: Result,
+    a: ResultLike,
+    b: ResultLike,
     align: str,
     points: tuple[IntArray, IntArray],
     images: tuple[IntArray, IntArray],
@@ -179,7 +202,7 @@ def _sum(
 
 
 def _tests(
-    a: Result, b: Result, difference: FloatArray, covariance: FloatArray, alpha: float
+    a: ResultLike, b: ResultLike, difference: FloatArray, covariance: FloatArray, alpha: float
 ) -> tuple[FloatArray, float, float]:
     """T of each point, its critical value for one of all points, and that of the mean of T."""
     n = len(difference)
@@ -203,7 +226,7 @@ def _tests(
     return statistic, float(f.isf(one, 3, freedom)), float(f.isf(every, 3 * tested, freedom))
 
 
-def _interior(a: Result, b: Result, ia: IntArray, ib: IntArray) -> tuple[InteriorDifference, ...]:
+def _interior(a: ResultLike, b: ResultLike, ia: IntArray, ib: IntArray) -> tuple[InteriorDifference, ...]:
     """Differences of the cameras that took the same photographs, each pair once."""
     found = []
     pairs = dict.fromkeys(zip(a.network.camera[ia].tolist(), b.network.camera[ib].tolist(), strict=True))

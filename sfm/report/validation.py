@@ -1,0 +1,223 @@
+"""A validation as validation.csv, validation.json and validation.html."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from sfm.analysis.validation import SAME, SAME_COST, Trial, Validation
+from sfm.report.markup import figure, table
+from sfm.report.pages import csv_text, page, png, write_files
+
+COLUMNS = (
+    "network",
+    "arrangement",
+    "photographs",
+    "points",
+    "image_points",
+    "planar",
+    "visibility",
+    "noise_px",
+    "model",
+    "cameras",
+    "interior",
+    "datum",
+    "cost_kolinear_px2",
+    "cost_other_px2",
+    "rms_kolinear_px",
+    "rms_other_px",
+    "iterations_kolinear",
+    "iterations_other",
+    "seconds_kolinear",
+    "seconds_other",
+    "interior_over_sigma",
+    "position_over_sigma",
+    "rotation_over_sigma",
+    "point_over_sigma",
+    "conditional_covariance_difference",
+    "interior_covariance_difference",
+    "marginal_over_conditional_sigma",
+    "verdict",
+    "reason",
+)
+BLUE, RED = "#1f5fa8", "#c8372d"
+TIME_CAPTION = (
+    "Seconds of adjustment on one thread. The other adjuster runs until its cost stands still, for the sake "
+    "of the comparison; in everyday use it stops earlier."
+)
+
+
+def write_validation(validation: Validation, out: Path) -> Path:
+    """Write a validation into a folder and return the path of its page.
+
+    Raises:
+        OutputError: the folder holds something else or cannot be written.
+    """
+    rows = [trial_row(trial) for trial in validation.trials]
+    text = json.dumps(validation_summary(validation), indent=2, allow_nan=False)
+    return write_files(
+        out,
+        (
+            ("validation.csv", csv_text(COLUMNS, rows)),
+            ("validation.json", text + "\n"),
+            ("validation.html", validation_page(validation)),
+        ),
+        main="validation.html",
+    )
+
+
+def trial_row(trial: Trial) -> tuple[object, ...]:
+    """Return one trial in the order of COLUMNS."""
+    plan = trial.plan
+    return (
+        *(trial.number, plan.arrangement, plan.images, trial.points, trial.image_points),
+        *(int(plan.planar), plan.visibility, plan.noise_px, plan.model, plan.cameras, plan.interior),
+        *(plan.datum, *trial.cost, *trial.rms_px, *trial.iterations, *trial.seconds),
+        *(trial.interior_sigmas, trial.position_sigmas, trial.rotation_sigmas, trial.point_sigmas),
+        *(trial.conditional_difference, trial.interior_difference, trial.marginal_over_conditional),
+        *(trial.verdict, trial.reason),
+    )
+
+
+def validation_summary(validation: Validation) -> dict[str, Any]:
+    """Return what validation.json holds: plain values only, None for what is not known."""
+    return {
+        "backend": validation.backend,
+        "seed": validation.seed,
+        "networks": len(validation.trials),
+        "passed": validation.passed,
+        "verdicts": dict(validation.counts()),
+        "largest": {name: _number(value) for name, value, _ in largest(validation)},
+        "seconds": {
+            "kolinear": _number(sum(_known(t.seconds[0] for t in validation.trials))),
+            validation.backend: _number(sum(_known(t.seconds[1] for t in validation.trials))),
+        },
+        "trials": [_plain(asdict(trial)) for trial in validation.trials],
+    }
+
+
+def largest(validation: Validation) -> tuple[tuple[str, float, str], ...]:
+    """Return name, largest value over all networks, and meaning of every difference."""
+    trials = validation.trials
+    solved = [t for t in trials if t.verdict == SAME]
+    costs = [abs(t.cost[1] - t.cost[0]) / min(t.cost) for t in solved if min(t.cost) > 0]
+    return (
+        ("cost", max(costs, default=math.nan), "relative difference of the costs"),
+        ("interior", _max(t.interior_sigmas for t in solved), "of a free parameter, over its sigma"),
+        ("position", _max(t.position_sigmas for t in solved), "of a projection centre, over its sigma"),
+        ("rotation", _max(t.rotation_sigmas for t in solved), "of a rotation, over its sigma"),
+        ("point", _max(t.point_sigmas for t in solved), "of an object coordinate, over its sigma"),
+        (
+            "conditional covariance",
+            _max(t.conditional_difference for t in trials),
+            "of the points' covariances with cameras held, relative",
+        ),
+        (
+            "interior covariance",
+            _max(t.interior_difference for t in trials),
+            "of the marginal covariances of the interior orientation, relative",
+        ),
+    )
+
+
+def validation_page(validation: Validation) -> str:
+    """Return the page: verdicts, largest differences, time, and every network."""
+    count = len(validation.trials)
+    same = dict(validation.counts()).get(SAME, 0)
+    verdict = f"{same} of {count} networks: both adjusters end at the same optimum. "
+    verdict += (
+        "Kolinear is nowhere the worse one."
+        if validation.passed
+        else f"Kolinear is the worse one in {sum(t.worse for t in validation.trials)}."
+    )
+    level = "bad" if not validation.passed else "good" if same == count else "fair"
+    name = validation.backend
+    other = [t for t in validation.trials if t.verdict != SAME]
+    sections = [
+        (
+            "Verdicts",
+            table(("verdict", "networks"), [(v, str(n)) for v, n in validation.counts()])
+            + f"<p class=note>Same optimum: costs within {SAME_COST:g} of one another, relative.</p>",
+        ),
+        (
+            "Largest differences",
+            table(("", "largest", ""), [(n, f"{v:.1e}", text) for n, v, text in largest(validation)])
+            + "<p>A point's sigma counts all that is uncertain (marginal); with photographs and cameras "
+            "held, "
+            f"as {name} gives it, it is smaller: by {_median_ratio(validation):.2f} in the median.</p>",
+        ),
+        ("Time", figure(png(time_figure(validation)), TIME_CAPTION)),
+    ]
+    if other:
+        rows = [(str(t.number), t.plan.arrangement, t.verdict, t.reason) for t in other]
+        sections.append(("Not the same", table(("network", "arrangement", "verdict", "reason"), rows)))
+    listed = (
+        *("network", "arrangement", "photographs", "points", "image points", "noise px", "model"),
+        *("interior", "datum", "cost", "relative difference", "steps", "seconds", "point / sigma", "verdict"),
+    )
+    all_rows = [_listed(t) for t in validation.trials]
+    sections.append(
+        ("All networks", f"<details><summary>{count} networks</summary>{table(listed, all_rows)}</details>")
+    )
+    return page("Validation", f"Kolinear and {name}, seed {validation.seed}", verdict, level, sections)
+
+
+def time_figure(validation: Validation) -> Figure:
+    """Draw the seconds of both adjusters over the number of image points."""
+    k = np.array([t.image_points for t in validation.trials])
+    seconds = np.array([t.seconds for t in validation.trials])
+    picture = Figure(figsize=(8.5, 3.6), layout="constrained")
+    axes = picture.subplots()
+    axes.loglog(k, seconds[:, 0], "o", ms=3.5, color=BLUE, label="kolinear")
+    axes.loglog(k, seconds[:, 1], "o", ms=3.5, color=RED, label=validation.backend)
+    axes.set_xlabel("image points")
+    axes.set_ylabel("s")
+    axes.grid(alpha=0.3)
+    axes.legend(frameon=False)
+    return picture
+
+
+def _listed(t: Trial) -> tuple[str, ...]:
+    relative = (t.cost[1] - t.cost[0]) / t.cost[0] if t.cost[0] > 0 else math.nan
+    return (
+        *(str(t.number), t.plan.arrangement, str(t.plan.images), str(t.points), str(t.image_points)),
+        *(f"{t.plan.noise_px:.2f}", t.plan.model, t.plan.interior, t.plan.datum, f"{t.cost[0]:.6g}"),
+        *(f"{relative:.1e}", f"{t.iterations[0]} / {t.iterations[1]}"),
+        *(f"{t.seconds[0]:.2f} / {t.seconds[1]:.2f}", f"{t.point_sigmas:.1e}", t.verdict),
+    )
+
+
+def _median_ratio(validation: Validation) -> float:
+    known = list(_known(t.marginal_over_conditional for t in validation.trials))
+    return float(np.median(known)) if known else math.nan
+
+
+def _known(values):  # type: ignore[no-untyped-def]
+    return (value for value in values if math.isfinite(value))
+
+
+def _max(values) -> float:  # type: ignore[no-untyped-def]
+    return max(_known(values), default=math.nan)
+
+
+def _number(value: float) -> float | None:
+    return float(value) if math.isfinite(value) else None
+
+
+def _plain(value: Any) -> Any:
+    """Return a value with NaN as None and tuples as lists."""
+    if isinstance(value, dict):
+        return {key: _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    if isinstance(value, float | np.floating):
+        return _number(float(value))
+    if isinstance(value, np.integer | np.bool_):
+        return value.item()
+    return value

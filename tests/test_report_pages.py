@@ -1,0 +1,118 @@
+"""Pages of a validation and of a comparison: complete, self-contained, escaped, whole or not at all."""
+
+from __future__ import annotations
+
+import csv
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sfm.analysis.random_network import Plan
+from sfm.analysis.significance import Result, ResultComparison, compare_results
+from sfm.analysis.validation import SAME, Trial, Validation
+from sfm.errors import OutputError
+from sfm.report.differences import write_differences
+from sfm.report.validation import COLUMNS, write_validation
+from tests.synthetic import make_network, seed_of
+
+PLAN = Plan("ring", 8, 60, False, 0.8, 0.1, "opencv", 1, "all", "free")
+
+
+def trial(number: int, *, cost: float = 10.0, verdict: str = SAME, worse: bool = False) -> Trial:
+    return Trial(
+        number,
+        PLAN,
+        60,
+        400,
+        (10.0, cost),
+        (0.1, 0.1),
+        (5, 12),
+        (0.01, 0.02),
+        1e-6,
+        2e-6,
+        3e-6,
+        4e-6,
+        1e-12,
+        np.nan,
+        1.4,
+        verdict,
+        "" if verdict == SAME else "colmap: <out of order>",
+        worse,
+    )
+
+
+def test_validation_is_written_with_every_figure(tmp_path: Path) -> None:
+    lost = trial(1, cost=np.nan, verdict="colmap failed")
+    path = write_validation(Validation("colmap", 7, (trial(0), lost)), tmp_path / "out")
+    with (tmp_path / "out" / "validation.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert list(rows[0]) == list(COLUMNS)
+    assert rows[0]["verdict"] == SAME and rows[1]["cost_other_px2"] == ""
+    summary = json.loads((tmp_path / "out" / "validation.json").read_text())
+    assert summary["passed"] is True
+    assert summary["verdicts"] == {SAME: 1, "colmap failed": 1}
+    assert summary["largest"]["cost"] == 0.0
+    assert summary["trials"][1]["cost"] == [10.0, None]
+    page = path.read_text(encoding="utf-8")
+    assert "1 of 2 networks" in page
+    assert "colmap: &lt;out of order&gt;" in page and "<out of order>" not in page
+    assert 'src="http' not in page and 'href="http' not in page
+
+
+def test_a_worse_kolinear_is_said_first(tmp_path: Path) -> None:
+    worse = trial(3, cost=9.0, verdict="different optima, colmap lower", worse=True)
+    page = write_validation(Validation("colmap", 7, (trial(0), worse)), tmp_path / "out").read_text()
+    assert '<div class="banner bad"><strong>1 of 2 networks' in page
+    assert "Kolinear is the worse one in 1." in page
+
+
+def test_foreign_folders_are_left_alone(tmp_path: Path) -> None:
+    validation = Validation("colmap", 7, (trial(0),))
+    write_validation(validation, tmp_path / "out")
+    write_validation(validation, tmp_path / "out")  # an earlier one is replaced
+    (tmp_path / "out" / "mine.txt").write_text("keep")
+    with pytest.raises(OutputError, match=r"holds 'mine\.txt'"):
+        write_validation(validation, tmp_path / "out")
+    assert (tmp_path / "out" / "mine.txt").read_text() == "keep"
+    with pytest.raises(OutputError, match="a file is in the way"):
+        write_validation(validation, tmp_path / "out" / "mine.txt")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["out"]
+
+
+@pytest.fixture
+def moved() -> tuple[ResultComparison, np.ndarray]:
+    network, truth = make_network(seed_of("page"), model="opencv", images=5, points=20)
+    covariance = np.tile(np.eye(3) * 1e-8, (20, 1, 1))
+    points = truth.points.copy()
+    points[4] += 0.003
+    a = Result("before", network, truth, covariance, redundancy=100)
+    b = Result("after <b>", network, replace(truth, points=points), covariance, redundancy=100)
+    found = compare_results(a, b, align="control", control=("1", "2", "9", "15"))
+    return found, truth.points
+
+
+def test_comparison_is_written_with_every_point(
+    moved: tuple[ResultComparison, np.ndarray], tmp_path: Path
+) -> None:
+    path = write_differences(*moved, tmp_path / "out", unit="m")
+    with (tmp_path / "out" / "differences.csv").open() as file:
+        rows = {row["id"]: row for row in csv.DictReader(file)}
+    assert len(rows) == 20
+    assert [name for name, row in rows.items() if row["significant"] == "1"] == ["5"]
+    assert float(rows["5"]["dX"]) == pytest.approx(0.003)
+    summary = json.loads((tmp_path / "out" / "comparison.json").read_text())
+    assert summary["significant"] == ["5"] and summary["changed"] is True
+    page = path.read_text(encoding="utf-8")
+    assert "The points differ significantly." in page
+    assert "after &lt;b&gt;" in page and "after <b>" not in page
+
+
+def test_comparison_without_sigmas_says_so(tmp_path: Path) -> None:
+    network, truth = make_network(seed_of("bare"), model="opencv", images=5, points=20)
+    found = compare_results(Result("a", network, truth), Result("b", network, truth))
+    page = write_differences(found, truth.points, tmp_path / "out").read_text()
+    assert "No standard deviations are known" in page
+    assert json.loads((tmp_path / "out" / "comparison.json").read_text())["changed"] is None
