@@ -9,36 +9,25 @@ orientation is learnt while the network grows.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sfm.camera import Camera, project, tangents_from_pixel
+from sfm.camera import Camera
 from sfm.conventions import BoolArray, FloatArray
 from sfm.errors import GeometryError
-from sfm.network import Estimate, Network, reduce_network
-from sfm.orientation.intersection import intersect
-from sfm.orientation.resection.robust import fewest_fitting, resect_robust
-from sfm.orientation.start import Start, best_start
+from sfm.network import Estimate, Network
+from sfm.orientation.growth import FIRST_ADJUSTMENT, Growth, Refine
+from sfm.orientation.resection.robust import fewest_fitting
+from sfm.orientation.start import Start
 from sfm.similarity import fit_similarity
 
 MIN_POINTS = 4  # of a photograph: three are always fitted by P3P, the fourth checks it
-MIN_ANGLE_DEG = 2.0  # smallest ray angle of a point that others are oriented on
-MIN_SHARE = 0.5  # of the rays of a point must meet in it
 START_TOLERANCE = 0.03  # of the photograph's diagonal: what an unknown distortion leaves after resection
 FINAL_TOLERANCE_PX = 4.0  # below this no image point is put aside here; the adjustment tests further
-TOLERANCE_FACTOR = 6.0  # times the robust spread of the residuals
 GROWTH = 1.25  # the network is adjusted when it has this many times the photographs of last time
-FIRST_ADJUSTMENT = 4  # photographs
-EARLY = ("c", "fx", "fy", "K1", "k1")  # parameters that few photographs determine
-ALL_FREE_PHOTOGRAPHS = 6  # from which on all parameters are adjusted
-SURPLUS_PER_PARAMETER = 3  # observations beyond the exterior orientations for each free parameter
-MAD_TO_SIGMA = 1.4826  # median absolute deviation of a normal distribution
 MAX_ROUNDS = 200
 FINAL_ROUNDS = 3  # of resection, intersection and adjustment of all, while image points come or go
-
-Refine = Callable[[Network, Estimate], Estimate]
 
 
 @dataclass(frozen=True)
@@ -82,7 +71,7 @@ def orient(
     """
     cameras = estimate.cameras
     diagonal = np.array([np.hypot(*camera.size_px) for camera in cameras])
-    growth = _Growth(network, estimate, seed, start_tolerance * diagonal, max(min_points, MIN_POINTS))
+    growth = Growth(network, estimate, seed, start_tolerance * diagonal, max(min_points, MIN_POINTS))
     start = growth.begin()
     adjusted = 0
     for _ in range(MAX_ROUNDS):
@@ -102,307 +91,54 @@ def orient(
         growth.intersect()
         if not growth.refined(refine):
             break
-    return growth.finish(start, cameras)
+    return _finish(growth, start, cameras)
 
 
-class _Growth:
-    """The state of a growing network: one estimate that is replaced step by step."""
-
-    def __init__(
-        self, network: Network, estimate: Estimate, seed: int, tolerance_px: FloatArray, min_points: int
-    ) -> None:
-        self.network = network
-        self.estimate = estimate
-        self.seed = seed
-        self.tolerance_px = tolerance_px
-        self.start_tolerance_px = tolerance_px
-        self.min_points = min_points
-        self.reasons: dict[int, str] = {}  # why a photograph is not oriented
-        area = [np.prod(camera.size_px) / camera.c_px**2 for camera in estimate.cameras]
-        self.field = np.array(area)[network.camera]  # area of each photograph, squared tangents, (m,)
-        points = network.control.point
-        self.fixed = np.zeros(len(network.points), dtype=bool)
-        self.fixed[points] = True
-        self.adjusted = np.zeros(0, dtype=bool)  # image points of the last adjustment, (k,)
-
-    # --- views of the measured image points --------------------------------------------------------
-
-    def tangents(self) -> FloatArray:
-        """Tangents of all image points with the present interior orientations, (k, 2)."""
-        seen = self.network.image_points
-        camera = self.network.camera[seen.image]
-        uv = np.full((len(seen), 2), np.nan)
-        for index, one in enumerate(self.estimate.cameras):
-            own = camera == index
-            uv[own] = tangents_from_pixel(one, seen.xy[own])
-        return uv
-
-    def tolerance(self) -> FloatArray:
-        """Tolerance of every photograph, tangents, (m,)."""
-        c = np.array([camera.c_px for camera in self.estimate.cameras])
-        return (self.tolerance_px / c)[self.network.camera]
-
-    def residuals_px(self) -> FloatArray:
-        """Length of the reprojection residual of every image point, px, inf where undetermined, (k,)."""
-        return residual_lengths(self.network, self.estimate)
-
-    # --- steps -------------------------------------------------------------------------------------
-
-    def begin(self) -> Start:
-        """Find a start and take it over."""
-        network, control = self.network, self.network.control
-        if self.estimate.oriented.any() or self.estimate.determined.any():
-            kind = "given"
-        elif len(control) >= 3:
-            kind = "control"
-            points = self.estimate.points.copy()
-            points[control.point] = control.xyz
-            self.estimate = replace(self.estimate, points=points)
-        else:
-            kind = ""
-        if kind:
-            self.resect_all(only_new=True)
-            if self.estimate.oriented.any():
-                self.intersect()
-                if self.estimate.oriented.sum() >= 2 or kind == "given":
-                    return Start(
-                        None, kind, self.estimate.position, self.estimate.rotation, self.estimate.points
-                    )
-            # too little of it in any photograph: a free start, brought onto control when there is enough
-            nan = np.full_like(self.estimate.points, np.nan)
-            self.estimate = Estimate(
-                self.estimate.cameras,
-                np.full_like(self.estimate.position, np.nan),
-                np.full_like(self.estimate.rotation, np.nan),
-                nan,
-            )
-            self.fixed[:] = False
-        start = best_start(network, self.tangents(), self.tolerance(), seed=self.seed)
-        self.estimate = replace(
-            self.estimate, position=start.position, rotation=start.rotation, points=start.points
-        )
-        return start
-
-    def resect_next(self) -> int:
-        """Orient the photographs that see enough determined points; return how many were added.
-
-        Those with the most points come first; a photograph with less than half as many as the best
-        waits for the points that the others bring.
-        """
-        waiting = np.flatnonzero(~self.estimate.oriented)
-        seen = self.network.image_points
-        known = self.estimate.determined[seen.point]
-        count = np.bincount(seen.image[known], minlength=len(self.network.images))
-        if not len(waiting) or count[waiting].max() < self.min_points:
-            for i in waiting.tolist():
-                self.reasons[i] = _too_few(int(count[i]), self.min_points)
-            return 0
-        best = count[waiting].max()
-        order = waiting[np.argsort(-count[waiting], kind="stable")].tolist()
-        added = self._resect([i for i in order if count[i] >= max(self.min_points, best / 2)])
-        if not added:
-            added = self._resect([i for i in order if count[i] < best / 2])
-        return added
-
-    def resect_all(self, *, only_new: bool = False) -> None:
-        """Resect the photographs anew on the present points; oriented ones keep what fits better."""
-        oriented = self.estimate.oriented
-        self._resect([i for i in range(len(self.network.images)) if not (only_new and oriented[i])])
-
-    def _resect(self, images: list[int]) -> int:
-        uv, tolerance = self.tangents(), self.tolerance()
-        position, rotation = self.estimate.position.copy(), self.estimate.rotation.copy()
-        seen = self.network.image_points
-        known = self.estimate.determined[seen.point] & np.isfinite(uv).all(axis=1)
-        residuals = self.residuals_px()
-        added = 0
-        for i in images:
-            own = np.flatnonzero((seen.image == i) & known)
-            result = resect_robust(
-                uv[own],
-                self.estimate.points[seen.point[own]],
-                tolerance=tolerance[i],
-                seed=self.seed + i,
-                min_inliers=self.min_points,
-                field=self.field[i],
-            )
-            camera = self.estimate.cameras[self.network.camera[i]]
-            if not result.found:
-                if not np.isfinite(position[i]).all():
-                    self.reasons[i] = result.reason
-                continue
-            if np.isfinite(position[i]).all():
-                limit = self.tolerance_px[self.network.camera[i]] ** 2
-                old = np.minimum(residuals[own] ** 2, limit).sum()
-                new = np.minimum(np.sum((result.residuals * camera.c_px) ** 2, axis=1), limit)
-                if not np.nansum(np.where(np.isnan(new), limit, new)) < old:
-                    continue
-            else:
-                added += 1
-            position[i], rotation[i] = result.position, result.rotation
-            self.reasons.pop(i, None)
-        self.estimate = replace(self.estimate, position=position, rotation=rotation)
-        return added
-
-    def intersect(self) -> None:
-        """Intersect all points that are not control anew from the oriented photographs."""
-        seen = self.network.image_points
-        result = intersect(
-            self.tangents(),
-            seen.image,
-            seen.point,
-            self.estimate.position,
-            self.estimate.rotation,
-            n_points=len(self.network.points),
-            tolerance=float(self.tolerance().max()),
-            min_angle_deg=MIN_ANGLE_DEG,
-        )
-        # rays of a point that is somewhere else in every photograph meet by twos, here and there
-        rays = np.bincount(seen.point[self.estimate.oriented[seen.image]], minlength=len(self.network.points))
-        points = np.where((result.rays >= MIN_SHARE * rays)[:, None], result.points, np.nan)
-        points = np.where(self.fixed[:, None], self.estimate.points, points)
-        self.estimate = replace(self.estimate, points=points)
-
-    def refined(self, refine: Refine | None) -> bool:
-        """Let the caller adjust what is determined; keep the result if the image points fit better.
-
-        Returns whether there was anything new to adjust.
-        """
-        if refine is None:
-            return False
-        seen = self.network.image_points
-        residuals = self.residuals_px()
-        limit = self.tolerance_px[self.network.camera[seen.image]]
-        fits = residuals <= limit
-        rays = np.bincount(seen.point[fits], minlength=len(self.network.points))
-        points = self.estimate.determined & ((rays >= 2) | self.fixed)
-        count = np.bincount(seen.image[fits & points[seen.point]], minlength=len(self.network.images))
-        images = self.estimate.oriented & (count >= 3)
-        used = fits & images[seen.image] & points[seen.point]
-        if images.sum() < 2 or np.array_equal(used, self.adjusted):
-            return False
-        self.adjusted = used
-        part, start = reduce_network(self.network, self.estimate, images, points, fits)
-        staged = tuple(_staged(camera, part, index) for index, camera in enumerate(start.cameras))
-        try:
-            result = refine(part, replace(start, cameras=staged))
-        except (GeometryError, np.linalg.LinAlgError):
-            return True
-        if not (result.oriented.all() and result.determined.all()):
-            return True
-        cameras = tuple(
-            replace(new, free=old.free)
-            for new, old in zip(result.cameras, self.estimate.cameras, strict=True)
-        )
-        position, rotation, xyz = (
-            self.estimate.position.copy(),
-            self.estimate.rotation.copy(),
-            self.estimate.points.copy(),
-        )
-        position[images], rotation[images], xyz[points] = result.position, result.rotation, result.points
-        candidate = Estimate(cameras, position, rotation, xyz)
-        capped = np.minimum(residuals, limit)[fits]
-        new = np.minimum(residual_lengths(self.network, candidate), limit)[fits]
-        if np.sum(new**2) < np.sum(capped**2):
-            self.estimate = candidate
-        return True
-
-    def adapt_tolerance(self, final_px: float) -> None:
-        """Let the tolerance of each camera follow the spread of its residuals."""
-        camera = self.network.camera[self.network.image_points.image]
-        residuals = self.residuals_px()
-        tolerance = self.tolerance_px.copy()
-        for index in range(len(tolerance)):
-            own = residuals[(camera == index) & np.isfinite(residuals)]
-            if len(own):
-                spread = MAD_TO_SIGMA * float(np.median(own))
-                tolerance[index] = np.clip(
-                    TOLERANCE_FACTOR * spread, final_px, self.start_tolerance_px[index]
-                )
-        self.tolerance_px = tolerance
-
-    def finish(self, start: Start, cameras: tuple[Camera, ...]) -> Orientation:
-        """Bring the network onto control if it started free, drop what does not hold, and report."""
-        network, control = self.network, self.network.control
-        seen = network.image_points
-        residuals = self.residuals_px()
-        fits = residuals <= self.tolerance_px[network.camera[seen.image]]
-        count = np.bincount(seen.image[fits], minlength=len(network.images))
-        known = self.estimate.determined[seen.point]
-        total = np.bincount(seen.image[known], minlength=len(network.images))
-        tolerance = self.tolerance()
-        needed = [
-            fewest_fitting(int(n), tolerance[i], self.field[i], minimum=self.min_points)
-            for i, n in enumerate(total)
-        ]
-        weak = self.estimate.oriented & (count < needed)
-        for i in np.flatnonzero(weak).tolist():
-            self.reasons[i] = (
-                f"only {count[i]} of its {total[i]} points fit the network, {needed[i]} are needed"
-            )
-        drop = weak[:, None]
-        self.estimate = replace(
-            self.estimate,
-            position=np.where(drop, np.nan, self.estimate.position),
-            rotation=np.where(drop[:, :, None], np.nan, self.estimate.rotation),
-        )
-        fits &= ~weak[seen.image]
-        if self.estimate.oriented.sum() < 2:
-            raise GeometryError(
-                f"orientation: {self.estimate.oriented.sum()} of {len(network.images)} photographs could be "
-                "oriented, at least 2 are needed"
-            )
-        if start.pair is not None and len(control) >= 3:
-            known = self.estimate.determined[control.point]
-            if known.sum() >= 3:
-                model = self.estimate.points[control.point[known]]
-                self.estimate = fit_similarity(model, control.xyz[known]).apply_estimate(self.estimate)
-        failures = tuple(
-            (network.images[i], self.reasons.get(int(i), "shares too few points with the others"))
-            for i in np.flatnonzero(~self.estimate.oriented)
-        )
-        pair = None if start.pair is None else (network.images[start.pair[0]], network.images[start.pair[1]])
-        used = residuals[fits]
-        rms = float(np.sqrt(np.mean(used**2) / 2)) if len(used) else np.nan
-        restored = tuple(
-            replace(new, free=old.free) for new, old in zip(self.estimate.cameras, cameras, strict=True)
-        )
-        estimate = replace(self.estimate, cameras=restored)
-        return Orientation(estimate, failures, pair, start.kind, fits, rms, self.tolerance_px)
-
-
-def residual_lengths(network: Network, estimate: Estimate) -> FloatArray:
-    """Return the length of every image residual in px, inf where it is not determined, shape (k,)."""
+def _finish(growth: Growth, start: Start, cameras: tuple[Camera, ...]) -> Orientation:
+    """Bring the network onto control if it started free, drop what does not hold, and report."""
+    network, control = growth.network, growth.network.control
     seen = network.image_points
-    out = np.full(len(seen), np.inf)
-    order = np.argsort(seen.image, kind="stable")
-    bounds = np.searchsorted(seen.image[order], np.arange(len(network.images) + 1))
-    for i in np.flatnonzero(estimate.oriented):
-        own = order[bounds[i] : bounds[i + 1]]
-        camera = estimate.cameras[network.camera[i]]
-        xy = project(camera, estimate.position[i], estimate.rotation[i], estimate.points[seen.point[own]])
-        length = np.linalg.norm(xy - seen.xy[own], axis=1)
-        out[own] = np.where(np.isfinite(length), length, np.inf)
-    return out
-
-
-def _staged(camera: Camera, network: Network, index: int) -> Camera:
-    """Free as many interior parameters as the photographs can determine: none, the first few, or all.
-
-    What the image points of the camera leave after the exterior orientations must exceed its free parameters
-    several times, and so must the redundancy of the network.
-    """
-    own = network.camera == index
-    n, m = len(network.points), len(network.images)
-    redundancy = 2 * len(network.image_points) - 6 * m - 3 * n + 7
-    surplus = min(2 * int(own[network.image_points.image].sum()) - 6 * int(own.sum()), redundancy)
-    early = camera.free & np.array([name in EARLY for name in camera.names])
-    if m >= ALL_FREE_PHOTOGRAPHS and surplus >= SURPLUS_PER_PARAMETER * camera.free.sum():
-        return camera
-    if m >= FIRST_ADJUSTMENT and surplus >= SURPLUS_PER_PARAMETER * early.sum():
-        return replace(camera, free=early)
-    return replace(camera, free=np.zeros_like(camera.free))
-
-
-def _too_few(count: int, needed: int) -> str:
-    return f"{count} point{'' if count == 1 else 's'} of the network seen, resection needs {needed}"
+    residuals = growth.residuals_px()
+    fits = residuals <= growth.tolerance_px[network.camera[seen.image]]
+    count = np.bincount(seen.image[fits], minlength=len(network.images))
+    known = growth.estimate.determined[seen.point]
+    total = np.bincount(seen.image[known], minlength=len(network.images))
+    tolerance = growth.tolerance()
+    needed = [
+        fewest_fitting(int(n), tolerance[i], growth.field[i], minimum=growth.min_points)
+        for i, n in enumerate(total)
+    ]
+    weak = growth.estimate.oriented & (count < needed)
+    for i in np.flatnonzero(weak).tolist():
+        growth.reasons[i] = (
+            f"only {count[i]} of its {total[i]} points fit the network, {needed[i]} are needed"
+        )
+    drop = weak[:, None]
+    growth.estimate = replace(
+        growth.estimate,
+        position=np.where(drop, np.nan, growth.estimate.position),
+        rotation=np.where(drop[:, :, None], np.nan, growth.estimate.rotation),
+    )
+    fits &= ~weak[seen.image]
+    if growth.estimate.oriented.sum() < 2:
+        raise GeometryError(
+            f"orientation: {growth.estimate.oriented.sum()} of {len(network.images)} photographs could be "
+            "oriented, at least 2 are needed"
+        )
+    if start.pair is not None and len(control) >= 3:
+        known = growth.estimate.determined[control.point]
+        if known.sum() >= 3:
+            model = growth.estimate.points[control.point[known]]
+            growth.estimate = fit_similarity(model, control.xyz[known]).apply_estimate(growth.estimate)
+    failures = tuple(
+        (network.images[i], growth.reasons.get(int(i), "shares too few points with the others"))
+        for i in np.flatnonzero(~growth.estimate.oriented)
+    )
+    pair = None if start.pair is None else (network.images[start.pair[0]], network.images[start.pair[1]])
+    used = residuals[fits]
+    rms = float(np.sqrt(np.mean(used**2) / 2)) if len(used) else np.nan
+    restored = tuple(
+        replace(new, free=old.free) for new, old in zip(growth.estimate.cameras, cameras, strict=True)
+    )
+    estimate = replace(growth.estimate, cameras=restored)
+    return Orientation(estimate, failures, pair, start.kind, fits, rms, growth.tolerance_px)
