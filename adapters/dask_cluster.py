@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import logging
 import queue
+import signal
 import time
 import uuid
 from collections.abc import Iterable, Iterator
@@ -16,7 +17,7 @@ from itertools import count
 from typing import Any
 
 import dask
-from dask.distributed import Client, Future, KilledWorker, LocalCluster, get_worker
+from dask.distributed import Client, Future, KilledWorker, LocalCluster, Worker, WorkerPlugin, get_worker
 from threadpoolctl import threadpool_limits
 
 from sfm.engine import Call, Done, Event, Lost, Told, Work
@@ -74,6 +75,7 @@ def local_engine(workers: int, *, memory_bytes: int | None = None) -> Iterator[D
             raise BackendError(f"{workers} worker processes cannot be started: {_line(error)}") from error
         try:
             with cluster, Client(cluster) as client:
+                client.register_plugin(_IgnoreInterrupt())
                 yield DaskEngine(client)
         finally:
             with suppress(Exception):
@@ -98,6 +100,16 @@ def remote_engine(address: str) -> Iterator[DaskEngine]:
         raise BackendError(f"--cluster {address}: no Dask scheduler answers ({_line(error)})") from error
     with client:
         yield DaskEngine(client)
+
+
+class _IgnoreInterrupt(WorkerPlugin):
+    """Ctrl-C reaches all processes of a terminal; whoever started the workers ends them."""
+
+    name = "kolinear-ignore-interrupt"
+
+    def setup(self, worker: Worker) -> None:
+        """Called in every worker that starts, also in place of one that died."""
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ import hashlib
 import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -69,7 +70,7 @@ class _Plan:
 def run_batch(
     files: Sequence[Path],
     out: Path,
-    engine: Engine,
+    engine: AbstractContextManager[Engine],
     adjusters: Adjusters,
     watch: Watch,
     *,
@@ -81,7 +82,7 @@ def run_batch(
     Args:
         files: survey files.
         out: folder of the batch; every survey gets a folder in it.
-        engine: runs the work.
+        engine: runs the work; it is entered here, since what workers leave can be cleared when they are gone.
         adjusters: the other adjuster.
         watch: is told what happens.
         resume: keep what an earlier run finished from the same inputs; else everything is run, and only
@@ -103,7 +104,8 @@ def run_batch(
         _clean(out, plans)
         watch.planned([plan.folder for plan in plans])
         try:
-            rows = _run(plans, out, engine, adjusters, watch, resume=resume, allow_outside=allow_outside)
+            with engine as running:
+                rows = _run(plans, out, running, adjusters, watch, resume=resume, allow_outside=allow_outside)
         finally:
             _clean(out, plans)
         ordered = tuple(rows[plan.folder] for plan in plans)

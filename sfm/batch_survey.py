@@ -132,7 +132,7 @@ def reconstruct(
             log.note("failed", reason=str(error))
             raise
         except Exception as error:
-            reason = str(error) if isinstance(error, KolinearError) else _fault(error)
+            reason = str(error) if isinstance(error, KolinearError | OSError) else _fault(error)
             log.note("failed", reason=reason, **_trace(error))
             seconds = round(before + time.perf_counter() - begun, 3)
             return SurveyRow(name, str(job.file), job.folder, "failed", reason=reason, seconds=seconds)

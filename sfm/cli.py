@@ -183,15 +183,11 @@ def batch(
     engine = (
         remote_engine(cluster) if cluster is not None else local_engine(jobs or min(_cores(), len(files)))
     )
-    with (
-        stopping_at_terminate(),
-        BatchTable(Console(stderr=True), verbose=verbose) as table,
-        engine as running,
-    ):
+    with stopping_at_terminate(), BatchTable(Console(stderr=True), verbose=verbose) as table:
         rows = run_batch(
             files,
             out,
-            running,
+            engine,
             Adjusters(_backend, _colmap_writer),
             table,
             resume=resume,
@@ -209,11 +205,16 @@ def main() -> None:
     except KolinearError as error:
         print(f"kolinear: {_one_line(str(error))}", file=sys.stderr)
         raise SystemExit(BAD_INPUT) from None
-    except KeyboardInterrupt:
-        print(
-            "kolinear: interrupted, nothing half-done was written (batch --resume goes on)", file=sys.stderr
-        )
-        raise SystemExit(INTERRUPTED) from None
+    except OSError as error:  # a disk, a network drive: nothing that a traceback would help with
+        where = f"{error.filename}: " if error.filename else ""
+        print(f"kolinear: {_one_line(f'{where}{error.strerror or error}')}", file=sys.stderr)
+        raise SystemExit(BAD_INPUT) from None
+    except SystemExit as end:
+        if end.code == INTERRUPTED:  # which is what typer makes of Ctrl-C, and says nothing
+            print(
+                "kolinear: interrupted, nothing half-done is left (batch --resume goes on)", file=sys.stderr
+            )
+        raise
 
 
 def _backend(survey: Survey) -> Backend | None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +35,9 @@ class Here:
                 value = work.whole.function(*work.whole.arguments, notes, tell=said.append)
             yield from (Told(work.key, message) for message in said)
             yield Done(work.key, value)
+
+
+HERE = nullcontext(Here())
 
 
 class Notes:

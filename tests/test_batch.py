@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
@@ -20,7 +21,7 @@ from sfm.batch_survey import SurveyRow
 from sfm.errors import BackendError, KolinearError, OutputError, SurveyFileError
 from sfm.folder_lock import locked
 from sfm.survey_log import read_log
-from tests.engines import ALONE, KILLER, Here, Notes, points_of
+from tests.engines import ALONE, HERE, KILLER, Notes, points_of
 from tests.surveys import write_observed_survey, write_photograph_survey
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -43,7 +44,7 @@ def finished(surveys: tuple[Path, ...], tmp_path_factory: pytest.TempPathFactory
     out = tmp_path_factory.mktemp("batch") / "out"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("sfm.report.output.all_plots", lambda *_: [])
-        rows = run_batch(surveys, out, Here(), ALONE, Notes())
+        rows = run_batch(surveys, out, HERE, ALONE, Notes())
     assert [row.status for row in rows] == ["done"] * 3
     return out
 
@@ -115,16 +116,16 @@ def test_resume_keeps_what_is_finished_and_runs_what_has_changed(
 ) -> None:
     own = [write_photograph_survey(tmp_path / "a", "one", backend="none"), surveys[2]]
     out = tmp_path / "out"
-    run_batch(own, out, Here(), ALONE, Notes())
+    run_batch(own, out, HERE, ALONE, Notes())
     before = {folder: os.stat(out / folder).st_ino for folder in ("one", "third")}
     again = Notes()
-    run_batch(own, out, Here(), ALONE, again, resume=True)
+    run_batch(own, out, HERE, ALONE, again, resume=True)
     assert [kept for _, kept in again.finished_rows] == [True, True]
     assert {folder: os.stat(out / folder).st_ino for folder in before} == before
 
     own[0].write_text(own[0].read_text(encoding="utf-8").replace('"c"', '"c", "K1"'), encoding="utf-8")
     changed = Notes()
-    rows = run_batch(own, out, Here(), ALONE, changed, resume=True)
+    rows = run_batch(own, out, HERE, ALONE, changed, resume=True)
     assert [kept for _, kept in changed.finished_rows] == [False, True]
     assert [row.survey for row in rows] == ["one", "third"]
     log = read_log(out / "one" / "log.jsonl")
@@ -135,11 +136,11 @@ def test_photographs_are_measured_again_only_where_they_changed(tmp_path: Path) 
     survey = write_photograph_survey(tmp_path / "a", "one")
     other = write_photograph_survey(tmp_path / "b", "two")
     out = tmp_path / "out"
-    run_batch([survey], out, Here(), ALONE, Notes())
+    run_batch([survey], out, HERE, ALONE, Notes())
     measured = points_of(out)
     (tmp_path / "a" / "photo 2.png").write_bytes((tmp_path / "b" / "photo 2.png").read_bytes())
     (tmp_path / "a" / "photo 5.png").rename(tmp_path / "a" / "photo 7.png")
-    run_batch([survey, other], out, Here(), ALONE, Notes())
+    run_batch([survey, other], out, HERE, ALONE, Notes())
     log = read_log(out / "one" / "log.jsonl")
     stored = {entry["image"]: entry["stored"] for entry in log if entry["event"] == "photograph"}
     assert stored == {f"photo {k}.png": k != 2 for k in (1, 2, 3, 4, 6, 7)}
@@ -156,7 +157,7 @@ def test_failures_are_rows_and_the_others_go_on(surveys: tuple[Path, ...], tmp_p
     out = tmp_path / "out"
     (out / "taken").mkdir(parents=True)
     (out / "taken" / "letter.txt").touch()
-    rows = run_batch([wrong, broken, taken, tmp_path / "no.toml", surveys[2]], out, Here(), ALONE, Notes())
+    rows = run_batch([wrong, broken, taken, tmp_path / "no.toml", surveys[2]], out, HERE, ALONE, Notes())
     assert [row.status for row in rows] == ["failed", "failed", "failed", "failed", "done"]
     assert "survey.name: found 3" in rows[0].reason
     assert "0 readable photographs" in rows[1].reason
@@ -177,7 +178,7 @@ def test_surveys_of_one_name_get_folders_of_their_own(tmp_path: Path) -> None:
     files = [write_observed_survey(tmp_path / folder, "same") for folder in ("a", "b")]
     files.append(write_observed_survey(tmp_path / "c", "logs"))
     notes = Notes()
-    rows = run_batch(files, tmp_path / "out", Here(), ALONE, notes)
+    rows = run_batch(files, tmp_path / "out", HERE, ALONE, notes)
     assert len({row.folder for row in rows}) == 3
     assert all(row.folder.startswith(("same-", "logs-")) for row in rows)
     assert list(notes.names) == [row.folder for row in rows]
@@ -199,14 +200,14 @@ def test_a_second_batch_in_the_same_folder_is_refused(finished: Path, surveys: t
             OutputError, match=f"another run is writing into this folder .process {os.getpid()} on"
         ),
     ):
-        run_batch(surveys, finished, Here(), ALONE, Notes(), resume=True)
+        run_batch(surveys, finished, HERE, ALONE, Notes(), resume=True)
 
 
 def test_a_fault_of_ours_is_a_row_with_a_trace(
     surveys: tuple[Path, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("sfm.batch_survey.adjust_survey", lambda *_, **__: [][0])
-    (row,) = run_batch([surveys[2]], tmp_path / "out", Here(), ALONE, Notes())
+    (row,) = run_batch([surveys[2]], tmp_path / "out", HERE, ALONE, Notes())
     assert row.reason.startswith("a fault of Kolinear: IndexError")
     (log,) = (tmp_path / "out" / "logs").iterdir()
     assert "trace" in read_log(log)[-1]
@@ -216,7 +217,7 @@ def test_two_workers_give_the_same_bytes(
     two_workers: DaskEngine, surveys: tuple[Path, ...], finished: Path, tmp_path: Path
 ) -> None:
     notes = Notes()
-    rows = run_batch(surveys, tmp_path / "out", two_workers, ALONE, notes)
+    rows = run_batch(surveys, tmp_path / "out", nullcontext(two_workers), ALONE, notes)
     assert [row.status for row in rows] == ["done"] * 3
     assert points_of(tmp_path / "out") == points_of(finished)
     told = [message for name, message in notes.messages if name == "first"]
@@ -230,7 +231,7 @@ def test_a_survey_that_kills_workers_is_set_aside(
 ) -> None:
     killer = write_observed_survey(tmp_path / "killer", KILLER)
     out = tmp_path / "out"
-    rows = run_batch([surveys[2], killer, surveys[0]], out, two_workers, ALONE, Notes())
+    rows = run_batch([surveys[2], killer, surveys[0]], out, nullcontext(two_workers), ALONE, Notes())
     assert [row.status for row in rows] == ["done", "set aside", "done"]
     assert "worker processes died" in rows[1].reason
     same = points_of(finished)
@@ -242,7 +243,7 @@ def test_a_disk_problem_ends_the_batch_with_one_line(surveys: tuple[Path, ...], 
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "logs").write_text("in the way", encoding="utf-8")
     with pytest.raises(OutputError, match="the log cannot be written"):
-        run_batch(surveys, tmp_path / "out", Here(), ALONE, Notes())
+        run_batch(surveys, tmp_path / "out", HERE, ALONE, Notes())
 
 
 def test_nobody_at_the_address_of_a_cluster() -> None:
@@ -281,7 +282,7 @@ def test_a_scheduler_started_separately_gives_the_same_bytes(
         with remote_engine(scheduler) as engine:
             engine.client.wait_for_workers(2, timeout=60)
             assert engine.workers == 2
-            rows = run_batch(surveys, tmp_path / "out", engine, ALONE, Notes())
+            rows = run_batch(surveys, tmp_path / "out", nullcontext(engine), ALONE, Notes())
         assert [row.status for row in rows] == ["done"] * 3
         assert points_of(tmp_path / "out") == points_of(finished)
     finally:
