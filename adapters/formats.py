@@ -74,8 +74,8 @@ def format_of(path: Path) -> FileFormat:
     if path.suffix.lower() in ENDINGS:
         return format_named(ENDINGS[path.suffix.lower()])
     try:
-        with path.open(encoding="utf-8", errors="replace") as file:
-            lines = [file.readline() for _ in range(4)]
+        with path.open(encoding="utf-8", errors="replace") as text:
+            lines = [text.readline() for _ in range(4)]
     except OSError as error:
         raise SurveyFileError(f"{path}: cannot be read ({error.strerror})") from error
     counts = [len(line.split()) for line in lines]

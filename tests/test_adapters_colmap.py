@@ -10,7 +10,9 @@ import pycolmap
 import pytest
 
 from adapters import colmap
-from adapters.colmap import adjust_with_colmap, read_model, write_model
+from adapters.colmap import adjust_with_colmap, covariance_with_colmap, read_model, write_model
+from sfm.adjustment.datum import Datum
+from sfm.adjustment.solve import adjust
 from sfm.camera import camera_from_values, project
 from sfm.errors import BackendError, OutputError, SurveyFileError
 from sfm.network import Estimate, Network, ObjectPoints
@@ -213,3 +215,41 @@ def test_refusals_name_what_was_found(tmp_path: Path, monkeypatch: pytest.Monkey
     monkeypatch.setattr(colmap, "NEEDED_VERSION", (9, 9))
     with pytest.raises(BackendError, match=r"pycolmap 4\.\d.* is installed, 9\.9 is needed"):
         read_model(tmp_path)
+
+
+def test_photographs_have_rigs_and_frames_of_their_own(tmp_path: Path) -> None:
+    network, truth = scene(cameras=2)
+    write_model(tmp_path, network, truth)
+    read = pycolmap.Reconstruction(tmp_path)
+    assert (read.num_rigs(), read.num_frames(), read.num_reg_images()) == (2, 8, 8)
+    for i, image in read.images.items():
+        assert image.frame_id == i
+        assert read.frame(image.frame_id).rig_id == image.camera_id
+
+
+def test_colmaps_covariance_of_points_is_conditional() -> None:
+    network, truth = scene()
+    adjustment = adjust(network, truth, datum=Datum("free"), sigma_px=0.1, reject="none")
+    found = covariance_with_colmap(network, adjustment.estimate)
+    assert found is not None
+    variance = (adjustment.sigma0 * adjustment.sigma_px) ** 2
+    limiting, interior = adjustment.covariance.points_limiting, adjustment.covariance.interior[0]
+    np.testing.assert_allclose(found.points * variance, limiting, rtol=1e-6, atol=1e-6 * limiting.max())
+    np.testing.assert_allclose(found.interior[0] * variance, interior, rtol=1e-5, atol=1e-5 * interior.max())
+    # Held cameras against cameras with an orientation to be determined, in a datum on four of the points
+    carrying = np.zeros(len(network.points), dtype=bool)
+    carrying[:4] = True
+    local = adjust(network, truth, datum=Datum("free", carrying), sigma_px=0.1, reject="none")
+    ratio = np.trace(local.covariance.points[4:], axis1=1, axis2=2) / np.trace(limiting[4:], axis1=1, axis2=2)
+    assert ratio.min() > 1.1
+
+
+def test_points_behind_a_camera_are_not_called_a_success() -> None:
+    """Ceres gives them no residual: without this the cost would seem to be lower."""
+    network, truth = scene()
+    points = truth.points.copy()
+    points[0] = truth.position[0] + 5 * truth.rotation[0][:, 2]  # behind the first photograph
+    found = adjust_with_colmap(network, replace(truth, points=points), max_iterations=0, polish=False)
+    assert not found.converged
+    assert "behind their camera" in found.message
+    assert np.isnan(found.cost)
