@@ -118,6 +118,19 @@ def read_any(path: Path, name: str | None = None) -> tuple[Network, Estimate]:
     raise SurveyFileError(f"{path}: format {form.name} holds no photographs, it is written only")
 
 
+def read_comparable(path: Path, name: str | None = None) -> TableResult:
+    """Read whatever can be compared: tables with standard deviations, any other format without.
+
+    Raises:
+        SurveyFileError: what is wrong, with file and line number.
+    """
+    form = format_of(path) if name is None else format_named(name)
+    if form.name == "tables":
+        return read_result(path)
+    network, estimate = read_any(path, form.name)
+    return TableResult(path.name, network, estimate)
+
+
 def write_any(path: Path, name: str, network: Network, estimate: Estimate) -> None:
     """Write a network and its solution; cameras must be in a model that the format holds.
 

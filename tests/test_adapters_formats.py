@@ -21,12 +21,13 @@ from adapters.bundle_text import (
 from adapters.colmap import read_model, write_model
 from adapters.colmap_database import read_database, write_database
 from adapters.formats import FORMATS as FILE_FORMATS
-from adapters.formats import format_named, format_of, read_any, write_any
+from adapters.formats import format_named, format_of, read_any, read_comparable, write_any
 from adapters.metashape import read_metashape, write_metashape
 from adapters.photomodeler import read_photomodeler, write_photomodeler
 from adapters.ply import read_ply, write_ply
 from sfm.analysis.comparison import reprojection
 from sfm.analysis.conversion import convert_camera, convert_cameras
+from sfm.analysis.significance import compare_results
 from sfm.camera import Camera, camera_from_values
 from sfm.errors import KolinearError, OutputError, SurveyFileError
 from sfm.network import Estimate, Network, ObjectPoints
@@ -413,6 +414,17 @@ def test_formats_are_recognised_and_go_round_by_name(name: str, tmp_path: Path) 
     assert np.abs(shift).max() <= max(one.max_px for one in conversions) + 1e-6
 
 
+def test_results_of_any_format_can_be_compared(tmp_path: Path) -> None:
+    network, truth = network_in("full_opencv")
+    write_any(tmp_path / "model", "colmap", network, truth)
+    write_any(tmp_path / "tables", "tables", network, truth)
+    a, b = read_comparable(tmp_path / "model"), read_comparable(tmp_path / "tables")
+    assert (a.name, b.name) == ("model", "tables")
+    found = compare_results(a, b)
+    assert np.abs(found.point_difference).max() < 1e-12
+    assert found.interior[0].conversion is None
+
+
 def test_formats_refuse_by_name(tmp_path: Path) -> None:
     network, truth = network_in("brown")
     with pytest.raises(SurveyFileError, match="format 'dxf' is none of colmap"):
@@ -442,7 +454,9 @@ def test_bal_projects_as_its_own_formulas_say(tmp_path: Path) -> None:
     x, y = f * (1 + k1 * r2 + k2 * r2**2) * p
     values = [*w, *t, f, k1, k2, *X]
     path = tmp_path / "problem.txt"
-    path.write_text("\n".join(["1 1 1", f"0 0 {float(x)!r} {float(y)!r}", *(repr(float(v)) for v in values)]) + "\n")
+    path.write_text(
+        "\n".join(["1 1 1", f"0 0 {float(x)!r} {float(y)!r}", *(repr(float(v)) for v in values)]) + "\n"
+    )
     network, estimate = read_bal(path)
     np.testing.assert_allclose(reprojection(network, estimate), 0, atol=1e-9)
 
