@@ -94,7 +94,7 @@ def solve(
     datum = Datum(survey.datum.kind)
     if datum.kind == "control" and len(network.control) == 0:
         raise GeometryError(f"survey {survey.name}: datum 'control', but no control point was measured")
-    needed = np.full(len(network.points), 2) if min_rays is None else min_rays
+    needed = np.full(len(network.points), 2) if min_rays is None else min_rays.copy()
     if datum.kind == "control":
         needed[network.control.point] = 1
     accepted = np.ones(len(network.image_points), dtype=bool)
@@ -117,6 +117,9 @@ def solve(
     else:
         estimate = adjustment.estimate
     final = _tested(survey, part, estimate, datum, covariance=True)
+    if len(part.scale_bars) or (datum.kind == "control" and part.control.covariance.any()):
+        part = _weighed(final)
+        final = _tested(survey, part, final.estimate, datum, covariance=True)
     dropped = tuple(
         (name, f"fewer than {MIN_IMAGE_POINTS} accepted image points of the network")
         for name, was, is_in in zip(network.images, oriented, images, strict=True)
@@ -140,6 +143,21 @@ def _tested(
         alpha=1 - (1 - FALSE_ALARM) ** (1 / tests),
         covariance=covariance,
     )
+
+
+def _weighed(adjustment: Adjustment) -> Network:
+    """Return the network with the image points weighted by their own variance component.
+
+    Lengths and control have the standard deviations that were stated for them; without this, sigma0 a
+    posteriori, which the image points decide, would scale these too.
+
+    Source: Foerstner and Wrobel (2016), Photogrammetric Computer Vision, sec. 4.2.4.
+    """
+    network, used = adjustment.network, ~adjustment.rejected
+    seen = network.image_points
+    v, P = adjustment.residuals[used], np.linalg.inv(seen.covariance[used])
+    component = np.einsum("ka,kab,kb->", v, P, v) / adjustment.redundancy_numbers[used].sum()
+    return replace(network, image_points=replace(seen, covariance=component * seen.covariance))
 
 
 def determined(

@@ -58,8 +58,14 @@ class Adjustment:
 
     @property
     def sigma0_px(self) -> float:
-        """A posteriori standard deviation of an image coordinate of unit weight, px."""
-        return self.sigma0 * self.sigma_px
+        """A posteriori standard deviation of an image coordinate, root mean square of the accepted, px."""
+        accepted = self.network.image_points.covariance[~self.rejected]
+        return float(self.sigma0 * (np.trace(accepted, axis1=1, axis2=2).mean() / 2) ** 0.5)
+
+    @property
+    def a_priori_px(self) -> float:
+        """A priori standard deviation of an image coordinate, root mean square of the accepted, px."""
+        return self.sigma0_px / self.sigma0
 
     @property
     def rms_px(self) -> float:

@@ -93,7 +93,7 @@ def _tiles(result: SurveyResult) -> str:
         (
             "Sigma0",
             f"{a.sigma0_px:.4f} px",
-            f"{a.sigma0:.3f} times the {a.sigma_px:g} px expected, redundancy {a.redundancy}",
+            f"{a.sigma0:.3f} times the {a.a_priori_px:.3g} px expected, redundancy {a.redundancy}",
         ),
     ]
     both = result.comparison

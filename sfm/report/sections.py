@@ -99,7 +99,7 @@ def quality_section(result: SurveyResult, pictures: dict[str, str]) -> str:
     text += table(
         ("", "px"),
         [
-            ("sigma0, a posteriori standard deviation of a coordinate of unit weight", f"{a.sigma0_px:.5f}"),
+            ("sigma0, a posteriori standard deviation of a coordinate", f"{a.sigma0_px:.5f}"),
             ("RMS residual per coordinate", f"{a.rms_px:.5f}"),
             ("longest residual vector among the accepted", f"{a.max_residual_px:.4f}"),
             ("mean redundancy number (0 none, 1 full control)", f"{np.nanmean(a.redundancy_numbers):.3f}"),
