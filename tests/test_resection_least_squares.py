@@ -26,6 +26,15 @@ TRUTH = [
     ),
     (18, 25, (2.1016108, 1.1946515, 3.6995847), (13.3667930, 1.4654585, 90.2308179), 5.900370e-5, 1.3664e-4),
 ]
+# document 003, "SD for EOPs": m, and rad although the heading says deg; with the divisor n - 6
+PRINTED_SD = {
+    9: (9.8035e-03, 8.8936e-03, 3.9152e-03, 2.1493e-03, 2.2192e-03, 9.0243e-04),
+    10: (3.6917e-03, 3.6434e-03, 1.1079e-03, 9.0229e-04, 9.1565e-04, 3.0840e-04),
+    14: (3.8604e-03, 3.7749e-03, 2.7233e-03, 1.1152e-03, 1.2504e-03, 5.4805e-04),
+    18: (7.2693e-03, 7.0928e-03, 2.5152e-03, 1.6975e-03, 1.6901e-03, 6.4748e-04),
+}
+# document 003, "EOPs over iterations", position after the first step (that of image 18 is not its own)
+FIRST_STEP = {9: (1.9589, 2.5775, 3.4054), 10: (1.6849, 2.1596, 3.4951), 14: (1.0147, 2.5411, 2.7957)}
 
 
 def lab2(image):
@@ -60,7 +69,11 @@ def test_document_003(image, n, X0, angles, variance, printed):
     assert sigma0_squared == pytest.approx(variance, rel=1e-6)
     # the document divides by n - 6 instead of 2n - 6: its own figure comes out with its own divisor
     assert sigma0_squared * (2 * n - 6) / (n - 6) == pytest.approx(printed, rel=5e-4)
+    deviations = np.sqrt(np.diag(result.covariance) * (2 * n - 6) / (n - 6))
+    np.testing.assert_allclose(deviations, PRINTED_SD[image], rtol=1e-4)
     np.testing.assert_allclose(result.history[0, :3], start[:3])
+    if image in FIRST_STEP:
+        np.testing.assert_allclose(result.history[1, :3], FIRST_STEP[image], atol=5.1e-5)
     np.testing.assert_allclose(result.history[-1, :3], result.position)
 
 
