@@ -15,6 +15,7 @@ import numpy as np
 from sfm.analysis.comparison import AdjusterComparison, BackendAdjustment, compare_adjusters
 from sfm.network import Estimate, Network, empty_estimate
 from sfm.orientation.sequence import orient
+from sfm.pipeline_texture import run_textured_survey
 from sfm.progress import SILENT, Progress, StageClock
 from sfm.project import Survey
 from sfm.report.result import FailedImage, StageTime, SurveyResult
@@ -50,6 +51,10 @@ def run_survey(
     Raises:
         KolinearError: the survey cannot be run; the message says what to do.
     """
+    if survey.tie_points is not None:
+        return run_textured_survey(
+            survey, images_dir=images_dir, jobs=jobs, backend=backend, progress=progress
+        )
     clock = StageClock(progress)
     files = find_photographs(survey, images_dir=images_dir)
     with clock.stage("targets"):

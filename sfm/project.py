@@ -78,6 +78,14 @@ class TargetSettings(Section):
     diameter: Length | None = None  # of all targets, object unit; else of each from its ellipses
 
 
+class TiePointSettings(Section):
+    """[tie_points]: natural texture in place of targets."""
+
+    detector: Literal["foerstner", "sift"] = "foerstner"
+    window_px: Annotated[int, Field(ge=7, le=101)] = 15  # odd side of the matched windows
+    max_features: Annotated[int, Field(ge=100)] = 4000  # of each photograph
+
+
 class DatumSettings(Section):
     """[datum]: what position, orientation and scale of the result rest on."""
 
@@ -131,6 +139,7 @@ class Survey(Section):
     head: Head = Field(alias="survey")
     cameras: Annotated[tuple[CameraSettings, ...], Field(strict=False, min_length=1, alias="camera")]
     targets: TargetSettings = TargetSettings()
+    tie_points: TiePointSettings | None = None
     datum: DatumSettings = DatumSettings()
     control: ControlSettings | None = None
     scale_bars: Annotated[tuple[ScaleBarSettings, ...], Field(strict=False, alias="scale_bar")] = ()
@@ -261,6 +270,16 @@ def read_survey(path: Path, *, allow_outside: bool = False) -> Survey:
 def _refuse_contradictions(survey: Survey) -> None:
     """Raise SurveyFileError where settings that are fine one by one do not go together."""
     where = str(survey.path)
+    if survey.tie_points is not None:
+        if survey.targets.codes != "none":
+            raise SurveyFileError(
+                f"{where}: [tie_points] take the place of targets, codes = '{survey.targets.codes}' asks for "
+                "targets; needed codes = 'none', or no [tie_points]"
+            )
+        if survey.tie_points.window_px % 2 == 0:
+            raise SurveyFileError(
+                f"{where}: tie_points.window_px = {survey.tie_points.window_px}, needed an odd number"
+            )
     names = [camera.name for camera in survey.cameras]
     for name in names:
         if names.count(name) > 1:
@@ -361,6 +380,7 @@ def _known(location: tuple[str | int, ...]) -> str:
         "survey": Head,
         "camera": CameraSettings,
         "targets": TargetSettings,
+        "tie_points": TiePointSettings,
         "datum": DatumSettings,
         "control": ControlSettings,
         "scale_bar": ScaleBarSettings,

@@ -1,0 +1,136 @@
+"""Interest points: the Foerstner operator, with the ellipse of precision of every point.
+
+Where gradients of all directions meet in a window, a match is precise in all directions: the normal
+equations N = sum g g^T of a shift are large (weight w) and round (roundness q).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numba import njit
+
+from sfm.conventions import AnyArray, FloatArray
+from sfm.errors import GeometryError
+from sfm.matching.radiometry import grey_of, odd_window
+
+# Foerstner and Guelch (1987): 0.5 <= q <= 0.75 and w >= 0.5 to 1.5 times its mean over the photograph.
+MIN_ROUNDNESS = 0.5
+WEIGHT_OF_MEAN = 0.5
+# Standard deviation of the derivative of a Gaussian for the gradients, px; their noise is then
+# sigma_n^2 / (8 pi s^4).
+DERIVATION_PX = 1.0
+
+
+@dataclass(frozen=True)
+class InterestPoints:
+    """Interest points of one photograph, the best first."""
+
+    xy: FloatArray  # point where the edges of the window meet, px, (k, 2)
+    covariance: FloatArray  # ellipse of precision of xy, px^2, (k, 2, 2)
+    weight: FloatArray  # w = det N / tr N, squared intensity per squared px, (k,)
+    roundness: FloatArray  # q = 4 det N / tr^2 N, 1 = a circle, (k,)
+
+    def __len__(self) -> int:
+        return len(self.xy)
+
+
+def foerstner_points(
+    photograph: AnyArray,
+    *,
+    window_px: int = 7,
+    min_distance_px: float = 10.0,
+    max_points: int = 5000,
+    border_px: int = 0,
+) -> InterestPoints:
+    """Find the points of a photograph at which matching is precise in all directions.
+
+    Args:
+        photograph: (H, W), 8 or 16 bit or float, grey or colour.
+        window_px: odd side of the window in which gradients are collected.
+        min_distance_px: of two points that are nearer the weaker one is left out.
+        max_points: of more the strongest are kept.
+        border_px: no points this close to the border of the photograph.
+
+    Returns:
+        The points; the sigma of an intensity for the ellipses is that of the misfit of the window's edges.
+
+    Source: Foerstner and Guelch (1987), ISPRS Intercommission Workshop Interlaken, p. 281.
+    """
+    side = odd_window("interest operator", window_px)
+    if max_points < 1:
+        raise GeometryError(f"interest operator: {max_points} points asked for, needed at least 1")
+    grey = grey_of(photograph)
+    reach = 2 * int(np.ceil(3 * DERIVATION_PX)) + 1
+    smooth = cv2.GaussianBlur(grey, (reach, reach), DERIVATION_PX, borderType=cv2.BORDER_REFLECT_101)
+    gx = cv2.Sobel(smooth, cv2.CV_32F, 1, 0, ksize=1, scale=0.5, borderType=cv2.BORDER_REFLECT_101)
+    gy = cv2.Sobel(smooth, cv2.CV_32F, 0, 1, ksize=1, scale=0.5, borderType=cv2.BORDER_REFLECT_101)
+    xx, xy, yy = (
+        cv2.boxFilter(product, cv2.CV_64F, (side, side), normalize=False)
+        for product in (gx * gx, gx * gy, gy * gy)
+    )
+    trace = np.maximum(xx + yy, 1e-12)
+    det = np.maximum(xx * yy - xy * xy, 0.0)
+    weight = det / trace
+    roundness = 4 * det / (trace * trace)
+    top = np.asarray(cv2.dilate(weight, np.ones((3, 3), np.uint8)) <= weight)
+    good = top & (roundness >= MIN_ROUNDNESS) & (weight > WEIGHT_OF_MEAN * weight.mean()) & (weight > 0)
+    margin = max(border_px, side // 2 + reach // 2)
+    good[:margin], good[-margin:], good[:, :margin], good[:, -margin:] = False, False, False, False
+    row, col = np.nonzero(good)
+    order = np.argsort(-weight[row, col], kind="stable")
+    row, col = row[order], col[order]
+    kept = np.zeros(len(row), dtype=np.bool_)
+    _thin(row, col, float(min_distance_px), max_points, np.zeros(grey.shape, dtype=np.int64), kept)
+    row, col = row[kept], col[kept]
+    place, covariance = np.empty((len(row), 2)), np.empty((len(row), 2, 2))
+    _intersect_edges(gx, gy, row, col, side // 2, place, covariance)
+    return InterestPoints(place, covariance, weight[row, col], roundness[row, col])
+
+
+@njit(cache=True, nogil=True)
+def _thin(row, col, distance, most, taken, kept):  # type: ignore[no-untyped-def]
+    """Mark points, strongest first, that have no stronger one within the distance."""
+    height, width = taken.shape
+    reach = int(np.ceil(distance))
+    count = 0
+    for k in range(len(row)):
+        if taken[row[k], col[k]]:
+            continue
+        kept[k] = True
+        count += 1
+        if count == most:
+            return
+        for i in range(max(0, row[k] - reach), min(height, row[k] + reach + 1)):
+            for j in range(max(0, col[k] - reach), min(width, col[k] + reach + 1)):
+                if (i - row[k]) ** 2 + (j - col[k]) ** 2 < distance * distance:
+                    taken[i, j] = 1
+
+
+@njit(cache=True, nogil=True)
+def _intersect_edges(gx, gy, row, col, half, place, covariance):  # type: ignore[no-untyped-def]
+    """The point nearest to the edge elements of a window, weighted by their gradients: N x = sum g g^T x."""
+    n = (2 * half + 1) ** 2
+    for k in range(len(row)):
+        xx, xy, yy, bx, by, rest = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+        for i in range(-half, half + 1):
+            for j in range(-half, half + 1):
+                a, b = gx[row[k] + i, col[k] + j], gy[row[k] + i, col[k] + j]
+                along = a * j + b * i
+                xx += a * a
+                xy += a * b
+                yy += b * b
+                bx += a * along
+                by += b * along
+                rest += along * along
+        det = xx * yy - xy * xy
+        dx, dy = (yy * bx - xy * by) / det, (xx * by - xy * bx) / det
+        variance = max(rest - dx * bx - dy * by, 0.0) / (n - 2)
+        # a centre of curvature far from the window's middle is no corner of this window
+        inside = abs(dx) <= half and abs(dy) <= half
+        place[k, 0] = col[k] + (dx if inside else 0.0)
+        place[k, 1] = row[k] + (dy if inside else 0.0)
+        covariance[k, 0, 0], covariance[k, 1, 1] = variance * yy / det, variance * xx / det
+        covariance[k, 0, 1] = covariance[k, 1, 0] = -variance * xy / det

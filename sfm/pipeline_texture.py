@@ -1,0 +1,63 @@
+"""A survey of natural texture from photographs to result, start to end, without any target.
+
+    photographs -> tie points -> orientation -> adjustment -> comparison -> result
+
+From the orientation on it is the way of `sfm.pipeline`: the same adjustment, the same comparison.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from sfm.analysis.comparison import BackendAdjustment, compare_adjusters
+from sfm.network import Estimate, Network, empty_estimate
+from sfm.orientation.sequence import orient
+from sfm.progress import SILENT, Progress, StageClock
+from sfm.project import Survey, TiePointSettings
+from sfm.report.result import FailedImage, StageTime, SurveyResult
+from sfm.survey_solution import refine, solve
+from sfm.survey_start import find_photographs
+from sfm.survey_tie_points import MIN_RAYS, tie_photographs
+
+
+def run_textured_survey(
+    survey: Survey,
+    *,
+    images_dir: Path | None = None,
+    jobs: int = 1,
+    backend: Callable[[Network, Estimate], BackendAdjustment] | None = None,
+    progress: Progress = SILENT,
+) -> SurveyResult:
+    """Run a survey with [tie_points] from its photographs.
+
+    Args, Raises: as `sfm.pipeline.run_survey`.
+    """
+    settings = survey.tie_points or TiePointSettings()
+    clock = StageClock(progress)
+    files = find_photographs(survey, images_dir=images_dir)
+    with clock.stage("tie points"):
+        tied = tie_photographs(survey, settings, files, jobs=jobs, progress=progress)
+    network = tied.network
+    with clock.stage("orientation"):
+        start = orient(network, empty_estimate(network, tied.cameras), refine=refine)
+    with clock.stage("adjustment"):
+        rays = np.full(len(network.points), MIN_RAYS)
+        solution = solve(survey, network, start.estimate, min_rays=rays)
+    with clock.stage("comparison"):
+        comparison = None if backend is None else compare_adjusters(solution.adjustment, backend)
+    return SurveyResult(
+        survey=survey.name,
+        unit=survey.unit,
+        images_total=len(files),
+        failed=tied.failed + tuple(FailedImage(*one) for one in (*start.failures, *solution.dropped_images)),
+        adjustment=solution.adjustment,
+        code=np.full(len(solution.adjustment.network.points), -1),
+        comparison=comparison,
+        photographs=tied.overlays(settings.window_px),
+        control_check=solution.control_check,
+        warnings=solution.warnings,
+        seconds=tuple(StageTime(*one) for one in clock.seconds),
+    )

@@ -1,0 +1,127 @@
+"""The tie points of all photographs of a survey without targets, as a network."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from sfm.camera import Camera
+from sfm.conventions import AnyArray, IntArray
+from sfm.errors import GeometryError, PhotographError
+from sfm.matching.tie_points import find_tie_points
+from sfm.network import ImagePoints, Network
+from sfm.progress import SILENT, Progress
+from sfm.project import Survey, TiePointSettings
+from sfm.report.result import FailedImage, PhotographTargets
+from sfm.survey_start import PhotographList, control_points, scale_bars, start_cameras
+from sfm.targets.photograph import Metadata, read_metadata, read_photograph
+
+MIN_RAYS = 3  # photographs that must agree on a tie point; two rays cannot contradict each other
+MIN_PHOTOGRAPHS = 2
+
+
+@dataclass(frozen=True)
+class TiedPhotographs:
+    """The readable photographs of a survey with the tie points that they have in common."""
+
+    network: Network  # image points with the covariance of matching and the survey's sigma
+    cameras: tuple[Camera, ...]  # with start values of the interior orientation
+    paths: tuple[Path, ...]  # of the photographs of the network, (m,)
+    failed: tuple[FailedImage, ...]  # photographs that could not be read
+
+    def overlays(self, window_px: int) -> tuple[PhotographTargets, ...]:
+        """Return what the report draws into each photograph: circles as wide as the windows."""
+        seen = self.network.image_points
+        drawn = []
+        for i, (name, path) in enumerate(zip(self.network.images, self.paths, strict=True)):
+            xy = seen.xy[seen.image == i]
+            radius = np.full((len(xy), 2), window_px / 2)
+            none = np.zeros(0, dtype=np.int64)
+            drawn.append(PhotographTargets(name, path, xy, radius, np.zeros(len(xy)), np.zeros((0, 2)), none))
+        return tuple(drawn)
+
+
+def tie_photographs(
+    survey: Survey,
+    settings: TiePointSettings,
+    photographs: PhotographList,
+    *,
+    jobs: int = 1,
+    progress: Progress = SILENT,
+) -> TiedPhotographs:
+    """Read the photographs and measure the points of natural texture that they have in common.
+
+    All photographs are in memory at the same time, since points are matched between any two of them.
+
+    Args:
+        survey: says what is known of the cameras, and the sigma of an image coordinate.
+        settings: detector and windows.
+        photographs: the files.
+        jobs: how many photographs are worked on at a time.
+        progress: told of every photograph.
+
+    Raises:
+        GeometryError: fewer than two readable photographs, or no point that three of them have in common.
+        PhotographError: photographs of different size under one camera.
+        SurveyFileError: the start values of a camera are incomplete.
+    """
+    pixels: list[AnyArray] = []
+    metadata: list[Metadata] = []
+    read: list[int] = []
+    failed: list[FailedImage] = []
+    with ThreadPoolExecutor(max(1, jobs)) as pool:
+        for k, found in enumerate(pool.map(_read, photographs.paths)):
+            if isinstance(found, PhotographError):
+                failed.append(FailedImage(photographs.names[k], str(found)))
+            else:
+                metadata.append(found[0])
+                pixels.append(found[1])
+                read.append(k)
+            progress.advance(photographs.names[k])
+    if len(read) < MIN_PHOTOGRAPHS:
+        raise GeometryError(
+            f"survey {survey.name}: {len(read)} readable photographs, at least {MIN_PHOTOGRAPHS} are needed"
+        )
+    names = tuple(photographs.names[k] for k in read)
+    camera: IntArray = photographs.camera[read]
+    cameras = start_cameras(survey, tuple(metadata), camera, names)
+    found_points = find_tie_points(
+        pixels,
+        detector=settings.detector,
+        window_px=settings.window_px,
+        max_features=settings.max_features,
+        min_rays=MIN_RAYS,
+        threads=jobs,
+    )
+    if not len(found_points):
+        raise GeometryError(
+            f"survey {survey.name}: no texture that {MIN_RAYS} photographs have in common; more overlap or "
+            "smaller steps between the photographs are needed"
+        )
+    points = tuple(f"t{j + 1:05d}" for j in range(int(found_points.point.max()) + 1))
+    covariance = found_points.covariance + survey.adjust.sigma_px**2 * np.eye(2)
+    network = Network(
+        names,
+        camera,
+        points,
+        ImagePoints(found_points.image, found_points.point, found_points.xy, covariance),
+    )
+    control, _ = control_points(survey, points)
+    bars, _ = scale_bars(survey, points)
+    return TiedPhotographs(
+        replace(network, control=control, scale_bars=bars),
+        cameras,
+        tuple(photographs.paths[k] for k in read),
+        tuple(failed),
+    )
+
+
+def _read(path: Path) -> tuple[Metadata, AnyArray] | PhotographError:
+    """Read one photograph; one that cannot be read does not stop the others."""
+    try:
+        return read_metadata(path), read_photograph(path)
+    except PhotographError as error:
+        return error
