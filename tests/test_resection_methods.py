@@ -14,7 +14,7 @@ from sfm.orientation.resection.choice import choose_by_line
 from sfm.orientation.resection.church import resect_church
 from sfm.orientation.resection.critical_cylinder import cylinder_distance, cylinder_warning
 from sfm.orientation.resection.dlt import resect_dlt
-from sfm.orientation.resection.fischler_bolles import rays_from_tangents
+from sfm.orientation.resection.fischler_bolles import rays_from_tangents, resect_fischler_bolles
 from sfm.orientation.resection.p4p import resect_p4p
 from sfm.orientation.resection.rampal import resect_rampal
 from sfm.orientation.resection.solution import solution_of
@@ -36,6 +36,12 @@ def test_zeng_wang_picks_the_first_solution_of_document_001():
     found = resect_zeng_wang(TANGENTS, POINTS)
     np.testing.assert_allclose([s.position for s in found], [FIRST, SECOND], atol=1e-8)
     assert found[0].rms * 24 < 1e-4 < 0.5 < found[1].rms * 24
+
+
+def test_fischler_bolles_orders_its_solutions():
+    found = resect_fischler_bolles(TANGENTS, POINTS)
+    np.testing.assert_allclose([s.position for s in found], [FIRST, SECOND], atol=1e-8)
+    assert len(resect_fischler_bolles(TANGENTS[:3], POINTS[:3])) == 2
 
 
 def test_zeng_wang_quartic_against_the_document():
@@ -266,7 +272,7 @@ def _found(uv, points):
         return ()
 
 
-@pytest.mark.parametrize("method", [resect_zeng_wang, resect_rampal, resect_p4p])
+@pytest.mark.parametrize("method", [resect_fischler_bolles, resect_zeng_wang, resect_rampal, resect_p4p])
 def test_degenerate_points_are_refused(method):
     X0 = np.array([0.2, 0.1, 5.0])
     line = np.outer([0.0, 1, 2, 3], [1.0, 0.5, 0.0])

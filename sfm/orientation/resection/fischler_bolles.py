@@ -8,7 +8,9 @@ import numpy as np
 from numba import njit
 
 from sfm.conventions import FloatArray, IntArray
+from sfm.errors import GeometryError
 from sfm.orientation.resection.quartic import MAX_ROOTS, find_positive_roots
+from sfm.orientation.resection.solution import Solution, checked_points, ordered, solution_of
 
 MAX_SOLUTIONS = 4
 WORK = MAX_ROOTS  # numbers of scratch space
@@ -28,6 +30,29 @@ class Poses:
     position: FloatArray  # projection centres X0, object unit, (k, 4, 3)
     rotation: FloatArray  # R, image to object axes, (k, 4, 3, 3)
     legs: FloatArray  # distances from the projection centre to the points, object unit, (k, 4, 3)
+
+
+def resect_fischler_bolles(tangents: FloatArray, points: FloatArray) -> tuple[Solution, ...]:
+    """Return the exterior orientations from the first three points, the one that all points confirm first.
+
+    Args:
+        tangents: u = -U/W, v = -V/W of the measured rays, shape (n, 2), n >= 3.
+        points: object points, shape (n, 3), object unit.
+
+    Returns:
+        One to four solutions; from four points on their order is meaningful (see also `choose_by_line`).
+
+    Raises:
+        GeometryError: fewer than three points, points on one line or coincident, or no solution.
+
+    Source: as `resect_triples`.
+    """
+    uv, xyz = checked_points("fischler-bolles", tangents, points, needed=3)
+    poses = resect_triples(rays_from_tangents(uv[:3])[None], xyz[None, :3])
+    found = [solution_of(poses.position[0, s], poses.rotation[0, s], uv, xyz) for s in range(poses.count[0])]
+    if not found:
+        raise GeometryError("fischler-bolles: no camera sees the first three points under these angles")
+    return ordered(found)
 
 
 def resect_triples(rays: FloatArray, points: FloatArray) -> Poses:

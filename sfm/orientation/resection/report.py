@@ -14,7 +14,7 @@ from sfm.orientation.resection.choice import choose_by_line
 from sfm.orientation.resection.church import resect_church
 from sfm.orientation.resection.critical_cylinder import cylinder_warning
 from sfm.orientation.resection.dlt import resect_dlt
-from sfm.orientation.resection.fischler_bolles import rays_from_tangents, resect_triples
+from sfm.orientation.resection.fischler_bolles import resect_fischler_bolles
 from sfm.orientation.resection.least_squares import resect_least_squares
 from sfm.orientation.resection.p4p import resect_p4p
 from sfm.orientation.resection.rampal import resect_rampal
@@ -22,9 +22,7 @@ from sfm.orientation.resection.robust import resect_robust
 from sfm.orientation.resection.solution import (
     Solution,
     checked_points,
-    ordered,
     rotation_from_position,
-    solution_of,
 )
 from sfm.orientation.resection.task import Task
 from sfm.orientation.resection.zeng_wang import resect_zeng_wang
@@ -91,7 +89,7 @@ def resect_table(task: Task, method: str) -> str:
     if task.start is None:
         # as the comparison of document 001 does: Church starts from what Fischler-Bolles found
         with suppress(GeometryError):
-            task = replace(task, start=_fischler_bolles(task)["solutions"][0].position)
+            task = replace(task, start=resect_fischler_bolles(task.tangents, task.points)[0].position)
     for name in METHODS:
         try:
             found = resect_json(task, name)
@@ -108,7 +106,7 @@ def _run(task: Task, method: str) -> dict[str, Any]:
     """Solutions of a method and what it knows beside them, under their JSON names."""
     match method:
         case "fischler-bolles":
-            return _fischler_bolles(task)
+            return {"solutions": resect_fischler_bolles(task.tangents, task.points)}
         case "p4p":
             return {"solutions": resect_p4p(task.tangents, task.points)}
         case "church":
@@ -124,15 +122,6 @@ def _run(task: Task, method: str) -> dict[str, Any]:
         case "least-squares":
             return _least_squares(task)
     raise GeometryError(f"resect: method '{method}' is none of {', '.join(METHODS)}, all")
-
-
-def _fischler_bolles(task: Task) -> dict[str, Any]:
-    uv, xyz = checked_points("fischler-bolles", task.tangents, task.points, needed=3)
-    poses = resect_triples(rays_from_tangents(uv[:3])[None], xyz[None, :3])
-    found = [solution_of(poses.position[0, s], poses.rotation[0, s], uv, xyz) for s in range(poses.count[0])]
-    if not found:
-        raise GeometryError("fischler-bolles: no camera sees the first three points under these angles")
-    return {"solutions": ordered(found)}
 
 
 def _church(task: Task) -> dict[str, Any]:
@@ -200,7 +189,7 @@ def _start(task: Task) -> tuple[FloatArray, FloatArray]:
     """Start of least squares: as given, with the rotation from the rays if need be, or by P3P."""
     if task.start is None:
         if len(task.points) == ALL_POINTS:
-            solution = _fischler_bolles(task)["solutions"][0]
+            solution = resect_fischler_bolles(task.tangents, task.points)[0]
             return solution.position, solution.rotation
         result = resect_robust(task.tangents, task.points, tolerance=START_TOLERANCE)
         if not result.found:
