@@ -39,7 +39,7 @@ class Solution:
 
 def refine(network: Network, estimate: Estimate) -> Estimate:
     """Adjust a growing network for its approximate values only; see `orientation.sequence.orient`."""
-    return adjust(network, estimate, datum=Datum("free"), reject="huber", covariance=False).estimate
+    return adjust(network, estimate, datum=Datum("free"), reject="none", covariance=False).estimate
 
 
 def match_and_adjust(
