@@ -263,8 +263,7 @@ def test_overlay_shows_targets_where_they_are(result: SurveyResult) -> None:
     photograph = result.photographs[0]
     picture = draw_photograph(photograph, result.adjustment, 100.0)
     width, height = result.adjustment.estimate.cameras[0].size_px
-    assert picture.shape[0] > height
-    assert picture.shape[1] == width
+    assert picture.shape == (height, width, 3)
     # Of the outline one row or column of pixels beside the target is green to the right, left, up and down.
     seen = 0
     for x, y in photograph.xy:

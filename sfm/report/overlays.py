@@ -78,8 +78,12 @@ def draw_overlays(result: SurveyResult, *, jobs: int = 1, progress: Progress = S
             picture = draw_photograph(photograph, result.adjustment, factor)
         except PhotographError:
             return None
+        legend = _legend(picture.shape[1], factor, photograph.rejected_flag)
         return Overlay(
-            photograph.image, names[index], _jpeg(picture), _jpeg(_fit(picture, THUMBNAIL_SIDE_PX))
+            photograph.image,
+            names[index],
+            _jpeg(np.vstack([picture, legend])),
+            _jpeg(_fit(picture, THUMBNAIL_SIDE_PX)),
         )
 
     drawn = []
@@ -129,7 +133,7 @@ def draw_photograph(photograph: PhotographTargets, adjustment: Adjustment, facto
         _arrow(picture, xy, xy + factor / scale * adjustment.residuals[row], scale)
         colour = DROPPED if adjustment.rejected[row] else USED
         _label(picture, name, xy + np.array([right, -right / 2]), scale, colour)
-    return np.vstack([picture, _legend(picture.shape[1], factor, photograph.rejected_flag)])
+    return picture
 
 
 def arrow_factor(adjustment: Adjustment) -> float:

@@ -296,8 +296,9 @@ def coordinates_section(result: SurveyResult) -> str:
         ),
         ("points.ply", f"the object points as a point cloud [{unit}]"),
         ("summary.json", "the figures of this page for programs"),
-        ("colmap/", "the result as a COLMAP model"),
     ]
+    if result.comparison is not None:
+        listed.append(("colmap/", f"the solution in {result.comparison.model} as a COLMAP model"))
     text = "<p>In the folder of this report:</p><table>"
     for name, what in listed:
         text += f'<tr><th scope=row><a href="{name}">{name}</a></th><td>{escape(what)}</td></tr>'
