@@ -1,11 +1,11 @@
 """COLMAP through pycolmap: models written and read, and its Ceres bundle adjustment of our networks.
 
-The only module that imports pycolmap. What differs from Kolinear is turned here and nowhere else:
+The only module that imports pycolmap. What its adjuster knows less of than Kolinear's:
 
-    pixel origin   COLMAP counts from the corner of the top-left pixel, Kolinear from its centre: +0.5 px
-    camera axes    COLMAP looks along +z with y down: R_colmap = diag(1, -1, -1) M, t = -R_colmap X0
     weights        COLMAP's adjuster gives every image coordinate the same weight
     constants      COLMAP frees focal lengths, principal points and distortion in groups, for all cameras
+
+Pixel origin and axes are turned in adapters.colmap_scene.
 
 Source: COLMAP 4.2 documentation, "Output Format" and "Camera Models".
 """
@@ -25,27 +25,20 @@ from typing import Any
 import numpy as np
 
 from adapters.colmap_files import check_model_files
+from adapters.colmap_scene import (
+    AXES,
+    HALF_PIXEL,
+    camera_of,
+    estimate_of,
+    reconstruction,
+    residuals_of,
+)
 from sfm.camera import Camera
-from sfm.conventions import BoolArray, FloatArray, IntArray
+from sfm.conventions import BoolArray, FloatArray
 from sfm.errors import BackendError, OutputError, SurveyFileError
 from sfm.network import Estimate, ImagePoints, Network
 
 NEEDED_VERSION = (4, 2)
-HALF_PIXEL = 0.5  # COLMAP's pixel coordinates minus ours, px
-AXES = np.diag([1.0, -1.0, -1.0])  # COLMAP's camera axes in ours
-COLMAP_NAMES = {"opencv": "OPENCV", "full_opencv": "FULL_OPENCV"}
-# COLMAP's simpler models as ours: where each of its parameters goes, in its order
-READABLE = {
-    "SIMPLE_PINHOLE": ("opencv", ("fx fy", "cx", "cy")),
-    "PINHOLE": ("opencv", ("fx", "fy", "cx", "cy")),
-    "SIMPLE_RADIAL": ("opencv", ("fx fy", "cx", "cy", "k1")),
-    "RADIAL": ("opencv", ("fx fy", "cx", "cy", "k1", "k2")),
-    "OPENCV": ("opencv", ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")),
-    "FULL_OPENCV": (
-        "full_opencv",
-        ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
-    ),
-}
 SIDE_FILE = "kolinear.json"  # names and pixel sizes, which COLMAP's model has no place for
 
 # The default start radius of 1e4 crawls (46 steps on 400 photographs, 6 with 1e8); the steps are then
@@ -102,10 +95,10 @@ def adjust_with_colmap(
     """
     pycolmap = load_pycolmap()
     refine = colmap_free(estimate.cameras)
-    options = _options(pycolmap, refine, len(network.images), threads, max_iterations)
+    options = ceres_options(pycolmap, refine, len(network.images), threads, max_iterations)
     with quiet(pycolmap):
-        scene = _reconstruction(pycolmap, network, estimate)
-        config = _config(pycolmap, network, estimate, gauge)
+        scene = reconstruction(pycolmap, network, estimate)
+        config = adjustment_config(pycolmap, network, estimate, gauge)
         iterations, seconds, converged, message = 0, 0.0, False, ""
         cost = np.inf
         for _ in range(MAX_RUNS if polish else 1):
@@ -123,8 +116,8 @@ def adjust_with_colmap(
             if still:
                 converged = True
                 break
-        adjusted = _estimate(scene, estimate)
-        residuals = _residuals(scene, network)
+        adjusted = estimate_of(scene, estimate)
+        residuals = residuals_of(scene, network)
     behind = int(np.isnan(residuals[:, 0]).sum())
     if behind:
         # Ceres gives them no residual, so that losing a point behind a camera lowers its cost.
@@ -140,70 +133,6 @@ def adjust_with_colmap(
         seconds,
         threads,
     )
-
-
-@dataclass(frozen=True)
-class ColmapCovariance:
-    """Covariances as COLMAP estimates them, for image coordinates of standard deviation 1 px."""
-
-    interior: tuple[FloatArray, ...]  # marginal, of the free parameters of each camera, in order, (f, f)
-    points: FloatArray  # with cameras and photographs held fixed (conditional), object unit^2, (n, 3, 3)
-
-
-def covariance_with_colmap(
-    network: Network, estimate: Estimate, *, gauge: str = "two_cameras"
-) -> ColmapCovariance | None:
-    """Return COLMAP's covariances at a solution, None where COLMAP finds it singular.
-
-    What COLMAP calls the covariance of a point is conditional on all photographs and cameras, too small
-    by the share that these contribute. That of the interior orientation is marginal and does not depend
-    on the gauge.
-
-    Args:
-        network: photographs, points and image points.
-        estimate: the solution, cameras in an opencv model.
-        gauge: two_cameras | control; COLMAP has no covariance without a gauge.
-
-    Raises:
-        BackendError: as for `adjust_with_colmap`.
-    """
-    pycolmap = load_pycolmap()
-    options = _options(pycolmap, colmap_free(estimate.cameras), len(network.images), 1, 1)
-    with quiet(pycolmap):
-        scene = _reconstruction(pycolmap, network, estimate)
-        config = _config(pycolmap, network, estimate, gauge)
-        # estimate_ba_covariance wants this adjuster and no other; it need not have been run
-        adjuster = pycolmap.create_default_ceres_bundle_adjuster(options, config, scene)
-        wanted = pycolmap.BACovarianceOptions()
-        wanted.damping = 0.0
-        found = pycolmap.estimate_ba_covariance(wanted, scene, adjuster)
-        if found is None:
-            return None
-        interior = []
-        for k, camera in enumerate(estimate.cameras):
-            block = found.get_other_params_cov(scene.camera(k + 1).params) if camera.free.any() else None
-            interior.append(np.zeros((0, 0)) if block is None else np.array(block))
-        points = np.zeros((len(network.points), 3, 3))  # held points have none
-        for j in range(len(network.points)):
-            block = found.get_point_cov(j + 1)
-            if block is not None:
-                points[j] = block
-    return ColmapCovariance(tuple(interior), points)
-
-
-@dataclass(frozen=True)
-class ColmapBackend:
-    """COLMAP as the other adjuster of a validation (sfm.analysis.validation)."""
-
-    name: str = "colmap"
-
-    def adjust(self, network: Network, start: Estimate, *, control: bool) -> ColmapAdjustment:
-        """Adjust with control points held or the datum free."""
-        return adjust_with_colmap(network, start, gauge="control" if control else "free")
-
-    def covariance(self, network: Network, estimate: Estimate, *, control: bool) -> ColmapCovariance | None:
-        """Return COLMAP's covariances at a solution."""
-        return covariance_with_colmap(network, estimate, gauge="control" if control else "two_cameras")
 
 
 def colmap_free(cameras: tuple[Camera, ...]) -> tuple[bool, bool, bool]:
@@ -252,7 +181,7 @@ def write_model(
     """
     pycolmap = load_pycolmap()
     with quiet(pycolmap):
-        scene = _reconstruction(pycolmap, network, estimate, rejected=rejected)
+        scene = reconstruction(pycolmap, network, estimate, rejected=rejected)
         scene.update_point_3d_errors()
         try:
             folder.mkdir(parents=True, exist_ok=True)
@@ -398,7 +327,7 @@ def quiet(pycolmap: ModuleType) -> Iterator[None]:
         log.minloglevel, log.stderrthreshold = before
 
 
-def _options(
+def ceres_options(
     pycolmap: ModuleType, refine: tuple[bool, bool, bool], images: int, threads: int, max_iterations: int
 ) -> Any:
     """Ceres run to the end of double precision, with nearly undamped steps."""
@@ -420,7 +349,7 @@ def _options(
     return options
 
 
-def _config(pycolmap: ModuleType, network: Network, estimate: Estimate, gauge: str) -> Any:
+def adjustment_config(pycolmap: ModuleType, network: Network, estimate: Estimate, gauge: str) -> Any:
     """Which photographs take part and what is held."""
     config = pycolmap.BundleAdjustmentConfig()
     for i in range(len(network.images)):
@@ -440,110 +369,6 @@ def _config(pycolmap: ModuleType, network: Network, estimate: Estimate, gauge: s
     elif gauge != "free":
         raise BackendError(f"gauge '{gauge}' is none of two_cameras, free, control")
     return config
-
-
-def _reconstruction(
-    pycolmap: ModuleType, network: Network, estimate: Estimate, *, rejected: BoolArray | None = None
-) -> Any:
-    """Return a pycolmap.Reconstruction; cameras, photographs and points are numbered from 1."""
-    scene = pycolmap.Reconstruction()
-    for k, camera in enumerate(estimate.cameras):
-        scene.add_camera_with_trivial_rig(colmap_camera(pycolmap, camera, k + 1))
-    seen = network.image_points
-    claimed = np.ones(len(seen), dtype=bool) if rejected is None else ~rejected
-    claimed &= estimate.oriented[seen.image] & estimate.determined[seen.point]
-    slot = np.zeros(len(seen), dtype=np.int64)  # number of each image point in its photograph
-    for i, rows in enumerate(_groups(seen.image, len(network.images))):
-        if not estimate.oriented[i]:
-            continue
-        slot[rows] = np.arange(len(rows))
-        R = AXES @ estimate.rotation[i].T
-        pose = pycolmap.Rigid3d(pycolmap.Rotation3d(R), -R @ estimate.position[i])
-        keypoints = seen.xy[rows] + HALF_PIXEL
-        image = pycolmap.Image(
-            name=network.images[i], keypoints=keypoints, camera_id=int(network.camera[i]) + 1, image_id=i + 1
-        )
-        scene.add_image_with_trivial_frame(image, pose)
-    for j, rows in enumerate(_groups(seen.point, len(network.points))):
-        if not estimate.determined[j]:
-            continue
-        track = pycolmap.Track(
-            [pycolmap.TrackElement(int(seen.image[r]) + 1, int(slot[r])) for r in rows if claimed[r]]
-        )
-        point = pycolmap.Point3D(xyz=estimate.points[j], track=pycolmap.Track())
-        scene.add_point3D_with_id(j + 1, point)
-        for element in track.elements:
-            scene.add_observation(j + 1, element)
-    return scene
-
-
-def colmap_camera(pycolmap: ModuleType, camera: Camera, number: int) -> Any:
-    """Return a camera as a pycolmap.Camera of that number."""
-    if camera.model not in COLMAP_NAMES:
-        raise BackendError(
-            f"camera {camera.name}: COLMAP has no model {camera.model}, convert it to opencv or full_opencv"
-        )
-    width, height = camera.size_px
-    params = camera.parameters.copy()
-    params[2:4] += HALF_PIXEL
-    return pycolmap.Camera(
-        model=COLMAP_NAMES[camera.model], width=width, height=height, params=params, camera_id=number
-    )
-
-
-def camera_of(found: Any) -> Camera:
-    """Return a COLMAP camera as ours, pixel size 1."""
-    if found.model_name not in READABLE:
-        raise BackendError(
-            f"camera {found.camera_id}: COLMAP's model {found.model_name} is none of {', '.join(READABLE)}"
-        )
-    model, places = READABLE[found.model_name]
-    camera = Camera(
-        str(found.camera_id),
-        model,
-        (int(found.width), int(found.height)),
-        np.ones(2),
-        np.zeros(8 if model == "opencv" else 12),
-    )
-    parameters = camera.parameters
-    for place, value in zip(places, found.params, strict=True):
-        for name in place.split():
-            parameters[camera.names.index(name)] = value
-    parameters[2:4] -= HALF_PIXEL
-    return camera
-
-
-def _estimate(scene: Any, start: Estimate) -> Estimate:
-    """Read the adjusted values back, counted as in the start values."""
-    cameras = []
-    for k, camera in enumerate(start.cameras):
-        params = np.array(scene.camera(k + 1).params, dtype=float)
-        params[2:4] -= HALF_PIXEL
-        cameras.append(camera.with_parameters(params))
-    poses = [scene.image(i + 1).cam_from_world().matrix() for i in range(len(start.position))]
-    R = np.array([(AXES @ pose[:, :3]).T for pose in poses])
-    position = np.array([-pose[:, :3].T @ pose[:, 3] for pose in poses])
-    points = np.array([scene.point3D(j + 1).xyz for j in range(len(start.points))])
-    return Estimate(tuple(cameras), position, R, points)
-
-
-def _residuals(scene: Any, network: Network) -> FloatArray:
-    """Computed minus measured by COLMAP's own projection, (k, 2), px."""
-    seen = network.image_points
-    xy = np.empty((len(seen), 2))
-    for i, rows in enumerate(_groups(seen.image, len(network.images))):
-        image = scene.image(i + 1)
-        pose = image.cam_from_world().matrix()
-        points = np.array([scene.point3D(int(j) + 1).xyz for j in seen.point[rows]]).reshape(-1, 3)
-        if len(rows):
-            xy[rows] = scene.camera(image.camera_id).img_from_cam(points @ pose[:, :3].T + pose[:, 3])
-    return xy - HALF_PIXEL - seen.xy
-
-
-def _groups(index: IntArray, count: int) -> list[IntArray]:
-    """Rows of each index value, in order."""
-    order = np.argsort(index, kind="stable")
-    return np.split(order, np.searchsorted(index[order], np.arange(1, count)))
 
 
 def one_line(error: BaseException) -> str:

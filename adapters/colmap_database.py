@@ -17,7 +17,8 @@ import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from adapters.colmap import HALF_PIXEL, camera_of, colmap_camera, load_pycolmap, one_line, quiet
+from adapters.colmap import load_pycolmap, one_line, quiet
+from adapters.colmap_scene import HALF_PIXEL, camera_of, colmap_camera
 from sfm.camera import Camera
 from sfm.conventions import IntArray
 from sfm.errors import OutputError, SurveyFileError

@@ -7,7 +7,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from adapters.colmap import ColmapBackend, adjust_with_colmap
+from adapters.colmap import adjust_with_colmap
+from adapters.colmap_validation import ColmapBackend
 from sfm.analysis.comparison import reprojection
 from sfm.analysis.random_network import (
     ARRANGEMENTS,
