@@ -29,7 +29,7 @@ MAX_STEPS = 30
 # far below the precision of any target.
 LAST_STEP_PX = 5e-3
 # Background taken into the fit: so many px and this share of the mean semi-axis, at most.
-MARGIN_PX, MARGIN_SHARE, MARGIN_MAX_PX = 3.5, 0.25, 10.0
+MARGIN_PX, MARGIN_SHARE, MARGIN_MAX_PX = 4.0, 0.25, 10.0
 # Of targets larger than this (mean semi-axis) only a band inside the edge is used: the rest tells nothing.
 LARGE_PX, BAND_PX = 25.0, 15.0
 # Blur of the edge at the start and its limits.
