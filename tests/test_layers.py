@@ -13,7 +13,7 @@ LAYERS = (
     ("sfm.camera", "sfm.network", "sfm.similarity"),
     ("sfm.targets", "sfm.matching", "sfm.orientation", "sfm.adjustment"),
     ("sfm.analysis",),
-    ("sfm.report", "sfm.pipeline", "sfm.project", "sfm.survey_"),
+    ("sfm.report", "sfm.pipeline", "sfm.pipeline_", "sfm.project", "sfm.survey_"),
     ("sfm.batch", "sfm.batch_", "sfm.cli", "sfm.warm_up"),
 )
 CV2_ROOMS = ("sfm.targets", "sfm.matching", "sfm.report", "sfm.orientation")

@@ -304,7 +304,7 @@ def test_control_scale_bars_and_start_values(tmp_path: Path) -> None:
         text,
         image_points="image,point,x_px,y_px\n1,a,10,20\n2,a,11,20\n1,b,5,5\n2,c,7,7\n",
         control="id,X,Y,Z,sX,sY,sZ\na,1,2,3,0,0.1,0.2\nelsewhere,0,0,0,0,0,0\n",
-        images="image,X,Y,Z,omega_deg,phi_deg,kappa_deg\n2,10,20,30,1,-2,179\nextra,0,0,0,0,0,0\n",
+        images="image,X,Y,Z,omega_deg,phi_deg,kappa_deg\n2,10,20,30,1,-2,179\n",
         points="point,X,Y,Z\nb,4,5,6\na,9,9,9\n",
     )
     survey = read_survey(path)

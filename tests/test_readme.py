@@ -24,20 +24,23 @@ def test_first_screen_has_both_commands_and_the_plain_lines() -> None:
         assert line in FIRST_SCREEN, line
 
 
-def test_survey_file_of_the_readme_is_read_and_shows_every_key(tmp_path: Path) -> None:
-    block = re.search(r"```toml\n(.*?)```", README, re.S)
-    assert block is not None
-    path = tmp_path / "survey.toml"
-    path.write_text(block[1], encoding="utf-8")
-    survey = read_survey(path)
-    table = tomllib.loads(block[1])
-    assert table.keys() == keys_of(Survey)
-    for name, field in Survey.model_fields.items():
-        value = getattr(survey, name)
-        section = value[0] if isinstance(value, tuple) else value
-        given = table[field.alias or name]
-        shown = set(given[0] if isinstance(given, list) else given)
-        assert keys_of(type(section)) - shown <= {"sensor_mm"}, name
+def test_survey_files_of_the_readme_are_read_and_show_every_key(tmp_path: Path) -> None:
+    blocks = re.findall(r"```toml\n(.*?)```", README, re.S)
+    assert blocks
+    shown: dict[str, set[str]] = {}
+    sections: dict[str, type[Section]] = {}
+    for block in blocks:
+        path = tmp_path / "survey.toml"
+        path.write_text(block, encoding="utf-8")
+        survey = read_survey(path)
+        for key, given in tomllib.loads(block).items():
+            name = next(n for n, field in Survey.model_fields.items() if (field.alias or n) == key)
+            value = getattr(survey, name)
+            sections[key] = type(value[0] if isinstance(value, tuple) else value)
+            shown.setdefault(key, set()).update(given[0] if isinstance(given, list) else given)
+    assert shown.keys() == keys_of(Survey)
+    for key, section in sections.items():
+        assert keys_of(section) - shown[key] <= {"sensor_mm"}, key
 
 
 def test_commands_of_the_readme_exist() -> None:
