@@ -27,13 +27,18 @@ def _not_empty(value: str) -> str:
     return value
 
 
-Length = Annotated[float, Field(gt=0)]
+# Beyond these no length, sigma or parameter makes sense in any unit, and their squares or inverses overflow.
+SMALLEST, LARGEST = 1e-9, 1e12
+MAX_SIDE_PX = 1_000_000
+MAX_LENGTH_PER_SIGMA = 1e6  # no scale bar is calibrated to better than a millionth of its length
+Length = Annotated[float, Field(ge=SMALLEST, le=LARGEST)]
 Name = Annotated[str, BeforeValidator(lambda v: _not_empty(v) if isinstance(v, str) else v)]
 TwoLengths = Annotated[tuple[Length, Length], Field(strict=False)]
-TwoCounts = Annotated[tuple[Annotated[int, Field(gt=0)], Annotated[int, Field(gt=0)]], Field(strict=False)]
+Side = Annotated[int, Field(gt=0, le=MAX_SIDE_PX)]
+TwoCounts = Annotated[tuple[Side, Side], Field(strict=False)]
 Names = Annotated[tuple[str, ...], Field(strict=False)]
 Values = Annotated[
-    tuple[Annotated[tuple[str, float], Field(strict=False)], ...],
+    tuple[Annotated[tuple[str, Annotated[float, Field(ge=-LARGEST, le=LARGEST)]], Field(strict=False)], ...],
     Field(strict=False),
     BeforeValidator(_pairs),
 ]
@@ -306,6 +311,11 @@ def _refuse_contradictions(survey: Survey) -> None:
     for bar in survey.scale_bars:
         if bar.start == bar.end:
             raise SurveyFileError(f"{where}: scale_bar from '{bar.start}' to the same point")
+        if bar.length > MAX_LENGTH_PER_SIGMA * bar.sigma:
+            raise SurveyFileError(
+                f"{where}: scale_bar {bar.start} - {bar.end}: length {bar.length:g} is more than a million "
+                f"times its sigma {bar.sigma:g}; are both in {survey.unit}?"
+            )
     if survey.targets.codes not in FAMILIES and not survey.beside(survey.targets.codes).is_file():
         raise SurveyFileError(
             f"{where}: targets.codes = '{survey.targets.codes}' is neither one of {', '.join(FAMILIES)} "
@@ -348,6 +358,11 @@ def _one_line(path: Path, text: str, error: ValidationError) -> str:
         needed = f"one of {context['expected']}"
     elif kind == "greater_than":
         needed = f"more than {context['gt']:g}"
+    elif kind == "greater_than_equal":
+        least = context["ge"]
+        needed = "more than 0" if least > 0 >= first["input"] else f"at least {least:g}"
+    elif kind == "less_than_equal":
+        needed = f"at most {context['le']:g}"
     elif kind == "too_long":
         needed = f"{context['max_length']} values"
     elif kind == "too_short":

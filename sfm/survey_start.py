@@ -14,6 +14,7 @@ from sfm.errors import PhotographError, SurveyFileError
 from sfm.network import Estimate, ImagePoints, Network, ObjectPoints, ScaleBars
 from sfm.project import CameraSettings, Survey, inside
 from sfm.survey_tables import (
+    ImagePointTable,
     read_control,
     read_exterior,
     read_image_points,
@@ -170,13 +171,15 @@ def network_from_observations(survey: Survey) -> tuple[Network, Estimate]:
     if survey.observations is None:
         raise SurveyFileError(f"{survey.path}: [observations] with a file of image points is needed")
     cameras = start_cameras(survey)
-    table = read_image_points(survey.beside(survey.observations.file))
+    where = survey.beside(survey.observations.file)
+    table = read_image_points(where)
     images, image = _numbered(table.image)
     points, point = _numbered(table.point)
     owner = np.array([camera_of_image(survey, name) for name in images], dtype=np.int64)
     xy, covariance = _in_pixels(
         table.xy, table.sigma, table.unit, cameras, owner[image], survey.adjust.sigma_px
     )
+    _refuse_far_outside(where, table, xy, cameras, owner[image])
     control, _ = control_points(survey, points)
     bars, _ = scale_bars(survey, points)
     network = Network(
@@ -261,13 +264,33 @@ def _in_pixels(
     return xy_px, covariance
 
 
+def _refuse_far_outside(
+    path: Path, table: ImagePointTable, xy_px: FloatArray, cameras: tuple[Camera, ...], camera: IntArray
+) -> None:
+    """Refuse image points farther outside their photograph than it is large: their unit is another."""
+    size = np.array([own.size_px for own in cameras])[camera]
+    for k in np.flatnonzero(((xy_px < -size) | (xy_px > 2 * size)).any(axis=1))[:1]:
+        x, y = table.xy[k]
+        raise SurveyFileError(
+            f"{path}, line {table.line[k]}: image point {x:g}, {y:g} {table.unit} is far outside its "
+            f"photograph of {size[k, 0]} x {size[k, 1]} px; the unit is another, or the size of camera "
+            f"{cameras[camera[k]].name}"
+        )
+
+
 def _approximate(survey: Survey, network: Network, cameras: tuple[Camera, ...]) -> Estimate:
     """Return start values from [approximate] and the control; NaN for what nothing is said about."""
     m, n = len(network.images), len(network.points)
     position, rotation = np.full((m, 3), np.nan), np.full((m, 3, 3), np.nan)
     points = np.full((n, 3), np.nan)
     if survey.approximate.images is not None:
-        exterior = read_exterior(survey.beside(survey.approximate.images))
+        path = survey.beside(survey.approximate.images)
+        exterior = read_exterior(path)
+        for name, line in zip(exterior.names, exterior.line.tolist(), strict=True):
+            if name not in network.images:
+                raise SurveyFileError(
+                    f"{path}, line {line}: image '{name}' has no observations; correct the name or remove it"
+                )
         row = {name: k for k, name in enumerate(exterior.names)}
         for i, name in enumerate(network.images):
             if name in row:

@@ -44,7 +44,7 @@ def kolinear(*arguments: object, limit: int | None = None) -> subprocess.Complet
         cwd=ROOT,
         capture_output=True,
         text=True,
-        timeout=300,
+        timeout=900,
         preexec_fn=full_disk,
         check=False,
     )
@@ -151,7 +151,7 @@ def test_read_only_folder_is_one_line(tmp_path: Path) -> None:
         if setpriv is None:
             pytest.skip("run by root, and there is no setpriv to give up the right to write everywhere")
         command = [setpriv, "--bounding-set=-dac_override", *command]
-    run = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=300, check=False)
+    run = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=900, check=False)
     assert run.returncode == 2, run.stderr
     assert run.stderr.count("\n") == 1, run.stderr
     assert "Permission denied" in run.stderr
