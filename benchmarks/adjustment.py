@@ -1,11 +1,12 @@
 """Adjustment timed against COLMAP's Ceres adjuster on the same networks: problem set-up plus solve, warm.
 
-    python benchmarks/adjustment.py [--networks small|all] [--no-covariance] [--repeat N]
+    python benchmarks/adjustment.py [--networks small|all] [--no-covariance] [--repeat N] [--cpu]
 
 Both start from the same values, adjust the same 8 shared parameters of an `opencv` camera and must end at
 the same cost. "default" is what a user of pycolmap gets; "best" is pycolmap tuned: DENSE_SCHUR or
 SPARSE_SCHUR, whichever wins, function_tolerance 1e-6, start radius 1e8, 1 or 2 threads, whichever wins.
-Only ratios within one run mean anything; run it on a machine that does nothing else.
+Only ratios within one run mean anything; run it on a machine that does nothing else. With --cpu everything
+gets one thread and CPU time is compared, which other programs disturb less.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.solve import adjust
@@ -56,34 +58,54 @@ def main() -> None:
     parser.add_argument("--networks", choices=("small", "all"), default="small")
     parser.add_argument("--no-covariance", action="store_true")
     parser.add_argument("--repeat", type=int, default=3)
+    parser.add_argument("--cpu", action="store_true")
     options = parser.parse_args()
+    clock = time.process_time if options.cpu else time.perf_counter
+    threads = (1,) if options.cpu else (1, 2)
+    if options.cpu:
+        threadpool_limits(1)
     print(f"load {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores (times mean nothing above 0.5)")
     print(f"{'network':24}{'image points':>13}{'default':>10}{'best':>10}{'adjust':>10}{'faster':>8}", end="")
     print(f"{'best+cov':>11}{'adjust+cov':>11}{'faster':>8}{'cost ratio - 1':>16}")
     for case in CASES:
         if case.large and options.networks == "small":
             continue
-        print(row(case, repeat=options.repeat, with_covariance=not options.no_covariance), flush=True)
+        line = row(
+            case,
+            repeat=options.repeat,
+            with_covariance=not options.no_covariance,
+            clock=clock,
+            threads=threads,
+        )
+        print(line, flush=True)
 
 
-def row(case: Case, *, repeat: int, with_covariance: bool) -> str:
+def row(
+    case: Case,
+    *,
+    repeat: int,
+    with_covariance: bool,
+    clock: Callable[[], float],
+    threads: tuple[int, ...],
+) -> str:
     """Return one line of the table."""
     network, start = convergent(case)
-    ours, a = timed(lambda: run_adjust(network, start, covariance=False), repeat)
-    default, _ = timed(lambda: run_ceres(network, start, tuned=None), 1)
+    ours, a = timed(lambda: run_adjust(network, start, covariance=False), repeat, clock)
+    default, _ = timed(lambda: run_ceres(network, start, tuned=None), 1, clock)
     best, cost, how = np.inf, np.inf, ("", 0)
     for solver in ("DENSE_SCHUR", "SPARSE_SCHUR"):
-        for threads in (1, 2):
+        for count in threads:
             seconds, (reached, _) = timed(
-                lambda s=solver, t=threads: run_ceres(network, start, tuned=(s, t)),  # type: ignore[misc]
+                lambda s=solver, t=count: run_ceres(network, start, tuned=(s, t)),  # type: ignore[misc]
                 repeat,
+                clock,
             )
             if seconds < best:
-                best, cost, how = seconds, reached, (solver, threads)
+                best, cost, how = seconds, reached, (solver, count)
     line = f"{case.name:24}{len(network.image_points):13d}{ms(default)}{ms(best)}{ms(ours)}{best / ours:8.1f}"
     if with_covariance:
-        full, _ = timed(lambda: run_adjust(network, start, covariance=True), repeat)
-        other, _ = timed(lambda: run_ceres(network, start, tuned=how, covariance=True), 1)
+        full, _ = timed(lambda: run_adjust(network, start, covariance=True), repeat, clock)
+        other, _ = timed(lambda: run_ceres(network, start, tuned=how, covariance=True), 1, clock)
         line += f"{ms(other, 11)}{ms(full, 11)}{other / full:8.1f}"
     else:
         line += " " * 30
@@ -96,16 +118,16 @@ def ms(seconds: float, width: int = 10) -> str:
     return f"{text:>{width}}"
 
 
-def timed(run: Callable[[], Any], repeat: int) -> tuple[float, Any]:
+def timed(run: Callable[[], Any], repeat: int, clock: Callable[[], float]) -> tuple[float, Any]:
     """Return the shortest of some runs after a warm one, and its result."""
-    started = time.perf_counter()
+    started = clock()
     result = run()
-    first = time.perf_counter() - started
+    first = clock() - started
     times = [first] if first > SLOW_S else []
     while len(times) < (1 if first > SLOW_S else repeat):
-        started = time.perf_counter()
+        started = clock()
         result = run()
-        times.append(time.perf_counter() - started)
+        times.append(clock() - started)
     return min(times), result
 
 

@@ -114,31 +114,36 @@ def collinearity(o, obs, state, weight, t):  # type: ignore[no-untyped-def]
     return W < 0.0
 
 
-@njit(cache=True, error_model="numpy")
-def sum_of_squares(obs, state, weight):  # type: ignore[no-untyped-def]
+def sum_of_squares(obs: Observations, state: State, weight: FloatArray) -> float:
     """Return v'Pv of the image points; infinite where one of weight > 0 lies behind its camera."""
+    return float(_residuals(obs, state, weight, np.empty((0, 2))))
+
+
+def residuals(obs: Observations, state: State) -> FloatArray:
+    """Return v = computed - measured of all image points, px, (k, 2); NaN behind the camera."""
+    v = np.empty((len(obs.image), 2))
+    _residuals(obs, state, np.ones(len(v)), v)
+    return v
+
+
+@njit(cache=True, error_model="numpy")
+def _residuals(obs, state, weight, v):  # type: ignore[no-untyped-def]
+    """Return v'Pv and write the residuals into v unless it is empty (one kernel: compiling takes seconds)."""
     t = scratch()
+    wanted = len(v) > 0
     total = 0.0
     for o in range(len(obs.image)):
         if weight[o] > 0.0:
-            if not _residual(o, obs, state, t):
+            in_front = _residual(o, obs, state, t)
+            if wanted:
+                v[o, 0] = t.r[0] if in_front else np.nan
+                v[o, 1] = t.r[1] if in_front else np.nan
+            elif not in_front:
                 return np.inf
             x = obs.whitening[o, 0] * t.r[0]
             y = obs.whitening[o, 1] * t.r[0] + obs.whitening[o, 2] * t.r[1]
             total += weight[o] * (x * x + y * y)
     return total
-
-
-@njit(cache=True, error_model="numpy")
-def residuals(obs, state):  # type: ignore[no-untyped-def]
-    """Return v = computed - measured of all image points, px, (k, 2); NaN behind the camera."""
-    t = scratch()
-    v = np.empty((len(obs.image), 2))
-    for o in range(len(obs.image)):
-        in_front = _residual(o, obs, state, t)
-        v[o, 0] = t.r[0] if in_front else np.nan
-        v[o, 1] = t.r[1] if in_front else np.nan
-    return v
 
 
 @njit(cache=True, inline="always", error_model="numpy")

@@ -32,7 +32,7 @@ SHORTEST = 2.0**-12  # shortest share of a Gauss-Newton step that is tried
 START_DAMPING = 1e-3  # share of the diagonal
 NEAR = 1e-2  # |A dx| / |v| below which Levenberg-Marquardt hands over to Gauss-Newton
 MAX_DAMPING = 1e10
-METHODS = ("gauss-newton", "levenberg-marquardt")
+METHODS = ("gauss-newton", "levenberg-marquardt", "undamped")
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,7 @@ def iterate(
         state: where to start.
         weight: factor on the weight of each image point, shape (k,).
         datum: kind and points.
-        method: gauss-newton or levenberg-marquardt.
+        method: gauss-newton, levenberg-marquardt, or undamped (Gauss-Newton with full steps, to compare).
         max_iterations: steps to try at most.
         tolerance: |A dx| / |v| at which the iteration has converged.
 
@@ -99,7 +99,9 @@ def iterate(
         if taken >= max_iterations:
             break
         taken += 1
-        found, reached = _line_search(layout, weighted, state, weight, reduced, points, vPv, predicted)
+        shortest = 1.0 if method == "undamped" else SHORTEST
+        wanted = -np.inf if method == "undamped" else predicted
+        found, reached = _line_search(layout, weighted, state, weight, reduced, points, vPv, wanted, shortest)
         if found is None:
             break
         state, vPv = found, reached
@@ -166,13 +168,14 @@ def _line_search(
     points: FloatArray,
     vPv: float,
     predicted: float,
+    shortest: float,
 ) -> tuple[State | None, float]:
     """Return the first of the steps 1, 1/2, 1/4 ... that meets Armijo's condition; None if none does."""
     share = 1.0
-    while share >= SHORTEST:
+    while share >= shortest:
         moved = step(layout, state, share * reduced, share * points)
         reached = total(layout, weighted, moved, weight)
-        if reached <= vPv - 2 * ARMIJO * share * predicted:
+        if np.isfinite(reached) and reached <= vPv - 2 * ARMIJO * share * predicted:
             return moved, reached
         share /= 2
     return None, vPv

@@ -156,14 +156,19 @@ def _accumulate(obs, state, weight, interior_start, Np, gp0, point_free, slot, k
     for j in range(len(state.points)):
         row = 3 * slot[j] if slot[j] >= 0 else 3 * j
         rows = b.K if slot[j] >= 0 else b.Yt
-        rows[row : row + 3, first_interior:] = 0.0
-        b.V[j] = Np[j]
-        b.gp[j] = gp0[j]
+        for p in range(3):
+            for q in range(first_interior, rows.shape[1]):
+                rows[row + p, q] = 0.0
+            for q in range(3):
+                b.V[j, p, q] = Np[j, p, q]
+            b.gp[j, p] = gp0[j, p]
         last_image, last_camera = -1, -1
         for o in range(obs.start[j], obs.start[j + 1]):
             i = obs.image[o]
             if i != last_image:
-                rows[row : row + 3, 6 * i : 6 * i + 6] = 0.0
+                for p in range(3):
+                    for q in range(6 * i, 6 * i + 6):
+                        rows[row + p, q] = 0.0
                 last_image = i
             if weight[o] > 0.0:
                 a = obs.camera[i]
@@ -176,52 +181,71 @@ def _accumulate(obs, state, weight, interior_start, Np, gp0, point_free, slot, k
                 _add_image_point(i, a, obs.interior[a], j, t, b, rows, row, E)
         _add_interior(E, last_camera, obs, interior_start, rows, row)
         for p in range(3):
+            for q in range(p):
+                b.V[j, p, q] = b.V[j, q, p]
+        for p in range(3):
             if not point_free[j, p]:
-                b.V[j, p, :] = 0.0
-                b.V[j, :, p] = 0.0
+                for q in range(3):
+                    b.V[j, p, q] = b.V[j, q, p] = 0.0
                 b.V[j, p, p] = 1.0
                 b.gp[j, p] = 0.0
-                rows[row + p] = 0.0
+                for q in range(rows.shape[1]):
+                    rows[row + p, q] = 0.0
         if slot[j] >= 0:
-            rows[row : row + 3, kept_start + row : kept_start + row + 3] = b.V[j]
-            b.L[j] = np.eye(3)
-            b.y[j] = 0.0
+            for p in range(3):
+                for q in range(3):
+                    rows[row + p, kept_start + row + q] = b.V[j, p, q]
+                    b.L[j, p, q] = 1.0 if p == q else 0.0
+                b.y[j, p] = 0.0
             b.held[j] = 0
         else:
-            b.held[j] = _factor(b.V[j], stretch, b.L[j])
-            _forward(b.L[j], b.gp[j], b.y[j])
+            b.held[j] = _factor(j, b.V, stretch, b.L)
+            _forward(j, b.L, b.gp, b.y)
             last_image = -1
             for o in range(obs.start[j], obs.start[j + 1]):
                 i = obs.image[o]
                 if i != last_image:
-                    _forward_columns(b.L[j], rows, row, 6 * i, 6 * i + 6)
+                    _forward_columns(j, b.L, rows, row, 6 * i, 6 * i + 6)
                     last_image = i
-            _forward_columns(b.L[j], rows, row, first_interior, kept_start)
+            _forward_columns(j, b.L, rows, row, first_interior, kept_start)
     return vPv
 
 
 @njit(cache=True, inline="always", error_model="numpy")
 def _add_image_point(i, a, f, j, t, b, rows, row, E):  # type: ignore[no-untyped-def]
-    """Add one weighted image point to the blocks; rows holds W' of its object point, E its interior part."""
-    for p in range(6):
-        x, y = t.A[0, p], t.A[1, p]
-        for q in range(p, 6 + f):
-            b.U[i, p, q] += x * t.A[0, q] + y * t.A[1, q]
-        b.g[i, p] += x * t.r[0] + y * t.r[1]
+    """Add one weighted image point to the blocks; rows holds W' of its object point, E its interior part.
+
+    With A = (-B, R, I) every product with B serves the point and, turned in sign, the projection centre.
+    """
+    for p in range(3):
+        B0, B1 = t.B[0, p], t.B[1, p]
+        R0, R1 = t.A[0, 3 + p], t.A[1, 3 + p]
+        for q in range(p, 3):
+            BB = B0 * t.B[0, q] + B1 * t.B[1, q]
+            b.V[j, p, q] += BB
+            b.U[i, p, q] += BB
+            rows[row + p, 6 * i + q] -= BB
+            if q > p:
+                rows[row + q, 6 * i + p] -= BB
+            b.U[i, 3 + p, 3 + q] += R0 * t.A[0, 3 + q] + R1 * t.A[1, 3 + q]
+        for q in range(3):
+            BR = B0 * t.A[0, 3 + q] + B1 * t.A[1, 3 + q]
+            b.U[i, p, 3 + q] -= BR
+            rows[row + p, 6 * i + 3 + q] += BR
+        Br = B0 * t.r[0] + B1 * t.r[1]
+        b.gp[j, p] += Br
+        b.g[i, p] -= Br
+        b.g[i, 3 + p] += R0 * t.r[0] + R1 * t.r[1]
+        for q in range(f):
+            BI = B0 * t.A[0, 6 + q] + B1 * t.A[1, 6 + q]
+            E[p, q] += BI
+            b.U[i, p, 6 + q] -= BI
+            b.U[i, 3 + p, 6 + q] += R0 * t.A[0, 6 + q] + R1 * t.A[1, 6 + q]
     for p in range(f):
         x, y = t.A[0, 6 + p], t.A[1, 6 + p]
         for q in range(p, f):
             b.D[a, p, q] += x * t.A[0, 6 + q] + y * t.A[1, 6 + q]
         b.gi[a, p] += x * t.r[0] + y * t.r[1]
-    for p in range(3):
-        x, y = t.B[0, p], t.B[1, p]
-        for q in range(3):
-            b.V[j, p, q] += x * t.B[0, q] + y * t.B[1, q]
-        b.gp[j, p] += x * t.r[0] + y * t.r[1]
-        for q in range(6):
-            rows[row + p, 6 * i + q] += x * t.A[0, q] + y * t.A[1, q]
-        for q in range(f):
-            E[p, q] += x * t.A[0, 6 + q] + y * t.A[1, 6 + q]
 
 
 @njit(cache=True, inline="always", error_model="numpy")
@@ -235,40 +259,40 @@ def _add_interior(E, a, obs, interior_start, rows, row):  # type: ignore[no-unty
 
 
 @njit(cache=True, inline="always", error_model="numpy")
-def _factor(V, stretch, L):  # type: ignore[no-untyped-def]
+def _factor(j, V, stretch, L):  # type: ignore[no-untyped-def]
     """Cholesky factor of V with its diagonal times stretch; holds directions that the rays leave open."""
     held = 0
-    L[:] = 0.0
     for p in range(3):
-        pivot = V[p, p] * stretch
+        pivot = V[j, p, p] * stretch
         for q in range(p):
-            pivot -= L[p, q] * L[p, q]
-        if pivot > SINGULAR_PIVOT * V[p, p]:
-            L[p, p] = np.sqrt(pivot)
+            pivot -= L[j, p, q] * L[j, p, q]
+        if pivot > SINGULAR_PIVOT * V[j, p, p]:
+            L[j, p, p] = np.sqrt(pivot)
         else:
             held = 1
-            L[p, p] = STIFF * np.sqrt(V[p, p]) if V[p, p] > 0.0 else STIFF
+            L[j, p, p] = STIFF * np.sqrt(V[j, p, p]) if V[j, p, p] > 0.0 else STIFF
         for s in range(p + 1, 3):
-            total = V[s, p]
+            total = V[j, s, p]
             for q in range(p):
-                total -= L[s, q] * L[p, q]
-            L[s, p] = total / L[p, p]
+                total -= L[j, s, q] * L[j, p, q]
+            L[j, s, p] = total / L[j, p, p]
+            L[j, p, s] = 0.0
     return held
 
 
 @njit(cache=True, inline="always", error_model="numpy")
-def _forward(L, g, y):  # type: ignore[no-untyped-def]
+def _forward(j, L, g, y):  # type: ignore[no-untyped-def]
     """y = L^-1 g."""
-    y[0] = g[0] / L[0, 0]
-    y[1] = (g[1] - L[1, 0] * y[0]) / L[1, 1]
-    y[2] = (g[2] - L[2, 0] * y[0] - L[2, 1] * y[1]) / L[2, 2]
+    y[j, 0] = g[j, 0] / L[j, 0, 0]
+    y[j, 1] = (g[j, 1] - L[j, 1, 0] * y[j, 0]) / L[j, 1, 1]
+    y[j, 2] = (g[j, 2] - L[j, 2, 0] * y[j, 0] - L[j, 2, 1] * y[j, 1]) / L[j, 2, 2]
 
 
 @njit(cache=True, inline="always", error_model="numpy")
-def _forward_columns(L, rows, row, first, end):  # type: ignore[no-untyped-def]
-    """Replace columns of the three rows W' of a point by L^-1 W'."""
-    i0, i1, i2 = 1.0 / L[0, 0], 1.0 / L[1, 1], 1.0 / L[2, 2]
-    l10, l20, l21 = L[1, 0], L[2, 0], L[2, 1]
+def _forward_columns(j, L, rows, row, first, end):  # type: ignore[no-untyped-def]
+    """Replace columns of the three rows W' of point j by L^-1 W'."""
+    i0, i1, i2 = 1.0 / L[j, 0, 0], 1.0 / L[j, 1, 1], 1.0 / L[j, 2, 2]
+    l10, l20, l21 = L[j, 1, 0], L[j, 2, 0], L[j, 2, 1]
     for q in range(first, end):
         y0 = rows[row, q] * i0
         y1 = (rows[row + 1, q] - l10 * y0) * i1

@@ -1,0 +1,120 @@
+"""Separate adjustment of points and orientations in turn, for the record and as a test.
+
+Each round first moves every object point with the orientations held (3 x 3 systems), then all
+orientations with the points held (one system of the exterior orientations and the interior parameters).
+It ends at the same optimum as the simultaneous adjustment, but converges only linearly and knows no
+covariance between points and orientations: what it would call the precision of a point is the limiting
+precision.
+
+Source: document 000 of the project's sources, sec. 2.4; block coordinate descent in Nocedal and Wright,
+Numerical Optimization (2006), sec. 9.3.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import cho_factor, cho_solve
+
+from sfm.adjustment.collinearity import State, sum_of_squares
+from sfm.adjustment.normals import new_blocks, normal_equations
+from sfm.adjustment.parameters import Unknowns, estimate_of, start_weights, step, unknowns_of
+from sfm.adjustment.weighted import weighted_of
+from sfm.conventions import FloatArray
+from sfm.errors import GeometryError
+from sfm.network import Estimate, Network
+
+SETTLED = 1e-13  # relative decrease of v'Pv in a round at which the rounds end
+SHORTEST = 2.0**-12  # shortest share of a step that is tried
+
+
+@dataclass(frozen=True)
+class SeparateAdjustment:
+    """Where the rounds ended."""
+
+    estimate: Estimate
+    vPv: float
+    rounds: int
+    converged: bool
+
+
+def adjust_separately(
+    network: Network, estimate: Estimate, *, max_rounds: int = 2000, settled: float = SETTLED
+) -> SeparateAdjustment:
+    """Return the adjustment by points and orientations in turn.
+
+    The control points of the network, fixed, are the datum if there are any; else it stays where the
+    start values put it.
+
+    Args:
+        network: image points, and control points if any.
+        estimate: start values.
+        max_rounds: rounds at most.
+        settled: relative decrease of v'Pv in a round at which the rounds end.
+
+    Raises:
+        GeometryError: scale bars or weighted unknowns, which join points to one another.
+    """
+    layout, state = unknowns_of(network, estimate, use_control=True)
+    weighted = weighted_of(network, layout, use_control=True)
+    if weighted.count:
+        raise GeometryError(
+            "separate adjustment: scale bars and weighted unknowns are for the simultaneous one"
+        )
+    weight = start_weights(layout, state)
+    vPv = float(sum_of_squares(layout.obs, state, weight))
+    space = new_blocks(layout)
+    for number in range(1, max_rounds + 1):
+        before = vPv
+        for move in (_points, _orientations):
+            normals = normal_equations(layout, weighted, state, weight, space=space)
+            reduced, points = move(normals.blocks, layout)
+            state, vPv = _shorten(layout, state, weight, reduced, points, vPv)
+        if before - vPv <= settled * before:
+            return SeparateAdjustment(estimate_of(state, estimate), vPv, number, True)
+    return SeparateAdjustment(estimate_of(state, estimate), vPv, max_rounds, False)
+
+
+def _points(blocks, layout: Unknowns) -> tuple[FloatArray, FloatArray]:  # type: ignore[no-untyped-def]
+    """Step of the points, -V^-1 g, with the orientations held."""
+    dX = -np.linalg.solve(blocks.V, blocks.gp[:, :, None])[:, :, 0]
+    return np.zeros(layout.reduced), np.where(layout.point_free, dX, 0.0)
+
+
+def _orientations(blocks, layout: Unknowns) -> tuple[FloatArray, FloatArray]:  # type: ignore[no-untyped-def]
+    """Step of exterior and interior orientation, -U^-1 g, with the points held."""
+    m = len(layout.exterior_free)
+    U = np.zeros((layout.reduced, layout.reduced))
+    g = np.zeros(layout.reduced)
+    g[: 6 * m] = blocks.g.ravel()
+    for i in range(m):
+        U[6 * i : 6 * i + 6, 6 * i : 6 * i + 6] = np.triu(blocks.U[i, :, :6])
+        a = layout.obs.camera[i]
+        free = layout.interior_free[a]
+        first = layout.interior_start[a]
+        U[6 * i : 6 * i + 6, first : first + len(free)] = blocks.U[i][:, 6 + free]
+    for a, free in enumerate(layout.interior_free):
+        own = slice(layout.interior_start[a], layout.interior_start[a] + len(free))
+        U[own, own] = np.triu(blocks.D[a])[np.ix_(free, free)]
+        g[own] = blocks.gi[a][free]
+    on = layout.reduced_free()
+    scale = 1 / np.sqrt(np.diagonal(U)[on])
+    factored = cho_factor(U[np.ix_(on, on)] * scale[:, None] * scale, lower=False)
+    dx = np.zeros(layout.reduced)
+    dx[on] = -scale * cho_solve(factored, scale * g[on])
+    return dx, np.zeros(layout.point_free.shape)
+
+
+def _shorten(
+    layout: Unknowns, state: State, weight: FloatArray, reduced: FloatArray, points: FloatArray, vPv: float
+) -> tuple[State, float]:
+    """Return the state after the longest share of the step, by halves, that does not raise v'Pv."""
+    share = 1.0
+    while share >= SHORTEST:
+        moved = step(layout, state, share * reduced, share * points)
+        reached = float(sum_of_squares(layout.obs, moved, weight))
+        if reached <= vPv:
+            return moved, reached
+        share /= 2
+    return state, vPv
