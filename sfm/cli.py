@@ -12,7 +12,6 @@ from typing import Annotated
 
 import typer
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 from rich.table import Table
 from rich.text import Text
 from threadpoolctl import threadpool_limits
@@ -20,6 +19,8 @@ from threadpoolctl import threadpool_limits
 from sfm.batch import find_surveys, run_batch
 from sfm.batch_survey import Adjusters
 from sfm.batch_table import BatchTable, print_batch, stopping_at_terminate
+from sfm.commands import measuring, solvers
+from sfm.commands.console import drawn_progress
 from sfm.errors import KolinearError
 from sfm.folder_lock import locked
 from sfm.pipeline import Backend, adjust_survey, run_survey
@@ -102,7 +103,7 @@ def run(
     folder = _folder(survey, out)
     workers = jobs or _cores()
     store = TargetStore(folder.parent / STORE)
-    with _drawn_progress() as drawn, _threads(), _written(folder), SurveyLog(watch=drawn) as log:
+    with drawn_progress() as drawn, _threads(), _written(folder), SurveyLog(watch=drawn) as log:
         log.note("start", survey=survey.name, file=str(survey_file))
         result = run_survey(
             survey, images_dir=images, jobs=workers, backend=backend, store=store, progress=log
@@ -130,7 +131,7 @@ def adjust(
         )
     backend = _backend(survey)
     folder = _folder(survey, out)
-    with _drawn_progress() as drawn, _threads(), _written(folder), SurveyLog(watch=drawn) as log:
+    with drawn_progress() as drawn, _threads(), _written(folder), SurveyLog(watch=drawn) as log:
         log.note("start", survey=survey.name, file=str(survey_file))
         result = adjust_survey(survey, backend=backend, progress=log)
         page = write_result(
@@ -196,6 +197,17 @@ def batch(
     print_batch(Console(highlight=False), rows, out / "index.html")
     if not all(row.succeeded for row in rows):
         raise SystemExit(FAILED)
+
+
+for _command in (
+    measuring.resect,
+    measuring.match,
+    measuring.targets,
+    solvers.validate,
+    solvers.compare,
+    solvers.convert,
+):
+    app.command()(_command)
 
 
 def main() -> None:
@@ -265,49 +277,6 @@ def _threads() -> Iterator[None]:
     """Hold BLAS to one thread: photographs are worked on side by side, and two BLAS pools in turn fight."""
     with threadpool_limits(limits=1, user_api="blas"):
         yield
-
-
-class _Drawn:
-    """Progress as a bar on the terminal: the stage, and the photographs done."""
-
-    def __init__(self, bar: Progress) -> None:
-        self._bar = bar
-        self._task: TaskID | None = None
-
-    def stage(self, name: str, total: int | None = None) -> None:
-        """Begin a line for the stage; a second call for the same stage tells its total."""
-        if self._task is not None:
-            task = self._bar.tasks[-1]
-            if task.description == name:
-                self._bar.update(self._task, total=total)
-                return
-            self._bar.update(self._task, total=task.total or 1, completed=task.total or 1, step="")
-            self._bar.stop_task(self._task)
-        self._task = self._bar.add_task(name, total=total, step="")
-
-    def advance(self, step: str = "") -> None:
-        """Count one step and name it."""
-        if self._task is not None:
-            self._bar.update(self._task, advance=1, step=step)
-
-
-@contextmanager
-def _drawn_progress() -> Iterator[_Drawn]:
-    """Show a progress bar on stderr while it is a terminal; nothing else ever goes there but an error."""
-    console = Console(stderr=True)
-    with Progress(
-        TextColumn("{task.description:12}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        TextColumn("{task.fields[step]}", style="dim"),
-        console=console,
-        disable=not console.is_terminal,
-    ) as bar:
-        drawn = _Drawn(bar)
-        yield drawn
-        drawn.stage("done", 1)
-        bar.remove_task(bar.task_ids[-1])
 
 
 def _tell(result: SurveyResult, page: Path, *, verbose: bool) -> None:

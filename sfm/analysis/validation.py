@@ -67,7 +67,8 @@ class ValidationCovariance(Protocol):
 class ValidationBackend(Protocol):
     """The other adjuster: a module or an object with a name and these two functions."""
 
-    name: str
+    @property
+    def name(self) -> str: ...
 
     def adjust(self, network: Network, start: Estimate, *, control: bool) -> ValidationAdjustment:
         """Adjust with unit weights, control points held or the datum free."""

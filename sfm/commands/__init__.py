@@ -1,0 +1,1 @@
+"""The commands of Kolinear besides run, adjust and batch, by what they are about."""

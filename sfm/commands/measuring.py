@@ -1,0 +1,140 @@
+"""Commands about single photographs: match, resect and targets."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+
+from sfm.conventions import IntArray
+from sfm.errors import GeometryError, SurveyFileError
+from sfm.orientation.resection.report import METHODS, resect_json, resect_table
+from sfm.orientation.resection.task import Task, read_task
+from sfm.report.matching import match_command
+from sfm.targets.sheet import lay_out_sheet, write_sheet
+
+MOST_TARGETS = 10_000  # on one sheet; no family has more codes
+
+
+def match(
+    left: Annotated[Path, typer.Argument(metavar="LEFT", help="Photograph in which the points are given.")],
+    right: Annotated[Path, typer.Argument(metavar="RIGHT", help="Photograph in which they are looked for.")],
+    point: Annotated[
+        str | None, typer.Option("--point", metavar="COL,ROW", help="One point of LEFT, px.")
+    ] = None,
+    points: Annotated[
+        Path | None,
+        typer.Option("--points", metavar="FILE", help="Table point,x_px,y_px[,x_right_px,y_right_px]."),
+    ] = None,
+    method: Annotated[
+        str,
+        typer.Option("--method", help="ncc, lsm (6 affine + 2 radiometric parameters), lsm8 or shift."),
+    ] = "lsm",
+    template: Annotated[
+        int, typer.Option("--template", metavar="N", help="Side of the patch, odd, px.")
+    ] = 21,
+    search: Annotated[int, typer.Option("--search", metavar="N", help="Side of the window, px.")] = 121,
+    equalise: Annotated[
+        bool, typer.Option("--equalise", help="Equalise the histograms before least squares matching.")
+    ] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON in place of a table.")] = False,
+    out: Annotated[Path | None, typer.Option("--out", metavar="FILE", help="Write CSV.")] = None,
+    picture: Annotated[
+        Path | None,
+        typer.Option("--picture", metavar="FILE.png", help="Picture of template, match and difference."),
+    ] = None,
+) -> None:
+    """Find conjugate points of two photographs by correlation and least squares matching."""
+    print(
+        match_command(
+            left,
+            right,
+            point=point,
+            points=points,
+            method=method,
+            template_px=template,
+            search_px=search,
+            equalise=equalise,
+            as_json=as_json,
+            out=out,
+            picture=picture,
+        )
+    )
+
+
+def resect(
+    points: Annotated[Path, typer.Argument(metavar="POINTS.csv", help="Table point,X,Y,Z,x_mm,y_mm.")],
+    c: Annotated[float | None, typer.Option("--c", metavar="MM", help="Principal distance, mm.")] = None,
+    method: Annotated[
+        str, typer.Option("--method", help=f"{', '.join(METHODS)}, or all for a table of them.")
+    ] = "robust",
+    camera: Annotated[
+        Path | None,
+        typer.Option("--camera", metavar="CAMERA.csv", help="Table parameter,value of model brown, mm."),
+    ] = None,
+    start: Annotated[
+        str | None,
+        typer.Option("--start", metavar="X,Y,Z[,omega,phi,kappa]", help="Start values, object unit and deg."),
+    ] = None,
+    tolerance: Annotated[
+        float | None,
+        typer.Option("--tolerance", metavar="MM", help="Largest residual of a good point for robust, mm."),
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON in place of a table.")] = False,
+) -> None:
+    """Orient one photograph on known points by any of the methods, or compare them all."""
+    task = read_task(points, c_mm=c, camera_file=camera, start=start, tolerance_mm=tolerance)
+    if not as_json:
+        print(resect_table(task, method))
+        return
+    found = [_tried(task, one) for one in METHODS] if method == "all" else resect_json(task, method)
+    print(json.dumps(found, indent=2, allow_nan=False))
+
+
+def _tried(task: Task, method: str) -> dict[str, object]:
+    """Return what one of all methods finds, or why it finds nothing."""
+    try:
+        return resect_json(task, method)
+    except GeometryError as error:
+        return {"method": method, "error": str(error)}
+
+
+def targets(
+    out: Annotated[Path, typer.Option("--out", metavar="FILE", help="Sheet to write: .pdf or .svg.")],
+    family: Annotated[
+        str, typer.Option("--family", help="ring12, ring14, ring20, arcs, or a code table file.")
+    ] = "ring14",
+    ids: Annotated[str, typer.Option("--ids", metavar="A-B,C", help="Code numbers.")] = "1-100",
+    diameter: Annotated[
+        float, typer.Option("--diameter-mm", metavar="MM", help="Diameter of the dot, mm.")
+    ] = 10.0,
+    page: Annotated[str, typer.Option("--page", help="a4, a3, letter ...")] = "a4",
+    bright: Annotated[bool, typer.Option("--bright", help="White targets on dark squares.")] = False,
+) -> None:
+    """Write a sheet of coded targets for printing, in true scale with a ruler to check the print."""
+    sheet = lay_out_sheet(family, _numbers(ids), diameter_mm=diameter, page=page, dark=not bright)
+    for path in write_sheet(sheet, out):
+        print(path)
+
+
+def _numbers(text: str) -> IntArray:
+    """Return the code numbers that `1-100,205` names.
+
+    Raises:
+        SurveyFileError: not numbers and ranges, or too many.
+    """
+    numbers: list[int] = []
+    for part in text.split(","):
+        first, dash, last = part.strip().partition("-")
+        if not first.isdecimal() or (dash and not last.isdecimal()):
+            raise SurveyFileError(f"--ids {text}: '{part}' is neither a number nor a range such as 1-100")
+        begin, end = int(first), int(last if dash else first)
+        if end < begin or end - begin >= MOST_TARGETS or len(numbers) + end - begin >= MOST_TARGETS:
+            raise SurveyFileError(
+                f"--ids {text}: '{part}' must run upwards, and a sheet holds at most {MOST_TARGETS} targets"
+            )
+        numbers += range(begin, end + 1)
+    return np.array(numbers, dtype=np.int64)

@@ -1,0 +1,102 @@
+"""Commands about solutions: validate, compare and convert."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from sfm.analysis.conversion import convert_cameras
+from sfm.analysis.significance import compare_results
+from sfm.analysis.validation import validate as validate_networks
+from sfm.commands.console import drawn_progress
+from sfm.report.differences import write_differences
+from sfm.report.output import refuse_foreign_folder
+from sfm.report.validation import largest, write_validation
+
+WORSE = 1  # exit code where the in-house adjuster was ever the worse one
+
+
+def validate(
+    networks: Annotated[int, typer.Option("--networks", metavar="N", min=1, help="Random networks.")] = 50,
+    seed: Annotated[int, typer.Option("--seed", metavar="S", help="Of the random numbers.")] = 1,
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder of table, JSON and page.")] = Path(
+        "out/validation"
+    ),
+    jobs: Annotated[int, typer.Option("--jobs", metavar="N", min=1, help="Networks at a time.")] = 2,
+) -> None:
+    """Adjust random networks with the in-house adjuster and COLMAP's, and compare everything."""
+    from adapters.colmap_validation import ColmapBackend
+
+    refuse_foreign_folder(out)
+    with drawn_progress() as progress:
+        found = validate_networks(ColmapBackend(), networks=networks, seed=seed, jobs=jobs, progress=progress)
+    page = write_validation(found, out)
+    for verdict, count in found.counts():
+        print(f"{count} of {networks} networks: {verdict}")
+    for name, value, meaning in largest(found):
+        print(f"{name}: {value:.2g} largest difference {meaning}")
+    print(f"Report: {page}")
+    if not found.passed:
+        raise SystemExit(WORSE)
+
+
+def compare(
+    a: Annotated[Path, typer.Argument(metavar="A", help="Result folder, COLMAP model, or another format.")],
+    b: Annotated[Path, typer.Argument(metavar="B", help="What to compare it with.")],
+    align: Annotated[
+        str, typer.Option("--align", help="points, cameras, control or none: what B is brought onto A by.")
+    ] = "points",
+    control: Annotated[
+        str, typer.Option("--control", metavar="A,B,C", help="Names of the points for --align control.")
+    ] = "",
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder of table, JSON and page.")] = Path(
+        "out/comparison"
+    ),
+) -> None:
+    """Compare two results: differences, their standard deviations and what of them is significant."""
+    from adapters.formats import read_comparable
+
+    refuse_foreign_folder(out)
+    first, second = read_comparable(a), read_comparable(b)
+    names = tuple(name.strip() for name in control.split(",") if name.strip())
+    found = compare_results(first, second, align=align, control=names)
+    place = {name: j for j, name in enumerate(first.network.points)}
+    xyz = first.estimate.points[[place[name] for name in found.points]]
+    page = write_differences(found, xyz, out)
+    largest = float((found.point_difference**2).sum(axis=1).max() ** 0.5) if len(xyz) else 0.0
+    print(f"{len(found.points)} common points, {int(found.significant.sum())} differ significantly")
+    print(f"largest difference of a point: {largest:.6g} (object unit of A)")
+    print(f"Report: {page}")
+
+
+def convert(
+    source: Annotated[Path, typer.Argument(metavar="IN", help="File or folder to read.")],
+    target: Annotated[Path, typer.Argument(metavar="OUT", help="File or folder to write.")],
+    to_format: Annotated[
+        str | None,
+        typer.Option("--to", metavar="F", help="Format to write; else by the ending of OUT.  See README."),
+    ] = None,
+    from_format: Annotated[
+        str | None, typer.Option("--from", metavar="F", help="Format to read; else by what is there.")
+    ] = None,
+) -> None:
+    """Carry a survey between programs; a camera is converted where the format lacks its model."""
+    from adapters.formats import ENDINGS, format_named, read_any, write_any
+
+    form = format_named(to_format or ENDINGS.get(target.suffix.lower(), "tables"))
+    network, estimate = read_any(source, from_format)
+    if form.models:
+        estimate, conversions = convert_cameras(estimate, form.models)
+        for one in conversions:
+            if one.camera.model != one.source_model:
+                print(
+                    f"camera {one.camera.name}: {one.source_model} to {one.camera.model}, "
+                    f"misfit {one.rms_px:.4f} px RMS, {one.max_px:.4f} px at most"
+                )
+    write_any(target, form.name, network, estimate)
+    print(
+        f"{target}: {len(network.images)} photographs, {len(network.points)} points, "
+        f"{len(network.image_points)} image points as {form.name}"
+    )
