@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import io
 import math
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from threading import Lock
@@ -23,6 +26,17 @@ cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
 _PILLOW = Lock()
 
 CHANNELS = ("luminance", "red", "green", "blue")
+# Photographs are read as untrusted: what they claim to be is bounded before memory is taken for it.
+FORMATS = ("JPEG", "PNG", "TIFF", "BMP", "PPM", "WEBP")  # by the names of Pillow, which finds none unasked
+Image.init()
+MAX_FILE_BYTES = 2**30
+MAX_PIXELS = 250_000_000  # the largest aerial scans; digital backs have 151 million
+# A larger picture in fewer bytes is a decompression bomb; one sole grey value is 250 px per byte in a JPEG.
+BOMB_PIXELS, BOMB_PX_PER_BYTE = 16_000_000, 500
+MAX_SCANNED_PIXELS = 2_500_000_000  # pixels times scans of a progressive JPEG, some 20 s of decoding
+# Beyond these what EXIF data say is no camera: principal distance and pixel in mm.
+FOCAL_MM = (0.1, 1e5)
+PIXEL_MM = (1e-5, 1.0)
 
 
 @dataclass(frozen=True)
@@ -63,6 +77,9 @@ def read_photograph(path: str | Path, *, channel: str = "luminance") -> AnyArray
         raise PhotographError(f"{path.name}: channel {channel!r} is none of {', '.join(CHANNELS)}")
     data = _read_bytes(path)
     _refuse_truncated(path, data)
+    with _opened(path, io.BytesIO(data)) as header:
+        size = header.size
+    _refuse_bomb(path, size, data)
     colour = cv2.IMREAD_GRAYSCALE if channel == "luminance" else cv2.IMREAD_COLOR
     try:
         image = cv2.imdecode(
@@ -72,6 +89,9 @@ def read_photograph(path: str | Path, *, channel: str = "luminance") -> AnyArray
         image = None
     if image is None:
         raise PhotographError(f"{path.name}: not a photograph that can be decoded ({len(data)} bytes)")
+    if image.shape[1::-1] != size:
+        found = f"{image.shape[1]} x {image.shape[0]}"
+        raise PhotographError(f"{path.name}: {found} px, its header says {size[0]} x {size[1]}")
     if image.dtype not in (np.uint8, np.uint16):
         raise PhotographError(f"{path.name}: found {image.dtype} intensities, needed 8 or 16 bit")
     if image.ndim == 3:
@@ -92,15 +112,15 @@ def read_metadata(path: str | Path) -> Metadata:
         PhotographError: no such file or no photograph.
     """
     path = Path(path)
-    try:
-        with _PILLOW, warnings.catch_warnings(action="ignore"), Image.open(path) as image:
-            size = image.size
+    with _opened(path, path) as image:
+        size = image.size
+        try:
             exif = image.getexif()
             camera = exif.get_ifd(ExifTags.IFD.Exif)
-    except (OSError, ValueError, SyntaxError) as error:
-        raise PhotographError(f"{path.name}: {_reason(path, error)}") from error
-    focal = _positive(camera.get(ExifTags.Base.FocalLength))
-    equivalent = _positive(camera.get(ExifTags.Base.FocalLengthIn35mmFilm))
+        except Exception:  # damaged EXIF data, over which Pillow stumbles in many ways, are as good as none
+            exif, camera = Image.Exif(), {}
+    focal = _between(camera.get(ExifTags.Base.FocalLength), FOCAL_MM)
+    equivalent = _between(camera.get(ExifTags.Base.FocalLengthIn35mmFilm), FOCAL_MM)
     orientation = exif.get(ExifTags.Base.Orientation, 1)
     return Metadata(
         size_px=size,
@@ -109,7 +129,7 @@ def read_metadata(path: str | Path) -> Metadata:
         focal_mm=focal,
         focal_35mm=equivalent,
         pixel_mm=_pixel_from_exif(size, camera, focal, equivalent),
-        orientation=orientation if orientation in range(1, 9) else 1,
+        orientation=orientation if isinstance(orientation, int) and 1 <= orientation <= 8 else 1,
     )
 
 
@@ -117,22 +137,71 @@ def _pixel_from_exif(
     size: tuple[int, int], camera: Any, focal: float | None, equivalent: float | None
 ) -> tuple[float, float] | None:
     """Return width and height of a pixel in mm, None if the file does not tell."""
-    unit_mm = {2: 25.4, 3: 10.0, 4: 1.0}.get(camera.get(ExifTags.Base.FocalPlaneResolutionUnit, 2))
+    unit = _positive(camera.get(ExifTags.Base.FocalPlaneResolutionUnit, 2))
+    unit_mm = {2.0: 25.4, 3.0: 10.0, 4.0: 1.0}.get(unit) if unit else None
     across = _positive(camera.get(ExifTags.Base.FocalPlaneXResolution))
     down = _positive(camera.get(ExifTags.Base.FocalPlaneYResolution))
-    full = camera.get(ExifTags.Base.ExifImageWidth)
+    full = _positive(camera.get(ExifTags.Base.ExifImageWidth))
+    width = height = None
     if unit_mm and across and down and full:
         scale = full / size[0]  # the resolution is that of the picture as taken
-        return unit_mm / across * scale, unit_mm / down * scale
-    if focal and equivalent:
+        width, height = unit_mm / across * scale, unit_mm / down * scale
+    elif focal and equivalent:
         diagonal_mm = math.hypot(36.0, 24.0) * focal / equivalent
-        pixel = diagonal_mm / math.hypot(*size)
-        return pixel, pixel
-    return None
+        width = height = diagonal_mm / math.hypot(*size)
+    width, height = _between(width, PIXEL_MM), _between(height, PIXEL_MM)
+    return (width, height) if width and height else None
+
+
+@contextmanager
+def _opened(path: Path, source: Path | io.BytesIO) -> Iterator[Image.Image]:
+    """Open the header of a photograph; nothing is decoded.
+
+    Raises:
+        PhotographError: no such file, no photograph of a known format, or one that claims to be too large.
+    """
+    with _PILLOW, warnings.catch_warnings(action="ignore"):
+        try:
+            if source is path and path.exists() and not path.is_file():  # reading a pipe would never end
+                raise PhotographError(f"{path.name}: not a file, a photograph is needed")
+            image = Image.open(source, formats=FORMATS)
+        except PhotographError:
+            raise
+        except Image.DecompressionBombError as error:
+            raise PhotographError(f"{path.name}: {_too_large(str(error))}") from error
+        except Exception as error:  # Pillow stumbles over damaged headers in many ways
+            raise PhotographError(f"{path.name}: {_reason(path, error)}") from error
+        with image:
+            if image.width * image.height > MAX_PIXELS:
+                raise PhotographError(f"{path.name}: {_too_large(f'{image.width} x {image.height} px')}")
+            yield image
+
+
+def _too_large(found: str) -> str:
+    return f"{found.rstrip('.')}; photographs of at most {MAX_PIXELS / 1e6:.0f} million pixels are read"
+
+
+def _refuse_bomb(path: Path, size: tuple[int, int], data: bytes) -> None:
+    """Refuse a file that claims far more pixels than its bytes can hold, or that takes too long to decode."""
+    pixels = size[0] * size[1]
+    if pixels > BOMB_PIXELS and pixels > BOMB_PX_PER_BYTE * len(data):
+        raise PhotographError(
+            f"{path.name}: {size[0]} x {size[1]} px in {len(data)} bytes is no photograph; "
+            f"a file of that size has at least {pixels // BOMB_PX_PER_BYTE} bytes"
+        )
+    scans = data.count(b"\xff\xda") if data.startswith(b"\xff\xd8") else 1
+    if scans * pixels > MAX_SCANNED_PIXELS:
+        raise PhotographError(f"{path.name}: a JPEG of {scans} scans; save it as a baseline JPEG")
 
 
 def _read_bytes(path: Path) -> bytes:
     try:
+        if path.exists() and not path.is_file():  # reading a pipe would never end
+            raise PhotographError(f"{path.name}: not a file, a photograph is needed")
+        if path.stat().st_size > MAX_FILE_BYTES:
+            raise PhotographError(
+                f"{path.name}: {path.stat().st_size} bytes, at most {MAX_FILE_BYTES} are read"
+            )
         data = path.read_bytes()
     except OSError as error:
         raise PhotographError(f"{path.name}: {_reason(path, error)}") from error
@@ -172,9 +241,15 @@ def _positive(value: Any) -> float | None:
     """Return a positive finite number or None; EXIF writers use 0 and 0/0 for unknown."""
     try:
         number = float(value)
-    except (TypeError, ValueError, ZeroDivisionError):
+    except (TypeError, ValueError, ArithmeticError):
         return None
     return number if math.isfinite(number) and number > 0 else None
+
+
+def _between(value: Any, limits: tuple[float, float]) -> float | None:
+    """Return a number within limits or None."""
+    number = _positive(value)
+    return number if number is not None and limits[0] <= number <= limits[1] else None
 
 
 def _text(value: Any) -> str | None:
