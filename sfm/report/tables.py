@@ -81,6 +81,8 @@ def summary(result: SurveyResult) -> dict[str, Any]:
             {
                 "name": camera.name,
                 "model": camera.model,
+                "size_px": list(camera.size_px),
+                "pixel_mm": [_number(value) for value in camera.pixel_mm],
                 "parameters": {
                     name: {"value": _number(value), "sigma": _number(sigma), "unit": unit}
                     for name, value, sigma, unit in zip(
@@ -236,6 +238,7 @@ def _comparison(result: SurveyResult) -> dict[str, Any] | None:
         "rms_px": {"kolinear": difference.rms_px[0], both.backend: difference.rms_px[1]},
         "cost": {"kolinear": difference.cost[0], both.backend: difference.cost[1]},
         "exceeded": list(difference.exceeded),
+        "held": list(both.held),
     }
 
 
