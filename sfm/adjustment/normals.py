@@ -21,8 +21,10 @@ from sfm.adjustment.parameters import Unknowns
 from sfm.adjustment.weighted import Weighted, point_terms, weighted_terms
 from sfm.camera import MAX_PARAMETERS
 from sfm.conventions import FloatArray, IntArray
+from sfm.errors import GeometryError
 
 SINGULAR_PIVOT = 1e-13  # share of a point's own normal equation left below which its rays are parallel
+LARGEST_BYTES = 6e9  # of Y'; larger networks would swap
 STIFF = 1e10  # factor on the pivot that holds such a direction of a point
 
 
@@ -124,9 +126,19 @@ def point_step(normals: Normals, reduced_step: FloatArray, layout: Unknowns) -> 
 
 
 def new_blocks(layout: Unknowns) -> Blocks:
-    """Return space for the blocks of a network."""
+    """Return space for the blocks of a network.
+
+    Raises:
+        GeometryError: the dense system would not fit in memory.
+    """
     m, n, a = len(layout.exterior_free), len(layout.point_free), len(layout.interior_free)
     q = MAX_PARAMETERS
+    size = 8 * 3 * n * layout.reduced
+    if size > LARGEST_BYTES:
+        raise GeometryError(
+            f"adjustment: {m} photographs and {n} points need {size / 1e9:.0f} GB in one dense system, "
+            f"at most {LARGEST_BYTES / 1e9:.0f} GB are taken"
+        )
     return Blocks(
         U=np.empty((m, 6, 6 + q)),
         D=np.empty((a, q, q)),
