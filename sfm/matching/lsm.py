@@ -187,8 +187,8 @@ def _match_all(left, right, half, kind, geometric, stop, max_steps, max_shift, m
             out[i, 0] = OUTSIDE
             continue
         gradients(grid, half, geometric, J)
-        _fill_normals(J, N)
-        if not _factorise(N, L):
+        fill_normals(J, N)
+        if not factorise(N, L):
             out[i, 0] = FLAT_TEXTURE
             continue
         out[i, 0] = _iterate(
@@ -210,7 +210,7 @@ def _match_all(left, right, half, kind, geometric, stop, max_steps, max_shift, m
             out[i],
         )
         if out[i, 0] == MATCHED:
-            out[i, 0] = _judge(half, kind, geometric, min_r, J, N, L, q, rhs, patch, wx, wy, warp[i], out[i])
+            out[i, 0] = judge(half, kind, geometric, min_r, J, N, L, q, rhs, patch, wx, wy, warp[i], out[i])
 
 
 @njit(cache=True, nogil=True)
@@ -269,14 +269,14 @@ def gradients(grid, half, geometric, J):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, fastmath=True)
-def _fill_normals(J, N):  # type: ignore[no-untyped-def]
+def fill_normals(J, N):  # type: ignore[no-untyped-def]
     for a in range(len(J)):
         for b in range(a + 1):
-            N[a, b] = N[b, a] = _dot(J[a], J[b])
+            N[a, b] = N[b, a] = dot(J[a], J[b])
 
 
 @njit(cache=True, nogil=True, fastmath=True)
-def _dot(a, b):  # type: ignore[no-untyped-def]
+def dot(a, b):  # type: ignore[no-untyped-def]
     total = 0.0
     for p in range(len(a)):
         total += np.float64(a[p]) * np.float64(b[p])
@@ -284,7 +284,7 @@ def _dot(a, b):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _factorise(N, L):  # type: ignore[no-untyped-def]
+def factorise(N, L):  # type: ignore[no-untyped-def]
     """Cholesky factor of N in the lower triangle of L; False where a parameter is not determined."""
     n = len(N)
     for a in range(n):
@@ -302,7 +302,7 @@ def _factorise(N, L):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _solve(L, q):  # type: ignore[no-untyped-def]
+def solve(L, q):  # type: ignore[no-untyped-def]
     n = len(L)
     for a in range(n):
         for c in range(a):
@@ -325,8 +325,8 @@ def _iterate(right, half, kind, geometric, stop, max_steps, max_shift, J, L, q, 
         if not resample_patch(right, H, half, BILINEAR if coarse else kind, wx, wy, patch):
             return OUTSIDE
         for a in range(len(q)):
-            rhs[a] = q[a] = _dot(J[a], patch)
-        _solve(L, q)
+            rhs[a] = q[a] = dot(J[a], patch)
+        solve(L, q)
         length = put_step(H, q, half, geometric)
         if not length < np.inf:
             return DIVERGED
@@ -429,7 +429,7 @@ def area_ratio(H):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _judge(half, kind, geometric, min_r, J, N, L, q, rhs, patch, wx, wy, H, out):  # type: ignore[no-untyped-def]
+def judge(half, kind, geometric, min_r, J, N, L, q, rhs, patch, wx, wy, H, out):  # type: ignore[no-untyped-def]
     """Residuals, covariance of the shift and correlation of the last step; returns the flag.
 
     A resampled intensity has the noise of a pixel times the sum of the squared weights, and neighbours have
@@ -438,14 +438,14 @@ def _judge(half, kind, geometric, min_r, J, N, L, q, rhs, patch, wx, wy, H, out)
     """
     n = len(patch)
     alpha, beta = q[geometric], q[geometric + 1]
-    square, total, cross = _dot(patch, patch), rhs[geometric], rhs[geometric + 1]
+    square, total, cross = dot(patch, patch), rhs[geometric], rhs[geometric + 1]
     T, TT = N[geometric, geometric + 1], N[geometric + 1, geometric + 1]
     spread = (square - total * total / n) * (TT - T * T / n)
     r = (cross - total * T / n) / np.sqrt(spread) if spread > 0.0 else 0.0
     for p in range(n):
         for a in range(len(q)):
             patch[p] -= np.float32(q[a]) * J[a, p]
-    residual = _dot(patch, patch)
+    residual = dot(patch, patch)
     gain = kernel_noise(H, half, kind, wx, wy)
     variance = residual / (n - len(q)) / (1.0 + gain)  # of one intensity, right units
     white = min(variance, white_noise(patch, 2 * half + 1) / (1.0 + gain))
@@ -454,24 +454,24 @@ def _judge(half, kind, geometric, min_r, J, N, L, q, rhs, patch, wx, wy, H, out)
     weakest = (xx + yy) / 2 - np.hypot((xx - yy) / 2, xy)
     out[1], out[2] = H[0, 2], H[1, 2]
     out[6], out[7], out[8], out[9] = beta, alpha, r, np.sqrt(residual / (n - len(q)))
-    if weakest < LEAST_TEXTURE * noise:
-        return FLAT_TEXTURE
     variance *= 1.0 + max(1.0, 1.0 / area_ratio(H))  # of the difference of two, as texture meets it
     # The solution obeys J'^T (S - ...) = 0 with noisy J': its covariance is (J'^T J)^-1 J'^T J' (J^T J')^-1.
-    variance *= (1.0 + 2.0 * noise / (xx + yy)) * (half / beta) ** 2
+    variance *= (1.0 + 2.0 * noise / max(xx + yy, noise)) * (half / beta) ** 2
     q[:] = 0.0
     q[0] = 1.0
-    _solve(L, q)
+    solve(L, q)
     cxx, cxy = q[0], q[1]
     q[:] = 0.0
     q[1] = 1.0
-    _solve(L, q)
+    solve(L, q)
     cyy = q[1]
     for k in range(3):
         i, j = k // 2, (k + 1) // 2
         ix, iy = H[i, 0] - H[i, 2] * H[2, 0], H[i, 1] - H[i, 2] * H[2, 1]
         jx, jy = H[j, 0] - H[j, 2] * H[2, 0], H[j, 1] - H[j, 2] * H[2, 1]
         out[3 + k] = variance * (ix * (cxx * jx + cxy * jy) + iy * (cxy * jx + cyy * jy))
+    if weakest < LEAST_TEXTURE * noise:
+        return FLAT_TEXTURE
     return LOW_CORRELATION if r < min_r else MATCHED
 
 
