@@ -6,6 +6,7 @@ import re
 import tomllib
 from pathlib import Path
 
+from adapters.formats import FORMATS
 from sfm.cli import app
 from sfm.project import Section, Survey, read_survey
 from sfm.report.output import WRITTEN
@@ -46,6 +47,12 @@ def test_survey_files_of_the_readme_are_read_and_show_every_key(tmp_path: Path) 
 def test_commands_of_the_readme_exist() -> None:
     commands = {command.callback.__name__ for command in app.registered_commands if command.callback}
     assert set(re.findall(r"^kolinear ([a-z]+) ", README, re.M)) == commands
+
+
+def test_formats_of_the_readme_exist() -> None:
+    line = README[README.index("Formats of `convert`") :].split("\n\n")[0]
+    named = set(re.findall(r"`([\w-]+)`", line)) - {"convert", "compare"}
+    assert named == {one.name for one in FORMATS}
 
 
 def test_everything_that_is_written_is_explained() -> None:
