@@ -197,7 +197,7 @@ def _derivatives(estimate: Estimate, camera: IntArray, image: IntArray, points: 
     return out
 
 
-def _pictures(estimate: Estimate, camera: IntArray, image: IntArray, points: FloatArray) -> FloatArray:
+def pictures_of(estimate: Estimate, camera: IntArray, image: IntArray, points: FloatArray) -> FloatArray:
     """Return the picture of one object point for each row, px, (k, 2)."""
     out = np.full((len(image), 2), np.nan)
     for i in np.unique(image):
@@ -249,7 +249,7 @@ def _intersect(
     """One Gauss-Newton step of the object points; returns them and their normal matrices, (n, 3, 3)."""
     rows = np.flatnonzero(np.isfinite(now).all(axis=1))
     J = _derivatives(estimate, camera, image[rows], points[point[rows]])
-    r = now[rows] - _pictures(estimate, camera, image[rows], points[point[rows]])
+    r = now[rows] - pictures_of(estimate, camera, image[rows], points[point[rows]])
     W = np.linalg.inv(C[rows] + orientation_px**2 * np.eye(2))
     N, b = np.zeros((len(points), 3, 3)), np.zeros((len(points), 3))
     JW = J.transpose(0, 2, 1) @ W
@@ -273,7 +273,7 @@ def _give_way(
     orientation_px: float,
 ) -> FloatArray:
     """Return the weighted mean of where a window wants to be and where its object point is, px, (k, 2)."""
-    picture = _pictures(estimate, camera, image, points[point])
+    picture = pictures_of(estimate, camera, image, points[point])
     good = np.isfinite(now).all(axis=1) & np.isfinite(picture).all(axis=1)
     target = place.copy()
     share = C[good] @ np.linalg.inv(C[good] + orientation_px**2 * np.eye(2))

@@ -1,0 +1,198 @@
+"""The key points of an existing model measured anew by multi-photo matching, and the model adjusted again."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from sfm.adjustment.datum import Datum
+from sfm.adjustment.result import Adjustment
+from sfm.adjustment.solve import adjust
+from sfm.camera import Camera
+from sfm.conventions import BoolArray, FloatArray, IntArray
+from sfm.errors import GeometryError, PhotographError, SurveyFileError
+from sfm.matching.lsm import LsmFlag
+from sfm.matching.multi_lsm import match_multi, pictures_of
+from sfm.network import Estimate, ImagePoints, Network, reduce_network
+from sfm.progress import SILENT, Progress
+from sfm.survey_solution import MAD_TO_SIGMA, determined, put_back
+from sfm.targets.photograph import read_photograph
+
+MIN_RAYS = 3
+SIGMA_PX = 0.02  # of a matched point, on top of what matching knows: surfaces are not plane over a window
+ORIENTATION_FACTOR = (
+    3.0  # of the robust spread of the model's residuals, by which its projected points may be off
+)
+MAX_SHIFT_FACTOR = 6.0  # of that spread, beyond which a key point was another one
+MIN_SHIFT_PX = 2.0
+
+
+@dataclass(frozen=True)
+class Refinement:
+    """A model before and after its key points were measured anew."""
+
+    before_px: float  # RMS per coordinate of the model as it came, px
+    readjusted_px: float  # the same points adjusted here, without rejection, px
+    after_px: float  # measured anew and adjusted, accepted points, px
+    adjustment: Adjustment  # of the points measured anew
+    key_points: int  # of the model
+    refined: int  # of these, matched and part of the adjustment
+    reasons: tuple[tuple[str, int], ...]  # why key points were not matched, most frequent first
+
+
+def refine_model(
+    network: Network,
+    estimate: Estimate,
+    images_dir: Path,
+    *,
+    window_px: int = 15,
+    min_correlation: float = 0.7,
+    progress: Progress = SILENT,
+) -> Refinement:
+    """Measure all image points of a solved model by multi-photo least squares matching and adjust it again.
+
+    Args:
+        network, estimate: a solved model, as `adapters.colmap.read_model` gives it.
+        images_dir: folder of its photographs.
+        window_px: odd side of the windows.
+        min_correlation: smallest coefficient r of a window and its template.
+        progress: told of stages and photographs.
+
+    Raises:
+        SurveyFileError: a photograph of the model is not in the folder.
+        PhotographError: a photograph that cannot be read, or of another size than its camera.
+        GeometryError: too little is left to adjust.
+    """
+    seen = network.image_points
+    everything = np.ones(len(seen), dtype=bool)
+    estimate = replace(estimate, cameras=tuple(_freed(camera) for camera in estimate.cameras))
+    residuals = pictures_of(estimate, network.camera, seen.image, estimate.points[seen.point]) - seen.xy
+    usable = np.isfinite(residuals).all(axis=1)
+    before = float(np.sqrt((residuals[usable] ** 2).mean()))
+    spread = MAD_TO_SIGMA * float(np.median(np.abs(residuals[usable])))
+    first, start, _, _ = _part(network, estimate, everything)
+    readjusted = adjust(first, start, datum=Datum("free"), reject="none", covariance=False)
+    progress.stage("photographs", len(network.images))
+    photographs = [
+        _photograph(network, estimate, images_dir, i, progress) for i in range(len(network.images))
+    ]
+    progress.stage("matching")
+    reference = _references(network, estimate)
+    known = reference >= 0
+    rows = np.flatnonzero(known[seen.point] & usable)
+    number, row_of = np.cumsum(known) - 1, np.full(len(seen), -1)
+    row_of[rows] = np.arange(len(rows))
+    matches = match_multi(
+        photographs,
+        replace(estimate, points=estimate.points[known]),
+        network.camera,
+        seen.image[rows],
+        number[seen.point[rows]],
+        seen.xy[rows],
+        row_of[reference[known]],
+        orientation_px=max(ORIENTATION_FACTOR * spread, SIGMA_PX),
+        window_px=window_px,
+        max_shift_px=max(MIN_SHIFT_PX, MAX_SHIFT_FACTOR * spread),
+        min_correlation=min_correlation,
+    )
+    good = np.isfinite(matches.xy).all(axis=1) & np.isfinite(matches.covariance).all(axis=(1, 2))
+    measured = ImagePoints(
+        seen.image[rows][good],
+        seen.point[rows][good],
+        matches.xy[good],
+        matches.covariance[good] + SIGMA_PX**2 * np.eye(2),
+    )
+    progress.stage("adjustment")
+    anew = replace(network, image_points=measured)
+    part, start, images, points = _part(anew, estimate, np.ones(len(measured), dtype=bool))
+    adjusted = adjust(part, start, datum=Datum("free"), reject="tau", covariance=False)
+    accepted = _accepted(anew, adjusted, images, points)
+    part, start, _, _ = _part(anew, put_back(estimate, adjusted.estimate, images, points), accepted)
+    final = adjust(part, start, datum=Datum("free"), reject="tau", covariance=True)
+    counts = [(flag.name, int(((matches.flag & flag) != 0).sum())) for flag in LsmFlag if flag]
+    return Refinement(
+        before,
+        readjusted.rms_px,
+        final.rms_px,
+        final,
+        len(seen),
+        int((~final.rejected).sum()),
+        tuple(
+            (str(name).lower().replace("_", " "), count)
+            for name, count in sorted(counts, key=lambda c: -c[1])
+            if count
+        ),
+    )
+
+
+def refinement_text(result: Refinement) -> str:
+    """Return the lines that the command line prints."""
+    why = ", ".join(f"{count} {reason}" for reason, count in result.reasons)
+    return (
+        f"key points    {result.refined} of {result.key_points} measured anew"
+        + (f" (not matched: {why})" if why else "")
+        + f"\nRMS before    {result.before_px:.4f} px per coordinate, "
+        f"{result.readjusted_px:.4f} px adjusted anew\n"
+        f"RMS after     {result.after_px:.4f} px\n"
+        f"sigma0        {result.adjustment.sigma0_px:.4f} px (redundancy {result.adjustment.redundancy})\n"
+    )
+
+
+def _part(
+    network: Network, estimate: Estimate, accepted: BoolArray
+) -> tuple[Network, Estimate, BoolArray, BoolArray]:
+    """Return what accepted image points determine, and which photographs and points that are."""
+    images, points = determined(network, estimate, accepted, np.full(len(network.points), MIN_RAYS))
+    part, start = reduce_network(network, estimate, images, points, accepted)
+    return part, start, images, points
+
+
+def _accepted(network: Network, adjustment: Adjustment, images: BoolArray, points: BoolArray) -> BoolArray:
+    accepted = images[network.image_points.image] & points[network.image_points.point]
+    accepted[accepted] = ~adjustment.rejected
+    return accepted
+
+
+def _freed(camera: Camera) -> Camera:
+    """Free what the model itself has estimated: the principal distances and distortion that is not zero."""
+    if camera.free.any():
+        return camera
+    distortion = np.array([name[0] in "kpKP" for name in camera.names]) & (camera.parameters != 0)
+    return replace(camera, free=np.array([name in ("fx", "fy", "c") for name in camera.names]) | distortion)
+
+
+def _references(network: Network, estimate: Estimate) -> IntArray:
+    """Return the row of each point that sees it at its middle scale, -1 for points with few rays, (n,)."""
+    seen = network.image_points
+    rays = estimate.points[seen.point] - estimate.position[seen.image]
+    depth = -np.einsum("ki,ki->k", rays, estimate.rotation[seen.image, :, 2])
+    c = np.array([camera.c_px for camera in estimate.cameras])[network.camera[seen.image]]
+    scale = np.where(depth > 0, c / depth, np.nan)
+    reference = np.full(len(network.points), -1)
+    count = np.bincount(seen.point[np.isfinite(scale)], minlength=len(reference))
+    order = np.lexsort([scale, seen.point])
+    first = np.searchsorted(seen.point[order], np.arange(len(reference)))
+    some = (count >= MIN_RAYS) & estimate.determined
+    reference[some] = order[first[some] + count[some] // 2]
+    return reference
+
+
+def _photograph(network: Network, estimate: Estimate, folder: Path, i: int, progress: Progress) -> FloatArray:
+    path = folder / network.images[i]
+    if not path.is_file():
+        raise SurveyFileError(
+            f"{folder}: photograph '{network.images[i]}' of the model is not in this folder"
+        )
+    photograph = read_photograph(path)
+    width, height = estimate.cameras[network.camera[i]].size_px
+    if photograph.shape != (height, width):
+        raise PhotographError(
+            f"{network.images[i]}: {photograph.shape[1]} x {photograph.shape[0]} px, its camera has "
+            f"{width} x {height} px"
+        )
+    if not estimate.oriented[i]:
+        raise GeometryError(f"{network.images[i]}: the model has no orientation for this photograph")
+    progress.advance(network.images[i])
+    return photograph

@@ -1,0 +1,264 @@
+"""Interest points, tie points, multi-photo matching and the survey without targets."""
+
+from __future__ import annotations
+
+from functools import cache
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from adapters.colmap import adjust_with_colmap
+from datasets.textured import render
+from sfm.camera import project, tangents_from_pixel
+from sfm.conventions import AnyArray, FloatArray
+from sfm.errors import GeometryError, SurveyFileError
+from sfm.matching.interest import foerstner_points
+from sfm.matching.lsm import LsmFlag
+from sfm.matching.multi_lsm import match_multi
+from sfm.matching.tie_points import Features, find_tie_points, link_features
+from sfm.network import Estimate, ImagePoints, Network
+from sfm.pipeline import run_survey
+from sfm.project import read_survey
+from sfm.similarity import fit_similarity
+from sfm.survey_refine import refine_model
+from tests.textures import random_texture, with_noise
+
+
+def test_corners_of_a_chessboard() -> None:
+    board = np.kron(np.indices((6, 6)).sum(axis=0) % 2, np.ones((16, 16))) * 160 + 40
+    shifted = cv2.GaussianBlur(board, (0, 0), 0.8)
+    found = foerstner_points(with_noise(shifted, 1.0, 1), min_distance_px=8)
+    corners = np.stack(np.meshgrid(np.arange(1, 6) * 16 - 0.5, np.arange(1, 6) * 16 - 0.5), axis=-1).reshape(
+        -1, 2
+    )
+    distance = np.linalg.norm(found.xy[:, None] - corners[None], axis=2).min(axis=0)
+    # between pixels a window of whole pixels has more of the edges on one side
+    assert distance.max() < 0.2
+    assert (found.roundness[:25] > 0.8).all() and (np.diff(found.weight) <= 0).all()
+    assert (np.linalg.eigvalsh(found.covariance) > 0).all()
+
+
+def test_interest_points_keep_their_distance_and_number() -> None:
+    y, x = np.mgrid[0:120, 0:160].astype(float)
+    photograph = with_noise(random_texture(np.random.default_rng(2), 2.0).value(x, y), 2.0, 1)
+    found = foerstner_points(photograph, min_distance_px=12, max_points=30, border_px=15)
+    assert len(found) == 30
+    apart = np.linalg.norm(found.xy[:, None] - found.xy[None], axis=2) + 99 * np.eye(30)
+    assert apart.min() > 12 - 2 * 3.5  # pixels keep the distance, edges meet within the window of 7 px
+    assert len(foerstner_points(np.full((50, 50), 9, np.uint8))) == 0
+
+
+def test_features_that_contradict_each_other_are_no_point() -> None:
+    rng = np.random.default_rng(4)
+    descriptor = rng.random((40, 128)).astype(np.float32)
+    descriptor /= np.linalg.norm(descriptor, axis=1, keepdims=True)
+    xyz = rng.uniform([-1, -1, 3], [1, 1, 5], (40, 3))
+
+    def view(shift: float) -> Features:
+        xy = 800 * (xyz[:, :2] - [shift, 0.1 * shift]) / xyz[:, 2:] + 500
+        return Features(xy, np.full(40, 4.0), np.zeros(40), descriptor)
+
+    views = [view(0.0), view(0.5), view(-0.5)]
+    tracks = link_features(views)
+    assert np.bincount(tracks.point).tolist() == [3] * 40
+    assert (tracks.feature.reshape(40, 3) == tracks.feature.reshape(40, 3)[:, :1]).all()
+    swapped = views[2].descriptor.copy()
+    swapped[[0, 1]] = swapped[[1, 0]]  # two wrong matches, off their epipolar lines
+    views[2] = Features(views[2].xy, views[2].scale, views[2].angle, swapped)
+    assert set(np.unique(link_features(views).feature)) == set(range(2, 40))
+
+
+SIZE = (480, 360)
+
+
+@cache
+def _scene() -> tuple[tuple[AnyArray, ...], Estimate, FloatArray]:
+    """Three small photographs of the textured surface, their orientation, and points on the surface."""
+    lens = render.camera_from_values("lens", "opencv", SIZE, render.PIXEL_MM, c_mm=render.C_MM)
+    position, rotation = (part[[0, 1, 7]] for part in render.stations())
+    skin = render.texture()
+    photographs = []
+    for i in range(3):
+        y, x = np.mgrid[0 : SIZE[1], 0 : SIZE[0]]
+        uv = tangents_from_pixel(lens, np.column_stack([x.ravel(), y.ravel()]))
+        rays = np.column_stack([uv, -np.ones(len(uv))]) @ rotation[i].T
+        at = render.surface_points(position[i], rays)[:, :2] / render.TEXEL_M + len(skin) / 2
+        at = at.astype(np.float32).reshape(SIZE[1], SIZE[0], 2)
+        light = cv2.remap(cv2.GaussianBlur(skin, (0, 0), 1.8), at[..., 0], at[..., 1], cv2.INTER_LINEAR)
+        photographs.append(with_noise(255 * light, render.NOISE, i).clip(0, 255).astype(np.float32))
+    x, y = np.meshgrid(np.arange(120, 361, 40.0), np.arange(100, 261, 40.0))
+    uv = tangents_from_pixel(lens, np.column_stack([x.ravel(), y.ravel()]))
+    points = render.surface_points(position[0], np.column_stack([uv, -np.ones(len(uv))]) @ rotation[0].T)
+    return (
+        tuple(photographs),
+        Estimate((lens,), position, rotation, points),
+        np.column_stack([x.ravel(), y.ravel()]),
+    )
+
+
+@pytest.mark.parametrize(("orientation_px", "limit"), [(None, 4.0), (0.02, 1.5)])
+def test_multi_photo_matching(orientation_px: float | None, limit: float) -> None:
+    photographs, truth, at = _scene()
+    n = len(at)
+    rng = np.random.default_rng(7)
+    points = truth.points + rng.normal(0, 5e-4, truth.points.shape)
+    start = Estimate(truth.cameras, truth.position, truth.rotation, points)
+    pictures = [project(truth.cameras[0], truth.position[i], truth.rotation[i], points) for i in (1, 2)]
+    matches = match_multi(
+        photographs,
+        start,
+        np.zeros(3, dtype=np.int64),
+        np.repeat(np.arange(3), n),
+        np.tile(np.arange(n), 3),
+        np.concatenate([at, *pictures]),
+        np.arange(n),
+        orientation_px=orientation_px,
+    )
+    assert matches.good.mean() > 0.9
+    seen = np.concatenate(
+        [project(truth.cameras[0], truth.position[i], truth.rotation[i], truth.points) for i in range(3)]
+    )
+    e = matches.xy - seen
+    # half of the noise is the template's, counted with the reference; curvature of the surface on top
+    sigma = np.sqrt(2 * np.nanmean(matches.covariance[n:, [0, 1], [0, 1]]))
+    assert np.sqrt(np.nanmedian(e[n:] ** 2)) / 0.6745 < limit * sigma
+    distance = np.linalg.norm(matches.points - truth.points, axis=1)
+    assert np.nanmedian(distance) < 1e-4  # a tenth of a pixel on the object; it began at 8e-4
+
+
+def test_multi_photo_matching_says_what_is_lost() -> None:
+    photographs, truth, _ = _scene()
+    image, point = np.repeat(np.arange(3), 2), np.tile(np.arange(2), 3)
+    xy = np.concatenate(
+        [project(truth.cameras[0], truth.position[i], truth.rotation[i], truth.points[:2]) for i in range(3)]
+    )
+    xy[2] = [2.0, 2.0]
+    start = Estimate(truth.cameras, truth.position, truth.rotation, truth.points[:2])
+    cameras = np.zeros(3, dtype=np.int64)
+    flat = [*photographs[:2], np.full_like(photographs[2], 80.0)]
+    matches = match_multi(flat, start, cameras, image, point, xy, np.arange(2))
+    assert matches.flag[2] == LsmFlag.OUTSIDE and matches.flag[4] != 0
+    assert np.isnan(matches.points[0]).all()  # no second ray is left
+    with pytest.raises(GeometryError, match="photograph 3 has no orientation"):
+        lost = Estimate(truth.cameras, truth.position * [[1], [1], [np.nan]], truth.rotation, truth.points)
+        match_multi(photographs, lost, cameras, image, point, xy, np.arange(2))
+
+
+def test_tie_points_of_three_photographs() -> None:
+    photographs, truth, _ = _scene()
+    found = find_tie_points(photographs, max_features=600)
+    n = len(found.reference)
+    assert n > 40 and (np.bincount(found.point) == 3).all()
+    at = found.xy[found.image == found.reference[found.point]]
+    points = np.full((n, 3), np.nan)
+    for i in range(3):
+        own = np.flatnonzero(found.reference == i)
+        uv = tangents_from_pixel(truth.cameras[0], at[own])
+        rays = np.column_stack([uv, -np.ones(len(own))]) @ truth.rotation[i].T
+        points[own] = render.surface_points(truth.position[i], rays)
+    e = np.array(
+        [
+            project(truth.cameras[0], truth.position[i], truth.rotation[i], points[j : j + 1])[0] - xy
+            for i, j, xy in zip(found.image, found.point, found.xy, strict=True)
+        ]
+    )
+    others = found.image != found.reference[found.point]
+    assert np.median(np.linalg.norm(e[others], axis=1)) < 0.1
+    with pytest.raises(GeometryError, match="detector 'orb' is none of"):
+        find_tie_points(photographs, detector="orb")
+    assert len(find_tie_points([np.zeros((90, 90), np.uint8)] * 3)) == 0
+
+
+def test_survey_file_refuses_contradictions(tmp_path: Path) -> None:
+    text = (Path(render.__file__).parent / "survey.toml").read_text(encoding="utf-8")
+    survey = tmp_path / "survey.toml"
+    survey.write_text(text.replace('codes = "none"', 'codes = "arcs"'), encoding="utf-8")
+    with pytest.raises(SurveyFileError, match=r"tie_points.*take the place of targets"):
+        read_survey(survey)
+    survey.write_text(text.replace('detector = "foerstner"', "window_px = 14"), encoding="utf-8")
+    with pytest.raises(SurveyFileError, match="window_px = 14, needed an odd number"):
+        read_survey(survey)
+    survey.write_text(text.replace('"foerstner"', '"orb"'), encoding="utf-8")
+    with pytest.raises(SurveyFileError, match="detector"):
+        read_survey(survey)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    rendered = tmp_path_factory.mktemp("textured")
+    render.render(rendered)
+    return rendered
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("detector", ["foerstner", "sift"])
+def test_textured_survey_from_photographs_to_result(folder: Path, tmp_path: Path, detector: str) -> None:
+    survey = folder / f"{detector}.toml"
+    text = (folder / "survey.toml").read_text(encoding="utf-8")
+    survey.write_text(text.replace('"foerstner"', f'"{detector}"'), encoding="utf-8")
+    result = run_survey(read_survey(survey), jobs=2, backend=adjust_with_colmap)
+    a = result.adjustment
+    assert len(a.network.images) == render.PHOTOGRAPHS and not result.failed
+    assert a.converged and len(a.network.points) > 2000
+    assert result.comparison is not None and result.comparison.agree
+    assert a.estimate.cameras[0].value("fx") == pytest.approx(render.C_MM / render.PIXEL_MM[0], abs=0.1)
+    assert a.covariance is not None
+    share, z_rms = _from_surface(a.network, a.estimate, a.covariance.points)
+    assert share >= 0.99
+    assert 0.8 < z_rms < 1.25
+
+
+def _from_surface(network: Network, estimate: Estimate, covariance: FloatArray) -> tuple[float, float]:
+    """Share of points within 3 sigma of the surface, along its normal, and RMS of distance over sigma."""
+    position, _ = render.stations()
+    place = fit_similarity(estimate.position, position)
+    start = place.apply(estimate.points)
+    foot = np.column_stack([start[:, :2], render.height(start[:, 0], start[:, 1])])
+    place = fit_similarity(estimate.points, foot)  # finer: all points on the surface they are near to
+    X = place.apply(estimate.points)
+    h = 1e-6
+    slope = [
+        (render.height(X[:, 0] + dx, X[:, 1] + dy) - render.height(X[:, 0] - dx, X[:, 1] - dy)) / (2 * h)
+        for dx, dy in ((h, 0.0), (0.0, h))
+    ]
+    normal = np.column_stack([-slope[0], -slope[1], np.ones(len(X))])
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    in_model = place.scale * normal @ place.rotation
+    sigma = np.sqrt(np.einsum("ki,kij,kj->k", in_model, covariance, in_model))
+    z = (X[:, 2] - render.height(X[:, 0], X[:, 1])) * normal[:, 2] / sigma
+    return float((np.abs(z) < 3).mean()), float(np.sqrt((z**2).mean()))
+
+
+@pytest.mark.slow
+def test_refining_a_model(folder: Path) -> None:
+    """Key points of a solved model with 0.5 px of noise become points of a few hundredths."""
+    position, rotation = render.stations()
+    lens = render.camera()
+    rng = np.random.default_rng(3)
+    x, y = np.meshgrid(np.linspace(-0.3, 0.3, 16), np.linspace(-0.3, 0.3, 16))
+    points = np.column_stack([x.ravel(), y.ravel(), render.height(x.ravel(), y.ravel())])
+    m, n = render.PHOTOGRAPHS, len(points)
+    seen = np.concatenate([project(lens, position[i], rotation[i], points) for i in range(m)])
+    inside = ((seen > 15) & (seen < np.array(render.SIZE_PX) - 16)).all(axis=1)
+    image, point = np.repeat(np.arange(m), n)[inside], np.tile(np.arange(n), m)[inside]
+    network = Network(
+        tuple(f"surface_{i + 1}.png" for i in range(m)),
+        np.zeros(m, dtype=np.int64),
+        tuple(str(j) for j in range(n)),
+        ImagePoints(
+            image,
+            point,
+            seen[inside] + rng.normal(0, 0.5, (len(image), 2)),
+            np.tile(np.eye(2), (len(image), 1, 1)),
+        ),
+    )
+    result = refine_model(network, Estimate((lens,), position, rotation, points), folder)
+    assert result.before_px == pytest.approx(0.5, rel=0.1)
+    assert result.after_px < 0.05
+    assert result.refined > 0.8 * result.key_points
+    with pytest.raises(
+        SurveyFileError, match=r"photograph 'surface_1.png' of the model is not in this folder"
+    ):
+        refine_model(network, Estimate((lens,), position, rotation, points), folder / "..")
