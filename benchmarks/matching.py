@@ -1,0 +1,124 @@
+"""Matching timed against cv2: LSM and a loop over findTransformECC, NCC and a loop over matchTemplate.
+
+python -m benchmarks.matching            # ten thousand patches, a thousand templates
+python -m benchmarks.matching --quick    # a tenth of it
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable
+
+import cv2
+import numpy as np
+
+from sfm.conventions import FloatArray
+from sfm.matching.lsm import match_lsm
+from sfm.matching.ncc import match_ncc
+from tests.textures import REACH, Pairs, affine_pairs, random_texture, with_noise
+
+SIGMA = 2.0
+TEXTURES = 500  # different patches; they come again with other noise
+HALF = 10
+ECC_STEPS, ECC_EPS = 50, 1e-4  # tighter, ECC is slower and no more precise
+REPEATS = 3  # the fastest of them counts
+
+
+def main() -> None:
+    """Print times per patch, precision and ratios."""
+    share = 0.1 if "--quick" in sys.argv else 1.0
+    cv2.setNumThreads(1)
+    compare_lsm(round(10_000 * share))
+    compare_ncc(round(1000 * share))
+
+
+def compare_lsm(patches: int) -> None:
+    """LSM with 6 + 2 parameters against ECC with 6 on the same patches of 21 x 21 px."""
+    pairs = affine_pairs(1, min(TEXTURES, patches))
+    rounds = [
+        (with_noise(pairs.left, SIGMA, 2 * i), with_noise(pairs.right, SIGMA, 2 * i + 1))
+        for i in range(max(1, patches // len(pairs.centre)))
+    ]
+    count = len(rounds) * len(pairs.centre)
+    ours: list[FloatArray] = []
+    theirs: list[FloatArray] = []
+    match_lsm(*rounds[0], pairs.centre[:2], pairs.centre[:2])  # compiled before the clock runs
+    seconds = {
+        threads: _fastest(lambda t=threads: _all_lsm(rounds, pairs, ours, t))  # type: ignore[misc]
+        for threads in (1, 2)
+    }
+    ecc = _fastest(lambda: _all_ecc(rounds, pairs, theirs), repeats=1)
+    rms = [_rms(np.array(one[-len(rounds) :]), pairs) for one in (ours, theirs)]
+    bound = SIGMA * np.sqrt(np.trace(pairs.bound, axis1=1, axis2=2).mean() / 2)
+    print(f"LSM, {count} patches of 21 x 21 px, noise {SIGMA:g} of 256 in both photographs")
+    print(f"  match_lsm, 1 thread    {seconds[1] / count * 1e6:7.1f} us a patch   RMS {rms[0]:.5f} px")
+    print(f"  match_lsm, 2 threads   {seconds[2] / count * 1e6:7.1f} us a patch")
+    print(f"  cv2.findTransformECC   {ecc / count * 1e6:7.1f} us a patch   RMS {rms[1]:.5f} px")
+    print(f"  Cramer-Rao bound                             RMS {bound:.5f} px")
+    print(f"  faster {ecc / seconds[1]:.1f} times (1 thread), {ecc / seconds[2]:.1f} times (2 threads)")
+    print(f"  RMS over the bound: {rms[0] / bound:.3f} (ours), {rms[1] / bound:.3f} (ECC)")
+
+
+def compare_ncc(templates: int) -> None:
+    """Correlation of 21 x 21 templates in 121 x 121 windows against the bare loop."""
+    y, x = np.mgrid[0:700, 0:700].astype(float)
+    texture = random_texture(np.random.default_rng(1), 2.0)
+    value = np.vstack([texture.value(x[rows], y[rows]) for rows in np.array_split(np.arange(700), 20)])
+    left, right = (np.rint(with_noise(value, SIGMA, i)).clip(0, 255).astype(np.uint8) for i in (1, 2))
+    at = np.random.default_rng(2).integers(70, 630, (templates, 2))
+    match_ncc(left, right, at[:1], at[:1], template_px=21, search_px=121)
+
+    def bare() -> None:
+        for col, row in at.tolist():
+            window, template = (
+                right[row - 60 : row + 61, col - 60 : col + 61],
+                left[row - 10 : row + 11, col - 10 : col + 11],
+            )
+            cv2.matchTemplate(window, template, cv2.TM_CCOEFF_NORMED)
+
+    ours = _fastest(lambda: match_ncc(left, right, at, at, template_px=21, search_px=121))
+    theirs = _fastest(bare)
+    print(f"NCC, {templates} templates of 21 x 21 px in windows of 121 x 121 px")
+    print(f"  match_ncc              {ours / templates * 1e6:7.1f} us a template, peak and precision")
+    print(f"  cv2.matchTemplate      {theirs / templates * 1e6:7.1f} us a template, sums only")
+    print(f"  ratio {ours / theirs:.2f}")
+
+
+def _all_lsm(
+    rounds: list[tuple[FloatArray, FloatArray]], pairs: Pairs, found: list[FloatArray], threads: int
+) -> None:
+    for left, right in rounds:
+        found.append(match_lsm(left, right, pairs.centre, pairs.centre, threads=threads).xy)
+
+
+def _all_ecc(rounds: list[tuple[FloatArray, FloatArray]], pairs: Pairs, found: list[FloatArray]) -> None:
+    stop = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, ECC_STEPS, ECC_EPS)
+    centres = pairs.centre.astype(int).tolist()
+    for left, right in rounds:
+        xy = np.full((len(centres), 2), np.nan)
+        for k, (col, row) in enumerate(centres):
+            template = left[row - HALF : row + HALF + 1, col - HALF : col + HALF + 1]
+            window = right[row - REACH : row + REACH + 1, col - REACH : col + REACH + 1]
+            warp = np.array([[1, 0, REACH - HALF], [0, 1, REACH - HALF]], dtype=np.float32)
+            _, warp = cv2.findTransformECC(template, window, warp, cv2.MOTION_AFFINE, stop, None, 1)
+            xy[k] = warp @ [HALF, HALF, 1.0] + [col - REACH, row - REACH]
+        found.append(xy)
+
+
+def _rms(found: FloatArray, pairs: Pairs) -> float:
+    return float(np.sqrt(np.nanmean((found - pairs.centre - pairs.shift) ** 2)))
+
+
+def _fastest(work: Callable[[], object], repeats: int = REPEATS) -> float:
+    """Return the seconds of the fastest run."""
+    best = np.inf
+    for _ in range(repeats):
+        begun = time.perf_counter()
+        work()
+        best = min(best, time.perf_counter() - begun)
+    return best
+
+
+if __name__ == "__main__":
+    main()
