@@ -116,7 +116,7 @@ def test_rejections_are_counted_by_reason() -> None:
     assert counts.pop("too_oblique") >= 1
     assert sum(counts.values()) >= 3
     square = np.hypot(*(found.rejected_xy - (109.5, 189.5)).T).argmin()
-    reasons = Flag.NOT_ELLIPTIC | Flag.UNEVEN_EDGE | Flag.POOR_FIT
+    reasons = Flag.NOT_ELLIPTIC | Flag.UNEVEN_EDGE | Flag.POOR_FIT | Flag.LOBED
     assert Flag(int(found.rejected_flag[square])) in reasons
 
 

@@ -24,6 +24,9 @@ from sfm.targets.outlines import (
 # Largest RMS of the residuals and largest mean residual on an eighth of the edge, over the contrast.
 POOR_FIT = 0.12
 UNEVEN_EDGE = 0.18
+# Largest lobes of an outline, in radii, for noise so many sigma of a component more (four of them are seen);
+# only half of it where the background is a thin stroke on more than this share of the circumference.
+LOBES, LOBES_SIGMAS, STROKES = 0.02, 5.0, 0.5
 # Centres nearer than this share of the smaller radius belong to concentric targets.
 CONCENTRIC = 0.5
 # Parts of an unreadable code are smaller than this share of its dot.
@@ -126,7 +129,7 @@ def find_targets(
         code[good], confidence[good] = read_codes(
             photograph, fit.xy[good], fit.shape[good], levels[good], family
         )
-        reason[good & _inside_codes(fit, code, family)] = Flag.PART_OF_CODE
+        reason[good & _inside_codes(fit, code, confidence, family)] = Flag.PART_OF_CODE
     keep = np.flatnonzero(reason == 0)
     keep = keep[np.lexsort((fit.xy[keep, 0], fit.xy[keep, 1]))]
     remark = np.where(code == UNREADABLE, fit.flag | Flag.CODE_UNREADABLE.value, fit.flag)
@@ -156,6 +159,7 @@ def _judge(fit: EllipseFit, noise: float, scale: float, smallest: float, largest
     if defined.any():
         a[defined], b[defined] = axes_from_shape(fit.shape[defined])[0].T
     contrast = np.abs(fit.contrast)
+    lobes = LOBES + LOBES_SIGMAS * fit.lobes_sigma
     border = (fit.flag & Flag.CUT_BY_BORDER) != 0
     with np.errstate(divide="ignore", invalid="ignore"):
         tests = [
@@ -168,6 +172,8 @@ def _judge(fit: EllipseFit, noise: float, scale: float, smallest: float, largest
             (Flag.LOW_CONTRAST, contrast < np.maximum(STEP_SIGMAS * noise, LEAST_STEP * scale)),
             (Flag.BLURRED, fit.blur > np.maximum(SOFTEST_EDGE * b, SOFTEST_EDGE_PX)),
             (Flag.UNEVEN_EDGE, fit.unevenness > UNEVEN_EDGE + 3 * noise / contrast),
+            (Flag.LOBED, fit.lobes > lobes),
+            (Flag.THIN_BACKGROUND, (fit.strokes > STROKES) & (fit.lobes > lobes / 2)),
             (Flag.POOR_FIT, fit.noise / contrast > POOR_FIT + noise / contrast),
         ]
     reason = np.zeros(len(fit.xy), dtype=np.int64)
@@ -205,14 +211,19 @@ def _surrounds(xy: FloatArray, radius: FloatArray) -> BoolArray:
     return outer
 
 
-def _inside_codes(fit: EllipseFit, code: IntArray, family: CodeFamily) -> BoolArray:
+def _inside_codes(fit: EllipseFit, code: IntArray, confidence: FloatArray, family: CodeFamily) -> BoolArray:
     """Return which candidates lie in the code ring of another target, hence are parts of its code.
 
+    The codes are gone through from the most confident to those that could not be read, and a part of one
+    code has no say in what follows: an arc that resembles a dot does not take the dot of its own ring away.
     About a dot whose code was not read only what is clearly smaller than the dot counts.
     """
     inside = np.zeros(len(fit.xy), dtype=bool)
     size = np.sqrt(np.abs(fit.shape[:, 0] * fit.shape[:, 2] - fit.shape[:, 1] ** 2))  # 1 / mean semi-axis
-    for k in np.flatnonzero(code != UNCODED):
+    coded = np.flatnonzero(code != UNCODED)
+    for k in coded[np.lexsort((size[coded], -confidence[coded], code[coded] < 0))]:
+        if inside[k]:
+            continue
         p, q, r = fit.shape[k]
         dx, dy = (fit.xy - fit.xy[k]).T
         rho = np.hypot(p * dx + q * dy, q * dx + r * dy)

@@ -15,11 +15,12 @@ STEP_PX = 0.5
 # A rise behind the edge by this share of the step, and by so many sigma of the noise, is no background.
 _DISTURBANCE, _DISTURBANCE_SIGMAS = 0.3, 5.0
 _PHI = 2 * math.pi * np.arange(RAYS) / RAYS
-_HARMONICS = np.column_stack([np.ones(RAYS), np.cos(_PHI), np.sin(_PHI), np.cos(2 * _PHI), np.sin(2 * _PHI)])
+HARMONICS = np.column_stack([np.ones(RAYS), np.cos(_PHI), np.sin(_PHI), np.cos(2 * _PHI), np.sin(2 * _PHI)])
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _bilinear(image: AnyArray, x: float, y: float) -> float:
+def bilinear(image: AnyArray, x: float, y: float) -> float:
+    """Return the intensity between four pixels; x, y from 0 to below the last column and row."""
     i, j = int(y), int(x)
     fy, fx = y - i, x - j
     top = image[i, j] * (1 - fx) + image[i, j + 1] * fx
@@ -116,7 +117,7 @@ def trace_rays(
     profile = np.empty(4096)
     steps = np.empty(RAYS)
     for k in range(RAYS):
-        c, s = _HARMONICS[k, 1], _HARMONICS[k, 2]
+        c, s = HARMONICS[k, 1], HARMONICS[k, 2]
         ex, ey = (r * c - q * s) / det, (p * s - q * c) / det
         R = math.sqrt(ex * ex + ey * ey)
         ex, ey = ex / R, ey / R
@@ -128,7 +129,7 @@ def trace_rays(
             x, y = x0 + (first + i * step) * ex, y0 + (first + i * step) * ey
             if x < 0 or y < 0 or x >= w - 1 or y >= h - 1:
                 break
-            profile[i] = sign * _bilinear(image, x, y)
+            profile[i] = sign * bilinear(image, x, y)
             m += 1
         best, at = 0.0, -1
         for i in range(2, m - 2):  # bright target: the profile falls outwards
@@ -177,11 +178,11 @@ def trace_rays(
 def improve_outline(theta: FloatArray, edge: FloatArray) -> tuple[float, float]:
     """Move and reshape the ellipse to the edges on the rays.
 
-    Returns the share of the rays that agree with an ellipse and the largest change, in radii.
-
-
     The edges are expanded as rho(phi) = c0 + c1 cos phi + c2 sin phi + c3 cos 2 phi + c4 sin 2 phi: size,
     centre and shape of the ellipse to first order.
+
+    Returns:
+        The share of the rays that agree with an ellipse, and the largest change in radii.
     """
     sound = edge[np.isfinite(edge)]
     if len(sound) < RAYS // 2:
@@ -194,7 +195,7 @@ def improve_outline(theta: FloatArray, edge: FloatArray) -> tuple[float, float]:
         N, g = np.zeros((5, 5)), np.zeros(5)
         used = 0
         for k in range(RAYS):
-            a = _HARMONICS[k]
+            a = HARMONICS[k]
             predicted = (
                 middle if c[0] == 0.0 else c[0] + c[1] * a[1] + c[2] * a[2] + c[3] * a[3] + c[4] * a[4]
             )

@@ -33,6 +33,8 @@ class Flag(IntFlag):
     NO_CONVERGENCE = 1 << 17  # the least squares fit did not converge on this outline
     DUPLICATE = 1 << 18  # the same target was found twice
     PART_OF_CODE = 1 << 19  # inside the code ring of another target
+    LOBED = 1 << 20  # the outline deviates from the ellipse as bars and squares do
+    THIN_BACKGROUND = 1 << 21  # the background is only a thin stroke, as in a letter "o"
 
 
 def count_flags(flags: IntArray) -> list[tuple[str, int]]:

@@ -10,8 +10,9 @@ import cv2
 import numpy as np
 
 from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
+from sfm.targets.blurred_ellipse import PARAMETERS
 from sfm.targets.flags import Flag
-from sfm.targets.template import PARAMETERS, fit_templates
+from sfm.targets.template import fit_templates
 
 # Variance of rounding to whole intensities.
 QUANTISATION = 1 / 12
@@ -46,6 +47,12 @@ class EllipseFit:
     """standard deviation of the intensities about the fit, shape (k,)"""
     unevenness: FloatArray
     """largest mean residual over one eighth of the edge, relative to the contrast, shape (k,)"""
+    lobes: FloatArray
+    """amplitude of the third and fourth harmonic of the outline about the ellipse, radii, shape (k,)"""
+    lobes_sigma: FloatArray
+    """standard deviation of one of their components that the given noise makes, radii, shape (k,)"""
+    strokes: FloatArray
+    """share of the circumference where the background is only a thin stroke, shape (k,)"""
     pixels: IntArray
     """number of intensities in the fit, shape (k,)"""
     iterations: IntArray
@@ -87,7 +94,7 @@ def fit_ellipse_model(
     theta, cofactor, statistics, flag = _fit_in_threads(
         photograph, start, np.asarray(sign, np.int64), float(noise), float(saturation)
     )
-    pixels, squares, unevenness, length, steps = statistics.T
+    pixels, squares, unevenness, length, steps, lobes, lobes_sigma, strokes = statistics.T
     variance = squares / np.maximum(pixels - PARAMETERS, 1)
     if integers:
         variance = np.maximum(variance, QUANTISATION)
@@ -109,6 +116,9 @@ def fit_ellipse_model(
         gain=theta[:, 8:] / length[:, None],
         noise=np.sqrt(variance),
         unevenness=unevenness,
+        lobes=lobes,
+        lobes_sigma=noise * lobes_sigma,
+        strokes=strokes,
         pixels=pixels.astype(np.int64),
         iterations=steps.astype(np.int64),
         flag=flag,

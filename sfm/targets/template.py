@@ -1,13 +1,4 @@
-"""Least squares template of a circular target: a blurred ellipse on a background, compiled.
-
-Model of the intensity at pixel (x, y), with d the signed distance from the edge of the ellipse (negative
-inside), s the blur of the edge, B the background, A the step to the target, g the change of the gain over L:
-
-    I = (B + A Phi(-d / s)) (1 + gx (x - x0) / L + gy (y - y0) / L)
-
-The ellipse is |S (x - x0, y - y0)| = 1 with a symmetric S = (p q; q r), which is regular for circles too, and
-rho = |S dx|, d = rho (rho - 1) / |S S dx|. The box of the pixel is part of s: it adds 1/12 to s^2.
-"""
+"""Least squares fit of the model of a blurred ellipse (see blurred_ellipse) to circular targets, compiled."""
 
 from __future__ import annotations
 
@@ -17,11 +8,11 @@ import numpy as np
 from numba import njit
 
 from sfm.conventions import AnyArray, FloatArray, IntArray
+from sfm.targets.blurred_ellipse import BLOCK, PARAMETERS, normal_equations
 from sfm.targets.edge_rays import RAYS, improve_outline, invert_spd, solve_spd, trace_rays
 from sfm.targets.flags import Flag
+from sfm.targets.goodness import STATISTICS, judge_background, judge_residuals
 
-# Unknowns of the fit: x0, y0, p, q, r, B, A, s, gx, gy.
-PARAMETERS = 10
 # A priori sigma of the change of gain over L: far above shading, it only keeps the fit regular.
 GAIN_SIGMA = 0.3
 MAX_STEPS = 30
@@ -36,9 +27,6 @@ LARGE_PX, BAND_PX = 25.0, 15.0
 BLUR_START, BLUR_LEAST = 0.9, 0.25
 # The outline is traced again if it changed by more than this share of the radius; so many rays must agree.
 MAX_TRACES, SMALL_CHANGE, LEAST_AGREEMENT = 2, 0.08, 0.7
-_BLOCK = 256
-_SQRT_HALF = math.sqrt(0.5)
-_DENSITY_0 = 1 / math.sqrt(2 * math.pi)
 _NONE = int(Flag.NONE)
 _SATURATED = int(Flag.SATURATED)
 _CLOSE_NEIGHBOUR = int(Flag.CLOSE_NEIGHBOUR)
@@ -62,15 +50,15 @@ def fit_templates(
 
     Returns:
         Unknowns, shape (k, 10); their cofactor matrices, shape (k, 10, 10), nan where the fit failed;
-        pixels used, sum of squared residuals, unevenness of the edge, L in px and steps, shape (k, 5);
+        statistics of the fit in the order of goodness, L in px and steps, shape (k, STATISTICS);
         flags, shape (k,).
     """
     k = len(start)
     theta = np.zeros((k, PARAMETERS))
     cofactor = np.full((k, PARAMETERS, PARAMETERS), math.nan)
-    statistics = np.ones((k, 5))
+    statistics = np.ones((k, STATISTICS))
     flag = np.zeros(k, np.int64)
-    J = np.zeros((PARAMETERS + 2) * _BLOCK)
+    J = np.zeros((PARAMETERS + 2) * BLOCK)
     for i in range(k):
         theta[i, :5] = start[i]
         flag[i] = _fit_one(image, theta[i], sign[i], noise, saturation, J, cofactor[i], statistics[i])
@@ -120,7 +108,7 @@ def _fit_one(
     N, N_trial = np.empty((PARAMETERS, PARAMETERS)), np.empty((PARAMETERS, PARAMETERS))
     L = np.empty((PARAMETERS, PARAMETERS))
     g, g_trial, trial = np.empty(PARAMETERS), np.empty(PARAMETERS), np.empty(PARAMETERS)
-    total, used = _normal_equations(data, n, theta, length, saturation, J, N, g)
+    total, used = normal_equations(data, n, theta, length, saturation, J, N, g)
     damping = 1e-3
     done = False
     steps = 0
@@ -146,7 +134,7 @@ def _fit_one(
             theta[:] = trial
             done = True
             break
-        squares, used_trial = _normal_equations(data, n, trial, length, saturation, J, N_trial, g_trial)
+        squares, used_trial = normal_equations(data, n, trial, length, saturation, J, N_trial, g_trial)
         before = total + prior * (theta[8] ** 2 + theta[9] ** 2)
         after = squares + prior * (trial[8] ** 2 + trial[9] ** 2)
         if after <= before * (1 + 1e-9) or used_trial != used:
@@ -155,7 +143,8 @@ def _fit_one(
             damping *= 0.1
         else:
             damping = max(damping, 1e-3) * 10
-    _residual_statistics(data, n, theta, length, saturation, J, statistics)
+    judge_residuals(data, n, theta, length, saturation, J, statistics)
+    judge_background(image, theta, length, statistics)
     statistics[4] = steps
     N[8, 8] += prior
     N[9, 9] += prior
@@ -223,145 +212,3 @@ def _start_levels(data: FloatArray, n: int, theta: FloatArray, saturation: float
         theta[5], theta[6] = outside / n_out, inside / n_in - outside / n_out
     theta[7], theta[8], theta[9] = BLUR_START, 0.0, 0.0
     return flag
-
-
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=True, inline="always")
-def _edge_profile(t: float) -> tuple[float, float]:
-    """Return Phi(t), the normal distribution, and exp(-t^2 / 2), without branches.
-
-    Source: Abramowitz and Stegun (1964), 7.1.26, error below 1.5e-7; exp(y) = exp(y / 64)^64 by its series.
-    """
-    z = min(abs(t) * _SQRT_HALF, 4.0)
-    y = z * z / -64
-    e = 1 + y * (1 + y * (1 / 2 + y * (1 / 6 + y * (1 / 24 + y / 120))))
-    for _ in range(6):
-        e *= e
-    k = 1 / (1 + 0.3275911 * z)
-    tail = 0.254829592 + k * (-0.284496736 + k * (1.421413741 + k * (-1.453152027 + k * 1.061405429)))
-    tail *= 0.5 * e * k
-    return (1 - tail if t > 0 else tail), e
-
-
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
-def _linearise(
-    data: FloatArray, first: int, m: int, theta: FloatArray, length: float, saturation: float, J: FloatArray
-) -> None:
-    """Write the derivatives, the residuals and the weights of a block of pixels, one unknown after the other.
-
-    The loop has no branches, so that it runs on several pixels at a time. A pixel at the end of the scale has
-    no weight where the model lies beyond the scale, too: no more is known of it (censored observation).
-    """
-    x0, y0, p, q, r = theta[0], theta[1], theta[2], theta[3], theta[4]
-    B, A, s, gx, gy = theta[5], theta[6], theta[7], theta[8] / length, theta[9] / length
-    for i in range(m):
-        dx, dy, value = data[0, first + i] - x0, data[1, first + i] - y0, data[2, first + i]
-        u, v = p * dx + q * dy, q * dx + r * dy
-        rho = math.sqrt(u * u + v * v) + 1e-12
-        wx, wy = p * u + q * v, q * u + r * v  # S S dx
-        nw = 1 / (math.sqrt(wx * wx + wy * wy) + 1e-12)
-        d = rho * (rho - 1) * nw
-        phi, e = _edge_profile(-d / s)
-        gain = 1 + gx * dx + gy * dy
-        level = B + A * phi
-        model = level * gain
-        censored = (value >= saturation and model >= saturation) or (value <= 0 and model <= 0)
-        weight = 0.0 if censored else 1.0
-        level *= weight
-        # d' = (2 rho - 1) rho' / |w| - d |w|' / |w|, rho' = u.u' / rho, |w|' = w.w' / |w|, w' = S u' + S' u
-        slope = weight * A * _DENSITY_0 * e * gain / s  # -dI/dd
-        f1 = -slope * (2 * rho - 1) * nw / rho
-        f2 = slope * d * nw * nw
-        ax, ay = p * wx + q * wy, q * wx + r * wy  # S w
-        J[0 * _BLOCK + i] = -f1 * (u * p + v * q) - f2 * (ax * p + ay * q) - level * gx
-        J[1 * _BLOCK + i] = -f1 * (u * q + v * r) - f2 * (ax * q + ay * r) - level * gy
-        J[2 * _BLOCK + i] = f1 * (u * dx) + f2 * (ax * dx + wx * u)
-        J[3 * _BLOCK + i] = f1 * (u * dy + v * dx) + f2 * (ax * dy + ay * dx + wx * v + wy * u)
-        J[4 * _BLOCK + i] = f1 * (v * dy) + f2 * (ay * dy + wy * v)
-        J[5 * _BLOCK + i] = weight * gain
-        J[6 * _BLOCK + i] = weight * phi * gain
-        J[7 * _BLOCK + i] = slope * d / s
-        J[8 * _BLOCK + i] = level * dx / length
-        J[9 * _BLOCK + i] = level * dy / length
-        J[10 * _BLOCK + i] = weight * (value - model)
-        J[11 * _BLOCK + i] = weight
-
-
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
-def _normal_equations(
-    data: FloatArray,
-    n: int,
-    theta: FloatArray,
-    length: float,
-    saturation: float,
-    J: FloatArray,
-    N: FloatArray,
-    g: FloatArray,
-) -> tuple[float, int]:
-    """Sum up N = J'J (lower triangle) and g = J'v of one target; return v'v and the number of pixels used.
-
-    The pixels are taken in blocks, so that the sums run over contiguous numbers in the cache.
-    """
-    N[:] = 0.0
-    g[:] = 0.0
-    squares, used = 0.0, 0.0
-    for first in range(0, n, _BLOCK):
-        m = min(_BLOCK, n - first)
-        _linearise(data, first, m, theta, length, saturation, J)
-        for j in range(PARAMETERS):
-            for k in range(j + 1):
-                product = 0.0
-                for i in range(m):
-                    product += J[j * _BLOCK + i] * J[k * _BLOCK + i]
-                N[j, k] += product
-            product = 0.0
-            for i in range(m):
-                product += J[j * _BLOCK + i] * J[10 * _BLOCK + i]
-            g[j] += product
-        for i in range(m):
-            squares += J[10 * _BLOCK + i] ** 2
-            used += J[11 * _BLOCK + i]
-    return squares, int(used)
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _residual_statistics(
-    data: FloatArray,
-    n: int,
-    theta: FloatArray,
-    length: float,
-    saturation: float,
-    J: FloatArray,
-    statistics: FloatArray,
-) -> None:
-    """Set the number of pixels, the sum of squared residuals and the unevenness of the edge.
-
-    The unevenness is the largest mean residual of an eighth of the edge, in- or outside, over the contrast.
-    """
-    p, q, r = theta[2], theta[3], theta[4]
-    A, s = theta[6], theta[7]
-    band = 1.0 + 1.5 * s
-    mean, count = np.zeros(16), np.zeros(16)
-    squares, used = 0.0, 0.0
-    for first in range(0, n, _BLOCK):
-        m = min(_BLOCK, n - first)
-        _linearise(data, first, m, theta, length, saturation, J)
-        for i in range(m):
-            residual = J[10 * _BLOCK + i]
-            squares += residual * residual
-            used += J[11 * _BLOCK + i]
-            dx, dy = data[0, first + i] - theta[0], data[1, first + i] - theta[1]
-            u, v = p * dx + q * dy, q * dx + r * dy
-            rho = math.sqrt(u * u + v * v)
-            d = rho * (rho - 1) / (math.sqrt((p * u + q * v) ** 2 + (q * u + r * v) ** 2) + 1e-12)
-            if abs(d) < band:
-                side, right, down = (8 if d > 0 else 0), (4 if u > 0 else 0), (2 if v > 0 else 0)
-                k = side + right + down + (1 if abs(u) > abs(v) else 0)
-                mean[k] += residual
-                count[k] += 1
-    worst = 0.0
-    for k in range(16):
-        if count[k] > 0:
-            worst = max(worst, abs(mean[k]) / count[k])
-        elif k >= 8:
-            worst = abs(A)  # no background at all on this side
-    statistics[0], statistics[1], statistics[2] = used, squares, worst / abs(A)

@@ -1,0 +1,123 @@
+"""Model of a circular target: a blurred ellipse on a background, with its derivatives, compiled.
+
+Model of the intensity at pixel (x, y), with d the signed distance from the edge of the ellipse (negative
+inside), s the blur of the edge, B the background, A the step to the target, g the change of the gain over L:
+
+    I = (B + A Phi(-d / s)) (1 + gx (x - x0) / L + gy (y - y0) / L)
+
+The ellipse is |S (x - x0, y - y0)| = 1 with a symmetric S = (p q; q r), which is regular for circles too, and
+rho = |S dx|, d = rho (rho - 1) / |S S dx|. The box of the pixel is part of s: it adds 1/12 to s^2.
+"""
+
+from __future__ import annotations
+
+import math
+
+from numba import njit
+
+from sfm.conventions import FloatArray
+
+# Unknowns of the fit: x0, y0, p, q, r, B, A, s, gx, gy.
+PARAMETERS = 10
+# So many pixels are worked on together, unknown after unknown, residual and weight last.
+BLOCK = 256
+_SQRT_HALF = math.sqrt(0.5)
+_DENSITY_0 = 1 / math.sqrt(2 * math.pi)
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=True, inline="always")
+def edge_profile(t: float) -> tuple[float, float]:
+    """Return Phi(t), the normal distribution, and exp(-t^2 / 2), without branches.
+
+    Source: Abramowitz and Stegun (1964), 7.1.26, error below 1.5e-7; exp(y) = exp(y / 64)^64 by its series.
+    """
+    z = min(abs(t) * _SQRT_HALF, 4.0)
+    y = z * z / -64
+    e = 1 + y * (1 + y * (1 / 2 + y * (1 / 6 + y * (1 / 24 + y / 120))))
+    for _ in range(6):
+        e *= e
+    k = 1 / (1 + 0.3275911 * z)
+    tail = 0.254829592 + k * (-0.284496736 + k * (1.421413741 + k * (-1.453152027 + k * 1.061405429)))
+    tail *= 0.5 * e * k
+    return (1 - tail if t > 0 else tail), e
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
+def linearise(
+    data: FloatArray, first: int, m: int, theta: FloatArray, length: float, saturation: float, J: FloatArray
+) -> None:
+    """Write the derivatives, the residuals and the weights of a block of pixels, one unknown after the other.
+
+    The loop has no branches, so that it runs on several pixels at a time. A pixel at the end of the scale has
+    no weight where the model lies beyond the scale, too: no more is known of it (censored observation).
+    """
+    x0, y0, p, q, r = theta[0], theta[1], theta[2], theta[3], theta[4]
+    B, A, s, gx, gy = theta[5], theta[6], theta[7], theta[8] / length, theta[9] / length
+    for i in range(m):
+        dx, dy, value = data[0, first + i] - x0, data[1, first + i] - y0, data[2, first + i]
+        u, v = p * dx + q * dy, q * dx + r * dy
+        rho = math.sqrt(u * u + v * v) + 1e-12
+        wx, wy = p * u + q * v, q * u + r * v  # S S dx
+        nw = 1 / (math.sqrt(wx * wx + wy * wy) + 1e-12)
+        d = rho * (rho - 1) * nw
+        phi, e = edge_profile(-d / s)
+        gain = 1 + gx * dx + gy * dy
+        level = B + A * phi
+        model = level * gain
+        censored = (value >= saturation and model >= saturation) or (value <= 0 and model <= 0)
+        weight = 0.0 if censored else 1.0
+        level *= weight
+        # d' = (2 rho - 1) rho' / |w| - d |w|' / |w|, rho' = u.u' / rho, |w|' = w.w' / |w|, w' = S u' + S' u
+        slope = weight * A * _DENSITY_0 * e * gain / s  # -dI/dd
+        f1 = -slope * (2 * rho - 1) * nw / rho
+        f2 = slope * d * nw * nw
+        ax, ay = p * wx + q * wy, q * wx + r * wy  # S w
+        J[0 * BLOCK + i] = -f1 * (u * p + v * q) - f2 * (ax * p + ay * q) - level * gx
+        J[1 * BLOCK + i] = -f1 * (u * q + v * r) - f2 * (ax * q + ay * r) - level * gy
+        J[2 * BLOCK + i] = f1 * (u * dx) + f2 * (ax * dx + wx * u)
+        J[3 * BLOCK + i] = f1 * (u * dy + v * dx) + f2 * (ax * dy + ay * dx + wx * v + wy * u)
+        J[4 * BLOCK + i] = f1 * (v * dy) + f2 * (ay * dy + wy * v)
+        J[5 * BLOCK + i] = weight * gain
+        J[6 * BLOCK + i] = weight * phi * gain
+        J[7 * BLOCK + i] = slope * d / s
+        J[8 * BLOCK + i] = level * dx / length
+        J[9 * BLOCK + i] = level * dy / length
+        J[10 * BLOCK + i] = weight * (value - model)
+        J[11 * BLOCK + i] = weight
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
+def normal_equations(
+    data: FloatArray,
+    n: int,
+    theta: FloatArray,
+    length: float,
+    saturation: float,
+    J: FloatArray,
+    N: FloatArray,
+    g: FloatArray,
+) -> tuple[float, int]:
+    """Sum up N = J'J (lower triangle) and g = J'v of one target; return v'v and the number of pixels used.
+
+    The pixels are taken in blocks, so that the sums run over contiguous numbers in the cache.
+    """
+    N[:] = 0.0
+    g[:] = 0.0
+    squares, used = 0.0, 0.0
+    for first in range(0, n, BLOCK):
+        m = min(BLOCK, n - first)
+        linearise(data, first, m, theta, length, saturation, J)
+        for j in range(PARAMETERS):
+            for k in range(j + 1):
+                product = 0.0
+                for i in range(m):
+                    product += J[j * BLOCK + i] * J[k * BLOCK + i]
+                N[j, k] += product
+            product = 0.0
+            for i in range(m):
+                product += J[j * BLOCK + i] * J[10 * BLOCK + i]
+            g[j] += product
+        for i in range(m):
+            squares += J[10 * BLOCK + i] ** 2
+            used += J[11 * BLOCK + i]
+    return squares, int(used)
