@@ -19,7 +19,7 @@ from threadpoolctl import threadpool_limits
 from sfm.batch import find_surveys, run_batch
 from sfm.batch_survey import Adjusters
 from sfm.batch_table import BatchTable, print_batch, stopping_at_terminate
-from sfm.commands import measuring, solvers
+from sfm.commands import measuring, refining, solvers
 from sfm.commands.console import drawn_progress
 from sfm.errors import KolinearError
 from sfm.folder_lock import locked
@@ -206,6 +206,7 @@ for _command in (
     solvers.validate,
     solvers.compare,
     solvers.convert,
+    refining.refine,
 ):
     app.command()(_command)
 

@@ -16,7 +16,13 @@ LAYERS = (
     ("sfm.report", "sfm.pipeline", "sfm.pipeline_", "sfm.project", "sfm.survey_"),
     ("sfm.batch", "sfm.batch_", "sfm.cli", "sfm.commands", "sfm.warm_up"),
 )
-COMMANDS = ("sfm.cli", "sfm.commands.measuring", "sfm.commands.solvers", "sfm.commands.console")
+COMMANDS = (
+    "sfm.cli",
+    "sfm.commands.measuring",
+    "sfm.commands.refining",
+    "sfm.commands.solvers",
+    "sfm.commands.console",
+)
 CV2_ROOMS = ("sfm.targets", "sfm.matching", "sfm.report", "sfm.orientation")
 CV2_THREADS = "adapters.dask_cluster"  # holds OpenCV to one thread per worker, as it does BLAS
 # Within a layer of rooms, siblings know nothing of one another.

@@ -1,0 +1,41 @@
+"""The command refine: key points of a COLMAP model measured anew."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from sfm.commands.console import drawn_progress
+from sfm.errors import OutputError
+from sfm.survey_refine import refine_model, refinement_text
+
+
+def refine(
+    model: Annotated[Path, typer.Argument(metavar="COLMAP_MODEL", help="Folder of cameras, images, points.")],
+    images: Annotated[Path, typer.Option("--images", metavar="DIR", help="Folder of its photographs.")],
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", metavar="DIR", help="New folder for the refined model, COLMAP's format."),
+    ] = None,
+    window: Annotated[int, typer.Option("--window", metavar="N", help="Side of the windows, odd, px.")] = 15,
+    min_correlation: Annotated[
+        float, typer.Option("--min-correlation", metavar="R", help="Smallest r of a window and its template.")
+    ] = 0.7,
+) -> None:
+    """Measure the key points of a COLMAP model by multi-photo matching and adjust it again."""
+    from adapters.colmap import read_model, write_model
+
+    if out is not None and out.exists():
+        raise OutputError(f"{out}: exists already, the refined model needs a new folder")
+    network, estimate = read_model(model)
+    with drawn_progress() as progress:
+        found = refine_model(
+            network, estimate, images, window_px=window, min_correlation=min_correlation, progress=progress
+        )
+    print(refinement_text(found), end="")
+    if out is not None:
+        a = found.adjustment
+        write_model(out, a.network, a.estimate, rejected=a.rejected)
+        print(f"Model: {out}")
