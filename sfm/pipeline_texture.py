@@ -13,14 +13,13 @@ from pathlib import Path
 import numpy as np
 
 from sfm.analysis.comparison import BackendAdjustment, compare_adjusters
-from sfm.network import Estimate, Network, empty_estimate
-from sfm.orientation.sequence import orient
+from sfm.network import Estimate, Network
 from sfm.progress import SILENT, Progress, StageClock
 from sfm.project import Survey, TiePointSettings
 from sfm.report.result import FailedImage, StageTime, SurveyResult
-from sfm.survey_solution import refine, solve
+from sfm.survey_solution import solve
 from sfm.survey_start import find_photographs
-from sfm.survey_tie_points import MIN_RAYS, tie_photographs
+from sfm.survey_tie_points import MIN_RAYS, orient_tied, tie_photographs
 
 
 def run_textured_survey(
@@ -42,17 +41,17 @@ def run_textured_survey(
         tied = tie_photographs(survey, settings, files, jobs=jobs, progress=progress)
     network = tied.network
     with clock.stage("orientation"):
-        start = orient(network, empty_estimate(network, tied.cameras), refine=refine)
+        estimate, not_oriented = orient_tied(tied)
     with clock.stage("adjustment"):
         rays = np.full(len(network.points), MIN_RAYS)
-        solution = solve(survey, network, start.estimate, min_rays=rays)
+        solution = solve(survey, network, estimate, min_rays=rays)
     with clock.stage("comparison"):
         comparison = None if backend is None else compare_adjusters(solution.adjustment, backend)
     return SurveyResult(
         survey=survey.name,
         unit=survey.unit,
         images_total=len(files),
-        failed=tied.failed + tuple(FailedImage(*one) for one in (*start.failures, *solution.dropped_images)),
+        failed=tied.failed + tuple(FailedImage(*one) for one in (*not_oriented, *solution.dropped_images)),
         adjustment=solution.adjustment,
         code=np.full(len(solution.adjustment.network.points), -1),
         comparison=comparison,

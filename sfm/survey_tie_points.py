@@ -8,19 +8,24 @@ from pathlib import Path
 
 import numpy as np
 
-from sfm.camera import Camera
-from sfm.conventions import AnyArray, IntArray
+from sfm.camera import Camera, tangents_from_pixel
+from sfm.conventions import AnyArray, BoolArray, IntArray
 from sfm.errors import GeometryError, PhotographError
 from sfm.matching.tie_points import find_tie_points
-from sfm.network import ImagePoints, Network
+from sfm.network import Estimate, ImagePoints, Network, empty_estimate, reduce_network
+from sfm.orientation.intersection import intersect
+from sfm.orientation.sequence import orient
 from sfm.progress import SILENT, Progress
 from sfm.project import Survey, TiePointSettings
 from sfm.report.result import FailedImage, PhotographTargets
+from sfm.survey_solution import refine
 from sfm.survey_start import PhotographList, control_points, scale_bars, start_cameras
 from sfm.targets.photograph import Metadata, read_metadata, read_photograph
 
 MIN_RAYS = 3  # photographs that must agree on a tie point; two rays cannot contradict each other
 MIN_PHOTOGRAPHS = 2
+ORIENTATION_POINTS = 400  # that take part in the orientation, those with the most rays, and
+POINTS_PER_PHOTOGRAPH = 100  # of every photograph at least so many
 
 
 @dataclass(frozen=True)
@@ -117,6 +122,59 @@ def tie_photographs(
         tuple(photographs.paths[k] for k in read),
         tuple(failed),
     )
+
+
+def orient_tied(tied: TiedPhotographs) -> tuple[Estimate, tuple[tuple[str, str], ...]]:
+    """Orient the photographs on the tie points with the most rays, then intersect all the others.
+
+    Thousands of points orient a survey no better than hundreds, and take their time in every trial.
+
+    Returns:
+        Estimate of the whole network, and (name, reason) of the photographs that could not be oriented.
+
+    Raises:
+        GeometryError: no two photographs could be oriented.
+    """
+    network = tied.network
+    everything = np.ones(len(network.image_points), dtype=bool)
+    part, start = reduce_network(
+        network,
+        empty_estimate(network, tied.cameras),
+        np.ones(len(network.images), dtype=bool),
+        _strongest(network),
+        everything,
+    )
+    found = orient(part, start, refine=refine)
+    seen, estimate = network.image_points, found.estimate
+    uv = np.full((len(seen), 2), np.nan)
+    for index, camera in enumerate(estimate.cameras):
+        own = network.camera[seen.image] == index
+        uv[own] = tangents_from_pixel(camera, seen.xy[own])
+    c = min(camera.c_px for camera in estimate.cameras)
+    rays = intersect(
+        uv,
+        seen.image,
+        seen.point,
+        estimate.position,
+        estimate.rotation,
+        n_points=len(network.points),
+        tolerance=float(found.tolerance_px.max()) / c,
+    )
+    return replace(estimate, points=rays.points), found.failures
+
+
+def _strongest(network: Network) -> BoolArray:
+    """Choose the points with the most rays, and in every photograph at least some, (n,)."""
+    seen = network.image_points
+    order = np.argsort(-network.rays(), kind="stable")
+    chosen = np.zeros(len(network.points), dtype=bool)
+    chosen[order[:ORIENTATION_POINTS]] = True
+    rank = np.empty(len(order), dtype=np.int64)
+    rank[order] = np.arange(len(order))
+    for i in range(len(network.images)):
+        own = seen.point[seen.image == i]
+        chosen[own[np.argsort(rank[own], kind="stable")][:POINTS_PER_PHOTOGRAPH]] = True
+    return chosen
 
 
 def _read(path: Path) -> tuple[Metadata, AnyArray] | PhotographError:
