@@ -39,6 +39,7 @@ from sfm.errors import BackendError, OutputError, SurveyFileError
 from sfm.network import Estimate, ImagePoints, Network
 
 NEEDED_VERSION = (4, 2)
+MAX_SIDE_BYTES = 100_000_000  # names of some million points
 SIDE_FILE = "kolinear.json"  # names and pixel sizes, which COLMAP's model has no place for
 
 # The default start radius of 1e4 crawls (46 steps on 400 photographs, 6 with 1e8); the steps are then
@@ -210,6 +211,31 @@ def write_model(
             raise OutputError(f"{folder}: the COLMAP model cannot be written ({error})") from error
 
 
+def _side_file(path: Path) -> dict[str, Any]:
+    """Read what `write_model` adds to a model; an empty dictionary where it is missing.
+
+    Raises:
+        SurveyFileError: it is not what `write_model` writes.
+    """
+    if not path.is_file():
+        return {}
+    try:
+        if path.stat().st_size > MAX_SIDE_BYTES:
+            raise ValueError(f"{path.stat().st_size} bytes, at most {MAX_SIDE_BYTES} are read")
+        side = json.loads(path.read_text(encoding="utf-8"))
+        for camera in side["cameras"]:
+            pixel, free = camera["pixel_mm"], camera["free"]
+            sound = len(pixel) == 2 and all(0 < float(p) < 1e3 for p in pixel)
+            if not isinstance(camera["name"], str) or not sound or not all(f in (True, False) for f in free):
+                raise ValueError("a camera needs name, pixel_mm and free")
+        for names in (side["images"], side["points"]):
+            if not all(isinstance(name, str) for name in names.values()):
+                raise ValueError("names must be texts")
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+        raise SurveyFileError(f"{path}: not written by Kolinear ({one_line(error)}); remove it") from error
+    return dict(side)
+
+
 def _refuse_short(pycolmap: ModuleType, folder: Path, scene: Any) -> None:
     """Raise OSError unless a model can be read back as it was written: COLMAP ignores that a disk is full."""
     try:
@@ -245,11 +271,16 @@ def read_model(folder: Path) -> tuple[Network, Estimate]:
             scene = pycolmap.Reconstruction(str(folder))
         except (ValueError, RuntimeError, LookupError, OSError, MemoryError) as error:
             raise SurveyFileError(f"{folder}: not a readable COLMAP model ({one_line(error)})") from error
-    side_path = folder / SIDE_FILE
-    side = json.loads(side_path.read_text(encoding="utf-8")) if side_path.is_file() else {}
+    side = _side_file(folder / SIDE_FILE)
     camera_ids = sorted(scene.cameras)
     cameras = tuple(camera_of(scene.camera(i)) for i in camera_ids)
     if len(side.get("cameras", ())) == len(cameras):
+        for camera, extra in zip(cameras, side["cameras"], strict=True):
+            if len(extra["free"]) != len(camera.free):
+                raise SurveyFileError(
+                    f"{folder / SIDE_FILE}: camera {extra['name']}: {len(extra['free'])} parameters, "
+                    f"the model has {len(camera.free)}"
+                )
         cameras = tuple(
             replace(
                 camera,
