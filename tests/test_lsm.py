@@ -174,7 +174,7 @@ def test_speckle_photographs_shifted_by_known_parts_of_a_pixel(name: str, step: 
     height, width = first.shape
     x, y = np.meshgrid(np.linspace(30, width - 31, 20).round(), np.linspace(30, height - 31, 10).round())
     at = np.column_stack([x.ravel(), y.ravel()])
-    matches = match_lsm(first, other, at, at, interpolation="bicubic", stop_px=1e-4)
+    matches = match_lsm(first, other, at, at, interpolation="bicubic", stop_px=1e-5)
     assert matches.good.all()
     e = matches.xy - at - [-step / 10, 0]
     assert np.abs(e.mean(axis=0)).max() <= 0.005

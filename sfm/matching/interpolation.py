@@ -114,7 +114,7 @@ def kernel_weights(kind, t, w):  # type: ignore[no-untyped-def]
             w[2], w[3] = (one, np.float32(0.0)) if t < half else (np.float32(0.0), one)
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@njit(cache=True, nogil=True, fastmath=True, inline="always")
 def sample(flat, at, width, wx, wy):  # type: ignore[no-untyped-def]
     """Weighted mean of 6 rows of 8 pixels of a photograph stored row by row, the first of them at `at`.
 

@@ -44,7 +44,7 @@ SLOPE_NOISE = 2.0 * (SLOPE[0] ** 2 + SLOPE[1] ** 2 + SLOPE[2] ** 2)
 # Texture is flat in a direction in which its gradients have less than this many times the energy of noise.
 LEAST_TEXTURE = 3.0
 COARSE_STEP = 0.5  # bilinear interpolation is good enough while steps are longer than this, px
-CONTRACTION = 0.1  # a step is at most this part of the one before; 0.01 to 0.03 on texture with noise
+CONTRACTION = 0.04  # a step is at most this part of the one before; 0.01 to 0.03 on texture with noise
 MAX_STRETCH = 3.0  # ratio of lengths, of a patch in both photographs, that is a match no more
 CHUNK = 256  # patches that a thread takes at a time
 
@@ -442,9 +442,7 @@ def judge(half, kind, geometric, min_r, J, N, L, q, rhs, patch, wx, wy, H, out):
     T, TT = N[geometric, geometric + 1], N[geometric + 1, geometric + 1]
     spread = (square - total * total / n) * (TT - T * T / n)
     r = (cross - total * T / n) / np.sqrt(spread) if spread > 0.0 else 0.0
-    for p in range(n):
-        for a in range(len(q)):
-            patch[p] -= np.float32(q[a]) * J[a, p]
+    subtract(patch, q, J)
     residual = dot(patch, patch)
     gain = kernel_noise(H, half, kind, wx, wy)
     variance = residual / (n - len(q)) / (1.0 + gain)  # of one intensity, right units
@@ -476,6 +474,15 @@ def judge(half, kind, geometric, min_r, J, N, L, q, rhs, patch, wx, wy, H, out):
 
 
 @njit(cache=True, nogil=True, fastmath=True)
+def subtract(patch, q, J):  # type: ignore[no-untyped-def]
+    """Turn the patch into its residuals."""
+    for a in range(len(q)):
+        factor, row = np.float32(q[a]), J[a]
+        for p in range(len(patch)):
+            patch[p] -= factor * row[p]
+
+
+@njit(cache=True, nogil=True, fastmath=True)
 def white_noise(residual, side):  # type: ignore[no-untyped-def]
     """Variance of the part of the residuals that is different from pixel to pixel.
 
@@ -496,7 +503,7 @@ def white_noise(residual, side):  # type: ignore[no-untyped-def]
 @njit(cache=True, nogil=True)
 def kernel_noise(H, half, kind, wx, wy):  # type: ignore[no-untyped-def]
     """Mean sum of the squared weights over the window: what resampling leaves of the noise of a pixel."""
-    stride = max(1, half // 4)
+    stride = max(1, half // 2)  # 25 places tell the mean
     total, count = 0.0, 0
     for b in range(-half, half + 1, stride):
         for a in range(-half, half + 1, stride):
