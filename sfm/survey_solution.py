@@ -15,7 +15,7 @@ from sfm.network import Estimate, Network, reduce_network
 from sfm.orientation.sequence import Orientation
 from sfm.project import Survey
 from sfm.report.result import ControlCheck
-from sfm.similarity import Similarity, fit_similarity
+from sfm.survey_datum import datum_warnings, placed_on_control, rescaled, without_contradicted_control
 from sfm.survey_network import Naming, build_network, match_uncoded, min_rays
 from sfm.survey_targets import MeasuredPhotographs
 
@@ -24,6 +24,7 @@ TOLERANCE_FACTOR = 6.0  # of the robust spread of the residuals
 MIN_TOLERANCE_PX = 1.0  # below it a difference is for the statistical test, not for the matching
 FALSE_ALARM = 0.05  # chance that a survey without any outlier loses an image coordinate; Pope (1976)
 MIN_IMAGE_POINTS = 4  # of a photograph in the final adjustment: three determine it, the fourth checks
+MOST_NAMES = 10  # points named in one line
 MAD_TO_SIGMA = 1.4826  # of a normal distribution; Hampel (1974), J. Am. Stat. Assoc. 69
 
 
@@ -98,14 +99,22 @@ def solve(
     if datum.kind == "control":
         needed[network.control.point] = 1
     accepted = np.ones(len(network.image_points), dtype=bool)
+    known = tuple(name for name, is_in in zip(network.points, estimate.determined, strict=True) if is_in)
     oriented = estimate.oriented
-    estimate = _rescaled(network, estimate, datum)
+    estimate = rescaled(network, estimate, datum)
     iterations = 0
+    contradictions: list[str] = []
     while True:
         images, points = determined(network, estimate, accepted, needed)
         part, start = reduce_network(network, estimate, images, points, np.ones_like(accepted))
         adjustment = _tested(survey, part, start, datum, covariance=False)
         iterations += adjustment.iterations
+        if datum.kind == "control":
+            freed, line = without_contradicted_control(network, adjustment)
+            if freed is not None:
+                needed[np.setdiff1d(network.control.point, freed.control.point)] = 2
+                network, contradictions = freed, [*contradictions, line]
+                continue
         estimate = put_back(estimate, adjustment.estimate, images, points)
         accepted = _accepted(network, adjustment, images, points)
         left_images, left_points = determined(network, estimate, accepted, needed)
@@ -113,7 +122,7 @@ def solve(
             break
     check = None
     if datum.kind != "control" and len(part.control) >= 3:
-        estimate, check = _placed_on_control(part, adjustment.estimate)
+        estimate, check = placed_on_control(part, adjustment.estimate)
     else:
         estimate = adjustment.estimate
     final = _tested(survey, part, estimate, datum, covariance=True)
@@ -126,7 +135,7 @@ def solve(
         if was and not is_in
     )
     final = replace(final, iterations=iterations + final.iterations)
-    return Solution(final, check, dropped, _warnings(survey, part, final))
+    return Solution(final, check, dropped, (*contradictions, *_warnings(survey, known, final)))
 
 
 def _tested(
@@ -203,54 +212,15 @@ def _accepted(network: Network, adjustment: Adjustment, images: BoolArray, point
     return accepted
 
 
-def object_scale(network: Network, estimate: Estimate) -> float:
-    """Return object units per unit of an estimate by its scale bars, else its control, else NaN."""
-    bars, control = network.scale_bars, network.control
-    length = np.linalg.norm(estimate.points[bars.end] - estimate.points[bars.start], axis=1)
-    usable = np.isfinite(length) & (length > 0)
-    if usable.any():
-        return float(np.median(bars.length[usable] / length[usable]))
-    known = estimate.determined[control.point]
-    if known.sum() >= 3:
-        return fit_similarity(estimate.points[control.point[known]], control.xyz[known]).scale
-    return float("nan")
-
-
-def _rescaled(network: Network, estimate: Estimate, datum: Datum) -> Estimate:
-    """Bring a network that control does not hold to the length of its scale bars, so that it starts near."""
-    if datum.kind == "control" or not len(network.scale_bars):
-        return estimate
-    scale = object_scale(network, estimate)
-    return Similarity(scale, np.eye(3), np.zeros(3)).apply_estimate(estimate) if scale > 0 else estimate
-
-
-def _placed_on_control(network: Network, estimate: Estimate) -> tuple[Estimate, ControlCheck]:
-    """Place an adjusted network on its control; scale bars, where there are some, keep its scale."""
-    control = network.control
-    points = estimate.points[control.point]
-    fitted = fit_similarity(points, control.xyz)
-    placing = fit_similarity(points, control.xyz, scale=1.0) if len(network.scale_bars) else fitted
-    scale = fitted.scale if len(network.scale_bars) else 1.0
-    names = tuple(network.points[j] for j in control.point)
-    return placing.apply_estimate(estimate), ControlCheck(names, placing.apply(points) - control.xyz, scale)
-
-
-def _warnings(survey: Survey, network: Network, adjustment: Adjustment) -> tuple[str, ...]:
+def _warnings(survey: Survey, known: tuple[str, ...], adjustment: Adjustment) -> tuple[str, ...]:
     """Return what a person must know beyond the numbers."""
     lines = []
     if not adjustment.converged:
         lines.append(f"the adjustment did NOT converge within {adjustment.iterations} iterations")
     if adjustment.undetermined:
         lines.append(f"not determined by the observations: {', '.join(adjustment.undetermined)}")
-    if survey.datum.kind != "control" and not len(network.scale_bars) and len(network.control) < 3:
-        lines.append(
-            f"the survey holds no scale: lengths are not in {survey.unit} until a scale bar or control "
-            "is added"
-        )
-    if survey.datum.kind != "control" and len(network.scale_bars) and survey.scale_bars:
-        missing = len(survey.scale_bars) - len(network.scale_bars)
-        if missing:
-            lines.append(
-                f"{missing} of {len(survey.scale_bars)} scale bars have an end that was not measured"
-            )
-    return tuple(lines)
+    gone = [name for name in known if name not in set(adjustment.network.points)]
+    if gone:
+        shown = ", ".join(gone[:MOST_NAMES]) + (" ..." if len(gone) > MOST_NAMES else "")
+        lines.append(f"{len(gone)} points left out, too few of their image points were accepted: {shown}")
+    return (*lines, *datum_warnings(survey, adjustment.network))

@@ -93,7 +93,7 @@ class SurveyResult:
     def has_scale(self) -> bool:
         """Whether lengths are in the object unit: from control, from scale bars, or placed on control."""
         a = self.adjustment
-        return a.datum == "control" or len(a.network.scale_bars) > 0 or self.control_check is not None
+        return a.datum == "control" or len(a.network.scale_bars) > 0 or len(a.network.control) >= 2
 
     @property
     def length_unit(self) -> str:
