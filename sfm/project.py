@@ -192,8 +192,7 @@ class Survey(Section):
         Raises:
             SurveyFileError: it leaves the survey's folder, which only the person who runs it can allow.
         """
-        folder = self._path.parent
-        return folder / name if self._allow_outside else inside(folder, name, str(self._path))
+        return inside(self._path.parent, name, str(self._path), allow_outside=self._allow_outside)
 
     def tables(self) -> tuple[Path, ...]:
         """Return the paths of all tables that the survey names.
@@ -211,23 +210,25 @@ class Survey(Section):
         return tuple(self.beside(name) for name in names if name is not None)
 
 
-def inside(folder: Path, name: str, where: str) -> Path:
+def inside(folder: Path, name: str, where: str, *, allow_outside: bool = False) -> Path:
     """Return the path of a file in a folder, links followed.
 
     Args:
         folder: the folder.
         name: a path relative to it.
         where: the file that names it, for the error.
+        allow_outside: whether it may leave the folder.
 
     Raises:
-        SurveyFileError: the path leaves the folder.
+        SurveyFileError: the path leaves the folder, or is none.
     """
     try:
         path = folder / name
+        path.is_file()  # raises where a name is too long for the disk
         left = not path.resolve().is_relative_to(folder.resolve())
     except (OSError, ValueError, RuntimeError) as error:  # a circle of links, a null byte
         raise SurveyFileError(f"{where}: {name!r:.100} is no path of a file") from error
-    if left:
+    if left and not allow_outside:
         raise SurveyFileError(
             f"{where}: {name!r:.100} leaves the survey's folder; --allow-outside allows that, "
             "for survey files that you trust"

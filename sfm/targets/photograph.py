@@ -164,21 +164,28 @@ def _opened(path: Path, source: Path | io.BytesIO) -> Iterator[Image.Image]:
         try:
             if source is path and path.exists() and not path.is_file():  # reading a pipe would never end
                 raise PhotographError(f"{path.name}: not a file, a photograph is needed")
-            image = Image.open(source, formats=FORMATS)
+            image = _unbounded_open(source)
         except PhotographError:
             raise
-        except Image.DecompressionBombError as error:
-            raise PhotographError(f"{path.name}: {_too_large(str(error))}") from error
         except Exception as error:  # Pillow stumbles over damaged headers in many ways
             raise PhotographError(f"{path.name}: {_reason(path, error)}") from error
         with image:
             if image.width * image.height > MAX_PIXELS:
-                raise PhotographError(f"{path.name}: {_too_large(f'{image.width} x {image.height} px')}")
+                raise PhotographError(
+                    f"{path.name}: {image.width} x {image.height} px; "
+                    f"photographs of at most {MAX_PIXELS / 1e6:.0f} million pixels are read"
+                )
             yield image
 
 
-def _too_large(found: str) -> str:
-    return f"{found.rstrip('.')}; photographs of at most {MAX_PIXELS / 1e6:.0f} million pixels are read"
+def _unbounded_open(source: Path | io.BytesIO) -> Image.Image:
+    """Open a header without Pillow's own limit, which is below that of aerial scans."""
+    limit = Image.MAX_IMAGE_PIXELS
+    Image.MAX_IMAGE_PIXELS = None
+    try:
+        return Image.open(source, formats=FORMATS)
+    finally:
+        Image.MAX_IMAGE_PIXELS = limit
 
 
 def _refuse_bomb(path: Path, size: tuple[int, int], data: bytes) -> None:

@@ -1,0 +1,252 @@
+"""What is fuzzed: good files of every kind, and how each is read."""
+
+from __future__ import annotations
+
+import io
+import random
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from PIL import Image
+
+from adapters.colmap import read_model, write_model
+from adapters.photomodeler import read_photomodeler
+from adapters.sba_text import read_sba_text
+from sfm.errors import KolinearError
+from sfm.pipeline import adjust_survey
+from sfm.project import read_survey
+from sfm.survey_start import find_photographs, network_from_observations
+from sfm.survey_tables import read_control, read_exterior, read_image_points, read_points
+from sfm.targets.codes import read_code_table
+from sfm.targets.detect import find_targets
+from sfm.targets.photograph import read_metadata, read_photograph
+from tests.fuzz.mutate import mutate_bytes, mutate_text
+from tests.synthetic import make_network, seed_of
+
+SURVEY = """\
+[survey]
+name = "fuzz"
+unit = "m"
+[[camera]]
+name = "synthetic"
+images = "image*"
+size_px = [2000, 1500]
+pixel_mm = [0.005, 0.005]
+c_mm = 10.0
+model = "brown"
+free = ["c", "x0", "y0"]
+[camera.fixed]
+K1 = 8e-4
+K2 = -4e-6
+[targets]
+polarity = "dark"
+codes = "codes.txt"
+min_diameter_px = 6
+[datum]
+kind = "control"
+[control]
+file = "control.csv"
+[[scale_bar]]
+from = "1"
+to = "2"
+length = 1.2
+sigma = 0.001
+[observations]
+file = "image_points.csv"
+[approximate]
+images = "images.csv"
+points = "points.csv"
+[adjust]
+sigma_px = 0.1
+reject = "tau"
+[compare]
+backend = "none"
+"""
+SOLVED_SHARE = 0.03  # of what can be read is adjusted, too, which takes longer
+
+
+@dataclass(frozen=True)
+class Seed:
+    """A good file and how it is read."""
+
+    kind: str
+    name: str
+    content: str | bytes
+    read: Callable[[Path, random.Random], None]  # the folder that holds it among its good neighbours
+
+
+def make_seeds(folder: Path) -> tuple[Seed, ...]:
+    """Write a folder of good files and return the seeds; one file is exchanged for each mutation."""
+    texts = _tables()
+    for name, text in texts.items():
+        (folder / name).write_text(text, encoding="utf-8")
+    pictures = _pictures()
+    network, truth = make_network(seed_of("fuzz model"), images=3, points=8, model="opencv")
+    models: dict[str, str | bytes] = {}
+    for kind in ("bin", "txt"):
+        write_model(folder / kind, network, truth, text=kind == "txt")
+        for path in sorted((folder / kind).iterdir()):
+            models[f"{kind}/{path.name}"] = path.read_bytes() if kind == "bin" else path.read_text("utf-8")
+    seeds = [Seed("surveys", "survey.toml", SURVEY, _read_survey)]
+    seeds += [
+        Seed("tables", name, text, _read_survey) for name, text in texts.items() if name.endswith(".csv")
+    ]
+    seeds += [Seed("tables", name, texts[name], read) for name, read in _TABLES]
+    seeds += [
+        Seed("codes", "codes.txt", texts["codes.txt"], lambda f, _: _drop(read_code_table(f / "codes.txt")))
+    ]
+    seeds += [Seed("photographs", name, data, _reader_of_photograph(name)) for name, data in pictures.items()]
+    seeds += [
+        Seed("models", name, data, lambda f, _, kind=name.split("/")[0]: _drop(read_model(f / kind)))
+        for name, data in models.items()
+    ]
+    seeds += [Seed("models", name, text, read) for name, text, read in _OTHER_PROGRAMS]
+    for seed in seeds:
+        path = folder / seed.name
+        if isinstance(seed.content, bytes):
+            path.write_bytes(seed.content)
+        else:
+            path.write_text(seed.content, encoding="utf-8")
+    return tuple(seeds)
+
+
+def run_case(seed: Seed, folder: Path, rng: random.Random) -> str:
+    """Read one mutated file; return "" or what went wrong. The good file is put back."""
+    path = folder / seed.name
+    if isinstance(seed.content, bytes):
+        good = seed.content
+        data = mutate_bytes(rng, good)
+    else:
+        good = seed.content.encode()
+        data = mutate_text(rng, seed.content).encode("utf-8", "surrogatepass")
+        if rng.random() < 0.1:
+            data = mutate_bytes(rng, data)
+    path.write_bytes(data)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            seed.read(folder, rng)
+    except KolinearError as error:
+        told = str(error)
+        if not told or "\n" in told or len(told) > 2000:
+            return f"not one clear line: {told[:200]!r}"
+    except Exception as error:
+        place = error.__traceback__
+        while place is not None and place.tb_next is not None:
+            place = place.tb_next
+        at = f"{place.tb_frame.f_code.co_filename}:{place.tb_lineno}" if place is not None else ""
+        return f"{type(error).__name__}: {str(error)[:150]} at {at}"
+    finally:
+        path.write_bytes(good)
+    return ""
+
+
+def _drop(value: object) -> None:
+    """Do nothing with what was read."""
+
+
+def _read_survey(folder: Path, rng: random.Random) -> None:
+    survey = read_survey(folder / "survey.toml")
+    if survey.observations is None:
+        find_photographs(survey)
+        return
+    network_from_observations(survey)
+    if rng.random() < SOLVED_SHARE:
+        adjust_survey(survey)
+
+
+def _reader_of_photograph(name: str) -> Callable[[Path, random.Random], None]:
+    def read(folder: Path, rng: random.Random) -> None:
+        read_metadata(folder / name)
+        picture = read_photograph(folder / name)
+        if picture.size < 1_000_000 and rng.random() < 0.2:
+            find_targets(picture, codes="ring14")
+
+    return read
+
+
+_TABLES: tuple[tuple[str, Callable[[Path, random.Random], None]], ...] = (
+    ("control.csv", lambda f, _: _drop(read_control(f / "control.csv"))),
+    ("images.csv", lambda f, _: _drop(read_exterior(f / "images.csv"))),
+    ("points.csv", lambda f, _: _drop(read_points(f / "points.csv"))),
+    ("image_points.csv", lambda f, _: _drop(read_image_points(f / "image_points.csv"))),
+)
+PHOTOMODELER = """\
+job
+1.0 0.1
+7.4 2.7 3.6 5.4 4.1 0.0 0.0 0.0 0.0 0.0
+100 100
+a.jpg
+0 0 0 0 0 0
+
+1 1 10.5 20.5 1.0 1.0
+"""
+SBA_CAMERAS = "1 0 0 0 0 0 0\n1 0 0 0 1 0 0\n"
+SBA_POINTS = "0 0 5 2 0 320 240 1 310 240\n1 0 5 2 0 420 240 1 410 240\n0 1 5 2 0 320 340 1 310 340\n"
+SBA_CALIBRATION = "800 0 320\n0 800 240\n0 0 1\n"
+
+
+def _read_sba(folder: Path, rng: random.Random) -> None:
+    read_sba_text(folder / "cams.txt", folder / "pts.txt", folder / "calib.txt")
+
+
+_OTHER_PROGRAMS: tuple[tuple[str, str, Callable[[Path, random.Random], None]], ...] = (
+    ("pm.txt", PHOTOMODELER, lambda f, _: _drop(read_photomodeler(f / "pm.txt"))),
+    ("cams.txt", SBA_CAMERAS, _read_sba),
+    ("pts.txt", SBA_POINTS, _read_sba),
+    ("calib.txt", SBA_CALIBRATION, _read_sba),
+)
+
+
+def _tables() -> dict[str, str]:
+    """Return the tables of the survey above."""
+    network, truth = make_network(seed_of("fuzz"), images=5, points=12, free=("c",))
+    seen = network.image_points
+    points = "".join(
+        f"{network.images[i]},{network.points[j]},{x:.3f},{y:.3f},0.1,0.1\n"
+        for i, j, (x, y) in zip(seen.image, seen.point, seen.xy, strict=True)
+    )
+    xyz = [
+        f"{name},{x:.6f},{y:.6f},{z:.6f}"
+        for name, (x, y, z) in zip(network.points, truth.points, strict=True)
+    ]
+    images = "".join(f"{name},0.1,0.2,4.0,1.0,-2.0,{10 * k}.0\n" for k, name in enumerate(network.images))
+    return {
+        "image_points.csv": "image,point,x_px,y_px,sx_px,sy_px\n" + points,
+        "control.csv": "id,X,Y,Z,sX,sY,sZ\n" + "".join(f"{row},0.001,0.001,0\n" for row in xyz[:5]),
+        "points.csv": "point,X,Y,Z\n" + "\n".join(xyz) + "\n",
+        "images.csv": "image,X,Y,Z,omega_deg,phi_deg,kappa_deg\n" + images,
+        "codes.txt": "# cells 12\n1 65\n2 195\n3 325\n",
+    }
+
+
+def _pictures() -> dict[str, bytes]:
+    """Return small photographs with a target, in all formats and depths."""
+    grey = np.full((48, 64), 200, np.uint8)
+    cv2.circle(grey, (30, 24), 9, 40, -1)
+    exif = Image.Exif()
+    exif[0x0112], exif[0x010F], exif[0x0110] = 1, "Maker", "Model"
+    inner = exif.get_ifd(0x8769)
+    inner[0x920A], inner[0xA405], inner[0xA20E], inner[0xA20F], inner[0xA210] = 7.3, 38, 300.0, 300.0, 3
+    inner[0xA002] = 64
+    jpeg, progressive = io.BytesIO(), io.BytesIO()
+    Image.fromarray(grey).save(jpeg, "JPEG", exif=exif, quality=92)
+    Image.fromarray(cv2.cvtColor(grey, cv2.COLOR_GRAY2RGB)).save(progressive, "JPEG", progressive=True)
+    coded = {
+        suffix: cv2.imencode(suffix, picture)[1].tobytes()
+        for suffix, picture in ((".png", grey), (".tif", grey.astype(np.uint16) * 200), (".bmp", grey))
+    }
+    tiled = io.BytesIO()
+    Image.fromarray(grey).save(tiled, "TIFF", compression="tiff_lzw", exif=exif)
+    return {
+        "a.jpg": jpeg.getvalue(),
+        "b.jpg": progressive.getvalue(),
+        "c.png": coded[".png"],
+        "d.tif": coded[".tif"],
+        "e.tif": tiled.getvalue(),
+        "f.bmp": coded[".bmp"],
+    }

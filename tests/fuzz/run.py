@@ -1,0 +1,136 @@
+"""Fuzz all readers: no traceback, no crash, no case over 10 s, no process over 1 GiB.
+
+python -m tests.fuzz.run [--count 20000] [--seed 1] [--kinds surveys tables ...]
+
+Every kind runs in a process of its own, so that a crash of a library or a hang is seen and told like any
+other fault, with the case that repeats it: --kinds KIND --seed S --only CASE.
+"""
+
+from __future__ import annotations
+
+import argparse
+import queue
+import random
+import resource
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from contextlib import suppress
+from pathlib import Path
+
+from sfm.errors import KolinearError
+
+LIMIT_SECONDS = 10.0
+START_SECONDS = 300.0  # imports and the first compilation of kernels
+LIMIT_MIB = 1024
+SHARES = {"surveys": 0.25, "tables": 0.25, "photographs": 0.3, "models": 0.17, "codes": 0.03}
+
+
+def main() -> int:
+    """Run the fuzzer; the exit code is 1 if anything was found."""
+    options = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    options.add_argument("--count", type=int, default=20_000)
+    options.add_argument("--seed", type=int, default=1)
+    options.add_argument("--kinds", nargs="*", default=list(SHARES), choices=list(SHARES))
+    options.add_argument("--only", type=int)
+    options.add_argument("--child", nargs=2, type=int, help=argparse.SUPPRESS)
+    given = options.parse_args()
+    if given.child is not None:
+        run_cases(given.kinds[0], given.seed, *given.child)
+        return 0
+    if given.only is not None:
+        run_cases(given.kinds[0], given.seed, given.only, given.only + 1)
+        return 0
+    whole = sum(SHARES[kind] for kind in given.kinds)
+    found = 0
+    for kind in given.kinds:
+        count = round(given.count * SHARES[kind] / whole)
+        found += watch(kind, given.seed, count)
+    print(f"{found} faults")
+    return 1 if found else 0
+
+
+def run_cases(kind: str, seed: int, first: int, last: int) -> None:
+    """Run cases and print a line for each: its number and what went wrong."""
+    from tests.fuzz.cases import make_seeds, run_case
+
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        seeds = [one for one in make_seeds(folder) if one.kind == kind]
+        for one in seeds:  # good files first: kernels are compiled here, not within the time of a case
+            with suppress(KolinearError):
+                one.read(folder, _Always())
+        for number in range(first, last):
+            rng = random.Random(f"{kind} {seed} {number}")
+            fault = run_case(rng.choice(seeds), folder, rng)
+            peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024
+            print(f"{number}\t{peak}\t{fault}", flush=True)
+
+
+class _Always(random.Random):
+    """Chance that never spares the long way."""
+
+    def random(self) -> float:
+        return 0.0
+
+
+def watch(kind: str, seed: int, count: int) -> int:
+    """Run a kind in processes that are watched; return the number of faults."""
+    first, faults, peak, slowest = 0, 0, 0, 0.0
+    begun = time.monotonic()
+    while first < count:
+        command = [sys.executable, "-m", "tests.fuzz.run", "--kinds", kind, "--seed", str(seed)]
+        process = subprocess.Popen(
+            [*command, "--child", str(first), str(count)],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            errors="replace",
+        )
+        lines: queue.SimpleQueue[str | None] = queue.SimpleQueue()
+        threading.Thread(target=_pump, args=(process, lines), daemon=True).start()
+        threading.Thread(target=process.stderr.read, daemon=True).start()  # type: ignore[union-attr]
+        started = False
+        last = time.monotonic()
+        while True:
+            try:
+                line = lines.get(timeout=LIMIT_SECONDS if started else START_SECONDS)
+            except queue.Empty:
+                process.kill()
+                print(f"{kind} {first}: more than {LIMIT_SECONDS:.0f} s")
+                faults, first = faults + 1, first + 1
+                break
+            if line is None:
+                if first < count:
+                    print(f"{kind} {first}: the process died, exit code {process.wait()}")
+                    faults, first = faults + 1, first + 1
+                break
+            now = time.monotonic()
+            if started:
+                slowest = max(slowest, now - last)
+            started, last = True, now
+            number, mib, fault = line.rstrip("\n").split("\t", 2)
+            first = int(number) + 1
+            over = int(mib) > LIMIT_MIB >= peak
+            peak = max(peak, int(mib))
+            if fault or over:
+                faults += 1
+                print(f"{kind} {number}: {fault or f'{mib} MiB'}", flush=True)
+        process.wait()
+    seconds = time.monotonic() - begun
+    print(f"{kind}: {count} cases, {faults} faults, {seconds:.0f} s, slowest {slowest:.1f} s, {peak} MiB")
+    return faults
+
+
+def _pump(process: subprocess.Popen[str], lines: queue.SimpleQueue[str | None]) -> None:
+    for line in process.stdout or ():
+        lines.put(line)
+    lines.put(None)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
