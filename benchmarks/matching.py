@@ -48,7 +48,7 @@ def compare_lsm(patches: int) -> None:
         threads: _fastest(lambda t=threads: _all_lsm(rounds, pairs, ours, t))  # type: ignore[misc]
         for threads in (1, 2)
     }
-    ecc = _fastest(lambda: _all_ecc(rounds, pairs, theirs), repeats=1)
+    ecc = _fastest(lambda: _all_ecc(rounds, pairs, theirs))
     rms = [_rms(np.array(one[-len(rounds) :]), pairs) for one in (ours, theirs)]
     bound = SIGMA * np.sqrt(np.trace(pairs.bound, axis1=1, axis2=2).mean() / 2)
     print(f"LSM, {count} patches of 21 x 21 px, noise {SIGMA:g} of 256 in both photographs")
@@ -110,10 +110,10 @@ def _rms(found: FloatArray, pairs: Pairs) -> float:
     return float(np.sqrt(np.nanmean((found - pairs.centre - pairs.shift) ** 2)))
 
 
-def _fastest(work: Callable[[], object], repeats: int = REPEATS) -> float:
+def _fastest(work: Callable[[], object]) -> float:
     """Return the seconds of the fastest run."""
     best = np.inf
-    for _ in range(repeats):
+    for _ in range(REPEATS):
         begun = time.perf_counter()
         work()
         best = min(best, time.perf_counter() - begun)
