@@ -10,6 +10,7 @@ from numba import njit
 
 from sfm.conventions import AnyArray, FloatArray, IntArray
 from sfm.errors import SurveyFileError
+from sfm.targets.ring_cells import fit_cells
 
 UNCODED = -1
 UNREADABLE = -2
@@ -157,7 +158,13 @@ def _is_number(word: str) -> bool:
 
 
 def read_codes(
-    photograph: AnyArray, xy: FloatArray, shape: FloatArray, levels: FloatArray, family: CodeFamily
+    photograph: AnyArray,
+    xy: FloatArray,
+    shape: FloatArray,
+    levels: FloatArray,
+    family: CodeFamily,
+    *,
+    blur_px: FloatArray | None = None,
 ) -> tuple[IntArray, FloatArray]:
     """Read the code around each measured dot.
 
@@ -170,6 +177,8 @@ def read_codes(
         shape: (p, q, r) with (p q; q r) turning image vectors into dot radii, 1/px, shape (k, 3).
         levels: intensity of the background and its step to the dot, shape (k, 2).
         family: the family of codes.
+        blur_px: standard deviation of the edge of each dot, pixel box included, shape (k,); default is that
+            of a sharp photograph.
 
     Returns:
         Code numbers, `UNCODED` where nothing is around the dot and `UNREADABLE` where something is that is
@@ -178,7 +187,17 @@ def read_codes(
     polar = _sample_rings(photograph, xy, shape, levels, family.inner, family.outer)
     if family.cells == 0:
         return _read_arcs(polar)
-    return _read_cells(polar, family)
+    code, confidence = np.full(len(xy), UNCODED, dtype=np.int64), np.zeros(len(xy))
+    body = polar[:, 1:4]
+    ring = np.flatnonzero((body > LEAST_SET).any(axis=(1, 2)))  # nan is not above
+    code[ring] = UNREADABLE
+    ring = ring[np.isfinite(body[ring]).all(axis=(1, 2))]
+    blur = np.full(len(xy), SHARP_PX) if blur_px is None else np.asarray(blur_px, dtype=float)
+    geometry = xy[ring], shape[ring], levels[ring], blur[ring]
+    cells = fit_cells(photograph, *geometry, family.cells, family.inner, family.outer)
+    for k, found in zip(ring, cells, strict=True):
+        code[k], confidence[k] = _read_cells(found, family)
+    return code, confidence
 
 
 # Sampling of the ring: angles, and radii as fractions between inner and outer radius of the ring. The first
@@ -186,12 +205,23 @@ def read_codes(
 ANGLES = 360
 RADII = np.array([-0.45, 0.25, 0.5, 0.75, 1.4])
 # Level between background (0) and dot (1) that separates set from clear, and the least distance from it
-# (both sides) that makes a reading certain.
+# (both sides) that makes a reading of arcs certain.
 HALF = 0.5
 MARGIN = 0.15
-# Least level of a set cell, and the part of the circle just outside the ring that other things may cover.
+# What is around a dot is no code where nothing in the ring is above this level.
 LEAST_SET = 0.3
+# Step from clear to set cells in units of that from background to dot, and the least gap between the levels
+# of set and clear cells, in steps. Codes of the retro-panel: 0.89 to 1.05 and 0.61.
+LEAST_STEP, LARGEST_STEP, LEAST_JUMP = 0.6, 1.5, 0.4
+# Largest deviations, in steps: of a clear cell and of the surroundings from the background, of a set cell
+# from shading (with the sigma of its change over the radius), of a cell from its mean on one radius, of the
+# samples.
+CLEAR_TOLERANCE, SET_TOLERANCE, SHADING = 0.15, 0.2, 0.3
+RADIAL_TOLERANCE, RESIDUAL_TOLERANCE, NOISE_SIGMAS = 0.2, 0.15, 3.0
+# Part of the circle just behind the ring that other things may cover.
 OUTSIDE_CLUTTER = 0.25
+# Blur of the edge in a sharp photograph, px.
+SHARP_PX = 0.8
 # A ring may be interrupted by less than this angle, and an arc must be longer.
 SHORTEST_ARC_DEG = 12
 
@@ -260,45 +290,43 @@ def _read_arcs(polar: FloatArray) -> tuple[IntArray, FloatArray]:
     return count, confidence
 
 
-def _read_cells(polar: FloatArray, family: CodeFamily) -> tuple[IntArray, FloatArray]:
-    """Return the code numbers of rings of cells and the confidence.
+def _read_cells(found: FloatArray, family: CodeFamily) -> tuple[int, float]:
+    """Return code number and confidence of one ring from the levels of its cells, see `fit_cells`.
 
-    Set and clear cells are separated at the widest gap between their sorted intensities, so that a shadow
-    across the ring does no harm; the position of the cells is the one with the least variation inside them.
+    Set and clear cells are separated at the widest gap between their sorted levels, so that a shadow across
+    the ring does no harm. Whatever covers part of a ring, or looks like one by chance, must not be read:
+    clear cells, clear ring and surroundings are at the level of the background, set cells at one level but
+    for shading, and each cell is the same on all radii and over its length.
     """
-    code = np.full(len(polar), UNCODED, dtype=np.int64)
-    confidence = np.zeros(len(polar))
-    n, phases = family.cells, 12
-    cell = ANGLES / n
-    weight = 1 << np.arange(n - 1, -1, -1)
-    # per phase and cell: samples in the middle of the cell, half of its width
-    start = (np.arange(n) + np.arange(phases)[:, None] / phases + 0.25) * cell
-    index = (start[:, :, None] + np.linspace(0, 0.5, 7) * cell).round().astype(int) % ANGLES
-    for k, rings in enumerate(polar):
-        gap, body, outside = rings[0], rings[1:4], rings[4]
-        inside = np.isfinite(body).all(axis=0)
-        if not inside.any() or not (body[:, inside] > LEAST_SET).any():
-            continue
-        code[k] = UNREADABLE
-        if not inside.all():
-            continue
-        z = body[:, index]  # radius, phase, cell, sample
-        phase = z.var(axis=-1).sum(axis=(0, 2)).argmin()
-        cells = z[:, phase].mean(axis=-1)
-        level = np.sort(cells.mean(axis=0))
-        jump = np.diff(level)
-        at = jump.argmax()
-        half = (level[at] + level[at + 1]) / 2
-        top = level[at + 1 :].mean()
-        state = cells > half
-        certainty = np.abs(cells - half).min() / top
-        if level[at] > half or level[at + 1] < LEAST_SET or certainty < MARGIN:
-            continue
-        if not (state == state[0]).all() or gap.max() > half or np.nanmean(outside > half) > OUTSIDE_CLUTTER:
-            continue
-        value = smallest_rotation(np.array([(state[0] * weight).sum()]), n)[0]
-        entry = np.searchsorted(family.pattern, value)
-        if entry < len(family.pattern) and family.pattern[entry] == value:
-            code[k] = family.number[entry]
-            confidence[k] = min(1.0, 2 * certainty)
-    return code, confidence
+    if not np.isfinite(found).all():
+        return UNREADABLE, 0.0
+    at_radii, (residual, gap, behind, sigma) = found[:3], found[3:]
+    level = at_radii.mean(axis=0)
+    order = np.sort(level)
+    jump = np.diff(order)
+    at = jump.argmax()
+    bits = level > (order[at] + order[at + 1]) / 2
+    step = level[bits].mean() - level[~bits].mean()
+    if not LEAST_STEP <= step <= LARGEST_STEP or jump[at] < LEAST_JUMP * step:
+        return UNREADABLE, 0.0
+    # Shading makes the levels of the set cells a plane, with a prior so that few cells do not fit any plane.
+    angle = 2 * np.pi * np.arange(family.cells) / family.cells
+    A = np.column_stack([np.ones(family.cells), np.cos(angle), np.sin(angle)])[bits]
+    prior = np.diag([0.0, 1.0, 1.0]) * (SET_TOLERANCE / SHADING) ** 2
+    plane = A @ np.linalg.solve(A.T @ A + prior, A.T @ level[bits])
+    noise = NOISE_SIGMAS * sigma * residual
+    uneven = np.abs(level)
+    uneven[bits] = np.abs(level[bits] - plane) * (CLEAR_TOLERANCE / SET_TOLERANCE)
+    tests = (
+        np.abs(at_radii - level) <= RADIAL_TOLERANCE * step + noise,
+        uneven <= CLEAR_TOLERANCE * step + noise,
+        np.abs(gap) <= CLEAR_TOLERANCE * step + noise,
+        residual <= RESIDUAL_TOLERANCE * step,
+        np.mean(np.abs(behind) > CLEAR_TOLERANCE * step + noise) <= OUTSIDE_CLUTTER,
+    )
+    value = smallest_rotation(np.array([bits @ (1 << np.arange(family.cells - 1, -1, -1))]), family.cells)[0]
+    entry = np.searchsorted(family.pattern, value)
+    known = entry < len(family.pattern) and family.pattern[entry] == value
+    if not known or not all(np.all(t) for t in tests):
+        return UNREADABLE, 0.0
+    return int(family.number[entry]), float(min(1.0, jump[at] / step))

@@ -127,7 +127,7 @@ def find_targets(
     if family is not None and good.any():
         levels = np.column_stack([fit.background, fit.contrast])
         code[good], confidence[good] = read_codes(
-            photograph, fit.xy[good], fit.shape[good], levels[good], family
+            photograph, fit.xy[good], fit.shape[good], levels[good], family, blur_px=fit.blur[good]
         )
         reason[good & _inside_codes(fit, code, confidence, family)] = Flag.PART_OF_CODE
     keep = np.flatnonzero(reason == 0)

@@ -1,0 +1,178 @@
+"""Decoding of thousands of rendered rings: no wrong code, and nearly all of the legible ones are read."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import pytest
+from numba import njit
+
+from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
+from sfm.targets.codes import CodeFamily, code_family
+from sfm.targets.detect import find_targets
+
+SUPER = 3
+TILE, ACROSS = 180, 8
+# Occluders: none, a straight edge, a disc.
+NOTHING, HALF_PLANE, DISC = 0, 1, 2
+# Least difference between an occluder and the background, grey levels.
+VISIBLE = 10.0
+
+
+@dataclass(frozen=True)
+class Rings:
+    """Rings in perspective, the last of whose cells may be covered."""
+
+    number: IntArray  # code, (n,)
+    pattern: IntArray  # bits, (n,)
+    diameter: FloatArray  # largest diameter of the dot, px, (n,)
+    tilt: FloatArray  # rad, (n,)
+    turn: FloatArray  # of the ring in its plane, and of the axis of the tilt, rad, (n, 2)
+    centre: FloatArray  # in the tile, px, (n, 2)
+    levels: FloatArray  # intensity of background, dot and occluder, (n, 3)
+    blur: FloatArray  # px, (n,)
+    noise: FloatArray  # (n,)
+    occluder: FloatArray  # kind, direction (rad), distance of its edge in radii, size in radii, (n, 4)
+
+
+def random_rings(count: int, family: CodeFamily, rng: np.random.Generator) -> Rings:
+    """Return rings at random, dark or bright, a tenth of them covered in part by something of any grey."""
+    k = rng.integers(len(family.number), size=count)
+    dark = rng.random(count) < 0.5
+    low, high = rng.uniform(10, 60, count), rng.uniform(130, 230, count)
+    occluder = np.zeros((count, 4))
+    hidden = rng.random(count) < 0.1
+    occluder[hidden, 0] = rng.integers(HALF_PLANE, DISC + 1, hidden.sum())
+    occluder[:, 1] = rng.uniform(0, 2 * np.pi, count)
+    occluder[:, 2] = rng.uniform(-0.5, family.outer, count)
+    occluder[:, 3] = rng.uniform(0.4, 2.0, count)
+    background = np.where(dark, high, low)
+    # What has the grey of the background and covers whole cells makes another code, so it is another grey.
+    grey = rng.uniform(5 + VISIBLE, 245 - VISIBLE, count)
+    grey += np.where(grey > background, VISIBLE, -VISIBLE)
+    return Rings(
+        family.number[k],
+        family.pattern[k],
+        rng.uniform(6, 40, count),
+        rng.uniform(0, np.radians(70), count),
+        rng.uniform(0, 2 * np.pi, (count, 2)),
+        TILE / 2 + rng.uniform(-1, 1, (count, 2)),
+        np.column_stack([background, np.where(dark, low, high), grey]),
+        rng.uniform(0.5, 0.9, count),
+        rng.uniform(0.5, 4.0, count),
+        occluder,
+    )
+
+
+def render(rings: Rings, k: int, family: CodeFamily, rng: np.random.Generator) -> AnyArray:
+    """Return one tile: area sampling of the perspective picture, blur, noise, rounding."""
+    tilt, (turn, axis), R = rings.tilt[k], rings.turn[k], rings.diameter[k] / 2
+    # A camera 25 dot diameters away: x = R * 50 * X / (50 + Z) with the plane turned about the axis.
+    c, s = math.cos(axis), math.sin(axis)
+    flip = np.array([[c, -s], [s, c]])
+    squeeze = np.array([[1.0, 0.0], [0.0, math.cos(tilt)]])
+    affine = R * flip @ squeeze @ flip.T
+    depth = math.sin(tilt) / 50 * flip[:, 1]
+    H = np.zeros((3, 3))
+    H[:2, :2], H[2, :2], H[2, 2] = affine + np.outer(rings.centre[k], depth), depth, 1.0
+    H[:2, 2] = rings.centre[k]
+    fine = _paint(
+        TILE * SUPER, np.linalg.inv(H), int(rings.pattern[k]), family.cells, family.inner, family.outer,
+        turn, rings.levels[k], rings.occluder[k],
+    )  # fmt: skip
+    soft = cv2.GaussianBlur(fine, (0, 0), rings.blur[k] * SUPER)
+    picture = cv2.resize(soft, (TILE, TILE), interpolation=cv2.INTER_AREA)
+    return picture + rings.noise[k] * rng.standard_normal(picture.shape, dtype=np.float32)
+
+
+@njit(cache=True, error_model="numpy")
+def _paint(
+    size: int,
+    G: FloatArray,
+    pattern: int,
+    cells: int,
+    inner: float,
+    outer: float,
+    turn: float,
+    levels: FloatArray,
+    occluder: FloatArray,
+) -> AnyArray:
+    """Paint dot, ring and occluder on a fine raster, G maps pixels to radii in the plane of the target."""
+    out = np.empty((size, size), np.float32)
+    nx, ny = math.cos(occluder[1]), math.sin(occluder[1])
+    ox, oy = nx * (occluder[2] + occluder[3]), ny * (occluder[2] + occluder[3])
+    for i in range(size):
+        for j in range(size):
+            x, y = (j + 0.5) / SUPER - 0.5, (i + 0.5) / SUPER - 0.5
+            w = G[2, 0] * x + G[2, 1] * y + G[2, 2]
+            a, b = (G[0, 0] * x + G[0, 1] * y + G[0, 2]) / w, (G[1, 0] * x + G[1, 1] * y + G[1, 2]) / w
+            rho = math.hypot(a, b)
+            value = levels[0]
+            if rho < 1:
+                value = levels[1]
+            elif inner < rho < outer:
+                cell = int((math.atan2(b, a) + turn + 4 * math.pi) % (2 * math.pi) / (2 * math.pi) * cells)
+                if pattern >> (cells - 1 - cell % cells) & 1:
+                    value = levels[1]
+            if (occluder[0] == HALF_PLANE and a * nx + b * ny > occluder[2]) or (
+                occluder[0] == DISC and math.hypot(a - ox, b - oy) < occluder[3]
+            ):
+                value = levels[2]
+            out[i, j] = value
+    return out
+
+
+def decode(rings: Rings, family: CodeFamily, rng: np.random.Generator) -> tuple[IntArray, IntArray]:
+    """Return the code read at each ring, -1 for none, and how many codes were read elsewhere."""
+    count = len(rings.number)
+    read, elsewhere = np.full(count, -1), 0
+    for first in range(0, count, ACROSS**2):
+        part = range(first, min(first + ACROSS**2, count))
+        picture = np.zeros((ACROSS * TILE, ACROSS * TILE), np.float32)
+        for k in part:
+            i, j = divmod(k - first, ACROSS)
+            picture[i * TILE : (i + 1) * TILE, j * TILE : (j + 1) * TILE] = render(rings, k, family, rng)
+        found = find_targets(np.rint(picture).clip(0, 255).astype(np.uint8), codes=family, min_diameter_px=3)
+        for xy, code in zip(found.xy, found.code, strict=True):
+            j, i = (xy // TILE).astype(int)
+            k = first + i * ACROSS + j
+            if code < 0:
+                continue
+            if k < count and np.hypot(*(xy - rings.centre[k] - (j * TILE, i * TILE))) < 1.5:
+                read[k] = code
+            else:
+                elsewhere += 1
+    return read, elsewhere
+
+
+def legible(rings: Rings) -> BoolArray:
+    """Return which rings are whole and neither tiny nor very oblique."""
+    return (rings.diameter > 8) & (rings.tilt < np.radians(60)) & (rings.occluder[:, 0] == NOTHING)
+
+
+def study(name: str, count: int, seed: int) -> None:
+    family = code_family(name)
+    assert family is not None
+    rng = np.random.default_rng(seed)
+    rings = random_rings(count, family, rng)
+    read, elsewhere = decode(rings, family, rng)
+    wrong = (read >= 0) & (read != rings.number)
+    recall = (read == rings.number)[legible(rings)].mean()
+    print(name, count, "wrong", wrong.sum(), "elsewhere", elsewhere, "recall", recall)
+    assert wrong.sum() == 0
+    assert elsewhere == 0
+    assert recall >= 0.995
+
+
+@pytest.mark.parametrize("name", ["ring12", "ring14", "ring20"])
+def test_few_rings_are_decoded(name: str) -> None:
+    study(name, 256, 1)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["ring12", "ring14", "ring20"])
+def test_ten_thousand_rings_are_decoded(name: str) -> None:
+    study(name, 10_000, 2)
