@@ -1,0 +1,87 @@
+"""Bars, print and parts of codes: what resembles a target and is none."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from sfm.camera import camera_from_values
+from sfm.conventions import AnyArray, rotation_from_angles
+from sfm.targets.codes import code_family
+from sfm.targets.detect import find_targets
+from sfm.targets.flags import count_flags
+from sfm.targets.render import render_photograph
+from sfm.targets.scene import CircularTargets, Faces, Optics, Scene, coded_ring, join_marks
+
+SUPER, NOISE, BLUR = 4, 3.5, 0.75
+WIDTH, HEIGHT = 1000, 700
+PAPER, INK = 200.0, 50.0
+# Semi-axes of bars, px: strokes of letters as large print shows them, and squares.
+BARS = ((21, 3.6), (10, 2.2), (5, 2.4), (14, 5), (8, 6), (6, 6), (30, 8))
+
+
+def exposed(ink: AnyArray, rng: np.random.Generator) -> AnyArray:
+    """Return a photograph of what is drawn on a finer raster with 255 for ink."""
+    soft = cv2.GaussianBlur(ink.astype(np.float32) / 255, (0, 0), BLUR * SUPER)
+    share = cv2.resize(soft, (WIDTH, HEIGHT), interpolation=cv2.INTER_AREA)
+    picture = PAPER + (INK - PAPER) * share + rng.normal(0, NOISE, share.shape)
+    return np.rint(picture).clip(0, 255).astype(np.uint8)
+
+
+def test_bars_are_no_targets() -> None:
+    rng = np.random.default_rng(1)
+    ink = np.zeros((HEIGHT * SUPER, WIDTH * SUPER), np.uint8)
+    count = 0
+    for y in range(40, HEIGHT - 40, 80):
+        for x in range(40, WIDTH - 40, 80):
+            half = np.array(BARS[rng.integers(len(BARS))]) * rng.uniform(0.8, 1.2, 2)
+            centre = SUPER * (np.array([x, y]) + rng.uniform(-3, 3, 2))
+            box = cv2.boxPoints((tuple(centre), tuple(2 * SUPER * half), rng.uniform(0, 180)))
+            cv2.fillPoly(ink, [np.rint(box).astype(np.int32)], 255)
+            count += 1
+    found = find_targets(exposed(ink, rng), min_diameter_px=4)
+    assert len(found) == 0
+    assert dict(count_flags(found.rejected_flag))["lobed"] > count / 3
+
+
+@pytest.mark.parametrize("codes", ["arcs", "ring12", "ring14", "ring20"])
+def test_no_code_is_read_from_print(codes: str) -> None:
+    rng = np.random.default_rng(2)
+    ink = np.zeros((HEIGHT * SUPER, WIDTH * SUPER), np.uint8)
+    letters = np.array(list("abdegopqO0689BDPQRci.,:;m"))
+    for y in range(30, HEIGHT - 10, 34):
+        x = 10
+        while x < WIDTH - 60:
+            size, font = rng.uniform(0.35, 1.3), int(rng.choice([0, 2, 3, 4, 5, 6, 7]))
+            stroke, word = max(1, round(rng.uniform(1, 4) * size)), "".join(rng.choice(letters, 5))
+            cv2.putText(ink, word, (x * SUPER, y * SUPER), font, size * SUPER, 255, stroke * SUPER)
+            x += int(1.05 * cv2.getTextSize(word, font, size, stroke)[0][0]) + 8
+    found = find_targets(exposed(ink, rng), codes=codes, min_diameter_px=4)
+    assert len(found.rejected_xy) > 500
+    assert (found.code < 0).all()
+
+
+def test_an_arc_does_not_take_the_dot_away() -> None:
+    """Three arcs about a dot, seen so that an arc looks like an ellipse."""
+    family = code_family("arcs")
+    assert family is not None
+    places = np.array([(-24.0, -15), (23, -14), (-23, 15), (22, 16)])
+    marks = [
+        coded_ring(0, at, 2.4, n, family, 0.05, turn=0.3 * n)
+        for at, n in zip(places, (1, 2, 3, 4), strict=True)
+    ]
+    sheet = Faces(
+        np.zeros((1, 3)), np.array([[[1.0, 0, 0], [0, 1, 0]]]), np.array([[40.0, 30.0]]), np.array([0.8]),
+        np.zeros(1), np.ones(1),
+    )  # fmt: skip
+    targets = CircularTargets(np.zeros(4, dtype=int), places, np.full(4, 2.4), np.arange(1, 5))
+    scene = Scene(sheet, join_marks(marks), targets, background=0.8)
+    camera = camera_from_values("test", "brown", (320, 240), (0.01, 0.01), c_mm=4.0)
+    R = rotation_from_angles(np.radians(20), np.radians(10), np.radians(70))
+    photograph, truth = render_photograph(
+        scene, camera, R @ [0.0, 0.0, 180.0], R, optics=Optics(noise=0.005), rng=np.random.default_rng(1)
+    )
+    found = find_targets(photograph, codes=family, min_diameter_px=5)
+    assert sorted(found.code.tolist()) == [1, 2, 3, 4]
+    assert np.hypot(*(found.xy[np.argsort(found.code)] - truth.outline_centre).T).max() < 0.05
