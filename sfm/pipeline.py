@@ -12,16 +12,16 @@ from pathlib import Path
 
 import numpy as np
 
-from sfm.analysis.comparison import AdjusterComparison, BackendAdjustment, compare_adjusters
-from sfm.network import Estimate, Network, empty_estimate
-from sfm.orientation.sequence import orient
+from sfm.analysis.comparison import BackendAdjustment, compare_adjusters
+from sfm.network import Estimate, Network
 from sfm.pipeline_texture import run_textured_survey
 from sfm.progress import SILENT, Progress, StageClock
 from sfm.project import Survey
 from sfm.report.result import FailedImage, StageTime, SurveyResult
 from sfm.survey_circles import check_circles
 from sfm.survey_network import build_network, codes_of, min_rays, name_coded
-from sfm.survey_solution import Solution, match_and_adjust, refine, solve
+from sfm.survey_orientation import orient_photographs, orient_survey
+from sfm.survey_solution import match_and_adjust, solve
 from sfm.survey_start import find_photographs, network_from_observations
 from sfm.survey_targets import measure_photographs
 from sfm.targets.store import TargetStore
@@ -62,14 +62,14 @@ def run_survey(
     with clock.stage("orientation"):
         naming = name_coded(photographs)
         network = build_network(survey, photographs, naming)
-        start = orient(network, empty_estimate(network, photographs.cameras), refine=refine)
+        start = orient_photographs(survey, network, files, photographs)
     with clock.stage("matching"):
         naming, network, estimate = match_and_adjust(survey, photographs, naming, start)
         circles = check_circles(survey, photographs, naming, network, estimate)
     with clock.stage("adjustment"):
         solution = solve(survey, circles.network, circles.estimate, min_rays=min_rays(naming))
     with clock.stage("comparison"):
-        comparison = _compare(solution, backend)
+        comparison = compare_adjusters(solution.adjustment, backend) if backend else None
     return SurveyResult(
         survey=survey.name,
         unit=survey.unit,
@@ -80,7 +80,7 @@ def run_survey(
         comparison=comparison,
         photographs=photographs.overlays(),
         control_check=solution.control_check,
-        warnings=solution.warnings,
+        warnings=start.warnings + solution.warnings,
         eccentricity=circles.eccentricity,
         no_circles=circles.no_circles,
         seconds=tuple(StageTime(*one) for one in clock.seconds),
@@ -90,18 +90,15 @@ def run_survey(
 def adjust_survey(
     survey: Survey, *, backend: Backend | None = None, progress: Progress = SILENT
 ) -> SurveyResult:
-    """Run the part of a survey that comes after the photographs, on its [observations].
-
-    Args, Raises: as `run_survey`.
-    """
+    """Run what comes after the photographs on a survey's [observations]; Args, Raises: as `run_survey`."""
     clock = StageClock(progress)
     network, estimate = network_from_observations(survey)
     with clock.stage("orientation"):
-        start = orient(network, estimate, refine=refine)
+        start = orient_survey(survey, network, estimate)
     with clock.stage("adjustment"):
         solution = solve(survey, network, start.estimate)
     with clock.stage("comparison"):
-        comparison = _compare(solution, backend)
+        comparison = compare_adjusters(solution.adjustment, backend) if backend else None
     return SurveyResult(
         survey=survey.name,
         unit=survey.unit,
@@ -111,13 +108,9 @@ def adjust_survey(
         code=np.full(len(solution.adjustment.network.points), -1),
         comparison=comparison,
         control_check=solution.control_check,
-        warnings=solution.warnings,
+        warnings=start.warnings + solution.warnings,
         seconds=tuple(StageTime(*one) for one in clock.seconds),
     )
-
-
-def _compare(solution: Solution, backend: Backend | None) -> AdjusterComparison | None:
-    return None if backend is None else compare_adjusters(solution.adjustment, backend)
 
 
 def _failed(*failures: tuple[tuple[str, str], ...]) -> tuple[FailedImage, ...]:

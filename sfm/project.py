@@ -298,6 +298,12 @@ def _refuse_contradictions(survey: Survey) -> None:
                 raise SurveyFileError(
                     f"{at}: model {camera.model} has no parameter '{parameter}', it has {', '.join(known)}"
                 )
+        for parameter in camera.free:
+            if camera.free.count(parameter) > 1:
+                raise SurveyFileError(
+                    f"{at}: parameter '{parameter}' stands {camera.free.count(parameter)} "
+                    "times in free, once is needed"
+                )
         for parameter, _ in camera.fixed:
             if parameter in camera.free:
                 raise SurveyFileError(f"{at}: parameter '{parameter}' is both free and fixed")
@@ -354,6 +360,8 @@ def _one_line(path: Path, text: str, error: ValidationError) -> str:
         return f"{where}unknown key '{location[-1]}' in {inside}, known are {_known(location[:-1])}"
     if kind == "missing":
         return f"{where}{key} is missing"
+    if kind == "tuple_type" and len(location) == 1 and isinstance(first["input"], dict):
+        return f"{where}found [{key}], needed [[{key}]] in double brackets, since there may be several"
     needed = dict(_NEEDED).get(kind)
     if kind == "literal_error":
         needed = f"one of {context['expected']}"

@@ -185,7 +185,7 @@ def network_from_observations(survey: Survey) -> tuple[Network, Estimate]:
     network = Network(
         images, owner, points, ImagePoints(image, point, xy, covariance), control=control, scale_bars=bars
     )
-    return network, _approximate(survey, network, cameras)
+    return network, approximate_values(survey, network, cameras, images)
 
 
 def control_points(survey: Survey, points: tuple[str, ...]) -> tuple[ObjectPoints, tuple[str, ...]]:
@@ -278,8 +278,20 @@ def _refuse_far_outside(
         )
 
 
-def _approximate(survey: Survey, network: Network, cameras: tuple[Camera, ...]) -> Estimate:
-    """Return start values from [approximate] and the control; NaN for what nothing is said about."""
+def approximate_values(
+    survey: Survey, network: Network, cameras: tuple[Camera, ...], images: tuple[str, ...]
+) -> Estimate:
+    """Return start values from [approximate] and the control; NaN for what nothing is said about.
+
+    Args:
+        survey: names the tables, and whether the control holds.
+        network: photographs and points that get their values by name.
+        cameras: with their start values.
+        images: all photographs of the survey, also those that could not be read.
+
+    Raises:
+        SurveyFileError: a table is unreadable or names a photograph that is none of the survey's.
+    """
     m, n = len(network.images), len(network.points)
     position, rotation = np.full((m, 3), np.nan), np.full((m, 3, 3), np.nan)
     points = np.full((n, 3), np.nan)
@@ -287,9 +299,10 @@ def _approximate(survey: Survey, network: Network, cameras: tuple[Camera, ...]) 
         path = survey.beside(survey.approximate.images)
         exterior = read_exterior(path)
         for name, line in zip(exterior.names, exterior.line.tolist(), strict=True):
-            if name not in network.images:
+            if name not in images:
+                lacks = "has no observations" if survey.observations else "is no photograph of the survey"
                 raise SurveyFileError(
-                    f"{path}, line {line}: image '{name}' has no observations; correct the name or remove it"
+                    f"{path}, line {line}: image '{name}' {lacks}; correct the name or remove it"
                 )
         row = {name: k for k, name in enumerate(exterior.names)}
         for i, name in enumerate(network.images):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor, as_completed
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,7 +19,7 @@ from sfm.survey_start import PhotographList, start_cameras
 from sfm.targets.codes import CodeFamily, code_family
 from sfm.targets.detect import Targets, find_targets
 from sfm.targets.photograph import Metadata, read_metadata, read_photograph
-from sfm.targets.store import TargetStore, target_key
+from sfm.targets.store import TargetStore, content_hash, target_key
 
 MIN_PHOTOGRAPHS = 2
 
@@ -54,7 +55,8 @@ def measure_photographs(
 ) -> MeasuredPhotographs:
     """Read the photographs, find, measure and decode their targets.
 
-    A photograph that cannot be read does not stop the others; it is named with the reason.
+    A photograph that cannot be read does not stop the others; it is named with the reason, as is one whose
+    file is a copy of another.
 
     Args:
         survey: says what the targets look like and what is known of the cameras.
@@ -71,23 +73,30 @@ def measure_photographs(
     family = code_family(survey.codes)
     found: dict[int, tuple[Metadata, Targets]] = {}
     failed: dict[int, FailedImage] = {}
+    originals: list[int] = []
+    for k, first in enumerate(find_copies(photographs)):
+        if first == k:
+            originals.append(k)
+        else:
+            reason = f"identical to {photographs.names[first]}"
+            failed[k] = FailedImage(photographs.names[k], reason)
+            progress.advance(photographs.names[k])
     with ThreadPoolExecutor(max_workers=max(1, jobs)) as pool:
         running = {
-            pool.submit(_read_and_measure, path, survey.targets, family, store): k
-            for k, path in enumerate(photographs.paths)
+            pool.submit(_read_and_measure, photographs.paths[k], survey.targets, family, store): k
+            for k in originals
         }
         for done in as_completed(running):
             k = running[done]
             try:
                 found[k] = done.result()
             except PhotographError as error:
-                failed[k] = FailedImage(photographs.names[k], str(error))
+                failed[k] = FailedImage(photographs.names[k], why_failed(error, photographs.paths[k]))
             progress.advance(photographs.names[k])
     if len(found) < MIN_PHOTOGRAPHS:
-        first = next(iter(failed.values()), None)
-        why = f" ({first.reason})" if first else ""
+        why = "".join(f" ({failed[k].image}: {failed[k].reason})" for k in sorted(failed)[:1])
         raise GeometryError(
-            f"survey {survey.name}: {len(found)} readable photographs, "
+            f"survey {survey.name}: {len(found)} readable photograph{'' if len(found) == 1 else 's'}, "
             f"at least {MIN_PHOTOGRAPHS} are needed{why}"
         )
     order = sorted(found)
@@ -103,10 +112,31 @@ def measure_photographs(
     )
 
 
+def find_copies(photographs: PhotographList) -> tuple[int, ...]:
+    """Return for every photograph the first one whose file has the same bytes, itself where there is none.
+
+    A copy is no second observation: it would only make the result look more precise than it is.
+    """
+    first = list(range(len(photographs)))
+    seen: dict[tuple[int, str], int] = {}
+    sizes = [path.stat().st_size if path.is_file() else 0 for path in photographs.paths]
+    for k, path in enumerate(photographs.paths):
+        if sizes[k] and sizes.count(sizes[k]) > 1:
+            with suppress(PhotographError):  # what cannot be read is said where it is measured
+                first[k] = seen.setdefault((sizes[k], content_hash(path)), k)
+    return tuple(first)
+
+
 def _read_and_measure(
     path: Path, settings: TargetSettings, family: CodeFamily | None, store: TargetStore | None
 ) -> tuple[Metadata, Targets]:
-    return read_metadata(path), measure_photograph(path, settings, family, store)[0]
+    targets, _ = measure_photograph(path, settings, family, store)  # says best what is wrong with a file
+    return read_metadata(path), targets
+
+
+def why_failed(error: PhotographError, path: Path) -> str:
+    """Return why a photograph cannot be read, without its name, which stands beside the reason."""
+    return str(error).removeprefix(f"{path.name}: ")
 
 
 def measure_photograph(

@@ -182,6 +182,74 @@ def test_start_from_given_values():
     np.testing.assert_allclose(result.estimate.points, truth.points, atol=0.02)
 
 
+def test_control_without_coordinates_is_intersected():
+    network, truth = make_network(seed_of("free control"), images=8, points=40, free=())
+    ids = np.array([0, 5, 11, 17])
+    control = ObjectPoints(ids, 3 * truth.points[ids] + 10.0, np.zeros((4, 3, 3)))  # of another frame
+    start = replace(unknown(truth), position=truth.position, rotation=truth.rotation)
+    result = orient(replace(network, control=control), start)
+    assert result.kind == "given" and result.warnings == ()
+    assert result.estimate.determined.all() and result.fits.all()
+
+
+@pytest.mark.parametrize("what", ["one photograph", "wrong photographs", "wrong points"])
+def test_given_values_of_no_use_are_put_aside(what):
+    network, truth = make_network(seed_of("no use"), images=8, points=40, visibility=0.8, free=())
+    start = unknown(truth)
+    position, rotation, points = start.position.copy(), start.rotation.copy(), start.points.copy()
+    if what == "one photograph":
+        position[0], rotation[0] = truth.position[0], truth.rotation[0]
+    elif what == "wrong photographs":
+        position, rotation = np.roll(truth.position, 1, axis=0), np.roll(truth.rotation, 3, axis=0)
+    else:
+        points[:12] = seed_of("wrong points").uniform(-1, 1, (12, 3))
+    start = replace(start, position=position, rotation=rotation, points=points)
+    result = orient(network, start)
+    assert result.failures == () and result.fits.all()
+    assert len(result.warnings) == 1 and "given approximate values were not used" in result.warnings[0]
+    position_error, point_error = misfit(result, truth)
+    assert position_error < 0.02 and point_error < 0.005
+
+
+def test_a_photograph_that_fits_four_points_only_is_let_go():
+    network, truth = make_network(seed_of("stranger"), images=8, points=40, free=())
+    seen = network.image_points
+    own = np.flatnonzero(seen.image == 4)
+    point, xy = seen.point.copy(), seen.xy.copy()
+    n, strange = len(network.points), own[4:24]
+    point[strange] = n + np.arange(len(strange))  # names that no other photograph knows
+    keep = np.ones(len(seen), dtype=bool)
+    keep[own[24:]] = False
+    names = (*network.points, *(f"strange {k}" for k in range(len(strange))))
+    moved = replace(seen, point=point, xy=xy).select(keep)
+    start = replace(unknown(truth), points=np.full((len(names), 3), np.nan))
+    result = orient(replace(network, points=names, image_points=moved), start)
+    (failure,) = result.failures
+    assert failure[0] == network.images[4]
+    assert "4 of its points fit the network" in failure[1] and "contradict it" in failure[1]
+
+
+def test_points_outside_the_network_do_not_speak_against_a_photograph():
+    """A photograph at the edge of a survey sees more that is its own than it has in common."""
+    network, truth = make_network(seed_of("edge"), images=8, points=40, free=())
+    seen = network.image_points
+    own = np.flatnonzero(seen.image == 4)
+    inner = own[np.argsort(np.linalg.norm(seen.xy[own] - seen.xy[own].mean(0), axis=1))]
+    shared = np.zeros(len(network.points), dtype=bool)
+    shared[seen.point[inner[:14]]] = True
+    alone = (seen.image == 4) & ~shared[seen.point]
+    point = seen.point.copy()
+    n = len(network.points)
+    point[alone] = n + np.arange(alone.sum())
+    names = (*network.points, *(f"alone {k}" for k in range(int(alone.sum()))))
+    keep = shared[seen.point] | alone
+    assert alone.sum() > shared.sum()
+    start = replace(unknown(truth), points=np.full((len(names), 3), np.nan))
+    moved = replace(seen, point=point).select(keep)
+    result = orient(replace(network, points=names, image_points=moved), start)
+    assert result.failures == ()
+
+
 def test_refusals():
     network, truth = make_network(seed_of("refused"), images=4, points=20, free=())
     few = network.image_points.point < 3

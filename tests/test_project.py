@@ -386,3 +386,15 @@ def test_images_belong_to_the_camera_whose_glob_they_match(tmp_path: Path) -> No
         camera_of_image(survey, "ab")
     with pytest.raises(SurveyFileError, match="'c' matches the glob of no camera"):
         camera_of_image(survey, "c")
+
+
+def test_single_brackets_of_a_camera_are_explained(tmp_path: Path) -> None:
+    path = write(tmp_path, MINIMAL.replace("[[camera]]", "[camera]"))
+    with pytest.raises(SurveyFileError, match=r"found \[camera\], needed \[\[camera\]\] in double brackets"):
+        read_survey(path)
+
+
+def test_a_parameter_is_free_once(tmp_path: Path) -> None:
+    text = FULL.replace('free = ["c",', 'free = ["c","c",')
+    with pytest.raises(SurveyFileError, match=r"camera olympus: parameter 'c' stands 2 times in free"):
+        read_survey(write(tmp_path, text))

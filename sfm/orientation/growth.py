@@ -10,10 +10,11 @@ import numpy as np
 from sfm.camera import Camera, project, tangents_from_pixel
 from sfm.conventions import FloatArray
 from sfm.errors import GeometryError
-from sfm.network import Estimate, Network, reduce_network
+from sfm.network import Estimate, Network, empty_estimate, reduce_network
 from sfm.orientation.intersection import intersect
-from sfm.orientation.resection.robust import resect_robust
+from sfm.orientation.resection.robust import fewest_fitting, resect_robust
 from sfm.orientation.start import Start, best_start
+from sfm.orientation.support import photograph_support
 
 FIRST_ADJUSTMENT = 4  # photographs
 MIN_ANGLE_DEG = 2.0  # smallest ray angle of a point that others are oriented on
@@ -40,11 +41,13 @@ class Growth:
         self.start_tolerance_px = tolerance_px
         self.min_points = min_points
         self.reasons: dict[int, str] = {}  # why a photograph is not oriented
+        self.dropped = np.zeros(len(network.images), dtype=bool)  # does not belong, (m,)
         area = [np.prod(camera.size_px) / camera.c_px**2 for camera in estimate.cameras]
         self.field = np.array(area)[network.camera]  # area of each photograph, squared tangents, (m,)
-        points = network.control.point
+        control = network.control
+        # control that the estimate does not hold to its coordinates is intersected like any other point
         self.fixed = np.zeros(len(network.points), dtype=bool)
-        self.fixed[points] = True
+        self.fixed[control.point] = (estimate.points[control.point] == control.xyz).all(axis=1)
         self.adjusted = np.zeros(0, dtype=bool)  # image points of the last adjustment, (k,)
 
     # --- views of the measured image points --------------------------------------------------------
@@ -71,34 +74,34 @@ class Growth:
     # --- steps -------------------------------------------------------------------------------------
 
     def begin(self) -> Start:
-        """Find a start and take it over."""
+        """Find a start and take it over.
+
+        Raises:
+            GeometryError: nothing orients two photographs; with given values these are not enough.
+        """
         network, control = self.network, self.network.control
-        if self.estimate.oriented.any() or self.estimate.determined.any():
-            kind = "given"
-        elif len(control) >= 3:
-            kind = "control"
-            points = self.estimate.points.copy()
-            points[control.point] = control.xyz
-            self.estimate = replace(self.estimate, points=points)
-        else:
-            kind = ""
-        if kind:
+        given = has_given_values(network, self.estimate)
+        if given or len(control) >= 3:
+            if not given:
+                points = self.estimate.points.copy()
+                points[control.point] = control.xyz
+                self.fixed[control.point] = True
+                self.estimate = replace(self.estimate, points=points)
             self.resect_all(only_new=True)
-            if self.estimate.oriented.any():
-                self.intersect()
-                if self.estimate.oriented.sum() >= 2 or kind == "given":
-                    return Start(
-                        None, kind, self.estimate.position, self.estimate.rotation, self.estimate.points
-                    )
-            # too little of it in any photograph: a free start, brought onto control when there is enough
-            nan = np.full_like(self.estimate.points, np.nan)
-            self.estimate = Estimate(
-                self.estimate.cameras,
-                np.full_like(self.estimate.position, np.nan),
-                np.full_like(self.estimate.rotation, np.nan),
-                nan,
-            )
-            self.fixed[:] = False
+            self.intersect()
+            oriented = int(self.estimate.oriented.sum())
+            if oriented >= 2:
+                now = self.estimate
+                kind = "given" if given else "control"
+                return Start(None, kind, now.position, now.rotation, now.points)
+            if given:
+                raise GeometryError(
+                    f"orientation: the given approximate values orient {oriented} of {len(network.images)} "
+                    "photographs, at least 2 are needed"
+                )
+        # no control or too little of it in any photograph: a free start, later brought onto control
+        self.estimate = empty_estimate(network, self.estimate.cameras)
+        self.fixed[:] = False
         start = best_start(network, self.tangents(), self.tolerance(), seed=self.seed)
         self.estimate = replace(
             self.estimate, position=start.position, rotation=start.rotation, points=start.points
@@ -128,8 +131,8 @@ class Growth:
 
     def resect_all(self, *, only_new: bool = False) -> None:
         """Resect the photographs anew on the present points; oriented ones keep what fits better."""
-        oriented = self.estimate.oriented
-        self._resect([i for i in range(len(self.network.images)) if not (only_new and oriented[i])])
+        left_out = self.dropped | (self.estimate.oriented if only_new else False)
+        self._resect(np.flatnonzero(~left_out).tolist())
 
     def _resect(self, images: list[int]) -> int:
         uv, tolerance = self.tangents(), self.tolerance()
@@ -229,6 +232,45 @@ class Growth:
             self.estimate = candidate
         return True
 
+    def drop_unsupported(self) -> int:
+        """Let go the photographs that the others do not hold up, the worst first; return how many.
+
+        Points that rested on them are intersected anew from the others, or are gone.
+        """
+        seen = self.network.image_points
+        limit = self.tolerance_px[self.network.camera[seen.image]]
+        tolerance = self.tolerance()
+        while self.estimate.oriented.any():
+            found = photograph_support(self.network, self.estimate, self.residuals_px(), limit, self.fixed)
+            needed = np.array(
+                [
+                    fewest_fitting(int(n), tolerance[i], self.field[i], minimum=self.min_points)
+                    for i, n in enumerate(found.known)
+                ]
+            )
+            few = found.fitting < needed
+            weak = np.flatnonzero(self.estimate.oriented & (few | found.doubtful))
+            if not len(weak):
+                break
+            share = found.fitting / np.maximum(found.fitting + found.against, 1)
+            i = int(weak[np.argmin(share[weak])])
+            if few[i]:
+                reason = (
+                    f"only {found.fitting[i]} of its {found.known[i]} points fit the network, "
+                    f"{needed[i]} are needed"
+                )
+            else:
+                reason = (
+                    f"{found.confirmed[i]} of its points fit the network, {found.against[i]} contradict it: "
+                    "another object, a mirrored picture or wrong codes"
+                )
+            position, rotation = self.estimate.position.copy(), self.estimate.rotation.copy()
+            position[i], rotation[i] = np.nan, np.nan
+            self.estimate = replace(self.estimate, position=position, rotation=rotation)
+            self.dropped[i], self.reasons[i] = True, reason
+            self.intersect()
+        return int(self.dropped.sum())
+
     def adapt_tolerance(self, final_px: float) -> None:
         """Let the tolerance of each camera follow the spread of its residuals."""
         camera = self.network.camera[self.network.image_points.image]
@@ -242,6 +284,14 @@ class Growth:
                     TOLERANCE_FACTOR * spread, final_px, self.start_tolerance_px[index]
                 )
         self.tolerance_px = tolerance
+
+
+def has_given_values(network: Network, estimate: Estimate) -> bool:
+    """Return whether an estimate holds more than cameras and the coordinates of control."""
+    control = network.control
+    other = estimate.determined
+    other[control.point] &= (estimate.points[control.point] != control.xyz).any(axis=1)
+    return bool(estimate.oriented.any() or other.any())
 
 
 def residual_lengths(network: Network, estimate: Estimate) -> FloatArray:

@@ -4,7 +4,8 @@ The start is control or given approximate values where there are some, else the 
 whose model most other photographs can be resected on. Planar pairs have two solutions; the one
 is taken that the other photographs confirm. After that: resection of every photograph that sees enough
 points, intersection of all points, and adjustment by a function of the caller, so that the interior
-orientation is learnt while the network grows.
+orientation is learnt while the network grows. At last photographs that the others contradict leave. Given
+values that lead nowhere are put aside for a start without them.
 """
 
 from __future__ import annotations
@@ -16,9 +17,8 @@ import numpy as np
 from sfm.camera import Camera
 from sfm.conventions import BoolArray, FloatArray
 from sfm.errors import GeometryError
-from sfm.network import Estimate, Network
-from sfm.orientation.growth import FIRST_ADJUSTMENT, Growth, Refine
-from sfm.orientation.resection.robust import fewest_fitting
+from sfm.network import Estimate, Network, empty_estimate
+from sfm.orientation.growth import FIRST_ADJUSTMENT, Growth, Refine, has_given_values
 from sfm.orientation.start import Start
 from sfm.similarity import fit_similarity
 
@@ -41,6 +41,7 @@ class Orientation:
     fits: BoolArray  # image points within the tolerance, (k,)
     rms_px: float  # over these, per coordinate, px
     tolerance_px: FloatArray  # last tolerance of each camera, px, one per camera
+    warnings: tuple[str, ...] = ()  # one line each: given values that were of no use
 
 
 def orient(
@@ -67,11 +68,51 @@ def orient(
         min_points: points that a photograph must share with the network, at least 4.
 
     Raises:
-        GeometryError: no two photographs could be oriented.
+        GeometryError: no two photographs could be oriented, with the given values or without them.
     """
-    cameras = estimate.cameras
-    diagonal = np.array([np.hypot(*camera.size_px) for camera in cameras])
-    growth = Growth(network, estimate, seed, start_tolerance * diagonal, max(min_points, MIN_POINTS))
+
+    def grow(values: Estimate) -> Orientation:
+        cameras = values.cameras
+        diagonal = np.array([np.hypot(*camera.size_px) for camera in cameras])
+        growth = Growth(network, values, seed, start_tolerance * diagonal, max(min_points, MIN_POINTS))
+        return _grown(growth, refine, final_tolerance_px)
+
+    if not has_given_values(network, estimate):
+        return grow(estimate)
+    try:
+        with_given = grow(estimate)
+    except GeometryError:
+        with_given = None
+    if with_given is not None and not with_given.failures and _holds_control(network, with_given):
+        return with_given
+    try:
+        without = grow(empty_estimate(network, estimate.cameras))
+    except GeometryError as error:
+        if with_given is not None:
+            return with_given
+        raise GeometryError(f"{error}, neither from the given approximate values nor without them") from error
+    before = 0 if with_given is None else int(with_given.estimate.oriented.sum())
+    now = int(without.estimate.oriented.sum())
+    if with_given is not None:
+        better = (now, _holds_control(network, without)) > (before, _holds_control(network, with_given))
+        if not better:
+            return with_given
+    found = f"{before} of the {now} photographs that can be oriented without them"
+    warning = "the given approximate values were not used: "
+    warning += f"they orient {found}" if before < now else "they contradict the control"
+    return replace(without, warnings=(warning,))
+
+
+def _holds_control(network: Network, found: Orientation) -> bool:
+    """Return whether every control point that is measured fits in some photograph."""
+    control, seen = network.control, network.image_points
+    measured = np.isin(control.point, seen.point[found.estimate.oriented[seen.image]])
+    return bool(np.isin(control.point[measured], seen.point[found.fits]).all())
+
+
+def _grown(growth: Growth, refine: Refine | None, final_tolerance_px: float) -> Orientation:
+    """Start, resect and intersect until nothing more comes, and let go what does not belong."""
+    cameras = growth.estimate.cameras
     start = growth.begin()
     adjusted = 0
     for _ in range(MAX_ROUNDS):
@@ -85,41 +126,29 @@ def orient(
             adjusted = now
         elif not added:
             break
+    _settled(growth, refine, final_tolerance_px)
+    if growth.drop_unsupported():
+        _settled(growth, refine, final_tolerance_px)
+        growth.drop_unsupported()
+    return _finish(growth, start, cameras)
+
+
+def _settled(growth: Growth, refine: Refine | None, final_tolerance_px: float) -> None:
+    """Resect, intersect and adjust all that is oriented until no image point comes or goes."""
     for _ in range(FINAL_ROUNDS):
         growth.adapt_tolerance(final_tolerance_px)
         growth.resect_all()
         growth.intersect()
         if not growth.refined(refine):
             break
-    return _finish(growth, start, cameras)
 
 
 def _finish(growth: Growth, start: Start, cameras: tuple[Camera, ...]) -> Orientation:
-    """Bring the network onto control if it started free, drop what does not hold, and report."""
+    """Bring the network onto control if it started free, and report."""
     network, control = growth.network, growth.network.control
     seen = network.image_points
     residuals = growth.residuals_px()
     fits = residuals <= growth.tolerance_px[network.camera[seen.image]]
-    count = np.bincount(seen.image[fits], minlength=len(network.images))
-    known = growth.estimate.determined[seen.point]
-    total = np.bincount(seen.image[known], minlength=len(network.images))
-    tolerance = growth.tolerance()
-    needed = [
-        fewest_fitting(int(n), tolerance[i], growth.field[i], minimum=growth.min_points)
-        for i, n in enumerate(total)
-    ]
-    weak = growth.estimate.oriented & (count < needed)
-    for i in np.flatnonzero(weak).tolist():
-        growth.reasons[i] = (
-            f"only {count[i]} of its {total[i]} points fit the network, {needed[i]} are needed"
-        )
-    drop = weak[:, None]
-    growth.estimate = replace(
-        growth.estimate,
-        position=np.where(drop, np.nan, growth.estimate.position),
-        rotation=np.where(drop[:, :, None], np.nan, growth.estimate.rotation),
-    )
-    fits &= ~weak[seen.image]
     if growth.estimate.oriented.sum() < 2:
         raise GeometryError(
             f"orientation: {growth.estimate.oriented.sum()} of {len(network.images)} photographs could be "

@@ -82,18 +82,26 @@ def target_key(path: Path, settings: str, family: CodeFamily | None) -> str:
     Raises:
         PhotographError: the photograph cannot be read.
     """
-    try:
-        with path.open("rb") as file:
-            photograph = hashlib.file_digest(file, "sha256").hexdigest()
-    except OSError as error:
-        why = f"no such file in {path.parent}" if not path.exists() else error.strerror
-        raise PhotographError(f"{path.name}: {why}") from error
     codes = "none"
     if family is not None:
         table = family.number.tobytes() + family.pattern.tobytes()
         codes = f"{family.cells} {family.inner} {family.outer} {hashlib.sha256(table).hexdigest()}"
-    parts = (photograph, settings, codes, _code_version())
+    parts = (content_hash(path), settings, codes, _code_version())
     return hashlib.sha256("\0".join(parts).encode()).hexdigest()
+
+
+def content_hash(path: Path) -> str:
+    """Return the SHA-256 of a photograph's file.
+
+    Raises:
+        PhotographError: the photograph cannot be read.
+    """
+    try:
+        with path.open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError as error:
+        why = f"no such file in {path.parent}" if not path.exists() else error.strerror
+        raise PhotographError(f"{path.name}: {why}") from error
 
 
 @cache

@@ -1,0 +1,82 @@
+"""Which photographs of a network are held up by the others, and which only happen to fit a few points."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import ConvexHull, QhullError
+
+from sfm.camera import project
+from sfm.conventions import BoolArray, FloatArray, IntArray
+from sfm.network import Estimate, Network
+
+
+@dataclass(frozen=True)
+class Support:
+    """What speaks for and against the orientation of every photograph."""
+
+    fitting: IntArray  # image points within the tolerance, (m,)
+    known: IntArray  # image points of determined points, (m,)
+    confirmed: IntArray  # fitting image points whose object point does not rest on this photograph, (m,)
+    against: (
+        IntArray  # image points that lie elsewhere, or in the midst of points that should know them, (m,)
+    )
+
+    @property
+    def doubtful(self) -> BoolArray:
+        """Photographs of whose image points fewer than half are where the network says, (m,).
+
+        Source: Rousseeuw (1984), J. Am. Stat. Assoc. 79: no estimate can be told from its contrary if
+        more than half of what it rests on contradicts it.
+        """
+        return np.asarray(self.confirmed < self.against)
+
+
+def photograph_support(
+    network: Network, estimate: Estimate, residuals_px: FloatArray, limit_px: FloatArray, fixed: BoolArray
+) -> Support:
+    """Count the image points of each photograph that speak for its orientation, and those against it.
+
+    A point that this photograph and one other see was intersected from the two and fits both by itself, so
+    it confirms nothing. An image point in the midst of the network that has no place in it contradicts: a
+    mirrored photograph fits, seen from behind, the few coplanar codes that a mirror leaves as they are, and
+    all its other codes nobody else has seen. Outside the network nothing is expected of the others.
+
+    Args:
+        network, estimate: m photographs, n points, k image points.
+        residuals_px: lengths, inf where undetermined, px, (k,).
+        limit_px: largest residual of a fitting image point, px, (k,).
+        fixed: points known from elsewhere than the photographs, (n,).
+    """
+    seen, m = network.image_points, len(network.images)
+    fits = residuals_px <= limit_px
+    rays = np.bincount(seen.point[fits], minlength=len(network.points))
+    known = estimate.determined[seen.point] & estimate.oriented[seen.image]
+    confirmed = fits & ((rays[seen.point] >= 3) | fixed[seen.point])
+    against = ~fits & (known | _amidst(network, estimate))
+    return Support(*(_count(rows, seen.image, m) for rows in (fits, known, confirmed, against)))
+
+
+def _amidst(network: Network, estimate: Estimate) -> BoolArray:
+    """Return which image points lie in the convex hull of the network as their photograph shows it, (k,)."""
+    seen = network.image_points
+    out = np.zeros(len(seen), dtype=bool)
+    points = estimate.points[estimate.determined]
+    for i in np.flatnonzero(estimate.oriented):
+        camera = estimate.cameras[network.camera[i]]
+        xy = project(camera, estimate.position[i], estimate.rotation[i], points)
+        xy = xy[((xy >= 0) & (xy < camera.size_px)).all(axis=1)]
+        own = np.flatnonzero(seen.image == i)
+        if len(xy) < 3 or not len(own):
+            continue
+        try:
+            lines = ConvexHull(xy).equations
+        except QhullError:  # all on one line
+            continue
+        out[own] = (seen.xy[own] @ lines[:, :2].T + lines[:, 2] <= 0).all(axis=1)
+    return out
+
+
+def _count(rows: BoolArray, image: IntArray, m: int) -> IntArray:
+    return np.bincount(image[rows], minlength=m)

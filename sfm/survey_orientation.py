@@ -1,0 +1,82 @@
+"""The orientation of a survey, and what its person must know where there is none."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from sfm.errors import GeometryError
+from sfm.network import Estimate, Network
+from sfm.orientation.sequence import MIN_POINTS, Orientation, orient
+from sfm.project import Survey
+from sfm.survey_solution import refine
+from sfm.survey_start import PhotographList, approximate_values
+from sfm.survey_targets import MeasuredPhotographs
+
+
+def orient_photographs(
+    survey: Survey, network: Network, files: PhotographList, photographs: MeasuredPhotographs
+) -> Orientation:
+    """Return approximate values of a network of measured targets.
+
+    Args:
+        survey: gives approximate values, if any; a failure names its settings.
+        network: all targets that have a name.
+        files: all photographs of the survey.
+        photographs: those that the targets were measured in.
+
+    Raises:
+        GeometryError: no two photographs could be oriented.
+        SurveyFileError: [approximate] names photographs that are none of the survey's.
+    """
+    estimate = approximate_values(survey, network, photographs.cameras, files.names)
+    try:
+        return orient_survey(survey, network, estimate)
+    except GeometryError as error:
+        if _most_in_common(network) >= MIN_POINTS:
+            raise
+        raise GeometryError(f"survey {survey.name}: {_codes_found(survey, photographs)}") from error
+
+
+def orient_survey(survey: Survey, network: Network, estimate: Estimate) -> Orientation:
+    """Return approximate values of a survey's network.
+
+    Args:
+        survey: says whether approximate values were given.
+        network: all image points that have a name.
+        estimate: cameras, and what [approximate] and the control tell.
+
+    Raises:
+        GeometryError: no two photographs could be oriented.
+    """
+    try:
+        found = orient(network, estimate, refine=refine)
+    except GeometryError as error:
+        given = survey.approximate.images is not None or survey.approximate.points is not None
+        hint = " (correct or complete [approximate], or leave it out)" if given else ""
+        raise GeometryError(f"survey {survey.name}: {error}{hint}") from error
+    return replace(found, warnings=tuple(f"[approximate]: {line}" for line in found.warnings))
+
+
+def _most_in_common(network: Network) -> int:
+    """Return how many points the two photographs with most in common share."""
+    sees = np.zeros((len(network.images), len(network.points)), dtype=np.int64)
+    sees[network.image_points.image, network.image_points.point] = 1
+    common = sees @ sees.T
+    np.fill_diagonal(common, 0)
+    return int(common.max(initial=0))
+
+
+def _codes_found(survey: Survey, photographs: MeasuredPhotographs) -> str:
+    """Say how many targets and codes were found where more codes were needed, and what decides on that."""
+    targets = [len(found) for found in photographs.targets]
+    codes = [int((found.code >= 0).sum()) for found in photographs.targets]
+    with_codes = sum(count > 0 for count in codes)
+    settings = survey.targets
+    return (
+        f"no two photographs have {MIN_POINTS} coded targets in common, which their orientation needs: "
+        f"{sum(targets)} targets were found in {len(targets)} photographs, {sum(codes)} codes were read in "
+        f"{with_codes} of them; check in [targets] codes = '{settings.codes}', "
+        f"polarity = '{settings.polarity}' and min_diameter_px = {settings.min_diameter_px:g}"
+    )
