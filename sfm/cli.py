@@ -5,39 +5,34 @@ from __future__ import annotations
 import os
 import re
 import sys
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 from rich.console import Console
-from rich.table import Table
-from rich.text import Text
 from threadpoolctl import threadpool_limits
 
 from sfm.batch import find_surveys, run_batch
 from sfm.batch_survey import Adjusters
 from sfm.batch_table import BatchTable, print_batch, stopping_at_terminate
 from sfm.commands import measuring, refining, solvers
-from sfm.commands.console import drawn_progress
+from sfm.commands.console import drawn_progress, tell_of_compiling, tell_result
 from sfm.errors import KolinearError
 from sfm.folder_lock import locked
 from sfm.pipeline import Backend, adjust_survey, run_survey
 from sfm.project import Survey, read_survey
-from sfm.report.markup import finer_unit, significant
 from sfm.report.output import refuse_foreign_folder, remove_leftovers, write_result
 from sfm.report.result import SurveyResult
-from sfm.report.tables import point_sigmas, root_mean_square
-from sfm.report.verdict import verdict_of
 from sfm.survey_log import SurveyLog
 from sfm.targets.store import STORE, TargetStore
 
 BAD_INPUT = 2  # exit code where a person must put something right
-FAILED = 1  # exit code where a survey of a batch failed
+FAILED = 1  # exit code where a survey, or one of a batch, has no dependable result
 INTERRUPTED = 130  # exit code after Ctrl-C, as a shell expects it
-MAX_WARNINGS = 5  # without --verbose
-COLOURS = {"good": "green", "fair": "yellow", "bad": "red"}
+USAGE_ERROR: Any = typer.BadParameter.__base__  # of all that typer says of wrong arguments; it has no name
 
 app = typer.Typer(
     name="kolinear",
@@ -93,7 +88,12 @@ def run(
     allow_outside: AllowOutside = False,
     verbose: Verbose = False,
 ) -> None:
-    """Run a survey from its photographs to the report."""
+    """Run a survey from its photographs to the report.
+
+    Exit code 0 with a result, remarks or none; 1 if the result cannot be depended on, the report says
+    why; 2 where a person must put something right.
+    """
+    begun = time.perf_counter()
     survey = read_survey(survey_file, allow_outside=allow_outside)
     if survey.observations is not None:
         raise KolinearError(
@@ -102,6 +102,7 @@ def run(
     backend = _backend(survey)
     folder = _folder(survey, out)
     workers = jobs or _cores()
+    tell_of_compiling()
     store = TargetStore(folder.parent / STORE)
     with drawn_progress() as drawn, _threads(), _written(folder), SurveyLog(watch=drawn) as log:
         log.note("start", survey=survey.name, file=str(survey_file))
@@ -116,14 +117,21 @@ def run(
             jobs=workers,
             progress=log,
         )
-    _tell(result, page, verbose=verbose)
+    if not tell_result(result, page, seconds=time.perf_counter() - begun, verbose=verbose):
+        raise SystemExit(FAILED)
 
 
 @app.command()
 def adjust(
     survey_file: SurveyFile, out: Out = None, allow_outside: AllowOutside = False, verbose: Verbose = False
 ) -> None:
-    """Run the part after the photographs, on the image points of [observations]."""
+    """Run a survey from measured image points to the report.
+
+    They are those of [observations] in the survey file, in place of photographs.  Exit code 0 with a
+    result, remarks or none; 1 if the result cannot be depended on, the report says why; 2 where a person
+    must put something right.
+    """
+    begun = time.perf_counter()
     survey = read_survey(survey_file, allow_outside=allow_outside)
     if survey.observations is None:
         raise KolinearError(
@@ -131,6 +139,7 @@ def adjust(
         )
     backend = _backend(survey)
     folder = _folder(survey, out)
+    tell_of_compiling()
     with drawn_progress() as drawn, _threads(), _written(folder), SurveyLog(watch=drawn) as log:
         log.note("start", survey=survey.name, file=str(survey_file))
         result = adjust_survey(survey, backend=backend, progress=log)
@@ -141,7 +150,8 @@ def adjust(
             finish=lambda part: log.close_into(part, result),
             progress=log,
         )
-    _tell(result, page, verbose=verbose)
+    if not tell_result(result, page, seconds=time.perf_counter() - begun, verbose=verbose):
+        raise SystemExit(FAILED)
 
 
 @app.command()
@@ -175,7 +185,11 @@ def batch(
     allow_outside: AllowOutside = False,
     verbose: Verbose = False,
 ) -> None:
-    """Run many surveys side by side, each to its own report, and tell them in one table."""
+    """Run many surveys side by side, each to its own report.
+
+    One table tells them all.  Exit code 0 if every survey has a dependable result, else 1; 2 where a
+    person must put something right.
+    """
     from adapters.dask_cluster import local_engine, remote_engine
 
     if cluster is not None and jobs is not None:
@@ -184,6 +198,7 @@ def batch(
     engine = (
         remote_engine(cluster) if cluster is not None else local_engine(jobs or min(_cores(), len(files)))
     )
+    tell_of_compiling()
     with stopping_at_terminate(), BatchTable(Console(stderr=True), verbose=verbose) as table:
         rows = run_batch(
             files,
@@ -214,7 +229,17 @@ for _command in (
 def main() -> None:
     """Run the command line; errors that a person can put right are one line and exit code 2."""
     try:
-        app()
+        code = app(prog_name="kolinear", standalone_mode=False)
+        if isinstance(code, int) and code:
+            raise SystemExit(code)
+    except USAGE_ERROR as error:
+        if not sys.argv[1:]:  # which asks for the help, and is no mistake
+            error.show()
+        else:
+            command = error.ctx.command_path if error.ctx else "kolinear"
+            message = _one_line(error.format_message()).rstrip(".")
+            print(f"kolinear: {message} (see {command} --help)", file=sys.stderr)
+        raise SystemExit(BAD_INPUT) from None
     except KolinearError as error:
         print(f"kolinear: {_one_line(str(error))}", file=sys.stderr)
         raise SystemExit(BAD_INPUT) from None
@@ -278,92 +303,6 @@ def _threads() -> Iterator[None]:
     """Hold BLAS to one thread: photographs are worked on side by side, and two BLAS pools in turn fight."""
     with threadpool_limits(limits=1, user_api="blas"):
         yield
-
-
-def _tell(result: SurveyResult, page: Path, *, verbose: bool) -> None:
-    """Print the summary: verdict, figures with their units, what failed, where the report is."""
-    a = result.adjustment
-    verdict = verdict_of(result)
-    console = Console(highlight=False)
-    console.print(Text(verdict.headline, style=f"bold {COLOURS[verdict.level]}"), soft_wrap=True)
-    table = Table(show_header=False, box=None, padding=(0, 2, 0, 0))
-    for name, value in _figures(result):
-        table.add_row(Text(name, style="dim"), Text(value))
-    console.print(table)
-    for line in verdict.remarks:
-        console.print(Text(f"! {line}", style="yellow"), soft_wrap=True)
-    for failed in result.failed:
-        console.print(Text(f"  {failed.image}: {failed.reason}"), soft_wrap=True)
-    shown = result.warnings if verbose else result.warnings[:MAX_WARNINGS]
-    for warning in shown:
-        console.print(Text(f"  {warning}"), soft_wrap=True)
-    if len(shown) < len(result.warnings):
-        console.print(Text(f"  ... and {len(result.warnings) - len(shown)} more, in the report"))
-    if verbose:
-        console.print(_photograph_table(result))
-        for camera in a.estimate.cameras:
-            values = ", ".join(
-                f"{name} {significant(value, 6)} {unit}"
-                for name, value, unit, free in zip(
-                    camera.names, camera.parameters, camera.units, camera.free, strict=True
-                )
-                if free
-            )
-            console.print(Text(f"  camera {camera.name} ({camera.model}): {values}"))
-    console.print(Text(f"Report: {page}", style="bold"), soft_wrap=True)
-
-
-def _figures(result: SurveyResult) -> tuple[tuple[str, str], ...]:
-    """Return the figures of the summary, each with its unit."""
-    a = result.adjustment
-    coded = int((result.code >= 0).sum())
-    rejected = int(a.rejected.sum())
-    sigma = point_sigmas(a)
-    typical, largest = root_mean_square(sigma), float(sigma.max())
-    factor, unit = finer_unit(result.length_unit, largest)
-    rows = [
-        ("photographs", f"{len(a.network.images)} of {result.images_total} oriented"),
-        (
-            "object points",
-            f"{len(a.network.points)} ({coded} coded, {len(a.network.points) - coded} uncoded)",
-        ),
-        ("image points", f"{len(a.rejected) - rejected} accepted, {rejected} rejected"),
-        ("adjustment", f"{'converged' if a.converged else 'NOT converged'}, {a.iterations} iterations"),
-        ("datum", f"{a.datum}, rank defect {a.defect} (expected {a.expected_defect})"),
-        ("sigma0", f"{a.sigma0_px:.4f} px (redundancy {a.redundancy})"),
-        ("residuals", f"RMS {a.rms_px:.4f} px per coordinate, largest {a.max_residual_px:.3f} px"),
-        (
-            "point precision",
-            f"{significant(typical * factor)} {unit} RMS, {significant(largest * factor)} {unit} at most",
-        ),
-    ]
-    check = result.control_check
-    if check is not None:
-        factor, unit = finer_unit(result.length_unit, float(abs(check.differences).max()))
-        dx, dy, dz = (significant(value * factor) for value in check.rms)
-        rows.append(
-            ("check at control", f"RMS {dx}, {dy}, {dz} {unit} in X, Y, Z at {len(check.points)} points")
-        )
-    both = result.comparison
-    if both is not None:
-        word = "agrees" if both.agree else "DIFFERS"
-        rms = both.comparison.rms_px
-        rows.append(
-            (both.backend, f"{word}: RMS {rms[0]:.7f} px (kolinear), {rms[1]:.7f} px ({both.backend})")
-        )
-    rows.append(("time", f"{sum(time.seconds for time in result.seconds):.1f} s"))
-    return tuple(rows)
-
-
-def _photograph_table(result: SurveyResult) -> Table:
-    """Return measured targets and rejected candidates of each photograph."""
-    table = Table(box=None, padding=(0, 2, 0, 0))
-    for name in ("photograph", "targets", "rejected candidates"):
-        table.add_column(name, justify="left" if name != "targets" else "right")
-    for photograph in result.photographs:
-        reasons = ", ".join(f"{count} {reason}" for reason, count in photograph.reasons())
-        table.add_row(Text(photograph.image), str(len(photograph.xy)), Text(reasons))
-    return table
 
 
 def _one_line(text: str) -> str:

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import csv
 import json
+import os
 import shutil
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import cv2
@@ -14,8 +16,11 @@ import numpy as np
 import pytest
 
 from sfm import cli
+from sfm.commands import console
+from sfm.report.output import write_result
 from sfm.targets.render import write_photographs
 from sfm.targets.scene_file import read_scene
+from tests.surveys import write_observed_survey
 
 SURVEY = """\
 [survey]
@@ -85,6 +90,12 @@ reflectance = 0.05
 codes = [0, 11, 0, 0]
 {stations}
 """
+
+
+@pytest.fixture(autouse=True)
+def compiled(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The kernels are as if compiled, whether or not this is the first run after a change."""
+    monkeypatch.setattr(console, "is_compiled", lambda kernel: True)
 
 
 @pytest.fixture(scope="module")
@@ -276,13 +287,85 @@ def test_run_and_adjust_know_their_surveys(
     assert "kamera: size_px = [width, height] is needed" in line
 
 
-def test_usage_errors_have_exit_code_2(
+def test_usage_errors_are_one_line_with_exit_code_2(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert kolinear(monkeypatch, "run") == 2
-    assert kolinear(monkeypatch, "run", "a.toml", "--jobs", "0") == 2
-    assert kolinear(monkeypatch, "fly") == 2
-    assert "Traceback" not in capsys.readouterr().err
+    line = refused(monkeypatch, capsys, "run")
+    assert line == "kolinear: Missing argument 'SURVEY.toml' (see kolinear run --help)"
+    assert "--jobs" in refused(monkeypatch, capsys, "run", "a.toml", "--jobs", "0")
+    assert "No such command 'fly'" in refused(monkeypatch, capsys, "fly")
+    assert "No such option: --bogus" in refused(monkeypatch, capsys, "run", "a.toml", "--bogus")
+
+
+def test_no_command_shows_the_help(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert kolinear(monkeypatch) == 2
+    assert "Commands:" in capsys.readouterr().err
+    assert kolinear(monkeypatch, "run", "--help") == 0
+    assert "Exit code 0" in capsys.readouterr().out
+
+
+def test_a_result_that_cannot_be_depended_on_has_exit_code_1(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    survey = write_observed_survey(tmp_path / "s", "broken")
+    good = tmp_path / "good"
+    assert kolinear(monkeypatch, "adjust", survey, "--out", good, "-v") == 0
+    shown = capsys.readouterr().out
+    assert "global test" in shown and "report included" in shown
+    text = survey.read_text(encoding="utf-8").replace('free = ["c"]', "free = []")
+    survey.write_text(text.replace("c_mm = 10.0", "c_mm = 11.0"), encoding="utf-8")
+    bad = tmp_path / "bad"
+    assert kolinear(monkeypatch, "adjust", survey, "--out", bad) == 1
+    shown = capsys.readouterr()
+    assert "The survey has no dependable result." in shown.out and shown.err == ""
+    assert "Sigma0 is" in shown.out
+    text = json.loads((bad / "summary.json").read_text(encoding="utf-8"))
+    assert text["verdict"]["level"] == "bad"
+    assert (bad / "report.html").is_file()
+
+
+def test_the_time_counts_the_report(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    survey = write_observed_survey(tmp_path / "s", "time")
+
+    def slow(*arguments: object, **options: object) -> Path:
+        time.sleep(1.5)
+        return write_result(*arguments, **options)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(cli, "write_result", slow)
+    assert kolinear(monkeypatch, "adjust", survey, "--out", tmp_path / "out") == 0
+    line = next(line for line in capsys.readouterr().out.splitlines() if line.startswith("time"))
+    stages = json.loads((tmp_path / "out" / "summary.json").read_text(encoding="utf-8"))["seconds"]
+    assert float(line.split()[1]) > sum(stages.values()) + 1.4
+
+
+def test_the_first_run_says_that_it_compiles(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    survey = write_observed_survey(tmp_path / "s", "first")
+    monkeypatch.setattr(console, "is_compiled", lambda kernel: False)
+    assert kolinear(monkeypatch, "adjust", survey, "--out", tmp_path / "out") == 0
+    line = capsys.readouterr().err.splitlines()
+    assert len(line) == 1 and "python -m sfm.warm_up" in line[0]
+
+
+def test_compiled_kernels_are_recognised(tmp_path: Path) -> None:
+    code = (
+        "from sfm.commands.console import is_compiled\n"
+        "import sys; sys.path.insert(0, '.')\n"
+        "import kernel\n"
+        "print(is_compiled(kernel.f)); kernel.f(1.0); print(is_compiled(kernel.f))\n"
+        "import os; os.utime('kernel.py', (9e9, 9e9)); print(is_compiled(kernel.f))\n"
+    )
+    text = "from numba import njit\n@njit(cache=True)\ndef f(x):\n    return x\n"
+    (tmp_path / "kernel.py").write_text(text, encoding="utf-8")
+    run = subprocess.run(
+        [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=True
+    )
+    assert run.stdout.split() == ["False", "True", "False"]
 
 
 def test_ctrl_c_is_no_traceback(
@@ -318,11 +401,13 @@ def test_adjust_runs_on_the_tables_of_a_result(
 def test_help_explains_every_command_and_option() -> None:
     shown = subprocess.run(
         [sys.executable, "-c", "from sfm.cli import main; main()", "--help"],
+        env={**os.environ, "COLUMNS": "80"},
         capture_output=True,
         text=True,
         check=True,
     ).stdout
     assert "run" in shown and "adjust" in shown
+    assert "..." not in shown
     for command in cli.app.registered_commands:
         assert command.callback is not None and command.callback.__doc__
 

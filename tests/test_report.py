@@ -18,14 +18,15 @@ from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.conventions import angles_from_rotation
 from sfm.errors import OutputError
-from sfm.network import Network, ScaleBars
+from sfm.network import Network, ObjectPoints, ScaleBars
 from sfm.report.html import render_html
 from sfm.report.markup import finer_unit, significant, table, to_precision, with_exponent
 from sfm.report.output import WRITTEN, refuse_foreign_folder, write_result
 from sfm.report.overlays import USED, draw_photograph, overlay_names
 from sfm.report.plots import all_plots, plan_axes
 from sfm.report.result import ControlCheck, FailedImage, PhotographTargets, StageTime, SurveyResult
-from sfm.report.tables import image_rms, summary, write_tables
+from sfm.report.summary import summary, write_summary
+from sfm.report.tables import image_rms, write_tables
 from sfm.report.verdict import verdict_of
 from sfm.survey_tables import read_exterior, read_image_points, read_points
 from sfm.targets.flags import Flag
@@ -134,6 +135,7 @@ def test_tables_of_a_result_can_be_input_of_another_survey(result: SurveyResult,
 
 def test_summary_says_what_the_adjustment_says(result: SurveyResult, tmp_path: Path) -> None:
     write_tables(result, tmp_path)
+    write_summary(result, tmp_path)
     a = result.adjustment
     text = json.loads((tmp_path / "summary.json").read_text(encoding="utf-8"))
     assert text == json.loads(json.dumps(summary(result)))
@@ -168,6 +170,7 @@ def test_unknown_numbers_are_null_and_empty_cells(result: SurveyResult, tmp_path
         result, adjustment=replace(result.adjustment, covariance=covariance, sigma0=float("nan"))
     )
     write_tables(unknown, tmp_path)
+    write_summary(unknown, tmp_path)
     text = (tmp_path / "summary.json").read_text(encoding="utf-8")
     assert json.loads(text, parse_constant=lambda name: pytest.fail(name))["sigma0_px"] is None
     assert rows_of(tmp_path / "points.csv")[0]["sX"] == ""
@@ -237,9 +240,11 @@ def test_page_is_whole_escaped_and_self_contained(result: SurveyResult) -> None:
 
 
 def test_a_network_without_scale_has_no_metric_unit(result: SurveyResult) -> None:
-    assert result.length_unit == "m"
     free = replace(result, control_check=None)
     assert not free.has_scale
+    known = ObjectPoints(np.arange(2), free.adjustment.estimate.points[:2], np.zeros((2, 3, 3)))
+    network = replace(free.adjustment.network, control=known)
+    assert replace(free, adjustment=replace(free.adjustment, network=network)).length_unit == "m"
     assert "network units" in render_html(free, (), ())
     bars = ScaleBars(np.array([0]), np.array([1]), np.array([1.0]), np.array([0.1]))
     network = replace(free.adjustment.network, scale_bars=bars)

@@ -1,12 +1,31 @@
-"""Progress on the terminal."""
+"""What is seen on the terminal: progress, and the summary of a result."""
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 
+from numba.core.dispatcher import Dispatcher
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
+from rich.table import Table
+from rich.text import Text
+
+from sfm.adjustment import collinearity, normals
+from sfm.adjustment.statistics import global_test
+from sfm.report.checks import count_observations, sigma0_ratio
+from sfm.report.markup import finer_unit, significant
+from sfm.report.result import SurveyResult
+from sfm.report.tables import point_sigmas, root_mean_square
+from sfm.report.verdict import verdict_of
+
+MAX_WARNINGS = 5  # without --verbose
+COLOURS = {"good": "green", "fair": "yellow", "bad": "red"}
+
+KERNELS: tuple[Dispatcher, ...] = (normals._accumulate, collinearity._residuals)
+"""kernels that every survey needs"""
 
 
 class Drawn:
@@ -50,3 +69,140 @@ def drawn_progress() -> Iterator[Drawn]:
         yield drawn
         drawn.stage("done", 1)
         bar.remove_task(bar.task_ids[-1])
+
+
+def tell_of_compiling() -> None:
+    """Say on stderr that kernels are compiled first, where none are kept from an earlier run."""
+    if not all(is_compiled(kernel) for kernel in KERNELS):
+        print(
+            "kolinear: the kernels are compiled first, a minute or more, once (ahead of it: "
+            "python -m sfm.warm_up)",
+            file=sys.stderr,
+        )
+
+
+def is_compiled(kernel: Dispatcher) -> bool:
+    """Whether numba keeps a compiled form of a kernel that is as new as its source."""
+    source = Path(kernel.py_func.__code__.co_filename)
+    kept = Path(kernel.stats.cache_path or ".")
+    try:
+        newest = max(
+            path.stat().st_mtime for path in kept.glob(f"{source.stem}.{kernel.py_func.__name__}-*.nbi")
+        )
+        return newest >= source.stat().st_mtime
+    except (OSError, ValueError):  # no folder, or nothing in it
+        return False
+
+
+def tell_result(result: SurveyResult, page: Path, *, seconds: float, verbose: bool) -> bool:
+    """Print the summary: verdict, figures with their units, what failed, where the report is.
+
+    Returns:
+        Whether the result can be depended on.
+    """
+    a = result.adjustment
+    verdict = verdict_of(result)
+    console = Console(highlight=False)
+    console.print(Text(verdict.headline, style=f"bold {COLOURS[verdict.level]}"), soft_wrap=True)
+    table = Table(show_header=False, box=None, padding=(0, 2, 0, 0))
+    figures = (*_figures(result), ("time", f"{seconds:.1f} s, report included"))
+    for name, value in (*figures, *(_details(result) if verbose else ())):
+        table.add_row(Text(name, style="dim"), Text(value))
+    console.print(table)
+    for line in verdict.remarks:
+        console.print(Text(f"! {line}", style="yellow"), soft_wrap=True)
+    for failed in result.failed:
+        console.print(Text(f"  {failed.image}: {failed.reason}"), soft_wrap=True)
+    shown = result.warnings if verbose else result.warnings[:MAX_WARNINGS]
+    for warning in shown:
+        console.print(Text(f"  {warning}"), soft_wrap=True)
+    if len(shown) < len(result.warnings):
+        console.print(Text(f"  ... and {len(result.warnings) - len(shown)} more, in the report"))
+    if verbose:
+        console.print(_photograph_table(result))
+        for camera in a.estimate.cameras:
+            values = ", ".join(
+                f"{name} {significant(value, 6)} {unit}"
+                for name, value, unit, free in zip(
+                    camera.names, camera.parameters, camera.units, camera.free, strict=True
+                )
+                if free
+            )
+            console.print(Text(f"  camera {camera.name} ({camera.model}): {values}"))
+    console.print(Text(f"Report: {page}", style="bold"), soft_wrap=True)
+    return verdict.level != "bad"
+
+
+def _figures(result: SurveyResult) -> tuple[tuple[str, str], ...]:
+    """Return the figures of the summary, each with its unit."""
+    a = result.adjustment
+    coded = int((result.code >= 0).sum())
+    rejected = int(a.rejected.sum())
+    sigma = point_sigmas(a)
+    typical, largest = root_mean_square(sigma), float(sigma.max())
+    factor, unit = finer_unit(result.length_unit, largest)
+    rows = [
+        ("photographs", f"{len(a.network.images)} of {result.images_total} oriented"),
+        (
+            "object points",
+            f"{len(a.network.points)} ({coded} coded, {len(a.network.points) - coded} uncoded)",
+        ),
+        ("image points", f"{len(a.rejected) - rejected} accepted, {rejected} rejected"),
+        ("adjustment", f"{'converged' if a.converged else 'NOT converged'}, {a.iterations} iterations"),
+        ("datum", f"{a.datum}, rank defect {a.defect} (expected {a.expected_defect})"),
+        (
+            "sigma0",
+            f"{a.sigma0_px:.4f} px, {sigma0_ratio(result):.2f} times the expected, redundancy {a.redundancy}",
+        ),
+        ("residuals", f"RMS {a.rms_px:.4f} px per coordinate, largest {a.max_residual_px:.3f} px"),
+        (
+            "point precision",
+            f"{significant(typical * factor)} {unit} RMS, {significant(largest * factor)} {unit} at most",
+        ),
+    ]
+    check = result.control_check
+    if check is not None:
+        factor, unit = finer_unit(result.length_unit, float(abs(check.differences).max()))
+        dx, dy, dz = (significant(value * factor) for value in check.rms)
+        rows.append(
+            ("check at control", f"RMS {dx}, {dy}, {dz} {unit} in X, Y, Z at {len(check.points)} points")
+        )
+    both = result.comparison
+    if both is not None:
+        word = "agrees" if both.agree else "DIFFERS"
+        rms = both.comparison.rms_px
+        rows.append(
+            (both.backend, f"{word}: RMS {rms[0]:.7f} px (kolinear), {rms[1]:.7f} px ({both.backend})")
+        )
+    return tuple(rows)
+
+
+def _details(result: SurveyResult) -> tuple[tuple[str, str], ...]:
+    """Return further figures, for --verbose."""
+    a = result.adjustment
+    test, counts = global_test(a), count_observations(a)
+    rows = [
+        ("observations", f"{counts.total}: {counts.image} image coordinates, {counts.control} of control, "
+         f"{counts.scale_bars} scale bars; {counts.constraints} constraints, {a.unknowns} unknowns"),
+        ("global test", f"{'passed' if test.passed else 'not passed'}: v'Pv {test.statistic:.1f}, "
+         f"critical values {test.lower:.1f} and {test.upper:.1f}"),
+    ]  # fmt: skip
+    found = result.eccentricity
+    if found is not None:
+        rows.append(
+            ("eccentricity", f"corrected by {found.rms_px:.4f} px RMS, {found.largest_px:.4f} px at most")
+        )
+    if result.no_circles:
+        rows.append(("no circles", f"{len(result.no_circles)} left out: {', '.join(result.no_circles)}"))
+    return tuple(rows)
+
+
+def _photograph_table(result: SurveyResult) -> Table:
+    """Return measured targets and rejected candidates of each photograph."""
+    table = Table(box=None, padding=(0, 2, 0, 0))
+    for name in ("photograph", "targets", "rejected candidates"):
+        table.add_column(name, justify="left" if name != "targets" else "right")
+    for photograph in result.photographs:
+        reasons = ", ".join(f"{count} {reason}" for reason, count in photograph.reasons())
+        table.add_row(Text(photograph.image), str(len(photograph.xy)), Text(reasons))
+    return table

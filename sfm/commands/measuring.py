@@ -47,7 +47,10 @@ def match(
         typer.Option("--picture", metavar="FILE.png", help="Picture of template, match and difference."),
     ] = None,
 ) -> None:
-    """Find conjugate points of two photographs by correlation and least squares matching."""
+    """Find conjugate points of two photographs.
+
+    By cross correlation, then least squares matching.
+    """
     print(
         match_command(
             left,
@@ -85,7 +88,10 @@ def resect(
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON in place of a table.")] = False,
 ) -> None:
-    """Orient one photograph on known points by any of the methods, or compare them all."""
+    """Orient one photograph on known points.
+
+    By any of the methods, or all of them for a comparison.
+    """
     task = read_task(points, c_mm=c, camera_file=camera, start=start, tolerance_mm=tolerance)
     if not as_json:
         print(resect_table(task, method))
@@ -114,7 +120,10 @@ def targets(
     page: Annotated[str, typer.Option("--page", help="a4, a3, letter ...")] = "a4",
     bright: Annotated[bool, typer.Option("--bright", help="White targets on dark squares.")] = False,
 ) -> None:
-    """Write a sheet of coded targets for printing, in true scale with a ruler to check the print."""
+    """Write a sheet of coded targets for printing.
+
+    It is in true scale and has a ruler to check the print.
+    """
     sheet = lay_out_sheet(family, _numbers(ids), diameter_mm=diameter, page=page, dark=not bright)
     for path in write_sheet(sheet, out):
         print(path)

@@ -24,7 +24,10 @@ def refine(
         float, typer.Option("--min-correlation", metavar="R", help="Smallest r of a window and its template.")
     ] = 0.7,
 ) -> None:
-    """Measure the key points of a COLMAP model by multi-photo matching and adjust it again."""
+    """Measure the key points of a COLMAP model anew.
+
+    By multi-photo least squares matching; then the model is adjusted again.
+    """
     from adapters.colmap import read_model, write_model
 
     if out is not None and out.exists():

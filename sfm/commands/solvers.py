@@ -26,7 +26,10 @@ def validate(
     ),
     jobs: Annotated[int, typer.Option("--jobs", metavar="N", min=1, help="Networks at a time.")] = 2,
 ) -> None:
-    """Adjust random networks with the in-house adjuster and COLMAP's, and compare everything."""
+    """Compare the adjuster with COLMAP's on random networks.
+
+    Exit code 1 if the in-house adjuster was ever the worse one.
+    """
     from adapters.colmap_validation import ColmapBackend
 
     refuse_foreign_folder(out)
@@ -55,7 +58,10 @@ def compare(
         "out/comparison"
     ),
 ) -> None:
-    """Compare two results: differences, their standard deviations and what of them is significant."""
+    """Compare two results.
+
+    Differences, their standard deviations and what of them is significant.
+    """
     from adapters.formats import read_comparable
 
     refuse_foreign_folder(out)
@@ -82,7 +88,10 @@ def convert(
         str | None, typer.Option("--from", metavar="F", help="Format to read; else by what is there.")
     ] = None,
 ) -> None:
-    """Carry a survey between programs; a camera is converted where the format lacks its model."""
+    """Carry a survey between programs.
+
+    A camera is converted where the format lacks its model.
+    """
     from adapters.formats import ENDINGS, format_named, read_any, write_any
 
     form = format_named(to_format or ENDINGS.get(target.suffix.lower(), "tables"))

@@ -10,27 +10,24 @@ from collections.abc import Sequence
 from html import escape
 from importlib.resources import files
 
-import numpy as np
-
-from sfm.conventions import FloatArray
+from sfm.report.checks import object_size, sigma0_ratio
 from sfm.report.markup import figure, finer_unit, significant
 from sfm.report.overlays import Overlay
 from sfm.report.result import SurveyResult
-from sfm.report.sections import (
-    comparison_section,
-    coordinates_section,
-    photographs_section,
-    process_section,
-    quality_section,
-    rejected_section,
-    worked_section,
-)
+from sfm.report.section_comparison import comparison_section
+from sfm.report.section_quality import quality_section
+from sfm.report.section_rejected import rejected_section
+from sfm.report.sections import coordinates_section, photographs_section, process_section, worked_section
 from sfm.report.tables import point_sigmas, root_mean_square
 from sfm.report.verdict import Verdict, verdict_of
 
 
 def render_html(
-    result: SurveyResult, plots: Sequence[tuple[str, str, bytes]], overlays: Sequence[Overlay]
+    result: SurveyResult,
+    plots: Sequence[tuple[str, str, bytes]],
+    overlays: Sequence[Overlay],
+    *,
+    has_model: bool = False,
 ) -> str:
     """Return the report as one HTML page.
 
@@ -38,6 +35,7 @@ def render_html(
         result: the result.
         plots: (stem, caption, PNG) of each picture.
         overlays: the drawn photographs; their thumbnails are embedded, links lead to the overlays folder.
+        has_model: whether the folder holds the compared solution as a COLMAP model.
     """
     verdict = verdict_of(result)
     pictures = {stem: figure(data, caption) for stem, caption, data in plots}
@@ -46,7 +44,7 @@ def render_html(
         ("quality", "How good is it?", quality_section(result, pictures)),
         ("rejected", "What was thrown out, and why?", rejected_section(result)),
         ("comparison", "Does the other adjuster agree?", comparison_section(result)),
-        ("coordinates", "Where are my coordinates?", coordinates_section(result)),
+        ("coordinates", "Where are my coordinates?", coordinates_section(result, has_model=has_model)),
         ("photographs", "The photographs", photographs_section(result, overlays)),
         ("process", "How it was done", process_section(result)),
     )
@@ -78,7 +76,7 @@ def _tiles(result: SurveyResult) -> str:
     """Return the figures that are asked for first."""
     a = result.adjustment
     sigma = point_sigmas(a)
-    size = _object_size(a.estimate.points)
+    size = object_size(a.estimate.points)
     typical = root_mean_square(sigma)
     factor, unit = finer_unit(result.length_unit, typical)
     tiles = [
@@ -93,7 +91,8 @@ def _tiles(result: SurveyResult) -> str:
         (
             "Sigma0",
             f"{a.sigma0_px:.4f} px",
-            f"{a.sigma0:.3f} times the {a.a_priori_px:.3g} px expected, redundancy {a.redundancy}",
+            f"{sigma0_ratio(result):.3f} times the {a.a_priori_px / result.weight_factor:.3g} px expected, "
+            f"redundancy {a.redundancy}",
         ),
     ]
     both = result.comparison
@@ -112,7 +111,3 @@ def _tiles(result: SurveyResult) -> str:
 def _coded_of(result: SurveyResult) -> str:
     coded = int((result.code >= 0).sum())
     return f"{coded} coded, {len(result.code) - coded} uncoded"
-
-
-def _object_size(points: FloatArray) -> float:
-    return float(np.linalg.norm(np.ptp(points, axis=0)))

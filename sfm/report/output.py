@@ -19,6 +19,7 @@ from sfm.report.html import render_html
 from sfm.report.overlays import draw_overlays
 from sfm.report.plots import all_plots
 from sfm.report.result import StageTime, SurveyResult
+from sfm.report.summary import write_summary
 from sfm.report.tables import write_tables
 
 WRITTEN = (
@@ -86,7 +87,8 @@ def write_result(
             (folder / "plots" / f"{stem}.png").write_bytes(data)
         timed = replace(result, seconds=(*result.seconds, StageTime("report", time.perf_counter() - started)))
         write_tables(timed, folder)
-        page = render_html(timed, plots, overlays)
+        write_summary(timed, folder)
+        page = render_html(timed, plots, overlays, has_model=write_colmap is not None)
         (folder / "report.html").write_text(page, encoding="utf-8")
         if finish is not None:
             finish(folder)

@@ -58,7 +58,7 @@ _PHOTOGRAPHS = "RMS residual per coordinate and number of accepted image points 
 def network_figure(adjustment: Adjustment, unit: str) -> Figure:
     """Draw the network in plan and in space."""
     estimate = adjustment.estimate
-    axes_from_object, labels = plan_axes(estimate.points)
+    axes_from_object, labels = plan_axes(estimate.points, estimate.position)
     figure = Figure(figsize=(11, 5.2), layout="constrained")
     plan = figure.add_subplot(1, 2, 1)
     space = figure.add_subplot(1, 2, 2, projection="3d")
@@ -74,13 +74,21 @@ def network_figure(adjustment: Adjustment, unit: str) -> Figure:
         plan.add_collection(LineCollection(list(edges[:, :, :2]), colors=colour, linewidths=0.8))
         for edge in edges:
             space.plot(*edge.T, color=colour, linewidth=0.7)
-        plan.plot(position[own, 0], position[own, 1], "o", color=colour, markersize=4, label=camera.name)
+        plan.plot(
+            position[own, 0], position[own, 1], "o", color=colour, markersize=4, label=_plain(camera.name)
+        )
     for name, x, y in zip(adjustment.network.images, position[:, 0], position[:, 1], strict=True):
         if len(position) <= 60:
             plan.annotate(
-                _short(name), (x, y), xytext=(4, 4), textcoords="offset points", fontsize=6, color="#444"
+                _plain(_short(name)),
+                (x, y),
+                xytext=(4, 4),
+                textcoords="offset points",
+                fontsize=6,
+                color="#444",
             )
     plan.set_aspect("equal", adjustable="datalim")
+    plan.margins(0.1)  # for the names of the photographs
     plan.autoscale_view()
     plan.set_xlabel(f"{labels[0]} [{_plain(unit)}]")
     plan.set_ylabel(f"{labels[1]} [{_plain(unit)}]")
@@ -88,6 +96,7 @@ def network_figure(adjustment: Adjustment, unit: str) -> Figure:
     plan.grid(color="#ddd", linewidth=0.5)
     plan.legend(loc="best", fontsize=7)
     space.set_aspect("equal", adjustable="datalim")
+    space.set_box_aspect(None, zoom=0.85)  # else the name of the third axis is cut off
     space.set_title("In space")
     for set_label, label in zip((space.set_xlabel, space.set_ylabel, space.set_zlabel), labels, strict=True):
         set_label(label, fontsize=8)
@@ -196,20 +205,29 @@ def standardised_residuals(adjustment: Adjustment) -> FloatArray:
     return np.asarray((adjustment.residuals[used] / sigma).ravel())
 
 
-def plan_axes(points: FloatArray) -> tuple[FloatArray, tuple[str, str, str]]:
-    """Return the axes in which the object is best seen from above, and what they are called.
+def plan_axes(
+    points: FloatArray, position: FloatArray | None = None
+) -> tuple[FloatArray, tuple[str, str, str]]:
+    """Return the axes in which the object is best seen from the cameras' side, and what they are called.
 
     Args:
         points: object points, shape (n, 3).
+        position: projection centres, shape (m, 3); without them the third axis may point either way.
 
     Returns:
-        Rotation from object axes, shape (3, 3): the identity if the object lies nearly level, else its
-        principal axes; and the names of the three axes.
+        Rotation from object axes, shape (3, 3): the identity if the object lies nearly level below the
+        cameras, turned about X if above them, else its principal axes; and the names of the three axes.
     """
-    _, _, Vt = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)
+    centre = points.mean(axis=0)
+    towards = np.zeros(3) if position is None or not len(position) else position.mean(axis=0) - centre
+    _, _, Vt = np.linalg.svd(points - centre, full_matrices=False)
     if len(Vt) < 3 or abs(Vt[2, 2]) > FLAT_COSINE:
+        if towards[2] < 0:
+            return np.diag([1.0, -1.0, -1.0]), ("X", "-Y", "-Z")
         return np.eye(3), ("X", "Y", "Z")
-    Vt[2] *= np.sign(np.linalg.det(Vt))
+    if Vt[2] @ towards < 0:
+        Vt[2] *= -1
+    Vt[1] *= np.sign(np.linalg.det(Vt))
     return Vt, ("along", "across", "up from the main plane")
 
 

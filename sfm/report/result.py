@@ -54,7 +54,7 @@ class ControlCheck:
 
     points: tuple[str, ...]  # names of the control points that were measured, (n,)
     differences: FloatArray  # placed minus nominal X, Y, Z, object unit, (n, 3)
-    scale: float  # by which the adjusted network was multiplied
+    scale: float  # of the control over the adjusted network; 1 where the scale came from the control
 
     @property
     def rms(self) -> FloatArray:
@@ -88,6 +88,8 @@ class SurveyResult:
     eccentricity: Eccentricity | None = None  # None where it was not corrected
     no_circles: tuple[str, ...] = ()  # uncoded points left out: their outlines are not images of one circle
     seconds: tuple[StageTime, ...] = field(default_factory=tuple)  # in the order of the stages
+    weight_factor: float = 1.0  # by which the a priori sigmas of the image points were multiplied, from their
+    # own variance component, before the final adjustment; 1 where they were left as stated
 
     @property
     def has_scale(self) -> bool:

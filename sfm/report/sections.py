@@ -5,33 +5,23 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from html import escape
 
-import numpy as np
-
 from sfm.report.markup import (
     data_url,
     file_url,
-    finer_unit,
-    raised,
-    signed,
     significant,
     table,
     to_precision,
-    with_exponent,
-    yes_or_no,
 )
 from sfm.report.overlays import Overlay
 from sfm.report.result import SurveyResult
+from sfm.report.section_statistics import observations
 from sfm.report.tables import (
     image_rms,
     image_rows,
-    parameter_sigmas,
     point_rows,
-    point_sigmas,
-    root_mean_square,
 )
 from sfm.report.verdict import Verdict
 
-MAX_REJECTED_ROWS = 60
 MAX_POINT_ROWS = 2000
 
 
@@ -58,6 +48,7 @@ def worked_section(result: SurveyResult, verdict: Verdict) -> str:
     if a.undetermined:
         rows.append(("Cannot be determined", ", ".join(a.undetermined)))
     text = table(("", ""), rows, plain_first=True, head=False)
+    text += observations(result)
     if result.failed:
         text += "<h3>Photographs that are not in the result</h3>" + table(
             ("photograph", "reason"), [(f.image, f.reason) for f in result.failed]
@@ -67,221 +58,13 @@ def worked_section(result: SurveyResult, verdict: Verdict) -> str:
     return text
 
 
-def quality_section(result: SurveyResult, pictures: dict[str, str]) -> str:
-    """How good is it: precision of points, check at control, image coordinates, cameras."""
-    a = result.adjustment
-    sigma = point_sigmas(a)
-    limiting = np.sqrt(np.einsum("nii->ni", a.covariance.points_limiting))
-    factor, unit = finer_unit(result.length_unit, float(np.nanmax(sigma)))
-    text = "<h3>Object points</h3>"
-    text += table(
-        (f"standard deviation [{unit}]", "X", "Y", "Z", "all"),
-        [
-            (name, *(significant(value * factor) for value in (*columns, over_all)))
-            for name, columns, over_all in (
-                ("RMS", np.sqrt(np.nanmean(sigma**2, axis=0)), root_mean_square(sigma)),
-                ("largest", np.nanmax(sigma, axis=0), np.nanmax(sigma)),
-                (
-                    "RMS if the cameras were free of error",
-                    np.sqrt(np.nanmean(limiting**2, axis=0)),
-                    root_mean_square(limiting),
-                ),
-            )
-        ],
-    )
-    text += (
-        "<p class=note>Standard deviations are a posteriori and in the datum of the adjustment "
-        f"({escape(a.datum)}); in a free network they say how the points lie to one another, not in an outer "
-        "frame.</p>"
-    )
-    text += _control(result)
-    text += "<h3>Image coordinates</h3>"
-    text += table(
-        ("", "px"),
-        [
-            ("sigma0, a posteriori standard deviation of a coordinate", f"{a.sigma0_px:.5f}"),
-            ("RMS residual per coordinate", f"{a.rms_px:.5f}"),
-            ("longest residual vector among the accepted", f"{a.max_residual_px:.4f}"),
-            ("mean redundancy number (0 none, 1 full control)", f"{np.nanmean(a.redundancy_numbers):.3f}"),
-        ],
-    )
-    text += pictures.get("distribution", "") + pictures.get("residuals", "")
-    text += "<h3>Cameras</h3>"
-    for index, camera in enumerate(a.estimate.cameras):
-        s = parameter_sigmas(a, index)
-        rows = [
-            (
-                name,
-                *with_exponent(value, s[k]),
-                raised(unit),
-                f"{abs(value) / s[k]:.1f}" if np.isfinite(s[k]) and s[k] > 0 else "",
-            )
-            for k, (name, value, unit) in enumerate(
-                zip(camera.names, camera.parameters, camera.units, strict=True)
-            )
-            if camera.free[k] or value != 0
-        ]
-        width, height = camera.size_px
-        text += (
-            f"<h4>{escape(camera.name)}</h4><p class=note>model {escape(camera.model)}, {width} x "
-            f"{height} px of {camera.pixel_mm[0] * 1e3:.5g} x {camera.pixel_mm[1] * 1e3:.5g} &micro;m</p>"
-        )
-        text += table(("parameter", "value", "sigma", "unit", "value / sigma"), rows)
-    text += "<h3>Photographs</h3>" + pictures.get("photographs", "")
-    return text
+def coordinates_section(result: SurveyResult, *, has_model: bool) -> str:
+    """Where are my coordinates: the files, and the coordinates themselves.
 
-
-def _control(result: SurveyResult) -> str:
-    """Return the differences at control that took no part, nothing if there is none."""
-    check = result.control_check
-    if check is None:
-        return ""
-    factor, unit = finer_unit(result.length_unit, float(np.abs(check.differences).max()))
-    rows = [
-        (name, *(signed(v) for v in d), significant(float(np.linalg.norm(d))))
-        for name, d in zip(check.points, check.differences * factor, strict=True)
-    ]
-    rms = check.rms * factor
-    rows.append(("RMS", *(significant(v) for v in rms), significant(float(np.linalg.norm(rms)))))
-    return (
-        "<h3>Check at the control</h3><p class=note>The control took no part in the adjustment. The result "
-        f"was placed on it afterwards by shift, rotation and scale ({check.scale:.9g}); what remains at each "
-        f"point, placed minus nominal [{escape(unit)}]:</p>"
-        + table(("control point", "dX", "dY", "dZ", "length"), rows)
-    )
-
-
-def rejected_section(result: SurveyResult) -> str:
-    """What was thrown out and why: image points by the test, candidates by their looks."""
-    a = result.adjustment
-    rejected = np.flatnonzero(a.rejected)
-    total = len(a.rejected)
-    text = (
-        f"<p>{len(rejected)} of {total} image points were rejected in the adjustment"
-        f" ({100 * len(rejected) / max(total, 1):.1f} %). Their residuals are too long for their standard "
-        "deviations; they took no part in the result.</p>"
-    )
-    if len(rejected):
-        length = np.linalg.norm(a.residuals[rejected], axis=1)
-        order = rejected[np.argsort(-np.nan_to_num(length, nan=np.inf))]
-        seen = a.network.image_points
-        text += table(
-            ("photograph", "point", "x [px]", "y [px]", "vx [px]", "vy [px]", "length [px]"),
-            [
-                (
-                    a.network.images[seen.image[k]],
-                    a.network.points[seen.point[k]],
-                    f"{seen.xy[k, 0]:.2f}",
-                    f"{seen.xy[k, 1]:.2f}",
-                    f"{a.residuals[k, 0]:+.3f}",
-                    f"{a.residuals[k, 1]:+.3f}",
-                    f"{np.linalg.norm(a.residuals[k]):.3f}",
-                )
-                for k in order[:MAX_REJECTED_ROWS]
-            ],
-        )
-        if len(order) > MAX_REJECTED_ROWS:
-            text += f"<p class=note>The {MAX_REJECTED_ROWS} longest; all are in image_points.csv.</p>"
-    if result.photographs:
-        text += _rejected_candidates(result)
-    return text
-
-
-def _rejected_candidates(result: SurveyResult) -> str:
-    """Return what was seen in the photographs but not measured, by reason and photograph."""
-    by_photograph = [dict(photograph.reasons()) for photograph in result.photographs]
-    total: dict[str, int] = {}
-    for counts in by_photograph:
-        for reason, count in counts.items():
-            total[reason] = total.get(reason, 0) + count
-    reasons = sorted(total, key=lambda reason: (-total[reason], reason))
-    used = dict(zip(result.adjustment.network.images, image_rms(result.adjustment)[1], strict=True))
-    rows = [
-        (
-            photograph.image,
-            str(len(photograph.xy)),
-            str(int(used.get(photograph.image, 0))),
-            *(str(counts.get(reason, "")) for reason in reasons),
-        )
-        for photograph, counts in zip(result.photographs, by_photograph, strict=True)
-    ]
-    rows.append(
-        (
-            "all",
-            str(sum(len(photograph.xy) for photograph in result.photographs)),
-            str(int(sum(used.values()))),
-            *(str(total[reason]) for reason in reasons),
-        )
-    )
-    return (
-        "<h3>Candidates in the photographs</h3><p class=note>Blobs that might have been targets and were not "
-        "measured, by reason. Clutter in view makes many of them; the overlays show each.</p>"
-        + table(("photograph", "measured", "accepted in the result", *reasons), rows, last_bold=True)
-    )
-
-
-def comparison_section(result: SurveyResult) -> str:
-    """Does the other adjuster agree: the verdict first, then both in numbers."""
-    both = result.comparison
-    if both is None:
-        return "<p>The survey asked for no comparison.</p>"
-    d = both.comparison
-    unit = result.length_unit
-    name = both.backend
-    verdict = (
-        f"Yes: kolinear and {name} end at the same optimum."
-        if both.agree
-        else f"No: kolinear and {name} do not end at the same optimum."
-    )
-    text = f'<p class="verdict {"good" if both.agree else "bad"}">{escape(verdict)}</p>'
-    if not both.agree:
-        reasons = list(d.exceeded)
-        reasons += [] if both.adjustment.converged else ["kolinear did not converge in this model"]
-        reasons += [] if both.backend_converged else [f"{name} did not converge"]
-        text += "<ul>" + "".join(f"<li>{escape(reason)}</li>" for reason in reasons) + "</ul>"
-    survey_model = " and ".join(sorted({camera.model for camera in result.adjustment.estimate.cameras}))
-    text += (
-        f"<p>Both adjusters had the {len(both.network.image_points)} accepted image points with equal "
-        f"weights in the camera model {escape(both.model)} (the survey's own: {escape(survey_model)}), "
-        "without control and scale bars. One solution is brought onto the other by shift, rotation "
-        "and scale before anything is compared.</p>"
-    )
-    text += table(
-        ("", "kolinear", name, "unit"),
-        [
-            ("RMS residual per coordinate", f"{d.rms_px[0]:.9f}", f"{d.rms_px[1]:.9f}", "px"),
-            ("cost (half the sum of squares)", f"{d.cost[0]:.9g}", f"{d.cost[1]:.9g}", "px\u00b2"),
-            ("converged", yes_or_no(both.adjustment.converged), yes_or_no(both.backend_converged), ""),
-            ("iterations", str(both.adjustment.iterations), str(both.backend_iterations), ""),
-        ],
-    )
-    size = d.object_size
-    text += table(
-        ("largest difference", "value", "unit", "of the object size"),
-        [
-            ("projection centre", f"{d.max_position:.2e}", unit, f"{d.max_position / size:.1e}"),
-            ("object point", f"{d.max_point:.2e}", unit, f"{d.max_point / size:.1e}"),
-            ("rotation", f"{d.max_rotation_deg:.2e}", "deg", ""),
-            (
-                "interior orientation, in the photograph",
-                f"{np.nanmax(d.interior_px, initial=0.0):.2e}",
-                "px",
-                "",
-            ),
-        ],
-    )
-    notes = [
-        f"{conversion.camera.name}: {conversion.source_model} written as {both.model} differs by "
-        f"{conversion.rms_px:.4f} px RMS, {conversion.max_px:.4f} px at most"
-        for conversion in both.conversions
-        if conversion.source_model != both.model
-    ]
-    notes += [f"free in the comparison besides the survey's own: {line}" for line in both.freed]
-    return text + "".join(f"<p class=note>{escape(note)}</p>" for note in notes)
-
-
-def coordinates_section(result: SurveyResult) -> str:
-    """Where are my coordinates: the files, and the coordinates themselves."""
+    Args:
+        result: the result.
+        has_model: whether the folder holds the compared solution as a COLMAP model.
+    """
     unit = result.length_unit
     listed = [
         ("points.csv", f"object points: X, Y, Z and standard deviations [{unit}], number of rays, code"),
@@ -292,13 +75,18 @@ def coordinates_section(result: SurveyResult) -> str:
         ("cameras.csv", "interior orientation with standard deviations and units"),
         (
             "image_points.csv",
-            "image points [px], (0, 0) is the centre of the top-left pixel; residuals; rejected",
+            "image points [px], (0, 0) is the centre of the top-left pixel; residuals; rejected"
+            + ("" if result.eccentricity is None else "; corrected for eccentricity (the circle's centre)"),
         ),
         ("points.ply", f"the object points as a point cloud [{unit}]"),
         ("summary.json", "the figures of this page for programs"),
     ]
-    if result.comparison is not None:
-        listed.append(("colmap/", f"the solution in {result.comparison.model} as a COLMAP model"))
+    if result.comparison is not None and has_model:
+        what = (
+            f"the solution that was compared, in COLMAP's camera model ({result.comparison.model}): free "
+            "datum, equal weights, without control and scale bars; the survey's result are the tables above"
+        )
+        listed.append(("colmap/", what))
     text = "<p>In the folder of this report:</p><table>"
     for name, what in listed:
         text += f'<tr><th scope=row><a href="{name}">{name}</a></th><td>{escape(what)}</td></tr>'
@@ -369,11 +157,27 @@ def process_section(result: SurveyResult) -> str:
     total = sum(time.seconds for time in result.seconds)
     rows = [(time.stage, f"{time.seconds:.2f}") for time in result.seconds]
     rows.append(("all", f"{total:.2f}"))
-    return table(("stage", "seconds"), rows, last_bold=True) + (
-        "<p class=note>Pixel frame: (0, 0) is the centre of the top-left pixel, x to the right, y down. "
-        "Rotation: R = Rx(omega) Ry(phi) Rz(kappa) turns image axes (x right, y up, looking along -z) into "
-        "object axes. "
-        "Residuals are computed minus measured. A sigma is one standard deviation.</p>"
+    return (
+        table(("stage", "seconds"), rows, last_bold=True)
+        + _eccentricity(result)
+        + (
+            "<p class=note>Pixel frame: (0, 0) is the centre of the top-left pixel, x to the right, y down. "
+            "Rotation: R = Rx(omega) Ry(phi) Rz(kappa) turns image axes (x right, y up, looking along -z) "
+            "into object axes. "
+            "Residuals are computed minus measured. A sigma is one standard deviation.</p>"
+        )
+    )
+
+
+def _eccentricity(result: SurveyResult) -> str:
+    """How the centres of ellipses became those of circles."""
+    found = result.eccentricity
+    if found is None:
+        return ""
+    return (
+        "<p>Eccentricity: the centre of an ellipse is not the picture of the circle's centre. Image points "
+        f"were corrected by {found.rms_px:.4f} px RMS per coordinate, {found.largest_px:.4f} px at most; the "
+        f"correction has a standard deviation of {found.sigma_px:.5f} px, which is part of theirs.</p>"
     )
 
 

@@ -1,4 +1,4 @@
-"""The tables of a result: summary.json, points.csv, images.csv, cameras.csv, image_points.csv, points.ply.
+"""The tables of a result: points.csv, images.csv, cameras.csv, image_points.csv, points.ply.
 
 Degrees in files, the object unit of the survey, sigmas are standard deviations a posteriori (those of image
 points: as measured). Numbers are written with enough digits to give the same number back.
@@ -7,11 +7,9 @@ points: as measured). Numbers are written with enough digits to give the same nu
 from __future__ import annotations
 
 import csv
-import json
 import math
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -23,7 +21,7 @@ UNCODED = -1
 
 
 def write_tables(result: SurveyResult, folder: Path) -> None:
-    """Write all tables of a result into a folder.
+    """Write all tables of a result into a folder; `summary.write_summary` adds the figures.
 
     Args:
         result: the result.
@@ -43,64 +41,6 @@ def write_tables(result: SurveyResult, folder: Path) -> None:
         image_point_rows(adjustment),
     )
     write_ply(folder / "points.ply", result)
-    text = json.dumps(summary(result), indent=2, ensure_ascii=False, allow_nan=False)
-    (folder / "summary.json").write_text(text + "\n", encoding="utf-8")
-
-
-def summary(result: SurveyResult) -> dict[str, Any]:
-    """Return what summary.json holds: plain values only, None for what is not known."""
-    adjustment = result.adjustment
-    coded = int((result.code != UNCODED).sum())
-    return {
-        "survey": result.survey,
-        "unit": result.unit,
-        "converged": adjustment.converged,
-        "iterations": adjustment.iterations,
-        "images": {
-            "used": len(adjustment.network.images),
-            "total": result.images_total,
-            "failed": [{"image": f.image, "reason": f.reason} for f in result.failed],
-        },
-        "points": {"total": len(result.code), "coded": coded, "uncoded": len(result.code) - coded},
-        "observations": {
-            "used": int((~adjustment.rejected).sum()),
-            "rejected": int(adjustment.rejected.sum()),
-        },
-        "unknowns": adjustment.unknowns,
-        "redundancy": adjustment.redundancy,
-        "datum": {
-            "kind": adjustment.datum,
-            "defect": adjustment.defect,
-            "expected_defect": adjustment.expected_defect,
-            "undetermined": list(adjustment.undetermined),
-        },
-        "sigma0_px": _number(adjustment.sigma0_px),
-        "rms_px": _number(adjustment.rms_px),
-        "max_residual_px": _number(adjustment.max_residual_px),
-        "cameras": [
-            {
-                "name": camera.name,
-                "model": camera.model,
-                "size_px": list(camera.size_px),
-                "pixel_mm": [_number(value) for value in camera.pixel_mm],
-                "parameters": {
-                    name: {"value": _number(value), "sigma": _number(sigma), "unit": unit}
-                    for name, value, sigma, unit in zip(
-                        camera.names,
-                        camera.parameters,
-                        parameter_sigmas(adjustment, index),
-                        camera.units,
-                        strict=True,
-                    )
-                },
-            }
-            for index, camera in enumerate(adjustment.estimate.cameras)
-        ],
-        "control": _control(result),
-        "comparison": _comparison(result),
-        "warnings": list(result.warnings),
-        "seconds": {time.stage: round(time.seconds, 3) for time in result.seconds},
-    }
 
 
 def point_rows(result: SurveyResult) -> Iterable[Sequence[object]]:
@@ -207,41 +147,6 @@ def write_ply(path: Path, result: SurveyResult) -> None:
     path.write_text("\n".join(lines) + "\n", encoding="ascii")
 
 
-def _control(result: SurveyResult) -> dict[str, Any] | None:
-    check = result.control_check
-    if check is None:
-        return None
-    return {
-        "scale": _number(check.scale),
-        "rms": [_number(value) for value in check.rms],
-        "differences": {
-            name: [_number(value) for value in difference]
-            for name, difference in zip(check.points, check.differences, strict=True)
-        },
-    }
-
-
-def _comparison(result: SurveyResult) -> dict[str, Any] | None:
-    both = result.comparison
-    if both is None:
-        return None
-    difference = both.comparison
-    return {
-        "backend": both.backend,
-        "agree": both.agree,
-        "model": both.model,
-        "max_position": _number(difference.max_position),
-        "max_rotation_deg": _number(difference.max_rotation_deg),
-        "max_point": _number(difference.max_point),
-        "max_interior_px": _number(float(np.nanmax(difference.interior_px, initial=0.0))),
-        "object_size": _number(difference.object_size),
-        "rms_px": {"kolinear": difference.rms_px[0], both.backend: difference.rms_px[1]},
-        "cost": {"kolinear": difference.cost[0], both.backend: difference.cost[1]},
-        "exceeded": list(difference.exceeded),
-        "held": list(both.held),
-    }
-
-
 def _write_csv(path: Path, header: str, rows: Iterable[Sequence[object]]) -> None:
     with path.open("w", encoding="utf-8", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
@@ -254,10 +159,6 @@ def _text(value: object) -> str:
     if isinstance(value, float | np.floating):
         return repr(float(value)) if math.isfinite(value) else ""
     return str(value)
-
-
-def _number(value: float) -> float | None:
-    return float(value) if math.isfinite(value) else None
 
 
 def _ascii(text: str) -> str:

@@ -5,9 +5,28 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
+import numpy as np
+
+from sfm.report.checks import (
+    bar_residuals,
+    check_over_sigma,
+    control_residuals,
+    longest_residual,
+    object_size,
+    sigma0_ratio,
+)
+from sfm.report.markup import finer_unit, significant
 from sfm.report.result import SurveyResult
 
 MUCH_REJECTED = 0.05  # share of rejected image points above which a person should look
+# sigma_px is a rough guess, so the global test alone says little. Twice the guess is worth a look; five
+# times is no precision that anybody expected, but a wrong model, wrong names or wrong control.
+SIGMA0_REMARK, SIGMA0_BAD = 2.0, 5.0
+# Data snooping leaves nothing beyond 4 or 5 sigma; ten is an outlier, thirty is a mistake that was kept.
+RESIDUAL_REMARK, RESIDUAL_BAD = 10.0, 30.0
+WEIGHTED_REMARK, WEIGHTED_BAD = 5.0, 30.0  # control and scale bars, in their own standard deviations
+CHECK_REMARK = 100.0  # differences at control in sigmas: datum and print are never as good as the network
+MISCLOSURE_BAD = 0.01  # of the size of the object, or of a length: no measurement, a mistake
 
 
 @dataclass(frozen=True)
@@ -20,14 +39,14 @@ class Verdict:
 
 
 def verdict_of(result: SurveyResult) -> Verdict:
-    """Judge a result by convergence, rank, photographs, rejections and the comparison.
+    """Judge a result by convergence, rank, sigma0, residuals, control, photographs and the comparison.
 
     Args:
         result: the result.
 
     Returns:
-        `bad` if the adjustment did not converge or something cannot be determined; `fair` if there is
-        something to look at; else `good`.
+        `bad` if the adjustment did not converge, something cannot be determined, or the observations
+        contradict one another; `fair` if there is something to look at; else `good`.
     """
     a = result.adjustment
     oriented, total = len(a.network.images), result.images_total
@@ -39,7 +58,10 @@ def verdict_of(result: SurveyResult) -> Verdict:
         serious.append(
             f"Rank defect {a.defect}, expected {a.expected_defect}; not everything can be determined{what}."
         )
-    remarks = []
+    remarks: list[str] = []
+    for judge in (_sigma0, _residual, _control, _bars, _check):
+        for is_bad, line in judge(result):
+            (serious if is_bad else remarks).append(line)
     if oriented < total:
         remarks.append(f"{total - oriented} of {total} photographs are not in the result.")
     rejected = int(a.rejected.sum())
@@ -55,3 +77,101 @@ def verdict_of(result: SurveyResult) -> Verdict:
     if remarks:
         return Verdict("fair", f"The survey worked, with remarks: {found}.", tuple(remarks))
     return Verdict("good", f"The survey worked: {found}.", ())
+
+
+Judged = list[tuple[bool, str]]  # whether the result cannot be depended on, and why
+
+
+def _sigma0(result: SurveyResult) -> Judged:
+    """Judge sigma0 a posteriori over a priori."""
+    ratio = sigma0_ratio(result)
+    if not ratio > SIGMA0_REMARK:
+        return []
+    a = result.adjustment
+    line = (
+        f"Sigma0 is {significant(ratio)} times the expected standard deviation of an image coordinate "
+        f"({significant(a.a_priori_px / result.weight_factor)} px): "
+    )
+    if ratio > SIGMA0_BAD:
+        return [(True, line + "points, control or the camera contradict the photographs.")]
+    return [(False, line + "see the residuals, or set sigma_px to what the photographs give.")]
+
+
+def _residual(result: SurveyResult) -> Judged:
+    """Judge the longest accepted residual."""
+    ratio, worst = longest_residual(result.adjustment)
+    if not ratio > RESIDUAL_REMARK:
+        return []
+    network = result.adjustment.network
+    image = network.images[network.image_points.image[worst]]
+    point = network.points[network.image_points.point[worst]]
+    length = float(np.linalg.norm(result.adjustment.residuals[worst]))
+    line = (
+        f"Point {point} in {image} has a residual of {significant(length)} px, {significant(ratio)} times "
+        "the standard deviation, and was not rejected."
+    )
+    return [(ratio > RESIDUAL_BAD, line)]
+
+
+def _control(result: SurveyResult) -> Judged:
+    """Judge the residuals of weighted control."""
+    found = control_residuals(result.adjustment)
+    if found is None or not np.isfinite(found.ratio).any():
+        return []
+    size = np.nanmax(np.abs(found.ratio), axis=1, initial=0.0)
+    worst = int(np.argmax(size))
+    if not size[worst] > WEIGHTED_REMARK:
+        return []
+    line = (
+        f"Control point {found.points[worst]} differs from its given coordinates by "
+        f"{significant(float(size[worst]))} times its standard deviation."
+    )
+    return [(bool(size[worst] > WEIGHTED_BAD), line)]
+
+
+def _bars(result: SurveyResult) -> Judged:
+    """Judge the residuals of scale bars."""
+    found = bar_residuals(result.adjustment)
+    if found is None:
+        return []
+    ratio = np.nan_to_num(np.abs(found.ratio))
+    worst = int(np.argmax(ratio))
+    relative = abs(float(found.difference[worst] / found.length[worst]))
+    if not ratio[worst] > WEIGHTED_REMARK:
+        return []
+    start, end = found.names[worst]
+    line = (
+        f"Scale bar {start} - {end} differs from its given length by {significant(float(ratio[worst]))} "
+        f"times its standard deviation ({significant(100 * relative)} %)."
+    )
+    return [(bool(ratio[worst] > WEIGHTED_BAD or relative > MISCLOSURE_BAD), line)]
+
+
+def _check(result: SurveyResult) -> Judged:
+    """Judge the differences at control that took no part."""
+    check = result.control_check
+    if check is None:
+        return []
+    judged: Judged = []
+    if result.adjustment.network.scale_bars and abs(check.scale - 1) > MISCLOSURE_BAD:
+        line = f"The control says lengths are {check.scale:.6g} times those of the scale bars."
+        judged.append((True, line))
+    length = np.linalg.norm(check.differences, axis=1)
+    worst = int(np.argmax(length))
+    part = float(length[worst]) / object_size(result.adjustment.estimate.points)
+    sigmas = np.nan_to_num(check_over_sigma(result, check))
+    factor, unit = finer_unit(result.length_unit, float(length[worst]))
+    said = f"differs from its given place by {significant(float(length[worst]) * factor)} {unit}"
+    if part > MISCLOSURE_BAD:
+        line = f"Control point {check.points[worst]} {said}, {significant(100 * part)} % of the object."
+        judged.append((True, line))
+    elif sigmas.max(initial=0.0) > CHECK_REMARK:
+        worst = int(np.argmax(sigmas))
+        factor, unit = finer_unit(result.length_unit, float(length[worst]))
+        line = (
+            f"Control point {check.points[worst]} differs from its given place by "
+            f"{significant(float(length[worst]) * factor)} {unit}, {significant(float(sigmas[worst]))} times "
+            "its precision."
+        )
+        judged.append((False, line))
+    return judged

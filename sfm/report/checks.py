@@ -1,0 +1,183 @@
+"""How well the observations agree with one another: residuals in standard deviations, control and bars.
+
+What a verdict rests on. Standard deviations are those stated before the adjustment; sigma0 tells by how
+much they were wrong, and must not hide it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sfm.adjustment.result import Adjustment
+from sfm.adjustment.weighted import observed
+from sfm.conventions import BoolArray, FloatArray, IntArray
+from sfm.report.result import ControlCheck, SurveyResult
+
+MEDIAN_LENGTH = 1.1774  # median length of a normal vector in the plane over its sigma: sqrt(2 ln 2)
+
+
+@dataclass(frozen=True)
+class ObservationCounts:
+    """Scalar observations of an adjustment by type."""
+
+    image: int  # image coordinates that were accepted
+    control: int  # weighted coordinates of control; fixed ones are no observations
+    exterior: int  # observed parameters of exterior orientation
+    interior: int  # observed parameters of interior orientation
+    scale_bars: int
+    constraints: int  # of the datum
+    total: int  # without the constraints
+
+
+@dataclass(frozen=True)
+class WorstResiduals:
+    """The accepted image points with the largest standardised residuals."""
+
+    row: IntArray  # index among the image points, (w,)
+    v: FloatArray  # residual, px, (w, 2)
+    w: FloatArray  # Baarda's w of the worse coordinate, (w,)
+    tau: FloatArray  # Pope's tau of the same coordinate, (w,)
+
+
+@dataclass(frozen=True)
+class ControlResiduals:
+    """Residuals of control that took part with a weight."""
+
+    points: tuple[str, ...]  # names, (n,)
+    difference: FloatArray  # adjusted minus given X, Y, Z, object unit, (n, 3)
+    sigma: FloatArray  # given standard deviations; NaN where not observed, 0 where fixed, (n, 3)
+    ratio: FloatArray  # difference over sigma; NaN where fixed or not observed, (n, 3)
+
+
+@dataclass(frozen=True)
+class BarResiduals:
+    """Residuals of scale bars."""
+
+    names: tuple[tuple[str, str], ...]  # the two ends, (b,)
+    length: FloatArray  # given, object unit, (b,)
+    difference: FloatArray  # adjusted minus given, object unit, (b,)
+    sigma: FloatArray  # given, object unit, (b,)
+    ratio: FloatArray  # difference over sigma, (b,)
+
+
+def sigma0_ratio(result: SurveyResult) -> float:
+    """Return the a posteriori over the stated a priori standard deviation of the image coordinates.
+
+    Where the image points were weighted anew by their own variance component, that factor is put back in.
+    """
+    return float(result.adjustment.sigma0 * result.weight_factor)
+
+
+def longest_residual(adjustment: Adjustment) -> tuple[float, int]:
+    """Return the longest residual in standard deviations, and its index; (0, -1) without image points.
+
+    A residual of a reweighted image point counts as much as it did in the adjustment. The standard
+    deviation is the a priori one, or that which the median of the residuals shows if it is larger, so
+    that a cautious guess of it makes no good image point an outlier.
+    """
+    used = np.flatnonzero(~adjustment.rejected)
+    if not len(used):
+        return 0.0, -1
+    v = adjustment.residuals[used]
+    P = np.linalg.inv(adjustment.network.image_points.covariance[used])
+    length = np.sqrt(np.einsum("ka,kab,kb->k", v, P, v))
+    if len(adjustment.weights):
+        length = length * np.sqrt(adjustment.weights[used])
+    shown = float(np.median(length)) / MEDIAN_LENGTH
+    worst = int(np.argmax(length))
+    return float(length[worst] / max(1.0, shown)), int(used[worst])
+
+
+def count_observations(adjustment: Adjustment) -> ObservationCounts:
+    """Return how many observations of each type took part."""
+    network = adjustment.network
+    image = 2 * int((~adjustment.rejected).sum())
+    control = 0
+    if adjustment.datum == "control":
+        control = int(observed(_variances(network.control.covariance)).sum())
+    exterior = int(observed(_variances(network.exterior.covariance)).sum())
+    sigma = network.interior.sigma
+    interior = int(((sigma > 0) & np.isfinite(sigma)).sum())
+    bars = adjustment.observations - image - control - exterior - interior
+    return ObservationCounts(
+        image,
+        control,
+        exterior,
+        interior,
+        bars,
+        adjustment.redundancy - adjustment.observations + adjustment.unknowns,
+        adjustment.observations,
+    )
+
+
+def worst_residuals(adjustment: Adjustment, count: int = 10) -> WorstResiduals:
+    """Return the accepted image points with the largest standardised residuals, largest first."""
+    if len(adjustment.standardised) != len(adjustment.rejected):
+        none = np.zeros(0)
+        return WorstResiduals(np.zeros(0, dtype=np.int64), np.zeros((0, 2)), none, none)
+    w = np.nan_to_num(np.abs(adjustment.standardised))
+    size = np.where(adjustment.rejected, -1.0, w.max(axis=1, initial=0.0))
+    row = np.argsort(-size, kind="stable")[: min(count, int((~adjustment.rejected).sum()))]
+    axis = np.argmax(w[row], axis=1)
+    return WorstResiduals(
+        row, adjustment.residuals[row], adjustment.standardised[row, axis], adjustment.tau[row, axis]
+    )
+
+
+def control_residuals(adjustment: Adjustment) -> ControlResiduals | None:
+    """Return what control differs from its given coordinates; None where control took no part."""
+    control = adjustment.network.control
+    if adjustment.datum != "control" or not len(control):
+        return None
+    variance = _variances(control.covariance)
+    sigma = np.where(np.isfinite(variance), np.sqrt(variance), np.nan)
+    difference = adjustment.estimate.points[control.point] - control.xyz
+    names = tuple(adjustment.network.points[j] for j in control.point)
+    return ControlResiduals(names, difference, sigma, _ratio(difference, sigma, observed(variance)))
+
+
+def bar_residuals(adjustment: Adjustment) -> BarResiduals | None:
+    """Return by how much scale bars differ from their given lengths; None without scale bars."""
+    network, bars = adjustment.network, adjustment.network.scale_bars
+    if not len(bars):
+        return None
+    X = adjustment.estimate.points
+    difference = np.linalg.norm(X[bars.end] - X[bars.start], axis=1) - bars.length
+    names = tuple((network.points[i], network.points[j]) for i, j in zip(bars.start, bars.end, strict=True))
+    return BarResiduals(
+        names, bars.length, difference, bars.sigma, _ratio(difference, bars.sigma, bars.sigma > 0)
+    )
+
+
+def check_over_sigma(result: SurveyResult, check: ControlCheck) -> FloatArray:
+    """Return the length of each difference at control over the standard deviation expected of it, (n,).
+
+    Expected are the precision of the adjusted point and that of the control together.
+    """
+    a = result.adjustment
+    control = a.network.control
+    place = {a.network.points[j]: k for k, j in enumerate(control.point)}
+    known = [place[name] for name in check.points if name in place]
+    if len(known) != len(check.points):
+        return np.full(len(check.points), np.nan)
+    given = _variances(control.covariance[known])
+    given = np.where(np.isfinite(given), given, np.nan)
+    adjusted = _variances(a.covariance.points[control.point[known]])
+    expected = np.sqrt(np.nansum(given, axis=1) + adjusted.sum(axis=1))
+    length = np.linalg.norm(check.differences, axis=1)
+    return _ratio(length, expected, expected > 0)
+
+
+def object_size(points: FloatArray) -> float:
+    """Return the diagonal of the box around points, object unit."""
+    return float(np.linalg.norm(np.ptp(points, axis=0)))
+
+
+def _variances(covariance: FloatArray) -> FloatArray:
+    return np.asarray(np.einsum("nii->ni", covariance))
+
+
+def _ratio(difference: FloatArray, sigma: FloatArray, known: BoolArray) -> FloatArray:
+    return np.asarray(np.where(known, difference / np.where(known, sigma, 1.0), np.nan))

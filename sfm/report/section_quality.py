@@ -1,0 +1,68 @@
+"""How good is it: the part of the report on precision of points, image coordinates and cameras."""
+
+from __future__ import annotations
+
+from html import escape
+
+import numpy as np
+
+from sfm.report.markup import finer_unit, raised, significant, table, with_exponent
+from sfm.report.result import SurveyResult
+from sfm.report.section_statistics import camera_notes, components, control, image_coordinates, worst
+from sfm.report.tables import parameter_sigmas, point_sigmas, root_mean_square
+
+
+def quality_section(result: SurveyResult, pictures: dict[str, str]) -> str:
+    """How good is it: precision of points, check at control, image coordinates, cameras."""
+    a = result.adjustment
+    sigma = point_sigmas(a)
+    limiting = np.sqrt(np.einsum("nii->ni", a.covariance.points_limiting))
+    factor, unit = finer_unit(result.length_unit, float(np.nanmax(sigma)))
+    text = "<h3>Object points</h3>"
+    text += table(
+        (f"standard deviation [{unit}]", "X", "Y", "Z", "all"),
+        [
+            (name, *(significant(value * factor) for value in (*columns, over_all)))
+            for name, columns, over_all in (
+                ("RMS", np.sqrt(np.nanmean(sigma**2, axis=0)), root_mean_square(sigma)),
+                ("largest", np.nanmax(sigma, axis=0), np.nanmax(sigma)),
+                (
+                    "RMS if the cameras were free of error",
+                    np.sqrt(np.nanmean(limiting**2, axis=0)),
+                    root_mean_square(limiting),
+                ),
+            )
+        ],
+    )
+    text += (
+        "<p class=note>Standard deviations are a posteriori and in the datum of the adjustment "
+        f"({escape(a.datum)}); in a free network they say how the points lie to one another, not in an outer "
+        "frame.</p>"
+    )
+    text += control(result)
+    text += image_coordinates(result)
+    text += pictures.get("distribution", "") + pictures.get("residuals", "") + worst(result)
+    text += "<h3>Cameras</h3>"
+    for index, camera in enumerate(a.estimate.cameras):
+        s = parameter_sigmas(a, index)
+        rows = [
+            (
+                name,
+                *with_exponent(value, s[k]),
+                raised(unit),
+                f"{abs(value) / s[k]:.1f}" if np.isfinite(s[k]) and s[k] > 0 else "",
+            )
+            for k, (name, value, unit) in enumerate(
+                zip(camera.names, camera.parameters, camera.units, strict=True)
+            )
+            if camera.free[k] or value != 0
+        ]
+        width, height = camera.size_px
+        text += (
+            f"<h4>{escape(camera.name)}</h4><p class=note>model {escape(camera.model)}, {width} x "
+            f"{height} px of {camera.pixel_mm[0] * 1e3:.5g} x {camera.pixel_mm[1] * 1e3:.5g} &micro;m</p>"
+        )
+        text += table(("parameter", "value", "sigma", "unit", "value / sigma"), rows)
+    text += camera_notes(result)
+    text += "<h3>Photographs</h3>" + pictures.get("photographs", "")
+    return text + components(result)

@@ -1,0 +1,247 @@
+"""The statistics of an adjustment in the report: tests, worst residuals, control, bars, components."""
+
+from __future__ import annotations
+
+from html import escape
+
+import numpy as np
+
+from sfm.adjustment.statistics import (
+    STRONG,
+    Correlation,
+    VarianceComponents,
+    by_camera,
+    by_photograph,
+    correlations,
+    global_test,
+    significance,
+)
+from sfm.report.checks import (
+    bar_residuals,
+    control_residuals,
+    count_observations,
+    sigma0_ratio,
+    worst_residuals,
+)
+from sfm.report.markup import finer_unit, signed, significant, table
+from sfm.report.result import SurveyResult
+
+ALPHA = 0.05  # of the global test and of the significance of parameters
+SIGNIFICANT = 2.0  # value over sigma below which a parameter might as well be 0
+
+
+def image_coordinates(result: SurveyResult) -> str:
+    """Sigma0, the global test, residuals and redundancy, then the ten worst residuals."""
+    a = result.adjustment
+    test, r = global_test(a, alpha=ALPHA), a.redundancy_numbers
+    verdict = "passed" if test.passed else "NOT passed"
+    rows = [
+        ("sigma0, a posteriori standard deviation of a coordinate", f"{a.sigma0_px:.5f}", "px"),
+        ("standard deviation stated beforehand", f"{a.a_priori_px / result.weight_factor:.5f}", "px"),
+        ("a posteriori over a priori", f"{sigma0_ratio(result):.3f}", ""),
+        ("RMS residual per coordinate", f"{a.rms_px:.5f}", "px"),
+        ("longest residual vector among the accepted", f"{a.max_residual_px:.4f}", "px"),
+        (f"global test of v'Pv, {100 * ALPHA:.0f} %: {verdict}", f"{test.statistic:.2f}", ""),
+        ("its critical values, lower", f"{test.lower:.2f}", ""),
+        ("its critical values, upper", f"{test.upper:.2f}", ""),
+    ]
+    if np.isfinite(r).any():
+        rows += [
+            ("mean redundancy number (0 none, 1 full control)", f"{np.nanmean(r):.3f}", ""),
+            ("smallest redundancy number", f"{np.nanmin(r):.3f}", ""),
+        ]
+    text = "<h3>Image coordinates</h3>" + table(("", "value", "unit"), rows)
+    text += (
+        "<p class=note>The global test asks whether the standard deviation stated beforehand (sigma_px) is "
+        "that of the photographs. It is only a rough guess: a test that is not passed says by how much to "
+        "correct it, unless sigma0 is several times too large.</p>"
+    )
+    if result.weight_factor != 1:
+        text += (
+            "<p class=note>Before the final adjustment the standard deviations of the image points were "
+            f"multiplied by {result.weight_factor:.3f}, from their own variance component, so that control "
+            "and scale bars keep those stated for them. The test is that of the weights so found.</p>"
+        )
+    return text
+
+
+def worst(result: SurveyResult) -> str:
+    """The accepted image points with the largest standardised residuals."""
+    found = worst_residuals(result.adjustment)
+    if not len(found.row):
+        return ""
+    network = result.adjustment.network
+    seen = network.image_points
+    return f"<h3>The {len(found.row)} largest residuals that were accepted</h3>" + table(
+        ("photograph", "point", "vx [px]", "vy [px]", "w (Baarda)", "tau (Pope)"),
+        [
+            (
+                network.images[seen.image[k]],
+                network.points[seen.point[k]],
+                *(f"{value:+.3f}" for value in v),
+                f"{w:+.2f}",
+                f"{tau:+.2f}",
+            )
+            for k, v, w, tau in zip(found.row, found.v, found.w, found.tau, strict=True)
+        ],
+    )
+
+
+def observations(result: SurveyResult) -> str:
+    """How many observations of each type took part."""
+    counts = count_observations(result.adjustment)
+    rows = [
+        (name, str(count))
+        for name, count in (
+            ("image coordinates", counts.image),
+            ("coordinates of control with a standard deviation", counts.control),
+            ("parameters of exterior orientation", counts.exterior),
+            ("parameters of interior orientation", counts.interior),
+            ("scale bars", counts.scale_bars),
+        )
+        if count
+    ]
+    rows.append(("all", str(counts.total)))
+    text = "<h3>Observations</h3>" + table(("observations", "number"), rows, last_bold=True)
+    if counts.constraints:
+        text += f"<p class=note>Besides, {counts.constraints} constraints fix the datum.</p>"
+    return text
+
+
+def camera_notes(result: SurveyResult) -> str:
+    """What of the cameras cannot be told apart from something else, or from 0."""
+    a = result.adjustment
+    weak = [test for test in significance(a, alpha=ALPHA) if test.t < SIGNIFICANT]
+    strong = camera_correlations(result)
+    text = "<h3>Correlations and significance of camera parameters</h3>"
+    if strong:
+        text += table(
+            ("parameter", "and", "correlation [%]"),
+            [(pair.first, pair.second, f"{100 * pair.value:+.1f}") for pair in strong],
+        )
+        text += "<p class=note>So strongly correlated, each stands in for the other.</p>"
+    else:
+        text += f"<p>No two parameters of a camera are correlated beyond {100 * STRONG:.0f} %.</p>"
+    if weak:
+        names = ", ".join(f"{test.parameter} of {test.camera} ({test.t:.1f})" for test in weak)
+        text += (
+            f"<p>Not significant, the value is below {SIGNIFICANT:g} times its standard deviation: "
+            f"{escape(names)}. Held at 0, such a parameter would change nothing.</p>"
+        )
+    else:
+        text += (
+            f"<p>All adjusted parameters are significant (beyond {SIGNIFICANT:g} standard deviations).</p>"
+        )
+    return text
+
+
+def camera_correlations(result: SurveyResult) -> tuple[Correlation, ...]:
+    """Return the pairs of camera parameters that are strongly correlated, without those of photographs."""
+    a = result.adjustment
+    names = {f"{name} of camera {camera.name}" for camera in a.estimate.cameras for name in camera.names}
+    return tuple(pair for pair in correlations(a) if pair.first in names)
+
+
+def components(result: SurveyResult) -> str:
+    """Variance components of cameras and photographs."""
+    a = result.adjustment
+    text = "<h3>Variance components</h3><p class=note>Sigma0 of a group over that stated beforehand; a group "
+    text += "far above the others was measured worse, or does not fit.</p>"
+    text += table(("camera", "sigma0", "redundancy", "coordinates"), _component_rows(by_camera(a)))
+    rows = _component_rows(by_photograph(a))
+    return (
+        text
+        + f"<details><summary>{len(rows)} photographs</summary>"
+        + table(("photograph", "sigma0", "redundancy", "coordinates"), rows)
+        + "</details>"
+    )
+
+
+def _component_rows(found: VarianceComponents) -> list[tuple[str, ...]]:
+    return [
+        (name, f"{s:.3f}" if np.isfinite(s) else "not known", f"{r:.1f}", str(int(n)))
+        for name, s, r, n in zip(found.names, found.sigma0, found.redundancy, found.count, strict=True)
+    ]
+
+
+def control(result: SurveyResult) -> str:
+    """Differences at control: as a check where it took no part, as residuals where it did."""
+    return _check(result) + _control_residuals(result) + _bars(result)
+
+
+def _check(result: SurveyResult) -> str:
+    check = result.control_check
+    if check is None:
+        return ""
+    factor, unit = finer_unit(result.length_unit, float(np.abs(check.differences).max()))
+    rows = [
+        (name, *(signed(v) for v in d), significant(float(np.linalg.norm(d))))
+        for name, d in zip(check.points, check.differences * factor, strict=True)
+    ]
+    rms = check.rms * factor
+    rows.append(("RMS", *(significant(v) for v in rms), significant(float(np.linalg.norm(rms)))))
+    if result.adjustment.network.scale_bars:
+        placed = (
+            "by shift and rotation, in the scale of the scale bars; the control says lengths are "
+            f"{check.scale:.9g} times those of the scale bars."
+        )
+    else:
+        placed = "by shift, rotation and scale; the scale was taken from the control."
+    return (
+        "<h3>Check at the control</h3><p class=note>The control took no part in the adjustment. The result "
+        f"was placed on it afterwards {placed} What remains at each point, placed minus nominal "
+        f"[{escape(unit)}]:</p>" + table(("control point", "dX", "dY", "dZ", "length"), rows, last_bold=True)
+    )
+
+
+def _control_residuals(result: SurveyResult) -> str:
+    found = control_residuals(result.adjustment)
+    if found is None:
+        return ""
+    factor, unit = finer_unit(result.length_unit, float(np.nanmax(np.abs(found.difference), initial=0.0)))
+    rows = [
+        (
+            name,
+            *(signed(v) for v in d * factor),
+            *("not known" if np.isnan(v) else "fixed" if v == 0 else significant(v) for v in s * factor),
+            f"{np.nanmax(np.abs(q)):.2f}" if np.isfinite(q).any() else "",
+        )
+        for name, d, s, q in zip(found.points, found.difference, found.sigma, found.ratio, strict=True)
+    ]
+    return (
+        f"<h3>Control</h3><p class=note>Adjusted minus given, given standard deviations [{escape(unit)}], "
+        "and the largest difference over its standard deviation:</p>"
+        + table(("control point", "dX", "dY", "dZ", "sX", "sY", "sZ", "largest / s"), rows)
+    )
+
+
+def _bars(result: SurveyResult) -> str:
+    found = bar_residuals(result.adjustment)
+    if found is None:
+        return ""
+    largest = float(np.abs(np.concatenate([found.difference, found.sigma])).max())
+    factor, unit = finer_unit(result.length_unit, largest)
+    rows = [
+        (
+            f"{start} - {end}",
+            f"{found.length[b]:.9g}",
+            signed(found.difference[b] * factor),
+            significant(found.sigma[b] * factor),
+            f"{found.ratio[b]:+.2f}",
+        )
+        for b, (start, end) in enumerate(found.names)
+    ]
+    header = (
+        "scale bar",
+        f"given [{result.length_unit}]",
+        f"adjusted minus given [{unit}]",
+        f"sigma given [{unit}]",
+        "difference / sigma",
+    )
+    text = "<h3>Scale bars</h3>" + table(header, rows)
+    if len(rows) == 1 and result.adjustment.datum != "control":
+        text += (
+            "<p class=note>A single bar gives the scale and cannot be checked; two or more check one "
+            "another.</p>"
+        )
+    return text

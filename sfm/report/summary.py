@@ -1,0 +1,236 @@
+"""summary.json: the figures of a result for programs."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sfm.adjustment.result import Adjustment
+from sfm.adjustment.statistics import (
+    VarianceComponents,
+    by_camera,
+    by_photograph,
+    correlations,
+    global_test,
+    significance,
+)
+from sfm.report.checks import bar_residuals, control_residuals, count_observations, sigma0_ratio
+from sfm.report.result import SurveyResult
+from sfm.report.tables import UNCODED, parameter_sigmas
+from sfm.report.verdict import verdict_of
+
+
+def write_summary(result: SurveyResult, folder: Path) -> None:
+    """Write summary.json into an existing folder."""
+    text = json.dumps(summary(result), indent=2, ensure_ascii=False, allow_nan=False)
+    (folder / "summary.json").write_text(text + "\n", encoding="utf-8")
+
+
+def summary(result: SurveyResult) -> dict[str, Any]:
+    """Return what summary.json holds: plain values only, None for what is not known."""
+    adjustment = result.adjustment
+    coded = int((result.code != UNCODED).sum())
+    return {
+        "survey": result.survey,
+        "unit": result.unit,
+        "length_unit": result.length_unit,
+        "verdict": _verdict(result),
+        "converged": adjustment.converged,
+        "iterations": adjustment.iterations,
+        "images": {
+            "used": len(adjustment.network.images),
+            "total": result.images_total,
+            "failed": [{"image": f.image, "reason": f.reason} for f in result.failed],
+        },
+        "points": {"total": len(result.code), "coded": coded, "uncoded": len(result.code) - coded},
+        "observations": {
+            "used": int((~adjustment.rejected).sum()),
+            "rejected": int(adjustment.rejected.sum()),
+        },
+        "unknowns": adjustment.unknowns,
+        "redundancy": adjustment.redundancy,
+        "datum": {
+            "kind": adjustment.datum,
+            "defect": adjustment.defect,
+            "expected_defect": adjustment.expected_defect,
+            "undetermined": list(adjustment.undetermined),
+        },
+        "sigma0_px": _number(adjustment.sigma0_px),
+        "rms_px": _number(adjustment.rms_px),
+        "max_residual_px": _number(adjustment.max_residual_px),
+        "cameras": [
+            {
+                "name": camera.name,
+                "model": camera.model,
+                "size_px": list(camera.size_px),
+                "pixel_mm": [_number(value) for value in camera.pixel_mm],
+                "parameters": {
+                    name: {"value": _number(value), "sigma": _number(sigma), "unit": unit}
+                    for name, value, sigma, unit in zip(
+                        camera.names,
+                        camera.parameters,
+                        parameter_sigmas(adjustment, index),
+                        camera.units,
+                        strict=True,
+                    )
+                },
+            }
+            for index, camera in enumerate(adjustment.estimate.cameras)
+        ],
+        "statistics": _statistics(result),
+        "control": _control(result),
+        "scale_bars": _scale_bars(adjustment),
+        "eccentricity": _eccentricity(result),
+        "no_circles": list(result.no_circles),
+        "comparison": _comparison(result),
+        "warnings": list(result.warnings),
+        "seconds": {time.stage: round(time.seconds, 3) for time in result.seconds},
+    }
+
+
+def _verdict(result: SurveyResult) -> dict[str, Any]:
+    verdict = verdict_of(result)
+    return {"level": verdict.level, "headline": verdict.headline, "remarks": list(verdict.remarks)}
+
+
+def _statistics(result: SurveyResult) -> dict[str, Any]:
+    a = result.adjustment
+    test, counts, r = global_test(a), count_observations(a), a.redundancy_numbers
+    known = np.isfinite(r).any()
+    return {
+        "sigma0_ratio": _number(sigma0_ratio(result)),
+        "global_test": {
+            "vPv": _number(test.statistic),
+            "redundancy": test.redundancy,
+            "lower": _number(test.lower),
+            "upper": _number(test.upper),
+            "passed": test.passed,
+        },
+        "observations": {
+            "image_coordinates": counts.image,
+            "control": counts.control,
+            "exterior": counts.exterior,
+            "interior": counts.interior,
+            "scale_bars": counts.scale_bars,
+            "constraints": counts.constraints,
+            "total": counts.total,
+        },
+        "redundancy_number": {
+            "mean": _number(float(np.nanmean(r))) if known else None,
+            "min": _number(float(np.nanmin(r))) if known else None,
+        },
+        "sigma0_by_camera": _components(by_camera(a)),
+        "sigma0_by_photograph": _components(by_photograph(a)),
+        "correlations": [
+            {"first": pair.first, "second": pair.second, "value": _number(pair.value)}
+            for pair in correlations(a)
+        ],
+        "not_significant": [
+            {"camera": test.camera, "parameter": test.parameter, "t": _number(test.t)}
+            for test in significance(a)
+            if not test.significant
+        ],
+    }
+
+
+def _components(components: VarianceComponents) -> dict[str, float | None]:
+    return {name: _number(float(s)) for name, s in zip(components.names, components.sigma0, strict=True)}
+
+
+def _control(result: SurveyResult) -> dict[str, Any] | None:
+    check = result.control_check
+    if check is not None:
+        return {
+            "role": "check",
+            "scale": _number(check.scale),
+            "rms": [_number(value) for value in check.rms],
+            "differences": {
+                name: [_number(value) for value in difference]
+                for name, difference in zip(check.points, check.differences, strict=True)
+            },
+        }
+    found = control_residuals(result.adjustment)
+    if found is None:
+        return None
+    return {
+        "role": "datum",
+        "points": [
+            {
+                "id": name,
+                "difference": [_number(value) for value in difference],
+                "sigma": [_number(value) for value in sigma],
+                "ratio": [_number(value) for value in ratio],
+            }
+            for name, difference, sigma, ratio in zip(
+                found.points, found.difference, found.sigma, found.ratio, strict=True
+            )
+        ],
+    }
+
+
+def _scale_bars(adjustment: Adjustment) -> list[dict[str, Any]]:
+    found = bar_residuals(adjustment)
+    if found is None:
+        return []
+    return [
+        {
+            "from": start,
+            "to": end,
+            "length": _number(found.length[b]),
+            "difference": _number(found.difference[b]),
+            "sigma": _number(found.sigma[b]),
+            "ratio": _number(found.ratio[b]),
+        }
+        for b, (start, end) in enumerate(found.names)
+    ]
+
+
+def _eccentricity(result: SurveyResult) -> dict[str, Any] | None:
+    found = result.eccentricity
+    if found is None:
+        return None
+    return {
+        "largest_px": _number(found.largest_px),
+        "rms_px": _number(found.rms_px),
+        "sigma_px": _number(found.sigma_px),
+    }
+
+
+def _comparison(result: SurveyResult) -> dict[str, Any] | None:
+    both = result.comparison
+    if both is None:
+        return None
+    difference = both.comparison
+    return {
+        "backend": both.backend,
+        "agree": both.agree,
+        "model": both.model,
+        "max_position": _number(difference.max_position),
+        "max_rotation_deg": _number(difference.max_rotation_deg),
+        "max_point": _number(difference.max_point),
+        "max_interior_px": _number(float(np.nanmax(difference.interior_px, initial=0.0))),
+        "object_size": _number(difference.object_size),
+        "rms_px": {"kolinear": difference.rms_px[0], both.backend: difference.rms_px[1]},
+        "cost": {"kolinear": difference.cost[0], both.backend: difference.cost[1]},
+        "exceeded": list(difference.exceeded),
+        "held": list(both.held),
+        "freed": list(both.freed),
+        "conversions": [
+            {
+                "camera": one.camera.name,
+                "from": one.source_model,
+                "to": one.camera.model,
+                "rms_px": _number(one.rms_px),
+                "max_px": _number(one.max_px),
+            }
+            for one in both.conversions
+        ],
+    }
+
+
+def _number(value: float) -> float | None:
+    return float(value) if math.isfinite(value) else None

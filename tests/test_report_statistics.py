@@ -1,0 +1,325 @@
+"""Verdict and statistics of the report: broken surveys are called broken, statistics are what they say."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sfm.adjustment.datum import Datum
+from sfm.adjustment.result import Adjustment
+from sfm.adjustment.solve import adjust
+from sfm.adjustment.statistics import global_test
+from sfm.analysis.comparison import AdjusterComparison, BackendAdjustment, compare_adjusters
+from sfm.camera import Camera
+from sfm.network import Estimate, Network, ObjectPoints, ScaleBars
+from sfm.report.checks import (
+    bar_residuals,
+    control_residuals,
+    count_observations,
+    longest_residual,
+    worst_residuals,
+)
+from sfm.report.html import render_html
+from sfm.report.plots import all_plots, plan_axes
+from sfm.report.result import ControlCheck, Eccentricity, SurveyResult
+from sfm.report.section_statistics import camera_correlations
+from sfm.report.summary import summary
+from sfm.report.verdict import verdict_of
+from tests.synthetic import make_network, seed_of
+
+NOISE_PX = 0.1
+
+
+def result_of(adjustment: Adjustment, **other: object) -> SurveyResult:
+    return SurveyResult(
+        "synthetic",
+        "m",
+        len(adjustment.network.images),
+        (),
+        adjustment,
+        np.full(len(adjustment.network.points), -1),
+        None,
+        **other,  # type: ignore[arg-type]
+    )
+
+
+@pytest.fixture(scope="module")
+def synthetic() -> tuple[Network, Estimate]:
+    return make_network(seed_of("statistics"), images=8, points=40, noise_px=NOISE_PX)
+
+
+def with_control(network: Network, xyz: np.ndarray, sigma: float) -> Network:
+    covariance = np.tile(np.eye(3) * sigma**2, (len(xyz), 1, 1))
+    return replace(network, control=ObjectPoints(np.arange(len(xyz)), xyz, covariance))
+
+
+def with_bars(network: Network, truth: Estimate, errors: tuple[float, ...], sigma: float) -> Network:
+    start, end = np.arange(len(errors)), np.arange(len(errors)) + 10
+    length = np.linalg.norm(truth.points[end] - truth.points[start], axis=1) * (1 + np.array(errors))
+    return replace(network, scale_bars=ScaleBars(start, end, length, np.full(len(errors), sigma)))
+
+
+def spoiled(camera: Camera, factor: float) -> Camera:
+    parameters = camera.parameters.copy()
+    parameters[camera.names.index("c")] *= factor
+    return replace(camera, parameters=parameters)
+
+
+def test_a_good_survey_is_called_good(synthetic: tuple[Network, Estimate]) -> None:
+    network, truth = synthetic
+    for one, datum in (
+        (network, "free"),
+        (with_control(network, truth.points[:6], 1e-4), "control"),
+        (with_bars(network, truth, (0.0, 1e-4), 1e-4), "free"),
+    ):
+        verdict = verdict_of(result_of(adjust(one, truth, datum=Datum(datum))))  # type: ignore[arg-type]
+        assert verdict.level == "good", verdict
+
+
+@pytest.mark.parametrize("sigma", [0.0, 1e-3])
+def test_swapped_control_is_no_result(synthetic: tuple[Network, Estimate], sigma: float) -> None:
+    network, truth = synthetic
+    swapped = with_control(network, truth.points[[1, 0, 2, 3, 4, 5]], sigma)
+    verdict = verdict_of(result_of(adjust(swapped, truth, datum=Datum("control"), reject="none")))
+    assert verdict.level == "bad"
+    assert verdict.headline == "The survey has no dependable result."
+    assert any("Sigma0 is" in line or "Control point" in line for line in verdict.remarks)
+
+
+def test_a_scale_bar_that_contradicts_another_is_no_result(synthetic: tuple[Network, Estimate]) -> None:
+    network, truth = synthetic
+    barred = with_bars(network, truth, (0.0, 0.05), 1e-4)
+    a = adjust(barred, truth, datum=Datum("free"), reject="none")
+    verdict = verdict_of(result_of(a))
+    assert verdict.level == "bad"
+    assert any(line.startswith("Scale bar ") for line in verdict.remarks), verdict.remarks
+
+
+def test_a_wrong_fixed_camera_is_no_result() -> None:
+    network, truth = make_network(seed_of("fixed"), images=8, points=40, noise_px=NOISE_PX, free=())
+    wrong = replace(truth, cameras=tuple(spoiled(camera, 1.05) for camera in truth.cameras))
+    a = adjust(network, wrong, datum=Datum("free"), reject="none")
+    assert a.sigma0 > 5
+    assert verdict_of(result_of(a)).level == "bad"
+
+
+def test_blunders_left_in_are_no_result(synthetic: tuple[Network, Estimate]) -> None:
+    network, truth = synthetic
+    seen = network.image_points
+    xy = seen.xy.copy()
+    blunders = seed_of("blunders").choice(len(xy), 3, replace=False)
+    xy[blunders] += (8.0, -8.0)
+    a = adjust(replace(network, image_points=replace(seen, xy=xy)), truth, datum=Datum("free"), reject="none")
+    verdict = verdict_of(result_of(a))
+    assert verdict.level == "bad"
+    assert any("was not rejected" in line for line in verdict.remarks)
+    assert longest_residual(a)[1] in blunders
+
+
+def test_sigma_px_is_only_a_guess(synthetic: tuple[Network, Estimate]) -> None:
+    network, truth = synthetic
+    seen = network.image_points
+    levels = {}
+    for guess in (4.0, 1 / 1.5, 1 / 3, 1 / 8):  # of the true standard deviation
+        stated = replace(network, image_points=replace(seen, covariance=seen.covariance * guess**2))
+        a = adjust(stated, truth, datum=Datum("free"), reject="none")
+        assert not global_test(a).passed
+        levels[guess] = verdict_of(result_of(a)).level
+    assert levels == {4.0: "good", 1 / 1.5: "good", 1 / 3: "fair", 1 / 8: "bad"}
+
+
+def test_weights_found_from_the_residuals_do_not_hide_sigma0(synthetic: tuple[Network, Estimate]) -> None:
+    network, truth = synthetic
+    a = adjust(network, truth, datum=Datum("free"))
+    assert verdict_of(result_of(a, weight_factor=3.0)).level == "fair"
+    bad = verdict_of(result_of(a, weight_factor=200.0))
+    assert bad.level == "bad"
+    assert "expected standard deviation of an image coordinate (0.0005" in bad.remarks[0]
+    text = summary(result_of(a, weight_factor=3.0))
+    assert text["statistics"]["sigma0_ratio"] == pytest.approx(3 * a.sigma0)
+
+
+def test_control_that_only_checks() -> None:
+    network, truth = make_network(seed_of("checks"), images=8, points=40, noise_px=0.02)
+    known = with_control(network, truth.points[:4], 1e-5)
+    a = adjust(known, truth, datum=Datum("free"))
+    names = a.network.points[:4]
+
+    def level(differences: float, *, scale: float = 1.0, bars: bool = False) -> str:
+        d = np.zeros((4, 3))
+        d[2] = (differences, 0, 0)
+        one = a
+        if bars:
+            one = adjust(with_bars(known, truth, (0.0,), 1e-4), truth, datum=Datum("free"))
+        return verdict_of(result_of(one, control_check=ControlCheck(names, d, scale))).level
+
+    assert level(2e-4) == "good"
+    expected = np.sqrt(np.trace(a.covariance.points[2]) + 3e-10)
+    size = np.linalg.norm(np.ptp(a.estimate.points, axis=0))
+    assert 120 * expected < 0.009 * size
+    assert level(80 * expected) == "good"
+    assert level(120 * expected) == "fair"
+    assert level(0.05) == "bad"
+    assert level(2e-4, scale=1.001, bars=True) == "good"
+    assert level(2e-4, scale=1.05, bars=True) == "bad"
+
+
+def test_words_for_the_scale_of_the_control(synthetic: tuple[Network, Estimate]) -> None:
+    network, truth = synthetic
+    known = with_control(network, truth.points[:4], 1e-4)
+    check = ControlCheck(network.points[:4], np.full((4, 3), 1e-4), 1.0025)
+    free = result_of(adjust(known, truth, datum=Datum("free")), control_check=check)
+    assert "scale was taken from the control" in render_html(free, (), ())
+    bars = with_bars(known, truth, (0.0,), 1e-4)
+    barred = result_of(adjust(bars, truth, datum=Datum("free")), control_check=check)
+    page = render_html(barred, (), ())
+    assert "the control says lengths are 1.0025 times those of the scale bars" in page
+    assert "A single bar gives the scale" in page
+
+
+def test_residuals_of_control_and_bars_are_adjusted_minus_given(
+    synthetic: tuple[Network, Estimate],
+) -> None:
+    network, truth = synthetic
+    known = with_bars(with_control(network, truth.points[:6] + 2e-4, 1e-3), truth, (1e-4, -1e-4), 1e-4)
+    a = adjust(known, truth, datum=Datum("control"))
+    control, bars = control_residuals(a), bar_residuals(a)
+    assert control is not None and bars is not None
+    np.testing.assert_allclose(control.difference, a.estimate.points[:6] - truth.points[:6] - 2e-4)
+    np.testing.assert_allclose(control.ratio, control.difference / 1e-3)
+    adjusted = np.linalg.norm(a.estimate.points[[10, 11]] - a.estimate.points[[0, 1]], axis=1)
+    np.testing.assert_allclose(bars.difference, adjusted - known.scale_bars.length, atol=1e-15)
+    text = summary(result_of(a))
+    assert text["control"]["role"] == "datum"
+    assert text["control"]["points"][0]["ratio"] == pytest.approx(control.ratio[0].tolist())
+    assert text["scale_bars"][1]["from"] == "2" and text["scale_bars"][1]["to"] == "12"
+    assert text["scale_bars"][1]["ratio"] == pytest.approx(bars.ratio[1])
+    page = render_html(result_of(a), (), ())
+    assert "<h3>Control</h3>" in page and "<h3>Scale bars</h3>" in page and "2 - 12" in page
+    counts = count_observations(a)
+    assert (counts.control, counts.scale_bars, counts.constraints) == (18, 2, 0)
+    assert counts.image + counts.control + counts.scale_bars == counts.total == a.observations
+
+
+def test_fixed_control_has_no_ratio(synthetic: tuple[Network, Estimate]) -> None:
+    network, truth = synthetic
+    a = adjust(with_control(network, truth.points[:6], 0.0), truth, datum=Datum("control"))
+    text = summary(result_of(a))
+    assert text["control"]["points"][0]["ratio"] == [None, None, None]
+    assert count_observations(a).control == 0
+    assert "fixed" in render_html(result_of(a), (), ())
+
+
+def test_statistics_are_shown_and_written(synthetic: tuple[Network, Estimate]) -> None:
+    network, truth = synthetic
+    a = adjust(network, truth, datum=Datum("free"))
+    result = result_of(a)
+    page, text = render_html(result, (), ()), json.loads(json.dumps(summary(result)))
+    test = global_test(a)
+    found = text["statistics"]
+    assert found["global_test"]["lower"] == test.lower and found["global_test"]["upper"] == test.upper
+    assert f"{test.lower:.2f}" in page and f"{test.upper:.2f}" in page
+    assert found["observations"]["constraints"] == 7
+    assert found["redundancy_number"]["min"] == pytest.approx(np.nanmin(a.redundancy_numbers))
+    assert set(found["sigma0_by_photograph"]) == set(a.network.images)
+    assert "The 10 largest residuals" in page and "Variance components" in page
+    assert text["length_unit"] == "network units"
+    assert text["verdict"] == {"level": "good", "headline": verdict_of(result).headline, "remarks": []}
+    worst = worst_residuals(a)
+    w = np.abs(np.where(a.rejected[:, None], 0, a.standardised))
+    assert abs(worst.w[0]) == w.max()
+    np.testing.assert_array_equal(np.sort(w.max(axis=1))[::-1][:10], np.abs(worst.w))
+    assert f"{worst.w[9]:+.2f}" in page
+    for pair in camera_correlations(result):
+        assert "of camera" in pair.first and f"{100 * pair.value:+.1f}" in page
+
+
+def test_parameters_that_mean_nothing_are_named() -> None:
+    network, truth = make_network(
+        seed_of("insignificant"), images=8, points=40, noise_px=NOISE_PX, free=("c", "K1", "b2")
+    )
+    a = adjust(network, truth, datum=Datum("free"))
+    camera = a.estimate.cameras[0]
+    t = abs(camera.value("b2")) / np.sqrt(a.covariance.interior[0][-1, -1])
+    assert t < 2  # its true value is 0
+    page = render_html(result_of(a), (), ())
+    assert f"b2 of camera 1 ({t:.1f})" in page
+    named = summary(result_of(a))["statistics"]["not_significant"]
+    assert [one["parameter"] for one in named] == ["b2"]
+
+
+def test_circles_are_told(synthetic: tuple[Network, Estimate]) -> None:
+    network, truth = synthetic
+    a = adjust(network, truth, datum=Datum("free"))
+    found = result_of(a, eccentricity=Eccentricity(0.1641, 0.0443, 0.0003), no_circles=("u007", "u<9"))
+    text = summary(found)
+    assert text["eccentricity"] == {"largest_px": 0.1641, "rms_px": 0.0443, "sigma_px": 0.0003}
+    assert text["no_circles"] == ["u007", "u<9"]
+    page = render_html(found, (), ())
+    assert "u007, u&lt;9" in page and "0.0443 px RMS" in page
+    none = summary(result_of(a))
+    assert none["eccentricity"] is None and none["no_circles"] == []
+
+
+@pytest.fixture(scope="module")
+def compared(synthetic: tuple[Network, Estimate]) -> tuple[Adjustment, AdjusterComparison]:
+    network, truth = synthetic
+    a = adjust(network, truth, datum=Datum("free"))
+
+    class Same:
+        iterations, converged, seconds = 1, True, 0.1
+
+        def __init__(self, estimate: Estimate) -> None:
+            self.estimate = estimate
+
+    def backend(part: Network, start: Estimate) -> BackendAdjustment:
+        return Same(adjust(part, start, datum=Datum("free"), reject="none").estimate)
+
+    return a, compare_adjusters(a, backend)
+
+
+def test_comparison_tells_what_it_changed(compared: tuple[Adjustment, AdjusterComparison]) -> None:
+    a, both = compared
+    both = replace(both, held=("k<4> of camera 1",), freed=("camera 1: k3",))
+    result = replace(result_of(a), comparison=both)
+    page = render_html(result, (), ())
+    assert "k&lt;4&gt; of camera 1" in page and "camera 1: k3" in page
+    assert f"{both.conversions[0].rms_px:.4f}" in page and "Cameras written in another model" in page
+    text = summary(result)["comparison"]
+    assert text["conversions"][0]["max_px"] == both.conversions[0].max_px
+    assert text["held"] == ["k<4> of camera 1"] and text["freed"] == ["camera 1: k3"]
+
+
+def test_the_model_is_linked_where_it_is(compared: tuple[Adjustment, AdjusterComparison]) -> None:
+    result = replace(result_of(compared[0]), comparison=compared[1])
+    assert 'href="colmap/"' not in render_html(result, (), ())
+    page = render_html(result, (), (), has_model=True)
+    assert 'href="colmap/"' in page and "free datum, equal weights" in page
+
+
+def test_plan_is_seen_from_the_cameras() -> None:
+    rng = seed_of("plan")
+    level = rng.uniform(-1, 1, (30, 3)) * (5.0, 3.0, 0.1)
+    wall = level[:, [0, 2, 1]]
+    for points, towards in ((level, (0, 0, 4)), (level, (0, 0, -4)), (wall, (0, 4, 1)), (wall, (0, -4, 1))):
+        position = np.array(towards) + rng.uniform(-1, 1, (5, 3))
+        axes, names = plan_axes(points, position)
+        assert np.linalg.det(axes) == pytest.approx(1.0)
+        assert ((position - points.mean(axis=0)) @ axes[2]).mean() > 0
+        assert len(names) == 3
+    assert plan_axes(level, np.array([[0, 0, -4.0]]))[1] == ("X", "-Y", "-Z")
+
+
+def test_names_that_the_font_lacks_give_no_warning(
+    synthetic: tuple[Network, Estimate], recwarn: pytest.WarningsRecorder, tmp_path: Path
+) -> None:
+    network, truth = synthetic
+    names = tuple(f"写真{k}$.jpg" for k in range(len(network.images)))
+    cameras = tuple(replace(camera, name="相機_$x") for camera in truth.cameras)
+    a = adjust(replace(network, images=names), replace(truth, cameras=cameras), datum=Datum("free"))
+    all_plots(a, "米")
+    assert not recwarn.list
