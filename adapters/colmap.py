@@ -309,10 +309,14 @@ def read_model(folder: Path) -> tuple[Network, Estimate]:
     position = np.array([-pose[:, :3].T @ pose[:, 3] for pose in poses]).reshape(-1, 3)
     # COLMAP's text format loses what follows a space in the name of a photograph.
     full = {i: side.get("images", {}).get(str(i), "") for i in image_ids}
+    try:
+        short = [image.name for image in images]
+    except UnicodeDecodeError as error:
+        raise SurveyFileError(f"{folder}: the name of a photograph is not in UTF-8") from error
     network = Network(
         tuple(
-            full[i] if full[i].split()[:1] == [image.name] else image.name
-            for i, image in zip(image_ids, images, strict=True)
+            full[i] if full[i].split()[:1] == [name] else name
+            for i, name in zip(image_ids, short, strict=True)
         ),
         np.array([camera_ids.index(image.camera_id) for image in images], dtype=np.int64),
         tuple(names.get(str(j), str(j)) for j in point_ids),

@@ -25,6 +25,7 @@ from sfm.network import Estimate, ImagePoints, Network
 AXES = np.diag([1.0, -1.0, -1.0])  # sba's camera axes (y down, z forward) in ours
 POSE, POSE_WITH_CAMERA = 7, 12  # numbers of a camera line
 PLAIN, WITH_COVARIANCE = 3, 7  # numbers of a projection
+MAX_NUMBER = 1e12  # no length or pixel is larger; squares and products of larger ones overflow
 SIGMA_PX = 1.0  # of projections that come without
 
 
@@ -88,8 +89,8 @@ def _camera(name: str, values: FloatArray, size_px: tuple[int, int], path: Path)
 def _calibration(path: Path) -> FloatArray:
     rows = _rows(path)
     K = np.array([values for _, values in rows if len(values) == 3])
-    if K.shape != (3, 3):
-        raise SurveyFileError(f"{path}: {len(K)} lines of 3 numbers, a 3 x 3 matrix is needed")
+    if K.shape != (3, 3) or not K[0, 0] > 0:
+        raise SurveyFileError(f"{path}: {len(K)} lines of 3 numbers, a 3 x 3 calibration matrix is needed")
     return np.array([K[0, 0], K[0, 2], K[1, 2], K[1, 1] / K[0, 0], K[0, 1]])
 
 
@@ -151,9 +152,14 @@ def _rows(path: Path) -> list[tuple[int, list[float]]]:
         if not fields:
             continue
         try:
-            rows.append((number, [float(field) for field in fields]))
+            values = [float(field) for field in fields]
         except ValueError as error:
             raise SurveyFileError(f"{path}, line {number}: {error}") from error
+        if not all(abs(value) <= MAX_NUMBER for value in values):
+            raise SurveyFileError(
+                f"{path}, line {number}: finite numbers of at most {MAX_NUMBER:g} are needed"
+            )
+        rows.append((number, values))
     if not rows:
         raise SurveyFileError(f"{path}: no numbers")
     return rows
