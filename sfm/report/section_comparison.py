@@ -88,8 +88,8 @@ def _conversions(result: SurveyResult, both: AdjusterComparison) -> str:
         )
     if both.held:
         text += (
-            "<p class=note>The distortion was held at the survey's result in both adjusters, because with it "
-            f"free the image points leave open: {escape(', '.join(both.held))}.</p>"
+            "<p class=note>The distortion was held at the survey's result in both adjusters, since the image "
+            f"points do not determine all of it in this model: {escape(', '.join(both.held))}.</p>"
         )
     if both.freed:
         text += (
