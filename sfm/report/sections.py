@@ -84,7 +84,7 @@ def coordinates_section(result: SurveyResult, *, has_model: bool) -> str:
     if result.comparison is not None and has_model:
         what = (
             f"the solution that was compared, in COLMAP's camera model ({result.comparison.model}): free "
-            "datum, equal weights, without control and scale bars; the survey's own result is in the tables above"
+            "datum, equal weights, without control and scale bars; the survey's own result is above"
         )
         listed.append(("colmap/", what))
     text = "<p>In the folder of this report:</p><table>"
