@@ -213,10 +213,12 @@ LEAST_SET = 0.3
 # Step from clear to set cells in units of that from background to dot, and the least gap between the levels
 # of set and clear cells, in steps. Codes of the retro-panel: 0.89 to 1.05 and 0.61.
 LEAST_STEP, LARGEST_STEP, LEAST_JUMP = 0.6, 1.5, 0.4
-# Largest deviations, in steps: of a clear cell and of the surroundings from the background, of a set cell
-# from shading (with the sigma of its change over the radius), of a cell from its mean on one radius, of the
-# samples.
-CLEAR_TOLERANCE, SET_TOLERANCE, SHADING = 0.15, 0.2, 0.3
+# Largest deviations, in steps, and the worst of the retro-panel: of a clear cell from the background (0.08),
+# or under glare (0.18) from the mean of what is before and behind it (0.06); of what is beside the ring from
+# the background (0.12); of a set cell from shading (0.08), with the sigma of its change over the radius; of a
+# cell on one radius from its mean (0.05, and 0.18 at the limit of resolution); of the samples (0.10).
+CLEAR_TOLERANCE, GLARE, GLARE_TOLERANCE = 0.1, 0.25, 0.07
+GAP_TOLERANCE, SET_TOLERANCE, SHADING = 0.15, 0.1, 0.15
 RADIAL_TOLERANCE, RESIDUAL_TOLERANCE, NOISE_SIGMAS = 0.2, 0.15, 3.0
 # Part of the circle just behind the ring that other things may cover.
 OUTSIDE_CLUTTER = 0.25
@@ -295,8 +297,8 @@ def _read_cells(found: FloatArray, family: CodeFamily) -> tuple[int, float]:
 
     Set and clear cells are separated at the widest gap between their sorted levels, so that a shadow across
     the ring does no harm. Whatever covers part of a ring, or looks like one by chance, must not be read:
-    clear cells, clear ring and surroundings are at the level of the background, set cells at one level but
-    for shading, and each cell is the same on all radii and over its length.
+    clear cells, clear ring and what is behind set cells are at the level of the background, set cells at one
+    level but for shading, and each cell is the same on all radii and over its length.
     """
     if not np.isfinite(found).all():
         return UNREADABLE, 0.0
@@ -315,14 +317,19 @@ def _read_cells(found: FloatArray, family: CodeFamily) -> tuple[int, float]:
     prior = np.diag([0.0, 1.0, 1.0]) * (SET_TOLERANCE / SHADING) ** 2
     plane = A @ np.linalg.solve(A.T @ A + prior, A.T @ level[bits])
     noise = NOISE_SIGMAS * sigma * residual
-    uneven = np.abs(level)
+    # Glare across the ring is seen in a clear cell as it is before and behind it.
+    glare = np.abs(level - (gap + behind) / 2) * (CLEAR_TOLERANCE / GLARE_TOLERANCE)
+    uneven = np.minimum(np.abs(level), glare)
     uneven[bits] = np.abs(level[bits] - plane) * (CLEAR_TOLERANCE / SET_TOLERANCE)
+    clutter = np.abs(behind) > GAP_TOLERANCE * step + noise
     tests = (
         np.abs(at_radii - level) <= RADIAL_TOLERANCE * step + noise,
         uneven <= CLEAR_TOLERANCE * step + noise,
-        np.abs(gap) <= CLEAR_TOLERANCE * step + noise,
+        np.abs(level[~bits]) <= GLARE * step,
+        np.abs(gap) <= GAP_TOLERANCE * step + noise,
         residual <= RESIDUAL_TOLERANCE * step,
-        np.mean(np.abs(behind) > CLEAR_TOLERANCE * step + noise) <= OUTSIDE_CLUTTER,
+        clutter.mean() <= OUTSIDE_CLUTTER,
+        ~clutter[bits],
     )
     value = smallest_rotation(np.array([bits @ (1 << np.arange(family.cells - 1, -1, -1))]), family.cells)[0]
     entry = np.searchsorted(family.pattern, value)
