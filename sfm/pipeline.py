@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sfm.analysis.comparison import BackendAdjustment, compare_adjusters
+from sfm.analysis.comparison import BackendAdjustment
 from sfm.network import Estimate, Network
 from sfm.pipeline_texture import run_textured_survey
 from sfm.progress import SILENT, Progress, StageClock
@@ -21,7 +21,7 @@ from sfm.report.result import FailedImage, StageTime, SurveyResult
 from sfm.survey_circles import check_circles
 from sfm.survey_network import build_network, codes_of, min_rays, name_coded
 from sfm.survey_orientation import orient_photographs, orient_survey
-from sfm.survey_solution import match_and_adjust, solve
+from sfm.survey_solution import compare_solution, match_and_adjust, solve
 from sfm.survey_start import find_photographs, network_from_observations
 from sfm.survey_targets import measure_photographs
 from sfm.targets.store import TargetStore
@@ -69,7 +69,7 @@ def run_survey(
     with clock.stage("adjustment"):
         solution = solve(survey, circles.network, circles.estimate, min_rays=min_rays(naming))
     with clock.stage("comparison"):
-        comparison = compare_adjusters(solution.adjustment, backend) if backend else None
+        comparison, failure = compare_solution(solution, backend)
     return SurveyResult(
         survey=survey.name,
         unit=survey.unit,
@@ -80,7 +80,7 @@ def run_survey(
         comparison=comparison,
         photographs=photographs.overlays(),
         control_check=solution.control_check,
-        warnings=start.warnings + solution.warnings,
+        warnings=start.warnings + solution.warnings + failure,
         eccentricity=circles.eccentricity,
         no_circles=circles.no_circles,
         seconds=tuple(StageTime(*one) for one in clock.seconds),
@@ -98,7 +98,7 @@ def adjust_survey(
     with clock.stage("adjustment"):
         solution = solve(survey, network, start.estimate)
     with clock.stage("comparison"):
-        comparison = compare_adjusters(solution.adjustment, backend) if backend else None
+        comparison, failure = compare_solution(solution, backend)
     return SurveyResult(
         survey=survey.name,
         unit=survey.unit,
@@ -108,7 +108,7 @@ def adjust_survey(
         code=np.full(len(solution.adjustment.network.points), -1),
         comparison=comparison,
         control_check=solution.control_check,
-        warnings=start.warnings + solution.warnings,
+        warnings=start.warnings + solution.warnings + failure,
         seconds=tuple(StageTime(*one) for one in clock.seconds),
     )
 

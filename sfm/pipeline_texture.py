@@ -12,12 +12,12 @@ from pathlib import Path
 
 import numpy as np
 
-from sfm.analysis.comparison import BackendAdjustment, compare_adjusters
+from sfm.analysis.comparison import BackendAdjustment
 from sfm.network import Estimate, Network
 from sfm.progress import SILENT, Progress, StageClock
 from sfm.project import Survey, TiePointSettings
 from sfm.report.result import FailedImage, StageTime, SurveyResult
-from sfm.survey_solution import solve
+from sfm.survey_solution import compare_solution, solve
 from sfm.survey_start import find_photographs
 from sfm.survey_tie_points import MIN_RAYS, orient_tied, tie_photographs
 
@@ -46,7 +46,7 @@ def run_textured_survey(
         rays = np.full(len(network.points), MIN_RAYS)
         solution = solve(survey, network, estimate, min_rays=rays)
     with clock.stage("comparison"):
-        comparison = None if backend is None else compare_adjusters(solution.adjustment, backend)
+        comparison, failure = compare_solution(solution, backend)
     return SurveyResult(
         survey=survey.name,
         unit=survey.unit,
@@ -57,6 +57,6 @@ def run_textured_survey(
         comparison=comparison,
         photographs=tied.overlays(settings.window_px),
         control_check=solution.control_check,
-        warnings=solution.warnings,
+        warnings=solution.warnings + failure,
         seconds=tuple(StageTime(*one) for one in clock.seconds),
     )
