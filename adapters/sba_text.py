@@ -25,6 +25,7 @@ from sfm.network import Estimate, ImagePoints, Network
 AXES = np.diag([1.0, -1.0, -1.0])  # sba's camera axes (y down, z forward) in ours
 POSE, POSE_WITH_CAMERA = 7, 12  # numbers of a camera line
 PLAIN, WITH_COVARIANCE = 3, 7  # numbers of a projection
+MIN_QUATERNION = 1e-6  # length; unit quaternions are due
 MAX_NUMBER = 1e12  # no length or pixel is larger; squares and products of larger ones overflow
 SIGMA_PX = 1.0  # of projections that come without
 
@@ -48,6 +49,8 @@ def read_sba_text(
             f"{cameras}: lines of {sorted(lengths)} numbers, all must have {POSE} or all {POSE_WITH_CAMERA}"
         )
     table = np.array([values for _, values in rows])
+    for k in np.flatnonzero(np.linalg.norm(table[:, -7:-3], axis=1) < MIN_QUATERNION)[:1]:
+        raise SurveyFileError(f"{cameras}, line {rows[k][0]}: a quaternion of zeros is no rotation")
     image_points, xyz = _points(points, len(rows))
     if sigmas is not None:
         image_points = _with_sigmas(image_points, sigmas)

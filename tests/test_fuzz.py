@@ -141,3 +141,14 @@ def test_a_jpeg_of_endless_scans_is_refused(tmp_path: Path) -> None:
         read_photograph(tmp_path / "a.jpg")
     (tmp_path / "a.jpg").write_bytes(data)
     assert read_photograph(tmp_path / "a.jpg").shape == (2000, 3000)
+
+
+def test_a_png_chunk_larger_than_the_file_is_refused(tmp_path: Path) -> None:
+    data = bytearray(png(64, 48, zlib.compress(bytes(48 * 65))))
+    (tmp_path / "a.png").write_bytes(data)
+    assert read_photograph(tmp_path / "a.png").shape == (48, 64)
+    at = data.index(b"IDAT") - 4
+    data[at : at + 4] = struct.pack(">I", 2**31 - 1)  # for which OpenCV takes 2 GiB
+    (tmp_path / "a.png").write_bytes(data)
+    with pytest.raises(PhotographError, match="truncated"):
+        read_photograph(tmp_path / "a.png")

@@ -237,11 +237,22 @@ def _refuse_truncated(path: Path, data: bytes) -> None:
         # Inside a scan 0xff is always followed by 0 or a restart marker, so this is the end of the image.
         complete = data.find(b"\xff\xd9", at) >= 0
     elif data.startswith(b"\x89PNG\r\n\x1a\n"):
-        complete = data.rfind(b"IEND") >= 0
+        complete = _png_is_whole(data)
     else:
         return  # the decoder itself refuses truncated TIFF files
     if not complete:
         raise PhotographError(f"{path.name}: the file is truncated, its end is missing ({len(data)} bytes)")
+
+
+def _png_is_whole(data: bytes) -> bool:
+    """Whether the chunks of a PNG lie within the file up to its end; OpenCV takes memory for what they claim."""
+    at = 8
+    while at + 12 <= len(data):
+        kind = data[at + 4 : at + 8]
+        at += 12 + int.from_bytes(data[at : at + 4], "big")
+        if kind == b"IEND":
+            return at <= len(data)
+    return False
 
 
 def _positive(value: Any) -> float | None:
