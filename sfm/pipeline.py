@@ -83,6 +83,7 @@ def run_survey(
         warnings=start.warnings + solution.warnings + failure,
         eccentricity=circles.eccentricity,
         no_circles=circles.no_circles,
+        weight_factor=solution.weight_factor,
         seconds=tuple(StageTime(*one) for one in clock.seconds),
     )
 
@@ -109,6 +110,7 @@ def adjust_survey(
         comparison=comparison,
         control_check=solution.control_check,
         warnings=start.warnings + solution.warnings + failure,
+        weight_factor=solution.weight_factor,
         seconds=tuple(StageTime(*one) for one in clock.seconds),
     )
 

@@ -58,5 +58,6 @@ def run_textured_survey(
         photographs=tied.overlays(settings.window_px),
         control_check=solution.control_check,
         warnings=solution.warnings + failure,
+        weight_factor=solution.weight_factor,
         seconds=tuple(StageTime(*one) for one in clock.seconds),
     )

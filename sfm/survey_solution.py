@@ -38,6 +38,7 @@ class Solution:
     control_check: ControlCheck | None  # None without control or where the datum is control
     dropped_images: tuple[tuple[str, str], ...]  # photographs that lost their points, with the reason
     warnings: tuple[str, ...]  # one line each
+    weight_factor: float = 1.0  # by which the a priori sigmas of the image points were multiplied
 
 
 def refine(network: Network, estimate: Estimate) -> Estimate:
@@ -128,8 +129,9 @@ def solve(
     else:
         estimate = adjustment.estimate
     final = _tested(survey, part, estimate, datum, covariance=True)
+    weight_factor = 1.0
     if len(part.scale_bars) or (datum.kind == "control" and part.control.covariance.any()):
-        part = _weighed(final)
+        part, weight_factor = _weighed(final)
         final = _tested(survey, part, final.estimate, datum, covariance=True)
     dropped = tuple(
         (name, f"fewer than {MIN_IMAGE_POINTS} accepted image points of the network")
@@ -137,7 +139,7 @@ def solve(
         if was and not is_in
     )
     final = replace(final, iterations=iterations + final.iterations)
-    return Solution(final, check, dropped, (*contradictions, *_warnings(survey, known, final)))
+    return Solution(final, check, dropped, (*contradictions, *_warnings(survey, known, final)), weight_factor)
 
 
 def compare_solution(
@@ -171,8 +173,8 @@ def _tested(
     )
 
 
-def _weighed(adjustment: Adjustment) -> Network:
-    """Return the network with the image points weighted by their own variance component.
+def _weighed(adjustment: Adjustment) -> tuple[Network, float]:
+    """Return the network with the image points weighted by their own variance component, and its root.
 
     Lengths and control have the standard deviations that were stated for them; without this, sigma0 a
     posteriori, which the image points decide, would scale these too.
@@ -183,7 +185,8 @@ def _weighed(adjustment: Adjustment) -> Network:
     seen = network.image_points
     v, P = adjustment.residuals[used], np.linalg.inv(seen.covariance[used])
     component = np.einsum("ka,kab,kb->", v, P, v) / adjustment.redundancy_numbers[used].sum()
-    return replace(network, image_points=replace(seen, covariance=component * seen.covariance))
+    weighed = replace(network, image_points=replace(seen, covariance=component * seen.covariance))
+    return weighed, float(np.sqrt(component))
 
 
 def determined(

@@ -60,7 +60,8 @@ def cofactors(optimum: Optimum, layout: Unknowns) -> Cofactors:
         own = slice(first + 3 * s, first + 3 * s + 3)
         cross[3 * j : 3 * j + 3] = Qcc[own]
         points[j] = Qcc[own, own]
-        limiting[j] = np.linalg.inv(b.V[j])
+        # a point that lost all its rays to the test has no precision by rays; it is held as others are
+        limiting[j] = np.linalg.inv(b.V[j]) if np.linalg.matrix_rank(b.V[j]) == 3 else 0.0
     mask = layout.point_free.astype(float)
     points *= mask[:, :, None] * mask[:, None, :]
     limiting *= mask[:, :, None] * mask[:, None, :]
