@@ -245,7 +245,7 @@ def _refuse_truncated(path: Path, data: bytes) -> None:
 
 
 def _png_is_whole(data: bytes) -> bool:
-    """Whether the chunks of a PNG lie within the file up to its end; OpenCV takes memory for what they claim."""
+    """Whether the chunks of a PNG lie within the file; OpenCV takes memory for what they claim."""
     at = 8
     while at + 12 <= len(data):
         kind = data[at + 4 : at + 8]
