@@ -91,8 +91,8 @@ def test_its_points_are_targets_each_once_and_with_their_codes(demo: SurveyResul
 def test_its_points_agree_with_the_truth_within_their_sigmas(demo: SurveyResult, staging: Staging) -> None:
     truth = compare(demo, staging)
     assert 0.7 < truth.normalised_square() < 1.4
-    # With the scale of the bars, whose error all points share: over seeds the mean square is then between 1.05
-    # and 1.5, because one error of 17 in a million moves every point.
+    # With the scale of the bars, whose error all points share: over seeds the mean square is then between
+    # 1.05 and 1.5, because one error of 17 in a million moves every point.
     assert 0.7 < compare(demo, staging, scale=1.0).normalised_square() < 1.4
     # Both bars are read to 0.004 mm and end in points of 0.005 mm: 16 in a million, at four sigma.
     assert abs(truth.scale - 1) < 4 * 16e-6
