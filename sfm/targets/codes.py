@@ -220,8 +220,9 @@ LEAST_STEP, LARGEST_STEP, LEAST_JUMP = 0.6, 1.5, 0.4
 CLEAR_TOLERANCE, GLARE, GLARE_TOLERANCE = 0.1, 0.25, 0.07
 GAP_TOLERANCE, SET_TOLERANCE, SHADING = 0.15, 0.1, 0.15
 RADIAL_TOLERANCE, RESIDUAL_TOLERANCE, NOISE_SIGMAS = 0.2, 0.15, 3.0
-# Part of the circle just behind the ring that other things may cover.
-OUTSIDE_CLUTTER = 0.25
+# Part of the circle just behind the ring that other things may cover, and what there may be behind a set
+# cell, in steps (0.24 at the limit of resolution): what makes a clear cell look set mostly reaches out.
+OUTSIDE_CLUTTER, BEHIND_SET = 0.25, 0.3
 # Blur of the edge in a sharp photograph, px.
 SHARP_PX = 0.8
 # A ring may be interrupted by less than this angle, and an arc must be longer.
@@ -329,7 +330,7 @@ def _read_cells(found: FloatArray, family: CodeFamily) -> tuple[int, float]:
         np.abs(gap) <= GAP_TOLERANCE * step + noise,
         residual <= RESIDUAL_TOLERANCE * step,
         clutter.mean() <= OUTSIDE_CLUTTER,
-        ~clutter[bits],
+        np.abs(behind[bits]) <= BEHIND_SET * step + noise[bits],
     )
     value = smallest_rotation(np.array([bits @ (1 << np.arange(family.cells - 1, -1, -1))]), family.cells)[0]
     entry = np.searchsorted(family.pattern, value)
