@@ -162,21 +162,21 @@ def _mark_band(image: AnyArray, mean: AnyArray, step: float, sign: int, band: An
         out[width - 1] = 0
 
 
-def _trace_contours(band: AnyArray) -> tuple[IntArray, IntArray]:
-    """Return the points of the outer contours, shape (n, 2), and where each begins, shape (k + 1,)."""
+def _trace_contours(band: AnyArray) -> tuple[AnyArray, IntArray]:
+    """Return the points of the outer contours, int32, shape (n, 2), and where each begins, shape (k + 1,)."""
     contours: Any
     contours, hierarchy = cv2.findContours(band, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
     parent = np.zeros(0) if hierarchy is None else np.asarray(hierarchy).reshape(-1, 4)[:, 3]
     outer = [contours[k] for k in np.flatnonzero(parent < 0) if len(contours[k]) >= 4]
     if not outer:
-        return np.zeros((0, 2), np.int64), np.zeros(1, np.int64)
+        return np.zeros((0, 2), np.int32), np.zeros(1, np.int64)
     first = np.cumsum([0, *(len(c) for c in outer)])
-    return np.concatenate(outer).reshape(-1, 2).astype(np.int64), first
+    return np.concatenate(outer).reshape(-1, 2), first
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _ellipses_of_contours(
-    points: IntArray, first: IntArray, height: int, width: int, smallest: float, largest: float
+    points: AnyArray, first: IntArray, height: int, width: int, smallest: float, largest: float
 ) -> tuple[FloatArray, IntArray]:
     """Return x, y, p, q, r of the ellipse with the moments of each contour, and the reason against it.
 
