@@ -68,7 +68,8 @@ def local_engine(workers: int, *, memory_bytes: int | None = None) -> Iterator[D
                 processes=True,
                 memory_limit=memory_bytes or "auto",
                 host="127.0.0.1",
-                dashboard_address=None,
+                dashboard_address="127.0.0.1:0",  # None lets a server listen on a fixed port to the world
+                scheduler_kwargs={"dashboard": False},
                 silence_logs=logging.CRITICAL,
             )
         except (OSError, RuntimeError, TimeoutError) as error:

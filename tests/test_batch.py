@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from contextlib import nullcontext
 from pathlib import Path
 
+import psutil
 import pytest
 
 from adapters.dask_cluster import DaskEngine, local_engine, remote_engine
@@ -244,6 +245,19 @@ def test_a_disk_problem_ends_the_batch_with_one_line(surveys: tuple[Path, ...], 
     (tmp_path / "out" / "logs").write_text("in the way", encoding="utf-8")
     with pytest.raises(OutputError, match="the log cannot be written"):
         run_batch(surveys, tmp_path / "out", HERE, ALONE, Notes())
+
+
+def test_workers_listen_to_this_computer_only_and_two_batches_do_not_meet(two_workers: DaskEngine) -> None:
+    with local_engine(1) as other:
+        assert other.client.scheduler.address != two_workers.client.scheduler.address
+        own = psutil.Process()
+        listening = {
+            connection.laddr.ip
+            for process in (own, *own.children(recursive=True))
+            for connection in process.net_connections()
+            if connection.status == psutil.CONN_LISTEN
+        }
+    assert listening == {"127.0.0.1"}
 
 
 def test_nobody_at_the_address_of_a_cluster() -> None:
