@@ -5,6 +5,7 @@ Source: dask.distributed, Client futures API (https://distributed.dask.org/en/st
 
 from __future__ import annotations
 
+import gc
 import logging
 import queue
 import signal
@@ -57,7 +58,11 @@ def local_engine(workers: int, *, memory_bytes: int | None = None) -> Iterator[D
     settings = {
         "distributed.scheduler.allowed-failures": ALLOWED_FAILURES,
         "distributed.scheduler.work-stealing": True,
-        "distributed.nanny.pre-spawn-environ": {**ONE_THREAD, "MALLOC_TRIM_THRESHOLD_": "65536"},
+        "distributed.nanny.pre-spawn-environ": {
+            **ONE_THREAD,
+            "MALLOC_TRIM_THRESHOLD_": "65536",
+            "MALLOC_ARENA_MAX": "2",
+        },
         "distributed.comm.timeouts.connect": "60s",  # new workers compile and import on a busy computer
     }
     with dask.config.set(settings):
@@ -203,8 +208,12 @@ def _call(call: Call, parts: list[Any] | None = None, *, topic: str, work: str) 
         worker.log_event(topic, {"key": work, "message": message})
 
     more = () if parts is None else (parts,)
-    with _one_thread():
-        return call.function(*call.arguments, *more, tell=tell)
+    try:
+        with _one_thread():
+            return call.function(*call.arguments, *more, tell=tell)
+    finally:
+        if parts is not None:
+            gc.collect()  # figures are full of cycles, and Python is in no hurry: 1 MiB a survey
 
 
 @contextmanager
