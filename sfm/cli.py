@@ -15,9 +15,9 @@ import typer
 from rich.console import Console
 from threadpoolctl import threadpool_limits
 
-from sfm.batch import find_surveys, run_batch
-from sfm.batch_survey import Adjusters
-from sfm.batch_table import BatchTable, print_batch, stopping_at_terminate
+from sfm.batch.run import find_surveys, run_batch
+from sfm.batch.survey import Adjusters
+from sfm.batch.table import BatchTable, print_batch, stopping_at_terminate
 from sfm.commands import measuring, refining, solvers
 from sfm.commands.console import drawn_progress, tell_of_compiling, tell_result
 from sfm.errors import KolinearError
@@ -26,7 +26,7 @@ from sfm.pipeline import Backend, adjust_survey, run_survey
 from sfm.project import Survey, read_survey
 from sfm.report.output import refuse_foreign_folder, remove_leftovers, write_result
 from sfm.report.result import SurveyResult
-from sfm.survey_log import SurveyLog
+from sfm.survey.log import SurveyLog
 from sfm.targets.store import STORE, TargetStore
 
 BAD_INPUT = 2  # exit code where a person must put something right

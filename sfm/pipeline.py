@@ -14,16 +14,16 @@ import numpy as np
 
 from sfm.analysis.comparison import BackendAdjustment
 from sfm.network import Estimate, Network
-from sfm.pipeline_texture import run_textured_survey
 from sfm.progress import SILENT, Progress, StageClock
 from sfm.project import Survey
 from sfm.report.result import FailedImage, StageTime, SurveyResult
-from sfm.survey_circles import check_circles
-from sfm.survey_network import build_network, codes_of, min_rays, name_coded
-from sfm.survey_orientation import orient_photographs, orient_survey
-from sfm.survey_solution import compare_solution, match_and_adjust, solve
-from sfm.survey_start import find_photographs, network_from_observations
-from sfm.survey_targets import measure_photographs
+from sfm.survey.circles import check_circles
+from sfm.survey.network import build_network, codes_of, min_rays, name_coded
+from sfm.survey.orientation import orient_photographs, orient_survey
+from sfm.survey.solution import compare_solution, match_and_adjust, solve
+from sfm.survey.start import find_photographs, network_from_observations
+from sfm.survey.targets import measure_photographs
+from sfm.survey.texture import run_textured_survey
 from sfm.targets.store import TargetStore
 
 Backend = Callable[[Network, Estimate], BackendAdjustment]

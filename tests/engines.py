@@ -11,7 +11,7 @@ from typing import Any
 
 from threadpoolctl import threadpool_limits
 
-from sfm.batch_survey import Adjusters, SurveyRow
+from sfm.batch.survey import Adjusters, SurveyRow
 from sfm.engine import Done, Event, Told, Work
 from sfm.pipeline import Backend
 from sfm.project import Survey

@@ -16,12 +16,12 @@ import psutil
 import pytest
 
 from adapters.dask_cluster import DaskEngine, local_engine, remote_engine
-from sfm.batch import find_surveys, run_batch
-from sfm.batch_pages import render_index
-from sfm.batch_survey import SurveyRow
+from sfm.batch.pages import render_index
+from sfm.batch.run import find_surveys, run_batch
+from sfm.batch.survey import SurveyRow
 from sfm.errors import BackendError, KolinearError, OutputError, SurveyFileError
 from sfm.folder_lock import locked
-from sfm.survey_log import read_log
+from sfm.survey.log import read_log
 from tests.engines import ALONE, HERE, KILLER, Notes, points_of
 from tests.surveys import write_observed_survey, write_photograph_survey
 
@@ -207,7 +207,7 @@ def test_a_second_batch_in_the_same_folder_is_refused(finished: Path, surveys: t
 def test_a_fault_of_ours_is_a_row_with_a_trace(
     surveys: tuple[Path, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("sfm.batch_survey.adjust_survey", lambda *_, **__: [][0])
+    monkeypatch.setattr("sfm.batch.survey.adjust_survey", lambda *_, **__: [][0])
     (row,) = run_batch([surveys[2]], tmp_path / "out", HERE, ALONE, Notes())
     assert row.reason.startswith("a fault of Kolinear: IndexError")
     (log,) = (tmp_path / "out" / "logs").iterdir()

@@ -16,7 +16,7 @@ import psutil
 import pytest
 
 from adapters.dask_cluster import local_engine
-from sfm.batch import run_batch
+from sfm.batch.run import run_batch
 from tests.engines import ALONE, Notes, points_of
 from tests.surveys import write_observed_survey, write_photograph_survey
 

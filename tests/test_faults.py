@@ -21,7 +21,7 @@ import pytest
 from sfm.errors import OutputError
 from sfm.folder_lock import locked
 from sfm.report.output import remove_leftovers
-from sfm.survey_log import SurveyLog, read_log
+from sfm.survey.log import SurveyLog, read_log
 from sfm.targets.codes import code_family
 from sfm.targets.detect import Targets, find_targets
 from sfm.targets.store import TargetStore, target_key

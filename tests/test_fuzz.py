@@ -18,7 +18,7 @@ from PIL import Image
 
 from sfm.errors import KolinearError, PhotographError
 from sfm.project import read_survey
-from sfm.survey_tables import read_image_points
+from sfm.survey.tables import read_image_points
 from sfm.targets.photograph import BOMB_PX_PER_BYTE, read_metadata, read_photograph
 from tests.fuzz.cases import Seed, make_seeds, run_case
 

@@ -13,8 +13,8 @@ LAYERS = (
     ("sfm.camera", "sfm.network", "sfm.similarity"),
     ("sfm.targets", "sfm.matching", "sfm.orientation", "sfm.adjustment"),
     ("sfm.analysis",),
-    ("sfm.report", "sfm.pipeline", "sfm.pipeline_", "sfm.project", "sfm.survey_"),
-    ("sfm.batch", "sfm.batch_", "sfm.cli", "sfm.commands", "sfm.warm_up"),
+    ("sfm.report", "sfm.pipeline", "sfm.project", "sfm.survey"),
+    ("sfm.batch", "sfm.cli", "sfm.commands", "sfm.warm_up"),
 )
 COMMANDS = (
     "sfm.cli",
@@ -54,7 +54,7 @@ def imported(path: Path) -> set[str]:
 
 
 def belongs(name: str, group: str) -> bool:
-    return name.startswith(group) if group.endswith("_") else name == group or name.startswith(group + ".")
+    return name == group or name.startswith(group + ".")
 
 
 def layer_of(name: str) -> int | None:
@@ -106,11 +106,11 @@ def test_libraries_stay_in_their_rooms() -> None:
         if libraries & {"matplotlib"}:
             assert name.startswith("sfm.report"), f"{name} imports matplotlib"
         if libraries & {"typer", "rich"}:
-            assert name in (*COMMANDS, "sfm.batch_table"), f"{name} imports the command line's libraries"
+            assert name in (*COMMANDS, "sfm.batch.table"), f"{name} imports the command line's libraries"
 
 
 def test_the_rules_would_notice() -> None:
     assert layer_of("sfm.targets.detect") == 2
-    assert layer_of("sfm.survey_start") == layer_of("sfm.pipeline") == 4
+    assert layer_of("sfm.survey.start") == layer_of("sfm.pipeline") == 4
     assert layer_of("sfm.surveying") is None
     assert "sfm.errors" in imported(MODULES["sfm.cli"])

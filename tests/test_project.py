@@ -10,7 +10,7 @@ import pytest
 from sfm.conventions import angles_from_rotation, image_from_pixel
 from sfm.errors import PhotographError, SurveyFileError
 from sfm.project import read_survey
-from sfm.survey_start import (
+from sfm.survey.start import (
     camera_of_image,
     control_points,
     find_photographs,

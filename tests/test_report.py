@@ -28,7 +28,7 @@ from sfm.report.result import ControlCheck, FailedImage, PhotographTargets, Stag
 from sfm.report.summary import summary, write_summary
 from sfm.report.tables import image_rms, write_tables
 from sfm.report.verdict import verdict_of
-from sfm.survey_tables import read_exterior, read_image_points, read_points
+from sfm.survey.tables import read_exterior, read_image_points, read_points
 from sfm.targets.flags import Flag
 from tests.synthetic import make_network, seed_of
 

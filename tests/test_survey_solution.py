@@ -14,7 +14,7 @@ from sfm.errors import BackendError
 from sfm.network import Estimate, Network, ObjectPoints, ScaleBars
 from sfm.pipeline import adjust_survey
 from sfm.project import read_survey
-from sfm.survey_datum import object_scale, without_contradicted_control
+from sfm.survey.datum import object_scale, without_contradicted_control
 from tests.surveys import write_observed_survey
 from tests.synthetic import make_network, seed_of
 

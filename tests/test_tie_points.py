@@ -22,7 +22,7 @@ from sfm.network import Estimate, ImagePoints, Network
 from sfm.pipeline import run_survey
 from sfm.project import read_survey
 from sfm.similarity import fit_similarity
-from sfm.survey_refine import refine_model
+from sfm.survey.refine import refine_model
 from tests.textures import random_texture, with_noise
 
 

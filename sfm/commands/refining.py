@@ -9,7 +9,7 @@ import typer
 
 from sfm.commands.console import drawn_progress
 from sfm.errors import OutputError
-from sfm.survey_refine import refine_model, refinement_text
+from sfm.survey.refine import refine_model, refinement_text
 
 
 def refine(

@@ -19,8 +19,8 @@ from adapters.sba_text import read_sba_text
 from sfm.errors import KolinearError
 from sfm.pipeline import adjust_survey
 from sfm.project import read_survey
-from sfm.survey_start import find_photographs, network_from_observations
-from sfm.survey_tables import read_control, read_exterior, read_image_points, read_points
+from sfm.survey.start import find_photographs, network_from_observations
+from sfm.survey.tables import read_control, read_exterior, read_image_points, read_points
 from sfm.targets.codes import read_code_table
 from sfm.targets.detect import find_targets
 from sfm.targets.photograph import read_metadata, read_photograph

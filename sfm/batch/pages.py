@@ -15,7 +15,7 @@ from importlib.resources import files
 from pathlib import Path
 from urllib.parse import quote
 
-from sfm.batch_survey import LOGS, SurveyRow
+from sfm.batch.survey import LOGS, SurveyRow
 from sfm.errors import OutputError
 
 HEADER = (

@@ -15,7 +15,7 @@ from sfm.errors import GeometryError, PhotographError
 from sfm.progress import SILENT, Progress
 from sfm.project import Survey, TargetSettings
 from sfm.report.result import FailedImage, PhotographTargets
-from sfm.survey_start import PhotographList, start_cameras
+from sfm.survey.start import PhotographList, start_cameras
 from sfm.targets.codes import CodeFamily, code_family
 from sfm.targets.detect import Targets, find_targets
 from sfm.targets.photograph import Metadata, read_metadata, read_photograph

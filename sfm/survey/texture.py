@@ -17,9 +17,9 @@ from sfm.network import Estimate, Network
 from sfm.progress import SILENT, Progress, StageClock
 from sfm.project import Survey, TiePointSettings
 from sfm.report.result import FailedImage, StageTime, SurveyResult
-from sfm.survey_solution import compare_solution, solve
-from sfm.survey_start import find_photographs
-from sfm.survey_tie_points import MIN_RAYS, orient_tied, tie_photographs
+from sfm.survey.solution import compare_solution, solve
+from sfm.survey.start import find_photographs
+from sfm.survey.tie_points import MIN_RAYS, orient_tied, tie_photographs
 
 
 def run_textured_survey(

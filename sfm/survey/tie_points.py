@@ -18,8 +18,8 @@ from sfm.orientation.sequence import orient
 from sfm.progress import SILENT, Progress
 from sfm.project import Survey, TiePointSettings
 from sfm.report.result import FailedImage, PhotographTargets
-from sfm.survey_solution import refine
-from sfm.survey_start import PhotographList, control_points, scale_bars, start_cameras
+from sfm.survey.solution import refine
+from sfm.survey.start import PhotographList, control_points, scale_bars, start_cameras
 from sfm.targets.photograph import Metadata, read_metadata, read_photograph
 
 MIN_RAYS = 3  # photographs that must agree on a tie point; two rays cannot contradict each other

@@ -16,8 +16,8 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from sfm.batch_pages import totals
-from sfm.batch_survey import SurveyRow
+from sfm.batch.pages import totals
+from sfm.batch.survey import SurveyRow
 
 COLOURS = {"good": "green", "fair": "yellow", "bad": "red", "": "red"}
 RECENT = 8  # finished surveys that stay in sight

@@ -17,7 +17,7 @@ from sfm.matching.lsm import LsmFlag
 from sfm.matching.multi_lsm import match_multi, pictures_of
 from sfm.network import Estimate, ImagePoints, Network, reduce_network
 from sfm.progress import SILENT, Progress
-from sfm.survey_solution import MAD_TO_SIGMA, determined, put_back
+from sfm.survey.solution import MAD_TO_SIGMA, determined, put_back
 from sfm.targets.photograph import read_photograph
 
 MIN_RAYS = 3

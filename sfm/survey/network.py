@@ -11,8 +11,8 @@ from sfm.conventions import FloatArray, IntArray
 from sfm.matching.correspondence import match_targets
 from sfm.network import Estimate, ImagePoints, Network
 from sfm.project import Survey
-from sfm.survey_start import control_points, scale_bars
-from sfm.survey_targets import MeasuredPhotographs, image_point_covariance
+from sfm.survey.start import control_points, scale_bars
+from sfm.survey.targets import MeasuredPhotographs, image_point_covariance
 
 UNNAMED = -1
 MIN_RAYS = 3  # photographs that must agree on an uncoded point; two rays cannot contradict each other

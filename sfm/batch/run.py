@@ -16,8 +16,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
-from sfm.batch_pages import write_batch_pages
-from sfm.batch_survey import (
+from sfm.batch.pages import write_batch_pages
+from sfm.batch.survey import (
     LOGS,
     Adjusters,
     SurveyJob,
@@ -32,8 +32,8 @@ from sfm.errors import KolinearError, SurveyFileError
 from sfm.folder_lock import locked
 from sfm.project import Survey, read_survey
 from sfm.report.output import refuse_foreign_folder, remove_leftovers
-from sfm.survey_log import SurveyLog
-from sfm.survey_start import find_photographs
+from sfm.survey.log import SurveyLog
+from sfm.survey.start import find_photographs
 from sfm.targets.store import STORE, TargetStore
 
 LOCK = ".kolinear/lock"

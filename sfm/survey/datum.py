@@ -12,7 +12,7 @@ from sfm.network import Estimate, Network, ObjectPoints
 from sfm.project import Survey
 from sfm.report.result import ControlCheck
 from sfm.similarity import Similarity, fit_similarity
-from sfm.survey_start import control_points, scale_bars
+from sfm.survey.start import control_points, scale_bars
 
 CONTRADICTED = 0.5  # share of its rays that the test rejects, above which control itself is to blame
 MIN_CONTROL = 3  # points that a control datum needs

@@ -17,9 +17,9 @@ from sfm.network import Estimate, Network, reduce_network
 from sfm.orientation.sequence import Orientation
 from sfm.project import Survey
 from sfm.report.result import ControlCheck
-from sfm.survey_datum import datum_warnings, placed_on_control, rescaled, without_contradicted_control
-from sfm.survey_network import Naming, build_network, match_uncoded, min_rays
-from sfm.survey_targets import MeasuredPhotographs
+from sfm.survey.datum import datum_warnings, placed_on_control, rescaled, without_contradicted_control
+from sfm.survey.network import Naming, build_network, match_uncoded, min_rays
+from sfm.survey.targets import MeasuredPhotographs
 
 ROUNDS = 3  # matching with the orientation at hand, with the adjusted one, and once more to confirm
 TOLERANCE_FACTOR = 6.0  # of the robust spread of the residuals

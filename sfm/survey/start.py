@@ -13,7 +13,7 @@ from sfm.conventions import FloatArray, IntArray, pixel_from_image
 from sfm.errors import PhotographError, SurveyFileError
 from sfm.network import Estimate, ImagePoints, Network, ObjectPoints, ScaleBars
 from sfm.project import CameraSettings, Survey, inside
-from sfm.survey_tables import (
+from sfm.survey.tables import (
     ImagePointTable,
     read_control,
     read_exterior,

@@ -16,9 +16,9 @@ from sfm.pipeline import Backend, adjust_survey, run_survey
 from sfm.project import Survey, read_survey
 from sfm.report.output import write_result
 from sfm.report.result import SurveyResult
-from sfm.survey_log import LOG, SurveyLog, read_log, result_entries
-from sfm.survey_start import find_photographs
-from sfm.survey_targets import measure_photograph
+from sfm.survey.log import LOG, SurveyLog, read_log, result_entries
+from sfm.survey.start import find_photographs
+from sfm.survey.targets import measure_photograph
 from sfm.targets.codes import code_family
 from sfm.targets.store import STORE, TargetStore
 

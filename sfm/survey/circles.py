@@ -11,9 +11,9 @@ from sfm.conventions import BoolArray, IntArray
 from sfm.network import Estimate, ImagePoints, Network
 from sfm.project import Survey
 from sfm.report.result import Eccentricity
-from sfm.survey_datum import object_scale
-from sfm.survey_network import UNNAMED, Naming
-from sfm.survey_targets import MeasuredPhotographs
+from sfm.survey.datum import object_scale
+from sfm.survey.network import UNNAMED, Naming
+from sfm.survey.targets import MeasuredPhotographs
 from sfm.targets.eccentricity import CircleViews, ellipse_shape, fit_circles
 
 NOT_A_CIRCLE = (

@@ -10,9 +10,9 @@ from sfm.errors import GeometryError
 from sfm.network import Estimate, Network
 from sfm.orientation.sequence import MIN_POINTS, Orientation, orient
 from sfm.project import Survey
-from sfm.survey_solution import refine
-from sfm.survey_start import PhotographList, approximate_values
-from sfm.survey_targets import MeasuredPhotographs
+from sfm.survey.solution import refine
+from sfm.survey.start import PhotographList, approximate_values
+from sfm.survey.targets import MeasuredPhotographs
 
 
 def orient_photographs(
