@@ -34,6 +34,7 @@ class MapperBaseline:
     total: int  # photographs given
     rms_px: float  # root mean square residual per coordinate of its own points, px
     seconds: float  # from photographs to model, s
+    name: str = "COLMAP mapper"
 
 
 def map_photographs(

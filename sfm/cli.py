@@ -8,6 +8,8 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -16,16 +18,17 @@ from rich.console import Console
 from threadpoolctl import threadpool_limits
 
 from sfm.batch.run import find_surveys, run_batch
-from sfm.batch.survey import Adjusters
+from sfm.batch.survey import Comparers
 from sfm.batch.table import BatchTable, print_batch, stopping_at_terminate
 from sfm.commands import measuring, refining, solvers
 from sfm.commands.console import drawn_progress, tell_of_compiling, tell_result
 from sfm.errors import KolinearError
 from sfm.folder_lock import locked
-from sfm.pipeline import Backend, adjust_survey, run_survey
+from sfm.pipeline import adjust_survey, run_survey
 from sfm.project import Survey, read_survey
 from sfm.report.output import refuse_foreign_folder, remove_leftovers, write_result
 from sfm.report.result import SurveyResult
+from sfm.survey.comparison import OtherPrograms
 from sfm.survey.log import SurveyLog
 from sfm.targets.store import STORE, TargetStore
 
@@ -99,16 +102,14 @@ def run(
         raise KolinearError(
             f"{survey_file}: it has [observations] in place of photographs: kolinear adjust {survey_file}"
         )
-    backend = _backend(survey)
+    others = _others(survey)
     folder = _folder(survey, out)
     workers = jobs or _cores()
     tell_of_compiling()
     store = TargetStore(folder.parent / STORE)
     with drawn_progress() as drawn, _threads(), _written(folder), SurveyLog(watch=drawn) as log:
         log.note("start", survey=survey.name, file=str(survey_file))
-        result = run_survey(
-            survey, images_dir=images, jobs=workers, backend=backend, store=store, progress=log
-        )
+        result = run_survey(survey, images_dir=images, jobs=workers, others=others, store=store, progress=log)
         page = write_result(
             result,
             folder,
@@ -137,12 +138,12 @@ def adjust(
         raise KolinearError(
             f"{survey_file}: it has no [observations]; with photographs: kolinear run {survey_file}"
         )
-    backend = _backend(survey)
+    others = _others(survey)
     folder = _folder(survey, out)
     tell_of_compiling()
     with drawn_progress() as drawn, _threads(), _written(folder), SurveyLog(watch=drawn) as log:
         log.note("start", survey=survey.name, file=str(survey_file))
-        result = adjust_survey(survey, backend=backend, progress=log)
+        result = adjust_survey(survey, others=others, progress=log)
         page = write_result(
             result,
             folder,
@@ -204,7 +205,7 @@ def batch(
             files,
             out,
             engine,
-            Adjusters(_backend, _colmap_writer),
+            Comparers(_others_of_worker, _colmap_writer),
             table,
             resume=resume,
             allow_outside=allow_outside,
@@ -255,13 +256,23 @@ def main() -> None:
         raise
 
 
-def _backend(survey: Survey) -> Backend | None:
-    """Return the other adjuster that the survey asks for; its library is imported only then."""
-    if survey.compare.backend == "none":
-        return None
-    from adapters.colmap import adjust_with_colmap
+def _others(survey: Survey, *, threads: int = -1) -> OtherPrograms:
+    """Return the programs that the survey wants to be compared with; their library is imported only then."""
+    others = OtherPrograms()
+    if survey.compare.backend == "colmap":
+        from adapters.colmap import adjust_with_colmap
 
-    return adjust_with_colmap
+        others = replace(others, adjuster=adjust_with_colmap)
+    if survey.compare.baseline == "mapper":
+        from adapters.colmap_mapper import map_photographs
+
+        others = replace(others, mapper=partial(map_photographs, threads=threads))
+    return others
+
+
+def _others_of_worker(survey: Survey) -> OtherPrograms:
+    """Return the same for a worker of a batch, one of as many as there are cores."""
+    return _others(survey, threads=1)
 
 
 def _colmap_writer(result: SurveyResult) -> Callable[[Path], None] | None:

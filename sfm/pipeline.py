@@ -7,26 +7,22 @@ Every stage is one call; what it does, and from which book, is told where it is 
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 
-from sfm.analysis.comparison import BackendAdjustment
-from sfm.network import Estimate, Network
 from sfm.progress import SILENT, Progress, StageClock
 from sfm.project import Survey
 from sfm.report.result import FailedImage, StageTime, SurveyResult
 from sfm.survey.circles import check_circles
+from sfm.survey.comparison import ALONE, OtherPrograms, compare_solution
 from sfm.survey.network import build_network, codes_of, min_rays, name_coded
 from sfm.survey.orientation import orient_photographs, orient_survey
-from sfm.survey.solution import compare_solution, match_and_adjust, solve
+from sfm.survey.solution import match_and_adjust, solve
 from sfm.survey.start import find_photographs, network_from_observations
 from sfm.survey.targets import measure_photographs
 from sfm.survey.texture import run_textured_survey
 from sfm.targets.store import TargetStore
-
-Backend = Callable[[Network, Estimate], BackendAdjustment]
 
 
 def run_survey(
@@ -34,7 +30,7 @@ def run_survey(
     *,
     images_dir: Path | None = None,
     jobs: int = 1,
-    backend: Backend | None = None,
+    others: OtherPrograms = ALONE,
     store: TargetStore | None = None,
     progress: Progress = SILENT,
 ) -> SurveyResult:
@@ -44,7 +40,7 @@ def run_survey(
         survey: what was read from the survey file.
         images_dir: folder of the photographs in place of the survey file's own.
         jobs: photographs measured at a time.
-        backend: the other adjuster to compare with, none if not given.
+        others: the programs to compare with.
         store: of measured targets, so that a photograph is not measured twice.
         progress: told of stages and photographs.
 
@@ -53,7 +49,7 @@ def run_survey(
     """
     if survey.tie_points is not None:
         return run_textured_survey(
-            survey, images_dir=images_dir, jobs=jobs, backend=backend, progress=progress
+            survey, images_dir=images_dir, jobs=jobs, others=others, progress=progress
         )
     clock = StageClock(progress)
     files = find_photographs(survey, images_dir=images_dir)
@@ -68,8 +64,7 @@ def run_survey(
         circles = check_circles(survey, photographs, naming, network, estimate)
     with clock.stage("adjustment"):
         solution = solve(survey, circles.network, circles.estimate, min_rays=min_rays(naming))
-    with clock.stage("comparison"):
-        comparison, failure = compare_solution(solution, backend)
+    compared = compare_solution(solution, others, clock, files=files)
     return SurveyResult(
         survey=survey.name,
         unit=survey.unit,
@@ -77,10 +72,11 @@ def run_survey(
         failed=photographs.failed + _failed(start.failures, solution.dropped_images),
         adjustment=solution.adjustment,
         code=codes_of(naming, solution.adjustment.network),
-        comparison=comparison,
+        comparison=compared.adjusters,
+        baseline=compared.baseline,
         photographs=photographs.overlays(),
         control_check=solution.control_check,
-        warnings=start.warnings + solution.warnings + failure,
+        warnings=start.warnings + solution.warnings + compared.failures,
         eccentricity=circles.eccentricity,
         no_circles=circles.no_circles,
         weight_factor=solution.weight_factor,
@@ -89,7 +85,7 @@ def run_survey(
 
 
 def adjust_survey(
-    survey: Survey, *, backend: Backend | None = None, progress: Progress = SILENT
+    survey: Survey, *, others: OtherPrograms = ALONE, progress: Progress = SILENT
 ) -> SurveyResult:
     """Run what comes after the photographs on a survey's [observations]; Args, Raises: as `run_survey`."""
     clock = StageClock(progress)
@@ -98,8 +94,7 @@ def adjust_survey(
         start = orient_survey(survey, network, estimate)
     with clock.stage("adjustment"):
         solution = solve(survey, network, start.estimate)
-    with clock.stage("comparison"):
-        comparison, failure = compare_solution(solution, backend)
+    compared = compare_solution(solution, others, clock)
     return SurveyResult(
         survey=survey.name,
         unit=survey.unit,
@@ -107,9 +102,9 @@ def adjust_survey(
         failed=_failed(start.failures, solution.dropped_images),
         adjustment=solution.adjustment,
         code=np.full(len(solution.adjustment.network.points), -1),
-        comparison=comparison,
+        comparison=compared.adjusters,
         control_check=solution.control_check,
-        warnings=start.warnings + solution.warnings + failure,
+        warnings=start.warnings + solution.warnings + compared.failures,
         weight_factor=solution.weight_factor,
         seconds=tuple(StageTime(*one) for one in clock.seconds),
     )

@@ -133,9 +133,10 @@ class AdjustSettings(Section):
 
 
 class CompareSettings(Section):
-    """[compare]: the other adjuster."""
+    """[compare]: the other adjuster on the survey's network, the other pipeline on its photographs."""
 
     backend: Literal["colmap", "none"] = "colmap"
+    baseline: Literal["mapper", "none"] = "none"
 
 
 class Survey(Section):
@@ -313,6 +314,11 @@ def _refuse_contradictions(survey: Survey) -> None:
             raise SurveyFileError(f"{at}: c_mm and fixed.c are both given, one is needed")
         if camera.images is None and (survey.observations is None or len(survey.cameras) > 1):
             raise SurveyFileError(f"{at}: images is missing, the glob of its photographs is needed")
+    if survey.compare.baseline != "none" and survey.observations is not None:
+        raise SurveyFileError(
+            f"{where}: compare.baseline = '{survey.compare.baseline}' needs photographs, the survey has "
+            "[observations]; leave it out"
+        )
     if survey.datum.kind == "control" and survey.control is None:
         raise SurveyFileError(f"{where}: datum kind 'control' needs [control] with the file of known points")
     for bar in survey.scale_bars:

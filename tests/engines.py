@@ -11,11 +11,11 @@ from typing import Any
 
 from threadpoolctl import threadpool_limits
 
-from sfm.batch.survey import Adjusters, SurveyRow
+from sfm.batch.survey import Comparers, SurveyRow
 from sfm.engine import Done, Event, Told, Work
-from sfm.pipeline import Backend
 from sfm.project import Survey
 from sfm.report.result import SurveyResult
+from sfm.survey.comparison import OtherPrograms
 
 KILLER = "killer"  # a survey of this name kills whoever works on it
 
@@ -62,18 +62,18 @@ class Notes:
         self.remarks.append(text)
 
 
-def no_backend(survey: Survey) -> Backend | None:
+def no_others(survey: Survey) -> OtherPrograms:
     """Compare with nobody, and kill the worker where the survey asks for it."""
     if survey.name == KILLER:
         os.kill(os.getpid(), signal.SIGKILL)
-    return None
+    return OtherPrograms()
 
 
 def no_writer(result: SurveyResult) -> None:
     return None
 
 
-ALONE = Adjusters(no_backend, no_writer)
+ALONE = Comparers(no_others, no_writer)
 
 
 def points_of(out: Path) -> dict[str, bytes]:

@@ -8,10 +8,16 @@ import cv2
 import numpy as np
 import pytest
 
+from adapters.colmap import adjust_with_colmap
 from adapters.colmap_mapper import map_photographs
 from sfm.errors import BackendError
+from sfm.pipeline import run_survey
+from sfm.project import read_survey
+from sfm.survey.comparison import OtherPrograms
 
-PHOTOGRAPHS = Path(__file__).resolve().parents[2] / "shared" / "data" / "retro-panel" / "images"
+ROOT = Path(__file__).resolve().parents[1]
+DATA = ROOT.parent / "shared" / "data"
+PHOTOGRAPHS = DATA / "retro-panel" / "images"
 
 
 def test_photographs_without_texture_give_no_model(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
@@ -35,3 +41,23 @@ def test_retro_panel_is_oriented_by_colmaps_own_pipeline() -> None:
     assert len(found.network.images) == 8
     assert 0.1 < found.rms_px < 0.5  # 0.31 px when written
     assert len(found.estimate.cameras) == 2
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(
+    not (DATA / "camcal").is_dir(), reason="photographs of camcal are not beside the repository"
+)
+def test_camcal_beside_colmaps_own_pipeline() -> None:
+    """All photographs get oriented by texture too, but the targets lie several times their sigma away."""
+    survey = read_survey(ROOT / "datasets" / "camcal" / "survey.toml")
+    result = run_survey(
+        survey,
+        images_dir=DATA / "camcal" / "images",
+        jobs=2,
+        others=OtherPrograms(adjust_with_colmap, map_photographs),
+    )
+    found = result.baseline
+    assert result.comparison is not None and result.comparison.agree
+    assert found is not None and found.photographs == (21, 21) and found.targets == 100
+    assert found.rms_px[0] < 0.14 < 0.4 < found.rms_px[1] < 0.8  # 0.126 and 0.600 px when written
+    assert 50e-6 < found.point_rms < 600e-6  # 255 micrometres when written

@@ -101,7 +101,7 @@ def test_batch_gives_folders_tables_and_logs(finished: Path) -> None:
         assert log[0]["event"] == "start"
         assert log[-1]["event"] == "result"
         stages = [entry["stage"] for entry in log if entry["event"] == "stage"]
-        assert stages[-3:] == ["adjustment", "comparison", "report"]
+        assert stages[-2:] == ["adjustment", "report"]
         photographs = [entry for entry in log if entry["event"] == "photograph"]
         assert len(photographs) == (0 if row["survey"] == "third" else 6)
         assert all(entry["targets"] >= 10 and not entry["stored"] for entry in photographs)

@@ -14,6 +14,7 @@ from sfm.pipeline import run_survey
 from sfm.project import read_survey
 from sfm.report.result import SurveyResult
 from sfm.similarity import fit_similarity
+from sfm.survey.comparison import OtherPrograms
 from sfm.targets.render import write_photographs
 from sfm.targets.scene_file import Staging, read_scene
 
@@ -64,7 +65,7 @@ def staging() -> Staging:
 
 @pytest.fixture(scope="module")
 def demo(staging: Staging, tmp_path_factory: pytest.TempPathFactory) -> SurveyResult:
-    return run(staging, tmp_path_factory.mktemp("demo"), backend=adjust_with_colmap)
+    return run(staging, tmp_path_factory.mktemp("demo"), others=OtherPrograms(adjust_with_colmap))
 
 
 def test_every_photograph_is_oriented_and_the_optimum_is_colmaps(demo: SurveyResult) -> None:

@@ -14,6 +14,7 @@ from sfm.pipeline import adjust_survey, run_survey
 from sfm.project import read_survey
 from sfm.report.result import SurveyResult
 from sfm.similarity import fit_similarity
+from sfm.survey.comparison import OtherPrograms
 
 DATASETS = Path(__file__).resolve().parents[1] / "datasets"
 
@@ -22,14 +23,14 @@ DATASETS = Path(__file__).resolve().parents[1] / "datasets"
 def camcal(shared_data: Path) -> SurveyResult:
     survey = read_survey(DATASETS / "camcal" / "survey.toml")
     folder = shared_data / "camcal" / "images"
-    return run_survey(survey, images_dir=folder, jobs=2, backend=adjust_with_colmap)
+    return run_survey(survey, images_dir=folder, jobs=2, others=OtherPrograms(adjust_with_colmap))
 
 
 @pytest.fixture(scope="module")
 def panel(shared_data: Path) -> SurveyResult:
     survey = read_survey(DATASETS / "retro-panel" / "survey.toml")
     folder = shared_data / "retro-panel" / "images"
-    return run_survey(survey, images_dir=folder, jobs=2, backend=adjust_with_colmap)
+    return run_survey(survey, images_dir=folder, jobs=2, others=OtherPrograms(adjust_with_colmap))
 
 
 def test_camcal_orients_every_photograph_and_finds_every_dot(camcal: SurveyResult) -> None:
@@ -129,7 +130,9 @@ def test_camcal_reference_points(
     from datasets.camcal.reference import prepare
 
     prepare(shared_data / "camcal", tmp_path)
-    result = adjust_survey(read_survey(tmp_path / f"reference_{name}.toml"), backend=adjust_with_colmap)
+    result = adjust_survey(
+        read_survey(tmp_path / f"reference_{name}.toml"), others=OtherPrograms(adjust_with_colmap)
+    )
     digits = len(str(sigma0)) - 2
     assert round(result.adjustment.sigma0_px, digits) == sigma0
     assert result.adjustment.redundancy == redundancy

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from adapters.colmap import read_model, write_model
+from adapters.colmap_mapper import MapperBaseline
 from adapters.csv_tables import TableResult, read_result, write_tables
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.solve import adjust
@@ -202,7 +203,7 @@ def test_baseline_is_compared_at_the_targets(epochs: tuple[Result, Result]) -> N
         network.image_points.select(slice(0)),  # type: ignore[arg-type]
     )
     found = compare_baseline(
-        a, photographs, baseline, name="mapper", total=8, rms_px=0.5, seconds=(1.0, 50.0)
+        a, MapperBaseline(photographs, baseline, total=8, rms_px=0.5, seconds=50.0), seconds=1.0
     )
     assert found.photographs == (8, 6) and found.total == 8
     assert found.targets == 60

@@ -14,6 +14,7 @@ from sfm.errors import BackendError
 from sfm.network import Estimate, Network, ObjectPoints, ScaleBars
 from sfm.pipeline import adjust_survey
 from sfm.project import read_survey
+from sfm.survey.comparison import OtherPrograms
 from sfm.survey.datum import object_scale, without_contradicted_control
 from tests.surveys import write_observed_survey
 from tests.synthetic import make_network, seed_of
@@ -24,7 +25,7 @@ def test_a_failing_comparison_leaves_the_survey(tmp_path: Path) -> None:
         raise BackendError("COLMAP is not installed")
 
     survey = read_survey(write_observed_survey(tmp_path / "alone", "alone"))
-    result = adjust_survey(survey, backend=refuse)  # type: ignore[arg-type]
+    result = adjust_survey(survey, others=OtherPrograms(refuse))  # type: ignore[arg-type]
     assert result.comparison is None
     assert result.adjustment.converged
     assert "the comparison with the other adjuster failed: COLMAP is not installed" in result.warnings

@@ -22,6 +22,7 @@ from sfm.network import Estimate, ImagePoints, Network
 from sfm.pipeline import run_survey
 from sfm.project import read_survey
 from sfm.similarity import fit_similarity
+from sfm.survey.comparison import OtherPrograms
 from sfm.survey.refine import refine_model
 from tests.textures import random_texture, with_noise
 
@@ -198,7 +199,7 @@ def test_textured_survey_from_photographs_to_result(folder: Path, tmp_path: Path
     survey = folder / f"{detector}.toml"
     text = (folder / "survey.toml").read_text(encoding="utf-8")
     survey.write_text(text.replace('"foerstner"', f'"{detector}"'), encoding="utf-8")
-    result = run_survey(read_survey(survey), jobs=2, backend=adjust_with_colmap)
+    result = run_survey(read_survey(survey), jobs=2, others=OtherPrograms(adjust_with_colmap))
     a = result.adjustment
     assert len(a.network.images) == render.PHOTOGRAPHS and not result.failed
     assert a.converged and len(a.network.points) > 2000

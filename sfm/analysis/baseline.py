@@ -7,6 +7,7 @@ gives the same object points from both, whatever points the baseline found itsel
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
@@ -20,6 +21,34 @@ from sfm.orientation.intersection import intersect
 from sfm.similarity import Similarity, fit_similarity
 
 MIN_RAYS = 2
+
+
+class Baseline(Protocol):
+    """What another pipeline made of the photographs of a survey."""
+
+    @property
+    def name(self) -> str:
+        """Name of the pipeline."""
+
+    @property
+    def network(self) -> Network:
+        """The photographs it oriented, by the survey's names, and its own points in them."""
+
+    @property
+    def estimate(self) -> Estimate:
+        """Its cameras, orientations and points, in a frame and scale of its own."""
+
+    @property
+    def total(self) -> int:
+        """Photographs it was given."""
+
+    @property
+    def rms_px(self) -> float:
+        """Root mean square residual per coordinate of its own points, px."""
+
+    @property
+    def seconds(self) -> float:
+        """From photographs to model, s."""
 
 
 @dataclass(frozen=True)
@@ -44,35 +73,38 @@ class BaselineComparison:
         return float(np.sqrt(np.nanmean(self.points**2)))
 
     @property
+    def position_rms(self) -> float:
+        """Root mean square difference of a coordinate of the projection centres, object unit."""
+        return float(np.sqrt(np.nanmean(self.position**2)))
+
+    @property
+    def max_position(self) -> float:
+        """Largest difference of a projection centre, object unit."""
+        return float(np.nanmax(np.linalg.norm(self.position, axis=1)))
+
+    @property
+    def max_rotation_deg(self) -> float:
+        """Largest angle between the rotations of a photograph, deg."""
+        return float(np.nanmax(self.rotation_deg))
+
+    @property
     def max_point(self) -> float:
         """Largest difference of a target, object unit."""
         return float(np.nanmax(np.linalg.norm(self.points, axis=1)))
 
 
-def compare_baseline(
-    adjustment: Adjustment,
-    network: Network,
-    estimate: Estimate,
-    *,
-    name: str,
-    total: int,
-    rms_px: float,
-    seconds: tuple[float, float],
-) -> BaselineComparison:
+def compare_baseline(adjustment: Adjustment, baseline: Baseline, *, seconds: float) -> BaselineComparison:
     """Compare a survey with the orientations that another pipeline found for its photographs.
 
     Args:
         adjustment: of the survey.
-        network, estimate: photographs of the baseline, known by their names, and their orientations.
-        name: what to call the baseline.
-        total: photographs that both were given.
-        rms_px: of the baseline's own image points, px.
-        seconds: of survey and baseline, from the photographs on.
+        baseline: what the other pipeline made of the same photographs.
+        seconds: of the survey, from photographs to adjustment, s.
 
     Raises:
         GeometryError: fewer than three targets can be determined with the baseline's photographs.
     """
-    survey = adjustment.network
+    survey, network, estimate = adjustment.network, baseline.network, baseline.estimate
     index = {image: i for i, image in enumerate(network.images) if estimate.oriented[i]}
     of_survey = np.array([index.get(image, -1) for image in survey.images], dtype=np.int64)
     seen = survey.image_points
@@ -96,7 +128,8 @@ def compare_baseline(
     both = np.isfinite(points).all(axis=1) & adjustment.estimate.determined
     if both.sum() < 3:
         raise GeometryError(
-            f"baseline {name}: its photographs determine {both.sum()} targets of the survey, 3 are needed"
+            f"baseline {baseline.name}: its photographs determine {both.sum()} targets of the "
+            "survey, 3 are needed"
         )
     transform = fit_similarity(points[both], adjustment.estimate.points[both])
     oriented = (of_survey >= 0) & adjustment.estimate.oriented
@@ -115,15 +148,15 @@ def compare_baseline(
     )
     v = reprojection(measured, Estimate(estimate.cameras, estimate.position, estimate.rotation, points))
     return BaselineComparison(
-        name,
+        baseline.name,
         (int(adjustment.estimate.oriented.sum()), len(index)),
-        total,
-        (adjustment.rms_px, rms_px),
+        baseline.total,
+        (adjustment.rms_px, baseline.rms_px),
         int(both.sum()),
         float(np.sqrt(np.nanmean(v**2))),
         transform,
         np.where(both[:, None], transform.apply(points) - adjustment.estimate.points, np.nan),
         position,
         angle,
-        seconds,
+        (seconds, baseline.seconds),
     )

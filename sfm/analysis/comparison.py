@@ -208,7 +208,10 @@ def compare_adjusters(
     ours = _adjusted(network, start, adjustment.sigma_px)
     held: tuple[str, ...] = ()
     if start.cameras[0].model == "full_opencv" and (ours.undetermined or not ours.converged):
-        held = ours.undetermined or ("the in-house adjuster does not converge with the distortion free",)
+        held = ours.undetermined or (
+            f"k1 to k6 still grow together after {MAX_ITERATIONS} iterations, numerator and denominator of "
+            "the rational distortion cancelling",
+        )
         start = replace(start, cameras=tuple(_distortion_held(camera) for camera in start.cameras))
         ours = _adjusted(network, start, adjustment.sigma_px)
     theirs = backend(network, start)

@@ -19,7 +19,7 @@ from typing import Any, Protocol
 from sfm.batch.pages import write_batch_pages
 from sfm.batch.survey import (
     LOGS,
-    Adjusters,
+    Comparers,
     SurveyJob,
     SurveyRow,
     fingerprint,
@@ -71,7 +71,7 @@ def run_batch(
     files: Sequence[Path],
     out: Path,
     engine: AbstractContextManager[Engine],
-    adjusters: Adjusters,
+    comparers: Comparers,
     watch: Watch,
     *,
     resume: bool = False,
@@ -83,7 +83,7 @@ def run_batch(
         files: survey files.
         out: folder of the batch; every survey gets a folder in it.
         engine: runs the work; it is entered here, since what workers leave can be cleared when they are gone.
-        adjusters: the other adjuster.
+        comparers: what the surveys are compared with.
         watch: is told what happens.
         resume: keep what an earlier run finished from the same inputs; else everything is run, and only
             measured targets are taken from an earlier run.
@@ -105,7 +105,7 @@ def run_batch(
         watch.planned([plan.folder for plan in plans])
         try:
             with engine as running:
-                rows = _run(plans, out, running, adjusters, watch, resume=resume, allow_outside=allow_outside)
+                rows = _run(plans, out, running, comparers, watch, resume=resume, allow_outside=allow_outside)
         finally:
             _clean(out, plans)
         ordered = tuple(rows[plan.folder] for plan in plans)
@@ -175,7 +175,7 @@ def _run(
     plans: Sequence[_Plan],
     out: Path,
     engine: Engine,
-    adjusters: Adjusters,
+    comparers: Comparers,
     watch: Watch,
     *,
     resume: bool,
@@ -199,7 +199,7 @@ def _run(
                 job = SurveyJob(plan.file, out, plan.folder, fingerprint(plan.survey), allow_outside)
                 earlier = finished_row(job) if resume else None
                 if earlier is None:
-                    works[plan.folder] = _work(job, plan.survey, adjusters)
+                    works[plan.folder] = _work(job, plan.survey, comparers)
             except (KolinearError, OSError) as error:
                 finish(plan.folder, _without_result(plan, out, "failed", str(error)))
                 continue
@@ -232,7 +232,7 @@ def _run(
     return rows
 
 
-def _work(job: SurveyJob, survey: Survey, adjusters: Adjusters) -> Work:
+def _work(job: SurveyJob, survey: Survey, comparers: Comparers) -> Work:
     """Return a survey as the engine takes it: a part for each photograph, and the rest."""
     parts: tuple[Call, ...] = ()
     if survey.observations is None:
@@ -241,7 +241,7 @@ def _work(job: SurveyJob, survey: Survey, adjusters: Adjusters) -> Work:
             Call(measure_one, (job, survey, name, path))
             for name, path in zip(found.names, found.paths, strict=True)
         )
-    return Work(job.folder, parts, Call(reconstruct, (job, adjusters)))
+    return Work(job.folder, parts, Call(reconstruct, (job, comparers)))
 
 
 def _without_result(plan: _Plan, out: Path, status: str, reason: str) -> SurveyRow:

@@ -12,15 +12,16 @@ from typing import Any
 
 from sfm.engine import Tell
 from sfm.errors import KolinearError, OutputError
-from sfm.pipeline import Backend, adjust_survey, run_survey
+from sfm.pipeline import adjust_survey, run_survey
 from sfm.project import Survey, read_survey
 from sfm.report.output import write_result
 from sfm.report.result import SurveyResult
+from sfm.survey.comparison import OtherPrograms
 from sfm.survey.log import LOG, SurveyLog, read_log, result_entries
 from sfm.survey.start import find_photographs
 from sfm.survey.targets import measure_photograph
-from sfm.targets.codes import code_family
 from sfm.targets.store import STORE, TargetStore
+from sfm.targets.tags import target_family
 
 LOGS = "logs"  # folder of the logs of surveys that have no result
 
@@ -42,10 +43,10 @@ class SurveyJob:
 
 
 @dataclass(frozen=True)
-class Adjusters:
-    """The other adjuster: functions of a module, so that they travel to workers."""
+class Comparers:
+    """What surveys are compared with: functions of a module, so that they travel to workers."""
 
-    backend_of: Callable[[Survey], Backend | None]  # the one that a survey asks for
+    others_of: Callable[[Survey], OtherPrograms]  # those that a survey asks for
     writer_of: Callable[[SurveyResult], Callable[[Path], None] | None]  # writes its model
 
 
@@ -89,7 +90,7 @@ def measure_one(job: SurveyJob, survey: Survey, image: str, path: Path, *, tell:
     """Measure one photograph into the store; why it cannot be read is part of what is returned."""
     begun = time.perf_counter()
     try:
-        family = code_family(survey.codes)
+        family = target_family(survey.codes)
         targets, stored = measure_photograph(path, survey.targets, family, job.store)
     except KolinearError as error:
         note = PhotographNote(image, failed=str(error))
@@ -100,13 +101,13 @@ def measure_one(job: SurveyJob, survey: Survey, image: str, path: Path, *, tell:
 
 
 def reconstruct(
-    job: SurveyJob, adjusters: Adjusters, photographs: list[PhotographNote], *, tell: Tell
+    job: SurveyJob, comparers: Comparers, photographs: list[PhotographNote], *, tell: Tell
 ) -> SurveyRow:
     """Run a survey whose photographs are measured, and write its result.
 
     Args:
         job: the survey.
-        adjusters: the other adjuster.
+        comparers: what to compare it with.
         photographs: what came of its photographs.
         tell: is told the stages.
 
@@ -127,7 +128,7 @@ def reconstruct(
         try:
             survey = read_survey(job.file, allow_outside=job.allow_outside)
             name = survey.name
-            row = _run(job, survey, adjusters, log, lambda: before + time.perf_counter() - begun)
+            row = _run(job, survey, comparers, log, lambda: before + time.perf_counter() - begun)
         except OutputError as error:
             log.note("failed", reason=str(error))
             raise
@@ -176,13 +177,13 @@ def finished_row(job: SurveyJob) -> SurveyRow | None:
 
 
 def _run(
-    job: SurveyJob, survey: Survey, adjusters: Adjusters, log: SurveyLog, seconds: Callable[[], float]
+    job: SurveyJob, survey: Survey, comparers: Comparers, log: SurveyLog, seconds: Callable[[], float]
 ) -> SurveyRow:
-    backend = adjusters.backend_of(survey)
+    others = comparers.others_of(survey)
     if survey.observations is not None:
-        result = adjust_survey(survey, backend=backend, progress=log)
+        result = adjust_survey(survey, others=others, progress=log)
     else:
-        result = run_survey(survey, backend=backend, store=job.store, progress=log)
+        result = run_survey(survey, others=others, store=job.store, progress=log)
     log.stage("report")
     row: list[SurveyRow] = []
 
@@ -190,7 +191,7 @@ def _run(
         row.append(_row(job, result_entries(result), round(seconds(), 3)))
         log.close_into(folder, result, seconds=row[0].seconds)
 
-    write_result(result, job.out / job.folder, write_colmap=adjusters.writer_of(result), finish=close_log)
+    write_result(result, job.out / job.folder, write_colmap=comparers.writer_of(result), finish=close_log)
     return row[0]
 
 

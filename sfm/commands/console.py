@@ -174,6 +174,17 @@ def _figures(result: SurveyResult) -> tuple[tuple[str, str], ...]:
         rows.append(
             (both.backend, f"{word}: RMS {rms[0]:.7f} px (kolinear), {rms[1]:.7f} px ({both.backend})")
         )
+    found = result.baseline
+    if found is not None:
+        factor, unit = finer_unit(result.length_unit, found.point_rms)
+        rows.append(
+            (
+                found.name,
+                f"{found.photographs[1]} of {found.total} oriented, RMS {found.rms_px[1]:.3f} px, "
+                f"{significant(factor * found.point_rms)} {unit} from the survey at {found.targets} points, "
+                f"{found.seconds[1]:.0f} s",
+            )
+        )
     return tuple(rows)
 
 

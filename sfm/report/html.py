@@ -14,6 +14,7 @@ from sfm.report.checks import object_size, sigma0_ratio
 from sfm.report.markup import figure, finer_unit, significant
 from sfm.report.overlays import Overlay
 from sfm.report.result import SurveyResult
+from sfm.report.section_baseline import baseline_section
 from sfm.report.section_comparison import comparison_section
 from sfm.report.section_quality import quality_section
 from sfm.report.section_rejected import rejected_section
@@ -39,11 +40,17 @@ def render_html(
     """
     verdict = verdict_of(result)
     pictures = {stem: figure(data, caption) for stem, caption, data in plots}
+    baseline = (
+        (("baseline", "And COLMAP by itself?", baseline_section(result, result.baseline)),)
+        if result.baseline is not None
+        else ()
+    )
     sections = (
         ("worked", "Did it work?", worked_section(result, verdict) + pictures.get("network", "")),
         ("quality", "How good is it?", quality_section(result, pictures)),
         ("rejected", "What was thrown out, and why?", rejected_section(result)),
         ("comparison", "Does the other adjuster agree?", comparison_section(result)),
+        *baseline,
         ("coordinates", "Where are my coordinates?", coordinates_section(result, has_model=has_model)),
         ("photographs", "The photographs", photographs_section(result, overlays)),
         ("process", "How it was done", process_section(result)),

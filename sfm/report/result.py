@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from sfm.adjustment.result import Adjustment
+from sfm.analysis.baseline import BaselineComparison
 from sfm.analysis.comparison import AdjusterComparison
 from sfm.conventions import FloatArray, IntArray
 from sfm.targets.flags import count_flags
@@ -82,6 +83,7 @@ class SurveyResult:
     adjustment: Adjustment  # in the datum and on the control that the survey asks for
     code: IntArray  # code number of each point of adjustment.network, -1 = uncoded, (n,)
     comparison: AdjusterComparison | None  # with the other adjuster; None if the survey asks for none
+    baseline: BaselineComparison | None = None  # another pipeline on the photographs; None likewise
     photographs: tuple[PhotographTargets, ...] = ()  # of every readable photograph; none with [observations]
     control_check: ControlCheck | None = None  # None without control, or where the datum is control
     warnings: tuple[str, ...] = ()  # one line each, in words

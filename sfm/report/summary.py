@@ -87,6 +87,7 @@ def summary(result: SurveyResult) -> dict[str, Any]:
         "eccentricity": _eccentricity(result),
         "no_circles": list(result.no_circles),
         "comparison": _comparison(result),
+        "baseline": _baseline(result),
         "warnings": list(result.warnings),
         "seconds": {time.stage: round(time.seconds, 3) for time in result.seconds},
     }
@@ -229,6 +230,28 @@ def _comparison(result: SurveyResult) -> dict[str, Any] | None:
             }
             for one in both.conversions
         ],
+    }
+
+
+def _baseline(result: SurveyResult) -> dict[str, Any] | None:
+    found = result.baseline
+    if found is None:
+        return None
+
+    def pair(values: tuple[float, float]) -> dict[str, float | None]:
+        return {"kolinear": _number(values[0]), found.name: _number(values[1])}
+
+    return {
+        "pipeline": found.name,
+        "images": {"kolinear": found.photographs[0], found.name: found.photographs[1], "total": found.total},
+        "rms_px": pair(found.rms_px),
+        "seconds": pair(found.seconds),
+        "targets": found.targets,
+        "target_rms_px": _number(found.target_rms_px),
+        "point_rms": _number(found.point_rms),
+        "max_point": _number(found.max_point),
+        "position_rms": _number(found.position_rms),
+        "max_rotation_deg": _number(found.max_rotation_deg),
     }
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -10,9 +9,8 @@ import numpy as np
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
-from sfm.analysis.comparison import AdjusterComparison, BackendAdjustment, compare_adjusters
 from sfm.conventions import BoolArray, IntArray
-from sfm.errors import GeometryError, KolinearError
+from sfm.errors import GeometryError
 from sfm.network import Estimate, Network, reduce_network
 from sfm.orientation.sequence import Orientation
 from sfm.project import Survey
@@ -140,21 +138,6 @@ def solve(
     )
     final = replace(final, iterations=iterations + final.iterations)
     return Solution(final, check, dropped, (*contradictions, *_warnings(survey, known, final)), weight_factor)
-
-
-def compare_solution(
-    solution: Solution, backend: Callable[[Network, Estimate], BackendAdjustment] | None
-) -> tuple[AdjusterComparison | None, tuple[str, ...]]:
-    """Return the comparison with another adjuster, or none and a line why it failed.
-
-    The survey stands without it, so that a library that is missing or refuses does not lose the result.
-    """
-    if backend is None:
-        return None, ()
-    try:
-        return compare_adjusters(solution.adjustment, backend), ()
-    except KolinearError as error:
-        return None, (f"the comparison with the other adjuster failed: {error}",)
 
 
 def _tested(

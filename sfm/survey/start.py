@@ -30,6 +30,14 @@ class PhotographList:
     names: tuple[str, ...]  # file names, by which tables and reports know them, (m,)
     paths: tuple[Path, ...]  # (m,)
     camera: IntArray  # index into Survey.cameras, (m,)
+    folder: Path  # that the names are relative to
+
+    def by_camera(self) -> tuple[tuple[str, ...], ...]:
+        """Return the names of the photographs of each camera that has some."""
+        return tuple(
+            tuple(name for name, k in zip(self.names, self.camera, strict=True) if k == one)
+            for one in np.unique(self.camera)
+        )
 
     def __len__(self) -> int:
         return len(self.names)
@@ -76,7 +84,7 @@ def find_photographs(survey: Survey, *, images_dir: Path | None = None) -> Photo
             )
         seen[name] = index
     names, paths, cameras = zip(*owner, strict=True)
-    return PhotographList(names, paths, np.array(cameras, dtype=np.int64))
+    return PhotographList(names, paths, np.array(cameras, dtype=np.int64), folder)
 
 
 def camera_of_image(survey: Survey, image: str) -> int:

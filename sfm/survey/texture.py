@@ -7,17 +7,15 @@ From the orientation on it is the way of `sfm.pipeline`: the same adjustment, th
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 
-from sfm.analysis.comparison import BackendAdjustment
-from sfm.network import Estimate, Network
 from sfm.progress import SILENT, Progress, StageClock
 from sfm.project import Survey, TiePointSettings
 from sfm.report.result import FailedImage, StageTime, SurveyResult
-from sfm.survey.solution import compare_solution, solve
+from sfm.survey.comparison import ALONE, OtherPrograms, compare_solution
+from sfm.survey.solution import solve
 from sfm.survey.start import find_photographs
 from sfm.survey.tie_points import MIN_RAYS, orient_tied, tie_photographs
 
@@ -27,7 +25,7 @@ def run_textured_survey(
     *,
     images_dir: Path | None = None,
     jobs: int = 1,
-    backend: Callable[[Network, Estimate], BackendAdjustment] | None = None,
+    others: OtherPrograms = ALONE,
     progress: Progress = SILENT,
 ) -> SurveyResult:
     """Run a survey with [tie_points] from its photographs.
@@ -45,8 +43,7 @@ def run_textured_survey(
     with clock.stage("adjustment"):
         rays = np.full(len(network.points), MIN_RAYS)
         solution = solve(survey, network, estimate, min_rays=rays)
-    with clock.stage("comparison"):
-        comparison, failure = compare_solution(solution, backend)
+    compared = compare_solution(solution, others, clock, files=files)
     return SurveyResult(
         survey=survey.name,
         unit=survey.unit,
@@ -54,10 +51,11 @@ def run_textured_survey(
         failed=tied.failed + tuple(FailedImage(*one) for one in (*not_oriented, *solution.dropped_images)),
         adjustment=solution.adjustment,
         code=np.full(len(solution.adjustment.network.points), -1),
-        comparison=comparison,
+        comparison=compared.adjusters,
+        baseline=compared.baseline,
         photographs=tied.overlays(settings.window_px),
         control_check=solution.control_check,
-        warnings=solution.warnings + failure,
+        warnings=solution.warnings + compared.failures,
         weight_factor=solution.weight_factor,
         seconds=tuple(StageTime(*one) for one in clock.seconds),
     )
