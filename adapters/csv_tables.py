@@ -23,8 +23,9 @@ from typing import Any
 
 import numpy as np
 
-from sfm.camera import MODELS, Camera
+from sfm.camera import Camera
 from sfm.conventions import FloatArray, angles_from_rotation, rotation_from_angles
+from sfm.distortion.models import MODELS
 from sfm.errors import OutputError, SurveyFileError
 from sfm.network import Estimate, ImagePoints, Network
 

@@ -16,6 +16,7 @@ from adapters.csv_tables import TableResult, read_result, write_tables
 from adapters.metashape import read_metashape, write_metashape
 from adapters.photomodeler import read_photomodeler, write_photomodeler
 from adapters.ply import write_ply
+from sfm.distortion.models import MODELS
 from sfm.errors import KolinearError, OutputError, SurveyFileError
 from sfm.network import Estimate, Network, empty_estimate
 
@@ -34,7 +35,7 @@ FORMATS = (
     FileFormat("colmap", ("full_opencv", "opencv"), True, True),
     FileFormat("colmap-text", ("full_opencv", "opencv"), True, True),
     FileFormat("colmap-database", ("full_opencv", "opencv"), False, True),
-    FileFormat("tables", ("brown", "full_opencv", "opencv", "brown_forward"), True, True),
+    FileFormat("tables", tuple(MODELS), True, True),
     FileFormat("metashape", ("brown_forward", "opencv"), False, True),
     FileFormat("photomodeler", ("brown",), False, True),
     FileFormat("bal", ("opencv",), False, True),

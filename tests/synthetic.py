@@ -11,8 +11,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from sfm.camera import MODELS, Camera, camera_from_values, project
+from sfm.camera import Camera, camera_from_values, project
 from sfm.conventions import BoolArray, FloatArray, rotation_from_vector
+from sfm.distortion.models import MODELS
 from sfm.network import Estimate, ImagePoints, Network
 
 SIZE_PX = (2000, 1500)
@@ -32,12 +33,14 @@ DISTORTION = {
     "opencv": (("k1", -0.08), ("k2", 0.04), ("p1", 3e-4), ("p2", -2e-4), ("cx", 1005.0), ("cy", 745.0)),
     "full_opencv": (("k1", -0.08), ("k2", 0.04), ("p1", 3e-4), ("p2", -2e-4), ("k4", 0.01), ("cx", 1005.0)),
 }  # a lens with up to 40 px of distortion in the corners
+DISTORTION["brown_affine"] = DISTORTION["brown"]
 FREE = {
     "brown": ("c", "x0", "y0", "K1", "K2", "P1", "P2"),
     "brown_forward": ("c", "x0", "y0", "K1", "K2", "P1", "P2"),
     "opencv": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2"),
     "full_opencv": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2"),
 }
+FREE["brown_affine"] = (*FREE["brown"], "b1")
 
 
 def seed_of(name: str) -> np.random.Generator:
@@ -178,7 +181,7 @@ def _directions(rng: np.random.Generator, count: int) -> FloatArray:
 
 def _spoiled(camera: Camera, scale: float, distortion: bool) -> Camera:
     p = camera.parameters.copy()
-    lengths = 1 if camera.model.startswith("brown") else 2
+    lengths = 1 if camera.in_mm else 2
     p[:lengths] *= scale
     if not distortion:
         fresh = camera_from_values(

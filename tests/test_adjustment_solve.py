@@ -13,8 +13,8 @@ from sfm.adjustment.datum import Datum, free_motions
 from sfm.adjustment.parameters import angle_jacobian, step, unknowns_of
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
-from sfm.camera import MODELS
 from sfm.conventions import angles_from_rotation
+from sfm.distortion.models import MODELS
 from sfm.errors import GeometryError
 from sfm.network import (
     Estimate,

@@ -4,19 +4,18 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from numba import njit
 from synthetic import DISTORTION, FREE, PIXEL_MM, SIZE_PX, seed_of
 
 from sfm.camera import (
-    MAX_PARAMETERS,
-    MODELS,
     Camera,
     camera_from_values,
-    observe,
     pixel_from_tangents,
     pixel_jacobian,
     project,
     tangents_from_pixel,
 )
+from sfm.distortion.models import ALL, MAX_PARAMETERS, MODELS, Model, one_of
 from sfm.errors import SurveyFileError
 
 
@@ -33,7 +32,7 @@ def lens(model: str) -> Camera:
 
 def residual(camera: Camera, p: np.ndarray, xy: np.ndarray, uv: np.ndarray) -> tuple[np.ndarray, ...]:
     r, Ju, Jp = np.empty(2), np.empty((2, 2)), np.empty((2, MAX_PARAMETERS))
-    observe(camera.index, camera.frame, p, xy[0], xy[1], uv[0], uv[1], r, Ju, Jp)
+    MODELS[camera.model].function(camera.frame, p, xy[0], xy[1], uv[0], uv[1], r, Ju, Jp)
     return r, Ju, Jp[:, : len(p)]
 
 
@@ -64,6 +63,28 @@ def assert_derivative(derivative: np.ndarray, steps: list[np.ndarray], h: float)
     difference = (steps[0] - 8 * steps[1] + 8 * steps[2] - steps[3]) / (12 * h)
     rounding = 1e-12 / h  # residuals are of the order of 1000 px
     assert np.abs(derivative - difference).max() <= 1e-8 * np.abs(derivative).max() + rounding
+
+
+def test_a_model_is_a_function_and_a_row() -> None:
+    """A row more in the table is all that a further model needs to be observed by."""
+
+    @njit(error_model="numpy")
+    def fisheye(frame, p, x, y, u, v, r, Ju, Jp):  # type: ignore[no-untyped-def]
+        r[0] = p[0] * np.arctan(u) - x
+        r[1] = p[0] * np.arctan(v) - y
+
+    further = Model("fisheye", fisheye, "f", "px")
+    assert (further.names, further.in_mm) == (("f",), False)
+    observe = one_of((*ALL, further)).py_func
+    r, Ju, Jp = np.zeros(2), np.zeros((2, 2)), np.zeros((2, MAX_PARAMETERS))
+    observe(len(ALL), np.zeros(4), np.array([1000.0]), 1.0, 2.0, 0.5, -0.25, r, Ju, Jp)
+    assert r == pytest.approx([1000 * np.arctan(0.5) - 1, 1000 * np.arctan(-0.25) - 2])
+    for number, model in enumerate(ALL):
+        camera = lens(model.name)
+        assert camera.index == number and len(camera.units) == len(camera.names)
+        xy, uv = np.array([400.0, 300.0]), np.array([0.2, -0.1])
+        observe(number, camera.frame, camera.parameters, *xy, *uv, r, Ju, Jp)
+        assert (r == residual(camera, camera.parameters, xy, uv)[0]).all()
 
 
 @pytest.mark.parametrize("model", MODELS)

@@ -22,9 +22,9 @@ from sfm.analysis.comparison import (
     interior_effect_px,
     rotation_angle_deg,
 )
-from sfm.camera import MODELS as CAMERA_MODELS
 from sfm.camera import camera_from_values
 from sfm.conventions import rotation_from_vector
+from sfm.distortion.models import MODELS as CAMERA_MODELS
 from sfm.errors import GeometryError
 from sfm.network import Estimate, ImagePoints, Network
 from sfm.similarity import Similarity

@@ -10,7 +10,7 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 LAYERS = (
     ("sfm.conventions", "sfm.errors", "sfm.progress", "sfm.folder_lock", "sfm.engine"),
-    ("sfm.camera", "sfm.network", "sfm.similarity"),
+    ("sfm.distortion", "sfm.camera", "sfm.network", "sfm.similarity"),
     ("sfm.targets", "sfm.matching", "sfm.orientation", "sfm.adjustment"),
     ("sfm.analysis",),
     ("sfm.report", "sfm.pipeline", "sfm.project", "sfm.survey"),

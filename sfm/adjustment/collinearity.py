@@ -16,8 +16,8 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from sfm.camera import MAX_PARAMETERS, observe
 from sfm.conventions import BoolArray, FloatArray, IntArray
+from sfm.distortion.models import MAX_PARAMETERS, observe
 
 
 class Observations(NamedTuple):

@@ -19,8 +19,8 @@ from scipy.linalg.blas import dsyrk
 from sfm.adjustment.collinearity import State, collinearity, scratch
 from sfm.adjustment.parameters import Unknowns
 from sfm.adjustment.weighted import Weighted, point_terms, weighted_terms
-from sfm.camera import MAX_PARAMETERS
 from sfm.conventions import FloatArray, IntArray
+from sfm.distortion.models import MAX_PARAMETERS
 from sfm.errors import GeometryError
 
 SINGULAR_PIVOT = 1e-13  # share of a point's own normal equation left below which its rays are parallel

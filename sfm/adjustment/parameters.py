@@ -12,8 +12,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sfm.adjustment.collinearity import Observations, State, behind_camera, whitening_of
-from sfm.camera import MAX_PARAMETERS
 from sfm.conventions import BoolArray, FloatArray, IntArray, angles_from_rotation, rotation_from_vector
+from sfm.distortion.models import MAX_PARAMETERS
 from sfm.errors import GeometryError
 from sfm.network import Estimate, Network
 

@@ -13,16 +13,9 @@ import numpy as np
 from numba import njit
 from scipy.optimize import least_squares
 
-from sfm.camera import (
-    MAX_PARAMETERS,
-    MODELS,
-    Camera,
-    camera_from_values,
-    observe,
-    pixel_from_tangents,
-    tangents_from_pixel,
-)
+from sfm.camera import Camera, camera_from_values, pixel_from_tangents, tangents_from_pixel
 from sfm.conventions import BoolArray, FloatArray
+from sfm.distortion.models import MAX_PARAMETERS, MODELS, observe
 from sfm.errors import GeometryError, SurveyFileError
 from sfm.network import Estimate
 
@@ -60,7 +53,7 @@ def convert_camera(camera: Camera, model: str, *, region_px: FloatArray | None =
 
     Args:
         camera: interior orientation to convert.
-        model: one of sfm.camera.MODELS.
+        model: a name in sfm.distortion.models.MODELS.
         region_px: x_min, y_min, x_max, y_max of the region that matters, px, shape (4,); the whole
             photograph if not given.
 
@@ -131,14 +124,14 @@ def start_values(camera: Camera, model: str) -> Camera:
 
     Between `brown` and the opencv models they are p1 = c P2, p2 = -c P1, k1 = -c^2 K1,
     k2 = c^4 (3 K1^2 - K2), k3 = c^6 (8 K1 K2 - 12 K1^3 - K3), and the same read the other way;
-    between other models distortion starts at 0.
+    between other models distortion starts at 0, or at the same values where the parameters are the same.
     """
     pixel = (float(camera.pixel_mm[0]), float(camera.pixel_mm[1]))
-    backward = camera.model == "brown"
-    to_opencv = not model.startswith("brown")
+    backward = MODELS[camera.model].corrects
+    to_opencv = not MODELS[model].in_mm
     centre = (np.asarray(camera.size_px) - 1) / 2
     values: dict[str, float] = {}
-    if camera.model.startswith("brown"):
+    if camera.in_mm:
         c, x0, y0, b1 = (camera.value(name) for name in ("c", "x0", "y0", "b1"))
         if to_opencv:
             # brown multiplies the measured x by 1 + b1, brown_forward the ideal one
@@ -146,7 +139,9 @@ def start_values(camera: Camera, model: str) -> Camera:
             values |= {"fx": fx, "fy": c / pixel[1]}
             values |= {"cx": centre[0] + x0 / pixel[0], "cy": centre[1] - y0 / pixel[1]}
         else:
-            values |= {"x0": x0, "y0": y0, "b1": -b1}
+            values |= {"x0": x0, "y0": y0, "b1": b1 if backward == MODELS[model].corrects else -b1}
+        if MODELS[model].names == camera.names:
+            values |= dict(zip(camera.names, camera.parameters.tolist(), strict=True))
         if backward and to_opencv:
             k1, k2, k3 = _reversed(*(camera.value(f"K{i}") * c ** (2 * i) for i in (1, 2, 3)))
             values |= {"k1": k1, "k2": k2, "p1": c * camera.value("P2"), "p2": -c * camera.value("P1")}
@@ -159,8 +154,8 @@ def start_values(camera: Camera, model: str) -> Camera:
             stretch = camera.value("fx") * pixel[0] / c
             values |= {"x0": (camera.value("cx") - centre[0]) * pixel[0]}
             values |= {"y0": -(camera.value("cy") - centre[1]) * pixel[1]}
-            values |= {"b1": 1 - stretch if model == "brown" else stretch - 1}
-        if model == "brown":
+            values |= {"b1": 1 - stretch if MODELS[model].corrects else stretch - 1}
+        if MODELS[model].corrects:
             K = _reversed(*_power_series(camera))
             values |= {f"K{i}": K[i - 1] / c ** (2 * i) for i in (1, 2, 3)}
             values |= {"P1": -camera.value("p2") / c, "P2": camera.value("p1") / c}
@@ -174,7 +169,7 @@ def corresponding_free(camera: Camera, model: str) -> BoolArray:
     cut short on one side is not cut short on the other.
     """
     free = {name for name, is_free in zip(camera.names, camera.free, strict=True) if is_free}
-    return np.array([bool(free.intersection(_KIN[name])) for name in MODELS[model].names])
+    return np.array([bool(free.intersection(_KIN.get(name, (name,)))) for name in MODELS[model].names])
 
 
 def _reversed(a: float, b: float, c: float) -> tuple[float, float, float]:

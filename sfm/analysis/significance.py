@@ -21,7 +21,6 @@ from scipy.stats import chi2, f
 
 from sfm.analysis.comparison import rotation_angle_deg
 from sfm.analysis.conversion import Conversion, convert_camera
-from sfm.camera import MODELS
 from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.errors import GeometryError
 from sfm.network import Estimate, Network
@@ -233,11 +232,10 @@ def _interior(a: ResultLike, b: ResultLike, ia: IntArray, ib: IntArray) -> tuple
     for p, q in pairs:
         ours, theirs = a.estimate.cameras[p], b.estimate.cameras[q]
         conversion = None
-        sigma = np.full(len(MODELS[ours.model].names), np.nan)
+        sigma = np.full(len(ours.names), np.nan)
         if theirs.model != ours.model:
-            theirs = (
-                replace(theirs, pixel_mm=ours.pixel_mm) if not theirs.model.startswith("brown") else theirs
-            )
+            if not theirs.in_mm:
+                theirs = replace(theirs, pixel_mm=ours.pixel_mm)
             conversion = convert_camera(theirs, ours.model)
             theirs = conversion.camera
         elif a.interior_sigma is not None and b.interior_sigma is not None:

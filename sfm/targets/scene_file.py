@@ -12,6 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from sfm.camera import Camera, camera_from_values
 from sfm.conventions import FloatArray
+from sfm.distortion.models import MODELS
 from sfm.errors import SurveyFileError
 from sfm.targets.codes import CodeFamily, code_family
 from sfm.targets.scene import (
@@ -66,7 +67,7 @@ class _Head(_Section):
 
 
 class _Camera(_Section):
-    model: Literal["brown", "brown_forward", "opencv", "full_opencv"]
+    model: Literal[tuple(MODELS)]  # type: ignore[valid-type]
     size_px: Annotated[tuple[int, int], Field(strict=False)]
     pixel_mm: Two
     c_mm: Length

@@ -1,0 +1,87 @@
+"""The distortion models: which there are, what their parameters are called, and one way to all of them.
+
+A model is one compiled function `model(frame, p, x, y, u, v, r, Ju, Jp)`. From the tangents (u, v) of
+the ray in the image frame (u = -U/W, v = -V/W, y up) and the measured pixel (x, y) it fills
+
+    r  (2,)     computed minus measured, px, pixel frame (y down)
+    Ju (2, 2)   d r / d (u, v)
+    Jp (2, n)   d r / d p in the order of the model's parameter names
+
+The models of photogrammetry correct the measured point, those of computer vision distort the ideal
+one; in both cases r vanishes at the true parameters. To add a model: write its function and give it a
+row in `ALL`; adjustment, resection, conversion, survey file and reports follow from that row.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from numba import njit
+
+from sfm.distortion.brown import brown, brown_affine, brown_forward
+from sfm.distortion.opencv import full_opencv, opencv
+
+
+@dataclass(frozen=True)
+class Model:
+    """A distortion model and what its parameters are called and measured in."""
+
+    name: str
+    function: Callable[..., None]  # value and Jacobian, compiled
+    parameters: str  # names of the parameters in the order of the vector
+    units: str  # their units, in the same order
+    corrects: bool = False  # whether it corrects the measured point; else it distorts the ideal one
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the parameters in the order of the vector."""
+        return tuple(self.parameters.split())
+
+    @property
+    def in_mm(self) -> bool:
+        """Whether c, x0, y0 are in mm on the sensor; else there are focal lengths in px."""
+        return "c" in self.names
+
+
+_BROWN = ("c x0 y0 K1 K2 K3 P1 P2 b1 b2", "mm mm mm mm^-2 mm^-4 mm^-6 mm^-1 mm^-1 1 1")
+ALL = (
+    Model("brown", brown, *_BROWN, corrects=True),
+    Model(
+        "brown_forward",
+        brown_forward,
+        "c x0 y0 K1 K2 K3 K4 P1 P2 b1 b2",
+        "mm mm mm mm^-2 mm^-4 mm^-6 mm^-8 mm^-1 mm^-1 1 1",
+    ),
+    Model("opencv", opencv, "fx fy cx cy k1 k2 p1 p2", "px px px px 1 1 1 1"),
+    Model("full_opencv", full_opencv, "fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6", "px px px px 1 1 1 1 1 1 1 1"),
+    Model("brown_affine", brown_affine, *_BROWN, corrects=True),
+)
+MODELS = {model.name: model for model in ALL}
+MAX_PARAMETERS = max(len(model.names) for model in ALL)
+
+
+def number_of(model: str) -> int:
+    """Return the number by which compiled code knows a model: its row in `ALL`."""
+    return list(MODELS).index(model)
+
+
+def one_of(models: tuple[Model, ...]) -> Callable[..., None]:
+    """Return one compiled function of all: observe(number, frame, p, x, y, u, v, r, Ju, Jp).
+
+    Its source, a branch for each model, is written here, because the compiler inlines the models only from
+    plain branches on their names; a chain of closures over them makes an adjustment a third slower.
+    """
+    arguments = "frame, p, x, y, u, v, r, Ju, Jp"
+    lines = [f"def observe(number, {arguments}):"]
+    names: dict[str, Any] = {}
+    for number, model in enumerate(models):
+        names[model.name] = model.function
+        lines.append(f"    {'elif' if number else 'if'} number == {number}: {model.name}({arguments})")
+    exec("\n".join(lines), names)
+    compiled: Callable[..., None] = njit(inline="always", error_model="numpy")(names["observe"])
+    return compiled
+
+
+observe = one_of(ALL)
