@@ -11,7 +11,8 @@ import pytest
 
 from sfm.conventions import FloatArray
 from sfm.errors import GeometryError, PhotographError
-from sfm.matching.lsm import LsmFlag, LsmMatches, match_lsm
+from sfm.matching.flags import LsmFlag
+from sfm.matching.lsm import LsmMatches, match_lsm
 from sfm.matching.ncc import match_ncc
 from tests.textures import MEAN, Pairs, affine_pairs, with_noise
 

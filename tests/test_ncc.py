@@ -12,7 +12,10 @@ from sfm.conventions import FloatArray
 from sfm.errors import GeometryError
 from sfm.matching.conjugate import match_points
 from sfm.matching.epipolar_path import epipolar_paths
-from sfm.matching.ncc import NccFlag, match_along_line, match_ncc, match_pyramid
+from sfm.matching.flags import NccFlag
+from sfm.matching.ncc import match_ncc
+from sfm.matching.ncc_line import match_along_line
+from sfm.matching.ncc_pyramid import match_pyramid
 from tests.synthetic import make_network
 from tests.textures import random_texture, with_noise
 
@@ -172,3 +175,15 @@ def test_float_and_flat_regions_do_not_disturb_the_peak() -> None:
     inside = (at + SHIFT < 215).all(axis=1) & (at + SHIFT > 55).all(axis=1)
     matches = match_ncc(left, dark, at[inside], at[inside], search_px=101)
     assert np.linalg.norm(matches.xy - at[inside] - SHIFT, axis=1).max() < 0.5
+
+
+def test_pyramid_of_deep_photographs() -> None:
+    left, right, at = _photographs()
+    deep = [np.rint(p.clip(0, 255) * 257).astype(np.uint16) for p in (left, right)]
+    found = match_pyramid(deep[0], right, at, at, search_px=81)
+    assert found.good.mean() > 0.95
+    both = match_ncc(deep[0], right, at, at, search_px=81)
+    assert found.gain == pytest.approx(both.gain, rel=0.02)
+    assert found.offset == pytest.approx(both.offset, abs=2)
+    flat = np.full((260, 260), 7000, np.uint16) + np.random.default_rng(1).integers(0, 99, (260, 260))
+    assert not match_pyramid(flat.astype(np.uint16), deep[1], at, at, search_px=81).good.any()

@@ -14,8 +14,8 @@ from datasets.textured import render
 from sfm.camera import project, tangents_from_pixel
 from sfm.conventions import AnyArray, FloatArray
 from sfm.errors import GeometryError, SurveyFileError
+from sfm.matching.flags import LsmFlag
 from sfm.matching.interest import foerstner_points
-from sfm.matching.lsm import LsmFlag
 from sfm.matching.multi_lsm import match_multi
 from sfm.matching.tie_points import Features, find_tie_points, link_features
 from sfm.network import Estimate, ImagePoints, Network

@@ -13,8 +13,9 @@ import numpy as np
 
 from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
 from sfm.errors import GeometryError
-from sfm.matching.lsm import LsmFlag, match_lsm
-from sfm.matching.ncc import NccFlag, match_ncc
+from sfm.matching.flags import LsmFlag, NccFlag, in_words
+from sfm.matching.lsm import match_lsm
+from sfm.matching.ncc import match_ncc
 from sfm.matching.radiometry import equalise_histogram
 
 METHODS = {"ncc": "", "lsm": "affine", "lsm8": "projective", "shift": "shift"}
@@ -88,7 +89,7 @@ def match_points(
     found = match_ncc(
         left, right, a, b, template_px=template_px, search_px=search_px, min_correlation=min_correlation
     )
-    ncc_reason = tuple(_words(NccFlag, flag) for flag in found.flag)
+    ncc_reason = tuple(in_words(NccFlag, flag) for flag in found.flag)
     if method == "ncc":
         warp = np.tile(np.eye(3), (len(a), 1, 1))
         warp[:, :2, 2] = found.xy
@@ -112,7 +113,7 @@ def match_points(
         min_correlation=min_correlation,
     )
     reason = tuple(
-        _words(LsmFlag, flag) if ok else ncc
+        in_words(LsmFlag, flag) if ok else ncc
         for ok, ncc, flag in zip(started, ncc_reason, lsm.flag, strict=True)
     )
     correlation = np.where(started, lsm.correlation, found.correlation)
@@ -120,10 +121,3 @@ def match_points(
         method, a, lsm.xy, lsm.covariance, lsm.warp, correlation, found.second, lsm.gain, lsm.offset,
         np.where(started, lsm.steps, 0), reason,
     )  # fmt: skip
-
-
-def _words(kind: type[LsmFlag] | type[NccFlag], flag: int) -> str:
-    """Return the names of the flags set, in words."""
-    return ", ".join(
-        str(one.name).lower().replace("_", " ") for one in kind if one.value and flag & one.value
-    )

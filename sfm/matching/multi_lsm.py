@@ -17,29 +17,23 @@ from numba import njit
 from sfm.camera import pixel_jacobian, project
 from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
 from sfm.errors import GeometryError
+from sfm.matching.flags import DIVERGED, FLAT_TEXTURE, LOW_CORRELATION, MATCHED, OUTSIDE, TOO_FAR
 from sfm.matching.interpolation import TAPS, interpolation_index
-from sfm.matching.lsm import (
-    DIVERGED,
-    FLAT_TEXTURE,
-    LOW_CORRELATION,
+from sfm.matching.lsm import OUTPUTS
+from sfm.matching.lsm_precision import judge
+from sfm.matching.patch_equations import (
     MARGIN,
-    MATCHED,
     MODELS,
-    OUTPUTS,
-    OUTSIDE,
     RADIOMETRIC,
-    TOO_FAR,
     dot,
     factorise,
     fill_normals,
     gradients,
-    judge,
-    put_step,
-    resample_patch,
-    resample_window,
     solve,
 )
 from sfm.matching.radiometry import grey_of, odd_window
+from sfm.matching.warp import put_step
+from sfm.matching.window import resample_patch, resample_window
 from sfm.network import Estimate
 
 MAX_STEPS = 15

@@ -11,6 +11,7 @@ from sfm.conventions import AnyArray, FloatArray, IntArray
 from sfm.errors import GeometryError, PhotographError
 
 LEVELS_8, LEVELS_16 = 256, 65536
+FULL_SCALE_8, FULL_SCALE_16 = LEVELS_8 - 1.0, LEVELS_16 - 1.0
 # Rec. 601, as cv2 turns colour into grey; photographs in memory are red, green, blue here.
 LUMINANCE = (0.299, 0.587, 0.114)
 SMALLEST_WINDOW_PX = 3
@@ -56,6 +57,11 @@ def grey_of(photograph: AnyArray) -> AnyArray:
             "found intensities that are not finite, needed numbers in all of the photograph"
         )
     return np.ascontiguousarray(array, dtype=np.float32)
+
+
+def full_scale(photograph: AnyArray) -> float:
+    """Return the highest intensity that a photograph can have; floats count as 8 bit."""
+    return FULL_SCALE_16 if np.asarray(photograph).dtype == np.uint16 else FULL_SCALE_8
 
 
 def odd_window(what: str, side_px: int) -> int:

@@ -19,7 +19,7 @@ from sfm.conventions import AnyArray, FloatArray, IntArray
 from sfm.errors import GeometryError
 from sfm.matching.interest import foerstner_points
 from sfm.matching.lsm import match_lsm
-from sfm.matching.radiometry import grey_of
+from sfm.matching.radiometry import FULL_SCALE_8, full_scale, grey_of
 
 DETECTORS = ("foerstner", "sift")
 RATIO = 0.8  # of the distances to the nearest and the second-nearest descriptor; Lowe (2004), IJCV 60(2)
@@ -28,7 +28,6 @@ MIN_PAIR_MATCHES = 20  # with fewer the epipolar geometry of a pair is not trust
 RANSAC_CONFIDENCE, RANSAC_TRIALS = 0.999, 5000
 WINDOW_PX = 15  # larger ones are less noisy, but a curved surface is no affine warp over them
 SNAP_PX = 6.0  # an interest point this close to a feature takes its place
-FULL_SCALE_8, FULL_SCALE_16 = 255.0, 65535.0
 
 
 @dataclass(frozen=True)
@@ -121,9 +120,8 @@ def sift_features(photograph: AnyArray, *, max_features: int = 4000) -> Features
 
     Source: Lowe (2004), IJCV 60(2); Arandjelovic and Zisserman (2012), CVPR (square roots).
     """
-    grey = grey_of(photograph)
-    full = FULL_SCALE_16 if photograph.dtype == np.uint16 else FULL_SCALE_8
-    eight_bit = np.rint(np.clip(grey * (FULL_SCALE_8 / full), 0, 255)).astype(np.uint8)
+    grey = grey_of(photograph) * (FULL_SCALE_8 / full_scale(photograph))
+    eight_bit = np.rint(np.clip(grey, 0, FULL_SCALE_8)).astype(np.uint8)
     points, descriptor = cv2.SIFT.create(nfeatures=max_features).detectAndCompute(eight_bit, None)
     if descriptor is None:
         descriptor = np.zeros((0, 128), np.float32)

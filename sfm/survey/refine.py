@@ -13,7 +13,7 @@ from sfm.adjustment.solve import adjust
 from sfm.camera import Camera
 from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.errors import GeometryError, PhotographError, SurveyFileError
-from sfm.matching.lsm import LsmFlag
+from sfm.matching.flags import LsmFlag
 from sfm.matching.multi_lsm import match_multi, pictures_of
 from sfm.network import Estimate, ImagePoints, Network, reduce_network
 from sfm.progress import SILENT, Progress
