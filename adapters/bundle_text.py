@@ -14,6 +14,8 @@ C# program, one file:
     id X Y Z (x y)*                                   per point, one pair for every photograph
     id (sx sy)*                                       per point
 
+The MATLAB program asks for c, x0, y0 (mm); in a folder of its files they are in interior.txt.
+
 Both keep angles in degrees with M = R_kappa R_phi R_omega, as Kolinear does. Neither knows distortion,
 pixels or the size of the photographs: coordinates in mm become pixels of a nominal size.
 
@@ -39,6 +41,7 @@ from sfm.conventions import (
 from sfm.errors import OutputError
 from sfm.network import Estimate, ImagePoints, Network
 
+INTERIOR = "interior.txt"
 PIXEL_MM = 0.005  # nominal size of a pixel, since the files know none
 BORDER = 1.1  # sensor over the extent of the image points
 
@@ -115,6 +118,43 @@ def write_bundle_matlab(
         sigma_lines.append(" ".join([f"{len(rows)}", *frames]))
     write_lines(points, point_lines)
     write_lines(sigmas, sigma_lines)
+
+
+def read_bundle_matlab_folder(folder: Path) -> tuple[Network, Estimate]:
+    """Read cams.txt, pts.txt, sigmas.txt (if it is there) and interior.txt of a folder.
+
+    Raises:
+        SurveyFileError: what is wrong, with file and line number.
+    """
+    text = Lines.of(folder / INTERIOR)
+    c, x0, y0 = (text.number_of(word) for word in text.due_words(3, "c x0 y0 (mm)"))
+    if not c > 0:
+        raise text.error(f"c is {c:g} mm, it must be positive")
+    text.end()
+    sigmas = folder / "sigmas.txt"
+    return read_bundle_matlab(
+        folder / "cams.txt",
+        folder / "pts.txt",
+        sigmas if sigmas.is_file() else None,
+        c_mm=c,
+        x0_mm=x0,
+        y0_mm=y0,
+    )
+
+
+def write_bundle_matlab_folder(folder: Path, network: Network, estimate: Estimate) -> None:
+    """Write cams.txt, pts.txt, sigmas.txt and interior.txt into a folder.
+
+    Raises:
+        OutputError: what the files have no place for, or they cannot be written.
+    """
+    _millimetres(network, estimate)  # refuses what cannot be held, before a folder is made
+    folder.mkdir(parents=True, exist_ok=True)
+    files = (folder / name for name in ("cams.txt", "pts.txt", "sigmas.txt"))
+    write_bundle_matlab(*files, network, estimate)
+    camera = estimate.cameras[0]
+    values = _text(*(camera.value(name) for name in ("c", "x0", "y0")))
+    write_lines(folder / INTERIOR, ["# c x0 y0 (mm), which the program asks for", values])
 
 
 def read_bundle_csharp(path: Path, *, pixel_mm: float = PIXEL_MM) -> tuple[Network, Estimate]:

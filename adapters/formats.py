@@ -9,13 +9,20 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from adapters.bal import read_bal, write_bal
-from adapters.bundle_text import read_bundle_csharp, write_bundle_csharp
+from adapters.bundle_text import (
+    INTERIOR,
+    read_bundle_csharp,
+    read_bundle_matlab_folder,
+    write_bundle_csharp,
+    write_bundle_matlab_folder,
+)
 from adapters.colmap import read_model, write_model
 from adapters.colmap_database import read_database, write_database
 from adapters.csv_tables import TableResult, read_result, write_tables
 from adapters.metashape import read_metashape, write_metashape
 from adapters.photomodeler import read_photomodeler, write_photomodeler
 from adapters.ply import write_ply
+from adapters.sba_text import read_sba_text, sba_files, write_sba_text
 from sfm.distortion.models import MODELS
 from sfm.errors import KolinearError, OutputError, SurveyFileError
 from sfm.network import Estimate, Network, empty_estimate
@@ -40,6 +47,8 @@ FORMATS = (
     FileFormat("photomodeler", ("brown",), False, True),
     FileFormat("bal", ("opencv",), False, True),
     FileFormat("bundle-csharp", ("brown",), False, True),
+    FileFormat("bundle-matlab", ("brown",), True, True),
+    FileFormat("sba", ("opencv",), True, True),
     FileFormat("ply", (), False, False),
 )
 ENDINGS = {".xml": "metashape", ".ply": "ply", ".db": "colmap-database"}
@@ -68,10 +77,16 @@ def format_of(path: Path) -> FileFormat:
             ("cameras.bin", "colmap"),
             ("cameras.txt", "colmap-text"),
             ("points.csv", "tables"),
+            (INTERIOR, "bundle-matlab"),
         ):
             if (path / file).is_file():
                 return format_named(name)
-        raise SurveyFileError(f"{path}: neither a COLMAP model nor tables of a result are in this folder")
+        if any(path.glob("*cams*.txt")):
+            return format_named("sba")
+        raise SurveyFileError(
+            f"{path}: neither a COLMAP model, nor tables of a result, nor files of a bundle program are in "
+            "this folder"
+        )
     if path.suffix.lower() in ENDINGS:
         return format_named(ENDINGS[path.suffix.lower()])
     try:
@@ -80,6 +95,8 @@ def format_of(path: Path) -> FileFormat:
     except OSError as error:
         raise SurveyFileError(f"{path}: cannot be read ({error.strerror})") from error
     counts = [len(line.split()) for line in lines]
+    if "cams" in path.name:
+        return format_named("sba")
     if counts[2:4] == [9, 10]:
         return format_named("photomodeler")
     if counts[:2] == [3, 4]:
@@ -116,6 +133,11 @@ def read_any(path: Path, name: str | None = None) -> tuple[Network, Estimate]:
         return read_bal(path)
     if form.name == "bundle-csharp":
         return read_bundle_csharp(path)
+    if form.name == "bundle-matlab":
+        return read_bundle_matlab_folder(path)
+    if form.name == "sba":
+        cameras, points, calibration, sigmas = sba_files(path)
+        return read_sba_text(cameras, points, calibration, sigmas=sigmas)
     raise SurveyFileError(f"{path}: format {form.name} holds no photographs, it is written only")
 
 
@@ -162,5 +184,9 @@ def write_any(path: Path, name: str, network: Network, estimate: Estimate) -> No
         write_bal(path, network, estimate)
     elif name == "bundle-csharp":
         write_bundle_csharp(path, network, estimate)
+    elif name == "bundle-matlab":
+        write_bundle_matlab_folder(path, network, estimate)
+    elif name == "sba":
+        write_sba_text(path / "cams.txt", path / "pts.txt", network, estimate)
     else:
         write_ply(path, network.points, estimate.points)

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from synthetic import seed_of
 
-from adapters.sba_text import read_sba_text
+from adapters.formats import read_any, write_any
+from adapters.sba_text import read_sba_text, sba_files
 from sfm.camera import project
-from sfm.errors import SurveyFileError
+from sfm.errors import OutputError, SurveyFileError
 
 CAMERAS = "1 0 0 0 0 0 4\n0.8 0 0.6 0 1 0 4 # turned\n"
 CALIBRATION = "800 0 320\n0 808 240\n0 0 1\n"
@@ -63,15 +65,15 @@ def test_covariances_in_the_points_file(files: dict[str, Path]) -> None:
 @pytest.mark.parametrize(
     ("name", "text", "message"),
     [
-        ("cams", "1 0 0 0 0 0\n", r"lines of \[6\] numbers"),
+        ("cams", "1 0 0 0 0 0\n", r"line 1: 6 numbers, all lines"),
         ("cams", "", "no numbers"),
         ("cams", "1 0 0 0 x 0 0\n", "line 1: could not convert"),
         ("pts", "0 0 0 2 0 1 2\n", "line 1: 3 numbers for 2 projections"),
         ("pts", "0 0 0 1 5 1 2\n", "line 1: frame 5, there are 2 cameras"),
         ("pts", "0 0 0\n", "line 1: X Y Z and a number of projections"),
-        ("calib", "1 0 0\n", "1 lines of 3 numbers"),
+        ("calib", "1 0 0\n", "line 1: three lines of 3 numbers"),
         ("calib", "800 3 320\n0 808 240\n0 0 1\n", "skew 3"),
-        ("sigmas", "0.1 0.1\n", "2 numbers, 16 positive"),
+        ("sigmas", "0.1 0.1\n", "line 1: 2 numbers to the end, 16 positive"),
     ],
 )
 def test_bad_files_are_refused(files: dict[str, Path], name: str, text: str, message: str) -> None:
@@ -83,3 +85,30 @@ def test_bad_files_are_refused(files: dict[str, Path], name: str, text: str, mes
 def test_missing_calibration_is_refused(files: dict[str, Path]) -> None:
     with pytest.raises(SurveyFileError, match="a calibration matrix is needed"):
         read_sba_text(files["cams"], files["pts"])
+
+
+def test_a_problem_is_found_by_its_cameras_or_its_folder(files: dict[str, Path], tmp_path: Path) -> None:
+    network, estimate = read_any(tmp_path)
+    assert network.image_points.covariance[3] == pytest.approx(np.diag([0.01, 0.04]))  # sigmas.txt is used
+    write_any(tmp_path / "again", "sba", network, estimate)
+    again, same = read_any(tmp_path / "again" / "cams.txt")
+    np.testing.assert_array_equal(again.image_points.xy, network.image_points.xy)
+    np.testing.assert_allclose(again.image_points.covariance, network.image_points.covariance, rtol=1e-15)
+    np.testing.assert_allclose(same.position, estimate.position, atol=1e-14)
+    np.testing.assert_allclose(same.cameras[0].parameters, estimate.cameras[0].parameters, rtol=1e-15)
+    (tmp_path / "54cams.txt").write_text(CAMERAS)
+    with pytest.raises(SurveyFileError, match=r"there are: 54cams\.txt, cams\.txt"):
+        sba_files(tmp_path)
+    with pytest.raises(SurveyFileError, match=r"54cams\.txt: .* beside one \*pts\*\.txt"):
+        sba_files(tmp_path / "54cams.txt")
+
+
+def test_what_sba_cannot_hold_is_refused(files: dict[str, Path], tmp_path: Path) -> None:
+    network, estimate = read_any(tmp_path)
+    camera = estimate.cameras[0]
+    bent = camera.with_parameters(camera.parameters + np.array([0, 0, 0, 0, 0.1, 0, 0, 0]))
+    with pytest.raises(OutputError, match="camera 1: sba's files have no place for distortion"):
+        write_any(tmp_path / "x", "sba", network, replace(estimate, cameras=(bent,)))
+    lost = replace(estimate, points=estimate.points * np.nan)
+    with pytest.raises(OutputError, match="start values of all"):
+        write_any(tmp_path / "y", "sba", network, lost)
