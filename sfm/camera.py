@@ -28,6 +28,8 @@ class Camera:
     pixel_mm: FloatArray  # width and height of a pixel, mm, (2,)
     parameters: FloatArray  # in the order of MODELS[model].names and in its units, (n,)
     free: BoolArray = field(default_factory=lambda: np.zeros(0, dtype=bool))  # to be adjusted, (n,)
+    shared: tuple[str, ...] = ()  # of each parameter, the group of cameras that have one value of it, such as
+    # the camera whose photographs differ in c only; "" = this camera's own, () = all its own, (n,)
 
     def __post_init__(self) -> None:
         n = len(self.names)
@@ -35,6 +37,8 @@ class Camera:
             raise SurveyFileError(
                 f"camera {self.name}: {len(self.parameters)} parameters, model {self.model} has {n}"
             )
+        if len(self.shared) not in (0, n):
+            raise SurveyFileError(f"camera {self.name}: {len(self.shared)} groups of {n} parameters")
         if len(self.free) == 0:
             object.__setattr__(self, "free", np.zeros(n, dtype=bool))
 
@@ -76,6 +80,10 @@ class Camera:
         if name not in self.names:
             raise KeyError(name)
         return float(self.parameters[self.names.index(name)])
+
+    def group_of(self, parameter: int) -> str:
+        """Return the group of cameras that share a parameter, given by its index; "" if it is their own."""
+        return self.shared[parameter] if self.shared else ""
 
     def with_parameters(self, parameters: FloatArray) -> Camera:
         """Return the same camera with other parameter values, shape (n,)."""

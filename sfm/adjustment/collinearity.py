@@ -34,6 +34,7 @@ class Observations(NamedTuple):
     interior: IntArray  # how many parameters the model of each camera has, 0 if none is free, (a,)
     free_count: IntArray  # how many parameters of each camera are free, (a,)
     free_index: IntArray  # which they are, (a, MAX_PARAMETERS)
+    free_column: IntArray  # their columns among the reduced unknowns, (a, MAX_PARAMETERS)
 
 
 class State(NamedTuple):

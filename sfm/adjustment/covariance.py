@@ -98,10 +98,10 @@ def marginal_covariance(
         own = slice(6 * i, 6 * i + 6)
         exterior[i] = _in_datum(cofactors.reduced[own, own], H[own], F[:, own], G)
     exterior = T @ exterior @ np.swapaxes(T, 1, 2)
-    interior = []
-    for a, free in enumerate(layout.interior_free):
-        own = slice(layout.interior_start[a], layout.interior_start[a] + len(free))
-        interior.append(variance * _in_datum(cofactors.reduced[own, own], H[own], F[:, own], G))
+    interior = [
+        variance * _in_datum(cofactors.reduced[np.ix_(own, own)], H[own], F[:, own], G)
+        for own in layout.interior_column
+    ]
     return Covariance(variance * points, variance * exterior, tuple(interior), variance * cofactors.limiting)
 
 
@@ -123,7 +123,6 @@ def hat_complement(
         layout.obs,
         optimum.state,
         weight,
-        layout.interior_start,
         cofactors.reduced,
         cofactors.cross,
         cofactors.points,
@@ -179,7 +178,7 @@ def _points_product(Li: FloatArray, Z: FloatArray) -> FloatArray:
 
 
 @njit(cache=True)
-def _complement(obs, state, weight, interior_start, Qcc, cross, points):  # type: ignore[no-untyped-def]
+def _complement(obs, state, weight, Qcc, cross, points):  # type: ignore[no-untyped-def]
     t = scratch()
     out = np.empty((len(obs.image), 2, 2))
     column = np.empty(t.A.shape[1], dtype=np.int64)
@@ -196,7 +195,7 @@ def _complement(obs, state, weight, interior_start, Qcc, cross, points):  # type
             column[p] = 6 * i + p
             J[0, p], J[1, p] = t.A[0, p], t.A[1, p]
         for p in range(f):
-            column[6 + p] = interior_start[a] + p
+            column[6 + p] = obs.free_column[a, p]
             s = 6 + obs.free_index[a, p]
             J[0, 6 + p], J[1, 6 + p] = t.A[0, s], t.A[1, s]
         h00, h01, h11 = 0.0, 0.0, 0.0

@@ -52,7 +52,8 @@ class Marginal:
         Q, b, motions = self.cofactors, self.optimum.normals.blocks, self.optimum.motions
         rows = (3 * np.asarray(points)[:, None] + np.arange(3)).ravel()
         Li = np.linalg.inv(b.L[points])
-        YL = (np.swapaxes(Li, 1, 2) @ b.Yt[rows].reshape(len(points), 3, -1)).reshape(len(rows), -1)
+        width = b.Yt.shape[1]
+        YL = (np.swapaxes(Li, 1, 2) @ b.Yt[rows].reshape(len(points), 3, width)).reshape(len(rows), width)
         between = -YL @ Q.cross[rows].T  # L^-T Y' S^-1 Y L^-1
         for s, j in enumerate(points):
             own = slice(3 * s, 3 * s + 3)

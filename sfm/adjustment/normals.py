@@ -83,7 +83,6 @@ def normal_equations(
         layout.obs,
         state,
         weight,
-        layout.interior_start,
         Np,
         gp,
         layout.point_free,
@@ -97,8 +96,8 @@ def normal_equations(
         blocks.g[i] += terms.exterior_g[e]
     S = np.zeros((layout.reduced, layout.reduced), order="F")
     g = np.zeros(layout.reduced)
-    _assemble(layout.obs, layout.interior_start, layout.kept_start, blocks, S, g)
-    S[weighted.column, weighted.column] += weighted.interior_weight
+    _assemble(layout.obs, layout.kept_start, blocks, S, g)
+    np.add.at(S, (weighted.column, weighted.column), weighted.interior_weight)
     np.add.at(g, weighted.column, terms.interior_g)
     S[layout.kept_start :, layout.kept_start :] += terms.kept
     g[layout.kept_start :] += terms.kept_g + blocks.gp[layout.kept].ravel()
@@ -155,7 +154,7 @@ def new_blocks(layout: Unknowns) -> Blocks:
 
 
 @njit(cache=True, error_model="numpy")
-def _accumulate(obs, state, weight, interior_start, Np, gp0, point_free, slot, kept_start, stretch, b):  # type: ignore[no-untyped-def]
+def _accumulate(obs, state, weight, Np, gp0, point_free, slot, kept_start, stretch, b):  # type: ignore[no-untyped-def]
     """Fill the blocks in one pass, point by point; return v'Pv, infinite with points behind cameras."""
     t = scratch()
     first_interior = 6 * len(obs.camera)
@@ -185,13 +184,13 @@ def _accumulate(obs, state, weight, interior_start, Np, gp0, point_free, slot, k
             if weight[o] > 0.0:
                 a = obs.camera[i]
                 if a != last_camera:
-                    _add_interior(E, last_camera, obs, interior_start, rows, row)
+                    _add_interior(E, last_camera, obs, rows, row)
                     last_camera = a
                 if not collinearity(o, obs, state, weight[o], t):
                     vPv = np.inf
                 vPv += t.r[0] * t.r[0] + t.r[1] * t.r[1]
                 _add_image_point(i, a, obs.interior[a], j, t, b, rows, row, E)
-        _add_interior(E, last_camera, obs, interior_start, rows, row)
+        _add_interior(E, last_camera, obs, rows, row)
         for p in range(3):
             for q in range(p):
                 b.V[j, p, q] = b.V[j, q, p]
@@ -261,12 +260,12 @@ def _add_image_point(i, a, f, j, t, b, rows, row, E):  # type: ignore[no-untyped
 
 
 @njit(cache=True, inline="always", error_model="numpy")
-def _add_interior(E, a, obs, interior_start, rows, row):  # type: ignore[no-untyped-def]
+def _add_interior(E, a, obs, rows, row):  # type: ignore[no-untyped-def]
     """Add the free interior columns of camera a to the rows of a point and clear E."""
     if a >= 0:
         for p in range(3):
             for q in range(obs.free_count[a]):
-                rows[row + p, interior_start[a] + q] += E[p, obs.free_index[a, q]]
+                rows[row + p, obs.free_column[a, q]] += E[p, obs.free_index[a, q]]
         E[:] = 0.0
 
 
@@ -325,7 +324,7 @@ def _solve_transposed(L, h):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy")
-def _assemble(obs, interior_start, kept_start, b, S, g):  # type: ignore[no-untyped-def]
+def _assemble(obs, kept_start, b, S, g):  # type: ignore[no-untyped-def]
     """Write the blocks into the upper triangle of S and into g."""
     for i in range(len(obs.camera)):
         a = obs.camera[i]
@@ -334,13 +333,14 @@ def _assemble(obs, interior_start, kept_start, b, S, g):  # type: ignore[no-unty
             for q in range(p, 6):
                 S[6 * i + p, 6 * i + q] = b.U[i, p, q]
             for q in range(obs.free_count[a]):
-                S[6 * i + p, interior_start[a] + q] = b.U[i, p, 6 + obs.free_index[a, q]]
+                S[6 * i + p, obs.free_column[a, q]] = b.U[i, p, 6 + obs.free_index[a, q]]
     for a in range(len(obs.free_count)):
         for p in range(obs.free_count[a]):
-            s = obs.free_index[a, p]
-            g[interior_start[a] + p] = b.gi[a, s]
+            s, row = obs.free_index[a, p], obs.free_column[a, p]
+            g[row] += b.gi[a, s]
             for q in range(p, obs.free_count[a]):
-                S[interior_start[a] + p, interior_start[a] + q] = b.D[a, s, obs.free_index[a, q]]
+                column = obs.free_column[a, q]  # shared parameters stand in the columns of an earlier camera
+                S[min(row, column), max(row, column)] += b.D[a, s, obs.free_index[a, q]]
     for p in range(len(b.K)):
         for q in range(kept_start + p + 1):
             S[q, kept_start + p] = b.K[p, q]

@@ -3,6 +3,7 @@
 The reduced unknowns are [6 per photograph: X0, w | free interior parameters, camera by camera |
 3 per kept point]; all other object points are eliminated. Points at the ends of scale bars are kept,
 because an observed distance couples two points. Fixed unknowns keep their place with derivatives 0.
+A parameter that several cameras share stands in one column, that of the first of them.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sfm.adjustment.collinearity import Observations, State, behind_camera, whitening_of
+from sfm.camera import Camera
 from sfm.conventions import BoolArray, FloatArray, IntArray, angles_from_rotation, rotation_from_vector
 from sfm.distortion.models import MAX_PARAMETERS
 from sfm.errors import GeometryError
@@ -31,7 +33,7 @@ class Unknowns:
     active: BoolArray  # image points of obs that can take part, (k,)
     exterior_free: BoolArray  # (m, 6)
     interior_free: tuple[IntArray, ...]  # indices of the free parameters of each camera
-    interior_start: IntArray  # first interior column of each camera among the reduced unknowns, (a,)
+    interior_column: tuple[IntArray, ...]  # their columns among the reduced unknowns
     point_free: BoolArray  # (n, 3)
     image_on: BoolArray  # photographs that take part, (m,)
     point_on: BoolArray  # object points that take part, (n,)
@@ -49,7 +51,7 @@ class Unknowns:
     @property
     def count(self) -> int:
         """Number of free unknowns."""
-        interior = sum(len(free) for free in self.interior_free)
+        interior = self.kept_start - self.exterior_free.size
         return int(self.exterior_free.sum()) + interior + int(self.point_free.sum())
 
     @property
@@ -105,8 +107,11 @@ def unknowns_of(network: Network, estimate: Estimate, *, use_control: bool) -> t
     interior_free = tuple(f if u else f[:0] for f, u in zip(interior_free, used, strict=True))
     counts = np.where(used, counts, 0)
     free_index = np.zeros((len(counts), MAX_PARAMETERS), dtype=np.int64)
-    for a, free in enumerate(interior_free):
+    free_column = np.zeros_like(free_index)
+    columns, interior = _interior_columns(estimate.cameras, interior_free, 6 * m)
+    for a, (free, column) in enumerate(zip(interior_free, columns, strict=True)):
         free_index[a, : len(free)] = free
+        free_column[a, : len(free)] = column
     bars = np.flatnonzero(point_on[network.scale_bars.start] & point_on[network.scale_bars.end])
     ends = np.concatenate([network.scale_bars.start[bars], network.scale_bars.end[bars]])
     kept = np.unique(ends).astype(np.int64)
@@ -124,6 +129,7 @@ def unknowns_of(network: Network, estimate: Estimate, *, use_control: bool) -> t
         interior=np.where(counts > 0, [len(camera.names) for camera in estimate.cameras], 0),
         free_count=counts,
         free_index=free_index,
+        free_column=free_column,
     )
     layout = Unknowns(
         obs=obs,
@@ -131,13 +137,13 @@ def unknowns_of(network: Network, estimate: Estimate, *, use_control: bool) -> t
         active=active[order],
         exterior_free=exterior_free,
         interior_free=interior_free,
-        interior_start=6 * m + np.cumsum(counts) - counts,
+        interior_column=columns,
         point_free=point_free,
         image_on=np.bincount(k.image[active], minlength=m) > 0,
         point_on=np.bincount(k.point[active], minlength=n) > 0,
         kept=kept,
         bars=bars,
-        reduced=6 * m + int(counts.sum()) + 3 * len(kept),
+        reduced=6 * m + interior + 3 * len(kept),
         held=held,
         held_defect=held_defect,
     )
@@ -160,9 +166,8 @@ def step(layout: Unknowns, state: State, reduced: FloatArray, points: FloatArray
     m = len(state.position)
     exterior = reduced[: 6 * m].reshape(m, 6)
     parameters = state.parameters.copy()
-    for a, free in enumerate(layout.interior_free):
-        first = layout.interior_start[a]
-        parameters[a, free] += reduced[first : first + len(free)]
+    for a, (free, column) in enumerate(zip(layout.interior_free, layout.interior_column, strict=True)):
+        parameters[a, free] += reduced[column]
     return State(
         state.position + exterior[:, :3],
         np.ascontiguousarray(rotation_from_vector(-exterior[:, 3:]) @ state.M),
@@ -203,6 +208,48 @@ def angle_jacobian(M: FloatArray) -> FloatArray:
 def start_weights(layout: Unknowns, state: State) -> FloatArray:
     """Return weight 1 for image points that can take part, 0 for others and those behind the camera, (k,)."""
     return (layout.active & ~behind_camera(layout.obs, state)).astype(float)
+
+
+def interior_names(layout: Unknowns, estimate: Estimate) -> list[tuple[str, str]]:
+    """Return (parameter, camera or group of cameras) of each interior unknown, in order of columns."""
+    names = [("", "")] * (layout.kept_start - layout.exterior_free.size)
+    for camera, free, columns in zip(
+        estimate.cameras, layout.interior_free, layout.interior_column, strict=True
+    ):
+        for s, column in zip(free, columns, strict=True):
+            owner = camera.group_of(s) or camera.name
+            names[column - layout.exterior_free.size] = (camera.names[s], f"camera {owner}")
+    return names
+
+
+def _interior_columns(
+    cameras: tuple[Camera, ...], interior_free: tuple[IntArray, ...], first: int
+) -> tuple[tuple[IntArray, ...], int]:
+    """Return the column of each free parameter of each camera, from the first on, and how many there are.
+
+    Raises:
+        GeometryError: cameras that share a parameter start from different values of it.
+    """
+    seen: dict[tuple[str, str], tuple[int, Camera, float]] = {}
+    columns, count = [], 0
+    for camera, free in zip(cameras, interior_free, strict=True):
+        own = np.empty(len(free), dtype=np.int64)
+        for k, s in enumerate(free):
+            group, value = camera.group_of(s), float(camera.parameters[s])
+            known = seen.get((group, camera.names[s])) if group else None
+            if known is None:
+                known = (first + count, camera, value)
+                count += 1
+                if group:
+                    seen[group, camera.names[s]] = known
+            elif known[2] != value:
+                raise GeometryError(
+                    f"cameras {known[1].name} and {camera.name} share {camera.names[s]}, but start from "
+                    f"{known[2]:g} and {value:g}; one value is needed"
+                )
+            own[k] = known[0]
+        columns.append(own)
+    return tuple(columns), count
 
 
 def _hold_undetermined(

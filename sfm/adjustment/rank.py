@@ -7,7 +7,7 @@ from collections import Counter
 import numpy as np
 
 from sfm.adjustment.iterate import Optimum
-from sfm.adjustment.parameters import Unknowns
+from sfm.adjustment.parameters import Unknowns, interior_names
 from sfm.conventions import FloatArray
 from sfm.network import Estimate, Network
 
@@ -53,8 +53,7 @@ def undetermined_of(
 def reduced_names(layout: Unknowns, network: Network, estimate: Estimate) -> list[tuple[str, str]]:
     """Return (parameter, of what) of each reduced unknown."""
     names = [(part, f"photograph {image}") for image in network.images for part in EXTERIOR]
-    for camera, free in zip(estimate.cameras, layout.interior_free, strict=True):
-        names += [(camera.names[s], f"camera {camera.name}") for s in free]
+    names += interior_names(layout, estimate)
     names += [(axis, f"point {network.points[j]}") for j in layout.kept for axis in "XYZ"]
     return names
 

@@ -92,12 +92,11 @@ def _orientations(blocks, layout: Unknowns) -> tuple[FloatArray, FloatArray]:  #
         U[6 * i : 6 * i + 6, 6 * i : 6 * i + 6] = np.triu(blocks.U[i, :, :6])
         a = layout.obs.camera[i]
         free = layout.interior_free[a]
-        first = layout.interior_start[a]
-        U[6 * i : 6 * i + 6, first : first + len(free)] = blocks.U[i][:, 6 + free]
-    for a, free in enumerate(layout.interior_free):
-        own = slice(layout.interior_start[a], layout.interior_start[a] + len(free))
-        U[own, own] = np.triu(blocks.D[a])[np.ix_(free, free)]
-        g[own] = blocks.gi[a][free]
+        U[6 * i : 6 * i + 6, layout.interior_column[a]] = blocks.U[i][:, 6 + free]
+    for a, (free, column) in enumerate(zip(layout.interior_free, layout.interior_column, strict=True)):
+        D = np.triu(blocks.D[a]) + np.triu(blocks.D[a], 1).T
+        U[np.ix_(column, column)] += D[np.ix_(free, free)]
+        g[column] += blocks.gi[a][free]
     on = layout.reduced_free()
     scale = 1 / np.sqrt(np.diagonal(U)[on])
     factored = cho_factor(U[np.ix_(on, on)] * scale[:, None] * scale, lower=False)

@@ -72,7 +72,7 @@ def weighted_of(network: Network, layout: Unknowns, *, use_control: bool) -> Wei
         where = np.flatnonzero(layout.interior_free[a] == s)
         if len(where) and 0 < interior.sigma[q] < np.inf:
             used.append(q)
-            columns.append(layout.interior_start[a] + where[0])
+            columns.append(layout.interior_column[a][where[0]])
     slot = np.full(len(network.points), -1)
     slot[layout.kept] = np.arange(len(layout.kept))
     b = layout.bars
