@@ -9,9 +9,12 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PrivateAttr, ValidationError
 
-from sfm.camera import MODELS
+from sfm.distortion.models import MODELS
 from sfm.errors import SurveyFileError
-from sfm.targets.codes import FAMILIES
+from sfm.targets.codes import FAMILIES as RING_FAMILIES
+from sfm.targets.tags import TAG_FAMILIES
+
+FAMILIES = (*RING_FAMILIES, *TAG_FAMILIES)
 
 MAX_SURVEY_BYTES = 1_000_000  # a survey file is written by people; anything larger is another file
 
@@ -68,7 +71,7 @@ class CameraSettings(Section):
     pixel_mm: TwoLengths | None = None  # width and height of a pixel, else from sensor_mm or EXIF, mm
     sensor_mm: TwoLengths | None = None  # width and height of the sensor, mm
     c_mm: Length | None = None  # start value of the principal distance, else the EXIF focal length, mm
-    model: Literal["brown", "brown_forward", "opencv", "full_opencv"] = "brown"
+    model: Literal[tuple(MODELS)] = "brown"  # type: ignore[valid-type]
     free: Names = ()  # parameters to be adjusted; none = a calibrated camera
     fixed: Values = ()  # (parameter, value) of what is not free, in the model's units
 
@@ -77,10 +80,14 @@ class TargetSettings(Section):
     """[targets]: what circular targets look like in the photographs."""
 
     polarity: Literal["dark", "bright", "auto"] = "auto"
+    channel: Literal["luminance", "red", "green", "blue"] = "luminance"  # of colour photographs
     codes: Name = "none"  # a code family, or a table file relative to the survey file
     min_diameter_px: Length = 6.0
     eccentricity: bool = True  # whether to correct it
     diameter: Length | None = None  # of all targets, object unit; else of each from its ellipses
+    diameters: Name | None = None  # a table id,diameter of single targets, before the one of all
+    tag_size: Length | None = None  # side of the black square of all tags, object unit
+    tag_sigma: Length | None = None  # its standard deviation, common to all tags of a print, object unit
 
 
 class TiePointSettings(Section):
@@ -207,6 +214,7 @@ class Survey(Section):
             self.approximate.images,
             self.approximate.points,
             None if self.targets.codes in FAMILIES else self.targets.codes,
+            self.targets.diameters,
         ]
         return tuple(self.beside(name) for name in names if name is not None)
 
@@ -329,11 +337,29 @@ def _refuse_contradictions(survey: Survey) -> None:
                 f"{where}: scale_bar {bar.start} - {bar.end}: length {bar.length:g} is more than a million "
                 f"times its sigma {bar.sigma:g}; are both in {survey.unit}?"
             )
+    _refuse_contradicting_tags(survey.targets, where)
     if survey.targets.codes not in FAMILIES and not survey.beside(survey.targets.codes).is_file():
         raise SurveyFileError(
             f"{where}: targets.codes = '{survey.targets.codes}' is neither one of {', '.join(FAMILIES)} "
             f"nor a table file in {survey.path.parent}"
         )
+
+
+def _refuse_contradicting_tags(targets: TargetSettings, where: str) -> None:
+    """Raise SurveyFileError where the size of tags is given without tags, or its sigma without the size."""
+    if targets.tag_size is not None and targets.codes not in TAG_FAMILIES:
+        raise SurveyFileError(
+            f"{where}: targets.tag_size is the size of tags, codes = '{targets.codes}' has none; "
+            f"tags are {', '.join(TAG_FAMILIES[:4])} ..."
+        )
+    if targets.tag_sigma is not None:
+        if targets.tag_size is None:
+            raise SurveyFileError(f"{where}: targets.tag_sigma needs targets.tag_size")
+        if targets.tag_size > MAX_LENGTH_PER_SIGMA * targets.tag_sigma:
+            raise SurveyFileError(
+                f"{where}: targets.tag_size {targets.tag_size:g} is more than a million times its sigma "
+                f"{targets.tag_sigma:g}; are both in the object unit?"
+            )
 
 
 _NEEDED = (

@@ -111,11 +111,19 @@ def _tried(task: Task, method: str) -> dict[str, object]:
 def targets(
     out: Annotated[Path, typer.Option("--out", metavar="FILE", help="Sheet to write: .pdf or .svg.")],
     family: Annotated[
-        str, typer.Option("--family", help="ring12, ring14, ring20, arcs, or a code table file.")
+        str,
+        typer.Option(
+            "--family",
+            help="ring12, ring14, ring20, arcs, a family of tags (apriltag36h11, aruco4x4_50 ...), or a code "
+            "table file.",
+        ),
     ] = "ring14",
     ids: Annotated[str, typer.Option("--ids", metavar="A-B,C", help="Code numbers.")] = "1-100",
     diameter: Annotated[
-        float, typer.Option("--diameter-mm", metavar="MM", help="Diameter of the dot, mm.")
+        float,
+        typer.Option(
+            "--diameter-mm", metavar="MM", help="Diameter of the dot, of tags the side of the square, mm."
+        ),
     ] = 10.0,
     page: Annotated[str, typer.Option("--page", help="a4, a3, letter ...")] = "a4",
     bright: Annotated[bool, typer.Option("--bright", help="White targets on dark squares.")] = False,

@@ -7,14 +7,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sfm.camera import pixel_jacobian
-from sfm.conventions import BoolArray, IntArray
+from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
 from sfm.network import Estimate, ImagePoints, Network
 from sfm.project import Survey
 from sfm.report.result import Eccentricity
 from sfm.survey.datum import object_scale
 from sfm.survey.network import UNNAMED, Naming
+from sfm.survey.tables import read_diameters
 from sfm.survey.targets import MeasuredPhotographs
 from sfm.targets.eccentricity import CircleViews, ellipse_shape, fit_circles
+from sfm.targets.flags import Flag
 
 NOT_A_CIRCLE = (
     0.1  # relative misfit of the semi-axes; targets have 0.003 to 0.03, letters and leaves over 0.2
@@ -48,6 +50,7 @@ def check_circles(
     """
     seen = network.image_points
     rows = estimate.oriented[seen.image] & estimate.determined[seen.point]
+    rows &= _named(photographs, naming, [(found.flag & Flag.CORNER) == 0 for found in photographs.targets])
     rays = np.bincount(seen.point[rows], minlength=len(network.points))
     rows &= rays[seen.point] >= 2
     numbers, point = np.unique(seen.point[rows], return_inverse=True)
@@ -62,12 +65,12 @@ def check_circles(
     names = tuple(network.points[j] for j in no_circle)
     if not survey.targets.eccentricity:
         return CircleCheck(network, estimate, names, None)
-    if survey.targets.diameter is not None:
+    known = _known_radius(survey, tuple(network.points[j] for j in numbers))
+    if np.isfinite(known).any():
         scale = object_scale(network, estimate)
         if np.isnan(scale):  # then the targets themselves tell the scale
-            scale = survey.targets.diameter / 2 / float(np.median(circles.radius))
-        known = np.full(len(numbers), survey.targets.diameter / 2 / scale)
-        circles = fit_circles(views, len(numbers), radius=known)
+            scale = float(np.nanmedian(known / circles.radius))
+        circles = fit_circles(views, len(numbers), radius=known / scale)
     xy, covariance = seen.xy.copy(), seen.covariance.copy()
     xy[rows] -= circles.shift
     covariance[rows] += circles.shift_covariance
@@ -83,6 +86,23 @@ def check_circles(
     return CircleCheck(corrected, estimate, names, summary)
 
 
+def _known_radius(survey: Survey, points: tuple[str, ...]) -> FloatArray:
+    """Return the radius of each target that the survey states, NaN where it does not, object unit, (n,)."""
+    diameter = survey.targets.diameter
+    radius = np.full(len(points), np.nan if diameter is None else diameter / 2)
+    if survey.targets.diameters is not None:
+        names, diameters = read_diameters(survey.beside(survey.targets.diameters))
+        stated = dict(zip(names, diameters.tolist(), strict=True))
+        radius = np.array([stated.get(p, 2 * r) / 2 for p, r in zip(points, radius, strict=True)])
+    return radius
+
+
+def _named(photographs: MeasuredPhotographs, naming: Naming, values: list[AnyArray]) -> AnyArray:
+    """Return what is known of the targets of each photograph for the image points made of them, (k, ...)."""
+    targets = zip(values, naming.point, strict=True)
+    return np.concatenate([of_photograph[named != UNNAMED] for of_photograph, named in targets])
+
+
 def _views(
     photographs: MeasuredPhotographs,
     naming: Naming,
@@ -92,12 +112,8 @@ def _views(
     point: IntArray,
 ) -> CircleViews:
     """Return the ellipses of some image points with the rays they were seen along."""
-    shape = np.concatenate(
-        [
-            ellipse_shape(found.semi_axes, found.angle)[named != UNNAMED]
-            for found, named in zip(photographs.targets, naming.point, strict=True)
-        ]
-    )[rows]
+    shapes = [ellipse_shape(found.semi_axes, found.angle) for found in photographs.targets]
+    shape = _named(photographs, naming, shapes)[rows]
     seen = network.image_points.select(rows)
     rotation = estimate.rotation[seen.image]
     outward = estimate.points[seen.point] - estimate.position[seen.image]

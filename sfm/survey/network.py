@@ -9,12 +9,17 @@ import numpy as np
 from sfm.camera import project
 from sfm.conventions import FloatArray, IntArray
 from sfm.matching.correspondence import match_targets
-from sfm.network import Estimate, ImagePoints, Network
+from sfm.network import Estimate, ImagePoints, Network, ScaleBars
 from sfm.project import Survey
 from sfm.survey.start import control_points, scale_bars
 from sfm.survey.targets import MeasuredPhotographs, image_point_covariance
+from sfm.targets.flags import Flag
+from sfm.targets.tags import CORNERS, corner_name
 
 UNNAMED = -1
+# Standard deviation of the size of tags where the survey states none, in parts of it: what desktop printers
+# and the setting "fit to page" by mistake are apart from true scale once the ruler was checked.
+TAG_SIGMA = 0.002
 MIN_RAYS = 3  # photographs that must agree on an uncoded point; two rays cannot contradict each other
 
 
@@ -22,9 +27,10 @@ MIN_RAYS = 3  # photographs that must agree on an uncoded point; two rays cannot
 class Naming:
     """Which object point every measured target is."""
 
-    names: tuple[str, ...]  # of the object points: code number, or u and a running number, (n,)
-    code: IntArray  # code number of each point, -1 = uncoded, (n,)
+    names: tuple[str, ...]  # of the object points: code number, tag and corner, or u and a number, (n,)
+    code: IntArray  # code number of each point, of a corner as in TagCorners, -1 = uncoded, (n,)
     point: tuple[IntArray, ...]  # of each photograph, the point of each target or UNNAMED, (k_i,)
+    corners: bool = False  # whether the coded points are corners of tags
 
 
 def min_rays(naming: Naming) -> IntArray:
@@ -33,8 +39,9 @@ def min_rays(naming: Naming) -> IntArray:
 
 
 def codes_of(naming: Naming, network: Network) -> IntArray:
-    """Return the code number of each point of a network, -1 where uncoded, (n,)."""
-    code = dict(zip(naming.names, naming.code, strict=True))
+    """Return the code number or the tag of each point of a network, -1 where uncoded, (n,)."""
+    per_code = len(CORNERS) if naming.corners else 1
+    code = dict(zip(naming.names, naming.code // per_code, strict=True))
     return np.array([code[name] for name in network.points], dtype=np.int64)
 
 
@@ -49,7 +56,9 @@ def name_coded(photographs: MeasuredPhotographs) -> Naming:
         named = np.full(len(code), UNNAMED)
         named[once] = np.searchsorted(numbers, code[once])
         point.append(named)
-    return Naming(tuple(str(n) for n in numbers), numbers.astype(np.int64), tuple(point))
+    corners = any(bool((found.flag & Flag.CORNER).any()) for found in photographs.targets)
+    names = tuple(corner_name(int(n)) if corners else str(n) for n in numbers)
+    return Naming(names, numbers.astype(np.int64), tuple(point), corners)
 
 
 def build_network(survey: Survey, photographs: MeasuredPhotographs, naming: Naming) -> Network:
@@ -71,7 +80,30 @@ def build_network(survey: Survey, photographs: MeasuredPhotographs, naming: Nami
     )
     control, _ = control_points(survey, naming.names)
     bars, _ = scale_bars(survey, naming.names)
+    if not survey.scale_bars and survey.control is None:
+        bars = tag_bars(survey, naming)
     return replace(network, control=control, scale_bars=bars)
+
+
+def tag_bars(survey: Survey, naming: Naming) -> ScaleBars:
+    """Return the diagonals of all tags as scale bars, none without the size of the tags.
+
+    The scale of a print is the same for all its tags, so that they together know the scale no better than
+    one of them: each of n bars has the standard deviation of one times the root of n.
+    """
+    size, sigma = survey.targets.tag_size, survey.targets.tag_sigma
+    if size is None or not naming.corners:
+        return ScaleBars()
+    row = dict(zip(naming.code.tolist(), range(len(naming.code)), strict=True))
+    ends = [
+        (row[first], row[first + 2])
+        for first in row
+        if first >= 0 and first % len(CORNERS) < 2 and first + 2 in row  # a to c and b to d
+    ]
+    start, end = np.array(ends, dtype=np.int64).reshape(-1, 2).T
+    one = sigma if sigma is not None else TAG_SIGMA * size
+    n = len(start)
+    return ScaleBars(start, end, np.full(n, np.sqrt(2) * size), np.full(n, np.sqrt(2 * n) * one))
 
 
 def match_uncoded(
@@ -119,10 +151,11 @@ def match_uncoded(
         point[i][rows[matches.target[own]]] = len(coded) + matches.point[own]
     uncoded = len(matches.points)
     return (
-        Naming(
-            tuple(naming.names[j] for j in coded) + tuple(f"u{k + 1:03d}" for k in range(uncoded)),
-            np.concatenate([naming.code[coded], np.full(uncoded, -1)]),
-            tuple(point),
+        replace(
+            naming,
+            names=tuple(naming.names[j] for j in coded) + tuple(f"u{k + 1:03d}" for k in range(uncoded)),
+            code=np.concatenate([naming.code[coded], np.full(uncoded, -1)]),
+            point=tuple(point),
         ),
         replace(estimate, points=np.vstack([known, matches.points])),
     )

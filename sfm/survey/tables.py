@@ -85,6 +85,20 @@ def read_control(path: Path) -> PointTable:
     return PointTable(table.keys("id"), xyz, sigma)
 
 
+def read_diameters(path: Path) -> tuple[tuple[str, ...], FloatArray]:
+    """Read the diameters of targets: id,diameter.
+
+    Returns:
+        Names of the points, and the diameters of their targets, object unit, (n,).
+
+    Raises:
+        SurveyFileError: unreadable, wrong columns, not a positive number or a duplicate id.
+    """
+    table = _read(path, ("id",), ("diameter",), aliases=(("point", "id"),))
+    table.refuse(table.values, table.values < MIN_SIGMA, ("diameter",), "more than 0")
+    return table.keys("id"), table.values[:, 0]
+
+
 def read_points(path: Path) -> PointTable:
     """Read approximate object points: point,X,Y,Z; points.csv of a result is welcome.
 

@@ -16,10 +16,11 @@ from sfm.progress import SILENT, Progress
 from sfm.project import Survey, TargetSettings
 from sfm.report.result import FailedImage, PhotographTargets
 from sfm.survey.start import PhotographList, start_cameras
-from sfm.targets.codes import CodeFamily, code_family
+from sfm.targets.codes import CodeFamily
 from sfm.targets.detect import Targets, find_targets
 from sfm.targets.photograph import Metadata, read_metadata, read_photograph
 from sfm.targets.store import TargetStore, content_hash, target_key
+from sfm.targets.tags import TagFamily, target_family
 
 MIN_PHOTOGRAPHS = 2
 
@@ -70,7 +71,7 @@ def measure_photographs(
         PhotographError: photographs of different size under one camera.
         SurveyFileError: the code table or the start values of a camera are unusable.
     """
-    family = code_family(survey.codes)
+    family = target_family(survey.codes)
     found: dict[int, tuple[Metadata, Targets]] = {}
     failed: dict[int, FailedImage] = {}
     originals: list[int] = []
@@ -128,7 +129,7 @@ def find_copies(photographs: PhotographList) -> tuple[int, ...]:
 
 
 def _read_and_measure(
-    path: Path, settings: TargetSettings, family: CodeFamily | None, store: TargetStore | None
+    path: Path, settings: TargetSettings, family: CodeFamily | TagFamily | None, store: TargetStore | None
 ) -> tuple[Metadata, Targets]:
     targets, _ = measure_photograph(path, settings, family, store)  # says best what is wrong with a file
     return read_metadata(path), targets
@@ -140,7 +141,10 @@ def why_failed(error: PhotographError, path: Path) -> str:
 
 
 def measure_photograph(
-    path: Path, settings: TargetSettings, family: CodeFamily | None, store: TargetStore | None = None
+    path: Path,
+    settings: TargetSettings,
+    family: CodeFamily | TagFamily | None,
+    store: TargetStore | None = None,
 ) -> tuple[Targets, bool]:
     """Return the targets of one photograph and whether they came from the store.
 
@@ -155,12 +159,13 @@ def measure_photograph(
     Raises:
         PhotographError: the photograph cannot be read.
     """
-    key = "" if store is None else target_key(path, settings.model_dump_json(exclude={"codes"}), family)
+    measured = settings.model_dump_json(include={"channel", "polarity", "min_diameter_px"})
+    key = "" if store is None else target_key(path, measured, family)
     kept = None if store is None else store.load(key)
     if kept is not None:
         return kept, True
     targets = find_targets(
-        read_photograph(path),
+        read_photograph(path, channel=settings.channel),
         polarity=settings.polarity,
         codes=family if family is not None else "none",
         min_diameter_px=settings.min_diameter_px,

@@ -9,7 +9,7 @@ import numpy as np
 from numba import njit
 
 from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
-from sfm.targets.codes import UNCODED, UNREADABLE, CodeFamily, code_family, read_codes
+from sfm.targets.codes import UNCODED, UNREADABLE, CodeFamily, read_codes
 from sfm.targets.flags import Flag
 from sfm.targets.measure import EllipseFit, axes_from_shape, fit_ellipse_model
 from sfm.targets.outlines import (
@@ -20,6 +20,7 @@ from sfm.targets.outlines import (
     find_outlines,
     scale_of,
 )
+from sfm.targets.tags import DRAWN_PX, TagCorners, TagFamily, find_tags, inside_tags, target_family
 
 # Largest RMS of the residuals and largest mean residual on an eighth of the edge, over the contrast.
 POOR_FIT = 0.12
@@ -38,18 +39,18 @@ SOFTEST_EDGE_PX = 1.3
 
 @dataclass(frozen=True)
 class Targets:
-    """The circular targets measured in one photograph, and the candidates that were rejected."""
+    """The targets measured in one photograph, circles and corners of tags, and the rejected candidates."""
 
     xy: FloatArray
     """centres, px, (0, 0) is the centre of the top-left pixel, shape (k, 2)"""
     covariance: FloatArray
     """covariance of the centres, px^2, shape (k, 2, 2)"""
     semi_axes: FloatArray
-    """major and minor semi-axis of the ellipse, px, shape (k, 2)"""
+    """major and minor semi-axis of the ellipse, px; what is drawn for a corner of a tag, shape (k, 2)"""
     angle: FloatArray
     """direction of the major axis from x (right) towards y (down), rad, shape (k,)"""
     code: IntArray
-    """code number, -1 where uncoded, shape (k,)"""
+    """code number, of a corner of a tag see sfm.targets.tags.TagCorners, -1 where uncoded, shape (k,)"""
     confidence: FloatArray
     """confidence of the code, 0 to 1, 0 where uncoded, shape (k,)"""
     polarity: IntArray
@@ -77,7 +78,7 @@ def find_targets(
     photograph: AnyArray,
     *,
     polarity: str = "auto",
-    codes: str | CodeFamily = "none",
+    codes: str | CodeFamily | TagFamily = "none",
     min_diameter_px: float = 4.0,
     max_diameter_px: float = 250.0,
 ) -> Targets:
@@ -89,7 +90,7 @@ def find_targets(
     Args:
         photograph: intensities, shape (H, W), uint8 or uint16.
         polarity: dark, bright or auto (both).
-        codes: arcs, ring12, ring14, ring20, none, the path of a code table, or a family.
+        codes: arcs, ring12, ring14, ring20, none, a family of tags, the path of a code table, or a family.
         min_diameter_px: least minor axis of a target.
         max_diameter_px: largest major axis of a target.
 
@@ -107,7 +108,7 @@ def find_targets(
     signs = {"bright": (1,), "dark": (-1,), "auto": (1, -1)}.get(polarity)
     if signs is None:
         raise ValueError(f"polarity {polarity!r} is none of dark, bright, auto")
-    family = code_family(codes)
+    family = target_family(codes)
     noise, scale = estimate_noise(photograph), scale_of(photograph)
     outlines = find_outlines(
         photograph,
@@ -123,8 +124,12 @@ def find_targets(
     reason = _judge(fit, noise, scale, min_diameter_px, max_diameter_px)
     reason[_duplicates(fit, reason)] = Flag.DUPLICATE
     code, confidence = np.full(len(reason), UNCODED), np.zeros(len(reason))
+    tags = None
+    if isinstance(family, TagFamily):
+        tags = find_tags(photograph, family, polarity=polarity, scale=scale)
+        reason[(reason == 0) & inside_tags(fit.xy, tags, family)] = Flag.PART_OF_CODE
     good = reason == 0
-    if family is not None and good.any():
+    if isinstance(family, CodeFamily) and good.any():
         levels = np.column_stack([fit.background, fit.contrast])
         code[good], confidence[good] = read_codes(
             photograph, fit.xy[good], fit.shape[good], levels[good], family, blur_px=fit.blur[good]
@@ -134,7 +139,7 @@ def find_targets(
     keep = keep[np.lexsort((fit.xy[keep, 0], fit.xy[keep, 1]))]
     remark = np.where(code == UNREADABLE, fit.flag | Flag.CODE_UNREADABLE.value, fit.flag)
     semi_axes, angle = axes_from_shape(fit.shape[keep])
-    return Targets(
+    targets = Targets(
         xy=fit.xy[keep],
         covariance=fit.covariance[keep],
         semi_axes=semi_axes,
@@ -149,6 +154,28 @@ def find_targets(
         flag=remark[keep],
         rejected_xy=np.vstack([outlines.rejected_xy, outlines.xy[reason != 0]]),
         rejected_flag=np.concatenate([outlines.rejected_flag, reason[reason != 0]]),
+    )
+    return targets if tags is None else _with_corners(targets, tags)
+
+
+def _with_corners(targets: Targets, tags: TagCorners) -> Targets:
+    """Return circular targets and the corners of tags behind them."""
+    k = len(tags.xy)
+    return Targets(
+        xy=np.vstack([targets.xy, tags.xy]),
+        covariance=np.concatenate([targets.covariance, tags.covariance]),
+        semi_axes=np.vstack([targets.semi_axes, np.full((k, 2), DRAWN_PX)]),
+        angle=np.append(targets.angle, np.zeros(k)),
+        code=np.append(targets.code, tags.code),
+        confidence=np.append(targets.confidence, np.ones(k)),
+        polarity=np.append(targets.polarity, np.sign(tags.levels[:, 1]).astype(np.int64)),
+        contrast=np.append(targets.contrast, tags.levels[:, 1]),
+        background=np.append(targets.background, tags.levels[:, 0]),
+        blur=np.append(targets.blur, tags.blur),
+        noise=np.append(targets.noise, tags.noise),
+        flag=np.append(targets.flag, tags.flag),
+        rejected_xy=np.vstack([targets.rejected_xy, tags.rejected_xy]),
+        rejected_flag=np.append(targets.rejected_flag, tags.rejected_flag),
     )
 
 

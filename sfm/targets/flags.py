@@ -20,6 +20,7 @@ class Flag(IntFlag):
     CODE_UNREADABLE = 1 << 1  # something like a code surrounds the dot, but no valid code was read
     SHADED = 1 << 2  # the gain changes by more than its own 3 sigma across the target
     CLOSE_NEIGHBOUR = 1 << 3  # part of the background was left out because something else is there
+    CORNER = 1 << 4  # the corner of a square tag, no circle
     # reasons for a rejection
     CUT_BY_BORDER = 1 << 8  # the border of the photograph cuts the target or its background
     TOO_SMALL = 1 << 9  # below min_diameter_px

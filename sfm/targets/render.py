@@ -17,34 +17,19 @@ import os
 import sys
 import tempfile
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
 import numpy as np
 
 from sfm.camera import Camera, project, tangents_from_pixel
-from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray, angles_from_rotation
+from sfm.conventions import AnyArray, FloatArray, IntArray, angles_from_rotation
 from sfm.errors import GeometryError, KolinearError, OutputError
 from sfm.targets.area import fill_face, paint_mark
 from sfm.targets.painting_order import painting_order
+from sfm.targets.picture import TargetPictures, picture_targets
 from sfm.targets.scene import ARC, DISC, UNCODED, Optics, Scene
 from sfm.targets.scene_file import Staging, read_scene
-
-# A ray meets this many points of the rim when the truth asks whether a target is hidden.
-RIM = 16
-# Corners of the polygon whose centre of area is the centre of the picture of a circle.
-OUTLINE = 256
-
-
-@dataclass(frozen=True)
-class TargetPictures:
-    """Where each target of the scene is in a photograph."""
-
-    centre: FloatArray  # picture of the centre of the circle, px, NaN behind the camera, (n, 2)
-    outline_centre: FloatArray  # centre of area of the picture of the circle, px, (n, 2)
-    diameter: FloatArray  # largest diameter of the picture, px, (n,)
-    visible: BoolArray  # whole in the photograph, seen from the front and not hidden, (n,)
 
 
 def render_photograph(
@@ -138,57 +123,6 @@ def corner_rays(camera: Camera) -> FloatArray:
             f"camera {camera.name}: its distortion cannot be inverted in all of the photograph"
         )
     return uv.reshape(height + 1, width + 1, 2)
-
-
-def picture_targets(
-    scene: Scene, camera: Camera, position: FloatArray, rotation: FloatArray
-) -> TargetPictures:
-    """Return where the targets of a scene are in a photograph and which are whole in it."""
-    faces, targets = scene.faces, scene.targets
-    n = len(targets)
-    angle = 2 * np.pi * np.arange(OUTLINE) / OUTLINE
-    circle = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-    rim = targets.centre[:, None] + targets.radius[:, None, None] * circle
-    outline = faces.place(np.repeat(targets.face, OUTLINE), rim.reshape(-1, 2))
-    centre = project(camera, position, rotation, faces.place(targets.face, targets.centre))
-    picture = project(camera, position, rotation, outline).reshape(n, OUTLINE, 2)
-    width, height = camera.size_px
-    inside = ((picture > 0) & (picture < (width - 1, height - 1))).all(axis=(1, 2))
-    normal = faces.normals()
-    front = np.einsum("fi,fi->f", normal, position - faces.centre)[targets.face] > 0
-    seen = outline.reshape(n, OUTLINE, 3)[:, :: OUTLINE // RIM]
-    hidden = np.array(
-        [_hidden(scene, position, points, own) for points, own in zip(seen, targets.face, strict=True)],
-        dtype=bool,
-    )
-    span = np.linalg.norm(picture - np.roll(picture, OUTLINE // 2, axis=1), axis=2).max(axis=1, initial=0.0)
-    return TargetPictures(centre, _centre_of_area(picture), span, inside & front & ~hidden)
-
-
-def _hidden(scene: Scene, position: FloatArray, points: FloatArray, own: int) -> bool:
-    """Tell whether any face stands between the camera and any of the points of one face."""
-    faces = scene.faces
-    direction = points - position
-    for f, normal in enumerate(faces.normals()):
-        height = float(normal @ (position - faces.centre[f]))
-        if f == own or height <= 0:
-            continue
-        with np.errstate(divide="ignore", invalid="ignore"):
-            part = -height / (direction @ normal)
-            hit = position + part[:, None] * direction - faces.centre[f]
-        within = (np.abs(hit @ faces.axes[f].T) < faces.half[f]).all(axis=1)
-        if (within & (part > 0) & (part < 1 - 1e-9)).any():
-            return True
-    return False
-
-
-def _centre_of_area(polygon: FloatArray) -> FloatArray:
-    """Return the centres of area of polygons with corners (n, k, 2), taken about their first corner."""
-    p = polygon - polygon[:, :1]
-    q = np.roll(p, -1, axis=1)
-    cross = p[..., 0] * q[..., 1] - p[..., 1] * q[..., 0]
-    moment = ((p + q) * cross[..., None]).sum(axis=1)
-    return np.asarray(polygon[:, 0] + moment / (3 * cross.sum(axis=1))[:, None])
 
 
 def _expose(light: FloatArray, optics: Optics, rng: np.random.Generator) -> AnyArray:

@@ -13,6 +13,7 @@ import numpy as np
 from sfm.conventions import FloatArray, IntArray
 from sfm.errors import GeometryError
 from sfm.targets.codes import CodeFamily
+from sfm.targets.tags import TagFamily, tag_modules
 
 DISC, ARC, RECTANGLE = 0, 1, 2
 UNCODED = -1
@@ -172,6 +173,54 @@ def coded_ring(
     at = np.tile(np.asarray(centre, float), (k, 1))
     ring = Marks(np.full(k, face), np.full(k, ARC), at, shape, np.full(k, value))
     return join_marks([discs(face, at[:1], radius, value), ring])
+
+
+def square_tag(
+    face: int,
+    centre: FloatArray,
+    half: float,
+    number: int,
+    family: TagFamily,
+    value: float,
+    paper: float,
+    *,
+    turn: float = 0.0,
+) -> Marks:
+    """Return the black square of a tag and the white modules of its code.
+
+    Args:
+        face: the face it is on.
+        centre: plane coordinates, (2,), object unit.
+        half: half a side of the black square, object unit.
+        number: id of the tag.
+        family: the family of tags.
+        value: reflectance of the border and of black modules.
+        paper: reflectance of white modules.
+        turn: direction of the upper side, counter-clockwise from a, rad.
+
+    Returns:
+        A rectangle, and one for each run of white modules along a row or a column: where two runs meet, one
+        that crosses them covers the joint.
+
+    Raises:
+        GeometryError: the family has no such tag.
+    """
+    white = ~tag_modules(family, number)
+    module = 2 * half / family.modules
+    at, size = [np.zeros(2)], [np.array([half, half])]
+    for rows, across in ((white, False), (white.T, True)):
+        for i, row in enumerate(rows):
+            steps = np.flatnonzero(np.diff(np.concatenate([[0], row.astype(np.int8), [0]])))
+            for first, last in steps.reshape(-1, 2):
+                middle, length = np.array([(first + last) / 2, i + 0.5]), np.array([last - first, 1]) / 2
+                x, y = middle[::-1] if across else middle
+                at.append(np.array([x * module - half, half - y * module]))
+                size.append(module * (length[::-1] if across else length))
+    cos, sin = np.cos(turn), np.sin(turn)
+    places = np.array(at) @ np.array([[cos, sin], [-sin, cos]]) + centre
+    k = len(places)
+    reflectance = np.concatenate([[value], np.full(k - 1, paper)])
+    return rectangles(face, places, np.array(size), np.full(k, turn), reflectance)
 
 
 def _runs(number: int, family: CodeFamily) -> FloatArray:

@@ -11,8 +11,8 @@ import numpy as np
 
 from sfm.conventions import FloatArray, IntArray
 from sfm.errors import OutputError, SurveyFileError
-from sfm.targets.codes import code_family
-from sfm.targets.scene import ARC, DISC, Marks, coded_ring, join_marks
+from sfm.targets.scene import ARC, DISC, RECTANGLE, Marks, coded_ring, join_marks, square_tag
+from sfm.targets.tags import TagFamily, target_family
 
 # ISO 216 and ANSI/ASME Y14.1, width and height in mm.
 PAGES_MM = {
@@ -38,7 +38,7 @@ class Page:
 
     number: IntArray  # code numbers on the page, (k,)
     centre: FloatArray  # their centres, mm, (k, 2)
-    marks: Marks  # dots and arcs, value 1 = printed
+    marks: Marks  # dots, arcs and rectangles, value 1 = printed, 0 = left as the background
 
 
 @dataclass(frozen=True)
@@ -46,11 +46,12 @@ class Sheet:
     """Coded targets on pages of one size."""
 
     family: str
-    diameter_mm: float  # of the dot
-    ring_mm: float  # outer diameter of the ring
+    diameter_mm: float  # of the dot; side of the square of a tag
+    ring_mm: float  # outer diameter of the ring; side of the square of a tag
     size_mm: tuple[float, float]  # width and height of a page
     pages: tuple[Page, ...]
     dark: bool  # dark on white; else white on dark squares
+    tags: bool = False  # whether its targets are square tags
 
 
 def lay_out_sheet(
@@ -59,9 +60,9 @@ def lay_out_sheet(
     """Lay coded targets out on pages, row by row from the upper left.
 
     Args:
-        family: arcs, ring12, ring14, ring20 or the path of a code table.
+        family: arcs, ring12, ring14, ring20, a family of tags or the path of a code table.
         numbers: code numbers, (k,).
-        diameter_mm: diameter of the dot.
+        diameter_mm: diameter of the dot, or side of the square of a tag.
         page: one of PAGES_MM.
         dark: dark targets on white; else white ones on dark squares.
 
@@ -72,7 +73,7 @@ def lay_out_sheet(
         SurveyFileError: unknown page or family, or a target that is larger than the page.
         GeometryError: the family has no such number.
     """
-    codes = code_family(family)
+    codes = target_family(family)
     if codes is None:
         raise SurveyFileError("targets: family 'none' has no codes to print")
     if page not in PAGES_MM:
@@ -80,14 +81,15 @@ def lay_out_sheet(
     if not diameter_mm > 0:
         raise SurveyFileError(f"targets: diameter is {diameter_mm} mm, needed more than 0")
     width, height = PAGES_MM[page]
-    ring = codes.outer * diameter_mm
+    tags = isinstance(codes, TagFamily)
+    ring = diameter_mm if isinstance(codes, TagFamily) else codes.outer * diameter_mm
     across, down = CLEAR * ring, CLEAR * ring + LABEL_MM
     columns = int((width - 2 * MARGIN_MM) // across)
     rows = int((height - 2 * MARGIN_MM - FOOT_MM) // down)
     if columns < 1 or rows < 1:
         raise SurveyFileError(
-            f"targets: a ring of {ring:.1f} mm with its surroundings does not fit on {page} "
-            f"({width:g} x {height:g} mm)"
+            f"targets: a {'tag' if tags else 'ring'} of {ring:.1f} mm with its surroundings does not fit "
+            f"on {page} ({width:g} x {height:g} mm)"
         )
     pages = []
     for first in range(0, len(numbers), columns * rows):
@@ -96,11 +98,14 @@ def lay_out_sheet(
         left = (width - columns * across) / 2 + across / 2
         top = height - MARGIN_MM - across / 2
         centre = np.column_stack([left + across * (k % columns), top - down * (k // columns)])
-        rings = [
-            coded_ring(0, at, diameter_mm / 2, int(n), codes, 1.0) for at, n in zip(centre, some, strict=True)
+        marks = [
+            square_tag(0, at, diameter_mm / 2, int(n), codes, 1.0, 0.0)
+            if isinstance(codes, TagFamily)
+            else coded_ring(0, at, diameter_mm / 2, int(n), codes, 1.0)
+            for at, n in zip(centre, some, strict=True)
         ]
-        pages.append(Page(some, centre, join_marks(rings)))
-    return Sheet(codes.name, diameter_mm, ring, (width, height), tuple(pages), dark)
+        pages.append(Page(some, centre, join_marks(marks)))
+    return Sheet(codes.name, diameter_mm, ring, (width, height), tuple(pages), dark, tags)
 
 
 def write_sheet(sheet: Sheet, path: Path) -> tuple[Path, ...]:
@@ -149,10 +154,14 @@ def _outlines(sheet: Sheet, page: Page) -> list[_Path]:
     """Return everything that is filled on a page."""
     half = CLEAR * sheet.ring_mm / 2
     paths = [] if sheet.dark else [_rectangle(x - half, y - half, 2 * half, 2 * half) for x, y in page.centre]
-    for kind, (x, y), shape in zip(page.marks.kind, page.marks.centre, page.marks.shape, strict=True):
+    marks = page.marks
+    for kind, (x, y), shape, value in zip(marks.kind, marks.centre, marks.shape, marks.value, strict=True):
         if kind == DISC:
             turn = _arc(x, y, shape[0], 0.0, 2 * np.pi)
             paths.append(_Path((("M", (x + shape[0], y)), *turn), not sheet.dark))
+        elif kind == RECTANGLE:
+            corner, size = (x - shape[0], y - shape[1]), (2 * shape[0], 2 * shape[1])
+            paths.append(_rectangle(*corner, *size, white=(value == 0) == sheet.dark))
         elif kind == ARC:
             inner, outer, start, length = shape
             end = start + length
@@ -175,9 +184,9 @@ def _outlines(sheet: Sheet, page: Page) -> list[_Path]:
     return paths
 
 
-def _rectangle(x: float, y: float, width: float, height: float) -> _Path:
+def _rectangle(x: float, y: float, width: float, height: float, *, white: bool = False) -> _Path:
     corners = ((x + width, y), (x + width, y + height), (x, y + height))
-    return _Path((("M", (x, y)), *(("L", corner) for corner in corners)))
+    return _Path((("M", (x, y)), *(("L", corner) for corner in corners)), white)
 
 
 def _arc(
@@ -207,8 +216,11 @@ def _texts(sheet: Sheet, k: int) -> list[tuple[float, float, float, str]]:
     below = CLEAR * sheet.ring_mm / 2 + 0.5 * LABEL_MM
     height = 0.6 * LABEL_MM
     texts = [(x, y - below, height, str(n)) for (x, y), n in zip(page.centre, page.number, strict=True)]
+    size = f"dot {sheet.diameter_mm:g} mm, ring {sheet.ring_mm:g} mm"
+    if sheet.tags:
+        size = f"square {sheet.diameter_mm:g} mm"
     note = (
-        f"{sheet.family}, dot {sheet.diameter_mm:g} mm, ring {sheet.ring_mm:g} mm, "
+        f"{sheet.family}, {size}, "
         f"page {k + 1} of {len(sheet.pages)}; ruler {RULER_MM:g} mm: print without scaling and check"
     )
     return [*texts, (sheet.size_mm[0] / 2, MARGIN_MM + 7.5, height, note)]

@@ -22,6 +22,7 @@ import numpy as np
 from sfm.errors import PhotographError
 from sfm.targets.codes import CodeFamily
 from sfm.targets.detect import Targets
+from sfm.targets.tags import TagFamily
 
 MAX_ENTRY_BYTES = 100_000_000  # some 400,000 targets; bounded before any memory is taken
 STORE = ".kolinear/targets"  # folder of the store, beside the folders of results
@@ -71,7 +72,7 @@ class TargetStore:
         return self.folder / key[:2] / f"{key}.npz"
 
 
-def target_key(path: Path, settings: str, family: CodeFamily | None) -> str:
+def target_key(path: Path, settings: str, family: CodeFamily | TagFamily | None) -> str:
     """Return the key of a photograph's targets: a SHA-256 of everything that they depend on.
 
     Args:
@@ -83,7 +84,9 @@ def target_key(path: Path, settings: str, family: CodeFamily | None) -> str:
         PhotographError: the photograph cannot be read.
     """
     codes = "none"
-    if family is not None:
+    if isinstance(family, TagFamily):
+        codes = family.name
+    elif family is not None:
         table = family.number.tobytes() + family.pattern.tobytes()
         codes = f"{family.cells} {family.inner} {family.outer} {hashlib.sha256(table).hexdigest()}"
     parts = (content_hash(path), settings, codes, _code_version())
