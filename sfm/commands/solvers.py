@@ -13,7 +13,7 @@ from sfm.analysis.validation import validate as validate_networks
 from sfm.commands.console import drawn_progress
 from sfm.report.differences import write_differences
 from sfm.report.output import refuse_foreign_folder
-from sfm.report.validation import largest, write_validation
+from sfm.report.validation import in_words, largest, write_validation
 
 WORSE = 1  # exit code where the in-house adjuster was ever the worse one
 
@@ -38,8 +38,9 @@ def validate(
     page = write_validation(found, out)
     for verdict, count in found.counts():
         print(f"{count} of {networks} networks: {verdict}")
-    for name, value, meaning in largest(found):
-        print(f"{name}: {value:.2g} largest difference {meaning}")
+    print("Largest differences:")
+    for name, value, unit in largest(found):
+        print(f"  {name}: {in_words(value, unit)}")
     print(f"Report: {page}")
     if not found.passed:
         raise SystemExit(WORSE)

@@ -103,27 +103,32 @@ def validation_summary(validation: Validation) -> dict[str, Any]:
 
 
 def largest(validation: Validation) -> tuple[tuple[str, float, str], ...]:
-    """Return name, largest value over all networks, and meaning of every difference."""
+    """Return what was compared, its largest difference over all networks (NaN: none), and its unit."""
     trials = validation.trials
     solved = [t for t in trials if t.verdict == SAME]
     costs = [abs(t.cost[1] - t.cost[0]) / min(t.cost) for t in solved if min(t.cost) > 0]
     return (
-        ("cost", max(costs, default=math.nan), "relative difference of the costs"),
-        ("interior", _max(t.interior_sigmas for t in solved), "of a free parameter, over its sigma"),
-        ("position", _max(t.position_sigmas for t in solved), "of a projection centre, over its sigma"),
-        ("rotation", _max(t.rotation_sigmas for t in solved), "of a rotation, over its sigma"),
-        ("point", _max(t.point_sigmas for t in solved), "of an object coordinate, over its sigma"),
+        ("cost", max(costs, default=math.nan), "relative"),
+        ("free parameter of interior orientation", _max(t.interior_sigmas for t in solved), "sigma"),
+        ("projection centre, per coordinate", _max(t.position_sigmas for t in solved), "sigma"),
+        ("rotation", _max(t.rotation_sigmas for t in solved), "sigma"),
+        ("object coordinate", _max(t.point_sigmas for t in solved), "sigma"),
         (
-            "conditional covariance",
+            "covariance of a point, cameras held (conditional)",
             _max(t.conditional_difference for t in trials),
-            "of the points' covariances with cameras held, relative",
+            "relative",
         ),
         (
-            "interior covariance",
+            "covariance of interior orientation (marginal)",
             _max(t.interior_difference for t in trials),
-            "of the marginal covariances of the interior orientation, relative",
+            "relative",
         ),
     )
+
+
+def in_words(value: float, unit: str) -> str:
+    """Write a largest difference with its unit, or that there is none."""
+    return f"{value:.1e} {unit}" if math.isfinite(value) else "nothing to compare"
 
 
 def validation_page(validation: Validation) -> str:
@@ -147,7 +152,10 @@ def validation_page(validation: Validation) -> str:
         ),
         (
             "Largest differences",
-            table(("", "largest", ""), [(n, f"{v:.1e}", text) for n, v, text in largest(validation)])
+            table(
+                ("", "largest difference"),
+                [(name, in_words(value, unit)) for name, value, unit in largest(validation)],
+            )
             + "<p>A point's sigma counts all that is uncertain (marginal); with photographs and cameras "
             "held, "
             f"as {name} gives it, it is smaller: by {_median_ratio(validation):.2f} in the median.</p>",
