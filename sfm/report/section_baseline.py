@@ -19,9 +19,9 @@ def baseline_section(result: SurveyResult, found: BaselineComparison) -> str:
     text = (
         f"<p>{escape(name)} oriented {found.photographs[1]} of {found.total} photographs from their natural "
         f"texture alone, kolinear {found.photographs[0]} from the survey's points. Brought onto the survey "
-        f"by shift, rotation and scale, its orientations put the {found.targets} points of the survey that "
-        f"they determine {significant(apart)} {unit} (RMS of a coordinate) from where the survey has them; the "
-        f"survey's own standard deviation is {significant(sigma)} {unit}.</p>"
+        f"by shift, rotation and scale, its orientations put {found.targets} points of the survey "
+        f"{significant(apart)} {unit} (RMS of a coordinate) from where the survey has them; the survey's own "
+        f"standard deviation is {significant(sigma)} {unit}.</p>"
     )
     text += table(
         ("", "kolinear", name, "unit"),
