@@ -8,11 +8,16 @@ import numpy as np
 import pytest
 from synthetic import make_network, seed_of
 
+from sfm.adjustment.collinearity import residuals
 from sfm.adjustment.datum import Datum
+from sfm.adjustment.parameters import unknowns_of
 from sfm.adjustment.reliability import tau_critical
+from sfm.adjustment.result import Adjustment
+from sfm.adjustment.robust import HUBER, TUKEY, huber_weights, robust_scale, tukey_weights
 from sfm.adjustment.solve import adjust
 from sfm.conventions import BoolArray
 from sfm.network import Estimate, Network
+from sfm.similarity import fit_similarity
 
 FREE = Datum("free")
 
@@ -52,6 +57,68 @@ def test_huber_limits_the_harm_of_gross_errors() -> None:
     robust = adjust(network, truth, datum=FREE, reject="huber")
     good = ~bad
     assert (plain.residuals[good] ** 2).mean() > 4 * (robust.residuals[good] ** 2).mean()
+
+
+def one_sided(name: str, part: float) -> tuple[Network, Estimate, BoolArray]:
+    """Gross errors of 20 to 200 sigma that all point about the same way, so that they do not average out."""
+    rng = seed_of(name)
+    network, truth = make_network(rng, images=12, points=40)
+    k = network.image_points
+    bad = rng.random(len(k)) < part
+    angle = rng.normal(0.5, 0.3, len(k))
+    error = rng.uniform(2, 20, len(k))[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    return replace(network, image_points=replace(k, xy=k.xy + error * bad[:, None])), truth, bad
+
+
+def point_error(a: Adjustment, truth: Estimate) -> float:
+    """Root mean square error of a coordinate of an object point."""
+    placed = fit_similarity(a.estimate.points, truth.points).apply_estimate(a.estimate)
+    return float(np.sqrt(((placed.points - truth.points) ** 2).mean()))
+
+
+def test_tukey_rejects_a_third_of_gross_errors_where_huber_has_broken_down() -> None:
+    network, truth, bad = one_sided("breakdown", 0.3)
+    k = network.image_points
+    clean, _ = make_network(seed_of("breakdown"), images=12, points=40)
+    best = point_error(adjust(clean, truth, datum=FREE, reject="none"), truth)
+    tukey = adjust(network, truth, datum=FREE, reject="tukey")
+    huber = adjust(network, truth, datum=FREE, reject="huber")
+    assert tukey.converged
+    assert (tukey.rejected == (tukey.weights == 0)).all()
+    assert tukey.rejected[bad].all()
+    assert tukey.rejected[~bad].mean() < 0.01  # a normal vector is beyond 5 sigma once in 10^5
+    assert tukey.observations == 2 * int((~tukey.rejected).sum())
+    # with 0.7 of the image points, errors are 1.2 times as large; huber's are systematic
+    assert point_error(tukey, truth) < 2 * best
+    assert point_error(huber, truth) > 5 * best
+    assert len(k) > 300
+
+
+def test_tukey_agrees_with_least_squares_where_nothing_is_wrong() -> None:
+    network, truth, _ = spoiled(seed_of("nothing wrong"), 0.0, 0.0)
+    plain = adjust(network, truth, datum=FREE, reject="none")
+    tukey = adjust(network, truth, datum=FREE, reject="tukey")
+    assert tukey.rejected.sum() <= 1
+    assert tukey.weights.max() <= 1 and tukey.weights[~tukey.rejected].min() > 0
+    assert point_error(tukey, truth) < 1.2 * point_error(plain, truth)  # 95 % efficient
+
+
+def test_weights_of_both_estimators() -> None:
+    network, truth = make_network(seed_of("weights"), images=4, points=10)
+    layout, state = unknowns_of(network, truth, use_control=False)
+    v = np.zeros((len(network.image_points), 2))
+    v[:5, 0] = 0.1 * np.array([0.5 * HUBER, 2 * HUBER, TUKEY / 2, 0.999 * TUKEY, 1.001 * TUKEY])
+    v[5] = np.nan  # behind its camera
+    huber = huber_weights(layout.obs, v, sigma0=1.0)
+    tukey = tukey_weights(layout.obs, v, sigma0=1.0)
+    assert huber[:2] == pytest.approx([1.0, 0.5])
+    assert tukey[[2, 4, 5, 6]] == pytest.approx([0.5625, 0.0, 0.0, 1.0])
+    assert 0 < tukey[3] < 1e-5 and huber[5] == 0
+    noise = residuals(layout.obs, state)
+    used = np.ones(len(v), dtype=bool)
+    assert robust_scale(layout.obs, noise, used, freedom=1.0) == pytest.approx(
+        1, abs=4 * 1.17 / np.sqrt(2 * 40)
+    )
 
 
 def test_tau_is_bounded_by_the_root_of_the_redundancy() -> None:

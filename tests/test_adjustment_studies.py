@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from scipy import stats
 from synthetic import make_network, perturb, seed_of
+from test_adjustment_robust import one_sided, point_error
 
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.reliability import tau_critical
@@ -121,6 +122,26 @@ def test_five_per_cent_gross_errors_of_ten_sigma() -> None:
     print(f"gross errors found {found}/{bad_total}, good ones lost {lost}/{good_total}")
     assert found >= 0.99 * bad_total
     assert lost <= 0.005 * good_total
+
+
+def test_breakdown_of_huber_and_of_tukey() -> None:
+    """Error of the object points over that without gross errors, for growing shares of one-sided ones."""
+    ratio: dict[tuple[str, float], list[float]] = {}
+    for share in (0.05, 0.1, 0.2, 0.3, 0.35):
+        for copy in range(20):
+            network, truth, _ = one_sided(f"breakdown {copy}", share)
+            clean, _ = make_network(seed_of(f"breakdown {copy}"), images=12, points=40)
+            best = point_error(adjust(clean, truth, datum=FREE, reject="none"), truth)
+            for reject in ("huber", "tukey"):
+                a = adjust(network, truth, datum=FREE, reject=reject)
+                ratio.setdefault((reject, share), []).append(point_error(a, truth) / best)
+    worst = {key: max(values) for key, values in ratio.items()}
+    for (reject, share), values in ratio.items():
+        print(f"{reject} {100 * share:.0f} %: {np.median(values):.2f} (largest {max(values):.2f})")
+    # fewer good image points cost the root of their number, and some more by an uneven distribution
+    assert all(worst["tukey", share] < 2 / np.sqrt(1 - share) for share in (0.05, 0.1, 0.2, 0.3, 0.35))
+    assert worst["huber", 0.05] < 2
+    assert np.median(ratio["huber", 0.3]) > 5
 
 
 def test_convergence_from_bad_start_values() -> None:

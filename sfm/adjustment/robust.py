@@ -1,12 +1,17 @@
-"""Gross errors: iterative data snooping by Pope's tau with reinstatement, and Huber's M-estimator.
+"""Gross errors: iterative data snooping by Pope's tau with reinstatement, Huber's and Tukey's M-estimators.
 
 Data snooping takes out, round by round, the image points of the largest tau above the critical value:
 the largest of all, and with it others whose photograph and object point hold no larger one, so that
 none is judged beside a larger error. A rejected point is taken back when its predicted residual
 passes the test again.
 
+Huber's estimator bounds the influence of an image point, Tukey's biweight takes it back to nothing:
+beyond TUKEY standard deviations an image point has weight 0. It starts from Huber's, because its sum
+has many minima, and both take their scale from the median of the residuals.
+
 Source: Pope (1976), NOAA TR NOS 65 NGS 1; Kok (1984), On data snooping and multiple outlier testing;
-Huber (1981), Robust Statistics, ch. 7.
+Huber (1981), Robust Statistics, ch. 7; Beaton and Tukey (1974), Technometrics 16(2), for the biweight;
+Maronna et al. (2019), Robust Statistics, sec. 2.3, for efficiency.
 """
 
 from __future__ import annotations
@@ -17,7 +22,12 @@ from sfm.adjustment.collinearity import Observations
 from sfm.adjustment.reliability import standardised_residuals, tau_critical
 from sfm.conventions import BoolArray, FloatArray
 
-HUBER = 1.345  # in sigmas; 95 % efficient with normal errors (Huber 1981)
+# In sigmas of a coordinate, for the length of a residual vector: both are 95 % efficient with normal errors
+# in the plane (for a single coordinate they would be 1.345 and 4.685).
+HUBER = 1.501
+TUKEY = 5.123
+NORMAL_MAD = 1.4826  # standard deviation of a normal variable over its median absolute deviation
+LEAST_FREEDOM = 0.05  # of redundancy over observations, so that a network without redundancy has a scale
 
 
 def snoop(
@@ -64,6 +74,44 @@ def huber_weights(obs: Observations, residuals: FloatArray, *, sigma0: float) ->
         residuals: v, px, shape (k, 2).
         sigma0: standard deviation of unit weight.
     """
-    a, b, c = obs.whitening.T
-    size = np.hypot(a * residuals[:, 0], b * residuals[:, 0] + c * residuals[:, 1]) / sigma0
+    size = _lengths(obs, residuals) / sigma0
     return np.where(size > HUBER, HUBER / np.maximum(size, HUBER), 1.0)
+
+
+def tukey_weights(obs: Observations, residuals: FloatArray, *, sigma0: float) -> FloatArray:
+    """Return the factor (1 - (|v| / TUKEY)^2)^2 on the weight of each image point, 0 beyond TUKEY, (k,).
+
+    Args:
+        obs: image points.
+        residuals: v, px, shape (k, 2).
+        sigma0: standard deviation of unit weight.
+    """
+    share = _lengths(obs, residuals) / (TUKEY * sigma0)
+    return np.where(share < 1.0, (1.0 - share**2) ** 2, 0.0)
+
+
+def robust_scale(obs: Observations, residuals: FloatArray, used: BoolArray, *, freedom: float) -> float:
+    """Return the standard deviation of unit weight from the median of the residuals.
+
+    Half of the image points may be wrong before it is.
+
+    Args:
+        obs: image points.
+        residuals: v, px, shape (k, 2).
+        used: image points that can take part, shape (k,).
+        freedom: redundancy over observations, by which residuals are smaller than errors.
+
+    Source: Hampel (1974), J. Am. Stat. Assoc. 69, for the median absolute deviation.
+    """
+    a, b, c = obs.whitening[used].T
+    v = residuals[used]
+    whitened = np.abs(np.concatenate([a * v[:, 0], b * v[:, 0] + c * v[:, 1]]))
+    scale = NORMAL_MAD * float(np.median(whitened)) / np.sqrt(max(freedom, LEAST_FREEDOM))
+    return max(scale, np.finfo(float).tiny)
+
+
+def _lengths(obs: Observations, residuals: FloatArray) -> FloatArray:
+    """Return the lengths of the residuals in their standard deviations, infinite behind the camera, (k,)."""
+    a, b, c = obs.whitening.T
+    length = np.hypot(a * residuals[:, 0], b * residuals[:, 0] + c * residuals[:, 1])
+    return np.where(np.isfinite(length), length, np.inf)

@@ -7,6 +7,7 @@ data snooping; rank defect found numerically; nothing is damped where the result
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,7 +26,7 @@ from sfm.adjustment.parameters import Unknowns, estimate_of, start_weights, unkn
 from sfm.adjustment.rank import rank_defect, undetermined_of
 from sfm.adjustment.reliability import redundancy_numbers, standardised_residuals
 from sfm.adjustment.result import Adjustment, Covariance
-from sfm.adjustment.robust import huber_weights, snoop
+from sfm.adjustment.robust import huber_weights, robust_scale, snoop, tukey_weights
 from sfm.adjustment.threads import blas_threads
 from sfm.adjustment.weighted import Weighted, weighted_of
 from sfm.conventions import FloatArray
@@ -34,10 +35,9 @@ from sfm.network import Estimate, Network
 
 MAX_ROUNDS = 200  # of data snooping
 ROUND_TOLERANCE = 1e-3  # |A dx| / |v| that is near enough to judge gross errors
-HUBER_ROUNDS = 30
-HUBER_SETTLED = 1e-3  # largest change of a weight at which reweighting ends
-NORMAL_MAD = 1.4826  # standard deviation of a normal variable over its median absolute deviation
-REJECTS = ("tau", "huber", "none")
+REWEIGHTINGS = 30
+REWEIGHTED = 1e-3  # largest change of a weight at which reweighting ends
+REJECTS = ("tau", "huber", "tukey", "none")
 
 
 def adjust(
@@ -63,7 +63,8 @@ def adjust(
         estimate: start values; NaN where a photograph or point has none (it is held out and named).
         datum: how position, attitude and scale are decided.
         sigma_px: standard deviation of unit weight, in which sigma0_px is told, px.
-        reject: "tau" (data snooping by Pope's test), "huber" (reweighting) or "none".
+        reject: "tau" (data snooping by Pope's test), "huber" or "tukey" (reweighting; Tukey's biweight,
+            from Huber's start, rejects what it gives weight 0) or "none".
         alpha: probability with which the test of one image coordinate rejects a good one.
         method: "gauss-newton" (line search) or "levenberg-marquardt" (ends in undamped Gauss-Newton).
         max_iterations: steps at most, in each round of the robust test.
@@ -85,8 +86,10 @@ def adjust(
         optimum, weight = run.minimise(run.start(state, weight), weight)
         if reject == "tau":
             optimum, weight = _snoop_all(run, optimum, weight, alpha)
-        elif reject == "huber":
-            optimum, weight = _huber(run, optimum, weight)
+        elif reject in ("huber", "tukey"):
+            optimum, weight = _reweight(run, optimum, weight, huber_weights)
+            if reject == "tukey":
+                optimum, weight = _reweight(run, optimum, weight, tukey_weights)
         if near > tolerance:
             run.tolerance = tolerance
             optimum = run.again(optimum, weight)
@@ -169,20 +172,22 @@ def _snoop_all(run: _Run, optimum: Optimum, weight: FloatArray, alpha: float) ->
     return optimum, weight
 
 
-def _huber(run: _Run, optimum: Optimum, weight: FloatArray) -> tuple[Optimum, FloatArray]:
-    """Return the optimum of Huber's estimator by reweighting."""
-    base = (weight > 0).astype(float)
-    for _ in range(HUBER_ROUNDS):
-        v = residuals(run.layout.obs, optimum.state)
-        a, b, c = run.layout.obs.whitening[base > 0].T
-        used = v[base > 0]
-        whitened = np.abs(np.concatenate([a * used[:, 0], b * used[:, 0] + c * used[:, 1]]))
-        sigma0 = max(NORMAL_MAD * float(np.median(whitened)), np.finfo(float).tiny)
-        new = base * np.nan_to_num(huber_weights(run.layout.obs, v, sigma0=sigma0))
+def _reweight(
+    run: _Run, optimum: Optimum, weight: FloatArray, weights: Callable[..., FloatArray]
+) -> tuple[Optimum, FloatArray]:
+    """Return the optimum of an M-estimator by reweighting; a scale from the median goes with every round."""
+    layout = run.layout
+    ready = layout.active & ~behind_camera(layout.obs, optimum.state)
+    count = 2 * int(ready.sum()) + run.weighted.count
+    freedom = run.redundancy(optimum, ready.astype(float)) / max(count, 1)
+    for _ in range(REWEIGHTINGS):
+        v = residuals(layout.obs, optimum.state)
+        sigma0 = robust_scale(layout.obs, v, ready & np.isfinite(v).all(axis=1), freedom=freedom)
+        new = np.where(ready, weights(layout.obs, v, sigma0=sigma0), 0.0)
         change = float(np.abs(new - weight).max())
         weight = new
         optimum = run.again(optimum, weight)
-        if change <= HUBER_SETTLED:
+        if change <= REWEIGHTED:
             break
     return optimum, weight
 
