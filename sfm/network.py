@@ -132,6 +132,37 @@ class Estimate:
         return np.asarray(np.isfinite(self.points).all(axis=1))
 
 
+def supported(
+    network: Network,
+    estimate: Estimate,
+    accepted: BoolArray,
+    *,
+    min_points: int,
+    min_rays: int | IntArray,
+) -> tuple[BoolArray, BoolArray]:
+    """Return the photographs and points that are left when those with too few image points go, in turn.
+
+    Args:
+        network, estimate: of m photographs, n points and k image points.
+        accepted: image points that count, (k,).
+        min_points: image points that a photograph needs.
+        min_rays: image points that a point needs, of all or of each, (n,).
+
+    Returns:
+        Photographs (m,) and points (n,); of those, oriented and determined ones only.
+    """
+    seen = network.image_points
+    images, points = estimate.oriented, estimate.determined
+    while True:
+        used = accepted & images[seen.image] & points[seen.point]
+        shown = np.bincount(seen.image[used], minlength=len(images))
+        rays = np.bincount(seen.point[used], minlength=len(points))
+        still_images, still_points = images & (shown >= min_points), points & (rays >= min_rays)
+        if (still_images == images).all() and (still_points == points).all():
+            return images, points
+        images, points = still_images, still_points
+
+
 def reduce_network(
     network: Network, estimate: Estimate, images: BoolArray, points: BoolArray, image_points: BoolArray
 ) -> tuple[Network, Estimate]:

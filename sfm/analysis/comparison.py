@@ -26,7 +26,7 @@ from sfm.analysis.conversion import Conversion, convert_camera
 from sfm.camera import Camera, pixel_from_tangents, project, tangents_from_pixel
 from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.errors import GeometryError
-from sfm.network import Estimate, ImagePoints, Network, reduce_network
+from sfm.network import Estimate, ImagePoints, Network, reduce_network, supported
 from sfm.similarity import Similarity, fit_similarity
 
 EFFECT_STEPS = 9  # places along each side of the photograph where interior orientations are compared
@@ -271,21 +271,14 @@ def common_problem(
         for camera, now in zip(converted, grouped, strict=True)
         if (now.free & ~camera.free).any()
     )
-    images, points = estimate.oriented, estimate.determined
     accepted = ~adjustment.rejected
-    seen = adjustment.network.image_points
-    while True:
-        use = accepted & images[seen.image] & points[seen.point]
-        rays = np.bincount(seen.point[use], minlength=len(points))
-        shown = np.bincount(seen.image[use], minlength=len(images))
-        kept_images, kept_points = images & (shown >= MIN_POINTS), points & (rays >= MIN_RAYS)
-        if (kept_images == images).all() and (kept_points == points).all():
-            break
-        images, points = kept_images, kept_points
+    images, points = supported(
+        adjustment.network, estimate, accepted, min_points=MIN_POINTS, min_rays=MIN_RAYS
+    )
     if images.sum() < 2:
         raise GeometryError("comparison: fewer than two photographs with accepted image points are left")
     network, start = reduce_network(
-        adjustment.network, replace(estimate, cameras=grouped), images, points, use
+        adjustment.network, replace(estimate, cameras=grouped), images, points, accepted
     )
     seen = network.image_points
     unit = np.tile(np.eye(2) * adjustment.sigma_px**2, (len(seen), 1, 1))

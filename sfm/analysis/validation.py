@@ -21,7 +21,7 @@ from threadpoolctl import threadpool_limits
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
-from sfm.analysis.comparison import reprojection, rotation_angle_deg
+from sfm.analysis.comparison import BackendAdjustment, reprojection, rotation_angle_deg
 from sfm.analysis.random_network import Plan, RandomNetwork, random_network
 from sfm.conventions import BoolArray, FloatArray
 from sfm.errors import KolinearError
@@ -40,19 +40,11 @@ THEIRS_FAILED = "{name} failed"
 BOTH_FAILED = "both failed"
 
 
-class ValidationAdjustment(Protocol):
-    """What the other adjuster must return."""
+class ValidationAdjustment(BackendAdjustment, Protocol):
+    """What the other adjuster must return, and why it stopped."""
 
     @property
-    def estimate(self) -> Estimate: ...
-    @property
-    def iterations(self) -> int: ...
-    @property
-    def converged(self) -> bool: ...
-    @property
     def message(self) -> str: ...
-    @property
-    def seconds(self) -> float: ...
 
 
 class ValidationCovariance(Protocol):

@@ -11,7 +11,7 @@ from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.conventions import BoolArray, IntArray
 from sfm.errors import GeometryError
-from sfm.network import Estimate, Network, reduce_network
+from sfm.network import Estimate, Network, reduce_network, supported
 from sfm.orientation.sequence import Orientation
 from sfm.project import Survey
 from sfm.report.result import ControlCheck
@@ -180,16 +180,7 @@ def determined(
     Raises:
         GeometryError: fewer than two photographs are left.
     """
-    seen = network.image_points
-    images, points = estimate.oriented, estimate.determined
-    while True:
-        used = accepted & images[seen.image] & points[seen.point]
-        rays = np.bincount(seen.point[used], minlength=len(points))
-        count = np.bincount(seen.image[used], minlength=len(images))
-        still_images, still_points = images & (count >= MIN_IMAGE_POINTS), points & (rays >= min_rays)
-        if (still_images == images).all() and (still_points == points).all():
-            break
-        images, points = still_images, still_points
+    images, points = supported(network, estimate, accepted, min_points=MIN_IMAGE_POINTS, min_rays=min_rays)
     if images.sum() < 2:
         raise GeometryError(
             f"{images.sum()} of {len(images)} photographs see at least {MIN_IMAGE_POINTS} points of the "
