@@ -150,8 +150,8 @@ def write_bundle_matlab_folder(folder: Path, network: Network, estimate: Estimat
     """
     _millimetres(network, estimate)  # refuses what cannot be held, before a folder is made
     folder.mkdir(parents=True, exist_ok=True)
-    files = (folder / name for name in ("cams.txt", "pts.txt", "sigmas.txt"))
-    write_bundle_matlab(*files, network, estimate)
+    cameras, points, sigmas = folder / "cams.txt", folder / "pts.txt", folder / "sigmas.txt"
+    write_bundle_matlab(cameras, points, sigmas, network, estimate)
     camera = estimate.cameras[0]
     values = _text(*(camera.value(name) for name in ("c", "x0", "y0")))
     write_lines(folder / INTERIOR, ["# c x0 y0 (mm), which the program asks for", values])

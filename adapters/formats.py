@@ -136,8 +136,8 @@ def read_any(path: Path, name: str | None = None) -> tuple[Network, Estimate]:
     if form.name == "bundle-matlab":
         return read_bundle_matlab_folder(path)
     if form.name == "sba":
-        cameras, points, calibration, sigmas = sba_files(path)
-        return read_sba_text(cameras, points, calibration, sigmas=sigmas)
+        files = sba_files(path)
+        return read_sba_text(*files[:3], sigmas=files[3])
     raise SurveyFileError(f"{path}: format {form.name} holds no photographs, it is written only")
 
 
