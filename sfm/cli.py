@@ -20,7 +20,7 @@ from threadpoolctl import threadpool_limits
 from sfm.batch.run import find_surveys, run_batch
 from sfm.batch.survey import Comparers
 from sfm.batch.table import BatchTable, print_batch, stopping_at_terminate
-from sfm.commands import measuring, refining, solvers
+from sfm.commands import measuring, planning, refining, solvers
 from sfm.commands.console import drawn_progress, tell_of_compiling, tell_result
 from sfm.errors import KolinearError
 from sfm.folder_lock import locked
@@ -225,6 +225,7 @@ for _command in (
     refining.refine,
 ):
     app.command()(_command)
+app.add_typer(planning.plan)
 
 
 def main() -> None:

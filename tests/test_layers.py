@@ -19,6 +19,7 @@ LAYERS = (
 COMMANDS = (
     "sfm.cli",
     "sfm.commands.measuring",
+    "sfm.commands.planning",
     "sfm.commands.refining",
     "sfm.commands.solvers",
     "sfm.commands.console",

@@ -46,6 +46,7 @@ def test_survey_files_of_the_readme_are_read_and_show_every_key(tmp_path: Path) 
 
 def test_commands_of_the_readme_exist() -> None:
     commands = {command.callback.__name__ for command in app.registered_commands if command.callback}
+    commands |= {group.typer_instance.info.name for group in app.registered_groups if group.typer_instance}
     assert set(re.findall(r"^kolinear ([a-z]+) ", README, re.M)) == commands
 
 

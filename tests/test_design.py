@@ -1,0 +1,64 @@
+"""Planning: the size of targets by the formula of document 000 and as a renderer sees it."""
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from sfm.analysis.design import target_size
+from sfm.camera import camera_from_values, project
+from sfm.errors import GeometryError
+
+
+def test_formula_of_document_000() -> None:
+    # 7 px with the document's Nikon D60 (23.6 mm, 3872 px) and 18 mm: a line through the origin
+    size = target_size(p=7, w_mm=23.6, d=5000.0, c_mm=18.0, n=3872)
+    assert size.diameter == pytest.approx(7 * 23.6 * 5000 / (18 * 3872), abs=1e-12)
+    assert size.diameter == pytest.approx(11.85, abs=0.01)
+    assert size.ring == pytest.approx(3 * size.diameter)
+    assert target_size(p=7, w_mm=23.6, d=10.0, c_mm=18.0, n=3872).diameter == pytest.approx(0.0237, abs=1e-4)
+
+
+@pytest.mark.parametrize("tilt", [0.0, 60.0])
+def test_a_target_of_that_size_shows_that_many_pixels(tilt: float) -> None:
+    size = target_size(p=12, w_mm=36.0, d=3000.0, c_mm=28.0, n=6000, tilt_deg=tilt)
+    camera = camera_from_values("c", "brown", (6000, 4000), (0.006, 0.006), c_mm=28.0)
+    t = np.linspace(0, 2 * np.pi, 721)
+    r, slope = size.diameter / 2, np.radians(tilt)
+    rim = r * np.column_stack([np.cos(t), np.sin(t) * np.cos(slope), np.sin(t) * np.sin(slope)])
+    xy = project(camera, np.array([0.0, 0.0, 3000.0]), np.eye(3), rim)
+    across = np.ptp(xy, axis=0)
+    assert across.min() == pytest.approx(12, rel=1e-3)
+    assert across.max() == pytest.approx(12 / np.cos(slope), rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"d": 0.0}, "distance is 0"),
+        ({"c_mm": float("nan")}, "principal distance is nan"),
+        ({"tilt_deg": 80.0}, "tilt is 80 deg, needed 0 to 75"),
+    ],
+)
+def test_nonsense_is_refused(wrong: dict[str, float], message: str) -> None:
+    given = {"p": 7, "w_mm": 36.0, "d": 1000.0, "c_mm": 24.0, "n": 6000} | wrong
+    with pytest.raises(GeometryError, match=message):
+        target_size(**given)
+
+
+def test_command() -> None:
+    camera = ["--c-mm", "18", "--sensor-width-mm", "23.6", "--width-px", "3872"]
+    words = ["plan", "target-size", "--distance", "5", "--unit", "m", *camera]
+    done = subprocess.run(
+        [sys.executable, "-c", "from sfm.cli import main; main()", *words], capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+    assert "0.01185 m, 7 px across" in done.stdout
+    assert "0.03555 m outer diameter (ring14)" in done.stdout
+    bad = [*words[:-1], "0"]
+    done = subprocess.run(
+        [sys.executable, "-c", "from sfm.cli import main; main()", *bad], capture_output=True, text=True
+    )
+    assert done.returncode == 2
+    assert done.stderr.strip() == "kolinear: target size: photograph is 0, needed more than 0"
