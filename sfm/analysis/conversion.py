@@ -197,7 +197,7 @@ def _grid(camera: Camera, region_px: FloatArray | None) -> FloatArray:
     return np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _residuals(model, frame, p, xy, uv):  # type: ignore[no-untyped-def]
     """Residuals (k, 2) and their derivatives by the parameters (k, 2, n) at given pixels and rays."""
     r, Ju, Jp = np.empty(2), np.empty((2, 2)), np.zeros((2, MAX_PARAMETERS))

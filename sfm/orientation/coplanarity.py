@@ -64,7 +64,7 @@ def turned_pair(base: FloatArray, rotation: FloatArray, step: FloatArray) -> tup
     return new_base, new_rotation
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _adjust_coplanarity(uv1, uv2, base, R, residuals, N):  # type: ignore[no-untyped-def]
     """Gauss-Newton in place with halved steps; False if singular."""
     b5, dx = np.empty(5), np.empty(5)
@@ -93,7 +93,7 @@ def _adjust_coplanarity(uv1, uv2, base, R, residuals, N):  # type: ignore[no-unt
     return True
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _across(base, p, q):  # type: ignore[no-untyped-def]
     """Two unit vectors across the base."""
     k = 0
@@ -108,7 +108,7 @@ def _across(base, p, q):  # type: ignore[no-untyped-def]
     q[2] = base[0] * p[1] - base[1] * p[0]
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _turn_base(base, s, t, out):  # type: ignore[no-untyped-def]
     p, q = np.empty(3), np.empty(3)
     _across(base, p, q)
@@ -116,7 +116,7 @@ def _turn_base(base, s, t, out):  # type: ignore[no-untyped-def]
     out /= np.sqrt(out[0] ** 2 + out[1] ** 2 + out[2] ** 2)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _coplanarity_normals(uv1, uv2, base, R, residuals, N, b5):  # type: ignore[no-untyped-def]
     """Normal equations of (two turns of b, w); each equation divided by its gradient; returns v'v."""
     N[:] = 0.0
@@ -159,7 +159,7 @@ def _coplanarity_normals(uv1, uv2, base, R, residuals, N, b5):  # type: ignore[n
     return cost
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _cross(a, b, out):  # type: ignore[no-untyped-def]
     out[0] = a[1] * b[2] - a[2] * b[1]
     out[1] = a[2] * b[0] - a[0] * b[2]

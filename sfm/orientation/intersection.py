@@ -99,7 +99,7 @@ def intersect(
     return Intersection(xyz, Q, sigma0**2 * Q, residuals, used, rays, angle, sigma0, redundancy)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _intersect_all(  # type: ignore[no-untyped-def]
     tangents,
     image,
@@ -196,13 +196,13 @@ def _intersect_all(  # type: ignore[no-untyped-def]
     return total
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _drop(own, used):  # type: ignore[no-untyped-def]
     for i in range(len(own)):
         used[own[i]] = False
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _direction(uv, R, out):  # type: ignore[no-untyped-def]
     """Unit vector of a ray in object axes."""
     norm = np.sqrt(uv[0] * uv[0] + uv[1] * uv[1] + 1.0)
@@ -210,7 +210,7 @@ def _direction(uv, R, out):  # type: ignore[no-untyped-def]
         out[d] = (R[d, 0] * uv[0] + R[d, 1] * uv[1] - R[d, 2]) / norm
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _nearest_to_rays(own, image, positions, direction, used, N, b, X):  # type: ignore[no-untyped-def]
     """The point with the least sum of squared distances from the rays in use: linear equations."""
     N[:] = 0.0
@@ -228,7 +228,7 @@ def _nearest_to_rays(own, image, positions, direction, used, N, b, X):  # type: 
     return solve_scaled(N, b, X)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _best_pair(own, tangents, image, positions, rotations, direction, limit, used, N, b, X, best_X):  # type: ignore[no-untyped-def]
     """The two-ray point with the least truncated squares over all rays; returns that sum (inf: none)."""
     m = len(own)
@@ -259,7 +259,7 @@ def _best_pair(own, tangents, image, positions, rotations, direction, limit, use
     return best
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _square(uv, C, R, X):  # type: ignore[no-untyped-def]
     """Squared image residual; inf for a point behind the camera."""
     dx, dy, dz = X[0] - C[0], X[1] - C[1], X[2] - C[2]
@@ -271,7 +271,7 @@ def _square(uv, C, R, X):  # type: ignore[no-untyped-def]
     return ru * ru + rv * rv
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _residual(uv, C, R, X, r):  # type: ignore[no-untyped-def]
     dx, dy, dz = X[0] - C[0], X[1] - C[1], X[2] - C[2]
     W = R[0, 2] * dx + R[1, 2] * dy + R[2, 2] * dz
@@ -280,7 +280,7 @@ def _residual(uv, C, R, X, r):  # type: ignore[no-untyped-def]
         r[1] = -(R[0, 1] * dx + R[1, 1] * dy + R[2, 1] * dz) / W - uv[1]
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _least_squares(own, tangents, image, positions, rotations, weights, used, X, N, b, dx):  # type: ignore[no-untyped-def]
     """Gauss-Newton on the image residuals of the rays in use; leaves N; False if it fails."""
     A = np.empty((2, 3))

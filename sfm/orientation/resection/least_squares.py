@@ -123,7 +123,7 @@ def _rotation_from_angle_rates(rotation: FloatArray) -> FloatArray:
 DONE, LIMIT, BEHIND, RANK = 0, 1, 2, 3  # how an adjustment of one pose ends
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def adjust_pose(tangents, points, weights, used, X0, R, max_steps, history, N, residuals):  # type: ignore[no-untyped-def]
     """Adjust X0 and R in place; fill history, N (of X0 and w) and residuals; return v'Pv, steps, state."""
     n_vector, new_n, new_N = np.empty(6), np.empty(6), np.empty((6, 6))
@@ -167,7 +167,7 @@ def adjust_pose(tangents, points, weights, used, X0, R, max_steps, history, N, r
     return cost, steps, LIMIT
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _note(history, row, X0, R):  # type: ignore[no-untyped-def]
     if row >= len(history):
         return
@@ -177,7 +177,7 @@ def _note(history, row, X0, R):  # type: ignore[no-untyped-def]
     history[row, 5] = np.arctan2(-R[0, 1], R[0, 0])
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def pose_normals(tangents, points, weights, used, X0, R, N, n_vector, residuals):  # type: ignore[no-untyped-def]
     """Normal equations of X0 and w (R exp([w]x)); returns v'Pv (inf: a point behind) and mean distance."""
     N[:] = 0.0
@@ -224,7 +224,7 @@ def pose_normals(tangents, points, weights, used, X0, R, N, n_vector, residuals)
     return cost, distance / max(count, 1)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def solve_scaled(N, n_vector, dx):  # type: ignore[no-untyped-def]
     """Solve N dx = n by Cholesky after scaling N to unit diagonal; False if singular."""
     m = len(n_vector)
@@ -260,7 +260,7 @@ def solve_scaled(N, n_vector, dx):  # type: ignore[no-untyped-def]
     return True
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def turn(R, wx, wy, wz, out):  # type: ignore[no-untyped-def]
     """Fill out = R exp([w]x) (Rodrigues)."""
     t2 = wx * wx + wy * wy + wz * wz

@@ -163,7 +163,7 @@ def _failure(n: int, reason: str) -> RobustResection:
     )  # fmt: skip
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _search(tangents, rays, points, weights, tolerance, max_trials, seed, X0, R, used, residuals, N):  # type: ignore[no-untyped-def]
     """Fill the best pose, the points that fit it, residuals and normal matrix; return trials (-1: none)."""
     n = len(points)
@@ -243,7 +243,7 @@ def _search(tangents, rays, points, weights, tolerance, max_trials, seed, X0, R,
     return trial
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def truncated_squares(tangents, points, X0, R, limit, stop):  # type: ignore[no-untyped-def]
     """Sum of min(squared residual, limit); given up as soon as it exceeds `stop`."""
     total = 0.0
@@ -261,7 +261,7 @@ def truncated_squares(tangents, points, X0, R, limit, stop):  # type: ignore[no-
     return total
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def select(tangents, points, X0, R, limit, used):  # type: ignore[no-untyped-def]
     """Mark the points in front of the camera whose squared residual is at most `limit`; return how many."""
     count = 0
@@ -278,7 +278,7 @@ def select(tangents, points, X0, R, limit, used):  # type: ignore[no-untyped-def
     return count
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _next_triple(pick, n):  # type: ignore[no-untyped-def]
     """Step to the next i < j < k in lexical order; pick[2] = -1 starts."""
     if pick[2] < 0:
@@ -293,7 +293,7 @@ def _next_triple(pick, n):  # type: ignore[no-untyped-def]
     return False
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _random_triple(state, n, pick):  # type: ignore[no-untyped-def]
     """Draw three different indices; returns the new state (splitmix64, Steele et al. 2014)."""
     k = 0

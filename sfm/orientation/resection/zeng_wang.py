@@ -64,7 +64,7 @@ def distance_quartic(rays: FloatArray, points: FloatArray) -> FloatArray:
     return np.array(_quartic(ab, ac, bc, gab / 2, gac / 2, gbc / 2)[::-1])
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _resect_batch(rays, points):  # type: ignore[no-untyped-def]
     k = len(rays)
     count = np.zeros(k, dtype=np.int64)
@@ -76,7 +76,7 @@ def _resect_batch(rays, points):  # type: ignore[no-untyped-def]
     return count, position, rotation, distances
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _solve(rays, points, position, rotation, distances):  # type: ignore[no-untyped-def]
     roots, R123, S = np.empty(MAX_ROOTS), np.empty(3), np.empty(3)
     L3, L2, L1 = squared_sides(points)
@@ -112,7 +112,7 @@ def _solve(rays, points, position, rotation, distances):  # type: ignore[no-unty
     return n
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _quartic(L3, L2, L1, g12, g13, g23):  # type: ignore[no-untyped-def]
     """N5 to N1, the coefficients of 1 to n^4, from A^2 - D1 A B + B^2 C = 0; sides squared, gaps 1 - cos.
 
@@ -132,7 +132,7 @@ def _quartic(L3, L2, L1, g12, g13, g23):  # type: ignore[no-untyped-def]
     return N5, N4, N3, N2, N1
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def direction_test(rays):  # type: ignore[no-untyped-def]
     """Sign that T = 1S . (12 x 13) must have: 1S = -R1 r1 and 12 x 13 turn with the image points.
 
@@ -146,7 +146,7 @@ def direction_test(rays):  # type: ignore[no-untyped-def]
     return -1.0 if det > 0.0 else 1.0
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def trilaterate(points, distances, T, S):  # type: ignore[no-untyped-def]
     """Fill the point S at three distances from three points, on the side of their plane that T says.
 
@@ -180,7 +180,7 @@ def trilaterate(points, distances, T, S):  # type: ignore[no-untyped-def]
         S[d] = points[0, d] + x * e[d] + y * f[d] + z * g[d]
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def pope_hinsken(rays, points, S, rotation):  # type: ignore[no-untyped-def]
     """Fill R from unit vectors to the points in object and image axes by the parameters d, a, b, c.
 
