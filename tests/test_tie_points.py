@@ -11,11 +11,13 @@ import pytest
 
 from adapters.colmap import adjust_with_colmap
 from datasets.textured import render
+from sfm.adjustment.result import Adjustment
 from sfm.camera import project, tangents_from_pixel
 from sfm.conventions import AnyArray, FloatArray
 from sfm.errors import GeometryError, SurveyFileError
 from sfm.matching.flags import LsmFlag
 from sfm.matching.interest import foerstner_points
+from sfm.matching.lsm import match_lsm
 from sfm.matching.multi_lsm import match_multi
 from sfm.matching.tie_points import Features, find_tie_points, link_features
 from sfm.network import Estimate, ImagePoints, Network
@@ -209,6 +211,11 @@ def test_textured_survey_from_photographs_to_result(folder: Path, tmp_path: Path
     share, z_rms = _from_surface(a.network, a.estimate, a.covariance.points)
     assert share >= 0.99
     assert 0.8 < z_rms < 1.25
+    near, z2, noise, stated = _from_their_places(a, folder)
+    assert near >= 0.99
+    # surfaces that are not plane and differences of blur move all pictures of a point by 0.01 px together
+    assert 0.8 < z2 < 1.7
+    assert noise == pytest.approx(stated, rel=0.2)
 
 
 def _from_surface(network: Network, estimate: Estimate, covariance: FloatArray) -> tuple[float, float]:
@@ -230,6 +237,38 @@ def _from_surface(network: Network, estimate: Estimate, covariance: FloatArray) 
     sigma = np.sqrt(np.einsum("ki,kij,kj->k", in_model, covariance, in_model))
     z = (X[:, 2] - render.height(X[:, 0], X[:, 1])) * normal[:, 2] / sigma
     return float((np.abs(z) < 3).mean()), float(np.sqrt((z**2).mean()))
+
+
+def _from_their_places(a: Adjustment, folder: Path) -> tuple[float, float, float, float]:
+    """Compare object points in space with the places of the surface that their templates show.
+
+    What a template shows is not quite what is at its middle: its noise has a shift too, which goes into all
+    matches of the point. Without noise its own photograph tells the shift.
+
+    Returns:
+        Share of points within three times their point error sqrt(sX2 + sY2 + sZ2), mean of the squares of
+        normalised coordinates, and the shift of templates, RMS and as stated by their covariance, px.
+    """
+    seen, skin = a.network.image_points, render.texture()
+    whole = np.flatnonzero((seen.xy == np.rint(seen.xy)).all(axis=1) & ~a.rejected)  # templates are
+    point, X = seen.point[whole], np.full((len(whole), 3), np.nan)
+    shift = np.full((len(whole), 2), np.nan)
+    for i in range(render.PHOTOGRAPHS):
+        own = np.flatnonzero(seen.image[whole] == i)
+        at = seen.xy[whole[own]]
+        noisy = cv2.imread(str(folder / f"surface_{i + 1}.png"), cv2.IMREAD_UNCHANGED)
+        shift[own] = match_lsm(noisy, render.intensities(i, skin), at, at, window_px=15).xy - at
+        X[own] = render.surface_at(i, at + shift[own])
+    assert a.covariance is not None and len(np.unique(point)) == len(point) > 2000
+    known = np.isfinite(X).all(axis=1)
+    X, point = X[known], point[known]
+    place = fit_similarity(a.estimate.points[point], X)
+    C = place.scale**2 * place.rotation @ a.covariance.points[point] @ place.rotation.T
+    e = place.apply(a.estimate.points[point]) - X
+    near = np.linalg.norm(e, axis=1) < 3 * np.sqrt(np.trace(C, axis1=1, axis2=2))
+    z2 = np.einsum("ki,kij,kj->k", e, np.linalg.inv(C), e) / 3
+    stated = a.sigma0 * np.sqrt(seen.covariance[whole][:, [0, 1], [0, 1]].mean())
+    return float(near.mean()), float(z2.mean()), float(np.sqrt((shift[known] ** 2).mean())), float(stated)
 
 
 @pytest.mark.slow

@@ -89,8 +89,8 @@ def texture(seed: int = SEED) -> AnyArray:
     return np.asarray(np.clip(0.45 + 0.17 * total, 0.02, 0.98), dtype=np.float32)
 
 
-def photograph(index: int, skin: AnyArray) -> AnyArray:
-    """Return one photograph, uint8."""
+def intensities(index: int, skin: AnyArray) -> AnyArray:
+    """Return one photograph as it would be without noise, float32, 0 to 255."""
     width, height_px = SIZE_PX
     position, rotation = (part[index] for part in stations())
     lens = camera()
@@ -105,9 +105,21 @@ def photograph(index: int, skin: AnyArray) -> AnyArray:
             at = at.astype(np.float32).reshape(height_px, width, 2)
             light += cv2.remap(skin, at[..., 0], at[..., 1], cv2.INTER_LINEAR, borderValue=0.45)
     light = cv2.GaussianBlur(light / SAMPLES**2, (0, 0), BLUR_PX)
-    noise = np.random.default_rng((SEED, index)).normal(0, NOISE, light.shape)
     # exposure changes a little from photograph to photograph
-    return np.rint(np.clip(255 * light * (0.85 + 0.04 * (index % 4)) + noise, 0, 255)).astype(np.uint8)
+    return np.asarray(255 * light * (0.85 + 0.04 * (index % 4)))
+
+
+def photograph(index: int, light: AnyArray) -> AnyArray:
+    """Return one photograph of its intensities, with noise, uint8."""
+    noise = np.random.default_rng((SEED, index)).normal(0, NOISE, light.shape)
+    return np.rint(np.clip(light + noise, 0, 255)).astype(np.uint8)
+
+
+def surface_at(index: int, xy: FloatArray) -> FloatArray:
+    """Return where the surface is at places of a photograph, px, (k, 2); shape (k, 3)."""
+    position, rotation = (part[index] for part in stations())
+    uv = tangents_from_pixel(camera(), xy)
+    return surface_points(position, np.column_stack([uv, -np.ones(len(uv))]) @ rotation.T)
 
 
 def render(folder: Path) -> None:
@@ -115,7 +127,7 @@ def render(folder: Path) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     skin = texture()
     for index in range(PHOTOGRAPHS):
-        cv2.imwrite(str(folder / f"surface_{index + 1}.png"), photograph(index, skin))
+        cv2.imwrite(str(folder / f"surface_{index + 1}.png"), photograph(index, intensities(index, skin)))
     survey = (Path(__file__).parent / "survey.toml").read_text(encoding="utf-8")
     (folder / "survey.toml").write_text(survey, encoding="utf-8")
 

@@ -39,23 +39,23 @@ def run_textured_survey(
         tied = tie_photographs(survey, settings, files, jobs=jobs, progress=progress)
     network = tied.network
     with clock.stage("orientation"):
-        estimate, not_oriented = orient_tied(tied)
+        start = orient_tied(survey, tied, files)
     with clock.stage("adjustment"):
         rays = np.full(len(network.points), MIN_RAYS)
-        solution = solve(survey, network, estimate, min_rays=rays)
+        solution = solve(survey, network, start.estimate, min_rays=rays)
     compared = compare_solution(solution, others, clock, files=files)
     return SurveyResult(
         survey=survey.name,
         unit=survey.unit,
         images_total=len(files),
-        failed=tied.failed + tuple(FailedImage(*one) for one in (*not_oriented, *solution.dropped_images)),
+        failed=tied.failed + tuple(FailedImage(*one) for one in (*start.failures, *solution.dropped_images)),
         adjustment=solution.adjustment,
         code=np.full(len(solution.adjustment.network.points), -1),
         comparison=compared.adjusters,
         baseline=compared.baseline,
         photographs=tied.overlays(settings.window_px),
         control_check=solution.control_check,
-        warnings=solution.warnings + compared.failures,
+        warnings=start.warnings + solution.warnings + compared.failures,
         weight_factor=solution.weight_factor,
         seconds=tuple(StageTime(*one) for one in clock.seconds),
     )

@@ -12,18 +12,18 @@ from sfm.camera import Camera, tangents_from_pixel
 from sfm.conventions import AnyArray, BoolArray, IntArray
 from sfm.errors import GeometryError, PhotographError
 from sfm.matching.tie_points import find_tie_points
-from sfm.network import Estimate, ImagePoints, Network, empty_estimate, reduce_network
+from sfm.network import ImagePoints, Network, reduce_network
 from sfm.orientation.intersection import intersect
-from sfm.orientation.sequence import orient
+from sfm.orientation.sequence import Orientation
 from sfm.progress import SILENT, Progress
 from sfm.project import Survey, TiePointSettings
 from sfm.report.result import FailedImage, PhotographTargets
-from sfm.survey.solution import refine
-from sfm.survey.start import PhotographList, control_points, scale_bars, start_cameras
+from sfm.survey.orientation import orient_survey
+from sfm.survey.start import PhotographList, approximate_values, control_points, scale_bars, start_cameras
+from sfm.survey.targets import MIN_PHOTOGRAPHS, find_copies, why_failed
 from sfm.targets.photograph import Metadata, read_metadata, read_photograph
 
 MIN_RAYS = 3  # photographs that must agree on a tie point; two rays cannot contradict each other
-MIN_PHOTOGRAPHS = 2
 ORIENTATION_POINTS = 400  # that take part in the orientation, those with the most rays, and
 POINTS_PER_PHOTOGRAPH = 100  # of every photograph at least so many
 
@@ -35,7 +35,7 @@ class TiedPhotographs:
     network: Network  # image points with the covariance of matching and the survey's sigma
     cameras: tuple[Camera, ...]  # with start values of the interior orientation
     paths: tuple[Path, ...]  # of the photographs of the network, (m,)
-    failed: tuple[FailedImage, ...]  # photographs that could not be read
+    failed: tuple[FailedImage, ...]  # photographs that could not be read, and copies of others
 
     def overlays(self, window_px: int) -> tuple[PhotographTargets, ...]:
         """Return what the report draws into each photograph: circles as wide as the windows."""
@@ -59,7 +59,8 @@ def tie_photographs(
 ) -> TiedPhotographs:
     """Read the photographs and measure the points of natural texture that they have in common.
 
-    All photographs are in memory at the same time, since points are matched between any two of them.
+    All photographs are in memory at the same time, since points are matched between any two of them. One
+    that cannot be read does not stop the others; it is named with the reason, as is a copy of another.
 
     Args:
         survey: says what is known of the cameras, and the sigma of an image coordinate.
@@ -73,46 +74,52 @@ def tie_photographs(
         PhotographError: photographs of different size under one camera.
         SurveyFileError: the start values of a camera are incomplete.
     """
-    pixels: list[AnyArray] = []
-    metadata: list[Metadata] = []
-    read: list[int] = []
+    found: dict[int, tuple[Metadata, AnyArray]] = {}
     failed: list[FailedImage] = []
+    first = find_copies(photographs)
     with ThreadPoolExecutor(max(1, jobs)) as pool:
-        for k, found in enumerate(pool.map(_read, photographs.paths)):
-            if isinstance(found, PhotographError):
-                failed.append(FailedImage(photographs.names[k], str(found)))
+        reading = [
+            pool.submit(_read, path) if first[k] == k else None for k, path in enumerate(photographs.paths)
+        ]
+        for k, (name, one) in enumerate(zip(photographs.names, reading, strict=True)):
+            if one is None:
+                failed.append(FailedImage(name, f"identical to {photographs.names[first[k]]}"))
             else:
-                metadata.append(found[0])
-                pixels.append(found[1])
-                read.append(k)
-            progress.advance(photographs.names[k])
+                try:
+                    found[k] = one.result()
+                except PhotographError as error:
+                    failed.append(FailedImage(name, why_failed(error, photographs.paths[k])))
+            progress.advance(name)
+    read = sorted(found)
     if len(read) < MIN_PHOTOGRAPHS:
+        why = "".join(f" ({one.image}: {one.reason})" for one in failed[:1])
         raise GeometryError(
-            f"survey {survey.name}: {len(read)} readable photographs, at least {MIN_PHOTOGRAPHS} are needed"
+            f"survey {survey.name}: {len(read)} readable photograph{'' if len(read) == 1 else 's'}, "
+            f"at least {MIN_PHOTOGRAPHS} are needed{why}"
         )
     names = tuple(photographs.names[k] for k in read)
     camera: IntArray = photographs.camera[read]
-    cameras = start_cameras(survey, tuple(metadata), camera, names)
-    found_points = find_tie_points(
-        pixels,
+    cameras = start_cameras(survey, tuple(found[k][0] for k in read), camera, names)
+    tied = find_tie_points(
+        [found[k][1] for k in read],
         detector=settings.detector,
         window_px=settings.window_px,
         max_features=settings.max_features,
         min_rays=MIN_RAYS,
         threads=jobs,
     )
-    if not len(found_points):
+    if not len(tied):
         raise GeometryError(
             f"survey {survey.name}: no texture that {MIN_RAYS} photographs have in common; more overlap or "
             "smaller steps between the photographs are needed"
         )
-    points = tuple(f"t{j + 1:05d}" for j in range(int(found_points.point.max()) + 1))
-    covariance = found_points.covariance + survey.adjust.sigma_px**2 * np.eye(2)
+    points = tuple(f"t{j + 1:05d}" for j in range(int(tied.point.max()) + 1))
+    covariance = tied.covariance + survey.adjust.sigma_px**2 * np.eye(2)
     network = Network(
         names,
         camera,
         points,
-        ImagePoints(found_points.image, found_points.point, found_points.xy, covariance),
+        ImagePoints(tied.image, tied.point, tied.xy, covariance),
     )
     control, _ = control_points(survey, points)
     bars, _ = scale_bars(survey, points)
@@ -124,27 +131,32 @@ def tie_photographs(
     )
 
 
-def orient_tied(tied: TiedPhotographs) -> tuple[Estimate, tuple[tuple[str, str], ...]]:
+def orient_tied(survey: Survey, tied: TiedPhotographs, files: PhotographList) -> Orientation:
     """Orient the photographs on the tie points with the most rays, then intersect all the others.
 
     Thousands of points orient a survey no better than hundreds, and take their time in every trial.
 
+    Args:
+        survey: gives approximate values, if any.
+        tied: photographs and tie points.
+        files: all photographs of the survey.
+
     Returns:
-        Estimate of the whole network, and (name, reason) of the photographs that could not be oriented.
+        The orientation with all points of the network.
 
     Raises:
         GeometryError: no two photographs could be oriented.
+        SurveyFileError: [approximate] names photographs that are none of the survey's.
     """
     network = tied.network
-    everything = np.ones(len(network.image_points), dtype=bool)
     part, start = reduce_network(
         network,
-        empty_estimate(network, tied.cameras),
+        approximate_values(survey, network, tied.cameras, files.names),
         np.ones(len(network.images), dtype=bool),
         _strongest(network),
-        everything,
+        np.ones(len(network.image_points), dtype=bool),
     )
-    found = orient(part, start, refine=refine)
+    found = orient_survey(survey, part, start)
     seen, estimate = network.image_points, found.estimate
     uv = np.full((len(seen), 2), np.nan)
     for index, camera in enumerate(estimate.cameras):
@@ -160,7 +172,7 @@ def orient_tied(tied: TiedPhotographs) -> tuple[Estimate, tuple[tuple[str, str],
         n_points=len(network.points),
         tolerance=float(found.tolerance_px.max()) / c,
     )
-    return replace(estimate, points=rays.points), found.failures
+    return replace(found, estimate=replace(estimate, points=rays.points))
 
 
 def _strongest(network: Network) -> BoolArray:
@@ -177,9 +189,5 @@ def _strongest(network: Network) -> BoolArray:
     return chosen
 
 
-def _read(path: Path) -> tuple[Metadata, AnyArray] | PhotographError:
-    """Read one photograph; one that cannot be read does not stop the others."""
-    try:
-        return read_metadata(path), read_photograph(path)
-    except PhotographError as error:
-        return error
+def _read(path: Path) -> tuple[Metadata, AnyArray]:
+    return read_metadata(path), read_photograph(path)
