@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 from functools import cache
 from pathlib import Path
 
@@ -12,8 +13,9 @@ import pytest
 from adapters.colmap import adjust_with_colmap
 from datasets.textured import render
 from sfm.adjustment.result import Adjustment
+from sfm.batch.run import run_batch
 from sfm.camera import project, tangents_from_pixel
-from sfm.conventions import AnyArray, FloatArray
+from sfm.conventions import AnyArray, FloatArray, angles_from_rotation
 from sfm.errors import GeometryError, SurveyFileError
 from sfm.matching.flags import LsmFlag
 from sfm.matching.interest import foerstner_points
@@ -26,6 +28,7 @@ from sfm.project import read_survey
 from sfm.similarity import fit_similarity
 from sfm.survey.comparison import OtherPrograms
 from sfm.survey.refine import refine_model
+from tests.engines import ALONE, HERE, Notes
 from tests.textures import random_texture, with_noise
 
 
@@ -186,6 +189,87 @@ def test_survey_file_refuses_contradictions(tmp_path: Path) -> None:
     survey.write_text(text.replace('"foerstner"', '"orb"'), encoding="utf-8")
     with pytest.raises(SurveyFileError, match="detector"):
         read_survey(survey)
+
+
+def _write_small_survey(folder: Path, name: str, *, side: int = 1) -> Path:
+    """Write three small photographs, a copy of one, a broken one, and a survey that knows their stations.
+
+    Side -1 puts the stations on the other side of the origin, where they look away from the surface.
+    """
+    photographs, truth, _ = _scene()
+    folder.mkdir(parents=True)
+    for i, one in enumerate(photographs):
+        cv2.imwrite(str(folder / f"{i + 1}.png"), np.rint(one).astype(np.uint8))
+    (folder / "copy.png").write_bytes((folder / "2.png").read_bytes())
+    (folder / "broken.png").write_bytes(b"no photograph")
+    angles = [angles_from_rotation(R) for R in truth.rotation]
+    rows = [
+        f"{i + 1}.png," + ",".join(f"{v:.6f}" for v in (*(side * X0), *np.degrees(w)))
+        for i, (X0, w) in enumerate(zip(truth.position, angles, strict=True))
+    ]
+    table = "\n".join(["image,X,Y,Z,omega_deg,phi_deg,kappa_deg", *rows]) + "\n"
+    (folder / "images.csv").write_text(table, encoding="utf-8")
+    survey = folder / "survey.toml"
+    survey.write_text(
+        f"""
+[survey]
+name = "{name}"
+unit = "m"
+[[camera]]
+name = "lens"
+images = "*.png"
+pixel_mm = [{render.PIXEL_MM[0]}, {render.PIXEL_MM[1]}]
+c_mm = {render.C_MM}
+model = "opencv"
+free = []
+[targets]
+codes = "none"
+[tie_points]
+max_features = 600
+[approximate]
+images = "images.csv"
+[adjust]
+sigma_px = 0.02
+[compare]
+backend = "none"
+""",
+        encoding="utf-8",
+    )
+    return survey
+
+
+def test_small_survey_names_copies_and_reasons_and_starts_from_given_values(tmp_path: Path) -> None:
+    survey = _write_small_survey(tmp_path / "a", "small")
+    result = run_survey(read_survey(survey))
+    a = result.adjustment
+    assert a.network.images == ("1.png", "2.png", "3.png") and a.converged
+    reasons = {one.image: one.reason for one in result.failed}
+    assert reasons["copy.png"] == "identical to 2.png"
+    assert reasons["broken.png"] and "broken.png" not in reasons["broken.png"]  # the name stands beside it
+    # the given values hold the datum of a free network up to what its inner constraints move
+    _, truth, _ = _scene()
+    assert np.abs(a.estimate.position - truth.position).max() < 0.02
+    table = survey.parent / "images.csv"
+    table.write_text(table.read_text(encoding="utf-8").replace("3.png", "9.png"), encoding="utf-8")
+    with pytest.raises(SurveyFileError, match=r"image '9\.png' is no photograph of the survey"):
+        run_survey(read_survey(survey))
+    away = run_survey(read_survey(_write_small_survey(tmp_path / "b", "away", side=-1)))
+    assert any(line.startswith("[approximate]: ") for line in away.warnings)
+
+
+def test_batch_of_a_survey_without_targets_is_that_survey(tmp_path: Path) -> None:
+    survey = _write_small_survey(tmp_path / "a", "small")
+    out = tmp_path / "out"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("sfm.report.output.all_plots", lambda *_: [])
+        (row,) = run_batch([survey], out, HERE, ALONE, Notes())
+    assert row.status == "done" and row.photographs == 3 and row.photographs_total == 5
+    alone = run_survey(read_survey(survey)).adjustment
+    with (out / "small" / "points.csv").open(encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    assert [one["id"] for one in rows] == list(alone.network.points)
+    xyz = np.array([[float(one[axis]) for axis in "XYZ"] for one in rows])
+    assert xyz == pytest.approx(alone.estimate.points, abs=1e-9)
 
 
 @pytest.fixture(scope="module")

@@ -233,9 +233,12 @@ def _run(
 
 
 def _work(job: SurveyJob, survey: Survey, comparers: Comparers) -> Work:
-    """Return a survey as the engine takes it: a part for each photograph, and the rest."""
+    """Return a survey as the engine takes it: a part for each photograph with targets, and the rest.
+
+    Tie points belong to several photographs at once: the whole measures them, in one worker.
+    """
     parts: tuple[Call, ...] = ()
-    if survey.observations is None:
+    if survey.observations is None and survey.tie_points is None:
         found = find_photographs(survey)
         parts = tuple(
             Call(measure_one, (job, survey, name, path))
