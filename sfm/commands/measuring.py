@@ -40,6 +40,13 @@ def match(
     equalise: Annotated[
         bool, typer.Option("--equalise", help="Equalise the histograms before least squares matching.")
     ] = False,
+    interpolation: Annotated[
+        str,
+        typer.Option(
+            "--interpolation",
+            help="six_tap; bicubic or bilinear where a photograph was itself shifted by interpolation.",
+        ),
+    ] = "six_tap",
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON in place of a table.")] = False,
     out: Annotated[Path | None, typer.Option("--out", metavar="FILE", help="Write CSV.")] = None,
     picture: Annotated[
@@ -61,6 +68,7 @@ def match(
             template_px=template,
             search_px=search,
             equalise=equalise,
+            interpolation=interpolation,
             as_json=as_json,
             out=out,
             picture=picture,

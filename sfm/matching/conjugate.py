@@ -61,6 +61,7 @@ def match_points(
     template_px: int = 21,
     search_px: int = 121,
     equalise: bool = False,
+    interpolation: str = "six_tap",
     min_correlation: float = 0.5,
 ) -> ConjugatePoints:
     """Find points of the left photograph in the right one.
@@ -72,6 +73,7 @@ def match_points(
         method: ncc, or ncc and then shift (2), lsm (6) or lsm8 (8 geometric parameters).
         template_px, search_px: odd sides of template and search window; document 002 has 19 and 21.
         equalise: equalise the histograms of both photographs before least squares matching.
+        interpolation: six_tap, bicubic or bilinear; see `sfm.matching.lsm.match_lsm`.
         min_correlation: smallest r of a match, of correlation and of least squares matching.
 
     Returns:
@@ -110,6 +112,7 @@ def match_points(
         start,
         model=METHODS[method],
         window_px=template_px,
+        interpolation=interpolation,
         min_correlation=min_correlation,
     )
     reason = tuple(

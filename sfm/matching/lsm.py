@@ -91,8 +91,9 @@ def match_lsm(
         xy_right: where they are in the right photograph, approximately, px, (k, 2).
         model: shift (2), affine (6) or projective (8 parameters), each with gain and offset.
         window_px: odd side of the template.
-        interpolation: kernel for the right photograph; bilinear costs 1.28 times and bicubic 1.15 times the
-            standard deviation of six_tap on fine texture.
+        interpolation: kernel for the right photograph; on fine texture bilinear costs 1.25 times and bicubic
+            1.06 times the standard deviation of six_tap, and both are off by up to 0.013 px where all of the
+            patch is shifted by the same 0.1 to 0.4 px, six_tap by 0.002 px.
         stop_px: the shift of the step that would come next is shorter than this.
         max_steps: after so many a patch counts as diverged.
         max_shift_px: farther from the start is too far.

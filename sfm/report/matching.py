@@ -47,6 +47,7 @@ def match_command(
     template_px: int = 21,
     search_px: int = 121,
     equalise: bool = False,
+    interpolation: str = "six_tap",
     as_json: bool = False,
     out: Path | None = None,
     picture: Path | None = None,
@@ -57,7 +58,7 @@ def match_command(
         left_path, right_path: the photographs.
         point: "COL,ROW" in the left photograph, px; either this or `points`.
         points: table of points, see `read_points_to_match`.
-        method, template_px, search_px, equalise: see `sfm.matching.conjugate.match_points`.
+        method, template_px, search_px, equalise, interpolation: see `sfm.matching.conjugate.match_points`.
         as_json: JSON in place of the table.
         out: file that gets the table as CSV (or JSON), in place of the terminal.
         picture: PNG file that gets template, matched patch and their difference.
@@ -81,6 +82,7 @@ def match_command(
         template_px=template_px,
         search_px=search_px,
         equalise=equalise,
+        interpolation=interpolation,
     )
     if picture is not None:
         drawing = draw_patches(left, right, found, template_px)
