@@ -13,7 +13,7 @@ LAYERS = (
     ("sfm.distortion", "sfm.camera", "sfm.network", "sfm.similarity"),
     ("sfm.targets", "sfm.matching", "sfm.orientation", "sfm.adjustment"),
     ("sfm.analysis",),
-    ("sfm.report", "sfm.pipeline", "sfm.project", "sfm.survey"),
+    ("sfm.report", "sfm.pipeline", "sfm.project", "sfm.settings", "sfm.settings_errors", "sfm.survey"),
     ("sfm.batch", "sfm.cli", "sfm.commands", "sfm.warm_up"),
 )
 COMMANDS = (

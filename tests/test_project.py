@@ -10,13 +10,12 @@ import pytest
 from sfm.conventions import angles_from_rotation, image_from_pixel
 from sfm.errors import PhotographError, SurveyFileError
 from sfm.project import read_survey
+from sfm.survey.cameras import camera_of_image, start_cameras
 from sfm.survey.start import (
-    camera_of_image,
     control_points,
     find_photographs,
     network_from_observations,
     scale_bars,
-    start_cameras,
 )
 from sfm.targets.photograph import Metadata
 

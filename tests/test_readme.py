@@ -8,8 +8,9 @@ from pathlib import Path
 
 from adapters.formats import FORMATS
 from sfm.cli import app
-from sfm.project import Section, Survey, read_survey
+from sfm.project import Survey, read_survey
 from sfm.report.output import WRITTEN
+from sfm.settings import Section
 
 ROOT = Path(__file__).resolve().parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")

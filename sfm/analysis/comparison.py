@@ -23,6 +23,7 @@ from sfm.adjustment.datum import Datum
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.analysis.conversion import Conversion, convert_camera
+from sfm.analysis.unshared import without_sharing
 from sfm.camera import Camera, pixel_from_tangents, project, tangents_from_pixel
 from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.errors import GeometryError
@@ -31,8 +32,7 @@ from sfm.similarity import Similarity, fit_similarity
 
 EFFECT_STEPS = 9  # places along each side of the photograph where interior orientations are compared
 MAX_ITERATIONS = 200  # the weak directions of full_opencv take more steps than a survey
-MIN_RAYS = 2  # photographs that a point must be in to be determined by them
-MIN_POINTS = 3  # points that a photograph must show to be determined by them
+MIN_RAYS, MIN_POINTS = 2, 3  # photographs that determine a point, points that determine a photograph
 GROUPS = (slice(0, 2), slice(2, 4), slice(4, None))  # focal lengths, principal point, distortion
 
 
@@ -93,15 +93,14 @@ class AdjusterComparison:
     model: str  # functional model of both
     conversions: tuple[Conversion, ...]  # of each camera from the survey's model; misfit 0 if it is the same
     freed: tuple[str, ...]  # cameras with more free parameters than the survey's, in words
-    held: tuple[
-        str, ...
-    ]  # why the distortion was held at the survey's result, in words; empty if it was free
+    held: tuple[str, ...]  # why the distortion was held at the survey's result; empty if it was free
     network: Network  # accepted image points with unit weights, as both had them
     adjustment: Adjustment  # the in-house one in that model
     backend_iterations: int  # steps of the other adjuster
     backend_converged: bool
     backend_seconds: float  # s
     comparison: Comparison
+    unshared: tuple[str, ...] = ()  # what cameras share in the survey and was held at its result, in words
 
     @property
     def agree(self) -> bool:
@@ -204,6 +203,8 @@ def compare_adjusters(
         GeometryError: nothing is left to compare.
         BackendError: the backend refuses.
     """
+    cameras, unshared = without_sharing(adjustment.estimate.cameras)
+    adjustment = replace(adjustment, estimate=replace(adjustment.estimate, cameras=cameras))
     network, start, conversions, freed = common_problem(adjustment, model=model)
     ours = _adjusted(network, start, adjustment.sigma_px)
     held: tuple[str, ...] = ()
@@ -227,6 +228,7 @@ def compare_adjusters(
         theirs.converged,
         theirs.seconds,
         compare(ours.estimate, theirs.estimate, network, names=("kolinear", name), thresholds=thresholds),
+        unshared,
     )
 
 

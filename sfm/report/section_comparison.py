@@ -91,6 +91,12 @@ def _conversions(result: SurveyResult, both: AdjusterComparison) -> str:
             "<p class=note>The distortion was held at the survey's result in both adjusters, since the image "
             f"points do not determine all of it in this model: {escape(', '.join(both.held))}.</p>"
         )
+    if both.unshared:
+        text += (
+            f"<p class=note>{escape(both.backend)} shares all parameters of a camera among photographs or "
+            "none. Held at the survey's result in both adjusters were therefore: "
+            f"{escape('; '.join(both.unshared))}.</p>"
+        )
     if both.freed:
         text += (
             "<p class=note>Free in the comparison besides the survey's own: "

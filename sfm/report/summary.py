@@ -219,6 +219,7 @@ def _comparison(result: SurveyResult) -> dict[str, Any] | None:
         "cost": {"kolinear": difference.cost[0], both.backend: difference.cost[1]},
         "exceeded": list(difference.exceeded),
         "held": list(both.held),
+        "unshared": list(both.unshared),
         "freed": list(both.freed),
         "conversions": [
             {

@@ -16,6 +16,7 @@ from sfm.orientation.sequence import Orientation
 from sfm.project import Survey
 from sfm.report.result import ControlCheck
 from sfm.survey.datum import datum_warnings, placed_on_control, rescaled, without_contradicted_control
+from sfm.survey.interior import as_asked_for, without_idle_cameras
 from sfm.survey.network import Naming, build_network, match_uncoded, min_rays
 from sfm.survey.targets import MeasuredPhotographs
 
@@ -103,6 +104,7 @@ def solve(
     known = tuple(name for name, is_in in zip(network.points, estimate.determined, strict=True) if is_in)
     oriented = estimate.oriented
     estimate = rescaled(network, estimate, datum)
+    network, estimate = as_asked_for(survey, network, estimate)
     iterations = 0
     contradictions: list[str] = []
     while True:
@@ -126,9 +128,14 @@ def solve(
         estimate, check = placed_on_control(part, adjustment.estimate)
     else:
         estimate = adjustment.estimate
+    part, estimate = without_idle_cameras(survey, part, estimate)
     final = _tested(survey, part, estimate, datum, covariance=True)
     weight_factor = 1.0
-    if len(part.scale_bars) or (datum.kind == "control" and part.control.covariance.any()):
+    if (
+        len(part.scale_bars)
+        or len(part.interior)
+        or (datum.kind == "control" and part.control.covariance.any())
+    ):
         part, weight_factor = _weighed(final)
         final = _tested(survey, part, final.estimate, datum, covariance=True)
     dropped = tuple(

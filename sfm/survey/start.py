@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-import fnmatch
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from sfm.camera import Camera, camera_from_values
+from sfm.camera import Camera
 from sfm.conventions import FloatArray, IntArray, pixel_from_image
-from sfm.errors import PhotographError, SurveyFileError
+from sfm.errors import SurveyFileError
 from sfm.network import Estimate, ImagePoints, Network, ObjectPoints, ScaleBars
-from sfm.project import CameraSettings, Survey, inside
+from sfm.project import Survey, inside
+from sfm.survey.cameras import camera_of_image, start_cameras
+from sfm.survey.interior import refuse_ungrouped
 from sfm.survey.tables import (
     ImagePointTable,
     read_control,
@@ -20,7 +21,6 @@ from sfm.survey.tables import (
     read_image_points,
     read_points,
 )
-from sfm.targets.photograph import Metadata
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,8 @@ def find_photographs(survey: Survey, *, images_dir: Path | None = None) -> Photo
         images_dir: folder of the photographs in place of the survey file's own.
 
     Raises:
-        SurveyFileError: no such folder, a camera without photographs, or a photograph of two cameras.
+        SurveyFileError: no such folder, a camera without photographs, a photograph of two cameras, or of no
+            group where its camera has groups.
     """
     folder = Path(images_dir) if images_dir is not None else survey.path.parent
     if not folder.is_dir():
@@ -84,83 +85,8 @@ def find_photographs(survey: Survey, *, images_dir: Path | None = None) -> Photo
             )
         seen[name] = index
     names, paths, cameras = zip(*owner, strict=True)
+    refuse_ungrouped(survey, names, cameras)
     return PhotographList(names, paths, np.array(cameras, dtype=np.int64), folder)
-
-
-def camera_of_image(survey: Survey, image: str) -> int:
-    """Return the index of the camera whose glob an image name matches.
-
-    Raises:
-        SurveyFileError: no camera, or more than one.
-    """
-    if len(survey.cameras) == 1 and survey.cameras[0].images is None:
-        return 0
-    matches = [
-        index
-        for index, camera in enumerate(survey.cameras)
-        if camera.images is not None and fnmatch.fnmatchcase(image, camera.images)
-    ]
-    if len(matches) != 1:
-        globs = ", ".join(f"{c.name} '{c.images}'" for c in survey.cameras)
-        many = "no camera" if not matches else f"{len(matches)} cameras"
-        raise SurveyFileError(f"{survey.path}: image '{image}' matches the glob of {many}: {globs}")
-    return matches[0]
-
-
-def start_cameras(
-    survey: Survey,
-    metadata: tuple[Metadata, ...] = (),
-    camera: IntArray | None = None,
-    names: tuple[str, ...] = (),
-) -> tuple[Camera, ...]:
-    """Return the cameras with their start values, in the order of the survey file.
-
-    Args:
-        survey: says what is known; what it leaves out is taken from the photographs.
-        metadata: size and EXIF data of the readable photographs, (m,); none with [observations].
-        camera: index of the camera of each photograph, (m,).
-        names: names of the photographs, (m,).
-
-    Raises:
-        PhotographError: photographs of one camera differ in size from one another or from size_px.
-        SurveyFileError: size, pixel size or principal distance is not known from anywhere.
-    """
-    index = np.zeros(0, dtype=np.int64) if camera is None else camera
-    cameras = []
-    for number, settings in enumerate(survey.cameras):
-        own = [k for k in range(len(metadata)) if index[k] == number]
-        size = _common_size(settings, [(names[k], metadata[k].size_px) for k in own])
-        where = f"{survey.path}: camera {settings.name}"
-        if size is None:
-            raise SurveyFileError(f"{where}: size_px = [width, height] is needed, there is no photograph")
-        pixel, focal = settings.pixel_mm, settings.c_mm
-        if settings.sensor_mm is not None:
-            pixel = settings.sensor_mm[0] / size[0], settings.sensor_mm[1] / size[1]
-        fixed = dict(settings.fixed)
-        if pixel is None:
-            pixel = next((metadata[k].pixel_mm for k in own if metadata[k].pixel_mm), None)
-        if focal is None:
-            focal = fixed.get("c") or next((metadata[k].focal_mm for k in own if metadata[k].focal_mm), None)
-        if pixel is None:
-            raise SurveyFileError(
-                f"{where}: no photograph's EXIF data tell the pixel size, pixel_mm or sensor_mm is needed"
-            )
-        if focal is None and "fx" in fixed:
-            focal = fixed["fx"] * pixel[0]
-        if focal is None:
-            raise SurveyFileError(f"{where}: no photograph's EXIF data tell the focal length, c_mm is needed")
-        cameras.append(
-            camera_from_values(
-                settings.name,
-                settings.model,
-                size,
-                pixel,
-                c_mm=focal,
-                free=settings.free,
-                values=settings.fixed,
-            )
-        )
-    return tuple(cameras)
 
 
 def network_from_observations(survey: Survey) -> tuple[Network, Estimate]:
@@ -184,6 +110,7 @@ def network_from_observations(survey: Survey) -> tuple[Network, Estimate]:
     images, image = _numbered(table.image)
     points, point = _numbered(table.point)
     owner = np.array([camera_of_image(survey, name) for name in images], dtype=np.int64)
+    refuse_ungrouped(survey, images, owner)
     xy, covariance = _in_pixels(
         table.xy, table.sigma, table.unit, cameras, owner[image], survey.adjust.sigma_px
     )
@@ -325,22 +252,6 @@ def approximate_values(
     if survey.datum.kind == "control":
         points[network.control.point] = network.control.xyz
     return Estimate(cameras, position, rotation, points)
-
-
-def _common_size(
-    settings: CameraSettings, sizes: list[tuple[str, tuple[int, int]]]
-) -> tuple[int, int] | None:
-    """Return the size of all photographs of one camera, None if nothing tells it."""
-    size, source = settings.size_px, "size_px"
-    for name, found in sizes:
-        if size is None:
-            size, source = found, f"'{name}'"
-        elif found != size:
-            raise PhotographError(
-                f"camera {settings.name}: photograph '{name}' has {found[0]} x {found[1]} px, {source} "
-                f"{size[0]} x {size[1]} px; photographs of one camera have one size"
-            )
-    return size
 
 
 def _holds(folder: Path) -> str:

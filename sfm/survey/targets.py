@@ -13,9 +13,11 @@ from sfm.camera import Camera
 from sfm.conventions import FloatArray, IntArray
 from sfm.errors import GeometryError, PhotographError
 from sfm.progress import SILENT, Progress
-from sfm.project import Survey, TargetSettings
+from sfm.project import Survey
 from sfm.report.result import FailedImage, PhotographTargets
-from sfm.survey.start import PhotographList, start_cameras
+from sfm.settings import TargetSettings
+from sfm.survey.cameras import start_cameras
+from sfm.survey.start import PhotographList
 from sfm.targets.codes import CodeFamily
 from sfm.targets.detect import Targets, find_targets
 from sfm.targets.photograph import Metadata, read_metadata, read_photograph
@@ -40,7 +42,14 @@ class MeasuredPhotographs:
         """Return what the report draws into each photograph."""
         return tuple(
             PhotographTargets(
-                name, path, found.xy, found.semi_axes, found.angle, found.rejected_xy, found.rejected_flag
+                name,
+                path,
+                found.xy,
+                found.semi_axes,
+                found.angle,
+                found.flag,
+                found.rejected_xy,
+                found.rejected_flag,
             )
             for name, path, found in zip(self.names, self.paths, self.targets, strict=True)
         )

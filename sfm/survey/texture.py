@@ -12,8 +12,9 @@ from pathlib import Path
 import numpy as np
 
 from sfm.progress import SILENT, Progress, StageClock
-from sfm.project import Survey, TiePointSettings
+from sfm.project import Survey
 from sfm.report.result import FailedImage, StageTime, SurveyResult
+from sfm.settings import TiePointSettings
 from sfm.survey.comparison import ALONE, OtherPrograms, compare_solution
 from sfm.survey.solution import solve
 from sfm.survey.start import find_photographs

@@ -16,10 +16,12 @@ from sfm.network import ImagePoints, Network, reduce_network
 from sfm.orientation.intersection import intersect
 from sfm.orientation.sequence import Orientation
 from sfm.progress import SILENT, Progress
-from sfm.project import Survey, TiePointSettings
+from sfm.project import Survey
 from sfm.report.result import FailedImage, PhotographTargets
+from sfm.settings import TiePointSettings
+from sfm.survey.cameras import start_cameras
 from sfm.survey.orientation import orient_survey
-from sfm.survey.start import PhotographList, approximate_values, control_points, scale_bars, start_cameras
+from sfm.survey.start import PhotographList, approximate_values, control_points, scale_bars
 from sfm.survey.targets import MIN_PHOTOGRAPHS, find_copies, why_failed
 from sfm.targets.photograph import Metadata, read_metadata, read_photograph
 

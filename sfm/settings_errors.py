@@ -1,0 +1,140 @@
+"""What is wrong in a survey file, in one line: file, line, key, what was found and what was needed."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+from pydantic import ValidationError
+
+from sfm.settings import (
+    AdjustSettings,
+    ApproximateSettings,
+    CameraSettings,
+    CompareSettings,
+    ControlSettings,
+    DatumSettings,
+    Head,
+    ObservationSettings,
+    ScaleBarSettings,
+    Section,
+    TargetSettings,
+    TiePointSettings,
+)
+
+_NEEDED = (
+    ("string_type", "a text in quotes"),
+    ("float_type", "a number"),
+    ("int_type", "a whole number"),
+    ("int_from_float", "a whole number"),
+    ("bool_type", "true or false"),
+    ("tuple_type", "a list in square brackets"),
+    ("finite_number", "a finite number"),
+    ("model_type", "a table"),
+)
+
+
+def one_line(path: Path, text: str, error: ValidationError, whole: type[Section]) -> str:
+    """Return the first error of pydantic as one line with file, line, key, found and needed.
+
+    Unknown keys come first: a misspelt key is unknown, and missing under its right name.
+
+    Args:
+        path: the survey file.
+        text: what it says.
+        error: what pydantic found.
+        whole: the file as a section, for the keys that it may have.
+    """
+    errors = error.errors(include_url=False)
+    first = next((one for one in errors if one["type"] == "extra_forbidden"), errors[0])
+    location = first["loc"]
+    kind, context = first["type"], first.get("ctx", {})
+    line = _line_of(text, location)
+    where = f"{path}, line {line}: " if line else f"{path}: "
+    key = _key(location)
+    if kind == "extra_forbidden":
+        table = _key(location[:-1])
+        inside = f"[{table}]" if table else "the survey file"
+        return f"{where}unknown key '{location[-1]}' in {inside}, known are {_known(location[:-1], whole)}"
+    if kind == "missing":
+        return f"{where}{key} is missing"
+    if kind == "tuple_type" and len(location) == 1 and isinstance(first["input"], dict):
+        return f"{where}found [{key}], needed [[{key}]] in double brackets, since there may be several"
+    needed = dict(_NEEDED).get(kind)
+    if kind == "literal_error":
+        needed = f"one of {context['expected']}"
+    elif kind == "greater_than":
+        needed = f"more than {context['gt']:g}"
+    elif kind == "greater_than_equal":
+        least = context["ge"]
+        needed = "more than 0" if least > 0 >= first["input"] else f"at least {least:g}"
+    elif kind == "less_than_equal":
+        needed = f"at most {context['le']:g}"
+    elif kind == "too_long":
+        needed = f"{context['max_length']} values"
+    elif kind == "too_short":
+        needed = f"at least {context['min_length']}"
+    if needed is None:
+        return f"{where}{key}: {first['msg'][0].lower()}{first['msg'][1:]}"
+    return f"{where}{key}: found {_found(first['input'])}, needed {needed}"
+
+
+def _found(value: Any) -> str:
+    """Show a value as it stands in a TOML file, shortened."""
+    shown = str(value).lower() if isinstance(value, bool) else repr(value)
+    return shown if len(shown) <= 60 else shown[:57] + "..."
+
+
+def _key(location: tuple[str | int, ...]) -> str:
+    """Write a location as a person would: camera 2 pixel_mm, value 1."""
+    words: list[str] = []
+    for part in location:
+        if isinstance(part, int):
+            words[-1:] = [f"{words[-1]} {part + 1}"] if words else [str(part + 1)]
+        else:
+            words.append(part)
+    return ".".join(words)
+
+
+def _known(location: tuple[str | int, ...], whole: type[Section]) -> str:
+    """Return the keys that the table at a location may have."""
+    sections: dict[str, type[Section]] = {
+        "survey": Head,
+        "camera": CameraSettings,
+        "targets": TargetSettings,
+        "tie_points": TiePointSettings,
+        "datum": DatumSettings,
+        "control": ControlSettings,
+        "scale_bar": ScaleBarSettings,
+        "observations": ObservationSettings,
+        "approximate": ApproximateSettings,
+        "adjust": AdjustSettings,
+        "compare": CompareSettings,
+    }
+    section = sections[str(location[0])] if location else whole
+    return ", ".join(field.alias or name for name, field in section.model_fields.items())
+
+
+def _line_of(text: str, location: tuple[str | int, ...]) -> int | None:
+    """Return the line of the survey file on which the key of a location stands, None if not found."""
+    keys = [str(part) for part in location if isinstance(part, str)]
+    number = next((part for part in location if isinstance(part, int)), 0)
+    count: dict[str, int] = {}
+    table, last = "", None
+    for k, line in enumerate(text.splitlines(), 1):
+        header = re.match(r"\s*\[\[?\s*([\w.\- ]+?)\s*\]\]?", line)
+        if header:
+            table = header[1]
+            count[table] = count.get(table, -1) + 1
+            if table == ".".join(keys) and count[table] == number:
+                return k
+            if table == keys[0] and count[table] == number:
+                last = k
+            continue
+        key = re.match(r"\s*([\w\-.]+|\"[^\"]*\"|'[^']*')\s*=", line)
+        if key and count.get(keys[0], number) == number:
+            full = ".".join(filter(None, (table, key[1].strip("\"'"))))
+            if full == ".".join(keys):
+                return k
+    return last
