@@ -16,7 +16,8 @@ from pathlib import Path
 
 import numpy as np
 
-from adapters.colmap import load_pycolmap, one_line, quiet, read_model
+from adapters.colmap import load_pycolmap, one_line, quiet
+from adapters.colmap_model import read_model
 from sfm.camera import project
 from sfm.errors import BackendError
 from sfm.network import Estimate, Network

@@ -16,8 +16,8 @@ from adapters.bundle_text import (
     write_bundle_csharp,
     write_bundle_matlab_folder,
 )
-from adapters.colmap import read_model, write_model
 from adapters.colmap_database import read_database, write_database
+from adapters.colmap_model import read_model, write_model
 from adapters.csv_tables import TableResult, read_result, write_tables
 from adapters.metashape import read_metashape, write_metashape
 from adapters.photomodeler import read_photomodeler, write_photomodeler

@@ -281,7 +281,7 @@ def _colmap_writer(result: SurveyResult) -> Callable[[Path], None] | None:
     both = result.comparison
     if both is None:
         return None
-    from adapters.colmap import write_model
+    from adapters.colmap_model import write_model
 
     return lambda folder: write_model(folder, both.network, both.adjustment.estimate)
 

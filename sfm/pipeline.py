@@ -48,9 +48,7 @@ def run_survey(
         KolinearError: the survey cannot be run; the message says what to do.
     """
     if survey.tie_points is not None:
-        return run_textured_survey(
-            survey, images_dir=images_dir, jobs=jobs, others=others, progress=progress
-        )
+        return run_textured_survey(survey, images_dir=images_dir, jobs=jobs, others=others, progress=progress)
     clock = StageClock(progress)
     files = find_photographs(survey, images_dir=images_dir)
     with clock.stage("targets"):

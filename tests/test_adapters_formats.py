@@ -18,8 +18,8 @@ from adapters.bundle_text import (
     write_bundle_csharp,
     write_bundle_matlab,
 )
-from adapters.colmap import read_model, write_model
 from adapters.colmap_database import read_database, write_database
+from adapters.colmap_model import read_model, write_model
 from adapters.formats import FORMATS as FILE_FORMATS
 from adapters.formats import format_named, format_of, read_any, read_comparable, write_any
 from adapters.metashape import read_metashape, write_metashape

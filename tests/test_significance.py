@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from adapters.colmap import read_model, write_model
 from adapters.colmap_mapper import MapperBaseline
+from adapters.colmap_model import read_model, write_model
 from adapters.csv_tables import TableResult, read_result, write_tables
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.solve import adjust

@@ -28,7 +28,7 @@ def refine(
 
     By multi-photo least squares matching; then the model is adjusted again.
     """
-    from adapters.colmap import read_model, write_model
+    from adapters.colmap_model import read_model, write_model
 
     if out is not None and out.exists():
         raise OutputError(f"{out}: exists already, the refined model needs a new folder")

@@ -54,7 +54,7 @@ def refine_model(
     """Measure all image points of a solved model by multi-photo least squares matching and adjust it again.
 
     Args:
-        network, estimate: a solved model, as `adapters.colmap.read_model` gives it.
+        network, estimate: a solved model, as `adapters.colmap_model.read_model` gives it.
         images_dir: folder of its photographs.
         window_px: odd side of the windows.
         min_correlation: smallest coefficient r of a window and its template.

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from PIL import Image
 
-from adapters.colmap import read_model, write_model
+from adapters.colmap_model import read_model, write_model
 from adapters.photomodeler import read_photomodeler
 from adapters.sba_text import read_sba_text
 from sfm.errors import KolinearError
