@@ -14,16 +14,15 @@ from sfm.adjustment.marginal import change_datum, marginal_of
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.adjustment.statistics import (
-    by_camera,
-    by_kind,
-    by_photograph,
     correlations,
-    estimate_components,
     global_test,
     non_centrality,
     reliability,
     significance,
+    tau_test,
+    w_test,
 )
+from sfm.adjustment.variance_components import by_camera, by_kind, by_photograph, estimate_components
 from sfm.errors import GeometryError
 from sfm.network import ExteriorObservations, InteriorObservations, Network, ObjectPoints, ScaleBars
 
@@ -41,6 +40,16 @@ def test_standardised_residuals_of_uncorrelated_coordinates(plain: Adjustment) -
     assert np.abs(plain.standardised - w).max() < 1e-8
     assert np.abs(plain.tau - w / plain.sigma0).max() < 1e-8
     assert stats.kstest(plain.standardised.ravel(), "norm").pvalue > 0.01
+
+
+def test_w_and_tau_tests_reject_as_often_as_alpha_says(plain: Adjustment) -> None:
+    for test, statistic in ((w_test, plain.standardised), (tau_test, plain.tau)):
+        found = test(plain, alpha=0.05)
+        assert found.tested == statistic.size == 2 * len(plain.network.image_points)
+        assert found.beyond == (np.abs(statistic) > found.critical).sum()
+        assert abs(found.beyond - found.expected) < 4 * np.sqrt(found.expected)
+    assert w_test(plain).critical == pytest.approx(3.2905, abs=1e-4)
+    assert tau_test(plain).critical < w_test(plain).critical
 
 
 def test_global_test_is_two_sided(plain: Adjustment) -> None:
@@ -128,7 +137,7 @@ def test_kinds_of_observation_share_the_redundancy() -> None:
         interior=InteriorObservations(np.array([0]), np.array([0]), np.array([10.001]), np.array([1e-3])),
     )
     a = adjust(network, truth, datum=Datum("control"), reject="none")
-    kinds = by_kind(marginal_of(a))
+    kinds = by_kind(a)
     assert kinds.names == (
         "image points",
         "control points",
@@ -140,6 +149,14 @@ def test_kinds_of_observation_share_the_redundancy() -> None:
     assert kinds.redundancy.sum() == pytest.approx(a.redundancy, abs=1e-3)
     assert (kinds.redundancy > 0).all()
     assert np.nansum(kinds.sigma0**2 * kinds.redundancy) == pytest.approx(a.vPv, rel=1e-6)
+    m = marginal_of(a)  # redundancy numbers of the scale bars from the covariance of their ends
+    taken = 0.0
+    for i, j in ends.T:
+        Q = m.joint(np.zeros(0, dtype=int), np.array([i, j])) / a.sigma0**2
+        d = a.estimate.points[j] - a.estimate.points[i]
+        row = np.concatenate([-d, d]) / np.linalg.norm(d)
+        taken += row @ Q @ row / 1e-8
+    assert kinds.redundancy[4] == pytest.approx(3 - taken, abs=1e-3)
 
 
 def test_significance_and_correlations() -> None:

@@ -1,34 +1,27 @@
 """Statistics of a finished adjustment, in the words of the field.
 
-Global test of the model, minimal detectable bias and external reliability of each image coordinate,
-variance components of groups of observations, significance of parameters, strong correlations.
+Global test of the model, tests of the image coordinates, their minimal detectable bias and external
+reliability, significance of parameters, strong correlations.
 
-Source: Baarda (1968), A testing procedure for use in geodetic networks; Foerstner (1979), Ein Verfahren
-zur Schaetzung von Varianz- und Kovarianzkomponenten; Luhmann et al., Close-Range Photogrammetry (2020),
-sec. 2.4.
+Source: Baarda (1968), A testing procedure for use in geodetic networks; Pope (1976), NOAA TR NOS 65
+NGS 1; Luhmann et al., Close-Range Photogrammetry (2020), sec. 2.4.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from scipy import stats
 
-from sfm.adjustment.marginal import Marginal
-from sfm.adjustment.reliability import UNCONTROLLED
+from sfm.adjustment.reliability import UNCONTROLLED, tau_critical
 from sfm.adjustment.result import Adjustment
-from sfm.adjustment.weighted import bar_rows, exterior_misclosure
-from sfm.conventions import BoolArray, FloatArray, IntArray
-from sfm.network import Network
+from sfm.camera import Camera
+from sfm.conventions import FloatArray, IntArray
 
 ALPHA = 0.001  # Baarda's usual probability of rejecting a good observation
 POWER = 0.8  # and of finding a gross error of the minimal detectable size
 STRONG = 0.95  # correlation from which two parameters are reported
-SETTLED = 1e-3  # relative change of a variance component at which its estimation ends
-MAX_ROUNDS = 20
-FEW = 1.0  # redundancy of a group below which its variance component is not estimated
 UNTESTED = ("c", "fx", "fy", "cx", "cy")  # parameters for which 0 is no sensible null hypothesis
 
 
@@ -44,22 +37,28 @@ class GlobalTest:
 
 
 @dataclass(frozen=True)
+class CoordinateTest:
+    """Test of every accepted image coordinate for a gross error."""
+
+    alpha: float  # probability of rejecting a good one
+    critical: float
+    statistic: FloatArray  # w or tau of each coordinate; NaN where rejected, (k, 2)
+    tested: int  # coordinates that have a check
+    beyond: int  # of them, those beyond the critical value
+
+    @property
+    def expected(self) -> float:
+        """How many would be beyond the critical value by chance."""
+        return self.alpha * self.tested
+
+
+@dataclass(frozen=True)
 class Reliability:
     """How well gross errors of image coordinates can be found, and what the others do."""
 
     delta0: float  # non-centrality of the test for alpha and power
     minimal_bias: FloatArray  # smallest gross error found with the given power, px, (k, 2); inf: none is
     external: FloatArray  # largest effect of that error on any unknown over its sigma, (k, 2)
-
-
-@dataclass(frozen=True)
-class VarianceComponents:
-    """Variance factors of groups of image points."""
-
-    names: tuple[str, ...]
-    sigma0: FloatArray  # a posteriori over a priori standard deviation, (g,); NaN with too little redundancy
-    redundancy: FloatArray  # of each group, (g,)
-    count: IntArray  # scalar observations of each group, (g,)
 
 
 @dataclass(frozen=True)
@@ -98,6 +97,27 @@ def global_test(adjustment: Adjustment, *, alpha: float = 0.05) -> GlobalTest:
     return GlobalTest(adjustment.vPv, r, float(lower), float(upper), bool(lower <= adjustment.vPv <= upper))
 
 
+def w_test(adjustment: Adjustment, *, alpha: float = ALPHA) -> CoordinateTest:
+    """Return Baarda's test of each image coordinate: w is standard normal where sigma0 is as stated."""
+    return _coordinate_test(adjustment, adjustment.standardised, float(stats.norm.ppf(1 - alpha / 2)), alpha)
+
+
+def tau_test(adjustment: Adjustment, *, alpha: float = ALPHA) -> CoordinateTest:
+    """Return Pope's test of each image coordinate, which takes sigma0 from the adjustment."""
+    critical = tau_critical(alpha, adjustment.redundancy)
+    return _coordinate_test(adjustment, adjustment.tau, critical, alpha)
+
+
+def _coordinate_test(
+    adjustment: Adjustment, statistic: FloatArray, critical: float, alpha: float
+) -> CoordinateTest:
+    r = adjustment.redundancy_numbers
+    checked = np.isfinite(r) & (r > UNCONTROLLED)
+    shown = np.where(np.isfinite(r), statistic, np.nan)
+    beyond = int((np.abs(shown[checked]) > critical).sum())
+    return CoordinateTest(alpha, critical, shown, int(checked.sum()), beyond)
+
+
 def non_centrality(alpha: float = ALPHA, power: float = POWER) -> float:
     """Return delta0, by which a test of size alpha finds an error with the given power."""
     return float(stats.norm.ppf(1 - alpha / 2) + stats.norm.ppf(power))
@@ -128,148 +148,26 @@ def reliability(adjustment: Adjustment, *, alpha: float = ALPHA, power: float = 
     )
 
 
-def variance_components(
-    adjustment: Adjustment, group: IntArray, names: tuple[str, ...]
-) -> VarianceComponents:
-    """Return the variance factor of each group of image points, v'Pv over the group's redundancy.
-
-    Args:
-        adjustment: the adjustment.
-        group: group of each image point, shape (k,).
-        names: names of the groups, g of them.
-    """
-    g = len(names)
-    used = ~adjustment.rejected
-    v = adjustment.residuals[used]
-    P = np.linalg.inv(adjustment.network.image_points.covariance[used])
-    vPv, redundancy = np.zeros(g), np.zeros(g)
-    np.add.at(vPv, group[used], adjustment.weights[used] * np.einsum("ka,kab,kb->k", v, P, v))
-    np.add.at(redundancy, group[used], adjustment.redundancy_numbers[used].sum(axis=1))
-    enough = redundancy > FEW
-    sigma0 = np.where(enough, np.sqrt(vPv / np.where(enough, redundancy, 1.0)), np.nan)
-    return VarianceComponents(names, sigma0, redundancy, 2 * np.bincount(group[used], minlength=g))
-
-
-def by_photograph(adjustment: Adjustment) -> VarianceComponents:
-    """Return the variance factor of each photograph."""
-    network = adjustment.network
-    return variance_components(adjustment, network.image_points.image, network.images)
-
-
-def by_camera(adjustment: Adjustment) -> VarianceComponents:
-    """Return the variance factor of the photographs of each camera."""
-    network = adjustment.network
-    names = tuple(camera.name for camera in adjustment.estimate.cameras)
-    return variance_components(adjustment, network.camera[network.image_points.image], names)
-
-
-def by_kind(marginal: Marginal) -> VarianceComponents:
-    """Return the variance factor of each kind of observation.
-
-    Kinds are image points, control points, exterior and interior orientation, and scale bars; those
-    that were not observed are left out. The redundancy of a kind is its count less tr(P Q) of what it
-    observes.
-    """
-    a, w, layout, state = marginal.adjustment, marginal.weighted, marginal.layout, marginal.optimum.state
-    Q = marginal.cofactors
-    image = variance_components(a, np.zeros(len(a.rejected), dtype=np.int64), ("image points",))
-    kinds = [("image points", a.vPv * np.nan, image.redundancy[0], int(image.count[0]))]
-    dX = state.points[w.point] - w.xyz
-    e, J = exterior_misclosure(w, state)
-    own = (6 * w.image[:, None] + np.arange(6))[:, :, None]
-    exterior = J @ Q.reduced[own, np.swapaxes(own, 1, 2)] @ np.swapaxes(J, 1, 2)
-    dp = state.parameters[w.camera, w.parameter] - w.value
-    rows, length = bar_rows(w, layout, state)
-    kept = Q.reduced[layout.kept_start :, layout.kept_start :]
-    for name, count, vPv, taken in (
-        (
-            "control points",
-            int((np.diagonal(w.point_weight, axis1=1, axis2=2) > 0).sum()),
-            np.einsum("pa,pab,pb->", dX, w.point_weight, dX),
-            np.einsum("pab,pba->", w.point_weight, Q.points[w.point]),
-        ),
-        (
-            "exterior orientation",
-            int((np.diagonal(w.exterior_weight, axis1=1, axis2=2) > 0).sum()),
-            np.einsum("ea,eab,eb->", e, w.exterior_weight, e),
-            np.einsum("eab,eba->", w.exterior_weight, exterior),
-        ),
-        (
-            "interior orientation",
-            len(w.column),
-            w.interior_weight @ dp**2,
-            w.interior_weight @ np.diagonal(Q.reduced)[w.column],
-        ),
-        (
-            "scale bars",
-            len(length),
-            w.length_weight @ length**2,
-            w.length_weight @ np.einsum("ba,ac,bc->b", rows, kept, rows),
-        ),
-    ):
-        if count:
-            kinds.append((name, float(vPv), count - float(taken), count))
-    rest = a.vPv - sum(kind[1] for kind in kinds[1:])
-    vPv_of = np.array([rest] + [kind[1] for kind in kinds[1:]])
-    redundancy = np.array([kind[2] for kind in kinds])
-    enough = redundancy > FEW / 10
-    sigma0 = np.where(enough, np.sqrt(np.maximum(vPv_of, 0) / np.where(enough, redundancy, 1.0)), np.nan)
-    names = tuple(kind[0] for kind in kinds)
-    return VarianceComponents(names, sigma0, redundancy, np.array([kind[3] for kind in kinds]))
-
-
-def estimate_components(
-    adjust_network: Callable[[Network], Adjustment], network: Network, group: IntArray, names: tuple[str, ...]
-) -> tuple[Adjustment, FloatArray]:
-    """Return the adjustment with the weights of groups of image points estimated from the data.
-
-    The covariance of each group is multiplied by its variance factor and the network adjusted again,
-    until the factors are 1.
-
-    Args:
-        adjust_network: adjusts a network from fixed start values and returns the adjustment.
-        network: what was measured.
-        group: group of each image point, shape (k,).
-        names: names of the groups, g of them.
-
-    Returns:
-        Last adjustment, and standard deviation of each group over that given, shape (g,).
-    """
-    factor = np.ones(len(names))
-    k = network.image_points
-    adjustment = adjust_network(network)
-    for _ in range(MAX_ROUNDS):
-        found = variance_components(adjustment, group, names).sigma0
-        found = np.where(np.isfinite(found) & (found > 0), found, 1.0)
-        factor = factor * found
-        scaled = replace(k, covariance=k.covariance * factor[group][:, None, None] ** 2)
-        adjustment = adjust_network(replace(network, image_points=scaled))
-        if np.abs(found - 1).max() <= SETTLED:
-            break
-    return adjustment, factor
-
-
 def significance(adjustment: Adjustment, *, alpha: float = 0.05) -> tuple[Significance, ...]:
     """Return the t-test against 0 of each free parameter of distortion and principal point in mm.
+
+    A parameter that several cameras share is tested once, under the name of their group.
 
     Args:
         adjustment: the adjustment.
         alpha: probability of calling a parameter significant that is 0.
     """
-    tests = []
+    tests: dict[tuple[str, str], Significance] = {}
     for camera, Q in zip(adjustment.estimate.cameras, adjustment.covariance.interior, strict=True):
-        for s, sigma in zip(_free(camera.free, Q), np.sqrt(np.diagonal(Q)), strict=True):
-            name = camera.names[s]
+        for s, sigma in zip(_free(camera, Q), np.sqrt(np.diagonal(Q)), strict=True):
+            name, owner = camera.names[s], camera.group_of(s) or camera.name
             if name in UNTESTED or not sigma > 0:
                 continue
-            t = abs(camera.parameters[s]) / sigma
+            value = float(camera.parameters[s])
+            t = abs(value) / float(sigma)
             p = float(2 * stats.t.sf(t, adjustment.redundancy))
-            tests.append(
-                Significance(
-                    camera.name, name, float(camera.parameters[s]), float(sigma), float(t), p, p < alpha
-                )
-            )
-    return tuple(tests)
+            tests[owner, name] = Significance(owner, name, value, float(sigma), t, p, p < alpha)
+    return tuple(tests.values())
 
 
 def correlations(adjustment: Adjustment, *, limit: float = STRONG) -> tuple[Correlation, ...]:
@@ -281,17 +179,19 @@ def correlations(adjustment: Adjustment, *, limit: float = STRONG) -> tuple[Corr
     """
     found = []
     for camera, Q in zip(adjustment.estimate.cameras, adjustment.covariance.interior, strict=True):
-        names = [f"{camera.names[s]} of camera {camera.name}" for s in _free(camera.free, Q)]
+        free = _free(camera, Q)
+        names = [f"{camera.names[s]} of camera {camera.group_of(s) or camera.name}" for s in free]
         found += _strong(Q, names, limit)
     parts = ("X0", "Y0", "Z0", "omega", "phi", "kappa")
     for image, Q in zip(adjustment.network.images, adjustment.covariance.exterior, strict=True):
         found += _strong(Q, [f"{part} of photograph {image}" for part in parts], limit)
-    return tuple(sorted(found, key=lambda pair: -abs(pair.value)))
+    once = {(pair.first, pair.second): pair for pair in found}  # of shared parameters every camera has it
+    return tuple(sorted(once.values(), key=lambda pair: -abs(pair.value)))
 
 
-def _free(free: BoolArray, Q: FloatArray) -> IntArray:
+def _free(camera: Camera, Q: FloatArray) -> IntArray:
     """Indices of the parameters that a covariance belongs to; none for a camera that took no part."""
-    return np.flatnonzero(free)[: len(Q)]
+    return np.flatnonzero(camera.free)[: len(Q)]
 
 
 def _strong(Q: FloatArray, names: list[str], limit: float) -> list[Correlation]:

@@ -9,13 +9,11 @@ import numpy as np
 from sfm.adjustment.statistics import (
     STRONG,
     Correlation,
-    VarianceComponents,
-    by_camera,
-    by_photograph,
     correlations,
     global_test,
     significance,
 )
+from sfm.adjustment.variance_components import VarianceComponents, by_camera, by_photograph
 from sfm.report.checks import (
     bar_residuals,
     control_residuals,

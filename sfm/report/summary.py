@@ -11,13 +11,11 @@ import numpy as np
 
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.statistics import (
-    VarianceComponents,
-    by_camera,
-    by_photograph,
     correlations,
     global_test,
     significance,
 )
+from sfm.adjustment.variance_components import VarianceComponents, by_camera, by_photograph
 from sfm.report.checks import bar_residuals, control_residuals, count_observations, sigma0_ratio
 from sfm.report.result import SurveyResult
 from sfm.report.tables import UNCODED, parameter_sigmas
