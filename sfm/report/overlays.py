@@ -45,6 +45,14 @@ REASON_COLOURS = (
     (Flag.NO_CONVERGENCE, (150, 60, 150)),
     (Flag.DUPLICATE, (200, 200, 60)),
     (Flag.PART_OF_CODE, (230, 150, 230)),
+    (Flag.LOBED, (90, 200, 250)),
+    (Flag.THIN_BACKGROUND, (40, 110, 40)),
+)
+# Remarks on measured targets, drawn as a second outline.
+REMARK_COLOURS = (
+    (Flag.FLARE, (0, 160, 255)),
+    (Flag.HALO, (255, 255, 120)),
+    (Flag.SATURATED, (180, 180, 255)),
 )
 
 
@@ -78,7 +86,7 @@ def draw_overlays(result: SurveyResult, *, jobs: int = 1, progress: Progress = S
             picture = draw_photograph(photograph, result.adjustment, factor)
         except PhotographError:
             return None
-        legend = _legend(picture.shape[1], factor, photograph.rejected_flag)
+        legend = _legend(picture.shape[1], factor, photograph)
         return Overlay(
             photograph.image,
             names[index],
@@ -119,12 +127,16 @@ def draw_photograph(photograph: PhotographTargets, adjustment: Adjustment, facto
     seen = adjustment.network.image_points
     owner = _nearest(photograph.xy, seen.xy[rows])
     reach = np.zeros(len(rows))  # of the outline of each image point to the right, px
+    remarks = _remarks(photograph)
     for k in range(len(photograph.xy)):
         row = owner[k]
         colour = UNUSED if row < 0 else DROPPED if adjustment.rejected[rows[row]] else USED
-        _ellipse(
-            picture, photograph.xy[k], photograph.semi_axes[k] + 2 / scale, photograph.angle[k], scale, colour
-        )
+        outline = photograph.semi_axes[k] + 2 / scale
+        _ellipse(picture, photograph.xy[k], outline, photograph.angle[k], scale, colour)
+        for remark, second in REMARK_COLOURS:
+            if remarks[k] & remark.value:
+                outline = outline + 2 / scale
+                _ellipse(picture, photograph.xy[k], outline, photograph.angle[k], scale, second)
     for xy, flag in zip(photograph.rejected_xy, photograph.rejected_flag, strict=True):
         _cross(picture, xy, scale, 2 if flag & Flag.TOO_SMALL else 4, _colour_of(int(flag)))
     # The vector points from the measured to the adjusted position: v = computed - measured.
@@ -179,6 +191,11 @@ def _nearest(xy: FloatArray, measured: FloatArray) -> IntArray:
     return np.where(close, nearest, -1)
 
 
+def _remarks(photograph: PhotographTargets) -> IntArray:
+    """Return the remarks on the measured targets, none where they were not kept, (k,)."""
+    return np.zeros(len(photograph.xy), np.int64) if photograph.flag is None else photograph.flag
+
+
 def _colour_of(flag: int) -> tuple[int, int, int]:
     return next((colour for reason, colour in REASON_COLOURS if flag & reason.value), INK)
 
@@ -217,7 +234,7 @@ def _label(picture: AnyArray, name: str, xy: FloatArray, scale: float, colour: t
         cv2.putText(picture, text, at, cv2.FONT_HERSHEY_SIMPLEX, LABEL_SIZE, shade, thickness, cv2.LINE_AA)
 
 
-def _legend(width: int, factor: float, flags: IntArray) -> AnyArray:
+def _legend(width: int, factor: float, photograph: PhotographTargets) -> AnyArray:
     """Return the strip below the photograph that explains the colours and the scale of the vectors."""
     entries: list[tuple[str, tuple[int, int, int]]] = [
         ("accepted", USED),
@@ -228,7 +245,12 @@ def _legend(width: int, factor: float, flags: IntArray) -> AnyArray:
     entries += [
         (f"x {in_words(str(reason.name).lower())}", colour)
         for reason, colour in REASON_COLOURS
-        if (flags & reason.value).any()
+        if (photograph.rejected_flag & reason.value).any()
+    ]
+    entries += [
+        (f"o {in_words(str(remark.name).lower())}", colour)
+        for remark, colour in REMARK_COLOURS
+        if (_remarks(photograph) & remark.value).any()
     ]
     size, row_height = 0.5, 24
     rows: list[list[tuple[str, tuple[int, int, int], int]]] = [[]]

@@ -43,6 +43,7 @@ class PhotographTargets:
     angle: FloatArray  # of the larger semi-axis from x towards y, rad, (k,)
     rejected_xy: FloatArray  # centres of the rejected candidates, px, (r, 2)
     rejected_flag: IntArray  # reason for each rejection, see sfm.targets.flags.Flag, (r,)
+    flag: IntArray | None = None  # remarks on the measured targets, see sfm.targets.flags.Flag, (k,)
 
     def reasons(self) -> list[tuple[str, int]]:
         """Return (reason, number of candidates) of this photograph, most frequent first."""

@@ -47,9 +47,9 @@ class MeasuredPhotographs:
                 found.xy,
                 found.semi_axes,
                 found.angle,
-                found.flag,
                 found.rejected_xy,
                 found.rejected_flag,
+                found.flag,
             )
             for name, path, found in zip(self.names, self.paths, self.targets, strict=True)
         )

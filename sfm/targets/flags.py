@@ -21,6 +21,8 @@ class Flag(IntFlag):
     SHADED = 1 << 2  # the gain changes by more than its own 3 sigma across the target
     CLOSE_NEIGHBOUR = 1 << 3  # part of the background was left out because something else is there
     CORNER = 1 << 4  # the corner of a square tag, no circle
+    HALO = 1 << 5  # the background falls off from the edge: light scattered about a retro-reflective target
+    FLARE = 1 << 6  # the background is saturated or changes strongly across the target: glare on its surface
     # reasons for a rejection
     CUT_BY_BORDER = 1 << 8  # the border of the photograph cuts the target or its background
     TOO_SMALL = 1 << 9  # below min_diameter_px

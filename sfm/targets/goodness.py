@@ -11,12 +11,16 @@ from sfm.conventions import AnyArray, FloatArray
 from sfm.targets.blurred_ellipse import BLOCK, linearise
 from sfm.targets.edge_rays import HARMONICS, RAYS, STEP_PX, bilinear
 
-# Pixels used, sum of squared residuals, unevenness, L, steps, lobes and their sigma, share of strokes.
-STATISTICS = 8
+# Pixels used, sum of squared residuals, unevenness, L, steps, lobes and their sigma, share of strokes, halo
+# and its sigma, saturated share of the background, share of the circumference behind which glare is.
+STATISTICS = 12
 # A background narrower than this, in radii, is a stroke: the rings of codes begin one radius from the edge.
 STROKE = 0.75
 # Behind a stroke this far is looked at, and what lies beyond so many contrasts from the background is glare.
 _BEHIND_PX, _GLARE = 2.5, 1.5
+# The background begins so many blurs from the edge, where 0.6 % of the step are left; a halo is looked for in
+# this width of it.
+_EDGE_ENDS_BLURS, _HALO_PX = 2.5, 2.0
 # Residuals of the edge are taken from this far in units of its blur, and at least so many px.
 _BAND_BLURS, _BAND_PX = 1.5, 1.0
 
@@ -82,16 +86,17 @@ def judge_residuals(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def judge_background(image: AnyArray, theta: FloatArray, length: float, statistics: FloatArray) -> None:
-    """Set the share of the circumference where the background is only a thin stroke: in a letter "o".
+    """Set the shares of the circumference where the background is only a thin stroke, and where glare is.
 
-    There the intensity comes back to that of the target nearer to the edge than any ring of a code. What is
-    much farther from the background than the target is glare about the rim of a retro-reflective target.
+    The stroke of a letter "o" is one: the intensity comes back to that of the target nearer to the edge than
+    any ring of a code. What is much farther from the background than the target is glare about the rim of a
+    retro-reflective target.
     """
     h, w = image.shape
     x0, y0, p, q, r = theta[0], theta[1], theta[2], theta[3], theta[4]
     B, A, gx, gy = theta[5], theta[6], theta[8] / length, theta[9] / length
     det = p * r - q * q
-    strokes = 0
+    strokes, glaring = 0, 0
     for k in range(RAYS):
         c, s = HARMONICS[k, 1], HARMONICS[k, 2]
         ex, ey = (r * c - q * s) / det, (p * s - q * c) / det
@@ -110,6 +115,39 @@ def judge_background(image: AnyArray, theta: FloatArray, length: float, statisti
             elif level > 0.5:
                 back = t
             t += 0.5 * STEP_PX
-        if back < math.inf and highest < _GLARE:
-            strokes += 1
-    statistics[7] = strokes / RAYS
+        if back < math.inf:
+            strokes += highest < _GLARE
+            glaring += highest >= _GLARE
+    statistics[7], statistics[11] = strokes / RAYS, glaring / RAYS
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def judge_glow(
+    data: FloatArray, n: int, theta: FloatArray, saturation: float, statistics: FloatArray
+) -> None:
+    """Set by how much the background beside the edge is nearer to the target than farther away, in contrasts.
+
+    And the standard deviation of that, and the share of the background that is saturated.
+    """
+    x0, y0, p, q, r = theta[0], theta[1], theta[2], theta[3], theta[4]
+    B, A, s = theta[5], theta[6], theta[7]
+    begin = _EDGE_ENDS_BLURS * s
+    total, count, saturated = np.zeros(2), np.zeros(2), 0.0
+    for i in range(n):
+        dx, dy = data[0, i] - x0, data[1, i] - y0
+        u, v = p * dx + q * dy, q * dx + r * dy
+        rho = math.sqrt(u * u + v * v)
+        d = rho * (rho - 1) / (math.sqrt((p * u + q * v) ** 2 + (q * u + r * v) ** 2) + 1e-12)
+        if d < begin:
+            continue
+        far = 1 if d > begin + _HALO_PX else 0
+        total[far] += data[2, i] - B
+        count[far] += 1
+        saturated += data[2, i] >= saturation
+    statistics[8], statistics[9], statistics[10] = 0.0, math.inf, 0.0
+    if count[0] + count[1] > 0:
+        statistics[10] = saturated / (count[0] + count[1])
+    if count[0] > 0 and count[1] > 0:
+        variance = statistics[1] / max(statistics[0] - len(theta), 1.0)
+        statistics[8] = (total[0] / count[0] - total[1] / count[1]) / A
+        statistics[9] = math.sqrt(variance * (1 / count[0] + 1 / count[1])) / abs(A)

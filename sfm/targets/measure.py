@@ -19,6 +19,10 @@ QUANTISATION = 1 / 12
 # From so many targets on, the shading of a photograph is estimated from them; a target whose own gain is more
 # than so many sigma away from that keeps its own.
 LEAST_FOR_SHADING, OWN_GAIN_SIGMAS = 10, 3.0
+# A halo is above this share of the contrast (9 of 10 of the retro-panel are below) and so many of its
+# sigmas. Flare is a background of which more than this share is saturated, that has glare behind it on more
+# than this share of the circumference, or that changes by more than this share of the contrast.
+HALO, HALO_SIGMAS, FLARE_SATURATED, FLARE_AROUND, FLARE_CHANGE = 0.035, 5.0, 0.02, 0.25, 0.25
 # Fewer targets than this are not worth a thread.
 TARGETS_PER_THREAD = 100
 # A gain per px below this is none.
@@ -94,7 +98,7 @@ def fit_ellipse_model(
     theta, cofactor, statistics, flag = _fit_in_threads(
         photograph, start, np.asarray(sign, np.int64), float(noise), float(saturation)
     )
-    pixels, squares, unevenness, length, steps, lobes, lobes_sigma, strokes = statistics.T
+    pixels, squares, unevenness, length, steps, lobes, lobes_sigma, strokes, *glow = statistics.T
     variance = squares / np.maximum(pixels - PARAMETERS, 1)
     if integers:
         variance = np.maximum(variance, QUANTISATION)
@@ -106,6 +110,11 @@ def fit_ellipse_model(
             theta[good], cofactor[good], variance[good], length[good]
         )
         flag[good[shaded]] |= Flag.SHADED.value
+    gain = theta[:, 8:] / length[:, None]
+    halo, halo_sigma, saturated, glaring = glow
+    flag[(halo > HALO) & (halo > HALO_SIGMAS * halo_sigma)] |= Flag.HALO.value
+    glare = (saturated > FLARE_SATURATED) | (glaring > FLARE_AROUND)
+    flag[glare | _changes(theta, gain)] |= Flag.FLARE.value
     return EllipseFit(
         xy=theta[:, :2],
         covariance=covariance,
@@ -113,7 +122,7 @@ def fit_ellipse_model(
         background=theta[:, 5],
         contrast=theta[:, 6],
         blur=theta[:, 7],
-        gain=theta[:, 8:] / length[:, None],
+        gain=gain,
         noise=np.sqrt(variance),
         unevenness=unevenness,
         lobes=lobes,
@@ -123,6 +132,14 @@ def fit_ellipse_model(
         iterations=steps.astype(np.int64),
         flag=flag,
     )
+
+
+def _changes(theta: FloatArray, gain: FloatArray) -> BoolArray:
+    """Return where the background changes across the target by a good part of the contrast, (k,)."""
+    p, q, r, B, A = theta[:, 2:7].T
+    with np.errstate(divide="ignore", invalid="ignore"):
+        radius = np.abs(p * r - q * q) ** -0.5
+        return 2 * radius * np.abs(B) * np.hypot(*gain.T) > FLARE_CHANGE * np.abs(A)
 
 
 def _fit_in_threads(

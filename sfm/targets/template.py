@@ -11,7 +11,7 @@ from sfm.conventions import AnyArray, FloatArray, IntArray
 from sfm.targets.blurred_ellipse import BLOCK, PARAMETERS, normal_equations
 from sfm.targets.edge_rays import RAYS, improve_outline, invert_spd, solve_spd, trace_rays
 from sfm.targets.flags import Flag
-from sfm.targets.goodness import STATISTICS, judge_background, judge_residuals
+from sfm.targets.goodness import STATISTICS, judge_background, judge_glow, judge_residuals
 
 # A priori sigma of the change of gain over L: far above shading, it only keeps the fit regular.
 GAIN_SIGMA = 0.3
@@ -145,6 +145,7 @@ def _fit_one(
             damping = max(damping, 1e-3) * 10
     judge_residuals(data, n, theta, length, saturation, J, statistics)
     judge_background(image, theta, length, statistics)
+    judge_glow(data, n, theta, saturation, statistics)
     statistics[4] = steps
     N[8, 8] += prior
     N[9, 9] += prior
