@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import csv
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,7 +14,7 @@ import pytest
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
-from sfm.adjustment.statistics import global_test
+from sfm.adjustment.statistics import global_test, reliability, tau_test, w_test
 from sfm.analysis.comparison import AdjusterComparison, BackendAdjustment, compare_adjusters
 from sfm.camera import Camera
 from sfm.network import Estimate, Network, ObjectPoints, ScaleBars
@@ -27,7 +29,10 @@ from sfm.report.html import render_html
 from sfm.report.plots import all_plots, plan_axes
 from sfm.report.result import ControlCheck, Eccentricity, SurveyResult
 from sfm.report.section_statistics import camera_correlations
+from sfm.report.statistics import families, interior_parameters, parameter_sigmas
 from sfm.report.summary import summary
+from sfm.report.tables import write_tables
+from sfm.report.text import WIDTH, text_report
 from sfm.report.verdict import verdict_of
 from tests.synthetic import make_network, seed_of
 
@@ -323,3 +328,102 @@ def test_names_that_the_font_lacks_give_no_warning(
     a = adjust(replace(network, images=names), replace(truth, cameras=cameras), datum=Datum("free"))
     all_plots(a, "米")
     assert not recwarn.list
+
+
+def test_text_report_is_one_page_with_the_figures_of_the_adjustment(
+    synthetic: tuple[Network, Estimate],
+) -> None:
+    network, truth = synthetic
+    network = with_bars(network, truth, (0.0, 1e-5), 1e-4)
+    a = adjust(network, truth, datum=Datum("free"))
+    text = text_report(result_of(a))
+    lines = text.splitlines()
+    assert len(lines) < 90 and max(map(len, lines)) <= WIDTH
+    assert f"{a.sigma0_px:.5f} px" in text and "rank defect 6, as expected" in text
+    assert f"{a.observations} ({2 * int((~a.rejected).sum())} image coordinates, 2 scale bars)" in text
+    test = global_test(a)
+    assert f"v'Pv = {test.statistic:.2f}, chi-square of {a.redundancy}" in text
+    numbers = re.search(r"sum ([\d.]+), of all observations ([\d.]+); mean", text)
+    assert numbers is not None
+    assert float(numbers[1]) == pytest.approx(np.nansum(a.redundancy_numbers), abs=0.06)
+    assert float(numbers[2]) == pytest.approx(a.redundancy, abs=0.06)
+    assert f"beyond {w_test(a).critical:.2f}" in text and f"beyond {tau_test(a).critical:.2f}" in text
+    for words in ("minimal bias", "external reliability", "Variance components", "correlations over 95 %"):
+        assert words in text
+    assert text == text_report(result_of(a))
+
+
+def test_what_cannot_be_determined_stands_in_every_report() -> None:
+    network, truth = make_network(seed_of("one ray"), images=6, points=20)
+    k = network.image_points
+    keep = (k.point != 7) | (k.image == 0)
+    a = adjust(replace(network, image_points=k.select(keep)), truth, datum=Datum("free"))
+    words = "point 8: 1 ray, 2 are needed"
+    assert a.undetermined == (words,)
+    result = result_of(a)
+    assert f"NOT DETERMINED: {words}" in text_report(result)
+    assert words in render_html(result, (), ())
+    assert summary(result)["datum"]["undetermined"] == [words]
+
+
+def test_tables_of_reliability_and_variance_components(
+    synthetic: tuple[Network, Estimate], tmp_path: Path
+) -> None:
+    network, truth = synthetic
+    k = network.image_points
+    xy = k.xy.copy()
+    xy[3] += 5.0
+    network = with_bars(replace(network, image_points=replace(k, xy=xy)), truth, (0.0, 1e-5), 1e-4)
+    a = adjust(network, truth, datum=Datum("free"))
+    assert a.rejected[3]
+    write_tables(result_of(a), tmp_path)
+    with (tmp_path / "reliability.csv").open(encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == len(k)
+    assert rows[3]["rejected"] == "1" and rows[3]["rx"] == rows[3]["mdbx_px"] == rows[3]["extx"] == ""
+    found = reliability(a)
+    for row, index in ((rows[0], 0), (rows[40], 40)):
+        assert float(row["rx"]) == a.redundancy_numbers[index, 0]
+        assert float(row["wy"]) == a.standardised[index, 1]
+        assert float(row["tauy"]) == a.tau[index, 1]
+        assert float(row["mdbx_px"]) == pytest.approx(4.1324 * 0.1 / np.sqrt(float(row["rx"])), rel=1e-4)
+        assert float(row["exty"]) == found.external[index, 1]
+    numbers = sum(float(row[c]) for row in rows for c in ("rx", "ry") if row[c])
+    with (tmp_path / "variance_components.csv").open(encoding="utf-8") as file:
+        components = list(csv.DictReader(file))
+    kinds = {row["group"]: row for row in components if row["kind"] == "kind"}
+    assert set(kinds) == {"image points", "scale bars"}
+    assert float(kinds["image points"]["redundancy"]) == pytest.approx(numbers, rel=1e-9)
+    assert sum(float(row["redundancy"]) for row in kinds.values()) == pytest.approx(a.redundancy, abs=1e-3)
+    photographs = [row for row in components if row["kind"] == "photograph"]
+    assert [row["group"] for row in photographs] == list(a.network.images)
+
+
+def test_shared_parameters_are_told_once(synthetic: tuple[Network, Estimate]) -> None:
+    network, truth = synthetic
+    m = len(network.images)
+    cameras = tuple(
+        replace(
+            truth.cameras[0],
+            name=f"A image {i + 1}",
+            shared=tuple("" if name == "c" else "A" for name in truth.cameras[0].names),
+        )
+        for i in range(m)
+    )
+    a = adjust(replace(network, camera=np.arange(m)), replace(truth, cameras=cameras), datum=Datum("free"))
+    once = interior_parameters(a)
+    assert [one.owner for one in once if one.name == "c"] == [camera.name for camera in cameras]
+    assert [(one.owner, one.photographs) for one in once if one.name == "K1"] == [("A", m)]
+    assert [name for name, _ in families(a)] == ["A"]
+    page = render_html(result_of(a), (), ())
+    assert page.count("<h4>A</h4>") == 1 and f"{m} parameters of single photographs and groups" in page
+    tests = summary(result_of(a))["statistics"]["significance"]
+    assert [one["camera"] for one in tests if one["parameter"] == "K1"] == ["A"]
+
+
+def test_a_camera_without_photographs_in_the_network_has_no_sigmas() -> None:
+    network, truth = make_network(seed_of("idle"), images=6, points=20, cameras=2)
+    network = replace(network, camera=np.zeros(6, dtype=np.int64))
+    a = adjust(network, replace(truth, cameras=(truth.cameras[0], truth.cameras[1])), datum=Datum("free"))
+    assert np.isnan(parameter_sigmas(a, 1)).all()
+    assert "camera 2" in render_html(result_of(a), (), ())

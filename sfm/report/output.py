@@ -21,6 +21,7 @@ from sfm.report.plots import all_plots
 from sfm.report.result import StageTime, SurveyResult
 from sfm.report.summary import write_summary
 from sfm.report.tables import write_tables
+from sfm.report.text import text_report
 
 WRITTEN = (
     "summary.json",
@@ -28,6 +29,9 @@ WRITTEN = (
     "images.csv",
     "cameras.csv",
     "image_points.csv",
+    "reliability.csv",
+    "variance_components.csv",
+    "report.txt",
     "points.ply",
     "report.html",
     "colmap",
@@ -88,6 +92,7 @@ def write_result(
         timed = replace(result, seconds=(*result.seconds, StageTime("report", time.perf_counter() - started)))
         write_tables(timed, folder)
         write_summary(timed, folder)
+        (folder / "report.txt").write_text(text_report(timed), encoding="utf-8")
         page = render_html(timed, plots, overlays, has_model=write_colmap is not None)
         (folder / "report.html").write_text(page, encoding="utf-8")
         if finish is not None:

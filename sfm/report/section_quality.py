@@ -9,7 +9,8 @@ import numpy as np
 from sfm.report.markup import finer_unit, raised, significant, table, with_exponent
 from sfm.report.result import SurveyResult
 from sfm.report.section_statistics import camera_notes, components, control, image_coordinates, worst
-from sfm.report.tables import parameter_sigmas, point_sigmas, root_mean_square
+from sfm.report.statistics import InteriorParameter, families, interior_parameters
+from sfm.report.tables import point_sigmas, root_mean_square
 
 
 def quality_section(result: SurveyResult, pictures: dict[str, str]) -> str:
@@ -43,26 +44,42 @@ def quality_section(result: SurveyResult, pictures: dict[str, str]) -> str:
     text += image_coordinates(result)
     text += pictures.get("distribution", "") + pictures.get("residuals", "") + worst(result)
     text += "<h3>Cameras</h3>"
-    for index, camera in enumerate(a.estimate.cameras):
-        s = parameter_sigmas(a, index)
-        rows = [
-            (
-                name,
-                *with_exponent(value, s[k]),
-                raised(unit),
-                f"{abs(value) / s[k]:.1f}" if np.isfinite(s[k]) and s[k] > 0 else "",
-            )
-            for k, (name, value, unit) in enumerate(
-                zip(camera.names, camera.parameters, camera.units, strict=True)
-            )
-            if camera.free[k] or value != 0
-        ]
-        width, height = camera.size_px
-        text += (
-            f"<h4>{escape(camera.name)}</h4><p class=note>model {escape(camera.model)}, {width} x "
-            f"{height} px of {camera.pixel_mm[0] * 1e3:.5g} x {camera.pixel_mm[1] * 1e3:.5g} &micro;m</p>"
-        )
-        text += table(("parameter", "value", "sigma", "unit", "value / sigma"), rows)
+    text += _cameras(result)
     text += camera_notes(result)
     text += "<h3>Photographs</h3>" + pictures.get("photographs", "")
     return text + components(result)
+
+
+def _cameras(result: SurveyResult) -> str:
+    """Interior orientation of each camera; parameters of single photographs and groups in a table below."""
+    a = result.adjustment
+    parameters = interior_parameters(a)
+    text = ""
+    listed = families(a)
+    for family, camera in listed:
+        width, height = camera.size_px
+        own = [one for one in parameters if one.owner == family]
+        photographs = max((one.photographs for one in own), default=0)
+        text += (
+            f"<h4>{escape(family)}</h4><p class=note>model {escape(camera.model)}, {width} x "
+            f"{height} px of {camera.pixel_mm[0] * 1e3:.5g} x {camera.pixel_mm[1] * 1e3:.5g} &micro;m"
+            + (f"; these parameters are common to {photographs} photographs" if camera.shared else "")
+            + "</p>"
+        )
+        text += table(
+            ("parameter", "value", "sigma", "unit", "value / sigma"), [_row(one)[1:] for one in own]
+        )
+    single = [one for one in parameters if one.owner not in dict(listed)]
+    if single:
+        text += (
+            f"<details{' open' if len(single) <= 30 else ''}><summary>{len(single)} parameters of single "
+            "photographs and groups</summary>"
+        )
+        header = ("of", "parameter", "value", "sigma", "unit", "value / sigma")
+        text += table(header, [_row(one) for one in single]) + "</details>"
+    return text
+
+
+def _row(one: InteriorParameter) -> tuple[str, ...]:
+    ratio = f"{abs(one.value) / one.sigma:.1f}" if np.isfinite(one.sigma) and one.sigma > 0 else ""
+    return (one.owner, one.name, *with_exponent(one.value, one.sigma), raised(one.unit), ratio)

@@ -10,10 +10,9 @@ from sfm.adjustment.statistics import (
     STRONG,
     Correlation,
     correlations,
-    global_test,
     significance,
 )
-from sfm.adjustment.variance_components import VarianceComponents, by_camera, by_photograph
+from sfm.adjustment.variance_components import VarianceComponents, by_camera, by_kind, by_photograph
 from sfm.report.checks import (
     bar_residuals,
     control_residuals,
@@ -23,15 +22,13 @@ from sfm.report.checks import (
 )
 from sfm.report.markup import finer_unit, signed, significant, table
 from sfm.report.result import SurveyResult
-
-ALPHA = 0.05  # of the global test and of the significance of parameters
-SIGNIFICANT = 2.0  # value over sigma below which a parameter might as well be 0
+from sfm.report.statistics import GLOBAL_ALPHA, SIGNIFICANT, Statistics, quantiles, statistics_of
 
 
 def image_coordinates(result: SurveyResult) -> str:
     """Sigma0, the global test, residuals and redundancy, then the ten worst residuals."""
-    a = result.adjustment
-    test, r = global_test(a, alpha=ALPHA), a.redundancy_numbers
+    a, found = result.adjustment, statistics_of(result.adjustment)
+    test, r = found.global_test, a.redundancy_numbers
     verdict = "passed" if test.passed else "NOT passed"
     rows = [
         ("sigma0, a posteriori standard deviation of a coordinate", f"{a.sigma0_px:.5f}", "px"),
@@ -39,15 +36,10 @@ def image_coordinates(result: SurveyResult) -> str:
         ("a posteriori over a priori", f"{sigma0_ratio(result):.3f}", ""),
         ("RMS residual per coordinate", f"{a.rms_px:.5f}", "px"),
         ("longest residual vector among the accepted", f"{a.max_residual_px:.4f}", "px"),
-        (f"global test of v'Pv, {100 * ALPHA:.0f} %: {verdict}", f"{test.statistic:.2f}", ""),
-        ("its critical values, lower", f"{test.lower:.2f}", ""),
+        (f"global test of v'Pv, {100 * GLOBAL_ALPHA:.0f} %: {verdict}", f"{test.statistic:.2f}", ""),
+        (f"its critical values (chi-square of {test.redundancy}), lower", f"{test.lower:.2f}", ""),
         ("its critical values, upper", f"{test.upper:.2f}", ""),
     ]
-    if np.isfinite(r).any():
-        rows += [
-            ("mean redundancy number (0 none, 1 full control)", f"{np.nanmean(r):.3f}", ""),
-            ("smallest redundancy number", f"{np.nanmin(r):.3f}", ""),
-        ]
     text = "<h3>Image coordinates</h3>" + table(("", "value", "unit"), rows)
     text += (
         "<p class=note>The global test asks whether the standard deviation stated beforehand (sigma_px) is "
@@ -60,7 +52,58 @@ def image_coordinates(result: SurveyResult) -> str:
             f"multiplied by {result.weight_factor:.3f}, from their own variance component, so that control "
             "and scale bars keep those stated for them. The test is that of the weights so found.</p>"
         )
-    return text
+    return text + (_tests_and_reliability(result, found) if np.isfinite(r).any() else "")
+
+
+def _tests_and_reliability(result: SurveyResult, found: Statistics) -> str:
+    """Redundancy numbers, the tests for single gross errors, and what such an error could do."""
+    r = result.adjustment.redundancy_numbers
+    bias, external = quantiles(found.reliability.minimal_bias), quantiles(found.reliability.external)
+    text = "<h3>Tests and reliability of single image coordinates</h3>" + table(
+        ("test for a gross error", "coordinates", "critical value", "beyond it", "by chance", "largest"),
+        [
+            (
+                f"{name}, {100 * test.alpha:.1f} %",
+                str(test.tested),
+                f"{test.critical:.2f}",
+                str(test.beyond),
+                f"{test.expected:.1f}",
+                f"{np.nanmax(np.abs(test.statistic)):.2f}",
+            )
+            for name, test in (
+                ("Baarda's w (sigma0 as stated)", found.w),
+                ("Pope's tau (sigma0 as found)", found.tau),
+            )
+        ],
+    )
+    text += table(
+        ("reliability", "median", "worst", "unit"),
+        [
+            (
+                "redundancy number (0 no check, 1 full check)",
+                f"{np.nanmedian(r):.3f}",
+                f"{np.nanmin(r):.3f}",
+                "",
+            ),
+            ("smallest gross error that is found", significant(bias[0]), _or_unlimited(bias[1]), "px"),
+            (
+                "its effect on an unknown if it is not found",
+                significant(external[0]),
+                _or_unlimited(external[1]),
+                "sigmas of the unknown",
+            ),
+        ],
+    )
+    return text + (
+        f"<p class=note>The redundancy numbers add up to {found.redundancy_sum:.1f}, the redundancy is "
+        f"{result.adjustment.redundancy}. The smallest gross error (minimal detectable bias) is found by the "
+        f"w test in {100 * found.power:.0f} of 100 cases, with the standard deviations stated beforehand. "
+        "Its effect is the external reliability. Of every image coordinate: reliability.csv.</p>"
+    )
+
+
+def _or_unlimited(value: float) -> str:
+    return "unlimited" if np.isinf(value) else significant(value)
 
 
 def worst(result: SurveyResult) -> str:
@@ -109,7 +152,7 @@ def observations(result: SurveyResult) -> str:
 def camera_notes(result: SurveyResult) -> str:
     """What of the cameras cannot be told apart from something else, or from 0."""
     a = result.adjustment
-    weak = [test for test in significance(a, alpha=ALPHA) if test.t < SIGNIFICANT]
+    weak = [test for test in significance(a, alpha=GLOBAL_ALPHA) if test.t < SIGNIFICANT]
     strong = camera_correlations(result)
     text = "<h3>Correlations and significance of camera parameters</h3>"
     if strong:
@@ -136,15 +179,22 @@ def camera_notes(result: SurveyResult) -> str:
 def camera_correlations(result: SurveyResult) -> tuple[Correlation, ...]:
     """Return the pairs of camera parameters that are strongly correlated, without those of photographs."""
     a = result.adjustment
-    names = {f"{name} of camera {camera.name}" for camera in a.estimate.cameras for name in camera.names}
+    names = {
+        f"{name} of camera {camera.group_of(s) or camera.name}"
+        for camera in a.estimate.cameras
+        for s, name in enumerate(camera.names)
+    }
     return tuple(pair for pair in correlations(a) if pair.first in names)
 
 
 def components(result: SurveyResult) -> str:
-    """Variance components of cameras and photographs."""
+    """Variance components of kinds of observation, cameras and photographs."""
     a = result.adjustment
     text = "<h3>Variance components</h3><p class=note>Sigma0 of a group over that stated beforehand; a group "
     text += "far above the others was measured worse, or does not fit.</p>"
+    kinds = by_kind(a)
+    if len(kinds.names) > 1:
+        text += table(("kind of observation", "sigma0", "redundancy", "observations"), _component_rows(kinds))
     text += table(("camera", "sigma0", "redundancy", "coordinates"), _component_rows(by_camera(a)))
     rows = _component_rows(by_photograph(a))
     return (

@@ -78,7 +78,14 @@ def coordinates_section(result: SurveyResult, *, has_model: bool) -> str:
             "image points [px], (0, 0) is the centre of the top-left pixel; residuals; rejected"
             + ("" if result.eccentricity is None else "; corrected for eccentricity (the circle's centre)"),
         ),
+        (
+            "reliability.csv",
+            "of every image coordinate: residual [px], redundancy number, w, tau, minimal detectable bias "
+            "[px], external reliability [sigmas of an unknown]",
+        ),
+        ("variance_components.csv", "sigma0 of kinds of observation, cameras and photographs"),
         ("points.ply", f"the object points as a point cloud [{unit}]"),
+        ("report.txt", "the bundle report on one page of plain text"),
         ("summary.json", "the figures of this page for programs"),
     ]
     if result.comparison is not None and has_model:

@@ -10,15 +10,12 @@ from typing import Any
 import numpy as np
 
 from sfm.adjustment.result import Adjustment
-from sfm.adjustment.statistics import (
-    correlations,
-    global_test,
-    significance,
-)
-from sfm.adjustment.variance_components import VarianceComponents, by_camera, by_photograph
+from sfm.adjustment.statistics import CoordinateTest
+from sfm.adjustment.variance_components import VarianceComponents
 from sfm.report.checks import bar_residuals, control_residuals, count_observations, sigma0_ratio
 from sfm.report.result import SurveyResult
-from sfm.report.tables import UNCODED, parameter_sigmas
+from sfm.report.statistics import parameter_sigmas, quantiles, statistics_of
+from sfm.report.tables import UNCODED
 from sfm.report.verdict import verdict_of
 
 
@@ -97,9 +94,10 @@ def _verdict(result: SurveyResult) -> dict[str, Any]:
 
 
 def _statistics(result: SurveyResult) -> dict[str, Any]:
-    a = result.adjustment
-    test, counts, r = global_test(a), count_observations(a), a.redundancy_numbers
+    a, found = result.adjustment, statistics_of(result.adjustment)
+    test, counts, r = found.global_test, count_observations(a), a.redundancy_numbers
     known = np.isfinite(r).any()
+    bias, external = quantiles(found.reliability.minimal_bias), quantiles(found.reliability.external)
     return {
         "sigma0_ratio": _number(sigma0_ratio(result)),
         "global_test": {
@@ -109,6 +107,8 @@ def _statistics(result: SurveyResult) -> dict[str, Any]:
             "upper": _number(test.upper),
             "passed": test.passed,
         },
+        "w_test": _coordinate_test(found.w),
+        "tau_test": _coordinate_test(found.tau),
         "observations": {
             "image_coordinates": counts.image,
             "control": counts.control,
@@ -119,20 +119,46 @@ def _statistics(result: SurveyResult) -> dict[str, Any]:
             "total": counts.total,
         },
         "redundancy_number": {
+            "sum": _number(found.redundancy_sum),
             "mean": _number(float(np.nanmean(r))) if known else None,
             "min": _number(float(np.nanmin(r))) if known else None,
         },
-        "sigma0_by_camera": _components(by_camera(a)),
-        "sigma0_by_photograph": _components(by_photograph(a)),
+        "minimal_detectable_bias_px": {"median": _number(bias[0]), "max": _number(bias[1])},
+        "external_reliability_sigmas": {"median": _number(external[0]), "max": _number(external[1])},
+        "sigma0_by_kind": _components(found.kinds),
+        "sigma0_by_camera": _components(found.cameras),
+        "sigma0_by_photograph": _components(found.photographs),
         "correlations": [
             {"first": pair.first, "second": pair.second, "value": _number(pair.value)}
-            for pair in correlations(a)
+            for pair in found.correlations
+        ],
+        "significance": [
+            {
+                "camera": test.camera,
+                "parameter": test.parameter,
+                "t": _number(test.t),
+                "probability": _number(test.probability),
+                "significant": bool(test.significant),
+            }
+            for test in found.significance
         ],
         "not_significant": [
             {"camera": test.camera, "parameter": test.parameter, "t": _number(test.t)}
-            for test in significance(a)
+            for test in found.significance
             if not test.significant
         ],
+    }
+
+
+def _coordinate_test(test: CoordinateTest) -> dict[str, Any]:
+    known = np.isfinite(test.statistic)
+    return {
+        "alpha": test.alpha,
+        "critical": _number(test.critical),
+        "tested": test.tested,
+        "beyond": test.beyond,
+        "expected": test.expected,
+        "max": _number(float(np.abs(test.statistic[known]).max())) if known.any() else None,
     }
 
 

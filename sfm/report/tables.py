@@ -1,4 +1,4 @@
-"""The tables of a result: points.csv, images.csv, cameras.csv, image_points.csv, points.ply.
+"""The tables of a result: points, images, cameras, image points, their reliability, groups of observations.
 
 Degrees in files, the object unit of the survey, sigmas are standard deviations a posteriori (those of image
 points: as measured). Numbers are written with enough digits to give the same number back.
@@ -16,6 +16,7 @@ import numpy as np
 from sfm.adjustment.result import Adjustment
 from sfm.conventions import FloatArray, angles_from_rotation
 from sfm.report.result import SurveyResult
+from sfm.report.statistics import Statistics, parameter_sigmas, statistics_of
 
 UNCODED = -1
 
@@ -39,6 +40,17 @@ def write_tables(result: SurveyResult, folder: Path) -> None:
         folder / "image_points.csv",
         "image,point,x_px,y_px,sx_px,sy_px,vx_px,vy_px,rejected",
         image_point_rows(adjustment),
+    )
+    statistics = statistics_of(adjustment)
+    _write_csv(
+        folder / "reliability.csv",
+        "image,point,vx_px,vy_px,rx,ry,wx,wy,taux,tauy,mdbx_px,mdby_px,extx,exty,weight,rejected",
+        reliability_rows(adjustment, statistics),
+    )
+    _write_csv(
+        folder / "variance_components.csv",
+        "kind,group,observations,redundancy,sigma0",
+        component_rows(statistics),
     )
     write_ply(folder / "points.ply", result)
 
@@ -97,17 +109,43 @@ def image_point_rows(adjustment: Adjustment) -> Iterable[Sequence[object]]:
         )
 
 
+def reliability_rows(adjustment: Adjustment, statistics: Statistics) -> Iterable[Sequence[object]]:
+    """Return the tests of every image point: residual, redundancy number, w, tau, smallest error, its effect.
+
+    Empty cells: rejected image points have neither redundancy number nor reliability, and where the
+    redundancy number is 0 no error is found.
+    """
+    network = adjustment.network
+    seen, found = network.image_points, statistics.reliability
+    for k in range(len(seen)):
+        yield (
+            network.images[seen.image[k]],
+            network.points[seen.point[k]],
+            *adjustment.residuals[k],
+            *adjustment.redundancy_numbers[k],
+            *adjustment.standardised[k],
+            *adjustment.tau[k],
+            *found.minimal_bias[k],
+            *found.external[k],
+            float(adjustment.weights[k]),
+            int(adjustment.rejected[k]),
+        )
+
+
+def component_rows(statistics: Statistics) -> Iterable[Sequence[object]]:
+    """Return the variance components of kinds of observation, cameras and photographs."""
+    for kind, found in (
+        ("kind", statistics.kinds),
+        ("camera", statistics.cameras),
+        ("photograph", statistics.photographs),
+    ):
+        for g, name in enumerate(found.names):
+            yield (kind, name, int(found.count[g]), found.redundancy[g], found.sigma0[g])
+
+
 def point_sigmas(adjustment: Adjustment) -> FloatArray:
     """Return the standard deviations of X, Y, Z, object unit, (n, 3)."""
     return _sqrt_diagonal(adjustment.covariance.points)
-
-
-def parameter_sigmas(adjustment: Adjustment, camera: int) -> FloatArray:
-    """Return the standard deviation of each parameter of a camera, NaN for those held fixed, (p,)."""
-    free = adjustment.estimate.cameras[camera].free
-    sigma = np.full(len(free), np.nan)
-    sigma[free] = _sqrt_diagonal(adjustment.covariance.interior[camera])
-    return sigma
 
 
 def image_rms(adjustment: Adjustment) -> tuple[FloatArray, FloatArray]:

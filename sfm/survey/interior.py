@@ -123,13 +123,13 @@ def _variants(
     labels = [f"{camera.name} {settings.groups[g]}" if settings.groups else camera.name for g in grouped]
     names = [f"{camera.name} {image}" for image in images] if settings.per_photograph else labels
 
-    def shared(name: str, parameter: str, label: str) -> str:
+    def shared(parameter: str, label: str) -> str:
         if parameter in settings.per_photograph:
-            return name
+            return ""
         return label if parameter in settings.per_group else camera.name
 
     made = {
-        name: replace(camera, name=name, shared=tuple(shared(name, p, label) for p in camera.names))
+        name: replace(camera, name=name, shared=tuple(shared(p, label) for p in camera.names))
         for name, label in zip(names, labels, strict=True)
     }
     order = list(made)

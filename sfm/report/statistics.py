@@ -1,0 +1,135 @@
+"""The statistics of a result, gathered once for summary.json, the tables, report.txt and report.html."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass
+
+import numpy as np
+
+from sfm.adjustment.result import Adjustment
+from sfm.adjustment.statistics import (
+    POWER,
+    CoordinateTest,
+    Correlation,
+    GlobalTest,
+    Reliability,
+    Significance,
+    correlations,
+    global_test,
+    reliability,
+    significance,
+    tau_test,
+    w_test,
+)
+from sfm.adjustment.variance_components import VarianceComponents, by_camera, by_kind, by_photograph
+from sfm.camera import Camera
+from sfm.conventions import FloatArray
+
+GLOBAL_ALPHA = 0.05  # of the global test and of the significance of parameters
+SIGNIFICANT = 2.0  # value over sigma below which a parameter might as well be 0
+
+
+@dataclass(frozen=True)
+class Statistics:
+    """What a bundle report says besides the unknowns and their standard deviations."""
+
+    global_test: GlobalTest
+    w: CoordinateTest  # Baarda's test of every image coordinate
+    tau: CoordinateTest  # Pope's
+    reliability: Reliability  # internal and external, of every image coordinate
+    power: float  # with which the w test finds the minimal detectable bias
+    redundancy_sum: float  # of the redundancy numbers of all kinds of observation
+    kinds: VarianceComponents
+    cameras: VarianceComponents
+    photographs: VarianceComponents
+    significance: tuple[Significance, ...]
+    correlations: tuple[Correlation, ...]
+
+
+@dataclass(frozen=True)
+class InteriorParameter:
+    """A parameter of interior orientation as people ask for it: once, whoever shares it."""
+
+    owner: str  # camera, or group of photographs that have it in common
+    photographs: int  # how many have it
+    name: str
+    value: float
+    sigma: float  # NaN where it was not adjusted
+    unit: str
+
+
+def statistics_of(adjustment: Adjustment) -> Statistics:
+    """Return the statistics of an adjustment with its covariance."""
+    kinds = by_kind(adjustment)
+    return Statistics(
+        global_test=global_test(adjustment, alpha=GLOBAL_ALPHA),
+        w=w_test(adjustment),
+        tau=tau_test(adjustment),
+        reliability=reliability(adjustment),
+        power=POWER,
+        redundancy_sum=float(kinds.redundancy.sum()),
+        kinds=kinds,
+        cameras=by_camera(adjustment),
+        photographs=by_photograph(adjustment),
+        significance=significance(adjustment, alpha=GLOBAL_ALPHA),
+        correlations=correlations(adjustment),
+    )
+
+
+def interior_parameters(adjustment: Adjustment) -> tuple[InteriorParameter, ...]:
+    """Return every parameter of interior orientation once, those that are fixed at 0 left out."""
+    network = adjustment.network
+    used = np.bincount(network.camera, minlength=len(adjustment.estimate.cameras))
+    found: dict[tuple[str, str], InteriorParameter] = {}
+    for a, camera in enumerate(adjustment.estimate.cameras):
+        sigma = parameter_sigmas(adjustment, a)
+        for s, name in enumerate(camera.names):
+            value = float(camera.parameters[s])
+            if not camera.free[s] and value == 0:
+                continue
+            owner = camera.group_of(s) or camera.name
+            known = found.get((owner, name))
+            count = int(used[a]) + (known.photographs if known else 0)
+            found[owner, name] = InteriorParameter(
+                owner, count, name, value, float(sigma[s]), camera.units[s]
+            )
+    return tuple(found.values())
+
+
+def families(adjustment: Adjustment) -> tuple[tuple[str, Camera], ...]:
+    """Return the name of each family of cameras that share parameters, and the first camera of it.
+
+    A camera that shares nothing is a family of its own. The name is that of the group that most
+    photographs have in common.
+    """
+    used = np.bincount(adjustment.network.camera, minlength=len(adjustment.estimate.cameras))
+    owners = [
+        {camera.group_of(s) or camera.name for s in range(len(camera.names))}
+        for camera in adjustment.estimate.cameras
+    ]
+    photographs: Counter[str] = Counter()
+    for own, count in zip(owners, used.tolist(), strict=True):
+        photographs.update(dict.fromkeys(own, count))
+    found: dict[str, Camera] = {}
+    for own, camera in zip(owners, adjustment.estimate.cameras, strict=True):
+        found.setdefault(max(sorted(own), key=lambda owner: photographs[owner]), camera)
+    return tuple(found.items())
+
+
+def parameter_sigmas(adjustment: Adjustment, camera: int) -> FloatArray:
+    """Return the standard deviation of each parameter of a camera, NaN for those not adjusted, (p,)."""
+    free = np.flatnonzero(adjustment.estimate.cameras[camera].free)
+    sigma = np.full(len(adjustment.estimate.cameras[camera].free), np.nan)
+    variance = np.diagonal(adjustment.covariance.interior[camera])
+    if len(variance):  # a camera without photographs in the network has none
+        sigma[free] = np.sqrt(np.where(variance >= 0, variance, np.nan))
+    return sigma
+
+
+def quantiles(values: FloatArray) -> tuple[float, float]:
+    """Return median and largest of the known values; infinite where something has no check."""
+    known = values[~np.isnan(values)]
+    if not len(known):
+        return np.nan, np.nan
+    return float(np.median(known)), float(known.max())

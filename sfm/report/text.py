@@ -1,0 +1,330 @@
+"""report.txt: the bundle report on one page of plain text, as surveyors read it in a terminal.
+
+Rank and datum, sigma0 and redundancy, tests, reliability, variance components, unknowns with their standard
+deviations, correlations, worst residuals. No dates and hosts, so that two reports can be compared.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+
+from sfm.adjustment.statistics import STRONG
+from sfm.adjustment.variance_components import VarianceComponents
+from sfm.conventions import FloatArray
+from sfm.report.checks import (
+    bar_residuals,
+    control_residuals,
+    count_observations,
+    sigma0_ratio,
+    worst_residuals,
+)
+from sfm.report.markup import finer_unit, significant, with_exponent
+from sfm.report.result import SurveyResult
+from sfm.report.statistics import Statistics, interior_parameters, quantiles, statistics_of
+from sfm.report.tables import image_rms, point_sigmas, root_mean_square
+from sfm.report.verdict import verdict_of
+
+WIDTH = 100
+MOST_ROWS = 12  # of a list; the rest is in the tables of the result
+WORST = 5
+
+
+def text_report(result: SurveyResult) -> str:
+    """Return the report as plain text of at most WIDTH columns.
+
+    Args:
+        result: the result.
+    """
+    statistics = statistics_of(result.adjustment)
+    verdict = verdict_of(result)
+    lines = [f"KOLINEAR  {result.survey}"[:WIDTH], "=" * WIDTH, verdict.headline]
+    for remark in verdict.remarks:
+        lines += _wrapped(f"- {remark}")
+    for part in (
+        _adjustment(result),
+        _sigma0(result, statistics),
+        _single_tests(result, statistics),
+        _components(result, statistics),
+        _interior(result, statistics),
+        _points(result),
+        _given(result),
+        _worst(result),
+    ):
+        lines += part
+    lines += [
+        "",
+        "sigma: one standard deviation, a posteriori; w test and minimal bias rest on those a priori.",
+        "Residuals: computed minus measured. Pixel (0, 0): centre of the top-left pixel.",
+        "Tables (.csv): points, images, cameras, image_points, reliability, variance_components.",
+    ]
+    return "\n".join(line.rstrip() for line in lines) + "\n"
+
+
+def _adjustment(result: SurveyResult) -> list[str]:
+    a, counts = result.adjustment, count_observations(result.adjustment)
+    network = a.network
+    exterior = 6 * len(network.images)
+    interior = sum(1 for p in interior_parameters(a) if np.isfinite(p.sigma))
+    observed = [
+        f"{number} {name}"
+        for name, number in (
+            ("image coordinates", counts.image),
+            ("control coordinates", counts.control),
+            ("exterior orientation", counts.exterior),
+            ("interior orientation", counts.interior),
+            ("scale bars", counts.scale_bars),
+        )
+        if number
+    ]
+    unknowns = (
+        f"{exterior} exterior orientation, {interior} interior, {a.unknowns - exterior - interior} points"
+    )
+    rank = "as expected" if a.defect == a.expected_defect else f"expected {a.expected_defect}"
+    lines = [
+        *_head("Network and rank"),
+        _line("photographs", f"{len(network.images)} of {result.images_total}"),
+        _line("object points", f"{len(network.points)}"),
+        _line("image points", f"{int((~a.rejected).sum())} accepted, {int(a.rejected.sum())} rejected"),
+        _line("adjustment", f"{'converged' if a.converged else 'NOT converged'}, {a.iterations} iterations"),
+        _line("datum", f"{a.datum}; rank defect {a.defect}, {rank}"),
+        _line("observations", f"{a.observations} ({', '.join(observed)})"),
+        _line("unknowns", f"{a.unknowns} ({unknowns})"),
+        _line("constraints", f"{counts.constraints}"),
+        _line("redundancy", f"{a.redundancy}"),
+    ]
+    for words in a.undetermined:
+        lines += _wrapped(f"  NOT DETERMINED: {words}")
+    return lines
+
+
+def _sigma0(result: SurveyResult, statistics: Statistics) -> list[str]:
+    a, test = result.adjustment, statistics.global_test
+    lines = [
+        *_head("Sigma0 and global test"),
+        _line("sigma0", f"{a.sigma0_px:.5f} px, {sigma0_ratio(result):.3f} times the a priori one"),
+        _line("a priori", f"{a.a_priori_px / result.weight_factor:.5f} px"),
+        _line("residuals", f"RMS {a.rms_px:.5f} px per coordinate, longest {a.max_residual_px:.4f} px"),
+        _line(
+            "global test",
+            f"{'passed' if test.passed else 'NOT passed'}: v'Pv = {test.statistic:.2f}, chi-square of "
+            f"{test.redundancy} between {test.lower:.2f} and {test.upper:.2f} (95 %)",
+        ),
+    ]
+    if result.weight_factor != 1:
+        lines.append(
+            _line("weights", f"a priori sigmas times {result.weight_factor:.3f}, from their component")
+        )
+    return lines
+
+
+def _single_tests(result: SurveyResult, statistics: Statistics) -> list[str]:
+    r = result.adjustment.redundancy_numbers
+    lines = _head("Tests and reliability of image coordinates")
+    if not np.isfinite(r).any():
+        return [*lines, _line("", "not known, the adjustment has no covariance")]
+    lines += [
+        _line(
+            "redundancy numbers",
+            f"sum {np.nansum(r):.1f}, of all observations {statistics.redundancy_sum:.1f}; mean "
+            f"{np.nanmean(r):.3f}, smallest {np.nanmin(r):.3f}",
+        )
+    ]
+    for name, test in (("w test (Baarda)", statistics.w), ("tau test (Pope)", statistics.tau)):
+        lines.append(
+            _line(
+                name,
+                f"{test.beyond} of {test.tested} beyond {test.critical:.2f}, by chance {test.expected:.1f} "
+                f"({100 * test.alpha:.1f} %); largest {np.nanmax(np.abs(test.statistic)):.2f}",
+            )
+        )
+    found = statistics.reliability
+    bias, external = quantiles(found.minimal_bias), quantiles(found.external)
+    return [
+        *lines,
+        _line(
+            "minimal bias",
+            f"median {significant(bias[0])} px, largest {_or_none(bias[1])} px: gross error found with "
+            f"{100 * statistics.power:.0f} %",
+        ),
+        _line(
+            "external reliability",
+            f"median {significant(external[0])}, largest {_or_none(external[1])} sigmas of an unknown: "
+            "what it does if not found",
+        ),
+    ]
+
+
+def _components(result: SurveyResult, statistics: Statistics) -> list[str]:
+    lines = _head("Variance components: sigma0 of groups, a posteriori over a priori")
+    rows = _component_rows("kind", statistics.kinds)
+    rows += _component_rows("camera", statistics.cameras) if len(statistics.cameras.names) > 1 else []
+    photographs = _component_rows("photograph", statistics.photographs)
+    order = np.argsort(-np.nan_to_num(statistics.photographs.sigma0), kind="stable")
+    shown = [photographs[k] for k in order[:WORST]]
+    lines += _table(("", "group", "sigma0", "redundancy", "observations"), rows + shown, left=2)
+    if len(photographs) > WORST:
+        lines.append(f"  the {WORST} worst of {len(photographs)} photographs; all in variance_components.csv")
+    return lines
+
+
+def _component_rows(what: str, found: VarianceComponents) -> list[tuple[str, ...]]:
+    return [
+        (what, name, f"{s:.3f}" if np.isfinite(s) else "-", f"{r:.1f}", str(int(n)))
+        for name, s, r, n in zip(found.names, found.sigma0, found.redundancy, found.count, strict=True)
+    ]
+
+
+def _interior(result: SurveyResult, statistics: Statistics) -> list[str]:
+    a = result.adjustment
+    parameters = interior_parameters(a)
+    models = ", ".join(sorted({camera.model for camera in a.estimate.cameras}))
+    rows = []
+    for one in parameters[: 4 * MOST_ROWS]:
+        value, sigma = with_exponent(one.value, one.sigma)
+        ratio = abs(one.value) / one.sigma if one.sigma > 0 else np.nan
+        rows.append(
+            (one.owner, one.name, value, sigma, "" if one.unit == "1" else one.unit,
+             f"{ratio:.1f}" if np.isfinite(ratio) else "")
+        )  # fmt: skip
+    lines = _head(f"Interior orientation (model {models})")
+    lines += _table(("camera", "", "value", "sigma", "unit", "value/sigma"), rows, left=2)
+    if len(parameters) > len(rows):
+        lines.append(f"  and {len(parameters) - len(rows)} more, in cameras.csv")
+    weak = [f"{t.parameter} of {t.camera} (p {t.probability:.2f})" for t in statistics.significance
+            if not t.significant]  # fmt: skip
+    lines += _wrapped(f"  not significant (t test, 5 %): {', '.join(weak) or 'none'}")
+    pairs = [f"{pair.first} - {pair.second} {100 * pair.value:+.1f} %" for pair in statistics.correlations]
+    over = f"{100 * STRONG:.0f} %"
+    lines.append(f"  correlations over {over}: {len(pairs) or 'none'}")
+    lines += [line for pair in pairs[:MOST_ROWS] for line in _wrapped(f"    {pair}")]
+    if len(pairs) > MOST_ROWS:
+        lines.append(f"    and {len(pairs) - MOST_ROWS} more, in summary.json")
+    return lines
+
+
+def _points(result: SurveyResult) -> list[str]:
+    a = result.adjustment
+    sigma = point_sigmas(a)
+    limiting = np.sqrt(np.maximum(np.einsum("nii->ni", a.covariance.points_limiting), 0))
+    factor, unit = finer_unit(result.length_unit, float(np.nanmax(sigma, initial=0.0)))
+    rows = [
+        (name, *(significant(v * factor) for v in (*columns, over_all)), unit)
+        for name, columns, over_all in (
+            ("object points, RMS sigma", np.sqrt(np.nanmean(sigma**2, axis=0)), root_mean_square(sigma)),
+            ("object points, largest sigma", np.nanmax(sigma, axis=0), np.nanmax(sigma)),
+            (
+                "limiting (cameras without error), RMS",
+                np.sqrt(np.nanmean(limiting**2, axis=0)),
+                root_mean_square(limiting),
+            ),
+        )
+    ]
+    exterior = np.sqrt(np.einsum("nii->ni", a.covariance.exterior))
+    rows.append(
+        ("projection centres, RMS sigma", *(significant(v * factor) for v in _rms(exterior[:, :3])),
+         significant(root_mean_square(exterior[:, :3]) * factor), unit)
+    )  # fmt: skip
+    angles = np.degrees(exterior[:, 3:]) * 3600
+    rows.append(
+        ("omega, phi, kappa, RMS sigma", *(significant(v) for v in _rms(angles)),
+         significant(root_mean_square(angles)), 'arc seconds')
+    )  # fmt: skip
+    rms, _ = image_rms(a)
+    worst = int(np.nanargmax(rms))
+    return [
+        *_head("Precision of the unknowns"),
+        *_table(("", "X", "Y", "Z", "all", "unit"), rows, left=1),
+        f"  worst photograph: {a.network.images[worst]}, RMS residual {rms[worst]:.4f} px",
+    ]
+
+
+def _given(result: SurveyResult) -> list[str]:
+    """Control, differences at it, and scale bars."""
+    lines: list[str] = []
+    unit = result.length_unit
+    check, control, bars = (
+        result.control_check, control_residuals(result.adjustment), bar_residuals(result.adjustment)
+    )  # fmt: skip
+    if check is not None:
+        factor, finer = finer_unit(unit, float(np.abs(check.differences).max()))
+        rms = ", ".join(significant(v * factor) for v in check.rms)
+        lines.append(_line("check at control", f"RMS {rms} {finer} in X, Y, Z at {len(check.points)} points"))
+    if control is not None and np.isfinite(control.ratio).any():
+        size = np.nanmax(np.abs(control.ratio), axis=1, initial=0.0)
+        worst = int(np.argmax(size))
+        lines.append(
+            _line("control", f"largest residual {size[worst]:.2f} sigma at {control.points[worst]} of "
+                  f"{len(control.points)} points")
+        )  # fmt: skip
+    if bars is not None:
+        for b in range(min(len(bars.names), MOST_ROWS)):
+            factor, finer = finer_unit(unit, float(np.abs(bars.difference[b])))
+            lines.append(
+                _line(
+                    "scale bar",
+                    f"{bars.names[b][0]} - {bars.names[b][1]}: {bars.length[b]:.9g} {unit}, adjusted minus "
+                    f"given {significant(bars.difference[b] * factor)} {finer} ({bars.ratio[b]:+.2f} sigma)",
+                )
+            )
+        if len(bars.names) > MOST_ROWS:
+            lines.append(f"  and {len(bars.names) - MOST_ROWS} more, in summary.json")
+    return _head("Control and scale") + lines if lines else []
+
+
+def _worst(result: SurveyResult) -> list[str]:
+    found = worst_residuals(result.adjustment, WORST)
+    if not len(found.row):
+        return []
+    network = result.adjustment.network
+    seen = network.image_points
+    rows = [
+        (network.images[seen.image[k]], network.points[seen.point[k]], f"{v[0]:+.3f}", f"{v[1]:+.3f}",
+         f"{w:+.2f}", f"{tau:+.2f}")
+        for k, v, w, tau in zip(found.row, found.v, found.w, found.tau, strict=True)
+    ]  # fmt: skip
+    return _head(f"The {len(rows)} largest standardised residuals among the accepted") + _table(
+        ("photograph", "point", "vx [px]", "vy [px]", "w", "tau"), rows, left=2
+    )
+
+
+def _rms(values: FloatArray) -> FloatArray:
+    return np.asarray(np.sqrt(np.nanmean(values**2, axis=0)))
+
+
+def _or_none(value: float) -> str:
+    return "unlimited" if np.isinf(value) else significant(value)
+
+
+def _head(title: str) -> list[str]:
+    return ["", f"{title} ".ljust(WIDTH, "-")]
+
+
+def _line(name: str, text: str) -> str:
+    return f"  {name:<21} {text}"
+
+
+def _table(header: Sequence[str], rows: Iterable[Sequence[str]], *, left: int) -> list[str]:
+    """Return rows in columns; the first `left` ones set to the left, numbers to the right."""
+    cells = [tuple(header), *(tuple(row) for row in rows)]
+    widths = [min(max(len(row[c]) for row in cells), 40) for c in range(len(header))]
+    return [
+        "  "
+        + "  ".join(
+            f"{row[c][:40]:<{width}}" if c < left else f"{row[c]:>{width}}" for c, width in enumerate(widths)
+        )
+        for row in cells
+    ]
+
+
+def _wrapped(text: str) -> list[str]:
+    """Break a line between words; what follows stands behind its indentation."""
+    indent = " " * (len(text) - len(text.lstrip()) + 2)
+    lines, rest = [], text
+    while len(rest) > WIDTH:
+        cut = rest.rfind(" ", len(indent) + 1, WIDTH)
+        cut = WIDTH if cut < 0 else cut
+        lines.append(rest[:cut])
+        rest = indent + rest[cut:].strip()
+    return [*lines, rest]
