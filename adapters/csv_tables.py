@@ -44,6 +44,7 @@ class TableResult:
     position_covariance: FloatArray | None = None  # likewise of the projection centres, (m, 3, 3)
     interior_sigma: tuple[FloatArray, ...] | None = None  # of each parameter, NaN where fixed
     redundancy: int | None = None
+    unit: str = ""  # of lengths, as people call it; empty where nobody knows
 
 
 def read_result(folder: Path) -> TableResult:
@@ -78,6 +79,7 @@ def read_result(folder: Path) -> TableResult:
         None if position_sigma is None else np.eye(3) * position_sigma[:, None, :] ** 2,
         sigmas,
         summary.get("redundancy"),
+        str(summary.get("length_unit", "")),
     )
 
 
@@ -104,6 +106,7 @@ def write_tables(folder: Path, result: TableResult) -> None:
     summary: dict[str, Any] = {
         "survey": result.name,
         "redundancy": result.redundancy,
+        "length_unit": result.unit,
         "cameras": [
             {
                 "name": camera.name,
