@@ -13,6 +13,7 @@ from sfm.adjustment.datum import Datum
 from sfm.adjustment.marginal import marginal_of
 from sfm.adjustment.normals import normal_equations
 from sfm.adjustment.parameters import interior_names, start_weights, step, unknowns_of
+from sfm.adjustment.reduced import schur_complement
 from sfm.adjustment.separate import adjust_separately
 from sfm.adjustment.solve import adjust
 from sfm.adjustment.weighted import weighted_of
@@ -127,12 +128,13 @@ def test_normal_equations_equal_those_of_differences() -> None:
         J[:, s] = (moved[0] - 8 * moved[1] + 8 * moved[2] - moved[3]) / (12 * h)
     weighted = weighted_of(network, layout, use_control=True)
     weight = start_weights(layout, state)
-    normals = normal_equations(layout, weighted, state, weight)
+    equations = normal_equations(layout, weighted, state, weight)
     N = 100 * J.T @ J
     scale = 1 / np.sqrt(np.diagonal(N))
-    assert np.abs((np.triu(normals.S) - np.triu(N)) * scale[:, None] * scale).max() < 1e-8
+    S = schur_complement(equations, layout) / equations.parts.scale[:, None] / equations.parts.scale
+    assert np.abs((np.triu(S) - np.triu(N)) * scale[:, None] * scale).max() < 1e-8
     g = 100 * J.T @ residuals(layout.obs, state).ravel()
-    assert np.abs((normals.g - g) * scale).max() < 1e-7 * np.abs(g * scale).max()
+    assert np.abs((equations.parts.g - g) * scale).max() < 1e-7 * np.abs(g * scale).max()
 
 
 def _value(layout, state, column: int) -> float:  # type: ignore[no-untyped-def]
@@ -215,7 +217,7 @@ def test_tables_of_groups_are_as_long_as_the_parameters() -> None:
 def gradient(network: Network, estimate: Estimate) -> FloatArray:
     layout, state = unknowns_of(network, estimate, use_control=False)
     weighted = weighted_of(network, layout, use_control=False)
-    return normal_equations(layout, weighted, state, start_weights(layout, state)).g
+    return normal_equations(layout, weighted, state, start_weights(layout, state)).parts.g
 
 
 def test_gradient_vanishes_at_the_truth() -> None:

@@ -16,6 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
+from sfm.adjustment.kernel import kernel
 from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.distortion.models import MAX_PARAMETERS, observe
 
@@ -190,6 +191,16 @@ def whitening_of(covariance: FloatArray) -> FloatArray:
 
 def behind_camera(obs: Observations, state: State) -> BoolArray:
     """Return which image points belong to object points behind their camera or undetermined, (k,)."""
-    d = state.points[obs.point] - state.position[obs.image]
-    W = (state.M[obs.image, 2] * d).sum(axis=1)
-    return np.asarray(~(W < 0))
+    behind = np.empty(len(obs.image), dtype=np.bool_)
+    _behind(obs, state, behind)
+    return behind
+
+
+@kernel
+def _behind(obs, state, behind):  # type: ignore[no-untyped-def]
+    for o in range(len(behind)):
+        i, j = obs.image[o], obs.point[o]
+        W = 0.0
+        for p in range(3):
+            W += state.M[i, 2, p] * (state.points[j, p] - state.position[i, p])
+        behind[o] = not W < 0.0

@@ -13,10 +13,13 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numba import njit
 
+from sfm.adjustment.accumulate import times_points, times_reduced
 from sfm.adjustment.collinearity import collinearity, scratch
+from sfm.adjustment.inverse import Inverse, inverse_of
 from sfm.adjustment.iterate import Optimum
+from sfm.adjustment.kernel import kernel
+from sfm.adjustment.normals import solve_lower, solve_transposed
 from sfm.adjustment.parameters import Unknowns, angle_jacobian
 from sfm.adjustment.result import Covariance
 from sfm.conventions import FloatArray
@@ -28,46 +31,47 @@ ZERO = 1e-9  # variance over its limiting value below which a coordinate is one 
 class Cofactors:
     """Cofactor matrices (covariance for sigma0 = 1) in the datum of the adjustment, and what makes more."""
 
-    reduced: FloatArray  # of the reduced unknowns, any datum, (reduced, reduced)
-    cross: FloatArray  # of object points (rows) by reduced unknowns, any datum, (3 n, reduced)
+    exterior: FloatArray  # of X0, w of each photograph, any datum, (m, 6, 6)
+    border: FloatArray  # of interior unknowns and kept points, any datum, (i + 3 s, i + 3 s)
+    mixed: FloatArray  # of exterior by border unknowns, any datum, (6 m, i + 3 s)
     points: FloatArray  # of each object point, any datum, (n, 3, 3)
     limiting: FloatArray  # of each object point with the cameras fixed, (n, 3, 3)
+    cross: FloatArray  # of the object point by the photograph of each image point, any datum, (k, 3, 6)
+    cross_border: FloatArray  # of each object point by the border, any datum, (n, 3, i + 3 s)
     F_reduced: FloatArray  # (B'H)^-1 B'Q of the reduced unknowns, (d, reduced)
     F_points: FloatArray  # the same of object points, (n, d, 3)
     G: FloatArray  # (B'H)^-1 B'QB (H'B)^-1, (d, d)
 
+    @property
+    def has_cross(self) -> bool:
+        """Whether those between points and photographs are there."""
+        return len(self.cross) > 0
 
-def cofactors(optimum: Optimum, layout: Unknowns) -> Cofactors:
-    """Return the cofactors of all unknowns at an optimum.
+
+def cofactors(optimum: Optimum, layout: Unknowns, *, cross: bool = True) -> Cofactors:
+    """Return the cofactors at an optimum.
 
     Args:
         optimum: undamped normal equations and their factor.
         layout: order of the unknowns.
+        cross: whether those between points and photographs are wanted; empty otherwise.
     """
-    b = optimum.normals.blocks
-    n = len(b.L)
-    Qcc = optimum.factor.inverse()
-    free = layout.reduced_free().astype(float)
-    Qcc *= free[:, None] * free
-    Li = np.asarray(np.linalg.inv(b.L))
-    Z = b.Yt @ Qcc
-    cross = -_points_product(Li, Z)
-    core = b.Yt.reshape(n, 3, -1) @ np.swapaxes(Z.reshape(n, 3, -1), 1, 2)
-    limiting = np.swapaxes(Li, 1, 2) @ Li
-    points = np.swapaxes(Li, 1, 2) @ (np.eye(3) + core) @ Li
-    first = layout.kept_start
+    b = optimum.equations.blocks
+    q = inverse_of(optimum.equations, optimum.factor, layout, cross=cross)
+    first = 6 * len(b.U)
+    limiting = _inverse_of_squares(b.L)
+    points = limiting + _twice_solved(b.L, q.core)
     for s, j in enumerate(layout.kept):
-        own = slice(first + 3 * s, first + 3 * s + 3)
-        cross[3 * j : 3 * j + 3] = Qcc[own]
-        points[j] = Qcc[own, own]
+        own = slice(layout.kept_start - first + 3 * s, layout.kept_start - first + 3 * s + 3)
+        points[j] = q.border[own, own]
         # a point that lost all its rays to the test has no precision by rays; it is held as others are
         limiting[j] = np.linalg.inv(b.V[j]) if np.linalg.matrix_rank(b.V[j]) == 3 else 0.0
     mask = layout.point_free.astype(float)
     points *= mask[:, :, None] * mask[:, None, :]
     limiting *= mask[:, :, None] * mask[:, None, :]
-    cross *= mask.reshape(-1, 1)
-    F_c, F_p, G = _datum_terms(optimum, layout, Qcc, cross, limiting)
-    return Cofactors(Qcc, cross, points, limiting, F_c, F_p, G)
+    rays, inner = _cross(layout, q, b.L, mask)
+    F_c, F_p, G = _datum_terms(optimum, layout, limiting)
+    return Cofactors(q.exterior, q.border, q.mixed, points, limiting, rays, inner, F_c, F_p, G)
 
 
 def marginal_covariance(
@@ -83,25 +87,21 @@ def marginal_covariance(
     """
     H, P = optimum.motions.reduced, optimum.motions.points
     F, G = cofactors.F_reduced, cofactors.G
-    FP = cofactors.F_points
-    half = P @ FP
-    points = cofactors.points - half - np.swapaxes(half, 1, 2) + P @ G @ np.swapaxes(P, 1, 2)
+    points = _in_datum(cofactors.points, P, cofactors.F_points, G)
     fixed = np.diagonal(points, axis1=1, axis2=2) <= ZERO * np.diagonal(cofactors.limiting, axis1=1, axis2=2)
     points[fixed] = 0.0
     np.swapaxes(points, 1, 2)[fixed] = 0.0
-    m = len(layout.exterior_free)
+    m, d = len(layout.exterior_free), len(G)
     T = np.zeros((m, 6, 6))
     T[:, :3, :3] = np.eye(3)
     T[:, 3:, 3:] = angle_jacobian(optimum.state.M)
-    exterior = np.empty((m, 6, 6))
-    for i in range(m):
-        own = slice(6 * i, 6 * i + 6)
-        exterior[i] = _in_datum(cofactors.reduced[own, own], H[own], F[:, own], G)
+    of_exterior = np.moveaxis(F[:, : 6 * m].reshape(d, m, 6), 1, 0)
+    exterior = _in_datum(cofactors.exterior, H[: 6 * m].reshape(m, 6, d), of_exterior, G)
     exterior = T @ exterior @ np.swapaxes(T, 1, 2)
-    interior = [
-        variance * _in_datum(cofactors.reduced[np.ix_(own, own)], H[own], F[:, own], G)
-        for own in layout.interior_column
-    ]
+    interior = []
+    for own in layout.interior_column:
+        Q = cofactors.border[np.ix_(own - 6 * m, own - 6 * m)]
+        interior.append(variance * _in_datum(Q[None], H[own][None], F[:, own][None], G)[0])
     return Covariance(variance * points, variance * exterior, tuple(interior), variance * cofactors.limiting)
 
 
@@ -113,20 +113,20 @@ def hat_complement(
     For an image point without weight it is I + A Q A', the cofactor of its predicted residual.
 
     Args:
-        optimum, layout, cofactors: of one adjustment.
+        optimum, layout, cofactors: of one adjustment; with cross-cofactors.
         weight: factor on the weight of each image point, shape (k,).
 
     Returns:
         Cofactors of the whitened residuals, shape (k, 2, 2); NaN behind the camera.
     """
-    return _complement(
-        layout.obs,
-        optimum.state,
-        weight,
-        cofactors.reduced,
-        cofactors.cross,
-        cofactors.points,
-    )
+    Q, t, out = cofactors, scratch(), np.empty((len(weight), 2, 2))
+    mixed = Q.mixed.reshape(len(Q.exterior), 6, -1)
+    space = np.empty((2, 9 + t.Jp.shape[1])), np.empty((9 + t.Jp.shape[1], 9 + t.Jp.shape[1]))
+    _complement(
+        layout.obs, optimum.state, weight, Q.exterior, mixed, Q.border, Q.points, Q.cross, Q.cross_border,
+        t, *space, out,
+    )  # fmt: skip
+    return out
 
 
 def without_held(covariance: Covariance, layout: Unknowns) -> Covariance:
@@ -140,87 +140,108 @@ def without_held(covariance: Covariance, layout: Unknowns) -> Covariance:
 
 
 def _in_datum(Q: FloatArray, H: FloatArray, F: FloatArray, G: FloatArray) -> FloatArray:
+    """Return Q - H F - (H F)' + H G H' of many blocks at once."""
     half = H @ F
-    return np.asarray(Q - half - half.T + H @ G @ H.T)
+    return np.asarray(Q - half - np.swapaxes(half, 1, 2) + H @ G @ np.swapaxes(H, 1, 2))
 
 
 def _datum_terms(
-    optimum: Optimum, layout: Unknowns, Qcc: FloatArray, cross: FloatArray, limiting: FloatArray
+    optimum: Optimum, layout: Unknowns, limiting: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return (B'H)^-1 B'Q and (B'H)^-1 B'QB (H'B)^-1; kept points appear in B of the points only."""
-    motions, b = optimum.motions, optimum.normals.blocks
+    motions, b = optimum.motions, optimum.equations.blocks
     n, d = len(b.L), motions.defect
     B = motions.constraints
-    on_kept = np.zeros((layout.reduced, d))
-    on_kept[layout.kept_start :] = B[layout.kept].reshape(3 * len(layout.kept), d)
-    on_reduced = motions.on_reduced + on_kept
+    on_reduced = motions.on_reduced.copy()
+    on_reduced[layout.kept_start :] += B[layout.kept].reshape(3 * len(layout.kept), d)
     eliminated = np.array(B)
     eliminated[layout.kept] = 0.0
-    flat = eliminated.reshape(3 * n, d)
-    BQ_c = on_reduced.T @ Qcc + flat.T @ cross
+    # B'Q_c = (B_c - Y L^-1 B_p)' S^-1
+    through = np.zeros((layout.reduced, d))
+    times_points(layout.obs, b, solve_lower(b.L, eliminated), through)
+    free = layout.reduced_free()[:, None]
+    QB_c = optimum.factor.solve((on_reduced - through) * free) * free
     # Q_pp B_p = V^-1 B_p - L^-T Y' (Q_cp B_p), with Q_cp of all points together
-    through = -(b.Yt @ BQ_c.T).reshape(n, 3, d)
-    Li = np.linalg.inv(b.L)
-    BQ_p = np.swapaxes(limiting @ eliminated + np.swapaxes(Li, 1, 2) @ through, 1, 2)
-    for s, j in enumerate(layout.kept):
-        own = slice(layout.kept_start + 3 * s, layout.kept_start + 3 * s + 3)
-        BQ_p[j] = BQ_c[:, own]
-    BQ_p = BQ_p * layout.point_free[:, None, :]
-    BQB = np.einsum("jda,jae->de", BQ_p, eliminated) + BQ_c @ on_reduced
+    YQB = np.empty((n, 3, d))
+    times_reduced(layout.obs, b, np.ascontiguousarray(QB_c), YQB)
+    QB_p = limiting @ eliminated - solve_transposed(b.L, YQB)
+    QB_p[layout.kept] = QB_c[layout.kept_start :].reshape(len(layout.kept), 3, d)
+    QB_p *= layout.point_free[:, :, None]
+    BQB = np.einsum("jad,jae->de", QB_p, eliminated) + QB_c.T @ on_reduced
     inverse = motions.inverse
-    return inverse @ BQ_c, inverse @ BQ_p, inverse @ BQB @ inverse.T
+    return inverse @ QB_c.T, inverse @ np.swapaxes(QB_p, 1, 2), inverse @ BQB @ inverse.T
 
 
-def _points_product(Li: FloatArray, Z: FloatArray) -> FloatArray:
-    """Return L^-T times the three rows of every point, (3 n, reduced)."""
-    n = len(Li)
-    return np.asarray((np.swapaxes(Li, 1, 2) @ Z.reshape(n, 3, -1)).reshape(3 * n, -1))
+def _cross(layout: Unknowns, q: Inverse, L: FloatArray, mask: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return Q_pc = -L^-T Y'S^-1 of each image point and of each object point by the border."""
+    if len(q.YQ) == 0:
+        return q.YQ, q.YQ_border
+    point, first = layout.obs.point, 6 * len(q.exterior)
+    rays = -solve_transposed(L[point], q.YQ) * mask[point][:, :, None]
+    inner = -solve_transposed(L, q.YQ_border) * mask[:, :, None]
+    mixed = q.mixed.reshape(len(q.exterior), 6, -1)
+    for s, j in enumerate(layout.kept):
+        own = slice(layout.kept_start - first + 3 * s, layout.kept_start - first + 3 * s + 3)
+        seen = slice(layout.obs.start[j], layout.obs.start[j + 1])
+        rays[seen] = np.swapaxes(mixed[layout.obs.image[seen], :, own], 1, 2)
+        inner[j] = q.border[own]
+    return rays, inner
 
 
-@njit(cache=True)
-def _complement(obs, state, weight, Qcc, cross, points):  # type: ignore[no-untyped-def]
-    t = scratch()
-    out = np.empty((len(obs.image), 2, 2))
-    column = np.empty(t.A.shape[1], dtype=np.int64)
-    J = np.empty(t.A.shape)
+def _twice_solved(L: FloatArray, core: FloatArray) -> FloatArray:
+    """Return L^-T core L^-1 of every point, (n, 3, 3)."""
+    return solve_transposed(L, np.swapaxes(solve_transposed(L, core), 1, 2))
+
+
+def _inverse_of_squares(L: FloatArray) -> FloatArray:
+    """Return (L L')^-1 of every point, (n, 3, 3)."""
+    Li = solve_lower(L, np.broadcast_to(np.eye(3), L.shape))
+    return np.asarray(np.swapaxes(Li, 1, 2) @ Li)
+
+
+@kernel
+def _complement(obs, state, weight, exterior, mixed, border, points, cross, cross_border, t, J, Q, out):  # type: ignore[no-untyped-def]
+    """Fill I - J Q J' of each image point, J and Q of its own unknowns: X0, w, X, free interior ones."""
+    first = 6 * len(obs.camera)
     for o in range(len(obs.image)):
         i, j = obs.image[o], obs.point[o]
         a = obs.camera[i]
         f = obs.free_count[a]
         used = weight[o] > 0.0
-        if not collinearity(o, obs, state, weight[o] if used else 1.0, t):
-            out[o] = np.nan
-            continue
+        in_front = collinearity(o, obs, state, weight[o] if used else 1.0, t)
+        for row in range(2):
+            for p in range(6):
+                J[row, p] = t.A[row, p]
+            for p in range(3):
+                J[row, 6 + p] = t.B[row, p]
+            for p in range(f):
+                J[row, 9 + p] = t.A[row, 6 + obs.free_index[a, p]]
         for p in range(6):
-            column[p] = 6 * i + p
-            J[0, p], J[1, p] = t.A[0, p], t.A[1, p]
-        for p in range(f):
-            column[6 + p] = obs.free_column[a, p]
-            s = 6 + obs.free_index[a, p]
-            J[0, 6 + p], J[1, 6 + p] = t.A[0, s], t.A[1, s]
-        h00, h01, h11 = 0.0, 0.0, 0.0
-        for p in range(6 + f):
-            s0, s1 = 0.0, 0.0
-            for q in range(6 + f):
-                value = Qcc[column[p], column[q]]
-                s0 += value * J[0, q]
-                s1 += value * J[1, q]
-            h00 += J[0, p] * s0
-            h01 += J[0, p] * s1
-            h11 += J[1, p] * s1
+            for q in range(6):
+                Q[p, q] = exterior[i, p, q]
             for q in range(3):
-                value = cross[3 * j + q, column[p]]
-                h00 += 2.0 * J[0, p] * value * t.B[0, q]
-                h01 += J[0, p] * value * t.B[1, q] + J[1, p] * value * t.B[0, q]
-                h11 += 2.0 * J[1, p] * value * t.B[1, q]
+                Q[p, 6 + q] = cross[o, q, p]
+            for q in range(f):
+                Q[p, 9 + q] = mixed[i, p, obs.free_column[a, q] - first]
         for p in range(3):
             for q in range(3):
-                h00 += t.B[0, p] * points[j, p, q] * t.B[0, q]
-                h01 += t.B[0, p] * points[j, p, q] * t.B[1, q]
-                h11 += t.B[1, p] * points[j, p, q] * t.B[1, q]
+                Q[6 + p, 6 + q] = points[j, p, q]
+            for q in range(f):
+                Q[6 + p, 9 + q] = cross_border[j, p, obs.free_column[a, q] - first]
+        for p in range(f):
+            for q in range(p, f):
+                Q[9 + p, 9 + q] = border[obs.free_column[a, p] - first, obs.free_column[a, q] - first]
+        h00, h01, h11 = 0.0, 0.0, 0.0
+        for p in range(9 + f):
+            x, y = 0.5 * Q[p, p] * J[0, p], 0.5 * Q[p, p] * J[1, p]
+            for q in range(p + 1, 9 + f):
+                x += Q[p, q] * J[0, q]
+                y += Q[p, q] * J[1, q]
+            h00 += 2.0 * J[0, p] * x
+            h01 += J[0, p] * y + J[1, p] * x
+            h11 += 2.0 * J[1, p] * y
         sign = -1.0 if used else 1.0
-        out[o, 0, 0] = 1.0 + sign * h00
-        out[o, 0, 1] = sign * h01
-        out[o, 1, 0] = sign * h01
-        out[o, 1, 1] = 1.0 + sign * h11
-    return out
+        out[o, 0, 0] = 1.0 + sign * h00 if in_front else np.nan
+        out[o, 0, 1] = sign * h01 if in_front else np.nan
+        out[o, 1, 0] = out[o, 0, 1]
+        out[o, 1, 1] = 1.0 + sign * h11 if in_front else np.nan

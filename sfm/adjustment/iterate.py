@@ -13,12 +13,15 @@ veto; Nielsen (1999), IMM-REP-1999-05, for the damping.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NoReturn
 
 import numpy as np
 
+from sfm.adjustment.banded import BandFactor, factor_band
 from sfm.adjustment.collinearity import State, sum_of_squares
+from sfm.adjustment.connectivity import Order, band_order
 from sfm.adjustment.datum import Datum, Motions, motions_of
-from sfm.adjustment.normals import Blocks, Normals, new_blocks, normal_equations, point_step
+from sfm.adjustment.normals import Blocks, Equations, new_blocks, normal_equations, point_step
 from sfm.adjustment.parameters import Unknowns, step
 from sfm.adjustment.reduced import Factor, factor
 from sfm.adjustment.weighted import Weighted, weighted_vPv
@@ -32,6 +35,9 @@ SHORTEST = 2.0**-12  # shortest share of a Gauss-Newton step that is tried
 START_DAMPING = 1e-3  # share of the diagonal
 NEAR = 1e-2  # |A dx| / |v| below which Levenberg-Marquardt hands over to Gauss-Newton
 MAX_DAMPING = 1e10
+ROUNDING = 1e-12  # relative difference of two sums of the same squares in another order
+COARSE = 1e-2  # |A dx| / |v| down to which steps may come from a product in single precision
+SINGLE_FROM = 400  # reduced unknowns from which the product in single precision saves time
 METHODS = ("gauss-newton", "levenberg-marquardt", "undamped")
 
 
@@ -40,96 +46,178 @@ class Optimum:
     """Where an iteration ended, with the undamped normal equations of its last step."""
 
     state: State
-    normals: Normals
-    factor: Factor
+    equations: Equations
+    factor: Factor | BandFactor
     motions: Motions
     converged: bool
     iterations: int
     vPv: float
 
 
+@dataclass(frozen=True)
+class Problem:
+    """What stays the same over all steps and rounds of an adjustment."""
+
+    layout: Unknowns  # order of the unknowns
+    weighted: Weighted  # observed unknowns
+    datum: Datum  # kind and points
+    space: Blocks  # for the normal equations, used again and again
+    order: Order | None  # of the photographs in a banded matrix; None: full matrix
+
+
+@dataclass(frozen=True)
+class Step:
+    """A step in the datum and what it was taken from."""
+
+    equations: Equations
+    factor: Factor | BandFactor
+    motions: Motions
+    reduced: FloatArray  # of the reduced unknowns, (reduced,)
+    points: FloatArray  # of the object points, (n, 3)
+    predicted: float  # g'N^-1 g = |A dx|^2 without damping
+
+    def within(self, share: float) -> bool:
+        """Whether |A dx| is at most this share of |v|, or MIN_SHIFT."""
+        return bool(np.sqrt(self.predicted) <= max(share * np.sqrt(self.equations.vPv), MIN_SHIFT))
+
+
+def problem_of(layout: Unknowns, weighted: Weighted, datum: Datum) -> Problem:
+    """Return what all steps of an adjustment have in common; chooses full or banded normal equations."""
+    return Problem(layout, weighted, datum, new_blocks(layout), band_order(layout))
+
+
 def iterate(
-    layout: Unknowns,
-    weighted: Weighted,
+    problem: Problem,
     state: State,
     weight: FloatArray,
-    datum: Datum,
     *,
     method: str = "gauss-newton",
     max_iterations: int = 50,
     tolerance: float = TOLERANCE,
+    near: bool = False,
 ) -> Optimum:
     """Return the state of least weighted sum of squares.
 
     Args:
-        layout: order of the unknowns.
-        weighted: observed unknowns.
+        problem: what is adjusted.
         state: where to start.
         weight: factor on the weight of each image point, shape (k,).
-        datum: kind and points.
         method: gauss-newton, levenberg-marquardt, or undamped (Gauss-Newton with full steps, to compare).
         max_iterations: steps to try at most.
         tolerance: |A dx| / |v| at which the iteration has converged.
+        near: whether the start is near the optimum, so that no step is taken in single precision.
 
     Raises:
-        GeometryError: unknown method.
+        GeometryError: unknown method, or start values whose normal equations cannot be solved.
     """
     if method not in METHODS:
         raise GeometryError(f"adjustment: method '{method}' is none of {', '.join(METHODS)}")
-    space = new_blocks(layout)
+    layout = problem.layout
+    single = problem.order is None and layout.reduced >= SINGLE_FROM and not near
     taken = 0
     if method == "levenberg-marquardt":
-        state, taken = _approach(layout, weighted, state, weight, datum, max_iterations, space)
-    converged = False
+        state, taken = _approach(problem, state, weight, max_iterations, single)
+        single = False
+    share = 1.0
+    before: tuple[State, Step] | None = None
+    shortest = 1.0 if method == "undamped" else SHORTEST
     while True:
-        normals = normal_equations(layout, weighted, state, weight, space=space)
-        motions = motions_of(layout, weighted, state, datum)
-        factored = factor(normals, motions)
-        if factored is None:
-            raise GeometryError("adjustment: the normal equations cannot be solved from these start values")
-        reduced, points, predicted = _newton_step(normals, factored, motions, layout)
-        converged = np.sqrt(predicted) <= max(tolerance * np.sqrt(normals.vPv), MIN_SHIFT)
-        vPv = normals.vPv
-        if converged:
-            moved = step(layout, state, reduced, points)
-            reached = total(layout, weighted, moved, weight)
-            if reached <= vPv:
-                state, vPv = moved, reached
-            break
-        if taken >= max_iterations:
+        found = _solve(problem, state, weight, single=single)
+        if found is None:
+            if before is None:
+                _refuse(problem, state)
+            start, tried = before
+            better = _line_search(problem, start, weight, tried, share / 2, shortest)
+            if better is None:  # no share of the last step leads where they can be solved
+                state, found = start, _solve(problem, start, weight)
+                break
+            state, share = better
+            continue
+        if found.within(tolerance) or taken >= max_iterations:
             break
         taken += 1
-        shortest = 1.0 if method == "undamped" else SHORTEST
-        wanted = -np.inf if method == "undamped" else predicted
-        found, reached = _line_search(layout, weighted, state, weight, reduced, points, vPv, wanted, shortest)
-        if found is None:
+        single = single and not found.within(COARSE)
+        better = _line_search(problem, state, weight, found, 1.0, shortest)
+        if better is None:
             break
-        state, vPv = found, reached
-    return Optimum(state, normals, factored, motions, bool(converged), taken, vPv)
+        before = state, found
+        state, share = better
+    if found is None:
+        _refuse(problem, state)
+    converged, vPv = found.within(tolerance), found.equations.vPv
+    if converged:
+        moved = step(layout, state, found.reduced, found.points)
+        reached = total(problem, moved, weight)
+        if reached <= vPv * (1 + ROUNDING):
+            state, vPv = moved, reached
+    return Optimum(state, found.equations, found.factor, found.motions, converged, taken, vPv)
+
+
+def _refuse(problem: Problem, state: State) -> NoReturn:
+    """Say why the normal equations of the start values cannot be solved."""
+    motions_of(problem.layout, problem.weighted, state, problem.datum)  # if the datum is the reason
+    raise GeometryError("adjustment: the normal equations cannot be solved from these start values")
+
+
+def optimum_at(problem: Problem, state: State, weight: FloatArray) -> Optimum | None:
+    """Return the normal equations at a state that is taken as the optimum; None if they cannot be solved."""
+    found = _solve(problem, state, weight)
+    if found is None:
+        return None
+    return Optimum(state, found.equations, found.factor, found.motions, True, 0, found.equations.vPv)
+
+
+def _solve(
+    problem: Problem, state: State, weight: FloatArray, *, damping: float = 0.0, single: bool = False
+) -> Step | None:
+    """Return the step from a state; None where the normal equations cannot be solved.
+
+    Args:
+        problem: what is adjusted.
+        state: where the step starts.
+        weight: factor on the weight of each image point, shape (k,).
+        damping: share of its diagonal added to the normal matrix.
+        single: whether single precision will do while the step is far from convergence.
+    """
+    p, layout = problem, problem.layout
+    equations = normal_equations(layout, p.weighted, state, weight, damping=damping, space=p.space)
+    if not (np.isfinite(equations.vPv) and np.isfinite(equations.parts.g).all()):
+        return None
+    try:
+        motions = motions_of(layout, p.weighted, state, p.datum)
+    except GeometryError:  # the datum points have fallen together on the way
+        return None
+    for coarse in (True, False) if single else (False,):
+        factored: Factor | BandFactor | None
+        if p.order is not None:
+            factored = factor_band(equations, layout, motions, p.order, damped=damping > 0)
+        else:
+            factored = factor(equations, layout, motions, damped=damping > 0, single=coarse)
+        if factored is None:
+            continue
+        reduced = -factored.solve(equations.parts.g)
+        points = point_step(equations, reduced, layout)
+        y = equations.blocks.y.ravel()
+        predicted = max(float(y @ y - equations.parts.g @ reduced), 0.0)
+        found = Step(equations, factored, motions, *motions.transform(reduced, points), predicted)
+        if not (coarse and found.within(COARSE)):
+            return found
+    return None
 
 
 def _approach(
-    layout: Unknowns,
-    weighted: Weighted,
-    state: State,
-    weight: FloatArray,
-    datum: Datum,
-    max_iterations: int,
-    space: Blocks,
+    problem: Problem, state: State, weight: FloatArray, max_iterations: int, single: bool
 ) -> tuple[State, int]:
     """Return a state near the optimum by Levenberg-Marquardt, and how many steps were tried."""
     damping, growth = START_DAMPING, 2.0
     for taken in range(max_iterations):
-        normals = normal_equations(layout, weighted, state, weight, damping=damping, space=space)
-        motions = motions_of(layout, weighted, state, datum)
-        factored = factor(normals, motions, damped=True)
+        found = _solve(problem, state, weight, damping=damping, single=single)
         gain = -1.0
-        if factored is not None:
-            reduced, points, predicted = _newton_step(normals, factored, motions, layout)
-            if np.sqrt(predicted) <= max(NEAR * np.sqrt(normals.vPv), MIN_SHIFT):
+        if found is not None:
+            if found.within(NEAR):
                 return state, taken
-            moved = step(layout, state, reduced, points)
-            gain = (normals.vPv - total(layout, weighted, moved, weight)) / predicted
+            moved = step(problem.layout, state, found.reduced, found.points)
+            gain = (found.equations.vPv - total(problem, moved, weight)) / found.predicted
         if gain > ARMIJO:
             state = moved
             damping *= max(1 / 10, 1 - (2 * gain - 1) ** 3)
@@ -142,40 +230,31 @@ def _approach(
     return state, max_iterations
 
 
-def total(layout: Unknowns, weighted: Weighted, state: State, weight: FloatArray) -> float:
+def total(problem: Problem, state: State, weight: FloatArray) -> float:
     """Return v'Pv of image points and observed unknowns; infinite if a point is behind a camera."""
-    return float(sum_of_squares(layout.obs, state, weight)) + weighted_vPv(weighted, layout, state)
-
-
-def _newton_step(
-    normals: Normals, factored: Factor, motions: Motions, layout: Unknowns
-) -> tuple[FloatArray, FloatArray, float]:
-    """Return the step in the datum and g'N^-1 g = |A dx|^2."""
-    reduced = -factored.solve(normals.g)
-    points = point_step(normals, reduced, layout)
-    y = normals.blocks.y.ravel()
-    predicted = float(y @ y - normals.g @ reduced)
-    reduced, points = motions.transform(reduced, points)
-    return reduced, points, max(predicted, 0.0)
+    p = problem
+    return sum_of_squares(p.layout.obs, state, weight) + weighted_vPv(p.weighted, p.layout, state)
 
 
 def _line_search(
-    layout: Unknowns,
-    weighted: Weighted,
-    state: State,
-    weight: FloatArray,
-    reduced: FloatArray,
-    points: FloatArray,
-    vPv: float,
-    predicted: float,
-    shortest: float,
-) -> tuple[State | None, float]:
-    """Return the first of the steps 1, 1/2, 1/4 ... that meets Armijo's condition; None if none does."""
-    share = 1.0
+    problem: Problem, state: State, weight: FloatArray, found: Step, share: float, shortest: float
+) -> tuple[State, float] | None:
+    """Return where the first of the shares 1, 1/2, 1/4 ... to meet Armijo's condition leads, and it.
+
+    Args:
+        problem: what is adjusted.
+        state: where the step starts.
+        weight: factor on the weight of each image point, shape (k,).
+        found: the step.
+        share: first share to try.
+        shortest: last share to try; 1 takes the full step whatever it brings, if it can be computed.
+    """
+    wanted = -np.inf if shortest == 1.0 else 2 * ARMIJO * found.predicted
+    before = found.equations.vPv * (1 + ROUNDING)
     while share >= shortest:
-        moved = step(layout, state, share * reduced, share * points)
-        reached = total(layout, weighted, moved, weight)
-        if np.isfinite(reached) and reached <= vPv - 2 * ARMIJO * share * predicted:
-            return moved, reached
+        moved = step(problem.layout, state, share * found.reduced, share * found.points)
+        reached = total(problem, moved, weight)
+        if np.isfinite(reached) and reached <= before - share * wanted:
+            return moved, share
         share /= 2
-    return None, vPv
+    return None

@@ -12,13 +12,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from sfm.adjustment.accumulate import times_points
 from sfm.adjustment.covariance import Cofactors, cofactors, marginal_covariance, without_held
 from sfm.adjustment.datum import Datum, motions_of
-from sfm.adjustment.iterate import Optimum
-from sfm.adjustment.normals import normal_equations
+from sfm.adjustment.iterate import Optimum, optimum_at, problem_of
+from sfm.adjustment.normals import solve_lower
 from sfm.adjustment.parameters import Unknowns, unknowns_of
 from sfm.adjustment.rank import reduced_names
-from sfm.adjustment.reduced import factor
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.weighted import Weighted, weighted_of
 from sfm.conventions import FloatArray, IntArray
@@ -49,26 +49,29 @@ class Marginal:
         Returns:
             Covariance in this order, X Y Z of each point, shape (u + 3 p, u + 3 p).
         """
-        Q, b, motions = self.cofactors, self.optimum.normals.blocks, self.optimum.motions
+        Q, b, motions = self.cofactors, self.optimum.equations.blocks, self.optimum.motions
+        obs, first, u = self.layout.obs, self.layout.kept_start, len(unknowns)
         rows = (3 * np.asarray(points)[:, None] + np.arange(3)).ravel()
-        Li = np.linalg.inv(b.L[points])
-        width = b.Yt.shape[1]
-        YL = (np.swapaxes(Li, 1, 2) @ b.Yt[rows].reshape(len(points), 3, width)).reshape(len(rows), width)
-        between = -YL @ Q.cross[rows].T  # L^-T Y' S^-1 Y L^-1
+        # dx of each as a linear function of the reduced unknowns: themselves, or -L^-T Y' of a point
+        h = np.zeros((len(b.L), 3, len(rows)))
+        h.reshape(3 * len(h), len(rows))[rows, np.arange(len(rows))] = 1.0
+        through = np.zeros((self.layout.reduced, len(rows)))
+        times_points(obs, b, solve_lower(b.L, h), through)
+        E = np.zeros((self.layout.reduced, u + len(rows)))
+        E[unknowns, np.arange(u)] = 1.0
+        E[:, u:] = -through
         for s, j in enumerate(points):
-            own = slice(3 * s, 3 * s + 3)
             kept = np.flatnonzero(self.layout.kept == j)
             if len(kept):
-                first = self.layout.kept_start + 3 * int(kept[0])
-                between[own] = Q.cross[rows][:, first : first + 3].T
-                between[:, own] = between[own].T
-            between[own, own] = Q.points[j]
-        cofactor = np.block(
-            [
-                [Q.reduced[np.ix_(unknowns, unknowns)], Q.cross[np.ix_(rows, unknowns)].T],
-                [Q.cross[np.ix_(rows, unknowns)], between],
-            ]
-        )
+                place = first + 3 * int(kept[0])
+                E[:, u + 3 * s : u + 3 * s + 3] = 0.0
+                E[place : place + 3, u + 3 * s : u + 3 * s + 3] = np.eye(3)
+        E *= self.layout.reduced_free()[:, None]
+        E[:, u:] *= self.layout.point_free[points].ravel()
+        cofactor = E.T @ self.optimum.factor.solve(E)
+        for s, j in enumerate(points):
+            own = slice(u + 3 * s, u + 3 * s + 3)
+            cofactor[own, own] = Q.points[j]
         H = np.vstack([motions.reduced[unknowns], motions.points[points].reshape(len(rows), motions.defect)])
         F = np.hstack(
             [
@@ -98,12 +101,10 @@ def marginal_of(adjustment: Adjustment, *, datum: Datum | None = None) -> Margin
     layout, state = unknowns_of(adjustment.network, adjustment.estimate, use_control=use_control)
     weighted = weighted_of(adjustment.network, layout, use_control=use_control)
     weight = np.ascontiguousarray(adjustment.weights[layout.order])
-    normals = normal_equations(layout, weighted, state, weight)
-    motions = motions_of(layout, weighted, state, datum)
-    factored = factor(normals, motions)
-    if factored is None:
+    optimum = optimum_at(problem_of(layout, weighted, datum), state, weight)
+    if optimum is None:
+        motions_of(layout, weighted, state, datum)  # says so if the datum is the reason
         raise GeometryError("adjustment: its normal equations cannot be solved")
-    optimum = Optimum(state, normals, factored, motions, adjustment.converged, 0, normals.vPv)
     return Marginal(adjustment, layout, weighted, optimum, cofactors(optimum, layout))
 
 

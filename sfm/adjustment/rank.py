@@ -21,8 +21,8 @@ def rank_defect(optimum: Optimum, layout: Unknowns) -> int:
     It counts the motions that the normal matrix maps to zero, its further null vectors, directions of
     object points that their rays leave open, and the unknowns held for want of image points.
     """
-    found = optimum.factor.verified(optimum.normals) + optimum.factor.further.shape[1]
-    return found + int(optimum.normals.blocks.held.sum()) + layout.held_defect
+    found = optimum.factor.verified() + optimum.factor.further.shape[1]
+    return found + int(optimum.equations.blocks.held.sum()) + layout.held_defect
 
 
 def undetermined_of(
@@ -39,7 +39,7 @@ def undetermined_of(
     words = list(layout.held)
     words += [
         f"point {network.points[j]}: its rays are parallel"
-        for j in np.flatnonzero(optimum.normals.blocks.held)
+        for j in np.flatnonzero(optimum.equations.blocks.held)
     ]
     if optimum.motions.defect > allowed_motions:
         words.append(

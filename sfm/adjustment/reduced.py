@@ -1,4 +1,4 @@
-"""The reduced normal equations factored: scaled, with the open motions of the datum held, undamped.
+"""The reduced normal matrix in full and factored: scaled, with the open motions of the datum held, undamped.
 
 With scaled S and an orthonormal basis Q of its null space, S + QQ' is positive definite and its
 solution is the one with Q'dx = 0: an inner constraint, not damping. Directions that the observations
@@ -10,19 +10,25 @@ Source: Foerstner and Wrobel (2016), sec. 4.5; Luhmann et al. (2020), sec. 4.4.3
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
+from numba import njit
 from scipy.linalg import eigh
-from scipy.linalg.blas import dsyrk
+from scipy.linalg.blas import dsymm, dsyrk, dtrsm, ssyrk
 from scipy.linalg.lapack import dpotrf, dpotri, dpotrs
 
 from sfm.adjustment.datum import Motions
-from sfm.adjustment.normals import Normals
+from sfm.adjustment.normals import Blocks, Equations
+from sfm.adjustment.parameters import Unknowns
 from sfm.conventions import FloatArray
+from sfm.errors import GeometryError
 
 NULL = 1e-12  # eigenvalue of the scaled matrix (diagonal at most 1) taken as 0; rounding leaves 1e-15
 WEAK_PIVOT = 1e-11  # squared pivot below which the eigenvalues are looked at
+CHUNK_BYTES = 8e6  # of the rows Y' that are multiplied at a time: a second-level cache and a little
+LARGEST_BYTES = 6e9  # of the full matrix; larger ones would swap
 
 
 @dataclass(frozen=True)
@@ -30,7 +36,8 @@ class Factor:
     """Cholesky factor of the scaled reduced normal matrix with its null space filled."""
 
     scale: FloatArray  # 1/sqrt of the unreduced diagonal, (reduced,)
-    cholesky: FloatArray  # upper factor of scale S scale + QQ', (reduced, reduced)
+    matrix: FloatArray  # S + QQ' scaled, upper triangle, (reduced, reduced)
+    cholesky: FloatArray  # its upper factor, (reduced, reduced)
     motions: FloatArray  # Q, null vectors that the datum explains, scaled, orthonormal, (reduced, d)
     further: FloatArray  # null vectors that it does not, scaled, orthonormal, (reduced, e)
 
@@ -40,43 +47,127 @@ class Factor:
         x, _ = dpotrs(self.cholesky, s * right)
         return np.asarray(s * x)
 
-    def verified(self, normals: Normals) -> int:
+    def verified(self) -> int:
         """Return how many of the null vectors that the datum explains the normal matrix maps to 0."""
-        S = normals.S * self.scale[:, None] * self.scale
-        SQ = np.triu(S) @ self.motions + np.triu(S, 1).T @ self.motions
+        if self.motions.shape[1] == 0:
+            return 0
+        SQ = dsymm(1.0, self.matrix, self.motions) - self.motions
         return int((np.linalg.norm(SQ, axis=0) < np.sqrt(NULL)).sum())
 
     def inverse(self) -> FloatArray:
         """Return the inverse with its null space filled, in the units of the unknowns, (reduced, reduced)."""
         Q, _ = dpotri(self.cholesky)
-        Q = np.triu(Q) + np.triu(Q, 1).T
-        return np.asarray(Q * self.scale[:, None] * self.scale)
+        _mirror(Q, self.scale)
+        return np.asarray(Q)
+
+    def whitened(self, rows: FloatArray) -> FloatArray:
+        """Return rows R^-1 with S = R'R, so that products of its rows are those of S^+, (r, reduced)."""
+        return np.asarray(dtrsm(1.0, self.cholesky, (rows * self.scale).T, trans_a=1)).T
 
 
-def factor(normals: Normals, motions: Motions, *, damped: bool = False) -> Factor | None:
-    """Return the factored reduced normal equations; None if a damped matrix is not positive definite.
+def factor(
+    equations: Equations, layout: Unknowns, motions: Motions, *, damped: bool = False, single: bool = False
+) -> Factor | None:
+    """Return the factored reduced normal equations; None if they are not positive definite.
 
     Args:
-        normals: reduced normal equations, upper triangle.
+        equations: normal equations with object points eliminated.
+        layout: order of the unknowns.
         motions: null vectors that the datum explains.
         damped: whether the equations carry damping, so that no further null vectors are sought.
+        single: whether Y Y' may be summed in single precision, for a step on the way.
+
+    Raises:
+        GeometryError: the matrix would not fit in memory.
     """
-    scale = 1 / np.sqrt(np.maximum(normals.diagonal, np.finfo(float).tiny))
-    S = np.asfortranarray(normals.S * scale[:, None] * scale)
+    scale = equations.parts.scale
+    S = schur_complement(equations, layout, single=single)
     Q = np.linalg.qr(motions.reduced / scale[:, None])[0] if motions.defect else motions.reduced
     if motions.defect:
         S = dsyrk(1.0, Q, beta=1.0, c=S, overwrite_c=1)
     further = np.zeros((len(S), 0))
-    cholesky, info = dpotrf(S)
+    cholesky, info = dpotrf(S, clean=0)
     weak = info != 0 or float(np.diagonal(cholesky).min()) ** 2 < WEAK_PIVOT
-    if weak and damped:
-        return None if info != 0 else Factor(scale, cholesky, Q, further)
+    if weak and (damped or single):
+        return None if info != 0 or single else Factor(scale, S, cholesky, Q, further)
     if weak:
         values, vectors = eigh(S, lower=False)
         further = np.asfortranarray(vectors[:, values < NULL])
         if further.shape[1]:
-            S = dsyrk(1.0, further, beta=1.0, c=S, overwrite_c=1)
-            cholesky, info = dpotrf(S)
+            filled = dsyrk(1.0, further, beta=1.0, c=S)
+            cholesky, info = dpotrf(filled, clean=0)
         if info != 0:
             return None
-    return Factor(scale, cholesky, Q, further)
+    return Factor(scale, S, cholesky, Q, further)
+
+
+def rows_of(
+    blocks: Blocks, layout: Unknowns, scale: FloatArray, dtype: type
+) -> Iterator[tuple[int, FloatArray]]:
+    """Yield rows Y' times scale, some object points at a time: the first point, and (3 points, reduced)."""
+    n = len(blocks.y)
+    points = max(1, int(CHUNK_BYTES / (3 * layout.reduced * np.dtype(dtype).itemsize)))
+    for first in range(0, n, points):
+        rows: FloatArray = np.zeros((3 * min(points, n - first), layout.reduced), dtype=dtype)
+        _fill(layout.obs, blocks.Y, blocks.Z, scale, first, rows)
+        yield first, rows
+
+
+def schur_complement(equations: Equations, layout: Unknowns, *, single: bool = False) -> FloatArray:
+    """Return S = U - Y Y' scaled, upper triangle, column-major."""
+    size = 8.0 * layout.reduced**2
+    if size > LARGEST_BYTES:
+        raise GeometryError(
+            f"adjustment: {layout.reduced} unknowns that are all connected need {size / 1e9:.0f} GB in one "
+            f"dense system, at most {LARGEST_BYTES / 1e9:.0f} GB are taken"
+        )
+    b, parts = equations.blocks, equations.parts
+    dtype = np.float32 if single else np.float64
+    product = ssyrk if single else dsyrk
+    S = np.zeros((layout.reduced, layout.reduced), order="F", dtype=dtype)
+    for _, rows in rows_of(b, layout, parts.scale, dtype):
+        S = product(-1.0, rows.T, beta=1.0, c=S, overwrite_c=1)
+    S = np.asarray(S, dtype=np.float64, order="F")
+    _add_blocks(b.U, parts.border, parts.corner, parts.scale, 1 + equations.damping, S)
+    return S
+
+
+@njit(cache=True, error_model="numpy")
+def _fill(obs, Y, Z, scale, first, rows):  # type: ignore[no-untyped-def]
+    start = 6 * len(obs.camera)
+    for h in range(len(rows) // 3):
+        j = first + h
+        for o in range(obs.start[j], obs.start[j + 1]):
+            c = 6 * obs.image[o]
+            for p in range(3):
+                for q in range(6):
+                    rows[3 * h + p, c + q] += Y[o, p, q] * scale[c + q]
+        for p in range(3):
+            for q in range(Z.shape[2]):
+                rows[3 * h + p, start + q] = Z[j, p, q] * scale[start + q]
+
+
+@njit(cache=True, error_model="numpy")
+def _add_blocks(U, border, corner, scale, stretch, S):  # type: ignore[no-untyped-def]
+    """Add the scaled blocks to the upper triangle of S."""
+    first = 6 * len(U)
+    for i in range(len(U)):
+        for q in range(6):
+            for p in range(q + 1):
+                value = U[i, p, q] * scale[6 * i + p] * scale[6 * i + q]
+                S[6 * i + p, 6 * i + q] += value * stretch if p == q else value
+    for q in range(border.shape[1]):
+        for p in range(first):
+            S[p, first + q] += border[p, q] * scale[p] * scale[first + q]
+        for p in range(q + 1):
+            value = corner[p, q] * scale[first + p] * scale[first + q]
+            S[first + p, first + q] += value * stretch if p == q else value
+
+
+@njit(cache=True, error_model="numpy")
+def _mirror(Q, scale):  # type: ignore[no-untyped-def]
+    """Scale the upper triangle of Q and copy it to the lower one."""
+    for q in range(len(Q)):
+        for p in range(q + 1):
+            Q[p, q] *= scale[p] * scale[q]
+            Q[q, p] = Q[p, q]

@@ -89,14 +89,13 @@ def _orientations(blocks, layout: Unknowns) -> tuple[FloatArray, FloatArray]:  #
     g = np.zeros(layout.reduced)
     g[: 6 * m] = blocks.g.ravel()
     for i in range(m):
-        U[6 * i : 6 * i + 6, 6 * i : 6 * i + 6] = np.triu(blocks.U[i, :, :6])
-        a = layout.obs.camera[i]
-        free = layout.interior_free[a]
-        U[6 * i : 6 * i + 6, layout.interior_column[a]] = blocks.U[i][:, 6 + free]
-    for a, (free, column) in enumerate(zip(layout.interior_free, layout.interior_column, strict=True)):
-        D = np.triu(blocks.D[a]) + np.triu(blocks.D[a], 1).T
-        U[np.ix_(column, column)] += D[np.ix_(free, free)]
-        g[column] += blocks.gi[a][free]
+        U[6 * i : 6 * i + 6, 6 * i : 6 * i + 6] = np.triu(blocks.U[i])
+        column = layout.interior_column[layout.obs.camera[i]]
+        U[6 * i : 6 * i + 6, column] = blocks.C[i, :, : len(column)]
+    for a, column in enumerate(layout.interior_column):
+        f = len(column)
+        U[np.ix_(column, column)] += blocks.D[a, :f, :f]
+        g[column] += blocks.gi[a, :f]
     on = layout.reduced_free()
     scale = 1 / np.sqrt(np.diagonal(U)[on])
     factored = cho_factor(U[np.ix_(on, on)] * scale[:, None] * scale, lower=False)

@@ -21,14 +21,15 @@ from sfm.adjustment.covariance import (
     without_held,
 )
 from sfm.adjustment.datum import Datum
-from sfm.adjustment.iterate import TOLERANCE, Optimum, iterate
-from sfm.adjustment.parameters import Unknowns, estimate_of, start_weights, unknowns_of
+from sfm.adjustment.iterate import TOLERANCE, Optimum, Problem, iterate, problem_of
+from sfm.adjustment.parameters import estimate_of, start_weights, unknowns_of
 from sfm.adjustment.rank import rank_defect, undetermined_of
-from sfm.adjustment.reliability import redundancy_numbers, standardised_residuals
+from sfm.adjustment.reliability import redundancy_numbers as numbers_of
+from sfm.adjustment.reliability import standardised_residuals
 from sfm.adjustment.result import Adjustment, Covariance
 from sfm.adjustment.robust import huber_weights, robust_scale, snoop, tukey_weights
 from sfm.adjustment.threads import blas_threads
-from sfm.adjustment.weighted import Weighted, weighted_of
+from sfm.adjustment.weighted import weighted_of
 from sfm.conventions import FloatArray
 from sfm.errors import GeometryError
 from sfm.network import Estimate, Network
@@ -52,6 +53,7 @@ def adjust(
     max_iterations: int = 50,
     tolerance: float = TOLERANCE,
     covariance: bool = True,
+    redundancy_numbers: bool = True,
 ) -> Adjustment:
     """Return the least-squares adjustment of a network.
 
@@ -70,6 +72,7 @@ def adjust(
         max_iterations: steps at most, in each round of the robust test.
         tolerance: |A dx| / |v| at which the iteration has converged.
         covariance: whether covariance and redundancy numbers are wanted; NaN otherwise.
+        redundancy_numbers: whether they and standardised residuals are wanted beside the covariance.
 
     Raises:
         GeometryError: nothing to adjust, an unknown option, or datum points that cannot carry the datum.
@@ -82,7 +85,7 @@ def adjust(
     weight = start_weights(layout, state)
     with blas_threads(layout.reduced):
         near = tolerance if reject == "none" else max(tolerance, ROUND_TOLERANCE)
-        run = _Run(layout, weighted, datum, method, max_iterations, near)
+        run = _Run(problem_of(layout, weighted, datum), method, max_iterations, near)
         optimum, weight = run.minimise(run.start(state, weight), weight)
         if reject == "tau":
             optimum, weight = _snoop_all(run, optimum, weight, alpha)
@@ -93,7 +96,7 @@ def adjust(
         if near > tolerance:
             run.tolerance = tolerance
             optimum = run.again(optimum, weight)
-        Q = cofactors(optimum, layout) if covariance else None
+        Q = cofactors(optimum, layout, cross=redundancy_numbers) if covariance else None
         return _result(network, estimate, run, optimum, weight, Q, sigma_px)
 
 
@@ -101,9 +104,7 @@ def adjust(
 class _Run:
     """What stays the same over the rounds of one adjustment, and the steps taken so far."""
 
-    layout: Unknowns
-    weighted: Weighted
-    datum: Datum
+    problem: Problem
     method: str
     max_iterations: int
     tolerance: float
@@ -115,7 +116,7 @@ class _Run:
 
     def minimise(self, optimum: Optimum, weight: FloatArray) -> tuple[Optimum, FloatArray]:
         """Return the optimum with image points that were behind their camera at the start back in."""
-        ready = self.layout.active & ~behind_camera(self.layout.obs, optimum.state)
+        ready = self.problem.layout.active & ~behind_camera(self.problem.layout.obs, optimum.state)
         if (ready & (weight == 0)).any():
             weight = np.where(ready, 1.0, weight)
             optimum = self._iterate(optimum.state, weight, self.method)
@@ -123,25 +124,24 @@ class _Run:
 
     def again(self, optimum: Optimum, weight: FloatArray) -> Optimum:
         """Return the optimum with other weights, from a near one."""
-        return self._iterate(optimum.state, weight, "gauss-newton")
+        return self._iterate(optimum.state, weight, "gauss-newton", near=True)
 
     def redundancy(self, optimum: Optimum, weight: FloatArray) -> int:
         """Observations and constraints minus unknowns."""
         held = optimum.motions.defect + optimum.factor.further.shape[1]
-        held += int(optimum.normals.blocks.held.sum())
-        observations = 2 * int((weight > 0).sum()) + self.weighted.count
-        return observations - self.layout.count + held
+        held += int(optimum.equations.blocks.held.sum())
+        observations = 2 * int((weight > 0).sum()) + self.problem.weighted.count
+        return observations - self.problem.layout.count + held
 
-    def _iterate(self, state, weight: FloatArray, method: str) -> Optimum:  # type: ignore[no-untyped-def]
+    def _iterate(self, state, weight: FloatArray, method: str, near: bool = False) -> Optimum:  # type: ignore[no-untyped-def]
         optimum = iterate(
-            self.layout,
-            self.weighted,
+            self.problem,
             state,
             weight,
-            self.datum,
             method=method,
             max_iterations=self.max_iterations,
             tolerance=self.tolerance,
+            near=near,
         )
         self.iterations += optimum.iterations
         return optimum
@@ -149,7 +149,7 @@ class _Run:
 
 def _snoop_all(run: _Run, optimum: Optimum, weight: FloatArray, alpha: float) -> tuple[Optimum, FloatArray]:
     """Return the optimum without the image points that fail Pope's test."""
-    layout = run.layout
+    layout = run.problem.layout
     returned = np.zeros(len(weight), dtype=bool)
     for _ in range(MAX_ROUNDS):
         redundancy = run.redundancy(optimum, weight)
@@ -176,9 +176,9 @@ def _reweight(
     run: _Run, optimum: Optimum, weight: FloatArray, weights: Callable[..., FloatArray]
 ) -> tuple[Optimum, FloatArray]:
     """Return the optimum of an M-estimator by reweighting; a scale from the median goes with every round."""
-    layout = run.layout
+    layout = run.problem.layout
     ready = layout.active & ~behind_camera(layout.obs, optimum.state)
-    count = 2 * int(ready.sum()) + run.weighted.count
+    count = 2 * int(ready.sum()) + run.problem.weighted.count
     freedom = run.redundancy(optimum, ready.astype(float)) / max(count, 1)
     for _ in range(REWEIGHTINGS):
         v = residuals(layout.obs, optimum.state)
@@ -201,7 +201,7 @@ def _result(
     Q: Cofactors | None,
     sigma_px: float,
 ) -> Adjustment:
-    layout = run.layout
+    layout = run.problem.layout
     redundancy = run.redundancy(optimum, weight)
     sigma0 = float(np.sqrt(optimum.vPv / redundancy)) if redundancy > 0 else float("nan")
     k, n, m = len(weight), len(network.points), len(network.images)
@@ -215,19 +215,20 @@ def _result(
     else:
         result = marginal_covariance(optimum, layout, Q, sigma0**2)
         result = without_held(result, layout)
+    if Q is not None and Q.has_cross:
         complement = hat_complement(optimum, layout, Q, weight)
-        numbers = redundancy_numbers(complement, layout.obs.whitening)
+        numbers = numbers_of(complement, layout.obs.whitening)
         numbers[weight == 0] = np.nan
         standardised = standardised_residuals(v, complement, layout.obs.whitening)
     unsorted = np.empty(k, dtype=np.int64)
     unsorted[layout.order] = np.arange(k)
-    allowed = 0 if run.datum.kind == "control" else 7
+    allowed = 0 if run.problem.datum.kind == "control" else 7
     return Adjustment(
         network=network,
         estimate=estimate_of(optimum.state, estimate),
         converged=optimum.converged,
         iterations=run.iterations,
-        datum=run.datum.kind,
+        datum=run.problem.datum.kind,
         defect=rank_defect(optimum, layout),
         expected_defect=optimum.motions.defect,
         undetermined=undetermined_of(optimum, layout, network, estimate, allowed_motions=allowed),
@@ -238,7 +239,7 @@ def _result(
         sigma0=sigma0,
         redundancy=redundancy,
         unknowns=layout.count,
-        observations=2 * int((weight > 0).sum()) + run.weighted.count,
+        observations=2 * int((weight > 0).sum()) + run.problem.weighted.count,
         covariance=result,
         standardised=standardised[unsorted],
         weights=weight[unsorted],

@@ -13,7 +13,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextC
 from rich.table import Table
 from rich.text import Text
 
-from sfm.adjustment import collinearity, normals
+from sfm.adjustment import accumulate, collinearity
 from sfm.adjustment.statistics import global_test
 from sfm.report.checks import count_observations, sigma0_ratio
 from sfm.report.markup import finer_unit, significant
@@ -24,7 +24,7 @@ from sfm.report.verdict import verdict_of
 MAX_WARNINGS = 5  # without --verbose
 COLOURS = {"good": "green", "fair": "yellow", "bad": "red"}
 
-KERNELS: tuple[Dispatcher, ...] = (normals._accumulate, collinearity._residuals)
+KERNELS: tuple[Dispatcher, ...] = (accumulate.add_photographs, collinearity._residuals)
 """kernels that every survey needs"""
 
 
