@@ -208,7 +208,7 @@ def _refuse_contradictions(survey: Survey) -> None:
                 f"{where}: scale_bar {bar.start} - {bar.end}: length {bar.length:g} is more than a million "
                 f"times its sigma {bar.sigma:g}; are both in {survey.unit}?"
             )
-    _refuse_contradicting_tags(survey.targets, where)
+    _refuse_contradicting_sizes(survey.targets, where)
     if survey.targets.codes not in FAMILIES and not survey.beside(survey.targets.codes).is_file():
         raise SurveyFileError(
             f"{where}: targets.codes = '{survey.targets.codes}' is neither one of {', '.join(FAMILIES)} "
@@ -216,13 +216,24 @@ def _refuse_contradictions(survey: Survey) -> None:
         )
 
 
-def _refuse_contradicting_tags(targets: TargetSettings, where: str) -> None:
-    """Raise SurveyFileError where the size of tags is given without tags, or its sigma without the size."""
+def _refuse_contradicting_sizes(targets: TargetSettings, where: str) -> None:
+    """Raise SurveyFileError where sizes of tags or rings do not go with the codes or with one another."""
     if targets.tag_size is not None and targets.codes not in TAG_FAMILIES:
         raise SurveyFileError(
             f"{where}: targets.tag_size is the size of tags, codes = '{targets.codes}' has none; "
             f"tags are {', '.join(TAG_FAMILIES[:4])} ..."
         )
+    if targets.ring_radii is not None:
+        inner, outer = targets.ring_radii
+        if targets.codes == "none" or targets.codes in TAG_FAMILIES:
+            raise SurveyFileError(
+                f"{where}: targets.ring_radii are of rings, codes = '{targets.codes}' has none"
+            )
+        if not 1 < inner < outer:
+            raise SurveyFileError(
+                f"{where}: targets.ring_radii = [{inner:g}, {outer:g}], needed more than 1 radius of the dot "
+                "and the second larger"
+            )
     if targets.tag_sigma is not None:
         if targets.tag_size is None:
             raise SurveyFileError(f"{where}: targets.tag_sigma needs targets.tag_size")

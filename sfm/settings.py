@@ -90,6 +90,9 @@ class TargetSettings(Section):
     polarity: Literal["dark", "bright", "auto"] = "auto"
     channel: Literal["luminance", "red", "green", "blue"] = "luminance"  # of colour photographs
     codes: Name = "none"  # a code family, or a table file relative to the survey file
+    ring_radii: TwoLengths | None = (
+        None  # of the ring, inner and outer, in those of the dot; else the family's
+    )
     min_diameter_px: Length = 6.0
     eccentricity: bool = True  # whether to correct it
     diameter: Length | None = None  # of all targets, object unit; else of each from its ellipses

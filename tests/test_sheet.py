@@ -1,6 +1,7 @@
 """Sheets of coded targets: read back by the detector, true scale, files whole or not at all."""
 
 import re
+from dataclasses import replace
 from xml.etree import ElementTree
 
 import cv2
@@ -54,6 +55,21 @@ def test_the_printed_page_is_read_back(tmp_path, family, dark):
         assert xy == pytest.approx(expected, abs=0.1)
         # OpenCV fills the pixels of the outline as well, so dots come out larger by up to a pixel.
         assert axes == pytest.approx(4.0 * PX_PER_MM, abs=1.0)
+
+
+def test_rings_of_other_radii_are_printed_and_read(tmp_path):
+    sheet = lay_out_sheet("ring12", np.arange(1, 9), diameter_mm=8.0, ring_radii=(1.7, 2.4))
+    assert sheet.ring_mm == pytest.approx(2.4 * 8)
+    (file,) = write_sheet(sheet, tmp_path / "sheet.svg")
+    picture = drawn(file, sheet.size_mm)
+    family = replace(code_family("ring12"), inner=1.7, outer=2.4)
+    found = find_targets(picture, polarity="dark", codes=family, min_diameter_px=40)
+    assert sorted(found.code[found.code >= 0]) == list(range(1, 9))
+    usual = find_targets(picture, polarity="dark", codes="ring12", min_diameter_px=40)
+    assert (usual.code < 0).all()
+    for radii in ((0.9, 2.0), (2.0, 2.0)):
+        with pytest.raises(SurveyFileError, match="radii of the ring are"):
+            lay_out_sheet("ring12", np.arange(1, 9), diameter_mm=8.0, ring_radii=radii)
 
 
 def test_a_dot_has_its_diameter_on_paper(tmp_path):

@@ -212,12 +212,18 @@ def test_a_survey_from_tags(surveyed: tuple[Path, FloatArray, dict[str, FloatArr
     assert 0.5 < adjustment.sigma0_px / 0.02 < 2
 
 
-def test_the_size_of_tags_is_refused_without_tags(tmp_path: Path) -> None:
+def test_sizes_that_do_not_go_with_the_codes_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "survey.toml"
     for old, new, message in (
         ('codes = "apriltag36h11"', 'codes = "ring14"', "codes = 'ring14' has none"),
         ("tag_size = 30.0\n", "", "tag_sigma needs targets.tag_size"),
         ("tag_sigma = 0.01", "tag_sigma = 1e-7", "more than a million times its sigma"),
+        ("tag_sigma = 0.01", "ring_radii = [2, 3]", "are of rings"),
+        (
+            'codes = "apriltag36h11"\ntag_size = 30.0\ntag_sigma = 0.01',
+            'codes = "ring14"\nring_radii = [3, 2]',
+            "needed more than 1 radius",
+        ),
     ):
         path.write_text(SURVEY.replace(old, new), encoding="utf-8")
         with pytest.raises(SurveyFileError, match=message):

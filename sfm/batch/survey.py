@@ -19,9 +19,8 @@ from sfm.report.result import SurveyResult
 from sfm.survey.comparison import OtherPrograms
 from sfm.survey.log import LOG, SurveyLog, read_log, result_entries
 from sfm.survey.start import find_photographs
-from sfm.survey.targets import measure_photograph
+from sfm.survey.targets import measure_photograph, survey_family
 from sfm.targets.store import STORE, TargetStore
-from sfm.targets.tags import target_family
 
 LOGS = "logs"  # folder of the logs of surveys that have no result
 
@@ -90,7 +89,7 @@ def measure_one(job: SurveyJob, survey: Survey, image: str, path: Path, *, tell:
     """Measure one photograph into the store; why it cannot be read is part of what is returned."""
     begun = time.perf_counter()
     try:
-        family = target_family(survey.codes)
+        family = survey_family(survey)
         targets, stored = measure_photograph(path, survey.targets, family, job.store)
     except KolinearError as error:
         note = PhotographNote(image, failed=str(error))

@@ -135,14 +135,36 @@ def targets(
     ] = 10.0,
     page: Annotated[str, typer.Option("--page", help="a4, a3, letter ...")] = "a4",
     bright: Annotated[bool, typer.Option("--bright", help="White targets on dark squares.")] = False,
+    ring_radii: Annotated[
+        str | None,
+        typer.Option(
+            "--ring-radii", metavar="R1,R2", help="Inner and outer radius of rings, in radii of the dot."
+        ),
+    ] = None,
 ) -> None:
     """Write a sheet of coded targets for printing.
 
     It is in true scale and has a ruler to check the print.
     """
-    sheet = lay_out_sheet(family, _numbers(ids), diameter_mm=diameter, page=page, dark=not bright)
+    radii = None if ring_radii is None else _two(ring_radii)
+    sheet = lay_out_sheet(
+        family, _numbers(ids), diameter_mm=diameter, page=page, dark=not bright, ring_radii=radii
+    )
     for path in write_sheet(sheet, out):
         print(path)
+
+
+def _two(text: str) -> tuple[float, float]:
+    """Return the two numbers of `2,3`.
+
+    Raises:
+        SurveyFileError: not two numbers.
+    """
+    try:
+        first, second = (float(part) for part in text.split(","))
+    except ValueError as error:
+        raise SurveyFileError(f"--ring-radii {text}: needed two numbers such as 2,3") from error
+    return first, second
 
 
 def _numbers(text: str) -> IntArray:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -80,7 +80,7 @@ def measure_photographs(
         PhotographError: photographs of different size under one camera.
         SurveyFileError: the code table or the start values of a camera are unusable.
     """
-    family = target_family(survey.codes)
+    family = survey_family(survey)
     found: dict[int, tuple[Metadata, Targets]] = {}
     failed: dict[int, FailedImage] = {}
     originals: list[int] = []
@@ -120,6 +120,18 @@ def measure_photographs(
         tuple(found[k][1] for k in order),
         tuple(failed[k] for k in sorted(failed)),
     )
+
+
+def survey_family(survey: Survey) -> CodeFamily | TagFamily | None:
+    """Return the codes of a survey, rings with the radii that it states, None where targets have none.
+
+    Raises:
+        SurveyFileError: the code table is unreadable.
+    """
+    family = target_family(survey.codes)
+    if survey.targets.ring_radii is not None and isinstance(family, CodeFamily):
+        return replace(family, inner=survey.targets.ring_radii[0], outer=survey.targets.ring_radii[1])
+    return family
 
 
 def find_copies(photographs: PhotographList) -> tuple[int, ...]:

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import os
 import tempfile
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from sfm.conventions import FloatArray, IntArray
 from sfm.errors import OutputError, SurveyFileError
+from sfm.targets.codes import CodeFamily
 from sfm.targets.scene import ARC, DISC, RECTANGLE, Marks, coded_ring, join_marks, square_tag
 from sfm.targets.tags import TagFamily, target_family
 
@@ -55,7 +56,13 @@ class Sheet:
 
 
 def lay_out_sheet(
-    family: str, numbers: IntArray, *, diameter_mm: float, page: str = "a4", dark: bool = True
+    family: str,
+    numbers: IntArray,
+    *,
+    diameter_mm: float,
+    page: str = "a4",
+    dark: bool = True,
+    ring_radii: tuple[float, float] | None = None,
 ) -> Sheet:
     """Lay coded targets out on pages, row by row from the upper left.
 
@@ -65,12 +72,13 @@ def lay_out_sheet(
         diameter_mm: diameter of the dot, or side of the square of a tag.
         page: one of PAGES_MM.
         dark: dark targets on white; else white ones on dark squares.
+        ring_radii: inner and outer radius of the rings in radii of the dot; else those of the family.
 
     Returns:
         The sheet, with as many pages as it takes.
 
     Raises:
-        SurveyFileError: unknown page or family, or a target that is larger than the page.
+        SurveyFileError: unknown page or family, impossible radii, or a target that is larger than the page.
         GeometryError: the family has no such number.
     """
     codes = target_family(family)
@@ -81,6 +89,13 @@ def lay_out_sheet(
     if not diameter_mm > 0:
         raise SurveyFileError(f"targets: diameter is {diameter_mm} mm, needed more than 0")
     width, height = PAGES_MM[page]
+    if ring_radii is not None and isinstance(codes, CodeFamily):
+        if not 1 < ring_radii[0] < ring_radii[1]:
+            raise SurveyFileError(
+                f"targets: radii of the ring are {ring_radii[0]:g} and {ring_radii[1]:g} radii of the dot, "
+                "needed more than 1 and the second larger"
+            )
+        codes = replace(codes, inner=ring_radii[0], outer=ring_radii[1])
     tags = isinstance(codes, TagFamily)
     ring = diameter_mm if isinstance(codes, TagFamily) else codes.outer * diameter_mm
     across, down = CLEAR * ring, CLEAR * ring + LABEL_MM
