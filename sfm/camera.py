@@ -5,12 +5,13 @@ The distortion models are in `sfm.distortion`; a camera holds the values of one 
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numba import njit
 
-from sfm.conventions import BoolArray, FloatArray
+from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.distortion.models import MAX_PARAMETERS, MODELS, number_of, observe
 from sfm.errors import SurveyFileError
 
@@ -137,6 +138,33 @@ def camera_from_values(
         np.array(pixel_mm, dtype=float),
         np.array([p[key] for key in names]),
         np.array([key in free for key in names]),
+    )
+
+
+def camera_families(cameras: tuple[Camera, ...], camera: IntArray) -> tuple[tuple[str, ...], IntArray]:
+    """Return the families of cameras that share parameters, such as the photographs of one zoom lens.
+
+    A camera that shares nothing is a family of its own. The name of another is that of the group that
+    most photographs have in common.
+
+    Args:
+        cameras: interior orientations.
+        camera: index of the camera of each photograph, shape (m,).
+
+    Returns:
+        Names of the families, and the family of each camera, shape (a,).
+    """
+    used = np.bincount(camera, minlength=len(cameras)).tolist()
+    owners = [sorted({one.group_of(s) or one.name for s in range(len(one.names))}) for one in cameras]
+    photographs: Counter[str] = Counter()
+    for own, count in zip(owners, used, strict=True):
+        photographs.update(dict.fromkeys(own, count))
+    names = [max(own, key=lambda owner: photographs[owner]) for own in owners]
+    # two cameras without anything in common may have one name in another program's files
+    keys = [(name, -1 if one.shared else a) for a, (name, one) in enumerate(zip(names, cameras, strict=True))]
+    families = list(dict.fromkeys(keys))
+    return tuple(name for name, _ in families), np.array(
+        [families.index(key) for key in keys], dtype=np.int64
     )
 
 

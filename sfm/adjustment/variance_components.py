@@ -18,6 +18,7 @@ import numpy as np
 from sfm.adjustment.parameters import unknowns_of
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.weighted import exterior_misclosure, weighted_of
+from sfm.camera import camera_families
 from sfm.conventions import FloatArray, IntArray
 from sfm.network import Network
 
@@ -66,10 +67,10 @@ def by_photograph(adjustment: Adjustment) -> VarianceComponents:
 
 
 def by_camera(adjustment: Adjustment) -> VarianceComponents:
-    """Return the variance factor of the photographs of each camera."""
+    """Return the variance factor of the photographs of each camera; those that share parameters are one."""
     network = adjustment.network
-    names = tuple(camera.name for camera in adjustment.estimate.cameras)
-    return variance_components(adjustment, network.camera[network.image_points.image], names)
+    names, family = camera_families(adjustment.estimate.cameras, network.camera)
+    return variance_components(adjustment, family[network.camera[network.image_points.image]], names)
 
 
 def by_kind(adjustment: Adjustment) -> VarianceComponents:

@@ -14,6 +14,7 @@ from matplotlib.figure import Figure
 from sfm.adjustment.result import Adjustment
 from sfm.conventions import FloatArray, IntArray
 from sfm.network import Estimate
+from sfm.report.statistics import families, family_of_photographs
 from sfm.report.tables import image_rms
 
 BLUE, RED, GREY, GREEN, ORANGE = "#1f5fa8", "#c8372d", "#8a8f98", "#2b7a4b", "#d98a1f"
@@ -67,16 +68,14 @@ def network_figure(adjustment: Adjustment, unit: str) -> Figure:
     size = 0.12 * float(np.median(np.linalg.norm(position - np.median(points, axis=0), axis=1)))
     plan.plot(points[:, 0], points[:, 1], ".", color=GREY, markersize=4)
     space.plot(*points.T, ".", color=GREY, markersize=3)
-    for k, camera in enumerate(estimate.cameras):
-        own = np.flatnonzero(adjustment.network.camera == k)
+    for k, (name, camera) in enumerate(families(adjustment)):
+        own = np.flatnonzero(family_of_photographs(adjustment) == k)
         colour = CAMERA_COLOURS[k % len(CAMERA_COLOURS)]
         edges = _pyramids(estimate, own, camera.c_px, camera.size_px, size) @ axes_from_object.T
         plan.add_collection(LineCollection(list(edges[:, :, :2]), colors=colour, linewidths=0.8))
         for edge in edges:
             space.plot(*edge.T, color=colour, linewidth=0.7)
-        plan.plot(
-            position[own, 0], position[own, 1], "o", color=colour, markersize=4, label=_plain(camera.name)
-        )
+        plan.plot(position[own, 0], position[own, 1], "o", color=colour, markersize=4, label=_plain(name))
     for name, x, y in zip(adjustment.network.images, position[:, 0], position[:, 1], strict=True):
         if len(position) <= 60:
             plan.annotate(
@@ -106,23 +105,23 @@ def network_figure(adjustment: Adjustment, unit: str) -> Figure:
 
 def residual_figure(adjustment: Adjustment) -> Figure:
     """Draw residual vectors over the format of each camera, one by one and as means of cells."""
-    network, cameras = adjustment.network, adjustment.estimate.cameras
+    network, cameras = adjustment.network, families(adjustment)
     figure = Figure(figsize=(11, 4.4 * len(cameras)), layout="constrained")
     panels = figure.subplots(len(cameras), 2, squeeze=False)
-    owner = network.camera[network.image_points.image]
-    for k, camera in enumerate(cameras):
+    owner = family_of_photographs(adjustment)[network.image_points.image]
+    for k, (name, camera) in enumerate(cameras):
         own = (owner == k) & ~adjustment.rejected
         xy, v = network.image_points.xy[own], adjustment.residuals[own]
         width, height = camera.size_px
         factor = _round_factor(0.03 * width / max(_typical(v), 1e-12))
         keep = slice(None, None, max(1, len(xy) // MAX_ARROWS))
         _arrows(panels[k, 0], xy[keep], v[keep] * factor, BLUE)
-        panels[k, 0].set_title(f"{_plain(camera.name)}: {len(xy)} residuals, drawn {factor:g} times as long")
+        panels[k, 0].set_title(f"{_plain(name)}: {len(xy)} residuals, drawn {factor:g} times as long")
         centres, means = _cell_means(xy, v, width, height)
         if len(centres):
             factor = _round_factor(0.6 * width / CELLS / max(_typical(means), 1e-12))
             _arrows(panels[k, 1], centres, means * factor, RED)
-        panels[k, 1].set_title(f"{_plain(camera.name)}: mean of each cell, drawn {factor:g} times as long")
+        panels[k, 1].set_title(f"{_plain(name)}: mean of each cell, drawn {factor:g} times as long")
         for panel in panels[k]:
             panel.set_xlim(-0.5, width - 0.5)
             panel.set_ylim(height - 0.5, -0.5)

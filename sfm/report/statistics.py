@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,8 +22,8 @@ from sfm.adjustment.statistics import (
     w_test,
 )
 from sfm.adjustment.variance_components import VarianceComponents, by_camera, by_kind, by_photograph
-from sfm.camera import Camera
-from sfm.conventions import FloatArray
+from sfm.camera import Camera, camera_families
+from sfm.conventions import FloatArray, IntArray
 
 GLOBAL_ALPHA = 0.05  # of the global test and of the significance of parameters
 SIGNIFICANT = 2.0  # value over sigma below which a parameter might as well be 0
@@ -81,7 +80,7 @@ def interior_parameters(adjustment: Adjustment) -> tuple[InteriorParameter, ...]
     """Return every parameter of interior orientation once, those that are fixed at 0 left out."""
     network = adjustment.network
     used = np.bincount(network.camera, minlength=len(adjustment.estimate.cameras))
-    found: dict[tuple[str, str], InteriorParameter] = {}
+    found: dict[tuple[str, str, int], InteriorParameter] = {}
     for a, camera in enumerate(adjustment.estimate.cameras):
         sigma = parameter_sigmas(adjustment, a)
         for s, name in enumerate(camera.names):
@@ -89,32 +88,24 @@ def interior_parameters(adjustment: Adjustment) -> tuple[InteriorParameter, ...]
             if not camera.free[s] and value == 0:
                 continue
             owner = camera.group_of(s) or camera.name
-            known = found.get((owner, name))
+            key = (owner, name, -1 if camera.group_of(s) else a)
+            known = found.get(key)
             count = int(used[a]) + (known.photographs if known else 0)
-            found[owner, name] = InteriorParameter(
-                owner, count, name, value, float(sigma[s]), camera.units[s]
-            )
+            found[key] = InteriorParameter(owner, count, name, value, float(sigma[s]), camera.units[s])
     return tuple(found.values())
 
 
 def families(adjustment: Adjustment) -> tuple[tuple[str, Camera], ...]:
-    """Return the name of each family of cameras that share parameters, and the first camera of it.
+    """Return the name of each family of cameras that share parameters, and the first camera of it."""
+    cameras = adjustment.estimate.cameras
+    names, family = camera_families(cameras, adjustment.network.camera)
+    return tuple((name, cameras[int(np.argmax(family == f))]) for f, name in enumerate(names))
 
-    A camera that shares nothing is a family of its own. The name is that of the group that most
-    photographs have in common.
-    """
-    used = np.bincount(adjustment.network.camera, minlength=len(adjustment.estimate.cameras))
-    owners = [
-        {camera.group_of(s) or camera.name for s in range(len(camera.names))}
-        for camera in adjustment.estimate.cameras
-    ]
-    photographs: Counter[str] = Counter()
-    for own, count in zip(owners, used.tolist(), strict=True):
-        photographs.update(dict.fromkeys(own, count))
-    found: dict[str, Camera] = {}
-    for own, camera in zip(owners, adjustment.estimate.cameras, strict=True):
-        found.setdefault(max(sorted(own), key=lambda owner: photographs[owner]), camera)
-    return tuple(found.items())
+
+def family_of_photographs(adjustment: Adjustment) -> IntArray:
+    """Return the index of the family of cameras that each photograph was taken with, (m,)."""
+    network = adjustment.network
+    return camera_families(adjustment.estimate.cameras, network.camera)[1][network.camera]
 
 
 def parameter_sigmas(adjustment: Adjustment, camera: int) -> FloatArray:
