@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -11,12 +12,13 @@ import numpy as np
 import pytest
 
 from adapters.colmap import adjust_with_colmap
+from adapters.colmap_model import read_model
 from datasets.textured import render
 from sfm.adjustment.result import Adjustment
 from sfm.batch.run import run_batch
 from sfm.camera import project, tangents_from_pixel
 from sfm.conventions import AnyArray, FloatArray, angles_from_rotation
-from sfm.errors import GeometryError, SurveyFileError
+from sfm.errors import GeometryError, PhotographError, SurveyFileError
 from sfm.matching.flags import LsmFlag
 from sfm.matching.interest import foerstner_points
 from sfm.matching.lsm import match_lsm
@@ -27,7 +29,7 @@ from sfm.pipeline import run_survey
 from sfm.project import read_survey
 from sfm.similarity import fit_similarity
 from sfm.survey.comparison import OtherPrograms
-from sfm.survey.refine import refine_model
+from sfm.survey.refine import refine_model, refinement_text
 from tests.engines import ALONE, HERE, Notes
 from tests.textures import random_texture, with_noise
 
@@ -353,6 +355,64 @@ def _from_their_places(a: Adjustment, folder: Path) -> tuple[float, float, float
     z2 = np.einsum("ki,kij,kj->k", e, np.linalg.inv(C), e) / 3
     stated = a.sigma0 * np.sqrt(seen.covariance[whole][:, [0, 1], [0, 1]].mean())
     return float(near.mean()), float(z2.mean()), float(np.sqrt((shift[known] ** 2).mean())), float(stated)
+
+
+def test_refining_what_another_program_wrote(tmp_path: Path) -> None:
+    """A simple radial camera, folders, a photograph not registered, points with two rays or far astray."""
+    pycolmap = pytest.importorskip("pycolmap")
+    photographs, truth, _ = _scene()
+    rng = np.random.default_rng(9)
+    scene = pycolmap.Reconstruction()
+    width, height = SIZE
+    focal = render.C_MM / render.PIXEL_MM[0]
+    lens = pycolmap.Camera(
+        model="SIMPLE_RADIAL",
+        width=width,
+        height=height,
+        camera_id=1,
+        params=[focal, 240, 180, 0],
+    )
+    scene.add_camera_with_trivial_rig(lens)
+    seen = [
+        project(truth.cameras[0], truth.position[i], truth.rotation[i], truth.points)
+        + rng.normal(0, 0.3, (len(truth.points), 2))
+        for i in range(3)
+    ]
+    for i, one in enumerate(photographs):
+        M = np.diag([1.0, -1.0, -1.0]) @ truth.rotation[i].T
+        pose = pycolmap.Rigid3d(pycolmap.Rotation3d(M), -M @ truth.position[i])
+        name = f"{'ab'[i // 2]}/{i}.png"
+        image = pycolmap.Image(name=name, keypoints=seen[i] + 0.5, camera_id=1, image_id=i + 1)
+        scene.add_image_with_trivial_frame(image, pose)
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        cv2.imwrite(str(tmp_path / name), np.rint(one).astype(np.uint8))
+    for j, xyz in enumerate(truth.points):
+        images = (1, 2) if j < 5 else (1, 2, 3)
+        xyz = 50 * xyz if j == 9 else xyz  # behind the photographs
+        scene.add_point3D(
+            xyz, pycolmap.Track([pycolmap.TrackElement(i, j) for i in images]), np.zeros(3, np.uint8)
+        )
+    (tmp_path / "model").mkdir()
+    scene.write_binary(str(tmp_path / "model"))
+    network, estimate = read_model(tmp_path / "model")
+    lost = replace(estimate, position=np.vstack([estimate.position, np.full(3, np.nan)]))
+    lost = replace(lost, rotation=np.vstack([estimate.rotation, np.full((1, 3, 3), np.nan)]))
+    beside = replace(network, images=(*network.images, "not registered.png"), camera=np.zeros(4, np.int64))
+    result = refine_model(beside, lost, tmp_path)
+    reasons = dict(result.reasons)
+    assert reasons["of a point that fewer than 3 photographs see"] == 13  # one is behind all of them
+    assert result.refined >= 0.8 * (result.key_points - 13) and result.after_px < 0.1 < result.before_px
+    text = refinement_text(result)
+    assert "RMS before" in text and "RMS after" in text
+    (tmp_path / "b" / "2.png").unlink()
+    with pytest.raises(SurveyFileError, match=r"photograph 'b/2\.png' of the model is not in this folder"):
+        refine_model(network, estimate, tmp_path)
+    cv2.imwrite(str(tmp_path / "b" / "2.png"), np.zeros((50, 60), np.uint8))
+    with pytest.raises(PhotographError, match="60 x 50 px, its camera has 480 x 360 px"):
+        refine_model(network, estimate, tmp_path)
+    nothing = replace(estimate, points=estimate.points * np.nan)
+    with pytest.raises(GeometryError, match="nothing to refine"):
+        refine_model(network, nothing, tmp_path)
 
 
 @pytest.mark.slow

@@ -14,7 +14,6 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
-from sfm.camera import pixel_jacobian, project
 from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
 from sfm.errors import GeometryError
 from sfm.matching.flags import DIVERGED, FLAT_TEXTURE, LOW_CORRELATION, MATCHED, OUTSIDE, TOO_FAR
@@ -31,6 +30,7 @@ from sfm.matching.patch_equations import (
     gradients,
     solve,
 )
+from sfm.matching.pictures import derivatives, facing_warps, pictures_of
 from sfm.matching.radiometry import grey_of, odd_window
 from sfm.matching.warp import put_step
 from sfm.matching.window import resample_patch, resample_window
@@ -38,6 +38,7 @@ from sfm.network import Estimate
 
 MAX_STEPS = 15
 STOP_PX = 0.005
+LEAST_EIGENVALUE = 1e-12  # part of the largest, what rounding leaves of parallel rays
 
 
 @dataclass(frozen=True)
@@ -115,24 +116,28 @@ def match_multi(
     pairs = np.unique(np.column_stack([image[ref[windows]], image[windows]]), axis=0)
     groups = [(i, j, windows[(image[ref[windows]] == i) & (image[windows] == j)]) for i, j in pairs.tolist()]
     step = 0
-    while step < MAX_STEPS and (length[windows][out[windows, 0] == MATCHED] > STOP_PX).any():
+    q, follow = np.zeros((len(image), SIZE)), np.zeros((len(image), SIZE, 2))
+    moving = np.ones(len(X), dtype=bool)  # points with a window that still moves
+    while step < MAX_STEPS and moving.any():
         step += 1
-        q, follow = np.zeros((len(image), SIZE)), np.zeros((len(image), SIZE, 2))
         for i, j, own in groups:
-            rows = own[out[own, 0] == MATCHED]
-            parts = _window_steps(greys[i], greys[j], half, kind, xy[ref[rows]], warp[rows])
-            out[rows], q[rows], follow[rows] = parts
+            rows = own[(out[own, 0] == MATCHED) & moving[point[own]]]
+            out[rows], q[rows], follow[rows] = _window_steps(
+                greys[i], greys[j], half, kind, xy[ref[rows]], warp[rows]
+            )
         now, C = _measured(xy, warp, q, out, reference, point, windows, half)
         X, N = _intersect(estimate, camera, image, point, X, now, C, orientation_px or 0.0)
         target = now if orientation_px is None else _give_way(
             estimate, camera, image, point, X, now, C, warp[:, :2, 2], orientation_px
         )  # fmt: skip
-        for k in windows[out[windows, 0] == MATCHED]:
-            length[k] = move_window(warp[k], q[k], follow[k], target[k] - warp[k, :2, 2], half)
-            if not np.isfinite(length[k]):
-                out[k, 0] = DIVERGED
-            elif np.hypot(*(warp[k, :2, 2] - xy[k])) > max_shift_px:
-                out[k, 0] = TOO_FAR
+        rows = windows[(out[windows, 0] == MATCHED) & moving[point[windows]]]
+        shift = target[rows] - warp[rows, :2, 2]
+        warp[rows], length[rows] = _move_windows(warp[rows], q[rows], follow[rows], shift, half)
+        far = np.hypot(*(warp[rows, :2, 2] - xy[rows]).T) > max_shift_px
+        out[rows, 0] = np.where(np.isfinite(length[rows]), np.where(far, TOO_FAR, MATCHED), DIVERGED)
+        still = rows[(out[rows, 0] == MATCHED) & (length[rows] > STOP_PX)]
+        moving = np.bincount(point[still], minlength=len(X)) > 0
+        q[~moving[point], :2] = 0.0  # they are where they want to be
     matched = out[:, 0] == MATCHED
     out[matched & (length > STOP_PX) & (ref != np.arange(len(image))), 0] = DIVERGED
     out[windows[(out[windows, 0] == MATCHED) & (out[windows, 10] == FLAT_TEXTURE)], 0] = FLAT_TEXTURE
@@ -140,11 +145,11 @@ def match_multi(
     flag = out[:, 0].astype(np.int64)
     good = flag == MATCHED
     seen = np.bincount(point[good], minlength=len(X)) >= 2
-    good &= seen[point]
     now[windows] = warp[windows, :2, 2]
-    X, N = _intersect(
-        estimate, camera, image, point, X, np.where(good[:, None], now, np.nan), C, orientation_px or 0.0
-    )
+    last = np.where((good & seen[point])[:, None], now, np.nan)
+    X, N = _intersect(estimate, camera, image, point, X, last, C, orientation_px or 0.0)
+    seen &= _regular(N)
+    good &= seen[point]
     covariance = np.full((len(X), 3, 3), np.nan)
     covariance[seen] = np.linalg.inv(N[seen])
     X[~seen] = np.nan
@@ -156,49 +161,6 @@ def match_multi(
 
 
 SIZE = MODELS["affine"] + RADIOMETRIC
-
-
-def facing_warps(
-    estimate: Estimate, camera: IntArray, image: IntArray, ref: IntArray, points: FloatArray
-) -> FloatArray:
-    """Return d (picture) / d (picture in the reference) of a surface that faces the reference, (k, 2, 2).
-
-    Args:
-        estimate, camera, image: as in `match_multi`.
-        ref: the row of the reference of each row, (k,).
-        points: the object point of each row, (k, 3).
-    """
-    in_object = _derivatives(estimate, camera, image, points)
-    R = estimate.rotation[image[ref]]
-    along = in_object[ref] @ R[:, :, :2]  # pictures of the two axes of the reference, in the reference
-    across = in_object @ R[:, :, :2]
-    return np.asarray(across @ np.linalg.inv(along))
-
-
-def _derivatives(estimate: Estimate, camera: IntArray, image: IntArray, points: FloatArray) -> FloatArray:
-    """Return d (x, y) / d X of each image point, px per object unit, (k, 2, 3)."""
-    out = np.full((len(image), 2, 3), np.nan)
-    for i in np.unique(image):
-        rows = np.flatnonzero(image == i)
-        lens, R = estimate.cameras[camera[i]], estimate.rotation[i]
-        UVW = (points[rows] - estimate.position[i]) @ R
-        u, v = -UVW[:, 0] / UVW[:, 2], -UVW[:, 1] / UVW[:, 2]
-        in_uv = np.stack(
-            [-(R[:, a] + t[:, None] * R[:, 2]) / UVW[:, 2:] for a, t in enumerate((u, v))], axis=1
-        )
-        xy = project(lens, estimate.position[i], R, points[rows])
-        out[rows] = pixel_jacobian(lens, xy) @ in_uv
-    return out
-
-
-def pictures_of(estimate: Estimate, camera: IntArray, image: IntArray, points: FloatArray) -> FloatArray:
-    """Return the picture of one object point for each row, px, (k, 2)."""
-    out = np.full((len(image), 2), np.nan)
-    for i in np.unique(image):
-        rows = np.flatnonzero(image == i)
-        lens = estimate.cameras[camera[i]]
-        out[rows] = project(lens, estimate.position[i], estimate.rotation[i], points[rows])
-    return out
 
 
 def _measured(
@@ -241,18 +203,24 @@ def _intersect(
     orientation_px: float,
 ) -> tuple[FloatArray, FloatArray]:
     """One Gauss-Newton step of the object points; returns them and their normal matrices, (n, 3, 3)."""
-    rows = np.flatnonzero(np.isfinite(now).all(axis=1))
-    J = _derivatives(estimate, camera, image[rows], points[point[rows]])
-    r = now[rows] - pictures_of(estimate, camera, image[rows], points[point[rows]])
+    r = now - pictures_of(estimate, camera, image, points[point])  # NaN of points behind a photograph
+    rows = np.flatnonzero(np.isfinite(r).all(axis=1) & np.isfinite(C).all(axis=(1, 2)))
+    J = derivatives(estimate, camera, image[rows], points[point[rows]])
     W = np.linalg.inv(C[rows] + orientation_px**2 * np.eye(2))
     N, b = np.zeros((len(points), 3, 3)), np.zeros((len(points), 3))
     JW = J.transpose(0, 2, 1) @ W
     np.add.at(N, point[rows], JW @ J)
-    np.add.at(b, point[rows], np.einsum("kij,kj->ki", JW, r))
-    solvable = np.bincount(point[rows], minlength=len(points)) >= 2
+    np.add.at(b, point[rows], np.einsum("kij,kj->ki", JW, r[rows]))
+    solvable = (np.bincount(point[rows], minlength=len(points)) >= 2) & _regular(N)
     moved = points.copy()
     moved[solvable] += np.linalg.solve(N[solvable], b[solvable, :, None])[..., 0]
     return moved, N
+
+
+def _regular(N: FloatArray) -> BoolArray:
+    """Return which normal matrices determine their point: rays that are parallel do not, (n,)."""
+    values = np.linalg.eigvalsh(N)
+    return np.asarray(values[:, 0] > LEAST_EIGENVALUE * values[:, 2])
 
 
 def _give_way(
@@ -318,13 +286,16 @@ def _window_steps(left, right, half, kind, xy, warp):  # type: ignore[no-untyped
 
 
 @njit(cache=True, nogil=True)
-def move_window(H, q, follow, shift, half):  # type: ignore[no-untyped-def]
-    """Put a step of prescribed shift (px) on H, the other parameters follow; returns its length."""
-    det = H[0, 0] * H[1, 1] - H[0, 1] * H[1, 0]
-    beta = q[SIZE - 1]
-    dx = -(H[1, 1] * shift[0] - H[0, 1] * shift[1]) / det * beta / half - q[0]
-    dy = -(H[0, 0] * shift[1] - H[1, 0] * shift[0]) / det * beta / half - q[1]
-    step = q.copy()
-    for a in range(SIZE):
-        step[a] += follow[a, 0] * dx + follow[a, 1] * dy
-    return put_step(H, step, half, SIZE - 2)
+def _move_windows(warp, q, follow, shift, half):  # type: ignore[no-untyped-def]
+    """Put steps of prescribed shift (px) on warps, the other parameters follow; returns both."""
+    length, step = np.empty(len(warp)), np.empty(SIZE)
+    for k in range(len(warp)):
+        H = warp[k]
+        det = H[0, 0] * H[1, 1] - H[0, 1] * H[1, 0]
+        factor = q[k, SIZE - 1] / (det * half)
+        dx = -(H[1, 1] * shift[k, 0] - H[0, 1] * shift[k, 1]) * factor - q[k, 0]
+        dy = -(H[0, 0] * shift[k, 1] - H[1, 0] * shift[k, 0]) * factor - q[k, 1]
+        for a in range(SIZE):
+            step[a] = q[k, a] + follow[k, a, 0] * dx + follow[k, a, 1] * dy
+        length[k] = put_step(H, step, half, SIZE - 2)
+    return warp, length

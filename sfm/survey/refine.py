@@ -13,11 +13,12 @@ from sfm.adjustment.solve import adjust
 from sfm.camera import Camera
 from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.errors import GeometryError, PhotographError, SurveyFileError
-from sfm.matching.flags import LsmFlag
-from sfm.matching.multi_lsm import match_multi, pictures_of
+from sfm.matching.flags import LsmFlag, in_words
+from sfm.matching.multi_lsm import match_multi
+from sfm.matching.pictures import pictures_of
 from sfm.network import Estimate, ImagePoints, Network, reduce_network
 from sfm.progress import SILENT, Progress
-from sfm.survey.solution import MAD_TO_SIGMA, determined, put_back
+from sfm.survey.solution import FALSE_ALARM, MAD_TO_SIGMA, TOLERANCE_FACTOR, determined, put_back
 from sfm.targets.photograph import read_photograph
 
 MIN_RAYS = 3
@@ -27,6 +28,7 @@ ORIENTATION_FACTOR = (
 )
 MAX_SHIFT_FACTOR = 6.0  # of that spread, beyond which a key point was another one
 MIN_SHIFT_PX = 2.0
+NOTHING = np.zeros((1, 1))  # in place of a photograph that the model has not oriented
 
 
 @dataclass(frozen=True)
@@ -39,7 +41,7 @@ class Refinement:
     adjustment: Adjustment  # of the points measured anew
     key_points: int  # of the model
     refined: int  # of these, matched and part of the adjustment
-    reasons: tuple[tuple[str, int], ...]  # why key points were not matched, most frequent first
+    reasons: tuple[tuple[str, int], ...]  # why key points took no part, and how many, most frequent first
 
 
 def refine_model(
@@ -70,13 +72,16 @@ def refine_model(
     estimate = replace(estimate, cameras=tuple(_freed(camera) for camera in estimate.cameras))
     residuals = pictures_of(estimate, network.camera, seen.image, estimate.points[seen.point]) - seen.xy
     usable = np.isfinite(residuals).all(axis=1)
+    if not usable.any():
+        raise GeometryError("no image point of an oriented photograph in the model, nothing to refine")
     before = float(np.sqrt((residuals[usable] ** 2).mean()))
     spread = MAD_TO_SIGMA * float(np.median(np.abs(residuals[usable])))
     first, start, _, _ = _part(network, estimate, everything)
     readjusted = adjust(first, start, datum=Datum("free"), reject="none", covariance=False)
     progress.stage("photographs", len(network.images))
     photographs = [
-        _photograph(network, estimate, images_dir, i, progress) for i in range(len(network.images))
+        _photograph(network, estimate, images_dir, i, progress) if oriented else NOTHING
+        for i, oriented in enumerate(estimate.oriented)
     ]
     progress.stage("matching")
     reference = _references(network, estimate)
@@ -107,11 +112,18 @@ def refine_model(
     progress.stage("adjustment")
     anew = replace(network, image_points=measured)
     part, start, images, points = _part(anew, estimate, np.ones(len(measured), dtype=bool))
-    adjusted = adjust(part, start, datum=Datum("free"), reject="tau", covariance=False)
-    accepted = _accepted(anew, adjusted, images, points)
+    adjusted = adjust(part, start, datum=Datum("free"), reject="huber", covariance=False)
+    v = np.abs(adjusted.residuals)
+    fits = (v <= TOLERANCE_FACTOR * MAD_TO_SIGMA * np.median(v)).all(axis=1)
+    accepted = images[measured.image] & points[measured.point]
+    accepted[accepted] = fits
     part, start, _, _ = _part(anew, put_back(estimate, adjusted.estimate, images, points), accepted)
-    final = adjust(part, start, datum=Datum("free"), reject="tau", covariance=True)
-    counts = [(flag.name, int(((matches.flag & flag) != 0).sum())) for flag in LsmFlag if flag]
+    tests = 2 * len(part.image_points)
+    alpha = 1 - (1 - FALSE_ALARM) ** (1 / tests)
+    final = adjust(part, start, datum=Datum("free"), reject="tau", alpha=alpha, covariance=True)
+    counts = [(in_words(LsmFlag, flag), int(((matches.flag & flag) != 0).sum())) for flag in LsmFlag if flag]
+    counts.append((f"of a point that fewer than {MIN_RAYS} photographs see", len(seen) - len(rows)))
+    counts.append(("contradict the others", int(good.sum() - (~final.rejected).sum())))
     return Refinement(
         before,
         readjusted.rms_px,
@@ -119,11 +131,7 @@ def refine_model(
         final,
         len(seen),
         int((~final.rejected).sum()),
-        tuple(
-            (str(name).lower().replace("_", " "), count)
-            for name, count in sorted(counts, key=lambda c: -c[1])
-            if count
-        ),
+        tuple((why, count) for why, count in sorted(counts, key=lambda c: -c[1]) if count),
     )
 
 
@@ -132,7 +140,7 @@ def refinement_text(result: Refinement) -> str:
     why = ", ".join(f"{count} {reason}" for reason, count in result.reasons)
     return (
         f"key points    {result.refined} of {result.key_points} measured anew"
-        + (f" (not matched: {why})" if why else "")
+        + (f" (not: {why})" if why else "")
         + f"\nRMS before    {result.before_px:.4f} px per coordinate, "
         f"{result.readjusted_px:.4f} px adjusted anew\n"
         f"RMS after     {result.after_px:.4f} px\n"
@@ -147,12 +155,6 @@ def _part(
     images, points = determined(network, estimate, accepted, np.full(len(network.points), MIN_RAYS))
     part, start = reduce_network(network, estimate, images, points, accepted)
     return part, start, images, points
-
-
-def _accepted(network: Network, adjustment: Adjustment, images: BoolArray, points: BoolArray) -> BoolArray:
-    accepted = images[network.image_points.image] & points[network.image_points.point]
-    accepted[accepted] = ~adjustment.rejected
-    return accepted
 
 
 def _freed(camera: Camera) -> Camera:
@@ -192,7 +194,5 @@ def _photograph(network: Network, estimate: Estimate, folder: Path, i: int, prog
             f"{network.images[i]}: {photograph.shape[1]} x {photograph.shape[0]} px, its camera has "
             f"{width} x {height} px"
         )
-    if not estimate.oriented[i]:
-        raise GeometryError(f"{network.images[i]}: the model has no orientation for this photograph")
     progress.advance(network.images[i])
     return photograph
