@@ -268,3 +268,76 @@ def test_camcal_as_a_free_network() -> None:
     expected |= {"P1": -6.102879e-5, "P2": -4.589405e-5, "b1": 3.916193e-4}
     for name, value in expected.items():
         assert a.estimate.cameras[0].value(name) == pytest.approx(value, rel=3e-7)
+
+
+BROWN_FREE = ("c", "x0", "y0", "K1", "K2", "K3", "P1", "P2")
+DBAT_MODELS = {  # number: our model, free parameters, redundancy, sigma0 in px, c in mm, with fixed control
+    1: ("brown", BROWN_FREE, 3726, 0.168901, 7.457396),
+    2: ("brown", BROWN_FREE, 3726, 0.168901, 7.457396),
+    3: ("brown", (*BROWN_FREE, "b1"), 3725, 0.161480, 7.456995),
+    4: ("brown_affine", (*BROWN_FREE, "b1"), 3725, 0.161247, 7.457019),
+    5: ("brown", (*BROWN_FREE, "b1"), 3725, 0.161480, 7.456995),
+    -1: ("brown_forward", BROWN_FREE, 3726, 0.162168, 7.457482),
+}
+
+
+def dbat_residuals(number: int, p: dict[str, float], xy: np.ndarray, uv: np.ndarray, s: float) -> np.ndarray:
+    """Residuals in px by DBAT's own formulas, millimetres counted from the corner of the photograph."""
+    px = s * 2272 / 2 + p["x0"]
+    py = s * 1704 / 2 - p["y0"]
+    col, y = s * (xy[:, 0] + 0.5), py - s * (xy[:, 1] + 0.5)
+    a1 = 1 + p["b1"]
+    ideal = p["c"] * uv
+
+    def lens(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        r2 = x**2 + y**2
+        radial = p["K1"] * r2 + p["K2"] * r2**2 + p["K3"] * r2**3
+        dx = x * radial + p["P1"] * (r2 + 2 * x**2) + 2 * p["P2"] * x * y
+        dy = y * radial + p["P2"] * (r2 + 2 * y**2) + 2 * p["P1"] * x * y
+        return np.stack([dx, dy], axis=1)
+
+    measured = np.stack([col - px, y], axis=1)
+    if number == -1:  # distortion of the projected point
+        v = ideal + lens(*ideal.T) - measured
+    elif number in (1, 2):  # no affinity
+        v = ideal - measured - lens(*measured.T)
+    elif number == 3:  # affinity before the lens
+        stretched = measured * [a1, 1.0]
+        v = ideal - stretched - lens(*stretched.T)
+    elif number == 4:  # and behind it
+        v = ideal - (measured + lens(*measured.T)) * [a1, 1.0]
+    else:  # aspect before the principal point, which is thereby another number: (1 + b1) px
+        stretched = np.stack([a1 * col - a1 * px, y], axis=1)
+        v = ideal - stretched - lens(*stretched.T)
+    return np.asarray(v / s)
+
+
+@needs_camcal
+@pytest.mark.parametrize("number", DBAT_MODELS)
+def test_camcal_with_the_six_camera_models_of_dbat(number: int) -> None:
+    """Models 1 and 2 are `brown` without affinity, 3 is the report's, 5 is 3 with another principal point."""
+    model, free, redundancy, sigma0_px, c = DBAT_MODELS[number]
+    network, start = read_photomodeler(CAMCAL / "camcal-pmexport.txt", control=CAMCAL / "camcal-fixed.txt")
+    s = 5.43764 / 1704
+    camera = camera_from_values("A", model, start.cameras[0].size_px, (s, s), c_mm=7.3, free=free)
+    a = adjust(network, replace(start, cameras=(camera,)), datum=Datum("control"), reject="none")
+    assert a.converged and a.defect == 0 and a.redundancy == redundancy
+    assert agrees(a.sigma0_px, f"{sigma0_px:.6f}")
+    found = a.estimate.cameras[0]
+    assert agrees(found.value("c"), f"{c:.6f}")
+    sigma_c = np.sqrt(a.covariance.interior[0][0, 0])
+    assert abs(found.value("c") - 7.45700) < 1.5 * sigma_c  # DBAT's, by model 3
+    seen = network.image_points
+    d = a.estimate.points[seen.point] - a.estimate.position[seen.image]
+    UVW = np.einsum("kji,kj->ki", a.estimate.rotation[seen.image], d)
+    p = dict(zip(found.names, found.parameters.tolist(), strict=True))
+    uv = -UVW[:, :2] / UVW[:, 2:]
+    v = dbat_residuals(number, p, seen.xy, uv, s)
+    assert (v**2).sum() == pytest.approx((a.residuals**2).sum(), rel=1e-12)
+    for k, name in enumerate(free):  # the sum of squares by DBAT's formulas is least in every parameter
+        step = np.sqrt(a.covariance.interior[0][k, k])
+        higher = [
+            (dbat_residuals(number, p | {name: p[name] + f * step}, seen.xy, uv, s) ** 2).sum() - (v**2).sum()
+            for f in (1, -1)
+        ]
+        assert min(higher) > 0 and higher[0] == pytest.approx(higher[1], rel=1e-2)
