@@ -32,9 +32,9 @@ FREE = ("c", "x0", "y0", "K1", "P1", "P2")
 
 
 def compile_targets() -> None:
-    """Find dark and bright targets in a drawn photograph, with rings of cells and with arcs."""
+    """Find dark and bright targets in a drawn photograph, with rings of cells, with arcs and with tags."""
     for bright in (False, True):
-        for codes in ("ring14", "arcs"):
+        for codes in ("ring14", "arcs", "apriltag36h11"):
             find_targets(_photograph(bright), polarity="auto", codes=codes)
 
 

@@ -259,6 +259,21 @@ def test_a_photographed_sheet_gives_its_ids(name: str, dark: bool) -> None:
     assert np.abs(error).max() < 0.1
 
 
+@pytest.mark.parametrize("name", ["apriltag16h5", "apriltag36h11", "aruco4x4_1000", "aruco_original"])
+def test_no_tag_is_read_from_print_and_boxes(name: str) -> None:
+    rng = np.random.default_rng(9)
+    picture = np.full((700, 1000), 210, np.uint8)
+    letters = list("abdegopqO0689BDPQRci#@%&HE")
+    for y in range(20, 700, 30):
+        size, stroke = float(rng.uniform(0.4, 1.2)), int(rng.integers(1, 4))
+        cv2.putText(picture, "".join(rng.choice(letters, 80)), (5, y), 0, size, 30, stroke, cv2.LINE_AA)
+    for _ in range(60):
+        (x, y), (w, h) = rng.integers(0, (950, 650)), rng.integers(20, 120, 2)
+        picture[y : y + h, x : x + w] = rng.integers(0, 255)
+    found = find_targets(cv2.GaussianBlur(picture, (0, 0), 0.8), polarity="auto", codes=name)
+    assert (found.code < 0).all()
+
+
 def test_names_of_corners() -> None:
     assert [corner_name(28 + k) for k in range(4)] == ["7a", "7b", "7c", "7d"]
     assert tag_family("ring14") is None
