@@ -9,7 +9,10 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 LAYERS = (
-    ("sfm.conventions", "sfm.errors", "sfm.progress", "sfm.folder_lock", "sfm.engine"),
+    (
+        *("sfm.conventions", "sfm.errors", "sfm.progress", "sfm.folder_lock", "sfm.whole_files"),
+        "sfm.engine",
+    ),
     ("sfm.distortion", "sfm.camera", "sfm.network", "sfm.similarity"),
     ("sfm.targets", "sfm.matching", "sfm.orientation", "sfm.adjustment"),
     ("sfm.analysis",),

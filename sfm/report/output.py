@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import glob
 import json
-import os
 import shutil
-import tempfile
 import time
 from collections.abc import Callable
 from contextlib import suppress
@@ -22,6 +20,7 @@ from sfm.report.result import StageTime, SurveyResult
 from sfm.report.summary import write_summary
 from sfm.report.tables import write_tables
 from sfm.report.text import text_report
+from sfm.whole_files import whole_folder
 
 WRITTEN = (
     "summary.json",
@@ -70,13 +69,7 @@ def write_result(
     refuse_foreign_folder(out)
     started = time.perf_counter()
     progress.stage("report", len(result.photographs))
-    try:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        folder = Path(tempfile.mkdtemp(prefix=f".{out.name}.", suffix=".part", dir=out.parent))
-    except OSError as error:
-        raise OutputError(f"{out}: the result cannot be written here: {error.strerror}") from error
-    try:
-        folder.chmod(0o755)  # mkdtemp makes it for the owner alone
+    with whole_folder(out, "the result") as folder:
         if write_colmap is not None:
             (folder / "colmap").mkdir()
             write_colmap(folder / "colmap")
@@ -97,14 +90,6 @@ def write_result(
         (folder / "report.html").write_text(page, encoding="utf-8")
         if finish is not None:
             finish(folder)
-        _make_durable(folder)
-        _put_in_place(folder, out)
-    except OSError as error:
-        raise OutputError(f"{out}: the result cannot be written: {error.strerror or error}") from error
-    except OutputError as error:  # of the folder that nobody will find
-        raise OutputError(str(error).replace(str(folder), str(out))) from error
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)
     return out / "report.html"
 
 
@@ -153,38 +138,3 @@ def remove_leftovers(out: Path) -> None:
         shutil.rmtree(old, ignore_errors=True)
     for part in out.parent.glob(f".{name}.*.part"):
         shutil.rmtree(part, ignore_errors=True)
-
-
-def _make_durable(folder: Path) -> None:
-    """Have all files on the disk before the folder has its name, so that a power cut leaves none empty."""
-    for path in (*folder.rglob("*"), folder):
-        _sync(path)
-
-
-def _sync(path: Path) -> None:
-    if path.is_dir() and os.name == "nt":
-        return  # Windows knows no handles of folders
-    handle = os.open(path, os.O_RDONLY if path.is_dir() else os.O_RDWR)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)
-
-
-def _put_in_place(folder: Path, out: Path) -> None:
-    """Rename the finished folder to its place; an earlier result is kept until the new one is there."""
-    if not out.exists():
-        folder.rename(out)
-        _sync(out.parent)
-        return
-    old = Path(tempfile.mkdtemp(prefix=f".{out.name}.", suffix=".old", dir=out.parent))
-    try:
-        out.rename(old / "result")
-        try:
-            folder.rename(out)
-        except OSError:
-            (old / "result").rename(out)
-            raise
-        _sync(out.parent)
-    finally:
-        shutil.rmtree(old, ignore_errors=True)
