@@ -20,6 +20,9 @@ MAX_SIDE_PX = 2400  # longer photographs are drawn smaller
 THUMBNAIL_SIDE_PX = 720
 JPEG_QUALITY = 82
 ARROW_PX = 22.0  # length in the picture of a residual of the size of the RMS
+CROWDED = 300  # image points of a photograph; more of them are drawn as dots without names
+CROWDED_ARROW_PX = 8.0  # the same length where photographs are crowded, which keeps the vectors apart
+DOT_PX = 2  # radius of such a dot
 LABEL_SIZE = 0.5  # of OpenCV's Hershey font
 SHIFT = 4  # fractional bits of the coordinates that OpenCV draws at
 
@@ -128,9 +131,14 @@ def draw_photograph(photograph: PhotographTargets, adjustment: Adjustment, facto
     owner = _nearest(photograph.xy, seen.xy[rows])
     reach = np.zeros(len(rows))  # of the outline of each image point to the right, px
     remarks = _remarks(photograph)
+    crowded = len(photograph.xy) > CROWDED
     for k in range(len(photograph.xy)):
         row = owner[k]
         colour = UNUSED if row < 0 else DROPPED if adjustment.rejected[rows[row]] else USED
+        if crowded:
+            at = _drawn(photograph.xy[k], scale)
+            cv2.circle(picture, at, DOT_PX << SHIFT, colour, cv2.FILLED, cv2.LINE_AA, SHIFT)
+            continue
         outline = photograph.semi_axes[k] + 2 / scale
         _ellipse(picture, photograph.xy[k], outline, photograph.angle[k], scale, colour)
         for remark, second in REMARK_COLOURS:
@@ -142,7 +150,10 @@ def draw_photograph(photograph: PhotographTargets, adjustment: Adjustment, facto
     # The vector points from the measured to the adjusted position: v = computed - measured.
     for row, name, right in zip(rows, names, reach, strict=True):
         xy = seen.xy[row]
-        _arrow(picture, xy, xy + factor / scale * adjustment.residuals[row], scale)
+        end = xy + factor / scale * adjustment.residuals[row]
+        _arrow(picture, xy, end, scale, thickness=1 if crowded else 2)
+        if crowded:
+            continue
         colour = DROPPED if adjustment.rejected[row] else USED
         _label(picture, name, xy + np.array([right, -right / 2]), scale, colour)
     return picture
@@ -150,11 +161,13 @@ def draw_photograph(photograph: PhotographTargets, adjustment: Adjustment, facto
 
 def arrow_factor(adjustment: Adjustment) -> float:
     """Return by what residual vectors are enlarged: 1, 2 or 5 times a power of ten."""
-    rms = adjustment.rms_px
+    rms, network = adjustment.rms_px, adjustment.network
     if not np.isfinite(rms) or rms <= 0:
         return 1.0
-    power = 10.0 ** np.floor(np.log10(ARROW_PX / rms))
-    return float(max(step * power for step in (1, 2, 5) if step * power <= ARROW_PX / rms))
+    crowded = len(network.image_points) > CROWDED * len(network.images)
+    longest = (CROWDED_ARROW_PX if crowded else ARROW_PX) / rms
+    power = 10.0 ** np.floor(np.log10(longest))
+    return float(max(step * power for step in (1, 2, 5) if step * power <= longest))
 
 
 def overlay_names(images: tuple[str, ...]) -> tuple[str, ...]:
@@ -222,8 +235,8 @@ def _cross(picture: AnyArray, xy: FloatArray, scale: float, arm_px: int, colour:
     cv2.line(picture, (x - arm, y + arm), (x + arm, y - arm), colour, 1, cv2.LINE_AA, SHIFT)
 
 
-def _arrow(picture: AnyArray, start: FloatArray, end: FloatArray, scale: float) -> None:
-    cv2.line(picture, _drawn(start, scale), _drawn(end, scale), ARROW, 2, cv2.LINE_AA, SHIFT)
+def _arrow(picture: AnyArray, start: FloatArray, end: FloatArray, scale: float, *, thickness: int) -> None:
+    cv2.line(picture, _drawn(start, scale), _drawn(end, scale), ARROW, thickness, cv2.LINE_AA, SHIFT)
 
 
 def _label(picture: AnyArray, name: str, xy: FloatArray, scale: float, colour: tuple[int, ...]) -> None:
