@@ -198,6 +198,11 @@ def _refuse_contradictions(survey: Survey) -> None:
             f"{where}: compare.baseline = '{survey.compare.baseline}' needs photographs, the survey has "
             "[observations]; leave it out"
         )
+    if survey.datum.kind == "control" and survey.datum.points:
+        raise SurveyFileError(
+            f"{where}: datum.points are for kind 'free' or 'minimal', in kind 'control' the control carries "
+            "the datum"
+        )
     if survey.datum.kind == "control" and survey.control is None:
         raise SurveyFileError(f"{where}: datum kind 'control' needs [control] with the file of known points")
     for bar in survey.scale_bars:

@@ -113,6 +113,7 @@ class DatumSettings(Section):
     """[datum]: what position, orientation and scale of the result rest on."""
 
     kind: Literal["free", "minimal", "control"] = "free"
+    points: Names = ()  # object points that carry a free or minimal datum; all if none are named
 
 
 class ControlSettings(Section):

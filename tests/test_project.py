@@ -178,6 +178,12 @@ def test_datum_control_needs_control(tmp_path: Path) -> None:
         read_survey(write(tmp_path, MINIMAL + '[datum]\nkind = "control"\n'))
 
 
+def test_datum_points_are_not_for_control(tmp_path: Path) -> None:
+    given = MINIMAL + '[datum]\nkind = "control"\npoints = ["1"]\n[control]\nfile = "control.csv"\n'
+    with pytest.raises(SurveyFileError, match=r"datum.points are for kind 'free' or 'minimal'"):
+        read_survey(write(tmp_path, given))
+
+
 def test_unreadable_survey_files(tmp_path: Path) -> None:
     with pytest.raises(SurveyFileError, match="cannot be read: No such file"):
         read_survey(tmp_path / "none.toml")

@@ -10,13 +10,17 @@ import pytest
 from synthetic import PIXEL_MM, SIZE_PX, make_network, seed_of
 
 from adapters.colmap import adjust_with_colmap
+from sfm.adjustment.datum import Datum
+from sfm.adjustment.marginal import change_datum, marginal_of
 from sfm.camera import project
 from sfm.conventions import angles_from_rotation
-from sfm.errors import SurveyFileError
+from sfm.errors import GeometryError, SurveyFileError
 from sfm.network import Estimate, Network
 from sfm.pipeline import adjust_survey
 from sfm.project import read_survey
 from sfm.report.result import SurveyResult
+from sfm.report.summary import summary
+from sfm.report.text import text_report
 from sfm.survey.comparison import OtherPrograms
 
 IMAGES = 8
@@ -107,6 +111,32 @@ def test_c_of_each_photograph_x0_of_groups_and_the_rest_of_all(tmp_path: Path) -
         assert_recovered(result, truth, parameter)
     whole, _ = zoomed(tmp_path, LENS, x0_of_groups=(0.02, 0.05))
     assert adjust_survey(read_survey(whole)).adjustment.sigma0 > 1 + 6 / np.sqrt(2 * a.redundancy)
+
+
+def test_inner_constraints_on_chosen_points(tmp_path: Path) -> None:
+    path, _ = zoomed(tmp_path, LENS + 'per_photograph = ["c"]\n')
+    all_points = adjust_survey(read_survey(path)).adjustment
+    path.write_text(path.read_text(encoding="utf-8") + '[datum]\npoints = ["p1", "p5", "p9", "q"]\n')
+    result = adjust_survey(read_survey(path))
+    a = result.adjustment
+    assert a.datum_points is not None and a.datum_points.sum() == 3
+    assert "datum points that are not in the network: q" in result.warnings
+    on = [a.network.points.index(name) for name in ("p1", "p5", "p9")]
+    changed = change_datum(all_points, Datum("free", a.datum_points))
+    # carried over without a new adjustment, from points that were adjusted in another datum
+    ratio = np.trace(changed.covariance.points[on].sum(axis=0)) / np.trace(
+        a.covariance.points[on].sum(axis=0)
+    )
+    scale = np.linalg.norm(np.diff(all_points.estimate.points[on[:2]], axis=0))
+    scale /= np.linalg.norm(np.diff(a.estimate.points[on[:2]], axis=0))
+    assert ratio == pytest.approx(scale**2, rel=1e-4)
+    assert "free on 3 chosen points" in text_report(result)
+    assert summary(result)["datum"]["points"] == ["p1", "p5", "p9"]
+    again = marginal_of(a).joint(np.zeros(0, dtype=int), np.array(on))
+    assert again[:3, :3] == pytest.approx(a.covariance.points[on[0]], rel=1e-4)
+    path.write_text(path.read_text(encoding="utf-8").replace('"p5", "p9"', '"r", "s"'))
+    with pytest.raises(GeometryError, match=r"1 of the 4 datum\.points are in the network, at least 3"):
+        adjust_survey(read_survey(path))
 
 
 def test_one_camera_for_each_group(tmp_path: Path) -> None:

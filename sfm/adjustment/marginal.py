@@ -88,14 +88,14 @@ def marginal_of(adjustment: Adjustment, *, datum: Datum | None = None) -> Margin
 
     Args:
         adjustment: what `adjust` returned.
-        datum: another datum of the same kinds (control stays control); its own on all points if None.
+        datum: another datum of the same kinds (control stays control); its own if None.
 
     Raises:
         GeometryError: a change between control and a datum without.
     """
     use_control = adjustment.datum == "control"
     if datum is None:
-        datum = Datum(adjustment.datum)
+        datum = Datum(adjustment.datum, adjustment.datum_points)
     if (datum.kind == "control") != use_control:
         raise GeometryError("datum: with or without control is another adjustment, not an S-transformation")
     layout, state = unknowns_of(adjustment.network, adjustment.estimate, use_control=use_control)
@@ -120,4 +120,6 @@ def change_datum(adjustment: Adjustment, datum: Datum) -> Adjustment:
     """
     m = marginal_of(adjustment, datum=datum)
     covariance = marginal_covariance(m.optimum, m.layout, m.cofactors, adjustment.sigma0**2)
-    return replace(adjustment, datum=datum.kind, covariance=without_held(covariance, m.layout))
+    return replace(
+        adjustment, datum=datum.kind, datum_points=datum.points, covariance=without_held(covariance, m.layout)
+    )

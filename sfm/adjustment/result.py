@@ -46,6 +46,8 @@ class Adjustment:
     weights: FloatArray = field(default_factory=lambda: np.zeros(0))  # factor on the weight of each image
     # point: 0 where rejected, between 0 and 1 by reweighting, else 1, (k,)
 
+    datum_points: BoolArray | None = None  # object points that carry the datum; all if None, (n,)
+
     @property
     def vPv(self) -> float:
         """Weighted sum of squared residuals of all observations, a priori unit weight."""

@@ -243,4 +243,5 @@ def _result(
         covariance=result,
         standardised=standardised[unsorted],
         weights=weight[unsorted],
+        datum_points=run.problem.datum.points,
     )

@@ -15,6 +15,7 @@ from sfm.report.markup import (
 from sfm.report.overlays import Overlay
 from sfm.report.result import SurveyResult
 from sfm.report.section_statistics import observations
+from sfm.report.statistics import datum_in_words
 from sfm.report.tables import (
     image_rms,
     image_rows,
@@ -37,8 +38,8 @@ def worked_section(result: SurveyResult, verdict: Verdict) -> str:
         ("Adjustment", f"{'converged' if a.converged else 'did NOT converge'} in {a.iterations} iterations"),
         (
             "Datum",
-            f"{a.datum}; rank defect of the normal equations {a.defect}, expected {a.expected_defect}"
-            + ("" if a.defect == a.expected_defect else " - see the warnings"),
+            f"{datum_in_words(a)}; rank defect of the normal equations {a.defect}, expected "
+            f"{a.expected_defect}" + ("" if a.defect == a.expected_defect else " - see the warnings"),
         ),
         (
             "Equations",

@@ -76,6 +76,12 @@ def statistics_of(adjustment: Adjustment) -> Statistics:
     )
 
 
+def datum_in_words(adjustment: Adjustment) -> str:
+    """Return what carries the datum: its kind, and how many points where they were chosen."""
+    points = adjustment.datum_points
+    return adjustment.datum if points is None else f"{adjustment.datum} on {int(points.sum())} chosen points"
+
+
 def interior_parameters(adjustment: Adjustment) -> tuple[InteriorParameter, ...]:
     """Return every parameter of interior orientation once, those that are fixed at 0 left out."""
     network = adjustment.network

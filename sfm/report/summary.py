@@ -50,6 +50,7 @@ def summary(result: SurveyResult) -> dict[str, Any]:
         "redundancy": adjustment.redundancy,
         "datum": {
             "kind": adjustment.datum,
+            "points": _datum_points(adjustment),
             "defect": adjustment.defect,
             "expected_defect": adjustment.expected_defect,
             "undetermined": list(adjustment.undetermined),
@@ -148,6 +149,14 @@ def _statistics(result: SurveyResult) -> dict[str, Any]:
             if not test.significant
         ],
     }
+
+
+def _datum_points(adjustment: Adjustment) -> list[str] | None:
+    """Return the names of chosen datum points, None where all points carry the datum."""
+    if adjustment.datum_points is None:
+        return None
+    names = adjustment.network.points
+    return [name for name, on in zip(names, adjustment.datum_points, strict=True) if on]
 
 
 def _coordinate_test(test: CoordinateTest) -> dict[str, Any]:

@@ -22,7 +22,7 @@ from sfm.report.checks import (
 )
 from sfm.report.markup import finer_unit, significant, with_exponent
 from sfm.report.result import SurveyResult
-from sfm.report.statistics import Statistics, interior_parameters, quantiles, statistics_of
+from sfm.report.statistics import Statistics, datum_in_words, interior_parameters, quantiles, statistics_of
 from sfm.report.tables import image_rms, point_sigmas, root_mean_square
 from sfm.report.verdict import verdict_of
 
@@ -88,7 +88,7 @@ def _adjustment(result: SurveyResult) -> list[str]:
         _line("object points", f"{len(network.points)}"),
         _line("image points", f"{int((~a.rejected).sum())} accepted, {int(a.rejected.sum())} rejected"),
         _line("adjustment", f"{'converged' if a.converged else 'NOT converged'}, {a.iterations} iterations"),
-        _line("datum", f"{a.datum}; rank defect {a.defect}, {rank}"),
+        _line("datum", f"{datum_in_words(a)}; rank defect {a.defect}, {rank}"),
         _line("observations", f"{a.observations} ({', '.join(observed)})"),
         _line("unknowns", f"{a.unknowns} ({unknowns})"),
         _line("constraints", f"{counts.constraints}"),

@@ -25,6 +25,7 @@ TOLERANCE_FACTOR = 6.0  # of the robust spread of the residuals
 MIN_TOLERANCE_PX = 1.0  # below it a difference is for the statistical test, not for the matching
 FALSE_ALARM = 0.05  # chance that a survey without any outlier loses an image coordinate; Pope (1976)
 MIN_IMAGE_POINTS = 4  # of a photograph in the final adjustment: three determine it, the fourth checks
+MIN_DATUM_POINTS = 3  # that fix position, attitude and scale
 MOST_NAMES = 10  # points named in one line
 MAD_TO_SIGMA = 1.4826  # of a normal distribution; Hampel (1974), J. Am. Stat. Assoc. 69
 
@@ -155,12 +156,30 @@ def _tested(
     return adjust(
         network,
         estimate,
-        datum=datum,
+        datum=_on_points(survey, network, datum),
         sigma_px=survey.adjust.sigma_px,
         reject=survey.reject,
         alpha=1 - (1 - FALSE_ALARM) ** (1 / tests),
         covariance=covariance,
     )
+
+
+def _on_points(survey: Survey, network: Network, datum: Datum) -> Datum:
+    """Return the datum on the points that the survey names, on all if it names none.
+
+    Raises:
+        GeometryError: fewer than three of them are in the network.
+    """
+    named = survey.datum.points
+    if not named:
+        return datum
+    on = np.isin(network.points, named)
+    if on.sum() < MIN_DATUM_POINTS:
+        raise GeometryError(
+            f"survey {survey.name}: {on.sum()} of the {len(named)} datum.points are in the network, at least "
+            f"{MIN_DATUM_POINTS} are needed"
+        )
+    return replace(datum, points=on)
 
 
 def _weighed(adjustment: Adjustment) -> tuple[Network, float]:
@@ -224,4 +243,7 @@ def _warnings(survey: Survey, known: tuple[str, ...], adjustment: Adjustment) ->
     if gone:
         shown = ", ".join(gone[:MOST_NAMES]) + (" ..." if len(gone) > MOST_NAMES else "")
         lines.append(f"{len(gone)} points left out, too few of their image points were accepted: {shown}")
+    absent = [name for name in survey.datum.points if name not in set(adjustment.network.points)]
+    if absent:
+        lines.append(f"datum points that are not in the network: {', '.join(absent[:MOST_NAMES])}")
     return (*lines, *datum_warnings(survey, adjustment.network))
