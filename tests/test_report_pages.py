@@ -13,8 +13,9 @@ import pytest
 from sfm.analysis.random_network import Plan
 from sfm.analysis.significance import Result, ResultComparison, compare_results
 from sfm.analysis.validation import SAME, Trial, Validation
-from sfm.errors import OutputError
-from sfm.report.differences import write_differences
+from sfm.errors import GeometryError, OutputError
+from sfm.network import Network
+from sfm.report.differences import largest_difference, words_of_test, write_differences
 from sfm.report.validation import COLUMNS, write_validation
 from tests.synthetic import make_network, seed_of
 
@@ -88,16 +89,23 @@ def moved() -> tuple[ResultComparison, np.ndarray]:
     covariance = np.tile(np.eye(3) * 1e-8, (20, 1, 1))
     points = truth.points.copy()
     points[4] += 0.003
-    a = Result("before", network, truth, covariance, redundancy=100)
-    b = Result("after <b>", network, replace(truth, points=points), covariance, redundancy=100)
+    a = Result("before", network, truth, covariance, redundancy=100, unit="m")
+    b = Result(
+        "after <b>", measured_again(network), replace(truth, points=points), covariance, redundancy=100
+    )
     found = compare_results(a, b, align="control", control=("1", "2", "9", "15"))
     return found, truth.points
+
+
+def measured_again(network: Network) -> Network:
+    seen = network.image_points
+    return replace(network, image_points=replace(seen, xy=seen.xy + 0.1))
 
 
 def test_comparison_is_written_with_every_point(
     moved: tuple[ResultComparison, np.ndarray], tmp_path: Path
 ) -> None:
-    path = write_differences(*moved, tmp_path / "out", unit="m")
+    path = write_differences(*moved, tmp_path / "out")
     with (tmp_path / "out" / "differences.csv").open() as file:
         rows = {row["id"]: row for row in csv.DictReader(file)}
     assert len(rows) == 20
@@ -106,13 +114,59 @@ def test_comparison_is_written_with_every_point(
     summary = json.loads((tmp_path / "out" / "comparison.json").read_text())
     assert summary["significant"] == ["5"] and summary["changed"] is True
     page = path.read_text(encoding="utf-8")
-    assert "The points differ significantly." in page
+    assert "The points differ significantly, 1 of them singly." in page
+    assert largest_difference(moved[0]) == "5.20 mm"
     assert "after &lt;b&gt;" in page and "after <b>" not in page
 
 
 def test_comparison_without_sigmas_says_so(tmp_path: Path) -> None:
     network, truth = make_network(seed_of("bare"), model="opencv", images=5, points=20)
-    found = compare_results(Result("a", network, truth), Result("b", network, truth))
+    found = compare_results(Result("a", network, truth), Result("b", measured_again(network), truth))
     page = write_differences(found, truth.points, tmp_path / "out").read_text()
-    assert "No standard deviations are known" in page
+    assert "Not tested: neither result knows its standard deviations." in page
     assert json.loads((tmp_path / "out" / "comparison.json").read_text())["changed"] is None
+
+
+def test_results_of_the_same_image_points_are_not_tested(tmp_path: Path) -> None:
+    network, truth = make_network(seed_of("same"), model="opencv", images=5, points=20)
+    covariance = np.tile(np.eye(3) * 1e-8, (20, 1, 1))
+    a, b = (Result(name, network, truth, covariance) for name in "ab")
+    found = compare_results(a, b)
+    assert found.same_share == 1.0 and found.changed is None and not found.significant.any()
+    page = write_differences(found, truth.points, tmp_path / "out").read_text()
+    assert "Not tested: 100% of the image points of a are those of b." in page
+    write_differences(found, truth.points, tmp_path / "out")  # again, over its own files
+
+
+def test_nothing_in_common_is_no_agreement(tmp_path: Path) -> None:
+    network, truth = make_network(seed_of("strangers"), model="opencv", images=5, points=20)
+    other = replace(
+        network,
+        points=tuple(f"other {name}" for name in network.points),
+        images=tuple(f"other {name}" for name in network.images),
+    )
+    for align in ("points", "cameras", "none"):
+        with pytest.raises(GeometryError, match="a and b have neither points nor photographs of the same"):
+            compare_results(Result("a", network, truth), Result("b", other, truth), align=align)
+    photographs_only = compare_results(
+        Result("a", network, truth),
+        Result("b", replace(other, images=network.images), truth),
+        align="cameras",
+    )
+    assert words_of_test(photographs_only)[0].startswith("No points in common")
+    write_differences(photographs_only, truth.points[:0], tmp_path / "out")
+
+
+def test_sigmas_of_one_result_are_enough() -> None:
+    """Those of the other, unknown as a whole or for single points, count as 0."""
+    network, truth = make_network(seed_of("one-sided"), model="opencv", images=5, points=20)
+    covariance = np.tile(np.eye(3) * 1e-8, (20, 1, 1))
+    unknown = np.full((20, 3, 3), np.nan)
+    some = covariance.copy()
+    some[3] = np.nan
+    a = Result("a", network, truth, some)
+    b = Result("b", measured_again(network), truth, unknown)
+    found = compare_results(a, b)
+    assert found.has_sigma == (True, False)
+    assert np.isnan(found.statistic).tolist() == [j == 3 for j in range(20)]
+    assert found.changed is False

@@ -106,8 +106,10 @@ def test_both_adjusters_end_at_the_same_optimum_with_the_same_covariances() -> N
     assert found.passed
     assert found.counts() == ((SAME, 12),)
     for trial in found.trials:
-        for name in ("interior_sigmas", "position_sigmas", "rotation_sigmas", "point_sigmas"):
+        for name in ("position_sigmas", "rotation_sigmas", "point_sigmas"):
             assert getattr(trial, name) < 1e-3  # of a standard deviation
+        free = trial.plan.interior != "fixed"
+        assert trial.interior_sigmas < 1e-3 if free else np.isnan(trial.interior_sigmas)
         assert trial.conditional_difference < 1e-5
         assert not trial.interior_difference > 1e-5
         assert trial.rms_px[0] == pytest.approx(trial.rms_px[1], rel=1e-9)

@@ -5,7 +5,7 @@ points or projection centres, or over control, or none) each difference d of a p
 T = d' (Qa + Qb)^-1 d / 3, which under no change follows Fisher's F with 3 and the redundancy's degrees of
 freedom (chi-square over 3 where that is not known). The covariance of the aligned result is turned and scaled
 with it; the uncertainty of the alignment itself is left out, which makes the tests a little strict for few
-points.
+points. Results that were adjusted from the same image points are not independent and are not tested.
 
 Source: Luhmann et al. (2020), Close-Range Photogrammetry and 3D Imaging, sec. 2.4.2; Caspary (2000),
 Concepts of network and deformation analysis, sec. 7.
@@ -27,6 +27,8 @@ from sfm.network import Estimate, Network
 from sfm.similarity import Similarity, fit_similarity
 
 ALIGNMENTS = ("points", "cameras", "control", "none")
+SAME_PX = 1e-3  # image points closer than this are one measurement
+SAME_SHARE = 0.5  # of a's image points that b has too, from which on they are not independent
 ALPHA = 0.05  # level of the global test; single points are tested at ALPHA / number of points (Bonferroni)
 
 
@@ -41,6 +43,7 @@ class Result:
     position_covariance: FloatArray | None = None  # of projection centres, object unit^2, (m, 3, 3)
     interior_sigma: tuple[FloatArray, ...] | None = None  # of each parameter, NaN where fixed
     redundancy: int | None = None  # of the adjustment, for the test's degrees of freedom
+    unit: str = ""  # of lengths, as people call it; empty where nobody knows
 
 
 class ResultLike(Protocol):
@@ -58,6 +61,8 @@ class ResultLike(Protocol):
     def interior_sigma(self) -> tuple[FloatArray, ...] | None: ...
     @property
     def redundancy(self) -> int | None: ...
+    @property
+    def unit(self) -> str: ...
 
 
 @dataclass(frozen=True)
@@ -67,8 +72,9 @@ class InteriorDifference:
     camera: str
     model: str  # in which they are compared: that of a
     names: tuple[str, ...]
-    difference: FloatArray  # b - a, units of the model, (p,)
-    sigma: FloatArray  # of the difference where both are known in this model, else NaN, (p,)
+    units: tuple[str, ...]  # of each parameter
+    difference: FloatArray  # b - a, (p,)
+    sigma: FloatArray  # of the difference where one is known in this model, NaN where none is, (p,)
     conversion: Conversion | None  # of b's camera into a's model, None if it was the same
 
 
@@ -77,6 +83,9 @@ class ResultComparison:
     """Differences b - a of two results after b was aligned to a."""
 
     names: tuple[str, str]
+    unit: str  # of a's lengths, as people call it; empty where nobody knows
+    has_sigma: tuple[bool, bool]  # whether standard deviations of points of a and of b are known
+    same_share: float  # of a's image points that b has too; NaN if a has none
     alignment: str  # points | cameras | control | none
     a_from_b: Similarity
     points: tuple[str, ...]  # names of the common points, n of them
@@ -88,13 +97,18 @@ class ResultComparison:
     global_statistic: float  # mean of T over all points
     global_critical: float  # of the global test; NaN if no covariance is known
     images: tuple[str, ...]  # names of the common photographs, m of them
-    position_difference: FloatArray  # object unit of a, (m, 3)
+    position_difference: FloatArray  # of projection centres, object unit of a, (m, 3)
     rotation_deg: FloatArray  # angle between the rotations, deg, (m,)
     interior: tuple[InteriorDifference, ...]  # of cameras that share photographs
 
     @property
+    def independent(self) -> bool:
+        """Whether the results come from measurements of their own, as the test wants it."""
+        return not self.same_share > SAME_SHARE
+
+    @property
     def changed(self) -> bool | None:
-        """Whether the points differ significantly as a whole; None if no covariance is known."""
+        """Whether the points differ significantly as a whole; None if that is not tested."""
         if np.isnan(self.global_critical):
             return None
         return bool(self.global_statistic > self.global_critical)
@@ -117,21 +131,33 @@ def compare_results(
         alpha: probability of calling something a change that is none.
 
     Raises:
-        GeometryError: an unknown alignment, or too little in common for it.
+        GeometryError: an unknown alignment, too little in common for it, or nothing in common at all.
     """
     if align not in ALIGNMENTS:
         raise GeometryError(f"comparison: align '{align}' is none of {', '.join(ALIGNMENTS)}")
     pa, pb = _common(a.network.points, a.estimate.determined, b.network.points, b.estimate.determined)
     ia, ib = _common(a.network.images, a.estimate.oriented, b.network.images, b.estimate.oriented)
     point_names = tuple(a.network.points[j] for j in pa)
+    if not len(pa) and not len(ia):
+        raise GeometryError(
+            f"{a.name} and {b.name} have neither points nor photographs of the same names, so there is "
+            "nothing to compare"
+        )
     transform = _align(a, b, align, (pa, pb), (ia, ib), point_names, control)
     moved = transform.apply_estimate(b.estimate)
     difference = moved.points[pb] - a.estimate.points[pa]
     covariance = _sum(a.point_covariance, b.point_covariance, pa, pb, transform)
-    statistic, critical, global_critical = _tests(a, b, difference, covariance, alpha)
+    same_share = _same_share(a.network, b.network)
+    if same_share > SAME_SHARE:
+        statistic, critical, global_critical = np.full(len(pa), np.nan), np.nan, np.nan
+    else:
+        statistic, critical, global_critical = _tests(a, b, difference, covariance, alpha)
     variance = np.einsum("njj->nj", covariance)
     return ResultComparison(
         (a.name, b.name),
+        a.unit,
+        (_has_sigma(a), _has_sigma(b)),
+        same_share,
         align,
         transform,
         point_names,
@@ -185,19 +211,37 @@ def _align(
     return fit_similarity(source, target)
 
 
+def _has_sigma(result: ResultLike) -> bool:
+    return result.point_covariance is not None and bool(np.isfinite(result.point_covariance).any())
+
+
+def _same_share(a: Network, b: Network) -> float:
+    """Share of a's image points that b has too, at the same place of the same photograph; NaN without any."""
+    ours, theirs = a.image_points, b.image_points
+    if not len(ours):
+        return np.nan
+    place = {
+        (b.images[i], b.points[j]): xy for i, j, xy in zip(theirs.image, theirs.point, theirs.xy, strict=True)
+    }
+    same = 0
+    for i, j, xy in zip(ours.image, ours.point, ours.xy, strict=True):
+        other = place.get((a.images[i], a.points[j]))
+        same += other is not None and bool(np.abs(other - xy).max() < SAME_PX)
+    return same / len(ours)
+
+
 def _sum(
     a: FloatArray | None, b: FloatArray | None, pa: IntArray, pb: IntArray, transform: Similarity
 ) -> FloatArray:
-    """Covariance of the differences, NaN if neither is known; one that is not known counts as 0."""
-    if a is None and b is None:
-        return np.full((len(pa), 3, 3), np.nan)
-    total = np.zeros((len(pa), 3, 3))
-    if a is not None:
-        total = total + a[pa]
-    if b is not None:
-        J = transform.scale * transform.rotation
-        total = total + J @ b[pb] @ J.T
-    return total
+    """Covariance of the differences, NaN where neither is known; one that is not known counts as 0."""
+    unknown = np.full((len(pa), 3, 3), np.nan)
+    J = transform.scale * transform.rotation
+    ours = unknown if a is None else a[pa]
+    theirs = unknown if b is None else J @ b[pb] @ J.T
+    first = np.isfinite(ours).all(axis=(1, 2), keepdims=True)
+    second = np.isfinite(theirs).all(axis=(1, 2), keepdims=True)
+    total = np.where(first, ours, 0.0) + np.where(second, theirs, 0.0)
+    return np.where(first | second, total, np.nan)
 
 
 def _tests(
@@ -238,11 +282,28 @@ def _interior(a: ResultLike, b: ResultLike, ia: IntArray, ib: IntArray) -> tuple
                 theirs = replace(theirs, pixel_mm=ours.pixel_mm)
             conversion = convert_camera(theirs, ours.model)
             theirs = conversion.camera
-        elif a.interior_sigma is not None and b.interior_sigma is not None:
-            sigma = np.hypot(a.interior_sigma[p], b.interior_sigma[q])
+        else:
+            sigma = _either(
+                None if a.interior_sigma is None else a.interior_sigma[p],
+                None if b.interior_sigma is None else b.interior_sigma[q],
+                sigma,
+            )
         found.append(
             InteriorDifference(
-                ours.name, ours.model, ours.names, theirs.parameters - ours.parameters, sigma, conversion
+                ours.name,
+                ours.model,
+                ours.names,
+                ours.units,
+                theirs.parameters - ours.parameters,
+                sigma,
+                conversion,
             )
         )
     return tuple(found)
+
+
+def _either(a: FloatArray | None, b: FloatArray | None, unknown: FloatArray) -> FloatArray:
+    """Sigma of a difference; what only one knows is its sigma, what neither knows stays NaN."""
+    known = [unknown if one is None else one for one in (a, b)]
+    total = np.hypot(*(np.nan_to_num(one) for one in known))
+    return np.where(np.isfinite(known[0]) | np.isfinite(known[1]), total, np.nan)

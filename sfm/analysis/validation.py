@@ -9,10 +9,13 @@ standard deviation in any direction would cost.
 from __future__ import annotations
 
 import multiprocessing
+import signal
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
+from functools import partial
+from itertools import count
 from typing import Protocol, TypeVar
 
 import numpy as np
@@ -32,6 +35,8 @@ from sfm.similarity import fit_similarity
 T = TypeVar("T")
 SAME_COST = 1e-9  # relative difference of the costs of one optimum
 MAX_ITERATIONS = 100
+WARM_UP_SEED = 0  # of networks that are adjusted before any is timed
+WARM_UP_IMAGE_POINTS = 3000  # which are smaller than this
 SAME = "same optimum"
 OURS_LOWER = "different optima, kolinear lower"
 THEIRS_LOWER = "different optima, {name} lower"
@@ -160,15 +165,17 @@ def make_trial(number: int, seed: int, backend: ValidationBackend) -> Trial:
         their_reason = theirs.message or "not converged"
     cost_a, rms_a = _fit(network, None if ours is None else ours.estimate)
     cost_b, rms_b = _fit(network, None if theirs is None else theirs.estimate)
-    same = abs(cost_b - cost_a) <= SAME_COST * min(cost_a, cost_b)
-    verdict, worse = _judge(cost_a, cost_b, same, bool(our_reason), bool(their_reason))
     sigmas = (np.nan,) * 4
     covariances = (np.nan,) * 3
     if ours is not None and not our_reason:
-        full = _adjust(made, covariance=True, start=ours.estimate)
-        if theirs is not None and np.isfinite(cost_b):
+        at_optimum = ours.estimate
+        full, our_reason = _tried(lambda: _adjust(made, covariance=True, start=at_optimum))
+        if full is not None and theirs is not None and np.isfinite(cost_b):
             sigmas = _differences(full, theirs.estimate, control=control)
-        covariances = _covariances(full, backend, control=control)
+        if full is not None:
+            covariances = _covariances(full, backend, control=control)
+    same = abs(cost_b - cost_a) <= SAME_COST * min(cost_a, cost_b)
+    verdict, worse = _judge(cost_a, cost_b, same, bool(our_reason), bool(their_reason))
     reasons = [
         f"{who}: {why}" for who, why in (("kolinear", our_reason), (backend.name, their_reason)) if why
     ]
@@ -192,17 +199,39 @@ def make_trial(number: int, seed: int, backend: ValidationBackend) -> Trial:
 def _run(backend: ValidationBackend, seed: int, networks: int, jobs: int) -> Iterator[Trial]:
     if jobs <= 1:
         with threadpool_limits(1):
+            warm_up(backend)
             for number in range(networks):
                 yield make_trial(number, seed, backend)
         return
     # Fresh processes: threads of compiled libraries do not survive a fork.
     context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(jobs, mp_context=context, initializer=_single_thread) as pool:
-        yield from pool.map(make_trial, range(networks), [seed] * networks, [backend] * networks)
+    with ProcessPoolExecutor(jobs, mp_context=context, initializer=_begin, initargs=(backend,)) as pool:
+        try:
+            yield from pool.map(make_trial, range(networks), [seed] * networks, [backend] * networks)
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
 
 
-def _single_thread() -> None:
+def _begin(backend: ValidationBackend) -> None:
+    """Prepare a worker: one thread, no answer to Ctrl-C (the parent's answer ends it), kernels loaded."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
     threadpool_limits(1)
+    warm_up(backend)
+
+
+def warm_up(backend: ValidationBackend) -> None:
+    """Adjust a network of every camera model once, so that loading and compiling is not in the seconds."""
+    waiting = {"opencv", "full_opencv"}
+    for number in count():
+        made = random_network(np.random.default_rng([WARM_UP_SEED, number]))
+        if made.plan.model in waiting and len(made.network.image_points) < WARM_UP_IMAGE_POINTS:
+            waiting.remove(made.plan.model)
+            control = made.plan.datum == "control"
+            _tried(partial(_adjust, made, covariance=True))
+            _tried(partial(backend.adjust, made.network, made.start, control=control))
+        if not waiting:
+            return
 
 
 def _adjust(made: RandomNetwork, *, covariance: bool, start: Estimate | None = None) -> Adjustment:
@@ -218,11 +247,13 @@ def _adjust(made: RandomNetwork, *, covariance: bool, start: Estimate | None = N
 
 
 def _tried(run: Callable[[], T]) -> tuple[T | None, str]:
-    """Run an adjuster; what it refuses with is a result here."""
+    """Run an adjuster; whatever it ends with is a result here, faults of a program too."""
     try:
         return run(), ""
     except KolinearError as error:
         return None, str(error)
+    except Exception as error:
+        return None, f"{type(error).__name__}: {error}"
 
 
 def _fit(network: Network, estimate: Estimate | None) -> tuple[float, float]:
@@ -268,10 +299,10 @@ def _differences(full: Adjustment, theirs: Estimate, *, control: bool) -> tuple[
     moved = variance.min(axis=1) > 0
     shift = (theirs.points - ours.points)[moved] / np.sqrt(variance[moved])
     return (
-        float(np.abs(np.concatenate(interior)).max(initial=0.0)),
+        float(np.abs(np.concatenate(interior)).max()) if any(map(len, interior)) else np.nan,
         float(np.abs((theirs.position - ours.position) / sigma[:, :3]).max()),
         float((angle / sigma[:, 3:].min(axis=1)).max()),
-        float(np.abs(shift).max(initial=0.0)),
+        float(np.abs(shift).max()) if len(shift) else np.nan,
     )
 
 

@@ -11,8 +11,10 @@ from sfm.analysis.conversion import convert_cameras
 from sfm.analysis.significance import compare_results
 from sfm.analysis.validation import validate as validate_networks
 from sfm.commands.console import drawn_progress
-from sfm.report.differences import write_differences
-from sfm.report.output import refuse_foreign_folder
+from sfm.report.differences import FILES as DIFFERENCE_FILES
+from sfm.report.differences import largest_difference, words_of_test, write_differences
+from sfm.report.pages import refuse_other_files
+from sfm.report.validation import FILES as VALIDATION_FILES
 from sfm.report.validation import in_words, largest, write_validation
 
 WORSE = 1  # exit code where the in-house adjuster was ever the worse one
@@ -20,7 +22,7 @@ WORSE = 1  # exit code where the in-house adjuster was ever the worse one
 
 def validate(
     networks: Annotated[int, typer.Option("--networks", metavar="N", min=1, help="Random networks.")] = 50,
-    seed: Annotated[int, typer.Option("--seed", metavar="S", help="Of the random numbers.")] = 1,
+    seed: Annotated[int, typer.Option("--seed", metavar="S", min=0, help="Of the random numbers.")] = 1,
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder of table, JSON and page.")] = Path(
         "out/validation"
     ),
@@ -32,7 +34,7 @@ def validate(
     """
     from adapters.colmap_validation import ColmapBackend
 
-    refuse_foreign_folder(out)
+    refuse_other_files(out, VALIDATION_FILES)
     with drawn_progress() as progress:
         found = validate_networks(ColmapBackend(), networks=networks, seed=seed, jobs=jobs, progress=progress)
     page = write_validation(found, out)
@@ -53,8 +55,12 @@ def compare(
         str, typer.Option("--align", help="points, cameras, control or none: what B is brought onto A by.")
     ] = "points",
     control: Annotated[
-        str, typer.Option("--control", metavar="A,B,C", help="Names of the points for --align control.")
+        str, typer.Option("--control", metavar="P,Q,R", help="Names of the points for --align control.")
     ] = "",
+    a_format: Annotated[
+        str | None, typer.Option("--from-a", metavar="F", help="Format of A; else by what is there.")
+    ] = None,
+    b_format: Annotated[str | None, typer.Option("--from-b", metavar="F", help="Format of B.")] = None,
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder of table, JSON and page.")] = Path(
         "out/comparison"
     ),
@@ -65,16 +71,17 @@ def compare(
     """
     from adapters.formats import read_comparable
 
-    refuse_foreign_folder(out)
-    first, second = read_comparable(a), read_comparable(b)
+    refuse_other_files(out, DIFFERENCE_FILES)
+    first, second = read_comparable(a, a_format), read_comparable(b, b_format)
     names = tuple(name.strip() for name in control.split(",") if name.strip())
     found = compare_results(first, second, align=align, control=names)
     place = {name: j for j, name in enumerate(first.network.points)}
     xyz = first.estimate.points[[place[name] for name in found.points]]
     page = write_differences(found, xyz, out)
-    largest = float((found.point_difference**2).sum(axis=1).max() ** 0.5) if len(xyz) else 0.0
-    print(f"{len(found.points)} common points, {int(found.significant.sum())} differ significantly")
-    print(f"largest difference of a point: {largest:.6g} (object unit of A)")
+    print(words_of_test(found)[0])
+    print(f"{len(found.points)} common points, {len(found.images)} common photographs")
+    if found.points:
+        print(f"largest difference of a point: {largest_difference(found)}")
     print(f"Report: {page}")
 
 

@@ -73,12 +73,7 @@ def write_files(out: Path, contents: Sequence[tuple[str, str]], *, main: str) ->
     Raises:
         OutputError: the folder holds something else or cannot be written.
     """
-    names = {name for name, _ in contents}
-    if out.exists() and not out.is_dir():
-        raise OutputError(f"{out}: a file is in the way, --out needs a folder")
-    foreign = sorted({path.name for path in out.iterdir()} - names) if out.exists() else []
-    if foreign:
-        raise OutputError(f"{out}: the folder holds '{foreign[0]}'; --out needs a new or empty folder")
+    refuse_other_files(out, [name for name, _ in contents])
     part = None
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
@@ -95,6 +90,19 @@ def write_files(out: Path, contents: Sequence[tuple[str, str]], *, main: str) ->
         if part is not None:
             shutil.rmtree(part, ignore_errors=True)
     return out / main
+
+
+def refuse_other_files(out: Path, names: Sequence[str]) -> None:
+    """Refuse a folder that holds anything but files of these names, before work is done for it.
+
+    Raises:
+        OutputError: the folder holds something else, or is none.
+    """
+    if out.exists() and not out.is_dir():
+        raise OutputError(f"{out}: a file is in the way, --out needs a folder")
+    foreign = sorted({path.name for path in out.iterdir()} - set(names)) if out.exists() else []
+    if foreign:
+        raise OutputError(f"{out}: the folder holds '{foreign[0]}'; --out needs a new or empty folder")
 
 
 def _cell(value: object) -> str:

@@ -15,6 +15,7 @@ from sfm.analysis.validation import SAME, SAME_COST, Trial, Validation
 from sfm.report.markup import figure, table
 from sfm.report.pages import csv_text, page, png, write_files
 
+FILES = ("validation.csv", "validation.json", "validation.html")
 COLUMNS = (
     "network",
     "arrangement",
@@ -63,12 +64,8 @@ def write_validation(validation: Validation, out: Path) -> Path:
     text = json.dumps(validation_summary(validation), indent=2, allow_nan=False)
     return write_files(
         out,
-        (
-            ("validation.csv", csv_text(COLUMNS, rows)),
-            ("validation.json", text + "\n"),
-            ("validation.html", validation_page(validation)),
-        ),
-        main="validation.html",
+        tuple(zip(FILES, (csv_text(COLUMNS, rows), text + "\n", validation_page(validation)), strict=True)),
+        main=FILES[-1],
     )
 
 
