@@ -18,7 +18,9 @@ from sfm.adjustment.solve import adjust
 from sfm.analysis.comparison import common_problem, reprojection
 from sfm.camera import camera_from_values, project
 from sfm.conventions import AnyArray
+from sfm.matching.conjugate import METHODS, match_points
 from sfm.matching.correspondence import match_targets
+from sfm.matching.interest import foerstner_points
 from sfm.network import Estimate, ImagePoints, Network, empty_estimate
 from sfm.orientation.sequence import orient
 from sfm.targets.codes import code_family
@@ -62,7 +64,15 @@ def compile_adjustment() -> None:
     reprojection(part, compared.estimate)
 
 
-PARTS = (compile_orientation, compile_adjustment, compile_targets)  # the longest first
+def compile_matching() -> None:
+    """Find interest points, and match some by correlation and by least squares in every model."""
+    photograph = _photograph(False)
+    at = foerstner_points(photograph, border_px=30).xy[:4]
+    for method in METHODS:
+        match_points(photograph, photograph, at, method=method, search_px=41)
+
+
+PARTS = (compile_orientation, compile_adjustment, compile_targets, compile_matching)  # the longest first
 
 
 def main() -> None:

@@ -160,6 +160,22 @@ def test_windows_of_document_002() -> None:
     assert found.right == pytest.approx(at + SHIFT, abs=0.1)
 
 
+def test_photographs_of_different_size_depth_and_colour() -> None:
+    left, right, at = _photographs()
+    some = at[(at < 150).all(axis=1)]
+    eight = np.rint(left).clip(0, 255).astype(np.uint8)
+    deep = np.rint(right[:190, :210].clip(0, 255) * 257).astype(np.uint16)
+    colour = np.repeat(deep[..., None], 3, axis=2)
+    whole = match_points(left, right, some, search_px=61)
+    for other in (deep, colour):
+        for equalise in (False, True):
+            found = match_points(eight, other, some, search_px=61, equalise=equalise)
+            assert found.good.all()
+            assert found.right == pytest.approx(whole.right, abs=0.05)
+    outside = match_points(eight, deep, np.array([[255.0, 100.0], [200.0, 200.0]]), search_px=31)
+    assert outside.reason == ("outside", "outside")  # beyond the left, and beyond the smaller right one
+
+
 def test_a_point_that_is_not_found_says_why() -> None:
     left, right, _ = _photographs()
     found = match_points(left, right, np.array([[2.0, 2.0], [100.0, 100.0]]), search_px=61)
