@@ -12,19 +12,23 @@ import numpy as np
 import pytest
 
 from adapters.colmap import adjust_with_colmap
+from adapters.colmap_mapper import map_photographs
 from adapters.colmap_model import read_model
 from datasets.textured import render
 from sfm.adjustment.result import Adjustment
 from sfm.batch.run import run_batch
-from sfm.camera import project, tangents_from_pixel
+from sfm.camera import Camera, project, tangents_from_pixel
 from sfm.conventions import AnyArray, FloatArray, angles_from_rotation
 from sfm.errors import GeometryError, PhotographError, SurveyFileError
+from sfm.matching.epipolar_path import epipolar_paths
 from sfm.matching.flags import LsmFlag
 from sfm.matching.interest import foerstner_points
 from sfm.matching.lsm import match_lsm
 from sfm.matching.multi_lsm import match_multi
+from sfm.matching.ncc_line import match_along_line
 from sfm.matching.tie_points import Features, find_tie_points, link_features
 from sfm.network import Estimate, ImagePoints, Network
+from sfm.orientation.relative import relative_orientations
 from sfm.pipeline import run_survey
 from sfm.project import read_survey
 from sfm.similarity import fit_similarity
@@ -81,21 +85,27 @@ def test_features_that_contradict_each_other_are_no_point() -> None:
 SIZE = (480, 360)
 
 
+def _pictures(lens: Camera, position: FloatArray, rotation: FloatArray) -> list[AnyArray]:
+    """Photographs of the textured surface, with noise."""
+    skin = cv2.GaussianBlur(render.texture(), (0, 0), 1.8)
+    pictures = []
+    for i, (X0, R) in enumerate(zip(position, rotation, strict=True)):
+        y, x = np.mgrid[0 : SIZE[1], 0 : SIZE[0]]
+        uv = tangents_from_pixel(lens, np.column_stack([x.ravel(), y.ravel()]))
+        rays = np.column_stack([uv, -np.ones(len(uv))]) @ R.T
+        at = render.surface_points(X0, rays)[:, :2] / render.TEXEL_M + len(skin) / 2
+        at = at.astype(np.float32).reshape(SIZE[1], SIZE[0], 2)
+        light = cv2.remap(skin, at[..., 0], at[..., 1], cv2.INTER_LINEAR)
+        pictures.append(with_noise(255 * light, render.NOISE, i).clip(0, 255).astype(np.float32))
+    return pictures
+
+
 @cache
 def _scene() -> tuple[tuple[AnyArray, ...], Estimate, FloatArray]:
     """Three small photographs of the textured surface, their orientation, and points on the surface."""
     lens = render.camera_from_values("lens", "opencv", SIZE, render.PIXEL_MM, c_mm=render.C_MM)
     position, rotation = (part[[0, 1, 7]] for part in render.stations())
-    skin = render.texture()
-    photographs = []
-    for i in range(3):
-        y, x = np.mgrid[0 : SIZE[1], 0 : SIZE[0]]
-        uv = tangents_from_pixel(lens, np.column_stack([x.ravel(), y.ravel()]))
-        rays = np.column_stack([uv, -np.ones(len(uv))]) @ rotation[i].T
-        at = render.surface_points(position[i], rays)[:, :2] / render.TEXEL_M + len(skin) / 2
-        at = at.astype(np.float32).reshape(SIZE[1], SIZE[0], 2)
-        light = cv2.remap(cv2.GaussianBlur(skin, (0, 0), 1.8), at[..., 0], at[..., 1], cv2.INTER_LINEAR)
-        photographs.append(with_noise(255 * light, render.NOISE, i).clip(0, 255).astype(np.float32))
+    photographs = _pictures(lens, position, rotation)
     x, y = np.meshgrid(np.arange(120, 361, 40.0), np.arange(100, 261, 40.0))
     uv = tangents_from_pixel(lens, np.column_stack([x.ravel(), y.ravel()]))
     points = render.surface_points(position[0], np.column_stack([uv, -np.ones(len(uv))]) @ rotation[0].T)
@@ -177,6 +187,30 @@ def test_tie_points_of_three_photographs() -> None:
     with pytest.raises(GeometryError, match="detector 'orb' is none of"):
         find_tie_points(photographs, detector="orb")
     assert len(find_tie_points([np.zeros((90, 90), np.uint8)] * 3)) == 0
+
+
+def test_along_epipolar_lines_of_an_orientation_computed_from_the_photographs() -> None:
+    lens = render.camera_from_values("lens", "opencv", SIZE, render.PIXEL_MM, c_mm=render.C_MM)
+    position = np.array([[-0.06, 0.0, 1.6], [0.06, 0.05, 1.65]])
+    left, right = _pictures(lens, position, np.tile(np.eye(3), (2, 1, 1)))
+    found = find_tie_points([left, right], max_features=600, min_rays=2)
+    xy = [found.xy[found.image == i][np.argsort(found.point[found.image == i])] for i in range(2)]
+    uv = [tangents_from_pixel(lens, one) for one in xy]
+    pair = relative_orientations(uv[0], uv[1], tolerance=1.0 / lens.c_px)[0]
+    assert pair.kind == "spatial"
+    computed = Estimate(
+        (lens,), np.stack([np.zeros(3), pair.base]), np.stack([np.eye(3), pair.rotation]), np.zeros((0, 3))
+    )
+    x, y = np.meshgrid(np.arange(180, 440, 40.0), np.arange(60, 301, 40.0))
+    at = np.column_stack([x.ravel(), y.ravel()])
+    cameras = np.zeros(2, dtype=np.int64)
+    paths = epipolar_paths(computed, cameras, 0, 1, at, nearest=6.0, farthest=20.0)  # in bases
+    along = match_along_line(left, right, at, paths)
+    rays = np.column_stack([tangents_from_pixel(lens, at), -np.ones(len(at))])
+    truth = project(lens, position[1], np.eye(3), render.surface_points(position[0], rays))
+    inside = ((truth > 20) & (truth < np.array(SIZE) - 21)).all(axis=1)
+    assert inside.sum() > 25 and along.good[inside].mean() > 0.9
+    assert np.nanmax(np.linalg.norm(along.xy - truth, axis=1)[inside]) < 0.5
 
 
 def test_survey_file_refuses_contradictions(tmp_path: Path) -> None:
@@ -446,3 +480,12 @@ def test_refining_a_model(folder: Path) -> None:
         SurveyFileError, match=r"photograph 'surface_1.png' of the model is not in this folder"
     ):
         refine_model(network, Estimate((lens,), position, rotation, points), folder / "..")
+
+
+@pytest.mark.slow
+def test_refining_the_model_of_colmaps_mapper(folder: Path) -> None:
+    names = tuple(f"surface_{i + 1}.png" for i in range(render.PHOTOGRAPHS))
+    mapped = map_photographs(folder, (names,), threads=1)
+    result = refine_model(mapped.network, mapped.estimate, folder)
+    assert result.before_px > 0.15
+    assert result.after_px < 0.06 and result.refined > 0.9 * result.key_points
