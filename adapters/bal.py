@@ -27,6 +27,7 @@ from sfm.errors import OutputError
 from sfm.network import Estimate, ImagePoints, Network
 
 CAMERA_VALUES = 9
+FOCAL = 6  # place of the focal length among them
 FREE = ("fx", "fy", "k1", "k2")  # what BAL adjusts; its fx and fy are one
 
 
@@ -47,6 +48,9 @@ def read_bal(path: Path, *, size_px: tuple[int, int] | None = None) -> tuple[Net
     m, n, k = (
         text.count_of(w, what) for w, what in zip(head, ("cameras", "points", "observations"), strict=True)
     )
+    due = text.number + k + CAMERA_VALUES * m + 3 * n
+    if due > len(text.lines):
+        raise text.error(f"{len(text.lines)} lines in the file, {due} are due by these numbers")
     image, point = np.empty(k, dtype=np.int64), np.empty(k, dtype=np.int64)
     xy = np.empty((k, 2))
     for row in range(k):
@@ -63,6 +67,8 @@ def read_bal(path: Path, *, size_px: tuple[int, int] | None = None) -> tuple[Net
         if len(words) != 1:
             raise text.error(f"{len(words)} words, {what} was due")
         values[row] = text.number_of(words[0])
+        if row < CAMERA_VALUES * m and row % CAMERA_VALUES == FOCAL and values[row] <= 0:
+            raise text.error(f"focal length {values[row]:g} px, it must be positive")
     text.end()
     cams = values[: CAMERA_VALUES * m].reshape(m, CAMERA_VALUES)
     width, height = 2 * np.ceil(np.abs(xy).max(axis=0) + 1).astype(int)

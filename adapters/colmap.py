@@ -12,6 +12,7 @@ Source: COLMAP 4.2 documentation, "Output Format" and "Camera Models".
 
 from __future__ import annotations
 
+import re
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -227,3 +228,9 @@ def adjustment_config(pycolmap: ModuleType, network: Network, estimate: Estimate
 def one_line(error: BaseException) -> str:
     """The message of an error on one line."""
     return " ".join(str(error).split()) or type(error).__name__
+
+
+def told(error: BaseException) -> str:
+    """What COLMAP says of an error, without the places in its own source and its own words for them."""
+    text = re.sub(r"\[\S+\.(cc|h):\d+\] *", "", one_line(error))
+    return re.sub(r"^Check failed: *", "COLMAP expected ", text)

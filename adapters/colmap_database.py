@@ -9,6 +9,7 @@ Source: COLMAP 4.2 documentation, "Database Format".
 
 from __future__ import annotations
 
+import sqlite3
 from itertools import combinations
 from pathlib import Path
 from typing import Any
@@ -17,12 +18,18 @@ import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from adapters.colmap import load_pycolmap, one_line, quiet
+from adapters.colmap import load_pycolmap, quiet, told
 from adapters.colmap_scene import HALF_PIXEL, camera_of, colmap_camera
+from adapters.json_files import MAX_SIDE_PX
 from sfm.camera import Camera
 from sfm.conventions import IntArray
+from sfm.csv_tables import MAX_NUMBER, MAX_TABLE_BYTES
 from sfm.errors import OutputError, SurveyFileError
 from sfm.network import ImagePoints, Network
+from sfm.whole_files import refuse_full, whole_file
+
+TABLES = ("cameras", "images", "keypoints", "matches", "two_view_geometries")
+SQLITE_HEADER_BYTES = 100
 
 
 def write_database(path: Path, network: Network, cameras: tuple[Camera, ...]) -> None:
@@ -40,18 +47,14 @@ def write_database(path: Path, network: Network, cameras: tuple[Camera, ...]) ->
     pycolmap = load_pycolmap()
     if Path(path).exists():
         raise OutputError(f"{path}: there already is a file of this name")
-    part = Path(path).with_name(Path(path).name + ".part")
-    part.unlink(missing_ok=True)
-    with quiet(pycolmap):
+    with quiet(pycolmap), whole_file(path, "the database") as part:
         try:
             database = pycolmap.Database.open(str(part))
             _fill(pycolmap, database, network, cameras)
             database.close()
-            part.replace(path)
-        except (OSError, RuntimeError, ValueError) as error:
-            raise OutputError(f"{path}: the database cannot be written ({one_line(error)})") from error
-        finally:
-            part.unlink(missing_ok=True)
+        except (RuntimeError, ValueError) as error:
+            refuse_full(part.parent)
+            raise OutputError(f"{path}: the database cannot be written: {told(error)}") from error
 
 
 def read_database(path: Path) -> tuple[Network, tuple[Camera, ...]]:
@@ -65,10 +68,7 @@ def read_database(path: Path) -> tuple[Network, tuple[Camera, ...]]:
         SurveyFileError: not a readable database.
     """
     pycolmap = load_pycolmap()
-    if not Path(path).is_file():
-        raise SurveyFileError(f"{path}: there is no such file")
-    if Path(path).read_bytes()[:16] != b"SQLite format 3\0":
-        raise SurveyFileError(f"{path}, line 1: not a COLMAP database (no SQLite file)")
+    _check_database(path)
     with quiet(pycolmap):
         try:
             database = pycolmap.Database.open(str(path))
@@ -78,7 +78,18 @@ def read_database(path: Path) -> tuple[Network, tuple[Camera, ...]]:
             pairs = _matches(pycolmap, database, [image.image_id for image in images])
             database.close()
         except (OSError, RuntimeError, ValueError, IndexError) as error:
-            raise SurveyFileError(f"{path}: not a readable COLMAP database ({one_line(error)})") from error
+            raise SurveyFileError(f"{path}: not a readable COLMAP database ({told(error)})") from error
+    for camera in found:
+        if not (1 <= camera.width <= MAX_SIDE_PX and 1 <= camera.height <= MAX_SIDE_PX):
+            raise SurveyFileError(
+                f"{path}: camera {camera.camera_id} has photographs of {camera.width} x {camera.height} px, "
+                f"needed 1 to {MAX_SIDE_PX} on each side"
+            )
+    for image, xy in zip(images, keypoints, strict=True):
+        if not (np.abs(xy) <= MAX_NUMBER).all():
+            raise SurveyFileError(
+                f"{path}: a keypoint of {image.name} is no finite number of at most {MAX_NUMBER:g}"
+            )
     camera_ids = [camera.camera_id for camera in found]
     first = np.concatenate([[0], np.cumsum([len(points) for points in keypoints])]).astype(np.int64)
     edges = [(first[a] + matches[:, 0], first[b] + matches[:, 1]) for a, b, matches in pairs]
@@ -96,6 +107,48 @@ def read_database(path: Path) -> tuple[Network, tuple[Camera, ...]]:
         ImagePoints(image[kept], point[kept], xy[kept], np.tile(np.eye(2), (len(kept), 1, 1))),
     )
     return network, tuple(camera_of(camera) for camera in found)
+
+
+def _check_database(path: Path) -> None:
+    """Refuse what is no whole COLMAP database, before COLMAP opens it.
+
+    Source: sqlite.org/fileformat.html, sec. 1.3, for the header.
+    """
+    try:
+        if not path.is_file():
+            raise SurveyFileError(f"{path}: there is no such file")
+        with path.open("rb") as file:
+            header = file.read(SQLITE_HEADER_BYTES)
+        size = path.stat().st_size
+        if size > MAX_TABLE_BYTES:
+            raise SurveyFileError(f"{path}: {size} bytes, at most {MAX_TABLE_BYTES} are read")
+    except OSError as error:
+        raise SurveyFileError(f"{path}: cannot be read ({error.strerror})") from error
+    if header[:16] != b"SQLite format 3\0" or len(header) < SQLITE_HEADER_BYTES:
+        raise SurveyFileError(f"{path}, line 1: not a COLMAP database (no SQLite file)")
+    page = int.from_bytes(header[16:18], "big")
+    whole = (65536 if page == 1 else page) * int.from_bytes(header[28:32], "big")
+    if size < whole:
+        raise SurveyFileError(
+            f"{path}: the file is cut off, it has {size} of the {whole} bytes that its header says"
+        )
+    try:
+        database = sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro", uri=True)
+        try:
+            damage = database.execute("PRAGMA quick_check(1)").fetchone()[0]
+            tables = {row[0] for row in database.execute("SELECT name FROM sqlite_master")}
+        finally:
+            database.close()
+    except sqlite3.Error as error:
+        raise SurveyFileError(f"{path}: not a readable COLMAP database, {error}") from error
+    if damage != "ok":
+        raise SurveyFileError(f"{path}: the database is damaged, {' '.join(str(damage).split())[:200]}")
+    missing = [name for name in TABLES if name not in tables]
+    if missing:
+        raise SurveyFileError(
+            f"{path}: an SQLite file without the table {missing[0]}; a COLMAP database has "
+            f"{', '.join(TABLES)}"
+        )
 
 
 def _fill(pycolmap: Any, database: Any, network: Network, cameras: tuple[Camera, ...]) -> None:

@@ -9,7 +9,6 @@ Source: COLMAP 4.2 documentation, "Output Format".
 from __future__ import annotations
 
 import errno
-import json
 from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
@@ -17,15 +16,14 @@ from typing import Any
 
 import numpy as np
 
-from adapters.colmap import load_pycolmap, one_line, quiet
+from adapters.colmap import load_pycolmap, quiet, told
 from adapters.colmap_files import check_model_files
+from adapters.colmap_names import SIDE_FILE, read_side_file, write_side_file
 from adapters.colmap_scene import AXES, HALF_PIXEL, camera_of, reconstruction
 from sfm.conventions import BoolArray
 from sfm.errors import OutputError, SurveyFileError
 from sfm.network import Estimate, ImagePoints, Network
-
-MAX_SIDE_BYTES = 100_000_000  # names of some million points
-SIDE_FILE = "kolinear.json"
+from sfm.whole_files import refuse_full
 
 
 def write_model(
@@ -60,56 +58,19 @@ def write_model(
                 scene.write_text(str(folder))
             else:
                 scene.write_binary(str(folder))
-            _refuse_short(pycolmap, folder, scene)
-            side = {
-                "cameras": [
-                    {
-                        "name": c.name,
-                        "size_px": list(c.size_px),
-                        "pixel_mm": [float(p) for p in c.pixel_mm],
-                        "free": c.free.tolist(),
-                    }
-                    for c in estimate.cameras
-                ],
-                "images": {str(i + 1): name for i, name in enumerate(network.images)},
-                "points": {str(j + 1): name for j, name in enumerate(network.points)},
-            }
-            (folder / SIDE_FILE).write_text(
-                json.dumps(side, ensure_ascii=False, indent=1) + "\n", encoding="utf-8"
-            )
-        except (OSError, ValueError) as error:
-            raise OutputError(f"{folder}: the COLMAP model cannot be written ({error})") from error
+            _refuse_short(pycolmap, folder, scene, text=text)
+            write_side_file(folder / SIDE_FILE, network, estimate)
+        except OSError as error:
+            reason = error.strerror or error
+            raise OutputError(f"{folder}: the COLMAP model cannot be written: {reason}") from error
+        except (RuntimeError, ValueError) as error:
+            raise OutputError(f"{folder}: the COLMAP model cannot be written: {told(error)}") from error
 
 
-def _side_file(path: Path) -> dict[str, Any]:
-    """Read what `write_model` adds to a model; an empty dictionary where it is missing.
-
-    Raises:
-        SurveyFileError: it is not what `write_model` writes.
-    """
-    if not path.is_file():
-        return {}
-    try:
-        if path.stat().st_size > MAX_SIDE_BYTES:
-            raise ValueError(f"{path.stat().st_size} bytes, at most {MAX_SIDE_BYTES} are read")
-        side = json.loads(path.read_text(encoding="utf-8"))
-        for camera in side["cameras"]:
-            pixel, free = camera["pixel_mm"], camera["free"]
-            sound = len(pixel) == 2 and all(0 < float(p) < 1e3 for p in pixel)
-            if not isinstance(camera["name"], str) or not sound or not all(f in (True, False) for f in free):
-                raise ValueError("a camera needs name, pixel_mm and free")
-        for names in (side["images"], side["points"]):
-            if not all(isinstance(name, str) for name in names.values()):
-                raise ValueError("names must be texts")
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-        raise SurveyFileError(f"{path}: not written by Kolinear ({one_line(error)}); remove it") from error
-    return dict(side)
-
-
-def _refuse_short(pycolmap: ModuleType, folder: Path, scene: Any) -> None:
+def _refuse_short(pycolmap: ModuleType, folder: Path, scene: Any, *, text: bool) -> None:
     """Raise OSError unless a model can be read back as it was written: COLMAP ignores that a disk is full."""
     try:
-        written = pycolmap.Reconstruction(str(folder))
+        written = _opened(pycolmap, folder, text=text)
         whole = all(
             getattr(written, count)() == getattr(scene, count)()
             for count in ("num_images", "num_points3D", "compute_num_observations")
@@ -117,15 +78,27 @@ def _refuse_short(pycolmap: ModuleType, folder: Path, scene: Any) -> None:
     except (ValueError, RuntimeError, IndexError, OSError):
         whole = False
     if not whole:
-        raise OSError(errno.ENOSPC, "the files are not whole, as on a full disk")
+        refuse_full(folder)
+        raise OSError(errno.EIO, "what COLMAP wrote cannot be read back")
 
 
-def read_model(folder: Path) -> tuple[Network, Estimate]:
+def _opened(pycolmap: ModuleType, folder: Path, *, text: bool) -> Any:
+    """Return the model in the text or the binary files of a folder, which may hold both."""
+    scene = pycolmap.Reconstruction()
+    (scene.read_text if text else scene.read_binary)(str(folder))
+    return scene
+
+
+def read_model(folder: Path, *, text: bool | None = None) -> tuple[Network, Estimate]:
     """Read a COLMAP model, binary or text, as a network and its solution.
 
     Cameras in COLMAP's pinhole and radial models become `opencv` ones. Points are named by their number
     in COLMAP, cameras too, and a pixel is 1 mm, unless the model was written by `write_model`. The
     covariance of every image point is 1 px^2, since COLMAP keeps none.
+
+    Args:
+        folder: of the model.
+        text: whether its text files are read or the binary ones; binary ones if there are any if not given.
 
     Raises:
         SurveyFileError: no model in the folder, or one that cannot be read.
@@ -135,35 +108,39 @@ def read_model(folder: Path) -> tuple[Network, Estimate]:
     pycolmap = load_pycolmap()
     if not any((folder / f"cameras.{kind}").is_file() for kind in ("bin", "txt")):
         raise SurveyFileError(f"{folder}: no COLMAP model (cameras.bin or cameras.txt) in this folder")
-    check_model_files(folder)
+    if text and not (folder / "cameras.txt").is_file():
+        raise SurveyFileError(f"{folder}: no COLMAP model of text files (cameras.txt), only binary ones")
+    if text is False and not (folder / "cameras.bin").is_file():
+        raise SurveyFileError(f"{folder}: no binary COLMAP model (cameras.bin), only text files")
+    if text is None:
+        text = not (folder / "cameras.bin").is_file()
+    check_model_files(folder, text=text)
     with quiet(pycolmap):
         try:
-            scene = pycolmap.Reconstruction(str(folder))
+            scene = _opened(pycolmap, folder, text=text)
         except (ValueError, RuntimeError, LookupError, OSError, MemoryError) as error:
-            raise SurveyFileError(f"{folder}: not a readable COLMAP model ({one_line(error)})") from error
-    side = _side_file(folder / SIDE_FILE)
+            raise SurveyFileError(
+                f"{folder}: each file of the COLMAP model is in order, but they do not fit together "
+                f"({told(error)})"
+            ) from error
+    side = read_side_file(folder / SIDE_FILE)
     camera_ids = sorted(scene.cameras)
     cameras = tuple(camera_of(scene.camera(i)) for i in camera_ids)
-    if len(side.get("cameras", ())) == len(cameras):
-        for camera, extra in zip(cameras, side["cameras"], strict=True):
-            if len(extra["free"]) != len(camera.free):
+    if len(side.cameras) == len(cameras):
+        for camera, extra in zip(cameras, side.cameras, strict=True):
+            if len(extra.free) != len(camera.free):
                 raise SurveyFileError(
-                    f"{folder / SIDE_FILE}: camera {extra['name']}: {len(extra['free'])} parameters, "
+                    f"{folder / SIDE_FILE}: camera {extra.name}: {len(extra.free)} parameters, "
                     f"the model has {len(camera.free)}"
                 )
         cameras = tuple(
-            replace(
-                camera,
-                name=extra["name"],
-                pixel_mm=np.array(extra["pixel_mm"], dtype=float),
-                free=np.array(extra["free"], dtype=bool),
-            )
-            for camera, extra in zip(cameras, side["cameras"], strict=True)
+            replace(camera, name=extra.name, pixel_mm=np.array(extra.pixel_mm), free=np.array(extra.free))
+            for camera, extra in zip(cameras, side.cameras, strict=True)
         )
     image_ids = sorted(scene.images)
     images = [scene.image(i) for i in image_ids]
     point_ids = sorted(scene.point3D_ids())
-    names = side.get("points", {})
+    names = side.points
     index = {j: k for k, j in enumerate(point_ids)}
     seen = [
         (i, index[p.point3D_id], p.x() - HALF_PIXEL, p.y() - HALF_PIXEL)
@@ -178,7 +155,7 @@ def read_model(folder: Path) -> tuple[Network, Estimate]:
     M = np.array([AXES @ pose[:, :3] for pose in poses]).reshape(-1, 3, 3)
     position = np.array([-pose[:, :3].T @ pose[:, 3] for pose in poses]).reshape(-1, 3)
     # COLMAP's text format loses what follows a space in the name of a photograph.
-    full = {i: side.get("images", {}).get(str(i), "") for i in image_ids}
+    full = {i: side.images.get(str(i), "") for i in image_ids}
     try:
         short = [image.name for image in images]
     except UnicodeDecodeError as error:

@@ -19,18 +19,24 @@ import json
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
+from pydantic import Field, StrictStr, StringConstraints
 
+from adapters.colmap_names import SIDE_FILE, read_side_file
+from adapters.json_files import Content, Name, Pixel, Side, read_json
 from sfm.camera import Camera
 from sfm.conventions import FloatArray, angles_from_rotation, rotation_from_angles
+from sfm.csv_tables import MAX_NAME, CsvTable, read_header, read_table
 from sfm.distortion.models import MODELS
 from sfm.errors import OutputError, SurveyFileError
 from sfm.network import Estimate, ImagePoints, Network
 
+EXTERIOR = ("X", "Y", "Z", "omega_deg", "phi_deg", "kappa_deg")
 SIGMAS = ("sX", "sY", "sZ")
-COLMAP_SIDE_FILE = "colmap/kolinear.json"  # as written by adapters.colmap
+PRINCIPAL_DISTANCES = ("c", "fx", "fy")
+COLMAP_SIDE_FILE = f"colmap/{SIDE_FILE}"
 
 
 @dataclass(frozen=True)
@@ -56,43 +62,48 @@ def read_result(folder: Path) -> TableResult:
     summary = _summary(folder / "summary.json")
     cameras, sigmas = _cameras(folder, summary)
     index = {camera.name: k for k, camera in enumerate(cameras)}
-    table = _Table.of(
-        folder / "images.csv", ("image", "X", "Y", "Z", "omega_deg", "phi_deg", "kappa_deg", "camera")
-    )
+    table = read_table(folder / "images.csv", ("image", "camera"), EXTERIOR, SIGMAS, ignored=None, blank=True)
     images = table.keys("image")
-    for row, name in zip(table.rows, table.text("camera"), strict=True):
+    for line, name in zip(table.line, table.texts[1], strict=True):
         if name not in index:
-            raise table.error(row, f"camera '{name}' is not in cameras.csv")
-    exterior = table.numbers(("X", "Y", "Z", "omega_deg", "phi_deg", "kappa_deg"))
-    rotation = np.array([rotation_from_angles(*np.deg2rad(row)) for row in exterior[:, 3:]]).reshape(-1, 3, 3)
-    position_sigma = table.maybe_numbers(SIGMAS)
-    camera = np.array([index[name] for name in table.text("camera")], dtype=np.int64)
-    table = _Table.of(folder / "points.csv", ("id", "X", "Y", "Z"))
+            raise SurveyFileError(f"{table.path}, line {line}: camera '{name}' is not in cameras.csv")
+    camera = np.array([index[name] for name in table.texts[1]], dtype=np.int64)
+    rotation = np.array([rotation_from_angles(*np.deg2rad(row)) for row in table.values[:, 3:6]])
+    position, position_covariance = table.values[:, :3].copy(), _covariance(table, table.values[:, 6:])
+    table = read_table(folder / "points.csv", ("id",), ("X", "Y", "Z"), SIGMAS, ignored=None, blank=True)
     points = table.keys("id")
-    xyz, point_sigma = table.numbers(("X", "Y", "Z")), table.maybe_numbers(SIGMAS)
     network = Network(images, camera, points, _image_points(folder, images, points))
     return TableResult(
-        str(summary.get("survey", folder.name)),
+        summary.survey or folder.name,
         network,
-        Estimate(cameras, exterior[:, :3].copy(), rotation, xyz),
-        None if point_sigma is None else np.eye(3) * point_sigma[:, None, :] ** 2,
-        None if position_sigma is None else np.eye(3) * position_sigma[:, None, :] ** 2,
+        Estimate(cameras, position, rotation, table.values[:, :3].copy()),
+        _covariance(table, table.values[:, 3:]),
+        position_covariance,
         sigmas,
-        summary.get("redundancy"),
-        str(summary.get("length_unit", "")),
+        summary.redundancy,
     )
 
 
 def write_tables(folder: Path, result: TableResult) -> None:
-    """Write a result as tables with named columns.
+    """Write a result as tables with named columns; standard deviations only where any is known.
+
+    Args:
+        folder: made if it is not there.
+        result: complete; whoever wants the folder whole or not at all gives one of `sfm.whole_files`.
 
     Raises:
-        OutputError: the folder cannot be written.
+        OutputError: a photograph or point has no place in the object, or the folder cannot be written.
     """
     network, estimate = result.network, result.estimate
+    for names, placed, kind in (
+        (network.images, estimate.oriented, "photograph"),
+        (network.points, estimate.determined, "point"),
+    ):
+        for k in np.flatnonzero(~placed)[:1]:
+            raise OutputError(f"{folder}: {kind} {names[k]} has no coordinates, tables want them of all")
     angles = np.rad2deg(angles_from_rotation(estimate.rotation))
-    point_sigma = _sigma_of(result.point_covariance, len(network.points))
-    position_sigma = _sigma_of(result.position_covariance, len(network.images))
+    point_sigma, sigmas_of_points = _sigma_of(result.point_covariance, len(network.points))
+    position_sigma, sigmas_of_images = _sigma_of(result.position_covariance, len(network.images))
     seen = network.image_points
     sigma = np.sqrt(np.diagonal(seen.covariance, axis1=1, axis2=2))
     camera_rows = []
@@ -106,7 +117,6 @@ def write_tables(folder: Path, result: TableResult) -> None:
     summary: dict[str, Any] = {
         "survey": result.name,
         "redundancy": result.redundancy,
-        "length_unit": result.unit,
         "cameras": [
             {
                 "name": camera.name,
@@ -121,12 +131,12 @@ def write_tables(folder: Path, result: TableResult) -> None:
         folder.mkdir(parents=True, exist_ok=True)
         _write(
             folder / "points.csv",
-            "id,X,Y,Z,sX,sY,sZ",
+            ("id", "X", "Y", "Z", *sigmas_of_points),
             ((n, *x, *s) for n, x, s in zip(network.points, estimate.points, point_sigma, strict=True)),
         )
         _write(
             folder / "images.csv",
-            "image,X,Y,Z,omega_deg,phi_deg,kappa_deg,sX,sY,sZ,camera",
+            ("image", *EXTERIOR, *sigmas_of_images, "camera"),
             (
                 (
                     name,
@@ -138,10 +148,10 @@ def write_tables(folder: Path, result: TableResult) -> None:
                 for i, name in enumerate(network.images)
             ),
         )
-        _write(folder / "cameras.csv", "camera,parameter,value,sigma,unit", camera_rows)
+        _write(folder / "cameras.csv", ("camera", "parameter", "value", "sigma", "unit"), camera_rows)
         _write(
             folder / "image_points.csv",
-            "image,point,x_px,y_px,sx_px,sy_px",
+            ("image", "point", "x_px", "y_px", "sx_px", "sy_px"),
             (
                 (network.images[i], network.points[j], *xy, *s)
                 for i, j, xy, s in zip(seen.image, seen.point, seen.xy, sigma, strict=True)
@@ -150,169 +160,124 @@ def write_tables(folder: Path, result: TableResult) -> None:
         text = json.dumps(summary, indent=2, ensure_ascii=False)
         (folder / "summary.json").write_text(text + "\n", encoding="utf-8")
     except OSError as error:
-        raise OutputError(f"{folder}: the tables cannot be written ({error.strerror})") from error
+        raise OutputError(f"{folder}: the tables cannot be written: {error.strerror}") from error
 
 
-def _summary(path: Path) -> dict[str, Any]:
-    try:
-        found = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise SurveyFileError(f"{path}: cannot be read ({error.strerror})") from error
-    except ValueError as error:
-        line = getattr(error, "lineno", 1)
-        raise SurveyFileError(f"{path}, line {line}: not valid JSON ({error})") from error
-    if not isinstance(found, dict) or not isinstance(found.get("cameras"), list):
-        raise SurveyFileError(f"{path}, line 1: not the summary of a result, it names no cameras")
-    return found
+class _CameraEntry(Content):
+    """A camera as the summary names it."""
+
+    name: Name
+    model: Literal[tuple(MODELS)]  # type: ignore[valid-type]
+    size_px: tuple[Side, Side] | None = None
+    pixel_mm: tuple[Pixel, Pixel] | None = None
 
 
-def _cameras(folder: Path, summary: dict[str, Any]) -> tuple[tuple[Camera, ...], tuple[FloatArray, ...]]:
+class _Summary(Content):
+    """What is read of summary.json."""
+
+    survey: Annotated[StrictStr, StringConstraints(max_length=MAX_NAME)] | None = None
+    redundancy: Annotated[int, Field(ge=0, strict=True)] | None = None
+    cameras: Annotated[tuple[_CameraEntry, ...], Field(min_length=1)]
+
+
+def _summary(path: Path) -> _Summary:
+    """Read the summary, in which no camera may stand twice."""
+    summary = read_json(path, _Summary, "the summary of a result")
+    names = [camera.name for camera in summary.cameras]
+    for name in names:
+        if names.count(name) > 1:
+            raise SurveyFileError(f"{path}: camera '{name}' stands twice")
+    return summary
+
+
+def _cameras(folder: Path, summary: _Summary) -> tuple[tuple[Camera, ...], tuple[FloatArray, ...]]:
     """Cameras in the order of the summary, and the sigmas of their parameters."""
-    table = _Table.of(folder / "cameras.csv", ("camera", "parameter", "value"))
-    values = table.numbers(("value",))[:, 0]
-    sigma = table.maybe_numbers(("sigma",))
-    rows = {}
-    for k, key in enumerate(zip(table.text("camera"), table.text("parameter"), strict=True)):
-        if key in rows:
-            raise table.error(table.rows[k], f"parameter {key[1]} of camera {key[0]} stands twice")
-        rows[key] = k
+    table = read_table(
+        folder / "cameras.csv", ("camera", "parameter"), ("value",), ("sigma",), ignored=None, blank=True
+    )
+    values, sigma = table.values[:, 0], table.values[:, 1:]
+    table.refuse(sigma, sigma < 0, ("sigma",), "0 or more, or nothing")
+    keys = tuple(zip(*table.texts, strict=True))
+    table.refuse_duplicates(keys, ("camera", "parameter"))
+    positive = np.array([name in PRINCIPAL_DISTANCES for name in table.texts[1]])
+    table.refuse(values[:, None], (positive & (values <= 0))[:, None], ("value",), "a positive c, fx or fy")
+    rows = {key: k for k, key in enumerate(keys)}
+    for name in table.texts[0]:
+        if name not in (camera.name for camera in summary.cameras):
+            line = table.line[table.texts[0].index(name)]
+            raise SurveyFileError(f"{table.path}, line {line}: camera '{name}' is not in summary.json")
     cameras, sigmas = [], []
-    for number, entry in enumerate(summary["cameras"]):
-        name, model = entry.get("name"), entry.get("model")
-        if model not in MODELS:
-            raise SurveyFileError(f"{folder / 'summary.json'}: camera {name} has the unknown model '{model}'")
-        missing = [p for p in MODELS[model].names if (name, p) not in rows]
+    for number, entry in enumerate(summary.cameras):
+        names = MODELS[entry.model].names
+        missing = [p for p in names if (entry.name, p) not in rows]
         if missing:
             raise SurveyFileError(
-                f"{table.path}, line {table.last}: {missing[0]} of camera {name} is missing"
+                f"{table.path}, line {table.line[-1]}: {missing[0]} of camera {entry.name} is missing"
             )
-        chosen = [rows[name, p] for p in MODELS[model].names]
-        s = np.full(len(chosen), np.nan) if sigma is None else sigma[chosen, 0]
+        chosen = [rows[entry.name, p] for p in names]
+        s = sigma[chosen, 0] if sigma.size else np.full(len(chosen), np.nan)
         size, pixel = _size(folder, entry, number)
-        cameras.append(Camera(name, model, size, pixel, values[chosen], np.isfinite(s)))
+        cameras.append(Camera(entry.name, entry.model, size, pixel, values[chosen], np.isfinite(s)))
         sigmas.append(s)
     return tuple(cameras), tuple(sigmas)
 
 
-def _size(folder: Path, entry: dict[str, Any], number: int) -> tuple[tuple[int, int], FloatArray]:
+def _size(folder: Path, entry: _CameraEntry, number: int) -> tuple[tuple[int, int], FloatArray]:
     """Size and pixel of a camera, from the summary or else from the COLMAP model beside it."""
-    if "size_px" in entry and "pixel_mm" in entry:
-        return (int(entry["size_px"][0]), int(entry["size_px"][1])), np.array(entry["pixel_mm"], dtype=float)
-    try:
-        side = json.loads((folder / COLMAP_SIDE_FILE).read_text(encoding="utf-8"))["cameras"][number]
-        size = (int(side["size_px"][0]), int(side["size_px"][1]))
-        return size, np.array(side["pixel_mm"], dtype=float)
-    except (OSError, ValueError, LookupError) as error:
+    size, pixel = entry.size_px, entry.pixel_mm
+    if size is None or pixel is None:
+        path = folder / COLMAP_SIDE_FILE
+        beside = read_side_file(path).cameras if path.is_file() else ()
+        if number < len(beside):
+            size, pixel = beside[number].size_px, beside[number].pixel_mm
+    if size is None or pixel is None:
         raise SurveyFileError(
             f"{folder}: neither summary.json nor {COLMAP_SIDE_FILE} tells size and pixel of camera "
-            f"{number + 1}"
-        ) from error
+            f"{entry.name}"
+        )
+    return size, np.array(pixel)
 
 
 def _image_points(folder: Path, images: tuple[str, ...], points: tuple[str, ...]) -> ImagePoints:
-    table = _Table.of(folder / "image_points.csv", ("image", "point", "x_px", "y_px"))
-    image_index = {name: i for i, name in enumerate(images)}
-    point_index = {name: j for j, name in enumerate(points)}
-    image, point = [], []
-    for row, a, b in zip(table.rows, table.text("image"), table.text("point"), strict=True):
-        if a not in image_index:
-            raise table.error(row, f"image '{a}' is not in images.csv")
-        if b not in point_index:
-            raise table.error(row, f"point '{b}' is not in points.csv")
-        image.append(image_index[a])
-        point.append(point_index[b])
-    sigma = table.maybe_numbers(("sx_px", "sy_px"))
-    sigma = np.ones((len(image), 2)) if sigma is None else sigma
-    found = ImagePoints(
-        np.array(image, dtype=np.int64),
-        np.array(point, dtype=np.int64),
-        table.numbers(("x_px", "y_px")),
-        np.eye(2) * sigma[:, None, :] ** 2,
-    )
-    if "rejected" in table.header:
-        found = found.select(np.array([text != "1" for text in table.text("rejected")], dtype=bool))
-    return found
+    path = folder / "image_points.csv"
+    flagged = ("rejected",) if "rejected" in read_header(path) else ()
+    sigmas = ("sx_px", "sy_px")
+    table = read_table(path, ("image", "point"), ("x_px", "y_px", *flagged), sigmas, ignored=None)
+    table.refuse_duplicates(tuple(zip(*table.texts, strict=True)), ("image", "point"))
+    index = []
+    files = ("images.csv", "points.csv")
+    for column, names, known, file in zip(table.names, table.texts, (images, points), files, strict=True):
+        place = {name: k for k, name in enumerate(known)}
+        for line, name in zip(table.line, names, strict=True):
+            if name not in place:
+                raise SurveyFileError(f"{path}, line {line}: {column} '{name}' is not in {file}")
+        index.append(np.array([place[name] for name in names], dtype=np.int64))
+    rejected, sigma = table.values[:, 2 : 2 + len(flagged)], table.values[:, 2 + len(flagged) :]
+    table.refuse(rejected, (rejected != 0) & (rejected != 1), flagged, "0 or 1")
+    table.refuse(sigma, sigma <= 0, sigmas, "more than 0")
+    sigma = sigma if sigma.size else np.ones((len(table.line), 2))
+    image, point = index
+    found = ImagePoints(image, point, table.values[:, :2].copy(), np.eye(2) * sigma[:, None, :] ** 2)
+    return found.select(rejected[:, 0] == 0) if flagged else found
 
 
-@dataclass
-class _Table:
-    """A CSV table and the line of each of its rows."""
-
-    path: Path
-    header: list[str]
-    rows: list[tuple[int, list[str]]]  # line number and cells
-    last: int  # number of the last line
-
-    @classmethod
-    def of(cls, path: Path, needed: tuple[str, ...]) -> _Table:
-        try:
-            with Path(path).open(encoding="utf-8-sig", newline="") as file:
-                reader = csv.reader(file, strict=True)
-                lines = [(reader.line_num, row) for row in reader if row]
-        except OSError as error:
-            raise SurveyFileError(f"{path}: cannot be read ({error.strerror})") from error
-        except (csv.Error, UnicodeDecodeError) as error:
-            raise SurveyFileError(f"{path}, line {reader.line_num + 1}: not a CSV table ({error})") from error
-        if not lines:
-            raise SurveyFileError(f"{path}, line 1: the table is empty")
-        header = [cell.strip() for cell in lines[0][1]]
-        missing = [name for name in needed if name not in header]
-        if missing:
-            raise SurveyFileError(
-                f"{path}, line {lines[0][0]}: no column {missing[0]}, needed {','.join(needed)}"
-            )
-        table = cls(path, header, lines[1:], lines[-1][0])
-        for row in table.rows:
-            if len(row[1]) != len(header):
-                raise table.error(row, f"{len(row[1])} cells, the header has {len(header)}")
-        return table
-
-    def error(self, row: tuple[int, list[str]], message: str) -> SurveyFileError:
-        return SurveyFileError(f"{self.path}, line {row[0]}: {message}")
-
-    def text(self, name: str) -> list[str]:
-        k = self.header.index(name)
-        return [cells[k].strip() for _, cells in self.rows]
-
-    def keys(self, name: str) -> tuple[str, ...]:
-        """Cells of a column in which none may stand twice or be empty."""
-        known: set[str] = set()
-        for row, key in zip(self.rows, self.text(name), strict=True):
-            if key in known or not key:
-                raise self.error(row, f"{name} '{key}' stands twice" if key else f"{name} is empty")
-            known.add(key)
-        return tuple(self.text(name))
-
-    def numbers(self, names: Sequence[str], *, empty: bool = False) -> FloatArray:
-        """Columns of finite numbers; with `empty`, a cell without one is NaN."""
-        columns = [self.header.index(name) for name in names]
-        out = np.empty((len(self.rows), len(names)))
-        for k, row in enumerate(self.rows):
-            for c, column in enumerate(columns):
-                cell = row[1][column].strip()
-                try:
-                    value = np.nan if empty and not cell else float(cell)
-                except ValueError:
-                    value = np.inf
-                if not (np.isfinite(value) or (empty and not cell)):
-                    raise self.error(row, f"{names[c]} '{cell[:40]}' is not a number")
-                out[k, c] = value
-        return out
-
-    def maybe_numbers(self, names: tuple[str, ...]) -> FloatArray | None:
-        return self.numbers(names, empty=True) if set(names) <= set(self.header) else None
+def _covariance(table: CsvTable, sigma: FloatArray) -> FloatArray | None:
+    """Diagonal covariances (n, 3, 3) of columns sX, sY, sZ; None where no row has any."""
+    table.refuse(sigma, sigma < 0, SIGMAS, "0 or more, or nothing")
+    return np.eye(3) * sigma[:, None, :] ** 2 if np.isfinite(sigma).any() else None
 
 
-def _sigma_of(covariance: FloatArray | None, count: int) -> FloatArray:
-    if covariance is None:
-        return np.full((count, 3), np.nan)
-    return np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+def _sigma_of(covariance: FloatArray | None, count: int) -> tuple[FloatArray, tuple[str, ...]]:
+    """Standard deviations and the names of their columns, none where none is known."""
+    if covariance is None or not np.isfinite(covariance).any():
+        return np.empty((count, 0)), ()
+    return np.sqrt(np.diagonal(covariance, axis1=1, axis2=2)), SIGMAS
 
 
-def _write(path: Path, header: str, rows: Iterable[Sequence[object]]) -> None:
+def _write(path: Path, header: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
     with path.open("w", encoding="utf-8", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(header.split(","))
+        writer.writerow(header)
         writer.writerows([_cell(value) for value in row] for row in rows)
 
 

@@ -26,6 +26,7 @@ from adapters.sba_text import read_sba_text, sba_files, write_sba_text
 from sfm.distortion.models import MODELS
 from sfm.errors import KolinearError, OutputError, SurveyFileError
 from sfm.network import Estimate, Network, empty_estimate
+from sfm.whole_files import whole_folder
 
 
 @dataclass(frozen=True)
@@ -118,7 +119,7 @@ def read_any(path: Path, name: str | None = None) -> tuple[Network, Estimate]:
     """
     form = format_of(path) if name is None else format_named(name)
     if form.name in ("colmap", "colmap-text"):
-        return read_model(path)
+        return read_model(path, text=form.name == "colmap-text")
     if form.name == "colmap-database":
         network, cameras = read_database(path)
         return network, empty_estimate(network, cameras)
@@ -170,12 +171,11 @@ def write_any(path: Path, name: str, network: Network, estimate: Estimate) -> No
             f"camera {wrong[0].name}: format {name} holds models {', '.join(form.models)}, "
             f"not {wrong[0].model}"
         )
-    if name in ("colmap", "colmap-text"):
-        write_model(path, network, estimate, text=name == "colmap-text")
+    if form.folder:
+        with whole_folder(path) as folder:
+            _write_folder(folder, name, path.name, network, estimate)
     elif name == "colmap-database":
         write_database(path, network, estimate.cameras)
-    elif name == "tables":
-        write_tables(path, TableResult(path.name, network, estimate))
     elif name == "metashape":
         write_metashape(path, network, estimate)
     elif name == "photomodeler":
@@ -184,9 +184,17 @@ def write_any(path: Path, name: str, network: Network, estimate: Estimate) -> No
         write_bal(path, network, estimate)
     elif name == "bundle-csharp":
         write_bundle_csharp(path, network, estimate)
-    elif name == "bundle-matlab":
-        write_bundle_matlab_folder(path, network, estimate)
-    elif name == "sba":
-        write_sba_text(path / "cams.txt", path / "pts.txt", network, estimate)
     else:
         write_ply(path, network.points, estimate.points)
+
+
+def _write_folder(folder: Path, name: str, title: str, network: Network, estimate: Estimate) -> None:
+    """Write the files of a format that is a folder."""
+    if name in ("colmap", "colmap-text"):
+        write_model(folder, network, estimate, text=name == "colmap-text")
+    elif name == "tables":
+        write_tables(folder, TableResult(title, network, estimate))
+    elif name == "bundle-matlab":
+        write_bundle_matlab_folder(folder, network, estimate)
+    else:
+        write_sba_text(folder / "cams.txt", folder / "pts.txt", network, estimate)

@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
 
 from sfm.conventions import FloatArray
-from sfm.errors import OutputError, SurveyFileError
+from sfm.csv_tables import MAX_NUMBER, MAX_ROWS, MAX_TABLE_BYTES
+from sfm.errors import SurveyFileError
+from sfm.whole_files import whole_file
 
+MAX_LINES = 2 * MAX_ROWS  # as of tables
+MAX_DIGITS = 20  # of a whole number; COLMAP's largest have as many
 SHOWN = 40  # characters of a bad piece that a message repeats
 
 
@@ -20,14 +25,31 @@ class Lines:
     path: Path
     lines: list[str]
     number: int = 0  # of the line read last, from 1
+    ended: bool = True  # whether the last line has its end
 
     @classmethod
     def of(cls, path: Path) -> Lines:
-        """Read a file."""
+        """Read a file of bearable size.
+
+        Raises:
+            SurveyFileError: it is none.
+        """
         try:
-            return cls(path, Path(path).read_text(encoding="utf-8", errors="replace").splitlines())
-        except OSError as error:
-            raise SurveyFileError(f"{path}: cannot be read ({error.strerror})") from error
+            if path.exists() and not path.is_file():  # reading a pipe would never end
+                raise SurveyFileError(f"{path}: not a file, a text file is needed")
+            if path.stat().st_size > MAX_TABLE_BYTES:
+                raise SurveyFileError(
+                    f"{path}: {path.stat().st_size} bytes, at most {MAX_TABLE_BYTES} are read"
+                )
+            with path.open(encoding="utf-8", errors="replace") as file:
+                lines = list(islice(file, MAX_LINES + 1))
+        except (OSError, ValueError) as error:
+            reason = error.strerror if isinstance(error, OSError) else error
+            raise SurveyFileError(f"{path}: cannot be read ({reason})") from error
+        if len(lines) > MAX_LINES:
+            raise SurveyFileError(f"{path}: more than {MAX_LINES} lines, no more are read")
+        ended = not lines or lines[-1].endswith("\n")
+        return cls(path, [line.removesuffix("\n") for line in lines], ended=ended)
 
     @property
     def where(self) -> str:
@@ -75,26 +97,32 @@ class Lines:
             raise self.error(f"'{' '.join(words)[:SHOWN]}' after the end of the data")
 
     def number_of(self, text: str) -> float:
-        """Return a finite number."""
+        """Return a finite number of bearable size."""
         try:
-            value = float(text)
+            value = float(text) if text.isascii() and "_" not in text else np.nan
         except ValueError:
             value = np.nan
         if not np.isfinite(value):
             raise self.error(f"'{text[:SHOWN]}' is not a number")
+        if abs(value) > MAX_NUMBER:
+            raise self.error(f"'{text[:SHOWN]}', needed a number of at most {MAX_NUMBER:g}")
         return value
+
+    def whole_of(self, text: str, fewest: int, most: int, what: str) -> int:
+        """Return a whole number within bounds."""
+        digits = text.removeprefix("-")
+        sound = digits.isascii() and digits.isdecimal() and len(digits) <= MAX_DIGITS
+        if not (sound and fewest <= int(text) <= most):
+            raise self.error(f"{what} is '{text[:SHOWN]}', needed a whole number from {fewest} to {most}")
+        return int(text)
 
     def index_of(self, text: str, count: int, what: str) -> int:
         """Return an index from 0 to count - 1."""
-        if not text.isdecimal() or int(text) >= count:
-            raise self.error(f"{what} '{text[:SHOWN]}', needed a number from 0 to {count - 1}")
-        return int(text)
+        return self.whole_of(text, 0, count - 1, what)
 
     def count_of(self, text: str, what: str) -> int:
-        """Return a number of things, 1 or more."""
-        if not text.isdecimal() or int(text) < 1:
-            raise self.error(f"'{text[:SHOWN]}' where the number of {what} was due")
-        return int(text)
+        """Return a number of things, 1 or more, that the file can have room for."""
+        return self.whole_of(text, 1, MAX_LINES, f"the number of {what}")
 
     def numbers(self, fewest: int, most: int, *, photograph: str | None = None) -> FloatArray:
         """Return a line of numbers, the first of which is that of the photograph if given."""
@@ -124,10 +152,5 @@ def write_lines(path: Path, lines: list[str]) -> None:
     Raises:
         OutputError: the file cannot be written.
     """
-    part = Path(path).with_name(Path(path).name + ".part")
-    try:
+    with whole_file(path) as part:
         part.write_text("\n".join(lines) + "\n", encoding="utf-8")
-        part.replace(path)
-    except OSError as error:
-        part.unlink(missing_ok=True)
-        raise OutputError(f"{path}: cannot be written ({error.strerror})") from error

@@ -28,6 +28,7 @@ from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
+from adapters.json_files import MAX_PIXEL_MM
 from adapters.lines import write_lines
 from adapters.xml_lines import Node, read_xml
 from sfm.camera import Camera, camera_from_values
@@ -163,11 +164,13 @@ def _camera(sensor: Node) -> Camera:
     if sensor.attributes.get("type", "frame") != "frame":
         raise sensor.error(f"sensor of type {sensor.attributes['type']}, only frame sensors can be read")
     resolution = sensor.one("resolution")
-    size = (int(resolution.number("width")), int(resolution.number("height")))
+    size = (resolution.side_px("width"), resolution.side_px("height"))
     given = {node.attribute("name"): node for node in sensor.all("property")}
     pixel = tuple(
         given[name].number("value") if name in given else 1.0 for name in ("pixel_width", "pixel_height")
     )
+    if not all(0 < side <= MAX_PIXEL_MM for side in pixel):
+        raise sensor.error(f"pixels of {pixel[0]:g} x {pixel[1]:g} mm, needed 0 to {MAX_PIXEL_MM:g}")
     calibrations = sensor.all("calibration")
     if not calibrations:
         raise sensor.error("sensor without calibration")

@@ -31,6 +31,7 @@ from pathlib import Path
 
 import numpy as np
 
+from adapters.json_files import MAX_SIDE_PX
 from adapters.lines import Lines, write_lines
 from sfm.camera import Camera, camera_from_values
 from sfm.conventions import FloatArray, angles_from_rotation, rotation_from_angles
@@ -63,7 +64,9 @@ def read_photomodeler(
     text.line()  # title
     header = text.numbers(2, 4)
     if len(header) == 4:
-        size_px = (int(header[2]), int(header[3]))
+        words = text.lines[text.number - 1].split()
+        width, height = (text.whole_of(word, 1, MAX_SIDE_PX, "the size in px") for word in words[2:])
+        size_px = (width, height)
     if size_px is None:
         raise text.error("no size of the photographs in this line, give size_px")
     text.numbers(9, 9)

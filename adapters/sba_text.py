@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from adapters.lines import write_lines
+from adapters.lines import Lines, write_lines
 from sfm.camera import Camera, camera_from_values
 from sfm.conventions import FloatArray
 from sfm.errors import OutputError, SurveyFileError
@@ -28,7 +28,6 @@ AXES = np.diag([1.0, -1.0, -1.0])  # sba's camera axes (y down, z forward) in ou
 POSE, POSE_WITH_CAMERA = 7, 12  # numbers of a camera line
 PLAIN, WITH_COVARIANCE = 3, 7  # numbers of a projection
 MIN_QUATERNION = 1e-6  # length; unit quaternions are due
-MAX_NUMBER = 1e12  # no length or pixel is larger; squares and products of larger ones overflow
 SIGMA_PX = 1.0  # of projections that come without
 
 
@@ -55,9 +54,15 @@ def read_sba_text(
     for k in np.flatnonzero(np.linalg.norm(table[:, -7:-3], axis=1) < MIN_QUATERNION)[:1]:
         raise SurveyFileError(f"{cameras}, line {rows[k][0]}: a quaternion of zeros is no rotation")
     image_points, xyz = _points(points, len(rows))
+    seen = np.bincount(image_points.image, minlength=len(rows))
+    for i in np.flatnonzero(seen == 0)[:1]:
+        raise SurveyFileError(
+            f"{points}: no projection in frame {i} of {cameras}, line {rows[i][0]}, nor in "
+            f"{int((seen == 0).sum()) - 1} other frames; the points are cut off or belong to other cameras"
+        )
     if sigmas is not None:
         image_points = _with_sigmas(image_points, sigmas)
-    size = tuple(int(v) + 1 for v in np.ceil(image_points.xy.max(axis=0)))
+    size = tuple(max(int(v), 0) + 1 for v in np.ceil(image_points.xy.max(axis=0)))
     if table.shape[1] == POSE_WITH_CAMERA:
         inner, camera = np.unique(table[:, :5], axis=0, return_inverse=True)
     elif calibration is None:
@@ -143,6 +148,10 @@ def _numbers(*values: float) -> str:
 
 def _camera(name: str, values: FloatArray, size_px: tuple[int, int], path: Path) -> Camera:
     fu, u0, v0, aspect, skew = values
+    if not (fu > 0 and aspect > 0):
+        raise SurveyFileError(
+            f"{path}: focal length {fu:g} px, aspect ratio {aspect:g}: both must be positive"
+        )
     if skew != 0:
         raise SurveyFileError(f"{path}: skew {skew}, only cameras without skew can be read")
     return camera_from_values(
@@ -223,24 +232,10 @@ def _with_sigmas(image_points: ImagePoints, path: Path) -> ImagePoints:
 
 def _rows(path: Path) -> list[tuple[int, list[float]]]:
     """Return line number and numbers of each line that holds any; # starts a comment."""
+    text = Lines.of(path)
     rows = []
-    try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise SurveyFileError(f"{path}: cannot be read ({error})") from error
-    for number, line in enumerate(text.splitlines(), start=1):
-        fields = line.split("#")[0].split()
-        if not fields:
-            continue
-        try:
-            values = [float(field) for field in fields]
-        except ValueError as error:
-            raise SurveyFileError(f"{path}, line {number}: {error}") from error
-        if not all(abs(value) <= MAX_NUMBER for value in values):
-            raise SurveyFileError(
-                f"{path}, line {number}: finite numbers of at most {MAX_NUMBER:g} are needed"
-            )
-        rows.append((number, values))
+    while (words := text.row()) is not None:
+        rows.append((text.number, [text.number_of(word) for word in words]))
     if not rows:
         raise SurveyFileError(f"{path}, line 1: no numbers")
     return rows

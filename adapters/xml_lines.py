@@ -8,8 +8,12 @@ from xml.parsers import expat
 
 import numpy as np
 
+from adapters.json_files import MAX_SIDE_PX
 from sfm.conventions import FloatArray
+from sfm.csv_tables import MAX_NUMBER, MAX_TABLE_BYTES
 from sfm.errors import SurveyFileError
+
+MAX_DEPTH = 100  # of elements in one another; exports have about ten
 
 
 @dataclass
@@ -61,12 +65,21 @@ class Node:
 
     def _number(self, text: str) -> float:
         try:
-            value = float(text)
+            value = float(text) if text.isascii() and "_" not in text else np.nan
         except ValueError:
             value = np.nan
-        if not np.isfinite(value):
-            raise self.error(f"'{text[:40]}' in <{self.tag}> is not a number")
+        if not abs(value) <= MAX_NUMBER:
+            raise self.error(
+                f"'{text[:40]}' in <{self.tag}> is not a finite number of at most {MAX_NUMBER:g}"
+            )
         return value
+
+    def side_px(self, name: str) -> int:
+        """Return an attribute that is the side of a photograph, px."""
+        value = self.number(name)
+        if not (1 <= value <= MAX_SIDE_PX and value == int(value)):
+            raise self.error(f"{name} is {value:g} px, needed a whole number from 1 to {MAX_SIDE_PX}")
+        return int(value)
 
 
 def read_xml(path: Path) -> Node:
@@ -80,6 +93,10 @@ def read_xml(path: Path) -> Node:
     open_nodes = [top]
 
     def start(tag: str, attributes: dict[str, str]) -> None:
+        if len(open_nodes) > MAX_DEPTH:
+            raise SurveyFileError(
+                f"{path}, line {parser.CurrentLineNumber}: elements more than {MAX_DEPTH} deep in one another"
+            )
         node = Node(path, parser.CurrentLineNumber, tag, attributes)
         open_nodes[-1].children.append(node)
         open_nodes.append(node)
@@ -96,7 +113,11 @@ def read_xml(path: Path) -> Node:
     parser.CharacterDataHandler = text
     parser.StartDoctypeDeclHandler = doctype
     try:
-        parser.Parse(Path(path).read_bytes(), True)
+        size = Path(path).stat().st_size
+        if size > MAX_TABLE_BYTES:
+            raise SurveyFileError(f"{path}: {size} bytes, at most {MAX_TABLE_BYTES} are read")
+        with Path(path).open("rb") as file:
+            parser.ParseFile(file)
     except OSError as error:
         raise SurveyFileError(f"{path}: cannot be read ({error.strerror})") from error
     except expat.ExpatError as error:

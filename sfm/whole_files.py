@@ -15,12 +15,12 @@ ROOM_BYTES = 1 << 20  # what is written on trial to learn why a library could no
 
 
 @contextmanager
-def whole_folder(out: Path, what: str = "it") -> Iterator[Path]:
+def whole_folder(out: Path, what: str = "") -> Iterator[Path]:
     """Give a folder to write into, which takes the place of `out` when everything is in it.
 
     Args:
         out: the folder; an earlier one is replaced, and kept until the new one is there.
-        what: what is written, for the message.
+        what: what is written, for the message, if the path alone does not say it.
 
     Yields:
         An empty folder beside `out`.
@@ -41,14 +41,14 @@ def whole_folder(out: Path, what: str = "it") -> Iterator[Path]:
 
 
 @contextmanager
-def whole_file(path: Path, what: str = "it") -> Iterator[Path]:
+def whole_file(path: Path, what: str = "") -> Iterator[Path]:
     """Give a file to write, which takes the place of `path` when it is finished.
 
     It lies in a folder of its own, so that what a library leaves beside its file goes with it.
 
     Args:
         path: the file; an earlier one is replaced.
-        what: what is written, for the message.
+        what: what is written, for the message, if the path alone does not say it.
 
     Yields:
         Path of the file to write.
@@ -84,7 +84,9 @@ def _beside(out: Path, what: str) -> Path:
         out.parent.mkdir(parents=True, exist_ok=True)
         return Path(tempfile.mkdtemp(prefix=f".{out.name}.", suffix=".part", dir=out.parent))
     except OSError as error:
-        raise OutputError(f"{out}: {what} cannot be written here: {error.strerror or error}") from error
+        raise OutputError(
+            f"{out}: {_subject(what)}cannot be written here: {error.strerror or error}"
+        ) from error
 
 
 @contextmanager
@@ -93,11 +95,15 @@ def _told_of(out: Path, part: Path, what: str) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        raise OutputError(f"{out}: {what} cannot be written: {error.strerror or error}") from error
+        raise OutputError(f"{out}: {_subject(what)}cannot be written: {error.strerror or error}") from error
     except KolinearError as error:
         if str(part) not in str(error):
             raise
         raise type(error)(str(error).replace(str(part), str(out))) from error
+
+
+def _subject(what: str) -> str:
+    return f"{what} " if what else ""
 
 
 def _sync(path: Path) -> None:

@@ -67,9 +67,11 @@ def test_covariances_in_the_points_file(files: dict[str, Path]) -> None:
     [
         ("cams", "1 0 0 0 0 0\n", r"line 1: 6 numbers, all lines"),
         ("cams", "", "no numbers"),
-        ("cams", "1 0 0 0 x 0 0\n", "line 1: could not convert"),
+        ("cams", "1 0 0 0 x 0 0\n", "line 1: 'x' is not a number"),
         ("pts", "0 0 0 2 0 1 2\n", "line 1: 3 numbers for 2 projections"),
         ("pts", "0 0 0 1 5 1 2\n", "line 1: frame 5, there are 2 cameras"),
+        ("pts", "0 0 0 1 0 1 2\n", "pts.txt: no projection in frame 1 of .*cams.txt, line 2"),
+        ("pts", "0 0 1e300 1 0 1 2\n", "line 1: '1e300', needed a number of at most 1e\\+12"),
         ("pts", "0 0 0\n", "line 1: X Y Z and a number of projections"),
         ("calib", "1 0 0\n", "line 1: three lines of 3 numbers"),
         ("calib", "800 3 320\n0 808 240\n0 0 1\n", "skew 3"),

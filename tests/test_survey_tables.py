@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
+from sfm import csv_tables
 from sfm.errors import SurveyFileError
 from sfm.project import read_survey
-from sfm.survey import tables as survey_tables
 from sfm.survey.start import find_photographs, network_from_observations
 from sfm.survey.tables import read_control, read_exterior, read_image_points
 from tests.surveys import write_observed_survey, write_photograph_survey
@@ -66,7 +66,7 @@ def test_large_tables_are_refused_before_memory_is_taken(
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert peak < 1_000_000
-    monkeypatch.setattr(survey_tables, "MAX_ROWS", 10)
+    monkeypatch.setattr(csv_tables, "MAX_ROWS", 10)
     rows = "".join(f"1,p{k},1,2\n" for k in range(11))
     with pytest.raises(SurveyFileError, match="line 12: more than 10 rows"):
         read_image_points(table(tmp_path, HEADER + rows))

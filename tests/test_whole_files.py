@@ -35,7 +35,7 @@ def test_a_file_leaves_nothing_beside_it(tmp_path: Path) -> None:
 @pytest.mark.parametrize("whole", [whole_file, whole_folder])
 def test_failures_leave_nothing_and_speak_of_the_place_asked_for(whole, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
     out = tmp_path / "out"
-    with pytest.raises(OutputError, match=r"out: it cannot be written: No space left on device$"), whole(out):
+    with pytest.raises(OutputError, match=r"out: cannot be written: No space left on device$"), whole(out):
         raise OSError(28, "No space left on device")
     with pytest.raises(BackendError) as told, whole(out, "the model") as part:
         raise BackendError(f"{part}: cameras differ")

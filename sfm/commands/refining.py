@@ -10,6 +10,7 @@ import typer
 from sfm.commands.console import drawn_progress
 from sfm.errors import OutputError
 from sfm.survey.refine import refine_model, refinement_text
+from sfm.whole_files import whole_folder
 
 
 def refine(
@@ -40,5 +41,6 @@ def refine(
     print(refinement_text(found), end="")
     if out is not None:
         a = found.adjustment
-        write_model(out, a.network, a.estimate, rejected=a.rejected)
+        with whole_folder(out) as folder:
+            write_model(folder, a.network, a.estimate, rejected=a.rejected)
         print(f"Model: {out}")
