@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from synthetic import make_network, perturb, seed_of
 
+from sfm.adjustment import connectivity
 from sfm.adjustment.collinearity import residuals
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.marginal import marginal_of
@@ -158,6 +159,21 @@ def test_covariance_equals_the_inverse_of_the_whole() -> None:
         own = Q[np.ix_(rows, rows)]
         sigma = np.sqrt(np.diagonal(own))
         assert np.abs((own - a.covariance.interior[i]) / sigma[:, None] / sigma).max() < 1e-5
+
+
+def test_banded_and_full_normal_equations_share_alike(monkeypatch: pytest.MonkeyPatch) -> None:
+    network, truth = zoomed("banded", noise_px=0.1)
+    full = adjust(network, truth, datum=FREE, reject="none")
+    monkeypatch.setattr(connectivity, "SMALL", 0)
+    monkeypatch.setattr(connectivity, "DENSE_RATE", 1e-3)  # so that the band is always less work
+    layout, _ = unknowns_of(network, truth, use_control=False)
+    assert connectivity.band_order(layout) is not None
+    band = adjust(network, truth, datum=FREE, reject="none")
+    assert band.sigma0 == pytest.approx(full.sigma0, rel=1e-9)
+    for one, other in zip(band.covariance.interior, full.covariance.interior, strict=True):
+        sigma = np.sqrt(np.diagonal(other))
+        assert np.abs((one - other) / sigma[:, None] / sigma).max() < 1e-5
+    assert np.abs(band.redundancy_numbers - full.redundancy_numbers).max() < 1e-6
 
 
 def test_one_camera_is_the_case_of_all_parameters_shared() -> None:
