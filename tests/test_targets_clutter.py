@@ -62,6 +62,23 @@ def test_no_code_is_read_from_print(codes: str) -> None:
     assert (found.code < 0).all()
 
 
+def test_counters_of_letters_are_no_targets_and_free_rings_are() -> None:
+    rng = np.random.default_rng(4)
+    ink = np.zeros((HEIGHT * SUPER, WIDTH * SUPER), np.uint8)
+    for y in range(40, 400, 34):  # words of o
+        for x in range(40, WIDTH - 40, 26):
+            cv2.circle(ink, (x * SUPER, y * SUPER), 8 * SUPER, 255, 4 * SUPER)
+    rings = [(100, 560), (300, 560), (500, 560)]
+    for x, y in rings:  # a white dot on a black disc stands for itself
+        cv2.circle(ink, (x * SUPER, y * SUPER), 16 * SUPER, 255, -1)
+        cv2.circle(ink, (x * SUPER, y * SUPER), 9 * SUPER, 0, -1)
+    for codes in ("none", "ring14"):
+        found = find_targets(exposed(ink, rng), polarity="bright", codes=codes, min_diameter_px=4)
+        assert len(found) == len(rings)
+        assert np.abs(np.sort(found.xy[:, 0]) - [x for x, _ in rings]).max() < 0.6
+        assert dict(count_flags(found.rejected_flag))["thin_background"] > 300
+
+
 def test_an_arc_does_not_take_the_dot_away() -> None:
     """Three arcs about a dot, seen so that an arc looks like an ellipse."""
     family = code_family("arcs")

@@ -10,6 +10,7 @@ from numba import njit
 
 from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
 from sfm.targets.codes import UNCODED, UNREADABLE, CodeFamily, read_codes
+from sfm.targets.counters import find_counters
 from sfm.targets.flags import Flag
 from sfm.targets.measure import EllipseFit, axes_from_shape, fit_ellipse_model
 from sfm.targets.outlines import (
@@ -135,6 +136,10 @@ def find_targets(
             photograph, fit.xy[good], fit.shape[good], levels[good], family, blur_px=fit.blur[good]
         )
         reason[good & _inside_codes(fit, code, confidence, family)] = Flag.PART_OF_CODE
+    free = np.flatnonzero((reason == 0) & (code < 0))
+    levels = np.column_stack([fit.background, fit.contrast])[free]
+    counter = find_counters(photograph, fit.xy[free], fit.shape[free], levels)
+    reason[free[counter]] = Flag.THIN_BACKGROUND.value
     keep = np.flatnonzero(reason == 0)
     keep = keep[np.lexsort((fit.xy[keep, 0], fit.xy[keep, 1]))]
     remark = np.where(code == UNREADABLE, fit.flag | Flag.CODE_UNREADABLE.value, fit.flag)
