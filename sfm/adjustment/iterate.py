@@ -36,8 +36,9 @@ START_DAMPING = 1e-3  # share of the diagonal
 NEAR = 1e-2  # |A dx| / |v| below which Levenberg-Marquardt hands over to Gauss-Newton
 MAX_DAMPING = 1e10
 ROUNDING = 1e-12  # relative difference of two sums of the same squares in another order
+FAR = 0.9  # |A dx| / |v| down to which the step after the next is not expected to be the last
 COARSE = 1e-2  # |A dx| / |v| down to which steps may come from a product in single precision
-SINGLE_FROM = 400  # reduced unknowns from which the product in single precision saves time
+SINGLE_FROM = 200  # reduced unknowns from which the product in single precision saves time
 METHODS = ("gauss-newton", "levenberg-marquardt", "undamped")
 
 
@@ -136,7 +137,7 @@ def iterate(
         if found.within(tolerance) or taken >= max_iterations:
             break
         taken += 1
-        single = single and not found.within(COARSE)
+        single = single and not found.within(FAR)
         better = _line_search(problem, state, weight, found, 1.0, shortest)
         if better is None:
             break
