@@ -83,7 +83,7 @@ def datum_in_words(adjustment: Adjustment) -> str:
 
 
 def interior_parameters(adjustment: Adjustment) -> tuple[InteriorParameter, ...]:
-    """Return every parameter of interior orientation once, those that are fixed at 0 left out."""
+    """Return every parameter of interior orientation once, common ones first, those fixed at 0 left out."""
     network = adjustment.network
     used = np.bincount(network.camera, minlength=len(adjustment.estimate.cameras))
     found: dict[tuple[str, str, int], InteriorParameter] = {}
@@ -98,7 +98,8 @@ def interior_parameters(adjustment: Adjustment) -> tuple[InteriorParameter, ...]
             known = found.get(key)
             count = int(used[a]) + (known.photographs if known else 0)
             found[key] = InteriorParameter(owner, count, name, value, float(sigma[s]), camera.units[s])
-    return tuple(found.values())
+    common = {name for name, _ in families(adjustment)}
+    return tuple(sorted(found.values(), key=lambda one: one.owner not in common))
 
 
 def families(adjustment: Adjustment) -> tuple[tuple[str, Camera], ...]:
