@@ -72,7 +72,8 @@ def match(
             as_json=as_json,
             out=out,
             picture=picture,
-        )
+        ),
+        end="",
     )
 
 

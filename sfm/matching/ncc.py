@@ -14,7 +14,7 @@ import numpy as np
 from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
 from sfm.errors import GeometryError
 from sfm.matching.flags import NccFlag
-from sfm.matching.peak import OUTPUTS, read_peak
+from sfm.matching.peak import NOT_COMPARED, OUTPUTS, read_peak
 from sfm.matching.radiometry import full_scale, grey_of, odd_window
 
 # Standard deviation below which a template is flat, part of the full scale of 8 bit (of 16 bit alike).
@@ -94,12 +94,12 @@ def match_ncc(
     corners = _corners(a, b, half, reach, grey_left.shape, grey_right.shape)
     for k, (x, y, x0, y0, x1, y1) in enumerate(corners.tolist()):
         if x < 0 or x1 - x0 < side or y1 - y0 < side:
-            out[k, 0] = int(NccFlag.OUTSIDE)
+            out[k] = NOT_COMPARED
             continue
         template, window = grey_left[y : y + side, x : x + side], grey_right[y0:y1, x0:x1]
         surface = cv2.matchTemplate(window, template, cv2.TM_CCOEFF_NORMED)
         read_peak(template, window, surface, surface, least, min_correlation, max_second, out[k])
-    out[~np.isfinite(a).all(axis=1) | ~np.isfinite(b).all(axis=1), 0] = int(NccFlag.OUTSIDE)
+    out[~np.isfinite(a).all(axis=1) | ~np.isfinite(b).all(axis=1)] = NOT_COMPARED
     matches = matches_of(out, corners[:, 2:4], a, half)
     return matches if back_px is None else _confirm(left, right, a, matches, side, search_px, back_px)
 

@@ -9,9 +9,8 @@ import numpy as np
 
 from sfm.conventions import AnyArray, FloatArray
 from sfm.errors import GeometryError
-from sfm.matching.flags import NccFlag
 from sfm.matching.ncc import NccMatches, least_deviations, matches_of, template_corners
-from sfm.matching.peak import OUTPUTS, read_peak
+from sfm.matching.peak import NOT_COMPARED, OUTPUTS, read_peak
 from sfm.matching.radiometry import grey_of, odd_window
 
 
@@ -53,13 +52,13 @@ def match_along_line(
         near = np.asarray((path > -width) & (path < 2 * np.array([width, height])))
         path = path[near.all(axis=1)]
         if x < 0 or len(path) < 2:
-            out[k, 0] = int(NccFlag.OUTSIDE)
+            out[k] = NOT_COMPARED
             continue
         margin = half + width_px
         low = np.maximum(np.floor(path.min(axis=0)).astype(int) - margin, 0)
         high = np.minimum(np.ceil(path.max(axis=0)).astype(int) + margin + 1, [width, height])
         if (high - low < side).any():
-            out[k, 0] = int(NccFlag.OUTSIDE)
+            out[k] = NOT_COMPARED
             continue
         template, window = (
             grey_left[y : y + side, x : x + side],

@@ -9,6 +9,7 @@ from sfm.matching.flags import NccFlag
 
 PEAK_ZONE = 2  # a second peak is at least this many pixels farther from the first in a row or column, px
 OUTPUTS = 10  # flag; x, y in the surface, their three covariances; r, second r, gain, offset
+NOT_COMPARED = np.array([int(NccFlag.OUTSIDE)] + [np.nan] * (OUTPUTS - 1))
 FLAT, BORDER, LOW, DOUBT = (
     int(f) for f in (NccFlag.FLAT_TEXTURE, NccFlag.AT_BORDER, NccFlag.LOW_CORRELATION, NccFlag.AMBIGUOUS)
 )

@@ -34,6 +34,7 @@ COLUMNS = (
 )
 ZOOM = 8  # side of a pixel in the picture of patches, px
 GAP = 4  # between the patches, px
+NO_SECOND = -1.0  # r of the second-best place where there is none
 MAX_PICTURES = 25  # points in one picture
 
 
@@ -213,7 +214,8 @@ def _text_rows(names: tuple[str, ...], found: ConjugatePoints) -> list[tuple[str
         place = "-" if why else f"{xr:.3f}, {yr:.3f}"
         sigma = "-" if why else f"{sx:.4f}, {sy:.4f}"
         quality = f"{r:.4f}" if math.isfinite(float(r)) else "-"
-        rows.append((name, f"{x:.2f}, {y:.2f}", place, sigma, quality, f"{second:.2f}", str(steps), str(why)))
+        next_best = f"{second:.2f}" if second > NO_SECOND else "-"
+        rows.append((name, f"{x:.2f}, {y:.2f}", place, sigma, quality, next_best, str(steps), str(why)))
     return rows
 
 
