@@ -2,7 +2,7 @@
 
 Of S^-1 only the blocks of single photographs, the border of interior unknowns and kept points, and between
 photographs that share a point are needed: Y'S^-1 Y of an object point sums over pairs of its rays. The
-full matrix gives them by products or triangular solutions of the rows Y', some points at a time; the banded
+full matrix gives them by products or triangular products of the rows Y', some points at a time; the banded
 one by the elements of its inverse within the band,
 
     S^-1 = (Z + X Q X'   -X Q; -Q X'   Q)    Z = A^-1, X = A^-1 C, Q = (D - C' A^-1 C)^-1.
@@ -17,6 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 from scipy.linalg import cho_solve
+from scipy.linalg.blas import dsyrk, dtrmm
 
 from sfm.adjustment.band_inverse import band_inverse
 from sfm.adjustment.banded import BandFactor
@@ -57,10 +58,12 @@ def inverse_of(
 
 def _of_full(b: Blocks, factor: Factor, layout: Unknowns, cross: bool) -> Inverse:
     m, n = len(b.U), len(b.y)
-    Q = factor.inverse()
+    W = factor.inverse_root()
     free = layout.reduced_free()
     if not free.all():
-        Q *= free[:, None] * free.astype(float)
+        W *= free[:, None]
+    Q = dsyrk(1.0, W)
+    _mirror(Q)
     first = 6 * m
     core = np.empty((n, 3, 3))
     YQ = np.empty((len(b.Y) if cross else 0, 3, 6))
@@ -72,7 +75,7 @@ def _of_full(b: Blocks, factor: Factor, layout: Unknowns, cross: bool) -> Invers
             _pick(layout.obs, products, start, YQ, YQ_border)
             pairs = products.reshape(-1, 3, layout.reduced), rows.reshape(-1, 3, layout.reduced)
         else:
-            white = np.ascontiguousarray(factor.whitened(rows)).reshape(-1, 3, layout.reduced)
+            white = dtrmm(1.0, W, rows.T, trans_a=1, overwrite_b=1).T.reshape(-1, 3, layout.reduced)
             pairs = white, white
         core[start : start + len(rows) // 3] = pairs[0] @ np.swapaxes(pairs[1], 1, 2)
     block = np.arange(first).reshape(m, 6)
@@ -104,6 +107,14 @@ def _of_band(b: Blocks, factor: BandFactor, layout: Unknowns, cross: bool) -> In
     if not cross:
         YQ, YQ_border = YQ[:0], YQ_border[:0]
     return Inverse(exterior, mixed, Q, core, YQ, YQ_border)
+
+
+@njit(cache=True)
+def _mirror(Q):  # type: ignore[no-untyped-def]
+    """Copy the upper triangle to the lower one."""
+    for q in range(len(Q)):
+        for p in range(q):
+            Q[q, p] = Q[p, q]
 
 
 @njit(cache=True, error_model="numpy")

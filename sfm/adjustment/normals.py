@@ -28,6 +28,8 @@ from sfm.adjustment.parameters import Unknowns
 from sfm.adjustment.weighted import Weighted, point_terms, weighted_terms
 from sfm.conventions import FloatArray, IntArray
 
+CHUNK = 1_000_000  # numbers of rows Y' that are multiplied at a time: a second-level cache and a little
+
 
 class Blocks(NamedTuple):
     """Parts of the normal equations that one pass over the image points fills; f free parameters a camera."""
@@ -46,6 +48,7 @@ class Blocks(NamedTuple):
     Yy: FloatArray  # Y y, what the right side is reduced by, (reduced,)
     K: FloatArray  # kept points by all reduced unknowns, (3 s, reduced)
     held: IntArray  # 1 where a direction of a point had to be held, (n,)
+    chunk: FloatArray  # for rows Y' of some object points, flat
     A: FloatArray  # derivatives and residuals of the image points of one photograph
     order: IntArray  # image points, photograph by photograph, (k,)
     first: IntArray  # place in it of the first image point of each photograph, and the end, (m + 1,)
@@ -176,6 +179,7 @@ def new_blocks(layout: Unknowns) -> Blocks:
         Yy=np.empty(layout.reduced),
         K=np.zeros((3 * len(layout.kept), layout.reduced)),
         held=np.zeros(n, dtype=np.int64),
+        chunk=np.empty(max(3 * layout.reduced, CHUNK)),
         A=np.zeros((2 * most, width)),
         order=order,
         first=first,

@@ -16,8 +16,8 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 from scipy.linalg import eigh
-from scipy.linalg.blas import dsymm, dsyrk, dtrsm, ssyrk
-from scipy.linalg.lapack import dpotrf, dpotri, dpotrs
+from scipy.linalg.blas import dsymm, dsyrk, ssyrk
+from scipy.linalg.lapack import dpotrf, dpotrs, dtrtri
 
 from sfm.adjustment.datum import Motions
 from sfm.adjustment.normals import Blocks, Equations
@@ -27,7 +27,6 @@ from sfm.errors import GeometryError
 
 NULL = 1e-12  # eigenvalue of the scaled matrix (diagonal at most 1) taken as 0; rounding leaves 1e-15
 WEAK_PIVOT = 1e-11  # squared pivot below which the eigenvalues are looked at
-CHUNK_BYTES = 8e6  # of the rows Y' that are multiplied at a time: a second-level cache and a little
 LARGEST_BYTES = 6e9  # of the full matrix; larger ones would swap
 
 
@@ -54,15 +53,11 @@ class Factor:
         SQ = dsymm(1.0, self.matrix, self.motions) - self.motions
         return int((np.linalg.norm(SQ, axis=0) < np.sqrt(NULL)).sum())
 
-    def inverse(self) -> FloatArray:
-        """Return the inverse with its null space filled, in the units of the unknowns, (reduced, reduced)."""
-        Q, _ = dpotri(self.cholesky)
-        _mirror(Q, self.scale)
-        return np.asarray(Q)
-
-    def whitened(self, rows: FloatArray) -> FloatArray:
-        """Return rows R^-1 with S = R'R, so that products of its rows are those of S^+, (r, reduced)."""
-        return np.asarray(dtrsm(1.0, self.cholesky, (rows * self.scale).T, trans_a=1)).T
+    def inverse_root(self) -> FloatArray:
+        """Return W with S^+ = W W', upper triangle, in the units of the unknowns, (reduced, reduced)."""
+        W, _ = dtrtri(self.cholesky)
+        W *= self.scale[:, None]
+        return np.asarray(W)
 
 
 def factor(
@@ -104,11 +99,17 @@ def factor(
 def rows_of(
     blocks: Blocks, layout: Unknowns, scale: FloatArray, dtype: type
 ) -> Iterator[tuple[int, FloatArray]]:
-    """Yield rows Y' times scale, some object points at a time: the first point, and (3 points, reduced)."""
-    n = len(blocks.y)
-    points = max(1, int(CHUNK_BYTES / (3 * layout.reduced * np.dtype(dtype).itemsize)))
+    """Yield rows Y' times scale, some object points at a time: the first point, and (3 points, reduced).
+
+    The next rows take the place of the last ones.
+    """
+    n, width = len(blocks.y), layout.reduced
+    space: FloatArray = blocks.chunk.view(dtype)
+    points = len(space) // (3 * width)
     for first in range(0, n, points):
-        rows: FloatArray = np.zeros((3 * min(points, n - first), layout.reduced), dtype=dtype)
+        number = 3 * min(points, n - first)
+        rows: FloatArray = space[: number * width].reshape(number, width)
+        rows.fill(0.0)
         _fill(layout.obs, blocks.Y, blocks.Z, scale, first, rows)
         yield first, rows
 
@@ -162,12 +163,3 @@ def _add_blocks(U, border, corner, scale, stretch, S):  # type: ignore[no-untype
         for p in range(q + 1):
             value = corner[p, q] * scale[first + p] * scale[first + q]
             S[first + p, first + q] += value * stretch if p == q else value
-
-
-@njit(cache=True, error_model="numpy")
-def _mirror(Q, scale):  # type: ignore[no-untyped-def]
-    """Scale the upper triangle of Q and copy it to the lower one."""
-    for q in range(len(Q)):
-        for p in range(q + 1):
-            Q[p, q] *= scale[p] * scale[q]
-            Q[q, p] = Q[p, q]
