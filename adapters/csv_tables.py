@@ -81,6 +81,7 @@ def read_result(folder: Path) -> TableResult:
         position_covariance,
         sigmas,
         summary.redundancy,
+        summary.length_unit or "",
     )
 
 
@@ -117,6 +118,7 @@ def write_tables(folder: Path, result: TableResult) -> None:
     summary: dict[str, Any] = {
         "survey": result.name,
         "redundancy": result.redundancy,
+        "length_unit": result.unit,
         "cameras": [
             {
                 "name": camera.name,
@@ -176,6 +178,7 @@ class _Summary(Content):
     """What is read of summary.json."""
 
     survey: Annotated[StrictStr, StringConstraints(max_length=MAX_NAME)] | None = None
+    length_unit: Annotated[StrictStr, StringConstraints(max_length=MAX_NAME)] | None = None
     redundancy: Annotated[int, Field(ge=0, strict=True)] | None = None
     cameras: Annotated[tuple[_CameraEntry, ...], Field(min_length=1)]
 

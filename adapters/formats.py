@@ -8,6 +8,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
 from adapters.bal import read_bal, write_bal
 from adapters.bundle_text import (
     INTERIOR,
@@ -23,9 +25,10 @@ from adapters.metashape import read_metashape, write_metashape
 from adapters.photomodeler import read_photomodeler, write_photomodeler
 from adapters.ply import write_ply
 from adapters.sba_text import read_sba_text, sba_files, write_sba_text
+from sfm.camera import Camera
 from sfm.distortion.models import MODELS
 from sfm.errors import KolinearError, OutputError, SurveyFileError
-from sfm.network import Estimate, Network, empty_estimate
+from sfm.network import Estimate, Network, empty_estimate, reduce_network
 from sfm.whole_files import whole_folder
 
 
@@ -37,21 +40,29 @@ class FileFormat:
     models: tuple[str, ...]  # camera models that it can hold, the most capable first; empty: no cameras
     folder: bool  # whether it is a folder of files
     readable: bool
+    lacks: tuple[str, ...] = ()  # parameters of these models that it has no place for, others can stand in
+    straight: tuple[str, ...] = ()  # parameters that it has no place for and nothing can stand in
 
 
+_OPENCV_DISTORTION = ("k1", "k2", "p1", "p2")
+_BROWN_DISTORTION = MODELS["brown"].names[3:]
 FORMATS = (
     FileFormat("colmap", ("full_opencv", "opencv"), True, True),
     FileFormat("colmap-text", ("full_opencv", "opencv"), True, True),
     FileFormat("colmap-database", ("full_opencv", "opencv"), False, True),
     FileFormat("tables", tuple(MODELS), True, True),
-    FileFormat("metashape", ("brown_forward", "opencv"), False, True),
-    FileFormat("photomodeler", ("brown",), False, True),
-    FileFormat("bal", ("opencv",), False, True),
-    FileFormat("bundle-csharp", ("brown",), False, True),
-    FileFormat("bundle-matlab", ("brown",), True, True),
-    FileFormat("sba", ("opencv",), True, True),
+    FileFormat(
+        *("metashape", ("brown_forward", "full_opencv", "opencv"), False, True),
+        lacks=("b1", "b2", "k4", "k5", "k6"),
+    ),
+    FileFormat("photomodeler", ("brown",), False, True, lacks=("b1", "b2")),
+    FileFormat("bal", ("opencv",), False, True, straight=("p1", "p2")),
+    FileFormat("bundle-csharp", ("brown",), False, True, straight=_BROWN_DISTORTION),
+    FileFormat("bundle-matlab", ("brown",), True, True, straight=_BROWN_DISTORTION),
+    FileFormat("sba", ("opencv",), True, True, straight=_OPENCV_DISTORTION),
     FileFormat("ply", (), False, False),
 )
+PLACED = ("colmap", "colmap-text", "tables", "ply")  # leave out what has no place in the object
 ENDINGS = {".xml": "metashape", ".ply": "ply", ".db": "colmap-database"}
 
 
@@ -151,7 +162,16 @@ def read_comparable(path: Path, name: str | None = None) -> TableResult:
     form = format_of(path) if name is None else format_named(name)
     if form.name == "tables":
         return read_result(path)
+    if not form.readable:
+        raise SurveyFileError(
+            f"{path}: format {form.name} holds points only, results with photographs are compared"
+        )
     network, estimate = read_any(path, form.name)
+    if not (estimate.oriented.any() or estimate.determined.any()):
+        raise SurveyFileError(
+            f"{path}: {len(network.image_points)} image points as format {form.name}, but no coordinates of "
+            "photographs or points that could be compared"
+        )
     return TableResult(path.name, network, estimate)
 
 
@@ -165,12 +185,14 @@ def write_any(path: Path, name: str, network: Network, estimate: Estimate) -> No
     if path.exists() and (form.folder != path.is_dir() or (form.folder and any(path.iterdir()))):
         needed = "a new or empty folder" if form.folder else "a new file"
         raise OutputError(f"{path}: it is there already; format {name} needs {needed}")
-    wrong = [camera for camera in estimate.cameras if form.models and camera.model not in form.models]
-    if wrong:
-        raise KolinearError(
-            f"camera {wrong[0].name}: format {name} holds models {', '.join(form.models)}, "
-            f"not {wrong[0].model}"
-        )
+    _refuse_cameras(form, estimate.cameras)
+    if form.name in PLACED:
+        points_only = not form.models
+        if not (estimate.determined.any() and (points_only or estimate.oriented.any())):
+            raise OutputError(
+                f"{path}: format {name} holds what has a place in the object, but no "
+                f"{'point' if points_only else 'photograph or no point'} has coordinates"
+            )
     if form.folder:
         with whole_folder(path) as folder:
             _write_folder(folder, name, path.name, network, estimate)
@@ -188,12 +210,51 @@ def write_any(path: Path, name: str, network: Network, estimate: Estimate) -> No
         write_ply(path, network.points, estimate.points)
 
 
+def _refuse_cameras(form: FileFormat, cameras: tuple[Camera, ...]) -> None:
+    """Raise KolinearError for the first camera that a format cannot hold."""
+    for camera in cameras if form.models else ():
+        if camera.model not in form.models:
+            raise KolinearError(
+                f"camera {camera.name}: format {form.name} holds models {', '.join(form.models)}, "
+                f"not {camera.model}"
+            )
+        left = [
+            name for name in (*form.lacks, *form.straight) if name in camera.names and camera.value(name) != 0
+        ]
+        if form.name == "bal" and camera.value("fx") != camera.value("fy"):
+            left.append("fx other than fy")
+        if left:
+            remedy = "; --undistort corrects the image points for it" if form.straight else ""
+            raise KolinearError(
+                f"camera {camera.name}: format {form.name} has no place for {', '.join(left)} of "
+                f"{camera.model}{remedy}"
+            )
+
+
+def written(name: str, network: Network, estimate: Estimate) -> str:
+    """Return what of a network a format holds, in words."""
+    form = format_named(name)
+    if not form.models:
+        return f"{int(estimate.determined.sum())} points"
+    image_points = f"{len(network.image_points)} image points"
+    if name == "colmap-database":
+        return f"{len(network.images)} photographs, {image_points}, no coordinates of points"
+    images, points = estimate.oriented, estimate.determined
+    if name not in PLACED:
+        images, points = np.ones_like(images), np.ones_like(points)
+    seen = network.image_points
+    kept = images[seen.image] & (points[seen.point] | (name != "tables"))
+    return f"{int(images.sum())} photographs, {int(points.sum())} points, {int(kept.sum())} image points"
+
+
 def _write_folder(folder: Path, name: str, title: str, network: Network, estimate: Estimate) -> None:
     """Write the files of a format that is a folder."""
     if name in ("colmap", "colmap-text"):
         write_model(folder, network, estimate, text=name == "colmap-text")
     elif name == "tables":
-        write_tables(folder, TableResult(title, network, estimate))
+        every = np.ones(len(network.image_points), dtype=bool)
+        placed = reduce_network(network, estimate, estimate.oriented, estimate.determined, every)
+        write_tables(folder, TableResult(title, *placed))
     elif name == "bundle-matlab":
         write_bundle_matlab_folder(folder, network, estimate)
     else:

@@ -204,7 +204,7 @@ def write_photomodeler(path: Path, network: Network, estimate: Estimate, *, titl
         if camera.model != "brown" or camera.value("b1") or camera.value("b2"):
             raise OutputError(
                 f"camera {camera.name}: PhotoModeler has no place for model {camera.model} with affinity; "
-                "convert it to brown and put b1 into the pixel size"
+                "convert it to brown with b1 in the pixel size"
             )
     sizes = {camera.size_px for camera in estimate.cameras}
     if len(sizes) > 1:

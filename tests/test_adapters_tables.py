@@ -38,7 +38,7 @@ def made() -> tuple[Network, Estimate]:
 def folder(made: tuple[Network, Estimate], tmp_path: Path) -> Path:
     network, truth = made
     sigma = np.tile(np.eye(3) * 1e-6, (6, 1, 1))
-    write_tables(tmp_path / "t", TableResult("t", network, truth, sigma, sigma[:4], redundancy=7))
+    write_tables(tmp_path / "t", TableResult("t", network, truth, sigma, sigma[:4], None, 7, "mm"))
     return tmp_path / "t"
 
 
@@ -76,7 +76,8 @@ def with_camera(**changed: Any) -> str:
     ],
 )
 def test_bad_summaries_are_refused(folder: Path, text: str, message: str) -> None:
-    assert read_result(folder).redundancy == 7
+    good = read_result(folder)
+    assert (good.redundancy, good.unit) == (7, "mm")
     (folder / "summary.json").write_text(text)
     with pytest.raises(SurveyFileError, match=message) as refused:
         read_result(folder)

@@ -48,7 +48,9 @@ class Conversion:
     max_px: float  # longest misfit vector over the region, px
 
 
-def convert_camera(camera: Camera, model: str, *, region_px: FloatArray | None = None) -> Conversion:
+def convert_camera(
+    camera: Camera, model: str, *, region_px: FloatArray | None = None, held: tuple[str, ...] = ()
+) -> Conversion:
     """Return the camera in another model, fitted over the photograph or a region of it.
 
     Args:
@@ -56,6 +58,8 @@ def convert_camera(camera: Camera, model: str, *, region_px: FloatArray | None =
         model: a name in sfm.distortion.models.MODELS.
         region_px: x_min, y_min, x_max, y_max of the region that matters, px, shape (4,); the whole
             photograph if not given.
+        held: parameters of the model that must be 0, others take over what they can; where b1 is one of
+            them affinity becomes the ratio of the sides of a pixel.
 
     Raises:
         SurveyFileError: unknown model.
@@ -66,7 +70,7 @@ def convert_camera(camera: Camera, model: str, *, region_px: FloatArray | None =
     """
     if model not in MODELS:
         raise SurveyFileError(f"camera {camera.name}: model '{model}' is none of {', '.join(MODELS)}")
-    if model == camera.model:
+    if model == camera.model and not needs_less(camera, held):
         return Conversion(camera, model, 0.0, 0.0)
     xy = _grid(camera, region_px)
     uv = tangents_from_pixel(camera, xy)
@@ -75,12 +79,16 @@ def convert_camera(camera: Camera, model: str, *, region_px: FloatArray | None =
             f"camera {camera.name}: its {camera.model} distortion cannot be inverted at "
             f"{(~np.isfinite(uv[:, 0])).sum()} of {len(uv)} places of the photograph"
         )
-    start = start_values(camera, model)
+    start = start_values(_affinity_in_pixels(camera) if "b1" in held else camera, model)
+    fitted = np.array([name not in held for name in start.names])
+    start = start.with_parameters(np.where(fitted, start.parameters, 0.0))
     # The start is scaled by the effect of each parameter in px, so that the tolerance means the same to all.
     fit = least_squares(
-        lambda p: _residuals(start.index, start.frame, p, xy, uv)[0].ravel(),
-        start.parameters,
-        jac=lambda p: _residuals(start.index, start.frame, p, xy, uv)[1].reshape(2 * len(xy), -1),
+        lambda p: _residuals(start.index, start.frame, _filled(p, fitted), xy, uv)[0].ravel(),
+        start.parameters[fitted],
+        jac=lambda p: _residuals(start.index, start.frame, _filled(p, fitted), xy, uv)[1].reshape(
+            2 * len(xy), -1
+        )[:, fitted],
         method="lm",
         x_scale="jac",
         ftol=FIT_TOLERANCE,
@@ -88,7 +96,8 @@ def convert_camera(camera: Camera, model: str, *, region_px: FloatArray | None =
         gtol=FIT_TOLERANCE,
         max_nfev=1000,
     )
-    converted = replace(start.with_parameters(fit.x), free=corresponding_free(camera, model))
+    free = corresponding_free(camera, model) & fitted
+    converted = replace(start.with_parameters(_filled(fit.x, fitted)), free=free)
     misfit = pixel_from_tangents(converted, uv) - xy
     if not np.isfinite(misfit).all():
         raise GeometryError(
@@ -103,20 +112,56 @@ def convert_camera(camera: Camera, model: str, *, region_px: FloatArray | None =
     )
 
 
-def convert_cameras(estimate: Estimate, models: tuple[str, ...]) -> tuple[Estimate, tuple[Conversion, ...]]:
+def convert_cameras(
+    estimate: Estimate, models: tuple[str, ...], *, held: tuple[str, ...] = ()
+) -> tuple[Estimate, tuple[Conversion, ...]]:
     """Return the estimate with every camera in one of some models, and what that cost.
 
-    A camera that is in one of them already stays as it is; any other goes into the first.
+    A camera that is in one of them already, and in need of nothing held, stays as it is; any other goes
+    into the first.
 
     Args:
         estimate: a solution.
         models: models that are wanted, the best first.
+        held: their parameters that must be 0.
     """
     conversions = tuple(
-        convert_camera(camera, camera.model if camera.model in models else models[0])
+        convert_camera(
+            camera,
+            camera.model if camera.model in models and not needs_less(camera, held) else models[0],
+            held=held,
+        )
         for camera in estimate.cameras
     )
     return replace(estimate, cameras=tuple(one.camera for one in conversions)), conversions
+
+
+def needs_less(camera: Camera, held: tuple[str, ...]) -> bool:
+    """Return whether a camera has a parameter other than 0 that must be 0."""
+    return any(camera.value(name) != 0 for name in held if name in camera.names)
+
+
+def _affinity_in_pixels(camera: Camera) -> Camera:
+    """Return the camera with its affinity in the ratio of the sides of a pixel.
+
+    It is the same camera for `brown` without shear, whose affinity is that of the measured point, and for
+    the opencv models, whose parameters are in px; for others it is a start.
+    """
+    sx, sy = camera.pixel_mm
+    if not camera.in_mm:
+        return replace(camera, pixel_mm=np.array([sy * camera.value("fy") / camera.value("fx"), sy]))
+    stretch = 1 + camera.value("b1") if MODELS[camera.model].corrects else 1 / (1 + camera.value("b1"))
+    values = dict(zip(camera.names, camera.parameters.tolist(), strict=True))
+    values |= {"b1": 0.0, "x0": values["x0"] * stretch}
+    folded = camera.with_parameters(np.array(list(values.values())))
+    return replace(folded, pixel_mm=np.array([sx * stretch, sy]))
+
+
+def _filled(p: FloatArray, fitted: BoolArray) -> FloatArray:
+    """All parameters of a model, those that are not fitted 0."""
+    values = np.zeros(len(fitted))
+    values[fitted] = p
+    return values
 
 
 def start_values(camera: Camera, model: str) -> Camera:

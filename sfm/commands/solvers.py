@@ -7,8 +7,9 @@ from typing import Annotated
 
 import typer
 
-from sfm.analysis.conversion import convert_cameras
+from sfm.analysis.conversion import Conversion, convert_cameras
 from sfm.analysis.significance import compare_results
+from sfm.analysis.undistortion import undistort
 from sfm.analysis.validation import validate as validate_networks
 from sfm.commands.console import drawn_progress
 from sfm.report.differences import FILES as DIFFERENCE_FILES
@@ -95,25 +96,32 @@ def convert(
     from_format: Annotated[
         str | None, typer.Option("--from", metavar="F", help="Format to read; else by what is there.")
     ] = None,
+    straighten: Annotated[
+        bool,
+        typer.Option("--undistort", help="Correct image points for distortion: for formats that hold none."),
+    ] = False,
 ) -> None:
     """Carry a survey between programs.
 
     A camera is converted where the format lacks its model.
     """
-    from adapters.formats import ENDINGS, format_named, read_any, write_any
+    from adapters.formats import ENDINGS, format_named, read_any, write_any, written
 
     form = format_named(to_format or ENDINGS.get(target.suffix.lower(), "tables"))
     network, estimate = read_any(source, from_format)
+    cameras = estimate.cameras
+    conversions: tuple[Conversion, ...] = ()
     if form.models:
-        estimate, conversions = convert_cameras(estimate, form.models)
-        for one in conversions:
-            if one.camera.model != one.source_model:
-                print(
-                    f"camera {one.camera.name}: {one.source_model} to {one.camera.model}, "
-                    f"misfit {one.rms_px:.4f} px RMS, {one.max_px:.4f} px at most"
-                )
+        if straighten:
+            network, estimate = undistort(network, estimate, form.models)
+        estimate, conversions = convert_cameras(estimate, form.models, held=form.lacks)
     write_any(target, form.name, network, estimate)
-    print(
-        f"{target}: {len(network.images)} photographs, {len(network.points)} points, "
-        f"{len(network.image_points)} image points as {form.name}"
-    )
+    for camera, one in zip(cameras, conversions, strict=False):
+        if straighten:
+            print(f"camera {camera.name}: image points corrected for {camera.model}, ideal camera written")
+        elif one.camera is not camera:
+            print(
+                f"camera {camera.name}: {one.source_model} to {one.camera.model}, "
+                f"misfit {one.rms_px:.4f} px RMS, {one.max_px:.4f} px at most"
+            )
+    print(f"{target}: {written(form.name, network, estimate)} as {form.name}")
