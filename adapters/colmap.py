@@ -57,6 +57,8 @@ class ColmapAdjustment:
     message: str  # Ceres' reason to stop
     seconds: float  # time in Ceres, s; without building the problem
     threads: int  # threads that Ceres was given
+    point_covariance: FloatArray | None = None  # of the points, photographs and cameras held, image points of
+    # standard deviation 1 px, object unit^2, (n, 3, 3); None where not asked for
 
 
 def adjust_with_colmap(

@@ -261,9 +261,9 @@ def _others(survey: Survey, *, threads: int = -1) -> OtherPrograms:
     """Return the programs that the survey wants to be compared with; their library is imported only then."""
     others = OtherPrograms()
     if survey.compare.backend == "colmap":
-        from adapters.colmap import adjust_with_colmap
+        from adapters.colmap_covariance import adjust_with_covariance
 
-        others = replace(others, adjuster=adjust_with_colmap)
+        others = replace(others, adjuster=adjust_with_covariance)
     if survey.compare.baseline == "mapper":
         from adapters.colmap_mapper import map_photographs
 

@@ -15,7 +15,8 @@ import numpy as np
 
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.solve import adjust
-from sfm.analysis.comparison import common_problem, reprojection
+from sfm.analysis.common_problem import common_problem
+from sfm.analysis.comparison import reprojection
 from sfm.camera import camera_from_values, project
 from sfm.conventions import AnyArray
 from sfm.matching.conjugate import METHODS, match_points

@@ -11,8 +11,8 @@ import pytest
 
 from adapters import colmap
 from adapters.colmap import adjust_with_colmap
+from adapters.colmap_covariance import covariance_with_colmap
 from adapters.colmap_model import read_model, write_model
-from adapters.colmap_validation import covariance_with_colmap
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.solve import adjust
 from sfm.camera import camera_from_values, project

@@ -10,15 +10,15 @@ import numpy as np
 import pytest
 
 from adapters.colmap import adjust_with_colmap
+from adapters.colmap_covariance import adjust_with_covariance
 from adapters.photomodeler import read_photomodeler
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.solve import adjust
+from sfm.analysis.common_problem import common_problem, grouped_free
 from sfm.analysis.comparison import (
     Thresholds,
-    common_problem,
     compare,
     compare_adjusters,
-    grouped_free,
     interior_effect_px,
     rotation_angle_deg,
 )
@@ -240,3 +240,14 @@ def test_retro_panel_reference_points_end_at_the_same_optimum(model: str) -> Non
     assert found.comparison.exceeded == ()
     assert found.agree
     assert len(found.adjustment.estimate.cameras) == 2
+
+
+def test_conditional_covariances_of_both_stand_beside_the_marginal() -> None:
+    """What COLMAP calls the covariance of a point is that with photographs and cameras held."""
+    network, truth = make_network(seed_of("conditional"), model="opencv", noise_px=0.1)
+    adjustment = adjust(network, truth, datum=Datum("free"), sigma_px=0.1, reject="none")
+    found = compare_adjusters(adjustment, adjust_with_covariance)
+    own = found.adjustment.covariance
+    assert found.backend_points is not None
+    np.testing.assert_allclose(found.backend_points, own.points_limiting, rtol=1e-5, atol=1e-16)
+    assert not np.allclose(own.points, own.points_limiting, rtol=0.05)

@@ -276,7 +276,7 @@ def compared(synthetic: tuple[Network, Estimate]) -> tuple[Adjustment, AdjusterC
     a = adjust(network, truth, datum=Datum("free"))
 
     class Same:
-        iterations, converged, seconds = 1, True, 0.1
+        iterations, converged, seconds, point_covariance = 1, True, 0.1, None
 
         def __init__(self, estimate: Estimate) -> None:
             self.estimate = estimate

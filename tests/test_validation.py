@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from adapters.colmap import adjust_with_colmap
-from adapters.colmap_validation import ColmapBackend
+from adapters.colmap_covariance import ColmapBackend
 from sfm.analysis.comparison import reprojection
 from sfm.analysis.random_network import (
     ARRANGEMENTS,

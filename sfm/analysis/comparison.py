@@ -22,18 +22,16 @@ import numpy as np
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
-from sfm.analysis.conversion import Conversion, convert_camera
+from sfm.analysis.common_problem import common_problem, distortion_held
+from sfm.analysis.conversion import Conversion
 from sfm.analysis.unshared import without_sharing
 from sfm.camera import Camera, pixel_from_tangents, project, tangents_from_pixel
-from sfm.conventions import BoolArray, FloatArray, IntArray
-from sfm.errors import GeometryError
-from sfm.network import Estimate, ImagePoints, Network, reduce_network, supported
+from sfm.conventions import FloatArray, IntArray
+from sfm.network import Estimate, Network
 from sfm.similarity import Similarity, fit_similarity
 
 EFFECT_STEPS = 9  # places along each side of the photograph where interior orientations are compared
 MAX_ITERATIONS = 200  # the weak directions of full_opencv take more steps than a survey
-MIN_RAYS, MIN_POINTS = 2, 3  # photographs that determine a point, points that determine a photograph
-GROUPS = (slice(0, 2), slice(2, 4), slice(4, None))  # focal lengths, principal point, distortion
 
 
 @dataclass(frozen=True)
@@ -100,6 +98,10 @@ class AdjusterComparison:
     backend_converged: bool
     backend_seconds: float  # s
     comparison: Comparison
+    backend_points: (
+        FloatArray | None
+    )  # the other's covariances of the points with photographs and cameras held
+    # (conditional), scaled by our sigma0, object unit^2, (n, 3, 3); None where it has none
     unshared: tuple[str, ...] = ()  # what cameras share in the survey and was held at its result, in words
 
     @property
@@ -119,6 +121,9 @@ class BackendAdjustment(Protocol):
     def converged(self) -> bool: ...
     @property
     def seconds(self) -> float: ...
+    @property
+    def point_covariance(self) -> FloatArray | None:
+        """Of the points, photographs and cameras held, for image coordinates of 1 px; None without."""
 
 
 def compare(
@@ -213,9 +218,10 @@ def compare_adjusters(
             f"k1 to k6 still grow together after {MAX_ITERATIONS} iterations, numerator and denominator of "
             "the rational distortion cancelling",
         )
-        start = replace(start, cameras=tuple(_distortion_held(camera) for camera in start.cameras))
+        start = replace(start, cameras=tuple(distortion_held(camera) for camera in start.cameras))
         ours = _adjusted(network, start, adjustment.sigma_px)
     theirs = backend(network, start)
+    conditional = theirs.point_covariance
     return AdjusterComparison(
         name,
         start.cameras[0].model,
@@ -228,6 +234,7 @@ def compare_adjusters(
         theirs.converged,
         theirs.seconds,
         compare(ours.estimate, theirs.estimate, network, names=("kolinear", name), thresholds=thresholds),
+        None if conditional is None else (ours.sigma0 * ours.sigma_px) ** 2 * conditional,
         unshared,
     )
 
@@ -241,67 +248,6 @@ def _adjusted(network: Network, start: Estimate, sigma_px: float) -> Adjustment:
         reject="none",
         max_iterations=MAX_ITERATIONS,
     )
-
-
-def _distortion_held(camera: Camera) -> Camera:
-    free = camera.free.copy()
-    free[GROUPS[2]] = False
-    return replace(camera, free=free)
-
-
-def common_problem(
-    adjustment: Adjustment, *, model: str | None = None
-) -> tuple[Network, Estimate, tuple[Conversion, ...], tuple[str, ...]]:
-    """Return the network, start values, conversions and changes of free parameters of a comparison.
-
-    Left are photographs that are oriented and show three points, points in two photographs, and accepted
-    image points, each with the covariance sigma_px^2 I. Parameters of a group that COLMAP frees as a
-    whole (focal lengths, principal point, distortion) are all free if one of them is, and in all cameras
-    that are not fixed.
-    """
-    estimate = adjustment.estimate
-    cameras = estimate.cameras
-    if model is None:
-        forward = {camera.model for camera in cameras if not camera.model.startswith("brown")}
-        all_opencv = forward == {"opencv"} and not any(c.model.startswith("brown") for c in cameras)
-        model = "opencv" if all_opencv else "full_opencv"
-    conversions = tuple(convert_camera(camera, model) for camera in cameras)
-    converted = tuple(conversion.camera for conversion in conversions)
-    grouped = grouped_free(converted)
-    freed = tuple(
-        f"{camera.name}: " + ", ".join(np.array(camera.names)[now.free & ~camera.free])
-        for camera, now in zip(converted, grouped, strict=True)
-        if (now.free & ~camera.free).any()
-    )
-    accepted = ~adjustment.rejected
-    images, points = supported(
-        adjustment.network, estimate, accepted, min_points=MIN_POINTS, min_rays=MIN_RAYS
-    )
-    if images.sum() < 2:
-        raise GeometryError("comparison: fewer than two photographs with accepted image points are left")
-    network, start = reduce_network(
-        adjustment.network, replace(estimate, cameras=grouped), images, points, accepted
-    )
-    seen = network.image_points
-    unit = np.tile(np.eye(2) * adjustment.sigma_px**2, (len(seen), 1, 1))
-    # Nothing but image points: no control, scale bars or other observations.
-    network = Network(
-        network.images, network.camera, network.points, ImagePoints(seen.image, seen.point, seen.xy, unit)
-    )
-    return network, start, conversions, freed
-
-
-def grouped_free(cameras: tuple[Camera, ...]) -> tuple[Camera, ...]:
-    """Return opencv cameras whose free parameters are whole groups, the same in all that are not fixed."""
-    free = [any(camera.free[group].any() for camera in cameras) for group in GROUPS]
-    out = []
-    for camera in cameras:
-        flags: BoolArray = np.zeros(len(camera.names), dtype=bool)
-        if camera.free.any():
-            for group, is_free in zip(GROUPS, free, strict=True):
-                flags[group] = is_free
-        out.append(replace(camera, free=flags))
-    return tuple(out)
 
 
 def reprojection(network: Network, estimate: Estimate) -> FloatArray:

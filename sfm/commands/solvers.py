@@ -33,7 +33,7 @@ def validate(
 
     Exit code 1 if the in-house adjuster was ever the worse one.
     """
-    from adapters.colmap_validation import ColmapBackend
+    from adapters.colmap_covariance import ColmapBackend
 
     refuse_other_files(out, VALIDATION_FILES)
     with drawn_progress() as progress:

@@ -7,8 +7,9 @@ from html import escape
 import numpy as np
 
 from sfm.analysis.comparison import AdjusterComparison
-from sfm.report.markup import table, yes_or_no
+from sfm.report.markup import finer_unit, significant, table, yes_or_no
 from sfm.report.result import SurveyResult
+from sfm.report.tables import root_mean_square
 
 
 def comparison_section(result: SurveyResult) -> str:
@@ -61,7 +62,41 @@ def comparison_section(result: SurveyResult) -> str:
             ),
         ],
     )
-    return text + _conversions(result, both)
+    return text + _precision(result, both) + _conversions(result, both)
+
+
+def _precision(result: SurveyResult, both: AdjusterComparison) -> str:
+    """Standard deviations of the points by both, marginal and conditional, each called what it is."""
+    covariance = both.adjustment.covariance
+    rows = [
+        ("kolinear: everything adjusted is uncertain (marginal)", covariance.points),
+        (
+            "kolinear: photographs and cameras held (conditional, limiting precision)",
+            covariance.points_limiting,
+        ),
+    ]
+    if both.backend_points is not None:
+        rows.append((f"{both.backend}: photographs, cameras held (conditional)", both.backend_points))
+    sigmas = [np.sqrt(np.diagonal(Q, axis1=1, axis2=2)) for _, Q in rows]
+    factor, unit = finer_unit(result.length_unit, float(np.nanmax(sigmas[0])))
+    return (
+        "<h3>Precision of the points</h3>"
+        + table(
+            ("standard deviation of a coordinate", "RMS", "largest", "unit"),
+            [
+                (
+                    what,
+                    significant(factor * root_mean_square(sigma), 4),
+                    significant(factor * float(np.nanmax(sigma)), 4),
+                    unit,
+                )
+                for (what, _), sigma in zip(rows, sigmas, strict=True)
+            ],
+        )
+        + "<p class=note>With photographs and cameras held, all that is uncertain of them is missing: only the "
+        f"marginal standard deviations are those of the whole adjustment. {escape(both.backend)} gives the "
+        "conditional ones alone. They are of the compared adjustment, with its sigma0.</p>"
+    )
 
 
 def _conversions(result: SurveyResult, both: AdjusterComparison) -> str:

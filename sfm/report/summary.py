@@ -12,10 +12,11 @@ import numpy as np
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.statistics import CoordinateTest
 from sfm.adjustment.variance_components import VarianceComponents
+from sfm.conventions import FloatArray
 from sfm.report.checks import bar_residuals, control_residuals, count_observations, sigma0_ratio
 from sfm.report.result import SurveyResult
 from sfm.report.statistics import parameter_sigmas, quantiles, statistics_of
-from sfm.report.tables import UNCODED
+from sfm.report.tables import UNCODED, root_mean_square
 from sfm.report.verdict import verdict_of
 
 
@@ -250,6 +251,13 @@ def _comparison(result: SurveyResult) -> dict[str, Any] | None:
         "object_size": _number(difference.object_size),
         "rms_px": {"kolinear": difference.rms_px[0], both.backend: difference.rms_px[1]},
         "cost": {"kolinear": difference.cost[0], both.backend: difference.cost[1]},
+        "point_sigma_rms": {
+            "kolinear_marginal": _point_sigma(both.adjustment.covariance.points),
+            "kolinear_conditional": _point_sigma(both.adjustment.covariance.points_limiting),
+            f"{both.backend}_conditional": None
+            if both.backend_points is None
+            else _point_sigma(both.backend_points),
+        },
         "exceeded": list(difference.exceeded),
         "held": list(both.held),
         "unshared": list(both.unshared),
@@ -287,6 +295,11 @@ def _baseline(result: SurveyResult) -> dict[str, Any] | None:
         "position_rms": _number(found.position_rms),
         "max_rotation_deg": _number(found.max_rotation_deg),
     }
+
+
+def _point_sigma(covariance: FloatArray) -> float | None:
+    """Root mean square standard deviation of a coordinate, object unit."""
+    return _number(root_mean_square(np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))))
 
 
 def _number(value: float) -> float | None:

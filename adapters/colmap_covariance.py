@@ -5,7 +5,7 @@ Source: COLMAP 4.2, estimate_ba_covariance.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -70,6 +70,16 @@ def covariance_with_colmap(
             if block is not None:
                 points[j] = block
     return ColmapCovariance(tuple(interior), points)
+
+
+def adjust_with_covariance(network: Network, start: Estimate, *, threads: int = 1) -> ColmapAdjustment:
+    """Adjust with COLMAP in a free datum, and have its covariances of points at the solution.
+
+    Args, Raises: as `adjust_with_colmap`.
+    """
+    found = adjust_with_colmap(network, start, threads=threads)
+    covariance = covariance_with_colmap(network, found.estimate)
+    return replace(found, point_covariance=None if covariance is None else covariance.points)
 
 
 @dataclass(frozen=True)
