@@ -93,7 +93,7 @@ def _precision(result: SurveyResult, both: AdjusterComparison) -> str:
                 for (what, _), sigma in zip(rows, sigmas, strict=True)
             ],
         )
-        + "<p class=note>With photographs and cameras held, all that is uncertain of them is missing: only the "
+        + "<p class=note>With photographs and cameras held, what is uncertain of them is missing: only the "
         f"marginal standard deviations are those of the whole adjustment. {escape(both.backend)} gives the "
         "conditional ones alone. They are of the compared adjustment, with its sigma0.</p>"
     )
