@@ -115,7 +115,9 @@ def format_of(path: Path) -> FileFormat:
         return format_named("bal")
     if counts[:2] == [4, 7]:
         return format_named("bundle-csharp")
-    raise SurveyFileError(f"{path}, line 1: this is no format that is known, name it with --from")
+    raise SurveyFileError(
+        f"{path}, line 1: this is no format that is known, name it with --from (compare: --from-a, --from-b)"
+    )
 
 
 def read_any(path: Path, name: str | None = None) -> tuple[Network, Estimate]:

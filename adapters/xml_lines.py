@@ -124,4 +124,7 @@ def read_xml(path: Path) -> Node:
         raise SurveyFileError(
             f"{path}, line {error.lineno}: not well-formed XML ({expat.ErrorString(error.code)})"
         ) from error
+    except (LookupError, ValueError) as error:  # of encodings that Python does not know or expat cannot take
+        told = " ".join(str(error).split())[:100]
+        raise SurveyFileError(f"{path}, line 1: the encoding is none that can be read ({told})") from error
     return top.children[0]

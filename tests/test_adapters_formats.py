@@ -360,6 +360,10 @@ def test_metashape_chunk_transform_and_missing_orientation(tmp_path: Path) -> No
         ("<f>", "<f>-", "line 9: f = -"),
         ('camera_id="4"', 'camera_id="44"', "camera_id 44, there is no such camera"),
         ("</cameras>", "</camera>", "not well-formed XML"),
+        ('encoding="UTF-8"', 'encoding="UTF-99"', "line 1: the encoding is none that can be read"),
+        ('encoding="UTF-8"', 'encoding="GBK"', "line 1: the encoding is none that can be read"),
+        ('width="2000"', 'width="-5"', "line 6: width is -5 px, needed a whole number from 1 to"),
+        ("<f>", "<f>1e300", "line 11: '1e300.*' in <f> is not a"),
         ('<document version="2.0.0">', '<!DOCTYPE x><document version="2.0.0">', "line 2: a document type"),
     ],
 )

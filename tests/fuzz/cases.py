@@ -6,7 +6,7 @@ import io
 import random
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -14,8 +14,11 @@ import numpy as np
 from PIL import Image
 
 from adapters.colmap_model import read_model, write_model
-from adapters.photomodeler import read_photomodeler
+from adapters.csv_tables import TableResult, read_result, write_tables
+from adapters.formats import read_any, write_any
+from adapters.ply import read_ply
 from adapters.sba_text import read_sba_text
+from sfm.camera import camera_from_values
 from sfm.errors import KolinearError
 from sfm.pipeline import adjust_survey
 from sfm.project import read_survey
@@ -105,6 +108,7 @@ def make_seeds(folder: Path) -> tuple[Seed, ...]:
         for name, data in models.items()
     ]
     seeds += [Seed("models", name, text, read) for name, text, read in _OTHER_PROGRAMS]
+    seeds += _results(folder)
     for seed in seeds:
         path = folder / seed.name
         if isinstance(seed.content, bytes):
@@ -112,6 +116,55 @@ def make_seeds(folder: Path) -> tuple[Seed, ...]:
         else:
             path.write_text(seed.content, encoding="utf-8")
     return tuple(seeds)
+
+
+def _results(folder: Path) -> list[Seed]:
+    """Return the tables of a result and the files of other programs."""
+    network, truth = make_network(seed_of("fuzz result"), images=3, points=8, model="opencv", visibility=1.0)
+    network = replace(network, images=("a.jpg", "b.jpg", "c.jpg"))
+    camera = truth.cameras[0]
+    plain = camera.with_parameters(camera.parameters[[1, 1, 2, 3, 4, 5, 6, 7]] * ([1] * 4 + [0] * 4))
+    ideal = replace(truth, cameras=(plain,))
+    sigma = np.tile(np.eye(3) * 1e-6, (8, 1, 1))
+    write_tables(folder / "result", TableResult("fuzz", network, truth, sigma, sigma[:3], redundancy=5))
+    write_any(folder / "m.xml", "metashape", network, truth)
+    write_any(folder / "bal.txt", "bal", network, ideal)
+    write_any(folder / "sba", "sba", network, ideal)
+    brown = camera_from_values("camera", "brown", camera.size_px, (0.005, 0.005), c_mm=10.0)
+    write_any(folder / "bundle", "bundle-matlab", network, replace(truth, cameras=(brown,)))
+    write_any(folder / "8pts.txt", "bundle-csharp", network, replace(truth, cameras=(brown,)))
+    write_any(folder / "pm", "photomodeler", network, replace(truth, cameras=(brown,)))
+    write_any(folder / "scene.db", "colmap-database", network, truth)
+    write_any(folder / "p.ply", "ply", network, truth)
+    found: list[Seed] = []
+    for name in ("summary.json", "points.csv", "images.csv", "cameras.csv", "image_points.csv"):
+        text = (folder / "result" / name).read_text("utf-8")
+        found.append(Seed("results", f"result/{name}", text, lambda f, _: _drop(read_result(f / "result"))))
+    files = [("m.xml", "m.xml", "metashape"), ("bal.txt", "bal.txt", "bal"), ("pm", "pm", "photomodeler")]
+    files += [("8pts.txt", "8pts.txt", "bundle-csharp")]
+    files += [(f"sba/{name}", "sba", "sba") for name in ("cams.txt", "pts.txt")]
+    files += [
+        (f"bundle/{name}", "bundle", "bundle-matlab")
+        for name in ("cams.txt", "pts.txt", "sigmas.txt", "interior.txt")
+    ]
+    for name, whole, form in files:
+        text = (folder / name).read_text("utf-8")
+        found.append(Seed("results", name, text, _reader_of(whole, form)))
+    found.append(
+        Seed(
+            "results",
+            "scene.db",
+            (folder / "scene.db").read_bytes(),
+            _reader_of("scene.db", "colmap-database"),
+        )
+    )
+    text = (folder / "p.ply").read_text("utf-8")
+    found.append(Seed("results", "p.ply", text, lambda f, _: _drop(read_ply(f / "p.ply"))))
+    return found
+
+
+def _reader_of(name: str, form: str) -> Callable[[Path, random.Random], None]:
+    return lambda folder, _: _drop(read_any(folder / name, form))
 
 
 def run_case(seed: Seed, folder: Path, rng: random.Random) -> str:
@@ -175,16 +228,6 @@ _TABLES: tuple[tuple[str, Callable[[Path, random.Random], None]], ...] = (
     ("points.csv", lambda f, _: _drop(read_points(f / "points.csv"))),
     ("image_points.csv", lambda f, _: _drop(read_image_points(f / "image_points.csv"))),
 )
-PHOTOMODELER = """\
-job
-1.0 0.1
-7.4 2.7 3.6 5.4 4.1 0.0 0.0 0.0 0.0 0.0
-100 100
-a.jpg
-0 0 0 0 0 0
-
-1 1 10.5 20.5 1.0 1.0
-"""
 SBA_CAMERAS = "1 0 0 0 0 0 0\n1 0 0 0 1 0 0\n"
 SBA_POINTS = "0 0 5 2 0 320 240 1 310 240\n1 0 5 2 0 420 240 1 410 240\n0 1 5 2 0 320 340 1 310 340\n"
 SBA_CALIBRATION = "800 0 320\n0 800 240\n0 0 1\n"
@@ -195,7 +238,6 @@ def _read_sba(folder: Path, rng: random.Random) -> None:
 
 
 _OTHER_PROGRAMS: tuple[tuple[str, str, Callable[[Path, random.Random], None]], ...] = (
-    ("pm.txt", PHOTOMODELER, lambda f, _: _drop(read_photomodeler(f / "pm.txt"))),
     ("cams.txt", SBA_CAMERAS, _read_sba),
     ("pts.txt", SBA_POINTS, _read_sba),
     ("calib.txt", SBA_CALIBRATION, _read_sba),
