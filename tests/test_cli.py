@@ -6,6 +6,7 @@ import csv
 import json
 import os
 import shutil
+import signal
 import subprocess
 import sys
 import time
@@ -16,12 +17,13 @@ import numpy as np
 import pytest
 
 from sfm import cli
-from sfm.commands import console
+from sfm.commands import app, starting
 from sfm.report.output import write_result
 from sfm.targets.render import write_photographs
 from sfm.targets.scene_file import read_scene
 from tests.surveys import write_observed_survey
 
+ROOT = Path(__file__).resolve().parents[1]
 SURVEY = """\
 [survey]
 name = "Plättchen 1"
@@ -94,8 +96,8 @@ codes = [0, 11, 0, 0]
 
 @pytest.fixture(autouse=True)
 def compiled(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The kernels are as if compiled, whether or not this is the first run after a change."""
-    monkeypatch.setattr(console, "is_compiled", lambda kernel: True)
+    """Nothing is told of compiling, whether or not this is the first run after a change."""
+    monkeypatch.setattr(starting, "_tell_of_compiling", lambda: None)
 
 
 @pytest.fixture(scope="module")
@@ -335,37 +337,36 @@ def test_the_time_counts_the_report(
         time.sleep(1.5)
         return write_result(*arguments, **options)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(cli, "write_result", slow)
+    monkeypatch.setattr("sfm.report.output.write_result", slow)
     assert kolinear(monkeypatch, "adjust", survey, "--out", tmp_path / "out") == 0
     line = next(line for line in capsys.readouterr().out.splitlines() if line.startswith("time"))
     stages = json.loads((tmp_path / "out" / "summary.json").read_text(encoding="utf-8"))["seconds"]
     assert float(line.split()[1]) > sum(stages.values()) + 1.4
 
 
-def test_the_first_run_says_that_it_compiles(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
-    survey = write_observed_survey(tmp_path / "s", "first")
-    monkeypatch.setattr(console, "is_compiled", lambda kernel: False)
-    assert kolinear(monkeypatch, "adjust", survey, "--out", tmp_path / "out") == 0
-    line = capsys.readouterr().err.splitlines()
-    assert len(line) == 1 and "python -m sfm.warm_up" in line[0]
-
-
-def test_compiled_kernels_are_recognised(tmp_path: Path) -> None:
-    code = (
-        "from sfm.commands.console import is_compiled\n"
-        "import sys; sys.path.insert(0, '.')\n"
-        "import kernel\n"
-        "print(is_compiled(kernel.f)); kernel.f(1.0); print(is_compiled(kernel.f))\n"
-        "import os; os.utime('kernel.py', (9e9, 9e9)); print(is_compiled(kernel.f))\n"
-    )
+def test_compiling_is_told_when_it_happens_and_only_then(tmp_path: Path) -> None:
     text = "from numba import njit\n@njit(cache=True)\ndef f(x):\n    return x\n"
     (tmp_path / "kernel.py").write_text(text, encoding="utf-8")
-    run = subprocess.run(
-        [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=True
+    code = (
+        "import importlib.util, sys\n"
+        "from sfm.commands.starting import loading, stopped_once\n"
+        "spec = importlib.util.spec_from_file_location('sfm.kernel', 'kernel.py')\n"
+        "kernel = sys.modules['sfm.kernel'] = importlib.util.module_from_spec(spec)\n"
+        "with stopped_once():\n"
+        "    with loading():\n"
+        "        spec.loader.exec_module(kernel)\n"
+        "    kernel.f(1.0); kernel.f(1)\n"
     )
-    assert run.stdout.split() == ["False", "True", "False"]
+    for told in (1, 0):
+        run = subprocess.run(
+            [sys.executable, "-c", code],
+            cwd=tmp_path,
+            env={**os.environ, "PYTHONPATH": str(ROOT)},
+            capture_output=True,
+            text=True,
+            check=True,
+        )
+        assert run.stderr.count("python -m sfm.warm_up") == run.stderr.count("\n") == told
 
 
 def test_ctrl_c_is_no_traceback(
@@ -374,7 +375,7 @@ def test_ctrl_c_is_no_traceback(
     def interrupt(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(cli, "run_survey", interrupt)
+    monkeypatch.setattr("sfm.pipeline.run_survey", interrupt)
     assert kolinear(monkeypatch, "run", survey, "--out", survey.parent / "out") == 130
     assert "Traceback" not in capsys.readouterr().err
     assert not (survey.parent / "out").exists()
@@ -408,9 +409,42 @@ def test_help_explains_every_command_and_option() -> None:
     ).stdout
     assert "run" in shown and "adjust" in shown
     assert "..." not in shown[shown.index("Commands:") :]
-    for command in cli.app.registered_commands:
+    for command in app.app.registered_commands:
         assert command.callback is not None and command.callback.__doc__
 
 
 def test_messages_stay_on_one_line() -> None:
     assert cli._one_line("a\nb\x1b[31m\tc") == "a b [31m c"
+
+
+def test_nothing_that_takes_time_is_imported_for_the_help() -> None:
+    code = (
+        "import sys; sys.argv[1:] = ['--help']\n"
+        "import sfm.cli\n"
+        "assert 'typer' not in sys.modules, 'imported outside of main'\n"
+        "try: sfm.cli.main()\n"
+        "finally: print(*sys.modules, file=sys.stderr)\n"
+    )
+    run = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
+    heavy = {"numpy", "scipy", "numba", "cv2", "matplotlib", "dask", "pydantic", "pycolmap"}
+    assert heavy.isdisjoint(run.stderr.split())
+
+
+@pytest.mark.parametrize("seconds", [0.15, 0.4, 0.8, 1.2])
+def test_ctrl_c_while_modules_are_imported_is_one_line(tmp_path: Path, seconds: float) -> None:
+    process = subprocess.Popen(
+        [sys.executable, "-c", "print(1, flush=True); from sfm.cli import main; main()", "batch", tmp_path],
+        cwd=ROOT,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    assert process.stdout is not None
+    process.stdout.readline()
+    time.sleep(seconds)
+    process.send_signal(signal.SIGINT)
+    process.send_signal(signal.SIGINT)  # as timeout does
+    errors = process.communicate(timeout=60)[1]
+    if process.returncode != 2:  # on a fast computer it has found by now that there are no surveys
+        assert process.returncode == 130, errors
+        assert errors == f"{starting.INTERRUPTED_TEXT}\n"

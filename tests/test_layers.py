@@ -11,7 +11,7 @@ ROOT = Path(__file__).resolve().parents[1]
 LAYERS = (
     (
         *("sfm.conventions", "sfm.errors", "sfm.progress", "sfm.folder_lock", "sfm.whole_files"),
-        *("sfm.csv_tables", "sfm.engine"),
+        *("sfm.csv_tables", "sfm.engine", "sfm.compiling"),
     ),
     ("sfm.distortion", "sfm.camera", "sfm.network", "sfm.similarity"),
     ("sfm.targets", "sfm.matching", "sfm.orientation", "sfm.adjustment"),
@@ -20,7 +20,8 @@ LAYERS = (
     ("sfm.batch", "sfm.cli", "sfm.commands", "sfm.warm_up"),
 )
 COMMANDS = (
-    "sfm.cli",
+    "sfm.commands.app",
+    "sfm.commands.surveying",
     "sfm.commands.measuring",
     "sfm.commands.planning",
     "sfm.commands.refining",

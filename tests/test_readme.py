@@ -7,7 +7,7 @@ import tomllib
 from pathlib import Path
 
 from adapters.formats import FORMATS
-from sfm.cli import app
+from sfm.commands.app import app
 from sfm.project import Survey, read_survey
 from sfm.report.output import WRITTEN
 from sfm.settings import Section

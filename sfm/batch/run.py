@@ -48,7 +48,10 @@ class Watch(Protocol):
         """These surveys are part of the batch, by the names of their folders."""
 
     def told(self, name: str, message: dict[str, Any]) -> None:
-        """A survey has {"photographs": count}, begins {"stage": name}, has measured {"photograph": name}."""
+        """A survey has {"photographs": count}, begins {"stage": name}, has measured {"photograph": name}.
+
+        Kernels that it needs may be {"compiling": True} first, in its worker.
+        """
 
     def finished(self, name: str, row: SurveyRow, *, kept: bool) -> None:
         """A survey is at its end; `kept` where an earlier run finished it."""

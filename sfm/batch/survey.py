@@ -10,6 +10,7 @@ from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
+from sfm.compiling import when_compiling
 from sfm.engine import Tell
 from sfm.errors import KolinearError, OutputError
 from sfm.pipeline import adjust_survey, run_survey
@@ -90,7 +91,8 @@ def measure_one(job: SurveyJob, survey: Survey, image: str, path: Path, *, tell:
     begun = time.perf_counter()
     try:
         family = survey_family(survey)
-        targets, stored = measure_photograph(path, survey.targets, family, job.store)
+        with when_compiling(lambda: tell({"compiling": True})):
+            targets, stored = measure_photograph(path, survey.targets, family, job.store)
     except KolinearError as error:
         note = PhotographNote(image, failed=str(error))
     else:
@@ -119,7 +121,7 @@ def reconstruct(
     begun = time.perf_counter()
     name = job.folder
     live = job.out / LOGS / f"{job.folder}.jsonl"
-    with SurveyLog(live, watch=_Telling(tell)) as log:
+    with SurveyLog(live, watch=_Telling(tell)) as log, when_compiling(lambda: tell({"compiling": True})):
         log.note("start", survey=name, file=str(job.file), inputs=job.inputs)
         for note in photographs:
             log.note("photograph", **asdict(note))

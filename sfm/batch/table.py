@@ -18,6 +18,7 @@ from rich.text import Text
 
 from sfm.batch.pages import totals
 from sfm.batch.survey import SurveyRow
+from sfm.compiling import COMPILING
 
 COLOURS = {"good": "green", "fair": "yellow", "bad": "red", "": "red"}
 RECENT = 8  # finished surveys that stay in sight
@@ -43,6 +44,7 @@ class BatchTable:
         self._lines: dict[str, _Line] = {}
         self._recent: list[SurveyRow] = []
         self._left = self._done = self._kept = self._failed = 0
+        self._compiling = False
         self._begun = time.monotonic()
         self._live = Live(
             console=console, get_renderable=self._render, refresh_per_second=REFRESHES_PER_SECOND
@@ -69,6 +71,9 @@ class BatchTable:
             line.total = int(message["photographs"])
         if "photograph" in message:
             line.photographs += 1
+        if "compiling" in message and not self._compiling:
+            self._compiling = True
+            self.remark(f"kolinear: the {COMPILING}")
         if "stage" in message:
             line.stage = str(message["stage"])
         if self._verbose:

@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from numba.core.dispatcher import Dispatcher
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 from rich.table import Table
 from rich.text import Text
 
-from sfm.adjustment import accumulate, collinearity
 from sfm.adjustment.statistics import global_test
 from sfm.report.checks import count_observations, sigma0_ratio
 from sfm.report.markup import finer_unit, significant
@@ -23,9 +20,6 @@ from sfm.report.verdict import verdict_of
 
 MAX_WARNINGS = 5  # without --verbose
 COLOURS = {"good": "green", "fair": "yellow", "bad": "red"}
-
-KERNELS: tuple[Dispatcher, ...] = (accumulate.add_photographs, collinearity._residuals)
-"""kernels that every survey needs"""
 
 
 class Drawn:
@@ -69,29 +63,6 @@ def drawn_progress() -> Iterator[Drawn]:
         yield drawn
         drawn.stage("done", 1)
         bar.remove_task(bar.task_ids[-1])
-
-
-def tell_of_compiling() -> None:
-    """Say on stderr that kernels are compiled first, where none are kept from an earlier run."""
-    if not all(is_compiled(kernel) for kernel in KERNELS):
-        print(
-            "kolinear: the kernels are compiled first, a minute or more, once (ahead of it: "
-            "python -m sfm.warm_up)",
-            file=sys.stderr,
-        )
-
-
-def is_compiled(kernel: Dispatcher) -> bool:
-    """Whether numba keeps a compiled form of a kernel that is as new as its source."""
-    source = Path(kernel.py_func.__code__.co_filename)
-    kept = Path(kernel.stats.cache_path or ".")
-    try:
-        newest = max(
-            path.stat().st_mtime for path in kept.glob(f"{source.stem}.{kernel.py_func.__name__}-*.nbi")
-        )
-        return newest >= source.stat().st_mtime
-    except (OSError, ValueError):  # no folder, or nothing in it
-        return False
 
 
 def tell_result(result: SurveyResult, page: Path, *, seconds: float, verbose: bool) -> bool:

@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
-import numpy as np
 import typer
 
-from sfm.conventions import IntArray
+from sfm.commands.starting import loading
 from sfm.errors import GeometryError, SurveyFileError
-from sfm.orientation.resection.report import METHODS, resect_json, resect_table
-from sfm.orientation.resection.task import Task, read_task
-from sfm.report.matching import match_command
-from sfm.targets.sheet import lay_out_sheet, write_sheet
+from sfm.orientation.resection.methods import METHODS
+
+if TYPE_CHECKING:
+    from sfm.conventions import IntArray
+    from sfm.orientation.resection.task import Task
 
 MOST_TARGETS = 10_000  # on one sheet; no family has more codes
 
@@ -58,6 +58,9 @@ def match(
 
     By cross correlation, then least squares matching.
     """
+    with loading():
+        from sfm.report.matching import match_command
+
     print(
         match_command(
             left,
@@ -101,6 +104,10 @@ def resect(
 
     By any of the methods, or all of them for a comparison.
     """
+    with loading():
+        from sfm.orientation.resection.report import resect_json, resect_table
+        from sfm.orientation.resection.task import read_task
+
     task = read_task(points, c_mm=c, camera_file=camera, start=start, tolerance_mm=tolerance)
     if not as_json:
         print(resect_table(task, method))
@@ -111,6 +118,8 @@ def resect(
 
 def _tried(task: Task, method: str) -> dict[str, object]:
     """Return what one of all methods finds, or why it finds nothing."""
+    from sfm.orientation.resection.report import resect_json
+
     try:
         return resect_json(task, method)
     except GeometryError as error:
@@ -147,6 +156,9 @@ def targets(
 
     It is in true scale and has a ruler to check the print.
     """
+    with loading():
+        from sfm.targets.sheet import lay_out_sheet, write_sheet
+
     radii = None if ring_radii is None else _two(ring_radii)
     sheet = lay_out_sheet(
         family, _numbers(ids), diameter_mm=diameter, page=page, dark=not bright, ring_radii=radii
@@ -174,6 +186,8 @@ def _numbers(text: str) -> IntArray:
     Raises:
         SurveyFileError: not numbers and ranges, or too many.
     """
+    import numpy as np
+
     numbers: list[int] = []
     for part in text.split(","):
         first, dash, last = part.strip().partition("-")

@@ -7,9 +7,8 @@ from typing import Annotated
 import typer
 
 from sfm.analysis.design import LEAST_PIXELS, target_size
+from sfm.commands.starting import loading
 from sfm.errors import SurveyFileError
-from sfm.targets.codes import CodeFamily
-from sfm.targets.tags import target_family
 
 plan = typer.Typer(name="plan", help="Plan a survey before the photographs are taken.")
 
@@ -42,6 +41,10 @@ def target_size_command(
 
     diameter = pixels x sensor width x distance / (c x photograph width), over the cosine of the tilt.
     """
+    with loading():
+        from sfm.targets.codes import CodeFamily
+        from sfm.targets.tags import target_family
+
     codes = target_family(family)
     if not isinstance(codes, CodeFamily):
         raise SurveyFileError(f"--family {family}: needed rings, such as ring14")

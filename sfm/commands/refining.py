@@ -7,10 +7,8 @@ from typing import Annotated
 
 import typer
 
-from sfm.commands.console import drawn_progress
+from sfm.commands.starting import loading
 from sfm.errors import OutputError
-from sfm.survey.refine import refine_model, refinement_text
-from sfm.whole_files import whole_folder
 
 
 def refine(
@@ -29,7 +27,11 @@ def refine(
 
     By multi-photo least squares matching; then the model is adjusted again.
     """
-    from adapters.colmap_model import read_model, write_model
+    with loading():
+        from adapters.colmap_model import read_model, write_model
+        from sfm.commands.console import drawn_progress
+        from sfm.survey.refine import refine_model, refinement_text
+        from sfm.whole_files import whole_folder
 
     if out is not None and out.exists():
         raise OutputError(f"{out}: exists already, the refined model needs a new folder")

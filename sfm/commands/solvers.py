@@ -7,16 +7,7 @@ from typing import Annotated
 
 import typer
 
-from sfm.analysis.conversion import Conversion, convert_cameras
-from sfm.analysis.significance import compare_results
-from sfm.analysis.undistortion import undistort
-from sfm.analysis.validation import validate as validate_networks
-from sfm.commands.console import drawn_progress
-from sfm.report.differences import FILES as DIFFERENCE_FILES
-from sfm.report.differences import largest_difference, words_of_test, write_differences
-from sfm.report.pages import refuse_other_files
-from sfm.report.validation import FILES as VALIDATION_FILES
-from sfm.report.validation import in_words, largest, write_validation
+from sfm.commands.starting import loading
 
 WORSE = 1  # exit code where the in-house adjuster was ever the worse one
 
@@ -33,9 +24,14 @@ def validate(
 
     Exit code 1 if the in-house adjuster was ever the worse one.
     """
-    from adapters.colmap_covariance import ColmapBackend
+    with loading():
+        from adapters.colmap_covariance import ColmapBackend
+        from sfm.analysis.validation import validate as validate_networks
+        from sfm.commands.console import drawn_progress
+        from sfm.report.pages import refuse_other_files
+        from sfm.report.validation import FILES, in_words, largest, write_validation
 
-    refuse_other_files(out, VALIDATION_FILES)
+    refuse_other_files(out, FILES)
     with drawn_progress() as progress:
         found = validate_networks(ColmapBackend(), networks=networks, seed=seed, jobs=jobs, progress=progress)
     page = write_validation(found, out)
@@ -70,9 +66,13 @@ def compare(
 
     Differences, their standard deviations and what of them is significant.
     """
-    from adapters.formats import read_comparable
+    with loading():
+        from adapters.formats import read_comparable
+        from sfm.analysis.significance import compare_results
+        from sfm.report.differences import FILES, largest_difference, words_of_test, write_differences
+        from sfm.report.pages import refuse_other_files
 
-    refuse_other_files(out, DIFFERENCE_FILES)
+    refuse_other_files(out, FILES)
     first, second = read_comparable(a, a_format), read_comparable(b, b_format)
     names = tuple(name.strip() for name in control.split(",") if name.strip())
     found = compare_results(first, second, align=align, control=names)
@@ -105,7 +105,10 @@ def convert(
 
     A camera is converted where the format lacks its model.
     """
-    from adapters.formats import ENDINGS, format_named, read_any, write_any, written
+    with loading():
+        from adapters.formats import ENDINGS, format_named, read_any, write_any, written
+        from sfm.analysis.conversion import Conversion, convert_cameras
+        from sfm.analysis.undistortion import undistort
 
     form = format_named(to_format or ENDINGS.get(target.suffix.lower(), "tables"))
     network, estimate = read_any(source, from_format)

@@ -16,6 +16,7 @@ from sfm.orientation.resection.critical_cylinder import cylinder_warning
 from sfm.orientation.resection.dlt import resect_dlt
 from sfm.orientation.resection.fischler_bolles import resect_fischler_bolles
 from sfm.orientation.resection.least_squares import resect_least_squares
+from sfm.orientation.resection.methods import METHODS
 from sfm.orientation.resection.p4p import resect_p4p
 from sfm.orientation.resection.rampal import resect_rampal
 from sfm.orientation.resection.robust import resect_robust
@@ -27,16 +28,6 @@ from sfm.orientation.resection.solution import (
 from sfm.orientation.resection.task import Task
 from sfm.orientation.resection.zeng_wang import resect_zeng_wang
 
-METHODS = (
-    "fischler-bolles",
-    "p4p",
-    "church",
-    "zeng-wang",
-    "rampal",
-    "dlt",
-    "robust",
-    "least-squares",
-)
 START_TOLERANCE = 0.1  # of c: what the start of least squares may be off
 ALL_POINTS = 3  # fewest points of any method
 

@@ -1,0 +1,41 @@
+"""Whether kernels are being compiled, which takes a minute that a person wants to know of.
+
+Numba itself says when it begins to compile, and says nothing when it takes a form that it has kept.
+
+Source: numba, developer manual, "Notes on the event API", event numba:compile.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+from numba.core.event import Event, Listener, install_listener
+
+COMPILING = (
+    "kernels are compiled first, a minute or more, once (ahead of it: python -m sfm.warm_up, which takes "
+    "the common ones)"
+)
+
+
+@contextmanager
+def when_compiling(tell: Callable[[], None]) -> Iterator[None]:
+    """Call `tell` when the first kernel of this program is compiled, in any thread of this process."""
+    with install_listener("numba:compile", _First(tell)):
+        yield
+
+
+class _First(Listener):  # type: ignore[misc]  # numba has no types
+    """Hears of every kernel, tells of the first."""
+
+    def __init__(self, tell: Callable[[], None]) -> None:
+        self._tell: Callable[[], None] | None = tell
+
+    def on_start(self, event: Event) -> None:
+        """A function is compiled; those of numba and other libraries are none of ours."""
+        if self._tell is not None and event.data["dispatcher"].py_func.__module__.startswith("sfm."):
+            tell, self._tell = self._tell, None
+            tell()
+
+    def on_end(self, event: Event) -> None:
+        """Nothing is told of the end."""
