@@ -5,6 +5,7 @@ Source: dask.distributed, Client futures API (https://distributed.dask.org/en/st
 
 from __future__ import annotations
 
+import asyncio
 import gc
 import logging
 import queue
@@ -12,13 +13,14 @@ import signal
 import time
 import uuid
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from itertools import count
 from typing import Any
 
 import dask
 from dask.distributed import Client, Future, KilledWorker, LocalCluster, Worker, WorkerPlugin, get_worker
+from distributed.core import rpc
 from threadpoolctl import threadpool_limits
 
 from sfm.engine import Call, Done, Event, Lost, Told, Work
@@ -26,7 +28,7 @@ from sfm.errors import BackendError, KolinearError
 
 # Deaths of workers that a call may be near before Dask gives it up: once is bad luck, and is tried elsewhere.
 ALLOWED_FAILURES = 1
-CONNECT_SECONDS = 15.0
+CONNECT_SECONDS = 5.0
 NOBODY_SECONDS = 60.0  # without a single worker before a run gives up; a new one takes some 3 s
 LOOK_SECONDS = 2.0
 CLOSE_SECONDS = 5.0
@@ -65,31 +67,51 @@ def local_engine(workers: int, *, memory_bytes: int | None = None) -> Iterator[D
         },
         "distributed.comm.timeouts.connect": "60s",  # new workers compile and import on a busy computer
     }
-    with dask.config.set(settings):
-        try:
-            cluster = LocalCluster(
-                n_workers=workers,
-                threads_per_worker=1,
-                processes=True,
-                memory_limit=memory_bytes or "auto",
-                host="127.0.0.1",
-                dashboard_address="127.0.0.1:0",  # None lets a server listen on a fixed port to the world
-                scheduler_kwargs={"dashboard": False},
-                silence_logs=logging.CRITICAL,
-            )
-        except (OSError, RuntimeError, TimeoutError) as error:
-            raise BackendError(f"{workers} worker processes cannot be started: {_line(error)}") from error
-        try:
-            with cluster, Client(cluster) as client:
-                client.register_plugin(_IgnoreInterrupt())
-                yield DaskEngine(client)
-        finally:
-            with suppress(Exception):
-                cluster.close(timeout=CLOSE_SECONDS)
+    with dask.config.set(settings), ExitStack() as stack:
+        with _interrupt_held_back():  # a Ctrl-C meanwhile comes when all of this is up, and can be ended
+            try:
+                cluster = LocalCluster(
+                    n_workers=workers,
+                    threads_per_worker=1,
+                    processes=True,
+                    memory_limit=memory_bytes or "auto",
+                    host="127.0.0.1",
+                    dashboard_address="127.0.0.1:0",  # None lets a server listen on a fixed port to the world
+                    scheduler_kwargs={"dashboard": False},
+                    silence_logs=logging.CRITICAL,
+                )
+            except (OSError, RuntimeError, TimeoutError) as error:
+                raise BackendError(f"{workers} worker processes cannot be started: {_line(error)}") from error
+            stack.callback(_close, cluster)
+            stack.enter_context(cluster)
+            client = stack.enter_context(Client(cluster))
+            client.register_plugin(_IgnoreInterrupt())
+        yield DaskEngine(client)
+
+
+def _close(cluster: LocalCluster) -> None:
+    """Close a cluster that could not be closed in peace."""
+    with suppress(Exception):
+        cluster.close(timeout=CLOSE_SECONDS)
 
 
 @contextmanager
-def remote_engine(address: str) -> Iterator[DaskEngine]:
+def _interrupt_held_back() -> Iterator[None]:
+    """Hold Ctrl-C back, which reaches all processes of a terminal, here and in what is started.
+
+    Threads and processes that begin in here never see it: whoever started the workers ends them.
+    """
+    if not hasattr(signal, "pthread_sigmask"):  # Windows, where a plug-in must do
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def remote_engine(address: str) -> AbstractContextManager[DaskEngine]:
     """Use a scheduler that is running; its workers must have Kolinear and see the same folders.
 
     Args:
@@ -97,9 +119,31 @@ def remote_engine(address: str) -> Iterator[DaskEngine]:
             workers, so it belongs in a network of trust.
 
     Raises:
-        BackendError: no scheduler answers.
+        BackendError: no scheduler answers, which is known before anything else is begun.
     """
     logging.getLogger("distributed").setLevel(logging.CRITICAL)
+    try:
+        # A Client that cannot connect is never done with it, and says so half a minute later.
+        asyncio.run(_ask(address))
+    except TimeoutError as error:
+        raise BackendError(
+            f"--cluster {address}: no Dask scheduler answers within {CONNECT_SECONDS:.0f} s"
+        ) from error
+    except (OSError, ValueError, TypeError, AttributeError) as error:
+        raise BackendError(f"--cluster {address}: no Dask scheduler answers ({_line(error)})") from error
+    return _connected(address)
+
+
+async def _ask(address: str) -> None:
+    """Ask whoever is at an address whether it is a scheduler; ValueError if not."""
+    async with asyncio.timeout(CONNECT_SECONDS), rpc(address, timeout=CONNECT_SECONDS) as server:
+        kind = (await server.identity())["type"]
+    if kind != "Scheduler":
+        raise ValueError(f"it is a {kind}")
+
+
+@contextmanager
+def _connected(address: str) -> Iterator[DaskEngine]:
     try:
         client = Client(address, timeout=CONNECT_SECONDS, set_as_default=False)
     except (OSError, ValueError, TypeError, TimeoutError) as error:
@@ -109,7 +153,7 @@ def remote_engine(address: str) -> Iterator[DaskEngine]:
 
 
 class _IgnoreInterrupt(WorkerPlugin):
-    """Ctrl-C reaches all processes of a terminal; whoever started the workers ends them."""
+    """Keep Ctrl-C from workers where signals cannot be held back."""
 
     name = "kolinear-ignore-interrupt"
 
@@ -243,4 +287,4 @@ def _event(key: str, future: Future) -> Event:
 
 
 def _line(error: BaseException | None) -> str:
-    return (str(error).strip().splitlines() or ["no reason given"])[0]
+    return (str(error).strip().splitlines() or [type(error).__name__])[0]
