@@ -14,7 +14,6 @@ Source: RFC 4180 for CSV; the columns are described in the README.
 
 from __future__ import annotations
 
-import csv
 import json
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -31,6 +30,7 @@ from sfm.conventions import FloatArray, angles_from_rotation, rotation_from_angl
 from sfm.csv_tables import MAX_NAME, CsvTable, read_header, read_table
 from sfm.distortion.models import MODELS
 from sfm.errors import OutputError, SurveyFileError
+from sfm.file_values import csv_text
 from sfm.network import Estimate, ImagePoints, Network
 
 EXTERIOR = ("X", "Y", "Z", "omega_deg", "phi_deg", "kappa_deg")
@@ -278,13 +278,4 @@ def _sigma_of(covariance: FloatArray | None, count: int) -> tuple[FloatArray, tu
 
 
 def _write(path: Path, header: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
-    with path.open("w", encoding="utf-8", newline="") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(header)
-        writer.writerows([_cell(value) for value in row] for row in rows)
-
-
-def _cell(value: object) -> str:
-    if isinstance(value, float | np.floating):
-        return repr(float(value)) if np.isfinite(value) else ""
-    return str(value)
+    path.write_text(csv_text(header, rows), encoding="utf-8", newline="")

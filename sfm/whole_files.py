@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import glob
 import os
 import shutil
 import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from sfm.errors import KolinearError, OutputError
@@ -65,6 +66,21 @@ def whole_file(path: Path, what: str = "") -> Iterator[Path]:
             _sync(path.parent)
     finally:
         shutil.rmtree(folder, ignore_errors=True)
+
+
+def remove_leftovers(out: Path) -> None:
+    """Remove what killed runs have left beside a place, and put back there what they had moved away.
+
+    Only for who knows that nobody is writing there, by a lock.
+    """
+    name = glob.escape(out.name)
+    for old in out.parent.glob(f".{name}.*.old"):
+        if (old / "result").is_dir() and not out.exists():
+            with suppress(OSError):
+                (old / "result").rename(out)
+        shutil.rmtree(old, ignore_errors=True)
+    for part in out.parent.glob(f".{name}.*.part"):
+        shutil.rmtree(part, ignore_errors=True)
 
 
 def refuse_full(folder: Path) -> None:

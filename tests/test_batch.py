@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import gc
 import json
 import os
 import subprocess
@@ -166,8 +167,12 @@ def test_failures_are_rows_and_the_others_go_on(surveys: tuple[Path, ...], tmp_p
     assert "cannot be read" in rows[3].reason
     assert (out / "taken" / "letter.txt").exists()
     page = (out / "index.html").read_text(encoding="utf-8")
-    assert "<b>" not in page
+    assert "<b>broken" not in page
     assert "&lt;b&gt;broken&lt;/b&gt;" in page
+    assert '<div class="banner bad"><strong>1 of 5 surveys has a dependable result.' in page
+    assert page.count('<span class="mark bad">failed</span>') == 2 * 4
+    assert f'<span class="mark {rows[4].verdict}">{rows[4].verdict}</span>' in page
+    assert "<td class=n>6 / 6</td>" in page
     for row in rows[:4]:
         log = read_log(out / "logs" / f"{row.folder}.jsonl")
         assert log[-1]["event"] == "failed"
@@ -183,13 +188,16 @@ def test_surveys_of_one_name_get_folders_of_their_own(tmp_path: Path) -> None:
     assert len({row.folder for row in rows}) == 3
     assert all(row.folder.startswith(("same-", "logs-")) for row in rows)
     assert list(notes.names) == [row.folder for row in rows]
+    page = (tmp_path / "out" / "index.html").read_text(encoding="utf-8")
+    for file in files:  # two of one name are told apart by their files
+        assert f"<td>{file.relative_to(tmp_path)}</td>" in page
 
 
 def test_index_escapes_everything() -> None:
     nasty = "\"><script>alert('1')</script>&"
     row = SurveyRow(nasty, nasty, nasty, nasty, nasty, comparison=nasty, reason=nasty)
     for status in ("failed", "done"):
-        page = render_index([SurveyRow(**{**row.__dict__, "status": status})])
+        page = render_index([SurveyRow(**{**row.__dict__, "status": status})], nasty)
         assert "<script" not in page
         assert 'href="' + nasty not in page
 
@@ -260,12 +268,20 @@ def test_workers_listen_to_this_computer_only_and_two_batches_do_not_meet(two_wo
     assert listening == {"127.0.0.1"}
 
 
-def test_nobody_at_the_address_of_a_cluster() -> None:
-    with (
-        pytest.raises(BackendError, match=r"--cluster .*: no Dask scheduler answers"),
-        remote_engine("nonsense"),
-    ):
-        pass
+@pytest.mark.parametrize(
+    ("address", "told"),
+    [("nonsense", "missing port number"), ("tcp://127.0.0.1:1", "within"), ("bar://x:1", "unknown address")],
+)
+def test_nobody_at_the_address_of_a_cluster_is_known_at_once(
+    address: str, told: str, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("adapters.dask_cluster.CONNECT_SECONDS", 0.5)
+    begun = time.perf_counter()
+    with pytest.raises(BackendError, match=f"--cluster {address}: no Dask scheduler answers.*{told}"):
+        remote_engine(address)
+    gc.collect()  # what is not done with says so when it is thrown away
+    assert time.perf_counter() - begun < 10  # it was 30 s and more
+    assert capfd.readouterr().err == ""
 
 
 @pytest.mark.slow

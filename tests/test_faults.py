@@ -20,11 +20,11 @@ import pytest
 
 from sfm.errors import OutputError
 from sfm.folder_lock import locked
-from sfm.report.output import remove_leftovers
 from sfm.survey.log import SurveyLog, read_log
 from sfm.targets.codes import code_family
 from sfm.targets.detect import Targets, find_targets
 from sfm.targets.store import TargetStore, target_key
+from sfm.whole_files import remove_leftovers
 from tests.engines import points_of
 from tests.surveys import pictures, write_observed_survey, write_photograph_survey
 

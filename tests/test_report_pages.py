@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import csv
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,6 +19,7 @@ from sfm.errors import GeometryError, OutputError
 from sfm.network import Network
 from sfm.report.differences import largest_difference, words_of_test, write_differences
 from sfm.report.validation import COLUMNS, write_validation
+from sfm.whole_files import remove_leftovers
 from tests.synthetic import make_network, seed_of
 
 PLAN = Plan("ring", 8, 60, False, 0.8, 0.1, "opencv", 1, "all", "free")
@@ -81,6 +84,36 @@ def test_foreign_folders_are_left_alone(tmp_path: Path) -> None:
     with pytest.raises(OutputError, match="a file is in the way"):
         write_validation(validation, tmp_path / "out" / "mine.txt")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["out"]
+
+
+@pytest.mark.parametrize("moment", [1, 2])
+def test_an_earlier_page_outlives_a_run_that_is_killed_while_it_replaces_it(
+    moment: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class KilledError(BaseException):
+        """After it nothing is done any more."""
+
+    validation = Validation("colmap", 7, (trial(0),))
+    page = write_validation(validation, tmp_path / "out")
+    before, renamed = page.read_text(), []
+
+    def rename(path: Path, target: Path, real: Any = Path.rename) -> Path:
+        renamed.append(path)
+        if len(renamed) == moment:
+            raise KilledError
+        return real(path, target)
+
+    def rmtree(path: Path, real: Any = shutil.rmtree, **options: Any) -> None:
+        if len(renamed) < moment:
+            real(path, **options)
+
+    with monkeypatch.context() as patch, pytest.raises(KilledError):
+        patch.setattr(Path, "rename", rename)
+        patch.setattr(shutil, "rmtree", rmtree)
+        write_validation(validation, tmp_path / "out")
+    remove_leftovers(tmp_path / "out")
+    assert page.read_text() == before
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]
 
 
 @pytest.fixture

@@ -2,34 +2,24 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 import os
-import tempfile
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict, fields
 from html import escape
-from importlib.resources import files
 from pathlib import Path
-from urllib.parse import quote
 
 from sfm.batch.survey import LOGS, SurveyRow
-from sfm.errors import OutputError
+from sfm.file_values import csv_text
+from sfm.report.markup import Cell, file_url, table
+from sfm.report.pages import page
+from sfm.whole_files import whole_file
 
-HEADER = (
-    "survey",
-    "status",
-    "verdict",
-    "sigma0, px",
-    "RMS, px",
-    "photographs",
-    "points",
-    "COLMAP",
-    "seconds",
-    "remark",
-)
+PAGES = ("batch.csv", "batch.json", "index.html")
+HEADER = ("survey", "file", "result", "photographs", "points", "sigma0, px", "RMS, px", "COLMAP", "seconds")
+LEVELS = {"good": "good", "fair": "fair", "bad": "bad", "": "bad"}
+"""colour of a verdict; without a result there is none, which is bad"""
 
 
 def write_batch_pages(rows: Sequence[SurveyRow], out: Path) -> None:
@@ -42,15 +32,16 @@ def write_batch_pages(rows: Sequence[SurveyRow], out: Path) -> None:
     Raises:
         OutputError: they cannot be written.
     """
-    table = io.StringIO()
-    writer = csv.writer(table, lineterminator="\n")
     names = [field.name for field in fields(SurveyRow)]
-    writer.writerow(names)
-    writer.writerows(["" if v is None else v for v in asdict(row).values()] for row in rows)
     data = {"surveys": [asdict(row) for row in rows], "totals": totals(rows)}
-    _write(out / "batch.csv", table.getvalue())
-    _write(out / "batch.json", json.dumps(data, indent=2, ensure_ascii=False, allow_nan=False) + "\n")
-    _write(out / "index.html", render_index(rows))
+    texts = (
+        csv_text(names, [tuple(asdict(row).values()) for row in rows]),
+        json.dumps(data, indent=2, ensure_ascii=False, allow_nan=False) + "\n",
+        render_index(rows, out.name),
+    )
+    for name, text in zip(PAGES, texts, strict=True):
+        with whole_file(out / name) as part:
+            part.write_text(text, encoding="utf-8", newline="")
 
 
 def totals(rows: Sequence[SurveyRow]) -> dict[str, int]:
@@ -66,55 +57,78 @@ def totals(rows: Sequence[SurveyRow]) -> dict[str, int]:
     }
 
 
-def render_index(rows: Sequence[SurveyRow]) -> str:
-    """Return the page with a line for every survey; whatever came from files is escaped."""
-    style = files("sfm.report").joinpath("report.css").read_text(encoding="utf-8")
-    told = ", ".join(f"{count} {name}" for name, count in totals(rows).items() if count or name == "done")
-    head = "".join(f"<th>{escape(name)}</th>" for name in HEADER)
-    body = "\n".join(_line(row) for row in rows)
-    return (
-        '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        f"<title>Batch</title><style>{style}</style></head><body><main><h1>Batch</h1><p>{escape(told)}</p>"
-        f"<div class=scroll><table><thead><tr>{head}</tr></thead><tbody>\n{body}\n</tbody></table></div>"
-        "</main></body></html>\n"
+def render_index(rows: Sequence[SurveyRow], name: str) -> str:
+    """Return the page with a line for every survey; whatever came from files is escaped.
+
+    Args:
+        rows: one per survey.
+        name: of the batch.
+    """
+    count = totals(rows)
+    good = sum(row.succeeded for row in rows)
+    remarked = sum(row.verdict == "fair" for row in rows)
+    differs = sum(row.comparison == "differs" for row in rows)
+    remarks = [f"{count[word]} {word}" for word in ("failed", "set aside", "not dependable") if count[word]]
+    remarks += [f"{remarked} with remarks: see their reports"] if remarked else []
+    remarks += [f"{differs} where COLMAP's adjustment differs"] if differs else []
+    level = "bad" if good < len(rows) else "fair" if remarked or differs else "good"
+    above = _common_folder(rows)
+    where = f"<p class=note>Files are below {escape(above)}</p>" if above else ""
+    sections = [("Surveys", table(HEADER, [_cells(row, above) for row in rows]) + where)]
+    without = [row for row in rows if row.status != "done"]
+    if without:
+        told = [
+            (row.survey, _below(row.file, above), Cell(row.status, level="bad"), row.reason, _log(row))
+            for row in without
+        ]
+        sections.append(("Without a result", table(("survey", "file", "", "reason", "log"), told)))
+    seconds = sum(row.seconds for row in rows)
+    tiles = (
+        ("Surveys", str(len(rows)), f"{good} with a dependable result"),
+        ("Photographs oriented", _oriented(rows), "of surveys with a result"),
+        ("Object points", str(sum(row.points or 0 for row in rows)), ""),
+        ("Computing", f"{seconds:.1f} s", "of all workers together"),
     )
+    verdict = f"{good} of {len(rows)} surveys {'has' if good == 1 else 'have'} a dependable result."
+    return page("Batch of surveys", name, verdict, level, sections, remarks=remarks, tiles=tiles)
 
 
-def _line(row: SurveyRow) -> str:
+def _cells(row: SurveyRow, above: str) -> tuple[str | Cell, ...]:
+    """Return the line of a survey in the table."""
     done = row.status == "done"
-    link = f"{quote(row.folder)}/report.html" if done else f"{LOGS}/{quote(row.folder)}.jsonl"
-    cells = (
-        row.status,
-        row.verdict,
-        _number(row.sigma0_px, 4),
-        _number(row.rms_px, 4),
-        f"{row.photographs} of {row.photographs_total}" if done else "",
+    return (
+        Cell(row.survey, url=f"{file_url(row.folder)}/report.html" if done else ""),
+        _below(row.file, above),
+        Cell(row.verdict if done else row.status, level=LEVELS.get(row.verdict, "bad")),
+        f"{row.photographs} / {row.photographs_total}" if done else "",
         "" if row.points is None else str(row.points),
-        row.comparison,
+        _fixed(row.sigma0_px),
+        _fixed(row.rms_px),
+        Cell(row.comparison, level="bad") if row.comparison == "differs" else row.comparison,
         f"{row.seconds:.1f}",
-        row.reason,
     )
-    name = f'<th scope=row><a href="{escape(link)}">{escape(row.survey)}</a></th>'
-    return f"<tr>{name}{''.join(f'<td>{escape(cell)}</td>' for cell in cells)}</tr>"
 
 
-def _number(value: float | None, decimals: int) -> str:
-    return "" if value is None else f"{value:.{decimals}f}"
+def _log(row: SurveyRow) -> Cell:
+    return Cell(f"{row.folder}.jsonl", url=f"{LOGS}/{file_url(row.folder)}.jsonl")
 
 
-def _write(path: Path, text: str) -> None:
-    """Write a file beside its place, have it on the disk, and put it there."""
+def _oriented(rows: Sequence[SurveyRow]) -> str:
+    return f"{sum(r.photographs or 0 for r in rows)} of {sum(r.photographs_total or 0 for r in rows)}"
+
+
+def _common_folder(rows: Sequence[SurveyRow]) -> str:
+    """Return the folder that all survey files are below, empty if there is none but the root."""
     try:
-        handle, part = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".part", dir=path.parent)
-        try:
-            with os.fdopen(handle, "w", encoding="utf-8") as file:
-                file.write(text)
-                file.flush()
-                os.fsync(file.fileno())
-            Path(part).chmod(0o644)  # mkstemp makes it for the owner alone
-            Path(part).replace(path)
-        finally:
-            Path(part).unlink(missing_ok=True)
-    except OSError as error:
-        raise OutputError(f"{path}: cannot be written: {error.strerror or error}") from error
+        common = os.path.commonpath([Path(row.file).parent for row in rows])
+    except ValueError:  # none at all, or several drives
+        return ""
+    return "" if common == Path(common).anchor else common
+
+
+def _below(file: str, above: str) -> str:
+    return os.path.relpath(file, above) if above else file
+
+
+def _fixed(value: float | None) -> str:
+    return "" if value is None else f"{value:.4f}"

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
-from sfm.batch.pages import write_batch_pages
+from sfm.batch.pages import PAGES, write_batch_pages
 from sfm.batch.survey import (
     LOGS,
     Comparers,
@@ -31,13 +31,13 @@ from sfm.engine import Call, Done, Engine, Lost, Told, Work
 from sfm.errors import KolinearError, SurveyFileError
 from sfm.folder_lock import locked
 from sfm.project import Survey, read_survey
-from sfm.report.output import refuse_foreign_folder, remove_leftovers
+from sfm.report.output import refuse_foreign_folder
 from sfm.survey.log import SurveyLog
 from sfm.survey.start import find_photographs
 from sfm.targets.store import STORE, TargetStore
+from sfm.whole_files import remove_leftovers
 
 LOCK = ".kolinear/lock"
-PAGES = ("batch.csv", "batch.json", "index.html")
 SURVEY_NAME = "survey.toml"  # what a folder is searched for
 
 
@@ -264,5 +264,4 @@ def _clean(out: Path, plans: Sequence[_Plan]) -> None:
     for plan in plans:
         remove_leftovers(out / plan.folder)
     for page in PAGES:
-        for part in out.glob(f".{page}.*.part"):
-            part.unlink(missing_ok=True)
+        remove_leftovers(out / page)

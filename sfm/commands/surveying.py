@@ -256,7 +256,7 @@ def _cores() -> int:
 def _written(folder: Path) -> Iterator[None]:
     """Keep other runs from writing the same folder, and clear away what killed ones have left there."""
     from sfm.folder_lock import locked
-    from sfm.report.output import remove_leftovers
+    from sfm.whole_files import remove_leftovers
 
     with locked(folder.parent / f".{folder.name}.lock"):
         remove_leftovers(folder)

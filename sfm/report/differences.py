@@ -12,13 +12,13 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from sfm.analysis.significance import ResultComparison
+from sfm.file_values import csv_text, or_none
 from sfm.report.markup import figure, finer_unit, significant, table
-from sfm.report.pages import csv_text, page, png, write_files
-from sfm.report.plots import plan_axes
+from sfm.report.pages import page, png, write_files
+from sfm.report.plots import BLUE, RED, plan_axes
 
 COLUMNS = ("id", "dX", "dY", "dZ", "sdX", "sdY", "sdZ", "T", "significant")
 FILES = ("differences.csv", "comparison.json", "comparison.html")
-BLUE, RED = "#1f5fa8", "#c8372d"
 LONGEST_ARROW = 0.1  # of the object's size, that of the largest difference
 
 
@@ -45,17 +45,8 @@ def write_differences(found: ResultComparison, xyz: np.ndarray, out: Path) -> Pa
         )
     ]
     text = json.dumps(differences_summary(found), indent=2, ensure_ascii=False, allow_nan=False)
-    return write_files(
-        out,
-        tuple(
-            zip(
-                FILES,
-                (csv_text(COLUMNS, rows), text + "\n", differences_page(found, xyz)),
-                strict=True,
-            )
-        ),
-        main=FILES[-1],
-    )
+    texts = (csv_text(COLUMNS, rows), text + "\n", differences_page(found, xyz))
+    return write_files(out, tuple(zip(FILES, texts, strict=True)), main=FILES[-1])
 
 
 def differences_summary(found: ResultComparison) -> dict[str, Any]:
@@ -64,28 +55,28 @@ def differences_summary(found: ResultComparison) -> dict[str, Any]:
         "results": list(found.names),
         "length_unit": found.unit,
         "standard_deviations": list(found.has_sigma),
-        "same_image_points": _number(found.same_share),
+        "same_image_points": or_none(found.same_share),
         "alignment": found.alignment,
-        "scale": _number(found.a_from_b.scale),
+        "scale": or_none(found.a_from_b.scale),
         "points": len(found.points),
         "images": len(found.images),
-        "rms_point": _number(_rms(found.point_difference)),
-        "max_point": _number(_longest(found.point_difference)),
-        "rms_position": _number(_rms(found.position_difference)),
-        "max_rotation_deg": _number(_largest(found.rotation_deg)),
+        "rms_point": or_none(_rms(found.point_difference)),
+        "max_point": or_none(_longest(found.point_difference)),
+        "rms_position": or_none(_rms(found.position_difference)),
+        "max_rotation_deg": or_none(_largest(found.rotation_deg)),
         "changed": found.changed,
         "tested": _tested(found),
         "global_test": {
-            "statistic": _number(found.global_statistic),
-            "critical": _number(found.global_critical),
+            "statistic": or_none(found.global_statistic),
+            "critical": or_none(found.global_critical),
         },
         "significant": [n for n, flag in zip(found.points, found.significant, strict=True) if flag],
         "cameras": [
             {
                 "name": one.camera,
                 "model": one.model,
-                "difference": dict(zip(one.names, map(_number, one.difference), strict=True)),
-                "sigma": dict(zip(one.names, map(_number, one.sigma), strict=True)),
+                "difference": dict(zip(one.names, map(or_none, one.difference), strict=True)),
+                "sigma": dict(zip(one.names, map(or_none, one.sigma), strict=True)),
                 "conversion": None
                 if one.conversion is None
                 else {
@@ -307,7 +298,3 @@ def _rms(vectors: np.ndarray) -> float:
 
 def _longest(vectors: np.ndarray) -> float:
     return float(np.linalg.norm(vectors, axis=1).max()) if len(vectors) else math.nan
-
-
-def _number(value: float) -> float | None:
-    return float(value) if math.isfinite(value) else None

@@ -7,12 +7,11 @@ other adjuster agree, where are my coordinates. Every text that came from a file
 from __future__ import annotations
 
 from collections.abc import Sequence
-from html import escape
-from importlib.resources import files
 
 from sfm.report.checks import object_size, sigma0_ratio
 from sfm.report.markup import figure, finer_unit, significant
 from sfm.report.overlays import Overlay
+from sfm.report.pages import page
 from sfm.report.result import SurveyResult
 from sfm.report.section_baseline import baseline_section
 from sfm.report.section_comparison import comparison_section
@@ -20,7 +19,7 @@ from sfm.report.section_quality import quality_section
 from sfm.report.section_rejected import rejected_section
 from sfm.report.sections import coordinates_section, photographs_section, process_section, worked_section
 from sfm.report.tables import point_sigmas, root_mean_square
-from sfm.report.verdict import Verdict, verdict_of
+from sfm.report.verdict import verdict_of
 
 
 def render_html(
@@ -55,31 +54,19 @@ def render_html(
         ("photographs", "The photographs", photographs_section(result, overlays)),
         ("process", "How it was done", process_section(result)),
     )
-    title = escape(result.survey)
-    style = files("sfm.report").joinpath("report.css").read_text(encoding="utf-8")
-    links = "".join(f'<a href="#{key}">{escape(name)}</a>' for key, name, _ in sections)
-    body = "".join(
-        f'<section id="{key}"><h2>{escape(name)}</h2>{text}</section>' for key, name, text in sections
-    )
-    return (
-        '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        f"<title>{title} - Kolinear</title><style>{style}</style></head><body>"
-        f"<header><p class=kind>Survey report</p><h1>{title}</h1>{_banner(verdict)}{_tiles(result)}</header>"
-        f"<nav>{links}</nav><main>{body}</main></body></html>\n"
+    return page(
+        "Survey report",
+        result.survey,
+        verdict.headline,
+        verdict.level,
+        [(name, text) for _, name, text in sections],
+        remarks=verdict.remarks,
+        tiles=_tiles(result),
+        anchors=[key for key, _, _ in sections],
     )
 
 
-def _banner(verdict: Verdict) -> str:
-    remarks = "".join(f"<li>{escape(line)}</li>" for line in verdict.remarks)
-    return (
-        f'<div class="banner {verdict.level}"><strong>{escape(verdict.headline)}</strong>'
-        + (f"<ul>{remarks}</ul>" if remarks else "")
-        + "</div>"
-    )
-
-
-def _tiles(result: SurveyResult) -> str:
+def _tiles(result: SurveyResult) -> list[tuple[str, str, str]]:
     """Return the figures that are asked for first."""
     a = result.adjustment
     sigma = point_sigmas(a)
@@ -105,14 +92,7 @@ def _tiles(result: SurveyResult) -> str:
     both = result.comparison
     if both is not None:
         tiles.append((both.backend, "agrees" if both.agree else "differs", "both in the same camera model"))
-    return (
-        "<div class=tiles>"
-        + "".join(
-            f"<div><span>{escape(name)}</span><b>{escape(value)}</b><small>{escape(note)}</small></div>"
-            for name, value, note in tiles
-        )
-        + "</div>"
-    )
+    return tiles
 
 
 def _coded_of(result: SurveyResult) -> str:

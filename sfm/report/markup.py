@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from html import escape
 from urllib.parse import quote
 
@@ -16,9 +17,18 @@ SMALL = 1e-3
 SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
+@dataclass(frozen=True)
+class Cell:
+    """A cell of a table that is more than text."""
+
+    text: str
+    url: str = ""  # where it leads, ready for a link
+    level: str = ""  # good | fair | bad, its colour
+
+
 def table(
     header: Sequence[str],
-    rows: Iterable[Sequence[str]],
+    rows: Iterable[Sequence[str | Cell]],
     *,
     head: bool = True,
     plain_first: bool = False,
@@ -40,10 +50,19 @@ def table(
     for k, row in enumerate(rows):
         bold = " class=sum" if last_bold and k == len(rows) - 1 else ""
         cells = "".join(
-            f"<td{' class=n' if _is_number(cell) else ''}>{escape(cell)}</td>" for cell in row[1:]
+            f"<td{' class=n' if _is_number(cell) else ''}>{_inside(cell)}</td>" for cell in row[1:]
         )
-        text += f"<tr{bold}><th scope=row>{escape(row[0])}</th>{cells}</tr>"
+        text += f"<tr{bold}><th scope=row>{_inside(row[0])}</th>{cells}</tr>"
     return text + "</tbody></table></div>"
+
+
+def _inside(cell: str | Cell) -> str:
+    if isinstance(cell, str):
+        return escape(cell)
+    text = escape(cell.text)
+    if cell.level:
+        text = f'<span class="mark {cell.level}">{text}</span>'
+    return f'<a href="{cell.url}">{text}</a>' if cell.url else text
 
 
 def figure(data: bytes, caption: str) -> str:
@@ -117,10 +136,10 @@ def yes_or_no(value: bool) -> str:
     return "yes" if value else "no"
 
 
-def _is_number(cell: str) -> bool:
-    return (
-        bool(cell) and cell.lstrip("+-")[:1].isdigit() and not any(c.isalpha() for c in cell.replace("e", ""))
-    )
+def _is_number(cell: str | Cell) -> bool:
+    if isinstance(cell, Cell) or not cell.lstrip("+-")[:1].isdigit():
+        return False
+    return not any(c.isalpha() for c in cell.replace("e", ""))
 
 
 def finer_unit(unit: str, value: float) -> tuple[float, str]:

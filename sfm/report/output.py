@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import glob
 import json
-import shutil
 import time
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -123,18 +120,3 @@ def _is_summary(path: Path) -> bool:
     except (OSError, ValueError, RecursionError):
         return False
     return isinstance(text, dict) and {"survey", "images", "points", "observations"} <= text.keys()
-
-
-def remove_leftovers(out: Path) -> None:
-    """Remove what killed runs have left beside the place of a result, and put an earlier result back.
-
-    Only for who knows that nobody is writing there, by a lock.
-    """
-    name = glob.escape(out.name)
-    for old in out.parent.glob(f".{name}.*.old"):
-        if (old / "result").is_dir() and not out.exists():
-            with suppress(OSError):
-                (old / "result").rename(out)
-        shutil.rmtree(old, ignore_errors=True)
-    for part in out.parent.glob(f".{name}.*.part"):
-        shutil.rmtree(part, ignore_errors=True)

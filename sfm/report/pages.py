@@ -1,27 +1,35 @@
-"""Pages beside the survey report: one HTML file with all it shows, and its tables, whole or not at all."""
+"""HTML pages, all of one house, and folders of a page and its tables, whole or not at all."""
 
 from __future__ import annotations
 
-import csv
 import io
-import shutil
-import tempfile
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Sequence
 from html import escape
 from importlib.resources import files
 from pathlib import Path
 
-import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from sfm.errors import OutputError
+from sfm.folder_lock import locked
+from sfm.whole_files import remove_leftovers, whole_folder
 
 DPI = 110
 
 
-def page(kind: str, title: str, verdict: str, level: str, sections: Sequence[tuple[str, str]]) -> str:
-    """Return an HTML page in the style of the survey report.
+def page(
+    kind: str,
+    title: str,
+    verdict: str,
+    level: str,
+    sections: Sequence[tuple[str, str]],
+    *,
+    remarks: Sequence[str] = (),
+    tiles: Sequence[tuple[str, str, str]] = (),
+    anchors: Sequence[str] = (),
+) -> str:
+    """Return an HTML page with everything that it shows inside it.
 
     Args:
         kind: what sort of page it is.
@@ -29,26 +37,47 @@ def page(kind: str, title: str, verdict: str, level: str, sections: Sequence[tup
         verdict: the one sentence on top.
         level: good | fair | bad, the colour of the verdict.
         sections: heading and HTML of each part.
+        remarks: what to look at, below the verdict.
+        tiles: name, value and note of the figures that are asked for first.
+        anchors: names of the sections, for a line of links to them; none leaves it out.
     """
     style = files("sfm.report").joinpath("report.css").read_text(encoding="utf-8")
-    body = "".join(f"<section><h2>{escape(name)}</h2>{text}</section>" for name, text in sections)
+    ids = [f' id="{escape(key)}"' for key in anchors] or [""] * len(sections)
+    body = "".join(
+        f"<section{key}><h2>{escape(name)}</h2>{text}</section>"
+        for key, (name, text) in zip(ids, sections, strict=True)
+    )
+    links = "".join(
+        f'<a href="#{escape(key)}">{escape(name)}</a>'
+        for key, (name, _) in zip(anchors, sections, strict=False)
+    )
     return (
         '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
         f"<title>{escape(title)} - Kolinear</title><style>{style}</style></head><body>"
         f"<header><p class=kind>{escape(kind)}</p><h1>{escape(title)}</h1>"
-        f'<div class="banner {level}"><strong>{escape(verdict)}</strong></div></header>'
-        f"<main>{body}</main></body></html>\n"
+        f"{_banner(verdict, level, remarks)}{_tiles(tiles)}</header>"
+        f"{f'<nav>{links}</nav>' if links else ''}<main>{body}</main></body></html>\n"
     )
 
 
-def csv_text(header: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
-    """Return a table as CSV, numbers with the digits that give them back, unknown ones empty."""
-    buffer = io.StringIO()
-    writer = csv.writer(buffer, lineterminator="\n")
-    writer.writerow(header)
-    writer.writerows([_cell(value) for value in row] for row in rows)
-    return buffer.getvalue()
+def _banner(verdict: str, level: str, remarks: Sequence[str]) -> str:
+    lines = "".join(f"<li>{escape(line)}</li>" for line in remarks)
+    return (
+        f'<div class="banner {level}"><strong>{escape(verdict)}</strong>'
+        + (f"<ul>{lines}</ul>" if lines else "")
+        + "</div>"
+    )
+
+
+def _tiles(tiles: Sequence[tuple[str, str, str]]) -> str:
+    if not tiles:
+        return ""
+    shown = "".join(
+        f"<div><span>{escape(name)}</span><b>{escape(value)}</b><small>{escape(note)}</small></div>"
+        for name, value, note in tiles
+    )
+    return f"<div class=tiles>{shown}</div>"
 
 
 def png(figure: Figure) -> bytes:
@@ -57,6 +86,23 @@ def png(figure: Figure) -> bytes:
     FigureCanvasAgg(figure)
     figure.savefig(buffer, format="png", dpi=DPI)
     return buffer.getvalue()
+
+
+def refuse_other_files(out: Path, names: Collection[str]) -> None:
+    """Raise OutputError unless the folder is absent, empty, or holds files of these names and nothing else.
+
+    It is called before the work starts, too, so that nobody waits for a result that has no place.
+    """
+    if not out.exists() and not out.is_symlink():
+        return
+    if not out.is_dir():
+        raise OutputError(f"{out}: a file is in the way, --out needs a folder")
+    try:
+        foreign = sorted({path.name for path in out.iterdir()} - set(names))
+    except OSError as error:
+        raise OutputError(f"{out}: the folder cannot be read: {error.strerror}") from error
+    if foreign:
+        raise OutputError(f"{out}: the folder holds '{foreign[0]}'; --out needs a new or empty folder")
 
 
 def write_files(out: Path, contents: Sequence[tuple[str, str]], *, main: str) -> Path:
@@ -71,41 +117,12 @@ def write_files(out: Path, contents: Sequence[tuple[str, str]], *, main: str) ->
         Path of the main file.
 
     Raises:
-        OutputError: the folder holds something else or cannot be written.
+        OutputError: the folder holds something else or cannot be written, or another run is writing it.
     """
-    refuse_other_files(out, [name for name, _ in contents])
-    part = None
-    try:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        part = Path(tempfile.mkdtemp(prefix=f".{out.name}.", suffix=".part", dir=out.parent))
-        part.chmod(0o755)  # mkdtemp makes it for the owner alone
-        for name, text in contents:
-            (part / name).write_text(text, encoding="utf-8")
-        if out.exists():
-            shutil.rmtree(out)
-        part.rename(out)
-    except OSError as error:
-        raise OutputError(f"{out}: cannot be written ({error.strerror or error})") from error
-    finally:
-        if part is not None:
-            shutil.rmtree(part, ignore_errors=True)
+    with locked(out.parent / f".{out.name}.lock"):
+        remove_leftovers(out)
+        refuse_other_files(out, [name for name, _ in contents])
+        with whole_folder(out, "the result") as folder:
+            for name, text in contents:
+                (folder / name).write_text(text, encoding="utf-8", newline="")
     return out / main
-
-
-def refuse_other_files(out: Path, names: Sequence[str]) -> None:
-    """Refuse a folder that holds anything but files of these names, before work is done for it.
-
-    Raises:
-        OutputError: the folder holds something else, or is none.
-    """
-    if out.exists() and not out.is_dir():
-        raise OutputError(f"{out}: a file is in the way, --out needs a folder")
-    foreign = sorted({path.name for path in out.iterdir()} - set(names)) if out.exists() else []
-    if foreign:
-        raise OutputError(f"{out}: the folder holds '{foreign[0]}'; --out needs a new or empty folder")
-
-
-def _cell(value: object) -> str:
-    if isinstance(value, float | np.floating):
-        return repr(float(value)) if np.isfinite(value) else ""
-    return str(value)

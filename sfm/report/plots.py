@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Callable
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 
 from sfm.adjustment.result import Adjustment
 from sfm.conventions import FloatArray, IntArray
 from sfm.network import Estimate
+from sfm.report.pages import png
 from sfm.report.statistics import families, family_of_photographs
 from sfm.report.tables import image_rms
 
@@ -22,7 +21,6 @@ CAMERA_COLOURS = (BLUE, ORANGE, GREEN, "#7a4fa3", "#b0567a")
 MAX_ARROWS = 4000  # more residual vectors than this only blacken the picture
 CELLS = 12  # of the grid of mean residuals along the longer side
 FLAT_COSINE = 0.94  # within 20 degrees of Z the object's main plane is drawn as X and Y
-DPI = 110
 
 
 def all_plots(adjustment: Adjustment, unit: str) -> tuple[tuple[str, str, bytes], ...]:
@@ -41,7 +39,7 @@ def all_plots(adjustment: Adjustment, unit: str) -> tuple[tuple[str, str, bytes]
         ("distribution", _DISTRIBUTION, lambda: distribution_figure(adjustment)),
         ("photographs", _PHOTOGRAPHS, lambda: photograph_figure(adjustment)),
     )
-    return tuple((stem, caption, _png(draw())) for stem, caption, draw in drawn)
+    return tuple((stem, caption, png(draw())) for stem, caption, draw in drawn)
 
 
 _NETWORK = "Photographs (pyramids, looking where the camera looked) and object points."
@@ -302,10 +300,3 @@ def _plain(text: str) -> str:
     """Return text that matplotlib draws as it stands: no mathematics, no characters that its font lacks."""
     shown = "".join(c if c.isprintable() and ord(c) < 0x250 else "?" for c in text)
     return shown.replace("$", r"\$")
-
-
-def _png(figure: Figure) -> bytes:
-    buffer = io.BytesIO()
-    FigureCanvasAgg(figure)
-    figure.savefig(buffer, format="png", dpi=DPI)
-    return buffer.getvalue()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +12,7 @@ from sfm.adjustment.result import Adjustment
 from sfm.adjustment.statistics import CoordinateTest
 from sfm.adjustment.variance_components import VarianceComponents
 from sfm.conventions import FloatArray
+from sfm.file_values import or_none
 from sfm.report.checks import bar_residuals, control_residuals, count_observations, sigma0_ratio
 from sfm.report.result import SurveyResult
 from sfm.report.statistics import parameter_sigmas, quantiles, statistics_of
@@ -56,17 +56,17 @@ def summary(result: SurveyResult) -> dict[str, Any]:
             "expected_defect": adjustment.expected_defect,
             "undetermined": list(adjustment.undetermined),
         },
-        "sigma0_px": _number(adjustment.sigma0_px),
-        "rms_px": _number(adjustment.rms_px),
-        "max_residual_px": _number(adjustment.max_residual_px),
+        "sigma0_px": or_none(adjustment.sigma0_px),
+        "rms_px": or_none(adjustment.rms_px),
+        "max_residual_px": or_none(adjustment.max_residual_px),
         "cameras": [
             {
                 "name": camera.name,
                 "model": camera.model,
                 "size_px": list(camera.size_px),
-                "pixel_mm": [_number(value) for value in camera.pixel_mm],
+                "pixel_mm": [or_none(value) for value in camera.pixel_mm],
                 "parameters": {
-                    name: {"value": _number(value), "sigma": _number(sigma), "unit": unit}
+                    name: {"value": or_none(value), "sigma": or_none(sigma), "unit": unit}
                     for name, value, sigma, unit in zip(
                         camera.names,
                         camera.parameters,
@@ -101,12 +101,12 @@ def _statistics(result: SurveyResult) -> dict[str, Any]:
     known = np.isfinite(r).any()
     bias, external = quantiles(found.reliability.minimal_bias), quantiles(found.reliability.external)
     return {
-        "sigma0_ratio": _number(sigma0_ratio(result)),
+        "sigma0_ratio": or_none(sigma0_ratio(result)),
         "global_test": {
-            "vPv": _number(test.statistic),
+            "vPv": or_none(test.statistic),
             "redundancy": test.redundancy,
-            "lower": _number(test.lower),
-            "upper": _number(test.upper),
+            "lower": or_none(test.lower),
+            "upper": or_none(test.upper),
             "passed": test.passed,
         },
         "w_test": _coordinate_test(found.w),
@@ -121,31 +121,34 @@ def _statistics(result: SurveyResult) -> dict[str, Any]:
             "total": counts.total,
         },
         "redundancy_number": {
-            "sum": _number(found.redundancy_sum),
-            "mean": _number(float(np.nanmean(r))) if known else None,
-            "min": _number(float(np.nanmin(r))) if known else None,
+            "sum": or_none(found.redundancy_sum),
+            "mean": or_none(float(np.nanmean(r))) if known else None,
+            "min": or_none(float(np.nanmin(r))) if known else None,
         },
-        "minimal_detectable_bias_px": {"median": _number(bias[0]), "max": _number(bias[1])},
-        "external_reliability_sigmas": {"median": _number(external[0]), "max": _number(external[1])},
+        "minimal_detectable_bias_px": {"median": or_none(bias[0]), "max": or_none(bias[1])},
+        "external_reliability_sigmas": {
+            "median": or_none(external[0]),
+            "max": or_none(external[1]),
+        },
         "sigma0_by_kind": _components(found.kinds),
         "sigma0_by_camera": _components(found.cameras),
         "sigma0_by_photograph": _components(found.photographs),
         "correlations": [
-            {"first": pair.first, "second": pair.second, "value": _number(pair.value)}
+            {"first": pair.first, "second": pair.second, "value": or_none(pair.value)}
             for pair in found.correlations
         ],
         "significance": [
             {
                 "camera": test.camera,
                 "parameter": test.parameter,
-                "t": _number(test.t),
-                "probability": _number(test.probability),
+                "t": or_none(test.t),
+                "probability": or_none(test.probability),
                 "significant": bool(test.significant),
             }
             for test in found.significance
         ],
         "not_significant": [
-            {"camera": test.camera, "parameter": test.parameter, "t": _number(test.t)}
+            {"camera": test.camera, "parameter": test.parameter, "t": or_none(test.t)}
             for test in found.significance
             if not test.significant
         ],
@@ -164,16 +167,16 @@ def _coordinate_test(test: CoordinateTest) -> dict[str, Any]:
     known = np.isfinite(test.statistic)
     return {
         "alpha": test.alpha,
-        "critical": _number(test.critical),
+        "critical": or_none(test.critical),
         "tested": test.tested,
         "beyond": test.beyond,
         "expected": test.expected,
-        "max": _number(float(np.abs(test.statistic[known]).max())) if known.any() else None,
+        "max": or_none(float(np.abs(test.statistic[known]).max())) if known.any() else None,
     }
 
 
 def _components(components: VarianceComponents) -> dict[str, float | None]:
-    return {name: _number(float(s)) for name, s in zip(components.names, components.sigma0, strict=True)}
+    return {name: or_none(float(s)) for name, s in zip(components.names, components.sigma0, strict=True)}
 
 
 def _control(result: SurveyResult) -> dict[str, Any] | None:
@@ -181,10 +184,10 @@ def _control(result: SurveyResult) -> dict[str, Any] | None:
     if check is not None:
         return {
             "role": "check",
-            "scale": _number(check.scale),
-            "rms": [_number(value) for value in check.rms],
+            "scale": or_none(check.scale),
+            "rms": [or_none(value) for value in check.rms],
             "differences": {
-                name: [_number(value) for value in difference]
+                name: [or_none(value) for value in difference]
                 for name, difference in zip(check.points, check.differences, strict=True)
             },
         }
@@ -196,9 +199,9 @@ def _control(result: SurveyResult) -> dict[str, Any] | None:
         "points": [
             {
                 "id": name,
-                "difference": [_number(value) for value in difference],
-                "sigma": [_number(value) for value in sigma],
-                "ratio": [_number(value) for value in ratio],
+                "difference": [or_none(value) for value in difference],
+                "sigma": [or_none(value) for value in sigma],
+                "ratio": [or_none(value) for value in ratio],
             }
             for name, difference, sigma, ratio in zip(
                 found.points, found.difference, found.sigma, found.ratio, strict=True
@@ -215,10 +218,10 @@ def _scale_bars(adjustment: Adjustment) -> list[dict[str, Any]]:
         {
             "from": start,
             "to": end,
-            "length": _number(found.length[b]),
-            "difference": _number(found.difference[b]),
-            "sigma": _number(found.sigma[b]),
-            "ratio": _number(found.ratio[b]),
+            "length": or_none(found.length[b]),
+            "difference": or_none(found.difference[b]),
+            "sigma": or_none(found.sigma[b]),
+            "ratio": or_none(found.ratio[b]),
         }
         for b, (start, end) in enumerate(found.names)
     ]
@@ -229,9 +232,9 @@ def _eccentricity(result: SurveyResult) -> dict[str, Any] | None:
     if found is None:
         return None
     return {
-        "largest_px": _number(found.largest_px),
-        "rms_px": _number(found.rms_px),
-        "sigma_px": _number(found.sigma_px),
+        "largest_px": or_none(found.largest_px),
+        "rms_px": or_none(found.rms_px),
+        "sigma_px": or_none(found.sigma_px),
     }
 
 
@@ -244,11 +247,11 @@ def _comparison(result: SurveyResult) -> dict[str, Any] | None:
         "backend": both.backend,
         "agree": both.agree,
         "model": both.model,
-        "max_position": _number(difference.max_position),
-        "max_rotation_deg": _number(difference.max_rotation_deg),
-        "max_point": _number(difference.max_point),
-        "max_interior_px": _number(float(np.nanmax(difference.interior_px, initial=0.0))),
-        "object_size": _number(difference.object_size),
+        "max_position": or_none(difference.max_position),
+        "max_rotation_deg": or_none(difference.max_rotation_deg),
+        "max_point": or_none(difference.max_point),
+        "max_interior_px": or_none(float(np.nanmax(difference.interior_px, initial=0.0))),
+        "object_size": or_none(difference.object_size),
         "rms_px": {"kolinear": difference.rms_px[0], both.backend: difference.rms_px[1]},
         "cost": {"kolinear": difference.cost[0], both.backend: difference.cost[1]},
         "point_sigma_rms": {
@@ -267,8 +270,8 @@ def _comparison(result: SurveyResult) -> dict[str, Any] | None:
                 "camera": one.camera.name,
                 "from": one.source_model,
                 "to": one.camera.model,
-                "rms_px": _number(one.rms_px),
-                "max_px": _number(one.max_px),
+                "rms_px": or_none(one.rms_px),
+                "max_px": or_none(one.max_px),
             }
             for one in both.conversions
         ],
@@ -281,7 +284,7 @@ def _baseline(result: SurveyResult) -> dict[str, Any] | None:
         return None
 
     def pair(values: tuple[float, float]) -> dict[str, float | None]:
-        return {"kolinear": _number(values[0]), found.name: _number(values[1])}
+        return {"kolinear": or_none(values[0]), found.name: or_none(values[1])}
 
     return {
         "pipeline": found.name,
@@ -289,18 +292,14 @@ def _baseline(result: SurveyResult) -> dict[str, Any] | None:
         "rms_px": pair(found.rms_px),
         "seconds": pair(found.seconds),
         "targets": found.targets,
-        "target_rms_px": _number(found.target_rms_px),
-        "point_rms": _number(found.point_rms),
-        "max_point": _number(found.max_point),
-        "position_rms": _number(found.position_rms),
-        "max_rotation_deg": _number(found.max_rotation_deg),
+        "target_rms_px": or_none(found.target_rms_px),
+        "point_rms": or_none(found.point_rms),
+        "max_point": or_none(found.max_point),
+        "position_rms": or_none(found.position_rms),
+        "max_rotation_deg": or_none(found.max_rotation_deg),
     }
 
 
 def _point_sigma(covariance: FloatArray) -> float | None:
     """Root mean square standard deviation of a coordinate, object unit."""
-    return _number(root_mean_square(np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))))
-
-
-def _number(value: float) -> float | None:
-    return float(value) if math.isfinite(value) else None
+    return or_none(root_mean_square(np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))))

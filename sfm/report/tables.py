@@ -6,8 +6,6 @@ points: as measured). Numbers are written with enough digits to give the same nu
 
 from __future__ import annotations
 
-import csv
-import math
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
@@ -15,6 +13,7 @@ import numpy as np
 
 from sfm.adjustment.result import Adjustment
 from sfm.conventions import FloatArray, angles_from_rotation
+from sfm.file_values import csv_text
 from sfm.report.result import SurveyResult
 from sfm.report.statistics import Statistics, parameter_sigmas, statistics_of
 
@@ -186,17 +185,7 @@ def write_ply(path: Path, result: SurveyResult) -> None:
 
 
 def _write_csv(path: Path, header: str, rows: Iterable[Sequence[object]]) -> None:
-    with path.open("w", encoding="utf-8", newline="") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(header.split(","))
-        writer.writerows([_text(value) for value in row] for row in rows)
-
-
-def _text(value: object) -> str:
-    """Write a number with the digits that give it back, an unknown one as an empty cell."""
-    if isinstance(value, float | np.floating):
-        return repr(float(value)) if math.isfinite(value) else ""
-    return str(value)
+    path.write_text(csv_text(header.split(","), rows), encoding="utf-8", newline="")
 
 
 def _ascii(text: str) -> str:

@@ -12,8 +12,10 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from sfm.analysis.validation import SAME, SAME_COST, Trial, Validation
+from sfm.file_values import csv_text, or_none
 from sfm.report.markup import figure, table
-from sfm.report.pages import csv_text, page, png, write_files
+from sfm.report.pages import page, png, write_files
+from sfm.report.plots import BLUE, RED
 
 FILES = ("validation.csv", "validation.json", "validation.html")
 COLUMNS = (
@@ -47,7 +49,6 @@ COLUMNS = (
     "verdict",
     "reason",
 )
-BLUE, RED = "#1f5fa8", "#c8372d"
 TIME_CAPTION = (
     "Seconds of adjustment on one thread. The other adjuster runs until its cost stands still, for the sake "
     "of the comparison; in everyday use it stops earlier."
@@ -62,11 +63,8 @@ def write_validation(validation: Validation, out: Path) -> Path:
     """
     rows = [trial_row(trial) for trial in validation.trials]
     text = json.dumps(validation_summary(validation), indent=2, allow_nan=False)
-    return write_files(
-        out,
-        tuple(zip(FILES, (csv_text(COLUMNS, rows), text + "\n", validation_page(validation)), strict=True)),
-        main=FILES[-1],
-    )
+    texts = (csv_text(COLUMNS, rows), text + "\n", validation_page(validation))
+    return write_files(out, tuple(zip(FILES, texts, strict=True)), main=FILES[-1])
 
 
 def trial_row(trial: Trial) -> tuple[object, ...]:
@@ -90,10 +88,10 @@ def validation_summary(validation: Validation) -> dict[str, Any]:
         "networks": len(validation.trials),
         "passed": validation.passed,
         "verdicts": dict(validation.counts()),
-        "largest": {name: _number(value) for name, value, _ in largest(validation)},
+        "largest": {name: or_none(value) for name, value, _ in largest(validation)},
         "seconds": {
-            "kolinear": _number(sum(_known(t.seconds[0] for t in validation.trials))),
-            validation.backend: _number(sum(_known(t.seconds[1] for t in validation.trials))),
+            "kolinear": or_none(sum(_known(t.seconds[0] for t in validation.trials))),
+            validation.backend: or_none(sum(_known(t.seconds[1] for t in validation.trials))),
         },
         "trials": [_plain(asdict(trial)) for trial in validation.trials],
     }
@@ -211,10 +209,6 @@ def _max(values) -> float:  # type: ignore[no-untyped-def]
     return max(_known(values), default=math.nan)
 
 
-def _number(value: float) -> float | None:
-    return float(value) if math.isfinite(value) else None
-
-
 def _plain(value: Any) -> Any:
     """Return a value with NaN as None and tuples as lists."""
     if isinstance(value, dict):
@@ -222,7 +216,7 @@ def _plain(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [_plain(item) for item in value]
     if isinstance(value, float | np.floating):
-        return _number(float(value))
+        return or_none(float(value))
     if isinstance(value, np.integer | np.bool_):
         return value.item()
     return value

@@ -10,6 +10,7 @@ import numpy as np
 
 from sfm.conventions import FloatArray, angles_from_rotation, rotation_from_angles
 from sfm.errors import GeometryError
+from sfm.file_values import or_none
 from sfm.orientation.resection.choice import choose_by_line
 from sfm.orientation.resection.church import resect_church
 from sfm.orientation.resection.critical_cylinder import cylinder_warning
@@ -135,7 +136,7 @@ def _dlt(task: Task) -> dict[str, Any]:
     }
     return {
         "solutions": (solution,),
-        "sigma0_mm": _number(result.sigma0),
+        "sigma0_mm": or_none(result.sigma0),
         "redundancy": result.redundancy,
         "interior": interior,
     }
@@ -149,7 +150,7 @@ def _robust(task: Task) -> dict[str, Any]:
     fitting = Solution(result.position, result.rotation, result.residuals[result.inliers])
     return {
         "solutions": (fitting,),
-        "sigma0_mm": _number(result.sigma0 * task.c),
+        "sigma0_mm": or_none(result.sigma0 * task.c),
         "redundancy": int(2 * result.inliers.sum() - 6),
         "dispersion": _in_degrees(result.covariance),
         "residuals_mm": _rows(result.residuals * task.c),
@@ -168,7 +169,7 @@ def _least_squares(task: Task) -> dict[str, Any]:
     history[:, 3:] = np.degrees(history[:, 3:])
     return {
         "solutions": (Solution(result.position, result.rotation, result.residuals),),
-        "sigma0_mm": _number(result.sigma0 * task.c),
+        "sigma0_mm": or_none(result.sigma0 * task.c),
         "redundancy": result.redundancy,
         "dispersion": _in_degrees(result.covariance),
         "history": history.tolist(),
@@ -212,12 +213,7 @@ def _in_degrees(covariance: FloatArray) -> list[list[float | None]]:
 
 
 def _rows(values: FloatArray) -> list[list[float | None]]:
-    return [[_number(value) for value in row] for row in values]
-
-
-def _number(value: float) -> float | None:
-    """JSON knows no NaN."""
-    return float(value) if np.isfinite(value) else None
+    return [[or_none(value) for value in row] for row in values]
 
 
 def _row(name: str, number: int, one: dict[str, Any]) -> str:
