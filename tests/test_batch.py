@@ -10,7 +10,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import nullcontext
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 
 import psutil
@@ -163,6 +163,7 @@ def test_failures_are_rows_and_the_others_go_on(surveys: tuple[Path, ...], tmp_p
     assert [row.status for row in rows] == ["failed", "failed", "failed", "failed", "done"]
     assert "survey.name: found 3" in rows[0].reason
     assert "0 readable photographs" in rows[1].reason
+    assert all(f"photo {k}.png" in rows[1].reason for k in range(1, 6)) and "and 1 more" in rows[1].reason
     assert "letter.txt" in rows[2].reason
     assert "cannot be read" in rows[3].reason
     assert (out / "taken" / "letter.txt").exists()
@@ -246,6 +247,17 @@ def test_a_survey_that_kills_workers_is_set_aside(
     same = points_of(finished)
     assert points_of(out) == {name: same[name] for name in ("first", "third")}
     assert not [path for path in out.iterdir() if path.name.endswith((".part", ".old"))]
+
+
+def test_a_batch_that_comes_to_nothing_leaves_no_folder(surveys: tuple[Path, ...], tmp_path: Path) -> None:
+    @contextmanager
+    def absent() -> Iterator[DaskEngine]:
+        raise BackendError("nobody there")
+        yield
+
+    with pytest.raises(BackendError):
+        run_batch(surveys, tmp_path / "out" / "batch", absent(), ALONE, Notes())
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_disk_problem_ends_the_batch_with_one_line(surveys: tuple[Path, ...], tmp_path: Path) -> None:

@@ -91,7 +91,7 @@ def test_unreadable_files_are_named_once_with_their_reason(
         assert result.failed[1].reason.startswith("the file is truncated")
     for number in (3, 4, 5):
         (folder / f"photo {number}.png").write_bytes(b"")
-    with pytest.raises(GeometryError, match=r": 1 readable photograph, .*\(photo 1.png: the file is empty\)"):
+    with pytest.raises(GeometryError, match=r": 1 readable .* \(photo 1.png: the file is empty; "):
         run_survey(read_survey(folder / "survey.toml"), store=store)
 
 

@@ -69,7 +69,7 @@ def render_index(rows: Sequence[SurveyRow], name: str) -> str:
     remarked = sum(row.verdict == "fair" for row in rows)
     differs = sum(row.comparison == "differs" for row in rows)
     remarks = [f"{count[word]} {word}" for word in ("failed", "set aside", "not dependable") if count[word]]
-    remarks += [f"{remarked} with remarks: see their reports"] if remarked else []
+    remarks += [f"{remarked} with remarks, told in the report"] if remarked else []
     remarks += [f"{differs} where COLMAP's adjustment differs"] if differs else []
     level = "bad" if good < len(rows) else "fair" if remarked or differs else "good"
     above = _common_folder(rows)

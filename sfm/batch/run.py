@@ -11,7 +11,7 @@ import hashlib
 import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -101,7 +101,7 @@ def run_batch(
     """
     out = Path(out).resolve()
     plans = _plan(files, allow_outside=allow_outside)
-    with locked(out / LOCK) as before:
+    with _no_empty_folders(out), locked(out / LOCK) as before:
         if before is not None:
             watch.remark(f"an earlier run was cut off ({before}); what it had finished is safe")
         _clean(out, plans)
@@ -114,6 +114,18 @@ def run_batch(
         ordered = tuple(rows[plan.folder] for plan in plans)
         write_batch_pages(ordered, out)
     return ordered
+
+
+@contextmanager
+def _no_empty_folders(out: Path) -> Iterator[None]:
+    """Take away again what was made for a batch that has come to nothing."""
+    missing = [folder for folder in (out, *out.parents) if not folder.exists()]
+    try:
+        yield
+    finally:
+        for folder in (out / STORE, (out / LOCK).parent, out / LOGS, *missing):
+            with suppress(OSError):  # it is in use
+                folder.rmdir()
 
 
 def find_surveys(names: Sequence[str]) -> tuple[Path, ...]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -25,6 +26,7 @@ from sfm.targets.store import TargetStore, content_hash, target_key
 from sfm.targets.tags import TagFamily, target_family
 
 MIN_PHOTOGRAPHS = 2
+MAX_TOLD = 5  # photographs that a message names
 
 
 @dataclass(frozen=True)
@@ -96,15 +98,19 @@ def measure_photographs(
             pool.submit(_read_and_measure, photographs.paths[k], survey.targets, family, store): k
             for k in originals
         }
-        for done in as_completed(running):
-            k = running[done]
-            try:
-                found[k] = done.result()
-            except PhotographError as error:
-                failed[k] = FailedImage(photographs.names[k], why_failed(error, photographs.paths[k]))
-            progress.advance(photographs.names[k])
+        try:
+            for done in as_completed(running):
+                k = running[done]
+                try:
+                    found[k] = done.result()
+                except PhotographError as error:
+                    failed[k] = FailedImage(photographs.names[k], why_failed(error, photographs.paths[k]))
+                progress.advance(photographs.names[k])
+        except BaseException:  # Ctrl-C among them: nobody waits for photographs that are not begun
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
     if len(found) < MIN_PHOTOGRAPHS:
-        why = "".join(f" ({failed[k].image}: {failed[k].reason})" for k in sorted(failed)[:1])
+        why = in_brackets([failed[k] for k in sorted(failed)])
         raise GeometryError(
             f"survey {survey.name}: {len(found)} readable photograph{'' if len(found) == 1 else 's'}, "
             f"at least {MIN_PHOTOGRAPHS} are needed{why}"
@@ -120,6 +126,16 @@ def measure_photographs(
         tuple(found[k][1] for k in order),
         tuple(failed[k] for k in sorted(failed)),
     )
+
+
+def in_brackets(failed: Sequence[FailedImage]) -> str:
+    """Return which photographs could not be read and why, the first of many, to stand behind a message."""
+    if not failed:
+        return ""
+    told = [f"{one.image}: {one.reason}" for one in failed[:MAX_TOLD]]
+    if len(failed) > MAX_TOLD:
+        told.append(f"and {len(failed) - MAX_TOLD} more")
+    return f" ({'; '.join(told)})"
 
 
 def survey_family(survey: Survey) -> CodeFamily | TagFamily | None:

@@ -22,7 +22,7 @@ from sfm.settings import TiePointSettings
 from sfm.survey.cameras import start_cameras
 from sfm.survey.orientation import orient_survey
 from sfm.survey.start import PhotographList, approximate_values, control_points, scale_bars
-from sfm.survey.targets import MIN_PHOTOGRAPHS, find_copies, why_failed
+from sfm.survey.targets import MIN_PHOTOGRAPHS, find_copies, in_brackets, why_failed
 from sfm.targets.photograph import Metadata, read_metadata, read_photograph
 
 MIN_RAYS = 3  # photographs that must agree on a tie point; two rays cannot contradict each other
@@ -94,7 +94,7 @@ def tie_photographs(
             progress.advance(name)
     read = sorted(found)
     if len(read) < MIN_PHOTOGRAPHS:
-        why = "".join(f" ({one.image}: {one.reason})" for one in failed[:1])
+        why = in_brackets(failed)
         raise GeometryError(
             f"survey {survey.name}: {len(read)} readable photograph{'' if len(read) == 1 else 's'}, "
             f"at least {MIN_PHOTOGRAPHS} are needed{why}"
