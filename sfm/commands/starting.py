@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import os
 import signal
 import sys
@@ -52,6 +53,7 @@ def stopped_once() -> Iterator[None]:
     finally:
         if signal.getsignal(signal.SIGINT) is _stop:
             signal.signal(signal.SIGINT, before)
+        atexit.register(signal.signal, signal.SIGINT, signal.SIG_IGN)  # what is done is done
 
 
 def _stop(number: int, frame: FrameType | None) -> None:
