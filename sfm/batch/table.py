@@ -23,6 +23,8 @@ from sfm.compiling import COMPILING
 COLOURS = {"good": "green", "fair": "yellow", "bad": "red", "": "red"}
 RECENT = 8  # finished surveys that stay in sight
 REFRESHES_PER_SECOND = 4
+MEASURING_SHARE = 0.5  # of a survey's time, in small ones; the rest is its adjustment and report
+TELLING_SHARE = 0.05  # of a batch that must be done before it is told how long the rest takes
 
 
 @dataclass
@@ -104,7 +106,7 @@ class BatchTable:
         for row in self._recent:
             style = COLOURS[row.verdict]
             table.add_row(
-                Text(row.survey, style=style), Text(told_of(row), style=style), "", f"{row.seconds:.1f}"
+                Text(row.folder, style=style), Text(told_of(row), style=style), "", f"{row.seconds:.1f}"
             )
         for name, line in list(self._lines.items()):
             count = f"{line.photographs} of {line.total}" if line.total else ""
@@ -113,11 +115,13 @@ class BatchTable:
 
     def _sum(self, now: float) -> str:
         run = self._done + self._failed - self._kept
+        begun = sum(line.photographs / line.total for line in self._lines.values() if line.total)
+        run_share = (run + MEASURING_SHARE * begun) / max(1, run + self._left)
         text = f"{self._done + self._failed} of {self._done + self._failed + self._left} surveys"
         if self._failed:
             text += f", {self._failed} failed"
-        if run and self._left:
-            text += f", {_duration((now - self._begun) / run * self._left)} left"
+        if run_share >= TELLING_SHARE and self._left:
+            text += f", about {_duration((now - self._begun) * (1 / run_share - 1))} left"
         return text
 
 
