@@ -25,6 +25,9 @@ IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
 AnyArray = NDArray[Any]
 
+MAD_TO_SIGMA = 1.4826
+"""standard deviation of a normal variable over its median absolute deviation; Hampel (1974), JASA 69"""
+
 
 def rotation_from_angles(omega: float, phi: float, kappa: float) -> FloatArray:
     """Return R = Rx(omega) Ry(phi) Rz(kappa), which turns image axes into object axes.

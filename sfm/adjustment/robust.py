@@ -20,13 +20,12 @@ import numpy as np
 
 from sfm.adjustment.collinearity import Observations
 from sfm.adjustment.reliability import standardised_residuals, tau_critical
-from sfm.conventions import BoolArray, FloatArray
+from sfm.conventions import MAD_TO_SIGMA, BoolArray, FloatArray
 
 # In sigmas of a coordinate, for the length of a residual vector: both are 95 % efficient with normal errors
 # in the plane (for a single coordinate they would be 1.345 and 4.685).
 HUBER = 1.501
 TUKEY = 5.123
-NORMAL_MAD = 1.4826  # standard deviation of a normal variable over its median absolute deviation
 LEAST_FREEDOM = 0.05  # of redundancy over observations, so that a network without redundancy has a scale
 
 
@@ -106,7 +105,7 @@ def robust_scale(obs: Observations, residuals: FloatArray, used: BoolArray, *, f
     a, b, c = obs.whitening[used].T
     v = residuals[used]
     whitened = np.abs(np.concatenate([a * v[:, 0], b * v[:, 0] + c * v[:, 1]]))
-    scale = NORMAL_MAD * float(np.median(whitened)) / np.sqrt(max(freedom, LEAST_FREEDOM))
+    scale = MAD_TO_SIGMA * float(np.median(whitened)) / np.sqrt(max(freedom, LEAST_FREEDOM))
     return max(scale, np.finfo(float).tiny)
 
 

@@ -203,6 +203,8 @@ def _run(backend: ValidationBackend, seed: int, networks: int, jobs: int) -> Ite
             for number in range(networks):
                 yield make_trial(number, seed, backend)
         return
+    with threadpool_limits(1):
+        warm_up(backend)  # compiles, where it must, once and not in every worker
     # Fresh processes: threads of compiled libraries do not survive a fork.
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(jobs, mp_context=context, initializer=_begin, initargs=(backend,)) as pool:

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from sfm.camera import Camera, project, tangents_from_pixel
-from sfm.conventions import FloatArray
+from sfm.conventions import MAD_TO_SIGMA, FloatArray
 from sfm.errors import GeometryError
 from sfm.network import Estimate, Network, empty_estimate, reduce_network
 from sfm.orientation.intersection import intersect
@@ -23,7 +23,6 @@ TOLERANCE_FACTOR = 6.0  # times the robust spread of the residuals
 EARLY = ("c", "fx", "fy", "K1", "k1")  # parameters that few photographs determine
 ALL_FREE_PHOTOGRAPHS = 6  # from which on all parameters are adjusted
 SURPLUS_PER_PARAMETER = 3  # observations beyond the exterior orientations for each free parameter
-MAD_TO_SIGMA = 1.4826  # median absolute deviation of a normal distribution
 
 Refine = Callable[[Network, Estimate], Estimate]
 

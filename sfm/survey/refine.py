@@ -11,14 +11,14 @@ from sfm.adjustment.datum import Datum
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.camera import Camera
-from sfm.conventions import BoolArray, FloatArray, IntArray
+from sfm.conventions import MAD_TO_SIGMA, BoolArray, FloatArray, IntArray
 from sfm.errors import GeometryError, PhotographError, SurveyFileError
 from sfm.matching.flags import LsmFlag, in_words
 from sfm.matching.multi_lsm import match_multi
 from sfm.matching.pictures import pictures_of
 from sfm.network import Estimate, ImagePoints, Network, reduce_network
 from sfm.progress import SILENT, Progress
-from sfm.survey.solution import FALSE_ALARM, MAD_TO_SIGMA, TOLERANCE_FACTOR, determined, put_back
+from sfm.survey.solution import FALSE_ALARM, TOLERANCE_FACTOR, determined, put_back
 from sfm.targets.photograph import read_photograph
 
 MIN_RAYS = 3

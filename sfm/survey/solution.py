@@ -9,7 +9,7 @@ import numpy as np
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
-from sfm.conventions import BoolArray, IntArray
+from sfm.conventions import MAD_TO_SIGMA, BoolArray, IntArray
 from sfm.errors import GeometryError
 from sfm.network import Estimate, Network, reduce_network, supported
 from sfm.orientation.sequence import Orientation
@@ -27,7 +27,6 @@ FALSE_ALARM = 0.05  # chance that a survey without any outlier loses an image co
 MIN_IMAGE_POINTS = 4  # of a photograph in the final adjustment: three determine it, the fourth checks
 MIN_DATUM_POINTS = 3  # that fix position, attitude and scale
 MOST_NAMES = 10  # points named in one line
-MAD_TO_SIGMA = 1.4826  # of a normal distribution; Hampel (1974), J. Am. Stat. Assoc. 69
 
 
 @dataclass(frozen=True)

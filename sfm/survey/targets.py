@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor, as_completed
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -12,21 +9,18 @@ import numpy as np
 
 from sfm.camera import Camera
 from sfm.conventions import FloatArray, IntArray
-from sfm.errors import GeometryError, PhotographError
 from sfm.progress import SILENT, Progress
 from sfm.project import Survey
 from sfm.report.result import FailedImage, PhotographTargets
 from sfm.settings import TargetSettings
 from sfm.survey.cameras import start_cameras
+from sfm.survey.photographs import each_photograph
 from sfm.survey.start import PhotographList
 from sfm.targets.codes import CodeFamily
 from sfm.targets.detect import Targets, find_targets
 from sfm.targets.photograph import Metadata, read_metadata, read_photograph
-from sfm.targets.store import TargetStore, content_hash, target_key
+from sfm.targets.store import TargetStore, target_key
 from sfm.targets.tags import TagFamily, target_family
-
-MIN_PHOTOGRAPHS = 2
-MAX_TOLD = 5  # photographs that a message names
 
 
 @dataclass(frozen=True)
@@ -83,38 +77,13 @@ def measure_photographs(
         SurveyFileError: the code table or the start values of a camera are unusable.
     """
     family = survey_family(survey)
-    found: dict[int, tuple[Metadata, Targets]] = {}
-    failed: dict[int, FailedImage] = {}
-    originals: list[int] = []
-    for k, first in enumerate(find_copies(photographs)):
-        if first == k:
-            originals.append(k)
-        else:
-            reason = f"identical to {photographs.names[first]}"
-            failed[k] = FailedImage(photographs.names[k], reason)
-            progress.advance(photographs.names[k])
-    with ThreadPoolExecutor(max_workers=max(1, jobs)) as pool:
-        running = {
-            pool.submit(_read_and_measure, photographs.paths[k], survey.targets, family, store): k
-            for k in originals
-        }
-        try:
-            for done in as_completed(running):
-                k = running[done]
-                try:
-                    found[k] = done.result()
-                except PhotographError as error:
-                    failed[k] = FailedImage(photographs.names[k], why_failed(error, photographs.paths[k]))
-                progress.advance(photographs.names[k])
-        except BaseException:  # Ctrl-C among them: nobody waits for photographs that are not begun
-            pool.shutdown(wait=False, cancel_futures=True)
-            raise
-    if len(found) < MIN_PHOTOGRAPHS:
-        why = in_brackets([failed[k] for k in sorted(failed)])
-        raise GeometryError(
-            f"survey {survey.name}: {len(found)} readable photograph{'' if len(found) == 1 else 's'}, "
-            f"at least {MIN_PHOTOGRAPHS} are needed{why}"
-        )
+    found, failed = each_photograph(
+        survey,
+        photographs,
+        lambda path: _read_and_measure(path, survey.targets, family, store),
+        jobs=jobs,
+        progress=progress,
+    )
     order = sorted(found)
     names = tuple(photographs.names[k] for k in order)
     camera = photographs.camera[order]
@@ -124,18 +93,8 @@ def measure_photographs(
         camera,
         start_cameras(survey, tuple(found[k][0] for k in order), camera, names),
         tuple(found[k][1] for k in order),
-        tuple(failed[k] for k in sorted(failed)),
+        failed,
     )
-
-
-def in_brackets(failed: Sequence[FailedImage]) -> str:
-    """Return which photographs could not be read and why, the first of many, to stand behind a message."""
-    if not failed:
-        return ""
-    told = [f"{one.image}: {one.reason}" for one in failed[:MAX_TOLD]]
-    if len(failed) > MAX_TOLD:
-        told.append(f"and {len(failed) - MAX_TOLD} more")
-    return f" ({'; '.join(told)})"
 
 
 def survey_family(survey: Survey) -> CodeFamily | TagFamily | None:
@@ -150,31 +109,11 @@ def survey_family(survey: Survey) -> CodeFamily | TagFamily | None:
     return family
 
 
-def find_copies(photographs: PhotographList) -> tuple[int, ...]:
-    """Return for every photograph the first one whose file has the same bytes, itself where there is none.
-
-    A copy is no second observation: it would only make the result look more precise than it is.
-    """
-    first = list(range(len(photographs)))
-    seen: dict[tuple[int, str], int] = {}
-    sizes = [path.stat().st_size if path.is_file() else 0 for path in photographs.paths]
-    for k, path in enumerate(photographs.paths):
-        if sizes[k] and sizes.count(sizes[k]) > 1:
-            with suppress(PhotographError):  # what cannot be read is said where it is measured
-                first[k] = seen.setdefault((sizes[k], content_hash(path)), k)
-    return tuple(first)
-
-
 def _read_and_measure(
     path: Path, settings: TargetSettings, family: CodeFamily | TagFamily | None, store: TargetStore | None
 ) -> tuple[Metadata, Targets]:
     targets, _ = measure_photograph(path, settings, family, store)  # says best what is wrong with a file
     return read_metadata(path), targets
-
-
-def why_failed(error: PhotographError, path: Path) -> str:
-    """Return why a photograph cannot be read, without its name, which stands beside the reason."""
-    return str(error).removeprefix(f"{path.name}: ")
 
 
 def measure_photograph(

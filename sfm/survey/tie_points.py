@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -10,7 +9,7 @@ import numpy as np
 
 from sfm.camera import Camera, tangents_from_pixel
 from sfm.conventions import AnyArray, BoolArray, IntArray
-from sfm.errors import GeometryError, PhotographError
+from sfm.errors import GeometryError
 from sfm.matching.tie_points import find_tie_points
 from sfm.network import ImagePoints, Network, reduce_network
 from sfm.orientation.intersection import intersect
@@ -21,8 +20,8 @@ from sfm.report.result import FailedImage, PhotographTargets
 from sfm.settings import TiePointSettings
 from sfm.survey.cameras import start_cameras
 from sfm.survey.orientation import orient_survey
+from sfm.survey.photographs import each_photograph
 from sfm.survey.start import PhotographList, approximate_values, control_points, scale_bars
-from sfm.survey.targets import MIN_PHOTOGRAPHS, find_copies, in_brackets, why_failed
 from sfm.targets.photograph import Metadata, read_metadata, read_photograph
 
 MIN_RAYS = 3  # photographs that must agree on a tie point; two rays cannot contradict each other
@@ -76,29 +75,8 @@ def tie_photographs(
         PhotographError: photographs of different size under one camera.
         SurveyFileError: the start values of a camera are incomplete.
     """
-    found: dict[int, tuple[Metadata, AnyArray]] = {}
-    failed: list[FailedImage] = []
-    first = find_copies(photographs)
-    with ThreadPoolExecutor(max(1, jobs)) as pool:
-        reading = [
-            pool.submit(_read, path) if first[k] == k else None for k, path in enumerate(photographs.paths)
-        ]
-        for k, (name, one) in enumerate(zip(photographs.names, reading, strict=True)):
-            if one is None:
-                failed.append(FailedImage(name, f"identical to {photographs.names[first[k]]}"))
-            else:
-                try:
-                    found[k] = one.result()
-                except PhotographError as error:
-                    failed.append(FailedImage(name, why_failed(error, photographs.paths[k])))
-            progress.advance(name)
+    found, failed = each_photograph(survey, photographs, _read, jobs=jobs, progress=progress)
     read = sorted(found)
-    if len(read) < MIN_PHOTOGRAPHS:
-        why = in_brackets(failed)
-        raise GeometryError(
-            f"survey {survey.name}: {len(read)} readable photograph{'' if len(read) == 1 else 's'}, "
-            f"at least {MIN_PHOTOGRAPHS} are needed{why}"
-        )
     names = tuple(photographs.names[k] for k in read)
     camera: IntArray = photographs.camera[read]
     cameras = start_cameras(survey, tuple(found[k][0] for k in read), camera, names)
@@ -129,7 +107,7 @@ def tie_photographs(
         replace(network, control=control, scale_bars=bars),
         cameras,
         tuple(photographs.paths[k] for k in read),
-        tuple(failed),
+        failed,
     )
 
 

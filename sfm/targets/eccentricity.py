@@ -16,14 +16,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sfm.conventions import FloatArray, IntArray
+from sfm.conventions import MAD_TO_SIGMA, FloatArray, IntArray
 
 STEPS = 30  # of Gauss-Newton at most; it settles in six to ten
 SETTLED = 1e-8  # change of the normal, rad, and relative change of the radius
 DIFFERENCE = 1e-6  # step of the difference quotients, rad and relative
 LONGEST_STEP = 0.3  # rad and relative; ellipses change their kind beyond
 HUBER = 2.0  # residuals beyond this many robust sigma lose weight; Huber (1981), Robust Statistics, ch. 4
-MAD_TO_SIGMA = 1.4826  # of a normal distribution
 
 
 @dataclass(frozen=True)
