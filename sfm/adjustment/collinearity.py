@@ -175,20 +175,6 @@ def _residual(o, obs, state, t):  # type: ignore[no-untyped-def]
     return W < 0.0  # one way out: with an early return the compiler keeps the unused derivatives
 
 
-def whitening_of(covariance: FloatArray) -> FloatArray:
-    """Return a, b, c of F = (a 0; b c) with F'F = inverse covariance, shape (k, 3).
-
-    Args:
-        covariance: of image points, px^2, shape (k, 2, 2).
-
-    The inverse of the Cholesky factor of the covariance.
-    """
-    sx = np.sqrt(covariance[:, 0, 0])
-    slope = covariance[:, 0, 1] / sx
-    sy = np.sqrt(covariance[:, 1, 1] - slope**2)
-    return np.stack([1 / sx, -slope / (sx * sy), 1 / sy], axis=1)
-
-
 def behind_camera(obs: Observations, state: State) -> BoolArray:
     """Return which image points belong to object points behind their camera or undetermined, (k,)."""
     behind = np.empty(len(obs.image), dtype=np.bool_)

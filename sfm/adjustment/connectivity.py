@@ -17,7 +17,6 @@ from numba import njit
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
-from sfm.adjustment.collinearity import Observations
 from sfm.adjustment.parameters import Unknowns
 from sfm.conventions import IntArray
 
@@ -62,23 +61,6 @@ def band_order(layout: Unknowns) -> Order | None:
     earliest = np.full(len(rays), m)
     np.minimum.at(earliest, obs.point, place[obs.image])
     return Order(place, np.argsort(earliest, kind="stable"), width)
-
-
-def by_photograph(obs: Observations) -> tuple[IntArray, IntArray]:
-    """Return the image points photograph by photograph (k,), and where each photograph starts (m + 1,)."""
-    count = np.bincount(obs.image, minlength=len(obs.camera))
-    first = np.concatenate([[0], np.cumsum(count)])
-    order = np.empty(len(obs.image), dtype=np.int64)
-    _sort(obs.image, first[:-1].copy(), order)
-    return order, first
-
-
-@njit(cache=True)
-def _sort(key, place, order):  # type: ignore[no-untyped-def]
-    """Counting sort: place holds where the next one of each key goes."""
-    for o in range(len(key)):
-        order[place[key[o]]] = o
-        place[key[o]] += 1
 
 
 @njit(cache=True)

@@ -121,9 +121,10 @@ def iterate(
         single = False
     share = 1.0
     before: tuple[State, Step] | None = None
+    limit = np.inf
     shortest = 1.0 if method == "undamped" else SHORTEST
     while True:
-        found = _solve(problem, state, weight, single=single)
+        found = _solve(problem, state, weight, single=single, limit=limit)
         if found is None:
             if before is None:
                 _refuse(problem, state)
@@ -132,17 +133,15 @@ def iterate(
             if better is None:  # no share of the last step leads where they can be solved
                 state, found = start, _solve(problem, start, weight)
                 break
-            state, share = better
+            (state, share), limit = better, np.inf
             continue
         if found.within(tolerance) or taken >= max_iterations:
             break
         taken += 1
         single = single and not found.within(FAR)
-        better = _line_search(problem, state, weight, found, 1.0, shortest)
-        if better is None:
-            break
-        before = state, found
-        state, share = better
+        before, share = (state, found), 1.0
+        state = step(layout, state, found.reduced, found.points)  # tried by the next normal equations
+        limit = _most_allowed(found, share, shortest)
     if found is None:
         _refuse(problem, state)
     converged, vPv = found.within(tolerance), found.equations.vPv
@@ -169,9 +168,15 @@ def optimum_at(problem: Problem, state: State, weight: FloatArray) -> Optimum | 
 
 
 def _solve(
-    problem: Problem, state: State, weight: FloatArray, *, damping: float = 0.0, single: bool = False
+    problem: Problem,
+    state: State,
+    weight: FloatArray,
+    *,
+    damping: float = 0.0,
+    single: bool = False,
+    limit: float = np.inf,
 ) -> Step | None:
-    """Return the step from a state; None where the normal equations cannot be solved.
+    """Return the step from a state; None where the normal equations cannot be solved or v'Pv is too large.
 
     Args:
         problem: what is adjusted.
@@ -179,10 +184,11 @@ def _solve(
         weight: factor on the weight of each image point, shape (k,).
         damping: share of its diagonal added to the normal matrix.
         single: whether single precision will do while the step is far from convergence.
+        limit: largest v'Pv.
     """
     p, layout = problem, problem.layout
     equations = normal_equations(layout, p.weighted, state, weight, damping=damping, space=p.space)
-    if not (np.isfinite(equations.vPv) and np.isfinite(equations.parts.g).all()):
+    if equations.vPv > limit or not (np.isfinite(equations.vPv) and np.isfinite(equations.parts.g).all()):
         return None
     try:
         motions = motions_of(layout, p.weighted, state, p.datum)
@@ -250,12 +256,17 @@ def _line_search(
         share: first share to try.
         shortest: last share to try; 1 takes the full step whatever it brings, if it can be computed.
     """
-    wanted = -np.inf if shortest == 1.0 else 2 * ARMIJO * found.predicted
-    before = found.equations.vPv * (1 + ROUNDING)
     while share >= shortest:
         moved = step(problem.layout, state, share * found.reduced, share * found.points)
         reached = total(problem, moved, weight)
-        if np.isfinite(reached) and reached <= before - share * wanted:
+        if np.isfinite(reached) and reached <= _most_allowed(found, share, shortest):
             return moved, share
         share /= 2
     return None
+
+
+def _most_allowed(found: Step, share: float, shortest: float) -> float:
+    """Return the largest v'Pv with which a share of a step meets Armijo's condition."""
+    if shortest == 1.0:
+        return np.inf
+    return found.equations.vPv * (1 + ROUNDING) - share * 2 * ARMIJO * found.predicted

@@ -23,7 +23,7 @@ from sfm.adjustment.accumulate import (
     step_points,
 )
 from sfm.adjustment.collinearity import State, scratch
-from sfm.adjustment.connectivity import by_photograph
+from sfm.adjustment.ordering import by_photograph
 from sfm.adjustment.parameters import Unknowns
 from sfm.adjustment.weighted import Weighted, point_terms, weighted_terms
 from sfm.conventions import FloatArray, IntArray
@@ -161,7 +161,7 @@ def new_blocks(layout: Unknowns) -> Blocks:
     m, n, k = len(layout.exterior_free), len(layout.point_free), len(layout.order)
     a = len(layout.interior_free)
     f = max(len(free) for free in layout.interior_free)
-    order, first = by_photograph(layout.obs)
+    order, first = by_photograph(layout.obs.image, m)
     most = int(np.diff(first).max())
     width = -(-(RESIDUAL + 1 + f) // 4) * 4  # whole vector registers
     return Blocks(

@@ -12,7 +12,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sfm.adjustment.collinearity import Observations, State, behind_camera, whitening_of
+from sfm.adjustment.collinearity import Observations, State, behind_camera
+from sfm.adjustment.ordering import by_point, whitening_of
 from sfm.camera import Camera
 from sfm.conventions import BoolArray, FloatArray, IntArray, angles_from_rotation, rotation_from_vector
 from sfm.distortion.models import MAX_PARAMETERS
@@ -95,15 +96,16 @@ def unknowns_of(network: Network, estimate: Estimate, *, use_control: bool) -> t
         exterior_known[network.exterior.image] = np.isfinite(variance)
 
     start = replace(estimate, position=position, points=points)
-    active, point_on, held, held_defect = _hold_undetermined(
+    active, seen, rays, held, held_defect = _hold_undetermined(
         network, start, exterior_free, exterior_known, point_free, point_known
     )
-    if not active.any():
+    if not seen.any():
         raise GeometryError("adjustment: no image point joins an oriented photograph and a determined point")
 
     interior_free = tuple(np.flatnonzero(camera.free) for camera in estimate.cameras)
     counts = np.array([len(free) for free in interior_free], dtype=np.int64)
-    used = np.bincount(network.camera[np.unique(k.image[active])], minlength=len(counts)) > 0
+    image_on, point_on = seen > 0, rays > 0
+    used = np.bincount(network.camera[image_on], minlength=len(counts)) > 0
     interior_free = tuple(f if u else f[:0] for f, u in zip(interior_free, used, strict=True))
     counts = np.where(used, counts, 0)
     free_index = np.zeros((len(counts), MAX_PARAMETERS), dtype=np.int64)
@@ -116,13 +118,13 @@ def unknowns_of(network: Network, estimate: Estimate, *, use_control: bool) -> t
     ends = np.concatenate([network.scale_bars.start[bars], network.scale_bars.end[bars]])
     kept = np.unique(ends).astype(np.int64)
 
-    order = np.argsort(k.point * m + k.image, kind="stable")
+    order, rays_from = by_point(k, m, n)
     obs = Observations(
-        start=np.searchsorted(k.point[order], np.arange(n + 1)).astype(np.int64),
-        image=np.ascontiguousarray(k.image[order], dtype=np.int64),
-        point=np.ascontiguousarray(k.point[order], dtype=np.int64),
-        xy=np.ascontiguousarray(k.xy[order], dtype=float),
-        whitening=whitening_of(k.covariance[order]),
+        start=rays_from,
+        image=np.take(k.image, order).astype(np.int64, copy=False),
+        point=np.repeat(np.arange(n), np.diff(rays_from)),
+        xy=np.take(k.xy, order, axis=0).astype(float, copy=False),
+        whitening=whitening_of(k.covariance, order),
         camera=np.ascontiguousarray(network.camera, dtype=np.int64),
         model=np.array([camera.index for camera in estimate.cameras], dtype=np.int64),
         frame=np.array([camera.frame for camera in estimate.cameras]),
@@ -139,8 +141,8 @@ def unknowns_of(network: Network, estimate: Estimate, *, use_control: bool) -> t
         interior_free=interior_free,
         interior_column=columns,
         point_free=point_free,
-        image_on=np.bincount(k.image[active], minlength=m) > 0,
-        point_on=np.bincount(k.point[active], minlength=n) > 0,
+        image_on=image_on,
+        point_on=point_on,
         kept=kept,
         bars=bars,
         reduced=6 * m + interior + 3 * len(kept),
@@ -259,8 +261,12 @@ def _hold_undetermined(
     exterior_known: BoolArray,
     point_free: BoolArray,
     point_known: BoolArray,
-) -> tuple[BoolArray, BoolArray, tuple[str, ...], int]:
-    """Hold photographs and points with too few image points, until none is left; clears their free flags."""
+) -> tuple[BoolArray, IntArray, IntArray, tuple[str, ...], int]:
+    """Hold photographs and points with too few image points, until none is left; clears their free flags.
+
+    Returns which image points take part, how many of each photograph and of each point, who is held, in
+    words, and the rank defect that these would have had.
+    """
     k = network.image_points
     m, n = len(network.images), len(network.points)
     image_on, point_on = estimate.oriented.copy(), estimate.determined.copy()
@@ -271,8 +277,9 @@ def _hold_undetermined(
     defect = 0
     while True:
         active = image_on[k.image] & point_on[k.point]
-        seen = np.bincount(k.image[active], minlength=m)
-        rays = np.bincount(k.point[active], minlength=n)
+        every = bool(active.all())
+        seen = np.bincount(k.image if every else k.image[active], minlength=m)
+        rays = np.bincount(k.point if every else k.point[active], minlength=n)
         lost_points = point_on & needs_rays & (rays < MIN_RAYS)
         lost_images = image_on & needs_points & (seen < MIN_POINTS)
         if not (lost_points.any() or lost_images.any()):
@@ -290,4 +297,4 @@ def _hold_undetermined(
         image_on &= ~lost_images
     exterior_free[~image_on] = False
     point_free[~point_on] = False
-    return active, point_on, tuple(held), defect
+    return active, seen, rays, tuple(held), defect

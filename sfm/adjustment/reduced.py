@@ -17,7 +17,7 @@ import numpy as np
 from numba import njit
 from scipy.linalg import eigh
 from scipy.linalg.blas import dsymm, dsyrk, ssyrk
-from scipy.linalg.lapack import dpotrf, dpotrs, dtrtri
+from scipy.linalg.lapack import dpotrf, dpotrs, dtrtri, spotrf, spotrs
 
 from sfm.adjustment.datum import Motions
 from sfm.adjustment.normals import Blocks, Equations
@@ -27,6 +27,7 @@ from sfm.errors import GeometryError
 
 NULL = 1e-12  # eigenvalue of the scaled matrix (diagonal at most 1) taken as 0; rounding leaves 1e-15
 WEAK_PIVOT = 1e-11  # squared pivot below which the eigenvalues are looked at
+WEAK_SINGLE = 1e-5  # the same in single precision, whose rounding leaves 1e-6
 LARGEST_BYTES = 6e9  # of the full matrix; larger ones would swap
 
 
@@ -43,7 +44,8 @@ class Factor:
     def solve(self, right: FloatArray) -> FloatArray:
         """Return S^+ right for one or several right sides, (reduced,) or (reduced, r)."""
         s = self.scale if right.ndim == 1 else self.scale[:, None]
-        x, _ = dpotrs(self.cholesky, s * right)
+        solved = dpotrs if self.cholesky.dtype == np.float64 else spotrs
+        x, _ = solved(self.cholesky, s * right)
         return np.asarray(s * x)
 
     def verified(self) -> int:
@@ -70,7 +72,7 @@ def factor(
         layout: order of the unknowns.
         motions: null vectors that the datum explains.
         damped: whether the equations carry damping, so that no further null vectors are sought.
-        single: whether Y Y' may be summed in single precision, for a step on the way.
+        single: whether all this may be in single precision, for a step on the way; None if that is too weak.
 
     Raises:
         GeometryError: the matrix would not fit in memory.
@@ -79,12 +81,16 @@ def factor(
     S = schur_complement(equations, layout, single=single)
     Q = np.linalg.qr(motions.reduced / scale[:, None])[0] if motions.defect else motions.reduced
     if motions.defect:
-        S = dsyrk(1.0, Q, beta=1.0, c=S, overwrite_c=1)
+        S = (ssyrk if single else dsyrk)(1.0, Q, beta=1.0, c=S, overwrite_c=1)
     further = np.zeros((len(S), 0))
+    if single:
+        cholesky, info = spotrf(S, clean=0, overwrite_a=1)
+        weak = info != 0 or float(np.diagonal(cholesky).min()) ** 2 < WEAK_SINGLE
+        return None if weak else Factor(scale, S, cholesky, Q, further)
     cholesky, info = dpotrf(S, clean=0)
     weak = info != 0 or float(np.diagonal(cholesky).min()) ** 2 < WEAK_PIVOT
-    if weak and (damped or single):
-        return None if info != 0 or single else Factor(scale, S, cholesky, Q, further)
+    if weak and damped:
+        return None if info != 0 else Factor(scale, S, cholesky, Q, further)
     if weak:
         values, vectors = eigh(S, lower=False)
         further = np.asfortranarray(vectors[:, values < NULL])
@@ -128,7 +134,6 @@ def schur_complement(equations: Equations, layout: Unknowns, *, single: bool = F
     S = np.zeros((layout.reduced, layout.reduced), order="F", dtype=dtype)
     for _, rows in rows_of(b, layout, parts.scale, dtype):
         S = product(-1.0, rows.T, beta=1.0, c=S, overwrite_c=1)
-    S = np.asarray(S, dtype=np.float64, order="F")
     _add_blocks(b.U, parts.border, parts.corner, parts.scale, 1 + equations.damping, S)
     return S
 

@@ -205,8 +205,9 @@ def _result(
     redundancy = run.redundancy(optimum, weight)
     sigma0 = float(np.sqrt(optimum.vPv / redundancy)) if redundancy > 0 else float("nan")
     k, n, m = len(weight), len(network.points), len(network.images)
-    numbers = np.full((k, 2), np.nan)
-    standardised = np.full((k, 2), np.nan)
+    back = np.empty(k, dtype=np.int64)  # place of each image point of the network in the layout
+    back[layout.order] = np.arange(k)
+    numbers = standardised = np.full((k, 2), np.nan)
     v = residuals(layout.obs, optimum.state)
     if Q is None:
         empty = np.full((n, 3, 3), np.nan)
@@ -219,9 +220,8 @@ def _result(
         complement = hat_complement(optimum, layout, Q, weight)
         numbers = numbers_of(complement, layout.obs.whitening)
         numbers[weight == 0] = np.nan
-        standardised = standardised_residuals(v, complement, layout.obs.whitening)
-    unsorted = np.empty(k, dtype=np.int64)
-    unsorted[layout.order] = np.arange(k)
+        numbers = np.take(numbers, back, axis=0)
+        standardised = np.take(standardised_residuals(v, complement, layout.obs.whitening), back, axis=0)
     allowed = 0 if run.problem.datum.kind == "control" else 7
     return Adjustment(
         network=network,
@@ -232,16 +232,16 @@ def _result(
         defect=rank_defect(optimum, layout),
         expected_defect=optimum.motions.defect,
         undetermined=undetermined_of(optimum, layout, network, estimate, allowed_motions=allowed),
-        residuals=v[unsorted],
-        rejected=(weight == 0)[unsorted],
-        redundancy_numbers=numbers[unsorted],
+        residuals=np.take(v, back, axis=0),
+        rejected=np.take((weight == 0), back, axis=0),
+        redundancy_numbers=numbers,
         sigma_px=sigma_px,
         sigma0=sigma0,
         redundancy=redundancy,
         unknowns=layout.count,
         observations=2 * int((weight > 0).sum()) + run.problem.weighted.count,
         covariance=result,
-        standardised=standardised[unsorted],
-        weights=weight[unsorted],
+        standardised=standardised,
+        weights=np.take(weight, back, axis=0),
         datum_points=run.problem.datum.points,
     )
