@@ -107,9 +107,8 @@ def test_batch_gives_folders_tables_and_logs(finished: Path) -> None:
         assert len(photographs) == (0 if row["survey"] == "third" else 6)
         assert all(entry["targets"] >= 10 and not entry["stored"] for entry in photographs)
     assert sorted(p.name for p in finished.iterdir()) == [
-        *(".kolinear", "batch.csv", "batch.json", "first", "index.html", "logs", "second", "third"),
+        *(".kolinear", "batch.csv", "batch.json", "first", "index.html", "second", "third"),
     ]
-    assert not list((finished / "logs").iterdir())
     assert not (finished / ".kolinear" / "lock").exists()
 
 
