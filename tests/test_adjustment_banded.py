@@ -7,14 +7,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from synthetic import seed_of
+from threadpoolctl import threadpool_limits
 
-from sfm.adjustment import iterate
+from sfm.adjustment import iterate, normals
 from sfm.adjustment.band_inverse import band_inverse
 from sfm.adjustment.banded import BandFactor
 from sfm.adjustment.connectivity import Order, band_order
 from sfm.adjustment.covariance import hat_complement, marginal_covariance
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.marginal import Marginal, marginal_of
+from sfm.adjustment.normals import HALVED, MANY_RAYS
 from sfm.adjustment.parameters import unknowns_of
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
@@ -264,3 +266,18 @@ def test_nowhere_to_go_ends_as_not_converged_and_bad_start_values_are_refused(
     monkeypatch.setattr(iterate, "factor", lambda *args, **options: None)
     with pytest.raises(GeometryError, match="start values"):
         run(network, start, method="gauss-newton", covariance=False)
+
+
+def test_two_threads_give_the_same_to_the_last_bit(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a network large enough that a second thread takes half of the sums and of the products."""
+    network, truth = aerial("threads", 4, 14, 600, rays=40.0)
+    assert len(network.image_points) >= max(HALVED, MANY_RAYS * len(network.points))
+    results = []
+    for threads in (1, 2):
+        with threadpool_limits(threads):
+            a = run(network, truth)
+        results.append(a.estimate.points.tobytes() + a.covariance.points.tobytes())
+    assert results[0] == results[1]
+    monkeypatch.setattr(normals, "HALVED", len(network.image_points) + 1)
+    whole = run(network, truth)  # the sums in another order
+    assert np.abs(whole.estimate.points - a.estimate.points).max() < 1e-9 * HEIGHT

@@ -20,38 +20,51 @@ STIFF = 1e10  # factor on the pivot that holds such a direction of a point
 RESIDUAL = 6  # column of the residual among A: X0, w, residual, interior
 
 
-@njit(cache=True, error_model="numpy")
-def add_photographs(obs, state, weight, exterior_free, t, b):  # type: ignore[no-untyped-def]
-    """Fill all blocks but those of points by themselves; return v'Pv, infinite with points behind cameras."""
-    b.D[:] = 0.0
-    b.gi[:] = 0.0
-    b.Z[:] = 0.0
+@njit(cache=True, error_model="numpy", nogil=True)
+def add_photographs(obs, state, weight, exterior_free, t, s, b):  # type: ignore[no-untyped-def]
+    """Fill the blocks U, C, g, Y of some photographs and add to the sums over photographs.
+
+    Args:
+        obs: image points.
+        state: values of all parameters.
+        weight: factor on the weight of each image point, (k,).
+        exterior_free: (m, 6).
+        t: space for one image point.
+        s: which photographs, and the sums that they add to.
+        b: blocks.
+
+    Returns:
+        Their v'Pv, infinite with a point behind the camera.
+    """
+    s.D[:] = 0.0
+    s.gi[:] = 0.0
+    s.Z[:] = 0.0
     vPv = 0.0
-    for i in range(len(obs.camera)):
+    for i in range(s.first, s.end):
         a = obs.camera[i]
-        rays = _derivatives(i, obs, state, weight, t, b)
-        A = b.A[: 2 * abs(rays)]
+        rays = _derivatives(i, obs, state, weight, t, s.A, b)
+        A = s.A[: 2 * abs(rays)]
         N = np.dot(A.T, A)
         vPv += N[RESIDUAL, RESIDUAL] if rays >= 0 else np.inf
-        _add_photograph(i, a, obs.free_count[a], N, exterior_free, b)
-        _add_to_points(i, obs, weight, exterior_free, b)
+        _add_photograph(i, a, obs.free_count[a], N, exterior_free, s, b)
+        _add_to_points(i, obs, weight, exterior_free, s, b)
     return vPv
 
 
 @kernel
-def _derivatives(i, obs, state, weight, t, b):  # type: ignore[no-untyped-def]
+def _derivatives(i, obs, state, weight, t, A, b):  # type: ignore[no-untyped-def]
     """Fill two rows of A and B for each image point of photograph i that takes part.
 
     Returns how many these are, made negative where one is behind the camera.
     """
     a = obs.camera[i]
     rays, in_front = 0, True
-    for s in range(b.first[i], b.first[i + 1]):
-        o = b.order[s]
+    for h in range(b.first[i], b.first[i + 1]):
+        o = b.order[h]
         if weight[o] > 0.0:
             if not collinearity(o, obs, state, weight[o], t):
                 in_front = False
-            x, y = b.A[2 * rays], b.A[2 * rays + 1]
+            x, y = A[2 * rays], A[2 * rays + 1]
             for p in range(6):
                 x[p], y[p] = t.A[0, p], t.A[1, p]
             x[RESIDUAL], y[RESIDUAL] = t.r[0], t.r[1]
@@ -63,7 +76,7 @@ def _derivatives(i, obs, state, weight, t, b):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _add_photograph(i, a, f, N, exterior_free, b):  # type: ignore[no-untyped-def]
+def _add_photograph(i, a, f, N, exterior_free, sums, b):  # type: ignore[no-untyped-def]
     """Share out the sum (A r)'(A r) of photograph i; fixed unknowns keep their place with derivatives 0."""
     for p in range(6):
         on = 1.0 if exterior_free[i, p] else 0.0
@@ -75,26 +88,26 @@ def _add_photograph(i, a, f, N, exterior_free, b):  # type: ignore[no-untyped-de
         if not exterior_free[i, p]:
             b.U[i, p, p] = 1.0
     for p in range(f):
-        b.gi[a, p] += N[RESIDUAL + 1 + p, RESIDUAL]
+        sums.gi[a, p] += N[RESIDUAL + 1 + p, RESIDUAL]
         for q in range(f):
-            b.D[a, p, q] += N[RESIDUAL + 1 + p, RESIDUAL + 1 + q]
+            sums.D[a, p, q] += N[RESIDUAL + 1 + p, RESIDUAL + 1 + q]
 
 
 @kernel
-def _add_to_points(i, obs, weight, exterior_free, b):  # type: ignore[no-untyped-def]
+def _add_to_points(i, obs, weight, exterior_free, sums, b):  # type: ignore[no-untyped-def]
     """Add B'B, B'r, W' of the image points of photograph i; B = -A of the projection centre."""
     a = obs.camera[i]
     f = obs.free_count[a]
     first = 6 * len(obs.camera)
     row = 0
-    for s in range(b.first[i], b.first[i + 1]):
-        o = b.order[s]
+    for h in range(b.first[i], b.first[i + 1]):
+        o = b.order[h]
         j = obs.point[o]
         if weight[o] > 0.0:
-            x, y = b.A[row], b.A[row + 1]
+            x, y = sums.A[row], sums.A[row + 1]
             row += 2
             x0, x1, x2, y0, y1, y2 = x[0], x[1], x[2], y[0], y[1], y[2]
-            V, gp, Y, Z = b.V[j], b.gp[j], b.Y[o], b.Z[j]
+            V, gp, Y, Z = sums.V[j], sums.gp[j], b.Y[o], sums.Z[j]
             for q in range(6):
                 Y[0, q] = -(x0 * x[q] + y0 * y[q])
                 Y[1, q] = -(x1 * x[q] + y1 * y[q])

@@ -94,20 +94,21 @@ def motions_of(layout: Unknowns, weighted: Weighted, state: State, datum: Datum)
         H = H @ open_motions * layout.reduced_free()[:, None]
         points = points @ open_motions * layout.point_free[:, :, None]
     d = open_motions.shape[1]
-    B, on_reduced = np.zeros_like(points), np.zeros_like(H)
+    on_reduced = np.zeros_like(H)
     if d == 0:
-        return Motions(H, points, B, on_reduced, np.zeros((0, 0)))
+        return Motions(H, points, points, on_reduced, np.zeros((0, 0)))
     on: BoolArray = np.asarray(layout.point_free.any(axis=1))
     if datum.points is not None:
         on = on & datum.points
-    carrier = points * on[:, None, None]
+    carrier = points if on.all() else points * on[:, None, None]
     flat = carrier.reshape(-1, d)
     if not on.any():
-        on_reduced = H.copy()
+        on_reduced, B = H.copy(), np.zeros_like(points)
         inverse = _regular_inverse(on_reduced.T @ H)
     else:
         if datum.kind == "minimal":
             picked = minimal_coordinates(flat, state.points, on)
+            B = np.zeros_like(points)
             B.reshape(-1, d)[picked] = np.eye(d)
         else:
             B = carrier

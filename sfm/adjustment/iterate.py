@@ -21,7 +21,7 @@ from sfm.adjustment.banded import BandFactor, factor_band
 from sfm.adjustment.collinearity import State, sum_of_squares
 from sfm.adjustment.connectivity import Order, band_order
 from sfm.adjustment.datum import Datum, Motions, motions_of
-from sfm.adjustment.normals import Blocks, Equations, new_blocks, normal_equations, point_step
+from sfm.adjustment.normals import Equations, Space, new_space, normal_equations, point_step
 from sfm.adjustment.parameters import Unknowns, step
 from sfm.adjustment.reduced import Factor, factor
 from sfm.adjustment.weighted import Weighted, weighted_vPv
@@ -62,29 +62,40 @@ class Problem:
     layout: Unknowns  # order of the unknowns
     weighted: Weighted  # observed unknowns
     datum: Datum  # kind and points
-    space: Blocks  # for the normal equations, used again and again
+    space: Space  # for the normal equations, used again and again
     order: Order | None  # of the photographs in a banded matrix; None: full matrix
 
 
 @dataclass(frozen=True)
-class Step:
-    """A step in the datum and what it was taken from."""
+class Move:
+    """A step in the datum."""
+
+    reduced: FloatArray  # of the reduced unknowns, (reduced,)
+    points: FloatArray  # of the object points, (n, 3)
+    predicted: float  # g'N^-1 g = |A dx|^2 without damping
+    vPv: float  # where it starts
+
+
+@dataclass(frozen=True)
+class Step(Move):
+    """A step and what it was taken from."""
 
     equations: Equations
     factor: Factor | BandFactor
     motions: Motions
-    reduced: FloatArray  # of the reduced unknowns, (reduced,)
-    points: FloatArray  # of the object points, (n, 3)
-    predicted: float  # g'N^-1 g = |A dx|^2 without damping
+
+    def move(self) -> Move:
+        """Return it without the normal equations, which fill memory."""
+        return Move(self.reduced, self.points, self.predicted, self.vPv)
 
     def within(self, share: float) -> bool:
         """Whether |A dx| is at most this share of |v|, or MIN_SHIFT."""
-        return bool(np.sqrt(self.predicted) <= max(share * np.sqrt(self.equations.vPv), MIN_SHIFT))
+        return bool(np.sqrt(self.predicted) <= max(share * np.sqrt(self.vPv), MIN_SHIFT))
 
 
 def problem_of(layout: Unknowns, weighted: Weighted, datum: Datum) -> Problem:
     """Return what all steps of an adjustment have in common; chooses full or banded normal equations."""
-    return Problem(layout, weighted, datum, new_blocks(layout), band_order(layout))
+    return Problem(layout, weighted, datum, new_space(layout), band_order(layout))
 
 
 def iterate(
@@ -120,7 +131,7 @@ def iterate(
         state, taken = _approach(problem, state, weight, max_iterations, single)
         single = False
     share = 1.0
-    before: tuple[State, Step] | None = None
+    before: tuple[State, Move] | None = None
     limit = np.inf
     shortest = 1.0 if method == "undamped" else SHORTEST
     while True:
@@ -139,9 +150,10 @@ def iterate(
             break
         taken += 1
         single = single and not found.within(FAR)
-        before, share = (state, found), 1.0
+        before, share = (state, found.move()), 1.0
         state = step(layout, state, found.reduced, found.points)  # tried by the next normal equations
-        limit = _most_allowed(found, share, shortest)
+        limit = _most_allowed(before[1], share, shortest)
+        del found  # its memory is needed for the next
     if found is None:
         _refuse(problem, state)
     converged, vPv = found.within(tolerance), found.equations.vPv
@@ -206,7 +218,8 @@ def _solve(
         points = point_step(equations, reduced, layout)
         y = equations.blocks.y.ravel()
         predicted = max(float(y @ y - equations.parts.g @ reduced), 0.0)
-        found = Step(equations, factored, motions, *motions.transform(reduced, points), predicted)
+        dx, dX = motions.transform(reduced, points)
+        found = Step(dx, dX, predicted, equations.vPv, equations, factored, motions)
         if not (coarse and found.within(COARSE)):
             return found
     return None
@@ -244,7 +257,7 @@ def total(problem: Problem, state: State, weight: FloatArray) -> float:
 
 
 def _line_search(
-    problem: Problem, state: State, weight: FloatArray, found: Step, share: float, shortest: float
+    problem: Problem, state: State, weight: FloatArray, found: Move, share: float, shortest: float
 ) -> tuple[State, float] | None:
     """Return where the first of the shares 1, 1/2, 1/4 ... to meet Armijo's condition leads, and it.
 
@@ -265,8 +278,8 @@ def _line_search(
     return None
 
 
-def _most_allowed(found: Step, share: float, shortest: float) -> float:
+def _most_allowed(found: Move, share: float, shortest: float) -> float:
     """Return the largest v'Pv with which a share of a step meets Armijo's condition."""
     if shortest == 1.0:
         return np.inf
-    return found.equations.vPv * (1 + ROUNDING) - share * 2 * ARMIJO * found.predicted
+    return found.vPv * (1 + ROUNDING) - share * 2 * ARMIJO * found.predicted

@@ -22,12 +22,16 @@ from scipy.linalg.lapack import dpotrf, dpotrs, dtrtri, spotrf, spotrs
 from sfm.adjustment.datum import Motions
 from sfm.adjustment.normals import Blocks, Equations
 from sfm.adjustment.parameters import Unknowns
+from sfm.adjustment.threads import at_once
 from sfm.conventions import FloatArray
 from sfm.errors import GeometryError
 
 NULL = 1e-12  # eigenvalue of the scaled matrix (diagonal at most 1) taken as 0; rounding leaves 1e-15
 WEAK_PIVOT = 1e-11  # squared pivot below which the eigenvalues are looked at
 WEAK_SINGLE = 1e-5  # the same in single precision, whose rounding leaves 1e-6
+CHUNK = 1_000_000  # numbers of rows Y' that are multiplied at a time, at least
+ROWS = 2  # and rows for each unknown: adding up the products would take longer than forming them otherwise
+HALVED = 200**2  # elements of the matrix from which its halves are formed by themselves
 LARGEST_BYTES = 6e9  # of the full matrix; larger ones would swap
 
 
@@ -87,7 +91,7 @@ def factor(
         cholesky, info = spotrf(S, clean=0, overwrite_a=1)
         weak = info != 0 or float(np.diagonal(cholesky).min()) ** 2 < WEAK_SINGLE
         return None if weak else Factor(scale, S, cholesky, Q, further)
-    cholesky, info = dpotrf(S, clean=0)
+    cholesky, info = dpotrf(S)
     weak = info != 0 or float(np.diagonal(cholesky).min()) ** 2 < WEAK_PIVOT
     if weak and damped:
         return None if info != 0 else Factor(scale, S, cholesky, Q, further)
@@ -96,7 +100,7 @@ def factor(
         further = np.asfortranarray(vectors[:, values < NULL])
         if further.shape[1]:
             filled = dsyrk(1.0, further, beta=1.0, c=S)
-            cholesky, info = dpotrf(filled, clean=0)
+            cholesky, info = dpotrf(filled)
         if info != 0:
             return None
     return Factor(scale, S, cholesky, Q, further)
@@ -110,12 +114,10 @@ def rows_of(
     The next rows take the place of the last ones.
     """
     n, width = len(blocks.y), layout.reduced
-    space: FloatArray = blocks.chunk.view(dtype)
-    points = len(space) // (3 * width)
+    points = min(n, max(ROWS * width, CHUNK // width) // 3 + 1)
+    space: FloatArray = np.empty((3 * points, width), dtype=dtype)
     for first in range(0, n, points):
-        number = 3 * min(points, n - first)
-        rows: FloatArray = space[: number * width].reshape(number, width)
-        rows.fill(0.0)
+        rows = space[: 3 * min(points, n - first)]
         _fill(layout.obs, blocks.Y, blocks.Z, scale, first, rows)
         yield first, rows
 
@@ -130,12 +132,33 @@ def schur_complement(equations: Equations, layout: Unknowns, *, single: bool = F
         )
     b, parts = equations.blocks, equations.parts
     dtype = np.float32 if single else np.float64
-    product = ssyrk if single else dsyrk
-    S = np.zeros((layout.reduced, layout.reduced), order="F", dtype=dtype)
+    S = np.zeros((layout.reduced, layout.reduced), dtype=dtype)  # lower triangle, row-major, until the end
+    product = np.empty_like(S)
     for _, rows in rows_of(b, layout, parts.scale, dtype):
-        S = product(-1.0, rows.T, beta=1.0, c=S, overwrite_c=1)
-    _add_blocks(b.U, parts.border, parts.corner, parts.scale, 1 + equations.damping, S)
-    return S
+        _subtract_square(rows, product, S)
+    _add_blocks(b.U, parts.border, parts.corner, parts.scale, 1 + equations.damping, S.T)
+    return S.T
+
+
+def _subtract_square(rows: FloatArray, product: FloatArray, S: FloatArray) -> None:
+    """Take rows' rows off the lower triangle of S: both triangles of its halves in one thread, the square
+    between them, which is as many operations, in another. numpy's product lets other threads run."""
+    half = S.shape[0] // 2
+    left, right = rows[:, :half], rows[:, half:]
+
+    def subtract(a: FloatArray, b: FloatArray, row: int, column: int) -> None:
+        own = slice(row, row + a.shape[1]), slice(column, column + b.shape[1])
+        np.matmul(a.T, b, out=product[own])
+        S[own] -= product[own]
+
+    def triangles() -> None:
+        subtract(left, left, 0, 0)
+        subtract(right, right, half, half)
+
+    if S.size < HALVED:
+        subtract(rows, rows, 0, 0)
+    else:
+        at_once(triangles, lambda: subtract(right, left, half, 0))
 
 
 @njit(cache=True, error_model="numpy")
@@ -143,6 +166,7 @@ def _fill(obs, Y, Z, scale, first, rows):  # type: ignore[no-untyped-def]
     start = 6 * len(obs.camera)
     for h in range(len(rows) // 3):
         j = first + h
+        rows[3 * h : 3 * h + 3] = 0.0
         for o in range(obs.start[j], obs.start[j + 1]):
             c = 6 * obs.image[o]
             for p in range(3):

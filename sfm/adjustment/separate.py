@@ -18,7 +18,7 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
 from sfm.adjustment.collinearity import State, sum_of_squares
-from sfm.adjustment.normals import new_blocks, normal_equations
+from sfm.adjustment.normals import new_space, normal_equations
 from sfm.adjustment.parameters import Unknowns, estimate_of, start_weights, step, unknowns_of
 from sfm.adjustment.weighted import weighted_of
 from sfm.conventions import FloatArray
@@ -64,7 +64,7 @@ def adjust_separately(
         )
     weight = start_weights(layout, state)
     vPv = float(sum_of_squares(layout.obs, state, weight))
-    space = new_blocks(layout)
+    space = new_space(layout)
     for number in range(1, max_rounds + 1):
         before = vPv
         for move in (_points, _orientations):

@@ -28,7 +28,7 @@ from sfm.adjustment.reliability import redundancy_numbers as numbers_of
 from sfm.adjustment.reliability import standardised_residuals
 from sfm.adjustment.result import Adjustment, Covariance
 from sfm.adjustment.robust import huber_weights, robust_scale, snoop, tukey_weights
-from sfm.adjustment.threads import one_thread
+from sfm.adjustment.threads import own_threads
 from sfm.adjustment.weighted import weighted_of
 from sfm.conventions import FloatArray
 from sfm.errors import GeometryError
@@ -83,7 +83,7 @@ def adjust(
     layout, state = unknowns_of(network, estimate, use_control=use_control)
     weighted = weighted_of(network, layout, use_control=use_control)
     weight = start_weights(layout, state)
-    with one_thread():
+    with own_threads():
         near = tolerance if reject == "none" else max(tolerance, ROUND_TOLERANCE)
         run = _Run(problem_of(layout, weighted, datum), method, max_iterations, near)
         optimum, weight = run.minimise(run.start(state, weight), weight)
