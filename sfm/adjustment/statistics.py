@@ -58,7 +58,9 @@ class Reliability:
 
     delta0: float  # non-centrality of the test for alpha and power
     minimal_bias: FloatArray  # smallest gross error found with the given power, px, (k, 2); inf: none is
-    external: FloatArray  # largest effect of that error on any unknown over its sigma, (k, 2)
+    external: (
+        FloatArray  # largest effect that error can have on a function of the unknowns, over its sigma, (k, 2)
+    )
 
 
 @dataclass(frozen=True)

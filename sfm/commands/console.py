@@ -143,7 +143,11 @@ def _figures(result: SurveyResult) -> tuple[tuple[str, str], ...]:
         word = "agrees" if both.agree else "DIFFERS"
         rms = both.comparison.rms_px
         rows.append(
-            (both.backend, f"{word}: RMS {rms[0]:.7f} px (kolinear), {rms[1]:.7f} px ({both.backend})")
+            (
+                both.backend,
+                f"{word}: RMS {rms[0]:.7f} px (kolinear), {rms[1]:.7f} px ({both.backend}), both with equal "
+                f"weights, free datum, {both.model}",
+            )
         )
     found = result.baseline
     if found is not None:

@@ -22,7 +22,7 @@ from sfm.report.checks import (
 )
 from sfm.report.markup import finer_unit, signed, significant, table
 from sfm.report.result import SurveyResult
-from sfm.report.statistics import GLOBAL_ALPHA, SIGNIFICANT, Statistics, quantiles, statistics_of
+from sfm.report.statistics import GLOBAL_ALPHA, Statistics, quantiles, statistics_of
 
 
 def image_coordinates(result: SurveyResult) -> str:
@@ -152,7 +152,7 @@ def observations(result: SurveyResult) -> str:
 def camera_notes(result: SurveyResult) -> str:
     """What of the cameras cannot be told apart from something else, or from 0."""
     a = result.adjustment
-    weak = [test for test in significance(a, alpha=GLOBAL_ALPHA) if test.t < SIGNIFICANT]
+    weak = [test for test in significance(a) if not test.significant]
     strong = camera_correlations(result)
     text = "<h3>Correlations and significance of camera parameters</h3>"
     if strong:
@@ -166,13 +166,11 @@ def camera_notes(result: SurveyResult) -> str:
     if weak:
         names = ", ".join(f"{test.parameter} of {test.camera} ({test.t:.1f})" for test in weak)
         text += (
-            f"<p>Not significant, the value is below {SIGNIFICANT:g} times its standard deviation: "
-            f"{escape(names)}. Held at 0, such a parameter would change nothing.</p>"
+            "<p>Not significantly different from 0 (t test, 5 %; in brackets the value over its standard "
+            f"deviation): {escape(names)}. Held at 0, such a parameter would change nothing.</p>"
         )
     else:
-        text += (
-            f"<p>All adjusted parameters are significant (beyond {SIGNIFICANT:g} standard deviations).</p>"
-        )
+        text += "<p>All adjusted parameters differ significantly from 0 (t test, 5 %).</p>"
     return text
 
 

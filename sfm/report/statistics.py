@@ -26,7 +26,6 @@ from sfm.camera import Camera, camera_families
 from sfm.conventions import FloatArray, IntArray
 
 GLOBAL_ALPHA = 0.05  # of the global test and of the significance of parameters
-SIGNIFICANT = 2.0  # value over sigma below which a parameter might as well be 0
 
 
 @dataclass(frozen=True)
