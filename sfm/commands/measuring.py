@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from sfm.conventions import IntArray
     from sfm.orientation.resection.task import Task
 
+NONE_MATCHED = 1  # exit code
 MOST_TARGETS = 10_000  # on one sheet; no family has more codes
 
 
@@ -48,7 +49,9 @@ def match(
         ),
     ] = "six_tap",
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON in place of a table.")] = False,
-    out: Annotated[Path | None, typer.Option("--out", metavar="FILE", help="Write CSV.")] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", metavar="FILE", help="Write the table: .csv or .json.")
+    ] = None,
     picture: Annotated[
         Path | None,
         typer.Option("--picture", metavar="FILE.png", help="Picture of template, match and difference."),
@@ -56,28 +59,29 @@ def match(
 ) -> None:
     """Find conjugate points of two photographs.
 
-    By cross correlation, then least squares matching.
+    By cross correlation, then least squares matching. Files given with --out and --picture may replace
+    earlier ones of this command, and nothing else. Exit code 1 if no point was matched.
     """
     with loading():
         from sfm.report.matching import match_command
 
-    print(
-        match_command(
-            left,
-            right,
-            point=point,
-            points=points,
-            method=method,
-            template_px=template,
-            search_px=search,
-            equalise=equalise,
-            interpolation=interpolation,
-            as_json=as_json,
-            out=out,
-            picture=picture,
-        ),
-        end="",
+    text, matched = match_command(
+        left,
+        right,
+        point=point,
+        points=points,
+        method=method,
+        template_px=template,
+        search_px=search,
+        equalise=equalise,
+        interpolation=interpolation,
+        as_json=as_json,
+        out=out,
+        picture=picture,
     )
+    print(text, end="")
+    if not matched:
+        raise SystemExit(NONE_MATCHED)
 
 
 def resect(

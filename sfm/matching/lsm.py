@@ -113,6 +113,10 @@ def match_lsm(
     if model not in MODELS:
         raise GeometryError(f"LSM: model '{model}' is none of {', '.join(MODELS)}")
     kind = interpolation_index(interpolation)
+    if kind < BILINEAR:
+        raise GeometryError(
+            "LSM: interpolation 'nearest' has no gradient, needed bilinear, bicubic or six_tap"
+        )
     half = odd_window("LSM", window_px) // 2
     a = np.ascontiguousarray(xy_left, dtype=float).reshape(-1, 2)
     b = np.ascontiguousarray(xy_right, dtype=float).reshape(-1, 2)

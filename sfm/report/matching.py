@@ -6,17 +6,17 @@ import csv
 import io
 import json
 import math
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 
 from sfm.conventions import AnyArray, FloatArray
-from sfm.errors import GeometryError, OutputError, SurveyFileError
+from sfm.csv_tables import read_table
+from sfm.errors import PhotographError, SurveyFileError
 from sfm.matching.conjugate import ConjugatePoints, match_points
-from sfm.matching.interpolation import resample
+from sfm.report.match_files import picture_file, refuse_outputs, whole_outputs
+from sfm.report.patch_pictures import draw_patches
 from sfm.targets.photograph import read_photograph
 
 COLUMNS = (
@@ -32,10 +32,7 @@ COLUMNS = (
     "steps",
     "reason",
 )
-ZOOM = 8  # side of a pixel in the picture of patches, px
-GAP = 4  # between the patches, px
 NO_SECOND = -1.0  # r of the second-best place where there is none
-MAX_PICTURES = 25  # points in one picture
 
 
 def match_command(
@@ -52,8 +49,8 @@ def match_command(
     as_json: bool = False,
     out: Path | None = None,
     picture: Path | None = None,
-) -> str:
-    """Match points of two photograph files and return what the command line prints.
+) -> tuple[str, bool]:
+    """Match points of two photograph files.
 
     Args:
         left_path, right_path: the photographs.
@@ -61,37 +58,47 @@ def match_command(
         points: table of points, see `read_points_to_match`.
         method, template_px, search_px, equalise, interpolation: see `sfm.matching.conjugate.match_points`.
         as_json: JSON in place of the table.
-        out: file that gets the table as CSV (or JSON), in place of the terminal.
+        out: file .csv or .json that gets the table, in place of the terminal.
         picture: PNG file that gets template, matched patch and their difference.
+
+    Returns:
+        What the command line prints, and whether any point was matched.
 
     Raises:
         KolinearError: unreadable photographs, points or table, even windows, or files that cannot be written.
     """
     if (point is None) == (points is None):
         raise SurveyFileError("match: give either --point COL,ROW or --points FILE")
+    inputs = (left_path, right_path, *(() if points is None else (points,)))
+    refuse_outputs(out, picture, inputs, COLUMNS, as_json)
     if points is not None:
         names, xy, start = read_points_to_match(points)
     else:
         names, xy, start = ("1",), _parse_point(str(point)), None
-    left, right = read_photograph(left_path), read_photograph(right_path)
-    found = match_points(
-        left,
-        right,
-        xy,
-        xy_right=start,
-        method=method,
-        template_px=template_px,
-        search_px=search_px,
-        equalise=equalise,
-        interpolation=interpolation,
-    )
-    if picture is not None:
-        drawing = draw_patches(left, right, found, template_px)
-        _write(picture, cv2.imencode(".png", drawing)[1].tobytes())
+    left, right = _photograph("LEFT", left_path), _photograph("RIGHT", right_path)
+    with whole_outputs(out, picture) as (table_file, picture_part):
+        found = match_points(
+            left,
+            right,
+            xy,
+            xy_right=start,
+            method=method,
+            template_px=template_px,
+            search_px=search_px,
+            equalise=equalise,
+            interpolation=interpolation,
+        )
+        as_json = as_json or (out is not None and out.suffix.lower() == ".json")
+        if picture_part is not None:
+            drawing = draw_patches(names, left, right, found, template_px)
+            picture_part.write_bytes(picture_file(drawing))
+        if table_file is not None:
+            text = matches_json(names, found) if as_json else matches_csv(names, found)
+            table_file.write_bytes(text.encode())
+    matched = int(found.good.sum())
     if out is not None:
-        _write(out, (matches_json(names, found) if as_json else matches_csv(names, found)).encode())
-        return f"{int(found.good.sum())} of {len(found)} points matched: {out}\n"
-    return matches_json(names, found) if as_json else matches_text(names, found)
+        return f"{matched} of {len(found)} points matched: {out}\n", matched > 0
+    return matches_json(names, found) if as_json else matches_text(names, found), matched > 0
 
 
 def read_points_to_match(path: Path) -> tuple[tuple[str, ...], FloatArray, FloatArray | None]:
@@ -101,33 +108,11 @@ def read_points_to_match(path: Path) -> tuple[tuple[str, ...], FloatArray, Float
         Names, left points (k, 2) and centres (k, 2) or None, px.
 
     Raises:
-        SurveyFileError: unreadable, wrong columns, or not a finite number.
+        SurveyFileError: unreadable, wrong columns, no rows, a name twice, or not a finite number.
     """
-    try:
-        with path.open(encoding="utf-8-sig", newline="") as file:
-            rows = [row for row in csv.reader(file) if any(cell.strip() for cell in row)]
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise SurveyFileError(f"{path}: the table of points cannot be read: {error}") from error
-    header = tuple(cell.strip() for cell in rows[0]) if rows else ()
-    needed = COLUMNS[:3], COLUMNS[:5]
-    if header not in needed:
-        raise SurveyFileError(
-            f"{path}: columns {','.join(header) or 'none'}, needed "
-            f"{' or '.join(','.join(columns) for columns in needed)}"
-        )
-    values = np.full((len(rows) - 1, len(header) - 1), np.nan)
-    for k, row in enumerate(rows[1:]):
-        with suppress(ValueError):
-            values[k] = [float(cell) for cell in row[1:]]
-        if not np.isfinite(values[k]).all():
-            raise SurveyFileError(
-                f"{path}, row {k + 2}: {','.join(row)!r:.60}, needed {len(header)} columns, finite"
-            )
-    return (
-        tuple(row[0].strip() for row in rows[1:]),
-        values[:, :2],
-        values[:, 2:] if len(header) == 5 else None,
-    )
+    table = read_table(path, COLUMNS[:1], COLUMNS[1:3], COLUMNS[3:5])
+    values = table.values
+    return table.keys("point"), values[:, :2], values[:, 2:] if values.shape[1] > 2 else None
 
 
 def matches_text(names: tuple[str, ...], found: ConjugatePoints) -> str:
@@ -166,39 +151,6 @@ def matches_json(names: tuple[str, ...], found: ConjugatePoints) -> str:
     return json.dumps({"method": found.method, "points": entries}, indent=1, ensure_ascii=False) + "\n"
 
 
-def draw_patches(left: AnyArray, right: AnyArray, found: ConjugatePoints, template_px: int) -> AnyArray:
-    """Return template, matched patch (in the template's intensities) and difference, a row for each point.
-
-    The difference is grey where there is none and saturates at a quarter of the scale of the template.
-    """
-    half = template_px // 2
-    v, u = np.mgrid[-half : half + 1, -half : half + 1].astype(float)
-    rows = []
-    for k in np.flatnonzero(found.good)[:MAX_PICTURES]:
-        template = resample(left, found.left[k] + np.stack([u, v], axis=-1), interpolation="bilinear")
-        H = found.warp[k]
-        w = H[2, 0] * u + H[2, 1] * v + H[2, 2]
-        place = np.stack([(H[i, 0] * u + H[i, 1] * v + H[i, 2]) / w for i in range(2)], axis=-1)
-        patch = (resample(right, place, interpolation="bilinear") - found.offset[k]) / found.gain[k]
-        low, high = np.nanmin(template), np.nanmax(template)
-        scale = 255.0 / max(high - low, 1e-6)
-        panels = [(template - low) * scale, (patch - low) * scale, 128 + 4 * (patch - template) * scale]
-        big = [
-            cv2.resize(
-                np.nan_to_num(p).clip(0, 255).astype(np.uint8), None, fx=ZOOM, fy=ZOOM, interpolation=0
-            )
-            for p in panels
-        ]
-        gap = np.full((big[0].shape[0], GAP), 255, np.uint8)
-        rows += [
-            np.hstack([big[0], gap, big[1], gap, big[2]]),
-            np.full((GAP, 3 * len(big[0]) + 2 * GAP), 255, np.uint8),
-        ]
-    if not rows:
-        raise GeometryError("match: no point was matched, there is nothing to draw")
-    return np.vstack(rows[:-1])
-
-
 def _values(found: ConjugatePoints) -> list[tuple[Any, ...]]:
     """Return the columns behind the name, one tuple for each point."""
     table = np.column_stack([found.left, found.right, found.sigma, found.correlation, found.second])
@@ -219,6 +171,13 @@ def _text_rows(names: tuple[str, ...], found: ConjugatePoints) -> list[tuple[str
     return rows
 
 
+def _photograph(which: str, path: Path) -> AnyArray:
+    """Read a photograph; a folder has no name to be called by, so the argument is named."""
+    if path.is_dir():
+        raise PhotographError(f"{which} {path}: a folder, a photograph is needed")
+    return read_photograph(path)
+
+
 def _parse_point(text: str) -> FloatArray:
     try:
         xy = np.array([[float(part) for part in text.split(",")]])
@@ -227,10 +186,3 @@ def _parse_point(text: str) -> FloatArray:
     if xy.shape != (1, 2) or not np.isfinite(xy).all():
         raise SurveyFileError(f"match: --point {text!r}, needed COL,ROW such as 812.5,403")
     return xy
-
-
-def _write(path: Path, data: bytes) -> None:
-    try:
-        path.write_bytes(data)
-    except OSError as error:
-        raise OutputError(f"{path}: cannot be written: {error.strerror}") from error
