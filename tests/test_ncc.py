@@ -16,6 +16,7 @@ from sfm.matching.flags import NccFlag
 from sfm.matching.ncc import match_ncc
 from sfm.matching.ncc_line import match_along_line
 from sfm.matching.ncc_pyramid import match_pyramid
+from sfm.matching.significance import ambiguous, independent_pixels
 from tests.synthetic import make_network
 from tests.textures import random_texture, with_noise
 
@@ -173,13 +174,16 @@ def test_photographs_of_different_size_depth_and_colour() -> None:
             assert found.good.all()
             assert found.right == pytest.approx(whole.right, abs=0.05)
     outside = match_points(eight, deep, np.array([[255.0, 100.0], [200.0, 200.0]]), search_px=31)
-    assert outside.reason == ("outside", "outside")  # beyond the left, and beyond the smaller right one
+    assert outside.reason == (
+        "outside: the template in the left photograph",
+        "outside: the search window in the right photograph",
+    )  # beyond the left, and beyond the smaller right one
 
 
 def test_a_point_that_is_not_found_says_why() -> None:
     left, right, _ = _photographs()
     found = match_points(left, right, np.array([[2.0, 2.0], [100.0, 100.0]]), search_px=61)
-    assert found.reason == ("outside", "")
+    assert found.reason == ("outside: the template in the left photograph", "")
     assert np.isnan(found.right[0]).all()
 
 
@@ -203,3 +207,50 @@ def test_pyramid_of_deep_photographs() -> None:
     assert found.offset == pytest.approx(both.offset, abs=2)
     flat = np.full((260, 260), 7000, np.uint16) + np.random.default_rng(1).integers(0, 99, (260, 260))
     assert not match_pyramid(flat.astype(np.uint16), deep[1], at, at, search_px=81).good.any()
+
+
+@pytest.mark.parametrize("method", ["ncc", "lsm"])
+def test_turned_photographs_and_small_templates_are_not_matched(method: str) -> None:
+    left, right, at = _photographs()
+    y, x = np.mgrid[0:260, 0:260] - 130.0
+    c, s = np.cos(np.radians(40)), np.sin(np.radians(40))
+    turned = random_texture(np.random.default_rng(1), 2.0).value(130 + c * x - s * y, 130 + s * x + c * y)
+    for wrong in (turned, 255 - turned):
+        assert not match_points(left, wrong, at, method=method).good.any()
+    small = match_points(left, right, at, method=method, template_px=3)
+    assert not small.good.any()
+    assert sum(reason == "ambiguous" for reason in small.reason) > 0.9 * len(at)
+
+
+@pytest.mark.parametrize("method", ["ncc", "lsm"])
+def test_conjugate_points_lead_back(method: str) -> None:
+    left, right, _ = _photographs()
+    left, right = left.copy(), right.copy()
+    rng = np.random.default_rng(5)
+    at = np.array([[109.0, 130.0]])
+    original = left[110:151, 130:171]  # seen in both photographs; a bad copy of it in the left one alone
+    left[110:151, 89:130] = original + 0.5 * (left[200:241, 200:241] - left.mean())
+    right[100:156, 90:136] = rng.normal(128, 30, (56, 46))
+    assert match_points(left, right, at, method=method, back_px=None).good.all()
+    found = match_points(left, right, at, method=method)
+    assert found.reason == ("not confirmed",) and np.isnan(found.right).all()
+
+
+def test_ambiguous_is_a_test_of_significance() -> None:
+    # tanh(1) and tanh(0.5) of 53 pixels: 0.5 / sqrt(2 / 50) = 2.5; of 23: 1.58; no second place; 3 pixels
+    best, second = np.tanh([1.0, 1.0, 1.0, 9.0]), np.array([*np.tanh([0.5, 0.5]), -1.0, 0.0])
+    assert ambiguous(best, second, np.array([53.0, 23.0, 3.0, 3.0])).tolist() == [False, True, False, True]
+    rng = np.random.default_rng(7)
+    noise = rng.normal(0, 1, (200, 200))
+    at = np.stack(np.meshgrid(np.arange(30, 170, 20), np.arange(30, 170, 20)), axis=-1).reshape(-1, 2)
+    # the scatter of r of unrelated patches is that of so many independent pixels, or less
+    for blur in (1, 3, 5):
+        kernel = np.ones(blur) / blur
+        smooth = noise
+        for axis in (0, 1):
+            smooth = np.apply_along_axis(np.convolve, axis, smooth, kernel, "same")
+        n = independent_pixels(smooth, at.astype(float), 21)
+        patches = np.array([smooth[v - 10 : v + 11, u - 10 : u + 11].ravel() for u, v in at])
+        r = np.corrcoef(patches)[np.triu_indices(len(at), 1)]
+        assert 0.4 < n.mean() * r.var() < 1.3
+    assert np.isnan(independent_pixels(noise, np.array([[5.0, 50.0]]), 21)).all()

@@ -48,6 +48,15 @@ def match(
             help="six_tap; bicubic or bilinear where a photograph was itself shifted by interpolation.",
         ),
     ] = "six_tap",
+    min_correlation: Annotated[
+        float, typer.Option("--min-correlation", metavar="R", help="Smallest r of a match, 0 to 1.")
+    ] = 0.7,
+    back: Annotated[
+        bool,
+        typer.Option(
+            "--back/--no-back", help="Whether a match must lead back to within 1 px of where it came from."
+        ),
+    ] = True,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON in place of a table.")] = False,
     out: Annotated[
         Path | None, typer.Option("--out", metavar="FILE", help="Write the table: .csv or .json.")
@@ -59,10 +68,13 @@ def match(
 ) -> None:
     """Find conjugate points of two photographs.
 
-    By cross correlation, then least squares matching. Files given with --out and --picture may replace
-    earlier ones of this command, and nothing else. Exit code 1 if no point was matched.
+    By cross correlation, then least squares matching. A match is ambiguous if the second-best place of the
+    search window has an r that is not lower by more than chance (5 %, by Fisher's z).
+    Files given with --out and --picture may replace earlier ones of this command, and nothing else. Exit
+    code 1 if no point was matched.
     """
     with loading():
+        from sfm.matching.conjugate import BACK_PX
         from sfm.report.matching import match_command
 
     text, matched = match_command(
@@ -75,6 +87,8 @@ def match(
         search_px=search,
         equalise=equalise,
         interpolation=interpolation,
+        min_correlation=min_correlation,
+        back_px=BACK_PX if back else None,
         as_json=as_json,
         out=out,
         picture=picture,

@@ -7,18 +7,24 @@ it helps the eye more than the matching, which has a gain and an offset of its o
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
 from sfm.errors import GeometryError
 from sfm.matching.flags import LsmFlag, NccFlag, in_words
+from sfm.matching.interpolation import AFTER, BEFORE
 from sfm.matching.lsm import match_lsm
 from sfm.matching.ncc import match_ncc
-from sfm.matching.radiometry import equalise_histogram
+from sfm.matching.patch_equations import MARGIN
+from sfm.matching.radiometry import equalise_histogram, grey_of
+from sfm.matching.significance import ambiguous, independent_pixels
 
 METHODS = {"ncc": "", "lsm": "affine", "lsm8": "projective", "shift": "shift"}
+MIN_CORRELATION = 0.7  # half of the variance of one patch is then explained by the other
+BACK_PX = 1.0  # a point that leads back farther than this from where it came is another one
+START_CORRELATION = 0.5  # smallest r of a start, which the warp has yet to make alike
 
 
 @dataclass(frozen=True)
@@ -62,7 +68,8 @@ def match_points(
     search_px: int = 121,
     equalise: bool = False,
     interpolation: str = "six_tap",
-    min_correlation: float = 0.5,
+    min_correlation: float = MIN_CORRELATION,
+    back_px: float | None = BACK_PX,
 ) -> ConjugatePoints:
     """Find points of the left photograph in the right one.
 
@@ -74,7 +81,9 @@ def match_points(
         template_px, search_px: odd sides of template and search window; document 002 has 19 and 21.
         equalise: equalise the histograms of both photographs before least squares matching.
         interpolation: six_tap, bicubic or bilinear; see `sfm.matching.lsm.match_lsm`.
-        min_correlation: smallest r of a match, of correlation and of least squares matching.
+        min_correlation: smallest r of a match. Least squares matching is started from 0.5 on, as the warp
+            makes patches more alike.
+        back_px: a point must lead back to within this of where it came from, px; None: it need not.
 
     Returns:
         One result for each point.
@@ -88,39 +97,104 @@ def match_points(
         raise GeometryError(f"matching: method '{method}' is none of {', '.join(METHODS)}")
     a = np.asarray(xy_left, dtype=float).reshape(-1, 2)
     b = a if xy_right is None else np.asarray(xy_right, dtype=float).reshape(-1, 2)
-    found = match_ncc(
-        left, right, a, b, template_px=template_px, search_px=search_px, min_correlation=min_correlation
+    least = min_correlation if method == "ncc" else min(min_correlation, START_CORRELATION)
+    found = match_ncc(left, right, a, b, template_px=template_px, search_px=search_px, min_correlation=least)
+    # A peak at the border of the search window is a start like any other: least squares may walk out of it.
+    started = found.good | (found.flag == int(NccFlag.AT_BORDER))
+    pixels = independent_pixels(grey_of(left), a, template_px)
+    doubt = started & ambiguous(found.correlation, found.second, pixels)
+    flag = np.where(doubt, int(NccFlag.AMBIGUOUS), found.flag)
+    outside = _what_is_outside(left, a, template_px // 2)
+    ncc_reason = tuple(
+        where or "outside: the search window in the right photograph"
+        if one == int(NccFlag.OUTSIDE)
+        else in_words(NccFlag, one)
+        for one, where in zip(flag.tolist(), outside, strict=True)
     )
-    ncc_reason = tuple(in_words(NccFlag, flag) for flag in found.flag)
     if method == "ncc":
         warp = np.tile(np.eye(3), (len(a), 1, 1))
         warp[:, :2, 2] = found.xy
-        lost = ~found.good[:, None, None]
-        return ConjugatePoints(
-            method, a, found.xy, np.where(lost, np.nan, found.covariance), warp, found.correlation,
+        matched = ConjugatePoints(
+            method, a, found.xy, found.covariance, warp, found.correlation,
             found.second, found.gain, found.offset, np.zeros(len(a), dtype=np.int64), ncc_reason,
         )  # fmt: skip
-    if equalise:
-        left, right = equalise_histogram(left), equalise_histogram(right)
-    # A peak at the border of the search window is a start like any other: least squares may walk out of it.
-    started = found.good | (found.flag == int(NccFlag.AT_BORDER))
-    start = np.where(started[:, None], np.where(found.good[:, None], found.xy, found.peak), -1.0)
-    lsm = match_lsm(
-        left,
-        right,
-        a,
-        start,
-        model=METHODS[method],
-        window_px=template_px,
-        interpolation=interpolation,
-        min_correlation=min_correlation,
+    else:
+        started &= ~doubt
+        seen = (equalise_histogram(left), equalise_histogram(right)) if equalise else (left, right)
+        start = np.where(started[:, None], np.where(found.good[:, None], found.xy, found.peak), -1.0)
+        lsm = match_lsm(
+            *seen,
+            a,
+            start,
+            model=METHODS[method],
+            window_px=template_px,
+            interpolation=interpolation,
+            min_correlation=min_correlation,
+        )
+        outside = _what_is_outside(left, a, template_px // 2, kernel=True)
+        lsm_reason = tuple(
+            where or "outside: the patch in the right photograph"
+            if one == int(LsmFlag.OUTSIDE)
+            else in_words(LsmFlag, one)
+            for one, where in zip(lsm.flag.tolist(), outside, strict=True)
+        )
+        reason = tuple(
+            one if ok else ncc for ok, one, ncc in zip(started, lsm_reason, ncc_reason, strict=True)
+        )
+        correlation = np.where(started & np.isfinite(lsm.correlation), lsm.correlation, found.correlation)
+        matched = ConjugatePoints(
+            method, a, lsm.xy, lsm.covariance, lsm.warp, correlation, found.second, lsm.gain, lsm.offset,
+            np.where(started, lsm.steps, 0), reason,
+        )  # fmt: skip
+    if back_px is not None and matched.good.any():
+        good = np.flatnonzero(matched.good)
+        back = match_points(
+            right,
+            left,
+            matched.right[good],
+            xy_right=a[good],
+            method=method,
+            template_px=template_px,
+            search_px=search_px,
+            equalise=equalise,
+            interpolation=interpolation,
+            min_correlation=min_correlation,
+            back_px=None,
+        )
+        lost = good[~(np.linalg.norm(back.right - a[good], axis=1) <= back_px)]
+        why = np.array(matched.reason, dtype=object)
+        why[lost] = in_words(NccFlag, NccFlag.NOT_CONFIRMED)
+        matched = replace(matched, reason=tuple(why.tolist()))
+    bad = ~matched.good
+    return replace(
+        matched,
+        right=np.where(bad[:, None], np.nan, matched.right),
+        covariance=np.where(bad[:, None, None], np.nan, matched.covariance),
     )
-    reason = tuple(
-        in_words(LsmFlag, flag) if ok else ncc
-        for ok, ncc, flag in zip(started, ncc_reason, lsm.flag, strict=True)
+
+
+def _what_is_outside(
+    photograph: AnyArray, xy: FloatArray, half: int, *, kernel: bool = False
+) -> tuple[str, ...]:
+    """Return in words what of the left points is outside their photograph, empty where nothing is.
+
+    Args:
+        photograph: the left photograph.
+        xy: the points, px, (k, 2).
+        half: half the side of the template, px.
+        kernel: whether the margin counts that least squares matching needs around the template.
+    """
+    size = np.array(photograph.shape[1::-1])
+    reach = half + MARGIN if kernel else half
+    at = np.floor(xy) if kernel else np.rint(xy)
+    resampled = (xy != at).any(axis=1, keepdims=True) & kernel
+    before, after = BEFORE * resampled, AFTER * resampled
+    off = np.asarray(~((xy >= 0) & (xy <= size - 1)).all(axis=1))
+    cut = np.asarray(((at - reach - before < 0) | (at + reach + after > size - 1)).any(axis=1))
+    what = "the template with the margin of its kernel" if kernel else "the template"
+    return tuple(
+        "outside: the point in the left photograph"
+        if o
+        else (f"outside: {what} in the left photograph" if c else "")
+        for o, c in zip(off.tolist(), cut.tolist(), strict=True)
     )
-    correlation = np.where(started, lsm.correlation, found.correlation)
-    return ConjugatePoints(
-        method, a, lsm.xy, lsm.covariance, lsm.warp, correlation, found.second, lsm.gain, lsm.offset,
-        np.where(started, lsm.steps, 0), reason,
-    )  # fmt: skip

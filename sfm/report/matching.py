@@ -14,7 +14,7 @@ import numpy as np
 from sfm.conventions import AnyArray, FloatArray
 from sfm.csv_tables import read_table
 from sfm.errors import PhotographError, SurveyFileError
-from sfm.matching.conjugate import ConjugatePoints, match_points
+from sfm.matching.conjugate import BACK_PX, MIN_CORRELATION, ConjugatePoints, match_points
 from sfm.report.match_files import picture_file, refuse_outputs, whole_outputs
 from sfm.report.patch_pictures import draw_patches
 from sfm.targets.photograph import read_photograph
@@ -46,6 +46,8 @@ def match_command(
     search_px: int = 121,
     equalise: bool = False,
     interpolation: str = "six_tap",
+    min_correlation: float = MIN_CORRELATION,
+    back_px: float | None = BACK_PX,
     as_json: bool = False,
     out: Path | None = None,
     picture: Path | None = None,
@@ -56,7 +58,8 @@ def match_command(
         left_path, right_path: the photographs.
         point: "COL,ROW" in the left photograph, px; either this or `points`.
         points: table of points, see `read_points_to_match`.
-        method, template_px, search_px, equalise, interpolation: see `sfm.matching.conjugate.match_points`.
+        method, template_px, search_px, equalise, interpolation, min_correlation, back_px: see
+            `sfm.matching.conjugate.match_points`.
         as_json: JSON in place of the table.
         out: file .csv or .json that gets the table, in place of the terminal.
         picture: PNG file that gets template, matched patch and their difference.
@@ -69,6 +72,8 @@ def match_command(
     """
     if (point is None) == (points is None):
         raise SurveyFileError("match: give either --point COL,ROW or --points FILE")
+    if not 0.0 <= min_correlation <= 1.0:
+        raise SurveyFileError(f"match: --min-correlation {min_correlation:g}, needed 0 to 1")
     inputs = (left_path, right_path, *(() if points is None else (points,)))
     refuse_outputs(out, picture, inputs, COLUMNS, as_json)
     if points is not None:
@@ -87,6 +92,8 @@ def match_command(
             search_px=search_px,
             equalise=equalise,
             interpolation=interpolation,
+            min_correlation=min_correlation,
+            back_px=back_px,
         )
         as_json = as_json or (out is not None and out.suffix.lower() == ".json")
         if picture_part is not None:
