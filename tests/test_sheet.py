@@ -153,3 +153,55 @@ def test_what_cannot_be_printed_is_named(tmp_path):
         lay_out_sheet("ring14", np.array([9999]), diameter_mm=10.0)
     with pytest.raises(OutputError, match=r"written as \.pdf or \.svg"):
         write_sheet(lay_out_sheet("ring14", np.array([1]), diameter_mm=10.0), tmp_path / "t.doc")
+
+
+@pytest.mark.parametrize(
+    "name", ["köln (1).txt", "a<b&c.txt", "a (1.txt", "b\\).txt", "日本.txt", 90 * "x" + ".txt"]
+)
+def test_any_name_of_a_code_table_is_written_as_text(tmp_path, name):
+    table = tmp_path / name
+    family = code_family("ring12")
+    table.write_text(
+        "# cells 12\n" + "".join(f"{n} {p}\n" for n, p in zip(family.number, family.pattern, strict=True))
+    )
+    sheet = lay_out_sheet(str(table), np.arange(1, 5), diameter_mm=10.0)
+    shown = name if len(name) <= 40 else name[:37] + "..."
+    (svg,) = write_sheet(sheet, tmp_path / "k.svg")
+    texts = [t.text for t in ElementTree.parse(svg).getroot().iter("{http://www.w3.org/2000/svg}text")]
+    assert texts[-1].startswith(f"{shown}, dot 10 mm")
+    (pdf,) = write_sheet(sheet, tmp_path / "k.pdf")
+    content = pdf.read_bytes().decode("cp1252")
+    strings = re.findall(r"Td \(((?:[^\\()]|\\.)*)\) Tj", content)
+    assert len(strings) == content.count(" Tj ET") == 5
+    said = re.sub(r"\\(.)", r"\1", strings[-1])
+    assert said.startswith(shown.encode("cp1252", "replace").decode("cp1252") + ", dot 10 mm")
+
+
+def test_what_is_ignored_or_unprintable_is_refused():
+    with pytest.raises(SurveyFileError, match="radii of the ring are of rings, apriltag36h11 has none"):
+        lay_out_sheet("apriltag36h11", np.arange(4), diameter_mm=40.0, ring_radii=(2.0, 3.0))
+    with pytest.raises(SurveyFileError, match="number 1 is named 3 times"):
+        lay_out_sheet("ring14", np.array([1, 2, 1, 1]), diameter_mm=10.0)
+    with pytest.raises(SurveyFileError, match=r"diameter is 0\.1 mm, needed at least 1 mm for ring14"):
+        lay_out_sheet("ring14", np.arange(1, 4), diameter_mm=0.1)
+    with pytest.raises(SurveyFileError, match=r"needed at least 2 mm for apriltag36h11"):
+        lay_out_sheet("apriltag36h11", np.arange(4), diameter_mm=1.9)
+    assert len(lay_out_sheet("apriltag36h11", np.arange(4), diameter_mm=2.0).pages) == 1
+
+
+def test_only_earlier_sheets_are_replaced(tmp_path):
+    sheet = lay_out_sheet("ring14", np.arange(1, 60), diameter_mm=14.0)
+    files = (*write_sheet(sheet, tmp_path / "t.svg"), *write_sheet(sheet, tmp_path / "t.pdf"))
+    assert (*write_sheet(sheet, tmp_path / "t.svg"), *write_sheet(sheet, tmp_path / "t.pdf")) == files
+    (tmp_path / "d.pdf").mkdir()
+    with pytest.raises(OutputError, match=r"d\.pdf: is a folder"):
+        write_sheet(sheet, tmp_path / "d.pdf")
+    for name, other in (("o.pdf", b"%PDF-1.4 a letter"), ("o-2.svg", b"<svg/>")):
+        (tmp_path / name).write_bytes(other)
+        with pytest.raises(OutputError, match="exists and is no earlier sheet"):
+            write_sheet(sheet, tmp_path / name.replace("-2", ""))
+        assert (tmp_path / name).read_bytes() == other
+    assert not (tmp_path / "o-1.svg").exists()
+    with pytest.raises(OutputError, match="cannot be written"):
+        write_sheet(sheet, tmp_path / "t.pdf" / "in.pdf")
+    assert not list(tmp_path.glob(".*"))

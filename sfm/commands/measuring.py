@@ -145,7 +145,10 @@ def _tried(task: Task, method: str) -> dict[str, object]:
 
 
 def targets(
-    out: Annotated[Path, typer.Option("--out", metavar="FILE", help="Sheet to write: .pdf or .svg.")],
+    out: Annotated[
+        Path,
+        typer.Option("--out", metavar="FILE", help="Sheet to write: .pdf or .svg; replaces only a sheet."),
+    ],
     family: Annotated[
         str,
         typer.Option(
@@ -154,11 +157,13 @@ def targets(
             "table file.",
         ),
     ] = "ring14",
-    ids: Annotated[str, typer.Option("--ids", metavar="A-B,C", help="Code numbers.")] = "1-100",
+    ids: Annotated[str, typer.Option("--ids", metavar="A-B,C", help="Code numbers, each once.")] = "1-100",
     diameter: Annotated[
         float,
         typer.Option(
-            "--diameter-mm", metavar="MM", help="Diameter of the dot, of tags the side of the square, mm."
+            "--diameter-mm",
+            metavar="MM",
+            help="Diameter of the dot, at least 1 mm; of tags the side of the square.",
         ),
     ] = 10.0,
     page: Annotated[str, typer.Option("--page", help="a4, a3, letter ...")] = "a4",
@@ -166,7 +171,9 @@ def targets(
     ring_radii: Annotated[
         str | None,
         typer.Option(
-            "--ring-radii", metavar="R1,R2", help="Inner and outer radius of rings, in radii of the dot."
+            "--ring-radii",
+            metavar="R1,R2",
+            help="Inner and outer radius of rings (not tags), in radii of the dot.",
         ),
     ] = None,
 ) -> None:

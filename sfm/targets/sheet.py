@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-import os
-import tempfile
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
+from xml.sax.saxutils import escape
 
 import numpy as np
 
 from sfm.conventions import FloatArray, IntArray
 from sfm.errors import OutputError, SurveyFileError
-from sfm.targets.codes import CodeFamily
 from sfm.targets.scene import ARC, DISC, RECTANGLE, Marks, coded_ring, join_marks, square_tag
 from sfm.targets.tags import TagFamily, target_family
+from sfm.whole_files import whole_file
 
 # ISO 216 and ANSI/ASME Y14.1, width and height in mm.
 PAGES_MM = {
@@ -31,6 +31,10 @@ FOOT_MM = 16.0  # room for the ruler and the text beside it
 LABEL_MM = 4.0  # room for the id below a target
 # Radius that stays clear around a target, in radii of its ring, so that neighbours are not taken for code.
 CLEAR = 1.35
+# Printers of 600 dots per inch put 24 dots across the smallest target, 6 across a module of the smallest tag.
+SMALLEST_DOT_MM, SMALLEST_MODULE_MM = 1.0, 0.25
+MOST_LETTERS = 40  # of the name of a code table, so that the line with it stays on the page
+CHECK = "print without scaling and check"  # stands on every page; a file with it is an earlier sheet
 
 
 @dataclass(frozen=True)
@@ -78,7 +82,8 @@ def lay_out_sheet(
         The sheet, with as many pages as it takes.
 
     Raises:
-        SurveyFileError: unknown page or family, impossible radii, or a target that is larger than the page.
+        SurveyFileError: unknown page or family, impossible radii, a number twice, or a target that is too
+            small to be printed or larger than the page.
         GeometryError: the family has no such number.
     """
     codes = target_family(family)
@@ -89,7 +94,24 @@ def lay_out_sheet(
     if not diameter_mm > 0:
         raise SurveyFileError(f"targets: diameter is {diameter_mm} mm, needed more than 0")
     width, height = PAGES_MM[page]
-    if ring_radii is not None and isinstance(codes, CodeFamily):
+    if isinstance(codes, TagFamily):
+        smallest = SMALLEST_MODULE_MM * codes.modules
+    else:
+        smallest = SMALLEST_DOT_MM
+    if diameter_mm < smallest:
+        raise SurveyFileError(
+            f"targets: diameter is {diameter_mm:g} mm, needed at least {smallest:g} mm for {codes.name} to "
+            "be printed"
+        )
+    values, count = np.unique(numbers, return_counts=True)
+    if (count > 1).any():
+        raise SurveyFileError(
+            f"targets: number {values[count > 1][0]} is named {count[count > 1][0]} times, a survey needs "
+            "every code once"
+        )
+    if ring_radii is not None:
+        if isinstance(codes, TagFamily):
+            raise SurveyFileError(f"targets: radii of the ring are of rings, {codes.name} has none")
         if not 1 < ring_radii[0] < ring_radii[1]:
             raise SurveyFileError(
                 f"targets: radii of the ring are {ring_radii[0]:g} and {ring_radii[1]:g} radii of the dot, "
@@ -134,27 +156,33 @@ def write_sheet(sheet: Sheet, path: Path) -> tuple[Path, ...]:
         The files written; all of them appear, or none.
 
     Raises:
-        OutputError: another ending, or the file cannot be written.
+        OutputError: another ending, something else than a sheet is there, or the file cannot be written.
     """
     if path.suffix.lower() not in (".pdf", ".svg"):
         raise OutputError(f"{path}: a sheet is written as .pdf or .svg")
     count = len(sheet.pages)
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=path.parent, prefix=".sheet") as folder:
-            if path.suffix.lower() == ".pdf":
-                contents = [_pdf(sheet)]
-                names = [path]
-            else:
-                contents = [_svg(sheet, k).encode() for k in range(count)]
-                names = [path if count == 1 else path.with_stem(f"{path.stem}-{k + 1}") for k in range(count)]
-            for name, content in zip(names, contents, strict=True):
-                (Path(folder) / name.name).write_bytes(content)
-            for name in names:
-                os.replace(Path(folder) / name.name, name)
-    except OSError as error:
-        raise OutputError(f"{path}: {error}") from error
+    if path.suffix.lower() == ".pdf":
+        names, contents = [path], [_pdf(sheet)]
+    else:
+        names = [path if count == 1 else path.with_stem(f"{path.stem}-{k + 1}") for k in range(count)]
+        contents = [_svg(sheet, k).encode() for k in range(count)]
+    for name in names:
+        _refuse_other_files(name)
+    with ExitStack() as files:
+        for name, content in zip(names, contents, strict=True):
+            files.enter_context(whole_file(name, "the sheet")).write_bytes(content)
     return tuple(names)
+
+
+def _refuse_other_files(path: Path) -> None:
+    """Raise OutputError where something is that is no earlier sheet: it would be lost."""
+    try:
+        if path.is_dir():
+            raise OutputError(f"{path}: is a folder, needed the name of a file")
+        if path.exists() and CHECK.encode() not in path.read_bytes():
+            raise OutputError(f"{path}: exists and is no earlier sheet, needed another name")
+    except OSError as error:
+        raise OutputError(f"{path}: the sheet cannot be written: {error.strerror or error}") from error
 
 
 @dataclass(frozen=True)
@@ -234,10 +262,10 @@ def _texts(sheet: Sheet, k: int) -> list[tuple[float, float, float, str]]:
     size = f"dot {sheet.diameter_mm:g} mm, ring {sheet.ring_mm:g} mm"
     if sheet.tags:
         size = f"square {sheet.diameter_mm:g} mm"
-    note = (
-        f"{sheet.family}, {size}, "
-        f"page {k + 1} of {len(sheet.pages)}; ruler {RULER_MM:g} mm: print without scaling and check"
-    )
+    family = "".join(letter if letter.isprintable() else "?" for letter in sheet.family)
+    if len(family) > MOST_LETTERS:
+        family = family[: MOST_LETTERS - 3] + "..."
+    note = f"{family}, {size}, page {k + 1} of {len(sheet.pages)}; ruler {RULER_MM:g} mm: {CHECK}"
     return [*texts, (sheet.size_mm[0] / 2, MARGIN_MM + 7.5, height, note)]
 
 
@@ -257,7 +285,7 @@ def _svg(sheet: Sheet, k: int) -> str:
         lines.append(f'<path d="{"".join(words)}Z" fill="{"#fff" if path.white else "#000"}"/>')
     lines += [
         f'<text x="{x:.3f}" y="{height - y:.3f}" font-family="Helvetica, Arial, sans-serif" '
-        f'font-size="{size:g}" text-anchor="middle">{words}</text>'
+        f'font-size="{size:g}" text-anchor="middle">{escape(words)}</text>'
         for x, y, size, words in _texts(sheet, k)
     ]
     return "\n".join([*lines, "</svg>", ""])
@@ -265,6 +293,15 @@ def _svg(sheet: Sheet, k: int) -> str:
 
 # Mean advance of Helvetica's letters and figures in parts of its size, to centre what is written.
 HELVETICA_WIDTH = 0.5
+
+
+def _pdf_text(words: str) -> str:
+    """Return words as the inside of a PDF string of WinAnsiEncoding, what that has not as a question mark.
+
+    Source: ISO 32000-1:2008, sec. 7.3.4.2 (literal strings) and annex D.2 (Windows code page 1252).
+    """
+    known = words.encode("cp1252", "replace").decode("cp1252")
+    return "".join(f"\\{letter}" if letter in "\\()" else letter for letter in known)
 
 
 def _pdf(sheet: Sheet) -> bytes:
@@ -286,14 +323,14 @@ def _pdf(sheet: Sheet) -> bytes:
         lines.append("0 g")
         for x, y, size, words in _texts(sheet, k):
             left = x - HELVETICA_WIDTH * size * len(words) / 2
-            lines.append(f"BT /F {size:g} Tf {left:.3f} {y:.3f} Td ({words}) Tj ET")
-        streams.append("\n".join(lines).encode("ascii"))
+            lines.append(f"BT /F {size:g} Tf {left:.3f} {y:.3f} Td ({_pdf_text(words)}) Tj ET")
+        streams.append("\n".join(lines).encode("cp1252"))
     n = len(streams)
     kids = " ".join(f"{4 + 2 * k} 0 R" for k in range(n))
     objects = [
         b"<< /Type /Catalog /Pages 2 0 R >>",
         f"<< /Type /Pages /Kids [{kids}] /Count {n} >>".encode(),
-        b"<< /Type /Font /Subtype /Type1 /BaseFont /Helvetica >>",
+        b"<< /Type /Font /Subtype /Type1 /BaseFont /Helvetica /Encoding /WinAnsiEncoding >>",
     ]
     for k, stream in enumerate(streams):
         objects.append(
