@@ -62,3 +62,9 @@ def test_command() -> None:
     )
     assert done.returncode == 2
     assert done.stderr.strip() == "kolinear: target size: photograph is 0, needed more than 0"
+    bad = [*words[:5], "furlong", *camera]
+    done = subprocess.run(
+        [sys.executable, "-c", "from sfm.cli import main; main()", *bad], capture_output=True, text=True
+    )
+    assert done.returncode == 2
+    assert done.stderr.strip() == "kolinear: --unit furlong: needed mm, cm, m, km, in or ft"

@@ -444,6 +444,15 @@ def test_refining_what_another_program_wrote(tmp_path: Path) -> None:
     cv2.imwrite(str(tmp_path / "b" / "2.png"), np.zeros((50, 60), np.uint8))
     with pytest.raises(PhotographError, match="60 x 50 px, its camera has 480 x 360 px"):
         refine_model(network, estimate, tmp_path)
+    (tmp_path / "b" / "2.png").unlink()  # what is refused now is refused before any photograph is read
+    for wrong, message in (
+        ({"window_px": 301}, "window is 301 px, needed at most 101 px"),
+        ({"window_px": 16}, "16"),
+        ({"min_correlation": float("nan")}, "smallest correlation is nan, needed 0 to 1"),
+        ({"min_correlation": 7.0}, "smallest correlation is 7, needed 0 to 1"),
+    ):
+        with pytest.raises(GeometryError, match=message):
+            refine_model(network, estimate, tmp_path, **wrong)
     nothing = replace(estimate, points=estimate.points * np.nan)
     with pytest.raises(GeometryError, match="nothing to refine"):
         refine_model(network, nothing, tmp_path)

@@ -10,6 +10,8 @@ from sfm.analysis.design import LEAST_PIXELS, target_size
 from sfm.commands.starting import loading
 from sfm.errors import SurveyFileError
 
+UNITS = ("mm", "cm", "m", "km", "in", "ft")  # of distances, and so of the answer
+
 plan = typer.Typer(name="plan", help="Plan a survey before the photographs are taken.")
 
 
@@ -21,7 +23,10 @@ def _plans() -> None:
 @plan.command("target-size")
 def target_size_command(
     distance: Annotated[
-        float, typer.Option("--distance", metavar="D", help="Farthest distance of the camera, in any unit.")
+        float,
+        typer.Option(
+            "--distance", metavar="D", help="Farthest distance of the camera, in the unit of --unit."
+        ),
     ],
     c: Annotated[float, typer.Option("--c-mm", metavar="MM", help="Principal distance (focal length), mm.")],
     width: Annotated[float, typer.Option("--sensor-width-mm", metavar="MM", help="Width of the sensor, mm.")],
@@ -35,7 +40,9 @@ def target_size_command(
     family: Annotated[
         str, typer.Option("--family", help="Rings around the dots: ring12, ring14, ring20 or arcs.")
     ] = "ring14",
-    unit: Annotated[str, typer.Option("--unit", help="Unit of the distance, for the answer.")] = "mm",
+    unit: Annotated[
+        str, typer.Option("--unit", help="Unit of the distance: mm, cm, m, km, in or ft.")
+    ] = "mm",
 ) -> None:
     """Tell how large targets must be for a camera and a distance.
 
@@ -45,6 +52,8 @@ def target_size_command(
         from sfm.targets.codes import CodeFamily
         from sfm.targets.tags import target_family
 
+    if unit not in UNITS:
+        raise SurveyFileError(f"--unit {unit}: needed {', '.join(UNITS[:-1])} or {UNITS[-1]}")
     codes = target_family(family)
     if not isinstance(codes, CodeFamily):
         raise SurveyFileError(f"--family {family}: needed rings, such as ring14")

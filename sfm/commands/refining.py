@@ -18,9 +18,14 @@ def refine(
         Path | None,
         typer.Option("--out", metavar="DIR", help="New folder for the refined model, COLMAP's format."),
     ] = None,
-    window: Annotated[int, typer.Option("--window", metavar="N", help="Side of the windows, odd, px.")] = 15,
+    window: Annotated[
+        int, typer.Option("--window", metavar="N", help="Side of the windows, odd, 3 to 101 px.")
+    ] = 15,
     min_correlation: Annotated[
-        float, typer.Option("--min-correlation", metavar="R", help="Smallest r of a window and its template.")
+        float,
+        typer.Option(
+            "--min-correlation", metavar="R", help="Smallest r of a window and its template, 0 to 1."
+        ),
     ] = 0.7,
 ) -> None:
     """Measure the key points of a COLMAP model anew.

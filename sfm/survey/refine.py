@@ -16,12 +16,15 @@ from sfm.errors import GeometryError, PhotographError, SurveyFileError
 from sfm.matching.flags import LsmFlag, in_words
 from sfm.matching.multi_lsm import match_multi
 from sfm.matching.pictures import pictures_of
+from sfm.matching.radiometry import odd_window
 from sfm.network import Estimate, ImagePoints, Network, reduce_network
 from sfm.progress import SILENT, Progress
 from sfm.survey.solution import FALSE_ALARM, TOLERANCE_FACTOR, determined, put_back
 from sfm.targets.photograph import read_photograph
 
 MIN_RAYS = 3
+# Over larger windows no surface is a plane, and memory and time grow with the square of the side.
+MAX_WINDOW_PX = 101
 SIGMA_PX = 0.02  # of a matched point, on top of what matching knows: surfaces are not plane over a window
 ORIENTATION_FACTOR = (
     3.0  # of the robust spread of the model's residuals, by which its projected points may be off
@@ -58,15 +61,19 @@ def refine_model(
     Args:
         network, estimate: a solved model, as `adapters.colmap_model.read_model` gives it.
         images_dir: folder of its photographs.
-        window_px: odd side of the windows.
-        min_correlation: smallest coefficient r of a window and its template.
+        window_px: odd side of the windows, at most MAX_WINDOW_PX.
+        min_correlation: smallest coefficient r of a window and its template, 0 to 1.
         progress: told of stages and photographs.
 
     Raises:
         SurveyFileError: a photograph of the model is not in the folder.
         PhotographError: a photograph that cannot be read, or of another size than its camera.
-        GeometryError: too little is left to adjust.
+        GeometryError: an impossible window or correlation, or too little is left to adjust.
     """
+    if odd_window("refine", window_px) > MAX_WINDOW_PX:
+        raise GeometryError(f"refine: window is {window_px} px, needed at most {MAX_WINDOW_PX} px")
+    if not 0 <= min_correlation <= 1:
+        raise GeometryError(f"refine: smallest correlation is {min_correlation:g}, needed 0 to 1")
     seen = network.image_points
     everything = np.ones(len(seen), dtype=bool)
     estimate = replace(estimate, cameras=tuple(_freed(camera) for camera in estimate.cameras))
