@@ -57,6 +57,9 @@ def one_line(path: Path, text: str, error: ValidationError, whole: type[Section]
         table = _key(location[:-1])
         inside = f"[{table}]" if table else "the survey file"
         return f"{where}unknown key '{location[-1]}' in {inside}, known are {_known(location[:-1], whole)}"
+    if kind == "missing" and isinstance(location[-1], int) and isinstance(first["input"], list | tuple):
+        found = _found(list(first["input"]))
+        return f"{where}{_key(location[:-1])}: found {found}, needed {location[-1] + 1} values"
     if kind == "missing":
         return f"{where}{key} is missing"
     if kind == "tuple_type" and len(location) == 1 and isinstance(first["input"], dict):
@@ -119,7 +122,8 @@ def _known(location: tuple[str | int, ...], whole: type[Section]) -> str:
 def _line_of(text: str, location: tuple[str | int, ...]) -> int | None:
     """Return the line of the survey file on which the key of a location stands, None if not found."""
     keys = [str(part) for part in location if isinstance(part, str)]
-    number = next((part for part in location if isinstance(part, int)), 0)
+    # An index behind the table is that of a table in double brackets, a later one counts values of a key.
+    number = location[1] if len(location) > 1 and isinstance(location[1], int) else 0
     count: dict[str, int] = {}
     table, last = "", None
     for k, line in enumerate(text.splitlines(), 1):

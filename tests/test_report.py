@@ -253,6 +253,9 @@ def test_a_network_without_scale_has_no_metric_unit(result: SurveyResult) -> Non
 
 def test_verdict(result: SurveyResult) -> None:
     assert verdict_of(result).level == "fair"
+    assert verdict_of(result).remarks[-1] == "Warning: scale bar 1 - 2 was not measured."
+    more = replace(result, warnings=("one thing.", "another", "a third"))
+    assert verdict_of(more).remarks[-1] == "Warning: one thing (2 more warnings, see below)."
     fine = replace(result, images_total=8, failed=(), warnings=())
     assert verdict_of(fine).level == "good"
     assert verdict_of(fine).headline == "The survey worked: 8 of 8 photographs oriented, 40 object points."

@@ -224,6 +224,11 @@ def test_sizes_that_do_not_go_with_the_codes_are_refused(tmp_path: Path) -> None
             'codes = "ring14"\nring_radii = [3, 2]',
             "needed more than 1 radius",
         ),
+        (
+            'codes = "apriltag36h11"\ntag_size = 30.0\ntag_sigma = 0.01',
+            'codes = "ring14"\nring_radii = [2.0]',
+            r"line \d+: targets\.ring_radii: found \[2\.0\], needed 2 values",
+        ),
     ):
         path.write_text(SURVEY.replace(old, new), encoding="utf-8")
         with pytest.raises(SurveyFileError, match=message):

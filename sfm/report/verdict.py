@@ -70,7 +70,9 @@ def verdict_of(result: SurveyResult) -> Verdict:
     if result.comparison is not None and not result.comparison.agree:
         remarks.append(f"{result.comparison.backend} does not agree with the adjustment.")
     if result.warnings:
-        remarks.append(f"{len(result.warnings)} warning{'s' if len(result.warnings) > 1 else ''}, see below.")
+        more = len(result.warnings) - 1
+        other = f" ({more} more warning{'s' if more > 1 else ''}, see below)" if more else ""
+        remarks.append(f"Warning: {result.warnings[0].rstrip('.')}{other}.")
     if serious:
         return Verdict("bad", "The survey has no dependable result.", (*serious, *remarks))
     found = f"{oriented} of {total} photographs oriented, {len(a.network.points)} object points"
