@@ -74,7 +74,7 @@ def run_survey(
         baseline=compared.baseline,
         photographs=photographs.overlays(),
         control_check=solution.control_check,
-        warnings=start.warnings + solution.warnings + compared.failures,
+        warnings=start.warnings + circles.warnings + solution.warnings + compared.failures,
         eccentricity=circles.eccentricity,
         no_circles=circles.no_circles,
         weight_factor=solution.weight_factor,

@@ -175,6 +175,29 @@ def test_they_are_unbiased_with_the_correction(
     assert np.mean(squares) == pytest.approx(1.0, abs=4 * np.sqrt(2 / len(squares)))
 
 
+def test_stated_diameters_are_compared_with_the_ellipses(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    centres, _ = places()
+    length = float(np.linalg.norm(centres[39] - centres[0]))
+    bar = f'\n[[scale_bar]]\nfrom = "1"\nto = "40"\nlength = {length}\nsigma = 0.01'
+    right = surveyed(tmp_path, monkeypatch, f"diameter = {1.05 * SMALL_MM}{bar}")  # two thirds are small
+    assert right.warnings == ()
+    wrong = surveyed(tmp_path, monkeypatch, f"diameter = 12.0{bar}")
+    assert wrong.warnings == ("targets.diameter is 12 mm, but the ellipses of 40 targets give 1.2 mm",)
+    table = f"id,diameter\n1,{LARGE_MM}\n2,{2 * SMALL_MM}\n3,{1.05 * SMALL_MM}\n"
+    (tmp_path / "d.csv").write_text(table + "".join(f"{k},3\n" for k in range(901, 913)), encoding="utf-8")
+    several = surveyed(tmp_path, monkeypatch, f'diameters = "d.csv"{bar}')
+    ids = ", ".join(str(k) for k in range(901, 911))
+    assert several.warnings == (
+        f"d.csv: diameters of targets that are not in the survey: {ids} and 2 more",
+        "d.csv: the diameter of target 2 is 2.4 mm, but its ellipses give 1.2 mm "
+        "(more than 10 % apart: 1 of 3 targets)",
+    )
+    only = surveyed(tmp_path, monkeypatch, 'diameters = "d.csv"')  # no scale to compare with
+    assert len(only.warnings) == 2 and "not in the survey" in only.warnings[0]
+
+
 def test_table_of_diameters(tmp_path: Path) -> None:
     path = tmp_path / "d.csv"
     path.write_text("id,diameter\n7,12.5\nu001,3\n", encoding="utf-8")

@@ -23,6 +23,10 @@ NOT_A_CIRCLE = (
 )
 
 
+OTHER_SIZE = 0.1  # relative difference of a stated diameter from that of the ellipses, which know 1 to 3 %
+MOST_NAMED = 10  # ids in a warning
+
+
 @dataclass(frozen=True)
 class CircleCheck:
     """The network after its targets were compared with circles in space."""
@@ -31,6 +35,7 @@ class CircleCheck:
     estimate: Estimate  # without the points that are no circles
     no_circles: tuple[str, ...]  # uncoded points left out: their outlines are not images of one circle
     eccentricity: Eccentricity | None  # what was corrected; None where nothing was
+    warnings: tuple[str, ...] = ()  # on stated diameters, one line each
 
 
 def check_circles(
@@ -65,10 +70,13 @@ def check_circles(
     names = tuple(network.points[j] for j in no_circle)
     if not survey.targets.eccentricity:
         return CircleCheck(network, estimate, names, None)
-    known = _known_radius(survey, tuple(network.points[j] for j in numbers))
+    names_of_circles = tuple(network.points[j] for j in numbers)
+    known, warnings = _known_radius(survey, names_of_circles), _unknown_ids(survey, network.points)
     if np.isfinite(known).any():
         scale = object_scale(network, estimate)
-        if np.isnan(scale):  # then the targets themselves tell the scale
+        if np.isfinite(scale):
+            warnings += _other_sizes(survey, names_of_circles, known, scale * circles.radius)
+        else:  # then the targets themselves tell the scale
             scale = float(np.nanmedian(known / circles.radius))
         circles = fit_circles(views, len(numbers), radius=known / scale)
     xy, covariance = seen.xy.copy(), seen.covariance.copy()
@@ -83,7 +91,7 @@ def check_circles(
         float(np.sqrt(np.sum(length**2) / max(2 * len(length), 1))),
         float(np.sqrt(np.sum(sigma) / max(len(sigma), 1))),
     )
-    return CircleCheck(corrected, estimate, names, summary)
+    return CircleCheck(corrected, estimate, names, summary, warnings)
 
 
 def _known_radius(survey: Survey, points: tuple[str, ...]) -> FloatArray:
@@ -95,6 +103,58 @@ def _known_radius(survey: Survey, points: tuple[str, ...]) -> FloatArray:
         stated = dict(zip(names, diameters.tolist(), strict=True))
         radius = np.array([stated.get(p, 2 * r) / 2 for p, r in zip(points, radius, strict=True)])
     return radius
+
+
+def _unknown_ids(survey: Survey, points: tuple[str, ...]) -> tuple[str, ...]:
+    """Return a warning on the ids of the table of diameters that no target of the survey has."""
+    if survey.targets.diameters is None:
+        return ()
+    stated, _ = read_diameters(survey.beside(survey.targets.diameters))
+    unknown = [name for name in stated if name not in set(points)]
+    if not unknown:
+        return ()
+    more = f" and {len(unknown) - MOST_NAMED} more" if len(unknown) > MOST_NAMED else ""
+    return (
+        f"{survey.targets.diameters}: diameters of targets that are not in the survey: "
+        f"{', '.join(unknown[:MOST_NAMED])}{more}",
+    )
+
+
+def _other_sizes(
+    survey: Survey, points: tuple[str, ...], stated: FloatArray, found: FloatArray
+) -> tuple[str, ...]:
+    """Return warnings on stated diameters that the ellipses contradict.
+
+    The one diameter of all targets is judged by their median, since other round things may be among the
+    uncoded ones; those of a table are judged one by one.
+
+    Args:
+        survey: says which diameters are of single targets.
+        points: names of the targets, (n,).
+        stated, found: their radii, NaN where not stated, object unit, (n,).
+    """
+    single = np.zeros(len(points), dtype=bool)
+    if survey.targets.diameters is not None:
+        names, _ = read_diameters(survey.beside(survey.targets.diameters))
+        single = np.isin(points, names)
+    lines = []
+    common = ~single & np.isfinite(stated)
+    if common.any():
+        given, seen = 2 * stated[common][0], 2 * float(np.median(found[common]))
+        if abs(np.log(given / seen)) > np.log1p(OTHER_SIZE):
+            lines.append(
+                f"targets.diameter is {given:.3g} {survey.unit}, but the ellipses of {common.sum()} targets "
+                f"give {seen:.3g} {survey.unit}"
+            )
+    differs = single & (np.abs(np.log(stated / found)) > np.log1p(OTHER_SIZE))
+    if differs.any():
+        worst = int(np.nanargmax(np.where(differs, np.abs(np.log(stated / found)), np.nan)))
+        lines.append(
+            f"{survey.targets.diameters}: the diameter of target {points[worst]} is {2 * stated[worst]:.3g} "
+            f"{survey.unit}, but its ellipses give {2 * found[worst]:.3g} {survey.unit} "
+            f"(more than {100 * OTHER_SIZE:g} % apart: {differs.sum()} of {single.sum()} targets)"
+        )
+    return tuple(lines)
 
 
 def _named(photographs: MeasuredPhotographs, naming: Naming, values: list[AnyArray]) -> AnyArray:
