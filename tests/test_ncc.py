@@ -45,7 +45,6 @@ def test_peak_and_regression() -> None:
     assert matches.gain == pytest.approx(np.full(len(at), 0.8), abs=0.1)
     assert matches.offset == pytest.approx(np.full(len(at), 20), abs=16)
     assert (matches.second < matches.correlation).all()
-    # the parabola is biased towards whole pixels, which the precision of the peak cannot know
     sigma = np.sqrt(matches.covariance[:, 0, 0].mean())
     assert 0.2 < sigma / np.sqrt((e**2).mean()) < 5
 
@@ -254,3 +253,12 @@ def test_ambiguous_is_a_test_of_significance() -> None:
         r = np.corrcoef(patches)[np.triu_indices(len(at), 1)]
         assert 0.4 < n.mean() * r.var() < 1.3
     assert np.isnan(independent_pixels(noise, np.array([[5.0, 50.0]]), 21)).all()
+
+
+def test_sigma_of_the_peak_holds_what_the_parabola_misses() -> None:
+    left, _, at = _photographs()
+    points = at + np.random.default_rng(3).uniform(-0.5, 0.5, at.shape)
+    same = match_ncc(left, left, points, points, search_px=41)  # the same pixels: no noise, only the parabola
+    sigma = np.sqrt(np.diagonal(same.covariance, axis1=1, axis2=2))
+    ratio = np.sqrt(((same.xy - points) ** 2).mean() / (sigma**2).mean())
+    assert 0.5 < ratio < 2.0

@@ -91,7 +91,20 @@ def read_peak(template, window, surface, whole, least, min_r, max_second, out): 
     out[2] += min(1.0, max(-1.0, dy))
     # least squares of the shift has N = sum g g^T = -r'' sum f^2 / r, sigma^2 = (1 - r^2) sum f^2 / (n - 4)
     c = (1.0 - r * r) * r / (n - 4) / det
-    out[3], out[4], out[5] = -hyy * c, hxy * c, -hxx * c
+    # r is no parabola: what the nine coefficients miss it by, of 9 - 6 degrees of freedom, is in the gradient
+    mean = 0.0
+    for i in range(-1, 2):
+        for j in range(-1, 2):
+            mean += whole[bi + i, bj + j] / 9.0
+    misfit = 0.0
+    for i in range(-1, 2):
+        for j in range(-1, 2):
+            bend = hxx * (j * j - 2.0 / 3.0) / 2.0 + hyy * (i * i - 2.0 / 3.0) / 2.0 + hxy * i * j
+            misfit += (whole[bi + i, bj + j] - mean - gx * j - gy * i - bend) ** 2
+    m = misfit / 3.0 / 6.0 / (det * det)
+    out[3] = -hyy * c + m * (hyy * hyy + hxy * hxy)
+    out[4] = hxy * c - m * hxy * (hxx + hyy)
+    out[5] = -hxx * c + m * (hxx * hxx + hxy * hxy)
 
 
 @njit(cache=True, nogil=True, fastmath=True)
