@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 import time
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -126,3 +129,29 @@ def test_faster_and_better_than_the_simple_blob_detector() -> None:
     print({k: min(v) for k, v in seconds.items()}, np.sqrt((theirs**2).mean()), np.sqrt((error**2).mean()))
     assert min(seconds["kolinear"]) < min(seconds["simple blob"]) / 2.5
     assert np.sqrt((error[seen] ** 2).mean()) < np.sqrt((theirs**2).mean()) / 3
+
+
+MEASURE = """
+import re, sys
+from pathlib import Path
+from sfm.targets.detect import find_targets
+from sfm.targets.photograph import read_photograph
+found = find_targets(read_photograph(Path(sys.argv[1])), polarity="bright", min_diameter_px=3)
+# The peak that getrusage tells begins with that of the process which started this one.
+print(len(found), int(re.search(r"VmHWM:\\s+(\\d+)", Path("/proc/self/status").read_text())[1]) // 1024)
+"""
+
+
+@pytest.mark.slow
+def test_24_megapixels_with_600_targets_stay_under_500_mib(tmp_path: Path) -> None:
+    image, truth, _ = photograph((30, 20), 200, 1, 0.0, 1)
+    path = tmp_path / "targets.png"
+    cv2.imwrite(str(path), image, [cv2.IMWRITE_PNG_COMPRESSION, 1])
+    root = Path(__file__).resolve().parents[1]
+    run = subprocess.run(
+        [sys.executable, "-c", MEASURE, str(path)], cwd=root, capture_output=True, text=True, check=True
+    )
+    count, mib = (int(word) for word in run.stdout.split())
+    print(f"{image.size / 1e6:.0f} megapixels, {count} targets: {mib} MiB at most")
+    assert count == len(truth) == 600
+    assert mib < 500
