@@ -100,6 +100,10 @@ def test_unreadable_files_are_named_once_with_their_reason(
     [
         ({"codes": '"none"'}, r"0 codes were read in 0 of them; .*codes = 'none', polarity = 'dark'"),
         ({"codes": '"arcs"'}, r"codes were read in \d+ of them; .*codes = 'arcs'"),
+        (
+            {"codes": '"ring20"'},
+            r"codes = 'ring20', .*; in photo \d\.png codes = 'ring14' reads \d\d? codes$",
+        ),
         ({"polarity": '"bright"'}, r"polarity = 'bright' and min_diameter_px = 6"),
     ],
 )

@@ -13,6 +13,9 @@ from sfm.project import Survey
 from sfm.survey.solution import refine
 from sfm.survey.start import PhotographList, approximate_values
 from sfm.survey.targets import MeasuredPhotographs
+from sfm.targets.codes import FAMILIES
+from sfm.targets.detect import find_targets
+from sfm.targets.photograph import read_photograph
 
 
 def orient_photographs(
@@ -74,9 +77,35 @@ def _codes_found(survey: Survey, photographs: MeasuredPhotographs) -> str:
     codes = [int((found.code >= 0).sum()) for found in photographs.targets]
     with_codes = sum(count > 0 for count in codes)
     settings = survey.targets
+    other = _other_family(survey, photographs)
     return (
         f"no two photographs have {MIN_POINTS} coded targets in common, which their orientation needs: "
         f"{sum(targets)} targets were found in {len(targets)} photographs, {sum(codes)} codes were read in "
         f"{with_codes} of them; check in [targets] codes = '{settings.codes}', "
-        f"polarity = '{settings.polarity}' and min_diameter_px = {settings.min_diameter_px:g}"
+        f"polarity = '{settings.polarity}' and min_diameter_px = {settings.min_diameter_px:g}{other}"
     )
+
+
+def _other_family(survey: Survey, photographs: MeasuredPhotographs) -> str:
+    """Say which other rings or arcs read more in the photograph with most targets, if any do."""
+    settings = survey.targets
+    if settings.codes not in FAMILIES:
+        return ""
+    fullest = int(np.argmax([len(found) for found in photographs.targets]))
+    photograph = read_photograph(photographs.paths[fullest], channel=settings.channel)
+    counts = []
+    for family in FAMILIES:
+        if family in (settings.codes, "none"):
+            continue
+        found = find_targets(
+            photograph,
+            polarity=settings.polarity,
+            codes=family,
+            min_diameter_px=settings.min_diameter_px,
+        )
+        counts.append((len(np.unique(found.code[found.code >= 0])), family))
+    most, best = max(counts)
+    own = photographs.targets[fullest].code
+    if most < MIN_POINTS or most <= len(np.unique(own[own >= 0])):
+        return ""
+    return f"; in {photographs.names[fullest]} codes = '{best}' reads {most} codes"
