@@ -47,11 +47,21 @@ class Adjustment:
     # point: 0 where rejected, between 0 and 1 by reweighting, else 1, (k,)
 
     datum_points: BoolArray | None = None  # object points that carry the datum; all if None, (n,)
+    remarks: tuple[str, ...] = ()  # what of the robust test could not be carried through, one line each
 
     @property
     def vPv(self) -> float:
         """Weighted sum of squared residuals of all observations, a priori unit weight."""
         return self.sigma0**2 * self.redundancy
+
+    @property
+    def steps(self) -> str:
+        """How many iterations there were, in words; the start values of a survey are adjusted already."""
+        return (
+            f"{self.iterations} iterations"
+            if self.iterations
+            else "0 further iterations after the orientation"
+        )
 
     @property
     def tau(self) -> FloatArray:

@@ -119,7 +119,7 @@ def _figures(result: SurveyResult) -> tuple[tuple[str, str], ...]:
             f"{len(a.network.points)} ({coded} coded, {len(a.network.points) - coded} uncoded)",
         ),
         ("image points", f"{len(a.rejected) - rejected} accepted, {rejected} rejected"),
-        ("adjustment", f"{'converged' if a.converged else 'NOT converged'}, {a.iterations} iterations"),
+        ("adjustment", f"{'converged' if a.converged else 'NOT converged'}, {a.steps}"),
         ("datum", f"{a.datum}, rank defect {a.defect} (expected {a.expected_defect})"),
         (
             "sigma0",

@@ -35,7 +35,7 @@ def worked_section(result: SurveyResult, verdict: Verdict) -> str:
             f"{len(a.network.images)} of {result.images_total} oriented"
             + (f", {len(result.failed)} failed (below)" if result.failed else ""),
         ),
-        ("Adjustment", f"{'converged' if a.converged else 'did NOT converge'} in {a.iterations} iterations"),
+        ("Adjustment", f"{'converged' if a.converged else 'did NOT converge'} in {a.steps}"),
         (
             "Datum",
             f"{datum_in_words(a)}; rank defect of the normal equations {a.defect}, expected "

@@ -87,7 +87,7 @@ def _adjustment(result: SurveyResult) -> list[str]:
         _line("photographs", f"{len(network.images)} of {result.images_total}"),
         _line("object points", f"{len(network.points)}"),
         _line("image points", f"{int((~a.rejected).sum())} accepted, {int(a.rejected.sum())} rejected"),
-        _line("adjustment", f"{'converged' if a.converged else 'NOT converged'}, {a.iterations} iterations"),
+        _line("adjustment", f"{'converged' if a.converged else 'NOT converged'}, {a.steps}"),
         _line("datum", f"{datum_in_words(a)}; rank defect {a.defect}, {rank}"),
         _line("observations", f"{a.observations} ({', '.join(observed)})"),
         _line("unknowns", f"{a.unknowns} ({unknowns})"),
