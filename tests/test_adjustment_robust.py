@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from synthetic import make_network, seed_of
 
+from sfm.adjustment import solve
 from sfm.adjustment.collinearity import residuals
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.parameters import unknowns_of
@@ -16,6 +17,7 @@ from sfm.adjustment.result import Adjustment
 from sfm.adjustment.robust import HUBER, TUKEY, huber_weights, robust_scale, tukey_weights
 from sfm.adjustment.solve import adjust
 from sfm.conventions import BoolArray
+from sfm.errors import GeometryError
 from sfm.network import Estimate, Network
 from sfm.similarity import fit_similarity
 
@@ -136,3 +138,68 @@ def test_a_point_behind_its_camera_at_the_start_comes_back() -> None:
     assert a.converged
     assert not a.rejected.any()
     assert a.sigma0 == pytest.approx(reference.sigma0, rel=1e-9)
+
+
+def exchanged(network: Network, photographs: int, first: int, second: int) -> tuple[Network, BoolArray]:
+    """The names of two points exchanged in some photographs, and which image points are wrong by it."""
+    k = network.image_points
+    there = k.image < photographs
+    a, b = there & (k.point == first), there & (k.point == second)
+    point = k.point.copy()
+    point[a], point[b] = second, first
+    return replace(network, image_points=replace(k, point=point)), a | b
+
+
+@pytest.mark.parametrize("photographs", [1, 4])
+@pytest.mark.parametrize("reject", ["tau", "tukey"])
+def test_exchanged_names_are_rejected_though_they_bend_the_network(photographs: int, reject: str) -> None:
+    # Errors of hundreds of pixels; in four photographs data snooping from a plain adjustment fails.
+    network, truth = make_network(seed_of("exchanged 0"), images=12, points=40, planar=True)
+    extent = np.linalg.norm(truth.points - truth.points[0], axis=1)
+    network, bad = exchanged(network, photographs, 0, int(np.argmax(extent)))
+    plain = adjust(network, truth, datum=FREE, reject="none", covariance=False)
+    assert plain.sigma0 > 20
+    a = adjust(network, truth, datum=FREE, reject=reject, alpha=1e-5)
+    assert a.converged
+    assert a.defect == a.expected_defect == 7
+    assert bad.sum() == 2 * photographs
+    assert a.rejected[bad].all()
+    assert a.rejected[~bad].sum() <= (2 if reject == "tau" else 0.01 * len(bad))
+    if reject == "tau":
+        assert a.sigma0 == pytest.approx(1, abs=4 / np.sqrt(2 * a.redundancy))
+
+
+def test_an_adjustment_that_gross_errors_break_is_begun_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    network, truth = make_network(seed_of("broken"), images=10, points=30)
+    clean = adjust(network, truth, datum=FREE, reject="tau", alpha=1e-5)
+    monkeypatch.setattr(solve, "_plain", refuse)
+    again = adjust(network, truth, datum=FREE, reject="tau", alpha=1e-5)
+    assert again.converged
+    np.testing.assert_array_equal(again.rejected, clean.rejected)
+    assert again.vPv == pytest.approx(clean.vPv, rel=1e-9)
+
+
+def test_snooping_keeps_the_last_round_that_could_be_solved(monkeypatch: pytest.MonkeyPatch) -> None:
+    network, truth, _ = spoiled(seed_of("last round"), 0.05, 50.0)
+    plain = adjust(network, truth, datum=FREE, reject="none", tolerance=1e-3)
+    monkeypatch.setattr(solve._Run, "again", once_more(solve._Run.again))
+    a = adjust(network, truth, datum=FREE, alpha=1e-5)
+    assert a.rejected.sum() > 0
+    assert a.vPv < plain.vPv
+
+
+def refuse(*_: object) -> None:
+    raise GeometryError("adjustment: the normal equations cannot be solved from these start values")
+
+
+def once_more(again):  # type: ignore[no-untyped-def]
+    """The rounds of an adjustment of which the second cannot be solved."""
+    calls = []
+
+    def counted(run, optimum, weight):  # type: ignore[no-untyped-def]
+        calls.append(weight)
+        if len(calls) == 2:
+            refuse()
+        return again(run, optimum, weight)
+
+    return counted

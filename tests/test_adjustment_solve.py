@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from synthetic import make_network, perturb, seed_of
 
+from sfm.adjustment.centroid import shifted
 from sfm.adjustment.collinearity import collinearity, residuals, scratch
 from sfm.adjustment.datum import Datum, free_motions
 from sfm.adjustment.parameters import angle_jacobian, step, unknowns_of
@@ -311,3 +312,24 @@ def test_refusals() -> None:
     lost = replace(truth, position=np.full_like(truth.position, np.nan))
     with pytest.raises(GeometryError, match="no image point joins"):
         adjust(network, lost, datum=FREE)
+
+
+@pytest.mark.parametrize("kind", ["free", "control"])
+def test_a_network_far_from_the_origin_is_adjusted_as_one_near_it(kind: str) -> None:
+    # 4096 km by 8192 km, exact in binary, so that the coordinates themselves are rounded to 1e-9 m only.
+    far = np.array([2.0**22, 2.0**23, 0.0])
+    network, truth = make_network(seed_of("far"), images=8, points=30)
+    control = ObjectPoints(np.arange(5), truth.points[:5], np.zeros((5, 3, 3)))
+    network = replace(network, control=control)
+    start = perturb(truth, seed_of("far start"))
+    distant, distant_start = shifted(network, start, far)
+    near = adjust(network, start, datum=Datum(kind), reject="none")
+    a = adjust(distant, distant_start, datum=Datum(kind), reject="none")
+    assert a.converged
+    assert a.network is distant
+    assert a.iterations <= near.iterations + 1
+    assert a.vPv == pytest.approx(near.vPv, rel=1e-6)
+    if kind == "control":
+        np.testing.assert_array_equal(a.estimate.points[:5], distant.control.xyz)
+        np.testing.assert_allclose(a.estimate.points - far, near.estimate.points, atol=1e-7)
+    np.testing.assert_allclose(a.covariance.points, near.covariance.points, rtol=1e-4, atol=1e-15)

@@ -126,7 +126,7 @@ def iterate(
         raise GeometryError(f"adjustment: method '{method}' is none of {', '.join(METHODS)}")
     layout = problem.layout
     single = problem.order is None and layout.reduced >= SINGLE_FROM and not near
-    taken = 0
+    taken, first = 0, state
     if method == "levenberg-marquardt":
         state, taken = _approach(problem, state, weight, max_iterations, single)
         single = False
@@ -138,7 +138,10 @@ def iterate(
         found = _solve(problem, state, weight, single=single, limit=limit)
         if found is None:
             if before is None:
-                _refuse(problem, state)
+                if state is first:
+                    _refuse(problem, state)
+                state = first  # the damped steps have led where nothing can be solved
+                continue
             start, tried = before
             better = _line_search(problem, start, weight, tried, share / 2, shortest)
             if better is None:  # no share of the last step leads where they can be solved

@@ -8,11 +8,12 @@ data snooping; rank defect found numerically; nothing is damped where the result
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sfm.adjustment.collinearity import behind_camera, residuals
+from sfm.adjustment.centroid import centroid_of, shifted
+from sfm.adjustment.collinearity import State, behind_camera, residuals
 from sfm.adjustment.covariance import (
     Cofactors,
     cofactors,
@@ -21,7 +22,7 @@ from sfm.adjustment.covariance import (
     without_held,
 )
 from sfm.adjustment.datum import Datum
-from sfm.adjustment.iterate import TOLERANCE, Optimum, Problem, iterate, problem_of
+from sfm.adjustment.iterate import METHODS, TOLERANCE, Optimum, Problem, iterate, optimum_at, problem_of
 from sfm.adjustment.parameters import estimate_of, start_weights, unknowns_of
 from sfm.adjustment.rank import rank_defect, undetermined_of
 from sfm.adjustment.reliability import redundancy_numbers as numbers_of
@@ -36,6 +37,7 @@ from sfm.network import Estimate, Network
 
 MAX_ROUNDS = 200  # of data snooping
 ROUND_TOLERANCE = 1e-3  # |A dx| / |v| that is near enough to judge gross errors
+BENT = 2.0  # spread of residuals over that with the start values, above which gross errors bend the network
 REWEIGHTINGS = 30
 REWEIGHTED = 1e-3  # largest change of a weight at which reweighting ends
 REJECTS = ("tau", "huber", "tukey", "none")
@@ -79,14 +81,18 @@ def adjust(
     """
     if reject not in REJECTS:
         raise GeometryError(f"adjustment: reject '{reject}' is none of {', '.join(REJECTS)}")
+    if method not in METHODS:
+        raise GeometryError(f"adjustment: method '{method}' is none of {', '.join(METHODS)}")
     use_control = datum.kind == "control"
-    layout, state = unknowns_of(network, estimate, use_control=use_control)
-    weighted = weighted_of(network, layout, use_control=use_control)
+    centroid = centroid_of(network, estimate)
+    local, start = shifted(network, estimate, -centroid) if centroid.any() else (network, estimate)
+    layout, state = unknowns_of(local, start, use_control=use_control)
+    weighted = weighted_of(local, layout, use_control=use_control)
     weight = start_weights(layout, state)
     with own_threads():
         near = tolerance if reject == "none" else max(tolerance, ROUND_TOLERANCE)
         run = _Run(problem_of(layout, weighted, datum), method, max_iterations, near)
-        optimum, weight = run.minimise(run.start(state, weight), weight)
+        optimum, weight = _plain(run, state, weight) if reject == "none" else _sound(run, state, weight)
         if reject == "tau":
             optimum, weight = _snoop_all(run, optimum, weight, alpha)
         elif reject in ("huber", "tukey"):
@@ -97,7 +103,11 @@ def adjust(
             run.tolerance = tolerance
             optimum = run.again(optimum, weight)
         Q = cofactors(optimum, layout, cross=redundancy_numbers) if covariance else None
-        return _result(network, estimate, run, optimum, weight, Q, sigma_px)
+        result = _result(local, start, run, optimum, weight, Q, sigma_px)
+    if centroid.any():
+        _, adjusted = shifted(local, result.estimate, centroid)
+        result = replace(result, network=network, estimate=adjusted)
+    return result
 
 
 @dataclass
@@ -109,6 +119,7 @@ class _Run:
     max_iterations: int
     tolerance: float
     iterations: int = 0
+    remarks: tuple[str, ...] = ()
 
     def start(self, state, weight: FloatArray) -> Optimum:  # type: ignore[no-untyped-def]
         """Return the optimum from start values by the method asked for."""
@@ -147,8 +158,56 @@ class _Run:
         return optimum
 
 
+def _plain(run: _Run, state: State, weight: FloatArray) -> tuple[Optimum, FloatArray]:
+    """Return the optimum of all image points."""
+    return run.minimise(run.start(state, weight), weight)
+
+
+def _sound(run: _Run, state: State, weight: FloatArray) -> tuple[Optimum, FloatArray]:
+    """Return the optimum from which gross errors are judged: of all image points, unless they bend it.
+
+    An error of hundreds of pixels can turn a photograph over or let the principal distance collapse. Then
+    the adjustment does not converge, or most image points fit worse than with the start values; it is
+    begun again there by Huber's and Tukey's weights, and what Tukey's weigh 0 is left out.
+
+    Raises:
+        GeometryError: neither can be solved.
+    """
+    layout = run.problem.layout
+    try:
+        optimum, plain = _plain(run, state, weight)
+    except GeometryError:
+        begun = optimum_at(run.problem, state, weight)
+        if begun is None:
+            raise
+        optimum, plain = replace(begun, converged=False), weight
+
+    def spread(at: State) -> float:
+        v = residuals(layout.obs, at)
+        return robust_scale(layout.obs, v, layout.active & np.isfinite(v).all(axis=1), freedom=1.0)
+
+    if optimum.converged and spread(optimum.state) <= BENT * spread(state):
+        return optimum, plain
+    begun = optimum_at(run.problem, state, weight)
+    if begun is None:
+        return optimum, plain
+    try:
+        robust, factor = _reweight(run, begun, weight, huber_weights)
+        robust, factor = _reweight(run, robust, factor, tukey_weights)
+        factor = (factor > 0).astype(float)
+        robust = run.again(robust, factor)
+    except GeometryError:
+        return optimum, plain
+    if robust.converged and spread(robust.state) < spread(optimum.state):
+        return robust, factor
+    return optimum, plain
+
+
 def _snoop_all(run: _Run, optimum: Optimum, weight: FloatArray, alpha: float) -> tuple[Optimum, FloatArray]:
-    """Return the optimum without the image points that fail Pope's test."""
+    """Return the optimum without the image points that fail Pope's test.
+
+    Ends with the last round that could be solved where the next one cannot.
+    """
     layout = run.problem.layout
     returned = np.zeros(len(weight), dtype=bool)
     for _ in range(MAX_ROUNDS):
@@ -164,11 +223,18 @@ def _snoop_all(run: _Run, optimum: Optimum, weight: FloatArray, alpha: float) ->
         if not (out.any() or back.any()):
             break
         if out.any():
-            weight = np.where(out, 0.0, weight)
+            changed = np.where(out, 0.0, weight)
         else:  # take back only once nothing large is left
-            weight = np.where(back, 1.0, weight)
+            changed = np.where(back, 1.0, weight)
             returned |= back
-        optimum = run.again(optimum, weight)
+        try:
+            optimum, weight = run.again(optimum, changed), changed
+        except GeometryError as error:
+            run.remarks = (
+                f"data snooping ended before its last round: with {int((changed == 0).sum())} image points "
+                f"rejected in place of {int((weight == 0).sum())}, {error}",
+            )
+            break
     return optimum, weight
 
 
@@ -222,7 +288,8 @@ def _result(
         numbers[weight == 0] = np.nan
         numbers = np.take(numbers, back, axis=0)
         standardised = np.take(standardised_residuals(v, complement, layout.obs.whitening), back, axis=0)
-    allowed = 0 if run.problem.datum.kind == "control" else 7
+    of_control = run.problem.datum.kind == "control"
+    allowed = 0 if of_control else 7  # motions: control is meant to fix all of them
     return Adjustment(
         network=network,
         estimate=estimate_of(optimum.state, estimate),
@@ -230,7 +297,7 @@ def _result(
         iterations=run.iterations,
         datum=run.problem.datum.kind,
         defect=rank_defect(optimum, layout),
-        expected_defect=optimum.motions.defect,
+        expected_defect=0 if of_control else optimum.motions.defect,
         undetermined=undetermined_of(optimum, layout, network, estimate, allowed_motions=allowed),
         residuals=np.take(v, back, axis=0),
         rejected=np.take((weight == 0), back, axis=0),
@@ -244,4 +311,5 @@ def _result(
         standardised=standardised,
         weights=np.take(weight, back, axis=0),
         datum_points=run.problem.datum.points,
+        remarks=run.remarks,
     )

@@ -233,7 +233,7 @@ def _accepted(network: Network, adjustment: Adjustment, images: BoolArray, point
 
 def _warnings(survey: Survey, known: tuple[str, ...], adjustment: Adjustment) -> tuple[str, ...]:
     """Return what a person must know beyond the numbers."""
-    lines = []
+    lines = list(adjustment.remarks)
     if not adjustment.converged:
         lines.append(f"the adjustment did NOT converge within {adjustment.iterations} iterations")
     if adjustment.undetermined:
