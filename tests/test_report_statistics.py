@@ -17,11 +17,12 @@ from sfm.adjustment.solve import adjust
 from sfm.adjustment.statistics import global_test, reliability, tau_test, w_test
 from sfm.analysis.comparison import AdjusterComparison, BackendAdjustment, compare_adjusters
 from sfm.camera import Camera
-from sfm.network import Estimate, Network, ObjectPoints, ScaleBars
+from sfm.network import Estimate, InteriorObservations, Network, ObjectPoints, ScaleBars
 from sfm.report.checks import (
     bar_residuals,
     control_residuals,
     count_observations,
+    interior_residuals,
     longest_residual,
     worst_residuals,
 )
@@ -102,6 +103,45 @@ def test_a_scale_bar_that_contradicts_another_is_no_result(synthetic: tuple[Netw
     verdict = verdict_of(result_of(a))
     assert verdict.level == "bad"
     assert any(line.startswith("Scale bar ") for line in verdict.remarks), verdict.remarks
+
+
+@pytest.mark.parametrize(("sigmas", "level"), [(0.5, "good"), (50.0, "fair"), (200.0, "bad")])
+def test_a_false_calibration_certificate_is_noticed(sigmas: float, level: str) -> None:
+    network, truth = make_network(seed_of("certificate"), images=8, points=40, noise_px=NOISE_PX, free=("c",))
+    camera = truth.cameras[0]
+    s = camera.names.index("c")
+    sigma = 1e-3  # mm; the photographs know c a few times worse
+    one = np.zeros(1, dtype=np.int64)
+    given = np.array([camera.parameters[s] + sigmas * sigma])
+    certificate = InteriorObservations(one, one + s, given, np.array([sigma]))
+    result = result_of(
+        adjust(replace(network, interior=certificate), truth, datum=Datum("free"), reject="none")
+    )
+    found = interior_residuals(result.adjustment)
+    assert found is not None and found.names == (f"c of camera {camera.name}",)
+    v = -sigmas * sigma  # of the parameter, if the photographs had no error
+    own = adjust(network, truth, datum=Datum("free"), reject="none")
+    q = own.covariance.interior[0][0, 0] / own.sigma0**2
+    expected = v / np.sqrt(sigma**2 + q)  # independent: misclosure over its standard deviation
+    assert found.ratio[0] == pytest.approx(expected, abs=4, rel=0.05)
+    verdict = verdict_of(result)
+    assert verdict.level == level, verdict
+    assert any("The given c of camera" in line for line in verdict.remarks) == (level != "good")
+    assert "weighted interior" in text_report(result)
+    assert summary(result)["weighted_interior"][0]["w"] == pytest.approx(found.ratio[0])
+
+
+def test_a_point_that_lost_most_of_its_rays_is_named(synthetic: tuple[Network, Estimate]) -> None:
+    network, truth = synthetic
+    a = adjust(network, truth, datum=Datum("free"), reject="none")
+    of_point = np.flatnonzero(network.image_points.point == 4)
+    for lost, level in ((len(of_point) // 2, "good"), (len(of_point) // 2 + 1, "fair")):
+        rejected = a.rejected.copy()
+        rejected[of_point[:lost]] = True
+        verdict = verdict_of(result_of(replace(a, rejected=rejected)))
+        assert verdict.level == level
+        told = any(f"{network.points[4]} ({lost} of {len(of_point)})" in line for line in verdict.remarks)
+        assert told == (level == "fair")
 
 
 def test_a_wrong_fixed_camera_is_no_result() -> None:

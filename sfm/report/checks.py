@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sfm.adjustment.reliability import UNCONTROLLED
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.weighted import observed
 from sfm.conventions import BoolArray, FloatArray, IntArray
@@ -60,6 +61,18 @@ class BarResiduals:
     difference: FloatArray  # adjusted minus given, object unit, (b,)
     sigma: FloatArray  # given, object unit, (b,)
     ratio: FloatArray  # difference over sigma, (b,)
+
+
+@dataclass(frozen=True)
+class InteriorResiduals:
+    """Residuals of interior orientation that took part with a weight."""
+
+    names: tuple[str, ...]  # parameter and camera, in words, (q,)
+    units: tuple[str, ...]  # (q,)
+    given: FloatArray  # (q,)
+    difference: FloatArray  # adjusted minus given, (q,)
+    sigma: FloatArray  # given, (q,)
+    ratio: FloatArray  # difference over sigma sqrt(r), its standard deviation, (q,)
 
 
 def sigma0_ratio(result: SurveyResult) -> float:
@@ -149,6 +162,30 @@ def bar_residuals(adjustment: Adjustment) -> BarResiduals | None:
     return BarResiduals(
         names, bars.length, difference, bars.sigma, _ratio(difference, bars.sigma, bars.sigma > 0)
     )
+
+
+def interior_residuals(adjustment: Adjustment) -> InteriorResiduals | None:
+    """Return by how much weighted interior orientation differs from its given values; None without.
+
+    The redundancy number of an observed parameter is r = 1 - q / sigma^2, with its cofactor q.
+    """
+    found = adjustment.network.interior
+    rows: list[tuple[str, str, float, float, float, float]] = []
+    for a, s, given, sigma in zip(found.camera, found.parameter, found.value, found.sigma, strict=True):
+        camera, Q = adjustment.estimate.cameras[a], adjustment.covariance.interior[a]
+        where = np.flatnonzero(np.flatnonzero(camera.free) == s)
+        if not len(where) or not 0 < sigma < np.inf:
+            continue
+        difference = float(camera.parameters[s] - given)
+        q = Q[where[0], where[0]] / adjustment.sigma0**2 if len(Q) else np.nan
+        r = min(1.0, 1 - q / sigma**2)
+        ratio = difference / (sigma * np.sqrt(r)) if r > UNCONTROLLED else np.nan
+        name = f"{camera.names[s]} of camera {camera.group_of(s) or camera.name}"
+        rows.append((name, camera.units[s], float(given), difference, float(sigma), float(ratio)))
+    if not rows:
+        return None
+    names, units, *values = zip(*rows, strict=True)
+    return InteriorResiduals(names, units, *(np.array(column) for column in values))
 
 
 def check_over_sigma(result: SurveyResult, check: ControlCheck) -> FloatArray:

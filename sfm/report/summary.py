@@ -13,7 +13,13 @@ from sfm.adjustment.statistics import CoordinateTest
 from sfm.adjustment.variance_components import VarianceComponents
 from sfm.conventions import FloatArray
 from sfm.file_values import or_none
-from sfm.report.checks import bar_residuals, control_residuals, count_observations, sigma0_ratio
+from sfm.report.checks import (
+    bar_residuals,
+    control_residuals,
+    count_observations,
+    interior_residuals,
+    sigma0_ratio,
+)
 from sfm.report.result import SurveyResult
 from sfm.report.statistics import parameter_sigmas, quantiles, statistics_of
 from sfm.report.tables import UNCODED, root_mean_square
@@ -81,6 +87,7 @@ def summary(result: SurveyResult) -> dict[str, Any]:
         "statistics": _statistics(result),
         "control": _control(result),
         "scale_bars": _scale_bars(adjustment),
+        "weighted_interior": _weighted_interior(adjustment),
         "eccentricity": _eccentricity(result),
         "no_circles": list(result.no_circles),
         "comparison": _comparison(result),
@@ -224,6 +231,23 @@ def _scale_bars(adjustment: Adjustment) -> list[dict[str, Any]]:
             "ratio": or_none(found.ratio[b]),
         }
         for b, (start, end) in enumerate(found.names)
+    ]
+
+
+def _weighted_interior(adjustment: Adjustment) -> list[dict[str, Any]]:
+    found = interior_residuals(adjustment)
+    if found is None:
+        return []
+    return [
+        {
+            "parameter": name,
+            "unit": found.units[q],
+            "given": or_none(found.given[q]),
+            "difference": or_none(found.difference[q]),
+            "sigma": or_none(found.sigma[q]),
+            "w": or_none(found.ratio[q]),
+        }
+        for q, name in enumerate(found.names)
     ]
 
 

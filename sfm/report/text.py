@@ -17,6 +17,7 @@ from sfm.report.checks import (
     bar_residuals,
     control_residuals,
     count_observations,
+    interior_residuals,
     sigma0_ratio,
     worst_residuals,
 )
@@ -241,7 +242,7 @@ def _points(result: SurveyResult) -> list[str]:
 
 
 def _given(result: SurveyResult) -> list[str]:
-    """Control, differences at it, and scale bars."""
+    """Control, differences at it, scale bars, and weighted interior orientation."""
     lines: list[str] = []
     unit = result.length_unit
     check, control, bars = (
@@ -270,7 +271,21 @@ def _given(result: SurveyResult) -> list[str]:
             )
         if len(bars.names) > MOST_ROWS:
             lines.append(f"  and {len(bars.names) - MOST_ROWS} more, in summary.json")
-    return _head("Control and scale") + lines if lines else []
+    interior = interior_residuals(result.adjustment)
+    if interior is not None:
+        for q in range(min(len(interior.names), MOST_ROWS)):
+            unit = "" if interior.units[q] == "1" else f" {interior.units[q]}"
+            given, sigma = with_exponent(interior.given[q], interior.sigma[q])
+            lines.append(
+                _line(
+                    "weighted interior",
+                    f"{interior.names[q]}: given {given} +- {sigma}{unit}, adjusted minus given "
+                    f"{significant(interior.difference[q])}{unit} (w {interior.ratio[q]:+.2f})",
+                )
+            )
+        if len(interior.names) > MOST_ROWS:
+            lines.append(f"  and {len(interior.names) - MOST_ROWS} more, in summary.json")
+    return _head("Control, scale and given interior orientation") + lines if lines else []
 
 
 def _worst(result: SurveyResult) -> list[str]:

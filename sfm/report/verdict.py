@@ -11,6 +11,7 @@ from sfm.report.checks import (
     bar_residuals,
     check_over_sigma,
     control_residuals,
+    interior_residuals,
     longest_residual,
     object_size,
     sigma0_ratio,
@@ -19,6 +20,8 @@ from sfm.report.markup import finer_unit, significant
 from sfm.report.result import SurveyResult
 
 MUCH_REJECTED = 0.05  # share of rejected image points above which a person should look
+MOST_RAYS = 0.5  # share of the rays of a point: most of them say something else than the result
+MOST_NAMES = 5  # points named in one remark
 # sigma_px is a rough guess, so the global test alone says little. Twice the guess is worth a look; five
 # times is no precision that anybody expected, but a wrong model, wrong names or wrong control.
 SIGMA0_REMARK, SIGMA0_BAD = 2.0, 5.0
@@ -59,7 +62,7 @@ def verdict_of(result: SurveyResult) -> Verdict:
             f"Rank defect {a.defect}, expected {a.expected_defect}; not everything can be determined{what}."
         )
     remarks: list[str] = []
-    for judge in (_sigma0, _residual, _control, _bars, _check):
+    for judge in (_sigma0, _residual, _rays, _control, _bars, _interior, _check):
         for is_bad, line in judge(result):
             (serious if is_bad else remarks).append(line)
     if oriented < total:
@@ -147,6 +150,36 @@ def _bars(result: SurveyResult) -> Judged:
         f"times its standard deviation ({significant(100 * relative)} %)."
     )
     return [(bool(ratio[worst] > WEIGHTED_BAD or relative > MISCLOSURE_BAD), line)]
+
+
+def _interior(result: SurveyResult) -> Judged:
+    """Judge the residuals of weighted interior orientation, as of a calibration certificate."""
+    found = interior_residuals(result.adjustment)
+    if found is None:
+        return []
+    ratio = np.nan_to_num(np.abs(found.ratio))
+    worst = int(np.argmax(ratio))
+    if not ratio[worst] > WEIGHTED_REMARK:
+        return []
+    unit = "" if found.units[worst] == "1" else f" {found.units[worst]}"
+    line = (
+        f"The given {found.names[worst]}, {found.given[worst]:.6g}{unit}, differs from the adjusted one "
+        f"by {significant(float(ratio[worst]))} times the standard deviation of its residual."
+    )
+    return [(bool(ratio[worst] > WEIGHTED_BAD), line)]
+
+
+def _rays(result: SurveyResult) -> Judged:
+    """Judge the points that lost most of their rays to rejection."""
+    network, rejected = result.adjustment.network, result.adjustment.rejected
+    n, point = len(network.points), network.image_points.point
+    lost, rays = np.bincount(point[rejected], minlength=n), network.rays()
+    most = np.flatnonzero(lost > MOST_RAYS * rays)
+    if not len(most):
+        return []
+    shown = ", ".join(f"{network.points[j]} ({lost[j]} of {rays[j]})" for j in most[:MOST_NAMES])
+    more = " ..." if len(most) > MOST_NAMES else ""
+    return [(False, f"Most rays were rejected of {len(most)} point(s): {shown}{more}.")]
 
 
 def _check(result: SurveyResult) -> Judged:
