@@ -9,13 +9,14 @@ import numpy as np
 import pytest
 
 from sfm.adjustment.datum import Datum
+from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.errors import BackendError
 from sfm.network import Estimate, Network, ObjectPoints, ScaleBars
 from sfm.pipeline import adjust_survey
 from sfm.project import read_survey
 from sfm.survey.comparison import OtherPrograms
-from sfm.survey.datum import object_scale, without_contradicted_control
+from sfm.survey.datum import contradiction, object_scale
 from tests.surveys import write_observed_survey
 from tests.synthetic import make_network, seed_of
 
@@ -31,25 +32,68 @@ def test_a_failing_comparison_leaves_the_survey(tmp_path: Path) -> None:
     assert "the comparison with the other adjuster failed: COLMAP is not installed" in result.warnings
 
 
-@pytest.mark.parametrize("wrong", [False, True])
-def test_control_that_its_own_rays_contradict_is_named(wrong: bool) -> None:
-    rng = seed_of("contradicted control")
-    network, truth = make_network(rng, images=8, points=30, noise_px=0.1)
-    rows = np.arange(6)
+def spoiled_by(kind: str) -> tuple[Network, Estimate, Datum]:
+    """Return a network with control or bars, of which some are 50 mm or 3 % off, a start, and its datum."""
+    network, truth = make_network(seed_of("contradicted control"), images=8, points=30, noise_px=0.1)
+    rows = np.arange(4 if kind == "twist" else 6)
     xyz = truth.points[rows].copy()
-    if wrong:
-        xyz[2, 0] += 0.05
-    network = replace(network, control=ObjectPoints(rows, xyz, np.zeros((6, 3, 3))))
     start = replace(truth, points=truth.points.copy())
+    if "bar" in kind:
+        ends = np.array([[0, 10], [1, 11], [2, 12]])[: 2 if kind == "one of two bars" else 3]
+        length = np.linalg.norm(truth.points[ends[:, 1]] - truth.points[ends[:, 0]], axis=1)
+        if kind != "good bars":
+            length[1] *= 1.03
+        bars = ScaleBars(ends[:, 0], ends[:, 1], length, np.full(len(ends), 1e-5))
+        return replace(network, scale_bars=bars), start, Datum("free")
+    if kind == "one control point":
+        xyz[2, 0] += 0.05
+    if kind == "twist":
+        normal = np.linalg.svd(xyz - xyz.mean(axis=0))[2][2]
+        xyz += 0.05 * np.array([1, -1, 1, -1])[:, None] * normal
     start.points[rows] = xyz
-    adjustment = adjust(network, start, datum=Datum("control"), sigma_px=0.1, reject="tau", alpha=1e-4)
-    left, line = without_contradicted_control(network, adjustment)
-    if not wrong:
-        assert left is None
+    control = ObjectPoints(rows, xyz, np.zeros((len(rows), 3, 3)))
+    return replace(network, control=control), start, Datum("control")
+
+
+@pytest.mark.parametrize(
+    ("kind", "blamed"),
+    [
+        ("good control", None),
+        ("one control point", "control point {2}"),
+        ("twist", "the control points contradict one another"),
+        ("good bars", None),
+        ("one of three bars", "scale bar {1} - {11}"),
+        ("one of two bars", "the scale bars contradict one another"),
+    ],
+)
+def test_what_contradicts_the_photographs_is_named_if_it_can_be_told(kind: str, blamed: str | None) -> None:
+    network, start, datum = spoiled_by(kind)
+    a = adjust(network, start, datum=datum, sigma_px=0.1, reject="tau", alpha=1e-4)
+
+    def readjust(one: Network) -> Adjustment:
+        return adjust(one, a.estimate, datum=datum, sigma_px=0.1, reject="none", covariance=False)
+
+    found = contradiction(network, a, readjust)
+    if blamed is None:
+        assert found is None
         return
-    assert left is not None
-    assert network.points[2] in line
-    assert list(left.control.point) == [0, 1, 3, 4, 5]
+    assert found is not None
+    assert found.line.startswith(blamed.format(*network.points)), found.line
+    if "contradict one another" in blamed:
+        assert found.freed is None
+        carriers = {*network.control.point, *network.scale_bars.start, *network.scale_bars.end}
+        assert set(np.flatnonzero(found.protected)) == carriers
+        return
+    assert found.freed is not None
+    if kind == "one control point":
+        assert list(found.freed.control.point) == [0, 1, 3, 4, 5]
+        off = float(found.line.split("it is ")[1].split()[0])
+        assert off == pytest.approx(0.05, rel=0.05)
+    else:
+        assert list(found.freed.scale_bars.start) == [0, 2]
+        X = start.points
+        off = 0.03 * np.linalg.norm(X[11] - X[1])
+        assert float(found.line.split("it is ")[1].split()[0]) == pytest.approx(off, rel=0.05)
 
 
 def test_scale_comes_from_bars_before_control_and_two_control_points_are_enough() -> None:
@@ -62,3 +106,16 @@ def test_scale_comes_from_bars_before_control_and_two_control_points_are_enough(
     bar = ScaleBars(np.array([2]), np.array([3]), np.array([3 * length]), np.array([1e-3]))
     assert object_scale(replace(network, control=two, scale_bars=bar), half) == pytest.approx(6.0)
     assert np.isnan(object_scale(network, half))
+
+
+def test_a_point_with_one_ray_is_named(tmp_path: Path) -> None:
+    path = write_observed_survey(tmp_path / "one ray", "one ray")
+    table = path.parent / "image_points.csv"
+    header, *rows = table.read_text(encoding="utf-8").splitlines()
+    name = rows[0].split(",")[1]
+    own = [row for row in rows if row.split(",")[1] == name]
+    left = [header, own[0], *(row for row in rows if row not in own)]
+    table.write_text("\n".join(left) + "\n", encoding="utf-8")
+    result = adjust_survey(read_survey(path))
+    assert name not in result.adjustment.network.points
+    assert f"point {name}: 1 ray, 2 are needed" in result.warnings

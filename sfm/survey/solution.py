@@ -15,7 +15,7 @@ from sfm.network import Estimate, Network, reduce_network, supported
 from sfm.orientation.sequence import Orientation
 from sfm.project import Survey
 from sfm.report.result import ControlCheck
-from sfm.survey.datum import datum_warnings, placed_on_control, rescaled, without_contradicted_control
+from sfm.survey.datum import Contradiction, contradiction, datum_warnings, placed_on_control, rescaled
 from sfm.survey.interior import as_asked_for, without_idle_cameras
 from sfm.survey.network import Naming, build_network, match_uncoded, min_rays
 from sfm.survey.targets import MeasuredPhotographs
@@ -102,53 +102,81 @@ def solve(
         needed[network.control.point] = 1
     accepted = np.ones(len(network.image_points), dtype=bool)
     known = tuple(name for name, is_in in zip(network.points, estimate.determined, strict=True) if is_in)
+    single = tuple(network.points[j] for j in np.flatnonzero((network.rays() == 1) & (needed > 1)))
     oriented = estimate.oriented
     estimate = rescaled(network, estimate, datum)
     network, estimate = as_asked_for(survey, network, estimate)
     iterations = 0
     contradictions: list[str] = []
+    reject = survey.reject
+    begin = estimate
     while True:
         images, points = determined(network, estimate, accepted, needed)
         part, start = reduce_network(network, estimate, images, points, np.ones_like(accepted))
-        adjustment = _tested(survey, part, start, datum, covariance=False)
+        adjustment = _tested(survey, part, start, datum, reject=reject, covariance=False)
         iterations += adjustment.iterations
-        if datum.kind == "control":
-            freed, line = without_contradicted_control(network, adjustment)
-            if freed is not None:
-                needed[np.setdiff1d(network.control.point, freed.control.point)] = 2
-                network, contradictions = freed, [*contradictions, line]
-                continue
+        found = _contradiction(survey, network, adjustment, datum, reject)
         estimate = put_back(estimate, adjustment.estimate, images, points)
         accepted = _accepted(network, adjustment, images, points)
         left_images, left_points = determined(network, estimate, accepted, needed)
-        if (left_images == images).all() and (left_points == points).all():
-            break
-    check = None
-    if datum.kind != "control" and len(part.control) >= 3:
-        estimate, check = placed_on_control(part, adjustment.estimate)
-    else:
-        estimate = adjustment.estimate
-    part, estimate = without_idle_cameras(survey, part, estimate)
-    final = _tested(survey, part, estimate, datum, covariance=True)
-    weight_factor = 1.0
-    if (
-        len(part.scale_bars)
-        or len(part.interior)
-        or (datum.kind == "control" and part.control.covariance.any())
-    ):
-        part, weight_factor = _weighed(final)
-        final = _tested(survey, part, final.estimate, datum, covariance=True)
+        if found is None and (left_images == images).all() and (left_points == points).all():
+            check = None
+            if datum.kind != "control" and len(part.control) >= 3:
+                last, check = placed_on_control(part, adjustment.estimate)
+            else:
+                last = adjustment.estimate
+            final, weight_factor = _final(survey, part, last, datum, reject)
+            found = _contradiction(survey, network, final, datum, reject)
+            if found is None:
+                break
+        if found is not None:
+            contradictions.append(found.line)
+            if found.freed is not None:
+                needed[np.setdiff1d(network.control.point, found.freed.control.point)] = 2
+                network, accepted = found.freed, np.ones_like(accepted)
+            else:  # what the test holds against the other image points stands
+                keep = accepted | found.protected[network.image_points.point]
+                network = replace(network, image_points=network.image_points.select(keep))
+                accepted, reject = np.ones(int(keep.sum()), dtype=bool), "none"
+            estimate = begin
     dropped = tuple(
         (name, f"fewer than {MIN_IMAGE_POINTS} accepted image points of the network")
         for name, was, is_in in zip(network.images, oriented, images, strict=True)
         if was and not is_in
     )
     final = replace(final, iterations=iterations + final.iterations)
-    return Solution(final, check, dropped, (*contradictions, *_warnings(survey, known, final)), weight_factor)
+    warnings = (*contradictions, *_warnings(survey, known, single, final))
+    return Solution(final, check, dropped, warnings, weight_factor)
+
+
+def _final(
+    survey: Survey, part: Network, estimate: Estimate, datum: Datum, reject: str
+) -> tuple[Adjustment, float]:
+    """Return the last adjustment with its covariance, and the factor on the sigmas of the image points."""
+    part, estimate = without_idle_cameras(survey, part, estimate)
+    final = _tested(survey, part, estimate, datum, reject=reject, covariance=True)
+    weighted_control = datum.kind == "control" and part.control.covariance.any()
+    if not (len(part.scale_bars) or len(part.interior) or weighted_control):
+        return final, 1.0
+    part, weight_factor = _weighed(final)
+    return _tested(survey, part, final.estimate, datum, reject=reject, covariance=True), weight_factor
+
+
+def _contradiction(
+    survey: Survey, network: Network, adjustment: Adjustment, datum: Datum, reject: str
+) -> Contradiction | None:
+    """Return control or a scale bar that cost a point most of its rays; None where nothing was tested."""
+    if reject == "none":
+        return None
+
+    def readjust(one: Network) -> Adjustment:
+        return _tested(survey, one, adjustment.estimate, datum, reject="none", covariance=False)
+
+    return contradiction(network, adjustment, readjust)
 
 
 def _tested(
-    survey: Survey, network: Network, estimate: Estimate, datum: Datum, *, covariance: bool
+    survey: Survey, network: Network, estimate: Estimate, datum: Datum, *, reject: str, covariance: bool
 ) -> Adjustment:
     """Adjust with data snooping, the level of the single test shared out among all image coordinates."""
     tests = 2 * len(network.image_points)
@@ -157,7 +185,7 @@ def _tested(
         estimate,
         datum=_on_points(survey, network, datum),
         sigma_px=survey.adjust.sigma_px,
-        reject=survey.reject,
+        reject=reject,
         alpha=1 - (1 - FALSE_ALARM) ** (1 / tests),
         covariance=covariance,
     )
@@ -231,7 +259,9 @@ def _accepted(network: Network, adjustment: Adjustment, images: BoolArray, point
     return accepted
 
 
-def _warnings(survey: Survey, known: tuple[str, ...], adjustment: Adjustment) -> tuple[str, ...]:
+def _warnings(
+    survey: Survey, known: tuple[str, ...], single: tuple[str, ...], adjustment: Adjustment
+) -> tuple[str, ...]:
     """Return what a person must know beyond the numbers."""
     lines = list(adjustment.remarks)
     if not adjustment.converged:
@@ -242,6 +272,9 @@ def _warnings(survey: Survey, known: tuple[str, ...], adjustment: Adjustment) ->
     if gone:
         shown = ", ".join(gone[:MOST_NAMES]) + (" ..." if len(gone) > MOST_NAMES else "")
         lines.append(f"{len(gone)} points left out, too few of their image points were accepted: {shown}")
+    if single:
+        shown = "; ".join(f"point {name}: 1 ray, 2 are needed" for name in single[:MOST_NAMES])
+        lines.append(shown + (f"; and {len(single) - MOST_NAMES} more" if len(single) > MOST_NAMES else ""))
     absent = [name for name in survey.datum.points if name not in set(adjustment.network.points)]
     if absent:
         lines.append(f"datum points that are not in the network: {', '.join(absent[:MOST_NAMES])}")
