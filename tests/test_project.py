@@ -133,7 +133,7 @@ def test_a_survey_is_frozen(tmp_path: Path) -> None:
             "[2272.5, 1704]",
             r"line 7: camera 1.size_px 1: found 2272.5, needed a whole number",
         ),
-        ("[2272, 1704]", "[2272]", r"camera 1.size_px 2 is missing"),
+        ("[2272, 1704]", "[2272]", r"camera 1.size_px: found \[2272\], needed 2 values"),
         ("[2272, 1704]", "[2272, 1704, 3]", r"camera 1.size_px: found \[2272, 1704, 3\], needed 2 values"),
         ("[2272, 1704]", "2272", r"needed a list in square brackets"),
         ('"dark"', '"black"', r"line 15: targets.polarity: found 'black', needed one of 'dark', 'bright'"),
