@@ -120,10 +120,12 @@ def hat_complement(
         Cofactors of the whitened residuals, shape (k, 2, 2); NaN behind the camera.
     """
     Q, t, out = cofactors, scratch(), np.empty((len(weight), 2, 2))
-    mixed = Q.mixed.reshape(len(Q.exterior), 6, -1)
+    # one layout whatever the parameters, so that one compiled form serves every network
+    mixed = np.ascontiguousarray(Q.mixed).reshape(len(Q.exterior), 6, -1)
+    border = np.ascontiguousarray(Q.border)
     space = np.empty((2, 9 + t.Jp.shape[1])), np.empty((9 + t.Jp.shape[1], 9 + t.Jp.shape[1]))
     _complement(
-        layout.obs, optimum.state, weight, Q.exterior, mixed, Q.border, Q.points, Q.cross, Q.cross_border,
+        layout.obs, optimum.state, weight, Q.exterior, mixed, border, Q.points, Q.cross, Q.cross_border,
         t, *space, out,
     )  # fmt: skip
     return out
