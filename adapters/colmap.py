@@ -29,7 +29,7 @@ from adapters.colmap_scene import (
 )
 from sfm.camera import Camera
 from sfm.conventions import FloatArray
-from sfm.errors import BackendError
+from sfm.errors import BackendError, one_line
 from sfm.network import Estimate, Network
 
 NEEDED_VERSION = (4, 2)
@@ -225,11 +225,6 @@ def adjustment_config(pycolmap: ModuleType, network: Network, estimate: Estimate
     elif gauge != "free":
         raise BackendError(f"gauge '{gauge}' is none of two_cameras, free, control")
     return config
-
-
-def one_line(error: BaseException) -> str:
-    """The message of an error on one line."""
-    return " ".join(str(error).split()) or type(error).__name__
 
 
 def told(error: BaseException) -> str:

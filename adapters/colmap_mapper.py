@@ -16,10 +16,10 @@ from pathlib import Path
 
 import numpy as np
 
-from adapters.colmap import load_pycolmap, one_line, quiet
+from adapters.colmap import load_pycolmap, quiet
 from adapters.colmap_model import read_model
 from sfm.camera import project
-from sfm.errors import BackendError
+from sfm.errors import BackendError, one_line
 from sfm.network import Estimate, Network
 
 MODEL = "OPENCV"  # of COLMAP's models the one that calibrates a lens as a survey does

@@ -49,10 +49,10 @@ def read_json(path: Path, content: type[ContentT], what: str) -> ContentT:
     except OSError as error:
         raise SurveyFileError(f"{path}: cannot be read ({error.strerror})") from error
     except ValidationError as error:
-        raise SurveyFileError(_one_line(path, error, what)) from error
+        raise SurveyFileError(_first_error(path, error, what)) from error
 
 
-def _one_line(path: Path, error: ValidationError, what: str) -> str:
+def _first_error(path: Path, error: ValidationError, what: str) -> str:
     """Say the first thing that is wrong: where, what was found, what is needed."""
     first = error.errors(include_url=False)[0]
     message = " ".join(first["msg"].split())

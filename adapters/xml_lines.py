@@ -11,7 +11,7 @@ import numpy as np
 from adapters.json_files import MAX_SIDE_PX
 from sfm.conventions import FloatArray
 from sfm.csv_tables import MAX_NUMBER, MAX_TABLE_BYTES
-from sfm.errors import SurveyFileError
+from sfm.errors import SurveyFileError, one_line
 
 MAX_DEPTH = 100  # of elements in one another; exports have about ten
 
@@ -125,6 +125,7 @@ def read_xml(path: Path) -> Node:
             f"{path}, line {error.lineno}: not well-formed XML ({expat.ErrorString(error.code)})"
         ) from error
     except (LookupError, ValueError) as error:  # of encodings that Python does not know or expat cannot take
-        told = " ".join(str(error).split())[:100]
-        raise SurveyFileError(f"{path}, line 1: the encoding is none that can be read ({told})") from error
+        raise SurveyFileError(
+            f"{path}, line 1: the encoding is none that can be read ({one_line(error):.100})"
+        ) from error
     return top.children[0]

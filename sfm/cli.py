@@ -48,10 +48,10 @@ def _run() -> None:
 
 def _refuse(message: str) -> None:
     """End with one line and the exit code of bad input."""
-    print(f"kolinear: {_one_line(message)}", file=sys.stderr)
+    print(f"kolinear: {_printable(message)}", file=sys.stderr)
     raise SystemExit(BAD_INPUT) from None
 
 
-def _one_line(text: str) -> str:
+def _printable(text: str) -> str:
     """Return a message on one line, without control characters that a file name may carry."""
     return "".join(c if c.isprintable() else " " for c in text)

@@ -33,3 +33,8 @@ class OutputError(KolinearError):
 
 class BackendError(KolinearError):
     """An external library is missing, of the wrong version, or refuses the problem."""
+
+
+def one_line(error: BaseException) -> str:
+    """Return the message of an error on one line, the name of its kind where it has none."""
+    return " ".join(str(error).split()) or type(error).__name__

@@ -25,7 +25,7 @@ from sfm.settings import (
     TargetSettings,
     TiePointSettings,
 )
-from sfm.settings_errors import one_line
+from sfm.settings_errors import first_error
 from sfm.targets.codes import FAMILIES as RING_FAMILIES
 from sfm.targets.tags import TAG_FAMILIES
 
@@ -164,7 +164,7 @@ def read_survey(path: Path, *, allow_outside: bool = False) -> Survey:
     try:
         survey = Survey.model_validate(table)
     except ValidationError as error:
-        raise SurveyFileError(one_line(path, text, error, Survey)) from error
+        raise SurveyFileError(first_error(path, text, error, Survey)) from error
     survey._path, survey._allow_outside = path, allow_outside
     _refuse_contradictions(survey)
     return survey

@@ -4,24 +4,11 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 from pydantic import ValidationError
 
-from sfm.settings import (
-    AdjustSettings,
-    ApproximateSettings,
-    CameraSettings,
-    CompareSettings,
-    ControlSettings,
-    DatumSettings,
-    Head,
-    ObservationSettings,
-    ScaleBarSettings,
-    Section,
-    TargetSettings,
-    TiePointSettings,
-)
+from sfm.settings import Section
 
 _NEEDED = (
     ("string_type", "a text in quotes"),
@@ -35,7 +22,7 @@ _NEEDED = (
 )
 
 
-def one_line(path: Path, text: str, error: ValidationError, whole: type[Section]) -> str:
+def first_error(path: Path, text: str, error: ValidationError, whole: type[Section]) -> str:
     """Return the first error of pydantic as one line with file, line, key, found and needed.
 
     Unknown keys come first: a misspelt key is unknown, and missing under its right name.
@@ -102,21 +89,18 @@ def _key(location: tuple[str | int, ...]) -> str:
 
 def _known(location: tuple[str | int, ...], whole: type[Section]) -> str:
     """Return the keys that the table at a location may have."""
-    sections: dict[str, type[Section]] = {
-        "survey": Head,
-        "camera": CameraSettings,
-        "targets": TargetSettings,
-        "tie_points": TiePointSettings,
-        "datum": DatumSettings,
-        "control": ControlSettings,
-        "scale_bar": ScaleBarSettings,
-        "observations": ObservationSettings,
-        "approximate": ApproximateSettings,
-        "adjust": AdjustSettings,
-        "compare": CompareSettings,
-    }
-    section = sections[str(location[0])] if location else whole
+    section = whole
+    for key in (part for part in location if isinstance(part, str)):
+        fields = {field.alias or name: field for name, field in section.model_fields.items()}
+        section = _section_in(fields[key].annotation) or section
     return ", ".join(field.alias or name for name, field in section.model_fields.items())
+
+
+def _section_in(annotation: Any) -> type[Section] | None:
+    """Return the section that the type of a field is, or is a list of."""
+    if isinstance(annotation, type) and issubclass(annotation, Section):
+        return annotation
+    return next(filter(None, (_section_in(part) for part in get_args(annotation))), None)
 
 
 def _line_of(text: str, location: tuple[str | int, ...]) -> int | None:

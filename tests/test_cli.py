@@ -414,7 +414,7 @@ def test_help_explains_every_command_and_option() -> None:
 
 
 def test_messages_stay_on_one_line() -> None:
-    assert cli._one_line("a\nb\x1b[31m\tc") == "a b [31m c"
+    assert cli._printable("a\nb\x1b[31m\tc") == "a b [31m c"
 
 
 def test_nothing_that_takes_time_is_imported_for_the_help() -> None:
