@@ -14,6 +14,7 @@ from sfm.adjustment.marginal import change_datum, marginal_of
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.adjustment.statistics import (
+    component_tests,
     correlations,
     global_test,
     non_centrality,
@@ -57,6 +58,29 @@ def test_global_test_is_two_sided(plain: Adjustment) -> None:
     assert plain.vPv == pytest.approx((plain.residuals**2).sum() / 0.01, rel=1e-9)
     for factor in (0.8, 1.25):
         assert not global_test(replace(plain, sigma0=factor)).passed
+    none = global_test(replace(plain, sigma0=np.nan, redundancy=0))
+    assert none.passed is None and "redundancy, 0, is too small" in none.reason
+
+
+def test_the_component_of_a_kind_is_tested_against_what_is_stated_for_it() -> None:
+    """Of right standard deviations each kind is refused as often as alpha says."""
+    copies, alpha = 200, 0.1
+    network, truth = make_network(seed_of("tests of kinds"), images=5, points=15, noise_px=0.0, free=())
+    k, start, end = network.image_points, np.arange(5), np.arange(5) + 8
+    length = np.linalg.norm(truth.points[end] - truth.points[start], axis=1)
+    rng, alarms = seed_of("noise of kinds"), np.zeros(2)
+    for _ in range(copies):
+        bars = ScaleBars(start, end, length + rng.normal(0, 1e-3, 5), np.full(5, 1e-3))
+        noisy = replace(k, xy=k.xy + rng.normal(0, 0.1, k.xy.shape))
+        found = by_kind(
+            adjust(replace(network, image_points=noisy, scale_bars=bars), truth, datum=FREE, reject="none")
+        )
+        tests = component_tests(found, alpha=alpha)
+        assert [test.of for test in tests] == ["image points", "scale bars"]
+        alarms += [test.passed is False for test in tests]
+    assert np.abs(alarms / copies - alpha).max() < 4 * np.sqrt(alpha * (1 - alpha) / copies)
+    wrong = component_tests(replace(found, sigma0=found.sigma0 * (1.2, 3.0)), alpha=alpha)
+    assert [test.passed for test in wrong] == [False, False]
 
 
 def test_reliability_of_a_known_redundancy_number() -> None:
@@ -106,7 +130,8 @@ def test_weights_of_two_cameras_are_estimated() -> None:
     def run(given: Network) -> Adjustment:
         return adjust(given, truth, datum=FREE, reject="none")
 
-    a, factor = estimate_components(run, network, group, ("one", "two"))
+    a, factor, settled = estimate_components(run, network, group, ("one", "two"))
+    assert settled
     assert factor == pytest.approx([0.5, 3.0], rel=0.1)
     assert by_camera(a).sigma0 == pytest.approx([1, 1], abs=2e-3)
     assert a.sigma0 == pytest.approx(1, abs=2e-3)

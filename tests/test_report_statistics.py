@@ -6,6 +6,7 @@ import csv
 import json
 import re
 from dataclasses import replace
+from html import escape
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,8 @@ import pytest
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
-from sfm.adjustment.statistics import global_test, reliability, tau_test, w_test
+from sfm.adjustment.statistics import component_tests, global_test, reliability, tau_test, w_test
+from sfm.adjustment.variance_components import by_kind
 from sfm.analysis.comparison import AdjusterComparison, BackendAdjustment, compare_adjusters
 from sfm.camera import Camera
 from sfm.network import Estimate, InteriorObservations, Network, ObjectPoints, ScaleBars
@@ -30,7 +32,14 @@ from sfm.report.html import render_html
 from sfm.report.plots import all_plots, plan_axes
 from sfm.report.result import ControlCheck, Eccentricity, SurveyResult
 from sfm.report.section_statistics import camera_correlations
-from sfm.report.statistics import families, interior_parameters, parameter_sigmas
+from sfm.report.statistics import (
+    families,
+    interior_parameters,
+    parameter_sigmas,
+    statistics_of,
+    words_of_test,
+    words_of_weights,
+)
 from sfm.report.summary import summary
 from sfm.report.tables import write_tables
 from sfm.report.text import WIDTH, text_report
@@ -188,6 +197,43 @@ def test_weights_found_from_the_residuals_do_not_hide_sigma0(synthetic: tuple[Ne
     assert text["statistics"]["sigma0_ratio"] == pytest.approx(3 * a.sigma0)
 
 
+def test_each_kind_is_tested_against_what_was_stated_in_the_same_words_everywhere(
+    synthetic: tuple[Network, Estimate],
+) -> None:
+    network, truth = synthetic
+    a = adjust(with_bars(network, truth, (0.0, 1e-5), 1e-4), truth, datum=Datum("free"))
+    for factor, passed in ((1.0, True), (0.8, False), (1.25, False)):
+        result = result_of(a, weight_factor=factor)
+        image, bars = statistics_of(result).global_tests
+        assert image.passed is passed and bars.passed
+        r = float(np.nansum(a.redundancy_numbers))
+        seen = a.network.image_points
+        squares = (a.residuals[~a.rejected] ** 2).sum() / NOISE_PX**2 * factor**2
+        assert image.redundancy == pytest.approx(r) and image.statistic == pytest.approx(squares)
+        assert len(seen) > 100
+        text = " ".join(text_report(result).split())
+        page, written = render_html(result, (), ()), summary(result)["statistics"]
+        for test, one in zip((image, bars), written["global_tests"], strict=True):
+            words = words_of_test(test)
+            assert words in text and escape(words, quote=False) in page and words == one["words"]
+            assert one["passed"] is test.passed
+        words = words_of_weights(result)
+        assert (words == "") == (factor == 1)
+        assert words in text and words in page and words == written["weights"]
+        assert written["sigma0_by_kind"]["image points"] == pytest.approx(written["sigma0_ratio"], rel=1e-6)
+
+
+def test_bars_that_are_all_a_little_too_bad_are_noticed(synthetic: tuple[Network, Estimate]) -> None:
+    network, truth = synthetic
+    errors = 4e-4 * np.array([1, -1, 1, -1, 1, -1])
+    a = adjust(with_bars(network, truth, tuple(errors), 1e-4), truth, datum=Datum("free"))
+    bars = bar_residuals(a)
+    assert bars is not None and np.abs(bars.ratio).max() < 5
+    verdict = verdict_of(result_of(a))
+    assert verdict.level == "fair" and len(verdict.remarks) == 1
+    assert verdict.remarks[0].startswith("The residuals of the scale bars are"), verdict.remarks
+
+
 def test_control_that_only_checks() -> None:
     network, truth = make_network(seed_of("checks"), images=8, points=40, noise_px=0.02)
     known = with_control(network, truth.points[:4], 1e-5)
@@ -266,7 +312,9 @@ def test_statistics_are_shown_and_written(synthetic: tuple[Network, Estimate]) -
     page, text = render_html(result, (), ()), json.loads(json.dumps(summary(result)))
     test = global_test(a)
     found = text["statistics"]
-    assert found["global_test"]["lower"] == test.lower and found["global_test"]["upper"] == test.upper
+    (written,) = found["global_tests"]
+    assert written["of"] == "all observations" and written["passed"] is test.passed
+    assert written["lower"] == test.lower and written["upper"] == test.upper
     assert f"{test.lower:.2f}" in page and f"{test.upper:.2f}" in page
     assert found["observations"]["constraints"] == 7
     assert found["redundancy_number"]["min"] == pytest.approx(np.nanmin(a.redundancy_numbers))
@@ -381,8 +429,8 @@ def test_text_report_is_one_page_with_the_figures_of_the_adjustment(
     assert len(lines) < 90 and max(map(len, lines)) <= WIDTH
     assert f"{a.sigma0_px:.5f} px" in text and "rank defect 6, as expected" in text
     assert f"{a.observations} ({2 * int((~a.rejected).sum())} image coordinates, 2 scale bars)" in text
-    test = global_test(a)
-    assert f"v'Pv = {test.statistic:.2f}, chi-square of {a.redundancy}" in text
+    for test in component_tests(by_kind(a)):
+        assert " ".join(words_of_test(test).split()) in " ".join(text.split())
     numbers = re.search(r"sum ([\d.]+), of all observations ([\d.]+); mean", text)
     assert numbers is not None
     assert float(numbers[1]) == pytest.approx(np.nansum(a.redundancy_numbers), abs=0.06)

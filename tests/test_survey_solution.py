@@ -8,13 +8,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from sfm.adjustment import variance_components
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
+from sfm.adjustment.variance_components import by_kind
 from sfm.errors import BackendError
 from sfm.network import Estimate, Network, ObjectPoints, ScaleBars
 from sfm.pipeline import adjust_survey
 from sfm.project import read_survey
+from sfm.report.statistics import statistics_of
 from sfm.survey.comparison import OtherPrograms
 from sfm.survey.datum import contradiction, object_scale
 from tests.surveys import write_observed_survey
@@ -106,6 +109,40 @@ def test_scale_comes_from_bars_before_control_and_two_control_points_are_enough(
     bar = ScaleBars(np.array([2]), np.array([3]), np.array([3 * length]), np.array([1e-3]))
     assert object_scale(replace(network, control=two, scale_bars=bar), half) == pytest.approx(6.0)
     assert np.isnan(object_scale(network, half))
+
+
+def barred_survey(folder: Path) -> Path:
+    """Write a survey whose sigma of the image points is 100 times too large, and that of its bars right."""
+    path = write_observed_survey(folder, "barred", images=8, points=30)
+    network, truth = make_network(seed_of("barred"), images=8, points=30, free=("c",))
+    rng = seed_of("bars of the barred survey")
+    bars = ""
+    for i, j in ((0, 10), (1, 11), (2, 12), (3, 13), (4, 14), (5, 15)):
+        length = np.linalg.norm(truth.points[i] - truth.points[j]) + rng.normal(0, 1e-3)
+        ends = f'from = "{network.points[i]}"\nto = "{network.points[j]}"'
+        bars += f"[[scale_bar]]\n{ends}\nlength = {length}\nsigma = 1e-3\n"
+    with path.open("a", encoding="utf-8") as file:
+        file.write(f'{bars}[adjust]\nsigma_px = 10.0\nreject = "tau"\n')
+    return path
+
+
+def test_weights_come_to_rest_on_the_image_points_that_are_accepted(tmp_path: Path) -> None:
+    """A single estimate has the image points bent by bars that were 100 times too heavy."""
+    result = adjust_survey(read_survey(barred_survey(tmp_path / "barred")))
+    a = result.adjustment
+    assert by_kind(a).sigma0[0] == pytest.approx(1, abs=1e-3)
+    freedom = 2 * np.nansum(a.redundancy_numbers)
+    assert result.weight_factor == pytest.approx(0.01, rel=4 / np.sqrt(freedom))
+    assert not a.remarks
+    image, bars = statistics_of(result).global_tests
+    assert image.passed is False and image.statistic < image.lower
+    assert bars.passed
+
+
+def test_weights_that_do_not_come_to_rest_are_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(variance_components, "MAX_ROUNDS", 1)
+    result = adjust_survey(read_survey(barred_survey(tmp_path / "barred")))
+    assert any("did not come to rest" in line for line in result.warnings)
 
 
 def test_a_point_with_one_ray_is_named(tmp_path: Path) -> None:

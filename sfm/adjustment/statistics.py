@@ -16,10 +16,12 @@ from scipy import stats
 
 from sfm.adjustment.reliability import UNCONTROLLED, tau_critical
 from sfm.adjustment.result import Adjustment
+from sfm.adjustment.variance_components import VarianceComponents
 from sfm.camera import Camera
 from sfm.conventions import FloatArray, IntArray
 
 ALPHA = 0.001  # Baarda's usual probability of rejecting a good observation
+GLOBAL_ALPHA = 0.05  # of the global test and of the significance of parameters
 POWER = 0.8  # and of finding a gross error of the minimal detectable size
 STRONG = 0.95  # correlation from which two parameters are reported
 UNTESTED = ("c", "fx", "fy", "cx", "cy")  # parameters for which 0 is no sensible null hypothesis
@@ -27,13 +29,15 @@ UNTESTED = ("c", "fx", "fy", "cx", "cy")  # parameters for which 0 is no sensibl
 
 @dataclass(frozen=True)
 class GlobalTest:
-    """Test of sigma0 a posteriori against 1 by the chi-square distribution."""
+    """Test of stated standard deviations against the residuals by the chi-square distribution."""
 
-    statistic: float  # v'Pv
-    redundancy: int
+    of: str  # all observations, or a kind of them
+    statistic: float  # v'Pv with the standard deviations stated
+    redundancy: float
     lower: float  # acceptance region of v'Pv
     upper: float
-    passed: bool
+    passed: bool | None  # None where it was not tested
+    reason: str = ""  # why it was not tested
 
 
 @dataclass(frozen=True)
@@ -85,18 +89,41 @@ class Correlation:
     value: float
 
 
-def global_test(adjustment: Adjustment, *, alpha: float = 0.05) -> GlobalTest:
-    """Return the two-sided chi-square test of v'Pv.
+def global_test(adjustment: Adjustment, *, alpha: float = GLOBAL_ALPHA) -> GlobalTest:
+    """Return the two-sided chi-square test of v'Pv of all observations.
 
     Args:
         adjustment: the adjustment.
         alpha: probability of rejecting a right model.
     """
-    r = adjustment.redundancy
-    if r < 1:
-        return GlobalTest(0.0, r, 0.0, np.inf, True)
-    lower, upper = stats.chi2.ppf([alpha / 2, 1 - alpha / 2], r)
-    return GlobalTest(adjustment.vPv, r, float(lower), float(upper), bool(lower <= adjustment.vPv <= upper))
+    return _chi_square("all observations", adjustment.sigma0, adjustment.redundancy, alpha)
+
+
+def component_tests(components: VarianceComponents, *, alpha: float = GLOBAL_ALPHA) -> tuple[GlobalTest, ...]:
+    """Return the two-sided chi-square test of the variance component of each group against 1.
+
+    The v'Pv of a group is nearly chi-square distributed with the sum of its redundancy numbers, exactly
+    where the other groups take no part in its residuals.
+
+    Args:
+        components: of groups, over the standard deviations stated for them.
+        alpha: probability of rejecting a group whose standard deviations are right.
+
+    Source: Foerstner and Wrobel (2016), Photogrammetric Computer Vision, sec. 4.2.4.
+    """
+    return tuple(
+        _chi_square(name, float(sigma0), float(r), alpha)
+        for name, sigma0, r in zip(components.names, components.sigma0, components.redundancy, strict=True)
+    )
+
+
+def _chi_square(of: str, sigma0: float, redundancy: float, alpha: float) -> GlobalTest:
+    if not np.isfinite(sigma0):
+        reason = f"its redundancy, {redundancy:.2g}, is too small"
+        return GlobalTest(of, np.nan, redundancy, np.nan, np.nan, None, reason)
+    statistic = float(sigma0**2 * redundancy)
+    lower, upper = (float(x) for x in stats.chi2.ppf([alpha / 2, 1 - alpha / 2], redundancy))
+    return GlobalTest(of, statistic, redundancy, lower, upper, lower <= statistic <= upper)
 
 
 def w_test(adjustment: Adjustment, *, alpha: float = ALPHA) -> CoordinateTest:
@@ -150,7 +177,7 @@ def reliability(adjustment: Adjustment, *, alpha: float = ALPHA, power: float = 
     )
 
 
-def significance(adjustment: Adjustment, *, alpha: float = 0.05) -> tuple[Significance, ...]:
+def significance(adjustment: Adjustment, *, alpha: float = GLOBAL_ALPHA) -> tuple[Significance, ...]:
     """Return the t-test against 0 of each free parameter of distortion and principal point in mm.
 
     A parameter that several cameras share is tested once, under the name of their group.

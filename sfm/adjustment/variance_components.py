@@ -25,6 +25,7 @@ from sfm.network import Network
 SETTLED = 1e-3  # relative change of a variance component at which its estimation ends
 MAX_ROUNDS = 20
 FEW = 1.0  # redundancy of a group of image points below which its variance component is not estimated
+IMAGE_POINTS = "image points"
 FEW_OF_A_KIND = 0.1  # the same of a kind, of which a few scale bars may be all there is
 
 
@@ -84,7 +85,7 @@ def by_kind(adjustment: Adjustment) -> VarianceComponents:
     use_control = a.datum == "control"
     layout, state = unknowns_of(network, a.estimate, use_control=use_control)
     w = weighted_of(network, layout, use_control=use_control)
-    image = variance_components(a, np.zeros(len(a.rejected), dtype=np.int64), ("image points",))
+    image = variance_components(a, np.zeros(len(a.rejected), dtype=np.int64), (IMAGE_POINTS,))
     Q_points, Q_exterior = a.covariance.points[w.point], a.covariance.exterior[w.image]
     dX = state.points[w.point] - w.xyz
     e, _ = exterior_misclosure(w, state)
@@ -126,7 +127,7 @@ def by_kind(adjustment: Adjustment) -> VarianceComponents:
     own = np.array([float(image.redundancy[0]), *(kind[1] - kind[3] for kind in seen)])
     enough = own > FEW_OF_A_KIND
     sigma0 = np.where(enough, np.sqrt(np.maximum(vPv, 0) / np.where(enough, own, 1.0)), np.nan)
-    names = ("image points", *(kind[0] for kind in seen))
+    names = (IMAGE_POINTS, *(kind[0] for kind in seen))
     return VarianceComponents(
         names, sigma0, own, np.array([int(image.count[0]), *(kind[1] for kind in seen)])
     )
@@ -134,11 +135,11 @@ def by_kind(adjustment: Adjustment) -> VarianceComponents:
 
 def estimate_components(
     adjust_network: Callable[[Network], Adjustment], network: Network, group: IntArray, names: tuple[str, ...]
-) -> tuple[Adjustment, FloatArray]:
+) -> tuple[Adjustment, FloatArray, bool]:
     """Return the adjustment with the weights of groups of image points estimated from the data.
 
     The covariance of each group is multiplied by its variance factor and the network adjusted again,
-    until the factors are 1.
+    until the factors of the image points that the last adjustment accepted are 1.
 
     Args:
         adjust_network: adjusts a network from fixed start values and returns the adjustment.
@@ -147,7 +148,8 @@ def estimate_components(
         names: names of the groups, g of them.
 
     Returns:
-        Last adjustment, and standard deviation of each group over that given, shape (g,).
+        Last adjustment, standard deviation of each group over that given, shape (g,), and whether the
+        factors came to rest.
     """
     factor = np.ones(len(names))
     k = network.image_points
@@ -155,9 +157,9 @@ def estimate_components(
     for _ in range(MAX_ROUNDS):
         found = variance_components(adjustment, group, names).sigma0
         found = np.where(np.isfinite(found) & (found > 0), found, 1.0)
+        if np.abs(found - 1).max() <= SETTLED:
+            return adjustment, factor, True
         factor = factor * found
         scaled = replace(k, covariance=k.covariance * factor[group][:, None, None] ** 2)
         adjustment = adjust_network(replace(network, image_points=scaled))
-        if np.abs(found - 1).max() <= SETTLED:
-            break
-    return adjustment, factor
+    return adjustment, factor, False

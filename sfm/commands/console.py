@@ -11,10 +11,10 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextC
 from rich.table import Table
 from rich.text import Text
 
-from sfm.adjustment.statistics import global_test
 from sfm.report.checks import count_observations, sigma0_ratio
 from sfm.report.markup import finer_unit, significant
 from sfm.report.result import SurveyResult
+from sfm.report.statistics import statistics_of, words_of_test
 from sfm.report.tables import point_sigmas, root_mean_square
 from sfm.report.verdict import verdict_of
 
@@ -166,12 +166,11 @@ def _figures(result: SurveyResult) -> tuple[tuple[str, str], ...]:
 def _details(result: SurveyResult) -> tuple[tuple[str, str], ...]:
     """Return further figures, for --verbose."""
     a = result.adjustment
-    test, counts = global_test(a), count_observations(a)
+    counts = count_observations(a)
     rows = [
         ("observations", f"{counts.total}: {counts.image} image coordinates, {counts.control} of control, "
          f"{counts.scale_bars} scale bars; {counts.constraints} constraints, {a.unknowns} unknowns"),
-        ("global test", f"{'passed' if test.passed else 'not passed'}: v'Pv {test.statistic:.1f}, "
-         f"critical values {test.lower:.1f} and {test.upper:.1f}"),
+        *(("global test", words_of_test(test)) for test in statistics_of(result).global_tests),
     ]  # fmt: skip
     found = result.eccentricity
     if found is not None:

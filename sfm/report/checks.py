@@ -12,6 +12,7 @@ import numpy as np
 
 from sfm.adjustment.reliability import UNCONTROLLED
 from sfm.adjustment.result import Adjustment
+from sfm.adjustment.variance_components import IMAGE_POINTS, variance_components
 from sfm.adjustment.weighted import observed
 from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.report.result import ControlCheck, SurveyResult
@@ -78,9 +79,12 @@ class InteriorResiduals:
 def sigma0_ratio(result: SurveyResult) -> float:
     """Return the a posteriori over the stated a priori standard deviation of the image coordinates.
 
-    Where the image points were weighted anew by their own variance component, that factor is put back in.
+    By the variance component of the image points alone; where they were weighted anew by it, that factor is
+    put back in. Without redundancy of their own it is sigma0 of all observations.
     """
-    return float(result.adjustment.sigma0 * result.weight_factor)
+    a = result.adjustment
+    own = variance_components(a, np.zeros(len(a.rejected), dtype=np.int64), (IMAGE_POINTS,)).sigma0[0]
+    return float((own if np.isfinite(own) else a.sigma0) * result.weight_factor)
 
 
 def longest_residual(adjustment: Adjustment) -> tuple[float, int]:

@@ -12,7 +12,7 @@ from sfm.adjustment.statistics import (
     correlations,
     significance,
 )
-from sfm.adjustment.variance_components import VarianceComponents, by_camera, by_kind, by_photograph
+from sfm.adjustment.variance_components import VarianceComponents
 from sfm.report.checks import (
     bar_residuals,
     control_residuals,
@@ -22,37 +22,37 @@ from sfm.report.checks import (
 )
 from sfm.report.markup import finer_unit, signed, significant, table
 from sfm.report.result import SurveyResult
-from sfm.report.statistics import GLOBAL_ALPHA, Statistics, quantiles, statistics_of
+from sfm.report.statistics import (
+    Statistics,
+    quantiles,
+    statistics_of,
+    words_of_test,
+    words_of_weights,
+)
 
 
 def image_coordinates(result: SurveyResult) -> str:
     """Sigma0, the global test, residuals and redundancy, then the ten worst residuals."""
-    a, found = result.adjustment, statistics_of(result.adjustment)
-    test, r = found.global_test, a.redundancy_numbers
-    verdict = "passed" if test.passed else "NOT passed"
+    a, found = result.adjustment, statistics_of(result)
     rows = [
         ("sigma0, a posteriori standard deviation of a coordinate", f"{a.sigma0_px:.5f}", "px"),
         ("standard deviation stated beforehand", f"{a.a_priori_px / result.weight_factor:.5f}", "px"),
-        ("a posteriori over a priori", f"{sigma0_ratio(result):.3f}", ""),
+        ("of the image points, a posteriori over that stated", f"{sigma0_ratio(result):.3f}", ""),
         ("RMS residual per coordinate", f"{a.rms_px:.5f}", "px"),
         ("longest residual vector among the accepted", f"{a.max_residual_px:.4f}", "px"),
-        (f"global test of v'Pv, {100 * GLOBAL_ALPHA:.0f} %: {verdict}", f"{test.statistic:.2f}", ""),
-        (f"its critical values (chi-square of {test.redundancy}), lower", f"{test.lower:.2f}", ""),
-        ("its critical values, upper", f"{test.upper:.2f}", ""),
     ]
     text = "<h3>Image coordinates</h3>" + table(("", "value", "unit"), rows)
+    tests = "".join(f"<li>{escape(words_of_test(test), quote=False)}</li>" for test in found.global_tests)
+    text += f"<p>Global test:</p><ul>{tests}</ul>"
+    words = words_of_weights(result)
+    text += f"<p class=note>{escape(words)}</p>" if words else ""
     text += (
         "<p class=note>The global test asks whether the standard deviation stated beforehand (sigma_px) is "
         "that of the photographs. It is only a rough guess: a test that is not passed says by how much to "
         "correct it, unless sigma0 is several times too large.</p>"
     )
-    if result.weight_factor != 1:
-        text += (
-            "<p class=note>Before the final adjustment the standard deviations of the image points were "
-            f"multiplied by {result.weight_factor:.3f}, from their own variance component, so that control "
-            "and scale bars keep those stated for them. The test is that of the weights so found.</p>"
-        )
-    return text + (_tests_and_reliability(result, found) if np.isfinite(r).any() else "")
+    known = np.isfinite(a.redundancy_numbers).any()
+    return text + (_tests_and_reliability(result, found) if known else "")
 
 
 def _tests_and_reliability(result: SurveyResult, found: Statistics) -> str:
@@ -71,7 +71,7 @@ def _tests_and_reliability(result: SurveyResult, found: Statistics) -> str:
                 f"{np.nanmax(np.abs(test.statistic)):.2f}",
             )
             for name, test in (
-                ("Baarda's w (sigma0 as stated)", found.w),
+                ("Baarda's w (sigma of the weights)", found.w),
                 ("Pope's tau (sigma0 as found)", found.tau),
             )
         ],
@@ -97,7 +97,7 @@ def _tests_and_reliability(result: SurveyResult, found: Statistics) -> str:
     return text + (
         f"<p class=note>The redundancy numbers add up to {found.redundancy_sum:.1f}, the redundancy is "
         f"{result.adjustment.redundancy}. The smallest gross error (minimal detectable bias) is found by the "
-        f"w test in {100 * found.power:.0f} of 100 cases, with the standard deviations stated beforehand. "
+        f"w test in {100 * found.power:.0f} of 100 cases, with the standard deviations of the weights. "
         "Its effect is the external reliability. Of every image coordinate: reliability.csv.</p>"
     )
 
@@ -187,14 +187,14 @@ def camera_correlations(result: SurveyResult) -> tuple[Correlation, ...]:
 
 def components(result: SurveyResult) -> str:
     """Variance components of kinds of observation, cameras and photographs."""
-    a = result.adjustment
     text = "<h3>Variance components</h3><p class=note>Sigma0 of a group over that stated beforehand; a group "
     text += "far above the others was measured worse, or does not fit.</p>"
-    kinds = by_kind(a)
-    if len(kinds.names) > 1:
-        text += table(("kind of observation", "sigma0", "redundancy", "observations"), _component_rows(kinds))
-    text += table(("camera", "sigma0", "redundancy", "coordinates"), _component_rows(by_camera(a)))
-    rows = _component_rows(by_photograph(a))
+    found = statistics_of(result)
+    if len(found.kinds.names) > 1:
+        rows = _component_rows(found.kinds)
+        text += table(("kind of observation", "sigma0", "redundancy", "observations"), rows)
+    text += table(("camera", "sigma0", "redundancy", "coordinates"), _component_rows(found.cameras))
+    rows = _component_rows(found.photographs)
     return (
         text
         + f"<details><summary>{len(rows)} photographs</summary>"

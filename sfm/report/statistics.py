@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.statistics import (
+    GLOBAL_ALPHA,
     POWER,
     CoordinateTest,
     Correlation,
     GlobalTest,
     Reliability,
     Significance,
+    component_tests,
     correlations,
     global_test,
     reliability,
@@ -21,18 +23,23 @@ from sfm.adjustment.statistics import (
     tau_test,
     w_test,
 )
-from sfm.adjustment.variance_components import VarianceComponents, by_camera, by_kind, by_photograph
+from sfm.adjustment.variance_components import (
+    IMAGE_POINTS,
+    VarianceComponents,
+    by_camera,
+    by_kind,
+    by_photograph,
+)
 from sfm.camera import Camera, camera_families
 from sfm.conventions import FloatArray, IntArray
-
-GLOBAL_ALPHA = 0.05  # of the global test and of the significance of parameters
+from sfm.report.result import SurveyResult
 
 
 @dataclass(frozen=True)
 class Statistics:
     """What a bundle report says besides the unknowns and their standard deviations."""
 
-    global_test: GlobalTest
+    global_tests: tuple[GlobalTest, ...]  # of all observations, or of each kind where there are several
     w: CoordinateTest  # Baarda's test of every image coordinate
     tau: CoordinateTest  # Pope's
     reliability: Reliability  # internal and external, of every image coordinate
@@ -57,21 +64,61 @@ class InteriorParameter:
     unit: str
 
 
-def statistics_of(adjustment: Adjustment) -> Statistics:
-    """Return the statistics of an adjustment with its covariance."""
-    kinds = by_kind(adjustment)
+def statistics_of(result: SurveyResult) -> Statistics:
+    """Return the statistics of a result with its covariance, against the standard deviations stated for it.
+
+    Each kind of observation is tested by itself, since a test of all of them together passes by
+    construction where the image points have the weight of their own residuals.
+    """
+    adjustment = result.adjustment
+    kinds = kinds_over_stated(result)
     return Statistics(
-        global_test=global_test(adjustment, alpha=GLOBAL_ALPHA),
+        global_tests=component_tests(kinds) if len(kinds.names) > 1 else (global_test(adjustment),),
         w=w_test(adjustment),
         tau=tau_test(adjustment),
         reliability=reliability(adjustment),
         power=POWER,
         redundancy_sum=float(kinds.redundancy.sum()),
         kinds=kinds,
-        cameras=by_camera(adjustment),
-        photographs=by_photograph(adjustment),
-        significance=significance(adjustment, alpha=GLOBAL_ALPHA),
+        cameras=_stated(by_camera(adjustment), result),
+        photographs=_stated(by_photograph(adjustment), result),
+        significance=significance(adjustment),
         correlations=correlations(adjustment),
+    )
+
+
+def kinds_over_stated(result: SurveyResult) -> VarianceComponents:
+    """Return the variance components of the kinds of observation over the standard deviations stated."""
+    kinds = by_kind(result.adjustment)
+    factor = np.where(np.array(kinds.names) == IMAGE_POINTS, result.weight_factor, 1.0)
+    return replace(kinds, sigma0=factor * kinds.sigma0)
+
+
+def _stated(image_points: VarianceComponents, result: SurveyResult) -> VarianceComponents:
+    """Return components of image points over the standard deviations stated, not over those adjusted with."""
+    return replace(image_points, sigma0=result.weight_factor * image_points.sigma0)
+
+
+def words_of_test(test: GlobalTest) -> str:
+    """Return what a global test says, the same in every report."""
+    if test.passed is None:
+        return f"{test.of}: not tested, {test.reason}"
+    said, r = "passed" if test.passed else "NOT passed", f"{test.redundancy:.1f}".removesuffix(".0")
+    return (
+        f"{test.of}: {said}; v'Pv = {test.statistic:.2f}, chi-square of {r} between {test.lower:.2f} and "
+        f"{test.upper:.2f} ({100 * (1 - GLOBAL_ALPHA):.0f} %)"
+    )
+
+
+def words_of_weights(result: SurveyResult) -> str:
+    """Return which weights the image points have, and what follows for the tests; empty if as stated."""
+    if result.weight_factor == 1:
+        return ""
+    return (
+        "Weights: the standard deviations of the image points were multiplied by "
+        f"{result.weight_factor:.3f}, from their own variance component, so that the other kinds of "
+        "observation keep those stated for them. A test of all observations together would pass by "
+        "construction; each kind is tested against the standard deviations stated for it."
     )
 
 

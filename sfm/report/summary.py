@@ -21,7 +21,13 @@ from sfm.report.checks import (
     sigma0_ratio,
 )
 from sfm.report.result import SurveyResult
-from sfm.report.statistics import parameter_sigmas, quantiles, statistics_of
+from sfm.report.statistics import (
+    parameter_sigmas,
+    quantiles,
+    statistics_of,
+    words_of_test,
+    words_of_weights,
+)
 from sfm.report.tables import UNCODED, root_mean_square
 from sfm.report.verdict import verdict_of
 
@@ -103,19 +109,26 @@ def _verdict(result: SurveyResult) -> dict[str, Any]:
 
 
 def _statistics(result: SurveyResult) -> dict[str, Any]:
-    a, found = result.adjustment, statistics_of(result.adjustment)
-    test, counts, r = found.global_test, count_observations(a), a.redundancy_numbers
+    a, found = result.adjustment, statistics_of(result)
+    counts, r = count_observations(a), a.redundancy_numbers
     known = np.isfinite(r).any()
     bias, external = quantiles(found.reliability.minimal_bias), quantiles(found.reliability.external)
     return {
         "sigma0_ratio": or_none(sigma0_ratio(result)),
-        "global_test": {
-            "vPv": or_none(test.statistic),
-            "redundancy": test.redundancy,
-            "lower": or_none(test.lower),
-            "upper": or_none(test.upper),
-            "passed": test.passed,
-        },
+        "weight_factor": result.weight_factor,
+        "weights": words_of_weights(result),
+        "global_tests": [
+            {
+                "of": test.of,
+                "vPv": or_none(test.statistic),
+                "redundancy": test.redundancy,
+                "lower": or_none(test.lower),
+                "upper": or_none(test.upper),
+                "passed": test.passed,
+                "words": words_of_test(test),
+            }
+            for test in found.global_tests
+        ],
         "w_test": _coordinate_test(found.w),
         "tau_test": _coordinate_test(found.tau),
         "observations": {

@@ -40,7 +40,7 @@ def write_tables(result: SurveyResult, folder: Path) -> None:
         "image,point,x_px,y_px,sx_px,sy_px,vx_px,vy_px,rejected",
         image_point_rows(adjustment),
     )
-    statistics = statistics_of(adjustment)
+    statistics = statistics_of(result)
     _write_csv(
         folder / "reliability.csv",
         "image,point,vx_px,vy_px,rx,ry,wx,wy,taux,tauy,mdbx_px,mdby_px,extx,exty,weight,rejected",

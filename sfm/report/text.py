@@ -23,7 +23,15 @@ from sfm.report.checks import (
 )
 from sfm.report.markup import finer_unit, significant, with_exponent
 from sfm.report.result import SurveyResult
-from sfm.report.statistics import Statistics, datum_in_words, interior_parameters, quantiles, statistics_of
+from sfm.report.statistics import (
+    Statistics,
+    datum_in_words,
+    interior_parameters,
+    quantiles,
+    statistics_of,
+    words_of_test,
+    words_of_weights,
+)
 from sfm.report.tables import image_rms, point_sigmas, root_mean_square
 from sfm.report.verdict import verdict_of
 
@@ -38,7 +46,7 @@ def text_report(result: SurveyResult) -> str:
     Args:
         result: the result.
     """
-    statistics = statistics_of(result.adjustment)
+    statistics = statistics_of(result)
     verdict = verdict_of(result)
     lines = [f"KOLINEAR  {result.survey}"[:WIDTH], "=" * WIDTH, verdict.headline]
     for remark in verdict.remarks:
@@ -56,7 +64,7 @@ def text_report(result: SurveyResult) -> str:
         lines += part
     lines += [
         "",
-        "sigma: one standard deviation, a posteriori; w test and minimal bias rest on those a priori.",
+        "sigma: one standard deviation, a posteriori; w test and minimal bias rest on those of the weights.",
         "Residuals: computed minus measured. Pixel (0, 0): centre of the top-left pixel.",
         "Tables (.csv): points, images, cameras, image_points, reliability, variance_components.",
     ]
@@ -101,23 +109,18 @@ def _adjustment(result: SurveyResult) -> list[str]:
 
 
 def _sigma0(result: SurveyResult, statistics: Statistics) -> list[str]:
-    a, test = result.adjustment, statistics.global_test
+    a = result.adjustment
     lines = [
         *_head("Sigma0 and global test"),
-        _line("sigma0", f"{a.sigma0_px:.5f} px, {sigma0_ratio(result):.3f} times the a priori one"),
-        _line("a priori", f"{a.a_priori_px / result.weight_factor:.5f} px"),
+        _line("sigma0", f"{a.sigma0_px:.5f} px"),
+        _line("a priori", f"{a.a_priori_px / result.weight_factor:.5f} px, of which the image points show "
+              f"{sigma0_ratio(result):.3f} times"),
         _line("residuals", f"RMS {a.rms_px:.5f} px per coordinate, longest {a.max_residual_px:.4f} px"),
-        _line(
-            "global test",
-            f"{'passed' if test.passed else 'NOT passed'}: v'Pv = {test.statistic:.2f}, chi-square of "
-            f"{test.redundancy} between {test.lower:.2f} and {test.upper:.2f} (95 %)",
-        ),
-    ]
-    if result.weight_factor != 1:
-        lines.append(
-            _line("weights", f"a priori sigmas times {result.weight_factor:.3f}, from their component")
-        )
-    return lines
+    ]  # fmt: skip
+    for test in statistics.global_tests:
+        lines += _wrapped(f"  global test, {words_of_test(test)}")
+    words = words_of_weights(result)
+    return lines + _wrapped(f"  {words}") if words else lines
 
 
 def _single_tests(result: SurveyResult, statistics: Statistics) -> list[str]:
@@ -158,7 +161,7 @@ def _single_tests(result: SurveyResult, statistics: Statistics) -> list[str]:
 
 
 def _components(result: SurveyResult, statistics: Statistics) -> list[str]:
-    lines = _head("Variance components: sigma0 of groups, a posteriori over a priori")
+    lines = _head("Variance components: sigma0 of groups, a posteriori over that stated")
     rows = _component_rows("kind", statistics.kinds)
     rows += _component_rows("camera", statistics.cameras) if len(statistics.cameras.names) > 1 else []
     photographs = _component_rows("photograph", statistics.photographs)

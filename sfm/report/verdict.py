@@ -7,6 +7,8 @@ from typing import Literal
 
 import numpy as np
 
+from sfm.adjustment.statistics import ALPHA, component_tests
+from sfm.adjustment.variance_components import IMAGE_POINTS
 from sfm.report.checks import (
     bar_residuals,
     check_over_sigma,
@@ -18,6 +20,7 @@ from sfm.report.checks import (
 )
 from sfm.report.markup import finer_unit, significant
 from sfm.report.result import SurveyResult
+from sfm.report.statistics import kinds_over_stated
 
 MUCH_REJECTED = 0.05  # share of rejected image points above which a person should look
 MOST_RAYS = 0.5  # share of the rays of a point: most of them say something else than the result
@@ -62,7 +65,7 @@ def verdict_of(result: SurveyResult) -> Verdict:
             f"Rank defect {a.defect}, expected {a.expected_defect}; not everything can be determined{what}."
         )
     remarks: list[str] = []
-    for judge in (_sigma0, _residual, _rays, _control, _bars, _interior, _check):
+    for judge in (_sigma0, _residual, _rays, _control, _bars, _interior, _kinds, _check):
         for is_bad, line in judge(result):
             (serious if is_bad else remarks).append(line)
     if oriented < total:
@@ -167,6 +170,21 @@ def _interior(result: SurveyResult) -> Judged:
         f"by {significant(float(ratio[worst]))} times the standard deviation of its residual."
     )
     return [(bool(ratio[worst] > WEIGHTED_BAD), line)]
+
+
+def _kinds(result: SurveyResult) -> Judged:
+    """Judge control, bars and interior orientation as a whole by their variance components."""
+    found = kinds_over_stated(result)
+    judged: Judged = []
+    for g, test in enumerate(component_tests(found, alpha=2 * ALPHA)):
+        if test.of == IMAGE_POINTS or found.count[g] < 2 or not test.statistic > test.upper:
+            continue
+        line = (
+            f"The residuals of the {test.of} are {significant(float(found.sigma0[g]))} times what the "
+            f"standard deviations stated for them give, more than chance (redundancy {test.redundancy:.1f})."
+        )
+        judged.append((False, line))
+    return judged
 
 
 def _rays(result: SurveyResult) -> Judged:

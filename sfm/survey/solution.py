@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -9,6 +10,7 @@ import numpy as np
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
+from sfm.adjustment.variance_components import IMAGE_POINTS, estimate_components
 from sfm.conventions import MAD_TO_SIGMA, BoolArray, IntArray
 from sfm.errors import GeometryError
 from sfm.network import Estimate, Network, reduce_network, supported
@@ -154,12 +156,14 @@ def _final(
 ) -> tuple[Adjustment, float]:
     """Return the last adjustment with its covariance, and the factor on the sigmas of the image points."""
     part, estimate = without_idle_cameras(survey, part, estimate)
-    final = _tested(survey, part, estimate, datum, reject=reject, covariance=True)
+
+    def adjust_part(one: Network) -> Adjustment:
+        return _tested(survey, one, estimate, datum, reject=reject, covariance=True)
+
     weighted_control = datum.kind == "control" and part.control.covariance.any()
-    if not (len(part.scale_bars) or len(part.interior) or weighted_control):
-        return final, 1.0
-    part, weight_factor = _weighed(final)
-    return _tested(survey, part, final.estimate, datum, reject=reject, covariance=True), weight_factor
+    if len(part.scale_bars) or len(part.interior) or weighted_control:
+        return _weighed(adjust_part, part)
+    return adjust_part(part), 1.0
 
 
 def _contradiction(
@@ -209,20 +213,21 @@ def _on_points(survey: Survey, network: Network, datum: Datum) -> Datum:
     return replace(datum, points=on)
 
 
-def _weighed(adjustment: Adjustment) -> tuple[Network, float]:
-    """Return the network with the image points weighted by their own variance component, and its root.
+def _weighed(adjust_part: Callable[[Network], Adjustment], part: Network) -> tuple[Adjustment, float]:
+    """Return the adjustment with the image points weighted by their own variance component, and its root.
 
     Lengths and control have the standard deviations that were stated for them; without this, sigma0 a
-    posteriori, which the image points decide, would scale these too.
+    posteriori, which the image points decide, would scale these too. The component is that of the image
+    points that the last adjustment accepts.
 
     Source: Foerstner and Wrobel (2016), Photogrammetric Computer Vision, sec. 4.2.4.
     """
-    network, used = adjustment.network, ~adjustment.rejected
-    seen = network.image_points
-    v, P = adjustment.residuals[used], np.linalg.inv(seen.covariance[used])
-    component = np.einsum("ka,kab,kb->", v, P, v) / adjustment.redundancy_numbers[used].sum()
-    weighed = replace(network, image_points=replace(seen, covariance=component * seen.covariance))
-    return weighed, float(np.sqrt(component))
+    group = np.zeros(len(part.image_points), dtype=np.int64)
+    final, factor, settled = estimate_components(adjust_part, part, group, (IMAGE_POINTS,))
+    if not settled:
+        line = "the weights of the image points did not come to rest: each of them rejects other image points"
+        final = replace(final, remarks=(*final.remarks, line))
+    return final, float(factor[0])
 
 
 def determined(
