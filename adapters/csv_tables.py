@@ -62,7 +62,9 @@ def read_result(folder: Path) -> TableResult:
     summary = _summary(folder / "summary.json")
     cameras, sigmas = _cameras(folder, summary)
     index = {camera.name: k for k, camera in enumerate(cameras)}
-    table = read_table(folder / "images.csv", ("image", "camera"), EXTERIOR, SIGMAS, ignored=None, blank=True)
+    table = read_table(
+        folder / "images.csv", ("image", "camera"), EXTERIOR, SIGMAS, ignored=None, blank=SIGMAS
+    )
     images = table.keys("image")
     for line, name in zip(table.line, table.texts[1], strict=True):
         if name not in index:
@@ -70,7 +72,7 @@ def read_result(folder: Path) -> TableResult:
     camera = np.array([index[name] for name in table.texts[1]], dtype=np.int64)
     rotation = np.array([rotation_from_angles(*np.deg2rad(row)) for row in table.values[:, 3:6]])
     position, position_covariance = table.values[:, :3].copy(), _covariance(table, table.values[:, 6:])
-    table = read_table(folder / "points.csv", ("id",), ("X", "Y", "Z"), SIGMAS, ignored=None, blank=True)
+    table = read_table(folder / "points.csv", ("id",), ("X", "Y", "Z"), SIGMAS, ignored=None, blank=SIGMAS)
     points = table.keys("id")
     network = Network(images, camera, points, _image_points(folder, images, points))
     return TableResult(
@@ -196,7 +198,12 @@ def _summary(path: Path) -> _Summary:
 def _cameras(folder: Path, summary: _Summary) -> tuple[tuple[Camera, ...], tuple[FloatArray, ...]]:
     """Cameras in the order of the summary, and the sigmas of their parameters."""
     table = read_table(
-        folder / "cameras.csv", ("camera", "parameter"), ("value",), ("sigma",), ignored=None, blank=True
+        folder / "cameras.csv",
+        ("camera", "parameter"),
+        ("value",),
+        ("sigma",),
+        ignored=None,
+        blank=("sigma",),
     )
     values, sigma = table.values[:, 0], table.values[:, 1:]
     table.refuse(sigma, sigma < 0, ("sigma",), "0 or more, or nothing")

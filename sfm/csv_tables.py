@@ -72,7 +72,7 @@ def read_table(
     *,
     aliases: tuple[tuple[str, str], ...] = (),
     ignored: tuple[str, ...] | None = (),
-    blank: bool = False,
+    blank: tuple[str, ...] = (),
 ) -> CsvTable:
     """Read a CSV file whose header names its columns.
 
@@ -83,7 +83,7 @@ def read_table(
         optional: columns of numbers that come all together or not at all.
         aliases: (other name, name) of columns.
         ignored: further columns that may be there; None for any.
-        blank: whether cells of the optional columns may be empty, which is NaN.
+        blank: columns of numbers whose cells may be empty, which is NaN.
 
     Raises:
         SurveyFileError: unreadable, too large, wrong columns, or not a finite number of bearable size.
@@ -112,7 +112,7 @@ def read_table(
         for column, at, name in zip(columns, text_at, texts, strict=True):
             column.append(_name(row[at], f"{where}: column {name}"))
         for at, name in zip(number_at, numbers, strict=True):
-            empty = blank and name in optional and not row[at].strip()
+            empty = name in blank and not row[at].strip()
             values.append(math.nan if empty else _number(row[at], f"{where}: column {name}"))
         lines.append(line)
     if not lines:

@@ -16,6 +16,7 @@ from sfm.project import Survey
 from sfm.report.result import FailedImage, StageTime, SurveyResult
 from sfm.survey.circles import check_circles
 from sfm.survey.comparison import ALONE, OtherPrograms, compare_solution
+from sfm.survey.exterior import with_exterior
 from sfm.survey.network import build_network, codes_of, min_rays, name_coded
 from sfm.survey.orientation import orient_photographs, orient_survey
 from sfm.survey.solution import match_and_adjust, solve
@@ -61,7 +62,8 @@ def run_survey(
         naming, network, estimate = match_and_adjust(survey, photographs, naming, start)
         circles = check_circles(survey, photographs, naming, network, estimate)
     with clock.stage("adjustment"):
-        solution = solve(survey, circles.network, circles.estimate, min_rays=min_rays(naming))
+        placed = with_exterior(survey, circles.network, circles.estimate, files.names)
+        solution = solve(survey, placed.network, placed.estimate, min_rays=min_rays(naming))
     compared = compare_solution(solution, others, clock, files=files)
     return SurveyResult(
         survey=survey.name,
@@ -74,7 +76,7 @@ def run_survey(
         baseline=compared.baseline,
         photographs=photographs.overlays(),
         control_check=solution.control_check,
-        warnings=start.warnings + circles.warnings + solution.warnings + compared.failures,
+        warnings=start.warnings + circles.warnings + placed.warnings + solution.warnings + compared.failures,
         eccentricity=circles.eccentricity,
         no_circles=circles.no_circles,
         weight_factor=solution.weight_factor,
@@ -91,7 +93,8 @@ def adjust_survey(
     with clock.stage("orientation"):
         start = orient_survey(survey, network, estimate)
     with clock.stage("adjustment"):
-        solution = solve(survey, network, start.estimate)
+        placed = with_exterior(survey, network, start.estimate, network.images)
+        solution = solve(survey, placed.network, placed.estimate)
     compared = compare_solution(solution, others, clock)
     return SurveyResult(
         survey=survey.name,
@@ -102,7 +105,7 @@ def adjust_survey(
         code=np.full(len(solution.adjustment.network.points), -1),
         comparison=compared.adjusters,
         control_check=solution.control_check,
-        warnings=start.warnings + solution.warnings + compared.failures,
+        warnings=start.warnings + placed.warnings + solution.warnings + compared.failures,
         weight_factor=solution.weight_factor,
         seconds=tuple(StageTime(*one) for one in clock.seconds),
     )

@@ -18,6 +18,7 @@ from sfm.settings import (
     CompareSettings,
     ControlSettings,
     DatumSettings,
+    ExteriorSettings,
     Head,
     ObservationSettings,
     ScaleBarSettings,
@@ -43,6 +44,7 @@ class Survey(Section):
     tie_points: TiePointSettings | None = None
     datum: DatumSettings = DatumSettings()
     control: ControlSettings | None = None
+    exterior: ExteriorSettings | None = None
     scale_bars: Annotated[tuple[ScaleBarSettings, ...], Field(strict=False, alias="scale_bar")] = ()
     observations: ObservationSettings | None = None
     approximate: ApproximateSettings = ApproximateSettings()
@@ -98,6 +100,7 @@ class Survey(Section):
         """
         names = [
             self.control.file if self.control else None,
+            self.exterior.file if self.exterior else None,
             self.observations.file if self.observations else None,
             self.approximate.images,
             self.approximate.points,

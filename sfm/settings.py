@@ -122,6 +122,12 @@ class ControlSettings(Section):
     file: Name  # id,X,Y,Z[,sX,sY,sZ]
 
 
+class ExteriorSettings(Section):
+    """[exterior]: observed exterior orientation, as by satellite positioning, a tracker or known stations."""
+
+    file: Name  # image,X,Y,Z[,sX,sY,sZ][,omega_deg,phi_deg,kappa_deg[,somega_deg,sphi_deg,skappa_deg]]
+
+
 class ScaleBarSettings(Section):
     """[[scale_bar]]: a measured distance between two object points."""
 

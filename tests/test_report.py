@@ -295,9 +295,8 @@ def test_result_appears_whole_and_replaces_an_earlier_one(result: SurveyResult, 
     out = tmp_path / "deep" / "out"
     page = write_result(result, out, write_colmap=lambda folder: (folder / "x.bin").touch(), jobs=2)
     assert page == out / "report.html"
-    assert {path.name for path in out.iterdir()} == set(WRITTEN) - {
-        "log.jsonl"
-    }  # the run itself adds the log
+    absent = {"log.jsonl", "observed_exterior.csv"}  # the run itself adds the log; nothing was observed
+    assert {path.name for path in out.iterdir()} == set(WRITTEN) - absent
     assert len(list((out / "overlays").iterdir())) == 8
     assert [path.name for path in out.parent.iterdir()] == ["out"]
     before = (out / "points.csv").read_bytes()

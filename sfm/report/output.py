@@ -27,6 +27,7 @@ WRITTEN = (
     "image_points.csv",
     "reliability.csv",
     "variance_components.csv",
+    "observed_exterior.csv",
     "report.txt",
     "points.ply",
     "report.html",

@@ -7,6 +7,7 @@ from html import escape
 import numpy as np
 
 from sfm.report.markup import finer_unit, raised, significant, table, with_exponent
+from sfm.report.observed_exterior import exterior_section
 from sfm.report.result import SurveyResult
 from sfm.report.section_statistics import camera_notes, components, control, image_coordinates, worst
 from sfm.report.statistics import InteriorParameter, families, interior_parameters
@@ -40,7 +41,7 @@ def quality_section(result: SurveyResult, pictures: dict[str, str]) -> str:
         f"({escape(a.datum)}); in a free network they say how the points lie to one another, not in an outer "
         "frame.</p>"
     )
-    text += control(result)
+    text += control(result) + exterior_section(result)
     text += image_coordinates(result)
     text += pictures.get("distribution", "") + pictures.get("residuals", "") + worst(result)
     text += "<h3>Cameras</h3>"

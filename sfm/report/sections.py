@@ -89,6 +89,9 @@ def coordinates_section(result: SurveyResult, *, has_model: bool) -> str:
         ("report.txt", "the bundle report on one page of plain text"),
         ("summary.json", "the figures of this page for programs"),
     ]
+    if len(result.adjustment.network.exterior):
+        what = "observed exterior orientation: given, residual, redundancy number, w"
+        listed.insert(-3, ("observed_exterior.csv", what))
     if result.comparison is not None and has_model:
         what = (
             f"the solution that was compared, in COLMAP's camera model ({result.comparison.model}): free "

@@ -20,6 +20,7 @@ from sfm.report.checks import (
     interior_residuals,
     sigma0_ratio,
 )
+from sfm.report.observed_exterior import exterior_summary
 from sfm.report.result import SurveyResult
 from sfm.report.statistics import (
     parameter_sigmas,
@@ -94,6 +95,7 @@ def summary(result: SurveyResult) -> dict[str, Any]:
         "control": _control(result),
         "scale_bars": _scale_bars(adjustment),
         "weighted_interior": _weighted_interior(adjustment),
+        "observed_exterior": exterior_summary(result),
         "eccentricity": _eccentricity(result),
         "no_circles": list(result.no_circles),
         "comparison": _comparison(result),

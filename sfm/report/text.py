@@ -6,8 +6,6 @@ deviations, correlations, worst residuals. No dates and hosts, so that two repor
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-
 import numpy as np
 
 from sfm.adjustment.statistics import STRONG
@@ -22,6 +20,7 @@ from sfm.report.checks import (
     worst_residuals,
 )
 from sfm.report.markup import finer_unit, significant, with_exponent
+from sfm.report.observed_exterior import exterior_text
 from sfm.report.result import SurveyResult
 from sfm.report.statistics import (
     Statistics,
@@ -33,10 +32,13 @@ from sfm.report.statistics import (
     words_of_weights,
 )
 from sfm.report.tables import image_rms, point_sigmas, root_mean_square
+from sfm.report.text_lines import MOST_ROWS, WIDTH
+from sfm.report.text_lines import columns as _table
+from sfm.report.text_lines import head as _head
+from sfm.report.text_lines import line as _line
+from sfm.report.text_lines import wrapped as _wrapped
 from sfm.report.verdict import verdict_of
 
-WIDTH = 100
-MOST_ROWS = 12  # of a list; the rest is in the tables of the result
 WORST = 5
 
 
@@ -59,6 +61,7 @@ def text_report(result: SurveyResult) -> str:
         _interior(result, statistics),
         _points(result),
         _given(result),
+        exterior_text(result),
         _worst(result),
     ):
         lines += part
@@ -313,36 +316,3 @@ def _rms(values: FloatArray) -> FloatArray:
 
 def _or_none(value: float) -> str:
     return "unlimited" if np.isinf(value) else significant(value)
-
-
-def _head(title: str) -> list[str]:
-    return ["", f"{title} ".ljust(WIDTH, "-")]
-
-
-def _line(name: str, text: str) -> str:
-    return f"  {name:<21} {text}"
-
-
-def _table(header: Sequence[str], rows: Iterable[Sequence[str]], *, left: int) -> list[str]:
-    """Return rows in columns; the first `left` ones set to the left, numbers to the right."""
-    cells = [tuple(header), *(tuple(row) for row in rows)]
-    widths = [min(max(len(row[c]) for row in cells), 40) for c in range(len(header))]
-    return [
-        "  "
-        + "  ".join(
-            f"{row[c][:40]:<{width}}" if c < left else f"{row[c]:>{width}}" for c, width in enumerate(widths)
-        )
-        for row in cells
-    ]
-
-
-def _wrapped(text: str) -> list[str]:
-    """Break a line between words; what follows stands behind its indentation."""
-    indent = " " * (len(text) - len(text.lstrip()) + 2)
-    lines, rest = [], text
-    while len(rest) > WIDTH:
-        cut = rest.rfind(" ", len(indent) + 1, WIDTH)
-        cut = WIDTH if cut < 0 else cut
-        lines.append(rest[:cut])
-        rest = indent + rest[cut:].strip()
-    return [*lines, rest]

@@ -19,6 +19,7 @@ from sfm.report.checks import (
     sigma0_ratio,
 )
 from sfm.report.markup import finer_unit, significant
+from sfm.report.observed_exterior import worst_exterior
 from sfm.report.result import SurveyResult
 from sfm.report.statistics import kinds_over_stated
 
@@ -65,7 +66,7 @@ def verdict_of(result: SurveyResult) -> Verdict:
             f"Rank defect {a.defect}, expected {a.expected_defect}; not everything can be determined{what}."
         )
     remarks: list[str] = []
-    for judge in (_sigma0, _residual, _rays, _control, _bars, _interior, _kinds, _check):
+    for judge in (_sigma0, _residual, _rays, _control, _bars, _interior, _exterior, _kinds, _check):
         for is_bad, line in judge(result):
             (serious if is_bad else remarks).append(line)
     if oriented < total:
@@ -185,6 +186,18 @@ def _kinds(result: SurveyResult) -> Judged:
         )
         judged.append((False, line))
     return judged
+
+
+def _exterior(result: SurveyResult) -> Judged:
+    """Judge the residuals of observed exterior orientation."""
+    name, w = worst_exterior(result.adjustment)
+    if not w > WEIGHTED_REMARK:
+        return []
+    line = (
+        f"The given {name} differs from the adjusted one by {significant(w)} times the standard deviation of "
+        "its residual."
+    )
+    return [(w > WEIGHTED_BAD, line)]
 
 
 def _rays(result: SurveyResult) -> Judged:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,9 +17,11 @@ from sfm.survey.cameras import camera_of_image, start_cameras
 from sfm.survey.interior import refuse_ungrouped
 from sfm.survey.tables import (
     ImagePointTable,
+    ObservedExteriorTable,
     read_control,
     read_exterior,
     read_image_points,
+    read_observed_exterior,
     read_points,
 )
 
@@ -52,7 +55,7 @@ def find_photographs(survey: Survey, *, images_dir: Path | None = None) -> Photo
 
     Raises:
         SurveyFileError: no such folder, a camera without photographs, a photograph of two cameras, or of no
-            group where its camera has groups.
+            group where its camera has groups, or observed exterior orientation that cannot be used.
     """
     folder = Path(images_dir) if images_dir is not None else survey.path.parent
     if not folder.is_dir():
@@ -86,6 +89,7 @@ def find_photographs(survey: Survey, *, images_dir: Path | None = None) -> Photo
         seen[name] = index
     names, paths, cameras = zip(*owner, strict=True)
     refuse_ungrouped(survey, names, cameras)
+    observed_exterior(survey, names)  # refused before the photographs are measured
     return PhotographList(names, paths, np.array(cameras, dtype=np.int64), folder)
 
 
@@ -115,6 +119,7 @@ def network_from_observations(survey: Survey) -> tuple[Network, Estimate]:
         table.xy, table.sigma, table.unit, cameras, owner[image], survey.adjust.sigma_px
     )
     _refuse_far_outside(where, table, xy, cameras, owner[image])
+    observed_exterior(survey, images)  # refused before anything is computed
     control, _ = control_points(survey, points)
     bars, _ = scale_bars(survey, points)
     network = Network(
@@ -148,6 +153,30 @@ def control_points(survey: Survey, points: tuple[str, ...]) -> tuple[ObjectPoint
         ),
         tuple(name for name in table.names if name not in index),
     )
+
+
+def observed_exterior(survey: Survey, images: Sequence[str]) -> ObservedExteriorTable | None:
+    """Return the observed exterior orientations that a survey names, None if it names none.
+
+    Args:
+        survey: names the table.
+        images: all photographs of the survey, also those that could not be read.
+
+    Raises:
+        SurveyFileError: the table cannot be used, or names a photograph that is none of the survey's.
+    """
+    if survey.exterior is None:
+        return None
+    path = survey.beside(survey.exterior.file)
+    table = read_observed_exterior(path)
+    known = set(images)
+    for name, line in zip(table.names, table.line.tolist(), strict=True):
+        if name not in known:
+            lacks = "has no observations" if survey.observations else "is no photograph of the survey"
+            raise SurveyFileError(
+                f"{path}, line {line}: column image: '{name}' {lacks}; correct the name or remove it"
+            )
+    return table
 
 
 def scale_bars(survey: Survey, points: tuple[str, ...]) -> tuple[ScaleBars, tuple[str, ...]]:

@@ -1,4 +1,4 @@
-"""The tables that a survey file names (CSV): control, image points, exterior orientation, points.
+"""The tables that a survey file names (CSV): control, observed exterior orientation, image points, points.
 
 Every refusal names the line and the column; what is true of all tables is in `sfm.csv_tables`.
 """
@@ -11,10 +11,15 @@ from pathlib import Path
 import numpy as np
 
 from sfm.conventions import FloatArray, IntArray, rotation_from_angles
-from sfm.csv_tables import read_header, read_table
+from sfm.csv_tables import CsvTable, read_header, read_table
+from sfm.errors import SurveyFileError
 
 MIN_SIGMA = 1e-9  # in any unit used here less than an atom
 MAX_EXTENT_PER_SIGMA = 1e6  # no control is known to better than a millionth of its extent
+FULL_TURN = 360.0  # deg
+LEAST_COS_PHI = 0.01  # nearer to phi = +-90 deg omega and kappa say nearly the same
+AXES, ANGLES = ("X", "Y", "Z"), ("omega_deg", "phi_deg", "kappa_deg")
+SIGMAS_OF_AXES, SIGMAS_OF_ANGLES = ("sX", "sY", "sZ"), ("somega_deg", "sphi_deg", "skappa_deg")
 
 
 @dataclass(frozen=True)
@@ -34,6 +39,16 @@ class ExteriorTable:
     position: FloatArray  # projection centres X0, object unit, (m, 3)
     rotation: FloatArray  # R, image to object axes, (m, 3, 3)
     line: IntArray  # line of the file, (m,)
+
+
+@dataclass(frozen=True)
+class ObservedExteriorTable:
+    """Observed exterior orientations of exterior.csv: X0, Y0, Z0 in the object unit, angles in rad."""
+
+    names: tuple[str, ...]  # photographs, (e,)
+    value: FloatArray  # X0, Y0, Z0, omega, phi, kappa; NaN where not observed, (e, 6)
+    sigma: FloatArray  # standard deviations, 0 = fixed, infinite where not observed, (e, 6)
+    line: IntArray  # line of the file, (e,)
 
 
 @dataclass(frozen=True)
@@ -108,12 +123,89 @@ def read_exterior(path: Path) -> ExteriorTable:
     Raises:
         SurveyFileError: unreadable, wrong columns, not a finite number or a duplicate image.
     """
-    angles = ("omega_deg", "phi_deg", "kappa_deg")
-    ignored = ("camera", "sX", "sY", "sZ", *(f"s{name}" for name in angles), "points", "rms_px")
-    table = read_table(path, ("image",), ("X", "Y", "Z", *angles), ignored=ignored)
+    ignored = ("camera", *SIGMAS_OF_AXES, *SIGMAS_OF_ANGLES, "points", "rms_px")
+    table = read_table(path, ("image",), (*AXES, *ANGLES), ignored=ignored)
     rotation = [rotation_from_angles(*row) for row in np.radians(table.values[:, 3:])]
     return ExteriorTable(
         table.keys("image"), table.values[:, :3], np.reshape(rotation, (-1, 3, 3)), table.line
+    )
+
+
+def read_observed_exterior(path: Path) -> ObservedExteriorTable:
+    """Read observed exterior orientations; images.csv of a result is welcome.
+
+    Columns are image,X,Y,Z[,sX,sY,sZ][,omega_deg,phi_deg,kappa_deg[,somega_deg,sphi_deg,skappa_deg]]. An
+    empty cell means not observed; no column of sigma, or a sigma of 0, means fixed.
+
+    Raises:
+        SurveyFileError: unreadable, wrong columns, not a finite number, a duplicate image, a sigma that is
+            negative or stands alone or is missing, one so small that its unit must be another, angles of
+            which only some are fixed, or that cannot be told apart.
+    """
+    header = read_header(path)
+    sigmas_of_axes = SIGMAS_OF_AXES if any(name in header for name in SIGMAS_OF_AXES) else ()
+    sigmas_of_angles = SIGMAS_OF_ANGLES if any(name in header for name in SIGMAS_OF_ANGLES) else ()
+    angles = ANGLES if any(name in header for name in (*ANGLES, *sigmas_of_angles)) else ()
+    columns = (*AXES, *sigmas_of_axes, *angles, *sigmas_of_angles)
+    aliases = (("photograph", "image"), ("X0", "X"), ("Y0", "Y"), ("Z0", "Z"))
+    table = read_table(
+        path,
+        ("image",),
+        columns,
+        tuple(name for name in (*SIGMAS_OF_AXES, *ANGLES, *SIGMAS_OF_ANGLES) if name not in columns),
+        aliases=aliases,
+        ignored=("camera", "points", "rms_px"),
+        blank=columns,
+    )
+    value, sigma = np.full((len(table.line), 6), np.nan), np.full((len(table.line), 6), np.inf)
+    for place, names, sigmas in ((0, AXES, sigmas_of_axes), (3, angles, sigmas_of_angles)):
+        for k, name in enumerate(names):
+            given = table.values[:, columns.index(name)]
+            own = (
+                table.values[:, columns.index(sigmas[k])] if sigmas else np.where(np.isnan(given), given, 0.0)
+            )
+            _refuse_halves(table, given, own, name, sigmas[k] if sigmas else "")
+            value[:, place + k], sigma[:, place + k] = given, np.where(np.isnan(own), np.inf, own)
+    _refuse_impossible(table, value, sigma)
+    value[:, 3:], sigma[:, 3:] = np.radians(value[:, 3:]), np.radians(sigma[:, 3:])
+    return ObservedExteriorTable(table.keys("image"), value, sigma, table.line)
+
+
+def _refuse_halves(table: CsvTable, given: FloatArray, sigma: FloatArray, name: str, sigma_name: str) -> None:
+    """Refuse a value without its sigma and a sigma without its value."""
+    for k in np.flatnonzero(np.isnan(given) != np.isnan(sigma))[:1]:
+        empty, other = (name, sigma_name) if np.isnan(given[k]) else (sigma_name, name)
+        raise SurveyFileError(
+            f"{table.path}, line {table.line[k]}: column {empty} is empty beside a value in {other}; needed "
+            "both, sigma 0 for a fixed value, or neither for one that was not observed"
+        )
+
+
+def _refuse_impossible(table: CsvTable, value: FloatArray, sigma: FloatArray) -> None:
+    """Refuse observed orientations (degrees) that no adjustment can take as they stand."""
+    columns = (*SIGMAS_OF_AXES, *SIGMAS_OF_ANGLES)
+    table.refuse(sigma, sigma < 0, columns, "0 (fixed) or more")
+    known = value[np.isfinite(value[:, :3]).all(axis=1), :3]
+    extent = float(np.ptp(known, axis=0).max()) if len(known) else 0.0
+    least = np.array([max(MIN_SIGMA, extent / MAX_EXTENT_PER_SIGMA)] * 3 + [MIN_SIGMA] * 3)
+    table.refuse(
+        sigma,
+        (sigma > 0) & (sigma < least),
+        columns,
+        f"at least {least[0]:.3g} (of angles {MIN_SIGMA:g} deg), or 0 for a fixed value: coordinates and "
+        "sigmas are in the object unit, angles in degrees",
+    )
+    angles = value[:, 3:]
+    table.refuse(angles, np.abs(angles) > FULL_TURN, ANGLES, f"degrees, at most {FULL_TURN:g}")
+    fixed = sigma[:, 3:] == 0
+    some = fixed & ~fixed.all(axis=1, keepdims=True)
+    table.refuse(sigma[:, 3:], some, SIGMAS_OF_ANGLES, "omega, phi, kappa fixed together or none of them")
+    phi = np.abs(np.cos(np.radians(angles[:, 1]))) < LEAST_COS_PHI
+    table.refuse(
+        angles,
+        phi[:, None] & np.array([False, True, False]),
+        ANGLES,
+        "another than +-90, where omega and kappa cannot be told apart; leave the three angles empty",
     )
 
 

@@ -16,6 +16,7 @@ from sfm.project import Survey
 from sfm.report.result import FailedImage, StageTime, SurveyResult
 from sfm.settings import TiePointSettings
 from sfm.survey.comparison import ALONE, OtherPrograms, compare_solution
+from sfm.survey.exterior import with_exterior
 from sfm.survey.solution import solve
 from sfm.survey.start import find_photographs
 from sfm.survey.tie_points import MIN_RAYS, orient_tied, tie_photographs
@@ -43,7 +44,8 @@ def run_textured_survey(
         start = orient_tied(survey, tied, files)
     with clock.stage("adjustment"):
         rays = np.full(len(network.points), MIN_RAYS)
-        solution = solve(survey, network, start.estimate, min_rays=rays)
+        placed = with_exterior(survey, network, start.estimate, files.names)
+        solution = solve(survey, placed.network, placed.estimate, min_rays=rays)
     compared = compare_solution(solution, others, clock, files=files)
     return SurveyResult(
         survey=survey.name,
@@ -56,7 +58,7 @@ def run_textured_survey(
         baseline=compared.baseline,
         photographs=tied.overlays(settings.window_px),
         control_check=solution.control_check,
-        warnings=start.warnings + solution.warnings + compared.failures,
+        warnings=start.warnings + placed.warnings + solution.warnings + compared.failures,
         weight_factor=solution.weight_factor,
         seconds=tuple(StageTime(*one) for one in clock.seconds),
     )

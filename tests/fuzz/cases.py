@@ -23,7 +23,13 @@ from sfm.errors import KolinearError
 from sfm.pipeline import adjust_survey
 from sfm.project import read_survey
 from sfm.survey.start import find_photographs, network_from_observations
-from sfm.survey.tables import read_control, read_exterior, read_image_points, read_points
+from sfm.survey.tables import (
+    read_control,
+    read_exterior,
+    read_image_points,
+    read_observed_exterior,
+    read_points,
+)
 from sfm.targets.codes import read_code_table
 from sfm.targets.detect import find_targets
 from sfm.targets.photograph import read_metadata, read_photograph
@@ -53,6 +59,8 @@ min_diameter_px = 6
 kind = "control"
 [control]
 file = "control.csv"
+[exterior]
+file = "exterior.csv"
 [[scale_bar]]
 from = "1"
 to = "2"
@@ -224,6 +232,7 @@ def _reader_of_photograph(name: str) -> Callable[[Path, random.Random], None]:
 
 _TABLES: tuple[tuple[str, Callable[[Path, random.Random], None]], ...] = (
     ("control.csv", lambda f, _: _drop(read_control(f / "control.csv"))),
+    ("exterior.csv", lambda f, _: _drop(read_observed_exterior(f / "exterior.csv"))),
     ("images.csv", lambda f, _: _drop(read_exterior(f / "images.csv"))),
     ("points.csv", lambda f, _: _drop(read_points(f / "points.csv"))),
     ("image_points.csv", lambda f, _: _drop(read_image_points(f / "image_points.csv"))),
@@ -257,7 +266,14 @@ def _tables() -> dict[str, str]:
         for name, (x, y, z) in zip(network.points, truth.points, strict=True)
     ]
     images = "".join(f"{name},0.1,0.2,4.0,1.0,-2.0,{10 * k}.0\n" for k, name in enumerate(network.images))
+    seen_from = "".join(
+        f"{name},{x:.4f},{y:.4f},{z:.4f},0.01,0.01,0.01,,,,,,\n"
+        for name, (x, y, z) in zip(network.images[:3], truth.position, strict=False)
+    )
     return {
+        "exterior.csv": "image,X,Y,Z,sX,sY,sZ,omega_deg,phi_deg,kappa_deg,somega_deg,sphi_deg,skappa_deg\n"
+        + seen_from
+        + f"{network.images[3]},,,,,,,1.0,-2.0,30.0,0.1,0.1,0.1\n",
         "image_points.csv": "image,point,x_px,y_px,sx_px,sy_px\n" + points,
         "control.csv": "id,X,Y,Z,sX,sY,sZ\n" + "".join(f"{row},0.001,0.001,0\n" for row in xyz[:5]),
         "points.csv": "point,X,Y,Z\n" + "\n".join(xyz) + "\n",

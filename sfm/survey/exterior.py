@@ -1,0 +1,158 @@
+"""Observed exterior orientation of a survey: satellite positioning, a tracker, known stations.
+
+In the datum `control` it takes part in the adjustment beside the control; in the others it does not, as the
+control does not. Start values are brought into its frame where control alone does not do that.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from sfm.conventions import FloatArray, IntArray, rotation_from_angles
+from sfm.errors import GeometryError
+from sfm.network import Estimate, ExteriorObservations, Network
+from sfm.project import Survey
+from sfm.similarity import Similarity, fit_similarity
+from sfm.survey.datum import object_scale
+from sfm.survey.start import observed_exterior
+
+MIN_POINTS = 3  # that fix position, attitude and scale
+NARROW = 0.05  # breadth over length of places below which their turn about the length is taken from angles
+ROUGH = 1e-3  # of the extent of the places: no start value needs to be better
+
+
+@dataclass(frozen=True)
+class Placed:
+    """A network with its observed exterior orientation, ready to be adjusted."""
+
+    network: Network
+    estimate: Estimate  # start values in the frame of the datum
+    warnings: tuple[str, ...] = ()  # one line each
+
+
+def with_exterior(survey: Survey, network: Network, estimate: Estimate, images: Sequence[str]) -> Placed:
+    """Return the network with the observed exterior orientations, and start values in their frame.
+
+    Args:
+        survey: names the table and the datum.
+        network, estimate: after the orientation; photographs without start values are NaN.
+        images: all photographs of the survey.
+
+    Returns:
+        All as it was, with a warning, where the datum is not `control`.
+
+    Raises:
+        SurveyFileError: as `observed_exterior`.
+        GeometryError: they and the control cannot place the network.
+    """
+    table = observed_exterior(survey, images)
+    if table is None:
+        return Placed(network, estimate)
+    if survey.datum.kind != "control":
+        line = (
+            f"[exterior]: observed exterior orientation takes no part in datum '{survey.datum.kind}', as "
+            "control does not; datum kind 'control' uses it"
+        )
+        return Placed(network, estimate, (line,))
+    index = {name: i for i, name in enumerate(network.images)}
+    rows = np.array([k for k, name in enumerate(table.names) if name in index], dtype=np.int64)
+    image = np.array([index[table.names[k]] for k in rows], dtype=np.int64)
+    value, sigma = table.value[rows], table.sigma[rows]
+    covariance = np.zeros((len(rows), 6, 6))
+    covariance[:, range(6), range(6)] = sigma**2
+    # what was not observed has no weight, and any number may stand in its place
+    filled = np.where(np.isnan(value), 0.0, value)
+    observed = ExteriorObservations(image, filled[:, :3], filled[:, 3:], covariance)
+    placed = _placed(survey, network, estimate, image, value, sigma)
+    return Placed(replace(network, exterior=observed), _held(placed, image, value, sigma))
+
+
+def _held(estimate: Estimate, image: IntArray, value: FloatArray, sigma: FloatArray) -> Estimate:
+    """Return the estimate with fixed projection centres and rotations at their values."""
+    position, rotation = estimate.position.copy(), estimate.rotation.copy()
+    oriented = estimate.oriented
+    for i, given, s in zip(image, value, sigma, strict=True):
+        if oriented[i]:
+            position[i] = np.where(s[:3] == 0, given[:3], position[i])
+            if (s[3:] == 0).all():
+                rotation[i] = rotation_from_angles(*given[3:])
+    return replace(estimate, position=position, rotation=rotation)
+
+
+def _placed(
+    survey: Survey,
+    network: Network,
+    estimate: Estimate,
+    image: IntArray,
+    value: FloatArray,
+    sigma: FloatArray,
+) -> Estimate:
+    """Return the start values in the frame of control and observed exterior orientation."""
+    control = network.control
+    known = estimate.determined[control.point]
+    if known.sum() >= MIN_POINTS and _breadth(control.xyz[known]) >= NARROW:
+        return estimate  # the orientation has brought it there
+    oriented = estimate.oriented[image]
+    centres = oriented & np.isfinite(value[:, :3]).all(axis=1)
+    source = np.concatenate([estimate.points[control.point[known]], estimate.position[image[centres]]])
+    target = np.concatenate([control.xyz[known], value[centres, :3]])
+    variance = np.concatenate(
+        [np.einsum("nii->n", control.covariance[known]), (sigma[centres, :3] ** 2).sum(axis=1)]
+    )
+    turned = oriented & np.isfinite(value[:, 3:]).all(axis=1)
+    if not len(target) or not (len(target) >= MIN_POINTS or turned.any()):
+        raise GeometryError(_too_few(survey, len(target), int(turned.sum())))
+    least = (ROUGH * float(np.ptp(target, axis=0).max())) ** 2
+    weight = 1 / np.maximum(variance, least if least > 0 else 1.0)
+    if turned.any() and (len(target) < MIN_POINTS or _breadth(target) < NARROW):
+        similarity = _by_angles(network, estimate, image[turned], value[turned, 3:], source, target, weight)
+    else:
+        try:
+            similarity = fit_similarity(source, target, weights=weight)
+        except GeometryError as error:
+            raise GeometryError(_too_few(survey, len(target), 0, on_a_line=True)) from error
+    return similarity.apply_estimate(estimate)
+
+
+def _by_angles(
+    network: Network,
+    estimate: Estimate,
+    image: IntArray,
+    angles: FloatArray,
+    source: FloatArray,
+    target: FloatArray,
+    weight: FloatArray,
+) -> Similarity:
+    """Return the similarity whose rotation is the mean that observed angles say (Horn 1987)."""
+    observed = np.stack([rotation_from_angles(*one) for one in angles])
+    U, _, Vt = np.linalg.svd(np.einsum("eab,ecb->ac", observed, estimate.rotation[image]))
+    R = (U * np.array([1.0, 1.0, np.linalg.det(U) * np.linalg.det(Vt)])) @ Vt
+    w = weight / weight.sum()
+    centre_s, centre_t = w @ source, w @ target
+    spread_s, spread_t = (w @ ((x - c) ** 2).sum(axis=1) for x, c in ((source, centre_s), (target, centre_t)))
+    scale = float(np.sqrt(spread_t / spread_s)) if spread_s > 0 else object_scale(network, estimate)
+    if not scale > 0:
+        raise GeometryError(
+            "observed exterior orientation: one projection centre gives no scale; a second one, control or a "
+            "scale bar is needed"
+        )
+    return Similarity(scale, R, centre_t - scale * R @ centre_s)
+
+
+def _breadth(places: FloatArray) -> float:
+    """Return the second over the first principal extent of places, 0 where they lie on a line."""
+    spread = np.linalg.svd(places - places.mean(axis=0), compute_uv=False)
+    return float(spread[1] / spread[0]) if len(spread) > 1 and spread[0] > 0 else 0.0
+
+
+def _too_few(survey: Survey, places: int, turned: int, *, on_a_line: bool = False) -> str:
+    """Say why observed exterior orientation and control do not place the network."""
+    how = " on a line" if on_a_line else ""
+    return (
+        f"survey {survey.name}: datum 'control': {places} projection centres and control points{how} in the "
+        f"network and the angles of {turned} photographs are known; needed three places that are not on a "
+        "line, or two and the angles of a photograph"
+    )
