@@ -216,7 +216,7 @@ def _refuse_contradictions(survey: Survey) -> None:
                 f"{where}: scale_bar {bar.start} - {bar.end}: length {bar.length:g} is more than a million "
                 f"times its sigma {bar.sigma:g}; are both in {survey.unit}?"
             )
-    _refuse_contradicting_sizes(survey.targets, where)
+    _refuse_contradicting_sizes(survey.targets, where, survey.unit)
     if survey.targets.codes not in FAMILIES and not survey.beside(survey.targets.codes).is_file():
         raise SurveyFileError(
             f"{where}: targets.codes = '{survey.targets.codes}' is neither one of {', '.join(FAMILIES)} "
@@ -224,7 +224,7 @@ def _refuse_contradictions(survey: Survey) -> None:
         )
 
 
-def _refuse_contradicting_sizes(targets: TargetSettings, where: str) -> None:
+def _refuse_contradicting_sizes(targets: TargetSettings, where: str, unit: str) -> None:
     """Raise SurveyFileError where sizes of tags or rings do not go with the codes or with one another."""
     if targets.tag_size is not None and targets.codes not in TAG_FAMILIES:
         raise SurveyFileError(
@@ -248,7 +248,7 @@ def _refuse_contradicting_sizes(targets: TargetSettings, where: str) -> None:
         if targets.tag_size > MAX_LENGTH_PER_SIGMA * targets.tag_sigma:
             raise SurveyFileError(
                 f"{where}: targets.tag_size {targets.tag_size:g} is more than a million times its sigma "
-                f"{targets.tag_sigma:g}; are both in the object unit?"
+                f"{targets.tag_sigma:g}; are both in {unit}?"
             )
 
 

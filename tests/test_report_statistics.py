@@ -29,7 +29,9 @@ from sfm.report.checks import (
     worst_residuals,
 )
 from sfm.report.html import render_html
+from sfm.report.markup import signed
 from sfm.report.plots import all_plots, plan_axes
+from sfm.report.precision import point_precision, without_fixed
 from sfm.report.result import ControlCheck, Eccentricity, SurveyResult
 from sfm.report.section_statistics import camera_correlations
 from sfm.report.statistics import (
@@ -137,7 +139,44 @@ def test_a_false_calibration_certificate_is_noticed(sigmas: float, level: str) -
     assert verdict.level == level, verdict
     assert any("The given c of camera" in line for line in verdict.remarks) == (level != "good")
     assert "weighted interior" in text_report(result)
+    page = render_html(result, (), ())
+    table = page[page.index("<h4>Observed interior orientation</h4>") :].split("</table>")[0]
+    assert f"c of camera {camera.name}" in table and f"{found.ratio[0]:+.2f}" in table
+    assert signed(float(found.difference[0])) in table
     assert summary(result)["weighted_interior"][0]["w"] == pytest.approx(found.ratio[0])
+
+
+@pytest.mark.parametrize("fixed", [0, 1, 4])
+def test_fixed_coordinates_do_not_make_the_points_look_more_precise(fixed: int) -> None:
+    network, truth = make_network(seed_of("fixed points"), images=8, points=20, noise_px=NOISE_PX, free=())
+    rows = np.arange(6)
+    covariance = np.tile(1e-6 * np.eye(3), (6, 1, 1))
+    covariance[:fixed] = 0.0
+    control = ObjectPoints(rows, truth.points[rows], covariance)
+    result = result_of(
+        adjust(replace(network, control=control), truth, datum=Datum("control"), reject="none")
+    )
+    a = result.adjustment
+    sigma = np.sqrt(np.einsum("nii->ni", a.covariance.points[fixed:]))
+    rms = point_precision(a)[0]
+    np.testing.assert_allclose(rms[:3], np.sqrt((sigma**2).mean(axis=0)), rtol=1e-12)
+    assert rms[3] == pytest.approx(float(np.sqrt((sigma**2).mean())))
+    words = {
+        0: "",
+        1: "without the fixed coordinates of 1 point",
+        4: "without the fixed coordinates of 4 points",
+    }
+    assert without_fixed(a) == words[fixed]
+    assert ("without the fixed" in text_report(result)) == (fixed > 0)
+    assert ("without the fixed" in render_html(result, (), ())) == (fixed > 0)
+
+
+def test_precision_where_everything_is_fixed_is_not_known() -> None:
+    network, truth = make_network(seed_of("all fixed"), images=4, points=12, noise_px=NOISE_PX, free=())
+    control = ObjectPoints(np.arange(12), truth.points, np.zeros((12, 3, 3)))
+    a = adjust(replace(network, control=control), truth, datum=Datum("control"), reject="none")
+    assert np.isnan(point_precision(a)).all()
+    assert "not known" in text_report(result_of(a)) and "not known" in render_html(result_of(a), (), ())
 
 
 def test_a_point_that_lost_most_of_its_rays_is_named(synthetic: tuple[Network, Estimate]) -> None:

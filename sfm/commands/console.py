@@ -13,9 +13,9 @@ from rich.text import Text
 
 from sfm.report.checks import count_observations, sigma0_ratio
 from sfm.report.markup import finer_unit, significant
+from sfm.report.precision import point_precision
 from sfm.report.result import SurveyResult
 from sfm.report.statistics import statistics_of, words_of_test
-from sfm.report.tables import point_sigmas, root_mean_square
 from sfm.report.verdict import verdict_of
 
 MAX_WARNINGS = 5  # without --verbose
@@ -109,8 +109,7 @@ def _figures(result: SurveyResult) -> tuple[tuple[str, str], ...]:
     a = result.adjustment
     coded = int((result.code >= 0).sum())
     rejected = int(a.rejected.sum())
-    sigma = point_sigmas(a)
-    typical, largest = root_mean_square(sigma), float(sigma.max())
+    typical, largest = (float(value) for value in point_precision(a)[:2, 3])
     factor, unit = finer_unit(result.length_unit, largest)
     rows = [
         ("photographs", f"{len(a.network.images)} of {result.images_total} oriented"),

@@ -12,13 +12,13 @@ from sfm.report.checks import object_size, sigma0_ratio
 from sfm.report.markup import figure, finer_unit, significant
 from sfm.report.overlays import Overlay
 from sfm.report.pages import page
+from sfm.report.precision import point_precision, without_fixed
 from sfm.report.result import SurveyResult
 from sfm.report.section_baseline import baseline_section
 from sfm.report.section_comparison import comparison_section
 from sfm.report.section_quality import quality_section
 from sfm.report.section_rejected import rejected_section
 from sfm.report.sections import coordinates_section, photographs_section, process_section, worked_section
-from sfm.report.tables import point_sigmas, root_mean_square
 from sfm.report.verdict import verdict_of
 
 
@@ -69,9 +69,9 @@ def render_html(
 def _tiles(result: SurveyResult) -> list[tuple[str, str, str]]:
     """Return the figures that are asked for first."""
     a = result.adjustment
-    sigma = point_sigmas(a)
     size = object_size(a.estimate.points)
-    typical = root_mean_square(sigma)
+    typical = float(point_precision(a)[0, 3])
+    fixed = without_fixed(a)
     factor, unit = finer_unit(result.length_unit, typical)
     tiles = [
         ("Photographs oriented", f"{len(a.network.images)} of {result.images_total}", ""),
@@ -79,7 +79,9 @@ def _tiles(result: SurveyResult) -> list[tuple[str, str, str]]:
         (
             "Precision of a point",
             f"{significant(typical * factor)} {unit}",
-            f"RMS of sX, sY, sZ; 1 : {size / typical:,.0f} of the object" if typical > 0 else "",
+            f"RMS of sX, sY, sZ{f' {fixed}' if fixed else ''}; 1 : {size / typical:,.0f} of the object"
+            if typical > 0
+            else "",
         ),
         ("RMS residual", f"{a.rms_px:.4f} px", "per image coordinate"),
         (

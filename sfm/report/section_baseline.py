@@ -6,15 +6,15 @@ from html import escape
 
 from sfm.analysis.baseline import BaselineComparison
 from sfm.report.markup import finer_unit, significant, table
+from sfm.report.precision import point_precision
 from sfm.report.result import SurveyResult
-from sfm.report.tables import point_sigmas, root_mean_square
 
 
 def baseline_section(result: SurveyResult, found: BaselineComparison) -> str:
     """Both surveys side by side, then how far they are apart."""
     name = found.name
     factor, unit = finer_unit(result.length_unit, found.point_rms)
-    sigma = factor * root_mean_square(point_sigmas(result.adjustment))
+    sigma = factor * point_precision(result.adjustment)[0, 3]
     apart = factor * found.point_rms
     text = (
         f"<p>{escape(name)} oriented {found.photographs[1]} of {found.total} photographs from their natural "

@@ -8,8 +8,8 @@ import numpy as np
 
 from sfm.analysis.comparison import AdjusterComparison
 from sfm.report.markup import finer_unit, significant, table, yes_or_no
+from sfm.report.precision import root_mean_square
 from sfm.report.result import SurveyResult
-from sfm.report.tables import root_mean_square
 
 
 def comparison_section(result: SurveyResult) -> str:

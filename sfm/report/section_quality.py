@@ -6,46 +6,41 @@ from html import escape
 
 import numpy as np
 
-from sfm.report.markup import finer_unit, raised, significant, table, with_exponent
+from sfm.report.checks import interior_residuals
+from sfm.report.markup import finer_unit, raised, signed, significant, table, with_exponent
 from sfm.report.observed_exterior import exterior_section
+from sfm.report.precision import point_precision, without_fixed
 from sfm.report.result import SurveyResult
 from sfm.report.section_statistics import camera_notes, components, control, image_coordinates, worst
 from sfm.report.statistics import InteriorParameter, families, interior_parameters
-from sfm.report.tables import point_sigmas, root_mean_square
 
 
 def quality_section(result: SurveyResult, pictures: dict[str, str]) -> str:
     """How good is it: precision of points, check at control, image coordinates, cameras."""
     a = result.adjustment
-    sigma = point_sigmas(a)
-    limiting = np.sqrt(np.einsum("nii->ni", a.covariance.points_limiting))
-    factor, unit = finer_unit(result.length_unit, float(np.nanmax(sigma)))
+    precision = point_precision(a)
+    factor, unit = finer_unit(result.length_unit, float(precision[1, 3]))
+    fixed = f", {without_fixed(a)}" if without_fixed(a) else ""
     text = "<h3>Object points</h3>"
     text += table(
         (f"standard deviation [{unit}]", "X", "Y", "Z", "all"),
         [
-            (name, *(significant(value * factor) for value in (*columns, over_all)))
-            for name, columns, over_all in (
-                ("RMS", np.sqrt(np.nanmean(sigma**2, axis=0)), root_mean_square(sigma)),
-                ("largest", np.nanmax(sigma, axis=0), np.nanmax(sigma)),
-                (
-                    "RMS if the cameras were free of error",
-                    np.sqrt(np.nanmean(limiting**2, axis=0)),
-                    root_mean_square(limiting),
-                ),
+            (name, *(significant(value * factor) for value in row))
+            for name, row in zip(
+                ("RMS", "largest", "RMS if the cameras were free of error"), precision, strict=True
             )
         ],
     )
     text += (
         "<p class=note>Standard deviations are a posteriori and in the datum of the adjustment "
-        f"({escape(a.datum)}); in a free network they say how the points lie to one another, not in an outer "
-        "frame.</p>"
+        f"({escape(a.datum)}){fixed}; in a free network they say how the points lie to one another, not in "
+        "an outer frame.</p>"
     )
     text += control(result) + exterior_section(result)
     text += image_coordinates(result)
     text += pictures.get("distribution", "") + pictures.get("residuals", "") + worst(result)
     text += "<h3>Cameras</h3>"
-    text += _cameras(result)
+    text += _cameras(result) + _observed_interior(result)
     text += camera_notes(result)
     text += "<h3>Photographs</h3>" + pictures.get("photographs", "")
     return text + components(result)
@@ -79,6 +74,26 @@ def _cameras(result: SurveyResult) -> str:
         header = ("of", "parameter", "value", "sigma", "unit", "value / sigma")
         text += table(header, [_row(one) for one in single]) + "</details>"
     return text
+
+
+def _observed_interior(result: SurveyResult) -> str:
+    """Interior orientation that was observed, as by a calibration certificate: by how much it differs."""
+    found = interior_residuals(result.adjustment)
+    if found is None:
+        return ""
+    rows = []
+    for q, name in enumerate(found.names):
+        given, sigma = with_exponent(found.given[q], found.sigma[q])
+        adjusted, _ = with_exponent(found.given[q] + found.difference[q], found.sigma[q])
+        w = f"{found.ratio[q]:+.2f}" if np.isfinite(found.ratio[q]) else "no check"
+        rows.append((name, adjusted, given, sigma, signed(found.difference[q]), raised(found.units[q]), w))
+    header = ("parameter", "adjusted", "observed", "its sigma", "adjusted minus observed", "unit", "w")
+    return (
+        "<h4>Observed interior orientation</h4>"
+        + table(header, rows)
+        + "<p class=note>w: the difference over its own standard deviation; by chance 1 of 1000 is beyond "
+        "3.3.</p>"
+    )
 
 
 def _row(one: InteriorParameter) -> tuple[str, ...]:

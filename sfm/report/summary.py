@@ -21,6 +21,7 @@ from sfm.report.checks import (
     sigma0_ratio,
 )
 from sfm.report.observed_exterior import exterior_summary
+from sfm.report.precision import root_mean_square
 from sfm.report.result import SurveyResult
 from sfm.report.statistics import (
     parameter_sigmas,
@@ -29,7 +30,7 @@ from sfm.report.statistics import (
     words_of_test,
     words_of_weights,
 )
-from sfm.report.tables import UNCODED, root_mean_square
+from sfm.report.tables import UNCODED
 from sfm.report.verdict import verdict_of
 
 

@@ -161,11 +161,6 @@ def image_rms(adjustment: Adjustment) -> tuple[FloatArray, FloatArray]:
     return rms, count
 
 
-def root_mean_square(values: FloatArray) -> float:
-    """Return the root mean square of the values that are known."""
-    return float(np.sqrt(np.nanmean(values**2)))
-
-
 def write_ply(path: Path, result: SurveyResult) -> None:
     """Write the object points as a PLY point cloud in text form: coded green, uncoded grey.
 

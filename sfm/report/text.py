@@ -10,7 +10,6 @@ import numpy as np
 
 from sfm.adjustment.statistics import STRONG
 from sfm.adjustment.variance_components import VarianceComponents
-from sfm.conventions import FloatArray
 from sfm.report.checks import (
     bar_residuals,
     control_residuals,
@@ -21,6 +20,7 @@ from sfm.report.checks import (
 )
 from sfm.report.markup import finer_unit, significant, with_exponent
 from sfm.report.observed_exterior import exterior_text
+from sfm.report.precision import adjusted_sigmas, point_precision, root_mean_squares, without_fixed
 from sfm.report.result import SurveyResult
 from sfm.report.statistics import (
     Statistics,
@@ -31,12 +31,8 @@ from sfm.report.statistics import (
     words_of_test,
     words_of_weights,
 )
-from sfm.report.tables import image_rms, point_sigmas, root_mean_square
-from sfm.report.text_lines import MOST_ROWS, WIDTH
-from sfm.report.text_lines import columns as _table
-from sfm.report.text_lines import head as _head
-from sfm.report.text_lines import line as _line
-from sfm.report.text_lines import wrapped as _wrapped
+from sfm.report.tables import image_rms
+from sfm.report.text_lines import MOST_ROWS, WIDTH, columns, head, line, wrapped
 from sfm.report.verdict import verdict_of
 
 WORST = 5
@@ -52,7 +48,7 @@ def text_report(result: SurveyResult) -> str:
     verdict = verdict_of(result)
     lines = [f"KOLINEAR  {result.survey}"[:WIDTH], "=" * WIDTH, verdict.headline]
     for remark in verdict.remarks:
-        lines += _wrapped(f"- {remark}")
+        lines += wrapped(f"- {remark}")
     for part in (
         _adjustment(result),
         _sigma0(result, statistics),
@@ -71,7 +67,7 @@ def text_report(result: SurveyResult) -> str:
         "Residuals: computed minus measured. Pixel (0, 0): centre of the top-left pixel.",
         "Tables (.csv): points, images, cameras, image_points, reliability, variance_components.",
     ]
-    return "\n".join(line.rstrip() for line in lines) + "\n"
+    return "\n".join(one.rstrip() for one in lines) + "\n"
 
 
 def _adjustment(result: SurveyResult) -> list[str]:
@@ -95,44 +91,44 @@ def _adjustment(result: SurveyResult) -> list[str]:
     )
     rank = "as expected" if a.defect == a.expected_defect else f"expected {a.expected_defect}"
     lines = [
-        *_head("Network and rank"),
-        _line("photographs", f"{len(network.images)} of {result.images_total}"),
-        _line("object points", f"{len(network.points)}"),
-        _line("image points", f"{int((~a.rejected).sum())} accepted, {int(a.rejected.sum())} rejected"),
-        _line("adjustment", f"{'converged' if a.converged else 'NOT converged'}, {a.steps}"),
-        _line("datum", f"{datum_in_words(a)}; rank defect {a.defect}, {rank}"),
-        _line("observations", f"{a.observations} ({', '.join(observed)})"),
-        _line("unknowns", f"{a.unknowns} ({unknowns})"),
-        _line("constraints", f"{counts.constraints}"),
-        _line("redundancy", f"{a.redundancy}"),
+        *head("Network and rank"),
+        line("photographs", f"{len(network.images)} of {result.images_total}"),
+        line("object points", f"{len(network.points)}"),
+        line("image points", f"{int((~a.rejected).sum())} accepted, {int(a.rejected.sum())} rejected"),
+        line("adjustment", f"{'converged' if a.converged else 'NOT converged'}, {a.steps}"),
+        line("datum", f"{datum_in_words(a)}; rank defect {a.defect}, {rank}"),
+        line("observations", f"{a.observations} ({', '.join(observed)})"),
+        line("unknowns", f"{a.unknowns} ({unknowns})"),
+        line("constraints", f"{counts.constraints}"),
+        line("redundancy", f"{a.redundancy}"),
     ]
     for words in a.undetermined:
-        lines += _wrapped(f"  NOT DETERMINED: {words}")
+        lines += wrapped(f"  NOT DETERMINED: {words}")
     return lines
 
 
 def _sigma0(result: SurveyResult, statistics: Statistics) -> list[str]:
     a = result.adjustment
     lines = [
-        *_head("Sigma0 and global test"),
-        _line("sigma0", f"{a.sigma0_px:.5f} px"),
-        _line("a priori", f"{a.a_priori_px / result.weight_factor:.5f} px, of which the image points show "
+        *head("Sigma0 and global test"),
+        line("sigma0", f"{a.sigma0_px:.5f} px"),
+        line("a priori", f"{a.a_priori_px / result.weight_factor:.5f} px, of which the image points show "
               f"{sigma0_ratio(result):.3f} times"),
-        _line("residuals", f"RMS {a.rms_px:.5f} px per coordinate, longest {a.max_residual_px:.4f} px"),
+        line("residuals", f"RMS {a.rms_px:.5f} px per coordinate, longest {a.max_residual_px:.4f} px"),
     ]  # fmt: skip
     for test in statistics.global_tests:
-        lines += _wrapped(f"  global test, {words_of_test(test)}")
+        lines += wrapped(f"  global test, {words_of_test(test)}")
     words = words_of_weights(result)
-    return lines + _wrapped(f"  {words}") if words else lines
+    return lines + wrapped(f"  {words}") if words else lines
 
 
 def _single_tests(result: SurveyResult, statistics: Statistics) -> list[str]:
     r = result.adjustment.redundancy_numbers
-    lines = _head("Tests and reliability of image coordinates")
+    lines = head("Tests and reliability of image coordinates")
     if not np.isfinite(r).any():
-        return [*lines, _line("", "not known, the adjustment has no covariance")]
+        return [*lines, line("", "not known, the adjustment has no covariance")]
     lines += [
-        _line(
+        line(
             "redundancy numbers",
             f"sum {np.nansum(r):.1f}, of all observations {statistics.redundancy_sum:.1f}; mean "
             f"{np.nanmean(r):.3f}, smallest {np.nanmin(r):.3f}",
@@ -140,7 +136,7 @@ def _single_tests(result: SurveyResult, statistics: Statistics) -> list[str]:
     ]
     for name, test in (("w test (Baarda)", statistics.w), ("tau test (Pope)", statistics.tau)):
         lines.append(
-            _line(
+            line(
                 name,
                 f"{test.beyond} of {test.tested} beyond {test.critical:.2f}, by chance {test.expected:.1f} "
                 f"({100 * test.alpha:.1f} %); largest {np.nanmax(np.abs(test.statistic)):.2f}",
@@ -150,12 +146,12 @@ def _single_tests(result: SurveyResult, statistics: Statistics) -> list[str]:
     bias, external = quantiles(found.minimal_bias), quantiles(found.external)
     return [
         *lines,
-        _line(
+        line(
             "minimal bias",
             f"median {significant(bias[0])} px, largest {_or_none(bias[1])} px: gross error found with "
             f"{100 * statistics.power:.0f} %",
         ),
-        _line(
+        line(
             "external reliability",
             f"median {significant(external[0])}, largest {_or_none(external[1])} sigmas of an unknown: "
             "what it does if not found",
@@ -164,13 +160,13 @@ def _single_tests(result: SurveyResult, statistics: Statistics) -> list[str]:
 
 
 def _components(result: SurveyResult, statistics: Statistics) -> list[str]:
-    lines = _head("Variance components: sigma0 of groups, a posteriori over that stated")
+    lines = head("Variance components: sigma0 of groups, a posteriori over that stated")
     rows = _component_rows("kind", statistics.kinds)
     rows += _component_rows("camera", statistics.cameras) if len(statistics.cameras.names) > 1 else []
     photographs = _component_rows("photograph", statistics.photographs)
     order = np.argsort(-np.nan_to_num(statistics.photographs.sigma0), kind="stable")
     shown = [photographs[k] for k in order[:WORST]]
-    lines += _table(("", "group", "sigma0", "redundancy", "observations"), rows + shown, left=2)
+    lines += columns(("", "group", "sigma0", "redundancy", "observations"), rows + shown, left=2)
     if len(photographs) > WORST:
         lines.append(f"  the {WORST} worst of {len(photographs)} photographs; all in variance_components.csv")
     return lines
@@ -195,17 +191,17 @@ def _interior(result: SurveyResult, statistics: Statistics) -> list[str]:
             (one.owner, one.name, value, sigma, "" if one.unit == "1" else one.unit,
              f"{ratio:.1f}" if np.isfinite(ratio) else "")
         )  # fmt: skip
-    lines = _head(f"Interior orientation (model {models})")
-    lines += _table(("camera", "", "value", "sigma", "unit", "value/sigma"), rows, left=2)
+    lines = head(f"Interior orientation (model {models})")
+    lines += columns(("camera", "", "value", "sigma", "unit", "value/sigma"), rows, left=2)
     if len(parameters) > len(rows):
         lines.append(f"  and {len(parameters) - len(rows)} more, in cameras.csv")
     weak = [f"{t.parameter} of {t.camera} (p {t.probability:.2f})" for t in statistics.significance
             if not t.significant]  # fmt: skip
-    lines += _wrapped(f"  not significant (t test, 5 %): {', '.join(weak) or 'none'}")
+    lines += wrapped(f"  not significant (t test, 5 %): {', '.join(weak) or 'none'}")
     pairs = [f"{pair.first} - {pair.second} {100 * pair.value:+.1f} %" for pair in statistics.correlations]
     over = f"{100 * STRONG:.0f} %"
     lines.append(f"  correlations over {over}: {len(pairs) or 'none'}")
-    lines += [line for pair in pairs[:MOST_ROWS] for line in _wrapped(f"    {pair}")]
+    lines += [part for pair in pairs[:MOST_ROWS] for part in wrapped(f"    {pair}")]
     if len(pairs) > MOST_ROWS:
         lines.append(f"    and {len(pairs) - MOST_ROWS} more, in summary.json")
     return lines
@@ -213,36 +209,29 @@ def _interior(result: SurveyResult, statistics: Statistics) -> list[str]:
 
 def _points(result: SurveyResult) -> list[str]:
     a = result.adjustment
-    sigma = point_sigmas(a)
-    limiting = np.sqrt(np.maximum(np.einsum("nii->ni", a.covariance.points_limiting), 0))
-    factor, unit = finer_unit(result.length_unit, float(np.nanmax(sigma, initial=0.0)))
+    precision = point_precision(a)
+    factor, unit = finer_unit(result.length_unit, float(precision[1, 3]))
+    names = (
+        "object points, RMS sigma",
+        "object points, largest sigma",
+        "limiting (cameras without error), RMS",
+    )
     rows = [
-        (name, *(significant(v * factor) for v in (*columns, over_all)), unit)
-        for name, columns, over_all in (
-            ("object points, RMS sigma", np.sqrt(np.nanmean(sigma**2, axis=0)), root_mean_square(sigma)),
-            ("object points, largest sigma", np.nanmax(sigma, axis=0), np.nanmax(sigma)),
-            (
-                "limiting (cameras without error), RMS",
-                np.sqrt(np.nanmean(limiting**2, axis=0)),
-                root_mean_square(limiting),
-            ),
-        )
+        (name, *(significant(v * factor) for v in row), unit)
+        for name, row in zip(names, precision, strict=True)
     ]
-    exterior = np.sqrt(np.einsum("nii->ni", a.covariance.exterior))
-    rows.append(
-        ("projection centres, RMS sigma", *(significant(v * factor) for v in _rms(exterior[:, :3])),
-         significant(root_mean_square(exterior[:, :3]) * factor), unit)
-    )  # fmt: skip
-    angles = np.degrees(exterior[:, 3:]) * 3600
-    rows.append(
-        ("omega, phi, kappa, RMS sigma", *(significant(v) for v in _rms(angles)),
-         significant(root_mean_square(angles)), 'arc seconds')
-    )  # fmt: skip
+    exterior = adjusted_sigmas(a.covariance.exterior)
+    centres, angles = exterior[:, :3] * factor, np.degrees(exterior[:, 3:]) * 3600
+    rows += [
+        ("projection centres, RMS sigma", *(significant(v) for v in root_mean_squares(centres)), unit),
+        ("omega, phi, kappa, RMS sigma", *(significant(v) for v in root_mean_squares(angles)), "arc seconds"),
+    ]
     rms, _ = image_rms(a)
     worst = int(np.nanargmax(rms))
     return [
-        *_head("Precision of the unknowns"),
-        *_table(("", "X", "Y", "Z", "all", "unit"), rows, left=1),
+        *head("Precision of the unknowns"),
+        *columns(("", "X", "Y", "Z", "all", "unit"), rows, left=1),
+        *([f"  RMS {without_fixed(a)}"] if without_fixed(a) else []),
         f"  worst photograph: {a.network.images[worst]}, RMS residual {rms[worst]:.4f} px",
     ]
 
@@ -257,19 +246,19 @@ def _given(result: SurveyResult) -> list[str]:
     if check is not None:
         factor, finer = finer_unit(unit, float(np.abs(check.differences).max()))
         rms = ", ".join(significant(v * factor) for v in check.rms)
-        lines.append(_line("check at control", f"RMS {rms} {finer} in X, Y, Z at {len(check.points)} points"))
+        lines.append(line("check at control", f"RMS {rms} {finer} in X, Y, Z at {len(check.points)} points"))
     if control is not None and np.isfinite(control.ratio).any():
         size = np.nanmax(np.abs(control.ratio), axis=1, initial=0.0)
         worst = int(np.argmax(size))
         lines.append(
-            _line("control", f"largest residual {size[worst]:.2f} sigma at {control.points[worst]} of "
+            line("control", f"largest residual {size[worst]:.2f} sigma at {control.points[worst]} of "
                   f"{len(control.points)} points")
         )  # fmt: skip
     if bars is not None:
         for b in range(min(len(bars.names), MOST_ROWS)):
             factor, finer = finer_unit(unit, float(np.abs(bars.difference[b])))
             lines.append(
-                _line(
+                line(
                     "scale bar",
                     f"{bars.names[b][0]} - {bars.names[b][1]}: {bars.length[b]:.9g} {unit}, adjusted minus "
                     f"given {significant(bars.difference[b] * factor)} {finer} ({bars.ratio[b]:+.2f} sigma)",
@@ -283,7 +272,7 @@ def _given(result: SurveyResult) -> list[str]:
             unit = "" if interior.units[q] == "1" else f" {interior.units[q]}"
             given, sigma = with_exponent(interior.given[q], interior.sigma[q])
             lines.append(
-                _line(
+                line(
                     "weighted interior",
                     f"{interior.names[q]}: given {given} +- {sigma}{unit}, adjusted minus given "
                     f"{significant(interior.difference[q])}{unit} (w {interior.ratio[q]:+.2f})",
@@ -291,7 +280,7 @@ def _given(result: SurveyResult) -> list[str]:
             )
         if len(interior.names) > MOST_ROWS:
             lines.append(f"  and {len(interior.names) - MOST_ROWS} more, in summary.json")
-    return _head("Control, scale and given interior orientation") + lines if lines else []
+    return head("Control, scale and given interior orientation") + lines if lines else []
 
 
 def _worst(result: SurveyResult) -> list[str]:
@@ -305,13 +294,9 @@ def _worst(result: SurveyResult) -> list[str]:
          f"{w:+.2f}", f"{tau:+.2f}")
         for k, v, w, tau in zip(found.row, found.v, found.w, found.tau, strict=True)
     ]  # fmt: skip
-    return _head(f"The {len(rows)} largest standardised residuals among the accepted") + _table(
+    return head(f"The {len(rows)} largest standardised residuals among the accepted") + columns(
         ("photograph", "point", "vx [px]", "vy [px]", "w", "tau"), rows, left=2
     )
-
-
-def _rms(values: FloatArray) -> FloatArray:
-    return np.asarray(np.sqrt(np.nanmean(values**2, axis=0)))
 
 
 def _or_none(value: float) -> str:
