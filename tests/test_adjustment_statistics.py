@@ -180,7 +180,9 @@ def test_kinds_of_observation_share_the_redundancy() -> None:
         Q = m.joint(np.zeros(0, dtype=int), np.array([i, j])) / a.sigma0**2
         d = a.estimate.points[j] - a.estimate.points[i]
         row = np.concatenate([-d, d]) / np.linalg.norm(d)
-        taken += row @ Q @ row / 1e-8
+        own = row @ Q @ row / 1e-8
+        assert a.bar_redundancy[list(ends[0]).index(i)] == pytest.approx(1 - own, abs=1e-4)
+        taken += own
     assert kinds.redundancy[4] == pytest.approx(3 - taken, abs=1e-3)
 
 

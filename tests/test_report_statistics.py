@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy import stats
 
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.result import Adjustment
@@ -20,14 +21,8 @@ from sfm.adjustment.variance_components import by_kind
 from sfm.analysis.comparison import AdjusterComparison, BackendAdjustment, compare_adjusters
 from sfm.camera import Camera
 from sfm.network import Estimate, InteriorObservations, Network, ObjectPoints, ScaleBars
-from sfm.report.checks import (
-    bar_residuals,
-    control_residuals,
-    count_observations,
-    interior_residuals,
-    longest_residual,
-    worst_residuals,
-)
+from sfm.report.checks import count_observations, longest_residual, worst_residuals
+from sfm.report.given import bar_residuals, control_residuals, interior_residuals
 from sfm.report.html import render_html
 from sfm.report.markup import signed
 from sfm.report.plots import all_plots, plan_axes
@@ -128,22 +123,23 @@ def test_a_false_calibration_certificate_is_noticed(sigmas: float, level: str) -
     result = result_of(
         adjust(replace(network, interior=certificate), truth, datum=Datum("free"), reject="none")
     )
-    found = interior_residuals(result.adjustment)
+    found = interior_residuals(result)
     assert found is not None and found.names == (f"c of camera {camera.name}",)
     v = -sigmas * sigma  # of the parameter, if the photographs had no error
     own = adjust(network, truth, datum=Datum("free"), reject="none")
     q = own.covariance.interior[0][0, 0] / own.sigma0**2
     expected = v / np.sqrt(sigma**2 + q)  # independent: misclosure over its standard deviation
-    assert found.ratio[0] == pytest.approx(expected, abs=4, rel=0.05)
+    assert found.w[0, 0] == pytest.approx(expected, abs=4, rel=0.05)
+    assert found.r[0, 0] == pytest.approx(sigma**2 / (sigma**2 + q), rel=0.1)  # as c moves
     verdict = verdict_of(result)
     assert verdict.level == level, verdict
     assert any("The given c of camera" in line for line in verdict.remarks) == (level != "good")
-    assert "weighted interior" in text_report(result)
+    assert re.search(f"interior  c of camera {camera.name} .* mm ", text_report(result))
     page = render_html(result, (), ())
     table = page[page.index("<h4>Observed interior orientation</h4>") :].split("</table>")[0]
-    assert f"c of camera {camera.name}" in table and f"{found.ratio[0]:+.2f}" in table
-    assert signed(float(found.difference[0])) in table
-    assert summary(result)["weighted_interior"][0]["w"] == pytest.approx(found.ratio[0])
+    assert f"c of camera {camera.name}" in table and f"{found.w[0, 0]:+.2f}" in table
+    assert signed(float(found.difference[0, 0])) in table and f"{found.r[0, 0]:.3f}" in table
+    assert summary(result)["weighted_interior"][0]["w"] == pytest.approx(found.w[0, 0])
 
 
 @pytest.mark.parametrize("fixed", [0, 1, 4])
@@ -264,10 +260,10 @@ def test_each_kind_is_tested_against_what_was_stated_in_the_same_words_everywher
 
 def test_bars_that_are_all_a_little_too_bad_are_noticed(synthetic: tuple[Network, Estimate]) -> None:
     network, truth = synthetic
-    errors = 4e-4 * np.array([1, -1, 1, -1, 1, -1])
+    errors = 3e-4 * np.array([1, -1, 1, -1, 1, -1])
     a = adjust(with_bars(network, truth, tuple(errors), 1e-4), truth, datum=Datum("free"))
-    bars = bar_residuals(a)
-    assert bars is not None and np.abs(bars.ratio).max() < 5
+    bars = bar_residuals(result_of(a))
+    assert bars is not None and np.abs(bars.w).max() < 5
     verdict = verdict_of(result_of(a))
     assert verdict.level == "fair" and len(verdict.remarks) == 1
     assert verdict.remarks[0].startswith("The residuals of the scale bars are"), verdict.remarks
@@ -317,17 +313,20 @@ def test_residuals_of_control_and_bars_are_adjusted_minus_given(
     network, truth = synthetic
     known = with_bars(with_control(network, truth.points[:6] + 2e-4, 1e-3), truth, (1e-4, -1e-4), 1e-4)
     a = adjust(known, truth, datum=Datum("control"))
-    control, bars = control_residuals(a), bar_residuals(a)
+    control, bars = control_residuals(result_of(a)), bar_residuals(result_of(a))
     assert control is not None and bars is not None
     np.testing.assert_allclose(control.difference, a.estimate.points[:6] - truth.points[:6] - 2e-4)
-    np.testing.assert_allclose(control.ratio, control.difference / 1e-3)
+    np.testing.assert_allclose(control.w, control.difference / (1e-3 * np.sqrt(control.r)))
+    np.testing.assert_allclose(bars.w, bars.difference / (1e-4 * np.sqrt(bars.r)))
     adjusted = np.linalg.norm(a.estimate.points[[10, 11]] - a.estimate.points[[0, 1]], axis=1)
-    np.testing.assert_allclose(bars.difference, adjusted - known.scale_bars.length, atol=1e-15)
+    np.testing.assert_allclose(bars.difference[:, 0], adjusted - known.scale_bars.length, atol=1e-15)
     text = summary(result_of(a))
     assert text["control"]["role"] == "datum"
-    assert text["control"]["points"][0]["ratio"] == pytest.approx(control.ratio[0].tolist())
+    assert text["control"]["points"][0]["w"] == pytest.approx(control.w[0].tolist())
+    assert text["control"]["points"][0]["r"] == pytest.approx(control.r[0].tolist())
     assert text["scale_bars"][1]["from"] == "2" and text["scale_bars"][1]["to"] == "12"
-    assert text["scale_bars"][1]["ratio"] == pytest.approx(bars.ratio[1])
+    assert text["scale_bars"][1]["w"] == pytest.approx(bars.w[1, 0])
+    assert text["scale_bars"][1]["r"] == pytest.approx(bars.r[1, 0])
     page = render_html(result_of(a), (), ())
     assert "<h3>Control</h3>" in page and "<h3>Scale bars</h3>" in page and "2 - 12" in page
     counts = count_observations(a)
@@ -335,11 +334,70 @@ def test_residuals_of_control_and_bars_are_adjusted_minus_given(
     assert counts.image + counts.control + counts.scale_bars == counts.total == a.observations
 
 
+def test_w_of_given_values_is_standard_normal() -> None:
+    """Control with correlated coordinates and scale bars, as good as the photographs find the points."""
+    network, truth = make_network(seed_of("given"), images=6, points=12, noise_px=0.0, free=())
+    rng, k = seed_of("noise of the given"), network.image_points
+    factor = 3e-4 * np.array([[1.0, 0, 0], [0.7, 0.7, 0], [0.2, -0.3, 0.9]])
+    start, end = np.arange(4), np.arange(4) + 6
+    length, w, r, plain = np.linalg.norm(truth.points[end] - truth.points[start], axis=1), [], [], []
+    for _ in range(60):
+        xyz = truth.points[:5] + rng.standard_normal((5, 3)) @ factor.T
+        one = replace(
+            network,
+            image_points=replace(k, xy=k.xy + rng.normal(0, 0.1, k.xy.shape)),
+            control=ObjectPoints(np.arange(5), xyz, np.tile(factor @ factor.T, (5, 1, 1))),
+            scale_bars=ScaleBars(start, end, length + rng.normal(0, 3e-4, 4), np.full(4, 3e-4)),
+        )
+        result = result_of(adjust(one, truth, datum=Datum("control"), reject="none"))
+        control, bars = control_residuals(result), bar_residuals(result)
+        assert control is not None and bars is not None
+        w.append(np.concatenate([control.w.ravel(), bars.w.ravel()]))
+        r.append(np.concatenate([control.r.ravel(), bars.r.ravel()]))
+        plain.append((bars.difference / bars.sigma).ravel())
+    assert 0.1 < np.mean(r) < 0.9  # some are well checked, some are not
+    for part in (np.array(w)[:, :15], np.array(w)[:, 15:]):
+        assert stats.kstest(part.ravel(), "norm").pvalue > 0.01
+    assert np.std(plain) < 0.9
+
+
+def test_what_is_met_exactly_is_not_checked(synthetic: tuple[Network, Estimate], tmp_path: Path) -> None:
+    network, truth = synthetic
+    single = result_of(adjust(with_bars(network, truth, (0.3,), 1e-4), truth, datum=Datum("free")))
+    bars = bar_residuals(single)
+    assert bars is not None and np.isnan(bars.w).all() and bars.r[0, 0] < 1e-6
+    assert verdict_of(single).level == "good"
+    assert re.search(r"scale bar  1 - 11 .* m  0\.000  not checked", text_report(single))
+    assert summary(single)["scale_bars"][0]["w"] is None
+    assert "<td>not checked" in render_html(single, (), ())
+    write_tables(single, tmp_path)
+    with (tmp_path / "given.csv").open(encoding="utf-8") as file:
+        (row,) = csv.DictReader(file)
+    assert row["kind"] == "scale bar" and row["name"] == "1 - 11" and row["w"] == ""
+    assert float(row["given"]) == bars.given[0, 0] and row["unit"] == "m"
+
+
+def test_every_given_value_stands_in_its_table(synthetic: tuple[Network, Estimate], tmp_path: Path) -> None:
+    network, truth = synthetic
+    known = with_bars(with_control(network, truth.points[:6] + 2e-4, 1e-3), truth, (1e-4, -1e-4), 1e-4)
+    result = result_of(adjust(known, truth, datum=Datum("control")))
+    control = control_residuals(result)
+    assert control is not None
+    write_tables(result, tmp_path)
+    with (tmp_path / "given.csv").open(encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    assert [row["kind"] for row in rows] == ["control point"] * 18 + ["scale bar"] * 2
+    assert [row["coordinate"] for row in rows[:3]] == ["X", "Y", "Z"]
+    for column, values in (("w", control.w), ("r", control.r), ("difference", control.difference)):
+        assert [float(row[column]) for row in rows[:18]] == values.ravel().tolist()
+
+
 def test_fixed_control_has_no_ratio(synthetic: tuple[Network, Estimate]) -> None:
     network, truth = synthetic
     a = adjust(with_control(network, truth.points[:6], 0.0), truth, datum=Datum("control"))
     text = summary(result_of(a))
-    assert text["control"]["points"][0]["ratio"] == [None, None, None]
+    assert text["control"]["points"][0]["w"] == [None, None, None]
+    assert "6 points without standard deviation: not checked" in text_report(result_of(a))
     assert count_observations(a).control == 0
     assert "fixed" in render_html(result_of(a), (), ())
 

@@ -13,6 +13,9 @@ from __future__ import annotations
 import numpy as np
 from scipy import stats
 
+from sfm.adjustment.collinearity import State
+from sfm.adjustment.parameters import Unknowns
+from sfm.adjustment.weighted import Weighted, bar_rows
 from sfm.conventions import FloatArray
 
 
@@ -48,6 +51,39 @@ def standardised_residuals(
 
 
 UNCONTROLLED = 1e-6  # redundancy number below which an observation has no check
+
+
+def standardised_of_given(
+    difference: FloatArray, weight: FloatArray, cofactor: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return Baarda's w for sigma0 = 1, and the redundancy number, of unknowns that were observed, (n, d).
+
+    w is NaN where the observation has no check, both are where a component was not observed.
+
+    Args:
+        difference: v, adjusted minus given, shape (n, d).
+        weight: P, inverse covariance of what was given, 0 where it was not, shape (n, d, d).
+        cofactor: Q of the adjusted unknowns, shape (n, d, d).
+    """
+    PQP = np.diagonal(weight - weight @ cofactor @ weight, axis1=1, axis2=2)
+    P = np.diagonal(weight, axis1=1, axis2=2)
+    r = np.where(P > 0, 1 - np.diagonal(cofactor @ weight, axis1=1, axis2=2), np.nan)
+    Pv = np.einsum("nab,nb->na", weight, difference)
+    checked = PQP > UNCONTROLLED * P
+    return np.where(checked, Pv / np.sqrt(np.where(checked, PQP, 1.0)), np.nan), np.clip(r, 0.0, 1.0)
+
+
+def redundancy_of_bars(
+    weighted: Weighted, layout: Unknowns, state: State, cofactor: FloatArray
+) -> FloatArray:
+    """Return the redundancy number 1 - p a Q a' of each scale bar that took part, (b,).
+
+    Args:
+        weighted, layout, state: of an adjustment at its optimum.
+        cofactor: Q of the kept object points, in any datum, shape (3 s, 3 s).
+    """
+    rows, _ = bar_rows(weighted, layout, state)
+    return np.clip(1 - weighted.length_weight * ((rows @ cofactor) * rows).sum(axis=1), 0.0, 1.0)
 
 
 def tau_critical(alpha: float, redundancy: int) -> float:

@@ -46,6 +46,8 @@ class Adjustment:
     weights: FloatArray = field(default_factory=lambda: np.zeros(0))  # factor on the weight of each image
     # point: 0 where rejected, between 0 and 1 by reweighting, else 1, (k,)
 
+    bar_redundancy: FloatArray = field(default_factory=lambda: np.zeros(0))  # redundancy number of each scale
+    # bar, 0 to 1; NaN where it took no part, (b,)
     datum_points: BoolArray | None = None  # object points that carry the datum; all if None, (n,)
     remarks: tuple[str, ...] = ()  # what of the robust test could not be carried through, one line each
 

@@ -26,7 +26,7 @@ from sfm.adjustment.iterate import METHODS, TOLERANCE, Optimum, Problem, iterate
 from sfm.adjustment.parameters import estimate_of, start_weights, unknowns_of
 from sfm.adjustment.rank import rank_defect, undetermined_of
 from sfm.adjustment.reliability import redundancy_numbers as numbers_of
-from sfm.adjustment.reliability import standardised_residuals
+from sfm.adjustment.reliability import redundancy_of_bars, standardised_residuals
 from sfm.adjustment.result import Adjustment, Covariance
 from sfm.adjustment.robust import huber_weights, robust_scale, snoop, tukey_weights
 from sfm.adjustment.threads import own_threads
@@ -274,6 +274,7 @@ def _result(
     back = np.empty(k, dtype=np.int64)  # place of each image point of the network in the layout
     back[layout.order] = np.arange(k)
     numbers = standardised = np.full((k, 2), np.nan)
+    of_bars = np.full(len(network.scale_bars), np.nan)
     v = residuals(layout.obs, optimum.state)
     if Q is None:
         empty = np.full((n, 3, 3), np.nan)
@@ -282,6 +283,8 @@ def _result(
     else:
         result = marginal_covariance(optimum, layout, Q, sigma0**2)
         result = without_held(result, layout)
+        kept = Q.border[layout.kept_start - 6 * m :, layout.kept_start - 6 * m :]
+        of_bars[layout.bars] = redundancy_of_bars(run.problem.weighted, layout, optimum.state, kept)
     if Q is not None and Q.has_cross:
         complement = hat_complement(optimum, layout, Q, weight)
         numbers = numbers_of(complement, layout.obs.whitening)
@@ -310,6 +313,7 @@ def _result(
         covariance=result,
         standardised=standardised,
         weights=np.take(weight, back, axis=0),
+        bar_redundancy=of_bars,
         datum_points=run.problem.datum.points,
         remarks=run.remarks,
     )

@@ -78,8 +78,7 @@ def by_kind(adjustment: Adjustment) -> VarianceComponents:
     """Return the variance factor of each kind of observation.
 
     Kinds are image points, control points, exterior and interior orientation, and scale bars; those
-    that were not observed are left out. Redundancy numbers of all kinds add up to the redundancy, so
-    that of the scale bars, which depends on two points each, is what the others leave.
+    that were not observed are left out. Redundancy numbers of all kinds add up to the redundancy.
     """
     a, network = adjustment, adjustment.network
     use_control = a.datum == "control"
@@ -119,9 +118,8 @@ def by_kind(adjustment: Adjustment) -> VarianceComponents:
             float(w.interior_weight @ np.array(Q_interior, dtype=float)) / unit,
         ),
     ]
-    redundancy = float(image.redundancy[0]) + sum(count - taken for _, count, _, taken in kinds)
-    vPv_of_bars = float(w.length_weight @ length**2)
-    kinds.append(("scale bars", len(length), vPv_of_bars, len(length) - (a.redundancy - redundancy)))
+    taken = len(length) - float(a.bar_redundancy[layout.bars].sum())
+    kinds.append(("scale bars", len(length), float(w.length_weight @ length**2), taken))
     seen = [kind for kind in kinds if kind[1]]
     vPv = np.array([a.vPv - sum(kind[2] for kind in seen), *(kind[2] for kind in seen)])
     own = np.array([float(image.redundancy[0]), *(kind[1] - kind[3] for kind in seen)])

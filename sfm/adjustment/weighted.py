@@ -63,9 +63,9 @@ def weighted_of(network: Network, layout: Unknowns, *, use_control: bool) -> Wei
         network.scale_bars,
     )
     on = layout.point_free[control.point].any(axis=1) if use_control else np.zeros(len(control), dtype=bool)
-    point_weight, point_count = _weights(control.covariance[on])
+    point_weight, point_count = inverse_of_observed(control.covariance[on])
     on_e = layout.exterior_free[exterior.image].any(axis=1)
-    exterior_weight, exterior_count = _weights(exterior.covariance[on_e])
+    exterior_weight, exterior_count = inverse_of_observed(exterior.covariance[on_e])
     columns, used = [], []
     for q in range(len(interior)):
         a, s = interior.camera[q], interior.parameter[q]
@@ -180,8 +180,8 @@ def _bar_terms(weighted: Weighted, layout: Unknowns, state: State) -> tuple[Floa
     return rows.T @ Pa, Pa.T @ misclosure, float(weighted.length_weight @ misclosure**2)
 
 
-def _weights(covariance: FloatArray) -> tuple[FloatArray, int]:
-    """Return inverse covariances over the observed components only, and how many there are."""
+def inverse_of_observed(covariance: FloatArray) -> tuple[FloatArray, int]:
+    """Return inverse covariances (n, d, d) over the observed components only, and how many there are."""
     weight = np.zeros(covariance.shape)
     count = 0
     for p, Q in enumerate(covariance):

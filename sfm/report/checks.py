@@ -1,4 +1,4 @@
-"""How well the observations agree with one another: residuals in standard deviations, control and bars.
+"""How well the observations agree with one another: residuals in standard deviations, checks at control.
 
 What a verdict rests on. Standard deviations are those stated before the adjustment; sigma0 tells by how
 much they were wrong, and must not hide it.
@@ -10,7 +10,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sfm.adjustment.reliability import UNCONTROLLED
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.variance_components import IMAGE_POINTS, variance_components
 from sfm.adjustment.weighted import observed
@@ -41,39 +40,6 @@ class WorstResiduals:
     v: FloatArray  # residual, px, (w, 2)
     w: FloatArray  # Baarda's w of the worse coordinate, (w,)
     tau: FloatArray  # Pope's tau of the same coordinate, (w,)
-
-
-@dataclass(frozen=True)
-class ControlResiduals:
-    """Residuals of control that took part with a weight."""
-
-    points: tuple[str, ...]  # names, (n,)
-    difference: FloatArray  # adjusted minus given X, Y, Z, object unit, (n, 3)
-    sigma: FloatArray  # given standard deviations; NaN where not observed, 0 where fixed, (n, 3)
-    ratio: FloatArray  # difference over sigma; NaN where fixed or not observed, (n, 3)
-
-
-@dataclass(frozen=True)
-class BarResiduals:
-    """Residuals of scale bars."""
-
-    names: tuple[tuple[str, str], ...]  # the two ends, (b,)
-    length: FloatArray  # given, object unit, (b,)
-    difference: FloatArray  # adjusted minus given, object unit, (b,)
-    sigma: FloatArray  # given, object unit, (b,)
-    ratio: FloatArray  # difference over sigma, (b,)
-
-
-@dataclass(frozen=True)
-class InteriorResiduals:
-    """Residuals of interior orientation that took part with a weight."""
-
-    names: tuple[str, ...]  # parameter and camera, in words, (q,)
-    units: tuple[str, ...]  # (q,)
-    given: FloatArray  # (q,)
-    difference: FloatArray  # adjusted minus given, (q,)
-    sigma: FloatArray  # given, (q,)
-    ratio: FloatArray  # difference over sigma sqrt(r), its standard deviation, (q,)
 
 
 def sigma0_ratio(result: SurveyResult) -> float:
@@ -141,55 +107,6 @@ def worst_residuals(adjustment: Adjustment, count: int = 10) -> WorstResiduals:
     return WorstResiduals(
         row, adjustment.residuals[row], adjustment.standardised[row, axis], adjustment.tau[row, axis]
     )
-
-
-def control_residuals(adjustment: Adjustment) -> ControlResiduals | None:
-    """Return what control differs from its given coordinates; None where control took no part."""
-    control = adjustment.network.control
-    if adjustment.datum != "control" or not len(control):
-        return None
-    variance = _variances(control.covariance)
-    sigma = np.where(np.isfinite(variance), np.sqrt(variance), np.nan)
-    difference = adjustment.estimate.points[control.point] - control.xyz
-    names = tuple(adjustment.network.points[j] for j in control.point)
-    return ControlResiduals(names, difference, sigma, _ratio(difference, sigma, observed(variance)))
-
-
-def bar_residuals(adjustment: Adjustment) -> BarResiduals | None:
-    """Return by how much scale bars differ from their given lengths; None without scale bars."""
-    network, bars = adjustment.network, adjustment.network.scale_bars
-    if not len(bars):
-        return None
-    X = adjustment.estimate.points
-    difference = np.linalg.norm(X[bars.end] - X[bars.start], axis=1) - bars.length
-    names = tuple((network.points[i], network.points[j]) for i, j in zip(bars.start, bars.end, strict=True))
-    return BarResiduals(
-        names, bars.length, difference, bars.sigma, _ratio(difference, bars.sigma, bars.sigma > 0)
-    )
-
-
-def interior_residuals(adjustment: Adjustment) -> InteriorResiduals | None:
-    """Return by how much weighted interior orientation differs from its given values; None without.
-
-    The redundancy number of an observed parameter is r = 1 - q / sigma^2, with its cofactor q.
-    """
-    found = adjustment.network.interior
-    rows: list[tuple[str, str, float, float, float, float]] = []
-    for a, s, given, sigma in zip(found.camera, found.parameter, found.value, found.sigma, strict=True):
-        camera, Q = adjustment.estimate.cameras[a], adjustment.covariance.interior[a]
-        where = np.flatnonzero(np.flatnonzero(camera.free) == s)
-        if not len(where) or not 0 < sigma < np.inf:
-            continue
-        difference = float(camera.parameters[s] - given)
-        q = Q[where[0], where[0]] / adjustment.sigma0**2 if len(Q) else np.nan
-        r = min(1.0, 1 - q / sigma**2)
-        ratio = difference / (sigma * np.sqrt(r)) if r > UNCONTROLLED else np.nan
-        name = f"{camera.names[s]} of camera {camera.group_of(s) or camera.name}"
-        rows.append((name, camera.units[s], float(given), difference, float(sigma), float(ratio)))
-    if not rows:
-        return None
-    names, units, *values = zip(*rows, strict=True)
-    return InteriorResiduals(names, units, *(np.array(column) for column in values))
 
 
 def check_over_sigma(result: SurveyResult, check: ControlCheck) -> FloatArray:

@@ -25,6 +25,7 @@ WRITTEN = (
     "images.csv",
     "cameras.csv",
     "image_points.csv",
+    "given.csv",
     "reliability.csv",
     "variance_components.csv",
     "observed_exterior.csv",

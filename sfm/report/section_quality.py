@@ -6,12 +6,13 @@ from html import escape
 
 import numpy as np
 
-from sfm.report.checks import interior_residuals
+from sfm.report.given import interior_residuals, words_of_w
 from sfm.report.markup import finer_unit, raised, signed, significant, table, with_exponent
 from sfm.report.observed_exterior import exterior_section
 from sfm.report.precision import point_precision, without_fixed
 from sfm.report.result import SurveyResult
-from sfm.report.section_statistics import camera_notes, components, control, image_coordinates, worst
+from sfm.report.section_given import NOTE, given_section
+from sfm.report.section_statistics import camera_notes, components, image_coordinates, worst
 from sfm.report.statistics import InteriorParameter, families, interior_parameters
 
 
@@ -36,7 +37,7 @@ def quality_section(result: SurveyResult, pictures: dict[str, str]) -> str:
         f"({escape(a.datum)}){fixed}; in a free network they say how the points lie to one another, not in "
         "an outer frame.</p>"
     )
-    text += control(result) + exterior_section(result)
+    text += given_section(result) + exterior_section(result)
     text += image_coordinates(result)
     text += pictures.get("distribution", "") + pictures.get("residuals", "") + worst(result)
     text += "<h3>Cameras</h3>"
@@ -78,22 +79,19 @@ def _cameras(result: SurveyResult) -> str:
 
 def _observed_interior(result: SurveyResult) -> str:
     """Interior orientation that was observed, as by a calibration certificate: by how much it differs."""
-    found = interior_residuals(result.adjustment)
+    found = interior_residuals(result)
     if found is None:
         return ""
     rows = []
     for q, name in enumerate(found.names):
-        given, sigma = with_exponent(found.given[q], found.sigma[q])
-        adjusted, _ = with_exponent(found.given[q] + found.difference[q], found.sigma[q])
-        w = f"{found.ratio[q]:+.2f}" if np.isfinite(found.ratio[q]) else "no check"
-        rows.append((name, adjusted, given, sigma, signed(found.difference[q]), raised(found.units[q]), w))
-    header = ("parameter", "adjusted", "observed", "its sigma", "adjusted minus observed", "unit", "w")
-    return (
-        "<h4>Observed interior orientation</h4>"
-        + table(header, rows)
-        + "<p class=note>w: the difference over its own standard deviation; by chance 1 of 1000 is beyond "
-        "3.3.</p>"
-    )
+        v, r, w = found.difference[q, 0], found.r[q, 0], found.w[q, 0]
+        given, sigma = with_exponent(found.given[q, 0], found.sigma[q, 0])
+        adjusted, _ = with_exponent(found.given[q, 0] + v, found.sigma[q, 0])
+        rows.append(
+            (name, adjusted, given, sigma, signed(v), raised(found.units[q]), f"{r:.3f}", words_of_w(w, r))
+        )
+    header = ("parameter", "adjusted", "observed", "its sigma", "adjusted minus observed", "unit", "r", "w")
+    return "<h4>Observed interior orientation</h4>" + table(header, rows) + f"<p class=note>{NOTE}</p>"
 
 
 def _row(one: InteriorParameter) -> tuple[str, ...]:

@@ -14,13 +14,11 @@ from sfm.adjustment.statistics import (
 )
 from sfm.adjustment.variance_components import VarianceComponents
 from sfm.report.checks import (
-    bar_residuals,
-    control_residuals,
     count_observations,
     sigma0_ratio,
     worst_residuals,
 )
-from sfm.report.markup import finer_unit, signed, significant, table
+from sfm.report.markup import significant, table
 from sfm.report.result import SurveyResult
 from sfm.report.statistics import (
     Statistics,
@@ -208,86 +206,3 @@ def _component_rows(found: VarianceComponents) -> list[tuple[str, ...]]:
         (name, f"{s:.3f}" if np.isfinite(s) else "not known", f"{r:.1f}", str(int(n)))
         for name, s, r, n in zip(found.names, found.sigma0, found.redundancy, found.count, strict=True)
     ]
-
-
-def control(result: SurveyResult) -> str:
-    """Differences at control: as a check where it took no part, as residuals where it did."""
-    return _check(result) + _control_residuals(result) + _bars(result)
-
-
-def _check(result: SurveyResult) -> str:
-    check = result.control_check
-    if check is None:
-        return ""
-    factor, unit = finer_unit(result.length_unit, float(np.abs(check.differences).max()))
-    rows = [
-        (name, *(signed(v) for v in d), significant(float(np.linalg.norm(d))))
-        for name, d in zip(check.points, check.differences * factor, strict=True)
-    ]
-    rms = check.rms * factor
-    rows.append(("RMS", *(significant(v) for v in rms), significant(float(np.linalg.norm(rms)))))
-    if result.adjustment.network.scale_bars:
-        placed = (
-            "by shift and rotation, in the scale of the scale bars; the control says lengths are "
-            f"{check.scale:.9g} times those of the scale bars."
-        )
-    else:
-        placed = "by shift, rotation and scale; the scale was taken from the control."
-    return (
-        "<h3>Check at the control</h3><p class=note>The control took no part in the adjustment. The result "
-        f"was placed on it afterwards {placed} What remains at each point, placed minus nominal "
-        f"[{escape(unit)}]:</p>" + table(("control point", "dX", "dY", "dZ", "length"), rows, last_bold=True)
-    )
-
-
-def _control_residuals(result: SurveyResult) -> str:
-    found = control_residuals(result.adjustment)
-    if found is None:
-        return ""
-    factor, unit = finer_unit(result.length_unit, float(np.nanmax(np.abs(found.difference), initial=0.0)))
-    rows = [
-        (
-            name,
-            *(signed(v) for v in d * factor),
-            *("not known" if np.isnan(v) else "fixed" if v == 0 else significant(v) for v in s * factor),
-            f"{np.nanmax(np.abs(q)):.2f}" if np.isfinite(q).any() else "",
-        )
-        for name, d, s, q in zip(found.points, found.difference, found.sigma, found.ratio, strict=True)
-    ]
-    return (
-        f"<h3>Control</h3><p class=note>Adjusted minus given, given standard deviations [{escape(unit)}], "
-        "and the largest difference over its standard deviation:</p>"
-        + table(("control point", "dX", "dY", "dZ", "sX", "sY", "sZ", "largest / s"), rows)
-    )
-
-
-def _bars(result: SurveyResult) -> str:
-    found = bar_residuals(result.adjustment)
-    if found is None:
-        return ""
-    largest = float(np.abs(np.concatenate([found.difference, found.sigma])).max())
-    factor, unit = finer_unit(result.length_unit, largest)
-    rows = [
-        (
-            f"{start} - {end}",
-            f"{found.length[b]:.9g}",
-            signed(found.difference[b] * factor),
-            significant(found.sigma[b] * factor),
-            f"{found.ratio[b]:+.2f}",
-        )
-        for b, (start, end) in enumerate(found.names)
-    ]
-    header = (
-        "scale bar",
-        f"given [{result.length_unit}]",
-        f"adjusted minus given [{unit}]",
-        f"sigma given [{unit}]",
-        "difference / sigma",
-    )
-    text = "<h3>Scale bars</h3>" + table(header, rows)
-    if len(rows) == 1 and result.adjustment.datum != "control":
-        text += (
-            "<p class=note>A single bar gives the scale and cannot be checked; two or more check one "
-            "another.</p>"
-        )
-    return text

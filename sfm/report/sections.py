@@ -80,6 +80,11 @@ def coordinates_section(result: SurveyResult, *, has_model: bool) -> str:
             + ("" if result.eccentricity is None else "; corrected for eccentricity (the circle's centre)"),
         ),
         (
+            "given.csv",
+            "control, scale bars and interior orientation that took part: given value, difference, standard "
+            "deviation, redundancy number, w",
+        ),
+        (
             "reliability.csv",
             "of every image coordinate: residual [px], redundancy number, w, tau, minimal detectable bias "
             "[px], external reliability [sigmas of an unknown]",

@@ -14,12 +14,10 @@ from sfm.adjustment.variance_components import VarianceComponents
 from sfm.conventions import FloatArray
 from sfm.file_values import or_none
 from sfm.report.checks import (
-    bar_residuals,
-    control_residuals,
     count_observations,
-    interior_residuals,
     sigma0_ratio,
 )
+from sfm.report.given import bar_residuals, control_residuals, interior_residuals
 from sfm.report.observed_exterior import exterior_summary
 from sfm.report.precision import root_mean_square
 from sfm.report.result import SurveyResult
@@ -94,8 +92,8 @@ def summary(result: SurveyResult) -> dict[str, Any]:
         ],
         "statistics": _statistics(result),
         "control": _control(result),
-        "scale_bars": _scale_bars(adjustment),
-        "weighted_interior": _weighted_interior(adjustment),
+        "scale_bars": _scale_bars(result),
+        "weighted_interior": _weighted_interior(result),
         "observed_exterior": exterior_summary(result),
         "eccentricity": _eccentricity(result),
         "no_circles": list(result.no_circles),
@@ -214,54 +212,52 @@ def _control(result: SurveyResult) -> dict[str, Any] | None:
                 for name, difference in zip(check.points, check.differences, strict=True)
             },
         }
-    found = control_residuals(result.adjustment)
+    found = control_residuals(result)
     if found is None:
         return None
+    columns = ("difference", "sigma", "r", "w")
     return {
         "role": "datum",
         "points": [
-            {
-                "id": name,
-                "difference": [or_none(value) for value in difference],
-                "sigma": [or_none(value) for value in sigma],
-                "ratio": [or_none(value) for value in ratio],
-            }
-            for name, difference, sigma, ratio in zip(
-                found.points, found.difference, found.sigma, found.ratio, strict=True
-            )
+            {"id": name} | {c: [or_none(value) for value in getattr(found, c)[k]] for c in columns}
+            for k, name in enumerate(found.names)
         ],
     }
 
 
-def _scale_bars(adjustment: Adjustment) -> list[dict[str, Any]]:
-    found = bar_residuals(adjustment)
+def _scale_bars(result: SurveyResult) -> list[dict[str, Any]]:
+    found, bars, names = (
+        bar_residuals(result), result.adjustment.network.scale_bars, result.adjustment.network.points
+    )  # fmt: skip
     if found is None:
         return []
     return [
         {
-            "from": start,
-            "to": end,
-            "length": or_none(found.length[b]),
-            "difference": or_none(found.difference[b]),
-            "sigma": or_none(found.sigma[b]),
-            "ratio": or_none(found.ratio[b]),
+            "from": names[bars.start[b]],
+            "to": names[bars.end[b]],
+            "length": or_none(found.given[b, 0]),
+            "difference": or_none(found.difference[b, 0]),
+            "sigma": or_none(found.sigma[b, 0]),
+            "r": or_none(found.r[b, 0]),
+            "w": or_none(found.w[b, 0]),
         }
-        for b, (start, end) in enumerate(found.names)
+        for b in range(len(bars))
     ]
 
 
-def _weighted_interior(adjustment: Adjustment) -> list[dict[str, Any]]:
-    found = interior_residuals(adjustment)
+def _weighted_interior(result: SurveyResult) -> list[dict[str, Any]]:
+    found = interior_residuals(result)
     if found is None:
         return []
     return [
         {
             "parameter": name,
             "unit": found.units[q],
-            "given": or_none(found.given[q]),
-            "difference": or_none(found.difference[q]),
-            "sigma": or_none(found.sigma[q]),
-            "w": or_none(found.ratio[q]),
+            "given": or_none(found.given[q, 0]),
+            "difference": or_none(found.difference[q, 0]),
+            "sigma": or_none(found.sigma[q, 0]),
+            "r": or_none(found.r[q, 0]),
+            "w": or_none(found.w[q, 0]),
         }
         for q, name in enumerate(found.names)
     ]

@@ -1,4 +1,4 @@
-"""The tables of a result: points, images, cameras, image points, their reliability, groups of observations.
+"""The tables of a result: points, images, cameras, image points, given values, reliability, groups.
 
 Degrees in files, the object unit of the survey, sigmas are standard deviations a posteriori (those of image
 points: as measured). Numbers are written with enough digits to give the same number back.
@@ -14,6 +14,7 @@ import numpy as np
 from sfm.adjustment.result import Adjustment
 from sfm.conventions import FloatArray, angles_from_rotation
 from sfm.file_values import csv_text
+from sfm.report.given import given_rows
 from sfm.report.observed_exterior import HEADER, exterior_rows
 from sfm.report.result import SurveyResult
 from sfm.report.statistics import Statistics, parameter_sigmas, statistics_of
@@ -40,6 +41,9 @@ def write_tables(result: SurveyResult, folder: Path) -> None:
         folder / "image_points.csv",
         "image,point,x_px,y_px,sx_px,sy_px,vx_px,vy_px,rejected",
         image_point_rows(adjustment),
+    )
+    _write_csv(
+        folder / "given.csv", "kind,name,coordinate,unit,given,difference,sigma,r,w", given_rows(result)
     )
     statistics = statistics_of(result)
     _write_csv(

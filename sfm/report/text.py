@@ -11,12 +11,17 @@ import numpy as np
 from sfm.adjustment.statistics import STRONG
 from sfm.adjustment.variance_components import VarianceComponents
 from sfm.report.checks import (
-    bar_residuals,
-    control_residuals,
     count_observations,
-    interior_residuals,
     sigma0_ratio,
     worst_residuals,
+)
+from sfm.report.given import (
+    NOT_CHECKED,
+    GivenResiduals,
+    bar_residuals,
+    control_residuals,
+    interior_residuals,
+    words_of_w,
 )
 from sfm.report.markup import finer_unit, significant, with_exponent
 from sfm.report.observed_exterior import exterior_text
@@ -65,7 +70,7 @@ def text_report(result: SurveyResult) -> str:
         "",
         "sigma: one standard deviation, a posteriori; w test and minimal bias rest on those of the weights.",
         "Residuals: computed minus measured. Pixel (0, 0): centre of the top-left pixel.",
-        "Tables (.csv): points, images, cameras, image_points, reliability, variance_components.",
+        "Tables (.csv): points, images, cameras, image_points, given, reliability, variance_components.",
     ]
     return "\n".join(one.rstrip() for one in lines) + "\n"
 
@@ -240,47 +245,41 @@ def _given(result: SurveyResult) -> list[str]:
     """Control, differences at it, scale bars, and weighted interior orientation."""
     lines: list[str] = []
     unit = result.length_unit
-    check, control, bars = (
-        result.control_check, control_residuals(result.adjustment), bar_residuals(result.adjustment)
-    )  # fmt: skip
+    check = result.control_check
     if check is not None:
         factor, finer = finer_unit(unit, float(np.abs(check.differences).max()))
         rms = ", ".join(significant(v * factor) for v in check.rms)
         lines.append(line("check at control", f"RMS {rms} {finer} in X, Y, Z at {len(check.points)} points"))
-    if control is not None and np.isfinite(control.ratio).any():
-        size = np.nanmax(np.abs(control.ratio), axis=1, initial=0.0)
-        worst = int(np.argmax(size))
-        lines.append(
-            line("control", f"largest residual {size[worst]:.2f} sigma at {control.points[worst]} of "
-                  f"{len(control.points)} points")
-        )  # fmt: skip
-    if bars is not None:
-        for b in range(min(len(bars.names), MOST_ROWS)):
-            factor, finer = finer_unit(unit, float(np.abs(bars.difference[b])))
-            lines.append(
-                line(
-                    "scale bar",
-                    f"{bars.names[b][0]} - {bars.names[b][1]}: {bars.length[b]:.9g} {unit}, adjusted minus "
-                    f"given {significant(bars.difference[b] * factor)} {finer} ({bars.ratio[b]:+.2f} sigma)",
-                )
-            )
-        if len(bars.names) > MOST_ROWS:
-            lines.append(f"  and {len(bars.names) - MOST_ROWS} more, in summary.json")
-    interior = interior_residuals(result.adjustment)
-    if interior is not None:
-        for q in range(min(len(interior.names), MOST_ROWS)):
-            unit = "" if interior.units[q] == "1" else f" {interior.units[q]}"
-            given, sigma = with_exponent(interior.given[q], interior.sigma[q])
-            lines.append(
-                line(
-                    "weighted interior",
-                    f"{interior.names[q]}: given {given} +- {sigma}{unit}, adjusted minus given "
-                    f"{significant(interior.difference[q])}{unit} (w {interior.ratio[q]:+.2f})",
-                )
-            )
-        if len(interior.names) > MOST_ROWS:
-            lines.append(f"  and {len(interior.names) - MOST_ROWS} more, in summary.json")
+    control, bars, interior = control_residuals(result), bar_residuals(result), interior_residuals(result)
+    if control is not None:
+        lines.append(line("control", _of_control(control)))
+    rows = []
+    for kind, one in (("scale bar", bars), ("interior", interior)):
+        if one is None:
+            continue
+        for k, name in enumerate(one.names):
+            given, v, sigma, r, w = (x[k, 0] for x in (one.given, one.difference, one.sigma, one.r, one.w))
+            unit = "" if one.units[k] == "1" else one.units[k]
+            rows.append((kind, name, *with_exponent(given, sigma), significant(v), unit, f"{r:.3f}",
+                         words_of_w(w, r)))  # fmt: skip
+    if rows:
+        header = ("given", "", "value", "sigma", "adjusted - given", "unit", "r", "w")
+        lines += columns(header, rows[: 2 * MOST_ROWS], left=2)
+    if len(rows) > 2 * MOST_ROWS:
+        lines.append(f"  and {len(rows) - 2 * MOST_ROWS} more, in given.csv")
     return head("Control, scale and given interior orientation") + lines if lines else []
+
+
+def _of_control(found: GivenResiduals) -> str:
+    """Largest w, and how far the coordinates of control are checked."""
+    points, known = f"{len(found.names)} points", found.r[np.isfinite(found.r)]
+    if not len(known):
+        return f"{points} without standard deviation: {NOT_CHECKED}"
+    worst = found.worst()
+    unchecked = int((np.isfinite(found.r) & ~np.isfinite(found.w)).sum())
+    size = f"largest |w| {worst[1]:.2f} at {found.names[worst[0]]} of {points}, " if worst else f"{points}, "
+    more = f"; {unchecked} coordinates {NOT_CHECKED}" if unchecked else ""
+    return f"{size}redundancy numbers {known.min():.3f} to {known.max():.3f}{more}"
 
 
 def _worst(result: SurveyResult) -> list[str]:

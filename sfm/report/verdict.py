@@ -10,14 +10,12 @@ import numpy as np
 from sfm.adjustment.statistics import ALPHA, component_tests
 from sfm.adjustment.variance_components import IMAGE_POINTS
 from sfm.report.checks import (
-    bar_residuals,
     check_over_sigma,
-    control_residuals,
-    interior_residuals,
     longest_residual,
     object_size,
     sigma0_ratio,
 )
+from sfm.report.given import bar_residuals, control_residuals, interior_residuals
 from sfm.report.markup import finer_unit, significant
 from sfm.report.observed_exterior import worst_exterior
 from sfm.report.result import SurveyResult
@@ -31,7 +29,7 @@ MOST_NAMES = 5  # points named in one remark
 SIGMA0_REMARK, SIGMA0_BAD = 2.0, 5.0
 # Data snooping leaves nothing beyond 4 or 5 sigma; ten is an outlier, thirty is a mistake that was kept.
 RESIDUAL_REMARK, RESIDUAL_BAD = 10.0, 30.0
-WEIGHTED_REMARK, WEIGHTED_BAD = 5.0, 30.0  # control and scale bars, in their own standard deviations
+WEIGHTED_REMARK, WEIGHTED_BAD = 5.0, 30.0  # w of control, scale bars, interior orientation
 CHECK_REMARK = 100.0  # differences at control in sigmas: datum and print are never as good as the network
 MISCLOSURE_BAD = 0.01  # of the size of the object, or of a length: no measurement, a mistake
 
@@ -124,53 +122,43 @@ def _residual(result: SurveyResult) -> Judged:
 
 def _control(result: SurveyResult) -> Judged:
     """Judge the residuals of weighted control."""
-    found = control_residuals(result.adjustment)
-    if found is None or not np.isfinite(found.ratio).any():
-        return []
-    size = np.nanmax(np.abs(found.ratio), axis=1, initial=0.0)
-    worst = int(np.argmax(size))
-    if not size[worst] > WEIGHTED_REMARK:
+    found = control_residuals(result)
+    worst = found.worst() if found is not None else None
+    if found is None or worst is None or not worst[1] > WEIGHTED_REMARK:
         return []
     line = (
-        f"Control point {found.points[worst]} differs from its given coordinates by "
-        f"{significant(float(size[worst]))} times its standard deviation."
+        f"Control point {found.names[worst[0]]} differs from its given coordinates by "
+        f"{significant(worst[1])} times the standard deviation of that difference."
     )
-    return [(bool(size[worst] > WEIGHTED_BAD), line)]
+    return [(worst[1] > WEIGHTED_BAD, line)]
 
 
 def _bars(result: SurveyResult) -> Judged:
     """Judge the residuals of scale bars."""
-    found = bar_residuals(result.adjustment)
-    if found is None:
+    found = bar_residuals(result)
+    worst = found.worst() if found is not None else None
+    if found is None or worst is None or not worst[1] > WEIGHTED_REMARK:
         return []
-    ratio = np.nan_to_num(np.abs(found.ratio))
-    worst = int(np.argmax(ratio))
-    relative = abs(float(found.difference[worst] / found.length[worst]))
-    if not ratio[worst] > WEIGHTED_REMARK:
-        return []
-    start, end = found.names[worst]
+    relative = abs(float(found.difference[worst[0], 0] / found.given[worst[0], 0]))
     line = (
-        f"Scale bar {start} - {end} differs from its given length by {significant(float(ratio[worst]))} "
-        f"times its standard deviation ({significant(100 * relative)} %)."
+        f"Scale bar {found.names[worst[0]]} differs from its given length by {significant(worst[1])} "
+        f"times the standard deviation of that difference ({significant(100 * relative)} %)."
     )
-    return [(bool(ratio[worst] > WEIGHTED_BAD or relative > MISCLOSURE_BAD), line)]
+    return [(worst[1] > WEIGHTED_BAD or relative > MISCLOSURE_BAD, line)]
 
 
 def _interior(result: SurveyResult) -> Judged:
     """Judge the residuals of weighted interior orientation, as of a calibration certificate."""
-    found = interior_residuals(result.adjustment)
-    if found is None:
+    found = interior_residuals(result)
+    worst = found.worst() if found is not None else None
+    if found is None or worst is None or not worst[1] > WEIGHTED_REMARK:
         return []
-    ratio = np.nan_to_num(np.abs(found.ratio))
-    worst = int(np.argmax(ratio))
-    if not ratio[worst] > WEIGHTED_REMARK:
-        return []
-    unit = "" if found.units[worst] == "1" else f" {found.units[worst]}"
+    unit = "" if found.units[worst[0]] == "1" else f" {found.units[worst[0]]}"
     line = (
-        f"The given {found.names[worst]}, {found.given[worst]:.6g}{unit}, differs from the adjusted one "
-        f"by {significant(float(ratio[worst]))} times the standard deviation of its residual."
+        f"The given {found.names[worst[0]]}, {found.given[worst[0], 0]:.6g}{unit}, differs from the adjusted "
+        f"one by {significant(worst[1])} times the standard deviation of that difference."
     )
-    return [(bool(ratio[worst] > WEIGHTED_BAD), line)]
+    return [(worst[1] > WEIGHTED_BAD, line)]
 
 
 def _kinds(result: SurveyResult) -> Judged:

@@ -11,6 +11,7 @@ from sfm.adjustment.datum import Datum
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.adjustment.variance_components import IMAGE_POINTS, estimate_components
+from sfm.adjustment.weighted import observed
 from sfm.conventions import MAD_TO_SIGMA, BoolArray, IntArray
 from sfm.errors import GeometryError
 from sfm.network import Estimate, Network, reduce_network, supported
@@ -160,8 +161,11 @@ def _final(
     def adjust_part(one: Network) -> Adjustment:
         return _tested(survey, one, estimate, datum, reject=reject, covariance=True)
 
-    weighted_control = datum.kind == "control" and part.control.covariance.any()
-    if len(part.scale_bars) or len(part.interior) or weighted_control:
+    outer = np.concatenate(
+        [np.einsum("nii->ni", x.covariance).ravel() for x in (part.control, part.exterior)]
+    )
+    weighted = datum.kind == "control" and observed(outer).any()
+    if len(part.scale_bars) or len(part.interior) or weighted:
         return _weighed(adjust_part, part)
     return adjust_part(part), 1.0
 
