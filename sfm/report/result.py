@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from sfm.adjustment.orientation_correlations import OrientationCorrelation
 from sfm.adjustment.result import Adjustment
 from sfm.analysis.baseline import BaselineComparison
 from sfm.analysis.comparison import AdjusterComparison
@@ -90,6 +91,8 @@ class SurveyResult:
     warnings: tuple[str, ...] = ()  # one line each, in words
     eccentricity: Eccentricity | None = None  # None where it was not corrected
     no_circles: tuple[str, ...] = ()  # uncoded points left out: their outlines are not images of one circle
+    orientation_correlations: tuple[OrientationCorrelation, ...] = ()  # of camera parameters with exterior
+    # orientation, the strong ones
     seconds: tuple[StageTime, ...] = field(default_factory=tuple)  # in the order of the stages
     weight_factor: float = 1.0  # by which the a priori sigmas of the image points were multiplied, from their
     # own variance component, before the final adjustment; 1 where they were left as stated

@@ -161,6 +161,22 @@ def camera_notes(result: SurveyResult) -> str:
         text += "<p class=note>So strongly correlated, each stands in for the other.</p>"
     else:
         text += f"<p>No two parameters of a camera are correlated beyond {100 * STRONG:.0f} %.</p>"
+    with_exterior = result.orientation_correlations
+    if with_exterior:
+        rows = [
+            (one.parameter, one.partners, f"{100 * one.largest:+.1f}", f"{one.part} of {one.image}")
+            for one in with_exterior
+        ]
+        text += table(("camera parameter", "strongly correlated with", "largest [%]", "which is with"), rows)
+        text += (
+            "<p class=note>The photographs can hardly tell these apart, as c from Z0 in a flat network. "
+            "Photographs turned about their axis, convergent ones, and an object with depth can.</p>"
+        )
+    else:
+        text += (
+            "<p>No camera parameter is correlated with the exterior orientation of a photograph beyond "
+            f"{100 * STRONG:.0f} %.</p>"
+        )
     if weak:
         names = ", ".join(f"{test.parameter} of {test.camera} ({test.t:.1f})" for test in weak)
         text += (

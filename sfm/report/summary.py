@@ -11,7 +11,6 @@ import numpy as np
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.statistics import CoordinateTest
 from sfm.adjustment.variance_components import VarianceComponents
-from sfm.conventions import FloatArray
 from sfm.file_values import or_none
 from sfm.report.checks import (
     count_observations,
@@ -19,7 +18,6 @@ from sfm.report.checks import (
 )
 from sfm.report.given import bar_residuals, control_residuals, interior_residuals
 from sfm.report.observed_exterior import exterior_summary
-from sfm.report.precision import root_mean_square
 from sfm.report.result import SurveyResult
 from sfm.report.statistics import (
     parameter_sigmas,
@@ -28,6 +26,7 @@ from sfm.report.statistics import (
     words_of_test,
     words_of_weights,
 )
+from sfm.report.summary_comparison import baseline_summary, comparison_summary
 from sfm.report.tables import UNCODED
 from sfm.report.verdict import verdict_of
 
@@ -97,8 +96,8 @@ def summary(result: SurveyResult) -> dict[str, Any]:
         "observed_exterior": exterior_summary(result),
         "eccentricity": _eccentricity(result),
         "no_circles": list(result.no_circles),
-        "comparison": _comparison(result),
-        "baseline": _baseline(result),
+        "comparison": comparison_summary(result),
+        "baseline": baseline_summary(result),
         "warnings": list(result.warnings),
         "seconds": {time.stage: round(time.seconds, 3) for time in result.seconds},
     }
@@ -157,6 +156,16 @@ def _statistics(result: SurveyResult) -> dict[str, Any]:
         "correlations": [
             {"first": pair.first, "second": pair.second, "value": or_none(pair.value)}
             for pair in found.correlations
+        ],
+        "orientation_correlations": [
+            {
+                "parameter": one.parameter,
+                "with": one.part,
+                "image": one.image,
+                "value": one.largest,
+                "photographs": dict(one.counts),
+            }
+            for one in result.orientation_correlations
         ],
         "significance": [
             {
@@ -272,70 +281,3 @@ def _eccentricity(result: SurveyResult) -> dict[str, Any] | None:
         "rms_px": or_none(found.rms_px),
         "sigma_px": or_none(found.sigma_px),
     }
-
-
-def _comparison(result: SurveyResult) -> dict[str, Any] | None:
-    both = result.comparison
-    if both is None:
-        return None
-    difference = both.comparison
-    return {
-        "backend": both.backend,
-        "agree": both.agree,
-        "model": both.model,
-        "max_position": or_none(difference.max_position),
-        "max_rotation_deg": or_none(difference.max_rotation_deg),
-        "max_point": or_none(difference.max_point),
-        "max_interior_px": or_none(float(np.nanmax(difference.interior_px, initial=0.0))),
-        "object_size": or_none(difference.object_size),
-        "rms_px": {"kolinear": difference.rms_px[0], both.backend: difference.rms_px[1]},
-        "cost": {"kolinear": difference.cost[0], both.backend: difference.cost[1]},
-        "point_sigma_rms": {
-            "kolinear_marginal": _point_sigma(both.adjustment.covariance.points),
-            "kolinear_conditional": _point_sigma(both.adjustment.covariance.points_limiting),
-            f"{both.backend}_conditional": None
-            if both.backend_points is None
-            else _point_sigma(both.backend_points),
-        },
-        "exceeded": list(difference.exceeded),
-        "held": list(both.held),
-        "unshared": list(both.unshared),
-        "freed": list(both.freed),
-        "conversions": [
-            {
-                "camera": one.camera.name,
-                "from": one.source_model,
-                "to": one.camera.model,
-                "rms_px": or_none(one.rms_px),
-                "max_px": or_none(one.max_px),
-            }
-            for one in both.conversions
-        ],
-    }
-
-
-def _baseline(result: SurveyResult) -> dict[str, Any] | None:
-    found = result.baseline
-    if found is None:
-        return None
-
-    def pair(values: tuple[float, float]) -> dict[str, float | None]:
-        return {"kolinear": or_none(values[0]), found.name: or_none(values[1])}
-
-    return {
-        "pipeline": found.name,
-        "images": {"kolinear": found.photographs[0], found.name: found.photographs[1], "total": found.total},
-        "rms_px": pair(found.rms_px),
-        "seconds": pair(found.seconds),
-        "targets": found.targets,
-        "target_rms_px": or_none(found.target_rms_px),
-        "point_rms": or_none(found.point_rms),
-        "max_point": or_none(found.max_point),
-        "position_rms": or_none(found.position_rms),
-        "max_rotation_deg": or_none(found.max_rotation_deg),
-    }
-
-
-def _point_sigma(covariance: FloatArray) -> float | None:
-    """Root mean square standard deviation of a coordinate, object unit."""
-    return or_none(root_mean_square(np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))))

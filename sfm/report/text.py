@@ -159,7 +159,7 @@ def _single_tests(result: SurveyResult, statistics: Statistics) -> list[str]:
         line(
             "external reliability",
             f"median {significant(external[0])}, largest {_or_none(external[1])} sigmas of an unknown: "
-            "what it does if not found",
+            "effect if not found",
         ),
     ]
 
@@ -209,6 +209,18 @@ def _interior(result: SurveyResult, statistics: Statistics) -> list[str]:
     lines += [part for pair in pairs[:MOST_ROWS] for part in wrapped(f"    {pair}")]
     if len(pairs) > MOST_ROWS:
         lines.append(f"    and {len(pairs) - MOST_ROWS} more, in summary.json")
+    return lines + _with_exterior(result, over)
+
+
+def _with_exterior(result: SurveyResult, over: str) -> list[str]:
+    """Camera parameters that hang together with exterior orientation."""
+    found = result.orientation_correlations
+    lines = [f"  of camera parameters with exterior orientation, over {over}: {len(found) or 'none'}"]
+    for one in found[:MOST_ROWS]:
+        largest = f"{100 * one.largest:+.1f} % ({one.part} of {one.image})"
+        lines += wrapped(f"    {one.parameter} - {one.partners}; largest {largest}")
+    if len(found) > MOST_ROWS:
+        lines.append(f"    and {len(found) - MOST_ROWS} more, in summary.json")
     return lines
 
 

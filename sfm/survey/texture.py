@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from sfm.adjustment.orientation_correlations import orientation_correlations
 from sfm.progress import SILENT, Progress, StageClock
 from sfm.project import Survey
 from sfm.report.result import FailedImage, StageTime, SurveyResult
@@ -60,5 +61,6 @@ def run_textured_survey(
         control_check=solution.control_check,
         warnings=start.warnings + placed.warnings + solution.warnings + compared.failures,
         weight_factor=solution.weight_factor,
+        orientation_correlations=orientation_correlations(solution.adjustment),
         seconds=tuple(StageTime(*one) for one in clock.seconds),
     )
