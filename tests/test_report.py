@@ -295,8 +295,9 @@ def test_result_appears_whole_and_replaces_an_earlier_one(result: SurveyResult, 
     out = tmp_path / "deep" / "out"
     page = write_result(result, out, write_colmap=lambda folder: (folder / "x.bin").touch(), jobs=2)
     assert page == out / "report.html"
-    absent = {"log.jsonl", "observed_exterior.csv"}  # the run itself adds the log; nothing was observed
-    assert {path.name for path in out.iterdir()} == set(WRITTEN) - absent
+    assert {path.name for path in out.iterdir()} == set(WRITTEN) - {
+        "log.jsonl"
+    }  # the run itself adds the log
     assert len(list((out / "overlays").iterdir())) == 8
     assert [path.name for path in out.parent.iterdir()] == ["out"]
     before = (out / "points.csv").read_bytes()

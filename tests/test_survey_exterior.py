@@ -16,8 +16,8 @@ from sfm.errors import GeometryError, SurveyFileError
 from sfm.network import Estimate
 from sfm.pipeline import adjust_survey
 from sfm.project import read_survey
+from sfm.report.given import exterior_residuals
 from sfm.report.html import render_html
-from sfm.report.observed_exterior import exterior_residuals
 from sfm.report.output import write_result
 from sfm.report.result import SurveyResult
 from sfm.report.text import text_report
@@ -169,10 +169,12 @@ def test_residuals_and_tests_stand_in_every_report(tmp_path: Path) -> None:
     table[3] = ",".join([name, repr(float(X) + 20 * SIGMA), *rest])  # a gross error
     (tmp_path / "survey" / "exterior.csv").write_text("\n".join(table), encoding="utf-8")
     result = solved(path)
-    found = exterior_residuals(result.adjustment)
-    assert found is not None
+    both = exterior_residuals(result)
+    assert both is not None
+    found, angles = both
+    assert np.isnan(angles.sigma).all()
     e, k = np.unravel_index(np.nanargmax(np.abs(found.w)), found.w.shape)
-    assert (found.images[e], k) == ("image 3", 0)
+    assert (found.names[e], k) == ("image 3", 0)
     assert found.difference[e, k] < -10 * SIGMA
     assert "The given X0 of photograph image 3 differs" in " ".join(verdict_of(result).remarks)
     write_result(result, tmp_path / "out")
@@ -180,11 +182,11 @@ def test_residuals_and_tests_stand_in_every_report(tmp_path: Path) -> None:
     assert len(rows) == 3 * IMAGES
     worst = max(rows, key=lambda row: abs(row["w"]))
     assert (worst["image"], worst["parameter"], worst["unit"]) == ("image 3", "X0", "m")
-    lines = (tmp_path / "out" / "observed_exterior.csv").read_text().splitlines()
-    assert lines[0] == "image,parameter,given,sigma,difference,redundancy,w,unit"
-    assert len(lines) == 1 + 3 * IMAGES
+    lines = (tmp_path / "out" / "given.csv").read_text().splitlines()
+    assert sum(line.startswith("projection centre,") for line in lines) == 3 * IMAGES
+    assert not any(line.startswith("rotation,") for line in lines)
     text, page = text_report(result), render_html(result, (), ())
-    assert "Observed exterior orientation ---" in text
+    assert "Observed exterior orientation: adjusted minus given ---" in text
     assert f"{found.w[e, k]:+.2f}" in text and f"{found.w[e, k]:+.2f}" in page
     assert "<h3>Observed exterior orientation</h3>" in page
 
@@ -192,14 +194,14 @@ def test_residuals_and_tests_stand_in_every_report(tmp_path: Path) -> None:
 def test_its_redundancy_is_that_of_the_variance_components(tmp_path: Path) -> None:
     path, _ = written(tmp_path, "redundancy")
     result = solved(path)
-    found = exterior_residuals(result.adjustment)
-    assert found is not None
+    both = exterior_residuals(result)
+    assert both is not None
     path_of = (
         row
         for row in text_report(result).splitlines()
         if row.split()[:3] == ["kind", "exterior", "orientation"]
     )
-    assert float(next(path_of).split()[4]) == pytest.approx(float(np.nansum(found.redundancy)), abs=0.06)
+    assert float(next(path_of).split()[4]) == pytest.approx(float(np.nansum(both[0].r)), abs=0.06)
 
 
 @pytest.mark.parametrize(

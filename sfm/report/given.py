@@ -1,4 +1,5 @@
-"""Residuals of what was given with a standard deviation: control, scale bars, interior orientation.
+"""Residuals of what was given with a standard deviation: control, scale bars, interior and exterior
+orientation.
 
 Each is judged by Baarda's w, its residual over the standard deviation of that residual, sigma sqrt(r) with
 the standard deviation stated for it and its redundancy number r. A value with r = 0 is met exactly whatever
@@ -16,23 +17,30 @@ import numpy as np
 
 from sfm.adjustment.reliability import UNCONTROLLED, standardised_of_given
 from sfm.adjustment.weighted import inverse_of_observed
-from sfm.conventions import FloatArray
+from sfm.conventions import FloatArray, IntArray, angles_from_rotation
 from sfm.report.result import SurveyResult
 
 NOT_CHECKED = "not checked"
+EXTERIOR = (("projection centre", ("X0", "Y0", "Z0")), ("rotation", ("omega", "phi", "kappa")))
 
 
 @dataclass(frozen=True)
 class GivenResiduals:
-    """Residuals of given values of one kind; d = 3 coordinates of a control point, else 1."""
+    """Residuals of given values of one kind; d = 3 coordinates or angles of a point or photograph, else 1."""
 
-    names: tuple[str, ...]  # control point, both ends of a bar, or parameter and camera in words, (n,)
+    names: tuple[str, ...]  # control point, both ends of a bar, parameter and camera, or photograph, (n,)
     units: tuple[str, ...]  # (n,)
     given: FloatArray  # (n, d)
     difference: FloatArray  # adjusted minus given, (n, d)
     sigma: FloatArray  # given standard deviation; NaN where not observed, 0 where fixed, (n, d)
     r: FloatArray  # redundancy number; NaN where fixed or not observed, (n, d)
     w: FloatArray  # difference over sigma sqrt(r); NaN where not checked, (n, d)
+
+    def select(self, rows: IntArray) -> GivenResiduals:
+        """Return the residuals that an index names."""
+        names, units = (tuple(words[k] for k in rows) for words in (self.names, self.units))
+        values = (x[rows] for x in (self.given, self.difference, self.sigma, self.r, self.w))
+        return GivenResiduals(names, units, *values)
 
     def worst(self) -> tuple[int, float] | None:
         """Return the index with the largest |w|, and it; None where nothing is checked."""
@@ -107,17 +115,45 @@ def interior_residuals(result: SurveyResult) -> GivenResiduals | None:
     return GivenResiduals(tuple(names), tuple(units), given, difference, sigma, r, w)
 
 
+def exterior_residuals(result: SurveyResult) -> tuple[GivenResiduals, GivenResiduals] | None:
+    """Return by how much projection centres and angles (deg) differ from those observed; None without."""
+    a, seen = result.adjustment, result.adjustment.network.exterior
+    if not len(seen):
+        return None
+    variance = np.einsum("eii->ei", seen.covariance)
+    position, rotation = a.estimate.position[seen.image], a.estimate.rotation[seen.image]
+    angles = (angles_from_rotation(rotation) - seen.angles + np.pi) % (2 * np.pi) - np.pi
+    v = np.where(np.isfinite(variance), np.hstack([position - seen.position, angles]), 0.0)
+    weight, _ = inverse_of_observed(seen.covariance)
+    w, r = standardised_of_given(v, weight, a.covariance.exterior[seen.image] / a.sigma0**2)
+    given = np.where(np.isfinite(variance), np.hstack([seen.position, seen.angles]), np.nan)
+    sigma = np.sqrt(np.where(np.isfinite(variance), variance, np.nan))
+    v = np.where(np.isfinite(variance), v, np.nan)
+    names = tuple(a.network.images[i] for i in seen.image)
+
+    def part(rows: slice, unit: str, factor: float) -> GivenResiduals:
+        values, differences, sigmas = (factor * x[:, rows] for x in (given, v, sigma))
+        units = (unit,) * len(names)
+        return GivenResiduals(names, units, values, differences, sigmas, r[:, rows], w[:, rows])
+
+    return part(slice(0, 3), result.length_unit, 1.0), part(slice(3, 6), "deg", np.degrees(1.0))
+
+
 def given_rows(result: SurveyResult) -> Iterable[Sequence[object]]:
     """Return kind, name, coordinate, unit, given value, difference, sigma, r and w of every given value."""
+    exterior = exterior_residuals(result) or (None, None)
     for kind, found, coordinates in (
         ("control point", control_residuals(result), "XYZ"),
         ("scale bar", bar_residuals(result), ("length",)),
         ("interior orientation", interior_residuals(result), ("value",)),
+        *((kind, found, names) for (kind, names), found in zip(EXTERIOR, exterior, strict=True)),
     ):
         if found is None:
             continue
         for k, name in enumerate(found.names):
             for d, coordinate in enumerate(coordinates):
+                if np.isnan(found.sigma[k, d]):  # not observed
+                    continue
                 values = (x[k, d] for x in (found.given, found.difference, found.sigma, found.r, found.w))
                 yield (kind, name, coordinate, found.units[k], *values)
 

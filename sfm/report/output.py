@@ -28,7 +28,6 @@ WRITTEN = (
     "given.csv",
     "reliability.csv",
     "variance_components.csv",
-    "observed_exterior.csv",
     "report.txt",
     "points.ply",
     "report.html",

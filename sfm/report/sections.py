@@ -81,8 +81,8 @@ def coordinates_section(result: SurveyResult, *, has_model: bool) -> str:
         ),
         (
             "given.csv",
-            "control, scale bars and interior orientation that took part: given value, difference, standard "
-            "deviation, redundancy number, w",
+            "control, scale bars, interior and exterior orientation that took part: given value, difference, "
+            "standard deviation, redundancy number, w",
         ),
         (
             "reliability.csv",
@@ -94,9 +94,6 @@ def coordinates_section(result: SurveyResult, *, has_model: bool) -> str:
         ("report.txt", "the bundle report on one page of plain text"),
         ("summary.json", "the figures of this page for programs"),
     ]
-    if len(result.adjustment.network.exterior):
-        what = "observed exterior orientation: given, residual, redundancy number, w"
-        listed.insert(-3, ("observed_exterior.csv", what))
     if result.comparison is not None and has_model:
         what = (
             f"the solution that was compared, in COLMAP's camera model ({result.comparison.model}): free "

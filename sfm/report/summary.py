@@ -16,8 +16,7 @@ from sfm.report.checks import (
     count_observations,
     sigma0_ratio,
 )
-from sfm.report.given import bar_residuals, control_residuals, interior_residuals
-from sfm.report.observed_exterior import exterior_summary
+from sfm.report.given import EXTERIOR, bar_residuals, control_residuals, given_rows, interior_residuals
 from sfm.report.result import SurveyResult
 from sfm.report.statistics import (
     parameter_sigmas,
@@ -93,7 +92,7 @@ def summary(result: SurveyResult) -> dict[str, Any]:
         "control": _control(result),
         "scale_bars": _scale_bars(result),
         "weighted_interior": _weighted_interior(result),
-        "observed_exterior": exterior_summary(result),
+        "observed_exterior": _observed_exterior(result),
         "eccentricity": _eccentricity(result),
         "no_circles": list(result.no_circles),
         "comparison": comparison_summary(result),
@@ -269,6 +268,16 @@ def _weighted_interior(result: SurveyResult) -> list[dict[str, Any]]:
             "w": or_none(found.w[q, 0]),
         }
         for q, name in enumerate(found.names)
+    ]
+
+
+def _observed_exterior(result: SurveyResult) -> list[dict[str, Any]]:
+    names = ("image", "parameter", "unit", "given", "difference", "sigma", "r", "w")
+    kinds = [kind for kind, _ in EXTERIOR]
+    return [
+        dict(zip(names, (*row[1:4], *(or_none(float(str(value))) for value in row[4:])), strict=True))
+        for row in given_rows(result)
+        if row[0] in kinds
     ]
 
 

@@ -15,7 +15,6 @@ from sfm.adjustment.result import Adjustment
 from sfm.conventions import FloatArray, angles_from_rotation
 from sfm.file_values import csv_text
 from sfm.report.given import given_rows
-from sfm.report.observed_exterior import HEADER, exterior_rows
 from sfm.report.result import SurveyResult
 from sfm.report.statistics import Statistics, parameter_sigmas, statistics_of
 
@@ -56,8 +55,6 @@ def write_tables(result: SurveyResult, folder: Path) -> None:
         "kind,group,observations,redundancy,sigma0",
         component_rows(statistics),
     )
-    if len(adjustment.network.exterior):
-        _write_csv(folder / "observed_exterior.csv", HEADER, exterior_rows(result))
     write_ply(folder / "points.ply", result)
 
 

@@ -15,9 +15,14 @@ from sfm.report.checks import (
     object_size,
     sigma0_ratio,
 )
-from sfm.report.given import bar_residuals, control_residuals, interior_residuals
+from sfm.report.given import (
+    EXTERIOR,
+    bar_residuals,
+    control_residuals,
+    exterior_residuals,
+    interior_residuals,
+)
 from sfm.report.markup import finer_unit, significant
-from sfm.report.observed_exterior import worst_exterior
 from sfm.report.result import SurveyResult
 from sfm.report.statistics import kinds_over_stated
 
@@ -178,14 +183,18 @@ def _kinds(result: SurveyResult) -> Judged:
 
 def _exterior(result: SurveyResult) -> Judged:
     """Judge the residuals of observed exterior orientation."""
-    name, w = worst_exterior(result.adjustment)
-    if not w > WEIGHTED_REMARK:
-        return []
-    line = (
-        f"The given {name} differs from the adjusted one by {significant(w)} times the standard deviation of "
-        "its residual."
-    )
-    return [(w > WEIGHTED_BAD, line)]
+    judged: Judged = []
+    for found, (_, names) in zip(exterior_residuals(result) or (), EXTERIOR, strict=False):
+        worst = found.worst()
+        if worst is None or not worst[1] > WEIGHTED_REMARK:
+            continue
+        name = names[int(np.nanargmax(np.abs(found.w[worst[0]])))]
+        line = (
+            f"The given {name} of photograph {found.names[worst[0]]} differs from the adjusted one by "
+            f"{significant(worst[1])} times the standard deviation of its residual."
+        )
+        judged.append((worst[1] > WEIGHTED_BAD, line))
+    return judged
 
 
 def _rays(result: SurveyResult) -> Judged:
