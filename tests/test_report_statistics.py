@@ -24,7 +24,7 @@ from sfm.network import Estimate, InteriorObservations, Network, ObjectPoints, S
 from sfm.report.checks import count_observations, longest_residual, worst_residuals
 from sfm.report.given import bar_residuals, control_residuals, interior_residuals
 from sfm.report.html import render_html
-from sfm.report.markup import signed
+from sfm.report.markup import signed, significant
 from sfm.report.plots import all_plots, plan_axes
 from sfm.report.precision import point_precision, without_fixed
 from sfm.report.result import ControlCheck, Eccentricity, SurveyResult
@@ -219,6 +219,53 @@ def test_sigma_px_is_only_a_guess(synthetic: tuple[Network, Estimate]) -> None:
         assert not global_test(a).passed
         levels[guess] = verdict_of(result_of(a)).level
     assert levels == {4.0: "good", 1 / 1.5: "good", 1 / 3: "fair", 1 / 8: "bad"}
+
+
+@pytest.mark.parametrize(("guess", "told"), [(1.0, False), (1.8, False), (2.2, True), (4.0, True)])
+def test_a_sigma_that_is_far_too_large_is_told_with_what_it_would_be(
+    synthetic: tuple[Network, Estimate], guess: float, told: bool
+) -> None:
+    network, truth = synthetic
+    seen = network.image_points
+    stated = replace(network, image_points=replace(seen, covariance=seen.covariance * guess**2))
+    a = adjust(stated, truth, datum=Datum("free"), reject="none")
+    lines = verdict_of(result_of(a)).remarks
+    ratio = a.sigma0
+    line = (
+        f"The stated standard deviation of the image points, {significant(guess * NOISE_PX)} px, is "
+        f"pessimistic: their residuals show {significant(ratio * guess * NOISE_PX)} px."
+    )
+    assert list(lines) == ([line] if told else [])
+    # the same where the image points were weighted by their own component before
+    weighed = replace(network, image_points=replace(seen, covariance=seen.covariance * (ratio * guess) ** 2))
+    b = adjust(weighed, truth, datum=Datum("free"), reject="none")
+    assert verdict_of(result_of(b, weight_factor=ratio)).remarks == lines
+
+
+@pytest.mark.parametrize(
+    ("bad", "guess", "told"), [(0, 1.0, ""), (6, 1.0, "w"), (6, 5.0, "tau"), (0, 0.5, "")]
+)
+def test_gross_errors_that_nobody_looked_for_are_counted(
+    synthetic: tuple[Network, Estimate], bad: int, guess: float, told: str
+) -> None:
+    """Of 1 px; where sigma is stated five times too large only tau sees them; too small, none is seen."""
+    network, truth = synthetic
+    seen = network.image_points
+    xy = seen.xy.copy()
+    xy[seed_of("not looked for").choice(len(xy), bad, replace=False), 0] += 1.0
+    spoiled = replace(seen, xy=xy, covariance=guess**2 * seen.covariance)
+    a = adjust(replace(network, image_points=spoiled), truth, datum=Datum("free"), reject="none")
+    lines = [line for line in verdict_of(result_of(a, reject="none")).remarks if "adjust.reject" in line]
+    assert not any("adjust.reject" in line for line in verdict_of(result_of(a)).remarks)
+    if not told:
+        assert lines == []
+        return
+    test = {"tau": tau_test, "w": w_test}[told](a)
+    assert test.beyond >= bad
+    assert lines == [
+        f"{test.beyond} of {test.tested} image coordinates have |{told}| beyond {test.critical:.2f} "
+        f'({test.expected:.1f} by chance), none was rejected: adjust.reject = "tau" takes out gross errors.'
+    ]
 
 
 def test_weights_found_from_the_residuals_do_not_hide_sigma0(synthetic: tuple[Network, Estimate]) -> None:

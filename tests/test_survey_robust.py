@@ -10,6 +10,7 @@ from surveys import write_observed_survey
 
 from sfm.pipeline import adjust_survey
 from sfm.project import read_survey
+from sfm.report.verdict import verdict_of
 
 SPOILED = 12  # image points, each 8 px off, of 240
 
@@ -26,7 +27,10 @@ def test_gross_errors_are_treated_as_the_survey_says(tmp_path: Path, reject: str
     table.write_text("\n".join([header, *rows]) + "\n", encoding="utf-8")
     with path.open("a", encoding="utf-8") as file:
         file.write(f'[adjust]\nreject = "{reject}"\n')
-    a = adjust_survey(read_survey(path)).adjustment
+    result = adjust_survey(read_survey(path))
+    a = result.adjustment
+    told = [line for line in verdict_of(result).remarks if "adjust.reject" in line]
+    assert len(told) == (reject == "none")
     spoiled = np.isin(np.arange(len(rows)), bad)
     assert a.converged and len(a.rejected) == len(rows)
     if reject in ("tau", "tukey"):

@@ -21,6 +21,7 @@ from sfm.camera import Camera
 from sfm.conventions import FloatArray, IntArray
 
 ALPHA = 0.001  # Baarda's usual probability of rejecting a good observation
+FAR_MORE = 2.0  # coordinates beyond the critical value over those expected by chance
 GLOBAL_ALPHA = 0.05  # of the global test and of the significance of parameters
 POWER = 0.8  # and of finding a gross error of the minimal detectable size
 STRONG = 0.95  # correlation from which two parameters are reported
@@ -54,6 +55,14 @@ class CoordinateTest:
     def expected(self) -> float:
         """How many would be beyond the critical value by chance."""
         return self.alpha * self.tested
+
+    @property
+    def far_more(self) -> bool:
+        """Whether far more are beyond it: more than FAR_MORE times as many, by chance once in 1 / ALPHA."""
+        return bool(
+            self.beyond > FAR_MORE * self.expected
+            and stats.poisson.sf(self.beyond - 1, self.expected) < ALPHA
+        )
 
 
 @dataclass(frozen=True)

@@ -7,8 +7,9 @@ from typing import Literal
 
 import numpy as np
 
-from sfm.adjustment.statistics import ALPHA, component_tests
+from sfm.adjustment.statistics import ALPHA, component_tests, tau_test, w_test
 from sfm.adjustment.variance_components import IMAGE_POINTS
+from sfm.conventions import MAD_TO_SIGMA
 from sfm.report.checks import (
     check_over_sigma,
     longest_residual,
@@ -32,6 +33,8 @@ MOST_NAMES = 5  # points named in one remark
 # sigma_px is a rough guess, so the global test alone says little. Twice the guess is worth a look; five
 # times is no precision that anybody expected, but a wrong model, wrong names or wrong control.
 SIGMA0_REMARK, SIGMA0_BAD = 2.0, 5.0
+SIGMA0_LOW = 0.5  # the same times too cautious
+AS_STATED = 1.5  # standard deviation of w by its median, up to which image points are about as stated
 # Data snooping leaves nothing beyond 4 or 5 sigma; ten is an outlier, thirty is a mistake that was kept.
 RESIDUAL_REMARK, RESIDUAL_BAD = 10.0, 30.0
 WEIGHTED_REMARK, WEIGHTED_BAD = 5.0, 30.0  # w of control, scale bars, interior orientation
@@ -45,7 +48,7 @@ class Verdict:
 
     level: Literal["good", "fair", "bad"]
     headline: str
-    remarks: tuple[str, ...]  # what to look at, one line each
+    remarks: tuple[str, ...]  # what to look at or to know, one line each
 
 
 def verdict_of(result: SurveyResult) -> Verdict:
@@ -69,7 +72,18 @@ def verdict_of(result: SurveyResult) -> Verdict:
             f"Rank defect {a.defect}, expected {a.expected_defect}; not everything can be determined{what}."
         )
     remarks: list[str] = []
-    for judge in (_sigma0, _residual, _rays, _control, _bars, _interior, _exterior, _kinds, _check):
+    for judge in (
+        _sigma0,
+        _residual,
+        _untested,
+        _rays,
+        _control,
+        _bars,
+        _interior,
+        _exterior,
+        _kinds,
+        _check,
+    ):
         for is_bad, line in judge(result):
             (serious if is_bad else remarks).append(line)
     if oriented < total:
@@ -83,12 +97,13 @@ def verdict_of(result: SurveyResult) -> Verdict:
         more = len(result.warnings) - 1
         other = f" ({more} more warning{'s' if more > 1 else ''}, see below)" if more else ""
         remarks.append(f"Warning: {result.warnings[0].rstrip('.')}{other}.")
+    notes = _pessimistic(result)
     if serious:
-        return Verdict("bad", "The survey has no dependable result.", (*serious, *remarks))
+        return Verdict("bad", "The survey has no dependable result.", (*serious, *remarks, *notes))
     found = f"{oriented} of {total} photographs oriented, {len(a.network.points)} object points"
     if remarks:
-        return Verdict("fair", f"The survey worked, with remarks: {found}.", tuple(remarks))
-    return Verdict("good", f"The survey worked: {found}.", ())
+        return Verdict("fair", f"The survey worked, with remarks: {found}.", (*remarks, *notes))
+    return Verdict("good", f"The survey worked: {found}.", notes)
 
 
 Judged = list[tuple[bool, str]]  # whether the result cannot be depended on, and why
@@ -123,6 +138,42 @@ def _residual(result: SurveyResult) -> Judged:
         "the standard deviation, and was not rejected."
     )
     return [(ratio > RESIDUAL_BAD, line)]
+
+
+def _untested(result: SurveyResult) -> Judged:
+    """Judge what the tests of single image coordinates show where the survey rejects nothing.
+
+    Tau is blind where gross errors are so many that they make sigma0; w tells then, if the bulk of the
+    image points is as good as stated.
+    """
+    if result.reject != "none":
+        return []
+    a = result.adjustment
+    tests = [("tau", tau_test(a))]
+    w = w_test(a)
+    if w.tested and MAD_TO_SIGMA * np.nanmedian(np.abs(w.statistic)) < AS_STATED:
+        tests.append(("w", w))
+    name, most = max(tests, key=lambda one: one[1].beyond)
+    if not most.far_more:
+        return []
+    line = (
+        f"{most.beyond} of {most.tested} image coordinates have |{name}| beyond {most.critical:.2f} "
+        f'({most.expected:.1f} by chance), none was rejected: adjust.reject = "tau" takes out gross errors.'
+    )
+    return [(False, line)]
+
+
+def _pessimistic(result: SurveyResult) -> tuple[str, ...]:
+    """Say if the image points are far better than stated, which is no fault of the result."""
+    a, ratio = result.adjustment, sigma0_ratio(result)
+    image = component_tests(kinds_over_stated(result), alpha=2 * ALPHA)[0]
+    if not (ratio < SIGMA0_LOW and image.statistic < image.lower):
+        return ()
+    stated = a.a_priori_px / result.weight_factor
+    return (
+        f"The stated standard deviation of the image points, {significant(stated)} px, is pessimistic: their "
+        f"residuals show {significant(ratio * stated)} px.",
+    )
 
 
 def _control(result: SurveyResult) -> Judged:
