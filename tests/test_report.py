@@ -90,7 +90,7 @@ def test_tables_give_back_every_number(result: SurveyResult, tmp_path: Path) -> 
     write_tables(result, tmp_path)
     a = result.adjustment
     points = rows_of(tmp_path / "points.csv")
-    assert list(points[0]) == ["id", "X", "Y", "Z", "sX", "sY", "sZ", "rays", "code"]
+    assert list(points[0]) == ["id", "X", "Y", "Z", "sX", "sY", "sZ", "rays", "code", "angle_deg", "rms_px"]
     assert [row["id"] for row in points] == list(a.network.points)
     np.testing.assert_array_equal([[float(row[c]) for c in "XYZ"] for row in points], a.estimate.points)
     variances = np.array([[float(row[f"s{c}"]) for c in "XYZ"] for row in points]) ** 2

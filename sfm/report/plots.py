@@ -12,9 +12,9 @@ from matplotlib.figure import Figure
 from sfm.adjustment.result import Adjustment
 from sfm.conventions import FloatArray, IntArray
 from sfm.network import Estimate
+from sfm.report.geometry import image_rms
 from sfm.report.pages import png
 from sfm.report.statistics import families, family_of_photographs
-from sfm.report.tables import image_rms
 
 BLUE, RED, GREY, GREEN, ORANGE = "#1f5fa8", "#c8372d", "#8a8f98", "#2b7a4b", "#d98a1f"
 CAMERA_COLOURS = (BLUE, ORANGE, GREEN, "#7a4fa3", "#b0567a")

@@ -11,6 +11,7 @@ from sfm.report.markup import finer_unit, raised, signed, significant, table, wi
 from sfm.report.observed_exterior import exterior_section
 from sfm.report.precision import point_precision, without_fixed
 from sfm.report.result import SurveyResult
+from sfm.report.section_geometry import geometry_section
 from sfm.report.section_given import NOTE, given_section
 from sfm.report.section_statistics import camera_notes, components, image_coordinates, worst
 from sfm.report.statistics import InteriorParameter, families, interior_parameters
@@ -37,7 +38,7 @@ def quality_section(result: SurveyResult, pictures: dict[str, str]) -> str:
         f"({escape(a.datum)}){fixed}; in a free network they say how the points lie to one another, not in "
         "an outer frame.</p>"
     )
-    text += given_section(result) + exterior_section(result)
+    text += geometry_section(result) + given_section(result) + exterior_section(result)
     text += image_coordinates(result)
     text += pictures.get("distribution", "") + pictures.get("residuals", "") + worst(result)
     text += "<h3>Cameras</h3>"

@@ -6,9 +6,9 @@ from html import escape
 
 import numpy as np
 
+from sfm.report.geometry import image_rms
 from sfm.report.markup import table
 from sfm.report.result import SurveyResult
-from sfm.report.tables import image_rms
 
 MAX_REJECTED_ROWS = 60
 

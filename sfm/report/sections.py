@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from html import escape
 
+from sfm.report.geometry import image_rms
 from sfm.report.markup import (
     data_url,
     file_url,
@@ -17,7 +18,6 @@ from sfm.report.result import SurveyResult
 from sfm.report.section_statistics import observations
 from sfm.report.statistics import datum_in_words
 from sfm.report.tables import (
-    image_rms,
     image_rows,
     point_rows,
 )
@@ -68,10 +68,11 @@ def coordinates_section(result: SurveyResult, *, has_model: bool) -> str:
     """
     unit = result.length_unit
     listed = [
-        ("points.csv", f"object points: X, Y, Z and standard deviations [{unit}], number of rays, code"),
+        ("points.csv", f"object points: X, Y, Z and standard deviations [{unit}], rays, code, angle, RMS"),
         (
             "images.csv",
-            f"exterior orientation: X, Y, Z [{unit}], omega, phi, kappa [deg], standard deviations",
+            f"exterior orientation: X, Y, Z [{unit}], omega, phi, kappa [deg], standard deviations, points, "
+            "RMS, coverage",
         ),
         ("cameras.csv", "interior orientation with standard deviations and units"),
         (
@@ -106,10 +107,11 @@ def coordinates_section(result: SurveyResult, *, has_model: bool) -> str:
     text += "</table>"
     rows = [
         (str(row[0]), *(to_precision(v, s) for v, s in zip(row[1:4], row[4:7], strict=True)),
-         *(significant(float(str(s))) for s in row[4:7]), str(row[7]), str(row[8]))
+         *(significant(float(str(s))) for s in row[4:7]), *_of_point(row[7:]))
         for row in _first(point_rows(result), MAX_POINT_ROWS)
     ]  # fmt: skip
-    header = ("point", *(f"{c} [{unit}]" for c in ("X", "Y", "Z", "sX", "sY", "sZ")), "rays", "code")
+    header = ("point", *(f"{c} [{unit}]" for c in ("X", "Y", "Z", "sX", "sY", "sZ")))
+    header = (*header, "rays", "code", "angle [deg]", "RMS [px]")
     text += (
         f"<details{' open' if len(rows) <= 60 else ''}><summary>{len(result.code)} object points</summary>"
     )
@@ -121,6 +123,7 @@ def coordinates_section(result: SurveyResult, *, has_model: bool) -> str:
             *(significant(float(str(s))) for s in row[7:13]),
             str(row[14]),
             f"{float(str(row[15])):.4f}",
+            f"{100 * float(str(row[16])):.0f}",
         )
         for row in _first(image_rows(result.adjustment), MAX_POINT_ROWS)
     ]
@@ -133,9 +136,16 @@ def coordinates_section(result: SurveyResult, *, has_model: bool) -> str:
         *(f"s {c} [deg]" for c in angles),
         "points",
         "RMS [px]",
+        "coverage [%]",
     )
     text += f"<details><summary>Exterior orientation of {len(images)} photographs</summary>"
     return text + table(header, images) + "</details>"
+
+
+def _of_point(cells: Sequence[object]) -> tuple[str, str, str, str]:
+    """Write rays, code, intersection angle and RMS of a point."""
+    rays, code, angle, rms = cells
+    return str(rays), str(code), f"{float(str(angle)):.1f}", f"{float(str(rms)):.3f}"
 
 
 def photographs_section(result: SurveyResult, overlays: Sequence[Overlay]) -> str:

@@ -18,6 +18,7 @@ from sfm.report.checks import (
 )
 from sfm.report.given import EXTERIOR, bar_residuals, control_residuals, given_rows, interior_residuals
 from sfm.report.result import SurveyResult
+from sfm.report.section_geometry import geometry_summary
 from sfm.report.statistics import (
     parameter_sigmas,
     quantiles,
@@ -89,6 +90,7 @@ def summary(result: SurveyResult) -> dict[str, Any]:
             for index, camera in enumerate(adjustment.estimate.cameras)
         ],
         "statistics": _statistics(result),
+        "geometry": geometry_summary(result),
         "control": _control(result),
         "scale_bars": _scale_bars(result),
         "weighted_interior": _weighted_interior(result),

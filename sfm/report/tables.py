@@ -14,6 +14,7 @@ import numpy as np
 from sfm.adjustment.result import Adjustment
 from sfm.conventions import FloatArray, angles_from_rotation
 from sfm.file_values import csv_text
+from sfm.report.geometry import geometry_of, image_rms
 from sfm.report.given import given_rows
 from sfm.report.result import SurveyResult
 from sfm.report.statistics import Statistics, parameter_sigmas, statistics_of
@@ -29,10 +30,11 @@ def write_tables(result: SurveyResult, folder: Path) -> None:
         folder: an existing folder.
     """
     adjustment = result.adjustment
-    _write_csv(folder / "points.csv", "id,X,Y,Z,sX,sY,sZ,rays,code", point_rows(result))
+    _write_csv(folder / "points.csv", "id,X,Y,Z,sX,sY,sZ,rays,code,angle_deg,rms_px", point_rows(result))
     _write_csv(
         folder / "images.csv",
-        "image,X,Y,Z,omega_deg,phi_deg,kappa_deg,sX,sY,sZ,somega_deg,sphi_deg,skappa_deg,camera,points,rms_px",
+        "image,X,Y,Z,omega_deg,phi_deg,kappa_deg,sX,sY,sZ,somega_deg,sphi_deg,skappa_deg,camera,points,rms_px"
+        ",coverage",
         image_rows(adjustment),
     )
     _write_csv(folder / "cameras.csv", "camera,parameter,value,sigma,unit", camera_rows(adjustment))
@@ -59,22 +61,23 @@ def write_tables(result: SurveyResult, folder: Path) -> None:
 
 
 def point_rows(result: SurveyResult) -> Iterable[Sequence[object]]:
-    """Return id, X, Y, Z, sX, sY, sZ, accepted rays and code number of every point."""
+    """Return id, X, Y, Z, sX, sY, sZ, accepted rays, code, intersection angle and RMS of every point."""
     adjustment = result.adjustment
-    seen = adjustment.network.image_points.select(~adjustment.rejected)
-    rays = np.bincount(seen.point, minlength=len(adjustment.network.points))
+    found = geometry_of(adjustment)
     sigma = point_sigmas(adjustment)
     for j, name in enumerate(adjustment.network.points):
         code = "" if result.code[j] == UNCODED else int(result.code[j])
-        yield (name, *adjustment.estimate.points[j], *sigma[j], int(rays[j]), code)
+        own = (int(found.rays[j]), code, found.angle_deg[j], found.point_rms_px[j])
+        yield (name, *adjustment.estimate.points[j], *sigma[j], *own)
 
 
 def image_rows(adjustment: Adjustment) -> Iterable[Sequence[object]]:
-    """Return exterior orientation, sigmas, camera, number of points and RMS of every photograph."""
+    """Return exterior orientation, sigmas, camera, number of points, RMS and coverage of every photograph."""
     network, estimate = adjustment.network, adjustment.estimate
     angles = np.degrees(angles_from_rotation(estimate.rotation))
     sigma = _sqrt_diagonal(adjustment.covariance.exterior)
-    rms, count = image_rms(adjustment)
+    _, count = image_rms(adjustment)
+    found = geometry_of(adjustment)
     for i, name in enumerate(network.images):
         yield (
             name,
@@ -84,7 +87,8 @@ def image_rows(adjustment: Adjustment) -> Iterable[Sequence[object]]:
             *np.degrees(sigma[i, 3:]),
             estimate.cameras[network.camera[i]].name,
             int(count[i]),
-            rms[i],
+            found.image_rms_px[i],
+            found.hull[i],
         )
 
 
@@ -149,17 +153,6 @@ def component_rows(statistics: Statistics) -> Iterable[Sequence[object]]:
 def point_sigmas(adjustment: Adjustment) -> FloatArray:
     """Return the standard deviations of X, Y, Z, object unit, (n, 3)."""
     return _sqrt_diagonal(adjustment.covariance.points)
-
-
-def image_rms(adjustment: Adjustment) -> tuple[FloatArray, FloatArray]:
-    """Return RMS residual per coordinate (px) and number of the accepted image points by photograph, (m,)."""
-    m = len(adjustment.network.images)
-    image = adjustment.network.image_points.image[~adjustment.rejected]
-    squares = (adjustment.residuals[~adjustment.rejected] ** 2).sum(axis=1)
-    count = np.bincount(image, minlength=m).astype(float)
-    total = np.bincount(image, weights=squares, minlength=m)
-    rms = np.sqrt(np.divide(total, 2 * count, out=np.full(m, np.nan), where=count > 0))
-    return rms, count
 
 
 def write_ply(path: Path, result: SurveyResult) -> None:

@@ -27,6 +27,7 @@ from sfm.report.markup import finer_unit, significant, with_exponent
 from sfm.report.observed_exterior import exterior_text
 from sfm.report.precision import adjusted_sigmas, point_precision, root_mean_squares, without_fixed
 from sfm.report.result import SurveyResult
+from sfm.report.section_geometry import geometry_text
 from sfm.report.statistics import (
     Statistics,
     datum_in_words,
@@ -36,7 +37,6 @@ from sfm.report.statistics import (
     words_of_test,
     words_of_weights,
 )
-from sfm.report.tables import image_rms
 from sfm.report.text_lines import MOST_ROWS, WIDTH, columns, head, line, wrapped
 from sfm.report.verdict import verdict_of
 
@@ -61,6 +61,7 @@ def text_report(result: SurveyResult) -> str:
         _components(result, statistics),
         _interior(result, statistics),
         _points(result),
+        geometry_text(result),
         _given(result),
         exterior_text(result),
         _worst(result),
@@ -243,13 +244,10 @@ def _points(result: SurveyResult) -> list[str]:
         ("projection centres, RMS sigma", *(significant(v) for v in root_mean_squares(centres)), unit),
         ("omega, phi, kappa, RMS sigma", *(significant(v) for v in root_mean_squares(angles)), "arc seconds"),
     ]
-    rms, _ = image_rms(a)
-    worst = int(np.nanargmax(rms))
     return [
         *head("Precision of the unknowns"),
         *columns(("", "X", "Y", "Z", "all", "unit"), rows, left=1),
         *([f"  RMS {without_fixed(a)}"] if without_fixed(a) else []),
-        f"  worst photograph: {a.network.images[worst]}, RMS residual {rms[worst]:.4f} px",
     ]
 
 

@@ -19,6 +19,11 @@ def line(name: str, text: str) -> str:
     return f"  {name:<21} {text}"
 
 
+def lines(name: str, text: str) -> list[str]:
+    """Return the same on as many lines as it needs, one below the other."""
+    return wrapped(line(name, text), behind=len(line("", "")))
+
+
 def columns(header: Sequence[str], rows: Iterable[Sequence[str]], *, left: int) -> list[str]:
     """Return rows in columns; the first `left` ones set to the left, numbers to the right."""
     cells = [tuple(header), *(tuple(row) for row in rows)]
@@ -33,9 +38,9 @@ def columns(header: Sequence[str], rows: Iterable[Sequence[str]], *, left: int) 
     ]
 
 
-def wrapped(text: str) -> list[str]:
-    """Break a line between words; what follows stands behind its indentation."""
-    indent = " " * (len(text) - len(text.lstrip()) + 2)
+def wrapped(text: str, *, behind: int | None = None) -> list[str]:
+    """Break a line between words; what follows stands behind so many spaces, two more than it has if None."""
+    indent = " " * (len(text) - len(text.lstrip()) + 2 if behind is None else behind)
     lines, rest = [], text
     while len(rest) > WIDTH:
         cut = rest.rfind(" ", len(indent) + 1, WIDTH)

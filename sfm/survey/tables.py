@@ -112,7 +112,7 @@ def read_points(path: Path) -> PointTable:
         ("point",),
         ("X", "Y", "Z"),
         aliases=(("id", "point"),),
-        ignored=("sX", "sY", "sZ", "rays", "code"),
+        ignored=("sX", "sY", "sZ", "rays", "code", "angle_deg", "rms_px"),
     )
     return PointTable(table.keys("point"), table.values, np.zeros_like(table.values))
 
@@ -123,7 +123,7 @@ def read_exterior(path: Path) -> ExteriorTable:
     Raises:
         SurveyFileError: unreadable, wrong columns, not a finite number or a duplicate image.
     """
-    ignored = ("camera", *SIGMAS_OF_AXES, *SIGMAS_OF_ANGLES, "points", "rms_px")
+    ignored = ("camera", *SIGMAS_OF_AXES, *SIGMAS_OF_ANGLES, "points", "rms_px", "coverage")
     table = read_table(path, ("image",), (*AXES, *ANGLES), ignored=ignored)
     rotation = [rotation_from_angles(*row) for row in np.radians(table.values[:, 3:])]
     return ExteriorTable(
@@ -154,7 +154,7 @@ def read_observed_exterior(path: Path) -> ObservedExteriorTable:
         columns,
         tuple(name for name in (*SIGMAS_OF_AXES, *ANGLES, *SIGMAS_OF_ANGLES) if name not in columns),
         aliases=aliases,
-        ignored=("camera", "points", "rms_px"),
+        ignored=("camera", "points", "rms_px", "coverage"),
         blank=columns,
     )
     value, sigma = np.full((len(table.line), 6), np.nan), np.full((len(table.line), 6), np.inf)
