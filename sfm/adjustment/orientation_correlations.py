@@ -20,6 +20,7 @@ from sfm.adjustment.iterate import optimum_at, problem_of
 from sfm.adjustment.parameters import angle_jacobian, interior_names, unknowns_of
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.statistics import STRONG
+from sfm.adjustment.threads import own_threads
 from sfm.adjustment.weighted import weighted_of
 from sfm.conventions import FloatArray
 from sfm.errors import GeometryError
@@ -55,7 +56,8 @@ def orientation_correlations(
     Raises:
         GeometryError: its normal equations cannot be solved.
     """
-    names, rho = _correlations(adjustment)
+    with own_threads():
+        names, rho = _correlations(adjustment)
     if not rho.size:
         return ()
     images = adjustment.network.images
