@@ -13,6 +13,7 @@ from adapters.photomodeler import read_photomodeler
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
+from sfm.network import ObjectPoints
 from sfm.report.geometry import Geometry, geometry_of, hull_area, intersection_angles
 from sfm.report.html import render_html
 from sfm.report.result import SurveyResult
@@ -117,6 +118,18 @@ def test_coverage_is_that_of_the_whole_photograph() -> None:
     assert found.coverage[0].hull_of_all == pytest.approx(whole)
     assert found.coverage[0].radius[2] == pytest.approx(1, abs=1e-3)
     assert (np.delete(found.hull, 2) < 0.9).all()
+
+
+def test_points_with_one_ray_each_have_no_angle() -> None:
+    network, truth = make_network(seed_of("one ray each"), images=2, points=20, free=())
+    control = ObjectPoints(np.arange(20), truth.points, np.zeros((20, 3, 3)))
+    seen = network.image_points
+    network = replace(network, image_points=seen.select(seen.point % 2 == seen.image), control=control)
+    result = result_of(adjust(network, truth, datum=Datum("control"), reject="none"))
+    assert np.isnan(geometry_of(result.adjustment).angle_deg).all()
+    assert "intersection angle    not known\n" in text_report(result)
+    assert summary(result)["geometry"]["intersection_angle_deg"]["max"] is None
+    assert "not known" in render_html(result, (), ())
 
 
 def test_many_numbers_of_rays_are_told_in_ranges() -> None:

@@ -83,14 +83,13 @@ def _facts(result: SurveyResult, found: Geometry) -> list[tuple[str, str]]:
     names = ", ".join(f"{network.points[j]} ({found.angle_deg[j]:.1f})" for j in weak[:MOST_NAMES])
     more = " ..." if len(weak) > MOST_NAMES else ""
     told = f"{len(weak)} points: {names}{more}" if len(weak) else "none"
-    angles, mean = _between(found.angle_deg, network.points, "deg", 1), np.nanmean(found.angle_deg)
+    points = tuple(f"point {name}" for name in network.points)
+    known = found.angle_deg[np.isfinite(found.angle_deg)]
+    mean = f", mean {known.mean():.1f} deg; below {WEAK_DEG:g} deg: {told}" if len(known) else ""
     return [
         ("rays of a point", f"{found.rays.min()} to {found.rays.max()}, mean {found.rays.mean():.1f}"),
-        (
-            "intersection angle",
-            f"{angles}, mean {mean:.1f} deg; below {WEAK_DEG:g} deg: {told}",
-        ),
-        ("RMS by point", f"{_between(found.point_rms_px, network.points, 'px', 4)} per coordinate"),
+        ("intersection angle", _between(found.angle_deg, points, "deg", 1) + mean),
+        ("RMS by point", f"{_between(found.point_rms_px, points, 'px', 4)} per coordinate"),
         ("RMS by photograph", f"{_between(found.image_rms_px, network.images, 'px', 4)} per coordinate"),
         *((f"coverage {one.camera}", _covered(one)) for one in found.coverage),
     ]
