@@ -305,6 +305,28 @@ def test_each_kind_is_tested_against_what_was_stated_in_the_same_words_everywher
         assert written["sigma0_by_kind"]["image points"] == pytest.approx(written["sigma0_ratio"], rel=1e-6)
 
 
+@pytest.mark.parametrize("reject", ["huber", "tukey"])
+def test_the_global_test_of_an_m_estimator_is_left_out_with_the_reason(
+    synthetic: tuple[Network, Estimate], reject: str
+) -> None:
+    network, truth = synthetic
+    reason = "not tested, the weights come from the residuals, so that v'Pv is not chi-square distributed"
+    for one, of in (
+        (network, "all observations"),
+        (with_bars(network, truth, (0.0, 1e-5), 1e-4), "image points"),
+    ):
+        result = result_of(adjust(one, truth, datum=Datum("free"), reject=reject))
+        first, *other = statistics_of(result).global_tests
+        assert first.passed is None and all(test.passed for test in other)
+        assert words_of_test(first) == f"{of}: {reason}"
+        written = summary(result)["statistics"]["global_tests"][0]
+        assert written["passed"] is None and written["words"] == words_of_test(first)
+        assert words_of_test(first) in " ".join(text_report(result).split())
+        assert escape(words_of_test(first), quote=False) in render_html(result, (), ())
+        assert len(other) == len(one.scale_bars) // 2
+        assert verdict_of(result).level == "good"
+
+
 def test_bars_that_are_all_a_little_too_bad_are_noticed(synthetic: tuple[Network, Estimate]) -> None:
     network, truth = synthetic
     errors = 3e-4 * np.array([1, -1, 1, -1, 1, -1])

@@ -36,7 +36,7 @@ class Adjustment:
     rejected: BoolArray  # image points that took no part, (k,)
     redundancy_numbers: FloatArray  # of each image coordinate, 0 to 1; NaN where rejected, (k, 2)
     sigma_px: float  # a priori standard deviation of unit weight, px
-    sigma0: float  # a posteriori over a priori standard deviation of unit weight
+    sigma0: float  # a posteriori over a priori standard deviation of unit weight, `inflation` included
     redundancy: int  # observations and constraints minus unknowns
     unknowns: int  # all adjusted parameters
     observations: int  # scalar observations used: image coordinates, weighted parameters, scale bars
@@ -46,6 +46,8 @@ class Adjustment:
     weights: FloatArray = field(default_factory=lambda: np.zeros(0))  # factor on the weight of each image
     # point: 0 where rejected, between 0 and 1 by reweighting, else 1, (k,)
 
+    inflation: float = 1.0  # of standard deviations by an M-estimator, over those that v'Pv with its weights
+    # gives; see `robust.inflation`; 1 with least squares
     bar_redundancy: FloatArray = field(default_factory=lambda: np.zeros(0))  # redundancy number of each scale
     # bar, 0 to 1; NaN where it took no part, (b,)
     datum_points: BoolArray | None = None  # object points that carry the datum; all if None, (n,)
@@ -54,7 +56,12 @@ class Adjustment:
     @property
     def vPv(self) -> float:
         """Weighted sum of squared residuals of all observations, a priori unit weight."""
-        return self.sigma0**2 * self.redundancy
+        return (self.sigma0 / self.inflation) ** 2 * self.redundancy
+
+    @property
+    def reweighted(self) -> bool:
+        """Whether the weights of image points come from their residuals, as with an M-estimator."""
+        return self.inflation != 1.0
 
     @property
     def steps(self) -> str:

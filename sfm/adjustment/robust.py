@@ -10,8 +10,8 @@ beyond TUKEY standard deviations an image point has weight 0. It starts from Hub
 has many minima, and both take their scale from the median of the residuals.
 
 Source: Pope (1976), NOAA TR NOS 65 NGS 1; Kok (1984), On data snooping and multiple outlier testing;
-Huber (1981), Robust Statistics, ch. 7; Beaton and Tukey (1974), Technometrics 16(2), for the biweight;
-Maronna et al. (2019), Robust Statistics, sec. 2.3, for efficiency.
+Huber and Ronchetti (2009), Robust Statistics, ch. 7; Beaton and Tukey (1974), Technometrics 16(2), for
+the biweight; Maronna et al. (2019), Robust Statistics, sec. 2.3, for efficiency.
 """
 
 from __future__ import annotations
@@ -87,6 +87,56 @@ def tukey_weights(obs: Observations, residuals: FloatArray, *, sigma0: float) ->
     """
     share = _lengths(obs, residuals) / (TUKEY * sigma0)
     return np.where(share < 1.0, (1.0 - share**2) ** 2, 0.0)
+
+
+def huber_slopes(weight: FloatArray) -> FloatArray:
+    """Return the derivatives of psi(v) = w(|v|) v along v and across it, from Huber's weights, (k, 2)."""
+    return np.stack([np.where(weight < 1.0, 0.0, 1.0), weight], axis=1)
+
+
+def tukey_slopes(weight: FloatArray) -> FloatArray:
+    """Return the derivatives of psi(v) = w(|v|) v along v and across it, from Tukey's weights, (k, 2)."""
+    root = np.sqrt(weight)  # 1 - (|v| / TUKEY)^2
+    return np.stack([root * (5.0 * root - 4.0), weight], axis=1)
+
+
+def inflation(
+    obs: Observations,
+    residuals: FloatArray,
+    weight: FloatArray,
+    slopes: FloatArray,
+    *,
+    vPv: float,
+    observations: int,
+    redundancy: int,
+) -> float:
+    """Return by what to multiply sqrt(v'Pv / r) for the standard deviations of an M-estimator.
+
+    Its covariance is K^2 [sum psi^2 / r] / [mean psi']^2 (X'X)^-1, K = 1 + (u / n) var psi' / [mean psi']^2,
+    while v'Pv / r belongs to the cofactors (X'WX)^-1, which are (X'X)^-1 over the mean weight. It is
+    asymptotic: standard deviations are about 2 % too small where the redundancy is 3/4 of the observations,
+    and 3 % (Huber) to 8 % (Tukey) where it is 0.4 to 0.6 of them.
+
+    Args:
+        obs: image points.
+        residuals: v, px, shape (k, 2).
+        weight: of the estimator at its end, shape (k,).
+        slopes: psi' along and across the residual, shape (k, 2).
+        vPv: sum of squares of all observations with these weights; those that are no image points have 1.
+        observations: n, scalar observations of weight above 0.
+        redundancy: r = n - u.
+
+    Source: Huber and Ronchetti (2009), Robust Statistics, sec. 7.6, here for vectors in the plane.
+    """
+    used = weight > 0
+    w = weight[used]
+    others = observations - 2 * len(w)
+    psi2 = vPv - float((w * (1 - w)) @ _lengths(obs, residuals)[used] ** 2)
+    slope = np.concatenate([slopes[used].ravel(), np.ones(others)])
+    mean = float(slope.mean())
+    K = 1 + (observations - redundancy) / observations * float(slope.var()) / mean**2
+    mean_weight = (2 * float(w.sum()) + others) / observations
+    return float(np.sqrt(psi2 / vPv * mean_weight) * K / mean)
 
 
 def robust_scale(obs: Observations, residuals: FloatArray, used: BoolArray, *, freedom: float) -> float:

@@ -28,7 +28,15 @@ from sfm.adjustment.rank import rank_defect, undetermined_of
 from sfm.adjustment.reliability import redundancy_numbers as numbers_of
 from sfm.adjustment.reliability import redundancy_of_bars, standardised_residuals
 from sfm.adjustment.result import Adjustment, Covariance
-from sfm.adjustment.robust import huber_weights, robust_scale, snoop, tukey_weights
+from sfm.adjustment.robust import (
+    huber_slopes,
+    huber_weights,
+    inflation,
+    robust_scale,
+    snoop,
+    tukey_slopes,
+    tukey_weights,
+)
 from sfm.adjustment.threads import own_threads
 from sfm.adjustment.weighted import weighted_of
 from sfm.conventions import FloatArray
@@ -41,6 +49,7 @@ BENT = 2.0  # spread of residuals over that with the start values, above which g
 REWEIGHTINGS = 30
 REWEIGHTED = 1e-3  # largest change of a weight at which reweighting ends
 REJECTS = ("tau", "huber", "tukey", "none")
+SLOPES = {"huber": huber_slopes, "tukey": tukey_slopes}  # of the M-estimators
 
 
 def adjust(
@@ -103,7 +112,7 @@ def adjust(
             run.tolerance = tolerance
             optimum = run.again(optimum, weight)
         Q = cofactors(optimum, layout, cross=redundancy_numbers) if covariance else None
-        result = _result(local, start, run, optimum, weight, Q, sigma_px)
+        result = _result(local, start, run, optimum, weight, Q, sigma_px, SLOPES.get(reject))
     if centroid.any():
         _, adjusted = shifted(local, result.estimate, centroid)
         result = replace(result, network=network, estimate=adjusted)
@@ -266,16 +275,25 @@ def _result(
     weight: FloatArray,
     Q: Cofactors | None,
     sigma_px: float,
+    slopes: Callable[[FloatArray], FloatArray] | None,
 ) -> Adjustment:
     layout = run.problem.layout
     redundancy = run.redundancy(optimum, weight)
+    observations = 2 * int((weight > 0).sum()) + run.problem.weighted.count
     sigma0 = float(np.sqrt(optimum.vPv / redundancy)) if redundancy > 0 else float("nan")
+    v = residuals(layout.obs, optimum.state)
+    factor = 1.0
+    if slopes is not None and redundancy > 0:
+        factor = inflation(
+            layout.obs, v, weight, slopes(weight),
+            vPv=optimum.vPv, observations=observations, redundancy=redundancy,
+        )  # fmt: skip
+        sigma0 *= factor
     k, n, m = len(weight), len(network.points), len(network.images)
     back = np.empty(k, dtype=np.int64)  # place of each image point of the network in the layout
     back[layout.order] = np.arange(k)
     numbers = standardised = np.full((k, 2), np.nan)
     of_bars = np.full(len(network.scale_bars), np.nan)
-    v = residuals(layout.obs, optimum.state)
     if Q is None:
         empty = np.full((n, 3, 3), np.nan)
         interior = tuple(np.full((len(free), len(free)), np.nan) for free in layout.interior_free)
@@ -309,10 +327,11 @@ def _result(
         sigma0=sigma0,
         redundancy=redundancy,
         unknowns=layout.count,
-        observations=2 * int((weight > 0).sum()) + run.problem.weighted.count,
+        observations=observations,
         covariance=result,
         standardised=standardised,
         weights=np.take(weight, back, axis=0),
+        inflation=factor,
         bar_redundancy=of_bars,
         datum_points=run.problem.datum.points,
         remarks=run.remarks,

@@ -9,18 +9,19 @@ NGS 1; Luhmann et al., Close-Range Photogrammetry (2020), sec. 2.4.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import stats
 
 from sfm.adjustment.reliability import UNCONTROLLED, tau_critical
 from sfm.adjustment.result import Adjustment
-from sfm.adjustment.variance_components import VarianceComponents
+from sfm.adjustment.variance_components import IMAGE_POINTS, VarianceComponents
 from sfm.camera import Camera
 from sfm.conventions import FloatArray, IntArray
 
 ALPHA = 0.001  # Baarda's usual probability of rejecting a good observation
+REWEIGHTED = "the weights come from the residuals, so that v'Pv is not chi-square distributed"
 FAR_MORE = 2.0  # coordinates beyond the critical value over those expected by chance
 GLOBAL_ALPHA = 0.05  # of the global test and of the significance of parameters
 POWER = 0.8  # and of finding a gross error of the minimal detectable size
@@ -105,10 +106,13 @@ def global_test(adjustment: Adjustment, *, alpha: float = GLOBAL_ALPHA) -> Globa
         adjustment: the adjustment.
         alpha: probability of rejecting a right model.
     """
-    return _chi_square("all observations", adjustment.sigma0, adjustment.redundancy, alpha)
+    test = _chi_square("all observations", adjustment.sigma0, adjustment.redundancy, alpha)
+    return replace(test, passed=None, reason=REWEIGHTED) if adjustment.reweighted else test
 
 
-def component_tests(components: VarianceComponents, *, alpha: float = GLOBAL_ALPHA) -> tuple[GlobalTest, ...]:
+def component_tests(
+    components: VarianceComponents, *, alpha: float = GLOBAL_ALPHA, reweighted: bool = False
+) -> tuple[GlobalTest, ...]:
     """Return the two-sided chi-square test of the variance component of each group against 1.
 
     The v'Pv of a group is nearly chi-square distributed with the sum of its redundancy numbers, exactly
@@ -117,12 +121,17 @@ def component_tests(components: VarianceComponents, *, alpha: float = GLOBAL_ALP
     Args:
         components: of groups, over the standard deviations stated for them.
         alpha: probability of rejecting a group whose standard deviations are right.
+        reweighted: whether the weights of the image points come from their residuals: they have no test then.
 
     Source: Foerstner and Wrobel (2016), Photogrammetric Computer Vision, sec. 4.2.4.
     """
-    return tuple(
+    tests = [
         _chi_square(name, float(sigma0), float(r), alpha)
         for name, sigma0, r in zip(components.names, components.sigma0, components.redundancy, strict=True)
+    ]
+    return tuple(
+        replace(test, passed=None, reason=REWEIGHTED) if reweighted and test.of == IMAGE_POINTS else test
+        for test in tests
     )
 
 

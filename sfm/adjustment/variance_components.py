@@ -58,6 +58,7 @@ def variance_components(
     np.add.at(redundancy, group[used], adjustment.redundancy_numbers[used].sum(axis=1))
     enough = redundancy > FEW
     sigma0 = np.where(enough, np.sqrt(vPv / np.where(enough, redundancy, 1.0)), np.nan)
+    sigma0 = adjustment.inflation * sigma0
     return VarianceComponents(names, sigma0, redundancy, 2 * np.bincount(group[used], minlength=g))
 
 
@@ -125,6 +126,7 @@ def by_kind(adjustment: Adjustment) -> VarianceComponents:
     own = np.array([float(image.redundancy[0]), *(kind[1] - kind[3] for kind in seen)])
     enough = own > FEW_OF_A_KIND
     sigma0 = np.where(enough, np.sqrt(np.maximum(vPv, 0) / np.where(enough, own, 1.0)), np.nan)
+    sigma0[0] *= a.inflation
     names = (IMAGE_POINTS, *(kind[0] for kind in seen))
     return VarianceComponents(
         names, sigma0, own, np.array([int(image.count[0]), *(kind[1] for kind in seen)])

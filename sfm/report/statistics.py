@@ -73,7 +73,9 @@ def statistics_of(result: SurveyResult) -> Statistics:
     adjustment = result.adjustment
     kinds = kinds_over_stated(result)
     return Statistics(
-        global_tests=component_tests(kinds) if len(kinds.names) > 1 else (global_test(adjustment),),
+        global_tests=component_tests(kinds, reweighted=adjustment.reweighted)
+        if len(kinds.names) > 1
+        else (global_test(adjustment),),
         w=w_test(adjustment),
         tau=tau_test(adjustment),
         reliability=reliability(adjustment),
