@@ -118,6 +118,20 @@ def test_fixed_stations_stay_where_they_are(tmp_path: Path) -> None:
     assert farthest(error, a.covariance.points) < stats.chi2.ppf(1 - ANY, 3)
 
 
+def test_fixed_stations_beside_fixed_control_are_no_observations(tmp_path: Path) -> None:
+    path, truth = written(tmp_path, "all fixed")
+    for name, header, label, places in (
+        ("exterior.csv", "image", "image ", truth.position[:2]),
+        ("control.csv", "id", "", truth.points[:3]),
+    ):
+        rows = "".join(f"{label}{k + 1},{X!r},{Y!r},{Z!r}\n" for k, (X, Y, Z) in enumerate(places.tolist()))
+        (tmp_path / name).write_text(f"{header},X,Y,Z\n{rows}", encoding="utf-8")
+    a = solved(path).adjustment
+    assert a.converged and (a.defect, a.undetermined) == (0, ())
+    assert a.observations == 2 * int((~a.rejected).sum())
+    np.testing.assert_array_equal(a.estimate.position[:2], truth.position[:2])
+
+
 @pytest.mark.parametrize("fixed", [False, True])
 def test_two_centres_and_the_angles_of_one_photograph_are_enough(tmp_path: Path, fixed: bool) -> None:
     path, truth = written(tmp_path, "two centres and angles")

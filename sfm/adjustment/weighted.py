@@ -65,6 +65,7 @@ def weighted_of(network: Network, layout: Unknowns, *, use_control: bool) -> Wei
     on = layout.point_free[control.point].any(axis=1) if use_control else np.zeros(len(control), dtype=bool)
     point_weight, point_count = inverse_of_observed(control.covariance[on])
     on_e = layout.exterior_free[exterior.image].any(axis=1)
+    on_e &= observed(np.einsum("eii->ei", exterior.covariance)).any(axis=1)  # not only fixed or unknown
     exterior_weight, exterior_count = inverse_of_observed(exterior.covariance[on_e])
     columns, used = [], []
     for q in range(len(interior)):
