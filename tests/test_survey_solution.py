@@ -18,6 +18,7 @@ from sfm.network import Estimate, Network, ObjectPoints, ScaleBars
 from sfm.pipeline import adjust_survey
 from sfm.project import read_survey
 from sfm.report.statistics import statistics_of
+from sfm.report.verdict import verdict_of
 from sfm.survey.comparison import OtherPrograms
 from sfm.survey.datum import contradiction, object_scale
 from tests.surveys import write_observed_survey
@@ -156,3 +157,29 @@ def test_a_point_with_one_ray_is_named(tmp_path: Path) -> None:
     result = adjust_survey(read_survey(path))
     assert name not in result.adjustment.network.points
     assert f"point {name}: 1 ray, 2 are needed" in result.warnings
+
+
+@pytest.mark.parametrize("bars", [3, 2])
+def test_a_survey_goes_on_where_a_scale_bar_does_not_fit(tmp_path: Path, bars: int) -> None:
+    """Of three bars the wrong one is taken out and all is tested again; of two both stay, and no test."""
+    path = write_observed_survey(tmp_path / "wrong bar", "wrong bar", images=8, points=30)
+    network, truth = make_network(seed_of("wrong bar"), images=8, points=30, free=("c",))
+    text = '[adjust]\nreject = "tau"\n'
+    for b in range(bars):
+        length = np.linalg.norm(truth.points[b] - truth.points[b + 10]) * (1.03 if b == 1 else 1.0)
+        ends = f'from = "{network.points[b]}"\nto = "{network.points[b + 10]}"'
+        text += f"[[scale_bar]]\n{ends}\nlength = {length}\nsigma = 1e-4\n"
+    with path.open("a", encoding="utf-8") as file:
+        file.write(text)
+    result = adjust_survey(read_survey(path))
+    a = result.adjustment
+    assert a.converged and len(a.network.points) == 30
+    if bars == 3:
+        assert result.warnings[0].startswith("scale bar 2 - 12 does not fit")
+        assert a.network.scale_bars.start.tolist() == [0, 2]
+        assert result.weight_factor == pytest.approx(1, abs=4 / np.sqrt(2 * a.redundancy))
+    else:
+        assert result.warnings[0].startswith("the scale bars contradict one another")
+        assert len(a.network.scale_bars) == 2
+        assert not a.rejected[np.isin(a.network.image_points.point, [0, 1, 10, 11])].any()
+        assert verdict_of(result).level == "bad"

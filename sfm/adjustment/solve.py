@@ -183,21 +183,22 @@ def _sound(run: _Run, state: State, weight: FloatArray) -> tuple[Optimum, FloatA
         GeometryError: neither can be solved.
     """
     layout = run.problem.layout
-    try:
-        optimum, plain = _plain(run, state, weight)
-    except GeometryError:
-        begun = optimum_at(run.problem, state, weight)
-        if begun is None:
-            raise
-        optimum, plain = replace(begun, converged=False), weight
 
     def spread(at: State) -> float:
         v = residuals(layout.obs, at)
         return robust_scale(layout.obs, v, layout.active & np.isfinite(v).all(axis=1), freedom=1.0)
 
-    if optimum.converged and spread(optimum.state) <= BENT * spread(state):
+    try:
+        (optimum, plain), begun = _plain(run, state, weight), None
+    except GeometryError:
+        begun = optimum_at(run.problem, state, weight)
+        if begun is None:
+            raise
+        optimum, plain = replace(begun, converged=False), weight
+    limit = spread(optimum.state)
+    if optimum.converged and limit <= BENT * spread(state):
         return optimum, plain
-    begun = optimum_at(run.problem, state, weight)
+    begun = begun or optimum_at(run.problem, state, weight)
     if begun is None:
         return optimum, plain
     try:
@@ -207,9 +208,7 @@ def _sound(run: _Run, state: State, weight: FloatArray) -> tuple[Optimum, FloatA
         robust = run.again(robust, factor)
     except GeometryError:
         return optimum, plain
-    if robust.converged and spread(robust.state) < spread(optimum.state):
-        return robust, factor
-    return optimum, plain
+    return (robust, factor) if robust.converged and spread(robust.state) < limit else (optimum, plain)
 
 
 def _snoop_all(run: _Run, optimum: Optimum, weight: FloatArray, alpha: float) -> tuple[Optimum, FloatArray]:

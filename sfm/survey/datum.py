@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -83,79 +83,112 @@ def contradiction(
     Returns:
         None where nothing is contradicted, or nothing is left to tell it from.
     """
-    part, seen = adjustment.network, adjustment.network.image_points
-    use_control = adjustment.datum == "control"
-    bars = part.scale_bars
-    share = lost_share(adjustment)
-    ends = np.maximum(share[bars.start], share[bars.end])
-    held = share[part.control.point] if use_control else np.zeros(0)
+    part, share = adjustment.network, lost_share(adjustment)
+    held = share[part.control.point] if adjustment.datum == "control" else np.zeros(0)
+    ends = np.maximum(share[part.scale_bars.start], share[part.scale_bars.end])
     if max(held.max(initial=0.0), ends.max(initial=0.0)) <= CONTRADICTED:
         return None
     carriers = np.zeros(len(part.points), dtype=bool)
-    carriers[bars.start], carriers[bars.end] = True, True
-    if use_control:
-        carriers[part.control.point] = True
-    usable = ~adjustment.rejected | carriers[seen.point]
-    whole = replace(part, image_points=seen.select(usable))
-    ways: list[tuple[Network, Network, str, int]] = []  # part and network without one, name, which
-    if len(held) > MIN_CONTROL:
-        for k in np.argsort(-held, kind="stable")[:MOST_CANDIDATES]:
-            point = int(part.control.point[k])
-            ways.append(
-                (
-                    _without_control(whole, point),
-                    _without_control(network, network.points.index(part.points[point])),
-                    f"control point {part.points[point]}",
-                    point,
-                )
-            )
-    if len(bars) > 1 or (use_control and len(bars)):
-        for b in np.argsort(-ends, kind="stable")[:MOST_CANDIDATES]:
-            names = part.points[bars.start[b]], part.points[bars.end[b]]
-            start, end = (network.points.index(name) for name in names)
-            ways.append(
-                (
-                    _without_bar(whole, int(bars.start[b]), int(bars.end[b])),
-                    _without_bar(network, start, end),
-                    f"scale bar {names[0]} - {names[1]}",
-                    -1 - int(b),
-                )
-            )
-    if len(ways) < 2:
+    carriers[part.scale_bars.start] = carriers[part.scale_bars.end] = True
+    carriers[part.control.point[: len(held)]] = True
+    usable = ~adjustment.rejected | carriers[part.image_points.point]
+    whole = replace(part, image_points=part.image_points.select(usable))
+    suspects = (*_suspect_control(whole, held), *_suspect_bars(whole, ends, alone=not len(held)))
+    if len(suspects) < 2:
         return None
-    tried: list[Adjustment | None] = []
-    for one in (whole, *(way[0] for way in ways)):
-        try:
-            tried.append(readjust(one))
-        except GeometryError:  # nothing that fits: the others hold too little
-            tried.append(None)
-    misfit = np.array([a.vPv if a is not None else np.inf for a in tried[1:]])
+    everything, *tried = (
+        _readjusted(readjust, one) for one in (whole, *(suspect.without(whole) for suspect in suspects))
+    )
+    misfit = np.array([a.vPv if a is not None else np.inf for a in tried])
     order = np.argsort(misfit, kind="stable")
-    best, second = (tried[1 + k] for k in order[:2])
+    best, second = (tried[k] for k in order[:2])
     if best is None or second is None:
         return None
-    total = tried[0].vPv if tried[0] is not None else float(misfit[np.isfinite(misfit)].max())
+    total = everything.vPv if everything is not None else float(misfit[np.isfinite(misfit)].max())
     if second.vPv - best.vPv < CLEARLY * (total - best.vPv):
-        what = "control points" if len(held) else "scale bars"
-        what = "control points and scale bars" if len(held) and len(bars) else what
+        what = " and ".join(
+            name for name, some in (("control points", len(held)), ("scale bars", len(ends))) if some
+        )
         line = (
             f"the {what} contradict one another, and which one is wrong cannot be told; all were kept, and "
             "none of their image points was tested"
         )
         known = {part.points[j] for j in np.flatnonzero(carriers)}
         return Contradiction(None, np.array([name in known for name in network.points]), line)
-    _, freed, name, which = ways[order[0]]
-    X = best.estimate.points
-    if which >= 0:
-        given = part.control.xyz[part.control.point == which][0]
-        off, treated = float(np.linalg.norm(X[which] - given)), "it was adjusted as a new point"
-    else:
-        b = -1 - which
-        off = float(bars.length[b] - np.linalg.norm(X[bars.end[b]] - X[bars.start[b]]))
-        treated = "it was taken out"
-    by = f"{off:.3g}" if which >= 0 else f"{off:+.3g}"
-    line = f"{name} does not fit: by the others and the photographs it is {by} off (object unit); {treated}"
-    return Contradiction(freed, np.zeros(len(network.points), dtype=bool), line)
+    blamed = suspects[order[0]]
+    return Contradiction(
+        blamed.without(network), np.zeros(len(network.points), dtype=bool), blamed.line(best.estimate.points)
+    )
+
+
+@dataclass(frozen=True)
+class _Suspect:
+    """A control point or a scale bar that may be what is wrong."""
+
+    names: tuple[str, ...]  # of the control point, or of both ends of the bar
+    indices: tuple[int, ...]  # of the same in the network that was adjusted
+    given: FloatArray  # coordinates (3,) or length (1,)
+
+    def without(self, network: Network) -> Network:
+        """Return a network without it, which may hold other points than that which was adjusted."""
+        where = [network.points.index(name) for name in self.names]
+        control, bars = network.control, network.scale_bars
+        if len(where) == 1:
+            keep = control.point != where[0]
+            kept = ObjectPoints(control.point[keep], control.xyz[keep], control.covariance[keep])
+            return replace(network, control=kept)
+        keep = ~((bars.start == where[0]) & (bars.end == where[1]))
+        left = ScaleBars(bars.start[keep], bars.end[keep], bars.length[keep], bars.sigma[keep])
+        return replace(network, scale_bars=left)
+
+    def line(self, X: FloatArray) -> str:
+        """Return in words by how much it is off from the adjusted object points, (n, 3)."""
+        at = X[list(self.indices)]
+        if len(at) == 1:
+            name, treated = f"control point {self.names[0]}", "it was adjusted as a new point"
+            by = f"{np.linalg.norm(at[0] - self.given):.3g}"
+        else:
+            name, treated = f"scale bar {self.names[0]} - {self.names[1]}", "it was taken out"
+            by = f"{self.given[0] - np.linalg.norm(at[1] - at[0]):+.3g}"
+        return (
+            f"{name} does not fit: by the others and the photographs it is {by} off (object unit); {treated}"
+        )
+
+
+def _suspect_control(part: Network, held: FloatArray) -> Iterator[_Suspect]:
+    """Return the control points that lose most rays, none where too few would be left.
+
+    Args:
+        part: what was adjusted.
+        held: share of its rays that each control point lost, none in a datum without control.
+    """
+    if len(held) > MIN_CONTROL:
+        for k in np.argsort(-held, kind="stable")[:MOST_CANDIDATES]:
+            point = int(part.control.point[k])
+            yield _Suspect((part.points[point],), (point,), part.control.xyz[k])
+
+
+def _suspect_bars(part: Network, ends: FloatArray, *, alone: bool) -> Iterator[_Suspect]:
+    """Return the scale bars whose ends lose most rays, none where the only scale would be lost.
+
+    Args:
+        part: what was adjusted.
+        ends: larger share of their rays that the ends of each bar lost.
+        alone: whether there is no control beside the bars.
+    """
+    bars = part.scale_bars
+    if len(bars) > 1 or not alone:
+        for b in np.argsort(-ends, kind="stable")[:MOST_CANDIDATES]:
+            at = int(bars.start[b]), int(bars.end[b])
+            yield _Suspect((part.points[at[0]], part.points[at[1]]), at, bars.length[b : b + 1])
+
+
+def _readjusted(readjust: Callable[[Network], Adjustment], network: Network) -> Adjustment | None:
+    """Return the adjustment of a network, None where it holds too little."""
+    try:
+        return readjust(network)
+    except GeometryError:
+        return None
 
 
 def lost_share(adjustment: Adjustment) -> FloatArray:
@@ -163,20 +196,6 @@ def lost_share(adjustment: Adjustment) -> FloatArray:
     seen, n = adjustment.network.image_points, len(adjustment.network.points)
     lost = np.bincount(seen.point[adjustment.rejected], minlength=n)
     return np.asarray(lost / np.maximum(np.bincount(seen.point, minlength=n), 1))
-
-
-def _without_control(network: Network, point: int) -> Network:
-    control = network.control
-    keep = control.point != point
-    kept = ObjectPoints(control.point[keep], control.xyz[keep], control.covariance[keep])
-    return replace(network, control=kept)
-
-
-def _without_bar(network: Network, start: int, end: int) -> Network:
-    bars = network.scale_bars
-    keep = ~((bars.start == start) & (bars.end == end))
-    kept = ScaleBars(bars.start[keep], bars.end[keep], bars.length[keep], bars.sigma[keep])
-    return replace(network, scale_bars=kept)
 
 
 def datum_warnings(survey: Survey, network: Network) -> tuple[str, ...]:

@@ -103,48 +103,31 @@ def solve(
     needed = np.full(len(network.points), 2) if min_rays is None else min_rays.copy()
     if datum.kind == "control":
         needed[network.control.point] = 1
-    accepted = np.ones(len(network.image_points), dtype=bool)
     known = tuple(name for name, is_in in zip(network.points, estimate.determined, strict=True) if is_in)
     single = tuple(network.points[j] for j in np.flatnonzero((network.rays() == 1) & (needed > 1)))
     oriented = estimate.oriented
     estimate = rescaled(network, estimate, datum)
     network, estimate = as_asked_for(survey, network, estimate)
+    task = _Task(survey, datum, network, needed, survey.reject)
     iterations = 0
     contradictions: list[str] = []
-    reject = survey.reject
-    begin = estimate
     while True:
-        images, points = determined(network, estimate, accepted, needed)
-        part, start = reduce_network(network, estimate, images, points, np.ones_like(accepted))
-        adjustment = _tested(survey, part, start, datum, reject=reject, covariance=False)
-        iterations += adjustment.iterations
-        found = _contradiction(survey, network, adjustment, datum, reject)
-        estimate = put_back(estimate, adjustment.estimate, images, points)
-        accepted = _accepted(network, adjustment, images, points)
-        left_images, left_points = determined(network, estimate, accepted, needed)
-        if found is None and (left_images == images).all() and (left_points == points).all():
-            check = None
-            if datum.kind != "control" and len(part.control) >= 3:
-                last, check = placed_on_control(part, adjustment.estimate)
-            else:
-                last = adjustment.estimate
-            final, weight_factor = _final(survey, part, last, datum, reject)
-            found = _contradiction(survey, network, final, datum, reject)
-            if found is None:
-                break
-        if found is not None:
-            contradictions.append(found.line)
-            if found.freed is not None:
-                needed[np.setdiff1d(network.control.point, found.freed.control.point)] = 2
-                network, accepted = found.freed, np.ones_like(accepted)
-            else:  # what the test holds against the other image points stands
-                keep = accepted | found.protected[network.image_points.point]
-                network = replace(network, image_points=network.image_points.select(keep))
-                accepted, reject = np.ones(int(keep.sum()), dtype=bool), "none"
-            estimate = begin
+        settled = _settle(task, estimate)
+        iterations += settled.iterations
+        found = settled.contradiction
+        if found is None:
+            last, check = settled.estimate, None
+            if datum.kind != "control" and len(settled.part.control) >= 3:
+                last, check = placed_on_control(settled.part, last)
+            final, weight_factor = _final(task, settled.part, last)
+            found = _contradiction(task, final)
+        if found is None:
+            break
+        contradictions.append(found.line)
+        task = _resolved(task, found, settled.accepted)
     dropped = tuple(
         (name, f"fewer than {MIN_IMAGE_POINTS} accepted image points of the network")
-        for name, was, is_in in zip(network.images, oriented, images, strict=True)
+        for name, was, is_in in zip(network.images, oriented, settled.images, strict=True)
         if was and not is_in
     )
     final = replace(final, iterations=iterations + final.iterations)
@@ -152,48 +135,96 @@ def solve(
     return Solution(final, check, dropped, warnings, weight_factor)
 
 
-def _final(
-    survey: Survey, part: Network, estimate: Estimate, datum: Datum, reject: str
-) -> tuple[Adjustment, float]:
+@dataclass(frozen=True)
+class _Task:
+    """What is adjusted and how; contradictions change it."""
+
+    survey: Survey
+    datum: Datum
+    network: Network
+    needed: IntArray  # rays that each point needs to stay, (n,)
+    reject: str  # how gross errors are treated
+
+
+@dataclass(frozen=True)
+class _Settled:
+    """An adjustment after which no point or photograph leaves, or in which there is a contradiction."""
+
+    part: Network  # what was adjusted
+    estimate: Estimate  # of it
+    images: BoolArray  # photographs in it, (m,)
+    accepted: BoolArray  # image points of the whole network, (k,)
+    contradiction: Contradiction | None
+    iterations: int  # of all adjustments on the way
+
+
+def _settle(task: _Task, estimate: Estimate) -> _Settled:
+    """Adjust until the points and photographs that are left stay, or control or a bar is contradicted."""
+    network, iterations = task.network, 0
+    accepted = np.ones(len(network.image_points), dtype=bool)
+    images, points = determined(network, estimate, accepted, task.needed)
+    while True:
+        part, start = reduce_network(network, estimate, images, points, np.ones_like(accepted))
+        adjustment = _tested(task, part, start, covariance=False)
+        iterations += adjustment.iterations
+        found = _contradiction(task, adjustment)
+        estimate = put_back(estimate, adjustment.estimate, images, points)
+        accepted = _accepted(network, adjustment, images, points)
+        left_images, left_points = determined(network, estimate, accepted, task.needed)
+        if found is not None or ((left_images == images).all() and (left_points == points).all()):
+            return _Settled(part, adjustment.estimate, images, accepted, found, iterations)
+        images, points = left_images, left_points
+
+
+def _resolved(task: _Task, found: Contradiction, accepted: BoolArray) -> _Task:
+    """Return the task without what is to blame, or, where that cannot be told, without any more tests."""
+    network = task.network
+    if found.freed is not None:
+        needed = task.needed.copy()
+        needed[np.setdiff1d(network.control.point, found.freed.control.point)] = 2
+        return replace(task, network=found.freed, needed=needed)
+    # what the test holds against the other image points stands
+    keep = accepted | found.protected[network.image_points.point]
+    return replace(
+        task, network=replace(network, image_points=network.image_points.select(keep)), reject="none"
+    )
+
+
+def _final(task: _Task, part: Network, estimate: Estimate) -> tuple[Adjustment, float]:
     """Return the last adjustment with its covariance, and the factor on the sigmas of the image points."""
-    part, estimate = without_idle_cameras(survey, part, estimate)
+    part, estimate = without_idle_cameras(task.survey, part, estimate)
 
     def adjust_part(one: Network) -> Adjustment:
-        return _tested(survey, one, estimate, datum, reject=reject, covariance=True)
+        return _tested(task, one, estimate, covariance=True)
 
-    outer = np.concatenate(
-        [np.einsum("nii->ni", x.covariance).ravel() for x in (part.control, part.exterior)]
-    )
-    weighted = datum.kind == "control" and observed(outer).any()
+    outer = (part.control, part.exterior) if task.datum.kind == "control" else ()
+    weighted = any(observed(np.einsum("nii->ni", one.covariance)).any() for one in outer)
     if len(part.scale_bars) or len(part.interior) or weighted:
         return _weighed(adjust_part, part)
     return adjust_part(part), 1.0
 
 
-def _contradiction(
-    survey: Survey, network: Network, adjustment: Adjustment, datum: Datum, reject: str
-) -> Contradiction | None:
+def _contradiction(task: _Task, adjustment: Adjustment) -> Contradiction | None:
     """Return control or a scale bar that cost a point most of its rays; None where nothing was tested."""
-    if reject == "none":
+    if task.reject == "none":
         return None
+    untested = replace(task, reject="none")
 
     def readjust(one: Network) -> Adjustment:
-        return _tested(survey, one, adjustment.estimate, datum, reject="none", covariance=False)
+        return _tested(untested, one, adjustment.estimate, covariance=False)
 
-    return contradiction(network, adjustment, readjust)
+    return contradiction(task.network, adjustment, readjust)
 
 
-def _tested(
-    survey: Survey, network: Network, estimate: Estimate, datum: Datum, *, reject: str, covariance: bool
-) -> Adjustment:
+def _tested(task: _Task, network: Network, estimate: Estimate, *, covariance: bool) -> Adjustment:
     """Adjust with data snooping, the level of the single test shared out among all image coordinates."""
     tests = 2 * len(network.image_points)
     return adjust(
         network,
         estimate,
-        datum=_on_points(survey, network, datum),
-        sigma_px=survey.adjust.sigma_px,
-        reject=reject,
+        datum=_on_points(task.survey, network, task.datum),
+        sigma_px=task.survey.adjust.sigma_px,
+        reject=task.reject,
         alpha=1 - (1 - FALSE_ALARM) ** (1 / tests),
         covariance=covariance,
     )
