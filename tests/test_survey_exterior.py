@@ -163,6 +163,17 @@ def test_too_little_to_place_the_network_is_said(tmp_path: Path) -> None:
         solved(path)
 
 
+@pytest.mark.parametrize("off", [0.0, SIGMA / 2])
+def test_projection_centres_on_a_line_do_not_place_a_network(tmp_path: Path, off: float) -> None:
+    path, _ = written(tmp_path, "line")
+    rows = "".join(
+        f"image {k + 1},{k},{2 * k},{off * (k == 1)!r},{SIGMA},{SIGMA},{SIGMA}\n" for k in range(3)
+    )
+    (tmp_path / "exterior.csv").write_text(CENTRES + rows, encoding="utf-8")
+    with pytest.raises(GeometryError, match="on a line in the network and the angles of 0 photographs"):
+        solved(path)
+
+
 def test_in_a_free_datum_it_takes_no_part_and_a_warning_says_so(tmp_path: Path) -> None:
     path, _ = written(tmp_path, "free", datum="free")
     result = solved(path)

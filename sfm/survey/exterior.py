@@ -21,6 +21,8 @@ from sfm.survey.start import observed_exterior
 
 MIN_POINTS = 3  # that fix position, attitude and scale
 NARROW = 0.05  # breadth over length of places below which their turn about the length is taken from angles
+SURE = 3.0  # standard deviations by which places must be off a line to tell the turn about it
+FLAT = 1e-6  # the same for places without error, over their extent
 ROUGH = 1e-3  # of the extent of the places: no start value needs to be better
 
 
@@ -93,7 +95,8 @@ def _placed(
     """Return the start values in the frame of control and observed exterior orientation."""
     control = network.control
     known = estimate.determined[control.point]
-    if known.sum() >= MIN_POINTS and _breadth(control.xyz[known]) >= NARROW:
+    length, breadth = _extents(control.xyz[known], np.ones(int(known.sum())))
+    if known.sum() >= MIN_POINTS and breadth >= NARROW * length:
         return estimate  # the orientation has brought it there
     oriented = estimate.oriented[image]
     centres = oriented & np.isfinite(value[:, :3]).all(axis=1)
@@ -107,13 +110,14 @@ def _placed(
         raise GeometryError(_too_few(survey, len(target), int(turned.sum())))
     least = (ROUGH * float(np.ptp(target, axis=0).max())) ** 2
     weight = 1 / np.maximum(variance, least if least > 0 else 1.0)
-    if turned.any() and (len(target) < MIN_POINTS or _breadth(target) < NARROW):
+    length, breadth = _extents(target, weight)
+    noise = float(np.sqrt(weight @ variance / weight.sum() / 3))
+    if turned.any() and (len(target) < MIN_POINTS or breadth < NARROW * length):
         similarity = _by_angles(network, estimate, image[turned], value[turned, 3:], source, target, weight)
+    elif breadth > max(SURE * noise, FLAT * length) or np.isfinite(value[:, 3:]).any():
+        similarity = fit_similarity(source, target, weights=weight)
     else:
-        try:
-            similarity = fit_similarity(source, target, weights=weight)
-        except GeometryError as error:
-            raise GeometryError(_too_few(survey, len(target), 0, on_a_line=True)) from error
+        raise GeometryError(_too_few(survey, len(target), 0, on_a_line=True))
     return similarity.apply_estimate(estimate)
 
 
@@ -142,10 +146,13 @@ def _by_angles(
     return Similarity(scale, R, centre_t - scale * R @ centre_s)
 
 
-def _breadth(places: FloatArray) -> float:
-    """Return the second over the first principal extent of places, 0 where they lie on a line."""
-    spread = np.linalg.svd(places - places.mean(axis=0), compute_uv=False)
-    return float(spread[1] / spread[0]) if len(spread) > 1 and spread[0] > 0 else 0.0
+def _extents(places: FloatArray, weight: FloatArray) -> tuple[float, float]:
+    """Return the first and second principal extent of weighted places, (n, 3) and (n,), as RMS."""
+    if len(places) < 2:
+        return 0.0, 0.0
+    w = weight / weight.sum()
+    spread = np.linalg.svd((places - w @ places) * np.sqrt(w)[:, None], compute_uv=False)
+    return float(spread[0]), float(spread[1])
 
 
 def _too_few(survey: Survey, places: int, turned: int, *, on_a_line: bool = False) -> str:
