@@ -9,15 +9,17 @@ import pytest
 from synthetic import seed_of
 from threadpoolctl import threadpool_limits
 
-from sfm.adjustment import iterate, normals
+from sfm.adjustment import connectivity, iterate, normals
 from sfm.adjustment.band_inverse import band_inverse
 from sfm.adjustment.banded import BandFactor
-from sfm.adjustment.connectivity import Order, band_order
+from sfm.adjustment.connectivity import Order, pattern_of
 from sfm.adjustment.covariance import hat_complement, marginal_covariance
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.marginal import Marginal, marginal_of
-from sfm.adjustment.normals import HALVED, MANY_RAYS
+from sfm.adjustment.normals import HALVED
+from sfm.adjustment.pairs import Pairs, pairs_of
 from sfm.adjustment.parameters import unknowns_of
+from sfm.adjustment.rank import null_motions
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.camera import Camera, camera_from_values, project
@@ -117,8 +119,8 @@ def run(network: Network, start: Estimate, **options: object) -> Adjustment:
     return adjust(network, start, datum=Datum("free"), reject="none", **options)  # type: ignore[arg-type]
 
 
-def order_of(network: Network, estimate: Estimate) -> Order | None:
-    return band_order(unknowns_of(network, estimate, use_control=False)[0])
+def pattern_for(network: Network, estimate: Estimate) -> Order | Pairs | None:
+    return pattern_of(unknowns_of(network, estimate, use_control=False)[0])
 
 
 def in_sigmas(Q: FloatArray, reference: FloatArray) -> float:
@@ -140,31 +142,47 @@ def test_inverse_within_the_band_equals_that_of_the_whole() -> None:
         assert np.abs(band_inverse(stored) - expected).max() < 1e-12 * np.abs(expected).max()
 
 
-def test_blocks_take_the_band_and_networks_of_many_rays_the_full_matrix() -> None:
-    order = order_of(*aerial("choice", 6, 14, 1700))
-    assert order is not None
+def test_blocks_take_the_band_and_networks_of_many_rays_the_product_of_full_rows() -> None:
+    order = pattern_for(*aerial("choice", 6, 14, 1700))
+    assert isinstance(order, Order)
     assert order.width < 84 / 3
-    assert order_of(*unordered("all seen", 70, 100, 70)) is None
-    assert order_of(*aerial("small", 3, 8, 300)) is None
+    assert isinstance(pattern_for(*unordered("some seen", 70, 300, 20)), Pairs)
+    assert pattern_for(*unordered("all seen", 70, 100, 70)) is None
+    assert pattern_for(*aerial("small", 3, 8, 300)) is None
 
 
 @pytest.mark.parametrize("bars", [False, True])
 @pytest.mark.parametrize("kind", ["free", "minimal"])
-def test_covariance_of_the_band_equals_that_of_the_full_matrix(
-    kind: str, bars: bool, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("pattern", [Order, Pairs])
+def test_covariance_of_band_and_pairs_equals_that_of_the_product_of_full_rows(
+    pattern: type, kind: str, bars: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     network, truth = aerial("covariance", 6, 14, 1700)
+    twice = np.arange(0, len(network.image_points), 50)  # measured twice in a photograph
+    network = replace(
+        network,
+        image_points=network.image_points.select(np.append(np.arange(len(network.image_points)), twice)),
+    )
     if bars:  # kept points in the border; the scale is no longer free
         length = np.linalg.norm(truth.points[5] - truth.points[900])
         ends = np.array([5]), np.array([900])
         network = replace(network, scale_bars=ScaleBars(*ends, np.array([length]), np.array([0.01])))
     a = run(network, truth, covariance=False, tolerance=1e-9)
+    if pattern is Pairs:
+        monkeypatch.setattr(iterate, "pattern_of", lambda layout: pairs_of(layout.obs))
     band = marginal_of(a, datum=Datum(kind))
-    monkeypatch.setattr(iterate, "band_order", lambda layout: None)
+    monkeypatch.setattr(iterate, "pattern_of", lambda layout: None)
     full = marginal_of(a, datum=Datum(kind))
-    assert isinstance(band.optimum.factor, BandFactor)
+    if isinstance(band.optimum.factor, BandFactor):
+        assert pattern is Order
+    else:
+        assert pattern is Pairs
+        assert band.optimum.factor.pairs is not None
+        assert band.optimum.factor.pairs.tiles > 1
     assert not isinstance(full.optimum.factor, BandFactor)
-    assert band.optimum.factor.verified() == full.optimum.factor.verified() == (6 if bars else 7)
+    assert full.optimum.factor.pairs is None
+    for found in (band, full):
+        assert null_motions(found.optimum, found.layout) == (6 if bars else 7)
     Q, reference = (marginal_covariance(m.optimum, m.layout, m.cofactors, 1.0) for m in (band, full))
     free = np.diagonal(reference.points, axis1=1, axis2=2).all(axis=1)  # a minimal datum fixes some
     assert in_sigmas(Q.points[free], reference.points[free]) < 1e-9
@@ -187,7 +205,7 @@ def test_what_a_flat_nadir_block_leaves_open_is_found_in_the_band_too(
     network, truth = aerial("flat", 6, 14, 1700, tilt=0.0, hills=0.0, noise_px=0.0)
     truth = replace(truth, cameras=(lens(free),))
     band = run(network, truth)
-    monkeypatch.setattr(iterate, "band_order", lambda layout: None)
+    monkeypatch.setattr(iterate, "pattern_of", lambda layout: None)
     full = run(network, truth)
     assert band.defect == full.defect == defect
     assert len(band.undetermined) == len(full.undetermined) == defect - 7
@@ -202,7 +220,7 @@ def test_what_a_flat_nadir_block_leaves_open_is_found_in_the_band_too(
 )
 def test_a_weak_block_near_nadir_converges(strips: int, per_strip: int, points: int) -> None:
     network, truth = aerial(f"weak {strips}", strips, per_strip, points, rays=5.0)
-    assert order_of(network, truth) is not None
+    assert isinstance(pattern_for(network, truth), Order)
     a = run(network, spoiled(truth, "weak", 0.25), covariance=False)
     assert a.converged
     assert abs(a.sigma0 - 1) < 5 / np.sqrt(2 * a.redundancy)
@@ -247,12 +265,8 @@ def test_nowhere_to_go_ends_as_not_converged_and_bad_start_values_are_refused(
     at_start = start.position[0].copy()
     solvable = iterate.factor
 
-    def only_at_start(equations, layout, motions, **options):  # type: ignore[no-untyped-def]
-        return (
-            solvable(equations, layout, motions, **options)
-            if abs(equations.vPv - first) < 1e-6 * first
-            else None
-        )
+    def only_at_start(equations, *others, **options):  # type: ignore[no-untyped-def]
+        return solvable(equations, *others, **options) if abs(equations.vPv - first) < 1e-6 * first else None
 
     first = np.inf
     seen: list[float] = []
@@ -268,10 +282,18 @@ def test_nowhere_to_go_ends_as_not_converged_and_bad_start_values_are_refused(
         run(network, start, method="gauss-newton", covariance=False)
 
 
-def test_two_threads_give_the_same_to_the_last_bit(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("way", ["chosen", "band", "pairs", "product"])
+def test_two_threads_give_the_same_to_the_last_bit(way: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of a network large enough that a second thread takes half of the sums and of the products."""
+    if way == "pairs":
+        monkeypatch.setattr(iterate, "pattern_of", lambda layout: pairs_of(layout.obs))
+    elif way == "product":
+        monkeypatch.setattr(iterate, "pattern_of", lambda layout: None)
+    elif way == "band":
+        monkeypatch.setattr(connectivity, "SMALL", 0)
+        monkeypatch.setattr(connectivity, "FACTOR_RATE", 1e-3)
     network, truth = aerial("threads", 4, 14, 600, rays=40.0)
-    assert len(network.image_points) >= max(HALVED, MANY_RAYS * len(network.points))
+    assert len(network.image_points) >= HALVED
     results = []
     for threads in (1, 2):
         with threadpool_limits(threads):

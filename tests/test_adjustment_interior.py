@@ -165,9 +165,9 @@ def test_banded_and_full_normal_equations_share_alike(monkeypatch: pytest.Monkey
     network, truth = zoomed("banded", noise_px=0.1)
     full = adjust(network, truth, datum=FREE, reject="none")
     monkeypatch.setattr(connectivity, "SMALL", 0)
-    monkeypatch.setattr(connectivity, "DENSE_RATE", 1e-3)  # so that the band is always less work
+    monkeypatch.setattr(connectivity, "FACTOR_RATE", 1e-3)  # so that the band is always less work
     layout, _ = unknowns_of(network, truth, use_control=False)
-    assert connectivity.band_order(layout) is not None
+    assert connectivity.pattern_of(layout) is not None
     band = adjust(network, truth, datum=FREE, reject="none")
     assert band.sigma0 == pytest.approx(full.sigma0, rel=1e-9)
     for one, other in zip(band.covariance.interior, full.covariance.interior, strict=True):

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from synthetic import make_network, perturb, seed_of
 
-from sfm.adjustment.centroid import shifted
 from sfm.adjustment.collinearity import collinearity, residuals, scratch
 from sfm.adjustment.datum import Datum, free_motions
+from sfm.adjustment.local import shifted
 from sfm.adjustment.parameters import angle_jacobian, step, unknowns_of
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust

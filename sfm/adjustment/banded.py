@@ -28,6 +28,8 @@ from sfm.adjustment.kernel import kernel
 from sfm.adjustment.normals import Equations
 from sfm.adjustment.parameters import Unknowns
 from sfm.adjustment.reduced import NULL, WEAK_PIVOT
+from sfm.adjustment.threads import at_once
+from sfm.adjustment.vectors import subtract_pair
 from sfm.conventions import FloatArray, IntArray
 
 SHIFT = 1e-10  # share of the diagonal added to look for null vectors; far above rounding, far below weak ones
@@ -50,7 +52,7 @@ class BandFactor:
     scale: FloatArray  # 1/sqrt of the unreduced diagonal, (reduced,)
     rows: IntArray  # exterior unknown at each place of the band, (6 m,)
     points: IntArray  # object points as the band meets them, (n,)
-    matrix: BandMatrix  # with nothing held
+    C: FloatArray  # (6 m, i + 3 s)
     L: FloatArray  # A + holds = L L', stored as A
     X: FloatArray  # A^-1 C, (6 m, i + 3 s)
     corner: FloatArray  # upper Cholesky factor of D - C' A^-1 C, (i + 3 s, i + 3 s)
@@ -64,18 +66,13 @@ class BandFactor:
         s = self.scale[:, None]
         r = s * columns
         z, _ = dpbtrs(self.L.T, r[self.rows], lower=1)
-        xb = r[first:] - self.matrix.C.T @ z
+        xb = r[first:] - self.C.T @ z
         if len(xb):
             xb = cho_solve((self.corner, False), xb)
         x = np.empty_like(r)
         x[self.rows] = z - self.X @ xb
         x[first:] = xb
         return np.asarray((s * x).reshape(right.shape))
-
-    def verified(self) -> int:
-        """Return how many of the null vectors that the datum explains the normal matrix maps to 0."""
-        SQ = _times(self.matrix, self.rows, self.motions)
-        return int((np.linalg.norm(SQ, axis=0) < np.sqrt(NULL)).sum())
 
 
 def factor_band(
@@ -92,18 +89,18 @@ def factor_band(
     """
     scale = equations.parts.scale
     rows = (6 * np.argsort(order.place)[:, None] + np.arange(6)).ravel()
-    matrix = _matrix(equations, layout, order, rows)
     Q = np.linalg.qr(motions.reduced / scale[:, None])[0] if motions.defect else motions.reduced
-    none = np.zeros((layout.reduced, 0))
     holds = _largest(Q[: len(rows)])  # of exterior unknowns, else A would stay singular
+    matrix = _matrix(equations, layout, order, rows)
     found = _factored(matrix, rows, holds)
-    if found is not None and not found[3]:
-        return BandFactor(scale, rows, order.points, matrix, *found[:3], Q, none)
-    if damped:
-        return None if found is None else BandFactor(scale, rows, order.points, matrix, *found[:3], Q, none)
-    further = _null_vectors(matrix, rows, holds, Q)
-    found = _factored(matrix, rows, np.concatenate([holds, _largest(further)]))
-    return None if found is None else BandFactor(scale, rows, order.points, matrix, *found[:3], Q, further)
+    further = np.zeros((layout.reduced, 0))
+    if not damped and (found is None or found.weak):
+        matrix = _matrix(equations, layout, order, rows)  # factoring has taken its place
+        further = _null_vectors(matrix, rows, holds, Q)
+        found = _factored(matrix, rows, np.concatenate([holds, _largest(further)]))
+    if found is None:
+        return None
+    return BandFactor(scale, rows, order.points, matrix.C, found.L, found.X, found.corner, Q, further)
 
 
 def _matrix(equations: Equations, layout: Unknowns, order: Order, rows: IntArray) -> BandMatrix:
@@ -112,10 +109,17 @@ def _matrix(equations: Equations, layout: Unknowns, order: Order, rows: IntArray
     A = np.zeros((first, 6 * order.width + 6))
     C = parts.border[rows]
     inner = b.Z.shape[2]
-    flat = b.Z.reshape(-1, inner)
+    interior = b.Z.reshape(-1, inner)
     D = parts.corner.copy()
-    D[:inner, :inner] -= flat.T @ flat
-    _add_pairs(layout.obs, b.U, b.Y, b.Z, order.place, order.points, A, C)
+    D[:inner, :inner] -= interior.T @ interior
+    flat = np.reshape(A, -1)
+    stride = A.shape[1] - 1  # element (r, c) of the matrix at c stride + r
+
+    def add(begin: int, end: int) -> None:
+        _add_pairs(layout.obs, b.U, b.Y, b.Z, order.place, order.points, begin, end, flat, stride, C)
+
+    half = len(b.U) // 2
+    at_once(lambda: add(0, half), lambda: add(half, len(b.U)))
     s, sb = parts.scale[rows], parts.scale[first:]
     _scale_band(A, s, 1 + equations.damping)
     C *= s[:, None] * sb
@@ -124,14 +128,21 @@ def _matrix(equations: Equations, layout: Unknowns, order: Order, rows: IntArray
     return BandMatrix(A, C, D)
 
 
-def _factored(
-    matrix: BandMatrix, rows: IntArray, holds: IntArray, shift: float = 0.0
-) -> tuple[FloatArray, FloatArray, FloatArray, bool] | None:
-    """Return L, A^-1 C, the factor of the corner, and whether a pivot is weak; None if that fails."""
+class _Factored(NamedTuple):
+    """The factors that `BandFactor` explains."""
+
+    L: FloatArray
+    X: FloatArray
+    corner: FloatArray
+    weak: bool  # whether a pivot is near 0
+
+
+def _factored(matrix: BandMatrix, rows: IntArray, holds: IntArray, shift: float = 0.0) -> _Factored | None:
+    """Return the factors, in the place of the matrix's A; None if that fails."""
     first = len(rows)
     place = np.empty(first, dtype=np.int64)
     place[rows] = np.arange(first)
-    A, D = matrix.A.copy(), matrix.D.copy()
+    A, D = matrix.A, matrix.D.copy()
     A[:, 0] += shift
     D[np.arange(len(D)), np.arange(len(D))] += shift
     A[place[holds[holds < first]], 0] += 1.0
@@ -149,15 +160,15 @@ def _factored(
         except np.linalg.LinAlgError:
             return None
         pivots = np.concatenate([pivots, np.diagonal(corner)])
-    return L.T, np.asarray(X), corner, bool(pivots.min() ** 2 < WEAK_PIVOT)
+    return _Factored(L.T, np.asarray(X), corner, bool(pivots.min() ** 2 < WEAK_PIVOT))
 
 
 def _null_vectors(matrix: BandMatrix, rows: IntArray, holds: IntArray, Q: FloatArray) -> FloatArray:
     """Return null vectors that are none of the motions Q, orthonormal, by inverse iteration."""
-    found = _factored(matrix, rows, holds, SHIFT)
+    found = _factored(matrix._replace(A=matrix.A.copy()), rows, holds, SHIFT)
     if found is None:
         return np.zeros((len(Q), 0))
-    factor = BandFactor(np.ones(len(Q)), rows, rows, matrix, *found[:3], Q, Q)
+    factor = BandFactor(np.ones(len(Q)), rows, rows, matrix.C, found.L, found.X, found.corner, Q, Q)
     sought = FIRST_SOUGHT
     while True:
         V = np.random.default_rng(0).standard_normal((len(Q), sought))
@@ -192,45 +203,49 @@ def _times(matrix: BandMatrix, rows: IntArray, V: FloatArray) -> FloatArray:
 
 
 @kernel
-def _add_pairs(obs, U, Y, Z, place, points, A, C):  # type: ignore[no-untyped-def]
-    """Add U - Y Y' of the photographs to the band A and -Y Z of interior unknowns to the border C."""
+def _add_pairs(obs, U, Y, Z, place, points, begin, end, flat, stride, C):  # type: ignore[no-untyped-def]
+    """Add U - Y Y' of photographs to the band and -Y Z of interior unknowns to the border C.
+
+    Takes the columns of the photographs in places begin to end, so that others can be taken at the same time.
+    """
     for i in range(len(U)):
         c = 6 * place[i]
-        for q in range(6):
-            for p in range(q, 6):
-                A[c + q, p - q] += U[i, p, q]
+        if begin <= place[i] < end:
+            for q in range(6):
+                for p in range(q, 6):
+                    flat[(c + q) * stride + c + p] += U[i, p, q]
     for j in points:
         for s in range(obs.start[j], obs.start[j + 1]):
-            row = 6 * place[obs.image[s]]
-            for q in range(6):
-                s0, s1, s2 = Y[s, 0, q], Y[s, 1, q], Y[s, 2, q]
-                for c in range(Z.shape[2]):
-                    C[row + q, c] -= s0 * Z[j, 0, c] + s1 * Z[j, 1, c] + s2 * Z[j, 2, c]
+            own = place[obs.image[s]]
+            if begin <= own < end:
+                _add_border(6 * own, Y, s, Z, j, C)
+                _add_triangle(flat, 6 * own, stride, Y, s, s)
             for t in range(obs.start[j], s):
-                column = 6 * place[obs.image[t]]
-                if column < row:
-                    _add_pair(A, column, row - column, Y[t], Y[s])
-                elif column > row:
-                    _add_pair(A, row, column - row, Y[s], Y[t])
-                else:  # a point measured twice in a photograph
-                    _add_triangle(A, row, Y[s], Y[t])
-                    _add_triangle(A, row, Y[t], Y[s])
-            _add_triangle(A, row, Y[s], Y[s])
+                other = place[obs.image[t]]
+                if begin <= min(own, other) < end:
+                    if other < own:
+                        subtract_pair(flat, 6 * other * stride + 6 * own, stride, Y, t, s)
+                    elif other > own:
+                        subtract_pair(flat, 6 * own * stride + 6 * other, stride, Y, s, t)
+                    else:  # a point measured twice in a photograph
+                        _add_triangle(flat, 6 * own, stride, Y, s, t)
+                        _add_triangle(flat, 6 * own, stride, Y, t, s)
 
 
 @njit(cache=True, inline="always", error_model="numpy")
-def _add_pair(A, column, distance, Yc, Yr):  # type: ignore[no-untyped-def]
+def _add_border(row, Y, s, Z, j, C):  # type: ignore[no-untyped-def]
     for q in range(6):
-        c0, c1, c2 = Yc[0, q], Yc[1, q], Yc[2, q]
-        for p in range(6):
-            A[column + q, distance + p - q] -= c0 * Yr[0, p] + c1 * Yr[1, p] + c2 * Yr[2, p]
+        s0, s1, s2 = Y[s, 0, q], Y[s, 1, q], Y[s, 2, q]
+        for c in range(Z.shape[2]):
+            C[row + q, c] -= s0 * Z[j, 0, c] + s1 * Z[j, 1, c] + s2 * Z[j, 2, c]
 
 
 @njit(cache=True, inline="always", error_model="numpy")
-def _add_triangle(A, column, Yc, Yr):  # type: ignore[no-untyped-def]
+def _add_triangle(flat, column, stride, Y, s, t):  # type: ignore[no-untyped-def]
     for q in range(6):
         for p in range(q, 6):
-            A[column + q, p - q] -= Yc[0, q] * Yr[0, p] + Yc[1, q] * Yr[1, p] + Yc[2, q] * Yr[2, p]
+            product = Y[s, 0, q] * Y[t, 0, p] + Y[s, 1, q] * Y[t, 1, p] + Y[s, 2, q] * Y[t, 2, p]
+            flat[(column + q) * stride + column + p] -= product
 
 
 @njit(cache=True, error_model="numpy")

@@ -2,8 +2,8 @@
 
 Of S^-1 only the blocks of single photographs, the border of interior unknowns and kept points, and between
 photographs that share a point are needed: Y'S^-1 Y of an object point sums over pairs of its rays. The
-full matrix gives them by products or triangular products of the rows Y', some points at a time; the banded
-one by the elements of its inverse within the band,
+full matrix gives them pair by pair of rays, or by products or triangular products of the rows Y', some points
+at a time; the banded one by the elements of its inverse within the band,
 
     S^-1 = (Z + X Q X'   -X Q; -Q X'   Q)    Z = A^-1, X = A^-1 C, Q = (D - C' A^-1 C)^-1.
 
@@ -17,15 +17,20 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 from scipy.linalg import cho_solve
-from scipy.linalg.blas import dsyrk, dtrmm
+from scipy.linalg.lapack import dlauum
 
+from sfm.adjustment.accumulate import times_reduced
 from sfm.adjustment.band_inverse import band_inverse
 from sfm.adjustment.banded import BandFactor
 from sfm.adjustment.kernel import kernel
 from sfm.adjustment.normals import Blocks, Equations
+from sfm.adjustment.pairs import times_inverse
 from sfm.adjustment.parameters import Unknowns
-from sfm.adjustment.reduced import Factor, rows_of
+from sfm.adjustment.reduced import HALVED, Factor, rows_of
+from sfm.adjustment.threads import at_once
 from sfm.conventions import FloatArray
+
+TRIANGLE_PARTS = 4  # stretches of columns of a triangular matrix; 5/8 of the work of a full one
 
 
 @dataclass(frozen=True)
@@ -62,26 +67,53 @@ def _of_full(b: Blocks, factor: Factor, layout: Unknowns, cross: bool) -> Invers
     free = layout.reduced_free()
     if not free.all():
         W *= free[:, None]
-    Q = dsyrk(1.0, W)
+    Q, _ = dlauum(W)
     _mirror(Q)
     first = 6 * m
+    wanted = cross or factor.pairs is not None
     core = np.empty((n, 3, 3))
-    YQ = np.empty((len(b.Y) if cross else 0, 3, 6))
-    YQ_border = np.empty((n if cross else 0, 3, layout.reduced - first))
-    ones = np.ones(layout.reduced)
-    for start, rows in rows_of(b, layout, ones, np.float64):
-        if cross:
-            products = rows @ Q
-            _pick(layout.obs, products, start, YQ, YQ_border)
-            pairs = products.reshape(-1, 3, layout.reduced), rows.reshape(-1, 3, layout.reduced)
-        else:
-            white = dtrmm(1.0, W, rows.T, trans_a=1, overwrite_b=1).T.reshape(-1, 3, layout.reduced)
-            pairs = white, white
-        core[start : start + len(rows) // 3] = pairs[0] @ np.swapaxes(pairs[1], 1, 2)
+    YQ = np.empty((len(b.Y) if wanted else 0, 3, 6))
+    YQ_border = np.empty((n if wanted else 0, 3, layout.reduced - first))
+    if factor.pairs is not None:
+        times_inverse(factor.pairs, layout.obs, b.Y, Q.T, b.Z, YQ)
+        times_reduced(layout.obs, b, np.ascontiguousarray(Q[:, first:]), YQ_border)
+        _core(layout.obs, YQ, b.Y, YQ_border, b.Z, core)
+    else:
+        half = n // 2 if layout.reduced**2 >= HALVED else n
+
+        def products(begin: int, end: int) -> None:
+            for start, rows in rows_of(b, layout, np.ones(layout.reduced), np.float64, begin, end):
+                own = slice(start, start + len(rows) // 3)
+                if cross:
+                    rowsQ = rows @ Q
+                    _pick(layout.obs, rowsQ, start, YQ, YQ_border)
+                    _core_of_rows(rowsQ, rows, core[own])
+                else:
+                    white = _times_triangle(rows, W)
+                    _core_of_rows(white, white, core[own])
+
+        at_once(lambda: products(0, half), lambda: products(half, n))
+    if not cross:
+        YQ, YQ_border = YQ[:0], YQ_border[:0]
     block = np.arange(first).reshape(m, 6)
     return Inverse(
         Q[block[:, :, None], block[:, None, :]], Q[:first, first:], Q[first:, first:], core, YQ, YQ_border
     )
+
+
+def _times_triangle(rows: FloatArray, W: FloatArray) -> FloatArray:
+    """Return rows W, W upper triangular, some columns at a time to leave out most of the zeros."""
+    product = np.empty_like(rows)
+    width = -(-W.shape[0] // TRIANGLE_PARTS)
+    for start in range(0, W.shape[0], width):
+        end = min(start + width, W.shape[0])
+        np.matmul(rows[:, :end], W[:end, start:end], out=product[:, start:end])
+    return product
+
+
+def _core_of_rows(left: FloatArray, right: FloatArray, core: FloatArray) -> None:
+    shape = (-1, 3, left.shape[1])
+    np.matmul(left.reshape(shape), np.swapaxes(right.reshape(shape), 1, 2), out=core)
 
 
 def _of_band(b: Blocks, factor: BandFactor, layout: Unknowns, cross: bool) -> Inverse:
@@ -117,7 +149,7 @@ def _mirror(Q):  # type: ignore[no-untyped-def]
             Q[q, p] = Q[p, q]
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", nogil=True)
 def _pick(obs, products, start, YQ, YQ_border):  # type: ignore[no-untyped-def]
     """Take the columns of the photographs that see each point, and those of the border."""
     first = 6 * len(obs.camera)
@@ -129,6 +161,23 @@ def _pick(obs, products, start, YQ, YQ_border):  # type: ignore[no-untyped-def]
                     YQ[o, p, q] = products[3 * h + p, 6 * obs.image[o] + q]
             for q in range(YQ_border.shape[2]):
                 YQ_border[j, p, q] = products[3 * h + p, first + q]
+
+
+@kernel
+def _core(obs, YQ, Y, YQ_border, Z, core):  # type: ignore[no-untyped-def]
+    """Fill Y'Q Y of each object point."""
+    for j in range(len(core)):
+        for p in range(3):
+            for q in range(3):
+                total = 0.0
+                for c in range(Z.shape[2]):
+                    total += YQ_border[j, p, c] * Z[j, q, c]
+                core[j, p, q] = total
+        for o in range(obs.start[j], obs.start[j + 1]):
+            for p in range(3):
+                for q in range(3):
+                    for r in range(6):
+                        core[j, p, q] += YQ[o, p, r] * Y[o, q, r]
 
 
 @njit(cache=True, error_model="numpy")

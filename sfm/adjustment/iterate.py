@@ -1,13 +1,16 @@
 """Iteration of the normal equations to the least sum of squares.
 
 Gauss-Newton with an Armijo line search, or Levenberg-Marquardt to get near and Gauss-Newton to end:
-the last steps are undamped in either case. A step that would bring a point behind a camera has an
-infinite sum of squares and is shortened or damped. Converged means that the predicted change of the
-adjusted observations, |A dx| weighted, is at most `tolerance` times the residuals |v|, or at most
-MIN_SHIFT, so that no unknown would move by more than that share of its own a priori standard deviation.
+the last steps are undamped in either case. Where only the values are wanted, the step that shows
+convergence may be taken with the reduced matrix of the step before, for the gradient of its own state
+(simplified Newton). A step that would bring a point behind a camera has an infinite sum of squares and
+is shortened or damped. Converged means that the predicted change of the adjusted observations, |A dx|
+weighted, is at most `tolerance` times the residuals |v|, or at most MIN_SHIFT, so that no unknown would
+move by more than that share of its own a priori standard deviation.
 
 Source: Boerlin and Grussenmeyer (2013), Photogrammetric Record 28(144), for criterion, line search and
-veto; Nielsen (1999), IMM-REP-1999-05, for the damping.
+veto; Nielsen (1999), IMM-REP-1999-05, for the damping; Deuflhard (2011), Newton Methods for Nonlinear
+Problems, sec. 2.1.2, for the simplified step.
 """
 
 from __future__ import annotations
@@ -19,9 +22,10 @@ import numpy as np
 
 from sfm.adjustment.banded import BandFactor, factor_band
 from sfm.adjustment.collinearity import State, sum_of_squares
-from sfm.adjustment.connectivity import Order, band_order
+from sfm.adjustment.connectivity import Order, pattern_of
 from sfm.adjustment.datum import Datum, Motions, motions_of
 from sfm.adjustment.normals import Equations, Space, new_space, normal_equations, point_step
+from sfm.adjustment.pairs import Pairs
 from sfm.adjustment.parameters import Unknowns, step
 from sfm.adjustment.reduced import Factor, factor
 from sfm.adjustment.weighted import Weighted, weighted_vPv
@@ -37,6 +41,7 @@ NEAR = 1e-2  # |A dx| / |v| below which Levenberg-Marquardt hands over to Gauss-
 MAX_DAMPING = 1e10
 ROUNDING = 1e-12  # relative difference of two sums of the same squares in another order
 FAR = 0.9  # |A dx| / |v| down to which the step after the next is not expected to be the last
+SIMPLIFIED = 0.8  # |A dx| / |v| of a step below which its reduced matrix may show that the next is the last
 COARSE = 1e-2  # |A dx| / |v| down to which steps may come from a product in single precision
 SINGLE_FROM = 200  # reduced unknowns from which the product in single precision saves time
 METHODS = ("gauss-newton", "levenberg-marquardt", "undamped")
@@ -63,7 +68,7 @@ class Problem:
     weighted: Weighted  # observed unknowns
     datum: Datum  # kind and points
     space: Space  # for the normal equations, used again and again
-    order: Order | None  # of the photographs in a banded matrix; None: full matrix
+    pattern: Order | Pairs | None  # a band, or a full matrix summed pair by pair or as a product (None)
 
 
 @dataclass(frozen=True)
@@ -95,7 +100,7 @@ class Step(Move):
 
 def problem_of(layout: Unknowns, weighted: Weighted, datum: Datum) -> Problem:
     """Return what all steps of an adjustment have in common; chooses full or banded normal equations."""
-    return Problem(layout, weighted, datum, new_space(layout), band_order(layout))
+    return Problem(layout, weighted, datum, new_space(layout), pattern_of(layout))
 
 
 def iterate(
@@ -107,6 +112,7 @@ def iterate(
     max_iterations: int = 50,
     tolerance: float = TOLERANCE,
     near: bool = False,
+    exact: bool = True,
 ) -> Optimum:
     """Return the state of least weighted sum of squares.
 
@@ -118,6 +124,8 @@ def iterate(
         max_iterations: steps to try at most.
         tolerance: |A dx| / |v| at which the iteration has converged.
         near: whether the start is near the optimum, so that no step is taken in single precision.
+        exact: whether the factor must belong to the normal equations of the last step, as a covariance needs
+            it; else it may belong to those of the step before.
 
     Raises:
         GeometryError: unknown method, or start values whose normal equations cannot be solved.
@@ -125,7 +133,7 @@ def iterate(
     if method not in METHODS:
         raise GeometryError(f"adjustment: method '{method}' is none of {', '.join(METHODS)}")
     layout = problem.layout
-    single = problem.order is None and layout.reduced >= SINGLE_FROM and not near
+    single = problem.pattern is None and layout.reduced >= SINGLE_FROM and not near
     taken, first = 0, state
     if method == "levenberg-marquardt":
         state, taken = _approach(problem, state, weight, max_iterations, single)
@@ -134,8 +142,9 @@ def iterate(
     before: tuple[State, Move] | None = None
     limit = np.inf
     shortest = 1.0 if method == "undamped" else SHORTEST
+    last: tuple[Factor | BandFactor, Motions] | None = None
     while True:
-        found = _solve(problem, state, weight, single=single, limit=limit)
+        found = _solve(problem, state, weight, single=single, limit=limit, last=last, tolerance=tolerance)
         if found is None:
             if before is None:
                 if state is first:
@@ -156,6 +165,7 @@ def iterate(
         before, share = (state, found.move()), 1.0
         state = step(layout, state, found.reduced, found.points)  # tried by the next normal equations
         limit = _most_allowed(before[1], share, shortest)
+        last = None if exact or not found.within(SIMPLIFIED) else (found.factor, found.motions)
         del found  # its memory is needed for the next
     if found is None:
         _refuse(problem, state)
@@ -190,6 +200,8 @@ def _solve(
     damping: float = 0.0,
     single: bool = False,
     limit: float = np.inf,
+    last: tuple[Factor | BandFactor, Motions] | None = None,
+    tolerance: float = 0.0,
 ) -> Step | None:
     """Return the step from a state; None where the normal equations cannot be solved or v'Pv is too large.
 
@@ -200,32 +212,42 @@ def _solve(
         damping: share of its diagonal added to the normal matrix.
         single: whether single precision will do while the step is far from convergence.
         limit: largest v'Pv.
+        last: factor and motions of the step before, taken if they show convergence.
+        tolerance: |A dx| / |v| of convergence.
     """
     p, layout = problem, problem.layout
     equations = normal_equations(layout, p.weighted, state, weight, damping=damping, space=p.space)
     if equations.vPv > limit or not (np.isfinite(equations.vPv) and np.isfinite(equations.parts.g).all()):
         return None
+    if last is not None:
+        found = _step(layout, equations, *last)
+        if found.within(tolerance):
+            return found
     try:
         motions = motions_of(layout, p.weighted, state, p.datum)
     except GeometryError:  # the datum points have fallen together on the way
         return None
     for coarse in (True, False) if single else (False,):
         factored: Factor | BandFactor | None
-        if p.order is not None:
-            factored = factor_band(equations, layout, motions, p.order, damped=damping > 0)
+        if isinstance(p.pattern, Order):
+            factored = factor_band(equations, layout, motions, p.pattern, damped=damping > 0)
         else:
-            factored = factor(equations, layout, motions, damped=damping > 0, single=coarse)
+            factored = factor(equations, layout, motions, p.pattern, damped=damping > 0, single=coarse)
         if factored is None:
             continue
-        reduced = -factored.solve(equations.parts.g)
-        points = point_step(equations, reduced, layout)
-        y = equations.blocks.y.ravel()
-        predicted = max(float(y @ y - equations.parts.g @ reduced), 0.0)
-        dx, dX = motions.transform(reduced, points)
-        found = Step(dx, dX, predicted, equations.vPv, equations, factored, motions)
+        found = _step(layout, equations, factored, motions)
         if not (coarse and found.within(COARSE)):
             return found
     return None
+
+
+def _step(layout: Unknowns, equations: Equations, factor: Factor | BandFactor, motions: Motions) -> Step:
+    reduced = -factor.solve(equations.parts.g)
+    points = point_step(equations, reduced, layout)
+    y = equations.blocks.y.ravel()
+    predicted = max(float(y @ y - equations.parts.g @ reduced), 0.0)
+    dx, dX = motions.transform(reduced, points)
+    return Step(dx, dX, predicted, equations.vPv, equations, factor, motions)
 
 
 def _approach(

@@ -15,7 +15,7 @@ def kernel(function: Callable[..., Any]) -> Callable[..., Any]:
     the counting would take twice the time of the formula (213 against 47 ns for the collinearity
     equations). All arrays belong to the caller here, so nothing has to be counted.
     """
-    compiled: Callable[..., Any] = njit(cache=True, error_model="numpy", fastmath={"contract"}, _nrt=False)(  # type: ignore[call-overload]
-        function
-    )
+    compiled: Callable[..., Any] = njit(  # type: ignore[call-overload]
+        cache=True, error_model="numpy", fastmath={"contract"}, nogil=True, _nrt=False
+    )(function)
     return compiled

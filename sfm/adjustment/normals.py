@@ -29,7 +29,6 @@ from sfm.adjustment.threads import at_once
 from sfm.adjustment.weighted import Weighted, point_terms, weighted_terms
 from sfm.conventions import FloatArray, IntArray
 
-MANY_RAYS = 10  # image points of an object point, on average, from which two sums of it take little memory
 HALVED = 8_000  # image points from which two halves of the photographs are summed by themselves; a thread of
 # its own takes 0.1 ms to start and saves 0.07 microseconds for each
 
@@ -223,7 +222,7 @@ def new_space(layout: Unknowns) -> Space:
         first=first,
     )
     sums = Sums(0, m, b.D, b.gi, b.V, b.gp, b.Z, np.zeros((2 * most, width)))
-    if k < HALVED or k < MANY_RAYS * n:
+    if k < HALVED:
         return Space(b, (sums,))
     own = (np.zeros_like(part) for part in sums[2:])
     middle = int(np.searchsorted(first, k // 2))

@@ -13,10 +13,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sfm.adjustment.centroid import centroid_of, shifted
 from sfm.adjustment.covariance import cofactors
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.iterate import optimum_at, problem_of
+from sfm.adjustment.local import centroid_of, shifted
 from sfm.adjustment.parameters import angle_jacobian, interior_names, unknowns_of
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.statistics import STRONG

@@ -6,11 +6,13 @@ from collections import Counter
 
 import numpy as np
 
+from sfm.adjustment.accumulate import times_points, times_reduced
 from sfm.adjustment.iterate import Optimum
 from sfm.adjustment.parameters import Unknowns, interior_names
 from sfm.conventions import FloatArray
 from sfm.network import Estimate, Network
 
+MAPPED_TO_ZERO = 1e-6  # length of the image of a null vector of length 1, diagonal 1; rounding leaves 1e-13
 LEADING = 0.1  # share of the largest component of a null vector from which a parameter is named
 EXTERIOR = ("X0", "Y0", "Z0", "x rotation", "y rotation", "z rotation")
 
@@ -21,8 +23,24 @@ def rank_defect(optimum: Optimum, layout: Unknowns) -> int:
     It counts the motions that the normal matrix maps to zero, its further null vectors, directions of
     object points that their rays leave open, and the unknowns held for want of image points.
     """
-    found = optimum.factor.verified() + optimum.factor.further.shape[1]
+    found = null_motions(optimum, layout) + optimum.factor.further.shape[1]
     return found + int(optimum.equations.blocks.held.sum()) + layout.held_defect
+
+
+def null_motions(optimum: Optimum, layout: Unknowns) -> int:
+    """Return how many of the motions that the datum has to fix the normal matrix maps to zero."""
+    b, parts, Q = optimum.equations.blocks, optimum.equations.parts, optimum.factor.motions
+    d = Q.shape[1]
+    H = np.ascontiguousarray(parts.scale[:, None] * Q)
+    first = 6 * len(b.U)
+    NH = np.empty_like(H)
+    NH[:first] = (b.U @ H[:first].reshape(len(b.U), 6, d)).reshape(first, d) + parts.border @ H[first:]
+    NH[first:] = parts.border.T @ H[:first] + parts.corner @ H[first:]
+    through = np.empty((len(b.y), 3, d))
+    times_reduced(layout.obs, b, H, through)
+    np.negative(through, out=through)
+    times_points(layout.obs, b, through, NH)
+    return int((np.linalg.norm(parts.scale[:, None] * NH, axis=0) < MAPPED_TO_ZERO).sum())
 
 
 def undetermined_of(

@@ -16,11 +16,12 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 from scipy.linalg import eigh
-from scipy.linalg.blas import dsymm, dsyrk, ssyrk
+from scipy.linalg.blas import dsyrk, ssyrk
 from scipy.linalg.lapack import dpotrf, dpotrs, dtrtri, spotrf, spotrs
 
 from sfm.adjustment.datum import Motions
 from sfm.adjustment.normals import Blocks, Equations
+from sfm.adjustment.pairs import Pairs, subtract_squares
 from sfm.adjustment.parameters import Unknowns
 from sfm.adjustment.threads import at_once
 from sfm.conventions import FloatArray
@@ -40,10 +41,10 @@ class Factor:
     """Cholesky factor of the scaled reduced normal matrix with its null space filled."""
 
     scale: FloatArray  # 1/sqrt of the unreduced diagonal, (reduced,)
-    matrix: FloatArray  # S + QQ' scaled, upper triangle, (reduced, reduced)
-    cholesky: FloatArray  # its upper factor, (reduced, reduced)
+    cholesky: FloatArray  # upper factor of S + QQ' scaled, (reduced, reduced)
     motions: FloatArray  # Q, null vectors that the datum explains, scaled, orthonormal, (reduced, d)
     further: FloatArray  # null vectors that it does not, scaled, orthonormal, (reduced, e)
+    pairs: Pairs | None  # where it was summed pair by pair
 
     def solve(self, right: FloatArray) -> FloatArray:
         """Return S^+ right for one or several right sides, (reduced,) or (reduced, r)."""
@@ -51,13 +52,6 @@ class Factor:
         solved = dpotrs if self.cholesky.dtype == np.float64 else spotrs
         x, _ = solved(self.cholesky, s * right)
         return np.asarray(s * x)
-
-    def verified(self) -> int:
-        """Return how many of the null vectors that the datum explains the normal matrix maps to 0."""
-        if self.motions.shape[1] == 0:
-            return 0
-        SQ = dsymm(1.0, self.matrix, self.motions) - self.motions
-        return int((np.linalg.norm(SQ, axis=0) < np.sqrt(NULL)).sum())
 
     def inverse_root(self) -> FloatArray:
         """Return W with S^+ = W W', upper triangle, in the units of the unknowns, (reduced, reduced)."""
@@ -67,7 +61,13 @@ class Factor:
 
 
 def factor(
-    equations: Equations, layout: Unknowns, motions: Motions, *, damped: bool = False, single: bool = False
+    equations: Equations,
+    layout: Unknowns,
+    motions: Motions,
+    pairs: Pairs | None = None,
+    *,
+    damped: bool = False,
+    single: bool = False,
 ) -> Factor | None:
     """Return the factored reduced normal equations; None if they are not positive definite.
 
@@ -75,6 +75,7 @@ def factor(
         equations: normal equations with object points eliminated.
         layout: order of the unknowns.
         motions: null vectors that the datum explains.
+        pairs: places of the rays where the matrix is summed pair by pair, None: as a product of full rows.
         damped: whether the equations carry damping, so that no further null vectors are sought.
         single: whether all this may be in single precision, for a step on the way; None if that is too weak.
 
@@ -82,7 +83,7 @@ def factor(
         GeometryError: the matrix would not fit in memory.
     """
     scale = equations.parts.scale
-    S = schur_complement(equations, layout, single=single)
+    S = schur_complement(equations, layout, pairs, single=single)
     Q = np.linalg.qr(motions.reduced / scale[:, None])[0] if motions.defect else motions.reduced
     if motions.defect:
         S = (ssyrk if single else dsyrk)(1.0, Q, beta=1.0, c=S, overwrite_c=1)
@@ -90,11 +91,11 @@ def factor(
     if single:
         cholesky, info = spotrf(S, clean=0, overwrite_a=1)
         weak = info != 0 or float(np.diagonal(cholesky).min()) ** 2 < WEAK_SINGLE
-        return None if weak else Factor(scale, S, cholesky, Q, further)
+        return None if weak else Factor(scale, cholesky, Q, further, pairs)
     cholesky, info = dpotrf(S)
     weak = info != 0 or float(np.diagonal(cholesky).min()) ** 2 < WEAK_PIVOT
     if weak and damped:
-        return None if info != 0 else Factor(scale, S, cholesky, Q, further)
+        return None if info != 0 else Factor(scale, cholesky, Q, further, pairs)
     if weak:
         values, vectors = eigh(S, lower=False)
         further = np.asfortranarray(vectors[:, values < NULL])
@@ -103,26 +104,33 @@ def factor(
             cholesky, info = dpotrf(filled)
         if info != 0:
             return None
-    return Factor(scale, S, cholesky, Q, further)
+    return Factor(scale, cholesky, Q, further, pairs)
 
 
 def rows_of(
-    blocks: Blocks, layout: Unknowns, scale: FloatArray, dtype: type
+    blocks: Blocks,
+    layout: Unknowns,
+    scale: FloatArray,
+    dtype: type,
+    begin: int = 0,
+    end: int | None = None,
 ) -> Iterator[tuple[int, FloatArray]]:
     """Yield rows Y' times scale, some object points at a time: the first point, and (3 points, reduced).
 
-    The next rows take the place of the last ones.
+    The next rows take the place of the last ones. Begins and ends with object points begin and end, if given.
     """
-    n, width = len(blocks.y), layout.reduced
-    points = min(n, max(ROWS * width, CHUNK // width) // 3 + 1)
+    end, width = len(blocks.y) if end is None else end, layout.reduced
+    points = max(min(end - begin, max(ROWS * width, CHUNK // width) // 3 + 1), 1)
     space: FloatArray = np.empty((3 * points, width), dtype=dtype)
-    for first in range(0, n, points):
-        rows = space[: 3 * min(points, n - first)]
+    for first in range(begin, end, points):
+        rows = space[: 3 * min(points, end - first)]
         _fill(layout.obs, blocks.Y, blocks.Z, scale, first, rows)
         yield first, rows
 
 
-def schur_complement(equations: Equations, layout: Unknowns, *, single: bool = False) -> FloatArray:
+def schur_complement(
+    equations: Equations, layout: Unknowns, pairs: Pairs | None = None, *, single: bool = False
+) -> FloatArray:
     """Return S = U - Y Y' scaled, upper triangle, column-major."""
     size = 8.0 * layout.reduced**2
     if size > LARGEST_BYTES:
@@ -133,9 +141,14 @@ def schur_complement(equations: Equations, layout: Unknowns, *, single: bool = F
     b, parts = equations.blocks, equations.parts
     dtype = np.float32 if single else np.float64
     S = np.zeros((layout.reduced, layout.reduced), dtype=dtype)  # lower triangle, row-major, until the end
-    product = np.empty_like(S)
-    for _, rows in rows_of(b, layout, parts.scale, dtype):
-        _subtract_square(rows, product, S)
+    if pairs is None:
+        product = np.empty_like(S)
+        for _, rows in rows_of(b, layout, parts.scale, dtype):
+            _subtract_square(rows, product, S)
+    else:
+        subtract_squares(pairs, layout.obs, b.Y, b.Z, S)
+        S *= parts.scale
+        S *= parts.scale[:, None]
     _add_blocks(b.U, parts.border, parts.corner, parts.scale, 1 + equations.damping, S.T)
     return S.T
 
@@ -161,7 +174,7 @@ def _subtract_square(rows: FloatArray, product: FloatArray, S: FloatArray) -> No
         at_once(triangles, lambda: subtract(right, left, half, 0))
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", nogil=True)
 def _fill(obs, Y, Z, scale, first, rows):  # type: ignore[no-untyped-def]
     start = 6 * len(obs.camera)
     for h in range(len(rows) // 3):

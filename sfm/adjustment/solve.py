@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sfm.adjustment.centroid import centroid_of, shifted
 from sfm.adjustment.collinearity import State, behind_camera, residuals
 from sfm.adjustment.covariance import (
     Cofactors,
@@ -23,6 +22,7 @@ from sfm.adjustment.covariance import (
 )
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.iterate import METHODS, TOLERANCE, Optimum, Problem, iterate, optimum_at, problem_of
+from sfm.adjustment.local import Local, local_of
 from sfm.adjustment.parameters import estimate_of, start_weights, unknowns_of
 from sfm.adjustment.rank import rank_defect, undetermined_of
 from sfm.adjustment.reliability import redundancy_numbers as numbers_of
@@ -93,14 +93,14 @@ def adjust(
     if method not in METHODS:
         raise GeometryError(f"adjustment: method '{method}' is none of {', '.join(METHODS)}")
     use_control = datum.kind == "control"
-    centroid = centroid_of(network, estimate)
-    local, start = shifted(network, estimate, -centroid) if centroid.any() else (network, estimate)
-    layout, state = unknowns_of(local, start, use_control=use_control)
-    weighted = weighted_of(local, layout, use_control=use_control)
+    local = local_of(network, estimate, datum)
+    layout, state = unknowns_of(local.network, local.estimate, use_control=use_control)
+    weighted = weighted_of(local.network, layout, use_control=use_control)
     weight = start_weights(layout, state)
     with own_threads():
         near = tolerance if reject == "none" else max(tolerance, ROUND_TOLERANCE)
-        run = _Run(problem_of(layout, weighted, datum), method, max_iterations, near)
+        run = _Run(problem_of(layout, weighted, local.datum), method, max_iterations, near)
+        run.exact = covariance or reject == "tau"
         optimum, weight = _plain(run, state, weight) if reject == "none" else _sound(run, state, weight)
         if reject == "tau":
             optimum, weight = _snoop_all(run, optimum, weight, alpha)
@@ -112,11 +112,7 @@ def adjust(
             run.tolerance = tolerance
             optimum = run.again(optimum, weight)
         Q = cofactors(optimum, layout, cross=redundancy_numbers) if covariance else None
-        result = _result(local, start, run, optimum, weight, Q, sigma_px, SLOPES.get(reject))
-    if centroid.any():
-        _, adjusted = shifted(local, result.estimate, centroid)
-        result = replace(result, network=network, estimate=adjusted)
-    return result
+        return local.back(_result(local, run, optimum, weight, Q, sigma_px, SLOPES.get(reject)))
 
 
 @dataclass
@@ -127,6 +123,7 @@ class _Run:
     method: str
     max_iterations: int
     tolerance: float
+    exact: bool = True  # whether the factor must belong to the last normal equations
     iterations: int = 0
     remarks: tuple[str, ...] = ()
 
@@ -162,6 +159,7 @@ class _Run:
             max_iterations=self.max_iterations,
             tolerance=self.tolerance,
             near=near,
+            exact=self.exact,
         )
         self.iterations += optimum.iterations
         return optimum
@@ -267,8 +265,7 @@ def _reweight(
 
 
 def _result(
-    network: Network,
-    estimate: Estimate,
+    local: Local,
     run: _Run,
     optimum: Optimum,
     weight: FloatArray,
@@ -276,7 +273,7 @@ def _result(
     sigma_px: float,
     slopes: Callable[[FloatArray], FloatArray] | None,
 ) -> Adjustment:
-    layout = run.problem.layout
+    layout, network, estimate = run.problem.layout, local.network, local.estimate
     redundancy = run.redundancy(optimum, weight)
     observations = 2 * int((weight > 0).sum()) + run.problem.weighted.count
     sigma0 = float(np.sqrt(optimum.vPv / redundancy)) if redundancy > 0 else float("nan")
