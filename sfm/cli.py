@@ -5,6 +5,7 @@ Nothing is imported here that takes time: Ctrl-C and wrong arguments are answere
 
 from __future__ import annotations
 
+import io
 import sys
 
 from sfm.commands.starting import INTERRUPTED, INTERRUPTED_TEXT, loading, stopped_once
@@ -15,6 +16,8 @@ BAD_INPUT = 2  # exit code where a person must put something right
 
 def main() -> None:
     """Run the command line; errors that a person can put right are one line and exit code 2."""
+    if isinstance(sys.stdout, io.TextIOWrapper):  # of a code page that lacks a name's letters
+        sys.stdout.reconfigure(errors="backslashreplace")
     try:
         with stopped_once():
             _run()

@@ -20,12 +20,12 @@ import numpy as np
 
 from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.errors import SurveyFileError
+from sfm.file_values import MAX_NAME, is_plain
 
 # Room for the largest networks that are adjusted here, some 300 MB of memory at most.
 MAX_TABLE_BYTES = 500_000_000
 MAX_ROWS = 5_000_000
 MAX_LINE = 10_000  # characters
-MAX_NAME = 500  # characters
 MAX_NUMBER = 1e12  # no length, angle or pixel is larger; squares and products of larger ones overflow
 
 
@@ -95,7 +95,8 @@ def read_table(
         if header.count(name) > 1:
             raise SurveyFileError(f"{path}, line 1: column {name!r:.60} stands twice in the header")
         if ignored is not None and name not in (*wanted, *optional, *ignored):
-            raise SurveyFileError(f"{path}, line 1: unknown column {name!r:.60}, needed {shape}")
+            hint = "; commas must separate the columns" if ";" in name or "\t" in name else ""
+            raise SurveyFileError(f"{path}, line 1: unknown column {name!r:.60}, needed {shape}{hint}")
     if any(name in header for name in optional):
         numbers = (*numbers, *optional)
     for name in (*texts, *numbers):
@@ -142,7 +143,7 @@ def _rows(path: Path, columns: int) -> Iterator[tuple[int, list[str]]]:
                 yield reader.line_num, row
         except UnicodeDecodeError as error:
             raise SurveyFileError(
-                f"{path}: not a text file in UTF-8 (after line {reader.line_num})"
+                f"{path}: not a text file in UTF-8 (after line {reader.line_num}); save it as such"
             ) from error
         except csv.Error as error:
             raise SurveyFileError(f"{path}, line {reader.line_num}: not a CSV table: {error}") from error
@@ -168,7 +169,7 @@ def read_header(path: Path) -> tuple[str, ...]:
         try:
             return tuple(name.strip() for name in next(csv.reader(_lines(path, file)), []))
         except (UnicodeDecodeError, csv.Error) as error:
-            raise SurveyFileError(f"{path}, line 1: not a CSV table in UTF-8") from error
+            raise SurveyFileError(f"{path}, line 1: not a CSV table in UTF-8; save it as such") from error
         except OSError as error:
             raise SurveyFileError(f"{path}: the table cannot be read: {error.strerror}") from error
 
@@ -191,7 +192,7 @@ def _name(cell: str, where: str) -> str:
     name = cell.strip()
     if not name:
         raise SurveyFileError(f"{where} is empty, a name is needed")
-    if len(name) > MAX_NAME or any(ord(c) < 32 or 127 <= ord(c) < 160 for c in name):
+    if len(name) > MAX_NAME or not is_plain(name):
         raise SurveyFileError(
             f"{where} holds {name!r:.60}, needed plain text of at most {MAX_NAME} characters"
         )

@@ -10,6 +10,7 @@ from pydantic import Field, PrivateAttr, ValidationError
 
 from sfm.distortion.models import MODELS
 from sfm.errors import SurveyFileError
+from sfm.file_values import as_plain, is_plain
 from sfm.settings import (
     MAX_LENGTH_PER_SIGMA,
     AdjustSettings,
@@ -148,6 +149,8 @@ def read_survey(path: Path, *, allow_outside: bool = False) -> Survey:
             another; the line names the file, the key, what was found and what was needed.
     """
     path = Path(path)
+    if not is_plain(str(path)):
+        raise SurveyFileError(f"{as_plain(str(path))}: the path is no plain text; rename the file or folder")
     try:
         if path.exists() and not path.is_file():  # reading a pipe would never end
             raise SurveyFileError(f"{path}: not a file, a survey file (TOML) is needed")
@@ -155,15 +158,20 @@ def read_survey(path: Path, *, allow_outside: bool = False) -> Survey:
             raise SurveyFileError(
                 f"{path}: {path.stat().st_size} bytes, a survey file has at most {MAX_SURVEY_BYTES}"
             )
-        text = path.read_text(encoding="utf-8")
+        text = path.read_text(encoding="utf-8-sig")  # editors of Windows put a byte order mark first
     except OSError as error:
         raise SurveyFileError(f"{path}: the survey file cannot be read: {error.strerror}") from error
     except UnicodeDecodeError as error:
-        raise SurveyFileError(f"{path}: not a text file in UTF-8 (byte {error.start})") from error
+        raise SurveyFileError(
+            f"{path}: not a text file in UTF-8 (byte {error.start}); save it as such"
+        ) from error
     try:
         table = tomllib.loads(text)
-    except (ValueError, RecursionError) as error:  # ValueError: a whole number of thousands of digits
+    except tomllib.TOMLDecodeError as error:
         raise SurveyFileError(f"{path}: not a TOML file: {error}") from error
+    except (ValueError, RecursionError) as error:
+        what = "brackets nested too deeply" if isinstance(error, RecursionError) else "a number is too long"
+        raise SurveyFileError(f"{path}: not a TOML file: {what}") from error
     try:
         survey = Survey.model_validate(table)
     except ValidationError as error:

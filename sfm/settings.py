@@ -7,6 +7,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 
 from sfm.distortion.models import MODELS
+from sfm.file_values import MAX_NAME, is_plain
 
 
 def _pairs(value: Any) -> Any:
@@ -14,9 +15,12 @@ def _pairs(value: Any) -> Any:
     return tuple(value.items()) if isinstance(value, dict) else value
 
 
-def _not_empty(value: str) -> str:
+def _plain(value: str) -> str:
     if not value.strip():
         raise ValueError("found an empty text")
+    if len(value) > MAX_NAME or not is_plain(value):
+        shown = repr(value[:40])
+        raise ValueError(f"found {shown}, needed plain text on one line, at most {MAX_NAME} characters")
     return value
 
 
@@ -26,7 +30,7 @@ SMALLEST_SIGMA = 1e-30  # of a distortion parameter, mm^-8
 MAX_SIDE_PX = 1_000_000
 MAX_LENGTH_PER_SIGMA = 1e6  # no scale bar is calibrated to better than a millionth of its length
 Length = Annotated[float, Field(ge=SMALLEST, le=LARGEST)]
-Name = Annotated[str, BeforeValidator(lambda v: _not_empty(v) if isinstance(v, str) else v)]
+Name = Annotated[str, BeforeValidator(lambda v: _plain(v) if isinstance(v, str) else v)]
 TwoLengths = Annotated[tuple[Length, Length], Field(strict=False)]
 Side = Annotated[int, Field(gt=0, le=MAX_SIDE_PX)]
 TwoCounts = Annotated[tuple[Side, Side], Field(strict=False)]

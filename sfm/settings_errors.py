@@ -66,7 +66,8 @@ def first_error(path: Path, text: str, error: ValidationError, whole: type[Secti
     elif kind == "too_short":
         needed = f"at least {context['min_length']}"
     if needed is None:
-        return f"{where}{key}: {first['msg'][0].lower()}{first['msg'][1:]}"
+        said = first["msg"].removeprefix("Value error, ")
+        return f"{where}{key}: {said[0].lower()}{said[1:]}"
     return f"{where}{key}: found {_found(first['input'])}, needed {needed}"
 
 

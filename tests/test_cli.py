@@ -417,6 +417,21 @@ def test_messages_stay_on_one_line() -> None:
     assert cli._printable("a\nb\x1b[31m\tc") == "a b [31m c"
 
 
+def test_a_name_that_the_terminal_cannot_show_is_no_fault(tmp_path: Path) -> None:
+    survey = write_observed_survey(tmp_path / "s", "\u6e2c\u91cf")
+    out = tmp_path / "\u6e2c"
+    run = subprocess.run(
+        [sys.executable, "-c", "from sfm.cli import main; main()", "adjust", str(survey), "--out", str(out)],
+        cwd=ROOT,
+        env={**os.environ, "PYTHONIOENCODING": "ascii", "PYTHONUTF8": "0"},
+        capture_output=True,
+        timeout=300,
+        check=False,
+    )
+    assert run.returncode == 0, run.stderr
+    assert b"\\u6e2c" in run.stdout.splitlines()[-1]
+
+
 def test_nothing_that_takes_time_is_imported_for_the_help() -> None:
     code = (
         "import sys; sys.argv[1:] = ['--help']\n"

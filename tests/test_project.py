@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import numpy as np
@@ -153,7 +154,13 @@ def test_a_survey_is_frozen(tmp_path: Path) -> None:
         ("sigma = 0.010", "sigma = 0", r"scale_bar 1.sigma: found 0, needed more than 0"),
         ("sigma_px = 0.1", "sigma_px = inf", r"needed a finite number"),
         ('"arcs"', '"ring13"', r"targets.codes = 'ring13' is neither one of arcs, ring12,"),
-        ('name = "camcal"', 'name = " "', r"found an empty text"),
+        ('name = "camcal"', 'name = " "', r"line 2: survey.name: found an empty text"),
+        ('name = "camcal"', r'name = "a\u001b[31m"', r"survey.name: found 'a\\x1b\[31m', needed plain text"),
+        (
+            'name = "camcal"',
+            f'name = "{"a" * 501}"',
+            r"needed plain text on one line, at most 500 characters",
+        ),
         ("c_mm = 7.3", "c_mm = 7.3\nsensor_mm = [7, 5]", r"pixel_mm and sensor_mm are both given"),
         ('[control]\nfile = "control.csv"', "", None),
         ("[survey]", "[survey", r"not a TOML file: .*line 1"),
@@ -202,8 +209,17 @@ def test_unreadable_survey_files(tmp_path: Path) -> None:
     with pytest.raises(SurveyFileError, match="1000001 bytes, a survey file has at most"):
         read_survey(tmp_path / "large.toml")
     (tmp_path / "deep.toml").write_text("a = " + "[" * 5000, encoding="utf-8")
-    with pytest.raises(SurveyFileError, match="not a TOML file"):
+    with pytest.raises(SurveyFileError, match="not a TOML file: brackets nested too deeply"):
         read_survey(tmp_path / "deep.toml")
+    (tmp_path / "long.toml").write_text("a = " + "9" * 5000, encoding="utf-8")
+    with pytest.raises(SurveyFileError, match=r"not a TOML file: a number is too long$"):
+        read_survey(tmp_path / "long.toml")
+
+
+def test_a_survey_file_with_byte_order_mark_and_crlf_is_read(tmp_path: Path) -> None:
+    path = tmp_path / "survey.toml"
+    path.write_bytes(b"\xef\xbb\xbf" + FULL.replace("\n", "\r\n").encode())
+    assert read_survey(path) == read_survey(write(tmp_path, FULL))
 
 
 def test_photographs_are_found_by_glob(tmp_path: Path) -> None:
@@ -229,6 +245,27 @@ def test_photographs_are_found_by_glob(tmp_path: Path) -> None:
 def test_globs_that_are_none(tmp_path: Path, glob: str) -> None:
     with pytest.raises(SurveyFileError, match=r"no glob|empty text"):
         find_photographs(read_survey(write(tmp_path, MINIMAL.replace("*.jpg", glob))))
+
+
+def test_a_photograph_whose_name_is_no_plain_text_is_refused(tmp_path: Path) -> None:
+    survey = read_survey(write(tmp_path, FULL), allow_outside=True)
+    odd = tmp_path / os.fsdecode(b"P825\xff\n.JPG")
+    try:
+        odd.touch()
+    except OSError:
+        pytest.skip("this disk takes names in UTF-8 only")
+    with pytest.raises(SurveyFileError, match=r"photograph 'P825\\xff\\n.JPG' is no plain text; rename"):
+        find_photographs(survey)
+    odd.rename(tmp_path / "P825 ü,'<b>.JPG")
+    assert find_photographs(survey).names == ("P825 ü,'<b>.JPG",)
+
+
+def test_a_photograph_that_is_missing_behind_its_link_is_not_passed_over(tmp_path: Path) -> None:
+    survey = read_survey(write(tmp_path, FULL))
+    (tmp_path / "P8251.JPG").touch()
+    (tmp_path / "P8252.JPG").symlink_to("nowhere.JPG")
+    (tmp_path / "P8253.JPG").mkdir()
+    assert find_photographs(survey).names == ("P8251.JPG", "P8252.JPG")
 
 
 def test_a_photograph_of_two_cameras_is_refused(tmp_path: Path) -> None:
@@ -340,7 +377,14 @@ GOOD = "image,point,x_px,y_px\n1,a,10,20\n"
     ("table", "match"),
     [
         ("", r"line 1: no column image, needed image,point,x_px,y_px\[,sx_px,sy_px\]"),
-        (GOOD.replace("x_px", "x"), r"line 1: unknown column 'x'"),
+        (
+            GOOD.replace("x_px", "x"),
+            r"line 1: unknown column 'x', needed image,point,x_px,y_px\[,sx_px,sy_px\]$",
+        ),
+        (
+            GOOD.replace(",", ";"),
+            r"line 1: unknown column 'image;point;.*; commas must separate the columns$",
+        ),
         (GOOD.replace("y_px", "x_px"), r"line 1: column 'x_px' stands twice"),
         (GOOD.replace("y_px", "y_px,sx_px").replace("20", "20,1"), r"line 1: no column sy_px"),
         (GOOD + "1,b,nan,3\n", r"line 3: column x_px holds 'nan', a finite number is needed"),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -18,6 +19,8 @@ from sfm.report.summary import write_summary
 from sfm.report.tables import write_tables
 from sfm.report.text import text_report
 from sfm.whole_files import whole_folder
+
+MAX_FOLDER_BYTES = 100  # of the name of a survey's folder; disks take 255, endings included
 
 WRITTEN = (
     "summary.json",
@@ -89,6 +92,12 @@ def write_result(
         if finish is not None:
             finish(folder)
     return out / "report.html"
+
+
+def folder_name(name: str) -> str:
+    """Return the name of the folder of a survey's result: its own, as far as all disks take it."""
+    kept = re.sub(r"[^\w.\-]+", "_", name).encode()[:MAX_FOLDER_BYTES].decode(errors="ignore")
+    return kept.strip("._-") or "survey"
 
 
 def refuse_foreign_folder(out: Path) -> None:

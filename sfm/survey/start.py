@@ -11,6 +11,7 @@ import numpy as np
 from sfm.camera import Camera
 from sfm.conventions import FloatArray, IntArray, pixel_from_image
 from sfm.errors import SurveyFileError
+from sfm.file_values import as_plain, is_plain
 from sfm.network import Estimate, ImagePoints, Network, ObjectPoints, ScaleBars
 from sfm.project import Survey, inside
 from sfm.survey.cameras import camera_of_image, start_cameras
@@ -54,8 +55,9 @@ def find_photographs(survey: Survey, *, images_dir: Path | None = None) -> Photo
         images_dir: folder of the photographs in place of the survey file's own.
 
     Raises:
-        SurveyFileError: no such folder, a camera without photographs, a photograph of two cameras, or of no
-            group where its camera has groups, or observed exterior orientation that cannot be used.
+        SurveyFileError: no such folder, a camera without photographs, a photograph of two cameras, of no
+            group where its camera has groups, or with a name that is no plain text; observed exterior
+            orientation that cannot be used.
     """
     folder = Path(images_dir) if images_dir is not None else survey.path.parent
     if not folder.is_dir():
@@ -66,7 +68,7 @@ def find_photographs(survey: Survey, *, images_dir: Path | None = None) -> Photo
         try:
             if ".." in Path(pattern).parts and not survey.allow_outside:
                 inside(folder, pattern, str(survey.path))
-            found = sorted(path for path in folder.glob(pattern) if path.is_file())
+            found = sorted(path for path in folder.glob(pattern) if not path.is_dir())
         except (ValueError, NotImplementedError, IndexError) as error:
             raise SurveyFileError(
                 f"{survey.path}: camera {camera.name}: images = '{pattern}' is no glob relative to {folder}"
@@ -78,6 +80,12 @@ def find_photographs(survey: Survey, *, images_dir: Path | None = None) -> Photo
             raise SurveyFileError(
                 f"no photographs found: camera {camera.name} needs '{pattern}' in {folder}, {_holds(folder)}"
             )
+        for name in (path.relative_to(folder).as_posix() for path in found):
+            if not is_plain(name):
+                raise SurveyFileError(
+                    f"{survey.path}: the name of photograph '{as_plain(name)}' is no plain text; rename the "
+                    "file"
+                )
         owner += [(path.relative_to(folder).as_posix(), path, index) for path in found]
     seen: dict[str, int] = {}
     for name, _, index in owner:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import io
 import os
+import uuid
 import zipfile
 from contextlib import suppress
 from dataclasses import dataclass, fields
@@ -48,7 +49,7 @@ class TargetStore:
     def save(self, key: str, targets: Targets) -> None:
         """Keep targets, whole or not at all; where there is no room they are simply not kept."""
         path = self._path(key)
-        part = path.with_name(f".{path.name}.{os.getpid()}{PART}")
+        part = path.with_name(f".{path.name}.{uuid.uuid4().hex}{PART}")
         data = io.BytesIO()
         np.savez(data, allow_pickle=False, **{f.name: getattr(targets, f.name) for f in fields(Targets)})
         try:
@@ -100,6 +101,8 @@ def content_hash(path: Path) -> str:
         PhotographError: the photograph cannot be read.
     """
     try:
+        if path.exists() and not path.is_file():  # reading a pipe would never end
+            raise PhotographError(f"{path.name}: not a file, a photograph is needed")
         with path.open("rb") as file:
             return hashlib.file_digest(file, "sha256").hexdigest()
     except OSError as error:
