@@ -17,9 +17,12 @@ from contextlib import AbstractContextManager, ExitStack, contextmanager, suppre
 from dataclasses import dataclass
 from itertools import count
 from multiprocessing import resource_tracker
+from threading import Lock
 from typing import Any
 
 import dask
+import dask.system
+import distributed.system
 from dask.distributed import Client, Future, KilledWorker, LocalCluster, Worker, WorkerPlugin, get_worker
 from distributed.core import rpc
 from threadpoolctl import threadpool_limits
@@ -29,6 +32,7 @@ from sfm.errors import BackendError, KolinearError
 
 # Deaths of workers that a call may be near before Dask gives it up: once is bad luck, and is tried elsewhere.
 ALLOWED_FAILURES = 1
+WORKER_BYTES = 3 << 29  # 1.5 GiB, which a photograph of 100 megapixels may take
 CONNECT_SECONDS = 5.0
 NOBODY_SECONDS = 60.0  # without a single worker before a run gives up; a new one takes some 3 s
 LOOK_SECONDS = 2.0
@@ -46,6 +50,11 @@ ONE_THREAD = dict.fromkeys(
 )
 
 
+def fitting_workers() -> int:
+    """Return how many workers this computer bears by its cores and memory, or what is granted of them."""
+    return max(1, min(dask.system.CPU_COUNT, distributed.system.MEMORY_LIMIT // WORKER_BYTES))
+
+
 @contextmanager
 def local_engine(workers: int, *, memory_bytes: int | None = None) -> Iterator[DaskEngine]:
     """Start worker processes on this computer, each with one thread.
@@ -57,7 +66,7 @@ def local_engine(workers: int, *, memory_bytes: int | None = None) -> Iterator[D
     Raises:
         BackendError: they do not start.
     """
-    logging.getLogger("distributed").setLevel(logging.CRITICAL)
+    _silence()
     settings = {
         "distributed.scheduler.allowed-failures": ALLOWED_FAILURES,
         "distributed.scheduler.work-stealing": True,
@@ -88,6 +97,13 @@ def local_engine(workers: int, *, memory_bytes: int | None = None) -> Iterator[D
             client = stack.enter_context(Client(cluster))
             client.register_plugin(_IgnoreInterrupt())
         yield DaskEngine(client)
+
+
+def _silence() -> None:
+    """Keep Dask's own words and tracebacks from the terminal; some of its loggers have their own level."""
+    for name in ("distributed", *logging.root.manager.loggerDict):
+        if name.split(".")[0] == "distributed":
+            logging.getLogger(name).setLevel(logging.CRITICAL)
 
 
 def _close(cluster: LocalCluster) -> None:
@@ -123,7 +139,7 @@ def remote_engine(address: str) -> AbstractContextManager[DaskEngine]:
     Raises:
         BackendError: no scheduler answers, which is known before anything else is begun.
     """
-    logging.getLogger("distributed").setLevel(logging.CRITICAL)
+    _silence()
     try:
         # A Client that cannot connect is never done with it, and says so half a minute later.
         asyncio.run(_ask(address))
@@ -255,21 +271,42 @@ def _call(call: Call, parts: list[Any] | None = None, *, topic: str, work: str) 
 
     more = () if parts is None else (parts,)
     try:
-        with _one_thread():
+        with _HELD:
             return call.function(*call.arguments, *more, tell=tell)
     finally:
         if parts is not None:
             gc.collect()  # figures are full of cycles, and Python is in no hurry: 1 MiB a survey
 
 
-@contextmanager
-def _one_thread() -> Iterator[None]:
-    """Hold BLAS and OpenCV to one thread, in workers that others have started, too."""
-    import cv2
+class _OneThread:
+    """Holds BLAS and OpenCV to one thread, in workers that others have started, too.
 
-    cv2.setNumThreads(1)
-    with threadpool_limits(limits=1):
-        yield
+    Those may have several threads, and the last of their calls gives the libraries theirs back.
+    """
+
+    def __init__(self) -> None:
+        self._lock = Lock()
+        self._calls = 0
+        self._limits: threadpool_limits | None = None
+
+    def __enter__(self) -> None:
+        import cv2
+
+        with self._lock:
+            cv2.setNumThreads(1)
+            self._calls += 1
+            if self._limits is None:
+                self._limits = threadpool_limits(limits=1)
+
+    def __exit__(self, *_: object) -> None:
+        with self._lock:
+            self._calls -= 1
+            if not self._calls and self._limits is not None:
+                self._limits.restore_original_limits()
+                self._limits = None
+
+
+_HELD = _OneThread()  # libraries of this process
 
 
 def _event(key: str, future: Future) -> Event:
