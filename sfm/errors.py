@@ -5,6 +5,7 @@
     |-- PhotographError         a photograph cannot be read or does not fit its camera
     |-- GeometryError           the points or photographs do not determine what is asked for
     |-- OutputError             a result cannot be written
+    |   `-- FolderInUseError    another run is writing there
     `-- BackendError            an external program or library is missing or refuses
 
 Rank, convergence and rejected observations are results, not exceptions.
@@ -29,6 +30,10 @@ class GeometryError(KolinearError):
 
 class OutputError(KolinearError):
     """A result cannot be written where it was asked for."""
+
+
+class FolderInUseError(OutputError):
+    """Another run is writing into the folder."""
 
 
 class BackendError(KolinearError):

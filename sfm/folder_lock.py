@@ -16,7 +16,7 @@ from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
-from sfm.errors import OutputError
+from sfm.errors import FolderInUseError, OutputError
 
 MAX_OWNER_BYTES = 10_000  # of the text in a lock file
 
@@ -34,21 +34,23 @@ class Owner:
 
 
 @contextmanager
-def locked(path: Path) -> Iterator[Owner | None]:
+def locked(path: Path, folder: Path | None = None) -> Iterator[Owner | None]:
     """Hold the lock file `path`, which is gone afterwards.
 
     Args:
         path: the lock file; its folder is made if it is not there.
+        folder: what it locks, for the message; else the folder that it is in.
 
     Yields:
         The owner of a stale lock that was taken over, a run that was killed; None if there was none.
 
     Raises:
-        OutputError: another run holds the lock, or the file cannot be written.
+        FolderInUseError: another run holds the lock.
+        OutputError: the file cannot be written.
     """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        handle = _open_and_lock(path)
+        handle = _open_and_lock(path, folder or path.parent)
     except OSError as error:
         raise OutputError(f"{path}: the lock cannot be written: {error.strerror or error}") from error
     try:
@@ -62,7 +64,19 @@ def locked(path: Path) -> Iterator[Owner | None]:
         _release(handle, path)
 
 
-def _open_and_lock(path: Path) -> int:
+def owner_of(path: Path) -> Owner | None:
+    """Read who holds the lock file `path`, or has left it behind; None if nobody says so."""
+    try:
+        handle = os.open(path, os.O_RDONLY)
+    except OSError:
+        return None
+    try:
+        return _owner(handle)
+    finally:
+        os.close(handle)
+
+
+def _open_and_lock(path: Path, folder: Path) -> int:
     """Open and lock the file that stands at `path` now, not one that its owner has just removed."""
     while True:
         handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
@@ -70,7 +84,7 @@ def _open_and_lock(path: Path) -> int:
             owner = _owner(handle)
             os.close(handle)
             who = f" ({owner})" if owner else ""
-            raise OutputError(f"{path.parent}: another run is writing into this folder{who}; wait or end it")
+            raise FolderInUseError(f"{folder}: another run is writing into this folder{who}; wait or end it")
         try:
             if os.path.samestat(os.fstat(handle), os.stat(path)):
                 return handle

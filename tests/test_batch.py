@@ -5,23 +5,25 @@ from __future__ import annotations
 import csv
 import gc
 import json
+import logging
 import os
 import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import ExitStack, contextmanager, nullcontext
 from pathlib import Path
 
 import psutil
 import pytest
+from threadpoolctl import threadpool_info
 
-from adapters.dask_cluster import DaskEngine, local_engine, remote_engine
+from adapters.dask_cluster import DaskEngine, _OneThread, fitting_workers, local_engine, remote_engine
 from sfm.batch.pages import render_index
-from sfm.batch.run import find_surveys, run_batch
-from sfm.batch.survey import SurveyRow
+from sfm.batch.run import calls_of, find_surveys, run_batch
+from sfm.batch.survey import SurveyJob, SurveyRow, reconstruct
 from sfm.errors import BackendError, KolinearError, OutputError, SurveyFileError
-from sfm.folder_lock import locked
+from sfm.folder_lock import Owner, locked
 from sfm.survey.log import read_log
 from tests.engines import ALONE, HERE, KILLER, Notes, points_of
 from tests.surveys import write_observed_survey, write_photograph_survey
@@ -80,6 +82,8 @@ def test_surveys_are_found_by_file_folder_and_glob(tmp_path: Path) -> None:
         names("e")
     with pytest.raises(SurveyFileError, match="no file matches"):
         names("*.none")
+    with pytest.raises(SurveyFileError, match="an empty name stands for no survey"):
+        find_surveys([""])
 
 
 def test_batch_gives_folders_tables_and_logs(finished: Path) -> None:
@@ -193,6 +197,117 @@ def test_surveys_of_one_name_get_folders_of_their_own(tmp_path: Path) -> None:
         assert f"<td>{file.relative_to(tmp_path)}</td>" in page
 
 
+def test_names_that_disks_and_tables_do_not_take_fail_alone(
+    surveys: tuple[Path, ...], tmp_path: Path
+) -> None:
+    long = [
+        write_observed_survey(tmp_path / folder, "\N{MATHEMATICAL SCRIPT CAPITAL A}" * 100) for folder in "ab"
+    ]
+    bad_folder = write_observed_survey(tmp_path / os.fsdecode(b"bad\xff"), "bad")
+    bad_photograph = write_photograph_survey(tmp_path / "p", "p")
+    (tmp_path / "p" / "photo 1.png").rename(tmp_path / "p" / os.fsdecode(b"photo\xff.png"))
+    out = tmp_path / "out"
+    rows = run_batch([*long, bad_folder, bad_photograph, surveys[2]], out, HERE, ALONE, Notes())
+    assert [row.status for row in rows] == ["done", "done", "failed", "failed", "done"]
+    assert rows[2].file == str(tmp_path / r"bad\xff" / "survey.toml")
+    assert rows[2].reason.endswith("the path is no plain text; rename the file or folder")
+    assert r"'photo\xff.png' is no plain text" in rows[3].reason
+    assert "3 of 5 surveys" in (out / "index.html").read_text(encoding="utf-8")
+
+
+def test_tables_that_cannot_be_read_are_told_by_their_reader(tmp_path: Path) -> None:
+    files = [write_observed_survey(tmp_path / name, name) for name in ("pipe", "folder", "none")]
+    for file in files:
+        (file.parent / "image_points.csv").unlink()
+    os.mkfifo(tmp_path / "pipe" / "image_points.csv")  # whoever opens it waits for ever
+    (tmp_path / "folder" / "image_points.csv").mkdir()
+    rows = run_batch(files, tmp_path / "out", HERE, ALONE, Notes())
+    tables = [file.parent / "image_points.csv" for file in files]
+    assert [row.reason for row in rows] == [
+        f"{tables[0]}: not a file, a CSV table is needed",
+        f"{tables[1]}: not a file, a CSV table is needed",
+        f"{tables[2]}: the table cannot be read: No such file or directory",
+    ]
+
+
+def test_photographs_that_are_no_files_are_told_and_do_not_stop_the_others(tmp_path: Path) -> None:
+    survey = write_photograph_survey(tmp_path / "a", "a")
+    for number in (1, 2):
+        (tmp_path / "a" / f"photo {number}.png").unlink()
+    os.mkfifo(tmp_path / "a" / "photo 1.png")
+    (tmp_path / "a" / "photo 2.png").symlink_to("nowhere.png")
+    (row,) = run_batch([survey], tmp_path / "out", HERE, ALONE, Notes())
+    assert (row.status, row.photographs, row.photographs_total) == ("done", 4, 6)
+    log = read_log(tmp_path / "out" / "a" / "log.jsonl")
+    failed = {one["image"]: one["reason"] for one in log[-1]["failed_photographs"]}
+    assert failed == {
+        "photo 1.png": "not a file, a photograph is needed",
+        "photo 2.png": f"no such file in {tmp_path / 'a'}",
+    }
+
+
+def test_a_page_that_no_batch_has_written_is_left_alone(surveys: tuple[Path, ...], tmp_path: Path) -> None:
+    (tmp_path / "index.html").write_text("my own", encoding="utf-8")
+    with pytest.raises(OutputError, match=r"holds 'index.html', which no batch has written"):
+        run_batch(surveys, tmp_path, HERE, ALONE, Notes())
+    (tmp_path / "batch.json").write_text("[]", encoding="utf-8")
+    with pytest.raises(OutputError, match="which no batch has written"):
+        run_batch(surveys, tmp_path, HERE, ALONE, Notes())
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["batch.json", "index.html"]
+
+
+def test_a_worker_whose_run_is_over_writes_nothing(
+    surveys: tuple[Path, ...], finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As on a cluster, where workers work on when the run that asked was killed and another has begun."""
+    out = tmp_path / "out"
+    job = SurveyJob(surveys[2], out, "third", "", False, Owner(1, "elsewhere", "2026-01-01T00:00:00+00:00"))
+    with (
+        locked(out / ".kolinear" / "lock"),
+        pytest.raises(OutputError, match="the run that asked for survey third is over"),
+    ):
+        reconstruct(job, ALONE, [], tell=lambda _: None)
+    assert not (out / "logs").exists()
+    owners = iter([job.owner, None])  # it ends while the survey is computed
+    monkeypatch.setattr("sfm.batch.survey.owner_of", lambda _: next(owners))
+    with pytest.raises(OutputError, match="the run that asked for survey third is over"):
+        reconstruct(job, ALONE, [], tell=lambda _: None)
+    assert {path.name for path in out.iterdir()} == {".kolinear", "logs"}
+
+
+def test_a_single_run_into_a_folder_of_the_batch_is_not_disturbed(
+    surveys: tuple[Path, ...], finished: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    theirs = out / ".third.abc.part"
+    theirs.mkdir(parents=True)
+    with locked(out / ".third.lock"):  # as `kolinear adjust --out out/third` holds it
+        rows = run_batch([surveys[2], surveys[0]], out, HERE, ALONE, Notes())
+    assert [row.status for row in rows] == ["failed", "done"]
+    assert rows[0].reason.startswith(f"{out / 'third'}: another run is writing into this folder")
+    assert theirs.exists()
+    rows = run_batch([surveys[2]], out, HERE, ALONE, Notes(), resume=True)
+    assert rows[0].status == "done"
+    assert sorted(path.name for path in out.iterdir() if path.name.startswith(".")) == [".kolinear"]
+
+
+def test_resume_removes_the_log_of_a_run_killed_at_the_last_moment(
+    surveys: tuple[Path, ...], tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    run_batch([surveys[2]], out, HERE, ALONE, Notes())
+    (out / "logs").mkdir()
+    (out / "logs" / "third.jsonl").write_text("{}\n", encoding="utf-8")
+    run_batch([surveys[2]], out, HERE, ALONE, Notes(), resume=True)
+    assert not (out / "logs").exists()
+
+
+def test_as_many_workers_as_have_something_to_do(surveys: tuple[Path, ...], tmp_path: Path) -> None:
+    assert calls_of(surveys) == 6 + 6 + 1
+    assert calls_of([tmp_path / "none.toml"]) == 1
+    assert 1 <= fitting_workers() <= (os.cpu_count() or 1)
+
+
 def test_index_escapes_everything() -> None:
     nasty = "\"><script>alert('1')</script>&"
     row = SurveyRow(nasty, nasty, nasty, nasty, nasty, comparison=nasty, reason=nasty)
@@ -277,6 +392,26 @@ def test_workers_listen_to_this_computer_only_and_two_batches_do_not_meet(two_wo
             if connection.status == psutil.CONN_LISTEN
         }
     assert listening == {"127.0.0.1"}
+
+
+def test_dask_says_nothing_by_itself(two_workers: DaskEngine) -> None:
+    """A scheduler that dies would be a traceback of its client, beside our own line."""
+    own = [name for name in logging.root.manager.loggerDict if name.split(".")[0] == "distributed"]
+    assert "distributed.client" in own
+    assert not [name for name in own if logging.getLogger(name).isEnabledFor(logging.ERROR)]
+
+
+def test_libraries_get_their_threads_back_from_the_last_call() -> None:
+    def threads() -> set[int]:
+        return {library["num_threads"] for library in threadpool_info() if library["user_api"] == "blas"}
+
+    before, held = threads(), _OneThread()
+    with ExitStack() as first, ExitStack() as second:  # as two threads of one worker
+        first.enter_context(held)
+        second.enter_context(held)
+        first.close()
+        assert threads() == {1}
+    assert threads() == before
 
 
 @pytest.mark.parametrize(

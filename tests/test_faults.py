@@ -18,8 +18,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sfm.errors import OutputError
-from sfm.folder_lock import locked
+from sfm.errors import FolderInUseError, OutputError
+from sfm.folder_lock import locked, owner_of
 from sfm.survey.log import SurveyLog, read_log
 from sfm.targets.codes import code_family
 from sfm.targets.detect import Targets, find_targets
@@ -192,6 +192,16 @@ def test_lock_tells_its_owner_and_is_free_after_death(tmp_path: Path) -> None:
     with locked(path) as before:
         assert before is None
     (tmp_path / "file").touch()
+    assert owner_of(path) is None
+    with locked(path, tmp_path / "out"):
+        held = owner_of(path)
+        assert held is not None
+        assert held.process == os.getpid()
+        with (
+            pytest.raises(FolderInUseError, match=f"^{tmp_path / 'out'}: another run"),
+            locked(path, tmp_path / "out"),
+        ):
+            pass
     with pytest.raises(OutputError, match="the lock cannot be written"), locked(tmp_path / "file" / "lock"):
         pass
 
@@ -270,6 +280,17 @@ def test_key_depends_on_content_settings_and_codes(tmp_path: Path) -> None:
     ]
     assert len(set(keys)) == len(keys)
     assert target_key(tmp_path / "b.png", "s", ring) == keys[0]
+
+
+def test_a_full_disk_is_told_by_the_log_with_its_name() -> None:
+    full = Path("/dev/full")
+    if not full.exists():
+        pytest.skip("this system has no disk that is always full")
+    with (
+        pytest.raises(OutputError, match=r"^/dev/full: the log cannot be written: No space left"),
+        SurveyLog(full, append=True) as log,
+    ):
+        log.note("start")
 
 
 def test_log_of_a_killed_run_can_be_read(tmp_path: Path) -> None:

@@ -11,19 +11,20 @@ from html import escape
 from pathlib import Path
 
 from sfm.batch.survey import LOGS, SurveyRow
+from sfm.errors import OutputError
 from sfm.file_values import csv_text
 from sfm.report.markup import Cell, file_url, table
 from sfm.report.pages import page
 from sfm.whole_files import whole_file
 
-PAGES = ("batch.csv", "batch.json", "index.html")
+PAGES = ("batch.json", "batch.csv", "index.html")  # the first tells whose they are
 HEADER = ("survey", "file", "result", "photographs", "points", "sigma0, px", "RMS, px", "COLMAP", "seconds")
 LEVELS = {"good": "good", "fair": "fair", "bad": "bad", "": "bad"}
 """colour of a verdict; without a result there is none, which is bad"""
 
 
 def write_batch_pages(rows: Sequence[SurveyRow], out: Path) -> None:
-    """Write batch.csv, batch.json and index.html, each whole or not at all.
+    """Write batch.json, batch.csv and index.html, each whole or not at all.
 
     Args:
         rows: one per survey.
@@ -35,13 +36,27 @@ def write_batch_pages(rows: Sequence[SurveyRow], out: Path) -> None:
     names = [field.name for field in fields(SurveyRow)]
     data = {"surveys": [asdict(row) for row in rows], "totals": totals(rows)}
     texts = (
-        csv_text(names, [tuple(asdict(row).values()) for row in rows]),
         json.dumps(data, indent=2, ensure_ascii=False, allow_nan=False) + "\n",
+        csv_text(names, [tuple(asdict(row).values()) for row in rows]),
         render_index(rows, out.name),
     )
     for name, text in zip(PAGES, texts, strict=True):
         with whole_file(out / name) as part:
             part.write_text(text, encoding="utf-8", newline="")
+
+
+def refuse_foreign_pages(out: Path) -> None:
+    """Raise OutputError where a folder has files of these names that no batch has written."""
+    there = [name for name in PAGES if (out / name).exists() or (out / name).is_symlink()]
+    try:
+        found = json.loads((out / PAGES[0]).read_text(encoding="utf-8")) if there else {}
+        ours = not there or (isinstance(found, dict) and {"surveys", "totals"} <= set(found))
+    except (OSError, ValueError, RecursionError):
+        ours = False
+    if not ours:
+        raise OutputError(
+            f"{out}: the folder holds '{there[-1]}', which no batch has written; needed another --out"
+        )
 
 
 def totals(rows: Sequence[SurveyRow]) -> dict[str, int]:

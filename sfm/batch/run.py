@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import glob
 import hashlib
-import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, suppress
@@ -16,28 +15,30 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
-from sfm.batch.pages import PAGES, write_batch_pages
+from sfm.batch.pages import PAGES, refuse_foreign_pages, write_batch_pages
 from sfm.batch.survey import (
+    LOCK,
     LOGS,
     Comparers,
     SurveyJob,
     SurveyRow,
     fingerprint,
     finished_row,
+    lock_of,
     measure_one,
     reconstruct,
 )
 from sfm.engine import Call, Done, Engine, Lost, Told, Work
-from sfm.errors import KolinearError, SurveyFileError
-from sfm.folder_lock import locked
+from sfm.errors import FolderInUseError, KolinearError, SurveyFileError
+from sfm.file_values import as_plain
+from sfm.folder_lock import locked, owner_of
 from sfm.project import Survey, read_survey
-from sfm.report.output import refuse_foreign_folder
+from sfm.report.output import folder_name, refuse_foreign_folder
 from sfm.survey.log import SurveyLog
 from sfm.survey.start import find_photographs
 from sfm.targets.store import STORE, TargetStore
 from sfm.whole_files import remove_leftovers
 
-LOCK = ".kolinear/lock"
 SURVEY_NAME = "survey.toml"  # what a folder is searched for
 
 
@@ -100,8 +101,9 @@ def run_batch(
         BackendError: there is nobody left to work.
     """
     out = Path(out).resolve()
+    refuse_foreign_pages(out)
     plans = _plan(files, allow_outside=allow_outside)
-    with _no_empty_folders(out), locked(out / LOCK) as before:
+    with _no_empty_folders(out), locked(out / LOCK, out) as before:
         if before is not None:
             watch.remark(f"an earlier run was cut off ({before}); what it had finished is safe")
         _clean(out, plans)
@@ -140,6 +142,8 @@ def find_surveys(names: Sequence[str]) -> tuple[Path, ...]:
     """
     found: dict[Path, None] = {}
     for name in names:
+        if not name:  # as of an unset variable of the shell; for Path it is the current folder
+            raise SurveyFileError("an empty name stands for no survey")
         path = Path(name)
         if path.exists() or not glob.has_magic(name):
             found.update(dict.fromkeys(_below(path)))
@@ -150,6 +154,21 @@ def find_surveys(names: Sequence[str]) -> tuple[Path, ...]:
         for match in matches:
             found.update(dict.fromkeys(_below(match)))
     return tuple(found)
+
+
+def calls_of(files: Sequence[Path], *, allow_outside: bool = False) -> int:
+    """Return how many workers can be busy at a time, at least 1: the photographs and the surveys without."""
+    calls = 0
+    for file in files:
+        with suppress(KolinearError, OSError):  # what is wrong is told by the run
+            survey = read_survey(file, allow_outside=allow_outside)
+            calls += len(find_photographs(survey)) if _has_parts(survey) else 1
+    return max(1, calls)
+
+
+def _has_parts(survey: Survey) -> bool:
+    """Whether photographs are measured one by one; tie points belong to several at once."""
+    return survey.observations is None and survey.tie_points is None
 
 
 def _below(path: Path) -> list[Path]:
@@ -182,8 +201,8 @@ def _plan(files: Sequence[Path], *, allow_outside: bool) -> tuple[_Plan, ...]:
 
 
 def _folder_name(file: Path, survey: Survey | None) -> str:
-    name = survey.name if survey is not None else file.parent.name if file.name == SURVEY_NAME else file.stem
-    return re.sub(r"[^\w.\-]+", "_", name).strip("._")[:80] or "survey"
+    name = file.parent.name if file.name == SURVEY_NAME else file.stem
+    return folder_name(name if survey is None else survey.name)
 
 
 def _run(
@@ -211,14 +230,16 @@ def _run(
                 if plan.survey is None:
                     raise SurveyFileError(plan.reason)
                 refuse_foreign_folder(out / plan.folder)
-                job = SurveyJob(plan.file, out, plan.folder, fingerprint(plan.survey), allow_outside)
+                inputs = fingerprint(plan.survey)
+                job = SurveyJob(plan.file, out, plan.folder, inputs, allow_outside, owner_of(out / LOCK))
                 earlier = finished_row(job) if resume else None
                 if earlier is None:
                     works[plan.folder] = _work(job, plan.survey, comparers)
             except (KolinearError, OSError) as error:
                 finish(plan.folder, _without_result(plan, out, "failed", str(error)))
                 continue
-            if earlier is not None:
+            if earlier is not None:  # its log may be there still, of a run killed at the last moment
+                (out / LOGS / f"{plan.folder}.jsonl").unlink(missing_ok=True)
                 finish(plan.folder, earlier, kept=True)
                 continue
             work = works[plan.folder]
@@ -248,12 +269,9 @@ def _run(
 
 
 def _work(job: SurveyJob, survey: Survey, comparers: Comparers) -> Work:
-    """Return a survey as the engine takes it: a part for each photograph with targets, and the rest.
-
-    Tie points belong to several photographs at once: the whole measures them, in one worker.
-    """
+    """Return a survey as the engine takes it: a part for each photograph with targets, and the rest."""
     parts: tuple[Call, ...] = ()
-    if survey.observations is None and survey.tie_points is None:
+    if _has_parts(survey):
         found = find_photographs(survey)
         parts = tuple(
             Call(measure_one, (job, survey, name, path))
@@ -265,15 +283,18 @@ def _work(job: SurveyJob, survey: Survey, comparers: Comparers) -> Work:
 def _without_result(plan: _Plan, out: Path, status: str, reason: str) -> SurveyRow:
     """Return the row of a survey that no worker has brought to its end, and write its log."""
     name = plan.survey.name if plan.survey is not None else plan.folder
+    file, reason = as_plain(str(plan.file)), as_plain(reason)
     with SurveyLog(out / LOGS / f"{plan.folder}.jsonl", append=True) as log:
-        log.note("failed", survey=name, file=str(plan.file), reason=reason)
-    return SurveyRow(name, str(plan.file), plan.folder, status, reason=reason)
+        log.note("failed", survey=name, file=file, reason=reason)
+    return SurveyRow(name, file, plan.folder, status, reason=reason)
 
 
 def _clean(out: Path, plans: Sequence[_Plan]) -> None:
-    """Remove what killed workers left half-written, and logs of surveys whose results have theirs."""
+    """Remove what killed workers left half-written, but not what others are writing beside this batch."""
     TargetStore(out / STORE).remove_parts()
     for plan in plans:
-        remove_leftovers(out / plan.folder)
+        if any(out.glob(f".{glob.escape(plan.folder)}.*")):
+            with suppress(FolderInUseError), locked(lock_of(out, plan.folder)):
+                remove_leftovers(out / plan.folder)
     for page in PAGES:
         remove_leftovers(out / page)

@@ -12,7 +12,9 @@ from typing import Any
 
 from sfm.compiling import when_compiling
 from sfm.engine import Tell
-from sfm.errors import KolinearError, OutputError
+from sfm.errors import FolderInUseError, KolinearError, OutputError
+from sfm.file_values import as_plain
+from sfm.folder_lock import Owner, locked, owner_of
 from sfm.pipeline import adjust_survey, run_survey
 from sfm.project import Survey, read_survey
 from sfm.report.output import write_result
@@ -23,6 +25,7 @@ from sfm.survey.start import find_photographs
 from sfm.survey.targets import measure_photograph, survey_family
 from sfm.targets.store import STORE, TargetStore
 
+LOCK = ".kolinear/lock"  # of the batch
 LOGS = "logs"  # folder of the logs of surveys that have no result
 
 
@@ -35,6 +38,7 @@ class SurveyJob:
     folder: str  # name of the survey's folder in it
     inputs: str  # fingerprint of everything that the survey reads
     allow_outside: bool  # whether the survey file may name files outside its folder
+    owner: Owner | None  # of the folder of the batch, who asked for this
 
     @property
     def store(self) -> TargetStore:
@@ -86,6 +90,11 @@ class SurveyRow:
         return self.status == "done" and self.verdict != "bad"
 
 
+def lock_of(out: Path, folder: str) -> Path:
+    """Return the lock of a survey's folder, the same as that of a single run into it."""
+    return out / f".{folder}.lock"
+
+
 def measure_one(job: SurveyJob, survey: Survey, image: str, path: Path, *, tell: Tell) -> PhotographNote:
     """Measure one photograph into the store; why it cannot be read is part of what is returned."""
     begun = time.perf_counter()
@@ -119,6 +128,7 @@ def reconstruct(
         OutputError: the result or the log cannot be written.
     """
     begun = time.perf_counter()
+    _refuse_ended(job)
     name = job.folder
     live = job.out / LOGS / f"{job.folder}.jsonl"
     with SurveyLog(live, watch=_Telling(tell)) as log, when_compiling(lambda: tell({"compiling": True})):
@@ -130,11 +140,11 @@ def reconstruct(
             survey = read_survey(job.file, allow_outside=job.allow_outside)
             name = survey.name
             row = _run(job, survey, comparers, log, lambda: before + time.perf_counter() - begun)
-        except OutputError as error:
-            log.note("failed", reason=str(error))
-            raise
         except Exception as error:
-            reason = str(error) if isinstance(error, KolinearError | OSError) else _fault(error)
+            if isinstance(error, OutputError) and not isinstance(error, FolderInUseError):
+                log.note("failed", reason=str(error))  # others will not be written, either
+                raise
+            reason = as_plain(str(error) if isinstance(error, KolinearError | OSError) else _fault(error))
             log.note("failed", reason=reason, **_trace(error))
             seconds = round(before + time.perf_counter() - begun, 3)
             return SurveyRow(name, str(job.file), job.folder, "failed", reason=reason, seconds=seconds)
@@ -147,16 +157,17 @@ def fingerprint(survey: Survey) -> str:
 
     Raises:
         KolinearError: photographs are missing.
-        OSError: a table cannot be read.
+        OSError: a file cannot be read.
     """
     digest = hashlib.sha256(survey.path.read_bytes())
     for table in survey.tables():
-        with table.open("rb") as file:
-            digest.update(hashlib.file_digest(file, "sha256").digest())
+        if table.is_file():  # what cannot be read is said by who reads it; a pipe would never end
+            with table.open("rb") as file:
+                digest.update(hashlib.file_digest(file, "sha256").digest())
     if survey.observations is None:
         found = find_photographs(survey)
         for name, path in zip(found.names, found.paths, strict=True):
-            status = path.stat()
+            status = path.stat() if path.exists() else path.lstat()  # a link that leads nowhere
             digest.update(f"{name}\0{status.st_size}\0{status.st_mtime_ns}\0".encode())
     return digest.hexdigest()
 
@@ -189,11 +200,22 @@ def _run(
     row: list[SurveyRow] = []
 
     def close_log(folder: Path) -> None:
+        _refuse_ended(job)
         row.append(_row(job, result_entries(result), round(seconds(), 3)))
         log.close_into(folder, result, seconds=row[0].seconds)
 
-    write_result(result, job.out / job.folder, write_colmap=comparers.writer_of(result), finish=close_log)
+    with locked(lock_of(job.out, job.folder), job.out / job.folder):
+        write_result(result, job.out / job.folder, write_colmap=comparers.writer_of(result), finish=close_log)
     return row[0]
+
+
+def _refuse_ended(job: SurveyJob) -> None:
+    """Raise OutputError where the run that asked for a survey is over.
+
+    Workers of a cluster work on when it was killed, and another run may have the folder by now.
+    """
+    if owner_of(job.out / LOCK) != job.owner:
+        raise OutputError(f"{job.out}: the run that asked for survey {job.folder} is over")
 
 
 def _row(job: SurveyJob, entries: dict[str, Any], seconds: float) -> SurveyRow:

@@ -135,12 +135,15 @@ def told_of(row: SurveyRow) -> str:
 
 def print_batch(console: Console, rows: Sequence[SurveyRow], page: Path) -> None:
     """Print the outcome of a batch: how many worked, which did not and why, and where the page is."""
-    count = totals(rows)
-    console.print(Text(", ".join(f"{n} {name}" for name, n in count.items() if n or name == "done"), "bold"))
+    count = [(name, n) for name, n in totals(rows).items() if name != "surveys"]
+    counted = [f"{len(rows)} survey{'' if len(rows) == 1 else 's'}"]
+    counted += [f"{n} {name}" for name, n in count if n or name == "done"]
+    console.print(Text(", ".join(counted), "bold"))
     for row in rows:
         if not row.succeeded:
             told = told_of(row) if row.status != "done" else f"{told_of(row)}: see its report"
-            console.print(Text(f"  {row.survey} ({row.file}): {told}", style="red"), soft_wrap=True)
+            where = "" if row.reason.startswith(row.file) else f" ({row.file})"  # not twice
+            console.print(Text(f"  {row.survey}{where}: {told}", style="red"), soft_wrap=True)
     console.print(Text(f"Index: {page}", style="bold"), soft_wrap=True)
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -152,7 +151,12 @@ def batch(
     ] = Path("out/batch"),
     jobs: Annotated[
         int | None,
-        typer.Option("--jobs", metavar="N", min=1, help="Worker processes.  [default: all cores]"),
+        typer.Option(
+            "--jobs",
+            metavar="N",
+            min=1,
+            help="Worker processes.  [default: as many as there are cores and 1.5 GiB of memory]",
+        ),
     ] = None,
     cluster: Annotated[
         str | None,
@@ -179,15 +183,16 @@ def batch(
     with loading():
         from rich.console import Console
 
-        from adapters.dask_cluster import local_engine, remote_engine
-        from sfm.batch.run import find_surveys, run_batch
+        from adapters.dask_cluster import fitting_workers, local_engine, remote_engine
+        from sfm.batch.run import calls_of, find_surveys, run_batch
         from sfm.batch.survey import Comparers
         from sfm.batch.table import BatchTable, print_batch, stopping_at_terminate
 
     files = find_surveys(surveys)
-    engine = (
-        remote_engine(cluster) if cluster is not None else local_engine(jobs or min(_cores(), len(files)))
-    )
+    if cluster is not None:
+        engine = remote_engine(cluster)
+    else:
+        engine = local_engine(jobs or min(fitting_workers(), calls_of(files, allow_outside=allow_outside)))
     with stopping_at_terminate(), BatchTable(Console(stderr=True), verbose=verbose) as table:
         rows = run_batch(
             files,
@@ -236,11 +241,9 @@ def _colmap_writer(result: SurveyResult) -> Callable[[Path], None] | None:
 
 def _folder(survey: Survey, out: Path | None) -> Path:
     """Return the folder of the result, before any work is done for one that cannot be used."""
-    if out is None:
-        name = re.sub(r"[^\w.\-]+", "_", survey.name).strip("._") or "survey"
-        out = Path("out") / name
-    from sfm.report.output import refuse_foreign_folder
+    from sfm.report.output import folder_name, refuse_foreign_folder
 
+    out = Path("out") / folder_name(survey.name) if out is None else out
     refuse_foreign_folder(out)
     return out
 
@@ -258,7 +261,7 @@ def _written(folder: Path) -> Iterator[None]:
     from sfm.folder_lock import locked
     from sfm.whole_files import remove_leftovers
 
-    with locked(folder.parent / f".{folder.name}.lock"):
+    with locked(folder.parent / f".{folder.name}.lock", folder):
         remove_leftovers(folder)
         yield
 

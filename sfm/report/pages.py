@@ -119,7 +119,7 @@ def write_files(out: Path, contents: Sequence[tuple[str, str]], *, main: str) ->
     Raises:
         OutputError: the folder holds something else or cannot be written, or another run is writing it.
     """
-    with locked(out.parent / f".{out.name}.lock"):
+    with locked(out.parent / f".{out.name}.lock", out):
         remove_leftovers(out)
         refuse_other_files(out, [name for name, _ in contents])
         with whole_folder(out, "the result") as folder:

@@ -16,6 +16,7 @@ import json
 import math
 import threading
 import time
+from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from types import TracebackType
@@ -48,6 +49,8 @@ class SurveyLog:
         if path is not None:
             try:
                 path.parent.mkdir(parents=True, exist_ok=True)
+                if not append:  # another run may have it open still
+                    path.unlink(missing_ok=True)
                 self._file = path.open("a" if append else "w", encoding="utf-8")
             except OSError as error:
                 raise OutputError(f"{path}: the log cannot be written: {error.strerror}") from error
@@ -59,7 +62,8 @@ class SurveyLog:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         if self._file is not None:
-            self._file.close()
+            with suppress(OSError):  # said when the line was written
+                self._file.close()
 
     def note(self, event: str, **what: Any) -> None:
         """Write one line.
