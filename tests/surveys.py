@@ -92,7 +92,7 @@ def write_observed_survey(
 @lru_cache
 def pictures() -> tuple[AnyArray, ...]:
     """Render six convergent photographs of two plates with coded targets, without noise."""
-    positions, rotations = _stations(6)
+    positions, rotations = stations(6)
     optics = Optics(blur_px=0.7, exposure=0.9)
     found, _ = render_photographs(_scene(), _camera(), positions, rotations, optics=optics, seed=1)
     return tuple(found)
@@ -102,7 +102,7 @@ def _camera() -> Camera:
     return camera_from_values("small", "brown", SIZE_PX, (PIXEL_MM, PIXEL_MM), c_mm=C_MM)
 
 
-def _stations(count: int) -> tuple[FloatArray, FloatArray]:
+def stations(count: int) -> tuple[FloatArray, FloatArray]:
     """Return positions and rotations of cameras on a ring, 500 mm above the plates, rolled by turns."""
     azimuth = 2 * np.pi * np.arange(count) / count
     position = np.stack([330 * np.cos(azimuth), 330 * np.sin(azimuth), np.full(count, 520.0)], axis=1)

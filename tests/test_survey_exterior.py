@@ -14,7 +14,7 @@ from sfm.adjustment.result import Adjustment
 from sfm.conventions import FloatArray, angles_from_rotation
 from sfm.errors import GeometryError, SurveyFileError
 from sfm.network import Estimate
-from sfm.pipeline import adjust_survey
+from sfm.pipeline import adjust_survey, run_survey
 from sfm.project import read_survey
 from sfm.report.given import exterior_residuals
 from sfm.report.html import render_html
@@ -23,7 +23,7 @@ from sfm.report.result import SurveyResult
 from sfm.report.text import text_report
 from sfm.report.verdict import verdict_of
 from sfm.survey.tables import read_observed_exterior
-from tests.surveys import OBSERVED
+from tests.surveys import OBSERVED, stations, write_photograph_survey
 from tests.synthetic import make_network, seed_of
 
 IMAGES = 8
@@ -261,6 +261,31 @@ def test_wrong_tables_are_refused_with_line_and_column(tmp_path: Path, text: str
     path, _ = written(tmp_path, "refused", text)
     with pytest.raises(SurveyFileError, match=match):
         solved(path)
+
+
+def test_photographs_are_placed_by_their_observed_stations(tmp_path: Path) -> None:
+    path = write_photograph_survey(tmp_path / "photographs", "stations")
+    position, _ = stations(6)
+    seen = position + 0.5 * seed_of("stations").standard_normal(position.shape)
+    rows = "".join(
+        f"photo {i + 1}.png,{X!r},{Y!r},{Z!r},0.5,0.5,0.5\n" for i, (X, Y, Z) in enumerate(seen.tolist())
+    )
+    (path.parent / "exterior.csv").write_text(CENTRES + rows, encoding="utf-8")
+    (path.parent / "control.csv").write_text("id,X,Y,Z,sX,sY,sZ\n5,0,0,0,9e3,9e3,9e3\n", encoding="utf-8")
+    with path.open("a", encoding="utf-8") as file:
+        file.write(
+            '[datum]\nkind = "control"\n[control]\nfile = "control.csv"\n[exterior]\nfile = "exterior.csv"\n'
+        )
+    a = run_survey(read_survey(path)).adjustment
+    assert a.converged and a.network.images == tuple(f"photo {i + 1}.png" for i in range(6))
+    error = a.estimate.position - position
+    assert farthest(error, a.covariance.exterior[:, :3, :3]) < stats.chi2.ppf(1 - ANY, 3)
+    assert np.linalg.norm(error, axis=1).max() < 2.0  # mm, of stations 600 mm away
+    (path.parent / "exterior.csv").write_text(
+        CENTRES + rows.replace("photo 3.png", "photo 9.png"), encoding="utf-8"
+    )
+    with pytest.raises(SurveyFileError, match=r"line 4: column image: .photo 9.png. is no photograph"):
+        run_survey(read_survey(path))
 
 
 def test_images_of_a_result_are_welcome(tmp_path: Path) -> None:

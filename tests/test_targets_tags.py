@@ -20,7 +20,7 @@ from sfm.targets.render import render_photograph, render_photographs
 from sfm.targets.scene import CircularTargets, Faces, Marks, Optics, Scene, discs, join_marks, square_tag
 from sfm.targets.sheet import lay_out_sheet
 from sfm.targets.tags import TAG_FAMILIES, corner_name, tag_family
-from tests.surveys import C_MM, PIXEL_MM, SIZE_PX, _stations
+from tests.surveys import C_MM, PIXEL_MM, SIZE_PX, stations
 
 LOW, HIGH = 0.08, 0.8
 NO_TARGETS = CircularTargets(np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros(0), np.zeros(0, np.int64))
@@ -156,7 +156,7 @@ def surveyed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, FloatArray
     dots = np.array([[-35.0, -120], [0, -120], [35, -120], [-35, 120], [0, 120], [35, 120]])
     marks.append(discs(0, dots, 6.0, LOW))
     camera: Camera = camera_from_values("small", "brown", SIZE_PX, (PIXEL_MM, PIXEL_MM), c_mm=C_MM)
-    positions, rotations = _stations(6)
+    positions, rotations = stations(6)
     optics = Optics(blur_px=0.7, exposure=0.9, noise=2 / 255)
     scene = Scene(faces, join_marks(marks), NO_TARGETS)
     pictures, _ = render_photographs(scene, camera, positions, rotations, optics=optics, seed=2)
