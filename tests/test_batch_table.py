@@ -31,7 +31,12 @@ def test_stage_photographs_and_time_left_are_seen(clock: list[float]) -> None:
     table.planned(["a", "b"])
     assert "0 of 2 surveys" in seen(table) and "left" not in seen(table)
     table.told("a", {"photographs": 4})
+    clock[0] += 5  # no worker has time for it, and its own has not begun
+    line = next(line for line in seen(table).splitlines() if line.startswith("a "))
+    assert line.split() == ["a", "waiting", "0", "of", "4"]
+    clock[0] -= 5
     table.told("a", {"photograph": "1.jpg"})
+    assert "targets" in seen(table)
     table.told("a", {"photograph": "2.jpg"})
     clock[0] += 10
     # Half of its photographs are a quarter of one survey of two: an eighth of the batch took 10 s.

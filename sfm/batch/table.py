@@ -31,8 +31,8 @@ TELLING_SHARE = 0.05  # of a batch that must be done before it is told how long 
 class _Line:
     """A survey under way."""
 
-    begun: float  # time.monotonic()
-    stage: str = "targets"
+    begun: float | None = None  # by a worker, time.monotonic()
+    stage: str = "waiting"
     photographs: int = 0  # measured
     total: int = 0  # to be measured
 
@@ -68,10 +68,13 @@ class BatchTable:
 
     def told(self, name: str, message: dict[str, Any]) -> None:
         """Note what a survey is at."""
-        line = self._lines.setdefault(name, _Line(time.monotonic()))
+        line = self._lines.setdefault(name, _Line())
         if "photographs" in message:
             line.total = int(message["photographs"])
+        elif line.begun is None:
+            line.begun = time.monotonic()
         if "photograph" in message:
+            line.stage = "targets"
             line.photographs += 1
         if "compiling" in message and not self._compiling:
             self._compiling = True
@@ -110,7 +113,8 @@ class BatchTable:
             )
         for name, line in list(self._lines.items()):
             count = f"{line.photographs} of {line.total}" if line.total else ""
-            table.add_row(Text(name), Text(line.stage), count, f"{now - line.begun:.0f}")
+            seconds = "" if line.begun is None else f"{now - line.begun:.0f}"
+            table.add_row(Text(name), Text(line.stage), count, seconds)
         return table
 
     def _sum(self, now: float) -> str:
