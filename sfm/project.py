@@ -214,8 +214,10 @@ def _refuse_contradictions(survey: Survey) -> None:
             f"{where}: datum.points are for kind 'free' or 'minimal', in kind 'control' the control carries "
             "the datum"
         )
-    if survey.datum.kind == "control" and survey.control is None:
-        raise SurveyFileError(f"{where}: datum kind 'control' needs [control] with the file of known points")
+    if survey.datum.kind == "control" and survey.control is None and survey.exterior is None:
+        raise SurveyFileError(
+            f"{where}: datum kind 'control' needs [control] with the file of known points, or [exterior]"
+        )
     for bar in survey.scale_bars:
         if bar.start == bar.end:
             raise SurveyFileError(f"{where}: scale_bar from '{bar.start}' to the same point")

@@ -35,9 +35,15 @@ WHOLE = "image,X,Y,Z,sX,sY,sZ,omega_deg,phi_deg,kappa_deg,somega_deg,sphi_deg,sk
 
 
 def written(
-    folder: Path, name: str, exterior: str | None = None, *, datum: str = "control", images: int = IMAGES
+    folder: Path,
+    name: str,
+    exterior: str | None = None,
+    *,
+    datum: str = "control",
+    images: int = IMAGES,
+    control: bool = False,
 ) -> tuple[Path, Estimate]:
-    """Write a survey whose only control is a point known to 100 m, and observed projection centres."""
+    """Write a survey of observed projection centres, with no control or one point known to 100 m."""
     folder.mkdir(parents=True, exist_ok=True)
     rng = seed_of(name)
     network, truth = make_network(rng, images=images, points=25, free=("c",))
@@ -56,7 +62,8 @@ def written(
     (folder / "exterior.csv").write_text(exterior, encoding="utf-8")
     (folder / "control.csv").write_text("id,X,Y,Z,sX,sY,sZ\n1,0,0,0,100,100,100\n", encoding="utf-8")
     text = OBSERVED.format(name=name, backend="none") + f'[datum]\nkind = "{datum}"\n'
-    text += '[control]\nfile = "control.csv"\n[exterior]\nfile = "exterior.csv"\n'
+    text += '[exterior]\nfile = "exterior.csv"\n'
+    text += '[control]\nfile = "control.csv"\n' if control else ""
     (folder / "survey.toml").write_text(text, encoding="utf-8")
     return folder / "survey.toml", truth
 
@@ -75,8 +82,11 @@ def farthest(error: FloatArray, covariance: FloatArray) -> float:
     return float(np.einsum("na,nab,nb->n", error, np.linalg.inv(covariance), error).max())
 
 
-def test_projection_centres_alone_place_a_survey_within_its_standard_deviations(tmp_path: Path) -> None:
-    path, truth = written(tmp_path, "placed by centres")
+@pytest.mark.parametrize("control", [False, True])
+def test_projection_centres_place_a_survey_within_its_standard_deviations(
+    tmp_path: Path, control: bool
+) -> None:
+    path, truth = written(tmp_path, "placed by centres", control=control)
     a = solved(path).adjustment
     assert a.converged and a.datum == "control"
     assert (a.defect, a.undetermined) == (0, ())
@@ -119,7 +129,7 @@ def test_fixed_stations_stay_where_they_are(tmp_path: Path) -> None:
 
 
 def test_fixed_stations_beside_fixed_control_are_no_observations(tmp_path: Path) -> None:
-    path, truth = written(tmp_path, "all fixed")
+    path, truth = written(tmp_path, "all fixed", control=True)
     for name, header, label, places in (
         ("exterior.csv", "image", "image ", truth.position[:2]),
         ("control.csv", "id", "", truth.points[:3]),
@@ -157,7 +167,7 @@ def test_too_little_to_place_the_network_is_said(tmp_path: Path) -> None:
     X, Y, Z = truth.position[0].tolist()
     (tmp_path / "exterior.csv").write_text(f"image,X,Y,Z\nimage 1,{X!r},{Y!r},{Z!r}\n", encoding="utf-8")
     needed = (
-        "2 projection centres and control points in the network and the angles of 0 photographs are known"
+        "1 projection centres and control points in the network and the angles of 0 photographs are known"
     )
     with pytest.raises(GeometryError, match=needed):
         solved(path)
@@ -172,6 +182,15 @@ def test_projection_centres_on_a_line_do_not_place_a_network(tmp_path: Path, off
     (tmp_path / "exterior.csv").write_text(CENTRES + rows, encoding="utf-8")
     with pytest.raises(GeometryError, match="on a line in the network and the angles of 0 photographs"):
         solved(path)
+
+
+def test_a_control_datum_needs_control_or_exterior(tmp_path: Path) -> None:
+    path, _ = written(tmp_path, "nothing")
+    path.write_text(path.read_text().replace('[exterior]\nfile = "exterior.csv"\n', ""), encoding="utf-8")
+    with pytest.raises(
+        SurveyFileError, match=r"needs \[control\] with the file of known points, or \[exterior\]"
+    ):
+        read_survey(path)
 
 
 def test_in_a_free_datum_it_takes_no_part_and_a_warning_says_so(tmp_path: Path) -> None:

@@ -98,7 +98,7 @@ def solve(
         GeometryError: too little is left to adjust, or control is asked for and not seen.
     """
     datum = Datum(survey.datum.kind)
-    if datum.kind == "control" and len(network.control) == 0:
+    if datum.kind == "control" and len(network.control) == len(network.exterior) == 0:
         raise GeometryError(f"survey {survey.name}: datum 'control', but no control point was measured")
     needed = np.full(len(network.points), 2) if min_rays is None else min_rays.copy()
     if datum.kind == "control":
