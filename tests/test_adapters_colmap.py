@@ -143,7 +143,7 @@ def test_gauge_leaves_the_optimum_alone() -> None:
     a = adjust_with_colmap(network, start, gauge="two_cameras")
     b = adjust_with_colmap(network, start, gauge="free")
     assert a.cost == pytest.approx(b.cost, rel=1e-12)
-    np.testing.assert_allclose(a.residuals, b.residuals, atol=1e-9)
+    np.testing.assert_allclose(a.residuals, b.residuals, atol=1e-8)  # px; how near Ceres gets varies by CPU
     assert a.rms_px == pytest.approx(rms(network, a.estimate), abs=1e-12)
     np.testing.assert_allclose(
         a.estimate.position[0], start.position[0], atol=1e-12
