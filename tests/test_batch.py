@@ -247,6 +247,8 @@ def test_photographs_that_are_no_files_are_told_and_do_not_stop_the_others(tmp_p
 
 
 def test_a_page_that_no_batch_has_written_is_left_alone(surveys: tuple[Path, ...], tmp_path: Path) -> None:
+    with pytest.raises(OutputError, match=r"a\\xff: the path is no plain text; needed another --out"):
+        run_batch(surveys, tmp_path / os.fsdecode(b"a\xff"), HERE, ALONE, Notes())
     (tmp_path / "index.html").write_text("my own", encoding="utf-8")
     with pytest.raises(OutputError, match=r"holds 'index.html', which no batch has written"):
         run_batch(surveys, tmp_path, HERE, ALONE, Notes())

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from sfm.batch.survey import LOGS, SurveyRow
 from sfm.errors import OutputError
-from sfm.file_values import csv_text
+from sfm.file_values import as_plain, csv_text, is_plain
 from sfm.report.markup import Cell, file_url, table
 from sfm.report.pages import page
 from sfm.whole_files import whole_file
@@ -46,7 +46,12 @@ def write_batch_pages(rows: Sequence[SurveyRow], out: Path) -> None:
 
 
 def refuse_foreign_pages(out: Path) -> None:
-    """Raise OutputError where a folder has files of these names that no batch has written."""
+    """Raise OutputError where a folder has files of these names that no batch has written.
+
+    So it does where the path is no text that can stand in them.
+    """
+    if not is_plain(str(out)):
+        raise OutputError(f"{as_plain(str(out))}: the path is no plain text; needed another --out")
     there = [name for name in PAGES if (out / name).exists() or (out / name).is_symlink()]
     try:
         found = json.loads((out / PAGES[0]).read_text(encoding="utf-8")) if there else {}
