@@ -192,7 +192,8 @@ def batch(
     if cluster is not None:
         engine = remote_engine(cluster)
     else:
-        engine = local_engine(jobs or min(fitting_workers(), calls_of(files, allow_outside=allow_outside)))
+        busy = calls_of(files, allow_outside=allow_outside)  # more would wait for nothing
+        engine = local_engine(min(jobs or fitting_workers(), busy))
     with stopping_at_terminate(), BatchTable(Console(stderr=True), verbose=verbose) as table:
         rows = run_batch(
             files,
