@@ -280,19 +280,20 @@ def gather_interior(obs, b, border, corner, g):  # type: ignore[no-untyped-def]
 def times_reduced(obs, b, x, out):  # type: ignore[no-untyped-def]
     """Fill out with Y' x: x of the reduced unknowns, (reduced, d), out of the object points, (n, 3, d)."""
     first = 6 * len(obs.camera)
+    out[:] = 0.0
     for j in range(len(out)):
         for p in range(3):
-            for e in range(x.shape[1]):
-                total = 0.0
-                for q in range(b.Z.shape[2]):
-                    total += b.Z[j, p, q] * x[first + q, e]
-                out[j, p, e] = total
+            for q in range(b.Z.shape[2]):
+                z = b.Z[j, p, q]
+                for e in range(x.shape[1]):
+                    out[j, p, e] += z * x[first + q, e]
         for o in range(obs.start[j], obs.start[j + 1]):
             column = 6 * obs.image[o]
             for p in range(3):
                 for q in range(6):
+                    y = b.Y[o, p, q]
                     for e in range(x.shape[1]):
-                        out[j, p, e] += b.Y[o, p, q] * x[column + q, e]
+                        out[j, p, e] += y * x[column + q, e]
 
 
 @kernel
@@ -301,12 +302,14 @@ def times_points(obs, b, h, out):  # type: ignore[no-untyped-def]
     first = 6 * len(obs.camera)
     for j in range(len(h)):
         for p in range(3):
-            for e in range(h.shape[2]):
-                for q in range(b.Z.shape[2]):
-                    out[first + q, e] += b.Z[j, p, q] * h[j, p, e]
+            for q in range(b.Z.shape[2]):
+                z = b.Z[j, p, q]
+                for e in range(h.shape[2]):
+                    out[first + q, e] += z * h[j, p, e]
         for o in range(obs.start[j], obs.start[j + 1]):
             column = 6 * obs.image[o]
             for p in range(3):
                 for q in range(6):
+                    y = b.Y[o, p, q]
                     for e in range(h.shape[2]):
-                        out[column + q, e] += b.Y[o, p, q] * h[j, p, e]
+                        out[column + q, e] += y * h[j, p, e]
