@@ -293,6 +293,24 @@ def test_a_single_run_into_a_folder_of_the_batch_is_not_disturbed(
     assert sorted(path.name for path in out.iterdir() if path.name.startswith(".")) == [".kolinear"]
 
 
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [("sigma0_px", float("nan")), ("verdict", "splendid"), ("points", "20"), ("survey", 3), ("seconds", "x")],
+)
+def test_resume_runs_again_what_has_a_log_of_somebody_else(
+    surveys: tuple[Path, ...], tmp_path: Path, key: str, value: object
+) -> None:
+    out = tmp_path / "out"
+    run_batch([surveys[2]], out, HERE, ALONE, Notes())
+    log = out / "third" / "log.jsonl"
+    lines = [json.loads(line) for line in log.read_text(encoding="utf-8").splitlines()]
+    lines[-1][key] = value
+    log.write_text("\n".join(json.dumps(line) for line in lines), encoding="utf-8")
+    again = Notes()
+    run_batch([surveys[2]], out, HERE, ALONE, again, resume=True)
+    assert [kept for _, kept in again.finished_rows] == [False]
+
+
 def test_resume_removes_the_log_of_a_run_killed_at_the_last_moment(
     surveys: tuple[Path, ...], tmp_path: Path
 ) -> None:

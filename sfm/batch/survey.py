@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 import time
 import traceback
 from collections.abc import Callable
@@ -26,6 +27,7 @@ from sfm.survey.targets import measure_photograph, survey_family
 from sfm.targets.store import STORE, TargetStore
 
 LOCK = ".kolinear/lock"  # of the batch
+VERDICTS = ("good", "fair", "bad")
 LOGS = "logs"  # folder of the logs of surveys that have no result
 
 
@@ -183,9 +185,20 @@ def finished_row(job: SurveyJob) -> SurveyRow | None:
     if not same or not results:
         return None
     try:
-        return _row(job, results[-1], float(results[-1].get("seconds", 0.0)))
+        row = _row(job, results[-1], float(results[-1].get("seconds", 0.0)))
     except (TypeError, ValueError):
         return None
+    return row if _is_sound(row) else None
+
+
+def _is_sound(row: SurveyRow) -> bool:
+    """Whether the values of a row that was read are such as this program writes."""
+    numbers = (row.sigma0_px, row.rms_px, row.photographs, row.photographs_total, row.points, row.seconds)
+    return (
+        row.verdict in VERDICTS
+        and all(isinstance(text, str) for text in (row.survey, row.comparison, row.reason))
+        and all(n is None or (isinstance(n, int | float) and math.isfinite(n)) for n in numbers)
+    )
 
 
 def _run(
