@@ -303,3 +303,21 @@ def test_two_threads_give_the_same_to_the_last_bit(way: str, monkeypatch: pytest
     monkeypatch.setattr(normals, "HALVED", len(network.image_points) + 1)
     whole = run(network, truth)  # the sums in another order
     assert np.abs(whole.estimate.points - a.estimate.points).max() < 1e-9 * HEIGHT
+
+
+@pytest.mark.parametrize("tolerance", [1e-3, 1e-6])
+@pytest.mark.parametrize("rays", [20, 50])
+def test_values_without_covariance_are_those_with_it(tolerance: float, rays: int) -> None:
+    """Their last step may be taken with the reduced matrix before it; the defect is found all the same."""
+    network, truth = unordered(f"simplified {rays}", 70, 300, rays)
+    start = spoiled(truth, "simplified", 0.02)
+    options = {"method": "gauss-newton", "tolerance": tolerance}
+    quick = run(network, start, covariance=False, **options)
+    whole = run(network, start, **options)
+    assert quick.converged
+    assert whole.converged
+    assert quick.defect == whole.defect == 7
+    assert quick.vPv == pytest.approx(whole.vPv, rel=1e-9)
+    moved = np.linalg.norm(quick.estimate.points - whole.estimate.points, axis=1)
+    sigma = np.sqrt(np.trace(whole.covariance.points, axis1=1, axis2=2))
+    assert (moved / sigma).max() < 10 * tolerance

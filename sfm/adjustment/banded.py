@@ -56,8 +56,7 @@ class BandFactor:
     L: FloatArray  # A + holds = L L', stored as A
     X: FloatArray  # A^-1 C, (6 m, i + 3 s)
     corner: FloatArray  # upper Cholesky factor of D - C' A^-1 C, (i + 3 s, i + 3 s)
-    motions: FloatArray  # null vectors that the datum explains, scaled, orthonormal, (reduced, d)
-    further: FloatArray  # null vectors that it does not, scaled, orthonormal, (reduced, e)
+    further: FloatArray  # null vectors that the datum does not explain, scaled, orthonormal, (reduced, e)
 
     def solve(self, right: FloatArray) -> FloatArray:
         """Return a solution of S x = right for one or several right sides, (reduced,) or (reduced, r)."""
@@ -100,7 +99,7 @@ def factor_band(
         found = _factored(matrix, rows, np.concatenate([holds, _largest(further)]))
     if found is None:
         return None
-    return BandFactor(scale, rows, order.points, matrix.C, found.L, found.X, found.corner, Q, further)
+    return BandFactor(scale, rows, order.points, matrix.C, found.L, found.X, found.corner, further)
 
 
 def _matrix(equations: Equations, layout: Unknowns, order: Order, rows: IntArray) -> BandMatrix:
@@ -168,7 +167,7 @@ def _null_vectors(matrix: BandMatrix, rows: IntArray, holds: IntArray, Q: FloatA
     found = _factored(matrix._replace(A=matrix.A.copy()), rows, holds, SHIFT)
     if found is None:
         return np.zeros((len(Q), 0))
-    factor = BandFactor(np.ones(len(Q)), rows, rows, matrix.C, found.L, found.X, found.corner, Q, Q)
+    factor = BandFactor(np.ones(len(Q)), rows, rows, matrix.C, found.L, found.X, found.corner, Q)
     sought = FIRST_SOUGHT
     while True:
         V = np.random.default_rng(0).standard_normal((len(Q), sought))

@@ -142,7 +142,7 @@ def iterate(
     before: tuple[State, Move] | None = None
     limit = np.inf
     shortest = 1.0 if method == "undamped" else SHORTEST
-    last: tuple[Factor | BandFactor, Motions] | None = None
+    last: Factor | BandFactor | None = None
     while True:
         found = _solve(problem, state, weight, single=single, limit=limit, last=last, tolerance=tolerance)
         if found is None:
@@ -165,7 +165,7 @@ def iterate(
         before, share = (state, found.move()), 1.0
         state = step(layout, state, found.reduced, found.points)  # tried by the next normal equations
         limit = _most_allowed(before[1], share, shortest)
-        last = None if exact or not found.within(SIMPLIFIED) else (found.factor, found.motions)
+        last = None if exact or not found.within(SIMPLIFIED) else found.factor
         del found  # its memory is needed for the next
     if found is None:
         _refuse(problem, state)
@@ -200,7 +200,7 @@ def _solve(
     damping: float = 0.0,
     single: bool = False,
     limit: float = np.inf,
-    last: tuple[Factor | BandFactor, Motions] | None = None,
+    last: Factor | BandFactor | None = None,
     tolerance: float = 0.0,
 ) -> Step | None:
     """Return the step from a state; None where the normal equations cannot be solved or v'Pv is too large.
@@ -212,21 +212,21 @@ def _solve(
         damping: share of its diagonal added to the normal matrix.
         single: whether single precision will do while the step is far from convergence.
         limit: largest v'Pv.
-        last: factor and motions of the step before, taken if they show convergence.
+        last: factor of the step before, taken if it shows convergence.
         tolerance: |A dx| / |v| of convergence.
     """
     p, layout = problem, problem.layout
     equations = normal_equations(layout, p.weighted, state, weight, damping=damping, space=p.space)
     if equations.vPv > limit or not (np.isfinite(equations.vPv) and np.isfinite(equations.parts.g).all()):
         return None
-    if last is not None:
-        found = _step(layout, equations, *last)
-        if found.within(tolerance):
-            return found
     try:
         motions = motions_of(layout, p.weighted, state, p.datum)
     except GeometryError:  # the datum points have fallen together on the way
         return None
+    if last is not None:
+        found = _step(layout, equations, last, motions)
+        if found.within(tolerance):
+            return found
     for coarse in (True, False) if single else (False,):
         factored: Factor | BandFactor | None
         if isinstance(p.pattern, Order):

@@ -29,9 +29,11 @@ def rank_defect(optimum: Optimum, layout: Unknowns) -> int:
 
 def null_motions(optimum: Optimum, layout: Unknowns) -> int:
     """Return how many of the motions that the datum has to fix the normal matrix maps to zero."""
-    b, parts, Q = optimum.equations.blocks, optimum.equations.parts, optimum.factor.motions
-    d = Q.shape[1]
-    H = np.ascontiguousarray(parts.scale[:, None] * Q)
+    b, parts, motions = optimum.equations.blocks, optimum.equations.parts, optimum.motions
+    d = motions.defect
+    if d == 0:
+        return 0
+    H = parts.scale[:, None] * np.linalg.qr(motions.reduced / parts.scale[:, None])[0]
     first = 6 * len(b.U)
     NH = np.empty_like(H)
     NH[:first] = (b.U @ H[:first].reshape(len(b.U), 6, d)).reshape(first, d) + parts.border @ H[first:]

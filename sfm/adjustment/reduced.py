@@ -42,8 +42,7 @@ class Factor:
 
     scale: FloatArray  # 1/sqrt of the unreduced diagonal, (reduced,)
     cholesky: FloatArray  # upper factor of S + QQ' scaled, (reduced, reduced)
-    motions: FloatArray  # Q, null vectors that the datum explains, scaled, orthonormal, (reduced, d)
-    further: FloatArray  # null vectors that it does not, scaled, orthonormal, (reduced, e)
+    further: FloatArray  # null vectors that the datum does not explain, scaled, orthonormal, (reduced, e)
     pairs: Pairs | None  # where it was summed pair by pair
 
     def solve(self, right: FloatArray) -> FloatArray:
@@ -91,11 +90,11 @@ def factor(
     if single:
         cholesky, info = spotrf(S, clean=0, overwrite_a=1)
         weak = info != 0 or float(np.diagonal(cholesky).min()) ** 2 < WEAK_SINGLE
-        return None if weak else Factor(scale, cholesky, Q, further, pairs)
+        return None if weak else Factor(scale, cholesky, further, pairs)
     cholesky, info = dpotrf(S)
     weak = info != 0 or float(np.diagonal(cholesky).min()) ** 2 < WEAK_PIVOT
     if weak and damped:
-        return None if info != 0 else Factor(scale, cholesky, Q, further, pairs)
+        return None if info != 0 else Factor(scale, cholesky, further, pairs)
     if weak:
         values, vectors = eigh(S, lower=False)
         further = np.asfortranarray(vectors[:, values < NULL])
@@ -104,7 +103,7 @@ def factor(
             cholesky, info = dpotrf(filled)
         if info != 0:
             return None
-    return Factor(scale, cholesky, Q, further, pairs)
+    return Factor(scale, cholesky, further, pairs)
 
 
 def rows_of(
