@@ -274,6 +274,10 @@ def _result(
     slopes: Callable[[FloatArray], FloatArray] | None,
 ) -> Adjustment:
     layout, network, estimate = run.problem.layout, local.network, local.estimate
+    of_control = run.problem.datum.kind == "control"
+    allowed = 0 if of_control else 7  # motions: control is meant to fix all of them
+    defect = rank_defect(optimum, layout)
+    undetermined = undetermined_of(optimum, layout, network, estimate, allowed_motions=allowed)
     redundancy = run.redundancy(optimum, weight)
     observations = 2 * int((weight > 0).sum()) + run.problem.weighted.count
     sigma0 = float(np.sqrt(optimum.vPv / redundancy)) if redundancy > 0 else float("nan")
@@ -305,17 +309,15 @@ def _result(
         numbers[weight == 0] = np.nan
         numbers = np.take(numbers, back, axis=0)
         standardised = np.take(standardised_residuals(v, complement, layout.obs.whitening), back, axis=0)
-    of_control = run.problem.datum.kind == "control"
-    allowed = 0 if of_control else 7  # motions: control is meant to fix all of them
     return Adjustment(
         network=network,
         estimate=estimate_of(optimum.state, estimate),
         converged=optimum.converged,
         iterations=run.iterations,
         datum=run.problem.datum.kind,
-        defect=rank_defect(optimum, layout),
+        defect=defect,
         expected_defect=0 if of_control else optimum.motions.defect,
-        undetermined=undetermined_of(optimum, layout, network, estimate, allowed_motions=allowed),
+        undetermined=undetermined,
         residuals=np.take(v, back, axis=0),
         rejected=np.take((weight == 0), back, axis=0),
         redundancy_numbers=numbers,
