@@ -48,6 +48,13 @@ ONE_THREAD = dict.fromkeys(
     ),
     "1",
 )
+# What Dask remembers for its dashboard, which nobody sees here. Call stacks, sampled 100 times a second in
+# each worker and kept for 1000 s, were 1.1 MiB a survey; its logs grow for the first hundreds of surveys.
+NO_DIARY = {
+    "distributed.worker.profile.enabled": False,
+    "distributed.admin.low-level-log-length": 100,
+    "distributed.admin.system-monitor.log-length": 60,
+}
 
 
 def fitting_workers() -> int:
@@ -70,6 +77,7 @@ def local_engine(workers: int, *, memory_bytes: int | None = None) -> Iterator[D
     settings = {
         "distributed.scheduler.allowed-failures": ALLOWED_FAILURES,
         "distributed.scheduler.work-stealing": True,
+        **NO_DIARY,
         "distributed.nanny.pre-spawn-environ": {
             **ONE_THREAD,
             "MALLOC_TRIM_THRESHOLD_": "65536",
@@ -231,7 +239,10 @@ class DaskEngine:
                 self.client.unsubscribe_topic(run)
 
     def _submit(self, work: Work, run: str, *, priority: int) -> list[Future]:
-        """Submit the parts of a piece of work and then its whole, which comes first in the list."""
+        """Submit the parts of a piece of work and then its whole, which comes first in the list.
+
+        Keys are without the name of the work: the scheduler remembers forever what stands before the digits.
+        """
 
         def submit(call: Call, name: str, *more: Any) -> Future:
             return self.client.submit(
@@ -240,7 +251,7 @@ class DaskEngine:
                 *more,
                 topic=run,
                 work=work.key,
-                key=f"{name}-{work.key}-{uuid.uuid4().hex}",
+                key=f"{name}-{uuid.uuid4().hex}",
                 priority=priority,
                 pure=False,
             )
