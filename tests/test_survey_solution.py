@@ -77,7 +77,7 @@ def test_what_contradicts_the_photographs_is_named_if_it_can_be_told(kind: str, 
     def readjust(one: Network) -> Adjustment:
         return adjust(one, a.estimate, datum=datum, sigma_px=0.1, reject="none", covariance=False)
 
-    found = contradiction(network, a, readjust)
+    found = contradiction(network, a, readjust, unit="m")
     if blamed is None:
         assert found is None
         return

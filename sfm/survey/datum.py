@@ -67,7 +67,7 @@ class Contradiction:
 
 
 def contradiction(
-    network: Network, adjustment: Adjustment, readjust: Callable[[Network], Adjustment]
+    network: Network, adjustment: Adjustment, readjust: Callable[[Network], Adjustment], *, unit: str
 ) -> Contradiction | None:
     """Return what contradicts the photographs where the test rejects most rays of a control point or bar end.
 
@@ -79,6 +79,7 @@ def contradiction(
         network: all image points, with control and bars.
         adjustment: of a part of it, after the test, points by the same names.
         readjust: adjusts such a part without any test.
+        unit: object unit, for the words.
 
     Returns:
         None where nothing is contradicted, or nothing is left to tell it from.
@@ -117,7 +118,9 @@ def contradiction(
         return Contradiction(None, np.array([name in known for name in network.points]), line)
     blamed = suspects[order[0]]
     return Contradiction(
-        blamed.without(network), np.zeros(len(network.points), dtype=bool), blamed.line(best.estimate.points)
+        blamed.without(network),
+        np.zeros(len(network.points), dtype=bool),
+        blamed.line(best.estimate.points, unit),
     )
 
 
@@ -141,8 +144,8 @@ class _Suspect:
         left = ScaleBars(bars.start[keep], bars.end[keep], bars.length[keep], bars.sigma[keep])
         return replace(network, scale_bars=left)
 
-    def line(self, X: FloatArray) -> str:
-        """Return in words by how much it is off from the adjusted object points, (n, 3)."""
+    def line(self, X: FloatArray, unit: str) -> str:
+        """Return in words by how much it is off from the adjusted object points, object unit, (n, 3)."""
         at = X[list(self.indices)]
         if len(at) == 1:
             name, treated = f"control point {self.names[0]}", "it was adjusted as a new point"
@@ -150,9 +153,7 @@ class _Suspect:
         else:
             name, treated = f"scale bar {self.names[0]} - {self.names[1]}", "it was taken out"
             by = f"{self.given[0] - np.linalg.norm(at[1] - at[0]):+.3g}"
-        return (
-            f"{name} does not fit: by the others and the photographs it is {by} off (object unit); {treated}"
-        )
+        return f"{name} does not fit: by the others and the photographs it is {by} {unit} off; {treated}"
 
 
 def _suspect_control(part: Network, held: FloatArray) -> Iterator[_Suspect]:

@@ -213,7 +213,7 @@ def _contradiction(task: _Task, adjustment: Adjustment) -> Contradiction | None:
     def readjust(one: Network) -> Adjustment:
         return _tested(untested, one, adjustment.estimate, covariance=False)
 
-    return contradiction(task.network, adjustment, readjust)
+    return contradiction(task.network, adjustment, readjust, unit=task.survey.unit)
 
 
 def _tested(task: _Task, network: Network, estimate: Estimate, *, covariance: bool) -> Adjustment:
