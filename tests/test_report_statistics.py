@@ -21,7 +21,14 @@ from sfm.adjustment.variance_components import by_kind
 from sfm.analysis.comparison import AdjusterComparison, BackendAdjustment, compare_adjusters
 from sfm.camera import Camera
 from sfm.network import Estimate, InteriorObservations, Network, ObjectPoints, ScaleBars
-from sfm.report.checks import count_observations, longest_residual, worst_residuals
+from sfm.report.checks import (
+    count_observations,
+    longest_residual,
+    sigma0_ratio,
+    stated_px,
+    words_of_sigma0,
+    worst_residuals,
+)
 from sfm.report.given import bar_residuals, control_residuals, interior_residuals
 from sfm.report.html import render_html
 from sfm.report.markup import signed, significant
@@ -277,6 +284,31 @@ def test_weights_found_from_the_residuals_do_not_hide_sigma0(synthetic: tuple[Ne
     assert "expected standard deviation of an image coordinate (0.0005" in bad.remarks[0]
     text = summary(result_of(a, weight_factor=3.0))
     assert text["statistics"]["sigma0_ratio"] == pytest.approx(3 * a.sigma0)
+
+
+def test_control_that_contradicts_is_told_apart_from_the_image_points(
+    synthetic: tuple[Network, Estimate],
+) -> None:
+    network, truth = synthetic
+    xyz = truth.points[:6].copy()
+    xyz[0, 0] += 0.02
+    a = adjust(with_control(network, xyz, 1e-3), truth, datum=Datum("control"), reject="none")
+    result = result_of(a)
+    own = sigma0_ratio(result) * stated_px(result)
+    assert a.sigma0_px > 1.05 * own
+    assert own == pytest.approx(NOISE_PX, rel=0.1)  # whatever the control does
+    figure, words = words_of_sigma0(result)
+    assert figure == f"{a.sigma0_px:.4f} px"
+    assert f"image points by themselves {own:.4f} px" in words
+    page = " ".join(render_html(result, (), ()).split())
+    assert figure in page and words in page
+    assert f"{own:.5f} px, by themselves" in " ".join(text_report(result).split())
+    written = summary(result)["statistics"]
+    assert written["image_points_px"] == pytest.approx(own) and written["stated_px"] == pytest.approx(
+        NOISE_PX
+    )
+    free = result_of(adjust(network, truth, datum=Datum("free")))
+    assert "by themselves" not in " ".join(words_of_sigma0(free))
 
 
 def test_each_kind_is_tested_against_what_was_stated_in_the_same_words_everywhere(

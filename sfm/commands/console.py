@@ -11,7 +11,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextC
 from rich.table import Table
 from rich.text import Text
 
-from sfm.report.checks import count_observations, sigma0_ratio
+from sfm.report.checks import count_observations, words_of_sigma0
 from sfm.report.markup import finer_unit, significant
 from sfm.report.precision import point_precision
 from sfm.report.result import SurveyResult
@@ -122,7 +122,7 @@ def _figures(result: SurveyResult) -> tuple[tuple[str, str], ...]:
         ("datum", f"{a.datum}, rank defect {a.defect} (expected {a.expected_defect})"),
         (
             "sigma0",
-            f"{a.sigma0_px:.4f} px, {sigma0_ratio(result):.2f} times the expected, redundancy {a.redundancy}",
+            f"{', '.join(words_of_sigma0(result))}, redundancy {a.redundancy}",
         ),
         ("residuals", f"RMS {a.rms_px:.4f} px per coordinate, largest {a.max_residual_px:.3f} px"),
         (

@@ -14,8 +14,10 @@ from sfm.adjustment.result import Adjustment
 from sfm.adjustment.variance_components import IMAGE_POINTS, variance_components
 from sfm.adjustment.weighted import observed
 from sfm.conventions import BoolArray, FloatArray, IntArray
+from sfm.report.markup import significant
 from sfm.report.result import ControlCheck, SurveyResult
 
+TOLD_APART = 0.01  # relative difference from which sigma0 of the image points is told beside that of all
 MEDIAN_LENGTH = 1.1774  # median length of a normal vector in the plane over its sigma: sqrt(2 ln 2)
 
 
@@ -51,6 +53,25 @@ def sigma0_ratio(result: SurveyResult) -> float:
     a = result.adjustment
     own = variance_components(a, np.zeros(len(a.rejected), dtype=np.int64), (IMAGE_POINTS,)).sigma0[0]
     return float((own if np.isfinite(own) else a.sigma0) * result.weight_factor)
+
+
+def stated_px(result: SurveyResult) -> float:
+    """Return the stated a priori standard deviation of an image coordinate, px."""
+    return result.adjustment.a_priori_px / result.weight_factor
+
+
+def words_of_sigma0(result: SurveyResult) -> tuple[str, str]:
+    """Return sigma0 and what it is to the stated one, with the image points where they show another.
+
+    Sigma0 is that of all observations together, so that control that contradicts the photographs raises it
+    above what their residuals show.
+    """
+    a, ratio = result.adjustment, sigma0_ratio(result)
+    stated = stated_px(result)
+    own, times = ratio * stated, f"{ratio:.3f} times the {significant(stated)} px expected"
+    if not abs(a.sigma0_px - own) > TOLD_APART * own:
+        return f"{a.sigma0_px:.4f} px", times
+    return f"{a.sigma0_px:.4f} px", f"of all observations; image points by themselves {own:.4f} px, {times}"
 
 
 def longest_residual(adjustment: Adjustment) -> tuple[float, int]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from sfm.report.checks import object_size, sigma0_ratio
+from sfm.report.checks import object_size, words_of_sigma0
 from sfm.report.markup import figure, finer_unit, significant
 from sfm.report.overlays import Overlay
 from sfm.report.pages import page
@@ -72,6 +72,7 @@ def _tiles(result: SurveyResult) -> list[tuple[str, str, str]]:
     size = object_size(a.estimate.points)
     typical = float(point_precision(a)[0, 3])
     fixed = without_fixed(a)
+    sigma0, words = words_of_sigma0(result)
     factor, unit = finer_unit(result.length_unit, typical)
     tiles = [
         ("Photographs oriented", f"{len(a.network.images)} of {result.images_total}", ""),
@@ -86,9 +87,8 @@ def _tiles(result: SurveyResult) -> list[tuple[str, str, str]]:
         ("RMS residual", f"{a.rms_px:.4f} px", "per image coordinate"),
         (
             "Sigma0",
-            f"{a.sigma0_px:.4f} px",
-            f"{sigma0_ratio(result):.3f} times the {a.a_priori_px / result.weight_factor:.3g} px expected, "
-            f"redundancy {a.redundancy}",
+            sigma0,
+            f"{words}, redundancy {a.redundancy}",
         ),
     ]
     both = result.comparison

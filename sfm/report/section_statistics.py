@@ -16,6 +16,7 @@ from sfm.adjustment.variance_components import VarianceComponents
 from sfm.report.checks import (
     count_observations,
     sigma0_ratio,
+    stated_px,
     worst_residuals,
 )
 from sfm.report.markup import significant, table
@@ -32,10 +33,12 @@ from sfm.report.statistics import (
 def image_coordinates(result: SurveyResult) -> str:
     """Sigma0, the global test, residuals and redundancy, then the ten worst residuals."""
     a, found = result.adjustment, statistics_of(result)
+    ratio = sigma0_ratio(result)
     rows = [
-        ("sigma0, a posteriori standard deviation of a coordinate", f"{a.sigma0_px:.5f}", "px"),
-        ("standard deviation stated beforehand", f"{a.a_priori_px / result.weight_factor:.5f}", "px"),
-        ("of the image points, a posteriori over that stated", f"{sigma0_ratio(result):.3f}", ""),
+        ("sigma0, a posteriori, of all observations", f"{a.sigma0_px:.5f}", "px"),
+        ("standard deviation by the image points alone", f"{ratio * stated_px(result):.5f}", "px"),
+        ("standard deviation stated beforehand", f"{stated_px(result):.5f}", "px"),
+        ("of the image points, a posteriori over that stated", f"{ratio:.3f}", ""),
         ("RMS residual per coordinate", f"{a.rms_px:.5f}", "px"),
         ("longest residual vector among the accepted", f"{a.max_residual_px:.4f}", "px"),
     ]
@@ -45,9 +48,9 @@ def image_coordinates(result: SurveyResult) -> str:
     words = words_of_weights(result)
     text += f"<p class=note>{escape(words)}</p>" if words else ""
     text += (
-        "<p class=note>The global test asks whether the standard deviation stated beforehand (sigma_px) is "
-        "that of the photographs. It is only a rough guess: a test that is not passed says by how much to "
-        "correct it, unless sigma0 is several times too large.</p>"
+        "<p class=note>The global test asks whether the standard deviations stated beforehand are those of "
+        "the residuals. That of the image points (sigma_px) is only a rough guess: a test that is not passed "
+        "says by how much to correct it, unless sigma0 is several times too large.</p>"
     )
     known = np.isfinite(a.redundancy_numbers).any()
     return text + (_tests_and_reliability(result, found) if known else "")

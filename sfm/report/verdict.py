@@ -15,6 +15,7 @@ from sfm.report.checks import (
     longest_residual,
     object_size,
     sigma0_ratio,
+    stated_px,
 )
 from sfm.report.given import (
     EXTERIOR,
@@ -114,10 +115,9 @@ def _sigma0(result: SurveyResult) -> Judged:
     ratio = sigma0_ratio(result)
     if not ratio > SIGMA0_REMARK:
         return []
-    a = result.adjustment
     line = (
         f"Sigma0 is {significant(ratio)} times the expected standard deviation of an image coordinate "
-        f"({significant(a.a_priori_px / result.weight_factor)} px): "
+        f"({significant(stated_px(result))} px): "
     )
     if ratio > SIGMA0_BAD:
         return [(True, line + "points, control or the camera contradict the photographs.")]
@@ -165,11 +165,11 @@ def _untested(result: SurveyResult) -> Judged:
 
 def _pessimistic(result: SurveyResult) -> tuple[str, ...]:
     """Say if the image points are far better than stated, which is no fault of the result."""
-    a, ratio = result.adjustment, sigma0_ratio(result)
+    ratio = sigma0_ratio(result)
     image = component_tests(kinds_over_stated(result), alpha=2 * ALPHA)[0]
     if not (ratio < SIGMA0_LOW and image.statistic < image.lower):
         return ()
-    stated = a.a_priori_px / result.weight_factor
+    stated = stated_px(result)
     return (
         f"The stated standard deviation of the image points, {significant(stated)} px, is pessimistic: their "
         f"residuals show {significant(ratio * stated)} px.",
