@@ -9,7 +9,7 @@ import numpy as np
 from sfm.adjustment.accumulate import times_points, times_reduced
 from sfm.adjustment.iterate import Optimum
 from sfm.adjustment.parameters import Unknowns, interior_names
-from sfm.conventions import FloatArray
+from sfm.conventions import BoolArray, FloatArray
 from sfm.network import Estimate, Network
 
 MAPPED_TO_ZERO = 1e-6  # length of the image of a null vector of length 1, diagonal 1; rounding leaves 1e-13
@@ -28,13 +28,25 @@ def rank_defect(optimum: Optimum, layout: Unknowns) -> int:
 
 
 def null_motions(optimum: Optimum, layout: Unknowns) -> int:
-    """Return how many of the motions that the datum has to fix the normal matrix maps to zero."""
-    b, parts, motions = optimum.equations.blocks, optimum.equations.parts, optimum.motions
-    d = motions.defect
+    """Return how many of the motions that the datum has to fix the normal matrix maps to zero.
+
+    All do if their sum does, which is tried first; otherwise they are counted one by one.
+    """
+    d = optimum.motions.defect
     if d == 0:
         return 0
-    H = parts.scale[:, None] * np.linalg.qr(motions.reduced / parts.scale[:, None])[0]
-    first = 6 * len(b.U)
+    scale = optimum.equations.parts.scale[:, None]
+    H = np.linalg.qr(optimum.motions.reduced / scale)[0]
+    together = H.sum(axis=1, keepdims=True) / np.sqrt(d)
+    if _mapped_to_zero(optimum, layout, scale * together).all():
+        return d
+    return int(_mapped_to_zero(optimum, layout, scale * H).sum())
+
+
+def _mapped_to_zero(optimum: Optimum, layout: Unknowns, H: FloatArray) -> BoolArray:
+    """Return which columns of H, of scaled length 1, the reduced normal matrix maps to zero, (d,)."""
+    b, parts = optimum.equations.blocks, optimum.equations.parts
+    first, d = 6 * len(b.U), H.shape[1]
     NH = np.empty_like(H)
     NH[:first] = (b.U @ H[:first].reshape(len(b.U), 6, d)).reshape(first, d) + parts.border @ H[first:]
     NH[first:] = parts.border.T @ H[:first] + parts.corner @ H[first:]
@@ -42,7 +54,7 @@ def null_motions(optimum: Optimum, layout: Unknowns) -> int:
     times_reduced(layout.obs, b, H, through)
     np.negative(through, out=through)
     times_points(layout.obs, b, through, NH)
-    return int((np.linalg.norm(parts.scale[:, None] * NH, axis=0) < MAPPED_TO_ZERO).sum())
+    return np.asarray(np.linalg.norm(parts.scale[:, None] * NH, axis=0) < MAPPED_TO_ZERO)
 
 
 def undetermined_of(
