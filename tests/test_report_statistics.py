@@ -216,6 +216,26 @@ def test_blunders_left_in_are_no_result(synthetic: tuple[Network, Estimate]) -> 
     assert longest_residual(a)[1] in blunders
 
 
+def test_a_residual_with_a_lowered_weight_is_told_with_and_without_it(
+    synthetic: tuple[Network, Estimate],
+) -> None:
+    network, truth = synthetic
+    seen = network.image_points
+    xy = seen.xy.copy()
+    xy[7] += (20.0, 0.0)
+    a = adjust(
+        replace(network, image_points=replace(seen, xy=xy)), truth, datum=Datum("free"), reject="huber"
+    )
+    result = result_of(a)
+    (remark,) = (line for line in verdict_of(result).remarks if "lowered" in line)
+    found = re.search(r"residual of ([\d.]+) px, ([\d.]+) times .* ([\d.]+) times with its lowered", remark)
+    assert found is not None, remark
+    length, plain, lowered = (float(word) for word in found.groups())
+    assert plain == pytest.approx(length / NOISE_PX, rel=0.02) and plain > 150
+    assert lowered == pytest.approx(longest_residual(a)[0], rel=0.01)
+    assert a.weights[longest_residual(a)[1]] == pytest.approx((lowered / plain) ** 2, rel=0.02)
+
+
 def test_sigma_px_is_only_a_guess(synthetic: tuple[Network, Estimate]) -> None:
     network, truth = synthetic
     seen = network.image_points
@@ -331,6 +351,8 @@ def test_each_kind_is_tested_against_what_was_stated_in_the_same_words_everywher
             words = words_of_test(test)
             assert words in text and escape(words, quote=False) in page and words == one["words"]
             assert one["passed"] is test.passed
+            assert ("better than stated" in words) == (test is image and factor < 1)
+            assert ("worse than stated" in words) == (test is image and factor > 1)
         words = words_of_weights(result)
         assert (words == "") == (factor == 1)
         assert words in text and words in page and words == written["weights"]

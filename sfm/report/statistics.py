@@ -105,7 +105,9 @@ def words_of_test(test: GlobalTest) -> str:
     """Return what a global test says, the same in every report."""
     if test.passed is None:
         return f"{test.of}: not tested, {test.reason}"
-    said, r = "passed" if test.passed else "NOT passed", f"{test.redundancy:.1f}".removesuffix(".0")
+    r = f"{test.redundancy:.1f}".removesuffix(".0")
+    side = "better" if test.statistic < test.lower else "worse"
+    said = "passed" if test.passed else f"NOT passed, {side} than stated"
     return (
         f"{test.of}: {said}; v'Pv = {test.statistic:.2f}, chi-square of {r} between {test.lower:.2f} and "
         f"{test.upper:.2f} ({100 * (1 - GLOBAL_ALPHA):.0f} %)"

@@ -133,9 +133,12 @@ def _residual(result: SurveyResult) -> Judged:
     image = network.images[network.image_points.image[worst]]
     point = network.points[network.image_points.point[worst]]
     length = float(np.linalg.norm(result.adjustment.residuals[worst]))
+    weight = float(result.adjustment.weights[worst]) if len(result.adjustment.weights) else 1.0
+    lowered = f", {significant(ratio)} times with its lowered weight," if weight < 1 else ""
     line = (
-        f"Point {point} in {image} has a residual of {significant(length)} px, {significant(ratio)} times "
-        "the standard deviation, and was not rejected."
+        f"Point {point} in {image} has a residual of {significant(length)} px, "
+        f"{significant(ratio / np.sqrt(weight))} times the standard deviation{lowered or ','} and was not "
+        "rejected."
     )
     return [(ratio > RESIDUAL_BAD, line)]
 
