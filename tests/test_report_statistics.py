@@ -392,9 +392,10 @@ def test_bars_that_are_all_a_little_too_bad_are_noticed(synthetic: tuple[Network
     assert verdict.remarks[0].startswith("The residuals of the scale bars are"), verdict.remarks
 
 
-def test_control_that_only_checks() -> None:
+@pytest.mark.parametrize(("sigma", "limit"), [(0.0, 100.0), (1e-5, 5.0)])
+def test_control_that_only_checks(sigma: float, limit: float) -> None:
     network, truth = make_network(seed_of("checks"), images=8, points=40, noise_px=0.02)
-    known = with_control(network, truth.points[:4], 1e-5)
+    known = with_control(network, truth.points[:4], sigma)
     a = adjust(known, truth, datum=Datum("free"))
     names = a.network.points[:4]
 
@@ -406,15 +407,15 @@ def test_control_that_only_checks() -> None:
             one = adjust(with_bars(known, truth, (0.0,), 1e-4), truth, datum=Datum("free"))
         return verdict_of(result_of(one, control_check=ControlCheck(names, d, scale))).level
 
-    assert level(2e-4) == "good"
-    expected = np.sqrt(np.trace(a.covariance.points[2]) + 3e-10)
+    expected = np.sqrt(np.trace(a.covariance.points[2]) / 3 + sigma**2)
+    assert level(2 * expected) == "good"
     size = np.linalg.norm(np.ptp(a.estimate.points, axis=0))
     assert 120 * expected < 0.009 * size
-    assert level(80 * expected) == "good"
-    assert level(120 * expected) == "fair"
+    assert level(0.8 * limit * expected) == "good"
+    assert level(1.2 * limit * expected) == "fair"
     assert level(0.05) == "bad"
-    assert level(2e-4, scale=1.001, bars=True) == "good"
-    assert level(2e-4, scale=1.05, bars=True) == "bad"
+    assert level(2 * expected, scale=1.001, bars=True) == "good"
+    assert level(2 * expected, scale=1.05, bars=True) == "bad"
 
 
 def test_words_for_the_scale_of_the_control(synthetic: tuple[Network, Estimate]) -> None:

@@ -130,23 +130,24 @@ def worst_residuals(adjustment: Adjustment, count: int = 10) -> WorstResiduals:
     )
 
 
-def check_over_sigma(result: SurveyResult, check: ControlCheck) -> FloatArray:
-    """Return the length of each difference at control over the standard deviation expected of it, (n,).
+def check_over_sigma(result: SurveyResult, check: ControlCheck) -> tuple[FloatArray, BoolArray]:
+    """Return the largest coordinate of each difference at control over its expected standard deviation, (n,).
 
-    Expected are the precision of the adjusted point and that of the control together.
+    Expected are the precision of the adjusted point, its mean over the axes, and that of the control
+    together. The second array says which control states standard deviations, (n,).
     """
     a = result.adjustment
     control = a.network.control
     place = {a.network.points[j]: k for k, j in enumerate(control.point)}
     known = [place[name] for name in check.points if name in place]
     if len(known) != len(check.points):
-        return np.full(len(check.points), np.nan)
+        return np.full(len(check.points), np.nan), np.zeros(len(check.points), dtype=bool)
     given = _variances(control.covariance[known])
     given = np.where(np.isfinite(given), given, np.nan)
     adjusted = _variances(a.covariance.points[control.point[known]])
-    expected = np.sqrt(np.nansum(given, axis=1) + adjusted.sum(axis=1))
-    length = np.linalg.norm(check.differences, axis=1)
-    return _ratio(length, expected, expected > 0)
+    expected = np.sqrt(np.nan_to_num(given) + adjusted.mean(axis=1)[:, None])
+    ratio = _ratio(np.abs(check.differences), expected, expected > 0)
+    return ratio.max(axis=1), np.asarray(np.nansum(given, axis=1) > 0)
 
 
 def object_size(points: FloatArray) -> float:

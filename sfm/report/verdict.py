@@ -39,7 +39,9 @@ AS_STATED = 1.5  # standard deviation of w by its median, up to which image poin
 # Data snooping leaves nothing beyond 4 or 5 sigma; ten is an outlier, thirty is a mistake that was kept.
 RESIDUAL_REMARK, RESIDUAL_BAD = 10.0, 30.0
 WEIGHTED_REMARK, WEIGHTED_BAD = 5.0, 30.0  # w of control, scale bars, interior orientation
-CHECK_REMARK = 100.0  # differences at control in sigmas: datum and print are never as good as the network
+# Differences at control that took no part, in sigmas. Control without standard deviations is a print or a
+# drawing, never as good as the network; control that states them must keep to them.
+CHECK_REMARK = 100.0
 MISCLOSURE_BAD = 0.01  # of the size of the object, or of a length: no measurement, a mistake
 
 
@@ -276,19 +278,20 @@ def _check(result: SurveyResult) -> Judged:
     length = np.linalg.norm(check.differences, axis=1)
     worst = int(np.argmax(length))
     part = float(length[worst]) / object_size(result.adjustment.estimate.points)
-    sigmas = np.nan_to_num(check_over_sigma(result, check))
+    sigmas, stated = check_over_sigma(result, check)
+    beyond = np.nan_to_num(sigmas) / np.where(stated, WEIGHTED_REMARK, CHECK_REMARK)
     factor, unit = finer_unit(result.length_unit, float(length[worst]))
     said = f"differs from its given place by {significant(float(length[worst]) * factor)} {unit}"
     if part > MISCLOSURE_BAD:
         line = f"Control point {check.points[worst]} {said}, {significant(100 * part)} % of the object."
         judged.append((True, line))
-    elif sigmas.max(initial=0.0) > CHECK_REMARK:
-        worst = int(np.argmax(sigmas))
+    elif beyond.max(initial=0.0) > 1:
+        worst = int(np.argmax(beyond))
         factor, unit = finer_unit(result.length_unit, float(length[worst]))
         line = (
             f"Control point {check.points[worst]} differs from its given place by "
             f"{significant(float(length[worst]) * factor)} {unit}, {significant(float(sigmas[worst]))} times "
-            "its precision."
+            f"the standard deviation of {'both' if stated[worst] else 'its adjusted place'} in a coordinate."
         )
         judged.append((False, line))
     return judged
