@@ -428,6 +428,7 @@ def test_words_for_the_scale_of_the_control(synthetic: tuple[Network, Estimate])
     barred = result_of(adjust(bars, truth, datum=Datum("free")), control_check=check)
     page = render_html(barred, (), ())
     assert "the control says lengths are 1.0025 times those of the scale bars" in page
+    assert f"100 µm in X, Y, Z at 4 points; largest 173 µm at {network.points[0]}" in text_report(barred)
     assert "A single bar gives the scale" in page
 
 
@@ -483,6 +484,29 @@ def test_w_of_given_values_is_standard_normal() -> None:
     for part in (np.array(w)[:, :15], np.array(w)[:, 15:]):
         assert stats.kstest(part.ravel(), "norm").pvalue > 0.01
     assert np.std(plain) < 0.9
+
+
+def test_the_worst_control_stands_in_the_text_with_residual_and_w(
+    synthetic: tuple[Network, Estimate],
+) -> None:
+    network, truth = synthetic
+    xyz = truth.points[:6].copy()
+    xyz[3, 1] += 5e-3
+    result = result_of(adjust(with_control(network, xyz, 1e-3), truth, datum=Datum("control")))
+    control = control_residuals(result)
+    assert control is not None
+    text = text_report(result)
+    section = text[text.index("Control, scale") :].splitlines()
+    assert max(map(len, section)) <= WIDTH and "6 points, RMS" in section[1]
+    name, axis, v, sigma, unit, r, w = section[3].split()
+    assert (name, axis, unit) == (network.points[3], "Y", "mm")
+    assert float(v) == pytest.approx(1000 * control.difference[3, 1], rel=0.01) and float(sigma) == 1
+    assert float(r) == pytest.approx(control.r[3, 1], abs=1e-3)
+    assert float(w) == pytest.approx(control.w[3, 1], abs=0.01)
+    assert "the 12 with the largest w of 18; all in given.csv" in text
+    fixed = with_control(network, truth.points[:6], 0.0)
+    words = text_report(result_of(adjust(fixed, truth, datum=Datum("control"))))
+    assert "6 points without standard deviation: not checked" in words
 
 
 def test_what_is_met_exactly_is_not_checked(synthetic: tuple[Network, Estimate], tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextC
 from rich.table import Table
 from rich.text import Text
 
-from sfm.report.checks import count_observations, words_of_sigma0
+from sfm.report.checks import count_observations, words_of_check, words_of_sigma0
 from sfm.report.markup import finer_unit, significant
 from sfm.report.precision import point_precision
 from sfm.report.result import SurveyResult
@@ -132,11 +132,7 @@ def _figures(result: SurveyResult) -> tuple[tuple[str, str], ...]:
     ]
     check = result.control_check
     if check is not None:
-        factor, unit = finer_unit(result.length_unit, float(abs(check.differences).max()))
-        dx, dy, dz = (significant(value * factor) for value in check.rms)
-        rows.append(
-            ("check at control", f"RMS {dx}, {dy}, {dz} {unit} in X, Y, Z at {len(check.points)} points")
-        )
+        rows.append(("check at control", words_of_check(check, result.length_unit)))
     both = result.comparison
     if both is not None:
         word = "agrees" if both.agree else "DIFFERS"

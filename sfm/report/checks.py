@@ -14,7 +14,7 @@ from sfm.adjustment.result import Adjustment
 from sfm.adjustment.variance_components import IMAGE_POINTS, variance_components
 from sfm.adjustment.weighted import observed
 from sfm.conventions import BoolArray, FloatArray, IntArray
-from sfm.report.markup import significant
+from sfm.report.markup import finer_unit, significant
 from sfm.report.result import ControlCheck, SurveyResult
 
 TOLD_APART = 0.01  # relative difference from which sigma0 of the image points is told beside that of all
@@ -148,6 +148,23 @@ def check_over_sigma(result: SurveyResult, check: ControlCheck) -> tuple[FloatAr
     expected = np.sqrt(np.nan_to_num(given) + adjusted.mean(axis=1)[:, None])
     ratio = _ratio(np.abs(check.differences), expected, expected > 0)
     return ratio.max(axis=1), np.asarray(np.nansum(given, axis=1) > 0)
+
+
+def words_of_check(check: ControlCheck, unit: str) -> str:
+    """Return how far the placed points are from control that took no part.
+
+    Args:
+        check: the differences.
+        unit: object unit.
+    """
+    length = np.linalg.norm(check.differences, axis=1)
+    worst = int(np.argmax(length))
+    factor, finer = finer_unit(unit, float(length[worst]))
+    rms = ", ".join(significant(value * factor) for value in check.rms)
+    return (
+        f"RMS {rms} {finer} in X, Y, Z at {len(check.points)} points; largest "
+        f"{significant(float(length[worst]) * factor)} {finer} at {check.points[worst]}"
+    )
 
 
 def object_size(points: FloatArray) -> float:

@@ -12,32 +12,22 @@ from sfm.report.markup import finer_unit, signed, significant, table
 from sfm.report.precision import root_mean_square
 from sfm.report.result import SurveyResult
 from sfm.report.section_given import NOTE
-from sfm.report.text_lines import MOST_ROWS, columns, head, line
+from sfm.report.text_given import worst_of_given
+from sfm.report.text_lines import head, line
 
 OPEN_ROWS = 30  # up to which a table of the page is unfolded
 
 
 def exterior_text(result: SurveyResult) -> list[str]:
     """Return the part of report.txt: RMS of each coordinate and angle, and the worst of all."""
-    lines: list[str] = []
-    rows: list[tuple[float, tuple[str, ...]]] = []
-    for found, names in _kinds(result):
-        factor, unit = _unit(found)
+    kinds = [(found, names, *_unit(found)) for found, names in _kinds(result)]
+    if not kinds:
+        return []
+    lines = head("Observed exterior orientation: adjusted minus given")
+    for found, names, factor, unit in kinds:
         rms = ", ".join(significant(root_mean_square(v) * factor) for v in found.difference.T)
         lines.append(line(", ".join(names), f"{len(found.names)} photographs, RMS {rms} {unit}"))
-        for k, d in np.argwhere(np.isfinite(found.r)):
-            v, sigma, r, w = (float(x[k, d]) for x in (found.difference, found.sigma, found.r, found.w))
-            words = (signed(v * factor), significant(sigma * factor), unit, f"{r:.3f}", words_of_w(w, r))
-            rows.append((-abs(np.nan_to_num(w)), (found.names[k], names[d], *words)))
-    if not lines:
-        return []
-    if rows:
-        rows.sort(key=lambda row: row[0])
-        header = ("photograph", "", "adjusted - given", "sigma", "unit", "r", "w")
-        lines += columns(header, [words for _, words in rows[:MOST_ROWS]], left=2)
-    if len(rows) > MOST_ROWS:
-        lines.append(f"  the {MOST_ROWS} with the largest w of {len(rows)}; all in given.csv")
-    return head("Observed exterior orientation: adjusted minus given") + lines
+    return lines + worst_of_given("photograph", kinds)
 
 
 def exterior_section(result: SurveyResult) -> str:

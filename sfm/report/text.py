@@ -16,14 +16,6 @@ from sfm.report.checks import (
     stated_px,
     worst_residuals,
 )
-from sfm.report.given import (
-    NOT_CHECKED,
-    GivenResiduals,
-    bar_residuals,
-    control_residuals,
-    interior_residuals,
-    words_of_w,
-)
 from sfm.report.markup import finer_unit, significant, with_exponent
 from sfm.report.observed_exterior import exterior_text
 from sfm.report.precision import adjusted_sigmas, point_precision, root_mean_squares, without_fixed
@@ -38,6 +30,7 @@ from sfm.report.statistics import (
     words_of_test,
     words_of_weights,
 )
+from sfm.report.text_given import given_text
 from sfm.report.text_lines import MOST_ROWS, WIDTH, columns, head, line, wrapped
 from sfm.report.verdict import verdict_of
 
@@ -63,7 +56,7 @@ def text_report(result: SurveyResult) -> str:
         _interior(result, statistics),
         _points(result),
         geometry_text(result),
-        _given(result),
+        given_text(result),
         exterior_text(result),
         _worst(result),
     ):
@@ -250,47 +243,6 @@ def _points(result: SurveyResult) -> list[str]:
         *columns(("", "X", "Y", "Z", "all", "unit"), rows, left=1),
         *([f"  RMS {without_fixed(a)}"] if without_fixed(a) else []),
     ]
-
-
-def _given(result: SurveyResult) -> list[str]:
-    """Control, differences at it, scale bars, and weighted interior orientation."""
-    lines: list[str] = []
-    unit = result.length_unit
-    check = result.control_check
-    if check is not None:
-        factor, finer = finer_unit(unit, float(np.abs(check.differences).max()))
-        rms = ", ".join(significant(v * factor) for v in check.rms)
-        lines.append(line("check at control", f"RMS {rms} {finer} in X, Y, Z at {len(check.points)} points"))
-    control, bars, interior = control_residuals(result), bar_residuals(result), interior_residuals(result)
-    if control is not None:
-        lines.append(line("control", _of_control(control)))
-    rows = []
-    for kind, one in (("scale bar", bars), ("interior", interior)):
-        if one is None:
-            continue
-        for k, name in enumerate(one.names):
-            given, v, sigma, r, w = (x[k, 0] for x in (one.given, one.difference, one.sigma, one.r, one.w))
-            unit = "" if one.units[k] == "1" else one.units[k]
-            rows.append((kind, name, *with_exponent(given, sigma), significant(v), unit, f"{r:.3f}",
-                         words_of_w(w, r)))  # fmt: skip
-    if rows:
-        header = ("given", "", "value", "sigma", "adjusted - given", "unit", "r", "w")
-        lines += columns(header, rows[: 2 * MOST_ROWS], left=2)
-    if len(rows) > 2 * MOST_ROWS:
-        lines.append(f"  and {len(rows) - 2 * MOST_ROWS} more, in given.csv")
-    return head("Control, scale and given interior orientation") + lines if lines else []
-
-
-def _of_control(found: GivenResiduals) -> str:
-    """Largest w, and how far the coordinates of control are checked."""
-    points, known = f"{len(found.names)} points", found.r[np.isfinite(found.r)]
-    if not len(known):
-        return f"{points} without standard deviation: {NOT_CHECKED}"
-    worst = found.worst()
-    unchecked = int((np.isfinite(found.r) & ~np.isfinite(found.w)).sum())
-    size = f"largest |w| {worst[1]:.2f} at {found.names[worst[0]]} of {points}, " if worst else f"{points}, "
-    more = f"; {unchecked} coordinates {NOT_CHECKED}" if unchecked else ""
-    return f"{size}redundancy numbers {known.min():.3f} to {known.max():.3f}{more}"
 
 
 def _worst(result: SurveyResult) -> list[str]:
