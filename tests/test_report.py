@@ -16,6 +16,7 @@ import pytest
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
+from sfm.commands.console import tell_result
 from sfm.conventions import angles_from_rotation
 from sfm.errors import OutputError
 from sfm.network import Network, ObjectPoints, ScaleBars
@@ -27,6 +28,7 @@ from sfm.report.plots import all_plots, plan_axes
 from sfm.report.result import ControlCheck, FailedImage, PhotographTargets, StageTime, SurveyResult
 from sfm.report.summary import summary, write_summary
 from sfm.report.tables import image_rms, write_tables
+from sfm.report.text import WIDTH, text_report
 from sfm.report.verdict import verdict_of
 from sfm.survey.tables import read_exterior, read_image_points, read_points
 from sfm.targets.flags import Flag
@@ -265,6 +267,21 @@ def test_verdict(result: SurveyResult) -> None:
     assert "Rank defect 8, expected 7" in verdict_of(weak).remarks[0]
     many = replace(fine, adjustment=replace(fine.adjustment, rejected=np.arange(320) < 100))
     assert verdict_of(many).level == "fair"
+
+
+def test_every_warning_is_told_once_where_the_remark_says_so(
+    result: SurveyResult, capsys: pytest.CaptureFixture[str]
+) -> None:
+    more = replace(result, warnings=("one thing", "another, " + "and so on " * 20 + "to its end", "a third"))
+    text = text_report(more)
+    assert max(map(len, text.splitlines())) <= WIDTH
+    words = " ".join(text[text.index("\nWarnings ") : text.index("\nNetwork and rank ")].split())
+    assert all(warning in words for warning in more.warnings)
+    assert f"{result.failed[0].image}: {result.failed[0].reason}" in " ".join(text.split())
+    assert "\nWarnings " not in text_report(result)
+    tell_result(more, Path("report.html"), seconds=1.0, verbose=False)
+    told = capsys.readouterr().out
+    assert all(told.count(warning) == 1 for warning in more.warnings)
 
 
 def test_overlay_shows_targets_where_they_are(result: SurveyResult) -> None:

@@ -84,11 +84,12 @@ def tell_result(result: SurveyResult, page: Path, *, seconds: float, verbose: bo
         console.print(Text(f"! {line}", style="yellow"), soft_wrap=True)
     for failed in result.failed:
         console.print(Text(f"  {failed.image}: {failed.reason}"), soft_wrap=True)
-    shown = result.warnings if verbose else result.warnings[:MAX_WARNINGS]
+    others = result.warnings[1:]  # the first is among the remarks
+    shown = others if verbose else others[: MAX_WARNINGS - 1]
     for warning in shown:
         console.print(Text(f"  {warning}"), soft_wrap=True)
-    if len(shown) < len(result.warnings):
-        console.print(Text(f"  ... and {len(result.warnings) - len(shown)} more, in the report"))
+    if len(shown) < len(others):
+        console.print(Text(f"  ... and {len(others) - len(shown)} more, in the report"))
     if verbose:
         console.print(_photograph_table(result))
         for camera in a.estimate.cameras:

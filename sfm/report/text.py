@@ -49,6 +49,8 @@ def text_report(result: SurveyResult) -> str:
     for remark in verdict.remarks:
         lines += wrapped(f"- {remark}")
     for part in (
+        _left_out(result),
+        _warnings(result),
         _adjustment(result),
         _sigma0(result, statistics),
         _single_tests(result, statistics),
@@ -68,6 +70,21 @@ def text_report(result: SurveyResult) -> str:
         "Tables (.csv): points, images, cameras, image_points, given, reliability, variance_components.",
     ]
     return "\n".join(one.rstrip() for one in lines) + "\n"
+
+
+def _left_out(result: SurveyResult) -> list[str]:
+    """Photographs that are not in the result, and why."""
+    lines = [one for f in result.failed[:MOST_ROWS] for one in wrapped(f"  {f.image}: {f.reason}")]
+    if len(result.failed) > MOST_ROWS:
+        lines.append(f"  and {len(result.failed) - MOST_ROWS} more, in summary.json")
+    return head("Photographs that are not in the result") + lines if lines else []
+
+
+def _warnings(result: SurveyResult) -> list[str]:
+    """All warnings, of which the remarks tell the first."""
+    if len(result.warnings) < 2:
+        return []
+    return head("Warnings") + [one for warning in result.warnings for one in wrapped(f"  {warning}")]
 
 
 def _adjustment(result: SurveyResult) -> list[str]:
