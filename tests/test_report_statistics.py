@@ -182,6 +182,19 @@ def test_precision_where_everything_is_fixed_is_not_known() -> None:
     assert "not known" in text_report(result_of(a)) and "not known" in render_html(result_of(a), (), ())
 
 
+def test_a_limiting_precision_above_the_achieved_one_is_explained(
+    synthetic: tuple[Network, Estimate],
+) -> None:
+    network, truth = synthetic
+    a = adjust(network, truth, datum=Datum("free"))
+    words = "The limiting precision is in the datum of the cameras"
+    for factor, explained in ((0.5, False), (3.0, True)):
+        covariance = replace(a.covariance, points_limiting=factor**2 * a.covariance.points)
+        result = result_of(replace(a, covariance=covariance))
+        assert (words in " ".join(text_report(result).split())) is explained
+        assert (words in render_html(result, (), ())) is explained
+
+
 def test_a_point_that_lost_most_of_its_rays_is_named(synthetic: tuple[Network, Estimate]) -> None:
     network, truth = synthetic
     a = adjust(network, truth, datum=Datum("free"), reject="none")

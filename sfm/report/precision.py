@@ -25,6 +25,23 @@ def point_precision(adjustment: Adjustment) -> FloatArray:
     return np.array([root_mean_squares(sigma), largest(sigma), root_mean_squares(limiting)])
 
 
+def words_of_limiting(precision: FloatArray) -> str:
+    """Return why a limiting standard deviation is above the achieved one; empty where none is.
+
+    With the cameras held, shift, rotation and scale of the points are theirs; inner constraints on the
+    points take these out, and can take out more of a coordinate than the errors of the cameras add.
+
+    Args:
+        precision: as `point_precision` returns it, (3, 4).
+    """
+    if not (precision[2] > precision[0]).any():
+        return ""
+    return (
+        "The limiting precision is in the datum of the cameras, in which a coordinate can be less precise "
+        "than in that of the adjustment."
+    )
+
+
 def root_mean_squares(values: FloatArray) -> FloatArray:
     """Return the root mean square of each column (n, d) and of all, of the values known, (d + 1,)."""
     return np.array([root_mean_square(column) for column in (*values.T, values)])

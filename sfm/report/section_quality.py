@@ -9,7 +9,7 @@ import numpy as np
 from sfm.report.given import interior_residuals, words_of_w
 from sfm.report.markup import finer_unit, raised, signed, significant, table, with_exponent
 from sfm.report.observed_exterior import exterior_section
-from sfm.report.precision import point_precision, without_fixed
+from sfm.report.precision import point_precision, without_fixed, words_of_limiting
 from sfm.report.result import SurveyResult
 from sfm.report.section_geometry import geometry_section
 from sfm.report.section_given import NOTE, given_section
@@ -29,14 +29,14 @@ def quality_section(result: SurveyResult, pictures: dict[str, str]) -> str:
         [
             (name, *(significant(value * factor) for value in row))
             for name, row in zip(
-                ("RMS", "largest", "RMS if the cameras were free of error"), precision, strict=True
+                ("RMS", "largest", "limiting: RMS if the cameras were free of error"), precision, strict=True
             )
         ],
     )
     text += (
         "<p class=note>Standard deviations are a posteriori and in the datum of the adjustment "
         f"({escape(a.datum)}){fixed}; in a free network they say how the points lie to one another, not in "
-        "an outer frame.</p>"
+        f"an outer frame. {words_of_limiting(precision)}</p>"
     )
     text += geometry_section(result) + given_section(result) + exterior_section(result)
     text += image_coordinates(result)

@@ -18,7 +18,13 @@ from sfm.report.checks import (
 )
 from sfm.report.markup import finer_unit, significant, with_exponent
 from sfm.report.observed_exterior import exterior_text
-from sfm.report.precision import adjusted_sigmas, point_precision, root_mean_squares, without_fixed
+from sfm.report.precision import (
+    adjusted_sigmas,
+    point_precision,
+    root_mean_squares,
+    without_fixed,
+    words_of_limiting,
+)
 from sfm.report.result import SurveyResult
 from sfm.report.section_geometry import geometry_text
 from sfm.report.statistics import (
@@ -259,6 +265,7 @@ def _points(result: SurveyResult) -> list[str]:
         *head("Precision of the unknowns"),
         *columns(("", "X", "Y", "Z", "all", "unit"), rows, left=1),
         *([f"  RMS {without_fixed(a)}"] if without_fixed(a) else []),
+        *(wrapped(f"  {words_of_limiting(precision)}") if words_of_limiting(precision) else []),
     ]
 
 
