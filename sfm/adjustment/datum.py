@@ -24,7 +24,6 @@ from sfm.errors import GeometryError
 
 DETERMINED = 1e-9  # relative effect on an observed unknown above which it takes part in the datum
 KINDS = ("free", "minimal", "control")
-MOTIONS = ("X shift", "Y shift", "Z shift", "X turn", "Y turn", "Z turn", "scale")
 
 
 @dataclass(frozen=True)
