@@ -118,7 +118,7 @@ def component_tests(
     The v'Pv of a group is nearly chi-square distributed with the sum of its redundancy numbers, exactly
     where the other groups take no part in its residuals. Where that sum is a small part of the observations,
     as of two bars that give the scale to the photographs, the test is on the safe side: with one residual in
-    common and r = 0.4, v'Pv is 0.4 times chi-square of 1, beyond the limits for 95 % in 1 of 150 cases.
+    common and r = 0.4, v'Pv is 0.4 times chi-square of 1, beyond the limits for 95 % in 1 of 160 cases.
 
     Args:
         components: of groups, over the standard deviations stated for them.
