@@ -41,6 +41,7 @@ from sfm.report.statistics import (
     interior_parameters,
     parameter_sigmas,
     statistics_of,
+    words_of_t,
     words_of_test,
     words_of_weights,
 )
@@ -601,6 +602,19 @@ def test_parameters_that_mean_nothing_are_named() -> None:
     assert f"b2 of camera 1 ({t:.1f})" in page
     named = summary(result_of(a))["statistics"]["not_significant"]
     assert [one["parameter"] for one in named] == ["b2"]
+
+
+def test_only_what_may_be_0_is_told_over_its_standard_deviation(
+    synthetic: tuple[Network, Estimate],
+) -> None:
+    network, truth = synthetic
+    a = adjust(network, truth, datum=Datum("free"))
+    told = {one.name: words_of_t(one) for one in interior_parameters(a) if one.sigma > 0}
+    assert told["c"] == "" and len(told) > 3
+    by_name = {test.parameter: test for test in statistics_of(result_of(a)).significance}
+    assert {name: words for name, words in told.items() if words} == {
+        name: f"{test.t:.1f}" for name, test in by_name.items()
+    }
 
 
 def test_circles_are_told(synthetic: tuple[Network, Estimate]) -> None:

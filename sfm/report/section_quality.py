@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from html import escape
 
-import numpy as np
-
 from sfm.report.given import interior_residuals, words_of_w
 from sfm.report.markup import finer_unit, raised, signed, significant, table, with_exponent
 from sfm.report.observed_exterior import exterior_section
@@ -14,7 +12,7 @@ from sfm.report.result import SurveyResult
 from sfm.report.section_geometry import geometry_section
 from sfm.report.section_given import NOTE, given_section
 from sfm.report.section_statistics import camera_notes, components, image_coordinates, worst
-from sfm.report.statistics import InteriorParameter, families, interior_parameters
+from sfm.report.statistics import InteriorParameter, families, interior_parameters, words_of_t
 
 
 def quality_section(result: SurveyResult, pictures: dict[str, str]) -> str:
@@ -96,5 +94,4 @@ def _observed_interior(result: SurveyResult) -> str:
 
 
 def _row(one: InteriorParameter) -> tuple[str, ...]:
-    ratio = f"{abs(one.value) / one.sigma:.1f}" if np.isfinite(one.sigma) and one.sigma > 0 else ""
-    return (one.owner, one.name, *with_exponent(one.value, one.sigma), raised(one.unit), ratio)
+    return (one.owner, one.name, *with_exponent(one.value, one.sigma), raised(one.unit), words_of_t(one))

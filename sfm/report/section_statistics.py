@@ -184,7 +184,8 @@ def camera_notes(result: SurveyResult) -> str:
         names = ", ".join(f"{test.parameter} of {test.camera} ({test.t:.1f})" for test in weak)
         text += (
             "<p>Not significantly different from 0 (t test, 5 %; in brackets the value over its standard "
-            f"deviation): {escape(names)}. Held at 0, such a parameter would change nothing.</p>"
+            f"deviation): {escape(names)}. Held at 0, each by itself would worsen the fit by no more "
+            "than chance.</p>"
         )
     else:
         text += "<p>All adjusted parameters differ significantly from 0 (t test, 5 %).</p>"

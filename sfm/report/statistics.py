@@ -10,6 +10,7 @@ from sfm.adjustment.result import Adjustment
 from sfm.adjustment.statistics import (
     GLOBAL_ALPHA,
     POWER,
+    UNTESTED,
     CoordinateTest,
     Correlation,
     GlobalTest,
@@ -99,6 +100,11 @@ def kinds_over_stated(result: SurveyResult) -> VarianceComponents:
 def _stated(image_points: VarianceComponents, result: SurveyResult) -> VarianceComponents:
     """Return components of image points over the standard deviations stated, not over those adjusted with."""
     return replace(image_points, sigma0=result.weight_factor * image_points.sigma0)
+
+
+def words_of_t(one: InteriorParameter) -> str:
+    """Return a parameter over its standard deviation; empty where 0 is no sensible value, as for c."""
+    return f"{abs(one.value) / one.sigma:.1f}" if one.sigma > 0 and one.name not in UNTESTED else ""
 
 
 def words_of_test(test: GlobalTest) -> str:

@@ -33,6 +33,7 @@ from sfm.report.statistics import (
     interior_parameters,
     quantiles,
     statistics_of,
+    words_of_t,
     words_of_test,
     words_of_weights,
 )
@@ -209,11 +210,7 @@ def _interior(result: SurveyResult, statistics: Statistics) -> list[str]:
     rows = []
     for one in parameters[: 4 * MOST_ROWS]:
         value, sigma = with_exponent(one.value, one.sigma)
-        ratio = abs(one.value) / one.sigma if one.sigma > 0 else np.nan
-        rows.append(
-            (one.owner, one.name, value, sigma, "" if one.unit == "1" else one.unit,
-             f"{ratio:.1f}" if np.isfinite(ratio) else "")
-        )  # fmt: skip
+        rows.append((one.owner, one.name, value, sigma, "" if one.unit == "1" else one.unit, words_of_t(one)))
     lines = head(f"Interior orientation (model {models})")
     lines += columns(("camera", "", "value", "sigma", "unit", "value/sigma"), rows, left=2)
     if len(parameters) > len(rows):
