@@ -12,6 +12,7 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, nullcontext
+from importlib.metadata import version
 from pathlib import Path
 
 import psutil
@@ -306,6 +307,21 @@ def test_resume_runs_again_what_has_a_log_of_somebody_else(
     lines = [json.loads(line) for line in log.read_text(encoding="utf-8").splitlines()]
     lines[-1][key] = value
     log.write_text("\n".join(json.dumps(line) for line in lines), encoding="utf-8")
+    again = Notes()
+    run_batch([surveys[2]], out, HERE, ALONE, again, resume=True)
+    assert [kept for _, kept in again.finished_rows] == [False]
+
+
+def test_resume_runs_again_what_another_version_has_finished(
+    surveys: tuple[Path, ...], tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    run_batch([surveys[2]], out, HERE, ALONE, Notes())
+    log = out / "third" / "log.jsonl"
+    first, *others = log.read_text(encoding="utf-8").splitlines()
+    entry = json.loads(first)
+    assert entry["version"] == version("kolinear")
+    log.write_text("\n".join([json.dumps({**entry, "version": "0.0.1"}), *others]), encoding="utf-8")
     again = Notes()
     run_batch([surveys[2]], out, HERE, ALONE, again, resume=True)
     assert [kept for _, kept in again.finished_rows] == [False]

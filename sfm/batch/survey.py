@@ -8,6 +8,7 @@ import time
 import traceback
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, fields, replace
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -134,7 +135,7 @@ def reconstruct(
     name = job.folder
     live = job.out / LOGS / f"{job.folder}.jsonl"
     with SurveyLog(live, watch=_Telling(tell)) as log, when_compiling(lambda: tell({"compiling": True})):
-        log.note("start", survey=name, file=str(job.file), inputs=job.inputs)
+        log.start(name, job.file, inputs=job.inputs)
         for note in photographs:
             log.note("photograph", **asdict(note))
         before = sum(note.seconds for note in photographs)
@@ -175,12 +176,13 @@ def fingerprint(survey: Survey) -> str:
 
 
 def finished_row(job: SurveyJob) -> SurveyRow | None:
-    """Return the row of a result that an earlier run has written from the same inputs, None without one."""
+    """Return the row of a result that this version has written from the same inputs, None without one."""
     try:
         entries = read_log(job.out / job.folder / LOG)
     except OSError:
         return None
-    same = [entry for entry in entries if entry.get("event") == "start" and entry.get("inputs") == job.inputs]
+    begun = {"event": "start", "inputs": job.inputs, "version": version("kolinear")}
+    same = [entry for entry in entries if begun.items() <= entry.items()]
     results = [entry for entry in entries if entry.get("event") == "result"]
     if not same or not results:
         return None

@@ -86,7 +86,7 @@ def run(
     workers = jobs or _cores()
     store = TargetStore(folder.parent / STORE)
     with drawn_progress() as drawn, _threads(), _written(folder), SurveyLog(watch=drawn) as log:
-        log.note("start", survey=survey.name, file=str(survey_file))
+        log.start(survey.name, survey_file)
         result = run_survey(survey, images_dir=images, jobs=workers, others=others, store=store, progress=log)
         page = write_result(
             result,
@@ -125,7 +125,7 @@ def adjust(
     others = _others(survey)
     folder = _folder(survey, out)
     with drawn_progress() as drawn, _threads(), _written(folder), SurveyLog(watch=drawn) as log:
-        log.note("start", survey=survey.name, file=str(survey_file))
+        log.start(survey.name, survey_file)
         result = adjust_survey(survey, others=others, progress=log)
         page = write_result(
             result,

@@ -2,7 +2,7 @@
 
 Every line has `time` (UTC) and `event`:
 
-    start       survey, file, inputs (fingerprint of all it reads), version
+    start       survey, file, version; in a batch: inputs (fingerprint of all it reads)
     photograph  image, targets, rejected, stored (measured in an earlier run), seconds; or failed, a reason
     stage       stage, seconds, steps
     warning     text
@@ -18,6 +18,7 @@ import threading
 import time
 from contextlib import suppress
 from datetime import UTC, datetime
+from importlib.metadata import version
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -64,6 +65,14 @@ class SurveyLog:
         if self._file is not None:
             with suppress(OSError):  # said when the line was written
                 self._file.close()
+
+    def start(self, survey: str, file: Path, **more: Any) -> None:
+        """Write the first line of a survey.
+
+        Raises:
+            OutputError: the file cannot be written.
+        """
+        self.note("start", survey=survey, file=str(file), version=version("kolinear"), **more)
 
     def note(self, event: str, **what: Any) -> None:
         """Write one line.
