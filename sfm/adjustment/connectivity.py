@@ -51,11 +51,12 @@ def pattern_of(layout: Unknowns) -> Order | Pairs | None:
     summed = PAIR_OPERATIONS * pairs / PAIR_RATE
     product = 3.0 * len(rays) * layout.reduced**2 / PRODUCT_RATE
     full = min(summed, product) + layout.reduced**3 / 3.0 / FACTOR_RATE
-    other = pairs_of(obs) if summed < product and m > SMALL else None
     # a point joins all its photographs, so no order has a narrower band than its rays
     least = summed + 6.0 * m * (6.0 * rays.max()) ** 2 / BAND_RATE
-    if m <= SMALL or least > full:
-        return other
+    if m <= SMALL:
+        return None
+    if least > full:
+        return pairs_of(obs) if summed < product else None
     rows, columns = np.nonzero(_joined(obs, np.zeros((m, m), dtype=np.uint8)))
     graph = csr_matrix((np.ones(len(rows), dtype=np.int8), (rows, columns)), shape=(m, m))
     place = np.empty(m, dtype=np.int64)
@@ -63,7 +64,7 @@ def pattern_of(layout: Unknowns) -> Order | Pairs | None:
     width = int(np.abs(place[rows] - place[columns]).max(initial=0))
     banded = summed + 6.0 * m * (6.0 * width + 6.0) ** 2 / BAND_RATE
     if banded > full:
-        return other
+        return pairs_of(obs) if summed < product else None
     earliest = np.full(len(rays), m)
     np.minimum.at(earliest, obs.point, place[obs.image])
     return Order(place, np.argsort(earliest, kind="stable"), width)

@@ -99,7 +99,7 @@ class Step(Move):
 
 
 def problem_of(layout: Unknowns, weighted: Weighted, datum: Datum) -> Problem:
-    """Return what all steps of an adjustment have in common; chooses full or banded normal equations."""
+    """Return what all steps of an adjustment have in common; chooses how the normal equations are summed."""
     return Problem(layout, weighted, datum, new_space(layout), pattern_of(layout))
 
 

@@ -16,6 +16,7 @@ from sfm.adjustment.accumulate import times_points
 from sfm.adjustment.covariance import Cofactors, cofactors, marginal_covariance, without_held
 from sfm.adjustment.datum import Datum, motions_of
 from sfm.adjustment.iterate import Optimum, optimum_at, problem_of
+from sfm.adjustment.local import centroid_of, shifted
 from sfm.adjustment.normals import solve_lower
 from sfm.adjustment.parameters import Unknowns, unknowns_of
 from sfm.adjustment.rank import reduced_names
@@ -83,12 +84,13 @@ class Marginal:
         return np.asarray(self.adjustment.sigma0**2 * (cofactor - half - half.T + H @ Q.G @ H.T))
 
 
-def marginal_of(adjustment: Adjustment, *, datum: Datum | None = None) -> Marginal:
+def marginal_of(adjustment: Adjustment, *, datum: Datum | None = None, cross: bool = True) -> Marginal:
     """Return a finished adjustment with its normal equations at hand.
 
     Args:
         adjustment: what `adjust` returned.
         datum: another datum of the same kinds (control stays control); its own if None.
+        cross: whether cofactors between points and photographs are wanted.
 
     Raises:
         GeometryError: a change between control and a datum without.
@@ -98,14 +100,16 @@ def marginal_of(adjustment: Adjustment, *, datum: Datum | None = None) -> Margin
         datum = Datum(adjustment.datum, adjustment.datum_points)
     if (datum.kind == "control") != use_control:
         raise GeometryError("datum: with or without control is another adjustment, not an S-transformation")
-    layout, state = unknowns_of(adjustment.network, adjustment.estimate, use_control=use_control)
-    weighted = weighted_of(adjustment.network, layout, use_control=use_control)
+    centroid = centroid_of(adjustment.network, adjustment.estimate)
+    network, estimate = shifted(adjustment.network, adjustment.estimate, -centroid)
+    layout, state = unknowns_of(network, estimate, use_control=use_control)
+    weighted = weighted_of(network, layout, use_control=use_control)
     weight = np.ascontiguousarray(adjustment.weights[layout.order])
     optimum = optimum_at(problem_of(layout, weighted, datum), state, weight)
     if optimum is None:
         motions_of(layout, weighted, state, datum)  # says so if the datum is the reason
         raise GeometryError("adjustment: its normal equations cannot be solved")
-    return Marginal(adjustment, layout, weighted, optimum, cofactors(optimum, layout))
+    return Marginal(adjustment, layout, weighted, optimum, cofactors(optimum, layout, cross=cross))
 
 
 def change_datum(adjustment: Adjustment, datum: Datum) -> Adjustment:

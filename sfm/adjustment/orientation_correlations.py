@@ -13,17 +13,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sfm.adjustment.covariance import cofactors
-from sfm.adjustment.datum import Datum
-from sfm.adjustment.iterate import optimum_at, problem_of
-from sfm.adjustment.local import centroid_of, shifted
-from sfm.adjustment.parameters import angle_jacobian, interior_names, unknowns_of
+from sfm.adjustment.marginal import marginal_of
+from sfm.adjustment.parameters import angle_jacobian, interior_names
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.statistics import STRONG
 from sfm.adjustment.threads import own_threads
-from sfm.adjustment.weighted import weighted_of
 from sfm.conventions import FloatArray
-from sfm.errors import GeometryError
 
 PARTS = ("X0", "Y0", "Z0", "omega", "phi", "kappa")
 
@@ -82,28 +77,19 @@ def _correlations(adjustment: Adjustment) -> tuple[list[tuple[str, str]], FloatA
 
     0 where one of the two is fixed or was not adjusted.
     """
-    use_control = adjustment.datum == "control"
-    centroid = centroid_of(adjustment.network, adjustment.estimate)
-    network, estimate = shifted(adjustment.network, adjustment.estimate, -centroid)
-    layout, state = unknowns_of(network, estimate, use_control=use_control)
-    names = interior_names(layout, estimate)
-    m, i = len(network.images), len(names)
-    if not i:
-        return names, np.zeros((m, 6, 0))
-    weighted = weighted_of(network, layout, use_control=use_control)
-    weight = np.ascontiguousarray(adjustment.weights[layout.order])
-    datum = Datum(adjustment.datum, adjustment.datum_points)
-    optimum = optimum_at(problem_of(layout, weighted, datum), state, weight)
-    if optimum is None:
-        raise GeometryError("adjustment: its normal equations cannot be solved")
-    Q = cofactors(optimum, layout, cross=False)
+    if not any(camera.free.any() for camera in adjustment.estimate.cameras):
+        return [], np.zeros((0, 6, 0))
+    marginal = marginal_of(adjustment, cross=False)
+    layout, optimum, Q = marginal.layout, marginal.optimum, marginal.cofactors
+    names = interior_names(layout, adjustment.estimate)
+    m, i = len(adjustment.network.images), len(names)
     own, inner = slice(0, 6 * m), slice(6 * m, 6 * m + i)
     H, F, G = optimum.motions.reduced, Q.F_reduced, Q.G
     # S Q S' of the S-transformation, the block of exterior by interior unknowns
     C = Q.mixed[:, :i] - H[own] @ F[:, inner] - (H[inner] @ F[:, own]).T + H[own] @ G @ H[inner].T
     T = np.zeros((m, 6, 6))
     T[:, :3, :3] = np.eye(3)
-    T[:, 3:, 3:] = angle_jacobian(state.M)
+    T[:, 3:, 3:] = angle_jacobian(optimum.state.M)
     C = T @ C.reshape(m, 6, i)
     exterior = np.einsum("mpp->mp", adjustment.covariance.exterior) / adjustment.sigma0**2
     interior = np.diagonal(Q.border)[:i]  # no motion of the network moves them

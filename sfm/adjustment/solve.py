@@ -99,8 +99,8 @@ def adjust(
     weight = start_weights(layout, state)
     with own_threads():
         near = tolerance if reject == "none" else max(tolerance, ROUND_TOLERANCE)
-        run = _Run(problem_of(layout, weighted, local.datum), method, max_iterations, near)
-        run.exact = covariance or reject == "tau"
+        exact = covariance or reject == "tau"
+        run = _Run(problem_of(layout, weighted, local.datum), method, max_iterations, near, exact)
         optimum, weight = _plain(run, state, weight) if reject == "none" else _sound(run, state, weight)
         if reject == "tau":
             optimum, weight = _snoop_all(run, optimum, weight, alpha)
@@ -123,7 +123,7 @@ class _Run:
     method: str
     max_iterations: int
     tolerance: float
-    exact: bool = True  # whether the factor must belong to the last normal equations
+    exact: bool  # whether the factor must belong to the last normal equations
     iterations: int = 0
     remarks: tuple[str, ...] = ()
 

@@ -17,6 +17,7 @@ from sfm.project import Survey, inside
 from sfm.survey.cameras import camera_of_image, start_cameras
 from sfm.survey.interior import refuse_ungrouped
 from sfm.survey.tables import (
+    ExteriorTable,
     ImagePointTable,
     ObservedExteriorTable,
     read_control,
@@ -177,14 +178,25 @@ def observed_exterior(survey: Survey, images: Sequence[str]) -> ObservedExterior
         return None
     path = survey.beside(survey.exterior.file)
     table = read_observed_exterior(path)
+    _refuse_unknown(table, path, survey, images, "column image:")
+    return table
+
+
+def _refuse_unknown(
+    table: ExteriorTable | ObservedExteriorTable,
+    path: Path,
+    survey: Survey,
+    images: Sequence[str],
+    what: str,
+) -> None:
+    """Raise SurveyFileError if a table names a photograph that is none of the survey's."""
     known = set(images)
     for name, line in zip(table.names, table.line.tolist(), strict=True):
         if name not in known:
             lacks = "has no observations" if survey.observations else "is no photograph of the survey"
             raise SurveyFileError(
-                f"{path}, line {line}: column image: '{name}' {lacks}; correct the name or remove it"
+                f"{path}, line {line}: {what} '{name}' {lacks}; correct the name or remove it"
             )
-    return table
 
 
 def scale_bars(survey: Survey, points: tuple[str, ...]) -> tuple[ScaleBars, tuple[str, ...]]:
@@ -270,12 +282,7 @@ def approximate_values(
     if survey.approximate.images is not None:
         path = survey.beside(survey.approximate.images)
         exterior = read_exterior(path)
-        for name, line in zip(exterior.names, exterior.line.tolist(), strict=True):
-            if name not in images:
-                lacks = "has no observations" if survey.observations else "is no photograph of the survey"
-                raise SurveyFileError(
-                    f"{path}, line {line}: image '{name}' {lacks}; correct the name or remove it"
-                )
+        _refuse_unknown(exterior, path, survey, images, "image")
         row = {name: k for k, name in enumerate(exterior.names)}
         for i, name in enumerate(network.images):
             if name in row:
