@@ -11,7 +11,7 @@ ROOT = Path(__file__).resolve().parents[1]
 LAYERS = (
     (
         *("sfm.conventions", "sfm.errors", "sfm.progress", "sfm.folder_lock", "sfm.whole_files"),
-        *("sfm.csv_tables", "sfm.engine", "sfm.compiling", "sfm.file_values"),
+        *("sfm.csv_tables", "sfm.engine", "sfm.compiling", "sfm.faults", "sfm.file_values"),
     ),
     ("sfm.distortion", "sfm.camera", "sfm.network", "sfm.similarity"),
     ("sfm.targets", "sfm.matching", "sfm.orientation", "sfm.adjustment"),
