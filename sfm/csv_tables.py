@@ -20,7 +20,7 @@ import numpy as np
 
 from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.errors import SurveyFileError
-from sfm.file_values import MAX_NAME, is_plain
+from sfm.file_values import MAX_NAME, as_plain, from_cell, is_plain
 
 # Room for the largest networks that are adjusted here, some 300 MB of memory at most.
 MAX_TABLE_BYTES = 500_000_000
@@ -188,13 +188,13 @@ def _opened(path: Path) -> TextIO:
 
 
 def _name(cell: str, where: str) -> str:
-    """Return a name; one that is empty, very long or holds control characters is refused."""
-    name = cell.strip()
+    """Return a name; one that is empty, very long or holds characters that nobody sees is refused."""
+    name = from_cell(cell.strip())
     if not name:
         raise SurveyFileError(f"{where} is empty, a name is needed")
     if len(name) > MAX_NAME or not is_plain(name):
         raise SurveyFileError(
-            f"{where} holds {name!r:.60}, needed plain text of at most {MAX_NAME} characters"
+            f"{where} holds '{as_plain(name):.60}', needed plain text of at most {MAX_NAME} characters"
         )
     return sys.intern(name)
 

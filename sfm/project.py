@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
 from pathlib import Path
 from typing import Annotated
 
@@ -12,6 +11,7 @@ from sfm.distortion.models import MODELS
 from sfm.errors import SurveyFileError
 from sfm.file_values import as_plain, is_plain
 from sfm.settings import (
+    MAX_CAMERAS,
     MAX_LENGTH_PER_SIGMA,
     AdjustSettings,
     ApproximateSettings,
@@ -30,17 +30,18 @@ from sfm.settings import (
 from sfm.settings_errors import first_error
 from sfm.targets.codes import FAMILIES as RING_FAMILIES
 from sfm.targets.tags import TAG_FAMILIES
+from sfm.toml_files import read_toml
 
 FAMILIES = (*RING_FAMILIES, *TAG_FAMILIES)
-
-MAX_SURVEY_BYTES = 1_000_000  # a survey file is written by people; anything larger is another file
 
 
 class Survey(Section):
     """A survey as its file describes it."""
 
     head: Head = Field(alias="survey")
-    cameras: Annotated[tuple[CameraSettings, ...], Field(strict=False, min_length=1, alias="camera")]
+    cameras: Annotated[
+        tuple[CameraSettings, ...], Field(strict=False, min_length=1, max_length=MAX_CAMERAS, alias="camera")
+    ]
     targets: TargetSettings = TargetSettings()
     tie_points: TiePointSettings | None = None
     datum: DatumSettings = DatumSettings()
@@ -151,27 +152,7 @@ def read_survey(path: Path, *, allow_outside: bool = False) -> Survey:
     path = Path(path)
     if not is_plain(str(path)):
         raise SurveyFileError(f"{as_plain(str(path))}: the path is no plain text; rename the file or folder")
-    try:
-        if path.exists() and not path.is_file():  # reading a pipe would never end
-            raise SurveyFileError(f"{path}: not a file, a survey file (TOML) is needed")
-        if path.stat().st_size > MAX_SURVEY_BYTES:
-            raise SurveyFileError(
-                f"{path}: {path.stat().st_size} bytes, a survey file has at most {MAX_SURVEY_BYTES}"
-            )
-        text = path.read_text(encoding="utf-8-sig")  # editors of Windows put a byte order mark first
-    except OSError as error:
-        raise SurveyFileError(f"{path}: the survey file cannot be read: {error.strerror}") from error
-    except UnicodeDecodeError as error:
-        raise SurveyFileError(
-            f"{path}: not a text file in UTF-8 (byte {error.start}); save it as such"
-        ) from error
-    try:
-        table = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise SurveyFileError(f"{path}: not a TOML file: {error}") from error
-    except (ValueError, RecursionError) as error:
-        what = "brackets nested too deeply" if isinstance(error, RecursionError) else "a number is too long"
-        raise SurveyFileError(f"{path}: not a TOML file: {what}") from error
+    text, table = read_toml(path, "a survey file")
     try:
         survey = Survey.model_validate(table)
     except ValidationError as error:

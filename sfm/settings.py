@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 
 from sfm.distortion.models import MODELS
-from sfm.file_values import MAX_NAME, is_plain
+from sfm.file_values import MAX_NAME, as_plain, is_plain
 
 
 def _pairs(value: Any) -> Any:
@@ -19,8 +19,8 @@ def _plain(value: str) -> str:
     if not value.strip():
         raise ValueError("found an empty text")
     if len(value) > MAX_NAME or not is_plain(value):
-        shown = repr(value[:40])
-        raise ValueError(f"found {shown}, needed plain text on one line, at most {MAX_NAME} characters")
+        shown = as_plain(value[:40])
+        raise ValueError(f"found '{shown}', needed plain text on one line, at most {MAX_NAME} characters")
     return value
 
 
@@ -28,23 +28,24 @@ def _plain(value: str) -> str:
 SMALLEST, LARGEST = 1e-9, 1e12
 SMALLEST_SIGMA = 1e-30  # of a distortion parameter, mm^-8
 MAX_SIDE_PX = 1_000_000
+MAX_CAMERAS, MAX_GROUPS = 1000, 1000  # each is tried on every photograph
 MAX_LENGTH_PER_SIGMA = 1e6  # no scale bar is calibrated to better than a millionth of its length
 Length = Annotated[float, Field(ge=SMALLEST, le=LARGEST)]
 Name = Annotated[str, BeforeValidator(lambda v: _plain(v) if isinstance(v, str) else v)]
 TwoLengths = Annotated[tuple[Length, Length], Field(strict=False)]
 Side = Annotated[int, Field(gt=0, le=MAX_SIDE_PX)]
 TwoCounts = Annotated[tuple[Side, Side], Field(strict=False)]
-Names = Annotated[tuple[str, ...], Field(strict=False)]
+Names = Annotated[tuple[Name, ...], Field(strict=False)]
 Value = Annotated[float, Field(ge=-LARGEST, le=LARGEST)]
 Values = Annotated[
-    tuple[Annotated[tuple[str, Value], Field(strict=False)], ...],
+    tuple[Annotated[tuple[Name, Value], Field(strict=False)], ...],
     Field(strict=False),
     BeforeValidator(_pairs),
 ]
 Sigma = Annotated[float, Field(ge=SMALLEST_SIGMA, le=LARGEST)]
 ValueAndSigma = Annotated[tuple[Value, Sigma], Field(strict=False)]
 Observed = Annotated[
-    tuple[Annotated[tuple[str, ValueAndSigma], Field(strict=False)], ...],
+    tuple[Annotated[tuple[Name, ValueAndSigma], Field(strict=False)], ...],
     Field(strict=False),
     BeforeValidator(_pairs),
 ]
@@ -80,7 +81,7 @@ class CameraSettings(Section):
     weighted: Observed = ()  # (parameter, (value, sigma)): adjusted, with this as an observation
     per_photograph: Names = ()  # adjusted parameters of which every photograph has a value of its own
     per_group: Names = ()  # adjusted parameters of which every group of photographs has a value of its own
-    groups: Names = ()  # globs of these groups of photographs
+    groups: Annotated[Names, Field(max_length=MAX_GROUPS)] = ()  # globs of these groups of photographs
 
     @property
     def adjusted(self) -> tuple[str, ...]:

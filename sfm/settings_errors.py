@@ -8,7 +8,11 @@ from typing import Any, get_args
 
 from pydantic import ValidationError
 
+from sfm.file_values import as_plain
 from sfm.settings import Section
+
+MAX_SHOWN = 60  # characters of a key
+FEW = 3  # values of a list that has a fixed number of them
 
 _NEEDED = (
     ("string_type", "a text in quotes"),
@@ -43,7 +47,8 @@ def first_error(path: Path, text: str, error: ValidationError, whole: type[Secti
     if kind == "extra_forbidden":
         table = _key(location[:-1])
         inside = f"[{table}]" if table else "the survey file"
-        return f"{where}unknown key '{location[-1]}' in {inside}, known are {_known(location[:-1], whole)}"
+        known = _known(location[:-1], whole)
+        return f"{where}unknown key '{_key(location[-1:])}' in {inside}, known are {known}"
     if kind == "missing" and isinstance(location[-1], int) and isinstance(first["input"], list | tuple):
         found = _found(list(first["input"]))
         return f"{where}{_key(location[:-1])}: found {found}, needed {location[-1] + 1} values"
@@ -62,7 +67,8 @@ def first_error(path: Path, text: str, error: ValidationError, whole: type[Secti
     elif kind == "less_than_equal":
         needed = f"at most {context['le']:g}"
     elif kind == "too_long":
-        needed = f"{context['max_length']} values"
+        most = context["max_length"]
+        needed = f"{most} values" if most <= FEW else f"at most {most} values"
     elif kind == "too_short":
         needed = f"at least {context['min_length']}"
     if needed is None:
@@ -84,7 +90,7 @@ def _key(location: tuple[str | int, ...]) -> str:
         if isinstance(part, int):
             words[-1:] = [f"{words[-1]} {part + 1}"] if words else [str(part + 1)]
         else:
-            words.append(part)
+            words.append(as_plain(part[:MAX_SHOWN]))
     return ".".join(words)
 
 

@@ -11,7 +11,6 @@ which are then means over their areas.
 from __future__ import annotations
 
 import argparse
-import csv
 import math
 import os
 import sys
@@ -25,6 +24,7 @@ import numpy as np
 from sfm.camera import Camera, project, tangents_from_pixel
 from sfm.conventions import AnyArray, FloatArray, IntArray, angles_from_rotation
 from sfm.errors import GeometryError, KolinearError, OutputError
+from sfm.file_values import csv_text
 from sfm.targets.area import fill_face, paint_mark
 from sfm.targets.painting_order import painting_order
 from sfm.targets.picture import TargetPictures, picture_targets
@@ -275,10 +275,8 @@ def write_photographs(staging: Staging, folder: Path) -> None:
 
 
 def _write_table(path: Path, header: tuple[str, ...], rows: list[tuple[object, ...]]) -> None:
-    with path.open("w", newline="", encoding="utf-8") as file:
-        table = csv.writer(file, lineterminator="\n")
-        table.writerow(header)
-        table.writerows([f"{v:.9g}" if isinstance(v, float) else v for v in row] for row in rows)
+    cells = ([f"{v:.9g}" if isinstance(v, float) else v for v in row] for row in rows)
+    path.write_text(csv_text(header, cells), encoding="utf-8", newline="")
 
 
 def main() -> int:

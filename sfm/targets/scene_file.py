@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
@@ -28,11 +27,14 @@ from sfm.targets.scene import (
     join_marks,
     rectangles,
 )
+from sfm.toml_files import read_toml
 
 Two = Annotated[tuple[float, float], Field(strict=False)]
 Three = Annotated[tuple[float, float, float], Field(strict=False)]
 Part = Annotated[float, Field(ge=0, le=1)]
 Length = Annotated[float, Field(gt=0)]
+Side = Annotated[int, Field(gt=0, le=20_000)]  # px; pictures are drawn whole, with oversampling
+Count = Annotated[int, Field(gt=0, le=1000)]
 
 # A code of 0 in a grid is a dot without ring, this one leaves the place empty.
 NO_TARGET = -1
@@ -59,7 +61,9 @@ class _Section(BaseModel):
 
 
 class _Head(_Section):
-    photographs: str  # file name with {} for the number of the station
+    photographs: Annotated[
+        str, Field(pattern=r"^[^/\\{}]*\{(:0?\d?d)?\}[^/\\{}]*$", max_length=100)
+    ]  # file name with {} for the number of the station
     quality: Annotated[int, Field(ge=1, le=100)] = 95
     codes: str = "none"
     background: Part = 0.05
@@ -68,7 +72,7 @@ class _Head(_Section):
 
 class _Camera(_Section):
     model: Literal[tuple(MODELS)]  # type: ignore[valid-type]
-    size_px: Annotated[tuple[int, int], Field(strict=False)]
+    size_px: Annotated[tuple[Side, Side], Field(strict=False)]
     pixel_mm: Two
     c_mm: Length
     values: dict[str, float] = {}
@@ -93,7 +97,7 @@ class _Light(_Section):
 class _Grid(_Section):
     first: Two  # plane coordinates of the first target
     step: Two = (0.0, 0.0)
-    count: Annotated[tuple[int, int], Field(strict=False)] = (1, 1)  # columns and rows
+    count: Annotated[tuple[Count, Count], Field(strict=False)] = (1, 1)  # columns and rows
     radius: Length
     reflectance: Part
     codes: tuple[int, ...] | list[int] = ()  # row by row; 0 = no ring, -1 = no target; all 0 if left out
@@ -109,7 +113,7 @@ class _Rectangle(_Section):
 
 class _Print(_Section):
     at: Two  # left end of the first line
-    lines: Annotated[int, Field(gt=0)]
+    lines: Count
     length: Length
     height: Length  # of a letter
     turn_deg: float = 0.0
@@ -157,10 +161,9 @@ def read_scene(path: Path) -> Staging:
     Raises:
         SurveyFileError: the file is missing, is no TOML, or says something that a scene file may not say.
     """
+    _, table = read_toml(path, "a scene file")
     try:
-        file = _File.model_validate(tomllib.loads(path.read_text(encoding="utf-8")))
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise SurveyFileError(f"{path}: {error}") from error
+        file = _File.model_validate(table)
     except ValidationError as error:
         first = error.errors()[0]
         raise SurveyFileError(f"{path}: {'.'.join(map(str, first['loc']))}: {first['msg']}") from error

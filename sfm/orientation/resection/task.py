@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,6 +9,7 @@ import numpy as np
 
 from sfm.camera import camera_from_values, tangents_from_pixel
 from sfm.conventions import FloatArray, pixel_from_image
+from sfm.csv_tables import read_table
 from sfm.errors import SurveyFileError
 
 TOLERANCE = 1e-3  # of c: the tolerance of `robust` if none is given, some px of a usual camera
@@ -70,56 +70,19 @@ def read_task(
 
 
 def _read_points(path: Path) -> tuple[tuple[str, ...], FloatArray, FloatArray]:
-    names, values = [], []
-    for number, row in _read_rows(path, ("point", "X", "Y", "Z", "x_mm", "y_mm")):
-        names.append(row["point"].strip())
-        values.append([_float(path, number, key, row[key]) for key in ("X", "Y", "Z", "x_mm", "y_mm")])
-    if not names:
-        raise SurveyFileError(f"{path.name}: no points in it")
-    table = np.array(values)
-    return tuple(names), table[:, :3], table[:, 3:]
+    table = read_table(path, ("point",), ("X", "Y", "Z", "x_mm", "y_mm"), ignored=None)
+    return table.texts[0], table.values[:, :3], table.values[:, 3:]
 
 
 def _read_camera(path: Path) -> dict[str, float]:
-    values = {}
-    for number, row in _read_rows(path, ("parameter", "value")):
-        key = row["parameter"].strip()
-        if key not in _CAMERA:
+    table = read_table(path, ("parameter",), ("value",), ignored=None)
+    parameters = table.keys("parameter")
+    for line, name in zip(table.line, parameters, strict=True):
+        if name not in _CAMERA:
             raise SurveyFileError(
-                f"{path.name}, line {number}: no parameter '{key}', known are {', '.join(_CAMERA)}"
+                f"{path}, line {line}: no parameter '{name}', known are {', '.join(_CAMERA)}"
             )
-        values[key] = _float(path, number, key, row["value"])
-    return values
-
-
-def _read_rows(path: Path, columns: tuple[str, ...]) -> list[tuple[int, dict[str, str]]]:
-    """Rows of a CSV file with the numbers of their lines."""
-    try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            reader = csv.DictReader(file)
-            missing = [name for name in columns if name not in (reader.fieldnames or ())]
-            if missing:
-                raise SurveyFileError(
-                    f"{path.name}: column '{missing[0]}' is missing, needed are {','.join(columns)}"
-                )
-            return [
-                (reader.line_num, row)
-                for row in reader
-                if any((v or "").strip() for v in row.values() if isinstance(v, str))
-            ]
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
-        raise SurveyFileError(f"{path}: cannot be read ({reason})") from None
-
-
-def _float(path: Path, number: int, column: str, text: str | None) -> float:
-    try:
-        value = float(text or "")
-    except ValueError:
-        value = np.nan
-    if not np.isfinite(value):
-        raise SurveyFileError(f"{path.name}, line {number}: {column} is '{text}', a number is needed")
-    return value
+    return dict(zip(parameters, table.values[:, 0].tolist(), strict=True))
 
 
 def _parse_start(text: str | None) -> FloatArray | None:
