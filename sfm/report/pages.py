@@ -12,8 +12,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from sfm.errors import OutputError
-from sfm.folder_lock import locked
-from sfm.whole_files import remove_leftovers, whole_folder
+from sfm.files.folder_lock import locked
+from sfm.files.whole_files import remove_leftovers, whole_folder
 
 DPI = 110
 
