@@ -8,8 +8,8 @@ import pytest
 from test_resection_least_squares import LAB2, TRUTH
 
 from sfm.errors import GeometryError, SurveyFileError
-from sfm.orientation.resection.report import METHODS, resect_json, resect_table
-from sfm.orientation.resection.task import read_task
+from sfm.report.resection import METHODS, resect_json, resect_table
+from sfm.survey.inputs.resection_points import read_task
 
 TABLE = np.loadtxt(
     Path(__file__).parents[1] / "datasets/resection4/resection4_points.csv", delimiter=",", skiprows=1

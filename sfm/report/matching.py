@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 
 from sfm.conventions import AnyArray, FloatArray
-from sfm.csv_tables import read_table
 from sfm.errors import PhotographError, SurveyFileError
-from sfm.file_values import csv_text
+from sfm.files.csv_tables import read_table
+from sfm.files.plain_text import csv_text
 from sfm.matching.conjugate import BACK_PX, MIN_CORRELATION, ConjugatePoints, match_points
+from sfm.photographs.reading import read_photograph
 from sfm.report.match_files import picture_file, refuse_outputs, whole_outputs
 from sfm.report.patch_pictures import draw_patches
-from sfm.targets.photograph import read_photograph
 
 COLUMNS = (
     "point",
