@@ -1,4 +1,4 @@
-"""How functions are compiled: the only place that names numba's options, typed so that callers keep their types."""
+"""How functions are compiled: the one place that names the options of numba, typed as the functions are."""
 
 from __future__ import annotations
 
