@@ -10,10 +10,8 @@ from scipy import stats
 from synthetic import make_network, seed_of
 
 from sfm.adjustment.datum import Datum
-from sfm.adjustment.marginal import change_datum, marginal_of
-from sfm.adjustment.result import Adjustment
-from sfm.adjustment.solve import adjust
-from sfm.adjustment.statistics import (
+from sfm.adjustment.engine.marginal import change_datum, marginal_of
+from sfm.adjustment.quality.statistics import (
     component_tests,
     correlations,
     global_test,
@@ -23,7 +21,9 @@ from sfm.adjustment.statistics import (
     tau_test,
     w_test,
 )
-from sfm.adjustment.variance_components import by_camera, by_kind, by_photograph, estimate_components
+from sfm.adjustment.quality.variance_components import by_camera, by_kind, by_photograph, estimate_components
+from sfm.adjustment.result import Adjustment
+from sfm.adjustment.solve import adjust
 from sfm.errors import GeometryError
 from sfm.network import ExteriorObservations, InteriorObservations, Network, ObjectPoints, ScaleBars
 

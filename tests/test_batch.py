@@ -25,10 +25,10 @@ from adapters.dask_cluster import DaskEngine, _OneThread, fitting_workers, local
 from sfm.batch.pages import render_index
 from sfm.batch.run import calls_of, find_surveys, run_batch
 from sfm.batch.survey import SurveyJob, SurveyRow, reconstruct
-from sfm.engine import Call, Done, Lost, Work
 from sfm.errors import BackendError, KolinearError, OutputError, SurveyFileError
-from sfm.folder_lock import Owner, locked
-from sfm.survey.log import read_log
+from sfm.executor import Call, Done, Lost, Work
+from sfm.files.folder_lock import Owner, locked
+from sfm.report.log import read_log
 from tests.engines import ALONE, HERE, KILLER, Notes, points_of, raise_unforeseen, return_nothing
 from tests.surveys import write_observed_survey, write_photograph_survey
 

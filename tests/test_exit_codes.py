@@ -14,11 +14,11 @@ import pytest
 
 from sfm import cli
 from sfm.batch.run import run_batch
-from sfm.commands import starting
-from sfm.commands.app import app
+from sfm.cli import starting
+from sfm.cli.app import app
 from sfm.errors import KolinearError
 from sfm.faults import told_of_error, working_on
-from sfm.survey.log import read_log
+from sfm.report.log import read_log
 from tests.engines import ALONE, HERE, Notes
 from tests.surveys import write_observed_survey, write_photograph_survey
 
@@ -84,7 +84,7 @@ def test_what_nobody_has_foreseen_is_one_line_with_its_traceback_in_a_file(
 ) -> None:
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     for module in ("surveying", "measuring", "solvers", "refining", "planning"):
-        monkeypatch.setattr(f"sfm.commands.{module}.loading", raising(ValueError("new\nline \x1b[31m")))
+        monkeypatch.setattr(f"sfm.cli.{module}.loading", raising(ValueError("new\nline \x1b[31m")))
     code, lines = kolinear(monkeypatch, capsys, command, *COMMANDS[command])
     (path,) = tmp_path.iterdir()
     assert code == 70
@@ -100,7 +100,7 @@ def test_a_traceback_that_cannot_be_kept_is_said(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr("tempfile.tempdir", "/nowhere")
-    monkeypatch.setattr("sfm.commands.solvers.loading", raising(KeyError("x")))
+    monkeypatch.setattr("sfm.cli.solvers.loading", raising(KeyError("x")))
     code, (line,) = kolinear(monkeypatch, capsys, "compare", "a", "b")
     assert code == 70 and line.endswith("; its traceback cannot be written")
 
@@ -121,7 +121,7 @@ def test_memory_that_is_not_enough_says_for_which_photograph(
 def test_memory_that_is_not_enough_says_for_which_file(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("adapters.formats.read_comparable", raising(MemoryError()))
+    monkeypatch.setattr("adapters.formats.registry.read_comparable", raising(MemoryError()))
     code, lines = kolinear(monkeypatch, capsys, "compare", "a result", "b")
     assert (code, lines) == (2, ["kolinear: not enough memory for a result"])
 

@@ -16,7 +16,7 @@ import pytest
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
-from sfm.commands.console import tell_result
+from sfm.cli.console import tell_result
 from sfm.conventions import angles_from_rotation
 from sfm.errors import OutputError
 from sfm.network import Network, ObjectPoints, ScaleBars
@@ -25,12 +25,12 @@ from sfm.report.markup import finer_unit, significant, table, to_precision, with
 from sfm.report.output import WRITTEN, refuse_foreign_folder, write_result
 from sfm.report.overlays import USED, draw_photograph, overlay_names
 from sfm.report.plots import all_plots, plan_axes
-from sfm.report.result import ControlCheck, FailedImage, PhotographTargets, StageTime, SurveyResult
 from sfm.report.summary import summary, write_summary
 from sfm.report.tables import image_rms, write_tables
 from sfm.report.text import WIDTH, text_report
 from sfm.report.verdict import verdict_of
-from sfm.survey.tables import read_exterior, read_image_points, read_points
+from sfm.result import ControlCheck, FailedImage, PhotographTargets, StageTime, SurveyResult
+from sfm.survey.inputs.tables import read_exterior, read_image_points, read_points
 from sfm.targets.flags import Flag
 from tests.synthetic import make_network, seed_of
 

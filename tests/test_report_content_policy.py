@@ -12,18 +12,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sfm.analysis.random_network import Plan
-from sfm.analysis.significance import Result, compare_results
-from sfm.analysis.validation import SAME, Trial, Validation
 from sfm.batch.pages import render_index
 from sfm.batch.survey import SurveyRow
+from sfm.comparison.random_network import Plan
+from sfm.comparison.significance import Result, compare_results
+from sfm.comparison.validation import SAME, Trial, Validation
 from sfm.pipeline import run_survey
-from sfm.project import read_survey
 from sfm.report.content_policy import content_policy
 from sfm.report.differences import write_differences
 from sfm.report.output import write_result
 from sfm.report.pages import page
 from sfm.report.validation import write_validation
+from sfm.survey.inputs.survey_file import read_survey
 from tests.surveys import write_photograph_survey
 from tests.synthetic import make_network, seed_of
 

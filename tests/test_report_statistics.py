@@ -14,12 +14,12 @@ import pytest
 from scipy import stats
 
 from sfm.adjustment.datum import Datum
+from sfm.adjustment.quality.statistics import component_tests, global_test, reliability, tau_test, w_test
+from sfm.adjustment.quality.variance_components import by_kind
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
-from sfm.adjustment.statistics import component_tests, global_test, reliability, tau_test, w_test
-from sfm.adjustment.variance_components import by_kind
-from sfm.analysis.comparison import AdjusterComparison, BackendAdjustment, compare_adjusters
 from sfm.camera import Camera
+from sfm.comparison.adjusters import AdjusterComparison, BackendAdjustment, compare_adjusters
 from sfm.network import Estimate, InteriorObservations, Network, ObjectPoints, ScaleBars
 from sfm.report.checks import (
     count_observations,
@@ -34,7 +34,6 @@ from sfm.report.html import render_html
 from sfm.report.markup import signed, significant
 from sfm.report.plots import all_plots, plan_axes
 from sfm.report.precision import point_precision, without_fixed
-from sfm.report.result import ControlCheck, Eccentricity, SurveyResult
 from sfm.report.section_statistics import camera_correlations
 from sfm.report.statistics import (
     families,
@@ -49,6 +48,7 @@ from sfm.report.summary import summary
 from sfm.report.tables import write_tables
 from sfm.report.text import WIDTH, text_report
 from sfm.report.verdict import verdict_of
+from sfm.result import ControlCheck, Eccentricity, SurveyResult
 from tests.synthetic import make_network, seed_of
 
 NOISE_PX = 0.1

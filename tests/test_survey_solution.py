@@ -8,19 +8,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sfm.adjustment import variance_components
 from sfm.adjustment.datum import Datum
+from sfm.adjustment.quality import variance_components
+from sfm.adjustment.quality.variance_components import by_kind
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
-from sfm.adjustment.variance_components import by_kind
 from sfm.errors import BackendError
 from sfm.network import Estimate, Network, ObjectPoints, ScaleBars
 from sfm.pipeline import adjust_survey
-from sfm.project import read_survey
 from sfm.report.statistics import statistics_of
 from sfm.report.verdict import verdict_of
 from sfm.survey.comparison import OtherPrograms
 from sfm.survey.datum import contradiction, object_scale
+from sfm.survey.inputs.survey_file import read_survey
 from tests.surveys import write_observed_survey
 from tests.synthetic import make_network, seed_of
 

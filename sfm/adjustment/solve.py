@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sfm.adjustment.collinearity import State, behind_camera, residuals
 from sfm.adjustment.covariance import (
     Cofactors,
     cofactors,
@@ -21,14 +20,23 @@ from sfm.adjustment.covariance import (
     without_held,
 )
 from sfm.adjustment.datum import Datum
-from sfm.adjustment.iterate import METHODS, TOLERANCE, Optimum, Problem, iterate, optimum_at, problem_of
-from sfm.adjustment.local import Local, local_of
-from sfm.adjustment.parameters import estimate_of, start_weights, unknowns_of
-from sfm.adjustment.rank import rank_defect, undetermined_of
-from sfm.adjustment.reliability import redundancy_numbers as numbers_of
-from sfm.adjustment.reliability import redundancy_of_bars, standardised_residuals
-from sfm.adjustment.result import Adjustment, Covariance
-from sfm.adjustment.robust import (
+from sfm.adjustment.engine.collinearity import State, behind_camera, residuals
+from sfm.adjustment.engine.iterate import (
+    METHODS,
+    TOLERANCE,
+    Optimum,
+    Problem,
+    iterate,
+    optimum_at,
+    problem_of,
+)
+from sfm.adjustment.engine.local_frame import Local, local_of
+from sfm.adjustment.engine.observed_unknowns import weighted_of
+from sfm.adjustment.engine.unknowns import estimate_of, start_weights, unknowns_of
+from sfm.adjustment.quality.rank import rank_defect, undetermined_of
+from sfm.adjustment.quality.reliability import redundancy_numbers as numbers_of
+from sfm.adjustment.quality.reliability import redundancy_of_bars, standardised_residuals
+from sfm.adjustment.quality.robust import (
     huber_slopes,
     huber_weights,
     inflation,
@@ -37,10 +45,10 @@ from sfm.adjustment.robust import (
     tukey_slopes,
     tukey_weights,
 )
-from sfm.adjustment.threads import own_threads
-from sfm.adjustment.weighted import weighted_of
+from sfm.adjustment.result import Adjustment, Covariance
 from sfm.conventions import FloatArray
 from sfm.errors import GeometryError
+from sfm.kernels.threads import own_threads
 from sfm.network import Estimate, Network
 
 MAX_ROUNDS = 200  # of data snooping

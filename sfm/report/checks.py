@@ -10,12 +10,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sfm.adjustment.engine.observed_unknowns import observed
+from sfm.adjustment.quality.variance_components import IMAGE_POINTS, variance_components
 from sfm.adjustment.result import Adjustment
-from sfm.adjustment.variance_components import IMAGE_POINTS, variance_components
-from sfm.adjustment.weighted import observed
 from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.report.markup import finer_unit, significant
-from sfm.report.result import ControlCheck, SurveyResult
+from sfm.result import ControlCheck, SurveyResult
 
 TOLD_APART = 0.01  # relative difference from which sigma0 of the image points is told beside that of all
 MEDIAN_LENGTH = 1.1774  # median length of a normal vector in the plane over its sigma: sqrt(2 ln 2)

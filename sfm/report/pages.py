@@ -12,9 +12,9 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from sfm.errors import OutputError
-from sfm.folder_lock import locked
+from sfm.files.folder_lock import locked
+from sfm.files.whole_files import remove_leftovers, whole_folder
 from sfm.report.content_policy import content_policy
-from sfm.whole_files import remove_leftovers, whole_folder
 
 DPI = 110
 

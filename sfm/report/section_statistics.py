@@ -6,13 +6,13 @@ from html import escape
 
 import numpy as np
 
-from sfm.adjustment.statistics import (
+from sfm.adjustment.quality.statistics import (
     STRONG,
     Correlation,
     correlations,
     significance,
 )
-from sfm.adjustment.variance_components import VarianceComponents
+from sfm.adjustment.quality.variance_components import VarianceComponents
 from sfm.report.checks import (
     count_observations,
     sigma0_ratio,
@@ -20,7 +20,6 @@ from sfm.report.checks import (
     worst_residuals,
 )
 from sfm.report.markup import significant, table
-from sfm.report.result import SurveyResult
 from sfm.report.statistics import (
     Statistics,
     quantiles,
@@ -28,6 +27,7 @@ from sfm.report.statistics import (
     words_of_test,
     words_of_weights,
 )
+from sfm.result import SurveyResult
 
 
 def image_coordinates(result: SurveyResult) -> str:

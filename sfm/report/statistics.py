@@ -6,8 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sfm.adjustment.result import Adjustment
-from sfm.adjustment.statistics import (
+from sfm.adjustment.quality.statistics import (
     GLOBAL_ALPHA,
     POWER,
     UNTESTED,
@@ -24,16 +23,17 @@ from sfm.adjustment.statistics import (
     tau_test,
     w_test,
 )
-from sfm.adjustment.variance_components import (
+from sfm.adjustment.quality.variance_components import (
     IMAGE_POINTS,
     VarianceComponents,
     by_camera,
     by_kind,
     by_photograph,
 )
+from sfm.adjustment.result import Adjustment
 from sfm.camera import Camera, camera_families
 from sfm.conventions import FloatArray, IntArray
-from sfm.report.result import SurveyResult
+from sfm.result import SurveyResult
 
 
 @dataclass(frozen=True)

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from sfm.adjustment.statistics import STRONG
-from sfm.adjustment.variance_components import VarianceComponents
+from sfm.adjustment.quality.statistics import STRONG
+from sfm.adjustment.quality.variance_components import VarianceComponents
 from sfm.report.checks import (
     count_observations,
     sigma0_ratio,
@@ -25,7 +25,6 @@ from sfm.report.precision import (
     without_fixed,
     words_of_limiting,
 )
-from sfm.report.result import SurveyResult
 from sfm.report.section_geometry import geometry_text
 from sfm.report.statistics import (
     Statistics,
@@ -40,6 +39,7 @@ from sfm.report.statistics import (
 from sfm.report.text_given import given_text
 from sfm.report.text_lines import MOST_ROWS, WIDTH, columns, head, line, wrapped
 from sfm.report.verdict import verdict_of
+from sfm.result import SurveyResult
 
 WORST = 5
 

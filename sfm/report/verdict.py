@@ -7,8 +7,8 @@ from typing import Literal
 
 import numpy as np
 
-from sfm.adjustment.statistics import ALPHA, component_tests, tau_test, w_test
-from sfm.adjustment.variance_components import IMAGE_POINTS
+from sfm.adjustment.quality.statistics import ALPHA, component_tests, tau_test, w_test
+from sfm.adjustment.quality.variance_components import IMAGE_POINTS
 from sfm.conventions import MAD_TO_SIGMA
 from sfm.report.checks import (
     check_over_sigma,
@@ -25,8 +25,8 @@ from sfm.report.given import (
     interior_residuals,
 )
 from sfm.report.markup import finer_unit, significant
-from sfm.report.result import SurveyResult
 from sfm.report.statistics import kinds_over_stated
+from sfm.result import SurveyResult
 
 MUCH_REJECTED = 0.05  # share of rejected image points above which a person should look
 MOST_RAYS = 0.5  # share of the rays of a point: most of them say something else than the result

@@ -8,18 +8,18 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sfm.adjustment.datum import Datum
+from sfm.adjustment.engine.observed_unknowns import observed
+from sfm.adjustment.quality.variance_components import IMAGE_POINTS, estimate_components
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
-from sfm.adjustment.variance_components import IMAGE_POINTS, estimate_components
-from sfm.adjustment.weighted import observed
 from sfm.conventions import MAD_TO_SIGMA, BoolArray, IntArray
 from sfm.errors import GeometryError
 from sfm.network import Estimate, Network, reduce_network, supported
 from sfm.orientation.sequence import Orientation
-from sfm.project import Survey
-from sfm.report.result import ControlCheck
+from sfm.result import ControlCheck
 from sfm.survey.datum import Contradiction, contradiction, datum_warnings, placed_on_control, rescaled
-from sfm.survey.interior import as_asked_for, without_idle_cameras
+from sfm.survey.inputs.interior import as_asked_for, without_idle_cameras
+from sfm.survey.inputs.survey_file import Survey
 from sfm.survey.network import Naming, build_network, match_uncoded, min_rays
 from sfm.survey.targets import MeasuredPhotographs
 

@@ -1,0 +1,80 @@
+"""The entry point of kolinear, and the one line that a person reads when something is wrong.
+
+Nothing is imported here that takes time: Ctrl-C and wrong arguments are answered at once.
+"""
+
+from __future__ import annotations
+
+import sys
+
+from sfm.cli.outlets import guard_outlets
+from sfm.cli.starting import INTERRUPTED, INTERRUPTED_TEXT, loading, stopped_once
+from sfm.errors import KolinearError
+
+BAD_INPUT = 2  # exit code where a person must put something right
+
+
+def main() -> None:
+    """Run the command line; every error is one line.
+
+    Exit code 2 stands for what a person can put right, 70 for what nobody has foreseen.
+    """
+    guard_outlets()
+    try:
+        with stopped_once():
+            try:
+                _run()
+            finally:
+                if sys.stdout is not None:
+                    sys.stdout.flush()  # while it can still be said that the disk is full
+    except KolinearError as error:
+        _refuse(str(error))
+    except OSError as error:  # a disk, a network drive: nothing that a traceback would help with
+        where = f"{error.filename}: " if error.filename else ""
+        _refuse(f"{where}{error.strerror or error}")
+    except KeyboardInterrupt:
+        print(INTERRUPTED_TEXT, file=sys.stderr)
+        raise SystemExit(INTERRUPTED) from None
+    except Exception as error:
+        _own_up(error)
+
+
+def _run() -> None:
+    """Run the command that the arguments name."""
+    with loading():
+        from sfm.cli.app import USAGE_ERROR, app
+    try:
+        code = app(prog_name="kolinear", standalone_mode=False)
+    except USAGE_ERROR as error:
+        if not sys.argv[1:]:  # which asks for the help, and is no mistake
+            error.show()
+            raise SystemExit(BAD_INPUT) from None
+        command = error.ctx.command_path if error.ctx else "kolinear"
+        _refuse(f"{error.format_message().rstrip()} (see {command} --help)".replace(". (see", " (see"))
+    if code == INTERRUPTED:  # which is what typer makes of Ctrl-C, and says nothing
+        raise KeyboardInterrupt
+    if isinstance(code, int) and code:
+        raise SystemExit(code)
+
+
+def _own_up(error: Exception) -> None:
+    """End with one line about what nobody has foreseen; not enough memory is something to put right."""
+    from sfm.faults import FAULT, is_fault, keep_traceback, told_of_error
+
+    told = told_of_error(error)
+    if not is_fault(error):
+        _refuse(told)
+    path = keep_traceback(error)
+    where = "its traceback cannot be written" if path is None else f"its traceback is in {path}"
+    _refuse(f"{told}; {where}", code=FAULT)
+
+
+def _refuse(message: str, *, code: int = BAD_INPUT) -> None:
+    """End with one line and an exit code."""
+    print(f"kolinear: {_printable(message)}", file=sys.stderr)
+    raise SystemExit(code) from None
+
+
+def _printable(text: str) -> str:
+    """Return a message on one line, without control characters that a file name may carry."""
+    return "".join(c if c.isprintable() else " " for c in text)
