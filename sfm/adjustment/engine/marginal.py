@@ -102,7 +102,9 @@ def marginal_of(adjustment: Adjustment, *, datum: Datum | None = None, cross: bo
         raise GeometryError("datum: with or without control is another adjustment, not an S-transformation")
     centroid = centroid_of(adjustment.network, adjustment.estimate)
     network, estimate = shifted(adjustment.network, adjustment.estimate, -centroid)
-    layout, state = unknowns_of(network, estimate, use_control=use_control)
+    layout, state = unknowns_of(
+        network, estimate, use_control=use_control, image_sigma_factor=adjustment.image_sigma_factor
+    )
     weighted = weighted_of(network, layout, use_control=use_control)
     weight = np.ascontiguousarray(adjustment.weights[layout.order])
     optimum = optimum_at(problem_of(layout, weighted, datum), state, weight)
