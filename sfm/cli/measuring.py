@@ -11,7 +11,7 @@ import typer
 from sfm.cli.starting import loading
 from sfm.errors import GeometryError, SurveyFileError
 from sfm.faults import working_on
-from sfm.orientation.resection.methods import METHODS
+from sfm.orientation.resection import METHODS
 
 if TYPE_CHECKING:
     from sfm.conventions import IntArray
