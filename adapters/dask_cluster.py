@@ -13,6 +13,7 @@ import signal
 import time
 import uuid
 from collections.abc import Iterable, Iterator
+from concurrent.futures import CancelledError
 from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from itertools import count
@@ -105,6 +106,7 @@ def local_engine(workers: int, *, memory_bytes: int | None = None) -> Iterator[D
             "MALLOC_ARENA_MAX": "2",
         },
         "distributed.comm.timeouts.connect": "60s",  # new workers compile and import on a busy computer
+        "distributed.deploy.lost-worker-timeout": "1h",  # nor is one that starts again for long given up
     }
     with dask.config.set(settings), ExitStack() as stack:
         scratch = stack.enter_context(TemporaryDirectory(prefix="kolinear-", ignore_cleanup_errors=True))
@@ -356,19 +358,24 @@ _HELD = _OneThread()  # libraries of this process
 
 
 def _event(key: str, future: Future) -> Event:
-    """Return how a piece of work ended, or raise what ends them all."""
-    if future.status == "finished":
+    """Return how a piece of work ended, or raise what ends them all.
+
+    A result that is lost with its worker before it is here is computed again, and may then fail.
+    """
+    try:
         return Done(key, future.result())
-    if future.status == "cancelled":
-        raise BackendError("the Dask scheduler is gone or has dropped the work; run again with --resume")
-    error = future.exception()
-    if isinstance(error, KilledWorker):
+    except CancelledError as error:
+        raise BackendError(
+            "the Dask scheduler is gone or has dropped the work; run again with --resume"
+        ) from error
+    except KilledWorker:
         return Lost(key, "worker processes died, out of memory or by a fault in a library")
-    if isinstance(error, KolinearError):
-        raise error
-    if isinstance(error, ImportError):
+    except KolinearError:
+        raise
+    except ImportError as error:
         raise BackendError(f"the workers of the cluster lack what Kolinear needs: {_line(error)}") from error
-    return Lost(key, f"it failed in its worker: {type(error).__name__}: {_line(error)}")
+    except Exception as error:
+        return Lost(key, f"it failed in its worker: {type(error).__name__}: {_line(error)}")
 
 
 def _line(error: BaseException | None) -> str:

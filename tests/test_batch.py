@@ -19,9 +19,10 @@ from urllib.request import urlopen
 
 import psutil
 import pytest
+from dask.distributed import KilledWorker
 from threadpoolctl import threadpool_info
 
-from adapters.dask_cluster import DaskEngine, _OneThread, fitting_workers, local_engine, remote_engine
+from adapters.dask_cluster import DaskEngine, _event, _OneThread, fitting_workers, local_engine, remote_engine
 from sfm.batch.pages import render_index
 from sfm.batch.run import calls_of, find_surveys, run_batch
 from sfm.batch.survey import SurveyJob, SurveyRow, reconstruct
@@ -412,6 +413,17 @@ def test_an_unforeseen_error_in_a_worker_ends_its_work_alone(two_workers: DaskEn
     assert events.pop("sound") == Done("sound", None)
     told = "it failed in its worker: ZeroDivisionError: nobody thought of it"
     assert events == {name: Lost(name, told) for name in ("faulty", "part")}
+
+
+def test_a_result_that_is_lost_with_its_worker_is_tried_again_and_not_the_end_of_the_batch() -> None:
+    class LostResult:
+        status = "finished"
+
+        def result(self) -> None:
+            raise KilledWorker("whole-1", None, 2)
+
+    event = _event("third", LostResult())
+    assert isinstance(event, Lost) and event.key == "third" and "worker processes died" in event.reason
 
 
 def test_a_batch_that_comes_to_nothing_leaves_no_folder(surveys: tuple[Path, ...], tmp_path: Path) -> None:
