@@ -64,7 +64,7 @@ class Growth:
     def tolerance(self) -> FloatArray:
         """Tolerance of every photograph, tangents, (m,)."""
         c = np.array([camera.c_px for camera in self.estimate.cameras])
-        return (self.tolerance_px / c)[self.network.camera]
+        return np.asarray((self.tolerance_px / c)[self.network.camera])
 
     def residuals_px(self) -> FloatArray:
         """Length of the reprojection residual of every image point, px, inf where undetermined, (k,)."""
