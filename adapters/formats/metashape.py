@@ -84,7 +84,7 @@ def read_metashape(path: Path) -> tuple[Network, Estimate]:
     seen = _locations(chunk, labels, images)
     index = {identifier: j for j, identifier in enumerate(labels)}
     network = Network(
-        tuple(node.attribute("label") for node in nodes),
+        tuple(node.name("label") for node in nodes),
         camera_index,
         tuple(labels.values()),
         ImagePoints(
@@ -185,7 +185,7 @@ def _camera(sensor: Node) -> Camera:
         raise node.error(f"f = {f:g} px, b1 = {p['b1']:g} px: f and f + b1 must be positive")
     centre = (np.array(size) - 1) / 2
     free = {child.tag for child in listed}
-    label = sensor.attributes.get("label", sensor.attribute("id"))
+    label = sensor.name("label" if "label" in sensor.attributes else "id")
     if p["k4"] == 0 and p["b2"] == 0:
         model = "opencv" if p["k3"] == 0 else "full_opencv"
         values = {"fx": f + p["b1"], "fy": f, "cx": centre[0] + p["cx"], "cy": centre[1] + p["cy"]}
@@ -290,7 +290,7 @@ def _markers(chunk: Node) -> tuple[dict[str, str], FloatArray, ObjectPoints]:
         identifier = node.attribute("id")
         if identifier in labels:
             raise node.error(f"marker id {identifier} stands twice")
-        labels[identifier] = node.attribute("label")
+        labels[identifier] = node.name("label")
         reference = node.maybe("reference")
         if reference is None or "x" not in reference.attributes:
             continue
