@@ -35,7 +35,7 @@ from adapters.formats.xml_lines import Node, read_xml
 from sfm.camera import Camera, camera_from_values
 from sfm.conventions import FloatArray
 from sfm.errors import OutputError, SurveyFileError
-from sfm.network import Estimate, ImagePoints, Network, ObjectPoints
+from sfm.network import Estimate, ImagePoints, Network, ObjectPoints, rows_of
 from sfm.similarity import Similarity
 
 HALF_PIXEL = 0.5  # Metashape's pixel coordinates minus ours, px
@@ -123,11 +123,12 @@ def write_metashape(path: Path, network: Network, estimate: Estimate) -> None:
         for j, C in zip(network.control.point, network.control.covariance, strict=True)
     }
     markers, locations = [], []
+    rows = rows_of(network.image_points.point, len(network.points))
     for j, name in enumerate(network.points):
         reference = _reference(estimate.points[j], sigma.get(j))
         markers.append(f'      <marker id="{j}" label={quoteattr(name)}>{reference}</marker>')
         locations.append(f'          <marker marker_id="{j}">')
-        for row in np.flatnonzero(network.image_points.point == j):
+        for row in rows[j]:
             x, y = (repr(float(v)) for v in network.image_points.xy[row] + HALF_PIXEL)
             camera = network.image_points.image[row]
             locations.append(f'            <location camera_id="{camera}" pinned="true" x="{x}" y="{y}"/>')
