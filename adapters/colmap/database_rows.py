@@ -78,6 +78,7 @@ def _opened(path: Path) -> Iterator[sqlite3.Connection]:
     try:
         database = sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro&immutable=1", uri=True)
         try:
+            database.text_factory = lambda text: text.decode("utf-8", "surrogateescape")
             left = iter(range(MAX_STEPS))
             database.set_progress_handler(lambda: next(left, None) is None, STEPS)
             database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, max(size, HEADER_BYTES))
