@@ -12,8 +12,8 @@ from sfm.conventions import MAD_TO_SIGMA, FloatArray
 from sfm.errors import GeometryError
 from sfm.network import Estimate, Network, empty_estimate, reduce_network, rows_of
 from sfm.orientation.intersection import intersect
-from sfm.orientation.resection.robust import fewest_fitting, resect_robust
-from sfm.orientation.start import Start, best_start
+from sfm.orientation.resection.ransac import fewest_fitting, resect_robust
+from sfm.orientation.starting_pair import Start, best_start
 from sfm.orientation.support import photograph_support
 
 FIRST_ADJUSTMENT = 4  # photographs
@@ -64,7 +64,7 @@ class Growth:
     def tolerance(self) -> FloatArray:
         """Tolerance of every photograph, tangents, (m,)."""
         c = np.array([camera.c_px for camera in self.estimate.cameras])
-        return (self.tolerance_px / c)[self.network.camera]
+        return np.asarray((self.tolerance_px / c)[self.network.camera])
 
     def residuals_px(self) -> FloatArray:
         """Length of the reprojection residual of every image point, px, inf where undetermined, (k,)."""

@@ -44,7 +44,8 @@ def photograph_support(
     all its other codes nobody else has seen. Outside the network nothing is expected of the others.
 
     Args:
-        network, estimate: m photographs, n points, k image points.
+        network: k image points of m photographs and n points.
+        estimate: the orientation that is judged.
         residuals_px: lengths, inf where undetermined, px, (k,).
         limit_px: largest residual of a fitting image point, px, (k,).
         fixed: points known from elsewhere than the photographs, (n,).
