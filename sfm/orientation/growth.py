@@ -10,7 +10,7 @@ import numpy as np
 from sfm.camera import Camera, project, tangents_from_pixel
 from sfm.conventions import MAD_TO_SIGMA, FloatArray
 from sfm.errors import GeometryError
-from sfm.network import Estimate, Network, empty_estimate, reduce_network
+from sfm.network import Estimate, Network, empty_estimate, reduce_network, rows_of
 from sfm.orientation.intersection import intersect
 from sfm.orientation.resection.ransac import fewest_fitting, resect_robust
 from sfm.orientation.starting_pair import Start, best_start
@@ -139,9 +139,9 @@ class Growth:
         seen = self.network.image_points
         known = self.estimate.determined[seen.point] & np.isfinite(uv).all(axis=1)
         residuals = self.residuals_px()
-        added = 0
+        of_image, added = rows_of(seen.image, len(position)), 0
         for i in images:
-            own = np.flatnonzero((seen.image == i) & known)
+            own = of_image[i][known[of_image[i]]]
             result = resect_robust(
                 uv[own],
                 self.estimate.points[seen.point[own]],
