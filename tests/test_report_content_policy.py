@@ -18,8 +18,9 @@ from sfm.comparison.random_network import Plan
 from sfm.comparison.significance import Result, compare_results
 from sfm.comparison.validation import SAME, Trial, Validation
 from sfm.pipeline import run_survey
-from sfm.report.content_policy import content_policy
 from sfm.report.differences import write_differences
+from sfm.report.findings.findings import findings_of
+from sfm.report.html.content_policy import content_policy
 from sfm.report.output import write_result
 from sfm.report.pages import page
 from sfm.report.validation import write_validation
@@ -79,7 +80,7 @@ def held_by(text: str) -> Held:
 
 def report_page(folder: Path) -> str:
     survey = read_survey(write_photograph_survey(folder / "survey", "report"))
-    return write_result(run_survey(survey), folder / "out").read_text(encoding="utf-8")
+    return write_result(findings_of(run_survey(survey)), folder / "out").read_text(encoding="utf-8")
 
 
 def index_page(folder: Path) -> str:

@@ -16,8 +16,8 @@ from sfm.adjustment.solve import adjust
 from sfm.errors import BackendError
 from sfm.network import Estimate, Network, ObjectPoints, ScaleBars
 from sfm.pipeline import adjust_survey
-from sfm.report.statistics import statistics_of
-from sfm.report.verdict import verdict_of
+from sfm.report.findings.findings import findings_of
+from sfm.report.findings.statistics import statistics_of
 from sfm.survey.comparison import OtherPrograms
 from sfm.survey.datum import contradiction, object_scale
 from sfm.survey.inputs.survey_file import read_survey
@@ -182,4 +182,4 @@ def test_a_survey_goes_on_where_a_scale_bar_does_not_fit(tmp_path: Path, bars: i
         assert result.warnings[0].startswith("the scale bars contradict one another")
         assert len(a.network.scale_bars) == 2
         assert not a.rejected[np.isin(a.network.image_points.point, [0, 1, 10, 11])].any()
-        assert verdict_of(result).level == "bad"
+        assert findings_of(result).verdict.level == "bad"
