@@ -12,6 +12,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from jinja2 import UndefinedError
 
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.result import Adjustment
@@ -23,8 +24,10 @@ from sfm.network import Network, ObjectPoints, ScaleBars
 from sfm.report.figures.overlays import USED, draw_photograph, overlay_names
 from sfm.report.figures.plots import all_plots, plan_axes
 from sfm.report.findings.findings import findings_of
+from sfm.report.findings.geometry import geometry_of
+from sfm.report.html.page import environment
 from sfm.report.html.report import report_page
-from sfm.report.numbers import finer_unit, significant, table, to_precision, with_exponent
+from sfm.report.numbers import finer_unit, significant, to_precision, with_exponent
 from sfm.report.output import WRITTEN, refuse_foreign_folder, write_result
 from sfm.report.tables.csv_files import write_tables
 from sfm.report.tables.summary import summary, write_summary
@@ -190,7 +193,7 @@ def test_points_as_ply(result: SurveyResult, tmp_path: Path) -> None:
 
 
 def test_image_rms_adds_up_to_that_of_the_network(adjustment: Adjustment) -> None:
-    rms, count = image_rms(adjustment)
+    rms, count = (geometry := geometry_of(adjustment)).image_rms_px, geometry.image_points
     assert count.sum() == (~adjustment.rejected).sum()
     assert np.sqrt((rms**2 * count).sum() / count.sum()) == pytest.approx(adjustment.rms_px, rel=1e-12)
 
@@ -219,7 +222,7 @@ class Tags(HTMLParser):
 
 
 def test_page_is_whole_escaped_and_self_contained(result: SurveyResult) -> None:
-    page = report_page(findings_of(result), all_plots(result.adjustment, result.unit), ())
+    page = report_page(findings_of(result), all_plots(findings_of(result)), ())
     tags = Tags()
     tags.feed(page)
     assert tags.open == []
@@ -232,7 +235,7 @@ def test_page_is_whole_escaped_and_self_contained(result: SurveyResult) -> None:
     for question in (
         "Did it work?",
         "How good is it?",
-        "What was thrown out, and why?",
+        "What was rejected, and why?",
         "Does the other adjuster agree?",
         "Where are my coordinates?",
     ):
@@ -384,10 +387,12 @@ def test_plan_of_an_upright_wall_is_seen_from_its_front() -> None:
 def test_plots_of_small_and_plain_results() -> None:
     network, truth = make_network(seed_of("plots"), images=3, points=12, noise_px=0.0, cameras=2, free=())
     names = tuple(f"$x_{k}^ä.jpg" for k in range(3))
-    plain: Network = replace(network, images=names)
-    plots = all_plots(adjust(plain, truth, datum=Datum("free")), "$m")
-    assert [stem for stem, _, _ in plots] == ["network", "residuals", "distribution", "photographs"]
-    assert all(data.startswith(b"\x89PNG") for _, _, data in plots)
+    bars = ScaleBars(np.array([0]), np.array([1]), np.array([1.0]), np.array([0.1]))
+    plain: Network = replace(network, images=names, scale_bars=bars)
+    a = adjust(plain, truth, datum=Datum("free"))
+    plots = all_plots(findings_of(SurveyResult("plots", "$m", 3, (), a, np.full(12, -1), None)))
+    assert [plot.stem for plot in plots] == ["network", "residuals", "distribution", "photographs"]
+    assert all(plot.png.startswith(b"\x89PNG") for plot in plots)
 
 
 @pytest.mark.parametrize(
@@ -414,7 +419,13 @@ def test_lengths_are_shown_in_a_unit_that_reads_well() -> None:
 
 
 def test_table_escapes_and_aligns() -> None:
-    text = table(("a", "b [px]"), [("<x>", "1.5"), ("y", "")])
+    template = environment().from_string(
+        '{% import "macros.html" as t %}{% call t.table(("a", ">b [px]")) %}'
+        "{% for row in rows %}{{ t.row(*row) }}{% endfor %}{% endcall %}"
+    )
+    text = template.render(rows=[("<x>", "1.5"), ("y", "")])
     assert "&lt;x&gt;" in text
+    with pytest.raises(UndefinedError, match="'rows' is undefined"):
+        template.render()
     assert "<th class=n>b [px]</th>" in text
     assert "<td class=n>1.5</td>" in text

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from sfm.report.section_geometry import MOST_BINS, binned
 
 from adapters.formats.photomodeler import read_photomodeler
 from sfm.adjustment.datum import Datum
@@ -18,6 +17,7 @@ from sfm.network import ObjectPoints
 from sfm.report.findings.findings import findings_of
 from sfm.report.findings.geometry import Geometry, geometry_of, hull_area, intersection_angles
 from sfm.report.html.report import report_page
+from sfm.report.phrases import MAX_BINS, points_by_rays
 from sfm.report.tables.csv_files import write_tables
 from sfm.report.tables.summary import summary
 from sfm.report.text.lines import WIDTH
@@ -137,9 +137,9 @@ def test_points_with_one_ray_each_have_no_angle() -> None:
 def test_many_numbers_of_rays_are_told_in_ranges() -> None:
     rays = np.repeat(np.arange(2, 60), np.arange(2, 60))
     none = np.zeros(0)
-    found = Geometry(rays, none, none, none, none, ())
-    bins = binned(found)
-    assert len(bins) <= MOST_BINS
+    found = Geometry(rays, none, none, none, none, (), rays)
+    bins = points_by_rays(found)
+    assert len(bins) <= MAX_BINS
     assert sum(n for _, n in bins) == len(rays)
     assert bins[0] == ("2-6", 2 + 3 + 4 + 5 + 6)
 

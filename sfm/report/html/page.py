@@ -28,7 +28,7 @@ def render(template: str, **context: Any) -> str:
         template: name of a template that extends `base.html`.
         context: what it asks for.
     """
-    return _environment().get_template(template).render(context)
+    return environment().get_template(template).render(context)
 
 
 def data_url(data: bytes, kind: str) -> str:
@@ -37,9 +37,10 @@ def data_url(data: bytes, kind: str) -> str:
 
 
 @cache
-def _environment() -> Environment:
+def environment() -> Environment:
+    """Return what the templates are rendered with: escaping, no undefined names, our filters and phrases."""
     style = files("sfm.report.html").joinpath("templates/report.css").read_text(encoding="utf-8")
-    environment = Environment(
+    made = Environment(
         loader=PackageLoader("sfm.report.html"),
         autoescape=True,
         undefined=StrictUndefined,
@@ -47,13 +48,13 @@ def _environment() -> Environment:
         lstrip_blocks=True,
         extensions=["jinja2.ext.do"],
     )
-    environment.filters |= FILTERS | {"data_url": data_url, "quoted": quote, "right": ">{}".format}
-    environment.tests |= {"numeric": lambda cell: is_number(str(cell)), "nan": math.isnan}
-    environment.globals |= PHRASES | {
+    made.filters |= FILTERS | {"data_url": data_url, "quoted": quote, "right": ">{}".format}
+    made.tests |= {"numeric": lambda cell: is_number(str(cell)), "nan": math.isnan}
+    made.globals |= PHRASES | {
         "finer_unit": finer_unit,
         "finer_unit_of": finer_unit_of,
         "strong": STRONG,
         "style": Markup(style),
         "policy": content_policy([style]),
     }
-    return environment
+    return made

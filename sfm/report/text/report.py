@@ -43,7 +43,7 @@ def text_report(findings: Findings) -> str:
 
 @cache
 def _environment() -> Environment:
-    environment = Environment(
+    made = Environment(
         loader=PackageLoader("sfm.report.text"),
         autoescape=False,  # plain text
         undefined=StrictUndefined,
@@ -53,9 +53,9 @@ def _environment() -> Environment:
         keep_trailing_newline=True,
         extensions=["jinja2.ext.do"],
     )
-    environment.filters |= FILTERS
-    environment.filters |= {one.__name__: one for one in (lines.columns, lines.facts, lines.wrap)}
-    environment.globals |= PHRASES | {
+    made.filters |= FILTERS
+    made.filters |= {one.__name__: one for one in (lines.columns, lines.facts, lines.wrap)}
+    made.globals |= PHRASES | {
         "finer_unit": finer_unit,
         "finer_unit_of": finer_unit_of,
         "heading": lines.heading,
@@ -63,4 +63,4 @@ def _environment() -> Environment:
         "strong": STRONG,
         "isnan": np.isnan,
     }
-    return environment
+    return made
