@@ -81,7 +81,6 @@ def run_survey(
         eccentricity=circles.eccentricity,
         no_circles=circles.no_circles,
         reject=survey.reject,
-        weight_factor=solution.weight_factor,
         orientation_correlations=orientation_correlations(solution.adjustment),
         seconds=tuple(StageTime(*one) for one in clock.seconds),
     )
@@ -110,7 +109,6 @@ def adjust_survey(
         control_check=solution.control_check,
         warnings=start.warnings + placed.warnings + solution.warnings + compared.failures,
         reject=survey.reject,
-        weight_factor=solution.weight_factor,
         orientation_correlations=orientation_correlations(solution.adjustment),
         seconds=tuple(StageTime(*one) for one in clock.seconds),
     )

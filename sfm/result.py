@@ -95,8 +95,6 @@ class SurveyResult:
     # orientation, the strong ones
     seconds: tuple[StageTime, ...] = field(default_factory=tuple)  # in the order of the stages
     reject: str = "tau"  # how the survey treats gross errors: tau | huber | tukey | none
-    weight_factor: float = 1.0  # by which the a priori sigmas of the image points were multiplied, from their
-    # own variance component, before the final adjustment; 1 where they were left as stated
 
     @property
     def has_scale(self) -> bool:

@@ -9,8 +9,8 @@ import pytest
 from scipy import stats
 from synthetic import make_network, seed_of
 
+from sfm.adjustment.covariance import change_datum, marginal_of
 from sfm.adjustment.datum import Datum
-from sfm.adjustment.engine.marginal import change_datum, marginal_of
 from sfm.adjustment.quality.statistics import (
     component_tests,
     correlations,
@@ -24,8 +24,9 @@ from sfm.adjustment.quality.statistics import (
 from sfm.adjustment.quality.variance_components import by_camera, by_kind, by_photograph, estimate_components
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
+from sfm.conventions import FloatArray
 from sfm.errors import GeometryError
-from sfm.network import ExteriorObservations, InteriorObservations, Network, ObjectPoints, ScaleBars
+from sfm.network import ExteriorObservations, InteriorObservations, ObjectPoints, ScaleBars
 
 FREE = Datum("free")
 
@@ -127,13 +128,14 @@ def test_weights_of_two_cameras_are_estimated() -> None:
     noise = np.array([0.05, 0.3])[group][:, None] * rng.standard_normal(k.xy.shape)
     network = replace(network, image_points=replace(k, xy=k.xy + noise))
 
-    def run(given: Network) -> Adjustment:
-        return adjust(given, truth, datum=FREE, reject="none")
+    def run(factor: FloatArray) -> Adjustment:
+        return adjust(network, truth, datum=FREE, reject="none", image_sigma_factor=factor)
 
-    a, factor, settled = estimate_components(run, network, group, ("one", "two"))
+    a, factor, settled = estimate_components(run, group, ("one", "two"))
     assert settled
     assert factor == pytest.approx([0.5, 3.0], rel=0.1)
-    assert by_camera(a).sigma0 == pytest.approx([1, 1], abs=2e-3)
+    np.testing.assert_array_equal(a.image_sigma_factor, factor[group])
+    assert by_camera(a).sigma0 / factor == pytest.approx([1, 1], abs=2e-3)
     assert a.sigma0 == pytest.approx(1, abs=2e-3)
 
 
@@ -225,17 +227,43 @@ def test_joint_covariance_of_a_subset_and_of_a_distance(plain: Adjustment) -> No
 
 
 def test_datum_changes_without_a_new_adjustment(plain: Adjustment) -> None:
+    """Adjusting anew from the adjusted coordinates takes no step, so that both are of the same state."""
+    index = np.array([1, 5, 9, 20])
     some = np.zeros(40, dtype=bool)
-    some[[1, 5, 9, 20]] = True
-    for datum in (Datum("minimal"), Datum("free", some), Datum("minimal", some)):
-        again = adjust(plain.network, plain.estimate, datum=datum, reject="none")
-        changed = change_datum(plain, datum)
-        assert changed.estimate is plain.estimate
-        size = np.abs(again.covariance.points).max()
-        assert np.abs(changed.covariance.points - again.covariance.points).max() < 1e-5 * size
-        size = np.abs(again.covariance.exterior).max()
-        assert np.abs(changed.covariance.exterior - again.covariance.exterior).max() < 1e-5 * size
+    some[index] = True
+    names = [plain.network.points[j] for j in index]
+    for points in (None, some, index, names):
+        for kind in ("minimal", "free"):
+            again = adjust(plain.network, plain.estimate, datum=Datum(kind, points), reject="none")
+            changed = change_datum(plain, Datum(kind, points))
+            assert changed.datum == again.datum == kind
+            np.testing.assert_array_equal(changed.datum_points, again.datum_points)
+            for a, b in zip(values_of(changed), values_of(again), strict=True):
+                assert np.abs(a - b).max() < 1e-9 * np.abs(b).max()
     back = change_datum(change_datum(plain, Datum("minimal")), FREE)
     assert np.allclose(back.covariance.points, plain.covariance.points, rtol=1e-5, atol=1e-18)
     with pytest.raises(GeometryError, match="another adjustment"):
         change_datum(plain, Datum("control"))
+
+
+def values_of(a: Adjustment) -> tuple[FloatArray, ...]:
+    """Return all that an adjustment says of its unknowns."""
+    interior = tuple(camera.parameters for camera in a.estimate.cameras)
+    Q = a.covariance
+    values = a.estimate.points, a.estimate.position, a.estimate.rotation, *interior
+    return *values, Q.points, Q.exterior, Q.points_limiting, *Q.interior
+
+
+@pytest.mark.parametrize(
+    ("points", "message"),
+    [
+        (["no such point"], "datum: point no such point is not in the network of 40 points"),
+        ([40, 41], "datum: point 40 is not in the network"),
+        (np.ones(3, dtype=bool), r"a mask of shape \(3,\), expected \(40,\)"),
+        ([], "expected names or indices"),
+        ([0.5], "points of type float64, expected names, indices or a mask"),
+    ],
+)
+def test_datum_points_that_are_not_there_are_told(plain: Adjustment, points: object, message: str) -> None:
+    with pytest.raises(GeometryError, match=message):
+        change_datum(plain, Datum("free", points))

@@ -95,7 +95,10 @@ def test_a_number_that_differs_is_told_with_its_place(folders: tuple[Path, Path]
     (new / "points.csv").write_text("\n".join([*lines[:3], ",".join(cells), *lines[4:]]) + "\n")
     code, told = compared(old, new)
     assert code == 1 and f"line 4 ({cells[0]}), Y:" in told and "1 of " in told.splitlines()[-1]
-    assert compared(old, new, "--relative", "1e-12")[0] == 0
+    (new / "points.ply").unlink()
+    shutil.copy(old / "points.ply", new)
+    code, told = compared(old, new, "--relative", "1e-12")
+    assert code == 0, told
     summary = json.loads((new / "summary.json").read_text())
     summary["statistics"]["redundancy_number"]["min"] *= 1 + 1e-9
     (new / "summary.json").write_text(json.dumps(summary))
@@ -109,7 +112,7 @@ def test_a_number_that_differs_is_told_with_its_place(folders: tuple[Path, Path]
         ("report.html", "How good is it?", "How precise is it?", 0),
         ("report.html", "20 object points", "21 object points", 1),
         ("report.txt", "Network and rank", "Rank", 0),
-        ("report.txt", "points          20", "points          22", 1),
+        ("report.txt", "5 of 5", "4 of 5", 1),
     ],
 )
 def test_words_may_differ_where_that_is_meant_but_numbers_may_not(

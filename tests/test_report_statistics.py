@@ -47,6 +47,17 @@ from tests.synthetic import make_network, seed_of
 NOISE_PX = 0.1
 
 
+def multiplied(adjustment: Adjustment, factor: float) -> Adjustment:
+    """Return the same adjustment of standard deviations stated that much smaller, and multiplied for it."""
+    seen = adjustment.network.image_points
+    stated = replace(seen, covariance=seen.covariance / factor**2)
+    return replace(
+        adjustment,
+        network=replace(adjustment.network, image_points=stated),
+        image_sigma_factor=np.full(len(seen), factor),
+    )
+
+
 def result_of(adjustment: Adjustment, **other: object) -> SurveyResult:
     return SurveyResult(
         "synthetic",
@@ -275,9 +286,9 @@ def test_a_sigma_that_is_far_too_large_is_told_with_what_it_would_be(
     )
     assert list(lines) == ([line] if told else [])
     # the same where the image points were weighted by their own component before
-    weighed = replace(network, image_points=replace(seen, covariance=seen.covariance * (ratio * guess) ** 2))
-    b = adjust(weighed, truth, datum=Datum("free"), reject="none")
-    assert findings_of(result_of(b, weight_factor=ratio)).verdict.remarks == lines
+    b = adjust(stated, truth, datum=Datum("free"), reject="none", image_sigma_factor=ratio)
+    assert b.sigma0 == pytest.approx(1)
+    assert findings_of(result_of(b)).verdict.remarks == lines
 
 
 @pytest.mark.parametrize(
@@ -311,11 +322,11 @@ def test_gross_errors_that_nobody_looked_for_are_counted(
 def test_weights_found_from_the_residuals_do_not_hide_sigma0(synthetic: tuple[Network, Estimate]) -> None:
     network, truth = synthetic
     a = adjust(network, truth, datum=Datum("free"))
-    assert findings_of(result_of(a, weight_factor=3.0)).verdict.level == "fair"
-    bad = findings_of(result_of(a, weight_factor=200.0)).verdict
+    assert findings_of(result_of(multiplied(a, 3.0))).verdict.level == "fair"
+    bad = findings_of(result_of(multiplied(a, 200.0))).verdict
     assert bad.level == "bad"
     assert "expected standard deviation of an image coordinate (0.0005" in bad.remarks[0]
-    text = summary(findings_of(result_of(a, weight_factor=3.0)))
+    text = summary(findings_of(result_of(multiplied(a, 3.0))))
     assert text["statistics"]["sigma0_ratio"] == pytest.approx(3 * a.sigma0)
 
 
@@ -350,7 +361,7 @@ def test_each_kind_is_tested_against_what_was_stated_in_the_same_words_everywher
     network, truth = synthetic
     a = adjust(with_bars(network, truth, (0.0, 1e-5), 1e-4), truth, datum=Datum("free"))
     for factor, passed in ((1.0, True), (0.8, False), (1.25, False)):
-        result = result_of(a, weight_factor=factor)
+        result = result_of(multiplied(a, factor))
         image, bars = statistics_of(result).global_tests
         assert image.passed is passed and bars.passed
         r = float(np.nansum(a.redundancy_numbers))

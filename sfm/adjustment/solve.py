@@ -12,14 +12,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sfm.adjustment.covariance import (
+from sfm.adjustment.datum import Datum
+from sfm.adjustment.engine.cofactors import (
     Cofactors,
     cofactors,
     hat_complement,
     marginal_covariance,
     without_held,
 )
-from sfm.adjustment.datum import Datum
 from sfm.adjustment.engine.collinearity import State, behind_camera, residuals
 from sfm.adjustment.engine.iterate import (
     METHODS,
@@ -66,6 +66,7 @@ def adjust(
     *,
     datum: Datum,
     sigma_px: float = 0.1,
+    image_sigma_factor: float | FloatArray = 1.0,
     reject: str = "tau",
     alpha: float = 0.001,
     method: str = "levenberg-marquardt",
@@ -84,6 +85,8 @@ def adjust(
         estimate: start values; NaN where a photograph or point has none (it is held out and named).
         datum: how position, attitude and scale are decided.
         sigma_px: standard deviation of unit weight, in which sigma0_px is told, px.
+        image_sigma_factor: on the stated standard deviations of the image points, of all or of each, (k,);
+            the network of the result keeps those stated.
         reject: "tau" (data snooping by Pope's test), "huber" or "tukey" (reweighting; Tukey's biweight,
             from Huber's start, rejects what it gives weight 0) or "none".
         alpha: probability with which the test of one image coordinate rejects a good one.
@@ -97,12 +100,15 @@ def adjust(
         GeometryError: nothing to adjust, an unknown option, or datum points that cannot carry the datum.
     """
     if reject not in REJECTS:
-        raise GeometryError(f"adjustment: reject '{reject}' is none of {', '.join(REJECTS)}")
+        raise GeometryError(f"adjustment: reject '{reject}', expected one of {', '.join(REJECTS)}")
     if method not in METHODS:
-        raise GeometryError(f"adjustment: method '{method}' is none of {', '.join(METHODS)}")
+        raise GeometryError(f"adjustment: method '{method}', expected one of {', '.join(METHODS)}")
     use_control = datum.kind == "control"
-    local = local_of(network, estimate, datum)
-    layout, state = unknowns_of(local.network, local.estimate, use_control=use_control)
+    local = local_of(network, estimate, datum.resolve(network))
+    factor = np.broadcast_to(np.asarray(image_sigma_factor, dtype=float), (len(network.image_points),))
+    layout, state = unknowns_of(
+        local.network, local.estimate, use_control=use_control, image_sigma_factor=factor
+    )
     weighted = weighted_of(local.network, layout, use_control=use_control)
     weight = start_weights(layout, state)
     with own_threads():
@@ -120,7 +126,8 @@ def adjust(
             run.tolerance = tolerance
             optimum = run.again(optimum, weight)
         Q = cofactors(optimum, layout, cross=redundancy_numbers) if covariance else None
-        return local.back(_result(local, run, optimum, weight, Q, sigma_px, SLOPES.get(reject)))
+        result = _result(local, run, optimum, weight, Q, sigma_px, SLOPES.get(reject))
+        return local.back(replace(result, image_sigma_factor=factor))
 
 
 @dataclass

@@ -27,7 +27,7 @@ def validate(
     with loading():
         from adapters.colmap.covariance import ColmapBackend
         from sfm.cli.console import drawn_progress
-        from sfm.comparison.validation import validate as validate_networks
+        from sfm.comparison.adjuster_validation import validate as validate_networks
         from sfm.report.pages import refuse_other_files
         from sfm.report.validation import FILES, in_words, largest, write_validation
 

@@ -12,8 +12,8 @@ from sfm.conventions import MAD_TO_SIGMA, FloatArray
 from sfm.errors import GeometryError
 from sfm.network import Estimate, Network, empty_estimate, reduce_network
 from sfm.orientation.intersection import intersect
-from sfm.orientation.resection.robust import fewest_fitting, resect_robust
-from sfm.orientation.start import Start, best_start
+from sfm.orientation.resection.ransac import fewest_fitting, resect_robust
+from sfm.orientation.starting_pair import Start, best_start
 from sfm.orientation.support import photograph_support
 
 FIRST_ADJUSTMENT = 4  # photographs

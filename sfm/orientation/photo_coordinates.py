@@ -13,7 +13,7 @@ import numpy as np
 
 from sfm.conventions import FloatArray
 from sfm.errors import GeometryError
-from sfm.orientation.resection.solution import tangents_of
+from sfm.orientation.resection.candidates import tangents_of
 
 EARTH_RADIUS_KM = 6372.2  # of the sphere of document 004
 INVERSE_STEPS = 100

@@ -22,7 +22,7 @@ from sfm.orientation.homography import (
     transfer_residuals,
 )
 from sfm.orientation.intersection import intersect
-from sfm.orientation.resection.solution import rotation_from_position
+from sfm.orientation.resection.candidates import rotation_from_position
 
 SPATIAL_POINTS = 6  # five points give up to ten solutions, the sixth tells them apart
 PLANAR_SHARE = 0.8  # share of the pairs that must lie on one homography for a planar solution

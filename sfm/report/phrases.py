@@ -41,11 +41,12 @@ def words_of_test(test: GlobalTest) -> str:
 
 def words_of_weights(result: SurveyResult) -> str:
     """Return which weights the image points have, and what follows for the tests; empty if as stated."""
-    if result.weight_factor == 1:
+    factor = result.adjustment.weight_factor
+    if factor == 1:
         return ""
     return (
         "Weights: the standard deviations of the image points were multiplied by "
-        f"{result.weight_factor:.3f}, from their own variance component, so that the other kinds of "
+        f"{factor:.3f}, from their own variance component, so that the other kinds of "
         "observation keep those stated for them. A test of all observations together would pass by "
         "construction; each kind is tested against the standard deviations stated for it."
     )

@@ -61,7 +61,6 @@ def run_textured_survey(
         control_check=solution.control_check,
         warnings=start.warnings + placed.warnings + solution.warnings + compared.failures,
         reject=survey.reject,
-        weight_factor=solution.weight_factor,
         orientation_correlations=orientation_correlations(solution.adjustment),
         seconds=tuple(StageTime(*one) for one in clock.seconds),
     )

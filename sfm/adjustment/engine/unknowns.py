@@ -14,6 +14,7 @@ import numpy as np
 
 from sfm.adjustment.engine.collinearity import Observations, State, behind_camera
 from sfm.adjustment.engine.ordering import by_point, whitening_of
+from sfm.adjustment.result import scaled_covariance
 from sfm.camera import Camera
 from sfm.conventions import BoolArray, FloatArray, IntArray, angles_from_rotation, rotation_from_vector
 from sfm.distortion.models import MAX_PARAMETERS
@@ -66,13 +67,20 @@ class Unknowns:
         return np.concatenate([self.exterior_free.ravel(), interior, self.point_free[self.kept].ravel()])
 
 
-def unknowns_of(network: Network, estimate: Estimate, *, use_control: bool) -> tuple[Unknowns, State]:
+def unknowns_of(
+    network: Network,
+    estimate: Estimate,
+    *,
+    use_control: bool,
+    image_sigma_factor: FloatArray | None = None,
+) -> tuple[Unknowns, State]:
     """Return the layout of the unknowns of a network and the state they start from.
 
     Args:
         network: what was measured.
         estimate: start values; photographs and points without (NaN) are held out.
         use_control: whether the control points of the network take part.
+        image_sigma_factor: on the stated standard deviations of each image point, 1 if not given, (k,).
 
     Raises:
         GeometryError: no image point can take part.
@@ -119,12 +127,15 @@ def unknowns_of(network: Network, estimate: Estimate, *, use_control: bool) -> t
     kept = np.unique(ends).astype(np.int64)
 
     order, rays_from = by_point(k, m, n)
+    covariance = k.covariance
+    if image_sigma_factor is not None:
+        covariance = scaled_covariance(covariance, image_sigma_factor)
     obs = Observations(
         start=rays_from,
         image=np.take(k.image, order).astype(np.int64, copy=False),
         point=np.repeat(np.arange(n), np.diff(rays_from)),
         xy=np.take(k.xy, order, axis=0).astype(float, copy=False),
-        whitening=whitening_of(k.covariance, order),
+        whitening=whitening_of(covariance, order),
         camera=np.ascontiguousarray(network.camera, dtype=np.int64),
         model=np.array([camera.index for camera in estimate.cameras], dtype=np.int64),
         frame=np.array([camera.frame for camera in estimate.cameras]),

@@ -183,8 +183,7 @@ def reliability(adjustment: Adjustment, *, alpha: float = ALPHA, power: float = 
     """
     delta0 = non_centrality(alpha, power)
     r = np.clip(adjustment.redundancy_numbers, 0, 1)
-    k = adjustment.network.image_points
-    sigma = np.sqrt(np.diagonal(k.covariance, axis1=1, axis2=2))
+    sigma = np.sqrt(np.diagonal(adjustment.image_covariance, axis1=1, axis2=2))
     controlled = r > UNCONTROLLED
     safe = np.where(controlled, r, 1.0)
     unknown = np.isnan(r)

@@ -11,7 +11,7 @@ al., Close-Range Photogrammetry (2020), sec. 2.4.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -20,7 +20,6 @@ from sfm.adjustment.engine.unknowns import unknowns_of
 from sfm.adjustment.result import Adjustment
 from sfm.camera import camera_families
 from sfm.conventions import FloatArray, IntArray
-from sfm.network import Network
 
 SETTLED = 1e-3  # relative change of a variance component at which its estimation ends
 MAX_ROUNDS = 20
@@ -34,7 +33,7 @@ class VarianceComponents:
     """Variance factors of groups of image points."""
 
     names: tuple[str, ...]
-    sigma0: FloatArray  # a posteriori over a priori standard deviation, (g,); NaN with too little redundancy
+    sigma0: FloatArray  # a posteriori over stated standard deviation, (g,); NaN with too little redundancy
     redundancy: FloatArray  # of each group, (g,)
     count: IntArray  # scalar observations of each group, (g,)
 
@@ -44,22 +43,36 @@ def variance_components(
 ) -> VarianceComponents:
     """Return the variance factor of each group of image points, v'Pv over the group's redundancy.
 
+    P is of the standard deviations stated, whatever factor they were given in the adjustment.
+
     Args:
         adjustment: the adjustment.
         group: group of each image point, shape (k,).
         names: names of the groups, g of them.
     """
+    covariance = adjustment.network.image_points.covariance
+    return _components(adjustment, covariance, group, names, few=FEW)
+
+
+def _components(
+    adjustment: Adjustment, covariance: FloatArray, group: IntArray, names: tuple[str, ...], *, few: float
+) -> VarianceComponents:
+    """Return the variance factor of each group of image points over these covariances, (k, 2, 2)."""
     g = len(names)
     used = ~adjustment.rejected
     v = adjustment.residuals[used]
-    P = np.linalg.inv(adjustment.network.image_points.covariance[used])
+    P = np.linalg.inv(covariance[used])
     vPv, redundancy = np.zeros(g), np.zeros(g)
     np.add.at(vPv, group[used], adjustment.weights[used] * np.einsum("ka,kab,kb->k", v, P, v))
     np.add.at(redundancy, group[used], adjustment.redundancy_numbers[used].sum(axis=1))
-    enough = redundancy > FEW
-    sigma0 = np.where(enough, np.sqrt(vPv / np.where(enough, redundancy, 1.0)), np.nan)
-    sigma0 = adjustment.inflation * sigma0
+    sigma0 = adjustment.inflation * _root_ratio(vPv, redundancy, few)
     return VarianceComponents(names, sigma0, redundancy, 2 * np.bincount(group[used], minlength=g))
+
+
+def _root_ratio(vPv: FloatArray, redundancy: FloatArray, few: float) -> FloatArray:
+    """Return sqrt(v'Pv / r) of groups, NaN where the redundancy is too little."""
+    enough = redundancy > few
+    return np.where(enough, np.sqrt(np.maximum(vPv, 0) / np.where(enough, redundancy, 1.0)), np.nan)
 
 
 def by_photograph(adjustment: Adjustment) -> VarianceComponents:
@@ -85,7 +98,8 @@ def by_kind(adjustment: Adjustment) -> VarianceComponents:
     use_control = a.datum == "control"
     layout, state = unknowns_of(network, a.estimate, use_control=use_control)
     w = weighted_of(network, layout, use_control=use_control)
-    image = variance_components(a, np.zeros(len(a.rejected), dtype=np.int64), (IMAGE_POINTS,))
+    whole = np.zeros(len(a.rejected), dtype=np.int64)
+    image = _components(a, network.image_points.covariance, whole, (IMAGE_POINTS,), few=FEW_OF_A_KIND)
     Q_points, Q_exterior = a.covariance.points[w.point], a.covariance.exterior[w.image]
     dX = state.points[w.point] - w.xyz
     e, _ = exterior_misclosure(w, state)
@@ -122,44 +136,41 @@ def by_kind(adjustment: Adjustment) -> VarianceComponents:
     taken = len(length) - float(a.bar_redundancy[layout.bars].sum())
     kinds.append(("scale bars", len(length), float(w.length_weight @ length**2), taken))
     seen = [kind for kind in kinds if kind[1]]
-    vPv = np.array([a.vPv - sum(kind[2] for kind in seen), *(kind[2] for kind in seen)])
-    own = np.array([float(image.redundancy[0]), *(kind[1] - kind[3] for kind in seen)])
-    enough = own > FEW_OF_A_KIND
-    sigma0 = np.where(enough, np.sqrt(np.maximum(vPv, 0) / np.where(enough, own, 1.0)), np.nan)
-    sigma0[0] *= a.inflation
-    names = (IMAGE_POINTS, *(kind[0] for kind in seen))
+    own = np.array([kind[1] - kind[3] for kind in seen])
+    sigma0 = _root_ratio(np.array([kind[2] for kind in seen]), own, FEW_OF_A_KIND)
     return VarianceComponents(
-        names, sigma0, own, np.array([int(image.count[0]), *(kind[1] for kind in seen)])
+        (IMAGE_POINTS, *(kind[0] for kind in seen)),
+        np.concatenate([image.sigma0, sigma0]),
+        np.concatenate([image.redundancy, own]),
+        np.concatenate([image.count, np.array([kind[1] for kind in seen], dtype=np.int64)]),
     )
 
 
 def estimate_components(
-    adjust_network: Callable[[Network], Adjustment], network: Network, group: IntArray, names: tuple[str, ...]
+    adjust_with: Callable[[FloatArray], Adjustment], group: IntArray, names: tuple[str, ...]
 ) -> tuple[Adjustment, FloatArray, bool]:
     """Return the adjustment with the weights of groups of image points estimated from the data.
 
-    The covariance of each group is multiplied by its variance factor and the network adjusted again,
-    until the factors of the image points that the last adjustment accepted are 1.
+    The standard deviations of each group are multiplied by the root of its variance factor and the network
+    adjusted again, until the factors of the image points that the last adjustment accepted are 1.
 
     Args:
-        adjust_network: adjusts a network from fixed start values and returns the adjustment.
-        network: what was measured.
+        adjust_with: adjusts a network from fixed start values with the factor on the stated standard
+            deviations of each image point, (k,), and returns the adjustment.
         group: group of each image point, shape (k,).
         names: names of the groups, g of them.
 
     Returns:
-        Last adjustment, standard deviation of each group over that given, shape (g,), and whether the
-        factors came to rest.
+        Last adjustment, standard deviation of each group over that stated, shape (g,), and whether the
+        factors converged.
     """
     factor = np.ones(len(names))
-    k = network.image_points
-    adjustment = adjust_network(network)
+    adjustment = adjust_with(factor[group])
     for _ in range(MAX_ROUNDS):
-        found = variance_components(adjustment, group, names).sigma0
+        found = _components(adjustment, adjustment.image_covariance, group, names, few=FEW).sigma0
         found = np.where(np.isfinite(found) & (found > 0), found, 1.0)
         if np.abs(found - 1).max() <= SETTLED:
             return adjustment, factor, True
         factor = factor * found
-        scaled = replace(k, covariance=k.covariance * factor[group][:, None, None] ** 2)
-        adjustment = adjust_network(replace(network, image_points=scaled))
+        adjustment = adjust_with(factor[group])
     return adjustment, factor, False

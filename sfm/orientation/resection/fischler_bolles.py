@@ -9,8 +9,8 @@ from numba import njit
 
 from sfm.conventions import FloatArray, IntArray
 from sfm.errors import GeometryError
-from sfm.orientation.resection.quartic import MAX_ROOTS, find_positive_roots
-from sfm.orientation.resection.solution import Solution, checked_points, ordered, solution_of
+from sfm.kernels.quartic import MAX_ROOTS, find_positive_roots
+from sfm.orientation.resection.candidates import Solution, checked_points, ordered, solution_of
 
 MAX_SOLUTIONS = 4
 WORK = MAX_ROOTS  # numbers of scratch space

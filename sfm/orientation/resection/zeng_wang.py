@@ -7,6 +7,8 @@ from numba import njit
 
 from sfm.conventions import FloatArray
 from sfm.errors import GeometryError
+from sfm.kernels.quartic import MAX_ROOTS, find_positive_roots
+from sfm.orientation.resection.candidates import Solution, checked_points, ordered, solution_of
 from sfm.orientation.resection.fischler_bolles import (
     MAX_SOLUTIONS,
     NEAR,
@@ -17,8 +19,6 @@ from sfm.orientation.resection.fischler_bolles import (
     rays_from_tangents,
     squared_sides,
 )
-from sfm.orientation.resection.quartic import MAX_ROOTS, find_positive_roots
-from sfm.orientation.resection.solution import Solution, checked_points, ordered, solution_of
 
 MIN_POINTS = 3
 

@@ -94,13 +94,13 @@ class CheckedControl:
 def sigma0_of(result: SurveyResult) -> Sigma0:
     """Return sigma0 of all observations, and of the image points by themselves.
 
-    The latter is by the variance component of the image points; where they were weighted anew by it, that
-    factor is put back in. Without redundancy of their own it is sigma0 of all observations.
+    The latter is by the variance component of the image points; without redundancy of their own it is sigma0
+    of all observations.
     """
     a = result.adjustment
     own = variance_components(a, np.zeros(len(a.rejected), dtype=np.int64), (IMAGE_POINTS,)).sigma0[0]
-    ratio = float((own if np.isfinite(own) else a.sigma0) * result.weight_factor)
-    return Sigma0(a.sigma0_px, ratio, a.a_priori_px / result.weight_factor)
+    ratio = float(own if np.isfinite(own) else a.sigma0_px / a.stated_px)
+    return Sigma0(a.sigma0_px, ratio, a.stated_px)
 
 
 def longest_residual(adjustment: Adjustment) -> LongestResidual:
@@ -114,7 +114,7 @@ def longest_residual(adjustment: Adjustment) -> LongestResidual:
     if not len(used):
         return LongestResidual("", "", 0.0, 0.0, 1.0)
     v = adjustment.residuals[used]
-    P = np.linalg.inv(seen.covariance[used])
+    P = np.linalg.inv(adjustment.image_covariance[used])
     length = np.sqrt(np.einsum("ka,kab,kb->k", v, P, v))
     if len(adjustment.weights):
         length = length * np.sqrt(adjustment.weights[used])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -22,7 +22,6 @@ from sfm.adjustment.quality.statistics import (
     w_test,
 )
 from sfm.adjustment.quality.variance_components import (
-    IMAGE_POINTS,
     VarianceComponents,
     by_camera,
     by_kind,
@@ -84,8 +83,6 @@ def statistics_of(result: SurveyResult) -> Statistics:
     """
     adjustment = result.adjustment
     kinds = by_kind(adjustment)
-    factor = np.where(np.array(kinds.names) == IMAGE_POINTS, result.weight_factor, 1.0)
-    kinds = replace(kinds, sigma0=factor * kinds.sigma0)
     found, w, tau, pairs = (
         reliability(adjustment),
         w_test(adjustment),
@@ -113,8 +110,8 @@ def statistics_of(result: SurveyResult) -> Statistics:
         redundancy_of_image_points=float(np.nansum(adjustment.redundancy_numbers)),
         redundancy_sum=float(kinds.redundancy.sum()),
         kinds=kinds,
-        cameras=_stated(by_camera(adjustment), result),
-        photographs=_stated(by_photograph(adjustment), result),
+        cameras=by_camera(adjustment),
+        photographs=by_photograph(adjustment),
         significance=significance(adjustment),
         correlations=pairs,
         camera_correlations=tuple(pair for pair in pairs if pair.first in of_cameras),
@@ -127,8 +124,3 @@ def spread(values: FloatArray) -> Spread:
     if not len(known):
         return Spread(np.nan, np.nan, np.nan, np.nan)
     return Spread(float(known.min()), float(np.nanmean(values)), float(np.median(known)), float(known.max()))
-
-
-def _stated(image_points: VarianceComponents, result: SurveyResult) -> VarianceComponents:
-    """Return components of image points over the standard deviations stated, not over those adjusted with."""
-    return replace(image_points, sigma0=result.weight_factor * image_points.sigma0)

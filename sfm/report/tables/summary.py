@@ -109,7 +109,7 @@ def _statistics(findings: Findings) -> dict[str, Any]:
         "sigma0_ratio": or_none(sigma0.ratio),
         "image_points_px": or_none(sigma0.image_points_px),
         "stated_px": or_none(sigma0.stated_px),
-        "weight_factor": result.weight_factor,
+        "weight_factor": result.adjustment.weight_factor,
         "weights": words_of_weights(result),
         "global_tests": [
             {

@@ -12,7 +12,7 @@ from sfm.network import Network
 from sfm.orientation.homography import PLANAR_POINTS
 from sfm.orientation.intersection import intersect
 from sfm.orientation.relative import RelativeOrientation, model_points, relative_orientations
-from sfm.orientation.resection.robust import resect_robust
+from sfm.orientation.resection.ransac import resect_robust
 
 MAX_PAIRS = 60  # pairs whose solutions are tried on the other photographs
 MIN_MEDIAN_ANGLE_DEG = 5.0  # median ray angle of a pair that is worth starting from
