@@ -26,7 +26,7 @@ from sfm.report.output import write_result
 from sfm.result import SurveyResult
 from tests.synthetic import make_network, seed_of
 
-SCRIPT = Path(__file__).resolve().parents[1] / "benchmarks" / "compare_results.py"
+SCRIPT = Path(__file__).resolve().parent / "compare_results.py"
 COMPUTED = (
     *((checks, name) for name in ("variance_components",)),
     *((statistics, name) for name in ("by_kind", "by_camera", "by_photograph", "w_test", "tau_test")),

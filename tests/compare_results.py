@@ -1,6 +1,6 @@
 """Say whether two result folders are the same: tables, summary, reports, pictures, and what differs.
 
-    python benchmarks/compare_results.py OLD NEW [--relative 1e-12] [--wording]
+    python tests/compare_results.py OLD NEW [--relative 1e-12] [--wording]
 
 Numbers are the same if they are equal to the last bit, or within the relative difference that is allowed.
 Times and logs are not compared: they differ from run to run. Exit code 0 if the results are the same, 1 if
