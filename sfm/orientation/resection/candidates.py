@@ -36,7 +36,8 @@ def solution_of(
     """Return an exterior orientation with its residuals at the given points.
 
     Args:
-        position, rotation: X0 and R, shapes (3,) and (3, 3).
+        position: projection centre X0, shape (3,), object unit.
+        rotation: R, image to object axes, shape (3, 3).
         tangents: u = -U/W, v = -V/W of the measured rays, shape (n, 2).
         points: object points, shape (n, 3), object unit.
     """
