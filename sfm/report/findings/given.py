@@ -1,5 +1,4 @@
-"""Residuals of what was given with a standard deviation: control, scale bars, interior and exterior
-orientation.
+"""Residuals of what was given with a standard deviation: control, bars, interior and exterior orientation.
 
 Each is judged by Baarda's w, its residual over the standard deviation of that residual, sigma sqrt(r) with
 the standard deviation stated for it and its redundancy number r. A value with r = 0 is met exactly whatever
