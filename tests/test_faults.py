@@ -23,7 +23,7 @@ from sfm.files.folder_lock import locked, owner_of
 from sfm.files.whole_files import remove_leftovers
 from sfm.report.log import SurveyLog, read_log
 from sfm.survey.target_store import TargetStore, target_key
-from sfm.targets.codes.rings import code_family
+from sfm.targets.codes.families import code_family
 from sfm.targets.detect import Targets, find_targets
 from tests.engines import points_of
 from tests.surveys import pictures, write_observed_survey, write_photograph_survey

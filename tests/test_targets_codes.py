@@ -10,16 +10,9 @@ import pytest
 
 from sfm.conventions import AnyArray, FloatArray
 from sfm.errors import SurveyFileError
-from sfm.targets.codes.rings import (
-    UNCODED,
-    UNREADABLE,
-    CodeFamily,
-    code_family,
-    read_code_table,
-    read_codes,
-    ring_patterns,
-    smallest_rotation,
-)
+from sfm.targets.codes.families import code_family
+from sfm.targets.codes.ring_reading import UNCODED, UNREADABLE, read_codes
+from sfm.targets.codes.rings import CodeFamily, read_code_table, ring_patterns, smallest_rotation
 from sfm.targets.measure import shape_from_axes
 
 PUBLISHED = Path(__file__).parents[1].parent / "shared" / "data" / "retro-panel"

@@ -27,7 +27,9 @@ from sfm.rendering.scene import (
     join_marks,
     rectangles,
 )
-from sfm.targets.codes.rings import CodeFamily, code_family
+from sfm.targets.codes.families import code_family
+from sfm.targets.codes.rings import CodeFamily
+from sfm.targets.codes.tags import TagFamily
 
 Two = Annotated[tuple[float, float], Field(strict=False)]
 Three = Annotated[tuple[float, float, float], Field(strict=False)]
@@ -169,6 +171,8 @@ def read_scene(path: Path) -> Staging:
         raise SurveyFileError(f"{path}: {'.'.join(map(str, first['loc']))}: {first['msg']}") from error
     faces = _faces(file.face)
     family = code_family(file.scene.codes)
+    if isinstance(family, TagFamily):
+        raise SurveyFileError(f"{path}: codes = '{family.name}', expected rings or arcs")
     rng = np.random.default_rng(file.scene.seed)
     marks: list[Marks] = []
     targets: list[tuple[int, float, float, float, int]] = []

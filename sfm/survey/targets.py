@@ -18,8 +18,8 @@ from sfm.survey.inputs.start import PhotographList
 from sfm.survey.inputs.survey_file import Survey
 from sfm.survey.photographs import each_photograph
 from sfm.survey.target_store import TargetStore, target_key
+from sfm.targets.codes.families import Family, code_family
 from sfm.targets.codes.rings import CodeFamily
-from sfm.targets.codes.tags import TagFamily, target_family
 from sfm.targets.detect import Targets, find_targets
 
 
@@ -97,20 +97,20 @@ def measure_photographs(
     )
 
 
-def survey_family(survey: Survey) -> CodeFamily | TagFamily | None:
+def survey_family(survey: Survey) -> Family | None:
     """Return the codes of a survey, rings with the radii that it states, None where targets have none.
 
     Raises:
         SurveyFileError: the code table is unreadable.
     """
-    family = target_family(survey.codes)
+    family = code_family(survey.codes)
     if survey.targets.ring_radii is not None and isinstance(family, CodeFamily):
         return replace(family, inner=survey.targets.ring_radii[0], outer=survey.targets.ring_radii[1])
     return family
 
 
 def _read_and_measure(
-    path: Path, settings: TargetSettings, family: CodeFamily | TagFamily | None, store: TargetStore | None
+    path: Path, settings: TargetSettings, family: Family | None, store: TargetStore | None
 ) -> tuple[Metadata, Targets]:
     targets, _ = measure_photograph(path, settings, family, store)  # says best what is wrong with a file
     return read_metadata(path), targets
@@ -119,7 +119,7 @@ def _read_and_measure(
 def measure_photograph(
     path: Path,
     settings: TargetSettings,
-    family: CodeFamily | TagFamily | None,
+    family: Family | None,
     store: TargetStore | None = None,
 ) -> tuple[Targets, bool]:
     """Return the targets of one photograph and whether they came from the store.

@@ -12,6 +12,7 @@ Multiple View Geometry, sec. 2.2.3 (dual conics) and 2.3.1 (their transformation
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -144,10 +145,15 @@ def _misfit(
 def _shift(views: CircleViews, normal: FloatArray, log_radius: FloatArray) -> FloatArray:
     """Return the eccentricity, px, (k, 2)."""
     m, _, centre = _ellipses(views, normal, log_radius)
-    return np.einsum("kab,kb->ka", views.pixel_jacobian, m - centre)
+    return np.asarray(np.einsum("kab,kb->ka", views.pixel_jacobian, m - centre))
 
 
-def _derivatives(function, normal: FloatArray, axes: FloatArray, log_radius: FloatArray) -> FloatArray:  # type: ignore[no-untyped-def]
+def _derivatives(
+    function: Callable[[FloatArray, FloatArray], FloatArray],
+    normal: FloatArray,
+    axes: FloatArray,
+    log_radius: FloatArray,
+) -> FloatArray:
     """Return d function / d (two tilts, ln radius) by central differences, (k, rows, 3)."""
     columns = []
     for j in range(3):
