@@ -25,7 +25,7 @@ from sfm.camera import Camera, project, tangents_from_pixel
 from sfm.conventions import AnyArray, FloatArray, IntArray, angles_from_rotation
 from sfm.errors import GeometryError, KolinearError, OutputError
 from sfm.files.plain_text import csv_text
-from sfm.rendering.area import fill_face, paint_mark
+from sfm.rendering.area import Lamp, fill_face, paint_mark
 from sfm.rendering.painting_order import painting_order
 from sfm.rendering.scene import ARC, DISC, UNCODED, Optics, Scene
 from sfm.rendering.scene_file import Staging, read_scene
@@ -88,9 +88,11 @@ def render_photographs(
     """Photograph a scene from several stations side by side; each has its own noise, given by the seed.
 
     Args:
-        scene, camera, optics: as in `render_photograph`.
+        scene: what is photographed.
+        camera: interior orientation, any distortion model.
         positions: projection centres, (m, 3), object unit.
         rotations: R of each photograph, (m, 3, 3).
+        optics: blur, vignetting, exposure, noise and depth of the photographs.
         seed: of the noise.
         threads: photographs rendered at a time.
 
@@ -135,7 +137,8 @@ def _expose(light: FloatArray, optics: Optics, rng: np.random.Generator) -> AnyA
     sigma = np.sqrt(optics.noise**2 + optics.shot_noise**2 * np.clip(signal, 0, None))
     signal += sigma * rng.standard_normal(signal.shape, dtype=np.float32)
     full = 2**optics.bits - 1
-    return np.clip(np.rint(signal * full), 0, full).astype(np.uint8 if optics.bits == 8 else np.uint16)
+    intensities = np.clip(np.rint(signal * full), 0, full)
+    return np.asarray(intensities.astype(np.uint8 if optics.bits == 8 else np.uint16))
 
 
 def _paint_face(
@@ -162,9 +165,9 @@ def _paint_face(
     value = np.empty((box[1] - box[0], box[3] - box[2]), dtype=np.float32)
     cover = np.empty_like(value)
     rectangle = np.array([*faces.half[face], 0.0, 0.0])
-    grain = (faces.value[face], faces.texture[face], faces.grain[face], face)
     lamp = _lamp(scene, face)
-    fill_face(value, cover, box, rays, H, rectangle, *grain, lamp, n)
+    surface = faces.value[face], faces.texture[face], faces.grain[face]
+    fill_face(value, cover, box, rays, H, rectangle, *surface, face, lamp, n)
     for k in np.flatnonzero(marks.face == face):
         shape, kind = marks.shape[k], int(marks.kind[k])
         reach = shape[0] if kind == DISC else shape[1] if kind == ARC else math.hypot(shape[0], shape[1])
@@ -198,13 +201,14 @@ def _window(xy: FloatArray, shape: tuple[int, ...], n: int) -> IntArray:
     return np.array([low[1], high[1], low[0], high[0]])
 
 
-def _lamp(scene: Scene, face: int) -> FloatArray:
-    """Return plane coordinates and height of the lamp over a face, its squared reach, ambient light, (5,)."""
+def _lamp(scene: Scene, face: int) -> Lamp:
+    """Return the light over a face."""
     if scene.light is None:
-        return np.array([0.0, 0.0, 1.0, 0.0, 1.0])
+        return Lamp(0.0, 0.0, 1.0, 0.0, 1.0)
     away = scene.light.position - scene.faces.centre[face]
+    a, b = scene.faces.axes[face] @ away
     height = scene.faces.normals()[face] @ away
-    return np.array([*(scene.faces.axes[face] @ away), height, scene.light.reach**2, scene.light.ambient])
+    return Lamp(float(a), float(b), float(height), float(scene.light.reach) ** 2, float(scene.light.ambient))
 
 
 def _plane_from_ray(scene: Scene, face: int, position: FloatArray, rotation: FloatArray) -> FloatArray:
