@@ -205,7 +205,7 @@ def interpolate(
 
 @compiled
 def area_inside(kind: int, cell: Cell, a0: float, b0: float, shape: FloatArray) -> float:
-    """Return the part of a cell inside a mark, 0 to 1; straight edges in each of PARTS^2 squares are exact."""
+    """Return the part of a cell inside a mark, 0 to 1, exact for straight edges in PARTS^2 parts of it."""
     a, b = cell.a - a0, cell.b - b0
     f, fa, fb = inside(kind, a, b, shape)
     gc, gr = fa * cell.a_column + fb * cell.b_column, fa * cell.a_row + fb * cell.b_row
