@@ -29,7 +29,7 @@ from sfm.rendering.area import Lamp, fill_face, paint_mark
 from sfm.rendering.painting_order import painting_order
 from sfm.rendering.scene import ARC, DISC, UNCODED, Optics, Scene
 from sfm.rendering.scene_file import Staging, read_scene
-from sfm.rendering.visibility import TargetPictures, picture_targets
+from sfm.rendering.visibility import ProjectedTargets, project_targets
 
 
 def render_photograph(
@@ -41,7 +41,7 @@ def render_photograph(
     optics: Optics,
     rng: np.random.Generator,
     rays: FloatArray | None = None,
-) -> tuple[AnyArray, TargetPictures]:
+) -> tuple[AnyArray, ProjectedTargets]:
     """Photograph a scene.
 
     Args:
@@ -72,7 +72,7 @@ def render_photograph(
         reach = 2 * math.ceil(5 * sigma) + 1
         cv2.GaussianBlur(fine, (reach, reach), sigma, dst=fine, borderType=cv2.BORDER_REPLICATE)
     light = fine.reshape(height, n, width, n).mean(axis=(1, 3), dtype=np.float32)
-    return _expose(light, optics, rng), picture_targets(scene, camera, position, rotation)
+    return _expose(light, optics, rng), project_targets(scene, camera, position, rotation)
 
 
 def render_photographs(
@@ -84,7 +84,7 @@ def render_photographs(
     optics: Optics,
     seed: int,
     threads: int = 2,
-) -> tuple[list[AnyArray], list[TargetPictures]]:
+) -> tuple[list[AnyArray], list[ProjectedTargets]]:
     """Photograph a scene from several stations side by side; each has its own noise, given by the seed.
 
     Args:
@@ -102,7 +102,7 @@ def render_photographs(
     rays = corner_rays(camera)
     sources = np.random.default_rng(seed).spawn(len(positions))
 
-    def one(i: int) -> tuple[AnyArray, TargetPictures]:
+    def one(i: int) -> tuple[AnyArray, ProjectedTargets]:
         return render_photograph(
             scene, camera, positions[i], rotations[i], optics=optics, rng=sources[i], rays=rays
         )
@@ -179,7 +179,7 @@ def _paint_face(
     part += cover * (value - part)
 
 
-# A square of half length 1, points along its sides so that its picture is bounded under distortion too.
+# A square of half length 1, points along its sides so that its image is bounded under distortion too.
 _SIDE = np.linspace(-1, 1, 9)[:-1]
 SQUARE = np.concatenate(
     [
@@ -231,14 +231,14 @@ def write_photographs(staging: Staging, folder: Path) -> None:
     Args:
         staging: result of `read_scene`.
         folder: where the photographs go, with truth_points.csv (targets at the object), truth_images.csv
-            (exterior orientation) and truth_image_points.csv (pictures of the circles' centres and the
+            (exterior orientation) and truth_image_points.csv (images of the circles' centres and the
             centres of their outlines, where the whole target is seen).
 
     Raises:
         OutputError: a file cannot be written.
     """
     scene = staging.scene
-    photographs, pictures = render_photographs(
+    photographs, projected = render_photographs(
         scene, staging.camera, staging.positions, staging.rotations, optics=staging.optics, seed=staging.seed
     )
     places = scene.faces.place(scene.targets.face, scene.targets.centre)
@@ -267,9 +267,9 @@ def write_photographs(staging: Staging, folder: Path) -> None:
                 Path(part) / "truth_image_points.csv",
                 ("image", "target", "x_px", "y_px", "outline_x_px", "outline_y_px", "diameter_px"),
                 [
-                    (image, names[k], *picture.centre[k], *picture.outline_centre[k], picture.diameter[k])
-                    for image, picture in zip(staging.names, pictures, strict=True)
-                    for k in np.flatnonzero(picture.visible)
+                    (image, names[k], *targets.centre[k], *targets.outline_centre[k], targets.diameter[k])
+                    for image, targets in zip(staging.names, projected, strict=True)
+                    for k in np.flatnonzero(targets.visible)
                 ],
             )
             for file in sorted(Path(part).iterdir()):
