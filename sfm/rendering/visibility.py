@@ -47,10 +47,9 @@ def project_targets(
         [_hidden(scene, position, points, own) for points, own in zip(seen, targets.face, strict=True)],
         dtype=bool,
     )
-    span = np.linalg.norm(outline_px - np.roll(outline_px, OUTLINE // 2, axis=1), axis=2).max(
-        axis=1, initial=0.0
-    )
-    return ProjectedTargets(centre, _centre_of_area(outline_px), span, inside & front & ~hidden)
+    across = np.linalg.norm(outline_px - np.roll(outline_px, OUTLINE // 2, axis=1), axis=2)
+    diameter = across.max(axis=1, initial=0.0)
+    return ProjectedTargets(centre, _centre_of_area(outline_px), diameter, inside & front & ~hidden)
 
 
 def _hidden(scene: Scene, position: FloatArray, points: FloatArray, own: int) -> bool:
