@@ -9,7 +9,11 @@ Source: COLMAP 4.2 documentation, "Database Format".
 
 from __future__ import annotations
 
+import shutil
 import sqlite3
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from itertools import combinations
 from pathlib import Path
 from typing import Any
@@ -68,10 +72,9 @@ def read_database(path: Path) -> tuple[Network, tuple[Camera, ...]]:
         SurveyFileError: not a readable database.
     """
     pycolmap = load_pycolmap()
-    _check_database(path)
-    with quiet(pycolmap):
+    with quiet(pycolmap), _checked_copy(Path(path)) as copy:
         try:
-            database = pycolmap.Database.open(str(path))
+            database = pycolmap.Database.open(str(copy))
             found = sorted(database.read_all_cameras(), key=lambda camera: camera.camera_id)
             images = sorted(database.read_all_images(), key=lambda image: image.image_id)
             keypoints = [database.read_keypoints(image.image_id)[:, :2] for image in images]
@@ -109,8 +112,9 @@ def read_database(path: Path) -> tuple[Network, tuple[Camera, ...]]:
     return network, tuple(camera_of(camera) for camera in found)
 
 
-def _check_database(path: Path) -> None:
-    """Refuse what is no whole COLMAP database, before COLMAP opens it.
+@contextmanager
+def _checked_copy(path: Path) -> Iterator[Path]:
+    """Give a copy of a whole COLMAP database: whoever opens one writes into it, and into files beside it.
 
     Source: sqlite.org/fileformat.html, sec. 1.3, for the header.
     """
@@ -132,8 +136,23 @@ def _check_database(path: Path) -> None:
         raise SurveyFileError(
             f"{path}: the file is cut off, it has {size} of the {whole} bytes that its header says"
         )
+    with tempfile.TemporaryDirectory(prefix="kolinear-database-") as folder:
+        copy = Path(folder) / "copy.db"
+        try:
+            shutil.copyfile(path, copy)
+            log = path.with_name(f"{path.name}-wal")  # what SQLite has not yet taken over
+            if log.is_file() and log.stat().st_size <= MAX_TABLE_BYTES:
+                shutil.copyfile(log, f"{copy}-wal")
+        except OSError as error:
+            raise SurveyFileError(f"{path}: cannot be read ({error.strerror})") from error
+        _check_tables(copy, path)
+        yield copy
+
+
+def _check_tables(copy: Path, path: Path) -> None:
+    """Refuse the copy of a database that is damaged or not COLMAP's."""
     try:
-        database = sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro", uri=True)
+        database = sqlite3.connect(copy)
         try:
             damage = database.execute("PRAGMA quick_check(1)").fetchone()[0]
             tables = {row[0] for row in database.execute("SELECT name FROM sqlite_master")}

@@ -22,7 +22,7 @@ from sfm.errors import OutputError
 from sfm.network import Network, ObjectPoints, ScaleBars
 from sfm.report.html import render_html
 from sfm.report.markup import finer_unit, significant, table, to_precision, with_exponent
-from sfm.report.output import WRITTEN, refuse_foreign_folder, write_result
+from sfm.report.output import WRITTEN, write_result
 from sfm.report.overlays import USED, draw_photograph, overlay_names
 from sfm.report.plots import all_plots, plan_axes
 from sfm.report.result import ControlCheck, FailedImage, PhotographTargets, StageTime, SurveyResult
@@ -32,6 +32,7 @@ from sfm.report.text import WIDTH, text_report
 from sfm.report.verdict import verdict_of
 from sfm.survey.tables import read_exterior, read_image_points, read_points
 from sfm.targets.flags import Flag
+from sfm.whole_files import refuse_foreign_folder
 from tests.synthetic import make_network, seed_of
 
 EVIL = "<script>alert('x')</script>&\"é€"
@@ -348,7 +349,7 @@ def test_other_peoples_folders_are_not_touched(tmp_path: Path) -> None:
     with pytest.raises(OutputError, match="the folder holds 'file'; --out needs a new or empty folder"):
         refuse_foreign_folder(tmp_path)
     (tmp_path / "file").rename(tmp_path / "summary.json")
-    with pytest.raises(OutputError, match=r"holds no summary.json of an earlier result"):
+    with pytest.raises(OutputError, match=r"holds 'summary.json'; --out needs"):
         refuse_foreign_folder(tmp_path)
 
 

@@ -36,10 +36,12 @@ def refine(
         from adapters.colmap_model import read_model, write_model
         from sfm.commands.console import drawn_progress
         from sfm.survey.refine import refine_model, refinement_text
-        from sfm.whole_files import whole_folder
+        from sfm.whole_files import refuse_links, whole_folder
 
-    if out is not None and out.exists():
-        raise OutputError(f"{out}: exists already, the refined model needs a new folder")
+    if out is not None:
+        refuse_links(out)
+        if out.exists():
+            raise OutputError(f"{out}: exists already, the refined model needs a new folder")
     network, estimate = read_model(model)
     with drawn_progress() as progress:
         found = refine_model(

@@ -30,6 +30,7 @@ from sfm.targets.painting_order import painting_order
 from sfm.targets.picture import TargetPictures, picture_targets
 from sfm.targets.scene import ARC, DISC, UNCODED, Optics, Scene
 from sfm.targets.scene_file import Staging, read_scene
+from sfm.whole_files import make_folder
 
 
 def render_photograph(
@@ -242,7 +243,7 @@ def write_photographs(staging: Staging, folder: Path) -> None:
     names = [f"t{k + 1:03d}" if code[k] == UNCODED else str(code[k]) for k in range(len(code))]
     angles = np.degrees(angles_from_rotation(staging.rotations))
     try:
-        folder.mkdir(parents=True, exist_ok=True)
+        make_folder(folder)
         with tempfile.TemporaryDirectory(dir=folder, prefix=".part") as part:
             for name, photograph in zip(staging.names, photographs, strict=True):
                 if not cv2.imwrite(
