@@ -11,7 +11,7 @@ READY := $(VENV)/.ready
 .PHONY: demo test study bench setup clean
 
 demo: $(READY)
-	$(BIN)/python -m sfm.targets.render datasets/demo/scene.toml build/demo
+	$(BIN)/python -m sfm.rendering.render datasets/demo/scene.toml build/demo
 	$(BIN)/kolinear run datasets/demo/survey.toml --images build/demo --out out/demo
 
 test: $(READY)

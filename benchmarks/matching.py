@@ -14,8 +14,8 @@ import cv2
 import numpy as np
 
 from sfm.conventions import FloatArray
-from sfm.matching.lsm import match_lsm
-from sfm.matching.ncc import match_ncc
+from sfm.matching.correlation.ncc import match_ncc
+from sfm.matching.lsm.two_photo import match_lsm
 from tests.textures import REACH, Pairs, affine_pairs, random_texture, with_noise
 
 SIGMA = 2.0

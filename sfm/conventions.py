@@ -2,7 +2,7 @@
 
 Pixel frame
     (0, 0) is the centre of the top-left pixel, x = column to the right, y = row down, unit px.
-    (COLMAP counts from the corner of that pixel; adapters/colmap.py alone adds the half pixel.)
+    (COLMAP counts from the corner of that pixel; adapters/colmap/adjuster.py alone adds the half pixel.)
 Image frame
     mm, origin at the centre of the sensor, x right, y up; the camera looks along -z.
 Object frame

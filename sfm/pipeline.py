@@ -11,20 +11,20 @@ from pathlib import Path
 
 import numpy as np
 
-from sfm.adjustment.orientation_correlations import orientation_correlations
+from sfm.adjustment.quality.correlations import orientation_correlations
 from sfm.progress import SILENT, Progress, StageClock
-from sfm.project import Survey
-from sfm.report.result import FailedImage, StageTime, SurveyResult
+from sfm.result import FailedImage, StageTime, SurveyResult
 from sfm.survey.circles import check_circles
 from sfm.survey.comparison import ALONE, OtherPrograms, compare_solution
 from sfm.survey.exterior import with_exterior
+from sfm.survey.inputs.start import find_photographs, network_from_observations
+from sfm.survey.inputs.survey_file import Survey
 from sfm.survey.network import build_network, codes_of, min_rays, name_coded
 from sfm.survey.orientation import orient_photographs, orient_survey
 from sfm.survey.solution import match_and_adjust, solve
-from sfm.survey.start import find_photographs, network_from_observations
+from sfm.survey.target_store import TargetStore
 from sfm.survey.targets import measure_photographs
 from sfm.survey.texture import run_textured_survey
-from sfm.targets.store import TargetStore
 
 
 def run_survey(
@@ -81,7 +81,6 @@ def run_survey(
         eccentricity=circles.eccentricity,
         no_circles=circles.no_circles,
         reject=survey.reject,
-        weight_factor=solution.weight_factor,
         orientation_correlations=orientation_correlations(solution.adjustment),
         seconds=tuple(StageTime(*one) for one in clock.seconds),
     )
@@ -110,7 +109,6 @@ def adjust_survey(
         control_check=solution.control_check,
         warnings=start.warnings + placed.warnings + solution.warnings + compared.failures,
         reject=survey.reject,
-        weight_factor=solution.weight_factor,
         orientation_correlations=orientation_correlations(solution.adjustment),
         seconds=tuple(StageTime(*one) for one in clock.seconds),
     )

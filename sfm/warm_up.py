@@ -15,16 +15,16 @@ import numpy as np
 
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.solve import adjust
-from sfm.analysis.common_problem import common_problem
-from sfm.analysis.comparison import reprojection
 from sfm.camera import camera_from_values, project
+from sfm.comparison.adjusters import reprojection
+from sfm.comparison.common_problem import common_problem
 from sfm.conventions import AnyArray
 from sfm.matching.conjugate import METHODS, match_points
-from sfm.matching.correspondence import match_targets
-from sfm.matching.interest import foerstner_points
+from sfm.matching.tracks.correspondence import match_targets
+from sfm.matching.tracks.interest import foerstner_points
 from sfm.network import Estimate, ImagePoints, Network, empty_estimate
 from sfm.orientation.sequence import orient
-from sfm.targets.codes import code_family
+from sfm.targets.codes.rings import code_family
 from sfm.targets.detect import find_targets
 
 IMAGES, POINTS = 8, 40

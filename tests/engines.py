@@ -12,10 +12,10 @@ from typing import Any
 from threadpoolctl import threadpool_limits
 
 from sfm.batch.survey import Comparers, SurveyRow
-from sfm.engine import Done, Event, Told, Work
-from sfm.project import Survey
-from sfm.report.result import SurveyResult
+from sfm.executor import Done, Event, Told, Work
+from sfm.result import SurveyResult
 from sfm.survey.comparison import OtherPrograms
+from sfm.survey.inputs.survey_file import Survey
 
 KILLER = "killer"  # a survey of this name kills whoever works on it
 

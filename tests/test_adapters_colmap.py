@@ -9,10 +9,10 @@ import numpy as np
 import pycolmap
 import pytest
 
-from adapters import colmap
-from adapters.colmap import adjust_with_colmap
-from adapters.colmap_covariance import covariance_with_colmap
-from adapters.colmap_model import read_model, write_model
+from adapters.colmap import adjuster as colmap
+from adapters.colmap.adjuster import adjust_with_colmap
+from adapters.colmap.camera_models import read_model, write_model
+from adapters.colmap.covariance import covariance_with_colmap
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.solve import adjust
 from sfm.camera import camera_from_values, project

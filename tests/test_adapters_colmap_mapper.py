@@ -8,12 +8,12 @@ import cv2
 import numpy as np
 import pytest
 
-from adapters.colmap import adjust_with_colmap
-from adapters.colmap_mapper import map_photographs
+from adapters.colmap.adjuster import adjust_with_colmap
+from adapters.colmap.mapper import map_photographs
 from sfm.errors import BackendError
 from sfm.pipeline import run_survey
-from sfm.project import read_survey
 from sfm.survey.comparison import OtherPrograms
+from sfm.survey.inputs.survey_file import read_survey
 
 ROOT = Path(__file__).resolve().parents[1]
 DATA = ROOT.parent / "shared" / "data"

@@ -11,27 +11,27 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from adapters.bal import read_bal, write_bal
-from adapters.bundle_text import (
+from adapters.colmap.camera_models import read_model, write_model
+from adapters.colmap.database import read_database, write_database
+from adapters.formats.bal import read_bal, write_bal
+from adapters.formats.bundle_text import (
     read_bundle_csharp,
     read_bundle_matlab,
     write_bundle_csharp,
     write_bundle_matlab,
 )
-from adapters.colmap_database import read_database, write_database
-from adapters.colmap_model import read_model, write_model
-from adapters.formats import FORMATS as FILE_FORMATS
-from adapters.formats import format_named, format_of, read_any, read_comparable, write_any, written
-from adapters.metashape import read_metashape, write_metashape
-from adapters.photomodeler import read_photomodeler, write_photomodeler
-from adapters.ply import read_ply, write_ply
-from adapters.sba_text import read_sba_text, write_sba_text
-from sfm.analysis.comparison import reprojection
-from sfm.analysis.conversion import convert_camera, convert_cameras
-from sfm.analysis.significance import compare_results
-from sfm.analysis.undistortion import undistort
+from adapters.formats.metashape import read_metashape, write_metashape
+from adapters.formats.photomodeler import read_photomodeler, write_photomodeler
+from adapters.formats.ply import read_ply, write_ply
+from adapters.formats.registry import FORMATS as FILE_FORMATS
+from adapters.formats.registry import format_named, format_of, read_any, read_comparable, write_any, written
+from adapters.formats.sba_text import read_sba_text, write_sba_text
 from sfm.camera import Camera, camera_from_values, pixel_jacobian
-from sfm.commands.solvers import convert
+from sfm.cli.solvers import convert
+from sfm.comparison.adjusters import reprojection
+from sfm.comparison.camera_conversion import convert_camera, convert_cameras
+from sfm.comparison.significance import compare_results
+from sfm.comparison.undistortion import undistort
 from sfm.errors import KolinearError, OutputError, SurveyFileError
 from sfm.network import Estimate, Network, ObjectPoints
 from tests.synthetic import DISTORTION, make_network, seed_of

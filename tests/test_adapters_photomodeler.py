@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from adapters.photomodeler import read_photomodeler
+from adapters.formats.photomodeler import read_photomodeler
 from sfm.camera import project
 from sfm.conventions import angles_from_rotation
 from sfm.errors import SurveyFileError

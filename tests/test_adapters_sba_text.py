@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from synthetic import seed_of
 
-from adapters.formats import read_any, write_any
-from adapters.sba_text import read_sba_text, sba_files
+from adapters.formats.registry import read_any, write_any
+from adapters.formats.sba_text import read_sba_text, sba_files
 from sfm.camera import project
 from sfm.errors import KolinearError, OutputError, SurveyFileError
 

@@ -15,12 +15,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from adapters import lines
-from adapters.colmap_database import write_database
-from adapters.csv_tables import TableResult, read_result, write_tables
-from adapters.formats import FORMATS, read_any, write_any
-from adapters.lines import Lines
-from adapters.xml_lines import read_xml
+from adapters.colmap.database import write_database
+from adapters.formats import lines
+from adapters.formats.lines import Lines
+from adapters.formats.registry import FORMATS, read_any, write_any
+from adapters.formats.result_tables import TableResult, read_result, write_tables
+from adapters.formats.xml_lines import read_xml
 from sfm.errors import OutputError, SurveyFileError
 from sfm.network import Estimate, Network
 from tests.synthetic import make_network, seed_of

@@ -9,17 +9,17 @@ import pytest
 from synthetic import seed_of
 from threadpoolctl import threadpool_limits
 
-from sfm.adjustment import connectivity, iterate, normals
-from sfm.adjustment.band_inverse import band_inverse
-from sfm.adjustment.banded import BandFactor
-from sfm.adjustment.connectivity import Order, pattern_of
 from sfm.adjustment.covariance import hat_complement, marginal_covariance
 from sfm.adjustment.datum import Datum
-from sfm.adjustment.marginal import Marginal, marginal_of
-from sfm.adjustment.normals import HALVED
-from sfm.adjustment.pairs import Pairs, pairs_of
-from sfm.adjustment.parameters import unknowns_of
-from sfm.adjustment.rank import null_motions
+from sfm.adjustment.engine import connectivity, iterate, normals
+from sfm.adjustment.engine.connectivity import Order, pattern_of
+from sfm.adjustment.engine.marginal import Marginal, marginal_of
+from sfm.adjustment.engine.normals import HALVED
+from sfm.adjustment.engine.solvers.banded import BandFactor
+from sfm.adjustment.engine.solvers.banded_inverse import band_inverse
+from sfm.adjustment.engine.solvers.pairs import Pairs, pairs_of
+from sfm.adjustment.engine.unknowns import unknowns_of
+from sfm.adjustment.quality.rank import null_motions
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.camera import Camera, camera_from_values, project

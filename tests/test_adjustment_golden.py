@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from adapters.photomodeler import read_photomodeler
-from adapters.sba_text import read_sba_text
+from adapters.formats.photomodeler import read_photomodeler
+from adapters.formats.sba_text import read_sba_text
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust

@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 from synthetic import make_network, perturb, seed_of
 
-from sfm.adjustment import connectivity
-from sfm.adjustment.collinearity import residuals
 from sfm.adjustment.datum import Datum
-from sfm.adjustment.marginal import marginal_of
-from sfm.adjustment.normals import normal_equations
-from sfm.adjustment.parameters import interior_names, start_weights, step, unknowns_of
-from sfm.adjustment.reduced import schur_complement
+from sfm.adjustment.engine import connectivity
+from sfm.adjustment.engine.collinearity import residuals
+from sfm.adjustment.engine.marginal import marginal_of
+from sfm.adjustment.engine.normals import normal_equations
+from sfm.adjustment.engine.observed_unknowns import weighted_of
+from sfm.adjustment.engine.solvers.dense import schur_complement
+from sfm.adjustment.engine.unknowns import interior_names, start_weights, step, unknowns_of
 from sfm.adjustment.separate import adjust_separately
 from sfm.adjustment.solve import adjust
-from sfm.adjustment.weighted import weighted_of
 from sfm.camera import Camera, project
 from sfm.conventions import FloatArray
 from sfm.errors import GeometryError, SurveyFileError

@@ -8,17 +8,17 @@ import numpy as np
 import pytest
 
 from sfm.adjustment.datum import Datum
-from sfm.adjustment.marginal import marginal_of
-from sfm.adjustment.orientation_correlations import _correlations, orientation_correlations
+from sfm.adjustment.engine.marginal import marginal_of
+from sfm.adjustment.quality.correlations import _correlations, orientation_correlations
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.camera import camera_from_values, project
 from sfm.conventions import FloatArray, rotation_from_angles
 from sfm.network import Estimate, ImagePoints, Network, ObjectPoints
 from sfm.report.html import render_html
-from sfm.report.result import SurveyResult
 from sfm.report.summary import summary
 from sfm.report.text import WIDTH, text_report
+from sfm.result import SurveyResult
 from tests.synthetic import PIXEL_MM, SIZE_PX, make_network, seed_of
 
 HEIGHT = 10.0

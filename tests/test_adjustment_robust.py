@@ -9,12 +9,11 @@ import pytest
 from synthetic import make_network, seed_of
 
 from sfm.adjustment import solve
-from sfm.adjustment.collinearity import residuals
 from sfm.adjustment.datum import Datum
-from sfm.adjustment.parameters import unknowns_of
-from sfm.adjustment.reliability import tau_critical
-from sfm.adjustment.result import Adjustment
-from sfm.adjustment.robust import (
+from sfm.adjustment.engine.collinearity import residuals
+from sfm.adjustment.engine.unknowns import unknowns_of
+from sfm.adjustment.quality.reliability import tau_critical
+from sfm.adjustment.quality.robust import (
     HUBER,
     TUKEY,
     huber_slopes,
@@ -23,6 +22,7 @@ from sfm.adjustment.robust import (
     tukey_slopes,
     tukey_weights,
 )
+from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.conventions import BoolArray, FloatArray
 from sfm.errors import GeometryError

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from synthetic import make_network, perturb, seed_of
 
-from sfm.adjustment.collinearity import collinearity, residuals, scratch
 from sfm.adjustment.datum import Datum, free_motions
-from sfm.adjustment.local import shifted
-from sfm.adjustment.parameters import angle_jacobian, step, unknowns_of
+from sfm.adjustment.engine.collinearity import collinearity, residuals, scratch
+from sfm.adjustment.engine.local_frame import shifted
+from sfm.adjustment.engine.unknowns import angle_jacobian, step, unknowns_of
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.conventions import angles_from_rotation

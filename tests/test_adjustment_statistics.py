@@ -10,10 +10,8 @@ from scipy import stats
 from synthetic import make_network, seed_of
 
 from sfm.adjustment.datum import Datum
-from sfm.adjustment.marginal import change_datum, marginal_of
-from sfm.adjustment.result import Adjustment
-from sfm.adjustment.solve import adjust
-from sfm.adjustment.statistics import (
+from sfm.adjustment.engine.marginal import change_datum, marginal_of
+from sfm.adjustment.quality.statistics import (
     component_tests,
     correlations,
     global_test,
@@ -23,9 +21,12 @@ from sfm.adjustment.statistics import (
     tau_test,
     w_test,
 )
-from sfm.adjustment.variance_components import by_camera, by_kind, by_photograph, estimate_components
+from sfm.adjustment.quality.variance_components import by_camera, by_kind, by_photograph, estimate_components
+from sfm.adjustment.result import Adjustment
+from sfm.adjustment.solve import adjust
+from sfm.conventions import FloatArray
 from sfm.errors import GeometryError
-from sfm.network import ExteriorObservations, InteriorObservations, Network, ObjectPoints, ScaleBars
+from sfm.network import ExteriorObservations, InteriorObservations, ObjectPoints, ScaleBars
 
 FREE = Datum("free")
 
@@ -127,13 +128,14 @@ def test_weights_of_two_cameras_are_estimated() -> None:
     noise = np.array([0.05, 0.3])[group][:, None] * rng.standard_normal(k.xy.shape)
     network = replace(network, image_points=replace(k, xy=k.xy + noise))
 
-    def run(given: Network) -> Adjustment:
-        return adjust(given, truth, datum=FREE, reject="none")
+    def run(factor: FloatArray) -> Adjustment:
+        return adjust(network, truth, datum=FREE, reject="none", image_sigma_factor=factor)
 
-    a, factor, settled = estimate_components(run, network, group, ("one", "two"))
+    a, factor, settled = estimate_components(run, group, ("one", "two"))
     assert settled
     assert factor == pytest.approx([0.5, 3.0], rel=0.1)
-    assert by_camera(a).sigma0 == pytest.approx([1, 1], abs=2e-3)
+    np.testing.assert_array_equal(a.image_sigma_factor, factor[group])
+    assert by_camera(a).sigma0 / factor == pytest.approx([1, 1], abs=2e-3)
     assert a.sigma0 == pytest.approx(1, abs=2e-3)
 
 

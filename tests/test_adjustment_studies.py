@@ -14,7 +14,7 @@ from synthetic import make_network, perturb, seed_of
 from test_adjustment_robust import one_sided, point_error, rms, scatter_over_predicted
 
 from sfm.adjustment.datum import Datum
-from sfm.adjustment.reliability import tau_critical
+from sfm.adjustment.quality.reliability import tau_critical
 from sfm.adjustment.solve import adjust
 from sfm.conventions import FloatArray, angles_from_rotation
 from sfm.similarity import fit_similarity

@@ -24,8 +24,8 @@ from sfm.batch.pages import render_index
 from sfm.batch.run import calls_of, find_surveys, run_batch
 from sfm.batch.survey import LOCK, SurveyJob, SurveyRow, reconstruct
 from sfm.errors import BackendError, KolinearError, OutputError, SurveyFileError
-from sfm.folder_lock import Owner, locked
-from sfm.survey.log import read_log
+from sfm.files.folder_lock import Owner, locked
+from sfm.report.log import read_log
 from tests.engines import ALONE, HERE, KILLER, Notes, points_of
 from tests.surveys import write_observed_survey, write_photograph_survey
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from adapters.dask_cluster import local_engine
 from sfm.batch.survey import SurveyJob, reconstruct
-from sfm.engine import Call, Done, Tell, Work
+from sfm.executor import Call, Done, Tell, Work
 from tests.engines import ALONE
 from tests.surveys import write_observed_survey
 

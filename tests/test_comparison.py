@@ -9,20 +9,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from adapters.colmap import adjust_with_colmap
-from adapters.colmap_covariance import adjust_with_covariance
-from adapters.photomodeler import read_photomodeler
+from adapters.colmap.adjuster import adjust_with_colmap
+from adapters.colmap.covariance import adjust_with_covariance
+from adapters.formats.photomodeler import read_photomodeler
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.solve import adjust
-from sfm.analysis.common_problem import common_problem, grouped_free
-from sfm.analysis.comparison import (
+from sfm.camera import camera_from_values
+from sfm.comparison.adjusters import (
     Thresholds,
     compare,
     compare_adjusters,
     interior_effect_px,
     rotation_angle_deg,
 )
-from sfm.camera import camera_from_values
+from sfm.comparison.common_problem import common_problem, grouped_free
 from sfm.conventions import rotation_from_vector
 from sfm.distortion.models import MODELS as CAMERA_MODELS
 from sfm.errors import GeometryError

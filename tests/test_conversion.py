@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sfm.analysis.conversion import convert_camera, corresponding_free, start_values
 from sfm.camera import Camera, camera_from_values, pixel_from_tangents, tangents_from_pixel
+from sfm.comparison.camera_conversion import convert_camera, corresponding_free, start_values
 from sfm.distortion.models import MODELS
 from sfm.errors import SurveyFileError
 from tests.synthetic import seed_of

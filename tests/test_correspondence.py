@@ -9,8 +9,8 @@ import pytest
 from sfm.camera import camera_from_values, project, tangents_from_pixel
 from sfm.conventions import rotation_from_angles, rotation_from_vector
 from sfm.errors import GeometryError
-from sfm.matching.correspondence import match_targets
 from sfm.matching.epipolar import epipolar_distance, essential_matrices
+from sfm.matching.tracks.correspondence import match_targets
 from sfm.network import Estimate
 
 SIZE = (2000, 1500)

@@ -8,15 +8,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from adapters.colmap import adjust_with_colmap
+from adapters.colmap.adjuster import adjust_with_colmap
 from sfm.conventions import FloatArray, IntArray
 from sfm.pipeline import run_survey
-from sfm.project import read_survey
-from sfm.report.result import SurveyResult
+from sfm.rendering.render import write_photographs
+from sfm.rendering.scene_file import Staging, read_scene
+from sfm.result import SurveyResult
 from sfm.similarity import fit_similarity
 from sfm.survey.comparison import OtherPrograms
-from sfm.targets.render import write_photographs
-from sfm.targets.scene_file import Staging, read_scene
+from sfm.survey.inputs.survey_file import read_survey
 
 DEMO = Path(__file__).resolve().parents[1] / "datasets" / "demo"
 SAME_MM = 1.0  # a point farther than this from every target is none; targets are 30 mm apart

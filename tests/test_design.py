@@ -6,9 +6,9 @@ import sys
 import numpy as np
 import pytest
 
-from sfm.analysis.design import target_size
 from sfm.camera import camera_from_values, project
 from sfm.errors import GeometryError
+from sfm.planning.target_size import target_size
 
 
 def test_formula_of_document_000() -> None:

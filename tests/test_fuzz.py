@@ -17,9 +17,9 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from sfm.errors import KolinearError, PhotographError
-from sfm.project import read_survey
-from sfm.survey.tables import read_image_points
-from sfm.targets.photograph import BOMB_PX_PER_BYTE, read_metadata, read_photograph
+from sfm.photographs.reading import BOMB_PX_PER_BYTE, read_metadata, read_photograph
+from sfm.survey.inputs.survey_file import read_survey
+from sfm.survey.inputs.tables import read_image_points
 from tests.fuzz.cases import Seed, make_seeds, run_case
 
 SHORT = settings(

@@ -8,13 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from adapters.colmap import adjust_with_colmap
-from adapters.photomodeler import read_photomodeler
+from adapters.colmap.adjuster import adjust_with_colmap
+from adapters.formats.photomodeler import read_photomodeler
 from sfm.pipeline import adjust_survey, run_survey
-from sfm.project import read_survey
-from sfm.report.result import SurveyResult
+from sfm.result import SurveyResult
 from sfm.similarity import fit_similarity
 from sfm.survey.comparison import OtherPrograms
+from sfm.survey.inputs.survey_file import read_survey
 
 DATASETS = Path(__file__).resolve().parents[1] / "datasets"
 

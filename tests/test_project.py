@@ -10,15 +10,15 @@ import pytest
 
 from sfm.conventions import angles_from_rotation, image_from_pixel
 from sfm.errors import PhotographError, SurveyFileError
-from sfm.project import read_survey
-from sfm.survey.cameras import camera_of_image, start_cameras
-from sfm.survey.start import (
+from sfm.photographs.reading import Metadata
+from sfm.survey.inputs.cameras import camera_of_image, start_cameras
+from sfm.survey.inputs.start import (
     control_points,
     find_photographs,
     network_from_observations,
     scale_bars,
 )
-from sfm.targets.photograph import Metadata
+from sfm.survey.inputs.survey_file import read_survey
 
 FULL = """\
 [survey]

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from sfm.errors import GeometryError, PhotographError
-from sfm.matching.interpolation import resample
+from sfm.kernels.sampling import resample
 from sfm.matching.radiometry import (
     equalise_histogram,
     fit_radiometry,

@@ -6,11 +6,11 @@ import re
 import tomllib
 from pathlib import Path
 
-from adapters.formats import FORMATS
-from sfm.commands.app import app
-from sfm.project import Survey, read_survey
+from adapters.formats.registry import FORMATS
+from sfm.cli.app import app
 from sfm.report.output import WRITTEN
-from sfm.settings import Section
+from sfm.survey.inputs.settings import Section
+from sfm.survey.inputs.survey_file import Survey, read_survey
 
 ROOT = Path(__file__).resolve().parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")

@@ -12,16 +12,16 @@ import pytest
 from sfm.camera import camera_from_values, project
 from sfm.conventions import rotation_from_angles
 from sfm.errors import GeometryError, SurveyFileError
-from sfm.targets.codes import code_family, read_codes
-from sfm.targets.render import (
+from sfm.rendering.render import (
     painting_order,
     picture_targets,
     render_photograph,
     render_photographs,
     write_photographs,
 )
-from sfm.targets.scene import CircularTargets, Faces, Light, Optics, Scene, coded_ring, discs, join_marks
-from sfm.targets.scene_file import read_scene
+from sfm.rendering.scene import CircularTargets, Faces, Light, Optics, Scene, coded_ring, discs, join_marks
+from sfm.rendering.scene_file import read_scene
+from sfm.targets.codes.rings import code_family, read_codes
 
 DEMO = Path(__file__).parents[1] / "datasets/demo/scene.toml"
 SIZE = (320, 240)
@@ -358,7 +358,7 @@ def test_unknown_code_numbers_are_named(tmp_path):
 
 def test_the_command_refuses_in_one_line(tmp_path):
     run = subprocess.run(
-        [sys.executable, "-m", "sfm.targets.render", str(tmp_path / "none.toml"), str(tmp_path)],
+        [sys.executable, "-m", "sfm.rendering.render", str(tmp_path / "none.toml"), str(tmp_path)],
         capture_output=True, text=True, check=False,
     )  # fmt: skip
     assert run.returncode == 2

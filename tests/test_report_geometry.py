@@ -9,19 +9,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from adapters.photomodeler import read_photomodeler
+from adapters.formats.photomodeler import read_photomodeler
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.network import ObjectPoints
 from sfm.report.geometry import Geometry, geometry_of, hull_area, intersection_angles
 from sfm.report.html import render_html
-from sfm.report.result import SurveyResult
 from sfm.report.section_geometry import MOST_BINS, binned
 from sfm.report.summary import summary
 from sfm.report.tables import write_tables
 from sfm.report.text import WIDTH, text_report
-from sfm.survey.tables import read_exterior, read_points
+from sfm.result import SurveyResult
+from sfm.survey.inputs.tables import read_exterior, read_points
 from tests.synthetic import SIZE_PX, make_network, seed_of
 
 CAMCAL = Path(__file__).resolve().parents[2] / "shared" / "data" / "camcal"

@@ -12,14 +12,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sfm.analysis.random_network import Plan
-from sfm.analysis.significance import Result, ResultComparison, compare_results
-from sfm.analysis.validation import SAME, Trial, Validation
+from sfm.comparison.random_network import Plan
+from sfm.comparison.significance import Result, ResultComparison, compare_results
+from sfm.comparison.validation import SAME, Trial, Validation
 from sfm.errors import GeometryError, OutputError
+from sfm.files.whole_files import remove_leftovers
 from sfm.network import Network
 from sfm.report.differences import largest_difference, words_of_test, write_differences
 from sfm.report.validation import COLUMNS, write_validation
-from sfm.whole_files import remove_leftovers
 from tests.synthetic import make_network, seed_of
 
 PLAN = Plan("ring", 8, 60, False, 0.8, 0.1, "opencv", 1, "all", "free")

@@ -14,18 +14,17 @@ import pytest
 from scipy import stats
 
 from sfm.adjustment.datum import Datum
+from sfm.adjustment.quality.statistics import component_tests, global_test, reliability, tau_test, w_test
+from sfm.adjustment.quality.variance_components import by_kind
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
-from sfm.adjustment.statistics import component_tests, global_test, reliability, tau_test, w_test
-from sfm.adjustment.variance_components import by_kind
-from sfm.analysis.comparison import AdjusterComparison, BackendAdjustment, compare_adjusters
 from sfm.camera import Camera
+from sfm.comparison.adjusters import AdjusterComparison, BackendAdjustment, compare_adjusters
 from sfm.network import Estimate, InteriorObservations, Network, ObjectPoints, ScaleBars
 from sfm.report.checks import (
     count_observations,
     longest_residual,
     sigma0_ratio,
-    stated_px,
     words_of_sigma0,
     worst_residuals,
 )
@@ -34,7 +33,6 @@ from sfm.report.html import render_html
 from sfm.report.markup import signed, significant
 from sfm.report.plots import all_plots, plan_axes
 from sfm.report.precision import point_precision, without_fixed
-from sfm.report.result import ControlCheck, Eccentricity, SurveyResult
 from sfm.report.section_statistics import camera_correlations
 from sfm.report.statistics import (
     families,
@@ -49,9 +47,21 @@ from sfm.report.summary import summary
 from sfm.report.tables import write_tables
 from sfm.report.text import WIDTH, text_report
 from sfm.report.verdict import verdict_of
+from sfm.result import ControlCheck, Eccentricity, SurveyResult
 from tests.synthetic import make_network, seed_of
 
 NOISE_PX = 0.1
+
+
+def multiplied(adjustment: Adjustment, factor: float) -> Adjustment:
+    """Return the same adjustment of standard deviations stated that much smaller, and multiplied for it."""
+    seen = adjustment.network.image_points
+    stated = replace(seen, covariance=seen.covariance / factor**2)
+    return replace(
+        adjustment,
+        network=replace(adjustment.network, image_points=stated),
+        image_sigma_factor=np.full(len(seen), factor),
+    )
 
 
 def result_of(adjustment: Adjustment, **other: object) -> SurveyResult:
@@ -278,9 +288,9 @@ def test_a_sigma_that_is_far_too_large_is_told_with_what_it_would_be(
     )
     assert list(lines) == ([line] if told else [])
     # the same where the image points were weighted by their own component before
-    weighed = replace(network, image_points=replace(seen, covariance=seen.covariance * (ratio * guess) ** 2))
-    b = adjust(weighed, truth, datum=Datum("free"), reject="none")
-    assert verdict_of(result_of(b, weight_factor=ratio)).remarks == lines
+    b = adjust(stated, truth, datum=Datum("free"), reject="none", image_sigma_factor=ratio)
+    assert b.sigma0 == pytest.approx(1)
+    assert verdict_of(result_of(b)).remarks == lines
 
 
 @pytest.mark.parametrize(
@@ -312,11 +322,11 @@ def test_gross_errors_that_nobody_looked_for_are_counted(
 def test_weights_found_from_the_residuals_do_not_hide_sigma0(synthetic: tuple[Network, Estimate]) -> None:
     network, truth = synthetic
     a = adjust(network, truth, datum=Datum("free"))
-    assert verdict_of(result_of(a, weight_factor=3.0)).level == "fair"
-    bad = verdict_of(result_of(a, weight_factor=200.0))
+    assert verdict_of(result_of(multiplied(a, 3.0))).level == "fair"
+    bad = verdict_of(result_of(multiplied(a, 200.0)))
     assert bad.level == "bad"
     assert "expected standard deviation of an image coordinate (0.0005" in bad.remarks[0]
-    text = summary(result_of(a, weight_factor=3.0))
+    text = summary(result_of(multiplied(a, 3.0)))
     assert text["statistics"]["sigma0_ratio"] == pytest.approx(3 * a.sigma0)
 
 
@@ -328,7 +338,7 @@ def test_control_that_contradicts_is_told_apart_from_the_image_points(
     xyz[0, 0] += 0.02
     a = adjust(with_control(network, xyz, 1e-3), truth, datum=Datum("control"), reject="none")
     result = result_of(a)
-    own = sigma0_ratio(result) * stated_px(result)
+    own = sigma0_ratio(result) * result.adjustment.stated_px
     assert a.sigma0_px > 1.05 * own
     assert own == pytest.approx(NOISE_PX, rel=0.1)  # whatever the control does
     figure, words = words_of_sigma0(result)
@@ -351,7 +361,7 @@ def test_each_kind_is_tested_against_what_was_stated_in_the_same_words_everywher
     network, truth = synthetic
     a = adjust(with_bars(network, truth, (0.0, 1e-5), 1e-4), truth, datum=Datum("free"))
     for factor, passed in ((1.0, True), (0.8, False), (1.25, False)):
-        result = result_of(a, weight_factor=factor)
+        result = result_of(multiplied(a, factor))
         image, bars = statistics_of(result).global_tests
         assert image.passed is passed and bars.passed
         r = float(np.nansum(a.redundancy_numbers))

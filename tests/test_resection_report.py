@@ -8,8 +8,8 @@ import pytest
 from test_resection_least_squares import LAB2, TRUTH
 
 from sfm.errors import GeometryError, SurveyFileError
-from sfm.orientation.resection.report import METHODS, resect_json, resect_table
-from sfm.orientation.resection.task import read_task
+from sfm.report.resection import METHODS, resect_json, resect_table
+from sfm.survey.inputs.resection_points import read_task
 
 TABLE = np.loadtxt(
     Path(__file__).parents[1] / "datasets/resection4/resection4_points.csv", delimiter=",", skiprows=1
@@ -119,14 +119,16 @@ def test_bad_files(tmp_path, four):
 
     refused("principal distance is missing")
     refused("it must be positive", c_mm=-1)
-    refused("cannot be read", path=tmp_path / "none.csv", c_mm=24)
+    refused("the table cannot be read: No such file", path=tmp_path / "none.csv", c_mm=24)
     refused(r"--start '1,2': X,Y,Z or X,Y,Z,omega,phi,kappa", c_mm=24, start="1,2")
     (tmp_path / "a.csv").write_text("point,X,Y,x_mm,y_mm\n1,2,3,4,5\n")
-    refused("a.csv: column 'Z' is missing", path=tmp_path / "a.csv", c_mm=24)
+    refused("a.csv, line 1: no column Z, needed point,X,Y,Z,x_mm,y_mm", path=tmp_path / "a.csv", c_mm=24)
     (tmp_path / "b.csv").write_text("point,X,Y,Z,x_mm,y_mm\n1,2,3,four,5,6\n")
-    refused("b.csv, line 2: Z is 'four', a number is needed", path=tmp_path / "b.csv", c_mm=24)
+    refused(
+        "b.csv, line 2: column Z holds 'four', a finite number is needed", path=tmp_path / "b.csv", c_mm=24
+    )
     (tmp_path / "c.csv").write_text("point,X,Y,Z,x_mm,y_mm\n")
-    refused("c.csv: no points in it", path=tmp_path / "c.csv", c_mm=24)
+    refused("c.csv: no rows below the header", path=tmp_path / "c.csv", c_mm=24)
     (tmp_path / "cam.csv").write_text("parameter,value\nc,24\nfocus,3\n")
     refused("cam.csv, line 3: no parameter 'focus'", camera_file=tmp_path / "cam.csv")
 

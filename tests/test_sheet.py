@@ -10,11 +10,11 @@ import pytest
 
 from sfm.camera import camera_from_values
 from sfm.errors import GeometryError, OutputError, SurveyFileError
-from sfm.targets.codes import code_family
+from sfm.printing.sheet import MARGIN_MM, RULER_MM, lay_out_sheet, write_sheet
+from sfm.rendering.render import render_photograph
+from sfm.rendering.scene import CircularTargets, Faces, Optics, Scene
+from sfm.targets.codes.rings import code_family
 from sfm.targets.detect import find_targets
-from sfm.targets.render import render_photograph
-from sfm.targets.scene import CircularTargets, Faces, Optics, Scene
-from sfm.targets.sheet import MARGIN_MM, RULER_MM, lay_out_sheet, write_sheet
 
 PX_PER_MM = 8
 

@@ -8,14 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from adapters.colmap_mapper import MapperBaseline
-from adapters.colmap_model import read_model, write_model
-from adapters.csv_tables import TableResult, read_result, write_tables
+from adapters.colmap.camera_models import read_model, write_model
+from adapters.colmap.mapper import MapperBaseline
+from adapters.formats.result_tables import TableResult, read_result, write_tables
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.solve import adjust
-from sfm.analysis.baseline import compare_baseline
-from sfm.analysis.comparison import reprojection
-from sfm.analysis.significance import Result, compare_results
+from sfm.comparison.adjusters import reprojection
+from sfm.comparison.baseline import compare_baseline
+from sfm.comparison.significance import Result, compare_results
 from sfm.conventions import rotation_from_vector
 from sfm.errors import GeometryError, SurveyFileError
 from sfm.network import Estimate, Network

@@ -14,17 +14,17 @@ import numpy as np
 import pytest
 
 import sfm.cli
-from adapters.colmap_database import read_database, write_database
-from adapters.colmap_model import write_model
+from adapters.colmap.camera_models import write_model
+from adapters.colmap.database import read_database, write_database
 from sfm.batch.run import run_batch
-from sfm.compiling import COMPILING
 from sfm.errors import OutputError
-from sfm.folder_lock import locked
+from sfm.files.folder_lock import locked
+from sfm.files.whole_files import remove_leftovers, whole_file, whole_folder
+from sfm.kernels.compiling import COMPILING
+from sfm.report.log import SurveyLog, read_log
 from sfm.report.output import folder_name
-from sfm.survey.log import SurveyLog, read_log
+from sfm.survey.target_store import TargetStore, measuring_sources
 from sfm.targets.detect import Targets, find_targets
-from sfm.targets.store import TargetStore, measuring_sources
-from sfm.whole_files import remove_leftovers, whole_file, whole_folder
 from tests.engines import ALONE, HERE, Notes
 from tests.surveys import pictures, write_observed_survey, write_photograph_survey
 from tests.synthetic import make_network, seed_of
@@ -347,8 +347,8 @@ def test_a_store_that_others_can_write_is_refused(
 
 def test_what_is_measured_is_known_by_what_measures() -> None:
     names = measuring_sources().keys()
-    assert {f"sfm.targets.{name}" for name in ("detect", "measure", "codes", "tags", "photograph")} <= names
-    assert not names & {f"sfm.targets.{name}" for name in ("sheet", "render", "scene", "store")}
+    assert {"sfm.photographs.reading", "sfm.targets.measure", "sfm.targets.codes.rings"} <= names
+    assert not [name for name in names if name.startswith(("sfm.printing", "sfm.rendering", "sfm.survey"))]
 
 
 def test_targets_travel_between_workers_that_have_no_common_store(

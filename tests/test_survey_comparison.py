@@ -9,15 +9,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from adapters.colmap_mapper import MapperBaseline
+from adapters.colmap.mapper import MapperBaseline
 from sfm.conventions import rotation_from_vector
 from sfm.errors import BackendError, SurveyFileError
 from sfm.pipeline import run_survey
-from sfm.project import Survey, read_survey
 from sfm.report.output import write_result
-from sfm.report.result import SurveyResult
+from sfm.result import SurveyResult
 from sfm.similarity import Similarity
 from sfm.survey.comparison import OtherPrograms
+from sfm.survey.inputs.survey_file import Survey, read_survey
 from tests.surveys import write_observed_survey, write_photograph_survey
 
 TURN = Similarity(30.0, rotation_from_vector(np.array([0.4, 1.0, -0.2])), np.array([5.0, -2.0, 8.0]))

@@ -11,10 +11,10 @@ import sfm.pipeline as pipeline
 from sfm.camera import Camera, camera_from_values, project
 from sfm.conventions import FloatArray
 from sfm.errors import SurveyFileError
-from sfm.project import read_survey
-from sfm.report.result import SurveyResult
+from sfm.result import SurveyResult
 from sfm.similarity import fit_similarity
-from sfm.survey.tables import read_diameters
+from sfm.survey.inputs.survey_file import read_survey
+from sfm.survey.inputs.tables import read_diameters
 from sfm.survey.targets import MeasuredPhotographs
 from sfm.targets.detect import Targets
 

@@ -9,20 +9,20 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from sfm.adjustment.marginal import marginal_of
+from sfm.adjustment.engine.marginal import marginal_of
 from sfm.adjustment.result import Adjustment
 from sfm.conventions import FloatArray, angles_from_rotation
 from sfm.errors import GeometryError, SurveyFileError
 from sfm.network import Estimate
 from sfm.pipeline import adjust_survey, run_survey
-from sfm.project import read_survey
 from sfm.report.given import exterior_residuals
 from sfm.report.html import render_html
 from sfm.report.output import write_result
-from sfm.report.result import SurveyResult
 from sfm.report.text import text_report
 from sfm.report.verdict import verdict_of
-from sfm.survey.tables import read_observed_exterior
+from sfm.result import SurveyResult
+from sfm.survey.inputs.survey_file import read_survey
+from sfm.survey.inputs.tables import read_observed_exterior
 from tests.surveys import OBSERVED, stations, write_photograph_survey
 from tests.synthetic import make_network, seed_of
 

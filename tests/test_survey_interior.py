@@ -9,19 +9,19 @@ import numpy as np
 import pytest
 from synthetic import PIXEL_MM, SIZE_PX, make_network, seed_of
 
-from adapters.colmap import adjust_with_colmap
+from adapters.colmap.adjuster import adjust_with_colmap
 from sfm.adjustment.datum import Datum
-from sfm.adjustment.marginal import change_datum, marginal_of
+from sfm.adjustment.engine.marginal import change_datum, marginal_of
 from sfm.camera import project
 from sfm.conventions import angles_from_rotation
 from sfm.errors import GeometryError, SurveyFileError
 from sfm.network import Estimate, Network
 from sfm.pipeline import adjust_survey
-from sfm.project import read_survey
-from sfm.report.result import SurveyResult
 from sfm.report.summary import summary
 from sfm.report.text import text_report
+from sfm.result import SurveyResult
 from sfm.survey.comparison import OtherPrograms
+from sfm.survey.inputs.survey_file import read_survey
 
 IMAGES = 8
 SURVEY = """\

@@ -12,9 +12,9 @@ import pytest
 from sfm.conventions import angles_from_rotation
 from sfm.errors import GeometryError, SurveyFileError
 from sfm.pipeline import adjust_survey, run_survey
-from sfm.project import read_survey
-from sfm.report.result import SurveyResult
-from sfm.targets.store import TargetStore
+from sfm.result import SurveyResult
+from sfm.survey.inputs.survey_file import read_survey
+from sfm.survey.target_store import TargetStore
 from tests.surveys import write_observed_survey, write_photograph_survey
 from tests.synthetic import make_network, seed_of
 

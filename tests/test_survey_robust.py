@@ -9,8 +9,8 @@ import pytest
 from surveys import write_observed_survey
 
 from sfm.pipeline import adjust_survey
-from sfm.project import read_survey
 from sfm.report.verdict import verdict_of
+from sfm.survey.inputs.survey_file import read_survey
 
 SPOILED = 12  # image points, each 8 px off, of 240
 

@@ -8,11 +8,11 @@ from pathlib import Path
 
 import pytest
 
-from sfm import csv_tables
 from sfm.errors import SurveyFileError
-from sfm.project import read_survey
-from sfm.survey.start import find_photographs, network_from_observations
-from sfm.survey.tables import read_control, read_exterior, read_image_points
+from sfm.files import csv_tables
+from sfm.survey.inputs.start import find_photographs, network_from_observations
+from sfm.survey.inputs.survey_file import read_survey
+from sfm.survey.inputs.tables import read_control, read_exterior, read_image_points
 from tests.surveys import write_observed_survey, write_photograph_survey
 
 HEADER = "image,point,x_px,y_px\n"

@@ -135,7 +135,7 @@ MEASURE = """
 import re, sys
 from pathlib import Path
 from sfm.targets.detect import find_targets
-from sfm.targets.photograph import read_photograph
+from sfm.photographs.reading import read_photograph
 found = find_targets(read_photograph(Path(sys.argv[1])), polarity="bright", min_diameter_px=3)
 # The peak that getrusage tells begins with that of the process which started this one.
 print(len(found), int(re.search(r"VmHWM:\\s+(\\d+)", Path("/proc/self/status").read_text())[1]) // 1024)

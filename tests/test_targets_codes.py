@@ -10,7 +10,7 @@ import pytest
 
 from sfm.conventions import AnyArray, FloatArray
 from sfm.errors import SurveyFileError
-from sfm.targets.codes import (
+from sfm.targets.codes.rings import (
     UNCODED,
     UNREADABLE,
     CodeFamily,

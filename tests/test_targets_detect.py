@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from sfm.conventions import AnyArray, FloatArray
-from sfm.targets.codes import code_family
+from sfm.photographs.reading import read_photograph
+from sfm.targets.codes.rings import code_family
 from sfm.targets.detect import find_targets
 from sfm.targets.flags import Flag, count_flags
 from sfm.targets.outlines import estimate_noise
-from sfm.targets.photograph import read_photograph
 
 DATA = Path(__file__).parents[1].parent / "shared" / "data"
 SUPER = 4

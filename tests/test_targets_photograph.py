@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 from sfm.errors import PhotographError
-from sfm.targets.photograph import read_metadata, read_photograph
+from sfm.photographs.reading import read_metadata, read_photograph
 
 WIDTH, HEIGHT = 96, 64
 

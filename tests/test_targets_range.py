@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from sfm.conventions import AnyArray
-from sfm.settings import TargetSettings
+from sfm.survey.inputs.settings import TargetSettings
 from sfm.survey.targets import measure_photograph
 from sfm.targets.detect import find_targets
 from sfm.targets.flags import Flag

@@ -12,14 +12,14 @@ from sfm.camera import Camera, camera_from_values, project
 from sfm.conventions import AnyArray, FloatArray
 from sfm.errors import GeometryError, SurveyFileError
 from sfm.pipeline import run_survey
-from sfm.project import read_survey
+from sfm.printing.sheet import lay_out_sheet
+from sfm.rendering.render import render_photograph, render_photographs
+from sfm.rendering.scene import CircularTargets, Faces, Marks, Optics, Scene, discs, join_marks, square_tag
 from sfm.similarity import fit_similarity
+from sfm.survey.inputs.survey_file import read_survey
+from sfm.targets.codes.tags import TAG_FAMILIES, corner_name, tag_family
 from sfm.targets.detect import find_targets
 from sfm.targets.flags import Flag
-from sfm.targets.render import render_photograph, render_photographs
-from sfm.targets.scene import CircularTargets, Faces, Marks, Optics, Scene, discs, join_marks, square_tag
-from sfm.targets.sheet import lay_out_sheet
-from sfm.targets.tags import TAG_FAMILIES, corner_name, tag_family
 from tests.surveys import C_MM, PIXEL_MM, SIZE_PX, stations
 
 LOW, HIGH = 0.08, 0.8

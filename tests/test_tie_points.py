@@ -11,28 +11,28 @@ import cv2
 import numpy as np
 import pytest
 
-from adapters.colmap import adjust_with_colmap
-from adapters.colmap_mapper import map_photographs
-from adapters.colmap_model import read_model
+from adapters.colmap.adjuster import adjust_with_colmap
+from adapters.colmap.camera_models import read_model
+from adapters.colmap.mapper import map_photographs
 from datasets.textured import render
 from sfm.adjustment.result import Adjustment
 from sfm.batch.run import run_batch
 from sfm.camera import Camera, project, tangents_from_pixel
 from sfm.conventions import AnyArray, FloatArray, angles_from_rotation
 from sfm.errors import GeometryError, PhotographError, SurveyFileError
+from sfm.matching.correlation.along_line import match_along_line
 from sfm.matching.epipolar_path import epipolar_paths
 from sfm.matching.flags import LsmFlag
-from sfm.matching.interest import foerstner_points
-from sfm.matching.lsm import match_lsm
-from sfm.matching.multi_lsm import match_multi
-from sfm.matching.ncc_line import match_along_line
-from sfm.matching.tie_points import Features, find_tie_points, link_features
+from sfm.matching.lsm.multi_photo import match_multi
+from sfm.matching.lsm.two_photo import match_lsm
+from sfm.matching.tracks.interest import foerstner_points
+from sfm.matching.tracks.tie_points import Features, find_tie_points, link_features
 from sfm.network import Estimate, ImagePoints, Network
 from sfm.orientation.relative import relative_orientations
 from sfm.pipeline import run_survey
-from sfm.project import read_survey
 from sfm.similarity import fit_similarity
 from sfm.survey.comparison import OtherPrograms
+from sfm.survey.inputs.survey_file import read_survey
 from sfm.survey.refine import refine_model, refinement_text
 from tests.engines import ALONE, HERE, Notes
 from tests.textures import random_texture, with_noise

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sfm.analysis.undistortion import undistort
 from sfm.camera import tangents_from_pixel
+from sfm.comparison.undistortion import undistort
 from sfm.distortion.models import MODELS
 from sfm.errors import GeometryError
 from tests.synthetic import make_network, seed_of

@@ -7,10 +7,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from adapters.colmap import adjust_with_colmap
-from adapters.colmap_covariance import ColmapBackend
-from sfm.analysis.comparison import reprojection
-from sfm.analysis.random_network import (
+from adapters.colmap.adjuster import adjust_with_colmap
+from adapters.colmap.covariance import ColmapBackend
+from sfm.comparison.adjusters import reprojection
+from sfm.comparison.random_network import (
     ARRANGEMENTS,
     IMAGES,
     MIN_POINTS,
@@ -18,7 +18,7 @@ from sfm.analysis.random_network import (
     SIZE_PX,
     random_network,
 )
-from sfm.analysis.validation import (
+from sfm.comparison.validation import (
     BOTH_FAILED,
     OURS_FAILED,
     SAME,

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from sfm.errors import BackendError, OutputError
-from sfm.whole_files import refuse_full, whole_file, whole_folder
+from sfm.files.whole_files import refuse_full, whole_file, whole_folder
 
 
 def test_a_folder_takes_the_place_of_an_earlier_one_when_it_is_finished(tmp_path: Path) -> None:

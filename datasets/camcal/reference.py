@@ -11,7 +11,7 @@ import shutil
 import sys
 from pathlib import Path
 
-from adapters.photomodeler import read_photomodeler
+from adapters.formats.photomodeler import read_photomodeler
 
 HERE = Path(__file__).parent
 SURVEYS = ("reference_fixed.toml", "reference_free.toml")

@@ -14,15 +14,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sfm.adjustment.accumulate import times_points, times_reduced
-from sfm.adjustment.collinearity import collinearity, scratch
-from sfm.adjustment.inverse import Inverse, inverse_of
-from sfm.adjustment.iterate import Optimum
-from sfm.adjustment.kernel import kernel
-from sfm.adjustment.normals import solve_lower, solve_transposed
-from sfm.adjustment.parameters import Unknowns, angle_jacobian
+from sfm.adjustment.engine.accumulate import times_points, times_reduced
+from sfm.adjustment.engine.collinearity import collinearity, scratch
+from sfm.adjustment.engine.iterate import Optimum
+from sfm.adjustment.engine.normals import solve_lower, solve_transposed
+from sfm.adjustment.engine.solvers.inverse import Inverse, inverse_of
+from sfm.adjustment.engine.unknowns import Unknowns, angle_jacobian
 from sfm.adjustment.result import Covariance
 from sfm.conventions import FloatArray
+from sfm.kernels.options import kernel
 
 ZERO = 1e-9  # variance over its limiting value below which a coordinate is one that the datum fixes
 

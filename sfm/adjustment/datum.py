@@ -16,9 +16,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import qr
 
-from sfm.adjustment.collinearity import State
-from sfm.adjustment.parameters import Unknowns
-from sfm.adjustment.weighted import Weighted, bar_directions, exterior_misclosure
+from sfm.adjustment.engine.collinearity import State
+from sfm.adjustment.engine.observed_unknowns import Weighted, bar_directions, exterior_misclosure
+from sfm.adjustment.engine.unknowns import Unknowns
 from sfm.conventions import BoolArray, FloatArray, skew
 from sfm.errors import GeometryError
 

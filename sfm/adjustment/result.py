@@ -24,7 +24,7 @@ class Covariance:
 class Adjustment:
     """Result of a least-squares adjustment of a network."""
 
-    network: Network  # as adjusted, rejected image points included
+    network: Network  # as stated, rejected image points included
     estimate: Estimate  # adjusted interior and exterior orientation and points
     converged: bool  # whether the criterion of convergence was met
     iterations: int  # steps taken
@@ -50,6 +50,8 @@ class Adjustment:
     # gives; see `robust.inflation`; 1 with least squares
     bar_redundancy: FloatArray = field(default_factory=lambda: np.zeros(0))  # redundancy number of each scale
     # bar, 0 to 1; NaN where it took no part, (b,)
+    image_sigma_factor: FloatArray = field(default_factory=lambda: np.ones(0))  # by which the stated standard
+    # deviations of each image point were multiplied for its weight, (k,)
     datum_points: BoolArray | None = None  # object points that carry the datum; all if None, (n,)
     remarks: tuple[str, ...] = ()  # what of the robust test could not be carried through, one line each
 
@@ -78,15 +80,24 @@ class Adjustment:
         return self.standardised / self.sigma0
 
     @property
-    def sigma0_px(self) -> float:
-        """A posteriori standard deviation of an image coordinate, root mean square of the accepted, px."""
-        accepted = self.network.image_points.covariance[~self.rejected]
-        return float(self.sigma0 * (np.trace(accepted, axis1=1, axis2=2).mean() / 2) ** 0.5)
+    def image_covariance(self) -> FloatArray:
+        """Covariance by which image points were weighted, stated times factor squared, px^2, (k, 2, 2)."""
+        return scaled_covariance(self.network.image_points.covariance, self.image_sigma_factor)
 
     @property
-    def a_priori_px(self) -> float:
-        """A priori standard deviation of an image coordinate, root mean square of the accepted, px."""
-        return self.sigma0_px / self.sigma0
+    def weight_factor(self) -> float:
+        """Factor on the stated standard deviations of the image points, the median where it differs."""
+        return float(np.median(self.image_sigma_factor))
+
+    @property
+    def sigma0_px(self) -> float:
+        """A posteriori standard deviation of an image coordinate, root mean square of the accepted, px."""
+        return self.sigma0 * _rms_sigma(self.image_covariance[~self.rejected])
+
+    @property
+    def stated_px(self) -> float:
+        """Stated standard deviation of an image coordinate, root mean square of the accepted, px."""
+        return _rms_sigma(self.network.image_points.covariance[~self.rejected])
 
     @property
     def rms_px(self) -> float:
@@ -99,3 +110,12 @@ class Adjustment:
         """Longest residual vector among the accepted image points, px."""
         used = self.residuals[~self.rejected]
         return float((used**2).sum(axis=1).max() ** 0.5)
+
+
+def scaled_covariance(covariance: FloatArray, sigma_factor: FloatArray) -> FloatArray:
+    """Return covariances (k, 2, 2) of standard deviations multiplied by a factor of each, (k,)."""
+    return np.asarray(covariance * sigma_factor[:, None, None] ** 2)
+
+
+def _rms_sigma(covariance: FloatArray) -> float:
+    return float((np.trace(covariance, axis1=1, axis2=2).mean() / 2) ** 0.5)

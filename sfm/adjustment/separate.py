@@ -17,10 +17,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
-from sfm.adjustment.collinearity import State, sum_of_squares
-from sfm.adjustment.normals import new_space, normal_equations
-from sfm.adjustment.parameters import Unknowns, estimate_of, start_weights, step, unknowns_of
-from sfm.adjustment.weighted import weighted_of
+from sfm.adjustment.engine.collinearity import State, sum_of_squares
+from sfm.adjustment.engine.normals import new_space, normal_equations
+from sfm.adjustment.engine.observed_unknowns import weighted_of
+from sfm.adjustment.engine.unknowns import Unknowns, estimate_of, start_weights, step, unknowns_of
 from sfm.conventions import FloatArray
 from sfm.errors import GeometryError
 from sfm.network import Estimate, Network

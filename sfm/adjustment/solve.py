@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sfm.adjustment.collinearity import State, behind_camera, residuals
 from sfm.adjustment.covariance import (
     Cofactors,
     cofactors,
@@ -21,14 +20,23 @@ from sfm.adjustment.covariance import (
     without_held,
 )
 from sfm.adjustment.datum import Datum
-from sfm.adjustment.iterate import METHODS, TOLERANCE, Optimum, Problem, iterate, optimum_at, problem_of
-from sfm.adjustment.local import Local, local_of
-from sfm.adjustment.parameters import estimate_of, start_weights, unknowns_of
-from sfm.adjustment.rank import rank_defect, undetermined_of
-from sfm.adjustment.reliability import redundancy_numbers as numbers_of
-from sfm.adjustment.reliability import redundancy_of_bars, standardised_residuals
-from sfm.adjustment.result import Adjustment, Covariance
-from sfm.adjustment.robust import (
+from sfm.adjustment.engine.collinearity import State, behind_camera, residuals
+from sfm.adjustment.engine.iterate import (
+    METHODS,
+    TOLERANCE,
+    Optimum,
+    Problem,
+    iterate,
+    optimum_at,
+    problem_of,
+)
+from sfm.adjustment.engine.local_frame import Local, local_of
+from sfm.adjustment.engine.observed_unknowns import weighted_of
+from sfm.adjustment.engine.unknowns import estimate_of, start_weights, unknowns_of
+from sfm.adjustment.quality.rank import rank_defect, undetermined_of
+from sfm.adjustment.quality.reliability import redundancy_numbers as numbers_of
+from sfm.adjustment.quality.reliability import redundancy_of_bars, standardised_residuals
+from sfm.adjustment.quality.robust import (
     huber_slopes,
     huber_weights,
     inflation,
@@ -37,10 +45,10 @@ from sfm.adjustment.robust import (
     tukey_slopes,
     tukey_weights,
 )
-from sfm.adjustment.threads import own_threads
-from sfm.adjustment.weighted import weighted_of
+from sfm.adjustment.result import Adjustment, Covariance
 from sfm.conventions import FloatArray
 from sfm.errors import GeometryError
+from sfm.kernels.threads import own_threads
 from sfm.network import Estimate, Network
 
 MAX_ROUNDS = 200  # of data snooping
@@ -58,6 +66,7 @@ def adjust(
     *,
     datum: Datum,
     sigma_px: float = 0.1,
+    image_sigma_factor: float | FloatArray = 1.0,
     reject: str = "tau",
     alpha: float = 0.001,
     method: str = "levenberg-marquardt",
@@ -76,6 +85,8 @@ def adjust(
         estimate: start values; NaN where a photograph or point has none (it is held out and named).
         datum: how position, attitude and scale are decided.
         sigma_px: standard deviation of unit weight, in which sigma0_px is told, px.
+        image_sigma_factor: on the stated standard deviations of the image points, of all or of each, (k,);
+            the network of the result keeps those stated.
         reject: "tau" (data snooping by Pope's test), "huber" or "tukey" (reweighting; Tukey's biweight,
             from Huber's start, rejects what it gives weight 0) or "none".
         alpha: probability with which the test of one image coordinate rejects a good one.
@@ -94,7 +105,10 @@ def adjust(
         raise GeometryError(f"adjustment: method '{method}' is none of {', '.join(METHODS)}")
     use_control = datum.kind == "control"
     local = local_of(network, estimate, datum)
-    layout, state = unknowns_of(local.network, local.estimate, use_control=use_control)
+    factor = np.broadcast_to(np.asarray(image_sigma_factor, dtype=float), (len(network.image_points),))
+    layout, state = unknowns_of(
+        local.network, local.estimate, use_control=use_control, image_sigma_factor=factor
+    )
     weighted = weighted_of(local.network, layout, use_control=use_control)
     weight = start_weights(layout, state)
     with own_threads():
@@ -112,7 +126,8 @@ def adjust(
             run.tolerance = tolerance
             optimum = run.again(optimum, weight)
         Q = cofactors(optimum, layout, cross=redundancy_numbers) if covariance else None
-        return local.back(_result(local, run, optimum, weight, Q, sigma_px, SLOPES.get(reject)))
+        result = _result(local, run, optimum, weight, Q, sigma_px, SLOPES.get(reject))
+        return local.back(replace(result, image_sigma_factor=factor))
 
 
 @dataclass

@@ -13,10 +13,10 @@ from pathlib import Path
 
 from sfm.batch.survey import LOGS, SurveyRow
 from sfm.errors import OutputError
-from sfm.file_values import as_plain, csv_text, is_plain
+from sfm.files.plain_text import as_plain, csv_text, is_plain
+from sfm.files.whole_files import MANIFEST, read_manifest, refuse_links, sha256_of, whole_file, write_manifest
 from sfm.report.markup import Cell, file_url, table
 from sfm.report.pages import page
-from sfm.whole_files import MANIFEST, read_manifest, refuse_links, sha256_of, whole_file, write_manifest
 
 PAGES = ("batch.json", "batch.csv", "index.html")
 HEADER = ("survey", "file", "result", "photographs", "points", "sigma0, px", "RMS, px", "COLMAP", "seconds")

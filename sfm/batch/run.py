@@ -29,16 +29,16 @@ from sfm.batch.survey import (
     measure_one,
     reconstruct,
 )
-from sfm.engine import Call, Done, Engine, Lost, Told, Work
 from sfm.errors import FolderInUseError, KolinearError, SurveyFileError
-from sfm.file_values import as_plain
-from sfm.folder_lock import locked, owner_of
-from sfm.project import Survey, read_survey
+from sfm.executor import Call, Done, Engine, Lost, Told, Work
+from sfm.files.folder_lock import locked, owner_of
+from sfm.files.plain_text import as_plain
+from sfm.files.whole_files import MANIFEST, refuse_foreign_folder, remove_leftovers
+from sfm.report.log import SurveyLog, refuse_other_log, remove_log
 from sfm.report.output import folder_name
-from sfm.survey.log import SurveyLog, refuse_other_log, remove_log
-from sfm.survey.start import find_photographs
-from sfm.targets.store import TargetStore
-from sfm.whole_files import MANIFEST, refuse_foreign_folder, remove_leftovers
+from sfm.survey.inputs.start import find_photographs
+from sfm.survey.inputs.survey_file import Survey, read_survey
+from sfm.survey.target_store import TargetStore
 
 SURVEY_NAME = "survey.toml"  # what a folder is searched for
 

@@ -12,21 +12,21 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from sfm.compiling import when_compiling
-from sfm.engine import Tell
 from sfm.errors import FolderInUseError, KolinearError, OutputError
-from sfm.file_values import as_plain
-from sfm.folder_lock import Owner, locked, owner_of
+from sfm.executor import Tell
+from sfm.files.folder_lock import Owner, locked, owner_of
+from sfm.files.plain_text import as_plain
+from sfm.kernels.compiling import when_compiling
 from sfm.pipeline import adjust_survey, run_survey
-from sfm.project import Survey, read_survey
+from sfm.report.log import LOG, SurveyLog, read_log, remove_log, result_entries
 from sfm.report.output import write_result
-from sfm.report.result import SurveyResult
+from sfm.result import SurveyResult
 from sfm.survey.comparison import OtherPrograms
-from sfm.survey.log import LOG, SurveyLog, read_log, remove_log, result_entries
-from sfm.survey.start import find_photographs
+from sfm.survey.inputs.start import find_photographs
+from sfm.survey.inputs.survey_file import Survey, read_survey
+from sfm.survey.target_store import TargetStore
 from sfm.survey.targets import measure_photograph, survey_family
 from sfm.targets.detect import Targets
-from sfm.targets.store import TargetStore
 
 LOCK = ".lock"  # of the batch
 VERDICTS = ("good", "fair", "bad")

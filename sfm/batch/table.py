@@ -18,7 +18,7 @@ from rich.text import Text
 
 from sfm.batch.pages import totals
 from sfm.batch.survey import SurveyRow
-from sfm.compiling import COMPILING
+from sfm.kernels.compiling import COMPILING
 
 COLOURS = {"good": "green", "fair": "yellow", "bad": "red", "": "red"}
 RECENT = 8  # finished surveys that stay in sight

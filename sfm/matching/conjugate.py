@@ -13,13 +13,13 @@ import numpy as np
 
 from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
 from sfm.errors import GeometryError
+from sfm.kernels.sampling import AFTER, BEFORE
+from sfm.matching.correlation.ambiguity import ambiguous, independent_pixels
+from sfm.matching.correlation.ncc import match_ncc
 from sfm.matching.flags import LsmFlag, NccFlag, in_words
-from sfm.matching.interpolation import AFTER, BEFORE
-from sfm.matching.lsm import match_lsm
-from sfm.matching.ncc import match_ncc
-from sfm.matching.patch_equations import MARGIN
+from sfm.matching.lsm.patch_equations import MARGIN
+from sfm.matching.lsm.two_photo import match_lsm
 from sfm.matching.radiometry import equalise_histogram, grey_of
-from sfm.matching.significance import ambiguous, independent_pixels
 
 METHODS = {"ncc": "", "lsm": "affine", "lsm8": "projective", "shift": "shift"}
 MIN_CORRELATION = 0.7  # half of the variance of one patch is then explained by the other
@@ -80,7 +80,7 @@ def match_points(
         method: ncc, or ncc and then shift (2), lsm (6) or lsm8 (8 geometric parameters).
         template_px, search_px: odd sides of template and search window; document 002 has 19 and 21.
         equalise: equalise the histograms of both photographs before least squares matching.
-        interpolation: six_tap, bicubic or bilinear; see `sfm.matching.lsm.match_lsm`.
+        interpolation: six_tap, bicubic or bilinear; see `sfm.matching.lsm.two_photo.match_lsm`.
         min_correlation: smallest r of a match. Least squares matching is started from 0.5 on, as the warp
             makes patches more alike.
         back_px: a point must lead back to within this of where it came from, px; None: it need not.

@@ -10,12 +10,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sfm.adjustment.engine.observed_unknowns import observed
+from sfm.adjustment.quality.variance_components import IMAGE_POINTS, variance_components
 from sfm.adjustment.result import Adjustment
-from sfm.adjustment.variance_components import IMAGE_POINTS, variance_components
-from sfm.adjustment.weighted import observed
 from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.report.markup import finer_unit, significant
-from sfm.report.result import ControlCheck, SurveyResult
+from sfm.result import ControlCheck, SurveyResult
 
 TOLD_APART = 0.01  # relative difference from which sigma0 of the image points is told beside that of all
 MEDIAN_LENGTH = 1.1774  # median length of a normal vector in the plane over its sigma: sqrt(2 ln 2)
@@ -47,17 +47,12 @@ class WorstResiduals:
 def sigma0_ratio(result: SurveyResult) -> float:
     """Return the a posteriori over the stated a priori standard deviation of the image coordinates.
 
-    By the variance component of the image points alone; where they were weighted anew by it, that factor is
-    put back in. Without redundancy of their own it is sigma0 of all observations.
+    By the variance component of the image points alone; without redundancy of their own it is sigma0 of all
+    observations.
     """
     a = result.adjustment
     own = variance_components(a, np.zeros(len(a.rejected), dtype=np.int64), (IMAGE_POINTS,)).sigma0[0]
-    return float((own if np.isfinite(own) else a.sigma0) * result.weight_factor)
-
-
-def stated_px(result: SurveyResult) -> float:
-    """Return the stated a priori standard deviation of an image coordinate, px."""
-    return result.adjustment.a_priori_px / result.weight_factor
+    return float(own if np.isfinite(own) else a.sigma0_px / a.stated_px)
 
 
 def words_of_sigma0(result: SurveyResult) -> tuple[str, str]:
@@ -67,7 +62,7 @@ def words_of_sigma0(result: SurveyResult) -> tuple[str, str]:
     above what their residuals show.
     """
     a, ratio = result.adjustment, sigma0_ratio(result)
-    stated = stated_px(result)
+    stated = a.stated_px
     own, times = ratio * stated, f"{ratio:.3f} times the {significant(stated)} px expected"
     if not abs(a.sigma0_px - own) > TOLD_APART * own:
         return f"{a.sigma0_px:.4f} px", times
@@ -85,7 +80,7 @@ def longest_residual(adjustment: Adjustment) -> tuple[float, int]:
     if not len(used):
         return 0.0, -1
     v = adjustment.residuals[used]
-    P = np.linalg.inv(adjustment.network.image_points.covariance[used])
+    P = np.linalg.inv(adjustment.image_covariance[used])
     length = np.sqrt(np.einsum("ka,kab,kb->k", v, P, v))
     if len(adjustment.weights):
         length = length * np.sqrt(adjustment.weights[used])

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from sfm.analysis.significance import ResultComparison
-from sfm.file_values import csv_text, or_none
+from sfm.comparison.significance import ResultComparison
+from sfm.files.plain_text import csv_text, or_none
 from sfm.report.markup import figure, finer_unit, significant, table
 from sfm.report.pages import page, png, write_files
 from sfm.report.plots import BLUE, RED, plan_axes

@@ -15,10 +15,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sfm.adjustment.reliability import UNCONTROLLED, standardised_of_given
-from sfm.adjustment.weighted import inverse_of_observed
+from sfm.adjustment.engine.observed_unknowns import inverse_of_observed
+from sfm.adjustment.quality.reliability import UNCONTROLLED, standardised_of_given
 from sfm.conventions import FloatArray, IntArray, angles_from_rotation
-from sfm.report.result import SurveyResult
+from sfm.result import SurveyResult
 
 NOT_CHECKED = "not checked"
 EXTERIOR = (("projection centre", ("X0", "Y0", "Z0")), ("rotation", ("omega", "phi", "kappa")))

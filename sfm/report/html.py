@@ -13,13 +13,13 @@ from sfm.report.markup import figure, finer_unit, significant
 from sfm.report.overlays import Overlay
 from sfm.report.pages import page
 from sfm.report.precision import point_precision, without_fixed
-from sfm.report.result import SurveyResult
 from sfm.report.section_baseline import baseline_section
 from sfm.report.section_comparison import comparison_section
 from sfm.report.section_quality import quality_section
 from sfm.report.section_rejected import rejected_section
 from sfm.report.sections import coordinates_section, photographs_section, process_section, worked_section
 from sfm.report.verdict import verdict_of
+from sfm.result import SurveyResult
 
 
 def render_html(

@@ -11,7 +11,7 @@ import cv2
 
 from sfm.conventions import AnyArray
 from sfm.errors import OutputError
-from sfm.whole_files import whole_file
+from sfm.files.whole_files import whole_file
 
 TABLE_ENDINGS = (".csv", ".json")
 PICTURE_ENDING = ".png"

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 import math
 from pathlib import Path
@@ -12,12 +10,13 @@ from typing import Any
 import numpy as np
 
 from sfm.conventions import AnyArray, FloatArray
-from sfm.csv_tables import read_table
 from sfm.errors import PhotographError, SurveyFileError
+from sfm.files.csv_tables import read_table
+from sfm.files.plain_text import csv_text
 from sfm.matching.conjugate import BACK_PX, MIN_CORRELATION, ConjugatePoints, match_points
+from sfm.photographs.reading import read_photograph
 from sfm.report.match_files import picture_file, refuse_outputs, whole_outputs
 from sfm.report.patch_pictures import draw_patches
-from sfm.targets.photograph import read_photograph
 
 COLUMNS = (
     "point",
@@ -135,13 +134,11 @@ def matches_text(names: tuple[str, ...], found: ConjugatePoints) -> str:
 
 def matches_csv(names: tuple[str, ...], found: ConjugatePoints) -> str:
     """Return the results as CSV, empty fields where there is nothing."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(COLUMNS)
+    rows = []
     for name, row in zip(names, _values(found), strict=True):
         numbers = ["" if not math.isfinite(value) else f"{value:.6g}" for value in row[:-2]]
-        writer.writerow([name, *numbers, int(row[-2]), row[-1]])
-    return text.getvalue()
+        rows.append([name, *numbers, int(row[-2]), row[-1]])
+    return csv_text(COLUMNS, rows)
 
 
 def matches_json(names: tuple[str, ...], found: ConjugatePoints) -> str:

@@ -10,10 +10,10 @@ from sfm.conventions import FloatArray
 from sfm.report.given import EXTERIOR, GivenResiduals, exterior_residuals, words_of_w
 from sfm.report.markup import finer_unit, signed, significant, table
 from sfm.report.precision import root_mean_square
-from sfm.report.result import SurveyResult
 from sfm.report.section_given import NOTE
 from sfm.report.text_given import worst_of_given
 from sfm.report.text_lines import head, line
+from sfm.result import SurveyResult
 
 OPEN_ROWS = 30  # up to which a table of the page is unfolded
 

@@ -8,15 +8,15 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+from sfm.files.whole_files import MANIFEST, refuse_foreign_folder, whole_folder
 from sfm.progress import SILENT, Progress
 from sfm.report.html import render_html
 from sfm.report.overlays import draw_overlays
 from sfm.report.plots import all_plots
-from sfm.report.result import StageTime, SurveyResult
 from sfm.report.summary import write_summary
 from sfm.report.tables import write_tables
 from sfm.report.text import text_report
-from sfm.whole_files import MANIFEST, refuse_foreign_folder, whole_folder
+from sfm.result import StageTime, SurveyResult
 
 MAX_FOLDER_BYTES = 100  # of the name of a survey's folder; disks take 255, endings included
 

@@ -11,10 +11,10 @@ import numpy as np
 from sfm.adjustment.result import Adjustment
 from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
 from sfm.errors import PhotographError
+from sfm.photographs.reading import read_photograph
 from sfm.progress import SILENT, Progress
-from sfm.report.result import PhotographTargets, SurveyResult, in_words
+from sfm.result import PhotographTargets, SurveyResult, in_words
 from sfm.targets.flags import Flag
-from sfm.targets.photograph import read_photograph
 
 MAX_SIDE_PX = 2400  # longer photographs are drawn smaller
 THUMBNAIL_SIDE_PX = 720

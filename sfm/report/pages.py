@@ -11,8 +11,9 @@ from pathlib import Path
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from sfm.folder_lock import locked
-from sfm.whole_files import remove_leftovers, whole_folder
+from sfm.files.folder_lock import locked
+from sfm.files.whole_files import remove_leftovers, whole_folder
+from sfm.report.content_policy import content_policy
 
 DPI = 110
 
@@ -52,6 +53,7 @@ def page(
     )
     return (
         '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
+        f'<meta http-equiv="Content-Security-Policy" content="{content_policy([style])}">'
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
         f"<title>{escape(title)} - Kolinear</title><style>{style}</style></head><body>"
         f"<header><p class=kind>{escape(kind)}</p><h1>{escape(title)}</h1>"

@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 
 from sfm.conventions import AnyArray
+from sfm.kernels.sampling import resample
 from sfm.matching.conjugate import ConjugatePoints
-from sfm.matching.interpolation import resample
 
 PANEL = 168  # least side of a patch in the picture, px
 ZOOM = 8  # least side of one of its pixels, px

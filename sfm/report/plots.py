@@ -196,7 +196,7 @@ def standardised_residuals(adjustment: Adjustment) -> FloatArray:
     Source: Baarda (1968): sigma of v = sigma0 * sigma * sqrt(r) with the redundancy number r.
     """
     used = ~adjustment.rejected
-    variance = np.einsum("kii->ki", adjustment.network.image_points.covariance[used])
+    variance = np.einsum("kii->ki", adjustment.image_covariance[used])
     r = adjustment.redundancy_numbers[used]
     sigma = adjustment.sigma0 * np.sqrt(np.where(r > 1e-6, variance * r, np.nan))
     return np.asarray((adjustment.residuals[used] / sigma).ravel())

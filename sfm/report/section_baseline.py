@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from html import escape
 
-from sfm.analysis.baseline import BaselineComparison
+from sfm.comparison.baseline import BaselineComparison
 from sfm.report.markup import finer_unit, significant, table
 from sfm.report.precision import point_precision
-from sfm.report.result import SurveyResult
+from sfm.result import SurveyResult
 
 
 def baseline_section(result: SurveyResult, found: BaselineComparison) -> str:

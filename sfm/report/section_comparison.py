@@ -6,10 +6,10 @@ from html import escape
 
 import numpy as np
 
-from sfm.analysis.comparison import AdjusterComparison
+from sfm.comparison.adjusters import AdjusterComparison
 from sfm.report.markup import finer_unit, significant, table, yes_or_no
 from sfm.report.precision import root_mean_square
-from sfm.report.result import SurveyResult
+from sfm.result import SurveyResult
 
 
 def comparison_section(result: SurveyResult) -> str:

@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 
 from sfm.conventions import FloatArray
-from sfm.file_values import or_none
+from sfm.files.plain_text import or_none
 from sfm.report.geometry import WEAK_DEG, Coverage, Geometry, geometry_of
 from sfm.report.markup import table
-from sfm.report.result import SurveyResult
 from sfm.report.text_lines import head, lines
+from sfm.result import SurveyResult
 
 MOST_BINS = 12  # numbers of rays that are told one by one
 MOST_NAMES = 5  # weak points that are named

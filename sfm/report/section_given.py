@@ -8,7 +8,7 @@ import numpy as np
 
 from sfm.report.given import bar_residuals, control_residuals, words_of_w
 from sfm.report.markup import finer_unit, signed, significant, table
-from sfm.report.result import SurveyResult
+from sfm.result import SurveyResult
 
 NOTE = (
     "r: redundancy number (0 no check, 1 full check). w: the difference over its own standard deviation, "

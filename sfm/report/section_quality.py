@@ -8,11 +8,11 @@ from sfm.report.given import interior_residuals, words_of_w
 from sfm.report.markup import finer_unit, raised, signed, significant, table, with_exponent
 from sfm.report.observed_exterior import exterior_section
 from sfm.report.precision import point_precision, without_fixed, words_of_limiting
-from sfm.report.result import SurveyResult
 from sfm.report.section_geometry import geometry_section
 from sfm.report.section_given import NOTE, given_section
 from sfm.report.section_statistics import camera_notes, components, image_coordinates, worst
 from sfm.report.statistics import InteriorParameter, families, interior_parameters, words_of_t
+from sfm.result import SurveyResult
 
 
 def quality_section(result: SurveyResult, pictures: dict[str, str]) -> str:

@@ -8,7 +8,7 @@ import numpy as np
 
 from sfm.report.geometry import image_rms
 from sfm.report.markup import table
-from sfm.report.result import SurveyResult
+from sfm.result import SurveyResult
 
 MAX_REJECTED_ROWS = 60
 

@@ -6,21 +6,19 @@ from html import escape
 
 import numpy as np
 
-from sfm.adjustment.statistics import (
+from sfm.adjustment.quality.statistics import (
     STRONG,
     Correlation,
     correlations,
     significance,
 )
-from sfm.adjustment.variance_components import VarianceComponents
+from sfm.adjustment.quality.variance_components import VarianceComponents
 from sfm.report.checks import (
     count_observations,
     sigma0_ratio,
-    stated_px,
     worst_residuals,
 )
 from sfm.report.markup import significant, table
-from sfm.report.result import SurveyResult
 from sfm.report.statistics import (
     Statistics,
     quantiles,
@@ -28,6 +26,7 @@ from sfm.report.statistics import (
     words_of_test,
     words_of_weights,
 )
+from sfm.result import SurveyResult
 
 
 def image_coordinates(result: SurveyResult) -> str:
@@ -36,8 +35,8 @@ def image_coordinates(result: SurveyResult) -> str:
     ratio = sigma0_ratio(result)
     rows = [
         ("sigma0, a posteriori, of all observations", f"{a.sigma0_px:.5f}", "px"),
-        ("standard deviation by the image points alone", f"{ratio * stated_px(result):.5f}", "px"),
-        ("standard deviation stated beforehand", f"{stated_px(result):.5f}", "px"),
+        ("standard deviation by the image points alone", f"{ratio * result.adjustment.stated_px:.5f}", "px"),
+        ("standard deviation stated beforehand", f"{result.adjustment.stated_px:.5f}", "px"),
         ("of the image points, a posteriori over that stated", f"{ratio:.3f}", ""),
         ("RMS residual per coordinate", f"{a.rms_px:.5f}", "px"),
         ("longest residual vector among the accepted", f"{a.max_residual_px:.4f}", "px"),

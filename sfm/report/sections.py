@@ -14,7 +14,6 @@ from sfm.report.markup import (
     to_precision,
 )
 from sfm.report.overlays import Overlay
-from sfm.report.result import SurveyResult
 from sfm.report.section_statistics import observations
 from sfm.report.statistics import datum_in_words
 from sfm.report.tables import (
@@ -22,6 +21,7 @@ from sfm.report.tables import (
     point_rows,
 )
 from sfm.report.verdict import Verdict
+from sfm.result import SurveyResult
 
 MAX_POINT_ROWS = 2000
 

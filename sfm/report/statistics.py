@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
-from sfm.adjustment.result import Adjustment
-from sfm.adjustment.statistics import (
+from sfm.adjustment.quality.statistics import (
     GLOBAL_ALPHA,
     POWER,
     UNTESTED,
@@ -24,16 +23,16 @@ from sfm.adjustment.statistics import (
     tau_test,
     w_test,
 )
-from sfm.adjustment.variance_components import (
-    IMAGE_POINTS,
+from sfm.adjustment.quality.variance_components import (
     VarianceComponents,
     by_camera,
     by_kind,
     by_photograph,
 )
+from sfm.adjustment.result import Adjustment
 from sfm.camera import Camera, camera_families
 from sfm.conventions import FloatArray, IntArray
-from sfm.report.result import SurveyResult
+from sfm.result import SurveyResult
 
 
 @dataclass(frozen=True)
@@ -72,7 +71,7 @@ def statistics_of(result: SurveyResult) -> Statistics:
     construction where the image points have the weight of their own residuals.
     """
     adjustment = result.adjustment
-    kinds = kinds_over_stated(result)
+    kinds = by_kind(adjustment)
     return Statistics(
         global_tests=component_tests(kinds, reweighted=adjustment.reweighted)
         if len(kinds.names) > 1
@@ -83,23 +82,11 @@ def statistics_of(result: SurveyResult) -> Statistics:
         power=POWER,
         redundancy_sum=float(kinds.redundancy.sum()),
         kinds=kinds,
-        cameras=_stated(by_camera(adjustment), result),
-        photographs=_stated(by_photograph(adjustment), result),
+        cameras=by_camera(adjustment),
+        photographs=by_photograph(adjustment),
         significance=significance(adjustment),
         correlations=correlations(adjustment),
     )
-
-
-def kinds_over_stated(result: SurveyResult) -> VarianceComponents:
-    """Return the variance components of the kinds of observation over the standard deviations stated."""
-    kinds = by_kind(result.adjustment)
-    factor = np.where(np.array(kinds.names) == IMAGE_POINTS, result.weight_factor, 1.0)
-    return replace(kinds, sigma0=factor * kinds.sigma0)
-
-
-def _stated(image_points: VarianceComponents, result: SurveyResult) -> VarianceComponents:
-    """Return components of image points over the standard deviations stated, not over those adjusted with."""
-    return replace(image_points, sigma0=result.weight_factor * image_points.sigma0)
 
 
 def words_of_t(one: InteriorParameter) -> str:
@@ -122,11 +109,12 @@ def words_of_test(test: GlobalTest) -> str:
 
 def words_of_weights(result: SurveyResult) -> str:
     """Return which weights the image points have, and what follows for the tests; empty if as stated."""
-    if result.weight_factor == 1:
+    factor = result.adjustment.weight_factor
+    if factor == 1:
         return ""
     return (
         "Weights: the standard deviations of the image points were multiplied by "
-        f"{result.weight_factor:.3f}, from their own variance component, so that the other kinds of "
+        f"{factor:.3f}, from their own variance component, so that the other kinds of "
         "observation keep those stated for them. A test of all observations together would pass by "
         "construction; each kind is tested against the standard deviations stated for it."
     )

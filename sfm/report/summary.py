@@ -8,17 +8,15 @@ from typing import Any
 
 import numpy as np
 
+from sfm.adjustment.quality.statistics import CoordinateTest
+from sfm.adjustment.quality.variance_components import VarianceComponents
 from sfm.adjustment.result import Adjustment
-from sfm.adjustment.statistics import CoordinateTest
-from sfm.adjustment.variance_components import VarianceComponents
-from sfm.file_values import or_none
+from sfm.files.plain_text import or_none
 from sfm.report.checks import (
     count_observations,
     sigma0_ratio,
-    stated_px,
 )
 from sfm.report.given import EXTERIOR, bar_residuals, control_residuals, given_rows, interior_residuals
-from sfm.report.result import SurveyResult
 from sfm.report.section_geometry import geometry_summary
 from sfm.report.statistics import (
     parameter_sigmas,
@@ -30,6 +28,7 @@ from sfm.report.statistics import (
 from sfm.report.summary_comparison import baseline_summary, comparison_summary
 from sfm.report.tables import UNCODED
 from sfm.report.verdict import verdict_of
+from sfm.result import SurveyResult
 
 
 def write_summary(result: SurveyResult, folder: Path) -> None:
@@ -117,9 +116,9 @@ def _statistics(result: SurveyResult) -> dict[str, Any]:
     bias, external = quantiles(found.reliability.minimal_bias), quantiles(found.reliability.external)
     return {
         "sigma0_ratio": or_none(sigma0_ratio(result)),
-        "image_points_px": or_none(sigma0_ratio(result) * stated_px(result)),
-        "stated_px": or_none(stated_px(result)),
-        "weight_factor": result.weight_factor,
+        "image_points_px": or_none(sigma0_ratio(result) * result.adjustment.stated_px),
+        "stated_px": or_none(result.adjustment.stated_px),
+        "weight_factor": result.adjustment.weight_factor,
         "weights": words_of_weights(result),
         "global_tests": [
             {

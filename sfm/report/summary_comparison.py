@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 
 from sfm.conventions import FloatArray
-from sfm.file_values import or_none
+from sfm.files.plain_text import or_none
 from sfm.report.precision import root_mean_square
-from sfm.report.result import SurveyResult
+from sfm.result import SurveyResult
 
 
 def comparison_summary(result: SurveyResult) -> dict[str, Any] | None:

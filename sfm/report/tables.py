@@ -13,11 +13,11 @@ import numpy as np
 
 from sfm.adjustment.result import Adjustment
 from sfm.conventions import FloatArray, angles_from_rotation
-from sfm.file_values import csv_text
+from sfm.files.plain_text import csv_text
 from sfm.report.geometry import geometry_of, image_rms
 from sfm.report.given import given_rows
-from sfm.report.result import SurveyResult
 from sfm.report.statistics import Statistics, parameter_sigmas, statistics_of
+from sfm.result import SurveyResult
 
 UNCODED = -1
 

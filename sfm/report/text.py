@@ -8,12 +8,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from sfm.adjustment.statistics import STRONG
-from sfm.adjustment.variance_components import VarianceComponents
+from sfm.adjustment.quality.statistics import STRONG
+from sfm.adjustment.quality.variance_components import VarianceComponents
 from sfm.report.checks import (
     count_observations,
     sigma0_ratio,
-    stated_px,
     worst_residuals,
 )
 from sfm.report.markup import finer_unit, significant, with_exponent
@@ -25,7 +24,6 @@ from sfm.report.precision import (
     without_fixed,
     words_of_limiting,
 )
-from sfm.report.result import SurveyResult
 from sfm.report.section_geometry import geometry_text
 from sfm.report.statistics import (
     Statistics,
@@ -40,6 +38,7 @@ from sfm.report.statistics import (
 from sfm.report.text_given import given_text
 from sfm.report.text_lines import MOST_ROWS, WIDTH, columns, head, line, wrapped
 from sfm.report.verdict import verdict_of
+from sfm.result import SurveyResult
 
 WORST = 5
 
@@ -136,8 +135,8 @@ def _sigma0(result: SurveyResult, statistics: Statistics) -> list[str]:
     lines = [
         *head("Sigma0 and global test"),
         line("sigma0", f"{a.sigma0_px:.5f} px, of all observations, a posteriori"),
-        line("image points", f"{sigma0_ratio(result) * stated_px(result):.5f} px, by themselves, "
-              f"{sigma0_ratio(result):.3f} times the {stated_px(result):.5f} px a priori"),
+        line("image points", f"{sigma0_ratio(result) * result.adjustment.stated_px:.5f} px, by themselves, "
+              f"{sigma0_ratio(result):.3f} times the {result.adjustment.stated_px:.5f} px a priori"),
         line("residuals", f"RMS {a.rms_px:.5f} px per coordinate, longest {a.max_residual_px:.4f} px"),
     ]  # fmt: skip
     for test in statistics.global_tests:

@@ -17,9 +17,9 @@ from sfm.report.given import (
 )
 from sfm.report.markup import finer_unit, signed, significant, with_exponent
 from sfm.report.precision import root_mean_square
-from sfm.report.result import SurveyResult
 from sfm.report.text_lines import MOST_ROWS, columns, head
 from sfm.report.text_lines import lines as told
+from sfm.result import SurveyResult
 
 
 def given_text(result: SurveyResult) -> list[str]:

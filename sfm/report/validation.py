@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from sfm.analysis.validation import SAME, SAME_COST, Trial, Validation
-from sfm.file_values import csv_text, or_none
+from sfm.comparison.validation import SAME, SAME_COST, Trial, Validation
+from sfm.files.plain_text import csv_text, or_none
 from sfm.report.markup import figure, table
 from sfm.report.pages import page, png, write_files
 from sfm.report.plots import BLUE, RED

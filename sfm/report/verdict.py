@@ -7,15 +7,14 @@ from typing import Literal
 
 import numpy as np
 
-from sfm.adjustment.statistics import ALPHA, component_tests, tau_test, w_test
-from sfm.adjustment.variance_components import IMAGE_POINTS
+from sfm.adjustment.quality.statistics import ALPHA, component_tests, tau_test, w_test
+from sfm.adjustment.quality.variance_components import IMAGE_POINTS, by_kind
 from sfm.conventions import MAD_TO_SIGMA
 from sfm.report.checks import (
     check_over_sigma,
     longest_residual,
     object_size,
     sigma0_ratio,
-    stated_px,
 )
 from sfm.report.given import (
     EXTERIOR,
@@ -25,8 +24,7 @@ from sfm.report.given import (
     interior_residuals,
 )
 from sfm.report.markup import finer_unit, significant
-from sfm.report.result import SurveyResult
-from sfm.report.statistics import kinds_over_stated
+from sfm.result import SurveyResult
 
 MUCH_REJECTED = 0.05  # share of rejected image points above which a person should look
 MOST_RAYS = 0.5  # share of the rays of a point: most of them say something else than the result
@@ -119,7 +117,7 @@ def _sigma0(result: SurveyResult) -> Judged:
         return []
     line = (
         f"Sigma0 is {significant(ratio)} times the expected standard deviation of an image coordinate "
-        f"({significant(stated_px(result))} px): "
+        f"({significant(result.adjustment.stated_px)} px): "
     )
     if ratio > SIGMA0_BAD:
         return [(True, line + "points, control or the camera contradict the photographs.")]
@@ -171,10 +169,10 @@ def _untested(result: SurveyResult) -> Judged:
 def _pessimistic(result: SurveyResult) -> tuple[str, ...]:
     """Say if the image points are far better than stated, which is no fault of the result."""
     ratio = sigma0_ratio(result)
-    image = component_tests(kinds_over_stated(result), alpha=2 * ALPHA)[0]
+    image = component_tests(by_kind(result.adjustment), alpha=2 * ALPHA)[0]
     if not (ratio < SIGMA0_LOW and image.statistic < image.lower):
         return ()
-    stated = stated_px(result)
+    stated = result.adjustment.stated_px
     return (
         f"The stated standard deviation of the image points, {significant(stated)} px, is pessimistic: their "
         f"residuals show {significant(ratio * stated)} px.",
@@ -224,7 +222,7 @@ def _interior(result: SurveyResult) -> Judged:
 
 def _kinds(result: SurveyResult) -> Judged:
     """Judge control, bars and interior orientation as a whole by their variance components."""
-    found = kinds_over_stated(result)
+    found = by_kind(result.adjustment)
     judged: Judged = []
     for g, test in enumerate(component_tests(found, alpha=2 * ALPHA)):
         if test.of == IMAGE_POINTS or found.count[g] < 2 or not test.statistic > test.upper:

@@ -6,13 +6,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from sfm.analysis.baseline import Baseline, BaselineComparison, compare_baseline
-from sfm.analysis.comparison import AdjusterComparison, BackendAdjustment, compare_adjusters
+from sfm.comparison.adjusters import AdjusterComparison, BackendAdjustment, compare_adjusters
+from sfm.comparison.baseline import Baseline, BaselineComparison, compare_baseline
 from sfm.errors import KolinearError
 from sfm.network import Estimate, Network
 from sfm.progress import StageClock
+from sfm.survey.inputs.start import PhotographList
 from sfm.survey.solution import Solution
-from sfm.survey.start import PhotographList
 
 Adjuster = Callable[[Network, Estimate], BackendAdjustment]
 """another adjuster: network and start values in, its solution out"""

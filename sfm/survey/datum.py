@@ -12,10 +12,10 @@ from sfm.adjustment.result import Adjustment
 from sfm.conventions import BoolArray, FloatArray
 from sfm.errors import GeometryError
 from sfm.network import Estimate, Network, ObjectPoints, ScaleBars
-from sfm.project import Survey
-from sfm.report.result import ControlCheck
+from sfm.result import ControlCheck
 from sfm.similarity import Similarity, fit_similarity
-from sfm.survey.start import control_points, scale_bars
+from sfm.survey.inputs.start import control_points, scale_bars
+from sfm.survey.inputs.survey_file import Survey
 
 CONTRADICTED = 0.5  # share of its rays that the test rejects, above which control or a bar is to blame
 CLEARLY = 0.25  # of the misfit that the best choice removes: by how much more than the second it must remove

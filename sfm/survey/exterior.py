@@ -14,10 +14,10 @@ import numpy as np
 from sfm.conventions import FloatArray, IntArray, rotation_from_angles
 from sfm.errors import GeometryError
 from sfm.network import Estimate, ExteriorObservations, Network
-from sfm.project import Survey
 from sfm.similarity import Similarity, fit_similarity
 from sfm.survey.datum import object_scale
-from sfm.survey.start import observed_exterior
+from sfm.survey.inputs.start import observed_exterior
+from sfm.survey.inputs.survey_file import Survey
 
 MIN_POINTS = 3  # that fix position, attitude and scale
 NARROW = 0.05  # breadth over length of places below which their turn about the length is taken from angles

@@ -8,13 +8,13 @@ import numpy as np
 
 from sfm.camera import project
 from sfm.conventions import FloatArray, IntArray
-from sfm.matching.correspondence import match_targets
+from sfm.matching.tracks.correspondence import match_targets
 from sfm.network import Estimate, ImagePoints, Network, ScaleBars
-from sfm.project import Survey
-from sfm.survey.start import control_points, scale_bars
+from sfm.survey.inputs.start import control_points, scale_bars
+from sfm.survey.inputs.survey_file import Survey
 from sfm.survey.targets import MeasuredPhotographs, image_point_covariance
+from sfm.targets.codes.tags import CORNERS, corner_name
 from sfm.targets.flags import Flag
-from sfm.targets.tags import CORNERS, corner_name
 
 UNNAMED = -1
 # Standard deviation of the size of tags where the survey states none, in parts of it: what desktop printers

@@ -9,13 +9,13 @@ import numpy as np
 from sfm.errors import GeometryError
 from sfm.network import Estimate, Network
 from sfm.orientation.sequence import MIN_POINTS, Orientation, orient
-from sfm.project import Survey
+from sfm.photographs.reading import read_photograph
+from sfm.survey.inputs.start import PhotographList, approximate_values
+from sfm.survey.inputs.survey_file import Survey
 from sfm.survey.solution import refine
-from sfm.survey.start import PhotographList, approximate_values
 from sfm.survey.targets import MeasuredPhotographs
-from sfm.targets.codes import FAMILIES
+from sfm.targets.codes.rings import FAMILIES
 from sfm.targets.detect import find_targets
-from sfm.targets.photograph import read_photograph
 
 
 def orient_photographs(

@@ -10,10 +10,10 @@ from typing import TypeVar
 
 from sfm.errors import GeometryError, PhotographError
 from sfm.progress import SILENT, Progress
-from sfm.project import Survey
-from sfm.report.result import FailedImage
-from sfm.survey.start import PhotographList
-from sfm.targets.store import content_hash
+from sfm.result import FailedImage
+from sfm.survey.inputs.start import PhotographList
+from sfm.survey.inputs.survey_file import Survey
+from sfm.survey.target_store import content_hash
 
 T = TypeVar("T")
 MIN_PHOTOGRAPHS = 2

@@ -14,13 +14,13 @@ from sfm.camera import Camera
 from sfm.conventions import MAD_TO_SIGMA, BoolArray, FloatArray, IntArray
 from sfm.errors import GeometryError, PhotographError, SurveyFileError
 from sfm.matching.flags import LsmFlag, in_words
-from sfm.matching.multi_lsm import match_multi
-from sfm.matching.pictures import pictures_of
+from sfm.matching.lsm.multi_photo import match_multi
+from sfm.matching.lsm.projected_points import pictures_of
 from sfm.matching.radiometry import odd_window
 from sfm.network import Estimate, ImagePoints, Network, reduce_network
+from sfm.photographs.reading import read_photograph
 from sfm.progress import SILENT, Progress
 from sfm.survey.solution import FALSE_ALARM, TOLERANCE_FACTOR, determined, put_back
-from sfm.targets.photograph import read_photograph
 
 MIN_RAYS = 3
 # Over larger windows no surface is a plane, and memory and time grow with the square of the side.
@@ -59,7 +59,7 @@ def refine_model(
     """Measure all image points of a solved model by multi-photo least squares matching and adjust it again.
 
     Args:
-        network, estimate: a solved model, as `adapters.colmap_model.read_model` gives it.
+        network, estimate: a solved model, as `adapters.colmap.camera_models.read_model` gives it.
         images_dir: folder of its photographs.
         window_px: odd side of the windows, at most MAX_WINDOW_PX.
         min_correlation: smallest coefficient r of a window and its template, 0 to 1.

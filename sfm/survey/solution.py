@@ -8,18 +8,18 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sfm.adjustment.datum import Datum
+from sfm.adjustment.engine.observed_unknowns import observed
+from sfm.adjustment.quality.variance_components import IMAGE_POINTS, estimate_components
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
-from sfm.adjustment.variance_components import IMAGE_POINTS, estimate_components
-from sfm.adjustment.weighted import observed
-from sfm.conventions import MAD_TO_SIGMA, BoolArray, IntArray
+from sfm.conventions import MAD_TO_SIGMA, BoolArray, FloatArray, IntArray
 from sfm.errors import GeometryError
 from sfm.network import Estimate, Network, reduce_network, supported
 from sfm.orientation.sequence import Orientation
-from sfm.project import Survey
-from sfm.report.result import ControlCheck
+from sfm.result import ControlCheck
 from sfm.survey.datum import Contradiction, contradiction, datum_warnings, placed_on_control, rescaled
-from sfm.survey.interior import as_asked_for, without_idle_cameras
+from sfm.survey.inputs.interior import as_asked_for, without_idle_cameras
+from sfm.survey.inputs.survey_file import Survey
 from sfm.survey.network import Naming, build_network, match_uncoded, min_rays
 from sfm.survey.targets import MeasuredPhotographs
 
@@ -40,7 +40,6 @@ class Solution:
     control_check: ControlCheck | None  # None without control or where the datum is control
     dropped_images: tuple[tuple[str, str], ...]  # photographs that lost their points, with the reason
     warnings: tuple[str, ...]  # one line each
-    weight_factor: float = 1.0  # by which the a priori sigmas of the image points were multiplied
 
 
 def refine(network: Network, estimate: Estimate) -> Estimate:
@@ -119,7 +118,7 @@ def solve(
             last, check = settled.estimate, None
             if datum.kind != "control" and len(settled.part.control) >= 3:
                 last, check = placed_on_control(settled.part, last)
-            final, weight_factor = _final(task, settled.part, last)
+            final = _final(task, settled.part, last)
             found = _contradiction(task, final)
         if found is None:
             break
@@ -132,7 +131,7 @@ def solve(
     )
     final = replace(final, iterations=iterations + final.iterations)
     warnings = (*contradictions, *_warnings(survey, known, single, final))
-    return Solution(final, check, dropped, warnings, weight_factor)
+    return Solution(final, check, dropped, warnings)
 
 
 @dataclass(frozen=True)
@@ -190,33 +189,38 @@ def _resolved(task: _Task, found: Contradiction, accepted: BoolArray) -> _Task:
     )
 
 
-def _final(task: _Task, part: Network, estimate: Estimate) -> tuple[Adjustment, float]:
-    """Return the last adjustment with its covariance, and the factor on the sigmas of the image points."""
+def _final(task: _Task, part: Network, estimate: Estimate) -> Adjustment:
+    """Return the last adjustment with its covariance.
+
+    Where other observations take part, the image points are weighted by their own variance component.
+    """
     part, estimate = without_idle_cameras(task.survey, part, estimate)
 
-    def adjust_part(one: Network) -> Adjustment:
-        return _tested(task, one, estimate, covariance=True)
+    def adjust_part(factor: FloatArray) -> Adjustment:
+        return _tested(task, part, estimate, covariance=True, factor=factor)
 
     outer = (part.control, part.exterior) if task.datum.kind == "control" else ()
     weighted = any(observed(np.einsum("nii->ni", one.covariance)).any() for one in outer)
     if len(part.scale_bars) or len(part.interior) or weighted:
-        return _weighed(adjust_part, part)
-    return adjust_part(part), 1.0
+        return _weighed(adjust_part, len(part.image_points))
+    return _tested(task, part, estimate, covariance=True)
 
 
 def _contradiction(task: _Task, adjustment: Adjustment) -> Contradiction | None:
     """Return control or a scale bar that cost a point most of its rays; None where nothing was tested."""
     if task.reject == "none":
         return None
-    untested = replace(task, reject="none")
+    untested, factor = replace(task, reject="none"), adjustment.weight_factor
 
     def readjust(one: Network) -> Adjustment:
-        return _tested(untested, one, adjustment.estimate, covariance=False)
+        return _tested(untested, one, adjustment.estimate, covariance=False, factor=factor)
 
     return contradiction(task.network, adjustment, readjust, unit=task.survey.unit)
 
 
-def _tested(task: _Task, network: Network, estimate: Estimate, *, covariance: bool) -> Adjustment:
+def _tested(
+    task: _Task, network: Network, estimate: Estimate, *, covariance: bool, factor: float | FloatArray = 1.0
+) -> Adjustment:
     """Adjust with data snooping, the level of the single test shared out among all image coordinates."""
     tests = 2 * len(network.image_points)
     return adjust(
@@ -224,6 +228,7 @@ def _tested(task: _Task, network: Network, estimate: Estimate, *, covariance: bo
         estimate,
         datum=_on_points(task.survey, network, task.datum),
         sigma_px=task.survey.adjust.sigma_px,
+        image_sigma_factor=factor,
         reject=task.reject,
         alpha=1 - (1 - FALSE_ALARM) ** (1 / tests),
         covariance=covariance,
@@ -248,8 +253,8 @@ def _on_points(survey: Survey, network: Network, datum: Datum) -> Datum:
     return replace(datum, points=on)
 
 
-def _weighed(adjust_part: Callable[[Network], Adjustment], part: Network) -> tuple[Adjustment, float]:
-    """Return the adjustment with the image points weighted by their own variance component, and its root.
+def _weighed(adjust_part: Callable[[FloatArray], Adjustment], count: int) -> Adjustment:
+    """Return the adjustment with the image points weighted by their own variance component.
 
     Lengths and control have the standard deviations that were stated for them; without this, sigma0 a
     posteriori, which the image points decide, would scale these too. The component is that of the image
@@ -257,12 +262,12 @@ def _weighed(adjust_part: Callable[[Network], Adjustment], part: Network) -> tup
 
     Source: Foerstner and Wrobel (2016), Photogrammetric Computer Vision, sec. 4.2.4.
     """
-    group = np.zeros(len(part.image_points), dtype=np.int64)
-    final, factor, settled = estimate_components(adjust_part, part, group, (IMAGE_POINTS,))
+    group = np.zeros(count, dtype=np.int64)
+    final, _, settled = estimate_components(adjust_part, group, (IMAGE_POINTS,))
     if not settled:
-        line = "the weights of the image points did not come to rest: each of them rejects other image points"
+        line = "the weights of the image points did not converge: each of them rejects other image points"
         final = replace(final, remarks=(*final.remarks, line))
-    return final, float(factor[0])
+    return final
 
 
 def determined(

@@ -9,18 +9,18 @@ import numpy as np
 
 from sfm.camera import Camera
 from sfm.conventions import FloatArray, IntArray
+from sfm.photographs.reading import Metadata, read_metadata, read_photograph
 from sfm.progress import SILENT, Progress
-from sfm.project import Survey
-from sfm.report.result import FailedImage, PhotographTargets
-from sfm.settings import TargetSettings
-from sfm.survey.cameras import start_cameras
+from sfm.result import FailedImage, PhotographTargets
+from sfm.survey.inputs.cameras import start_cameras
+from sfm.survey.inputs.settings import TargetSettings
+from sfm.survey.inputs.start import PhotographList
+from sfm.survey.inputs.survey_file import Survey
 from sfm.survey.photographs import each_photograph
-from sfm.survey.start import PhotographList
-from sfm.targets.codes import CodeFamily
+from sfm.survey.target_store import TargetStore, target_key
+from sfm.targets.codes.rings import CodeFamily
+from sfm.targets.codes.tags import TagFamily, target_family
 from sfm.targets.detect import Targets, find_targets
-from sfm.targets.photograph import Metadata, read_metadata, read_photograph
-from sfm.targets.store import TargetStore, target_key
-from sfm.targets.tags import TagFamily, target_family
 
 
 @dataclass(frozen=True)

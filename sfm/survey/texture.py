@@ -11,15 +11,15 @@ from pathlib import Path
 
 import numpy as np
 
-from sfm.adjustment.orientation_correlations import orientation_correlations
+from sfm.adjustment.quality.correlations import orientation_correlations
 from sfm.progress import SILENT, Progress, StageClock
-from sfm.project import Survey
-from sfm.report.result import FailedImage, StageTime, SurveyResult
-from sfm.settings import TiePointSettings
+from sfm.result import FailedImage, StageTime, SurveyResult
 from sfm.survey.comparison import ALONE, OtherPrograms, compare_solution
 from sfm.survey.exterior import with_exterior
+from sfm.survey.inputs.settings import TiePointSettings
+from sfm.survey.inputs.start import find_photographs
+from sfm.survey.inputs.survey_file import Survey
 from sfm.survey.solution import solve
-from sfm.survey.start import find_photographs
 from sfm.survey.tie_points import MIN_RAYS, orient_tied, tie_photographs
 
 
@@ -61,7 +61,6 @@ def run_textured_survey(
         control_check=solution.control_check,
         warnings=start.warnings + placed.warnings + solution.warnings + compared.failures,
         reject=survey.reject,
-        weight_factor=solution.weight_factor,
         orientation_correlations=orientation_correlations(solution.adjustment),
         seconds=tuple(StageTime(*one) for one in clock.seconds),
     )

@@ -10,19 +10,19 @@ import numpy as np
 from sfm.camera import Camera, tangents_from_pixel
 from sfm.conventions import AnyArray, BoolArray, IntArray
 from sfm.errors import GeometryError
-from sfm.matching.tie_points import find_tie_points
+from sfm.matching.tracks.tie_points import find_tie_points
 from sfm.network import ImagePoints, Network, reduce_network
 from sfm.orientation.intersection import intersect
 from sfm.orientation.sequence import Orientation
+from sfm.photographs.reading import Metadata, read_metadata, read_photograph
 from sfm.progress import SILENT, Progress
-from sfm.project import Survey
-from sfm.report.result import FailedImage, PhotographTargets
-from sfm.settings import TiePointSettings
-from sfm.survey.cameras import start_cameras
+from sfm.result import FailedImage, PhotographTargets
+from sfm.survey.inputs.cameras import start_cameras
+from sfm.survey.inputs.settings import TiePointSettings
+from sfm.survey.inputs.start import PhotographList, approximate_values, control_points, scale_bars
+from sfm.survey.inputs.survey_file import Survey
 from sfm.survey.orientation import orient_survey
 from sfm.survey.photographs import each_photograph
-from sfm.survey.start import PhotographList, approximate_values, control_points, scale_bars
-from sfm.targets.photograph import Metadata, read_metadata, read_photograph
 
 MIN_RAYS = 3  # photographs that must agree on a tie point; two rays cannot contradict each other
 ORIENTATION_POINTS = 400  # that take part in the orientation, those with the most rays, and

@@ -9,7 +9,8 @@ import numpy as np
 from numba import njit
 
 from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
-from sfm.targets.codes import UNCODED, UNREADABLE, CodeFamily, read_codes
+from sfm.targets.codes.rings import UNCODED, UNREADABLE, CodeFamily, read_codes
+from sfm.targets.codes.tags import DRAWN_PX, TagCorners, TagFamily, find_tags, inside_tags, target_family
 from sfm.targets.counters import find_counters
 from sfm.targets.flags import Flag
 from sfm.targets.measure import EllipseFit, axes_from_shape, fit_ellipse_model
@@ -21,7 +22,6 @@ from sfm.targets.outlines import (
     find_outlines,
     scale_of,
 )
-from sfm.targets.tags import DRAWN_PX, TagCorners, TagFamily, find_tags, inside_tags, target_family
 
 # Largest RMS of the residuals and largest mean residual on an eighth of the edge, over the contrast.
 POOR_FIT = 0.12
@@ -51,7 +51,7 @@ class Targets:
     angle: FloatArray
     """direction of the major axis from x (right) towards y (down), rad, shape (k,)"""
     code: IntArray
-    """code number, of a corner of a tag see sfm.targets.tags.TagCorners, -1 where uncoded, shape (k,)"""
+    """code number, of a corner of a tag see codes.tags.TagCorners, -1 where uncoded, shape (k,)"""
     confidence: FloatArray
     """confidence of the code, 0 to 1, 0 where uncoded, shape (k,)"""
     polarity: IntArray

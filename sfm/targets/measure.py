@@ -10,9 +10,9 @@ import cv2
 import numpy as np
 
 from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
-from sfm.targets.blurred_ellipse import PARAMETERS
+from sfm.targets.fits.blurred_ellipse import PARAMETERS
+from sfm.targets.fits.ellipse_fit import fit_templates
 from sfm.targets.flags import Flag
-from sfm.targets.template import fit_templates
 
 # Variance of rounding to whole intensities.
 QUANTISATION = 1 / 12

@@ -13,26 +13,26 @@ import cv2
 import numpy as np
 from PIL import Image
 
-from adapters.colmap_model import read_model, write_model
-from adapters.csv_tables import TableResult, read_result, write_tables
-from adapters.formats import read_any, write_any
-from adapters.ply import read_ply
-from adapters.sba_text import read_sba_text
+from adapters.colmap.camera_models import read_model, write_model
+from adapters.formats.ply import read_ply
+from adapters.formats.registry import read_any, write_any
+from adapters.formats.result_tables import TableResult, read_result, write_tables
+from adapters.formats.sba_text import read_sba_text
 from sfm.camera import camera_from_values
 from sfm.errors import KolinearError
+from sfm.photographs.reading import read_metadata, read_photograph
 from sfm.pipeline import adjust_survey
-from sfm.project import read_survey
-from sfm.survey.start import find_photographs, network_from_observations
-from sfm.survey.tables import (
+from sfm.survey.inputs.start import find_photographs, network_from_observations
+from sfm.survey.inputs.survey_file import read_survey
+from sfm.survey.inputs.tables import (
     read_control,
     read_exterior,
     read_image_points,
     read_observed_exterior,
     read_points,
 )
-from sfm.targets.codes import read_code_table
+from sfm.targets.codes.rings import read_code_table
 from sfm.targets.detect import find_targets
-from sfm.targets.photograph import read_metadata, read_photograph
 from tests.fuzz.mutate import mutate_bytes, mutate_text
 from tests.synthetic import make_network, seed_of
 

@@ -1,0 +1,233 @@
+"""COLMAP through pycolmap: its Ceres bundle adjustment of our networks.
+
+The only module that imports pycolmap. What its adjuster knows less of than Kolinear's:
+
+    weights        COLMAP's adjuster gives every image coordinate the same weight
+    constants      COLMAP frees focal lengths, principal points and distortion in groups, for all cameras
+
+Pixel origin and axes are turned in adapters.colmap.scene.
+
+Source: COLMAP 4.2 documentation, "Output Format" and "Camera Models".
+"""
+
+from __future__ import annotations
+
+import re
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+
+from adapters.colmap.scene import (
+    estimate_of,
+    reconstruction,
+    residuals_of,
+)
+from sfm.camera import Camera
+from sfm.conventions import FloatArray
+from sfm.errors import BackendError, one_line
+from sfm.network import Estimate, Network
+
+NEEDED_VERSION = (4, 2)
+
+# The default start radius of 1e4 crawls (46 steps on 400 photographs, 6 with 1e8); the steps are then
+# Gauss-Newton's. Ceres' own tolerances stop long before the last digits.
+START_RADIUS = 1e8
+MAX_RADIUS = 1e32
+MIN_LM_DIAGONAL = 1e-30
+STILL = 1e-13  # relative decrease of the cost below which another run of Ceres has nothing to add
+MAX_RUNS = 8
+DENSE_LIMIT = 200  # photographs up to which the reduced normal matrix is factorised densely
+
+
+@dataclass(frozen=True)
+class ColmapAdjustment:
+    """What COLMAP's bundle adjuster made of a network."""
+
+    estimate: Estimate  # adjusted, in the gauge that COLMAP was left with
+    residuals: FloatArray  # computed - measured, px, pixel frame, NaN behind the camera, (k, 2)
+    rms_px: float  # root mean square residual per coordinate, px; NaN if points ended behind cameras
+    cost: float  # half the sum of squared residuals, px^2; NaN likewise
+    iterations: int  # steps of Ceres, unsuccessful ones included
+    converged: bool  # whether Ceres met a criterion of convergence
+    message: str  # Ceres' reason to stop
+    seconds: float  # time in Ceres, s; without building the problem
+    threads: int  # threads that Ceres was given
+    point_covariance: FloatArray | None = None  # of the points, photographs and cameras held, image points of
+    # standard deviation 1 px, object unit^2, (n, 3, 3); None where not asked for
+
+
+def adjust_with_colmap(
+    network: Network,
+    estimate: Estimate,
+    *,
+    gauge: str = "free",
+    threads: int = 1,
+    max_iterations: int = 200,
+    polish: bool = True,
+) -> ColmapAdjustment:
+    """Adjust a network with COLMAP's Ceres adjuster, all image coordinates with unit weight.
+
+    Free are the parameters that the cameras of the estimate declare; see `colmap_free`.
+
+    Args:
+        network: photographs, points and image points, all of which take part.
+        estimate: start values, complete, cameras in an opencv model.
+        gauge: free | two_cameras | control. Free leaves the datum to Ceres' damping, which moves little;
+            two_cameras holds the first two photographs in 7 elements, from where a poor start can lose
+            points behind cameras; control holds the control points.
+        threads: threads of Ceres.
+        max_iterations: steps per run of Ceres.
+        polish: run Ceres again from its own result until the cost stands still.
+
+    Raises:
+        BackendError: pycolmap is missing or of another version, a camera model or a set of free
+            parameters that COLMAP cannot express, weighted control, or Ceres fails.
+    """
+    pycolmap = load_pycolmap()
+    refine = colmap_free(estimate.cameras)
+    options = ceres_options(pycolmap, refine, len(network.images), threads, max_iterations)
+    with quiet(pycolmap):
+        scene = reconstruction(pycolmap, network, estimate)
+        config = adjustment_config(pycolmap, network, estimate, gauge)
+        iterations, seconds, converged, message = 0, 0.0, False, ""
+        cost = np.inf
+        for _ in range(MAX_RUNS if polish else 1):
+            adjuster = pycolmap.create_default_ceres_bundle_adjuster(options, config, scene)
+            started = time.perf_counter()
+            summary = adjuster.solve().ceres_summary
+            seconds += time.perf_counter() - started
+            iterations += summary.num_successful_steps + summary.num_unsuccessful_steps
+            converged = summary.termination_type.name == "CONVERGENCE"
+            message = summary.message
+            if not summary.IsSolutionUsable():
+                raise BackendError(f"COLMAP's adjuster failed: {summary.message}")
+            still = abs(cost - summary.final_cost) <= STILL * summary.final_cost
+            cost = summary.final_cost
+            if still:
+                converged = True
+                break
+        adjusted = estimate_of(scene, estimate)
+        residuals = residuals_of(scene, network)
+    behind = int(np.isnan(residuals[:, 0]).sum())
+    if behind:
+        # Ceres gives them no residual, so that losing a point behind a camera lowers its cost.
+        converged, message = False, f"{behind} image points ended behind their camera"
+    return ColmapAdjustment(
+        adjusted,
+        residuals,
+        float(np.sqrt((residuals**2).mean())),
+        float((residuals**2).sum() / 2),
+        iterations,
+        converged,
+        message,
+        seconds,
+        threads,
+    )
+
+
+def colmap_free(cameras: tuple[Camera, ...]) -> tuple[bool, bool, bool]:
+    """Return whether focal lengths, principal points and distortion are free, as COLMAP knows it.
+
+    Raises:
+        BackendError: a group is free in part, or in some of the cameras that are not fixed as a whole.
+    """
+    found: set[tuple[bool, bool, bool]] = set()
+    for camera in cameras:
+        if not camera.free.any():
+            continue
+        groups = camera.free[:2], camera.free[2:4], camera.free[4:]
+        for name, group in zip(("focal length", "principal point", "distortion"), groups, strict=True):
+            if group.any() and not group.all():
+                raise BackendError(
+                    f"camera {camera.name}: its {name} is free in part, COLMAP frees all of it or nothing"
+                )
+        found.add((bool(groups[0][0]), bool(groups[1][0]), bool(groups[2][0])))
+    if len(found) > 1:
+        raise BackendError("cameras with different free parameters: COLMAP frees the same in all of them")
+    return found.pop() if found else (False, False, False)
+
+
+def load_pycolmap() -> ModuleType:
+    """Import pycolmap, or say what is needed."""
+    needed = ".".join(str(part) for part in NEEDED_VERSION)
+    try:
+        import pycolmap
+        import pycolmap.pyceres  # registers the types of the Ceres options
+    except ImportError as error:
+        raise BackendError(
+            f"pycolmap cannot be imported ({one_line(error)}): pip install 'pycolmap=={needed}.*'"
+        ) from error
+    found = tuple(int(part) for part in pycolmap.__version__.split(".")[:2])
+    if found != NEEDED_VERSION:
+        raise BackendError(
+            f"pycolmap {pycolmap.__version__} is installed, {needed} is needed: "
+            f"pip install 'pycolmap=={needed}.*'"
+        )
+    return pycolmap
+
+
+@contextmanager
+def quiet(pycolmap: ModuleType) -> Iterator[None]:
+    """Keep the log of COLMAP and Ceres out of the terminal, and give it back as it was."""
+    log = pycolmap.logging
+    before = log.minloglevel, log.stderrthreshold
+    log.minloglevel = log.stderrthreshold = int(log.Level.FATAL)
+    try:
+        yield
+    finally:
+        log.minloglevel, log.stderrthreshold = before
+
+
+def ceres_options(
+    pycolmap: ModuleType, refine: tuple[bool, bool, bool], images: int, threads: int, max_iterations: int
+) -> Any:
+    """Ceres run to the end of double precision, with nearly undamped steps."""
+    options = pycolmap.BundleAdjustmentOptions()
+    options.refine_focal_length, options.refine_principal_point, options.refine_extra_params = refine
+    options.refine_sensor_from_rig = False
+    options.print_summary = False
+    options.ceres.auto_select_solver_type = False
+    options.ceres.min_num_residuals_for_cpu_multi_threading = 0
+    solver = options.ceres.solver_options
+    kinds = pycolmap.pyceres.LinearSolverType
+    solver.linear_solver_type = kinds.DENSE_SCHUR if images <= DENSE_LIMIT else kinds.SPARSE_SCHUR
+    solver.num_threads = threads
+    solver.max_num_iterations = max_iterations
+    solver.initial_trust_region_radius = START_RADIUS
+    solver.max_trust_region_radius = MAX_RADIUS
+    solver.min_lm_diagonal = MIN_LM_DIAGONAL
+    solver.function_tolerance = solver.gradient_tolerance = solver.parameter_tolerance = 1e-16
+    return options
+
+
+def adjustment_config(pycolmap: ModuleType, network: Network, estimate: Estimate, gauge: str) -> Any:
+    """Which photographs take part and what is held."""
+    config = pycolmap.BundleAdjustmentConfig()
+    for i in range(len(network.images)):
+        config.add_image(i + 1)
+    for k, camera in enumerate(estimate.cameras):
+        if not camera.free.any():
+            config.set_constant_cam_intrinsics(k + 1)
+    if gauge == "two_cameras":
+        config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    elif gauge == "control":
+        if network.control.covariance.any():
+            raise BackendError(
+                "control with standard deviations: COLMAP's adjuster holds points or frees them"
+            )
+        for j in network.control.point:
+            config.add_constant_point(int(j) + 1)
+    elif gauge != "free":
+        raise BackendError(f"gauge '{gauge}' is none of two_cameras, free, control")
+    return config
+
+
+def told(error: BaseException) -> str:
+    """What COLMAP says of an error, without the places in its own source and its own words for them."""
+    text = re.sub(r"\[\S+\.(cc|h):\d+\] *", "", one_line(error))
+    return re.sub(r"^Check failed: *", "COLMAP expected ", text)

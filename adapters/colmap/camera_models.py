@@ -1,0 +1,178 @@
+"""COLMAP's models, binary and text, written and read.
+
+COLMAP has no place for names of cameras and points or the size of a pixel; they lie beside a model in
+kolinear.json.
+
+Source: COLMAP 4.2 documentation, "Output Format".
+"""
+
+from __future__ import annotations
+
+import errno
+from dataclasses import replace
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+
+from adapters.colmap.adjuster import load_pycolmap, quiet, told
+from adapters.colmap.model_files import check_model_files
+from adapters.colmap.names import SIDE_FILE, read_side_file, write_side_file
+from adapters.colmap.scene import AXES, HALF_PIXEL, camera_of, reconstruction
+from sfm.conventions import BoolArray
+from sfm.errors import OutputError, SurveyFileError
+from sfm.files.whole_files import refuse_full
+from sfm.network import Estimate, ImagePoints, Network
+
+
+def write_model(
+    folder: Path,
+    network: Network,
+    estimate: Estimate,
+    *,
+    rejected: BoolArray | None = None,
+    text: bool = False,
+) -> None:
+    """Write a network and its solution as a COLMAP model: cameras, rigs, frames, images and points.
+
+    Image points keep their order in each photograph; rejected ones are written without a point.
+
+    Args:
+        folder: made if it is not there.
+        network, estimate: cameras in an opencv model; photographs without orientation are left out.
+        rejected: image points that no point shall claim, (k,).
+        text: text files instead of binary ones.
+
+    Raises:
+        BackendError: pycolmap is missing, or a camera is in a model that COLMAP does not know.
+        OutputError: the folder cannot be written.
+    """
+    pycolmap = load_pycolmap()
+    with quiet(pycolmap):
+        scene = reconstruction(pycolmap, network, estimate, rejected=rejected)
+        scene.update_point_3d_errors()
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            if text:
+                scene.write_text(str(folder))
+            else:
+                scene.write_binary(str(folder))
+            _refuse_short(pycolmap, folder, scene, text=text)
+            write_side_file(folder / SIDE_FILE, network, estimate)
+        except OSError as error:
+            reason = error.strerror or error
+            raise OutputError(f"{folder}: the COLMAP model cannot be written: {reason}") from error
+        except (RuntimeError, ValueError) as error:
+            raise OutputError(f"{folder}: the COLMAP model cannot be written: {told(error)}") from error
+
+
+def _refuse_short(pycolmap: ModuleType, folder: Path, scene: Any, *, text: bool) -> None:
+    """Raise OSError unless a model can be read back as it was written: COLMAP ignores that a disk is full."""
+    try:
+        written = _opened(pycolmap, folder, text=text)
+        whole = all(
+            getattr(written, count)() == getattr(scene, count)()
+            for count in ("num_images", "num_points3D", "compute_num_observations")
+        )
+    except (ValueError, RuntimeError, IndexError, OSError):
+        whole = False
+    if not whole:
+        refuse_full(folder)
+        raise OSError(errno.EIO, "what COLMAP wrote cannot be read back")
+
+
+def _opened(pycolmap: ModuleType, folder: Path, *, text: bool) -> Any:
+    """Return the model in the text or the binary files of a folder, which may hold both."""
+    scene = pycolmap.Reconstruction()
+    (scene.read_text if text else scene.read_binary)(str(folder))
+    return scene
+
+
+def read_model(folder: Path, *, text: bool | None = None) -> tuple[Network, Estimate]:
+    """Read a COLMAP model, binary or text, as a network and its solution.
+
+    Cameras in COLMAP's pinhole and radial models become `opencv` ones. Points are named by their number
+    in COLMAP, cameras too, and a pixel is 1 mm, unless the model was written by `write_model`. The
+    covariance of every image point is 1 px^2, since COLMAP keeps none.
+
+    Args:
+        folder: of the model.
+        text: whether its text files are read or the binary ones; binary ones if there are any if not given.
+
+    Raises:
+        SurveyFileError: no model in the folder, or one that cannot be read.
+        BackendError: pycolmap is missing, a camera model that Kolinear has no equal of, or photographs
+            in rigs of several cameras without an orientation of their own.
+    """
+    pycolmap = load_pycolmap()
+    if not any((folder / f"cameras.{kind}").is_file() for kind in ("bin", "txt")):
+        raise SurveyFileError(f"{folder}: no COLMAP model (cameras.bin or cameras.txt) in this folder")
+    if text and not (folder / "cameras.txt").is_file():
+        raise SurveyFileError(f"{folder}: no COLMAP model of text files (cameras.txt), only binary ones")
+    if text is False and not (folder / "cameras.bin").is_file():
+        raise SurveyFileError(f"{folder}: no binary COLMAP model (cameras.bin), only text files")
+    if text is None:
+        text = not (folder / "cameras.bin").is_file()
+    check_model_files(folder, text=text)
+    with quiet(pycolmap):
+        try:
+            scene = _opened(pycolmap, folder, text=text)
+        except (ValueError, RuntimeError, LookupError, OSError, MemoryError) as error:
+            raise SurveyFileError(
+                f"{folder}: each file of the COLMAP model is in order, but they do not fit together "
+                f"({told(error)})"
+            ) from error
+    side = read_side_file(folder / SIDE_FILE)
+    camera_ids = sorted(scene.cameras)
+    cameras = tuple(camera_of(scene.camera(i)) for i in camera_ids)
+    if len(side.cameras) == len(cameras):
+        for camera, extra in zip(cameras, side.cameras, strict=True):
+            if len(extra.free) != len(camera.free):
+                raise SurveyFileError(
+                    f"{folder / SIDE_FILE}: camera {extra.name}: {len(extra.free)} parameters, "
+                    f"the model has {len(camera.free)}"
+                )
+        cameras = tuple(
+            replace(camera, name=extra.name, pixel_mm=np.array(extra.pixel_mm), free=np.array(extra.free))
+            for camera, extra in zip(cameras, side.cameras, strict=True)
+        )
+    image_ids = sorted(scene.images)
+    images = [scene.image(i) for i in image_ids]
+    point_ids = sorted(scene.point3D_ids())
+    names = side.points
+    index = {j: k for k, j in enumerate(point_ids)}
+    seen = [
+        (i, index[p.point3D_id], p.x() - HALF_PIXEL, p.y() - HALF_PIXEL)
+        for i, image in enumerate(images)
+        for p in image.points2D
+        if p.has_point3D()
+    ]
+    table = np.array(seen, dtype=float).reshape(-1, 4)
+    poses = [
+        image.cam_from_world().matrix() if image.has_pose else np.full((3, 4), np.nan) for image in images
+    ]
+    M = np.array([AXES @ pose[:, :3] for pose in poses]).reshape(-1, 3, 3)
+    position = np.array([-pose[:, :3].T @ pose[:, 3] for pose in poses]).reshape(-1, 3)
+    # COLMAP's text format loses what follows a space in the name of a photograph.
+    full = {i: side.images.get(str(i), "") for i in image_ids}
+    try:
+        short = [image.name for image in images]
+    except UnicodeDecodeError as error:
+        raise SurveyFileError(f"{folder}: the name of a photograph is not in UTF-8") from error
+    network = Network(
+        tuple(
+            full[i] if full[i].split()[:1] == [name] else name
+            for i, name in zip(image_ids, short, strict=True)
+        ),
+        np.array([camera_ids.index(image.camera_id) for image in images], dtype=np.int64),
+        tuple(names.get(str(j), str(j)) for j in point_ids),
+        ImagePoints(
+            table[:, 0].astype(np.int64),
+            table[:, 1].astype(np.int64),
+            table[:, 2:].copy(),
+            np.tile(np.eye(2), (len(table), 1, 1)),
+        ),
+    )
+    points = np.array([scene.point3D(j).xyz for j in point_ids]).reshape(-1, 3)
+    return network, Estimate(cameras, position, M.transpose(0, 2, 1).copy(), points)

@@ -1,0 +1,106 @@
+"""COLMAP's own pipeline on the photographs of a survey: SIFT, exhaustive matching, incremental mapper.
+
+What people would use instead: no targets, no scale, no covariance. Its photographs and points are compared
+with the survey's by sfm.comparison.baseline.
+
+Source: Schoenberger and Frahm (2016), Structure-from-Motion revisited, CVPR; the pipeline of pycolmap 4.2.
+"""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from adapters.colmap.adjuster import load_pycolmap, quiet
+from adapters.colmap.camera_models import read_model
+from sfm.camera import project
+from sfm.errors import BackendError, one_line
+from sfm.network import Estimate, Network
+
+MODEL = "OPENCV"  # of COLMAP's models the one that calibrates a lens as a survey does
+RANDOM_SEED = 0  # of RANSAC, so that a run repeats as far as threads allow
+
+
+@dataclass(frozen=True)
+class MapperBaseline:
+    """What COLMAP's own pipeline made of the photographs."""
+
+    network: Network  # registered photographs and their SIFT points
+    estimate: Estimate  # its orientations and points, in a frame and scale of its own
+    total: int  # photographs given
+    rms_px: float  # root mean square residual per coordinate of its own points, px
+    seconds: float  # from photographs to model, s
+    name: str = "COLMAP mapper"
+
+
+def map_photographs(
+    folder: Path, cameras: tuple[tuple[str, ...], ...], *, threads: int = -1
+) -> MapperBaseline:
+    """Run COLMAP's pipeline on photographs and return its largest model.
+
+    Args:
+        folder: where the photographs are.
+        cameras: for each camera the names of its photographs, relative to the folder.
+        threads: of COLMAP, all cores if -1.
+
+    Raises:
+        BackendError: pycolmap is missing, a photograph is unreadable for it, or it finds no model.
+    """
+    pycolmap = load_pycolmap()
+    begun = time.perf_counter()
+    work = Path(tempfile.mkdtemp(prefix="kolinear-mapper-"))
+    try:
+        with quiet(pycolmap):
+            pycolmap.set_random_seed(RANDOM_SEED)
+            database = work / "scene.db"
+            extraction = pycolmap.FeatureExtractionOptions()
+            matching = pycolmap.FeatureMatchingOptions()
+            reader = pycolmap.ImageReaderOptions()
+            reader.camera_model = MODEL
+            pipeline = pycolmap.IncrementalPipelineOptions()
+            extraction.num_threads = matching.num_threads = pipeline.num_threads = threads
+            extraction.use_gpu = matching.use_gpu = False
+            for names in cameras:
+                pycolmap.extract_features(
+                    database,
+                    folder,
+                    image_names=list(names),
+                    camera_mode=pycolmap.CameraMode.SINGLE,
+                    reader_options=reader,
+                    extraction_options=extraction,
+                )
+            pycolmap.match_exhaustive(database, matching_options=matching)
+            found = pycolmap.incremental_mapping(database, folder, work, pipeline)
+            if not found:
+                raise BackendError("COLMAP's mapper found no model: too few matches between the photographs")
+            best = max(found.values(), key=lambda scene: scene.num_reg_images())
+            (work / "best").mkdir()
+            best.write_binary(str(work / "best"))
+        network, estimate = read_model(work / "best")
+    except (RuntimeError, ValueError, OSError) as error:
+        raise BackendError(f"COLMAP's mapper failed: {one_line(error)}") from error
+    finally:
+        shutil.rmtree(work, ignore_errors=True)
+    return MapperBaseline(
+        network,
+        estimate,
+        sum(len(names) for names in cameras),
+        _rms(network, estimate),
+        time.perf_counter() - begun,
+    )
+
+
+def _rms(network: Network, estimate: Estimate) -> float:
+    seen = network.image_points
+    squares = []
+    for i in range(len(network.images)):
+        rows = np.flatnonzero(seen.image == i)
+        camera = estimate.cameras[network.camera[i]]
+        xy = project(camera, estimate.position[i], estimate.rotation[i], estimate.points[seen.point[rows]])
+        squares.append(((xy - seen.xy[rows]) ** 2).ravel())
+    return float(np.sqrt(np.nanmean(np.concatenate(squares))))

@@ -1,0 +1,143 @@
+"""Our networks as COLMAP's scenes and back. What differs is turned here and nowhere else:
+
+    pixel origin   COLMAP counts from the corner of the top-left pixel, Kolinear from its centre: +0.5 px
+    camera axes    COLMAP looks along +z with y down: R_colmap = diag(1, -1, -1) M, t = -R_colmap X0
+    numbers        cameras, photographs and points are numbered from 1 in COLMAP
+    rigs, frames   since COLMAP 4 a photograph belongs to a frame of a rig: here each to one of its own
+
+pycolmap is handed in by adapters.colmap.adjuster, which alone imports it.
+
+Source: COLMAP 4.2 documentation, "Camera Models" and "Rigs and Frames".
+"""
+
+from __future__ import annotations
+
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+
+from sfm.camera import Camera
+from sfm.conventions import BoolArray, FloatArray, IntArray
+from sfm.errors import BackendError
+from sfm.network import Estimate, Network
+
+HALF_PIXEL = 0.5  # COLMAP's pixel coordinates minus ours, px
+AXES = np.diag([1.0, -1.0, -1.0])  # COLMAP's camera axes in ours
+COLMAP_NAMES = {"opencv": "OPENCV", "full_opencv": "FULL_OPENCV"}
+# COLMAP's simpler models as ours: where each of its parameters goes, in its order
+READABLE = {
+    "SIMPLE_PINHOLE": ("opencv", ("fx fy", "cx", "cy")),
+    "PINHOLE": ("opencv", ("fx", "fy", "cx", "cy")),
+    "SIMPLE_RADIAL": ("opencv", ("fx fy", "cx", "cy", "k1")),
+    "RADIAL": ("opencv", ("fx fy", "cx", "cy", "k1", "k2")),
+    "OPENCV": ("opencv", ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")),
+    "FULL_OPENCV": (
+        "full_opencv",
+        ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
+    ),
+}
+
+
+def reconstruction(
+    pycolmap: ModuleType, network: Network, estimate: Estimate, *, rejected: BoolArray | None = None
+) -> Any:
+    """Return a pycolmap.Reconstruction; cameras, photographs and points are numbered from 1."""
+    scene = pycolmap.Reconstruction()
+    for k, camera in enumerate(estimate.cameras):
+        scene.add_camera_with_trivial_rig(colmap_camera(pycolmap, camera, k + 1))
+    seen = network.image_points
+    claimed = np.ones(len(seen), dtype=bool) if rejected is None else ~rejected
+    claimed &= estimate.oriented[seen.image] & estimate.determined[seen.point]
+    slot = np.zeros(len(seen), dtype=np.int64)  # number of each image point in its photograph
+    for i, rows in enumerate(_groups(seen.image, len(network.images))):
+        if not estimate.oriented[i]:
+            continue
+        slot[rows] = np.arange(len(rows))
+        R = AXES @ estimate.rotation[i].T
+        pose = pycolmap.Rigid3d(pycolmap.Rotation3d(R), -R @ estimate.position[i])
+        keypoints = seen.xy[rows] + HALF_PIXEL
+        image = pycolmap.Image(
+            name=network.images[i], keypoints=keypoints, camera_id=int(network.camera[i]) + 1, image_id=i + 1
+        )
+        scene.add_image_with_trivial_frame(image, pose)
+    for j, rows in enumerate(_groups(seen.point, len(network.points))):
+        if not estimate.determined[j]:
+            continue
+        track = pycolmap.Track(
+            [pycolmap.TrackElement(int(seen.image[r]) + 1, int(slot[r])) for r in rows if claimed[r]]
+        )
+        point = pycolmap.Point3D(xyz=estimate.points[j], track=pycolmap.Track())
+        scene.add_point3D_with_id(j + 1, point)
+        for element in track.elements:
+            scene.add_observation(j + 1, element)
+    return scene
+
+
+def colmap_camera(pycolmap: ModuleType, camera: Camera, number: int) -> Any:
+    """Return a camera as a pycolmap.Camera of that number."""
+    if camera.model not in COLMAP_NAMES:
+        raise BackendError(
+            f"camera {camera.name}: COLMAP has no model {camera.model}, convert it to opencv or full_opencv"
+        )
+    width, height = camera.size_px
+    params = camera.parameters.copy()
+    params[2:4] += HALF_PIXEL
+    return pycolmap.Camera(
+        model=COLMAP_NAMES[camera.model], width=width, height=height, params=params, camera_id=number
+    )
+
+
+def camera_of(found: Any) -> Camera:
+    """Return a COLMAP camera as ours, pixel size 1."""
+    if found.model_name not in READABLE:
+        raise BackendError(
+            f"camera {found.camera_id}: COLMAP's model {found.model_name} is none of {', '.join(READABLE)}"
+        )
+    model, places = READABLE[found.model_name]
+    camera = Camera(
+        str(found.camera_id),
+        model,
+        (int(found.width), int(found.height)),
+        np.ones(2),
+        np.zeros(8 if model == "opencv" else 12),
+    )
+    parameters = camera.parameters
+    for place, value in zip(places, found.params, strict=True):
+        for name in place.split():
+            parameters[camera.names.index(name)] = value
+    parameters[2:4] -= HALF_PIXEL
+    return camera
+
+
+def estimate_of(scene: Any, start: Estimate) -> Estimate:
+    """Read the adjusted values back, counted as in the start values."""
+    cameras = []
+    for k, camera in enumerate(start.cameras):
+        params = np.array(scene.camera(k + 1).params, dtype=float)
+        params[2:4] -= HALF_PIXEL
+        cameras.append(camera.with_parameters(params))
+    poses = [scene.image(i + 1).cam_from_world().matrix() for i in range(len(start.position))]
+    R = np.array([(AXES @ pose[:, :3]).T for pose in poses])
+    position = np.array([-pose[:, :3].T @ pose[:, 3] for pose in poses])
+    points = np.array([scene.point3D(j + 1).xyz for j in range(len(start.points))])
+    return Estimate(tuple(cameras), position, R, points)
+
+
+def residuals_of(scene: Any, network: Network) -> FloatArray:
+    """Computed minus measured by COLMAP's own projection, (k, 2), px."""
+    seen = network.image_points
+    xy = np.empty((len(seen), 2))
+    for i, rows in enumerate(_groups(seen.image, len(network.images))):
+        image = scene.image(i + 1)
+        pose = image.cam_from_world().matrix()
+        points = np.array([scene.point3D(int(j) + 1).xyz for j in seen.point[rows]]).reshape(-1, 3)
+        if len(rows):
+            xy[rows] = scene.camera(image.camera_id).img_from_cam(points @ pose[:, :3].T + pose[:, 3])
+    return xy - HALF_PIXEL - seen.xy
+
+
+def _groups(index: IntArray, count: int) -> list[IntArray]:
+    """Rows of each index value, in order."""
+    order = np.argsort(index, kind="stable")
+    return np.split(order, np.searchsorted(index[order], np.arange(1, count)))

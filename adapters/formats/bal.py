@@ -1,0 +1,136 @@
+"""Bundle Adjustment in the Large (BAL) problems, read and written.
+
+    <cameras> <points> <observations>
+    <camera> <point> <x> <y>            per observation
+    <camera values>                     per camera 9 lines: rotation vector, translation, f, k1, k2
+    <point values>                      per point 3 lines: X, Y, Z
+
+P = R X + t, p = -P / P_z, p' = f (1 + k1 |p|^2 + k2 |p|^4) p, in px, origin at the centre of the photograph,
+x right, y up: the camera looks along -z as Kolinear's does, R is our M, and p are our tangents. BAL gives
+neither names nor sizes of photographs; every photograph has a camera of its own.
+
+Source: Agarwal, Snavely, Seitz, Szeliski (2010), Bundle adjustment in the large, ECCV; and the page
+https://grail.cs.washington.edu/projects/bal/.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from adapters.formats.lines import Lines, write_lines
+from sfm.camera import Camera, camera_from_values
+from sfm.conventions import FloatArray
+from sfm.errors import OutputError
+from sfm.network import Estimate, ImagePoints, Network
+
+CAMERA_VALUES = 9
+FOCAL = 6  # place of the focal length among them
+FREE = ("fx", "fy", "k1", "k2")  # what BAL adjusts; its fx and fy are one
+
+
+def read_bal(path: Path, *, size_px: tuple[int, int] | None = None) -> tuple[Network, Estimate]:
+    """Read a BAL problem as a network and its start values; photographs and points are named from 0.
+
+    Args:
+        path: the problem.
+        size_px: width and height of the photographs; the smallest that holds all image points if not given.
+
+    Raises:
+        SurveyFileError: what is wrong, with file and line number.
+    """
+    text = Lines.of(path)
+    head = text.due_row("the number of cameras, points and observations")
+    if len(head) != 3:
+        raise text.error(f"{len(head)} words, needed the number of cameras, points and observations")
+    m, n, k = (
+        text.count_of(w, what) for w, what in zip(head, ("cameras", "points", "observations"), strict=True)
+    )
+    due = text.number + k + CAMERA_VALUES * m + 3 * n
+    if due > len(text.lines):
+        raise text.error(f"{len(text.lines)} lines in the file, {due} are due by these numbers")
+    image, point = np.empty(k, dtype=np.int64), np.empty(k, dtype=np.int64)
+    xy = np.empty((k, 2))
+    for row in range(k):
+        words = text.due_row(f"observation {row} of {k}")
+        if len(words) != 4:
+            raise text.error(f"{len(words)} words, an observation is camera, point, x, y")
+        image[row] = text.index_of(words[0], m, "camera")
+        point[row] = text.index_of(words[1], n, "point")
+        xy[row] = text.number_of(words[2]), text.number_of(words[3])
+    values = np.empty(CAMERA_VALUES * m + 3 * n)
+    for row in range(len(values)):
+        what = f"value {row} of {len(values)}"
+        words = text.due_row(what)
+        if len(words) != 1:
+            raise text.error(f"{len(words)} words, {what} was due")
+        values[row] = text.number_of(words[0])
+        if row < CAMERA_VALUES * m and row % CAMERA_VALUES == FOCAL and values[row] <= 0:
+            raise text.error(f"focal length {values[row]:g} px, it must be positive")
+    text.end()
+    cams = values[: CAMERA_VALUES * m].reshape(m, CAMERA_VALUES)
+    width, height = 2 * np.ceil(np.abs(xy).max(axis=0) + 1).astype(int)
+    size = (int(width), int(height)) if size_px is None else size_px
+    M = Rotation.from_rotvec(cams[:, :3]).as_matrix()
+    cameras = tuple(_camera(f"{i}", cams[i, 6:], size) for i in range(m))
+    network = Network(
+        tuple(f"{i}" for i in range(m)),
+        np.arange(m, dtype=np.int64),
+        tuple(f"{j}" for j in range(n)),
+        ImagePoints(image, point, _centre(size) + xy * (1, -1), np.tile(np.eye(2), (k, 1, 1))),
+    )
+    position = -np.einsum("iba,ib->ia", M, cams[:, 3:6])
+    return network, Estimate(
+        cameras,
+        position,
+        np.ascontiguousarray(M.transpose(0, 2, 1)),
+        values[CAMERA_VALUES * m :].reshape(n, 3),
+    )
+
+
+def write_bal(path: Path, network: Network, estimate: Estimate) -> None:
+    """Write a network as a BAL problem.
+
+    Args:
+        path: file to write.
+        network, estimate: complete; cameras in model opencv with one focal length and no decentring.
+
+    Raises:
+        OutputError: what BAL has no place for, or the file cannot be written.
+    """
+    for camera in estimate.cameras:
+        if camera.model != "opencv" or camera.value("fx") != camera.value("fy"):
+            raise OutputError(
+                f"camera {camera.name}: BAL knows one focal length with k1, k2 and nothing else"
+            )
+        if camera.value("p1") or camera.value("p2"):
+            raise OutputError(f"camera {camera.name}: BAL has no place for p1 and p2")
+    if not (estimate.oriented.all() and estimate.determined.all()):
+        raise OutputError("BAL wants start values of all photographs and points, some have none")
+    seen = network.image_points
+    m, n = len(network.images), len(network.points)
+    lines = [f"{m} {n} {len(seen)}"]
+    principal = np.array([c.parameters[2:4] for c in estimate.cameras])[network.camera[seen.image]]
+    xy = (seen.xy - principal) * (1, -1)
+    lines += [f"{i} {j}     {x:.9e} {y:.9e}" for i, j, (x, y) in zip(seen.image, seen.point, xy, strict=True)]
+    M = estimate.rotation.transpose(0, 2, 1)
+    translation = -np.einsum("iab,ib->ia", M, estimate.position)
+    for i, vector in enumerate(Rotation.from_matrix(M).as_rotvec()):
+        camera = estimate.cameras[network.camera[i]]
+        values = (*vector, *translation[i], *(camera.value(name) for name in ("fx", "k1", "k2")))
+        lines += [f"{value:.16e}" for value in values]
+    lines += [f"{value:.16e}" for value in estimate.points.ravel()]
+    write_lines(path, lines)
+
+
+def _centre(size_px: tuple[int, int]) -> FloatArray:
+    return (np.asarray(size_px, dtype=float) - 1) / 2
+
+
+def _camera(name: str, values: FloatArray, size_px: tuple[int, int]) -> Camera:
+    f, k1, k2 = (float(value) for value in values)
+    return camera_from_values(
+        name, "opencv", size_px, (1.0, 1.0), c_mm=f, free=FREE, values=(("k1", k1), ("k2", k2))
+    )

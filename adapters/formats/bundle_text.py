@@ -1,0 +1,347 @@
+"""The text files of two bundle adjustment programs of a thesis, read and written.
+
+MATLAB program, three files (that of its cameras and points are modelled on those of the sba package):
+
+    cameras   id omega phi kappa XL YL ZL             a photograph per line, deg
+    points    X Y Z frames (frame x y)*               a point per line; frames from 0, mm in the image frame
+    sigmas    frames (frame sx sy)*                   a line for each line of points, mm
+
+C# program, one file:
+
+    photographs c x0 y0                               mm
+    id omega phi kappa XL YL ZL                       per photograph
+    points
+    id X Y Z (x y)*                                   per point, one pair for every photograph
+    id (sx sy)*                                       per point
+
+The MATLAB program asks for c, x0, y0 (mm); in a folder of its files they are in interior.txt.
+
+Both keep angles in degrees with M = R_kappa R_phi R_omega, as Kolinear does. Neither knows distortion,
+pixels or the size of the photographs: coordinates in mm become pixels of a nominal size.
+
+Source: the thesis "Bundle adjustment for close-range photogrammetry" (fly-over bridge pier), sec. 4.2.1 and
+app. B for the C# file, app. C for the MATLAB files.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from adapters.formats.lines import Lines, write_lines
+from sfm.camera import camera_from_values
+from sfm.conventions import (
+    FloatArray,
+    angles_from_rotation,
+    image_from_pixel,
+    pixel_from_image,
+    rotation_from_angles,
+)
+from sfm.errors import OutputError
+from sfm.network import Estimate, ImagePoints, Network
+
+INTERIOR = "interior.txt"
+PIXEL_MM = 0.005  # nominal size of a pixel, since the files know none
+BORDER = 1.1  # sensor over the extent of the image points
+
+
+def read_bundle_matlab(
+    cameras: Path,
+    points: Path,
+    sigmas: Path | None = None,
+    *,
+    c_mm: float,
+    x0_mm: float = 0.0,
+    y0_mm: float = 0.0,
+    pixel_mm: float = PIXEL_MM,
+) -> tuple[Network, Estimate]:
+    """Read the files of the MATLAB program as a network and its start values; points are named from 1.
+
+    Args:
+        cameras, points, sigmas: the three files; without sigmas they are one pixel.
+        c_mm, x0_mm, y0_mm: interior orientation, which the program asks for, mm.
+        pixel_mm: nominal size of a pixel, mm.
+
+    Raises:
+        SurveyFileError: what is wrong, with file and line number.
+    """
+    text = Lines.of(cameras)
+    names, exterior = _exterior(text, None)
+    m = len(names)
+    text = Lines.of(points)
+    image, point, xy, xyz, seen_in = [], [], [], [], []
+    while (words := text.row()) is not None:
+        if len(words) < 4:
+            raise text.error(f"{len(words)} words, a point is X Y Z frames (frame x y)...")
+        xyz.append([text.number_of(word) for word in words[:3]])
+        frames, values = _frames(text, words[3:], m)
+        image += frames
+        point += [len(xyz) - 1] * len(frames)
+        xy += values
+        seen_in.append(frames)
+    if not xyz:
+        raise text.error("no points")
+    sigma = None
+    if sigmas is not None:
+        text, sigma = Lines.of(sigmas), []
+        for j, frames in enumerate(seen_in):
+            given, values = _frames(text, text.due_row(f"sigmas of point {j + 1}"), m)
+            if given != frames:
+                raise text.error(f"frames {given}, the point on line {j + 1} of {points} has {frames}")
+            sigma += [_positive(text, pair) for pair in values]
+        text.end()
+    interior = (c_mm, x0_mm, y0_mm)
+    labels = tuple(f"{j + 1}" for j in range(len(xyz)))
+    return _network(names, exterior, labels, xyz, image, point, xy, sigma, interior, pixel_mm)
+
+
+def write_bundle_matlab(
+    cameras: Path, points: Path, sigmas: Path, network: Network, estimate: Estimate
+) -> None:
+    """Write a network as the three files of the MATLAB program; names of points are lost.
+
+    Raises:
+        OutputError: what the files have no place for, or they cannot be written.
+    """
+    xy, sigma = _millimetres(network, estimate)
+    lines = ["# id omega phi kappa XL YL ZL (deg)", *_exterior_lines(network, estimate)]
+    write_lines(cameras, lines)
+    seen = network.image_points
+    point_lines, sigma_lines = [], []
+    for j in range(len(network.points)):
+        rows = np.flatnonzero(seen.point == j)
+        rows = rows[np.argsort(seen.image[rows], kind="stable")]
+        frames = [f"{seen.image[r]} {_text(*xy[r])}" for r in rows]
+        point_lines.append(" ".join([_text(*estimate.points[j]), f"{len(rows)}", *frames]))
+        frames = [f"{seen.image[r]} {_text(*sigma[r])}" for r in rows]
+        sigma_lines.append(" ".join([f"{len(rows)}", *frames]))
+    write_lines(points, point_lines)
+    write_lines(sigmas, sigma_lines)
+
+
+def read_bundle_matlab_folder(folder: Path) -> tuple[Network, Estimate]:
+    """Read cams.txt, pts.txt, sigmas.txt (if it is there) and interior.txt of a folder.
+
+    Raises:
+        SurveyFileError: what is wrong, with file and line number.
+    """
+    text = Lines.of(folder / INTERIOR)
+    c, x0, y0 = (text.number_of(word) for word in text.due_words(3, "c x0 y0 (mm)"))
+    if not c > 0:
+        raise text.error(f"c is {c:g} mm, it must be positive")
+    text.end()
+    sigmas = folder / "sigmas.txt"
+    return read_bundle_matlab(
+        folder / "cams.txt",
+        folder / "pts.txt",
+        sigmas if sigmas.is_file() else None,
+        c_mm=c,
+        x0_mm=x0,
+        y0_mm=y0,
+    )
+
+
+def write_bundle_matlab_folder(folder: Path, network: Network, estimate: Estimate) -> None:
+    """Write cams.txt, pts.txt, sigmas.txt and interior.txt into a folder.
+
+    Raises:
+        OutputError: what the files have no place for, or they cannot be written.
+    """
+    _millimetres(network, estimate)  # refuses what cannot be held, before a folder is made
+    folder.mkdir(parents=True, exist_ok=True)
+    cameras, points, sigmas = folder / "cams.txt", folder / "pts.txt", folder / "sigmas.txt"
+    write_bundle_matlab(cameras, points, sigmas, network, estimate)
+    camera = estimate.cameras[0]
+    values = _text(*(camera.value(name) for name in ("c", "x0", "y0")))
+    write_lines(folder / INTERIOR, ["# c x0 y0 (mm), which the program asks for", values])
+
+
+def read_bundle_csharp(path: Path, *, pixel_mm: float = PIXEL_MM) -> tuple[Network, Estimate]:
+    """Read the file of the C# program as a network and its start values.
+
+    The program reads two photographs only; here there may be more.
+
+    Args:
+        path: the file.
+        pixel_mm: nominal size of a pixel, mm.
+
+    Raises:
+        SurveyFileError: what is wrong, with file and line number.
+    """
+    text = Lines.of(path)
+    words = text.due_row("photographs, c, x0 and y0")
+    if len(words) != 4:
+        raise text.error(f"{len(words)} words, needed the number of photographs, c, x0 and y0")
+    m = text.count_of(words[0], "photographs")
+    c, x0, y0 = (text.number_of(word) for word in words[1:])
+    if not c > 0:
+        raise text.error(f"c = {c:g} mm, it must be positive")
+    names, exterior = _exterior(text, m)
+    words = text.due_row("the number of points")
+    if len(words) != 1:
+        raise text.error(f"{len(words)} words, needed the number of points")
+    n = text.count_of(words[0], "points")
+    labels: list[str] = []
+    xyz, xy, sigma = [], [], []
+    for _ in range(n):
+        words = text.due_row(f"point {len(labels) + 1} of {n}")
+        if len(words) != 4 + 2 * m:
+            raise text.error(f"{len(words)} words, needed id X Y Z and x y of {m} photographs")
+        if words[0] in labels:
+            raise text.error(f"point {words[0]} stands twice")
+        labels.append(words[0])
+        values = [text.number_of(word) for word in words[1:]]
+        xyz.append(values[:3])
+        xy += [values[3 + 2 * i : 5 + 2 * i] for i in range(m)]
+    words = text.due_row("the sigmas of the first point")
+    if len(words) == 1:  # the program's reader allows their number to stand before them
+        words = text.due_row("the sigmas of the first point")
+    for j, label in enumerate(labels):
+        if j:
+            words = text.due_row(f"the sigmas of point {label}")
+        if len(words) != 1 + 2 * m or words[0] != label:
+            raise text.error(f"'{' '.join(words)[:40]}' where {label} and {2 * m} sigmas were due")
+        values = [text.number_of(word) for word in words[1:]]
+        sigma += [_positive(text, values[2 * i : 2 + 2 * i]) for i in range(m)]
+    text.end()
+    image = list(range(m)) * n
+    point = [j for j in range(n) for _ in range(m)]
+    return _network(names, exterior, tuple(labels), xyz, image, point, xy, sigma, (c, x0, y0), pixel_mm)
+
+
+def write_bundle_csharp(path: Path, network: Network, estimate: Estimate) -> None:
+    """Write a network as the file of the C# program, which wants every point in every photograph.
+
+    Raises:
+        OutputError: what the file has no place for, or it cannot be written.
+    """
+    xy, sigma = _millimetres(network, estimate)
+    seen = network.image_points
+    m, n = len(network.images), len(network.points)
+    row = np.full((n, m), -1)
+    row[seen.point, seen.image] = np.arange(len(seen))
+    if (row < 0).any():
+        j, i = np.argwhere(row < 0)[0]
+        raise OutputError(
+            f"{path}: point {network.points[j]} is not measured in {network.images[i]}; the file wants every "
+            "point in every photograph"
+        )
+    camera = estimate.cameras[0]
+    lines = [
+        _text(m, *(camera.value(name) for name in ("c", "x0", "y0"))),
+        *_exterior_lines(network, estimate),
+    ]
+    lines.append(f"{n}")
+    for j, name in enumerate(network.points):
+        lines.append(" ".join([_word(name), _text(*estimate.points[j], *xy[row[j]].ravel())]))
+    for j, name in enumerate(network.points):
+        lines.append(" ".join([_word(name), _text(*sigma[row[j]].ravel())]))
+    write_lines(path, lines)
+
+
+def _exterior(text: Lines, count: int | None) -> tuple[list[str], list[list[float]]]:
+    """Ids and omega, phi, kappa (deg), XL, YL, ZL of so many photographs, or of all to the end."""
+    names: list[str] = []
+    exterior = []
+    while count is None or len(names) < count:
+        words = text.row() if count is None else text.due_row(f"photograph {len(names) + 1} of {count}")
+        if words is None:
+            break
+        if len(words) != 7:
+            raise text.error(f"{len(words)} words, a photograph is id omega phi kappa XL YL ZL")
+        if words[0] in names:
+            raise text.error(f"photograph {words[0]} stands twice")
+        names.append(words[0])
+        exterior.append([text.number_of(word) for word in words[1:]])
+    if not names:
+        raise text.error("no photographs")
+    return names, exterior
+
+
+def _frames(text: Lines, words: list[str], m: int) -> tuple[list[int], list[list[float]]]:
+    """Frames and pairs of numbers of "count (frame a b)*"."""
+    count = text.count_of(words[0], "frames")
+    if len(words) != 1 + 3 * count:
+        raise text.error(f"{len(words) - 1} words after {count} frames, needed {3 * count}")
+    frames = [text.index_of(words[1 + 3 * k], m, "frame") for k in range(count)]
+    if len(set(frames)) < count:
+        raise text.error("a frame stands twice")
+    return frames, [[text.number_of(word) for word in words[2 + 3 * k : 4 + 3 * k]] for k in range(count)]
+
+
+def _positive(text: Lines, pair: list[float]) -> list[float]:
+    if min(pair) <= 0:
+        raise text.error(f"standard deviation {min(pair):g} mm, it must be positive")
+    return pair
+
+
+def _network(
+    names: list[str],
+    exterior: list[list[float]],
+    points: tuple[str, ...],
+    xyz: list[list[float]],
+    image: list[int],
+    point: list[int],
+    xy_mm: list[list[float]],
+    sigma_mm: list[list[float]] | None,
+    interior: tuple[float, float, float],
+    pixel_mm: float,
+) -> tuple[Network, Estimate]:
+    xy = np.array(xy_mm).reshape(-1, 2)
+    pixel = np.array([pixel_mm, pixel_mm])
+    width, height = 2 * np.ceil(BORDER * np.abs(xy).max(axis=0) / pixel).astype(int)
+    size = (int(width), int(height))
+    sigma = np.tile(pixel, (len(xy), 1)) if sigma_mm is None else np.array(sigma_mm).reshape(-1, 2)
+    c, x0, y0 = interior
+    camera = camera_from_values(
+        "camera", "brown", size, (pixel_mm, pixel_mm), c_mm=c, values=(("x0", x0), ("y0", y0))
+    )
+    table = np.array(exterior)
+    network = Network(
+        tuple(names),
+        np.zeros(len(names), dtype=np.int64),
+        points,
+        ImagePoints(
+            np.array(image, dtype=np.int64),
+            np.array(point, dtype=np.int64),
+            pixel_from_image(xy, size, pixel),
+            np.eye(2) * (sigma / pixel)[:, None, :] ** 2,
+        ),
+    )
+    rotation = np.array([rotation_from_angles(*np.deg2rad(row[:3])) for row in table])
+    return network, Estimate((camera,), table[:, 3:].copy(), rotation, np.array(xyz))
+
+
+def _millimetres(network: Network, estimate: Estimate) -> tuple[FloatArray, FloatArray]:
+    """Image points and their sigmas in mm, or why the files cannot hold the network."""
+    if len(estimate.cameras) != 1 or estimate.cameras[0].model != "brown":
+        raise OutputError("the files of the bundle programs know one camera, in model brown")
+    camera = estimate.cameras[0]
+    if camera.parameters[3:].any():
+        raise OutputError(
+            f"camera {camera.name}: the files of the bundle programs have no place for distortion"
+        )
+    if not (estimate.oriented.all() and estimate.determined.all()):
+        raise OutputError("the files of the bundle programs want start values of all photographs and points")
+    seen = network.image_points
+    sigma = np.sqrt(np.diagonal(seen.covariance, axis1=1, axis2=2)) * camera.pixel_mm
+    return image_from_pixel(seen.xy, camera.size_px, camera.pixel_mm), sigma
+
+
+def _exterior_lines(network: Network, estimate: Estimate) -> list[str]:
+    angles = np.rad2deg(angles_from_rotation(estimate.rotation))
+    return [
+        f"{_word(name)} {_text(*angles[i], *estimate.position[i])}" for i, name in enumerate(network.images)
+    ]
+
+
+def _word(name: str) -> str:
+    if not name or name.split() != [name] or "#" in name:
+        raise OutputError(f"'{name}': names in the files of the bundle programs are single words without #")
+    return name
+
+
+def _text(*values: float) -> str:
+    """Numbers with twelve digits, so that mm that went through pixels come back as they were written."""
+    return " ".join(f"{value:.12g}" for value in values)

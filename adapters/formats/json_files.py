@@ -1,0 +1,69 @@
+"""JSON files read as untrusted: their size bounded, their content checked against a model before use."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Annotated, TypeVar
+
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, StrictStr, StringConstraints, ValidationError
+
+from sfm.errors import SurveyFileError
+from sfm.files.csv_tables import MAX_NAME
+
+MAX_JSON_BYTES = 100_000_000  # names of some million points
+MAX_SIDE_PX = 1_000_000  # of a photograph; no sensor and no scan is larger
+MAX_PIXEL_MM = 1e3  # of a pixel; COLMAP's models without a size have 1 mm
+SHOWN = 40  # characters of what was found that a message repeats
+
+Name = Annotated[StrictStr, StringConstraints(min_length=1, max_length=MAX_NAME)]
+Side = Annotated[int, Field(ge=1, le=MAX_SIDE_PX, strict=True)]
+Pixel = Annotated[FiniteFloat, Field(gt=0, le=MAX_PIXEL_MM, strict=True)]
+
+
+class Content(BaseModel):
+    """What is read of a file; anything else in it is passed over."""
+
+    model_config = ConfigDict(extra="ignore", frozen=True)
+
+
+ContentT = TypeVar("ContentT", bound=Content)
+
+
+def read_json(path: Path, content: type[ContentT], what: str) -> ContentT:
+    """Read a file.
+
+    Args:
+        path: the file.
+        content: what must be in it.
+        what: the file is, for the message.
+
+    Raises:
+        SurveyFileError: unreadable, too large, no JSON, or something in it is not what it must be.
+    """
+    try:
+        size = path.stat().st_size
+        if size > MAX_JSON_BYTES:
+            raise SurveyFileError(f"{path}: {size} bytes, at most {MAX_JSON_BYTES} are read")
+        return content.model_validate_json(path.read_bytes())
+    except OSError as error:
+        raise SurveyFileError(f"{path}: cannot be read ({error.strerror})") from error
+    except ValidationError as error:
+        raise SurveyFileError(_first_error(path, error, what)) from error
+
+
+def _first_error(path: Path, error: ValidationError, what: str) -> str:
+    """Say the first thing that is wrong: where, what was found, what is needed."""
+    first = error.errors(include_url=False)[0]
+    message = " ".join(first["msg"].split())
+    if first["type"] == "json_invalid":
+        line = re.search(r" at line (\d+) column \d+$", message)
+        number, told = (line[1], message[: line.start()]) if line else ("1", message)
+        return f"{path}, line {number}: not {what} ({told})"
+    place = "".join(f"[{step}]" if isinstance(step, int) else f".{step}" for step in first["loc"]).lstrip(".")
+    if first["type"] == "missing":
+        return f"{path}: {place} is missing, which {what} needs"
+    found = " ".join(repr(first["input"])[: SHOWN + 1].split())
+    found = found if len(found) <= SHOWN else found[:SHOWN] + "..."
+    needed = message.removeprefix("Input should be ").removeprefix("Value error, ")
+    return f"{path}: {place or 'the content'} is {found}, needed {needed}"

@@ -1,0 +1,336 @@
+"""Agisoft Metashape camera and marker XML (File > Export > Export Cameras / Markers), read and written.
+
+    document/chunk/sensors/sensor            resolution, pixel size, calibration
+    document/chunk/cameras/camera            sensor_id, label, transform (16 numbers, by rows)
+    document/chunk/markers/marker            label, reference x y z [sx sy sz] enabled
+    document/chunk/frames/frame/markers      location camera_id x y per marker
+    document/chunk/transform                 rotation, translation, scale: object from chunk
+
+A camera's transform takes camera axes (x right, y down, z forward) into the chunk, so that
+R = (its rotation) diag(1, -1, -1). Image points count from the corner of the top-left pixel, 0.5 px more
+than Kolinear's. With x = X/Z, y = Y/Z of the camera axes and r2 = x2 + y2
+
+    x' = x (1 + k1 r2 + k2 r4 + k3 r6 + k4 r8) + p1 (r2 + 2 x2) + 2 p2 x y,   y' with p1, p2 exchanged
+    u = w/2 + cx + x' f + x' b1 + y' b2,   v = h/2 + cy + y' f
+
+which is `opencv` (k3 = k4 = b2 = 0) or `full_opencv` (k4 = b2 = 0) to the last digit, p1 and p2 exchanged,
+or with k4 `brown_forward` (b2 = 0), b1 being the ratio of the sides of a pixel. With b2 it is read as
+`brown_forward` with b1 and b2, which there act on the ideal point instead of the distorted: the difference,
+their product with the distortion, is a hundredth of a pixel for 100 px and 1e-4.
+
+Source: Agisoft Metashape Professional user manual 2.x, app. D "Camera models"; structure of the file as
+exported by versions 1.5 to 2.1.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from xml.sax.saxutils import quoteattr
+
+import numpy as np
+
+from adapters.formats.json_files import MAX_PIXEL_MM
+from adapters.formats.lines import write_lines
+from adapters.formats.xml_lines import Node, read_xml
+from sfm.camera import Camera, camera_from_values
+from sfm.conventions import FloatArray
+from sfm.errors import OutputError, SurveyFileError
+from sfm.network import Estimate, ImagePoints, Network, ObjectPoints
+from sfm.similarity import Similarity
+
+HALF_PIXEL = 0.5  # Metashape's pixel coordinates minus ours, px
+AXES = np.diag([1.0, -1.0, -1.0])  # Metashape's camera axes in ours
+CALIBRATION = ("f", "cx", "cy", "b1", "b2", "k1", "k2", "k3", "k4", "p1", "p2")
+MARKER_SIGMA_PX = 0.1  # Metashape's own default for markers placed by hand
+
+
+def read_metashape(path: Path) -> tuple[Network, Estimate]:
+    """Read an export as a network and its solution: cameras of one chunk, markers as object points.
+
+    Markers with an enabled reference are control points; the reference of a marker is its start value.
+    Cameras without transform have no orientation.
+
+    Raises:
+        SurveyFileError: what is wrong, with file and line number.
+    """
+    root = read_xml(path)
+    chunk = root if root.tag == "chunk" else root.one("chunk")
+    sensors = chunk.one("sensors").all("sensor")
+    if not sensors:
+        raise chunk.error("no sensors")
+    cameras = tuple(_camera(sensor) for sensor in sensors)
+    sensor_index = {sensor.attribute("id"): k for k, sensor in enumerate(sensors)}
+    object_from_chunk = _chunk_transform(chunk)
+    nodes = [
+        node
+        for group in (chunk.one("cameras"), *chunk.one("cameras").all("group"))
+        for node in group.all("camera")
+    ]
+    images = {node.attribute("id"): i for i, node in enumerate(nodes)}
+    m = len(nodes)
+    position, rotation = np.full((m, 3), np.nan), np.full((m, 3, 3), np.nan)
+    camera_index = np.empty(m, dtype=np.int64)
+    for i, node in enumerate(nodes):
+        sensor = node.attribute("sensor_id")
+        if sensor not in sensor_index:
+            raise node.error(f"sensor_id {sensor}, there is no such sensor")
+        camera_index[i] = sensor_index[sensor]
+        transform = node.maybe("transform")
+        if transform is not None:
+            T = transform.numbers(16).reshape(4, 4)
+            position[i] = object_from_chunk.apply(T[:3, 3])
+            rotation[i] = object_from_chunk.rotation @ T[:3, :3] @ AXES
+    labels, xyz, control = _markers(chunk)
+    seen = _locations(chunk, labels, images)
+    index = {identifier: j for j, identifier in enumerate(labels)}
+    network = Network(
+        tuple(node.attribute("label") for node in nodes),
+        camera_index,
+        tuple(labels.values()),
+        ImagePoints(
+            np.array([images[camera] for camera, _, _ in seen], dtype=np.int64),
+            np.array([index[marker] for _, marker, _ in seen], dtype=np.int64),
+            np.array([xy for _, _, xy in seen]).reshape(-1, 2) - HALF_PIXEL,
+            np.tile(MARKER_SIGMA_PX**2 * np.eye(2), (len(seen), 1, 1)),
+        ),
+        control,
+    )
+    return network, Estimate(cameras, position, rotation, xyz)
+
+
+def write_metashape(path: Path, network: Network, estimate: Estimate) -> None:
+    """Write a network and its solution as an export of one chunk, points as markers.
+
+    Raises:
+        OutputError: a camera model that Metashape has no equal of, or the file cannot be written.
+    """
+    sensors = [line for k, camera in enumerate(estimate.cameras) for line in _sensor_lines(k, camera)]
+    cameras = []
+    for i, name in enumerate(network.images):
+        head = f'      <camera id="{i}" sensor_id="{network.camera[i]}" label={quoteattr(name)}'
+        if not estimate.oriented[i]:
+            cameras.append(head + "/>")
+            continue
+        T = np.eye(4)
+        T[:3, :3], T[:3, 3] = estimate.rotation[i] @ AXES, estimate.position[i]
+        cameras += [
+            head + ">",
+            f"        <transform>{' '.join(repr(float(v)) for v in T.ravel())}</transform>",
+            "      </camera>",
+        ]
+    sigma = {
+        int(j): np.sqrt(np.diagonal(C))
+        for j, C in zip(network.control.point, network.control.covariance, strict=True)
+    }
+    markers, locations = [], []
+    for j, name in enumerate(network.points):
+        reference = _reference(estimate.points[j], sigma.get(j))
+        markers.append(f'      <marker id="{j}" label={quoteattr(name)}>{reference}</marker>')
+        locations.append(f'          <marker marker_id="{j}">')
+        for row in np.flatnonzero(network.image_points.point == j):
+            x, y = (repr(float(v)) for v in network.image_points.xy[row] + HALF_PIXEL)
+            camera = network.image_points.image[row]
+            locations.append(f'            <location camera_id="{camera}" pinned="true" x="{x}" y="{y}"/>')
+        locations.append("          </marker>")
+    write_lines(
+        path,
+        [
+            '<?xml version="1.0" encoding="UTF-8"?>',
+            '<document version="2.0.0">',
+            '  <chunk label="Kolinear" enabled="true">',
+            f'    <sensors next_id="{len(estimate.cameras)}">',
+            *sensors,
+            "    </sensors>",
+            f'    <cameras next_id="{len(network.images)}" next_group_id="0">',
+            *cameras,
+            "    </cameras>",
+            f'    <markers next_id="{len(network.points)}" next_group_id="0">',
+            *markers,
+            "    </markers>",
+            '    <frames next_id="1">',
+            '      <frame id="0">',
+            "        <markers>",
+            *locations,
+            "        </markers>",
+            "      </frame>",
+            "    </frames>",
+            "  </chunk>",
+            "</document>",
+        ],
+    )
+
+
+def _camera(sensor: Node) -> Camera:
+    """Read a sensor in the model that says the same."""
+    if sensor.attributes.get("type", "frame") != "frame":
+        raise sensor.error(f"sensor of type {sensor.attributes['type']}, only frame sensors can be read")
+    resolution = sensor.one("resolution")
+    size = (resolution.side_px("width"), resolution.side_px("height"))
+    given = {node.attribute("name"): node for node in sensor.all("property")}
+    pixel = tuple(
+        given[name].number("value") if name in given else 1.0 for name in ("pixel_width", "pixel_height")
+    )
+    if not all(0 < side <= MAX_PIXEL_MM for side in pixel):
+        raise sensor.error(f"pixels of {pixel[0]:g} x {pixel[1]:g} mm, needed 0 to {MAX_PIXEL_MM:g}")
+    calibrations = sensor.all("calibration")
+    if not calibrations:
+        raise sensor.error("sensor without calibration")
+    adjusted = [node for node in calibrations if node.attributes.get("class") == "adjusted"]
+    node = (adjusted or calibrations)[0]
+    p = dict.fromkeys(CALIBRATION, 0.0)
+    listed = [child for child in node.children if child.tag in p]
+    p |= {child.tag: float(child.numbers(1)[0]) for child in listed}
+    f = p["f"]
+    if not (f > 0 and f + p["b1"] > 0):
+        raise node.error(f"f = {f:g} px, b1 = {p['b1']:g} px: f and f + b1 must be positive")
+    centre = (np.array(size) - 1) / 2
+    free = {child.tag for child in listed}
+    label = sensor.attributes.get("label", sensor.attribute("id"))
+    if p["k4"] == 0 and p["b2"] == 0:
+        model = "opencv" if p["k3"] == 0 else "full_opencv"
+        values = {"fx": f + p["b1"], "fy": f, "cx": centre[0] + p["cx"], "cy": centre[1] + p["cy"]}
+        values |= {"k1": p["k1"], "k2": p["k2"], "p1": p["p2"], "p2": p["p1"]}
+        values |= {"k3": p["k3"]} if model == "full_opencv" else {}
+        names = {"f": ("fx", "fy"), "b1": ("fx",), "p1": ("p2",), "p2": ("p1",)}
+        names |= {name: (name,) for name in ("cx", "cy", "k1", "k2")}
+        names |= {"k3": ("k3",)} if model == "full_opencv" else {}
+    else:
+        model = "brown_forward"
+        if p["b2"] == 0:
+            pixel = (pixel[1] * f / (f + p["b1"]), pixel[1])
+        elif not np.isclose(pixel[0], pixel[1], rtol=1e-9):
+            raise sensor.error("pixels that are not square together with b2 cannot be read")
+        c = f * pixel[1]
+        values = {"x0": p["cx"] * pixel[0], "y0": -p["cy"] * pixel[1]}
+        values |= {"b1": p["b1"] / f, "b2": -p["b2"] / f} if p["b2"] else {}
+        values |= {f"K{i}": p[f"k{i}"] / c ** (2 * i) for i in (1, 2, 3, 4)}
+        values |= {"P1": p["p1"] / c, "P2": -p["p2"] / c}
+        names = {"f": ("c",), "cx": ("x0",), "cy": ("y0",)}
+        names |= {name: (name.upper(),) for name in ("k1", "k2", "k3", "k4", "p1", "p2")}
+        names |= {"b1": ("b1",), "b2": ("b2",)}
+    return camera_from_values(
+        label,
+        model,
+        size,
+        (float(pixel[0]), float(pixel[1])),
+        c_mm=f * pixel[1],
+        free=tuple(name for tag in CALIBRATION if tag in free for name in names.get(tag, ())),
+        values=tuple((name, float(value)) for name, value in values.items()),
+    )
+
+
+def _sensor_lines(number: int, camera: Camera) -> list[str]:
+    """Write a sensor, or say why Metashape has no equal of the camera."""
+    width, height = camera.size_px
+    centre = (np.array(camera.size_px) - 1) / 2
+    p = dict.fromkeys(CALIBRATION, 0.0)
+    if camera.model in ("opencv", "full_opencv"):
+        if camera.model == "full_opencv" and any(camera.value(name) for name in ("k4", "k5", "k6")):
+            raise OutputError(
+                f"camera {camera.name}: Metashape has no k4-k6 of full_opencv, convert it to brown_forward"
+            )
+        p |= {"f": camera.value("fy"), "b1": camera.value("fx") - camera.value("fy")}
+        p |= {"cx": camera.value("cx") - centre[0], "cy": camera.value("cy") - centre[1]}
+        p |= {"k1": camera.value("k1"), "k2": camera.value("k2")}
+        p |= {"p1": camera.value("p2"), "p2": camera.value("p1")}
+        p |= {"k3": camera.value("k3")} if camera.model == "full_opencv" else {}
+    elif camera.model == "brown_forward" and not (camera.value("b1") or camera.value("b2")):
+        c, (sx, sy) = camera.value("c"), camera.pixel_mm
+        p |= {"f": c / sy, "b1": c / sx - c / sy}
+        p |= {"cx": camera.value("x0") / sx, "cy": -camera.value("y0") / sy}
+        p |= {f"k{i}": camera.value(f"K{i}") * c ** (2 * i) for i in (1, 2, 3, 4)}
+        p |= {"p1": camera.value("P1") * c, "p2": -camera.value("P2") * c}
+    else:
+        raise OutputError(
+            f"camera {camera.name}: Metashape has no model {camera.model} with affinity of the ideal point, "
+            "convert it to brown_forward with affinity in the pixel size, or to opencv"
+        )
+    resolution = f'<resolution width="{width}" height="{height}"/>'
+    return [
+        f'      <sensor id="{number}" label={quoteattr(camera.name)} type="frame">',
+        f"        {resolution}",
+        f'        <property name="pixel_width" value="{float(camera.pixel_mm[0])!r}"/>',
+        f'        <property name="pixel_height" value="{float(camera.pixel_mm[1])!r}"/>',
+        '        <calibration type="frame" class="adjusted">',
+        f"          {resolution}",
+        *(
+            f"          <{name}>{float(value)!r}</{name}>"
+            for name, value in p.items()
+            if value or name == "f"
+        ),
+        "        </calibration>",
+        "      </sensor>",
+    ]
+
+
+def _chunk_transform(chunk: Node) -> Similarity:
+    """Object from chunk, of the chunk or of its only component; the identity if there is none."""
+    node = chunk.maybe("transform")
+    if node is None:
+        components = chunk.maybe("components")
+        inner = [] if components is None else components.all("component")
+        node = inner[0].maybe("transform") if len(inner) == 1 else None
+    if node is None or not node.children:
+        return Similarity(1.0, np.eye(3), np.zeros(3))
+    return Similarity(
+        float(node.one("scale").numbers(1)[0]),
+        node.one("rotation").numbers(9).reshape(3, 3),
+        node.one("translation").numbers(3),
+    )
+
+
+def _markers(chunk: Node) -> tuple[dict[str, str], FloatArray, ObjectPoints]:
+    """Labels of the markers by id, their coordinates, and those that are control."""
+    markers = chunk.maybe("markers")
+    nodes = [] if markers is None else markers.all("marker")
+    labels: dict[str, str] = {}
+    xyz = np.full((len(nodes), 3), np.nan)
+    control, sigma = [], []
+    for j, node in enumerate(nodes):
+        identifier = node.attribute("id")
+        if identifier in labels:
+            raise node.error(f"marker id {identifier} stands twice")
+        labels[identifier] = node.attribute("label")
+        reference = node.maybe("reference")
+        if reference is None or "x" not in reference.attributes:
+            continue
+        xyz[j] = [reference.number(axis) for axis in "xyz"]
+        if reference.attributes.get("enabled") in ("true", "1"):
+            control.append(j)
+            named = [f"s{axis}" for axis in "xyz"]
+            sigma.append([reference.number(n) if n in reference.attributes else 0.0 for n in named])
+    covariance = np.eye(3) * np.array(sigma).reshape(-1, 1, 3) ** 2
+    chosen = np.array(control, dtype=np.int64)
+    return labels, xyz, ObjectPoints(chosen, xyz[chosen], covariance)
+
+
+def _locations(
+    chunk: Node, labels: dict[str, str], images: dict[str, int]
+) -> list[tuple[str, str, tuple[float, float]]]:
+    """Image points as (camera id, marker id, x y as they stand there)."""
+    frames = chunk.maybe("frames")
+    found = []
+    for frame in [] if frames is None else frames.all("frame")[:1]:
+        group = frame.maybe("markers")
+        for marker in [] if group is None else group.all("marker"):
+            identifier = marker.attribute("marker_id")
+            if identifier not in labels:
+                raise marker.error(f"marker_id {identifier}, there is no such marker")
+            for node in marker.all("location"):
+                camera = node.attribute("camera_id")
+                if camera not in images:
+                    raise node.error(f"camera_id {camera}, there is no such camera")
+                found.append((camera, identifier, (node.number("x"), node.number("y"))))
+    if len({(camera, marker) for camera, marker, _ in found}) < len(found):
+        raise SurveyFileError(f"{chunk.path}: a marker stands twice in one camera")
+    return found
+
+
+def _reference(xyz: FloatArray, sigma: FloatArray | None) -> str:
+    if not np.isfinite(xyz).all():
+        return ""
+    named = " ".join(f'{axis}="{float(v)!r}"' for axis, v in zip("xyz", xyz, strict=True))
+    if sigma is None:
+        return f'<reference {named} enabled="false"/>'
+    named += " " + " ".join(f's{axis}="{float(s)!r}"' for axis, s in zip("xyz", sigma, strict=True))
+    return f'<reference {named} enabled="true"/>'

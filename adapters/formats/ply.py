@@ -1,0 +1,101 @@
+"""Object points as a PLY point cloud in text form, read and written.
+
+Vertices have x, y, z and, where they are known, the standard deviations sx, sy, sz; names of points follow
+as comments "name <id>", one for each vertex in order, which other programs pass over.
+
+Source: Turk (1994), The PLY polygon file format, Stanford.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from adapters.formats.lines import Lines, write_lines
+from sfm.conventions import FloatArray
+from sfm.errors import OutputError
+
+NUMBER_TYPES = {
+    *("char", "uchar", "short", "ushort", "int", "uint", "float", "double"),
+    *("int8", "uint8", "int16", "uint16", "int32", "uint32", "float32", "float64"),
+}
+SIGMAS = ("sx", "sy", "sz")
+
+
+def read_ply(path: Path) -> tuple[tuple[str, ...], FloatArray, FloatArray]:
+    """Read the vertices of a PLY file in text form.
+
+    Returns:
+        Names (from 1 where the file has none), coordinates (n, 3), and standard deviations (n, 3), NaN where
+        the file has none.
+
+    Raises:
+        SurveyFileError: what is wrong, with file and line number; also for binary files.
+    """
+    text = Lines.of(path)
+    if not text.lines or text.line().strip() != "ply":
+        text.number = 1
+        raise text.error("not a PLY file: the first line must be 'ply'")
+    names: list[str] = []
+    columns: list[str] = []
+    count = None
+    element = ""
+    while (words := text.line().split())[:1] != ["end_header"]:
+        if words[:1] == ["format"] and words[1:2] != ["ascii"]:
+            raise text.error(f"format {' '.join(words[1:])}, only ascii can be read")
+        if words[:2] == ["comment", "name"]:
+            names.append(" ".join(words[2:]))
+        elif words[:1] == ["element"]:
+            if len(words) != 3:
+                raise text.error("an element is 'element NAME COUNT'")
+            element = words[1]
+            if element == "vertex":
+                count = text.count_of(words[2], "vertices")
+            elif count is None:
+                raise text.error(f"element {element} before the vertices")
+        elif words[:1] == ["property"] and element == "vertex":
+            if len(words) != 3 or words[1] not in NUMBER_TYPES:
+                raise text.error(f"'{' '.join(words)}', needed 'property TYPE NAME'")
+            columns.append(words[2])
+    if count is None or not {"x", "y", "z"} <= set(columns):
+        raise text.error("the header has no vertices with x, y and z")
+    if names and len(names) != count:
+        raise text.error(f"{len(names)} names for {count} vertices")
+    table = np.empty((count, len(columns)))
+    for j in range(count):
+        words = text.due_row(f"vertex {j} of {count}")
+        if len(words) != len(columns):
+            raise text.error(f"{len(words)} words, a vertex has {len(columns)}")
+        table[j] = [text.number_of(word) for word in words]
+    xyz = table[:, [columns.index(axis) for axis in "xyz"]]
+    sigma = np.full((count, 3), np.nan)
+    if set(SIGMAS) <= set(columns):
+        sigma = table[:, [columns.index(name) for name in SIGMAS]]
+    return tuple(names) or tuple(f"{j + 1}" for j in range(count)), xyz, sigma
+
+
+def write_ply(path: Path, names: tuple[str, ...], xyz: FloatArray, sigma: FloatArray | None = None) -> None:
+    """Write points with their names and, if given, standard deviations (n, 3); points with NaN are left out.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    if any(" ".join(name.split()) != name for name in names):
+        raise OutputError("PLY: names of points cannot begin or end with a space or have two in a row")
+    table = np.asarray(xyz) if sigma is None else np.hstack([xyz, sigma])
+    kept = np.flatnonzero(np.isfinite(table).all(axis=1))
+    columns = ("x", "y", "z") if sigma is None else ("x", "y", "z", *SIGMAS)
+    write_lines(
+        path,
+        [
+            "ply",
+            "format ascii 1.0",
+            "comment kolinear",
+            *(f"comment name {names[j]}" for j in kept),
+            f"element vertex {len(kept)}",
+            *(f"property double {name}" for name in columns),
+            "end_header",
+            *(" ".join(repr(float(value)) for value in table[j]) for j in kept),
+        ],
+    )

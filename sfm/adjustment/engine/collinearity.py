@@ -1,0 +1,192 @@
+"""The collinearity equations of one image point: weighted residual and derivatives.
+
+    (U, V, W) = M (X - X0),  u = -U/W,  v = -V/W,  r = model(u, v, p) - measured
+
+The unknowns of a photograph are its projection centre X0 and a small rotation w in its own image
+axes, R <- R exp([w]x), so that d(U, V, W)/dw = [(U, V, W)]x and no angle is singular.
+
+Source: Kraus, Photogrammetry (2007), sec. 5.3; small rotations as in Foerstner and Wrobel (2016),
+sec. 8.1 and 12.2.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from sfm.conventions import BoolArray, FloatArray, IntArray
+from sfm.distortion.models import MAX_PARAMETERS, observe
+from sfm.kernels.options import kernel
+
+
+class Observations(NamedTuple):
+    """Image points in the order of their object points, as compiled code takes them."""
+
+    start: IntArray  # first image point of each object point, and the end, (n + 1,)
+    image: IntArray  # photograph of each image point, (k,)
+    point: IntArray  # object point of each image point, (k,)
+    xy: FloatArray  # measured pixel, px, (k, 2)
+    whitening: FloatArray  # a, b, c of F = (a 0; b c) with F'F = inverse covariance, 1/px, (k, 3)
+    camera: IntArray  # camera of each photograph, (m,)
+    model: IntArray  # number of the distortion model of each camera, (a,)
+    frame: FloatArray  # photograph centre (px) and pixel size (mm) of each camera, (a, 4)
+    interior: IntArray  # how many parameters the model of each camera has, 0 if none is free, (a,)
+    free_count: IntArray  # how many parameters of each camera are free, (a,)
+    free_index: IntArray  # which they are, (a, MAX_PARAMETERS)
+    free_column: IntArray  # their columns among the reduced unknowns, (a, MAX_PARAMETERS)
+
+
+class State(NamedTuple):
+    """Values of all parameters, as compiled code takes them."""
+
+    position: FloatArray  # X0, (m, 3)
+    M: FloatArray  # object to image axes, (m, 3, 3)
+    parameters: FloatArray  # interior orientation, (a, MAX_PARAMETERS)
+    points: FloatArray  # X, (n, 3)
+
+
+class Scratch(NamedTuple):
+    """Space of one image point for the compiled functions."""
+
+    r: FloatArray  # weighted residual, (2,)
+    Ju: FloatArray  # d r / d (u, v), px, (2, 2)
+    Jp: FloatArray  # d r / d all interior parameters, (2, MAX_PARAMETERS)
+    A: FloatArray  # weighted d r / d (X0, w, all interior parameters), (2, 6 + MAX_PARAMETERS)
+    B: FloatArray  # weighted d r / d X, (2, 3)
+
+
+@njit(cache=True, inline="always", error_model="numpy")
+def scratch():  # type: ignore[no-untyped-def]
+    """Return space for one image point."""
+    return Scratch(
+        np.empty(2),
+        np.empty((2, 2)),
+        np.zeros((2, MAX_PARAMETERS)),
+        np.zeros((2, 6 + MAX_PARAMETERS)),
+        np.empty((2, 3)),
+    )
+
+
+@njit(cache=True, inline="always", error_model="numpy")
+def collinearity(o, obs, state, weight, t):  # type: ignore[no-untyped-def]
+    """Fill the weighted residual and derivatives of image point o; False if it is behind the camera."""
+    i, j = obs.image[o], obs.point[o]
+    a = obs.camera[i]
+    m00, m01, m02 = state.M[i, 0, 0], state.M[i, 0, 1], state.M[i, 0, 2]
+    m10, m11, m12 = state.M[i, 1, 0], state.M[i, 1, 1], state.M[i, 1, 2]
+    m20, m21, m22 = state.M[i, 2, 0], state.M[i, 2, 1], state.M[i, 2, 2]
+    dX = state.points[j, 0] - state.position[i, 0]
+    dY = state.points[j, 1] - state.position[i, 1]
+    dZ = state.points[j, 2] - state.position[i, 2]
+    U = m00 * dX + m01 * dY + m02 * dZ
+    V = m10 * dX + m11 * dY + m12 * dZ
+    W = m20 * dX + m21 * dY + m22 * dZ
+    inverse = -1.0 / W
+    u, v = U * inverse, V * inverse
+    observe(
+        obs.model[a], obs.frame[a], state.parameters[a], obs.xy[o, 0], obs.xy[o, 1], u, v, t.r, t.Ju, t.Jp
+    )
+    root = np.sqrt(weight)
+    f00, f10, f11 = root * obs.whitening[o, 0], root * obs.whitening[o, 1], root * obs.whitening[o, 2]
+    t.r[1] = f10 * t.r[0] + f11 * t.r[1]
+    t.r[0] = f00 * t.r[0]
+    # weighted d r / d (U, V, W): du/d(U, V, W) = -(1, 0, u)/W because u = -U/W
+    xU, xV = f00 * t.Ju[0, 0] * inverse, f00 * t.Ju[0, 1] * inverse
+    yU = (f10 * t.Ju[0, 0] + f11 * t.Ju[1, 0]) * inverse
+    yV = (f10 * t.Ju[0, 1] + f11 * t.Ju[1, 1]) * inverse
+    xW, yW = xU * u + xV * v, yU * u + yV * v
+    # d (U, V, W)/d X = M = -d (U, V, W)/d X0
+    t.B[0, 0] = xU * m00 + xV * m10 + xW * m20
+    t.B[0, 1] = xU * m01 + xV * m11 + xW * m21
+    t.B[0, 2] = xU * m02 + xV * m12 + xW * m22
+    t.B[1, 0] = yU * m00 + yV * m10 + yW * m20
+    t.B[1, 1] = yU * m01 + yV * m11 + yW * m21
+    t.B[1, 2] = yU * m02 + yV * m12 + yW * m22
+    for b in range(3):
+        t.A[0, b] = -t.B[0, b]
+        t.A[1, b] = -t.B[1, b]
+    # d (U, V, W)/d w = [(U, V, W)]x
+    t.A[0, 3], t.A[0, 4], t.A[0, 5] = xV * W - xW * V, xW * U - xU * W, xU * V - xV * U
+    t.A[1, 3], t.A[1, 4], t.A[1, 5] = yV * W - yW * V, yW * U - yU * W, yU * V - yV * U
+    for s in range(obs.interior[a]):  # all, not only free ones: gathering them here would cost more
+        t.A[0, 6 + s] = f00 * t.Jp[0, s]
+        t.A[1, 6 + s] = f10 * t.Jp[0, s] + f11 * t.Jp[1, s]
+    return W < 0.0
+
+
+def sum_of_squares(obs: Observations, state: State, weight: FloatArray) -> float:
+    """Return v'Pv of the image points; infinite where one of weight > 0 lies behind its camera."""
+    return float(_residuals(obs, state, weight, np.empty((0, 2))))
+
+
+def residuals(obs: Observations, state: State) -> FloatArray:
+    """Return v = computed - measured of all image points, px, (k, 2); NaN behind the camera."""
+    v = np.empty((len(obs.image), 2))
+    _residuals(obs, state, np.ones(len(v)), v)
+    return v
+
+
+@njit(cache=True, error_model="numpy")
+def _residuals(obs, state, weight, v):  # type: ignore[no-untyped-def]
+    """Return v'Pv and write the residuals into v unless it is empty (one kernel: compiling takes seconds)."""
+    t = scratch()
+    wanted = len(v) > 0
+    total = 0.0
+    for o in range(len(obs.image)):
+        if weight[o] > 0.0:
+            in_front = _residual(o, obs, state, t)
+            if wanted:
+                v[o, 0] = t.r[0] if in_front else np.nan
+                v[o, 1] = t.r[1] if in_front else np.nan
+            elif not in_front:
+                return np.inf
+            x = obs.whitening[o, 0] * t.r[0]
+            y = obs.whitening[o, 1] * t.r[0] + obs.whitening[o, 2] * t.r[1]
+            total += weight[o] * (x * x + y * y)
+    return total
+
+
+@njit(cache=True, inline="always", error_model="numpy")
+def _residual(o, obs, state, t):  # type: ignore[no-untyped-def]
+    """Fill the unweighted residual of image point o; False if it is behind the camera."""
+    i, j = obs.image[o], obs.point[o]
+    a = obs.camera[i]
+    dX = state.points[j, 0] - state.position[i, 0]
+    dY = state.points[j, 1] - state.position[i, 1]
+    dZ = state.points[j, 2] - state.position[i, 2]
+    U = state.M[i, 0, 0] * dX + state.M[i, 0, 1] * dY + state.M[i, 0, 2] * dZ
+    V = state.M[i, 1, 0] * dX + state.M[i, 1, 1] * dY + state.M[i, 1, 2] * dZ
+    W = state.M[i, 2, 0] * dX + state.M[i, 2, 1] * dY + state.M[i, 2, 2] * dZ
+    inverse = -1.0 / W
+    observe(
+        obs.model[a],
+        obs.frame[a],
+        state.parameters[a],
+        obs.xy[o, 0],
+        obs.xy[o, 1],
+        U * inverse,
+        V * inverse,
+        t.r,
+        t.Ju,
+        t.Jp,
+    )
+    return W < 0.0  # one way out: with an early return the compiler keeps the unused derivatives
+
+
+def behind_camera(obs: Observations, state: State) -> BoolArray:
+    """Return which image points belong to object points behind their camera or undetermined, (k,)."""
+    behind = np.empty(len(obs.image), dtype=np.bool_)
+    _behind(obs, state, behind)
+    return behind
+
+
+@kernel
+def _behind(obs, state, behind):  # type: ignore[no-untyped-def]
+    for o in range(len(behind)):
+        i, j = obs.image[o], obs.point[o]
+        W = 0.0
+        for p in range(3):
+            W += state.M[i, 2, p] * (state.points[j, p] - state.position[i, p])
+        behind[o] = not W < 0.0

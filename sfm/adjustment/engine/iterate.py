@@ -1,0 +1,310 @@
+"""Iteration of the normal equations to the least sum of squares.
+
+Gauss-Newton with an Armijo line search, or Levenberg-Marquardt to get near and Gauss-Newton to end:
+the last steps are undamped in either case. Where only the values are wanted, the step that shows
+convergence may be taken with the reduced matrix of the step before, for the gradient of its own state
+(simplified Newton). A step that would bring a point behind a camera has an infinite sum of squares and
+is shortened or damped. Converged means that the predicted change of the adjusted observations, |A dx|
+weighted, is at most `tolerance` times the residuals |v|, or at most MIN_SHIFT, so that no unknown would
+move by more than that share of its own a priori standard deviation.
+
+Source: Boerlin and Grussenmeyer (2013), Photogrammetric Record 28(144), for criterion, line search and
+veto; Nielsen (1999), IMM-REP-1999-05, for the damping; Deuflhard (2011), Newton Methods for Nonlinear
+Problems, sec. 2.1.2, for the simplified step.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NoReturn
+
+import numpy as np
+
+from sfm.adjustment.datum import Datum, Motions, motions_of
+from sfm.adjustment.engine.collinearity import State, sum_of_squares
+from sfm.adjustment.engine.connectivity import Order, pattern_of
+from sfm.adjustment.engine.normals import Equations, Space, new_space, normal_equations, point_step
+from sfm.adjustment.engine.observed_unknowns import Weighted, weighted_vPv
+from sfm.adjustment.engine.solvers.banded import BandFactor, factor_band
+from sfm.adjustment.engine.solvers.dense import Factor, factor
+from sfm.adjustment.engine.solvers.pairs import Pairs
+from sfm.adjustment.engine.unknowns import Unknowns, step
+from sfm.conventions import FloatArray
+from sfm.errors import GeometryError
+
+TOLERANCE = 1e-6
+MIN_SHIFT = 1e-6
+ARMIJO = 1e-4  # share of the predicted decrease that a step must bring (Nocedal and Wright, sec. 3.1)
+SHORTEST = 2.0**-12  # shortest share of a Gauss-Newton step that is tried
+START_DAMPING = 1e-3  # share of the diagonal
+NEAR = 1e-2  # |A dx| / |v| below which Levenberg-Marquardt hands over to Gauss-Newton
+MAX_DAMPING = 1e10
+ROUNDING = 1e-12  # relative difference of two sums of the same squares in another order
+FAR = 0.9  # |A dx| / |v| down to which the step after the next is not expected to be the last
+SIMPLIFIED = 0.8  # |A dx| / |v| of a step below which its reduced matrix may show that the next is the last
+COARSE = 1e-2  # |A dx| / |v| down to which steps may come from a product in single precision
+SINGLE_FROM = 200  # reduced unknowns from which the product in single precision saves time
+METHODS = ("gauss-newton", "levenberg-marquardt", "undamped")
+
+
+@dataclass(frozen=True)
+class Optimum:
+    """Where an iteration ended, with the undamped normal equations of its last step."""
+
+    state: State
+    equations: Equations
+    factor: Factor | BandFactor
+    motions: Motions
+    converged: bool
+    iterations: int
+    vPv: float
+
+
+@dataclass(frozen=True)
+class Problem:
+    """What stays the same over all steps and rounds of an adjustment."""
+
+    layout: Unknowns  # order of the unknowns
+    weighted: Weighted  # observed unknowns
+    datum: Datum  # kind and points
+    space: Space  # for the normal equations, used again and again
+    pattern: Order | Pairs | None  # a band, or a full matrix summed pair by pair or as a product (None)
+
+
+@dataclass(frozen=True)
+class Move:
+    """A step in the datum."""
+
+    reduced: FloatArray  # of the reduced unknowns, (reduced,)
+    points: FloatArray  # of the object points, (n, 3)
+    predicted: float  # g'N^-1 g = |A dx|^2 without damping
+    vPv: float  # where it starts
+
+
+@dataclass(frozen=True)
+class Step(Move):
+    """A step and what it was taken from."""
+
+    equations: Equations
+    factor: Factor | BandFactor
+    motions: Motions
+
+    def move(self) -> Move:
+        """Return it without the normal equations, which fill memory."""
+        return Move(self.reduced, self.points, self.predicted, self.vPv)
+
+    def within(self, share: float) -> bool:
+        """Whether |A dx| is at most this share of |v|, or MIN_SHIFT."""
+        return bool(np.sqrt(self.predicted) <= max(share * np.sqrt(self.vPv), MIN_SHIFT))
+
+
+def problem_of(layout: Unknowns, weighted: Weighted, datum: Datum) -> Problem:
+    """Return what all steps of an adjustment have in common; chooses how the normal equations are summed."""
+    return Problem(layout, weighted, datum, new_space(layout), pattern_of(layout))
+
+
+def iterate(
+    problem: Problem,
+    state: State,
+    weight: FloatArray,
+    *,
+    method: str = "gauss-newton",
+    max_iterations: int = 50,
+    tolerance: float = TOLERANCE,
+    near: bool = False,
+    exact: bool = True,
+) -> Optimum:
+    """Return the state of least weighted sum of squares.
+
+    Args:
+        problem: what is adjusted.
+        state: where to start.
+        weight: factor on the weight of each image point, shape (k,).
+        method: gauss-newton, levenberg-marquardt, or undamped (Gauss-Newton with full steps, to compare).
+        max_iterations: steps to try at most.
+        tolerance: |A dx| / |v| at which the iteration has converged.
+        near: whether the start is near the optimum, so that no step is taken in single precision.
+        exact: whether the factor must belong to the normal equations of the last step, as a covariance needs
+            it; else it may belong to those of the step before.
+
+    Raises:
+        GeometryError: unknown method, or start values whose normal equations cannot be solved.
+    """
+    if method not in METHODS:
+        raise GeometryError(f"adjustment: method '{method}' is none of {', '.join(METHODS)}")
+    layout = problem.layout
+    single = problem.pattern is None and layout.reduced >= SINGLE_FROM and not near
+    taken, first = 0, state
+    if method == "levenberg-marquardt":
+        state, taken = _approach(problem, state, weight, max_iterations, single)
+        single = False
+    share = 1.0
+    before: tuple[State, Move] | None = None
+    limit = np.inf
+    shortest = 1.0 if method == "undamped" else SHORTEST
+    last: Factor | BandFactor | None = None
+    while True:
+        found = _solve(problem, state, weight, single=single, limit=limit, last=last, tolerance=tolerance)
+        if found is None:
+            if before is None:
+                if state is first:
+                    _refuse(problem, state)
+                state = first  # the damped steps have led where nothing can be solved
+                continue
+            start, tried = before
+            better = _line_search(problem, start, weight, tried, share / 2, shortest)
+            if better is None:  # no share of the last step leads where they can be solved
+                state, found = start, _solve(problem, start, weight)
+                break
+            (state, share), limit = better, np.inf
+            continue
+        if found.within(tolerance) or taken >= max_iterations:
+            break
+        taken += 1
+        single = single and not found.within(FAR)
+        before, share = (state, found.move()), 1.0
+        state = step(layout, state, found.reduced, found.points)  # tried by the next normal equations
+        limit = _most_allowed(before[1], share, shortest)
+        last = None if exact or not found.within(SIMPLIFIED) else found.factor
+        del found  # its memory is needed for the next
+    if found is None:
+        _refuse(problem, state)
+    converged, vPv = found.within(tolerance), found.equations.vPv
+    if converged:
+        moved = step(layout, state, found.reduced, found.points)
+        reached = total(problem, moved, weight)
+        if reached <= vPv * (1 + ROUNDING):
+            state, vPv = moved, reached
+    return Optimum(state, found.equations, found.factor, found.motions, converged, taken, vPv)
+
+
+def _refuse(problem: Problem, state: State) -> NoReturn:
+    """Say why the normal equations of the start values cannot be solved."""
+    motions_of(problem.layout, problem.weighted, state, problem.datum)  # if the datum is the reason
+    raise GeometryError("adjustment: the normal equations cannot be solved from these start values")
+
+
+def optimum_at(problem: Problem, state: State, weight: FloatArray) -> Optimum | None:
+    """Return the normal equations at a state that is taken as the optimum; None if they cannot be solved."""
+    found = _solve(problem, state, weight)
+    if found is None:
+        return None
+    return Optimum(state, found.equations, found.factor, found.motions, True, 0, found.equations.vPv)
+
+
+def _solve(
+    problem: Problem,
+    state: State,
+    weight: FloatArray,
+    *,
+    damping: float = 0.0,
+    single: bool = False,
+    limit: float = np.inf,
+    last: Factor | BandFactor | None = None,
+    tolerance: float = 0.0,
+) -> Step | None:
+    """Return the step from a state; None where the normal equations cannot be solved or v'Pv is too large.
+
+    Args:
+        problem: what is adjusted.
+        state: where the step starts.
+        weight: factor on the weight of each image point, shape (k,).
+        damping: share of its diagonal added to the normal matrix.
+        single: whether single precision will do while the step is far from convergence.
+        limit: largest v'Pv.
+        last: factor of the step before, taken if it shows convergence.
+        tolerance: |A dx| / |v| of convergence.
+    """
+    p, layout = problem, problem.layout
+    equations = normal_equations(layout, p.weighted, state, weight, damping=damping, space=p.space)
+    if equations.vPv > limit or not (np.isfinite(equations.vPv) and np.isfinite(equations.parts.g).all()):
+        return None
+    try:
+        motions = motions_of(layout, p.weighted, state, p.datum)
+    except GeometryError:  # the datum points have fallen together on the way
+        return None
+    if last is not None:
+        found = _step(layout, equations, last, motions)
+        if found.within(tolerance):
+            return found
+    for coarse in (True, False) if single else (False,):
+        factored: Factor | BandFactor | None
+        if isinstance(p.pattern, Order):
+            factored = factor_band(equations, layout, motions, p.pattern, damped=damping > 0)
+        else:
+            factored = factor(equations, layout, motions, p.pattern, damped=damping > 0, single=coarse)
+        if factored is None:
+            continue
+        found = _step(layout, equations, factored, motions)
+        if not (coarse and found.within(COARSE)):
+            return found
+    return None
+
+
+def _step(layout: Unknowns, equations: Equations, factor: Factor | BandFactor, motions: Motions) -> Step:
+    reduced = -factor.solve(equations.parts.g)
+    points = point_step(equations, reduced, layout)
+    y = equations.blocks.y.ravel()
+    predicted = max(float(y @ y - equations.parts.g @ reduced), 0.0)
+    dx, dX = motions.transform(reduced, points)
+    return Step(dx, dX, predicted, equations.vPv, equations, factor, motions)
+
+
+def _approach(
+    problem: Problem, state: State, weight: FloatArray, max_iterations: int, single: bool
+) -> tuple[State, int]:
+    """Return a state near the optimum by Levenberg-Marquardt, and how many steps were tried."""
+    damping, growth = START_DAMPING, 2.0
+    for taken in range(max_iterations):
+        found = _solve(problem, state, weight, damping=damping, single=single)
+        gain = -1.0
+        if found is not None:
+            if found.within(NEAR):
+                return state, taken
+            moved = step(problem.layout, state, found.reduced, found.points)
+            gain = (found.equations.vPv - total(problem, moved, weight)) / found.predicted
+        if gain > ARMIJO:
+            state = moved
+            damping *= max(1 / 10, 1 - (2 * gain - 1) ** 3)
+            growth = 2.0
+        else:
+            damping *= growth
+            growth *= 2
+        if damping > MAX_DAMPING:
+            break
+    return state, max_iterations
+
+
+def total(problem: Problem, state: State, weight: FloatArray) -> float:
+    """Return v'Pv of image points and observed unknowns; infinite if a point is behind a camera."""
+    p = problem
+    return sum_of_squares(p.layout.obs, state, weight) + weighted_vPv(p.weighted, p.layout, state)
+
+
+def _line_search(
+    problem: Problem, state: State, weight: FloatArray, found: Move, share: float, shortest: float
+) -> tuple[State, float] | None:
+    """Return where the first of the shares 1, 1/2, 1/4 ... to meet Armijo's condition leads, and it.
+
+    Args:
+        problem: what is adjusted.
+        state: where the step starts.
+        weight: factor on the weight of each image point, shape (k,).
+        found: the step.
+        share: first share to try.
+        shortest: last share to try; 1 takes the full step whatever it brings, if it can be computed.
+    """
+    while share >= shortest:
+        moved = step(problem.layout, state, share * found.reduced, share * found.points)
+        reached = total(problem, moved, weight)
+        if np.isfinite(reached) and reached <= _most_allowed(found, share, shortest):
+            return moved, share
+        share /= 2
+    return None
+
+
+def _most_allowed(found: Move, share: float, shortest: float) -> float:
+    """Return the largest v'Pv with which a share of a step meets Armijo's condition."""
+    if shortest == 1.0:
+        return np.inf
+    return found.vPv * (1 + ROUNDING) - share * 2 * ARMIJO * found.predicted

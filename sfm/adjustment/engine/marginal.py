@@ -1,0 +1,131 @@
+"""Covariance of any subset of the unknowns of a finished adjustment, in any datum, without adjusting again.
+
+The normal equations are formed once more at the solution. The coordinates stay; a change of datum is an
+S-transformation of their covariance.
+
+Source: Baarda (1973), S-transformations and criterion matrices.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from sfm.adjustment.covariance import Cofactors, cofactors, marginal_covariance, without_held
+from sfm.adjustment.datum import Datum, motions_of
+from sfm.adjustment.engine.accumulate import times_points
+from sfm.adjustment.engine.iterate import Optimum, optimum_at, problem_of
+from sfm.adjustment.engine.local_frame import centroid_of, shifted
+from sfm.adjustment.engine.normals import solve_lower
+from sfm.adjustment.engine.observed_unknowns import Weighted, weighted_of
+from sfm.adjustment.engine.unknowns import Unknowns, unknowns_of
+from sfm.adjustment.quality.rank import reduced_names
+from sfm.adjustment.result import Adjustment
+from sfm.conventions import FloatArray, IntArray
+from sfm.errors import GeometryError
+
+
+@dataclass(frozen=True)
+class Marginal:
+    """A finished adjustment with its normal equations at hand."""
+
+    adjustment: Adjustment
+    layout: Unknowns
+    weighted: Weighted
+    optimum: Optimum
+    cofactors: Cofactors
+
+    def names(self) -> list[tuple[str, str]]:
+        """Return (parameter, of what) of each reduced unknown: X0 ... of photographs, then interior ones."""
+        return reduced_names(self.layout, self.adjustment.network, self.adjustment.estimate)
+
+    def joint(self, unknowns: IntArray, points: IntArray) -> FloatArray:
+        """Return the joint covariance of some reduced unknowns and some object points.
+
+        Args:
+            unknowns: indices into `names`; of a photograph X0 and the small rotation in its axes.
+            points: indices of object points.
+
+        Returns:
+            Covariance in this order, X Y Z of each point, shape (u + 3 p, u + 3 p).
+        """
+        Q, b, motions = self.cofactors, self.optimum.equations.blocks, self.optimum.motions
+        obs, first, u = self.layout.obs, self.layout.kept_start, len(unknowns)
+        rows = (3 * np.asarray(points)[:, None] + np.arange(3)).ravel()
+        # dx of each as a linear function of the reduced unknowns: themselves, or -L^-T Y' of a point
+        h = np.zeros((len(b.L), 3, len(rows)))
+        h.reshape(3 * len(h), len(rows))[rows, np.arange(len(rows))] = 1.0
+        through = np.zeros((self.layout.reduced, len(rows)))
+        times_points(obs, b, solve_lower(b.L, h), through)
+        E = np.zeros((self.layout.reduced, u + len(rows)))
+        E[unknowns, np.arange(u)] = 1.0
+        E[:, u:] = -through
+        for s, j in enumerate(points):
+            kept = np.flatnonzero(self.layout.kept == j)
+            if len(kept):
+                place = first + 3 * int(kept[0])
+                E[:, u + 3 * s : u + 3 * s + 3] = 0.0
+                E[place : place + 3, u + 3 * s : u + 3 * s + 3] = np.eye(3)
+        E *= self.layout.reduced_free()[:, None]
+        E[:, u:] *= self.layout.point_free[points].ravel()
+        cofactor = E.T @ self.optimum.factor.solve(E)
+        for s, j in enumerate(points):
+            own = slice(u + 3 * s, u + 3 * s + 3)
+            cofactor[own, own] = Q.points[j]
+        H = np.vstack([motions.reduced[unknowns], motions.points[points].reshape(len(rows), motions.defect)])
+        F = np.hstack(
+            [
+                Q.F_reduced[:, unknowns],
+                np.moveaxis(Q.F_points[points], 1, 0).reshape(motions.defect, len(rows)),
+            ]
+        )
+        half = H @ F
+        return np.asarray(self.adjustment.sigma0**2 * (cofactor - half - half.T + H @ Q.G @ H.T))
+
+
+def marginal_of(adjustment: Adjustment, *, datum: Datum | None = None, cross: bool = True) -> Marginal:
+    """Return a finished adjustment with its normal equations at hand.
+
+    Args:
+        adjustment: what `adjust` returned.
+        datum: another datum of the same kinds (control stays control); its own if None.
+        cross: whether cofactors between points and photographs are wanted.
+
+    Raises:
+        GeometryError: a change between control and a datum without.
+    """
+    use_control = adjustment.datum == "control"
+    if datum is None:
+        datum = Datum(adjustment.datum, adjustment.datum_points)
+    if (datum.kind == "control") != use_control:
+        raise GeometryError("datum: with or without control is another adjustment, not an S-transformation")
+    centroid = centroid_of(adjustment.network, adjustment.estimate)
+    network, estimate = shifted(adjustment.network, adjustment.estimate, -centroid)
+    layout, state = unknowns_of(
+        network, estimate, use_control=use_control, image_sigma_factor=adjustment.image_sigma_factor
+    )
+    weighted = weighted_of(network, layout, use_control=use_control)
+    weight = np.ascontiguousarray(adjustment.weights[layout.order])
+    optimum = optimum_at(problem_of(layout, weighted, datum), state, weight)
+    if optimum is None:
+        motions_of(layout, weighted, state, datum)  # says so if the datum is the reason
+        raise GeometryError("adjustment: its normal equations cannot be solved")
+    return Marginal(adjustment, layout, weighted, optimum, cofactors(optimum, layout, cross=cross))
+
+
+def change_datum(adjustment: Adjustment, datum: Datum) -> Adjustment:
+    """Return the adjustment with its covariance carried into another datum; coordinates stay.
+
+    Args:
+        adjustment: what `adjust` returned.
+        datum: free or minimal, on all or some points.
+
+    Raises:
+        GeometryError: a change between control and a datum without, or points that cannot carry it.
+    """
+    m = marginal_of(adjustment, datum=datum)
+    covariance = marginal_covariance(m.optimum, m.layout, m.cofactors, adjustment.sigma0**2)
+    return replace(
+        adjustment, datum=datum.kind, datum_points=datum.points, covariance=without_held(covariance, m.layout)
+    )

@@ -1,0 +1,230 @@
+"""Normal equations of all image points, reduced to orientations and kept points by the Schur complement.
+
+With N = (U W; W' V), V block diagonal with one L L' per object point, and Y = W L^-T, the reduced
+normal equations are (U - Y Y') dx = -(g - Y y), y = L^-1 g_points. Y is stored by image points. Unknowns are
+scaled so that the diagonal of U is 1. Y Y' is summed as one dense product or pair by pair of rays into a
+band, whichever is less work (`sfm.adjustment.engine.connectivity`).
+
+Source: Brown (1958, 1976); Mikhail, Bethel and McGlone (2001), sec. 5.8; Foerstner and Wrobel (2016),
+sec. 15.2.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from sfm.adjustment.engine.accumulate import (
+    RESIDUAL,
+    add_photographs,
+    eliminate_points,
+    gather_interior,
+    step_points,
+)
+from sfm.adjustment.engine.collinearity import State, scratch
+from sfm.adjustment.engine.observed_unknowns import Weighted, point_terms, weighted_terms
+from sfm.adjustment.engine.ordering import by_photograph
+from sfm.adjustment.engine.unknowns import Unknowns
+from sfm.conventions import FloatArray, IntArray
+from sfm.kernels.threads import at_once
+
+HALVED = 8_000  # image points from which two halves of the photographs are summed by themselves; a thread of
+# its own takes 0.1 ms to start and saves 0.07 microseconds for each
+
+
+class Blocks(NamedTuple):
+    """Parts of the normal equations that one pass over the image points fills; f free parameters a camera."""
+
+    U: FloatArray  # X0, w of each photograph by themselves, (m, 6, 6)
+    C: FloatArray  # X0, w of each photograph by the free parameters of its camera, (m, 6, f)
+    D: FloatArray  # free parameters of each camera by themselves, (a, f, f)
+    g: FloatArray  # right side of X0, w, (m, 6)
+    gi: FloatArray  # right side of the free parameters of each camera, (a, f)
+    V: FloatArray  # object points before elimination, (n, 3, 3)
+    gp: FloatArray  # right side of object points, (n, 3)
+    L: FloatArray  # Cholesky factors of V; unit matrix for kept points, (n, 3, 3)
+    y: FloatArray  # L^-1 gp; 0 for kept points, (n, 3)
+    Y: FloatArray  # Y' of each image point by X0, w of its photograph; 0 for kept points, (k, 3, 6)
+    Z: FloatArray  # Y' of each object point by all interior unknowns; 0 for kept points, (n, 3, i)
+    Yy: FloatArray  # Y y, what the right side is reduced by, (reduced,)
+    K: FloatArray  # kept points by all reduced unknowns, (3 s, reduced)
+    held: IntArray  # 1 where a direction of a point had to be held, (n,)
+    order: IntArray  # image points, photograph by photograph, (k,)
+    first: IntArray  # place in it of the first image point of each photograph, and the end, (m + 1,)
+
+
+class Sums(NamedTuple):
+    """Sums over some photographs, as in `Blocks`, and space for one of them."""
+
+    first: int  # photograph
+    end: int  # photograph behind the last
+    D: FloatArray
+    gi: FloatArray
+    V: FloatArray
+    gp: FloatArray
+    Z: FloatArray
+    A: FloatArray  # derivatives and residuals of the image points of one photograph
+
+
+class Space(NamedTuple):
+    """Space for normal equations, used again and again."""
+
+    blocks: Blocks
+    sums: tuple[Sums, ...]  # of all photographs, or of two halves of them; the first are those of the blocks
+
+
+class Parts(NamedTuple):
+    """Reduced normal equations before Y Y' is taken off, without the exterior diagonal blocks."""
+
+    border: FloatArray  # X0, w by interior unknowns and kept points, (6 m, i + 3 s)
+    corner: FloatArray  # interior unknowns and kept points by themselves, (i + 3 s, i + 3 s)
+    g: FloatArray  # right side, reduced, (reduced,)
+    scale: FloatArray  # 1/sqrt of the diagonal of U, (reduced,)
+
+
+class Equations(NamedTuple):
+    """Normal equations at a state, object points eliminated, Y Y' not yet taken off."""
+
+    blocks: Blocks
+    parts: Parts
+    damping: float  # share of its diagonal added to the whole normal matrix
+    vPv: float  # weighted sum of squares at the state; infinite if a point is behind a camera
+
+
+def normal_equations(
+    layout: Unknowns,
+    weighted: Weighted,
+    state: State,
+    weight: FloatArray,
+    *,
+    damping: float = 0.0,
+    space: Space | None = None,
+) -> Equations:
+    """Return the normal equations at a state with object points eliminated.
+
+    Args:
+        layout: order of the unknowns.
+        weighted: observed unknowns.
+        state: values of all parameters.
+        weight: factor on the weight of each image point, 0 = takes no part, shape (k,).
+        damping: share of its diagonal added to the whole normal matrix (Marquardt); 0 for the truth.
+        space: to be used again.
+    """
+    space = new_space(layout) if space is None else space
+    b = space.blocks
+    b.V[:], b.gp[:] = point_terms(weighted, state)
+    slot = np.full(len(state.points), -1, dtype=np.int64)
+    slot[layout.kept] = np.arange(len(layout.kept))
+    vPv = _sum_photographs(layout, state, weight, space)
+    eliminate_points(layout.obs, layout.point_free, slot, layout.kept_start, 1 + damping, b)
+    terms = weighted_terms(weighted, layout, state)
+    if len(weighted.image):
+        np.add.at(b.U, weighted.image, terms.exterior)
+        np.add.at(b.g, weighted.image, terms.exterior_g)
+    return Equations(b, _parts(layout, weighted, terms, b), damping, vPv + terms.vPv)
+
+
+def _sum_photographs(layout: Unknowns, state: State, weight: FloatArray, space: Space) -> float:
+    """Fill the blocks of all photographs and return v'Pv; the same two halves however many threads."""
+    b = space.blocks
+
+    def add(s: Sums) -> float:
+        return float(add_photographs(layout.obs, state, weight, layout.exterior_free, scratch(), s, b))
+
+    if len(space.sums) == 1:
+        return add(space.sums[0])
+    half, other = space.sums
+    other.V.fill(0.0)
+    other.gp.fill(0.0)
+    vPv = at_once(lambda: add(half), lambda: add(other))
+    for total, part in zip(half[2:-1], other[2:-1], strict=True):
+        total += part
+    return sum(vPv)
+
+
+def _parts(layout: Unknowns, weighted: Weighted, terms, b: Blocks) -> Parts:  # type: ignore[no-untyped-def]
+    """Gather the blocks of interior unknowns, kept points and observed unknowns."""
+    first = 6 * len(b.U)
+    inner = layout.kept_start - first
+    border = np.zeros((first, layout.reduced - first))
+    corner = np.zeros((layout.reduced - first, layout.reduced - first))
+    g = np.zeros(layout.reduced)
+    gather_interior(layout.obs, b, border, corner, g)
+    if len(weighted.column):
+        np.add.at(corner, (weighted.column - first, weighted.column - first), weighted.interior_weight)
+        np.add.at(g, weighted.column, terms.interior_g)
+    if len(layout.kept):
+        border[:, inner:] = b.K[:, :first].T
+        corner[:inner, inner:] = b.K[:, first : layout.kept_start].T
+        corner[inner:, :inner] = b.K[:, first : layout.kept_start]
+        corner[inner:, inner:] = b.K[:, layout.kept_start :] + terms.kept
+        g[layout.kept_start :] = terms.kept_g + b.gp[layout.kept].ravel()
+        fixed = np.flatnonzero(~layout.point_free[layout.kept].ravel()) + inner
+        border[:, fixed] = corner[fixed] = corner[:, fixed] = 0.0
+        corner[fixed, fixed] = 1.0
+        g[first + fixed] = 0.0
+    diagonal = np.concatenate([np.diagonal(b.U, axis1=1, axis2=2).ravel(), corner.diagonal()])
+    scale = 1 / np.sqrt(np.maximum(diagonal, np.finfo(float).tiny))
+    return Parts(border, corner, g - b.Yy, scale)
+
+
+def point_step(equations: Equations, reduced_step: FloatArray, layout: Unknowns) -> FloatArray:
+    """Return the step of all object points that belongs to a step of the reduced unknowns, (n, 3)."""
+    dX = np.empty_like(equations.blocks.y)
+    step_points(layout.obs, layout.point_free, equations.blocks, reduced_step, dX)
+    dX[layout.kept] = reduced_step[layout.kept_start :].reshape(-1, 3) * layout.point_free[layout.kept]
+    return dX
+
+
+def solve_lower(L: FloatArray, h: FloatArray) -> FloatArray:
+    """Return L^-1 h of every point, (n, 3, d)."""
+    x = np.empty_like(h)
+    x[:, 0] = h[:, 0] / L[:, 0, 0, None]
+    x[:, 1] = (h[:, 1] - L[:, 1, 0, None] * x[:, 0]) / L[:, 1, 1, None]
+    x[:, 2] = (h[:, 2] - L[:, 2, 0, None] * x[:, 0] - L[:, 2, 1, None] * x[:, 1]) / L[:, 2, 2, None]
+    return x
+
+
+def solve_transposed(L: FloatArray, h: FloatArray) -> FloatArray:
+    """Return L^-T h of every point, (n, 3, d)."""
+    x = np.empty_like(h)
+    x[:, 2] = h[:, 2] / L[:, 2, 2, None]
+    x[:, 1] = (h[:, 1] - L[:, 2, 1, None] * x[:, 2]) / L[:, 1, 1, None]
+    x[:, 0] = (h[:, 0] - L[:, 1, 0, None] * x[:, 1] - L[:, 2, 0, None] * x[:, 2]) / L[:, 0, 0, None]
+    return x
+
+
+def new_space(layout: Unknowns) -> Space:
+    """Return space for the normal equations of a network."""
+    m, n, k = len(layout.exterior_free), len(layout.point_free), len(layout.order)
+    a = len(layout.interior_free)
+    f = max(len(free) for free in layout.interior_free)
+    order, first = by_photograph(layout.obs.image, m)
+    most = int(np.diff(first).max())
+    width = -(-(RESIDUAL + 1 + f) // 4) * 4  # whole vector registers
+    b = Blocks(
+        U=np.empty((m, 6, 6)),
+        C=np.empty((m, 6, f)),
+        D=np.empty((a, f, f)),
+        g=np.empty((m, 6)),
+        gi=np.empty((a, f)),
+        V=np.empty((n, 3, 3)),
+        gp=np.empty((n, 3)),
+        L=np.empty((n, 3, 3)),
+        y=np.empty((n, 3)),
+        Y=np.empty((k, 3, 6)),
+        Z=np.empty((n, 3, layout.kept_start - 6 * m)),
+        Yy=np.empty(layout.reduced),
+        K=np.zeros((3 * len(layout.kept), layout.reduced)),
+        held=np.zeros(n, dtype=np.int64),
+        order=order,
+        first=first,
+    )
+    sums = Sums(0, m, b.D, b.gi, b.V, b.gp, b.Z, np.zeros((2 * most, width)))
+    if k < HALVED:
+        return Space(b, (sums,))
+    own = (np.zeros_like(part) for part in sums[2:])
+    middle = int(np.searchsorted(first, k // 2))
+    other = Sums(middle, m, *own)
+    return Space(b, (sums._replace(end=middle), other))

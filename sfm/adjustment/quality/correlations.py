@@ -1,0 +1,98 @@
+"""Correlations of camera parameters with the exterior orientation: what the network cannot tell apart.
+
+In a flat network with parallel views c hangs together with Z0, x0 and y0 with X0, Y0 or with the angles: the
+standard deviations of both are then large together, while distances between points may be good.
+
+Source: Luhmann et al., Close-Range Photogrammetry (2020), sec. 7.3.2 (correlations in self-calibration);
+Fraser (1997), ISPRS J. Photogramm. Remote Sens. 52(4).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sfm.adjustment.engine.marginal import marginal_of
+from sfm.adjustment.engine.unknowns import angle_jacobian, interior_names
+from sfm.adjustment.quality.statistics import STRONG
+from sfm.adjustment.result import Adjustment
+from sfm.conventions import FloatArray
+from sfm.kernels.threads import own_threads
+
+PARTS = ("X0", "Y0", "Z0", "omega", "phi", "kappa")
+
+
+@dataclass(frozen=True)
+class OrientationCorrelation:
+    """A camera parameter that hangs together with the exterior orientation of photographs."""
+
+    parameter: str  # and its camera, in words
+    largest: float  # correlation, -1 to 1
+    part: str  # X0, Y0, Z0, omega, phi or kappa that it is with
+    image: str  # of this photograph
+    counts: tuple[tuple[str, int], ...]  # parts beyond the limit, and in how many photographs each
+
+    @property
+    def partners(self) -> str:
+        """All that it is strongly correlated with, in words."""
+        return ", ".join(f"{part} of {n} photograph{'s' if n > 1 else ''}" for part, n in self.counts)
+
+
+def orientation_correlations(
+    adjustment: Adjustment, *, limit: float = STRONG
+) -> tuple[OrientationCorrelation, ...]:
+    """Return the camera parameters correlated with exterior orientation beyond a limit, strongest first.
+
+    Args:
+        adjustment: with its covariance; the correlations are those in its datum.
+        limit: absolute correlation from which a parameter is reported.
+
+    Raises:
+        GeometryError: its normal equations cannot be solved.
+    """
+    with own_threads():
+        names, rho = _correlations(adjustment)
+    if not rho.size:
+        return ()
+    images = adjustment.network.images
+    found = []
+    for c, (parameter, camera) in enumerate(names):
+        size = np.abs(rho[:, :, c])
+        strong = size > limit
+        if not strong.any():
+            continue
+        i, p = np.unravel_index(int(np.argmax(size)), size.shape)
+        counts = tuple((part, int(n)) for part, n in zip(PARTS, strong.sum(axis=0), strict=True) if n)
+        found.append(
+            OrientationCorrelation(
+                f"{parameter} of {camera}", float(rho[i, p, c]), PARTS[p], images[i], counts
+            )
+        )
+    return tuple(sorted(found, key=lambda one: -abs(one.largest)))
+
+
+def _correlations(adjustment: Adjustment) -> tuple[list[tuple[str, str]], FloatArray]:
+    """Return (parameter, camera) of each interior unknown, and its correlations by photograph, (m, 6, i).
+
+    0 where one of the two is fixed or was not adjusted.
+    """
+    if not any(camera.free.any() for camera in adjustment.estimate.cameras):
+        return [], np.zeros((0, 6, 0))
+    marginal = marginal_of(adjustment, cross=False)
+    layout, optimum, Q = marginal.layout, marginal.optimum, marginal.cofactors
+    names = interior_names(layout, adjustment.estimate)
+    m, i = len(adjustment.network.images), len(names)
+    own, inner = slice(0, 6 * m), slice(6 * m, 6 * m + i)
+    H, F, G = optimum.motions.reduced, Q.F_reduced, Q.G
+    # S Q S' of the S-transformation, the block of exterior by interior unknowns
+    C = Q.mixed[:, :i] - H[own] @ F[:, inner] - (H[inner] @ F[:, own]).T + H[own] @ G @ H[inner].T
+    T = np.zeros((m, 6, 6))
+    T[:, :3, :3] = np.eye(3)
+    T[:, 3:, 3:] = angle_jacobian(optimum.state.M)
+    C = T @ C.reshape(m, 6, i)
+    exterior = np.einsum("mpp->mp", adjustment.covariance.exterior) / adjustment.sigma0**2
+    interior = np.diagonal(Q.border)[:i]  # no motion of the network moves them
+    square = exterior[:, :, None] * interior
+    known = square > 0
+    return names, np.asarray(np.where(known, C / np.sqrt(np.where(known, square, 1.0)), 0.0))

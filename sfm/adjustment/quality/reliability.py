@@ -1,0 +1,108 @@
+"""Redundancy numbers, standardised residuals and the tests of Baarda and Pope.
+
+    R = Q_vv P (redundancy numbers on its diagonal; their sum is the redundancy),
+    w = (P v)_i / sqrt(sigma0'^2 (P Q_vv P)_ii)     with sigma0' a priori: Baarda's w ~ N(0, 1),
+    tau = the same with sigma0 a posteriori:         Pope's tau ~ tau(r).
+
+Source: Baarda (1968), A testing procedure for use in geodetic networks; Pope (1976), NOAA TR NOS 65
+NGS 1; Foerstner and Wrobel (2016), sec. 4.6.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy import stats
+
+from sfm.adjustment.engine.collinearity import State
+from sfm.adjustment.engine.observed_unknowns import Weighted, bar_rows
+from sfm.adjustment.engine.unknowns import Unknowns
+from sfm.conventions import FloatArray
+
+
+def redundancy_numbers(complement: FloatArray, whitening: FloatArray) -> FloatArray:
+    """Return the diagonal of Q_vv P of each image point, (k, 2).
+
+    Args:
+        complement: I - A Q A' in whitened coordinates, shape (k, 2, 2).
+        whitening: a, b, c of F = (a 0; b c) with F'F = P, shape (k, 3).
+    """
+    F = whitening_matrix(whitening)
+    R = np.linalg.inv(F) @ complement @ F
+    return np.ascontiguousarray(np.diagonal(R, axis1=1, axis2=2))
+
+
+def standardised_residuals(
+    residuals: FloatArray, complement: FloatArray, whitening: FloatArray
+) -> FloatArray:
+    """Return Baarda's w of each image coordinate for sigma0 = 1, (k, 2); 0 where it is not controlled.
+
+    Args:
+        residuals: v, px, shape (k, 2).
+        complement: I - A Q A' in whitened coordinates, shape (k, 2, 2).
+        whitening: a, b, c of F = (a 0; b c) with F'F = P, shape (k, 3).
+    """
+    F = whitening_matrix(whitening)
+    Ft = np.swapaxes(F, 1, 2)
+    Pv = np.einsum("kab,kb->ka", Ft @ F, residuals)
+    PQP = np.diagonal(Ft @ complement @ F, axis1=1, axis2=2)
+    P = np.diagonal(Ft @ F, axis1=1, axis2=2)
+    controlled = PQP > UNCONTROLLED * P
+    return np.where(controlled, Pv / np.sqrt(np.where(controlled, PQP, 1.0)), 0.0)
+
+
+UNCONTROLLED = 1e-6  # redundancy number below which an observation has no check
+
+
+def standardised_of_given(
+    difference: FloatArray, weight: FloatArray, cofactor: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return Baarda's w for sigma0 = 1, and the redundancy number, of unknowns that were observed, (n, d).
+
+    w is NaN where the observation has no check, both are where a component was not observed.
+
+    Args:
+        difference: v, adjusted minus given, shape (n, d).
+        weight: P, inverse covariance of what was given, 0 where it was not, shape (n, d, d).
+        cofactor: Q of the adjusted unknowns, shape (n, d, d).
+    """
+    PQP = np.diagonal(weight - weight @ cofactor @ weight, axis1=1, axis2=2)
+    P = np.diagonal(weight, axis1=1, axis2=2)
+    r = np.where(P > 0, 1 - np.diagonal(cofactor @ weight, axis1=1, axis2=2), np.nan)
+    Pv = np.einsum("nab,nb->na", weight, difference)
+    checked = PQP > UNCONTROLLED * P
+    return np.where(checked, Pv / np.sqrt(np.where(checked, PQP, 1.0)), np.nan), np.clip(r, 0.0, 1.0)
+
+
+def redundancy_of_bars(
+    weighted: Weighted, layout: Unknowns, state: State, cofactor: FloatArray
+) -> FloatArray:
+    """Return the redundancy number 1 - p a Q a' of each scale bar that took part, (b,).
+
+    Args:
+        weighted, layout, state: of an adjustment at its optimum.
+        cofactor: Q of the kept object points, in any datum, shape (3 s, 3 s).
+    """
+    rows, _ = bar_rows(weighted, layout, state)
+    return np.clip(1 - weighted.length_weight * ((rows @ cofactor) * rows).sum(axis=1), 0.0, 1.0)
+
+
+def tau_critical(alpha: float, redundancy: int) -> float:
+    """Return the critical value of Pope's tau for a two-sided test of one observation.
+
+    Args:
+        alpha: probability of rejecting a good observation.
+        redundancy: r of the adjustment; infinite if not positive at least 2.
+
+    Source: Pope (1976), eq. 21: tau = t sqrt(r) / sqrt(r - 1 + t^2), t of r - 1 degrees of freedom.
+    """
+    if redundancy < 2:
+        return np.inf
+    t = stats.t.ppf(1 - alpha / 2, redundancy - 1)
+    return float(t * np.sqrt(redundancy) / np.sqrt(redundancy - 1 + t**2))
+
+
+def whitening_matrix(whitening: FloatArray) -> FloatArray:
+    """Return F = (a 0; b c), (k, 2, 2)."""
+    F = np.zeros((len(whitening), 2, 2))
+    F[:, 0, 0], F[:, 1, 0], F[:, 1, 1] = whitening.T
+    return F

@@ -1,0 +1,250 @@
+"""Statistics of a finished adjustment, in the words of the field.
+
+Global test of the model, tests of the image coordinates, their minimal detectable bias and external
+reliability, significance of parameters, strong correlations.
+
+Source: Baarda (1968), A testing procedure for use in geodetic networks; Pope (1976), NOAA TR NOS 65
+NGS 1; Luhmann et al., Close-Range Photogrammetry (2020), sec. 2.4.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy import stats
+
+from sfm.adjustment.quality.reliability import UNCONTROLLED, tau_critical
+from sfm.adjustment.quality.variance_components import IMAGE_POINTS, VarianceComponents
+from sfm.adjustment.result import Adjustment
+from sfm.camera import Camera
+from sfm.conventions import FloatArray, IntArray
+
+ALPHA = 0.001  # Baarda's usual probability of rejecting a good observation
+REWEIGHTED = "the weights come from the residuals, so that v'Pv is not chi-square distributed"
+FAR_MORE = 2.0  # coordinates beyond the critical value over those expected by chance
+GLOBAL_ALPHA = 0.05  # of the global test and of the significance of parameters
+POWER = 0.8  # and of finding a gross error of the minimal detectable size
+STRONG = 0.95  # correlation from which two parameters are reported
+UNTESTED = ("c", "fx", "fy", "cx", "cy")  # parameters for which 0 is no sensible null hypothesis
+
+
+@dataclass(frozen=True)
+class GlobalTest:
+    """Test of stated standard deviations against the residuals by the chi-square distribution."""
+
+    of: str  # all observations, or a kind of them
+    statistic: float  # v'Pv with the standard deviations stated
+    redundancy: float
+    lower: float  # acceptance region of v'Pv
+    upper: float
+    passed: bool | None  # None where it was not tested
+    reason: str = ""  # why it was not tested
+
+
+@dataclass(frozen=True)
+class CoordinateTest:
+    """Test of every accepted image coordinate for a gross error."""
+
+    alpha: float  # probability of rejecting a good one
+    critical: float
+    statistic: FloatArray  # w or tau of each coordinate; NaN where rejected, (k, 2)
+    tested: int  # coordinates that have a check
+    beyond: int  # of them, those beyond the critical value
+
+    @property
+    def expected(self) -> float:
+        """How many would be beyond the critical value by chance."""
+        return self.alpha * self.tested
+
+    @property
+    def far_more(self) -> bool:
+        """Whether far more are beyond it: more than FAR_MORE times as many, by chance once in 1 / ALPHA."""
+        return bool(
+            self.beyond > FAR_MORE * self.expected
+            and stats.poisson.sf(self.beyond - 1, self.expected) < ALPHA
+        )
+
+
+@dataclass(frozen=True)
+class Reliability:
+    """How well gross errors of image coordinates can be found, and what the others do."""
+
+    delta0: float  # non-centrality of the test for alpha and power
+    minimal_bias: FloatArray  # smallest gross error found with the given power, px, (k, 2); inf: none is
+    external: (
+        FloatArray  # largest effect that error can have on a function of the unknowns, over its sigma, (k, 2)
+    )
+
+
+@dataclass(frozen=True)
+class Significance:
+    """t-test of an interior parameter against 0."""
+
+    camera: str
+    parameter: str
+    value: float
+    sigma: float
+    t: float
+    probability: float  # of a t at least so large by chance
+    significant: bool
+
+
+@dataclass(frozen=True)
+class Correlation:
+    """Two parameters whose estimates hang together."""
+
+    first: str
+    second: str
+    value: float
+
+
+def global_test(adjustment: Adjustment, *, alpha: float = GLOBAL_ALPHA) -> GlobalTest:
+    """Return the two-sided chi-square test of v'Pv of all observations.
+
+    Args:
+        adjustment: the adjustment.
+        alpha: probability of rejecting a right model.
+    """
+    test = _chi_square("all observations", adjustment.sigma0, adjustment.redundancy, alpha)
+    return replace(test, passed=None, reason=REWEIGHTED) if adjustment.reweighted else test
+
+
+def component_tests(
+    components: VarianceComponents, *, alpha: float = GLOBAL_ALPHA, reweighted: bool = False
+) -> tuple[GlobalTest, ...]:
+    """Return the two-sided chi-square test of the variance component of each group against 1.
+
+    The v'Pv of a group is nearly chi-square distributed with the sum of its redundancy numbers, exactly
+    where the other groups take no part in its residuals. Where that sum is a small part of the observations,
+    as of two bars that give the scale to the photographs, the test is on the safe side: with one residual in
+    common and r = 0.4, v'Pv is 0.4 times chi-square of 1, beyond the limits for 95 % in 1 of 160 cases.
+
+    Args:
+        components: of groups, over the standard deviations stated for them.
+        alpha: probability of rejecting a group whose standard deviations are right.
+        reweighted: whether the weights of the image points come from their residuals: they have no test then.
+
+    Source: Foerstner and Wrobel (2016), Photogrammetric Computer Vision, sec. 4.2.4.
+    """
+    tests = [
+        _chi_square(name, float(sigma0), float(r), alpha)
+        for name, sigma0, r in zip(components.names, components.sigma0, components.redundancy, strict=True)
+    ]
+    return tuple(
+        replace(test, passed=None, reason=REWEIGHTED) if reweighted and test.of == IMAGE_POINTS else test
+        for test in tests
+    )
+
+
+def _chi_square(of: str, sigma0: float, redundancy: float, alpha: float) -> GlobalTest:
+    if not np.isfinite(sigma0):
+        reason = f"its redundancy, {redundancy:.2g}, is too small"
+        return GlobalTest(of, np.nan, redundancy, np.nan, np.nan, None, reason)
+    statistic = float(sigma0**2 * redundancy)
+    lower, upper = (float(x) for x in stats.chi2.ppf([alpha / 2, 1 - alpha / 2], redundancy))
+    return GlobalTest(of, statistic, redundancy, lower, upper, lower <= statistic <= upper)
+
+
+def w_test(adjustment: Adjustment, *, alpha: float = ALPHA) -> CoordinateTest:
+    """Return Baarda's test of each image coordinate: w is standard normal where sigma0 is as stated."""
+    return _coordinate_test(adjustment, adjustment.standardised, float(stats.norm.ppf(1 - alpha / 2)), alpha)
+
+
+def tau_test(adjustment: Adjustment, *, alpha: float = ALPHA) -> CoordinateTest:
+    """Return Pope's test of each image coordinate, which takes sigma0 from the adjustment."""
+    critical = tau_critical(alpha, adjustment.redundancy)
+    return _coordinate_test(adjustment, adjustment.tau, critical, alpha)
+
+
+def _coordinate_test(
+    adjustment: Adjustment, statistic: FloatArray, critical: float, alpha: float
+) -> CoordinateTest:
+    r = adjustment.redundancy_numbers
+    checked = np.isfinite(r) & (r > UNCONTROLLED)
+    shown = np.where(np.isfinite(r), statistic, np.nan)
+    beyond = int((np.abs(shown[checked]) > critical).sum())
+    return CoordinateTest(alpha, critical, shown, int(checked.sum()), beyond)
+
+
+def non_centrality(alpha: float = ALPHA, power: float = POWER) -> float:
+    """Return delta0, by which a test of size alpha finds an error with the given power."""
+    return float(stats.norm.ppf(1 - alpha / 2) + stats.norm.ppf(power))
+
+
+def reliability(adjustment: Adjustment, *, alpha: float = ALPHA, power: float = POWER) -> Reliability:
+    """Return internal and external reliability of each image coordinate; NaN where rejected.
+
+    Args:
+        adjustment: the adjustment.
+        alpha, power: of the test that is to find the error.
+
+    Source: Baarda (1968): delta0 sigma / sqrt(r); effect bounded by delta0 sqrt((1 - r)/r).
+    """
+    delta0 = non_centrality(alpha, power)
+    r = np.clip(adjustment.redundancy_numbers, 0, 1)
+    sigma = np.sqrt(np.diagonal(adjustment.image_covariance, axis1=1, axis2=2))
+    controlled = r > UNCONTROLLED
+    safe = np.where(controlled, r, 1.0)
+    unknown = np.isnan(r)
+
+    def where(values: FloatArray) -> FloatArray:
+        return np.where(unknown, np.nan, np.where(controlled, values, np.inf))
+
+    return Reliability(
+        delta0, where(delta0 * sigma / np.sqrt(safe)), where(delta0 * np.sqrt((1 - safe) / safe))
+    )
+
+
+def significance(adjustment: Adjustment, *, alpha: float = GLOBAL_ALPHA) -> tuple[Significance, ...]:
+    """Return the t-test against 0 of each free parameter of distortion and principal point in mm.
+
+    A parameter that several cameras share is tested once, under the name of their group.
+
+    Args:
+        adjustment: the adjustment.
+        alpha: probability of calling a parameter significant that is 0.
+    """
+    tests: dict[tuple[str, str], Significance] = {}
+    for camera, Q in zip(adjustment.estimate.cameras, adjustment.covariance.interior, strict=True):
+        for s, sigma in zip(_free(camera, Q), np.sqrt(np.diagonal(Q)), strict=True):
+            name, owner = camera.names[s], camera.group_of(s) or camera.name
+            if name in UNTESTED or not sigma > 0:
+                continue
+            value = float(camera.parameters[s])
+            t = abs(value) / float(sigma)
+            p = float(2 * stats.t.sf(t, adjustment.redundancy))
+            tests[owner, name] = Significance(owner, name, value, float(sigma), t, p, p < alpha)
+    return tuple(tests.values())
+
+
+def correlations(adjustment: Adjustment, *, limit: float = STRONG) -> tuple[Correlation, ...]:
+    """Return the pairs of parameters of one camera, or of one photograph, correlated beyond a limit.
+
+    Args:
+        adjustment: the adjustment.
+        limit: absolute correlation from which a pair is reported.
+    """
+    found = []
+    for camera, Q in zip(adjustment.estimate.cameras, adjustment.covariance.interior, strict=True):
+        free = _free(camera, Q)
+        names = [f"{camera.names[s]} of camera {camera.group_of(s) or camera.name}" for s in free]
+        found += _strong(Q, names, limit)
+    parts = ("X0", "Y0", "Z0", "omega", "phi", "kappa")
+    for image, Q in zip(adjustment.network.images, adjustment.covariance.exterior, strict=True):
+        found += _strong(Q, [f"{part} of photograph {image}" for part in parts], limit)
+    once = {(pair.first, pair.second): pair for pair in found}  # of shared parameters every camera has it
+    return tuple(sorted(once.values(), key=lambda pair: -abs(pair.value)))
+
+
+def _free(camera: Camera, Q: FloatArray) -> IntArray:
+    """Indices of the parameters that a covariance belongs to; none for a camera that took no part."""
+    return np.flatnonzero(camera.free)[: len(Q)]
+
+
+def _strong(Q: FloatArray, names: list[str], limit: float) -> list[Correlation]:
+    sigma = np.sqrt(np.clip(np.diagonal(Q), 0, None))
+    known = sigma > 0
+    rho = Q / np.where(known, sigma, 1.0)[:, None] / np.where(known, sigma, 1.0)
+    rows, columns = np.nonzero(np.triu(np.abs(rho) > limit, 1))
+    return [Correlation(names[r], names[c], float(rho[r, c])) for r, c in zip(rows, columns, strict=True)]

@@ -1,0 +1,176 @@
+"""Variance components: how well groups of observations were measured, from their own residuals.
+
+Groups are photographs, cameras, and kinds of observation. The variance factor of a group is its v'Pv over
+its redundancy, the sum of its redundancy numbers; that of a kind is its count less tr(P Q) of what it
+observes.
+
+Source: Foerstner (1979), Ein Verfahren zur Schaetzung von Varianz- und Kovarianzkomponenten; Luhmann et
+al., Close-Range Photogrammetry (2020), sec. 2.4.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from sfm.adjustment.engine.observed_unknowns import exterior_misclosure, weighted_of
+from sfm.adjustment.engine.unknowns import unknowns_of
+from sfm.adjustment.result import Adjustment
+from sfm.camera import camera_families
+from sfm.conventions import FloatArray, IntArray
+
+SETTLED = 1e-3  # relative change of a variance component at which its estimation ends
+MAX_ROUNDS = 20
+FEW = 1.0  # redundancy of a group of image points below which its variance component is not estimated
+IMAGE_POINTS = "image points"
+FEW_OF_A_KIND = 0.1  # the same of a kind, of which a few scale bars may be all there is
+
+
+@dataclass(frozen=True)
+class VarianceComponents:
+    """Variance factors of groups of image points."""
+
+    names: tuple[str, ...]
+    sigma0: FloatArray  # a posteriori over stated standard deviation, (g,); NaN with too little redundancy
+    redundancy: FloatArray  # of each group, (g,)
+    count: IntArray  # scalar observations of each group, (g,)
+
+
+def variance_components(
+    adjustment: Adjustment, group: IntArray, names: tuple[str, ...]
+) -> VarianceComponents:
+    """Return the variance factor of each group of image points, v'Pv over the group's redundancy.
+
+    P is of the standard deviations stated, whatever factor they were given in the adjustment.
+
+    Args:
+        adjustment: the adjustment.
+        group: group of each image point, shape (k,).
+        names: names of the groups, g of them.
+    """
+    covariance = adjustment.network.image_points.covariance
+    return _components(adjustment, covariance, group, names, few=FEW)
+
+
+def _components(
+    adjustment: Adjustment, covariance: FloatArray, group: IntArray, names: tuple[str, ...], *, few: float
+) -> VarianceComponents:
+    """Return the variance factor of each group of image points over these covariances, (k, 2, 2)."""
+    g = len(names)
+    used = ~adjustment.rejected
+    v = adjustment.residuals[used]
+    P = np.linalg.inv(covariance[used])
+    vPv, redundancy = np.zeros(g), np.zeros(g)
+    np.add.at(vPv, group[used], adjustment.weights[used] * np.einsum("ka,kab,kb->k", v, P, v))
+    np.add.at(redundancy, group[used], adjustment.redundancy_numbers[used].sum(axis=1))
+    sigma0 = adjustment.inflation * _root_ratio(vPv, redundancy, few)
+    return VarianceComponents(names, sigma0, redundancy, 2 * np.bincount(group[used], minlength=g))
+
+
+def _root_ratio(vPv: FloatArray, redundancy: FloatArray, few: float) -> FloatArray:
+    """Return sqrt(v'Pv / r) of groups, NaN where the redundancy is too little."""
+    enough = redundancy > few
+    return np.where(enough, np.sqrt(np.maximum(vPv, 0) / np.where(enough, redundancy, 1.0)), np.nan)
+
+
+def by_photograph(adjustment: Adjustment) -> VarianceComponents:
+    """Return the variance factor of each photograph."""
+    network = adjustment.network
+    return variance_components(adjustment, network.image_points.image, network.images)
+
+
+def by_camera(adjustment: Adjustment) -> VarianceComponents:
+    """Return the variance factor of the photographs of each camera; those that share parameters are one."""
+    network = adjustment.network
+    names, family = camera_families(adjustment.estimate.cameras, network.camera)
+    return variance_components(adjustment, family[network.camera[network.image_points.image]], names)
+
+
+def by_kind(adjustment: Adjustment) -> VarianceComponents:
+    """Return the variance factor of each kind of observation.
+
+    Kinds are image points, control points, exterior and interior orientation, and scale bars; those
+    that were not observed are left out. Redundancy numbers of all kinds add up to the redundancy.
+    """
+    a, network = adjustment, adjustment.network
+    use_control = a.datum == "control"
+    layout, state = unknowns_of(network, a.estimate, use_control=use_control)
+    w = weighted_of(network, layout, use_control=use_control)
+    whole = np.zeros(len(a.rejected), dtype=np.int64)
+    image = _components(a, network.image_points.covariance, whole, (IMAGE_POINTS,), few=FEW_OF_A_KIND)
+    Q_points, Q_exterior = a.covariance.points[w.point], a.covariance.exterior[w.image]
+    dX = state.points[w.point] - w.xyz
+    e, _ = exterior_misclosure(w, state)
+    dp = state.parameters[w.camera, w.parameter] - w.value
+    where = [
+        int(np.flatnonzero(layout.interior_free[c] == s)[0])
+        for c, s in zip(w.camera, w.parameter, strict=True)
+    ]
+    Q_interior = [a.covariance.interior[c][s, s] for c, s in zip(w.camera, where, strict=True)]
+    bars = network.scale_bars
+    ends = a.estimate.points[bars.end[layout.bars]] - a.estimate.points[bars.start[layout.bars]]
+    length = np.linalg.norm(ends, axis=1) - w.length
+    unit = a.sigma0**2  # the covariances are a posteriori
+    kinds = [
+        (
+            "control points",
+            int((np.diagonal(w.point_weight, axis1=1, axis2=2) > 0).sum()),
+            float(np.einsum("pa,pab,pb->", dX, w.point_weight, dX)),
+            float(np.einsum("pab,pba->", w.point_weight, Q_points)) / unit,
+        ),
+        (
+            "exterior orientation",
+            int((np.diagonal(w.exterior_weight, axis1=1, axis2=2) > 0).sum()),
+            float(np.einsum("ea,eab,eb->", e, w.exterior_weight, e)),
+            float(np.einsum("eab,eba->", w.exterior_weight, Q_exterior)) / unit,
+        ),
+        (
+            "interior orientation",
+            len(w.column),
+            float(w.interior_weight @ dp**2),
+            float(w.interior_weight @ np.array(Q_interior, dtype=float)) / unit,
+        ),
+    ]
+    taken = len(length) - float(a.bar_redundancy[layout.bars].sum())
+    kinds.append(("scale bars", len(length), float(w.length_weight @ length**2), taken))
+    seen = [kind for kind in kinds if kind[1]]
+    own = np.array([kind[1] - kind[3] for kind in seen])
+    sigma0 = _root_ratio(np.array([kind[2] for kind in seen]), own, FEW_OF_A_KIND)
+    return VarianceComponents(
+        (IMAGE_POINTS, *(kind[0] for kind in seen)),
+        np.concatenate([image.sigma0, sigma0]),
+        np.concatenate([image.redundancy, own]),
+        np.concatenate([image.count, np.array([kind[1] for kind in seen], dtype=np.int64)]),
+    )
+
+
+def estimate_components(
+    adjust_with: Callable[[FloatArray], Adjustment], group: IntArray, names: tuple[str, ...]
+) -> tuple[Adjustment, FloatArray, bool]:
+    """Return the adjustment with the weights of groups of image points estimated from the data.
+
+    The standard deviations of each group are multiplied by the root of its variance factor and the network
+    adjusted again, until the factors of the image points that the last adjustment accepted are 1.
+
+    Args:
+        adjust_with: adjusts a network from fixed start values with the factor on the stated standard
+            deviations of each image point, (k,), and returns the adjustment.
+        group: group of each image point, shape (k,).
+        names: names of the groups, g of them.
+
+    Returns:
+        Last adjustment, standard deviation of each group over that stated, shape (g,), and whether the
+        factors converged.
+    """
+    factor = np.ones(len(names))
+    adjustment = adjust_with(factor[group])
+    for _ in range(MAX_ROUNDS):
+        found = _components(adjustment, adjustment.image_covariance, group, names, few=FEW).sigma0
+        found = np.where(np.isfinite(found) & (found > 0), found, 1.0)
+        if np.abs(found - 1).max() <= SETTLED:
+            return adjustment, factor, True
+        factor = factor * found
+        adjustment = adjust_with(factor[group])
+    return adjustment, factor, False

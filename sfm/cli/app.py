@@ -1,0 +1,41 @@
+"""The commands of kolinear, put together; what they need is imported where they run."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import typer
+
+from sfm.cli import measuring, planning, refining, solvers, surveying
+
+USAGE_ERROR: Any = typer.BadParameter.__base__  # of all that typer says of wrong arguments; it has no name
+
+app = typer.Typer(
+    name="kolinear",
+    help="Close-range photogrammetry: targets, orientation, bundle adjustment, and COLMAP beside it.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+)
+
+
+@app.callback()
+def _commands() -> None:
+    """Keep `kolinear` a command with subcommands."""
+
+
+for _command in (
+    surveying.run,
+    surveying.adjust,
+    surveying.batch,
+    measuring.resect,
+    measuring.match,
+    measuring.targets,
+    solvers.validate,
+    solvers.compare,
+    solvers.convert,
+    refining.refine,
+):
+    app.command()(_command)
+app.add_typer(planning.plan)

@@ -1,0 +1,189 @@
+"""What is seen on the terminal: progress, and the summary of a result."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
+from rich.table import Table
+from rich.text import Text
+
+from sfm.report.checks import count_observations, words_of_check, words_of_sigma0
+from sfm.report.markup import finer_unit, significant
+from sfm.report.precision import point_precision
+from sfm.report.statistics import statistics_of, words_of_test
+from sfm.report.verdict import verdict_of
+from sfm.result import SurveyResult
+
+MAX_WARNINGS = 5  # without --verbose
+COLOURS = {"good": "green", "fair": "yellow", "bad": "red"}
+
+
+class Drawn:
+    """Progress as a bar on the terminal: the stage, and the photographs done."""
+
+    def __init__(self, bar: Progress) -> None:
+        self._bar = bar
+        self._task: TaskID | None = None
+
+    def stage(self, name: str, total: int | None = None) -> None:
+        """Begin a line for the stage; a second call for the same stage tells its total."""
+        if self._task is not None:
+            task = self._bar.tasks[-1]
+            if task.description == name:
+                self._bar.update(self._task, total=total)
+                return
+            self._bar.update(self._task, total=task.total or 1, completed=task.total or 1, step="")
+            self._bar.stop_task(self._task)
+        self._task = self._bar.add_task(name, total=total, step="")
+
+    def advance(self, step: str = "") -> None:
+        """Count one step and name it."""
+        if self._task is not None:
+            self._bar.update(self._task, advance=1, step=step)
+
+
+@contextmanager
+def drawn_progress() -> Iterator[Drawn]:
+    """Show a progress bar on stderr while it is a terminal; nothing else ever goes there but an error."""
+    console = Console(stderr=True)
+    with Progress(
+        TextColumn("{task.description:12}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TextColumn("{task.fields[step]}", style="dim"),
+        console=console,
+        disable=not console.is_terminal,
+    ) as bar:
+        drawn = Drawn(bar)
+        yield drawn
+        drawn.stage("done", 1)
+        bar.remove_task(bar.task_ids[-1])
+
+
+def tell_result(result: SurveyResult, page: Path, *, seconds: float, verbose: bool) -> bool:
+    """Print the summary: verdict, figures with their units, what failed, where the report is.
+
+    Returns:
+        Whether the result can be depended on.
+    """
+    a = result.adjustment
+    verdict = verdict_of(result)
+    console = Console(highlight=False)
+    console.print(Text(verdict.headline, style=f"bold {COLOURS[verdict.level]}"), soft_wrap=True)
+    table = Table(show_header=False, box=None, padding=(0, 2, 0, 0))
+    figures = (*_figures(result), ("time", f"{seconds:.1f} s, report included"))
+    for name, value in (*figures, *(_details(result) if verbose else ())):
+        table.add_row(Text(name, style="dim"), Text(value))
+    console.print(table)
+    for line in verdict.remarks:
+        console.print(Text(f"! {line}", style="yellow"), soft_wrap=True)
+    for failed in result.failed:
+        console.print(Text(f"  {failed.image}: {failed.reason}"), soft_wrap=True)
+    others = result.warnings[1:]  # the first is among the remarks
+    shown = others if verbose else others[: MAX_WARNINGS - 1]
+    for warning in shown:
+        console.print(Text(f"  {warning}"), soft_wrap=True)
+    if len(shown) < len(others):
+        console.print(Text(f"  ... and {len(others) - len(shown)} more, in the report"))
+    if verbose:
+        console.print(_photograph_table(result))
+        for camera in a.estimate.cameras:
+            values = ", ".join(
+                f"{name} {significant(value, 6)} {unit}"
+                for name, value, unit, free in zip(
+                    camera.names, camera.parameters, camera.units, camera.free, strict=True
+                )
+                if free
+            )
+            console.print(Text(f"  camera {camera.name} ({camera.model}): {values}"))
+    console.print(Text(f"Report: {page}", style="bold"), soft_wrap=True)
+    return verdict.level != "bad"
+
+
+def _figures(result: SurveyResult) -> tuple[tuple[str, str], ...]:
+    """Return the figures of the summary, each with its unit."""
+    a = result.adjustment
+    coded = int((result.code >= 0).sum())
+    rejected = int(a.rejected.sum())
+    typical, largest = (float(value) for value in point_precision(a)[:2, 3])
+    factor, unit = finer_unit(result.length_unit, largest)
+    rows = [
+        ("photographs", f"{len(a.network.images)} of {result.images_total} oriented"),
+        (
+            "object points",
+            f"{len(a.network.points)} ({coded} coded, {len(a.network.points) - coded} uncoded)",
+        ),
+        ("image points", f"{len(a.rejected) - rejected} accepted, {rejected} rejected"),
+        ("adjustment", f"{'converged' if a.converged else 'NOT converged'}, {a.steps}"),
+        ("datum", f"{a.datum}, rank defect {a.defect} (expected {a.expected_defect})"),
+        (
+            "sigma0",
+            f"{', '.join(words_of_sigma0(result))}, redundancy {a.redundancy}",
+        ),
+        ("residuals", f"RMS {a.rms_px:.4f} px per coordinate, largest {a.max_residual_px:.3f} px"),
+        (
+            "point precision",
+            f"{significant(typical * factor)} {unit} RMS, {significant(largest * factor)} {unit} at most",
+        ),
+    ]
+    check = result.control_check
+    if check is not None:
+        rows.append(("check at control", words_of_check(check, result.length_unit)))
+    both = result.comparison
+    if both is not None:
+        word = "agrees" if both.agree else "DIFFERS"
+        rms = both.comparison.rms_px
+        rows.append(
+            (
+                both.backend,
+                f"{word}: RMS {rms[0]:.7f} px (kolinear), {rms[1]:.7f} px ({both.backend}), both with equal "
+                f"weights, free datum, {both.model}",
+            )
+        )
+    found = result.baseline
+    if found is not None:
+        factor, unit = finer_unit(result.length_unit, found.point_rms)
+        rows.append(
+            (
+                found.name,
+                f"{found.photographs[1]} of {found.total} oriented, RMS {found.rms_px[1]:.3f} px, "
+                f"{significant(factor * found.point_rms)} {unit} from the survey at {found.targets} points, "
+                f"{found.seconds[1]:.0f} s",
+            )
+        )
+    return tuple(rows)
+
+
+def _details(result: SurveyResult) -> tuple[tuple[str, str], ...]:
+    """Return further figures, for --verbose."""
+    a = result.adjustment
+    counts = count_observations(a)
+    rows = [
+        ("observations", f"{counts.total}: {counts.image} image coordinates, {counts.control} of control, "
+         f"{counts.scale_bars} scale bars; {counts.constraints} constraints, {a.unknowns} unknowns"),
+        *(("global test", words_of_test(test)) for test in statistics_of(result).global_tests),
+    ]  # fmt: skip
+    found = result.eccentricity
+    if found is not None:
+        rows.append(
+            ("eccentricity", f"corrected by {found.rms_px:.4f} px RMS, {found.largest_px:.4f} px at most")
+        )
+    if result.no_circles:
+        rows.append(("no circles", f"{len(result.no_circles)} left out: {', '.join(result.no_circles)}"))
+    return tuple(rows)
+
+
+def _photograph_table(result: SurveyResult) -> Table:
+    """Return measured targets and rejected candidates of each photograph."""
+    table = Table(box=None, padding=(0, 2, 0, 0))
+    for name in ("photograph", "targets", "rejected candidates"):
+        table.add_column(name, justify="left" if name != "targets" else "right")
+    for photograph in result.photographs:
+        reasons = ", ".join(f"{count} {reason}" for reason, count in photograph.reasons())
+        table.add_row(Text(photograph.image), str(len(photograph.xy)), Text(reasons))
+    return table

@@ -1,0 +1,227 @@
+"""Commands about single photographs: match, resect and targets."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from sfm.cli.starting import loading
+from sfm.errors import GeometryError, SurveyFileError
+from sfm.orientation.resection.methods import METHODS
+
+if TYPE_CHECKING:
+    from sfm.conventions import IntArray
+    from sfm.survey.inputs.resection_points import Task
+
+NONE_MATCHED = 1  # exit code
+MOST_TARGETS = 10_000  # on one sheet; no family has more codes
+
+
+def match(
+    left: Annotated[Path, typer.Argument(metavar="LEFT", help="Photograph in which the points are given.")],
+    right: Annotated[Path, typer.Argument(metavar="RIGHT", help="Photograph in which they are looked for.")],
+    point: Annotated[
+        str | None, typer.Option("--point", metavar="COL,ROW", help="One point of LEFT, px.")
+    ] = None,
+    points: Annotated[
+        Path | None,
+        typer.Option("--points", metavar="FILE", help="Table point,x_px,y_px[,x_right_px,y_right_px]."),
+    ] = None,
+    method: Annotated[
+        str,
+        typer.Option("--method", help="ncc, lsm (6 affine + 2 radiometric parameters), lsm8 or shift."),
+    ] = "lsm",
+    template: Annotated[
+        int, typer.Option("--template", metavar="N", help="Side of the patch, odd, px.")
+    ] = 21,
+    search: Annotated[int, typer.Option("--search", metavar="N", help="Side of the window, px.")] = 121,
+    equalise: Annotated[
+        bool, typer.Option("--equalise", help="Equalise the histograms before least squares matching.")
+    ] = False,
+    interpolation: Annotated[
+        str,
+        typer.Option(
+            "--interpolation",
+            help="six_tap; bicubic or bilinear where a photograph was itself shifted by interpolation.",
+        ),
+    ] = "six_tap",
+    min_correlation: Annotated[
+        float, typer.Option("--min-correlation", metavar="R", help="Smallest r of a match, 0 to 1.")
+    ] = 0.7,
+    back: Annotated[
+        bool,
+        typer.Option(
+            "--back/--no-back", help="Whether a match must lead back to within 1 px of where it came from."
+        ),
+    ] = True,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON in place of a table.")] = False,
+    out: Annotated[
+        Path | None, typer.Option("--out", metavar="FILE", help="Write the table: .csv or .json.")
+    ] = None,
+    picture: Annotated[
+        Path | None,
+        typer.Option("--picture", metavar="FILE.png", help="Picture of template, match and difference."),
+    ] = None,
+) -> None:
+    """Find conjugate points of two photographs.
+
+    By cross correlation, then least squares matching. A match is ambiguous if the second-best place of the
+    search window has an r that is not lower by more than chance (5 %, by Fisher's z).
+    Files given with --out and --picture may replace earlier ones of this command, and nothing else. Exit
+    code 1 if no point was matched.
+    """
+    with loading():
+        from sfm.matching.conjugate import BACK_PX
+        from sfm.report.matching import match_command
+
+    text, matched = match_command(
+        left,
+        right,
+        point=point,
+        points=points,
+        method=method,
+        template_px=template,
+        search_px=search,
+        equalise=equalise,
+        interpolation=interpolation,
+        min_correlation=min_correlation,
+        back_px=BACK_PX if back else None,
+        as_json=as_json,
+        out=out,
+        picture=picture,
+    )
+    print(text, end="")
+    if not matched:
+        raise SystemExit(NONE_MATCHED)
+
+
+def resect(
+    points: Annotated[Path, typer.Argument(metavar="POINTS.csv", help="Table point,X,Y,Z,x_mm,y_mm.")],
+    c: Annotated[float | None, typer.Option("--c", metavar="MM", help="Principal distance, mm.")] = None,
+    method: Annotated[
+        str, typer.Option("--method", help=f"{', '.join(METHODS)}, or all for a table of them.")
+    ] = "robust",
+    camera: Annotated[
+        Path | None,
+        typer.Option("--camera", metavar="CAMERA.csv", help="Table parameter,value of model brown, mm."),
+    ] = None,
+    start: Annotated[
+        str | None,
+        typer.Option("--start", metavar="X,Y,Z[,omega,phi,kappa]", help="Start values, object unit and deg."),
+    ] = None,
+    tolerance: Annotated[
+        float | None,
+        typer.Option("--tolerance", metavar="MM", help="Largest residual of a good point for robust, mm."),
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON in place of a table.")] = False,
+) -> None:
+    """Orient one photograph on known points.
+
+    By any of the methods, or all of them for a comparison.
+    """
+    with loading():
+        from sfm.report.resection import resect_json, resect_table
+        from sfm.survey.inputs.resection_points import read_task
+
+    task = read_task(points, c_mm=c, camera_file=camera, start=start, tolerance_mm=tolerance)
+    if not as_json:
+        print(resect_table(task, method))
+        return
+    found = [_tried(task, one) for one in METHODS] if method == "all" else resect_json(task, method)
+    print(json.dumps(found, indent=2, allow_nan=False))
+
+
+def _tried(task: Task, method: str) -> dict[str, object]:
+    """Return what one of all methods finds, or why it finds nothing."""
+    from sfm.report.resection import resect_json
+
+    try:
+        return resect_json(task, method)
+    except GeometryError as error:
+        return {"method": method, "error": str(error)}
+
+
+def targets(
+    out: Annotated[
+        Path,
+        typer.Option("--out", metavar="FILE", help="Sheet to write: .pdf or .svg; replaces only a sheet."),
+    ],
+    family: Annotated[
+        str,
+        typer.Option(
+            "--family",
+            help="ring12, ring14, ring20, arcs, a family of tags (apriltag36h11, aruco4x4_50 ...), or a code "
+            "table file.",
+        ),
+    ] = "ring14",
+    ids: Annotated[str, typer.Option("--ids", metavar="A-B,C", help="Code numbers, each once.")] = "1-100",
+    diameter: Annotated[
+        float,
+        typer.Option(
+            "--diameter-mm",
+            metavar="MM",
+            help="Diameter of the dot, at least 1 mm; of tags the side of the square.",
+        ),
+    ] = 10.0,
+    page: Annotated[str, typer.Option("--page", help="a4, a3, letter ...")] = "a4",
+    bright: Annotated[bool, typer.Option("--bright", help="White targets on dark squares.")] = False,
+    ring_radii: Annotated[
+        str | None,
+        typer.Option(
+            "--ring-radii",
+            metavar="R1,R2",
+            help="Inner and outer radius of rings (not tags), in radii of the dot.",
+        ),
+    ] = None,
+) -> None:
+    """Write a sheet of coded targets for printing.
+
+    It is in true scale and has a ruler to check the print.
+    """
+    with loading():
+        from sfm.printing.sheet import lay_out_sheet, write_sheet
+
+    radii = None if ring_radii is None else _two(ring_radii)
+    sheet = lay_out_sheet(
+        family, _numbers(ids), diameter_mm=diameter, page=page, dark=not bright, ring_radii=radii
+    )
+    for path in write_sheet(sheet, out):
+        print(path)
+
+
+def _two(text: str) -> tuple[float, float]:
+    """Return the two numbers of `2,3`.
+
+    Raises:
+        SurveyFileError: not two numbers.
+    """
+    try:
+        first, second = (float(part) for part in text.split(","))
+    except ValueError as error:
+        raise SurveyFileError(f"--ring-radii {text}: needed two numbers such as 2,3") from error
+    return first, second
+
+
+def _numbers(text: str) -> IntArray:
+    """Return the code numbers that `1-100,205` names.
+
+    Raises:
+        SurveyFileError: not numbers and ranges, or too many.
+    """
+    import numpy as np
+
+    numbers: list[int] = []
+    for part in text.split(","):
+        first, dash, last = part.strip().partition("-")
+        if not first.isdecimal() or (dash and not last.isdecimal()):
+            raise SurveyFileError(f"--ids {text}: '{part}' is neither a number nor a range such as 1-100")
+        begin, end = int(first), int(last if dash else first)
+        if end < begin or end - begin >= MOST_TARGETS or len(numbers) + end - begin >= MOST_TARGETS:
+            raise SurveyFileError(
+                f"--ids {text}: '{part}' must run upwards, and a sheet holds at most {MOST_TARGETS} targets"
+            )
+        numbers += range(begin, end + 1)
+    return np.array(numbers, dtype=np.int64)

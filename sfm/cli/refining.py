@@ -1,0 +1,55 @@
+"""The command refine: key points of a COLMAP model measured anew."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from sfm.cli.starting import loading
+from sfm.errors import OutputError
+
+
+def refine(
+    model: Annotated[Path, typer.Argument(metavar="COLMAP_MODEL", help="Folder of cameras, images, points.")],
+    images: Annotated[Path, typer.Option("--images", metavar="DIR", help="Folder of its photographs.")],
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", metavar="DIR", help="New folder for the refined model, COLMAP's format."),
+    ] = None,
+    window: Annotated[
+        int, typer.Option("--window", metavar="N", help="Side of the windows, odd, 3 to 101 px.")
+    ] = 15,
+    min_correlation: Annotated[
+        float,
+        typer.Option(
+            "--min-correlation", metavar="R", help="Smallest r of a window and its template, 0 to 1."
+        ),
+    ] = 0.7,
+) -> None:
+    """Measure the key points of a COLMAP model anew.
+
+    By multi-photo least squares matching; then the model is adjusted again.
+    """
+    with loading():
+        from adapters.colmap.camera_models import read_model, write_model
+        from sfm.cli.console import drawn_progress
+        from sfm.files.whole_files import refuse_links, whole_folder
+        from sfm.survey.refine import refine_model, refinement_text
+
+    if out is not None:
+        refuse_links(out)
+        if out.exists():
+            raise OutputError(f"{out}: exists already, the refined model needs a new folder")
+    network, estimate = read_model(model)
+    with drawn_progress() as progress:
+        found = refine_model(
+            network, estimate, images, window_px=window, min_correlation=min_correlation, progress=progress
+        )
+    print(refinement_text(found), end="")
+    if out is not None:
+        a = found.adjustment
+        with whole_folder(out) as folder:
+            write_model(folder, a.network, a.estimate, rejected=a.rejected)
+        print(f"Model: {out}")

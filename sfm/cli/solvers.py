@@ -1,0 +1,130 @@
+"""Commands about solutions: validate, compare and convert."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from sfm.cli.starting import loading
+
+WORSE = 1  # exit code where the in-house adjuster was ever the worse one
+
+
+def validate(
+    networks: Annotated[int, typer.Option("--networks", metavar="N", min=1, help="Random networks.")] = 50,
+    seed: Annotated[int, typer.Option("--seed", metavar="S", min=0, help="Of the random numbers.")] = 1,
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder of table, JSON and page.")] = Path(
+        "out/validation"
+    ),
+    jobs: Annotated[int, typer.Option("--jobs", metavar="N", min=1, help="Networks at a time.")] = 2,
+) -> None:
+    """Compare the adjuster with COLMAP's on random networks.
+
+    Exit code 1 if the in-house adjuster was ever the worse one.
+    """
+    with loading():
+        from adapters.colmap.covariance import ColmapBackend
+        from sfm.cli.console import drawn_progress
+        from sfm.comparison.validation import validate as validate_networks
+        from sfm.files.whole_files import refuse_foreign_folder
+        from sfm.report.validation import in_words, largest, write_validation
+
+    refuse_foreign_folder(out)
+    with drawn_progress() as progress:
+        found = validate_networks(ColmapBackend(), networks=networks, seed=seed, jobs=jobs, progress=progress)
+    page = write_validation(found, out)
+    for verdict, count in found.counts():
+        print(f"{count} of {networks} networks: {verdict}")
+    print("Largest differences:")
+    for name, value, unit in largest(found):
+        print(f"  {name}: {in_words(value, unit)}")
+    print(f"Report: {page}")
+    if not found.passed:
+        raise SystemExit(WORSE)
+
+
+def compare(
+    a: Annotated[Path, typer.Argument(metavar="A", help="Result folder, COLMAP model, or another format.")],
+    b: Annotated[Path, typer.Argument(metavar="B", help="What to compare it with.")],
+    align: Annotated[
+        str, typer.Option("--align", help="points, cameras, control or none: what B is brought onto A by.")
+    ] = "points",
+    control: Annotated[
+        str, typer.Option("--control", metavar="P,Q,R", help="Names of the points for --align control.")
+    ] = "",
+    a_format: Annotated[
+        str | None, typer.Option("--from-a", metavar="F", help="Format of A; else by what is there.")
+    ] = None,
+    b_format: Annotated[str | None, typer.Option("--from-b", metavar="F", help="Format of B.")] = None,
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder of table, JSON and page.")] = Path(
+        "out/comparison"
+    ),
+) -> None:
+    """Compare two results.
+
+    Differences, their standard deviations and what of them is significant.
+    """
+    with loading():
+        from adapters.formats.registry import read_comparable
+        from sfm.comparison.significance import compare_results
+        from sfm.files.whole_files import refuse_foreign_folder
+        from sfm.report.differences import largest_difference, words_of_test, write_differences
+
+    refuse_foreign_folder(out)
+    first, second = read_comparable(a, a_format), read_comparable(b, b_format)
+    names = tuple(name.strip() for name in control.split(",") if name.strip())
+    found = compare_results(first, second, align=align, control=names)
+    place = {name: j for j, name in enumerate(first.network.points)}
+    xyz = first.estimate.points[[place[name] for name in found.points]]
+    page = write_differences(found, xyz, out)
+    print(words_of_test(found)[0])
+    print(f"{len(found.points)} common points, {len(found.images)} common photographs")
+    if found.points:
+        print(f"largest difference of a point: {largest_difference(found)}")
+    print(f"Report: {page}")
+
+
+def convert(
+    source: Annotated[Path, typer.Argument(metavar="IN", help="File or folder to read.")],
+    target: Annotated[Path, typer.Argument(metavar="OUT", help="File or folder to write.")],
+    to_format: Annotated[
+        str | None,
+        typer.Option("--to", metavar="F", help="Format to write; else by the ending of OUT.  See README."),
+    ] = None,
+    from_format: Annotated[
+        str | None, typer.Option("--from", metavar="F", help="Format to read; else by what is there.")
+    ] = None,
+    straighten: Annotated[
+        bool,
+        typer.Option("--undistort", help="Correct image points for distortion: for formats that hold none."),
+    ] = False,
+) -> None:
+    """Carry a survey between programs.
+
+    A camera is converted where the format lacks its model.
+    """
+    with loading():
+        from adapters.formats.registry import ENDINGS, format_named, read_any, write_any, written
+        from sfm.comparison.camera_conversion import Conversion, convert_cameras
+        from sfm.comparison.undistortion import undistort
+
+    form = format_named(to_format or ENDINGS.get(target.suffix.lower(), "tables"))
+    network, estimate = read_any(source, from_format)
+    cameras = estimate.cameras
+    conversions: tuple[Conversion, ...] = ()
+    if form.models:
+        if straighten:
+            network, estimate = undistort(network, estimate, form.models)
+        estimate, conversions = convert_cameras(estimate, form.models, held=form.lacks)
+    write_any(target, form.name, network, estimate)
+    for camera, one in zip(cameras, conversions, strict=False):
+        if straighten:
+            print(f"camera {camera.name}: image points corrected for {camera.model}, ideal camera written")
+        elif one.camera is not camera:
+            print(
+                f"camera {camera.name}: {one.source_model} to {one.camera.model}, "
+                f"misfit {one.rms_px:.4f} px RMS, {one.max_px:.4f} px at most"
+            )
+    print(f"{target}: {written(form.name, network, estimate)} as {form.name}")

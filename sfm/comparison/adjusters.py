@@ -1,0 +1,296 @@
+"""Comparison of two solutions of one network, and of two adjusters on one network.
+
+The datum is no part of a solution: one is brought onto the other by a 7-parameter similarity over the
+object points before anything is subtracted. Two adjusters are compared on what both can do: the accepted
+image points with equal weights, no control and no scale bars, and one functional model, which for a
+survey in `brown` is `full_opencv`.
+
+With all twelve parameters free, full_opencv is near to singular: a factor common to the numerator and
+the denominator of its radial term changes nothing, and COLMAP frees the distortion as a whole or not at
+all. Where the image points cannot tell k1-k3 from k4-k6, the distortion is therefore held at the survey's
+result in both adjusters, and the comparison says so.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+import numpy as np
+
+from sfm.adjustment.datum import Datum
+from sfm.adjustment.result import Adjustment
+from sfm.adjustment.solve import adjust
+from sfm.camera import Camera, pixel_from_tangents, project, tangents_from_pixel
+from sfm.comparison.camera_conversion import Conversion
+from sfm.comparison.common_problem import common_problem, distortion_held
+from sfm.comparison.unshared import without_sharing
+from sfm.conventions import FloatArray, IntArray
+from sfm.network import Estimate, Network
+from sfm.similarity import Similarity, fit_similarity
+
+EFFECT_STEPS = 9  # places along each side of the photograph where interior orientations are compared
+MAX_ITERATIONS = 200  # the weak directions of full_opencv take more steps than a survey
+
+
+@dataclass(frozen=True)
+class Thresholds:
+    """Largest differences with which two solutions are the same optimum."""
+
+    rms_px: float = 1e-6  # px
+    rotation_deg: float = 1e-6  # deg
+    position: float = 1e-7  # of the object size
+    point: float = 1e-7  # of the object size
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Differences b - a of two solutions of one network after a similarity of b onto a."""
+
+    names: tuple[str, str]  # of a and b
+    a: Estimate  # first solution
+    b: Estimate  # second solution, in the datum of the first
+    a_from_b: Similarity
+    object_size: float  # diagonal of the box around the object points, object unit
+    position: FloatArray  # of the projection centres, object unit, (m, 3)
+    rotation_deg: FloatArray  # angle between the two rotations of each photograph, deg, (m,)
+    points: FloatArray  # of the object points, object unit, (n, 3)
+    interior: tuple[FloatArray, ...]  # of the parameters of each camera, their units; NaN across models
+    interior_px: FloatArray  # largest shift of a ray in the photograph, px, (cameras,)
+    rms_px: tuple[float, float]  # root mean square residual per coordinate of a and b, px
+    cost: tuple[float, float]  # half the sum of squared residuals of a and b, px^2
+    exceeded: tuple[str, ...]  # thresholds that were exceeded, in words; empty if they agree
+
+    @property
+    def agree(self) -> bool:
+        """Whether both are the same optimum within all thresholds."""
+        return not self.exceeded
+
+    @property
+    def max_position(self) -> float:
+        """Largest difference of a projection centre, object unit."""
+        return _longest(self.position)
+
+    @property
+    def max_rotation_deg(self) -> float:
+        """Largest angle between two rotations, deg."""
+        return float(np.max(self.rotation_deg, initial=0.0))
+
+    @property
+    def max_point(self) -> float:
+        """Largest difference of an object point, object unit."""
+        return _longest(self.points)
+
+
+@dataclass(frozen=True)
+class AdjusterComparison:
+    """Two adjusters on the same network, model, weights and start values."""
+
+    backend: str  # the other adjuster
+    model: str  # functional model of both
+    conversions: tuple[Conversion, ...]  # of each camera from the survey's model; misfit 0 if it is the same
+    freed: tuple[str, ...]  # cameras with more free parameters than the survey's, in words
+    held: tuple[str, ...]  # why the distortion was held at the survey's result; empty if it was free
+    network: Network  # accepted image points with unit weights, as both had them
+    adjustment: Adjustment  # the in-house one in that model
+    backend_iterations: int  # steps of the other adjuster
+    backend_converged: bool
+    backend_seconds: float  # s
+    comparison: Comparison
+    backend_points: (
+        FloatArray | None
+    )  # the other's covariances of the points with photographs and cameras held
+    # (conditional), scaled by our sigma0, object unit^2, (n, 3, 3); None where it has none
+    unshared: tuple[str, ...] = ()  # what cameras share in the survey and was held at its result, in words
+
+    @property
+    def agree(self) -> bool:
+        """Whether both converged to the same optimum."""
+        return self.comparison.agree and self.adjustment.converged and self.backend_converged
+
+
+class BackendAdjustment(Protocol):
+    """What another adjuster must return."""
+
+    @property
+    def estimate(self) -> Estimate: ...
+    @property
+    def iterations(self) -> int: ...
+    @property
+    def converged(self) -> bool: ...
+    @property
+    def seconds(self) -> float: ...
+    @property
+    def point_covariance(self) -> FloatArray | None:
+        """Of the points, photographs and cameras held, for image coordinates of 1 px; None without."""
+
+
+def compare(
+    a: Estimate,
+    b: Estimate,
+    network: Network,
+    *,
+    names: tuple[str, str] = ("kolinear", "colmap"),
+    thresholds: Thresholds | None = None,
+) -> Comparison:
+    """Compare two solutions of the same network, whatever datum each is in.
+
+    Args:
+        a, b: the solutions; photographs and points that only one of them has are not compared.
+        network: the image points for the residuals of both.
+        names: what to call a and b.
+        thresholds: differences up to which they agree.
+
+    Raises:
+        GeometryError: fewer than three points in common, or all of them on a line.
+    """
+    limits = Thresholds() if thresholds is None else thresholds
+    both = a.determined & b.determined
+    a_from_b = fit_similarity(b.points[both], a.points[both])
+    moved = a_from_b.apply_estimate(b)
+    images = a.oriented & b.oriented
+    size = float(np.linalg.norm(np.ptp(a.points[both], axis=0)))
+    position = np.where(images[:, None], moved.position - a.position, np.nan)
+    points = np.where(both[:, None], moved.points - a.points, np.nan)
+    angle = np.full(len(images), np.nan)
+    angle[images] = rotation_angle_deg(a.rotation[images], moved.rotation[images])
+    squares = [(reprojection(network, estimate) ** 2).ravel() for estimate in (a, b)]
+    rms = tuple(float(np.sqrt(np.mean(s))) if len(s) else 0.0 for s in squares)
+    found = (
+        ("RMS", abs(rms[0] - rms[1]), limits.rms_px, "px"),
+        ("rotation", float(np.nanmax(angle, initial=0.0)), limits.rotation_deg, "deg"),
+        ("position", _longest(position) / size, limits.position, "of the object size"),
+        ("point", _longest(points) / size, limits.point, "of the object size"),
+    )
+    return Comparison(
+        names,
+        a,
+        moved,
+        a_from_b,
+        size,
+        position,
+        angle,
+        points,
+        tuple(_difference(p, q) for p, q in zip(a.cameras, b.cameras, strict=True)),
+        np.array([interior_effect_px(p, q) for p, q in zip(a.cameras, b.cameras, strict=True)]),
+        (rms[0], rms[1]),
+        (float(squares[0].sum() / 2), float(squares[1].sum() / 2)),
+        tuple(
+            f"{what} differs by {value:.2g} {unit}, {limit:.2g} is allowed"
+            for what, value, limit, unit in found
+            if not value <= limit
+        ),
+    )
+
+
+def compare_adjusters(
+    adjustment: Adjustment,
+    backend: Callable[[Network, Estimate], BackendAdjustment],
+    *,
+    name: str = "colmap",
+    model: str | None = None,
+    thresholds: Thresholds | None = None,
+) -> AdjusterComparison:
+    """Run the in-house adjuster and another one on the accepted image points of a survey.
+
+    Both start from the survey's result with its cameras converted, all image coordinates have the same
+    weight, and the datum is free.
+
+    Args:
+        adjustment: of the survey.
+        backend: the other adjuster, a function of network and start values.
+        name: of the backend.
+        model: functional model of both; that of the survey if it is an opencv one, else full_opencv.
+        thresholds: differences up to which they agree.
+
+    Raises:
+        GeometryError: nothing is left to compare.
+        BackendError: the backend refuses.
+    """
+    cameras, unshared = without_sharing(adjustment.estimate.cameras)
+    adjustment = replace(adjustment, estimate=replace(adjustment.estimate, cameras=cameras))
+    network, start, conversions, freed = common_problem(adjustment, model=model)
+    ours = _adjusted(network, start, adjustment.sigma_px)
+    held: tuple[str, ...] = ()
+    if start.cameras[0].model == "full_opencv" and (ours.undetermined or not ours.converged):
+        held = ours.undetermined or (
+            f"k1 to k6 still grow together after {MAX_ITERATIONS} iterations, numerator and denominator of "
+            "the rational distortion cancelling",
+        )
+        start = replace(start, cameras=tuple(distortion_held(camera) for camera in start.cameras))
+        ours = _adjusted(network, start, adjustment.sigma_px)
+    theirs = backend(network, start)
+    conditional = theirs.point_covariance
+    return AdjusterComparison(
+        name,
+        start.cameras[0].model,
+        conversions,
+        freed,
+        held,
+        network,
+        ours,
+        theirs.iterations,
+        theirs.converged,
+        theirs.seconds,
+        compare(ours.estimate, theirs.estimate, network, names=("kolinear", name), thresholds=thresholds),
+        None if conditional is None else (ours.sigma0 * ours.sigma_px) ** 2 * conditional,
+        unshared,
+    )
+
+
+def _adjusted(network: Network, start: Estimate, sigma_px: float) -> Adjustment:
+    return adjust(
+        network,
+        start,
+        datum=Datum("free"),
+        sigma_px=sigma_px,
+        reject="none",
+        max_iterations=MAX_ITERATIONS,
+    )
+
+
+def reprojection(network: Network, estimate: Estimate) -> FloatArray:
+    """Return computed minus measured pixels of the image points that the estimate determines, (k, 2)."""
+    seen = network.image_points
+    use = estimate.oriented[seen.image] & estimate.determined[seen.point]
+    v = np.zeros((len(seen), 2))
+    for i in np.unique(seen.image[use]):
+        rows: IntArray = np.flatnonzero(use & (seen.image == i))
+        computed = project(
+            estimate.cameras[network.camera[i]],
+            estimate.position[i],
+            estimate.rotation[i],
+            estimate.points[seen.point[rows]],
+        )
+        v[rows] = computed - seen.xy[rows]
+    return v[use]
+
+
+def rotation_angle_deg(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Return the angle between rotations, shape (k, 3, 3) each, deg; exact to rounding near 0."""
+    D = np.einsum("kji,kjl->kil", a, b)
+    sine = np.stack([D[:, 2, 1] - D[:, 1, 2], D[:, 0, 2] - D[:, 2, 0], D[:, 1, 0] - D[:, 0, 1]], axis=1) / 2
+    cosine = (np.trace(D, axis1=1, axis2=2) - 1) / 2
+    return np.rad2deg(np.arctan2(np.linalg.norm(sine, axis=1), cosine))
+
+
+def interior_effect_px(a: Camera, b: Camera) -> float:
+    """Return the largest shift between two interior orientations of a ray in the photograph, px."""
+    width, height = a.size_px
+    x = np.linspace(-0.5, width - 0.5, EFFECT_STEPS)
+    y = np.linspace(-0.5, height - 0.5, EFFECT_STEPS)
+    xy = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+    shift = pixel_from_tangents(b, tangents_from_pixel(a, xy)) - xy
+    return _longest(shift)
+
+
+def _difference(a: Camera, b: Camera) -> FloatArray:
+    if a.model != b.model:
+        return np.full(len(a.parameters), np.nan)
+    return b.parameters - a.parameters
+
+
+def _longest(vectors: FloatArray) -> float:
+    """Length of the longest vector; those with NaN do not count."""
+    return float(np.nanmax(np.linalg.norm(vectors, axis=1), initial=0.0))

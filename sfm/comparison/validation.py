@@ -1,0 +1,342 @@
+"""Validation of the in-house adjuster by another one, over random networks from the same start values.
+
+Per network: cost, RMS, steps and seconds of both; the largest differences of their results over the
+standard deviations of these; the covariances of both at the same solution; and a verdict. Two solutions
+are the same optimum when their costs agree to SAME_COST, far below what a difference of a hundredth of a
+standard deviation in any direction would cost.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import signal
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from functools import partial
+from itertools import count
+from typing import Protocol, TypeVar
+
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+from sfm.adjustment.datum import Datum
+from sfm.adjustment.result import Adjustment
+from sfm.adjustment.solve import adjust
+from sfm.comparison.adjusters import BackendAdjustment, reprojection, rotation_angle_deg
+from sfm.comparison.random_network import Plan, RandomNetwork, random_network
+from sfm.conventions import BoolArray, FloatArray
+from sfm.errors import KolinearError
+from sfm.network import Estimate, Network
+from sfm.progress import SILENT, Progress
+from sfm.similarity import fit_similarity
+
+T = TypeVar("T")
+SAME_COST = 1e-9  # relative difference of the costs of one optimum
+MAX_ITERATIONS = 100
+WARM_UP_SEED = 0  # of networks that are adjusted before any is timed
+WARM_UP_IMAGE_POINTS = 3000  # which are smaller than this
+SAME = "same optimum"
+OURS_LOWER = "different optima, kolinear lower"
+THEIRS_LOWER = "different optima, {name} lower"
+OURS_FAILED = "kolinear failed"
+THEIRS_FAILED = "{name} failed"
+BOTH_FAILED = "both failed"
+
+
+class ValidationAdjustment(BackendAdjustment, Protocol):
+    """What the other adjuster must return, and why it stopped."""
+
+    @property
+    def message(self) -> str: ...
+
+
+class ValidationCovariance(Protocol):
+    """Covariances for image coordinates of standard deviation 1 px."""
+
+    @property
+    def interior(self) -> tuple[FloatArray, ...]: ...  # marginal, of the free parameters
+    @property
+    def points(self) -> FloatArray: ...  # conditional on photographs and cameras, (n, 3, 3)
+
+
+class ValidationBackend(Protocol):
+    """The other adjuster: a module or an object with a name and these two functions."""
+
+    @property
+    def name(self) -> str: ...
+
+    def adjust(self, network: Network, start: Estimate, *, control: bool) -> ValidationAdjustment:
+        """Adjust with unit weights, control points held or the datum free."""
+
+    def covariance(
+        self, network: Network, estimate: Estimate, *, control: bool
+    ) -> ValidationCovariance | None:
+        """Return covariances at a solution, None if they cannot be had."""
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One random network adjusted by both; pairs are (kolinear, the other), NaN where there is nothing."""
+
+    number: int  # of the network, with the seed all that is needed to make it again
+    plan: Plan
+    points: int  # object points that took part
+    image_points: int
+    cost: tuple[float, float]  # half the sum of squared residuals, px^2
+    rms_px: tuple[float, float]  # per coordinate, px
+    iterations: tuple[int, int]
+    seconds: tuple[float, float]  # of adjustment alone, covariance not included, s
+    interior_sigmas: float  # largest difference of a free interior parameter over its sigma
+    position_sigmas: float  # of a coordinate of a projection centre over its sigma
+    rotation_sigmas: float  # of a rotation over the smallest sigma of its angles
+    point_sigmas: float  # of an object coordinate over its sigma
+    conditional_difference: float  # of the points' covariances with cameras held, relative
+    interior_difference: float  # of the marginal covariances of the interior orientation, relative
+    marginal_over_conditional: float  # median ratio of a point's sigma to that with cameras held
+    verdict: str
+    reason: str  # why one failed, else empty
+    worse: bool  # whether the in-house adjuster is the worse one
+
+
+@dataclass(frozen=True)
+class Validation:
+    """All trials of one run."""
+
+    backend: str  # name of the other adjuster
+    seed: int
+    trials: tuple[Trial, ...]
+
+    @property
+    def passed(self) -> bool:
+        """Whether the in-house adjuster is nowhere the worse one."""
+        return not any(trial.worse for trial in self.trials)
+
+    def counts(self) -> tuple[tuple[str, int], ...]:
+        """Return how often each verdict was given, most frequent first."""
+        verdicts = [trial.verdict for trial in self.trials]
+        return tuple(sorted(((v, verdicts.count(v)) for v in set(verdicts)), key=lambda row: -row[1]))
+
+
+def validate(
+    backend: ValidationBackend,
+    *,
+    networks: int,
+    seed: int,
+    jobs: int = 1,
+    progress: Progress = SILENT,
+) -> Validation:
+    """Adjust random networks with both adjusters and compare everything.
+
+    Args:
+        backend: the other adjuster; it must be picklable if jobs > 1.
+        networks: how many.
+        seed: of the random networks; network k is the same for any number of networks.
+        jobs: processes at work, each on one thread.
+        progress: told of every network.
+    """
+    progress.stage("networks", networks)
+    trials = []
+    for trial in _run(backend, seed, networks, jobs):
+        trials.append(trial)
+        progress.advance(f"network {trial.number}")
+    return Validation(backend.name, seed, tuple(trials))
+
+
+def make_trial(number: int, seed: int, backend: ValidationBackend) -> Trial:
+    """Make network `number` of a seed, adjust it with both and judge.
+
+    Args:
+        number: of the network, from 0.
+        seed: of the run.
+        backend: the other adjuster.
+    """
+    made = random_network(np.random.default_rng([seed, number]))
+    network, plan = made.network, made.plan
+    control = plan.datum == "control"
+    begun = time.perf_counter()
+    ours, our_reason = _tried(lambda: _adjust(made, covariance=False))
+    our_seconds = time.perf_counter() - begun
+    theirs, their_reason = _tried(lambda: backend.adjust(network, made.start, control=control))
+    if ours is not None:
+        our_reason = "; ".join(ours.undetermined) or ("" if ours.converged else "not converged")
+    if theirs is not None and not theirs.converged:
+        their_reason = theirs.message or "not converged"
+    cost_a, rms_a = _fit(network, None if ours is None else ours.estimate)
+    cost_b, rms_b = _fit(network, None if theirs is None else theirs.estimate)
+    sigmas = (np.nan,) * 4
+    covariances = (np.nan,) * 3
+    if ours is not None and not our_reason:
+        at_optimum = ours.estimate
+        full, our_reason = _tried(lambda: _adjust(made, covariance=True, start=at_optimum))
+        if full is not None and theirs is not None and np.isfinite(cost_b):
+            sigmas = _differences(full, theirs.estimate, control=control)
+        if full is not None:
+            covariances = _covariances(full, backend, control=control)
+    same = abs(cost_b - cost_a) <= SAME_COST * min(cost_a, cost_b)
+    verdict, worse = _judge(cost_a, cost_b, same, bool(our_reason), bool(their_reason))
+    reasons = [
+        f"{who}: {why}" for who, why in (("kolinear", our_reason), (backend.name, their_reason)) if why
+    ]
+    return Trial(
+        number,
+        plan,
+        len(network.points),
+        len(network.image_points),
+        (cost_a, cost_b),
+        (rms_a, rms_b),
+        (0 if ours is None else ours.iterations, 0 if theirs is None else theirs.iterations),
+        (our_seconds, np.nan if theirs is None else theirs.seconds),
+        *sigmas,
+        *covariances,
+        verdict.format(name=backend.name),
+        "; ".join(reasons),
+        worse,
+    )
+
+
+def _run(backend: ValidationBackend, seed: int, networks: int, jobs: int) -> Iterator[Trial]:
+    if jobs <= 1:
+        with threadpool_limits(1):
+            warm_up(backend)
+            for number in range(networks):
+                yield make_trial(number, seed, backend)
+        return
+    with threadpool_limits(1):
+        warm_up(backend)  # compiles, where it must, once and not in every worker
+    # Fresh processes: threads of compiled libraries do not survive a fork.
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(jobs, mp_context=context, initializer=_begin, initargs=(backend,)) as pool:
+        try:
+            yield from pool.map(make_trial, range(networks), [seed] * networks, [backend] * networks)
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
+
+
+def _begin(backend: ValidationBackend) -> None:
+    """Prepare a worker: one thread, no answer to Ctrl-C (the parent's answer ends it), kernels loaded."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threadpool_limits(1)
+    warm_up(backend)
+
+
+def warm_up(backend: ValidationBackend) -> None:
+    """Adjust a network of every camera model once, so that loading and compiling is not in the seconds."""
+    waiting = {"opencv", "full_opencv"}
+    for number in count():
+        made = random_network(np.random.default_rng([WARM_UP_SEED, number]))
+        if made.plan.model in waiting and len(made.network.image_points) < WARM_UP_IMAGE_POINTS:
+            waiting.remove(made.plan.model)
+            control = made.plan.datum == "control"
+            _tried(partial(_adjust, made, covariance=True))
+            _tried(partial(backend.adjust, made.network, made.start, control=control))
+        if not waiting:
+            return
+
+
+def _adjust(made: RandomNetwork, *, covariance: bool, start: Estimate | None = None) -> Adjustment:
+    return adjust(
+        made.network,
+        made.start if start is None else start,
+        datum=Datum(made.plan.datum),
+        sigma_px=made.plan.noise_px,
+        reject="none",
+        max_iterations=MAX_ITERATIONS,
+        covariance=covariance,
+    )
+
+
+def _tried(run: Callable[[], T]) -> tuple[T | None, str]:
+    """Run an adjuster; whatever it ends with is a result here, faults of a program too."""
+    try:
+        return run(), ""
+    except KolinearError as error:
+        return None, str(error)
+    except Exception as error:
+        return None, f"{type(error).__name__}: {error}"
+
+
+def _fit(network: Network, estimate: Estimate | None) -> tuple[float, float]:
+    """Cost (px^2) and RMS (px) of an estimate by the same formulas for both; NaN if it has lost points."""
+    if estimate is None:
+        return np.nan, np.nan
+    v = reprojection(network, estimate)
+    if len(v) < len(network.image_points):
+        return np.nan, np.nan
+    return float((v**2).sum() / 2), float(np.sqrt((v**2).mean()))
+
+
+def _judge(a: float, b: float, same: bool, our_failure: bool, their_failure: bool) -> tuple[str, bool]:
+    """Return the verdict, and whether the in-house adjuster is the worse one."""
+    # An adjuster that ends at the optimum of the other has solved the network, whatever it says of itself.
+    if same:
+        return SAME, False
+    if our_failure and their_failure:
+        return BOTH_FAILED, False
+    if our_failure or not np.isfinite(a):
+        return OURS_FAILED, True
+    if their_failure or not np.isfinite(b):
+        return THEIRS_FAILED, False
+    return (OURS_LOWER, False) if a < b else (THEIRS_LOWER, True)
+
+
+def _differences(full: Adjustment, theirs: Estimate, *, control: bool) -> tuple[float, float, float, float]:
+    """Largest differences of interior, position, rotation and points over their standard deviations.
+
+    In a free network after a 7-parameter similarity over all points, which is the datum of inner
+    constraints that the standard deviations refer to.
+    """
+    ours = full.estimate
+    if not control:
+        theirs = fit_similarity(theirs.points, ours.points).apply_estimate(theirs)
+    interior = [
+        (q.parameters - p.parameters)[p.free] / np.sqrt(np.diag(Q))
+        for p, q, Q in zip(ours.cameras, theirs.cameras, full.covariance.interior, strict=True)
+    ]
+    sigma = np.sqrt(np.diagonal(full.covariance.exterior, axis1=1, axis2=2))
+    angle = np.deg2rad(rotation_angle_deg(ours.rotation, theirs.rotation))
+    variance = np.diagonal(full.covariance.points, axis1=1, axis2=2)
+    moved = variance.min(axis=1) > 0
+    shift = (theirs.points - ours.points)[moved] / np.sqrt(variance[moved])
+    return (
+        float(np.abs(np.concatenate(interior)).max()) if any(map(len, interior)) else np.nan,
+        float(np.abs((theirs.position - ours.position) / sigma[:, :3]).max()),
+        float((angle / sigma[:, 3:].min(axis=1)).max()),
+        float(np.abs(shift).max()) if len(shift) else np.nan,
+    )
+
+
+def _covariances(
+    full: Adjustment, backend: ValidationBackend, *, control: bool
+) -> tuple[float, float, float]:
+    """Relative differences of conditional and interior covariances, ratio of marginal to conditional."""
+    network, variance = full.network, (full.sigma0 * full.sigma_px) ** 2
+    conditional = full.covariance.points_limiting
+    spread = np.trace(full.covariance.points, axis1=1, axis2=2)
+    moved: BoolArray = spread > 0
+    ratio = np.sqrt(spread[moved] / np.trace(conditional[moved], axis1=1, axis2=2))
+    found, _ = _tried(lambda: backend.covariance(network, full.estimate, control=control))
+    if found is None:
+        return np.nan, np.nan, float(np.median(ratio))
+    points = [
+        _relative(ours / variance, theirs)
+        for ours, theirs in zip(conditional[moved], found.points[moved], strict=True)
+    ]
+    interior = [
+        _relative(ours / variance, theirs)
+        for ours, theirs in zip(full.covariance.interior, found.interior, strict=True)
+        if len(theirs)
+    ]
+    return (
+        max(points, default=np.nan),
+        max(interior, default=np.nan),
+        float(np.median(ratio)),
+    )
+
+
+def _relative(ours: FloatArray, theirs: FloatArray) -> float:
+    """Largest difference of two covariances, each element over the sigmas it belongs to."""
+    sigma = np.sqrt(np.diag(theirs))
+    return float(np.abs((ours - theirs) / np.outer(sigma, sigma)).max())

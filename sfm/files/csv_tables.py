@@ -1,0 +1,213 @@
+"""CSV tables with named columns, read as untrusted.
+
+What they may hold is bounded before memory is taken for it, and every refusal names the line and the column.
+
+Source: RFC 4180.
+"""
+
+from __future__ import annotations
+
+import csv
+import math
+import sys
+from array import array
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TextIO
+
+import numpy as np
+
+from sfm.conventions import BoolArray, FloatArray, IntArray
+from sfm.errors import SurveyFileError
+from sfm.files.plain_text import MAX_NAME, as_plain, from_cell, is_plain
+
+# Room for the largest networks that are adjusted here, some 300 MB of memory at most.
+MAX_TABLE_BYTES = 500_000_000
+MAX_ROWS = 5_000_000
+MAX_LINE = 10_000  # characters
+MAX_NUMBER = 1e12  # no length, angle or pixel is larger; squares and products of larger ones overflow
+
+
+@dataclass(frozen=True)
+class CsvTable:
+    """Columns of a CSV file, with what is needed to say where something is wrong."""
+
+    path: Path
+    names: tuple[str, ...]  # of the columns of text
+    texts: tuple[tuple[str, ...], ...]  # one tuple per column of text
+    values: FloatArray  # columns of numbers, (rows, columns)
+    line: IntArray  # line of each row in the file, (rows,)
+
+    def keys(self, column: str) -> tuple[str, ...]:
+        """Return a column of names that are all different."""
+        values = self.texts[self.names.index(column)]
+        self.refuse_duplicates(values, (column,))
+        return values
+
+    def refuse(self, values: FloatArray, wrong: BoolArray, columns: tuple[str, ...], needed: str) -> None:
+        """Raise SurveyFileError for the first value of a mask, both (rows, columns)."""
+        for k, c in np.argwhere(wrong)[:1]:
+            where = f"{self.path}, line {self.line[k]}: column {columns[c]}"
+            raise SurveyFileError(f"{where} holds {values[k, c]:g}, needed {needed}")
+
+    def refuse_duplicates(self, keys: tuple[object, ...], columns: tuple[str, ...]) -> None:
+        """Raise SurveyFileError if a key comes twice."""
+        if len(set(keys)) == len(keys):
+            return
+        first: dict[object, int] = {}
+        for key, line in zip(keys, self.line.tolist(), strict=True):
+            if key in first:
+                names = key if isinstance(key, tuple) else (key,)
+                what = ", ".join(f"{c} '{name}'" for c, name in zip(columns, names, strict=True))
+                raise SurveyFileError(f"{self.path}, line {line}: {what} stands on line {first[key]} already")
+            first[key] = line
+
+
+def read_table(
+    path: Path,
+    texts: tuple[str, ...],
+    numbers: tuple[str, ...],
+    optional: tuple[str, ...] = (),
+    *,
+    aliases: tuple[tuple[str, str], ...] = (),
+    ignored: tuple[str, ...] | None = (),
+    blank: tuple[str, ...] = (),
+) -> CsvTable:
+    """Read a CSV file whose header names its columns.
+
+    Args:
+        path: the file, UTF-8, comma separated, `.` as decimal sign.
+        texts: columns of names.
+        numbers: columns of numbers.
+        optional: columns of numbers that come all together or not at all.
+        aliases: (other name, name) of columns.
+        ignored: further columns that may be there; None for any.
+        blank: columns of numbers whose cells may be empty, which is NaN.
+
+    Raises:
+        SurveyFileError: unreadable, too large, wrong columns, or not a finite number of bearable size.
+    """
+    header = tuple(dict(aliases).get(name, name) for name in read_header(path))
+    wanted = (*texts, *numbers)
+    shape = ",".join(wanted) + (f"[,{','.join(optional)}]" if optional else "")
+    for name in header:
+        if header.count(name) > 1:
+            raise SurveyFileError(f"{path}, line 1: column {name!r:.60} stands twice in the header")
+        if ignored is not None and name not in (*wanted, *optional, *ignored):
+            hint = "; commas must separate the columns" if ";" in name or "\t" in name else ""
+            raise SurveyFileError(f"{path}, line 1: unknown column {name!r:.60}, needed {shape}{hint}")
+    if any(name in header for name in optional):
+        numbers = (*numbers, *optional)
+    for name in (*texts, *numbers):
+        if name not in header:
+            raise SurveyFileError(f"{path}, line 1: no column {name}, needed {shape}")
+    text_at = [header.index(name) for name in texts]
+    number_at = [header.index(name) for name in numbers]
+    columns: list[list[str]] = [[] for _ in texts]
+    values, lines = array("d"), array("q")
+    for line, row in _rows(path, len(header)):
+        where = f"{path}, line {line}"
+        if len(lines) == MAX_ROWS:
+            raise SurveyFileError(f"{where}: more than {MAX_ROWS} rows, no more are read")
+        for column, at, name in zip(columns, text_at, texts, strict=True):
+            column.append(_name(row[at], f"{where}: column {name}"))
+        for at, name in zip(number_at, numbers, strict=True):
+            empty = name in blank and not row[at].strip()
+            values.append(math.nan if empty else _number(row[at], f"{where}: column {name}"))
+        lines.append(line)
+    if not lines:
+        raise SurveyFileError(f"{path}: no rows below the header, at least one is needed")
+    return CsvTable(
+        path,
+        texts,
+        tuple(tuple(column) for column in columns),
+        np.array(values).reshape(len(lines), len(numbers)),
+        np.array(lines, dtype=np.int64),
+    )
+
+
+def _rows(path: Path, columns: int) -> Iterator[tuple[int, list[str]]]:
+    """Yield line number and cells of every row below the header that is not empty."""
+    with _opened(path) as file:
+        reader = csv.reader(_lines(path, file))
+        try:
+            next(reader, None)
+            for row in reader:
+                if not any(cell.strip() for cell in row):
+                    continue
+                if len(row) != columns:
+                    raise SurveyFileError(
+                        f"{path}, line {reader.line_num}: {len(row)} columns, the header has {columns}"
+                    )
+                yield reader.line_num, row
+        except UnicodeDecodeError as error:
+            raise SurveyFileError(
+                f"{path}: not a text file in UTF-8 (after line {reader.line_num}); save it as such"
+            ) from error
+        except csv.Error as error:
+            raise SurveyFileError(f"{path}, line {reader.line_num}: not a CSV table: {error}") from error
+        except OSError as error:
+            raise SurveyFileError(f"{path}: the table cannot be read: {error.strerror}") from error
+
+
+def _lines(path: Path, file: TextIO) -> Iterator[str]:
+    """Yield the lines of a file, none longer than a line can be, and not more than twice the rows."""
+    for number in range(1, 2 * MAX_ROWS):
+        line = file.readline(MAX_LINE + 1)
+        if not line:
+            return
+        if len(line) > MAX_LINE:
+            raise SurveyFileError(f"{path}, line {number}: more than {MAX_LINE} characters, not a CSV table")
+        yield line
+    raise SurveyFileError(f"{path}: more than {2 * MAX_ROWS} lines, no more are read")
+
+
+def read_header(path: Path) -> tuple[str, ...]:
+    """Return the names of the columns."""
+    with _opened(path) as file:
+        try:
+            return tuple(name.strip() for name in next(csv.reader(_lines(path, file)), []))
+        except (UnicodeDecodeError, csv.Error) as error:
+            raise SurveyFileError(f"{path}, line 1: not a CSV table in UTF-8; save it as such") from error
+        except OSError as error:
+            raise SurveyFileError(f"{path}: the table cannot be read: {error.strerror}") from error
+
+
+def _opened(path: Path) -> TextIO:
+    """Open a table that is a file of bearable size."""
+    try:
+        if path.exists() and not path.is_file():  # reading a pipe would never end
+            raise SurveyFileError(f"{path}: not a file, a CSV table is needed")
+        if path.stat().st_size > MAX_TABLE_BYTES:
+            raise SurveyFileError(f"{path}: {path.stat().st_size} bytes, at most {MAX_TABLE_BYTES} are read")
+        return path.open(encoding="utf-8-sig", newline="")
+    except (OSError, ValueError) as error:
+        reason = error.strerror if isinstance(error, OSError) else error
+        raise SurveyFileError(f"{path}: the table cannot be read: {reason}") from error
+
+
+def _name(cell: str, where: str) -> str:
+    """Return a name; one that is empty, very long or holds characters that nobody sees is refused."""
+    name = from_cell(cell.strip())
+    if not name:
+        raise SurveyFileError(f"{where} is empty, a name is needed")
+    if len(name) > MAX_NAME or not is_plain(name):
+        raise SurveyFileError(
+            f"{where} holds '{as_plain(name):.60}', needed plain text of at most {MAX_NAME} characters"
+        )
+    return sys.intern(name)
+
+
+def _number(cell: str, where: str) -> float:
+    """Return a number as programs write it; Python's own float() takes 1_0 and digits of all scripts, too."""
+    text = cell.strip()
+    try:
+        value = float(text) if text.isascii() and "_" not in text else math.nan
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise SurveyFileError(f"{where} holds {cell!r:.60}, a finite number is needed")
+    if abs(value) > MAX_NUMBER:
+        raise SurveyFileError(f"{where} holds {text:.60}, needed a number of at most {MAX_NUMBER:g}")
+    return value

@@ -1,0 +1,84 @@
+"""Values as files hold them: numbers with the digits that give them back, names as plain text.
+
+Spreadsheets compute cells that begin with =, +, @ or a - that begins no number, after spaces, too, and
+some begin a cell after each semicolon. In every such place of a text an apostrophe is put before it where CSV
+is written, and taken away where it is read; apostrophes that stand there already get one more, so that texts
+come back as they were. Control characters (a tab or carriage return begins formulas, too) are no part of
+names, and written out in other texts.
+
+Source: OWASP, "CSV Injection"; Unicode Standard 15, property Default_Ignorable_Code_Point, and UAX 9 for
+bidirectional characters.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+import re
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+
+MAX_NAME = 500  # characters of a name that is read from a file
+
+# What nobody sees, or what changes how the text around it is seen: categories Cc, Cf, Cs, Zl and Zp, and all
+# else that is ignored by default.
+_HIDDEN = re.compile(
+    r"[\x00-\x1f\x7f-\x9f\xad\u034f\u0600-\u0605\u061c\u06dd\u070f\u0890\u0891\u08e2\u115f\u1160\u17b4\u17b5"
+    r"\u180b-\u180f\u200b-\u200f\u2028-\u202e\u2060-\u206f\u3164\ud800-\udfff\ufe00-\ufe0f\ufeff\uffa0"
+    r"\ufff0-\ufffb\U000110bd\U000110cd\U00013430-\U0001343f\U0001bca0-\U0001bca3\U0001d173-\U0001d17a"
+    r"\U000e0000-\U000e0fff]"
+)
+_START = r"(\A|;)"  # of a cell, also where a spreadsheet separates cells by semicolons
+_NUMBER = r"\d+(?:\.\d*)?(?:[eE][-+]?\d+)? *(?:\Z|;)"
+_FORMULA = (
+    rf"('*\s*(?:[=+@\uff1d\uff0b\uff20]|[-\uff0d](?!{_NUMBER})))"  # also in the width of Chinese letters
+)
+_BARE, _QUOTED = re.compile(_START + _FORMULA), re.compile(_START + "'" + _FORMULA)
+
+
+def or_none(value: float) -> float | None:
+    """Return a number for JSON, which knows no NaN and no infinity."""
+    return float(value) if math.isfinite(value) else None
+
+
+def csv_text(header: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
+    """Return a table as CSV."""
+    buffer = io.StringIO()
+    writer = csv.writer(buffer, lineterminator="\n")
+    writer.writerow(header)
+    writer.writerows([_cell(value) for value in row] for row in rows)
+    return buffer.getvalue()
+
+
+def as_cell(text: str) -> str:
+    """Return a text with an apostrophe before everything in it that a spreadsheet takes for a formula."""
+    return _BARE.sub(r"\1'\2", text)
+
+
+def from_cell(cell: str) -> str:
+    """Return the text that `as_cell` has made this of."""
+    return _QUOTED.sub(r"\1\2", cell)
+
+
+def is_plain(text: str) -> bool:
+    """Whether a name is fit for tables and terminals: no control, bidirectional or invisible characters.
+
+    On Linux the name of a file is any bytes; those that are no UTF-8 come as lone surrogates (PEP 383), which
+    are none of these either.
+    """
+    return _HIDDEN.search(text) is None
+
+
+def as_plain(text: str) -> str:
+    """Return a text with what is not plain in it written out, as \\xff or \\n."""
+    return _HIDDEN.sub(lambda found: ascii(found[0])[1:-1].replace("\\udc", "\\x"), text)
+
+
+def _cell(value: object) -> str:
+    if value is None:
+        return ""
+    if isinstance(value, float | np.floating):
+        return repr(float(value)) if math.isfinite(value) else ""
+    return as_cell(as_plain(value)) if isinstance(value, str) else str(value)

@@ -1,0 +1,74 @@
+"""Correlation along lines, such as the epipolar lines of two oriented photographs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+
+from sfm.conventions import AnyArray, FloatArray
+from sfm.errors import GeometryError
+from sfm.matching.correlation.ncc import NccMatches, least_deviations, matches_of, template_corners
+from sfm.matching.correlation.peak import NOT_COMPARED, OUTPUTS, read_peak
+from sfm.matching.radiometry import grey_of, odd_window
+
+
+def match_along_line(
+    left: AnyArray,
+    right: AnyArray,
+    xy_left: FloatArray,
+    lines: Sequence[FloatArray],
+    *,
+    template_px: int = 19,
+    width_px: int = 3,
+    min_correlation: float = 0.5,
+    max_second: float = 1.0,
+) -> NccMatches:
+    """Look for templates along lines of the right photograph, such as epipolar lines.
+
+    Args:
+        left, right, xy_left, template_px, min_correlation, max_second: as in `match_ncc`.
+        lines: for each point the polygon along which it is looked for, px, k arrays (n_i, 2); with distortion
+            an epipolar line is curved. Parts outside the photograph are passed over.
+        width_px: how far from the line the best place may be.
+
+    Returns:
+        One result for each point.
+    """
+    side = odd_window("NCC template", template_px)
+    a = np.asarray(xy_left, dtype=float).reshape(-1, 2)
+    if len(lines) != len(a):
+        raise GeometryError(f"NCC: {len(a)} points in the left photograph, {len(lines)} lines in the right")
+    grey_left, grey_right = grey_of(left), grey_of(right)
+    least = least_deviations(left, right)
+    half = side // 2
+    height, width = grey_right.shape
+    out, origin = np.zeros((len(a), OUTPUTS)), np.zeros((len(a), 2))
+    corners = template_corners(a, half, grey_left.shape)
+    for k, line in enumerate(lines):
+        x, y = corners[k].tolist()
+        path = np.asarray(line, dtype=float).reshape(-1, 2)
+        near = np.asarray((path > -width) & (path < 2 * np.array([width, height])))
+        path = path[near.all(axis=1)]
+        if x < 0 or len(path) < 2:
+            out[k] = NOT_COMPARED
+            continue
+        margin = half + width_px
+        low = np.maximum(np.floor(path.min(axis=0)).astype(int) - margin, 0)
+        high = np.minimum(np.ceil(path.max(axis=0)).astype(int) + margin + 1, [width, height])
+        if (high - low < side).any():
+            out[k] = NOT_COMPARED
+            continue
+        template, window = (
+            grey_left[y : y + side, x : x + side],
+            grey_right[low[1] : high[1], low[0] : high[0]],
+        )
+        surface = cv2.matchTemplate(window, template, cv2.TM_CCOEFF_NORMED)
+        band = np.zeros(surface.shape, dtype=np.uint8)
+        vertices = np.rint((path - low - half) * 256).astype(np.int32)
+        cv2.polylines(band, [vertices], False, 1, thickness=2 * width_px + 1, shift=8)
+        allowed = np.where(band == 0, np.float32(-1.0), surface)
+        read_peak(template, window, allowed, surface, least, min_correlation, max_second, out[k])
+        origin[k] = low
+    return matches_of(out, origin, a, half)

@@ -1,0 +1,225 @@
+"""Least squares matching: where the patch of one photograph is in another, to a hundredth of a pixel.
+
+The patch T around a point of the left photograph and the right photograph S are tied by
+
+    S(H x) = alpha + beta T(x) + noise
+
+with x in the window, a geometric model H (shift, affine or projective) and the two radiometric parameters.
+Gauss-Newton is written the inverse way: the change dH of a step is applied to the template, whose gradients
+and normal equations then stay the same from step to step, and is put on H as H <- H dH^-1. The right
+photograph is resampled in every step, the gradients are symmetric differences of the resampled template.
+At convergence it is the least squares solution of the forward equations, up to the noise of the gradients.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+
+from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
+from sfm.errors import GeometryError
+from sfm.kernels.sampling import BILINEAR, TAPS, interpolation_index
+from sfm.matching.flags import DIVERGED, FLAT_TEXTURE, MATCHED, OUTSIDE, TOO_FAR, LsmFlag
+from sfm.matching.lsm.patch_equations import (
+    MARGIN,
+    MODELS,
+    RADIOMETRIC,
+    dot,
+    factorise,
+    fill_normals,
+    gradients,
+    solve,
+)
+from sfm.matching.lsm.precision import judge
+from sfm.matching.lsm.warp import put_step
+from sfm.matching.lsm.window import resample_patch, resample_window
+from sfm.matching.radiometry import grey_of, odd_window
+
+COARSE_STEP = 0.5  # bilinear interpolation is good enough while steps are longer than this, px
+CONTRACTION = 0.04  # a step is at most this part of the one before; 0.01 to 0.03 on texture with noise
+CHUNK = 256  # patches that a thread takes at a time
+
+
+@dataclass(frozen=True)
+class LsmMatches:
+    """Positions in the right photograph found by least squares matching; NaN where the flag says why."""
+
+    xy: FloatArray  # place of the left point in the right photograph, px, (k, 2)
+    covariance: FloatArray  # of xy, px^2, (k, 2, 2)
+    warp: FloatArray  # H: right px from left px relative to the left point, homogeneous, (k, 3, 3)
+    gain: FloatArray  # beta: right intensities per left one, (k,)
+    offset: FloatArray  # alpha, right intensity units, (k,)
+    correlation: FloatArray  # r of template and resampled patch, (k,)
+    sigma0: FloatArray  # standard deviation of an intensity difference, right units, (k,)
+    steps: IntArray  # Gauss-Newton steps, (k,)
+    flag: IntArray  # see LsmFlag, 0 = matched, (k,)
+
+    def __len__(self) -> int:
+        return len(self.xy)
+
+    @property
+    def good(self) -> BoolArray:
+        """Which points were matched, (k,)."""
+        return np.asarray(self.flag == 0)
+
+
+def match_lsm(
+    left: AnyArray,
+    right: AnyArray,
+    xy_left: FloatArray,
+    xy_right: FloatArray,
+    *,
+    model: str = "affine",
+    window_px: int = 21,
+    interpolation: str = "six_tap",
+    stop_px: float = 0.002,
+    max_steps: int = 30,
+    max_shift_px: float = 5.0,
+    min_correlation: float = 0.5,
+    start: FloatArray | None = None,
+    threads: int = 1,
+) -> LsmMatches:
+    """Match points of the left photograph in the right one, from places known to a pixel or two.
+
+    Args:
+        left, right: photographs, (H, W), 8 or 16 bit or float, grey or colour.
+        xy_left: points in the left photograph, px, any fraction, (k, 2).
+        xy_right: where they are in the right photograph, approximately, px, (k, 2).
+        model: shift (2), affine (6) or projective (8 parameters), each with gain and offset.
+        window_px: odd side of the template.
+        interpolation: kernel for the right photograph; on fine texture bilinear costs 1.25 times and bicubic
+            1.06 times the standard deviation of six_tap, and both are off by up to 0.013 px where all of the
+            patch is shifted by the same 0.1 to 0.4 px, six_tap by 0.002 px.
+        stop_px: the shift of the step that would come next is shorter than this.
+        max_steps: after so many a patch counts as diverged.
+        max_shift_px: farther from the start is too far.
+        min_correlation: below it the places are not alike.
+        start: linear part of the warp, right px per left px, (k, 2, 2); the unit matrix if not given.
+        threads: patches are shared among so many.
+
+    Returns:
+        One match for each point; the covariance assumes the same noise in both photographs, after the gain.
+
+    Raises:
+        GeometryError: an unknown model or kernel, an even window, or points that do not go in pairs.
+
+    Source: Gruen (1985), S. Afr. J. Photogrammetry 14(3), and Foerstner (1993) in Haralick and Shapiro,
+    Computer and Robot Vision II, ch. 16; the inverse way is Baker and Matthews (2004), IJCV 56(3).
+    """
+    if model not in MODELS:
+        raise GeometryError(f"LSM: model '{model}' is none of {', '.join(MODELS)}")
+    kind = interpolation_index(interpolation)
+    if kind < BILINEAR:
+        raise GeometryError(
+            "LSM: interpolation 'nearest' has no gradient, needed bilinear, bicubic or six_tap"
+        )
+    half = odd_window("LSM", window_px) // 2
+    a = np.ascontiguousarray(xy_left, dtype=float).reshape(-1, 2)
+    b = np.ascontiguousarray(xy_right, dtype=float).reshape(-1, 2)
+    k = len(a)
+    if len(b) != k:
+        raise GeometryError(f"LSM: {k} points in the left photograph, {len(b)} in the right, needed in pairs")
+    linear = np.broadcast_to(np.eye(2), (k, 2, 2)) if start is None else start
+    if linear.shape != (k, 2, 2):
+        raise GeometryError(f"LSM: start has shape {linear.shape}, needed ({k}, 2, 2)")
+    warp = np.zeros((k, 3, 3))
+    warp[:, :2, :2], warp[:, :2, 2], warp[:, 2, 2] = linear, b, 1.0
+    out = np.zeros((k, OUTPUTS))
+    fixed = (grey_of(left), grey_of(right), half, kind, MODELS[model])
+    limits = (float(stop_px), int(max_steps), float(max_shift_px), float(min_correlation))
+
+    def work(part: slice) -> None:
+        _match_all(*fixed, *limits, a[part], warp[part], out[part])
+
+    if threads > 1:
+        with ThreadPoolExecutor(threads) as pool:
+            list(pool.map(work, _chunks(k)))
+    else:
+        work(slice(0, k))
+    flag = out[:, 0].astype(np.int64)
+    values = np.where((flag & ~int(LsmFlag.LOW_CORRELATION))[:, None] == 0, out[:, 1:9], np.nan)
+    xy = np.where((flag == 0)[:, None], values[:, :2], np.nan)
+    covariance = np.stack([values[:, 2], values[:, 3], values[:, 3], values[:, 4]], axis=1).reshape(k, 2, 2)
+    covariance[flag != 0] = np.nan
+    gain, offset, r = values[:, 5], values[:, 6], values[:, 7]
+    return LsmMatches(xy, covariance, warp, gain, offset, r, out[:, 9], out[:, 10].astype(np.int64), flag)
+
+
+OUTPUTS = 11  # flag; x, y, their three covariances; gain, offset, correlation; sigma0; steps
+
+
+def _chunks(k: int) -> Iterator[slice]:
+    return (slice(first, first + CHUNK) for first in range(0, k, CHUNK))
+
+
+@njit(cache=True, nogil=True)
+def _match_all(left, right, half, kind, geometric, stop, max_steps, max_shift, min_r, xy, warp, out):  # type: ignore[no-untyped-def]
+    """Match patch after patch; `warp` goes from start to solution, `out` as in OUTPUTS."""
+    side = 2 * half + 1
+    wide = side + 2 * MARGIN
+    grid = np.empty((wide, wide), np.float32)
+    size = geometric + RADIOMETRIC
+    J = np.empty((size, side * side), np.float32)
+    patch = np.empty(side * side, np.float32)
+    N, L = np.empty((size, size)), np.empty((size, size))
+    q, rhs = np.empty(size), np.empty(size)
+    wx, wy = np.zeros(TAPS, np.float32), np.zeros(TAPS, np.float32)
+    for i in range(len(xy)):
+        if not resample_window(left, xy[i, 0], xy[i, 1], half + MARGIN, kind, wx, wy, grid):
+            out[i, 0] = OUTSIDE
+            continue
+        gradients(grid, half, geometric, J)
+        fill_normals(J, N)
+        if not factorise(N, L):
+            out[i, 0] = FLAT_TEXTURE
+            continue
+        out[i, 0] = _iterate(
+            right,
+            half,
+            kind,
+            geometric,
+            stop,
+            max_steps,
+            max_shift,
+            J,
+            L,
+            q,
+            rhs,
+            patch,
+            wx,
+            wy,
+            warp[i],
+            out[i],
+        )
+        if out[i, 0] == MATCHED:
+            out[i, 0] = judge(half, kind, geometric, min_r, J, N, L, q, rhs, patch, wx, wy, warp[i], out[i])
+
+
+@njit(cache=True, nogil=True)
+def _iterate(right, half, kind, geometric, stop, max_steps, max_shift, J, L, q, rhs, patch, wx, wy, H, out):  # type: ignore[no-untyped-def]
+    """Gauss-Newton steps on H, from its start; returns the flag and leaves J^T S and the solution q."""
+    x0, y0 = H[0, 2], H[1, 2]
+    coarse = kind > BILINEAR
+    previous = np.inf
+    for step in range(1, max_steps + 1):
+        out[10] = step
+        if not resample_patch(right, H, half, BILINEAR if coarse else kind, wx, wy, patch):
+            return OUTSIDE
+        for a in range(len(q)):
+            rhs[a] = q[a] = dot(J[a], patch)
+        solve(L, q)
+        length = put_step(H, q, half, geometric)
+        if not length < np.inf:
+            return DIVERGED
+        if np.hypot(H[0, 2] - x0, H[1, 2] - y0) > max_shift:
+            return TOO_FAR
+        if not coarse:
+            if length * max(CONTRACTION, length / previous) < stop:
+                return MATCHED
+            previous = length
+        coarse = coarse and length > COARSE_STEP
+    return DIVERGED

@@ -1,0 +1,302 @@
+"""Tie points: points of natural texture found in several photographs and measured by least squares matching.
+
+SIFT features, whose descriptors know neither scale nor rotation, are matched pair by pair and kept where an
+epipolar geometry holds; what hangs together over all photographs is one point. Each point is then put on the
+most precise place nearby in the photograph that sees it best (its reference), and carried into the others by
+least squares matching, which starts from the features' scales and directions.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from sfm.conventions import AnyArray, FloatArray, IntArray
+from sfm.errors import GeometryError
+from sfm.matching.lsm.two_photo import match_lsm
+from sfm.matching.radiometry import FULL_SCALE_8, full_scale, grey_of
+from sfm.matching.tracks.interest import foerstner_points
+
+DETECTORS = ("foerstner", "sift")
+RATIO = 0.8  # of the distances to the nearest and the second-nearest descriptor; Lowe (2004), IJCV 60(2)
+EPIPOLAR_PX = 4.0  # distance from the epipolar line; lens distortion is not yet known
+MIN_PAIR_MATCHES = 20  # with fewer the epipolar geometry of a pair is not trusted
+RANSAC_CONFIDENCE, RANSAC_TRIALS = 0.999, 5000
+WINDOW_PX = 15  # larger ones are less noisy, but a curved surface is no affine warp over them
+SNAP_PX = 6.0  # an interest point this close to a feature takes its place
+
+
+@dataclass(frozen=True)
+class Features:
+    """SIFT features of one photograph."""
+
+    xy: FloatArray  # px, (k, 2)
+    scale: FloatArray  # size of the feature, px, (k,)
+    angle: FloatArray  # direction from x towards y, rad, (k,)
+    descriptor: AnyArray  # float32, (k, 128)
+
+    def __len__(self) -> int:
+        return len(self.xy)
+
+
+@dataclass(frozen=True)
+class Tracks:
+    """Which features belong to one point."""
+
+    image: IntArray  # (k,)
+    feature: IntArray  # index among the features of that photograph, (k,)
+    point: IntArray  # 0 to n - 1, sorted, (k,)
+
+
+@dataclass(frozen=True)
+class TiePoints:
+    """Image points of natural texture."""
+
+    image: IntArray  # index of the photograph, (k,)
+    point: IntArray  # 0 to n - 1, (k,)
+    xy: FloatArray  # px, (k, 2)
+    covariance: FloatArray  # px^2, (k, 2, 2)
+    reference: IntArray  # the photograph that each point was taken from, (n,)
+
+    def __len__(self) -> int:
+        return len(self.image)
+
+
+def find_tie_points(
+    photographs: Sequence[AnyArray],
+    *,
+    detector: str = "foerstner",
+    window_px: int = WINDOW_PX,
+    max_features: int = 4000,
+    min_rays: int = 3,
+    min_correlation: float = 0.7,
+    seed: int = 0,
+    threads: int = 1,
+) -> TiePoints:
+    """Find and measure points that several photographs have in common, knowing nothing of their orientation.
+
+    Args:
+        photographs: (H, W), 8 or 16 bit, grey or colour, m of them.
+        detector: foerstner moves each point to the best interest point nearby, sift leaves it.
+        window_px: odd side of the window of least squares matching.
+        max_features: of each photograph, the strongest ones.
+        min_rays: fewest photographs of a point.
+        min_correlation: smallest coefficient r of a match.
+        seed: of the random samples.
+        threads: photographs and pairs worked on at a time.
+
+    Returns:
+        The tie points; n may be 0.
+
+    Raises:
+        GeometryError: an unknown detector.
+    """
+    if detector not in DETECTORS:
+        raise GeometryError(f"tie points: detector '{detector}' is none of {', '.join(DETECTORS)}")
+    with ThreadPoolExecutor(max(1, threads)) as pool:
+        features = list(pool.map(lambda one: sift_features(one, max_features=max_features), photographs))
+    tracks = link_features(features, min_rays=min_rays, seed=seed, threads=threads)
+    corners = None
+    if detector == "foerstner":
+        corners = [foerstner_points(one).xy for one in photographs]
+    return measure_tracks(
+        photographs,
+        features,
+        tracks,
+        corners=corners,
+        window_px=window_px,
+        min_rays=min_rays,
+        min_correlation=min_correlation,
+        threads=threads,
+    )
+
+
+def sift_features(photograph: AnyArray, *, max_features: int = 4000) -> Features:
+    """Return SIFT features with root-normalised descriptors.
+
+    Source: Lowe (2004), IJCV 60(2); Arandjelovic and Zisserman (2012), CVPR (square roots).
+    """
+    grey = grey_of(photograph) * (FULL_SCALE_8 / full_scale(photograph))
+    eight_bit = np.rint(np.clip(grey, 0, FULL_SCALE_8)).astype(np.uint8)
+    points, descriptor = cv2.SIFT.create(nfeatures=max_features).detectAndCompute(eight_bit, None)
+    if descriptor is None:
+        descriptor = np.zeros((0, 128), np.float32)
+    norm = np.maximum(descriptor.sum(axis=1, keepdims=True), 1e-12)
+    return Features(
+        np.array([p.pt for p in points], dtype=float).reshape(-1, 2),
+        np.array([p.size for p in points], dtype=float),
+        np.radians([p.angle for p in points]),
+        np.sqrt(descriptor / norm),
+    )
+
+
+def link_features(
+    features: Sequence[Features], *, min_rays: int = 3, seed: int = 0, threads: int = 1
+) -> Tracks:
+    """Match the features of all pairs of photographs and put together what belongs to one point.
+
+    A point with two features in one photograph is none and is left out.
+
+    Args:
+        features: of m photographs.
+        min_rays: fewest photographs of a point.
+        seed: of the random samples.
+        threads: pairs worked on at a time.
+    """
+    first = np.concatenate([[0], np.cumsum([len(one) for one in features])]).astype(np.int64)
+    pairs = [(i, j) for i in range(len(features)) for j in range(i + 1, len(features))]
+    with ThreadPoolExecutor(max(1, threads)) as pool:
+        matched = list(pool.map(lambda p: match_features(features[p[0]], features[p[1]], seed=seed), pairs))
+    parent = np.arange(first[-1])
+    for (i, j), rows in zip(pairs, matched, strict=True):
+        for a, b in rows + np.array([first[i], first[j]]):
+            parent[_root(parent, a)] = _root(parent, b)
+    root = np.array([_root(parent, a) for a in range(len(parent))], dtype=np.int64)
+    image = np.repeat(np.arange(len(features)), np.diff(first))
+    _, group = np.unique(root, return_inverse=True)
+    size = np.bincount(group)
+    several = np.unique(group * len(features) + image)  # pairs of group and photograph, each once
+    photographs = np.bincount(several // len(features), minlength=len(size))
+    keep = ((photographs == size) & (size >= min_rays))[group]
+    rows = np.flatnonzero(keep)
+    _, point = np.unique(group[rows], return_inverse=True)
+    order = np.argsort(point, kind="stable")
+    rows = rows[order]
+    return Tracks(image[rows], rows - first[image[rows]], point[order])
+
+
+def match_features(a: Features, b: Features, *, seed: int = 0) -> IntArray:
+    """Return pairs of features (k, 2) that choose each other and obey one epipolar geometry."""
+    none = np.zeros((0, 2), dtype=np.int64)
+    if min(len(a), len(b)) < MIN_PAIR_MATCHES:
+        return none
+    similarity = a.descriptor @ b.descriptor.T
+    forth, back = similarity.argmax(axis=1), similarity.argmax(axis=0)
+    rows = np.flatnonzero(back[forth] == np.arange(len(a)))
+    best = similarity[rows, forth[rows]]
+    similarity[rows, forth[rows]] = -1.0
+    second = similarity[rows].max(axis=1)
+    # of unit vectors the squared distance is 2 - 2 s
+    rows = rows[1 - best < RATIO**2 * (1 - second)]
+    found = np.column_stack([rows, forth[rows]])
+    if len(found) < MIN_PAIR_MATCHES:
+        return none
+    cv2.setRNGSeed(seed)
+    _, fits = cv2.findFundamentalMat(
+        a.xy[found[:, 0]],
+        b.xy[found[:, 1]],
+        cv2.FM_RANSAC,
+        EPIPOLAR_PX,
+        RANSAC_CONFIDENCE,
+        RANSAC_TRIALS,
+    )
+    if fits is None or fits.sum() < MIN_PAIR_MATCHES:
+        return none
+    return np.asarray(found[fits.ravel() > 0], dtype=np.int64)
+
+
+def measure_tracks(
+    photographs: Sequence[AnyArray],
+    features: Sequence[Features],
+    tracks: Tracks,
+    *,
+    corners: Sequence[FloatArray] | None = None,
+    window_px: int = WINDOW_PX,
+    min_rays: int = 3,
+    min_correlation: float = 0.7,
+    threads: int = 1,
+) -> TiePoints:
+    """Measure the points of tracks by least squares matching from their references.
+
+    The reference is the photograph in which the features are the most extended among the middle ones of the
+    point: a template should be neither the finest nor the coarsest picture. Matching tells the difference of
+    two noises: half of its covariance goes to the point in the reference, half to the other.
+
+    Args:
+        photographs: m photographs.
+        features, tracks: what was found in them.
+        corners: places of each photograph that are better than the features near them, m arrays (c_i, 2).
+        window_px, min_rays, min_correlation, threads: as in `find_tie_points`.
+    """
+    m = len(photographs)
+    greys = [grey_of(one) for one in photographs]
+    xy = np.array([features[i].xy[f] for i, f in zip(tracks.image, tracks.feature, strict=True)])
+    scale = np.array([features[i].scale[f] for i, f in zip(tracks.image, tracks.feature, strict=True)])
+    angle = np.array([features[i].angle[f] for i, f in zip(tracks.image, tracks.feature, strict=True)])
+    xy, n = xy.reshape(-1, 2), int(tracks.point.max(initial=-1)) + 1
+    reference = _middle_scale(tracks.point, scale, n)
+    place = xy[reference].copy()
+    for i, better in enumerate(corners or ()):
+        own = np.flatnonzero(tracks.image[reference] == i)
+        place[own] = _snapped(place[own], better)
+    place = np.rint(place)  # a template of whole pixels needs no resampling
+    ref = reference[tracks.point]
+    offset = (place - xy[reference])[tracks.point]
+    turn, stretch = angle - angle[ref], scale / scale[ref]
+    A = stretch[:, None, None] * np.stack(
+        [np.stack([np.cos(turn), -np.sin(turn)], -1), np.stack([np.sin(turn), np.cos(turn)], -1)], axis=1
+    )
+    start = xy + np.einsum("kij,kj->ki", A, offset)
+    measured, covariance = np.full((len(xy), 2), np.nan), np.full((len(xy), 2, 2), np.nan)
+    at_reference = np.full((len(xy), 2, 2), np.nan)
+    for i in range(m):
+        for j in range(m):
+            rows = np.flatnonzero(
+                (tracks.image[ref] == i) & (tracks.image == j) & (ref != np.arange(len(xy)))
+            )
+            if i == j or not len(rows):
+                continue
+            found = match_lsm(
+                greys[i],
+                greys[j],
+                place[tracks.point[rows]],
+                start[rows],
+                window_px=window_px,
+                start=A[rows],
+                min_correlation=min_correlation,
+                threads=threads,
+            )
+            measured[rows], covariance[rows] = found.xy, found.covariance / 2
+            back = np.linalg.inv(found.warp[:, :2, :2])
+            at_reference[rows] = back @ (found.covariance / 2) @ back.transpose(0, 2, 1)
+    good = np.isfinite(measured).all(axis=1)
+    matched = np.bincount(tracks.point[good], minlength=n)
+    for a in range(2):
+        for b in range(2):
+            total = np.bincount(tracks.point[good], at_reference[good, a, b], minlength=n)
+            covariance[reference, a, b] = total / np.maximum(matched, 1)
+    measured[reference] = place
+    keep = np.isfinite(measured).all(axis=1) & (matched + 1 >= min_rays)[tracks.point]
+    _, point = np.unique(tracks.point[keep], return_inverse=True)
+    kept = np.unique(tracks.point[keep])
+    return TiePoints(
+        tracks.image[keep], point, measured[keep], covariance[keep], tracks.image[reference[kept]]
+    )
+
+
+def _middle_scale(point: IntArray, scale: FloatArray, n: int) -> IntArray:
+    """Return the row of each point whose feature has the middle scale (the larger of two), (n,)."""
+    order = np.lexsort([scale, point])
+    first = np.searchsorted(point[order], np.arange(n))
+    count = np.bincount(point, minlength=n)
+    return np.asarray(order[first + count // 2])
+
+
+def _snapped(xy: FloatArray, corners: FloatArray) -> FloatArray:
+    """Return for each place the first (strongest) corner within reach, or the place itself."""
+    if not len(xy) or not len(corners):
+        return xy
+    near = ((xy[:, None] - corners[None]) ** 2).sum(axis=2) < SNAP_PX**2
+    return np.where(near.any(axis=1)[:, None], corners[near.argmax(axis=1)], xy)
+
+
+def _root(parent: IntArray, a: int) -> int:
+    """Return the representative of a feature's point, and shorten the way to it."""
+    while parent[a] != a:
+        parent[a] = parent[parent[a]]
+        a = parent[a]
+    return int(a)

@@ -1,0 +1,106 @@
+"""The cameras of a survey with their start values, from the survey file and the photographs."""
+
+from __future__ import annotations
+
+import fnmatch
+
+import numpy as np
+
+from sfm.camera import Camera, camera_from_values
+from sfm.conventions import IntArray
+from sfm.errors import PhotographError, SurveyFileError
+from sfm.photographs.reading import Metadata
+from sfm.survey.inputs.settings import CameraSettings
+from sfm.survey.inputs.survey_file import Survey
+
+
+def camera_of_image(survey: Survey, image: str) -> int:
+    """Return the index of the camera whose glob an image name matches.
+
+    Raises:
+        SurveyFileError: no camera, or more than one.
+    """
+    if len(survey.cameras) == 1 and survey.cameras[0].images is None:
+        return 0
+    matches = [
+        index
+        for index, camera in enumerate(survey.cameras)
+        if camera.images is not None and fnmatch.fnmatchcase(image, camera.images)
+    ]
+    if len(matches) != 1:
+        globs = ", ".join(f"{c.name} '{c.images}'" for c in survey.cameras)
+        many = "no camera" if not matches else f"{len(matches)} cameras"
+        raise SurveyFileError(f"{survey.path}: image '{image}' matches the glob of {many}: {globs}")
+    return matches[0]
+
+
+def start_cameras(
+    survey: Survey,
+    metadata: tuple[Metadata, ...] = (),
+    camera: IntArray | None = None,
+    names: tuple[str, ...] = (),
+) -> tuple[Camera, ...]:
+    """Return the cameras with their start values, in the order of the survey file.
+
+    Args:
+        survey: says what is known; what it leaves out is taken from the photographs.
+        metadata: size and EXIF data of the readable photographs, (m,); none with [observations].
+        camera: index of the camera of each photograph, (m,).
+        names: names of the photographs, (m,).
+
+    Raises:
+        PhotographError: photographs of one camera differ in size from one another or from size_px.
+        SurveyFileError: size, pixel size or principal distance is not known from anywhere.
+    """
+    index = np.zeros(0, dtype=np.int64) if camera is None else camera
+    cameras = []
+    for number, settings in enumerate(survey.cameras):
+        own = [k for k in range(len(metadata)) if index[k] == number]
+        size = _common_size(settings, [(names[k], metadata[k].size_px) for k in own])
+        where = f"{survey.path}: camera {settings.name}"
+        if size is None:
+            raise SurveyFileError(f"{where}: size_px = [width, height] is needed, there is no photograph")
+        pixel, focal = settings.pixel_mm, settings.c_mm
+        if settings.sensor_mm is not None:
+            pixel = settings.sensor_mm[0] / size[0], settings.sensor_mm[1] / size[1]
+        known = {**dict(settings.fixed), **{name: value for name, (value, _) in settings.weighted}}
+        if pixel is None:
+            pixel = next((metadata[k].pixel_mm for k in own if metadata[k].pixel_mm), None)
+        if focal is None:
+            focal = known.get("c") or next((metadata[k].focal_mm for k in own if metadata[k].focal_mm), None)
+        if pixel is None:
+            raise SurveyFileError(
+                f"{where}: no photograph's EXIF data tell the pixel size, pixel_mm or sensor_mm is needed"
+            )
+        if focal is None and "fx" in known:
+            focal = known["fx"] * pixel[0]
+        if focal is None:
+            raise SurveyFileError(f"{where}: no photograph's EXIF data tell the focal length, c_mm is needed")
+        cameras.append(
+            camera_from_values(
+                settings.name,
+                settings.model,
+                size,
+                pixel,
+                c_mm=focal,
+                free=settings.free,
+                values=tuple(known.items()),
+            )
+        )
+    return tuple(cameras)
+
+
+def _common_size(
+    settings: CameraSettings, sizes: list[tuple[str, tuple[int, int]]]
+) -> tuple[int, int] | None:
+    """Return the size of all photographs of one camera, None if nothing tells it."""
+    size, source = settings.size_px, "size_px"
+    for name, found in sizes:
+        if size is None:
+            size, source = found, f"'{name}'"
+        elif found != size:
+            raise PhotographError(
+                f"camera {settings.name}: photograph '{name}' has {found[0]} x {found[1]} px, {source} "
+                f"{size[0]} x {size[1]} px; photographs of one camera have one size"
+            )
+    return size

@@ -1,0 +1,136 @@
+"""Interior orientation as the survey asks for it: of all photographs, of groups, or of each; observed or not.
+
+Approximate values are found with one interior orientation for each camera of the survey file, in which
+observed parameters keep their observed values. Only the final adjustment has the image-variant one.
+
+Source: Luhmann et al., Close-Range Photogrammetry and 3D Imaging (2020), sec. 4.4.2 (image-variant
+interior orientation).
+"""
+
+from __future__ import annotations
+
+import fnmatch
+from collections.abc import Iterable
+from dataclasses import replace
+
+import numpy as np
+
+from sfm.camera import Camera
+from sfm.conventions import IntArray
+from sfm.errors import SurveyFileError
+from sfm.network import Estimate, InteriorObservations, Network
+from sfm.survey.inputs.settings import CameraSettings
+from sfm.survey.inputs.survey_file import Survey
+
+
+def as_asked_for(survey: Survey, network: Network, estimate: Estimate) -> tuple[Network, Estimate]:
+    """Return the network and estimate with the interior orientations that the final adjustment has.
+
+    Args:
+        survey: its cameras say which parameters are observed, of each photograph, or of each group.
+        network, estimate: with one camera for each of the survey's, in their order.
+
+    Returns:
+        The same with a camera for each photograph or group where parameters of it are its own; the others
+        it shares. Observed parameters are free, and their values are among the observations.
+
+    Raises:
+        SurveyFileError: a photograph is in no group, or in more than one.
+    """
+    if not any(camera.weighted or camera.per_photograph or camera.per_group for camera in survey.cameras):
+        return network, estimate
+    cameras: list[Camera] = []
+    owner = np.empty(len(network.images), dtype=np.int64)
+    observed: list[tuple[int, int, float, float]] = []
+    for a, settings in enumerate(survey.cameras):
+        images = np.flatnonzero(network.camera == a)
+        first = len(cameras)
+        made, member = _variants(survey, settings, estimate.cameras[a], [network.images[i] for i in images])
+        cameras += made
+        owner[images] = first + member
+        for name, (value, sigma) in settings.weighted:
+            s = made[0].names.index(name)
+            groups = [camera.group_of(s) or camera.name for camera in made]
+            observed += [(first + groups.index(group), s, value, sigma) for group in dict.fromkeys(groups)]
+    columns = list(zip(*observed, strict=True)) or [(), (), (), ()]
+    interior = InteriorObservations(
+        np.array(columns[0], dtype=np.int64),
+        np.array(columns[1], dtype=np.int64),
+        np.array(columns[2], dtype=float),
+        np.array(columns[3], dtype=float),
+    )
+    return (
+        replace(network, camera=owner, interior=interior),
+        replace(estimate, cameras=tuple(cameras)),
+    )
+
+
+def without_idle_cameras(survey: Survey, network: Network, estimate: Estimate) -> tuple[Network, Estimate]:
+    """Return the network and estimate without the cameras of single photographs that have left it."""
+    if len(estimate.cameras) == len(survey.cameras):
+        return network, estimate
+    used = np.zeros(len(estimate.cameras), dtype=bool)
+    used[network.camera] = True
+    number = np.cumsum(used) - 1
+    seen = network.interior
+    keep = used[seen.camera]
+    interior = InteriorObservations(
+        number[seen.camera[keep]], seen.parameter[keep], seen.value[keep], seen.sigma[keep]
+    )
+    return (
+        replace(network, camera=number[network.camera], interior=interior),
+        replace(estimate, cameras=tuple(c for c, on in zip(estimate.cameras, used, strict=True) if on)),
+    )
+
+
+def refuse_ungrouped(survey: Survey, images: Iterable[str], camera: Iterable[int]) -> None:
+    """Raise SurveyFileError if a photograph is in no group of its camera, or in more than one.
+
+    Args:
+        survey: what to do.
+        images: names of the photographs.
+        camera: index of the camera of each of them.
+    """
+    for image, a in zip(images, camera, strict=True):
+        if survey.cameras[a].groups:
+            group_of_image(survey, survey.cameras[a], image)
+
+
+def group_of_image(survey: Survey, settings: CameraSettings, image: str) -> int:
+    """Return the index of the group that a photograph of a camera belongs to.
+
+    Raises:
+        SurveyFileError: no group, or more than one.
+    """
+    matches = [g for g, glob in enumerate(settings.groups) if fnmatch.fnmatchcase(image, glob)]
+    if len(matches) != 1:
+        many = "no group" if not matches else f"{len(matches)} groups"
+        raise SurveyFileError(
+            f"{survey.path}: camera {settings.name}: photograph '{image}' is in {many} of groups "
+            f"{', '.join(settings.groups)}; one is needed"
+        )
+    return matches[0]
+
+
+def _variants(
+    survey: Survey, settings: CameraSettings, camera: Camera, images: list[str]
+) -> tuple[list[Camera], IntArray]:
+    """Return a camera for each photograph or group with parameters of its own, and whose is whose."""
+    camera = replace(camera, free=np.array([name in settings.adjusted for name in camera.names]))
+    grouped = [group_of_image(survey, settings, image) if settings.groups else 0 for image in images]
+    if not images or not (settings.per_photograph or settings.per_group):
+        return [camera], np.zeros(len(images), dtype=np.int64)
+    labels = [f"{camera.name} {settings.groups[g]}" if settings.groups else camera.name for g in grouped]
+    names = [f"{camera.name} {image}" for image in images] if settings.per_photograph else labels
+
+    def shared(parameter: str, label: str) -> str:
+        if parameter in settings.per_photograph:
+            return ""
+        return label if parameter in settings.per_group else camera.name
+
+    made = {
+        name: replace(camera, name=name, shared=tuple(shared(p, label) for p in camera.names))
+        for name, label in zip(names, labels, strict=True)
+    }
+    order = list(made)
+    return list(made.values()), np.array([order.index(name) for name in names], dtype=np.int64)

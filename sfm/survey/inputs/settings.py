@@ -1,0 +1,169 @@
+"""The sections of the survey file: what each may say, its types and bounds."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
+
+from sfm.distortion.models import MODELS
+from sfm.files.plain_text import MAX_NAME, as_plain, is_plain
+
+
+def _pairs(value: Any) -> Any:
+    """Turn a TOML table into (key, value) pairs, so that no dictionary goes beyond this module."""
+    return tuple(value.items()) if isinstance(value, dict) else value
+
+
+def _plain(value: str) -> str:
+    if not value.strip():
+        raise ValueError("found an empty text")
+    if len(value) > MAX_NAME or not is_plain(value):
+        shown = as_plain(value[:40])
+        raise ValueError(f"found '{shown}', needed plain text on one line, at most {MAX_NAME} characters")
+    return value
+
+
+# Beyond these no length, sigma or parameter makes sense in any unit, and their squares or inverses overflow.
+SMALLEST, LARGEST = 1e-9, 1e12
+SMALLEST_SIGMA = 1e-30  # of a distortion parameter, mm^-8
+MAX_SIDE_PX = 1_000_000
+MAX_CAMERAS, MAX_GROUPS = 1000, 1000  # each is tried on every photograph
+MAX_LENGTH_PER_SIGMA = 1e6  # no scale bar is calibrated to better than a millionth of its length
+Length = Annotated[float, Field(ge=SMALLEST, le=LARGEST)]
+Name = Annotated[str, BeforeValidator(lambda v: _plain(v) if isinstance(v, str) else v)]
+TwoLengths = Annotated[tuple[Length, Length], Field(strict=False)]
+Side = Annotated[int, Field(gt=0, le=MAX_SIDE_PX)]
+TwoCounts = Annotated[tuple[Side, Side], Field(strict=False)]
+Names = Annotated[tuple[Name, ...], Field(strict=False)]
+Value = Annotated[float, Field(ge=-LARGEST, le=LARGEST)]
+Values = Annotated[
+    tuple[Annotated[tuple[Name, Value], Field(strict=False)], ...],
+    Field(strict=False),
+    BeforeValidator(_pairs),
+]
+Sigma = Annotated[float, Field(ge=SMALLEST_SIGMA, le=LARGEST)]
+ValueAndSigma = Annotated[tuple[Value, Sigma], Field(strict=False)]
+Observed = Annotated[
+    tuple[Annotated[tuple[Name, ValueAndSigma], Field(strict=False)], ...],
+    Field(strict=False),
+    BeforeValidator(_pairs),
+]
+
+
+class Section(BaseModel):
+    """A table of the survey file: types as written, no unknown keys, no NaN or infinity."""
+
+    model_config = ConfigDict(
+        strict=True, extra="forbid", frozen=True, allow_inf_nan=False, populate_by_name=False
+    )
+
+
+class Head(Section):
+    """[survey]: what the survey is called."""
+
+    name: Name
+    unit: Name  # object unit, for people and reports
+
+
+class CameraSettings(Section):
+    """[[camera]]: one camera, its photographs and what is known of its interior orientation."""
+
+    name: Name
+    images: Name | None = None  # glob of its photographs; may be left out with [observations] and one camera
+    size_px: TwoCounts | None = None  # else from the photographs, px
+    pixel_mm: TwoLengths | None = None  # width and height of a pixel, else from sensor_mm or EXIF, mm
+    sensor_mm: TwoLengths | None = None  # width and height of the sensor, mm
+    c_mm: Length | None = None  # start value of the principal distance, else the EXIF focal length, mm
+    model: Literal[tuple(MODELS)] = "brown"  # type: ignore[valid-type]
+    free: Names = ()  # parameters to be adjusted; none = a calibrated camera
+    fixed: Values = ()  # (parameter, value) of what is not free, in the model's units
+    weighted: Observed = ()  # (parameter, (value, sigma)): adjusted, with this as an observation
+    per_photograph: Names = ()  # adjusted parameters of which every photograph has a value of its own
+    per_group: Names = ()  # adjusted parameters of which every group of photographs has a value of its own
+    groups: Annotated[Names, Field(max_length=MAX_GROUPS)] = ()  # globs of these groups of photographs
+
+    @property
+    def adjusted(self) -> tuple[str, ...]:
+        """Parameters that are adjusted, with or without an observation of them."""
+        return (*self.free, *(name for name, _ in self.weighted))
+
+
+class TargetSettings(Section):
+    """[targets]: what circular targets look like in the photographs."""
+
+    polarity: Literal["dark", "bright", "auto"] = "auto"
+    channel: Literal["luminance", "red", "green", "blue"] = "luminance"  # of colour photographs
+    codes: Name = "none"  # a code family, or a table file relative to the survey file
+    ring_radii: TwoLengths | None = (
+        None  # of the ring, inner and outer, in those of the dot; else the family's
+    )
+    min_diameter_px: Length = 6.0
+    eccentricity: bool = True  # whether to correct it
+    diameter: Length | None = None  # of all targets, object unit; else of each from its ellipses
+    diameters: Name | None = None  # a table id,diameter of single targets, before the one of all
+    tag_size: Length | None = None  # side of the black square of all tags, object unit
+    tag_sigma: Length | None = None  # its standard deviation, common to all tags of a print, object unit
+
+
+class TiePointSettings(Section):
+    """[tie_points]: natural texture in place of targets."""
+
+    detector: Literal["foerstner", "sift"] = "foerstner"
+    window_px: Annotated[int, Field(ge=7, le=101)] = 15  # odd side of the matched windows
+    max_features: Annotated[int, Field(ge=100)] = 4000  # of each photograph
+
+
+class DatumSettings(Section):
+    """[datum]: what position, orientation and scale of the result rest on."""
+
+    kind: Literal["free", "minimal", "control"] = "free"
+    points: Names = ()  # object points that carry a free or minimal datum; all if none are named
+
+
+class ControlSettings(Section):
+    """[control]: known object points."""
+
+    file: Name  # id,X,Y,Z[,sX,sY,sZ]
+
+
+class ExteriorSettings(Section):
+    """[exterior]: observed exterior orientation, as by satellite positioning, a tracker or known stations."""
+
+    file: Name  # image,X,Y,Z[,sX,sY,sZ][,omega_deg,phi_deg,kappa_deg[,somega_deg,sphi_deg,skappa_deg]]
+
+
+class ScaleBarSettings(Section):
+    """[[scale_bar]]: a measured distance between two object points."""
+
+    start: Name = Field(alias="from")
+    end: Name = Field(alias="to")
+    length: Length  # object unit
+    sigma: Length  # object unit
+
+
+class ObservationSettings(Section):
+    """[observations]: measured image points in place of photographs."""
+
+    file: Name  # image,point,x_px,y_px[,sx_px,sy_px] or image,point,x_mm,y_mm[,sx_mm,sy_mm]
+
+
+class ApproximateSettings(Section):
+    """[approximate]: start values of exterior orientation and object points."""
+
+    images: Name | None = None  # image,X,Y,Z,omega_deg,phi_deg,kappa_deg
+    points: Name | None = None  # point,X,Y,Z
+
+
+class AdjustSettings(Section):
+    """[adjust]: the stochastic model."""
+
+    sigma_px: Length = 0.1  # a priori standard deviation of an image coordinate, px
+    reject: Literal["tau", "huber", "tukey", "none"] | None = None  # else tau; none with [observations]
+
+
+class CompareSettings(Section):
+    """[compare]: the other adjuster on the survey's network, the other pipeline on its photographs."""
+
+    backend: Literal["colmap", "none"] = "colmap"
+    baseline: Literal["mapper", "none"] = "none"

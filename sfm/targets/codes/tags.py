@@ -1,0 +1,201 @@
+"""Square tags (AprilTag, ArUco): found and read by OpenCV, their corners measured to sub-pixel as points.
+
+A tag gives four named points: "7a" is the upper left corner of the black square of tag 7 as it is printed,
+"7b" the upper right, "7c" the lower right and "7d" the lower left one.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
+from sfm.errors import GeometryError
+from sfm.targets.codes.rings import CodeFamily, code_family
+from sfm.targets.fits.corner import fit_corners
+from sfm.targets.flags import Flag
+
+# OpenCV's name of each dictionary behind the name that a survey file uses.
+TAG_FAMILIES = (
+    *(f"apriltag{kind}" for kind in ("16h5", "25h9", "36h10", "36h11")),
+    *(f"aruco{n}x{n}_{count}" for n in (4, 5, 6, 7) for count in (50, 100, 250, 1000)),
+    "aruco_original",
+    "aruco_mip_36h12",
+)
+CORNERS = "abcd"
+# A black module narrower than this is not told apart from the code behind it.
+LEAST_MODULE_PX = 3.0
+# Share of the bits that the dictionary could correct and that may be wrong: a wrong id costs more than a tag.
+CORRECTED, WRONG_IN_BORDER = 0.2, 0.1
+# A corner is refused if its residuals are beyond this share of the contrast, if an edge is softer than this
+# share of a module, or if its contrast is less than this share of the tag's.
+POOR_FIT, SOFTEST_EDGE, LEAST_CONTRAST = 0.1, 0.4, 0.3
+# Radius of the circle that stands for a corner where outlines are drawn, px.
+DRAWN_PX = 4.0
+
+
+@dataclass(frozen=True)
+class TagFamily:
+    """A dictionary of square tags."""
+
+    name: str
+    """one of TAG_FAMILIES"""
+    modules: int
+    """modules along a side of the black square, its border included"""
+    count: int
+    """number of tags; their ids begin with 0"""
+
+
+@dataclass(frozen=True)
+class TagCorners:
+    """Corners of the tags of one photograph, and those that could not be measured."""
+
+    xy: FloatArray
+    """corners, px, shape (k, 2)"""
+    covariance: FloatArray
+    """from the fit and its residuals, px^2, shape (k, 2, 2)"""
+    code: IntArray
+    """4 times the id of the tag plus 0 to 3 for the corners a to d, shape (k,)"""
+    levels: FloatArray
+    """intensity around the tag and the step to its border, shape (k, 2)"""
+    blur: FloatArray
+    """standard deviation of the edges, px, shape (k,)"""
+    noise: FloatArray
+    """standard deviation of the intensities about the fit, shape (k,)"""
+    flag: IntArray
+    """remarks, see sfm.targets.flags.Flag, shape (k,)"""
+    rejected_xy: FloatArray
+    """corners that could not be measured, px, shape (m, 2)"""
+    rejected_flag: IntArray
+    """their reasons, shape (m,)"""
+    quads: FloatArray
+    """outlines of all tags that were read, corners a to d as OpenCV gives them, px, shape (t, 4, 2)"""
+
+
+def tag_family(name: str) -> TagFamily | None:
+    """Return the family of a name of TAG_FAMILIES, None for any other name."""
+    if name not in TAG_FAMILIES:
+        return None
+    dictionary = _dictionary(name)
+    return TagFamily(name, dictionary.markerSize + 2, len(dictionary.bytesList))
+
+
+def target_family(codes: str | CodeFamily | TagFamily) -> CodeFamily | TagFamily | None:
+    """Return the family of rings or tags of a name or of a table file; None for "none".
+
+    Raises:
+        SurveyFileError: neither a known family nor a readable table.
+    """
+    if isinstance(codes, TagFamily):
+        return codes
+    return (tag_family(codes) if isinstance(codes, str) else None) or code_family(codes)
+
+
+def tag_modules(family: TagFamily, number: int) -> BoolArray:
+    """Return which modules of a tag are black, border included, row by row from above, (modules, modules).
+
+    Raises:
+        GeometryError: the family has no such tag.
+    """
+    if not 0 <= number < family.count:
+        raise GeometryError(f"tag {number}: family {family.name} has 0 to {family.count - 1}")
+    return np.asarray(_dictionary(family.name).generateImageMarker(number, family.modules) == 0)
+
+
+def corner_name(code: int) -> str:
+    """Return the name of a corner by its code, such as 7a."""
+    return f"{code // 4}{CORNERS[code % 4]}"
+
+
+def find_tags(photograph: AnyArray, family: TagFamily, *, polarity: str, scale: float) -> TagCorners:
+    """Find, read and measure the tags of one photograph.
+
+    Args:
+        photograph: intensities, shape (H, W), uint8 or uint16.
+        family: the dictionary.
+        polarity: dark (black border on white), bright (inverted) or auto (both).
+        scale: largest intensity that the photograph can hold; what reaches it is censored.
+
+    Returns:
+        The corners, tag by tag.
+
+    Source: Garrido-Jurado et al. (2014), Pattern Recognition 47(6), for finding and reading in OpenCV.
+    """
+    grey = photograph if photograph.dtype == np.uint8 else cv2.convertScaleAbs(photograph, alpha=255 / scale)
+    settings = cv2.aruco.DetectorParameters()
+    settings.errorCorrectionRate = CORRECTED
+    settings.maxErroneousBitsInBorderRate = WRONG_IN_BORDER
+    settings.minMarkerPerimeterRate = 4 * LEAST_MODULE_PX * family.modules / max(grey.shape)
+    detector = cv2.aruco.ArucoDetector(_dictionary(family.name), settings)
+    # OpenCV's own search for inverted tags loses upright ones, so that the photograph is inverted instead.
+    pictures = {"dark": (grey,), "bright": (255 - grey,)}.get(polarity, (grey, 255 - grey))
+    found = [_detect(detector, picture) for picture in pictures]
+    quads = np.concatenate([corners for corners, _ in found])
+    number = np.concatenate([ids for _, ids in found])
+    order = np.argsort(number, kind="stable")
+    quads, number = quads[order], number[order]
+    theta, covariance, noise, flag = fit_corners(photograph, quads, family.modules, float(scale))
+    contrast = theta[..., 5]
+    side = np.linalg.norm(quads - np.roll(quads, 1, axis=1), axis=2).min(axis=1, initial=np.inf)
+    module = np.repeat(side[:, None] / family.modules, 4, axis=1)
+    typical = np.median(contrast, axis=1, keepdims=True)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        tests = (
+            (Flag.CUT_BY_BORDER, (flag & Flag.CUT_BY_BORDER) != 0),
+            (Flag.TOO_SMALL, module < LEAST_MODULE_PX),
+            (Flag.NO_CONVERGENCE, (flag & Flag.NO_CONVERGENCE) != 0),
+            (Flag.LOW_CONTRAST, contrast / typical < LEAST_CONTRAST),
+            (Flag.BLURRED, theta[..., 6] > SOFTEST_EDGE * module),
+            (Flag.POOR_FIT, noise / np.abs(contrast) > POOR_FIT),
+        )
+    reason = np.zeros(flag.shape, dtype=np.int64)
+    for name, against in tests:
+        reason[(reason == 0) & against] = name.value
+    good = reason == 0
+    if polarity != "auto":  # an inverted tag is none of the survey's
+        wrong = np.sign(contrast) != (-1 if polarity == "dark" else 1)
+        reason[good & wrong] = Flag.LOW_CONTRAST.value
+        good &= ~wrong
+    code = 4 * number[:, None] + np.arange(4)
+    return TagCorners(
+        theta[good][:, :2],
+        covariance[good],
+        code[good],
+        theta[good][:, 4:6],
+        theta[good][:, 6],
+        noise[good],
+        flag[good] | Flag.CORNER.value,
+        quads[~good],
+        reason[~good],
+        quads,
+    )
+
+
+def _detect(detector: cv2.aruco.ArucoDetector, picture: AnyArray) -> tuple[FloatArray, IntArray]:
+    """Return corners a to d (t, 4, 2) and ids (t,) of the tags that OpenCV finds."""
+    corners, ids, _ = detector.detectMarkers(picture)
+    number = np.zeros(0) if ids is None else np.asarray(ids)
+    return np.array(corners, dtype=float).reshape(-1, 4, 2), number.reshape(-1).astype(np.int64)
+
+
+def inside_tags(xy: FloatArray, tags: TagCorners, family: TagFamily) -> BoolArray:
+    """Return which positions lie on a tag or within one module around it, (k,)."""
+    inside = np.zeros(len(xy), dtype=bool)
+    for quad in tags.quads if len(xy) else ():
+        middle = quad.mean(axis=0)
+        outline = (middle + (1 + 2 / family.modules) * (quad - middle)).astype(np.float32)
+        inside |= [cv2.pointPolygonTest(outline, (float(x), float(y)), False) >= 0 for x, y in xy]
+    return inside
+
+
+def _dictionary(name: str) -> cv2.aruco.Dictionary:
+    """Return OpenCV's dictionary of a name of TAG_FAMILIES."""
+    kind = name.removeprefix("aruco").removeprefix("_")
+    constant = {
+        "apriltag": f"DICT_APRILTAG_{name.removeprefix('apriltag')}",
+        "original": "DICT_ARUCO_ORIGINAL",
+        "mip_36h12": "DICT_ARUCO_MIP_36h12",
+    }.get("apriltag" if name.startswith("apriltag") else kind, f"DICT_{kind.upper()}")
+    return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, constant))

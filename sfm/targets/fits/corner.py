@@ -1,0 +1,255 @@
+"""Corner of a square tag by the least squares fit of two blurred edges, compiled.
+
+Model of the intensity at pixel (x, y), with d1, d2 the signed distances from two lines through the corner
+(x0, y0), negative on the side of the tag, s the blur of the edges, B the intensity around the tag, A the step
+to its border, g the change of the gain over L:
+
+    I = (B + A Phi(-d1 / s) Phi(-d2 / s)) (1 + gx (x - x0) / L + gy (y - y0) / L)
+
+The tip, where both edges act and the model would depend on the angle between them, is left out: the corner is
+where the two edges meet. The fit stays so near to it that distortion does not bend the edges.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+from sfm.conventions import AnyArray, FloatArray, IntArray
+from sfm.targets.edge_rays import invert_spd, solve_spd
+from sfm.targets.fits.blurred_ellipse import edge_profile
+from sfm.targets.flags import Flag
+
+# Unknowns of the fit: x0, y0, directions of the two normals, B, A, s, gx, gy.
+PARAMETERS = 9
+# Pixels where both edges are nearer than this are the tip; farther than this from an edge nothing is learnt.
+TIP_PX, BAND_PX, LEAST_BAND_PX = 2.5, 4.0, 1.5
+# Edges are followed for this share of a side, at most so far: distortion bends them by less than 0.01 px.
+REACH_SHARE, REACH_PX = 0.45, 20.0
+# What lies behind the border of one module (the code) is kept at this distance.
+CODE_PX = 2.5
+# A priori sigma of the change of gain over L, as for circular targets; it only keeps the fit regular.
+GAIN_SIGMA = 0.3
+# Blur at the start and its limits; the last step; the farthest that a corner is from where it was expected.
+BLUR_START, BLUR_LEAST, BLUR_MOST, LAST_STEP_PX, MAX_STEPS, FARTHEST_PX = 0.9, 0.25, 4.0, 1e-3, 30, 4.0
+_DENSITY_0 = 1 / math.sqrt(2 * math.pi)
+_CUT_BY_BORDER = int(Flag.CUT_BY_BORDER)
+_NO_CONVERGENCE = int(Flag.NO_CONVERGENCE)
+_SATURATED = int(Flag.SATURATED)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def fit_corners(
+    image: AnyArray, quads: FloatArray, modules: int, saturation: float
+) -> tuple[FloatArray, FloatArray, FloatArray, IntArray]:
+    """Fit the four corners of every tag.
+
+    Args:
+        image: intensities, shape (H, W).
+        quads: approximate corners of the black squares in turn, px, shape (k, 4, 2).
+        modules: modules along a side, border included.
+        saturation: intensities from here on are censored.
+
+    Returns:
+        Unknowns, shape (k, 4, 9); covariance of the corners, px^2, shape (k, 4, 2, 2), nan where the fit
+        failed; standard deviation of the intensities about the fit, shape (k, 4); flags, shape (k, 4).
+    """
+    k = len(quads)
+    theta = np.zeros((k, 4, PARAMETERS))
+    covariance = np.full((k, 4, 2, 2), math.nan)
+    noise = np.full((k, 4), math.nan)
+    flag = np.zeros((k, 4), np.int64)
+    for i in range(k):
+        for j in range(4):
+            quad = quads[i]
+            flag[i, j], noise[i, j] = _fit_one(
+                image, quad[j], quad[(j + 1) % 4], quad[(j + 2) % 4], quad[(j + 3) % 4],
+                modules, saturation, theta[i, j], covariance[i, j],
+            )  # fmt: skip
+    return theta, covariance, noise, flag
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _fit_one(
+    image: AnyArray,
+    corner: FloatArray,
+    following: FloatArray,
+    opposite: FloatArray,
+    previous: FloatArray,
+    modules: int,
+    saturation: float,
+    theta: FloatArray,
+    covariance: FloatArray,
+) -> tuple[int, float]:
+    """Fit one corner; theta and covariance are filled, flag and noise are returned."""
+    theta[0], theta[1] = corner[0], corner[1]
+    depth = math.inf
+    for k, (end, other) in enumerate(((following, previous), (previous, following))):
+        dx, dy = end[0] - corner[0], end[1] - corner[1]
+        nx, ny = -dy, dx
+        length = math.sqrt(nx * nx + ny * ny) + 1e-12
+        inside = nx * (other[0] - corner[0]) + ny * (other[1] - corner[1])
+        if inside > 0:  # the normal points away from the tag
+            nx, ny = -nx, -ny
+        theta[2 + k] = math.atan2(ny, nx)
+        depth = min(depth, abs(inside) / length)
+        depth = min(depth, abs(nx * (opposite[0] - corner[0]) + ny * (opposite[1] - corner[1])) / length)
+    band = min(BAND_PX, max(LEAST_BAND_PX, depth / modules - CODE_PX))
+    reach = min(REACH_PX, REACH_SHARE * depth)
+    data = np.empty((3, int((2 * FARTHEST_PX + 2 * (reach + band) * 4) ** 2) + 16))
+    flag, noise = 0, math.nan
+    for round_ in range(2):  # the pixels are chosen anew about the corner that was found
+        n, censored = _collect(image, theta, band, reach, saturation, data)
+        if n < 0:
+            return _CUT_BY_BORDER, noise
+        if censored:
+            flag |= _SATURATED
+        if n < 3 * PARAMETERS:
+            return flag | _NO_CONVERGENCE, noise
+        if round_ == 0:
+            _start_levels(data, n, theta)
+        squares, used = _iterate(data, n, theta, saturation, reach, covariance)
+        if used <= PARAMETERS or math.hypot(theta[0] - corner[0], theta[1] - corner[1]) > FARTHEST_PX:
+            covariance[:] = math.nan
+            return flag | _NO_CONVERGENCE, noise
+        variance = max(squares / (used - PARAMETERS), 1 / 12)  # at least that of rounding
+        noise = math.sqrt(variance)
+        covariance *= variance
+    return flag, noise
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _collect(
+    image: AnyArray, theta: FloatArray, band: float, reach: float, saturation: float, data: FloatArray
+) -> tuple[int, bool]:
+    """Collect x, y and intensity along the two edges; return how many, -1 where the border cuts them off."""
+    h, w = image.shape
+    x0, y0 = theta[0], theta[1]
+    c1, s1, c2, s2 = math.cos(theta[2]), math.sin(theta[2]), math.cos(theta[3]), math.sin(theta[3])
+    sine = abs(c1 * s2 - s1 * c2)
+    half = min((reach + band) / max(sine, 0.2) + 1, 2 * (reach + band))
+    if x0 < band or y0 < band or x0 > w - 1 - band or y0 > h - 1 - band:
+        return -1, False
+    n, censored = 0, False
+    for i in range(max(0, int(y0 - half)), min(h, int(y0 + half) + 2)):
+        for j in range(max(0, int(x0 - half)), min(w, int(x0 + half) + 2)):
+            d1, d2 = c1 * (j - x0) + s1 * (i - y0), c2 * (j - x0) + s2 * (i - y0)
+            if max(d1, d2) > band or min(d1, d2) < -reach or min(abs(d1), abs(d2)) > band:
+                continue
+            if abs(d1) < TIP_PX and abs(d2) < TIP_PX:
+                continue
+            if n == data.shape[1]:
+                return n, censored
+            data[0, n], data[1, n], data[2, n] = j, i, image[i, j]
+            censored = censored or image[i, j] >= saturation
+            n += 1
+    return n, censored
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _start_levels(data: FloatArray, n: int, theta: FloatArray) -> None:
+    """Set B and A to the mean intensities beside the tag and on its border, s and g to their start values."""
+    c1, s1, c2, s2 = math.cos(theta[2]), math.sin(theta[2]), math.cos(theta[3]), math.sin(theta[3])
+    sums, counts = np.zeros(2), np.zeros(2)
+    for i in range(n):
+        dx, dy = data[0, i] - theta[0], data[1, i] - theta[1]
+        side = 1 if c1 * dx + s1 * dy < 0 and c2 * dx + s2 * dy < 0 else 0
+        sums[side] += data[2, i]
+        counts[side] += 1
+    theta[4] = sums[0] / max(counts[0], 1)
+    theta[5] = sums[1] / max(counts[1], 1) - theta[4]
+    theta[6], theta[7], theta[8] = BLUR_START, 0.0, 0.0
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _iterate(
+    data: FloatArray, n: int, theta: FloatArray, saturation: float, length: float, cofactor: FloatArray
+) -> tuple[float, int]:
+    """Improve theta by Levenberg-Marquardt steps and set the cofactors of the corner.
+
+    Returns:
+        Sum of squared residuals, and the number of pixels used, 0 where it did not converge.
+    """
+    N, g = np.empty((PARAMETERS, PARAMETERS)), np.empty(PARAMETERS)
+    N_trial, g_trial = np.empty((PARAMETERS, PARAMETERS)), np.empty(PARAMETERS)
+    L, trial = np.empty((PARAMETERS, PARAMETERS)), np.empty(PARAMETERS)
+    total, used = _normal_equations(data, n, theta, saturation, length, N, g)
+    damping = 1e-3
+    for _ in range(MAX_STEPS):
+        L[:], trial[:] = N, g
+        for i in range(PARAMETERS):
+            L[i, i] *= 1 + damping
+        if not solve_spd(L, trial):
+            return total, 0
+        shift = max(abs(trial[0]), abs(trial[1]))
+        trial += theta
+        trial[6] = min(max(trial[6], BLUR_LEAST), BLUR_MOST)
+        squares, used_trial = _normal_equations(data, n, trial, saturation, length, N_trial, g_trial)
+        if squares > total * (1 + 1e-9) and used_trial == used:
+            damping = max(damping, 1e-3) * 10
+            if damping > 1e6:
+                return total, 0
+            continue
+        theta[:], N[:], g[:] = trial, N_trial, g_trial
+        total, used = squares, used_trial
+        damping *= 0.1
+        if shift < LAST_STEP_PX:
+            if not invert_spd(N):
+                return total, 0
+            cofactor[:] = N[:2, :2]
+            return total, used
+    return total, 0
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _normal_equations(
+    data: FloatArray,
+    n: int,
+    theta: FloatArray,
+    saturation: float,
+    length: float,
+    N: FloatArray,
+    g: FloatArray,
+) -> tuple[float, int]:
+    """Sum up N = J'J and g = J'v with the prior of the gain; return v'v and the number of pixels used."""
+    x0, y0, B, A, s = theta[0], theta[1], theta[4], theta[5], theta[6]
+    gx, gy = theta[7] / length, theta[8] / length
+    c1, s1, c2, s2 = math.cos(theta[2]), math.sin(theta[2]), math.cos(theta[3]), math.sin(theta[3])
+    N[:], g[:] = 0.0, 0.0
+    squares, used = 0.0, 0
+    J = np.empty(PARAMETERS)
+    for i in range(n):
+        dx, dy, value = data[0, i] - x0, data[1, i] - y0, data[2, i]
+        d1, d2 = c1 * dx + s1 * dy, c2 * dx + s2 * dy
+        phi1, e1 = edge_profile(-d1 / s)
+        phi2, e2 = edge_profile(-d2 / s)
+        gain = 1 + gx * dx + gy * dy
+        level = B + A * phi1 * phi2
+        model = level * gain
+        if (value >= saturation and model >= saturation) or (value <= 0 and model <= 0):
+            continue  # no more is known of it (censored observation)
+        f1 = -A * _DENSITY_0 * e1 * phi2 * gain / s  # dI / d d1
+        f2 = -A * _DENSITY_0 * e2 * phi1 * gain / s
+        J[0] = -f1 * c1 - f2 * c2 - level * gx
+        J[1] = -f1 * s1 - f2 * s2 - level * gy
+        J[2] = f1 * (c1 * dy - s1 * dx)
+        J[3] = f2 * (c2 * dy - s2 * dx)
+        J[4] = gain
+        J[5] = phi1 * phi2 * gain
+        J[6] = -(f1 * d1 + f2 * d2) / s
+        J[7] = level * dx / length
+        J[8] = level * dy / length
+        v = value - model
+        squares += v * v
+        used += 1
+        for j in range(PARAMETERS):
+            g[j] += J[j] * v
+            for k in range(j + 1):
+                N[j, k] += J[j] * J[k]
+    prior = (squares / max(used - PARAMETERS, 1) + 1 / 12) / GAIN_SIGMA**2
+    for j in (7, 8):
+        N[j, j] += prior
+        g[j] -= prior * theta[j]
+    return squares, used

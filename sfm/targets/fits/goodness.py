@@ -1,0 +1,153 @@
+"""Goodness of fit of a blurred ellipse: what it leaves unexplained, and how wide its background is."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+from sfm.conventions import AnyArray, FloatArray
+from sfm.targets.edge_rays import HARMONICS, RAYS, STEP_PX, bilinear
+from sfm.targets.fits.blurred_ellipse import BLOCK, linearise
+
+# Pixels used, sum of squared residuals, unevenness, L, steps, lobes and their sigma, share of strokes, halo
+# and its sigma, saturated share of the background, share of the circumference behind which glare is.
+STATISTICS = 12
+# A background narrower than this, in radii, is a stroke: the rings of codes begin one radius from the edge.
+STROKE = 0.75
+# Behind a stroke this far is looked at, and what lies beyond so many contrasts from the background is glare.
+_BEHIND_PX, _GLARE = 2.5, 1.5
+# The background begins so many blurs from the edge, where 0.6 % of the step are left; a halo is looked for in
+# this width of it.
+_EDGE_ENDS_BLURS, _HALO_PX = 2.5, 2.0
+# Residuals of the edge are taken from this far in units of its blur, and at least so many px.
+_BAND_BLURS, _BAND_PX = 1.5, 1.0
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def judge_residuals(
+    data: FloatArray,
+    n: int,
+    theta: FloatArray,
+    length: float,
+    saturation: float,
+    J: FloatArray,
+    statistics: FloatArray,
+) -> None:
+    """Set the number of pixels, the sum of squared residuals, the unevenness and the lobes of the edge.
+
+    The unevenness is the largest mean residual of an eighth of the edge, in- or outside, over the contrast.
+    The lobes are the amplitude of the deviations of the outline from the ellipse that go with the third and
+    fourth harmonic of the direction, in radii: the ends of a bar and the corners of a square. Their sigma is
+    that for unit noise.
+    """
+    p, q, r = theta[2], theta[3], theta[4]
+    A, s = theta[6], theta[7]
+    band = _BAND_PX + _BAND_BLURS * s
+    mean, count = np.zeros(16), np.zeros(16)
+    lobe, lobe_weight = np.zeros(4), np.full(4, 1e-12)
+    squares, used = 0.0, 0.0
+    for first in range(0, n, BLOCK):
+        m = min(BLOCK, n - first)
+        linearise(data, first, m, theta, length, saturation, J)
+        for i in range(m):
+            residual = J[10 * BLOCK + i]
+            squares += residual * residual
+            used += J[11 * BLOCK + i]
+            dx, dy = data[0, first + i] - theta[0], data[1, first + i] - theta[1]
+            u, v = p * dx + q * dy, q * dx + r * dy
+            rho = math.sqrt(u * u + v * v)
+            nw = math.sqrt((p * u + q * v) ** 2 + (q * u + r * v) ** 2) + 1e-12
+            d = rho * (rho - 1) / nw
+            if abs(d) >= band:
+                continue
+            side, right, down = (8 if d > 0 else 0), (4 if u > 0 else 0), (2 if v > 0 else 0)
+            k = side + right + down + (1 if abs(u) > abs(v) else 0)
+            mean[k] += residual
+            count[k] += 1
+            # An outline at rho = 1 + h has d = rho (rho - 1 - h) / |w|, and I falls by A / s phi(d / s) dd.
+            shift = A / s * math.exp(-0.5 * (d / s) ** 2) / math.sqrt(2 * math.pi) * rho / nw
+            c, z = u / (rho + 1e-12), v / (rho + 1e-12)
+            c2, z2 = c * c - z * z, 2 * c * z
+            for j, h in enumerate((c2 * c - z2 * z, z2 * c + c2 * z, c2 * c2 - z2 * z2, 2 * c2 * z2)):
+                lobe[j] += residual * shift * h
+                lobe_weight[j] += (shift * h) ** 2
+    worst = 0.0
+    for k in range(16):
+        if count[k] > 0:
+            worst = max(worst, abs(mean[k]) / count[k])
+        elif k >= 8:
+            worst = abs(A)  # no background at all on this side
+    statistics[0], statistics[1], statistics[2] = used, squares, worst / abs(A)
+    statistics[5] = math.sqrt(np.sum((lobe / lobe_weight) ** 2))
+    statistics[6] = 1 / math.sqrt(lobe_weight.min())
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def judge_background(image: AnyArray, theta: FloatArray, length: float, statistics: FloatArray) -> None:
+    """Set the shares of the circumference where the background is only a thin stroke, and where glare is.
+
+    The stroke of a letter "o" is one: the intensity comes back to that of the target nearer to the edge than
+    any ring of a code. What is much farther from the background than the target is glare about the rim of a
+    retro-reflective target.
+    """
+    h, w = image.shape
+    x0, y0, p, q, r = theta[0], theta[1], theta[2], theta[3], theta[4]
+    B, A, gx, gy = theta[5], theta[6], theta[8] / length, theta[9] / length
+    det = p * r - q * q
+    strokes, glaring = 0, 0
+    for k in range(RAYS):
+        c, s = HARMONICS[k, 1], HARMONICS[k, 2]
+        ex, ey = (r * c - q * s) / det, (p * s - q * c) / det
+        R = math.sqrt(ex * ex + ey * ey)
+        ex, ey = ex / R, ey / R
+        left, back, highest, t = False, math.inf, 0.0, 0.0
+        while t <= min(STROKE * R, back) + (_BEHIND_PX if back < math.inf else 0.0):
+            x, y = x0 + (R + t) * ex, y0 + (R + t) * ey
+            if x < 0 or y < 0 or x >= w - 1 or y >= h - 1:
+                break
+            level = (bilinear(image, x, y) / (1 + gx * (x - x0) + gy * (y - y0)) - B) / A
+            if back < math.inf:
+                highest = max(highest, level)
+            elif not left:
+                left = level < 0.5
+            elif level > 0.5:
+                back = t
+            t += 0.5 * STEP_PX
+        if back < math.inf:
+            strokes += highest < _GLARE
+            glaring += highest >= _GLARE
+    statistics[7], statistics[11] = strokes / RAYS, glaring / RAYS
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def judge_glow(
+    data: FloatArray, n: int, theta: FloatArray, saturation: float, statistics: FloatArray
+) -> None:
+    """Set by how much the background beside the edge is nearer to the target than farther away, in contrasts.
+
+    And the standard deviation of that, and the share of the background that is saturated.
+    """
+    x0, y0, p, q, r = theta[0], theta[1], theta[2], theta[3], theta[4]
+    B, A, s = theta[5], theta[6], theta[7]
+    begin = _EDGE_ENDS_BLURS * s
+    total, count, saturated = np.zeros(2), np.zeros(2), 0.0
+    for i in range(n):
+        dx, dy = data[0, i] - x0, data[1, i] - y0
+        u, v = p * dx + q * dy, q * dx + r * dy
+        rho = math.sqrt(u * u + v * v)
+        d = rho * (rho - 1) / (math.sqrt((p * u + q * v) ** 2 + (q * u + r * v) ** 2) + 1e-12)
+        if d < begin:
+            continue
+        far = 1 if d > begin + _HALO_PX else 0
+        total[far] += data[2, i] - B
+        count[far] += 1
+        saturated += data[2, i] >= saturation
+    statistics[8], statistics[9], statistics[10] = 0.0, math.inf, 0.0
+    if count[0] + count[1] > 0:
+        statistics[10] = saturated / (count[0] + count[1])
+    if count[0] > 0 and count[1] > 0:
+        variance = statistics[1] / max(statistics[0] - len(theta), 1.0)
+        statistics[8] = (total[0] / count[0] - total[1] / count[1]) / A
+        statistics[9] = math.sqrt(variance * (1 / count[0] + 1 / count[1])) / abs(A)
