@@ -12,7 +12,7 @@ import pycolmap
 
 from sfm.conventions import FloatArray, rotation_from_vector
 from sfm.orientation.resection.fischler_bolles import rays_from_tangents, resect_triples
-from sfm.orientation.resection.robust import resect_robust
+from sfm.orientation.resection.ransac import resect_robust
 from sfm.orientation.resection.zeng_wang import resect_triples_zeng_wang
 
 TRIPLES = 10_000

@@ -9,11 +9,11 @@ from collections import Counter
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numba import njit
 
 from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.distortion.models import MAX_PARAMETERS, MODELS, number_of, observe
 from sfm.errors import SurveyFileError
+from sfm.kernels.options import compiled
 
 FIXED_POINT_STEPS = 100
 PIXEL_TOLERANCE = 1e-11
@@ -24,13 +24,20 @@ class Camera:
     """Interior orientation of one camera, shared by the photographs taken with it."""
 
     name: str
-    model: str  # a name in MODELS
-    size_px: tuple[int, int]  # width and height of its photographs, px
-    pixel_mm: FloatArray  # width and height of a pixel, mm, (2,)
-    parameters: FloatArray  # in the order of MODELS[model].names and in its units, (n,)
-    free: BoolArray = field(default_factory=lambda: np.zeros(0, dtype=bool))  # to be adjusted, (n,)
-    shared: tuple[str, ...] = ()  # of each parameter, the group of cameras that have one value of it, such as
-    # the camera whose photographs differ in c only; "" = this camera's own, () = all its own, (n,)
+    """what people call the camera"""
+    model: str
+    """distortion model, a name in `sfm.distortion.models.MODELS`"""
+    size_px: tuple[int, int]
+    """width and height of its photographs, px"""
+    pixel_mm: FloatArray
+    """width and height of a pixel, mm, shape (2,)"""
+    parameters: FloatArray
+    """interior orientation in the order and units of the model, see `names` and `units`, shape (n,)"""
+    free: BoolArray = field(default_factory=lambda: np.zeros(0, dtype=bool))
+    """which parameters are to be adjusted; none by default, shape (n,)"""
+    shared: tuple[str, ...] = ()
+    """of each parameter, the group of cameras that have one value of it, such as the camera whose photographs
+    differ in c only; "" = this camera's own, () = all its own, length n"""
 
     def __post_init__(self) -> None:
         n = len(self.names)
@@ -115,9 +122,14 @@ def camera_from_values(
 
     Raises:
         SurveyFileError: unknown model or parameter name.
+
+    Example:
+        >>> camera = camera_from_values("D3", "brown", (6000, 4000), (0.004, 0.004), c_mm=20.0, free=("c",))
+        >>> camera.c_px, camera.names[:4]
+        (5000.0, ('c', 'x0', 'y0', 'K1'))
     """
     if model not in MODELS:
-        raise SurveyFileError(f"camera {name}: model '{model}' is none of {', '.join(MODELS)}")
+        raise SurveyFileError(f"camera {name}: model '{model}', expected one of {', '.join(MODELS)}")
     names = MODELS[model].names
     for given in (*free, *(key for key, _ in values)):
         if given not in names:
@@ -208,12 +220,17 @@ def project(camera: Camera, position: FloatArray, rotation: FloatArray, points: 
     Returns:
         Pixel coordinates, shape (n, 2), px; NaN for points behind the camera.
 
+    Example:
+        >>> camera = camera_from_values("D3", "brown", (6000, 4000), (0.004, 0.004), c_mm=20.0)
+        >>> project(camera, np.array([0.0, 0.0, 2.0]), np.eye(3), np.array([[0.1, 0.2, 0.0]]))
+        array([[3249.5, 1499.5]])
+
     Source: Kraus (2007), eq. 5.1-1.
     """
     UVW = (np.asarray(points, dtype=float) - position) @ rotation
     in_front = UVW[:, 2] < 0
     W = np.where(in_front, UVW[:, 2], np.nan)
-    return pixel_from_tangents(camera, -UVW[:, :2] / W[:, None])
+    return pixel_from_tangents(camera, np.asarray(-UVW[:, :2] / W[:, None]))
 
 
 def pixel_jacobian(camera: Camera, xy_px: FloatArray) -> FloatArray:
@@ -230,25 +247,28 @@ def pixel_jacobian(camera: Camera, xy_px: FloatArray) -> FloatArray:
     for step in np.eye(2):
         ahead = tangents_from_pixel(camera, xy_px + step)
         columns.append((ahead - tangents_from_pixel(camera, xy_px - step)) / 2)
-    return np.linalg.inv(np.stack(columns, axis=-1))
+    return np.asarray(np.linalg.inv(np.stack(columns, axis=-1)))
 
 
-@njit(cache=True, error_model="numpy")
-def _tangents(model, frame, p, xy):  # type: ignore[no-untyped-def]
-    """Newton's method on r(u, v) = 0; exact after one step for `brown`, where r is linear in u, v."""
-    r, Ju, Jp = np.empty(2), np.empty((2, 2)), np.empty((2, MAX_PARAMETERS))
+@compiled
+def _tangents(model: int, frame: FloatArray, p: FloatArray, xy: FloatArray) -> FloatArray:
+    """Return the tangents by Newton's method; one step is exact for `brown`, which is linear in u, v."""
+    residual, Ju, Jp = np.empty(2), np.empty((2, 2)), np.empty((2, MAX_PARAMETERS))
     uv = np.empty_like(xy)
     for i in range(len(xy)):
         u, v = 0.0, 0.0
         solved = False
         for _ in range(FIXED_POINT_STEPS):
-            observe(model, frame, p, xy[i, 0], xy[i, 1], u, v, r, Ju, Jp)
+            observe(model, frame, p, xy[i, 0], xy[i, 1], u, v, residual, Ju, Jp)
             det = Ju[0, 0] * Ju[1, 1] - Ju[0, 1] * Ju[1, 0]
-            du = (Ju[1, 1] * r[0] - Ju[0, 1] * r[1]) / det
-            dv = (Ju[0, 0] * r[1] - Ju[1, 0] * r[0]) / det
+            du = (Ju[1, 1] * residual[0] - Ju[0, 1] * residual[1]) / det
+            dv = (Ju[0, 0] * residual[1] - Ju[1, 0] * residual[0]) / det
             u -= du
             v -= dv
-            if abs(du) + abs(dv) < 1e-15 * (1.0 + abs(u) + abs(v)) or abs(r[0]) + abs(r[1]) < PIXEL_TOLERANCE:
+            if (
+                abs(du) + abs(dv) < 1e-15 * (1.0 + abs(u) + abs(v))
+                or abs(residual[0]) + abs(residual[1]) < PIXEL_TOLERANCE
+            ):
                 solved = True
                 break
         uv[i, 0] = u if solved else np.nan
@@ -256,19 +276,19 @@ def _tangents(model, frame, p, xy):  # type: ignore[no-untyped-def]
     return uv
 
 
-@njit(cache=True, error_model="numpy")
-def _pixels(model, frame, p, uv):  # type: ignore[no-untyped-def]
-    """Fixed point x <- x + r(x): r is computed minus measured, so distortion gradients contract it."""
-    r, Ju, Jp = np.empty(2), np.empty((2, 2)), np.empty((2, MAX_PARAMETERS))
+@compiled
+def _pixels(model: int, frame: FloatArray, p: FloatArray, uv: FloatArray) -> FloatArray:
+    """Return the pixels by the fixed point x <- x + residual(x), which gradients of distortion contract."""
+    residual, Ju, Jp = np.empty(2), np.empty((2, 2)), np.empty((2, MAX_PARAMETERS))
     xy = np.empty_like(uv)
     for i in range(len(uv)):
         x, y = frame[0], frame[1]
         solved = False
         for _ in range(FIXED_POINT_STEPS):
-            observe(model, frame, p, x, y, uv[i, 0], uv[i, 1], r, Ju, Jp)
-            x += r[0]
-            y += r[1]
-            if abs(r[0]) + abs(r[1]) < PIXEL_TOLERANCE:
+            observe(model, frame, p, x, y, uv[i, 0], uv[i, 1], residual, Ju, Jp)
+            x += residual[0]
+            y += residual[1]
+            if abs(residual[0]) + abs(residual[1]) < PIXEL_TOLERANCE:
                 solved = True
                 break
         xy[i, 0] = x if solved else np.nan

@@ -2,7 +2,7 @@
 
 Pixel frame
     (0, 0) is the centre of the top-left pixel, x = column to the right, y = row down, unit px.
-    (COLMAP counts from the corner of that pixel; adapters/colmap/adjuster.py alone adds the half pixel.)
+    (COLMAP counts from the corner of that pixel; adapters/colmap alone adds the half pixel.)
 Image frame
     mm, origin at the centre of the sensor, x right, y up; the camera looks along -z.
 Object frame
@@ -33,7 +33,9 @@ def rotation_from_angles(omega: float, phi: float, kappa: float) -> FloatArray:
     """Return R = Rx(omega) Ry(phi) Rz(kappa), which turns image axes into object axes.
 
     Args:
-        omega, phi, kappa: rotation angles about x, y' and z'', rad.
+        omega: rotation about x, rad.
+        phi: rotation about y', rad.
+        kappa: rotation about z'', rad.
 
     Returns:
         Rotation matrix, shape (3, 3).
@@ -125,7 +127,7 @@ def rotation_from_vector(vector: FloatArray) -> FloatArray:
     a = np.where(small, 1 - t2 / 6, np.sin(safe) / safe)
     b = np.where(small, 0.5 - t2 / 24, (1 - np.cos(safe)) / safe**2)
     W = skew(w)
-    return np.eye(3) + a * W + b * (W @ W)
+    return np.asarray(np.eye(3) + a * W + b * (W @ W))
 
 
 def skew(vector: FloatArray) -> FloatArray:

@@ -9,11 +9,11 @@ import pytest
 from synthetic import seed_of
 from threadpoolctl import threadpool_limits
 
-from sfm.adjustment.covariance import hat_complement, marginal_covariance
+from sfm.adjustment.covariance import Marginal, marginal_of
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.engine import connectivity, iterate, normals
+from sfm.adjustment.engine.cofactors import hat_complement, marginal_covariance
 from sfm.adjustment.engine.connectivity import Order, pattern_of
-from sfm.adjustment.engine.marginal import Marginal, marginal_of
 from sfm.adjustment.engine.normals import HALVED
 from sfm.adjustment.engine.solvers.banded import BandFactor
 from sfm.adjustment.engine.solvers.banded_inverse import band_inverse

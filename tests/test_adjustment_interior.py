@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from synthetic import make_network, perturb, seed_of
 
+from sfm.adjustment.covariance import marginal_of
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.engine import connectivity
 from sfm.adjustment.engine.collinearity import residuals
-from sfm.adjustment.engine.marginal import marginal_of
 from sfm.adjustment.engine.normals import normal_equations
 from sfm.adjustment.engine.observed_unknowns import weighted_of
 from sfm.adjustment.engine.solvers.dense import schur_complement

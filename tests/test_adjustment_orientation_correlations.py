@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from sfm.adjustment.covariance import marginal_of
 from sfm.adjustment.datum import Datum
-from sfm.adjustment.engine.marginal import marginal_of
 from sfm.adjustment.quality.correlations import _correlations, orientation_correlations
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust

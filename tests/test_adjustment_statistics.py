@@ -9,8 +9,8 @@ import pytest
 from scipy import stats
 from synthetic import make_network, seed_of
 
+from sfm.adjustment.covariance import change_datum, marginal_of
 from sfm.adjustment.datum import Datum
-from sfm.adjustment.engine.marginal import change_datum, marginal_of
 from sfm.adjustment.quality.statistics import (
     component_tests,
     correlations,
@@ -227,17 +227,43 @@ def test_joint_covariance_of_a_subset_and_of_a_distance(plain: Adjustment) -> No
 
 
 def test_datum_changes_without_a_new_adjustment(plain: Adjustment) -> None:
+    """Adjusting anew from the adjusted coordinates takes no step, so that both are of the same state."""
+    index = np.array([1, 5, 9, 20])
     some = np.zeros(40, dtype=bool)
-    some[[1, 5, 9, 20]] = True
-    for datum in (Datum("minimal"), Datum("free", some), Datum("minimal", some)):
-        again = adjust(plain.network, plain.estimate, datum=datum, reject="none")
-        changed = change_datum(plain, datum)
-        assert changed.estimate is plain.estimate
-        size = np.abs(again.covariance.points).max()
-        assert np.abs(changed.covariance.points - again.covariance.points).max() < 1e-5 * size
-        size = np.abs(again.covariance.exterior).max()
-        assert np.abs(changed.covariance.exterior - again.covariance.exterior).max() < 1e-5 * size
+    some[index] = True
+    names = [plain.network.points[j] for j in index]
+    for points in (None, some, index, names):
+        for kind in ("minimal", "free"):
+            again = adjust(plain.network, plain.estimate, datum=Datum(kind, points), reject="none")
+            changed = change_datum(plain, Datum(kind, points))
+            assert changed.datum == again.datum == kind
+            np.testing.assert_array_equal(changed.datum_points, again.datum_points)
+            for a, b in zip(values_of(changed), values_of(again), strict=True):
+                assert np.abs(a - b).max() < 1e-9 * np.abs(b).max()
     back = change_datum(change_datum(plain, Datum("minimal")), FREE)
     assert np.allclose(back.covariance.points, plain.covariance.points, rtol=1e-5, atol=1e-18)
     with pytest.raises(GeometryError, match="another adjustment"):
         change_datum(plain, Datum("control"))
+
+
+def values_of(a: Adjustment) -> tuple[FloatArray, ...]:
+    """Return all that an adjustment says of its unknowns."""
+    interior = tuple(camera.parameters for camera in a.estimate.cameras)
+    Q = a.covariance
+    values = a.estimate.points, a.estimate.position, a.estimate.rotation, *interior
+    return *values, Q.points, Q.exterior, Q.points_limiting, *Q.interior
+
+
+@pytest.mark.parametrize(
+    ("points", "message"),
+    [
+        (["no such point"], "datum: point no such point is not in the network of 40 points"),
+        ([40, 41], "datum: point 40 is not in the network"),
+        (np.ones(3, dtype=bool), r"a mask of shape \(3,\), expected \(40,\)"),
+        ([], "expected names or indices"),
+        ([0.5], "points of type float64, expected names, indices or a mask"),
+    ],
+)
+def test_datum_points_that_are_not_there_are_told(plain: Adjustment, points: object, message: str) -> None:
+    with pytest.raises(GeometryError, match=message):
+        change_datum(plain, Datum("free", points))

@@ -124,7 +124,7 @@ def test_pixel_jacobian_against_differences(model: str) -> None:
 @pytest.mark.parametrize(
     ("model", "free", "values", "message"),
     [
-        ("fisheye", (), (), "model 'fisheye' is none of brown"),
+        ("fisheye", (), (), "model 'fisheye', expected one of brown"),
         ("brown", ("f",), (), "has no parameter 'f'"),
         ("opencv", (), (("K1", 0.1),), "has no parameter 'K1'"),
     ],

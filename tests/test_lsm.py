@@ -12,8 +12,8 @@ import pytest
 from sfm.conventions import AnyArray, FloatArray
 from sfm.errors import GeometryError, PhotographError
 from sfm.matching.correlation.ncc import match_ncc
-from sfm.matching.flags import LsmFlag
 from sfm.matching.lsm.two_photo import LsmMatches, match_lsm
+from sfm.matching.match_flags import LsmFlag
 from tests.textures import MEAN, Pairs, affine_pairs, with_noise
 
 SIGMA = 2.0

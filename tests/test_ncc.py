@@ -15,8 +15,8 @@ from sfm.matching.correlation.along_line import match_along_line
 from sfm.matching.correlation.ambiguity import ambiguous, independent_pixels
 from sfm.matching.correlation.ncc import match_ncc
 from sfm.matching.correlation.pyramid import match_pyramid
-from sfm.matching.epipolar_path import epipolar_paths
-from sfm.matching.flags import NccFlag
+from sfm.matching.epipolar import epipolar_paths
+from sfm.matching.match_flags import NccFlag
 from tests.synthetic import make_network
 from tests.textures import random_texture, with_noise
 

@@ -14,9 +14,9 @@ import pytest
 
 from sfm.batch.pages import render_index
 from sfm.batch.survey import SurveyRow
+from sfm.comparison.adjuster_validation import SAME, Trial, Validation
 from sfm.comparison.random_network import Plan
 from sfm.comparison.significance import Result, compare_results
-from sfm.comparison.validation import SAME, Trial, Validation
 from sfm.pipeline import run_survey
 from sfm.report.content_policy import content_policy
 from sfm.report.differences import write_differences

@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from synthetic import seed_of
 
 from sfm.conventions import rotation_from_vector
+from sfm.kernels.quartic import positive_roots
 from sfm.orientation.resection.fischler_bolles import leg_quartic, rays_from_tangents, resect_triples
-from sfm.orientation.resection.quartic import positive_roots
 
 TABLE = np.loadtxt(
     Path(__file__).parents[1] / "datasets/resection4/resection4_points.csv", delimiter=",", skiprows=1

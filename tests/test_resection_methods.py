@@ -10,14 +10,13 @@ from test_resection_robust import scene
 
 from sfm.conventions import rotation_from_angles
 from sfm.errors import GeometryError
-from sfm.orientation.resection.choice import choose_by_line
+from sfm.orientation.resection.candidates import choose_by_line, solution_of
 from sfm.orientation.resection.church import resect_church
 from sfm.orientation.resection.critical_cylinder import cylinder_distance, cylinder_warning
 from sfm.orientation.resection.dlt import resect_dlt
 from sfm.orientation.resection.fischler_bolles import rays_from_tangents, resect_fischler_bolles
 from sfm.orientation.resection.p4p import resect_p4p
 from sfm.orientation.resection.rampal import resect_rampal
-from sfm.orientation.resection.solution import solution_of
 from sfm.orientation.resection.zeng_wang import (
     distance_quartic,
     resect_triples_zeng_wang,

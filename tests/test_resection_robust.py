@@ -5,7 +5,7 @@ import pytest
 from synthetic import seed_of
 
 from sfm.conventions import rotation_from_vector
-from sfm.orientation.resection.robust import expected_trials, resect_robust
+from sfm.orientation.resection.ransac import expected_trials, resect_robust
 
 SIGMA = 0.5 / 2000  # half a pixel at c = 2000 px
 

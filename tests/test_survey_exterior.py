@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from sfm.adjustment.engine.marginal import marginal_of
+from sfm.adjustment.covariance import marginal_of
 from sfm.adjustment.result import Adjustment
 from sfm.conventions import FloatArray, angles_from_rotation
 from sfm.errors import GeometryError, SurveyFileError

@@ -10,8 +10,8 @@ import pytest
 from synthetic import PIXEL_MM, SIZE_PX, make_network, seed_of
 
 from adapters.colmap.adjuster import adjust_with_colmap
+from sfm.adjustment.covariance import change_datum, marginal_of
 from sfm.adjustment.datum import Datum
-from sfm.adjustment.engine.marginal import change_datum, marginal_of
 from sfm.camera import project
 from sfm.conventions import angles_from_rotation
 from sfm.errors import GeometryError, SurveyFileError

@@ -21,12 +21,12 @@ from sfm.camera import Camera, project, tangents_from_pixel
 from sfm.conventions import AnyArray, FloatArray, angles_from_rotation
 from sfm.errors import GeometryError, PhotographError, SurveyFileError
 from sfm.matching.correlation.along_line import match_along_line
-from sfm.matching.epipolar_path import epipolar_paths
-from sfm.matching.flags import LsmFlag
+from sfm.matching.epipolar import epipolar_paths
 from sfm.matching.lsm.multi_photo import match_multi
 from sfm.matching.lsm.two_photo import match_lsm
+from sfm.matching.match_flags import LsmFlag
+from sfm.matching.tracks.feature_tracks import Features, find_tie_points, link_features
 from sfm.matching.tracks.interest import foerstner_points
-from sfm.matching.tracks.tie_points import Features, find_tie_points, link_features
 from sfm.network import Estimate, ImagePoints, Network
 from sfm.orientation.relative import relative_orientations
 from sfm.pipeline import run_survey

@@ -9,6 +9,15 @@ import pytest
 
 from adapters.colmap.adjuster import adjust_with_colmap
 from adapters.colmap.covariance import ColmapBackend
+from sfm.comparison.adjuster_validation import (
+    BOTH_FAILED,
+    OURS_FAILED,
+    SAME,
+    Validation,
+    _judge,
+    make_trial,
+    validate,
+)
 from sfm.comparison.adjusters import reprojection
 from sfm.comparison.random_network import (
     ARRANGEMENTS,
@@ -17,15 +26,6 @@ from sfm.comparison.random_network import (
     NOISE_PX,
     SIZE_PX,
     random_network,
-)
-from sfm.comparison.validation import (
-    BOTH_FAILED,
-    OURS_FAILED,
-    SAME,
-    Validation,
-    _judge,
-    make_trial,
-    validate,
 )
 from sfm.errors import BackendError
 from sfm.network import Estimate, Network

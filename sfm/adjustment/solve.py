@@ -12,14 +12,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sfm.adjustment.covariance import (
+from sfm.adjustment.datum import Datum
+from sfm.adjustment.engine.cofactors import (
     Cofactors,
     cofactors,
     hat_complement,
     marginal_covariance,
     without_held,
 )
-from sfm.adjustment.datum import Datum
 from sfm.adjustment.engine.collinearity import State, behind_camera, residuals
 from sfm.adjustment.engine.iterate import (
     METHODS,
@@ -100,11 +100,11 @@ def adjust(
         GeometryError: nothing to adjust, an unknown option, or datum points that cannot carry the datum.
     """
     if reject not in REJECTS:
-        raise GeometryError(f"adjustment: reject '{reject}' is none of {', '.join(REJECTS)}")
+        raise GeometryError(f"adjustment: reject '{reject}', expected one of {', '.join(REJECTS)}")
     if method not in METHODS:
-        raise GeometryError(f"adjustment: method '{method}' is none of {', '.join(METHODS)}")
+        raise GeometryError(f"adjustment: method '{method}', expected one of {', '.join(METHODS)}")
     use_control = datum.kind == "control"
-    local = local_of(network, estimate, datum)
+    local = local_of(network, estimate, datum.resolve(network))
     factor = np.broadcast_to(np.asarray(image_sigma_factor, dtype=float), (len(network.image_points),))
     layout, state = unknowns_of(
         local.network, local.estimate, use_control=use_control, image_sigma_factor=factor

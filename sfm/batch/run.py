@@ -32,6 +32,7 @@ from sfm.batch.survey import (
 from sfm.errors import FolderInUseError, KolinearError, SurveyFileError
 from sfm.executor import Call, Done, Engine, Lost, Told, Work
 from sfm.files.folder_lock import locked, owner_of
+from sfm.files.globs import BELOW, find_files
 from sfm.files.plain_text import as_plain
 from sfm.files.whole_files import MANIFEST, refuse_foreign_folder, remove_leftovers
 from sfm.report.log import SurveyLog, refuse_other_log, remove_log
@@ -152,12 +153,32 @@ def find_surveys(names: Sequence[str]) -> tuple[Path, ...]:
         if path.exists() or not glob.has_magic(name):
             found.update(dict.fromkeys(_below(path)))
             continue
-        matches = sorted(Path(match) for match in glob.glob(name, recursive=True))
-        if not matches:
-            raise SurveyFileError(f"{name}: no file matches")
+        matches = _matches(path)
         for match in matches:
             found.update(dict.fromkeys(_below(match)))
     return tuple(found)
+
+
+def _matches(path: Path) -> list[Path]:
+    """Return what a glob on the command line stands for; with `**` in it no links out of its folder count.
+
+    Raises:
+        SurveyFileError: nothing, or too much to look through.
+    """
+    first = next(k for k, part in enumerate(path.parts) if glob.has_magic(part))
+    folder, pattern = Path(*path.parts[:first]), Path(*path.parts[first:])
+
+    def refuse_leaving(link: Path) -> None:
+        if BELOW in pattern.parts and not link.resolve().is_relative_to(folder.resolve()):
+            raise SurveyFileError(f"{path}: {link} leads out of {folder}, which is not searched with {BELOW}")
+
+    try:
+        found = find_files(folder, str(pattern), enter=refuse_leaving, folders=True, hidden=False)
+    except ValueError as error:
+        raise SurveyFileError(f"{path}: {BELOW} stands for whole folders only") from error
+    if not found:
+        raise SurveyFileError(f"{path}: no file matches")
+    return found
 
 
 def calls_of(files: Sequence[Path], *, allow_outside: bool = False) -> int:
@@ -179,7 +200,7 @@ def _below(path: Path) -> list[Path]:
     """Return the survey files of a folder, or a file itself."""
     if not path.is_dir():
         return [path.resolve()]
-    below = sorted(path.rglob(SURVEY_NAME)) or sorted(path.glob("*.toml"))
+    below = find_files(path, f"**/{SURVEY_NAME}") or find_files(path, "*.toml")
     if not below:
         raise SurveyFileError(f"{path}: no {SURVEY_NAME} in or below this folder, nor any *.toml in it")
     return [file.resolve() for file in below]

@@ -10,7 +10,7 @@ import typer
 
 from sfm.cli.starting import loading
 from sfm.errors import GeometryError, SurveyFileError
-from sfm.orientation.resection.methods import METHODS
+from sfm.orientation.resection import METHODS
 
 if TYPE_CHECKING:
     from sfm.conventions import IntArray

@@ -27,7 +27,7 @@ def validate(
     with loading():
         from adapters.colmap.covariance import ColmapBackend
         from sfm.cli.console import drawn_progress
-        from sfm.comparison.validation import validate as validate_networks
+        from sfm.comparison.adjuster_validation import validate as validate_networks
         from sfm.files.whole_files import refuse_foreign_folder
         from sfm.report.validation import in_words, largest, write_validation
 

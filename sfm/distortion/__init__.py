@@ -1,0 +1,1 @@
+"""Distortion models: a function each in `brown` and `opencv`; begin with the registry, `models`."""

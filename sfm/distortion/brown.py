@@ -5,11 +5,15 @@ Signs as PhotoModeler and DBAT. What a model fills is said in `sfm.distortion.mo
 
 from __future__ import annotations
 
-from numba import njit
+from sfm.conventions import FloatArray
+from sfm.kernels.options import inlined
 
 
-@njit(cache=True, inline="always", error_model="numpy")
-def brown(frame, p, x, y, u, v, r, Ju, Jp):  # type: ignore[no-untyped-def]
+@inlined
+def brown(
+    frame: FloatArray, p: FloatArray, x: float, y: float, u: float, v: float,
+    residual: FloatArray, Ju: FloatArray, Jp: FloatArray,
+) -> None:  # fmt: skip
     """Corrections of the measured point: c, x0, y0, K1-K3, P1, P2, affinity b1, shear b2.
 
     Source: Brown (1971), Photogramm. Eng. 37(8); affinity before the distortion as DBAT's model 3:
@@ -22,8 +26,8 @@ def brown(frame, p, x, y, u, v, r, Ju, Jp):  # type: ignore[no-untyped-def]
     xb = (1.0 + b1) * xm + b2 * yb
     xc, yc, xx, xy, yy, r2 = _corrected(xb, yb, p)
     fx, fy = 1.0 / sx, -1.0 / sy  # mm, y up -> px, y down
-    r[0] = fx * (c * u - xc)
-    r[1] = fy * (c * v - yc)
+    residual[0] = fx * (c * u - xc)
+    residual[1] = fy * (c * v - yc)
     _pinhole_mm(fx, fy, c, u, v, Ju, Jp)
     Jp[0, 1] = fx * xx * (1.0 + b1)
     Jp[1, 1] = fy * xy * (1.0 + b1)
@@ -46,8 +50,11 @@ def brown(frame, p, x, y, u, v, r, Ju, Jp):  # type: ignore[no-untyped-def]
     Jp[1, 9] = -fy * xy * yb
 
 
-@njit(cache=True, inline="always", error_model="numpy")
-def brown_affine(frame, p, x, y, u, v, r, Ju, Jp):  # type: ignore[no-untyped-def]
+@inlined
+def brown_affine(
+    frame: FloatArray, p: FloatArray, x: float, y: float, u: float, v: float,
+    residual: FloatArray, Ju: FloatArray, Jp: FloatArray,
+) -> None:  # fmt: skip
     """As `brown` with affinity and shear behind the corrections instead of before them.
 
     Source: DBAT's model 4: (xd, yd) = Brown(x - x0, y - y0), (1 + b1) xd + b2 yd = c u, yd = c v.
@@ -58,8 +65,8 @@ def brown_affine(frame, p, x, y, u, v, r, Ju, Jp):  # type: ignore[no-untyped-de
     ym = -(y - frame[1]) * sy - y0
     xd, yd, xx, xy, yy, r2 = _corrected(xm, ym, p)
     fx, fy = 1.0 / sx, -1.0 / sy
-    r[0] = fx * (c * u - a1 * xd - b2 * yd)
-    r[1] = fy * (c * v - yd)
+    residual[0] = fx * (c * u - a1 * xd - b2 * yd)
+    residual[1] = fy * (c * v - yd)
     _pinhole_mm(fx, fy, c, u, v, Ju, Jp)
     Jp[0, 1] = fx * (a1 * xx + b2 * xy)
     Jp[1, 1] = fy * xy
@@ -80,8 +87,11 @@ def brown_affine(frame, p, x, y, u, v, r, Ju, Jp):  # type: ignore[no-untyped-de
     Jp[1, 9] = 0.0
 
 
-@njit(cache=True, inline="always", error_model="numpy")
-def brown_forward(frame, p, x, y, u, v, r, Ju, Jp):  # type: ignore[no-untyped-def]
+@inlined
+def brown_forward(
+    frame: FloatArray, p: FloatArray, x: float, y: float, u: float, v: float,
+    residual: FloatArray, Ju: FloatArray, Jp: FloatArray,
+) -> None:  # fmt: skip
     """Distortion of the ideal point in mm: c, x0, y0, K1-K4, P1, P2, affinity b1, shear b2.
 
     Source: Agisoft Metashape manual, app. D, frame camera (there in units of c), and AICON; in mm
@@ -105,8 +115,8 @@ def brown_forward(frame, p, x, y, u, v, r, Ju, Jp):  # type: ignore[no-untyped-d
     yX = slope * X * Y + 2.0 * P1 * Y + 2.0 * P2 * X
     yY = radial + slope * Y * Y + 6.0 * P2 * Y + 2.0 * P1 * X
     fx, fy = 1.0 / sx, -1.0 / sy
-    r[0] = fx * xd + frame[0] - x
-    r[1] = fy * yd + frame[1] - y
+    residual[0] = fx * xd + frame[0] - x
+    residual[1] = fy * yd + frame[1] - y
     Ju[0, 0] = fx * xX * c
     Ju[0, 1] = fx * xY * c
     Ju[1, 0] = fy * yX * c
@@ -135,8 +145,8 @@ def brown_forward(frame, p, x, y, u, v, r, Ju, Jp):  # type: ignore[no-untyped-d
     Jp[1, 10] = 0.0
 
 
-@njit(cache=True, inline="always", error_model="numpy")
-def _corrected(x, y, p):  # type: ignore[no-untyped-def]
+@inlined
+def _corrected(x: float, y: float, p: FloatArray) -> tuple[float, float, float, float, float, float]:
     """Return Brown's corrected point, its derivatives by the point (xx, xy = yx, yy) and r2.
 
     r2 = x^2 + y^2, xc = x (1 + K1 r2 + K2 r4 + K3 r6) + P1 (r2 + 2 x^2) + 2 P2 x y, yc likewise.
@@ -154,9 +164,9 @@ def _corrected(x, y, p):  # type: ignore[no-untyped-def]
     return xc, yc, xx, xy, yy, r2
 
 
-@njit(cache=True, inline="always", error_model="numpy")
-def _pinhole_mm(fx, fy, c, u, v, Ju, Jp):  # type: ignore[no-untyped-def]
-    """Fill d r / d (u, v) and d r / d c of r = (fx c u, fy c v) less what is measured."""
+@inlined
+def _pinhole_mm(fx: float, fy: float, c: float, u: float, v: float, Ju: FloatArray, Jp: FloatArray) -> None:
+    """Fill the derivatives of (fx c u, fy c v) by u, v and by c."""
     Ju[0, 0] = fx * c
     Ju[0, 1] = 0.0
     Ju[1, 0] = 0.0

@@ -1,15 +1,22 @@
 """The distortion models: which there are, what their parameters are called, and one way to all of them.
 
-A model is one compiled function `model(frame, p, x, y, u, v, r, Ju, Jp)`. From the tangents (u, v) of
-the ray in the image frame (u = -U/W, v = -V/W, y up) and the measured pixel (x, y) it fills
+A model is one compiled function `model(frame, p, x, y, u, v, residual, Ju, Jp)`. It is given
 
-    r  (2,)     computed minus measured, px, pixel frame (y down)
-    Ju (2, 2)   d r / d (u, v)
-    Jp (2, n)   d r / d p in the order of the model's parameter names
+    frame (4,)      centre of the photograph, px, and width and height of a pixel, mm
+    p     (n,)      parameters in the order of the model's names
+    x, y            measured pixel
+    u, v            tangents of the ray in the image frame (u = -U/W, v = -V/W, y up)
+
+and fills
+
+    residual (2,)   computed minus measured, px, pixel frame (y down)
+    Ju (2, 2)       its derivatives by u and v
+    Jp (2, n)       its derivatives by the parameters
 
 The models of photogrammetry correct the measured point, those of computer vision distort the ideal
-one; in both cases r vanishes at the true parameters. To add a model: write its function and give it a
-row in `ALL`; adjustment, resection, conversion, survey file and reports follow from that row.
+one; in both cases the residual vanishes at the true parameters. To add a model: write its function in a
+module beside `brown` and give it a row in `ALL`; adjustment, resection, conversion, survey file and reports
+follow from that row, and the tests of derivatives and inverse run over it.
 """
 
 from __future__ import annotations
@@ -29,10 +36,15 @@ class Model:
     """A distortion model and what its parameters are called and measured in."""
 
     name: str
-    function: Callable[..., None]  # value and Jacobian, compiled
-    parameters: str  # names of the parameters in the order of the vector
-    units: str  # their units, in the same order
-    corrects: bool = False  # whether it corrects the measured point; else it distorts the ideal one
+    """as survey files and `Camera.model` have it"""
+    function: Callable[..., None]
+    """residual and Jacobian, compiled"""
+    parameters: str
+    """names of the parameters in the order of the vector, separated by blanks"""
+    units: str
+    """their units, in the same order"""
+    corrects: bool = False
+    """whether it corrects the measured point; else it distorts the ideal one"""
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -68,12 +80,13 @@ def number_of(model: str) -> int:
 
 
 def one_of(models: tuple[Model, ...]) -> Callable[..., None]:
-    """Return one compiled function of all: observe(number, frame, p, x, y, u, v, r, Ju, Jp).
+    """Return one compiled function of all: observe(number, frame, p, x, y, u, v, residual, Ju, Jp).
 
     Its source, a branch for each model, is written here, because the compiler inlines the models only from
-    plain branches on their names; a chain of closures over them makes an adjustment a third slower.
+    plain branches on their names; a chain of closures over them makes an adjustment a third slower. It has no
+    file to be cached with, so that it is compiled into its callers.
     """
-    arguments = "frame, p, x, y, u, v, r, Ju, Jp"
+    arguments = "frame, p, x, y, u, v, residual, Ju, Jp"
     lines = [f"def observe(number, {arguments}):"]
     names: dict[str, Any] = {}
     for number, model in enumerate(models):

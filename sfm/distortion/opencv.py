@@ -5,11 +5,15 @@ They distort the ideal point. What a model fills is said in `sfm.distortion.mode
 
 from __future__ import annotations
 
-from numba import njit
+from sfm.conventions import FloatArray
+from sfm.kernels.options import inlined
 
 
-@njit(cache=True, inline="always", error_model="numpy")
-def opencv(frame, p, x, y, u, v, r, Ju, Jp):  # type: ignore[no-untyped-def]
+@inlined
+def opencv(
+    frame: FloatArray, p: FloatArray, x: float, y: float, u: float, v: float,
+    residual: FloatArray, Ju: FloatArray, Jp: FloatArray,
+) -> None:  # fmt: skip
     """Distortion of the ideal point in units of the focal length: fx, fy, cx, cy, k1, k2, p1, p2.
 
     Source: OpenCV calib3d and COLMAP, camera model OPENCV; there y is down, so a = u, b = -v.
@@ -22,7 +26,7 @@ def opencv(frame, p, x, y, u, v, r, Ju, Jp):  # type: ignore[no-untyped-def]
     slope = 2.0 * (k1 + 2.0 * k2 * r2)
     ad = a * radial + 2.0 * p1 * a * b + p2 * (r2 + 2.0 * a * a)
     bd = b * radial + 2.0 * p2 * a * b + p1 * (r2 + 2.0 * b * b)
-    _pinhole(p, x, y, a, b, ad, bd, radial, slope, p1, p2, r, Ju, Jp)
+    _pinhole(p, x, y, a, b, ad, bd, radial, slope, p1, p2, residual, Ju, Jp)
     Jp[0, 4] = fx * a * r2
     Jp[1, 4] = fy * b * r2
     Jp[0, 5] = fx * a * r2 * r2
@@ -30,8 +34,11 @@ def opencv(frame, p, x, y, u, v, r, Ju, Jp):  # type: ignore[no-untyped-def]
     _tangential(fx, fy, a, b, r2, Jp)
 
 
-@njit(cache=True, inline="always", error_model="numpy")
-def full_opencv(frame, p, x, y, u, v, r, Ju, Jp):  # type: ignore[no-untyped-def]
+@inlined
+def full_opencv(
+    frame: FloatArray, p: FloatArray, x: float, y: float, u: float, v: float,
+    residual: FloatArray, Ju: FloatArray, Jp: FloatArray,
+) -> None:  # fmt: skip
     """As `opencv` with the rational radial term (1 + k1 r2 + k2 r4 + k3 r6)/(1 + k4 r2 + k5 r4 + k6 r6).
 
     Source: OpenCV calib3d and COLMAP, camera model FULL_OPENCV (parameters in the same order).
@@ -49,7 +56,7 @@ def full_opencv(frame, p, x, y, u, v, r, Ju, Jp):  # type: ignore[no-untyped-def
     slope = 2.0 * below * (dtop - radial * dbottom)
     ad = a * radial + 2.0 * p1 * a * b + p2 * (r2 + 2.0 * a * a)
     bd = b * radial + 2.0 * p2 * a * b + p1 * (r2 + 2.0 * b * b)
-    _pinhole(p, x, y, a, b, ad, bd, radial, slope, p1, p2, r, Ju, Jp)
+    _pinhole(p, x, y, a, b, ad, bd, radial, slope, p1, p2, residual, Ju, Jp)
     power = r2 * below
     for j in range(3):
         numerator = 4 + j if j < 2 else 8
@@ -61,12 +68,16 @@ def full_opencv(frame, p, x, y, u, v, r, Ju, Jp):  # type: ignore[no-untyped-def
     _tangential(fx, fy, a, b, r2, Jp)
 
 
-@njit(cache=True, inline="always", error_model="numpy")
-def _pinhole(p, x, y, a, b, ad, bd, radial, slope, p1, p2, r, Ju, Jp):  # type: ignore[no-untyped-def]
-    """The part common to both OpenCV models: residual, d/d(u, v), d/d(fx, fy, cx, cy)."""
+@inlined
+def _pinhole(
+    p: FloatArray, x: float, y: float, a: float, b: float, ad: float, bd: float,
+    radial: float, slope: float, p1: float, p2: float,
+    residual: FloatArray, Ju: FloatArray, Jp: FloatArray,
+) -> None:  # fmt: skip
+    """Fill what is common to both OpenCV models: residual, derivatives by u, v and by fx, fy, cx, cy."""
     fx, fy = p[0], p[1]
-    r[0] = fx * ad + p[2] - x
-    r[1] = fy * bd + p[3] - y
+    residual[0] = fx * ad + p[2] - x
+    residual[1] = fy * bd + p[3] - y
     cross = slope * a * b + 2.0 * p1 * a + 2.0 * p2 * b
     Ju[0, 0] = fx * (radial + slope * a * a + 2.0 * p1 * b + 6.0 * p2 * a)
     Ju[0, 1] = -fx * cross
@@ -82,9 +93,9 @@ def _pinhole(p, x, y, a, b, ad, bd, radial, slope, p1, p2, r, Ju, Jp):  # type: 
     Jp[1, 3] = 1.0
 
 
-@njit(cache=True, inline="always", error_model="numpy")
-def _tangential(fx, fy, a, b, r2, Jp):  # type: ignore[no-untyped-def]
-    """d r / d (p1, p2), common to both OpenCV models."""
+@inlined
+def _tangential(fx: float, fy: float, a: float, b: float, r2: float, Jp: FloatArray) -> None:
+    """Fill the derivatives by p1 and p2, common to both OpenCV models."""
     Jp[0, 6] = fx * 2.0 * a * b
     Jp[1, 6] = fy * (r2 + 2.0 * b * b)
     Jp[0, 7] = fx * (r2 + 2.0 * a * a)

@@ -12,6 +12,7 @@ from numba import njit
 
 from sfm.conventions import AnyArray, FloatArray
 from sfm.errors import GeometryError
+from sfm.kernels.options import compiled
 
 NEAREST, BILINEAR, BICUBIC, SIX_TAP = 0, 1, 2, 3
 INTERPOLATIONS = {"nearest": NEAREST, "bilinear": BILINEAR, "bicubic": BICUBIC, "six_tap": SIX_TAP}
@@ -130,3 +131,13 @@ def sample(flat, at, width, wx, wy):  # type: ignore[no-untyped-def]
         line += wy[3] * flat[p + w3] + wy[4] * flat[p + w4] + wy[5] * flat[p + w5]
         total += wx[a] * line
     return total
+
+
+@compiled
+def bilinear(image: AnyArray, x: float, y: float) -> float:
+    """Return the intensity between four pixels; x, y from 0 to below the last column and row."""
+    row, column = int(y), int(x)
+    fy, fx = y - row, x - column
+    top = image[row, column] * (1 - fx) + image[row, column + 1] * fx
+    bottom = image[row + 1, column] * (1 - fx) + image[row + 1, column + 1] * fx
+    return float(top * (1 - fy) + bottom * fy)

@@ -16,9 +16,9 @@ from sfm.errors import GeometryError
 from sfm.kernels.sampling import AFTER, BEFORE
 from sfm.matching.correlation.ambiguity import ambiguous, independent_pixels
 from sfm.matching.correlation.ncc import match_ncc
-from sfm.matching.flags import LsmFlag, NccFlag, in_words
 from sfm.matching.lsm.patch_equations import MARGIN
 from sfm.matching.lsm.two_photo import match_lsm
+from sfm.matching.match_flags import LsmFlag, NccFlag, in_words
 from sfm.matching.radiometry import equalise_histogram, grey_of
 
 METHODS = {"ncc": "", "lsm": "affine", "lsm8": "projective", "shift": "shift"}

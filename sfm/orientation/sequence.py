@@ -19,7 +19,7 @@ from sfm.conventions import BoolArray, FloatArray
 from sfm.errors import GeometryError
 from sfm.network import Estimate, Network, empty_estimate
 from sfm.orientation.growth import FIRST_ADJUSTMENT, Growth, Refine, has_given_values
-from sfm.orientation.start import Start
+from sfm.orientation.starting_pair import Start
 from sfm.similarity import fit_similarity
 
 MIN_POINTS = 4  # of a photograph: three are always fitted by P3P, the fourth checks it

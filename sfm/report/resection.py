@@ -11,21 +11,21 @@ import numpy as np
 from sfm.conventions import FloatArray, angles_from_rotation, rotation_from_angles
 from sfm.errors import GeometryError
 from sfm.files.plain_text import or_none
-from sfm.orientation.resection.choice import choose_by_line
+from sfm.orientation.resection import METHODS
+from sfm.orientation.resection.candidates import (
+    Solution,
+    checked_points,
+    choose_by_line,
+    rotation_from_position,
+)
 from sfm.orientation.resection.church import resect_church
 from sfm.orientation.resection.critical_cylinder import cylinder_warning
 from sfm.orientation.resection.dlt import resect_dlt
 from sfm.orientation.resection.fischler_bolles import resect_fischler_bolles
 from sfm.orientation.resection.least_squares import resect_least_squares
-from sfm.orientation.resection.methods import METHODS
 from sfm.orientation.resection.p4p import resect_p4p
 from sfm.orientation.resection.rampal import resect_rampal
-from sfm.orientation.resection.robust import resect_robust
-from sfm.orientation.resection.solution import (
-    Solution,
-    checked_points,
-    rotation_from_position,
-)
+from sfm.orientation.resection.ransac import resect_robust
 from sfm.orientation.resection.zeng_wang import resect_zeng_wang
 from sfm.survey.inputs.resection_points import Task
 

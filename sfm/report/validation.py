@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from sfm.comparison.validation import SAME, SAME_COST, Trial, Validation
+from sfm.comparison.adjuster_validation import SAME, SAME_COST, Trial, Validation
 from sfm.files.plain_text import csv_text, or_none
 from sfm.report.markup import figure, table
 from sfm.report.pages import page, png, write_files

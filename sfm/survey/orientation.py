@@ -64,9 +64,7 @@ def orient_survey(survey: Survey, network: Network, estimate: Estimate) -> Orien
 
 def _most_in_common(network: Network) -> int:
     """Return how many points the two photographs with most in common share."""
-    sees = np.zeros((len(network.images), len(network.points)), dtype=np.int64)
-    sees[network.image_points.image, network.image_points.point] = 1
-    common = sees @ sees.T
+    common = network.common_points(np.ones(len(network.image_points), dtype=bool))
     np.fill_diagonal(common, 0)
     return int(common.max(initial=0))
 

@@ -13,9 +13,9 @@ from sfm.adjustment.solve import adjust
 from sfm.camera import Camera
 from sfm.conventions import MAD_TO_SIGMA, BoolArray, FloatArray, IntArray
 from sfm.errors import GeometryError, PhotographError, SurveyFileError
-from sfm.matching.flags import LsmFlag, in_words
 from sfm.matching.lsm.multi_photo import match_multi
 from sfm.matching.lsm.projected_points import pictures_of
+from sfm.matching.match_flags import LsmFlag, in_words
 from sfm.matching.radiometry import odd_window
 from sfm.network import Estimate, ImagePoints, Network, reduce_network
 from sfm.photographs.reading import read_photograph
@@ -190,6 +190,10 @@ def _references(network: Network, estimate: Estimate) -> IntArray:
 
 def _photograph(network: Network, estimate: Estimate, folder: Path, i: int, progress: Progress) -> FloatArray:
     path = folder / network.images[i]
+    if not path.resolve().is_relative_to(folder.resolve()):
+        raise SurveyFileError(
+            f"{folder}: photograph '{network.images[i]}' of the model is outside this folder"
+        )
     if not path.is_file():
         raise SurveyFileError(
             f"{folder}: photograph '{network.images[i]}' of the model is not in this folder"

@@ -10,7 +10,7 @@ import numpy as np
 from sfm.camera import Camera, tangents_from_pixel
 from sfm.conventions import AnyArray, BoolArray, IntArray
 from sfm.errors import GeometryError
-from sfm.matching.tracks.tie_points import find_tie_points
+from sfm.matching.tracks.feature_tracks import find_tie_points
 from sfm.network import ImagePoints, Network, reduce_network
 from sfm.orientation.intersection import intersect
 from sfm.orientation.sequence import Orientation

@@ -10,10 +10,11 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
 from sfm.conventions import AnyArray, BoolArray, FloatArray
-from sfm.targets.edge_rays import RAYS, bilinear
+from sfm.kernels.options import compiled
+from sfm.kernels.sampling import bilinear
+from sfm.targets.edge_rays import RAYS
 
 # Share of the rays on which a stroke ends, and on which something else begins behind it. No ring of up to 20
 # cells is set on so much of the circumference: even parity leaves at least two of them clear.
@@ -25,7 +26,7 @@ NEIGHBOURS, GLARE = 2.0, 1.5
 _STEP_PX, _RISE_PX = 0.5, 3.0
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def find_counters(image: AnyArray, xy: FloatArray, shape: FloatArray, levels: FloatArray) -> BoolArray:
     """Return which candidates are counters of letters, (k,).
 
@@ -52,7 +53,7 @@ def find_counters(image: AnyArray, xy: FloatArray, shape: FloatArray, levels: Fl
     return counter
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _stroke(
     image: AnyArray, xy: FloatArray, ux: float, uy: float, R: float, levels: FloatArray
 ) -> tuple[float, bool]:

@@ -6,9 +6,9 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 
 from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
+from sfm.kernels.options import compiled
 from sfm.targets.codes.rings import UNCODED, UNREADABLE, CodeFamily, read_codes
 from sfm.targets.codes.tags import DRAWN_PX, TagCorners, TagFamily, find_tags, inside_tags, target_family
 from sfm.targets.counters import find_counters
@@ -228,7 +228,7 @@ def _duplicates(fit: EllipseFit, reason: IntArray) -> BoolArray:
     return duplicate
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _surrounds(xy: FloatArray, radius: FloatArray) -> BoolArray:
     """Return which of the circles, in order of x, have the centre of a smaller one near their own."""
     outer = np.zeros(len(xy), dtype=np.bool_)

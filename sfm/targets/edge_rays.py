@@ -5,9 +5,11 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
 from sfm.conventions import AnyArray, FloatArray
+from sfm.kernels.cholesky import solve_symmetric
+from sfm.kernels.options import compiled
+from sfm.kernels.sampling import bilinear
 
 RAYS = 32
 # Spacing of the samples on a ray.
@@ -18,81 +20,7 @@ _PHI = 2 * math.pi * np.arange(RAYS) / RAYS
 HARMONICS = np.column_stack([np.ones(RAYS), np.cos(_PHI), np.sin(_PHI), np.cos(2 * _PHI), np.sin(2 * _PHI)])
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def bilinear(image: AnyArray, x: float, y: float) -> float:
-    """Return the intensity between four pixels; x, y from 0 to below the last column and row."""
-    i, j = int(y), int(x)
-    fy, fx = y - i, x - j
-    top = image[i, j] * (1 - fx) + image[i, j + 1] * fx
-    bottom = image[i + 1, j] * (1 - fx) + image[i + 1, j + 1] * fx
-    return top * (1 - fy) + bottom * fy
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def solve_spd(N: FloatArray, g: FloatArray) -> bool:
-    """Solve N x = g by Cholesky in place, x replaces g; False if N is not positive definite."""
-    n = len(g)
-    for i in range(n):
-        for j in range(i + 1):
-            t = N[i, j]
-            for k in range(j):
-                t -= N[i, k] * N[j, k]
-            if i == j:
-                if t <= 0:
-                    return False
-                N[i, i] = math.sqrt(t)
-            else:
-                N[i, j] = t / N[j, j]
-        t = g[i]
-        for k in range(i):
-            t -= N[i, k] * g[k]
-        g[i] = t / N[i, i]
-    for i in range(n - 1, -1, -1):
-        t = g[i]
-        for k in range(i + 1, n):
-            t -= N[k, i] * g[k]
-        g[i] = t / N[i, i]
-    return True
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def invert_spd(N: FloatArray) -> bool:
-    """Replace a symmetric matrix by its inverse (Cholesky); False if it is not positive definite.
-
-    Only the lower triangle is read; the whole inverse is written.
-    """
-    n = len(N)
-    for i in range(n):
-        for j in range(i + 1):
-            t = N[i, j]
-            for k in range(j):
-                t -= N[i, k] * N[j, k]
-            if i == j:
-                if not t > 0:
-                    return False
-                N[i, i] = math.sqrt(t)
-            else:
-                N[i, j] = t / N[j, j]
-    for j in range(n):  # L becomes its inverse
-        N[j, j] = 1 / N[j, j]
-        for i in range(j + 1, n):
-            t = 0.0
-            for k in range(j, i):
-                t -= N[i, k] * N[k, j]
-            N[i, j] = t / N[i, i]
-    for i in range(n):
-        for j in range(i + 1):
-            t = 0.0
-            for k in range(i, n):
-                t += N[k, i] * N[k, j]
-            N[j, i] = t  # rows above are no longer read
-    for i in range(n):
-        for j in range(i):
-            N[i, j] = N[j, i]
-    return True
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def trace_rays(
     image: AnyArray,
     theta: FloatArray,
@@ -174,7 +102,7 @@ def trace_rays(
     return np.median(steps)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def improve_outline(theta: FloatArray, edge: FloatArray) -> tuple[float, float]:
     """Move and reshape the ellipse to the edges on the rays.
 
@@ -206,7 +134,7 @@ def improve_outline(theta: FloatArray, edge: FloatArray) -> tuple[float, float]:
                 g[i] += a[i] * edge[k]
                 for j in range(5):
                     N[i, j] += a[i] * a[j]
-        if used < RAYS // 2 or not solve_spd(N, g):
+        if used < RAYS // 2 or not solve_symmetric(N, g):
             return 0.0, 1.0
         c = g
         tolerance = 0.15

@@ -8,9 +8,9 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numba import njit
 
 from sfm.conventions import AnyArray, FloatArray, IntArray
+from sfm.kernels.options import compiled
 from sfm.targets.flags import Flag
 
 # The local mean is that of 3 x 3 cells of 4 x 4 px, interpolated, about 14 px: an edge is seen up to half of
@@ -131,7 +131,7 @@ def _local_mean(image: AnyArray) -> AnyArray:
     return cv2.resize(cells, (width, rows), interpolation=cv2.INTER_LINEAR)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _mark_band(image: AnyArray, mean: AnyArray, step: float, sign: int, band: AnyArray) -> None:
     """Set band to 1 where the smoothed photograph is beyond the local mean by the step, elsewhere to 0.
 
@@ -174,7 +174,7 @@ def _trace_contours(band: AnyArray) -> tuple[AnyArray, IntArray]:
     return np.concatenate(outer).reshape(-1, 2), first
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _ellipses_of_contours(
     points: AnyArray, first: IntArray, height: int, width: int, smallest: float, largest: float
 ) -> tuple[FloatArray, IntArray]:

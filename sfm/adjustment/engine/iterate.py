@@ -20,9 +20,10 @@ from typing import NoReturn
 
 import numpy as np
 
-from sfm.adjustment.datum import Datum, Motions, motions_of
+from sfm.adjustment.datum import ResolvedDatum
 from sfm.adjustment.engine.collinearity import State, sum_of_squares
 from sfm.adjustment.engine.connectivity import Order, pattern_of
+from sfm.adjustment.engine.motions import Motions, motions_of
 from sfm.adjustment.engine.normals import Equations, Space, new_space, normal_equations, point_step
 from sfm.adjustment.engine.observed_unknowns import Weighted, weighted_vPv
 from sfm.adjustment.engine.solvers.banded import BandFactor, factor_band
@@ -66,7 +67,7 @@ class Problem:
 
     layout: Unknowns  # order of the unknowns
     weighted: Weighted  # observed unknowns
-    datum: Datum  # kind and points
+    datum: ResolvedDatum
     space: Space  # for the normal equations, used again and again
     pattern: Order | Pairs | None  # a band, or a full matrix summed pair by pair or as a product (None)
 
@@ -98,7 +99,7 @@ class Step(Move):
         return bool(np.sqrt(self.predicted) <= max(share * np.sqrt(self.vPv), MIN_SHIFT))
 
 
-def problem_of(layout: Unknowns, weighted: Weighted, datum: Datum) -> Problem:
+def problem_of(layout: Unknowns, weighted: Weighted, datum: ResolvedDatum) -> Problem:
     """Return what all steps of an adjustment have in common; chooses how the normal equations are summed."""
     return Problem(layout, weighted, datum, new_space(layout), pattern_of(layout))
 
@@ -131,7 +132,7 @@ def iterate(
         GeometryError: unknown method, or start values whose normal equations cannot be solved.
     """
     if method not in METHODS:
-        raise GeometryError(f"adjustment: method '{method}' is none of {', '.join(METHODS)}")
+        raise GeometryError(f"adjustment: method '{method}', expected one of {', '.join(METHODS)}")
     layout = problem.layout
     single = problem.pattern is None and layout.reduced >= SINGLE_FROM and not near
     taken, first = 0, state

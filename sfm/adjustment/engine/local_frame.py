@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sfm.adjustment.datum import Datum
+from sfm.adjustment.datum import ResolvedDatum
 from sfm.adjustment.result import Adjustment
 from sfm.conventions import FloatArray, IntArray
 from sfm.network import Estimate, Network
@@ -31,7 +31,7 @@ class Local:
 
     network: Network
     estimate: Estimate
-    datum: Datum
+    datum: ResolvedDatum
     given: Network  # the other one
     centroid: FloatArray  # by which its coordinates are reduced, (3,)
     order: IntArray | None  # its points in the order here, None if that is the same, (n,)
@@ -55,7 +55,7 @@ class Local:
         return replace(result, network=self.given, estimate=estimate)
 
 
-def local_of(network: Network, estimate: Estimate, datum: Datum) -> Local:
+def local_of(network: Network, estimate: Estimate, datum: ResolvedDatum) -> Local:
     """Return a network, its start values and its datum as they are best computed with."""
     centroid = centroid_of(network, estimate)
     own, start = network, estimate
@@ -88,8 +88,8 @@ def along_curve(points: FloatArray) -> IntArray:
 
 
 def _renumbered(
-    network: Network, estimate: Estimate, datum: Datum, order: IntArray
-) -> tuple[Network, Estimate, Datum]:
+    network: Network, estimate: Estimate, datum: ResolvedDatum, order: IntArray
+) -> tuple[Network, Estimate, ResolvedDatum]:
     """Return them with the points in another order."""
     place = np.argsort(order)
     bars = network.scale_bars
@@ -101,7 +101,7 @@ def _renumbered(
         scale_bars=replace(bars, start=place[bars.start], end=place[bars.end]),
     )
     if datum.points is not None:
-        datum = replace(datum, points=datum.points[order])
+        datum = datum._replace(points=datum.points[order])
     return own, replace(estimate, points=estimate.points[order]), datum
 
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sfm.adjustment.engine.marginal import marginal_of
+from sfm.adjustment.covariance import marginal_of
 from sfm.adjustment.engine.unknowns import angle_jacobian, interior_names
 from sfm.adjustment.quality.statistics import STRONG
 from sfm.adjustment.result import Adjustment

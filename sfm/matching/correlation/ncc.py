@@ -16,7 +16,7 @@ import numpy as np
 from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
 from sfm.errors import GeometryError
 from sfm.matching.correlation.peak import NOT_COMPARED, OUTPUTS, read_peak
-from sfm.matching.flags import NccFlag
+from sfm.matching.match_flags import NccFlag
 from sfm.matching.radiometry import full_scale, grey_of, odd_window
 
 # Standard deviation below which a template is flat, part of the full scale of 8 bit (of 16 bit alike).

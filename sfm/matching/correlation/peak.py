@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from sfm.matching.flags import NccFlag
+from sfm.matching.match_flags import NccFlag
 
 PEAK_ZONE = 2  # a second peak is at least this many pixels farther from the first in a row or column, px
 OUTPUTS = 10  # flag; x, y in the surface, their three covariances; r, second r, gain, offset

@@ -17,7 +17,6 @@ from numba import njit
 from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
 from sfm.errors import GeometryError
 from sfm.kernels.sampling import TAPS, interpolation_index
-from sfm.matching.flags import DIVERGED, FLAT_TEXTURE, LOW_CORRELATION, MATCHED, OUTSIDE, TOO_FAR
 from sfm.matching.lsm.patch_equations import (
     MARGIN,
     MODELS,
@@ -28,11 +27,12 @@ from sfm.matching.lsm.patch_equations import (
     gradients,
     solve,
 )
-from sfm.matching.lsm.precision import judge
+from sfm.matching.lsm.patch_precision import judge
 from sfm.matching.lsm.projected_points import derivatives, facing_warps, pictures_of
 from sfm.matching.lsm.two_photo import OUTPUTS
 from sfm.matching.lsm.warp import put_step
 from sfm.matching.lsm.window import resample_patch, resample_window
+from sfm.matching.match_flags import DIVERGED, FLAT_TEXTURE, LOW_CORRELATION, MATCHED, OUTSIDE, TOO_FAR
 from sfm.matching.radiometry import grey_of, odd_window
 from sfm.network import Estimate
 

@@ -23,7 +23,6 @@ from numba import njit
 from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
 from sfm.errors import GeometryError
 from sfm.kernels.sampling import BILINEAR, TAPS, interpolation_index
-from sfm.matching.flags import DIVERGED, FLAT_TEXTURE, MATCHED, OUTSIDE, TOO_FAR, LsmFlag
 from sfm.matching.lsm.patch_equations import (
     MARGIN,
     MODELS,
@@ -34,9 +33,10 @@ from sfm.matching.lsm.patch_equations import (
     gradients,
     solve,
 )
-from sfm.matching.lsm.precision import judge
+from sfm.matching.lsm.patch_precision import judge
 from sfm.matching.lsm.warp import put_step
 from sfm.matching.lsm.window import resample_patch, resample_window
+from sfm.matching.match_flags import DIVERGED, FLAT_TEXTURE, MATCHED, OUTSIDE, TOO_FAR, LsmFlag
 from sfm.matching.radiometry import grey_of, odd_window
 
 COARSE_STEP = 0.5  # bilinear interpolation is good enough while steps are longer than this, px

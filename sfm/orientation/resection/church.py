@@ -8,8 +8,8 @@ import numpy as np
 
 from sfm.conventions import FloatArray
 from sfm.errors import GeometryError
+from sfm.orientation.resection.candidates import Solution, checked_points, solution_of
 from sfm.orientation.resection.fischler_bolles import rays_from_tangents
-from sfm.orientation.resection.solution import Solution, checked_points, solution_of
 
 MIN_POINTS = 3
 MAX_STEPS = 100
@@ -88,7 +88,7 @@ def _directions(X: FloatArray, position: FloatArray) -> FloatArray:
     D = np.linalg.norm(X - position, axis=1, keepdims=True)
     if D.min() == 0:
         raise GeometryError("church: the start coincides with an object point")
-    return (X - position) / D
+    return np.asarray((X - position) / D)
 
 
 def _cosines(X: FloatArray, position: FloatArray) -> FloatArray:

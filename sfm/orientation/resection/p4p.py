@@ -6,7 +6,7 @@ import numpy as np
 
 from sfm.conventions import FloatArray, skew
 from sfm.errors import GeometryError
-from sfm.orientation.resection.solution import (
+from sfm.orientation.resection.candidates import (
     Solution,
     checked_points,
     rotation_from_position,

@@ -8,14 +8,14 @@ import numpy as np
 
 from sfm.conventions import FloatArray
 from sfm.errors import GeometryError
-from sfm.orientation.resection.fischler_bolles import rays_from_tangents
-from sfm.orientation.resection.solution import (
+from sfm.orientation.resection.candidates import (
     Solution,
     checked_points,
     ordered,
     rotation_from_position,
     solution_of,
 )
+from sfm.orientation.resection.fischler_bolles import rays_from_tangents
 from sfm.orientation.resection.zeng_wang import direction_test, trilaterate
 
 MIN_POINTS = 3

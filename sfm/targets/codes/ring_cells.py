@@ -5,10 +5,11 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
 from sfm.conventions import AnyArray, FloatArray
-from sfm.targets.edge_rays import bilinear, invert_spd
+from sfm.kernels.cholesky import invert_symmetric
+from sfm.kernels.options import compiled
+from sfm.kernels.sampling import bilinear
 
 # Samples along a cell, and positions of the first cell that are tried.
 SAMPLES, PHASES = 12, 12
@@ -25,7 +26,7 @@ _SAMPLE_SIGMA, _CELL_SIGMA = 0.05, 0.15
 _RESIDUAL, _GAP, _BEHIND_RING, _SIGMA, ROWS = 3, 4, 5, 6, 7
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def fit_cells(
     image: AnyArray,
     xy: FloatArray,
@@ -78,7 +79,7 @@ def fit_cells(
                     if W[i, a] != 0.0:
                         for b in range(a + 1):
                             N[a, b] += W[i, a] * W[i, b]
-            if not invert_spd(N):
+            if not invert_symmetric(N):
                 continue
             squares = 0.0
             for row in range(len(IN_RING)):
@@ -104,7 +105,7 @@ def fit_cells(
     return out
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _scatter(c: FloatArray) -> float:
     """Return the sum of squares of the levels about the means of set and of clear cells, for all radii."""
     radii, cells = c.shape
@@ -123,12 +124,12 @@ def _scatter(c: FloatArray) -> float:
     return squares
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _phi(t: float) -> float:
     return 0.5 * math.erfc(-t / math.sqrt(2.0))
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _sample(
     image: AnyArray,
     xy: FloatArray,
@@ -176,7 +177,7 @@ def _sample(
     return True
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _mixture(sigma: FloatArray, phase: float, W: FloatArray) -> None:
     """Write the share of each cell in each sample; phase is where the first cell begins, in cells."""
     m, cells = W.shape
@@ -191,7 +192,7 @@ def _mixture(sigma: FloatArray, phase: float, W: FloatArray) -> None:
             W[i, a] = _phi(far) - _phi(near) if near < 4 and far > -4 else 0.0
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _compare(
     z: FloatArray,
     ring_part: FloatArray,

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numba import njit
 
 from sfm.conventions import AnyArray, FloatArray, IntArray
 from sfm.errors import SurveyFileError
+from sfm.kernels.options import compiled
 from sfm.targets.codes.ring_cells import fit_cells
 
 UNCODED = -1
@@ -236,7 +236,7 @@ def _sample_rings(
     return _sample_polar(photograph, xy, shape, levels, inner + RADII * (outer - inner), ANGLES)
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _sample_polar(
     image: AnyArray, xy: FloatArray, shape: FloatArray, levels: FloatArray, radii: FloatArray, angles: int
 ) -> FloatArray:

@@ -13,9 +13,8 @@ from __future__ import annotations
 
 import math
 
-from numba import njit
-
 from sfm.conventions import FloatArray
+from sfm.kernels.options import compiled_fast, inlined_fast
 
 # Unknowns of the fit: x0, y0, p, q, r, B, A, s, gx, gy.
 PARAMETERS = 10
@@ -25,7 +24,7 @@ _SQRT_HALF = math.sqrt(0.5)
 _DENSITY_0 = 1 / math.sqrt(2 * math.pi)
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=True, inline="always")
+@inlined_fast
 def edge_profile(t: float) -> tuple[float, float]:
     """Return Phi(t), the normal distribution, and exp(-t^2 / 2), without branches.
 
@@ -42,7 +41,7 @@ def edge_profile(t: float) -> tuple[float, float]:
     return (1 - tail if t > 0 else tail), e
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
+@compiled_fast
 def linearise(
     data: FloatArray, first: int, m: int, theta: FloatArray, length: float, saturation: float, J: FloatArray
 ) -> None:
@@ -86,7 +85,7 @@ def linearise(
         J[11 * BLOCK + i] = weight
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
+@compiled_fast
 def normal_equations(
     data: FloatArray,
     n: int,

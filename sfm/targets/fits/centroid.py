@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
 from sfm.conventions import AnyArray, FloatArray, IntArray
 from sfm.errors import KolinearError
+from sfm.kernels.options import compiled
 
 WEIGHTS = ("binary", "intensity", "squared")
 # The window reaches this far beyond the outline, px; the background is the mean of what lies outside of the
@@ -60,7 +60,7 @@ def measure_centroids(
     return result[:, :2], result[:, [2, 3, 3, 4]].reshape(-1, 2, 2)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _centroids(image: AnyArray, outline: FloatArray, sign: IntArray, noise: float, power: int) -> FloatArray:
     """Return x, y and their variances and covariance (xx, xy, yy) for each target, shape (k, 5)."""
     h, w = image.shape

@@ -15,10 +15,10 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
 from sfm.conventions import AnyArray, FloatArray, IntArray
-from sfm.targets.edge_rays import invert_spd, solve_spd
+from sfm.kernels.cholesky import invert_symmetric, solve_symmetric
+from sfm.kernels.options import compiled
 from sfm.targets.fits.blurred_ellipse import edge_profile
 from sfm.targets.flags import Flag
 
@@ -40,7 +40,7 @@ _NO_CONVERGENCE = int(Flag.NO_CONVERGENCE)
 _SATURATED = int(Flag.SATURATED)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def fit_corners(
     image: AnyArray, quads: FloatArray, modules: int, saturation: float
 ) -> tuple[FloatArray, FloatArray, FloatArray, IntArray]:
@@ -71,7 +71,7 @@ def fit_corners(
     return theta, covariance, noise, flag
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _fit_one(
     image: AnyArray,
     corner: FloatArray,
@@ -120,7 +120,7 @@ def _fit_one(
     return flag, noise
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _collect(
     image: AnyArray, theta: FloatArray, band: float, reach: float, saturation: float, data: FloatArray
 ) -> tuple[int, bool]:
@@ -148,7 +148,7 @@ def _collect(
     return n, censored
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _start_levels(data: FloatArray, n: int, theta: FloatArray) -> None:
     """Set B and A to the mean intensities beside the tag and on its border, s and g to their start values."""
     c1, s1, c2, s2 = math.cos(theta[2]), math.sin(theta[2]), math.cos(theta[3]), math.sin(theta[3])
@@ -163,7 +163,7 @@ def _start_levels(data: FloatArray, n: int, theta: FloatArray) -> None:
     theta[6], theta[7], theta[8] = BLUR_START, 0.0, 0.0
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _iterate(
     data: FloatArray, n: int, theta: FloatArray, saturation: float, length: float, cofactor: FloatArray
 ) -> tuple[float, int]:
@@ -181,7 +181,7 @@ def _iterate(
         L[:], trial[:] = N, g
         for i in range(PARAMETERS):
             L[i, i] *= 1 + damping
-        if not solve_spd(L, trial):
+        if not solve_symmetric(L, trial):
             return total, 0
         shift = max(abs(trial[0]), abs(trial[1]))
         trial += theta
@@ -196,14 +196,14 @@ def _iterate(
         total, used = squares, used_trial
         damping *= 0.1
         if shift < LAST_STEP_PX:
-            if not invert_spd(N):
+            if not invert_symmetric(N):
                 return total, 0
             cofactor[:] = N[:2, :2]
             return total, used
     return total, 0
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _normal_equations(
     data: FloatArray,
     n: int,

@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
 from sfm.conventions import AnyArray, FloatArray, IntArray
+from sfm.kernels.options import compiled
 from sfm.targets.edge_rays import RAYS, STEP_PX, improve_outline, trace_rays
 
 # The edges are traced from the ellipse found last; three times do from a start that is half a radius off.
@@ -62,7 +62,7 @@ def measure_edge_ellipses(
     return theta[:, :2], variance[:, None, None] * (inverse @ inverse), theta[:, 2:]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _fit_edges(
     image: AnyArray, outline: FloatArray, sign: IntArray, noise: float
 ) -> tuple[FloatArray, FloatArray]:

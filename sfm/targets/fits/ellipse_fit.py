@@ -5,10 +5,11 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
 from sfm.conventions import AnyArray, FloatArray, IntArray
-from sfm.targets.edge_rays import RAYS, improve_outline, invert_spd, solve_spd, trace_rays
+from sfm.kernels.cholesky import invert_symmetric, solve_symmetric
+from sfm.kernels.options import compiled
+from sfm.targets.edge_rays import RAYS, improve_outline, trace_rays
 from sfm.targets.fits.blurred_ellipse import BLOCK, PARAMETERS, normal_equations
 from sfm.targets.fits.goodness import STATISTICS, judge_background, judge_glow, judge_residuals
 from sfm.targets.flags import Flag
@@ -35,7 +36,7 @@ _NOT_ELLIPTIC = int(Flag.NOT_ELLIPTIC)
 _NO_CONVERGENCE = int(Flag.NO_CONVERGENCE)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def fit_templates(
     image: AnyArray, start: FloatArray, sign: IntArray, noise: float, saturation: float
 ) -> tuple[FloatArray, FloatArray, FloatArray, IntArray]:
@@ -65,7 +66,7 @@ def fit_templates(
     return theta, cofactor, statistics, flag
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _fit_one(
     image: AnyArray,
     theta: FloatArray,
@@ -121,7 +122,7 @@ def _fit_one(
                 L[i, i] += prior
             L[i, i] *= 1 + damping
             trial[i] = g[i] - (prior * theta[i] if i >= 8 else 0.0)
-        if not solve_spd(L, trial):
+        if not solve_symmetric(L, trial):
             return flag | _NO_CONVERGENCE
         shift = max(abs(trial[0]), abs(trial[1]))
         for i in range(PARAMETERS):
@@ -149,13 +150,13 @@ def _fit_one(
     statistics[4] = steps
     N[8, 8] += prior
     N[9, 9] += prior
-    if not done or theta[6] * sign <= 0 or statistics[0] <= PARAMETERS or not invert_spd(N):
+    if not done or theta[6] * sign <= 0 or statistics[0] <= PARAMETERS or not invert_symmetric(N):
         return flag | _NO_CONVERGENCE
     cofactor[:] = N
     return flag
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _collect(
     image: AnyArray,
     theta: FloatArray,
@@ -192,7 +193,7 @@ def _collect(
     return n
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _start_levels(data: FloatArray, n: int, theta: FloatArray, saturation: float) -> int:
     """Set B and A to the mean intensities out- and inside the outline, s and g to their start values."""
     outside, inside, n_out, n_in = 0.0, 0.0, 0, 0

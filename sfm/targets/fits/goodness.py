@@ -5,10 +5,11 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
 from sfm.conventions import AnyArray, FloatArray
-from sfm.targets.edge_rays import HARMONICS, RAYS, STEP_PX, bilinear
+from sfm.kernels.options import compiled
+from sfm.kernels.sampling import bilinear
+from sfm.targets.edge_rays import HARMONICS, RAYS, STEP_PX
 from sfm.targets.fits.blurred_ellipse import BLOCK, linearise
 
 # Pixels used, sum of squared residuals, unevenness, L, steps, lobes and their sigma, share of strokes, halo
@@ -25,7 +26,7 @@ _EDGE_ENDS_BLURS, _HALO_PX = 2.5, 2.0
 _BAND_BLURS, _BAND_PX = 1.5, 1.0
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def judge_residuals(
     data: FloatArray,
     n: int,
@@ -84,7 +85,7 @@ def judge_residuals(
     statistics[6] = 1 / math.sqrt(lobe_weight.min())
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def judge_background(image: AnyArray, theta: FloatArray, length: float, statistics: FloatArray) -> None:
     """Set the shares of the circumference where the background is only a thin stroke, and where glare is.
 
@@ -121,7 +122,7 @@ def judge_background(image: AnyArray, theta: FloatArray, length: float, statisti
     statistics[7], statistics[11] = strokes / RAYS, glaring / RAYS
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def judge_glow(
     data: FloatArray, n: int, theta: FloatArray, saturation: float, statistics: FloatArray
 ) -> None:

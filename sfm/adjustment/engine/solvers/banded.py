@@ -22,8 +22,8 @@ from numba import njit
 from scipy.linalg import cho_factor, cho_solve, eigh, qr
 from scipy.linalg.lapack import dpbtrf, dpbtrs
 
-from sfm.adjustment.datum import Motions
 from sfm.adjustment.engine.connectivity import Order
+from sfm.adjustment.engine.motions import Motions
 from sfm.adjustment.engine.normals import Equations
 from sfm.adjustment.engine.solvers.dense import NULL, WEAK_PIVOT
 from sfm.adjustment.engine.unknowns import Unknowns

@@ -19,7 +19,7 @@ from scipy.linalg import eigh
 from scipy.linalg.blas import dsyrk, ssyrk
 from scipy.linalg.lapack import dpotrf, dpotrs, dtrtri, spotrf, spotrs
 
-from sfm.adjustment.datum import Motions
+from sfm.adjustment.engine.motions import Motions
 from sfm.adjustment.engine.normals import Blocks, Equations
 from sfm.adjustment.engine.solvers.pairs import Pairs, subtract_squares
 from sfm.adjustment.engine.unknowns import Unknowns

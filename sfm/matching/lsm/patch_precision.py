@@ -6,9 +6,9 @@ import numpy as np
 from numba import njit
 
 from sfm.kernels.sampling import TAPS, kernel_weights
-from sfm.matching.flags import FLAT_TEXTURE, LOW_CORRELATION, MATCHED
 from sfm.matching.lsm.patch_equations import SLOPE_NOISE, dot, solve
 from sfm.matching.lsm.warp import area_ratio
+from sfm.matching.match_flags import FLAT_TEXTURE, LOW_CORRELATION, MATCHED
 
 # Texture is flat in a direction in which its gradients have less than this many times the energy of noise.
 LEAST_TEXTURE = 3.0

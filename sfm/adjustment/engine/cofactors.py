@@ -1,0 +1,249 @@
+"""Marginal covariance of points, exterior and interior orientation from the reduced system.
+
+The cofactor of the reduced unknowns is S^-1; points follow without the inverse of the whole:
+Q_pp = L^-T (I + Y' S^-1 Y) L^-1 and Q_cp = -S^-1 Y L^-1. Any datum follows by S-transformation,
+Q <- S Q S' with S = I - H (B'H)^-1 B', block by block. The limiting precision, cameras fixed, is V^-1.
+
+Source: Foerstner and Wrobel (2016), sec. 15.2.5 and 4.5; limiting precision: Fraser (1987),
+Photogramm. Eng. Remote Sens. 53(5).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from sfm.adjustment.engine.accumulate import times_points, times_reduced
+from sfm.adjustment.engine.collinearity import collinearity, scratch
+from sfm.adjustment.engine.iterate import Optimum
+from sfm.adjustment.engine.normals import solve_lower, solve_transposed
+from sfm.adjustment.engine.solvers.inverse import Inverse, inverse_of
+from sfm.adjustment.engine.unknowns import Unknowns, angle_jacobian
+from sfm.adjustment.result import Covariance
+from sfm.conventions import FloatArray
+from sfm.kernels.options import kernel
+
+ZERO = 1e-9  # variance over its limiting value below which a coordinate is one that the datum fixes
+
+
+@dataclass(frozen=True)
+class Cofactors:
+    """Cofactor matrices (covariance for sigma0 = 1) in the datum of the adjustment, and what makes more."""
+
+    exterior: FloatArray  # of X0, w of each photograph, any datum, (m, 6, 6)
+    border: FloatArray  # of interior unknowns and kept points, any datum, (i + 3 s, i + 3 s)
+    mixed: FloatArray  # of exterior by border unknowns, any datum, (6 m, i + 3 s)
+    points: FloatArray  # of each object point, any datum, (n, 3, 3)
+    limiting: FloatArray  # of each object point with the cameras fixed, (n, 3, 3)
+    cross: FloatArray  # of the object point by the photograph of each image point, any datum, (k, 3, 6)
+    cross_border: FloatArray  # of each object point by the border, any datum, (n, 3, i + 3 s)
+    F_reduced: FloatArray  # (B'H)^-1 B'Q of the reduced unknowns, (d, reduced)
+    F_points: FloatArray  # the same of object points, (n, d, 3)
+    G: FloatArray  # (B'H)^-1 B'QB (H'B)^-1, (d, d)
+
+    @property
+    def has_cross(self) -> bool:
+        """Whether those between points and photographs are there."""
+        return len(self.cross) > 0
+
+
+def cofactors(optimum: Optimum, layout: Unknowns, *, cross: bool = True) -> Cofactors:
+    """Return the cofactors at an optimum.
+
+    Args:
+        optimum: undamped normal equations and their factor.
+        layout: order of the unknowns.
+        cross: whether those between points and photographs are wanted; empty otherwise.
+    """
+    b = optimum.equations.blocks
+    q = inverse_of(optimum.equations, optimum.factor, layout, cross=cross)
+    first = 6 * len(b.U)
+    limiting = _inverse_of_squares(b.L)
+    points = limiting + _twice_solved(b.L, q.core)
+    for s, j in enumerate(layout.kept):
+        own = slice(layout.kept_start - first + 3 * s, layout.kept_start - first + 3 * s + 3)
+        points[j] = q.border[own, own]
+        # a point that lost all its rays to the test has no precision by rays; it is held as others are
+        limiting[j] = np.linalg.inv(b.V[j]) if np.linalg.matrix_rank(b.V[j]) == 3 else 0.0
+    mask = layout.point_free.astype(float)
+    points *= mask[:, :, None] * mask[:, None, :]
+    limiting *= mask[:, :, None] * mask[:, None, :]
+    rays, inner = _cross(layout, q, b.L, mask)
+    F_c, F_p, G = _datum_terms(optimum, layout, limiting)
+    return Cofactors(q.exterior, q.border, q.mixed, points, limiting, rays, inner, F_c, F_p, G)
+
+
+def marginal_covariance(
+    optimum: Optimum, layout: Unknowns, cofactors: Cofactors, variance: float
+) -> Covariance:
+    """Return the covariance of points, exterior and interior orientation in the datum of the adjustment.
+
+    Args:
+        optimum: undamped normal equations and their factor.
+        layout: order of the unknowns.
+        cofactors: of the same.
+        variance: sigma0^2 a posteriori.
+    """
+    H, P = optimum.motions.reduced, optimum.motions.points
+    F, G = cofactors.F_reduced, cofactors.G
+    points = _in_datum(cofactors.points, P, cofactors.F_points, G)
+    fixed = np.diagonal(points, axis1=1, axis2=2) <= ZERO * np.diagonal(cofactors.limiting, axis1=1, axis2=2)
+    points[fixed] = 0.0
+    np.swapaxes(points, 1, 2)[fixed] = 0.0
+    m, d = len(layout.exterior_free), len(G)
+    T = np.zeros((m, 6, 6))
+    T[:, :3, :3] = np.eye(3)
+    T[:, 3:, 3:] = angle_jacobian(optimum.state.M)
+    of_exterior = np.moveaxis(F[:, : 6 * m].reshape(d, m, 6), 1, 0)
+    exterior = _in_datum(cofactors.exterior, H[: 6 * m].reshape(m, 6, d), of_exterior, G)
+    exterior = T @ exterior @ np.swapaxes(T, 1, 2)
+    interior = []
+    for own in layout.interior_column:
+        Q = cofactors.border[np.ix_(own - 6 * m, own - 6 * m)]
+        interior.append(variance * _in_datum(Q[None], H[own][None], F[:, own][None], G)[0])
+    return Covariance(variance * points, variance * exterior, tuple(interior), variance * cofactors.limiting)
+
+
+def hat_complement(
+    optimum: Optimum, layout: Unknowns, cofactors: Cofactors, weight: FloatArray
+) -> FloatArray:
+    """Return I - A Q A' of every image point in whitened coordinates, independent of the datum.
+
+    For an image point without weight it is I + A Q A', the cofactor of its predicted residual.
+
+    Args:
+        optimum, layout, cofactors: of one adjustment; with cross-cofactors.
+        weight: factor on the weight of each image point, shape (k,).
+
+    Returns:
+        Cofactors of the whitened residuals, shape (k, 2, 2); NaN behind the camera.
+    """
+    Q, t, out = cofactors, scratch(), np.empty((len(weight), 2, 2))
+    # one layout whatever the parameters, so that one compiled form serves every network
+    mixed = np.ascontiguousarray(Q.mixed).reshape(len(Q.exterior), 6, -1)
+    border = np.ascontiguousarray(Q.border)
+    space = np.empty((2, 9 + t.Jp.shape[1])), np.empty((9 + t.Jp.shape[1], 9 + t.Jp.shape[1]))
+    _complement(
+        layout.obs, optimum.state, weight, Q.exterior, mixed, border, Q.points, Q.cross, Q.cross_border,
+        t, *space, out,
+    )  # fmt: skip
+    return out
+
+
+def without_held(covariance: Covariance, layout: Unknowns) -> Covariance:
+    """Return the covariance with NaN for photographs and points that took no part."""
+    idle_point, idle_image = ~layout.point_on, ~layout.image_on
+    points, limiting = covariance.points.copy(), covariance.points_limiting.copy()
+    exterior = covariance.exterior.copy()
+    points[idle_point] = limiting[idle_point] = np.nan
+    exterior[idle_image] = np.nan
+    return replace(covariance, points=points, exterior=exterior, points_limiting=limiting)
+
+
+def _in_datum(Q: FloatArray, H: FloatArray, F: FloatArray, G: FloatArray) -> FloatArray:
+    """Return Q - H F - (H F)' + H G H' of many blocks at once."""
+    half = H @ F
+    return np.asarray(Q - half - np.swapaxes(half, 1, 2) + H @ G @ np.swapaxes(H, 1, 2))
+
+
+def _datum_terms(
+    optimum: Optimum, layout: Unknowns, limiting: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return (B'H)^-1 B'Q and (B'H)^-1 B'QB (H'B)^-1; kept points appear in B of the points only."""
+    motions, b = optimum.motions, optimum.equations.blocks
+    n, d = len(b.L), motions.defect
+    B = motions.constraints
+    on_reduced = motions.on_reduced.copy()
+    on_reduced[layout.kept_start :] += B[layout.kept].reshape(3 * len(layout.kept), d)
+    eliminated = np.array(B)
+    eliminated[layout.kept] = 0.0
+    # B'Q_c = (B_c - Y L^-1 B_p)' S^-1
+    through = np.zeros((layout.reduced, d))
+    times_points(layout.obs, b, solve_lower(b.L, eliminated), through)
+    free = layout.reduced_free()[:, None]
+    QB_c = optimum.factor.solve((on_reduced - through) * free) * free
+    # Q_pp B_p = V^-1 B_p - L^-T Y' (Q_cp B_p), with Q_cp of all points together
+    YQB = np.empty((n, 3, d))
+    times_reduced(layout.obs, b, np.ascontiguousarray(QB_c), YQB)
+    QB_p = limiting @ eliminated - solve_transposed(b.L, YQB)
+    QB_p[layout.kept] = QB_c[layout.kept_start :].reshape(len(layout.kept), 3, d)
+    QB_p *= layout.point_free[:, :, None]
+    BQB = np.einsum("jad,jae->de", QB_p, eliminated) + QB_c.T @ on_reduced
+    inverse = motions.inverse
+    return inverse @ QB_c.T, inverse @ np.swapaxes(QB_p, 1, 2), inverse @ BQB @ inverse.T
+
+
+def _cross(layout: Unknowns, q: Inverse, L: FloatArray, mask: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return Q_pc = -L^-T Y'S^-1 of each image point and of each object point by the border."""
+    if len(q.YQ) == 0:
+        return q.YQ, q.YQ_border
+    point, first = layout.obs.point, 6 * len(q.exterior)
+    rays = -solve_transposed(L[point], q.YQ) * mask[point][:, :, None]
+    inner = -solve_transposed(L, q.YQ_border) * mask[:, :, None]
+    mixed = q.mixed.reshape(len(q.exterior), 6, -1)
+    for s, j in enumerate(layout.kept):
+        own = slice(layout.kept_start - first + 3 * s, layout.kept_start - first + 3 * s + 3)
+        seen = slice(layout.obs.start[j], layout.obs.start[j + 1])
+        rays[seen] = np.swapaxes(mixed[layout.obs.image[seen], :, own], 1, 2)
+        inner[j] = q.border[own]
+    return rays, inner
+
+
+def _twice_solved(L: FloatArray, core: FloatArray) -> FloatArray:
+    """Return L^-T core L^-1 of every point, (n, 3, 3)."""
+    return solve_transposed(L, np.swapaxes(solve_transposed(L, core), 1, 2))
+
+
+def _inverse_of_squares(L: FloatArray) -> FloatArray:
+    """Return (L L')^-1 of every point, (n, 3, 3)."""
+    Li = solve_lower(L, np.broadcast_to(np.eye(3), L.shape))
+    return np.asarray(np.swapaxes(Li, 1, 2) @ Li)
+
+
+@kernel
+def _complement(obs, state, weight, exterior, mixed, border, points, cross, cross_border, t, J, Q, out):  # type: ignore[no-untyped-def]
+    """Fill I - J Q J' of each image point, J and Q of its own unknowns: X0, w, X, free interior ones."""
+    first = 6 * len(obs.camera)
+    for o in range(len(obs.image)):
+        i, j = obs.image[o], obs.point[o]
+        a = obs.camera[i]
+        f = obs.free_count[a]
+        used = weight[o] > 0.0
+        in_front = collinearity(o, obs, state, weight[o] if used else 1.0, t)
+        for row in range(2):
+            for p in range(6):
+                J[row, p] = t.A[row, p]
+            for p in range(3):
+                J[row, 6 + p] = t.B[row, p]
+            for p in range(f):
+                J[row, 9 + p] = t.A[row, 6 + obs.free_index[a, p]]
+        for p in range(6):
+            for q in range(6):
+                Q[p, q] = exterior[i, p, q]
+            for q in range(3):
+                Q[p, 6 + q] = cross[o, q, p]
+            for q in range(f):
+                Q[p, 9 + q] = mixed[i, p, obs.free_column[a, q] - first]
+        for p in range(3):
+            for q in range(3):
+                Q[6 + p, 6 + q] = points[j, p, q]
+            for q in range(f):
+                Q[6 + p, 9 + q] = cross_border[j, p, obs.free_column[a, q] - first]
+        for p in range(f):
+            for q in range(p, f):
+                Q[9 + p, 9 + q] = border[obs.free_column[a, p] - first, obs.free_column[a, q] - first]
+        h00, h01, h11 = 0.0, 0.0, 0.0
+        for p in range(9 + f):
+            x, y = 0.5 * Q[p, p] * J[0, p], 0.5 * Q[p, p] * J[1, p]
+            for q in range(p + 1, 9 + f):
+                x += Q[p, q] * J[0, q]
+                y += Q[p, q] * J[1, q]
+            h00 += 2.0 * J[0, p] * x
+            h01 += J[0, p] * y + J[1, p] * x
+            h11 += 2.0 * J[1, p] * y
+        sign = -1.0 if used else 1.0
+        out[o, 0, 0] = 1.0 + sign * h00 if in_front else np.nan
+        out[o, 0, 1] = sign * h01 if in_front else np.nan
+        out[o, 1, 0] = out[o, 0, 1]
+        out[o, 1, 1] = 1.0 + sign * h11 if in_front else np.nan

@@ -1,0 +1,171 @@
+"""Free similarity motions of a network, inner and minimal constraints on them, S-transformations.
+
+The normal equations of image points alone do not change when the whole network is shifted, turned or
+scaled. `free_motions` gives these null vectors H; what is fixed or observed takes some away. A datum
+is a matrix B with B' dx = 0 and B'H regular, and any solution is carried into it by
+S = I - H (B'H)^-1 B' without a new adjustment.
+
+Source: Baarda (1973), S-transformations and criterion matrices; Papo and Perelmuter (1980); Luhmann et
+al., Close-Range Photogrammetry (2020), sec. 4.4.3.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import qr
+
+from sfm.adjustment.datum import ResolvedDatum
+from sfm.adjustment.engine.collinearity import State
+from sfm.adjustment.engine.observed_unknowns import Weighted, bar_directions, exterior_misclosure
+from sfm.adjustment.engine.unknowns import Unknowns
+from sfm.conventions import BoolArray, FloatArray, skew
+from sfm.errors import GeometryError
+
+DETERMINED = 1e-9  # relative effect on an observed unknown above which it takes part in the datum
+
+
+@dataclass(frozen=True)
+class Motions:
+    """Null vectors H of the normal equations and datum constraints B, split as the unknowns are."""
+
+    reduced: FloatArray  # H of the reduced unknowns, (reduced, d)
+    points: FloatArray  # H of the object points, (n, 3, d)
+    constraints: FloatArray  # B of the object points, (n, 3, d)
+    on_reduced: FloatArray  # B of the reduced unknowns where no free point can carry it, (reduced, d)
+    inverse: FloatArray  # (B'H)^-1, (d, d)
+
+    @property
+    def defect(self) -> int:
+        """Number of motions that the datum has to fix."""
+        return self.reduced.shape[1]
+
+    def transform(self, reduced: FloatArray, points: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return a step (reduced,), (n, 3) carried into the datum: S dx."""
+        if self.defect == 0:
+            return reduced, points
+        t = self.inverse @ (np.einsum("npd,np->d", self.constraints, points) + self.on_reduced.T @ reduced)
+        return reduced - self.reduced @ t, points - self.points @ t
+
+
+def motions_of(layout: Unknowns, weighted: Weighted, state: State, datum: ResolvedDatum) -> Motions:
+    """Return the motions that the observations leave open and the constraints that the datum puts on them.
+
+    Args:
+        layout: order of the unknowns.
+        weighted: observed unknowns.
+        state: where the motions are taken; lengths are scaled by the size of the network.
+        datum: kind and points.
+
+    Raises:
+        GeometryError: the chosen datum points cannot carry the datum.
+    """
+    exterior, points = free_motions(layout, state)
+    inner = layout.kept_start - exterior[..., 0].size
+    kept = points[layout.kept].reshape(-1, 7)
+    H = np.vstack([exterior.reshape(-1, 7), np.zeros((inner, 7)), kept])
+    seen = _seen_by_datum(layout, weighted, state, exterior, points)
+    if len(seen):
+        _, singular, Vt = np.linalg.svd(seen)
+        rank = int((singular > DETERMINED * max(1.0, singular[0])).sum())
+        open_motions = Vt[rank:].T
+    else:
+        open_motions = np.eye(7)
+    if len(seen) or not layout.all_free:
+        H = H @ open_motions * layout.reduced_free()[:, None]
+        points = points @ open_motions * layout.point_free[:, :, None]
+    d = open_motions.shape[1]
+    on_reduced = np.zeros_like(H)
+    if d == 0:
+        return Motions(H, points, points, on_reduced, np.zeros((0, 0)))
+    on: BoolArray = np.asarray(layout.point_free.any(axis=1))
+    if datum.points is not None:
+        on = on & datum.points
+    carrier = points if on.all() else points * on[:, None, None]
+    flat = carrier.reshape(-1, d)
+    if not on.any():
+        on_reduced, B = H.copy(), np.zeros_like(points)
+        inverse = _regular_inverse(on_reduced.T @ H)
+    else:
+        if datum.kind == "minimal":
+            picked = minimal_coordinates(flat, state.points, on)
+            B = np.zeros_like(points)
+            B.reshape(-1, d)[picked] = np.eye(d)
+        else:
+            B = carrier
+        inverse = _regular_inverse(B.reshape(-1, d).T @ points.reshape(-1, d))
+    return Motions(H, points, B, on_reduced, inverse)
+
+
+def free_motions(layout: Unknowns, state: State) -> tuple[FloatArray, FloatArray]:
+    """Return the seven similarity motions as changes of X0, w (m, 6, 7) and of points (n, 3, 7).
+
+    Shifts, turns and scale about the centre of the network, the latter two over its size, so that all
+    seven are of the same order.
+    """
+    cloud = state.points[layout.point_on]
+    centre = cloud.mean(axis=0)
+    size = max(float(np.sqrt(((cloud - centre) ** 2).sum(axis=1).mean())), np.finfo(float).tiny)
+
+    def motion(xyz: FloatArray) -> FloatArray:
+        x = np.where(np.isfinite(xyz), xyz, centre) - centre
+        shift = np.broadcast_to(np.eye(3), (len(x), 3, 3))
+        return np.concatenate([shift, -skew(x) / size, x[:, :, None] / size], axis=2)
+
+    exterior = np.zeros((len(state.position), 6, 7))
+    exterior[:, :3] = motion(state.position)
+    exterior[:, 3:, 3:6] = state.M / size
+    return exterior, motion(state.points)
+
+
+def minimal_coordinates(motions: FloatArray, points: FloatArray, on: BoolArray) -> FloatArray:
+    """Return which coordinates (indices into the flat n x 3) carry a minimal datum.
+
+    They are taken from three points far apart, by pivoting, so that B'H is as regular as it can be.
+    """
+    index = np.flatnonzero(on)
+    X = points[index]
+    first = int(np.argmax(((X - X.mean(axis=0)) ** 2).sum(axis=1)))
+    second = int(np.argmax(((X - X[first]) ** 2).sum(axis=1)))
+    base = X[second] - X[first]
+    off = np.cross(X - X[first], base / max(float(np.linalg.norm(base)), np.finfo(float).tiny))
+    third = int(np.argmax((off**2).sum(axis=1)))
+    rows = (3 * index[[first, second, third], None] + np.arange(3)).ravel()
+    _, _, pivots = qr(motions[rows].T, mode="economic", pivoting=True)
+    return np.asarray(np.sort(rows[pivots[: motions.shape[1]]]))
+
+
+def _regular_inverse(BH: FloatArray) -> FloatArray:
+    singular = np.linalg.svd(BH, compute_uv=False)
+    if not singular[-1] > DETERMINED * singular[0]:
+        raise GeometryError("datum: the datum points cannot fix position, attitude and scale of the network")
+    return np.asarray(np.linalg.inv(BH))
+
+
+def _seen_by_datum(
+    layout: Unknowns,
+    weighted: Weighted,
+    state: State,
+    exterior: FloatArray,
+    points: FloatArray,
+) -> FloatArray:
+    """Return what each motion does to fixed and observed unknowns and distances, one row for each."""
+    if layout.all_free and weighted.count == 0:
+        return np.zeros((0, 7))
+    rows = [
+        points[~layout.point_free & layout.point_on[:, None]],
+        exterior[~layout.exterior_free & layout.image_on[:, None]],
+    ]
+    for p, j in enumerate(weighted.point):
+        rows.append(points[j][np.diagonal(weighted.point_weight[p]) > 0])
+    _, J = exterior_misclosure(weighted, state)
+    rows += [
+        (J[e] @ exterior[i])[np.diagonal(weighted.exterior_weight[e]) > 0]
+        for e, i in enumerate(weighted.image)
+    ]
+    if len(weighted.start):
+        direction, _ = bar_directions(weighted, layout, state)
+        difference = points[layout.kept[weighted.end]] - points[layout.kept[weighted.start]]
+        rows.append(np.einsum("bp,bpd->bd", direction, difference))
+    return np.concatenate([row.reshape(-1, 7) for row in rows])

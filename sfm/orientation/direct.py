@@ -1,0 +1,157 @@
+"""Direct orientation: photographs brought onto control in one adjustment, without a model in between."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from sfm.conventions import BoolArray, FloatArray, IntArray, rotation_from_vector, skew
+from sfm.errors import GeometryError
+from sfm.orientation.intersection import intersect
+from sfm.orientation.resection.least_squares import resect_least_squares
+from sfm.orientation.resection.ransac import resect_robust
+
+MAX_STEPS = 30
+CONVERGED = 1e-12
+START_TOLERANCE = 0.1  # tangents: what a start may be off
+
+
+@dataclass(frozen=True)
+class DirectOrientation:
+    """Photographs oriented to control in one adjustment, without a model in between."""
+
+    positions: FloatArray  # projection centres, control unit, (m, 3)
+    rotations: FloatArray  # R, image to object axes, (m, 3, 3)
+    points: FloatArray  # control as given, others intersected, control unit, (n, 3)
+    residuals: FloatArray  # v = computed - measured, tangents, (k, 2)
+    sigma0: float  # a posteriori standard deviation of an image coordinate, tangents
+    redundancy: int  # 2 k - 6 m - 3 new points
+    covariance: FloatArray  # of X0 and w in R exp([w]x) of all photographs, (6 m, 6 m)
+    converged: bool  # whether the last step was negligible
+
+
+def orient_direct(
+    tangents: FloatArray, image: IntArray, point: IntArray, control: FloatArray
+) -> DirectOrientation:
+    """Return photographs (usually two) oriented to control points, conjugate rays of new points included.
+
+    Args:
+        tangents: u = -U/W, v = -V/W of each ray, free of distortion, shape (k, 2).
+        image: index of the photograph of each ray, shape (k,).
+        point: index of the point of each ray, shape (k,).
+        control: coordinates of all points, NaN where they are not control, shape (n, 3), control unit.
+
+    Raises:
+        GeometryError: a photograph with fewer than four control points (its start), a new point without two
+            rays, or rays that do not determine the solution.
+
+    Source: document 004, "direct orientation": the collinearity equations of both photographs, control points
+    fixed, new points as unknowns that are eliminated; Gauss-Newton.
+    """
+    uv = np.ascontiguousarray(tangents, dtype=float)
+    known = np.asarray(np.isfinite(control).all(axis=1))
+    m = int(image.max()) + 1
+    positions, rotations = _resected(uv, image, point, control, known, m)
+    start = intersect(uv, image, point, positions, rotations, n_points=len(control)).points
+    points = np.where(known[:, None], control, start)
+    missing = np.flatnonzero(
+        ~np.isfinite(points).all(axis=1) & (np.bincount(point, minlength=len(points)) > 0)
+    )
+    if len(missing):
+        raise GeometryError(
+            f"direct orientation: point {missing[0]} is not control and not seen by two photographs"
+        )
+    converged = False
+    for _ in range(MAX_STEPS):
+        v, A, B = _observations(uv, image, point, positions, rotations, points)
+        N, n_vector, solve_points = _reduced(v, A, B, image, point, known, m)
+        try:
+            dx = np.asarray(np.linalg.solve(N, n_vector), dtype=float)
+        except np.linalg.LinAlgError:
+            raise GeometryError("direct orientation: control does not determine the photographs") from None
+        points = points + solve_points(dx)
+        step = dx.reshape(m, 6)
+        distance = np.linalg.norm(points[point] - positions[image], axis=1).mean()
+        positions = positions + step[:, :3]
+        rotations = rotations @ rotation_from_vector(step[:, 3:])
+        if np.abs(step[:, :3]).max() < CONVERGED * distance and np.abs(step[:, 3:]).max() < CONVERGED:
+            converged = True
+            break
+    v, A, B = _observations(uv, image, point, positions, rotations, points)
+    N, _, _ = _reduced(v, A, B, image, point, known, m)
+    new = np.unique(point[~known[point]])
+    redundancy = 2 * len(uv) - 6 * m - 3 * len(new)
+    sigma0 = float(np.sqrt(np.sum(v**2) / redundancy)) if redundancy > 0 else np.nan
+    covariance = sigma0**2 * np.linalg.inv(N)
+    return DirectOrientation(
+        positions, rotations, points, v, sigma0, redundancy, np.asarray(covariance), converged
+    )
+
+
+def _resected(
+    uv: FloatArray, image: IntArray, point: IntArray, control: FloatArray, known: BoolArray, m: int
+) -> tuple[FloatArray, FloatArray]:
+    """Start of every photograph by resection on its control points."""
+    positions, rotations = np.empty((m, 3)), np.empty((m, 3, 3))
+    for i in range(m):
+        own = (image == i) & known[point]
+        result = resect_robust(uv[own], control[point[own]], tolerance=START_TOLERANCE)
+        if not result.found:
+            raise GeometryError(f"direct orientation: photograph {i}: {result.reason}")
+        adjusted = resect_least_squares(uv[own], control[point[own]], result.position, result.rotation)
+        positions[i], rotations[i] = adjusted.position, adjusted.rotation
+    return positions, rotations
+
+
+def _observations(
+    uv: FloatArray,
+    image: IntArray,
+    point: IntArray,
+    positions: FloatArray,
+    rotations: FloatArray,
+    points: FloatArray,
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Residuals (k, 2) and derivatives by the photograph (k, 2, 6) and the point (k, 2, 3)."""
+    R = rotations[image]
+    UVW = np.einsum("kji,kj->ki", R, points[point] - positions[image])
+    W = UVW[:, 2:]
+    u = -UVW[:, :2] / W
+    # d (u, v) / d (U, V, W)
+    D = np.zeros((len(uv), 2, 3))
+    D[:, 0, 0] = D[:, 1, 1] = -1 / W[:, 0]
+    D[:, :, 2] = -u / W
+    B = D @ np.swapaxes(R, 1, 2)
+    A = np.concatenate([-B, D @ skew(UVW)], axis=2)
+    return u - uv, A, B
+
+
+def _reduced(
+    v: FloatArray, A: FloatArray, B: FloatArray, image: IntArray, point: IntArray, known: BoolArray, m: int
+) -> tuple[FloatArray, FloatArray, Callable[[FloatArray], FloatArray]]:
+    """Normal equations of the photographs with the new points eliminated, and the function for these."""
+    k = len(v)
+    wide = np.zeros((k, 2, 6 * m))
+    columns = 6 * image[:, None] + np.arange(6)
+    for axis in (0, 1):
+        wide[np.arange(k)[:, None], axis, columns] = A[:, axis]
+    N = np.einsum("kia,kib->ab", wide, wide)
+    n_vector = -np.einsum("kia,ki->a", wide, v)
+    parts = []
+    for j in np.unique(point[~known[point]]):
+        own = point == j
+        C = np.einsum("kia,kib->ab", wide[own], B[own])
+        inverse = np.linalg.inv(np.einsum("kia,kib->ab", B[own], B[own]))
+        b = -np.einsum("kia,ki->a", B[own], v[own])
+        N = N - C @ inverse @ C.T
+        n_vector = n_vector - C @ inverse @ b
+        parts.append((j, C, inverse, b))
+
+    def solve_points(dx: FloatArray) -> FloatArray:
+        step = np.zeros((len(known), 3))
+        for j, C, inverse, b in parts:
+            step[j] = inverse @ (b - C.T @ dx)
+        return step
+
+    return N, n_vector, solve_points
