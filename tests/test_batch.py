@@ -22,7 +22,7 @@ from threadpoolctl import threadpool_info
 from adapters.dask_cluster import DaskEngine, _OneThread, fitting_workers, local_engine, remote_engine
 from sfm.batch.pages import render_index
 from sfm.batch.run import calls_of, find_surveys, run_batch
-from sfm.batch.survey import SurveyJob, SurveyRow, reconstruct
+from sfm.batch.survey import LOCK, SurveyJob, SurveyRow, reconstruct
 from sfm.errors import BackendError, KolinearError, OutputError, SurveyFileError
 from sfm.files.folder_lock import Owner, locked
 from sfm.report.log import read_log
@@ -112,9 +112,8 @@ def test_batch_gives_folders_tables_and_logs(finished: Path) -> None:
         assert len(photographs) == (0 if row["survey"] == "third" else 6)
         assert all(entry["targets"] >= 10 and not entry["stored"] for entry in photographs)
     assert sorted(p.name for p in finished.iterdir()) == [
-        *(".kolinear", "batch.csv", "batch.json", "first", "index.html", "second", "third"),
+        *("batch.csv", "batch.json", "first", "index.html", "manifest.json", "second", "third"),
     ]
-    assert not (finished / ".kolinear" / "lock").exists()
 
 
 def test_resume_keeps_what_is_finished_and_runs_what_has_changed(
@@ -266,7 +265,7 @@ def test_a_worker_whose_run_is_over_writes_nothing(
     out = tmp_path / "out"
     job = SurveyJob(surveys[2], out, "third", "", False, Owner(1, "elsewhere", "2026-01-01T00:00:00+00:00"))
     with (
-        locked(out / ".kolinear" / "lock"),
+        locked(out / LOCK),
         pytest.raises(OutputError, match="the run that asked for survey third is over"),
     ):
         reconstruct(job, ALONE, [], tell=lambda _: None)
@@ -275,14 +274,14 @@ def test_a_worker_whose_run_is_over_writes_nothing(
     monkeypatch.setattr("sfm.batch.survey.owner_of", lambda _: next(owners))
     with pytest.raises(OutputError, match="the run that asked for survey third is over"):
         reconstruct(job, ALONE, [], tell=lambda _: None)
-    assert {path.name for path in out.iterdir()} == {".kolinear", "logs"}
+    assert {path.name for path in out.iterdir()} == {"logs"}
 
 
 def test_a_single_run_into_a_folder_of_the_batch_is_not_disturbed(
     surveys: tuple[Path, ...], finished: Path, tmp_path: Path
 ) -> None:
     out = tmp_path / "out"
-    theirs = out / ".third.abc.part"
+    theirs = out / ".third.abcdefgh.part"
     theirs.mkdir(parents=True)
     with locked(out / ".third.lock"):  # as `kolinear adjust --out out/third` holds it
         rows = run_batch([surveys[2], surveys[0]], out, HERE, ALONE, Notes())
@@ -291,7 +290,7 @@ def test_a_single_run_into_a_folder_of_the_batch_is_not_disturbed(
     assert theirs.exists()
     rows = run_batch([surveys[2]], out, HERE, ALONE, Notes(), resume=True)
     assert rows[0].status == "done"
-    assert sorted(path.name for path in out.iterdir() if path.name.startswith(".")) == [".kolinear"]
+    assert not [path for path in out.iterdir() if path.name.startswith(".")]
 
 
 @pytest.mark.parametrize(
@@ -333,7 +332,7 @@ def test_resume_removes_the_log_of_a_run_killed_at_the_last_moment(
     out = tmp_path / "out"
     run_batch([surveys[2]], out, HERE, ALONE, Notes())
     (out / "logs").mkdir()
-    (out / "logs" / "third.jsonl").write_text("{}\n", encoding="utf-8")
+    (out / "logs" / "third.jsonl").write_text('{"time": "", "event": ""}\n', encoding="utf-8")
     run_batch([surveys[2]], out, HERE, ALONE, Notes(), resume=True)
     assert not (out / "logs").exists()
 
@@ -355,7 +354,7 @@ def test_index_escapes_everything() -> None:
 
 def test_a_second_batch_in_the_same_folder_is_refused(finished: Path, surveys: tuple[Path, ...]) -> None:
     with (
-        locked(finished / ".kolinear" / "lock"),
+        locked(finished / LOCK),
         pytest.raises(
             OutputError, match=f"another run is writing into this folder .process {os.getpid()} on"
         ),

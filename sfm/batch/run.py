@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import glob
 import hashlib
+import os
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, suppress
@@ -33,12 +34,12 @@ from sfm.executor import Call, Done, Engine, Lost, Told, Work
 from sfm.files.folder_lock import locked, owner_of
 from sfm.files.globs import BELOW, find_files
 from sfm.files.plain_text import as_plain
-from sfm.files.whole_files import remove_leftovers
-from sfm.report.log import SurveyLog
-from sfm.report.output import folder_name, refuse_foreign_folder
+from sfm.files.whole_files import MANIFEST, refuse_foreign_folder, remove_leftovers
+from sfm.report.log import SurveyLog, refuse_other_log, remove_log
+from sfm.report.output import folder_name
 from sfm.survey.inputs.start import find_photographs
 from sfm.survey.inputs.survey_file import Survey, read_survey
-from sfm.survey.target_store import STORE, TargetStore
+from sfm.survey.target_store import TargetStore
 
 SURVEY_NAME = "survey.toml"  # what a folder is searched for
 
@@ -101,9 +102,12 @@ def run_batch(
         OutputError: the folder cannot be written, or another run is writing into it.
         BackendError: there is nobody left to work.
     """
-    out = Path(out).resolve()
-    refuse_foreign_pages(out)
+    refuse_foreign_pages(Path(out))
+    out = Path(os.path.abspath(out))  # it has no links
     plans = _plan(files, allow_outside=allow_outside)
+    for plan in plans:
+        refuse_other_log(out / LOGS / f"{plan.folder}.jsonl")
+    TargetStore.of_user().remove_old()
     with _no_empty_folders(out), locked(out / LOCK, out) as before:
         if before is not None:
             watch.remark(f"an earlier run was cut off ({before}); what it had finished is safe")
@@ -126,7 +130,7 @@ def _no_empty_folders(out: Path) -> Iterator[None]:
     try:
         yield
     finally:
-        for folder in (out / STORE, (out / LOCK).parent, out / LOGS, *missing):
+        for folder in (out / LOGS, *missing):
             with suppress(OSError):  # it is in use
                 folder.rmdir()
 
@@ -214,7 +218,7 @@ def _plan(files: Sequence[Path], *, allow_outside: bool) -> tuple[_Plan, ...]:
     often = Counter(name.casefold() for name in names)
     plans = []
     for (file, survey, reason), name in zip(read, names, strict=True):
-        reserved = name.casefold() in (LOGS, *PAGES)
+        reserved = name.casefold() in (LOGS, MANIFEST, *PAGES)
         if often[name.casefold()] > 1 or reserved:  # told apart by what stays the same from run to run
             name = f"{name}-{hashlib.sha256(str(file).encode()).hexdigest()[:8]}"
         plans.append(_Plan(file, name, survey, reason))
@@ -260,7 +264,7 @@ def _run(
                 finish(plan.folder, _without_result(plan, out, "failed", str(error)))
                 continue
             if earlier is not None:  # its log may be there still, of a run killed at the last moment
-                (out / LOGS / f"{plan.folder}.jsonl").unlink(missing_ok=True)
+                remove_log(out / LOGS / f"{plan.folder}.jsonl")
                 finish(plan.folder, earlier, kept=True)
                 continue
             work = works[plan.folder]
@@ -312,10 +316,9 @@ def _without_result(plan: _Plan, out: Path, status: str, reason: str) -> SurveyR
 
 def _clean(out: Path, plans: Sequence[_Plan]) -> None:
     """Remove what killed workers left half-written, but not what others are writing beside this batch."""
-    TargetStore(out / STORE).remove_parts()
     for plan in plans:
         if any(out.glob(f".{glob.escape(plan.folder)}.*")):
             with suppress(FolderInUseError), locked(lock_of(out, plan.folder)):
                 remove_leftovers(out / plan.folder)
-    for page in PAGES:
+    for page in (MANIFEST, *PAGES):
         remove_leftovers(out / page)

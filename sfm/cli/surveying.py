@@ -74,7 +74,7 @@ def run(
         from sfm.report.log import SurveyLog
         from sfm.report.output import write_result
         from sfm.survey.inputs.survey_file import read_survey
-        from sfm.survey.target_store import STORE, TargetStore
+        from sfm.survey.target_store import TargetStore
 
     survey = read_survey(survey_file, allow_outside=allow_outside)
     if survey.observations is not None:
@@ -84,7 +84,8 @@ def run(
     others = _others(survey)
     folder = _folder(survey, out)
     workers = jobs or _cores()
-    store = TargetStore(folder.parent / STORE)
+    store = TargetStore.of_user()
+    store.remove_old()
     with drawn_progress() as drawn, _threads(), _written(folder), SurveyLog(watch=drawn) as log:
         log.start(survey.name, survey_file)
         result = run_survey(survey, images_dir=images, jobs=workers, others=others, store=store, progress=log)
@@ -242,7 +243,8 @@ def _colmap_writer(result: SurveyResult) -> Callable[[Path], None] | None:
 
 def _folder(survey: Survey, out: Path | None) -> Path:
     """Return the folder of the result, before any work is done for one that cannot be used."""
-    from sfm.report.output import folder_name, refuse_foreign_folder
+    from sfm.files.whole_files import refuse_foreign_folder
+    from sfm.report.output import folder_name
 
     out = Path("out") / folder_name(survey.name) if out is None else out
     refuse_foreign_folder(out)
