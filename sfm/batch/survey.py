@@ -12,8 +12,9 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from sfm.errors import FolderInUseError, KolinearError, OutputError
+from sfm.errors import FolderInUseError, OutputError
 from sfm.executor import Tell
+from sfm.faults import is_fault, told_of_error
 from sfm.files.folder_lock import Owner, locked, owner_of
 from sfm.files.plain_text import as_plain
 from sfm.kernels.compiling import when_compiling
@@ -90,6 +91,7 @@ class SurveyRow:
     comparison: str = ""  # agrees | differs | none
     seconds: float = 0.0  # of computing, photographs included
     reason: str = ""  # why there is no result, one line
+    fault: bool = False  # whether that is an error of the program, not of the survey
 
     @property
     def succeeded(self) -> bool:
@@ -110,8 +112,8 @@ def measure_one(job: SurveyJob, survey: Survey, image: str, path: Path, *, tell:
         family = survey_family(survey)
         with when_compiling(lambda: tell({"compiling": True})):
             targets, stored = measure_photograph(path, survey.targets, family, store)
-    except KolinearError as error:
-        note = PhotographNote(image, failed=str(error))
+    except Exception as error:  # one that nobody has foreseen fails the survey, which comes upon it again
+        note = PhotographNote(image, failed=as_plain(told_of_error(error)))
     else:
         note = PhotographNote(image, len(targets), len(targets.rejected_xy), stored)
     tell({"photograph": image})
@@ -153,12 +155,25 @@ def reconstruct(
             if isinstance(error, OutputError) and not isinstance(error, FolderInUseError):
                 log.note("failed", reason=str(error))  # others will not be written, either
                 raise
-            reason = as_plain(str(error) if isinstance(error, KolinearError | OSError) else _fault(error))
-            log.note("failed", reason=reason, **_trace(error))
             seconds = round(before + time.perf_counter() - begun, 3)
-            return SurveyRow(name, str(job.file), job.folder, "failed", reason=reason, seconds=seconds)
+            row = SurveyRow(name, str(job.file), job.folder, "failed", seconds=seconds)
+            return failed_row(log, error, row)
     remove_log(live)  # the result has it
     return row
+
+
+def failed_row(log: SurveyLog, error: Exception, row: SurveyRow) -> SurveyRow:
+    """Return the row of a survey that an error has ended, and write the error into its log.
+
+    Raises:
+        OutputError: the log cannot be written.
+    """
+    reason, fault = as_plain(told_of_error(error)), is_fault(error)
+    trace = {"trace": traceback.format_exception(error)} if fault else {}
+    log.note("failed", survey=row.survey, file=as_plain(row.file), reason=reason, **trace)
+    if fault:
+        reason += f"; its traceback is in {LOGS}/{row.folder}.jsonl"
+    return replace(row, reason=reason, fault=fault)
 
 
 def fingerprint(survey: Survey) -> str:
@@ -247,7 +262,7 @@ def _refuse_ended(job: SurveyJob) -> None:
 
 def _row(job: SurveyJob, entries: dict[str, Any], seconds: float) -> SurveyRow:
     """Return the row of a survey from the last line of its log; TypeError if that is something else."""
-    names = {field.name for field in fields(SurveyRow)} - {"file", "folder", "status", "seconds"}
+    names = {field.name for field in fields(SurveyRow)} - {"file", "folder", "status", "seconds", "fault"}
     known = {key: value for key, value in entries.items() if key in names}
     return SurveyRow(file=str(job.file), folder=job.folder, status="done", seconds=seconds, **known)
 
@@ -263,17 +278,3 @@ class _Telling:
 
     def advance(self, step: str = "") -> None:
         """Photographs are told where they are measured."""
-
-
-def _fault(error: Exception) -> str:
-    """Say that the program is wrong, not the survey, and where."""
-    at = traceback.extract_tb(error.__traceback__)
-    place = f" ({Path(at[-1].filename).name}, line {at[-1].lineno})" if at else ""
-    said = " ".join(str(error).split())
-    return f"a fault of Kolinear: {type(error).__name__}: {said:.200}{place}"
-
-
-def _trace(error: Exception) -> dict[str, Any]:
-    if isinstance(error, KolinearError):
-        return {}
-    return {"trace": traceback.format_exception(error)}

@@ -9,6 +9,7 @@ import typer
 
 from sfm.cli.starting import loading
 from sfm.errors import OutputError
+from sfm.faults import working_on
 
 
 def refine(
@@ -42,7 +43,8 @@ def refine(
         refuse_links(out)
         if out.exists():
             raise OutputError(f"{out}: exists already, the refined model needs a new folder")
-    network, estimate = read_model(model)
+    with working_on(str(model)):
+        network, estimate = read_model(model)
     with drawn_progress() as progress:
         found = refine_model(
             network, estimate, images, window_px=window, min_correlation=min_correlation, progress=progress

@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from sfm.cli.starting import loading
+from sfm.faults import working_on
 
 WORSE = 1  # exit code where the in-house adjuster was ever the worse one
 
@@ -73,7 +74,10 @@ def compare(
         from sfm.report.differences import largest_difference, words_of_test, write_differences
 
     refuse_foreign_folder(out)
-    first, second = read_comparable(a, a_format), read_comparable(b, b_format)
+    with working_on(str(a)):
+        first = read_comparable(a, a_format)
+    with working_on(str(b)):
+        second = read_comparable(b, b_format)
     names = tuple(name.strip() for name in control.split(",") if name.strip())
     found = compare_results(first, second, align=align, control=names)
     place = {name: j for j, name in enumerate(first.network.points)}
@@ -111,7 +115,8 @@ def convert(
         from sfm.comparison.undistortion import undistort
 
     form = format_named(to_format or ENDINGS.get(target.suffix.lower(), "tables"))
-    network, estimate = read_any(source, from_format)
+    with working_on(str(source)):
+        network, estimate = read_any(source, from_format)
     cameras = estimate.cameras
     conversions: tuple[Conversion, ...] = ()
     if form.models:

@@ -15,6 +15,7 @@ import typer
 
 from sfm.cli.starting import loading
 from sfm.errors import KolinearError
+from sfm.faults import FAULT, working_on
 
 if TYPE_CHECKING:
     from sfm.result import SurveyResult
@@ -76,7 +77,8 @@ def run(
         from sfm.survey.inputs.survey_file import read_survey
         from sfm.survey.target_store import TargetStore
 
-    survey = read_survey(survey_file, allow_outside=allow_outside)
+    with working_on(str(survey_file)):
+        survey = read_survey(survey_file, allow_outside=allow_outside)
     if survey.observations is not None:
         raise KolinearError(
             f"{survey_file}: it has [observations] in place of photographs: kolinear adjust {survey_file}"
@@ -118,7 +120,8 @@ def adjust(
         from sfm.report.output import write_result
         from sfm.survey.inputs.survey_file import read_survey
 
-    survey = read_survey(survey_file, allow_outside=allow_outside)
+    with working_on(str(survey_file)):
+        survey = read_survey(survey_file, allow_outside=allow_outside)
     if survey.observations is None:
         raise KolinearError(
             f"{survey_file}: it has no [observations]; with photographs: kolinear run {survey_file}"
@@ -176,8 +179,8 @@ def batch(
 ) -> None:
     """Run many surveys side by side, each to its own report.
 
-    One table tells them all.  Exit code 0 if every survey has a dependable result, else 1; 2 where a
-    person must put something right.
+    One table tells them all.  Exit code 0 if every survey has a dependable result, else 1; 70 if one came
+    upon a fault of the program; 2 where a person must put something right.
     """
     if cluster is not None and jobs is not None:
         raise KolinearError("--jobs is for processes on this computer, --cluster brings its own workers")
@@ -206,6 +209,8 @@ def batch(
             allow_outside=allow_outside,
         )
     print_batch(Console(highlight=False), rows, out / "index.html")
+    if any(row.fault for row in rows):
+        raise SystemExit(FAULT)
     if not all(row.succeeded for row in rows):
         raise SystemExit(FAILED)
 
