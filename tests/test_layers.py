@@ -80,6 +80,19 @@ def test_siblings_do_not_import_one_another(room: str) -> None:
             assert not strangers, f"{name} imports {sorted(strangers)} of a sibling room"
 
 
+def test_measuring_depends_on_nothing_else() -> None:
+    """The key of stored targets covers what these import; a changed sheet or renderer must not change it."""
+    found: set[str] = set()
+    left = ["sfm.targets.detect", "sfm.photographs.reading"]
+    while left:
+        name = left.pop()
+        if name in MODULES and name not in found:
+            found.add(name)
+            left += imported(MODULES[name])
+    rooms = {".".join(name.split(".")[:2]) for name in found}
+    assert rooms == {"sfm.conventions", "sfm.errors", "sfm.kernels", "sfm.photographs", "sfm.targets"}
+
+
 def test_only_the_command_line_imports_adapters() -> None:
     for name, path in MODULES.items():
         if name.startswith("sfm") and not belongs(name, "sfm.cli"):

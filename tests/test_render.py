@@ -14,7 +14,7 @@ from sfm.conventions import rotation_from_angles
 from sfm.errors import GeometryError, SurveyFileError
 from sfm.rendering.render import (
     painting_order,
-    picture_targets,
+    project_targets,
     render_photograph,
     render_photographs,
     write_photographs,
@@ -372,7 +372,7 @@ def test_the_demo_scene_shows_most_targets_in_most_photographs():
     assert len(staging.names) == 12
     seen = np.array(
         [
-            picture_targets(staging.scene, staging.camera, X0, R).visible
+            project_targets(staging.scene, staging.camera, X0, R).visible
             for X0, R in zip(staging.positions, staging.rotations, strict=True)
         ]
     )

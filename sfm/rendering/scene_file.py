@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 
 from sfm.camera import Camera, camera_from_values
 from sfm.conventions import FloatArray
@@ -72,8 +72,14 @@ class _Head(_Section):
     seed: int = 0
 
 
+def _known_model(model: str) -> str:
+    if model not in MODELS:
+        raise ValueError(f"model '{model}', expected one of {', '.join(MODELS)}")
+    return model
+
+
 class _Camera(_Section):
-    model: Literal[tuple(MODELS)]  # type: ignore[valid-type]
+    model: Annotated[str, AfterValidator(_known_model)]
     size_px: Annotated[tuple[Side, Side], Field(strict=False)]
     pixel_mm: Two
     c_mm: Length

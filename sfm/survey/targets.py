@@ -9,7 +9,8 @@ import numpy as np
 
 from sfm.camera import Camera
 from sfm.conventions import FloatArray, IntArray
-from sfm.photographs.reading import Metadata, read_metadata, read_photograph
+from sfm.photographs.exif import Metadata, read_metadata
+from sfm.photographs.reading import read_photograph
 from sfm.progress import SILENT, Progress
 from sfm.result import FailedImage, PhotographTargets
 from sfm.survey.inputs.cameras import start_cameras

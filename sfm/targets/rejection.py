@@ -116,9 +116,9 @@ def find_parts_of_codes(
 ) -> BoolArray:
     """Return which candidates lie in the code ring of another target, hence are parts of its code.
 
-    The codes are gone through from the most confident to those that could not be read, and a part of one
-    code has no say in what follows: an arc that resembles a dot does not take the dot of its own ring away.
-    About a dot whose code was not read only what is clearly smaller than the dot counts.
+    Codes are taken from the most confident to those that could not be read, and a part of one code does not
+    count afterwards: an arc that resembles a dot does not take the dot of its own ring away. About a dot
+    whose code was not read only what is clearly smaller than the dot is a part.
     """
     inside = np.zeros(len(fit.xy), dtype=bool)
     size = np.sqrt(np.abs(fit.shape[:, 0] * fit.shape[:, 2] - fit.shape[:, 1] ** 2))  # 1 / mean semi-axis

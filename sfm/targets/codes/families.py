@@ -1,6 +1,6 @@
 """The code families by name: what a survey file, a sheet or `find_targets` can ask for.
 
-To add a family of rings with a table in a file, nothing is needed but the file. One that follows the rule of
+A family of rings with a table in a file needs that file only. One that follows the rule of
 `ring_patterns` is a row in `rings.RINGS`, a dictionary of square tags a row in `tags.DICTIONARIES`. Another
 kind of code is a module beside these with a type for its families, a row below, and its reading in
 `sfm.targets.detect`, behind that of rings (numbers for measured dots) or of tags (points of its own).
