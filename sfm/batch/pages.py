@@ -8,20 +8,15 @@ import os
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict, fields
-from html import escape
 from pathlib import Path
 
 from sfm.batch.survey import LOGS, SurveyRow
 from sfm.errors import OutputError
 from sfm.files.plain_text import as_plain, csv_text, is_plain
 from sfm.files.whole_files import MANIFEST, read_manifest, refuse_links, sha256_of, whole_file, write_manifest
-from sfm.report.markup import Cell, file_url, table
-from sfm.report.pages import page
+from sfm.report.html.page import render
 
-PAGES = ("batch.json", "batch.csv", "index.html")
-HEADER = ("survey", "file", "result", "photographs", "points", "sigma0, px", "RMS, px", "COLMAP", "seconds")
-LEVELS = {"good": "good", "fair": "fair", "bad": "bad", "": "bad"}
-"""colour of a verdict; without a result there is none, which is bad"""
+PAGES = ("batch.json", "batch.csv", "index.html")  # the first tells whose they are
 
 
 def write_batch_pages(rows: Sequence[SurveyRow], out: Path) -> None:
@@ -88,7 +83,7 @@ def totals(rows: Sequence[SurveyRow]) -> dict[str, int]:
 
 
 def render_index(rows: Sequence[SurveyRow], name: str) -> str:
-    """Return the page with a line for every survey; whatever came from files is escaped.
+    """Return the page with a line for every survey.
 
     Args:
         rows: one per survey.
@@ -101,50 +96,22 @@ def render_index(rows: Sequence[SurveyRow], name: str) -> str:
     remarks = [f"{count[word]} {word}" for word in ("failed", "set aside", "not dependable") if count[word]]
     remarks += [f"{remarked} with remarks, told in the report"] if remarked else []
     remarks += [f"{differs} where COLMAP's adjustment differs"] if differs else []
-    level = "bad" if good < len(rows) else "fair" if remarked or differs else "good"
     above = _common_folder(rows)
-    where = f"<p class=note>Files are below {escape(above)}</p>" if above else ""
-    sections = [("Surveys", table(HEADER, [_cells(row, above) for row in rows]) + where)]
-    without = [row for row in rows if row.status != "done"]
-    if without:
-        told = [
-            (row.survey, _below(row.file, above), Cell(row.status, level="bad"), row.reason, _log(row))
-            for row in without
-        ]
-        sections.append(("Without a result", table(("survey", "file", "", "reason", "log"), told)))
-    seconds = sum(row.seconds for row in rows)
-    tiles = (
-        ("Surveys", str(len(rows)), f"{good} with a dependable result"),
-        ("Photographs oriented", _oriented(rows), "of surveys with a result"),
-        ("Object points", str(sum(row.points or 0 for row in rows)), ""),
-        ("Computing", f"{seconds:.1f} s", "of all workers together"),
+    return render(
+        "batch.html",
+        title=name,
+        headline=f"{good} of {len(rows)} surveys {'has' if good == 1 else 'have'} a dependable result.",
+        level="bad" if good < len(rows) else "fair" if remarked or differs else "good",
+        remarks=remarks,
+        rows=rows,
+        good=good,
+        oriented=sum(row.photographs or 0 for row in rows),
+        photographs=sum(row.photographs_total or 0 for row in rows),
+        points=sum(row.points or 0 for row in rows),
+        above=above,
+        below=lambda file: os.path.relpath(file, above) if above else file,
+        logs=LOGS,
     )
-    verdict = f"{good} of {len(rows)} surveys {'has' if good == 1 else 'have'} a dependable result."
-    return page("Batch of surveys", name, verdict, level, sections, remarks=remarks, tiles=tiles)
-
-
-def _cells(row: SurveyRow, above: str) -> tuple[str | Cell, ...]:
-    """Return the line of a survey in the table."""
-    done = row.status == "done"
-    return (
-        Cell(row.survey, url=f"{file_url(row.folder)}/report.html" if done else ""),
-        _below(row.file, above),
-        Cell(row.verdict if done else row.status, level=LEVELS.get(row.verdict, "bad")),
-        f"{row.photographs} / {row.photographs_total}" if done else "",
-        "" if row.points is None else str(row.points),
-        _fixed(row.sigma0_px),
-        _fixed(row.rms_px),
-        Cell(row.comparison, level="bad") if row.comparison == "differs" else row.comparison,
-        f"{row.seconds:.1f}",
-    )
-
-
-def _log(row: SurveyRow) -> Cell:
-    return Cell(f"{row.folder}.jsonl", url=f"{LOGS}/{file_url(row.folder)}.jsonl")
-
-
-def _oriented(rows: Sequence[SurveyRow]) -> str:
-    return f"{sum(r.photographs or 0 for r in rows)} of {sum(r.photographs_total or 0 for r in rows)}"
 
 
 def _common_folder(rows: Sequence[SurveyRow]) -> str:
@@ -154,11 +121,3 @@ def _common_folder(rows: Sequence[SurveyRow]) -> str:
     except ValueError:  # none at all, or several drives
         return ""
     return "" if common == Path(common).anchor else common
-
-
-def _below(file: str, above: str) -> str:
-    return os.path.relpath(file, above) if above else file
-
-
-def _fixed(value: float | None) -> str:
-    return "" if value is None else f"{value:.4f}"

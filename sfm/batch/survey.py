@@ -19,6 +19,7 @@ from sfm.files.folder_lock import Owner, locked, owner_of
 from sfm.files.plain_text import as_plain
 from sfm.kernels.compiling import when_compiling
 from sfm.pipeline import adjust_survey, run_survey
+from sfm.report.findings.findings import findings_of
 from sfm.report.log import LOG, SurveyLog, read_log, remove_log, result_entries
 from sfm.report.output import write_result
 from sfm.result import SurveyResult
@@ -239,15 +240,18 @@ def _run(
         store = replace(TargetStore.of_user(), held=held)
         result = run_survey(survey, others=others, store=store, progress=log)
     log.stage("report")
+    findings = findings_of(result)
     row: list[SurveyRow] = []
 
     def close_log(folder: Path) -> None:
         _refuse_ended(job)
-        row.append(_row(job, result_entries(result), round(seconds(), 3)))
-        log.close_into(folder, result, seconds=row[0].seconds)
+        row.append(_row(job, result_entries(findings), round(seconds(), 3)))
+        log.close_into(folder, findings, seconds=row[0].seconds)
 
     with locked(lock_of(job.out, job.folder), job.out / job.folder):
-        write_result(result, job.out / job.folder, write_colmap=comparers.writer_of(result), finish=close_log)
+        write_result(
+            findings, job.out / job.folder, write_colmap=comparers.writer_of(result), finish=close_log
+        )
     return row[0]
 
 

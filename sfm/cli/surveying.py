@@ -72,6 +72,7 @@ def run(
     with loading():
         from sfm.cli.console import drawn_progress, tell_result
         from sfm.pipeline import run_survey
+        from sfm.report.findings.findings import findings_of
         from sfm.report.log import SurveyLog
         from sfm.report.output import write_result
         from sfm.survey.inputs.survey_file import read_survey
@@ -91,15 +92,16 @@ def run(
     with drawn_progress() as drawn, _threads(), _written(folder), SurveyLog(watch=drawn) as log:
         log.start(survey.name, survey_file)
         result = run_survey(survey, images_dir=images, jobs=workers, others=others, store=store, progress=log)
+        findings = findings_of(result)
         page = write_result(
-            result,
+            findings,
             folder,
             write_colmap=_colmap_writer(result),
-            finish=lambda part: log.close_into(part, result),
+            finish=lambda part: log.close_into(part, findings),
             jobs=workers,
             progress=log,
         )
-    if not tell_result(result, page, seconds=time.perf_counter() - begun, verbose=verbose):
+    if not tell_result(findings, page, seconds=time.perf_counter() - begun, verbose=verbose):
         raise SystemExit(FAILED)
 
 
@@ -116,6 +118,7 @@ def adjust(
     with loading():
         from sfm.cli.console import drawn_progress, tell_result
         from sfm.pipeline import adjust_survey
+        from sfm.report.findings.findings import findings_of
         from sfm.report.log import SurveyLog
         from sfm.report.output import write_result
         from sfm.survey.inputs.survey_file import read_survey
@@ -131,14 +134,15 @@ def adjust(
     with drawn_progress() as drawn, _threads(), _written(folder), SurveyLog(watch=drawn) as log:
         log.start(survey.name, survey_file)
         result = adjust_survey(survey, others=others, progress=log)
+        findings = findings_of(result)
         page = write_result(
-            result,
+            findings,
             folder,
             write_colmap=_colmap_writer(result),
-            finish=lambda part: log.close_into(part, result),
+            finish=lambda part: log.close_into(part, findings),
             progress=log,
         )
-    if not tell_result(result, page, seconds=time.perf_counter() - begun, verbose=verbose):
+    if not tell_result(findings, page, seconds=time.perf_counter() - begun, verbose=verbose):
         raise SystemExit(FAILED)
 
 

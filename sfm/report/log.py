@@ -27,8 +27,7 @@ from typing import Any, Self
 from sfm.errors import OutputError
 from sfm.files.whole_files import make_folder, open_own
 from sfm.progress import SILENT, Progress
-from sfm.report.verdict import verdict_of
-from sfm.result import SurveyResult
+from sfm.report.findings.findings import Findings
 
 LOG = "log.jsonl"  # in the folder of a result
 MAX_LOG_BYTES = 50_000_000  # of a log that is read back
@@ -129,27 +128,28 @@ class SurveyLog:
             self.note("stage", stage=self._stage, seconds=seconds, **steps)
             self._stage = None
 
-    def close_into(self, folder: Path, result: SurveyResult, **more: Any) -> None:
+    def close_into(self, folder: Path, findings: Findings, **more: Any) -> None:
         """Write the end of a survey that worked, and all lines into the folder of the result.
 
         Args:
             folder: the folder, before it appears in its place.
-            result: what the survey ended with.
+            findings: what the survey ended with.
             more: further entries of the last line.
         """
         self.end_stage()
-        for warning in result.warnings:
+        for warning in findings.result.warnings:
             self.note("warning", text=warning)
-        self.note("result", **result_entries(result), **more)
+        self.note("result", **result_entries(findings), **more)
         (folder / LOG).write_text("\n".join(self._lines) + "\n", encoding="utf-8")
 
 
-def result_entries(result: SurveyResult) -> dict[str, Any]:
+def result_entries(findings: Findings) -> dict[str, Any]:
     """Return the figures of a result by which a log or a table of surveys tells it; None where unknown."""
+    result = findings.result
     a, both = result.adjustment, result.comparison
     return {
         "survey": result.survey,
-        "verdict": verdict_of(result).level,
+        "verdict": findings.verdict.level,
         "sigma0_px": float(a.sigma0_px) if math.isfinite(a.sigma0_px) else None,
         "rms_px": float(a.rms_px) if math.isfinite(a.rms_px) else None,
         "photographs": len(a.network.images),

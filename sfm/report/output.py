@@ -10,13 +10,14 @@ from pathlib import Path
 
 from sfm.files.whole_files import MANIFEST, refuse_foreign_folder, whole_folder
 from sfm.progress import SILENT, Progress
-from sfm.report.html import render_html
-from sfm.report.overlays import draw_overlays
-from sfm.report.plots import all_plots
-from sfm.report.summary import write_summary
-from sfm.report.tables import write_tables
-from sfm.report.text import text_report
-from sfm.result import StageTime, SurveyResult
+from sfm.report.figures.overlays import draw_overlays
+from sfm.report.figures.plots import all_plots
+from sfm.report.findings.findings import Findings
+from sfm.report.html.report import report_page
+from sfm.report.tables.csv_files import write_tables
+from sfm.report.tables.summary import write_summary
+from sfm.report.text.report import text_report
+from sfm.result import StageTime
 
 MAX_FOLDER_BYTES = 100  # of the name of a survey's folder; disks take 255, endings included
 
@@ -41,7 +42,7 @@ WRITTEN = (
 
 
 def write_result(
-    result: SurveyResult,
+    findings: Findings,
     out: Path,
     *,
     write_colmap: Callable[[Path], None] | None = None,
@@ -52,7 +53,7 @@ def write_result(
     """Write everything that a survey gives into one folder, whole or not at all.
 
     Args:
-        result: the result.
+        findings: the result and what is said of it.
         out: the folder; an unchanged earlier result in it is replaced, anything else in it is an error.
         write_colmap: fills the folder `colmap`, which it is given; None leaves it out.
         finish: is given the folder when all else is in it, and may add log.jsonl.
@@ -68,6 +69,7 @@ def write_result(
     out = Path(out)
     refuse_foreign_folder(out)
     started = time.perf_counter()
+    result = findings.result
     progress.stage("report", len(result.photographs))
     with whole_folder(out, "the result", replaceable=True) as folder:
         if write_colmap is not None:
@@ -78,15 +80,16 @@ def write_result(
             (folder / "overlays").mkdir()
         for overlay in overlays:
             (folder / "overlays" / overlay.file_name).write_bytes(overlay.jpeg)
-        plots = all_plots(result.adjustment, result.length_unit)
+        plots = all_plots(findings)
         (folder / "plots").mkdir()
-        for stem, _, data in plots:
-            (folder / "plots" / f"{stem}.png").write_bytes(data)
-        timed = replace(result, seconds=(*result.seconds, StageTime("report", time.perf_counter() - started)))
+        for plot in plots:
+            (folder / "plots" / f"{plot.stem}.png").write_bytes(plot.png)
+        report_time = StageTime("report", time.perf_counter() - started)
+        timed = replace(findings, result=replace(result, seconds=(*result.seconds, report_time)))
         write_tables(timed, folder)
         write_summary(timed, folder)
         (folder / "report.txt").write_text(text_report(timed), encoding="utf-8")
-        page = render_html(timed, plots, overlays, has_model=write_colmap is not None)
+        page = report_page(timed, plots, overlays, has_model=write_colmap is not None)
         (folder / "report.html").write_text(page, encoding="utf-8")
         if finish is not None:
             finish(folder)
