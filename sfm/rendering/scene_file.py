@@ -174,7 +174,9 @@ def read_scene(path: Path) -> Staging:
         file = _File.model_validate(table)
     except ValidationError as error:
         first = error.errors()[0]
-        raise SurveyFileError(f"{path}: {'.'.join(map(str, first['loc']))}: {first['msg']}") from error
+        raise SurveyFileError(
+            f"{path}: {'.'.join(map(str, first['loc']))}: {first['msg'].removeprefix('Value error, ')}"
+        ) from error
     faces = _faces(file.face)
     family = code_family(file.scene.codes)
     if isinstance(family, TagFamily):
