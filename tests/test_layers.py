@@ -11,7 +11,7 @@ ROOT = Path(__file__).resolve().parents[1]
 LAYERS = (
     (
         *("sfm.conventions", "sfm.errors", "sfm.camera", "sfm.distortion", "sfm.network", "sfm.similarity"),
-        *("sfm.progress", "sfm.executor", "sfm.files", "sfm.kernels", "sfm.photographs"),
+        *("sfm.progress", "sfm.executor", "sfm.faults", "sfm.files", "sfm.kernels", "sfm.photographs"),
     ),
     ("sfm.targets", "sfm.matching", "sfm.orientation", "sfm.adjustment"),
     ("sfm.comparison", "sfm.geometry", "sfm.epochs", "sfm.planning", "sfm.rendering", "sfm.printing"),

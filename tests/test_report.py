@@ -20,6 +20,7 @@ from sfm.adjustment.solve import adjust
 from sfm.cli.console import tell_result
 from sfm.conventions import angles_from_rotation
 from sfm.errors import OutputError
+from sfm.files.whole_files import refuse_foreign_folder
 from sfm.network import Network, ObjectPoints, ScaleBars
 from sfm.report.figures.overlays import USED, draw_photograph, overlay_names
 from sfm.report.figures.plots import all_plots, plan_axes
@@ -28,7 +29,7 @@ from sfm.report.findings.geometry import geometry_of
 from sfm.report.html.page import environment
 from sfm.report.html.report import report_page
 from sfm.report.numbers import finer_unit, significant, to_precision, with_exponent
-from sfm.report.output import WRITTEN, refuse_foreign_folder, write_result
+from sfm.report.output import WRITTEN, write_result
 from sfm.report.tables.csv_files import write_tables
 from sfm.report.tables.summary import summary, write_summary
 from sfm.report.text.lines import WIDTH
@@ -357,7 +358,7 @@ def test_other_peoples_folders_are_not_touched(tmp_path: Path) -> None:
     with pytest.raises(OutputError, match="the folder holds 'file'; --out needs a new or empty folder"):
         refuse_foreign_folder(tmp_path)
     (tmp_path / "file").rename(tmp_path / "summary.json")
-    with pytest.raises(OutputError, match=r"holds no summary.json of an earlier result"):
+    with pytest.raises(OutputError, match=r"holds 'summary.json'; --out needs"):
         refuse_foreign_folder(tmp_path)
 
 

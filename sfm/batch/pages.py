@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 from collections import Counter
@@ -12,7 +13,7 @@ from pathlib import Path
 from sfm.batch.survey import LOGS, SurveyRow
 from sfm.errors import OutputError
 from sfm.files.plain_text import as_plain, csv_text, is_plain
-from sfm.files.whole_files import whole_file
+from sfm.files.whole_files import MANIFEST, read_manifest, refuse_links, sha256_of, whole_file, write_manifest
 from sfm.report.html.page import render
 
 PAGES = ("batch.json", "batch.csv", "index.html")  # the first tells whose they are
@@ -30,32 +31,41 @@ def write_batch_pages(rows: Sequence[SurveyRow], out: Path) -> None:
     """
     names = [field.name for field in fields(SurveyRow)]
     data = {"surveys": [asdict(row) for row in rows], "totals": totals(rows)}
-    texts = (
+    pages = (
         json.dumps(data, indent=2, ensure_ascii=False, allow_nan=False) + "\n",
         csv_text(names, [tuple(asdict(row).values()) for row in rows]),
         render_index(rows, out.name),
     )
-    for name, text in zip(PAGES, texts, strict=True):
+    texts = {name: text.encode() for name, text in zip(PAGES, pages, strict=True)}
+    there = {name: [sha256_of(out / name)] for name in PAGES if (out / name).exists()}
+    # Listed before they are written, beside those that are there: whatever ends the run, they are known.
+    new = {name: hashlib.sha256(text).hexdigest() for name, text in texts.items()}
+    write_manifest(out, {name: [*there.get(name, ()), new[name]] for name in PAGES})
+    for name, text in texts.items():
         with whole_file(out / name) as part:
-            part.write_text(text, encoding="utf-8", newline="")
+            part.write_bytes(text)
 
 
 def refuse_foreign_pages(out: Path) -> None:
-    """Raise OutputError where a folder has files of these names that no batch has written.
+    """Raise OutputError where a folder has files of these names that no batch has written, or a changed one.
 
-    So it does where the path is no text that can stand in them.
+    So it does where the path is no text that can stand in them, or leads through a link.
     """
     if not is_plain(str(out)):
         raise OutputError(f"{as_plain(str(out))}: the path is no plain text; needed another --out")
-    there = [name for name in PAGES if (out / name).exists() or (out / name).is_symlink()]
+    for name in (MANIFEST, *PAGES):
+        refuse_links(out / name)
+    known = read_manifest(out)
     try:
-        found = json.loads((out / PAGES[0]).read_text(encoding="utf-8")) if there else {}
-        ours = not there or (isinstance(found, dict) and {"surveys", "totals"} <= set(found))
-    except (OSError, ValueError, RecursionError):
-        ours = False
-    if not ours:
+        there = {name: sha256_of(out / name) for name in (MANIFEST, *PAGES) if (out / name).exists()}
+    except OSError as error:
+        raise OutputError(f"{out}: the folder cannot be read: {error.strerror}") from error
+    foreign = [name for name, digest in there.items() if digest not in known.get(name, ())]
+    foreign += [] if known.keys() <= {MANIFEST, *PAGES} else [MANIFEST]
+    if foreign:
         raise OutputError(
-            f"{out}: the folder holds '{there[-1]}', which no batch has written; needed another --out"
+            f"{out}: the folder holds '{foreign[-1]}', which no batch has written, or not as it is "
+            "now; needed another --out"
         )
 
 

@@ -25,6 +25,7 @@ from sfm.camera import Camera, project, tangents_from_pixel
 from sfm.conventions import AnyArray, FloatArray, IntArray, angles_from_rotation
 from sfm.errors import GeometryError, KolinearError, OutputError
 from sfm.files.plain_text import csv_text
+from sfm.files.whole_files import make_folder
 from sfm.rendering.area import Lamp, fill_face, paint_mark
 from sfm.rendering.painting_order import painting_order
 from sfm.rendering.scene import ARC, DISC, UNCODED, Optics, Scene
@@ -246,7 +247,7 @@ def write_photographs(staging: Staging, folder: Path) -> None:
     names = [f"t{k + 1:03d}" if code[k] == UNCODED else str(code[k]) for k in range(len(code))]
     angles = np.degrees(angles_from_rotation(staging.rotations))
     try:
-        folder.mkdir(parents=True, exist_ok=True)
+        make_folder(folder)
         with tempfile.TemporaryDirectory(dir=folder, prefix=".part") as part:
             for name, photograph in zip(staging.names, photographs, strict=True):
                 if not cv2.imwrite(

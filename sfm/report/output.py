@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import json
 import re
 import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-from sfm.errors import OutputError
-from sfm.files.whole_files import whole_folder
+from sfm.files.whole_files import MANIFEST, refuse_foreign_folder, whole_folder
 from sfm.progress import SILENT, Progress
 from sfm.report.figures.overlays import draw_overlays
 from sfm.report.figures.plots import all_plots
@@ -39,6 +37,7 @@ WRITTEN = (
     "overlays",
     "plots",
     "log.jsonl",
+    MANIFEST,
 )
 
 
@@ -55,7 +54,7 @@ def write_result(
 
     Args:
         findings: the result and what is said of it.
-        out: the folder; an earlier result in it is replaced, anything else in it is an error.
+        out: the folder; an unchanged earlier result in it is replaced, anything else in it is an error.
         write_colmap: fills the folder `colmap`, which it is given; None leaves it out.
         finish: is given the folder when all else is in it, and may add log.jsonl.
         jobs: photographs drawn at the same time.
@@ -72,7 +71,7 @@ def write_result(
     started = time.perf_counter()
     result = findings.result
     progress.stage("report", len(result.photographs))
-    with whole_folder(out, "the result") as folder:
+    with whole_folder(out, "the result", replaceable=True) as folder:
         if write_colmap is not None:
             (folder / "colmap").mkdir()
             write_colmap(folder / "colmap")
@@ -101,35 +100,3 @@ def folder_name(name: str) -> str:
     """Return the name of the folder of a survey's result: its own, as far as all disks take it."""
     kept = re.sub(r"[^\w.\-]+", "_", name).encode()[:MAX_FOLDER_BYTES].decode(errors="ignore")
     return kept.strip("._-") or "survey"
-
-
-def refuse_foreign_folder(out: Path) -> None:
-    """Raise OutputError unless the folder is absent, empty, or holds an earlier result and nothing else.
-
-    It is called before a survey starts, too, so that nobody waits for a result that has no place.
-    """
-    out = Path(out)
-    if not out.exists() and not out.is_symlink():
-        return
-    if not out.is_dir():
-        raise OutputError(f"{out}: a file is in the way, --out needs a folder")
-    try:
-        names = sorted(path.name for path in out.iterdir())
-        foreign = [name for name in names if name not in WRITTEN]
-        if not foreign and (not names or _is_summary(out / "summary.json")):
-            return
-    except OSError as error:
-        raise OutputError(f"{out}: the folder cannot be read: {error.strerror}") from error
-    found = f"'{foreign[0]}'" if foreign else "no summary.json of an earlier result"
-    raise OutputError(
-        f"{out}: the folder holds {found}; --out needs a new or empty folder or an earlier result"
-    )
-
-
-def _is_summary(path: Path) -> bool:
-    """Whether a file is the summary.json of a result."""
-    try:
-        text = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError):
-        return False
-    return isinstance(text, dict) and {"survey", "images", "points", "observations"} <= text.keys()
