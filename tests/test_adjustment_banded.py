@@ -169,7 +169,7 @@ def test_covariance_of_band_and_pairs_equals_that_of_the_product_of_full_rows(
         network = replace(network, scale_bars=ScaleBars(*ends, np.array([length]), np.array([0.01])))
     a = run(network, truth, covariance=False, tolerance=1e-9)
     if pattern is Pairs:
-        monkeypatch.setattr(iterate, "pattern_of", lambda layout: pairs_of(layout.obs))
+        monkeypatch.setattr(iterate, "pattern_of", lambda layout: pairs_of(layout.observations))
     band = marginal_of(a, datum=Datum(kind))
     monkeypatch.setattr(iterate, "pattern_of", lambda layout: None)
     full = marginal_of(a, datum=Datum(kind))
@@ -286,7 +286,7 @@ def test_nowhere_to_go_ends_as_not_converged_and_bad_start_values_are_refused(
 def test_two_threads_give_the_same_to_the_last_bit(way: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of a network large enough that a second thread takes half of the sums and of the products."""
     if way == "pairs":
-        monkeypatch.setattr(iterate, "pattern_of", lambda layout: pairs_of(layout.obs))
+        monkeypatch.setattr(iterate, "pattern_of", lambda layout: pairs_of(layout.observations))
     elif way == "product":
         monkeypatch.setattr(iterate, "pattern_of", lambda layout: None)
     elif way == "band":

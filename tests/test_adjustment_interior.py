@@ -123,7 +123,9 @@ def test_normal_equations_equal_those_of_differences() -> None:
     for s in range(layout.reduced):
         h = 1e-4 if s < 6 * IMAGES else 1e-3 * max(1e-4, abs(_value(layout, state, s)))
         moved = [
-            residuals(layout.obs, step(layout, state, f * h * np.eye(layout.reduced)[s], none)).ravel()
+            residuals(
+                layout.observations, step(layout, state, f * h * np.eye(layout.reduced)[s], none)
+            ).ravel()
             for f in (-2, -1, 1, 2)
         ]
         J[:, s] = (moved[0] - 8 * moved[1] + 8 * moved[2] - moved[3]) / (12 * h)
@@ -134,7 +136,7 @@ def test_normal_equations_equal_those_of_differences() -> None:
     scale = 1 / np.sqrt(np.diagonal(N))
     S = schur_complement(equations, layout) / equations.parts.scale[:, None] / equations.parts.scale
     assert np.abs((np.triu(S) - np.triu(N)) * scale[:, None] * scale).max() < 1e-8
-    g = 100 * J.T @ residuals(layout.obs, state).ravel()
+    g = 100 * J.T @ residuals(layout.observations, state).ravel()
     assert np.abs((equations.parts.g - g) * scale).max() < 1e-7 * np.abs(g * scale).max()
 
 

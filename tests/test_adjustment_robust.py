@@ -165,7 +165,7 @@ def test_slopes_of_both_estimators_are_the_derivatives_of_psi() -> None:
     size = np.array([0.3, 1.2, 1.7, 3.0, 4.9])
     network, truth = make_network(seed_of("slopes"), images=4, points=10)
     layout, _ = unknowns_of(network, truth, use_control=False)
-    obs = layout.obs
+    obs = layout.observations
     for weights, slopes in ((huber_weights, huber_slopes), (tukey_weights, tukey_slopes)):
 
         def psi(v: FloatArray, weights=weights) -> FloatArray:  # type: ignore[no-untyped-def]
@@ -198,14 +198,14 @@ def test_weights_of_both_estimators() -> None:
     v = np.zeros((len(network.image_points), 2))
     v[:5, 0] = 0.1 * np.array([0.5 * HUBER, 2 * HUBER, TUKEY / 2, 0.999 * TUKEY, 1.001 * TUKEY])
     v[5] = np.nan  # behind its camera
-    huber = huber_weights(layout.obs, v, sigma0=1.0)
-    tukey = tukey_weights(layout.obs, v, sigma0=1.0)
+    huber = huber_weights(layout.observations, v, sigma0=1.0)
+    tukey = tukey_weights(layout.observations, v, sigma0=1.0)
     assert huber[:2] == pytest.approx([1.0, 0.5])
     assert tukey[[2, 4, 5, 6]] == pytest.approx([0.5625, 0.0, 0.0, 1.0])
     assert 0 < tukey[3] < 1e-5 and huber[5] == 0
-    noise = residuals(layout.obs, state)
+    noise = residuals(layout.observations, state)
     used = np.ones(len(v), dtype=bool)
-    assert robust_scale(layout.obs, noise, used, freedom=1.0) == pytest.approx(
+    assert robust_scale(layout.observations, noise, used, freedom=1.0) == pytest.approx(
         1, abs=4 * 1.17 / np.sqrt(2 * 40)
     )
 

@@ -63,7 +63,7 @@ def adjust_separately(
             "separate adjustment: scale bars and weighted unknowns are for the simultaneous one"
         )
     weight = start_weights(layout, state)
-    vPv = float(sum_of_squares(layout.obs, state, weight))
+    vPv = float(sum_of_squares(layout.observations, state, weight))
     space = new_space(layout)
     for number in range(1, max_rounds + 1):
         before = vPv
@@ -90,7 +90,7 @@ def _orientations(blocks, layout: Unknowns) -> tuple[FloatArray, FloatArray]:  #
     g[: 6 * m] = blocks.g.ravel()
     for i in range(m):
         U[6 * i : 6 * i + 6, 6 * i : 6 * i + 6] = np.triu(blocks.U[i])
-        column = layout.interior_column[layout.obs.camera[i]]
+        column = layout.interior_column[layout.observations.camera[i]]
         U[6 * i : 6 * i + 6, column] = blocks.C[i, :, : len(column)]
     for a, column in enumerate(layout.interior_column):
         f = len(column)
@@ -111,7 +111,7 @@ def _shorten(
     share = 1.0
     while share >= SHORTEST:
         moved = step(layout, state, share * reduced, share * points)
-        reached = float(sum_of_squares(layout.obs, moved, weight))
+        reached = float(sum_of_squares(layout.observations, moved, weight))
         if reached <= vPv:
             return moved, reached
         share /= 2

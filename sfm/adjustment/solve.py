@@ -148,7 +148,7 @@ class _Run:
 
     def minimise(self, optimum: Optimum, weight: FloatArray) -> tuple[Optimum, FloatArray]:
         """Return the optimum with image points that were behind their camera at the start back in."""
-        ready = self.problem.layout.active & ~behind_camera(self.problem.layout.obs, optimum.state)
+        ready = self.problem.layout.active & ~behind_camera(self.problem.layout.observations, optimum.state)
         if (ready & (weight == 0)).any():
             weight = np.where(ready, 1.0, weight)
             optimum = self._iterate(optimum.state, weight, self.method)
@@ -198,8 +198,8 @@ def _sound(run: _Run, state: State, weight: FloatArray) -> tuple[Optimum, FloatA
     layout = run.problem.layout
 
     def spread(at: State) -> float:
-        v = residuals(layout.obs, at)
-        return robust_scale(layout.obs, v, layout.active & np.isfinite(v).all(axis=1), freedom=1.0)
+        v = residuals(layout.observations, at)
+        return robust_scale(layout.observations, v, layout.active & np.isfinite(v).all(axis=1), freedom=1.0)
 
     try:
         (optimum, plain), begun = _plain(run, state, weight), None
@@ -235,10 +235,16 @@ def _snoop_all(run: _Run, optimum: Optimum, weight: FloatArray, alpha: float) ->
         redundancy = run.redundancy(optimum, weight)
         if redundancy < 2:
             break
-        v = residuals(layout.obs, optimum.state)
+        v = residuals(layout.observations, optimum.state)
         complement = hat_complement(optimum, layout, cofactors(optimum, layout), weight)
         out, back = snoop(
-            layout.obs, v, complement, weight > 0, vPv=optimum.vPv, redundancy=redundancy, alpha=alpha
+            layout.observations,
+            v,
+            complement,
+            weight > 0,
+            vPv=optimum.vPv,
+            redundancy=redundancy,
+            alpha=alpha,
         )
         back &= layout.active & ~returned
         if not (out.any() or back.any()):
@@ -264,13 +270,13 @@ def _reweight(
 ) -> tuple[Optimum, FloatArray]:
     """Return the optimum of an M-estimator by reweighting; a scale from the median goes with every round."""
     layout = run.problem.layout
-    ready = layout.active & ~behind_camera(layout.obs, optimum.state)
+    ready = layout.active & ~behind_camera(layout.observations, optimum.state)
     count = 2 * int(ready.sum()) + run.problem.weighted.count
     freedom = run.redundancy(optimum, ready.astype(float)) / max(count, 1)
     for _ in range(REWEIGHTINGS):
-        v = residuals(layout.obs, optimum.state)
-        sigma0 = robust_scale(layout.obs, v, ready & np.isfinite(v).all(axis=1), freedom=freedom)
-        new = np.where(ready, weights(layout.obs, v, sigma0=sigma0), 0.0)
+        v = residuals(layout.observations, optimum.state)
+        sigma0 = robust_scale(layout.observations, v, ready & np.isfinite(v).all(axis=1), freedom=freedom)
+        new = np.where(ready, weights(layout.observations, v, sigma0=sigma0), 0.0)
         change = float(np.abs(new - weight).max())
         weight = new
         optimum = run.again(optimum, weight)
@@ -296,12 +302,12 @@ def _result(
     redundancy = run.redundancy(optimum, weight)
     observations = 2 * int((weight > 0).sum()) + run.problem.weighted.count
     sigma0 = float(np.sqrt(optimum.vPv / redundancy)) if redundancy > 0 else float("nan")
-    v = residuals(layout.obs, optimum.state)
+    v = residuals(layout.observations, optimum.state)
     factor = 1.0
     if slopes is not None and redundancy > 0:
         factor = inflation(
-            layout.obs, v, weight, slopes(weight),
-            vPv=optimum.vPv, observations=observations, redundancy=redundancy,
+            layout.observations, v, weight, slopes(weight),
+            vPv=optimum.vPv, count=observations, redundancy=redundancy,
         )  # fmt: skip
         sigma0 *= factor
     k, n, m = len(weight), len(network.points), len(network.images)
@@ -320,10 +326,12 @@ def _result(
         of_bars[layout.bars] = redundancy_of_bars(run.problem.weighted, layout, optimum.state, kept)
     if Q is not None and Q.has_cross:
         complement = hat_complement(optimum, layout, Q, weight)
-        numbers = numbers_of(complement, layout.obs.whitening)
+        numbers = numbers_of(complement, layout.observations.whitening)
         numbers[weight == 0] = np.nan
         numbers = np.take(numbers, back, axis=0)
-        standardised = np.take(standardised_residuals(v, complement, layout.obs.whitening), back, axis=0)
+        standardised = np.take(
+            standardised_residuals(v, complement, layout.observations.whitening), back, axis=0
+        )
     return Adjustment(
         network=network,
         estimate=estimate_of(optimum.state, estimate),

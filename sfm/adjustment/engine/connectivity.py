@@ -44,9 +44,9 @@ class Order:
 def pattern_of(layout: Unknowns) -> Order | Pairs | None:
     """Return the order of the photographs for a band, or the places of rays for a full matrix that is summed
     pair by pair; None where the product of full rows is less work."""
-    obs = layout.obs
-    m = len(obs.camera)
-    rays = np.diff(obs.start).astype(float)
+    observations = layout.observations
+    m = len(observations.camera)
+    rays = np.diff(observations.start).astype(float)
     pairs = float((rays * (rays + 1) / 2).sum())
     summed = PAIR_OPERATIONS * pairs / PAIR_RATE
     product = 3.0 * len(rays) * layout.reduced**2 / PRODUCT_RATE
@@ -56,25 +56,25 @@ def pattern_of(layout: Unknowns) -> Order | Pairs | None:
     if m <= SMALL:
         return None
     if least > full:
-        return pairs_of(obs) if summed < product else None
-    rows, columns = np.nonzero(_joined(obs, np.zeros((m, m), dtype=np.uint8)))
+        return pairs_of(observations) if summed < product else None
+    rows, columns = np.nonzero(_joined(observations, np.zeros((m, m), dtype=np.uint8)))
     graph = csr_matrix((np.ones(len(rows), dtype=np.int8), (rows, columns)), shape=(m, m))
     place = np.empty(m, dtype=np.int64)
     place[reverse_cuthill_mckee(graph, symmetric_mode=True)] = np.arange(m)
     width = int(np.abs(place[rows] - place[columns]).max(initial=0))
     banded = summed + 6.0 * m * (6.0 * width + 6.0) ** 2 / BAND_RATE
     if banded > full:
-        return pairs_of(obs) if summed < product else None
+        return pairs_of(observations) if summed < product else None
     earliest = np.full(len(rays), m)
-    np.minimum.at(earliest, obs.point, place[obs.image])
+    np.minimum.at(earliest, observations.point, place[observations.image])
     return Order(place, np.argsort(earliest, kind="stable"), width)
 
 
 @njit(cache=True)
-def _joined(obs, joined):  # type: ignore[no-untyped-def]
+def _joined(observations, joined):  # type: ignore[no-untyped-def]
     """Return 1 where two photographs share an object point, (m, m)."""
-    for j in range(len(obs.start) - 1):
-        for s in range(obs.start[j], obs.start[j + 1]):
-            for t in range(obs.start[j], obs.start[j + 1]):
-                joined[obs.image[s], obs.image[t]] = 1
+    for j in range(len(observations.start) - 1):
+        for s in range(observations.start[j], observations.start[j + 1]):
+            for t in range(observations.start[j], observations.start[j + 1]):
+                joined[observations.image[s], observations.image[t]] = 1
     return joined

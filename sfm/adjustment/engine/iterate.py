@@ -279,7 +279,7 @@ def _approach(
 def total(problem: Problem, state: State, weight: FloatArray) -> float:
     """Return v'Pv of image points and observed unknowns; infinite if a point is behind a camera."""
     p = problem
-    return sum_of_squares(p.layout.obs, state, weight) + weighted_vPv(p.weighted, p.layout, state)
+    return sum_of_squares(p.layout.observations, state, weight) + weighted_vPv(p.weighted, p.layout, state)
 
 
 def _line_search(

@@ -51,9 +51,9 @@ def _mapped_to_zero(optimum: Optimum, layout: Unknowns, H: FloatArray) -> BoolAr
     NH[:first] = (b.U @ H[:first].reshape(len(b.U), 6, d)).reshape(first, d) + parts.border @ H[first:]
     NH[first:] = parts.border.T @ H[:first] + parts.corner @ H[first:]
     through = np.empty((len(b.y), 3, d))
-    times_reduced(layout.obs, b, H, through)
+    times_reduced(layout.observations, b, H, through)
     np.negative(through, out=through)
-    times_points(layout.obs, b, through, NH)
+    times_points(layout.observations, b, through, NH)
     return np.asarray(np.linalg.norm(parts.scale[:, None] * NH, axis=0) < MAPPED_TO_ZERO)
 
 

@@ -115,7 +115,7 @@ def _matrix(equations: Equations, layout: Unknowns, order: Order, rows: IntArray
     stride = A.shape[1] - 1  # element (r, c) of the matrix at c stride + r
 
     def add(begin: int, end: int) -> None:
-        _add_pairs(layout.obs, b.U, b.Y, b.Z, order.place, order.points, begin, end, flat, stride, C)
+        _add_pairs(layout.observations, b.U, b.Y, b.Z, order.place, order.points, begin, end, flat, stride, C)
 
     half = len(b.U) // 2
     at_once(lambda: add(0, half), lambda: add(half, len(b.U)))
@@ -202,7 +202,7 @@ def _times(matrix: BandMatrix, rows: IntArray, V: FloatArray) -> FloatArray:
 
 
 @kernel
-def _add_pairs(obs, U, Y, Z, place, points, begin, end, flat, stride, C):  # type: ignore[no-untyped-def]
+def _add_pairs(observations, U, Y, Z, place, points, begin, end, flat, stride, C):  # type: ignore[no-untyped-def]
     """Add U - Y Y' of photographs to the band and -Y Z of interior unknowns to the border C.
 
     Takes the columns of the photographs in places begin to end, so that others can be taken at the same time.
@@ -214,13 +214,13 @@ def _add_pairs(obs, U, Y, Z, place, points, begin, end, flat, stride, C):  # typ
                 for p in range(q, 6):
                     flat[(c + q) * stride + c + p] += U[i, p, q]
     for j in points:
-        for s in range(obs.start[j], obs.start[j + 1]):
-            own = place[obs.image[s]]
+        for s in range(observations.start[j], observations.start[j + 1]):
+            own = place[observations.image[s]]
             if begin <= own < end:
                 _add_border(6 * own, Y, s, Z, j, C)
                 _add_triangle(flat, 6 * own, stride, Y, s, s)
-            for t in range(obs.start[j], s):
-                other = place[obs.image[t]]
+            for t in range(observations.start[j], s):
+                other = place[observations.image[t]]
                 if begin <= min(own, other) < end:
                     if other < own:
                         subtract_pair(flat, 6 * other * stride + 6 * own, stride, Y, t, s)

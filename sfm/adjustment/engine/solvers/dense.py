@@ -123,7 +123,7 @@ def rows_of(
     space: FloatArray = np.empty((3 * points, width), dtype=dtype)
     for first in range(begin, end, points):
         rows = space[: 3 * min(points, end - first)]
-        _fill(layout.obs, blocks.Y, blocks.Z, scale, first, rows)
+        _fill(layout.observations, blocks.Y, blocks.Z, scale, first, rows)
         yield first, rows
 
 
@@ -145,7 +145,7 @@ def schur_complement(
         for _, rows in rows_of(b, layout, parts.scale, dtype):
             _subtract_square(rows, product, S)
     else:
-        subtract_squares(pairs, layout.obs, b.Y, b.Z, S)
+        subtract_squares(pairs, layout.observations, b.Y, b.Z, S)
         S *= parts.scale
         S *= parts.scale[:, None]
     _add_blocks(b.U, parts.border, parts.corner, parts.scale, 1 + equations.damping, S.T)
@@ -174,13 +174,13 @@ def _subtract_square(rows: FloatArray, product: FloatArray, S: FloatArray) -> No
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _fill(obs, Y, Z, scale, first, rows):  # type: ignore[no-untyped-def]
-    start = 6 * len(obs.camera)
+def _fill(observations, Y, Z, scale, first, rows):  # type: ignore[no-untyped-def]
+    start = 6 * len(observations.camera)
     for h in range(len(rows) // 3):
         j = first + h
         rows[3 * h : 3 * h + 3] = 0.0
-        for o in range(obs.start[j], obs.start[j + 1]):
-            c = 6 * obs.image[o]
+        for o in range(observations.start[j], observations.start[j + 1]):
+            c = 6 * observations.image[o]
             for p in range(3):
                 for q in range(6):
                     rows[3 * h + p, c + q] += Y[o, p, q] * scale[c + q]

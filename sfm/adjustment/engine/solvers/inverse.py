@@ -75,9 +75,9 @@ def _of_full(b: Blocks, factor: Factor, layout: Unknowns, cross: bool) -> Invers
     YQ = np.empty((len(b.Y) if wanted else 0, 3, 6))
     YQ_border = np.empty((n if wanted else 0, 3, layout.reduced - first))
     if factor.pairs is not None:
-        times_inverse(factor.pairs, layout.obs, b.Y, Q.T, b.Z, YQ)
-        times_reduced(layout.obs, b, np.ascontiguousarray(Q[:, first:]), YQ_border)
-        _core(layout.obs, YQ, b.Y, YQ_border, b.Z, core)
+        times_inverse(factor.pairs, layout.observations, b.Y, Q.T, b.Z, YQ)
+        times_reduced(layout.observations, b, np.ascontiguousarray(Q[:, first:]), YQ_border)
+        _core(layout.observations, YQ, b.Y, YQ_border, b.Z, core)
     else:
         half = n // 2 if layout.reduced**2 >= HALVED else n
 
@@ -86,7 +86,7 @@ def _of_full(b: Blocks, factor: Factor, layout: Unknowns, cross: bool) -> Invers
                 own = slice(start, start + len(rows) // 3)
                 if cross:
                     rowsQ = rows @ Q
-                    _pick(layout.obs, rowsQ, start, YQ, YQ_border)
+                    _pick(layout.observations, rowsQ, start, YQ, YQ_border)
                     _core_of_rows(rowsQ, rows, core[own])
                 else:
                     white = _times_triangle(rows, W)
@@ -135,7 +135,7 @@ def _of_band(b: Blocks, factor: BandFactor, layout: Unknowns, cross: bool) -> In
     core, YQ, YQ_border = np.zeros((n, 3, 3)), np.empty((len(b.Y), 3, 6)), np.empty((n, 3, border))
     _diagonal_blocks(Z, place, X, XQ, exterior)
     space = np.empty((3, border))
-    _sum_pairs(layout.obs, place, factor.points, b.Y, b.Z, Z, X, Q, space, core, YQ, YQ_border)
+    _sum_pairs(layout.observations, place, factor.points, b.Y, b.Z, Z, X, Q, space, core, YQ, YQ_border)
     if not cross:
         YQ, YQ_border = YQ[:0], YQ_border[:0]
     return Inverse(exterior, mixed, Q, core, YQ, YQ_border)
@@ -150,21 +150,21 @@ def _mirror(Q):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _pick(obs, products, start, YQ, YQ_border):  # type: ignore[no-untyped-def]
+def _pick(observations, products, start, YQ, YQ_border):  # type: ignore[no-untyped-def]
     """Take the columns of the photographs that see each point, and those of the border."""
-    first = 6 * len(obs.camera)
+    first = 6 * len(observations.camera)
     for h in range(len(products) // 3):
         j = start + h
         for p in range(3):
-            for o in range(obs.start[j], obs.start[j + 1]):
+            for o in range(observations.start[j], observations.start[j + 1]):
                 for q in range(6):
-                    YQ[o, p, q] = products[3 * h + p, 6 * obs.image[o] + q]
+                    YQ[o, p, q] = products[3 * h + p, 6 * observations.image[o] + q]
             for q in range(YQ_border.shape[2]):
                 YQ_border[j, p, q] = products[3 * h + p, first + q]
 
 
 @kernel
-def _core(obs, YQ, Y, YQ_border, Z, core):  # type: ignore[no-untyped-def]
+def _core(observations, YQ, Y, YQ_border, Z, core):  # type: ignore[no-untyped-def]
     """Fill Y'Q Y of each object point."""
     for j in range(len(core)):
         for p in range(3):
@@ -173,7 +173,7 @@ def _core(obs, YQ, Y, YQ_border, Z, core):  # type: ignore[no-untyped-def]
                 for c in range(Z.shape[2]):
                     total += YQ_border[j, p, c] * Z[j, q, c]
                 core[j, p, q] = total
-        for o in range(obs.start[j], obs.start[j + 1]):
+        for o in range(observations.start[j], observations.start[j + 1]):
             for p in range(3):
                 for q in range(3):
                     for r in range(6):
@@ -201,15 +201,15 @@ def _diagonal_blocks(Z, place, X, XQ, exterior):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _sum_pairs(obs, place, points, Y, Zp, Z, X, Q, uQ, core, YQ, YQ_border):  # type: ignore[no-untyped-def]
+def _sum_pairs(observations, place, points, Y, Zp, Z, X, Q, uQ, core, YQ, YQ_border):  # type: ignore[no-untyped-def]
     """Fill Y'S^-1 and Y'S^-1 Y of each object point; Zp are the rows Y' of the interior unknowns."""
     inner = Zp.shape[2]
     for j in points:
         for p in range(3):  # u Q with u = Y'X - Zp
             for c in range(len(Q)):
                 YQ_border[j, p, c] = -Zp[j, p, c] if c < inner else 0.0
-        for t in range(obs.start[j], obs.start[j + 1]):
-            column = 6 * place[obs.image[t]]
+        for t in range(observations.start[j], observations.start[j + 1]):
+            column = 6 * place[observations.image[t]]
             for p in range(3):
                 for q in range(6):
                     for c in range(len(Q)):
@@ -220,16 +220,16 @@ def _sum_pairs(obs, place, points, Y, Zp, Z, X, Q, uQ, core, YQ, YQ_border):  # 
                 for s in range(len(Q)):
                     total += YQ_border[j, p, s] * Q[s, c]
                 uQ[p, c] = total
-        for s in range(obs.start[j], obs.start[j + 1]):
-            row = 6 * place[obs.image[s]]
+        for s in range(observations.start[j], observations.start[j + 1]):
+            row = 6 * place[observations.image[s]]
             for p in range(3):
                 for q in range(6):
                     total = 0.0
                     for c in range(len(Q)):
                         total += uQ[p, c] * X[row + q, c]
                     YQ[s, p, q] = total
-            for t in range(obs.start[j], obs.start[j + 1]):
-                column = 6 * place[obs.image[t]]
+            for t in range(observations.start[j], observations.start[j + 1]):
+                column = 6 * place[observations.image[t]]
                 for r in range(6):
                     t0, t1, t2 = Y[t, 0, r], Y[t, 1, r], Y[t, 2, r]
                     for q in range(6):
