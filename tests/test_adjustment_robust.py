@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from synthetic import make_network, seed_of
 
-from sfm.adjustment import solve
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.engine.collinearity import residuals
 from sfm.adjustment.engine.unknowns import unknowns_of
+from sfm.adjustment.quality import rejection
 from sfm.adjustment.quality.reliability import tau_critical
 from sfm.adjustment.quality.robust import (
     HUBER,
@@ -259,7 +259,7 @@ def test_exchanged_names_are_rejected_though_they_bend_the_network(photographs: 
 def test_an_adjustment_that_gross_errors_break_is_begun_again(monkeypatch: pytest.MonkeyPatch) -> None:
     network, truth = make_network(seed_of("broken"), images=10, points=30)
     clean = adjust(network, truth, datum=FREE, reject="tau", alpha=1e-5)
-    monkeypatch.setattr(solve, "_plain", refuse)
+    monkeypatch.setattr(rejection, "_plain", refuse)
     again = adjust(network, truth, datum=FREE, reject="tau", alpha=1e-5)
     assert again.converged
     np.testing.assert_array_equal(again.rejected, clean.rejected)
@@ -269,7 +269,7 @@ def test_an_adjustment_that_gross_errors_break_is_begun_again(monkeypatch: pytes
 def test_snooping_keeps_the_last_round_that_could_be_solved(monkeypatch: pytest.MonkeyPatch) -> None:
     network, truth, _ = spoiled(seed_of("last round"), 0.05, 50.0)
     plain = adjust(network, truth, datum=FREE, reject="none", tolerance=1e-3)
-    monkeypatch.setattr(solve._Run, "again", once_more(solve._Run.again))
+    monkeypatch.setattr(rejection.Run, "again", once_more(rejection.Run.again))
     a = adjust(network, truth, datum=FREE, alpha=1e-5)
     assert a.rejected.sum() > 0
     assert a.vPv < plain.vPv

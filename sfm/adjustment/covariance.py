@@ -13,13 +13,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sfm.adjustment.datum import Datum, ResolvedDatum
-from sfm.adjustment.engine.accumulate import times_points
 from sfm.adjustment.engine.cofactors import Cofactors, cofactors, marginal_covariance, without_held
 from sfm.adjustment.engine.iterate import Optimum, optimum_at, problem_of
 from sfm.adjustment.engine.local_frame import centroid_of, shifted
 from sfm.adjustment.engine.motions import motions_of
 from sfm.adjustment.engine.normals import solve_lower
 from sfm.adjustment.engine.observed_unknowns import Weighted, weighted_of
+from sfm.adjustment.engine.products import times_points
 from sfm.adjustment.engine.unknowns import Unknowns, unknowns_of
 from sfm.adjustment.quality.rank import reduced_names
 from sfm.adjustment.result import Adjustment

@@ -35,7 +35,7 @@ class Blocks(NamedTuple):
     L: FloatArray  # Cholesky factors of V; unit matrix for kept points, (n, 3, 3)
     y: FloatArray  # L^-1 gp; 0 for kept points, (n, 3)
     Y: FloatArray  # Y' of each image point by X0, w of its photograph; 0 for kept points, (k, 3, 6)
-    Z: FloatArray  # Y' of each object point by all interior unknowns; 0 for kept points, (n, 3, i)
+    Y_interior: FloatArray  # Y' of each object point by all interior unknowns; 0 for kept points, (n, 3, i)
     Yy: FloatArray  # Y y, what the right side is reduced by, (reduced,)
     K: FloatArray  # kept points by all reduced unknowns, (3 s, reduced)
     held: IntArray  # 1 where a direction of a point had to be held, (n,)
@@ -52,7 +52,7 @@ class Sums(NamedTuple):
     gi: FloatArray
     V: FloatArray
     gp: FloatArray
-    Z: FloatArray
+    Y_interior: FloatArray
     A: FloatArray  # derivatives and residuals of the image points of one photograph
 
 
@@ -82,7 +82,7 @@ def add_photographs(
     """
     sums.D[:] = 0.0
     sums.gi[:] = 0.0
-    sums.Z[:] = 0.0
+    sums.Y_interior[:] = 0.0
     vPv = 0.0
     for i in range(sums.first, sums.end):
         a = observations.camera[i]
@@ -168,7 +168,7 @@ def _add_to_points(
             x, y = sums.A[row], sums.A[row + 1]
             row += 2
             x0, x1, x2, y0, y1, y2 = x[0], x[1], x[2], y[0], y[1], y[2]
-            V, gp, Y, Z = sums.V[j], sums.gp[j], blocks.Y[o], sums.Z[j]
+            V, gp, Y, Yi = sums.V[j], sums.gp[j], blocks.Y[o], sums.Y_interior[j]
             for q in range(6):
                 Y[0, q] = -(x0 * x[q] + y0 * y[q])
                 Y[1, q] = -(x1 * x[q] + y1 * y[q])
@@ -186,9 +186,9 @@ def _add_to_points(
             for q in range(f):
                 c = observations.free_column[a, q] - first
                 u, v = x[RESIDUAL + 1 + q], y[RESIDUAL + 1 + q]
-                Z[0, c] -= x0 * u + y0 * v
-                Z[1, c] -= x1 * u + y1 * v
-                Z[2, c] -= x2 * u + y2 * v
+                Yi[0, c] -= x0 * u + y0 * v
+                Yi[1, c] -= x1 * u + y1 * v
+                Yi[2, c] -= x2 * u + y2 * v
             for q in range(6):
                 if not exterior_free[i, q]:
                     Y[0, q] = Y[1, q] = Y[2, q] = 0.0
@@ -227,8 +227,8 @@ def eliminate_points(
                     V[p, q] = V[q, p] = 0.0
                 V[p, p] = 1.0
                 gp[p] = 0.0
-                for q in range(blocks.Z.shape[2]):
-                    blocks.Z[j, p, q] = 0.0
+                for q in range(blocks.Y_interior.shape[2]):
+                    blocks.Y_interior[j, p, q] = 0.0
                 for o in range(observations.start[j], observations.start[j + 1]):
                     for q in range(6):
                         blocks.Y[o, p, q] = 0.0
@@ -241,7 +241,7 @@ def eliminate_points(
         y[2] = (gp[2] - L[2, 0] * y[0] - L[2, 1] * y[1]) / L[2, 2]
         for o in range(observations.start[j], observations.start[j + 1]):
             _forward(j, blocks.L, blocks.y, blocks.Y[o], blocks.Yy, 6 * observations.image[o])
-        _forward(j, blocks.L, blocks.y, blocks.Z[j], blocks.Yy, 6 * len(observations.camera))
+        _forward(j, blocks.L, blocks.y, blocks.Y_interior[j], blocks.Yy, 6 * len(observations.camera))
 
 
 @inlined
@@ -256,9 +256,9 @@ def _keep(j: int, row: int, observations: Observations, kept_start: int, blocks:
             for q in range(6):
                 blocks.K[row + p, 6 * observations.image[o] + q] += blocks.Y[o, p, q]
                 blocks.Y[o, p, q] = 0.0
-        for c in range(blocks.Z.shape[2]):
-            blocks.K[row + p, first + c] = blocks.Z[j, p, c]
-            blocks.Z[j, p, c] = 0.0
+        for c in range(blocks.Y_interior.shape[2]):
+            blocks.K[row + p, first + c] = blocks.Y_interior[j, p, c]
+            blocks.Y_interior[j, p, c] = 0.0
         for q in range(3):
             blocks.K[row + p, kept_start + row + q] = blocks.V[j, p, q]
             blocks.L[j, p, q] = 1.0 if p == q else 0.0
@@ -301,35 +301,6 @@ def _forward(j: int, L: FloatArray, y: FloatArray, W: FloatArray, Yy: FloatArray
 
 
 @kernel
-def step_points(
-    observations: Observations, point_free: BoolArray, blocks: Blocks, dx: FloatArray, dX: FloatArray
-) -> None:
-    """Fill the step of the object points dX = -L^-T (y + Y'dx), dx of the reduced unknowns; 0 where fixed."""
-    first = 6 * len(observations.camera)
-    for j in range(len(dX)):
-        h0, h1, h2 = blocks.y[j, 0], blocks.y[j, 1], blocks.y[j, 2]
-        for q in range(blocks.Z.shape[2]):
-            d = dx[first + q]
-            h0 += blocks.Z[j, 0, q] * d
-            h1 += blocks.Z[j, 1, q] * d
-            h2 += blocks.Z[j, 2, q] * d
-        for o in range(observations.start[j], observations.start[j + 1]):
-            Y, column = blocks.Y[o], 6 * observations.image[o]
-            for q in range(6):
-                d = dx[column + q]
-                h0 += Y[0, q] * d
-                h1 += Y[1, q] * d
-                h2 += Y[2, q] * d
-        L = blocks.L[j]
-        z = -h2 / L[2, 2]
-        y = (-h1 - L[2, 1] * z) / L[1, 1]
-        x = (-h0 - L[1, 0] * y - L[2, 0] * z) / L[0, 0]
-        dX[j, 0] = x if point_free[j, 0] else 0.0
-        dX[j, 1] = y if point_free[j, 1] else 0.0
-        dX[j, 2] = z if point_free[j, 2] else 0.0
-
-
-@kernel
 def gather_interior(
     observations: Observations, blocks: Blocks, border: FloatArray, corner: FloatArray, g: FloatArray
 ) -> None:
@@ -347,42 +318,3 @@ def gather_interior(
             g[first + row] += blocks.gi[a, p]
             for q in range(observations.free_count[a]):
                 corner[row, observations.free_column[a, q] - first] += blocks.D[a, p, q]
-
-
-@kernel
-def times_reduced(observations: Observations, blocks: Blocks, x: FloatArray, out: FloatArray) -> None:
-    """Fill out with Y' x: x of the reduced unknowns, (reduced, d), out of the object points, (n, 3, d)."""
-    first = 6 * len(observations.camera)
-    out[:] = 0.0
-    for j in range(len(out)):
-        for p in range(3):
-            for q in range(blocks.Z.shape[2]):
-                z = blocks.Z[j, p, q]
-                for e in range(x.shape[1]):
-                    out[j, p, e] += z * x[first + q, e]
-        for o in range(observations.start[j], observations.start[j + 1]):
-            column = 6 * observations.image[o]
-            for p in range(3):
-                for q in range(6):
-                    y = blocks.Y[o, p, q]
-                    for e in range(x.shape[1]):
-                        out[j, p, e] += y * x[column + q, e]
-
-
-@kernel
-def times_points(observations: Observations, blocks: Blocks, h: FloatArray, out: FloatArray) -> None:
-    """Add Y h to out: h of the object points, (n, 3, d), out of the reduced unknowns, (reduced, d)."""
-    first = 6 * len(observations.camera)
-    for j in range(len(h)):
-        for p in range(3):
-            for q in range(blocks.Z.shape[2]):
-                z = blocks.Z[j, p, q]
-                for e in range(h.shape[2]):
-                    out[first + q, e] += z * h[j, p, e]
-        for o in range(observations.start[j], observations.start[j + 1]):
-            column = 6 * observations.image[o]
-            for p in range(3):
-                for q in range(6):
-                    y = blocks.Y[o, p, q]
-                    for e in range(h.shape[2]):
-                        out[column + q, e] += y * h[j, p, e]

@@ -14,11 +14,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sfm.adjustment.engine.accumulate import times_points, times_reduced
 from sfm.adjustment.engine.collinearity import Observations, State, Workspace, collinearity, new_workspace
 from sfm.adjustment.engine.iterate import Optimum
 from sfm.adjustment.engine.normals import solve_lower, solve_transposed
-from sfm.adjustment.engine.solvers.inverse import Inverse, inverse_of
+from sfm.adjustment.engine.products import times_points, times_reduced
+from sfm.adjustment.engine.solvers.protocol import Inverse
 from sfm.adjustment.engine.unknowns import Unknowns, angle_jacobian
 from sfm.adjustment.result import Covariance
 from sfm.conventions import FloatArray
@@ -57,7 +57,7 @@ def cofactors(optimum: Optimum, layout: Unknowns, *, cross: bool = True) -> Cofa
         cross: whether those between points and photographs are wanted; empty otherwise.
     """
     b = optimum.equations.blocks
-    q = inverse_of(optimum.equations, optimum.factor, layout, cross=cross)
+    q = optimum.factor.inverse(b, cross=cross)
     first = 6 * len(b.U)
     limiting = _inverse_of_squares(b.L)
     points = limiting + _twice_solved(b.L, q.core)

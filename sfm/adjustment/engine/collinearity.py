@@ -128,7 +128,8 @@ def collinearity(
     for s in range(observations.interior[a]):  # all, not only free ones: gathering them here would cost more
         workspace.A[0, 6 + s] = f00 * workspace.Jp[0, s]
         workspace.A[1, 6 + s] = f10 * workspace.Jp[0, s] + f11 * workspace.Jp[1, s]
-    return W < 0.0
+    in_front: bool = W < 0.0
+    return in_front
 
 
 def sum_of_squares(observations: Observations, state: State, weight: FloatArray) -> float:
@@ -187,7 +188,8 @@ def _residual(o: int, observations: Observations, state: State, workspace: Works
         workspace.Ju,
         workspace.Jp,
     )
-    return W < 0.0  # one way out: with an early return the compiler keeps the unused derivatives
+    in_front: bool = W < 0.0
+    return in_front  # one way out: with an early return the compiler keeps the unused derivatives
 
 
 def behind_camera(observations: Observations, state: State) -> BoolArray:

@@ -3,7 +3,7 @@
 With N = (U W; W' V), V block diagonal with one L L' per object point, and Y = W L^-T, the reduced
 normal equations are (U - Y Y') dx = -(g - Y y), y = L^-1 g_points. Y is stored by image points. Unknowns are
 scaled so that the diagonal of U is 1. Y Y' is summed as one dense product or pair by pair of rays into a
-band, whichever is less work (`sfm.adjustment.engine.connectivity`).
+band, whichever is less work (`sfm.adjustment.engine.solvers.choice`).
 
 Source: Brown (1958, 1976); Mikhail, Bethel and McGlone (2001), sec. 5.8; Foerstner and Wrobel (2016),
 sec. 15.2.
@@ -22,11 +22,11 @@ from sfm.adjustment.engine.accumulate import (
     add_photographs,
     eliminate_points,
     gather_interior,
-    step_points,
 )
 from sfm.adjustment.engine.collinearity import State, new_workspace
 from sfm.adjustment.engine.observed_unknowns import Weighted, WeightedTerms, point_terms, weighted_terms
 from sfm.adjustment.engine.ordering import by_photograph
+from sfm.adjustment.engine.products import step_points
 from sfm.adjustment.engine.unknowns import Unknowns
 from sfm.conventions import FloatArray
 from sfm.kernels.threads import at_once
@@ -184,14 +184,14 @@ def new_space(layout: Unknowns) -> Space:
         L=np.empty((n, 3, 3)),
         y=np.empty((n, 3)),
         Y=np.empty((k, 3, 6)),
-        Z=np.empty((n, 3, layout.kept_start - 6 * m)),
+        Y_interior=np.empty((n, 3, layout.kept_start - 6 * m)),
         Yy=np.empty(layout.reduced),
         K=np.zeros((3 * len(layout.kept), layout.reduced)),
         held=np.zeros(n, dtype=np.int64),
         order=order,
         first=first,
     )
-    sums = Sums(0, m, b.D, b.gi, b.V, b.gp, b.Z, np.zeros((2 * most, width)))
+    sums = Sums(0, m, b.D, b.gi, b.V, b.gp, b.Y_interior, np.zeros((2 * most, width)))
     if k < HALVED:
         return Space(b, (sums,))
     own = (np.zeros_like(part) for part in sums[2:])

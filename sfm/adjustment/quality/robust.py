@@ -158,7 +158,7 @@ def robust_scale(
     v = residuals[used]
     whitened = np.abs(np.concatenate([a * v[:, 0], b * v[:, 0] + c * v[:, 1]]))
     scale = MAD_TO_SIGMA * float(np.median(whitened)) / np.sqrt(max(freedom, LEAST_FREEDOM))
-    return max(scale, np.finfo(float).tiny)
+    return float(max(scale, np.finfo(float).tiny))
 
 
 def _lengths(observations: Observations, residuals: FloatArray) -> FloatArray:

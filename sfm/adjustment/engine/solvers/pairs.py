@@ -31,7 +31,7 @@ class Pairs:
     @property
     def tiles(self) -> int:
         """Number of tiles of photographs."""
-        return self.cut.shape[1] - 1
+        return int(self.cut.shape[1]) - 1
 
 
 def pairs_of(observations: Observations) -> Pairs:
@@ -43,27 +43,27 @@ def pairs_of(observations: Observations) -> Pairs:
 
 
 def subtract_squares(
-    pairs: Pairs, observations: Observations, Y: FloatArray, Z: FloatArray, S: FloatArray
+    pairs: Pairs, observations: Observations, Y: FloatArray, Y_interior: FloatArray, S: FloatArray
 ) -> None:
-    """Take Y Y' and Z Z' off the lower triangle of S, row-major.
+    """Take Y Y' and Y_interior Y_interior' off the lower triangle of S, row-major.
 
     Args:
         pairs: places of the rays.
         observations: image points.
         Y: rows Y' of each image point by X0, w of its photograph, (k, 3, 6).
-        Z: rows Y' of each object point by the interior unknowns, (n, 3, i).
+        Y_interior: rows Y' of each object point by the interior unknowns, (n, 3, i).
         S: at least 6 m + i rows and columns.
     """
     flat = S.reshape(-1)
-    first, inner = 6 * len(observations.camera), Z.shape[2]
+    first, inner = 6 * len(observations.camera), Y_interior.shape[2]
 
     def subtract(row: int, column: int) -> None:
         _subtract_tile(row, column, pairs.cut, observations, Y, flat, len(S))
 
     _halves(subtract, [(row, column) for row in range(pairs.tiles) for column in range(row + 1)])
-    _subtract_border(observations, Y, Z, S[first : first + inner])
-    flat_Z = Z.reshape(-1, inner)
-    S[first : first + inner, first : first + inner] -= flat_Z.T @ flat_Z
+    _subtract_border(observations, Y, Y_interior, S[first : first + inner])
+    flat_interior = Y_interior.reshape(-1, inner)
+    S[first : first + inner, first : first + inner] -= flat_interior.T @ flat_interior
 
 
 def times_inverse(
@@ -99,7 +99,7 @@ def _halves(work: Callable[[int, int], None], tiles: list[tuple[int, int]]) -> N
 
 
 @kernel
-def _cut(observations, cut):  # type: ignore[no-untyped-def]
+def _cut(observations: Observations, cut: IntArray) -> None:
     for j in range(len(cut)):
         o = observations.start[j]
         for tile in range(cut.shape[1]):
@@ -109,7 +109,15 @@ def _cut(observations, cut):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _subtract_tile(row, column, cut, observations, Y, flat, stride):  # type: ignore[no-untyped-def]
+def _subtract_tile(
+    row: int,
+    column: int,
+    cut: IntArray,
+    observations: Observations,
+    Y: FloatArray,
+    flat: FloatArray,
+    stride: int,
+) -> None:
     """Take Y Y' off the blocks of the photographs of one tile by those of another that is not behind it."""
     for j in range(len(cut)):
         for s in range(cut[j, row], cut[j, row + 1]):
@@ -123,19 +131,30 @@ def _subtract_tile(row, column, cut, observations, Y, flat, stride):  # type: ig
 
 
 @kernel
-def _subtract_border(observations, Y, Z, S):  # type: ignore[no-untyped-def]
-    """Take Z Y' off the rows S of the interior unknowns."""
-    for j in range(len(Z)):
+def _subtract_border(
+    observations: Observations, Y: FloatArray, Y_interior: FloatArray, S: FloatArray
+) -> None:
+    """Take Y_interior Y' off the rows S of the interior unknowns."""
+    for j in range(len(Y_interior)):
         for o in range(observations.start[j], observations.start[j + 1]):
             column = 6 * observations.image[o]
             for c in range(len(S)):
-                z0, z1, z2 = Z[j, 0, c], Z[j, 1, c], Z[j, 2, c]
+                z0, z1, z2 = Y_interior[j, 0, c], Y_interior[j, 1, c], Y_interior[j, 2, c]
                 for q in range(6):
                     S[c, column + q] -= z0 * Y[o, 0, q] + z1 * Y[o, 1, q] + z2 * Y[o, 2, q]
 
 
 @kernel
-def _add_tile(row, column, cut, observations, Y, flat, stride, YQ):  # type: ignore[no-untyped-def]
+def _add_tile(
+    row: int,
+    column: int,
+    cut: IntArray,
+    observations: Observations,
+    Y: FloatArray,
+    flat: FloatArray,
+    stride: int,
+    YQ: FloatArray,
+) -> None:
     """Add to Y'Q of the image points of one tile of photographs what those of another bring."""
     for j in range(len(cut)):
         for s in range(cut[j, row], cut[j, row + 1]):
@@ -145,14 +164,14 @@ def _add_tile(row, column, cut, observations, Y, flat, stride, YQ):  # type: ign
 
 
 @kernel
-def _border_times(observations, Z, Q, YQ):  # type: ignore[no-untyped-def]
-    """Fill YQ with what the rows Z of the interior unknowns bring; Q their rows, (i, reduced)."""
-    for j in range(len(Z)):
+def _border_times(observations: Observations, Y_interior: FloatArray, Q: FloatArray, YQ: FloatArray) -> None:
+    """Fill YQ with what the rows Y_interior of the interior unknowns bring; Q their rows, (i, reduced)."""
+    for j in range(len(Y_interior)):
         for o in range(observations.start[j], observations.start[j + 1]):
             column = 6 * observations.image[o]
             for p in range(3):
                 for q in range(6):
                     total = 0.0
-                    for c in range(Z.shape[2]):
-                        total += Z[j, p, c] * Q[c, column + q]
+                    for c in range(Y_interior.shape[2]):
+                        total += Y_interior[j, p, c] * Q[c, column + q]
                     YQ[o, p, q] = total
