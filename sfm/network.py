@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from scipy.sparse import csr_matrix
 
 from sfm.camera import Camera
 from sfm.conventions import BoolArray, FloatArray, IntArray
@@ -111,6 +112,15 @@ class Network:
         """Return in how many photographs each point was measured, (n,)."""
         return np.bincount(self.image_points.point, minlength=len(self.points))
 
+    def common_points(self, usable: BoolArray) -> IntArray:
+        """Return how many points each two photographs share among usable image points, (m, m)."""
+        seen = self.image_points.select(usable)
+        shape = (len(self.images), len(self.points))
+        sees = csr_matrix((np.ones(len(seen), dtype=np.int32), (seen.image, seen.point)), shape=shape)
+        sees.sum_duplicates()
+        sees.data[:] = 1
+        return np.asarray((sees @ sees.T).toarray())
+
 
 @dataclass(frozen=True)
 class Estimate:
@@ -130,6 +140,12 @@ class Estimate:
     def determined(self) -> BoolArray:
         """Which points have coordinates, (n,)."""
         return np.asarray(np.isfinite(self.points).all(axis=1))
+
+
+def rows_of(index: IntArray, count: int) -> list[IntArray]:
+    """Return the rows of each index value from 0 to count - 1, in order."""
+    order = np.argsort(index, kind="stable")
+    return np.split(order, np.searchsorted(index[order], np.arange(1, count)))
 
 
 def supported(

@@ -105,19 +105,19 @@ def test_hidden_characters_are_refused_in_names(tmp_path: Path, hidden: str) -> 
 def test_long_dotted_keys_are_refused_before_they_are_parsed(tmp_path: Path, text: str) -> None:
     for read in (read_survey, read_scene):
         (tmp_path / "s.toml").write_text(text, encoding="utf-8")
-        begun = time.perf_counter()
+        begun = time.process_time()
         with pytest.raises(SurveyFileError, match=r"s.toml, line 1: more than 16 words joined by dots"):
             read(tmp_path / "s.toml")
-        assert time.perf_counter() - begun < 2
+        assert time.process_time() - begun < 2
 
 
 def test_very_many_cameras_are_refused(tmp_path: Path) -> None:
     cameras = "".join(f'[[camera]]\nname = "c{k}"\nimages = "*"\n' for k in range(20_000))
     (tmp_path / "s.toml").write_text(SURVEY + cameras, encoding="utf-8")
-    begun = time.perf_counter()
+    begun = time.process_time()
     with pytest.raises(SurveyFileError, match=r"camera: found .*, needed at most 1000 values"):
         read_survey(tmp_path / "s.toml")
-    assert time.perf_counter() - begun < 5
+    assert time.process_time() - begun < 5
 
 
 def test_a_very_long_key_is_cut(tmp_path: Path) -> None:

@@ -18,9 +18,9 @@ from typing import Any
 import numpy as np
 
 from sfm.camera import Camera
-from sfm.conventions import BoolArray, FloatArray, IntArray
+from sfm.conventions import BoolArray, FloatArray
 from sfm.errors import BackendError
-from sfm.network import Estimate, Network
+from sfm.network import Estimate, Network, rows_of
 
 HALF_PIXEL = 0.5  # COLMAP's pixel coordinates minus ours, px
 AXES = np.diag([1.0, -1.0, -1.0])  # COLMAP's camera axes in ours
@@ -50,7 +50,7 @@ def reconstruction(
     claimed = np.ones(len(seen), dtype=bool) if rejected is None else ~rejected
     claimed &= estimate.oriented[seen.image] & estimate.determined[seen.point]
     slot = np.zeros(len(seen), dtype=np.int64)  # number of each image point in its photograph
-    for i, rows in enumerate(_groups(seen.image, len(network.images))):
+    for i, rows in enumerate(rows_of(seen.image, len(network.images))):
         if not estimate.oriented[i]:
             continue
         slot[rows] = np.arange(len(rows))
@@ -61,7 +61,7 @@ def reconstruction(
             name=network.images[i], keypoints=keypoints, camera_id=int(network.camera[i]) + 1, image_id=i + 1
         )
         scene.add_image_with_trivial_frame(image, pose)
-    for j, rows in enumerate(_groups(seen.point, len(network.points))):
+    for j, rows in enumerate(rows_of(seen.point, len(network.points))):
         if not estimate.determined[j]:
             continue
         track = pycolmap.Track(
@@ -128,16 +128,10 @@ def residuals_of(scene: Any, network: Network) -> FloatArray:
     """Computed minus measured by COLMAP's own projection, (k, 2), px."""
     seen = network.image_points
     xy = np.empty((len(seen), 2))
-    for i, rows in enumerate(_groups(seen.image, len(network.images))):
+    for i, rows in enumerate(rows_of(seen.image, len(network.images))):
         image = scene.image(i + 1)
         pose = image.cam_from_world().matrix()
         points = np.array([scene.point3D(int(j) + 1).xyz for j in seen.point[rows]]).reshape(-1, 3)
         if len(rows):
             xy[rows] = scene.camera(image.camera_id).img_from_cam(points @ pose[:, :3].T + pose[:, 3])
     return xy - HALF_PIXEL - seen.xy
-
-
-def _groups(index: IntArray, count: int) -> list[IntArray]:
-    """Rows of each index value, in order."""
-    order = np.argsort(index, kind="stable")
-    return np.split(order, np.searchsorted(index[order], np.arange(1, count)))

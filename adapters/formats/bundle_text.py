@@ -39,7 +39,7 @@ from sfm.conventions import (
     rotation_from_angles,
 )
 from sfm.errors import OutputError
-from sfm.network import Estimate, ImagePoints, Network
+from sfm.network import Estimate, ImagePoints, Network, rows_of
 
 INTERIOR = "interior.txt"
 PIXEL_MM = 0.005  # nominal size of a pixel, since the files know none
@@ -109,8 +109,7 @@ def write_bundle_matlab(
     write_lines(cameras, lines)
     seen = network.image_points
     point_lines, sigma_lines = [], []
-    for j in range(len(network.points)):
-        rows = np.flatnonzero(seen.point == j)
+    for j, rows in enumerate(rows_of(seen.point, len(network.points))):
         rows = rows[np.argsort(seen.image[rows], kind="stable")]
         frames = [f"{seen.image[r]} {_text(*xy[r])}" for r in rows]
         point_lines.append(" ".join([_text(*estimate.points[j]), f"{len(rows)}", *frames]))
@@ -183,13 +182,15 @@ def read_bundle_csharp(path: Path, *, pixel_mm: float = PIXEL_MM) -> tuple[Netwo
         raise text.error(f"{len(words)} words, needed the number of points")
     n = text.count_of(words[0], "points")
     labels: list[str] = []
+    known: set[str] = set()
     xyz, xy, sigma = [], [], []
     for _ in range(n):
         words = text.due_row(f"point {len(labels) + 1} of {n}")
         if len(words) != 4 + 2 * m:
             raise text.error(f"{len(words)} words, needed id X Y Z and x y of {m} photographs")
-        if words[0] in labels:
+        if words[0] in known:
             raise text.error(f"point {words[0]} stands twice")
+        known.add(words[0])
         labels.append(words[0])
         values = [text.number_of(word) for word in words[1:]]
         xyz.append(values[:3])
@@ -243,6 +244,7 @@ def write_bundle_csharp(path: Path, network: Network, estimate: Estimate) -> Non
 def _exterior(text: Lines, count: int | None) -> tuple[list[str], list[list[float]]]:
     """Ids and omega, phi, kappa (deg), XL, YL, ZL of so many photographs, or of all to the end."""
     names: list[str] = []
+    known: set[str] = set()
     exterior = []
     while count is None or len(names) < count:
         words = text.row() if count is None else text.due_row(f"photograph {len(names) + 1} of {count}")
@@ -250,8 +252,9 @@ def _exterior(text: Lines, count: int | None) -> tuple[list[str], list[list[floa
             break
         if len(words) != 7:
             raise text.error(f"{len(words)} words, a photograph is id omega phi kappa XL YL ZL")
-        if words[0] in names:
+        if words[0] in known:
             raise text.error(f"photograph {words[0]} stands twice")
+        known.add(words[0])
         names.append(words[0])
         exterior.append([text.number_of(word) for word in words[1:]])
     if not names:

@@ -22,7 +22,7 @@ from adapters.formats.lines import Lines, write_lines
 from sfm.camera import Camera, camera_from_values
 from sfm.conventions import FloatArray
 from sfm.errors import OutputError, SurveyFileError
-from sfm.network import Estimate, ImagePoints, Network
+from sfm.network import Estimate, ImagePoints, Network, rows_of
 
 AXES = np.diag([1.0, -1.0, -1.0])  # sba's camera axes (y down, z forward) in ours
 POSE, POSE_WITH_CAMERA = 7, 12  # numbers of a camera line
@@ -105,8 +105,7 @@ def write_sba_text(cameras: Path, points: Path, network: Network, estimate: Esti
         lines.append(_numbers(fx, cx, cy, fy / fx, 0.0, *quaternion[i], *translation[i]))
     seen = network.image_points
     point_lines = ["# X Y Z n (frame x y covariance)*n"]
-    for j, xyz in enumerate(estimate.points):
-        rows = np.flatnonzero(seen.point == j)
+    for xyz, rows in zip(estimate.points, rows_of(seen.point, len(estimate.points)), strict=True):
         frames = [
             f"{seen.image[r]} {_numbers(*seen.xy[r], *seen.covariance[r].ravel())}"
             for r in rows[np.argsort(seen.image[rows], kind="stable")]

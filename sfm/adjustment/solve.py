@@ -85,6 +85,8 @@ def adjust(
 
     Raises:
         GeometryError: nothing to adjust, an unknown option, or datum points that cannot carry the datum.
+
+    Source: document 000, secs. 2.2 to 2.4; Foerstner, Wrobel (2016), Photogrammetric Computer Vision, ch. 15.
     """
     if reject not in REJECTS:
         raise GeometryError(f"adjustment: reject '{reject}', expected one of {', '.join(REJECTS)}")

@@ -20,6 +20,7 @@ from sfm.survey.inputs.survey_file import Survey
 CONTRADICTED = 0.5  # share of its rays that the test rejects, above which control or a bar is to blame
 CLEARLY = 0.25  # of the misfit that the best choice removes: by how much more than the second it must remove
 MOST_CANDIDATES = 10  # control points and bars that are taken out in turn, those that lose most rays first
+OTHER_UNIT = 8.0  # factor between scales that no start values explain: mm, cm, m, km differ by ten or more
 MIN_CONTROL = 3  # points that a control datum needs
 
 
@@ -36,6 +37,32 @@ def object_scale(network: Network, estimate: Estimate) -> float:
     given, found = control.xyz[known], estimate.points[control.point[known]]
     spread = np.linalg.norm(found - found.mean(axis=0))
     return float(np.linalg.norm(given - given.mean(axis=0)) / spread) if spread > 0 else float("nan")
+
+
+def refuse_other_units(survey: Survey, network: Network, estimate: Estimate) -> None:
+    """Raise GeometryError where the scales of control and scale bars differ by a power of ten.
+
+    Both are taken from the start values, whatever frame these are in, and by medians, so that a single wrong
+    value is left to the tests.
+    """
+    bars, control = network.scale_bars, network.control
+    given = control.xyz[estimate.determined[control.point]]
+    found = estimate.points[control.point[estimate.determined[control.point]]]
+    by_bars = _scale(bars.length, estimate.points[bars.end] - estimate.points[bars.start])
+    by_control = _scale(np.linalg.norm(np.diff(given, axis=0), axis=1), np.diff(found, axis=0))
+    factor = by_control / by_bars
+    if survey.datum.kind == "control" and not (np.isnan(factor) or 1 / OTHER_UNIT < factor < OTHER_UNIT):
+        raise GeometryError(
+            f"survey {survey.name}: lengths by the control are {factor:.4g} times those by the bars; are "
+            f"both in {survey.unit}?"
+        )
+
+
+def _scale(length: FloatArray, difference: FloatArray) -> float:
+    """Return the median of lengths over those of differences, NaN where there are none."""
+    found = np.linalg.norm(difference, axis=1)
+    usable = (found > 0) & (length > 0)
+    return float(np.median(length[usable] / found[usable])) if usable.any() else float("nan")
 
 
 def rescaled(network: Network, estimate: Estimate, datum: Datum) -> Estimate:

@@ -190,6 +190,10 @@ def _references(network: Network, estimate: Estimate) -> IntArray:
 
 def _photograph(network: Network, estimate: Estimate, folder: Path, i: int, progress: Progress) -> FloatArray:
     path = folder / network.images[i]
+    if not path.resolve().is_relative_to(folder.resolve()):
+        raise SurveyFileError(
+            f"{folder}: photograph '{network.images[i]}' of the model is outside this folder"
+        )
     if not path.is_file():
         raise SurveyFileError(
             f"{folder}: photograph '{network.images[i]}' of the model is not in this folder"

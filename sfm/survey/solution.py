@@ -17,7 +17,14 @@ from sfm.errors import GeometryError
 from sfm.network import Estimate, Network, reduce_network, supported
 from sfm.orientation.sequence import Orientation
 from sfm.result import ControlCheck
-from sfm.survey.datum import Contradiction, contradiction, datum_warnings, placed_on_control, rescaled
+from sfm.survey.datum import (
+    Contradiction,
+    contradiction,
+    datum_warnings,
+    placed_on_control,
+    refuse_other_units,
+    rescaled,
+)
 from sfm.survey.inputs.interior import as_asked_for, without_idle_cameras
 from sfm.survey.inputs.survey_file import Survey
 from sfm.survey.network import Naming, build_network, match_uncoded, min_rays
@@ -99,6 +106,7 @@ def solve(
     datum = Datum(survey.datum.kind)
     if datum.kind == "control" and len(network.control) == len(network.exterior) == 0:
         raise GeometryError(f"survey {survey.name}: datum 'control', but no control point was measured")
+    refuse_other_units(survey, network, estimate)
     needed = np.full(len(network.points), 2) if min_rays is None else min_rays.copy()
     if datum.kind == "control":
         needed[network.control.point] = 1

@@ -11,6 +11,7 @@ import numpy as np
 from sfm.camera import Camera
 from sfm.conventions import FloatArray, IntArray, pixel_from_image
 from sfm.errors import SurveyFileError
+from sfm.files.globs import find_files
 from sfm.files.plain_text import as_plain, is_plain
 from sfm.network import Estimate, ImagePoints, Network, ObjectPoints, ScaleBars
 from sfm.survey.inputs.cameras import camera_of_image, start_cameras
@@ -26,6 +27,8 @@ from sfm.survey.inputs.tables import (
     read_observed_exterior,
     read_points,
 )
+
+MAX_PHOTOGRAPHS = 5000  # tables of all pairs of them are kept, 100 MB each
 
 
 @dataclass(frozen=True)
@@ -63,20 +66,23 @@ def find_photographs(survey: Survey, *, images_dir: Path | None = None) -> Photo
     folder = Path(images_dir) if images_dir is not None else survey.path.parent
     if not folder.is_dir():
         raise SurveyFileError(f"{folder}: no such folder; photographs of survey {survey.name} were needed")
+
+    def inner(path: Path) -> None:
+        name = path.relative_to(folder).as_posix()
+        inside(folder, name, str(survey.path), allow_outside=survey.allow_outside)
+
     owner: list[tuple[str, Path, int]] = []
     for index, camera in enumerate(survey.cameras):
         pattern = camera.images or ""
         try:
-            if ".." in Path(pattern).parts and not survey.allow_outside:
-                inside(folder, pattern, str(survey.path))
-            found = sorted(path for path in folder.glob(pattern) if not path.is_dir())
-        except (ValueError, NotImplementedError, IndexError) as error:
+            found = find_files(folder, pattern, enter=inner)
+        except ValueError as error:
             raise SurveyFileError(
                 f"{survey.path}: camera {camera.name}: images = '{pattern}' is no glob relative to {folder}"
             ) from error
         if not survey.allow_outside:
             for path in found:
-                inside(folder, path.relative_to(folder).as_posix(), str(survey.path))
+                inner(path)
         if not found:
             raise SurveyFileError(
                 f"no photographs found: camera {camera.name} needs '{pattern}' in {folder}, {_holds(folder)}"
@@ -97,6 +103,7 @@ def find_photographs(survey: Survey, *, images_dir: Path | None = None) -> Photo
             )
         seen[name] = index
     names, paths, cameras = zip(*owner, strict=True)
+    refuse_many(survey.path, names)
     refuse_ungrouped(survey, names, cameras)
     observed_exterior(survey, names)  # refused before the photographs are measured
     return PhotographList(names, paths, np.array(cameras, dtype=np.int64), folder)
@@ -121,6 +128,7 @@ def network_from_observations(survey: Survey) -> tuple[Network, Estimate]:
     where = survey.beside(survey.observations.file)
     table = read_image_points(where)
     images, image = _numbered(table.image)
+    refuse_many(where, images)
     points, point = _numbered(table.point)
     owner = np.array([camera_of_image(survey, name) for name in images], dtype=np.int64)
     refuse_ungrouped(survey, images, owner)
@@ -135,6 +143,14 @@ def network_from_observations(survey: Survey) -> tuple[Network, Estimate]:
         images, owner, points, ImagePoints(image, point, xy, covariance), control=control, scale_bars=bars
     )
     return network, approximate_values(survey, network, cameras, images)
+
+
+def refuse_many(where: Path, images: Sequence[str]) -> None:
+    """Raise SurveyFileError if there are more photographs than one adjustment has room for."""
+    if len(images) > MAX_PHOTOGRAPHS:
+        raise SurveyFileError(
+            f"{where}: {len(images)} photographs, at most {MAX_PHOTOGRAPHS} are adjusted together"
+        )
 
 
 def control_points(survey: Survey, points: tuple[str, ...]) -> tuple[ObjectPoints, tuple[str, ...]]:
