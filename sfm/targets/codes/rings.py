@@ -138,7 +138,7 @@ def read_code_table(path: Path) -> CodeFamily:
             if int(words[1]) > 0:  # the published 20 bit table ends with a row 0
                 entries[int(words[1])] = int(words[0])
         else:
-            raise SurveyFileError(f"{path}, line {k}: found {line.strip()!r}, needed a number and a pattern")
+            raise SurveyFileError(f"{path}, line {k}: found {line.strip()!r:.60}, needed number and pattern")
     if not entries:
         raise SurveyFileError(f"{path}: no codes found, needed lines with a number and a pattern")
     if max(entries) >> MAX_CELLS:
