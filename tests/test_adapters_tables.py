@@ -157,7 +157,7 @@ def test_files_are_bounded_before_memory_is_taken(
     monkeypatch.setattr(lines, "MAX_LINES", 10)
     (tmp_path / "many.txt").write_text("\n" * 11)
     with pytest.raises(SurveyFileError, match="more than 10 lines"):
-        Lines.of(tmp_path / "many.txt")
+        Lines.of(tmp_path / "many.txt").end()
     (tmp_path / "bal.txt").write_text("9" * 15 + " 1 1\n")
     with pytest.raises(SurveyFileError, match=r"bal\.txt, line 1: the number of cameras is '9+'"):
         read_any(tmp_path / "bal.txt", "bal")

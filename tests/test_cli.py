@@ -20,7 +20,6 @@ from sfm import cli
 from sfm.cli import app, starting
 from sfm.rendering.render import write_photographs
 from sfm.rendering.scene_file import read_scene
-from sfm.report.findings.findings import findings_of
 from sfm.report.output import write_result
 from tests.surveys import write_observed_survey
 
@@ -336,7 +335,7 @@ def test_the_time_counts_the_report(
 
     def slow(*arguments: object, **options: object) -> Path:
         time.sleep(1.5)
-        return write_result(findings_of(*arguments), **options)  # type: ignore[arg-type]
+        return write_result(*arguments, **options)  # type: ignore[arg-type]
 
     monkeypatch.setattr("sfm.report.output.write_result", slow)
     assert kolinear(monkeypatch, "adjust", survey, "--out", tmp_path / "out") == 0

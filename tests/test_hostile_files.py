@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sqlite3
 import time
 from dataclasses import replace
@@ -11,11 +12,15 @@ import cv2
 import numpy as np
 import pytest
 
+from adapters.colmap.camera_models import read_model, write_model
 from adapters.colmap.database import read_database, write_database
 from adapters.formats.metashape import read_metashape
+from adapters.formats.ply import read_ply
+from adapters.formats.registry import read_any
 from sfm.batch.run import find_surveys
 from sfm.errors import GeometryError, KolinearError, SurveyFileError
 from sfm.files import globs
+from sfm.files.csv_tables import read_header, read_table
 from sfm.pipeline import adjust_survey
 from sfm.survey.inputs.start import find_photographs, network_from_observations
 from sfm.survey.inputs.survey_file import read_survey
@@ -215,6 +220,86 @@ def test_refine_stays_in_its_folder(tmp_path: Path, name: str) -> None:
     network = replace(network, images=(name.format(tmp_path), *network.images[1:]))
     with pytest.raises(SurveyFileError, match=r"images: photograph '.*' of the model is outside this folder"):
         refine_model(network, truth, tmp_path / "images")
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "form", "match"),
+    [
+        ("a.ply", "ply\n" + "property double x\n" * 9, "ply", r"the file ends here"),
+        (
+            "a.ply",
+            "ply\nelement vertex 4000000\n" + "property double x\n" * 5000 + "end_header\n",
+            "ply",
+            r"line 103: more than 100 properties, no more are read",
+        ),
+        (
+            "a.ply",
+            "ply\nelement vertex 4000000\n" + "".join(f"property int {c}\n" for c in "xyz") + "end_header\n",
+            "ply",
+            r"4000000 vertices of 3 numbers do not fit in \d+ bytes",
+        ),
+        ("a.txt", "9000000 2 2\n0 0 1 1\n", "bal", r"number of cameras is '9000000', needed .* to 100000"),
+        ("a.txt", "9000 2000000 2\n0 0 1 1\n", "bal", r"\d+ bytes in the file, at least 6081014 are due"),
+        ("a.txt", "1 1 1\n" + "1 " * 6_000_000, "bal", r"line 2: more than 10000000 characters"),
+        (
+            "a.txt",
+            "2 10 0 0\n1 0 0 0 0 0 0\n2 0 0 0 0 0 0\n9000000\n",
+            "bundle-csharp",
+            r"image points, no",
+        ),
+        (
+            "a.txt",
+            "2 10 0 0\na\u202eb 0 0 0 0 0 0\n",
+            "bundle-csharp",
+            r"photograph is 'a\\u202eb'",
+        ),
+        (
+            "a.txt",
+            "ply\ncomment name a\u200bb\n",
+            "ply",
+            r"name of a point is 'a\\u200bb', needed",
+        ),
+    ],
+)
+def test_sizes_and_names_in_text_files_are_checked_before_use(
+    tmp_path: Path, name: str, text: str, form: str, match: str
+) -> None:
+    (tmp_path / name).write_text(text, encoding="utf-8")
+    begun = time.process_time()
+    with pytest.raises(SurveyFileError, match=match):
+        read_ply(tmp_path / name) if form == "ply" else read_any(tmp_path / name, form)
+    assert time.process_time() - begun < SECONDS
+
+
+def test_one_row_over_very_many_lines_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text('id,"' + "a\n,\n" * 2_000_000 + '"\n', encoding="utf-8")
+    begun = time.process_time()
+    for read in (read_header, lambda path: read_table(path, ("id",), ("X",))):
+        with pytest.raises(SurveyFileError, match=r"more than 10000 characters, not a CSV table"):
+            read(tmp_path / "a.csv")
+    assert time.process_time() - begun < 1
+
+
+def test_names_and_counts_of_a_model_are_checked(tmp_path: Path) -> None:
+    network, truth = make_network(seed_of("model"), images=3, points=8, model="opencv")
+    write_model(tmp_path / "a", replace(network, images=("a\u202eb.jpg", *network.images[1:])), truth)
+    (tmp_path / "a" / "kolinear.json").unlink()
+    with pytest.raises(SurveyFileError, match=r"name of image 1 is 'a\\u202eb\.jpg', needed plain text"):
+        read_model(tmp_path / "a")
+    write_model(tmp_path / "b", network, truth, text=True)
+    path = tmp_path / "b" / "cameras.txt"
+    path.write_text(f"# Number of cameras: {'9' * 5000}\n" + path.read_text())
+    read_model(tmp_path / "b")
+    side = tmp_path / "b" / "kolinear.json"
+    side.write_text(side.read_text().replace('"1": "', '"1": "\u2066'))
+    with pytest.raises(SurveyFileError, match=r"kolinear.json: images.1 is '\\u2066.*, needed plain text"):
+        read_model(tmp_path / "b")
+
+
+def test_a_pipe_is_no_file_of_any_format(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(SurveyFileError, match=r"pipe: not a file"):
+        read_any(tmp_path / "pipe")
 
 
 def write_survey(folder: Path, images: list[str], datum: str = "") -> Path:

@@ -22,6 +22,7 @@ from adapters.colmap.names import SIDE_FILE, read_side_file, write_side_file
 from adapters.colmap.scene import AXES, HALF_PIXEL, camera_of, reconstruction
 from sfm.conventions import BoolArray
 from sfm.errors import OutputError, SurveyFileError
+from sfm.files.plain_text import MAX_NAME, is_name, shown
 from sfm.files.whole_files import refuse_full
 from sfm.network import Estimate, ImagePoints, Network
 
@@ -142,13 +143,11 @@ def read_model(folder: Path, *, text: bool | None = None) -> tuple[Network, Esti
     point_ids = sorted(scene.point3D_ids())
     names = side.points
     index = {j: k for k, j in enumerate(point_ids)}
-    seen = [
-        (i, index[p.point3D_id], p.x() - HALF_PIXEL, p.y() - HALF_PIXEL)
-        for i, image in enumerate(images)
-        for p in image.points2D
-        if p.has_point3D()
-    ]
-    table = np.array(seen, dtype=float).reshape(-1, 4)
+    seen = [np.zeros((0, 4))]  # an array for each photograph, which takes less than lists of all
+    for i, image in enumerate(images):
+        rows = [(i, index[p.point3D_id], p.x(), p.y()) for p in image.points2D if p.has_point3D()]
+        seen.append(np.array(rows, dtype=float).reshape(-1, 4))
+    table = np.concatenate(seen)
     poses = [
         image.cam_from_world().matrix() if image.has_pose else np.full((3, 4), np.nan) for image in images
     ]
@@ -160,17 +159,23 @@ def read_model(folder: Path, *, text: bool | None = None) -> tuple[Network, Esti
         short = [image.name for image in images]
     except UnicodeDecodeError as error:
         raise SurveyFileError(f"{folder}: the name of a photograph is not in UTF-8") from error
+    labels = tuple(
+        full[i] if full[i].split()[:1] == [name] else name for i, name in zip(image_ids, short, strict=True)
+    )
+    for i, name in zip(image_ids, labels, strict=True):
+        if not is_name(name):
+            raise SurveyFileError(
+                f"{folder}: the name of image {i} is '{shown(name)}', needed plain text of 1 to {MAX_NAME} "
+                "characters"
+            )
     network = Network(
-        tuple(
-            full[i] if full[i].split()[:1] == [name] else name
-            for i, name in zip(image_ids, short, strict=True)
-        ),
-        np.array([camera_ids.index(image.camera_id) for image in images], dtype=np.int64),
+        labels,
+        np.searchsorted(camera_ids, [image.camera_id for image in images]).astype(np.int64),
         tuple(names.get(str(j), str(j)) for j in point_ids),
         ImagePoints(
             table[:, 0].astype(np.int64),
             table[:, 1].astype(np.int64),
-            table[:, 2:].copy(),
+            table[:, 2:] - HALF_PIXEL,
             np.tile(np.eye(2), (len(table), 1, 1)),
         ),
     )

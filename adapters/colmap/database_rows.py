@@ -23,7 +23,7 @@ from adapters.formats.json_files import MAX_SIDE_PX
 from sfm.conventions import AnyArray, FloatArray, IntArray
 from sfm.errors import SurveyFileError
 from sfm.files.csv_tables import MAX_NUMBER, MAX_ROWS, MAX_TABLE_BYTES
-from sfm.files.plain_text import MAX_NAME, as_plain, is_plain
+from sfm.files.plain_text import MAX_NAME, as_plain, is_name
 
 TABLES = ("cameras", "images", "keypoints", "matches", "two_view_geometries")
 HEADER_BYTES = 100
@@ -165,7 +165,7 @@ class _Reader:
         numbers, names, owners = [], [], []
         for where, (number, name, camera_id) in self._rows("images", "image_id, name, camera_id"):
             numbers.append(self._whole(where, "image_id", number, PAIRS))
-            if not (isinstance(name, str) and 0 < len(name) <= MAX_NAME and is_plain(name)):
+            if not (isinstance(name, str) and is_name(name)):
                 raise self._error(
                     where, f"name is '{_shown(name)}', needed plain text of 1 to {MAX_NAME} characters"
                 )

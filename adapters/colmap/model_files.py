@@ -69,19 +69,17 @@ def check_model_files(folder: Path, *, text: bool) -> None:
 
 def _check_text(name: str, path: Path) -> None:
     text = Lines.of(path)
-    if not text.ended:
-        text.number = len(text.lines)
-        raise text.error("the last line is cut off")
-    count, due, text.number = 0, None, 0
-    while text.number < len(text.lines):
-        line = text.line()
-        stated = re.match(r"# Number of \w+: (\d+)", line)
+    count, due = 0, None
+    while (line := text.maybe_line()) is not None:
+        stated = re.match(r"# Number of \w+: (\d{1,20})(?!\d)", line)
         if stated:
             due = int(stated[1])
         if not line.strip() or line.startswith("#"):
             continue
         _check_row(name, text, line.split())
         count += 1
+    if not text.ended:
+        raise text.error("the last line is cut off")
     if due is None and not count:
         text.number = 1
         raise text.error("the file is empty")

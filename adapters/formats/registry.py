@@ -25,6 +25,7 @@ from adapters.formats.bundle_text import (
     write_bundle_csharp,
     write_bundle_matlab_folder,
 )
+from adapters.formats.lines import Lines
 from adapters.formats.metashape import read_metashape, write_metashape
 from adapters.formats.photomodeler import read_photomodeler, write_photomodeler
 from adapters.formats.ply import write_ply
@@ -167,12 +168,8 @@ def format_of(path: Path) -> FileFormat:
         )
     if path.suffix.lower() in ENDINGS:
         return format_named(ENDINGS[path.suffix.lower()])
-    try:
-        with path.open(encoding="utf-8", errors="replace") as text:
-            lines = [text.readline() for _ in range(4)]
-    except OSError as error:
-        raise SurveyFileError(f"{path}: cannot be read ({error.strerror})") from error
-    counts = [len(line.split()) for line in lines]
+    text = Lines.of(path)
+    counts = [len((text.maybe_line() or "").split()) for _ in range(4)]
     if "cams" in path.name:
         return format_named("sba")
     if counts[2:4] == [9, 10]:

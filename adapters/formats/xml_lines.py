@@ -9,11 +9,11 @@ from xml.parsers import expat
 
 import numpy as np
 
-from adapters.formats.json_files import MAX_SIDE_PX, SHOWN
+from adapters.formats.json_files import MAX_SIDE_PX
 from sfm.conventions import FloatArray
 from sfm.errors import SurveyFileError, one_line
 from sfm.files.csv_tables import MAX_NUMBER
-from sfm.files.plain_text import MAX_NAME, as_plain, is_plain
+from sfm.files.plain_text import MAX_NAME, is_name, shown
 
 MAX_XML_BYTES = 100_000_000
 MAX_ELEMENTS, MAX_ALL_ATTRIBUTES = 500_000, 5_000_000  # some 500 MB; markers of 1000 photographs have fewer
@@ -62,9 +62,8 @@ class Node:
     def name(self, name: str) -> str:
         """Return an attribute that is a name."""
         found = self.attribute(name)
-        if not (0 < len(found) <= MAX_NAME and is_plain(found)):
-            shown = as_plain(found[:SHOWN])
-            raise self.error(f"{name} is '{shown}', needed plain text of 1 to {MAX_NAME} characters")
+        if not is_name(found):
+            raise self.error(f"{name} is '{shown(found)}', needed plain text of 1 to {MAX_NAME} characters")
         return found
 
     def number(self, name: str) -> float:
@@ -86,7 +85,7 @@ class Node:
             value = np.nan
         if not abs(value) <= MAX_NUMBER:
             raise self.error(
-                f"'{as_plain(text[:SHOWN])}' in <{self.tag}> is not a finite number of at most {MAX_NUMBER:g}"
+                f"'{shown(text)}' in <{self.tag}> is not a finite number of at most {MAX_NUMBER:g}"
             )
         return value
 

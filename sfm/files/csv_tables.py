@@ -130,10 +130,12 @@ def read_table(
 def _rows(path: Path, columns: int) -> Iterator[tuple[int, list[str]]]:
     """Yield line number and cells of every row below the header that is not empty."""
     with _opened(path) as file:
-        reader = csv.reader(_lines(path, file))
+        lines = _Lines(path, file)
+        reader = csv.reader(lines)
         try:
             next(reader, None)
             for row in reader:
+                lines.characters = 0
                 if not any(cell.strip() for cell in row):
                     continue
                 if len(row) != columns:
@@ -151,23 +153,37 @@ def _rows(path: Path, columns: int) -> Iterator[tuple[int, list[str]]]:
             raise SurveyFileError(f"{path}: the table cannot be read: {error.strerror}") from error
 
 
-def _lines(path: Path, file: TextIO) -> Iterator[str]:
-    """Yield the lines of a file, none longer than a line can be, and not more than twice the rows."""
-    for number in range(1, 2 * MAX_ROWS):
-        line = file.readline(MAX_LINE + 1)
+class _Lines:
+    """The lines of a file: no row of them longer than a line can be, and not more than twice the rows."""
+
+    def __init__(self, path: Path, file: TextIO) -> None:
+        self.path, self.file = path, file
+        self.number = 0
+        self.characters = 0  # of the row so far, which quoted cells spread over lines
+
+    def __iter__(self) -> _Lines:
+        return self
+
+    def __next__(self) -> str:
+        line = self.file.readline(MAX_LINE + 1)
         if not line:
-            return
-        if len(line) > MAX_LINE:
-            raise SurveyFileError(f"{path}, line {number}: more than {MAX_LINE} characters, not a CSV table")
-        yield line
-    raise SurveyFileError(f"{path}: more than {2 * MAX_ROWS} lines, no more are read")
+            raise StopIteration
+        self.number += 1
+        if self.number >= 2 * MAX_ROWS:
+            raise SurveyFileError(f"{self.path}: more than {2 * MAX_ROWS} lines, no more are read")
+        self.characters += len(line)
+        if self.characters > MAX_LINE:
+            raise SurveyFileError(
+                f"{self.path}, line {self.number}: more than {MAX_LINE} characters, not a CSV table"
+            )
+        return line
 
 
 def read_header(path: Path) -> tuple[str, ...]:
     """Return the names of the columns."""
     with _opened(path) as file:
         try:
-            return tuple(name.strip() for name in next(csv.reader(_lines(path, file)), []))
+            return tuple(name.strip() for name in next(csv.reader(_Lines(path, file)), []))
         except (UnicodeDecodeError, csv.Error) as error:
             raise SurveyFileError(f"{path}, line 1: not a CSV table in UTF-8; save it as such") from error
         except OSError as error:

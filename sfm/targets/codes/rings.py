@@ -116,7 +116,7 @@ def read_code_table(path: Path) -> CodeFamily:
                 entries[int(words[1])] = int(words[0])
         else:
             raise SurveyFileError(
-                f"{path}, line {k}: found {line.strip()!r}, expected a number and a pattern"
+                f"{path}, line {k}: found {line.strip()!r:.60}, expected a number and a pattern"
             )
     if not entries:
         raise SurveyFileError(f"{path}: no codes found, expected lines with a number and a pattern")

@@ -11,16 +11,18 @@ Sparse Positive Definite Systems, ch. 4; operations: Golub and Van Loan (2013), 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
-from numba import njit
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
-from sfm.adjustment.engine.solvers.pairs import Pairs, pairs_of
+from sfm.adjustment.engine.collinearity import Observations
+from sfm.adjustment.engine.solvers.banded import BandSolver
+from sfm.adjustment.engine.solvers.dense import DenseSolver
+from sfm.adjustment.engine.solvers.pairs import pairs_of
+from sfm.adjustment.engine.solvers.protocol import Solver
 from sfm.adjustment.engine.unknowns import Unknowns
-from sfm.conventions import IntArray
+from sfm.conventions import AnyArray
+from sfm.kernels.options import compiled
 
 # Operations in a second, one thread, AVX-512 (OpenBLAS 0.3.30); only their ratios matter
 PRODUCT_RATE = 80e9  # symmetric product of full rows, most of them in single precision
@@ -31,22 +33,17 @@ PAIR_OPERATIONS = 216  # of a 6 x 6 x 3 product
 SMALL = 64  # photographs up to which the product of full rows costs so little that nothing else is sought
 
 
-@dataclass(frozen=True)
-class Order:
-    """Order of the photographs in a banded reduced normal matrix."""
+def choose_solver(layout: Unknowns) -> Solver:
+    """Return the solver that takes the least work for a network.
 
-    place: IntArray  # place of each photograph, (m,)
-    points: IntArray  # object points in the order of the first of their photographs, which keeps what is near
-    # in the band near in time, (n,)
-    width: int  # largest difference of the places of two photographs that share a point
+    A band, or a full matrix that is summed pair by pair of rays or as a product of full rows.
 
-
-def pattern_of(layout: Unknowns) -> Order | Pairs | None:
-    """Return the order of the photographs for a band, or the places of rays for a full matrix that is summed
-    pair by pair; None where the product of full rows is less work."""
-    obs = layout.obs
-    m = len(obs.camera)
-    rays = np.diff(obs.start).astype(float)
+    Args:
+        layout: order of the unknowns and the image points.
+    """
+    observations = layout.observations
+    m = len(observations.camera)
+    rays = np.diff(observations.start).astype(float)
     pairs = float((rays * (rays + 1) / 2).sum())
     summed = PAIR_OPERATIONS * pairs / PAIR_RATE
     product = 3.0 * len(rays) * layout.reduced**2 / PRODUCT_RATE
@@ -54,27 +51,27 @@ def pattern_of(layout: Unknowns) -> Order | Pairs | None:
     # a point joins all its photographs, so no order has a narrower band than its rays
     least = summed + 6.0 * m * (6.0 * rays.max()) ** 2 / BAND_RATE
     if m <= SMALL:
-        return None
+        return DenseSolver(layout)
     if least > full:
-        return pairs_of(obs) if summed < product else None
-    rows, columns = np.nonzero(_joined(obs, np.zeros((m, m), dtype=np.uint8)))
+        return DenseSolver(layout, pairs_of(observations) if summed < product else None)
+    rows, columns = np.nonzero(_joined(observations, np.zeros((m, m), dtype=np.uint8)))
     graph = csr_matrix((np.ones(len(rows), dtype=np.int8), (rows, columns)), shape=(m, m))
     place = np.empty(m, dtype=np.int64)
     place[reverse_cuthill_mckee(graph, symmetric_mode=True)] = np.arange(m)
     width = int(np.abs(place[rows] - place[columns]).max(initial=0))
     banded = summed + 6.0 * m * (6.0 * width + 6.0) ** 2 / BAND_RATE
     if banded > full:
-        return pairs_of(obs) if summed < product else None
+        return DenseSolver(layout, pairs_of(observations) if summed < product else None)
     earliest = np.full(len(rays), m)
-    np.minimum.at(earliest, obs.point, place[obs.image])
-    return Order(place, np.argsort(earliest, kind="stable"), width)
+    np.minimum.at(earliest, observations.point, place[observations.image])
+    return BandSolver(layout, place, np.argsort(earliest, kind="stable"), width)
 
 
-@njit(cache=True)
-def _joined(obs, joined):  # type: ignore[no-untyped-def]
+@compiled
+def _joined(observations: Observations, joined: AnyArray) -> AnyArray:
     """Return 1 where two photographs share an object point, (m, m)."""
-    for j in range(len(obs.start) - 1):
-        for s in range(obs.start[j], obs.start[j + 1]):
-            for t in range(obs.start[j], obs.start[j + 1]):
-                joined[obs.image[s], obs.image[t]] = 1
+    for j in range(len(observations.start) - 1):
+        for s in range(observations.start[j], observations.start[j + 1]):
+            for t in range(observations.start[j], observations.start[j + 1]):
+                joined[observations.image[s], observations.image[t]] = 1
     return joined
