@@ -1,4 +1,4 @@
-"""Compile the kernels of a survey ahead of the first one: python -m sfm.warm_up
+"""Compile the kernels of a survey ahead of the first one: `python -m sfm.warm_up`.
 
 Numba keeps compiled kernels on disk; the first run of each would take most of a minute otherwise. Every part
 works on a small made-up problem in a process of its own, since numba compiles one function at a time.

@@ -368,7 +368,7 @@ def test_a_second_batch_in_the_same_folder_is_refused(finished: Path, surveys: t
 def test_a_fault_of_ours_is_a_row_with_a_trace(
     surveys: tuple[Path, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("sfm.batch.survey.adjust_survey", lambda *_, **__: [][0])
+    monkeypatch.setattr("sfm.batch.survey.run_survey", lambda *_, **__: [][0])
     (row,) = run_batch([surveys[2]], tmp_path / "out", HERE, ALONE, Notes())
     assert row.reason.startswith("a fault of Kolinear: IndexError")
     (log,) = (tmp_path / "out" / "logs").iterdir()

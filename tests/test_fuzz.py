@@ -20,8 +20,8 @@ from sfm.errors import KolinearError, PhotographError
 from sfm.photographs.exif import read_metadata
 from sfm.photographs.file_checks import BOMB_PX_PER_BYTE
 from sfm.photographs.reading import read_photograph
-from sfm.survey.inputs.survey_file import read_survey
-from sfm.survey.inputs.tables import read_image_points
+from sfm.survey.inputs.given import read_image_points
+from sfm.survey.inputs.survey import read_survey
 from tests.fuzz.cases import Seed, make_seeds, run_case
 
 SHORT = settings(

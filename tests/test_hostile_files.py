@@ -21,9 +21,10 @@ from sfm.batch.run import find_surveys
 from sfm.errors import GeometryError, KolinearError, SurveyFileError
 from sfm.files import globs
 from sfm.files.csv_tables import read_header, read_table
-from sfm.pipeline import adjust_survey
-from sfm.survey.inputs.start import find_photographs, network_from_observations
-from sfm.survey.inputs.survey_file import read_survey
+from sfm.pipeline import run_survey
+from sfm.survey.inputs.photograph_list import find_photographs
+from sfm.survey.inputs.start import measurements_from_observations
+from sfm.survey.inputs.survey import read_survey
 from sfm.survey.refine import refine_model
 from tests.synthetic import make_network, seed_of
 
@@ -319,7 +320,7 @@ def test_very_many_photographs_are_refused(tmp_path: Path) -> None:
     with pytest.raises(
         SurveyFileError, match=r"obs\.csv: 20000 photographs, at most 5000 are adjusted together"
     ):
-        network_from_observations(read_survey(path))
+        measurements_from_observations(read_survey(path))
     assert time.process_time() - begun < SECONDS
 
 
@@ -343,7 +344,7 @@ def test_control_and_bars_of_different_units_are_refused(tmp_path: Path) -> None
         GeometryError,
         match=r"lengths by the control are (1000|999|1001)[.0-9]* times those by the bars; are both in m",
     ):
-        adjust_survey(read_survey(path))
+        run_survey(read_survey(path))
 
 
 def test_what_is_refused_is_one_line(tmp_path: Path) -> None:

@@ -18,7 +18,7 @@ from sfm.errors import SurveyFileError
 from sfm.files.csv_tables import read_table
 from sfm.files.plain_text import as_cell, as_plain, csv_text, from_cell, is_plain
 from sfm.rendering.scene_file import read_scene
-from sfm.survey.inputs.survey_file import read_survey
+from sfm.survey.inputs.survey import read_survey
 
 FORMULAS = ("=1+1", "+A1", "@SUM(A1)", "-A1", "-1+2", "\t=1", "\r=1", " =1", "a;=1", "\uff1d1", "\uff0dA1")
 NO_FORMULAS = ("1", "-1", "-1.5e-3", "a=b", "a-b", "u001", "'quoted'", "DSC_1.jpg", "a;b", "-2;b")

@@ -35,7 +35,7 @@ from sfm.report.tables.summary import summary, write_summary
 from sfm.report.text.lines import WIDTH
 from sfm.report.text.report import text_report
 from sfm.result import ControlCheck, FailedImage, PhotographTargets, StageTime, SurveyResult
-from sfm.survey.inputs.tables import read_exterior, read_image_points, read_points
+from sfm.survey.inputs.given import read_exterior, read_image_points, read_points
 from sfm.targets.flags import Flag
 from tests.synthetic import make_network, seed_of
 

@@ -24,7 +24,7 @@ from sfm.report.html.content_policy import content_policy
 from sfm.report.html.page import render
 from sfm.report.output import write_result
 from sfm.report.validation import write_validation
-from sfm.survey.inputs.survey_file import read_survey
+from sfm.survey.inputs.survey import read_survey
 from tests.surveys import write_photograph_survey
 from tests.synthetic import make_network, seed_of
 

@@ -23,7 +23,7 @@ from sfm.report.tables.summary import summary
 from sfm.report.text.lines import WIDTH
 from sfm.report.text.report import text_report
 from sfm.result import SurveyResult
-from sfm.survey.inputs.tables import read_exterior, read_points
+from sfm.survey.inputs.given import read_exterior, read_points
 from tests.synthetic import SIZE_PX, make_network, seed_of
 
 CAMCAL = Path(__file__).resolve().parents[2] / "shared" / "data" / "camcal"

@@ -13,9 +13,9 @@ from sfm.conventions import FloatArray
 from sfm.errors import SurveyFileError
 from sfm.result import SurveyResult
 from sfm.similarity import fit_similarity
-from sfm.survey.inputs.survey_file import read_survey
-from sfm.survey.inputs.tables import read_diameters
-from sfm.survey.targets import MeasuredPhotographs
+from sfm.survey.inputs.given import read_diameters
+from sfm.survey.inputs.survey import read_survey
+from sfm.survey.measurements import MeasuredPhotographs
 from sfm.targets.detect import Targets
 
 C_PX, DISTANCE_MM, TILT = 4000.0, 600.0, np.radians(60)
@@ -123,7 +123,7 @@ def surveyed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, targets: str, seed
     measured = photographs(seed)
     for name in measured.names:
         (tmp_path / name).touch()
-    monkeypatch.setattr(pipeline, "measure_photographs", lambda *given, **more: measured)
+    monkeypatch.setattr("sfm.survey.network.measure_photographs", lambda *given, **more: measured)
     return pipeline.run_survey(read_survey(tmp_path / "survey.toml"))
 
 
@@ -203,7 +203,8 @@ def test_stated_diameters_are_compared_with_the_ellipses(
 def test_table_of_diameters(tmp_path: Path) -> None:
     path = tmp_path / "d.csv"
     path.write_text("id,diameter\n7,12.5\nu001,3\n", encoding="utf-8")
-    names, diameter = read_diameters(path)
+    found = read_diameters(path)
+    names, diameter = found.names, found.diameter
     assert names == ("7", "u001")
     assert diameter.tolist() == [12.5, 3.0]
     for text, message in (

@@ -14,15 +14,15 @@ from sfm.adjustment.result import Adjustment
 from sfm.conventions import FloatArray, angles_from_rotation
 from sfm.errors import GeometryError, SurveyFileError
 from sfm.network import Estimate
-from sfm.pipeline import adjust_survey, run_survey
+from sfm.pipeline import run_survey
 from sfm.report.findings.findings import findings_of
 from sfm.report.findings.given import exterior_residuals
 from sfm.report.html.report import report_page
 from sfm.report.output import write_result
 from sfm.report.text.report import text_report
 from sfm.result import SurveyResult
-from sfm.survey.inputs.survey_file import read_survey
-from sfm.survey.inputs.tables import read_observed_exterior
+from sfm.survey.inputs.exterior_table import read_observed_exterior
+from sfm.survey.inputs.survey import read_survey
 from tests.surveys import OBSERVED, stations, write_photograph_survey
 from tests.synthetic import make_network, seed_of
 
@@ -69,7 +69,7 @@ def written(
 
 
 def solved(path: Path) -> SurveyResult:
-    return adjust_survey(read_survey(path))
+    return run_survey(read_survey(path))
 
 
 def truth_of(a: Adjustment, truth: Estimate) -> FloatArray:

@@ -16,7 +16,7 @@ from sfm.printing.sheet import lay_out_sheet
 from sfm.rendering.render import render_photograph, render_photographs
 from sfm.rendering.scene import CircularTargets, Faces, Marks, Optics, Scene, discs, join_marks, square_tag
 from sfm.similarity import fit_similarity
-from sfm.survey.inputs.survey_file import read_survey
+from sfm.survey.inputs.survey import read_survey
 from sfm.targets.codes.tags import DICTIONARIES, corner_name, tag_family
 from sfm.targets.detect import find_targets
 from sfm.targets.flags import Flag

@@ -32,7 +32,7 @@ from sfm.orientation.relative import relative_orientations
 from sfm.pipeline import run_survey
 from sfm.similarity import fit_similarity
 from sfm.survey.comparison import OtherPrograms
-from sfm.survey.inputs.survey_file import read_survey
+from sfm.survey.inputs.survey import read_survey
 from sfm.survey.refine import refine_model, refinement_text
 from tests.engines import ALONE, HERE, Notes
 from tests.textures import random_texture, with_noise

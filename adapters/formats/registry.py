@@ -29,13 +29,14 @@ from adapters.formats.lines import Lines
 from adapters.formats.metashape import read_metashape, write_metashape
 from adapters.formats.photomodeler import read_photomodeler, write_photomodeler
 from adapters.formats.ply import write_ply
-from adapters.formats.result_tables import TableResult, read_result, write_tables
+from adapters.formats.result_tables import read_result, write_tables
 from adapters.formats.sba_text import read_sba_text, sba_files, write_sba_text
 from sfm.camera import Camera
 from sfm.distortion.models import MODELS
 from sfm.errors import KolinearError, OutputError, SurveyFileError
 from sfm.files.whole_files import whole_folder
 from sfm.network import Estimate, Network, empty_estimate, reduce_network
+from sfm.stored_result import StoredResult
 
 Reader = Callable[[Path], tuple[Network, Estimate]]
 Writer = Callable[..., None]  # path, network, estimate; and title, where a format has a place for it
@@ -79,7 +80,7 @@ def _read_tables(path: Path) -> tuple[Network, Estimate]:
 def _write_tables(folder: Path, network: Network, estimate: Estimate, *, title: str) -> None:
     every = np.ones(len(network.image_points), dtype=bool)
     placed = reduce_network(network, estimate, estimate.oriented, estimate.determined, every)
-    write_tables(folder, TableResult(title, *placed))
+    write_tables(folder, StoredResult(title, *placed))
 
 
 def _read_sba(path: Path) -> tuple[Network, Estimate]:
@@ -199,7 +200,7 @@ def read_any(path: Path, name: str | None = None) -> tuple[Network, Estimate]:
     return form.read(path)
 
 
-def read_comparable(path: Path, name: str | None = None) -> TableResult:
+def read_comparable(path: Path, name: str | None = None) -> StoredResult:
     """Read whatever can be compared: tables with standard deviations, any other format without.
 
     Raises:
@@ -218,7 +219,7 @@ def read_comparable(path: Path, name: str | None = None) -> TableResult:
             f"{path}: {len(network.image_points)} image points as format {form.name}, but no coordinates of "
             "photographs or points that could be compared"
         )
-    return TableResult(path.name, network, estimate)
+    return StoredResult(path.name, network, estimate)
 
 
 def write_any(path: Path, name: str, network: Network, estimate: Estimate) -> None:

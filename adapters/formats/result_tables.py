@@ -17,7 +17,6 @@ from __future__ import annotations
 import json
 from collections import Counter
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -33,6 +32,7 @@ from sfm.errors import OutputError, SurveyFileError
 from sfm.files.csv_tables import CsvTable, read_header, read_table
 from sfm.files.plain_text import csv_text
 from sfm.network import Estimate, ImagePoints, Network
+from sfm.stored_result import StoredResult
 
 EXTERIOR = ("X", "Y", "Z", "omega_deg", "phi_deg", "kappa_deg")
 SIGMAS = ("sX", "sY", "sZ")
@@ -40,21 +40,7 @@ PRINCIPAL_DISTANCES = ("c", "fx", "fy")
 COLMAP_SIDE_FILE = f"colmap/{SIDE_FILE}"
 
 
-@dataclass(frozen=True)
-class TableResult:
-    """A result as its tables tell it."""
-
-    name: str  # of the survey
-    network: Network
-    estimate: Estimate
-    point_covariance: FloatArray | None = None  # diagonal: of sX, sY, sZ, object unit^2, (n, 3, 3)
-    position_covariance: FloatArray | None = None  # likewise of the projection centres, (m, 3, 3)
-    interior_sigma: tuple[FloatArray, ...] | None = None  # of each parameter, NaN where fixed
-    redundancy: int | None = None
-    unit: str = ""  # of lengths, as people call it; empty where nobody knows
-
-
-def read_result(folder: Path) -> TableResult:
+def read_result(folder: Path) -> StoredResult:
     """Read the tables of a result, rejected image points left out.
 
     Raises:
@@ -76,7 +62,7 @@ def read_result(folder: Path) -> TableResult:
     table = read_table(folder / "points.csv", ("id",), ("X", "Y", "Z"), SIGMAS, ignored=None, blank=SIGMAS)
     points = table.keys("id")
     network = Network(images, camera, points, _image_points(folder, images, points))
-    return TableResult(
+    return StoredResult(
         summary.survey or folder.name,
         network,
         Estimate(cameras, position, rotation, table.values[:, :3].copy()),
@@ -88,7 +74,7 @@ def read_result(folder: Path) -> TableResult:
     )
 
 
-def write_tables(folder: Path, result: TableResult) -> None:
+def write_tables(folder: Path, result: StoredResult) -> None:
     """Write a result as tables with named columns; standard deviations only where any is known.
 
     Args:

@@ -132,7 +132,9 @@ def change_datum(adjustment: Adjustment, datum: Datum) -> Adjustment:
             carry the datum.
 
     Example:
-        >>> change_datum(adjustment, Datum("minimal", points=["501", "502", "503"]))  # doctest: +SKIP
+        >>> import sfm
+        >>> sfm.change_datum(result.adjustment, sfm.Datum("minimal", points=["1", "2", "3"])).datum
+        'minimal'
 
     Source: Baarda (1973), S-transformations and criterion matrices.
     """

@@ -44,6 +44,7 @@ from sfm.errors import GeometryError
 from sfm.kernels.threads import own_threads
 from sfm.network import Estimate, Network
 
+FREE = Datum("free")
 SLOPES = {"huber": huber_slopes, "tukey": tukey_slopes}  # of the M-estimators
 
 
@@ -51,7 +52,7 @@ def adjust(
     network: Network,
     estimate: Estimate,
     *,
-    datum: Datum,
+    datum: Datum = FREE,
     sigma_px: float = 0.1,
     image_sigma_factor: float | FloatArray = 1.0,
     reject: str = "tau",
@@ -87,6 +88,11 @@ def adjust(
         GeometryError: nothing to adjust, an unknown option, or datum points that cannot carry the datum.
 
     Source: document 000, secs. 2.2 to 2.4; Foerstner, Wrobel (2016), Photogrammetric Computer Vision, ch. 15.
+
+    Example:
+        >>> import sfm
+        >>> sfm.adjust(result.network, result.estimate, reject="huber").converged
+        True
     """
     if reject not in REJECTS:
         raise GeometryError(f"adjustment: reject '{reject}', expected one of {', '.join(REJECTS)}")

@@ -38,8 +38,10 @@ from sfm.files.plain_text import as_plain
 from sfm.files.whole_files import MANIFEST, refuse_foreign_folder, remove_leftovers
 from sfm.report.log import SurveyLog, refuse_other_log, remove_log
 from sfm.report.output import folder_name
-from sfm.survey.inputs.start import find_photographs
-from sfm.survey.inputs.survey_file import Survey, read_survey
+from sfm.survey.inputs.photograph_list import find_photographs
+from sfm.survey.inputs.start import refuse_unknown_photographs
+from sfm.survey.inputs.survey import read_survey
+from sfm.survey.inputs.survey_file import SurveyFile, read_survey_file
 from sfm.survey.target_store import TargetStore
 
 SURVEY_NAME = "survey.toml"  # what a folder is searched for
@@ -70,7 +72,7 @@ class _Plan:
 
     file: Path
     folder: str
-    survey: Survey | Exception  # why its file cannot be read
+    survey: SurveyFile | Exception  # why its file cannot be read
 
 
 def run_batch(
@@ -186,12 +188,12 @@ def calls_of(files: Sequence[Path], *, allow_outside: bool = False) -> int:
     calls = 0
     for file in files:
         with suppress(Exception):  # what is wrong is told by the run
-            survey = read_survey(file, allow_outside=allow_outside)
+            survey = read_survey_file(file, allow_outside=allow_outside)
             calls += len(find_photographs(survey)) if _has_parts(survey) else 1
     return max(1, calls)
 
 
-def _has_parts(survey: Survey) -> bool:
+def _has_parts(survey: SurveyFile) -> bool:
     """Whether photographs are measured one by one; tie points belong to several at once."""
     return survey.observations is None and survey.tie_points is None
 
@@ -208,10 +210,10 @@ def _below(path: Path) -> list[Path]:
 
 def _plan(files: Sequence[Path], *, allow_outside: bool) -> tuple[_Plan, ...]:
     """Read all survey files and give each a folder of its own."""
-    read: list[tuple[Path, Survey | Exception]] = []
+    read: list[tuple[Path, SurveyFile | Exception]] = []
     for file in files:
         try:
-            read.append((file, read_survey(file, allow_outside=allow_outside)))
+            read.append((file, read_survey_file(file, allow_outside=allow_outside)))
         except Exception as error:  # one that nobody has foreseen fails this survey alone
             read.append((file, error))
     names = [_folder_name(file, survey) for file, survey in read]
@@ -225,9 +227,9 @@ def _plan(files: Sequence[Path], *, allow_outside: bool) -> tuple[_Plan, ...]:
     return tuple(plans)
 
 
-def _folder_name(file: Path, survey: Survey | Exception) -> str:
+def _folder_name(file: Path, survey: SurveyFile | Exception) -> str:
     name = file.parent.name if file.name == SURVEY_NAME else file.stem
-    return folder_name(survey.name if isinstance(survey, Survey) else name)
+    return folder_name(survey.name if isinstance(survey, SurveyFile) else name)
 
 
 def _run(
@@ -294,11 +296,13 @@ def _run(
     return rows
 
 
-def _work(job: SurveyJob, survey: Survey, comparers: Comparers) -> Work:
+def _work(job: SurveyJob, survey: SurveyFile, comparers: Comparers) -> Work:
     """Return a survey as the engine takes it: a part for each photograph with targets, and the rest."""
     parts: tuple[Call, ...] = ()
     if _has_parts(survey):
+        given = read_survey(job.file, allow_outside=job.allow_outside)
         found = find_photographs(survey)
+        refuse_unknown_photographs(given, found.names)  # before the photographs are measured
         parts = tuple(
             Call(measure_one, (job, survey, name, path))
             for name, path in zip(found.names, found.paths, strict=True)
@@ -308,7 +312,7 @@ def _work(job: SurveyJob, survey: Survey, comparers: Comparers) -> Work:
 
 def _without_result(plan: _Plan, out: Path, status: str, error: Exception) -> SurveyRow:
     """Return the row of a survey that no worker has brought to its end, and write its log."""
-    name = plan.survey.name if isinstance(plan.survey, Survey) else plan.folder
+    name = plan.survey.name if isinstance(plan.survey, SurveyFile) else plan.folder
     with SurveyLog(out / LOGS / f"{plan.folder}.jsonl", append=True) as log:
         return failed_row(log, error, SurveyRow(name, as_plain(str(plan.file)), plan.folder, status))
 

@@ -18,16 +18,17 @@ from sfm.faults import is_fault, told_of_error
 from sfm.files.folder_lock import Owner, locked, owner_of
 from sfm.files.plain_text import as_plain
 from sfm.kernels.compiling import when_compiling
-from sfm.pipeline import adjust_survey, run_survey
+from sfm.pipeline import run_survey
 from sfm.report.findings.findings import findings_of
 from sfm.report.log import LOG, SurveyLog, read_log, remove_log, result_entries
 from sfm.report.output import write_result
 from sfm.result import SurveyResult
 from sfm.survey.comparison import OtherPrograms
-from sfm.survey.inputs.start import find_photographs
-from sfm.survey.inputs.survey_file import Survey, read_survey
+from sfm.survey.inputs.photograph_list import find_photographs
+from sfm.survey.inputs.survey import Survey, read_survey, survey_family
+from sfm.survey.inputs.survey_file import SurveyFile
 from sfm.survey.target_store import TargetStore
-from sfm.survey.targets import measure_photograph, survey_family
+from sfm.survey.targets import measure_photograph
 from sfm.targets.detect import Targets
 
 LOCK = ".lock"  # of the batch
@@ -105,12 +106,14 @@ def lock_of(out: Path, folder: str) -> Path:
     return out / f".{folder}.lock"
 
 
-def measure_one(job: SurveyJob, survey: Survey, image: str, path: Path, *, tell: Tell) -> MeasuredPhotograph:
+def measure_one(
+    job: SurveyJob, survey: SurveyFile, image: str, path: Path, *, tell: Tell
+) -> MeasuredPhotograph:
     """Measure one photograph; why it cannot be read is part of what is returned."""
     begun = time.perf_counter()
     store = TargetStore.of_user()
     try:
-        family = survey_family(survey)
+        family = survey_family(survey.targets, survey.codes)
         with when_compiling(lambda: tell({"compiling": True})):
             targets, stored = measure_photograph(path, survey.targets, family, store)
     except Exception as error:  # one that nobody has foreseen fails the survey, which comes upon it again
@@ -177,7 +180,7 @@ def failed_row(log: SurveyLog, error: Exception, row: SurveyRow) -> SurveyRow:
     return replace(row, reason=reason, fault=fault)
 
 
-def fingerprint(survey: Survey) -> str:
+def fingerprint(survey: SurveyFile) -> str:
     """Return a SHA-256 of what a survey reads: tables by content, photographs by name, size and date.
 
     Raises:
@@ -234,11 +237,8 @@ def _run(
     seconds: Callable[[], float],
 ) -> SurveyRow:
     others = comparers.others_of(survey)
-    if survey.observations is not None:
-        result = adjust_survey(survey, others=others, progress=log)
-    else:
-        store = replace(TargetStore.of_user(), held=held)
-        result = run_survey(survey, others=others, store=store, progress=log)
+    store = replace(TargetStore.of_user(), held=held)
+    result = run_survey(survey, others=others, store=store, progress=log)
     log.stage("report")
     findings = findings_of(result)
     row: list[SurveyRow] = []

@@ -11,7 +11,7 @@ import csv
 import math
 import sys
 from array import array
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TextIO
@@ -31,13 +31,18 @@ MAX_NUMBER = 1e12  # no length, angle or pixel is larger; squares and products o
 
 @dataclass(frozen=True)
 class CsvTable:
-    """Columns of a CSV file, with what is needed to say where something is wrong."""
+    """Columns of a CSV file or of arrays, with what is needed to say where something is wrong."""
 
-    path: Path
+    path: Path  # of arrays what they are
     names: tuple[str, ...]  # of the columns of text
     texts: tuple[tuple[str, ...], ...]  # one tuple per column of text
     values: FloatArray  # columns of numbers, (rows, columns)
     line: IntArray  # line of each row in the file, (rows,)
+    word: str = "line"  # what the numbers count: row of arrays
+
+    def place(self, row: int) -> str:
+        """Return in words where a row stands."""
+        return f"{self.path}, {self.word} {self.line[row]}"
 
     def keys(self, column: str) -> tuple[str, ...]:
         """Return a column of names that are all different."""
@@ -48,7 +53,7 @@ class CsvTable:
     def refuse(self, values: FloatArray, wrong: BoolArray, columns: tuple[str, ...], needed: str) -> None:
         """Raise SurveyFileError for the first value of a mask, both (rows, columns)."""
         for k, c in np.argwhere(wrong)[:1]:
-            where = f"{self.path}, line {self.line[k]}: column {columns[c]}"
+            where = f"{self.place(k)}: column {columns[c]}"
             raise SurveyFileError(f"{where} holds {values[k, c]:g}, needed {needed}")
 
     def refuse_duplicates(self, keys: tuple[object, ...], columns: tuple[str, ...]) -> None:
@@ -60,7 +65,9 @@ class CsvTable:
             if key in first:
                 names = key if isinstance(key, tuple) else (key,)
                 what = ", ".join(f"{c} '{name}'" for c, name in zip(columns, names, strict=True))
-                raise SurveyFileError(f"{self.path}, line {line}: {what} stands on line {first[key]} already")
+                raise SurveyFileError(
+                    f"{self.path}, {self.word} {line}: {what} stands on {self.word} {first[key]} already"
+                )
             first[key] = line
 
 
@@ -125,6 +132,43 @@ def read_table(
         np.array(values).reshape(len(lines), len(numbers)),
         np.array(lines, dtype=np.int64),
     )
+
+
+def array_table(
+    what: str,
+    texts: Mapping[str, Sequence[str]],
+    numbers: Mapping[str, FloatArray],
+    *,
+    blank: tuple[str, ...] = (),
+) -> CsvTable:
+    """Return arrays as a table, as if they had been read from a file.
+
+    Args:
+        what: the arrays are, for messages.
+        texts: columns of names.
+        numbers: columns of numbers, as long.
+        blank: columns of numbers that may be NaN.
+
+    Raises:
+        SurveyFileError: columns of different length, none at all, a bad name, or not a finite number of
+            bearable size.
+    """
+    rows = len(next(iter(texts.values())))
+    for name, column in texts.items():
+        if len(column) != rows:
+            raise SurveyFileError(f"{what}: {len(column)} values of {name}, expected {rows}")
+    if not rows:
+        raise SurveyFileError(f"{what}: no rows, at least one is needed")
+    names = tuple(
+        tuple(_name(str(cell), f"{what}, row {k}: {name}") for k, cell in enumerate(column, 1))
+        for name, column in texts.items()
+    )
+    values = np.column_stack(list(numbers.values()))
+    table = CsvTable(Path(what), tuple(texts), names, values, np.arange(1, rows + 1), "row")
+    wrong = ~(np.abs(values) <= MAX_NUMBER)
+    wrong &= ~(np.isnan(values) & np.isin(list(numbers), blank))
+    table.refuse(values, wrong, tuple(numbers), f"a finite number of at most {MAX_NUMBER:g}")
+    return table
 
 
 def _rows(path: Path, columns: int) -> Iterator[tuple[int, list[str]]]:

@@ -75,6 +75,12 @@ def orient(
 
     Source: Luhmann et al. (2020), sec. 4.4.4 (orientation of image networks), with resection by Fischler and
     Bolles (1981) in every photograph.
+
+    Example:
+        >>> import sfm
+        >>> start = sfm.empty_estimate(result.network, result.estimate.cameras)
+        >>> sfm.orient(result.network, start).failures
+        ()
     """
 
     def grow(values: Estimate) -> Orientation:

@@ -14,8 +14,7 @@ from sfm.errors import GeometryError
 from sfm.network import Estimate, Network, ObjectPoints, ScaleBars
 from sfm.result import ControlCheck
 from sfm.similarity import Similarity, fit_similarity
-from sfm.survey.inputs.start import control_points, scale_bars
-from sfm.survey.inputs.survey_file import Survey
+from sfm.survey.inputs.survey import Survey
 
 CONTRADICTED = 0.5  # share of its rays that the test rejects, above which control or a bar is to blame
 CLEARLY = 0.25  # of the misfit that the best choice removes: by how much more than the second it must remove
@@ -53,8 +52,7 @@ def refuse_other_units(survey: Survey, network: Network, estimate: Estimate) -> 
     factor = by_control / by_bars
     if survey.datum.kind == "control" and not (np.isnan(factor) or 1 / OTHER_UNIT < factor < OTHER_UNIT):
         raise GeometryError(
-            f"survey {survey.name}: lengths by the control are {factor:.4g} times those by the bars; are "
-            f"both in {survey.unit}?"
+            f"lengths by the control are {factor:.4g} times those by the bars; are both in {survey.unit}?"
         )
 
 
@@ -65,7 +63,7 @@ def _scale(length: FloatArray, difference: FloatArray) -> float:
     return float(np.median(length[usable] / found[usable])) if usable.any() else float("nan")
 
 
-def rescaled(network: Network, estimate: Estimate, datum: Datum) -> Estimate:
+def scale_to_bars(network: Network, estimate: Estimate, datum: Datum) -> Estimate:
     """Bring a network that control does not hold to the length of its scale bars, else of its control."""
     if datum.kind == "control":
         return estimate
@@ -73,7 +71,7 @@ def rescaled(network: Network, estimate: Estimate, datum: Datum) -> Estimate:
     return Similarity(scale, np.eye(3), np.zeros(3)).apply_estimate(estimate) if scale > 0 else estimate
 
 
-def placed_on_control(network: Network, estimate: Estimate) -> tuple[Estimate, ControlCheck]:
+def place_on_control(network: Network, estimate: Estimate) -> tuple[Estimate, ControlCheck]:
     """Place an adjusted network on its control; scale bars, where there are some, keep its scale."""
     control = network.control
     points = estimate.points[control.point]
@@ -93,7 +91,7 @@ class Contradiction:
     line: str  # in words
 
 
-def contradiction(
+def find_contradiction(
     network: Network, adjustment: Adjustment, readjust: Callable[[Network], Adjustment], *, unit: str
 ) -> Contradiction | None:
     """Return what contradicts the photographs where the test rejects most rays of a control point or bar end.
@@ -228,16 +226,15 @@ def lost_share(adjustment: Adjustment) -> FloatArray:
 
 def datum_warnings(survey: Survey, network: Network) -> tuple[str, ...]:
     """Return a line for control and scale bars that were not measured, and for a missing scale."""
-    lines = []
-    _, control = control_points(survey, network.points)
+    lines, known = [], set(network.points)
+    control = [name for name in survey.control.names if name not in known] if survey.control else []
     if control:
         lines.append(f"control not in the result: {', '.join(control)}")
-    _, bars = scale_bars(survey, network.points)
+    bars = [f"{bar.start} - {bar.end}" for bar in survey.scale_bars if not {bar.start, bar.end} <= known]
     if bars:
         lines.append(f"scale bars with an end that is not in the result: {', '.join(bars)}")
     if survey.datum.kind != "control" and not len(network.scale_bars) and len(network.control) < 2:
         lines.append(
-            f"the survey holds no scale: lengths are not in {survey.unit} until a scale bar or control is "
-            "measured"
+            f"scale is undefined: lengths are not in {survey.unit} until a scale bar or control is measured"
         )
     return tuple(lines)

@@ -16,22 +16,24 @@ from PIL import Image
 from adapters.colmap.camera_models import read_model, write_model
 from adapters.formats.ply import read_ply
 from adapters.formats.registry import read_any, write_any
-from adapters.formats.result_tables import TableResult, read_result, write_tables
+from adapters.formats.result_tables import read_result, write_tables
 from adapters.formats.sba_text import read_sba_text
 from sfm.camera import camera_from_values
 from sfm.errors import KolinearError
 from sfm.photographs.exif import read_metadata
 from sfm.photographs.reading import read_photograph
-from sfm.pipeline import adjust_survey
-from sfm.survey.inputs.start import find_photographs, network_from_observations
-from sfm.survey.inputs.survey_file import read_survey
-from sfm.survey.inputs.tables import (
+from sfm.pipeline import run_survey
+from sfm.stored_result import StoredResult
+from sfm.survey.inputs.exterior_table import read_observed_exterior
+from sfm.survey.inputs.given import (
     read_control,
     read_exterior,
     read_image_points,
-    read_observed_exterior,
     read_points,
 )
+from sfm.survey.inputs.photograph_list import find_photographs
+from sfm.survey.inputs.start import measurements_from_observations
+from sfm.survey.inputs.survey import read_survey
 from sfm.targets.codes.rings import read_code_table
 from sfm.targets.detect import find_targets
 from tests.fuzz.mutate import mutate_bytes, mutate_text
@@ -135,7 +137,7 @@ def _results(folder: Path) -> list[Seed]:
     plain = camera.with_parameters(camera.parameters[[1, 1, 2, 3, 4, 5, 6, 7]] * ([1] * 4 + [0] * 4))
     ideal = replace(truth, cameras=(plain,))
     sigma = np.tile(np.eye(3) * 1e-6, (8, 1, 1))
-    write_tables(folder / "result", TableResult("fuzz", network, truth, sigma, sigma[:3], redundancy=5))
+    write_tables(folder / "result", StoredResult("fuzz", network, truth, sigma, sigma[:3], redundancy=5))
     write_any(folder / "m.xml", "metashape", network, truth)
     write_any(folder / "bal.txt", "bal", network, ideal)
     write_any(folder / "sba", "sba", network, ideal)
@@ -216,9 +218,9 @@ def _read_survey(folder: Path, rng: random.Random) -> None:
     if survey.observations is None:
         find_photographs(survey)
         return
-    network_from_observations(survey)
+    measurements_from_observations(survey)
     if rng.random() < SOLVED_SHARE:
-        adjust_survey(survey)
+        run_survey(survey)
 
 
 def _reader_of_photograph(name: str) -> Callable[[Path, random.Random], None]:
