@@ -17,14 +17,25 @@ from contextlib import AbstractContextManager, ExitStack, contextmanager, suppre
 from dataclasses import dataclass
 from itertools import count
 from multiprocessing import resource_tracker
+from tempfile import TemporaryDirectory
 from threading import Lock
 from typing import Any
 
 import dask
 import dask.system
 import distributed.system
-from dask.distributed import Client, Future, KilledWorker, LocalCluster, Worker, WorkerPlugin, get_worker
+from dask.distributed import (
+    Client,
+    Future,
+    KilledWorker,
+    LocalCluster,
+    Scheduler,
+    Worker,
+    WorkerPlugin,
+    get_worker,
+)
 from distributed.core import rpc
+from distributed.security import Security
 from threadpoolctl import threadpool_limits
 
 from sfm.errors import BackendError, KolinearError
@@ -55,6 +66,11 @@ NO_DIARY = {
     "distributed.admin.low-level-log-length": 100,
     "distributed.admin.system-monitor.log-length": 60,
 }
+# Pages for a browser, which would tell anybody on this computer what is computed.
+NO_PAGES: dict[str, list[str]] = {
+    "distributed.scheduler.http.routes": [],
+    "distributed.worker.http.routes": [],
+}
 
 
 def fitting_workers() -> int:
@@ -65,6 +81,10 @@ def fitting_workers() -> int:
 @contextmanager
 def local_engine(workers: int, *, memory_bytes: int | None = None) -> Iterator[DaskEngine]:
     """Start worker processes on this computer, each with one thread.
+
+    Whoever reaches a Dask scheduler or worker can run programs in it, and everybody on this computer reaches
+    127.0.0.1. So they talk by TLS only, to those who have the key of this run, which is in the memory of its
+    processes and nowhere else; and what workers set aside on the disk lies in a folder of this user alone.
 
     Args:
         workers: how many.
@@ -78,6 +98,7 @@ def local_engine(workers: int, *, memory_bytes: int | None = None) -> Iterator[D
         "distributed.scheduler.allowed-failures": ALLOWED_FAILURES,
         "distributed.scheduler.work-stealing": True,
         **NO_DIARY,
+        **NO_PAGES,
         "distributed.nanny.pre-spawn-environ": {
             **ONE_THREAD,
             "MALLOC_TRIM_THRESHOLD_": "65536",
@@ -86,6 +107,7 @@ def local_engine(workers: int, *, memory_bytes: int | None = None) -> Iterator[D
         "distributed.comm.timeouts.connect": "60s",  # new workers compile and import on a busy computer
     }
     with dask.config.set(settings), ExitStack() as stack:
+        scratch = stack.enter_context(TemporaryDirectory(prefix="kolinear-", ignore_cleanup_errors=True))
         with _interrupt_held_back():  # a Ctrl-C meanwhile comes when all of this is up, and can be ended
             try:
                 cluster = LocalCluster(
@@ -97,13 +119,16 @@ def local_engine(workers: int, *, memory_bytes: int | None = None) -> Iterator[D
                     dashboard_address="127.0.0.1:0",  # None lets a server listen on a fixed port to the world
                     scheduler_kwargs={"dashboard": False},
                     silence_logs=logging.CRITICAL,
+                    security=Security.temporary(),
+                    local_directory=scratch,
                 )
-            except (OSError, RuntimeError, TimeoutError) as error:
+            except (ImportError, OSError, RuntimeError, TimeoutError) as error:
                 raise BackendError(f"{workers} worker processes cannot be started: {_line(error)}") from error
             stack.callback(_close, cluster)
             stack.enter_context(cluster)
             client = stack.enter_context(Client(cluster))
-            client.register_plugin(_IgnoreInterrupt())
+            client.register_plugin(_LocalWorker())
+            client.run_on_scheduler(_close_pages)
         yield DaskEngine(client)
 
 
@@ -142,7 +167,8 @@ def remote_engine(address: str) -> AbstractContextManager[DaskEngine]:
 
     Args:
         address: such as tcp://192.168.1.5:8786; whoever reaches a scheduler can run programs on its
-            workers, so it belongs in a network of trust.
+            workers, so it belongs in a network of trust. For tls:// Dask's own configuration names the
+            certificates.
 
     Raises:
         BackendError: no scheduler answers, which is known before anything else is begun.
@@ -162,7 +188,11 @@ def remote_engine(address: str) -> AbstractContextManager[DaskEngine]:
 
 async def _ask(address: str) -> None:
     """Ask whoever is at an address whether it is a scheduler; ValueError if not."""
-    async with asyncio.timeout(CONNECT_SECONDS), rpc(address, timeout=CONNECT_SECONDS) as server:
+    credentials = Security().get_connection_args("client")
+    async with (
+        asyncio.timeout(CONNECT_SECONDS),
+        rpc(address, timeout=CONNECT_SECONDS, connection_args=credentials) as server,
+    ):
         kind = (await server.identity())["type"]
     if kind != "Scheduler":
         raise ValueError(f"it is a {kind}")
@@ -178,14 +208,19 @@ def _connected(address: str) -> Iterator[DaskEngine]:
         yield DaskEngine(client)
 
 
-class _IgnoreInterrupt(WorkerPlugin):
-    """Keep Ctrl-C from workers where signals cannot be held back."""
+class _LocalWorker(WorkerPlugin):
+    """Keep Ctrl-C from workers where signals cannot be held back, and browsers."""
 
-    name = "kolinear-ignore-interrupt"
+    name = "kolinear-local-worker"
 
     def setup(self, worker: Worker) -> None:
         """Called in every worker that starts, also in place of one that died."""
         signal.signal(signal.SIGINT, signal.SIG_IGN)
+        worker.http_server.stop()
+
+
+def _close_pages(dask_scheduler: Scheduler) -> None:
+    dask_scheduler.http_server.stop()  # which would still list its pages, if not show them
 
 
 @dataclass(frozen=True)
@@ -321,7 +356,7 @@ _HELD = _OneThread()  # libraries of this process
 
 
 def _event(key: str, future: Future) -> Event:
-    """Return how a piece of work ended, or raise what it raised."""
+    """Return how a piece of work ended, or raise what ends them all."""
     if future.status == "finished":
         return Done(key, future.result())
     if future.status == "cancelled":
@@ -333,7 +368,7 @@ def _event(key: str, future: Future) -> Event:
         raise error
     if isinstance(error, ImportError):
         raise BackendError(f"the workers of the cluster lack what Kolinear needs: {_line(error)}") from error
-    raise BackendError(f"the cluster failed: {type(error).__name__}: {_line(error)}") from error
+    return Lost(key, f"it failed in its worker: {type(error).__name__}: {_line(error)}")
 
 
 def _line(error: BaseException | None) -> str:

@@ -48,7 +48,7 @@ class Done:
 
 @dataclass(frozen=True)
 class Lost:
-    """Workers died, again and again, on a piece of work or beside it; the engine has given it up."""
+    """Workers died, again and again, on a piece of work or beside it, or it raised an unforeseen error."""
 
     key: str
     reason: str  # one line
@@ -67,7 +67,7 @@ class Engine(Protocol):
     def run(self, works: Iterable[Work], *, at_a_time: int) -> Iterator[Event]:
         """Run all work and yield what happens; `works` is drawn from as there is room for more.
 
-        An exception of a called function is raised here. If the iterator is closed, what has not begun is
+        A KolinearError of a called function is raised here. If the iterator is closed, what has not begun is
         dropped.
 
         Raises:

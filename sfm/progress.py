@@ -7,6 +7,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Protocol
 
+from sfm.faults import working_on
+
 
 class Progress(Protocol):
     """What a run calls while it works; implementations draw it, count it or ignore it."""
@@ -43,5 +45,6 @@ class StageClock:
         """Announce a stage and time what is done in it."""
         self.progress.stage(name)
         begun = time.perf_counter()
-        yield
+        with working_on(f"stage {name}"):
+            yield
         self.seconds.append((name, time.perf_counter() - begun))

@@ -45,6 +45,7 @@ class PhotographTargets:
     rejected_xy: FloatArray  # centres of the rejected candidates, px, (r, 2)
     rejected_flag: IntArray  # reason for each rejection, see sfm.targets.flags.Flag, (r,)
     flag: IntArray | None = None  # remarks on the measured targets, see sfm.targets.flags.Flag, (k,)
+    stored: bool = False  # whether the targets were measured in an earlier run
 
     def reasons(self) -> list[tuple[str, int]]:
         """Return (reason, number of candidates) of this photograph, most frequent first."""

@@ -7,12 +7,12 @@ import signal
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import nullcontext
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 from threadpoolctl import threadpool_limits
 
 from sfm.batch.survey import Comparers, SurveyRow
-from sfm.executor import Done, Event, Told, Work
+from sfm.executor import Done, Event, Tell, Told, Work
 from sfm.result import SurveyResult
 from sfm.survey.comparison import OtherPrograms
 from sfm.survey.inputs.survey_file import Survey
@@ -67,6 +67,14 @@ def no_others(survey: Survey) -> OtherPrograms:
     if survey.name == KILLER:
         os.kill(os.getpid(), signal.SIGKILL)
     return OtherPrograms()
+
+
+def raise_unforeseen(*parts: object, tell: Tell) -> NoReturn:
+    raise ZeroDivisionError("nobody thought of it")
+
+
+def return_nothing(parts: object, *, tell: Tell) -> None:
+    return None
 
 
 def no_writer(result: SurveyResult) -> None:

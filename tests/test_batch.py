@@ -11,9 +11,11 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager, nullcontext
+from contextlib import ExitStack, contextmanager, nullcontext, suppress
+from http.client import HTTPException
 from importlib.metadata import version
 from pathlib import Path
+from urllib.request import urlopen
 
 import psutil
 import pytest
@@ -22,11 +24,12 @@ from threadpoolctl import threadpool_info
 from adapters.dask_cluster import DaskEngine, _OneThread, fitting_workers, local_engine, remote_engine
 from sfm.batch.pages import render_index
 from sfm.batch.run import calls_of, find_surveys, run_batch
-from sfm.batch.survey import SurveyJob, SurveyRow, reconstruct
+from sfm.batch.survey import LOCK, SurveyJob, SurveyRow, reconstruct
 from sfm.errors import BackendError, KolinearError, OutputError, SurveyFileError
+from sfm.executor import Call, Done, Lost, Work
 from sfm.files.folder_lock import Owner, locked
 from sfm.report.log import read_log
-from tests.engines import ALONE, HERE, KILLER, Notes, points_of
+from tests.engines import ALONE, HERE, KILLER, Notes, points_of, raise_unforeseen, return_nothing
 from tests.surveys import write_observed_survey, write_photograph_survey
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -112,9 +115,8 @@ def test_batch_gives_folders_tables_and_logs(finished: Path) -> None:
         assert len(photographs) == (0 if row["survey"] == "third" else 6)
         assert all(entry["targets"] >= 10 and not entry["stored"] for entry in photographs)
     assert sorted(p.name for p in finished.iterdir()) == [
-        *(".kolinear", "batch.csv", "batch.json", "first", "index.html", "second", "third"),
+        *("batch.csv", "batch.json", "first", "index.html", "manifest.json", "second", "third"),
     ]
-    assert not (finished / ".kolinear" / "lock").exists()
 
 
 def test_resume_keeps_what_is_finished_and_runs_what_has_changed(
@@ -266,7 +268,7 @@ def test_a_worker_whose_run_is_over_writes_nothing(
     out = tmp_path / "out"
     job = SurveyJob(surveys[2], out, "third", "", False, Owner(1, "elsewhere", "2026-01-01T00:00:00+00:00"))
     with (
-        locked(out / ".kolinear" / "lock"),
+        locked(out / LOCK),
         pytest.raises(OutputError, match="the run that asked for survey third is over"),
     ):
         reconstruct(job, ALONE, [], tell=lambda _: None)
@@ -275,14 +277,14 @@ def test_a_worker_whose_run_is_over_writes_nothing(
     monkeypatch.setattr("sfm.batch.survey.owner_of", lambda _: next(owners))
     with pytest.raises(OutputError, match="the run that asked for survey third is over"):
         reconstruct(job, ALONE, [], tell=lambda _: None)
-    assert {path.name for path in out.iterdir()} == {".kolinear", "logs"}
+    assert {path.name for path in out.iterdir()} == {"logs"}
 
 
 def test_a_single_run_into_a_folder_of_the_batch_is_not_disturbed(
     surveys: tuple[Path, ...], finished: Path, tmp_path: Path
 ) -> None:
     out = tmp_path / "out"
-    theirs = out / ".third.abc.part"
+    theirs = out / ".third.abcdefgh.part"
     theirs.mkdir(parents=True)
     with locked(out / ".third.lock"):  # as `kolinear adjust --out out/third` holds it
         rows = run_batch([surveys[2], surveys[0]], out, HERE, ALONE, Notes())
@@ -291,7 +293,7 @@ def test_a_single_run_into_a_folder_of_the_batch_is_not_disturbed(
     assert theirs.exists()
     rows = run_batch([surveys[2]], out, HERE, ALONE, Notes(), resume=True)
     assert rows[0].status == "done"
-    assert sorted(path.name for path in out.iterdir() if path.name.startswith(".")) == [".kolinear"]
+    assert not [path for path in out.iterdir() if path.name.startswith(".")]
 
 
 @pytest.mark.parametrize(
@@ -333,7 +335,7 @@ def test_resume_removes_the_log_of_a_run_killed_at_the_last_moment(
     out = tmp_path / "out"
     run_batch([surveys[2]], out, HERE, ALONE, Notes())
     (out / "logs").mkdir()
-    (out / "logs" / "third.jsonl").write_text("{}\n", encoding="utf-8")
+    (out / "logs" / "third.jsonl").write_text('{"time": "", "event": ""}\n', encoding="utf-8")
     run_batch([surveys[2]], out, HERE, ALONE, Notes(), resume=True)
     assert not (out / "logs").exists()
 
@@ -355,7 +357,7 @@ def test_index_escapes_everything() -> None:
 
 def test_a_second_batch_in_the_same_folder_is_refused(finished: Path, surveys: tuple[Path, ...]) -> None:
     with (
-        locked(finished / ".kolinear" / "lock"),
+        locked(finished / LOCK),
         pytest.raises(
             OutputError, match=f"another run is writing into this folder .process {os.getpid()} on"
         ),
@@ -393,10 +395,22 @@ def test_a_survey_that_kills_workers_is_set_aside(
     out = tmp_path / "out"
     rows = run_batch([surveys[2], killer, surveys[0]], out, nullcontext(two_workers), ALONE, Notes())
     assert [row.status for row in rows] == ["done", "set aside", "done"]
-    assert "worker processes died" in rows[1].reason
+    assert "worker processes died" in rows[1].reason and rows[1].fault
     same = points_of(finished)
     assert points_of(out) == {name: same[name] for name in ("first", "third")}
     assert not [path for path in out.iterdir() if path.name.endswith((".part", ".old"))]
+
+
+def test_an_unforeseen_error_in_a_worker_ends_its_work_alone(two_workers: DaskEngine) -> None:
+    works = [
+        Work("faulty", (), Call(raise_unforeseen, ())),
+        Work("part", (Call(raise_unforeseen, ()),), Call(return_nothing, ())),
+        Work("sound", (), Call(return_nothing, ())),
+    ]
+    events = {event.key: event for event in two_workers.run(works, at_a_time=1)}
+    assert events.pop("sound") == Done("sound", None)
+    told = "it failed in its worker: ZeroDivisionError: nobody thought of it"
+    assert events == {name: Lost(name, told) for name in ("faulty", "part")}
 
 
 def test_a_batch_that_comes_to_nothing_leaves_no_folder(surveys: tuple[Path, ...], tmp_path: Path) -> None:
@@ -428,6 +442,78 @@ def test_workers_listen_to_this_computer_only_and_two_batches_do_not_meet(two_wo
             if connection.status == psutil.CONN_LISTEN
         }
     assert listening == {"127.0.0.1"}
+
+
+STRANGER = """
+import asyncio, os, pickle, sys
+from distributed.core import rpc
+from distributed.security import Security
+
+async def knock(address, security):
+    server = rpc(address, timeout=10, connection_args=security.get_connection_args("client"))
+    try:
+        async with asyncio.timeout(20), server:
+            print("in", address, (await server.identity())["type"])
+            await server.run(function=pickle.dumps(os.getpid))
+    except Exception as error:
+        print("out", address, type(error).__name__)
+
+async def knock_everywhere(ports):
+    own = Security.temporary()
+    await asyncio.gather(
+        *(knock(f"tcp://127.0.0.1:{port}", Security()) for port in ports),
+        *(knock(f"tls://127.0.0.1:{port}", own) for port in ports),
+    )
+
+asyncio.run(knock_everywhere(sys.argv[1:]))
+"""
+
+
+def listening_ports() -> set[int]:
+    own = psutil.Process()
+    return {
+        connection.laddr.port
+        for process in (own, *own.children(recursive=True))
+        for connection in process.net_connections()
+        if connection.status == psutil.CONN_LISTEN
+    }
+
+
+def test_a_stranger_on_this_computer_has_no_access_to_scheduler_and_workers(
+    two_workers: DaskEngine,
+) -> None:
+    """Neither without credentials nor with those of another run; who gets in runs any function there."""
+    two_workers.client.wait_for_workers(2, timeout=60)  # those that a test before has killed
+    known = two_workers.client.scheduler_info()["workers"]
+    servers = {two_workers.client.scheduler.address, *known, *(worker["nanny"] for worker in known.values())}
+    ports = listening_ports()
+    assert len(servers) == 5 and {int(address.rsplit(":", 1)[1]) for address in servers} <= ports
+    assert two_workers.client.submit(os.getpid, pure=False).result(timeout=60) != os.getpid()
+    stranger = subprocess.run(
+        [sys.executable, "-c", STRANGER, *map(str, sorted(ports))],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=300,
+        check=False,
+    )
+    words = [line.split()[0] for line in stranger.stdout.splitlines()]
+    assert words == ["out"] * (2 * len(ports)), stranger.stdout + stranger.stderr
+    assert two_workers.client.submit(os.getpid, pure=False).result(timeout=60) != os.getpid()
+
+
+def test_workers_show_no_pages_and_keep_their_files_to_this_user(two_workers: DaskEngine) -> None:
+    shown = []
+    two_workers.client.wait_for_workers(2, timeout=60)
+    assert len(listening_ports()) == 5  # of the scheduler, two workers, and of who starts them again
+    for port in listening_ports():
+        for page in ("", "health", "metrics", "sitemap.json", "json/counts.json", "info/main/workers.html"):
+            with suppress(OSError, HTTPException), urlopen(f"http://127.0.0.1:{port}/{page}", timeout=5):
+                shown.append(f"{port}/{page}")
+    assert not shown
+    for folder in two_workers.client.run(lambda dask_worker: dask_worker.local_directory).values():
+        above = next(path for path in Path(folder).parents if path.name.startswith("kolinear-"))
+        assert above.stat().st_mode & 0o077 == 0
 
 
 def test_dask_says_nothing_by_itself(two_workers: DaskEngine) -> None:

@@ -17,7 +17,9 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from sfm.errors import KolinearError, PhotographError
-from sfm.photographs.reading import BOMB_PX_PER_BYTE, read_metadata, read_photograph
+from sfm.photographs.exif import read_metadata
+from sfm.photographs.file_checks import BOMB_PX_PER_BYTE
+from sfm.photographs.reading import read_photograph
 from sfm.survey.inputs.survey_file import read_survey
 from sfm.survey.inputs.tables import read_image_points
 from tests.fuzz.cases import Seed, make_seeds, run_case

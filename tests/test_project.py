@@ -10,7 +10,7 @@ import pytest
 
 from sfm.conventions import angles_from_rotation, image_from_pixel
 from sfm.errors import PhotographError, SurveyFileError
-from sfm.photographs.reading import Metadata
+from sfm.photographs.exif import Metadata
 from sfm.survey.inputs.cameras import camera_of_image, start_cameras
 from sfm.survey.inputs.start import (
     control_points,

@@ -97,7 +97,7 @@ def test_alignments_bring_the_datum_back(align: str, epochs: tuple[Result, Resul
     assert found.rotation_deg.max() < 1e-10
     with pytest.raises(GeometryError, match="control point 99 is not in both"):
         compare_results(first, turned, align="control", control=("99",))
-    with pytest.raises(GeometryError, match="align 'middle' is none of"):
+    with pytest.raises(GeometryError, match="align 'middle', expected one of"):
         compare_results(first, turned, align="middle")
 
 

@@ -96,6 +96,8 @@ def photographs(seed: int) -> MeasuredPhotographs:
             Targets(
                 xy=xy + NOISE_PX * rng.standard_normal((k, 2)),
                 covariance=np.tile(1e-8 * np.eye(2), (k, 1, 1)),  # the survey's sigma_px is all there is
+                axes_covariance=np.tile(NOISE_PX**2 * np.eye(3), (k, 1, 1)),
+                edge_covariance=np.tile(np.eye(3), (k, 1, 1)),
                 semi_axes=axes + NOISE_PX * rng.standard_normal((k, 2)),
                 angle=angle,
                 code=np.arange(1, k + 1),

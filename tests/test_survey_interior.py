@@ -17,8 +17,9 @@ from sfm.conventions import angles_from_rotation
 from sfm.errors import GeometryError, SurveyFileError
 from sfm.network import Estimate, Network
 from sfm.pipeline import adjust_survey
-from sfm.report.summary import summary
-from sfm.report.text import text_report
+from sfm.report.findings.findings import findings_of
+from sfm.report.tables.summary import summary
+from sfm.report.text.report import text_report
 from sfm.result import SurveyResult
 from sfm.survey.comparison import OtherPrograms
 from sfm.survey.inputs.survey_file import read_survey
@@ -130,8 +131,8 @@ def test_inner_constraints_on_chosen_points(tmp_path: Path) -> None:
     scale = np.linalg.norm(np.diff(all_points.estimate.points[on[:2]], axis=0))
     scale /= np.linalg.norm(np.diff(a.estimate.points[on[:2]], axis=0))
     assert ratio == pytest.approx(scale**2, rel=1e-4)
-    assert "free on 3 chosen points" in text_report(result)
-    assert summary(result)["datum"]["points"] == ["p1", "p5", "p9"]
+    assert "free on 3 chosen points" in text_report(findings_of(result))
+    assert summary(findings_of(result))["datum"]["points"] == ["p1", "p5", "p9"]
     again = marginal_of(a).joint(np.zeros(0, dtype=int), np.array(on))
     assert again[:3, :3] == pytest.approx(a.covariance.points[on[0]], rel=1e-4)
     path.write_text(path.read_text(encoding="utf-8").replace('"p5", "p9"', '"r", "s"'))

@@ -16,9 +16,9 @@ from sfm.adjustment.solve import adjust
 from sfm.errors import BackendError
 from sfm.network import Estimate, Network, ObjectPoints, ScaleBars
 from sfm.pipeline import adjust_survey
-from sfm.report.statistics import statistics_of
-from sfm.report.tables import write_tables
-from sfm.report.verdict import verdict_of
+from sfm.report.findings.findings import findings_of
+from sfm.report.findings.statistics import statistics_of
+from sfm.report.tables.csv_files import write_tables
 from sfm.survey.comparison import OtherPrograms
 from sfm.survey.datum import contradiction, object_scale
 from sfm.survey.inputs.survey_file import read_survey
@@ -142,7 +142,7 @@ def test_stated_sigmas_are_written_as_stated_whatever_the_weights_were(tmp_path:
     np.testing.assert_allclose(stated, sigma, rtol=1e-14)
 
     (tmp_path / "out").mkdir()
-    write_tables(first, tmp_path / "out")
+    write_tables(findings_of(first), tmp_path / "out")
     again = barred_survey(tmp_path / "again", sigma_px=1.0)
     written = (tmp_path / "out" / "image_points.csv").read_text(encoding="utf-8")
     (again.parent / "image_points.csv").write_text(written, encoding="utf-8")
@@ -209,4 +209,4 @@ def test_a_survey_goes_on_where_a_scale_bar_does_not_fit(tmp_path: Path, bars: i
         assert result.warnings[0].startswith("the scale bars contradict one another")
         assert len(a.network.scale_bars) == 2
         assert not a.rejected[np.isin(a.network.image_points.point, [0, 1, 10, 11])].any()
-        assert verdict_of(result).level == "bad"
+        assert findings_of(result).verdict.level == "bad"

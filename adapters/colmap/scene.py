@@ -1,4 +1,6 @@
-"""Our networks as COLMAP's scenes and back. What differs is turned here and nowhere else:
+"""Our networks as COLMAP's scenes and back.
+
+What differs is turned here and nowhere else:
 
     pixel origin   COLMAP counts from the corner of the top-left pixel, Kolinear from its centre: +0.5 px
     camera axes    COLMAP looks along +z with y down: R_colmap = diag(1, -1, -1) M, t = -R_colmap X0
@@ -92,7 +94,8 @@ def camera_of(found: Any) -> Camera:
     """Return a COLMAP camera as ours, pixel size 1."""
     if found.model_name not in READABLE:
         raise BackendError(
-            f"camera {found.camera_id}: COLMAP's model {found.model_name} is none of {', '.join(READABLE)}"
+            f"camera {found.camera_id}: COLMAP's model {found.model_name}, expected one of "
+            + ", ".join(READABLE)
         )
     model, places = READABLE[found.model_name]
     camera = Camera(

@@ -8,10 +8,11 @@ from __future__ import annotations
 
 import glob
 import hashlib
+import os
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -22,23 +23,24 @@ from sfm.batch.survey import (
     Comparers,
     SurveyJob,
     SurveyRow,
+    failed_row,
     fingerprint,
     finished_row,
     lock_of,
     measure_one,
     reconstruct,
 )
-from sfm.errors import FolderInUseError, KolinearError, SurveyFileError
+from sfm.errors import BackendError, FolderInUseError, SurveyFileError
 from sfm.executor import Call, Done, Engine, Lost, Told, Work
 from sfm.files.folder_lock import locked, owner_of
 from sfm.files.globs import BELOW, find_files
 from sfm.files.plain_text import as_plain
-from sfm.files.whole_files import remove_leftovers
-from sfm.report.log import SurveyLog
-from sfm.report.output import folder_name, refuse_foreign_folder
+from sfm.files.whole_files import MANIFEST, refuse_foreign_folder, remove_leftovers
+from sfm.report.log import SurveyLog, refuse_other_log, remove_log
+from sfm.report.output import folder_name
 from sfm.survey.inputs.start import find_photographs
 from sfm.survey.inputs.survey_file import Survey, read_survey
-from sfm.survey.target_store import STORE, TargetStore
+from sfm.survey.target_store import TargetStore
 
 SURVEY_NAME = "survey.toml"  # what a folder is searched for
 
@@ -68,8 +70,7 @@ class _Plan:
 
     file: Path
     folder: str
-    survey: Survey | None  # None if its file cannot be read
-    reason: str = ""  # why not
+    survey: Survey | Exception  # why its file cannot be read
 
 
 def run_batch(
@@ -101,9 +102,12 @@ def run_batch(
         OutputError: the folder cannot be written, or another run is writing into it.
         BackendError: there is nobody left to work.
     """
-    out = Path(out).resolve()
-    refuse_foreign_pages(out)
+    refuse_foreign_pages(Path(out))
+    out = Path(os.path.abspath(out))  # it has no links
     plans = _plan(files, allow_outside=allow_outside)
+    for plan in plans:
+        refuse_other_log(out / LOGS / f"{plan.folder}.jsonl")
+    TargetStore.of_user().remove_old()
     with _no_empty_folders(out), locked(out / LOCK, out) as before:
         if before is not None:
             watch.remark(f"an earlier run was cut off ({before}); what it had finished is safe")
@@ -126,7 +130,7 @@ def _no_empty_folders(out: Path) -> Iterator[None]:
     try:
         yield
     finally:
-        for folder in (out / STORE, (out / LOCK).parent, out / LOGS, *missing):
+        for folder in (out / LOGS, *missing):
             with suppress(OSError):  # it is in use
                 folder.rmdir()
 
@@ -181,7 +185,7 @@ def calls_of(files: Sequence[Path], *, allow_outside: bool = False) -> int:
     """Return how many workers can be busy at a time, at least 1: the photographs and the surveys without."""
     calls = 0
     for file in files:
-        with suppress(KolinearError, OSError):  # what is wrong is told by the run
+        with suppress(Exception):  # what is wrong is told by the run
             survey = read_survey(file, allow_outside=allow_outside)
             calls += len(find_photographs(survey)) if _has_parts(survey) else 1
     return max(1, calls)
@@ -204,26 +208,26 @@ def _below(path: Path) -> list[Path]:
 
 def _plan(files: Sequence[Path], *, allow_outside: bool) -> tuple[_Plan, ...]:
     """Read all survey files and give each a folder of its own."""
-    read: list[tuple[Path, Survey | None, str]] = []
+    read: list[tuple[Path, Survey | Exception]] = []
     for file in files:
         try:
-            read.append((file, read_survey(file, allow_outside=allow_outside), ""))
-        except KolinearError as error:
-            read.append((file, None, str(error)))
-    names = [_folder_name(file, survey) for file, survey, _ in read]
+            read.append((file, read_survey(file, allow_outside=allow_outside)))
+        except Exception as error:  # one that nobody has foreseen fails this survey alone
+            read.append((file, error))
+    names = [_folder_name(file, survey) for file, survey in read]
     often = Counter(name.casefold() for name in names)
     plans = []
-    for (file, survey, reason), name in zip(read, names, strict=True):
-        reserved = name.casefold() in (LOGS, *PAGES)
+    for (file, survey), name in zip(read, names, strict=True):
+        reserved = name.casefold() in (LOGS, MANIFEST, *PAGES)
         if often[name.casefold()] > 1 or reserved:  # told apart by what stays the same from run to run
             name = f"{name}-{hashlib.sha256(str(file).encode()).hexdigest()[:8]}"
-        plans.append(_Plan(file, name, survey, reason))
+        plans.append(_Plan(file, name, survey))
     return tuple(plans)
 
 
-def _folder_name(file: Path, survey: Survey | None) -> str:
+def _folder_name(file: Path, survey: Survey | Exception) -> str:
     name = file.parent.name if file.name == SURVEY_NAME else file.stem
-    return folder_name(name if survey is None else survey.name)
+    return folder_name(survey.name if isinstance(survey, Survey) else name)
 
 
 def _run(
@@ -248,19 +252,19 @@ def _run(
     def begin() -> Iterator[Work]:
         for plan in plans:
             try:
-                if plan.survey is None:
-                    raise SurveyFileError(plan.reason)
+                if isinstance(plan.survey, Exception):
+                    raise plan.survey
                 refuse_foreign_folder(out / plan.folder)
                 inputs = fingerprint(plan.survey)
                 job = SurveyJob(plan.file, out, plan.folder, inputs, allow_outside, owner_of(out / LOCK))
                 earlier = finished_row(job) if resume else None
                 if earlier is None:
                     works[plan.folder] = _work(job, plan.survey, comparers)
-            except (KolinearError, OSError) as error:
-                finish(plan.folder, _without_result(plan, out, "failed", str(error)))
+            except Exception as error:
+                finish(plan.folder, _without_result(plan, out, "failed", error))
                 continue
             if earlier is not None:  # its log may be there still, of a run killed at the last moment
-                (out / LOGS / f"{plan.folder}.jsonl").unlink(missing_ok=True)
+                remove_log(out / LOGS / f"{plan.folder}.jsonl")
                 finish(plan.folder, earlier, kept=True)
                 continue
             work = works[plan.folder]
@@ -284,8 +288,9 @@ def _run(
             elif isinstance(event, Done):
                 finish(event.key, event.value)
             else:
-                reason = f"set aside: {event.reason}, alone as well as beside others"
-                finish(event.key, _without_result(by_name[event.key], out, "set aside", reason))
+                died = BackendError(f"set aside: {event.reason}, alone as well as beside others")
+                row = _without_result(by_name[event.key], out, "set aside", died)
+                finish(event.key, replace(row, fault=True))
     return rows
 
 
@@ -301,21 +306,18 @@ def _work(job: SurveyJob, survey: Survey, comparers: Comparers) -> Work:
     return Work(job.folder, parts, Call(reconstruct, (job, comparers)))
 
 
-def _without_result(plan: _Plan, out: Path, status: str, reason: str) -> SurveyRow:
+def _without_result(plan: _Plan, out: Path, status: str, error: Exception) -> SurveyRow:
     """Return the row of a survey that no worker has brought to its end, and write its log."""
-    name = plan.survey.name if plan.survey is not None else plan.folder
-    file, reason = as_plain(str(plan.file)), as_plain(reason)
+    name = plan.survey.name if isinstance(plan.survey, Survey) else plan.folder
     with SurveyLog(out / LOGS / f"{plan.folder}.jsonl", append=True) as log:
-        log.note("failed", survey=name, file=file, reason=reason)
-    return SurveyRow(name, file, plan.folder, status, reason=reason)
+        return failed_row(log, error, SurveyRow(name, as_plain(str(plan.file)), plan.folder, status))
 
 
 def _clean(out: Path, plans: Sequence[_Plan]) -> None:
     """Remove what killed workers left half-written, but not what others are writing beside this batch."""
-    TargetStore(out / STORE).remove_parts()
     for plan in plans:
         if any(out.glob(f".{glob.escape(plan.folder)}.*")):
             with suppress(FolderInUseError), locked(lock_of(out, plan.folder)):
                 remove_leftovers(out / plan.folder)
-    for page in PAGES:
+    for page in (MANIFEST, *PAGES):
         remove_leftovers(out / page)

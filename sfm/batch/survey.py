@@ -12,22 +12,25 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from sfm.errors import FolderInUseError, KolinearError, OutputError
+from sfm.errors import FolderInUseError, OutputError
 from sfm.executor import Tell
+from sfm.faults import is_fault, told_of_error
 from sfm.files.folder_lock import Owner, locked, owner_of
 from sfm.files.plain_text import as_plain
 from sfm.kernels.compiling import when_compiling
 from sfm.pipeline import adjust_survey, run_survey
-from sfm.report.log import LOG, SurveyLog, read_log, result_entries
+from sfm.report.findings.findings import findings_of
+from sfm.report.log import LOG, SurveyLog, read_log, remove_log, result_entries
 from sfm.report.output import write_result
 from sfm.result import SurveyResult
 from sfm.survey.comparison import OtherPrograms
 from sfm.survey.inputs.start import find_photographs
 from sfm.survey.inputs.survey_file import Survey, read_survey
-from sfm.survey.target_store import STORE, TargetStore
+from sfm.survey.target_store import TargetStore
 from sfm.survey.targets import measure_photograph, survey_family
+from sfm.targets.detect import Targets
 
-LOCK = ".kolinear/lock"  # of the batch
+LOCK = ".lock"  # of the batch
 VERDICTS = ("good", "fair", "bad")
 LOGS = "logs"  # folder of the logs of surveys that have no result
 
@@ -42,11 +45,6 @@ class SurveyJob:
     inputs: str  # fingerprint of everything that the survey reads
     allow_outside: bool  # whether the survey file may name files outside its folder
     owner: Owner | None  # of the folder of the batch, who asked for this
-
-    @property
-    def store(self) -> TargetStore:
-        """Where targets are kept."""
-        return TargetStore(self.out / STORE)
 
 
 @dataclass(frozen=True)
@@ -70,6 +68,14 @@ class PhotographNote:
 
 
 @dataclass(frozen=True)
+class MeasuredPhotograph:
+    """A photograph as the worker that measured it hands it to the one that goes on."""
+
+    note: PhotographNote
+    held: dict[str, tuple[Targets, bool]]  # as of a TargetStore; computers may have no common one
+
+
+@dataclass(frozen=True)
 class SurveyRow:
     """A survey in the tables of a batch; None where there is no result."""
 
@@ -86,6 +92,7 @@ class SurveyRow:
     comparison: str = ""  # agrees | differs | none
     seconds: float = 0.0  # of computing, photographs included
     reason: str = ""  # why there is no result, one line
+    fault: bool = False  # whether that is an error of the program, not of the survey
 
     @property
     def succeeded(self) -> bool:
@@ -98,23 +105,24 @@ def lock_of(out: Path, folder: str) -> Path:
     return out / f".{folder}.lock"
 
 
-def measure_one(job: SurveyJob, survey: Survey, image: str, path: Path, *, tell: Tell) -> PhotographNote:
-    """Measure one photograph into the store; why it cannot be read is part of what is returned."""
+def measure_one(job: SurveyJob, survey: Survey, image: str, path: Path, *, tell: Tell) -> MeasuredPhotograph:
+    """Measure one photograph; why it cannot be read is part of what is returned."""
     begun = time.perf_counter()
+    store = TargetStore.of_user()
     try:
         family = survey_family(survey)
         with when_compiling(lambda: tell({"compiling": True})):
-            targets, stored = measure_photograph(path, survey.targets, family, job.store)
-    except KolinearError as error:
-        note = PhotographNote(image, failed=str(error))
+            targets, stored = measure_photograph(path, survey.targets, family, store)
+    except Exception as error:  # one that nobody has foreseen fails the survey, which comes upon it again
+        note = PhotographNote(image, failed=as_plain(told_of_error(error)))
     else:
         note = PhotographNote(image, len(targets), len(targets.rejected_xy), stored)
     tell({"photograph": image})
-    return replace(note, seconds=round(time.perf_counter() - begun, 4))
+    return MeasuredPhotograph(replace(note, seconds=round(time.perf_counter() - begun, 4)), store.held)
 
 
 def reconstruct(
-    job: SurveyJob, comparers: Comparers, photographs: list[PhotographNote], *, tell: Tell
+    job: SurveyJob, comparers: Comparers, photographs: list[MeasuredPhotograph], *, tell: Tell
 ) -> SurveyRow:
     """Run a survey whose photographs are measured, and write its result.
 
@@ -136,23 +144,37 @@ def reconstruct(
     live = job.out / LOGS / f"{job.folder}.jsonl"
     with SurveyLog(live, watch=_Telling(tell)) as log, when_compiling(lambda: tell({"compiling": True})):
         log.start(name, job.file, inputs=job.inputs)
-        for note in photographs:
-            log.note("photograph", **asdict(note))
-        before = sum(note.seconds for note in photographs)
+        for photograph in photographs:
+            log.note("photograph", **asdict(photograph.note))
+        before = sum(photograph.note.seconds for photograph in photographs)
+        held = {key: found for photograph in photographs for key, found in photograph.held.items()}
         try:
             survey = read_survey(job.file, allow_outside=job.allow_outside)
             name = survey.name
-            row = _run(job, survey, comparers, log, lambda: before + time.perf_counter() - begun)
+            row = _run(job, survey, comparers, held, log, lambda: before + time.perf_counter() - begun)
         except Exception as error:
             if isinstance(error, OutputError) and not isinstance(error, FolderInUseError):
                 log.note("failed", reason=str(error))  # others will not be written, either
                 raise
-            reason = as_plain(str(error) if isinstance(error, KolinearError | OSError) else _fault(error))
-            log.note("failed", reason=reason, **_trace(error))
             seconds = round(before + time.perf_counter() - begun, 3)
-            return SurveyRow(name, str(job.file), job.folder, "failed", reason=reason, seconds=seconds)
-    live.unlink(missing_ok=True)  # the result has it
+            row = SurveyRow(name, str(job.file), job.folder, "failed", seconds=seconds)
+            return failed_row(log, error, row)
+    remove_log(live)  # the result has it
     return row
+
+
+def failed_row(log: SurveyLog, error: Exception, row: SurveyRow) -> SurveyRow:
+    """Return the row of a survey that an error has ended, and write the error into its log.
+
+    Raises:
+        OutputError: the log cannot be written.
+    """
+    reason, fault = as_plain(told_of_error(error)), is_fault(error)
+    trace = {"trace": traceback.format_exception(error)} if fault else {}
+    log.note("failed", survey=row.survey, file=as_plain(row.file), reason=reason, **trace)
+    if fault:
+        reason += f"; its traceback is in {LOGS}/{row.folder}.jsonl"
+    return replace(row, reason=reason, fault=fault)
 
 
 def fingerprint(survey: Survey) -> str:
@@ -204,23 +226,32 @@ def _is_sound(row: SurveyRow) -> bool:
 
 
 def _run(
-    job: SurveyJob, survey: Survey, comparers: Comparers, log: SurveyLog, seconds: Callable[[], float]
+    job: SurveyJob,
+    survey: Survey,
+    comparers: Comparers,
+    held: dict[str, tuple[Targets, bool]],
+    log: SurveyLog,
+    seconds: Callable[[], float],
 ) -> SurveyRow:
     others = comparers.others_of(survey)
     if survey.observations is not None:
         result = adjust_survey(survey, others=others, progress=log)
     else:
-        result = run_survey(survey, others=others, store=job.store, progress=log)
+        store = replace(TargetStore.of_user(), held=held)
+        result = run_survey(survey, others=others, store=store, progress=log)
     log.stage("report")
+    findings = findings_of(result)
     row: list[SurveyRow] = []
 
     def close_log(folder: Path) -> None:
         _refuse_ended(job)
-        row.append(_row(job, result_entries(result), round(seconds(), 3)))
-        log.close_into(folder, result, seconds=row[0].seconds)
+        row.append(_row(job, result_entries(findings), round(seconds(), 3)))
+        log.close_into(folder, findings, seconds=row[0].seconds)
 
     with locked(lock_of(job.out, job.folder), job.out / job.folder):
-        write_result(result, job.out / job.folder, write_colmap=comparers.writer_of(result), finish=close_log)
+        write_result(
+            findings, job.out / job.folder, write_colmap=comparers.writer_of(result), finish=close_log
+        )
     return row[0]
 
 
@@ -235,7 +266,7 @@ def _refuse_ended(job: SurveyJob) -> None:
 
 def _row(job: SurveyJob, entries: dict[str, Any], seconds: float) -> SurveyRow:
     """Return the row of a survey from the last line of its log; TypeError if that is something else."""
-    names = {field.name for field in fields(SurveyRow)} - {"file", "folder", "status", "seconds"}
+    names = {field.name for field in fields(SurveyRow)} - {"file", "folder", "status", "seconds", "fault"}
     known = {key: value for key, value in entries.items() if key in names}
     return SurveyRow(file=str(job.file), folder=job.folder, status="done", seconds=seconds, **known)
 
@@ -251,17 +282,3 @@ class _Telling:
 
     def advance(self, step: str = "") -> None:
         """Photographs are told where they are measured."""
-
-
-def _fault(error: Exception) -> str:
-    """Say that the program is wrong, not the survey, and where."""
-    at = traceback.extract_tb(error.__traceback__)
-    place = f" ({Path(at[-1].filename).name}, line {at[-1].lineno})" if at else ""
-    said = " ".join(str(error).split())
-    return f"a fault of Kolinear: {type(error).__name__}: {said:.200}{place}"
-
-
-def _trace(error: Exception) -> dict[str, Any]:
-    if isinstance(error, KolinearError):
-        return {}
-    return {"trace": traceback.format_exception(error)}

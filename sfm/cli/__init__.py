@@ -5,9 +5,9 @@ Nothing is imported here that takes time: Ctrl-C and wrong arguments are answere
 
 from __future__ import annotations
 
-import io
 import sys
 
+from sfm.cli.outlets import guard_outlets
 from sfm.cli.starting import INTERRUPTED, INTERRUPTED_TEXT, loading, stopped_once
 from sfm.errors import KolinearError
 
@@ -15,12 +15,18 @@ BAD_INPUT = 2  # exit code where a person must put something right
 
 
 def main() -> None:
-    """Run the command line; errors that a person can put right are one line and exit code 2."""
-    if isinstance(sys.stdout, io.TextIOWrapper):  # of a code page that lacks a name's letters
-        sys.stdout.reconfigure(errors="backslashreplace")
+    """Run the command line; every error is one line.
+
+    Exit code 2 stands for what a person can put right, 70 for what nobody has foreseen.
+    """
+    guard_outlets()
     try:
         with stopped_once():
-            _run()
+            try:
+                _run()
+            finally:
+                if sys.stdout is not None:
+                    sys.stdout.flush()  # while it can still be said that the disk is full
     except KolinearError as error:
         _refuse(str(error))
     except OSError as error:  # a disk, a network drive: nothing that a traceback would help with
@@ -29,6 +35,8 @@ def main() -> None:
     except KeyboardInterrupt:
         print(INTERRUPTED_TEXT, file=sys.stderr)
         raise SystemExit(INTERRUPTED) from None
+    except Exception as error:
+        _own_up(error)
 
 
 def _run() -> None:
@@ -49,10 +57,22 @@ def _run() -> None:
         raise SystemExit(code)
 
 
-def _refuse(message: str) -> None:
-    """End with one line and the exit code of bad input."""
+def _own_up(error: Exception) -> None:
+    """End with one line about what nobody has foreseen; not enough memory is something to put right."""
+    from sfm.faults import FAULT, is_fault, keep_traceback, told_of_error
+
+    told = told_of_error(error)
+    if not is_fault(error):
+        _refuse(told)
+    path = keep_traceback(error)
+    where = "its traceback cannot be written" if path is None else f"its traceback is in {path}"
+    _refuse(f"{told}; {where}", code=FAULT)
+
+
+def _refuse(message: str, *, code: int = BAD_INPUT) -> None:
+    """End with one line and an exit code."""
     print(f"kolinear: {_printable(message)}", file=sys.stderr)
-    raise SystemExit(BAD_INPUT) from None
+    raise SystemExit(code) from None
 
 
 def _printable(text: str) -> str:

@@ -10,6 +10,7 @@ import typer
 
 from sfm.cli.starting import loading
 from sfm.errors import GeometryError, SurveyFileError
+from sfm.faults import working_on
 from sfm.orientation.resection import METHODS
 
 if TYPE_CHECKING:
@@ -77,22 +78,23 @@ def match(
         from sfm.matching.conjugate import BACK_PX
         from sfm.report.matching import match_command
 
-    text, matched = match_command(
-        left,
-        right,
-        point=point,
-        points=points,
-        method=method,
-        template_px=template,
-        search_px=search,
-        equalise=equalise,
-        interpolation=interpolation,
-        min_correlation=min_correlation,
-        back_px=BACK_PX if back else None,
-        as_json=as_json,
-        out=out,
-        picture=picture,
-    )
+    with working_on(f"{left} and {right}"):
+        text, matched = match_command(
+            left,
+            right,
+            point=point,
+            points=points,
+            method=method,
+            template_px=template,
+            search_px=search,
+            equalise=equalise,
+            interpolation=interpolation,
+            min_correlation=min_correlation,
+            back_px=BACK_PX if back else None,
+            as_json=as_json,
+            out=out,
+            picture=picture,
+        )
     print(text, end="")
     if not matched:
         raise SystemExit(NONE_MATCHED)
@@ -126,7 +128,8 @@ def resect(
         from sfm.report.resection import resect_json, resect_table
         from sfm.survey.inputs.resection_points import read_task
 
-    task = read_task(points, c_mm=c, camera_file=camera, start=start, tolerance_mm=tolerance)
+    with working_on(str(points)):
+        task = read_task(points, c_mm=c, camera_file=camera, start=start, tolerance_mm=tolerance)
     if not as_json:
         print(resect_table(task, method))
         return

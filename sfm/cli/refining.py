@@ -9,6 +9,7 @@ import typer
 
 from sfm.cli.starting import loading
 from sfm.errors import OutputError
+from sfm.faults import working_on
 
 
 def refine(
@@ -35,12 +36,15 @@ def refine(
     with loading():
         from adapters.colmap.camera_models import read_model, write_model
         from sfm.cli.console import drawn_progress
-        from sfm.files.whole_files import whole_folder
+        from sfm.files.whole_files import refuse_links, whole_folder
         from sfm.survey.refine import refine_model, refinement_text
 
-    if out is not None and out.exists():
-        raise OutputError(f"{out}: exists already, the refined model needs a new folder")
-    network, estimate = read_model(model)
+    if out is not None:
+        refuse_links(out)
+        if out.exists():
+            raise OutputError(f"{out}: exists already, the refined model needs a new folder")
+    with working_on(str(model)):
+        network, estimate = read_model(model)
     with drawn_progress() as progress:
         found = refine_model(
             network, estimate, images, window_px=window, min_correlation=min_correlation, progress=progress

@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from sfm.cli.starting import loading
+from sfm.faults import working_on
 
 WORSE = 1  # exit code where the in-house adjuster was ever the worse one
 
@@ -28,10 +29,10 @@ def validate(
         from adapters.colmap.covariance import ColmapBackend
         from sfm.cli.console import drawn_progress
         from sfm.comparison.adjuster_validation import validate as validate_networks
-        from sfm.report.pages import refuse_other_files
-        from sfm.report.validation import FILES, in_words, largest, write_validation
+        from sfm.files.whole_files import refuse_foreign_folder
+        from sfm.report.validation import in_words, largest, write_validation
 
-    refuse_other_files(out, FILES)
+    refuse_foreign_folder(out)
     with drawn_progress() as progress:
         found = validate_networks(ColmapBackend(), networks=networks, seed=seed, jobs=jobs, progress=progress)
     page = write_validation(found, out)
@@ -69,11 +70,14 @@ def compare(
     with loading():
         from adapters.formats.registry import read_comparable
         from sfm.comparison.significance import compare_results
-        from sfm.report.differences import FILES, largest_difference, words_of_test, write_differences
-        from sfm.report.pages import refuse_other_files
+        from sfm.files.whole_files import refuse_foreign_folder
+        from sfm.report.differences import largest_difference, words_of_test, write_differences
 
-    refuse_other_files(out, FILES)
-    first, second = read_comparable(a, a_format), read_comparable(b, b_format)
+    refuse_foreign_folder(out)
+    with working_on(str(a)):
+        first = read_comparable(a, a_format)
+    with working_on(str(b)):
+        second = read_comparable(b, b_format)
     names = tuple(name.strip() for name in control.split(",") if name.strip())
     found = compare_results(first, second, align=align, control=names)
     place = {name: j for j, name in enumerate(first.network.points)}
@@ -111,7 +115,8 @@ def convert(
         from sfm.comparison.undistortion import undistort
 
     form = format_named(to_format or ENDINGS.get(target.suffix.lower(), "tables"))
-    network, estimate = read_any(source, from_format)
+    with working_on(str(source)):
+        network, estimate = read_any(source, from_format)
     cameras = estimate.cameras
     conversions: tuple[Conversion, ...] = ()
     if form.models:

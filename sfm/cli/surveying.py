@@ -15,6 +15,7 @@ import typer
 
 from sfm.cli.starting import loading
 from sfm.errors import KolinearError
+from sfm.faults import FAULT, working_on
 
 if TYPE_CHECKING:
     from sfm.result import SurveyResult
@@ -71,12 +72,14 @@ def run(
     with loading():
         from sfm.cli.console import drawn_progress, tell_result
         from sfm.pipeline import run_survey
+        from sfm.report.findings.findings import findings_of
         from sfm.report.log import SurveyLog
         from sfm.report.output import write_result
         from sfm.survey.inputs.survey_file import read_survey
-        from sfm.survey.target_store import STORE, TargetStore
+        from sfm.survey.target_store import TargetStore
 
-    survey = read_survey(survey_file, allow_outside=allow_outside)
+    with working_on(str(survey_file)):
+        survey = read_survey(survey_file, allow_outside=allow_outside)
     if survey.observations is not None:
         raise KolinearError(
             f"{survey_file}: it has [observations] in place of photographs: kolinear adjust {survey_file}"
@@ -84,19 +87,21 @@ def run(
     others = _others(survey)
     folder = _folder(survey, out)
     workers = jobs or _cores()
-    store = TargetStore(folder.parent / STORE)
+    store = TargetStore.of_user()
+    store.remove_old()
     with drawn_progress() as drawn, _threads(), _written(folder), SurveyLog(watch=drawn) as log:
         log.start(survey.name, survey_file)
         result = run_survey(survey, images_dir=images, jobs=workers, others=others, store=store, progress=log)
+        findings = findings_of(result)
         page = write_result(
-            result,
+            findings,
             folder,
             write_colmap=_colmap_writer(result),
-            finish=lambda part: log.close_into(part, result),
+            finish=lambda part: log.close_into(part, findings),
             jobs=workers,
             progress=log,
         )
-    if not tell_result(result, page, seconds=time.perf_counter() - begun, verbose=verbose):
+    if not tell_result(findings, page, seconds=time.perf_counter() - begun, verbose=verbose):
         raise SystemExit(FAILED)
 
 
@@ -113,11 +118,13 @@ def adjust(
     with loading():
         from sfm.cli.console import drawn_progress, tell_result
         from sfm.pipeline import adjust_survey
+        from sfm.report.findings.findings import findings_of
         from sfm.report.log import SurveyLog
         from sfm.report.output import write_result
         from sfm.survey.inputs.survey_file import read_survey
 
-    survey = read_survey(survey_file, allow_outside=allow_outside)
+    with working_on(str(survey_file)):
+        survey = read_survey(survey_file, allow_outside=allow_outside)
     if survey.observations is None:
         raise KolinearError(
             f"{survey_file}: it has no [observations]; with photographs: kolinear run {survey_file}"
@@ -127,14 +134,15 @@ def adjust(
     with drawn_progress() as drawn, _threads(), _written(folder), SurveyLog(watch=drawn) as log:
         log.start(survey.name, survey_file)
         result = adjust_survey(survey, others=others, progress=log)
+        findings = findings_of(result)
         page = write_result(
-            result,
+            findings,
             folder,
             write_colmap=_colmap_writer(result),
-            finish=lambda part: log.close_into(part, result),
+            finish=lambda part: log.close_into(part, findings),
             progress=log,
         )
-    if not tell_result(result, page, seconds=time.perf_counter() - begun, verbose=verbose):
+    if not tell_result(findings, page, seconds=time.perf_counter() - begun, verbose=verbose):
         raise SystemExit(FAILED)
 
 
@@ -175,8 +183,8 @@ def batch(
 ) -> None:
     """Run many surveys side by side, each to its own report.
 
-    One table tells them all.  Exit code 0 if every survey has a dependable result, else 1; 2 where a
-    person must put something right.
+    One table tells them all.  Exit code 0 if every survey has a dependable result, else 1; 70 if one came
+    upon a fault of the program; 2 where a person must put something right.
     """
     if cluster is not None and jobs is not None:
         raise KolinearError("--jobs is for processes on this computer, --cluster brings its own workers")
@@ -205,6 +213,8 @@ def batch(
             allow_outside=allow_outside,
         )
     print_batch(Console(highlight=False), rows, out / "index.html")
+    if any(row.fault for row in rows):
+        raise SystemExit(FAULT)
     if not all(row.succeeded for row in rows):
         raise SystemExit(FAILED)
 
@@ -242,7 +252,8 @@ def _colmap_writer(result: SurveyResult) -> Callable[[Path], None] | None:
 
 def _folder(survey: Survey, out: Path | None) -> Path:
     """Return the folder of the result, before any work is done for one that cannot be used."""
-    from sfm.report.output import folder_name, refuse_foreign_folder
+    from sfm.files.whole_files import refuse_foreign_folder
+    from sfm.report.output import folder_name
 
     out = Path("out") / folder_name(survey.name) if out is None else out
     refuse_foreign_folder(out)

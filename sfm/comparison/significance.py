@@ -50,19 +50,32 @@ class ResultLike(Protocol):
     """What is compared: a Result, or what an adapter read that has the same fields."""
 
     @property
-    def name(self) -> str: ...
+    def name(self) -> str:
+        """What people call it."""
+
     @property
-    def network(self) -> Network: ...
+    def network(self) -> Network:
+        """What was measured."""
+
     @property
-    def estimate(self) -> Estimate: ...
+    def estimate(self) -> Estimate:
+        """The solution."""
+
     @property
-    def point_covariance(self) -> FloatArray | None: ...
+    def point_covariance(self) -> FloatArray | None:
+        """Marginal covariances of the points, object unit^2, (n, 3, 3); None without."""
+
     @property
-    def interior_sigma(self) -> tuple[FloatArray, ...] | None: ...
+    def interior_sigma(self) -> tuple[FloatArray, ...] | None:
+        """Standard deviations of the parameters of each camera, NaN where fixed; None without."""
+
     @property
-    def redundancy(self) -> int | None: ...
+    def redundancy(self) -> int | None:
+        """Degrees of freedom of the adjustment; None where nobody knows."""
+
     @property
-    def unit(self) -> str: ...
+    def unit(self) -> str:
+        """Object unit, as people call it."""
 
 
 @dataclass(frozen=True)
@@ -125,7 +138,8 @@ def compare_results(
     """Align b to a and test the differences.
 
     Args:
-        a, b: the results; points and photographs are recognised by their names.
+        a: first result.
+        b: second result; points and photographs are recognised by their names.
         align: points (all common ones), cameras (projection centres), control (the named points) or none.
         control: names of the points for align = control.
         alpha: probability of calling something a change that is none.
@@ -134,7 +148,7 @@ def compare_results(
         GeometryError: an unknown alignment, too little in common for it, or nothing in common at all.
     """
     if align not in ALIGNMENTS:
-        raise GeometryError(f"comparison: align '{align}' is none of {', '.join(ALIGNMENTS)}")
+        raise GeometryError(f"comparison: align '{align}', expected one of {', '.join(ALIGNMENTS)}")
     pa, pb = _common(a.network.points, a.estimate.determined, b.network.points, b.estimate.determined)
     ia, ib = _common(a.network.images, a.estimate.oriented, b.network.images, b.estimate.oriented)
     point_names = tuple(a.network.points[j] for j in pa)

@@ -29,6 +29,9 @@ def positive_roots(coefficients: FloatArray) -> FloatArray:
 
     Returns:
         Roots in ascending order; near-double roots may appear as two close values, shape (r,).
+
+    Source: Ferrari, in Abramowitz and Stegun (1964), sec. 3.8.3; bracketed Newton steps, Press et al. (2007),
+    Numerical Recipes, sec. 9.4.
     """
     roots = np.empty(MAX_ROOTS)
     G4, G3, G2, G1, G0 = np.asarray(coefficients, dtype=float)

@@ -9,13 +9,13 @@ import numpy as np
 from sfm.camera import pixel_jacobian
 from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
 from sfm.network import Estimate, ImagePoints, Network
+from sfm.orientation.eccentricity import CircleViews, ellipse_shape, fit_circles
 from sfm.result import Eccentricity
 from sfm.survey.datum import object_scale
 from sfm.survey.inputs.survey_file import Survey
 from sfm.survey.inputs.tables import read_diameters
 from sfm.survey.network import UNNAMED, Naming
 from sfm.survey.targets import MeasuredPhotographs
-from sfm.targets.eccentricity import CircleViews, ellipse_shape, fit_circles
 from sfm.targets.flags import Flag
 
 NOT_A_CIRCLE = (

@@ -14,7 +14,7 @@ from sfm.survey.inputs.start import PhotographList, approximate_values
 from sfm.survey.inputs.survey_file import Survey
 from sfm.survey.solution import refine
 from sfm.survey.targets import MeasuredPhotographs
-from sfm.targets.codes.rings import FAMILIES
+from sfm.targets.codes.rings import RINGS
 from sfm.targets.detect import find_targets
 
 
@@ -87,13 +87,13 @@ def _codes_found(survey: Survey, photographs: MeasuredPhotographs) -> str:
 def _other_family(survey: Survey, photographs: MeasuredPhotographs) -> str:
     """Say which other rings or arcs read more in the photograph with most targets, if any do."""
     settings = survey.targets
-    if settings.codes not in FAMILIES:
+    if settings.codes not in (*RINGS, "none"):
         return ""
     fullest = int(np.argmax([len(found) for found in photographs.targets]))
     photograph = read_photograph(photographs.paths[fullest], channel=settings.channel)
     counts = []
-    for family in FAMILIES:
-        if family in (settings.codes, "none"):
+    for family in RINGS:
+        if family == settings.codes:
             continue
         found = find_targets(
             photograph,

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TypeVar
 
 from sfm.errors import GeometryError, PhotographError
+from sfm.faults import working_on
 from sfm.progress import SILENT, Progress
 from sfm.result import FailedImage
 from sfm.survey.inputs.start import PhotographList
@@ -55,8 +56,13 @@ def each_photograph(
         else:
             failed[k] = FailedImage(name, f"identical to {photographs.names[first]}")
             progress.advance(name)
+
+    def work_on(k: int) -> T:
+        with working_on(f"photograph {photographs.names[k]}"):
+            return work(photographs.paths[k])
+
     with ThreadPoolExecutor(max_workers=max(1, jobs)) as pool:
-        running = {pool.submit(work, photographs.paths[k]): k for k in originals}
+        running = {pool.submit(work_on, k): k for k in originals}
         try:
             for done in as_completed(running):
                 k = running[done]

@@ -14,7 +14,8 @@ from sfm.matching.tracks.feature_tracks import find_tie_points
 from sfm.network import ImagePoints, Network, reduce_network
 from sfm.orientation.intersection import intersect
 from sfm.orientation.sequence import Orientation
-from sfm.photographs.reading import Metadata, read_metadata, read_photograph
+from sfm.photographs.exif import Metadata, read_metadata
+from sfm.photographs.reading import read_photograph
 from sfm.progress import SILENT, Progress
 from sfm.result import FailedImage, PhotographTargets
 from sfm.survey.inputs.cameras import start_cameras

@@ -24,7 +24,8 @@ from adapters.formats.result_tables import TableResult, read_result, write_table
 from adapters.formats.sba_text import read_sba_text
 from sfm.camera import camera_from_values
 from sfm.errors import KolinearError
-from sfm.photographs.reading import read_metadata, read_photograph
+from sfm.photographs.exif import read_metadata
+from sfm.photographs.reading import read_photograph
 from sfm.pipeline import adjust_survey
 from sfm.survey.inputs.start import find_photographs, network_from_observations
 from sfm.survey.inputs.survey_file import read_survey

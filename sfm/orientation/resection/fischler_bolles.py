@@ -81,6 +81,8 @@ def leg_quartic(rays: FloatArray, points: FloatArray) -> FloatArray:
     Args:
         rays: unit vectors in the image frame, shape (3, 3).
         points: object points, shape (3, 3), object unit.
+
+    Source: Fischler, Bolles (1981), appendix A; document 001, sec. 2.3.4.
     """
     ab, ac, bc = squared_sides(np.asarray(points, dtype=float))
     gab, gac, gbc = squared_sides(np.asarray(rays, dtype=float))

@@ -58,7 +58,14 @@ def resect_triples_zeng_wang(rays: FloatArray, points: FloatArray) -> Poses:
 
 
 def distance_quartic(rays: FloatArray, points: FloatArray) -> FloatArray:
-    """Return N1 to N5 of the quartic in n = R3/R1 of one triple, shape (5,); document 001, eq. 2.72."""
+    """Return the coefficients N1 to N5 of the quartic in n = R3/R1 of one triple, shape (5,).
+
+    Args:
+        rays: unit vectors in the image frame, shape (3, 3).
+        points: object points, shape (3, 3), object unit.
+
+    Source: Zeng, Wang (1992); document 001, eq. 2.72.
+    """
     ab, ac, bc = squared_sides(np.asarray(points, dtype=float))
     gab, gac, gbc = squared_sides(np.asarray(rays, dtype=float))
     return np.array(_quartic(ab, ac, bc, gab / 2, gac / 2, gbc / 2)[::-1])
@@ -144,6 +151,9 @@ def _quartic(
 def direction_test(rays: FloatArray) -> float:
     """Return the sign that T = 1S . (12 x 13) must have: 1S = -R1 r1 and 12 x 13 turn with the image points.
 
+    Args:
+        rays: unit vectors in the image frame, shape (3, 3).
+
     Source: document 001, eq. 2.82, where the image points are taken clockwise and T > 0; here the
     order of the points is free.
     """
@@ -157,6 +167,12 @@ def direction_test(rays: FloatArray) -> float:
 @compiled
 def trilaterate(points: FloatArray, distances: FloatArray, T: float, S: FloatArray) -> None:
     """Fill the point S at three distances from three points, on the side of their plane that T says.
+
+    Args:
+        points: object points, shape (3, 3), object unit.
+        distances: of S from them, shape (3,), object unit.
+        T: sign of the direction test, +1 or -1.
+        S: receives the point, shape (3,), object unit.
 
     Source: Awange, Grafarend (2004), after eqs. 2.79-2.81 of document 001. Their elimination divides by
     differences of Y and Z; in the axes of the triangle itself (x along 12, z along 12 x 13) nothing
@@ -195,6 +211,12 @@ def pope_hinsken(rays: FloatArray, points: FloatArray, S: FloatArray, rotation: 
     The differences of corresponding vectors are at right angles to the rotation axis g, so g is the cross
     product of two of them. Of the three rays and their cross products the pair with the longest product is
     taken, so that rays near the axis do no harm.
+
+    Args:
+        rays: unit vectors in the image frame, shape (3, 3).
+        points: object points, shape (3, 3), object unit.
+        S: projection centre, shape (3,), object unit.
+        rotation: receives R, image to object axes, shape (3, 3).
 
     Source: Hinsken (1988), PE&RS 54(7), and Zeng, Wang (1992); document 001, eqs. 2.83-2.93. The sign of
     the angle, which eq. 2.91 leaves open, is taken from g . (image x object).

@@ -9,7 +9,7 @@ import numpy as np
 from sfm.camera import Camera, camera_from_values
 from sfm.conventions import IntArray
 from sfm.errors import PhotographError, SurveyFileError
-from sfm.photographs.reading import Metadata
+from sfm.photographs.exif import Metadata
 from sfm.survey.inputs.settings import CameraSettings
 from sfm.survey.inputs.survey_file import Survey
 

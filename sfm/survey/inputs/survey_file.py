@@ -29,10 +29,8 @@ from sfm.survey.inputs.settings import (
     TiePointSettings,
 )
 from sfm.survey.inputs.settings_errors import first_error
-from sfm.targets.codes.rings import FAMILIES as RING_FAMILIES
-from sfm.targets.codes.tags import TAG_FAMILIES
-
-FAMILIES = (*RING_FAMILIES, *TAG_FAMILIES)
+from sfm.targets.codes.families import FAMILIES
+from sfm.targets.codes.tags import DICTIONARIES
 
 
 class Survey(Section):
@@ -217,14 +215,14 @@ def _refuse_contradictions(survey: Survey) -> None:
 
 def _refuse_contradicting_sizes(targets: TargetSettings, where: str, unit: str) -> None:
     """Raise SurveyFileError where sizes of tags or rings do not go with the codes or with one another."""
-    if targets.tag_size is not None and targets.codes not in TAG_FAMILIES:
+    if targets.tag_size is not None and targets.codes not in DICTIONARIES:
         raise SurveyFileError(
             f"{where}: targets.tag_size is the size of tags, codes = '{targets.codes}' has none; "
-            f"tags are {', '.join(TAG_FAMILIES[:4])} ..."
+            f"tags are {', '.join(list(DICTIONARIES)[:4])} ..."
         )
     if targets.ring_radii is not None:
         inner, outer = targets.ring_radii
-        if targets.codes == "none" or targets.codes in TAG_FAMILIES:
+        if targets.codes == "none" or targets.codes in DICTIONARIES:
             raise SurveyFileError(
                 f"{where}: targets.ring_radii are of rings, codes = '{targets.codes}' has none"
             )

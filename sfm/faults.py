@@ -1,0 +1,71 @@
+"""What nobody has foreseen, and memory that is not enough: told in one line, with what was at work.
+
+A fault is an error of the program, not of what it was given. Its traceback is kept in a
+file for whoever mends it.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+import tempfile
+import traceback
+from collections.abc import Iterator
+from contextlib import contextmanager
+from importlib.metadata import version
+from pathlib import Path
+
+from sfm.errors import KolinearError, one_line
+
+FAULT = 70  # exit code; EX_SOFTWARE of sysexits.h
+OPENCV_NO_MEMORY = -4  # cv::Error::StsNoMem
+MAX_LETTERS = 200  # of an error's own message
+
+
+@contextmanager
+def working_on(what: str) -> Iterator[None]:
+    """Note on errors that nobody has foreseen what was at work; the innermost comes first."""
+    try:
+        yield
+    except KolinearError:
+        raise
+    except Exception as error:
+        error.add_note(what)
+        raise
+
+
+def is_fault(error: Exception) -> bool:
+    """Whether the program is wrong, rather than what it was given, the disk or the size of the memory."""
+    return not (isinstance(error, KolinearError | OSError) or _is_out_of_memory(error))
+
+
+def told_of_error(error: Exception) -> str:
+    """Return an error in one line; of a fault where it is, of missing memory what was too large."""
+    if isinstance(error, KolinearError | OSError):
+        return str(error)
+    message = one_line(error)[:MAX_LETTERS]
+    at_work = ", ".join(getattr(error, "__notes__", ()))
+    if _is_out_of_memory(error):
+        own = "" if message == type(error).__name__ else f" ({message})"
+        return f"not enough memory{f' for {at_work}' if at_work else ''}{own}"
+    frames = traceback.extract_tb(error.__traceback__)
+    place = f" ({Path(frames[-1].filename).name}, line {frames[-1].lineno})" if frames else ""
+    kind = type(error).__name__
+    told = kind if message == kind else f"{kind}: {message}"
+    return f"a fault of Kolinear: {told}{place}{f', at {at_work}' if at_work else ''}"
+
+
+def keep_traceback(error: Exception) -> Path | None:
+    """Write a traceback into a new file that only this user can read; None if there is no place for it."""
+    lines = (f"kolinear {version('kolinear')}, Python {sys.version}\n", f"{sys.argv}\n\n")
+    try:
+        number, name = tempfile.mkstemp(prefix="kolinear-fault-", suffix=".txt")
+        with os.fdopen(number, "w", encoding="utf-8", errors="backslashreplace") as file:
+            file.writelines((*lines, *traceback.format_exception(error)))
+    except OSError:
+        return None
+    return Path(name)
+
+
+def _is_out_of_memory(error: Exception) -> bool:
+    return isinstance(error, MemoryError) or getattr(error, "code", None) == OPENCV_NO_MEMORY
