@@ -45,7 +45,9 @@ class _NeverFar(random.Random):
         return max(0.25, super().random())
 
 
-@pytest.mark.parametrize("kind", ["surveys", "tables", "codes", "photographs", "models", "results"])
+@pytest.mark.parametrize(
+    "kind", ["surveys", "tables", "codes", "photographs", "models", "results", "folders", "rows"]
+)
 @given(number=st.integers(min_value=0, max_value=2**32))
 @SHORT
 def test_mutated_files_are_read_or_refused(
