@@ -199,9 +199,9 @@ def _read_folder(folder: Path, rng: random.Random) -> None:
         survey = read_survey(inner / "survey.toml")
         pattern = rng.choice(("**/*", "sub/**/*", "*/*/*", "sub/*", "a/**/image*", "**/sub/**/x*", "im*"))
         cameras = tuple(camera.model_copy(update={"images": pattern}) for camera in survey.cameras)
-        found = survey.model_copy(update={"cameras": cameras})
+        found = replace(survey, cameras=cameras)
         if rng.random() < 0.3:
-            network_from_observations(found)
+            measurements_from_observations(found)
         for path in find_photographs(found).paths:
             assert path.resolve().is_relative_to(inner.resolve())
 
