@@ -189,6 +189,8 @@ def tangents_from_pixel(camera: Camera, xy_px: FloatArray) -> FloatArray:
 
     Returns:
         u = -U/W and v = -V/W (image axes, y up), shape (k, 2); NaN where the model cannot be inverted.
+
+    Source: collinearity, Kraus (2007), sec. 4.2.1; the distortion model of the camera (`sfm.distortion`).
     """
     xy = np.ascontiguousarray(xy_px, dtype=float).reshape(-1, 2)
     return _tangents(camera.index, camera.frame, camera.parameters, xy)

@@ -64,6 +64,8 @@ def angles_from_rotation(rotation: FloatArray) -> FloatArray:
     Returns:
         Angles, shape (..., 3); at phi = +-90 deg, where omega and kappa are not separable, omega
         is 0.
+
+    Source: as `rotation_from_angles`.
     """
     R = np.asarray(rotation, dtype=float)
     sin_phi = np.clip(R[..., 0, 2], -1.0, 1.0)

@@ -4,6 +4,8 @@
     |-- SurveyFileError         the survey file or a table it names cannot be used
     |-- PhotographError         a photograph cannot be read or does not fit its camera
     |-- GeometryError           the points or photographs do not determine what is asked for
+    |-- UnknownNameError        a point, photograph or camera of that name is not there
+    |-- InstallationError       files of another project lie among Kolinear's
     |-- OutputError             a result cannot be written
     |   `-- FolderInUseError    another run is writing there
     `-- BackendError            an external program or library is missing or refuses
@@ -26,6 +28,14 @@ class PhotographError(KolinearError):
 
 class GeometryError(KolinearError):
     """The given points or photographs do not determine what is asked for."""
+
+
+class UnknownNameError(KolinearError):
+    """There is no point, photograph or camera of that name."""
+
+
+class InstallationError(KolinearError, ImportError):
+    """Files of another project lie among those of Kolinear."""
 
 
 class OutputError(KolinearError):

@@ -6,12 +6,18 @@ function that changes something returns a new object.
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+import numpy.typing as npt
+from scipy.sparse import csr_matrix
 
 from sfm.camera import Camera
 from sfm.conventions import BoolArray, FloatArray, IntArray
+from sfm.errors import GeometryError, UnknownNameError
+
+MOST_NAMES = 10  # in a message
 
 
 def _empty(*shape: int) -> FloatArray:
@@ -94,9 +100,21 @@ class InteriorObservations:
         return len(self.camera)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Network:
-    """All that was measured in a survey."""
+    """All that was measured in a survey.
+
+    Example:
+        >>> import sfm
+        >>> network = sfm.Network.from_arrays(
+        ...     image=["left", "left", "right", "right"],
+        ...     point=["1", "2", "1", "2"],
+        ...     xy=[[100.0, 50.0], [200.0, 52.0], [80.0, 51.0], [180.0, 53.0]],
+        ...     sigma_px=0.1,
+        ... )
+        >>> network.with_control(["1"], [[0, 0, 0]]).with_scale_bar("1", "2", 1.5, 0.001)
+        <Network: 2 photographs, 2 points, 4 image points, 1 control point, 1 scale bar>
+    """
 
     images: tuple[str, ...]  # names of the photographs, m of them
     camera: IntArray  # index of the camera of each photograph in Estimate.cameras, (m,)
@@ -107,14 +125,126 @@ class Network:
     exterior: ExteriorObservations = field(default_factory=ExteriorObservations)
     interior: InteriorObservations = field(default_factory=InteriorObservations)
 
+    @classmethod
+    def from_arrays(
+        cls,
+        image: Sequence[str],
+        point: Sequence[str],
+        xy: npt.ArrayLike,
+        *,
+        sigma_px: npt.ArrayLike = 0.1,
+        camera: Mapping[str, int] | None = None,
+    ) -> Network:
+        """Return the network of measured image points; photographs and points count as they come first.
+
+        Args:
+            image: name of the photograph of each image point, k of them.
+            point: name of the object point of each image point.
+            xy: positions in the pixel frame, px, (k, 2).
+            sigma_px: standard deviations of x and y, px, (k, 2) or what can be broadcast to it.
+            camera: index of the camera of each photograph in Estimate.cameras, by name; 0 where not named.
+
+        Raises:
+            GeometryError: arrays of different length, no finite positions, or no positive sigmas.
+        """
+        measured = np.asarray(xy, dtype=float)
+        k = len(image)
+        if not k or len(point) != k or measured.shape != (k, 2) or not np.isfinite(measured).all():
+            raise GeometryError(
+                f"network: {k} photographs, {len(point)} points and positions {measured.shape} of image "
+                "points; expected k names, k names and finite numbers (k, 2)"
+            )
+        try:
+            sigma = np.broadcast_to(np.asarray(sigma_px, dtype=float), (k, 2))
+        except ValueError:
+            sigma = np.zeros((k, 2))
+        if not (sigma > 0).all():
+            raise GeometryError(f"network: sigma_px {np.shape(sigma_px)}, expected positive numbers ({k}, 2)")
+        images, points = tuple(dict.fromkeys(map(str, image))), tuple(dict.fromkeys(map(str, point)))
+        image_number = {name: i for i, name in enumerate(images)}
+        point_number = {name: j for j, name in enumerate(points)}
+        seen = ImagePoints(
+            np.array([image_number[str(name)] for name in image], dtype=np.int64),
+            np.array([point_number[str(name)] for name in point], dtype=np.int64),
+            measured.copy(),
+            np.eye(2) * sigma[:, None, :] ** 2,
+        )
+        owner = np.array([(camera or {}).get(name, 0) for name in images], dtype=np.int64)
+        return cls(images, owner, points, seen)
+
+    def with_control(self, names: Sequence[str], xyz: npt.ArrayLike, sigma: npt.ArrayLike = 0.0) -> Network:
+        """Return the network with known points in place of its control.
+
+        Args:
+            names: of points of the network, c of them.
+            xyz: their coordinates, object unit, (c, 3).
+            sigma: standard deviations, 0 = fixed, object unit, (c, 3) or what can be broadcast to it.
+
+        Raises:
+            UnknownNameError: a point is not in the network.
+        """
+        index = np.array([self.point_index(name) for name in names], dtype=np.int64)
+        s = np.broadcast_to(np.asarray(sigma, dtype=float), (len(index), 3))
+        known = np.asarray(xyz, dtype=float).reshape(len(index), 3)
+        return replace(self, control=ObjectPoints(index, known, np.eye(3) * s[:, None, :] ** 2))
+
+    def with_scale_bar(self, start: str, end: str, length: float, sigma: float) -> Network:
+        """Return the network with one more measured distance between two of its points, object unit.
+
+        Raises:
+            UnknownNameError: a point is not in the network.
+        """
+        bars = self.scale_bars
+        added = ScaleBars(
+            np.append(bars.start, self.point_index(start)),
+            np.append(bars.end, self.point_index(end)),
+            np.append(bars.length, length),
+            np.append(bars.sigma, sigma),
+        )
+        return replace(self, scale_bars=added)
+
+    def image_index(self, name: str) -> int:
+        """Return the number of a photograph; UnknownNameError if there is none of that name."""
+        return index_of(self.images, name, "photograph")
+
+    def point_index(self, name: str) -> int:
+        """Return the number of a point; UnknownNameError if there is none of that name."""
+        return index_of(self.points, name, "point")
+
     def rays(self) -> IntArray:
         """Return in how many photographs each point was measured, (n,)."""
         return np.bincount(self.image_points.point, minlength=len(self.points))
 
+    def common_points(self, usable: BoolArray) -> IntArray:
+        """Return how many points each two photographs share among usable image points, (m, m)."""
+        seen = self.image_points.select(usable)
+        shape = (len(self.images), len(self.points))
+        sees = csr_matrix((np.ones(len(seen), dtype=np.int32), (seen.image, seen.point)), shape=shape)
+        sees.sum_duplicates()
+        sees.data[:] = 1
+        return np.asarray((sees @ sees.T).toarray())
 
-@dataclass(frozen=True)
+    def __repr__(self) -> str:
+        counted = (
+            (len(self.images), "photograph"),
+            (len(self.points), "point"),
+            (len(self.image_points), "image point"),
+            (len(self.control), "control point"),
+            (len(self.scale_bars), "scale bar"),
+        )
+        told = [f"{count} {what}{'' if count == 1 else 's'}" for count, what in counted if count]
+        return f"<Network: {', '.join(told)}>"
+
+
+@dataclass(frozen=True, repr=False)
 class Estimate:
-    """Interior and exterior orientation and object points; NaN where not yet determined."""
+    """Interior and exterior orientation and object points; NaN where not yet determined.
+
+    Example:
+        >>> import sfm
+        >>> result.estimate.position.shape, result.estimate.rotation.shape
+        ((6, 3), (6, 3, 3))
+    """
 
     cameras: tuple[Camera, ...]
     position: FloatArray  # projection centres X0, object unit, (m, 3)
@@ -131,6 +261,19 @@ class Estimate:
         """Which points have coordinates, (n,)."""
         return np.asarray(np.isfinite(self.points).all(axis=1))
 
+    def __repr__(self) -> str:
+        cameras = ", ".join(f"{camera.name} ({camera.model})" for camera in self.cameras)
+        return (
+            f"<Estimate: {self.oriented.sum()} of {len(self.position)} photographs oriented, "
+            f"{self.determined.sum()} of {len(self.points)} points, cameras {cameras}>"
+        )
+
+
+def rows_of(index: IntArray, count: int) -> list[IntArray]:
+    """Return the rows of each index value from 0 to count - 1, in order."""
+    order = np.argsort(index, kind="stable")
+    return np.split(order, np.searchsorted(index[order], np.arange(1, count)))
+
 
 def supported(
     network: Network,
@@ -143,7 +286,8 @@ def supported(
     """Return the photographs and points that are left when those with too few image points go, in turn.
 
     Args:
-        network, estimate: of m photographs, n points and k image points.
+        network: of m photographs, n points and k image points.
+        estimate: of the same.
         accepted: image points that count, (k,).
         min_points: image points that a photograph needs.
         min_rays: image points that a point needs, of all or of each, (n,).
@@ -169,7 +313,8 @@ def reduce_network(
     """Return the network and estimate of some photographs, points and image points only.
 
     Args:
-        network, estimate: of m photographs, n points and k image points.
+        network: of m photographs, n points and k image points.
+        estimate: of the same.
         images: photographs to keep, (m,).
         points: points to keep, (n,).
         image_points: image points to keep (those of dropped photographs and points go anyway), (k,).
@@ -209,6 +354,30 @@ def reduce_network(
 
 
 def empty_estimate(network: Network, cameras: tuple[Camera, ...]) -> Estimate:
-    """Return an estimate of which only the start values of the cameras are known."""
+    """Return an estimate of which only the start values of the cameras are known.
+
+    Example:
+        >>> import sfm
+        >>> sfm.empty_estimate(result.network, result.estimate.cameras).oriented.any()
+        np.False_
+    """
     m, n = len(network.images), len(network.points)
     return Estimate(cameras, np.full((m, 3), np.nan), np.full((m, 3, 3), np.nan), np.full((n, 3), np.nan))
+
+
+def index_of(names: Sequence[str], name: object, what: str) -> int:
+    """Return the number of a name.
+
+    Args:
+        names: all of them.
+        name: the one to find.
+        what: it is the name of, for messages.
+
+    Raises:
+        UnknownNameError: it is not among them.
+    """
+    try:
+        return names.index(name)
+    except ValueError:
+        some = ", ".join(names[:MOST_NAMES]) + (" ..." if len(names) > MOST_NAMES else "")
+        raise UnknownNameError(f"unknown {what} '{name}', expected one of {some or 'none'}") from None

@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 
 from sfm.adjustment.quality.correlations import OrientationCorrelation
 from sfm.adjustment.result import Adjustment
+from sfm.camera import Camera
 from sfm.comparison.adjusters import AdjusterComparison
 from sfm.comparison.baseline import BaselineComparison
-from sfm.conventions import FloatArray, IntArray
+from sfm.conventions import FloatArray, IntArray, angles_from_rotation
+from sfm.display import html_table, text_table
+from sfm.network import Estimate, Network, index_of
+from sfm.point_table import Point, PointTable
+from sfm.stored_result import StoredResult
 from sfm.targets.flags import count_flags
 
 NO_SCALE = "network units"
@@ -45,6 +51,7 @@ class PhotographTargets:
     rejected_xy: FloatArray  # centres of the rejected candidates, px, (r, 2)
     rejected_flag: IntArray  # reason for each rejection, see sfm.targets.flags.Flag, (r,)
     flag: IntArray | None = None  # remarks on the measured targets, see sfm.targets.flags.Flag, (k,)
+    stored: bool = False  # whether the targets were measured in an earlier run
 
     def reasons(self) -> list[tuple[str, int]]:
         """Return (reason, number of candidates) of this photograph, most frequent first."""
@@ -66,6 +73,26 @@ class ControlCheck:
 
 
 @dataclass(frozen=True)
+class OrientedImage:
+    """Exterior orientation of one photograph."""
+
+    name: str
+    position: FloatArray  # projection centre X0, object unit, (3,)
+    rotation: FloatArray  # R, image to object axes, (3, 3)
+    covariance: FloatArray  # of X0, Y0, Z0 (object unit) and omega, phi, kappa (rad), (6, 6)
+
+    @property
+    def angles(self) -> FloatArray:
+        """Omega, phi, kappa, rad, (3,)."""
+        return angles_from_rotation(self.rotation)
+
+    @property
+    def sigma(self) -> FloatArray:
+        """Standard deviations of X0, Y0, Z0 (object unit) and omega, phi, kappa (rad), (6,)."""
+        return np.asarray(np.sqrt(np.diagonal(self.covariance)))
+
+
+@dataclass(frozen=True)
 class Eccentricity:
     """By how much image points were corrected because a circle's centre is not its ellipse's centre."""
 
@@ -74,9 +101,16 @@ class Eccentricity:
     sigma_px: float  # root mean square of the standard deviations of a corrected coordinate, px
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False, eq=False)
 class SurveyResult:
-    """Result of a survey: the adjustment and what a person must know to judge it."""
+    """Result of a survey: the adjustment and what a person must know to judge it.
+
+    Example:
+        >>> import sfm
+        >>> result = sfm.run_survey(sfm.read_survey(observed_survey), compare_with="none")
+        >>> result.point("1").covariance.shape, result.image("image 1").sigma.shape
+        ((3, 3), (6,))
+    """
 
     survey: str  # name of the survey
     unit: str  # object unit
@@ -95,6 +129,96 @@ class SurveyResult:
     # orientation, the strong ones
     seconds: tuple[StageTime, ...] = field(default_factory=tuple)  # in the order of the stages
     reject: str = "tau"  # how the survey treats gross errors: tau | huber | tukey | none
+
+    @property
+    def name(self) -> str:
+        """Name of the survey."""
+        return self.survey
+
+    @property
+    def network(self) -> Network:
+        """What was adjusted, rejected image points included."""
+        return self.adjustment.network
+
+    @property
+    def estimate(self) -> Estimate:
+        """Adjusted cameras, orientations and points."""
+        return self.adjustment.estimate
+
+    @cached_property
+    def stored(self) -> StoredResult:
+        """The result as files hold it: accepted image points, solution and standard deviations."""
+        a = self.adjustment
+        sigmas = []
+        for camera, covariance in zip(a.estimate.cameras, a.covariance.interior, strict=True):
+            sigma = np.full(len(camera.names), np.nan)
+            sigma[camera.free] = np.sqrt(np.diagonal(covariance))
+            sigmas.append(sigma)
+        return StoredResult(
+            self.survey,
+            replace(a.network, image_points=a.network.image_points.select(~a.rejected)),
+            a.estimate,
+            a.covariance.points,
+            a.covariance.exterior[:, :3, :3],
+            tuple(sigmas),
+            a.redundancy,
+            self.length_unit,
+        )
+
+    @property
+    def points(self) -> PointTable:
+        """The adjusted object points, by name."""
+        return self.stored.points
+
+    def point(self, name: str) -> Point:
+        """Return an object point; UnknownNameError if there is none of that name."""
+        return self.stored.point(name)
+
+    def image(self, name: str) -> OrientedImage:
+        """Return the exterior orientation of a photograph; UnknownNameError if there is none of that name."""
+        a = self.adjustment
+        i = a.network.image_index(name)
+        position, rotation = a.estimate.position[i], a.estimate.rotation[i]
+        return OrientedImage(name, position, rotation, a.covariance.exterior[i])
+
+    def camera(self, name: str) -> Camera:
+        """Return an adjusted camera; UnknownNameError if there is none of that name."""
+        cameras = self.adjustment.estimate.cameras
+        return cameras[index_of([camera.name for camera in cameras], name, "camera")]
+
+    def write(self, folder: str | Path) -> Path:
+        """Write tables, figures and the report into a folder, whole or not at all; return report.html.
+
+        Raises:
+            OutputError: the folder cannot be written, or holds something else than an earlier result.
+        """
+        import sfm  # the report stands above the result, and is reached by its public name
+
+        page: Path = sfm.write_result(self, folder)
+        return page
+
+    def _rows(self) -> list[tuple[str, str]]:
+        a = self.adjustment
+        sigma = np.sqrt(np.nanmean(np.diagonal(a.covariance.points, axis1=1, axis2=2), axis=0))
+        state = "converged" if a.converged else "did NOT converge"
+        both = self.comparison
+        rows = [
+            ("photographs", f"{len(a.network.images)} of {self.images_total} oriented"),
+            ("points", f"{len(a.network.points)}, {int((self.code >= 0).sum())} coded"),
+            ("image points", f"{int((~a.rejected).sum())} accepted, {int(a.rejected.sum())} rejected"),
+            ("adjustment", f"{state}, datum {a.datum}, redundancy {a.redundancy}"),
+            ("sigma0", f"{a.sigma0_px:.4f} px"),
+            ("RMS sigma of points", f"{', '.join(f'{s:.3g}' for s in sigma)} {self.length_unit}"),
+        ]
+        if both is not None:
+            rows.append((both.backend, "agrees" if both.agree else "DIFFERS"))
+        return rows + [("warning", line) for line in self.warnings]
+
+    def __repr__(self) -> str:
+        return text_table(f"Survey {self.survey}", ("", ""), self._rows())
+
+    def _repr_html_(self) -> str:
+        return html_table(f"Survey {self.survey}", ("", ""), self._rows())
 
     @property
     def has_scale(self) -> bool:

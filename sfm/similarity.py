@@ -18,7 +18,13 @@ COLLINEAR = 1e-9  # second singular value over the first below which points lie 
 
 @dataclass(frozen=True)
 class Similarity:
-    """target = scale * rotation @ source + translation."""
+    """target = scale * rotation @ source + translation.
+
+    Example:
+        >>> import sfm
+        >>> sfm.Similarity(2.0, np.eye(3), np.array([1.0, 0.0, 0.0])).apply([[1.0, 2.0, 3.0]])
+        array([[3., 4., 6.]])
+    """
 
     scale: float  # target unit per source unit
     rotation: FloatArray  # (3, 3)
@@ -60,6 +66,12 @@ def fit_similarity(
 
     Raises:
         GeometryError: fewer than three points, or all points on a line.
+
+    Example:
+        >>> import sfm
+        >>> corners = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]])
+        >>> round(sfm.fit_similarity(corners, 3 * corners).scale, 9)
+        3.0
 
     Source: Horn (1987), J. Opt. Soc. Am. A 4(4), by the singular value decomposition of Umeyama
     (1991), IEEE PAMI 13(4), eqs. 40-42.

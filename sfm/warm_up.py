@@ -1,4 +1,4 @@
-"""Compile the kernels of a survey ahead of the first one: python -m sfm.warm_up
+"""Compile the kernels of a survey ahead of the first one: `python -m sfm.warm_up`.
 
 Numba keeps compiled kernels on disk; the first run of each would take most of a minute otherwise. Every part
 works on a small made-up problem in a process of its own, since numba compiles one function at a time.
@@ -24,7 +24,7 @@ from sfm.matching.tracks.correspondence import match_targets
 from sfm.matching.tracks.interest import foerstner_points
 from sfm.network import Estimate, ImagePoints, Network, empty_estimate
 from sfm.orientation.sequence import orient
-from sfm.targets.codes.rings import code_family
+from sfm.targets.codes.rings import ring_family
 from sfm.targets.detect import find_targets
 
 IMAGES, POINTS = 8, 40
@@ -116,8 +116,7 @@ def _network() -> tuple[Network, Estimate]:
 
 def _photograph(bright: bool) -> AnyArray:
     """Return a small photograph with four dots, one of them in a ring of cells."""
-    family = code_family("ring14")
-    assert family is not None
+    family = ring_family("ring14")
     pattern = int(family.pattern[20])
     y, x = np.mgrid[:240, :240]
     light = np.zeros((240, 240))

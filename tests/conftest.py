@@ -1,12 +1,29 @@
-"""What all tests share: where the public reference data are, if they are."""
+"""What all tests share: a cache folder of their own, and where the public reference data are, if they are."""
 
 from __future__ import annotations
 
+import atexit
+import os
+import shutil
+import tempfile
 from pathlib import Path
 
+import matplotlib
 import pytest
 
 SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"
+
+os.environ.setdefault("MPLCONFIGDIR", matplotlib.get_cachedir())  # its list of fonts takes long
+os.environ["XDG_CACHE_HOME"] = tempfile.mkdtemp(prefix="kolinear-tests-")  # never that of the user
+atexit.register(shutil.rmtree, os.environ["XDG_CACHE_HOME"], ignore_errors=True)
+
+
+@pytest.fixture(autouse=True)
+def cache(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A cache folder for each test, so that none finds what others have measured."""
+    folder = tmp_path_factory.mktemp("cache")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(folder))
+    return folder
 
 
 @pytest.fixture(scope="session")

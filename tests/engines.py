@@ -15,7 +15,7 @@ from sfm.batch.survey import Comparers, SurveyRow
 from sfm.executor import Done, Event, Tell, Told, Work
 from sfm.result import SurveyResult
 from sfm.survey.comparison import OtherPrograms
-from sfm.survey.inputs.survey_file import Survey
+from sfm.survey.inputs.survey import Survey
 
 KILLER = "killer"  # a survey of this name kills whoever works on it
 

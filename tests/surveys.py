@@ -12,7 +12,7 @@ from sfm.camera import Camera, camera_from_values
 from sfm.conventions import AnyArray, FloatArray
 from sfm.rendering.render import render_photographs
 from sfm.rendering.scene import CircularTargets, Faces, Marks, Optics, Scene, coded_ring, join_marks
-from sfm.targets.codes.rings import code_family
+from sfm.targets.codes.families import code_family
 from tests.synthetic import make_network, seed_of
 
 SIZE_PX = (640, 480)

@@ -207,7 +207,7 @@ def test_refusals_name_what_was_found(tmp_path: Path, monkeypatch: pytest.Monkey
     brown = camera_from_values("nikon", "brown", (2000, 1500), (0.005, 0.005), c_mm=10.0)
     with pytest.raises(BackendError, match="camera nikon: COLMAP has no model brown"):
         write_model(tmp_path, network, replace(truth, cameras=(brown,)))
-    with pytest.raises(BackendError, match="gauge 'inner' is none of"):
+    with pytest.raises(BackendError, match="gauge 'inner', expected one of"):
         adjust_with_colmap(network, truth, gauge="inner")
     with pytest.raises(SurveyFileError, match="no COLMAP model"):
         read_model(tmp_path / "nothing")

@@ -13,7 +13,7 @@ from adapters.colmap.mapper import map_photographs
 from sfm.errors import BackendError
 from sfm.pipeline import run_survey
 from sfm.survey.comparison import OtherPrograms
-from sfm.survey.inputs.survey_file import read_survey
+from sfm.survey.inputs.survey import read_survey
 
 ROOT = Path(__file__).resolve().parents[1]
 DATA = ROOT.parent / "shared" / "data"

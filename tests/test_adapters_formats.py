@@ -522,7 +522,7 @@ def test_results_of_any_format_can_be_compared(tmp_path: Path) -> None:
 
 def test_formats_refuse_by_name(tmp_path: Path) -> None:
     network, truth = network_in("brown")
-    with pytest.raises(SurveyFileError, match="format 'dxf' is none of colmap"):
+    with pytest.raises(SurveyFileError, match="format 'dxf', expected one of colmap"):
         format_named("dxf")
     with pytest.raises(KolinearError, match="format bal holds models opencv, not brown"):
         write_any(tmp_path / "x", "bal", network, truth)

@@ -19,10 +19,11 @@ from adapters.colmap.database import write_database
 from adapters.formats import lines
 from adapters.formats.lines import Lines
 from adapters.formats.registry import FORMATS, read_any, write_any
-from adapters.formats.result_tables import TableResult, read_result, write_tables
+from adapters.formats.result_tables import read_result, write_tables
 from adapters.formats.xml_lines import read_xml
 from sfm.errors import OutputError, SurveyFileError
 from sfm.network import Estimate, Network
+from sfm.stored_result import StoredResult
 from tests.synthetic import make_network, seed_of
 
 HUGE_BYTES = 10_000_000_000
@@ -38,7 +39,7 @@ def made() -> tuple[Network, Estimate]:
 def folder(made: tuple[Network, Estimate], tmp_path: Path) -> Path:
     network, truth = made
     sigma = np.tile(np.eye(3) * 1e-6, (6, 1, 1))
-    write_tables(tmp_path / "t", TableResult("t", network, truth, sigma, sigma[:4], None, 7, "mm"))
+    write_tables(tmp_path / "t", StoredResult("t", network, truth, sigma, sigma[:4], None, 7, "mm"))
     return tmp_path / "t"
 
 
@@ -129,7 +130,7 @@ def test_an_image_point_twice_is_refused(folder: Path) -> None:
 
 def test_sigmas_that_nobody_knows_are_none(made: tuple[Network, Estimate], tmp_path: Path) -> None:
     network, truth = made
-    write_tables(tmp_path, TableResult("t", network, truth))
+    write_tables(tmp_path, StoredResult("t", network, truth))
     assert (tmp_path / "points.csv").read_text().splitlines()[0] == "id,X,Y,Z"
     found = read_result(tmp_path)
     assert found.point_covariance is None and found.position_covariance is None
@@ -157,7 +158,7 @@ def test_files_are_bounded_before_memory_is_taken(
     monkeypatch.setattr(lines, "MAX_LINES", 10)
     (tmp_path / "many.txt").write_text("\n" * 11)
     with pytest.raises(SurveyFileError, match="more than 10 lines"):
-        Lines.of(tmp_path / "many.txt")
+        Lines.of(tmp_path / "many.txt").end()
     (tmp_path / "bal.txt").write_text("9" * 15 + " 1 1\n")
     with pytest.raises(SurveyFileError, match=r"bal\.txt, line 1: the number of cameras is '9+'"):
         read_any(tmp_path / "bal.txt", "bal")

@@ -11,14 +11,18 @@ from threadpoolctl import threadpool_limits
 
 from sfm.adjustment.covariance import Marginal, marginal_of
 from sfm.adjustment.datum import Datum
-from sfm.adjustment.engine import connectivity, iterate, normals
+from sfm.adjustment.engine import iterate, normals
 from sfm.adjustment.engine.cofactors import hat_complement, marginal_covariance
-from sfm.adjustment.engine.connectivity import Order, pattern_of
-from sfm.adjustment.engine.normals import HALVED
-from sfm.adjustment.engine.solvers.banded import BandFactor
+from sfm.adjustment.engine.normals import HALVED, Equations
+from sfm.adjustment.engine.solvers import choice
+from sfm.adjustment.engine.solvers.banded import BandSolver
+from sfm.adjustment.engine.solvers.banded_factor import BandFactor
 from sfm.adjustment.engine.solvers.banded_inverse import band_inverse
-from sfm.adjustment.engine.solvers.pairs import Pairs, pairs_of
-from sfm.adjustment.engine.unknowns import unknowns_of
+from sfm.adjustment.engine.solvers.choice import choose_solver
+from sfm.adjustment.engine.solvers.dense import DenseFactor, DenseSolver
+from sfm.adjustment.engine.solvers.pairs import pairs_of
+from sfm.adjustment.engine.solvers.protocol import Solver
+from sfm.adjustment.engine.unknowns import Unknowns, unknowns_of
 from sfm.adjustment.quality.rank import null_motions
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
@@ -119,8 +123,12 @@ def run(network: Network, start: Estimate, **options: object) -> Adjustment:
     return adjust(network, start, datum=Datum("free"), reject="none", **options)  # type: ignore[arg-type]
 
 
-def pattern_for(network: Network, estimate: Estimate) -> Order | Pairs | None:
-    return pattern_of(unknowns_of(network, estimate, use_control=False)[0])
+def solver_for(network: Network, estimate: Estimate) -> Solver:
+    return choose_solver(unknowns_of(network, estimate, use_control=False)[0])
+
+
+def pair_by_pair(layout: Unknowns) -> DenseSolver:
+    return DenseSolver(layout, pairs_of(layout.observations))
 
 
 def in_sigmas(Q: FloatArray, reference: FloatArray) -> float:
@@ -143,19 +151,22 @@ def test_inverse_within_the_band_equals_that_of_the_whole() -> None:
 
 
 def test_blocks_take_the_band_and_networks_of_many_rays_the_product_of_full_rows() -> None:
-    order = pattern_for(*aerial("choice", 6, 14, 1700))
-    assert isinstance(order, Order)
-    assert order.width < 84 / 3
-    assert isinstance(pattern_for(*unordered("some seen", 70, 300, 20)), Pairs)
-    assert pattern_for(*unordered("all seen", 70, 100, 70)) is None
-    assert pattern_for(*aerial("small", 3, 8, 300)) is None
+    band = solver_for(*aerial("choice", 6, 14, 1700))
+    assert isinstance(band, BandSolver)
+    assert band.width < 84 / 3
+    pairs = solver_for(*unordered("some seen", 70, 300, 20))
+    assert isinstance(pairs, DenseSolver) and pairs.pairs is not None and not pairs.has_coarse
+    product = solver_for(*unordered("all seen", 70, 100, 70))
+    assert isinstance(product, DenseSolver) and product.pairs is None and product.has_coarse
+    small = solver_for(*aerial("small", 3, 8, 300))
+    assert isinstance(small, DenseSolver) and small.pairs is None
 
 
 @pytest.mark.parametrize("bars", [False, True])
 @pytest.mark.parametrize("kind", ["free", "minimal"])
-@pytest.mark.parametrize("pattern", [Order, Pairs])
+@pytest.mark.parametrize("pattern", ["band", "pairs"])
 def test_covariance_of_band_and_pairs_equals_that_of_the_product_of_full_rows(
-    pattern: type, kind: str, bars: bool, monkeypatch: pytest.MonkeyPatch
+    pattern: str, kind: str, bars: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     network, truth = aerial("covariance", 6, 14, 1700)
     twice = np.arange(0, len(network.image_points), 50)  # measured twice in a photograph
@@ -168,18 +179,18 @@ def test_covariance_of_band_and_pairs_equals_that_of_the_product_of_full_rows(
         ends = np.array([5]), np.array([900])
         network = replace(network, scale_bars=ScaleBars(*ends, np.array([length]), np.array([0.01])))
     a = run(network, truth, covariance=False, tolerance=1e-9)
-    if pattern is Pairs:
-        monkeypatch.setattr(iterate, "pattern_of", lambda layout: pairs_of(layout.obs))
+    if pattern == "pairs":
+        monkeypatch.setattr(iterate, "choose_solver", pair_by_pair)
     band = marginal_of(a, datum=Datum(kind))
-    monkeypatch.setattr(iterate, "pattern_of", lambda layout: None)
+    monkeypatch.setattr(iterate, "choose_solver", DenseSolver)
     full = marginal_of(a, datum=Datum(kind))
     if isinstance(band.optimum.factor, BandFactor):
-        assert pattern is Order
+        assert pattern == "band"
     else:
-        assert pattern is Pairs
+        assert isinstance(band.optimum.factor, DenseFactor) and pattern == "pairs"
         assert band.optimum.factor.pairs is not None
         assert band.optimum.factor.pairs.tiles > 1
-    assert not isinstance(full.optimum.factor, BandFactor)
+    assert isinstance(full.optimum.factor, DenseFactor)
     assert full.optimum.factor.pairs is None
     for found in (band, full):
         assert null_motions(found.optimum, found.layout) == (6 if bars else 7)
@@ -205,7 +216,7 @@ def test_what_a_flat_nadir_block_leaves_open_is_found_in_the_band_too(
     network, truth = aerial("flat", 6, 14, 1700, tilt=0.0, hills=0.0, noise_px=0.0)
     truth = replace(truth, cameras=(lens(free),))
     band = run(network, truth)
-    monkeypatch.setattr(iterate, "pattern_of", lambda layout: None)
+    monkeypatch.setattr(iterate, "choose_solver", DenseSolver)
     full = run(network, truth)
     assert band.defect == full.defect == defect
     assert len(band.undetermined) == len(full.undetermined) == defect - 7
@@ -220,7 +231,7 @@ def test_what_a_flat_nadir_block_leaves_open_is_found_in_the_band_too(
 )
 def test_a_weak_block_near_nadir_converges(strips: int, per_strip: int, points: int) -> None:
     network, truth = aerial(f"weak {strips}", strips, per_strip, points, rays=5.0)
-    assert isinstance(pattern_for(network, truth), Order)
+    assert isinstance(solver_for(network, truth), BandSolver)
     a = run(network, spoiled(truth, "weak", 0.25), covariance=False)
     assert a.converged
     assert abs(a.sigma0 - 1) < 5 / np.sqrt(2 * a.redundancy)
@@ -244,14 +255,14 @@ def test_a_step_to_where_nothing_can_be_solved_is_shortened(
     start = spoiled(truth, "refused", 0.25)
     expected = run(network, start, method=method, covariance=False)
     calls = 0
-    solvable = iterate.factor
+    solvable = DenseSolver.factor
 
     def failing_once(*args: object, **options: object) -> object:
         nonlocal calls
         calls += 1
         return None if calls == 2 else solvable(*args, **options)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(iterate, "factor", failing_once)
+    monkeypatch.setattr(DenseSolver, "factor", failing_once)
     a = run(network, start, method=method, covariance=False)
     assert a.converged
     assert a.vPv == pytest.approx(expected.vPv, rel=1e-9)
@@ -263,21 +274,26 @@ def test_nowhere_to_go_ends_as_not_converged_and_bad_start_values_are_refused(
     network, truth = aerial("refused", 3, 5, 120)
     start = spoiled(truth, "refused", 0.25)
     at_start = start.position[0].copy()
-    solvable = iterate.factor
+    solvable = DenseSolver.factor
 
-    def only_at_start(equations, *others, **options):  # type: ignore[no-untyped-def]
-        return solvable(equations, *others, **options) if abs(equations.vPv - first) < 1e-6 * first else None
+    def only_at_start(solver: DenseSolver, equations: Equations, *args: object, **options: object) -> object:
+        near = abs(equations.vPv - first) < 1e-6 * first
+        return solvable(solver, equations, *args, **options) if near else None  # type: ignore[arg-type]
+
+    def noted(solver: DenseSolver, equations: Equations, *args: object, **options: object) -> object:
+        seen.append(equations.vPv)
+        return solvable(solver, equations, *args, **options)  # type: ignore[arg-type]
 
     first = np.inf
     seen: list[float] = []
-    monkeypatch.setattr(iterate, "factor", lambda e, *a, **o: (seen.append(e.vPv), solvable(e, *a, **o))[1])
+    monkeypatch.setattr(DenseSolver, "factor", noted)
     run(network, start, method="gauss-newton", covariance=False)
     first = seen[0]
-    monkeypatch.setattr(iterate, "factor", only_at_start)
+    monkeypatch.setattr(DenseSolver, "factor", only_at_start)
     a = run(network, start, method="gauss-newton", covariance=False)
     assert not a.converged
     assert np.allclose(a.estimate.position[0], at_start)
-    monkeypatch.setattr(iterate, "factor", lambda *args, **options: None)
+    monkeypatch.setattr(DenseSolver, "factor", lambda *args, **options: None)
     with pytest.raises(GeometryError, match="start values"):
         run(network, start, method="gauss-newton", covariance=False)
 
@@ -286,12 +302,12 @@ def test_nowhere_to_go_ends_as_not_converged_and_bad_start_values_are_refused(
 def test_two_threads_give_the_same_to_the_last_bit(way: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of a network large enough that a second thread takes half of the sums and of the products."""
     if way == "pairs":
-        monkeypatch.setattr(iterate, "pattern_of", lambda layout: pairs_of(layout.obs))
+        monkeypatch.setattr(iterate, "choose_solver", pair_by_pair)
     elif way == "product":
-        monkeypatch.setattr(iterate, "pattern_of", lambda layout: None)
+        monkeypatch.setattr(iterate, "choose_solver", DenseSolver)
     elif way == "band":
-        monkeypatch.setattr(connectivity, "SMALL", 0)
-        monkeypatch.setattr(connectivity, "FACTOR_RATE", 1e-3)
+        monkeypatch.setattr(choice, "SMALL", 0)
+        monkeypatch.setattr(choice, "FACTOR_RATE", 1e-3)
     network, truth = aerial("threads", 4, 14, 600, rays=40.0)
     assert len(network.image_points) >= HALVED
     results = []

@@ -10,10 +10,11 @@ from synthetic import make_network, perturb, seed_of
 
 from sfm.adjustment.covariance import marginal_of
 from sfm.adjustment.datum import Datum
-from sfm.adjustment.engine import connectivity
 from sfm.adjustment.engine.collinearity import residuals
 from sfm.adjustment.engine.normals import normal_equations
 from sfm.adjustment.engine.observed_unknowns import weighted_of
+from sfm.adjustment.engine.solvers import choice
+from sfm.adjustment.engine.solvers.banded import BandSolver
 from sfm.adjustment.engine.solvers.dense import schur_complement
 from sfm.adjustment.engine.unknowns import interior_names, start_weights, step, unknowns_of
 from sfm.adjustment.separate import adjust_separately
@@ -123,7 +124,9 @@ def test_normal_equations_equal_those_of_differences() -> None:
     for s in range(layout.reduced):
         h = 1e-4 if s < 6 * IMAGES else 1e-3 * max(1e-4, abs(_value(layout, state, s)))
         moved = [
-            residuals(layout.obs, step(layout, state, f * h * np.eye(layout.reduced)[s], none)).ravel()
+            residuals(
+                layout.observations, step(layout, state, f * h * np.eye(layout.reduced)[s], none)
+            ).ravel()
             for f in (-2, -1, 1, 2)
         ]
         J[:, s] = (moved[0] - 8 * moved[1] + 8 * moved[2] - moved[3]) / (12 * h)
@@ -134,7 +137,7 @@ def test_normal_equations_equal_those_of_differences() -> None:
     scale = 1 / np.sqrt(np.diagonal(N))
     S = schur_complement(equations, layout) / equations.parts.scale[:, None] / equations.parts.scale
     assert np.abs((np.triu(S) - np.triu(N)) * scale[:, None] * scale).max() < 1e-8
-    g = 100 * J.T @ residuals(layout.obs, state).ravel()
+    g = 100 * J.T @ residuals(layout.observations, state).ravel()
     assert np.abs((equations.parts.g - g) * scale).max() < 1e-7 * np.abs(g * scale).max()
 
 
@@ -164,10 +167,10 @@ def test_covariance_equals_the_inverse_of_the_whole() -> None:
 def test_banded_and_full_normal_equations_share_alike(monkeypatch: pytest.MonkeyPatch) -> None:
     network, truth = zoomed("banded", noise_px=0.1)
     full = adjust(network, truth, datum=FREE, reject="none")
-    monkeypatch.setattr(connectivity, "SMALL", 0)
-    monkeypatch.setattr(connectivity, "FACTOR_RATE", 1e-3)  # so that the band is always less work
+    monkeypatch.setattr(choice, "SMALL", 0)
+    monkeypatch.setattr(choice, "FACTOR_RATE", 1e-3)  # so that the band is always less work
     layout, _ = unknowns_of(network, truth, use_control=False)
-    assert connectivity.pattern_of(layout) is not None
+    assert isinstance(choice.choose_solver(layout), BandSolver)
     band = adjust(network, truth, datum=FREE, reject="none")
     assert band.sigma0 == pytest.approx(full.sigma0, rel=1e-9)
     for one, other in zip(band.covariance.interior, full.covariance.interior, strict=True):

@@ -15,9 +15,11 @@ from sfm.adjustment.solve import adjust
 from sfm.camera import camera_from_values, project
 from sfm.conventions import FloatArray, rotation_from_angles
 from sfm.network import Estimate, ImagePoints, Network, ObjectPoints
-from sfm.report.html import render_html
-from sfm.report.summary import summary
-from sfm.report.text import WIDTH, text_report
+from sfm.report.findings.findings import findings_of
+from sfm.report.html.report import report_page
+from sfm.report.tables.summary import summary
+from sfm.report.text.lines import WIDTH
+from sfm.report.text.report import text_report
 from sfm.result import SurveyResult
 from tests.synthetic import PIXEL_MM, SIZE_PX, make_network, seed_of
 
@@ -128,10 +130,10 @@ def test_they_stand_in_all_reports_in_one_line_each() -> None:
     a = adjust(controlled(network, truth), truth, datum=Datum("control"), reject="none")
     found = orientation_correlations(a)
     result = SurveyResult("s", "m", 6, (), a, np.full(54, -1), None, orientation_correlations=found)
-    text, page = text_report(result), render_html(result, (), ())
+    text, page = text_report(findings_of(result)), report_page(findings_of(result), (), ())
     assert f"over 95 %: {len(found)}" in text
     assert all(len(line) <= WIDTH for line in text.splitlines())
-    told = summary(result)["statistics"]["orientation_correlations"]
+    told = summary(findings_of(result))["statistics"]["orientation_correlations"]
     assert [row["parameter"] for row in told] == [one.parameter for one in found]
     assert told[0]["value"] == found[0].largest
     for one in found:

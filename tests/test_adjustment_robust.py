@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from synthetic import make_network, seed_of
 
-from sfm.adjustment import solve
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.engine.collinearity import residuals
 from sfm.adjustment.engine.unknowns import unknowns_of
+from sfm.adjustment.quality import rejection
 from sfm.adjustment.quality.reliability import tau_critical
 from sfm.adjustment.quality.robust import (
     HUBER,
@@ -165,7 +165,7 @@ def test_slopes_of_both_estimators_are_the_derivatives_of_psi() -> None:
     size = np.array([0.3, 1.2, 1.7, 3.0, 4.9])
     network, truth = make_network(seed_of("slopes"), images=4, points=10)
     layout, _ = unknowns_of(network, truth, use_control=False)
-    obs = layout.obs
+    obs = layout.observations
     for weights, slopes in ((huber_weights, huber_slopes), (tukey_weights, tukey_slopes)):
 
         def psi(v: FloatArray, weights=weights) -> FloatArray:  # type: ignore[no-untyped-def]
@@ -198,14 +198,14 @@ def test_weights_of_both_estimators() -> None:
     v = np.zeros((len(network.image_points), 2))
     v[:5, 0] = 0.1 * np.array([0.5 * HUBER, 2 * HUBER, TUKEY / 2, 0.999 * TUKEY, 1.001 * TUKEY])
     v[5] = np.nan  # behind its camera
-    huber = huber_weights(layout.obs, v, sigma0=1.0)
-    tukey = tukey_weights(layout.obs, v, sigma0=1.0)
+    huber = huber_weights(layout.observations, v, sigma0=1.0)
+    tukey = tukey_weights(layout.observations, v, sigma0=1.0)
     assert huber[:2] == pytest.approx([1.0, 0.5])
     assert tukey[[2, 4, 5, 6]] == pytest.approx([0.5625, 0.0, 0.0, 1.0])
     assert 0 < tukey[3] < 1e-5 and huber[5] == 0
-    noise = residuals(layout.obs, state)
+    noise = residuals(layout.observations, state)
     used = np.ones(len(v), dtype=bool)
-    assert robust_scale(layout.obs, noise, used, freedom=1.0) == pytest.approx(
+    assert robust_scale(layout.observations, noise, used, freedom=1.0) == pytest.approx(
         1, abs=4 * 1.17 / np.sqrt(2 * 40)
     )
 
@@ -259,7 +259,7 @@ def test_exchanged_names_are_rejected_though_they_bend_the_network(photographs: 
 def test_an_adjustment_that_gross_errors_break_is_begun_again(monkeypatch: pytest.MonkeyPatch) -> None:
     network, truth = make_network(seed_of("broken"), images=10, points=30)
     clean = adjust(network, truth, datum=FREE, reject="tau", alpha=1e-5)
-    monkeypatch.setattr(solve, "_plain", refuse)
+    monkeypatch.setattr(rejection, "_plain", refuse)
     again = adjust(network, truth, datum=FREE, reject="tau", alpha=1e-5)
     assert again.converged
     np.testing.assert_array_equal(again.rejected, clean.rejected)
@@ -269,7 +269,7 @@ def test_an_adjustment_that_gross_errors_break_is_begun_again(monkeypatch: pytes
 def test_snooping_keeps_the_last_round_that_could_be_solved(monkeypatch: pytest.MonkeyPatch) -> None:
     network, truth, _ = spoiled(seed_of("last round"), 0.05, 50.0)
     plain = adjust(network, truth, datum=FREE, reject="none", tolerance=1e-3)
-    monkeypatch.setattr(solve._Run, "again", once_more(solve._Run.again))
+    monkeypatch.setattr(rejection.Run, "again", once_more(rejection.Run.again))
     a = adjust(network, truth, datum=FREE, alpha=1e-5)
     assert a.rejected.sum() > 0
     assert a.vPv < plain.vPv

@@ -36,5 +36,5 @@ def test_rounds_end_at_the_simultaneous_optimum(free: tuple[str, ...], control: 
 def test_scale_bars_are_refused() -> None:
     network, truth = make_network(seed_of("bars"), images=4, points=10)
     bars = ScaleBars(np.array([0]), np.array([1]), np.array([1.0]), np.array([1e-3]))
-    with pytest.raises(GeometryError, match="for the simultaneous one"):
+    with pytest.raises(GeometryError, match="expected image points and fixed control only"):
         adjust_separately(replace(network, scale_bars=bars), truth)

@@ -9,7 +9,7 @@ import pytest
 from synthetic import make_network, perturb, seed_of
 
 from sfm.adjustment.datum import Datum
-from sfm.adjustment.engine.collinearity import collinearity, residuals, scratch
+from sfm.adjustment.engine.collinearity import collinearity, new_workspace, residuals
 from sfm.adjustment.engine.local_frame import shifted
 from sfm.adjustment.engine.motions import free_motions
 from sfm.adjustment.engine.unknowns import angle_jacobian, step, unknowns_of
@@ -48,13 +48,13 @@ def distances(a: Adjustment) -> np.ndarray:
 def test_residual_and_derivatives_of_one_image_point(model: str) -> None:
     network, truth = make_network(seed_of(model), images=2, points=8, noise_px=0.0, model=model)
     layout, state = unknowns_of(network, truth, use_control=False)
-    assert np.abs(residuals(layout.obs, state)).max() < 1e-8
-    t = scratch.py_func()
+    assert np.abs(residuals(layout.observations, state)).max() < 1e-8
+    t = new_workspace.py_func()
     o, h = 5, 1e-4
-    i, j = layout.obs.image[o], layout.obs.point[o]
-    assert collinearity.py_func(o, layout.obs, state, 1.0, t)
+    i, j = layout.observations.image[o], layout.observations.point[o]
+    assert collinearity.py_func(o, layout.observations, state, 1.0, t)
     A, B = t.A[:, :6].copy(), t.B.copy()
-    weight = layout.obs.whitening[o, 0]
+    weight = layout.observations.whitening[o, 0]
     for s in range(9):
         v = []
         for f in (-2, -1, 1, 2):
@@ -63,7 +63,7 @@ def test_residual_and_derivatives_of_one_image_point(model: str) -> None:
                 reduced[6 * i + s] = f * h
             else:
                 points[j, s - 6] = f * h
-            v.append(residuals(layout.obs, step(layout, state, reduced, points))[o])
+            v.append(residuals(layout.observations, step(layout, state, reduced, points))[o])
         difference = weight * (v[0] - 8 * v[1] + 8 * v[2] - v[3]) / (12 * h)
         derivative = A[:, s] if s < 6 else B[:, s - 6]
         assert np.abs(derivative - difference).max() < 1e-8 * max(np.abs(A).max(), 1)
@@ -150,10 +150,10 @@ def test_covariance_equals_the_inverse_of_the_whole(kind: str) -> None:
     first = layout.reduced - 3 * len(layout.kept)
     u = first + 3 * n
     N = np.zeros((u, u))
-    t = scratch.py_func()
+    t = new_workspace.py_func()
     for o in range(len(layout.order)):
-        collinearity.py_func(o, layout.obs, state, 1.0, t)
-        i, j = layout.obs.image[o], layout.obs.point[o]
+        collinearity.py_func(o, layout.observations, state, 1.0, t)
+        i, j = layout.observations.image[o], layout.observations.point[o]
         row = np.zeros((2, u))
         row[:, 6 * i : 6 * i + 6] = t.A[:, :6]
         row[:, 6 * m : first] = t.A[:, 6 + layout.interior_free[0]]

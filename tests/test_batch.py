@@ -25,7 +25,7 @@ from threadpoolctl import threadpool_info
 from adapters.dask_cluster import DaskEngine, _event, _OneThread, fitting_workers, local_engine, remote_engine
 from sfm.batch.pages import render_index
 from sfm.batch.run import calls_of, find_surveys, run_batch
-from sfm.batch.survey import SurveyJob, SurveyRow, reconstruct
+from sfm.batch.survey import LOCK, SurveyJob, SurveyRow, reconstruct
 from sfm.errors import BackendError, KolinearError, OutputError, SurveyFileError
 from sfm.executor import Call, Done, Lost, Work
 from sfm.files.folder_lock import Owner, locked
@@ -116,9 +116,8 @@ def test_batch_gives_folders_tables_and_logs(finished: Path) -> None:
         assert len(photographs) == (0 if row["survey"] == "third" else 6)
         assert all(entry["targets"] >= 10 and not entry["stored"] for entry in photographs)
     assert sorted(p.name for p in finished.iterdir()) == [
-        *(".kolinear", "batch.csv", "batch.json", "first", "index.html", "second", "third"),
+        *("batch.csv", "batch.json", "first", "index.html", "manifest.json", "second", "third"),
     ]
-    assert not (finished / ".kolinear" / "lock").exists()
 
 
 def test_resume_keeps_what_is_finished_and_runs_what_has_changed(
@@ -270,7 +269,7 @@ def test_a_worker_whose_run_is_over_writes_nothing(
     out = tmp_path / "out"
     job = SurveyJob(surveys[2], out, "third", "", False, Owner(1, "elsewhere", "2026-01-01T00:00:00+00:00"))
     with (
-        locked(out / ".kolinear" / "lock"),
+        locked(out / LOCK),
         pytest.raises(OutputError, match="the run that asked for survey third is over"),
     ):
         reconstruct(job, ALONE, [], tell=lambda _: None)
@@ -279,14 +278,14 @@ def test_a_worker_whose_run_is_over_writes_nothing(
     monkeypatch.setattr("sfm.batch.survey.owner_of", lambda _: next(owners))
     with pytest.raises(OutputError, match="the run that asked for survey third is over"):
         reconstruct(job, ALONE, [], tell=lambda _: None)
-    assert {path.name for path in out.iterdir()} == {".kolinear", "logs"}
+    assert {path.name for path in out.iterdir()} == {"logs"}
 
 
 def test_a_single_run_into_a_folder_of_the_batch_is_not_disturbed(
     surveys: tuple[Path, ...], finished: Path, tmp_path: Path
 ) -> None:
     out = tmp_path / "out"
-    theirs = out / ".third.abc.part"
+    theirs = out / ".third.abcdefgh.part"
     theirs.mkdir(parents=True)
     with locked(out / ".third.lock"):  # as `kolinear adjust --out out/third` holds it
         rows = run_batch([surveys[2], surveys[0]], out, HERE, ALONE, Notes())
@@ -295,7 +294,7 @@ def test_a_single_run_into_a_folder_of_the_batch_is_not_disturbed(
     assert theirs.exists()
     rows = run_batch([surveys[2]], out, HERE, ALONE, Notes(), resume=True)
     assert rows[0].status == "done"
-    assert sorted(path.name for path in out.iterdir() if path.name.startswith(".")) == [".kolinear"]
+    assert not [path for path in out.iterdir() if path.name.startswith(".")]
 
 
 @pytest.mark.parametrize(
@@ -337,7 +336,7 @@ def test_resume_removes_the_log_of_a_run_killed_at_the_last_moment(
     out = tmp_path / "out"
     run_batch([surveys[2]], out, HERE, ALONE, Notes())
     (out / "logs").mkdir()
-    (out / "logs" / "third.jsonl").write_text("{}\n", encoding="utf-8")
+    (out / "logs" / "third.jsonl").write_text('{"time": "", "event": ""}\n', encoding="utf-8")
     run_batch([surveys[2]], out, HERE, ALONE, Notes(), resume=True)
     assert not (out / "logs").exists()
 
@@ -359,7 +358,7 @@ def test_index_escapes_everything() -> None:
 
 def test_a_second_batch_in_the_same_folder_is_refused(finished: Path, surveys: tuple[Path, ...]) -> None:
     with (
-        locked(finished / ".kolinear" / "lock"),
+        locked(finished / LOCK),
         pytest.raises(
             OutputError, match=f"another run is writing into this folder .process {os.getpid()} on"
         ),
@@ -370,7 +369,7 @@ def test_a_second_batch_in_the_same_folder_is_refused(finished: Path, surveys: t
 def test_a_fault_of_ours_is_a_row_with_a_trace(
     surveys: tuple[Path, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("sfm.batch.survey.adjust_survey", lambda *_, **__: [][0])
+    monkeypatch.setattr("sfm.batch.survey.run_survey", lambda *_, **__: [][0])
     (row,) = run_batch([surveys[2]], tmp_path / "out", HERE, ALONE, Notes())
     assert row.reason.startswith("a fault of Kolinear: IndexError")
     (log,) = (tmp_path / "out" / "logs").iterdir()

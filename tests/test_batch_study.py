@@ -28,7 +28,8 @@ MEASURE = """
 import re, sys
 from pathlib import Path
 from sfm.targets.detect import find_targets
-from sfm.photographs.reading import read_metadata, read_photograph
+from sfm.photographs.exif import read_metadata
+from sfm.photographs.reading import read_photograph
 path = Path(sys.argv[1])
 read_metadata(path)
 found = find_targets(read_photograph(path), codes="ring14")

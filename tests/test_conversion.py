@@ -141,5 +141,5 @@ def test_free_parameters_follow_their_meaning() -> None:
 
 def test_same_model_is_left_alone_and_unknown_ones_are_refused() -> None:
     assert convert_camera(camcal(), "brown").camera.parameters == pytest.approx(camcal().parameters, abs=0)
-    with pytest.raises(SurveyFileError, match="model 'fisheye' is none of brown"):
+    with pytest.raises(SurveyFileError, match="model 'fisheye', expected one of brown"):
         convert_camera(camcal(), "fisheye")

@@ -8,7 +8,7 @@ import pytest
 
 from sfm.camera import Camera, camera_from_values, pixel_jacobian, project
 from sfm.conventions import FloatArray, rotation_from_vector
-from sfm.targets.eccentricity import CircleViews, ellipse_shape, fit_circles
+from sfm.orientation.eccentricity import CircleViews, ellipse_shape, fit_circles
 
 CAMERA = camera_from_values(
     "c", "brown", (4000, 3000), (0.005, 0.005), c_mm=20.0, values=(("K1", 1e-5), ("P1", 1e-6))

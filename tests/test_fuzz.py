@@ -17,9 +17,11 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from sfm.errors import KolinearError, PhotographError
-from sfm.photographs.reading import BOMB_PX_PER_BYTE, read_metadata, read_photograph
-from sfm.survey.inputs.survey_file import read_survey
-from sfm.survey.inputs.tables import read_image_points
+from sfm.photographs.exif import read_metadata
+from sfm.photographs.file_checks import BOMB_PX_PER_BYTE
+from sfm.photographs.reading import read_photograph
+from sfm.survey.inputs.given import read_image_points
+from sfm.survey.inputs.survey import read_survey
 from tests.fuzz.cases import Seed, make_seeds, run_case
 
 SHORT = settings(
@@ -43,7 +45,9 @@ class _NeverFar(random.Random):
         return max(0.25, super().random())
 
 
-@pytest.mark.parametrize("kind", ["surveys", "tables", "codes", "photographs", "models", "results"])
+@pytest.mark.parametrize(
+    "kind", ["surveys", "tables", "codes", "photographs", "models", "results", "folders", "rows"]
+)
 @given(number=st.integers(min_value=0, max_value=2**32))
 @SHORT
 def test_mutated_files_are_read_or_refused(

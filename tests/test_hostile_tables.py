@@ -18,7 +18,7 @@ from sfm.errors import SurveyFileError
 from sfm.files.csv_tables import read_table
 from sfm.files.plain_text import as_cell, as_plain, csv_text, from_cell, is_plain
 from sfm.rendering.scene_file import read_scene
-from sfm.survey.inputs.survey_file import read_survey
+from sfm.survey.inputs.survey import read_survey
 
 FORMULAS = ("=1+1", "+A1", "@SUM(A1)", "-A1", "-1+2", "\t=1", "\r=1", " =1", "a;=1", "\uff1d1", "\uff0dA1")
 NO_FORMULAS = ("1", "-1", "-1.5e-3", "a=b", "a-b", "u001", "'quoted'", "DSC_1.jpg", "a;b", "-2;b")
@@ -105,19 +105,19 @@ def test_hidden_characters_are_refused_in_names(tmp_path: Path, hidden: str) -> 
 def test_long_dotted_keys_are_refused_before_they_are_parsed(tmp_path: Path, text: str) -> None:
     for read in (read_survey, read_scene):
         (tmp_path / "s.toml").write_text(text, encoding="utf-8")
-        begun = time.perf_counter()
+        begun = time.process_time()
         with pytest.raises(SurveyFileError, match=r"s.toml, line 1: more than 16 words joined by dots"):
             read(tmp_path / "s.toml")
-        assert time.perf_counter() - begun < 2
+        assert time.process_time() - begun < 2
 
 
 def test_very_many_cameras_are_refused(tmp_path: Path) -> None:
     cameras = "".join(f'[[camera]]\nname = "c{k}"\nimages = "*"\n' for k in range(20_000))
     (tmp_path / "s.toml").write_text(SURVEY + cameras, encoding="utf-8")
-    begun = time.perf_counter()
+    begun = time.process_time()
     with pytest.raises(SurveyFileError, match=r"camera: found .*, needed at most 1000 values"):
         read_survey(tmp_path / "s.toml")
-    assert time.perf_counter() - begun < 5
+    assert time.process_time() - begun < 5
 
 
 def test_a_very_long_key_is_cut(tmp_path: Path) -> None:

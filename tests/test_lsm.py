@@ -149,9 +149,9 @@ def test_bad_input_is_refused_in_one_line() -> None:
     photograph, at = np.full((60, 60), MEAN), np.array([[30.0, 30.0]])
     with pytest.raises(GeometryError, match="window of 20 px, needed an odd number"):
         match_lsm(photograph, photograph, at, at, window_px=20)
-    with pytest.raises(GeometryError, match="model 'helmert' is none of"):
+    with pytest.raises(GeometryError, match="model 'helmert', expected one of"):
         match_lsm(photograph, photograph, at, at, model="helmert")
-    with pytest.raises(GeometryError, match="interpolation 'sinc' is none of"):
+    with pytest.raises(GeometryError, match="interpolation 'sinc', expected one of"):
         match_lsm(photograph, photograph, at, at, interpolation="sinc")
     with pytest.raises(GeometryError, match="1 points in the left photograph, 2 in the right"):
         match_lsm(photograph, photograph, at, np.vstack([at, at]))

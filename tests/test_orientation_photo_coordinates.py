@@ -39,7 +39,7 @@ def test_pixel_to_photo_coordinates_of_document_002():
         np.testing.assert_allclose(down, photo * (1, -1), atol=1e-12)
         for rows, value in (("up", photo), ("down", down)):
             np.testing.assert_allclose(pixel_from_photo(value, SIZE, PIXEL, rows=rows), pixel, atol=1e-9)
-    with pytest.raises(GeometryError, match="neither down nor up"):
+    with pytest.raises(GeometryError, match="expected one of down, up"):
         photo_from_pixel(pixel, SIZE, PIXEL, rows="left")
 
 
@@ -95,7 +95,7 @@ def test_fiducials_refusals():
         orient_fiducials(MARKS[:2], MARKS[:2])
     with pytest.raises(GeometryError, match="on one line"):
         orient_fiducials(MARKS[[0, 1, 1]], MARKS[:3])
-    with pytest.raises(GeometryError, match="kind 'conformal' is none of similarity, affine"):
+    with pytest.raises(GeometryError, match="kind 'conformal', expected one of similarity, affine"):
         orient_fiducials(MARKS, MARKS, kind="conformal")
     assert np.isnan(orient_fiducials(MARKS[:2], MARKS[:2], kind="similarity").sigma0)
 

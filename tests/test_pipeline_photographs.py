@@ -10,11 +10,11 @@ import pytest
 
 from adapters.colmap.adjuster import adjust_with_colmap
 from adapters.formats.photomodeler import read_photomodeler
-from sfm.pipeline import adjust_survey, run_survey
+from sfm.pipeline import run_survey
 from sfm.result import SurveyResult
 from sfm.similarity import fit_similarity
 from sfm.survey.comparison import OtherPrograms
-from sfm.survey.inputs.survey_file import read_survey
+from sfm.survey.inputs.survey import read_survey
 
 DATASETS = Path(__file__).resolve().parents[1] / "datasets"
 
@@ -131,7 +131,7 @@ def test_camcal_reference_points(
     from datasets.camcal.reference import prepare
 
     prepare(shared_data / "camcal", tmp_path)
-    result = adjust_survey(
+    result = run_survey(
         read_survey(tmp_path / f"reference_{name}.toml"), others=OtherPrograms(adjust_with_colmap)
     )
     digits = len(str(sigma0)) - 2

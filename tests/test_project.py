@@ -10,15 +10,14 @@ import pytest
 
 from sfm.conventions import angles_from_rotation, image_from_pixel
 from sfm.errors import PhotographError, SurveyFileError
-from sfm.photographs.reading import Metadata
+from sfm.network import Estimate, Network
+from sfm.photographs.exif import Metadata
+from sfm.survey.datum import datum_warnings
 from sfm.survey.inputs.cameras import camera_of_image, start_cameras
-from sfm.survey.inputs.start import (
-    control_points,
-    find_photographs,
-    network_from_observations,
-    scale_bars,
-)
-from sfm.survey.inputs.survey_file import read_survey
+from sfm.survey.inputs.photograph_list import find_photographs
+from sfm.survey.inputs.start import measurements_from_observations, start_values
+from sfm.survey.inputs.survey import read_survey
+from sfm.survey.inputs.survey_file import read_survey_file
 
 FULL = """\
 [survey]
@@ -87,12 +86,19 @@ def write(folder: Path, text: str, **tables: str) -> Path:
     return path
 
 
+def network_of(path: Path) -> tuple[Network, Estimate]:
+    """Return the network of a survey with observations, and its start values."""
+    survey = read_survey(path)
+    measured = measurements_from_observations(survey)
+    return measured.network, start_values(survey, measured.network, measured.cameras)
+
+
 def metadata(size: tuple[int, int], focal: float | None = None, pixel: float | None = None) -> Metadata:
     return Metadata(size, None, None, focal, None, None if pixel is None else (pixel, pixel), 1)
 
 
 def test_every_key_of_the_survey_file_is_read(tmp_path: Path) -> None:
-    survey = read_survey(write(tmp_path, FULL))
+    survey = read_survey_file(write(tmp_path, FULL))
     assert (survey.name, survey.unit, survey.path.name) == ("camcal", "m", "survey.toml")
     camera = survey.cameras[0]
     assert (camera.name, camera.images, camera.size_px) == ("olympus", "P825*.JPG", (2272, 1704))
@@ -110,7 +116,7 @@ def test_every_key_of_the_survey_file_is_read(tmp_path: Path) -> None:
 
 
 def test_a_survey_is_frozen(tmp_path: Path) -> None:
-    survey = read_survey(write(tmp_path, FULL))
+    survey = read_survey_file(write(tmp_path, FULL))
     with pytest.raises(ValueError, match="frozen"):
         survey.datum.kind = "control"  # type: ignore[misc]
 
@@ -170,10 +176,10 @@ def test_what_is_wrong_is_named_with_its_line(tmp_path: Path, old: str, new: str
     assert old in FULL
     path = write(tmp_path, FULL.replace(old, new, 1))
     if match is None:
-        read_survey(path)
+        read_survey_file(path)
         return
     with pytest.raises(SurveyFileError, match=match) as caught:
-        read_survey(path)
+        read_survey_file(path)
     assert "\n" not in str(caught.value)
     assert str(path) in str(caught.value)
 
@@ -181,49 +187,49 @@ def test_what_is_wrong_is_named_with_its_line(tmp_path: Path, old: str, new: str
 def test_the_second_of_two_cameras_is_named(tmp_path: Path) -> None:
     text = MINIMAL + '[[camera]]\nname = "two"\nimages = "*.tif"\ncolour = 3\n'
     with pytest.raises(SurveyFileError, match=r"line 10: unknown key 'colour' in \[camera 2\]"):
-        read_survey(write(tmp_path, text))
+        read_survey_file(write(tmp_path, text))
     with pytest.raises(SurveyFileError, match="two cameras are named 'one'"):
-        read_survey(write(tmp_path, text.replace("colour = 3", "").replace('"two"', '"one"')))
+        read_survey_file(write(tmp_path, text.replace("colour = 3", "").replace('"two"', '"one"')))
 
 
 def test_datum_control_needs_control(tmp_path: Path) -> None:
     with pytest.raises(SurveyFileError, match=r"datum kind 'control' needs \[control\]"):
-        read_survey(write(tmp_path, MINIMAL + '[datum]\nkind = "control"\n'))
+        read_survey_file(write(tmp_path, MINIMAL + '[datum]\nkind = "control"\n'))
 
 
 def test_datum_points_are_not_for_control(tmp_path: Path) -> None:
     given = MINIMAL + '[datum]\nkind = "control"\npoints = ["1"]\n[control]\nfile = "control.csv"\n'
     with pytest.raises(SurveyFileError, match=r"datum.points are for kind 'free' or 'minimal'"):
-        read_survey(write(tmp_path, given))
+        read_survey_file(write(tmp_path, given))
 
 
 def test_unreadable_survey_files(tmp_path: Path) -> None:
     with pytest.raises(SurveyFileError, match="cannot be read: No such file"):
-        read_survey(tmp_path / "none.toml")
+        read_survey_file(tmp_path / "none.toml")
     with pytest.raises(SurveyFileError, match="not a file, a survey file"):
-        read_survey(tmp_path)
+        read_survey_file(tmp_path)
     (tmp_path / "latin.toml").write_bytes(b'[survey]\nname = "M\xfcnchen"\n')
     with pytest.raises(SurveyFileError, match=r"not a text file in UTF-8 \(byte 18\)"):
-        read_survey(tmp_path / "latin.toml")
+        read_survey_file(tmp_path / "latin.toml")
     (tmp_path / "large.toml").write_bytes(b"#" * 1_000_001)
     with pytest.raises(SurveyFileError, match="1000001 bytes, a survey file has at most"):
-        read_survey(tmp_path / "large.toml")
+        read_survey_file(tmp_path / "large.toml")
     (tmp_path / "deep.toml").write_text("a = " + "[" * 5000, encoding="utf-8")
     with pytest.raises(SurveyFileError, match="not a TOML file: brackets nested too deeply"):
-        read_survey(tmp_path / "deep.toml")
+        read_survey_file(tmp_path / "deep.toml")
     (tmp_path / "long.toml").write_text("a = " + "9" * 5000, encoding="utf-8")
     with pytest.raises(SurveyFileError, match=r"not a TOML file: a number is too long$"):
-        read_survey(tmp_path / "long.toml")
+        read_survey_file(tmp_path / "long.toml")
 
 
 def test_a_survey_file_with_byte_order_mark_and_crlf_is_read(tmp_path: Path) -> None:
     path = tmp_path / "survey.toml"
     path.write_bytes(b"\xef\xbb\xbf" + FULL.replace("\n", "\r\n").encode())
-    assert read_survey(path) == read_survey(write(tmp_path, FULL))
+    assert read_survey_file(path) == read_survey_file(write(tmp_path, FULL))
 
 
 def test_photographs_are_found_by_glob(tmp_path: Path) -> None:
-    survey = read_survey(write(tmp_path, MINIMAL + '[[camera]]\nname = "two"\nimages = "sub/*.jpg"\n'))
+    survey = read_survey_file(write(tmp_path, MINIMAL + '[[camera]]\nname = "two"\nimages = "sub/*.jpg"\n'))
     with pytest.raises(
         SurveyFileError, match=r"no photographs found: camera one needs '\*.jpg' in .*such as"
     ):
@@ -244,11 +250,11 @@ def test_photographs_are_found_by_glob(tmp_path: Path) -> None:
 @pytest.mark.parametrize("glob", ["/abs/*.jpg", ""])
 def test_globs_that_are_none(tmp_path: Path, glob: str) -> None:
     with pytest.raises(SurveyFileError, match=r"no glob|empty text"):
-        find_photographs(read_survey(write(tmp_path, MINIMAL.replace("*.jpg", glob))))
+        find_photographs(read_survey_file(write(tmp_path, MINIMAL.replace("*.jpg", glob))))
 
 
 def test_a_photograph_whose_name_is_no_plain_text_is_refused(tmp_path: Path) -> None:
-    survey = read_survey(write(tmp_path, FULL), allow_outside=True)
+    survey = read_survey_file(write(tmp_path, FULL), allow_outside=True)
     odd = tmp_path / os.fsdecode(b"P825\xff\n.JPG")
     try:
         odd.touch()
@@ -261,7 +267,7 @@ def test_a_photograph_whose_name_is_no_plain_text_is_refused(tmp_path: Path) -> 
 
 
 def test_a_photograph_that_is_missing_behind_its_link_is_not_passed_over(tmp_path: Path) -> None:
-    survey = read_survey(write(tmp_path, FULL))
+    survey = read_survey_file(write(tmp_path, FULL))
     (tmp_path / "P8251.JPG").touch()
     (tmp_path / "P8252.JPG").symlink_to("nowhere.JPG")
     (tmp_path / "P8253.JPG").mkdir()
@@ -269,16 +275,18 @@ def test_a_photograph_that_is_missing_behind_its_link_is_not_passed_over(tmp_pat
 
 
 def test_a_photograph_of_two_cameras_is_refused(tmp_path: Path) -> None:
-    survey = read_survey(write(tmp_path, MINIMAL + '[[camera]]\nname = "two"\nimages = "a*"\n'))
+    survey = read_survey_file(write(tmp_path, MINIMAL + '[[camera]]\nname = "two"\nimages = "a*"\n'))
     (tmp_path / "a.jpg").touch()
     with pytest.raises(SurveyFileError, match=r"'a.jpg' matches the globs of cameras one and two"):
         find_photographs(survey)
 
 
 def test_start_values_come_from_the_file_then_from_the_photographs(tmp_path: Path) -> None:
-    survey = read_survey(write(tmp_path, MINIMAL))
+    survey = read_survey_file(write(tmp_path, MINIMAL))
     names, index = ("a.jpg", "b.jpg"), np.zeros(2, dtype=np.int64)
-    camera = start_cameras(survey, (metadata((600, 400)), metadata((600, 400), 8.0, 0.004)), index, names)[0]
+    camera = start_cameras(
+        survey.cameras, survey.source, (metadata((600, 400)), metadata((600, 400), 8.0, 0.004)), index, names
+    )[0]
     assert camera.size_px == (600, 400)
     assert camera.value("c") == 8.0
     assert not camera.free.any()
@@ -286,15 +294,17 @@ def test_start_values_come_from_the_file_then_from_the_photographs(tmp_path: Pat
     with pytest.raises(
         SurveyFileError, match="EXIF data tell the pixel size, pixel_mm or sensor_mm is needed"
     ):
-        start_cameras(survey, (metadata((600, 400), 8.0),), index, names)
+        start_cameras(survey.cameras, survey.source, (metadata((600, 400), 8.0),), index, names)
     with pytest.raises(SurveyFileError, match="EXIF data tell the focal length, c_mm is needed"):
-        start_cameras(survey, (metadata((600, 400), None, 0.004),), index, names)
+        start_cameras(survey.cameras, survey.source, (metadata((600, 400), None, 0.004),), index, names)
     with pytest.raises(SurveyFileError, match=r"size_px = .* is needed"):
-        start_cameras(survey)
+        start_cameras(survey.cameras, survey.source)
     given = (
         MINIMAL + 'sensor_mm = [6, 4]\nmodel = "opencv"\nfree = ["fx"]\n[camera.fixed]\nk1 = -0.1\nfy = 900\n'
     )
-    camera = start_cameras(read_survey(write(tmp_path, given)), (metadata((600, 400), 8.0),), index, names)[0]
+    camera = start_cameras(
+        read_survey_file(write(tmp_path, given)).cameras, "survey", (metadata((600, 400), 8.0),), index, names
+    )[0]
     np.testing.assert_allclose(camera.parameters, [800, 900, 299.5, 199.5, -0.1, 0, 0, 0])
     assert camera.free.tolist() == [True] + [False] * 7
 
@@ -305,16 +315,16 @@ def test_photographs_of_one_camera_have_one_size(tmp_path: Path) -> None:
     with pytest.raises(
         PhotographError, match=r"camera one: photograph 'b.jpg' has 400 x 600 px, 'a.jpg' 600 x 400 px"
     ):
-        start_cameras(read_survey(write(tmp_path, MINIMAL)), sizes, index, names)
-    survey = read_survey(write(tmp_path, MINIMAL + "size_px = [400, 600]\n"))
+        start_cameras(read_survey_file(write(tmp_path, MINIMAL)).cameras, "survey", sizes, index, names)
+    survey = read_survey_file(write(tmp_path, MINIMAL + "size_px = [400, 600]\n"))
     with pytest.raises(PhotographError, match=r"'a.jpg' has 600 x 400 px, size_px 400 x 600 px"):
-        start_cameras(survey, sizes, index, names)
+        start_cameras(survey.cameras, survey.source, sizes, index, names)
 
 
 def test_image_points_in_pixels_and_in_millimetres_are_the_same(tmp_path: Path) -> None:
     rows = [("i1", "p1", 10.0, 20.0), ("i1", "p2", 150.25, 70.5), ("i2", "p1", 99.5, 49.5)]
     px = "image,point,x_px,y_px,sx_px,sy_px\n" + "".join(f"{i},{p},{x},{y},0.1,0.2\n" for i, p, x, y in rows)
-    network, estimate = network_from_observations(read_survey(write(tmp_path, OBSERVED, image_points=px)))
+    network, estimate = network_of(write(tmp_path, OBSERVED, image_points=px))
     assert network.images == ("i1", "i2")
     assert network.points == ("p1", "p2")
     np.testing.assert_array_equal(network.image_points.image, [0, 0, 1])
@@ -327,7 +337,7 @@ def test_image_points_in_pixels_and_in_millimetres_are_the_same(tmp_path: Path) 
     for i, p, *xy in rows:
         x, y = image_from_pixel(np.array(xy), (200, 100), np.array([0.01, 0.02]))
         mm += f"{i},{p},{x!r},{y!r},0.001,0.004\n".replace("np.float64(", "").replace(")", "")
-    again, _ = network_from_observations(read_survey(write(tmp_path, OBSERVED, image_points=mm)))
+    again, _ = network_of(write(tmp_path, OBSERVED, image_points=mm))
     np.testing.assert_allclose(again.image_points.xy, network.image_points.xy, atol=1e-12)
     np.testing.assert_allclose(again.image_points.covariance, network.image_points.covariance, rtol=1e-12)
 
@@ -335,7 +345,7 @@ def test_image_points_in_pixels_and_in_millimetres_are_the_same(tmp_path: Path) 
 def test_observations_without_sigma_have_that_of_the_survey(tmp_path: Path) -> None:
     text = OBSERVED + "[adjust]\nsigma_px = 0.25\n"
     table = "image,point,x_px,y_px\n1,1,10,20\n2,1,11,20\n"
-    network, _ = network_from_observations(read_survey(write(tmp_path, text, image_points=table)))
+    network, _ = network_of(write(tmp_path, text, image_points=table))
     np.testing.assert_array_equal(network.image_points.covariance, np.tile(np.eye(2) * 0.0625, (2, 1, 1)))
 
 
@@ -355,14 +365,15 @@ def test_control_scale_bars_and_start_values(tmp_path: Path) -> None:
         images="image,X,Y,Z,omega_deg,phi_deg,kappa_deg\n2,10,20,30,1,-2,179\n",
         points="point,X,Y,Z\nb,4,5,6\na,9,9,9\n",
     )
-    survey = read_survey(path)
-    network, estimate = network_from_observations(survey)
+    network, estimate = network_of(path)
     np.testing.assert_array_equal(network.control.point, [0])
     np.testing.assert_array_equal(network.control.xyz, [[1, 2, 3]])
     np.testing.assert_allclose(network.control.covariance[0], np.diag([0, 0.01, 0.04]))
-    assert control_points(survey, network.points)[1] == ("elsewhere",)
     assert (network.scale_bars.start[0], network.scale_bars.end[0]) == (1, 0)
-    assert scale_bars(survey, network.points)[1] == ("a - lost",)
+    assert datum_warnings(read_survey(path), network) == (
+        "control not in the result: elsewhere",
+        "scale bars with an end that is not in the result: a - lost",
+    )
     assert estimate.oriented.tolist() == [False, True]
     np.testing.assert_array_equal(estimate.position[1], [10, 20, 30])
     np.testing.assert_allclose(np.degrees(angles_from_rotation(estimate.rotation[1])), [1, -2, 179])
@@ -400,14 +411,14 @@ GOOD = "image,point,x_px,y_px\n1,a,10,20\n"
     ],
 )
 def test_bad_tables_are_named_with_their_line(tmp_path: Path, table: str, match: str) -> None:
-    survey = read_survey(write(tmp_path, OBSERVED, image_points=table))
+    path = write(tmp_path, OBSERVED, image_points=table)
     with pytest.raises(SurveyFileError, match=match) as caught:
-        network_from_observations(survey)
+        read_survey(path)
     assert "image_points.csv" in str(caught.value)
 
 
 def test_bad_control_is_refused(tmp_path: Path) -> None:
-    survey = read_survey(write(tmp_path, MINIMAL + '[control]\nfile = "control.csv"\n'))
+    path = write(tmp_path, MINIMAL + '[control]\nfile = "control.csv"\n')
     for table, match in (
         ("id,X,Y,Z\n1,0,0,0\n1,1,1,1\n", "line 3: id '1' stands on line 2 already"),
         ("id,X,Y,Z,sX,sY,sZ\n1,0,0,0,0,-1,0\n", r"column sY holds -1, needed 0 \(fixed\) or more"),
@@ -415,41 +426,41 @@ def test_bad_control_is_refused(tmp_path: Path) -> None:
     ):
         (tmp_path / "control.csv").write_text(table, encoding="utf-8")
         with pytest.raises(SurveyFileError, match=match):
-            control_points(survey, ("1",))
+            read_survey(path)
     (tmp_path / "control.csv").unlink()
     with pytest.raises(SurveyFileError, match=r"control.csv: the table cannot be read: No such file"):
-        control_points(survey, ("1",))
+        read_survey(path)
     (tmp_path / "control.csv").write_bytes(b"id,X,Y,Z\n\xff,0,0,0\n")
     with pytest.raises(SurveyFileError, match="UTF-8"):
-        control_points(survey, ("1",))
+        read_survey(path)
 
 
 def test_a_table_with_byte_order_mark_and_crlf_is_read(tmp_path: Path) -> None:
-    survey = read_survey(write(tmp_path, MINIMAL + '[control]\nfile = "control.csv"\n'))
+    path = write(tmp_path, MINIMAL + '[control]\nfile = "control.csv"\n')
     (tmp_path / "control.csv").write_bytes("\ufeffid,X,Y,Z\r\n ä 1 ,0,0,1.5\r\n".encode())
-    control, missing = control_points(survey, ("ä 1",))
-    assert missing == ()
+    control = read_survey(path).control
+    assert control is not None and control.names == ("ä 1",)
     np.testing.assert_array_equal(control.xyz, [[0, 0, 1.5]])
 
 
 def test_images_belong_to_the_camera_whose_glob_they_match(tmp_path: Path) -> None:
     text = MINIMAL.replace("*.jpg", "a*") + '[[camera]]\nname = "two"\nimages = "*b"\n'
-    survey = read_survey(write(tmp_path, text))
-    assert camera_of_image(survey, "ac") == 0
-    assert camera_of_image(survey, "cb") == 1
+    survey = read_survey_file(write(tmp_path, text))
+    assert camera_of_image(survey.cameras, "ac", survey.source) == 0
+    assert camera_of_image(survey.cameras, "cb", survey.source) == 1
     with pytest.raises(SurveyFileError, match=r"'ab' matches the glob of 2 cameras: one 'a\*', two '\*b'"):
-        camera_of_image(survey, "ab")
+        camera_of_image(survey.cameras, "ab", survey.source)
     with pytest.raises(SurveyFileError, match="'c' matches the glob of no camera"):
-        camera_of_image(survey, "c")
+        camera_of_image(survey.cameras, "c", survey.source)
 
 
 def test_single_brackets_of_a_camera_are_explained(tmp_path: Path) -> None:
     path = write(tmp_path, MINIMAL.replace("[[camera]]", "[camera]"))
     with pytest.raises(SurveyFileError, match=r"found \[camera\], needed \[\[camera\]\] in double brackets"):
-        read_survey(path)
+        read_survey_file(path)
 
 
 def test_a_parameter_is_free_once(tmp_path: Path) -> None:
     text = FULL.replace('free = ["c",', 'free = ["c","c",')
     with pytest.raises(SurveyFileError, match=r"camera olympus: parameter 'c' stands 2 times in free"):
-        read_survey(write(tmp_path, text))
+        read_survey_file(write(tmp_path, text))

@@ -10,7 +10,7 @@ from adapters.formats.registry import FORMATS
 from sfm.cli.app import app
 from sfm.report.output import WRITTEN
 from sfm.survey.inputs.settings import Section
-from sfm.survey.inputs.survey_file import Survey, read_survey
+from sfm.survey.inputs.survey_file import SurveyFile, read_survey_file
 
 ROOT = Path(__file__).resolve().parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -34,13 +34,13 @@ def test_survey_files_of_the_readme_are_read_and_show_every_key(tmp_path: Path) 
     for block in blocks:
         path = tmp_path / "survey.toml"
         path.write_text(block, encoding="utf-8")
-        survey = read_survey(path)
+        survey = read_survey_file(path)
         for key, given in tomllib.loads(block).items():
-            name = next(n for n, field in Survey.model_fields.items() if (field.alias or n) == key)
+            name = next(n for n, field in SurveyFile.model_fields.items() if (field.alias or n) == key)
             value = getattr(survey, name)
             sections[key] = type(value[0] if isinstance(value, tuple) else value)
             shown.setdefault(key, set()).update(given[0] if isinstance(given, list) else given)
-    assert shown.keys() == keys_of(Survey)
+    assert shown.keys() == keys_of(SurveyFile)
     for key, section in sections.items():
         assert keys_of(section) - shown[key] <= {"sensor_mm"}, key
 

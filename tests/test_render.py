@@ -14,14 +14,15 @@ from sfm.conventions import rotation_from_angles
 from sfm.errors import GeometryError, SurveyFileError
 from sfm.rendering.render import (
     painting_order,
-    picture_targets,
+    project_targets,
     render_photograph,
     render_photographs,
     write_photographs,
 )
 from sfm.rendering.scene import CircularTargets, Faces, Light, Optics, Scene, coded_ring, discs, join_marks
 from sfm.rendering.scene_file import read_scene
-from sfm.targets.codes.rings import code_family, read_codes
+from sfm.targets.codes.families import code_family
+from sfm.targets.codes.ring_reading import read_codes
 
 DEMO = Path(__file__).parents[1] / "datasets/demo/scene.toml"
 SIZE = (320, 240)
@@ -339,6 +340,8 @@ def test_a_scene_file_gives_photographs_and_their_truth(tmp_path):
         ("reflectance = 0.8", "reflectance = 1.8", "face.0.reflectance"),
         ("radius = 2.5", "radius = 2.5\ncolour = 3", "colour"),
         ("[scene]", "[scene", "scene.toml"),
+        ('codes = "ring14"', 'codes = "aruco4x4_50"', "codes = 'aruco4x4_50', expected rings or arcs"),
+        ('model = "brown"', 'model = "fisheye"', "camera.model: model 'fisheye', expected one of brown"),
     ],
 )
 def test_wrong_scene_files_are_one_line(tmp_path, old, new, message):
@@ -371,7 +374,7 @@ def test_the_demo_scene_shows_most_targets_in_most_photographs():
     assert len(staging.names) == 12
     seen = np.array(
         [
-            picture_targets(staging.scene, staging.camera, X0, R).visible
+            project_targets(staging.scene, staging.camera, X0, R).visible
             for X0, R in zip(staging.positions, staging.rotations, strict=True)
         ]
     )

@@ -12,6 +12,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from jinja2 import UndefinedError
 
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.result import Adjustment
@@ -19,18 +20,22 @@ from sfm.adjustment.solve import adjust
 from sfm.cli.console import tell_result
 from sfm.conventions import angles_from_rotation
 from sfm.errors import OutputError
+from sfm.files.whole_files import refuse_foreign_folder
 from sfm.network import Network, ObjectPoints, ScaleBars
-from sfm.report.html import render_html
-from sfm.report.markup import finer_unit, significant, table, to_precision, with_exponent
-from sfm.report.output import WRITTEN, refuse_foreign_folder, write_result
-from sfm.report.overlays import USED, draw_photograph, overlay_names
-from sfm.report.plots import all_plots, plan_axes
-from sfm.report.summary import summary, write_summary
-from sfm.report.tables import image_rms, write_tables
-from sfm.report.text import WIDTH, text_report
-from sfm.report.verdict import verdict_of
+from sfm.report.figures.overlays import USED, draw_photograph, overlay_names
+from sfm.report.figures.plots import all_plots, plan_axes
+from sfm.report.findings.findings import findings_of
+from sfm.report.findings.geometry import geometry_of
+from sfm.report.html.page import environment
+from sfm.report.html.report import report_page
+from sfm.report.numbers import finer_unit, significant, to_precision, with_exponent
+from sfm.report.output import WRITTEN, write_result
+from sfm.report.tables.csv_files import write_tables
+from sfm.report.tables.summary import summary, write_summary
+from sfm.report.text.lines import WIDTH
+from sfm.report.text.report import text_report
 from sfm.result import ControlCheck, FailedImage, PhotographTargets, StageTime, SurveyResult
-from sfm.survey.inputs.tables import read_exterior, read_image_points, read_points
+from sfm.survey.inputs.given import read_exterior, read_image_points, read_points
 from sfm.targets.flags import Flag
 from tests.synthetic import make_network, seed_of
 
@@ -89,7 +94,7 @@ def rows_of(path: Path) -> list[dict[str, str]]:
 
 
 def test_tables_give_back_every_number(result: SurveyResult, tmp_path: Path) -> None:
-    write_tables(result, tmp_path)
+    write_tables(findings_of(result), tmp_path)
     a = result.adjustment
     points = rows_of(tmp_path / "points.csv")
     assert list(points[0]) == ["id", "X", "Y", "Z", "sX", "sY", "sZ", "rays", "code", "angle_deg", "rms_px"]
@@ -124,7 +129,7 @@ def test_tables_give_back_every_number(result: SurveyResult, tmp_path: Path) -> 
 
 
 def test_tables_of_a_result_can_be_input_of_another_survey(result: SurveyResult, tmp_path: Path) -> None:
-    write_tables(result, tmp_path)
+    write_tables(findings_of(result), tmp_path)
     a = result.adjustment
     np.testing.assert_array_equal(read_points(tmp_path / "points.csv").xyz, a.estimate.points)
     np.testing.assert_allclose(
@@ -136,11 +141,11 @@ def test_tables_of_a_result_can_be_input_of_another_survey(result: SurveyResult,
 
 
 def test_summary_says_what_the_adjustment_says(result: SurveyResult, tmp_path: Path) -> None:
-    write_tables(result, tmp_path)
-    write_summary(result, tmp_path)
+    write_tables(findings_of(result), tmp_path)
+    write_summary(findings_of(result), tmp_path)
     a = result.adjustment
     text = json.loads((tmp_path / "summary.json").read_text(encoding="utf-8"))
-    assert text == json.loads(json.dumps(summary(result)))
+    assert text == json.loads(json.dumps(summary(findings_of(result))))
     assert text["survey"] == result.survey
     assert text["images"] == {
         "used": 8,
@@ -171,15 +176,15 @@ def test_unknown_numbers_are_null_and_empty_cells(result: SurveyResult, tmp_path
     unknown = replace(
         result, adjustment=replace(result.adjustment, covariance=covariance, sigma0=float("nan"))
     )
-    write_tables(unknown, tmp_path)
-    write_summary(unknown, tmp_path)
+    write_tables(findings_of(unknown), tmp_path)
+    write_summary(findings_of(unknown), tmp_path)
     text = (tmp_path / "summary.json").read_text(encoding="utf-8")
     assert json.loads(text, parse_constant=lambda name: pytest.fail(name))["sigma0_px"] is None
     assert rows_of(tmp_path / "points.csv")[0]["sX"] == ""
 
 
 def test_points_as_ply(result: SurveyResult, tmp_path: Path) -> None:
-    write_tables(replace(result, unit="µm\nend_header"), tmp_path)
+    write_tables(findings_of(replace(result, unit="µm\nend_header")), tmp_path)
     lines = (tmp_path / "points.ply").read_text(encoding="ascii").splitlines()
     assert lines[0] == "ply"
     assert "element vertex 40" in lines
@@ -189,7 +194,7 @@ def test_points_as_ply(result: SurveyResult, tmp_path: Path) -> None:
 
 
 def test_image_rms_adds_up_to_that_of_the_network(adjustment: Adjustment) -> None:
-    rms, count = image_rms(adjustment)
+    rms, count = (geometry := geometry_of(adjustment)).image_rms_px, geometry.image_points
     assert count.sum() == (~adjustment.rejected).sum()
     assert np.sqrt((rms**2 * count).sum() / count.sum()) == pytest.approx(adjustment.rms_px, rel=1e-12)
 
@@ -218,7 +223,7 @@ class Tags(HTMLParser):
 
 
 def test_page_is_whole_escaped_and_self_contained(result: SurveyResult) -> None:
-    page = render_html(result, all_plots(result.adjustment, result.unit), ())
+    page = report_page(findings_of(result), all_plots(findings_of(result)), ())
     tags = Tags()
     tags.feed(page)
     assert tags.open == []
@@ -231,7 +236,7 @@ def test_page_is_whole_escaped_and_self_contained(result: SurveyResult) -> None:
     for question in (
         "Did it work?",
         "How good is it?",
-        "What was thrown out, and why?",
+        "What was rejected, and why?",
         "Does the other adjuster agree?",
         "Where are my coordinates?",
     ):
@@ -247,39 +252,42 @@ def test_a_network_without_scale_has_no_metric_unit(result: SurveyResult) -> Non
     known = ObjectPoints(np.arange(2), free.adjustment.estimate.points[:2], np.zeros((2, 3, 3)))
     network = replace(free.adjustment.network, control=known)
     assert replace(free, adjustment=replace(free.adjustment, network=network)).length_unit == "m"
-    assert "network units" in render_html(free, (), ())
+    assert "network units" in report_page(findings_of(free), (), ())
     bars = ScaleBars(np.array([0]), np.array([1]), np.array([1.0]), np.array([0.1]))
     network = replace(free.adjustment.network, scale_bars=bars)
     assert replace(free, adjustment=replace(free.adjustment, network=network)).length_unit == "m"
 
 
 def test_verdict(result: SurveyResult) -> None:
-    assert verdict_of(result).level == "fair"
-    assert verdict_of(result).remarks[-1] == "Warning: scale bar 1 - 2 was not measured."
+    assert findings_of(result).verdict.level == "fair"
+    assert findings_of(result).verdict.remarks[-1] == "Warning: scale bar 1 - 2 was not measured."
     more = replace(result, warnings=("one thing.", "another", "a third"))
-    assert verdict_of(more).remarks[-1] == "Warning: one thing (2 more warnings, see below)."
+    assert findings_of(more).verdict.remarks[-1] == "Warning: one thing (2 more warnings, see below)."
     fine = replace(result, images_total=8, failed=(), warnings=())
-    assert verdict_of(fine).level == "good"
-    assert verdict_of(fine).headline == "The survey worked: 8 of 8 photographs oriented, 40 object points."
+    assert findings_of(fine).verdict.level == "good"
+    assert (
+        findings_of(fine).verdict.headline
+        == "The survey worked: 8 of 8 photographs oriented, 40 object points."
+    )
     lost = replace(fine, adjustment=replace(fine.adjustment, converged=False))
-    assert verdict_of(lost).level == "bad"
+    assert findings_of(lost).verdict.level == "bad"
     weak = replace(fine, adjustment=replace(fine.adjustment, undetermined=("camera 1 c",), defect=8))
-    assert "Rank defect 8, expected 7" in verdict_of(weak).remarks[0]
+    assert "Rank defect 8, expected 7" in findings_of(weak).verdict.remarks[0]
     many = replace(fine, adjustment=replace(fine.adjustment, rejected=np.arange(320) < 100))
-    assert verdict_of(many).level == "fair"
+    assert findings_of(many).verdict.level == "fair"
 
 
 def test_every_warning_is_told_once_where_the_remark_says_so(
     result: SurveyResult, capsys: pytest.CaptureFixture[str]
 ) -> None:
     more = replace(result, warnings=("one thing", "another, " + "and so on " * 20 + "to its end", "a third"))
-    text = text_report(more)
+    text = text_report(findings_of(more))
     assert max(map(len, text.splitlines())) <= WIDTH
     words = " ".join(text[text.index("\nWarnings ") : text.index("\nNetwork and rank ")].split())
     assert all(warning in words for warning in more.warnings)
     assert f"{result.failed[0].image}: {result.failed[0].reason}" in " ".join(text.split())
-    assert "\nWarnings " not in text_report(result)
-    tell_result(more, Path("report.html"), seconds=1.0, verbose=False)
+    assert "\nWarnings " not in text_report(findings_of(result))
+    tell_result(findings_of(more), Path("report.html"), seconds=1.0, verbose=False)
     told = capsys.readouterr().out
     assert all(told.count(warning) == 1 for warning in more.warnings)
 
@@ -310,7 +318,9 @@ def test_overlays_have_different_names() -> None:
 
 def test_result_appears_whole_and_replaces_an_earlier_one(result: SurveyResult, tmp_path: Path) -> None:
     out = tmp_path / "deep" / "out"
-    page = write_result(result, out, write_colmap=lambda folder: (folder / "x.bin").touch(), jobs=2)
+    page = write_result(
+        findings_of(result), out, write_colmap=lambda folder: (folder / "x.bin").touch(), jobs=2
+    )
     assert page == out / "report.html"
     assert {path.name for path in out.iterdir()} == set(WRITTEN) - {
         "log.jsonl"
@@ -318,7 +328,7 @@ def test_result_appears_whole_and_replaces_an_earlier_one(result: SurveyResult, 
     assert len(list((out / "overlays").iterdir())) == 8
     assert [path.name for path in out.parent.iterdir()] == ["out"]
     before = (out / "points.csv").read_bytes()
-    write_result(replace(result, survey="again"), out, jobs=2)
+    write_result(findings_of(replace(result, survey="again")), out, jobs=2)
     assert json.loads((out / "summary.json").read_text(encoding="utf-8"))["survey"] == "again"
     assert not (out / "colmap").exists()
     assert (out / "points.csv").read_bytes() == before
@@ -328,13 +338,13 @@ def test_result_appears_whole_and_replaces_an_earlier_one(result: SurveyResult, 
 def test_a_failure_leaves_nothing_and_the_earlier_result(result: SurveyResult, tmp_path: Path) -> None:
     out = tmp_path / "out"
     small = replace(result, photographs=())
-    write_result(small, out)
+    write_result(findings_of(small), out)
 
     def fail(folder: Path) -> None:
         raise OSError(28, "No space left on device")
 
     with pytest.raises(OutputError, match="out: the result cannot be written: No space left on device"):
-        write_result(replace(small, survey="new"), out, write_colmap=fail)
+        write_result(findings_of(replace(small, survey="new")), out, write_colmap=fail)
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
     assert json.loads((out / "summary.json").read_text(encoding="utf-8"))["survey"] == result.survey
 
@@ -348,7 +358,7 @@ def test_other_peoples_folders_are_not_touched(tmp_path: Path) -> None:
     with pytest.raises(OutputError, match="the folder holds 'file'; --out needs a new or empty folder"):
         refuse_foreign_folder(tmp_path)
     (tmp_path / "file").rename(tmp_path / "summary.json")
-    with pytest.raises(OutputError, match=r"holds no summary.json of an earlier result"):
+    with pytest.raises(OutputError, match=r"holds 'summary.json'; --out needs"):
         refuse_foreign_folder(tmp_path)
 
 
@@ -361,7 +371,7 @@ def locked(tmp_path: Path) -> Iterator[Path]:
 
 def test_a_place_that_cannot_be_written(result: SurveyResult, locked: Path) -> None:
     with pytest.raises(OutputError, match=r"out: the result cannot be written here: (File exists|Not a dir)"):
-        write_result(replace(result, photographs=()), locked)
+        write_result(findings_of(replace(result, photographs=())), locked)
 
 
 def test_plan_of_an_upright_wall_is_seen_from_its_front() -> None:
@@ -378,10 +388,12 @@ def test_plan_of_an_upright_wall_is_seen_from_its_front() -> None:
 def test_plots_of_small_and_plain_results() -> None:
     network, truth = make_network(seed_of("plots"), images=3, points=12, noise_px=0.0, cameras=2, free=())
     names = tuple(f"$x_{k}^ä.jpg" for k in range(3))
-    plain: Network = replace(network, images=names)
-    plots = all_plots(adjust(plain, truth, datum=Datum("free")), "$m")
-    assert [stem for stem, _, _ in plots] == ["network", "residuals", "distribution", "photographs"]
-    assert all(data.startswith(b"\x89PNG") for _, _, data in plots)
+    bars = ScaleBars(np.array([0]), np.array([1]), np.array([1.0]), np.array([0.1]))
+    plain: Network = replace(network, images=names, scale_bars=bars)
+    a = adjust(plain, truth, datum=Datum("free"))
+    plots = all_plots(findings_of(SurveyResult("plots", "$m", 3, (), a, np.full(12, -1), None)))
+    assert [plot.stem for plot in plots] == ["network", "residuals", "distribution", "photographs"]
+    assert all(plot.png.startswith(b"\x89PNG") for plot in plots)
 
 
 @pytest.mark.parametrize(
@@ -408,7 +420,13 @@ def test_lengths_are_shown_in_a_unit_that_reads_well() -> None:
 
 
 def test_table_escapes_and_aligns() -> None:
-    text = table(("a", "b [px]"), [("<x>", "1.5"), ("y", "")])
+    template = environment().from_string(
+        '{% import "macros.html" as t %}{% call t.table(("a", ">b [px]")) %}'
+        "{% for row in rows %}{{ t.row(*row) }}{% endfor %}{% endcall %}"
+    )
+    text = template.render(rows=[("<x>", "1.5"), ("y", "")])
     assert "&lt;x&gt;" in text
+    with pytest.raises(UndefinedError, match="'rows' is undefined"):
+        template.render()
     assert "<th class=n>b [px]</th>" in text
     assert "<td class=n>1.5</td>" in text

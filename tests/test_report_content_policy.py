@@ -18,12 +18,13 @@ from sfm.comparison.adjuster_validation import SAME, Trial, Validation
 from sfm.comparison.random_network import Plan
 from sfm.comparison.significance import Result, compare_results
 from sfm.pipeline import run_survey
-from sfm.report.content_policy import content_policy
 from sfm.report.differences import write_differences
+from sfm.report.findings.findings import findings_of
+from sfm.report.html.content_policy import content_policy
+from sfm.report.html.page import render
 from sfm.report.output import write_result
-from sfm.report.pages import page
 from sfm.report.validation import write_validation
-from sfm.survey.inputs.survey_file import read_survey
+from sfm.survey.inputs.survey import read_survey
 from tests.surveys import write_photograph_survey
 from tests.synthetic import make_network, seed_of
 
@@ -79,7 +80,7 @@ def held_by(text: str) -> Held:
 
 def report_page(folder: Path) -> str:
     survey = read_survey(write_photograph_survey(folder / "survey", "report"))
-    return write_result(run_survey(survey), folder / "out").read_text(encoding="utf-8")
+    return write_result(findings_of(run_survey(survey)), folder / "out").read_text(encoding="utf-8")
 
 
 def index_page(folder: Path) -> str:
@@ -140,5 +141,6 @@ def test_all_pages_come_from_where_the_policy_is_written() -> None:
         if path.suffix in (".py", ".html", ".jinja", ".j2")
         and "<html" in path.read_text(encoding="utf-8").lower()
     ]
-    assert writers == ["sfm/report/pages.py"]
-    assert len(held_by(page("kind", "title", "verdict", "good", [])).policies) == 1
+    words = dict.fromkeys(("kind", "title", "headline", "level", "remarks"), "x")
+    assert writers == ["sfm/report/html/templates/base.html"]
+    assert len(held_by(render("base.html", **words, sections=())).policies) == 1

@@ -14,14 +14,16 @@ from sfm.adjustment.datum import Datum
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.network import ObjectPoints
-from sfm.report.geometry import Geometry, geometry_of, hull_area, intersection_angles
-from sfm.report.html import render_html
-from sfm.report.section_geometry import MOST_BINS, binned
-from sfm.report.summary import summary
-from sfm.report.tables import write_tables
-from sfm.report.text import WIDTH, text_report
+from sfm.report.findings.findings import findings_of
+from sfm.report.findings.geometry import Geometry, geometry_of, hull_area, intersection_angles
+from sfm.report.html.report import report_page
+from sfm.report.phrases import MAX_BINS, points_by_rays
+from sfm.report.tables.csv_files import write_tables
+from sfm.report.tables.summary import summary
+from sfm.report.text.lines import WIDTH
+from sfm.report.text.report import text_report
 from sfm.result import SurveyResult
-from sfm.survey.inputs.tables import read_exterior, read_points
+from sfm.survey.inputs.given import read_exterior, read_points
 from tests.synthetic import SIZE_PX, make_network, seed_of
 
 CAMCAL = Path(__file__).resolve().parents[2] / "shared" / "data" / "camcal"
@@ -127,17 +129,17 @@ def test_points_with_one_ray_each_have_no_angle() -> None:
     network = replace(network, image_points=seen.select(seen.point % 2 == seen.image), control=control)
     result = result_of(adjust(network, truth, datum=Datum("control"), reject="none"))
     assert np.isnan(geometry_of(result.adjustment).angle_deg).all()
-    assert "intersection angle    not known\n" in text_report(result)
-    assert summary(result)["geometry"]["intersection_angle_deg"]["max"] is None
-    assert "not known" in render_html(result, (), ())
+    assert "intersection angle    not known\n" in text_report(findings_of(result))
+    assert summary(findings_of(result))["geometry"]["intersection_angle_deg"]["max"] is None
+    assert "not known" in report_page(findings_of(result), (), ())
 
 
 def test_many_numbers_of_rays_are_told_in_ranges() -> None:
     rays = np.repeat(np.arange(2, 60), np.arange(2, 60))
     none = np.zeros(0)
-    found = Geometry(rays, none, none, none, none, ())
-    bins = binned(found)
-    assert len(bins) <= MOST_BINS
+    found = Geometry(rays, none, none, none, none, (), rays)
+    bins = points_by_rays(found)
+    assert len(bins) <= MAX_BINS
     assert sum(n for _, n in bins) == len(rays)
     assert bins[0] == ("2-6", 2 + 3 + 4 + 5 + 6)
 
@@ -149,14 +151,18 @@ def test_weak_points_are_named_and_all_reports_agree(tmp_path: Path) -> None:
     result = result_of(replace(a, estimate=replace(a.estimate, points=points)))
     found = geometry_of(result.adjustment)
     assert [a.network.points[j] for j in found.weak] == ["5"]
-    text, page, told = text_report(result), render_html(result, (), ()), summary(result)["geometry"]
+    text, page, told = (
+        text_report(findings_of(result)),
+        report_page(findings_of(result), (), ()),
+        summary(findings_of(result))["geometry"],
+    )
     words = f"below 10 deg: 1 points: 5 ({found.angle_deg[4]:.1f})"
     assert words in " ".join(text.split()) and words in page
     assert all(len(line) <= WIDTH for line in text.splitlines())
     assert told["weak_points"] == ["5"]
     assert told["points_by_rays"] == {"6": 20}
     assert told["point_rms_px"]["max"] == pytest.approx(float(found.point_rms_px.max()))
-    write_tables(result, tmp_path)
+    write_tables(findings_of(result), tmp_path)
     with (tmp_path / "points.csv").open(encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
     assert [float(row["angle_deg"]) for row in rows] == found.angle_deg.tolist()

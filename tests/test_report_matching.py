@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from sfm.errors import GeometryError, OutputError, PhotographError, SurveyFileError
+from sfm.report.figures.patches import LINE, MAX_PICTURES
 from sfm.report.matching import match_command
-from sfm.report.patch_pictures import LINE, MAX_PICTURES
 from tests.textures import random_texture, with_noise
 
 SHIFT = (4.3, -2.6)

@@ -13,7 +13,7 @@ from sfm.errors import GeometryError, OutputError, SurveyFileError
 from sfm.printing.sheet import MARGIN_MM, RULER_MM, lay_out_sheet, write_sheet
 from sfm.rendering.render import render_photograph
 from sfm.rendering.scene import CircularTargets, Faces, Optics, Scene
-from sfm.targets.codes.rings import code_family
+from sfm.targets.codes.families import code_family
 from sfm.targets.detect import find_targets
 
 PX_PER_MM = 8
@@ -141,7 +141,7 @@ def test_svg_pages_are_numbered(tmp_path):
 
 
 def test_what_cannot_be_printed_is_named(tmp_path):
-    with pytest.raises(SurveyFileError, match="page 'b5' is none of a4"):
+    with pytest.raises(SurveyFileError, match="page 'b5', expected one of a4"):
         lay_out_sheet("ring14", np.array([1]), diameter_mm=10.0, page="b5")
     with pytest.raises(SurveyFileError, match=r"ring of 300\.0 mm .* does not fit on a4"):
         lay_out_sheet("ring14", np.array([1]), diameter_mm=100.0)

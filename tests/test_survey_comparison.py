@@ -13,11 +13,12 @@ from adapters.colmap.mapper import MapperBaseline
 from sfm.conventions import rotation_from_vector
 from sfm.errors import BackendError, SurveyFileError
 from sfm.pipeline import run_survey
+from sfm.report.findings.findings import findings_of
 from sfm.report.output import write_result
 from sfm.result import SurveyResult
 from sfm.similarity import Similarity
 from sfm.survey.comparison import OtherPrograms
-from sfm.survey.inputs.survey_file import Survey, read_survey
+from sfm.survey.inputs.survey import Survey, read_survey
 from tests.surveys import write_observed_survey, write_photograph_survey
 
 TURN = Similarity(30.0, rotation_from_vector(np.array([0.4, 1.0, -0.2])), np.array([5.0, -2.0, 8.0]))
@@ -56,7 +57,7 @@ def test_another_pipeline_stands_beside_the_survey(
     assert found.rms_px == (a.rms_px, 0.7) and found.seconds[1] == 12.0
     assert a.rms_px < found.target_rms_px < 5.0  # its camera is wrong by 1/1000
     assert found.max_rotation_deg < 0.1
-    page = write_result(result, tmp_path / "out")
+    page = write_result(findings_of(result), tmp_path / "out")
     summary = json.loads((tmp_path / "out" / "summary.json").read_text(encoding="utf-8"))["baseline"]
     assert summary["images"] == {"kolinear": 6, "COLMAP mapper": 6, "total": 6}
     assert summary["point_rms"] == pytest.approx(found.point_rms)
@@ -71,7 +72,7 @@ def test_a_pipeline_that_fails_does_not_lose_the_survey(survey: Survey, tmp_path
     result = run_survey(survey, others=OtherPrograms(mapper=mapper))
     assert result.baseline is None
     assert "the comparison with the other pipeline failed: COLMAP's mapper found no model" in result.warnings
-    page = write_result(result, tmp_path / "out").read_text(encoding="utf-8")
+    page = write_result(findings_of(result), tmp_path / "out").read_text(encoding="utf-8")
     assert "And COLMAP by itself?" not in page and "found no model" in page
 
 

@@ -13,9 +13,9 @@ from sfm.conventions import FloatArray
 from sfm.errors import SurveyFileError
 from sfm.result import SurveyResult
 from sfm.similarity import fit_similarity
-from sfm.survey.inputs.survey_file import read_survey
-from sfm.survey.inputs.tables import read_diameters
-from sfm.survey.targets import MeasuredPhotographs
+from sfm.survey.inputs.given import read_diameters
+from sfm.survey.inputs.survey import read_survey
+from sfm.survey.measurements import MeasuredPhotographs
 from sfm.targets.detect import Targets
 
 C_PX, DISTANCE_MM, TILT = 4000.0, 600.0, np.radians(60)
@@ -96,6 +96,8 @@ def photographs(seed: int) -> MeasuredPhotographs:
             Targets(
                 xy=xy + NOISE_PX * rng.standard_normal((k, 2)),
                 covariance=np.tile(1e-8 * np.eye(2), (k, 1, 1)),  # the survey's sigma_px is all there is
+                axes_covariance=np.tile(NOISE_PX**2 * np.eye(3), (k, 1, 1)),
+                edge_covariance=np.tile(np.eye(3), (k, 1, 1)),
                 semi_axes=axes + NOISE_PX * rng.standard_normal((k, 2)),
                 angle=angle,
                 code=np.arange(1, k + 1),
@@ -121,7 +123,7 @@ def surveyed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, targets: str, seed
     measured = photographs(seed)
     for name in measured.names:
         (tmp_path / name).touch()
-    monkeypatch.setattr(pipeline, "measure_photographs", lambda *given, **more: measured)
+    monkeypatch.setattr("sfm.survey.network.measure_photographs", lambda *given, **more: measured)
     return pipeline.run_survey(read_survey(tmp_path / "survey.toml"))
 
 
@@ -201,7 +203,8 @@ def test_stated_diameters_are_compared_with_the_ellipses(
 def test_table_of_diameters(tmp_path: Path) -> None:
     path = tmp_path / "d.csv"
     path.write_text("id,diameter\n7,12.5\nu001,3\n", encoding="utf-8")
-    names, diameter = read_diameters(path)
+    found = read_diameters(path)
+    names, diameter = found.names, found.diameter
     assert names == ("7", "u001")
     assert diameter.tolist() == [12.5, 3.0]
     for text, message in (

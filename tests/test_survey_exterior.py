@@ -14,15 +14,15 @@ from sfm.adjustment.result import Adjustment
 from sfm.conventions import FloatArray, angles_from_rotation
 from sfm.errors import GeometryError, SurveyFileError
 from sfm.network import Estimate
-from sfm.pipeline import adjust_survey, run_survey
-from sfm.report.given import exterior_residuals
-from sfm.report.html import render_html
+from sfm.pipeline import run_survey
+from sfm.report.findings.findings import findings_of
+from sfm.report.findings.given import exterior_residuals
+from sfm.report.html.report import report_page
 from sfm.report.output import write_result
-from sfm.report.text import text_report
-from sfm.report.verdict import verdict_of
+from sfm.report.text.report import text_report
 from sfm.result import SurveyResult
-from sfm.survey.inputs.survey_file import read_survey
-from sfm.survey.inputs.tables import read_observed_exterior
+from sfm.survey.inputs.exterior_table import read_observed_exterior
+from sfm.survey.inputs.survey import read_survey
 from tests.surveys import OBSERVED, stations, write_photograph_survey
 from tests.synthetic import make_network, seed_of
 
@@ -69,7 +69,7 @@ def written(
 
 
 def solved(path: Path) -> SurveyResult:
-    return adjust_survey(read_survey(path))
+    return run_survey(read_survey(path))
 
 
 def truth_of(a: Adjustment, truth: Estimate) -> FloatArray:
@@ -220,8 +220,8 @@ def test_residuals_and_tests_stand_in_every_report(tmp_path: Path) -> None:
     e, k = np.unravel_index(np.nanargmax(np.abs(found.w)), found.w.shape)
     assert (found.names[e], k) == ("image 3", 0)
     assert found.difference[e, k] < -10 * SIGMA
-    assert "The given X0 of photograph image 3 differs" in " ".join(verdict_of(result).remarks)
-    write_result(result, tmp_path / "out")
+    assert "The given X0 of photograph image 3 differs" in " ".join(findings_of(result).verdict.remarks)
+    write_result(findings_of(result), tmp_path / "out")
     rows = json.loads((tmp_path / "out" / "summary.json").read_text())["observed_exterior"]
     assert len(rows) == 3 * IMAGES
     worst = max(rows, key=lambda row: abs(row["w"]))
@@ -229,7 +229,7 @@ def test_residuals_and_tests_stand_in_every_report(tmp_path: Path) -> None:
     lines = (tmp_path / "out" / "given.csv").read_text().splitlines()
     assert sum(line.startswith("projection centre,") for line in lines) == 3 * IMAGES
     assert not any(line.startswith("rotation,") for line in lines)
-    text, page = text_report(result), render_html(result, (), ())
+    text, page = text_report(findings_of(result)), report_page(findings_of(result), (), ())
     assert "Observed exterior orientation: adjusted minus given ---" in text
     assert f"{found.w[e, k]:+.2f}" in text and f"{found.w[e, k]:+.2f}" in page
     assert "<h3>Observed exterior orientation</h3>" in page
@@ -242,7 +242,7 @@ def test_its_redundancy_is_that_of_the_variance_components(tmp_path: Path) -> No
     assert both is not None
     path_of = (
         row
-        for row in text_report(result).splitlines()
+        for row in text_report(findings_of(result)).splitlines()
         if row.split()[:3] == ["kind", "exterior", "orientation"]
     )
     assert float(next(path_of).split()[4]) == pytest.approx(float(np.nansum(both[0].r)), abs=0.06)
@@ -310,7 +310,7 @@ def test_photographs_are_placed_by_their_observed_stations(tmp_path: Path) -> No
 def test_images_of_a_result_are_welcome(tmp_path: Path) -> None:
     path, _ = written(tmp_path / "survey", "welcome")
     result = solved(path)
-    write_result(result, tmp_path / "out")
+    write_result(findings_of(result), tmp_path / "out")
     table = read_observed_exterior(tmp_path / "out" / "images.csv")
     np.testing.assert_array_equal(table.value[:, :3], result.adjustment.estimate.position)
     assert np.isfinite(table.sigma).all()

@@ -16,12 +16,13 @@ from sfm.camera import project
 from sfm.conventions import angles_from_rotation
 from sfm.errors import GeometryError, SurveyFileError
 from sfm.network import Estimate, Network
-from sfm.pipeline import adjust_survey
-from sfm.report.summary import summary
-from sfm.report.text import text_report
+from sfm.pipeline import run_survey
+from sfm.report.findings.findings import findings_of
+from sfm.report.tables.summary import summary
+from sfm.report.text.report import text_report
 from sfm.result import SurveyResult
 from sfm.survey.comparison import OtherPrograms
-from sfm.survey.inputs.survey_file import read_survey
+from sfm.survey.inputs.survey import read_survey
 
 IMAGES = 8
 SURVEY = """\
@@ -101,7 +102,7 @@ def assert_recovered(result: SurveyResult, truth: Estimate, parameter: str) -> N
 def test_c_of_each_photograph_x0_of_groups_and_the_rest_of_all(tmp_path: Path) -> None:
     given = LENS + 'per_photograph = ["c"]\nper_group = ["x0"]\ngroups = ["even_*", "odd_*"]\n'
     path, truth = zoomed(tmp_path, given, x0_of_groups=(0.02, 0.05))
-    result = adjust_survey(read_survey(path))
+    result = run_survey(read_survey(path))
     a = result.adjustment
     assert a.converged and a.defect == 7 and not a.undetermined
     assert a.unknowns == 6 * IMAGES + IMAGES + 2 + 6 + 3 * len(a.network.points)
@@ -110,14 +111,14 @@ def test_c_of_each_photograph_x0_of_groups_and_the_rest_of_all(tmp_path: Path) -
     for parameter in ("c", "x0", "K1"):
         assert_recovered(result, truth, parameter)
     whole, _ = zoomed(tmp_path, LENS, x0_of_groups=(0.02, 0.05))
-    assert adjust_survey(read_survey(whole)).adjustment.sigma0 > 1 + 6 / np.sqrt(2 * a.redundancy)
+    assert run_survey(read_survey(whole)).adjustment.sigma0 > 1 + 6 / np.sqrt(2 * a.redundancy)
 
 
 def test_inner_constraints_on_chosen_points(tmp_path: Path) -> None:
     path, _ = zoomed(tmp_path, LENS + 'per_photograph = ["c"]\n')
-    all_points = adjust_survey(read_survey(path)).adjustment
+    all_points = run_survey(read_survey(path)).adjustment
     path.write_text(path.read_text(encoding="utf-8") + '[datum]\npoints = ["p1", "p5", "p9", "q"]\n')
-    result = adjust_survey(read_survey(path))
+    result = run_survey(read_survey(path))
     a = result.adjustment
     assert a.datum_points is not None and a.datum_points.sum() == 3
     assert "datum points that are not in the network: q" in result.warnings
@@ -130,19 +131,19 @@ def test_inner_constraints_on_chosen_points(tmp_path: Path) -> None:
     scale = np.linalg.norm(np.diff(all_points.estimate.points[on[:2]], axis=0))
     scale /= np.linalg.norm(np.diff(a.estimate.points[on[:2]], axis=0))
     assert ratio == pytest.approx(scale**2, rel=1e-4)
-    assert "free on 3 chosen points" in text_report(result)
-    assert summary(result)["datum"]["points"] == ["p1", "p5", "p9"]
+    assert "free on 3 chosen points" in text_report(findings_of(result))
+    assert summary(findings_of(result))["datum"]["points"] == ["p1", "p5", "p9"]
     again = marginal_of(a).joint(np.zeros(0, dtype=int), np.array(on))
     assert again[:3, :3] == pytest.approx(a.covariance.points[on[0]], rel=1e-4)
     path.write_text(path.read_text(encoding="utf-8").replace('"p5", "p9"', '"r", "s"'))
     with pytest.raises(GeometryError, match=r"1 of the 4 datum\.points are in the network, at least 3"):
-        adjust_survey(read_survey(path))
+        run_survey(read_survey(path))
 
 
 def test_one_camera_for_each_group(tmp_path: Path) -> None:
     given = LENS + 'per_group = ["c", "x0"]\ngroups = ["even_*", "odd_*"]\n'
     path, _ = zoomed(tmp_path, given)
-    a = adjust_survey(read_survey(path)).adjustment
+    a = run_survey(read_survey(path)).adjustment
     assert [camera.name for camera in a.estimate.cameras] == ["A even_*", "A odd_*"]
     assert a.unknowns == 6 * IMAGES + 4 + 6 + 3 * len(a.network.points)
 
@@ -153,7 +154,7 @@ def test_observed_parameters_are_adjusted_with_their_weight(tmp_path: Path) -> N
         "fixed = {b1 = 2e-4}\nweighted = {c = [10.0, 0.1], P1 = [3e-5, 1e-6], P2 = [-2e-5, 1e-9]}\n"
     )
     path, truth = zoomed(tmp_path, given)
-    result = adjust_survey(read_survey(path))
+    result = run_survey(read_survey(path))
     a = result.adjustment
     assert len(a.network.interior) == IMAGES + 2
     used = int((~a.rejected).sum())
@@ -166,7 +167,7 @@ def test_observed_parameters_are_adjusted_with_their_weight(tmp_path: Path) -> N
 
 def test_comparison_says_what_colmap_cannot_share(tmp_path: Path) -> None:
     path, _ = zoomed(tmp_path, LENS + 'per_photograph = ["c"]\n')
-    result = adjust_survey(read_survey(path), others=OtherPrograms(adjuster=adjust_with_colmap))
+    result = run_survey(read_survey(path), others=OtherPrograms(adjuster=adjust_with_colmap))
     both = result.comparison
     assert both is not None
     assert len(both.network.camera) == len(set(both.network.camera.tolist())) == IMAGES
@@ -195,7 +196,7 @@ def test_comparison_says_what_colmap_cannot_share(tmp_path: Path) -> None:
 def test_contradictions_are_named(tmp_path: Path, given: str, match: str) -> None:
     path, _ = zoomed(tmp_path, given)
     with pytest.raises(SurveyFileError, match=match):
-        adjust_survey(read_survey(path))
+        run_survey(read_survey(path))
 
 
 def test_sizes_are_those_of_the_synthetic_camera() -> None:

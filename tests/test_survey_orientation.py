@@ -11,9 +11,9 @@ import pytest
 
 from sfm.conventions import angles_from_rotation
 from sfm.errors import GeometryError, SurveyFileError
-from sfm.pipeline import adjust_survey, run_survey
+from sfm.pipeline import run_survey
 from sfm.result import SurveyResult
-from sfm.survey.inputs.survey_file import read_survey
+from sfm.survey.inputs.survey import read_survey
 from sfm.survey.target_store import TargetStore
 from tests.surveys import write_observed_survey, write_photograph_survey
 from tests.synthetic import make_network, seed_of
@@ -143,7 +143,7 @@ def test_approximate_values_of_no_photograph_are_refused(
 def test_useless_approximate_values_are_put_aside(how: str, tmp_path: Path) -> None:
     path = write_observed_survey(tmp_path / "s", "useless", images=8, points=30)
     network, truth = make_network(seed_of("useless"), images=8, points=30, free=("c",))
-    before = adjust_survey(read_survey(path))
+    before = run_survey(read_survey(path))
     names, position, rotation = network.images, truth.position, truth.rotation
     if how == "one photograph":
         names, position, rotation = names[:1], position[:1], rotation[:1]
@@ -152,7 +152,7 @@ def test_useless_approximate_values_are_put_aside(how: str, tmp_path: Path) -> N
     write_exterior(path.parent / "images.csv", names, position, rotation)
     with path.open("a", encoding="utf-8") as file:
         file.write('[approximate]\nimages = "images.csv"\n')
-    result = adjust_survey(read_survey(path))
+    result = run_survey(read_survey(path))
     assert result.failed == ()
     assert result.adjustment.redundancy == before.adjustment.redundancy
     assert result.warnings[0].startswith("[approximate]: the given approximate values were not used")
@@ -168,7 +168,7 @@ def test_a_failure_names_the_approximate_values(tmp_path: Path) -> None:
     with path.open("a", encoding="utf-8") as file:
         file.write('[approximate]\nimages = "images.csv"\n')
     with pytest.raises(GeometryError, match=r"correct or complete \[approximate\], or leave it out"):
-        adjust_survey(read_survey(path))
+        run_survey(read_survey(path))
 
 
 def test_free_datum_keeps_control_with_approximate_images(tmp_path: Path) -> None:
@@ -179,6 +179,6 @@ def test_free_datum_keeps_control_with_approximate_images(tmp_path: Path) -> Non
     (path.parent / "control.csv").write_text("\n".join(["id,X,Y,Z", *rows]) + "\n", encoding="utf-8")
     with path.open("a", encoding="utf-8") as file:
         file.write('[control]\nfile = "control.csv"\n[approximate]\nimages = "images.csv"\n')
-    result = adjust_survey(read_survey(path))
+    result = run_survey(read_survey(path))
     assert set(network.points[:5]) <= set(result.adjustment.network.points)
     assert result.control_check is not None and len(result.control_check.points) == 5

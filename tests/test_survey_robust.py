@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from surveys import write_observed_survey
 
-from sfm.pipeline import adjust_survey
-from sfm.report.verdict import verdict_of
-from sfm.survey.inputs.survey_file import read_survey
+from sfm.pipeline import run_survey
+from sfm.report.findings.findings import findings_of
+from sfm.survey.inputs.survey import read_survey
 
 SPOILED = 12  # image points, each 8 px off, of 240
 
@@ -27,9 +27,9 @@ def test_gross_errors_are_treated_as_the_survey_says(tmp_path: Path, reject: str
     table.write_text("\n".join([header, *rows]) + "\n", encoding="utf-8")
     with path.open("a", encoding="utf-8") as file:
         file.write(f'[adjust]\nreject = "{reject}"\n')
-    result = adjust_survey(read_survey(path))
+    result = run_survey(read_survey(path))
     a = result.adjustment
-    told = [line for line in verdict_of(result).remarks if "adjust.reject" in line]
+    told = [line for line in findings_of(result).verdict.remarks if "adjust.reject" in line]
     assert len(told) == (reject == "none")
     spoiled = np.isin(np.arange(len(rows)), bad)
     assert a.converged and len(a.rejected) == len(rows)

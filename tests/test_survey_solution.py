@@ -15,13 +15,13 @@ from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.errors import BackendError
 from sfm.network import Estimate, Network, ObjectPoints, ScaleBars
-from sfm.pipeline import adjust_survey
-from sfm.report.statistics import statistics_of
-from sfm.report.tables import write_tables
-from sfm.report.verdict import verdict_of
+from sfm.pipeline import run_survey
+from sfm.report.findings.findings import findings_of
+from sfm.report.findings.statistics import statistics_of
+from sfm.report.tables.csv_files import write_tables
 from sfm.survey.comparison import OtherPrograms
-from sfm.survey.datum import contradiction, object_scale
-from sfm.survey.inputs.survey_file import read_survey
+from sfm.survey.datum import find_contradiction, object_scale
+from sfm.survey.inputs.survey import read_survey
 from tests.surveys import write_observed_survey
 from tests.synthetic import make_network, seed_of
 
@@ -31,7 +31,7 @@ def test_a_failing_comparison_leaves_the_survey(tmp_path: Path) -> None:
         raise BackendError("COLMAP is not installed")
 
     survey = read_survey(write_observed_survey(tmp_path / "alone", "alone"))
-    result = adjust_survey(survey, others=OtherPrograms(refuse))  # type: ignore[arg-type]
+    result = run_survey(survey, others=OtherPrograms(refuse))  # type: ignore[arg-type]
     assert result.comparison is None
     assert result.adjustment.converged
     assert "the comparison with the other adjuster failed: COLMAP is not installed" in result.warnings
@@ -78,7 +78,7 @@ def test_what_contradicts_the_photographs_is_named_if_it_can_be_told(kind: str, 
     def readjust(one: Network) -> Adjustment:
         return adjust(one, a.estimate, datum=datum, sigma_px=0.1, reject="none", covariance=False)
 
-    found = contradiction(network, a, readjust, unit="m")
+    found = find_contradiction(network, a, readjust, unit="m")
     if blamed is None:
         assert found is None
         return
@@ -136,17 +136,17 @@ def test_stated_sigmas_are_written_as_stated_whatever_the_weights_were(tmp_path:
     sigma = 2 * 0.1 * seed_of("stated").uniform(0.9, 1.1, (len(lines) - 1, 2))
     rows = [f"{line},{sx!r},{sy!r}" for line, (sx, sy) in zip(lines[1:], sigma.tolist(), strict=True)]
     table.write_text("\n".join([f"{lines[0]},sx_px,sy_px", *rows]) + "\n", encoding="utf-8")
-    first = adjust_survey(read_survey(path))
+    first = run_survey(read_survey(path))
     assert first.adjustment.weight_factor == pytest.approx(0.5, rel=0.1)
     stated = np.sqrt(np.einsum("kii->ki", first.adjustment.network.image_points.covariance))
     np.testing.assert_allclose(stated, sigma, rtol=1e-14)
 
     (tmp_path / "out").mkdir()
-    write_tables(first, tmp_path / "out")
+    write_tables(findings_of(first), tmp_path / "out")
     again = barred_survey(tmp_path / "again", sigma_px=1.0)
     written = (tmp_path / "out" / "image_points.csv").read_text(encoding="utf-8")
     (again.parent / "image_points.csv").write_text(written, encoding="utf-8")
-    second = adjust_survey(read_survey(again))
+    second = run_survey(read_survey(again))
     a, b = first.adjustment, second.adjustment
     covariance = b.network.image_points.covariance
     np.testing.assert_allclose(covariance, a.network.image_points.covariance, rtol=1e-14)
@@ -156,7 +156,7 @@ def test_stated_sigmas_are_written_as_stated_whatever_the_weights_were(tmp_path:
 
 def test_weights_converge_on_the_image_points_that_are_accepted(tmp_path: Path) -> None:
     """A single estimate has the image points bent by bars that were 100 times too heavy."""
-    result = adjust_survey(read_survey(barred_survey(tmp_path / "barred")))
+    result = run_survey(read_survey(barred_survey(tmp_path / "barred")))
     a = result.adjustment
     assert by_kind(a).sigma0[0] == pytest.approx(a.weight_factor, rel=1e-3)
     freedom = 2 * np.nansum(a.redundancy_numbers)
@@ -169,7 +169,7 @@ def test_weights_converge_on_the_image_points_that_are_accepted(tmp_path: Path) 
 
 def test_weights_that_do_not_converge_are_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(variance_components, "MAX_ROUNDS", 1)
-    result = adjust_survey(read_survey(barred_survey(tmp_path / "barred")))
+    result = run_survey(read_survey(barred_survey(tmp_path / "barred")))
     assert any("did not converge: each" in line for line in result.warnings)
 
 
@@ -181,7 +181,7 @@ def test_a_point_with_one_ray_is_named(tmp_path: Path) -> None:
     own = [row for row in rows if row.split(",")[1] == name]
     left = [header, own[0], *(row for row in rows if row not in own)]
     table.write_text("\n".join(left) + "\n", encoding="utf-8")
-    result = adjust_survey(read_survey(path))
+    result = run_survey(read_survey(path))
     assert name not in result.adjustment.network.points
     assert f"point {name}: 1 ray, 2 are needed" in result.warnings
 
@@ -198,7 +198,7 @@ def test_a_survey_goes_on_where_a_scale_bar_does_not_fit(tmp_path: Path, bars: i
         text += f"[[scale_bar]]\n{ends}\nlength = {length}\nsigma = 1e-4\n"
     with path.open("a", encoding="utf-8") as file:
         file.write(text)
-    result = adjust_survey(read_survey(path))
+    result = run_survey(read_survey(path))
     a = result.adjustment
     assert a.converged and len(a.network.points) == 30
     if bars == 3:
@@ -209,4 +209,4 @@ def test_a_survey_goes_on_where_a_scale_bar_does_not_fit(tmp_path: Path, bars: i
         assert result.warnings[0].startswith("the scale bars contradict one another")
         assert len(a.network.scale_bars) == 2
         assert not a.rejected[np.isin(a.network.image_points.point, [0, 1, 10, 11])].any()
-        assert verdict_of(result).level == "bad"
+        assert findings_of(result).verdict.level == "bad"

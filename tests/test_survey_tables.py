@@ -10,9 +10,10 @@ import pytest
 
 from sfm.errors import SurveyFileError
 from sfm.files import csv_tables
-from sfm.survey.inputs.start import find_photographs, network_from_observations
-from sfm.survey.inputs.survey_file import read_survey
-from sfm.survey.inputs.tables import read_control, read_exterior, read_image_points
+from sfm.survey.inputs.given import read_control, read_exterior, read_image_points
+from sfm.survey.inputs.photograph_list import find_photographs
+from sfm.survey.inputs.start import measurements_from_observations
+from sfm.survey.inputs.survey import read_survey
 from tests.surveys import write_observed_survey, write_photograph_survey
 
 HEADER = "image,point,x_px,y_px\n"
@@ -47,7 +48,7 @@ def test_numbers_are_read_as_programs_write_them(tmp_path: Path) -> None:
     found = read_image_points(table(tmp_path, HEADER + "1,a, +1.5e1 ,-.25\n\n 1 ,b,1E0,2.\n"))
     assert found.xy.tolist() == [[15.0, -0.25], [1.0, 2.0]]
     assert found.image == ("1", "1")
-    assert found.line.tolist() == [2, 4]
+    assert found.table.line.tolist() == [2, 4]
 
 
 def test_large_tables_are_refused_before_memory_is_taken(
@@ -110,7 +111,7 @@ def test_image_points_in_another_unit_are_refused(tmp_path: Path) -> None:
     points.write_text(text + "image 1,new,250000,12\n", encoding="utf-8")
     lines = text.count("\n") + 1
     with pytest.raises(SurveyFileError, match=rf"line {lines}: image point 250000, 12 px is far outside"):
-        network_from_observations(read_survey(path))
+        measurements_from_observations(read_survey(path))
 
 
 def test_unknown_images_of_start_values_are_refused(tmp_path: Path) -> None:
@@ -121,7 +122,7 @@ def test_unknown_images_of_start_values_are_refused(tmp_path: Path) -> None:
     path.write_text(text + '[approximate]\nimages = "start.csv"\n', encoding="utf-8")
     assert len(read_exterior(path.parent / "start.csv").names) == 2
     with pytest.raises(SurveyFileError, match=r"start\.csv, line 3: image 'image 99' has no observations"):
-        network_from_observations(read_survey(path))
+        measurements_from_observations(read_survey(path))
 
 
 @pytest.mark.parametrize("name", ["../outside.csv", "/etc/hostname", "link.csv", "a/../../outside.csv"])
@@ -133,10 +134,10 @@ def test_tables_outside_the_folder_are_refused_unless_allowed(tmp_path: Path, na
     text = path.read_text(encoding="utf-8").replace('"image_points.csv"', f'"{name}"')
     path.write_text(text, encoding="utf-8")
     with pytest.raises(SurveyFileError, match=r"leaves the survey's folder; --allow-outside allows"):
-        network_from_observations(read_survey(path))
+        measurements_from_observations(read_survey(path))
     if name != "/etc/hostname":
-        network, _ = network_from_observations(read_survey(path, allow_outside=True))
-        assert len(network.images) == 6
+        measured = measurements_from_observations(read_survey(path, allow_outside=True))
+        assert len(measured.images) == 6
 
 
 @pytest.mark.parametrize("glob", ["../other/*.png", "link/*.png", "*.PNG"])

@@ -10,7 +10,7 @@ from sfm.camera import camera_from_values
 from sfm.conventions import AnyArray, rotation_from_angles
 from sfm.rendering.render import render_photograph
 from sfm.rendering.scene import CircularTargets, Faces, Optics, Scene, coded_ring, join_marks
-from sfm.targets.codes.rings import code_family
+from sfm.targets.codes.families import code_family
 from sfm.targets.detect import find_targets
 from sfm.targets.flags import count_flags
 

@@ -10,16 +10,9 @@ import pytest
 
 from sfm.conventions import AnyArray, FloatArray
 from sfm.errors import SurveyFileError
-from sfm.targets.codes.rings import (
-    UNCODED,
-    UNREADABLE,
-    CodeFamily,
-    code_family,
-    read_code_table,
-    read_codes,
-    ring_patterns,
-    smallest_rotation,
-)
+from sfm.targets.codes.families import FAMILIES, code_family
+from sfm.targets.codes.ring_reading import UNCODED, UNREADABLE, read_codes
+from sfm.targets.codes.rings import CodeFamily, read_code_table, ring_patterns, smallest_rotation
 from sfm.targets.measure import shape_from_axes
 
 PUBLISHED = Path(__file__).parents[1].parent / "shared" / "data" / "retro-panel"
@@ -193,6 +186,13 @@ def test_wrong_tables_are_refused(tmp_path: Path, text: str, message: str) -> No
     (tmp_path / "t.txt").write_text(text)
     with pytest.raises(SurveyFileError, match=message):
         code_family(str(tmp_path / "t.txt"))
+
+
+def test_every_name_of_the_registry_is_a_family() -> None:
+    for name in FAMILIES:
+        family = code_family(name)
+        assert family is None if name == "none" else family is not None and family.name == name
+        assert code_family(family if family is not None else "none") is family
 
 
 def test_an_unknown_family_is_refused() -> None:

@@ -11,7 +11,8 @@ import pytest
 from numba import njit
 
 from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
-from sfm.targets.codes.rings import CodeFamily, code_family
+from sfm.targets.codes.families import code_family
+from sfm.targets.codes.rings import CodeFamily
 from sfm.targets.detect import find_targets
 
 SUPER = 3

@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from sfm.conventions import AnyArray, FloatArray
+from sfm.errors import KolinearError, PhotographError
 from sfm.photographs.reading import read_photograph
-from sfm.targets.codes.rings import code_family
+from sfm.targets.codes.families import code_family
 from sfm.targets.detect import find_targets
 from sfm.targets.flags import Flag, count_flags
 from sfm.targets.outlines import estimate_noise
@@ -154,9 +155,9 @@ def test_noise_is_estimated() -> None:
 
 
 def test_wrong_arguments_are_refused() -> None:
-    with pytest.raises(ValueError, match="float64 of shape"):
+    with pytest.raises(PhotographError, match="float64 of shape"):
         find_targets(np.zeros((10, 10)))
-    with pytest.raises(ValueError, match="polarity 'white' is none of dark, bright, auto"):
+    with pytest.raises(KolinearError, match="polarity 'white', expected one of dark, bright, auto"):
         find_targets(np.zeros((50, 50), np.uint8), polarity="white")
 
 

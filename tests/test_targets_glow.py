@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from sfm.conventions import AnyArray, FloatArray
-from sfm.report.overlays import REASON_COLOURS, REMARK_COLOURS
+from sfm.report.figures.overlays import REASON_COLOURS, REMARK_COLOURS
 from sfm.targets.detect import Targets, find_targets
 from sfm.targets.flags import Flag
 

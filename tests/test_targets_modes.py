@@ -8,6 +8,7 @@ import pytest
 
 from sfm.conventions import AnyArray, FloatArray
 from sfm.errors import KolinearError
+from sfm.targets.detect import CENTRES, find_targets
 from sfm.targets.fits.centroid import measure_centroids
 from sfm.targets.fits.edge_ellipse import measure_edge_ellipses
 from sfm.targets.measure import axes_from_shape, fit_ellipse_model, shape_from_axes
@@ -73,6 +74,19 @@ def test_every_mode_is_unbiased_and_knows_its_precision(sign: int) -> None:
     np.testing.assert_allclose(axes_from_shape(edge_shape)[0], axes, rtol=0.05)
 
 
+def test_find_targets_measures_centres_in_every_mode() -> None:
+    photograph, truth, *_ = picture(-1, 3)
+    by_model = find_targets(photograph, polarity="dark")
+    for centres in CENTRES:
+        found = find_targets(photograph, polarity="dark", centres=centres)
+        nearest = ((found.xy[:, None] - truth) ** 2).sum(axis=2).min(axis=1)
+        assert len(found) == len(truth) and np.sqrt(nearest.max()) < 0.3
+        assert np.isfinite(found.covariance).all()
+        assert (centres == "model") == np.array_equal(found.xy, by_model.xy)
+    with pytest.raises(KolinearError, match="centres 'spline', expected one of model, edges, binary"):
+        find_targets(photograph, centres="spline")
+
+
 def test_what_cannot_be_measured_is_nan() -> None:
     flat = np.full((60, 60), 80, np.uint8)
     xy, shape = np.array([[30.0, 30.0], [3.0, 30.0]]), shape_from_axes(np.full((2, 2), 6.0), np.zeros(2))
@@ -82,5 +96,5 @@ def test_what_cannot_be_measured_is_nan() -> None:
     ):
         assert np.isnan(centre).all()
         assert np.isnan(covariance).all()
-    with pytest.raises(KolinearError, match="'cubic' are none of binary, intensity, squared"):
+    with pytest.raises(KolinearError, match="'cubic', expected one of binary, intensity, squared"):
         measure_centroids(flat, xy, shape, np.ones(2, int), noise=1.0, weights="cubic")

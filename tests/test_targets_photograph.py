@@ -10,7 +10,8 @@ import pytest
 from PIL import Image
 
 from sfm.errors import PhotographError
-from sfm.photographs.reading import read_metadata, read_photograph
+from sfm.photographs.exif import read_metadata
+from sfm.photographs.reading import read_photograph
 
 WIDTH, HEIGHT = 96, 64
 
@@ -43,7 +44,7 @@ def test_channels_of_a_colour_photograph(tmp_path: Path) -> None:
         np.testing.assert_array_equal(read_photograph(path, channel=channel), image[:, :, k])
     grey = 0.299 * image[:, :, 2] + 0.587 * image[:, :, 1] + 0.114 * image[:, :, 0]
     np.testing.assert_allclose(read_photograph(path), grey, atol=1.0)
-    with pytest.raises(PhotographError, match="channel 'infrared' is none of luminance, red"):
+    with pytest.raises(PhotographError, match="channel 'infrared', expected one of luminance, red"):
         read_photograph(path, channel="infrared")
 
 
@@ -124,5 +125,5 @@ def test_what_is_no_photograph_is_refused(tmp_path: Path) -> None:
             read(tmp_path / "text.jpg")
     with pytest.raises(PhotographError, match="the file is empty"):
         read_photograph(tmp_path / "empty.jpg")
-    with pytest.raises(PhotographError, match="found float32 intensities, needed 8 or 16 bit"):
+    with pytest.raises(PhotographError, match="found float32 intensities, expected 8 or 16 bit"):
         read_photograph(tmp_path / "float.tiff")

@@ -16,8 +16,8 @@ from sfm.printing.sheet import lay_out_sheet
 from sfm.rendering.render import render_photograph, render_photographs
 from sfm.rendering.scene import CircularTargets, Faces, Marks, Optics, Scene, discs, join_marks, square_tag
 from sfm.similarity import fit_similarity
-from sfm.survey.inputs.survey_file import read_survey
-from sfm.targets.codes.tags import TAG_FAMILIES, corner_name, tag_family
+from sfm.survey.inputs.survey import read_survey
+from sfm.targets.codes.tags import DICTIONARIES, corner_name, tag_family
 from sfm.targets.detect import find_targets
 from sfm.targets.flags import Flag
 from tests.surveys import C_MM, PIXEL_MM, SIZE_PX, stations
@@ -97,7 +97,7 @@ def test_corners_are_as_good_as_their_covariance_says(half: float, inverted: boo
     assert np.mean(squares) == pytest.approx(1.0, abs=0.4)
 
 
-@pytest.mark.parametrize("name", TAG_FAMILIES)
+@pytest.mark.parametrize("name", DICTIONARIES)
 def test_every_family_is_read(name: str) -> None:
     family = tag_family(name)
     assert family is not None
@@ -281,4 +281,3 @@ def test_no_tag_is_read_from_print_and_boxes(name: str) -> None:
 
 def test_names_of_corners() -> None:
     assert [corner_name(28 + k) for k in range(4)] == ["7a", "7b", "7c", "7d"]
-    assert tag_family("ring14") is None

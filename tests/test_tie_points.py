@@ -32,7 +32,7 @@ from sfm.orientation.relative import relative_orientations
 from sfm.pipeline import run_survey
 from sfm.similarity import fit_similarity
 from sfm.survey.comparison import OtherPrograms
-from sfm.survey.inputs.survey_file import read_survey
+from sfm.survey.inputs.survey import read_survey
 from sfm.survey.refine import refine_model, refinement_text
 from tests.engines import ALONE, HERE, Notes
 from tests.textures import random_texture, with_noise
@@ -184,7 +184,7 @@ def test_tie_points_of_three_photographs() -> None:
     )
     others = found.image != found.reference[found.point]
     assert np.median(np.linalg.norm(e[others], axis=1)) < 0.1
-    with pytest.raises(GeometryError, match="detector 'orb' is none of"):
+    with pytest.raises(GeometryError, match="detector 'orb', expected one of"):
         find_tie_points(photographs, detector="orb")
     assert len(find_tie_points([np.zeros((90, 90), np.uint8)] * 3)) == 0
 

@@ -13,7 +13,7 @@ from sfm.files.whole_files import refuse_full, whole_file, whole_folder
 def test_a_folder_takes_the_place_of_an_earlier_one_when_it_is_finished(tmp_path: Path) -> None:
     out = tmp_path / "deep" / "out"
     for text in ("old", "new"):
-        with whole_folder(out) as folder:
+        with whole_folder(out, replaceable=True) as folder:
             (folder / "inner").mkdir()
             (folder / "inner" / "file").write_text(text)
             assert folder.parent == out.parent

@@ -223,7 +223,7 @@ def adjustment_config(pycolmap: ModuleType, network: Network, estimate: Estimate
         for j in network.control.point:
             config.add_constant_point(int(j) + 1)
     elif gauge != "free":
-        raise BackendError(f"gauge '{gauge}' is none of two_cameras, free, control")
+        raise BackendError(f"gauge '{gauge}', expected one of two_cameras, free, control")
     return config
 
 

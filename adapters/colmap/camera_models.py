@@ -18,10 +18,11 @@ import numpy as np
 
 from adapters.colmap.adjuster import load_pycolmap, quiet, told
 from adapters.colmap.model_files import check_model_files
-from adapters.colmap.names import SIDE_FILE, read_side_file, write_side_file
+from adapters.colmap.names import SIDE_FILE, Names, read_side_file, write_side_file
 from adapters.colmap.scene import AXES, HALF_PIXEL, camera_of, reconstruction
 from sfm.conventions import BoolArray
 from sfm.errors import OutputError, SurveyFileError
+from sfm.files.plain_text import MAX_NAME, is_name, shown
 from sfm.files.whole_files import refuse_full
 from sfm.network import Estimate, ImagePoints, Network
 
@@ -124,31 +125,55 @@ def read_model(folder: Path, *, text: bool | None = None) -> tuple[Network, Esti
                 f"({told(error)})"
             ) from error
     side = read_side_file(folder / SIDE_FILE)
+    try:
+        network, estimate = network_of_scene(scene, side)
+    except UnicodeDecodeError as error:
+        raise SurveyFileError(f"{folder}: the name of a photograph is not in UTF-8") from error
+    except SurveyFileError as error:
+        raise SurveyFileError(f"{folder}: {error}") from error
+    if len(side.cameras) != len(estimate.cameras):
+        return network, estimate
+    for camera, extra in zip(estimate.cameras, side.cameras, strict=True):
+        if len(extra.free) != len(camera.free):
+            raise SurveyFileError(
+                f"{folder / SIDE_FILE}: camera {extra.name}: {len(extra.free)} parameters, "
+                f"the model has {len(camera.free)}"
+            )
+    cameras = tuple(
+        replace(camera, name=extra.name, pixel_mm=np.array(extra.pixel_mm), free=np.array(extra.free))
+        for camera, extra in zip(estimate.cameras, side.cameras, strict=True)
+    )
+    return network, replace(estimate, cameras=cameras)
+
+
+def network_of_scene(scene: Any, side: Names | None = None) -> tuple[Network, Estimate]:
+    """Return a pycolmap.Reconstruction as a network and its solution.
+
+    Args:
+        scene: the reconstruction.
+        side: names that COLMAP has no place for; none if not given.
+
+    Returns:
+        The network, with a covariance of 1 px^2 of every image point, since COLMAP keeps none, and what was
+        solved; photographs without a pose are NaN.
+
+    Raises:
+        BackendError: a camera model that Kolinear has no equal of.
+        SurveyFileError: the name of a photograph is no plain text.
+    """
+    side = side or Names()
     camera_ids = sorted(scene.cameras)
     cameras = tuple(camera_of(scene.camera(i)) for i in camera_ids)
-    if len(side.cameras) == len(cameras):
-        for camera, extra in zip(cameras, side.cameras, strict=True):
-            if len(extra.free) != len(camera.free):
-                raise SurveyFileError(
-                    f"{folder / SIDE_FILE}: camera {extra.name}: {len(extra.free)} parameters, "
-                    f"the model has {len(camera.free)}"
-                )
-        cameras = tuple(
-            replace(camera, name=extra.name, pixel_mm=np.array(extra.pixel_mm), free=np.array(extra.free))
-            for camera, extra in zip(cameras, side.cameras, strict=True)
-        )
     image_ids = sorted(scene.images)
     images = [scene.image(i) for i in image_ids]
     point_ids = sorted(scene.point3D_ids())
     names = side.points
     index = {j: k for k, j in enumerate(point_ids)}
-    seen = [
-        (i, index[p.point3D_id], p.x() - HALF_PIXEL, p.y() - HALF_PIXEL)
-        for i, image in enumerate(images)
-        for p in image.points2D
-        if p.has_point3D()
-    ]
-    table = np.array(seen, dtype=float).reshape(-1, 4)
+    seen = [np.zeros((0, 4))]  # an array for each photograph, which takes less than lists of all
+    for i, image in enumerate(images):
+        rows = [(i, index[p.point3D_id], p.x(), p.y()) for p in image.points2D if p.has_point3D()]
+        seen.append(np.array(rows, dtype=float).reshape(-1, 4))
+    table = np.concatenate(seen)
     poses = [
         image.cam_from_world().matrix() if image.has_pose else np.full((3, 4), np.nan) for image in images
     ]
@@ -156,21 +181,23 @@ def read_model(folder: Path, *, text: bool | None = None) -> tuple[Network, Esti
     position = np.array([-pose[:, :3].T @ pose[:, 3] for pose in poses]).reshape(-1, 3)
     # COLMAP's text format loses what follows a space in the name of a photograph.
     full = {i: side.images.get(str(i), "") for i in image_ids}
-    try:
-        short = [image.name for image in images]
-    except UnicodeDecodeError as error:
-        raise SurveyFileError(f"{folder}: the name of a photograph is not in UTF-8") from error
+    short = [image.name for image in images]
+    labels = tuple(
+        full[i] if full[i].split()[:1] == [name] else name for i, name in zip(image_ids, short, strict=True)
+    )
+    for i, name in zip(image_ids, labels, strict=True):
+        if not is_name(name):
+            raise SurveyFileError(
+                f"the name of image {i} is '{shown(name)}', needed plain text of 1 to {MAX_NAME} characters"
+            )
     network = Network(
-        tuple(
-            full[i] if full[i].split()[:1] == [name] else name
-            for i, name in zip(image_ids, short, strict=True)
-        ),
-        np.array([camera_ids.index(image.camera_id) for image in images], dtype=np.int64),
+        labels,
+        np.searchsorted(camera_ids, [image.camera_id for image in images]).astype(np.int64),
         tuple(names.get(str(j), str(j)) for j in point_ids),
         ImagePoints(
             table[:, 0].astype(np.int64),
             table[:, 1].astype(np.int64),
-            table[:, 2:].copy(),
+            table[:, 2:] - HALF_PIXEL,
             np.tile(np.eye(2), (len(table), 1, 1)),
         ),
     )

@@ -9,7 +9,6 @@ Source: COLMAP 4.2 documentation, "Database Format".
 
 from __future__ import annotations
 
-import sqlite3
 from itertools import combinations
 from pathlib import Path
 from typing import Any
@@ -19,17 +18,15 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from adapters.colmap.adjuster import load_pycolmap, quiet, told
+from adapters.colmap.database_rows import read_rows
 from adapters.colmap.scene import HALF_PIXEL, camera_of, colmap_camera
-from adapters.formats.json_files import MAX_SIDE_PX
 from sfm.camera import Camera
 from sfm.conventions import IntArray
-from sfm.errors import OutputError, SurveyFileError
-from sfm.files.csv_tables import MAX_NUMBER, MAX_TABLE_BYTES
+from sfm.errors import OutputError
 from sfm.files.whole_files import refuse_full, whole_file
-from sfm.network import ImagePoints, Network
+from sfm.network import ImagePoints, Network, rows_of
 
-TABLES = ("cameras", "images", "keypoints", "matches", "two_view_geometries")
-SQLITE_HEADER_BYTES = 100
+MAX_PLACES = 100_000_000  # photographs times points, of which a table is kept
 
 
 def write_database(path: Path, network: Network, cameras: tuple[Camera, ...]) -> None:
@@ -47,6 +44,11 @@ def write_database(path: Path, network: Network, cameras: tuple[Camera, ...]) ->
     pycolmap = load_pycolmap()
     if Path(path).exists():
         raise OutputError(f"{path}: there already is a file of this name")
+    if len(network.images) * len(network.points) > MAX_PLACES:
+        raise OutputError(
+            f"{path}: {len(network.images)} photographs of {len(network.points)} points, databases are "
+            f"written of at most {MAX_PLACES} of both multiplied"
+        )
     with quiet(pycolmap), whole_file(path, "the database") as part:
         try:
             database = pycolmap.Database.open(str(part))
@@ -64,91 +66,24 @@ def read_database(path: Path) -> tuple[Network, tuple[Camera, ...]]:
     that would be twice in one photograph are left out.
 
     Raises:
-        BackendError: pycolmap is missing, or a camera model that Kolinear has no equal of.
+        BackendError: a camera model that Kolinear has no equal of.
         SurveyFileError: not a readable database.
     """
-    pycolmap = load_pycolmap()
-    _check_database(path)
-    with quiet(pycolmap):
-        try:
-            database = pycolmap.Database.open(str(path))
-            found = sorted(database.read_all_cameras(), key=lambda camera: camera.camera_id)
-            images = sorted(database.read_all_images(), key=lambda image: image.image_id)
-            keypoints = [database.read_keypoints(image.image_id)[:, :2] for image in images]
-            pairs = _matches(pycolmap, database, [image.image_id for image in images])
-            database.close()
-        except (OSError, RuntimeError, ValueError, IndexError) as error:
-            raise SurveyFileError(f"{path}: not a readable COLMAP database ({told(error)})") from error
-    for camera in found:
-        if not (1 <= camera.width <= MAX_SIDE_PX and 1 <= camera.height <= MAX_SIDE_PX):
-            raise SurveyFileError(
-                f"{path}: camera {camera.camera_id} has photographs of {camera.width} x {camera.height} px, "
-                f"needed 1 to {MAX_SIDE_PX} on each side"
-            )
-    for image, xy in zip(images, keypoints, strict=True):
-        if not (np.abs(xy) <= MAX_NUMBER).all():
-            raise SurveyFileError(
-                f"{path}: a keypoint of {image.name} is no finite number of at most {MAX_NUMBER:g}"
-            )
-    camera_ids = [camera.camera_id for camera in found]
-    first = np.concatenate([[0], np.cumsum([len(points) for points in keypoints])]).astype(np.int64)
-    edges = [(first[a] + matches[:, 0], first[b] + matches[:, 1]) for a, b, matches in pairs]
-    if any(len(e) and e.max() >= first[-1] for edge in edges for e in edge):
-        raise SurveyFileError(f"{path}: a match names a keypoint that is not there")
-    image = np.repeat(np.arange(len(images)), np.diff(first))
+    rows = read_rows(path)
+    first = np.concatenate([[0], np.cumsum([len(points) for points in rows.keypoints])]).astype(np.int64)
+    edges = [(first[a] + matches[:, 0], first[b] + matches[:, 1]) for a, b, matches in rows.pairs]
+    image = np.repeat(np.arange(len(rows.images)), np.diff(first))
     point = _tracks(edges, image)
     kept = np.flatnonzero(point >= 0)
-    xy = np.concatenate([np.zeros((0, 2)), *keypoints]).astype(float) - HALF_PIXEL
+    xy = np.concatenate([np.zeros((0, 2)), *rows.keypoints]) - HALF_PIXEL
     count = int(point.max(initial=-1)) + 1
     network = Network(
-        tuple(one.name for one in images),
-        np.array([camera_ids.index(one.camera_id) for one in images], dtype=np.int64),
+        rows.images,
+        rows.camera,
         tuple(f"{j + 1}" for j in range(count)),
         ImagePoints(image[kept], point[kept], xy[kept], np.tile(np.eye(2), (len(kept), 1, 1))),
     )
-    return network, tuple(camera_of(camera) for camera in found)
-
-
-def _check_database(path: Path) -> None:
-    """Refuse what is no whole COLMAP database, before COLMAP opens it.
-
-    Source: sqlite.org/fileformat.html, sec. 1.3, for the header.
-    """
-    try:
-        if not path.is_file():
-            raise SurveyFileError(f"{path}: there is no such file")
-        with path.open("rb") as file:
-            header = file.read(SQLITE_HEADER_BYTES)
-        size = path.stat().st_size
-        if size > MAX_TABLE_BYTES:
-            raise SurveyFileError(f"{path}: {size} bytes, at most {MAX_TABLE_BYTES} are read")
-    except OSError as error:
-        raise SurveyFileError(f"{path}: cannot be read ({error.strerror})") from error
-    if header[:16] != b"SQLite format 3\0" or len(header) < SQLITE_HEADER_BYTES:
-        raise SurveyFileError(f"{path}, line 1: not a COLMAP database (no SQLite file)")
-    page = int.from_bytes(header[16:18], "big")
-    whole = (65536 if page == 1 else page) * int.from_bytes(header[28:32], "big")
-    if size < whole:
-        raise SurveyFileError(
-            f"{path}: the file is cut off, it has {size} of the {whole} bytes that its header says"
-        )
-    try:
-        database = sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro", uri=True)
-        try:
-            damage = database.execute("PRAGMA quick_check(1)").fetchone()[0]
-            tables = {row[0] for row in database.execute("SELECT name FROM sqlite_master")}
-        finally:
-            database.close()
-    except sqlite3.Error as error:
-        raise SurveyFileError(f"{path}: not a readable COLMAP database, {error}") from error
-    if damage != "ok":
-        raise SurveyFileError(f"{path}: the database is damaged, {' '.join(str(damage).split())[:200]}")
-    missing = [name for name in TABLES if name not in tables]
-    if missing:
-        raise SurveyFileError(
-            f"{path}: an SQLite file without the table {missing[0]}; a COLMAP database has "
-            f"{', '.join(TABLES)}"
-        )
+    return network, tuple(camera_of(camera) for camera in rows.cameras)
 
 
 def _fill(pycolmap: Any, database: Any, network: Network, cameras: tuple[Camera, ...]) -> None:
@@ -160,7 +95,8 @@ def _fill(pycolmap: Any, database: Any, network: Network, cameras: tuple[Camera,
         rig.add_ref_sensor(written.sensor_id)
         database.write_rig(rig, True)
     seen = network.image_points
-    slot = np.empty(len(seen), dtype=np.int64)
+    slot = np.empty(len(seen), dtype=np.int32)
+    of_image = rows_of(seen.image, len(network.images))
     for i, name in enumerate(network.images):
         camera_id = int(network.camera[i]) + 1
         image = pycolmap.Image(name=name, camera_id=camera_id, image_id=i + 1)
@@ -168,11 +104,11 @@ def _fill(pycolmap: Any, database: Any, network: Network, cameras: tuple[Camera,
         frame = pycolmap.Frame(frame_id=i + 1, rig_id=camera_id)
         frame.add_data_id(image.data_id)
         database.write_frame(frame, True)
-        rows = np.flatnonzero(seen.image == i)
+        rows = of_image[i]
         slot[rows] = np.arange(len(rows))
         xy = (seen.xy[rows] + HALF_PIXEL).astype(np.float32).reshape(-1, 2)
         database.write_keypoints(i + 1, xy)
-    table = np.full((len(network.images), len(network.points)), -1, dtype=np.int64)
+    table = np.full((len(network.images), len(network.points)), -1, dtype=np.int32)
     table[seen.image, seen.point] = slot
     for a, b in combinations(range(len(network.images)), 2):
         common = np.flatnonzero((table[a] >= 0) & (table[b] >= 0))
@@ -183,21 +119,6 @@ def _fill(pycolmap: Any, database: Any, network: Network, cameras: tuple[Camera,
                 config=pycolmap.TwoViewGeometryConfiguration.UNCALIBRATED, inlier_matches=matches
             )
             database.write_two_view_geometry(a + 1, b + 1, geometry)
-
-
-def _matches(pycolmap: Any, database: Any, image_ids: list[int]) -> list[tuple[int, int, IntArray]]:
-    """Matches as (index of one photograph, of the other, keypoints (n, 2))."""
-    pair_ids, tables = database.read_two_view_geometries()
-    tables = [geometry.inlier_matches for geometry in tables]
-    if not any(len(table) for table in tables):
-        pair_ids, tables = database.read_all_matches()
-    found = []
-    for pair_id, table in zip(pair_ids, tables, strict=True):
-        a, b = pycolmap.pair_id_to_image_pair(pair_id)
-        found.append(
-            (image_ids.index(a), image_ids.index(b), np.asarray(table, dtype=np.int64).reshape(-1, 2))
-        )
-    return found
 
 
 def _tracks(edges: list[tuple[IntArray, IntArray]], image: IntArray) -> IntArray:

@@ -23,8 +23,7 @@ from sfm.files.csv_tables import MAX_NUMBER, MAX_TABLE_BYTES
 
 FILES = ("cameras", "rigs", "frames", "images", "points3D")
 OLDER = ("rigs", "frames")  # models of COLMAP before version 3.12 have none
-# Number of parameters by COLMAP's model number and name
-PARAMETERS = (3, 4, 4, 5, 8, 8, 12, 5, 4, 5, 12, 16)
+# Number of parameters by the name of COLMAP's models, in the order of their numbers
 MODELS = {
     "SIMPLE_PINHOLE": 3,
     "PINHOLE": 4,
@@ -39,6 +38,7 @@ MODELS = {
     "THIN_PRISM_FISHEYE": 12,
     "RAD_TAN_THIN_PRISM_FISHEYE": 16,
 }
+PARAMETERS = tuple(MODELS.values())
 POSE = "7d"  # quaternion and translation
 MAX_ID = 2**32 - 1  # of cameras, rigs and photographs
 MAX_POINT_ID = 2**64 - 1  # of points, frames and data; the largest stands for none
@@ -69,19 +69,17 @@ def check_model_files(folder: Path, *, text: bool) -> None:
 
 def _check_text(name: str, path: Path) -> None:
     text = Lines.of(path)
-    if not text.ended:
-        text.number = len(text.lines)
-        raise text.error("the last line is cut off")
-    count, due, text.number = 0, None, 0
-    while text.number < len(text.lines):
-        line = text.line()
-        stated = re.match(r"# Number of \w+: (\d+)", line)
+    count, due = 0, None
+    while (line := text.maybe_line()) is not None:
+        stated = re.match(r"# Number of \w+: (\d{1,20})(?!\d)", line)
         if stated:
             due = int(stated[1])
         if not line.strip() or line.startswith("#"):
             continue
         _check_row(name, text, line.split())
         count += 1
+    if not text.ended:
+        raise text.error("the last line is cut off")
     if due is None and not count:
         text.number = 1
         raise text.error("the file is empty")

@@ -1,4 +1,6 @@
-"""Our networks as COLMAP's scenes and back. What differs is turned here and nowhere else:
+"""Our networks as COLMAP's scenes and back.
+
+What differs is turned here and nowhere else:
 
     pixel origin   COLMAP counts from the corner of the top-left pixel, Kolinear from its centre: +0.5 px
     camera axes    COLMAP looks along +z with y down: R_colmap = diag(1, -1, -1) M, t = -R_colmap X0
@@ -18,9 +20,9 @@ from typing import Any
 import numpy as np
 
 from sfm.camera import Camera
-from sfm.conventions import BoolArray, FloatArray, IntArray
+from sfm.conventions import BoolArray, FloatArray
 from sfm.errors import BackendError
-from sfm.network import Estimate, Network
+from sfm.network import Estimate, Network, rows_of
 
 HALF_PIXEL = 0.5  # COLMAP's pixel coordinates minus ours, px
 AXES = np.diag([1.0, -1.0, -1.0])  # COLMAP's camera axes in ours
@@ -50,7 +52,7 @@ def reconstruction(
     claimed = np.ones(len(seen), dtype=bool) if rejected is None else ~rejected
     claimed &= estimate.oriented[seen.image] & estimate.determined[seen.point]
     slot = np.zeros(len(seen), dtype=np.int64)  # number of each image point in its photograph
-    for i, rows in enumerate(_groups(seen.image, len(network.images))):
+    for i, rows in enumerate(rows_of(seen.image, len(network.images))):
         if not estimate.oriented[i]:
             continue
         slot[rows] = np.arange(len(rows))
@@ -61,7 +63,7 @@ def reconstruction(
             name=network.images[i], keypoints=keypoints, camera_id=int(network.camera[i]) + 1, image_id=i + 1
         )
         scene.add_image_with_trivial_frame(image, pose)
-    for j, rows in enumerate(_groups(seen.point, len(network.points))):
+    for j, rows in enumerate(rows_of(seen.point, len(network.points))):
         if not estimate.determined[j]:
             continue
         track = pycolmap.Track(
@@ -92,7 +94,8 @@ def camera_of(found: Any) -> Camera:
     """Return a COLMAP camera as ours, pixel size 1."""
     if found.model_name not in READABLE:
         raise BackendError(
-            f"camera {found.camera_id}: COLMAP's model {found.model_name} is none of {', '.join(READABLE)}"
+            f"camera {found.camera_id}: COLMAP's model {found.model_name}, expected one of "
+            + ", ".join(READABLE)
         )
     model, places = READABLE[found.model_name]
     camera = Camera(
@@ -128,16 +131,10 @@ def residuals_of(scene: Any, network: Network) -> FloatArray:
     """Computed minus measured by COLMAP's own projection, (k, 2), px."""
     seen = network.image_points
     xy = np.empty((len(seen), 2))
-    for i, rows in enumerate(_groups(seen.image, len(network.images))):
+    for i, rows in enumerate(rows_of(seen.image, len(network.images))):
         image = scene.image(i + 1)
         pose = image.cam_from_world().matrix()
         points = np.array([scene.point3D(int(j) + 1).xyz for j in seen.point[rows]]).reshape(-1, 3)
         if len(rows):
             xy[rows] = scene.camera(image.camera_id).img_from_cam(points @ pose[:, :3].T + pose[:, 3])
     return xy - HALF_PIXEL - seen.xy
-
-
-def _groups(index: IntArray, count: int) -> list[IntArray]:
-    """Rows of each index value, in order."""
-    order = np.argsort(index, kind="stable")
-    return np.split(order, np.searchsorted(index[order], np.arange(1, count)))

@@ -20,14 +20,16 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from adapters.formats.lines import Lines, write_lines
+from adapters.formats.lines import MAX_LINES, MAX_PHOTOGRAPHS, Lines, write_lines
 from sfm.camera import Camera, camera_from_values
 from sfm.conventions import FloatArray
 from sfm.errors import OutputError
+from sfm.files.csv_tables import MAX_ROWS
 from sfm.network import Estimate, ImagePoints, Network
 
 CAMERA_VALUES = 9
 FOCAL = 6  # place of the focal length among them
+OBSERVATION_BYTES, VALUE_BYTES = 7, 1  # of the shortest lines, the last without an end
 FREE = ("fx", "fy", "k1", "k2")  # what BAL adjusts; its fx and fy are one
 
 
@@ -46,11 +48,14 @@ def read_bal(path: Path, *, size_px: tuple[int, int] | None = None) -> tuple[Net
     if len(head) != 3:
         raise text.error(f"{len(head)} words, needed the number of cameras, points and observations")
     m, n, k = (
-        text.count_of(w, what) for w, what in zip(head, ("cameras", "points", "observations"), strict=True)
+        text.count_of(word, what, most)
+        for word, what, most in zip(
+            head, ("cameras", "points", "observations"), (MAX_PHOTOGRAPHS, MAX_ROWS, MAX_LINES), strict=True
+        )
     )
-    due = text.number + k + CAMERA_VALUES * m + 3 * n
-    if due > len(text.lines):
-        raise text.error(f"{len(text.lines)} lines in the file, {due} are due by these numbers")
+    due = OBSERVATION_BYTES * k + VALUE_BYTES * (CAMERA_VALUES * m + 3 * n)
+    if due > text.size:
+        raise text.error(f"{text.size} bytes in the file, at least {due} are due by these numbers")
     image, point = np.empty(k, dtype=np.int64), np.empty(k, dtype=np.int64)
     xy = np.empty((k, 2))
     for row in range(k):

@@ -29,7 +29,7 @@ from pathlib import Path
 
 import numpy as np
 
-from adapters.formats.lines import Lines, write_lines
+from adapters.formats.lines import MAX_IMAGE_POINTS, MAX_PHOTOGRAPHS, Lines, write_lines
 from sfm.camera import camera_from_values
 from sfm.conventions import (
     FloatArray,
@@ -39,7 +39,8 @@ from sfm.conventions import (
     rotation_from_angles,
 )
 from sfm.errors import OutputError
-from sfm.network import Estimate, ImagePoints, Network
+from sfm.files.plain_text import shown
+from sfm.network import Estimate, ImagePoints, Network, rows_of
 
 INTERIOR = "interior.txt"
 PIXEL_MM = 0.005  # nominal size of a pixel, since the files know none
@@ -80,6 +81,7 @@ def read_bundle_matlab(
         point += [len(xyz) - 1] * len(frames)
         xy += values
         seen_in.append(frames)
+        text.refuse_more(len(image) + len(xyz), MAX_IMAGE_POINTS, "points and image points")
     if not xyz:
         raise text.error("no points")
     sigma = None
@@ -88,7 +90,9 @@ def read_bundle_matlab(
         for j, frames in enumerate(seen_in):
             given, values = _frames(text, text.due_row(f"sigmas of point {j + 1}"), m)
             if given != frames:
-                raise text.error(f"frames {given}, the point on line {j + 1} of {points} has {frames}")
+                raise text.error(
+                    f"frames {given!s:.100}, the point on line {j + 1} of {points} has {frames!s:.100}"
+                )
             sigma += [_positive(text, pair) for pair in values]
         text.end()
     interior = (c_mm, x0_mm, y0_mm)
@@ -109,8 +113,7 @@ def write_bundle_matlab(
     write_lines(cameras, lines)
     seen = network.image_points
     point_lines, sigma_lines = [], []
-    for j in range(len(network.points)):
-        rows = np.flatnonzero(seen.point == j)
+    for j, rows in enumerate(rows_of(seen.point, len(network.points))):
         rows = rows[np.argsort(seen.image[rows], kind="stable")]
         frames = [f"{seen.image[r]} {_text(*xy[r])}" for r in rows]
         point_lines.append(" ".join([_text(*estimate.points[j]), f"{len(rows)}", *frames]))
@@ -173,7 +176,7 @@ def read_bundle_csharp(path: Path, *, pixel_mm: float = PIXEL_MM) -> tuple[Netwo
     words = text.due_row("photographs, c, x0 and y0")
     if len(words) != 4:
         raise text.error(f"{len(words)} words, needed the number of photographs, c, x0 and y0")
-    m = text.count_of(words[0], "photographs")
+    m = text.count_of(words[0], "photographs", MAX_PHOTOGRAPHS)
     c, x0, y0 = (text.number_of(word) for word in words[1:])
     if not c > 0:
         raise text.error(f"c = {c:g} mm, it must be positive")
@@ -182,14 +185,17 @@ def read_bundle_csharp(path: Path, *, pixel_mm: float = PIXEL_MM) -> tuple[Netwo
     if len(words) != 1:
         raise text.error(f"{len(words)} words, needed the number of points")
     n = text.count_of(words[0], "points")
+    text.refuse_more(m * n, MAX_IMAGE_POINTS, "image points")
     labels: list[str] = []
+    known: set[str] = set()
     xyz, xy, sigma = [], [], []
     for _ in range(n):
         words = text.due_row(f"point {len(labels) + 1} of {n}")
         if len(words) != 4 + 2 * m:
             raise text.error(f"{len(words)} words, needed id X Y Z and x y of {m} photographs")
-        if words[0] in labels:
-            raise text.error(f"point {words[0]} stands twice")
+        if words[0] in known:
+            raise text.error(f"point {shown(words[0])} stands twice")
+        known.add(text.name_of(words[0], "the id of a point"))
         labels.append(words[0])
         values = [text.number_of(word) for word in words[1:]]
         xyz.append(values[:3])
@@ -201,7 +207,7 @@ def read_bundle_csharp(path: Path, *, pixel_mm: float = PIXEL_MM) -> tuple[Netwo
         if j:
             words = text.due_row(f"the sigmas of point {label}")
         if len(words) != 1 + 2 * m or words[0] != label:
-            raise text.error(f"'{' '.join(words)[:40]}' where {label} and {2 * m} sigmas were due")
+            raise text.error(f"'{shown(' '.join(words))}' where {label} and {2 * m} sigmas were due")
         values = [text.number_of(word) for word in words[1:]]
         sigma += [_positive(text, values[2 * i : 2 + 2 * i]) for i in range(m)]
     text.end()
@@ -243,6 +249,7 @@ def write_bundle_csharp(path: Path, network: Network, estimate: Estimate) -> Non
 def _exterior(text: Lines, count: int | None) -> tuple[list[str], list[list[float]]]:
     """Ids and omega, phi, kappa (deg), XL, YL, ZL of so many photographs, or of all to the end."""
     names: list[str] = []
+    known: set[str] = set()
     exterior = []
     while count is None or len(names) < count:
         words = text.row() if count is None else text.due_row(f"photograph {len(names) + 1} of {count}")
@@ -250,8 +257,10 @@ def _exterior(text: Lines, count: int | None) -> tuple[list[str], list[list[floa
             break
         if len(words) != 7:
             raise text.error(f"{len(words)} words, a photograph is id omega phi kappa XL YL ZL")
-        if words[0] in names:
-            raise text.error(f"photograph {words[0]} stands twice")
+        if words[0] in known:
+            raise text.error(f"photograph {shown(words[0])} stands twice")
+        known.add(text.name_of(words[0], "the id of a photograph"))
+        text.refuse_more(len(known), MAX_PHOTOGRAPHS, "photographs")
         names.append(words[0])
         exterior.append([text.number_of(word) for word in words[1:]])
     if not names:

@@ -6,17 +6,33 @@ import re
 from pathlib import Path
 from typing import Annotated, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, StrictStr, StringConstraints, ValidationError
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Field,
+    FiniteFloat,
+    StrictStr,
+    StringConstraints,
+    ValidationError,
+)
 
 from sfm.errors import SurveyFileError
-from sfm.files.csv_tables import MAX_NAME
+from sfm.files.plain_text import MAX_NAME, SHOWN, as_plain, is_plain
 
-MAX_JSON_BYTES = 100_000_000  # names of some million points
+MAX_JSON_BYTES = 25_000_000  # names of a million points, for which reading takes 0.5 GB
 MAX_SIDE_PX = 1_000_000  # of a photograph; no sensor and no scan is larger
 MAX_PIXEL_MM = 1e3  # of a pixel; COLMAP's models without a size have 1 mm
-SHOWN = 40  # characters of what was found that a message repeats
 
-Name = Annotated[StrictStr, StringConstraints(min_length=1, max_length=MAX_NAME)]
+
+def _plain(text: str) -> str:
+    if not is_plain(text):
+        raise ValueError("plain text without control or invisible characters")
+    return text
+
+
+Text = Annotated[StrictStr, StringConstraints(max_length=MAX_NAME), AfterValidator(_plain)]
+Name = Annotated[Text, StringConstraints(min_length=1)]
 Side = Annotated[int, Field(ge=1, le=MAX_SIDE_PX, strict=True)]
 Pixel = Annotated[FiniteFloat, Field(gt=0, le=MAX_PIXEL_MM, strict=True)]
 
@@ -59,11 +75,12 @@ def _first_error(path: Path, error: ValidationError, what: str) -> str:
     if first["type"] == "json_invalid":
         line = re.search(r" at line (\d+) column \d+$", message)
         number, told = (line[1], message[: line.start()]) if line else ("1", message)
-        return f"{path}, line {number}: not {what} ({told})"
+        return f"{path}, line {number}: not {what} ({as_plain(told)})"
     place = "".join(f"[{step}]" if isinstance(step, int) else f".{step}" for step in first["loc"]).lstrip(".")
+    place = as_plain(place[:MAX_NAME])
     if first["type"] == "missing":
         return f"{path}: {place} is missing, which {what} needs"
-    found = " ".join(repr(first["input"])[: SHOWN + 1].split())
+    found = " ".join(as_plain(repr(first["input"])[: SHOWN + 1]).split())
     found = found if len(found) <= SHOWN else found[:SHOWN] + "..."
     needed = message.removeprefix("Input should be ").removeprefix("Value error, ")
     return f"{path}: {place or 'the content'} is {found}, needed {needed}"

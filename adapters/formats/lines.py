@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
-from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -11,25 +11,31 @@ import numpy as np
 from sfm.conventions import FloatArray
 from sfm.errors import SurveyFileError
 from sfm.files.csv_tables import MAX_NUMBER, MAX_ROWS, MAX_TABLE_BYTES
+from sfm.files.plain_text import MAX_NAME, is_name, shown
 from sfm.files.whole_files import whole_file
 
 MAX_LINES = 2 * MAX_ROWS  # as of tables
+MAX_LINE = 10_000_000  # characters; the image points of a photograph can stand on one
 MAX_DIGITS = 20  # of a whole number; COLMAP's largest have as many
-SHOWN = 40  # characters of a bad piece that a message repeats
+MAX_PHOTOGRAPHS = 100_000
+MAX_IMAGE_POINTS = 2_000_000  # where they are kept one by one, some 0.5 GB
 
 
 @dataclass
 class Lines:
-    """The lines of a file and how far they are read."""
+    """The lines of a file, read one after the other."""
 
     path: Path
-    lines: list[str]
+    size: int  # bytes
+    source: Iterator[str]
     number: int = 0  # of the line read last, from 1
-    ended: bool = True  # whether the last line has its end
+    current: str = ""  # the line read last
+    ended: bool = True  # whether that line has its end
+    again: bool = False  # whether that line is the next one, too
 
     @classmethod
     def of(cls, path: Path) -> Lines:
-        """Read a file of bearable size.
+        """Open a file of bearable size.
 
         Raises:
             SurveyFileError: it is none.
@@ -37,19 +43,14 @@ class Lines:
         try:
             if path.exists() and not path.is_file():  # reading a pipe would never end
                 raise SurveyFileError(f"{path}: not a file, a text file is needed")
-            if path.stat().st_size > MAX_TABLE_BYTES:
-                raise SurveyFileError(
-                    f"{path}: {path.stat().st_size} bytes, at most {MAX_TABLE_BYTES} are read"
-                )
-            with path.open(encoding="utf-8", errors="replace") as file:
-                lines = list(islice(file, MAX_LINES + 1))
+            size = path.stat().st_size
+            if size > MAX_TABLE_BYTES:
+                raise SurveyFileError(f"{path}: {size} bytes, at most {MAX_TABLE_BYTES} are read")
+            with path.open("rb"):
+                return cls(path, size, _lines_of(path))
         except (OSError, ValueError) as error:
             reason = error.strerror if isinstance(error, OSError) else error
             raise SurveyFileError(f"{path}: cannot be read ({reason})") from error
-        if len(lines) > MAX_LINES:
-            raise SurveyFileError(f"{path}: more than {MAX_LINES} lines, no more are read")
-        ended = not lines or lines[-1].endswith("\n")
-        return cls(path, [line.removesuffix("\n") for line in lines], ended=ended)
 
     @property
     def where(self) -> str:
@@ -60,17 +61,35 @@ class Lines:
         """Return the error of the line read last."""
         return SurveyFileError(f"{self.where}: {message}")
 
-    def line(self) -> str:
-        """Return the next line."""
+    def maybe_line(self) -> str | None:
+        """Return the next line, None at the end."""
+        if self.again:
+            self.again = False
+        else:
+            line = next(self.source, None)
+            if line is None:
+                return None
+            self.ended = line.endswith("\n")
+            self.current = line.removesuffix("\n")
         self.number += 1
-        if self.number > len(self.lines):
+        return self.current
+
+    def line(self) -> str:
+        """Return the next line, which must be there."""
+        line = self.maybe_line()
+        if line is None:
+            self.number += 1
             raise self.error("the file ends here, more was due")
-        return self.lines[self.number - 1]
+        return line
+
+    def put_back(self) -> None:
+        """Make the line read last the next one."""
+        self.number, self.again = self.number - 1, True
 
     def row(self) -> list[str] | None:
         """Return the words of the next line that is neither empty nor a # comment, None at the end."""
-        while self.number < len(self.lines):
-            words = self.line().split("#")[0].split()
+        while (line := self.maybe_line()) is not None:
+            words = line.split("#")[0].split()
             if words:
                 return words
         return None
@@ -94,7 +113,7 @@ class Lines:
         """Refuse anything that follows."""
         words = self.row()
         if words is not None:
-            raise self.error(f"'{' '.join(words)[:SHOWN]}' after the end of the data")
+            raise self.error(f"'{shown(' '.join(words))}' after the end of the data")
 
     def number_of(self, text: str) -> float:
         """Return a finite number of bearable size."""
@@ -103,9 +122,9 @@ class Lines:
         except ValueError:
             value = np.nan
         if not np.isfinite(value):
-            raise self.error(f"'{text[:SHOWN]}' is not a number")
+            raise self.error(f"'{shown(text)}' is not a number")
         if abs(value) > MAX_NUMBER:
-            raise self.error(f"'{text[:SHOWN]}', needed a number of at most {MAX_NUMBER:g}")
+            raise self.error(f"'{shown(text)}', needed a number of at most {MAX_NUMBER:g}")
         return value
 
     def whole_of(self, text: str, fewest: int, most: int, what: str) -> int:
@@ -113,16 +132,27 @@ class Lines:
         digits = text.removeprefix("-")
         sound = digits.isascii() and digits.isdecimal() and len(digits) <= MAX_DIGITS
         if not (sound and fewest <= int(text) <= most):
-            raise self.error(f"{what} is '{text[:SHOWN]}', needed a whole number from {fewest} to {most}")
+            raise self.error(f"{what} is '{shown(text)}', needed a whole number from {fewest} to {most}")
         return int(text)
+
+    def name_of(self, text: str, what: str) -> str:
+        """Return a name, which must be plain text."""
+        if not is_name(text):
+            raise self.error(f"{what} is '{shown(text)}', needed plain text of 1 to {MAX_NAME} characters")
+        return text
 
     def index_of(self, text: str, count: int, what: str) -> int:
         """Return an index from 0 to count - 1."""
         return self.whole_of(text, 0, count - 1, what)
 
-    def count_of(self, text: str, what: str) -> int:
-        """Return a number of things, 1 or more, that the file can have room for."""
-        return self.whole_of(text, 1, MAX_LINES, f"the number of {what}")
+    def count_of(self, text: str, what: str, most: int = MAX_LINES) -> int:
+        """Return a number of things, 1 or more, that a file can have room for."""
+        return self.whole_of(text, 1, most, f"the number of {what}")
+
+    def refuse_more(self, count: int, most: int, what: str) -> None:
+        """Raise the error of the line read last if there are more of something than are read."""
+        if count > most:
+            raise self.error(f"more than {most} {what}, no more are read")
 
     def numbers(self, fewest: int, most: int, *, photograph: str | None = None) -> FloatArray:
         """Return a line of numbers, the first of which is that of the photograph if given."""
@@ -132,18 +162,36 @@ class Lines:
             raise self.error(f"{len(parts)} numbers, needed {needed}")
         if photograph is not None and parts[0] != photograph:
             raise self.error(
-                f"'{parts[0][:SHOWN]}' at the start, needed the number {photograph} of the photograph"
+                f"'{shown(parts[0])}' at the start, needed the number {photograph} of the photograph"
             )
         return np.array([self.number_of(part) for part in parts])
 
     def block(self, count: int) -> list[tuple[str, str, FloatArray]]:
         """Return lines of so many numbers up to an empty one, as (where, first, others)."""
-        rows = []
+        rows: list[tuple[str, str, FloatArray]] = []
         while self.line().strip():
-            self.number -= 1
+            self.put_back()
             row = self.numbers(count, count)
+            self.refuse_more(len(rows) + 1, MAX_IMAGE_POINTS, "lines of a block")
             rows.append((self.where, f"{row[0]:.0f}", row[1:]))
         return rows
+
+
+def _lines_of(path: Path) -> Iterator[str]:
+    """Yield the lines of a file with their ends, none longer and not more than are read."""
+    try:
+        with path.open(encoding="utf-8", errors="replace") as file:
+            for number in range(1, MAX_LINES + 2):
+                line = file.readline(MAX_LINE + 1)
+                if not line:
+                    return
+                if number > MAX_LINES:
+                    raise SurveyFileError(f"{path}: more than {MAX_LINES} lines, no more are read")
+                if len(line) > MAX_LINE:
+                    raise SurveyFileError(f"{path}, line {number}: more than {MAX_LINE} characters")
+                yield line
+    except OSError as error:
+        raise SurveyFileError(f"{path}: cannot be read ({error.strerror})") from error
 
 
 def write_lines(path: Path, lines: list[str]) -> None:

@@ -35,7 +35,7 @@ from adapters.formats.xml_lines import Node, read_xml
 from sfm.camera import Camera, camera_from_values
 from sfm.conventions import FloatArray
 from sfm.errors import OutputError, SurveyFileError
-from sfm.network import Estimate, ImagePoints, Network, ObjectPoints
+from sfm.network import Estimate, ImagePoints, Network, ObjectPoints, rows_of
 from sfm.similarity import Similarity
 
 HALF_PIXEL = 0.5  # Metashape's pixel coordinates minus ours, px
@@ -84,7 +84,7 @@ def read_metashape(path: Path) -> tuple[Network, Estimate]:
     seen = _locations(chunk, labels, images)
     index = {identifier: j for j, identifier in enumerate(labels)}
     network = Network(
-        tuple(node.attribute("label") for node in nodes),
+        tuple(node.name("label") for node in nodes),
         camera_index,
         tuple(labels.values()),
         ImagePoints(
@@ -123,11 +123,12 @@ def write_metashape(path: Path, network: Network, estimate: Estimate) -> None:
         for j, C in zip(network.control.point, network.control.covariance, strict=True)
     }
     markers, locations = [], []
+    rows = rows_of(network.image_points.point, len(network.points))
     for j, name in enumerate(network.points):
         reference = _reference(estimate.points[j], sigma.get(j))
         markers.append(f'      <marker id="{j}" label={quoteattr(name)}>{reference}</marker>')
         locations.append(f'          <marker marker_id="{j}">')
-        for row in np.flatnonzero(network.image_points.point == j):
+        for row in rows[j]:
             x, y = (repr(float(v)) for v in network.image_points.xy[row] + HALF_PIXEL)
             camera = network.image_points.image[row]
             locations.append(f'            <location camera_id="{camera}" pinned="true" x="{x}" y="{y}"/>')
@@ -185,7 +186,7 @@ def _camera(sensor: Node) -> Camera:
         raise node.error(f"f = {f:g} px, b1 = {p['b1']:g} px: f and f + b1 must be positive")
     centre = (np.array(size) - 1) / 2
     free = {child.tag for child in listed}
-    label = sensor.attributes.get("label", sensor.attribute("id"))
+    label = sensor.name("label" if "label" in sensor.attributes else "id")
     if p["k4"] == 0 and p["b2"] == 0:
         model = "opencv" if p["k3"] == 0 else "full_opencv"
         values = {"fx": f + p["b1"], "fy": f, "cx": centre[0] + p["cx"], "cy": centre[1] + p["cy"]}
@@ -290,7 +291,7 @@ def _markers(chunk: Node) -> tuple[dict[str, str], FloatArray, ObjectPoints]:
         identifier = node.attribute("id")
         if identifier in labels:
             raise node.error(f"marker id {identifier} stands twice")
-        labels[identifier] = node.attribute("label")
+        labels[identifier] = node.name("label")
         reference = node.maybe("reference")
         if reference is None or "x" not in reference.attributes:
             continue

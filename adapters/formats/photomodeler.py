@@ -32,10 +32,11 @@ from pathlib import Path
 import numpy as np
 
 from adapters.formats.json_files import MAX_SIDE_PX
-from adapters.formats.lines import Lines, write_lines
+from adapters.formats.lines import MAX_IMAGE_POINTS, MAX_PHOTOGRAPHS, Lines, write_lines
 from sfm.camera import Camera, camera_from_values
 from sfm.conventions import FloatArray, angles_from_rotation, rotation_from_angles
 from sfm.errors import OutputError, SurveyFileError
+from sfm.files.plain_text import shown
 from sfm.network import Estimate, ImagePoints, Network, ObjectPoints
 
 HALF_PIXEL = 0.5  # PhotoModeler's pixel coordinates minus ours, px
@@ -64,7 +65,7 @@ def read_photomodeler(
     text.line()  # title
     header = text.numbers(2, 4)
     if len(header) == 4:
-        words = text.lines[text.number - 1].split()
+        words = text.current.split()
         width, height = (text.whole_of(word, 1, MAX_SIDE_PX, "the size in px") for word in words[2:])
         size_px = (width, height)
     if size_px is None:
@@ -81,8 +82,10 @@ def read_photomodeler(
             break
         number, _, name = line.strip().partition(" ")
         if number != str(len(names)) or not name.strip():
-            raise text.error(f"'{line.strip()[:40]}' where photograph {len(names)} and its file were due")
-        names.append(name.strip().replace("\\", "/").rsplit("/", 1)[-1])
+            raise text.error(f"'{shown(line.strip())}' where photograph {len(names)} and its file were due")
+        text.refuse_more(len(names) + 1, MAX_PHOTOGRAPHS, "photographs")
+        file = name.strip().replace("\\", "/").rsplit("/", 1)[-1]
+        names.append(text.name_of(file, "the file of a photograph"))
         outer.append(text.numbers(7, 7, photograph=number)[1:])
         text.numbers(7, 7, photograph=number)
         text.numbers(0, 4)
@@ -94,8 +97,9 @@ def read_photomodeler(
     if control is not None:
         control_rows = _read_control(control)
     known: dict[str, FloatArray] = {}
+    controls = {key for _, key, _ in control_rows}
     for where, key, row in (*object_rows, *control_rows):
-        if key in known and not any(key == k for _, k, _ in control_rows):
+        if key in known and key not in controls:
             raise SurveyFileError(f"{where}: point {key} stands twice")
         known.setdefault(key, row[:3])
     points = list(known)
@@ -177,17 +181,17 @@ def _cameras(
 
 def _read_control(path: Path) -> list[tuple[str, str, FloatArray]]:
     """Rows of a control file as (where, id, X Y Z sX sY sZ)."""
-    rows = []
+    rows: list[tuple[str, str, FloatArray]] = []
     text = Lines.of(path)
-    for number, line in enumerate(text.lines, start=1):
+    while (line := text.maybe_line()) is not None:
         if not line.strip() or line.lstrip().startswith("#"):
             continue
-        text.number = number
+        text.refuse_more(len(rows) + 1, MAX_IMAGE_POINTS, "control points")
         parts = [part.strip() for part in line.split(",")]
         if len(parts) not in (5, 8):
             raise text.error(f"{len(parts)} fields, needed id,label,X,Y,Z or id,label,X,Y,Z,sX,sY,sZ")
         values = [text.number_of(part) for part in parts[2:]]
-        rows.append((text.where, parts[0], np.array([*values, 0.0, 0.0, 0.0][:6])))
+        rows.append((text.where, text.name_of(parts[0], "id"), np.array([*values, 0.0, 0.0, 0.0][:6])))
     return rows
 
 

@@ -1,11 +1,16 @@
-"""The formats of other programs by name: which file is which, what each can hold, reading and writing.
+"""The formats of other programs by name: which file is which, what each can hold, who reads and writes it.
+
+To add a format: write its module beside this one, with a reader, a writer or both, and give it a row in
+FORMATS; where its files can be told from others by their looks, say so in `format_of`.
 
 Source: the module of each format names its own.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -20,49 +25,112 @@ from adapters.formats.bundle_text import (
     write_bundle_csharp,
     write_bundle_matlab_folder,
 )
+from adapters.formats.lines import Lines
 from adapters.formats.metashape import read_metashape, write_metashape
 from adapters.formats.photomodeler import read_photomodeler, write_photomodeler
 from adapters.formats.ply import write_ply
-from adapters.formats.result_tables import TableResult, read_result, write_tables
+from adapters.formats.result_tables import read_result, write_tables
 from adapters.formats.sba_text import read_sba_text, sba_files, write_sba_text
 from sfm.camera import Camera
 from sfm.distortion.models import MODELS
 from sfm.errors import KolinearError, OutputError, SurveyFileError
 from sfm.files.whole_files import whole_folder
 from sfm.network import Estimate, Network, empty_estimate, reduce_network
+from sfm.stored_result import StoredResult
+
+Reader = Callable[[Path], tuple[Network, Estimate]]
+Writer = Callable[..., None]  # path, network, estimate; and title, where a format has a place for it
 
 
 @dataclass(frozen=True)
 class FileFormat:
-    """What is known of a format."""
+    """What is known of a format, and who reads and writes it."""
 
     name: str  # as --from and --to say it
     models: tuple[str, ...]  # camera models that it can hold, the most capable first; empty: no cameras
-    folder: bool  # whether it is a folder of files
-    readable: bool
+    read: Reader | None  # of a file or folder; None: the format is written only
+    write: Writer  # to a new file, or into an empty folder
+    folder: bool = False  # whether it is a folder of files
+    placed: bool = False  # whether it leaves out what has no coordinates in the object
     lacks: tuple[str, ...] = ()  # parameters of these models that it has no place for, others can stand in
     straight: tuple[str, ...] = ()  # parameters that it has no place for and nothing can stand in
+    one_focal: bool = False  # whether fx and fy must be the same
+    titled: bool = False  # whether it holds the name of what is written
+
+    @property
+    def readable(self) -> bool:
+        """Whether it holds photographs, and can be read."""
+        return self.read is not None
 
 
+def _read_database(path: Path) -> tuple[Network, Estimate]:
+    network, cameras = read_database(path)
+    return network, empty_estimate(network, cameras)
+
+
+def _write_database(path: Path, network: Network, estimate: Estimate) -> None:
+    write_database(path, network, estimate.cameras)
+
+
+def _read_tables(path: Path) -> tuple[Network, Estimate]:
+    result = read_result(path)
+    return result.network, result.estimate
+
+
+def _write_tables(folder: Path, network: Network, estimate: Estimate, *, title: str) -> None:
+    every = np.ones(len(network.image_points), dtype=bool)
+    placed = reduce_network(network, estimate, estimate.oriented, estimate.determined, every)
+    write_tables(folder, StoredResult(title, *placed))
+
+
+def _read_sba(path: Path) -> tuple[Network, Estimate]:
+    files = sba_files(path)
+    return read_sba_text(*files[:3], sigmas=files[3])
+
+
+def _write_sba(folder: Path, network: Network, estimate: Estimate) -> None:
+    write_sba_text(folder / "cams.txt", folder / "pts.txt", network, estimate)
+
+
+def _write_ply(path: Path, network: Network, estimate: Estimate) -> None:
+    write_ply(path, network.points, estimate.points)
+
+
+_COLMAP = ("full_opencv", "opencv")
 _OPENCV_DISTORTION = ("k1", "k2", "p1", "p2")
 _BROWN_DISTORTION = MODELS["brown"].names[3:]
 FORMATS = (
-    FileFormat("colmap", ("full_opencv", "opencv"), True, True),
-    FileFormat("colmap-text", ("full_opencv", "opencv"), True, True),
-    FileFormat("colmap-database", ("full_opencv", "opencv"), False, True),
-    FileFormat("tables", tuple(MODELS), True, True),
     FileFormat(
-        *("metashape", ("brown_forward", "full_opencv", "opencv"), False, True),
+        *("colmap", _COLMAP, partial(read_model, text=False), partial(write_model, text=False)),
+        folder=True,
+        placed=True,
+    ),
+    FileFormat(
+        *("colmap-text", _COLMAP, partial(read_model, text=True), partial(write_model, text=True)),
+        folder=True,
+        placed=True,
+    ),
+    FileFormat("colmap-database", _COLMAP, _read_database, _write_database),
+    FileFormat(
+        *("tables", tuple(MODELS), _read_tables, _write_tables), folder=True, placed=True, titled=True
+    ),
+    FileFormat(
+        *("metashape", ("brown_forward", "full_opencv", "opencv"), read_metashape, write_metashape),
         lacks=("b1", "b2", "k4", "k5", "k6"),
     ),
-    FileFormat("photomodeler", ("brown",), False, True, lacks=("b1", "b2")),
-    FileFormat("bal", ("opencv",), False, True, straight=("p1", "p2")),
-    FileFormat("bundle-csharp", ("brown",), False, True, straight=_BROWN_DISTORTION),
-    FileFormat("bundle-matlab", ("brown",), True, True, straight=_BROWN_DISTORTION),
-    FileFormat("sba", ("opencv",), True, True, straight=_OPENCV_DISTORTION),
-    FileFormat("ply", (), False, False),
+    FileFormat("photomodeler", ("brown",), read_photomodeler, write_photomodeler, lacks=("b1", "b2")),
+    FileFormat("bal", ("opencv",), read_bal, write_bal, straight=("p1", "p2"), one_focal=True),
+    FileFormat(
+        *("bundle-csharp", ("brown",), read_bundle_csharp, write_bundle_csharp), straight=_BROWN_DISTORTION
+    ),
+    FileFormat(
+        *("bundle-matlab", ("brown",), read_bundle_matlab_folder, write_bundle_matlab_folder),
+        folder=True,
+        straight=_BROWN_DISTORTION,
+    ),
+    FileFormat("sba", ("opencv",), _read_sba, _write_sba, folder=True, straight=_OPENCV_DISTORTION),
+    FileFormat("ply", (), None, _write_ply, placed=True),
 )
-PLACED = ("colmap", "colmap-text", "tables", "ply")  # leave out what has no place in the object
 ENDINGS = {".xml": "metashape", ".ply": "ply", ".db": "colmap-database"}
 
 
@@ -70,11 +138,11 @@ def format_named(name: str) -> FileFormat:
     """Return a format by its name.
 
     Raises:
-        SurveyFileError: there is none of that name.
+        SurveyFileError: no format has that name.
     """
     found = next((one for one in FORMATS if one.name == name), None)
     if found is None:
-        raise SurveyFileError(f"format '{name}' is none of {', '.join(one.name for one in FORMATS)}")
+        raise SurveyFileError(f"format '{name}', expected one of {', '.join(one.name for one in FORMATS)}")
     return found
 
 
@@ -101,12 +169,8 @@ def format_of(path: Path) -> FileFormat:
         )
     if path.suffix.lower() in ENDINGS:
         return format_named(ENDINGS[path.suffix.lower()])
-    try:
-        with path.open(encoding="utf-8", errors="replace") as text:
-            lines = [text.readline() for _ in range(4)]
-    except OSError as error:
-        raise SurveyFileError(f"{path}: cannot be read ({error.strerror})") from error
-    counts = [len(line.split()) for line in lines]
+    text = Lines.of(path)
+    counts = [len((text.maybe_line() or "").split()) for _ in range(4)]
     if "cams" in path.name:
         return format_named("sba")
     if counts[2:4] == [9, 10]:
@@ -131,31 +195,12 @@ def read_any(path: Path, name: str | None = None) -> tuple[Network, Estimate]:
         SurveyFileError: what is wrong, with file and line number.
     """
     form = format_of(path) if name is None else format_named(name)
-    if form.name in ("colmap", "colmap-text"):
-        return read_model(path, text=form.name == "colmap-text")
-    if form.name == "colmap-database":
-        network, cameras = read_database(path)
-        return network, empty_estimate(network, cameras)
-    if form.name == "tables":
-        result = read_result(path)
-        return result.network, result.estimate
-    if form.name == "metashape":
-        return read_metashape(path)
-    if form.name == "photomodeler":
-        return read_photomodeler(path)
-    if form.name == "bal":
-        return read_bal(path)
-    if form.name == "bundle-csharp":
-        return read_bundle_csharp(path)
-    if form.name == "bundle-matlab":
-        return read_bundle_matlab_folder(path)
-    if form.name == "sba":
-        files = sba_files(path)
-        return read_sba_text(*files[:3], sigmas=files[3])
-    raise SurveyFileError(f"{path}: format {form.name} holds no photographs, it is written only")
+    if form.read is None:
+        raise SurveyFileError(f"{path}: format {form.name} holds no photographs, it is written only")
+    return form.read(path)
 
 
-def read_comparable(path: Path, name: str | None = None) -> TableResult:
+def read_comparable(path: Path, name: str | None = None) -> StoredResult:
     """Read whatever can be compared: tables with standard deviations, any other format without.
 
     Raises:
@@ -174,7 +219,7 @@ def read_comparable(path: Path, name: str | None = None) -> TableResult:
             f"{path}: {len(network.image_points)} image points as format {form.name}, but no coordinates of "
             "photographs or points that could be compared"
         )
-    return TableResult(path.name, network, estimate)
+    return StoredResult(path.name, network, estimate)
 
 
 def write_any(path: Path, name: str, network: Network, estimate: Estimate) -> None:
@@ -188,28 +233,19 @@ def write_any(path: Path, name: str, network: Network, estimate: Estimate) -> No
         needed = "a new or empty folder" if form.folder else "a new file"
         raise OutputError(f"{path}: it is there already; format {name} needs {needed}")
     _refuse_cameras(form, estimate.cameras)
-    if form.name in PLACED:
+    if form.placed:
         points_only = not form.models
         if not (estimate.determined.any() and (points_only or estimate.oriented.any())):
             raise OutputError(
                 f"{path}: format {name} holds what has a place in the object, but no "
                 f"{'point' if points_only else 'photograph or no point'} has coordinates"
             )
+    title = {"title": path.name} if form.titled else {}
     if form.folder:
         with whole_folder(path) as folder:
-            _write_folder(folder, name, path.name, network, estimate)
-    elif name == "colmap-database":
-        write_database(path, network, estimate.cameras)
-    elif name == "metashape":
-        write_metashape(path, network, estimate)
-    elif name == "photomodeler":
-        write_photomodeler(path, network, estimate)
-    elif name == "bal":
-        write_bal(path, network, estimate)
-    elif name == "bundle-csharp":
-        write_bundle_csharp(path, network, estimate)
+            form.write(folder, network, estimate, **title)
     else:
-        write_ply(path, network.points, estimate.points)
+        form.write(path, network, estimate, **title)
 
 
 def _refuse_cameras(form: FileFormat, cameras: tuple[Camera, ...]) -> None:
@@ -223,7 +259,7 @@ def _refuse_cameras(form: FileFormat, cameras: tuple[Camera, ...]) -> None:
         left = [
             name for name in (*form.lacks, *form.straight) if name in camera.names and camera.value(name) != 0
         ]
-        if form.name == "bal" and camera.value("fx") != camera.value("fy"):
+        if form.one_focal and camera.value("fx") != camera.value("fy"):
             left.append("fx other than fy")
         if left:
             remedy = "; --undistort corrects the image points for it" if form.straight else ""
@@ -242,22 +278,8 @@ def written(name: str, network: Network, estimate: Estimate) -> str:
     if name == "colmap-database":
         return f"{len(network.images)} photographs, {image_points}, no coordinates of points"
     images, points = estimate.oriented, estimate.determined
-    if name not in PLACED:
+    if not form.placed:
         images, points = np.ones_like(images), np.ones_like(points)
     seen = network.image_points
     kept = images[seen.image] & (points[seen.point] | (name != "tables"))
     return f"{int(images.sum())} photographs, {int(points.sum())} points, {int(kept.sum())} image points"
-
-
-def _write_folder(folder: Path, name: str, title: str, network: Network, estimate: Estimate) -> None:
-    """Write the files of a format that is a folder."""
-    if name in ("colmap", "colmap-text"):
-        write_model(folder, network, estimate, text=name == "colmap-text")
-    elif name == "tables":
-        every = np.ones(len(network.image_points), dtype=bool)
-        placed = reduce_network(network, estimate, estimate.oriented, estimate.determined, every)
-        write_tables(folder, TableResult(title, *placed))
-    elif name == "bundle-matlab":
-        write_bundle_matlab_folder(folder, network, estimate)
-    else:
-        write_sba_text(folder / "cams.txt", folder / "pts.txt", network, estimate)

@@ -15,23 +15,24 @@ Source: RFC 4180 for CSV; the columns are described in the README.
 from __future__ import annotations
 
 import json
+from collections import Counter
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import Field, StrictStr, StringConstraints
+from pydantic import Field
 
-from adapters.colmap.names import SIDE_FILE, read_side_file
-from adapters.formats.json_files import Content, Name, Pixel, Side, read_json
+from adapters.colmap.names import SIDE_FILE, NamedCamera, read_side_file
+from adapters.formats.json_files import Content, Name, Pixel, Side, Text, read_json
 from sfm.camera import Camera
 from sfm.conventions import FloatArray, angles_from_rotation, rotation_from_angles
 from sfm.distortion.models import MODELS
 from sfm.errors import OutputError, SurveyFileError
-from sfm.files.csv_tables import MAX_NAME, CsvTable, read_header, read_table
+from sfm.files.csv_tables import CsvTable, read_header, read_table
 from sfm.files.plain_text import csv_text
 from sfm.network import Estimate, ImagePoints, Network
+from sfm.stored_result import StoredResult
 
 EXTERIOR = ("X", "Y", "Z", "omega_deg", "phi_deg", "kappa_deg")
 SIGMAS = ("sX", "sY", "sZ")
@@ -39,21 +40,7 @@ PRINCIPAL_DISTANCES = ("c", "fx", "fy")
 COLMAP_SIDE_FILE = f"colmap/{SIDE_FILE}"
 
 
-@dataclass(frozen=True)
-class TableResult:
-    """A result as its tables tell it."""
-
-    name: str  # of the survey
-    network: Network
-    estimate: Estimate
-    point_covariance: FloatArray | None = None  # diagonal: of sX, sY, sZ, object unit^2, (n, 3, 3)
-    position_covariance: FloatArray | None = None  # likewise of the projection centres, (m, 3, 3)
-    interior_sigma: tuple[FloatArray, ...] | None = None  # of each parameter, NaN where fixed
-    redundancy: int | None = None
-    unit: str = ""  # of lengths, as people call it; empty where nobody knows
-
-
-def read_result(folder: Path) -> TableResult:
+def read_result(folder: Path) -> StoredResult:
     """Read the tables of a result, rejected image points left out.
 
     Raises:
@@ -75,7 +62,7 @@ def read_result(folder: Path) -> TableResult:
     table = read_table(folder / "points.csv", ("id",), ("X", "Y", "Z"), SIGMAS, ignored=None, blank=SIGMAS)
     points = table.keys("id")
     network = Network(images, camera, points, _image_points(folder, images, points))
-    return TableResult(
+    return StoredResult(
         summary.survey or folder.name,
         network,
         Estimate(cameras, position, rotation, table.values[:, :3].copy()),
@@ -87,7 +74,7 @@ def read_result(folder: Path) -> TableResult:
     )
 
 
-def write_tables(folder: Path, result: TableResult) -> None:
+def write_tables(folder: Path, result: StoredResult) -> None:
     """Write a result as tables with named columns; standard deviations only where any is known.
 
     Args:
@@ -179,8 +166,8 @@ class _CameraEntry(Content):
 class _Summary(Content):
     """What is read of summary.json."""
 
-    survey: Annotated[StrictStr, StringConstraints(max_length=MAX_NAME)] | None = None
-    length_unit: Annotated[StrictStr, StringConstraints(max_length=MAX_NAME)] | None = None
+    survey: Text | None = None
+    length_unit: Text | None = None
     redundancy: Annotated[int, Field(ge=0, strict=True)] | None = None
     cameras: Annotated[tuple[_CameraEntry, ...], Field(min_length=1)]
 
@@ -189,8 +176,8 @@ def _summary(path: Path) -> _Summary:
     """Read the summary, in which no camera may stand twice."""
     summary = read_json(path, _Summary, "the summary of a result")
     names = [camera.name for camera in summary.cameras]
-    for name in names:
-        if names.count(name) > 1:
+    for name, count in Counter(names).items():
+        if count > 1:
             raise SurveyFileError(f"{path}: camera '{name}' stands twice")
     return summary
 
@@ -212,11 +199,13 @@ def _cameras(folder: Path, summary: _Summary) -> tuple[tuple[Camera, ...], tuple
     positive = np.array([name in PRINCIPAL_DISTANCES for name in table.texts[1]])
     table.refuse(values[:, None], (positive & (values <= 0))[:, None], ("value",), "a positive c, fx or fy")
     rows = {key: k for k, key in enumerate(keys)}
-    for name in table.texts[0]:
-        if name not in (camera.name for camera in summary.cameras):
-            line = table.line[table.texts[0].index(name)]
+    known = {camera.name for camera in summary.cameras}
+    for line, name in zip(table.line, table.texts[0], strict=True):
+        if name not in known:
             raise SurveyFileError(f"{table.path}, line {line}: camera '{name}' is not in summary.json")
     cameras, sigmas = [], []
+    told = all(entry.size_px is not None and entry.pixel_mm is not None for entry in summary.cameras)
+    beside = () if told else read_side_file(folder / COLMAP_SIDE_FILE).cameras
     for number, entry in enumerate(summary.cameras):
         names = MODELS[entry.model].names
         missing = [p for p in names if (entry.name, p) not in rows]
@@ -226,20 +215,19 @@ def _cameras(folder: Path, summary: _Summary) -> tuple[tuple[Camera, ...], tuple
             )
         chosen = [rows[entry.name, p] for p in names]
         s = sigma[chosen, 0] if sigma.size else np.full(len(chosen), np.nan)
-        size, pixel = _size(folder, entry, number)
+        size, pixel = _size(folder, entry, beside[number : number + 1])
         cameras.append(Camera(entry.name, entry.model, size, pixel, values[chosen], np.isfinite(s)))
         sigmas.append(s)
     return tuple(cameras), tuple(sigmas)
 
 
-def _size(folder: Path, entry: _CameraEntry, number: int) -> tuple[tuple[int, int], FloatArray]:
-    """Size and pixel of a camera, from the summary or else from the COLMAP model beside it."""
+def _size(
+    folder: Path, entry: _CameraEntry, beside: tuple[NamedCamera, ...]
+) -> tuple[tuple[int, int], FloatArray]:
+    """Size and pixel of a camera, from the summary or else from that of the COLMAP model beside it."""
     size, pixel = entry.size_px, entry.pixel_mm
-    if size is None or pixel is None:
-        path = folder / COLMAP_SIDE_FILE
-        beside = read_side_file(path).cameras if path.is_file() else ()
-        if number < len(beside):
-            size, pixel = beside[number].size_px, beside[number].pixel_mm
+    if beside and (size is None or pixel is None):
+        size, pixel = beside[0].size_px, beside[0].pixel_mm
     if size is None or pixel is None:
         raise SurveyFileError(
             f"{folder}: neither summary.json nor {COLMAP_SIDE_FILE} tells size and pixel of camera "

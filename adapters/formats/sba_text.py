@@ -13,16 +13,18 @@ Source: M. Lourakis and A. Argyros (2009), ACM TOMS 36(1), and the README of sba
 
 from __future__ import annotations
 
+from array import array
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from adapters.formats.lines import Lines, write_lines
+from adapters.formats.lines import MAX_IMAGE_POINTS, MAX_LINES, MAX_PHOTOGRAPHS, Lines, write_lines
 from sfm.camera import Camera, camera_from_values
 from sfm.conventions import FloatArray
 from sfm.errors import OutputError, SurveyFileError
-from sfm.network import Estimate, ImagePoints, Network
+from sfm.network import Estimate, ImagePoints, Network, rows_of
 
 AXES = np.diag([1.0, -1.0, -1.0])  # sba's camera axes (y down, z forward) in ours
 POSE, POSE_WITH_CAMERA = 7, 12  # numbers of a camera line
@@ -43,7 +45,7 @@ def read_sba_text(
     Raises:
         SurveyFileError: what is wrong, with file and line number.
     """
-    rows = _rows(cameras)
+    rows = list(_rows(cameras, MAX_PHOTOGRAPHS))
     for number, values in rows:
         if len(values) not in (POSE, POSE_WITH_CAMERA) or len(values) != len(rows[0][1]):
             raise SurveyFileError(
@@ -105,8 +107,7 @@ def write_sba_text(cameras: Path, points: Path, network: Network, estimate: Esti
         lines.append(_numbers(fx, cx, cy, fy / fx, 0.0, *quaternion[i], *translation[i]))
     seen = network.image_points
     point_lines = ["# X Y Z n (frame x y covariance)*n"]
-    for j, xyz in enumerate(estimate.points):
-        rows = np.flatnonzero(seen.point == j)
+    for xyz, rows in zip(estimate.points, rows_of(seen.point, len(estimate.points)), strict=True):
         frames = [
             f"{seen.image[r]} {_numbers(*seen.xy[r], *seen.covariance[r].ravel())}"
             for r in rows[np.argsort(seen.image[rows], kind="stable")]
@@ -165,7 +166,7 @@ def _camera(name: str, values: FloatArray, size_px: tuple[int, int], path: Path)
 
 
 def _calibration(path: Path) -> FloatArray:
-    rows = _rows(path)
+    rows = list(_rows(path, 4))
     if [len(values) for _, values in rows] != [3, 3, 3] or not rows[0][1][0] > 0:
         raise SurveyFileError(f"{path}, line {rows[-1][0]}: three lines of 3 numbers are needed, a matrix K")
     K = np.array([values for _, values in rows])
@@ -199,6 +200,10 @@ def _points(path: Path, frames: int) -> tuple[ImagePoints, FloatArray]:
             xy.append(own[1:3])
             covariance.append(own[3:7] if width == WITH_COVARIANCE else [SIGMA_PX**2, 0.0, 0.0, SIGMA_PX**2])
         xyz.append(values[:3])
+        if len(image) + len(xyz) > MAX_IMAGE_POINTS:
+            raise SurveyFileError(
+                f"{path}, line {number}: more than {MAX_IMAGE_POINTS} points and projections"
+            )
     if not image:
         raise SurveyFileError(f"{path}, line {number}: no projections to the end")
     return (
@@ -218,11 +223,14 @@ def _is_covariance(values: list[float]) -> bool:
 
 
 def _with_sigmas(image_points: ImagePoints, path: Path) -> ImagePoints:
-    rows = _rows(path)
-    sigma = np.array([value for _, values in rows for value in values])
+    given, last = array("d"), 1
+    for number, values in _rows(path):
+        given.extend(values)
+        last = number
+    sigma = np.array(given)
     if len(sigma) != 2 * len(image_points) or not (sigma > 0).all():
         raise SurveyFileError(
-            f"{path}, line {rows[-1][0]}: {len(sigma)} numbers to the end, {2 * len(image_points)} positive "
+            f"{path}, line {last}: {len(sigma)} numbers to the end, {2 * len(image_points)} positive "
             "standard deviations are needed"
         )
     covariance = np.zeros((len(image_points), 2, 2))
@@ -230,12 +238,12 @@ def _with_sigmas(image_points: ImagePoints, path: Path) -> ImagePoints:
     return ImagePoints(image_points.image, image_points.point, image_points.xy, covariance)
 
 
-def _rows(path: Path) -> list[tuple[int, list[float]]]:
-    """Return line number and numbers of each line that holds any; # starts a comment."""
-    text = Lines.of(path)
-    rows = []
+def _rows(path: Path, most: int = MAX_LINES) -> Iterator[tuple[int, list[float]]]:
+    """Yield line number and numbers of each line that holds any, one at least; # starts a comment."""
+    text, count = Lines.of(path), 0
     while (words := text.row()) is not None:
-        rows.append((text.number, [text.number_of(word) for word in words]))
-    if not rows:
+        count += 1
+        text.refuse_more(count, most, "lines of numbers")
+        yield text.number, [text.number_of(word) for word in words]
+    if not count:
         raise SurveyFileError(f"{path}, line 1: no numbers")
-    return rows

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import BinaryIO
 from xml.parsers import expat
 
 import numpy as np
@@ -11,12 +12,18 @@ import numpy as np
 from adapters.formats.json_files import MAX_SIDE_PX
 from sfm.conventions import FloatArray
 from sfm.errors import SurveyFileError, one_line
-from sfm.files.csv_tables import MAX_NUMBER, MAX_TABLE_BYTES
+from sfm.files.csv_tables import MAX_NUMBER
+from sfm.files.plain_text import MAX_NAME, is_name, shown
 
+MAX_XML_BYTES = 100_000_000
+MAX_ELEMENTS, MAX_ALL_ATTRIBUTES = 500_000, 5_000_000  # some 500 MB; markers of 1000 photographs have fewer
 MAX_DEPTH = 100  # of elements in one another; exports have about ten
+MAX_ATTRIBUTES = 100  # of an element
+MAX_TAG_BYTES = 1_000_000  # of what expat can only read whole
+PIECE_BYTES = 2**18
 
 
-@dataclass
+@dataclass(slots=True)
 class Node:
     """An element of an XML file."""
 
@@ -52,15 +59,23 @@ class Node:
             raise self.error(f"<{self.tag}> without {name}")
         return self.attributes[name]
 
+    def name(self, name: str) -> str:
+        """Return an attribute that is a name."""
+        found = self.attribute(name)
+        if not is_name(found):
+            raise self.error(f"{name} is '{shown(found)}', needed plain text of 1 to {MAX_NAME} characters")
+        return found
+
     def number(self, name: str) -> float:
         """Return an attribute that is a finite number."""
         return self._number(self.attribute(name))
 
     def numbers(self, count: int) -> FloatArray:
         """Return the text, which must be so many finite numbers."""
-        words = self.text.split()
+        words = self.text.split(maxsplit=count)
         if len(words) != count:
-            raise self.error(f"<{self.tag}> with {len(words)} numbers, needed {count}")
+            found = f"more than {count}" if len(words) > count else f"{len(words)}"
+            raise self.error(f"<{self.tag}> with {found} numbers, needed {count}")
         return np.array([self._number(word) for word in words])
 
     def _number(self, text: str) -> float:
@@ -70,7 +85,7 @@ class Node:
             value = np.nan
         if not abs(value) <= MAX_NUMBER:
             raise self.error(
-                f"'{text[:40]}' in <{self.tag}> is not a finite number of at most {MAX_NUMBER:g}"
+                f"'{shown(text)}' in <{self.tag}> is not a finite number of at most {MAX_NUMBER:g}"
             )
         return value
 
@@ -86,46 +101,81 @@ def read_xml(path: Path) -> Node:
     """Read a file and return its root.
 
     Raises:
-        SurveyFileError: the file cannot be read or is not well-formed, with its line.
+        SurveyFileError: the file cannot be read, is larger in any way than exports are, or is not
+            well-formed, with its line.
     """
-    parser = expat.ParserCreate()
-    top = Node(path, 0, "", {})
-    open_nodes = [top]
-
-    def start(tag: str, attributes: dict[str, str]) -> None:
-        if len(open_nodes) > MAX_DEPTH:
-            raise SurveyFileError(
-                f"{path}, line {parser.CurrentLineNumber}: elements more than {MAX_DEPTH} deep in one another"
-            )
-        node = Node(path, parser.CurrentLineNumber, tag, attributes)
-        open_nodes[-1].children.append(node)
-        open_nodes.append(node)
-
-    def text(data: str) -> None:
-        open_nodes[-1].text += data
-
-    def doctype(*_: object) -> None:
-        # Entities can blow a small file up to gigabytes, and no exporter writes any.
-        raise SurveyFileError(f"{path}, line {parser.CurrentLineNumber}: a document type is not allowed here")
-
-    parser.StartElementHandler = start
-    parser.EndElementHandler = lambda _: open_nodes.pop()
-    parser.CharacterDataHandler = text
-    parser.StartDoctypeDeclHandler = doctype
     try:
-        size = Path(path).stat().st_size
-        if size > MAX_TABLE_BYTES:
-            raise SurveyFileError(f"{path}: {size} bytes, at most {MAX_TABLE_BYTES} are read")
-        with Path(path).open("rb") as file:
-            parser.ParseFile(file)
+        size = path.stat().st_size
+        if size > MAX_XML_BYTES:
+            raise SurveyFileError(f"{path}: {size} bytes, at most {MAX_XML_BYTES} are read")
+        with path.open("rb") as file:
+            return _Reader(path).read(file)
     except OSError as error:
         raise SurveyFileError(f"{path}: cannot be read ({error.strerror})") from error
-    except expat.ExpatError as error:
-        raise SurveyFileError(
-            f"{path}, line {error.lineno}: not well-formed XML ({expat.ErrorString(error.code)})"
-        ) from error
-    except (LookupError, ValueError) as error:  # of encodings that Python does not know or expat cannot take
-        raise SurveyFileError(
-            f"{path}, line 1: the encoding is none that can be read ({one_line(error):.100})"
-        ) from error
-    return top.children[0]
+
+
+class _Reader:
+    """Makes nodes of what expat tells."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.open_nodes = [Node(path, 0, "", {})]
+        self.texts: list[str] = []  # of the innermost element, as long as it has no children
+        self.elements, self.attributes = 0, 0
+        self.parser = expat.ParserCreate()
+        self.parser.buffer_text = True  # else every line is a piece of its own
+        self.parser.StartElementHandler = self.start
+        self.parser.EndElementHandler = self.end
+        self.parser.CharacterDataHandler = self.texts.append
+        self.parser.StartDoctypeDeclHandler = self.refuse_doctype
+
+    def read(self, file: BinaryIO) -> Node:
+        """Read a file in pieces, so that nothing in it that is too large is held whole."""
+        top, given = self.open_nodes[0], 0
+        try:
+            while data := file.read(PIECE_BYTES):
+                self.parser.Parse(data, False)
+                given += len(data)
+                if given - self.parser.CurrentByteIndex > MAX_TAG_BYTES:
+                    raise self.error(f"a tag or comment of more than {MAX_TAG_BYTES} bytes")
+            self.parser.Parse(b"", True)
+        except expat.ExpatError as error:
+            raise SurveyFileError(
+                f"{self.path}, line {error.lineno}: not well-formed XML ({expat.ErrorString(error.code)})"
+            ) from error
+        except (LookupError, ValueError) as error:  # of encodings that Python or expat do not know
+            raise SurveyFileError(
+                f"{self.path}, line 1: the encoding is none that can be read ({one_line(error):.100})"
+            ) from error
+        return top.children[0]
+
+    def error(self, message: str) -> SurveyFileError:
+        """Return the error of the line that is read."""
+        return SurveyFileError(f"{self.path}, line {self.parser.CurrentLineNumber}: {message}")
+
+    def start(self, tag: str, attributes: dict[str, str]) -> None:
+        """Open an element."""
+        self.elements, self.attributes = self.elements + 1, self.attributes + len(attributes)
+        if len(self.open_nodes) > MAX_DEPTH:
+            raise self.error(f"elements more than {MAX_DEPTH} deep in one another")
+        if self.elements > MAX_ELEMENTS:
+            raise self.error(f"more than {MAX_ELEMENTS} elements, no more are read")
+        if len(attributes) > MAX_ATTRIBUTES:
+            raise self.error(f"{len(attributes)} attributes of an element, at most {MAX_ATTRIBUTES} are read")
+        if self.attributes > MAX_ALL_ATTRIBUTES:
+            raise self.error(f"more than {MAX_ALL_ATTRIBUTES} attributes, no more are read")
+        node = Node(self.path, self.parser.CurrentLineNumber, tag, attributes)
+        self.open_nodes[-1].children.append(node)
+        self.open_nodes.append(node)
+        self.texts.clear()
+
+    def end(self, _: str) -> None:
+        """Close the innermost element, which has either children or text."""
+        node = self.open_nodes.pop()
+        if not node.children:
+            node.text = "".join(self.texts)
+        self.texts.clear()
+
+    def refuse_doctype(self, *_: object) -> None:
+        """Refuse entities, which can blow a small file up to gigabytes; no exporter writes any."""
+        raise self.error("a document type is not allowed here")

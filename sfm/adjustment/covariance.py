@@ -13,13 +13,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sfm.adjustment.datum import Datum, ResolvedDatum
-from sfm.adjustment.engine.accumulate import times_points
 from sfm.adjustment.engine.cofactors import Cofactors, cofactors, marginal_covariance, without_held
 from sfm.adjustment.engine.iterate import Optimum, optimum_at, problem_of
 from sfm.adjustment.engine.local_frame import centroid_of, shifted
 from sfm.adjustment.engine.motions import motions_of
 from sfm.adjustment.engine.normals import solve_lower
 from sfm.adjustment.engine.observed_unknowns import Weighted, weighted_of
+from sfm.adjustment.engine.products import times_points
 from sfm.adjustment.engine.unknowns import Unknowns, unknowns_of
 from sfm.adjustment.quality.rank import reduced_names
 from sfm.adjustment.result import Adjustment
@@ -53,13 +53,13 @@ class Marginal:
             Covariance in this order, X Y Z of each point, shape (u + 3 p, u + 3 p).
         """
         Q, b, motions = self.cofactors, self.optimum.equations.blocks, self.optimum.motions
-        obs, first, u = self.layout.obs, self.layout.kept_start, len(unknowns)
+        observations, first, u = self.layout.observations, self.layout.kept_start, len(unknowns)
         rows = (3 * np.asarray(points)[:, None] + np.arange(3)).ravel()
         # dx of each as a linear function of the reduced unknowns: themselves, or -L^-T Y' of a point
         h = np.zeros((len(b.L), 3, len(rows)))
         h.reshape(3 * len(h), len(rows))[rows, np.arange(len(rows))] = 1.0
         through = np.zeros((self.layout.reduced, len(rows)))
-        times_points(obs, b, solve_lower(b.L, h), through)
+        times_points(observations, b, solve_lower(b.L, h), through)
         E = np.zeros((self.layout.reduced, u + len(rows)))
         E[unknowns, np.arange(u)] = 1.0
         E[:, u:] = -through
@@ -132,7 +132,9 @@ def change_datum(adjustment: Adjustment, datum: Datum) -> Adjustment:
             carry the datum.
 
     Example:
-        >>> change_datum(adjustment, Datum("minimal", points=["501", "502", "503"]))  # doctest: +SKIP
+        >>> import sfm
+        >>> sfm.change_datum(result.adjustment, sfm.Datum("minimal", points=["1", "2", "3"])).datum
+        'minimal'
 
     Source: Baarda (1973), S-transformations and criterion matrices.
     """

@@ -32,6 +32,11 @@ class Datum:
     free: inner constraints on object points, control is ignored; minimal: as many fixed coordinates as
     needed; control: the network's control points, fixed or weighted. Scale bars, observed exterior and
     interior orientation take part in every kind, and the datum adds only what they leave open.
+
+    Example:
+        >>> import sfm
+        >>> sfm.Datum("minimal", points=["501", "502", "503"]).points
+        ['501', '502', '503']
     """
 
     kind: str = "free"  # free | minimal | control

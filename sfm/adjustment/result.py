@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from sfm.conventions import BoolArray, FloatArray
+from sfm.display import html_table, text_table
 from sfm.network import Estimate, Network
 
 
@@ -20,9 +21,16 @@ class Covariance:
     points_limiting: FloatArray  # of points with the cameras held fixed, object unit^2, (n, 3, 3)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Adjustment:
-    """Result of a least-squares adjustment of a network."""
+    """Result of a least-squares adjustment of a network.
+
+    Example:
+        >>> import sfm
+        >>> adjustment = sfm.adjust(result.network, result.estimate, reject="none")
+        >>> adjustment.datum, adjustment.rejected.any(), adjustment.covariance.points.shape
+        ('free', np.False_, (20, 3, 3))
+    """
 
     network: Network  # as stated, rejected image points included
     estimate: Estimate  # adjusted interior and exterior orientation and points
@@ -119,3 +127,19 @@ def scaled_covariance(covariance: FloatArray, sigma_factor: FloatArray) -> Float
 
 def _rms_sigma(covariance: FloatArray) -> float:
     return float((np.trace(covariance, axis1=1, axis2=2).mean() / 2) ** 0.5)
+
+    def _rows(self) -> list[tuple[str, str]]:
+        state = "converged" if self.converged else "did NOT converge"
+        rows = [
+            ("state", f"{state}, {self.steps}"),
+            ("datum", f"{self.datum}, rank defect {self.defect} (expected {self.expected_defect})"),
+            ("image points", f"{int((~self.rejected).sum())} accepted, {int(self.rejected.sum())} rejected"),
+            ("sigma0", f"{self.sigma0_px:.4f} px, redundancy {self.redundancy}"),
+        ]
+        return rows + [("undetermined", name) for name in self.undetermined]
+
+    def __repr__(self) -> str:
+        return text_table("Adjustment", ("", ""), self._rows())
+
+    def _repr_html_(self) -> str:
+        return html_table("Adjustment", ("", ""), self._rows())

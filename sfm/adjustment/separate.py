@@ -1,4 +1,4 @@
-"""Separate adjustment of points and orientations in turn, for the record and as a test.
+"""Separate adjustment: object points and orientations in turn, in place of all unknowns together.
 
 Each round first moves every object point with the orientations held (3 x 3 systems), then all
 orientations with the points held (one system of the exterior orientations and the interior parameters).
@@ -17,6 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
+from sfm.adjustment.engine.accumulate import Blocks
 from sfm.adjustment.engine.collinearity import State, sum_of_squares
 from sfm.adjustment.engine.normals import new_space, normal_equations
 from sfm.adjustment.engine.observed_unknowns import weighted_of
@@ -25,7 +26,7 @@ from sfm.conventions import FloatArray
 from sfm.errors import GeometryError
 from sfm.network import Estimate, Network
 
-SETTLED = 1e-13  # relative decrease of v'Pv in a round at which the rounds end
+TOLERANCE = 1e-13  # relative decrease of v'Pv in a round at which the rounds end
 SHORTEST = 2.0**-12  # shortest share of a step that is tried
 
 
@@ -33,37 +34,48 @@ SHORTEST = 2.0**-12  # shortest share of a step that is tried
 class SeparateAdjustment:
     """Where the rounds ended."""
 
-    estimate: Estimate
-    vPv: float
-    rounds: int
-    converged: bool
+    estimate: Estimate  # adjusted interior and exterior orientation and points
+    vPv: float  # weighted sum of squared residuals of the image points
+    rounds: int  # that were computed
+    converged: bool  # whether the last round decreased v'Pv by no more than the tolerance
 
 
 def adjust_separately(
-    network: Network, estimate: Estimate, *, max_rounds: int = 2000, settled: float = SETTLED
+    network: Network, estimate: Estimate, *, max_rounds: int = 2000, tolerance: float = TOLERANCE
 ) -> SeparateAdjustment:
-    """Return the adjustment by points and orientations in turn.
+    """Return the adjustment of points and orientations in turn.
 
-    The control points of the network, fixed, are the datum if there are any; else it stays where the
-    start values put it.
+    Each round moves every object point by itself, the orientations held, then all orientations, the points
+    held. It ends at the optimum of `sfm.adjustment.solve.adjust`, but takes hundreds of rounds where that
+    takes a few steps, and gives no covariance. The control points of the network, fixed, are the datum if
+    there are any; else it stays where the start values put it.
 
     Args:
         network: image points, and control points if any.
-        estimate: start values.
+        estimate: start values; photographs and points without (NaN) are held out.
         max_rounds: rounds at most.
-        settled: relative decrease of v'Pv in a round at which the rounds end.
+        tolerance: relative decrease of v'Pv in a round at which the rounds end.
+
+    Returns:
+        Adjusted values, v'Pv, and whether it converged.
 
     Raises:
         GeometryError: scale bars or weighted unknowns, which join points to one another.
+
+    Example:
+        >>> adjust_separately(network, start).estimate.points  # doctest: +SKIP
+
+    Source: Nocedal and Wright, Numerical Optimization (2006), sec. 9.3 (block coordinate descent).
     """
     layout, state = unknowns_of(network, estimate, use_control=True)
     weighted = weighted_of(network, layout, use_control=True)
     if weighted.count:
         raise GeometryError(
-            "separate adjustment: scale bars and weighted unknowns are for the simultaneous one"
+            "separate adjustment: the network has scale bars or weighted unknowns, expected image points and "
+            "fixed control only (adjust takes the others)"
         )
     weight = start_weights(layout, state)
-    vPv = float(sum_of_squares(layout.obs, state, weight))
+    vPv = float(sum_of_squares(layout.observations, state, weight))
     space = new_space(layout)
     for number in range(1, max_rounds + 1):
         before = vPv
@@ -71,18 +83,18 @@ def adjust_separately(
             normals = normal_equations(layout, weighted, state, weight, space=space)
             reduced, points = move(normals.blocks, layout)
             state, vPv = _shorten(layout, state, weight, reduced, points, vPv)
-        if before - vPv <= settled * before:
+        if before - vPv <= tolerance * before:
             return SeparateAdjustment(estimate_of(state, estimate), vPv, number, True)
     return SeparateAdjustment(estimate_of(state, estimate), vPv, max_rounds, False)
 
 
-def _points(blocks, layout: Unknowns) -> tuple[FloatArray, FloatArray]:  # type: ignore[no-untyped-def]
+def _points(blocks: Blocks, layout: Unknowns) -> tuple[FloatArray, FloatArray]:
     """Step of the points, -V^-1 g, with the orientations held."""
     dX = -np.linalg.solve(blocks.V, blocks.gp[:, :, None])[:, :, 0]
     return np.zeros(layout.reduced), np.where(layout.point_free, dX, 0.0)
 
 
-def _orientations(blocks, layout: Unknowns) -> tuple[FloatArray, FloatArray]:  # type: ignore[no-untyped-def]
+def _orientations(blocks: Blocks, layout: Unknowns) -> tuple[FloatArray, FloatArray]:
     """Step of exterior and interior orientation, -U^-1 g, with the points held."""
     m = len(layout.exterior_free)
     U = np.zeros((layout.reduced, layout.reduced))
@@ -90,7 +102,7 @@ def _orientations(blocks, layout: Unknowns) -> tuple[FloatArray, FloatArray]:  #
     g[: 6 * m] = blocks.g.ravel()
     for i in range(m):
         U[6 * i : 6 * i + 6, 6 * i : 6 * i + 6] = np.triu(blocks.U[i])
-        column = layout.interior_column[layout.obs.camera[i]]
+        column = layout.interior_column[layout.observations.camera[i]]
         U[6 * i : 6 * i + 6, column] = blocks.C[i, :, : len(column)]
     for a, column in enumerate(layout.interior_column):
         f = len(column)
@@ -111,7 +123,7 @@ def _shorten(
     share = 1.0
     while share >= SHORTEST:
         moved = step(layout, state, share * reduced, share * points)
-        reached = float(sum_of_squares(layout.obs, moved, weight))
+        reached = float(sum_of_squares(layout.observations, moved, weight))
         if reached <= vPv:
             return moved, reached
         share /= 2

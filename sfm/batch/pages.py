@@ -2,25 +2,21 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict, fields
-from html import escape
 from pathlib import Path
 
 from sfm.batch.survey import LOGS, SurveyRow
 from sfm.errors import OutputError
 from sfm.files.plain_text import as_plain, csv_text, is_plain
-from sfm.files.whole_files import whole_file
-from sfm.report.markup import Cell, file_url, table
-from sfm.report.pages import page
+from sfm.files.whole_files import MANIFEST, read_manifest, refuse_links, sha256_of, whole_file, write_manifest
+from sfm.report.html.page import render
 
 PAGES = ("batch.json", "batch.csv", "index.html")  # the first tells whose they are
-HEADER = ("survey", "file", "result", "photographs", "points", "sigma0, px", "RMS, px", "COLMAP", "seconds")
-LEVELS = {"good": "good", "fair": "fair", "bad": "bad", "": "bad"}
-"""colour of a verdict; without a result there is none, which is bad"""
 
 
 def write_batch_pages(rows: Sequence[SurveyRow], out: Path) -> None:
@@ -35,32 +31,41 @@ def write_batch_pages(rows: Sequence[SurveyRow], out: Path) -> None:
     """
     names = [field.name for field in fields(SurveyRow)]
     data = {"surveys": [asdict(row) for row in rows], "totals": totals(rows)}
-    texts = (
+    pages = (
         json.dumps(data, indent=2, ensure_ascii=False, allow_nan=False) + "\n",
         csv_text(names, [tuple(asdict(row).values()) for row in rows]),
         render_index(rows, out.name),
     )
-    for name, text in zip(PAGES, texts, strict=True):
+    texts = {name: text.encode() for name, text in zip(PAGES, pages, strict=True)}
+    there = {name: [sha256_of(out / name)] for name in PAGES if (out / name).exists()}
+    # Listed before they are written, beside those that are there: whatever ends the run, they are known.
+    new = {name: hashlib.sha256(text).hexdigest() for name, text in texts.items()}
+    write_manifest(out, {name: [*there.get(name, ()), new[name]] for name in PAGES})
+    for name, text in texts.items():
         with whole_file(out / name) as part:
-            part.write_text(text, encoding="utf-8", newline="")
+            part.write_bytes(text)
 
 
 def refuse_foreign_pages(out: Path) -> None:
-    """Raise OutputError where a folder has files of these names that no batch has written.
+    """Raise OutputError where a folder has files of these names that no batch has written, or a changed one.
 
-    So it does where the path is no text that can stand in them.
+    So it does where the path is no text that can stand in them, or leads through a link.
     """
     if not is_plain(str(out)):
         raise OutputError(f"{as_plain(str(out))}: the path is no plain text; needed another --out")
-    there = [name for name in PAGES if (out / name).exists() or (out / name).is_symlink()]
+    for name in (MANIFEST, *PAGES):
+        refuse_links(out / name)
+    known = read_manifest(out)
     try:
-        found = json.loads((out / PAGES[0]).read_text(encoding="utf-8")) if there else {}
-        ours = not there or (isinstance(found, dict) and {"surveys", "totals"} <= set(found))
-    except (OSError, ValueError, RecursionError):
-        ours = False
-    if not ours:
+        there = {name: sha256_of(out / name) for name in (MANIFEST, *PAGES) if (out / name).exists()}
+    except OSError as error:
+        raise OutputError(f"{out}: the folder cannot be read: {error.strerror}") from error
+    foreign = [name for name, digest in there.items() if digest not in known.get(name, ())]
+    foreign += [] if known.keys() <= {MANIFEST, *PAGES} else [MANIFEST]
+    if foreign:
         raise OutputError(
-            f"{out}: the folder holds '{there[-1]}', which no batch has written; needed another --out"
+            f"{out}: the folder holds '{foreign[-1]}', which no batch has written, or not as it is "
+            "now; needed another --out"
         )
 
 
@@ -78,7 +83,7 @@ def totals(rows: Sequence[SurveyRow]) -> dict[str, int]:
 
 
 def render_index(rows: Sequence[SurveyRow], name: str) -> str:
-    """Return the page with a line for every survey; whatever came from files is escaped.
+    """Return the page with a line for every survey.
 
     Args:
         rows: one per survey.
@@ -91,50 +96,22 @@ def render_index(rows: Sequence[SurveyRow], name: str) -> str:
     remarks = [f"{count[word]} {word}" for word in ("failed", "set aside", "not dependable") if count[word]]
     remarks += [f"{remarked} with remarks, told in the report"] if remarked else []
     remarks += [f"{differs} where COLMAP's adjustment differs"] if differs else []
-    level = "bad" if good < len(rows) else "fair" if remarked or differs else "good"
     above = _common_folder(rows)
-    where = f"<p class=note>Files are below {escape(above)}</p>" if above else ""
-    sections = [("Surveys", table(HEADER, [_cells(row, above) for row in rows]) + where)]
-    without = [row for row in rows if row.status != "done"]
-    if without:
-        told = [
-            (row.survey, _below(row.file, above), Cell(row.status, level="bad"), row.reason, _log(row))
-            for row in without
-        ]
-        sections.append(("Without a result", table(("survey", "file", "", "reason", "log"), told)))
-    seconds = sum(row.seconds for row in rows)
-    tiles = (
-        ("Surveys", str(len(rows)), f"{good} with a dependable result"),
-        ("Photographs oriented", _oriented(rows), "of surveys with a result"),
-        ("Object points", str(sum(row.points or 0 for row in rows)), ""),
-        ("Computing", f"{seconds:.1f} s", "of all workers together"),
+    return render(
+        "batch.html",
+        title=name,
+        headline=f"{good} of {len(rows)} surveys {'has' if good == 1 else 'have'} a dependable result.",
+        level="bad" if good < len(rows) else "fair" if remarked or differs else "good",
+        remarks=remarks,
+        rows=rows,
+        good=good,
+        oriented=sum(row.photographs or 0 for row in rows),
+        photographs=sum(row.photographs_total or 0 for row in rows),
+        points=sum(row.points or 0 for row in rows),
+        above=above,
+        below=lambda file: os.path.relpath(file, above) if above else file,
+        logs=LOGS,
     )
-    verdict = f"{good} of {len(rows)} surveys {'has' if good == 1 else 'have'} a dependable result."
-    return page("Batch of surveys", name, verdict, level, sections, remarks=remarks, tiles=tiles)
-
-
-def _cells(row: SurveyRow, above: str) -> tuple[str | Cell, ...]:
-    """Return the line of a survey in the table."""
-    done = row.status == "done"
-    return (
-        Cell(row.survey, url=f"{file_url(row.folder)}/report.html" if done else ""),
-        _below(row.file, above),
-        Cell(row.verdict if done else row.status, level=LEVELS.get(row.verdict, "bad")),
-        f"{row.photographs} / {row.photographs_total}" if done else "",
-        "" if row.points is None else str(row.points),
-        _fixed(row.sigma0_px),
-        _fixed(row.rms_px),
-        Cell(row.comparison, level="bad") if row.comparison == "differs" else row.comparison,
-        f"{row.seconds:.1f}",
-    )
-
-
-def _log(row: SurveyRow) -> Cell:
-    return Cell(f"{row.folder}.jsonl", url=f"{LOGS}/{file_url(row.folder)}.jsonl")
-
-
-def _oriented(rows: Sequence[SurveyRow]) -> str:
-    return f"{sum(r.photographs or 0 for r in rows)} of {sum(r.photographs_total or 0 for r in rows)}"
 
 
 def _common_folder(rows: Sequence[SurveyRow]) -> str:
@@ -144,11 +121,3 @@ def _common_folder(rows: Sequence[SurveyRow]) -> str:
     except ValueError:  # none at all, or several drives
         return ""
     return "" if common == Path(common).anchor else common
-
-
-def _below(file: str, above: str) -> str:
-    return os.path.relpath(file, above) if above else file
-
-
-def _fixed(value: float | None) -> str:
-    return "" if value is None else f"{value:.4f}"

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import glob
 import hashlib
+import os
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, suppress
@@ -32,13 +33,16 @@ from sfm.batch.survey import (
 from sfm.errors import BackendError, FolderInUseError, SurveyFileError
 from sfm.executor import Call, Done, Engine, Lost, Told, Work
 from sfm.files.folder_lock import locked, owner_of
+from sfm.files.globs import BELOW, find_files
 from sfm.files.plain_text import as_plain
-from sfm.files.whole_files import remove_leftovers
-from sfm.report.log import SurveyLog
-from sfm.report.output import folder_name, refuse_foreign_folder
-from sfm.survey.inputs.start import find_photographs
-from sfm.survey.inputs.survey_file import Survey, read_survey
-from sfm.survey.target_store import STORE, TargetStore
+from sfm.files.whole_files import MANIFEST, refuse_foreign_folder, remove_leftovers
+from sfm.report.log import SurveyLog, refuse_other_log, remove_log
+from sfm.report.output import folder_name
+from sfm.survey.inputs.photograph_list import find_photographs
+from sfm.survey.inputs.start import refuse_unknown_photographs
+from sfm.survey.inputs.survey import read_survey
+from sfm.survey.inputs.survey_file import SurveyFile, read_survey_file
+from sfm.survey.target_store import TargetStore
 
 SURVEY_NAME = "survey.toml"  # what a folder is searched for
 
@@ -68,7 +72,7 @@ class _Plan:
 
     file: Path
     folder: str
-    survey: Survey | Exception  # why its file cannot be read
+    survey: SurveyFile | Exception  # why its file cannot be read
 
 
 def run_batch(
@@ -100,9 +104,12 @@ def run_batch(
         OutputError: the folder cannot be written, or another run is writing into it.
         BackendError: there is nobody left to work.
     """
-    out = Path(out).resolve()
-    refuse_foreign_pages(out)
+    refuse_foreign_pages(Path(out))
+    out = Path(os.path.abspath(out))  # it has no links
     plans = _plan(files, allow_outside=allow_outside)
+    for plan in plans:
+        refuse_other_log(out / LOGS / f"{plan.folder}.jsonl")
+    TargetStore.of_user().remove_old()
     with _no_empty_folders(out), locked(out / LOCK, out) as before:
         if before is not None:
             watch.remark(f"an earlier run was cut off ({before}); what it had finished is safe")
@@ -125,7 +132,7 @@ def _no_empty_folders(out: Path) -> Iterator[None]:
     try:
         yield
     finally:
-        for folder in (out / STORE, (out / LOCK).parent, out / LOGS, *missing):
+        for folder in (out / LOGS, *missing):
             with suppress(OSError):  # it is in use
                 folder.rmdir()
 
@@ -148,12 +155,32 @@ def find_surveys(names: Sequence[str]) -> tuple[Path, ...]:
         if path.exists() or not glob.has_magic(name):
             found.update(dict.fromkeys(_below(path)))
             continue
-        matches = sorted(Path(match) for match in glob.glob(name, recursive=True))
-        if not matches:
-            raise SurveyFileError(f"{name}: no file matches")
+        matches = _matches(path)
         for match in matches:
             found.update(dict.fromkeys(_below(match)))
     return tuple(found)
+
+
+def _matches(path: Path) -> list[Path]:
+    """Return what a glob on the command line stands for; with `**` in it no links out of its folder count.
+
+    Raises:
+        SurveyFileError: nothing, or too much to look through.
+    """
+    first = next(k for k, part in enumerate(path.parts) if glob.has_magic(part))
+    folder, pattern = Path(*path.parts[:first]), Path(*path.parts[first:])
+
+    def refuse_leaving(link: Path) -> None:
+        if BELOW in pattern.parts and not link.resolve().is_relative_to(folder.resolve()):
+            raise SurveyFileError(f"{path}: {link} leads out of {folder}, which is not searched with {BELOW}")
+
+    try:
+        found = find_files(folder, str(pattern), enter=refuse_leaving, folders=True, hidden=False)
+    except ValueError as error:
+        raise SurveyFileError(f"{path}: {BELOW} stands for whole folders only") from error
+    if not found:
+        raise SurveyFileError(f"{path}: no file matches")
+    return found
 
 
 def calls_of(files: Sequence[Path], *, allow_outside: bool = False) -> int:
@@ -161,12 +188,12 @@ def calls_of(files: Sequence[Path], *, allow_outside: bool = False) -> int:
     calls = 0
     for file in files:
         with suppress(Exception):  # what is wrong is told by the run
-            survey = read_survey(file, allow_outside=allow_outside)
+            survey = read_survey_file(file, allow_outside=allow_outside)
             calls += len(find_photographs(survey)) if _has_parts(survey) else 1
     return max(1, calls)
 
 
-def _has_parts(survey: Survey) -> bool:
+def _has_parts(survey: SurveyFile) -> bool:
     """Whether photographs are measured one by one; tie points belong to several at once."""
     return survey.observations is None and survey.tie_points is None
 
@@ -175,7 +202,7 @@ def _below(path: Path) -> list[Path]:
     """Return the survey files of a folder, or a file itself."""
     if not path.is_dir():
         return [path.resolve()]
-    below = sorted(path.rglob(SURVEY_NAME)) or sorted(path.glob("*.toml"))
+    below = find_files(path, f"**/{SURVEY_NAME}") or find_files(path, "*.toml")
     if not below:
         raise SurveyFileError(f"{path}: no {SURVEY_NAME} in or below this folder, nor any *.toml in it")
     return [file.resolve() for file in below]
@@ -183,26 +210,26 @@ def _below(path: Path) -> list[Path]:
 
 def _plan(files: Sequence[Path], *, allow_outside: bool) -> tuple[_Plan, ...]:
     """Read all survey files and give each a folder of its own."""
-    read: list[tuple[Path, Survey | Exception]] = []
+    read: list[tuple[Path, SurveyFile | Exception]] = []
     for file in files:
         try:
-            read.append((file, read_survey(file, allow_outside=allow_outside)))
+            read.append((file, read_survey_file(file, allow_outside=allow_outside)))
         except Exception as error:  # one that nobody has foreseen fails this survey alone
             read.append((file, error))
     names = [_folder_name(file, survey) for file, survey in read]
     often = Counter(name.casefold() for name in names)
     plans = []
     for (file, survey), name in zip(read, names, strict=True):
-        reserved = name.casefold() in (LOGS, *PAGES)
+        reserved = name.casefold() in (LOGS, MANIFEST, *PAGES)
         if often[name.casefold()] > 1 or reserved:  # told apart by what stays the same from run to run
             name = f"{name}-{hashlib.sha256(str(file).encode()).hexdigest()[:8]}"
         plans.append(_Plan(file, name, survey))
     return tuple(plans)
 
 
-def _folder_name(file: Path, survey: Survey | Exception) -> str:
+def _folder_name(file: Path, survey: SurveyFile | Exception) -> str:
     name = file.parent.name if file.name == SURVEY_NAME else file.stem
-    return folder_name(survey.name if isinstance(survey, Survey) else name)
+    return folder_name(survey.name if isinstance(survey, SurveyFile) else name)
 
 
 def _run(
@@ -239,7 +266,7 @@ def _run(
                 finish(plan.folder, _without_result(plan, out, "failed", error))
                 continue
             if earlier is not None:  # its log may be there still, of a run killed at the last moment
-                (out / LOGS / f"{plan.folder}.jsonl").unlink(missing_ok=True)
+                remove_log(out / LOGS / f"{plan.folder}.jsonl")
                 finish(plan.folder, earlier, kept=True)
                 continue
             work = works[plan.folder]
@@ -269,11 +296,13 @@ def _run(
     return rows
 
 
-def _work(job: SurveyJob, survey: Survey, comparers: Comparers) -> Work:
+def _work(job: SurveyJob, survey: SurveyFile, comparers: Comparers) -> Work:
     """Return a survey as the engine takes it: a part for each photograph with targets, and the rest."""
     parts: tuple[Call, ...] = ()
     if _has_parts(survey):
+        given = read_survey(job.file, allow_outside=job.allow_outside)
         found = find_photographs(survey)
+        refuse_unknown_photographs(given, found.names)  # before the photographs are measured
         parts = tuple(
             Call(measure_one, (job, survey, name, path))
             for name, path in zip(found.names, found.paths, strict=True)
@@ -283,17 +312,16 @@ def _work(job: SurveyJob, survey: Survey, comparers: Comparers) -> Work:
 
 def _without_result(plan: _Plan, out: Path, status: str, error: Exception) -> SurveyRow:
     """Return the row of a survey that no worker has brought to its end, and write its log."""
-    name = plan.survey.name if isinstance(plan.survey, Survey) else plan.folder
+    name = plan.survey.name if isinstance(plan.survey, SurveyFile) else plan.folder
     with SurveyLog(out / LOGS / f"{plan.folder}.jsonl", append=True) as log:
         return failed_row(log, error, SurveyRow(name, as_plain(str(plan.file)), plan.folder, status))
 
 
 def _clean(out: Path, plans: Sequence[_Plan]) -> None:
     """Remove what killed workers left half-written, but not what others are writing beside this batch."""
-    TargetStore(out / STORE).remove_parts()
     for plan in plans:
         if any(out.glob(f".{glob.escape(plan.folder)}.*")):
             with suppress(FolderInUseError), locked(lock_of(out, plan.folder)):
                 remove_leftovers(out / plan.folder)
-    for page in PAGES:
+    for page in (MANIFEST, *PAGES):
         remove_leftovers(out / page)

@@ -18,17 +18,20 @@ from sfm.faults import is_fault, told_of_error
 from sfm.files.folder_lock import Owner, locked, owner_of
 from sfm.files.plain_text import as_plain
 from sfm.kernels.compiling import when_compiling
-from sfm.pipeline import adjust_survey, run_survey
-from sfm.report.log import LOG, SurveyLog, read_log, result_entries
+from sfm.pipeline import run_survey
+from sfm.report.findings.findings import findings_of
+from sfm.report.log import LOG, SurveyLog, read_log, remove_log, result_entries
 from sfm.report.output import write_result
 from sfm.result import SurveyResult
 from sfm.survey.comparison import OtherPrograms
-from sfm.survey.inputs.start import find_photographs
-from sfm.survey.inputs.survey_file import Survey, read_survey
-from sfm.survey.target_store import STORE, TargetStore
-from sfm.survey.targets import measure_photograph, survey_family
+from sfm.survey.inputs.photograph_list import find_photographs
+from sfm.survey.inputs.survey import Survey, read_survey, survey_family
+from sfm.survey.inputs.survey_file import SurveyFile
+from sfm.survey.target_store import TargetStore
+from sfm.survey.targets import measure_photograph
+from sfm.targets.detect import Targets
 
-LOCK = ".kolinear/lock"  # of the batch
+LOCK = ".lock"  # of the batch
 VERDICTS = ("good", "fair", "bad")
 LOGS = "logs"  # folder of the logs of surveys that have no result
 
@@ -43,11 +46,6 @@ class SurveyJob:
     inputs: str  # fingerprint of everything that the survey reads
     allow_outside: bool  # whether the survey file may name files outside its folder
     owner: Owner | None  # of the folder of the batch, who asked for this
-
-    @property
-    def store(self) -> TargetStore:
-        """Where targets are kept."""
-        return TargetStore(self.out / STORE)
 
 
 @dataclass(frozen=True)
@@ -68,6 +66,14 @@ class PhotographNote:
     stored: bool = False  # measured in an earlier run
     seconds: float = 0.0
     failed: str = ""  # why it could not be read
+
+
+@dataclass(frozen=True)
+class MeasuredPhotograph:
+    """A photograph as the worker that measured it hands it to the one that goes on."""
+
+    note: PhotographNote
+    held: dict[str, tuple[Targets, bool]]  # as of a TargetStore; computers may have no common one
 
 
 @dataclass(frozen=True)
@@ -100,23 +106,26 @@ def lock_of(out: Path, folder: str) -> Path:
     return out / f".{folder}.lock"
 
 
-def measure_one(job: SurveyJob, survey: Survey, image: str, path: Path, *, tell: Tell) -> PhotographNote:
-    """Measure one photograph into the store; why it cannot be read is part of what is returned."""
+def measure_one(
+    job: SurveyJob, survey: SurveyFile, image: str, path: Path, *, tell: Tell
+) -> MeasuredPhotograph:
+    """Measure one photograph; why it cannot be read is part of what is returned."""
     begun = time.perf_counter()
+    store = TargetStore.of_user()
     try:
-        family = survey_family(survey)
+        family = survey_family(survey.targets, survey.codes)
         with when_compiling(lambda: tell({"compiling": True})):
-            targets, stored = measure_photograph(path, survey.targets, family, job.store)
+            targets, stored = measure_photograph(path, survey.targets, family, store)
     except Exception as error:  # one that nobody has foreseen fails the survey, which comes upon it again
         note = PhotographNote(image, failed=as_plain(told_of_error(error)))
     else:
         note = PhotographNote(image, len(targets), len(targets.rejected_xy), stored)
     tell({"photograph": image})
-    return replace(note, seconds=round(time.perf_counter() - begun, 4))
+    return MeasuredPhotograph(replace(note, seconds=round(time.perf_counter() - begun, 4)), store.held)
 
 
 def reconstruct(
-    job: SurveyJob, comparers: Comparers, photographs: list[PhotographNote], *, tell: Tell
+    job: SurveyJob, comparers: Comparers, photographs: list[MeasuredPhotograph], *, tell: Tell
 ) -> SurveyRow:
     """Run a survey whose photographs are measured, and write its result.
 
@@ -138,13 +147,14 @@ def reconstruct(
     live = job.out / LOGS / f"{job.folder}.jsonl"
     with SurveyLog(live, watch=_Telling(tell)) as log, when_compiling(lambda: tell({"compiling": True})):
         log.start(name, job.file, inputs=job.inputs)
-        for note in photographs:
-            log.note("photograph", **asdict(note))
-        before = sum(note.seconds for note in photographs)
+        for photograph in photographs:
+            log.note("photograph", **asdict(photograph.note))
+        before = sum(photograph.note.seconds for photograph in photographs)
+        held = {key: found for photograph in photographs for key, found in photograph.held.items()}
         try:
             survey = read_survey(job.file, allow_outside=job.allow_outside)
             name = survey.name
-            row = _run(job, survey, comparers, log, lambda: before + time.perf_counter() - begun)
+            row = _run(job, survey, comparers, held, log, lambda: before + time.perf_counter() - begun)
         except Exception as error:
             if isinstance(error, OutputError) and not isinstance(error, FolderInUseError):
                 log.note("failed", reason=str(error))  # others will not be written, either
@@ -152,7 +162,7 @@ def reconstruct(
             seconds = round(before + time.perf_counter() - begun, 3)
             row = SurveyRow(name, str(job.file), job.folder, "failed", seconds=seconds)
             return failed_row(log, error, row)
-    live.unlink(missing_ok=True)  # the result has it
+    remove_log(live)  # the result has it
     return row
 
 
@@ -170,7 +180,7 @@ def failed_row(log: SurveyLog, error: Exception, row: SurveyRow) -> SurveyRow:
     return replace(row, reason=reason, fault=fault)
 
 
-def fingerprint(survey: Survey) -> str:
+def fingerprint(survey: SurveyFile) -> str:
     """Return a SHA-256 of what a survey reads: tables by content, photographs by name, size and date.
 
     Raises:
@@ -219,23 +229,29 @@ def _is_sound(row: SurveyRow) -> bool:
 
 
 def _run(
-    job: SurveyJob, survey: Survey, comparers: Comparers, log: SurveyLog, seconds: Callable[[], float]
+    job: SurveyJob,
+    survey: Survey,
+    comparers: Comparers,
+    held: dict[str, tuple[Targets, bool]],
+    log: SurveyLog,
+    seconds: Callable[[], float],
 ) -> SurveyRow:
     others = comparers.others_of(survey)
-    if survey.observations is not None:
-        result = adjust_survey(survey, others=others, progress=log)
-    else:
-        result = run_survey(survey, others=others, store=job.store, progress=log)
+    store = replace(TargetStore.of_user(), held=held)
+    result = run_survey(survey, others=others, store=store, progress=log)
     log.stage("report")
+    findings = findings_of(result)
     row: list[SurveyRow] = []
 
     def close_log(folder: Path) -> None:
         _refuse_ended(job)
-        row.append(_row(job, result_entries(result), round(seconds(), 3)))
-        log.close_into(folder, result, seconds=row[0].seconds)
+        row.append(_row(job, result_entries(findings), round(seconds(), 3)))
+        log.close_into(folder, findings, seconds=row[0].seconds)
 
     with locked(lock_of(job.out, job.folder), job.out / job.folder):
-        write_result(result, job.out / job.folder, write_colmap=comparers.writer_of(result), finish=close_log)
+        write_result(
+            findings, job.out / job.folder, write_colmap=comparers.writer_of(result), finish=close_log
+        )
     return row[0]
 
 

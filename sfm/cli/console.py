@@ -11,11 +11,9 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextC
 from rich.table import Table
 from rich.text import Text
 
-from sfm.report.checks import count_observations, words_of_check, words_of_sigma0
-from sfm.report.markup import finer_unit, significant
-from sfm.report.precision import point_precision
-from sfm.report.statistics import statistics_of, words_of_test
-from sfm.report.verdict import verdict_of
+from sfm.report.findings.findings import Findings
+from sfm.report.numbers import finer_unit, significant
+from sfm.report.phrases import words_of_check, words_of_sigma0, words_of_test
 from sfm.result import SurveyResult
 
 MAX_WARNINGS = 5  # without --verbose
@@ -65,19 +63,19 @@ def drawn_progress() -> Iterator[Drawn]:
         bar.remove_task(bar.task_ids[-1])
 
 
-def tell_result(result: SurveyResult, page: Path, *, seconds: float, verbose: bool) -> bool:
+def tell_result(findings: Findings, page: Path, *, seconds: float, verbose: bool) -> bool:
     """Print the summary: verdict, figures with their units, what failed, where the report is.
 
     Returns:
         Whether the result can be depended on.
     """
+    result, verdict = findings.result, findings.verdict
     a = result.adjustment
-    verdict = verdict_of(result)
     console = Console(highlight=False)
     console.print(Text(verdict.headline, style=f"bold {COLOURS[verdict.level]}"), soft_wrap=True)
     table = Table(show_header=False, box=None, padding=(0, 2, 0, 0))
-    figures = (*_figures(result), ("time", f"{seconds:.1f} s, report included"))
-    for name, value in (*figures, *(_details(result) if verbose else ())):
+    figures = (*_figures(findings), ("time", f"{seconds:.1f} s, report included"))
+    for name, value in (*figures, *(_details(findings) if verbose else ())):
         table.add_row(Text(name, style="dim"), Text(value))
     console.print(table)
     for line in verdict.remarks:
@@ -105,12 +103,13 @@ def tell_result(result: SurveyResult, page: Path, *, seconds: float, verbose: bo
     return verdict.level != "bad"
 
 
-def _figures(result: SurveyResult) -> tuple[tuple[str, str], ...]:
+def _figures(findings: Findings) -> tuple[tuple[str, str], ...]:
     """Return the figures of the summary, each with its unit."""
+    result, precision = findings.result, findings.precision
     a = result.adjustment
     coded = int((result.code >= 0).sum())
     rejected = int(a.rejected.sum())
-    typical, largest = (float(value) for value in point_precision(a)[:2, 3])
+    typical, largest = float(precision.rms[3]), float(precision.largest[3])
     factor, unit = finer_unit(result.length_unit, largest)
     rows = [
         ("photographs", f"{len(a.network.images)} of {result.images_total} oriented"),
@@ -123,7 +122,7 @@ def _figures(result: SurveyResult) -> tuple[tuple[str, str], ...]:
         ("datum", f"{a.datum}, rank defect {a.defect} (expected {a.expected_defect})"),
         (
             "sigma0",
-            f"{', '.join(words_of_sigma0(result))}, redundancy {a.redundancy}",
+            f"{', '.join(words_of_sigma0(findings.sigma0))}, redundancy {a.redundancy}",
         ),
         ("residuals", f"RMS {a.rms_px:.4f} px per coordinate, largest {a.max_residual_px:.3f} px"),
         (
@@ -131,9 +130,8 @@ def _figures(result: SurveyResult) -> tuple[tuple[str, str], ...]:
             f"{significant(typical * factor)} {unit} RMS, {significant(largest * factor)} {unit} at most",
         ),
     ]
-    check = result.control_check
-    if check is not None:
-        rows.append(("check at control", words_of_check(check, result.length_unit)))
+    if findings.check is not None:
+        rows.append(("check at control", words_of_check(findings.check, result.length_unit)))
     both = result.comparison
     if both is not None:
         word = "agrees" if both.agree else "DIFFERS"
@@ -159,14 +157,14 @@ def _figures(result: SurveyResult) -> tuple[tuple[str, str], ...]:
     return tuple(rows)
 
 
-def _details(result: SurveyResult) -> tuple[tuple[str, str], ...]:
+def _details(findings: Findings) -> tuple[tuple[str, str], ...]:
     """Return further figures, for --verbose."""
+    result, counts = findings.result, findings.counts
     a = result.adjustment
-    counts = count_observations(a)
     rows = [
         ("observations", f"{counts.total}: {counts.image} image coordinates, {counts.control} of control, "
          f"{counts.scale_bars} scale bars; {counts.constraints} constraints, {a.unknowns} unknowns"),
-        *(("global test", words_of_test(test)) for test in statistics_of(result).global_tests),
+        *(("global test", words_of_test(test)) for test in findings.statistics.global_tests),
     ]  # fmt: skip
     found = result.eccentricity
     if found is not None:

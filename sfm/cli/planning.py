@@ -49,12 +49,12 @@ def target_size_command(
     diameter = pixels x sensor width x distance / (c x photograph width), over the cosine of the tilt.
     """
     with loading():
+        from sfm.targets.codes.families import code_family
         from sfm.targets.codes.rings import CodeFamily
-        from sfm.targets.codes.tags import target_family
 
     if unit not in UNITS:
         raise SurveyFileError(f"--unit {unit}: needed {', '.join(UNITS[:-1])} or {UNITS[-1]}")
-    codes = target_family(family)
+    codes = code_family(family)
     if not isinstance(codes, CodeFamily):
         raise SurveyFileError(f"--family {family}: needed rings, such as ring14")
     size = target_size(

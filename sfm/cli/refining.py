@@ -36,11 +36,13 @@ def refine(
     with loading():
         from adapters.colmap.camera_models import read_model, write_model
         from sfm.cli.console import drawn_progress
-        from sfm.files.whole_files import whole_folder
+        from sfm.files.whole_files import refuse_links, whole_folder
         from sfm.survey.refine import refine_model, refinement_text
 
-    if out is not None and out.exists():
-        raise OutputError(f"{out}: exists already, the refined model needs a new folder")
+    if out is not None:
+        refuse_links(out)
+        if out.exists():
+            raise OutputError(f"{out}: exists already, the refined model needs a new folder")
     with working_on(str(model)):
         network, estimate = read_model(model)
     with drawn_progress() as progress:

@@ -29,10 +29,10 @@ def validate(
         from adapters.colmap.covariance import ColmapBackend
         from sfm.cli.console import drawn_progress
         from sfm.comparison.adjuster_validation import validate as validate_networks
-        from sfm.report.pages import refuse_other_files
-        from sfm.report.validation import FILES, in_words, largest, write_validation
+        from sfm.files.whole_files import refuse_foreign_folder
+        from sfm.report.validation import in_words, largest, write_validation
 
-    refuse_other_files(out, FILES)
+    refuse_foreign_folder(out)
     with drawn_progress() as progress:
         found = validate_networks(ColmapBackend(), networks=networks, seed=seed, jobs=jobs, progress=progress)
     page = write_validation(found, out)
@@ -70,10 +70,10 @@ def compare(
     with loading():
         from adapters.formats.registry import read_comparable
         from sfm.comparison.significance import compare_results
-        from sfm.report.differences import FILES, largest_difference, words_of_test, write_differences
-        from sfm.report.pages import refuse_other_files
+        from sfm.files.whole_files import refuse_foreign_folder
+        from sfm.report.differences import largest_difference, words_of_test, write_differences
 
-    refuse_other_files(out, FILES)
+    refuse_foreign_folder(out)
     with working_on(str(a)):
         first = read_comparable(a, a_format)
     with working_on(str(b)):

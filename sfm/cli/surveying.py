@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import os
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -18,9 +15,8 @@ from sfm.errors import KolinearError
 from sfm.faults import FAULT, working_on
 
 if TYPE_CHECKING:
-    from sfm.result import SurveyResult
     from sfm.survey.comparison import OtherPrograms
-    from sfm.survey.inputs.survey_file import Survey
+    from sfm.survey.inputs.survey import Survey
 
 FAILED = 1  # exit code where a survey, or one of a batch, has no dependable result
 
@@ -68,38 +64,7 @@ def run(
     Exit code 0 with a result, remarks or none; 1 if the result cannot be depended on, the report says
     why; 2 where a person must put something right.
     """
-    begun = time.perf_counter()
-    with loading():
-        from sfm.cli.console import drawn_progress, tell_result
-        from sfm.pipeline import run_survey
-        from sfm.report.log import SurveyLog
-        from sfm.report.output import write_result
-        from sfm.survey.inputs.survey_file import read_survey
-        from sfm.survey.target_store import STORE, TargetStore
-
-    with working_on(str(survey_file)):
-        survey = read_survey(survey_file, allow_outside=allow_outside)
-    if survey.observations is not None:
-        raise KolinearError(
-            f"{survey_file}: it has [observations] in place of photographs: kolinear adjust {survey_file}"
-        )
-    others = _others(survey)
-    folder = _folder(survey, out)
-    workers = jobs or _cores()
-    store = TargetStore(folder.parent / STORE)
-    with drawn_progress() as drawn, _threads(), _written(folder), SurveyLog(watch=drawn) as log:
-        log.start(survey.name, survey_file)
-        result = run_survey(survey, images_dir=images, jobs=workers, others=others, store=store, progress=log)
-        page = write_result(
-            result,
-            folder,
-            write_colmap=_colmap_writer(result),
-            finish=lambda part: log.close_into(part, result),
-            jobs=workers,
-            progress=log,
-        )
-    if not tell_result(result, page, seconds=time.perf_counter() - begun, verbose=verbose):
-        raise SystemExit(FAILED)
+    _run_survey(survey_file, images, out, jobs, allow_outside, verbose, from_photographs=True)
 
 
 def adjust(
@@ -111,33 +76,61 @@ def adjust(
     result, remarks or none; 1 if the result cannot be depended on, the report says why; 2 where a person
     must put something right.
     """
+    _run_survey(survey_file, None, out, None, allow_outside, verbose, from_photographs=False)
+
+
+def _run_survey(
+    survey_file: Path,
+    images: Path | None,
+    out: Path | None,
+    jobs: int | None,
+    allow_outside: bool,
+    verbose: bool,
+    *,
+    from_photographs: bool,
+) -> None:
+    """Run a survey, write its result and tell it; `from_photographs` is what the command is for."""
     begun = time.perf_counter()
     with loading():
+        from sfm.api import colmap_writer, cores, one_blas_thread, programs_of
         from sfm.cli.console import drawn_progress, tell_result
-        from sfm.pipeline import adjust_survey
+        from sfm.pipeline import run_survey
+        from sfm.report.findings.findings import findings_of
         from sfm.report.log import SurveyLog
         from sfm.report.output import write_result
-        from sfm.survey.inputs.survey_file import read_survey
+        from sfm.survey.inputs.survey import read_survey
+        from sfm.survey.target_store import TargetStore
 
     with working_on(str(survey_file)):
         survey = read_survey(survey_file, allow_outside=allow_outside)
-    if survey.observations is None:
+    if from_photographs and survey.observations is not None:
+        raise KolinearError(
+            f"{survey_file}: it has [observations] in place of photographs: kolinear adjust {survey_file}"
+        )
+    if not from_photographs and survey.observations is None:
         raise KolinearError(
             f"{survey_file}: it has no [observations]; with photographs: kolinear run {survey_file}"
         )
-    others = _others(survey)
+    others = programs_of(survey.compare.backend, survey.compare.baseline)
     folder = _folder(survey, out)
-    with drawn_progress() as drawn, _threads(), _written(folder), SurveyLog(watch=drawn) as log:
+    workers = (jobs or cores()) if from_photographs else 1
+    store = None
+    if from_photographs:
+        store = TargetStore.of_user()
+        store.remove_old()
+    with drawn_progress() as drawn, one_blas_thread(), _written(folder), SurveyLog(watch=drawn) as log:
         log.start(survey.name, survey_file)
-        result = adjust_survey(survey, others=others, progress=log)
+        result = run_survey(survey, images_dir=images, jobs=workers, others=others, store=store, progress=log)
+        findings = findings_of(result)
         page = write_result(
-            result,
+            findings,
             folder,
-            write_colmap=_colmap_writer(result),
-            finish=lambda part: log.close_into(part, result),
+            write_colmap=colmap_writer(result),
+            finish=lambda part: log.close_into(part, findings),
+            jobs=workers,
             progress=log,
         )
-    if not tell_result(result, page, seconds=time.perf_counter() - begun, verbose=verbose):
+    if not tell_result(findings, page, seconds=time.perf_counter() - begun, verbose=verbose):
         raise SystemExit(FAILED)
 
 
@@ -187,6 +180,7 @@ def batch(
         from rich.console import Console
 
         from adapters.dask_cluster import fitting_workers, local_engine, remote_engine
+        from sfm.api import colmap_writer
         from sfm.batch.run import calls_of, find_surveys, run_batch
         from sfm.batch.survey import Comparers
         from sfm.batch.table import BatchTable, print_batch, stopping_at_terminate
@@ -202,7 +196,7 @@ def batch(
             files,
             out,
             engine,
-            Comparers(_others_of_worker, _colmap_writer),
+            Comparers(_others_of_worker, colmap_writer),
             table,
             resume=resume,
             allow_outside=allow_outside,
@@ -214,51 +208,21 @@ def batch(
         raise SystemExit(FAILED)
 
 
-def _others(survey: Survey, *, threads: int = -1) -> OtherPrograms:
-    """Return the programs that the survey wants to be compared with; their library is imported only then."""
-    from sfm.survey.comparison import OtherPrograms
-
-    others = OtherPrograms()
-    if survey.compare.backend == "colmap":
-        from adapters.colmap.covariance import adjust_with_covariance
-
-        others = replace(others, adjuster=adjust_with_covariance)
-    if survey.compare.baseline == "mapper":
-        from adapters.colmap.mapper import map_photographs
-
-        others = replace(others, mapper=partial(map_photographs, threads=threads))
-    return others
-
-
 def _others_of_worker(survey: Survey) -> OtherPrograms:
-    """Return the same for a worker of a batch, one of as many as there are cores."""
-    return _others(survey, threads=1)
+    """Return what a survey is compared with in a worker of a batch, one of as many as there are cores."""
+    from sfm.api import programs_of
 
-
-def _colmap_writer(result: SurveyResult) -> Callable[[Path], None] | None:
-    """Return what writes the result in COLMAP's model, the solution that was compared; None without one."""
-    both = result.comparison
-    if both is None:
-        return None
-    from adapters.colmap.camera_models import write_model
-
-    return lambda folder: write_model(folder, both.network, both.adjustment.estimate)
+    return programs_of(survey.compare.backend, survey.compare.baseline, threads=1)
 
 
 def _folder(survey: Survey, out: Path | None) -> Path:
     """Return the folder of the result, before any work is done for one that cannot be used."""
-    from sfm.report.output import folder_name, refuse_foreign_folder
+    from sfm.files.whole_files import refuse_foreign_folder
+    from sfm.report.output import folder_name
 
     out = Path("out") / folder_name(survey.name) if out is None else out
     refuse_foreign_folder(out)
     return out
-
-
-def _cores() -> int:
-    """Return how many processor cores this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
 
 
 @contextmanager
@@ -269,13 +233,4 @@ def _written(folder: Path) -> Iterator[None]:
 
     with locked(folder.parent / f".{folder.name}.lock", folder):
         remove_leftovers(folder)
-        yield
-
-
-@contextmanager
-def _threads() -> Iterator[None]:
-    """Hold BLAS to one thread: photographs are worked on side by side, and two BLAS pools in turn fight."""
-    from threadpoolctl import threadpool_limits
-
-    with threadpool_limits(limits=1, user_api="blas"):
         yield

@@ -49,23 +49,28 @@ class ValidationAdjustment(BackendAdjustment, Protocol):
     """What the other adjuster must return, and why it stopped."""
 
     @property
-    def message(self) -> str: ...
+    def message(self) -> str:
+        """Why it stopped."""
 
 
 class ValidationCovariance(Protocol):
     """Covariances for image coordinates of standard deviation 1 px."""
 
     @property
-    def interior(self) -> tuple[FloatArray, ...]: ...  # marginal, of the free parameters
+    def interior(self) -> tuple[FloatArray, ...]:
+        """Marginal, of the free parameters of each camera."""
+
     @property
-    def points(self) -> FloatArray: ...  # conditional on photographs and cameras, (n, 3, 3)
+    def points(self) -> FloatArray:
+        """Conditional on photographs and cameras, (n, 3, 3)."""
 
 
 class ValidationBackend(Protocol):
     """The other adjuster: a module or an object with a name and these two functions."""
 
     @property
-    def name(self) -> str: ...
+    def name(self) -> str:
+        """What it is called."""
 
     def adjust(self, network: Network, start: Estimate, *, control: bool) -> ValidationAdjustment:
         """Adjust with unit weights, control points held or the datum free."""

@@ -114,13 +114,21 @@ class BackendAdjustment(Protocol):
     """What another adjuster must return."""
 
     @property
-    def estimate(self) -> Estimate: ...
+    def estimate(self) -> Estimate:
+        """The solution."""
+
     @property
-    def iterations(self) -> int: ...
+    def iterations(self) -> int:
+        """Steps taken."""
+
     @property
-    def converged(self) -> bool: ...
+    def converged(self) -> bool:
+        """Whether it says that it has converged."""
+
     @property
-    def seconds(self) -> float: ...
+    def seconds(self) -> float:
+        """Time of the adjustment alone, s."""
+
     @property
     def point_covariance(self) -> FloatArray | None:
         """Of the points, photographs and cameras held, for image coordinates of 1 px; None without."""
@@ -137,13 +145,20 @@ def compare(
     """Compare two solutions of the same network, whatever datum each is in.
 
     Args:
-        a, b: the solutions; photographs and points that only one of them has are not compared.
+        a: first solution.
+        b: second solution; photographs and points that only one of them has are not compared.
         network: the image points for the residuals of both.
         names: what to call a and b.
         thresholds: differences up to which they agree.
 
+    Returns:
+        Differences b - a after a similarity of b onto a, and which thresholds they exceed.
+
     Raises:
         GeometryError: fewer than three points in common, or all of them on a line.
+
+    Source: the 7-parameter similarity of Horn (1987) over all points, as for any two free networks: Caspary
+    (2000), Concepts of network and deformation analysis, sec. 7.
     """
     limits = Thresholds() if thresholds is None else thresholds
     both = a.determined & b.determined
@@ -272,7 +287,7 @@ def rotation_angle_deg(a: FloatArray, b: FloatArray) -> FloatArray:
     D = np.einsum("kji,kjl->kil", a, b)
     sine = np.stack([D[:, 2, 1] - D[:, 1, 2], D[:, 0, 2] - D[:, 2, 0], D[:, 1, 0] - D[:, 0, 1]], axis=1) / 2
     cosine = (np.trace(D, axis1=1, axis2=2) - 1) / 2
-    return np.rad2deg(np.arctan2(np.linalg.norm(sine, axis=1), cosine))
+    return np.asarray(np.rad2deg(np.arctan2(np.linalg.norm(sine, axis=1), cosine)))
 
 
 def interior_effect_px(a: Camera, b: Camera) -> float:

@@ -10,13 +10,13 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numba import njit
 from scipy.optimize import least_squares
 
 from sfm.camera import Camera, camera_from_values, pixel_from_tangents, tangents_from_pixel
 from sfm.conventions import BoolArray, FloatArray
 from sfm.distortion.models import MAX_PARAMETERS, MODELS, observe
 from sfm.errors import GeometryError, SurveyFileError
+from sfm.kernels.options import compiled
 from sfm.network import Estimate
 
 GRID_STEPS = 32  # fit points along the longer side: the misfit varies as r^9 at most, four of them per period
@@ -69,7 +69,7 @@ def convert_camera(
     (2020), sec. 3.3; the fit is by least squares.
     """
     if model not in MODELS:
-        raise SurveyFileError(f"camera {camera.name}: model '{model}' is none of {', '.join(MODELS)}")
+        raise SurveyFileError(f"camera {camera.name}: model '{model}', expected one of {', '.join(MODELS)}")
     if model == camera.model and not needs_less(camera, held):
         return Conversion(camera, model, 0.0, 0.0)
     xy = _grid(camera, region_px)
@@ -242,9 +242,11 @@ def _grid(camera: Camera, region_px: FloatArray | None) -> FloatArray:
     return np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
 
 
-@njit(cache=True, error_model="numpy")
-def _residuals(model, frame, p, xy, uv):  # type: ignore[no-untyped-def]
-    """Residuals (k, 2) and their derivatives by the parameters (k, 2, n) at given pixels and rays."""
+@compiled
+def _residuals(
+    model: int, frame: FloatArray, p: FloatArray, xy: FloatArray, uv: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return residuals (k, 2) and their derivatives by the parameters (k, 2, n) at given pixels and rays."""
     r, Ju, Jp = np.empty(2), np.empty((2, 2)), np.zeros((2, MAX_PARAMETERS))
     residuals = np.empty((len(xy), 2))
     jacobian = np.empty((len(xy), 2, len(p)))

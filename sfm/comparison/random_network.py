@@ -136,7 +136,7 @@ def _draw(rng: np.random.Generator) -> Plan:
 
 
 def _log_uniform(rng: np.random.Generator, low: int, high: int) -> int:
-    return round(np.exp(rng.uniform(np.log(low), np.log(high))))
+    return round(float(np.exp(rng.uniform(np.log(low), np.log(high)))))
 
 
 def _camera(rng: np.random.Generator, plan: Plan, number: int) -> Camera:

@@ -14,7 +14,6 @@ Concepts of network and deformation analysis, sec. 7.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Protocol
 
 import numpy as np
 from scipy.stats import chi2, f
@@ -23,46 +22,14 @@ from sfm.comparison.adjusters import rotation_angle_deg
 from sfm.comparison.camera_conversion import Conversion, convert_camera
 from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.errors import GeometryError
-from sfm.network import Estimate, Network
+from sfm.network import Network
 from sfm.similarity import Similarity, fit_similarity
+from sfm.stored_result import StoredResult
 
 ALIGNMENTS = ("points", "cameras", "control", "none")
 SAME_PX = 1e-3  # image points closer than this are one measurement
 SAME_SHARE = 0.5  # of a's image points that b has too, from which on they are not independent
 ALPHA = 0.05  # level of the global test; single points are tested at ALPHA / number of points (Bonferroni)
-
-
-@dataclass(frozen=True)
-class Result:
-    """One result to be compared: kolinear's own, COLMAP's or another program's."""
-
-    name: str  # what people call it
-    network: Network
-    estimate: Estimate
-    point_covariance: FloatArray | None = None  # marginal, object unit^2, (n, 3, 3)
-    position_covariance: FloatArray | None = None  # of projection centres, object unit^2, (m, 3, 3)
-    interior_sigma: tuple[FloatArray, ...] | None = None  # of each parameter, NaN where fixed
-    redundancy: int | None = None  # of the adjustment, for the test's degrees of freedom
-    unit: str = ""  # of lengths, as people call it; empty where nobody knows
-
-
-class ResultLike(Protocol):
-    """What is compared: a Result, or what an adapter read that has the same fields."""
-
-    @property
-    def name(self) -> str: ...
-    @property
-    def network(self) -> Network: ...
-    @property
-    def estimate(self) -> Estimate: ...
-    @property
-    def point_covariance(self) -> FloatArray | None: ...
-    @property
-    def interior_sigma(self) -> tuple[FloatArray, ...] | None: ...
-    @property
-    def redundancy(self) -> int | None: ...
-    @property
-    def unit(self) -> str: ...
 
 
 @dataclass(frozen=True)
@@ -115,8 +82,8 @@ class ResultComparison:
 
 
 def compare_results(
-    a: ResultLike,
-    b: ResultLike,
+    a: StoredResult,
+    b: StoredResult,
     *,
     align: str = "points",
     control: tuple[str, ...] = (),
@@ -125,7 +92,8 @@ def compare_results(
     """Align b to a and test the differences.
 
     Args:
-        a, b: the results; points and photographs are recognised by their names.
+        a: first result.
+        b: second result; points and photographs are recognised by their names.
         align: points (all common ones), cameras (projection centres), control (the named points) or none.
         control: names of the points for align = control.
         alpha: probability of calling something a change that is none.
@@ -134,7 +102,7 @@ def compare_results(
         GeometryError: an unknown alignment, too little in common for it, or nothing in common at all.
     """
     if align not in ALIGNMENTS:
-        raise GeometryError(f"comparison: align '{align}' is none of {', '.join(ALIGNMENTS)}")
+        raise GeometryError(f"comparison: align '{align}', expected one of {', '.join(ALIGNMENTS)}")
     pa, pb = _common(a.network.points, a.estimate.determined, b.network.points, b.estimate.determined)
     ia, ib = _common(a.network.images, a.estimate.oriented, b.network.images, b.estimate.oriented)
     point_names = tuple(a.network.points[j] for j in pa)
@@ -186,8 +154,8 @@ def _common(
 
 
 def _align(
-    a: ResultLike,
-    b: ResultLike,
+    a: StoredResult,
+    b: StoredResult,
     align: str,
     points: tuple[IntArray, IntArray],
     images: tuple[IntArray, IntArray],
@@ -211,7 +179,7 @@ def _align(
     return fit_similarity(source, target)
 
 
-def _has_sigma(result: ResultLike) -> bool:
+def _has_sigma(result: StoredResult) -> bool:
     return result.point_covariance is not None and bool(np.isfinite(result.point_covariance).any())
 
 
@@ -245,7 +213,7 @@ def _sum(
 
 
 def _tests(
-    a: ResultLike, b: ResultLike, difference: FloatArray, covariance: FloatArray, alpha: float
+    a: StoredResult, b: StoredResult, difference: FloatArray, covariance: FloatArray, alpha: float
 ) -> tuple[FloatArray, float, float]:
     """T of each point, its critical value for one of all points, and that of the mean of T."""
     n = len(difference)
@@ -269,7 +237,7 @@ def _tests(
     return statistic, float(f.isf(one, 3, freedom)), float(f.isf(every, 3 * tested, freedom))
 
 
-def _interior(a: ResultLike, b: ResultLike, ia: IntArray, ib: IntArray) -> tuple[InteriorDifference, ...]:
+def _interior(a: StoredResult, b: StoredResult, ia: IntArray, ib: IntArray) -> tuple[InteriorDifference, ...]:
     """Differences of the cameras that took the same photographs, each pair once."""
     found = []
     pairs = dict.fromkeys(zip(a.network.camera[ia].tolist(), b.network.camera[ib].tolist(), strict=True))

@@ -24,7 +24,8 @@ def undistort(network: Network, estimate: Estimate, models: tuple[str, ...]) -> 
     The rays are the same to rounding; covariances of image points follow.
 
     Args:
-        network, estimate: interior orientation must be known.
+        network: measured image points.
+        estimate: cameras they were measured with.
         models: that the ideal cameras may be in, with all distortion 0; brown or opencv must be one of them.
 
     Raises:

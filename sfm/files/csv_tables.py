@@ -11,7 +11,7 @@ import csv
 import math
 import sys
 from array import array
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TextIO
@@ -31,13 +31,18 @@ MAX_NUMBER = 1e12  # no length, angle or pixel is larger; squares and products o
 
 @dataclass(frozen=True)
 class CsvTable:
-    """Columns of a CSV file, with what is needed to say where something is wrong."""
+    """Columns of a CSV file or of arrays, with what is needed to say where something is wrong."""
 
-    path: Path
+    path: Path  # of arrays what they are
     names: tuple[str, ...]  # of the columns of text
     texts: tuple[tuple[str, ...], ...]  # one tuple per column of text
     values: FloatArray  # columns of numbers, (rows, columns)
     line: IntArray  # line of each row in the file, (rows,)
+    word: str = "line"  # what the numbers count: row of arrays
+
+    def place(self, row: int) -> str:
+        """Return in words where a row stands."""
+        return f"{self.path}, {self.word} {self.line[row]}"
 
     def keys(self, column: str) -> tuple[str, ...]:
         """Return a column of names that are all different."""
@@ -48,7 +53,7 @@ class CsvTable:
     def refuse(self, values: FloatArray, wrong: BoolArray, columns: tuple[str, ...], needed: str) -> None:
         """Raise SurveyFileError for the first value of a mask, both (rows, columns)."""
         for k, c in np.argwhere(wrong)[:1]:
-            where = f"{self.path}, line {self.line[k]}: column {columns[c]}"
+            where = f"{self.place(k)}: column {columns[c]}"
             raise SurveyFileError(f"{where} holds {values[k, c]:g}, needed {needed}")
 
     def refuse_duplicates(self, keys: tuple[object, ...], columns: tuple[str, ...]) -> None:
@@ -60,7 +65,9 @@ class CsvTable:
             if key in first:
                 names = key if isinstance(key, tuple) else (key,)
                 what = ", ".join(f"{c} '{name}'" for c, name in zip(columns, names, strict=True))
-                raise SurveyFileError(f"{self.path}, line {line}: {what} stands on line {first[key]} already")
+                raise SurveyFileError(
+                    f"{self.path}, {self.word} {line}: {what} stands on {self.word} {first[key]} already"
+                )
             first[key] = line
 
 
@@ -127,13 +134,52 @@ def read_table(
     )
 
 
+def array_table(
+    what: str,
+    texts: Mapping[str, Sequence[str]],
+    numbers: Mapping[str, FloatArray],
+    *,
+    blank: tuple[str, ...] = (),
+) -> CsvTable:
+    """Return arrays as a table, as if they had been read from a file.
+
+    Args:
+        what: the arrays are, for messages.
+        texts: columns of names.
+        numbers: columns of numbers, as long.
+        blank: columns of numbers that may be NaN.
+
+    Raises:
+        SurveyFileError: columns of different length, none at all, a bad name, or not a finite number of
+            bearable size.
+    """
+    rows = len(next(iter(texts.values())))
+    for name, column in texts.items():
+        if len(column) != rows:
+            raise SurveyFileError(f"{what}: {len(column)} values of {name}, expected {rows}")
+    if not rows:
+        raise SurveyFileError(f"{what}: no rows, at least one is needed")
+    names = tuple(
+        tuple(_name(str(cell), f"{what}, row {k}: {name}") for k, cell in enumerate(column, 1))
+        for name, column in texts.items()
+    )
+    values = np.column_stack(list(numbers.values()))
+    table = CsvTable(Path(what), tuple(texts), names, values, np.arange(1, rows + 1), "row")
+    wrong = ~(np.abs(values) <= MAX_NUMBER)
+    wrong &= ~(np.isnan(values) & np.isin(list(numbers), blank))
+    table.refuse(values, wrong, tuple(numbers), f"a finite number of at most {MAX_NUMBER:g}")
+    return table
+
+
 def _rows(path: Path, columns: int) -> Iterator[tuple[int, list[str]]]:
     """Yield line number and cells of every row below the header that is not empty."""
     with _opened(path) as file:
-        reader = csv.reader(_lines(path, file))
+        lines = _Lines(path, file)
+        reader = csv.reader(lines)
         try:
             next(reader, None)
             for row in reader:
+                lines.characters = 0
                 if not any(cell.strip() for cell in row):
                     continue
                 if len(row) != columns:
@@ -151,23 +197,37 @@ def _rows(path: Path, columns: int) -> Iterator[tuple[int, list[str]]]:
             raise SurveyFileError(f"{path}: the table cannot be read: {error.strerror}") from error
 
 
-def _lines(path: Path, file: TextIO) -> Iterator[str]:
-    """Yield the lines of a file, none longer than a line can be, and not more than twice the rows."""
-    for number in range(1, 2 * MAX_ROWS):
-        line = file.readline(MAX_LINE + 1)
+class _Lines:
+    """The lines of a file: no row of them longer than a line can be, and not more than twice the rows."""
+
+    def __init__(self, path: Path, file: TextIO) -> None:
+        self.path, self.file = path, file
+        self.number = 0
+        self.characters = 0  # of the row so far, which quoted cells spread over lines
+
+    def __iter__(self) -> _Lines:
+        return self
+
+    def __next__(self) -> str:
+        line = self.file.readline(MAX_LINE + 1)
         if not line:
-            return
-        if len(line) > MAX_LINE:
-            raise SurveyFileError(f"{path}, line {number}: more than {MAX_LINE} characters, not a CSV table")
-        yield line
-    raise SurveyFileError(f"{path}: more than {2 * MAX_ROWS} lines, no more are read")
+            raise StopIteration
+        self.number += 1
+        if self.number >= 2 * MAX_ROWS:
+            raise SurveyFileError(f"{self.path}: more than {2 * MAX_ROWS} lines, no more are read")
+        self.characters += len(line)
+        if self.characters > MAX_LINE:
+            raise SurveyFileError(
+                f"{self.path}, line {self.number}: more than {MAX_LINE} characters, not a CSV table"
+            )
+        return line
 
 
 def read_header(path: Path) -> tuple[str, ...]:
     """Return the names of the columns."""
     with _opened(path) as file:
         try:
-            return tuple(name.strip() for name in next(csv.reader(_lines(path, file)), []))
+            return tuple(name.strip() for name in next(csv.reader(_Lines(path, file)), []))
         except (UnicodeDecodeError, csv.Error) as error:
             raise SurveyFileError(f"{path}, line 1: not a CSV table in UTF-8; save it as such") from error
         except OSError as error:

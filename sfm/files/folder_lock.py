@@ -1,7 +1,8 @@
 """The lock of a folder: one run at a time writes into it, and everybody can read who.
 
 The operating system holds the lock and lets go of it when the process ends, however it ends. So a lock file
-that nobody holds is stale by that alone, and no process number has to be trusted.
+that nobody holds is stale by that alone, and no process number has to be trusted. It lies beside what it
+locks, where the runs of other computers on the same disk see it.
 """
 
 from __future__ import annotations
@@ -9,16 +10,19 @@ from __future__ import annotations
 import json
 import os
 import platform
-import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
+from filelock import lock_descriptor, unlock_descriptor
+
 from sfm.errors import FolderInUseError, OutputError
+from sfm.files.whole_files import make_folder, open_own
 
 MAX_OWNER_BYTES = 10_000  # of the text in a lock file
+TEXT_AT = 1  # Windows keeps others from reading the locked byte, the first
 
 
 @dataclass(frozen=True)
@@ -46,29 +50,38 @@ def locked(path: Path, folder: Path | None = None) -> Iterator[Owner | None]:
 
     Raises:
         FolderInUseError: another run holds the lock.
-        OutputError: the file cannot be written.
+        OutputError: the file cannot be written, or is no lock.
     """
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
+        make_folder(path.parent)
         handle = _open_and_lock(path, folder or path.parent)
     except OSError as error:
         raise OutputError(f"{path}: the lock cannot be written: {error.strerror or error}") from error
+    ours = False
     try:
         try:
             before = _owner(handle)
+            if before is None and os.fstat(handle).st_size:
+                raise OutputError(f"{path}: is no lock of Kolinear, and is left alone; remove it")
+            ours = True
             _write_owner(handle)
         except OSError as error:
             raise OutputError(f"{path}: the lock cannot be written: {error.strerror or error}") from error
         yield before
     finally:
-        _release(handle, path)
+        if ours:
+            os.ftruncate(handle, 0)  # an empty one is nobody's, where an open file cannot be removed
+            with suppress(OSError):
+                path.unlink()  # while it is still held: whoever waits for it opens a new one
+        unlock_descriptor(handle)
+        os.close(handle)
 
 
 def owner_of(path: Path) -> Owner | None:
     """Read who holds the lock file `path`, or has left it behind; None if nobody says so."""
     try:
-        handle = os.open(path, os.O_RDONLY)
-    except OSError:
+        handle = open_own(path, os.O_RDONLY)
+    except (OSError, OutputError):
         return None
     try:
         return _owner(handle)
@@ -79,17 +92,15 @@ def owner_of(path: Path) -> Owner | None:
 def _open_and_lock(path: Path, folder: Path) -> int:
     """Open and lock the file that stands at `path` now, not one that its owner has just removed."""
     while True:
-        handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
-        if not _try_lock(handle):
+        handle = open_own(path, os.O_RDWR | os.O_CREAT)
+        if not lock_descriptor(handle, blocking=False):
             owner = _owner(handle)
             os.close(handle)
             who = f" ({owner})" if owner else ""
             raise FolderInUseError(f"{folder}: another run is writing into this folder{who}; wait or end it")
-        try:
+        with suppress(FileNotFoundError):
             if os.path.samestat(os.fstat(handle), os.stat(path)):
                 return handle
-        except FileNotFoundError:
-            pass
         os.close(handle)
 
 
@@ -98,47 +109,15 @@ def _write_owner(handle: int) -> None:
     text = json.dumps(asdict(Owner(os.getpid(), platform.node(), now)))
     os.ftruncate(handle, 0)
     os.lseek(handle, 0, os.SEEK_SET)
-    os.write(handle, text.encode())
+    os.write(handle, b" " * TEXT_AT + text.encode())
     os.fsync(handle)
 
 
 def _owner(handle: int) -> Owner | None:
     """Read who holds a lock; None if nobody says so."""
     try:
-        os.lseek(handle, 0, os.SEEK_SET)
+        os.lseek(handle, TEXT_AT, os.SEEK_SET)
         found = json.loads(os.read(handle, MAX_OWNER_BYTES))
         return Owner(int(found["process"]), str(found["computer"]), str(found["since"]))
     except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return None
-
-
-if sys.platform == "win32":
-    import msvcrt
-
-    LOCKED_AT = 1 << 30  # Windows keeps others from reading the locked byte, so it lies behind the text
-
-    def _try_lock(handle: int) -> bool:
-        os.lseek(handle, LOCKED_AT, os.SEEK_SET)
-        try:
-            msvcrt.locking(handle, msvcrt.LK_NBLCK, 1)
-        except OSError:
-            return False
-        return True
-
-    def _release(handle: int, path: Path) -> None:
-        os.ftruncate(handle, 0)  # an open file cannot be removed here; an empty one is nobody's
-        os.close(handle)
-
-else:
-    import fcntl
-
-    def _try_lock(handle: int) -> bool:
-        try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            return False
-        return True
-
-    def _release(handle: int, path: Path) -> None:
-        path.unlink(missing_ok=True)  # while it is still held: whoever waits for it opens a new one
-        os.close(handle)

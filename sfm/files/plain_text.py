@@ -21,6 +21,7 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 
 MAX_NAME = 500  # characters of a name that is read from a file
+SHOWN = 40  # characters of what was found that a message repeats
 
 # What nobody sees, or what changes how the text around it is seen: categories Cc, Cf, Cs, Zl and Zp, and all
 # else that is ignored by default.
@@ -69,6 +70,16 @@ def is_plain(text: str) -> bool:
     are none of these either.
     """
     return _HIDDEN.search(text) is None
+
+
+def is_name(text: str) -> bool:
+    """Whether a text is fit for a name that is read from a file."""
+    return 0 < len(text) <= MAX_NAME and is_plain(text)
+
+
+def shown(text: str) -> str:
+    """Return the beginning of a text as a message can repeat it."""
+    return as_plain(text[:SHOWN])
 
 
 def as_plain(text: str) -> str:

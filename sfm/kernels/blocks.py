@@ -8,19 +8,22 @@ Source: vector types and `contract` (fused multiply-add): LLVM Language Referenc
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 from llvmlite import ir
+from numba import extending
 from numba.core import types
-from numba.extending import intrinsic
+
+from sfm.conventions import FloatArray
 
 SIX = ir.VectorType(ir.DoubleType(), 6)
 FUSED = ("contract",)
+_intrinsic: Any = extending.intrinsic  # whose own types are those of the code that is generated
 ALIGNED = 8  # bytes; no more is known of where six numbers lie
 
 
-@intrinsic
-def subtract_pair(_, flat, at, stride, Y, s, t):  # type: ignore[no-untyped-def]
+def _subtract_pair(_: Any, flat: Any, at: Any, stride: Any, Y: Any, s: Any, t: Any) -> Any:
     """Take Y_s Y_t' off 6 x 6 numbers: flat[at + q stride + p] -= sum_r Y[s, r, q] Y[t, r, p].
 
     Args:
@@ -28,10 +31,11 @@ def subtract_pair(_, flat, at, stride, Y, s, t):  # type: ignore[no-untyped-def]
         at: place of the first of them.
         stride: from one row to the next.
         Y: rows Y' of image points, contiguous, (k, 3, 6).
-        s, t: two of them.
+        s: one of them.
+        t: another.
     """
 
-    def generate(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         flat, at, stride, Y, s, t = arguments
         numbers = _data(context, builder, signature.args[0], flat)
         rows = _data(context, builder, signature.args[3], Y)
@@ -51,19 +55,20 @@ def subtract_pair(_, flat, at, stride, Y, s, t):  # type: ignore[no-untyped-def]
     return types.void(flat, types.intp, types.intp, Y, types.intp, types.intp), generate
 
 
-@intrinsic
-def add_product(_, YQ, s, Y, t, flat, at, stride):  # type: ignore[no-untyped-def]
+def _add_product(_: Any, YQ: Any, s: Any, Y: Any, t: Any, flat: Any, at: Any, stride: Any) -> Any:
     """Add Y_t' Q to YQ_s: YQ[s, r, p] += sum_q Y[t, r, q] flat[at + q stride + p].
 
     Args:
-        YQ, Y: rows of image points, contiguous, (k, 3, 6).
-        s, t: two of them.
+        YQ: what is added to, rows of image points, contiguous, (k, 3, 6).
+        s: image point of YQ.
+        Y: rows of image points, contiguous, (k, 3, 6).
+        t: image point of Y.
         flat: contiguous numbers, (any,).
         at: place of the first of 6 x 6 numbers Q.
         stride: from one row to the next.
     """
 
-    def generate(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         YQ, s, Y, t, flat, at, stride = arguments
         sums = _data(context, builder, signature.args[0], YQ)
         rows = _data(context, builder, signature.args[2], Y)
@@ -81,6 +86,12 @@ def add_product(_, YQ, s, Y, t, flat, at, stride):  # type: ignore[no-untyped-de
         return context.get_dummy_value()
 
     return types.void(YQ, types.intp, Y, types.intp, flat, types.intp, types.intp), generate
+
+
+subtract_pair: Callable[[FloatArray, int, int, FloatArray, int, int], None] = _intrinsic(_subtract_pair)
+add_product: Callable[[FloatArray, int, FloatArray, int, FloatArray, int, int], None] = _intrinsic(
+    _add_product
+)
 
 
 def _data(context: Any, builder: Any, kind: Any, array: Any) -> Any:

@@ -25,7 +25,7 @@ def when_compiling(tell: Callable[[], None]) -> Iterator[None]:
         yield
 
 
-class _First(Listener):  # type: ignore[misc]  # numba has no types
+class _First(Listener):
     """Hears of every kernel, tells of the first."""
 
     def __init__(self, tell: Callable[[], None]) -> None:

@@ -9,9 +9,9 @@ Newton steps, and a turning point that touches zero within rounding counts as a 
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from sfm.conventions import FloatArray
+from sfm.kernels.options import compiled_fused
 
 MAX_ROOTS = 8  # four roots, each of which may be reported once more as a touching turning point
 TOUCH = 1e-9  # |f| at a turning point over sum |coefficient| below which it counts as a double root
@@ -29,6 +29,9 @@ def positive_roots(coefficients: FloatArray) -> FloatArray:
 
     Returns:
         Roots in ascending order; near-double roots may appear as two close values, shape (r,).
+
+    Source: Ferrari, in Abramowitz and Stegun (1964), sec. 3.8.3; bracketed Newton steps, Press et al. (2007),
+    Numerical Recipes, sec. 9.4.
     """
     roots = np.empty(MAX_ROOTS)
     G4, G3, G2, G1, G0 = np.asarray(coefficients, dtype=float)
@@ -36,8 +39,8 @@ def positive_roots(coefficients: FloatArray) -> FloatArray:
     return np.sort(roots[:n])
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract"})
-def find_positive_roots(g0, g1, g2, g3, g4, roots):  # type: ignore[no-untyped-def]
+@compiled_fused
+def find_positive_roots(g0: float, g1: float, g2: float, g3: float, g4: float, roots: FloatArray) -> int:
     """Fill the positive roots of g0 + g1 x + ... + g4 x^4 and return their number."""
     n = _roots_by_factors(g0, g1, g2, g3, g4, roots)
     if n >= 0:
@@ -50,8 +53,8 @@ def find_positive_roots(g0, g1, g2, g3, g4, roots):  # type: ignore[no-untyped-d
     return m
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract"})
-def _roots_by_factors(g0, g1, g2, g3, g4, roots):  # type: ignore[no-untyped-def]
+@compiled_fused
+def _roots_by_factors(g0: float, g1: float, g2: float, g3: float, g4: float, roots: FloatArray) -> int:
     """Ferrari: x^4 + a x^3 + b x^2 + c x + d = (x^2 + p x + q)(x^2 + r x + s); -1 if it is not safe."""
     reverse = abs(g0) > abs(g4)
     if reverse:
@@ -98,8 +101,8 @@ def _roots_by_factors(g0, g1, g2, g3, g4, roots):  # type: ignore[no-untyped-def
     return n
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract"})
-def _largest_cubic_root(b, c, d):  # type: ignore[no-untyped-def]
+@compiled_fused
+def _largest_cubic_root(b: float, c: float, d: float) -> float:
     """Largest real root of y^3 + b y^2 + c y + d (Cardano, Vieta), polished by one Newton step."""
     shift = b / 3.0
     p = c / 3.0 - shift * shift
@@ -118,8 +121,10 @@ def _largest_cubic_root(b, c, d):  # type: ignore[no-untyped-def]
     return y
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract"})
-def _roots_in_unit_interval(g0, g1, g2, g3, g4, roots, n):  # type: ignore[no-untyped-def]
+@compiled_fused
+def _roots_in_unit_interval(
+    g0: float, g1: float, g2: float, g3: float, g4: float, roots: FloatArray, n: int
+) -> int:
     """Append the roots of the quartic in (0, 1] behind the first n and return the new number."""
     # turning points of the quartic are the roots of its derivative, whose turning points are those of
     # a quadratic
@@ -168,9 +173,11 @@ def _roots_in_unit_interval(g0, g1, g2, g3, g4, roots, n):  # type: ignore[no-un
     return n
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract"})
-def _bracketed(g0, g1, g2, g3, g4, low, high, f_low):  # type: ignore[no-untyped-def]
-    """Newton's method kept inside a bracket by bisection."""
+@compiled_fused
+def _bracketed(
+    g0: float, g1: float, g2: float, g3: float, g4: float, low: float, high: float, f_low: float
+) -> float:
+    """Return the root in a bracket by Newton's method, kept inside by bisection."""
     x = 0.5 * (low + high)
     rising = f_low < 0.0
     for _ in range(STEPS):

@@ -8,11 +8,10 @@ weights add up to 1, and at whole pixels each kernel returns the pixel itself.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from sfm.conventions import AnyArray, FloatArray
 from sfm.errors import GeometryError
-from sfm.kernels.options import compiled
+from sfm.kernels.options import compiled, compiled_fast, inlined_fast
 
 NEAREST, BILINEAR, BICUBIC, SIX_TAP = 0, 1, 2, 3
 INTERPOLATIONS = {"nearest": NEAREST, "bilinear": BILINEAR, "bicubic": BICUBIC, "six_tap": SIX_TAP}
@@ -27,7 +26,7 @@ def interpolation_index(name: str) -> int:
         GeometryError: no such kernel.
     """
     if name not in INTERPOLATIONS:
-        raise GeometryError(f"interpolation '{name}' is none of {', '.join(INTERPOLATIONS)}")
+        raise GeometryError(f"interpolation '{name}', expected one of {', '.join(INTERPOLATIONS)}")
     return INTERPOLATIONS[name]
 
 
@@ -54,8 +53,8 @@ def resample(photograph: AnyArray, xy: FloatArray, *, interpolation: str = "six_
     return np.asarray(_resample(grey, places.reshape(-1, 2), kind)).reshape(places.shape[:-1])
 
 
-@njit(cache=True, nogil=True)
-def _resample(grey, xy, kind):  # type: ignore[no-untyped-def]
+@compiled
+def _resample(grey: AnyArray, xy: FloatArray, kind: int) -> FloatArray:
     """Each place with as many pixels as its kernel has, so that those near the border are served too."""
     height, width = grey.shape
     wx, wy = np.zeros(TAPS, np.float32), np.zeros(TAPS, np.float32)
@@ -84,8 +83,8 @@ def _resample(grey, xy, kind):  # type: ignore[no-untyped-def]
     return out
 
 
-@njit(cache=True, nogil=True, fastmath=True)
-def kernel_weights(kind, t, w):  # type: ignore[no-untyped-def]
+@compiled_fast
+def kernel_weights(kind: int, t: np.float32, w: AnyArray) -> None:
     """Fill the weights of the pixels -2 ... 3 for the fraction t of a pixel, 0 <= t <= 1."""
     one = np.float32(1.0)
     half = np.float32(0.5)
@@ -115,8 +114,8 @@ def kernel_weights(kind, t, w):  # type: ignore[no-untyped-def]
             w[2], w[3] = (one, np.float32(0.0)) if t < half else (np.float32(0.0), one)
 
 
-@njit(cache=True, nogil=True, fastmath=True, inline="always")
-def sample(flat, at, width, wx, wy):  # type: ignore[no-untyped-def]
+@inlined_fast
+def sample(flat: AnyArray, at: np.uintp, width: np.uintp, wx: AnyArray, wy: AnyArray) -> np.float32:
     """Weighted mean of 6 rows of 8 pixels of a photograph stored row by row, the first of them at `at`.
 
     Unsigned places (np.uintp) spare the test for negative ones and make a row one vector: three times faster.

@@ -74,11 +74,13 @@ def match_points(
     """Find points of the left photograph in the right one.
 
     Args:
-        left, right: photographs, (H, W), 8 or 16 bit, grey or colour.
+        left: photograph, (H, W), 8 or 16 bit or float, grey or colour.
+        right: the other photograph.
         xy_left: points in the left photograph, px, (k, 2).
         xy_right: centres of the search windows, px, (k, 2); the same places as in the left if not given.
         method: ncc, or ncc and then shift (2), lsm (6) or lsm8 (8 geometric parameters).
-        template_px, search_px: odd sides of template and search window; document 002 has 19 and 21.
+        template_px: odd side of the template; document 002 has 19.
+        search_px: odd side of the search window; document 002 has 21.
         equalise: equalise the histograms of both photographs before least squares matching.
         interpolation: six_tap, bicubic or bilinear; see `sfm.matching.lsm.two_photo.match_lsm`.
         min_correlation: smallest r of a match. Least squares matching is started from 0.5 on, as the warp
@@ -94,7 +96,7 @@ def match_points(
     Source: document 002, sec. 2 (equations 2.1 to 2.20).
     """
     if method not in METHODS:
-        raise GeometryError(f"matching: method '{method}' is none of {', '.join(METHODS)}")
+        raise GeometryError(f"matching: method '{method}', expected one of {', '.join(METHODS)}")
     a = np.asarray(xy_left, dtype=float).reshape(-1, 2)
     b = a if xy_right is None else np.asarray(xy_right, dtype=float).reshape(-1, 2)
     least = min_correlation if method == "ncc" else min(min_correlation, START_CORRELATION)

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from sfm.camera import project, tangents_from_pixel
 from sfm.conventions import FloatArray, IntArray, skew
+from sfm.kernels.options import compiled
 from sfm.network import Estimate
 
 VERTICES = 65  # of a path; between them distortion bends it by less than 0.1 px on ordinary lenses
@@ -48,9 +48,11 @@ def epipolar_paths(
     Args:
         estimate: orientation of both photographs.
         camera: index of the camera of each photograph, (m,).
-        left, right: the photographs.
+        left: index of the photograph of the points.
+        right: index of the other photograph.
         xy: points in the left photograph, px, (k, 2).
-        nearest, farthest: depths along the axis of the left camera between which the points are, object unit.
+        nearest: smallest depth of the points along the axis of the left camera, object unit.
+        farthest: largest depth, object unit.
 
     Returns:
         k polygons (n, 2) in px, from near to far; points behind the right camera are left out. Use them with
@@ -72,13 +74,14 @@ def epipolar_paths(
     return tuple(paths)
 
 
-@njit(cache=True)
-def epipolar_distance(E, ui, vi, uj, vj):  # type: ignore[no-untyped-def]
-    """Distance of (uj, vj) from the epipolar line of (ui, vi), in tangents; inf where there is no line."""
+@compiled
+def epipolar_distance(E: FloatArray, ui: float, vi: float, uj: float, vj: float) -> float:
+    """Return how far (uj, vj) is from the epipolar line of (ui, vi), tangents; inf where there is no line."""
     l0 = E[0, 0] * ui + E[0, 1] * vi - E[0, 2]
     l1 = E[1, 0] * ui + E[1, 1] * vi - E[1, 2]
     l2 = E[2, 0] * ui + E[2, 1] * vi - E[2, 2]
     slope = np.sqrt(l0 * l0 + l1 * l1)
     if slope < 1e-15:
         return np.inf
-    return abs(l0 * uj + l1 * vj - l2) / slope
+    distance: float = abs(l0 * uj + l1 * vj - l2) / slope
+    return distance

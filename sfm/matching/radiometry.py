@@ -47,11 +47,11 @@ def grey_of(photograph: AnyArray) -> AnyArray:
     """
     array = np.asarray(photograph)
     if array.dtype not in (np.uint8, np.uint16, np.float32, np.float64):
-        raise PhotographError(f"found {array.dtype} intensities, needed 8 or 16 bit or float")
+        raise PhotographError(f"found {array.dtype} intensities, expected 8 or 16 bit or float")
     if array.ndim == 3 and array.shape[2] == 3:
         array = array.astype(np.float32) @ np.array(LUMINANCE, dtype=np.float32)
     if array.ndim != 2 or array.size == 0:
-        raise PhotographError(f"found a photograph of shape {array.shape}, needed (H, W) or (H, W, 3)")
+        raise PhotographError(f"found a photograph of shape {array.shape}, expected (H, W) or (H, W, 3)")
     if array.dtype.kind == "f" and not np.isfinite(array).all():
         raise PhotographError(
             "found intensities that are not finite, needed numbers in all of the photograph"
@@ -101,6 +101,9 @@ def patch_around(photograph: AnyArray, centre: tuple[int, int], side_px: int) ->
 def radiometry_of(patch: AnyArray) -> Radiometry:
     """Return mean, standard deviation and extremes of a patch or photograph.
 
+    Args:
+        patch: shape (H, W) or (H, W, 3), 8 or 16 bit or float.
+
     Source: document 002, eq. 2.1 (mean and standard deviation of the grey values).
     """
     values = grey_of(patch).astype(float)
@@ -109,14 +112,23 @@ def radiometry_of(patch: AnyArray) -> Radiometry:
 
 
 def histogram(photograph: AnyArray) -> IntArray:
-    """Return the number of pixels at each intensity, (256,) or (65536,) for 16 bit; colour is turned grey."""
+    """Return the number of pixels at each intensity, (256,) or (65536,) for 16 bit.
+
+    Args:
+        photograph: shape (H, W) or (H, W, 3); colour is turned grey.
+
+    Raises:
+        PhotographError: intensities beyond the scale.
+
+    Source: document 002, sec. II.1.1.1.
+    """
     levels = LEVELS_16 if photograph.dtype == np.uint16 else LEVELS_8
     values = np.rint(grey_of(photograph)).astype(np.int64).ravel()
     if values.min() < 0 or values.max() >= levels:
         raise PhotographError(
             f"intensities from {values.min()} to {values.max()}, a histogram needs 0 to {levels - 1}"
         )
-    return np.bincount(values, minlength=levels)
+    return np.asarray(np.bincount(values, minlength=levels))
 
 
 def equalise_histogram(photograph: AnyArray) -> AnyArray:
@@ -124,6 +136,9 @@ def equalise_histogram(photograph: AnyArray) -> AnyArray:
 
     The lowest intensity becomes 0, the highest the end of the scale; a photograph of one intensity is
     returned as it is.
+
+    Args:
+        photograph: shape (H, W) or (H, W, 3), 8 or 16 bit or float of the scale of 8 bit.
 
     Source: Gonzalez and Woods, Digital Image Processing, sec. 3.3.1; 8 bit is cv2.equalizeHist.
     """
@@ -137,17 +152,23 @@ def equalise_histogram(photograph: AnyArray) -> AnyArray:
     if rest == 0:
         return values.astype(kind)
     share = (np.cumsum(counts) - counts[first]) / rest
-    return np.rint(np.clip(share, 0, 1) * (len(counts) - 1)).astype(kind)[values]
+    return np.asarray(np.rint(np.clip(share, 0, 1) * (len(counts) - 1)).astype(kind)[values])
 
 
 def fit_radiometry(source: AnyArray, target: AnyArray) -> LinearRadiometry:
     """Return offset and gain that bring the intensities of one patch nearest to another, pixel by pixel.
 
     Args:
-        source, target: patches of the same shape.
+        source: patch, shape (H, W) or (H, W, 3).
+        target: patch of the same shape.
+
+    Returns:
+        Offset, gain and the coefficient r.
 
     Raises:
         GeometryError: patches of different shape.
+
+    Source: the radiometric part of least squares matching, Gruen (1985); document 002, sec. II.1.2.1.2.
     """
     a, b = grey_of(source).astype(float), grey_of(target).astype(float)
     if a.shape != b.shape:
@@ -164,7 +185,12 @@ def fit_radiometry(source: AnyArray, target: AnyArray) -> LinearRadiometry:
 def match_brightness(source: AnyArray, target: AnyArray) -> FloatArray:
     """Return the source with mean and standard deviation of the target; the two need not show the same.
 
-    A flat source is given the mean only.
+    Args:
+        source: photograph or patch; a flat one is given the mean only.
+        target: photograph or patch.
+
+    Returns:
+        Intensities in units of the target, shape (H, W) of the source.
 
     Source: Kraus (2007), sec. 3.5 (contrast and brightness transfer).
     """

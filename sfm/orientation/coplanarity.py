@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from sfm.conventions import FloatArray
 from sfm.errors import GeometryError
-from sfm.orientation.resection.least_squares import solve_scaled, turn
+from sfm.kernels.options import compiled
+from sfm.kernels.small_algebra import cross, solve_scaled, turn
 
 UNKNOWNS = 5
 MAX_STEPS = 30
@@ -21,8 +21,10 @@ def refine_coplanarity(
     """Return base, rotation, residuals and cofactors by least squares on the coplanarity condition.
 
     Args:
-        first, second: tangents of conjugate rays, shape (n, 2) each, n >= 5.
-        base, rotation: start values, shapes (3,) and (3, 3).
+        first: tangents u = -U/W, v = -V/W of rays of photograph 1, shape (n, 2), n >= 5.
+        second: the conjugate rays of photograph 2, shape (n, 2).
+        base: approximate direction from projection centre 1 to 2 in image axes 1, shape (3,).
+        rotation: approximate R, image axes 2 to image axes 1, shape (3, 3).
 
     Returns:
         Base (unit), rotation, distances from coplanarity in tangents (n,), and Qxx (5, 5) of two small
@@ -49,7 +51,19 @@ def refine_coplanarity(
 def coplanarity_residuals(
     first: FloatArray, second: FloatArray, base: FloatArray, rotation: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the distances from coplanarity in tangents, (n,), and the normal matrix of the five, (5, 5)."""
+    """Return how far conjugate rays are from coplanarity, and the normal matrix of the five parameters.
+
+    Args:
+        first: tangents u = -U/W, v = -V/W of rays of photograph 1, shape (n, 2).
+        second: the conjugate rays of photograph 2, shape (n, 2).
+        base: unit vector from projection centre 1 to 2 in image axes 1, shape (3,).
+        rotation: R, image axes 2 to image axes 1, shape (3, 3).
+
+    Returns:
+        Distances in tangents, (n,); normal matrix of two turns of b and of w in R exp([w]x), (5, 5).
+
+    Source: as `refine_coplanarity`.
+    """
     residuals, N, b = np.empty(len(first)), np.empty((UNKNOWNS, UNKNOWNS)), np.empty(UNKNOWNS)
     uv1, uv2 = np.ascontiguousarray(first, dtype=float), np.ascontiguousarray(second, dtype=float)
     _coplanarity_normals(uv1, uv2, base, rotation, residuals, N, b)
@@ -64,8 +78,10 @@ def turned_pair(base: FloatArray, rotation: FloatArray, step: FloatArray) -> tup
     return new_base, new_rotation
 
 
-@njit(cache=True, error_model="numpy")
-def _adjust_coplanarity(uv1, uv2, base, R, residuals, N):  # type: ignore[no-untyped-def]
+@compiled
+def _adjust_coplanarity(
+    uv1: FloatArray, uv2: FloatArray, base: FloatArray, R: FloatArray, residuals: FloatArray, N: FloatArray
+) -> bool:
     """Gauss-Newton in place with halved steps; False if singular."""
     b5, dx = np.empty(5), np.empty(5)
     new_base, new_R, new_N, new_b = np.empty(3), np.empty((3, 3)), np.empty((5, 5)), np.empty(5)
@@ -93,9 +109,9 @@ def _adjust_coplanarity(uv1, uv2, base, R, residuals, N):  # type: ignore[no-unt
     return True
 
 
-@njit(cache=True, error_model="numpy")
-def _across(base, p, q):  # type: ignore[no-untyped-def]
-    """Two unit vectors across the base."""
+@compiled
+def _across(base: FloatArray, p: FloatArray, q: FloatArray) -> None:
+    """Fill two unit vectors at right angles to the base."""
     k = 0
     for d in range(1, 3):
         if abs(base[d]) < abs(base[k]):
@@ -103,22 +119,29 @@ def _across(base, p, q):  # type: ignore[no-untyped-def]
     p[:] = -base[k] * base
     p[k] += 1.0
     p /= np.sqrt(p[0] ** 2 + p[1] ** 2 + p[2] ** 2)
-    q[0] = base[1] * p[2] - base[2] * p[1]
-    q[1] = base[2] * p[0] - base[0] * p[2]
-    q[2] = base[0] * p[1] - base[1] * p[0]
+    cross(base, p, q)
 
 
-@njit(cache=True, error_model="numpy")
-def _turn_base(base, s, t, out):  # type: ignore[no-untyped-def]
+@compiled
+def _turn_base(base: FloatArray, s: float, t: float, out: FloatArray) -> None:
+    """Fill the base turned by two small angles across it."""
     p, q = np.empty(3), np.empty(3)
     _across(base, p, q)
     out[:] = base + s * p + t * q
     out /= np.sqrt(out[0] ** 2 + out[1] ** 2 + out[2] ** 2)
 
 
-@njit(cache=True, error_model="numpy")
-def _coplanarity_normals(uv1, uv2, base, R, residuals, N, b5):  # type: ignore[no-untyped-def]
-    """Normal equations of (two turns of b, w); each equation divided by its gradient; returns v'v."""
+@compiled
+def _coplanarity_normals(
+    uv1: FloatArray,
+    uv2: FloatArray,
+    base: FloatArray,
+    R: FloatArray,
+    residuals: FloatArray,
+    N: FloatArray,
+    b5: FloatArray,
+) -> float:
+    """Fill the normal equations of (two turns of b, w), each divided by its gradient; return v'v."""
     N[:] = 0.0
     b5[:] = 0.0
     p, q = np.empty(3), np.empty(3)
@@ -131,9 +154,9 @@ def _coplanarity_normals(uv1, uv2, base, R, residuals, N, b5):  # type: ignore[n
         for d in range(3):
             r2[d] = R[d, 0] * x + R[d, 1] * y - R[d, 2]
         # e = b . (r1 x r2) = r1 . (r2 x b) = r2 . (b x r1)
-        _cross(r2, base, g)
-        _cross(base, r1, h)
-        _cross(r1, r2, a)
+        cross(r2, base, g)
+        cross(base, r1, h)
+        cross(r1, r2, a)
         e = base[0] * a[0] + base[1] * a[1] + base[2] * a[2]
         # gradient with respect to the image coordinates of both photographs
         gx = R[0, 0] * h[0] + R[1, 0] * h[1] + R[2, 0] * h[2]
@@ -157,10 +180,3 @@ def _coplanarity_normals(uv1, uv2, base, R, residuals, N, b5):  # type: ignore[n
             for k in range(5):
                 N[m, k] += J[m] * J[k]
     return cost
-
-
-@njit(cache=True, error_model="numpy")
-def _cross(a, b, out):  # type: ignore[no-untyped-def]
-    out[0] = a[1] * b[2] - a[2] * b[1]
-    out[1] = a[2] * b[0] - a[0] * b[2]
-    out[2] = a[0] * b[1] - a[1] * b[0]

@@ -32,12 +32,12 @@ class FiducialTransformation:
 
     def invert(self, photo: FloatArray) -> FloatArray:
         """Return measured coordinates of photo coordinates, comparator unit, shape (..., 2)."""
-        return (np.asarray(photo, dtype=float) - self.shift) @ np.linalg.inv(self.matrix).T
+        return np.asarray((np.asarray(photo, dtype=float) - self.shift) @ np.linalg.inv(self.matrix).T)
 
     @property
     def scales(self) -> FloatArray:
         """Scale along the two measured axes, mm per comparator unit, (2,)."""
-        return np.linalg.norm(self.matrix, axis=0)
+        return np.asarray(np.linalg.norm(self.matrix, axis=0))
 
     @property
     def rotation(self) -> float:
@@ -59,7 +59,10 @@ def orient_fiducials(
         measured: comparator or pixel coordinates, shape (n, 2). For pixels (y down) only the affine
             transformation can turn the y axis round.
         calibrated: photo coordinates of the marks from the calibration certificate, shape (n, 2), mm.
-        kind: similarity (x = a11 xm - a12 ym - xt, y = a12 xm + a11 ym - yt) or affine.
+        kind: similarity (x = a xm - b ym + tx, y = b xm + a ym + ty; 4 parameters) or affine (6 parameters).
+
+    Returns:
+        The transformation, with residuals (mm) and the covariance of its parameters.
 
     Raises:
         GeometryError: unknown kind, too few marks, or marks that do not determine it.
@@ -67,7 +70,7 @@ def orient_fiducials(
     Source: document 004, eqs. 1.2-1.9; Kraus (2007), sec. 3.2.1.
     """
     if kind not in FEWEST:
-        raise GeometryError(f"fiducial marks: kind '{kind}' is none of {', '.join(FEWEST)}")
+        raise GeometryError(f"fiducial marks: kind '{kind}', expected one of {', '.join(FEWEST)}")
     m = np.asarray(measured, dtype=float).reshape(-1, 2)
     f = np.asarray(calibrated, dtype=float).reshape(-1, 2)
     n = len(m)

@@ -10,7 +10,7 @@ import numpy as np
 from sfm.camera import Camera, project, tangents_from_pixel
 from sfm.conventions import MAD_TO_SIGMA, FloatArray
 from sfm.errors import GeometryError
-from sfm.network import Estimate, Network, empty_estimate, reduce_network
+from sfm.network import Estimate, Network, empty_estimate, reduce_network, rows_of
 from sfm.orientation.intersection import intersect
 from sfm.orientation.resection.ransac import fewest_fitting, resect_robust
 from sfm.orientation.starting_pair import Start, best_start
@@ -64,7 +64,7 @@ class Growth:
     def tolerance(self) -> FloatArray:
         """Tolerance of every photograph, tangents, (m,)."""
         c = np.array([camera.c_px for camera in self.estimate.cameras])
-        return (self.tolerance_px / c)[self.network.camera]
+        return np.asarray((self.tolerance_px / c)[self.network.camera])
 
     def residuals_px(self) -> FloatArray:
         """Length of the reprojection residual of every image point, px, inf where undetermined, (k,)."""
@@ -139,9 +139,9 @@ class Growth:
         seen = self.network.image_points
         known = self.estimate.determined[seen.point] & np.isfinite(uv).all(axis=1)
         residuals = self.residuals_px()
-        added = 0
+        of_image, added = rows_of(seen.image, len(position)), 0
         for i in images:
-            own = np.flatnonzero((seen.image == i) & known)
+            own = of_image[i][known[of_image[i]]]
             result = resect_robust(
                 uv[own],
                 self.estimate.points[seen.point[own]],

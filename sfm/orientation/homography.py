@@ -18,7 +18,8 @@ def fit_homography(
     """Return H with r2 ~ H r1 for rays r = (u, v, -1), and the pairs that fit it.
 
     Args:
-        first, second: tangents of conjugate rays, shape (n, 2) each, n >= 4.
+        first: tangents u = -U/W, v = -V/W of rays of photograph 1, shape (n, 2), n >= 4.
+        second: the conjugate rays of photograph 2, shape (n, 2).
         tolerance: largest residual in photograph 2, tangents.
         seed: of the random samples.
     """
@@ -51,7 +52,8 @@ def decompose_homography(
 
     Args:
         H: r2 ~ H r1 for rays r = (u, v, -1), its sign such that depths are positive, shape (3, 3).
-        first, second: tangents of conjugate rays on the plane, shape (n, 2) each.
+        first: tangents u = -U/W, v = -V/W of rays of photograph 1 to points of the plane, shape (n, 2).
+        second: the conjugate rays of photograph 2, shape (n, 2).
 
     Returns:
         The solutions that have the plane in front of photograph 1: two, one where they coincide, none for a
@@ -87,13 +89,13 @@ def _direct_homography(first: FloatArray, second: FloatArray) -> FloatArray:
     r1, r2 = rays_of(first) @ T1.T, rays_of(second) @ T2.T
     rows = np.einsum("nij,nk->nijk", skew(r2), r1).reshape(-1, 9)
     h = np.linalg.svd(rows)[2][-1].reshape(3, 3)
-    return np.linalg.inv(T2) @ h @ T1
+    return np.asarray(np.linalg.inv(T2) @ h @ T1)
 
 
 def _conditioner(uv: FloatArray) -> FloatArray:
     centre = uv.mean(axis=0)
     spread = np.sqrt(np.mean(np.sum((uv - centre) ** 2, axis=1)) / 2)
-    return np.array([[1, 0, centre[0]], [0, 1, centre[1]], [0, 0, spread]]) / spread
+    return np.asarray(np.array([[1, 0, centre[0]], [0, 1, centre[1]], [0, 0, spread]]) / spread)
 
 
 def rays_of(uv: FloatArray) -> FloatArray:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from sfm.conventions import BoolArray, FloatArray, IntArray
-from sfm.orientation.resection.least_squares import solve_scaled
+from sfm.kernels.options import compiled
+from sfm.kernels.small_algebra import solve_scaled
 
 MAX_STEPS = 20
 CONVERGED = 1e-13  # step relative to the distance of the point
@@ -48,8 +49,8 @@ def intersect(
         tangents: u = -U/W, v = -V/W of each measured ray, shape (k, 2).
         image: index of the photograph of each ray, shape (k,).
         point: index of the object point of each ray, shape (k,).
-        positions, rotations: of the photographs, shapes (m, 3) and (m, 3, 3); rays of photographs with
-            NaN are left out.
+        positions: projection centres X0, shape (m, 3), object unit; rays from NaN are left out.
+        rotations: R of the photographs, image to object axes, shape (m, 3, 3).
         n_points: number of object points; the largest index + 1 if not given.
         weights: weight matrix of each ray, shape (k, 2, 2); unit matrices if not given.
         tolerance: largest residual vector of a ray that takes part, tangents. With a finite tolerance
@@ -70,54 +71,51 @@ def intersect(
     order = np.argsort(point[usable], kind="stable")
     ray = np.flatnonzero(usable)[order]
     start = np.searchsorted(point[ray], np.arange(n + 1))
-    xyz, Q, rays, angle = (
-        np.full((n, 3), np.nan),
-        np.full((n, 3, 3), np.nan),
-        np.zeros(n, dtype=np.int64),
-        np.full(n, np.nan),
-    )
+    xyz, Q = np.full((n, 3), np.nan), np.full((n, 3, 3), np.nan)
+    count, angle = np.zeros(n, dtype=np.int64), np.full(n, np.nan)
     residuals, used = np.full((len(uv), 2), np.nan), np.zeros(len(uv), dtype=np.bool_)
-    cost = _intersect_all(
+    rays = _Rays(
         uv,
         np.ascontiguousarray(image, dtype=np.int64),
-        ray,
-        start,
         np.ascontiguousarray(positions, dtype=float),
         np.ascontiguousarray(rotations, dtype=float),
         np.ascontiguousarray(P, dtype=float),
-        tolerance * tolerance,
-        np.cos(np.radians(min_angle_deg)),
-        xyz,
-        Q,
-        rays,
-        angle,
-        residuals,
-        used,
     )
+    limit, cos_limit = tolerance * tolerance, float(np.cos(np.radians(min_angle_deg)))
+    cost = _intersect_all(rays, ray, start, limit, cos_limit, xyz, Q, count, angle, residuals, used)
     redundancy = int(2 * used.sum() - 3 * np.isfinite(xyz).all(axis=1).sum())
     sigma0 = float(np.sqrt(cost / redundancy)) if redundancy > 0 else np.nan
-    return Intersection(xyz, Q, sigma0**2 * Q, residuals, used, rays, angle, sigma0, redundancy)
+    return Intersection(xyz, Q, sigma0**2 * Q, residuals, used, count, angle, sigma0, redundancy)
 
 
-@njit(cache=True, error_model="numpy")
-def _intersect_all(  # type: ignore[no-untyped-def]
-    tangents,
-    image,
-    ray,
-    start,
-    positions,
-    rotations,
-    weights,
-    limit,
-    cos_limit,
-    xyz,
-    Q,
-    rays,
-    angle,
-    residuals,
-    used,
-):
-    """Intersect point by point; returns the sum of v'Pv over all of them."""
+class _Rays(NamedTuple):
+    """All measured rays, and the photographs they belong to."""
+
+    tangents: FloatArray  # u = -U/W, v = -V/W, (k, 2)
+    image: IntArray  # index of the photograph, (k,)
+    positions: FloatArray  # projection centres X0, object unit, (m, 3)
+    rotations: FloatArray  # R, image to object axes, (m, 3, 3)
+    weights: FloatArray  # weight matrices, (k, 2, 2)
+
+
+@compiled
+def _intersect_all(
+    rays: _Rays,
+    ray: IntArray,
+    start: IntArray,
+    limit: float,
+    cos_limit: float,
+    xyz: FloatArray,
+    Q: FloatArray,
+    number: IntArray,
+    angle: FloatArray,
+    residuals: FloatArray,
+    used: BoolArray,
+) -> float:
+    """Intersect point by point and return the sum of v'Pv over all of them.
+
+    The rays of point j are `ray[start[j]:start[j + 1]]`; a ray fits up to the squared residual `limit`.
+    """
     longest = 0
     for j in range(len(xyz)):
         longest = max(longest, start[j + 1] - start[j])
@@ -131,17 +129,15 @@ def _intersect_all(  # type: ignore[no-untyped-def]
         if m < 2:
             continue
         for i in range(m):
-            _direction(tangents[own[i]], rotations[image[own[i]]], direction[i])
+            _direction(rays, own[i], direction[i])
         if np.isinf(limit) or m == 2:
             for i in range(m):
                 used[own[i]] = True
-            if not _nearest_to_rays(own, image, positions, direction, used, N, b, X):
+            if not _nearest_to_rays(rays, own, direction, used, N, b, X):
                 _drop(own, used)
                 continue
         else:
-            score = _best_pair(
-                own, tangents, image, positions, rotations, direction, limit, used, N, b, X, best_X
-            )
+            score = _best_pair(rays, own, direction, limit, used, N, b, X, best_X)
             if np.isinf(score):
                 continue
             X[:] = best_X
@@ -151,13 +147,13 @@ def _intersect_all(  # type: ignore[no-untyped-def]
                 count = 0
                 for i in range(m):
                     k = own[i]
-                    used[k] = _square(tangents[k], positions[image[k]], rotations[image[k]], X) <= limit
+                    used[k] = _square(rays, k, X) <= limit
                     count += used[k]
                 if count < 2:
                     ok = False
                     break
             best_X[:] = X
-            ok = _least_squares(own, tangents, image, positions, rotations, weights, used, X, N, b, dx)
+            ok = _least_squares(rays, own, used, X, N, b, dx)
             if not ok:
                 X[:] = best_X
                 break
@@ -166,7 +162,7 @@ def _intersect_all(  # type: ignore[no-untyped-def]
         if ok:
             for i in range(m):
                 k = own[i]
-                square = _square(tangents[k], positions[image[k]], rotations[image[k]], X)
+                square = _square(rays, k, X)
                 if np.isinf(square) and used[k]:
                     ok = False
                 used[k] = used[k] and square <= limit
@@ -184,41 +180,51 @@ def _intersect_all(  # type: ignore[no-untyped-def]
             continue
         for i in range(m):
             k = own[i]
-            _residual(tangents[k], positions[image[k]], rotations[image[k]], X, residuals[k])
+            _residual(rays, k, X, residuals[k])
             if used[k]:
                 ru, rv = residuals[k, 0], residuals[k, 1]
-                P = weights[k]
+                P = rays.weights[k]
                 total += P[0, 0] * ru * ru + 2.0 * P[0, 1] * ru * rv + P[1, 1] * rv * rv
         xyz[j] = X
         Q[j] = np.linalg.inv(N)
-        rays[j] = count
+        number[j] = count
         angle[j] = np.arccos(max(-1.0, smallest))
     return total
 
 
-@njit(cache=True, error_model="numpy")
-def _drop(own, used):  # type: ignore[no-untyped-def]
+@compiled
+def _drop(own: IntArray, used: BoolArray) -> None:
+    """Mark rays as not taking part."""
     for i in range(len(own)):
         used[own[i]] = False
 
 
-@njit(cache=True, error_model="numpy")
-def _direction(uv, R, out):  # type: ignore[no-untyped-def]
-    """Unit vector of a ray in object axes."""
+@compiled
+def _direction(rays: _Rays, k: int, out: FloatArray) -> None:
+    """Fill the unit vector of ray k in object axes."""
+    uv, R = rays.tangents[k], rays.rotations[rays.image[k]]
     norm = np.sqrt(uv[0] * uv[0] + uv[1] * uv[1] + 1.0)
     for d in range(3):
         out[d] = (R[d, 0] * uv[0] + R[d, 1] * uv[1] - R[d, 2]) / norm
 
 
-@njit(cache=True, error_model="numpy")
-def _nearest_to_rays(own, image, positions, direction, used, N, b, X):  # type: ignore[no-untyped-def]
-    """The point with the least sum of squared distances from the rays in use: linear equations."""
+@compiled
+def _nearest_to_rays(
+    rays: _Rays,
+    own: IntArray,
+    direction: FloatArray,
+    used: BoolArray,
+    N: FloatArray,
+    b: FloatArray,
+    X: FloatArray,
+) -> bool:
+    """Fill the point with the least squared distances from the rays in use; False if there is none."""
     N[:] = 0.0
     b[:] = 0.0
     for i in range(len(own)):
         if not used[own[i]]:
             continue
-        C = positions[image[own[i]]]
+        C = rays.positions[rays.image[own[i]]]
         along = direction[i, 0] * C[0] + direction[i, 1] * C[1] + direction[i, 2] * C[2]
         for a in range(3):
             for c in range(3):
@@ -228,9 +234,19 @@ def _nearest_to_rays(own, image, positions, direction, used, N, b, X):  # type: 
     return solve_scaled(N, b, X)
 
 
-@njit(cache=True, error_model="numpy")
-def _best_pair(own, tangents, image, positions, rotations, direction, limit, used, N, b, X, best_X):  # type: ignore[no-untyped-def]
-    """The two-ray point with the least truncated squares over all rays; returns that sum (inf: none)."""
+@compiled
+def _best_pair(
+    rays: _Rays,
+    own: IntArray,
+    direction: FloatArray,
+    limit: float,
+    used: BoolArray,
+    N: FloatArray,
+    b: FloatArray,
+    X: FloatArray,
+    best_X: FloatArray,
+) -> float:
+    """Fill the two-ray point with the least truncated squares over all rays; return them (inf: none)."""
     m = len(own)
     best = np.inf
     stride = max(1, (m * (m - 1) // 2) // MAX_PAIRS)
@@ -242,12 +258,12 @@ def _best_pair(own, tangents, image, positions, rotations, direction, limit, use
                 continue
             _drop(own, used)
             used[own[i]] = used[own[h]] = True
-            if not _nearest_to_rays(own, image, positions, direction, used, N, b, X):
+            if not _nearest_to_rays(rays, own, direction, used, N, b, X):
                 continue
             score = 0.0
             fits = 0
             for k in own:
-                square = _square(tangents[k], positions[image[k]], rotations[image[k]], X)
+                square = _square(rays, k, X)
                 fits += square <= limit
                 score += min(square, limit)
                 if score >= best:
@@ -259,20 +275,23 @@ def _best_pair(own, tangents, image, positions, rotations, direction, limit, use
     return best
 
 
-@njit(cache=True, error_model="numpy")
-def _square(uv, C, R, X):  # type: ignore[no-untyped-def]
-    """Squared image residual; inf for a point behind the camera."""
+@compiled
+def _square(rays: _Rays, k: int, X: FloatArray) -> float:
+    """Return the squared image residual of ray k; inf for a point behind the camera."""
+    uv, C, R = rays.tangents[k], rays.positions[rays.image[k]], rays.rotations[rays.image[k]]
     dx, dy, dz = X[0] - C[0], X[1] - C[1], X[2] - C[2]
     W = R[0, 2] * dx + R[1, 2] * dy + R[2, 2] * dz
     if not W < 0.0:
         return np.inf
-    ru = (R[0, 0] * dx + R[1, 0] * dy + R[2, 0] * dz) / W + uv[0]
-    rv = (R[0, 1] * dx + R[1, 1] * dy + R[2, 1] * dz) / W + uv[1]
+    ru: float = (R[0, 0] * dx + R[1, 0] * dy + R[2, 0] * dz) / W + uv[0]
+    rv: float = (R[0, 1] * dx + R[1, 1] * dy + R[2, 1] * dz) / W + uv[1]
     return ru * ru + rv * rv
 
 
-@njit(cache=True, error_model="numpy")
-def _residual(uv, C, R, X, r):  # type: ignore[no-untyped-def]
+@compiled
+def _residual(rays: _Rays, k: int, X: FloatArray, r: FloatArray) -> None:
+    """Fill the image residual of ray k, (2,); nothing for a point behind the camera."""
+    uv, C, R = rays.tangents[k], rays.positions[rays.image[k]], rays.rotations[rays.image[k]]
     dx, dy, dz = X[0] - C[0], X[1] - C[1], X[2] - C[2]
     W = R[0, 2] * dx + R[1, 2] * dy + R[2, 2] * dz
     if W < 0.0:
@@ -280,9 +299,11 @@ def _residual(uv, C, R, X, r):  # type: ignore[no-untyped-def]
         r[1] = -(R[0, 1] * dx + R[1, 1] * dy + R[2, 1] * dz) / W - uv[1]
 
 
-@njit(cache=True, error_model="numpy")
-def _least_squares(own, tangents, image, positions, rotations, weights, used, X, N, b, dx):  # type: ignore[no-untyped-def]
-    """Gauss-Newton on the image residuals of the rays in use; leaves N; False if it fails."""
+@compiled
+def _least_squares(
+    rays: _Rays, own: IntArray, used: BoolArray, X: FloatArray, N: FloatArray, b: FloatArray, dx: FloatArray
+) -> bool:
+    """Move X by Gauss-Newton on the image residuals of the rays in use; leave N; False if it fails."""
     A = np.empty((2, 3))
     for _ in range(MAX_STEPS):
         N[:] = 0.0
@@ -292,14 +313,15 @@ def _least_squares(own, tangents, image, positions, rotations, weights, used, X,
             k = own[i]
             if not used[k]:
                 continue
-            C, R, P = positions[image[k]], rotations[image[k]], weights[k]
+            C, R = rays.positions[rays.image[k]], rays.rotations[rays.image[k]]
+            uv, P = rays.tangents[k], rays.weights[k]
             x, y, z = X[0] - C[0], X[1] - C[1], X[2] - C[2]
             W = R[0, 2] * x + R[1, 2] * y + R[2, 2] * z
             if not W < 0.0:
                 return False
             u = -(R[0, 0] * x + R[1, 0] * y + R[2, 0] * z) / W
             v = -(R[0, 1] * x + R[1, 1] * y + R[2, 1] * z) / W
-            ru, rv = u - tangents[k, 0], v - tangents[k, 1]
+            ru, rv = u - uv[0], v - uv[1]
             distance = max(distance, abs(W))
             for d in range(3):
                 A[0, d] = -(R[d, 0] + u * R[d, 2]) / W

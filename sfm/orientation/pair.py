@@ -45,10 +45,14 @@ def orient_dependent(
     """Return the dependent relative orientation: by, bz, omega, phi, kappa of photograph 2.
 
     Args:
-        first, second: tangents of conjugate rays of photographs 1 and 2, shape (n, 2) each, n >= 5.
+        first: tangents u = -U/W, v = -V/W of rays of photograph 1, shape (n, 2), n >= 5.
+        second: the conjugate rays of photograph 2, shape (n, 2).
         bx: X component of the base, which sets the scale of the model.
         start: approximate by, bz (in the unit of bx), omega, phi, kappa (rad), shape (5,); from the
             five-point solution if not given (six pairs at least).
+
+    Returns:
+        The five parameters with their covariance, and both photographs in the frame of photograph 1.
 
     Raises:
         GeometryError: too few pairs, pairs that do not determine the parameters, no base, or a base without
@@ -81,9 +85,13 @@ def orient_independent(
     """Return the independent relative orientation: phi1, kappa1, omega2, phi2, kappa2, base = X axis.
 
     Args:
-        first, second: tangents of conjugate rays of photographs 1 and 2, shape (n, 2) each, n >= 5.
+        first: tangents u = -U/W, v = -V/W of rays of photograph 1, shape (n, 2), n >= 5.
+        second: the conjugate rays of photograph 2, shape (n, 2).
         start: approximate phi1, kappa1, omega2, phi2, kappa2, rad, shape (5,); from the five-point
             solution if not given (six pairs at least).
+
+    Returns:
+        The five parameters with their covariance, and both photographs in the frame of the base.
 
     Raises:
         GeometryError: too few pairs, pairs that do not determine the parameters, or no base.

@@ -49,6 +49,12 @@ def correct_photo_coordinates(xy_mm: FloatArray, corrections: PhotoCorrections, 
         corrections: what is to be corrected.
         c_mm: principal distance, mm.
 
+    Returns:
+        Corrected photo coordinates from the principal point, shape (n, 2), mm.
+
+    Raises:
+        GeometryError: a point beyond the table of distortion, or a photograph below the terrain.
+
     Source: document 004, "Corrections of photo coordinates": principal point, radial distortion, refraction,
     earth curvature; decentring after the radial part, as in Brown (1971).
     """
@@ -59,7 +65,21 @@ def correct_photo_coordinates(xy_mm: FloatArray, corrections: PhotoCorrections, 
 
 
 def distort_photo_coordinates(xy_mm: FloatArray, corrections: PhotoCorrections, *, c_mm: float) -> FloatArray:
-    """Return the measured photo coordinates of ideal ones; inverse of `correct_photo_coordinates`."""
+    """Return the measured photo coordinates of ideal ones; inverse of `correct_photo_coordinates`.
+
+    Args:
+        xy_mm: ideal photo coordinates (y up) from the principal point, shape (n, 2), mm.
+        corrections: effects that the photograph has.
+        c_mm: principal distance, mm.
+
+    Returns:
+        Measured photo coordinates, shape (n, 2), mm.
+
+    Raises:
+        GeometryError: as `correct_photo_coordinates`, or a correction too strong to be inverted.
+
+    Source: document 004; each correction is inverted by fixed-point iteration, the last one first.
+    """
     xy = np.asarray(xy_mm, dtype=float)
     for step in reversed(_steps(corrections, c_mm)):
         xy = _inverse(step, xy)
@@ -78,12 +98,15 @@ def photo_coordinates(
 
     Args:
         points: object points, shape (n, 3), object unit.
-        position, rotation: X0 and R of the photograph, shapes (3,) and (3, 3).
+        position: projection centre X0, shape (3,), object unit.
+        rotation: R, image to object axes, shape (3, 3).
         c_mm: principal distance, mm.
-        corrections: effects that the photograph has.
+        corrections: effects that the photograph has; none if not given.
 
     Returns:
-        Shape (n, 2), mm; NaN for points behind the camera.
+        Photo coordinates (y up), shape (n, 2), mm; NaN for points behind the camera.
+
+    Source: document 004, computation of photo coordinates: collinearity, then the corrections in reverse.
     """
     ideal = c_mm * tangents_of(position, rotation, points)
     return distort_photo_coordinates(ideal, corrections or PhotoCorrections(), c_mm=c_mm)
@@ -100,8 +123,13 @@ def photo_from_pixel(
         pixel_mm: width and height of a pixel, shape (2,), mm.
         rows: "down" as in eqs. 2.3-2.4 of document 002, "up" as in its table of points.
 
+    Returns:
+        Photo coordinates, shape (n, 2), mm.
+
     Raises:
         GeometryError: rows is neither.
+
+    Source: document 002, eqs. 2.3-2.4.
     """
     centre = np.array(size_px) / 2 - 0.5
     return (np.asarray(pixel, dtype=float) - centre) * np.asarray(pixel_mm) * (1.0, _sign(rows))
@@ -110,16 +138,40 @@ def photo_from_pixel(
 def pixel_from_photo(
     photo_mm: FloatArray, size_px: tuple[int, int], pixel_mm: FloatArray, *, rows: str = "down"
 ) -> FloatArray:
-    """Return pixel coordinates of photo coordinates; inverse of `photo_from_pixel` (eq. 2.5)."""
+    """Return pixel coordinates of photo coordinates; inverse of `photo_from_pixel`.
+
+    Args:
+        photo_mm: photo coordinates (origin at the sensor centre, y up), shape (n, 2), mm.
+        size_px: columns and rows of the photograph.
+        pixel_mm: width and height of a pixel, shape (2,), mm.
+        rows: "down" or "up", as in `photo_from_pixel`.
+
+    Returns:
+        Column and row from the centre of the first pixel, shape (n, 2), px.
+
+    Raises:
+        GeometryError: rows is neither.
+
+    Source: document 002, eq. 2.5.
+    """
     centre = np.array(size_px) / 2 - 0.5
     return np.asarray(photo_mm, dtype=float) / (np.asarray(pixel_mm) * (1.0, _sign(rows))) + centre
 
 
 def radial_from_table(table: RadialTable, radius_mm: FloatArray) -> FloatArray:
-    """Return the distortion dr at given radii by linear interpolation, mm.
+    """Return the distortion dr at given radii by linear interpolation in a calibration certificate.
+
+    Args:
+        table: radii and distortions of the certificate.
+        radius_mm: distances from the principal point, any shape, mm.
+
+    Returns:
+        dr, positive outwards, same shape, mm.
 
     Raises:
         GeometryError: radii of the table that do not ascend from 0, or a radius beyond its end.
+
+    Source: document 004, radial distortion from a table.
     """
     r, dr = np.asarray(table.radius_mm, dtype=float), np.asarray(table.distortion_mm, dtype=float)
     if len(r) < 2 or len(r) != len(dr) or r[0] != 0 or (np.diff(r) <= 0).any():
@@ -128,11 +180,15 @@ def radial_from_table(table: RadialTable, radius_mm: FloatArray) -> FloatArray:
         raise GeometryError(
             f"radial distortion: a point at {np.nanmax(radius_mm):.3f} mm, the table ends at {r[-1]:.3f} mm"
         )
-    return np.interp(radius_mm, r, dr)
+    return np.asarray(np.interp(radius_mm, r, dr))
 
 
 def refraction_coefficient(flying_height_km: float, terrain_height_km: float) -> float:
-    """Return K of dr = K (r + r^3 / c^2), dimensionless.
+    """Return K of the refraction dr = K (r + r^3 / c^2), dimensionless.
+
+    Args:
+        flying_height_km: height H of the projection centre over the sea, km.
+        terrain_height_km: height h of the terrain over the sea, km.
 
     Source: document 004 (US Air Force model of the atmosphere): K = (2410 H / (H^2 - 6 H + 250)
     - 2410 h^2 / ((h^2 - 6 h + 250) H)) 1e-6 with H and h in km.
@@ -147,11 +203,16 @@ def refraction_coefficient(flying_height_km: float, terrain_height_km: float) ->
 
 
 def curvature_displacement(radius_mm: FloatArray, *, height_km: float, c_mm: float) -> FloatArray:
-    """Return the displacement towards the centre by the curvature of the earth, mm.
+    """Return the displacement towards the centre by the curvature of the earth, same shape as the radii, mm.
+
+    Args:
+        radius_mm: distances from the principal point, any shape, mm.
+        height_km: height H of the projection centre over the ground, km.
+        c_mm: principal distance, mm.
 
     Source: document 004: dr = H r^3 / (2 R c^2), R = 6372.2 km.
     """
-    return height_km * np.asarray(radius_mm) ** 3 / (2 * EARTH_RADIUS_KM * c_mm**2)
+    return np.asarray(height_km * np.asarray(radius_mm) ** 3 / (2 * EARTH_RADIUS_KM * c_mm**2))
 
 
 def _steps(corrections: PhotoCorrections, c: float) -> list[Callable[[FloatArray], FloatArray]]:
@@ -203,5 +264,5 @@ def _inverse(step: Callable[[FloatArray], FloatArray], target: FloatArray) -> Fl
 
 def _sign(rows: str) -> float:
     if rows not in ("down", "up"):
-        raise GeometryError(f"pixel coordinates: rows '{rows}' is neither down nor up")
+        raise GeometryError(f"pixel coordinates: rows '{rows}', expected one of down, up")
     return -1.0 if rows == "down" else 1.0

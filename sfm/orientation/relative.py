@@ -61,7 +61,8 @@ def relative_orientations(
     """Return the relative orientations that conjugate rays allow, from nothing but the rays.
 
     Args:
-        first, second: tangents u = -U/W, v = -V/W of conjugate rays of photographs 1 and 2, (n, 2) each.
+        first: tangents u = -U/W, v = -V/W of rays of photograph 1, shape (n, 2), n >= 4.
+        second: the conjugate rays of photograph 2, shape (n, 2).
         tolerance: largest residual of a fitting pair, tangents.
         seed: of the random samples.
 

@@ -67,8 +67,20 @@ def orient(
         final_tolerance_px: the tolerance follows the residuals down to this, px.
         min_points: points that a photograph must share with the network, at least 4.
 
+    Returns:
+        The orientation, NaN with a reason for every photograph that could not be oriented.
+
     Raises:
         GeometryError: no two photographs could be oriented, with the given values or without them.
+
+    Source: Luhmann et al. (2020), sec. 4.4.4 (orientation of image networks), with resection by Fischler and
+    Bolles (1981) in every photograph.
+
+    Example:
+        >>> import sfm
+        >>> start = sfm.empty_estimate(result.network, result.estimate.cameras)
+        >>> sfm.orient(result.network, start).failures
+        ()
     """
 
     def grow(values: Estimate) -> Orientation:

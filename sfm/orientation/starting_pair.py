@@ -8,7 +8,7 @@ import numpy as np
 
 from sfm.conventions import FloatArray, IntArray
 from sfm.errors import GeometryError
-from sfm.network import Network
+from sfm.network import Network, rows_of
 from sfm.orientation.homography import PLANAR_POINTS
 from sfm.orientation.intersection import intersect
 from sfm.orientation.relative import RelativeOrientation, model_points, relative_orientations
@@ -80,27 +80,26 @@ def best_start(network: Network, tangents: FloatArray, tolerance: FloatArray, *,
 def _sorted_rows(network: Network, tangents: FloatArray) -> list[IntArray]:
     """Rows of the usable image points of each photograph."""
     seen = network.image_points
-    usable = np.isfinite(tangents).all(axis=1)
-    return [np.flatnonzero((seen.image == i) & usable) for i in range(len(network.images))]
+    usable = np.flatnonzero(np.isfinite(tangents).all(axis=1))
+    return [usable[rows] for rows in rows_of(seen.image[usable], len(network.images))]
 
 
 def _promising_pairs(network: Network, own: list[IntArray]) -> list[tuple[int, int]]:
     """Pairs with at least four common points, those with most first, spread over the photographs."""
     m = len(own)
-    sees = np.zeros((m, len(network.points)), dtype=np.int64)
-    for i, rows in enumerate(own):
-        sees[i, network.image_points.point[rows]] = 1
-    common = sees @ sees.T
-    pairs = [(i, j) for i in range(m) for j in range(i + 1, m) if common[i, j] >= PLANAR_POINTS]
+    usable = np.zeros(len(network.image_points), dtype=bool)
+    usable[np.concatenate(own)] = True
+    common = np.triu(network.common_points(usable), 1)
+    first, second = np.nonzero(common >= PLANAR_POINTS)
+    count = common[first, second]
     # equal counts in the order of j - i, so that a cut takes pairs from all over the survey
-    pairs.sort(key=lambda pair: (-common[pair], (pair[1] - pair[0]) % max(2, m // 3), pair))
-    if len(pairs) <= MAX_PAIRS:
-        return pairs
-    floor = common[pairs[MAX_PAIRS - 1]]
-    sure = [pair for pair in pairs if common[pair] > floor]
-    tied = [pair for pair in pairs if common[pair] == floor]
-    step = len(tied) / (MAX_PAIRS - len(sure))
-    return sure + [tied[int(k * step)] for k in range(MAX_PAIRS - len(sure))]
+    order = np.lexsort((second, first, (second - first) % max(2, m // 3), -count))
+    if len(order) > MAX_PAIRS:
+        sure = int((count > count[order[MAX_PAIRS - 1]]).sum())
+        tied = int((count == count[order[MAX_PAIRS - 1]]).sum())
+        step = tied / (MAX_PAIRS - sure)
+        order = order[[*range(sure), *(sure + int(k * step) for k in range(MAX_PAIRS - sure))]]
+    return list(zip(first[order].tolist(), second[order].tolist(), strict=True))
 
 
 def _common(

@@ -9,7 +9,7 @@ from scipy.spatial import ConvexHull, QhullError
 
 from sfm.camera import project
 from sfm.conventions import BoolArray, FloatArray, IntArray
-from sfm.network import Estimate, Network
+from sfm.network import Estimate, Network, rows_of
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,8 @@ def photograph_support(
     all its other codes nobody else has seen. Outside the network nothing is expected of the others.
 
     Args:
-        network, estimate: m photographs, n points, k image points.
+        network: k image points of m photographs and n points.
+        estimate: the orientation that is judged.
         residuals_px: lengths, inf where undetermined, px, (k,).
         limit_px: largest residual of a fitting image point, px, (k,).
         fixed: points known from elsewhere than the photographs, (n,).
@@ -63,11 +64,12 @@ def _amidst(network: Network, estimate: Estimate) -> BoolArray:
     seen = network.image_points
     out = np.zeros(len(seen), dtype=bool)
     points = estimate.points[estimate.determined]
+    of_image = rows_of(seen.image, len(network.images))
     for i in np.flatnonzero(estimate.oriented):
         camera = estimate.cameras[network.camera[i]]
         xy = project(camera, estimate.position[i], estimate.rotation[i], points)
         xy = xy[((xy >= 0) & (xy < camera.size_px)).all(axis=1)]
-        own = np.flatnonzero(seen.image == i)
+        own = of_image[i]
         if len(xy) < 3 or not len(own):
             continue
         try:

@@ -1,0 +1,1 @@
+"""Sheets of coded targets to be printed in true scale, see `sheet`."""

@@ -13,7 +13,8 @@ from sfm.conventions import FloatArray, IntArray
 from sfm.errors import OutputError, SurveyFileError
 from sfm.files.whole_files import whole_file
 from sfm.rendering.scene import ARC, DISC, RECTANGLE, Marks, coded_ring, join_marks, square_tag
-from sfm.targets.codes.tags import TagFamily, target_family
+from sfm.targets.codes.families import code_family
+from sfm.targets.codes.tags import TagFamily
 
 # ISO 216 and ANSI/ASME Y14.1, width and height in mm.
 PAGES_MM = {
@@ -86,11 +87,11 @@ def lay_out_sheet(
             small to be printed or larger than the page.
         GeometryError: the family has no such number.
     """
-    codes = target_family(family)
+    codes = code_family(family)
     if codes is None:
         raise SurveyFileError("targets: family 'none' has no codes to print")
     if page not in PAGES_MM:
-        raise SurveyFileError(f"targets: page {page!r} is none of {', '.join(PAGES_MM)}")
+        raise SurveyFileError(f"targets: page {page!r}, expected one of {', '.join(PAGES_MM)}")
     if not diameter_mm > 0:
         raise SurveyFileError(f"targets: diameter is {diameter_mm} mm, needed more than 0")
     width, height = PAGES_MM[page]

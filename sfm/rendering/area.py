@@ -7,78 +7,164 @@ within a cell to second order, and the edge of a mark is taken as straight in ea
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
-from numba import njit
+from sfm.conventions import AnyArray, FloatArray, IntArray
+from sfm.kernels.options import compiled
+from sfm.rendering.scene import ARC, DISC, RECTANGLE
 
 # An edge counts as straight within this part of a cell; an arc of 4 px radius departs by 1e-3 px there.
 PARTS = 3
 
 
-@njit(cache=True, nogil=True)
-def fill_face(value, cover, box, rays, H, rectangle, mean, amplitude, grain, seed, lamp, n):  # type: ignore[no-untyped-def]
+class Cell(NamedTuple):
+    """A cell of the photograph on the plane of a face, object unit; zeros behind the camera."""
+
+    a: float
+    """plane coordinates of its middle"""
+    b: float
+    a_column: float
+    """steps of the plane coordinates to the next cell in the row"""
+    b_column: float
+    a_row: float
+    """steps of the plane coordinates to the next cell in the column"""
+    b_row: float
+
+
+class Lamp(NamedTuple):
+    """The light over a face."""
+
+    a: float
+    """plane coordinates of the lamp, object unit"""
+    b: float
+    height: float
+    """above the plane, object unit"""
+    reach2: float
+    """squared distance at which the lamp shines with strength 1, 0 where there is none"""
+    ambient: float
+    """light from everywhere"""
+
+
+@compiled
+def fill_face(
+    value: AnyArray,
+    cover: AnyArray,
+    box: IntArray,
+    rays: FloatArray,
+    H: FloatArray,
+    rectangle: FloatArray,
+    mean: float,
+    amplitude: float,
+    grain: float,
+    seed: int,
+    lamp: Lamp,
+    n: int,
+) -> None:
     """Fill value and cover of the cells of a face: its lit texture, and the part of each cell inside it.
 
-    Light and texture are taken once a pixel; only pixels at the edge of the face are looked at by cells.
+    Light and texture are taken once a pixel; only pixels at the edge of the face are divided into cells.
+
+    Args:
+        value: receives the intensities, (rows, columns) of the box.
+        cover: receives the parts inside the face, 0 to 1, of the same shape.
+        box: first and last row and column of the cells of the face, in whole pixels, (4,).
+        rays: tangents at the corners of the pixels, (height + 1, width + 1, 2).
+        H: plane coordinates from rays, (3, 3).
+        rectangle: the face as the shape of a mark, (4,).
+        mean: reflectance of the face.
+        amplitude: of its texture.
+        grain: size of a grain of the texture, object unit.
+        seed: of the texture.
+        lamp: the light.
+        n: cells along a pixel.
     """
     for y in range(box[0] // n, box[1] // n):
         for x in range(box[2] // n, box[3] // n):
             i, j = y * n - box[0], x * n - box[2]
-            ahead, p = on_plane(rays, H, y, x, 0.5, 0.5, 1.0)
-            whole = area_inside(2, p, 0.0, 0.0, rectangle) if ahead else 0.0
+            ahead, cell = on_plane(rays, H, y, x, 0.5, 0.5, 1.0)
+            whole = area_inside(RECTANGLE, cell, 0.0, 0.0, rectangle) if ahead else 0.0
             shade = 0.0
             if whole > 0:
                 texture = 0.0
                 if amplitude > 0:
-                    texture = amplitude * smooth_noise(p[0] / grain, p[1] / grain, seed)
-                shade = (mean + texture) * light_on(p[0], p[1], lamp)
+                    texture = amplitude * smooth_noise(cell.a / grain, cell.b / grain, seed)
+                shade = (mean + texture) * light_on(cell.a, cell.b, lamp)
             for r in range(n):
                 for c in range(n):
                     value[i + r, j + c] = shade
                     cover[i + r, j + c] = whole
                     if 0 < whole < 1:
-                        ahead, p = on_plane(rays, H, y, x, (c + 0.5) / n, (r + 0.5) / n, 1.0 / n)
-                        cover[i + r, j + c] = area_inside(2, p, 0.0, 0.0, rectangle) if ahead else 0.0
+                        ahead, cell = on_plane(rays, H, y, x, (c + 0.5) / n, (r + 0.5) / n, 1.0 / n)
+                        cover[i + r, j + c] = (
+                            area_inside(RECTANGLE, cell, 0.0, 0.0, rectangle) if ahead else 0.0
+                        )
 
 
-@njit(cache=True, nogil=True)
-def paint_mark(value, box, part, rays, H, kind, centre, shape, mark, lamp, n):  # type: ignore[no-untyped-def]
-    """Blend a lit mark into the cells of its face by the area that it covers of each."""
+@compiled
+def paint_mark(
+    value: AnyArray,
+    box: IntArray,
+    part: IntArray,
+    rays: FloatArray,
+    H: FloatArray,
+    kind: int,
+    centre: FloatArray,
+    shape: FloatArray,
+    mark: float,
+    lamp: Lamp,
+    n: int,
+) -> None:
+    """Blend a lit mark into the cells of its face by the area that it covers of each.
+
+    Args:
+        value: intensities of the cells of the face.
+        box: their first and last row and column, (4,).
+        part: those of the cells around the mark, (4,).
+        rays: tangents at the corners of the pixels, (height + 1, width + 1, 2).
+        H: plane coordinates from rays, (3, 3).
+        kind: DISC, ARC or RECTANGLE.
+        centre: plane coordinates of the mark, object unit, (2,).
+        shape: see `Marks`, (4,).
+        mark: reflectance of the mark.
+        lamp: the light.
+        n: cells along a pixel.
+    """
     for row in range(part[0], part[1]):
         y = row // n
         fy = (row - y * n + 0.5) / n
         for column in range(part[2], part[3]):
             x = column // n
-            ahead, p = on_plane(rays, H, y, x, (column - x * n + 0.5) / n, fy, 1.0 / n)
-            area = area_inside(kind, p, centre[0], centre[1], shape) if ahead else 0.0
+            ahead, cell = on_plane(rays, H, y, x, (column - x * n + 0.5) / n, fy, 1.0 / n)
+            area = area_inside(kind, cell, centre[0], centre[1], shape) if ahead else 0.0
             if area > 0:
                 i, j = row - box[0], column - box[2]
-                value[i, j] += area * (mark * light_on(p[0], p[1], lamp) - value[i, j])
+                value[i, j] += area * (mark * light_on(cell.a, cell.b, lamp) - value[i, j])
 
 
-@njit(cache=True, nogil=True)
-def light_on(a, b, lamp):  # type: ignore[no-untyped-def]
-    """Light on a face: ambient, and a lamp by the cosine and inverse square laws.
-
-    lamp = its plane coordinates and height, squared reach, ambient.
-    """
-    d2 = (a - lamp[0]) ** 2 + (b - lamp[1]) ** 2 + lamp[2] ** 2
-    return lamp[4] + max(lamp[2], 0.0) / math.sqrt(d2) * lamp[3] / d2
+@compiled
+def light_on(a: float, b: float, lamp: Lamp) -> float:
+    """Return the light at a place of a face: ambient, and a lamp by the cosine and inverse square laws."""
+    d2 = (a - lamp.a) ** 2 + (b - lamp.b) ** 2 + lamp.height**2
+    return lamp.ambient + max(lamp.height, 0.0) / math.sqrt(d2) * lamp.reach2 / d2
 
 
-@njit(cache=True, nogil=True)
-def on_plane(rays, H, y, x, fx, fy, step):  # type: ignore[no-untyped-def]
+@compiled
+def on_plane(
+    rays: FloatArray, H: FloatArray, y: int, x: int, fx: float, fy: float, step: float
+) -> tuple[bool, Cell]:
     """Return whether a place in pixel (x, y) meets the plane in front, and where.
 
     Args:
         rays: tangents at the corners of the pixels, (height + 1, width + 1, 2).
         H: plane coordinates from rays, (3, 3).
-        y, x: row and column of the pixel.
-        fx, fy: place in the pixel from its top-left corner, 0 to 1.
+        y: row of the pixel.
+        x: its column.
+        fx: place in the pixel from its left edge, 0 to 1.
+        fy: place in the pixel from its upper edge, 0 to 1.
         step: width of a cell, px.
 
     Returns:
-        False behind the camera; plane coordinates a, b and their steps da/dc, db/dc, da/dr, db/dr to the
-        next column and row of cells.
+        Whether the plane is in front of the camera, and the cell on it.
     """
     u, uc, ur = interpolate(
         rays[y, x, 0], rays[y, x + 1, 0], rays[y + 1, x, 0], rays[y + 1, x + 1, 0], fx, fy, step
@@ -88,7 +174,7 @@ def on_plane(rays, H, y, x, fx, fy, step):  # type: ignore[no-untyped-def]
     )
     w = H[2, 0] * u + H[2, 1] * v - H[2, 2]
     if w >= 0:
-        return False, (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+        return False, Cell(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     down = 1.0 / w
     wc, wr = H[2, 0] * uc + H[2, 1] * vc, H[2, 0] * ur + H[2, 1] * vr
     a = (H[0, 0] * u + H[0, 1] * v - H[0, 2]) * down
@@ -97,11 +183,19 @@ def on_plane(rays, H, y, x, fx, fy, step):  # type: ignore[no-untyped-def]
     bc = (H[1, 0] * uc + H[1, 1] * vc - b * wc) * down
     ar = (H[0, 0] * ur + H[0, 1] * vr - a * wr) * down
     br = (H[1, 0] * ur + H[1, 1] * vr - b * wr) * down
-    return True, (a, b, ac, bc, ar, br)
+    return True, Cell(a, b, ac, bc, ar, br)
 
 
-@njit(cache=True, nogil=True)
-def interpolate(top_left, top_right, bottom_left, bottom_right, fx, fy, step):  # type: ignore[no-untyped-def]
+@compiled
+def interpolate(
+    top_left: float,
+    top_right: float,
+    bottom_left: float,
+    bottom_right: float,
+    fx: float,
+    fy: float,
+    step: float,
+) -> tuple[float, float, float]:
     """Return the bilinear value in a pixel and its change to the next cell in columns and rows."""
     top = top_left + fx * (top_right - top_left)
     bottom = bottom_left + fx * (bottom_right - bottom_left)
@@ -109,26 +203,29 @@ def interpolate(top_left, top_right, bottom_left, bottom_right, fx, fy, step):  
     return top + fy * (bottom - top), across * step, (bottom - top) * step
 
 
-@njit(cache=True, nogil=True)
-def area_inside(kind, p, a0, b0, shape):  # type: ignore[no-untyped-def]
-    """Part of a cell inside a mark: exact for straight edges in each of PARTS^2 squares, 0 to 1."""
-    a, b = p[0] - a0, p[1] - b0
+@compiled
+def area_inside(kind: int, cell: Cell, a0: float, b0: float, shape: FloatArray) -> float:
+    """Return the part of a cell inside a mark, 0 to 1, exact for straight edges in PARTS^2 parts of it."""
+    a, b = cell.a - a0, cell.b - b0
     f, fa, fb = inside(kind, a, b, shape)
-    gc, gr = fa * p[2] + fb * p[3], fa * p[4] + fb * p[5]
+    gc, gr = fa * cell.a_column + fb * cell.b_column, fa * cell.a_row + fb * cell.b_row
     if abs(f) > abs(gc) + abs(gr):  # the edge is beyond the corners of the cell
         return 1.0 if f > 0 else 0.0
     area = 0.0
     for i in range(PARTS):
         for j in range(PARTS):
             dr, dc = (i + 0.5) / PARTS - 0.5, (j + 0.5) / PARTS - 0.5
-            f, fa, fb = inside(kind, a + dc * p[2] + dr * p[4], b + dc * p[3] + dr * p[5], shape)
-            area += half_plane(f, fa * p[2] + fb * p[3], fa * p[4] + fb * p[5], 1.0 / PARTS)
+            a_part = a + dc * cell.a_column + dr * cell.a_row
+            b_part = b + dc * cell.b_column + dr * cell.b_row
+            f, fa, fb = inside(kind, a_part, b_part, shape)
+            gc, gr = fa * cell.a_column + fb * cell.b_column, fa * cell.a_row + fb * cell.b_row
+            area += half_plane(f, gc, gr, 1.0 / PARTS)
     return area / PARTS**2
 
 
-@njit(cache=True, nogil=True)
-def half_plane(f, gx, gy, side):  # type: ignore[no-untyped-def]
-    """Part of a square on the positive side of the line f + gx x + gy y = 0 about its centre."""
+@compiled
+def half_plane(f: float, gx: float, gy: float, side: float) -> float:
+    """Return the part of a square on the positive side of the line f + gx x + gy y = 0 about its centre."""
     gx, gy = abs(gx) * side, abs(gy) * side
     if gx + gy < 1e-300:
         return 1.0 if f > 0 else 0.0
@@ -149,15 +246,15 @@ def half_plane(f, gx, gy, side):  # type: ignore[no-untyped-def]
     return 1.0 - rest * rest / (2 * low * high)
 
 
-@njit(cache=True, nogil=True)
-def inside(kind, a, b, shape):  # type: ignore[no-untyped-def]
-    """Signed distance inside a mark (object unit) at plane coordinates from its centre, and its gradient."""
-    if kind == 0:  # disc
+@compiled
+def inside(kind: int, a: float, b: float, shape: FloatArray) -> tuple[float, float, float]:
+    """Return the distance inside a mark (object unit) at plane coordinates from its centre, and gradient."""
+    if kind == DISC:
         radius = math.sqrt(a * a + b * b)
         if radius == 0.0:
             return shape[0], 1.0, 0.0
         return shape[0] - radius, -a / radius, -b / radius
-    if kind == 1:  # arc of a ring
+    if kind == ARC:
         radius = max(math.sqrt(a * a + b * b), 1e-300)
         f, fa, fb = radius - shape[0], a / radius, b / radius
         if shape[1] - radius < f:
@@ -186,9 +283,9 @@ def inside(kind, a, b, shape):  # type: ignore[no-untyped-def]
     return fy, -sign * sin, sign * cos
 
 
-@njit(cache=True, nogil=True)
-def smooth_noise(x, y, seed):  # type: ignore[no-untyped-def]
-    """Noise of about +-1 that changes smoothly over a unit, the same at the same place.
+@compiled
+def smooth_noise(x: float, y: float, seed: int) -> float:
+    """Return noise of about +-1 that changes smoothly over a unit, the same at the same place.
 
     Source: value noise after Perlin (1985), Computer Graphics 19(3), on a lattice of hashed values.
     """
@@ -200,9 +297,9 @@ def smooth_noise(x, y, seed):  # type: ignore[no-untyped-def]
     return top * (1 - fy) + bottom * fy
 
 
-@njit(cache=True, nogil=True)
-def lattice(i, j, seed):  # type: ignore[no-untyped-def]
-    """Value between -1 and 1 of a lattice point.
+@compiled
+def lattice(i: int, j: int, seed: int) -> float:
+    """Return the value between -1 and 1 of a lattice point.
 
     Source: finaliser of MurmurHash3 (Appleby 2011), 32 bit.
     """

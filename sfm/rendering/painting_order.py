@@ -14,7 +14,7 @@ TOUCHING = 1e-6
 def painting_order(scene: Scene, position: FloatArray) -> IntArray:
     """Return the faces turned to the camera, from back to front (painter's algorithm).
 
-    Of two faces whose pictures overlap, one is painted first if it lies on the far side of the plane of the
+    Of two faces whose images overlap, one is painted first if it lies on the far side of the plane of the
     other, or the other on the near side of its own.
 
     Source: Newell, Newell and Sancha (1972), Proc. ACM National Conference, p. 443 (tests 2 to 4).
@@ -43,9 +43,9 @@ def painting_order(scene: Scene, position: FloatArray) -> IntArray:
 
 
 def _apart(corners: FloatArray, slack: float) -> BoolArray:
-    """Tell which faces have pictures apart from each other, (f, f), from corners (f, 4, 3) off the camera.
+    """Return which faces have images apart from each other, (f, f), from corners (f, 4, 3) off the camera.
 
-    Two convex pictures are apart if a plane through the camera and an edge of one has the other outside.
+    Two convex images are apart if a plane through the camera and an edge of one has the other outside.
     """
     sight = np.cross(corners, np.roll(corners, -1, axis=1))  # normals of these planes
     sight /= np.linalg.norm(sight, axis=2, keepdims=True)

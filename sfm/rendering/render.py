@@ -25,11 +25,12 @@ from sfm.camera import Camera, project, tangents_from_pixel
 from sfm.conventions import AnyArray, FloatArray, IntArray, angles_from_rotation
 from sfm.errors import GeometryError, KolinearError, OutputError
 from sfm.files.plain_text import csv_text
-from sfm.rendering.area import fill_face, paint_mark
+from sfm.files.whole_files import make_folder
+from sfm.rendering.area import Lamp, fill_face, paint_mark
 from sfm.rendering.painting_order import painting_order
 from sfm.rendering.scene import ARC, DISC, UNCODED, Optics, Scene
 from sfm.rendering.scene_file import Staging, read_scene
-from sfm.rendering.visibility import TargetPictures, picture_targets
+from sfm.rendering.visibility import ProjectedTargets, project_targets
 
 
 def render_photograph(
@@ -41,7 +42,7 @@ def render_photograph(
     optics: Optics,
     rng: np.random.Generator,
     rays: FloatArray | None = None,
-) -> tuple[AnyArray, TargetPictures]:
+) -> tuple[AnyArray, ProjectedTargets]:
     """Photograph a scene.
 
     Args:
@@ -72,7 +73,7 @@ def render_photograph(
         reach = 2 * math.ceil(5 * sigma) + 1
         cv2.GaussianBlur(fine, (reach, reach), sigma, dst=fine, borderType=cv2.BORDER_REPLICATE)
     light = fine.reshape(height, n, width, n).mean(axis=(1, 3), dtype=np.float32)
-    return _expose(light, optics, rng), picture_targets(scene, camera, position, rotation)
+    return _expose(light, optics, rng), project_targets(scene, camera, position, rotation)
 
 
 def render_photographs(
@@ -84,13 +85,15 @@ def render_photographs(
     optics: Optics,
     seed: int,
     threads: int = 2,
-) -> tuple[list[AnyArray], list[TargetPictures]]:
+) -> tuple[list[AnyArray], list[ProjectedTargets]]:
     """Photograph a scene from several stations side by side; each has its own noise, given by the seed.
 
     Args:
-        scene, camera, optics: as in `render_photograph`.
+        scene: what is photographed.
+        camera: interior orientation, any distortion model.
         positions: projection centres, (m, 3), object unit.
         rotations: R of each photograph, (m, 3, 3).
+        optics: blur, vignetting, exposure, noise and depth of the photographs.
         seed: of the noise.
         threads: photographs rendered at a time.
 
@@ -100,7 +103,7 @@ def render_photographs(
     rays = corner_rays(camera)
     sources = np.random.default_rng(seed).spawn(len(positions))
 
-    def one(i: int) -> tuple[AnyArray, TargetPictures]:
+    def one(i: int) -> tuple[AnyArray, ProjectedTargets]:
         return render_photograph(
             scene, camera, positions[i], rotations[i], optics=optics, rng=sources[i], rays=rays
         )
@@ -135,7 +138,8 @@ def _expose(light: FloatArray, optics: Optics, rng: np.random.Generator) -> AnyA
     sigma = np.sqrt(optics.noise**2 + optics.shot_noise**2 * np.clip(signal, 0, None))
     signal += sigma * rng.standard_normal(signal.shape, dtype=np.float32)
     full = 2**optics.bits - 1
-    return np.clip(np.rint(signal * full), 0, full).astype(np.uint8 if optics.bits == 8 else np.uint16)
+    intensities = np.clip(np.rint(signal * full), 0, full)
+    return np.asarray(intensities.astype(np.uint8 if optics.bits == 8 else np.uint16))
 
 
 def _paint_face(
@@ -162,9 +166,9 @@ def _paint_face(
     value = np.empty((box[1] - box[0], box[3] - box[2]), dtype=np.float32)
     cover = np.empty_like(value)
     rectangle = np.array([*faces.half[face], 0.0, 0.0])
-    grain = (faces.value[face], faces.texture[face], faces.grain[face], face)
     lamp = _lamp(scene, face)
-    fill_face(value, cover, box, rays, H, rectangle, *grain, lamp, n)
+    surface = faces.value[face], faces.texture[face], faces.grain[face]
+    fill_face(value, cover, box, rays, H, rectangle, *surface, face, lamp, n)
     for k in np.flatnonzero(marks.face == face):
         shape, kind = marks.shape[k], int(marks.kind[k])
         reach = shape[0] if kind == DISC else shape[1] if kind == ARC else math.hypot(shape[0], shape[1])
@@ -176,7 +180,7 @@ def _paint_face(
     part += cover * (value - part)
 
 
-# A square of half length 1, points along its sides so that its picture is bounded under distortion too.
+# A square of half length 1, points along its sides so that its image is bounded under distortion too.
 _SIDE = np.linspace(-1, 1, 9)[:-1]
 SQUARE = np.concatenate(
     [
@@ -198,13 +202,14 @@ def _window(xy: FloatArray, shape: tuple[int, ...], n: int) -> IntArray:
     return np.array([low[1], high[1], low[0], high[0]])
 
 
-def _lamp(scene: Scene, face: int) -> FloatArray:
-    """Return plane coordinates and height of the lamp over a face, its squared reach, ambient light, (5,)."""
+def _lamp(scene: Scene, face: int) -> Lamp:
+    """Return the light over a face."""
     if scene.light is None:
-        return np.array([0.0, 0.0, 1.0, 0.0, 1.0])
+        return Lamp(0.0, 0.0, 1.0, 0.0, 1.0)
     away = scene.light.position - scene.faces.centre[face]
+    a, b = scene.faces.axes[face] @ away
     height = scene.faces.normals()[face] @ away
-    return np.array([*(scene.faces.axes[face] @ away), height, scene.light.reach**2, scene.light.ambient])
+    return Lamp(float(a), float(b), float(height), float(scene.light.reach) ** 2, float(scene.light.ambient))
 
 
 def _plane_from_ray(scene: Scene, face: int, position: FloatArray, rotation: FloatArray) -> FloatArray:
@@ -227,14 +232,14 @@ def write_photographs(staging: Staging, folder: Path) -> None:
     Args:
         staging: result of `read_scene`.
         folder: where the photographs go, with truth_points.csv (targets at the object), truth_images.csv
-            (exterior orientation) and truth_image_points.csv (pictures of the circles' centres and the
+            (exterior orientation) and truth_image_points.csv (images of the circles' centres and the
             centres of their outlines, where the whole target is seen).
 
     Raises:
         OutputError: a file cannot be written.
     """
     scene = staging.scene
-    photographs, pictures = render_photographs(
+    photographs, projected = render_photographs(
         scene, staging.camera, staging.positions, staging.rotations, optics=staging.optics, seed=staging.seed
     )
     places = scene.faces.place(scene.targets.face, scene.targets.centre)
@@ -242,7 +247,7 @@ def write_photographs(staging: Staging, folder: Path) -> None:
     names = [f"t{k + 1:03d}" if code[k] == UNCODED else str(code[k]) for k in range(len(code))]
     angles = np.degrees(angles_from_rotation(staging.rotations))
     try:
-        folder.mkdir(parents=True, exist_ok=True)
+        make_folder(folder)
         with tempfile.TemporaryDirectory(dir=folder, prefix=".part") as part:
             for name, photograph in zip(staging.names, photographs, strict=True):
                 if not cv2.imwrite(
@@ -263,9 +268,9 @@ def write_photographs(staging: Staging, folder: Path) -> None:
                 Path(part) / "truth_image_points.csv",
                 ("image", "target", "x_px", "y_px", "outline_x_px", "outline_y_px", "diameter_px"),
                 [
-                    (image, names[k], *picture.centre[k], *picture.outline_centre[k], picture.diameter[k])
-                    for image, picture in zip(staging.names, pictures, strict=True)
-                    for k in np.flatnonzero(picture.visible)
+                    (image, names[k], *targets.centre[k], *targets.outline_centre[k], targets.diameter[k])
+                    for image, targets in zip(staging.names, projected, strict=True)
+                    for k in np.flatnonzero(targets.visible)
                 ],
             )
             for file in sorted(Path(part).iterdir()):

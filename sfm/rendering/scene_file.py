@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 
 from sfm.camera import Camera, camera_from_values
 from sfm.conventions import FloatArray
@@ -27,7 +27,9 @@ from sfm.rendering.scene import (
     join_marks,
     rectangles,
 )
-from sfm.targets.codes.rings import CodeFamily, code_family
+from sfm.targets.codes.families import code_family
+from sfm.targets.codes.rings import CodeFamily
+from sfm.targets.codes.tags import TagFamily
 
 Two = Annotated[tuple[float, float], Field(strict=False)]
 Three = Annotated[tuple[float, float, float], Field(strict=False)]
@@ -70,8 +72,14 @@ class _Head(_Section):
     seed: int = 0
 
 
+def _known_model(model: str) -> str:
+    if model not in MODELS:
+        raise ValueError(f"model '{model}', expected one of {', '.join(MODELS)}")
+    return model
+
+
 class _Camera(_Section):
-    model: Literal[tuple(MODELS)]  # type: ignore[valid-type]
+    model: Annotated[str, AfterValidator(_known_model)]
     size_px: Annotated[tuple[Side, Side], Field(strict=False)]
     pixel_mm: Two
     c_mm: Length
@@ -166,9 +174,13 @@ def read_scene(path: Path) -> Staging:
         file = _File.model_validate(table)
     except ValidationError as error:
         first = error.errors()[0]
-        raise SurveyFileError(f"{path}: {'.'.join(map(str, first['loc']))}: {first['msg']}") from error
+        raise SurveyFileError(
+            f"{path}: {'.'.join(map(str, first['loc']))}: {first['msg'].removeprefix('Value error, ')}"
+        ) from error
     faces = _faces(file.face)
     family = code_family(file.scene.codes)
+    if isinstance(family, TagFamily):
+        raise SurveyFileError(f"{path}: codes = '{family.name}', expected rings or arcs")
     rng = np.random.default_rng(file.scene.seed)
     marks: list[Marks] = []
     targets: list[tuple[int, float, float, float, int]] = []

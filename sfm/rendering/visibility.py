@@ -12,23 +12,23 @@ from sfm.rendering.scene import Scene
 
 # A ray meets this many points of the rim when the truth asks whether a target is hidden.
 RIM = 16
-# Corners of the polygon whose centre of area is the centre of the picture of a circle.
+# Corners of the polygon whose centre of area is the centre of the image of a circle.
 OUTLINE = 256
 
 
 @dataclass(frozen=True)
-class TargetPictures:
+class ProjectedTargets:
     """Where each target of the scene is in a photograph."""
 
-    centre: FloatArray  # picture of the centre of the circle, px, NaN behind the camera, (n, 2)
-    outline_centre: FloatArray  # centre of area of the picture of the circle, px, (n, 2)
-    diameter: FloatArray  # largest diameter of the picture, px, (n,)
+    centre: FloatArray  # image of the centre of the circle, px, NaN behind the camera, (n, 2)
+    outline_centre: FloatArray  # centre of area of the image of the circle, px, (n, 2)
+    diameter: FloatArray  # largest diameter of the image, px, (n,)
     visible: BoolArray  # whole in the photograph, seen from the front and not hidden, (n,)
 
 
-def picture_targets(
+def project_targets(
     scene: Scene, camera: Camera, position: FloatArray, rotation: FloatArray
-) -> TargetPictures:
+) -> ProjectedTargets:
     """Return where the targets of a scene are in a photograph and which are whole in it."""
     faces, targets = scene.faces, scene.targets
     n = len(targets)
@@ -37,9 +37,9 @@ def picture_targets(
     rim = targets.centre[:, None] + targets.radius[:, None, None] * circle
     outline = faces.place(np.repeat(targets.face, OUTLINE), rim.reshape(-1, 2))
     centre = project(camera, position, rotation, faces.place(targets.face, targets.centre))
-    picture = project(camera, position, rotation, outline).reshape(n, OUTLINE, 2)
+    outline_px = project(camera, position, rotation, outline).reshape(n, OUTLINE, 2)
     width, height = camera.size_px
-    inside = ((picture > 0) & (picture < (width - 1, height - 1))).all(axis=(1, 2))
+    inside = ((outline_px > 0) & (outline_px < (width - 1, height - 1))).all(axis=(1, 2))
     normal = faces.normals()
     front = np.einsum("fi,fi->f", normal, position - faces.centre)[targets.face] > 0
     seen = outline.reshape(n, OUTLINE, 3)[:, :: OUTLINE // RIM]
@@ -47,12 +47,13 @@ def picture_targets(
         [_hidden(scene, position, points, own) for points, own in zip(seen, targets.face, strict=True)],
         dtype=bool,
     )
-    span = np.linalg.norm(picture - np.roll(picture, OUTLINE // 2, axis=1), axis=2).max(axis=1, initial=0.0)
-    return TargetPictures(centre, _centre_of_area(picture), span, inside & front & ~hidden)
+    across = np.linalg.norm(outline_px - np.roll(outline_px, OUTLINE // 2, axis=1), axis=2)
+    diameter = across.max(axis=1, initial=0.0)
+    return ProjectedTargets(centre, _centre_of_area(outline_px), diameter, inside & front & ~hidden)
 
 
 def _hidden(scene: Scene, position: FloatArray, points: FloatArray, own: int) -> bool:
-    """Tell whether any face stands between the camera and any of the points of one face."""
+    """Return whether any face stands between the camera and any of the points of one face."""
     faces = scene.faces
     direction = points - position
     for f, normal in enumerate(faces.normals()):

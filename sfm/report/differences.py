@@ -4,25 +4,29 @@ from __future__ import annotations
 
 import json
 import math
-from html import escape
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from sfm.comparison.significance import ResultComparison
+from sfm.conventions import FloatArray
 from sfm.files.plain_text import csv_text, or_none
-from sfm.report.markup import figure, finer_unit, significant, table
-from sfm.report.pages import page, png, write_files
-from sfm.report.plots import BLUE, RED, plan_axes
+from sfm.report.figures.comparisons import difference_figure
+from sfm.report.figures.plots import Plot, png
+from sfm.report.html.page import render
+from sfm.report.numbers import finer_unit, significant
+from sfm.report.pages import write_files
 
 COLUMNS = ("id", "dX", "dY", "dZ", "sdX", "sdY", "sdZ", "T", "significant")
 FILES = ("differences.csv", "comparison.json", "comparison.html")
-LONGEST_ARROW = 0.1  # of the object's size, that of the largest difference
+PICTURE = (
+    "Differences of the points: arrows in the object's main plane, significant ones in red; the colour of "
+    "the dots is the difference out of the plane."
+)
 
 
-def write_differences(found: ResultComparison, xyz: np.ndarray, out: Path) -> Path:
+def write_differences(found: ResultComparison, xyz: FloatArray, out: Path) -> Path:
     """Write a comparison into a folder and return the path of its page.
 
     Args:
@@ -118,169 +122,28 @@ def largest_difference(found: ResultComparison) -> str:
     return f"{significant(longest * factor)} {unit or 'object units of ' + found.names[0]}"
 
 
-def differences_page(found: ResultComparison, xyz: np.ndarray) -> str:
+def differences_page(found: ResultComparison, xyz: FloatArray) -> str:
     """Return the page: verdict, figures, picture and tables."""
-    a, b = found.names
     verdict, level = words_of_test(found)
-    aligned = {
-        "points": f"{len(found.points)} common points",
-        "cameras": f"{len(found.images)} projection centres",
-        "control": "control points",
-        "none": "nothing: both as they are",
-    }[found.alignment]
-    known = [name for name, has in zip(found.names, found.has_sigma, strict=True) if has]
-    tested = _tested(found)
-    sections = [
-        (
-            "Figures",
-            table(
-                ("", "value", "unit"),
-                [
-                    ("aligned by", aligned, ""),
-                    ("scale of A over B", f"{found.a_from_b.scale:.9g}", ""),
-                    ("common points", str(len(found.points)), ""),
-                    ("RMS difference of a point coordinate", *_length(found, _rms(found.point_difference))),
-                    ("largest difference of a point", *_length(found, _longest(found.point_difference))),
-                    ("common photographs", str(len(found.images)), ""),
-                    (
-                        "RMS difference of a projection centre's coordinate",
-                        *_length(found, _rms(found.position_difference)),
-                    ),
-                    ("largest difference of a rotation", significant(_largest(found.rotation_deg)), "deg"),
-                    ("standard deviations known of", " and ".join(known) or "neither", ""),
-                ],
-            )
-            + (
-                "<p class=note>The other result has none, and counts as free of error in the test.</p>"
-                if len(known) == 1 and tested
-                else ""
-            ),
-        ),
-    ]
-    if tested:
-        sections.append(
-            (
-                "Test",
-                table(
-                    ("", "value", "critical value"),
-                    [
-                        (
-                            "all points together",
-                            significant(found.global_statistic),
-                            significant(found.global_critical),
-                        ),
-                        (
-                            "largest of a single point",
-                            significant(float(np.nanmax(found.statistic))),
-                            significant(found.critical),
-                        ),
-                        (
-                            "points above the critical value",
-                            f"{int(found.significant.sum())} of {tested}",
-                            "",
-                        ),
-                    ],
-                )
-                + "<p class=note>T = d' (Qa + Qb)^-1 d / 3 of a difference d: 1 is what chance gives.</p>",
-            )
-        )
-    if len(found.points) >= 3 and _longest(found.point_difference) > 0:
-        sections.append(("Picture", figure(png(difference_figure(found, xyz)), PICTURE)))
-    for one in found.interior:
-        rows = [
-            (name, f"{d:.4g}", "not known" if math.isnan(s) else f"{s:.2g}", unit)
-            for name, d, s, unit in zip(one.names, one.difference, one.sigma, one.units, strict=True)
-        ]
-        text = table(("parameter", "difference", "sigma", "unit"), rows)
-        if one.conversion is not None:
-            text += (
-                f"<p class=note>{escape(b)}: {one.conversion.source_model} written as {one.model} differs by "
-                f"{one.conversion.rms_px:.4f} px RMS, {one.conversion.max_px:.4f} px at most. Parameters of "
-                "a converted camera have no sigma here.</p>"
-            )
-        sections.append((f"Camera {one.camera}", text))
-    point_rows = [
-        (
-            name,
-            *(significant(v) for v in d),
-            *(significant(v) for v in s),
-            significant(t),
-            "yes" if flag else "",
-        )
-        for name, d, s, t, flag in zip(
-            found.points,
-            found.point_difference,
-            found.point_sigma,
-            found.statistic,
-            found.significant,
-            strict=True,
-        )
-    ]
-    unit = f" [{found.unit}]" if found.unit else ""
-    listed = (
-        *("point", f"dX{unit}", f"dY{unit}", f"dZ{unit}"),
-        *(f"sdX{unit}", f"sdY{unit}", f"sdZ{unit}", "T", "significant"),
+    largest = _longest(found.point_difference)
+    return render(
+        "comparison.html",
+        headline=verdict,
+        level=level,
+        found=found,
+        size={
+            "rms_point": _rms(found.point_difference),
+            "max_point": largest,
+            "rms_position": _rms(found.position_difference),
+            "max_rotation_deg": _largest(found.rotation_deg),
+            "tested": _tested(found),
+            "largest_statistic": _largest(found.statistic[np.isfinite(found.statistic)]),
+        },
+        known=[name for name, has in zip(found.names, found.has_sigma, strict=True) if has],
+        picture=Plot("differences", PICTURE, png(difference_figure(found, xyz)))
+        if len(found.points) >= 3 and largest > 0
+        else None,
     )
-    sections.append(
-        (
-            "Points",
-            f"<details><summary>{len(point_rows)} points</summary>{table(listed, point_rows)}</details>",
-        )
-    )
-    return page("Comparison", f"{b} minus {a}", verdict, level, sections)
-
-
-PICTURE = (
-    "Differences of the points: arrows in the object's main plane, significant ones in red; the colour of "
-    "the dots is the difference out of the plane."
-)
-
-
-def difference_figure(found: ResultComparison, xyz: np.ndarray) -> Figure:
-    """Draw the differences as arrows on the object's main plane, and across it as colours."""
-    plane, names = plan_axes(xyz)
-    turned, d = xyz @ plane.T, found.point_difference @ plane.T
-    flat = turned[:, :2]
-    size = float(np.linalg.norm(np.ptp(flat, axis=0)))
-    longest = float(np.linalg.norm(d[:, :2], axis=1).max())
-    across = float(np.abs(d[:, 2]).max())
-    factor = LONGEST_ARROW * size / longest if longest > 0 else 1.0
-    finer, fine_unit = finer_unit(found.unit, max(longest, across))
-    fine_unit = fine_unit or "object units"
-    height = float(np.clip(8.5 * np.ptp(flat[:, 1]) / max(np.ptp(flat[:, 0]), 1e-12 * size), 2.5, 8.0))
-    picture = Figure(figsize=(8.5, height + 0.8), layout="constrained")
-    axes = picture.subplots()
-    colours = np.where(found.significant, RED, BLUE)
-    arrows = axes.quiver(
-        *flat.T, *(factor * d[:, :2]).T, color=colours, angles="xy", scale_units="xy", scale=1, width=0.002
-    )
-    limit = across * finer or 1.0
-    dots = axes.scatter(
-        flat[:, 0],
-        flat[:, 1],
-        c=d[:, 2] * finer,
-        s=14,
-        cmap="coolwarm",
-        vmin=-limit,
-        vmax=limit,
-        edgecolors="grey",
-        lw=0.3,
-    )
-    picture.colorbar(dots, ax=axes, label=f"{names[2]} [{fine_unit}]", shrink=0.7, fraction=0.04)
-    if longest > 0:
-        label = f"{significant(longest * finer)} {fine_unit}"
-        axes.quiverkey(arrows, 0.08, 1.03, factor * longest, label, labelpos="E", coordinates="axes")
-    axes.plot(*(flat + factor * d[:, :2]).T, alpha=0.0)  # arrows do not widen the axes by themselves
-    axes.set_aspect("equal")
-    unit = f" [{found.unit}]" if found.unit else ""
-    axes.set_xlabel(f"{names[0]}{unit}")
-    axes.set_ylabel(f"{names[1]}{unit}")
-    return picture
-
-
-def _length(found: ResultComparison, value: float) -> tuple[str, str]:
-    factor, unit = finer_unit(found.unit, value)
-    return significant(value * factor), unit or "object units"
 
 
 def _tested(found: ResultComparison) -> int:
@@ -288,13 +151,13 @@ def _tested(found: ResultComparison) -> int:
     return int(np.isfinite(found.statistic).sum())
 
 
-def _largest(values: np.ndarray) -> float:
+def _largest(values: FloatArray) -> float:
     return float(values.max()) if len(values) else math.nan
 
 
-def _rms(vectors: np.ndarray) -> float:
+def _rms(vectors: FloatArray) -> float:
     return float(np.sqrt(np.mean(vectors**2))) if vectors.size else math.nan
 
 
-def _longest(vectors: np.ndarray) -> float:
+def _longest(vectors: FloatArray) -> float:
     return float(np.linalg.norm(vectors, axis=1).max()) if len(vectors) else math.nan

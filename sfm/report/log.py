@@ -6,7 +6,7 @@ Every line has `time` (UTC) and `event`:
     photograph  image, targets, rejected, stored (measured in an earlier run), seconds; or failed, a reason
     stage       stage, seconds, steps
     warning     text
-    result      verdict, sigma0_px, rms_px, photographs, points, observations, ...
+    result      verdict, sigma0_px, rms_px, photographs, points, observations, stored_photographs, ...
     failed      reason
 """
 
@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import threading
 import time
 from contextlib import suppress
@@ -24,9 +25,9 @@ from types import TracebackType
 from typing import Any, Self
 
 from sfm.errors import OutputError
+from sfm.files.whole_files import make_folder, open_own
 from sfm.progress import SILENT, Progress
-from sfm.report.verdict import verdict_of
-from sfm.result import SurveyResult
+from sfm.report.findings.findings import Findings
 
 LOG = "log.jsonl"  # in the folder of a result
 MAX_LOG_BYTES = 50_000_000  # of a log that is read back
@@ -39,6 +40,16 @@ class SurveyLog:
     """
 
     def __init__(self, path: Path | None = None, *, append: bool = False, watch: Progress = SILENT) -> None:
+        """Begin a log.
+
+        Args:
+            path: its file, if it is to have one; an earlier log there is replaced or appended to.
+            append: whether it is appended to.
+            watch: is told the same.
+
+        Raises:
+            OutputError: the file cannot be written, or is something else than a log.
+        """
         self._lines: list[str] = []
         self._lock = threading.Lock()
         self._path = path
@@ -49,10 +60,13 @@ class SurveyLog:
         self._steps = 0
         if path is not None:
             try:
-                path.parent.mkdir(parents=True, exist_ok=True)
-                if not append:  # another run may have it open still
-                    path.unlink(missing_ok=True)
-                self._file = path.open("a" if append else "w", encoding="utf-8")
+                make_folder(path.parent)
+                if append:
+                    refuse_other_log(path)
+                else:
+                    remove_log(path)  # another run may have it open still
+                flags = os.O_WRONLY | os.O_CREAT | (os.O_APPEND if append else os.O_EXCL)
+                self._file = os.fdopen(open_own(path, flags), "a", encoding="utf-8")
             except OSError as error:
                 raise OutputError(f"{path}: the log cannot be written: {error.strerror}") from error
 
@@ -114,27 +128,28 @@ class SurveyLog:
             self.note("stage", stage=self._stage, seconds=seconds, **steps)
             self._stage = None
 
-    def close_into(self, folder: Path, result: SurveyResult, **more: Any) -> None:
+    def close_into(self, folder: Path, findings: Findings, **more: Any) -> None:
         """Write the end of a survey that worked, and all lines into the folder of the result.
 
         Args:
             folder: the folder, before it appears in its place.
-            result: what the survey ended with.
+            findings: what the survey ended with.
             more: further entries of the last line.
         """
         self.end_stage()
-        for warning in result.warnings:
+        for warning in findings.result.warnings:
             self.note("warning", text=warning)
-        self.note("result", **result_entries(result), **more)
+        self.note("result", **result_entries(findings), **more)
         (folder / LOG).write_text("\n".join(self._lines) + "\n", encoding="utf-8")
 
 
-def result_entries(result: SurveyResult) -> dict[str, Any]:
+def result_entries(findings: Findings) -> dict[str, Any]:
     """Return the figures of a result by which a log or a table of surveys tells it; None where unknown."""
+    result = findings.result
     a, both = result.adjustment, result.comparison
     return {
         "survey": result.survey,
-        "verdict": verdict_of(result).level,
+        "verdict": findings.verdict.level,
         "sigma0_px": float(a.sigma0_px) if math.isfinite(a.sigma0_px) else None,
         "rms_px": float(a.rms_px) if math.isfinite(a.rms_px) else None,
         "photographs": len(a.network.images),
@@ -145,8 +160,34 @@ def result_entries(result: SurveyResult) -> dict[str, Any]:
         "iterations": a.iterations,
         "converged": a.converged,
         "comparison": "none" if both is None else "agrees" if both.agree else "differs",
+        "stored_photographs": [p.image for p in result.photographs if p.stored],
         "failed_photographs": [{"image": f.image, "reason": f.reason} for f in result.failed],
     }
+
+
+def refuse_other_log(path: Path) -> None:
+    """Raise OutputError where something stands that is no log, or a link on the way to it."""
+    try:
+        os.close(open_own(path, os.O_RDONLY))
+        if path.stat().st_size and not any({"time", "event"} <= entry.keys() for entry in read_log(path)):
+            raise OutputError(f"{path}: is no log of Kolinear, and is left alone; needed another --out")
+    except FileNotFoundError:
+        return
+    except OSError as error:
+        raise OutputError(f"{path}: the log cannot be written: {error.strerror}") from error
+
+
+def remove_log(path: Path) -> None:
+    """Remove a log, if it is there.
+
+    Raises:
+        OutputError: something else stands there, or it cannot be removed.
+    """
+    refuse_other_log(path)
+    try:
+        path.unlink(missing_ok=True)
+    except OSError as error:
+        raise OutputError(f"{path}: the log cannot be removed: {error.strerror}") from error
 
 
 def read_log(path: Path) -> tuple[dict[str, Any], ...]:

@@ -15,8 +15,8 @@ from sfm.files.csv_tables import read_table
 from sfm.files.plain_text import csv_text
 from sfm.matching.conjugate import BACK_PX, MIN_CORRELATION, ConjugatePoints, match_points
 from sfm.photographs.reading import read_photograph
+from sfm.report.figures.patches import draw_patches
 from sfm.report.match_files import picture_file, refuse_outputs, whole_outputs
-from sfm.report.patch_pictures import draw_patches
 
 COLUMNS = (
     "point",

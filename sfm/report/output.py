@@ -2,23 +2,22 @@
 
 from __future__ import annotations
 
-import json
 import re
 import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-from sfm.errors import OutputError
-from sfm.files.whole_files import whole_folder
+from sfm.files.whole_files import MANIFEST, refuse_foreign_folder, whole_folder
 from sfm.progress import SILENT, Progress
-from sfm.report.html import render_html
-from sfm.report.overlays import draw_overlays
-from sfm.report.plots import all_plots
-from sfm.report.summary import write_summary
-from sfm.report.tables import write_tables
-from sfm.report.text import text_report
-from sfm.result import StageTime, SurveyResult
+from sfm.report.figures.overlays import draw_overlays
+from sfm.report.figures.plots import all_plots
+from sfm.report.findings.findings import Findings
+from sfm.report.html.report import report_page
+from sfm.report.tables.csv_files import write_tables
+from sfm.report.tables.summary import write_summary
+from sfm.report.text.report import text_report
+from sfm.result import StageTime
 
 MAX_FOLDER_BYTES = 100  # of the name of a survey's folder; disks take 255, endings included
 
@@ -38,11 +37,12 @@ WRITTEN = (
     "overlays",
     "plots",
     "log.jsonl",
+    MANIFEST,
 )
 
 
 def write_result(
-    result: SurveyResult,
+    findings: Findings,
     out: Path,
     *,
     write_colmap: Callable[[Path], None] | None = None,
@@ -53,8 +53,8 @@ def write_result(
     """Write everything that a survey gives into one folder, whole or not at all.
 
     Args:
-        result: the result.
-        out: the folder; an earlier result in it is replaced, anything else in it is an error.
+        findings: the result and what is said of it.
+        out: the folder; an unchanged earlier result in it is replaced, anything else in it is an error.
         write_colmap: fills the folder `colmap`, which it is given; None leaves it out.
         finish: is given the folder when all else is in it, and may add log.jsonl.
         jobs: photographs drawn at the same time.
@@ -69,8 +69,9 @@ def write_result(
     out = Path(out)
     refuse_foreign_folder(out)
     started = time.perf_counter()
+    result = findings.result
     progress.stage("report", len(result.photographs))
-    with whole_folder(out, "the result") as folder:
+    with whole_folder(out, "the result", replaceable=True) as folder:
         if write_colmap is not None:
             (folder / "colmap").mkdir()
             write_colmap(folder / "colmap")
@@ -79,15 +80,16 @@ def write_result(
             (folder / "overlays").mkdir()
         for overlay in overlays:
             (folder / "overlays" / overlay.file_name).write_bytes(overlay.jpeg)
-        plots = all_plots(result.adjustment, result.length_unit)
+        plots = all_plots(findings)
         (folder / "plots").mkdir()
-        for stem, _, data in plots:
-            (folder / "plots" / f"{stem}.png").write_bytes(data)
-        timed = replace(result, seconds=(*result.seconds, StageTime("report", time.perf_counter() - started)))
+        for plot in plots:
+            (folder / "plots" / f"{plot.stem}.png").write_bytes(plot.png)
+        report_time = StageTime("report", time.perf_counter() - started)
+        timed = replace(findings, result=replace(result, seconds=(*result.seconds, report_time)))
         write_tables(timed, folder)
         write_summary(timed, folder)
         (folder / "report.txt").write_text(text_report(timed), encoding="utf-8")
-        page = render_html(timed, plots, overlays, has_model=write_colmap is not None)
+        page = report_page(timed, plots, overlays, has_model=write_colmap is not None)
         (folder / "report.html").write_text(page, encoding="utf-8")
         if finish is not None:
             finish(folder)
@@ -98,35 +100,3 @@ def folder_name(name: str) -> str:
     """Return the name of the folder of a survey's result: its own, as far as all disks take it."""
     kept = re.sub(r"[^\w.\-]+", "_", name).encode()[:MAX_FOLDER_BYTES].decode(errors="ignore")
     return kept.strip("._-") or "survey"
-
-
-def refuse_foreign_folder(out: Path) -> None:
-    """Raise OutputError unless the folder is absent, empty, or holds an earlier result and nothing else.
-
-    It is called before a survey starts, too, so that nobody waits for a result that has no place.
-    """
-    out = Path(out)
-    if not out.exists() and not out.is_symlink():
-        return
-    if not out.is_dir():
-        raise OutputError(f"{out}: a file is in the way, --out needs a folder")
-    try:
-        names = sorted(path.name for path in out.iterdir())
-        foreign = [name for name in names if name not in WRITTEN]
-        if not foreign and (not names or _is_summary(out / "summary.json")):
-            return
-    except OSError as error:
-        raise OutputError(f"{out}: the folder cannot be read: {error.strerror}") from error
-    found = f"'{foreign[0]}'" if foreign else "no summary.json of an earlier result"
-    raise OutputError(
-        f"{out}: the folder holds {found}; --out needs a new or empty folder or an earlier result"
-    )
-
-
-def _is_summary(path: Path) -> bool:
-    """Whether a file is the summary.json of a result."""
-    try:
-        text = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError):
-        return False
-    return isinstance(text, dict) and {"survey", "images", "points", "observations"} <= text.keys()

@@ -4,18 +4,19 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Iterable, Iterator
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from sfm.comparison.adjuster_validation import SAME, SAME_COST, Trial, Validation
 from sfm.files.plain_text import csv_text, or_none
-from sfm.report.markup import figure, table
-from sfm.report.pages import page, png, write_files
-from sfm.report.plots import BLUE, RED
+from sfm.report.figures.comparisons import time_figure
+from sfm.report.figures.plots import Plot, png
+from sfm.report.html.page import render
+from sfm.report.pages import write_files
 
 FILES = ("validation.csv", "validation.json", "validation.html")
 COLUMNS = (
@@ -128,71 +129,19 @@ def in_words(value: float, unit: str) -> str:
 
 def validation_page(validation: Validation) -> str:
     """Return the page: verdicts, largest differences, time, and every network."""
-    count = len(validation.trials)
-    same = dict(validation.counts()).get(SAME, 0)
-    verdict = f"{same} of {count} networks: both adjusters end at the same optimum. "
-    verdict += (
-        "Kolinear is nowhere the worse one."
-        if validation.passed
-        else f"Kolinear is the worse one in {sum(t.worse for t in validation.trials)}."
-    )
-    level = "bad" if not validation.passed else "good" if same == count else "fair"
-    name = validation.backend
-    other = [t for t in validation.trials if t.verdict != SAME]
-    sections = [
-        (
-            "Verdicts",
-            table(("verdict", "networks"), [(v, str(n)) for v, n in validation.counts()])
-            + f"<p class=note>Same optimum: costs within {SAME_COST:g} of one another, relative.</p>",
-        ),
-        (
-            "Largest differences",
-            table(
-                ("", "largest difference"),
-                [(name, in_words(value, unit)) for name, value, unit in largest(validation)],
-            )
-            + "<p>A point's sigma counts all that is uncertain (marginal); with photographs and cameras "
-            "held, "
-            f"as {name} gives it, it is smaller: by {_median_ratio(validation):.2f} in the median.</p>",
-        ),
-        ("Time", figure(png(time_figure(validation)), TIME_CAPTION)),
-    ]
-    if other:
-        rows = [(str(t.number), t.plan.arrangement, t.verdict, t.reason) for t in other]
-        sections.append(("Not the same", table(("network", "arrangement", "verdict", "reason"), rows)))
-    listed = (
-        *("network", "arrangement", "photographs", "points", "image points", "noise px", "model"),
-        *("interior", "datum", "cost", "relative difference", "steps", "seconds", "point / sigma", "verdict"),
-    )
-    all_rows = [_listed(t) for t in validation.trials]
-    sections.append(
-        ("All networks", f"<details><summary>{count} networks</summary>{table(listed, all_rows)}</details>")
-    )
-    return page("Validation", f"Kolinear and {name}, seed {validation.seed}", verdict, level, sections)
-
-
-def time_figure(validation: Validation) -> Figure:
-    """Draw the seconds of both adjusters over the number of image points."""
-    k = np.array([t.image_points for t in validation.trials])
-    seconds = np.array([t.seconds for t in validation.trials])
-    picture = Figure(figsize=(8.5, 3.6), layout="constrained")
-    axes = picture.subplots()
-    axes.loglog(k, seconds[:, 0], "o", ms=3.5, color=BLUE, label="kolinear")
-    axes.loglog(k, seconds[:, 1], "o", ms=3.5, color=RED, label=validation.backend)
-    axes.set_xlabel("image points")
-    axes.set_ylabel("s")
-    axes.grid(alpha=0.3)
-    axes.legend(frameon=False)
-    return picture
-
-
-def _listed(t: Trial) -> tuple[str, ...]:
-    relative = (t.cost[1] - t.cost[0]) / t.cost[0] if t.cost[0] > 0 else math.nan
-    return (
-        *(str(t.number), t.plan.arrangement, str(t.plan.images), str(t.points), str(t.image_points)),
-        *(f"{t.plan.noise_px:.2f}", t.plan.model, t.plan.interior, t.plan.datum, f"{t.cost[0]:.6g}"),
-        *(f"{relative:.1e}", f"{t.iterations[0]} / {t.iterations[1]}"),
-        *(f"{t.seconds[0]:.2f} / {t.seconds[1]:.2f}", f"{t.point_sigmas:.1e}", t.verdict),
+    count, same = len(validation.trials), dict(validation.counts()).get(SAME, 0)
+    worse = sum(trial.worse for trial in validation.trials)
+    judged = "nowhere the worse one" if validation.passed else f"the worse one in {worse}"
+    return render(
+        "validation.html",
+        v=validation,
+        headline=f"{same} of {count} networks: both adjusters end at the same optimum. Kolinear is {judged}.",
+        level="bad" if not validation.passed else "good" if same == count else "fair",
+        same=SAME,
+        same_cost=SAME_COST,
+        largest=[(name, in_words(value, unit)) for name, value, unit in largest(validation)],
+        marginal_over_conditional=_median_ratio(validation),
+        picture=Plot("time", TIME_CAPTION, png(time_figure(validation))),
     )
 
 
@@ -201,11 +150,11 @@ def _median_ratio(validation: Validation) -> float:
     return float(np.median(known)) if known else math.nan
 
 
-def _known(values):  # type: ignore[no-untyped-def]
+def _known(values: Iterable[float]) -> Iterator[float]:
     return (value for value in values if math.isfinite(value))
 
 
-def _max(values) -> float:  # type: ignore[no-untyped-def]
+def _max(values: Iterable[float]) -> float:
     return max(_known(values), default=math.nan)
 
 

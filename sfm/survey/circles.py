@@ -9,13 +9,13 @@ import numpy as np
 from sfm.camera import pixel_jacobian
 from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
 from sfm.network import Estimate, ImagePoints, Network
+from sfm.orientation.eccentricity import CircleViews, ellipse_shape, fit_circles
 from sfm.result import Eccentricity
 from sfm.survey.datum import object_scale
-from sfm.survey.inputs.survey_file import Survey
-from sfm.survey.inputs.tables import read_diameters
-from sfm.survey.network import UNNAMED, Naming
-from sfm.survey.targets import MeasuredPhotographs
-from sfm.targets.eccentricity import CircleViews, ellipse_shape, fit_circles
+from sfm.survey.inputs.given import Diameters
+from sfm.survey.inputs.survey import Survey
+from sfm.survey.measurements import MeasuredPhotographs, Naming
+from sfm.survey.network import UNNAMED
 from sfm.targets.flags import Flag
 
 NOT_A_CIRCLE = (
@@ -48,7 +48,8 @@ def check_circles(
 
     Args:
         survey: says whether to correct the eccentricity, and the diameter if it is known.
-        photographs, naming: the targets that `network` was built from.
+        photographs: the targets that `network` was built from.
+        naming: which point each of them is.
         network: all image points.
         estimate: adjusted, in any datum and scale.
 
@@ -71,7 +72,7 @@ def check_circles(
     if not survey.targets.eccentricity:
         return CircleCheck(network, estimate, names, None)
     names_of_circles = tuple(network.points[j] for j in numbers)
-    known, warnings = _known_radius(survey, names_of_circles), _unknown_ids(survey, network.points)
+    known, warnings = _known_radius(survey, names_of_circles), _unknown_ids(survey.diameters, network.points)
     if np.isfinite(known).any():
         scale = object_scale(network, estimate)
         if np.isfinite(scale):
@@ -98,24 +99,21 @@ def _known_radius(survey: Survey, points: tuple[str, ...]) -> FloatArray:
     """Return the radius of each target that the survey states, NaN where it does not, object unit, (n,)."""
     diameter = survey.targets.diameter
     radius = np.full(len(points), np.nan if diameter is None else diameter / 2)
-    if survey.targets.diameters is not None:
-        names, diameters = read_diameters(survey.beside(survey.targets.diameters))
-        stated = dict(zip(names, diameters.tolist(), strict=True))
+    if survey.diameters is not None:
+        stated = dict(zip(survey.diameters.names, survey.diameters.diameter.tolist(), strict=True))
         radius = np.array([stated.get(p, 2 * r) / 2 for p, r in zip(points, radius, strict=True)])
     return radius
 
 
-def _unknown_ids(survey: Survey, points: tuple[str, ...]) -> tuple[str, ...]:
+def _unknown_ids(given: Diameters | None, points: tuple[str, ...]) -> tuple[str, ...]:
     """Return a warning on the ids of the table of diameters that no target of the survey has."""
-    if survey.targets.diameters is None:
-        return ()
-    stated, _ = read_diameters(survey.beside(survey.targets.diameters))
-    unknown = [name for name in stated if name not in set(points)]
-    if not unknown:
+    known = set(points)
+    unknown = [name for name in given.names if name not in known] if given is not None else []
+    if given is None or not unknown:
         return ()
     more = f" and {len(unknown) - MOST_NAMED} more" if len(unknown) > MOST_NAMED else ""
     return (
-        f"{survey.targets.diameters}: diameters of targets that are not in the survey: "
+        f"{given.source}: diameters of targets that are not in the survey: "
         f"{', '.join(unknown[:MOST_NAMED])}{more}",
     )
 
@@ -131,12 +129,12 @@ def _other_sizes(
     Args:
         survey: says which diameters are of single targets.
         points: names of the targets, (n,).
-        stated, found: their radii, NaN where not stated, object unit, (n,).
+        stated: their radii, NaN where not stated, object unit, (n,).
+        found: their radii by the ellipses, object unit, (n,).
     """
     single = np.zeros(len(points), dtype=bool)
-    if survey.targets.diameters is not None:
-        names, _ = read_diameters(survey.beside(survey.targets.diameters))
-        single = np.isin(points, names)
+    if survey.diameters is not None:
+        single = np.isin(points, survey.diameters.names)
     lines = []
     common = ~single & np.isfinite(stated)
     if common.any():
@@ -147,10 +145,10 @@ def _other_sizes(
                 f"give {seen:.3g} {survey.unit}"
             )
     differs = single & (np.abs(np.log(stated / found)) > np.log1p(OTHER_SIZE))
-    if differs.any():
+    if differs.any() and survey.diameters is not None:
         worst = int(np.nanargmax(np.where(differs, np.abs(np.log(stated / found)), np.nan)))
         lines.append(
-            f"{survey.targets.diameters}: the diameter of target {points[worst]} is {2 * stated[worst]:.3g} "
+            f"{survey.diameters.source}: the diameter of target {points[worst]} is {2 * stated[worst]:.3g} "
             f"{survey.unit}, but its ellipses give {2 * found[worst]:.3g} {survey.unit} "
             f"(more than {100 * OTHER_SIZE:g} % apart: {differs.sum()} of {single.sum()} targets)"
         )

@@ -11,7 +11,7 @@ from sfm.comparison.baseline import Baseline, BaselineComparison, compare_baseli
 from sfm.errors import KolinearError
 from sfm.network import Estimate, Network
 from sfm.progress import StageClock
-from sfm.survey.inputs.start import PhotographList
+from sfm.survey.inputs.photograph_list import PhotographList
 from sfm.survey.solution import Solution
 
 Adjuster = Callable[[Network, Estimate], BackendAdjustment]

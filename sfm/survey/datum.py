@@ -14,12 +14,12 @@ from sfm.errors import GeometryError
 from sfm.network import Estimate, Network, ObjectPoints, ScaleBars
 from sfm.result import ControlCheck
 from sfm.similarity import Similarity, fit_similarity
-from sfm.survey.inputs.start import control_points, scale_bars
-from sfm.survey.inputs.survey_file import Survey
+from sfm.survey.inputs.survey import Survey
 
 CONTRADICTED = 0.5  # share of its rays that the test rejects, above which control or a bar is to blame
 CLEARLY = 0.25  # of the misfit that the best choice removes: by how much more than the second it must remove
 MOST_CANDIDATES = 10  # control points and bars that are taken out in turn, those that lose most rays first
+OTHER_UNIT = 8.0  # factor between scales that no start values explain: mm, cm, m, km differ by ten or more
 MIN_CONTROL = 3  # points that a control datum needs
 
 
@@ -38,7 +38,32 @@ def object_scale(network: Network, estimate: Estimate) -> float:
     return float(np.linalg.norm(given - given.mean(axis=0)) / spread) if spread > 0 else float("nan")
 
 
-def rescaled(network: Network, estimate: Estimate, datum: Datum) -> Estimate:
+def refuse_other_units(survey: Survey, network: Network, estimate: Estimate) -> None:
+    """Raise GeometryError where the scales of control and scale bars differ by a power of ten.
+
+    Both are taken from the start values, whatever frame these are in, and by medians, so that a single wrong
+    value is left to the tests.
+    """
+    bars, control = network.scale_bars, network.control
+    given = control.xyz[estimate.determined[control.point]]
+    found = estimate.points[control.point[estimate.determined[control.point]]]
+    by_bars = _scale(bars.length, estimate.points[bars.end] - estimate.points[bars.start])
+    by_control = _scale(np.linalg.norm(np.diff(given, axis=0), axis=1), np.diff(found, axis=0))
+    factor = by_control / by_bars
+    if survey.datum.kind == "control" and not (np.isnan(factor) or 1 / OTHER_UNIT < factor < OTHER_UNIT):
+        raise GeometryError(
+            f"lengths by the control are {factor:.4g} times those by the bars; are both in {survey.unit}?"
+        )
+
+
+def _scale(length: FloatArray, difference: FloatArray) -> float:
+    """Return the median of lengths over those of differences, NaN where there are none."""
+    found = np.linalg.norm(difference, axis=1)
+    usable = (found > 0) & (length > 0)
+    return float(np.median(length[usable] / found[usable])) if usable.any() else float("nan")
+
+
+def scale_to_bars(network: Network, estimate: Estimate, datum: Datum) -> Estimate:
     """Bring a network that control does not hold to the length of its scale bars, else of its control."""
     if datum.kind == "control":
         return estimate
@@ -46,7 +71,7 @@ def rescaled(network: Network, estimate: Estimate, datum: Datum) -> Estimate:
     return Similarity(scale, np.eye(3), np.zeros(3)).apply_estimate(estimate) if scale > 0 else estimate
 
 
-def placed_on_control(network: Network, estimate: Estimate) -> tuple[Estimate, ControlCheck]:
+def place_on_control(network: Network, estimate: Estimate) -> tuple[Estimate, ControlCheck]:
     """Place an adjusted network on its control; scale bars, where there are some, keep its scale."""
     control = network.control
     points = estimate.points[control.point]
@@ -66,7 +91,7 @@ class Contradiction:
     line: str  # in words
 
 
-def contradiction(
+def find_contradiction(
     network: Network, adjustment: Adjustment, readjust: Callable[[Network], Adjustment], *, unit: str
 ) -> Contradiction | None:
     """Return what contradicts the photographs where the test rejects most rays of a control point or bar end.
@@ -201,16 +226,15 @@ def lost_share(adjustment: Adjustment) -> FloatArray:
 
 def datum_warnings(survey: Survey, network: Network) -> tuple[str, ...]:
     """Return a line for control and scale bars that were not measured, and for a missing scale."""
-    lines = []
-    _, control = control_points(survey, network.points)
+    lines, known = [], set(network.points)
+    control = [name for name in survey.control.names if name not in known] if survey.control else []
     if control:
         lines.append(f"control not in the result: {', '.join(control)}")
-    _, bars = scale_bars(survey, network.points)
+    bars = [f"{bar.start} - {bar.end}" for bar in survey.scale_bars if not {bar.start, bar.end} <= known]
     if bars:
         lines.append(f"scale bars with an end that is not in the result: {', '.join(bars)}")
     if survey.datum.kind != "control" and not len(network.scale_bars) and len(network.control) < 2:
         lines.append(
-            f"the survey holds no scale: lengths are not in {survey.unit} until a scale bar or control is "
-            "measured"
+            f"scale is undefined: lengths are not in {survey.unit} until a scale bar or control is measured"
         )
     return tuple(lines)

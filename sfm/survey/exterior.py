@@ -6,7 +6,6 @@ control does not. Start values are brought into its frame where control alone do
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -16,8 +15,7 @@ from sfm.errors import GeometryError
 from sfm.network import Estimate, ExteriorObservations, Network
 from sfm.similarity import Similarity, fit_similarity
 from sfm.survey.datum import object_scale
-from sfm.survey.inputs.start import observed_exterior
-from sfm.survey.inputs.survey_file import Survey
+from sfm.survey.inputs.exterior_table import ObservedExterior
 
 MIN_POINTS = 3  # that fix position, attitude and scale
 NARROW = 0.05  # breadth over length of places below which their turn about the length is taken from angles
@@ -35,27 +33,26 @@ class Placed:
     warnings: tuple[str, ...] = ()  # one line each
 
 
-def with_exterior(survey: Survey, network: Network, estimate: Estimate, images: Sequence[str]) -> Placed:
+def add_exterior(network: Network, estimate: Estimate, table: ObservedExterior | None, datum: str) -> Placed:
     """Return the network with the observed exterior orientations, and start values in their frame.
 
     Args:
-        survey: names the table and the datum.
-        network, estimate: after the orientation; photographs without start values are NaN.
-        images: all photographs of the survey.
+        network: all image points.
+        estimate: after the orientation; photographs without start values are NaN.
+        table: what was observed, None if nothing was.
+        datum: kind of the survey's datum.
 
     Returns:
         All as it was, with a warning, where the datum is not `control`.
 
     Raises:
-        SurveyFileError: as `observed_exterior`.
         GeometryError: they and the control cannot place the network.
     """
-    table = observed_exterior(survey, images)
     if table is None:
         return Placed(network, estimate)
-    if survey.datum.kind != "control":
+    if datum != "control":
         line = (
-            f"[exterior]: observed exterior orientation takes no part in datum '{survey.datum.kind}', as "
+            f"[exterior]: observed exterior orientation takes no part in datum '{datum}', as "
             "control does not; datum kind 'control' uses it"
         )
         return Placed(network, estimate, (line,))
@@ -68,7 +65,7 @@ def with_exterior(survey: Survey, network: Network, estimate: Estimate, images: 
     # what was not observed has no weight, and any number may stand in its place
     filled = np.where(np.isnan(value), 0.0, value)
     observed = ExteriorObservations(image, filled[:, :3], filled[:, 3:], covariance)
-    placed = _placed(survey, network, estimate, image, value, sigma)
+    placed = _placed(network, estimate, image, value, sigma)
     return Placed(replace(network, exterior=observed), _held(placed, image, value, sigma))
 
 
@@ -85,7 +82,6 @@ def _held(estimate: Estimate, image: IntArray, value: FloatArray, sigma: FloatAr
 
 
 def _placed(
-    survey: Survey,
     network: Network,
     estimate: Estimate,
     image: IntArray,
@@ -107,7 +103,7 @@ def _placed(
     )
     turned = oriented & np.isfinite(value[:, 3:]).all(axis=1)
     if not len(target) or not (len(target) >= MIN_POINTS or turned.any()):
-        raise GeometryError(_too_few(survey, len(target), int(turned.sum())))
+        raise GeometryError(_too_few(len(target), int(turned.sum())))
     least = (ROUGH * float(np.ptp(target, axis=0).max())) ** 2
     weight = 1 / np.maximum(variance, least if least > 0 else 1.0)
     length, breadth = _extents(target, weight)
@@ -117,7 +113,7 @@ def _placed(
     elif breadth > max(SURE * noise, FLAT * length) or np.isfinite(value[:, 3:]).any():
         similarity = fit_similarity(source, target, weights=weight)
     else:
-        raise GeometryError(_too_few(survey, len(target), 0, on_a_line=True))
+        raise GeometryError(_too_few(len(target), 0, on_a_line=True))
     return similarity.apply_estimate(estimate)
 
 
@@ -155,11 +151,11 @@ def _extents(places: FloatArray, weight: FloatArray) -> tuple[float, float]:
     return float(spread[0]), float(spread[1])
 
 
-def _too_few(survey: Survey, places: int, turned: int, *, on_a_line: bool = False) -> str:
+def _too_few(places: int, turned: int, *, on_a_line: bool = False) -> str:
     """Say why observed exterior orientation and control do not place the network."""
     how = " on a line" if on_a_line else ""
     return (
-        f"survey {survey.name}: datum 'control': {places} projection centres and control points{how} in the "
+        f"datum 'control': {places} projection centres and control points{how} in the "
         f"network and the angles of {turned} photographs are known; needed three places that are not on a "
         "line, or two and the angles of a photograph"
     )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -10,9 +10,14 @@ from sfm.camera import project
 from sfm.conventions import FloatArray, IntArray
 from sfm.matching.tracks.correspondence import match_targets
 from sfm.network import Estimate, ImagePoints, Network, ScaleBars
+from sfm.progress import SILENT, Progress
+from sfm.survey.inputs.photograph_list import PhotographList
+from sfm.survey.inputs.settings import TargetSettings
 from sfm.survey.inputs.start import control_points, scale_bars
-from sfm.survey.inputs.survey_file import Survey
-from sfm.survey.targets import MeasuredPhotographs, image_point_covariance
+from sfm.survey.inputs.survey import Survey
+from sfm.survey.measurements import MeasuredPhotographs, Measurements, Naming
+from sfm.survey.target_store import TargetStore
+from sfm.survey.targets import image_point_covariance, measure_photographs
 from sfm.targets.codes.tags import CORNERS, corner_name
 from sfm.targets.flags import Flag
 
@@ -23,26 +28,36 @@ TAG_SIGMA = 0.002
 MIN_RAYS = 3  # photographs that must agree on an uncoded point; two rays cannot contradict each other
 
 
-@dataclass(frozen=True)
-class Naming:
-    """Which object point every measured target is."""
+def measure_targets(
+    survey: Survey,
+    files: PhotographList,
+    *,
+    jobs: int = 1,
+    store: TargetStore | None = None,
+    progress: Progress = SILENT,
+) -> Measurements:
+    """Return the network of the coded targets of a survey, and the uncoded ones still without a name.
 
-    names: tuple[str, ...]  # of the object points: code number, tag and corner, or u and a number, (n,)
-    code: IntArray  # code number of each point, of a corner as in TagCorners, -1 = uncoded, (n,)
-    point: tuple[IntArray, ...]  # of each photograph, the point of each target or UNNAMED, (k_i,)
-    corners: bool = False  # whether the coded points are corners of tags
+    Args, Raises: as `measure_photographs`.
+    """
+    photographs = measure_photographs(survey, files, jobs=jobs, store=store, progress=progress)
+    naming = name_coded(photographs)
+    return Measurements(
+        build_network(survey, photographs, naming),
+        photographs.cameras,
+        files.names,
+        min_rays(naming),
+        photographs.failed,
+        photographs.overlays(),
+        files,
+        photographs,
+        naming,
+    )
 
 
 def min_rays(naming: Naming) -> IntArray:
     """Return how many photographs each point needs: codes confirm themselves, uncoded points do not, (n,)."""
     return np.where(naming.code >= 0, 2, MIN_RAYS)
-
-
-def codes_of(naming: Naming, network: Network) -> IntArray:
-    """Return the code number or the tag of each point of a network, -1 where uncoded, (n,)."""
-    per_code = len(CORNERS) if naming.corners else 1
-    code = dict(zip(naming.names, naming.code // per_code, strict=True))
-    return np.array([code[name] for name in network.points], dtype=np.int64)
 
 
 def name_coded(photographs: MeasuredPhotographs) -> Naming:
@@ -78,20 +93,19 @@ def build_network(survey: Survey, photographs: MeasuredPhotographs, naming: Nami
             np.concatenate(covariance),
         ),
     )
-    control, _ = control_points(survey, naming.names)
-    bars, _ = scale_bars(survey, naming.names)
+    bars = scale_bars(survey.scale_bars, naming.names)
     if not survey.scale_bars and survey.control is None:
-        bars = tag_bars(survey, naming)
-    return replace(network, control=control, scale_bars=bars)
+        bars = tag_bars(survey.targets, naming)
+    return replace(network, control=control_points(survey.control, naming.names), scale_bars=bars)
 
 
-def tag_bars(survey: Survey, naming: Naming) -> ScaleBars:
+def tag_bars(targets: TargetSettings, naming: Naming) -> ScaleBars:
     """Return the diagonals of all tags as scale bars, none without the size of the tags.
 
     The scale of a print is the same for all its tags, so that they together know the scale no better than
     one of them: each of n bars has the standard deviation of one times the root of n.
     """
-    size, sigma = survey.targets.tag_size, survey.targets.tag_sigma
+    size, sigma = targets.tag_size, targets.tag_sigma
     if size is None or not naming.corners:
         return ScaleBars()
     row = dict(zip(naming.code.tolist(), range(len(naming.code)), strict=True))

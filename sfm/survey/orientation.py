@@ -6,67 +6,97 @@ from dataclasses import replace
 
 import numpy as np
 
+from sfm.camera import tangents_from_pixel
+from sfm.conventions import BoolArray
 from sfm.errors import GeometryError
-from sfm.network import Estimate, Network
+from sfm.network import Estimate, Network, reduce_network
+from sfm.orientation.intersection import intersect
 from sfm.orientation.sequence import MIN_POINTS, Orientation, orient
 from sfm.photographs.reading import read_photograph
-from sfm.survey.inputs.start import PhotographList, approximate_values
-from sfm.survey.inputs.survey_file import Survey
+from sfm.survey.inputs.start import start_values
+from sfm.survey.inputs.survey import Survey
+from sfm.survey.measurements import MeasuredPhotographs, Measurements
 from sfm.survey.solution import refine
-from sfm.survey.targets import MeasuredPhotographs
-from sfm.targets.codes.rings import FAMILIES
+from sfm.targets.codes.rings import RINGS
 from sfm.targets.detect import find_targets
 
-
-def orient_photographs(
-    survey: Survey, network: Network, files: PhotographList, photographs: MeasuredPhotographs
-) -> Orientation:
-    """Return approximate values of a network of measured targets.
-
-    Args:
-        survey: gives approximate values, if any; a failure names its settings.
-        network: all targets that have a name.
-        files: all photographs of the survey.
-        photographs: those that the targets were measured in.
-
-    Raises:
-        GeometryError: no two photographs could be oriented.
-        SurveyFileError: [approximate] names photographs that are none of the survey's.
-    """
-    estimate = approximate_values(survey, network, photographs.cameras, files.names)
-    try:
-        return orient_survey(survey, network, estimate)
-    except GeometryError as error:
-        if _most_in_common(network) >= MIN_POINTS:
-            raise
-        raise GeometryError(f"survey {survey.name}: {_codes_found(survey, photographs)}") from error
+ORIENTATION_POINTS = (
+    400  # of natural texture that take part in the orientation, those with the most rays, and
+)
+POINTS_PER_PHOTOGRAPH = 100  # of every photograph at least so many
 
 
-def orient_survey(survey: Survey, network: Network, estimate: Estimate) -> Orientation:
+def orient_survey(survey: Survey, measured: Measurements) -> Orientation:
     """Return approximate values of a survey's network.
 
     Args:
-        survey: says whether approximate values were given.
-        network: all image points that have a name.
-        estimate: cameras, and what [approximate] and the control tell.
+        survey: gives start values, if any; a failure names its settings.
+        measured: all image points that have a name.
 
     Raises:
         GeometryError: no two photographs could be oriented.
     """
+    network = measured.network
+    estimate = start_values(survey, network, measured.cameras)
     try:
-        found = orient(network, estimate, refine=refine)
+        found = _orient_strongest(network, estimate) if survey.tie_points else _orient(network, estimate)
     except GeometryError as error:
-        given = survey.approximate.images is not None or survey.approximate.points is not None
+        if measured.photographs is not None and _most_in_common(network) < MIN_POINTS:
+            raise GeometryError(_codes_found(survey, measured.photographs)) from error
+        given = survey.start_orientations is not None or survey.start_points is not None
         hint = " (correct or complete [approximate], or leave it out)" if given else ""
-        raise GeometryError(f"survey {survey.name}: {error}{hint}") from error
+        raise GeometryError(f"{error}{hint}") from error
     return replace(found, warnings=tuple(f"[approximate]: {line}" for line in found.warnings))
+
+
+def _orient(network: Network, estimate: Estimate) -> Orientation:
+    """Orient all photographs on all points."""
+    return orient(network, estimate, refine=refine)
+
+
+def _orient_strongest(network: Network, estimate: Estimate) -> Orientation:
+    """Orient the photographs on the points with the most rays, then intersect all the others.
+
+    Thousands of points orient a survey no better than hundreds, and take their time in every trial.
+    """
+    images = np.ones(len(network.images), dtype=bool)
+    image_points = np.ones(len(network.image_points), dtype=bool)
+    found = _orient(*reduce_network(network, estimate, images, _strongest(network), image_points))
+    seen, estimate = network.image_points, found.estimate
+    uv = np.full((len(seen), 2), np.nan)
+    for index, camera in enumerate(estimate.cameras):
+        own = network.camera[seen.image] == index
+        uv[own] = tangents_from_pixel(camera, seen.xy[own])
+    c = min(camera.c_px for camera in estimate.cameras)
+    rays = intersect(
+        uv,
+        seen.image,
+        seen.point,
+        estimate.position,
+        estimate.rotation,
+        n_points=len(network.points),
+        tolerance=float(found.tolerance_px.max()) / c,
+    )
+    return replace(found, estimate=replace(estimate, points=rays.points))
+
+
+def _strongest(network: Network) -> BoolArray:
+    """Choose the points with the most rays, and in every photograph at least some, (n,)."""
+    seen = network.image_points
+    order = np.argsort(-network.rays(), kind="stable")
+    chosen = np.zeros(len(network.points), dtype=bool)
+    chosen[order[:ORIENTATION_POINTS]] = True
+    rank = np.empty(len(order), dtype=np.int64)
+    rank[order] = np.arange(len(order))
+    for i in range(len(network.images)):
+        own = seen.point[seen.image == i]
+        chosen[own[np.argsort(rank[own], kind="stable")][:POINTS_PER_PHOTOGRAPH]] = True
+    return chosen
 
 
 def _most_in_common(network: Network) -> int:
     """Return how many points the two photographs with most in common share."""
-    sees = np.zeros((len(network.images), len(network.points)), dtype=np.int64)
-    sees[network.image_points.image, network.image_points.point] = 1
-    common = sees @ sees.T
+    common = network.common_points(np.ones(len(network.image_points), dtype=bool))
     np.fill_diagonal(common, 0)
     return int(common.max(initial=0))
 
@@ -89,13 +119,13 @@ def _codes_found(survey: Survey, photographs: MeasuredPhotographs) -> str:
 def _other_family(survey: Survey, photographs: MeasuredPhotographs) -> str:
     """Say which other rings or arcs read more in the photograph with most targets, if any do."""
     settings = survey.targets
-    if settings.codes not in FAMILIES:
+    if settings.codes not in (*RINGS, "none"):
         return ""
     fullest = int(np.argmax([len(found) for found in photographs.targets]))
     photograph = read_photograph(photographs.paths[fullest], channel=settings.channel)
     counts = []
-    for family in FAMILIES:
-        if family in (settings.codes, "none"):
+    for family in RINGS:
+        if family == settings.codes:
             continue
         found = find_targets(
             photograph,

@@ -12,8 +12,7 @@ from sfm.errors import GeometryError, PhotographError
 from sfm.faults import working_on
 from sfm.progress import SILENT, Progress
 from sfm.result import FailedImage
-from sfm.survey.inputs.start import PhotographList
-from sfm.survey.inputs.survey_file import Survey
+from sfm.survey.inputs.photograph_list import PhotographList
 from sfm.survey.target_store import content_hash
 
 T = TypeVar("T")
@@ -22,7 +21,6 @@ MAX_TOLD = 5  # photographs that a message names
 
 
 def each_photograph(
-    survey: Survey,
     photographs: PhotographList,
     work: Callable[[Path], T],
     *,
@@ -35,7 +33,6 @@ def each_photograph(
     copy of another.
 
     Args:
-        survey: whose photographs these are.
         photographs: the files.
         work: what is done with a file; PhotographError says why it cannot be read.
         jobs: how many photographs are worked on at a time.
@@ -77,7 +74,7 @@ def each_photograph(
     in_order = tuple(failed[k] for k in sorted(failed))
     if len(found) < MIN_PHOTOGRAPHS:
         raise GeometryError(
-            f"survey {survey.name}: {len(found)} readable photograph{'' if len(found) == 1 else 's'}, "
+            f"{len(found)} readable photograph{'' if len(found) == 1 else 's'}, "
             f"at least {MIN_PHOTOGRAPHS} are needed{in_brackets(in_order)}"
         )
     return found, in_order

@@ -20,7 +20,7 @@ from sfm.matching.radiometry import odd_window
 from sfm.network import Estimate, ImagePoints, Network, reduce_network
 from sfm.photographs.reading import read_photograph
 from sfm.progress import SILENT, Progress
-from sfm.survey.solution import FALSE_ALARM, TOLERANCE_FACTOR, determined, put_back
+from sfm.survey.solution import FALSE_ALARM, TOLERANCE_FACTOR, determined, merge_estimate
 
 MIN_RAYS = 3
 # Over larger windows no surface is a plane, and memory and time grow with the square of the side.
@@ -59,7 +59,8 @@ def refine_model(
     """Measure all image points of a solved model by multi-photo least squares matching and adjust it again.
 
     Args:
-        network, estimate: a solved model, as `adapters.colmap.camera_models.read_model` gives it.
+        network: a solved model, as `adapters.colmap.camera_models.read_model` gives it.
+        estimate: its solution.
         images_dir: folder of its photographs.
         window_px: odd side of the windows, at most MAX_WINDOW_PX.
         min_correlation: smallest coefficient r of a window and its template, 0 to 1.
@@ -124,7 +125,7 @@ def refine_model(
     fits = (v <= TOLERANCE_FACTOR * MAD_TO_SIGMA * np.median(v)).all(axis=1)
     accepted = images[measured.image] & points[measured.point]
     accepted[accepted] = fits
-    part, start, _, _ = _part(anew, put_back(estimate, adjusted.estimate, images, points), accepted)
+    part, start, _, _ = _part(anew, merge_estimate(estimate, adjusted.estimate, images, points), accepted)
     tests = 2 * len(part.image_points)
     alpha = 1 - (1 - FALSE_ALARM) ** (1 / tests)
     final = adjust(part, start, datum=Datum("free"), reject="tau", alpha=alpha, covariance=True)
@@ -190,6 +191,10 @@ def _references(network: Network, estimate: Estimate) -> IntArray:
 
 def _photograph(network: Network, estimate: Estimate, folder: Path, i: int, progress: Progress) -> FloatArray:
     path = folder / network.images[i]
+    if not path.resolve().is_relative_to(folder.resolve()):
+        raise SurveyFileError(
+            f"{folder}: photograph '{network.images[i]}' of the model is outside this folder"
+        )
     if not path.is_file():
         raise SurveyFileError(
             f"{folder}: photograph '{network.images[i]}' of the model is not in this folder"

@@ -12,24 +12,41 @@ from sfm.adjustment.engine.observed_unknowns import observed
 from sfm.adjustment.quality.variance_components import IMAGE_POINTS, estimate_components
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
-from sfm.conventions import MAD_TO_SIGMA, BoolArray, FloatArray, IntArray
+from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.errors import GeometryError
 from sfm.network import Estimate, Network, reduce_network, supported
-from sfm.orientation.sequence import Orientation
-from sfm.result import ControlCheck
-from sfm.survey.datum import Contradiction, contradiction, datum_warnings, placed_on_control, rescaled
-from sfm.survey.inputs.interior import as_asked_for, without_idle_cameras
-from sfm.survey.inputs.survey_file import Survey
-from sfm.survey.network import Naming, build_network, match_uncoded, min_rays
-from sfm.survey.targets import MeasuredPhotographs
+from sfm.result import ControlCheck, Eccentricity
+from sfm.survey.datum import (
+    Contradiction,
+    datum_warnings,
+    find_contradiction,
+    place_on_control,
+    refuse_other_units,
+    scale_to_bars,
+)
+from sfm.survey.exterior import add_exterior
+from sfm.survey.inputs.interior import split_cameras, without_idle_cameras
+from sfm.survey.inputs.survey import Survey
+from sfm.survey.measurements import Naming
 
-ROUNDS = 3  # matching with the orientation at hand, with the adjusted one, and once more to confirm
 TOLERANCE_FACTOR = 6.0  # of the robust spread of the residuals
-MIN_TOLERANCE_PX = 1.0  # below it a difference is for the statistical test, not for the matching
 FALSE_ALARM = 0.05  # chance that a survey without any outlier loses an image coordinate; Pope (1976)
 MIN_IMAGE_POINTS = 4  # of a photograph in the final adjustment: three determine it, the fourth checks
 MIN_DATUM_POINTS = 3  # that fix position, attitude and scale
 MOST_NAMES = 10  # points named in one line
+
+
+@dataclass(frozen=True)
+class Correspondences:
+    """The network of a survey with all its points, and approximate values."""
+
+    network: Network
+    estimate: Estimate  # NaN for points that have left it
+    min_rays: IntArray  # photographs that each point needs, (n,)
+    naming: Naming | None = None  # of targets; None without
+    eccentricity: Eccentricity | None = None  # what was corrected; None where nothing was
+    no_circles: tuple[str, ...] = ()  # uncoded points left out: their outlines are not images of one circle
+    warnings: tuple[str, ...] = ()  # one line each
 
 
 @dataclass(frozen=True)
@@ -47,40 +64,7 @@ def refine(network: Network, estimate: Estimate) -> Estimate:
     return adjust(network, estimate, datum=Datum("free"), reject="none", covariance=False).estimate
 
 
-def match_and_adjust(
-    survey: Survey,
-    photographs: MeasuredPhotographs,
-    naming: Naming,
-    start: Orientation,
-) -> tuple[Naming, Network, Estimate]:
-    """Name the uncoded targets and adjust in turn, with a tolerance that shrinks with the residuals.
-
-    Args:
-        survey: what to do.
-        photographs: all measured targets.
-        naming: the coded targets by name.
-        start: orientation from the coded targets, with the tolerance it has left.
-
-    Returns:
-        The naming, its network, and the adjusted estimate.
-    """
-    estimate, tolerance_px = start.estimate, float(start.tolerance_px.max())
-    for _ in range(ROUNDS):
-        naming, estimate = match_uncoded(photographs, naming, estimate, tolerance_px=tolerance_px)
-        network = build_network(survey, photographs, naming)
-        everything = np.ones(len(network.image_points), dtype=bool)
-        images, points = determined(network, estimate, everything, min_rays(naming))
-        part, values = reduce_network(network, estimate, images, points, everything)
-        adjusted = adjust(part, values, datum=Datum("free"), reject="huber", covariance=False)
-        estimate = put_back(estimate, adjusted.estimate, images, points)
-        spread = MAD_TO_SIGMA * float(np.median(np.abs(adjusted.residuals)))
-        tolerance_px = float(np.clip(TOLERANCE_FACTOR * spread, MIN_TOLERANCE_PX, tolerance_px))
-    return naming, network, estimate
-
-
-def solve(
-    survey: Survey, network: Network, estimate: Estimate, *, min_rays: IntArray | None = None
-) -> Solution:
+def solve_survey(survey: Survey, matched: Correspondences) -> Solution:
     """Adjust the network in the datum of the survey, with rejection of outliers and full covariance.
 
     Points that keep too few rays and photographs that keep too few points leave the network, and the rest
@@ -88,25 +72,26 @@ def solve(
     without changing its shape.
 
     Args:
-        survey: says the datum and the a priori sigma.
-        network: all image points.
-        estimate: approximate values of all that is to be adjusted.
-        min_rays: rays that each point needs to stay, 2 if not given, (n,).
+        survey: says the datum and the a priori sigma, and gives observed exterior orientation.
+        matched: all image points, and approximate values of all that is to be adjusted.
 
     Raises:
         GeometryError: too little is left to adjust, or control is asked for and not seen.
     """
+    placed = add_exterior(matched.network, matched.estimate, survey.exterior, survey.datum.kind)
+    network, estimate = placed.network, placed.estimate
     datum = Datum(survey.datum.kind)
     if datum.kind == "control" and len(network.control) == len(network.exterior) == 0:
-        raise GeometryError(f"survey {survey.name}: datum 'control', but no control point was measured")
-    needed = np.full(len(network.points), 2) if min_rays is None else min_rays.copy()
+        raise GeometryError("datum 'control', but no control point was measured")
+    refuse_other_units(survey, network, estimate)
+    needed = matched.min_rays.copy()
     if datum.kind == "control":
         needed[network.control.point] = 1
     known = tuple(name for name, is_in in zip(network.points, estimate.determined, strict=True) if is_in)
     single = tuple(network.points[j] for j in np.flatnonzero((network.rays() == 1) & (needed > 1)))
     oriented = estimate.oriented
-    estimate = rescaled(network, estimate, datum)
-    network, estimate = as_asked_for(survey, network, estimate)
+    estimate = scale_to_bars(network, estimate, datum)
+    network, estimate = split_cameras(survey.cameras, network, estimate)
     task = _Task(survey, datum, network, needed, survey.reject)
     iterations = 0
     contradictions: list[str] = []
@@ -117,7 +102,7 @@ def solve(
         if found is None:
             last, check = settled.estimate, None
             if datum.kind != "control" and len(settled.part.control) >= 3:
-                last, check = placed_on_control(settled.part, last)
+                last, check = place_on_control(settled.part, last)
             final = _final(task, settled.part, last)
             found = _contradiction(task, final)
         if found is None:
@@ -130,7 +115,7 @@ def solve(
         if was and not is_in
     )
     final = replace(final, iterations=iterations + final.iterations)
-    warnings = (*contradictions, *_warnings(survey, known, single, final))
+    warnings = (*placed.warnings, *contradictions, *_warnings(survey, known, single, final))
     return Solution(final, check, dropped, warnings)
 
 
@@ -167,7 +152,7 @@ def _settle(task: _Task, estimate: Estimate) -> _Settled:
         adjustment = _tested(task, part, start, covariance=False)
         iterations += adjustment.iterations
         found = _contradiction(task, adjustment)
-        estimate = put_back(estimate, adjustment.estimate, images, points)
+        estimate = merge_estimate(estimate, adjustment.estimate, images, points)
         accepted = _accepted(network, adjustment, images, points)
         left_images, left_points = determined(network, estimate, accepted, task.needed)
         if found is not None or ((left_images == images).all() and (left_points == points).all()):
@@ -194,7 +179,7 @@ def _final(task: _Task, part: Network, estimate: Estimate) -> Adjustment:
 
     Where other observations take part, the image points are weighted by their own variance component.
     """
-    part, estimate = without_idle_cameras(task.survey, part, estimate)
+    part, estimate = without_idle_cameras(part, estimate, cameras=len(task.survey.cameras))
 
     def adjust_part(factor: FloatArray) -> Adjustment:
         return _tested(task, part, estimate, covariance=True, factor=factor)
@@ -215,7 +200,7 @@ def _contradiction(task: _Task, adjustment: Adjustment) -> Contradiction | None:
     def readjust(one: Network) -> Adjustment:
         return _tested(untested, one, adjustment.estimate, covariance=False, factor=factor)
 
-    return contradiction(task.network, adjustment, readjust, unit=task.survey.unit)
+    return find_contradiction(task.network, adjustment, readjust, unit=task.survey.unit)
 
 
 def _tested(
@@ -247,7 +232,7 @@ def _on_points(survey: Survey, network: Network, datum: Datum) -> Datum:
     on = np.isin(network.points, named)
     if on.sum() < MIN_DATUM_POINTS:
         raise GeometryError(
-            f"survey {survey.name}: {on.sum()} of the {len(named)} datum.points are in the network, at least "
+            f"{on.sum()} of the {len(named)} datum.points are in the network, at least "
             f"{MIN_DATUM_POINTS} are needed"
         )
     return replace(datum, points=on)
@@ -287,7 +272,7 @@ def determined(
     return images, points
 
 
-def put_back(estimate: Estimate, part: Estimate, images: BoolArray, points: BoolArray) -> Estimate:
+def merge_estimate(estimate: Estimate, part: Estimate, images: BoolArray, points: BoolArray) -> Estimate:
     """Return the estimate of all photographs and points with an adjusted part of it put in; NaN elsewhere."""
     position, rotation = np.full_like(estimate.position, np.nan), np.full_like(estimate.rotation, np.nan)
     xyz = np.full_like(estimate.points, np.nan)

@@ -1,7 +1,8 @@
 """The store of measured targets: what was measured once in a photograph is not measured again.
 
-Targets are kept by the content of the photograph, the settings and the code that measures, so an entry can
-be missing or unreadable but never out of date. The folder may be removed at any time.
+It lies in the cache folder of the user, never beside photographs or results, which may come from somebody
+else. Targets are kept by the content of the photograph, the settings and the code that measures, so an entry
+can be missing or unreadable but never out of date. The folder may be removed at any time.
 """
 
 from __future__ import annotations
@@ -9,32 +10,59 @@ from __future__ import annotations
 import hashlib
 import io
 import os
-import uuid
+import re
+import shutil
+import stat
+import time
 import zipfile
 from contextlib import suppress
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from functools import cache
-from importlib.resources import files
+from importlib.util import find_spec
 from pathlib import Path
 
 import cv2
 import numpy as np
+from platformdirs import user_cache_path
 
-from sfm.errors import PhotographError
+from sfm.errors import OutputError, PhotographError
+from sfm.files.whole_files import whole_file
 from sfm.targets.codes.rings import CodeFamily
 from sfm.targets.codes.tags import TagFamily
 from sfm.targets.detect import Targets
 
 MAX_ENTRY_BYTES = 100_000_000  # some 400,000 targets; bounded before any memory is taken
-STORE = ".kolinear/targets"  # folder of the store, beside the folders of results
-PART = ".part"  # ends the name of an entry that is being written
+KEPT_SECONDS = 90 * 86400  # entries that nobody has asked for are removed then
+WRITING_SECONDS = 86400  # what is half-written for longer was left by a killed run
+MEASURING = ("sfm.photographs.reading", "sfm.targets.detect")  # what is measured depends on these
 
 
 @dataclass(frozen=True)
 class TargetStore:
-    """A folder of measured targets."""
+    """A folder of measured targets, which is the user's alone."""
 
     folder: Path
+    held: dict[str, tuple[Targets, bool]] = field(default_factory=dict)
+    """of this run by their keys: targets, and whether they were taken from the folder"""
+
+    @classmethod
+    def of_user(cls) -> TargetStore:
+        """Return the store in the user's cache folder (XDG_CACHE_HOME), which is made when it is needed.
+
+        Raises:
+            OutputError: others can write into it.
+        """
+        folder = user_cache_path("kolinear", appauthor=False).resolve() / "targets"
+        with suppress(OSError):  # there is none
+            status = folder.lstat()
+            if hasattr(os, "geteuid") and (
+                not stat.S_ISDIR(status.st_mode) or status.st_uid != os.geteuid() or status.st_mode & 0o077
+            ):
+                raise OutputError(
+                    f"{folder}: measured targets are kept here, but others may write here; remove it, or set "
+                    "XDG_CACHE_HOME to another folder"
+                )
+        return cls(folder)
 
     def load(self, key: str) -> Targets | None:
         """Return the targets of a key; None if they are not there or not whole."""
@@ -42,32 +70,31 @@ class TargetStore:
             path = self._path(key)
             if path.stat().st_size > MAX_ENTRY_BYTES:
                 return None
-            return _targets(path.read_bytes())
+            found = _targets(path.read_bytes())
+            os.utime(path)  # asked for now
+            return found
         except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile):
             return None
 
     def save(self, key: str, targets: Targets) -> None:
         """Keep targets, whole or not at all; where there is no room they are simply not kept."""
-        path = self._path(key)
-        part = path.with_name(f".{path.name}.{uuid.uuid4().hex}{PART}")
         data = io.BytesIO()
         np.savez(data, allow_pickle=False, **{f.name: getattr(targets, f.name) for f in fields(Targets)})
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            with part.open("wb") as file:
-                file.write(data.getbuffer())
-                file.flush()
-                os.fsync(file.fileno())
-            part.replace(path)
-        except OSError:
-            with suppress(OSError):
-                part.unlink(missing_ok=True)
+        with suppress(OSError, OutputError):
+            self.folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+            with whole_file(self._path(key)) as part:
+                part.write_bytes(data.getbuffer())
 
-    def remove_parts(self) -> None:
-        """Remove what a killed run left half-written; only for who knows that nobody else is writing."""
-        for part in self.folder.glob(f"*/.*{PART}"):
+    def remove_old(self) -> None:
+        """Remove what nobody has asked for in months, and what a killed run left half-written."""
+        now = time.time()
+        for path in self.folder.glob("*/*"):
             with suppress(OSError):
-                part.unlink()
+                age = now - path.stat().st_mtime
+                if path.is_dir() and age > WRITING_SECONDS:
+                    shutil.rmtree(path)
+                elif age > KEPT_SECONDS:
+                    path.unlink()
 
     def _path(self, key: str) -> Path:
         return self.folder / key[:2] / f"{key}.npz"
@@ -112,12 +139,24 @@ def content_hash(path: Path) -> str:
 
 @cache
 def _code_version() -> str:
-    """Return a fingerprint of the code that measures: its own source and the library that decodes."""
+    """Return a fingerprint of the code that measures: its own sources and the library that decodes."""
     digest = hashlib.sha256(f"{cv2.__version__} {np.__version__}".encode())
-    for source in sorted(files("sfm.targets").iterdir(), key=lambda entry: entry.name):
-        if source.name.endswith(".py"):
-            digest.update(source.read_bytes())
+    for _, source in sorted(measuring_sources().items()):
+        digest.update(source.encode())
     return digest.hexdigest()
+
+
+def measuring_sources() -> dict[str, str]:
+    """Return the source of every module that measuring depends on, by its name: all that they import."""
+    found: dict[str, str] = {}
+    left = list(MEASURING)
+    while left:
+        name = left.pop()
+        spec = None if name in found else find_spec(name)
+        if spec is not None and spec.origin is not None:
+            found[name] = Path(spec.origin).read_text(encoding="utf-8")
+            left += re.findall(r"^\s*from (sfm[\w.]*) import", found[name], re.MULTILINE)
+    return found
 
 
 def _targets(data: bytes) -> Targets:

@@ -2,53 +2,23 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from sfm.camera import Camera
-from sfm.conventions import FloatArray, IntArray
-from sfm.photographs.reading import Metadata, read_metadata, read_photograph
+from sfm.conventions import FloatArray
+from sfm.photographs.exif import Metadata, read_metadata
+from sfm.photographs.reading import read_photograph
 from sfm.progress import SILENT, Progress
-from sfm.result import FailedImage, PhotographTargets
 from sfm.survey.inputs.cameras import start_cameras
+from sfm.survey.inputs.photograph_list import PhotographList
 from sfm.survey.inputs.settings import TargetSettings
-from sfm.survey.inputs.start import PhotographList
-from sfm.survey.inputs.survey_file import Survey
+from sfm.survey.inputs.survey import Survey
+from sfm.survey.measurements import MeasuredPhotographs
 from sfm.survey.photographs import each_photograph
 from sfm.survey.target_store import TargetStore, target_key
-from sfm.targets.codes.rings import CodeFamily
-from sfm.targets.codes.tags import TagFamily, target_family
+from sfm.targets.codes.families import Family
 from sfm.targets.detect import Targets, find_targets
-
-
-@dataclass(frozen=True)
-class MeasuredPhotographs:
-    """The readable photographs of a survey with their targets, and those that could not be read."""
-
-    names: tuple[str, ...]  # (m,)
-    paths: tuple[Path, ...]  # (m,)
-    camera: IntArray  # index into cameras, (m,)
-    cameras: tuple[Camera, ...]  # with start values of the interior orientation
-    targets: tuple[Targets, ...]  # (m,)
-    failed: tuple[FailedImage, ...]  # photographs that could not be read
-
-    def overlays(self) -> tuple[PhotographTargets, ...]:
-        """Return what the report draws into each photograph."""
-        return tuple(
-            PhotographTargets(
-                name,
-                path,
-                found.xy,
-                found.semi_axes,
-                found.angle,
-                found.rejected_xy,
-                found.rejected_flag,
-                found.flag,
-            )
-            for name, path, found in zip(self.names, self.paths, self.targets, strict=True)
-        )
 
 
 def measure_photographs(
@@ -76,9 +46,8 @@ def measure_photographs(
         PhotographError: photographs of different size under one camera.
         SurveyFileError: the code table or the start values of a camera are unusable.
     """
-    family = survey_family(survey)
+    family = survey.family
     found, failed = each_photograph(
-        survey,
         photographs,
         lambda path: _read_and_measure(path, survey.targets, family, store),
         jobs=jobs,
@@ -91,38 +60,27 @@ def measure_photographs(
         names,
         tuple(photographs.paths[k] for k in order),
         camera,
-        start_cameras(survey, tuple(found[k][0] for k in order), camera, names),
+        start_cameras(survey.cameras, survey.source, tuple(found[k][0] for k in order), camera, names),
         tuple(found[k][1] for k in order),
         failed,
+        tuple(found[k][2] for k in order),
     )
 
 
-def survey_family(survey: Survey) -> CodeFamily | TagFamily | None:
-    """Return the codes of a survey, rings with the radii that it states, None where targets have none.
-
-    Raises:
-        SurveyFileError: the code table is unreadable.
-    """
-    family = target_family(survey.codes)
-    if survey.targets.ring_radii is not None and isinstance(family, CodeFamily):
-        return replace(family, inner=survey.targets.ring_radii[0], outer=survey.targets.ring_radii[1])
-    return family
-
-
 def _read_and_measure(
-    path: Path, settings: TargetSettings, family: CodeFamily | TagFamily | None, store: TargetStore | None
-) -> tuple[Metadata, Targets]:
-    targets, _ = measure_photograph(path, settings, family, store)  # says best what is wrong with a file
-    return read_metadata(path), targets
+    path: Path, settings: TargetSettings, family: Family | None, store: TargetStore | None
+) -> tuple[Metadata, Targets, bool]:
+    targets, stored = measure_photograph(path, settings, family, store)  # says best what is wrong with a file
+    return read_metadata(path), targets, stored
 
 
 def measure_photograph(
     path: Path,
     settings: TargetSettings,
-    family: CodeFamily | TagFamily | None,
+    family: Family | None,
     store: TargetStore | None = None,
 ) -> tuple[Targets, bool]:
-    """Return the targets of one photograph and whether they came from the store.
+    """Return the targets of one photograph and whether an earlier run has measured them.
 
     The pixels are let go at once.
 
@@ -130,16 +88,18 @@ def measure_photograph(
         path: the photograph.
         settings: what the targets look like.
         family: their codes, None where they have none.
-        store: is asked first, and keeps what had to be measured.
+        store: is asked first, and keeps and holds what had to be measured.
 
     Raises:
         PhotographError: the photograph cannot be read.
     """
     measured = settings.model_dump_json(include={"channel", "polarity", "min_diameter_px"})
     key = "" if store is None else target_key(path, measured, family)
-    kept = None if store is None else store.load(key)
-    if kept is not None:
-        return kept, True
+    if store is not None:
+        if key not in store.held and (kept := store.load(key)) is not None:
+            store.held[key] = kept, True
+        if key in store.held:
+            return store.held[key]
     targets = find_targets(
         read_photograph(path, channel=settings.channel),
         polarity=settings.polarity,
@@ -148,6 +108,7 @@ def measure_photograph(
     )
     if store is not None:
         store.save(key, targets)
+        store.held[key] = targets, False
     return targets, False
 
 

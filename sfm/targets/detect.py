@@ -1,41 +1,26 @@
-"""Finding, measuring and decoding the circular targets of one photograph."""
+"""Finding, measuring and decoding the targets of one photograph: the entrance to this room."""
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
 
-from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
-from sfm.kernels.options import compiled
-from sfm.targets.codes.rings import UNCODED, UNREADABLE, CodeFamily, read_codes
-from sfm.targets.codes.tags import DRAWN_PX, TagCorners, TagFamily, find_tags, inside_tags, target_family
-from sfm.targets.counters import find_counters
+from sfm.conventions import AnyArray, FloatArray, IntArray
+from sfm.errors import KolinearError, PhotographError
+from sfm.targets.codes.families import Family, code_family
+from sfm.targets.codes.ring_reading import UNCODED, UNREADABLE, read_codes
+from sfm.targets.codes.rings import CodeFamily
+from sfm.targets.codes.tags import DRAWN_PX, TagCorners, TagFamily, find_tags, inside_tags
+from sfm.targets.fits.centroid import WEIGHTS, measure_centroids
+from sfm.targets.fits.edge_ellipse import measure_edge_ellipses
 from sfm.targets.flags import Flag
-from sfm.targets.measure import EllipseFit, axes_from_shape, fit_ellipse_model
-from sfm.targets.outlines import (
-    LEAST_AXIS_RATIO,
-    LEAST_STEP,
-    STEP_SIGMAS,
-    estimate_noise,
-    find_outlines,
-    scale_of,
-)
+from sfm.targets.measure import EllipseFit, axes_covariance, axes_from_shape, fit_ellipse_model
+from sfm.targets.outlines import estimate_noise, find_outlines, scale_of
+from sfm.targets.rejection import find_counters, find_duplicates, find_parts_of_codes, judge_fits
 
-# Largest RMS of the residuals and largest mean residual on an eighth of the edge, over the contrast.
-POOR_FIT = 0.12
-UNEVEN_EDGE = 0.18
-# Largest lobes of an outline, in radii, for noise so many sigma of a component more (four of them are seen);
-# only half of it where the background is a thin stroke on more than this share of the circumference.
-LOBES, LOBES_SIGMAS, STROKES = 0.02, 5.0, 0.5
-# Centres nearer than this share of the smaller radius belong to concentric targets.
-CONCENTRIC = 0.5
-# Parts of an unreadable code are smaller than this share of its dot.
-PART_OF_DOT = 0.75
-# Softest edge: this share of the minor semi-axis, or this blur in px where that is more.
-SOFTEST_EDGE = 0.35
-SOFTEST_EDGE_PX = 1.3
+SIGNS = {"dark": (-1,), "bright": (1,), "auto": (1, -1)}
+CENTRES = ("model", "edges", *WEIGHTS)
 
 
 @dataclass(frozen=True)
@@ -46,6 +31,10 @@ class Targets:
     """centres, px, (0, 0) is the centre of the top-left pixel, shape (k, 2)"""
     covariance: FloatArray
     """covariance of the centres, px^2, shape (k, 2, 2)"""
+    axes_covariance: FloatArray
+    """covariance of (major, minor, angle), px and rad, nan for corners of tags, shape (k, 3, 3)"""
+    edge_covariance: FloatArray
+    """covariance of (background, contrast, blur), units of the photograph and px, shape (k, 3, 3)"""
     semi_axes: FloatArray
     """major and minor semi-axis of the ellipse, px; what is drawn for a corner of a tag, shape (k, 2)"""
     angle: FloatArray
@@ -74,16 +63,21 @@ class Targets:
     def __len__(self) -> int:
         return len(self.xy)
 
+    def __repr__(self) -> str:
+        coded, rejected = int((self.code >= 0).sum()), len(self.rejected_xy)
+        return f"<{len(self)} targets, {coded} of them coded, {rejected} candidates rejected>"
+
 
 def find_targets(
     photograph: AnyArray,
     *,
     polarity: str = "auto",
-    codes: str | CodeFamily | TagFamily = "none",
+    codes: str | Family = "none",
+    centres: str = "model",
     min_diameter_px: float = 4.0,
     max_diameter_px: float = 250.0,
 ) -> Targets:
-    """Find, measure and decode the circular targets of one photograph.
+    """Find, measure and decode the targets of one photograph.
 
     Candidates are the outlines of what differs from its local mean; those that resemble ellipses are fitted
     with the model of a blurred ellipse, and what the model does not explain is rejected with a reason.
@@ -91,7 +85,11 @@ def find_targets(
     Args:
         photograph: intensities, shape (H, W), uint8 or uint16.
         polarity: dark, bright or auto (both).
-        codes: arcs, ring12, ring14, ring20, none, a family of tags, the path of a code table, or a family.
+        codes: a name in `sfm.targets.codes.families.FAMILIES` (arcs, ring12, ring14, ring20, none, a family
+            of tags), the path of a code table, or a family.
+        centres: how centres are measured: model (least squares fit of a blurred ellipse, the most precise),
+            edges (ellipse through the edges on rays), or the centroid with binary, intensity or squared
+            weights.
         min_diameter_px: least minor axis of a target.
         max_diameter_px: largest major axis of a target.
 
@@ -99,54 +97,65 @@ def find_targets(
         The targets in order of rows, and the rejected candidates.
 
     Raises:
-        ValueError: not a grey photograph of 8 or 16 bit, or an unknown polarity.
+        PhotographError: not a grey photograph of 8 or 16 bit.
         SurveyFileError: neither a known code family nor a readable table.
+        KolinearError: unknown polarity or way to measure centres.
+
+    Example:
+        >>> y, x = np.mgrid[:60, :80]
+        >>> disc = np.clip(12.5 - np.hypot(x - 40.3, y - 29.8), 0, 1)
+        >>> targets = find_targets((200 - 160 * disc).astype(np.uint8), polarity="dark")
+        >>> targets
+        <1 targets, 0 of them coded, 0 candidates rejected>
+        >>> targets.xy.round(1), targets.semi_axes.round(1)
+        (array([[40.3, 29.8]]), array([[12., 12.]]))
+        >>> bool(np.sqrt(targets.covariance[0, 0, 0]) < 0.02)  # px
+        True
     """
     if photograph.ndim != 2 or photograph.dtype not in (np.uint8, np.uint16):
-        raise ValueError(
-            f"photograph is {photograph.dtype} of shape {photograph.shape}, needed uint8 or uint16 (H, W)"
+        raise PhotographError(
+            f"photograph is {photograph.dtype} of shape {photograph.shape}, expected uint8 or uint16 (H, W)"
         )
-    signs = {"bright": (1,), "dark": (-1,), "auto": (1, -1)}.get(polarity)
-    if signs is None:
-        raise ValueError(f"polarity {polarity!r} is none of dark, bright, auto")
-    family = target_family(codes)
+    for name, given, known in (("polarity", polarity, tuple(SIGNS)), ("centres", centres, CENTRES)):
+        if given not in known:
+            raise KolinearError(f"{name} {given!r}, expected one of {', '.join(known)}")
+    family = code_family(codes)
     noise, scale = estimate_noise(photograph), scale_of(photograph)
-    outlines = find_outlines(
-        photograph,
-        signs,
-        noise=noise,
-        scale=scale,
-        min_diameter_px=min_diameter_px,
-        max_diameter_px=max_diameter_px,
-    )
+    limits = {"min_diameter_px": min_diameter_px, "max_diameter_px": max_diameter_px}
+    outlines = find_outlines(photograph, SIGNS[polarity], noise=noise, scale=scale, **limits)
     fit = fit_ellipse_model(
         photograph, outlines.xy, outlines.shape, outlines.sign, noise=noise, saturation=scale
     )
-    reason = _judge(fit, noise, scale, min_diameter_px, max_diameter_px)
-    reason[_duplicates(fit, reason)] = Flag.DUPLICATE
+    reason = judge_fits(fit, noise=noise, scale=scale, **limits)
+    reason[find_duplicates(fit, reason)] = Flag.DUPLICATE
     code, confidence = np.full(len(reason), UNCODED), np.zeros(len(reason))
+    levels = np.column_stack([fit.background, fit.contrast])
     tags = None
     if isinstance(family, TagFamily):
         tags = find_tags(photograph, family, polarity=polarity, scale=scale)
         reason[(reason == 0) & inside_tags(fit.xy, tags, family)] = Flag.PART_OF_CODE
     good = reason == 0
     if isinstance(family, CodeFamily) and good.any():
-        levels = np.column_stack([fit.background, fit.contrast])
         code[good], confidence[good] = read_codes(
             photograph, fit.xy[good], fit.shape[good], levels[good], family, blur_px=fit.blur[good]
         )
-        reason[good & _inside_codes(fit, code, confidence, family)] = Flag.PART_OF_CODE
+        reason[good & find_parts_of_codes(fit, code, confidence, family)] = Flag.PART_OF_CODE
     free = np.flatnonzero((reason == 0) & (code < 0))
-    levels = np.column_stack([fit.background, fit.contrast])[free]
-    counter = find_counters(photograph, fit.xy[free], fit.shape[free], levels)
+    counter = find_counters(photograph, fit.xy[free], fit.shape[free], levels[free])
     reason[free[counter]] = Flag.THIN_BACKGROUND.value
+    xy, covariance = fit.xy, fit.covariance
+    if centres != "model":
+        xy, covariance = _measure_centres(photograph, fit, outlines.sign, noise, centres)
+        reason[(reason == 0) & np.isnan(xy[:, 0])] = Flag.NO_CONVERGENCE.value
     keep = np.flatnonzero(reason == 0)
-    keep = keep[np.lexsort((fit.xy[keep, 0], fit.xy[keep, 1]))]
+    keep = keep[np.lexsort((xy[keep, 0], xy[keep, 1]))]
     remark = np.where(code == UNREADABLE, fit.flag | Flag.CODE_UNREADABLE.value, fit.flag)
     semi_axes, angle = axes_from_shape(fit.shape[keep])
     targets = Targets(
-        xy=fit.xy[keep],
-        covariance=fit.covariance[keep],
+        xy=xy[keep],
+        covariance=covariance[keep],
+        axes_covariance=axes_covariance(semi_axes, angle, fit.full_covariance[keep, 2:5, 2:5]),
+        edge_covariance=fit.full_covariance[keep, 5:, 5:],
         semi_axes=semi_axes,
         angle=angle,
         code=np.where(code == UNREADABLE, UNCODED, code)[keep],
@@ -163,12 +172,24 @@ def find_targets(
     return targets if tags is None else _with_corners(targets, tags)
 
 
+def _measure_centres(
+    photograph: AnyArray, fit: EllipseFit, sign: IntArray, noise: float, centres: str
+) -> tuple[FloatArray, FloatArray]:
+    """Return centres, px, (k, 2), and their covariance, (k, 2, 2), measured another way about a fit."""
+    if centres == "edges":
+        edges = measure_edge_ellipses(photograph, fit.xy, fit.shape, sign, noise=noise)
+        return edges.xy, edges.covariance
+    return measure_centroids(photograph, fit.xy, fit.shape, sign, noise=noise, weights=centres)
+
+
 def _with_corners(targets: Targets, tags: TagCorners) -> Targets:
     """Return circular targets and the corners of tags behind them."""
     k = len(tags.xy)
     return Targets(
         xy=np.vstack([targets.xy, tags.xy]),
         covariance=np.concatenate([targets.covariance, tags.covariance]),
+        axes_covariance=np.concatenate([targets.axes_covariance, np.full((k, 3, 3), np.nan)]),
+        edge_covariance=np.concatenate([targets.edge_covariance, tags.edge_covariance]),
         semi_axes=np.vstack([targets.semi_axes, np.full((k, 2), DRAWN_PX)]),
         angle=np.append(targets.angle, np.zeros(k)),
         code=np.append(targets.code, tags.code),
@@ -182,83 +203,3 @@ def _with_corners(targets: Targets, tags: TagCorners) -> Targets:
         rejected_xy=np.vstack([targets.rejected_xy, tags.rejected_xy]),
         rejected_flag=np.append(targets.rejected_flag, tags.rejected_flag),
     )
-
-
-def _judge(fit: EllipseFit, noise: float, scale: float, smallest: float, largest: float) -> IntArray:
-    """Return the first reason against each fitted candidate, 0 where there is none."""
-    a, b = np.full(len(fit.xy), np.nan), np.full(len(fit.xy), np.nan)
-    defined = fit.shape[:, 0] * fit.shape[:, 2] > fit.shape[:, 1] ** 2
-    if defined.any():
-        a[defined], b[defined] = axes_from_shape(fit.shape[defined])[0].T
-    contrast = np.abs(fit.contrast)
-    lobes = LOBES + LOBES_SIGMAS * fit.lobes_sigma
-    border = (fit.flag & Flag.CUT_BY_BORDER) != 0
-    with np.errstate(divide="ignore", invalid="ignore"):
-        tests = [
-            (Flag.CUT_BY_BORDER, border),
-            (Flag.NOT_ELLIPTIC, (fit.flag & Flag.NOT_ELLIPTIC) != 0),
-            (Flag.NO_CONVERGENCE, (fit.flag & Flag.NO_CONVERGENCE) != 0),
-            (Flag.TOO_SMALL, ~(2 * b >= smallest)),
-            (Flag.TOO_LARGE, ~(2 * a <= largest)),
-            (Flag.TOO_OBLIQUE, b / a < LEAST_AXIS_RATIO),
-            (Flag.LOW_CONTRAST, contrast < np.maximum(STEP_SIGMAS * noise, LEAST_STEP * scale)),
-            (Flag.BLURRED, fit.blur > np.maximum(SOFTEST_EDGE * b, SOFTEST_EDGE_PX)),
-            (Flag.UNEVEN_EDGE, fit.unevenness > UNEVEN_EDGE + 3 * noise / contrast),
-            (Flag.LOBED, fit.lobes > lobes),
-            (Flag.THIN_BACKGROUND, (fit.strokes > STROKES) & (fit.lobes > lobes / 2)),
-            (Flag.POOR_FIT, fit.noise / contrast > POOR_FIT + noise / contrast),
-        ]
-    reason = np.zeros(len(fit.xy), dtype=np.int64)
-    for flag, against in tests:
-        reason[(reason == 0) & against] = flag.value
-    return reason
-
-
-def _duplicates(fit: EllipseFit, reason: IntArray) -> BoolArray:
-    """Return which of the good candidates surround another one: of concentric ellipses the smallest is kept.
-
-    A retro-reflective dot with a dark rim in glare is seen as bright dot and, larger, as the dark rim.
-    """
-    duplicate = np.zeros(len(fit.xy), dtype=bool)
-    good = np.flatnonzero(reason == 0)
-    p, q, r = fit.shape[good].T
-    radius = (p * r - q * q) ** -0.5
-    order = np.argsort(fit.xy[good, 0], kind="stable")
-    duplicate[good[order]] = _surrounds(fit.xy[good][order], radius[order])
-    return duplicate
-
-
-@compiled
-def _surrounds(xy: FloatArray, radius: FloatArray) -> BoolArray:
-    """Return which of the circles, in order of x, have the centre of a smaller one near their own."""
-    outer = np.zeros(len(xy), dtype=np.bool_)
-    widest = radius.max() if len(radius) else 0.0
-    for i in range(len(xy)):
-        for j in range(i + 1, len(xy)):
-            if xy[j, 0] - xy[i, 0] > widest:
-                break
-            small, large = (i, j) if radius[i] <= radius[j] else (j, i)
-            if math.hypot(xy[j, 0] - xy[i, 0], xy[j, 1] - xy[i, 1]) < CONCENTRIC * radius[small]:
-                outer[large] = True
-    return outer
-
-
-def _inside_codes(fit: EllipseFit, code: IntArray, confidence: FloatArray, family: CodeFamily) -> BoolArray:
-    """Return which candidates lie in the code ring of another target, hence are parts of its code.
-
-    The codes are gone through from the most confident to those that could not be read, and a part of one
-    code has no say in what follows: an arc that resembles a dot does not take the dot of its own ring away.
-    About a dot whose code was not read only what is clearly smaller than the dot counts.
-    """
-    inside = np.zeros(len(fit.xy), dtype=bool)
-    size = np.sqrt(np.abs(fit.shape[:, 0] * fit.shape[:, 2] - fit.shape[:, 1] ** 2))  # 1 / mean semi-axis
-    coded = np.flatnonzero(code != UNCODED)
-    for k in coded[np.lexsort((size[coded], -confidence[coded], code[coded] < 0))]:
-        if inside[k]:
-            continue
-        p, q, r = fit.shape[k]
-        dx, dy = (fit.xy - fit.xy[k]).T
-        rho = np.hypot(p * dx + q * dy, q * dx + r * dy)
-        part = (rho > 1) & (rho < family.outer + 0.2)
-        inside |= part if code[k] >= 0 else part & (size * PART_OF_DOT > size[k])
-    return inside

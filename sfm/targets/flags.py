@@ -31,7 +31,7 @@ class Flag(IntFlag):
     NOT_ELLIPTIC = 1 << 12  # the outline is not an ellipse
     LOW_CONTRAST = 1 << 13  # the step of intensity is too small for the noise
     UNEVEN_EDGE = 1 << 14  # the edge is missing or different on part of the circumference
-    POOR_FIT = 1 << 15  # the picture differs from the model of a blurred ellipse
+    POOR_FIT = 1 << 15  # the intensities differ from the model of a blurred ellipse
     BLURRED = 1 << 16  # the edge is too soft for the size
     NO_CONVERGENCE = 1 << 17  # the least squares fit did not converge on this outline
     DUPLICATE = 1 << 18  # the same target was found twice

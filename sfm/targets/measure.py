@@ -10,8 +10,9 @@ import cv2
 import numpy as np
 
 from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
-from sfm.targets.fits.blurred_ellipse import PARAMETERS
-from sfm.targets.fits.ellipse_fit import fit_templates
+from sfm.targets.fits import goodness
+from sfm.targets.fits.blurred_ellipse import BACKGROUND, BLUR, CONTRAST, GAIN_X, UNKNOWNS, P, R
+from sfm.targets.fits.ellipse_fit import EllipseFits, fit_ellipses
 from sfm.targets.flags import Flag
 
 # Variance of rounding to whole intensities.
@@ -35,8 +36,9 @@ class EllipseFit:
 
     xy: FloatArray
     """centres, px, shape (k, 2)"""
-    covariance: FloatArray
-    """covariance of the centres from the fit and its own residuals, px^2, shape (k, 2, 2)"""
+    full_covariance: FloatArray
+    """covariance of centre, shape, background, contrast and blur in this order from the fit and its own
+    residuals, nan where it failed, shape (k, 8, 8)"""
     shape: FloatArray
     """(p, q, r) of S, which turns image vectors into radii, 1/px, shape (k, 3)"""
     background: FloatArray
@@ -64,6 +66,11 @@ class EllipseFit:
     flag: IntArray
     """remarks and reasons of failure, see Flag, shape (k,)"""
 
+    @property
+    def covariance(self) -> FloatArray:
+        """Covariance of the centres, px^2, shape (k, 2, 2)."""
+        return self.full_covariance[:, :2, :2]
+
 
 def fit_ellipse_model(
     photograph: AnyArray,
@@ -85,7 +92,7 @@ def fit_ellipse_model(
         saturation: intensities from here on are censored; default is the end of the integer scale.
 
     Returns:
-        The fits; where `flag` says NO_CONVERGENCE or CUT_BY_BORDER the values are the last ones reached.
+        The fits; where `flag` is NO_CONVERGENCE or CUT_BY_BORDER the values are the last ones reached.
 
     Source: Gauss-Markov model with Levenberg-Marquardt steps; Ahn, Rauh, Kim, "Circular coded target for
     automation of optical 3D-measurement" (1997), for the least squares template of an ellipse.
@@ -98,38 +105,38 @@ def fit_ellipse_model(
     theta, cofactor, statistics, flag = _fit_in_threads(
         photograph, start, np.asarray(sign, np.int64), float(noise), float(saturation)
     )
-    pixels, squares, unevenness, length, steps, lobes, lobes_sigma, strokes, *glow = statistics.T
-    variance = squares / np.maximum(pixels - PARAMETERS, 1)
+    found = statistics.T
+    variance = found[goodness.SQUARES] / np.maximum(found[goodness.PIXELS] - UNKNOWNS, 1)
     if integers:
         variance = np.maximum(variance, QUANTISATION)
-    covariance = np.full((k, 2, 2), np.nan)
+    covariance = np.full((k, GAIN_X, GAIN_X), np.nan)
     failed = Flag.NO_CONVERGENCE | Flag.CUT_BY_BORDER | Flag.NOT_ELLIPTIC
     good = np.flatnonzero((flag & failed) == 0)
     if len(good):
         theta[good], covariance[good], shaded = _shrink_gain(
-            theta[good], cofactor[good], variance[good], length[good]
+            theta[good], cofactor[good], variance[good], found[goodness.LENGTH][good]
         )
         flag[good[shaded]] |= Flag.SHADED.value
-    gain = theta[:, 8:] / length[:, None]
-    halo, halo_sigma, saturated, glaring = glow
-    flag[(halo > HALO) & (halo > HALO_SIGMAS * halo_sigma)] |= Flag.HALO.value
-    glare = (saturated > FLARE_SATURATED) | (glaring > FLARE_AROUND)
+    gain = theta[:, GAIN_X:] / found[goodness.LENGTH][:, None]
+    halo = found[goodness.HALO]
+    flag[(halo > HALO) & (halo > HALO_SIGMAS * found[goodness.HALO_SIGMA])] |= Flag.HALO.value
+    glare = (found[goodness.SATURATED] > FLARE_SATURATED) | (found[goodness.GLARING] > FLARE_AROUND)
     flag[glare | _changes(theta, gain)] |= Flag.FLARE.value
     return EllipseFit(
         xy=theta[:, :2],
-        covariance=covariance,
-        shape=theta[:, 2:5],
-        background=theta[:, 5],
-        contrast=theta[:, 6],
-        blur=theta[:, 7],
+        full_covariance=covariance,
+        shape=theta[:, P : R + 1],
+        background=theta[:, BACKGROUND],
+        contrast=theta[:, CONTRAST],
+        blur=theta[:, BLUR],
         gain=gain,
         noise=np.sqrt(variance),
-        unevenness=unevenness,
-        lobes=lobes,
-        lobes_sigma=noise * lobes_sigma,
-        strokes=strokes,
-        pixels=pixels.astype(np.int64),
-        iterations=steps.astype(np.int64),
+        unevenness=found[goodness.UNEVENNESS],
+        lobes=found[goodness.LOBES],
+        lobes_sigma=noise * found[goodness.LOBES_SIGMA],
+        strokes=found[goodness.STROKES],
+        pixels=found[goodness.PIXELS].astype(np.int64),
+        iterations=found[goodness.STEPS].astype(np.int64),
         flag=flag,
     )
 
@@ -139,21 +146,21 @@ def _changes(theta: FloatArray, gain: FloatArray) -> BoolArray:
     p, q, r, B, A = theta[:, 2:7].T
     with np.errstate(divide="ignore", invalid="ignore"):
         radius = np.abs(p * r - q * q) ** -0.5
-        return 2 * radius * np.abs(B) * np.hypot(*gain.T) > FLARE_CHANGE * np.abs(A)
+        change = 2 * radius * np.abs(B) * np.hypot(*gain.T)
+        return np.asarray(change > FLARE_CHANGE * np.abs(A))
 
 
 def _fit_in_threads(
     photograph: AnyArray, start: FloatArray, sign: IntArray, noise: float, saturation: float
-) -> tuple[FloatArray, FloatArray, FloatArray, IntArray]:
-    """Fit the templates in as many threads as OpenCV may use; the results do not depend on their number."""
+) -> EllipseFits:
+    """Fit the ellipses in as many threads as OpenCV may use; the results do not depend on their number."""
     parts = max(1, min(cv2.getNumThreads(), len(start) // TARGETS_PER_THREAD))
     if parts == 1:
-        return fit_templates(photograph, start, sign, noise, saturation)
+        return fit_ellipses(photograph, start, sign, noise, saturation)
     chunks = np.array_split(np.arange(len(start)), parts)
     with ThreadPoolExecutor(parts) as pool:
-        fits = pool.map(lambda c: fit_templates(photograph, start[c], sign[c], noise, saturation), chunks)
-        theta, cofactor, statistics, flag = zip(*fits, strict=True)
-    return np.concatenate(theta), np.concatenate(cofactor), np.concatenate(statistics), np.concatenate(flag)
+        fits = pool.map(lambda c: fit_ellipses(photograph, start[c], sign[c], noise, saturation), chunks)
+        return EllipseFits(*(np.concatenate(part) for part in zip(*fits, strict=True)))
 
 
 def _shrink_gain(
@@ -169,9 +176,9 @@ def _shrink_gain(
     Source: DerSimonian and Laird (1986), moment estimate of the variance between units; empirical Bayes.
 
     Returns:
-        Unknowns, shape (k, 10); covariance of the centre, px^2, shape (k, 2, 2); which gains are not zero.
+        Unknowns, shape (k, 10); covariance of all but the gains, shape (k, 8, 8); which gains are not zero.
     """
-    gains = slice(8, PARAMETERS)
+    gains = slice(GAIN_X, UNKNOWNS)
     gain = theta[:, gains] / length[:, None]
     gain_variance = (variance / length**2)[:, None] * np.diagonal(cofactor, axis1=1, axis2=2)[:, gains]
     shaded = np.any(gain**2 > OWN_GAIN_SIGMAS**2 * gain_variance, axis=1)
@@ -183,8 +190,8 @@ def _shrink_gain(
         K = cofactor[:, :, gains] @ np.linalg.inv(prior + cofactor[:, gains, gains])
         K[own] = 0.0
         theta = theta - np.einsum("kij,kj->ki", K, theta[:, gains])
-        cofactor = cofactor[:, :2, :2] - K[:, :2] @ cofactor[:, gains, :2]
-    return theta, variance[:, None, None] * cofactor[:, :2, :2], shaded
+        cofactor = cofactor - K @ cofactor[:, gains]
+    return theta, variance[:, None, None] * cofactor[:, :GAIN_X, :GAIN_X], shaded
 
 
 def axes_from_shape(shape: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -197,6 +204,32 @@ def axes_from_shape(shape: FloatArray) -> tuple[FloatArray, FloatArray]:
     angle = 0.5 * np.arctan2(2 * q, p - r) + math.pi / 2  # the small eigenvalue of S belongs to the long axis
     angle = (angle + math.pi / 2) % math.pi - math.pi / 2
     return np.column_stack([1 / (mean - half), 1 / (mean + half)]), angle
+
+
+def axes_covariance(semi_axes: FloatArray, angle: FloatArray, shape_covariance: FloatArray) -> FloatArray:
+    """Return the covariance of semi-axes and angle from that of (p, q, r).
+
+    Args:
+        semi_axes: major and minor semi-axis, px, shape (k, 2).
+        angle: direction of the major axis, rad, shape (k,).
+        shape_covariance: covariance of (p, q, r), 1/px^2, shape (k, 3, 3).
+
+    Returns:
+        Covariance of (major, minor, angle), px and rad, shape (k, 3, 3); the angle of a circle has none.
+    """
+    major, minor = semi_axes.T
+    c, s = np.cos(angle), np.sin(angle)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        turn = 1 / (1 / major - 1 / minor)  # d angle = u2' dS u1 / (l1 - l2) with eigenvectors u of S
+        rows = np.array(
+            [
+                [-(major**2) * c * c, -2 * major**2 * c * s, -(major**2) * s * s],
+                [-(minor**2) * s * s, 2 * minor**2 * c * s, -(minor**2) * c * c],
+                [-turn * c * s, turn * (c * c - s * s), turn * c * s],
+            ]
+        )
+        J = np.moveaxis(rows, -1, 0)
+        return np.asarray(J @ shape_covariance @ np.swapaxes(J, 1, 2))
 
 
 def shape_from_axes(semi_axes: FloatArray, angle: FloatArray) -> FloatArray:

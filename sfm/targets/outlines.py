@@ -66,7 +66,8 @@ def find_outlines(
         signs: +1 to look for bright, -1 for dark targets.
         noise: standard deviation of the intensities.
         scale: largest intensity that the photograph can hold.
-        min_diameter_px, max_diameter_px: limits of the minor and major axis.
+        min_diameter_px: least minor axis of a target.
+        max_diameter_px: largest major axis of a target.
 
     Returns:
         The outlines.

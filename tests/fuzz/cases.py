@@ -4,8 +4,12 @@ from __future__ import annotations
 
 import io
 import random
+import shutil
+import sqlite3
+import tempfile
 import warnings
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -16,21 +20,24 @@ from PIL import Image
 from adapters.colmap.camera_models import read_model, write_model
 from adapters.formats.ply import read_ply
 from adapters.formats.registry import read_any, write_any
-from adapters.formats.result_tables import TableResult, read_result, write_tables
+from adapters.formats.result_tables import read_result, write_tables
 from adapters.formats.sba_text import read_sba_text
 from sfm.camera import camera_from_values
 from sfm.errors import KolinearError
-from sfm.photographs.reading import read_metadata, read_photograph
-from sfm.pipeline import adjust_survey
-from sfm.survey.inputs.start import find_photographs, network_from_observations
-from sfm.survey.inputs.survey_file import read_survey
-from sfm.survey.inputs.tables import (
+from sfm.photographs.exif import read_metadata
+from sfm.photographs.reading import read_photograph
+from sfm.pipeline import run_survey
+from sfm.stored_result import StoredResult
+from sfm.survey.inputs.exterior_table import read_observed_exterior
+from sfm.survey.inputs.given import (
     read_control,
     read_exterior,
     read_image_points,
-    read_observed_exterior,
     read_points,
 )
+from sfm.survey.inputs.photograph_list import find_photographs
+from sfm.survey.inputs.start import measurements_from_observations
+from sfm.survey.inputs.survey import read_survey
 from sfm.targets.codes.rings import read_code_table
 from sfm.targets.detect import find_targets
 from tests.fuzz.mutate import mutate_bytes, mutate_text
@@ -117,6 +124,7 @@ def make_seeds(folder: Path) -> tuple[Seed, ...]:
     ]
     seeds += [Seed("models", name, text, read) for name, text, read in _OTHER_PROGRAMS]
     seeds += _results(folder)
+    seeds += [Seed("folders", "unused", b"x", _read_folder), Seed("rows", "unused", b"x", _read_rows)]
     for seed in seeds:
         path = folder / seed.name
         if isinstance(seed.content, bytes):
@@ -134,7 +142,7 @@ def _results(folder: Path) -> list[Seed]:
     plain = camera.with_parameters(camera.parameters[[1, 1, 2, 3, 4, 5, 6, 7]] * ([1] * 4 + [0] * 4))
     ideal = replace(truth, cameras=(plain,))
     sigma = np.tile(np.eye(3) * 1e-6, (8, 1, 1))
-    write_tables(folder / "result", TableResult("fuzz", network, truth, sigma, sigma[:3], redundancy=5))
+    write_tables(folder / "result", StoredResult("fuzz", network, truth, sigma, sigma[:3], redundancy=5))
     write_any(folder / "m.xml", "metashape", network, truth)
     write_any(folder / "bal.txt", "bal", network, ideal)
     write_any(folder / "sba", "sba", network, ideal)
@@ -143,6 +151,7 @@ def _results(folder: Path) -> list[Seed]:
     write_any(folder / "8pts.txt", "bundle-csharp", network, replace(truth, cameras=(brown,)))
     write_any(folder / "pm", "photomodeler", network, replace(truth, cameras=(brown,)))
     write_any(folder / "scene.db", "colmap-database", network, truth)
+    shutil.copy(folder / "scene.db", folder / "good.db")
     write_any(folder / "p.ply", "ply", network, truth)
     found: list[Seed] = []
     for name in ("summary.json", "points.csv", "images.csv", "cameras.csv", "image_points.csv"):
@@ -169,6 +178,78 @@ def _results(folder: Path) -> list[Seed]:
     text = (folder / "p.ply").read_text("utf-8")
     found.append(Seed("results", "p.ply", text, lambda f, _: _drop(read_ply(f / "p.ply"))))
     return found
+
+
+def _read_folder(folder: Path, rng: random.Random) -> None:
+    """Look for the photographs of a survey in a folder with links out of it, in circles, or nowhere."""
+    with tempfile.TemporaryDirectory(dir=folder) as name:
+        inner = Path(name)
+        shutil.copy(folder / "survey.toml", inner)
+        for file, text in _tables().items():
+            (inner / file).write_text(text, encoding="utf-8")
+        for place in ("image1", "sub", "a/b/image2", "control.csv", "survey.toml/x", "codes.txt"):
+            target = rng.choice(
+                ("/", "..", ".", "/etc/passwd", "/dev/zero", "/proc", "nowhere", str(folder), place)
+            )
+            link = inner / place
+            with suppress(OSError):
+                link.parent.mkdir(parents=True, exist_ok=True)
+                link.unlink(missing_ok=True)
+                link.symlink_to(target)
+        survey = read_survey(inner / "survey.toml")
+        pattern = rng.choice(("**/*", "sub/**/*", "*/*/*", "sub/*", "a/**/image*", "**/sub/**/x*", "im*"))
+        cameras = tuple(camera.model_copy(update={"images": pattern}) for camera in survey.cameras)
+        found = replace(survey, cameras=cameras)
+        if rng.random() < 0.3:
+            measurements_from_observations(found)
+        for path in find_photographs(found).paths:
+            assert path.resolve().is_relative_to(inner.resolve())
+
+
+def _read_rows(folder: Path, rng: random.Random) -> None:
+    """Read a database of which a cell is another."""
+    path = folder / "rows.db"
+    path.write_bytes((folder / "good.db").read_bytes())
+    database = sqlite3.connect(path)
+    try:
+        for _ in range(rng.choice((1, 1, 2, 4))):
+            table = rng.choice(tuple(COLUMNS))
+            value = rng.choice((*VALUES, rng.randbytes(rng.choice((0, 1, 8, 64, 128)))))
+            which = rng.choice(("1 = 1", "rowid = (SELECT min(rowid) FROM " + table + ")"))
+            with suppress(sqlite3.Error, OverflowError):
+                database.execute(
+                    f"UPDATE {table} SET {rng.choice(COLUMNS[table])} = ? WHERE {which}", (value,)
+                )
+        database.commit()
+    finally:
+        database.close()
+    _drop(read_any(path, "colmap-database"))
+
+
+COLUMNS = {
+    "cameras": ("camera_id", "model", "width", "height", "params"),
+    "images": ("image_id", "name", "camera_id"),
+    "keypoints": ("image_id", "rows", "cols", "data"),
+    "matches": ("pair_id", "rows", "cols", "data"),
+    "two_view_geometries": ("pair_id", "rows", "cols", "data"),
+}
+VALUES = (
+    None,
+    -1,
+    0,
+    1,
+    2,
+    7,
+    2**31,
+    2**63 - 1,
+    -(2**63),
+    1.5,
+    float("inf"),
+    "",
+    "1",
+    "../a",
+    "a\u202eb",
+)
 
 
 def _reader_of(name: str, form: str) -> Callable[[Path, random.Random], None]:
@@ -215,9 +296,9 @@ def _read_survey(folder: Path, rng: random.Random) -> None:
     if survey.observations is None:
         find_photographs(survey)
         return
-    network_from_observations(survey)
+    measurements_from_observations(survey)
     if rng.random() < SOLVED_SHARE:
-        adjust_survey(survey)
+        run_survey(survey)
 
 
 def _reader_of_photograph(name: str) -> Callable[[Path, random.Random], None]:

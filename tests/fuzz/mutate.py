@@ -35,6 +35,20 @@ NASTY = (
         "**/*",
         "\r\n",
     ),
+    *(
+        "=1+1",
+        "'=A1",
+        "+1-cmd",
+        "@SUM(A1)",
+        "\t=1",
+        "a;=1",
+        "\u2066",
+        "\u200b",
+        "\ufe0f",
+        "sub/**/*.jpg",
+        "link/**",
+    ),
+    *(".".join("a" * 5000), "a." * 12 + "a", "x " * 20_000, "\n" * 5000, "<a b=''/>" * 2000, "#" * 12_000),
 )
 NUMBERS = re.compile(r"-?\d+\.?\d*(?:[eE][-+]?\d+)?")
 HEADER_BYTES = 700  # where photographs and models say what they are
@@ -43,7 +57,7 @@ HEADER_BYTES = 700  # where photographs and models say what they are
 def mutate_text(rng: random.Random, text: str) -> str:
     """Return a text with one to four things wrong."""
     for _ in range(rng.choice((1, 1, 1, 2, 3, 4))):
-        text = rng.choice((_number, _number, _token, _line, _cut, _characters))(rng, text)
+        text = rng.choice((_number, _number, _token, _line, _cut, _characters, _many))(rng, text)
     return text
 
 
@@ -109,6 +123,13 @@ def _line(rng: random.Random, text: str) -> str:
     else:
         lines[at] = lines[at] * rng.choice((2, 50))
     return "".join(lines)
+
+
+def _many(rng: random.Random, text: str) -> str:
+    """Repeat a piece very often: rows, columns, keys, elements or what is deep in one another."""
+    at = rng.randrange(len(text) + 1)
+    piece = text[at : at + rng.choice((1, 3, 20, 80))]
+    return text[:at] + piece * rng.choice((1000, 10_000)) + text[at:]
 
 
 def _cut(rng: random.Random, text: str) -> str:

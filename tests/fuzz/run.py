@@ -25,7 +25,10 @@ from sfm.errors import KolinearError
 LIMIT_SECONDS = 10.0
 START_SECONDS = 300.0  # imports and the first compilation of kernels
 LIMIT_MIB = 1024
-SHARES = {"surveys": 0.22, "tables": 0.2, "photographs": 0.26, "models": 0.14, "results": 0.15, "codes": 0.03}
+SHARES = {
+    **{"surveys": 0.2, "tables": 0.18, "photographs": 0.24, "models": 0.13, "results": 0.14, "codes": 0.03},
+    **{"folders": 0.04, "rows": 0.04},
+}
 
 
 def main() -> int:

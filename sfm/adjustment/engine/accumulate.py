@@ -9,84 +9,138 @@ Source: Brown (1976), Photogramm. Eng. Remote Sens. 42(8); Foerstner and Wrobel 
 
 from __future__ import annotations
 
-import numpy as np
-from numba import njit
+from typing import NamedTuple
 
-from sfm.adjustment.engine.collinearity import collinearity
-from sfm.kernels.options import kernel
+import numpy as np
+
+from sfm.adjustment.engine.collinearity import Observations, State, Workspace, collinearity
+from sfm.conventions import BoolArray, FloatArray, IntArray
+from sfm.kernels.options import compiled, inlined, kernel
 
 SINGULAR_PIVOT = 1e-13  # share of a point's own normal equation left below which its rays are parallel
 STIFF = 1e10  # factor on the pivot that holds such a direction of a point
 RESIDUAL = 6  # column of the residual among A: X0, w, residual, interior
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
-def add_photographs(obs, state, weight, exterior_free, t, s, b):  # type: ignore[no-untyped-def]
+class Blocks(NamedTuple):
+    """Parts of the normal equations that one pass over the image points fills; f free parameters a camera."""
+
+    U: FloatArray  # X0, w of each photograph by themselves, (m, 6, 6)
+    C: FloatArray  # X0, w of each photograph by the free parameters of its camera, (m, 6, f)
+    D: FloatArray  # free parameters of each camera by themselves, (a, f, f)
+    g: FloatArray  # right side of X0, w, (m, 6)
+    gi: FloatArray  # right side of the free parameters of each camera, (a, f)
+    V: FloatArray  # object points before elimination, (n, 3, 3)
+    gp: FloatArray  # right side of object points, (n, 3)
+    L: FloatArray  # Cholesky factors of V; unit matrix for kept points, (n, 3, 3)
+    y: FloatArray  # L^-1 gp; 0 for kept points, (n, 3)
+    Y: FloatArray  # Y' of each image point by X0, w of its photograph; 0 for kept points, (k, 3, 6)
+    Y_interior: FloatArray  # Y' of each object point by all interior unknowns; 0 for kept points, (n, 3, i)
+    Yy: FloatArray  # Y y, what the right side is reduced by, (reduced,)
+    K: FloatArray  # kept points by all reduced unknowns, (3 s, reduced)
+    held: IntArray  # 1 where a direction of a point had to be held, (n,)
+    order: IntArray  # image points, photograph by photograph, (k,)
+    first: IntArray  # place in it of the first image point of each photograph, and the end, (m + 1,)
+
+
+class Sums(NamedTuple):
+    """Sums over some photographs, as in `Blocks`, and space for one of them."""
+
+    first: int  # photograph
+    end: int  # photograph behind the last
+    D: FloatArray
+    gi: FloatArray
+    V: FloatArray
+    gp: FloatArray
+    Y_interior: FloatArray
+    A: FloatArray  # derivatives and residuals of the image points of one photograph
+
+
+@compiled
+def add_photographs(
+    observations: Observations,
+    state: State,
+    weight: FloatArray,
+    exterior_free: BoolArray,
+    workspace: Workspace,
+    sums: Sums,
+    blocks: Blocks,
+) -> float:
     """Fill the blocks U, C, g, Y of some photographs and add to the sums over photographs.
 
     Args:
-        obs: image points.
+        observations: image points.
         state: values of all parameters.
         weight: factor on the weight of each image point, (k,).
         exterior_free: (m, 6).
-        t: space for one image point.
-        s: which photographs, and the sums that they add to.
-        b: blocks.
+        workspace: of one image point.
+        sums: which photographs, and the sums that they add to.
+        blocks: of the photographs.
 
     Returns:
         Their v'Pv, infinite with a point behind the camera.
     """
-    s.D[:] = 0.0
-    s.gi[:] = 0.0
-    s.Z[:] = 0.0
+    sums.D[:] = 0.0
+    sums.gi[:] = 0.0
+    sums.Y_interior[:] = 0.0
     vPv = 0.0
-    for i in range(s.first, s.end):
-        a = obs.camera[i]
-        rays = _derivatives(i, obs, state, weight, t, s.A, b)
-        A = s.A[: 2 * abs(rays)]
+    for i in range(sums.first, sums.end):
+        a = observations.camera[i]
+        rays = _derivatives(i, observations, state, weight, workspace, sums.A, blocks)
+        A = sums.A[: 2 * abs(rays)]
         N = np.dot(A.T, A)
         vPv += N[RESIDUAL, RESIDUAL] if rays >= 0 else np.inf
-        _add_photograph(i, a, obs.free_count[a], N, exterior_free, s, b)
-        _add_to_points(i, obs, weight, exterior_free, s, b)
+        _add_photograph(i, a, observations.free_count[a], N, exterior_free, sums, blocks)
+        _add_to_points(i, observations, weight, exterior_free, sums, blocks)
     return vPv
 
 
 @kernel
-def _derivatives(i, obs, state, weight, t, A, b):  # type: ignore[no-untyped-def]
+def _derivatives(
+    i: int,
+    observations: Observations,
+    state: State,
+    weight: FloatArray,
+    workspace: Workspace,
+    A: FloatArray,
+    blocks: Blocks,
+) -> int:
     """Fill two rows of A and B for each image point of photograph i that takes part.
 
     Returns how many these are, made negative where one is behind the camera.
     """
-    a = obs.camera[i]
+    a = observations.camera[i]
     rays, in_front = 0, True
-    for h in range(b.first[i], b.first[i + 1]):
-        o = b.order[h]
+    for h in range(blocks.first[i], blocks.first[i + 1]):
+        o = blocks.order[h]
         if weight[o] > 0.0:
-            if not collinearity(o, obs, state, weight[o], t):
+            if not collinearity(o, observations, state, weight[o], workspace):
                 in_front = False
             x, y = A[2 * rays], A[2 * rays + 1]
             for p in range(6):
-                x[p], y[p] = t.A[0, p], t.A[1, p]
-            x[RESIDUAL], y[RESIDUAL] = t.r[0], t.r[1]
-            for q in range(obs.free_count[a]):
-                own = 6 + obs.free_index[a, q]
-                x[RESIDUAL + 1 + q], y[RESIDUAL + 1 + q] = t.A[0, own], t.A[1, own]
+                x[p], y[p] = workspace.A[0, p], workspace.A[1, p]
+            x[RESIDUAL], y[RESIDUAL] = workspace.r[0], workspace.r[1]
+            for q in range(observations.free_count[a]):
+                own = 6 + observations.free_index[a, q]
+                x[RESIDUAL + 1 + q], y[RESIDUAL + 1 + q] = workspace.A[0, own], workspace.A[1, own]
             rays += 1
     return rays if in_front else -rays
 
 
 @kernel
-def _add_photograph(i, a, f, N, exterior_free, sums, b):  # type: ignore[no-untyped-def]
+def _add_photograph(
+    i: int, a: int, f: int, N: FloatArray, exterior_free: BoolArray, sums: Sums, blocks: Blocks
+) -> None:
     """Share out the sum (A r)'(A r) of photograph i; fixed unknowns keep their place with derivatives 0."""
     for p in range(6):
         on = 1.0 if exterior_free[i, p] else 0.0
         for q in range(6):
-            b.U[i, p, q] = N[p, q] * on if exterior_free[i, q] else 0.0
-        b.g[i, p] = N[p, RESIDUAL] * on
+            blocks.U[i, p, q] = N[p, q] * on if exterior_free[i, q] else 0.0
+        blocks.g[i, p] = N[p, RESIDUAL] * on
         for q in range(f):
-            b.C[i, p, q] = N[p, RESIDUAL + 1 + q] * on
+            blocks.C[i, p, q] = N[p, RESIDUAL + 1 + q] * on
         if not exterior_free[i, p]:
-            b.U[i, p, p] = 1.0
+            blocks.U[i, p, p] = 1.0
     for p in range(f):
         sums.gi[a, p] += N[RESIDUAL + 1 + p, RESIDUAL]
         for q in range(f):
@@ -94,20 +148,27 @@ def _add_photograph(i, a, f, N, exterior_free, sums, b):  # type: ignore[no-unty
 
 
 @kernel
-def _add_to_points(i, obs, weight, exterior_free, sums, b):  # type: ignore[no-untyped-def]
+def _add_to_points(
+    i: int,
+    observations: Observations,
+    weight: FloatArray,
+    exterior_free: BoolArray,
+    sums: Sums,
+    blocks: Blocks,
+) -> None:
     """Add B'B, B'r, W' of the image points of photograph i; B = -A of the projection centre."""
-    a = obs.camera[i]
-    f = obs.free_count[a]
-    first = 6 * len(obs.camera)
+    a = observations.camera[i]
+    f = observations.free_count[a]
+    first = 6 * len(observations.camera)
     row = 0
-    for h in range(b.first[i], b.first[i + 1]):
-        o = b.order[h]
-        j = obs.point[o]
+    for h in range(blocks.first[i], blocks.first[i + 1]):
+        o = blocks.order[h]
+        j = observations.point[o]
         if weight[o] > 0.0:
             x, y = sums.A[row], sums.A[row + 1]
             row += 2
             x0, x1, x2, y0, y1, y2 = x[0], x[1], x[2], y[0], y[1], y[2]
-            V, gp, Y, Z = sums.V[j], sums.gp[j], b.Y[o], sums.Z[j]
+            V, gp, Y, Yi = sums.V[j], sums.gp[j], blocks.Y[o], sums.Y_interior[j]
             for q in range(6):
                 Y[0, q] = -(x0 * x[q] + y0 * y[q])
                 Y[1, q] = -(x1 * x[q] + y1 * y[q])
@@ -123,81 +184,89 @@ def _add_to_points(i, obs, weight, exterior_free, sums, b):  # type: ignore[no-u
             gp[1] -= x1 * r0 + y1 * r1
             gp[2] -= x2 * r0 + y2 * r1
             for q in range(f):
-                c = obs.free_column[a, q] - first
+                c = observations.free_column[a, q] - first
                 u, v = x[RESIDUAL + 1 + q], y[RESIDUAL + 1 + q]
-                Z[0, c] -= x0 * u + y0 * v
-                Z[1, c] -= x1 * u + y1 * v
-                Z[2, c] -= x2 * u + y2 * v
+                Yi[0, c] -= x0 * u + y0 * v
+                Yi[1, c] -= x1 * u + y1 * v
+                Yi[2, c] -= x2 * u + y2 * v
             for q in range(6):
                 if not exterior_free[i, q]:
                     Y[0, q] = Y[1, q] = Y[2, q] = 0.0
         else:
             for p in range(3):
                 for q in range(6):
-                    b.Y[o, p, q] = 0.0
+                    blocks.Y[o, p, q] = 0.0
 
 
 @kernel
-def eliminate_points(obs, point_free, slot, kept_start, stretch, b):  # type: ignore[no-untyped-def]
+def eliminate_points(
+    observations: Observations,
+    point_free: BoolArray,
+    slot: IntArray,
+    kept_start: int,
+    stretch: float,
+    blocks: Blocks,
+) -> None:
     """Factor V = L L' of each object point and turn W' into Y' = L^-1 W'; kept points go to K instead.
 
     Args:
-        obs: image points.
+        observations: image points.
         point_free: free coordinates, (n, 3).
         slot: place of each object point among the kept ones, -1 for the others, (n,).
         kept_start: column of the first kept point.
         stretch: factor on the diagonal of V (Marquardt), 1 for the truth.
-        b: blocks.
+        blocks: what is filled.
     """
-    b.Yy[:] = 0.0
+    blocks.Yy[:] = 0.0
     for j in range(len(slot)):
-        b.V[j, 0, 1], b.V[j, 0, 2], b.V[j, 1, 2] = b.V[j, 1, 0], b.V[j, 2, 0], b.V[j, 2, 1]
+        V, L, y, gp = blocks.V[j], blocks.L[j], blocks.y[j], blocks.gp[j]
+        V[0, 1], V[0, 2], V[1, 2] = V[1, 0], V[2, 0], V[2, 1]
         for p in range(3):
             if not point_free[j, p]:
                 for q in range(3):
-                    b.V[j, p, q] = b.V[j, q, p] = 0.0
-                b.V[j, p, p] = 1.0
-                b.gp[j, p] = 0.0
-                for q in range(b.Z.shape[2]):
-                    b.Z[j, p, q] = 0.0
-                for o in range(obs.start[j], obs.start[j + 1]):
+                    V[p, q] = V[q, p] = 0.0
+                V[p, p] = 1.0
+                gp[p] = 0.0
+                for q in range(blocks.Y_interior.shape[2]):
+                    blocks.Y_interior[j, p, q] = 0.0
+                for o in range(observations.start[j], observations.start[j + 1]):
                     for q in range(6):
-                        b.Y[o, p, q] = 0.0
+                        blocks.Y[o, p, q] = 0.0
         if slot[j] >= 0:
-            _keep(j, 3 * slot[j], obs, kept_start, b)
+            _keep(j, 3 * slot[j], observations, kept_start, blocks)
             continue
-        b.held[j] = _factor(j, b.V, stretch, b.L)
-        b.y[j, 0] = b.gp[j, 0] / b.L[j, 0, 0]
-        b.y[j, 1] = (b.gp[j, 1] - b.L[j, 1, 0] * b.y[j, 0]) / b.L[j, 1, 1]
-        b.y[j, 2] = (b.gp[j, 2] - b.L[j, 2, 0] * b.y[j, 0] - b.L[j, 2, 1] * b.y[j, 1]) / b.L[j, 2, 2]
-        for o in range(obs.start[j], obs.start[j + 1]):
-            _forward(j, b.L, b.y, b.Y[o], b.Yy, 6 * obs.image[o])
-        _forward(j, b.L, b.y, b.Z[j], b.Yy, 6 * len(obs.camera))
+        blocks.held[j] = _factor(j, blocks.V, stretch, blocks.L)
+        y[0] = gp[0] / L[0, 0]
+        y[1] = (gp[1] - L[1, 0] * y[0]) / L[1, 1]
+        y[2] = (gp[2] - L[2, 0] * y[0] - L[2, 1] * y[1]) / L[2, 2]
+        for o in range(observations.start[j], observations.start[j + 1]):
+            _forward(j, blocks.L, blocks.y, blocks.Y[o], blocks.Yy, 6 * observations.image[o])
+        _forward(j, blocks.L, blocks.y, blocks.Y_interior[j], blocks.Yy, 6 * len(observations.camera))
 
 
-@njit(cache=True, inline="always", error_model="numpy")
-def _keep(j, row, obs, kept_start, b):  # type: ignore[no-untyped-def]
+@inlined
+def _keep(j: int, row: int, observations: Observations, kept_start: int, blocks: Blocks) -> None:
     """Move W' of a kept point to its rows K of the reduced system."""
-    first = 6 * len(obs.camera)
-    b.held[j] = 0
+    first = 6 * len(observations.camera)
+    blocks.held[j] = 0
     for p in range(3):
-        for c in range(b.K.shape[1]):
-            b.K[row + p, c] = 0.0
-        for o in range(obs.start[j], obs.start[j + 1]):
+        for c in range(blocks.K.shape[1]):
+            blocks.K[row + p, c] = 0.0
+        for o in range(observations.start[j], observations.start[j + 1]):
             for q in range(6):
-                b.K[row + p, 6 * obs.image[o] + q] += b.Y[o, p, q]
-                b.Y[o, p, q] = 0.0
-        for c in range(b.Z.shape[2]):
-            b.K[row + p, first + c] = b.Z[j, p, c]
-            b.Z[j, p, c] = 0.0
+                blocks.K[row + p, 6 * observations.image[o] + q] += blocks.Y[o, p, q]
+                blocks.Y[o, p, q] = 0.0
+        for c in range(blocks.Y_interior.shape[2]):
+            blocks.K[row + p, first + c] = blocks.Y_interior[j, p, c]
+            blocks.Y_interior[j, p, c] = 0.0
         for q in range(3):
-            b.K[row + p, kept_start + row + q] = b.V[j, p, q]
-            b.L[j, p, q] = 1.0 if p == q else 0.0
-        b.y[j, p] = 0.0
+            blocks.K[row + p, kept_start + row + q] = blocks.V[j, p, q]
+            blocks.L[j, p, q] = 1.0 if p == q else 0.0
+        blocks.y[j, p] = 0.0
 
 
-@njit(cache=True, inline="always", error_model="numpy")
-def _factor(j, V, stretch, L):  # type: ignore[no-untyped-def]
+@inlined
+def _factor(j: int, V: FloatArray, stretch: float, L: FloatArray) -> int:
     """Cholesky factor of V with its diagonal times stretch; holds directions that the rays leave open."""
     held = 0
     for p in range(3):
@@ -218,8 +287,8 @@ def _factor(j, V, stretch, L):  # type: ignore[no-untyped-def]
     return held
 
 
-@njit(cache=True, inline="always", error_model="numpy")
-def _forward(j, L, y, W, Yy, column):  # type: ignore[no-untyped-def]
+@inlined
+def _forward(j: int, L: FloatArray, y: FloatArray, W: FloatArray, Yy: FloatArray, column: int) -> None:
     """Replace some columns of the three rows W' of point j by L^-1 W' and add their part of Y y."""
     i0, i1, i2 = 1.0 / L[j, 0, 0], 1.0 / L[j, 1, 1], 1.0 / L[j, 2, 2]
     l10, l20, l21 = L[j, 1, 0], L[j, 2, 0], L[j, 2, 1]
@@ -232,84 +301,20 @@ def _forward(j, L, y, W, Yy, column):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def step_points(obs, point_free, b, dx, dX):  # type: ignore[no-untyped-def]
-    """Fill the step of the object points dX = -L^-T (y + Y'dx), dx of the reduced unknowns; 0 where fixed."""
-    first = 6 * len(obs.camera)
-    for j in range(len(dX)):
-        h0, h1, h2 = b.y[j, 0], b.y[j, 1], b.y[j, 2]
-        for q in range(b.Z.shape[2]):
-            d = dx[first + q]
-            h0 += b.Z[j, 0, q] * d
-            h1 += b.Z[j, 1, q] * d
-            h2 += b.Z[j, 2, q] * d
-        for o in range(obs.start[j], obs.start[j + 1]):
-            Y, column = b.Y[o], 6 * obs.image[o]
-            for q in range(6):
-                d = dx[column + q]
-                h0 += Y[0, q] * d
-                h1 += Y[1, q] * d
-                h2 += Y[2, q] * d
-        L = b.L[j]
-        z = -h2 / L[2, 2]
-        y = (-h1 - L[2, 1] * z) / L[1, 1]
-        x = (-h0 - L[1, 0] * y - L[2, 0] * z) / L[0, 0]
-        dX[j, 0] = x if point_free[j, 0] else 0.0
-        dX[j, 1] = y if point_free[j, 1] else 0.0
-        dX[j, 2] = z if point_free[j, 2] else 0.0
-
-
-@kernel
-def gather_interior(obs, b, border, corner, g):  # type: ignore[no-untyped-def]
+def gather_interior(
+    observations: Observations, blocks: Blocks, border: FloatArray, corner: FloatArray, g: FloatArray
+) -> None:
     """Write the blocks of photographs and cameras into border, corner and right side."""
-    first = 6 * len(obs.camera)
-    for i in range(len(obs.camera)):
-        a = obs.camera[i]
+    first = 6 * len(observations.camera)
+    for i in range(len(observations.camera)):
+        a = observations.camera[i]
         for p in range(6):
-            g[6 * i + p] = b.g[i, p]
-            for q in range(obs.free_count[a]):
-                border[6 * i + p, obs.free_column[a, q] - first] = b.C[i, p, q]
-    for a in range(len(obs.free_count)):
-        for p in range(obs.free_count[a]):
-            row = obs.free_column[a, p] - first
-            g[first + row] += b.gi[a, p]
-            for q in range(obs.free_count[a]):
-                corner[row, obs.free_column[a, q] - first] += b.D[a, p, q]
-
-
-@kernel
-def times_reduced(obs, b, x, out):  # type: ignore[no-untyped-def]
-    """Fill out with Y' x: x of the reduced unknowns, (reduced, d), out of the object points, (n, 3, d)."""
-    first = 6 * len(obs.camera)
-    out[:] = 0.0
-    for j in range(len(out)):
-        for p in range(3):
-            for q in range(b.Z.shape[2]):
-                z = b.Z[j, p, q]
-                for e in range(x.shape[1]):
-                    out[j, p, e] += z * x[first + q, e]
-        for o in range(obs.start[j], obs.start[j + 1]):
-            column = 6 * obs.image[o]
-            for p in range(3):
-                for q in range(6):
-                    y = b.Y[o, p, q]
-                    for e in range(x.shape[1]):
-                        out[j, p, e] += y * x[column + q, e]
-
-
-@kernel
-def times_points(obs, b, h, out):  # type: ignore[no-untyped-def]
-    """Add Y h to out: h of the object points, (n, 3, d), out of the reduced unknowns, (reduced, d)."""
-    first = 6 * len(obs.camera)
-    for j in range(len(h)):
-        for p in range(3):
-            for q in range(b.Z.shape[2]):
-                z = b.Z[j, p, q]
-                for e in range(h.shape[2]):
-                    out[first + q, e] += z * h[j, p, e]
-        for o in range(obs.start[j], obs.start[j + 1]):
-            column = 6 * obs.image[o]
-            for p in range(3):
-                for q in range(6):
-                    y = b.Y[o, p, q]
-                    for e in range(h.shape[2]):
-                        out[column + q, e] += y * h[j, p, e]
+            g[6 * i + p] = blocks.g[i, p]
+            for q in range(observations.free_count[a]):
+                border[6 * i + p, observations.free_column[a, q] - first] = blocks.C[i, p, q]
+    for a in range(len(observations.free_count)):
+        for p in range(observations.free_count[a]):
+            row = observations.free_column[a, p] - first
+            g[first + row] += blocks.gi[a, p]
+            for q in range(observations.free_count[a]):
+                corner[row, observations.free_column[a, q] - first] += blocks.D[a, p, q]

@@ -14,11 +14,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sfm.adjustment.engine.accumulate import times_points, times_reduced
-from sfm.adjustment.engine.collinearity import collinearity, scratch
+from sfm.adjustment.engine.collinearity import Observations, State, Workspace, collinearity, new_workspace
 from sfm.adjustment.engine.iterate import Optimum
 from sfm.adjustment.engine.normals import solve_lower, solve_transposed
-from sfm.adjustment.engine.solvers.inverse import Inverse, inverse_of
+from sfm.adjustment.engine.products import times_points, times_reduced
+from sfm.adjustment.engine.solvers.protocol import Inverse
 from sfm.adjustment.engine.unknowns import Unknowns, angle_jacobian
 from sfm.adjustment.result import Covariance
 from sfm.conventions import FloatArray
@@ -57,7 +57,7 @@ def cofactors(optimum: Optimum, layout: Unknowns, *, cross: bool = True) -> Cofa
         cross: whether those between points and photographs are wanted; empty otherwise.
     """
     b = optimum.equations.blocks
-    q = inverse_of(optimum.equations, optimum.factor, layout, cross=cross)
+    q = optimum.factor.inverse(b, cross=cross)
     first = 6 * len(b.U)
     limiting = _inverse_of_squares(b.L)
     points = limiting + _twice_solved(b.L, q.core)
@@ -113,20 +113,22 @@ def hat_complement(
     For an image point without weight it is I + A Q A', the cofactor of its predicted residual.
 
     Args:
-        optimum, layout, cofactors: of one adjustment; with cross-cofactors.
+        optimum: undamped normal equations and their factor.
+        layout: order of the unknowns.
+        cofactors: of the same, those between points and photographs included.
         weight: factor on the weight of each image point, shape (k,).
 
     Returns:
         Cofactors of the whitened residuals, shape (k, 2, 2); NaN behind the camera.
     """
-    Q, t, out = cofactors, scratch(), np.empty((len(weight), 2, 2))
+    Q, workspace, out = cofactors, new_workspace(), np.empty((len(weight), 2, 2))
     # one layout whatever the parameters, so that one compiled form serves every network
     mixed = np.ascontiguousarray(Q.mixed).reshape(len(Q.exterior), 6, -1)
     border = np.ascontiguousarray(Q.border)
-    space = np.empty((2, 9 + t.Jp.shape[1])), np.empty((9 + t.Jp.shape[1], 9 + t.Jp.shape[1]))
+    count = 9 + workspace.Jp.shape[1]
     _complement(
-        layout.obs, optimum.state, weight, Q.exterior, mixed, border, Q.points, Q.cross, Q.cross_border,
-        t, *space, out,
+        layout.observations, optimum.state, weight, Q.exterior, mixed, border, Q.points, Q.cross,
+        Q.cross_border, workspace, np.empty((2, count)), np.empty((count, count)), out,
     )  # fmt: skip
     return out
 
@@ -160,12 +162,12 @@ def _datum_terms(
     eliminated[layout.kept] = 0.0
     # B'Q_c = (B_c - Y L^-1 B_p)' S^-1
     through = np.zeros((layout.reduced, d))
-    times_points(layout.obs, b, solve_lower(b.L, eliminated), through)
+    times_points(layout.observations, b, solve_lower(b.L, eliminated), through)
     free = layout.reduced_free()[:, None]
     QB_c = optimum.factor.solve((on_reduced - through) * free) * free
     # Q_pp B_p = V^-1 B_p - L^-T Y' (Q_cp B_p), with Q_cp of all points together
     YQB = np.empty((n, 3, d))
-    times_reduced(layout.obs, b, np.ascontiguousarray(QB_c), YQB)
+    times_reduced(layout.observations, b, np.ascontiguousarray(QB_c), YQB)
     QB_p = limiting @ eliminated - solve_transposed(b.L, YQB)
     QB_p[layout.kept] = QB_c[layout.kept_start :].reshape(len(layout.kept), 3, d)
     QB_p *= layout.point_free[:, :, None]
@@ -178,14 +180,14 @@ def _cross(layout: Unknowns, q: Inverse, L: FloatArray, mask: FloatArray) -> tup
     """Return Q_pc = -L^-T Y'S^-1 of each image point and of each object point by the border."""
     if len(q.YQ) == 0:
         return q.YQ, q.YQ_border
-    point, first = layout.obs.point, 6 * len(q.exterior)
+    point, first = layout.observations.point, 6 * len(q.exterior)
     rays = -solve_transposed(L[point], q.YQ) * mask[point][:, :, None]
     inner = -solve_transposed(L, q.YQ_border) * mask[:, :, None]
     mixed = q.mixed.reshape(len(q.exterior), 6, -1)
     for s, j in enumerate(layout.kept):
         own = slice(layout.kept_start - first + 3 * s, layout.kept_start - first + 3 * s + 3)
-        seen = slice(layout.obs.start[j], layout.obs.start[j + 1])
-        rays[seen] = np.swapaxes(mixed[layout.obs.image[seen], :, own], 1, 2)
+        seen = slice(layout.observations.start[j], layout.observations.start[j + 1])
+        rays[seen] = np.swapaxes(mixed[layout.observations.image[seen], :, own], 1, 2)
         inner[j] = q.border[own]
     return rays, inner
 
@@ -202,37 +204,53 @@ def _inverse_of_squares(L: FloatArray) -> FloatArray:
 
 
 @kernel
-def _complement(obs, state, weight, exterior, mixed, border, points, cross, cross_border, t, J, Q, out):  # type: ignore[no-untyped-def]
+def _complement(
+    observations: Observations,
+    state: State,
+    weight: FloatArray,
+    exterior: FloatArray,
+    mixed: FloatArray,
+    border: FloatArray,
+    points: FloatArray,
+    cross: FloatArray,
+    cross_border: FloatArray,
+    workspace: Workspace,
+    J: FloatArray,
+    Q: FloatArray,
+    out: FloatArray,
+) -> None:
     """Fill I - J Q J' of each image point, J and Q of its own unknowns: X0, w, X, free interior ones."""
-    first = 6 * len(obs.camera)
-    for o in range(len(obs.image)):
-        i, j = obs.image[o], obs.point[o]
-        a = obs.camera[i]
-        f = obs.free_count[a]
+    first = 6 * len(observations.camera)
+    for o in range(len(observations.image)):
+        i, j = observations.image[o], observations.point[o]
+        a = observations.camera[i]
+        f = observations.free_count[a]
         used = weight[o] > 0.0
-        in_front = collinearity(o, obs, state, weight[o] if used else 1.0, t)
+        in_front = collinearity(o, observations, state, weight[o] if used else 1.0, workspace)
         for row in range(2):
             for p in range(6):
-                J[row, p] = t.A[row, p]
+                J[row, p] = workspace.A[row, p]
             for p in range(3):
-                J[row, 6 + p] = t.B[row, p]
+                J[row, 6 + p] = workspace.B[row, p]
             for p in range(f):
-                J[row, 9 + p] = t.A[row, 6 + obs.free_index[a, p]]
+                J[row, 9 + p] = workspace.A[row, 6 + observations.free_index[a, p]]
         for p in range(6):
             for q in range(6):
                 Q[p, q] = exterior[i, p, q]
             for q in range(3):
                 Q[p, 6 + q] = cross[o, q, p]
             for q in range(f):
-                Q[p, 9 + q] = mixed[i, p, obs.free_column[a, q] - first]
+                Q[p, 9 + q] = mixed[i, p, observations.free_column[a, q] - first]
         for p in range(3):
             for q in range(3):
                 Q[6 + p, 6 + q] = points[j, p, q]
             for q in range(f):
-                Q[6 + p, 9 + q] = cross_border[j, p, obs.free_column[a, q] - first]
+                Q[6 + p, 9 + q] = cross_border[j, p, observations.free_column[a, q] - first]
         for p in range(f):
             for q in range(p, f):
-                Q[9 + p, 9 + q] = border[obs.free_column[a, p] - first, obs.free_column[a, q] - first]
+                Q[9 + p, 9 + q] = border[
+                    observations.free_column[a, p] - first, observations.free_column[a, q] - first
+                ]
         h00, h01, h11 = 0.0, 0.0, 0.0
         for p in range(9 + f):
             x, y = 0.5 * Q[p, p] * J[0, p], 0.5 * Q[p, p] * J[1, p]

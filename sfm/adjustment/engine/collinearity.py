@@ -14,11 +14,10 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.distortion.models import MAX_PARAMETERS, observe
-from sfm.kernels.options import kernel
+from sfm.kernels.options import compiled, inlined, kernel
 
 
 class Observations(NamedTuple):
@@ -47,7 +46,7 @@ class State(NamedTuple):
     points: FloatArray  # X, (n, 3)
 
 
-class Scratch(NamedTuple):
+class Workspace(NamedTuple):
     """Space of one image point for the compiled functions."""
 
     r: FloatArray  # weighted residual, (2,)
@@ -57,10 +56,10 @@ class Scratch(NamedTuple):
     B: FloatArray  # weighted d r / d X, (2, 3)
 
 
-@njit(cache=True, inline="always", error_model="numpy")
-def scratch():  # type: ignore[no-untyped-def]
+@inlined
+def new_workspace() -> Workspace:
     """Return space for one image point."""
-    return Scratch(
+    return Workspace(
         np.empty(2),
         np.empty((2, 2)),
         np.zeros((2, MAX_PARAMETERS)),
@@ -69,11 +68,13 @@ def scratch():  # type: ignore[no-untyped-def]
     )
 
 
-@njit(cache=True, inline="always", error_model="numpy")
-def collinearity(o, obs, state, weight, t):  # type: ignore[no-untyped-def]
+@inlined
+def collinearity(
+    o: int, observations: Observations, state: State, weight: float, workspace: Workspace
+) -> bool:
     """Fill the weighted residual and derivatives of image point o; False if it is behind the camera."""
-    i, j = obs.image[o], obs.point[o]
-    a = obs.camera[i]
+    i, j = observations.image[o], observations.point[o]
+    a = observations.camera[i]
     m00, m01, m02 = state.M[i, 0, 0], state.M[i, 0, 1], state.M[i, 0, 2]
     m10, m11, m12 = state.M[i, 1, 0], state.M[i, 1, 1], state.M[i, 1, 2]
     m20, m21, m22 = state.M[i, 2, 0], state.M[i, 2, 1], state.M[i, 2, 2]
@@ -86,73 +87,88 @@ def collinearity(o, obs, state, weight, t):  # type: ignore[no-untyped-def]
     inverse = -1.0 / W
     u, v = U * inverse, V * inverse
     observe(
-        obs.model[a], obs.frame[a], state.parameters[a], obs.xy[o, 0], obs.xy[o, 1], u, v, t.r, t.Ju, t.Jp
+        observations.model[a],
+        observations.frame[a],
+        state.parameters[a],
+        observations.xy[o, 0],
+        observations.xy[o, 1],
+        u,
+        v,
+        workspace.r,
+        workspace.Ju,
+        workspace.Jp,
     )
     root = np.sqrt(weight)
-    f00, f10, f11 = root * obs.whitening[o, 0], root * obs.whitening[o, 1], root * obs.whitening[o, 2]
-    t.r[1] = f10 * t.r[0] + f11 * t.r[1]
-    t.r[0] = f00 * t.r[0]
+    f00, f10, f11 = (
+        root * observations.whitening[o, 0],
+        root * observations.whitening[o, 1],
+        root * observations.whitening[o, 2],
+    )
+    workspace.r[1] = f10 * workspace.r[0] + f11 * workspace.r[1]
+    workspace.r[0] = f00 * workspace.r[0]
     # weighted d r / d (U, V, W): du/d(U, V, W) = -(1, 0, u)/W because u = -U/W
-    xU, xV = f00 * t.Ju[0, 0] * inverse, f00 * t.Ju[0, 1] * inverse
-    yU = (f10 * t.Ju[0, 0] + f11 * t.Ju[1, 0]) * inverse
-    yV = (f10 * t.Ju[0, 1] + f11 * t.Ju[1, 1]) * inverse
+    xU, xV = f00 * workspace.Ju[0, 0] * inverse, f00 * workspace.Ju[0, 1] * inverse
+    yU = (f10 * workspace.Ju[0, 0] + f11 * workspace.Ju[1, 0]) * inverse
+    yV = (f10 * workspace.Ju[0, 1] + f11 * workspace.Ju[1, 1]) * inverse
     xW, yW = xU * u + xV * v, yU * u + yV * v
     # d (U, V, W)/d X = M = -d (U, V, W)/d X0
-    t.B[0, 0] = xU * m00 + xV * m10 + xW * m20
-    t.B[0, 1] = xU * m01 + xV * m11 + xW * m21
-    t.B[0, 2] = xU * m02 + xV * m12 + xW * m22
-    t.B[1, 0] = yU * m00 + yV * m10 + yW * m20
-    t.B[1, 1] = yU * m01 + yV * m11 + yW * m21
-    t.B[1, 2] = yU * m02 + yV * m12 + yW * m22
+    workspace.B[0, 0] = xU * m00 + xV * m10 + xW * m20
+    workspace.B[0, 1] = xU * m01 + xV * m11 + xW * m21
+    workspace.B[0, 2] = xU * m02 + xV * m12 + xW * m22
+    workspace.B[1, 0] = yU * m00 + yV * m10 + yW * m20
+    workspace.B[1, 1] = yU * m01 + yV * m11 + yW * m21
+    workspace.B[1, 2] = yU * m02 + yV * m12 + yW * m22
     for b in range(3):
-        t.A[0, b] = -t.B[0, b]
-        t.A[1, b] = -t.B[1, b]
+        workspace.A[0, b] = -workspace.B[0, b]
+        workspace.A[1, b] = -workspace.B[1, b]
     # d (U, V, W)/d w = [(U, V, W)]x
-    t.A[0, 3], t.A[0, 4], t.A[0, 5] = xV * W - xW * V, xW * U - xU * W, xU * V - xV * U
-    t.A[1, 3], t.A[1, 4], t.A[1, 5] = yV * W - yW * V, yW * U - yU * W, yU * V - yV * U
-    for s in range(obs.interior[a]):  # all, not only free ones: gathering them here would cost more
-        t.A[0, 6 + s] = f00 * t.Jp[0, s]
-        t.A[1, 6 + s] = f10 * t.Jp[0, s] + f11 * t.Jp[1, s]
-    return W < 0.0
+    workspace.A[0, 3], workspace.A[1, 3] = xV * W - xW * V, yV * W - yW * V
+    workspace.A[0, 4], workspace.A[1, 4] = xW * U - xU * W, yW * U - yU * W
+    workspace.A[0, 5], workspace.A[1, 5] = xU * V - xV * U, yU * V - yV * U
+    for s in range(observations.interior[a]):  # all, not only free ones: gathering them here would cost more
+        workspace.A[0, 6 + s] = f00 * workspace.Jp[0, s]
+        workspace.A[1, 6 + s] = f10 * workspace.Jp[0, s] + f11 * workspace.Jp[1, s]
+    in_front: bool = W < 0.0
+    return in_front
 
 
-def sum_of_squares(obs: Observations, state: State, weight: FloatArray) -> float:
+def sum_of_squares(observations: Observations, state: State, weight: FloatArray) -> float:
     """Return v'Pv of the image points; infinite where one of weight > 0 lies behind its camera."""
-    return float(_residuals(obs, state, weight, np.empty((0, 2))))
+    return float(_residuals(observations, state, weight, np.empty((0, 2))))
 
 
-def residuals(obs: Observations, state: State) -> FloatArray:
+def residuals(observations: Observations, state: State) -> FloatArray:
     """Return v = computed - measured of all image points, px, (k, 2); NaN behind the camera."""
-    v = np.empty((len(obs.image), 2))
-    _residuals(obs, state, np.ones(len(v)), v)
+    v = np.empty((len(observations.image), 2))
+    _residuals(observations, state, np.ones(len(v)), v)
     return v
 
 
-@njit(cache=True, error_model="numpy")
-def _residuals(obs, state, weight, v):  # type: ignore[no-untyped-def]
+@compiled
+def _residuals(observations: Observations, state: State, weight: FloatArray, v: FloatArray) -> float:
     """Return v'Pv and write the residuals into v unless it is empty (one kernel: compiling takes seconds)."""
-    t = scratch()
+    workspace = new_workspace()
     wanted = len(v) > 0
     total = 0.0
-    for o in range(len(obs.image)):
+    for o in range(len(observations.image)):
         if weight[o] > 0.0:
-            in_front = _residual(o, obs, state, t)
+            in_front = _residual(o, observations, state, workspace)
             if wanted:
-                v[o, 0] = t.r[0] if in_front else np.nan
-                v[o, 1] = t.r[1] if in_front else np.nan
+                v[o, 0] = workspace.r[0] if in_front else np.nan
+                v[o, 1] = workspace.r[1] if in_front else np.nan
             elif not in_front:
                 return np.inf
-            x = obs.whitening[o, 0] * t.r[0]
-            y = obs.whitening[o, 1] * t.r[0] + obs.whitening[o, 2] * t.r[1]
+            x = observations.whitening[o, 0] * workspace.r[0]
+            y = observations.whitening[o, 1] * workspace.r[0] + observations.whitening[o, 2] * workspace.r[1]
             total += weight[o] * (x * x + y * y)
     return total
 
 
-@njit(cache=True, inline="always", error_model="numpy")
-def _residual(o, obs, state, t):  # type: ignore[no-untyped-def]
+@inlined
+def _residual(o: int, observations: Observations, state: State, workspace: Workspace) -> bool:
     """Fill the unweighted residual of image point o; False if it is behind the camera."""
-    i, j = obs.image[o], obs.point[o]
-    a = obs.camera[i]
+    i, j = observations.image[o], observations.point[o]
+    a = observations.camera[i]
     dX = state.points[j, 0] - state.position[i, 0]
     dY = state.points[j, 1] - state.position[i, 1]
     dZ = state.points[j, 2] - state.position[i, 2]
@@ -161,31 +177,32 @@ def _residual(o, obs, state, t):  # type: ignore[no-untyped-def]
     W = state.M[i, 2, 0] * dX + state.M[i, 2, 1] * dY + state.M[i, 2, 2] * dZ
     inverse = -1.0 / W
     observe(
-        obs.model[a],
-        obs.frame[a],
+        observations.model[a],
+        observations.frame[a],
         state.parameters[a],
-        obs.xy[o, 0],
-        obs.xy[o, 1],
+        observations.xy[o, 0],
+        observations.xy[o, 1],
         U * inverse,
         V * inverse,
-        t.r,
-        t.Ju,
-        t.Jp,
+        workspace.r,
+        workspace.Ju,
+        workspace.Jp,
     )
-    return W < 0.0  # one way out: with an early return the compiler keeps the unused derivatives
+    in_front: bool = W < 0.0
+    return in_front  # one way out: with an early return the compiler keeps the unused derivatives
 
 
-def behind_camera(obs: Observations, state: State) -> BoolArray:
+def behind_camera(observations: Observations, state: State) -> BoolArray:
     """Return which image points belong to object points behind their camera or undetermined, (k,)."""
-    behind = np.empty(len(obs.image), dtype=np.bool_)
-    _behind(obs, state, behind)
+    behind = np.empty(len(observations.image), dtype=np.bool_)
+    _behind(observations, state, behind)
     return behind
 
 
 @kernel
-def _behind(obs, state, behind):  # type: ignore[no-untyped-def]
+def _behind(observations: Observations, state: State, behind: BoolArray) -> None:
     for o in range(len(behind)):
-        i, j = obs.image[o], obs.point[o]
+        i, j = observations.image[o], observations.point[o]
         W = 0.0
         for p in range(3):
             W += state.M[i, 2, p] * (state.points[j, p] - state.position[i, p])

@@ -22,13 +22,11 @@ import numpy as np
 
 from sfm.adjustment.datum import ResolvedDatum
 from sfm.adjustment.engine.collinearity import State, sum_of_squares
-from sfm.adjustment.engine.connectivity import Order, pattern_of
 from sfm.adjustment.engine.motions import Motions, motions_of
 from sfm.adjustment.engine.normals import Equations, Space, new_space, normal_equations, point_step
 from sfm.adjustment.engine.observed_unknowns import Weighted, weighted_vPv
-from sfm.adjustment.engine.solvers.banded import BandFactor, factor_band
-from sfm.adjustment.engine.solvers.dense import Factor, factor
-from sfm.adjustment.engine.solvers.pairs import Pairs
+from sfm.adjustment.engine.solvers.choice import choose_solver
+from sfm.adjustment.engine.solvers.protocol import Factor, Solver
 from sfm.adjustment.engine.unknowns import Unknowns, step
 from sfm.conventions import FloatArray
 from sfm.errors import GeometryError
@@ -44,7 +42,6 @@ ROUNDING = 1e-12  # relative difference of two sums of the same squares in anoth
 FAR = 0.9  # |A dx| / |v| down to which the step after the next is not expected to be the last
 SIMPLIFIED = 0.8  # |A dx| / |v| of a step below which its reduced matrix may show that the next is the last
 COARSE = 1e-2  # |A dx| / |v| down to which steps may come from a product in single precision
-SINGLE_FROM = 200  # reduced unknowns from which the product in single precision saves time
 METHODS = ("gauss-newton", "levenberg-marquardt", "undamped")
 
 
@@ -54,7 +51,7 @@ class Optimum:
 
     state: State
     equations: Equations
-    factor: Factor | BandFactor
+    factor: Factor
     motions: Motions
     converged: bool
     iterations: int
@@ -69,7 +66,7 @@ class Problem:
     weighted: Weighted  # observed unknowns
     datum: ResolvedDatum
     space: Space  # for the normal equations, used again and again
-    pattern: Order | Pairs | None  # a band, or a full matrix summed pair by pair or as a product (None)
+    solver: Solver  # of the reduced normal equations
 
 
 @dataclass(frozen=True)
@@ -87,7 +84,7 @@ class Step(Move):
     """A step and what it was taken from."""
 
     equations: Equations
-    factor: Factor | BandFactor
+    factor: Factor
     motions: Motions
 
     def move(self) -> Move:
@@ -100,8 +97,8 @@ class Step(Move):
 
 
 def problem_of(layout: Unknowns, weighted: Weighted, datum: ResolvedDatum) -> Problem:
-    """Return what all steps of an adjustment have in common; chooses how the normal equations are summed."""
-    return Problem(layout, weighted, datum, new_space(layout), pattern_of(layout))
+    """Return what all steps of an adjustment have in common; chooses the solver of the normal equations."""
+    return Problem(layout, weighted, datum, new_space(layout), choose_solver(layout))
 
 
 def iterate(
@@ -134,7 +131,7 @@ def iterate(
     if method not in METHODS:
         raise GeometryError(f"adjustment: method '{method}', expected one of {', '.join(METHODS)}")
     layout = problem.layout
-    single = problem.pattern is None and layout.reduced >= SINGLE_FROM and not near
+    single = problem.solver.has_coarse and not near
     taken, first = 0, state
     if method == "levenberg-marquardt":
         state, taken = _approach(problem, state, weight, max_iterations, single)
@@ -143,7 +140,7 @@ def iterate(
     before: tuple[State, Move] | None = None
     limit = np.inf
     shortest = 1.0 if method == "undamped" else SHORTEST
-    last: Factor | BandFactor | None = None
+    last: Factor | None = None
     while True:
         found = _solve(problem, state, weight, single=single, limit=limit, last=last, tolerance=tolerance)
         if found is None:
@@ -201,7 +198,7 @@ def _solve(
     damping: float = 0.0,
     single: bool = False,
     limit: float = np.inf,
-    last: Factor | BandFactor | None = None,
+    last: Factor | None = None,
     tolerance: float = 0.0,
 ) -> Step | None:
     """Return the step from a state; None where the normal equations cannot be solved or v'Pv is too large.
@@ -229,11 +226,7 @@ def _solve(
         if found.within(tolerance):
             return found
     for coarse in (True, False) if single else (False,):
-        factored: Factor | BandFactor | None
-        if isinstance(p.pattern, Order):
-            factored = factor_band(equations, layout, motions, p.pattern, damped=damping > 0)
-        else:
-            factored = factor(equations, layout, motions, p.pattern, damped=damping > 0, single=coarse)
+        factored = p.solver.factor(equations, motions, damped=damping > 0, coarse=coarse)
         if factored is None:
             continue
         found = _step(layout, equations, factored, motions)
@@ -242,7 +235,7 @@ def _solve(
     return None
 
 
-def _step(layout: Unknowns, equations: Equations, factor: Factor | BandFactor, motions: Motions) -> Step:
+def _step(layout: Unknowns, equations: Equations, factor: Factor, motions: Motions) -> Step:
     reduced = -factor.solve(equations.parts.g)
     points = point_step(equations, reduced, layout)
     y = equations.blocks.y.ravel()
@@ -279,7 +272,7 @@ def _approach(
 def total(problem: Problem, state: State, weight: FloatArray) -> float:
     """Return v'Pv of image points and observed unknowns; infinite if a point is behind a camera."""
     p = problem
-    return sum_of_squares(p.layout.obs, state, weight) + weighted_vPv(p.weighted, p.layout, state)
+    return sum_of_squares(p.layout.observations, state, weight) + weighted_vPv(p.weighted, p.layout, state)
 
 
 def _line_search(

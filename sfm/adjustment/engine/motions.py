@@ -39,7 +39,7 @@ class Motions:
     @property
     def defect(self) -> int:
         """Number of motions that the datum has to fix."""
-        return self.reduced.shape[1]
+        return int(self.reduced.shape[1])
 
     def transform(self, reduced: FloatArray, points: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return a step (reduced,), (n, 3) carried into the datum: S dx."""

@@ -3,7 +3,7 @@
 With N = (U W; W' V), V block diagonal with one L L' per object point, and Y = W L^-T, the reduced
 normal equations are (U - Y Y') dx = -(g - Y y), y = L^-1 g_points. Y is stored by image points. Unknowns are
 scaled so that the diagonal of U is 1. Y Y' is summed as one dense product or pair by pair of rays into a
-band, whichever is less work (`sfm.adjustment.engine.connectivity`).
+band, whichever is less work (`sfm.adjustment.engine.solvers.choice`).
 
 Source: Brown (1958, 1976); Mikhail, Bethel and McGlone (2001), sec. 5.8; Foerstner and Wrobel (2016),
 sec. 15.2.
@@ -17,54 +17,22 @@ import numpy as np
 
 from sfm.adjustment.engine.accumulate import (
     RESIDUAL,
+    Blocks,
+    Sums,
     add_photographs,
     eliminate_points,
     gather_interior,
-    step_points,
 )
-from sfm.adjustment.engine.collinearity import State, scratch
-from sfm.adjustment.engine.observed_unknowns import Weighted, point_terms, weighted_terms
+from sfm.adjustment.engine.collinearity import State, new_workspace
+from sfm.adjustment.engine.observed_unknowns import Weighted, WeightedTerms, point_terms, weighted_terms
 from sfm.adjustment.engine.ordering import by_photograph
+from sfm.adjustment.engine.products import step_points
 from sfm.adjustment.engine.unknowns import Unknowns
-from sfm.conventions import FloatArray, IntArray
+from sfm.conventions import FloatArray
 from sfm.kernels.threads import at_once
 
 HALVED = 8_000  # image points from which two halves of the photographs are summed by themselves; a thread of
 # its own takes 0.1 ms to start and saves 0.07 microseconds for each
-
-
-class Blocks(NamedTuple):
-    """Parts of the normal equations that one pass over the image points fills; f free parameters a camera."""
-
-    U: FloatArray  # X0, w of each photograph by themselves, (m, 6, 6)
-    C: FloatArray  # X0, w of each photograph by the free parameters of its camera, (m, 6, f)
-    D: FloatArray  # free parameters of each camera by themselves, (a, f, f)
-    g: FloatArray  # right side of X0, w, (m, 6)
-    gi: FloatArray  # right side of the free parameters of each camera, (a, f)
-    V: FloatArray  # object points before elimination, (n, 3, 3)
-    gp: FloatArray  # right side of object points, (n, 3)
-    L: FloatArray  # Cholesky factors of V; unit matrix for kept points, (n, 3, 3)
-    y: FloatArray  # L^-1 gp; 0 for kept points, (n, 3)
-    Y: FloatArray  # Y' of each image point by X0, w of its photograph; 0 for kept points, (k, 3, 6)
-    Z: FloatArray  # Y' of each object point by all interior unknowns; 0 for kept points, (n, 3, i)
-    Yy: FloatArray  # Y y, what the right side is reduced by, (reduced,)
-    K: FloatArray  # kept points by all reduced unknowns, (3 s, reduced)
-    held: IntArray  # 1 where a direction of a point had to be held, (n,)
-    order: IntArray  # image points, photograph by photograph, (k,)
-    first: IntArray  # place in it of the first image point of each photograph, and the end, (m + 1,)
-
-
-class Sums(NamedTuple):
-    """Sums over some photographs, as in `Blocks`, and space for one of them."""
-
-    first: int  # photograph
-    end: int  # photograph behind the last
-    D: FloatArray
-    gi: FloatArray
-    V: FloatArray
-    gp: FloatArray
-    Z: FloatArray
-    A: FloatArray  # derivatives and residuals of the image points of one photograph
 
 
 class Space(NamedTuple):
@@ -117,7 +85,7 @@ def normal_equations(
     slot = np.full(len(state.points), -1, dtype=np.int64)
     slot[layout.kept] = np.arange(len(layout.kept))
     vPv = _sum_photographs(layout, state, weight, space)
-    eliminate_points(layout.obs, layout.point_free, slot, layout.kept_start, 1 + damping, b)
+    eliminate_points(layout.observations, layout.point_free, slot, layout.kept_start, 1 + damping, b)
     terms = weighted_terms(weighted, layout, state)
     if len(weighted.image):
         np.add.at(b.U, weighted.image, terms.exterior)
@@ -130,7 +98,9 @@ def _sum_photographs(layout: Unknowns, state: State, weight: FloatArray, space: 
     b = space.blocks
 
     def add(s: Sums) -> float:
-        return float(add_photographs(layout.obs, state, weight, layout.exterior_free, scratch(), s, b))
+        return float(
+            add_photographs(layout.observations, state, weight, layout.exterior_free, new_workspace(), s, b)
+        )
 
     if len(space.sums) == 1:
         return add(space.sums[0])
@@ -143,14 +113,14 @@ def _sum_photographs(layout: Unknowns, state: State, weight: FloatArray, space: 
     return sum(vPv)
 
 
-def _parts(layout: Unknowns, weighted: Weighted, terms, b: Blocks) -> Parts:  # type: ignore[no-untyped-def]
+def _parts(layout: Unknowns, weighted: Weighted, terms: WeightedTerms, b: Blocks) -> Parts:
     """Gather the blocks of interior unknowns, kept points and observed unknowns."""
     first = 6 * len(b.U)
     inner = layout.kept_start - first
     border = np.zeros((first, layout.reduced - first))
     corner = np.zeros((layout.reduced - first, layout.reduced - first))
     g = np.zeros(layout.reduced)
-    gather_interior(layout.obs, b, border, corner, g)
+    gather_interior(layout.observations, b, border, corner, g)
     if len(weighted.column):
         np.add.at(corner, (weighted.column - first, weighted.column - first), weighted.interior_weight)
         np.add.at(g, weighted.column, terms.interior_g)
@@ -172,7 +142,7 @@ def _parts(layout: Unknowns, weighted: Weighted, terms, b: Blocks) -> Parts:  # 
 def point_step(equations: Equations, reduced_step: FloatArray, layout: Unknowns) -> FloatArray:
     """Return the step of all object points that belongs to a step of the reduced unknowns, (n, 3)."""
     dX = np.empty_like(equations.blocks.y)
-    step_points(layout.obs, layout.point_free, equations.blocks, reduced_step, dX)
+    step_points(layout.observations, layout.point_free, equations.blocks, reduced_step, dX)
     dX[layout.kept] = reduced_step[layout.kept_start :].reshape(-1, 3) * layout.point_free[layout.kept]
     return dX
 
@@ -200,7 +170,7 @@ def new_space(layout: Unknowns) -> Space:
     m, n, k = len(layout.exterior_free), len(layout.point_free), len(layout.order)
     a = len(layout.interior_free)
     f = max(len(free) for free in layout.interior_free)
-    order, first = by_photograph(layout.obs.image, m)
+    order, first = by_photograph(layout.observations.image, m)
     most = int(np.diff(first).max())
     width = -(-(RESIDUAL + 1 + f) // 4) * 4  # whole vector registers
     b = Blocks(
@@ -214,14 +184,14 @@ def new_space(layout: Unknowns) -> Space:
         L=np.empty((n, 3, 3)),
         y=np.empty((n, 3)),
         Y=np.empty((k, 3, 6)),
-        Z=np.empty((n, 3, layout.kept_start - 6 * m)),
+        Y_interior=np.empty((n, 3, layout.kept_start - 6 * m)),
         Yy=np.empty(layout.reduced),
         K=np.zeros((3 * len(layout.kept), layout.reduced)),
         held=np.zeros(n, dtype=np.int64),
         order=order,
         first=first,
     )
-    sums = Sums(0, m, b.D, b.gi, b.V, b.gp, b.Z, np.zeros((2 * most, width)))
+    sums = Sums(0, m, b.D, b.gi, b.V, b.gp, b.Y_interior, np.zeros((2 * most, width)))
     if k < HALVED:
         return Space(b, (sums,))
     own = (np.zeros_like(part) for part in sums[2:])

@@ -7,9 +7,9 @@ ascending; the derivatives are taken photograph by photograph, for which an inde
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from sfm.conventions import FloatArray, IntArray
+from sfm.kernels.options import compiled
 from sfm.network import ImagePoints
 
 
@@ -53,16 +53,16 @@ def _sorted(key: IntArray, before: IntArray, start: IntArray) -> IntArray:
     return order
 
 
-@njit(cache=True)
-def _sort(key, before, place, order):  # type: ignore[no-untyped-def]
+@compiled
+def _sort(key: IntArray, before: IntArray, place: IntArray, order: IntArray) -> None:
     """Counting sort of an order before: place holds where the next one of each key goes."""
     for o in before:
         order[place[key[o]]] = o
         place[key[o]] += 1
 
 
-@njit(cache=True, error_model="numpy")
-def _whiten(covariance, order, F):  # type: ignore[no-untyped-def]
+@compiled
+def _whiten(covariance: FloatArray, order: IntArray, F: FloatArray) -> None:
     for s in range(len(order)):
         o = order[s]
         a = 1.0 / np.sqrt(covariance[o, 0, 0])

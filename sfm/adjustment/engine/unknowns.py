@@ -30,9 +30,9 @@ MIN_POINTS = 3  # per photograph whose orientation is not known otherwise
 class Unknowns:
     """Layout of the unknowns of one network and the image points as compiled code takes them."""
 
-    obs: Observations  # image points, grouped by object point
-    order: IntArray  # index in network.image_points of each of obs, (k,)
-    active: BoolArray  # image points of obs that can take part, (k,)
+    observations: Observations  # image points, grouped by object point
+    order: IntArray  # index in network.image_points of each of observations, (k,)
+    active: BoolArray  # image points of observations that can take part, (k,)
     exterior_free: BoolArray  # (m, 6)
     interior_free: tuple[IntArray, ...]  # indices of the free parameters of each camera
     interior_column: tuple[IntArray, ...]  # their columns among the reduced unknowns
@@ -130,7 +130,7 @@ def unknowns_of(
     covariance = k.covariance
     if image_sigma_factor is not None:
         covariance = scaled_covariance(covariance, image_sigma_factor)
-    obs = Observations(
+    observations = Observations(
         start=rays_from,
         image=np.take(k.image, order).astype(np.int64, copy=False),
         point=np.repeat(np.arange(n), np.diff(rays_from)),
@@ -145,7 +145,7 @@ def unknowns_of(
         free_column=free_column,
     )
     layout = Unknowns(
-        obs=obs,
+        observations=observations,
         order=order,
         active=active[order],
         exterior_free=exterior_free,
@@ -220,7 +220,7 @@ def angle_jacobian(M: FloatArray) -> FloatArray:
 
 def start_weights(layout: Unknowns, state: State) -> FloatArray:
     """Return weight 1 for image points that can take part, 0 for others and those behind the camera, (k,)."""
-    return (layout.active & ~behind_camera(layout.obs, state)).astype(float)
+    return (layout.active & ~behind_camera(layout.observations, state)).astype(float)
 
 
 def interior_names(layout: Unknowns, estimate: Estimate) -> list[tuple[str, str]]:

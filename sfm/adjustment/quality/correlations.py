@@ -1,7 +1,7 @@
 """Correlations of camera parameters with the exterior orientation: what the network cannot tell apart.
 
-In a flat network with parallel views c hangs together with Z0, x0 and y0 with X0, Y0 or with the angles: the
-standard deviations of both are then large together, while distances between points may be good.
+In a flat network with parallel views c is strongly correlated with Z0, x0 and y0 with X0, Y0 or with the
+angles: the standard deviations of both are then large together, while distances between points may be good.
 
 Source: Luhmann et al., Close-Range Photogrammetry (2020), sec. 7.3.2 (correlations in self-calibration);
 Fraser (1997), ISPRS J. Photogramm. Remote Sens. 52(4).
@@ -25,7 +25,7 @@ PARTS = ("X0", "Y0", "Z0", "omega", "phi", "kappa")
 
 @dataclass(frozen=True)
 class OrientationCorrelation:
-    """A camera parameter that hangs together with the exterior orientation of photographs."""
+    """A camera parameter that is strongly correlated with the exterior orientation of photographs."""
 
     parameter: str  # and its camera, in words
     largest: float  # correlation, -1 to 1

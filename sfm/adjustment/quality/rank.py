@@ -6,8 +6,8 @@ from collections import Counter
 
 import numpy as np
 
-from sfm.adjustment.engine.accumulate import times_points, times_reduced
 from sfm.adjustment.engine.iterate import Optimum
+from sfm.adjustment.engine.products import times_points, times_reduced
 from sfm.adjustment.engine.unknowns import Unknowns, interior_names
 from sfm.conventions import BoolArray, FloatArray
 from sfm.network import Estimate, Network
@@ -23,7 +23,7 @@ def rank_defect(optimum: Optimum, layout: Unknowns) -> int:
     It counts the motions that the normal matrix maps to zero, its further null vectors, directions of
     object points that their rays leave open, and the unknowns held for want of image points.
     """
-    found = null_motions(optimum, layout) + optimum.factor.further.shape[1]
+    found = null_motions(optimum, layout) + int(optimum.factor.further.shape[1])
     return found + int(optimum.equations.blocks.held.sum()) + layout.held_defect
 
 
@@ -51,9 +51,9 @@ def _mapped_to_zero(optimum: Optimum, layout: Unknowns, H: FloatArray) -> BoolAr
     NH[:first] = (b.U @ H[:first].reshape(len(b.U), 6, d)).reshape(first, d) + parts.border @ H[first:]
     NH[first:] = parts.border.T @ H[:first] + parts.corner @ H[first:]
     through = np.empty((len(b.y), 3, d))
-    times_reduced(layout.obs, b, H, through)
+    times_reduced(layout.observations, b, H, through)
     np.negative(through, out=through)
-    times_points(layout.obs, b, through, NH)
+    times_points(layout.observations, b, through, NH)
     return np.asarray(np.linalg.norm(parts.scale[:, None] * NH, axis=0) < MAPPED_TO_ZERO)
 
 
@@ -65,7 +65,8 @@ def undetermined_of(
     Args:
         optimum: undamped normal equations and their factor.
         layout: order of the unknowns.
-        network, estimate: for the names.
+        network: for the names of photographs and points.
+        estimate: for the names of cameras.
         allowed_motions: defect that the kind of datum is meant to fix.
     """
     words = list(layout.held)

@@ -79,11 +79,14 @@ def redundancy_of_bars(
     """Return the redundancy number 1 - p a Q a' of each scale bar that took part, (b,).
 
     Args:
-        weighted, layout, state: of an adjustment at its optimum.
+        weighted: observed unknowns.
+        layout: order of the unknowns.
+        state: at the optimum.
         cofactor: Q of the kept object points, in any datum, shape (3 s, 3 s).
     """
     rows, _ = bar_rows(weighted, layout, state)
-    return np.clip(1 - weighted.length_weight * ((rows @ cofactor) * rows).sum(axis=1), 0.0, 1.0)
+    taken = weighted.length_weight * ((rows @ cofactor) * rows).sum(axis=1)
+    return np.asarray(np.clip(1 - taken, 0.0, 1.0))
 
 
 def tau_critical(alpha: float, redundancy: int) -> float:

@@ -30,7 +30,7 @@ LEAST_FREEDOM = 0.05  # of redundancy over observations, so that a network witho
 
 
 def snoop(
-    obs: Observations,
+    observations: Observations,
     residuals: FloatArray,
     complement: FloatArray,
     used: BoolArray,
@@ -42,7 +42,7 @@ def snoop(
     """Return which image points to take out and which to take back in one round.
 
     Args:
-        obs: image points.
+        observations: image points.
         residuals: v of all image points, rejected ones predicted, px, shape (k, 2).
         complement: whitened cofactors of the residuals, shape (k, 2, 2).
         used: image points in the adjustment, shape (k,).
@@ -50,42 +50,42 @@ def snoop(
         redundancy: of the adjustment.
         alpha: probability with which the test of one image coordinate rejects a good one.
     """
-    w = np.abs(standardised_residuals(residuals, complement, obs.whitening)).max(axis=1)
+    w = np.abs(standardised_residuals(residuals, complement, observations.whitening)).max(axis=1)
     w = np.where(np.isfinite(w), w, np.inf)
     sigma0 = np.sqrt(vPv / max(redundancy, 1))
     tau = w / max(sigma0, np.finfo(float).tiny)
     critical = tau_critical(alpha, redundancy)
     suspect = used & (tau > critical)
-    worst_image = np.zeros(len(obs.camera))
-    np.maximum.at(worst_image, obs.image[suspect], tau[suspect])
-    worst_point = np.zeros(len(obs.start) - 1)
-    np.maximum.at(worst_point, obs.point[suspect], tau[suspect])
-    out = suspect & (tau >= worst_image[obs.image]) & (tau >= worst_point[obs.point])
+    worst_image = np.zeros(len(observations.camera))
+    np.maximum.at(worst_image, observations.image[suspect], tau[suspect])
+    worst_point = np.zeros(len(observations.start) - 1)
+    np.maximum.at(worst_point, observations.point[suspect], tau[suspect])
+    out = suspect & (tau >= worst_image[observations.image]) & (tau >= worst_point[observations.point])
     back = ~used & (tau <= critical)
     return out, back
 
 
-def huber_weights(obs: Observations, residuals: FloatArray, *, sigma0: float) -> FloatArray:
+def huber_weights(observations: Observations, residuals: FloatArray, *, sigma0: float) -> FloatArray:
     """Return the factor min(1, HUBER / |v|) on the weight of each image point, (k,).
 
     Args:
-        obs: image points.
+        observations: image points.
         residuals: v, px, shape (k, 2).
         sigma0: standard deviation of unit weight.
     """
-    size = _lengths(obs, residuals) / sigma0
+    size = _lengths(observations, residuals) / sigma0
     return np.where(size > HUBER, HUBER / np.maximum(size, HUBER), 1.0)
 
 
-def tukey_weights(obs: Observations, residuals: FloatArray, *, sigma0: float) -> FloatArray:
+def tukey_weights(observations: Observations, residuals: FloatArray, *, sigma0: float) -> FloatArray:
     """Return the factor (1 - (|v| / TUKEY)^2)^2 on the weight of each image point, 0 beyond TUKEY, (k,).
 
     Args:
-        obs: image points.
+        observations: image points.
         residuals: v, px, shape (k, 2).
         sigma0: standard deviation of unit weight.
     """
-    share = _lengths(obs, residuals) / (TUKEY * sigma0)
+    share = _lengths(observations, residuals) / (TUKEY * sigma0)
     return np.where(share < 1.0, (1.0 - share**2) ** 2, 0.0)
 
 
@@ -101,13 +101,13 @@ def tukey_slopes(weight: FloatArray) -> FloatArray:
 
 
 def inflation(
-    obs: Observations,
+    observations: Observations,
     residuals: FloatArray,
     weight: FloatArray,
     slopes: FloatArray,
     *,
     vPv: float,
-    observations: int,
+    count: int,
     redundancy: int,
 ) -> float:
     """Return by what to multiply sqrt(v'Pv / r) for the standard deviations of an M-estimator.
@@ -118,49 +118,51 @@ def inflation(
     and 3 % (Huber) to 8 % (Tukey) where it is 0.4 to 0.6 of them.
 
     Args:
-        obs: image points.
+        observations: image points.
         residuals: v, px, shape (k, 2).
         weight: of the estimator at its end, shape (k,).
         slopes: psi' along and across the residual, shape (k, 2).
         vPv: sum of squares of all observations with these weights; those that are no image points have 1.
-        observations: n, scalar observations of weight above 0.
+        count: n, scalar observations of weight above 0.
         redundancy: r = n - u.
 
     Source: Huber and Ronchetti (2009), Robust Statistics, sec. 7.6, here for vectors in the plane.
     """
     used = weight > 0
     w = weight[used]
-    others = observations - 2 * len(w)
-    psi2 = vPv - float((w * (1 - w)) @ _lengths(obs, residuals)[used] ** 2)
+    others = count - 2 * len(w)
+    psi2 = vPv - float((w * (1 - w)) @ _lengths(observations, residuals)[used] ** 2)
     slope = np.concatenate([slopes[used].ravel(), np.ones(others)])
     mean = float(slope.mean())
-    K = 1 + (observations - redundancy) / observations * float(slope.var()) / mean**2
-    mean_weight = (2 * float(w.sum()) + others) / observations
+    K = 1 + (count - redundancy) / count * float(slope.var()) / mean**2
+    mean_weight = (2 * float(w.sum()) + others) / count
     return float(np.sqrt(psi2 / vPv * mean_weight) * K / mean)
 
 
-def robust_scale(obs: Observations, residuals: FloatArray, used: BoolArray, *, freedom: float) -> float:
+def robust_scale(
+    observations: Observations, residuals: FloatArray, used: BoolArray, *, freedom: float
+) -> float:
     """Return the standard deviation of unit weight from the median of the residuals.
 
     Half of the image points may be wrong before it is.
 
     Args:
-        obs: image points.
+        observations: image points.
         residuals: v, px, shape (k, 2).
         used: image points that can take part, shape (k,).
         freedom: redundancy over observations, by which residuals are smaller than errors.
 
     Source: Hampel (1974), J. Am. Stat. Assoc. 69, for the median absolute deviation.
     """
-    a, b, c = obs.whitening[used].T
+    a, b, c = observations.whitening[used].T
     v = residuals[used]
     whitened = np.abs(np.concatenate([a * v[:, 0], b * v[:, 0] + c * v[:, 1]]))
     scale = MAD_TO_SIGMA * float(np.median(whitened)) / np.sqrt(max(freedom, LEAST_FREEDOM))
-    return max(scale, np.finfo(float).tiny)
+    return float(max(scale, np.finfo(float).tiny))
 
 
-def _lengths(obs: Observations, residuals: FloatArray) -> FloatArray:
+def _lengths(observations: Observations, residuals: FloatArray) -> FloatArray:
     """Return the lengths of the residuals in their standard deviations, infinite behind the camera, (k,)."""
-    a, b, c = obs.whitening.T
+    a, b, c = observations.whitening.T
     length = np.hypot(a * residuals[:, 0], b * residuals[:, 0] + c * residuals[:, 1])
     return np.where(np.isfinite(length), length, np.inf)

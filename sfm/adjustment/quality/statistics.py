@@ -92,7 +92,7 @@ class Significance:
 
 @dataclass(frozen=True)
 class Correlation:
-    """Two parameters whose estimates hang together."""
+    """Two parameters whose estimates are strongly correlated."""
 
     first: str
     second: str
@@ -177,7 +177,8 @@ def reliability(adjustment: Adjustment, *, alpha: float = ALPHA, power: float = 
 
     Args:
         adjustment: the adjustment.
-        alpha, power: of the test that is to find the error.
+        alpha: probability with which the test that is to find the error rejects a good observation.
+        power: probability with which it finds an error of the minimal size.
 
     Source: Baarda (1968): delta0 sigma / sqrt(r); effect bounded by delta0 sqrt((1 - r)/r).
     """

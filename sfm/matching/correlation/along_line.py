@@ -28,13 +28,23 @@ def match_along_line(
     """Look for templates along lines of the right photograph, such as epipolar lines.
 
     Args:
-        left, right, xy_left, template_px, min_correlation, max_second: as in `match_ncc`.
+        left: photograph, (H, W), 8 or 16 bit or float, grey or colour.
+        right: the other photograph.
+        xy_left: points in the left photograph, px, (k, 2).
         lines: for each point the polygon along which it is looked for, px, k arrays (n_i, 2); with distortion
             an epipolar line is curved. Parts outside the photograph are passed over.
-        width_px: how far from the line the best place may be.
+        template_px: odd side of the template.
+        width_px: how far from the line the best place may be, px.
+        min_correlation: smallest r of a match.
+        max_second: largest ratio of the second-best r to the best.
 
     Returns:
         One result for each point.
+
+    Raises:
+        GeometryError: an even template, or points without a line each.
+
+    Source: document 002, sec. II.1.2.1 (epipolar lines) with eq. 2.6 for r; precision as in `match_ncc`.
     """
     side = odd_window("NCC template", template_px)
     a = np.asarray(xy_left, dtype=float).reshape(-1, 2)

@@ -18,7 +18,8 @@ def ambiguous(best: FloatArray, second: FloatArray, pixels: FloatArray) -> BoolA
     of so many pixels. Of 3 independent pixels or less nothing can be told, and any second place counts.
 
     Args:
-        best, second: coefficients r, (k,); the second -1 where there is no second place.
+        best: coefficients r of the best places, (k,).
+        second: those of the second-best places, -1 where there is none, (k,).
         pixels: pixels of the template that are independent of one another, (k,).
 
     Source: Fisher (1921), Metron 1, pp. 3-32.

@@ -15,7 +15,21 @@ import numpy as np
 
 from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
 from sfm.errors import GeometryError
-from sfm.matching.correlation.peak import NOT_COMPARED, OUTPUTS, read_peak
+from sfm.matching.correlation.peak import (
+    CXX,
+    CXY,
+    CYY,
+    FLAG,
+    GAIN,
+    NOT_COMPARED,
+    OFFSET,
+    OUTPUTS,
+    SECOND,
+    R,
+    X,
+    Y,
+    read_peak,
+)
 from sfm.matching.match_flags import NccFlag
 from sfm.matching.radiometry import full_scale, grey_of, odd_window
 
@@ -60,7 +74,8 @@ def match_ncc(
     """Look for the surroundings of points of the left photograph in windows of the right one.
 
     Args:
-        left, right: photographs, (H, W), 8 or 16 bit or float, grey or colour.
+        left: photograph, (H, W), 8 or 16 bit or float, grey or colour.
+        right: the other photograph.
         xy_left: points in the left photograph, px, (k, 2); the template is centred at the nearest pixel, and
             the fraction is added to the result.
         xy_right: centres of the search windows, px, (k, 2).
@@ -83,7 +98,7 @@ def match_ncc(
     side = odd_window("NCC template", template_px)
     if odd_window("NCC search", search_px) <= side:
         raise GeometryError(
-            f"NCC: a search window of {search_px} px for a template of {side} px, needed more"
+            f"NCC: a search window of {search_px} px for a template of {side} px, it must be larger"
         )
     a = np.asarray(xy_left, dtype=float).reshape(-1, 2)
     b = np.asarray(xy_right, dtype=float).reshape(-1, 2)
@@ -109,13 +124,13 @@ def match_ncc(
 def matches_of(out: FloatArray, origin: FloatArray | IntArray, xy_left: FloatArray, half: int) -> NccMatches:
     """Return what was read from surfaces of r, (k, OUTPUTS); their windows begin at `origin`, px, (k, 2)."""
     fraction = xy_left - np.rint(xy_left)
-    xy = origin + out[:, 1:3] + half + fraction
+    xy = origin + out[:, [X, Y]] + half + fraction
     peak = np.rint(xy - fraction) + fraction
-    flag = out[:, 0].astype(np.int64)
+    flag = out[:, FLAG].astype(np.int64)
     return NccMatches(
         np.where((flag == 0)[:, None], xy, np.nan), peak,
-        np.stack([out[:, 3], out[:, 4], out[:, 4], out[:, 5]], axis=1).reshape(-1, 2, 2),
-        out[:, 6], out[:, 7], out[:, 8], out[:, 9], flag,
+        out[:, [CXX, CXY, CXY, CYY]].reshape(-1, 2, 2),
+        out[:, R], out[:, SECOND], out[:, GAIN], out[:, OFFSET], flag,
     )  # fmt: skip
 
 

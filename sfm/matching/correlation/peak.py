@@ -3,21 +3,44 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from sfm.conventions import AnyArray, FloatArray
+from sfm.kernels.options import compiled, compiled_fast
 from sfm.matching.match_flags import NccFlag
 
 PEAK_ZONE = 2  # a second peak is at least this many pixels farther from the first in a row or column, px
-OUTPUTS = 10  # flag; x, y in the surface, their three covariances; r, second r, gain, offset
+# Columns of what is read from a surface: x and y in it with their covariances, r, second r, gain, offset.
+OUTPUTS = 10
+FLAG, X, Y, CXX, CXY, CYY, R, SECOND, GAIN, OFFSET = range(OUTPUTS)
 NOT_COMPARED = np.array([int(NccFlag.OUTSIDE)] + [np.nan] * (OUTPUTS - 1))
 FLAT, BORDER, LOW, DOUBT = (
     int(f) for f in (NccFlag.FLAT_TEXTURE, NccFlag.AT_BORDER, NccFlag.LOW_CORRELATION, NccFlag.AMBIGUOUS)
 )
 
 
-@njit(cache=True, nogil=True)
-def read_peak(template, window, surface, whole, least, min_r, max_second, out):  # type: ignore[no-untyped-def]
-    """Best and second-best peak of the surface of r, parabola in the whole of it, regression; see OUTPUTS."""
+@compiled
+def read_peak(
+    template: AnyArray,
+    window: AnyArray,
+    surface: AnyArray,
+    whole: AnyArray,
+    least: tuple[float, float],
+    min_r: float,
+    max_second: float,
+    out: FloatArray,
+) -> None:
+    """Fill best and second-best peak of a surface of r, its parabola and the regression of intensities.
+
+    Args:
+        template: intensities, float32, (s, s).
+        window: intensities of the search window, float32, (H, W).
+        surface: r where a match is allowed, else -1, float32, (H - s + 1, W - s + 1).
+        whole: r everywhere, for the parabola; same shape.
+        least: standard deviations below which a template, and a window, are flat.
+        min_r: smallest r of a match.
+        max_second: largest ratio of the second-best r to the best.
+        out: receives the columns FLAG to OFFSET.
+    """
     rows, cols = surface.shape
     side = template.shape[0]
     n = side * side
@@ -43,12 +66,12 @@ def read_peak(template, window, surface, whole, least, min_r, max_second, out): 
             tt += t * t
             ww += w * w
             tw += t * w
-    out[1], out[2] = bj, bi
+    out[X], out[Y] = bj, bi
     if tt < n * least[0] ** 2 or ww < n * least[1] ** 2:
-        out[0] = FLAT
+        out[FLAG] = FLAT
         return
     r = tw / np.sqrt(tt * ww)
-    out[6], out[8], out[9] = r, tw / tt, wm - tw / tt * tm
+    out[R], out[GAIN], out[OFFSET] = r, tw / tt, wm - tw / tt * tm
     second = np.float32(-1.0)
     for i in range(rows):
         if highest[i] <= second:
@@ -63,14 +86,14 @@ def read_peak(template, window, surface, whole, least, min_r, max_second, out): 
                     top = top and surface[u, v] <= r2
             if top:
                 second = r2
-    out[7] = second
+    out[SECOND] = second
     if r < min_r:
-        out[0] = LOW
+        out[FLAG] = LOW
     elif bi == 0 or bj == 0 or bi == rows - 1 or bj == cols - 1:
-        out[0] = BORDER
+        out[FLAG] = BORDER
     elif second > max_second * r:
-        out[0] = DOUBT
-    if out[0] != 0:
+        out[FLAG] = DOUBT
+    if out[FLAG] != 0:
         return
     # least squares parabola through the nine coefficients around the peak (their weights in closed form)
     gx, gy, hxx, hyy, hxy = 0.0, 0.0, 0.0, 0.0, 0.0
@@ -84,11 +107,11 @@ def read_peak(template, window, surface, whole, least, min_r, max_second, out): 
             hyy += (i * i - 2.0 / 3.0) * s
     det = hxx * hyy - hxy * hxy
     if not (hxx < 0.0 and det > 0.0):
-        out[0] = DOUBT
+        out[FLAG] = DOUBT
         return
     dx, dy = (hxy * gy - hyy * gx) / det, (hxy * gx - hxx * gy) / det
-    out[1] += min(1.0, max(-1.0, dx))
-    out[2] += min(1.0, max(-1.0, dy))
+    out[X] += min(1.0, max(-1.0, dx))
+    out[Y] += min(1.0, max(-1.0, dy))
     # least squares of the shift has N = sum g g^T = -r'' sum f^2 / r, sigma^2 = (1 - r^2) sum f^2 / (n - 4)
     c = (1.0 - r * r) * r / (n - 4) / det
     # r is no parabola: what the nine coefficients miss it by, of 9 - 6 degrees of freedom, is in the gradient
@@ -102,14 +125,15 @@ def read_peak(template, window, surface, whole, least, min_r, max_second, out): 
             bend = hxx * (j * j - 2.0 / 3.0) / 2.0 + hyy * (i * i - 2.0 / 3.0) / 2.0 + hxy * i * j
             misfit += (whole[bi + i, bj + j] - mean - gx * j - gy * i - bend) ** 2
     m = misfit / 3.0 / 6.0 / (det * det)
-    out[3] = -hyy * c + m * (hyy * hyy + hxy * hxy)
-    out[4] = hxy * c - m * hxy * (hxx + hyy)
-    out[5] = -hxx * c + m * (hxx * hxx + hxy * hxy)
+    out[CXX] = -hyy * c + m * (hyy * hyy + hxy * hxy)
+    out[CXY] = hxy * c - m * hxy * (hxx + hyy)
+    out[CYY] = -hxx * c + m * (hxx * hxx + hxy * hxy)
 
 
-@njit(cache=True, nogil=True, fastmath=True)
-def _largest(row):  # type: ignore[no-untyped-def]
-    largest = row[0]
+@compiled_fast
+def _largest(row: AnyArray) -> float:
+    """Return the largest of some numbers."""
+    largest: float = row[0]
     for value in row:
         largest = max(largest, value)
     return largest

@@ -29,15 +29,25 @@ def match_pyramid(
     """Look for templates from coarse to fine: the whole search window at the top, a few pixels below.
 
     Args:
-        left, right, xy_left, xy_right, template_px, search_px, min_correlation: as in `match_ncc`; search_px
-            counts pixels of the photograph.
+        left: photograph, (H, W), 8 or 16 bit or float, grey or colour.
+        right: the other photograph.
+        xy_left: points in the left photograph, px, (k, 2).
+        xy_right: centres of the search windows, px, (k, 2).
+        template_px: odd side of the template, the same on every level, px of that level.
+        search_px: odd side of the search window, px of the photograph.
         levels: photographs in the pyramid, each half the size of the one before.
+        min_correlation: smallest r of a match on any level.
 
     Returns:
         The matches in the photographs of full size; those lost on the way carry the flag of their level.
+
+    Raises:
+        GeometryError: fewer than one level, or windows as in `match_ncc`.
+
+    Source: Luhmann et al. (2020), sec. 5.5.3 (image pyramids), levels by cv2.pyrDown; r as in `match_ncc`.
     """
     if levels < 1:
-        raise GeometryError(f"NCC: a pyramid of {levels} levels, needed at least 1")
+        raise GeometryError(f"NCC: a pyramid of {levels} levels, at least 1 is needed")
     side = odd_window("NCC template", template_px)
     pyramids = [_pyramid(left, levels), _pyramid(right, levels)]
     a, b = np.asarray(xy_left, dtype=float).reshape(-1, 2), np.asarray(xy_right, dtype=float).reshape(-1, 2)

@@ -12,32 +12,25 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 
 from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
 from sfm.errors import GeometryError
-from sfm.kernels.sampling import TAPS, interpolation_index
-from sfm.matching.lsm.patch_equations import (
-    MARGIN,
-    MODELS,
-    RADIOMETRIC,
-    dot,
-    factorise,
-    fill_normals,
-    gradients,
-    solve,
-)
-from sfm.matching.lsm.patch_precision import judge
+from sfm.kernels.cholesky import solve_factorised
+from sfm.kernels.options import compiled
+from sfm.kernels.sampling import interpolation_index
+from sfm.matching.lsm.patch_equations import MODELS, RADIOMETRIC, dot, new_workspace, prepare_template
+from sfm.matching.lsm.patch_precision import CXX, CXY, CYY, FLAG, OUTPUTS, STEPS, R, judge
 from sfm.matching.lsm.projected_points import derivatives, facing_warps, pictures_of
-from sfm.matching.lsm.two_photo import OUTPUTS
 from sfm.matching.lsm.warp import put_step
-from sfm.matching.lsm.window import resample_patch, resample_window
+from sfm.matching.lsm.window import resample_patch
 from sfm.matching.match_flags import DIVERGED, FLAT_TEXTURE, LOW_CORRELATION, MATCHED, OUTSIDE, TOO_FAR
 from sfm.matching.radiometry import grey_of, odd_window
 from sfm.network import Estimate
 
 MAX_STEPS = 15
 STOP_PX = 0.005
+SIZE = MODELS["affine"] + RADIOMETRIC
+LAST_FLAG = STEPS  # steps are counted for all windows together: the column holds the flag of the last one
 LEAST_EIGENVALUE = 1e-12  # part of the largest, what rounding leaves of parallel rays
 
 
@@ -81,7 +74,8 @@ def match_multi(
         photographs: m photographs, (H, W).
         estimate: interior and exterior orientation of all, and object points to start from, (n, 3).
         camera: index of the camera of each photograph, (m,).
-        image, point: photograph and object point of each image point, (k,).
+        image: photograph of each image point, (k,).
+        point: object point of each image point, (k,).
         xy: approximate image points; in the reference the place itself, px, (k, 2).
         reference: the row of each point that is its template, (n,).
         orientation_px: standard deviation of a projected point because of the orientation, px; None leaves
@@ -121,7 +115,7 @@ def match_multi(
     while step < MAX_STEPS and moving.any():
         step += 1
         for i, j, own in groups:
-            rows = own[(out[own, 0] == MATCHED) & moving[point[own]]]
+            rows = own[(out[own, FLAG] == MATCHED) & moving[point[own]]]
             out[rows], q[rows], follow[rows] = _window_steps(
                 greys[i], greys[j], half, kind, xy[ref[rows]], warp[rows]
             )
@@ -130,19 +124,23 @@ def match_multi(
         target = now if orientation_px is None else _give_way(
             estimate, camera, image, point, X, now, C, warp[:, :2, 2], orientation_px
         )  # fmt: skip
-        rows = windows[(out[windows, 0] == MATCHED) & moving[point[windows]]]
+        rows = windows[(out[windows, FLAG] == MATCHED) & moving[point[windows]]]
         shift = target[rows] - warp[rows, :2, 2]
         warp[rows], length[rows] = _move_windows(warp[rows], q[rows], follow[rows], shift, half)
         far = np.hypot(*(warp[rows, :2, 2] - xy[rows]).T) > max_shift_px
-        out[rows, 0] = np.where(np.isfinite(length[rows]), np.where(far, TOO_FAR, MATCHED), DIVERGED)
-        still = rows[(out[rows, 0] == MATCHED) & (length[rows] > STOP_PX)]
+        out[rows, FLAG] = np.where(np.isfinite(length[rows]), np.where(far, TOO_FAR, MATCHED), DIVERGED)
+        still = rows[(out[rows, FLAG] == MATCHED) & (length[rows] > STOP_PX)]
         moving = np.bincount(point[still], minlength=len(X)) > 0
         q[~moving[point], :2] = 0.0  # they are where they want to be
-    matched = out[:, 0] == MATCHED
-    out[matched & (length > STOP_PX) & (ref != np.arange(len(image))), 0] = DIVERGED
-    out[windows[(out[windows, 0] == MATCHED) & (out[windows, 10] == FLAT_TEXTURE)], 0] = FLAT_TEXTURE
-    out[windows[(out[windows, 0] == MATCHED) & (out[windows, 8] < min_correlation)], 0] = LOW_CORRELATION
-    flag = out[:, 0].astype(np.int64)
+    matched = out[:, FLAG] == MATCHED
+    out[matched & (length > STOP_PX) & (ref != np.arange(len(image))), FLAG] = DIVERGED
+    out[windows[(out[windows, FLAG] == MATCHED) & (out[windows, LAST_FLAG] == FLAT_TEXTURE)], FLAG] = (
+        FLAT_TEXTURE
+    )
+    out[windows[(out[windows, FLAG] == MATCHED) & (out[windows, R] < min_correlation)], FLAG] = (
+        LOW_CORRELATION
+    )
+    flag = out[:, FLAG].astype(np.int64)
     good = flag == MATCHED
     seen = np.bincount(point[good], minlength=len(X)) >= 2
     now[windows] = warp[windows, :2, 2]
@@ -153,14 +151,11 @@ def match_multi(
     covariance = np.full((len(X), 3, 3), np.nan)
     covariance[seen] = np.linalg.inv(N[seen])
     X[~seen] = np.nan
-    out[reference, 8] = 1.0
+    out[reference, R] = 1.0
     return MultiMatches(
         X, covariance, np.where(good[:, None], now, np.nan), np.where(good[:, None, None], C, np.nan),
-        out[:, 8], flag, step,
+        out[:, R], flag, step,
     )  # fmt: skip
-
-
-SIZE = MODELS["affine"] + RADIOMETRIC
 
 
 def _measured(
@@ -177,11 +172,11 @@ def _measured(
 
     Half of the noise of a match is that of the template and goes to the reference, as in `tie_points`.
     """
-    good = windows[out[windows, 0] == MATCHED]
+    good = windows[out[windows, FLAG] == MATCHED]
     now, C = np.full(xy.shape, np.nan), np.full((len(xy), 2, 2), np.nan)
     A = warp[good, :2, :2]
     now[good] = warp[good, :2, 2] - np.einsum("kij,kj->ki", A, half * q[good, :2] / q[good, -1:])
-    C[good] = out[good][:, [3, 4, 4, 5]].reshape(-1, 2, 2) / 2
+    C[good] = out[good][:, [CXX, CXY, CXY, CYY]].reshape(-1, 2, 2) / 2
     back = np.linalg.inv(A)
     mean = np.zeros((len(reference), 2, 2))
     np.add.at(mean, point[good], back @ C[good] @ back.transpose(0, 2, 1))
@@ -243,41 +238,34 @@ def _give_way(
     return target
 
 
-@njit(cache=True, nogil=True)
-def _window_steps(left, right, half, kind, xy, warp):  # type: ignore[no-untyped-def]
+@compiled
+def _window_steps(
+    left: AnyArray, right: AnyArray, half: int, kind: int, xy: FloatArray, warp: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return judgement (k, OUTPUTS), step q (k, 8) and how q follows its shift (k, 8, 2)."""
-    side, wide = 2 * half + 1, 2 * (half + MARGIN) + 1
-    grid = np.empty((wide, wide), np.float32)
-    J, patch = np.empty((SIZE, side * side), np.float32), np.empty(side * side, np.float32)
-    N, L = np.empty((SIZE, SIZE)), np.empty((SIZE, SIZE))
-    rhs, scratch, unit = np.empty(SIZE), np.empty(SIZE), np.empty((2, SIZE))
-    wx, wy = np.zeros(TAPS, np.float32), np.zeros(TAPS, np.float32)
+    work = new_workspace(half, kind, SIZE - RADIOMETRIC)
+    L, unit = work.L, np.empty((2, SIZE))
     out, q, follow = np.zeros((len(xy), OUTPUTS)), np.zeros((len(xy), SIZE)), np.zeros((len(xy), SIZE, 2))
     for k in range(len(xy)):
-        if not resample_window(left, xy[k, 0], xy[k, 1], half + MARGIN, kind, wx, wy, grid):
-            out[k, 0] = OUTSIDE
+        out[k, FLAG] = prepare_template(left, xy[k, 0], xy[k, 1], work)
+        if out[k, FLAG] != MATCHED:
             continue
-        gradients(grid, half, SIZE - 2, J)
-        fill_normals(J, N)
-        if not factorise(N, L):
-            out[k, 0] = FLAT_TEXTURE
-            continue
-        if not resample_patch(right, warp[k], half, kind, wx, wy, patch):
-            out[k, 0] = OUTSIDE
+        if not resample_patch(right, warp[k], half, kind, work.wx, work.wy, work.patch):
+            out[k, FLAG] = OUTSIDE
             continue
         for a in range(SIZE):
-            rhs[a] = q[k, a] = dot(J[a], patch)
-        solve(L, q[k])
+            work.rhs[a] = q[k, a] = dot(work.J[a], work.patch)
+        solve_factorised(L, q[k])
         if not q[k, SIZE - 1] > 0.0:
-            out[k, 0] = DIVERGED
+            out[k, FLAG] = DIVERGED
             continue
-        scratch[:] = q[k]
+        work.q[:] = q[k]
         # far from the solution misfit looks like noise: whether the texture is flat, the last step tells
-        out[k, 10] = judge(half, kind, SIZE - 2, -1.0, J, N, L, scratch, rhs, patch, wx, wy, warp[k], out[k])
+        out[k, LAST_FLAG] = judge(work, -1.0, warp[k], out[k])
         for a in range(2):
             unit[a] = 0.0
             unit[a, a] = 1.0
-            solve(L, unit[a])
+            solve_factorised(L, unit[a])
         det = unit[0, 0] * unit[1, 1] - unit[0, 1] * unit[1, 0]
         for a in range(SIZE):
             follow[k, a, 0] = (unit[0, a] * unit[1, 1] - unit[1, a] * unit[0, 1]) / det
@@ -285,9 +273,11 @@ def _window_steps(left, right, half, kind, xy, warp):  # type: ignore[no-untyped
     return out, q, follow
 
 
-@njit(cache=True, nogil=True)
-def _move_windows(warp, q, follow, shift, half):  # type: ignore[no-untyped-def]
-    """Put steps of prescribed shift (px) on warps, the other parameters follow; returns both."""
+@compiled
+def _move_windows(
+    warp: FloatArray, q: FloatArray, follow: FloatArray, shift: FloatArray, half: int
+) -> tuple[FloatArray, FloatArray]:
+    """Put steps of given shift (px) on warps, the other parameters follow; return warps and lengths, px."""
     length, step = np.empty(len(warp)), np.empty(SIZE)
     for k in range(len(warp)):
         H = warp[k]

@@ -6,20 +6,77 @@ The template is in single precision, the sums are in double.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
-from numba import njit
+
+from sfm.conventions import AnyArray, FloatArray
+from sfm.kernels.cholesky import factorise
+from sfm.kernels.options import compiled, compiled_fast
+from sfm.kernels.sampling import TAPS
+from sfm.matching.lsm.window import resample_window
+from sfm.matching.match_flags import FLAT_TEXTURE, MATCHED, OUTSIDE
 
 MODELS = {"shift": 2, "affine": 6, "projective": 8}  # geometric parameters
 RADIOMETRIC = 2  # offset and gain
 MARGIN = 3  # pixels around the template that its gradients need
+UNDETERMINED = 1e-9  # part of a diagonal that rounding of float32 intensities leaves of nothing
 # Symmetric difference of sixth order, taps 1, 2, 3; a gradient has the variance of a pixel times SLOPE_NOISE.
 # Source: Abramowitz and Stegun (1964), table 25.2 (seven-point formula).
 SLOPE = (3.0 / 4.0, -3.0 / 20.0, 1.0 / 60.0)
 SLOPE_NOISE = 2.0 * (SLOPE[0] ** 2 + SLOPE[1] ** 2 + SLOPE[2] ** 2)
 
 
-@njit(cache=True, nogil=True)
-def gradients(grid, half, geometric, J):  # type: ignore[no-untyped-def]
+class Workspace(NamedTuple):
+    """What all patches have in common, and the arrays in which one after another is worked on."""
+
+    half: int  # half the side of the window, px
+    kind: int  # kernel of resampling
+    geometric: int  # geometric parameters
+    grid: AnyArray  # template with its margin, float32
+    J: AnyArray  # d (patch) / d (unknowns), a row each, float32, (u, side^2)
+    N: FloatArray  # normal matrix, (u, u)
+    L: FloatArray  # its factor, (u, u)
+    q: FloatArray  # solution, (u,)
+    rhs: FloatArray  # right-hand side, (u,)
+    patch: AnyArray  # resampled intensities, later residuals, float32, (side^2,)
+    wx: AnyArray  # weights of the kernel along a row, float32
+    wy: AnyArray  # and along a column, float32
+
+
+@compiled
+def new_workspace(half: int, kind: int, geometric: int) -> Workspace:
+    """Return arrays for windows of a size and a model."""
+    side, size = 2 * half + 1, geometric + RADIOMETRIC
+    wide = side + 2 * MARGIN
+    return Workspace(
+        half,
+        kind,
+        geometric,
+        np.empty((wide, wide), np.float32),
+        np.empty((size, side * side), np.float32),
+        np.empty((size, size)),
+        np.empty((size, size)),
+        np.empty(size),
+        np.empty(size),
+        np.empty(side * side, np.float32),
+        np.zeros(TAPS, np.float32),
+        np.zeros(TAPS, np.float32),
+    )
+
+
+@compiled
+def prepare_template(left: AnyArray, x: float, y: float, work: Workspace) -> int:
+    """Fill gradients, normal matrix and factor of the template around a point; return the flag."""
+    if not resample_window(left, x, y, work.half + MARGIN, work.kind, work.wx, work.wy, work.grid):
+        return OUTSIDE
+    gradients(work.grid, work.half, work.geometric, work.J)
+    fill_normals(work.J, work.N)
+    return MATCHED if factorise(work.N, work.L, UNDETERMINED) else FLAT_TEXTURE
+
+
+@compiled
+def gradients(grid: AnyArray, half: int, geometric: int, J: AnyArray) -> None:
     """Fill J: d (patch) / d (geometric, offset, gain), window coordinates counted in half windows.
 
     Order of the geometric parameters: shift x, y; xx, xy, yx, yy; and the two of perspective.
@@ -47,47 +104,18 @@ def gradients(grid, half, geometric, J):  # type: ignore[no-untyped-def]
             J[geometric + 1, p] = grid[y, x]
 
 
-@njit(cache=True, nogil=True, fastmath=True)
-def fill_normals(J, N):  # type: ignore[no-untyped-def]
+@compiled_fast
+def fill_normals(J: AnyArray, N: FloatArray) -> None:
+    """Fill N = J J^T, the rows of J being the unknowns."""
     for a in range(len(J)):
         for b in range(a + 1):
             N[a, b] = N[b, a] = dot(J[a], J[b])
 
 
-@njit(cache=True, nogil=True, fastmath=True)
-def dot(a, b):  # type: ignore[no-untyped-def]
+@compiled_fast
+def dot(a: AnyArray, b: AnyArray) -> float:
+    """Return the sum of products of two rows of float32 in double precision."""
     total = 0.0
     for p in range(len(a)):
         total += np.float64(a[p]) * np.float64(b[p])
     return total
-
-
-@njit(cache=True, nogil=True)
-def factorise(N, L):  # type: ignore[no-untyped-def]
-    """Cholesky factor of N in the lower triangle of L; False where a parameter is not determined."""
-    n = len(N)
-    for a in range(n):
-        for b in range(a + 1):
-            s = N[a, b]
-            for c in range(b):
-                s -= L[a, c] * L[b, c]
-            if a == b:
-                if not s > 1e-9 * N[a, a]:  # what rounding of float32 intensities leaves of nothing
-                    return False
-                L[a, a] = np.sqrt(s)
-            else:
-                L[a, b] = s / L[b, b]
-    return True
-
-
-@njit(cache=True, nogil=True)
-def solve(L, q):  # type: ignore[no-untyped-def]
-    n = len(L)
-    for a in range(n):
-        for c in range(a):
-            q[a] -= L[a, c] * q[c]
-        q[a] /= L[a, a]
-    for a in range(n - 1, -1, -1):
-        for c in range(a + 1, n):
-            q[a] -= L[c, a] * q[c]
-        q[a] /= L[a, a]

@@ -15,7 +15,9 @@ def facing_warps(
     """Return d (picture) / d (picture in the reference) of a surface that faces the reference, (k, 2, 2).
 
     Args:
-        estimate, camera, image: as in `match_multi`.
+        estimate: interior and exterior orientation of all photographs.
+        camera: index of the camera of each photograph, (m,).
+        image: photograph of each row, (k,).
         ref: the row of the reference of each row, (k,).
         points: the object point of each row, (k, 3).
     """

@@ -16,32 +16,48 @@ from __future__ import annotations
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
 from sfm.errors import GeometryError
-from sfm.kernels.sampling import BILINEAR, TAPS, interpolation_index
-from sfm.matching.lsm.patch_equations import (
-    MARGIN,
-    MODELS,
-    RADIOMETRIC,
-    dot,
-    factorise,
-    fill_normals,
-    gradients,
-    solve,
+from sfm.kernels.cholesky import solve_factorised
+from sfm.kernels.options import compiled
+from sfm.kernels.sampling import BILINEAR, interpolation_index
+from sfm.matching.lsm.patch_equations import MODELS, Workspace, dot, new_workspace, prepare_template
+from sfm.matching.lsm.patch_precision import (
+    CXX,
+    CXY,
+    CYY,
+    FLAG,
+    GAIN,
+    OFFSET,
+    OUTPUTS,
+    SIGMA0,
+    STEPS,
+    R,
+    X,
+    Y,
+    judge,
 )
-from sfm.matching.lsm.patch_precision import judge
 from sfm.matching.lsm.warp import put_step
-from sfm.matching.lsm.window import resample_patch, resample_window
-from sfm.matching.match_flags import DIVERGED, FLAT_TEXTURE, MATCHED, OUTSIDE, TOO_FAR, LsmFlag
+from sfm.matching.lsm.window import resample_patch
+from sfm.matching.match_flags import DIVERGED, MATCHED, OUTSIDE, TOO_FAR, LsmFlag
 from sfm.matching.radiometry import grey_of, odd_window
 
 COARSE_STEP = 0.5  # bilinear interpolation is good enough while steps are longer than this, px
 CONTRACTION = 0.04  # a step is at most this part of the one before; 0.01 to 0.03 on texture with noise
 CHUNK = 256  # patches that a thread takes at a time
+
+
+class Limits(NamedTuple):
+    """When the steps of a patch end, and which results are believed."""
+
+    stop_px: float  # the shift of the step that would come next is shorter
+    max_steps: int
+    max_shift_px: float  # from the start
+    min_correlation: float
 
 
 @dataclass(frozen=True)
@@ -86,7 +102,8 @@ def match_lsm(
     """Match points of the left photograph in the right one, from places known to a pixel or two.
 
     Args:
-        left, right: photographs, (H, W), 8 or 16 bit or float, grey or colour.
+        left: photograph, (H, W), 8 or 16 bit or float, grey or colour.
+        right: the other photograph.
         xy_left: points in the left photograph, px, any fraction, (k, 2).
         xy_right: where they are in the right photograph, approximately, px, (k, 2).
         model: shift (2), affine (6) or projective (8 parameters), each with gain and offset.
@@ -111,11 +128,11 @@ def match_lsm(
     Computer and Robot Vision II, ch. 16; the inverse way is Baker and Matthews (2004), IJCV 56(3).
     """
     if model not in MODELS:
-        raise GeometryError(f"LSM: model '{model}' is none of {', '.join(MODELS)}")
+        raise GeometryError(f"LSM: model '{model}', expected one of {', '.join(MODELS)}")
     kind = interpolation_index(interpolation)
     if kind < BILINEAR:
         raise GeometryError(
-            "LSM: interpolation 'nearest' has no gradient, needed bilinear, bicubic or six_tap"
+            "LSM: interpolation 'nearest' has no gradient, expected one of bilinear, bicubic, six_tap"
         )
     half = odd_window("LSM", window_px) // 2
     a = np.ascontiguousarray(xy_left, dtype=float).reshape(-1, 2)
@@ -130,95 +147,75 @@ def match_lsm(
     warp[:, :2, :2], warp[:, :2, 2], warp[:, 2, 2] = linear, b, 1.0
     out = np.zeros((k, OUTPUTS))
     fixed = (grey_of(left), grey_of(right), half, kind, MODELS[model])
-    limits = (float(stop_px), int(max_steps), float(max_shift_px), float(min_correlation))
+    limits = Limits(float(stop_px), int(max_steps), float(max_shift_px), float(min_correlation))
 
     def work(part: slice) -> None:
-        _match_all(*fixed, *limits, a[part], warp[part], out[part])
+        _match_all(*fixed, limits, a[part], warp[part], out[part])
 
     if threads > 1:
         with ThreadPoolExecutor(threads) as pool:
             list(pool.map(work, _chunks(k)))
     else:
         work(slice(0, k))
-    flag = out[:, 0].astype(np.int64)
-    values = np.where((flag & ~int(LsmFlag.LOW_CORRELATION))[:, None] == 0, out[:, 1:9], np.nan)
-    xy = np.where((flag == 0)[:, None], values[:, :2], np.nan)
-    covariance = np.stack([values[:, 2], values[:, 3], values[:, 3], values[:, 4]], axis=1).reshape(k, 2, 2)
+    flag = out[:, FLAG].astype(np.int64)
+    out[(flag & ~int(LsmFlag.LOW_CORRELATION)) != 0, X : R + 1] = np.nan
+    xy = np.where((flag == 0)[:, None], out[:, [X, Y]], np.nan)
+    covariance = out[:, [CXX, CXY, CXY, CYY]].reshape(k, 2, 2)
     covariance[flag != 0] = np.nan
-    gain, offset, r = values[:, 5], values[:, 6], values[:, 7]
-    return LsmMatches(xy, covariance, warp, gain, offset, r, out[:, 9], out[:, 10].astype(np.int64), flag)
-
-
-OUTPUTS = 11  # flag; x, y, their three covariances; gain, offset, correlation; sigma0; steps
+    steps = out[:, STEPS].astype(np.int64)
+    return LsmMatches(
+        xy, covariance, warp, out[:, GAIN], out[:, OFFSET], out[:, R], out[:, SIGMA0], steps, flag
+    )
 
 
 def _chunks(k: int) -> Iterator[slice]:
     return (slice(first, first + CHUNK) for first in range(0, k, CHUNK))
 
 
-@njit(cache=True, nogil=True)
-def _match_all(left, right, half, kind, geometric, stop, max_steps, max_shift, min_r, xy, warp, out):  # type: ignore[no-untyped-def]
-    """Match patch after patch; `warp` goes from start to solution, `out` as in OUTPUTS."""
-    side = 2 * half + 1
-    wide = side + 2 * MARGIN
-    grid = np.empty((wide, wide), np.float32)
-    size = geometric + RADIOMETRIC
-    J = np.empty((size, side * side), np.float32)
-    patch = np.empty(side * side, np.float32)
-    N, L = np.empty((size, size)), np.empty((size, size))
-    q, rhs = np.empty(size), np.empty(size)
-    wx, wy = np.zeros(TAPS, np.float32), np.zeros(TAPS, np.float32)
+@compiled
+def _match_all(
+    left: AnyArray,
+    right: AnyArray,
+    half: int,
+    kind: int,
+    geometric: int,
+    limits: Limits,
+    xy: FloatArray,
+    warp: FloatArray,
+    out: FloatArray,
+) -> None:
+    """Match patch after patch; `warp` goes from start to solution, `out` receives the columns."""
+    work = new_workspace(half, kind, geometric)
     for i in range(len(xy)):
-        if not resample_window(left, xy[i, 0], xy[i, 1], half + MARGIN, kind, wx, wy, grid):
-            out[i, 0] = OUTSIDE
-            continue
-        gradients(grid, half, geometric, J)
-        fill_normals(J, N)
-        if not factorise(N, L):
-            out[i, 0] = FLAT_TEXTURE
-            continue
-        out[i, 0] = _iterate(
-            right,
-            half,
-            kind,
-            geometric,
-            stop,
-            max_steps,
-            max_shift,
-            J,
-            L,
-            q,
-            rhs,
-            patch,
-            wx,
-            wy,
-            warp[i],
-            out[i],
-        )
-        if out[i, 0] == MATCHED:
-            out[i, 0] = judge(half, kind, geometric, min_r, J, N, L, q, rhs, patch, wx, wy, warp[i], out[i])
+        out[i, FLAG] = prepare_template(left, xy[i, 0], xy[i, 1], work)
+        if out[i, FLAG] == MATCHED:
+            out[i, FLAG] = _iterate(right, work, limits, warp[i], out[i])
+        if out[i, FLAG] == MATCHED:
+            out[i, FLAG] = judge(work, limits.min_correlation, warp[i], out[i])
 
 
-@njit(cache=True, nogil=True)
-def _iterate(right, half, kind, geometric, stop, max_steps, max_shift, J, L, q, rhs, patch, wx, wy, H, out):  # type: ignore[no-untyped-def]
-    """Gauss-Newton steps on H, from its start; returns the flag and leaves J^T S and the solution q."""
+@compiled
+def _iterate(right: AnyArray, work: Workspace, limits: Limits, H: FloatArray, out: FloatArray) -> int:
+    """Improve H by Gauss-Newton steps; return the flag, leave J^T S and the solution in the workspace."""
+    half, q, rhs = work.half, work.q, work.rhs
     x0, y0 = H[0, 2], H[1, 2]
-    coarse = kind > BILINEAR
+    coarse = work.kind > BILINEAR
     previous = np.inf
-    for step in range(1, max_steps + 1):
-        out[10] = step
-        if not resample_patch(right, H, half, BILINEAR if coarse else kind, wx, wy, patch):
+    for step in range(1, limits.max_steps + 1):
+        out[STEPS] = step
+        kind = BILINEAR if coarse else work.kind
+        if not resample_patch(right, H, half, kind, work.wx, work.wy, work.patch):
             return OUTSIDE
         for a in range(len(q)):
-            rhs[a] = q[a] = dot(J[a], patch)
-        solve(L, q)
-        length = put_step(H, q, half, geometric)
+            rhs[a] = q[a] = dot(work.J[a], work.patch)
+        solve_factorised(work.L, q)
+        length = put_step(H, q, half, work.geometric)
         if not length < np.inf:
             return DIVERGED
-        if np.hypot(H[0, 2] - x0, H[1, 2] - y0) > max_shift:
+        if np.hypot(H[0, 2] - x0, H[1, 2] - y0) > limits.max_shift_px:
             return TOO_FAR
         if not coarse:
-            if length * max(CONTRACTION, length / previous) < stop:
+            if length * max(CONTRACTION, length / previous) < limits.stop_px:
                 return MATCHED
             previous = length
         coarse = coarse and length > COARSE_STEP

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+
+from sfm.conventions import FloatArray
+from sfm.kernels.options import compiled
 
 MAX_STRETCH = 3.0  # ratio of lengths, of a patch in both photographs, that is a match no more
 
 
-@njit(cache=True, nogil=True)
-def put_step(H, q, half, geometric):  # type: ignore[no-untyped-def]
-    """Put the step q on H, H <- H dH^-1; returns the shift in px, inf if the patch is turned inside out."""
+@compiled
+def put_step(H: FloatArray, q: FloatArray, half: int, geometric: int) -> float:
+    """Put the step q on H, H <- H dH^-1; return the shift in px, inf if the patch is turned inside out."""
     beta = q[geometric + 1]
     if not beta > 0.0:
         return np.inf
@@ -45,12 +47,13 @@ def put_step(H, q, half, geometric):  # type: ignore[no-untyped-def]
     det = area_ratio(H)
     if not (det > MAX_STRETCH**-2 and det < MAX_STRETCH**2):
         return np.inf
-    return np.hypot(H[0, 2] - x, H[1, 2] - y)
+    return float(np.hypot(H[0, 2] - x, H[1, 2] - y))
 
 
-@njit(cache=True, nogil=True)
-def area_ratio(H):  # type: ignore[no-untyped-def]
-    """Area in the right photograph of a unit area at the point: the determinant of d(H x)/dx at x = 0."""
+@compiled
+def area_ratio(H: FloatArray) -> float:
+    """Return the right area of a unit area at the point: the determinant of d(H x)/dx at x = 0."""
     xx, xy = H[0, 0] - H[0, 2] * H[2, 0], H[0, 1] - H[0, 2] * H[2, 1]
     yx, yy = H[1, 0] - H[1, 2] * H[2, 0], H[1, 1] - H[1, 2] * H[2, 1]
-    return xx * yy - xy * yx
+    ratio: float = xx * yy - xy * yx
+    return ratio

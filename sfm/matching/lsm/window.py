@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from sfm.conventions import AnyArray, FloatArray
+from sfm.kernels.options import compiled, compiled_fast
 from sfm.kernels.sampling import AFTER, BEFORE, BILINEAR, kernel_weights, sample
 
 
-@njit(cache=True, nogil=True)
-def resample_window(grey, x, y, reach, kind, wx, wy, grid):  # type: ignore[no-untyped-def]
+@compiled
+def resample_window(
+    grey: AnyArray, x: float, y: float, reach: int, kind: int, wx: AnyArray, wy: AnyArray, grid: AnyArray
+) -> bool:
     """Fill `grid` with the intensities at (x + j, y + i), |i|, |j| <= reach; False outside the photograph."""
     height, width = grey.shape
     if not (x >= reach and y >= reach and x <= width - 1.0 - reach and y <= height - 1.0 - reach):
@@ -34,8 +37,10 @@ def resample_window(grey, x, y, reach, kind, wx, wy, grid):  # type: ignore[no-u
     return True
 
 
-@njit(cache=True, nogil=True, fastmath=True)
-def resample_patch(grey, H, half, kind, wx, wy, patch):  # type: ignore[no-untyped-def]
+@compiled_fast
+def resample_patch(
+    grey: AnyArray, H: FloatArray, half: int, kind: int, wx: AnyArray, wy: AnyArray, patch: AnyArray
+) -> bool:
     """Fill `patch` with S(H x) for x in the window; False where it reaches beyond the photograph."""
     height, width = grey.shape
     for b in (-half, half):

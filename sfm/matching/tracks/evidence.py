@@ -1,4 +1,4 @@
-"""Support: what speaks for an object point in all photographs, and what against it.
+"""Evidence: what speaks for an object point in all photographs, and what against it.
 
 The compiled part of `correspondence`: hypotheses from pairs of targets, multi-ray intersection, search of
 the targets around a projected point, and the number of points as good that chance would give.
@@ -10,9 +10,10 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from sfm.conventions import BoolArray, FloatArray, IntArray
+from sfm.kernels.options import compiled
+from sfm.kernels.small_algebra import solve_three
 from sfm.matching.epipolar import epipolar_distance
 
 # A point from two rays of an orientation that is wrong by the tolerance lands this many tolerances off in
@@ -50,8 +51,8 @@ class Scene(NamedTuple):
     member: IntArray  # targets in the order of their cells, (N,)
 
 
-@njit(cache=True)
-def list_seeds(seeds, scene, pairs, E, used):  # type: ignore[no-untyped-def]
+@compiled
+def list_seeds(seeds: IntArray, scene: Scene, pairs: IntArray, E: FloatArray, used: BoolArray) -> int:
     """Fill `seeds` with pairs of unused targets on each other's epipolar lines; return their number.
 
     With an empty array it only counts.
@@ -74,8 +75,17 @@ def list_seeds(seeds, scene, pairs, E, used):  # type: ignore[no-untyped-def]
     return n
 
 
-@njit(cache=True)
-def grow(scene, seeds, photograph, used, density, log_tests, min_rays, cos_angle):  # type: ignore[no-untyped-def]
+@compiled
+def grow(
+    scene: Scene,
+    seeds: IntArray,
+    photograph: IntArray,
+    used: BoolArray,
+    density: FloatArray,
+    log_tests: float,
+    min_rays: int,
+    cos_angle: float,
+) -> tuple[IntArray, FloatArray, FloatArray]:
     """Grow each pair to all photographs and return the best point of every target.
 
     Args:
@@ -130,8 +140,8 @@ def grow(scene, seeds, photograph, used, density, log_tests, min_rays, cos_angle
     return best, place, score
 
 
-@njit(cache=True)
-def meet(scene, a, b, i, j, cos_angle, X):  # type: ignore[no-untyped-def]
+@compiled
+def meet(scene: Scene, a: int, b: int, i: int, j: int, cos_angle: float, X: FloatArray) -> bool:
     """Fill X with the midpoint of the shortest line between two rays; False if it is of no use."""
     di, dj = np.empty(3), np.empty(3)
     for k in range(3):
@@ -159,8 +169,8 @@ def meet(scene, a, b, i, j, cos_angle, X):  # type: ignore[no-untyped-def]
     return True
 
 
-@njit(cache=True)
-def tangents(scene, i, X):  # type: ignore[no-untyped-def]
+@compiled
+def tangents(scene: Scene, i: int, X: FloatArray) -> tuple[float, float, float]:
     """Return u, v and the depth -W of a point in photograph i."""
     x = X[0] - scene.position[i, 0]
     y = X[1] - scene.position[i, 1]
@@ -172,20 +182,30 @@ def tangents(scene, i, X):  # type: ignore[no-untyped-def]
     return U / depth, V / depth, depth
 
 
-@njit(cache=True)
-def object_size(scene, a, i, X):  # type: ignore[no-untyped-def]
+@compiled
+def object_size(scene: Scene, a: int, i: int, X: FloatArray) -> float:
     """Return the diameter of a target at the object, 0 where it is unknown."""
-    return scene.size[a] * tangents(scene, i, X)[2]
+    size: float = scene.size[a] * tangents(scene, i, X)[2]
+    return size
 
 
-@njit(cache=True)
-def similar(one, other, ratio):  # type: ignore[no-untyped-def]
-    """Tell whether two sizes agree; unknown ones (0) agree with all."""
+@compiled
+def similar(one: float, other: float, ratio: float) -> bool:
+    """Return whether two sizes agree; unknown ones (0) agree with all."""
     return one == 0.0 or other == 0.0 or (one < ratio * other and other < ratio * one)
 
 
-@njit(cache=True)
-def gather(scene, X, kind, size, used, radius_px, track, residual):  # type: ignore[no-untyped-def]
+@compiled
+def gather(
+    scene: Scene,
+    X: FloatArray,
+    kind: int,
+    size: float,
+    used: BoolArray,
+    radius_px: float,
+    track: IntArray,
+    residual: FloatArray,
+) -> int:
     """Fill `track` with the nearest unused target around the projected point; return their number."""
     rays = 0
     for i in range(len(scene.c)):
@@ -215,8 +235,8 @@ def gather(scene, X, kind, size, used, radius_px, track, residual):  # type: ign
     return rays
 
 
-@njit(cache=True)
-def intersect(scene, track, X):  # type: ignore[no-untyped-def]
+@compiled
+def intersect(scene: Scene, track: IntArray, X: FloatArray) -> bool:
     """Move X to the least squares intersection of its rays, in px; False if they do not determine it.
 
     Source: Kraus (2007), sec. 5.2 (spatial intersection by the collinearity equations, Gauss-Newton).
@@ -242,42 +262,15 @@ def intersect(scene, track, X):  # type: ignore[no-untyped-def]
                     Jul = (scene.M[i, 0, l] + u * scene.M[i, 2, l]) / depth
                     Jvl = (scene.M[i, 1, l] + v * scene.M[i, 2, l]) / depth
                     N[k, l] += w2 * (Ju * Jul + Jv * Jvl)
-        if not solve3(N, h, step):
+        if not solve_three(N, h, step):
             return False
         for k in range(3):
             X[k] += step[k]
     return True
 
 
-@njit(cache=True)
-def solve3(N, h, x):  # type: ignore[no-untyped-def]
-    """Solve N x = h, 3 by 3, by Cramer's rule; False if N is singular to double precision."""
-    c0 = N[1, 1] * N[2, 2] - N[1, 2] * N[2, 1]
-    c1 = N[1, 2] * N[2, 0] - N[1, 0] * N[2, 2]
-    c2 = N[1, 0] * N[2, 1] - N[1, 1] * N[2, 0]
-    det = N[0, 0] * c0 + N[0, 1] * c1 + N[0, 2] * c2
-    if not det > 1e-13 * N[0, 0] * N[1, 1] * N[2, 2]:
-        return False
-    x[0] = (
-        c0 * h[0]
-        + (N[0, 2] * N[2, 1] - N[0, 1] * N[2, 2]) * h[1]
-        + (N[0, 1] * N[1, 2] - N[0, 2] * N[1, 1]) * h[2]
-    ) / det
-    x[1] = (
-        c1 * h[0]
-        + (N[0, 0] * N[2, 2] - N[0, 2] * N[2, 0]) * h[1]
-        + (N[0, 2] * N[1, 0] - N[0, 0] * N[1, 2]) * h[2]
-    ) / det
-    x[2] = (
-        c2 * h[0]
-        + (N[0, 1] * N[2, 0] - N[0, 0] * N[2, 1]) * h[1]
-        + (N[0, 0] * N[1, 1] - N[0, 1] * N[1, 0]) * h[2]
-    ) / det
-    return True
-
-
-@njit(cache=True)
-def prune(scene, X, track, residual):  # type: ignore[no-untyped-def]
+@compiled
+def prune(scene: Scene, X: FloatArray, track: IntArray, residual: FloatArray) -> int:
     """Recompute the residuals of a point and drop the rays beyond the tolerance; return how many are left."""
     rays = 0
     for i in range(len(track)):
@@ -293,9 +286,11 @@ def prune(scene, X, track, residual):  # type: ignore[no-untyped-def]
     return rays
 
 
-@njit(cache=True)
-def same_target(scene, one, X, other, Y, reach_px):  # type: ignore[no-untyped-def]
-    """Tell whether two points are one target: never in the same photograph, and close in most of them."""
+@compiled
+def same_target(
+    scene: Scene, one: IntArray, X: FloatArray, other: IntArray, Y: FloatArray, reach_px: float
+) -> bool:
+    """Return whether two points are one target: never in the same photograph, and close in most of them."""
     near = far = 0
     for i in range(len(scene.c)):
         if not scene.oriented[i]:
@@ -312,9 +307,9 @@ def same_target(scene, one, X, other, Y, reach_px):  # type: ignore[no-untyped-d
     return near > far
 
 
-@njit(cache=True)
-def in_view(scene, i, X):  # type: ignore[no-untyped-def]
-    """Tell whether a point falls inside photograph i."""
+@compiled
+def in_view(scene: Scene, i: int, X: FloatArray) -> bool:
+    """Return whether a point falls inside photograph i."""
     if not scene.oriented[i]:
         return False
     u, v, depth = tangents(scene, i, X)
@@ -322,9 +317,17 @@ def in_view(scene, i, X):  # type: ignore[no-untyped-def]
     return depth > 0 and w[0] < u < w[2] and w[1] < v < w[3]
 
 
-@njit(cache=True)
-def log_false_alarms(scene, X, track, residual, rays, density, log_tests):  # type: ignore[no-untyped-def]
-    """Logarithm of the number of points that chance would give with as many rays and as small residuals.
+@compiled
+def log_false_alarms(
+    scene: Scene,
+    X: FloatArray,
+    track: IntArray,
+    residual: FloatArray,
+    rays: int,
+    density: FloatArray,
+    log_tests: float,
+) -> float:
+    """Return the logarithm of the number of points as good, by rays and residuals, that chance would give.
 
     tests * binomial(n - 2, k - 2) * p^(k - 2): k of the n photographs that see the place agree, p is the
     chance that a target lies within the radius of the residuals; two rays are taken for the hypothesis.

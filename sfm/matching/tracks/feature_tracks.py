@@ -1,7 +1,7 @@
 """Tie points: points of natural texture found in several photographs and measured by least squares matching.
 
 SIFT features, whose descriptors know neither scale nor rotation, are matched pair by pair and kept where an
-epipolar geometry holds; what hangs together over all photographs is one point. Each point is then put on the
+epipolar geometry holds; what is connected over all photographs is one point. Each point is then put on the
 most precise place nearby in the photograph that sees it best (its reference), and carried into the others by
 least squares matching, which starts from the features' scales and directions.
 """
@@ -94,9 +94,12 @@ def find_tie_points(
 
     Raises:
         GeometryError: an unknown detector.
+
+    Source: Lowe (2004), IJCV 60(2), for the features; Foerstner and Guelch (1987) for the places; Gruen
+    (1985) for the measurement.
     """
     if detector not in DETECTORS:
-        raise GeometryError(f"tie points: detector '{detector}' is none of {', '.join(DETECTORS)}")
+        raise GeometryError(f"tie points: detector '{detector}', expected one of {', '.join(DETECTORS)}")
     with ThreadPoolExecutor(max(1, threads)) as pool:
         features = list(pool.map(lambda one: sift_features(one, max_features=max_features), photographs))
     tracks = link_features(features, min_rays=min_rays, seed=seed, threads=threads)
@@ -218,9 +221,13 @@ def measure_tracks(
 
     Args:
         photographs: m photographs.
-        features, tracks: what was found in them.
+        features: of each photograph.
+        tracks: which of them belong to one point.
         corners: places of each photograph that are better than the features near them, m arrays (c_i, 2).
-        window_px, min_rays, min_correlation, threads: as in `find_tie_points`.
+        window_px: odd side of the window of least squares matching.
+        min_rays: fewest photographs of a point.
+        min_correlation: smallest coefficient r of a match.
+        threads: patches worked on at a time.
     """
     m = len(photographs)
     greys = [grey_of(one) for one in photographs]

@@ -10,10 +10,10 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numba import njit
 
-from sfm.conventions import AnyArray, FloatArray
+from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
 from sfm.errors import GeometryError
+from sfm.kernels.options import compiled
 from sfm.matching.radiometry import grey_of, odd_window
 
 # Foerstner and Guelch (1987): 0.5 <= q <= 0.75 and w >= 0.5 to 1.5 times its mean over the photograph.
@@ -61,7 +61,7 @@ def foerstner_points(
     """
     side = odd_window("interest operator", window_px)
     if max_points < 1:
-        raise GeometryError(f"interest operator: {max_points} points asked for, needed at least 1")
+        raise GeometryError(f"interest operator: {max_points} points asked for, at least 1 is needed")
     grey = grey_of(photograph)
     reach = 2 * int(np.ceil(3 * DERIVATION_PX)) + 1
     smooth = cv2.GaussianBlur(grey, (reach, reach), DERIVATION_PX, borderType=cv2.BORDER_REFLECT_101)
@@ -90,8 +90,8 @@ def foerstner_points(
     return InterestPoints(place, covariance, weight[row, col], roundness[row, col])
 
 
-@njit(cache=True, nogil=True)
-def _thin(row, col, distance, most, taken, kept):  # type: ignore[no-untyped-def]
+@compiled
+def _thin(row: IntArray, col: IntArray, distance: float, most: int, taken: IntArray, kept: BoolArray) -> None:
     """Mark points, strongest first, that have no stronger one within the distance."""
     height, width = taken.shape
     reach = int(np.ceil(distance))
@@ -109,9 +109,17 @@ def _thin(row, col, distance, most, taken, kept):  # type: ignore[no-untyped-def
                     taken[i, j] = 1
 
 
-@njit(cache=True, nogil=True)
-def _intersect_edges(gx, gy, row, col, half, place, covariance):  # type: ignore[no-untyped-def]
-    """The point nearest to the edge elements of a window, weighted by their gradients: N x = sum g g^T x."""
+@compiled
+def _intersect_edges(
+    gx: AnyArray,
+    gy: AnyArray,
+    row: IntArray,
+    col: IntArray,
+    half: int,
+    place: FloatArray,
+    covariance: FloatArray,
+) -> None:
+    """Fill the point nearest to the edge elements of each window: N x = sum g g^T x, g their gradients."""
     n = (2 * half + 1) ** 2
     for k in range(len(row)):
         xx, xy, yy, bx, by, rest = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0

@@ -36,7 +36,8 @@ def solution_of(
     """Return an exterior orientation with its residuals at the given points.
 
     Args:
-        position, rotation: X0 and R, shapes (3,) and (3, 3).
+        position: projection centre X0, shape (3,), object unit.
+        rotation: R, image to object axes, shape (3, 3).
         tangents: u = -U/W, v = -V/W of the measured rays, shape (n, 2).
         points: object points, shape (n, 3), object unit.
     """
@@ -91,7 +92,18 @@ def _fit(measured: FloatArray, computed: FloatArray) -> LineFit:
 
 
 def tangents_of(position: FloatArray, rotation: FloatArray, points: FloatArray) -> FloatArray:
-    """Return the tangents of object points by the collinearity equations, NaN behind the camera, (n, 2)."""
+    """Return the tangents of object points by the collinearity equations.
+
+    Args:
+        position: projection centre X0, shape (3,), object unit.
+        rotation: R, image to object axes, shape (3, 3).
+        points: object points, shape (n, 3), object unit.
+
+    Returns:
+        u = -U/W, v = -V/W, shape (n, 2); NaN behind the camera.
+
+    Source: Kraus (2007), sec. 4.2.1; document 000, eqs. of the central perspective, with c = 1.
+    """
     UVW = (np.asarray(points, dtype=float) - position) @ rotation
     W = np.where(UVW[:, 2] < 0, UVW[:, 2], np.nan)
     return np.asarray(-UVW[:, :2] / W[:, None], dtype=float)

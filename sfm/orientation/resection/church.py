@@ -88,7 +88,7 @@ def _directions(X: FloatArray, position: FloatArray) -> FloatArray:
     D = np.linalg.norm(X - position, axis=1, keepdims=True)
     if D.min() == 0:
         raise GeometryError("church: the start coincides with an object point")
-    return (X - position) / D
+    return np.asarray((X - position) / D)
 
 
 def _cosines(X: FloatArray, position: FloatArray) -> FloatArray:

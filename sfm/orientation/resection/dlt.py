@@ -141,7 +141,7 @@ def _solve_linear(xy: FloatArray, X: FloatArray, columns: list[int]) -> tuple[Fl
 
 
 def _distortion_terms(xb: FloatArray) -> FloatArray:
-    """d (dx, dy) / d (K1, K2, K3, P1, P2) of `brown` at reduced image coordinates, (n, 2, 5)."""
+    """Return d (dx, dy) / d (K1, K2, K3, P1, P2) of `brown` at reduced image coordinates, (n, 2, 5)."""
     x, y = xb.T
     r2 = x * x + y * y
     dx = np.stack([x * r2, x * r2**2, x * r2**3, r2 + 2 * x * x, 2 * x * y], axis=1)

@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 
 from sfm.conventions import FloatArray, IntArray
 from sfm.errors import GeometryError
+from sfm.kernels.options import compiled_fused
 from sfm.kernels.quartic import MAX_ROOTS, find_positive_roots
 from sfm.orientation.resection.candidates import Solution, checked_points, ordered, solution_of
 
@@ -81,6 +81,8 @@ def leg_quartic(rays: FloatArray, points: FloatArray) -> FloatArray:
     Args:
         rays: unit vectors in the image frame, shape (3, 3).
         points: object points, shape (3, 3), object unit.
+
+    Source: Fischler, Bolles (1981), appendix A; document 001, sec. 2.3.4.
     """
     ab, ac, bc = squared_sides(np.asarray(points, dtype=float))
     gab, gac, gbc = squared_sides(np.asarray(rays, dtype=float))
@@ -91,11 +93,14 @@ def rays_from_tangents(tangents: FloatArray) -> FloatArray:
     """Return unit vectors in the image frame of tangents u = -U/W, v = -V/W, shape (..., 3)."""
     uv = np.asarray(tangents, dtype=float)
     rays = np.concatenate([uv, -np.ones((*uv.shape[:-1], 1))], axis=-1)
-    return rays / np.linalg.norm(rays, axis=-1, keepdims=True)
+    return np.asarray(rays / np.linalg.norm(rays, axis=-1, keepdims=True))
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract"})
-def _resect_batch(rays, points):  # type: ignore[no-untyped-def]
+@compiled_fused
+def _resect_batch(
+    rays: FloatArray, points: FloatArray
+) -> tuple[IntArray, FloatArray, FloatArray, FloatArray]:
+    """Return number, positions, rotations and legs of the solutions of every triple."""
     k = len(rays)
     count = np.empty(k, dtype=np.int64)
     position = np.empty((k, MAX_SOLUTIONS, 3))
@@ -111,8 +116,15 @@ def _resect_batch(rays, points):  # type: ignore[no-untyped-def]
     return count, position, rotation, legs
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract"})
-def solve_triple(rays, points, position, rotation, legs, work):  # type: ignore[no-untyped-def]
+@compiled_fused
+def solve_triple(
+    rays: FloatArray,
+    points: FloatArray,
+    position: FloatArray,
+    rotation: FloatArray,
+    legs: FloatArray,
+    work: FloatArray,
+) -> int:
     """Fill positions (4, 3), rotations (4, 3, 3) and legs (4, 3) of one triple; return their number.
 
     `work` is scratch space of WORK numbers, so that a batch allocates nothing.
@@ -149,26 +161,28 @@ def solve_triple(rays, points, position, rotation, legs, work):  # type: ignore[
     return n
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract"})
-def squared_sides(p):  # type: ignore[no-untyped-def]
-    """Squared distances 12, 13 and 23 of three points, one per row."""
+@compiled_fused
+def squared_sides(p: FloatArray) -> tuple[float, float, float]:
+    """Return the squared distances 12, 13 and 23 of three points, one per row."""
     ab = (p[0, 0] - p[1, 0]) ** 2 + (p[0, 1] - p[1, 1]) ** 2 + (p[0, 2] - p[1, 2]) ** 2
     ac = (p[0, 0] - p[2, 0]) ** 2 + (p[0, 1] - p[2, 1]) ** 2 + (p[0, 2] - p[2, 2]) ** 2
     bc = (p[1, 0] - p[2, 0]) ** 2 + (p[1, 1] - p[2, 1]) ** 2 + (p[1, 2] - p[2, 2]) ** 2
     return ab, ac, bc
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract"})
-def is_triangle(ab, ac, bc):  # type: ignore[no-untyped-def]
-    """Whether squared sides are those of a triangle with an area (Heron)."""
+@compiled_fused
+def is_triangle(ab: float, ac: float, bc: float) -> bool:
+    """Return whether squared sides are those of a triangle with an area (Heron)."""
     area16 = 2.0 * (ab * ac + ac * bc + bc * ab) - (ab * ab + ac * ac + bc * bc)
     largest = max(ab, max(ac, bc))
     return area16 > FLAT * largest * largest and min(ab, min(ac, bc)) > 0.0
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract"})
-def _quartic(Rab2, Rac2, Rbc2, cab, cac, cbc):  # type: ignore[no-untyped-def]
-    """G0 to G4 of Fischler and Bolles, appendix A, from squared sides and cosines of the face angles."""
+@compiled_fused
+def _quartic(
+    Rab2: float, Rac2: float, Rbc2: float, cab: float, cac: float, cbc: float
+) -> tuple[float, float, float, float, float]:
+    """Return G0 to G4 (appendix A) from squared sides and cosines of the face angles."""
     K1, K2 = Rbc2 / Rac2, Rbc2 / Rab2
     K12 = K1 * K2
     minus, plus = K12 - K1 - K2, K12 + K1 - K2
@@ -186,9 +200,19 @@ def _quartic(Rab2, Rac2, Rbc2, cab, cac, cbc):  # type: ignore[no-untyped-def]
     return G0, G1, G2, G3, G4
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract"})
-def polish_legs(a, b, c, Rab2, Rac2, Rbc2, gab, gac, gbc):  # type: ignore[no-untyped-def]
-    """Newton's method on R^2 = (a - b)^2 + 2 a b (1 - cos); returns whether the legs fit, and the legs."""
+@compiled_fused
+def polish_legs(
+    a: float,
+    b: float,
+    c: float,
+    Rab2: float,
+    Rac2: float,
+    Rbc2: float,
+    gab: float,
+    gac: float,
+    gbc: float,
+) -> tuple[bool, float, float, float]:
+    """Improve legs by Newton's method on R^2 = (a - b)^2 + 2 a b (1 - cos); return if they fit, and them."""
     misfit = np.inf
     for _ in range(NEWTON_STEPS):
         f0 = (a - b) ** 2 + 2.0 * a * b * gab - Rab2
@@ -215,24 +239,32 @@ def polish_legs(a, b, c, Rab2, Rac2, Rbc2, gab, gac, gbc):  # type: ignore[no-un
     return misfit < FITS * max(Rab2, max(Rac2, Rbc2)), a, b, c
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract"})
-def is_known(a, b, c, legs, n):  # type: ignore[no-untyped-def]
-    """Whether legs are those of one of the first n solutions."""
+@compiled_fused
+def is_known(a: float, b: float, c: float, legs: FloatArray, n: int) -> bool:
+    """Return whether legs are those of one of the first n solutions."""
     for i in range(n):
         if abs(a - legs[i, 0]) + abs(b - legs[i, 1]) + abs(c - legs[i, 2]) < SAME * (a + b + c):
             return True
     return False
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract"})
-def _pose_from_legs(rays, points, a, b, c, position, rotation):  # type: ignore[no-untyped-def]
-    """R from the orthonormal frames of the two triangles, X0 from their centres."""
+@compiled_fused
+def _pose_from_legs(
+    rays: FloatArray,
+    points: FloatArray,
+    a: float,
+    b: float,
+    c: float,
+    position: FloatArray,
+    rotation: FloatArray,
+) -> None:
+    """Fill R from the orthonormal frames of the two triangles, X0 from their centres."""
     ax, ay, az = a * rays[0, 0], a * rays[0, 1], a * rays[0, 2]
     bx, by, bz = b * rays[1, 0], b * rays[1, 1], b * rays[1, 2]
     cx, cy, cz = c * rays[2, 0], c * rays[2, 1], c * rays[2, 2]
-    i0, i1, i2, j0, j1, j2, k0, k1, k2 = _frame(bx - ax, by - ay, bz - az, cx - ax, cy - ay, cz - az)
+    in_image = _frame(bx - ax, by - ay, bz - az, cx - ax, cy - ay, cz - az)
     mx, my, mz = (ax + bx + cx) / 3.0, (ay + by + cy) / 3.0, (az + bz + cz) / 3.0
-    x0, x1, x2, y0, y1, y2, z0, z1, z2 = _frame(
+    in_object = _frame(
         points[1, 0] - points[0, 0],
         points[1, 1] - points[0, 1],
         points[1, 2] - points[0, 2],
@@ -240,23 +272,23 @@ def _pose_from_legs(rays, points, a, b, c, position, rotation):  # type: ignore[
         points[2, 1] - points[0, 1],
         points[2, 2] - points[0, 2],
     )
-    rotation[0, 0], rotation[0, 1], rotation[0, 2] = _mix(x0, y0, z0, i0, i1, i2, j0, j1, j2, k0, k1, k2)
-    rotation[1, 0], rotation[1, 1], rotation[1, 2] = _mix(x1, y1, z1, i0, i1, i2, j0, j1, j2, k0, k1, k2)
-    rotation[2, 0], rotation[2, 1], rotation[2, 2] = _mix(x2, y2, z2, i0, i1, i2, j0, j1, j2, k0, k1, k2)
+    for d in range(3):
+        for e in range(3):
+            rotation[d, e] = (
+                in_object[d] * in_image[e]
+                + in_object[3 + d] * in_image[3 + e]
+                + in_object[6 + d] * in_image[6 + e]
+            )
     for d in range(3):
         centre = (points[0, d] + points[1, d] + points[2, d]) / 3.0
         position[d] = centre - (rotation[d, 0] * mx + rotation[d, 1] * my + rotation[d, 2] * mz)
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract"})
-def _mix(x, y, z, i0, i1, i2, j0, j1, j2, k0, k1, k2):  # type: ignore[no-untyped-def]
-    """x i + y j + z k: a row of the product of two frames."""
-    return x * i0 + y * j0 + z * k0, x * i1 + y * j1 + z * k1, x * i2 + y * j2 + z * k2
-
-
-@njit(cache=True, error_model="numpy", fastmath={"contract"})
-def _frame(px, py, pz, qx, qy, qz):  # type: ignore[no-untyped-def]
-    """Right-handed orthonormal frame: x along p, z along p x q."""
+@compiled_fused
+def _frame(
+    px: float, py: float, pz: float, qx: float, qy: float, qz: float
+) -> tuple[float, float, float, float, float, float, float, float, float]:
+    """Return the right-handed axes x along p, y, and z along p x q, three numbers each."""
     zx, zy, zz = py * qz - pz * qy, pz * qx - px * qz, px * qy - py * qx
     z = 1.0 / np.sqrt(zx * zx + zy * zy + zz * zz)
     p = 1.0 / np.sqrt(px * px + py * py + pz * pz)

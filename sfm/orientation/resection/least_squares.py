@@ -5,16 +5,16 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 
-from sfm.conventions import FloatArray, rotation_from_angles
+from sfm.conventions import BoolArray, FloatArray, rotation_from_angles
 from sfm.errors import GeometryError
+from sfm.kernels.options import compiled
+from sfm.kernels.small_algebra import solve_scaled, turn
 
 UNKNOWNS = 6
 MAX_STEPS = 50
 HALVINGS = 8
 CONVERGED = 1e-12  # step relative to the distance of the points and to 1 rad
-SINGULAR = 1e-14  # reciprocal condition of the scaled normal equations below which they are singular
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,8 @@ def resect_least_squares(
     Args:
         tangents: u = -U/W, v = -V/W of the measured rays, free of distortion, shape (n, 2).
         points: object points, shape (n, 3), object unit.
-        position, rotation: start values, shapes (3,) and (3, 3).
+        position: approximate projection centre X0, shape (3,), object unit.
+        rotation: approximate R, image to object axes, shape (3, 3).
         weights: weight matrix of each image point, shape (n, 2, 2); unit matrices if not given, so that
             sigma0 is a tangent (times c: mm on the image).
         max_steps: largest number of Gauss-Newton steps.
@@ -112,7 +113,7 @@ def cofactors_in_angles(cofactors: FloatArray, rotation: FloatArray) -> FloatArr
 
 
 def _rotation_from_angle_rates(rotation: FloatArray) -> FloatArray:
-    """d w / d (omega, phi, kappa), w the rotation in image axes: columns Rz'Ry'ex, Rz'ey, ez."""
+    """Return d w / d (omega, phi, kappa), w the rotation in image axes: columns Rz'Ry'ex, Rz'ey, ez."""
     phi = np.arcsin(np.clip(rotation[0, 2], -1.0, 1.0))
     kappa = np.arctan2(-rotation[0, 1], rotation[0, 0])
     Rz = rotation_from_angles(0.0, 0.0, kappa)
@@ -123,8 +124,19 @@ def _rotation_from_angle_rates(rotation: FloatArray) -> FloatArray:
 DONE, LIMIT, BEHIND, RANK = 0, 1, 2, 3  # how an adjustment of one pose ends
 
 
-@njit(cache=True, error_model="numpy")
-def adjust_pose(tangents, points, weights, used, X0, R, max_steps, history, N, residuals):  # type: ignore[no-untyped-def]
+@compiled
+def adjust_pose(
+    tangents: FloatArray,
+    points: FloatArray,
+    weights: FloatArray,
+    used: BoolArray,
+    X0: FloatArray,
+    R: FloatArray,
+    max_steps: int,
+    history: FloatArray,
+    N: FloatArray,
+    residuals: FloatArray,
+) -> tuple[float, int, int]:
     """Adjust X0 and R in place; fill history, N (of X0 and w) and residuals; return v'Pv, steps, state."""
     n_vector, new_n, new_N = np.empty(6), np.empty(6), np.empty((6, 6))
     new_X0, new_R = np.empty(3), np.empty((3, 3))
@@ -167,8 +179,9 @@ def adjust_pose(tangents, points, weights, used, X0, R, max_steps, history, N, r
     return cost, steps, LIMIT
 
 
-@njit(cache=True, error_model="numpy")
-def _note(history, row, X0, R):  # type: ignore[no-untyped-def]
+@compiled
+def _note(history: FloatArray, row: int, X0: FloatArray, R: FloatArray) -> None:
+    """Write position and angles into a row of the history, if it has that row."""
     if row >= len(history):
         return
     history[row, :3] = X0
@@ -177,8 +190,18 @@ def _note(history, row, X0, R):  # type: ignore[no-untyped-def]
     history[row, 5] = np.arctan2(-R[0, 1], R[0, 0])
 
 
-@njit(cache=True, error_model="numpy")
-def pose_normals(tangents, points, weights, used, X0, R, N, n_vector, residuals):  # type: ignore[no-untyped-def]
+@compiled
+def pose_normals(
+    tangents: FloatArray,
+    points: FloatArray,
+    weights: FloatArray,
+    used: BoolArray,
+    X0: FloatArray,
+    R: FloatArray,
+    N: FloatArray,
+    n_vector: FloatArray,
+    residuals: FloatArray,
+) -> tuple[float, float]:
     """Normal equations of X0 and w (R exp([w]x)); returns v'Pv (inf: a point behind) and mean distance."""
     N[:] = 0.0
     n_vector[:] = 0.0
@@ -222,58 +245,3 @@ def pose_normals(tangents, points, weights, used, X0, R, N, n_vector, residuals)
         for b in range(a):
             N[a, b] = N[b, a]
     return cost, distance / max(count, 1)
-
-
-@njit(cache=True, error_model="numpy")
-def solve_scaled(N, n_vector, dx):  # type: ignore[no-untyped-def]
-    """Solve N dx = n by Cholesky after scaling N to unit diagonal; False if singular."""
-    m = len(n_vector)
-    L = np.empty((m, m))
-    s = np.empty(m)
-    for a in range(m):
-        if not N[a, a] > 0.0:
-            return False
-        s[a] = 1.0 / np.sqrt(N[a, a])
-    for a in range(m):
-        for b in range(a + 1):
-            value = N[a, b] * s[a] * s[b]
-            for k in range(b):
-                value -= L[a, k] * L[b, k]
-            if a == b:
-                if not value > SINGULAR:
-                    return False
-                L[a, a] = np.sqrt(value)
-            else:
-                L[a, b] = value / L[b, b]
-    for a in range(m):
-        value = n_vector[a] * s[a]
-        for k in range(a):
-            value -= L[a, k] * dx[k]
-        dx[a] = value / L[a, a]
-    for a in range(m - 1, -1, -1):
-        value = dx[a]
-        for k in range(a + 1, m):
-            value -= L[k, a] * dx[k]
-        dx[a] = value / L[a, a]
-    for a in range(m):
-        dx[a] *= s[a]
-    return True
-
-
-@njit(cache=True, error_model="numpy")
-def turn(R, wx, wy, wz, out):  # type: ignore[no-untyped-def]
-    """Fill out = R exp([w]x) (Rodrigues)."""
-    t2 = wx * wx + wy * wy + wz * wz
-    t = np.sqrt(t2)
-    if t < 1e-4:
-        a, b = 1.0 - t2 / 6.0, 0.5 - t2 / 24.0
-    else:
-        a, b = np.sin(t) / t, (1.0 - np.cos(t)) / t2
-    e00, e01, e02 = 1.0 - b * (wy * wy + wz * wz), b * wx * wy - a * wz, b * wx * wz + a * wy
-    e10, e11, e12 = b * wx * wy + a * wz, 1.0 - b * (wx * wx + wz * wz), b * wy * wz - a * wx
-    e20, e21, e22 = b * wx * wz - a * wy, b * wy * wz + a * wx, 1.0 - b * (wx * wx + wy * wy)
-    for i in range(3):
-        r0, r1, r2 = R[i, 0], R[i, 1], R[i, 2]
-        out[i, 0] = r0 * e00 + r1 * e10 + r2 * e20
-        out[i, 1] = r0 * e01 + r1 * e11 + r2 * e21
-        out[i, 2] = r0 * e02 + r1 * e12 + r2 * e22

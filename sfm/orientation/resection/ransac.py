@@ -6,10 +6,10 @@ from dataclasses import dataclass, replace
 from math import comb
 
 import numpy as np
-from numba import njit
 from scipy.special import bdtrc
 
-from sfm.conventions import BoolArray, FloatArray
+from sfm.conventions import BoolArray, FloatArray, IntArray
+from sfm.kernels.options import compiled
 from sfm.orientation.resection.fischler_bolles import MAX_SOLUTIONS, WORK, rays_from_tangents, solve_triple
 from sfm.orientation.resection.least_squares import (
     DONE,
@@ -163,8 +163,21 @@ def _failure(n: int, reason: str) -> RobustResection:
     )  # fmt: skip
 
 
-@njit(cache=True, error_model="numpy")
-def _search(tangents, rays, points, weights, tolerance, max_trials, seed, X0, R, used, residuals, N):  # type: ignore[no-untyped-def]
+@compiled
+def _search(
+    tangents: FloatArray,
+    rays: FloatArray,
+    points: FloatArray,
+    weights: FloatArray,
+    tolerance: float,
+    max_trials: int,
+    seed: int,
+    X0: FloatArray,
+    R: FloatArray,
+    used: BoolArray,
+    residuals: FloatArray,
+    N: FloatArray,
+) -> int:
     """Fill the best pose, the points that fit it, residuals and normal matrix; return trials (-1: none)."""
     n = len(points)
     position, rotation = np.empty((MAX_SOLUTIONS, 3)), np.empty((MAX_SOLUTIONS, 3, 3))
@@ -243,9 +256,11 @@ def _search(tangents, rays, points, weights, tolerance, max_trials, seed, X0, R,
     return trial
 
 
-@njit(cache=True, error_model="numpy")
-def truncated_squares(tangents, points, X0, R, limit, stop):  # type: ignore[no-untyped-def]
-    """Sum of min(squared residual, limit); given up as soon as it exceeds `stop`."""
+@compiled
+def truncated_squares(
+    tangents: FloatArray, points: FloatArray, X0: FloatArray, R: FloatArray, limit: float, stop: float
+) -> float:
+    """Return the sum of min(squared residual, limit); inf as soon as it exceeds `stop`."""
     total = 0.0
     for i in range(len(points)):
         dx, dy, dz = points[i, 0] - X0[0], points[i, 1] - X0[1], points[i, 2] - X0[2]
@@ -261,8 +276,10 @@ def truncated_squares(tangents, points, X0, R, limit, stop):  # type: ignore[no-
     return total
 
 
-@njit(cache=True, error_model="numpy")
-def select(tangents, points, X0, R, limit, used):  # type: ignore[no-untyped-def]
+@compiled
+def select(
+    tangents: FloatArray, points: FloatArray, X0: FloatArray, R: FloatArray, limit: float, used: BoolArray
+) -> int:
     """Mark the points in front of the camera whose squared residual is at most `limit`; return how many."""
     count = 0
     for i in range(len(points)):
@@ -278,8 +295,8 @@ def select(tangents, points, X0, R, limit, used):  # type: ignore[no-untyped-def
     return count
 
 
-@njit(cache=True, error_model="numpy")
-def _next_triple(pick, n):  # type: ignore[no-untyped-def]
+@compiled
+def _next_triple(pick: IntArray, n: int) -> bool:
     """Step to the next i < j < k in lexical order; pick[2] = -1 starts."""
     if pick[2] < 0:
         pick[0], pick[1], pick[2] = 0, 1, 2
@@ -293,8 +310,8 @@ def _next_triple(pick, n):  # type: ignore[no-untyped-def]
     return False
 
 
-@njit(cache=True, error_model="numpy")
-def _random_triple(state, n, pick):  # type: ignore[no-untyped-def]
+@compiled
+def _random_triple(state: np.uint64, n: int, pick: IntArray) -> np.uint64:
     """Draw three different indices; returns the new state (splitmix64, Steele et al. 2014)."""
     k = 0
     while k < 3:

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
-from sfm.conventions import FloatArray
+from sfm.conventions import FloatArray, IntArray
 from sfm.errors import GeometryError
+from sfm.kernels.options import compiled
 from sfm.kernels.quartic import MAX_ROOTS, find_positive_roots
 from sfm.orientation.resection.candidates import Solution, checked_points, ordered, solution_of
 from sfm.orientation.resection.fischler_bolles import (
@@ -58,14 +58,24 @@ def resect_triples_zeng_wang(rays: FloatArray, points: FloatArray) -> Poses:
 
 
 def distance_quartic(rays: FloatArray, points: FloatArray) -> FloatArray:
-    """Return N1 to N5 of the quartic in n = R3/R1 of one triple, shape (5,); document 001, eq. 2.72."""
+    """Return the coefficients N1 to N5 of the quartic in n = R3/R1 of one triple, shape (5,).
+
+    Args:
+        rays: unit vectors in the image frame, shape (3, 3).
+        points: object points, shape (3, 3), object unit.
+
+    Source: Zeng, Wang (1992); document 001, eq. 2.72.
+    """
     ab, ac, bc = squared_sides(np.asarray(points, dtype=float))
     gab, gac, gbc = squared_sides(np.asarray(rays, dtype=float))
     return np.array(_quartic(ab, ac, bc, gab / 2, gac / 2, gbc / 2)[::-1])
 
 
-@njit(cache=True, error_model="numpy")
-def _resect_batch(rays, points):  # type: ignore[no-untyped-def]
+@compiled
+def _resect_batch(
+    rays: FloatArray, points: FloatArray
+) -> tuple[IntArray, FloatArray, FloatArray, FloatArray]:
+    """Return number, positions, rotations and distances of the solutions of every triple."""
     k = len(rays)
     count = np.zeros(k, dtype=np.int64)
     position = np.full((k, MAX_SOLUTIONS, 3), np.nan)
@@ -76,8 +86,11 @@ def _resect_batch(rays, points):  # type: ignore[no-untyped-def]
     return count, position, rotation, distances
 
 
-@njit(cache=True, error_model="numpy")
-def _solve(rays, points, position, rotation, distances):  # type: ignore[no-untyped-def]
+@compiled
+def _solve(
+    rays: FloatArray, points: FloatArray, position: FloatArray, rotation: FloatArray, distances: FloatArray
+) -> int:
+    """Fill positions (4, 3), rotations (4, 3, 3) and distances (4, 3) of one triple; return their number."""
     roots, R123, S = np.empty(MAX_ROOTS), np.empty(3), np.empty(3)
     L3, L2, L1 = squared_sides(points)
     g12, g13, g23 = squared_sides(rays)
@@ -112,12 +125,14 @@ def _solve(rays, points, position, rotation, distances):  # type: ignore[no-unty
     return n
 
 
-@njit(cache=True, error_model="numpy")
-def _quartic(L3, L2, L1, g12, g13, g23):  # type: ignore[no-untyped-def]
-    """N5 to N1, the coefficients of 1 to n^4, from A^2 - D1 A B + B^2 C = 0; sides squared, gaps 1 - cos.
+@compiled
+def _quartic(
+    L3: float, L2: float, L1: float, g12: float, g13: float, g23: float
+) -> tuple[float, float, float, float, float]:
+    """Return N5 to N1, the coefficients of 1 to n^4, from A^2 - D1 A B + B^2 C = 0.
 
-    m = R2/R1 = A/B by the difference of the equations of sides 12 and 23, with q = n^2 - F1 n + 1:
-    A = (K32 - K12) q + n^2 - 1, B = E1 n - D1, C = 1 - K32 q.
+    Sides squared, gaps 1 - cos; m = R2/R1 = A/B by the difference of the equations of sides 12 and 23, with
+    q = n^2 - F1 n + 1: A = (K32 - K12) q + n^2 - 1, B = E1 n - D1, C = 1 - K32 q.
     """
     D1, F1, E1 = 2.0 * (1.0 - g12), 2.0 * (1.0 - g13), 2.0 * (1.0 - g23)
     K12, K32 = L1 / L2, L3 / L2
@@ -132,9 +147,12 @@ def _quartic(L3, L2, L1, g12, g13, g23):  # type: ignore[no-untyped-def]
     return N5, N4, N3, N2, N1
 
 
-@njit(cache=True, error_model="numpy")
-def direction_test(rays):  # type: ignore[no-untyped-def]
-    """Sign that T = 1S . (12 x 13) must have: 1S = -R1 r1 and 12 x 13 turn with the image points.
+@compiled
+def direction_test(rays: FloatArray) -> float:
+    """Return the sign that T = 1S . (12 x 13) must have: 1S = -R1 r1 and 12 x 13 turn with the image points.
+
+    Args:
+        rays: unit vectors in the image frame, shape (3, 3).
 
     Source: document 001, eq. 2.82, where the image points are taken clockwise and T > 0; here the
     order of the points is free.
@@ -146,9 +164,15 @@ def direction_test(rays):  # type: ignore[no-untyped-def]
     return -1.0 if det > 0.0 else 1.0
 
 
-@njit(cache=True, error_model="numpy")
-def trilaterate(points, distances, T, S):  # type: ignore[no-untyped-def]
+@compiled
+def trilaterate(points: FloatArray, distances: FloatArray, T: float, S: FloatArray) -> None:
     """Fill the point S at three distances from three points, on the side of their plane that T says.
+
+    Args:
+        points: object points, shape (3, 3), object unit.
+        distances: of S from them, shape (3,), object unit.
+        T: sign of the direction test, +1 or -1.
+        S: receives the point, shape (3,), object unit.
 
     Source: Awange, Grafarend (2004), after eqs. 2.79-2.81 of document 001. Their elimination divides by
     differences of Y and Z; in the axes of the triangle itself (x along 12, z along 12 x 13) nothing
@@ -180,13 +204,19 @@ def trilaterate(points, distances, T, S):  # type: ignore[no-untyped-def]
         S[d] = points[0, d] + x * e[d] + y * f[d] + z * g[d]
 
 
-@njit(cache=True, error_model="numpy")
-def pope_hinsken(rays, points, S, rotation):  # type: ignore[no-untyped-def]
+@compiled
+def pope_hinsken(rays: FloatArray, points: FloatArray, S: FloatArray, rotation: FloatArray) -> None:
     """Fill R from unit vectors to the points in object and image axes by the parameters d, a, b, c.
 
     The differences of corresponding vectors are at right angles to the rotation axis g, so g is the cross
     product of two of them. Of the three rays and their cross products the pair with the longest product is
     taken, so that rays near the axis do no harm.
+
+    Args:
+        rays: unit vectors in the image frame, shape (3, 3).
+        points: object points, shape (3, 3), object unit.
+        S: projection centre, shape (3,), object unit.
+        rotation: receives R, image to object axes, shape (3, 3).
 
     Source: Hinsken (1988), PE&RS 54(7), and Zeng, Wang (1992); document 001, eqs. 2.83-2.93. The sign of
     the angle, which eq. 2.91 leaves open, is taken from g . (image x object).

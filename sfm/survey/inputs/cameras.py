@@ -3,39 +3,45 @@
 from __future__ import annotations
 
 import fnmatch
+from collections.abc import Sequence
 
 import numpy as np
 
 from sfm.camera import Camera, camera_from_values
 from sfm.conventions import IntArray
 from sfm.errors import PhotographError, SurveyFileError
-from sfm.photographs.reading import Metadata
+from sfm.photographs.exif import Metadata
 from sfm.survey.inputs.settings import CameraSettings
-from sfm.survey.inputs.survey_file import Survey
 
 
-def camera_of_image(survey: Survey, image: str) -> int:
+def camera_of_image(cameras: Sequence[CameraSettings], image: str, source: str) -> int:
     """Return the index of the camera whose glob an image name matches.
+
+    Args:
+        cameras: of the survey.
+        image: the name.
+        source: what messages call the survey.
 
     Raises:
         SurveyFileError: no camera, or more than one.
     """
-    if len(survey.cameras) == 1 and survey.cameras[0].images is None:
+    if len(cameras) == 1 and cameras[0].images is None:
         return 0
     matches = [
         index
-        for index, camera in enumerate(survey.cameras)
+        for index, camera in enumerate(cameras)
         if camera.images is not None and fnmatch.fnmatchcase(image, camera.images)
     ]
     if len(matches) != 1:
-        globs = ", ".join(f"{c.name} '{c.images}'" for c in survey.cameras)
+        globs = ", ".join(f"{c.name} '{c.images}'" for c in cameras)
         many = "no camera" if not matches else f"{len(matches)} cameras"
-        raise SurveyFileError(f"{survey.path}: image '{image}' matches the glob of {many}: {globs}")
+        raise SurveyFileError(f"{source}: image '{image}' matches the glob of {many}: {globs}")
     return matches[0]
 
 
 def start_cameras(
-    survey: Survey,
+    settings: Sequence[CameraSettings],
+    source: str,
     metadata: tuple[Metadata, ...] = (),
     camera: IntArray | None = None,
     names: tuple[str, ...] = (),
@@ -43,7 +49,8 @@ def start_cameras(
     """Return the cameras with their start values, in the order of the survey file.
 
     Args:
-        survey: says what is known; what it leaves out is taken from the photographs.
+        settings: what the survey says of its cameras; what they leave out is taken from the photographs.
+        source: what messages call the survey.
         metadata: size and EXIF data of the readable photographs, (m,); none with [observations].
         camera: index of the camera of each photograph, (m,).
         names: names of the photographs, (m,).
@@ -54,16 +61,16 @@ def start_cameras(
     """
     index = np.zeros(0, dtype=np.int64) if camera is None else camera
     cameras = []
-    for number, settings in enumerate(survey.cameras):
+    for number, one in enumerate(settings):
         own = [k for k in range(len(metadata)) if index[k] == number]
-        size = _common_size(settings, [(names[k], metadata[k].size_px) for k in own])
-        where = f"{survey.path}: camera {settings.name}"
+        size = _common_size(one, [(names[k], metadata[k].size_px) for k in own])
+        where = f"{source}: camera {one.name}"
         if size is None:
             raise SurveyFileError(f"{where}: size_px = [width, height] is needed, there is no photograph")
-        pixel, focal = settings.pixel_mm, settings.c_mm
-        if settings.sensor_mm is not None:
-            pixel = settings.sensor_mm[0] / size[0], settings.sensor_mm[1] / size[1]
-        known = {**dict(settings.fixed), **{name: value for name, (value, _) in settings.weighted}}
+        pixel, focal = one.pixel_mm, one.c_mm
+        if one.sensor_mm is not None:
+            pixel = one.sensor_mm[0] / size[0], one.sensor_mm[1] / size[1]
+        known = {**dict(one.fixed), **{name: value for name, (value, _) in one.weighted}}
         if pixel is None:
             pixel = next((metadata[k].pixel_mm for k in own if metadata[k].pixel_mm), None)
         if focal is None:
@@ -78,12 +85,12 @@ def start_cameras(
             raise SurveyFileError(f"{where}: no photograph's EXIF data tell the focal length, c_mm is needed")
         cameras.append(
             camera_from_values(
-                settings.name,
-                settings.model,
+                one.name,
+                one.model,
                 size,
                 pixel,
                 c_mm=focal,
-                free=settings.free,
+                free=one.free,
                 values=tuple(known.items()),
             )
         )

@@ -10,7 +10,7 @@ interior orientation).
 from __future__ import annotations
 
 import fnmatch
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -20,15 +20,17 @@ from sfm.conventions import IntArray
 from sfm.errors import SurveyFileError
 from sfm.network import Estimate, InteriorObservations, Network
 from sfm.survey.inputs.settings import CameraSettings
-from sfm.survey.inputs.survey_file import Survey
 
 
-def as_asked_for(survey: Survey, network: Network, estimate: Estimate) -> tuple[Network, Estimate]:
+def split_cameras(
+    cameras: Sequence[CameraSettings], network: Network, estimate: Estimate
+) -> tuple[Network, Estimate]:
     """Return the network and estimate with the interior orientations that the final adjustment has.
 
     Args:
-        survey: its cameras say which parameters are observed, of each photograph, or of each group.
-        network, estimate: with one camera for each of the survey's, in their order.
+        cameras: of the survey; they say which parameters are observed, of each photograph, or of each group.
+        network: with one camera for each of the survey's, in their order.
+        estimate: of the same.
 
     Returns:
         The same with a camera for each photograph or group where parameters of it are its own; the others
@@ -37,16 +39,16 @@ def as_asked_for(survey: Survey, network: Network, estimate: Estimate) -> tuple[
     Raises:
         SurveyFileError: a photograph is in no group, or in more than one.
     """
-    if not any(camera.weighted or camera.per_photograph or camera.per_group for camera in survey.cameras):
+    if not any(camera.weighted or camera.per_photograph or camera.per_group for camera in cameras):
         return network, estimate
-    cameras: list[Camera] = []
+    variants: list[Camera] = []
     owner = np.empty(len(network.images), dtype=np.int64)
     observed: list[tuple[int, int, float, float]] = []
-    for a, settings in enumerate(survey.cameras):
+    for a, settings in enumerate(cameras):
         images = np.flatnonzero(network.camera == a)
-        first = len(cameras)
-        made, member = _variants(survey, settings, estimate.cameras[a], [network.images[i] for i in images])
-        cameras += made
+        first = len(variants)
+        made, member = _variants(settings, estimate.cameras[a], [network.images[i] for i in images])
+        variants += made
         owner[images] = first + member
         for name, (value, sigma) in settings.weighted:
             s = made[0].names.index(name)
@@ -61,13 +63,19 @@ def as_asked_for(survey: Survey, network: Network, estimate: Estimate) -> tuple[
     )
     return (
         replace(network, camera=owner, interior=interior),
-        replace(estimate, cameras=tuple(cameras)),
+        replace(estimate, cameras=tuple(variants)),
     )
 
 
-def without_idle_cameras(survey: Survey, network: Network, estimate: Estimate) -> tuple[Network, Estimate]:
-    """Return the network and estimate without the cameras of single photographs that have left it."""
-    if len(estimate.cameras) == len(survey.cameras):
+def without_idle_cameras(network: Network, estimate: Estimate, *, cameras: int) -> tuple[Network, Estimate]:
+    """Return the network and estimate without the cameras of single photographs that have left it.
+
+    Args:
+        network: as `split_cameras` returns it, or a part.
+        estimate: of the same.
+        cameras: how many the survey has; as many stay as they are.
+    """
+    if len(estimate.cameras) == cameras:
         return network, estimate
     used = np.zeros(len(estimate.cameras), dtype=bool)
     used[network.camera] = True
@@ -83,20 +91,23 @@ def without_idle_cameras(survey: Survey, network: Network, estimate: Estimate) -
     )
 
 
-def refuse_ungrouped(survey: Survey, images: Iterable[str], camera: Iterable[int]) -> None:
+def refuse_ungrouped(
+    cameras: Sequence[CameraSettings], images: Iterable[str], camera: Iterable[int], source: str
+) -> None:
     """Raise SurveyFileError if a photograph is in no group of its camera, or in more than one.
 
     Args:
-        survey: what to do.
+        cameras: of the survey.
         images: names of the photographs.
         camera: index of the camera of each of them.
+        source: what messages call the survey.
     """
     for image, a in zip(images, camera, strict=True):
-        if survey.cameras[a].groups:
-            group_of_image(survey, survey.cameras[a], image)
+        if cameras[a].groups:
+            group_of_image(cameras[a], image, source)
 
 
-def group_of_image(survey: Survey, settings: CameraSettings, image: str) -> int:
+def group_of_image(settings: CameraSettings, image: str, source: str = "survey") -> int:
     """Return the index of the group that a photograph of a camera belongs to.
 
     Raises:
@@ -106,18 +117,16 @@ def group_of_image(survey: Survey, settings: CameraSettings, image: str) -> int:
     if len(matches) != 1:
         many = "no group" if not matches else f"{len(matches)} groups"
         raise SurveyFileError(
-            f"{survey.path}: camera {settings.name}: photograph '{image}' is in {many} of groups "
+            f"{source}: camera {settings.name}: photograph '{image}' is in {many} of groups "
             f"{', '.join(settings.groups)}; one is needed"
         )
     return matches[0]
 
 
-def _variants(
-    survey: Survey, settings: CameraSettings, camera: Camera, images: list[str]
-) -> tuple[list[Camera], IntArray]:
+def _variants(settings: CameraSettings, camera: Camera, images: list[str]) -> tuple[list[Camera], IntArray]:
     """Return a camera for each photograph or group with parameters of its own, and whose is whose."""
     camera = replace(camera, free=np.array([name in settings.adjusted for name in camera.names]))
-    grouped = [group_of_image(survey, settings, image) if settings.groups else 0 for image in images]
+    grouped = [group_of_image(settings, image) if settings.groups else 0 for image in images]
     if not images or not (settings.per_photograph or settings.per_group):
         return [camera], np.zeros(len(images), dtype=np.int64)
     labels = [f"{camera.name} {settings.groups[g]}" if settings.groups else camera.name for g in grouped]

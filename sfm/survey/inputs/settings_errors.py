@@ -26,14 +26,14 @@ _NEEDED = (
 )
 
 
-def first_error(path: Path, text: str, error: ValidationError, whole: type[Section]) -> str:
+def first_error(path: Path | str, text: str, error: ValidationError, whole: type[Section]) -> str:
     """Return the first error of pydantic as one line with file, line, key, found and needed.
 
     Unknown keys come first: a misspelt key is unknown, and missing under its right name.
 
     Args:
-        path: the survey file.
-        text: what it says.
+        path: the survey file, or what else messages begin with.
+        text: what it says; empty for settings from Python.
         error: what pydantic found.
         whole: the file as a section, for the keys that it may have.
     """
@@ -46,7 +46,7 @@ def first_error(path: Path, text: str, error: ValidationError, whole: type[Secti
     key = _key(location)
     if kind == "extra_forbidden":
         table = _key(location[:-1])
-        inside = f"[{table}]" if table else "the survey file"
+        inside = f"[{table}]" if table else "the survey file" if text else "it"
         known = _known(location[:-1], whole)
         return f"{where}unknown key '{_key(location[-1:])}' in {inside}, known are {known}"
     if kind == "missing" and isinstance(location[-1], int) and isinstance(first["input"], list | tuple):

@@ -7,13 +7,12 @@ from typing import Annotated
 
 from pydantic import Field, PrivateAttr, ValidationError
 
-from sfm.distortion.models import MODELS
 from sfm.errors import SurveyFileError
 from sfm.files.plain_text import as_plain, is_plain
 from sfm.files.toml_files import read_toml
+from sfm.survey.inputs.contradictions import refuse_contradictions
 from sfm.survey.inputs.settings import (
     MAX_CAMERAS,
-    MAX_LENGTH_PER_SIGMA,
     AdjustSettings,
     ApproximateSettings,
     CameraSettings,
@@ -29,14 +28,11 @@ from sfm.survey.inputs.settings import (
     TiePointSettings,
 )
 from sfm.survey.inputs.settings_errors import first_error
-from sfm.targets.codes.rings import FAMILIES as RING_FAMILIES
-from sfm.targets.codes.tags import TAG_FAMILIES
-
-FAMILIES = (*RING_FAMILIES, *TAG_FAMILIES)
+from sfm.targets.codes.families import FAMILIES
 
 
-class Survey(Section):
-    """A survey as its file describes it."""
+class SurveyFile(Section):
+    """What a survey file says; the tables that it names are not read yet."""
 
     head: Head = Field(alias="survey")
     cameras: Annotated[
@@ -71,9 +67,14 @@ class Survey(Section):
         return self.head.unit
 
     @property
-    def reject(self) -> str:
-        """How outliers are treated; given observations are adjusted as they are unless the file says so."""
-        return self.adjust.reject or ("tau" if self.observations is None else "none")
+    def source(self) -> str:
+        """What messages call the survey."""
+        return str(self._path)
+
+    @property
+    def folder(self) -> Path:
+        """Folder that the globs of the photographs are relative to."""
+        return self._path.parent
 
     @property
     def codes(self) -> str:
@@ -138,8 +139,8 @@ def inside(folder: Path, name: str, where: str, *, allow_outside: bool = False) 
     return path
 
 
-def read_survey(path: Path, *, allow_outside: bool = False) -> Survey:
-    """Read and check a survey file.
+def read_survey_file(path: Path, *, allow_outside: bool = False) -> SurveyFile:
+    """Read and check a survey file, without the tables that it names.
 
     Args:
         path: the TOML file; every path in it is relative to it.
@@ -154,136 +155,9 @@ def read_survey(path: Path, *, allow_outside: bool = False) -> Survey:
         raise SurveyFileError(f"{as_plain(str(path))}: the path is no plain text; rename the file or folder")
     text, table = read_toml(path, "a survey file")
     try:
-        survey = Survey.model_validate(table)
+        survey = SurveyFile.model_validate(table)
     except ValidationError as error:
-        raise SurveyFileError(first_error(path, text, error, Survey)) from error
+        raise SurveyFileError(first_error(path, text, error, SurveyFile)) from error
     survey._path, survey._allow_outside = path, allow_outside
-    _refuse_contradictions(survey)
+    refuse_contradictions(survey)
     return survey
-
-
-def _refuse_contradictions(survey: Survey) -> None:
-    """Raise SurveyFileError where settings that are fine one by one do not go together."""
-    where = str(survey.path)
-    if survey.tie_points is not None:
-        if survey.targets.codes != "none":
-            raise SurveyFileError(
-                f"{where}: [tie_points] take the place of targets, codes = '{survey.targets.codes}' asks for "
-                "targets; needed codes = 'none', or no [tie_points]"
-            )
-        if survey.tie_points.window_px % 2 == 0:
-            raise SurveyFileError(
-                f"{where}: tie_points.window_px = {survey.tie_points.window_px}, needed an odd number"
-            )
-    names = [camera.name for camera in survey.cameras]
-    for name in names:
-        if names.count(name) > 1:
-            raise SurveyFileError(f"{where}: two cameras are named '{name}'")
-    for camera in survey.cameras:
-        _refuse_contradictions_of_camera(camera, f"{where}: camera {camera.name}")
-        if camera.images is None and (survey.observations is None or len(survey.cameras) > 1):
-            raise SurveyFileError(
-                f"{where}: camera {camera.name}: images is missing, the glob of its photographs is needed"
-            )
-    if survey.compare.baseline != "none" and survey.observations is not None:
-        raise SurveyFileError(
-            f"{where}: compare.baseline = '{survey.compare.baseline}' needs photographs, the survey has "
-            "[observations]; leave it out"
-        )
-    if survey.datum.kind == "control" and survey.datum.points:
-        raise SurveyFileError(
-            f"{where}: datum.points are for kind 'free' or 'minimal', in kind 'control' the control carries "
-            "the datum"
-        )
-    if survey.datum.kind == "control" and survey.control is None and survey.exterior is None:
-        raise SurveyFileError(
-            f"{where}: datum kind 'control' needs [control] with the file of known points, or [exterior]"
-        )
-    for bar in survey.scale_bars:
-        if bar.start == bar.end:
-            raise SurveyFileError(f"{where}: scale_bar from '{bar.start}' to the same point")
-        if bar.length > MAX_LENGTH_PER_SIGMA * bar.sigma:
-            raise SurveyFileError(
-                f"{where}: scale_bar {bar.start} - {bar.end}: length {bar.length:g} is more than a million "
-                f"times its sigma {bar.sigma:g}; are both in {survey.unit}?"
-            )
-    _refuse_contradicting_sizes(survey.targets, where, survey.unit)
-    if survey.targets.codes not in FAMILIES and not survey.beside(survey.targets.codes).is_file():
-        raise SurveyFileError(
-            f"{where}: targets.codes = '{survey.targets.codes}' is neither one of {', '.join(FAMILIES)} "
-            f"nor a table file in {survey.path.parent}"
-        )
-
-
-def _refuse_contradicting_sizes(targets: TargetSettings, where: str, unit: str) -> None:
-    """Raise SurveyFileError where sizes of tags or rings do not go with the codes or with one another."""
-    if targets.tag_size is not None and targets.codes not in TAG_FAMILIES:
-        raise SurveyFileError(
-            f"{where}: targets.tag_size is the size of tags, codes = '{targets.codes}' has none; "
-            f"tags are {', '.join(TAG_FAMILIES[:4])} ..."
-        )
-    if targets.ring_radii is not None:
-        inner, outer = targets.ring_radii
-        if targets.codes == "none" or targets.codes in TAG_FAMILIES:
-            raise SurveyFileError(
-                f"{where}: targets.ring_radii are of rings, codes = '{targets.codes}' has none"
-            )
-        if not 1 < inner < outer:
-            raise SurveyFileError(
-                f"{where}: targets.ring_radii = [{inner:g}, {outer:g}], needed more than 1 radius of the dot "
-                "and the second larger"
-            )
-    if targets.tag_sigma is not None:
-        if targets.tag_size is None:
-            raise SurveyFileError(f"{where}: targets.tag_sigma needs targets.tag_size")
-        if targets.tag_size > MAX_LENGTH_PER_SIGMA * targets.tag_sigma:
-            raise SurveyFileError(
-                f"{where}: targets.tag_size {targets.tag_size:g} is more than a million times its sigma "
-                f"{targets.tag_sigma:g}; are both in {unit}?"
-            )
-
-
-def _refuse_contradictions_of_camera(camera: CameraSettings, at: str) -> None:
-    """Raise SurveyFileError where the settings of a camera do not go together."""
-    known = MODELS[camera.model].names
-    fixed, weighted = dict(camera.fixed), dict(camera.weighted)
-    varying = (*camera.per_photograph, *camera.per_group)
-    for parameter in (*camera.free, *fixed, *weighted, *varying):
-        if parameter not in known:
-            raise SurveyFileError(
-                f"{at}: model {camera.model} has no parameter '{parameter}', it has {', '.join(known)}"
-            )
-    for key, names in (
-        ("free", camera.free),
-        ("per_photograph", camera.per_photograph),
-        ("per_group", camera.per_group),
-    ):
-        for parameter in names:
-            if names.count(parameter) > 1:
-                raise SurveyFileError(
-                    f"{at}: parameter '{parameter}' stands {names.count(parameter)} times in {key}, once is "
-                    "needed"
-                )
-    for one, other, both in (
-        ("free", "fixed", set(camera.free) & set(fixed)),
-        ("weighted", "free", set(weighted) & set(camera.free)),
-        ("weighted", "fixed", set(weighted) & set(fixed)),
-        ("per_photograph", "per_group", set(camera.per_photograph) & set(camera.per_group)),
-    ):
-        for parameter in sorted(both):
-            raise SurveyFileError(f"{at}: parameter '{parameter}' is both {one} and {other}")
-    for parameter in varying:
-        if parameter not in camera.adjusted:
-            key = "per_photograph" if parameter in camera.per_photograph else "per_group"
-            raise SurveyFileError(
-                f"{at}: parameter '{parameter}' stands in {key} but is not adjusted, it is needed in free or "
-                "weighted"
-            )
-    if bool(camera.per_group) != bool(camera.groups):
-        missing, given = ("groups", "per_group") if camera.per_group else ("per_group", "groups")
-        raise SurveyFileError(f"{at}: {given} is given, {missing} is needed with it")
-    if camera.pixel_mm is not None and camera.sensor_mm is not None:
-        raise SurveyFileError(f"{at}: pixel_mm and sensor_mm are both given, one is needed")
-    for key, values in (("fixed", fixed), ("weighted", weighted)):
-        if camera.c_mm is not None and "c" in values:
-            raise SurveyFileError(f"{at}: c_mm and {key}.c are both given, one is needed")

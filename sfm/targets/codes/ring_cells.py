@@ -49,7 +49,8 @@ def fit_cells(
         levels: intensity of the background and its step to the dot, shape (k, 2).
         blur: standard deviation of the edge of the dot, px, shape (k,).
         cells: number of cells.
-        inner, outer: radii of the ring in radii of the dot.
+        inner: inner radius of the ring in radii of the dot.
+        outer: outer radius of the ring in radii of the dot.
 
     Returns:
         For each dot and cell, clockwise, with 0 the background and 1 the dot: three levels of the cell,
@@ -58,7 +59,7 @@ def fit_cells(
     """
     m = cells * SAMPLES
     out = np.full((len(xy), ROWS, cells), math.nan)
-    z = np.empty((len(IN_RING) + 2, m))
+    samples = np.empty((len(IN_RING) + 2, m))
     sigma, ring_part = np.empty(m), np.empty((len(IN_RING) + 2, m))
     dot_part = np.empty((len(IN_RING) + 2, m))
     W, best_W = np.empty((m, cells)), np.empty((m, cells))
@@ -67,7 +68,7 @@ def fit_cells(
     g = np.empty(cells)
     for k in range(len(xy)):
         if not _sample(
-            image, xy[k], shape[k], levels[k], blur[k], inner, outer, z, sigma, ring_part, dot_part
+            image, xy[k], shape[k], levels[k], blur[k], inner, outer, samples, sigma, ring_part, dot_part
         ):
             continue
         least = math.inf
@@ -86,13 +87,13 @@ def fit_cells(
                 g[:] = 0.0
                 for i in range(m):
                     for a in range(cells):
-                        g[a] += W[i, a] * (z[row, i] - dot_part[row, i]) / ring_part[row, i]
+                        g[a] += W[i, a] * (samples[row, i] - dot_part[row, i]) / ring_part[row, i]
                 for a in range(cells):
                     c[row, a] = 0.0
                     for b in range(cells):
                         c[row, a] += N[a, b] * g[b]
                 for i in range(m):
-                    v = (z[row, i] - dot_part[row, i]) / ring_part[row, i]
+                    v = (samples[row, i] - dot_part[row, i]) / ring_part[row, i]
                     for a in range(cells):
                         v -= W[i, a] * c[row, a]
                     squares += v * v
@@ -101,7 +102,7 @@ def fit_cells(
                 least = cost
                 best_W[:], best_N[:], best_c[:] = W, N, c
         if least < math.inf:
-            _compare(z, ring_part, dot_part, best_W, best_N, best_c, out[k])
+            _compare(samples, ring_part, dot_part, best_W, best_N, best_c, out[k])
     return out
 
 
@@ -138,7 +139,7 @@ def _sample(
     blur: float,
     inner: float,
     outer: float,
-    z: FloatArray,
+    samples: FloatArray,
     sigma: FloatArray,
     ring_part: FloatArray,
     dot_part: FloatArray,
@@ -148,7 +149,7 @@ def _sample(
     p, q, r = shape[0], shape[1], shape[2]
     det = p * r - q * q
     s = math.sqrt(blur * blur + INTERPOLATION)
-    m = z.shape[1]
+    m = samples.shape[1]
     middle = (inner + outer) / 2
     for i in range(m):
         t = 2 * math.pi * i / m  # y is down, so growing angles run clockwise in the image
@@ -157,7 +158,7 @@ def _sample(
         # Ends of cells lie along e; a turn by dt moves the sample by rho dt / (det |e|) across them.
         sigma[i] = s * det * math.hypot(ex, ey) / middle
         steepness = math.hypot(p * u + q * v, q * u + r * v)  # |grad rho|
-        for row in range(z.shape[0]):
+        for row in range(samples.shape[0]):
             if row < len(IN_RING):
                 rho = inner + IN_RING[row] * (outer - inner)
             elif row == len(IN_RING):
@@ -168,9 +169,9 @@ def _sample(
             if not (x >= 0 and y >= 0 and x < w - 1 and y < h - 1):
                 if row <= len(IN_RING):
                     return False
-                z[row, i] = math.nan
+                samples[row, i] = math.nan
             else:
-                z[row, i] = (bilinear(image, x, y) - levels[0]) / levels[1]
+                samples[row, i] = (bilinear(image, x, y) - levels[0]) / levels[1]
             f = 1 / (steepness * s)
             ring_part[row, i] = _phi((rho - inner) * f) - _phi((rho - outer) * f)
             dot_part[row, i] = _phi((1 - rho) * f)
@@ -194,7 +195,7 @@ def _mixture(sigma: FloatArray, phase: float, W: FloatArray) -> None:
 
 @compiled
 def _compare(
-    z: FloatArray,
+    samples: FloatArray,
     ring_part: FloatArray,
     dot_part: FloatArray,
     W: FloatArray,
@@ -204,17 +205,18 @@ def _compare(
 ) -> None:
     """Write levels, residuals, deviations beside the ring and sigma of each cell."""
     m, cells = W.shape
+    gap_row, behind_row = len(IN_RING), len(IN_RING) + 1
     weight, seen, squares = np.full(cells, 1e-12), np.full(cells, 1e-12), np.zeros(cells)
     out[_GAP], out[_BEHIND_RING] = 0.0, 0.0
     for i in range(m):
         level = 0.0
         for a in range(cells):
             level += W[i, a] * (c[0, a] + c[1, a] + c[2, a]) / 3
-        gap = z[_RESIDUAL, i] - dot_part[_RESIDUAL, i] - ring_part[_RESIDUAL, i] * level
-        behind = z[_GAP, i] - dot_part[_GAP, i] - ring_part[_GAP, i] * level
+        gap = samples[gap_row, i] - dot_part[gap_row, i] - ring_part[gap_row, i] * level
+        behind = samples[behind_row, i] - dot_part[behind_row, i] - ring_part[behind_row, i] * level
         mean = 0.0
         for row in range(len(IN_RING)):
-            v = z[row, i] - dot_part[row, i]
+            v = samples[row, i] - dot_part[row, i]
             for a in range(cells):
                 v -= ring_part[row, i] * W[i, a] * c[row, a]
             mean += v * v / len(IN_RING)

@@ -13,17 +13,16 @@ import numpy as np
 
 from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
 from sfm.errors import GeometryError
-from sfm.targets.codes.rings import CodeFamily, code_family
-from sfm.targets.fits.corner import fit_corners
+from sfm.targets.fits.corner import BACKGROUND, BLUR, CONTRAST, fit_corners
 from sfm.targets.flags import Flag
 
-# OpenCV's name of each dictionary behind the name that a survey file uses.
-TAG_FAMILIES = (
-    *(f"apriltag{kind}" for kind in ("16h5", "25h9", "36h10", "36h11")),
-    *(f"aruco{n}x{n}_{count}" for n in (4, 5, 6, 7) for count in (50, 100, 250, 1000)),
-    "aruco_original",
-    "aruco_mip_36h12",
-)
+# OpenCV's dictionary behind each name that a survey file uses.
+DICTIONARIES = {
+    **{f"apriltag{kind}": f"DICT_APRILTAG_{kind}" for kind in ("16h5", "25h9", "36h10", "36h11")},
+    **{f"aruco{n}x{n}_{k}": f"DICT_{n}X{n}_{k}" for n in (4, 5, 6, 7) for k in (50, 100, 250, 1000)},
+    "aruco_original": "DICT_ARUCO_ORIGINAL",
+    "aruco_mip_36h12": "DICT_ARUCO_MIP_36h12",
+}
 CORNERS = "abcd"
 # A black module narrower than this is not told apart from the code behind it.
 LEAST_MODULE_PX = 3.0
@@ -41,7 +40,7 @@ class TagFamily:
     """A dictionary of square tags."""
 
     name: str
-    """one of TAG_FAMILIES"""
+    """a name in DICTIONARIES"""
     modules: int
     """modules along a side of the black square, its border included"""
     count: int
@@ -55,7 +54,9 @@ class TagCorners:
     xy: FloatArray
     """corners, px, shape (k, 2)"""
     covariance: FloatArray
-    """from the fit and its residuals, px^2, shape (k, 2, 2)"""
+    """covariance of the corners from the fit and its residuals, px^2, shape (k, 2, 2)"""
+    edge_covariance: FloatArray
+    """covariance of background, step and blur, shape (k, 3, 3)"""
     code: IntArray
     """4 times the id of the tag plus 0 to 3 for the corners a to d, shape (k,)"""
     levels: FloatArray
@@ -74,23 +75,10 @@ class TagCorners:
     """outlines of all tags that were read, corners a to d as OpenCV gives them, px, shape (t, 4, 2)"""
 
 
-def tag_family(name: str) -> TagFamily | None:
-    """Return the family of a name of TAG_FAMILIES, None for any other name."""
-    if name not in TAG_FAMILIES:
-        return None
+def tag_family(name: str) -> TagFamily:
+    """Return the family of a name in DICTIONARIES."""
     dictionary = _dictionary(name)
     return TagFamily(name, dictionary.markerSize + 2, len(dictionary.bytesList))
-
-
-def target_family(codes: str | CodeFamily | TagFamily) -> CodeFamily | TagFamily | None:
-    """Return the family of rings or tags of a name or of a table file; None for "none".
-
-    Raises:
-        SurveyFileError: neither a known family nor a readable table.
-    """
-    if isinstance(codes, TagFamily):
-        return codes
-    return (tag_family(codes) if isinstance(codes, str) else None) or code_family(codes)
 
 
 def tag_modules(family: TagFamily, number: int) -> BoolArray:
@@ -136,8 +124,9 @@ def find_tags(photograph: AnyArray, family: TagFamily, *, polarity: str, scale: 
     number = np.concatenate([ids for _, ids in found])
     order = np.argsort(number, kind="stable")
     quads, number = quads[order], number[order]
-    theta, covariance, noise, flag = fit_corners(photograph, quads, family.modules, float(scale))
-    contrast = theta[..., 5]
+    fits = fit_corners(photograph, quads, family.modules, float(scale))
+    flag, noise = fits.flag, fits.noise
+    contrast, blur = fits.theta[..., CONTRAST], fits.theta[..., BLUR]
     side = np.linalg.norm(quads - np.roll(quads, 1, axis=1), axis=2).min(axis=1, initial=np.inf)
     module = np.repeat(side[:, None] / family.modules, 4, axis=1)
     typical = np.median(contrast, axis=1, keepdims=True)
@@ -147,24 +136,25 @@ def find_tags(photograph: AnyArray, family: TagFamily, *, polarity: str, scale: 
             (Flag.TOO_SMALL, module < LEAST_MODULE_PX),
             (Flag.NO_CONVERGENCE, (flag & Flag.NO_CONVERGENCE) != 0),
             (Flag.LOW_CONTRAST, contrast / typical < LEAST_CONTRAST),
-            (Flag.BLURRED, theta[..., 6] > SOFTEST_EDGE * module),
+            (Flag.BLURRED, blur > SOFTEST_EDGE * module),
             (Flag.POOR_FIT, noise / np.abs(contrast) > POOR_FIT),
         )
     reason = np.zeros(flag.shape, dtype=np.int64)
     for name, against in tests:
         reason[(reason == 0) & against] = name.value
     good = reason == 0
-    if polarity != "auto":  # an inverted tag is none of the survey's
+    if polarity != "auto":  # inverted tags do not belong to the survey
         wrong = np.sign(contrast) != (-1 if polarity == "dark" else 1)
         reason[good & wrong] = Flag.LOW_CONTRAST.value
         good &= ~wrong
     code = 4 * number[:, None] + np.arange(4)
     return TagCorners(
-        theta[good][:, :2],
-        covariance[good],
+        fits.theta[good][:, :2],
+        fits.covariance[good][:, :2, :2],
+        fits.covariance[good][:, BACKGROUND : BLUR + 1, BACKGROUND : BLUR + 1],
         code[good],
-        theta[good][:, 4:6],
-        theta[good][:, 6],
+        fits.theta[good][:, BACKGROUND : CONTRAST + 1],
+        blur[good],
         noise[good],
         flag[good] | Flag.CORNER.value,
         quads[~good],
@@ -191,11 +181,5 @@ def inside_tags(xy: FloatArray, tags: TagCorners, family: TagFamily) -> BoolArra
 
 
 def _dictionary(name: str) -> cv2.aruco.Dictionary:
-    """Return OpenCV's dictionary of a name of TAG_FAMILIES."""
-    kind = name.removeprefix("aruco").removeprefix("_")
-    constant = {
-        "apriltag": f"DICT_APRILTAG_{name.removeprefix('apriltag')}",
-        "original": "DICT_ARUCO_ORIGINAL",
-        "mip_36h12": "DICT_ARUCO_MIP_36h12",
-    }.get("apriltag" if name.startswith("apriltag") else kind, f"DICT_{kind.upper()}")
-    return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, constant))
+    """Return OpenCV's dictionary of a name in DICTIONARIES."""
+    return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, DICTIONARIES[name]))

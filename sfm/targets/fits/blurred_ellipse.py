@@ -16,10 +16,14 @@ import math
 from sfm.conventions import FloatArray
 from sfm.kernels.options import compiled_fast, inlined_fast
 
-# Unknowns of the fit: x0, y0, p, q, r, B, A, s, gx, gy.
-PARAMETERS = 10
-# So many pixels are worked on together, unknown after unknown, residual and weight last.
+# Unknowns of the fit in their order: x0, y0, p, q, r, B, A, s, gx, gy.
+UNKNOWNS = 10
+X0, Y0, P, Q, R, BACKGROUND, CONTRAST, BLUR, GAIN_X, GAIN_Y = range(UNKNOWNS)
+# So many pixels are worked on together. A block holds the derivatives by one unknown after the other, and
+# behind them the residuals and the weights.
 BLOCK = 256
+RESIDUAL, WEIGHT = UNKNOWNS * BLOCK, (UNKNOWNS + 1) * BLOCK
+BLOCK_SIZE = (UNKNOWNS + 2) * BLOCK
 _SQRT_HALF = math.sqrt(0.5)
 _DENSITY_0 = 1 / math.sqrt(2 * math.pi)
 
@@ -43,17 +47,23 @@ def edge_profile(t: float) -> tuple[float, float]:
 
 @compiled_fast
 def linearise(
-    data: FloatArray, first: int, m: int, theta: FloatArray, length: float, saturation: float, J: FloatArray
+    pixels: FloatArray, first: int, m: int, theta: FloatArray, length: float, saturation: float, J: FloatArray
 ) -> None:
-    """Write the derivatives, the residuals and the weights of a block of pixels, one unknown after the other.
+    """Write the derivatives, the residuals and the weights of a block of pixels into J, one after the other.
 
     The loop has no branches, so that it runs on several pixels at a time. A pixel at the end of the scale has
     no weight where the model lies beyond the scale, too: no more is known of it (censored observation).
     """
-    x0, y0, p, q, r = theta[0], theta[1], theta[2], theta[3], theta[4]
-    B, A, s, gx, gy = theta[5], theta[6], theta[7], theta[8] / length, theta[9] / length
+    x0, y0, p, q, r = theta[X0], theta[Y0], theta[P], theta[Q], theta[R]
+    B, A, s, gx, gy = (
+        theta[BACKGROUND],
+        theta[CONTRAST],
+        theta[BLUR],
+        theta[GAIN_X] / length,
+        theta[GAIN_Y] / length,
+    )
     for i in range(m):
-        dx, dy, value = data[0, first + i] - x0, data[1, first + i] - y0, data[2, first + i]
+        dx, dy, value = pixels[0, first + i] - x0, pixels[1, first + i] - y0, pixels[2, first + i]
         u, v = p * dx + q * dy, q * dx + r * dy
         rho = math.sqrt(u * u + v * v) + 1e-12
         wx, wy = p * u + q * v, q * u + r * v  # S S dx
@@ -71,23 +81,23 @@ def linearise(
         f1 = -slope * (2 * rho - 1) * nw / rho
         f2 = slope * d * nw * nw
         ax, ay = p * wx + q * wy, q * wx + r * wy  # S w
-        J[0 * BLOCK + i] = -f1 * (u * p + v * q) - f2 * (ax * p + ay * q) - level * gx
-        J[1 * BLOCK + i] = -f1 * (u * q + v * r) - f2 * (ax * q + ay * r) - level * gy
-        J[2 * BLOCK + i] = f1 * (u * dx) + f2 * (ax * dx + wx * u)
-        J[3 * BLOCK + i] = f1 * (u * dy + v * dx) + f2 * (ax * dy + ay * dx + wx * v + wy * u)
-        J[4 * BLOCK + i] = f1 * (v * dy) + f2 * (ay * dy + wy * v)
-        J[5 * BLOCK + i] = weight * gain
-        J[6 * BLOCK + i] = weight * phi * gain
-        J[7 * BLOCK + i] = slope * d / s
-        J[8 * BLOCK + i] = level * dx / length
-        J[9 * BLOCK + i] = level * dy / length
-        J[10 * BLOCK + i] = weight * (value - model)
-        J[11 * BLOCK + i] = weight
+        J[X0 * BLOCK + i] = -f1 * (u * p + v * q) - f2 * (ax * p + ay * q) - level * gx
+        J[Y0 * BLOCK + i] = -f1 * (u * q + v * r) - f2 * (ax * q + ay * r) - level * gy
+        J[P * BLOCK + i] = f1 * (u * dx) + f2 * (ax * dx + wx * u)
+        J[Q * BLOCK + i] = f1 * (u * dy + v * dx) + f2 * (ax * dy + ay * dx + wx * v + wy * u)
+        J[R * BLOCK + i] = f1 * (v * dy) + f2 * (ay * dy + wy * v)
+        J[BACKGROUND * BLOCK + i] = weight * gain
+        J[CONTRAST * BLOCK + i] = weight * phi * gain
+        J[BLUR * BLOCK + i] = slope * d / s
+        J[GAIN_X * BLOCK + i] = level * dx / length
+        J[GAIN_Y * BLOCK + i] = level * dy / length
+        J[RESIDUAL + i] = weight * (value - model)
+        J[WEIGHT + i] = weight
 
 
 @compiled_fast
 def normal_equations(
-    data: FloatArray,
+    pixels: FloatArray,
     n: int,
     theta: FloatArray,
     length: float,
@@ -96,17 +106,30 @@ def normal_equations(
     N: FloatArray,
     g: FloatArray,
 ) -> tuple[float, int]:
-    """Sum up N = J'J (lower triangle) and g = J'v of one target; return v'v and the number of pixels used.
+    """Sum up N = J'J (lower triangle) and g = J'v of one target.
 
     The pixels are taken in blocks, so that the sums run over contiguous numbers in the cache.
+
+    Args:
+        pixels: x, y and intensity of the pixels, shape (3, >= n).
+        n: number of pixels.
+        theta: unknowns, shape (10,).
+        length: L, px.
+        saturation: intensities from here on are censored.
+        J: work space of BLOCK_SIZE.
+        N: receives the normal equations, shape (10, 10).
+        g: receives their right-hand side, shape (10,).
+
+    Returns:
+        Sum of squared residuals, and the number of pixels used.
     """
     N[:] = 0.0
     g[:] = 0.0
     squares, used = 0.0, 0.0
     for first in range(0, n, BLOCK):
         m = min(BLOCK, n - first)
-        linearise(data, first, m, theta, length, saturation, J)
-        for j in range(PARAMETERS):
+        linearise(pixels, first, m, theta, length, saturation, J)
+        for j in range(UNKNOWNS):
             for k in range(j + 1):
                 product = 0.0
                 for i in range(m):
@@ -114,9 +137,9 @@ def normal_equations(
                 N[j, k] += product
             product = 0.0
             for i in range(m):
-                product += J[j * BLOCK + i] * J[10 * BLOCK + i]
+                product += J[j * BLOCK + i] * J[RESIDUAL + i]
             g[j] += product
         for i in range(m):
-            squares += J[10 * BLOCK + i] ** 2
-            used += J[11 * BLOCK + i]
+            squares += J[RESIDUAL + i] ** 2
+            used += J[WEIGHT + i]
     return squares, int(used)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -20,6 +21,15 @@ THRESHOLD_SIGMAS = 3.0
 EDGE_VARIANCE = 1 / 12
 
 
+class Centroids(NamedTuple):
+    """Centroids of k targets; nan where the window is cut or nothing rises above the background."""
+
+    xy: FloatArray
+    """px, shape (k, 2)"""
+    covariance: FloatArray
+    """from noise (binary: the pixel grid), px^2, shape (k, 2, 2)"""
+
+
 def measure_centroids(
     photograph: AnyArray,
     xy: FloatArray,
@@ -28,7 +38,7 @@ def measure_centroids(
     *,
     noise: float,
     weights: str = "intensity",
-) -> tuple[FloatArray, FloatArray]:
+) -> Centroids:
     """Measure the centroid of each target.
 
     With g the intensity above the background (below it for dark targets), the weights are 1 where g exceeds
@@ -44,20 +54,16 @@ def measure_centroids(
         noise: standard deviation of the intensities.
         weights: binary, intensity or squared.
 
-    Returns:
-        Centroids, px, shape (k, 2), and their covariance from noise (binary: the pixel grid), px^2, shape
-        (k, 2, 2); nan where the window is not inside the photograph or nothing rises above the background.
-
     Raises:
         KolinearError: unknown weights.
 
     Source: Luhmann et al., Close-Range Photogrammetry and 3D Imaging (2014), sec. 5.4.2.
     """
     if weights not in WEIGHTS:
-        raise KolinearError(f"weights {weights!r} are none of {', '.join(WEIGHTS)}")
+        raise KolinearError(f"weights {weights!r}, expected one of {', '.join(WEIGHTS)}")
     outline = np.column_stack([np.asarray(xy, float).reshape(-1, 2), np.asarray(shape, float).reshape(-1, 3)])
     result = _centroids(photograph, outline, np.asarray(sign, np.int64), float(noise), WEIGHTS.index(weights))
-    return result[:, :2], result[:, [2, 3, 3, 4]].reshape(-1, 2, 2)
+    return Centroids(result[:, :2], result[:, [2, 3, 3, 4]].reshape(-1, 2, 2))
 
 
 @compiled

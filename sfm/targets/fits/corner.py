@@ -13,6 +13,7 @@ where the two edges meet. The fit stays so near to it that distortion does not b
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -22,8 +23,9 @@ from sfm.kernels.options import compiled
 from sfm.targets.fits.blurred_ellipse import edge_profile
 from sfm.targets.flags import Flag
 
-# Unknowns of the fit: x0, y0, directions of the two normals, B, A, s, gx, gy.
-PARAMETERS = 9
+# Unknowns of the fit in their order: x0, y0, directions of the two normals, B, A, s, gx, gy.
+UNKNOWNS = 9
+X0, Y0, NORMAL_1, NORMAL_2, BACKGROUND, CONTRAST, BLUR, GAIN_X, GAIN_Y = range(UNKNOWNS)
 # Pixels where both edges are nearer than this are the tip; farther than this from an edge nothing is learnt.
 TIP_PX, BAND_PX, LEAST_BAND_PX = 2.5, 4.0, 1.5
 # Edges are followed for this share of a side, at most so far: distortion bends them by less than 0.01 px.
@@ -40,10 +42,21 @@ _NO_CONVERGENCE = int(Flag.NO_CONVERGENCE)
 _SATURATED = int(Flag.SATURATED)
 
 
+class CornerFits(NamedTuple):
+    """Fits of the model to the four corners of k tags."""
+
+    theta: FloatArray
+    """unknowns, shape (k, 4, 9)"""
+    covariance: FloatArray
+    """their covariance, nan where the fit failed, shape (k, 4, 9, 9)"""
+    noise: FloatArray
+    """standard deviation of the intensities about the fit, shape (k, 4)"""
+    flag: IntArray
+    """remarks and reasons of failure, see Flag, shape (k, 4)"""
+
+
 @compiled
-def fit_corners(
-    image: AnyArray, quads: FloatArray, modules: int, saturation: float
-) -> tuple[FloatArray, FloatArray, FloatArray, IntArray]:
+def fit_corners(image: AnyArray, quads: FloatArray, modules: int, saturation: float) -> CornerFits:
     """Fit the four corners of every tag.
 
     Args:
@@ -51,14 +64,10 @@ def fit_corners(
         quads: approximate corners of the black squares in turn, px, shape (k, 4, 2).
         modules: modules along a side, border included.
         saturation: intensities from here on are censored.
-
-    Returns:
-        Unknowns, shape (k, 4, 9); covariance of the corners, px^2, shape (k, 4, 2, 2), nan where the fit
-        failed; standard deviation of the intensities about the fit, shape (k, 4); flags, shape (k, 4).
     """
     k = len(quads)
-    theta = np.zeros((k, 4, PARAMETERS))
-    covariance = np.full((k, 4, 2, 2), math.nan)
+    theta = np.zeros((k, 4, UNKNOWNS))
+    covariance = np.full((k, 4, UNKNOWNS, UNKNOWNS), math.nan)
     noise = np.full((k, 4), math.nan)
     flag = np.zeros((k, 4), np.int64)
     for i in range(k):
@@ -68,7 +77,7 @@ def fit_corners(
                 image, quad[j], quad[(j + 1) % 4], quad[(j + 2) % 4], quad[(j + 3) % 4],
                 modules, saturation, theta[i, j], covariance[i, j],
             )  # fmt: skip
-    return theta, covariance, noise, flag
+    return CornerFits(theta, covariance, noise, flag)
 
 
 @compiled
@@ -84,7 +93,7 @@ def _fit_one(
     covariance: FloatArray,
 ) -> tuple[int, float]:
     """Fit one corner; theta and covariance are filled, flag and noise are returned."""
-    theta[0], theta[1] = corner[0], corner[1]
+    theta[X0], theta[Y0] = corner[0], corner[1]
     depth = math.inf
     for k, (end, other) in enumerate(((following, previous), (previous, following))):
         dx, dy = end[0] - corner[0], end[1] - corner[1]
@@ -93,28 +102,28 @@ def _fit_one(
         inside = nx * (other[0] - corner[0]) + ny * (other[1] - corner[1])
         if inside > 0:  # the normal points away from the tag
             nx, ny = -nx, -ny
-        theta[2 + k] = math.atan2(ny, nx)
+        theta[NORMAL_1 + k] = math.atan2(ny, nx)
         depth = min(depth, abs(inside) / length)
         depth = min(depth, abs(nx * (opposite[0] - corner[0]) + ny * (opposite[1] - corner[1])) / length)
     band = min(BAND_PX, max(LEAST_BAND_PX, depth / modules - CODE_PX))
     reach = min(REACH_PX, REACH_SHARE * depth)
-    data = np.empty((3, int((2 * FARTHEST_PX + 2 * (reach + band) * 4) ** 2) + 16))
+    pixels = np.empty((3, int((2 * FARTHEST_PX + 2 * (reach + band) * 4) ** 2) + 16))
     flag, noise = 0, math.nan
     for round_ in range(2):  # the pixels are chosen anew about the corner that was found
-        n, censored = _collect(image, theta, band, reach, saturation, data)
+        n, censored = _collect(image, theta, band, reach, saturation, pixels)
         if n < 0:
             return _CUT_BY_BORDER, noise
         if censored:
             flag |= _SATURATED
-        if n < 3 * PARAMETERS:
+        if n < 3 * UNKNOWNS:
             return flag | _NO_CONVERGENCE, noise
         if round_ == 0:
-            _start_levels(data, n, theta)
-        squares, used = _iterate(data, n, theta, saturation, reach, covariance)
-        if used <= PARAMETERS or math.hypot(theta[0] - corner[0], theta[1] - corner[1]) > FARTHEST_PX:
+            _start_levels(pixels, n, theta)
+        squares, used = _iterate(pixels, n, theta, saturation, reach, covariance)
+        if used <= UNKNOWNS or math.hypot(theta[X0] - corner[0], theta[Y0] - corner[1]) > FARTHEST_PX:
             covariance[:] = math.nan
             return flag | _NO_CONVERGENCE, noise
-        variance = max(squares / (used - PARAMETERS), 1 / 12)  # at least that of rounding
+        variance = max(squares / (used - UNKNOWNS), 1 / 12)  # at least that of rounding
         noise = math.sqrt(variance)
         covariance *= variance
     return flag, noise
@@ -122,12 +131,17 @@ def _fit_one(
 
 @compiled
 def _collect(
-    image: AnyArray, theta: FloatArray, band: float, reach: float, saturation: float, data: FloatArray
+    image: AnyArray, theta: FloatArray, band: float, reach: float, saturation: float, pixels: FloatArray
 ) -> tuple[int, bool]:
     """Collect x, y and intensity along the two edges; return how many, -1 where the border cuts them off."""
     h, w = image.shape
-    x0, y0 = theta[0], theta[1]
-    c1, s1, c2, s2 = math.cos(theta[2]), math.sin(theta[2]), math.cos(theta[3]), math.sin(theta[3])
+    x0, y0 = theta[X0], theta[Y0]
+    c1, s1, c2, s2 = (
+        math.cos(theta[NORMAL_1]),
+        math.sin(theta[NORMAL_1]),
+        math.cos(theta[NORMAL_2]),
+        math.sin(theta[NORMAL_2]),
+    )
     sine = abs(c1 * s2 - s1 * c2)
     half = min((reach + band) / max(sine, 0.2) + 1, 2 * (reach + band))
     if x0 < band or y0 < band or x0 > w - 1 - band or y0 > h - 1 - band:
@@ -140,53 +154,58 @@ def _collect(
                 continue
             if abs(d1) < TIP_PX and abs(d2) < TIP_PX:
                 continue
-            if n == data.shape[1]:
+            if n == pixels.shape[1]:
                 return n, censored
-            data[0, n], data[1, n], data[2, n] = j, i, image[i, j]
+            pixels[0, n], pixels[1, n], pixels[2, n] = j, i, image[i, j]
             censored = censored or image[i, j] >= saturation
             n += 1
     return n, censored
 
 
 @compiled
-def _start_levels(data: FloatArray, n: int, theta: FloatArray) -> None:
+def _start_levels(pixels: FloatArray, n: int, theta: FloatArray) -> None:
     """Set B and A to the mean intensities beside the tag and on its border, s and g to their start values."""
-    c1, s1, c2, s2 = math.cos(theta[2]), math.sin(theta[2]), math.cos(theta[3]), math.sin(theta[3])
+    c1, s1, c2, s2 = (
+        math.cos(theta[NORMAL_1]),
+        math.sin(theta[NORMAL_1]),
+        math.cos(theta[NORMAL_2]),
+        math.sin(theta[NORMAL_2]),
+    )
     sums, counts = np.zeros(2), np.zeros(2)
     for i in range(n):
-        dx, dy = data[0, i] - theta[0], data[1, i] - theta[1]
+        dx, dy = pixels[0, i] - theta[X0], pixels[1, i] - theta[Y0]
         side = 1 if c1 * dx + s1 * dy < 0 and c2 * dx + s2 * dy < 0 else 0
-        sums[side] += data[2, i]
+        sums[side] += pixels[2, i]
         counts[side] += 1
-    theta[4] = sums[0] / max(counts[0], 1)
-    theta[5] = sums[1] / max(counts[1], 1) - theta[4]
-    theta[6], theta[7], theta[8] = BLUR_START, 0.0, 0.0
+    theta[BACKGROUND] = sums[0] / max(counts[0], 1)
+    theta[CONTRAST] = sums[1] / max(counts[1], 1) - theta[BACKGROUND]
+    theta[BLUR], theta[GAIN_X], theta[GAIN_Y] = BLUR_START, 0.0, 0.0
 
 
 @compiled
 def _iterate(
-    data: FloatArray, n: int, theta: FloatArray, saturation: float, length: float, cofactor: FloatArray
+    pixels: FloatArray, n: int, theta: FloatArray, saturation: float, length: float, cofactor: FloatArray
 ) -> tuple[float, int]:
-    """Improve theta by Levenberg-Marquardt steps and set the cofactors of the corner.
+    """Improve theta by Levenberg-Marquardt steps and set the cofactors.
 
     Returns:
         Sum of squared residuals, and the number of pixels used, 0 where it did not converge.
     """
-    N, g = np.empty((PARAMETERS, PARAMETERS)), np.empty(PARAMETERS)
-    N_trial, g_trial = np.empty((PARAMETERS, PARAMETERS)), np.empty(PARAMETERS)
-    L, trial = np.empty((PARAMETERS, PARAMETERS)), np.empty(PARAMETERS)
-    total, used = _normal_equations(data, n, theta, saturation, length, N, g)
+    N, g = np.empty((UNKNOWNS, UNKNOWNS)), np.empty(UNKNOWNS)
+    N_trial, g_trial = np.empty((UNKNOWNS, UNKNOWNS)), np.empty(UNKNOWNS)
+    L, trial = np.empty((UNKNOWNS, UNKNOWNS)), np.empty(UNKNOWNS)
+    total, used = _normal_equations(pixels, n, theta, saturation, length, N, g)
     damping = 1e-3
     for _ in range(MAX_STEPS):
         L[:], trial[:] = N, g
-        for i in range(PARAMETERS):
+        for i in range(UNKNOWNS):
             L[i, i] *= 1 + damping
         if not solve_symmetric(L, trial):
             return total, 0
-        shift = max(abs(trial[0]), abs(trial[1]))
+        shift = max(abs(trial[X0]), abs(trial[Y0]))
         trial += theta
-        trial[6] = min(max(trial[6], BLUR_LEAST), BLUR_MOST)
-        squares, used_trial = _normal_equations(data, n, trial, saturation, length, N_trial, g_trial)
+        trial[BLUR] = min(max(trial[BLUR], BLUR_LEAST), BLUR_MOST)
+        squares, used_trial = _normal_equations(pixels, n, trial, saturation, length, N_trial, g_trial)
         if squares > total * (1 + 1e-9) and used_trial == used:
             damping = max(damping, 1e-3) * 10
             if damping > 1e6:
@@ -198,14 +217,14 @@ def _iterate(
         if shift < LAST_STEP_PX:
             if not invert_symmetric(N):
                 return total, 0
-            cofactor[:] = N[:2, :2]
+            cofactor[:] = N
             return total, used
     return total, 0
 
 
 @compiled
 def _normal_equations(
-    data: FloatArray,
+    pixels: FloatArray,
     n: int,
     theta: FloatArray,
     saturation: float,
@@ -214,14 +233,19 @@ def _normal_equations(
     g: FloatArray,
 ) -> tuple[float, int]:
     """Sum up N = J'J and g = J'v with the prior of the gain; return v'v and the number of pixels used."""
-    x0, y0, B, A, s = theta[0], theta[1], theta[4], theta[5], theta[6]
-    gx, gy = theta[7] / length, theta[8] / length
-    c1, s1, c2, s2 = math.cos(theta[2]), math.sin(theta[2]), math.cos(theta[3]), math.sin(theta[3])
+    x0, y0, B, A, s = theta[X0], theta[Y0], theta[BACKGROUND], theta[CONTRAST], theta[BLUR]
+    gx, gy = theta[GAIN_X] / length, theta[GAIN_Y] / length
+    c1, s1, c2, s2 = (
+        math.cos(theta[NORMAL_1]),
+        math.sin(theta[NORMAL_1]),
+        math.cos(theta[NORMAL_2]),
+        math.sin(theta[NORMAL_2]),
+    )
     N[:], g[:] = 0.0, 0.0
     squares, used = 0.0, 0
-    J = np.empty(PARAMETERS)
+    J = np.empty(UNKNOWNS)
     for i in range(n):
-        dx, dy, value = data[0, i] - x0, data[1, i] - y0, data[2, i]
+        dx, dy, value = pixels[0, i] - x0, pixels[1, i] - y0, pixels[2, i]
         d1, d2 = c1 * dx + s1 * dy, c2 * dx + s2 * dy
         phi1, e1 = edge_profile(-d1 / s)
         phi2, e2 = edge_profile(-d2 / s)
@@ -232,24 +256,24 @@ def _normal_equations(
             continue  # no more is known of it (censored observation)
         f1 = -A * _DENSITY_0 * e1 * phi2 * gain / s  # dI / d d1
         f2 = -A * _DENSITY_0 * e2 * phi1 * gain / s
-        J[0] = -f1 * c1 - f2 * c2 - level * gx
-        J[1] = -f1 * s1 - f2 * s2 - level * gy
-        J[2] = f1 * (c1 * dy - s1 * dx)
-        J[3] = f2 * (c2 * dy - s2 * dx)
-        J[4] = gain
-        J[5] = phi1 * phi2 * gain
-        J[6] = -(f1 * d1 + f2 * d2) / s
-        J[7] = level * dx / length
-        J[8] = level * dy / length
+        J[X0] = -f1 * c1 - f2 * c2 - level * gx
+        J[Y0] = -f1 * s1 - f2 * s2 - level * gy
+        J[NORMAL_1] = f1 * (c1 * dy - s1 * dx)
+        J[NORMAL_2] = f2 * (c2 * dy - s2 * dx)
+        J[BACKGROUND] = gain
+        J[CONTRAST] = phi1 * phi2 * gain
+        J[BLUR] = -(f1 * d1 + f2 * d2) / s
+        J[GAIN_X] = level * dx / length
+        J[GAIN_Y] = level * dy / length
         v = value - model
         squares += v * v
         used += 1
-        for j in range(PARAMETERS):
+        for j in range(UNKNOWNS):
             g[j] += J[j] * v
             for k in range(j + 1):
                 N[j, k] += J[j] * J[k]
-    prior = (squares / max(used - PARAMETERS, 1) + 1 / 12) / GAIN_SIGMA**2
-    for j in (7, 8):
+    prior = (squares / max(used - UNKNOWNS, 1) + 1 / 12) / GAIN_SIGMA**2
+    for j in (GAIN_X, GAIN_Y):
         N[j, j] += prior
         g[j] -= prior * theta[j]
     return squares, used

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -13,7 +14,7 @@ from sfm.targets.edge_rays import RAYS, STEP_PX, improve_outline, trace_rays
 # The edges are traced from the ellipse found last; three times do from a start that is half a radius off.
 TRACES = 3
 # Unknowns of an ellipse.
-PARAMETERS = 5
+UNKNOWNS = 5
 # Share of the rays that must agree with the ellipse.
 LEAST_AGREEMENT = 0.7
 MARGIN_PX = 3.0
@@ -25,9 +26,20 @@ NEXT_HARMONICS = slice(3, 6)
 WINDOW = 5
 
 
+class EdgeEllipses(NamedTuple):
+    """Ellipses through the edges of k targets; nan where fewer than 70 % of the edges lie on one."""
+
+    xy: FloatArray
+    """centres, px, shape (k, 2)"""
+    covariance: FloatArray
+    """from the residuals of the edges and the correlation of neighbouring rays, px^2, shape (k, 2, 2)"""
+    shape: FloatArray
+    """(p, q, r) of S, 1/px, shape (k, 3)"""
+
+
 def measure_edge_ellipses(
     photograph: AnyArray, xy: FloatArray, shape: FloatArray, sign: IntArray, *, noise: float
-) -> tuple[FloatArray, FloatArray, FloatArray]:
+) -> EdgeEllipses:
     """Fit an ellipse to the mean positions of the edges on rays from the centre of each target.
 
     Args:
@@ -36,11 +48,6 @@ def measure_edge_ellipses(
         shape: approximate (p, q, r) of the outlines, 1/px, shape (k, 3).
         sign: +1 bright, -1 dark target, shape (k,).
         noise: standard deviation of the intensities.
-
-    Returns:
-        Centres, px, shape (k, 2), their covariance from the residuals of the edges and the correlation of
-        neighbouring rays over all targets, px^2, shape (k, 2, 2), and (p, q, r) of the ellipses, 1/px, shape
-        (k, 3); nan where fewer than 70 % of the edges lie on an ellipse.
 
     Source: Luhmann et al., Close-Range Photogrammetry and 3D Imaging (2014), sec. 5.4.2.5, star operator.
     """
@@ -52,14 +59,14 @@ def measure_edge_ellipses(
     # Neighbouring rays share pixels, so the errors have more power at low harmonics, where the centre is,
     # than on average; it is taken from the harmonics next to those of the ellipse, over all targets.
     low = (np.abs(np.fft.rfft(v, axis=1)[:, NEXT_HARMONICS]) ** 2).mean(axis=1) / RAYS
-    white = squares / (RAYS - PARAMETERS)
+    white = squares / (RAYS - UNKNOWNS)
     inflation = max(1.0, low.sum() / white.sum()) if white.sum() > 0 else 1.0
     # The centre is the first harmonic: each coordinate has the weight of half of the rays.
-    variance = inflation * squares / np.maximum(used - PARAMETERS, 1) / np.maximum(used / 2, 1)
+    variance = inflation * squares / np.maximum(used - UNKNOWNS, 1) / np.maximum(used / 2, 1)
     p, q, r = theta[:, 2:].T
     det = p * r - q * q
     inverse = np.array([[r, -q], [-q, p]]).transpose(2, 0, 1) / det[:, None, None]
-    return theta[:, :2], variance[:, None, None] * (inverse @ inverse), theta[:, 2:]
+    return EdgeEllipses(theta[:, :2], variance[:, None, None] * (inverse @ inverse), theta[:, 2:])
 
 
 @compiled

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -10,8 +11,8 @@ from sfm.conventions import AnyArray, FloatArray, IntArray
 from sfm.kernels.cholesky import invert_symmetric, solve_symmetric
 from sfm.kernels.options import compiled
 from sfm.targets.edge_rays import RAYS, improve_outline, trace_rays
-from sfm.targets.fits.blurred_ellipse import BLOCK, PARAMETERS, normal_equations
-from sfm.targets.fits.goodness import STATISTICS, judge_background, judge_glow, judge_residuals
+from sfm.targets.fits import blurred_ellipse as model
+from sfm.targets.fits import goodness
 from sfm.targets.flags import Flag
 
 # A priori sigma of the change of gain over L: far above shading, it only keeps the fit regular.
@@ -36,11 +37,24 @@ _NOT_ELLIPTIC = int(Flag.NOT_ELLIPTIC)
 _NO_CONVERGENCE = int(Flag.NO_CONVERGENCE)
 
 
+class EllipseFits(NamedTuple):
+    """Fits of the model to k targets."""
+
+    theta: FloatArray
+    """unknowns in the order of `blurred_ellipse`, shape (k, 10)"""
+    cofactor: FloatArray
+    """their cofactor matrices, nan where the fit failed, shape (k, 10, 10)"""
+    statistics: FloatArray
+    """in the columns of `goodness`, shape (k, STATISTICS)"""
+    flag: IntArray
+    """remarks and reasons of failure, see Flag, shape (k,)"""
+
+
 @compiled
-def fit_templates(
+def fit_ellipses(
     image: AnyArray, start: FloatArray, sign: IntArray, noise: float, saturation: float
-) -> tuple[FloatArray, FloatArray, FloatArray, IntArray]:
-    """Fit the template to every target.
+) -> EllipseFits:
+    """Fit the model to every target.
 
     Args:
         image: intensities, shape (H, W).
@@ -48,22 +62,17 @@ def fit_templates(
         sign: +1 bright, -1 dark target, shape (k,).
         noise: approximate standard deviation of the intensities.
         saturation: intensities from here on are censored.
-
-    Returns:
-        Unknowns, shape (k, 10); their cofactor matrices, shape (k, 10, 10), nan where the fit failed;
-        statistics of the fit in the order of goodness, L in px and steps, shape (k, STATISTICS);
-        flags, shape (k,).
     """
     k = len(start)
-    theta = np.zeros((k, PARAMETERS))
-    cofactor = np.full((k, PARAMETERS, PARAMETERS), math.nan)
-    statistics = np.ones((k, STATISTICS))
+    theta = np.zeros((k, model.UNKNOWNS))
+    cofactor = np.full((k, model.UNKNOWNS, model.UNKNOWNS), math.nan)
+    statistics = np.ones((k, goodness.STATISTICS))
     flag = np.zeros(k, np.int64)
-    J = np.zeros((PARAMETERS + 2) * BLOCK)
+    J = np.zeros(model.BLOCK_SIZE)
     for i in range(k):
         theta[i, :5] = start[i]
         flag[i] = _fit_one(image, theta[i], sign[i], noise, saturation, J, cofactor[i], statistics[i])
-    return theta, cofactor, statistics, flag
+    return EllipseFits(theta, cofactor, statistics, flag)
 
 
 @compiled
@@ -82,7 +91,7 @@ def _fit_one(
     edge, limit = np.empty(RAYS), np.empty(RAYS)
     mean, margin = 0.0, 0.0
     for _ in range(MAX_TRACES):
-        mean = 1 / math.sqrt(max(theta[2] * theta[4] - theta[3] ** 2, 1e-12))
+        mean = 1 / math.sqrt(max(theta[model.P] * theta[model.R] - theta[model.Q] ** 2, 1e-12))
         margin = min(MARGIN_MAX_PX, MARGIN_PX + MARGIN_SHARE * mean)
         step = trace_rays(image, theta, sign, noise, margin, edge, limit)
         agree, change = improve_outline(theta, edge)
@@ -94,63 +103,74 @@ def _fit_one(
         return _CUT_BY_BORDER
     if limit.min() < margin:
         flag |= _CLOSE_NEIGHBOUR
-    det = theta[2] * theta[4] - theta[3] ** 2
+    det = theta[model.P] * theta[model.R] - theta[model.Q] ** 2
     mean = 1 / math.sqrt(det)
     length = mean + margin
-    statistics[3] = length
-    half_x = math.sqrt(theta[4] ** 2 + theta[3] ** 2) / det + margin + 1
-    half_y = math.sqrt(theta[2] ** 2 + theta[3] ** 2) / det + margin + 1
-    data = np.empty((3, int((2 * half_x + 3) * (2 * half_y + 3))))
-    n = _collect(image, theta, limit, margin, half_x, half_y, mean < LARGE_PX, data)
-    flag |= _start_levels(data, n, theta, saturation)
-    if theta[6] * sign <= 0 or n < 2 * PARAMETERS:
+    statistics[goodness.LENGTH] = length
+    half_x = math.sqrt(theta[model.R] ** 2 + theta[model.Q] ** 2) / det + margin + 1
+    half_y = math.sqrt(theta[model.P] ** 2 + theta[model.Q] ** 2) / det + margin + 1
+    pixels = np.empty((3, int((2 * half_x + 3) * (2 * half_y + 3))))
+    n = _collect(image, theta, limit, margin, half_x, half_y, mean < LARGE_PX, pixels)
+    flag |= _start_levels(pixels, n, theta, saturation)
+    if theta[model.CONTRAST] * sign <= 0 or n < 2 * model.UNKNOWNS:
         return flag | _NO_CONVERGENCE
     prior = (noise / GAIN_SIGMA) ** 2
-    N, N_trial = np.empty((PARAMETERS, PARAMETERS)), np.empty((PARAMETERS, PARAMETERS))
-    L = np.empty((PARAMETERS, PARAMETERS))
-    g, g_trial, trial = np.empty(PARAMETERS), np.empty(PARAMETERS), np.empty(PARAMETERS)
-    total, used = normal_equations(data, n, theta, length, saturation, J, N, g)
+    N, N_trial = np.empty((model.UNKNOWNS, model.UNKNOWNS)), np.empty((model.UNKNOWNS, model.UNKNOWNS))
+    L = np.empty((model.UNKNOWNS, model.UNKNOWNS))
+    g, g_trial, trial = np.empty(model.UNKNOWNS), np.empty(model.UNKNOWNS), np.empty(model.UNKNOWNS)
+    total, used = model.normal_equations(pixels, n, theta, length, saturation, J, N, g)
     damping = 1e-3
     done = False
     steps = 0
     while steps < MAX_STEPS and damping < 1e6 and not done:
         steps += 1
-        for i in range(PARAMETERS):
+        for i in range(model.UNKNOWNS):
             for j in range(i + 1):
                 L[i, j] = N[i, j]
-            if i >= 8:
+            if i >= model.GAIN_X:
                 L[i, i] += prior
             L[i, i] *= 1 + damping
-            trial[i] = g[i] - (prior * theta[i] if i >= 8 else 0.0)
+            trial[i] = g[i] - (prior * theta[i] if i >= model.GAIN_X else 0.0)
         if not solve_symmetric(L, trial):
             return flag | _NO_CONVERGENCE
-        shift = max(abs(trial[0]), abs(trial[1]))
-        for i in range(PARAMETERS):
+        shift = max(abs(trial[model.X0]), abs(trial[model.Y0]))
+        for i in range(model.UNKNOWNS):
             trial[i] += theta[i]
-        trial[7] = min(max(trial[7], BLUR_LEAST), 2 * mean)
-        if trial[2] * trial[4] - trial[3] ** 2 <= 0 or trial[2] <= 0 or shift > mean + 2:
+        trial[model.BLUR] = min(max(trial[model.BLUR], BLUR_LEAST), 2 * mean)
+        if (
+            trial[model.P] * trial[model.R] - trial[model.Q] ** 2 <= 0
+            or trial[model.P] <= 0
+            or shift > mean + 2
+        ):
             damping = max(damping, 1e-3) * 10
             continue
         if shift < LAST_STEP_PX and damping < 1e-3:
             theta[:] = trial
             done = True
             break
-        squares, used_trial = normal_equations(data, n, trial, length, saturation, J, N_trial, g_trial)
-        before = total + prior * (theta[8] ** 2 + theta[9] ** 2)
-        after = squares + prior * (trial[8] ** 2 + trial[9] ** 2)
+        squares, used_trial = model.normal_equations(
+            pixels, n, trial, length, saturation, J, N_trial, g_trial
+        )
+        before = total + prior * (theta[model.GAIN_X] ** 2 + theta[model.GAIN_Y] ** 2)
+        after = squares + prior * (trial[model.GAIN_X] ** 2 + trial[model.GAIN_Y] ** 2)
         if after <= before * (1 + 1e-9) or used_trial != used:
             theta[:], N[:], g[:] = trial, N_trial, g_trial
             total, used = squares, used_trial
             damping *= 0.1
         else:
             damping = max(damping, 1e-3) * 10
-    judge_residuals(data, n, theta, length, saturation, J, statistics)
-    judge_background(image, theta, length, statistics)
-    judge_glow(data, n, theta, saturation, statistics)
-    statistics[4] = steps
-    N[8, 8] += prior
-    N[9, 9] += prior
-    if not done or theta[6] * sign <= 0 or statistics[0] <= PARAMETERS or not invert_symmetric(N):
+    goodness.judge_residuals(pixels, n, theta, length, saturation, J, statistics)
+    goodness.judge_background(image, theta, length, statistics)
+    goodness.judge_glow(pixels, n, theta, saturation, statistics)
+    statistics[goodness.STEPS] = steps
+    N[model.GAIN_X, model.GAIN_X] += prior
+    N[model.GAIN_Y, model.GAIN_Y] += prior
+    if (
+        not done
+        or theta[model.CONTRAST] * sign <= 0
+        or statistics[goodness.PIXELS] <= model.UNKNOWNS
+        or not invert_symmetric(N)
+    ):
         return flag | _NO_CONVERGENCE
     cofactor[:] = N
     return flag
@@ -165,11 +185,11 @@ def _collect(
     half_x: float,
     half_y: float,
     whole: bool,
-    data: FloatArray,
+    pixels: FloatArray,
 ) -> int:
     """Collect x, y and intensity of the target and its undisturbed background; return how many."""
     h, w = image.shape
-    x0, y0, p, q, r = theta[0], theta[1], theta[2], theta[3], theta[4]
+    x0, y0, p, q, r = theta[model.X0], theta[model.Y0], theta[model.P], theta[model.Q], theta[model.R]
     disturbed = limit.min() < margin
     n = 0
     for i in range(max(0, int(y0 - half_y)), min(h, int(y0 + half_y) + 2)):
@@ -186,31 +206,31 @@ def _collect(
                 k = int(math.atan2(v, u) * (RAYS / (2 * math.pi)) + RAYS)
                 if d > limit[k % RAYS] or d > limit[(k + 1) % RAYS]:
                     continue
-            if n == data.shape[1]:
+            if n == pixels.shape[1]:
                 return n
-            data[0, n], data[1, n], data[2, n] = j, i, image[i, j]
+            pixels[0, n], pixels[1, n], pixels[2, n] = j, i, image[i, j]
             n += 1
     return n
 
 
 @compiled
-def _start_levels(data: FloatArray, n: int, theta: FloatArray, saturation: float) -> int:
+def _start_levels(pixels: FloatArray, n: int, theta: FloatArray, saturation: float) -> int:
     """Set B and A to the mean intensities out- and inside the outline, s and g to their start values."""
     outside, inside, n_out, n_in = 0.0, 0.0, 0, 0
     flag = _NONE
     for i in range(n):
-        dx, dy = data[0, i] - theta[0], data[1, i] - theta[1]
-        u, v = theta[2] * dx + theta[3] * dy, theta[3] * dx + theta[4] * dy
+        dx, dy = pixels[0, i] - theta[model.X0], pixels[1, i] - theta[model.Y0]
+        u, v = theta[model.P] * dx + theta[model.Q] * dy, theta[model.Q] * dx + theta[model.R] * dy
         if u * u + v * v > 1:
-            outside += data[2, i]
+            outside += pixels[2, i]
             n_out += 1
         else:
-            inside += data[2, i]
+            inside += pixels[2, i]
             n_in += 1
-        if data[2, i] >= saturation:
+        if pixels[2, i] >= saturation:
             flag |= _SATURATED
-    theta[5], theta[6] = 0.0, 0.0
+    theta[model.BACKGROUND], theta[model.CONTRAST] = 0.0, 0.0
     if n_out > 0 and n_in > 0:
-        theta[5], theta[6] = outside / n_out, inside / n_in - outside / n_out
-    theta[7], theta[8], theta[9] = BLUR_START, 0.0, 0.0
+        theta[model.BACKGROUND], theta[model.CONTRAST] = outside / n_out, inside / n_in - outside / n_out
+    theta[model.BLUR], theta[model.GAIN_X], theta[model.GAIN_Y] = BLUR_START, 0.0, 0.0
     return flag

@@ -10,11 +10,14 @@ from sfm.conventions import AnyArray, FloatArray
 from sfm.kernels.options import compiled
 from sfm.kernels.sampling import bilinear
 from sfm.targets.edge_rays import HARMONICS, RAYS, STEP_PX
-from sfm.targets.fits.blurred_ellipse import BLOCK, linearise
+from sfm.targets.fits import blurred_ellipse as model
 
-# Pixels used, sum of squared residuals, unevenness, L, steps, lobes and their sigma, share of strokes, halo
-# and its sigma, saturated share of the background, share of the circumference behind which glare is.
+# Columns of the statistics of a fit: pixels used, sum of squared residuals, unevenness, L in px, steps, lobes
+# and their sigma, share of strokes, halo and its sigma, saturated share of the background, share of the
+# circumference behind which glare is.
 STATISTICS = 12
+PIXELS, SQUARES, UNEVENNESS, LENGTH, STEPS, LOBES = range(6)
+LOBES_SIGMA, STROKES, HALO, HALO_SIGMA, SATURATED, GLARING = range(6, STATISTICS)
 # A background narrower than this, in radii, is a stroke: the rings of codes begin one radius from the edge.
 STROKE = 0.75
 # Behind a stroke this far is looked at, and what lies beyond so many contrasts from the background is glare.
@@ -28,7 +31,7 @@ _BAND_BLURS, _BAND_PX = 1.5, 1.0
 
 @compiled
 def judge_residuals(
-    data: FloatArray,
+    pixels: FloatArray,
     n: int,
     theta: FloatArray,
     length: float,
@@ -43,20 +46,20 @@ def judge_residuals(
     fourth harmonic of the direction, in radii: the ends of a bar and the corners of a square. Their sigma is
     that for unit noise.
     """
-    p, q, r = theta[2], theta[3], theta[4]
-    A, s = theta[6], theta[7]
+    p, q, r = theta[model.P], theta[model.Q], theta[model.R]
+    A, s = theta[model.CONTRAST], theta[model.BLUR]
     band = _BAND_PX + _BAND_BLURS * s
     mean, count = np.zeros(16), np.zeros(16)
     lobe, lobe_weight = np.zeros(4), np.full(4, 1e-12)
     squares, used = 0.0, 0.0
-    for first in range(0, n, BLOCK):
-        m = min(BLOCK, n - first)
-        linearise(data, first, m, theta, length, saturation, J)
+    for first in range(0, n, model.BLOCK):
+        m = min(model.BLOCK, n - first)
+        model.linearise(pixels, first, m, theta, length, saturation, J)
         for i in range(m):
-            residual = J[10 * BLOCK + i]
+            residual = J[model.RESIDUAL + i]
             squares += residual * residual
-            used += J[11 * BLOCK + i]
-            dx, dy = data[0, first + i] - theta[0], data[1, first + i] - theta[1]
+            used += J[model.WEIGHT + i]
+            dx, dy = pixels[0, first + i] - theta[model.X0], pixels[1, first + i] - theta[model.Y0]
             u, v = p * dx + q * dy, q * dx + r * dy
             rho = math.sqrt(u * u + v * v)
             nw = math.sqrt((p * u + q * v) ** 2 + (q * u + r * v) ** 2) + 1e-12
@@ -80,9 +83,9 @@ def judge_residuals(
             worst = max(worst, abs(mean[k]) / count[k])
         elif k >= 8:
             worst = abs(A)  # no background at all on this side
-    statistics[0], statistics[1], statistics[2] = used, squares, worst / abs(A)
-    statistics[5] = math.sqrt(np.sum((lobe / lobe_weight) ** 2))
-    statistics[6] = 1 / math.sqrt(lobe_weight.min())
+    statistics[PIXELS], statistics[SQUARES], statistics[UNEVENNESS] = used, squares, worst / abs(A)
+    statistics[LOBES] = math.sqrt(np.sum((lobe / lobe_weight) ** 2))
+    statistics[LOBES_SIGMA] = 1 / math.sqrt(lobe_weight.min())
 
 
 @compiled
@@ -94,8 +97,13 @@ def judge_background(image: AnyArray, theta: FloatArray, length: float, statisti
     retro-reflective target.
     """
     h, w = image.shape
-    x0, y0, p, q, r = theta[0], theta[1], theta[2], theta[3], theta[4]
-    B, A, gx, gy = theta[5], theta[6], theta[8] / length, theta[9] / length
+    x0, y0, p, q, r = theta[model.X0], theta[model.Y0], theta[model.P], theta[model.Q], theta[model.R]
+    B, A, gx, gy = (
+        theta[model.BACKGROUND],
+        theta[model.CONTRAST],
+        theta[model.GAIN_X] / length,
+        theta[model.GAIN_Y] / length,
+    )
     det = p * r - q * q
     strokes, glaring = 0, 0
     for k in range(RAYS):
@@ -119,36 +127,36 @@ def judge_background(image: AnyArray, theta: FloatArray, length: float, statisti
         if back < math.inf:
             strokes += highest < _GLARE
             glaring += highest >= _GLARE
-    statistics[7], statistics[11] = strokes / RAYS, glaring / RAYS
+    statistics[STROKES], statistics[GLARING] = strokes / RAYS, glaring / RAYS
 
 
 @compiled
 def judge_glow(
-    data: FloatArray, n: int, theta: FloatArray, saturation: float, statistics: FloatArray
+    pixels: FloatArray, n: int, theta: FloatArray, saturation: float, statistics: FloatArray
 ) -> None:
     """Set by how much the background beside the edge is nearer to the target than farther away, in contrasts.
 
     And the standard deviation of that, and the share of the background that is saturated.
     """
-    x0, y0, p, q, r = theta[0], theta[1], theta[2], theta[3], theta[4]
-    B, A, s = theta[5], theta[6], theta[7]
+    x0, y0, p, q, r = theta[model.X0], theta[model.Y0], theta[model.P], theta[model.Q], theta[model.R]
+    B, A, s = theta[model.BACKGROUND], theta[model.CONTRAST], theta[model.BLUR]
     begin = _EDGE_ENDS_BLURS * s
     total, count, saturated = np.zeros(2), np.zeros(2), 0.0
     for i in range(n):
-        dx, dy = data[0, i] - x0, data[1, i] - y0
+        dx, dy = pixels[0, i] - x0, pixels[1, i] - y0
         u, v = p * dx + q * dy, q * dx + r * dy
         rho = math.sqrt(u * u + v * v)
         d = rho * (rho - 1) / (math.sqrt((p * u + q * v) ** 2 + (q * u + r * v) ** 2) + 1e-12)
         if d < begin:
             continue
         far = 1 if d > begin + _HALO_PX else 0
-        total[far] += data[2, i] - B
+        total[far] += pixels[2, i] - B
         count[far] += 1
-        saturated += data[2, i] >= saturation
-    statistics[8], statistics[9], statistics[10] = 0.0, math.inf, 0.0
+        saturated += pixels[2, i] >= saturation
+    statistics[HALO], statistics[HALO_SIGMA], statistics[SATURATED] = 0.0, math.inf, 0.0
     if count[0] + count[1] > 0:
-        statistics[10] = saturated / (count[0] + count[1])
+        statistics[SATURATED] = saturated / (count[0] + count[1])
     if count[0] > 0 and count[1] > 0:
-        variance = statistics[1] / max(statistics[0] - len(theta), 1.0)
-        statistics[8] = (total[0] / count[0] - total[1] / count[1]) / A
-        statistics[9] = math.sqrt(variance * (1 / count[0] + 1 / count[1])) / abs(A)
+        variance = statistics[SQUARES] / max(statistics[PIXELS] - len(theta), 1.0)
+        statistics[HALO] = (total[0] / count[0] - total[1] / count[1]) / A
+        statistics[HALO_SIGMA] = math.sqrt(variance * (1 / count[0] + 1 / count[1])) / abs(A)

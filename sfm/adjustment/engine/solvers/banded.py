@@ -1,6 +1,6 @@
 """The reduced normal matrix as a band with a border: photographs near one another, the rest beside them.
 
-With the photographs in the order of `sfm.adjustment.engine.connectivity`
+With the photographs in the order of `sfm.adjustment.engine.solvers.choice`
 
     S = (A C; C' D)     A banded: exterior orientation; D: interior unknowns and kept points
 
@@ -18,18 +18,18 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
-from scipy.linalg import cho_factor, cho_solve, eigh, qr
+from scipy.linalg import cho_factor, eigh, qr
 from scipy.linalg.lapack import dpbtrf, dpbtrs
 
-from sfm.adjustment.engine.connectivity import Order
+from sfm.adjustment.engine.collinearity import Observations
 from sfm.adjustment.engine.motions import Motions
 from sfm.adjustment.engine.normals import Equations
+from sfm.adjustment.engine.solvers.banded_factor import BandFactor
 from sfm.adjustment.engine.solvers.dense import NULL, WEAK_PIVOT
 from sfm.adjustment.engine.unknowns import Unknowns
 from sfm.conventions import FloatArray, IntArray
 from sfm.kernels.blocks import subtract_pair
-from sfm.kernels.options import kernel
+from sfm.kernels.options import compiled, inlined, kernel
 from sfm.kernels.threads import at_once
 
 SHIFT = 1e-10  # share of the diagonal added to look for null vectors; far above rounding, far below weak ones
@@ -46,85 +46,101 @@ class BandMatrix(NamedTuple):
 
 
 @dataclass(frozen=True)
-class BandFactor:
-    """Factors of a banded reduced normal matrix with its null space held."""
+class BandSolver:
+    """The reduced normal matrix as a band."""
 
-    scale: FloatArray  # 1/sqrt of the unreduced diagonal, (reduced,)
-    rows: IntArray  # exterior unknown at each place of the band, (6 m,)
-    points: IntArray  # object points as the band meets them, (n,)
-    C: FloatArray  # (6 m, i + 3 s)
-    L: FloatArray  # A + holds = L L', stored as A
-    X: FloatArray  # A^-1 C, (6 m, i + 3 s)
-    corner: FloatArray  # upper Cholesky factor of D - C' A^-1 C, (i + 3 s, i + 3 s)
-    further: FloatArray  # null vectors that the datum does not explain, scaled, orthonormal, (reduced, e)
+    layout: Unknowns
+    place: IntArray  # place of each photograph in the band, (m,)
+    points: IntArray  # object points in the order of the first of their photographs, which keeps what is near
+    # in the band near in time, (n,)
+    width: int  # largest difference of the places of two photographs that share a point
 
-    def solve(self, right: FloatArray) -> FloatArray:
-        """Return a solution of S x = right for one or several right sides, (reduced,) or (reduced, r)."""
-        first = len(self.rows)
-        columns = right if right.ndim == 2 else right[:, None]
-        s = self.scale[:, None]
-        r = s * columns
-        z, _ = dpbtrs(self.L.T, r[self.rows], lower=1)
-        xb = r[first:] - self.C.T @ z
-        if len(xb):
-            xb = cho_solve((self.corner, False), xb)
-        x = np.empty_like(r)
-        x[self.rows] = z - self.X @ xb
-        x[first:] = xb
-        return np.asarray((s * x).reshape(right.shape))
+    @property
+    def has_coarse(self) -> bool:
+        """Whether a step on the way takes less time in single precision: never."""
+        return False
 
+    def factor(
+        self, equations: Equations, motions: Motions, *, damped: bool = False, coarse: bool = False
+    ) -> BandFactor | None:
+        """Return the factored reduced normal equations; Args: as `Solver.factor`."""
+        scale = equations.parts.scale
+        rows = (6 * np.argsort(self.place)[:, None] + np.arange(6)).ravel()
+        Q = np.linalg.qr(motions.reduced / scale[:, None])[0] if motions.defect else motions.reduced
+        holds = _largest(Q[: len(rows)])  # of exterior unknowns, else A would stay singular
+        matrix = self._matrix(equations, rows)
+        found = _factored(matrix, rows, holds)
+        further = np.zeros((self.layout.reduced, 0))
+        if not damped and (found is None or found.weak):
+            matrix = self._matrix(equations, rows)  # factoring has taken its place
+            further = self._null_vectors(matrix, rows, holds, Q)
+            found = _factored(matrix, rows, np.concatenate([holds, _largest(further)]))
+        if found is None:
+            return None
+        return self._factor_of(scale, rows, matrix, found, further)
 
-def factor_band(
-    equations: Equations, layout: Unknowns, motions: Motions, order: Order, *, damped: bool = False
-) -> BandFactor | None:
-    """Return the factored reduced normal equations; None if they are not positive definite.
+    def _matrix(self, equations: Equations, rows: IntArray) -> BandMatrix:
+        """Return the scaled matrix, photographs in the order of the band."""
+        b, parts = equations.blocks, equations.parts
+        first, border = len(rows), len(parts.corner)
+        A = np.zeros((first, 6 * self.width + 6))
+        C = parts.border[rows]
+        inner = b.Y_interior.shape[2]
+        interior = b.Y_interior.reshape(-1, inner)
+        D = parts.corner.copy()
+        D[:inner, :inner] -= interior.T @ interior
+        flat = np.reshape(A, -1)
+        stride = A.shape[1] - 1  # element (r, c) of the matrix at c stride + r
 
-    Args:
-        equations: normal equations with object points eliminated.
-        layout: order of the unknowns.
-        motions: null vectors that the datum explains.
-        order: of the photographs.
-        damped: whether the equations carry damping, so that no further null vectors are sought.
-    """
-    scale = equations.parts.scale
-    rows = (6 * np.argsort(order.place)[:, None] + np.arange(6)).ravel()
-    Q = np.linalg.qr(motions.reduced / scale[:, None])[0] if motions.defect else motions.reduced
-    holds = _largest(Q[: len(rows)])  # of exterior unknowns, else A would stay singular
-    matrix = _matrix(equations, layout, order, rows)
-    found = _factored(matrix, rows, holds)
-    further = np.zeros((layout.reduced, 0))
-    if not damped and (found is None or found.weak):
-        matrix = _matrix(equations, layout, order, rows)  # factoring has taken its place
-        further = _null_vectors(matrix, rows, holds, Q)
-        found = _factored(matrix, rows, np.concatenate([holds, _largest(further)]))
-    if found is None:
-        return None
-    return BandFactor(scale, rows, order.points, matrix.C, found.L, found.X, found.corner, further)
+        def add(begin: int, end: int) -> None:
+            _add_pairs(
+                self.layout.observations,
+                b.U,
+                b.Y,
+                b.Y_interior,
+                self.place,
+                self.points,
+                begin,
+                end,
+                flat,
+                stride,
+                C,
+            )
 
+        half = len(b.U) // 2
+        at_once(lambda: add(0, half), lambda: add(half, len(b.U)))
+        s, sb = parts.scale[rows], parts.scale[first:]
+        _scale_band(A, s, 1 + equations.damping)
+        C *= s[:, None] * sb
+        D *= sb[:, None] * sb
+        D[np.arange(border), np.arange(border)] += equations.damping
+        return BandMatrix(A, C, D)
 
-def _matrix(equations: Equations, layout: Unknowns, order: Order, rows: IntArray) -> BandMatrix:
-    b, parts = equations.blocks, equations.parts
-    first, border = len(rows), len(parts.corner)
-    A = np.zeros((first, 6 * order.width + 6))
-    C = parts.border[rows]
-    inner = b.Z.shape[2]
-    interior = b.Z.reshape(-1, inner)
-    D = parts.corner.copy()
-    D[:inner, :inner] -= interior.T @ interior
-    flat = np.reshape(A, -1)
-    stride = A.shape[1] - 1  # element (r, c) of the matrix at c stride + r
+    def _null_vectors(self, matrix: BandMatrix, rows: IntArray, holds: IntArray, Q: FloatArray) -> FloatArray:
+        """Return null vectors that are none of the motions Q, orthonormal, by inverse iteration."""
+        found = _factored(matrix._replace(A=matrix.A.copy()), rows, holds, SHIFT)
+        if found is None:
+            return np.zeros((len(Q), 0))
+        factor = self._factor_of(np.ones(len(Q)), rows, matrix, found, Q)
+        sought = FIRST_SOUGHT
+        while True:
+            V = np.random.default_rng(0).standard_normal((len(Q), sought))
+            for _ in range(INVERSE_STEPS):
+                V = factor.solve(np.linalg.qr(V - Q @ (Q.T @ V))[0])
+            V = np.linalg.qr(V - Q @ (Q.T @ V))[0]
+            values, vectors = eigh(V.T @ _times(matrix, rows, V))
+            null = values < NULL
+            if not null.all() or sought >= len(Q):
+                return np.asarray(V @ vectors[:, null])
+            sought *= 2
 
-    def add(begin: int, end: int) -> None:
-        _add_pairs(layout.obs, b.U, b.Y, b.Z, order.place, order.points, begin, end, flat, stride, C)
-
-    half = len(b.U) // 2
-    at_once(lambda: add(0, half), lambda: add(half, len(b.U)))
-    s, sb = parts.scale[rows], parts.scale[first:]
-    _scale_band(A, s, 1 + equations.damping)
-    C *= s[:, None] * sb
-    D *= sb[:, None] * sb
-    D[np.arange(border), np.arange(border)] += equations.damping
-    return BandMatrix(A, C, D)
+    def _factor_of(
+        self, scale: FloatArray, rows: IntArray, matrix: BandMatrix, found: _Factored, further: FloatArray
+    ) -> BandFactor:
+        """Return the factor with all that belongs to it."""
+        return BandFactor(
+            self.layout, scale, rows, self.points, matrix.C, found.L, found.X, found.corner, further
+        )
 
 
 class _Factored(NamedTuple):
@@ -162,25 +178,6 @@ def _factored(matrix: BandMatrix, rows: IntArray, holds: IntArray, shift: float 
     return _Factored(L.T, np.asarray(X), corner, bool(pivots.min() ** 2 < WEAK_PIVOT))
 
 
-def _null_vectors(matrix: BandMatrix, rows: IntArray, holds: IntArray, Q: FloatArray) -> FloatArray:
-    """Return null vectors that are none of the motions Q, orthonormal, by inverse iteration."""
-    found = _factored(matrix._replace(A=matrix.A.copy()), rows, holds, SHIFT)
-    if found is None:
-        return np.zeros((len(Q), 0))
-    factor = BandFactor(np.ones(len(Q)), rows, rows, matrix.C, found.L, found.X, found.corner, Q)
-    sought = FIRST_SOUGHT
-    while True:
-        V = np.random.default_rng(0).standard_normal((len(Q), sought))
-        for _ in range(INVERSE_STEPS):
-            V = factor.solve(np.linalg.qr(V - Q @ (Q.T @ V))[0])
-        V = np.linalg.qr(V - Q @ (Q.T @ V))[0]
-        values, vectors = eigh(V.T @ _times(matrix, rows, V))
-        null = values < NULL
-        if not null.all() or sought >= len(Q):
-            return np.asarray(V @ vectors[:, null])
-        sought *= 2
-
-
 def _largest(vectors: FloatArray) -> IntArray:
     """Return as many rows as there are vectors, in which these are as independent as can be."""
     if vectors.shape[1] == 0:
@@ -202,8 +199,20 @@ def _times(matrix: BandMatrix, rows: IntArray, V: FloatArray) -> FloatArray:
 
 
 @kernel
-def _add_pairs(obs, U, Y, Z, place, points, begin, end, flat, stride, C):  # type: ignore[no-untyped-def]
-    """Add U - Y Y' of photographs to the band and -Y Z of interior unknowns to the border C.
+def _add_pairs(
+    observations: Observations,
+    U: FloatArray,
+    Y: FloatArray,
+    Y_interior: FloatArray,
+    place: IntArray,
+    points: IntArray,
+    begin: int,
+    end: int,
+    flat: FloatArray,
+    stride: int,
+    C: FloatArray,
+) -> None:
+    """Add U - Y Y' of photographs to the band and -Y Y_interior of interior unknowns to the border C.
 
     Takes the columns of the photographs in places begin to end, so that others can be taken at the same time.
     """
@@ -214,13 +223,13 @@ def _add_pairs(obs, U, Y, Z, place, points, begin, end, flat, stride, C):  # typ
                 for p in range(q, 6):
                     flat[(c + q) * stride + c + p] += U[i, p, q]
     for j in points:
-        for s in range(obs.start[j], obs.start[j + 1]):
-            own = place[obs.image[s]]
+        for s in range(observations.start[j], observations.start[j + 1]):
+            own = place[observations.image[s]]
             if begin <= own < end:
-                _add_border(6 * own, Y, s, Z, j, C)
+                _add_border(6 * own, Y, s, Y_interior, j, C)
                 _add_triangle(flat, 6 * own, stride, Y, s, s)
-            for t in range(obs.start[j], s):
-                other = place[obs.image[t]]
+            for t in range(observations.start[j], s):
+                other = place[observations.image[t]]
                 if begin <= min(own, other) < end:
                     if other < own:
                         subtract_pair(flat, 6 * other * stride + 6 * own, stride, Y, t, s)
@@ -231,24 +240,24 @@ def _add_pairs(obs, U, Y, Z, place, points, begin, end, flat, stride, C):  # typ
                         _add_triangle(flat, 6 * own, stride, Y, t, s)
 
 
-@njit(cache=True, inline="always", error_model="numpy")
-def _add_border(row, Y, s, Z, j, C):  # type: ignore[no-untyped-def]
+@inlined
+def _add_border(row: int, Y: FloatArray, s: int, Y_interior: FloatArray, j: int, C: FloatArray) -> None:
     for q in range(6):
         s0, s1, s2 = Y[s, 0, q], Y[s, 1, q], Y[s, 2, q]
-        for c in range(Z.shape[2]):
-            C[row + q, c] -= s0 * Z[j, 0, c] + s1 * Z[j, 1, c] + s2 * Z[j, 2, c]
+        for c in range(Y_interior.shape[2]):
+            C[row + q, c] -= s0 * Y_interior[j, 0, c] + s1 * Y_interior[j, 1, c] + s2 * Y_interior[j, 2, c]
 
 
-@njit(cache=True, inline="always", error_model="numpy")
-def _add_triangle(flat, column, stride, Y, s, t):  # type: ignore[no-untyped-def]
+@inlined
+def _add_triangle(flat: FloatArray, column: int, stride: int, Y: FloatArray, s: int, t: int) -> None:
     for q in range(6):
         for p in range(q, 6):
             product = Y[s, 0, q] * Y[t, 0, p] + Y[s, 1, q] * Y[t, 1, p] + Y[s, 2, q] * Y[t, 2, p]
             flat[(column + q) * stride + column + p] -= product
 
 
-@njit(cache=True, error_model="numpy")
-def _scale_band(A, scale, stretch):  # type: ignore[no-untyped-def]
+@compiled
+def _scale_band(A: FloatArray, scale: FloatArray, stretch: float) -> None:
     """Scale a band by rows and columns; its diagonal was 1 before anything was taken off."""
     for c in range(len(A)):
         for d in range(min(A.shape[1], len(A) - c)):
@@ -256,8 +265,8 @@ def _scale_band(A, scale, stretch):  # type: ignore[no-untyped-def]
         A[c, 0] += stretch - 1.0
 
 
-@njit(cache=True, error_model="numpy")
-def _band_times(A, V, out):  # type: ignore[no-untyped-def]
+@compiled
+def _band_times(A: FloatArray, V: FloatArray, out: FloatArray) -> None:
     """Add the product of a symmetric band and vectors (6 m, e) to out."""
     for c in range(len(A)):
         for d in range(min(A.shape[1], len(A) - c)):

@@ -13,10 +13,10 @@ Source: Takahashi, Fagan and Chin (1973), Formation of a sparse bus impedance ma
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from scipy.linalg.lapack import dtrtri
 
 from sfm.conventions import FloatArray
+from sfm.kernels.options import compiled
 
 BLOCK = 96  # columns at a time; large enough for matrix products, small against a band
 
@@ -55,16 +55,16 @@ def band_inverse(L: FloatArray) -> FloatArray:
     return Z
 
 
-@njit(cache=True)
-def _unpack(L, start, panel):  # type: ignore[no-untyped-def]
+@compiled
+def _unpack(L: FloatArray, start: int, panel: FloatArray) -> None:
     """Copy columns of a band, from start, into a dense panel whose first row is start."""
     for c in range(panel.shape[1]):
         for d in range(min(L.shape[1], len(panel) - c)):
             panel[c + d, c] = L[start + c, d]
 
 
-@njit(cache=True)
-def _pack(panel, start, Z):  # type: ignore[no-untyped-def]
+@compiled
+def _pack(panel: FloatArray, start: int, Z: FloatArray) -> None:
     """Copy a dense panel whose first row is start into columns of a band."""
     for c in range(panel.shape[1]):
         for d in range(min(Z.shape[1], len(panel) - c)):

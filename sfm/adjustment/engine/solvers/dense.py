@@ -5,45 +5,99 @@ solution is the one with Q'dx = 0: an inner constraint, not damping. Directions 
 cannot determine although the datum does not explain them are found as further null vectors and held in
 the same way, so that everything else is still estimated; they are reported.
 
-Source: Foerstner and Wrobel (2016), sec. 4.5; Luhmann et al. (2020), sec. 4.4.3.
+Y Y' is summed as a product of full rows (`full_rows`) or pair by pair of rays (`pairs`), and so are the
+elements of S^-1 that marginal covariances are made of.
+
+Source: Foerstner and Wrobel (2016), sec. 4.5 and 15.2.5; Luhmann et al. (2020), sec. 4.4.3.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from scipy.linalg import eigh
 from scipy.linalg.blas import dsyrk, ssyrk
-from scipy.linalg.lapack import dpotrf, dpotrs, dtrtri, spotrf, spotrs
+from scipy.linalg.lapack import dlauum, dpotrf, dpotrs, dtrtri, spotrf, spotrs
 
+from sfm.adjustment.engine.accumulate import Blocks
+from sfm.adjustment.engine.collinearity import Observations
 from sfm.adjustment.engine.motions import Motions
-from sfm.adjustment.engine.normals import Blocks, Equations
-from sfm.adjustment.engine.solvers.pairs import Pairs, subtract_squares
+from sfm.adjustment.engine.normals import Equations
+from sfm.adjustment.engine.products import times_reduced
+from sfm.adjustment.engine.solvers.full_rows import (
+    HALVED,
+    multiply_rows,
+    pick_columns,
+    rows_of,
+    subtract_square,
+    times_triangle,
+)
+from sfm.adjustment.engine.solvers.pairs import Pairs, subtract_squares, times_inverse
+from sfm.adjustment.engine.solvers.protocol import Inverse
 from sfm.adjustment.engine.unknowns import Unknowns
 from sfm.conventions import FloatArray
 from sfm.errors import GeometryError
+from sfm.kernels.options import compiled, kernel
 from sfm.kernels.threads import at_once
 
 NULL = 1e-12  # eigenvalue of the scaled matrix (diagonal at most 1) taken as 0; rounding leaves 1e-15
 WEAK_PIVOT = 1e-11  # squared pivot below which the eigenvalues are looked at
 WEAK_SINGLE = 1e-5  # the same in single precision, whose rounding leaves 1e-6
-CHUNK = 1_000_000  # numbers of rows Y' that are multiplied at a time, at least
-ROWS = 2  # and rows for each unknown: adding up the products would take longer than forming them otherwise
-HALVED = 200**2  # elements of the matrix from which its halves are formed by themselves
 LARGEST_BYTES = 6e9  # of the full matrix; larger ones would swap
+SINGLE_FROM = 200  # reduced unknowns from which the product in single precision saves time
 
 
 @dataclass(frozen=True)
-class Factor:
+class DenseSolver:
+    """The reduced normal matrix in full."""
+
+    layout: Unknowns
+    pairs: Pairs | None = None  # places of the rays where it is summed pair by pair; else a product of rows
+
+    @property
+    def has_coarse(self) -> bool:
+        """Whether a step on the way takes less time in single precision."""
+        return self.pairs is None and self.layout.reduced >= SINGLE_FROM
+
+    def factor(
+        self, equations: Equations, motions: Motions, *, damped: bool = False, coarse: bool = False
+    ) -> DenseFactor | None:
+        """Return the factored reduced normal equations; Args: as `Solver.factor`.
+
+        Raises:
+            GeometryError: the matrix would not fit in memory.
+        """
+        scale = equations.parts.scale
+        S = schur_complement(equations, self.layout, self.pairs, single=coarse)
+        Q = np.linalg.qr(motions.reduced / scale[:, None])[0] if motions.defect else motions.reduced
+        if motions.defect:
+            S = (ssyrk if coarse else dsyrk)(1.0, Q, beta=1.0, c=S, overwrite_c=1)
+        further = np.zeros((len(S), 0))
+        if coarse:
+            cholesky, info = spotrf(S, clean=0, overwrite_a=1)
+            weak = info != 0 or float(np.diagonal(cholesky).min()) ** 2 < WEAK_SINGLE
+            return None if weak else DenseFactor(self.layout, self.pairs, scale, cholesky, further)
+        cholesky, info = dpotrf(S)
+        weak = info != 0 or float(np.diagonal(cholesky).min()) ** 2 < WEAK_PIVOT
+        if weak and not damped:
+            values, vectors = eigh(S, lower=False)
+            further = np.asfortranarray(vectors[:, values < NULL])
+            if further.shape[1]:
+                filled = dsyrk(1.0, further, beta=1.0, c=S)
+                cholesky, info = dpotrf(filled)
+        return None if info != 0 else DenseFactor(self.layout, self.pairs, scale, cholesky, further)
+
+
+@dataclass(frozen=True)
+class DenseFactor:
     """Cholesky factor of the scaled reduced normal matrix with its null space filled."""
 
+    layout: Unknowns
+    pairs: Pairs | None  # where it was summed pair by pair
     scale: FloatArray  # 1/sqrt of the unreduced diagonal, (reduced,)
     cholesky: FloatArray  # upper factor of S + QQ' scaled, (reduced, reduced)
     further: FloatArray  # null vectors that the datum does not explain, scaled, orthonormal, (reduced, e)
-    pairs: Pairs | None  # where it was summed pair by pair
 
     def solve(self, right: FloatArray) -> FloatArray:
         """Return S^+ right for one or several right sides, (reduced,) or (reduced, r)."""
@@ -58,79 +112,62 @@ class Factor:
         W *= self.scale[:, None]
         return np.asarray(W)
 
+    def inverse(self, blocks: Blocks, *, cross: bool) -> Inverse:
+        """Return the elements of the inverse; Args: as `Factor.inverse`."""
+        b, layout = blocks, self.layout
+        m, n = len(b.U), len(b.y)
+        W = self.inverse_root()
+        free = layout.reduced_free()
+        if not free.all():
+            W *= free[:, None]
+        Q, _ = dlauum(W)
+        _mirror(Q)
+        first = 6 * m
+        wanted = cross or self.pairs is not None
+        core = np.empty((n, 3, 3))
+        YQ = np.empty((len(b.Y) if wanted else 0, 3, 6))
+        YQ_border = np.empty((n if wanted else 0, 3, layout.reduced - first))
+        if self.pairs is not None:
+            times_inverse(self.pairs, layout.observations, b.Y, Q.T, b.Y_interior, YQ)
+            times_reduced(layout.observations, b, np.ascontiguousarray(Q[:, first:]), YQ_border)
+            _core(layout.observations, YQ, b.Y, YQ_border, b.Y_interior, core)
+        else:
+            half = n // 2 if layout.reduced**2 >= HALVED else n
 
-def factor(
-    equations: Equations,
-    layout: Unknowns,
-    motions: Motions,
-    pairs: Pairs | None = None,
-    *,
-    damped: bool = False,
-    single: bool = False,
-) -> Factor | None:
-    """Return the factored reduced normal equations; None if they are not positive definite.
+            def products(begin: int, end: int) -> None:
+                for start, rows in rows_of(b, layout, np.ones(layout.reduced), np.float64, begin, end):
+                    own = slice(start, start + len(rows) // 3)
+                    if cross:
+                        rowsQ = rows @ Q
+                        pick_columns(layout.observations, rowsQ, start, YQ, YQ_border)
+                        multiply_rows(rowsQ, rows, core[own])
+                    else:
+                        white = times_triangle(rows, W)
+                        multiply_rows(white, white, core[own])
 
-    Args:
-        equations: normal equations with object points eliminated.
-        layout: order of the unknowns.
-        motions: null vectors that the datum explains.
-        pairs: places of the rays where the matrix is summed pair by pair, None: as a product of full rows.
-        damped: whether the equations carry damping, so that no further null vectors are sought.
-        single: whether all this may be in single precision, for a step on the way; None if that is too weak.
-
-    Raises:
-        GeometryError: the matrix would not fit in memory.
-    """
-    scale = equations.parts.scale
-    S = schur_complement(equations, layout, pairs, single=single)
-    Q = np.linalg.qr(motions.reduced / scale[:, None])[0] if motions.defect else motions.reduced
-    if motions.defect:
-        S = (ssyrk if single else dsyrk)(1.0, Q, beta=1.0, c=S, overwrite_c=1)
-    further = np.zeros((len(S), 0))
-    if single:
-        cholesky, info = spotrf(S, clean=0, overwrite_a=1)
-        weak = info != 0 or float(np.diagonal(cholesky).min()) ** 2 < WEAK_SINGLE
-        return None if weak else Factor(scale, cholesky, further, pairs)
-    cholesky, info = dpotrf(S)
-    weak = info != 0 or float(np.diagonal(cholesky).min()) ** 2 < WEAK_PIVOT
-    if weak and damped:
-        return None if info != 0 else Factor(scale, cholesky, further, pairs)
-    if weak:
-        values, vectors = eigh(S, lower=False)
-        further = np.asfortranarray(vectors[:, values < NULL])
-        if further.shape[1]:
-            filled = dsyrk(1.0, further, beta=1.0, c=S)
-            cholesky, info = dpotrf(filled)
-        if info != 0:
-            return None
-    return Factor(scale, cholesky, further, pairs)
-
-
-def rows_of(
-    blocks: Blocks,
-    layout: Unknowns,
-    scale: FloatArray,
-    dtype: type,
-    begin: int = 0,
-    end: int | None = None,
-) -> Iterator[tuple[int, FloatArray]]:
-    """Yield rows Y' times scale, some object points at a time: the first point, and (3 points, reduced).
-
-    The next rows take the place of the last ones. Begins and ends with object points begin and end, if given.
-    """
-    end, width = len(blocks.y) if end is None else end, layout.reduced
-    points = max(min(end - begin, max(ROWS * width, CHUNK // width) // 3 + 1), 1)
-    space: FloatArray = np.empty((3 * points, width), dtype=dtype)
-    for first in range(begin, end, points):
-        rows = space[: 3 * min(points, end - first)]
-        _fill(layout.obs, blocks.Y, blocks.Z, scale, first, rows)
-        yield first, rows
+            at_once(lambda: products(0, half), lambda: products(half, n))
+        if not cross:
+            YQ, YQ_border = YQ[:0], YQ_border[:0]
+        block = np.arange(first).reshape(m, 6)
+        return Inverse(
+            Q[block[:, :, None], block[:, None, :]], Q[:first, first:], Q[first:, first:], core, YQ, YQ_border
+        )
 
 
 def schur_complement(
     equations: Equations, layout: Unknowns, pairs: Pairs | None = None, *, single: bool = False
 ) -> FloatArray:
-    """Return S = U - Y Y' scaled, upper triangle, column-major."""
+    """Return S = U - Y Y' scaled, upper triangle, column-major, (reduced, reduced).
+
+    Args:
+        equations: normal equations with object points eliminated.
+        layout: order of the unknowns.
+        pairs: places of the rays where it is summed pair by pair, None: as a product of full rows.
+        single: whether it is wanted in single precision.
+
+    Raises:
+        GeometryError: the matrix would not fit in memory.
+    """
     size = 8.0 * layout.reduced**2
     if size > LARGEST_BYTES:
         raise GeometryError(
@@ -143,54 +180,19 @@ def schur_complement(
     if pairs is None:
         product = np.empty_like(S)
         for _, rows in rows_of(b, layout, parts.scale, dtype):
-            _subtract_square(rows, product, S)
+            subtract_square(rows, product, S)
     else:
-        subtract_squares(pairs, layout.obs, b.Y, b.Z, S)
+        subtract_squares(pairs, layout.observations, b.Y, b.Y_interior, S)
         S *= parts.scale
         S *= parts.scale[:, None]
     _add_blocks(b.U, parts.border, parts.corner, parts.scale, 1 + equations.damping, S.T)
     return S.T
 
 
-def _subtract_square(rows: FloatArray, product: FloatArray, S: FloatArray) -> None:
-    """Take rows' rows off the lower triangle of S: both triangles of its halves in one thread, the square
-    between them, which is as many operations, in another. numpy's product lets other threads run."""
-    half = S.shape[0] // 2
-    left, right = rows[:, :half], rows[:, half:]
-
-    def subtract(a: FloatArray, b: FloatArray, row: int, column: int) -> None:
-        own = slice(row, row + a.shape[1]), slice(column, column + b.shape[1])
-        np.matmul(a.T, b, out=product[own])
-        S[own] -= product[own]
-
-    def triangles() -> None:
-        subtract(left, left, 0, 0)
-        subtract(right, right, half, half)
-
-    if S.size < HALVED:
-        subtract(rows, rows, 0, 0)
-    else:
-        at_once(triangles, lambda: subtract(right, left, half, 0))
-
-
-@njit(cache=True, error_model="numpy", nogil=True)
-def _fill(obs, Y, Z, scale, first, rows):  # type: ignore[no-untyped-def]
-    start = 6 * len(obs.camera)
-    for h in range(len(rows) // 3):
-        j = first + h
-        rows[3 * h : 3 * h + 3] = 0.0
-        for o in range(obs.start[j], obs.start[j + 1]):
-            c = 6 * obs.image[o]
-            for p in range(3):
-                for q in range(6):
-                    rows[3 * h + p, c + q] += Y[o, p, q] * scale[c + q]
-        for p in range(3):
-            for q in range(Z.shape[2]):
-                rows[3 * h + p, start + q] = Z[j, p, q] * scale[start + q]
-
-
-@njit(cache=True, error_model="numpy")
-def _add_blocks(U, border, corner, scale, stretch, S):  # type: ignore[no-untyped-def]
+@compiled
+def _add_blocks(
+    U: FloatArray, border: FloatArray, corner: FloatArray, scale: FloatArray, stretch: float, S: FloatArray
+) -> None:
     """Add the scaled blocks to the upper triangle of S."""
     first = 6 * len(U)
     for i in range(len(U)):
@@ -204,3 +206,35 @@ def _add_blocks(U, border, corner, scale, stretch, S):  # type: ignore[no-untype
         for p in range(q + 1):
             value = corner[p, q] * scale[first + p] * scale[first + q]
             S[first + p, first + q] += value * stretch if p == q else value
+
+
+@compiled
+def _mirror(Q: FloatArray) -> None:
+    """Copy the upper triangle to the lower one."""
+    for q in range(len(Q)):
+        for p in range(q):
+            Q[q, p] = Q[p, q]
+
+
+@kernel
+def _core(
+    observations: Observations,
+    YQ: FloatArray,
+    Y: FloatArray,
+    YQ_border: FloatArray,
+    Y_interior: FloatArray,
+    core: FloatArray,
+) -> None:
+    """Fill Y'Q Y of each object point."""
+    for j in range(len(core)):
+        for p in range(3):
+            for q in range(3):
+                total = 0.0
+                for c in range(Y_interior.shape[2]):
+                    total += YQ_border[j, p, c] * Y_interior[j, q, c]
+                core[j, p, q] = total
+        for o in range(observations.start[j], observations.start[j + 1]):
+            for p in range(3):
+                for q in range(3):
+                    for r in range(6):
+                        core[j, p, q] += YQ[o, p, r] * Y[o, q, r]

@@ -31,57 +31,59 @@ class Pairs:
     @property
     def tiles(self) -> int:
         """Number of tiles of photographs."""
-        return self.cut.shape[1] - 1
+        return int(self.cut.shape[1]) - 1
 
 
-def pairs_of(obs: Observations) -> Pairs:
+def pairs_of(observations: Observations) -> Pairs:
     """Return where the rays of each object point lie among the tiles of photographs."""
-    tiles = -(-len(obs.camera) // TILE)
-    cut = np.empty((len(obs.start) - 1, tiles + 1), dtype=np.int64)
-    _cut(obs, cut)
+    tiles = -(-len(observations.camera) // TILE)
+    cut = np.empty((len(observations.start) - 1, tiles + 1), dtype=np.int64)
+    _cut(observations, cut)
     return Pairs(cut)
 
 
-def subtract_squares(pairs: Pairs, obs: Observations, Y: FloatArray, Z: FloatArray, S: FloatArray) -> None:
-    """Take Y Y' and Z Z' off the lower triangle of S, row-major.
+def subtract_squares(
+    pairs: Pairs, observations: Observations, Y: FloatArray, Y_interior: FloatArray, S: FloatArray
+) -> None:
+    """Take Y Y' and Y_interior Y_interior' off the lower triangle of S, row-major.
 
     Args:
         pairs: places of the rays.
-        obs: image points.
+        observations: image points.
         Y: rows Y' of each image point by X0, w of its photograph, (k, 3, 6).
-        Z: rows Y' of each object point by the interior unknowns, (n, 3, i).
+        Y_interior: rows Y' of each object point by the interior unknowns, (n, 3, i).
         S: at least 6 m + i rows and columns.
     """
     flat = S.reshape(-1)
-    first, inner = 6 * len(obs.camera), Z.shape[2]
+    first, inner = 6 * len(observations.camera), Y_interior.shape[2]
 
     def subtract(row: int, column: int) -> None:
-        _subtract_tile(row, column, pairs.cut, obs, Y, flat, len(S))
+        _subtract_tile(row, column, pairs.cut, observations, Y, flat, len(S))
 
     _halves(subtract, [(row, column) for row in range(pairs.tiles) for column in range(row + 1)])
-    _subtract_border(obs, Y, Z, S[first : first + inner])
-    flat_Z = Z.reshape(-1, inner)
-    S[first : first + inner, first : first + inner] -= flat_Z.T @ flat_Z
+    _subtract_border(observations, Y, Y_interior, S[first : first + inner])
+    flat_interior = Y_interior.reshape(-1, inner)
+    S[first : first + inner, first : first + inner] -= flat_interior.T @ flat_interior
 
 
 def times_inverse(
-    pairs: Pairs, obs: Observations, Y: FloatArray, Q: FloatArray, border: FloatArray, YQ: FloatArray
+    pairs: Pairs, observations: Observations, Y: FloatArray, Q: FloatArray, border: FloatArray, YQ: FloatArray
 ) -> None:
     """Fill YQ with the rows Y'Q of each image point by X0, w of its photograph, (k, 3, 6).
 
     Args:
         pairs: places of the rays.
-        obs: image points.
+        observations: image points.
         Y: rows Y' of each image point by X0, w of its photograph, (k, 3, 6).
         Q: symmetric matrix, row-major, (reduced, reduced).
         border: rows Y' of each object point by the interior unknowns, (n, 3, i).
         YQ: what is filled.
     """
-    _border_times(obs, border, Q[6 * len(obs.camera) :], YQ)
+    _border_times(observations, border, Q[6 * len(observations.camera) :], YQ)
 
     def add(row: int, _: int) -> None:
         for column in range(pairs.tiles):
-            _add_tile(row, column, pairs.cut, obs, Y, Q.reshape(-1), len(Q), YQ)
+            _add_tile(row, column, pairs.cut, observations, Y, Q.reshape(-1), len(Q), YQ)
 
     _halves(add, [(row, row) for row in range(pairs.tiles)])
 
@@ -97,58 +99,79 @@ def _halves(work: Callable[[int, int], None], tiles: list[tuple[int, int]]) -> N
 
 
 @kernel
-def _cut(obs, cut):  # type: ignore[no-untyped-def]
+def _cut(observations: Observations, cut: IntArray) -> None:
     for j in range(len(cut)):
-        o = obs.start[j]
+        o = observations.start[j]
         for tile in range(cut.shape[1]):
-            while o < obs.start[j + 1] and obs.image[o] < tile * TILE:
+            while o < observations.start[j + 1] and observations.image[o] < tile * TILE:
                 o += 1
             cut[j, tile] = o
 
 
 @kernel
-def _subtract_tile(row, column, cut, obs, Y, flat, stride):  # type: ignore[no-untyped-def]
+def _subtract_tile(
+    row: int,
+    column: int,
+    cut: IntArray,
+    observations: Observations,
+    Y: FloatArray,
+    flat: FloatArray,
+    stride: int,
+) -> None:
     """Take Y Y' off the blocks of the photographs of one tile by those of another that is not behind it."""
     for j in range(len(cut)):
         for s in range(cut[j, row], cut[j, row + 1]):
-            at = 6 * obs.image[s] * stride
+            at = 6 * observations.image[s] * stride
             for t in range(cut[j, column], min(cut[j, column + 1], s + 1)):
-                subtract_pair(flat, at + 6 * obs.image[t], stride, Y, s, t)
-                if obs.image[s] == obs.image[t] and s != t:  # a point measured twice in a photograph
-                    subtract_pair(flat, at + 6 * obs.image[t], stride, Y, t, s)
+                subtract_pair(flat, at + 6 * observations.image[t], stride, Y, s, t)
+                if (
+                    observations.image[s] == observations.image[t] and s != t
+                ):  # a point measured twice in a photograph
+                    subtract_pair(flat, at + 6 * observations.image[t], stride, Y, t, s)
 
 
 @kernel
-def _subtract_border(obs, Y, Z, S):  # type: ignore[no-untyped-def]
-    """Take Z Y' off the rows S of the interior unknowns."""
-    for j in range(len(Z)):
-        for o in range(obs.start[j], obs.start[j + 1]):
-            column = 6 * obs.image[o]
+def _subtract_border(
+    observations: Observations, Y: FloatArray, Y_interior: FloatArray, S: FloatArray
+) -> None:
+    """Take Y_interior Y' off the rows S of the interior unknowns."""
+    for j in range(len(Y_interior)):
+        for o in range(observations.start[j], observations.start[j + 1]):
+            column = 6 * observations.image[o]
             for c in range(len(S)):
-                z0, z1, z2 = Z[j, 0, c], Z[j, 1, c], Z[j, 2, c]
+                z0, z1, z2 = Y_interior[j, 0, c], Y_interior[j, 1, c], Y_interior[j, 2, c]
                 for q in range(6):
                     S[c, column + q] -= z0 * Y[o, 0, q] + z1 * Y[o, 1, q] + z2 * Y[o, 2, q]
 
 
 @kernel
-def _add_tile(row, column, cut, obs, Y, flat, stride, YQ):  # type: ignore[no-untyped-def]
+def _add_tile(
+    row: int,
+    column: int,
+    cut: IntArray,
+    observations: Observations,
+    Y: FloatArray,
+    flat: FloatArray,
+    stride: int,
+    YQ: FloatArray,
+) -> None:
     """Add to Y'Q of the image points of one tile of photographs what those of another bring."""
     for j in range(len(cut)):
         for s in range(cut[j, row], cut[j, row + 1]):
             for t in range(cut[j, column], cut[j, column + 1]):
-                at = 6 * obs.image[t] * stride + 6 * obs.image[s]
+                at = 6 * observations.image[t] * stride + 6 * observations.image[s]
                 add_product(YQ, s, Y, t, flat, at, stride)
 
 
 @kernel
-def _border_times(obs, Z, Q, YQ):  # type: ignore[no-untyped-def]
-    """Fill YQ with what the rows Z of the interior unknowns bring; Q their rows, (i, reduced)."""
-    for j in range(len(Z)):
-        for o in range(obs.start[j], obs.start[j + 1]):
-            column = 6 * obs.image[o]
+def _border_times(observations: Observations, Y_interior: FloatArray, Q: FloatArray, YQ: FloatArray) -> None:
+    """Fill YQ with what the rows Y_interior of the interior unknowns bring; Q their rows, (i, reduced)."""
+    for j in range(len(Y_interior)):
+        for o in range(observations.start[j], observations.start[j + 1]):
+            column = 6 * observations.image[o]
             for p in range(3):
                 for q in range(6):
                     total = 0.0
-                    for c in range(Z.shape[2]):
-                        total += Z[j, p, c] * Q[c, column + q]
+                    for c in range(Y_interior.shape[2]):
+                        total += Y_interior[j, p, c] * Q[c, column + q]
                     YQ[o, p, q] = total

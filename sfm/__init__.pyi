@@ -1,0 +1,32 @@
+"""The public names of Kolinear; `sfm/__init__.py` imports each when it is first asked for."""
+
+from sfm.adjustment.covariance import change_datum as change_datum
+from sfm.adjustment.datum import Datum as Datum
+from sfm.adjustment.result import Adjustment as Adjustment
+from sfm.adjustment.solve import adjust as adjust
+from sfm.api import compare as compare
+from sfm.api import network_from_colmap as network_from_colmap
+from sfm.api import read_result as read_result
+from sfm.api import run_survey as run_survey
+from sfm.api import write_result as write_result
+from sfm.camera import Camera as Camera
+from sfm.camera import camera_from_values as camera_from_values
+from sfm.errors import KolinearError as KolinearError
+from sfm.network import Estimate as Estimate
+from sfm.network import Network as Network
+from sfm.network import empty_estimate as empty_estimate
+from sfm.orientation.sequence import orient as orient
+from sfm.photographs.reading import read_photograph as read_photograph
+from sfm.result import SurveyResult as SurveyResult
+from sfm.similarity import Similarity as Similarity
+from sfm.similarity import fit_similarity as fit_similarity
+from sfm.stored_result import StoredResult as StoredResult
+from sfm.survey.inputs.exterior_table import ObservedExterior as ObservedExterior
+from sfm.survey.inputs.given import KnownPoints as KnownPoints
+from sfm.survey.inputs.given import Observations as Observations
+from sfm.survey.inputs.given import ScaleBar as ScaleBar
+from sfm.survey.inputs.survey import CameraSetup as CameraSetup
+from sfm.survey.inputs.survey import Survey as Survey
+from sfm.survey.inputs.survey import read_survey as read_survey
+from sfm.targets.detect import Targets as Targets
+from sfm.targets.detect import find_targets as find_targets

@@ -1,0 +1,221 @@
+"""The functions that people call from Python and that need more than one room, or an adapter.
+
+Everything public is named in `sfm/__init__.pyi`. Adapters are imported where they are asked for.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from sfm.comparison.significance import ResultComparison, compare_results
+from sfm.errors import SurveyFileError
+from sfm.network import Estimate, Network
+from sfm.pipeline import run_survey as run_stages
+from sfm.progress import SILENT, Progress
+from sfm.result import SurveyResult
+from sfm.stored_result import StoredResult
+from sfm.survey.comparison import OtherPrograms
+from sfm.survey.inputs.survey import Survey
+from sfm.survey.target_store import TargetStore
+
+BACKENDS = ("colmap", "none")
+
+
+def run_survey(
+    survey: Survey,
+    *,
+    images: str | Path | None = None,
+    compare_with: str | None = None,
+    jobs: int | None = None,
+    store: str | Path | None = None,
+    progress: bool | Progress = False,
+) -> SurveyResult:
+    """Run a survey from its photographs, or from the image points that it gives in place of them.
+
+    Args:
+        survey: settings and given data.
+        images: folder of the photographs in place of the survey's own.
+        compare_with: "colmap" (its adjuster on the same network) or "none"; else what the survey says.
+        jobs: photographs measured at a time; as many as there are cores if not given.
+        store: folder that keeps measured targets, so that a photograph is not measured twice.
+        progress: whether to draw a bar on a terminal, or what is told of stages and photographs.
+
+    Raises:
+        KolinearError: the survey cannot be run; the message says what to do.
+
+    Example:
+        >>> import sfm
+        >>> survey = sfm.read_survey(observed_survey)
+        >>> sfm.run_survey(survey, compare_with="none").adjustment.converged
+        True
+    """
+    if compare_with not in (*BACKENDS, None):
+        raise SurveyFileError(f"compare_with '{compare_with}', expected one of {', '.join(BACKENDS)}")
+    others = programs_of(
+        compare_with or survey.compare.backend, "none" if compare_with == "none" else survey.compare.baseline
+    )
+    with ExitStack() as stack:
+        stack.enter_context(one_blas_thread())
+        told: Progress = SILENT
+        if progress is True:
+            from sfm.cli.console import drawn_progress
+
+            told = stack.enter_context(drawn_progress())
+        elif progress is not False:
+            told = progress
+        return run_stages(
+            survey,
+            images_dir=None if images is None else Path(images),
+            jobs=jobs or cores(),
+            others=others,
+            store=None if store is None else TargetStore(Path(store)),
+            progress=told,
+        )
+
+
+def read_result(path: str | Path) -> StoredResult:
+    """Read a result: the folder of a survey, a COLMAP model, or another format that is known.
+
+    Args:
+        path: folder or file.
+
+    Raises:
+        SurveyFileError: what is wrong, with file and line number.
+
+    Example:
+        >>> import sfm
+        >>> sfm.read_result(result_folder).point("1").xyz.shape
+        (3,)
+    """
+    from adapters.formats.registry import read_comparable
+
+    return read_comparable(Path(path))
+
+
+def write_result(result: SurveyResult, folder: str | Path, *, jobs: int | None = None) -> Path:
+    """Write tables, figures and the report of a result into a folder, whole or not at all.
+
+    Args:
+        result: of a survey.
+        folder: an earlier result in it is replaced, anything else in it is an error.
+        jobs: photographs drawn at the same time; as many as there are cores if not given.
+
+    Returns:
+        The path of report.html.
+
+    Raises:
+        OutputError: the folder cannot be written, or holds something else than an earlier result.
+
+    Example:
+        >>> import sfm
+        >>> sfm.write_result(result, result_folder).name
+        'report.html'
+    """
+    from sfm.report.findings.findings import findings_of
+    from sfm.report.output import write_result as write
+
+    with one_blas_thread():
+        return write(
+            findings_of(result), Path(folder), write_colmap=colmap_writer(result), jobs=jobs or cores()
+        )
+
+
+def compare(
+    a: SurveyResult | StoredResult,
+    b: SurveyResult | StoredResult,
+    *,
+    align: str = "points",
+    control: tuple[str, ...] = (),
+) -> ResultComparison:
+    """Compare two results: differences b - a after an alignment, their standard deviations and tests.
+
+    Args:
+        a: result that is kept as it is; points and photographs are recognised by their names.
+        b: result that is brought onto it.
+        align: points (all common ones), cameras (projection centres), control (the named points) or none.
+        control: names of the points for align = control.
+
+    Raises:
+        GeometryError: an unknown alignment, too little in common for it, or nothing in common at all.
+
+    Example:
+        >>> import sfm
+        >>> result = sfm.read_result(result_folder)
+        >>> sfm.compare(result, result).point_difference.max() < 1e-9
+        np.True_
+    """
+    first, second = (one.stored if isinstance(one, SurveyResult) else one for one in (a, b))
+    return compare_results(first, second, align=align, control=tuple(control))
+
+
+def network_from_colmap(model: str | Path | Any) -> tuple[Network, Estimate]:
+    """Return a COLMAP model as a network and its solution; each image point has a sigma of 1 px.
+
+    Args:
+        model: folder of the model, or a pycolmap.Reconstruction.
+
+    Raises:
+        SurveyFileError: no model in the folder, or one that cannot be read.
+        BackendError: pycolmap is missing, or a camera model that Kolinear has no equal of.
+
+    Example:
+        >>> import sfm
+        >>> network, estimate = sfm.network_from_colmap(colmap_model)
+        >>> len(network.images) == len(estimate.position)
+        True
+    """
+    from adapters.colmap.camera_models import network_of_scene, read_model
+
+    return read_model(Path(model)) if isinstance(model, str | Path) else network_of_scene(model)
+
+
+def programs_of(backend: str, baseline: str, *, threads: int = -1) -> OtherPrograms:
+    """Return the programs to compare a survey with; their library is imported only here.
+
+    Args:
+        backend: colmap or none.
+        baseline: mapper or none.
+        threads: of the mapper; -1 for as many as there are cores.
+    """
+    others = OtherPrograms()
+    if backend == "colmap":
+        from adapters.colmap.covariance import adjust_with_covariance
+
+        others = replace(others, adjuster=adjust_with_covariance)
+    if baseline == "mapper":
+        from adapters.colmap.mapper import map_photographs
+
+        others = replace(others, mapper=partial(map_photographs, threads=threads))
+    return others
+
+
+def colmap_writer(result: SurveyResult) -> Callable[[Path], Any] | None:
+    """Return what writes the compared solution as COLMAP's model into a folder, None without one."""
+    both = result.comparison
+    if both is None:
+        return None
+    from adapters.colmap.camera_models import write_model
+
+    return lambda folder: write_model(folder, both.network, both.adjustment.estimate)
+
+
+def cores() -> int:
+    """Return how many processor cores this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+@contextmanager
+def one_blas_thread() -> Iterator[None]:
+    """Hold BLAS to one thread: photographs are worked on side by side, and two BLAS pools in turn fight."""
+    from threadpoolctl import threadpool_limits
+
+    with threadpool_limits(limits=1, user_api="blas"):
+        yield

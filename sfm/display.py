@@ -1,0 +1,33 @@
+"""Small tables for the prompt and for notebooks."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+TEMPLATE = """\
+<table><caption>{{ title }}</caption>
+<thead><tr>{% for name in header %}<th>{{ name }}</th>{% endfor %}</tr></thead>
+<tbody>{% for row in rows %}<tr>{% for cell in row %}<td>{{ cell }}</td>{% endfor %}</tr>
+{% endfor %}</tbody></table>"""
+
+
+def html_table(title: str, header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """Return a table as HTML; whatever comes from files is escaped."""
+    from jinja2 import Environment
+
+    template = Environment(autoescape=True).from_string(TEMPLATE)
+    return template.render(title=title, header=header, rows=rows)
+
+
+def text_table(title: str, header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """Return a table in columns of text, the first to the left and the others to the right."""
+    lines = [header, *rows] if any(header) else list(rows)
+    widths = [max(len(line[k]) for line in lines) for k in range(len(header))] if lines else []
+    told = [
+        "  ".join(
+            cell.ljust(width) if k == 0 else cell.rjust(width)
+            for k, (cell, width) in enumerate(zip(line, widths, strict=True))
+        ).rstrip()
+        for line in lines
+    ]
+    return "\n".join([title, *told])

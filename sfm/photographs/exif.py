@@ -1,0 +1,110 @@
+"""What the EXIF data of a photograph say about its camera and sensor."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from PIL import ExifTags, Image
+
+from sfm.photographs.file_checks import opened_header
+
+# Beyond these what EXIF data say is no camera: principal distance and pixel in mm.
+FOCAL_MM = (0.1, 1e5)
+PIXEL_MM = (1e-5, 1.0)
+
+
+@dataclass(frozen=True)
+class Metadata:
+    """What a photograph's file says about its size and camera; None where it is silent."""
+
+    size_px: tuple[int, int]
+    """width and height as stored, px"""
+    make: str | None
+    """maker of the camera"""
+    model: str | None
+    """model of the camera"""
+    focal_mm: float | None
+    """focal length, mm"""
+    focal_35mm: float | None
+    """focal length of the same angle of view on 36 mm x 24 mm film, mm"""
+    pixel_mm: tuple[float, float] | None
+    """width and height of a pixel, from the resolution of the focal plane or the 35 mm equivalent, mm"""
+    orientation: int
+    """EXIF orientation, 1 = as stored; never applied to the pixels"""
+
+
+def read_metadata(path: str | Path) -> Metadata:
+    """Read size and EXIF data of a photograph without decoding its pixels.
+
+    Args:
+        path: a photograph.
+
+    Returns:
+        The metadata; a file without EXIF data gives its size only.
+
+    Raises:
+        PhotographError: no such file or no photograph.
+    """
+    path = Path(path)
+    with opened_header(path, path) as image:
+        size = image.size
+        try:
+            exif = image.getexif()
+            camera = exif.get_ifd(ExifTags.IFD.Exif)
+        except Exception:  # damaged EXIF data, on which Pillow fails in many ways, are as good as none
+            exif, camera = Image.Exif(), {}
+    focal = _between(camera.get(ExifTags.Base.FocalLength), FOCAL_MM)
+    equivalent = _between(camera.get(ExifTags.Base.FocalLengthIn35mmFilm), FOCAL_MM)
+    orientation = exif.get(ExifTags.Base.Orientation, 1)
+    return Metadata(
+        size_px=size,
+        make=_text(exif.get(ExifTags.Base.Make)),
+        model=_text(exif.get(ExifTags.Base.Model)),
+        focal_mm=focal,
+        focal_35mm=equivalent,
+        pixel_mm=_pixel_from_exif(size, camera, focal, equivalent),
+        orientation=orientation if isinstance(orientation, int) and 1 <= orientation <= 8 else 1,
+    )
+
+
+def _pixel_from_exif(
+    size: tuple[int, int], camera: Any, focal: float | None, equivalent: float | None
+) -> tuple[float, float] | None:
+    """Return width and height of a pixel in mm, None if the file does not tell."""
+    unit = _positive(camera.get(ExifTags.Base.FocalPlaneResolutionUnit, 2))
+    unit_mm = {2.0: 25.4, 3.0: 10.0, 4.0: 1.0}.get(unit) if unit else None
+    across = _positive(camera.get(ExifTags.Base.FocalPlaneXResolution))
+    down = _positive(camera.get(ExifTags.Base.FocalPlaneYResolution))
+    full = _positive(camera.get(ExifTags.Base.ExifImageWidth))
+    width = height = None
+    if unit_mm and across and down and full:
+        scale = full / size[0]  # the resolution is that of the picture as taken
+        width, height = unit_mm / across * scale, unit_mm / down * scale
+    elif focal and equivalent:
+        diagonal_mm = math.hypot(36.0, 24.0) * focal / equivalent
+        width = height = diagonal_mm / math.hypot(*size)
+    width, height = _between(width, PIXEL_MM), _between(height, PIXEL_MM)
+    return (width, height) if width and height else None
+
+
+def _positive(value: Any) -> float | None:
+    """Return a positive finite number or None; EXIF writers use 0 and 0/0 for unknown."""
+    try:
+        number = float(value)
+    except (TypeError, ValueError, ArithmeticError):
+        return None
+    return number if math.isfinite(number) and number > 0 else None
+
+
+def _between(value: Any, limits: tuple[float, float]) -> float | None:
+    """Return a number within limits or None."""
+    number = _positive(value)
+    return number if number is not None and limits[0] <= number <= limits[1] else None
+
+
+def _text(value: Any) -> str | None:
+    text = str(value).strip(" \0") if value is not None else ""
+    return text or None

@@ -1,0 +1,320 @@
+"""Pictures of an adjustment: network, residuals over the format, their distribution, the photographs."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
+
+from sfm.adjustment.result import Adjustment
+from sfm.conventions import FloatArray, IntArray
+from sfm.network import Estimate
+from sfm.report.findings.findings import Findings
+
+BLUE, RED, GREY, GREEN, ORANGE = "#1f5fa8", "#c8372d", "#8a8f98", "#2b7a4b", "#d98a1f"
+DPI = 110
+CAMERA_COLOURS = (BLUE, ORANGE, GREEN, "#7a4fa3", "#b0567a")
+MAX_ARROWS = 4000  # more residual vectors than this only blacken the picture
+CELLS = 12  # of the grid of mean residuals along the longer side
+FLAT_COSINE = 0.94  # within 20 degrees of Z the object's main plane is drawn as X and Y
+
+
+@dataclass(frozen=True)
+class Plot:
+    """A picture of a page."""
+
+    stem: str  # of its file name
+    caption: str
+    png: bytes
+
+
+def all_plots(findings: Findings) -> tuple[Plot, ...]:
+    """Draw every picture of the report."""
+    drawn: tuple[tuple[str, str, Callable[[Findings], Figure]], ...] = (
+        ("network", _NETWORK, network_figure),
+        ("residuals", _RESIDUALS, residual_figure),
+        ("distribution", _DISTRIBUTION, distribution_figure),
+        ("photographs", _PHOTOGRAPHS, photograph_figure),
+    )
+    return tuple(Plot(stem, caption, png(draw(findings))) for stem, caption, draw in drawn)
+
+
+def png(figure: Figure) -> bytes:
+    """Return a picture as PNG."""
+    buffer = io.BytesIO()
+    FigureCanvasAgg(figure)
+    figure.savefig(buffer, format="png", dpi=DPI)
+    return buffer.getvalue()
+
+
+_NETWORK = "Photographs (pyramids, looking where the camera looked) and object points."
+_RESIDUALS = (
+    "Residual vectors over the format of each camera: all of them, and their mean in each cell. A pattern in "
+    "the means is distortion that the camera model does not describe."
+)
+_DISTRIBUTION = (
+    "Residuals divided by their own standard deviation, against the normal distribution, and residuals by "
+    "distance from the centre of the photograph."
+)
+_PHOTOGRAPHS = "RMS residual per coordinate and number of accepted image points of each photograph."
+
+
+def network_figure(findings: Findings) -> Figure:
+    """Draw the network in plan and in space."""
+    adjustment, unit = findings.result.adjustment, findings.result.length_unit
+    estimate = adjustment.estimate
+    axes_from_object, labels = plan_axes(estimate.points, estimate.position)
+    figure = Figure(figsize=(11, 5.2), layout="constrained")
+    plan = figure.add_subplot(1, 2, 1)
+    space = figure.add_subplot(1, 2, 2, projection="3d")
+    points = estimate.points @ axes_from_object.T
+    position = estimate.position @ axes_from_object.T
+    size = 0.12 * float(np.median(np.linalg.norm(position - np.median(points, axis=0), axis=1)))
+    plan.plot(points[:, 0], points[:, 1], ".", color=GREY, markersize=4)
+    space.plot(*points.T, ".", color=GREY, markersize=3)
+    for k, family in enumerate(findings.interior.families):
+        own, camera = np.flatnonzero(findings.interior.family == k), family.camera
+        colour = CAMERA_COLOURS[k % len(CAMERA_COLOURS)]
+        edges = _pyramids(estimate, own, camera.c_px, camera.size_px, size) @ axes_from_object.T
+        plan.add_collection(LineCollection(list(edges[:, :, :2]), colors=colour, linewidths=0.8))
+        for edge in edges:
+            space.plot(*edge.T, color=colour, linewidth=0.7)
+        plan.plot(
+            position[own, 0], position[own, 1], "o", color=colour, markersize=4, label=_plain(family.name)
+        )
+    for name, x, y in zip(adjustment.network.images, position[:, 0], position[:, 1], strict=True):
+        if len(position) <= 60:
+            plan.annotate(
+                _plain(_short(name)),
+                (x, y),
+                xytext=(4, 4),
+                textcoords="offset points",
+                fontsize=6,
+                color="#444",
+            )
+    plan.set_aspect("equal", adjustable="datalim")
+    plan.margins(0.1)  # for the names of the photographs
+    plan.autoscale_view()
+    plan.set_xlabel(f"{labels[0]} [{_plain(unit)}]")
+    plan.set_ylabel(f"{labels[1]} [{_plain(unit)}]")
+    plan.set_title("Plan")
+    plan.grid(color="#ddd", linewidth=0.5)
+    plan.legend(loc="best", fontsize=7)
+    space.set_aspect("equal", adjustable="datalim")
+    space.set_box_aspect(None, zoom=0.85)  # else the name of the third axis is cut off
+    space.set_title("In space")
+    for set_label, label in zip((space.set_xlabel, space.set_ylabel, space.set_zlabel), labels, strict=True):
+        set_label(label, fontsize=8)
+    space.tick_params(labelsize=6)
+    return figure
+
+
+def residual_figure(findings: Findings) -> Figure:
+    """Draw residual vectors over the format of each camera, one by one and as means of cells."""
+    adjustment, cameras = findings.result.adjustment, findings.interior.families
+    network = adjustment.network
+    figure = Figure(figsize=(11, 4.4 * len(cameras)), layout="constrained")
+    panels = figure.subplots(len(cameras), 2, squeeze=False)
+    owner = findings.interior.family[network.image_points.image]
+    for k, family in enumerate(cameras):
+        name, camera = family.name, family.camera
+        own = (owner == k) & ~adjustment.rejected
+        xy, v = network.image_points.xy[own], adjustment.residuals[own]
+        width, height = camera.size_px
+        factor = _round_factor(0.03 * width / max(_typical(v), 1e-12))
+        keep = slice(None, None, max(1, len(xy) // MAX_ARROWS))
+        _arrows(panels[k, 0], xy[keep], v[keep] * factor, BLUE)
+        panels[k, 0].set_title(f"{_plain(name)}: {len(xy)} residuals, drawn {factor:g} times as long")
+        centres, means = _cell_means(xy, v, width, height)
+        if len(centres):
+            factor = _round_factor(0.6 * width / CELLS / max(_typical(means), 1e-12))
+            _arrows(panels[k, 1], centres, means * factor, RED)
+        panels[k, 1].set_title(f"{_plain(name)}: mean of each cell, drawn {factor:g} times as long")
+        for panel in panels[k]:
+            panel.set_xlim(-0.5, width - 0.5)
+            panel.set_ylim(height - 0.5, -0.5)
+            panel.set_aspect("equal")
+            panel.set_xlabel("x [px]")
+            panel.set_ylabel("y [px]")
+    return figure
+
+
+def distribution_figure(findings: Findings) -> Figure:
+    """Draw the histogram of standardised residuals and the residuals by distance from the centre."""
+    adjustment = findings.result.adjustment
+    network, cameras = adjustment.network, adjustment.estimate.cameras
+    used = ~adjustment.rejected
+    seen = network.image_points.select(used)
+    v = adjustment.residuals[used]
+    figure = Figure(figsize=(11, 3.8), layout="constrained")
+    histogram, radial = figure.subplots(1, 2)
+    z = standardised_residuals(adjustment)
+    z = z[np.isfinite(z)]
+    bins = np.linspace(-5, 5, 41)
+    histogram.hist(
+        np.clip(z, -4.999, 4.999), bins=bins, density=True, color=BLUE, alpha=0.6, label="residuals"
+    )
+    t = np.linspace(-5, 5, 201)
+    histogram.plot(t, np.exp(-(t**2) / 2) / np.sqrt(2 * np.pi), color="black", linewidth=1, label="normal")
+    histogram.set_xlabel("residual / its standard deviation  (beyond 5 in the last bar)")
+    histogram.set_ylabel("frequency")
+    histogram.legend(fontsize=8)
+    centre = np.array([camera.frame[:2] for camera in cameras])[network.camera[seen.image]]
+    ray = seen.xy - centre
+    distance = np.linalg.norm(ray, axis=1)
+    direction = ray / np.maximum(distance, 1e-9)[:, None]
+    along = (v * direction).sum(axis=1)
+    across = v[:, 1] * direction[:, 0] - v[:, 0] * direction[:, 1]
+    edges = np.linspace(0, distance.max() * (1 + 1e-9), 13)
+    ring = np.clip(np.digitize(distance, edges) - 1, 0, 11)
+    middle = (edges[1:] + edges[:-1]) / 2
+    for values, colour, label in ((along, RED, "radial"), (across, BLUE, "tangential")):
+        mean, rms = _ring_means(values, ring)
+        radial.plot(middle, rms, "-o", color=colour, markersize=3, label=f"{label} RMS")
+        radial.plot(middle, mean, "--", color=colour, linewidth=1, label=f"{label} mean")
+    radial.axhline(0, color="black", linewidth=0.5)
+    radial.set_xlabel("distance from the centre of the photograph [px]")
+    radial.set_ylabel("residual [px]")
+    radial.legend(fontsize=8)
+    return figure
+
+
+def photograph_figure(findings: Findings) -> Figure:
+    """Draw RMS residual and number of points of each photograph."""
+    adjustment = findings.result.adjustment
+    rms, count = findings.geometry.image_rms_px, findings.geometry.image_points
+    m = len(rms)
+    figure = Figure(figsize=(11, 3.4), layout="constrained")
+    bars, numbers = figure.subplots(1, 2)
+    x = np.arange(m)
+    labels = [_plain(_short(name)) for name in adjustment.network.images]
+    for panel, values, colour, label in (
+        (bars, rms, BLUE, "RMS residual per coordinate [px]"),
+        (numbers, count, GREEN, "accepted image points"),
+    ):
+        panel.bar(x, np.nan_to_num(values), color=colour)
+        panel.set_ylabel(label)
+        if m <= 60:
+            panel.set_xticks(x, labels, rotation=90, fontsize=7)
+        else:
+            panel.set_xlabel("photograph, in order")
+    bars.axhline(adjustment.rms_px, color="black", linewidth=1, linestyle="--")
+    return figure
+
+
+def standardised_residuals(adjustment: Adjustment) -> FloatArray:
+    """Return accepted residuals over their own standard deviation a posteriori, shape (2k,).
+
+    Source: Baarda (1968): sigma of v = sigma0 * sigma * sqrt(r) with the redundancy number r.
+    """
+    used = ~adjustment.rejected
+    variance = np.einsum("kii->ki", adjustment.image_covariance[used])
+    r = adjustment.redundancy_numbers[used]
+    sigma = adjustment.sigma0 * np.sqrt(np.where(r > 1e-6, variance * r, np.nan))
+    return np.asarray((adjustment.residuals[used] / sigma).ravel())
+
+
+def plan_axes(
+    points: FloatArray, position: FloatArray | None = None
+) -> tuple[FloatArray, tuple[str, str, str]]:
+    """Return the axes in which the object is best seen from the cameras' side, and what they are called.
+
+    Args:
+        points: object points, shape (n, 3).
+        position: projection centres, shape (m, 3); without them the third axis may point either way.
+
+    Returns:
+        Rotation from object axes, shape (3, 3): the identity if the object lies nearly level below the
+        cameras, turned about X if above them, else its principal axes; and the names of the three axes.
+    """
+    centre = points.mean(axis=0)
+    towards = np.zeros(3) if position is None or not len(position) else position.mean(axis=0) - centre
+    _, _, Vt = np.linalg.svd(points - centre, full_matrices=False)
+    if len(Vt) < 3 or abs(Vt[2, 2]) > FLAT_COSINE:
+        if towards[2] < 0:
+            return np.diag([1.0, -1.0, -1.0]), ("X", "-Y", "-Z")
+        return np.eye(3), ("X", "Y", "Z")
+    if Vt[2] @ towards < 0:
+        Vt[2] *= -1
+    Vt[1] *= np.sign(np.linalg.det(Vt))
+    return Vt, ("along", "across", "up from the main plane")
+
+
+def _pyramids(
+    estimate: Estimate, images: IntArray, c_px: float, size_px: tuple[int, int], size: float
+) -> FloatArray:
+    """Return the edges of a pyramid of view at each photograph, shape (edges, 2, 3)."""
+    width, height = size_px
+    x, y = width / 2 / c_px, height / 2 / c_px
+    corners = np.array([[-x, -y, -1], [x, -y, -1], [x, y, -1], [-x, y, -1]]) * size
+    edges = []
+    for i in images:
+        tips = estimate.position[i] + corners @ estimate.rotation[i].T
+        for k in range(4):
+            edges += [(estimate.position[i], tips[k]), (tips[k], tips[(k + 1) % 4])]
+    return np.reshape(np.array(edges, dtype=float), (-1, 2, 3))
+
+
+def _arrows(panel: Axes, xy: FloatArray, v: FloatArray, colour: str) -> None:
+    panel.quiver(
+        xy[:, 0],
+        xy[:, 1],
+        v[:, 0],
+        v[:, 1],
+        color=colour,
+        angles="xy",
+        scale_units="xy",
+        scale=1,
+        width=0.0015,
+        headwidth=4,
+    )
+
+
+def _cell_means(xy: FloatArray, v: FloatArray, width: int, height: int) -> tuple[FloatArray, FloatArray]:
+    """Return centre and mean residual of each cell of the format that holds at least three."""
+    side = max(width, height) / CELLS
+    columns = int(np.ceil(width / side))
+    cell = (xy // side).astype(int) @ (1, columns)
+    number, index, count = np.unique(cell, return_inverse=True, return_counts=True)
+    mean = np.stack([np.bincount(index, weights=v[:, a]) / count for a in (0, 1)], axis=1)
+    centre = (np.stack([number % columns, number // columns], axis=1) + 0.5) * side
+    return centre[count >= 3], mean[count >= 3]
+
+
+def _ring_means(values: FloatArray, ring: IntArray) -> tuple[FloatArray, FloatArray]:
+    """Return mean and root mean square of the values of each of the 12 rings, NaN where there are none."""
+    count = np.bincount(ring, minlength=12).astype(float)
+    count[count == 0] = np.nan
+    mean = np.bincount(ring, weights=values, minlength=12) / count
+    return mean, np.sqrt(np.bincount(ring, weights=values**2, minlength=12) / count)
+
+
+def _typical(v: FloatArray) -> float:
+    """Return the root mean square length of vectors, 0 for none."""
+    return float(np.sqrt((v**2).sum(axis=1).mean())) if len(v) else 0.0
+
+
+def _round_factor(factor: float) -> float:
+    """Return the largest of 1, 2, 5 x 10^n that is not above the factor, at least 1."""
+    if not np.isfinite(factor) or factor <= 1:
+        return 1.0
+    power = 10.0 ** np.floor(np.log10(factor))
+    return float(max(step * power for step in (1, 2, 5) if step * power <= factor))
+
+
+def _short(name: str) -> str:
+    """Return a file name without folder and suffix, shortened from the left."""
+    stem = name.rsplit("/", 1)[-1].rsplit(".", 1)[0]
+    return stem if len(stem) <= 16 else "..." + stem[-13:]
+
+
+def _plain(text: str) -> str:
+    """Return text that matplotlib draws as it stands: no mathematics, no characters that its font lacks."""
+    shown = "".join(c if c.isprintable() and ord(c) < 0x250 else "?" for c in text)
+    return shown.replace("$", r"\$")

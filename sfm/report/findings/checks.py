@@ -1,0 +1,205 @@
+"""How well the observations agree with one another: residuals in standard deviations, checks at control.
+
+What a verdict rests on. Standard deviations are those stated before the adjustment; sigma0 tells by how
+much they were wrong, and must not hide it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sfm.adjustment.engine.observed_unknowns import observed
+from sfm.adjustment.quality.variance_components import IMAGE_POINTS, variance_components
+from sfm.adjustment.result import Adjustment
+from sfm.conventions import BoolArray, FloatArray
+from sfm.result import ControlCheck, SurveyResult
+
+LISTED = 10  # largest residuals
+TOLD_APART = 0.01  # relative difference from which sigma0 of the image points is told beside that of all
+MEDIAN_LENGTH = 1.1774  # median length of a normal vector in the plane over its sigma: sqrt(2 ln 2)
+
+
+@dataclass(frozen=True)
+class ObservationCounts:
+    """Scalar observations of an adjustment by type."""
+
+    image: int  # image coordinates that were accepted
+    control: int  # weighted coordinates of control; fixed ones are no observations
+    exterior: int  # observed parameters of exterior orientation
+    interior: int  # observed parameters of interior orientation
+    scale_bars: int
+    constraints: int  # of the datum
+    total: int  # without the constraints
+
+
+@dataclass(frozen=True)
+class Sigma0:
+    """Standard deviation of an image coordinate, a posteriori and as stated."""
+
+    px: float  # a posteriori, of all observations together: control that contradicts raises it, px
+    ratio: float  # of the image points by themselves, a posteriori over that stated
+    stated_px: float  # a priori, px
+
+    @property
+    def image_points_px(self) -> float:
+        """A posteriori, of the image points by themselves, px."""
+        return self.ratio * self.stated_px
+
+    @property
+    def differs(self) -> bool:
+        """Whether the image points by themselves show another one than all observations."""
+        return abs(self.px - self.image_points_px) > TOLD_APART * self.image_points_px
+
+
+@dataclass(frozen=True)
+class LargeResidual:
+    """An accepted image point and its standardised residuals."""
+
+    image: str
+    point: str
+    v: FloatArray  # residual, px, (2,)
+    w: float  # Baarda's w of the worse coordinate
+    tau: float  # Pope's tau of the same coordinate
+
+
+@dataclass(frozen=True)
+class LongestResidual:
+    """The accepted image point whose residual is the longest in standard deviations."""
+
+    image: str
+    point: str
+    length_px: float
+    over_sigma: float  # its length in standard deviations, with the weight that it had
+    weight: float  # factor on its weight, below 1 by reweighting
+
+
+@dataclass(frozen=True)
+class CheckedControl:
+    """Differences at control that took no part in the adjustment, over what is expected of them."""
+
+    check: ControlCheck
+    length: FloatArray  # of each difference, object unit, (n,)
+    worst: int  # index of the longest
+    over_sigma: FloatArray  # largest coordinate over its expected standard deviation; NaN unknown, (n,)
+    stated: BoolArray  # whether the control states standard deviations, (n,)
+
+    @property
+    def rms_length(self) -> float:
+        """Length of the vector of root mean square differences in X, Y, Z, object unit."""
+        return float(np.linalg.norm(self.check.rms))
+
+
+def sigma0_of(result: SurveyResult) -> Sigma0:
+    """Return sigma0 of all observations, and of the image points by themselves.
+
+    The latter is by the variance component of the image points; without redundancy of their own it is sigma0
+    of all observations.
+    """
+    a = result.adjustment
+    own = variance_components(a, np.zeros(len(a.rejected), dtype=np.int64), (IMAGE_POINTS,)).sigma0[0]
+    ratio = float(own if np.isfinite(own) else a.sigma0_px / a.stated_px)
+    return Sigma0(a.sigma0_px, ratio, a.stated_px)
+
+
+def longest_residual(adjustment: Adjustment) -> LongestResidual:
+    """Return the longest residual in standard deviations; of length 0 without image points.
+
+    A residual of a reweighted image point counts as much as it did in the adjustment. The standard
+    deviation is the a priori one, or that which the median of the residuals shows if it is larger, so
+    that a cautious guess of it makes no good image point an outlier.
+    """
+    used, seen = np.flatnonzero(~adjustment.rejected), adjustment.network.image_points
+    if not len(used):
+        return LongestResidual("", "", 0.0, 0.0, 1.0)
+    v = adjustment.residuals[used]
+    P = np.linalg.inv(adjustment.image_covariance[used])
+    length = np.sqrt(np.einsum("ka,kab,kb->k", v, P, v))
+    if len(adjustment.weights):
+        length = length * np.sqrt(adjustment.weights[used])
+    shown = float(np.median(length)) / MEDIAN_LENGTH
+    worst = int(np.argmax(length))
+    row = int(used[worst])
+    return LongestResidual(
+        adjustment.network.images[seen.image[row]],
+        adjustment.network.points[seen.point[row]],
+        float(np.linalg.norm(adjustment.residuals[row])),
+        float(length[worst] / max(1.0, shown)),
+        float(adjustment.weights[row]) if len(adjustment.weights) else 1.0,
+    )
+
+
+def count_observations(adjustment: Adjustment) -> ObservationCounts:
+    """Return how many observations of each type took part."""
+    network = adjustment.network
+    image = 2 * int((~adjustment.rejected).sum())
+    control = 0
+    if adjustment.datum == "control":
+        control = int(observed(_variances(network.control.covariance)).sum())
+    exterior = int(observed(_variances(network.exterior.covariance)).sum())
+    sigma = network.interior.sigma
+    interior = int(((sigma > 0) & np.isfinite(sigma)).sum())
+    bars = adjustment.observations - image - control - exterior - interior
+    return ObservationCounts(
+        image,
+        control,
+        exterior,
+        interior,
+        bars,
+        adjustment.redundancy - adjustment.observations + adjustment.unknowns,
+        adjustment.observations,
+    )
+
+
+def largest_residuals(adjustment: Adjustment, count: int = LISTED) -> tuple[LargeResidual, ...]:
+    """Return the accepted image points with the largest standardised residuals, largest first."""
+    a, seen = adjustment, adjustment.network.image_points
+    if len(a.standardised) != len(a.rejected):
+        return ()
+    w = np.nan_to_num(np.abs(a.standardised))
+    size = np.where(a.rejected, -1.0, w.max(axis=1, initial=0.0))
+    rows = np.argsort(-size, kind="stable")[: min(count, int((~a.rejected).sum()))]
+    return tuple(
+        LargeResidual(
+            a.network.images[seen.image[k]],
+            a.network.points[seen.point[k]],
+            a.residuals[k],
+            float(a.standardised[k, axis]),
+            float(a.tau[k, axis]),
+        )
+        for k, axis in zip(rows, np.argmax(w[rows], axis=1), strict=True)
+    )
+
+
+def checked_control(result: SurveyResult) -> CheckedControl | None:
+    """Return the differences at control that took no part, over their expected standard deviations.
+
+    Expected are the precision of the adjusted point, its mean over the axes, and that of the control
+    together.
+    """
+    check, a = result.control_check, result.adjustment
+    if check is None:
+        return None
+    length = np.linalg.norm(check.differences, axis=1)
+    worst, n = int(np.argmax(length)), len(check.points)
+    control = a.network.control
+    place = {a.network.points[j]: k for k, j in enumerate(control.point)}
+    known = [place[name] for name in check.points if name in place]
+    if len(known) != n:
+        return CheckedControl(check, length, worst, np.full(n, np.nan), np.zeros(n, dtype=bool))
+    given = _variances(control.covariance[known])
+    given = np.where(np.isfinite(given), given, np.nan)
+    adjusted = _variances(a.covariance.points[control.point[known]])
+    expected = np.sqrt(np.nan_to_num(given) + adjusted.mean(axis=1)[:, None])
+    ratio = np.abs(check.differences) / np.where(expected > 0, expected, np.nan)
+    return CheckedControl(check, length, worst, ratio.max(axis=1), np.nansum(given, axis=1) > 0)
+
+
+def object_size(points: FloatArray) -> float:
+    """Return the diagonal of the box around points, object unit."""
+    return float(np.linalg.norm(np.ptp(points, axis=0)))
+
+
+def _variances(covariance: FloatArray) -> FloatArray:
+    return np.asarray(np.einsum("nii->ni", covariance))

@@ -1,0 +1,63 @@
+"""The comparison with the other adjuster: why they do not agree, and the precision of the points by both."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sfm.comparison.adjusters import AdjusterComparison
+from sfm.comparison.camera_conversion import Conversion
+from sfm.conventions import FloatArray
+from sfm.report.findings.precision import root_mean_square
+from sfm.result import SurveyResult
+
+
+@dataclass(frozen=True)
+class PointSigma:
+    """Standard deviation of a coordinate of the object points."""
+
+    rms: float  # object unit
+    largest: float  # object unit
+
+
+@dataclass(frozen=True)
+class ComparisonFindings:
+    """What the comparison with the other adjuster says."""
+
+    both: AdjusterComparison
+    reasons: tuple[str, ...]  # why they do not agree, in words; empty if they do
+    survey_models: tuple[str, ...]  # camera models of the survey
+    converted: tuple[Conversion, ...]  # cameras that were written in another model
+    max_interior_px: float  # largest difference of interior orientation in the photograph, px
+    marginal: PointSigma  # in-house, everything adjusted is uncertain
+    conditional: PointSigma  # in-house, photographs and cameras held
+    backend_conditional: PointSigma | None  # the other's; None where it gives none
+
+
+def comparison_of(result: SurveyResult) -> ComparisonFindings | None:
+    """Return what the comparison of a survey says; None where it asked for none."""
+    both = result.comparison
+    if both is None:
+        return None
+    reasons: list[str] = []
+    if not both.agree:
+        reasons += both.comparison.exceeded
+        reasons += [] if both.adjustment.converged else ["kolinear did not converge in this model"]
+        reasons += [] if both.backend_converged else [f"{both.backend} did not converge"]
+    covariance, other = both.adjustment.covariance, both.backend_points
+    return ComparisonFindings(
+        both,
+        tuple(reasons),
+        tuple(sorted({camera.model for camera in result.adjustment.estimate.cameras})),
+        tuple(one for one in both.conversions if one.source_model != one.camera.model),
+        float(np.nanmax(both.comparison.interior_px, initial=0.0)),
+        _point_sigma(covariance.points),
+        _point_sigma(covariance.points_limiting),
+        None if other is None else _point_sigma(other),
+    )
+
+
+def _point_sigma(covariance: FloatArray) -> PointSigma:
+    sigma = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+    return PointSigma(root_mean_square(sigma), float(np.nanmax(sigma)))

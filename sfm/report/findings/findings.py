@@ -1,0 +1,83 @@
+"""Everything that the reports of a survey say, computed once: Findings.
+
+Statistics, checks, geometry, given values, precision, rejected observations, the comparison, the verdict.
+Whatever prints a result takes its numbers from here.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from sfm.report.findings.checks import (
+    CheckedControl,
+    LargeResidual,
+    LongestResidual,
+    ObservationCounts,
+    Sigma0,
+    checked_control,
+    count_observations,
+    largest_residuals,
+    longest_residual,
+    object_size,
+    sigma0_of,
+)
+from sfm.report.findings.comparison import ComparisonFindings, comparison_of
+from sfm.report.findings.geometry import Geometry, geometry_of
+from sfm.report.findings.given import Given, given_of
+from sfm.report.findings.interior import InteriorOrientation, interior_of
+from sfm.report.findings.precision import Precision, precision_of
+from sfm.report.findings.rejected import Rejected, rejected_of
+from sfm.report.findings.solution import PhotographRow, PointRow, photographs_of, points_of
+from sfm.report.findings.statistics import Statistics, statistics_of
+from sfm.report.findings.verdict import Evidence, Verdict, judge
+from sfm.result import SurveyResult
+
+
+@dataclass(frozen=True)
+class Findings:
+    """A result and everything that is said about it."""
+
+    result: SurveyResult
+    verdict: Verdict
+    sigma0: Sigma0
+    counts: ObservationCounts
+    longest: LongestResidual  # in standard deviations, of the accepted image points
+    largest: tuple[LargeResidual, ...]  # standardised, of the accepted image points
+    statistics: Statistics
+    geometry: Geometry
+    interior: InteriorOrientation
+    given: Given
+    check: CheckedControl | None  # control that took no part
+    precision: Precision
+    points: tuple[PointRow, ...]  # in the order of the network
+    photographs: tuple[PhotographRow, ...]  # likewise
+    rejected: Rejected
+    comparison: ComparisonFindings | None
+    object_size: float  # diagonal of the box around the points, object unit
+
+
+def findings_of(result: SurveyResult) -> Findings:
+    """Return everything that the reports say of a result."""
+    a = result.adjustment
+    sigma0, longest, statistics = sigma0_of(result), longest_residual(a), statistics_of(result)
+    given, check, size = given_of(result), checked_control(result), object_size(a.estimate.points)
+    geometry, precision = geometry_of(a), precision_of(a)
+    return Findings(
+        result=result,
+        verdict=judge(Evidence(result, sigma0, longest, statistics, given, check, size)),
+        sigma0=sigma0,
+        counts=count_observations(a),
+        longest=longest,
+        largest=largest_residuals(a),
+        statistics=statistics,
+        geometry=geometry,
+        interior=interior_of(a),
+        given=given,
+        check=check,
+        precision=precision,
+        points=points_of(result, precision, geometry),
+        photographs=photographs_of(a, precision, geometry),
+        rejected=rejected_of(result, geometry),
+        comparison=comparison_of(result),
+        object_size=size,
+    )

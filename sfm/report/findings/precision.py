@@ -1,0 +1,87 @@
+"""Precision of the unknowns over the whole network; what is fixed has none and does not count."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sfm.adjustment.result import Adjustment
+from sfm.conventions import FloatArray
+
+
+@dataclass(frozen=True)
+class Precision:
+    """Standard deviations of points and photographs; of X, Y, Z or omega, phi, kappa, and of all together."""
+
+    points: FloatArray  # of each coordinate, 0 where fixed, object unit, (n, 3)
+    exterior: FloatArray  # of each photograph, object unit and rad, (m, 6)
+    rms: FloatArray  # of the points, object unit, (4,)
+    largest: FloatArray  # of the points, object unit, (4,)
+    limiting: FloatArray  # RMS of the points with the cameras free of error, object unit, (4,)
+    centres: FloatArray  # RMS of the projection centres, object unit, (4,)
+    angles: FloatArray  # RMS of omega, phi, kappa, rad, (4,)
+    fixed_points: int  # points with fixed coordinates, as control or in a minimal datum
+
+    @property
+    def angles_arcsec(self) -> FloatArray:
+        """RMS of omega, phi, kappa, arc seconds, (4,)."""
+        return np.degrees(self.angles) * 3600
+
+
+def precision_of(adjustment: Adjustment) -> Precision:
+    """Return the precision of the unknowns."""
+    covariance = adjustment.covariance
+    exterior = adjusted_sigmas(covariance.exterior)
+    rms, largest_of_all, limiting = point_precision(adjustment)
+    return Precision(
+        _sqrt_diagonal(covariance.points),
+        _sqrt_diagonal(covariance.exterior),
+        rms,
+        largest_of_all,
+        limiting,
+        root_mean_squares(exterior[:, :3]),
+        root_mean_squares(exterior[:, 3:]),
+        int((np.einsum("nii->ni", covariance.points) == 0).any(axis=1).sum()),
+    )
+
+
+def adjusted_sigmas(covariance: FloatArray) -> FloatArray:
+    """Return standard deviations of covariance matrices (n, d, d), NaN where fixed or not known, (n, d)."""
+    variance = np.einsum("nii->ni", covariance)
+    adjusted = variance > 0
+    return np.asarray(np.where(adjusted, np.sqrt(np.where(adjusted, variance, 1.0)), np.nan))
+
+
+def point_precision(adjustment: Adjustment) -> FloatArray:
+    """Return RMS, largest, and RMS limiting standard deviation of X, Y, Z and all, object unit, (3, 4).
+
+    Limiting is the precision with the cameras free of error. NaN where no coordinate was adjusted.
+    """
+    sigma = adjusted_sigmas(adjustment.covariance.points)
+    limiting = adjusted_sigmas(adjustment.covariance.points_limiting)
+    return np.array([root_mean_squares(sigma), largest(sigma), root_mean_squares(limiting)])
+
+
+def root_mean_squares(values: FloatArray) -> FloatArray:
+    """Return the root mean square of each column (n, d) and of all, of the values known, (d + 1,)."""
+    return np.array([root_mean_square(column) for column in (*values.T, values)])
+
+
+def root_mean_square(values: FloatArray) -> float:
+    """Return the root mean square of the values that are known, NaN without any."""
+    known = values[np.isfinite(values)]
+    return float(np.sqrt(np.mean(known**2))) if known.size else float("nan")
+
+
+def largest(values: FloatArray) -> FloatArray:
+    """Return the largest of each column (n, d) and of all, of the values known, (d + 1,)."""
+    columns = np.where(np.isfinite(values), values, -np.inf).max(axis=0, initial=-np.inf)
+    found = np.array([*columns, columns.max()])
+    return np.asarray(np.where(np.isfinite(found), found, np.nan))
+
+
+def _sqrt_diagonal(covariance: FloatArray) -> FloatArray:
+    """Return standard deviations of covariance matrices (..., d, d), shape (..., d)."""
+    diagonal = np.einsum("...ii->...i", covariance)
+    return np.asarray(np.sqrt(np.where(diagonal >= 0, diagonal, np.nan)))

@@ -1,0 +1,60 @@
+"""HTML pages, all made from one base template, with the style sheet and its Content-Security-Policy inside.
+
+Every text that comes from a file is escaped by the templates, and a name that they do not know is an error.
+"""
+
+from __future__ import annotations
+
+import base64
+import math
+from functools import cache
+from importlib.resources import files
+from typing import Any
+from urllib.parse import quote
+
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup
+
+from sfm.adjustment.quality.statistics import STRONG
+from sfm.report.html.content_policy import content_policy
+from sfm.report.numbers import FILTERS, finer_unit, finer_unit_of, is_number
+from sfm.report.phrases import PHRASES
+
+
+def render(template: str, **context: Any) -> str:
+    """Return an HTML page with everything that it shows inside it.
+
+    Args:
+        template: name of a template that extends `base.html`.
+        context: what it asks for.
+    """
+    return environment().get_template(template).render(context)
+
+
+def data_url(data: bytes, kind: str) -> str:
+    """Return a picture as an address that holds it."""
+    return f"data:image/{kind};base64,{base64.b64encode(data).decode()}"
+
+
+@cache
+def environment() -> Environment:
+    """Return what the templates are rendered with: escaping, no undefined names, our filters and phrases."""
+    style = files("sfm.report.html").joinpath("templates/report.css").read_text(encoding="utf-8")
+    made = Environment(
+        loader=PackageLoader("sfm.report.html"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        extensions=["jinja2.ext.do"],
+    )
+    made.filters |= FILTERS | {"data_url": data_url, "quoted": quote, "right": ">{}".format}
+    made.tests |= {"numeric": lambda cell: is_number(str(cell)), "nan": math.isnan}
+    made.globals |= PHRASES | {
+        "finer_unit": finer_unit,
+        "finer_unit_of": finer_unit_of,
+        "strong": STRONG,
+        "style": Markup(style),
+        "policy": content_policy([style]),
+    }
+    return made

@@ -1,0 +1,37 @@
+"""report.html: one page, readable with no manual, with everything it shows inside it.
+
+In the order of a surveyor's questions: did it work, how good is it, what was rejected and why, does the
+other adjuster agree, where are my coordinates. What it says stands in `templates/report.html` and
+`templates/report/`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from sfm.report.figures.overlays import Overlay
+from sfm.report.figures.plots import Plot
+from sfm.report.findings.findings import Findings
+from sfm.report.html.page import render
+
+
+def report_page(
+    findings: Findings, plots: Sequence[Plot], overlays: Sequence[Overlay], *, has_model: bool = False
+) -> str:
+    """Return the report as one HTML page.
+
+    Args:
+        findings: the result and what is said of it.
+        plots: the pictures of the adjustment.
+        overlays: the drawn photographs; their thumbnails are embedded, links lead to the overlays folder.
+        has_model: whether the folder holds the compared solution as a COLMAP model.
+    """
+    return render(
+        "report.html",
+        f=findings,
+        r=findings.result,
+        a=findings.result.adjustment,
+        pictures={plot.stem: plot for plot in plots},
+        overlays=overlays,
+        has_model=has_model,
+    )

@@ -1,0 +1,124 @@
+"""Numbers as people read them: significant digits, exponents, units of a readable size.
+
+Every report writes its numbers with these; the templates know them as filters of the same names.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sfm.conventions import FloatArray
+
+METRIC = (("km", 1e3), ("m", 1.0), ("mm", 1e-3), ("µm", 1e-6))
+"""metric units and their length in metres, largest first"""
+SMALL = 1e-3
+"""parameters below it are written with an exponent"""
+SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+
+
+def fixed(value: float, decimals: int) -> str:
+    """Write a number with so many decimals."""
+    return f"{value:.{decimals}f}"
+
+
+def plus(value: float, decimals: int) -> str:
+    """Write a number with its sign and so many decimals."""
+    return f"{value:+.{decimals}f}"
+
+
+def scientific(value: float, decimals: int) -> str:
+    """Write a number with an exponent and so many decimals before it."""
+    return f"{value:.{decimals}e}"
+
+
+def general(value: float, digits: int) -> str:
+    """Write a number with at most so many digits, with an exponent where that is shorter."""
+    return f"{value:.{digits}g}"
+
+
+def significant(value: float, digits: int = 3) -> str:
+    """Write a number with so many significant digits and no exponent where that is short."""
+    value = float(value)
+    if not np.isfinite(value):
+        return "not known"
+    if value == 0:
+        return "0"
+    exponent = int(np.floor(np.log10(abs(value))))
+    if -6 <= exponent < 7:
+        return f"{value:.{max(0, digits - 1 - exponent)}f}"
+    return f"{value:.{digits - 1}e}"
+
+
+def signed(value: float) -> str:
+    """Write a difference with three significant digits and its sign."""
+    return ("+" if value >= 0 else "") + significant(value)
+
+
+def or_unlimited(value: float) -> str:
+    """Write a reliability, which is unlimited where nothing checks an observation."""
+    return "unlimited" if np.isinf(value) else significant(value)
+
+
+def with_exponent(value: float, sigma: float) -> tuple[str, str]:
+    """Write a parameter to the second digit of its standard deviation, and the latter; small ones as m e-n.
+
+    Args:
+        value: the parameter.
+        sigma: its standard deviation, NaN if it was held fixed.
+    """
+    if not (np.isfinite(sigma) and sigma > 0):
+        return (f"{value:.6g}", "held fixed")
+    if abs(value) >= SMALL or value == 0:
+        return to_precision(value, sigma), significant(sigma, 2)
+    power = int(np.floor(np.log10(abs(value))))
+    decimals = int(np.clip(1 - np.floor(np.log10(sigma)) + power, 0, 12))
+    mantissa = value / 10.0**power
+    return f"{mantissa:.{decimals}f}e{power}", f"{sigma / 10.0**power:.{decimals}f}e{power}"
+
+
+def to_precision(value: float, sigma: float) -> str:
+    """Write a coordinate to the second digit of its standard deviation, six decimals if that is not known."""
+    if not np.isfinite(value):
+        return "not known"
+    known = np.isfinite(sigma) and sigma > 0
+    decimals = int(np.clip(1 - np.floor(np.log10(sigma)), 0, 12)) if known else 6
+    return f"{value:.{decimals}f}"
+
+
+def raised(unit: str) -> str:
+    """Write the exponent of a unit such as mm^-2 above the line, nothing for a pure number."""
+    if unit == "1":
+        return ""
+    base, _, power = unit.partition("^")
+    return base + power.translate(SUPERSCRIPTS) if power else unit
+
+
+def finer_unit(unit: str, value: float) -> tuple[float, str]:
+    """Return by what to multiply lengths of about this size, and the metric unit in which they read well.
+
+    Args:
+        unit: object unit of the survey; lengths in a unit that is not metric stay as they are.
+        value: the largest of the lengths, in that unit.
+    """
+    metres = dict((*METRIC, ("cm", 1e-2), ("dm", 1e-1))).get(unit)
+    if metres is None or not np.isfinite(value) or value <= 0:
+        return 1.0, unit
+    name, size = next(((n, s) for n, s in METRIC if value * metres >= s), METRIC[-1])
+    return metres / size, name
+
+
+def finer_unit_of(unit: str, *values: FloatArray) -> tuple[float, str]:
+    """Return the same for arrays of lengths, of which the largest known one counts."""
+    return finer_unit(unit, max(float(np.nanmax(np.abs(array), initial=0.0)) for array in values))
+
+
+def is_number(text: str) -> bool:
+    """Whether a cell of a table is a number, which is set to the right."""
+    return text.lstrip("+-")[:1].isdigit() and not any(c.isalpha() for c in text.replace("e", ""))
+
+
+FILTERS = {
+    one.__name__: one
+    for one in (fixed, plus, scientific, general, significant, signed, or_unlimited, with_exponent)
+} | {one.__name__: one for one in (to_precision, raised)}
+"""what the templates call"""

@@ -1,0 +1,161 @@
+"""Sentences that more than one report says, and the terminal: the same words everywhere."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sfm.adjustment.quality.statistics import GLOBAL_ALPHA, GlobalTest
+from sfm.adjustment.result import Adjustment
+from sfm.conventions import FloatArray
+from sfm.report.findings.checks import CheckedControl, Sigma0
+from sfm.report.findings.findings import Findings
+from sfm.report.findings.geometry import WEAK_DEG, Coverage, Geometry
+from sfm.report.findings.precision import Precision
+from sfm.report.numbers import finer_unit, significant
+from sfm.result import SurveyResult
+
+NOT_CHECKED = "not checked"
+MAX_BINS = 12  # numbers of rays that are told one by one
+MAX_NAMES = 5  # weak points that are named
+
+
+def words_of_sigma0(sigma0: Sigma0) -> tuple[str, str]:
+    """Return sigma0 and what it is to the stated one, with the image points where they show another."""
+    times = f"{sigma0.ratio:.3f} times the {significant(sigma0.stated_px)} px expected"
+    own = f"of all observations; image points by themselves {sigma0.image_points_px:.4f} px, {times}"
+    return f"{sigma0.px:.4f} px", own if sigma0.differs else times
+
+
+def words_of_test(test: GlobalTest) -> str:
+    """Return what a global test says."""
+    if test.passed is None:
+        return f"{test.of}: not tested, {test.reason}"
+    r = f"{test.redundancy:.1f}".removesuffix(".0")
+    side = "better" if test.statistic < test.lower else "worse"
+    said = "passed" if test.passed else f"NOT passed, {side} than stated"
+    return (
+        f"{test.of}: {said}; v'Pv = {test.statistic:.2f}, chi-square of {r} between {test.lower:.2f} and "
+        f"{test.upper:.2f} ({100 * (1 - GLOBAL_ALPHA):.0f} %)"
+    )
+
+
+def words_of_weights(result: SurveyResult) -> str:
+    """Return which weights the image points have, and what follows for the tests; empty if as stated."""
+    factor = result.adjustment.weight_factor
+    if factor == 1:
+        return ""
+    return (
+        "Weights: the standard deviations of the image points were multiplied by "
+        f"{factor:.3f}, from their own variance component, so that the other kinds of "
+        "observation keep those stated for them. A test of all observations together would pass by "
+        "construction; each kind is tested against the standard deviations stated for it."
+    )
+
+
+def words_of_check(found: CheckedControl, unit: str) -> str:
+    """Return how far the placed points are from control that took no part.
+
+    Args:
+        found: the differences.
+        unit: object unit.
+    """
+    longest, points = float(found.length[found.worst]), found.check.points
+    factor, finer = finer_unit(unit, longest)
+    rms = ", ".join(significant(value * factor) for value in found.check.rms)
+    return (
+        f"RMS {rms} {finer} in X, Y, Z at {len(points)} points; largest "
+        f"{significant(longest * factor)} {finer} at {points[found.worst]}"
+    )
+
+
+def words_of_w(w: float, r: float) -> str:
+    """Return w of a given value; that it is not checked where r is 0, nothing where it was not observed."""
+    return f"{w:+.2f}" if np.isfinite(w) else "" if np.isnan(r) else NOT_CHECKED
+
+
+def words_of_limiting(precision: Precision) -> str:
+    """Return why a limiting standard deviation is above the achieved one; empty where none is.
+
+    With the cameras held, shift, rotation and scale of the points are theirs; inner constraints on the
+    points take these out, and can take out more of a coordinate than the errors of the cameras add.
+    """
+    if not (precision.limiting > precision.rms).any():
+        return ""
+    return (
+        "The limiting precision is in the datum of the cameras, in which a coordinate can be less precise "
+        "than in that of the adjustment."
+    )
+
+
+def words_of_fixed(precision: Precision) -> str:
+    """Say that fixed coordinates do not count; empty where there are none."""
+    count = precision.fixed_points
+    return f"without the fixed coordinates of {count} point{'s' if count > 1 else ''}" if count else ""
+
+
+def words_of_datum(adjustment: Adjustment) -> str:
+    """Return what carries the datum: its kind, and how many points where they were chosen."""
+    points = adjustment.datum_points
+    return adjustment.datum if points is None else f"{adjustment.datum} on {int(points.sum())} chosen points"
+
+
+def words_of_geometry(findings: Findings) -> tuple[tuple[str, str], ...]:
+    """Return what is told of the geometry of the network, and the words for it."""
+    network, found = findings.result.adjustment.network, findings.geometry
+    weak = found.weak
+    names = ", ".join(f"{network.points[j]} ({found.angle_deg[j]:.1f})" for j in weak[:MAX_NAMES])
+    more = " ..." if len(weak) > MAX_NAMES else ""
+    told = f"{len(weak)} points: {names}{more}" if len(weak) else "none"
+    points = tuple(f"point {name}" for name in network.points)
+    known = found.angle_deg[np.isfinite(found.angle_deg)]
+    mean = f", mean {known.mean():.1f} deg; below {WEAK_DEG:g} deg: {told}" if len(known) else ""
+    return (
+        ("rays of a point", f"{found.rays.min()} to {found.rays.max()}, mean {found.rays.mean():.1f}"),
+        ("intersection angle", _between(found.angle_deg, points, "deg", 1) + mean),
+        ("RMS by point", f"{_between(found.point_rms_px, points, 'px', 4)} per coordinate"),
+        ("RMS by photograph", f"{_between(found.image_rms_px, network.images, 'px', 4)} per coordinate"),
+        *((f"coverage {one.camera}", _covered(one)) for one in found.coverage),
+    )
+
+
+def points_by_rays(found: Geometry) -> tuple[tuple[str, int], ...]:
+    """Return (rays, points with so many); ranges of rays where there are many different numbers."""
+    histogram = found.histogram()
+    if len(histogram) <= MAX_BINS:
+        return tuple((str(rays), n) for rays, n in histogram)
+    low, high = histogram[0][0], histogram[-1][0]
+    width = -(-(high - low + 1) // MAX_BINS)
+    bins = []
+    for first in range(low, high + 1, width):
+        last = min(first + width - 1, high)
+        count = sum(n for rays, n in histogram if first <= rays <= last)
+        bins.append((f"{first}-{last}" if last > first else str(first), count))
+    return tuple(bins)
+
+
+def _between(values: FloatArray, names: tuple[str, ...], unit: str, decimals: int) -> str:
+    """Write the smallest and the largest of values, and whose they are."""
+    if not np.isfinite(values).any():
+        return "not known"
+    low, high = int(np.nanargmin(values)), int(np.nanargmax(values))
+    return (
+        f"{values[low]:.{decimals}f} {unit} ({names[low]}) to {values[high]:.{decimals}f} {unit} "
+        f"({names[high]})"
+    )
+
+
+def _covered(one: Coverage) -> str:
+    hull, radius = 100 * one.hull, 100 * one.radius
+    area = f"{hull.min():.0f} to {hull.max():.0f} % of a photograph, mean {hull.mean():.0f} %"
+    reach = f"{radius.min():.0f} to {radius.max():.0f} % of half the diagonal"
+    return f"{area}, all together {100 * one.hull_of_all:.0f} %; from the centre {reach}"
+
+
+PHRASES = {
+    one.__name__: one
+    for one in (
+        *(words_of_sigma0, words_of_test, words_of_weights, words_of_check, words_of_w, words_of_limiting),
+        *(words_of_fixed, words_of_datum, words_of_geometry, points_by_rays),
+    )
+}
+"""what the templates call"""

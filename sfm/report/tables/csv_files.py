@@ -1,0 +1,151 @@
+"""The tables of a result: points, images, cameras, image points, given values, reliability, groups.
+
+Degrees in files, the object unit of the survey, sigmas are standard deviations a posteriori (those of image
+points: as measured). Numbers are written with enough digits to give the same number back.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from sfm.adjustment.result import Adjustment
+from sfm.files.plain_text import csv_text
+from sfm.report.findings.findings import Findings
+from sfm.report.findings.given import Given
+from sfm.report.findings.statistics import Statistics
+
+
+def write_tables(findings: Findings, folder: Path) -> None:
+    """Write all tables of a result into an existing folder; `summary.write_summary` adds the figures."""
+    adjustment, statistics = findings.result.adjustment, findings.statistics
+    for name, header, rows in (
+        ("points", "id,X,Y,Z,sX,sY,sZ,rays,code,angle_deg,rms_px", point_rows(findings)),
+        (
+            "images",
+            "image,X,Y,Z,omega_deg,phi_deg,kappa_deg,sX,sY,sZ,somega_deg,sphi_deg,skappa_deg,camera,points,"
+            "rms_px,coverage",
+            photograph_rows(findings),
+        ),
+        ("cameras", "camera,parameter,value,sigma,unit", camera_rows(findings)),
+        (
+            "image_points",
+            "image,point,x_px,y_px,sx_px,sy_px,vx_px,vy_px,rejected",
+            image_point_rows(adjustment),
+        ),
+        ("given", "kind,name,coordinate,unit,given,difference,sigma,r,w", given_rows(findings.given)),
+        (
+            "reliability",
+            "image,point,vx_px,vy_px,rx,ry,wx,wy,taux,tauy,mdbx_px,mdby_px,extx,exty,weight,rejected",
+            reliability_rows(adjustment, statistics),
+        ),
+        ("variance_components", "kind,group,observations,redundancy,sigma0", component_rows(statistics)),
+    ):
+        text = csv_text(header.split(","), rows)
+        (folder / f"{name}.csv").write_text(text, encoding="utf-8", newline="")
+    write_ply(folder / "points.ply", findings)
+
+
+def point_rows(findings: Findings) -> Iterable[Sequence[object]]:
+    """Return coordinates, sigmas, accepted rays, code, intersection angle and RMS of every point."""
+    for one in findings.points:
+        yield (one.name, *one.xyz, *one.sigma, one.rays, one.code, one.angle_deg, one.rms_px)
+
+
+def photograph_rows(findings: Findings) -> Iterable[Sequence[object]]:
+    """Return exterior orientation, sigmas, camera, number of points, RMS and coverage of every photograph."""
+    for one in findings.photographs:
+        yield (one.name, *one.values, *one.sigma, one.camera, one.points, one.rms_px, one.coverage)
+
+
+def camera_rows(findings: Findings) -> Iterable[Sequence[object]]:
+    """Return camera, parameter, value, sigma (empty where it was not adjusted) and unit."""
+    cameras = findings.result.adjustment.estimate.cameras
+    for camera, sigma in zip(cameras, findings.interior.sigmas, strict=True):
+        for name, value, s, unit in zip(camera.names, camera.parameters, sigma, camera.units, strict=True):
+            yield (camera.name, name, value, s, unit)
+
+
+def image_point_rows(adjustment: Adjustment) -> Iterable[Sequence[object]]:
+    """Return image, point, position, sigmas as measured, residuals and 0 or 1 for rejected."""
+    network = adjustment.network
+    seen = network.image_points
+    sigma = np.sqrt(np.einsum("kii->ki", seen.covariance))
+    for k in range(len(seen)):
+        yield (
+            network.images[seen.image[k]],
+            network.points[seen.point[k]],
+            *seen.xy[k],
+            *sigma[k],
+            *adjustment.residuals[k],
+            int(adjustment.rejected[k]),
+        )
+
+
+def given_rows(given: Given) -> Iterable[Sequence[object]]:
+    """Return kind, name, coordinate, unit, given value, difference, sigma, r and w of every given value."""
+    for kind in given.kinds:
+        for one in kind.values:
+            row = (one.name, one.coordinate, one.unit, one.given, one.difference, one.sigma, one.r, one.w)
+            yield (kind.kind, *row)
+
+
+def reliability_rows(adjustment: Adjustment, statistics: Statistics) -> Iterable[Sequence[object]]:
+    """Return the tests of every image point: residual, redundancy number, w, tau, smallest error, its effect.
+
+    Empty cells: rejected image points have neither redundancy number nor reliability, and where the
+    redundancy number is 0 no error is found.
+    """
+    network = adjustment.network
+    seen, found = network.image_points, statistics.reliability
+    for k in range(len(seen)):
+        yield (
+            network.images[seen.image[k]],
+            network.points[seen.point[k]],
+            *adjustment.residuals[k],
+            *adjustment.redundancy_numbers[k],
+            *adjustment.standardised[k],
+            *adjustment.tau[k],
+            *found.minimal_bias[k],
+            *found.external[k],
+            float(adjustment.weights[k]),
+            int(adjustment.rejected[k]),
+        )
+
+
+def component_rows(statistics: Statistics) -> Iterable[Sequence[object]]:
+    """Return the variance components of kinds of observation, cameras and photographs."""
+    for kind, found in (
+        ("kind", statistics.kinds),
+        ("camera", statistics.cameras),
+        ("photograph", statistics.photographs),
+    ):
+        for g, name in enumerate(found.names):
+            yield (kind, name, int(found.count[g]), found.redundancy[g], found.sigma0[g])
+
+
+def write_ply(path: Path, findings: Findings) -> None:
+    """Write the object points as a PLY point cloud in text form: coded green, uncoded grey.
+
+    Source: Turk, The PLY polygon file format (1994).
+    """
+    points = findings.points
+    lines = [
+        "ply",
+        "format ascii 1.0",
+        f"comment kolinear, {_ascii(findings.result.length_unit)}",
+        f"element vertex {len(points)}",
+        *(f"property double {axis}" for axis in "xyz"),
+        *(f"property uchar {colour}" for colour in ("red", "green", "blue")),
+        "end_header",
+    ]
+    for point in points:
+        colour = "120 120 120" if point.code is None else "20 140 60"
+        lines.append(" ".join(f"{value:.17g}" for value in point.xyz) + " " + colour)
+    path.write_text("\n".join(lines) + "\n", encoding="ascii")
+
+
+def _ascii(text: str) -> str:
+    return text.encode("ascii", "replace").decode().replace("\n", " ").replace("\r", " ")

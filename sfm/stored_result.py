@@ -1,0 +1,67 @@
+"""A result as files hold it: a network with its solution and standard deviations, whoever computed it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sfm.conventions import FloatArray
+from sfm.display import html_table, text_table
+from sfm.network import Estimate, Network
+from sfm.point_table import Point, PointTable
+
+
+@dataclass(frozen=True, repr=False, eq=False)
+class StoredResult:
+    """One result to go on with or to compare: Kolinear's own, COLMAP's or another program's.
+
+    Example:
+        >>> import sfm
+        >>> sfm.StoredResult("bench", result.network, result.estimate).points["1"].xyz.shape
+        (3,)
+    """
+
+    name: str  # what people call it
+    network: Network
+    estimate: Estimate
+    point_covariance: FloatArray | None = None  # marginal, object unit^2, (n, 3, 3)
+    position_covariance: FloatArray | None = None  # of projection centres, object unit^2, (m, 3, 3)
+    interior_sigma: tuple[FloatArray, ...] | None = None  # of each parameter, NaN where fixed
+    redundancy: int | None = None  # of the adjustment, for the degrees of freedom of tests
+    unit: str = ""  # of lengths, as people call it; empty where nobody knows
+
+    @property
+    def points(self) -> PointTable:
+        """The object points by name."""
+        n = len(self.network.points)
+        covariance = self.point_covariance
+        if covariance is None:
+            covariance = np.full((n, 3, 3), np.nan)
+        return PointTable(
+            self.network.points, self.estimate.points, covariance, self.network.rays(), self.unit
+        )
+
+    def point(self, name: str) -> Point:
+        """Return an object point.
+
+        Raises:
+            UnknownNameError: there is none of that name.
+        """
+        found: Point = self.points[name]
+        return found
+
+    def _rows(self) -> list[tuple[str, str]]:
+        known = self.point_covariance is not None
+        return [
+            ("photographs", str(len(self.network.images))),
+            ("points", f"{len(self.network.points)}{', with' if known else ', without'} standard deviations"),
+            ("image points", str(len(self.network.image_points))),
+            ("cameras", ", ".join(f"{c.name} ({c.model})" for c in self.estimate.cameras)),
+        ]
+
+    def __repr__(self) -> str:
+        return text_table(f"Result {self.name}", ("", ""), self._rows())
+
+    def _repr_html_(self) -> str:
+        return html_table(f"Result {self.name}", ("", ""), self._rows())

@@ -1,0 +1,47 @@
+"""The result of a survey, put together from what its stages returned."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sfm.adjustment.quality.correlations import orientation_correlations
+from sfm.orientation.sequence import Orientation
+from sfm.progress import StageClock
+from sfm.result import FailedImage, StageTime, SurveyResult
+from sfm.survey.comparison import SurveyComparison
+from sfm.survey.inputs.survey import Survey
+from sfm.survey.measurements import Measurements
+from sfm.survey.solution import Correspondences, Solution
+
+
+def assemble_result(
+    survey: Survey,
+    measured: Measurements,
+    start: Orientation,
+    matched: Correspondences,
+    solution: Solution,
+    compared: SurveyComparison,
+    clock: StageClock,
+) -> SurveyResult:
+    """Return everything that a survey ends with; each argument is what the stage of that name returned."""
+    adjustment, naming = solution.adjustment, matched.naming
+    points = adjustment.network.points
+    failed = tuple(FailedImage(*one) for one in (*start.failures, *solution.dropped_images))
+    return SurveyResult(
+        survey=survey.name,
+        unit=survey.unit,
+        images_total=len(measured.images),
+        failed=measured.failed + failed,
+        adjustment=adjustment,
+        code=np.full(len(points), -1) if naming is None else naming.codes(adjustment.network),
+        comparison=compared.adjusters,
+        baseline=compared.baseline,
+        photographs=measured.overlays,
+        control_check=solution.control_check,
+        warnings=start.warnings + matched.warnings + solution.warnings + compared.failures,
+        eccentricity=matched.eccentricity,
+        no_circles=matched.no_circles,
+        reject=survey.reject,
+        orientation_correlations=orientation_correlations(adjustment),
+        seconds=tuple(StageTime(*one) for one in clock.seconds),
+    )

@@ -1,0 +1,74 @@
+"""Which target is which object point: uncoded targets named by the orientation, and checked as circles."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sfm.adjustment.datum import Datum
+from sfm.adjustment.solve import adjust
+from sfm.conventions import MAD_TO_SIGMA
+from sfm.network import Estimate, Network, reduce_network
+from sfm.orientation.sequence import Orientation
+from sfm.survey.circles import check_circles
+from sfm.survey.inputs.survey import Survey
+from sfm.survey.measurements import MeasuredPhotographs, Measurements, Naming
+from sfm.survey.network import build_network, match_uncoded, min_rays
+from sfm.survey.solution import TOLERANCE_FACTOR, Correspondences, determined, merge_estimate
+
+ROUNDS = 3  # matching with the orientation at hand, with the adjusted one, and once more to confirm
+MIN_TOLERANCE_PX = 1.0  # below it a difference is for the statistical test, not for the matching
+
+
+def find_correspondences(survey: Survey, measured: Measurements, start: Orientation) -> Correspondences:
+    """Return the network with the uncoded targets in it; where all points have names, as it was measured.
+
+    Args:
+        survey: what to do.
+        measured: the named image points, and all targets.
+        start: orientation from the named ones, with the tolerance it has left.
+
+    Raises:
+        GeometryError: fewer than two photographs keep enough points.
+    """
+    photographs, naming = measured.photographs, measured.naming
+    if photographs is None or naming is None:
+        return Correspondences(measured.network, start.estimate, measured.min_rays)
+    naming, network, estimate = _match_and_adjust(survey, photographs, naming, start)
+    circles = check_circles(survey, photographs, naming, network, estimate)
+    return Correspondences(
+        circles.network,
+        circles.estimate,
+        min_rays(naming),
+        naming,
+        circles.eccentricity,
+        circles.no_circles,
+        circles.warnings,
+    )
+
+
+def _match_and_adjust(
+    survey: Survey, photographs: MeasuredPhotographs, naming: Naming, start: Orientation
+) -> tuple[Naming, Network, Estimate]:
+    """Name the uncoded targets and adjust in turn, with a tolerance that shrinks with the residuals.
+
+    Args:
+        survey: what to do.
+        photographs: all measured targets.
+        naming: the coded targets by name.
+        start: orientation from the coded targets, with the tolerance it has left.
+
+    Returns:
+        The naming, its network, and the adjusted estimate.
+    """
+    estimate, tolerance_px = start.estimate, float(start.tolerance_px.max())
+    for _ in range(ROUNDS):
+        naming, estimate = match_uncoded(photographs, naming, estimate, tolerance_px=tolerance_px)
+        network = build_network(survey, photographs, naming)
+        everything = np.ones(len(network.image_points), dtype=bool)
+        images, points = determined(network, estimate, everything, min_rays(naming))
+        part, values = reduce_network(network, estimate, images, points, everything)
+        adjusted = adjust(part, values, datum=Datum("free"), reject="huber", covariance=False)
+        estimate = merge_estimate(estimate, adjusted.estimate, images, points)
+        spread = MAD_TO_SIGMA * float(np.median(np.abs(adjusted.residuals)))
+        tolerance_px = float(np.clip(TOLERANCE_FACTOR * spread, MIN_TOLERANCE_PX, tolerance_px))
+    return naming, network, estimate

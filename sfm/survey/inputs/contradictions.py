@@ -1,0 +1,213 @@
+"""Settings that are fine one by one and do not go together, in survey files and in surveys from Python."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Protocol
+
+from sfm.distortion.models import MODELS
+from sfm.errors import SurveyFileError
+from sfm.survey.inputs.given import ScaleBar
+from sfm.survey.inputs.settings import (
+    MAX_LENGTH_PER_SIGMA,
+    CameraSettings,
+    CompareSettings,
+    DatumSettings,
+    ScaleBarSettings,
+    TargetSettings,
+    TiePointSettings,
+)
+from sfm.targets.codes.families import FAMILIES
+from sfm.targets.codes.tags import DICTIONARIES
+
+
+class SurveySettings(Protocol):
+    """What a survey file and a survey with its tables have in common."""
+
+    @property
+    def name(self) -> str:
+        """Name of the survey."""
+
+    @property
+    def source(self) -> str:
+        """What messages call the survey."""
+
+    @property
+    def folder(self) -> Path:
+        """Folder that the globs of the photographs are relative to."""
+
+    @property
+    def allow_outside(self) -> bool:
+        """Whether photographs may lie outside that folder."""
+
+    @property
+    def unit(self) -> str:
+        """Object unit."""
+
+    @property
+    def cameras(self) -> Sequence[CameraSettings]:
+        """Its cameras."""
+
+    @property
+    def targets(self) -> TargetSettings:
+        """What targets look like."""
+
+    @property
+    def codes(self) -> str:
+        """Code family, or the path of the table file."""
+
+    @property
+    def tie_points(self) -> TiePointSettings | None:
+        """Natural texture in place of targets."""
+
+    @property
+    def datum(self) -> DatumSettings:
+        """What position, attitude and scale rest on."""
+
+    @property
+    def compare(self) -> CompareSettings:
+        """Other programs beside the survey."""
+
+    @property
+    def control(self) -> object:
+        """Known object points, or their table."""
+
+    @property
+    def exterior(self) -> object:
+        """Observed exterior orientation, or its table."""
+
+    @property
+    def observations(self) -> object:
+        """Image points in place of photographs, or their table."""
+
+    @property
+    def scale_bars(self) -> Sequence[ScaleBarSettings | ScaleBar]:
+        """Measured distances."""
+
+
+def refuse_contradictions(survey: SurveySettings) -> None:
+    """Raise SurveyFileError where settings that are fine one by one do not go together."""
+    where = survey.source
+    if survey.tie_points is not None:
+        if survey.targets.codes != "none":
+            raise SurveyFileError(
+                f"{where}: [tie_points] take the place of targets, codes = '{survey.targets.codes}' asks for "
+                "targets; needed codes = 'none', or no [tie_points]"
+            )
+        if survey.tie_points.window_px % 2 == 0:
+            raise SurveyFileError(
+                f"{where}: tie_points.window_px = {survey.tie_points.window_px}, needed an odd number"
+            )
+    names = [camera.name for camera in survey.cameras]
+    for name in names:
+        if names.count(name) > 1:
+            raise SurveyFileError(f"{where}: two cameras are named '{name}'")
+    for camera in survey.cameras:
+        _refuse_contradictions_of_camera(camera, f"{where}: camera {camera.name}")
+        if camera.images is None and (survey.observations is None or len(survey.cameras) > 1):
+            raise SurveyFileError(
+                f"{where}: camera {camera.name}: images is missing, the glob of its photographs is needed"
+            )
+    if survey.compare.baseline != "none" and survey.observations is not None:
+        raise SurveyFileError(
+            f"{where}: compare.baseline = '{survey.compare.baseline}' needs photographs, the survey has "
+            "[observations]; leave it out"
+        )
+    if survey.datum.kind == "control" and survey.datum.points:
+        raise SurveyFileError(
+            f"{where}: datum.points are for kind 'free' or 'minimal', in kind 'control' the control carries "
+            "the datum"
+        )
+    if survey.datum.kind == "control" and survey.control is None and survey.exterior is None:
+        raise SurveyFileError(
+            f"{where}: datum kind 'control' needs [control] with the file of known points, or [exterior]"
+        )
+    for bar in survey.scale_bars:
+        if bar.start == bar.end:
+            raise SurveyFileError(f"{where}: scale_bar from '{bar.start}' to the same point")
+        if bar.length > MAX_LENGTH_PER_SIGMA * bar.sigma:
+            raise SurveyFileError(
+                f"{where}: scale_bar {bar.start} - {bar.end}: length {bar.length:g} is more than a million "
+                f"times its sigma {bar.sigma:g}; are both in {survey.unit}?"
+            )
+    _refuse_contradicting_sizes(survey.targets, where, survey.unit)
+    if survey.targets.codes not in FAMILIES and not Path(survey.codes).is_file():
+        raise SurveyFileError(
+            f"{where}: targets.codes = '{survey.targets.codes}' is neither one of {', '.join(FAMILIES)} "
+            f"nor a table file in {survey.folder}"
+        )
+
+
+def _refuse_contradicting_sizes(targets: TargetSettings, where: str, unit: str) -> None:
+    """Raise SurveyFileError where sizes of tags or rings do not go with the codes or with one another."""
+    if targets.tag_size is not None and targets.codes not in DICTIONARIES:
+        raise SurveyFileError(
+            f"{where}: targets.tag_size is the size of tags, codes = '{targets.codes}' has none; "
+            f"tags are {', '.join(list(DICTIONARIES)[:4])} ..."
+        )
+    if targets.ring_radii is not None:
+        inner, outer = targets.ring_radii
+        if targets.codes == "none" or targets.codes in DICTIONARIES:
+            raise SurveyFileError(
+                f"{where}: targets.ring_radii are of rings, codes = '{targets.codes}' has none"
+            )
+        if not 1 < inner < outer:
+            raise SurveyFileError(
+                f"{where}: targets.ring_radii = [{inner:g}, {outer:g}], needed more than 1 radius of the dot "
+                "and the second larger"
+            )
+    if targets.tag_sigma is not None:
+        if targets.tag_size is None:
+            raise SurveyFileError(f"{where}: targets.tag_sigma needs targets.tag_size")
+        if targets.tag_size > MAX_LENGTH_PER_SIGMA * targets.tag_sigma:
+            raise SurveyFileError(
+                f"{where}: targets.tag_size {targets.tag_size:g} is more than a million times its sigma "
+                f"{targets.tag_sigma:g}; are both in {unit}?"
+            )
+
+
+def _refuse_contradictions_of_camera(camera: CameraSettings, at: str) -> None:
+    """Raise SurveyFileError where the settings of a camera do not go together."""
+    known = MODELS[camera.model].names
+    fixed, weighted = dict(camera.fixed), dict(camera.weighted)
+    varying = (*camera.per_photograph, *camera.per_group)
+    for parameter in (*camera.free, *fixed, *weighted, *varying):
+        if parameter not in known:
+            raise SurveyFileError(
+                f"{at}: model {camera.model} has no parameter '{parameter}', it has {', '.join(known)}"
+            )
+    for key, names in (
+        ("free", camera.free),
+        ("per_photograph", camera.per_photograph),
+        ("per_group", camera.per_group),
+    ):
+        for parameter in names:
+            if names.count(parameter) > 1:
+                raise SurveyFileError(
+                    f"{at}: parameter '{parameter}' stands {names.count(parameter)} times in {key}, once is "
+                    "needed"
+                )
+    for one, other, both in (
+        ("free", "fixed", set(camera.free) & set(fixed)),
+        ("weighted", "free", set(weighted) & set(camera.free)),
+        ("weighted", "fixed", set(weighted) & set(fixed)),
+        ("per_photograph", "per_group", set(camera.per_photograph) & set(camera.per_group)),
+    ):
+        for parameter in sorted(both):
+            raise SurveyFileError(f"{at}: parameter '{parameter}' is both {one} and {other}")
+    for parameter in varying:
+        if parameter not in camera.adjusted:
+            key = "per_photograph" if parameter in camera.per_photograph else "per_group"
+            raise SurveyFileError(
+                f"{at}: parameter '{parameter}' stands in {key} but is not adjusted, it is needed in free or "
+                "weighted"
+            )
+    if bool(camera.per_group) != bool(camera.groups):
+        missing, given = ("groups", "per_group") if camera.per_group else ("per_group", "groups")
+        raise SurveyFileError(f"{at}: {given} is given, {missing} is needed with it")
+    if camera.pixel_mm is not None and camera.sensor_mm is not None:
+        raise SurveyFileError(f"{at}: pixel_mm and sensor_mm are both given, one is needed")
+    for key, values in (("fixed", fixed), ("weighted", weighted)):
+        if camera.c_mm is not None and "c" in values:
+            raise SurveyFileError(f"{at}: c_mm and {key}.c are both given, one is needed")

@@ -1,0 +1,156 @@
+"""Observed exterior orientation as a survey is given it: satellite positioning, a tracker, known stations."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from sfm.conventions import FloatArray
+from sfm.errors import SurveyFileError
+from sfm.files.csv_tables import CsvTable, array_table, read_header, read_table
+from sfm.survey.inputs.given import (
+    ANGLES,
+    AXES,
+    MAX_EXTENT_PER_SIGMA,
+    MIN_SIGMA,
+    SIGMAS_OF_ANGLES,
+    SIGMAS_OF_AXES,
+    columns_of,
+)
+
+FULL_TURN = 360.0  # deg
+LEAST_COS_PHI = 0.01  # nearer to phi = +-90 deg omega and kappa say nearly the same
+
+
+@dataclass(frozen=True)
+class ObservedExterior:
+    """Observed exterior orientations: X0, Y0, Z0 in the object unit, angles in rad.
+
+    Example:
+        >>> import sfm
+        >>> sfm.ObservedExterior.from_arrays(["a.jpg"], [[10, 20, 30]], 0.02).sigma[0]
+        array([0.02, 0.02, 0.02,  inf,  inf,  inf])
+    """
+
+    names: tuple[str, ...]  # photographs, (e,)
+    value: FloatArray  # X0, Y0, Z0, omega, phi, kappa; NaN where not observed, (e, 6)
+    sigma: FloatArray  # standard deviations, 0 = fixed, infinite where not observed, (e, 6)
+    table: CsvTable  # where they stand, for messages
+
+    @classmethod
+    def from_arrays(
+        cls,
+        names: Sequence[str],
+        position: npt.ArrayLike,
+        position_sigma: npt.ArrayLike = 0.0,
+        angles_deg: npt.ArrayLike = np.nan,
+        angles_sigma_deg: npt.ArrayLike = 0.0,
+    ) -> ObservedExterior:
+        """Return observed exterior orientations from arrays.
+
+        Args:
+            names: of the photographs, e different ones.
+            position: projection centres, object unit; NaN = not observed, (e, 3).
+            position_sigma: their standard deviations, 0 = fixed, (e, 3) or what can be broadcast to it.
+            angles_deg: omega, phi, kappa, degrees; NaN = not observed, (e, 3).
+            angles_sigma_deg: their standard deviations, 0 = fixed, degrees.
+
+        Raises:
+            SurveyFileError: as `read_observed_exterior`.
+        """
+        what, names_of_columns = "observed exterior", (*AXES, *ANGLES, *SIGMAS_OF_AXES, *SIGMAS_OF_ANGLES)
+        given = [(position, 3), (angles_deg, 3), (position_sigma, 3), (angles_sigma_deg, 3)]
+        columns = columns_of(what, names_of_columns, len(names), *given)
+        for name, sigma in zip((*AXES, *ANGLES), (*SIGMAS_OF_AXES, *SIGMAS_OF_ANGLES), strict=True):
+            columns[sigma] = np.where(np.isnan(columns[name]), np.nan, columns[sigma])
+        table = array_table(what, {"image": names}, columns, blank=names_of_columns)
+        return _observed_exterior(table, table.values[:, :6], table.values[:, 6:])
+
+
+def read_observed_exterior(path: Path) -> ObservedExterior:
+    """Read observed exterior orientations; images.csv of a result is welcome.
+
+    Columns are image,X,Y,Z[,sX,sY,sZ][,omega_deg,phi_deg,kappa_deg[,somega_deg,sphi_deg,skappa_deg]]. An
+    empty cell means not observed; no column of sigma, or a sigma of 0, means fixed.
+
+    Raises:
+        SurveyFileError: unreadable, wrong columns, not a finite number, a duplicate image, a sigma that is
+            negative or stands alone or is missing, one so small that its unit must be another, angles of
+            which only some are fixed, or that cannot be told apart.
+    """
+    header = read_header(path)
+    sigmas_of_axes = SIGMAS_OF_AXES if any(name in header for name in SIGMAS_OF_AXES) else ()
+    sigmas_of_angles = SIGMAS_OF_ANGLES if any(name in header for name in SIGMAS_OF_ANGLES) else ()
+    angles = ANGLES if any(name in header for name in (*ANGLES, *sigmas_of_angles)) else ()
+    columns = (*AXES, *sigmas_of_axes, *angles, *sigmas_of_angles)
+    aliases = (("photograph", "image"), ("X0", "X"), ("Y0", "Y"), ("Z0", "Z"))
+    table = read_table(
+        path,
+        ("image",),
+        columns,
+        tuple(name for name in (*SIGMAS_OF_AXES, *ANGLES, *SIGMAS_OF_ANGLES) if name not in columns),
+        aliases=aliases,
+        ignored=("camera", "points", "rms_px", "coverage"),
+        blank=columns,
+    )
+    value, sigma = np.full((len(table.line), 6), np.nan), np.full((len(table.line), 6), np.nan)
+    for place, names, sigmas in ((0, AXES, sigmas_of_axes), (3, angles, sigmas_of_angles)):
+        for k, name in enumerate(names):
+            given = table.values[:, columns.index(name)]
+            own = (
+                table.values[:, columns.index(sigmas[k])] if sigmas else np.where(np.isnan(given), given, 0.0)
+            )
+            _refuse_halves(table, given, own, name, sigmas[k] if sigmas else "")
+            value[:, place + k], sigma[:, place + k] = given, own
+    return _observed_exterior(table, value, sigma)
+
+
+def _observed_exterior(table: CsvTable, value: FloatArray, sigma: FloatArray) -> ObservedExterior:
+    """Return observed orientations, (e, 6) in degrees with NaN where not observed, as they are adjusted."""
+    sigma = np.where(np.isnan(sigma), np.inf, sigma)
+    _refuse_impossible(table, value, sigma)
+    value, sigma = value.copy(), sigma.copy()
+    value[:, 3:], sigma[:, 3:] = np.radians(value[:, 3:]), np.radians(sigma[:, 3:])
+    return ObservedExterior(table.keys("image"), value, sigma, table)
+
+
+def _refuse_halves(table: CsvTable, given: FloatArray, sigma: FloatArray, name: str, sigma_name: str) -> None:
+    """Refuse a value without its sigma and a sigma without its value."""
+    for k in np.flatnonzero(np.isnan(given) != np.isnan(sigma))[:1]:
+        empty, other = (name, sigma_name) if np.isnan(given[k]) else (sigma_name, name)
+        raise SurveyFileError(
+            f"{table.place(k)}: column {empty} is empty beside a value in {other}; needed "
+            "both, sigma 0 for a fixed value, or neither for one that was not observed"
+        )
+
+
+def _refuse_impossible(table: CsvTable, value: FloatArray, sigma: FloatArray) -> None:
+    """Refuse observed orientations (degrees) that no adjustment can take as they stand."""
+    columns = (*SIGMAS_OF_AXES, *SIGMAS_OF_ANGLES)
+    table.refuse(sigma, sigma < 0, columns, "0 (fixed) or more")
+    known = value[np.isfinite(value[:, :3]).all(axis=1), :3]
+    extent = float(np.ptp(known, axis=0).max()) if len(known) else 0.0
+    least = np.array([max(MIN_SIGMA, extent / MAX_EXTENT_PER_SIGMA)] * 3 + [MIN_SIGMA] * 3)
+    table.refuse(
+        sigma,
+        (sigma > 0) & (sigma < least),
+        columns,
+        f"at least {least[0]:.3g} (of angles {MIN_SIGMA:g} deg), or 0 for a fixed value: coordinates and "
+        "sigmas are in the object unit, angles in degrees",
+    )
+    angles = value[:, 3:]
+    table.refuse(angles, np.abs(angles) > FULL_TURN, ANGLES, f"degrees, at most {FULL_TURN:g}")
+    fixed = sigma[:, 3:] == 0
+    some = fixed & ~fixed.all(axis=1, keepdims=True)
+    table.refuse(sigma[:, 3:], some, SIGMAS_OF_ANGLES, "omega, phi, kappa fixed together or none of them")
+    phi = np.abs(np.cos(np.radians(angles[:, 1]))) < LEAST_COS_PHI
+    table.refuse(
+        angles,
+        phi[:, None] & np.array([False, True, False]),
+        ANGLES,
+        "another than +-90, where omega and kappa cannot be told apart; leave the three angles empty",
+    )

@@ -1,0 +1,277 @@
+"""What a survey is given besides photographs: control, image points, sizes, start values.
+
+Each kind is a frozen dataclass that is made from a CSV file by its `read_...`, or from arrays by
+`from_arrays`; both refuse the same, with the line or row and the column. What is true of all tables is in
+`sfm.files.csv_tables`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from sfm.conventions import FloatArray, rotation_from_angles
+from sfm.errors import SurveyFileError
+from sfm.files.csv_tables import MAX_NUMBER, CsvTable, array_table, read_header, read_table
+
+MIN_SIGMA = 1e-9  # in any unit used here less than an atom
+MAX_EXTENT_PER_SIGMA = 1e6  # no control is known to better than a millionth of its extent
+AXES, ANGLES = ("X", "Y", "Z"), ("omega_deg", "phi_deg", "kappa_deg")
+SIGMAS_OF_AXES, SIGMAS_OF_ANGLES = ("sX", "sY", "sZ"), ("somega_deg", "sphi_deg", "skappa_deg")
+
+
+@dataclass(frozen=True)
+class KnownPoints:
+    """Object points known beforehand: control, or start values.
+
+    Example:
+        >>> import sfm
+        >>> control = sfm.KnownPoints.from_arrays(["501", "502"], [[0, 0, 0], [1000, 0, 0]], sigma=0.05)
+        >>> control.sigma
+        array([[0.05, 0.05, 0.05],
+               [0.05, 0.05, 0.05]])
+    """
+
+    names: tuple[str, ...]  # (n,)
+    xyz: FloatArray  # object unit, (n, 3)
+    sigma: FloatArray  # standard deviations, 0 = fixed, object unit, (n, 3)
+
+    @classmethod
+    def from_arrays(cls, names: Sequence[str], xyz: npt.ArrayLike, sigma: npt.ArrayLike = 0.0) -> KnownPoints:
+        """Return points from arrays.
+
+        Args:
+            names: of the points, n different ones.
+            xyz: coordinates, object unit, (n, 3).
+            sigma: standard deviations, 0 = fixed, object unit, (n, 3) or what can be broadcast to it.
+
+        Raises:
+            SurveyFileError: as `read_control`.
+        """
+        columns = columns_of("control", (*AXES, *SIGMAS_OF_AXES), len(names), (xyz, 3), (sigma, 3))
+        return _known_points(array_table("control", {"id": names}, columns))
+
+
+@dataclass(frozen=True)
+class StartOrientations:
+    """Approximate exterior orientations, as images.csv of a result holds them."""
+
+    names: tuple[str, ...]  # photographs, (m,)
+    position: FloatArray  # projection centres X0, object unit, (m, 3)
+    rotation: FloatArray  # R, image to object axes, (m, 3, 3)
+    table: CsvTable  # where they stand, for messages
+
+    @classmethod
+    def from_arrays(
+        cls, names: Sequence[str], position: npt.ArrayLike, angles_deg: npt.ArrayLike
+    ) -> StartOrientations:
+        """Return start values from arrays.
+
+        Args:
+            names: of the photographs, m different ones.
+            position: projection centres, object unit, (m, 3).
+            angles_deg: omega, phi, kappa, degrees, (m, 3).
+        """
+        columns = columns_of("start values", (*AXES, *ANGLES), len(names), (position, 3), (angles_deg, 3))
+        return _start_orientations(array_table("start values", {"image": names}, columns))
+
+
+@dataclass(frozen=True)
+class Observations:
+    """Measured image points in place of photographs.
+
+    Example:
+        >>> import sfm
+        >>> seen = sfm.Observations.from_arrays(["a.jpg", "b.jpg"], ["1", "1"], [[10.5, 20.0], [30.0, 41.5]])
+        >>> seen.unit, len(seen.xy)
+        ('px', 2)
+    """
+
+    image: tuple[str, ...]  # photograph of each row, (k,)
+    point: tuple[str, ...]  # point of each row, (k,)
+    xy: FloatArray  # px in the pixel frame or mm in the image frame, (k, 2)
+    sigma: FloatArray | None  # standard deviations in the same unit, None if there are none, (k, 2)
+    unit: str  # px | mm
+    table: CsvTable  # where they stand, for messages
+
+    @classmethod
+    def from_arrays(
+        cls,
+        image: Sequence[str],
+        point: Sequence[str],
+        xy: npt.ArrayLike,
+        sigma: npt.ArrayLike | None = None,
+        *,
+        unit: str = "px",
+    ) -> Observations:
+        """Return measured image points from arrays.
+
+        Args:
+            image: name of the photograph of each row, k of them.
+            point: name of the point of each row.
+            xy: positions, px in the pixel frame or mm in the image frame, (k, 2).
+            sigma: standard deviations in the same unit, (k, 2) or what can be broadcast to it; the survey's
+                sigma_px if not given.
+            unit: px or mm.
+
+        Raises:
+            SurveyFileError: as `read_image_points`, or another unit.
+        """
+        if unit not in ("px", "mm"):
+            raise SurveyFileError(f"observations: unit '{unit}', expected px or mm")
+        names = (f"x_{unit}", f"y_{unit}", f"sx_{unit}", f"sy_{unit}")
+        given = [(xy, 2)] if sigma is None else [(xy, 2), (sigma, 2)]
+        columns = columns_of("observations", names[: 2 * len(given)], len(image), *given)
+        return _observations(array_table("observations", {"image": image, "point": point}, columns), unit)
+
+
+@dataclass(frozen=True)
+class Diameters:
+    """Known diameters of single targets."""
+
+    names: tuple[str, ...]  # of the targets, (n,)
+    diameter: FloatArray  # object unit, (n,)
+    source: str  # the table, for messages
+
+
+@dataclass(frozen=True)
+class ScaleBar:
+    """A measured distance between two object points.
+
+    Example:
+        >>> import sfm
+        >>> sfm.ScaleBar("506", "507", 1389.688, 0.010)
+        ScaleBar(start='506', end='507', length=1389.688, sigma=0.01)
+    """
+
+    start: str  # name of the first point
+    end: str  # name of the second point
+    length: float  # object unit
+    sigma: float  # standard deviation, object unit
+
+    def __post_init__(self) -> None:
+        for what, value in (("length", self.length), ("sigma", self.sigma)):
+            if not MIN_SIGMA <= value <= MAX_NUMBER:
+                raise SurveyFileError(
+                    f"scale bar {self.start} - {self.end}: {what} {value}, needed more than 0"
+                )
+
+
+def read_control(path: Path) -> KnownPoints:
+    """Read known object points: id,X,Y,Z[,sX,sY,sZ]; no sigma or 0 means fixed.
+
+    Raises:
+        SurveyFileError: unreadable, wrong columns, not a finite number, a duplicate id, a negative sigma, or
+            one that is so small beside the coordinates that its unit must be another.
+    """
+    return _known_points(read_table(path, ("id",), AXES, SIGMAS_OF_AXES, aliases=(("point", "id"),)))
+
+
+def _known_points(table: CsvTable) -> KnownPoints:
+    """Return the points of a table with or without sigmas."""
+    xyz, sigma = table.values[:, :3], table.values[:, 3:]
+    if not sigma.size:
+        sigma = np.zeros_like(xyz)
+    table.refuse(sigma, sigma < 0, SIGMAS_OF_AXES, "0 (fixed) or more")
+    extent = float(np.ptp(xyz, axis=0).max())
+    table.refuse(
+        sigma,
+        (sigma > 0) & (sigma * MAX_EXTENT_PER_SIGMA < extent),
+        SIGMAS_OF_AXES,
+        f"at least a millionth of the extent of the points, {extent:g}: coordinates and sigmas in one unit; "
+        "0 for a fixed coordinate",
+    )
+    return KnownPoints(table.keys("id"), xyz, sigma)
+
+
+def read_diameters(path: Path) -> Diameters:
+    """Read the diameters of targets: id,diameter, object unit.
+
+    Raises:
+        SurveyFileError: unreadable, wrong columns, not a positive number or a duplicate id.
+    """
+    table = read_table(path, ("id",), ("diameter",), aliases=(("point", "id"),))
+    table.refuse(table.values, table.values < MIN_SIGMA, ("diameter",), "more than 0")
+    return Diameters(table.keys("id"), table.values[:, 0], path.name)
+
+
+def read_points(path: Path) -> KnownPoints:
+    """Read approximate object points: point,X,Y,Z; points.csv of a result is welcome.
+
+    Raises:
+        SurveyFileError: unreadable, wrong columns, not a finite number or a duplicate point.
+    """
+    table = read_table(
+        path,
+        ("point",),
+        ("X", "Y", "Z"),
+        aliases=(("id", "point"),),
+        ignored=("sX", "sY", "sZ", "rays", "code", "angle_deg", "rms_px"),
+    )
+    return KnownPoints(table.keys("point"), table.values, np.zeros_like(table.values))
+
+
+def read_exterior(path: Path) -> StartOrientations:
+    """Read exterior orientations: image,X,Y,Z,omega_deg,phi_deg,kappa_deg; images.csv of a result is welcome.
+
+    Raises:
+        SurveyFileError: unreadable, wrong columns, not a finite number or a duplicate image.
+    """
+    ignored = ("camera", *SIGMAS_OF_AXES, *SIGMAS_OF_ANGLES, "points", "rms_px", "coverage")
+    return _start_orientations(read_table(path, ("image",), (*AXES, *ANGLES), ignored=ignored))
+
+
+def _start_orientations(table: CsvTable) -> StartOrientations:
+    """Return the orientations of a table in degrees."""
+    rotation = [rotation_from_angles(*row) for row in np.radians(table.values[:, 3:])]
+    return StartOrientations(
+        table.keys("image"), table.values[:, :3], np.reshape(rotation, (-1, 3, 3)), table
+    )
+
+
+def read_image_points(path: Path) -> Observations:
+    """Read image points: image,point,x_px,y_px[,sx_px,sy_px] or image,point,x_mm,y_mm[,sx_mm,sy_mm].
+
+    image_points.csv of a result is welcome; its residuals and rejections are passed over, everything is
+    taken as measured.
+
+    Raises:
+        SurveyFileError: unreadable, wrong columns, not a finite number, a sigma that is not positive, or the
+            same point twice in one image.
+    """
+    unit = "mm" if "x_mm" in read_header(path) else "px"
+    sigmas = (f"sx_{unit}", f"sy_{unit}")
+    table = read_table(
+        path, ("image", "point"), (f"x_{unit}", f"y_{unit}"), sigmas, ignored=("vx_px", "vy_px", "rejected")
+    )
+    return _observations(table, unit)
+
+
+def _observations(table: CsvTable, unit: str) -> Observations:
+    """Return the image points of a table with or without sigmas."""
+    xy, sigma = table.values[:, :2], table.values[:, 2:]
+    sigmas = (f"sx_{unit}", f"sy_{unit}")
+    table.refuse(sigma, sigma < MIN_SIGMA, sigmas, f"more than 0, at least {MIN_SIGMA:g}")
+    image, point = table.texts
+    table.refuse_duplicates(tuple(zip(image, point, strict=True)), ("image", "point"))
+    return Observations(image, point, xy, sigma if sigma.size else None, unit, table)
+
+
+def columns_of(
+    what: str, names: tuple[str, ...], rows: int, *given: tuple[npt.ArrayLike, int]
+) -> dict[str, FloatArray]:
+    """Return arrays, each with the number of its columns, as named columns of so many rows."""
+    columns: list[FloatArray] = []
+    for values, width in given:
+        try:
+            columns += list(np.broadcast_to(np.asarray(values, dtype=float), (rows, width)).T)
+        except (TypeError, ValueError) as error:
+            name = ", ".join(names[len(columns) : len(columns) + width])
+            raise SurveyFileError(
+                f"{what}: {name} have the shape {np.shape(values)}, expected numbers ({rows}, {width})"
+            ) from error
+    return dict(zip(names, columns, strict=True))

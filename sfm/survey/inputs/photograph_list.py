@@ -1,0 +1,111 @@
+"""The photographs of a survey: the files that the globs of its cameras name."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from sfm.conventions import IntArray
+from sfm.errors import SurveyFileError
+from sfm.files.globs import find_files
+from sfm.files.plain_text import as_plain, is_plain
+from sfm.survey.inputs.contradictions import SurveySettings
+from sfm.survey.inputs.interior import refuse_ungrouped
+from sfm.survey.inputs.survey_file import inside
+
+MAX_PHOTOGRAPHS = 5000  # tables of all pairs of them are kept, 100 MB each
+
+
+@dataclass(frozen=True)
+class PhotographList:
+    """The photographs of a survey in order of camera and name."""
+
+    names: tuple[str, ...]  # file names, by which tables and reports know them, (m,)
+    paths: tuple[Path, ...]  # (m,)
+    camera: IntArray  # index of the camera, (m,)
+    folder: Path  # that the names are relative to
+
+    def by_camera(self) -> tuple[tuple[str, ...], ...]:
+        """Return the names of the photographs of each camera that has some."""
+        return tuple(
+            tuple(name for name, k in zip(self.names, self.camera, strict=True) if k == one)
+            for one in np.unique(self.camera)
+        )
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+
+def find_photographs(survey: SurveySettings, *, images_dir: Path | None = None) -> PhotographList:
+    """Return the photographs that the globs of the cameras name.
+
+    Args:
+        survey: a survey with photographs, or its file.
+        images_dir: folder of the photographs in place of the survey's own.
+
+    Raises:
+        SurveyFileError: no such folder, a camera without photographs, a photograph of two cameras, of no
+            group where its camera has groups, or with a name that is no plain text.
+    """
+    folder = Path(images_dir) if images_dir is not None else survey.folder
+    if not folder.is_dir():
+        raise SurveyFileError(f"{folder}: no such folder; photographs of survey {survey.name} were needed")
+
+    def refuse_outside(path: Path) -> None:
+        name = path.relative_to(folder).as_posix()
+        inside(folder, name, survey.source, allow_outside=survey.allow_outside)
+
+    owner: list[tuple[str, Path, int]] = []
+    for index, camera in enumerate(survey.cameras):
+        pattern = camera.images or ""
+        try:
+            found = find_files(folder, pattern, enter=refuse_outside)
+        except ValueError as error:
+            raise SurveyFileError(
+                f"{survey.source}: camera {camera.name}: images = '{pattern}' is no glob relative to {folder}"
+            ) from error
+        if not survey.allow_outside:
+            for path in found:
+                refuse_outside(path)
+        if not found:
+            raise SurveyFileError(
+                f"no photographs found: camera {camera.name} needs '{pattern}' in {folder}, {_holds(folder)}"
+            )
+        for name in (path.relative_to(folder).as_posix() for path in found):
+            if not is_plain(name):
+                raise SurveyFileError(
+                    f"{survey.source}: the name of photograph '{as_plain(name)}' is no plain text; "
+                    "rename the file"
+                )
+        owner += [(path.relative_to(folder).as_posix(), path, index) for path in found]
+    seen: dict[str, int] = {}
+    for name, _, index in owner:
+        if name in seen:
+            first, second = survey.cameras[seen[name]].name, survey.cameras[index].name
+            raise SurveyFileError(
+                f"{survey.source}: photograph '{name}' matches the globs of cameras {first} and {second}"
+            )
+        seen[name] = index
+    names, paths, cameras = zip(*owner, strict=True)
+    refuse_many(survey.source, names)
+    refuse_ungrouped(survey.cameras, names, cameras, survey.source)
+    return PhotographList(names, paths, np.array(cameras, dtype=np.int64), folder)
+
+
+def refuse_many(where: str, images: Sequence[str]) -> None:
+    """Raise SurveyFileError if there are more photographs than one adjustment has room for."""
+    if len(images) > MAX_PHOTOGRAPHS:
+        raise SurveyFileError(
+            f"{where}: {len(images)} photographs, at most {MAX_PHOTOGRAPHS} are adjusted together"
+        )
+
+
+def _holds(folder: Path) -> str:
+    """Say in a few words which files a folder holds."""
+    files = sorted(path.name for path in folder.iterdir() if path.is_file())
+    if not files:
+        return "which holds no files (--images names another folder)"
+    return f"which holds {len(files)} files such as '{files[0]}' (--images names another folder)"

@@ -1,0 +1,238 @@
+"""A survey: its settings and everything it was given, from a survey file or from Python."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any, TypeVar
+
+from pydantic import ValidationError
+
+from sfm.adjustment.datum import Datum
+from sfm.errors import SurveyFileError
+from sfm.files.plain_text import as_plain
+from sfm.survey.inputs.contradictions import refuse_contradictions
+from sfm.survey.inputs.exterior_table import ObservedExterior, read_observed_exterior
+from sfm.survey.inputs.given import (
+    Diameters,
+    KnownPoints,
+    Observations,
+    ScaleBar,
+    StartOrientations,
+    read_control,
+    read_diameters,
+    read_exterior,
+    read_image_points,
+    read_points,
+)
+from sfm.survey.inputs.settings import (
+    AdjustSettings,
+    CameraSettings,
+    CompareSettings,
+    DatumSettings,
+    Head,
+    Section,
+    TargetSettings,
+    TiePointSettings,
+)
+from sfm.survey.inputs.settings_errors import first_error
+from sfm.survey.inputs.survey_file import read_survey_file
+from sfm.targets.codes.families import FAMILIES, Family, code_family
+from sfm.targets.codes.rings import CodeFamily
+
+T = TypeVar("T")
+S = TypeVar("S", bound=Section)
+
+
+class CameraSetup(CameraSettings):
+    """One camera of a survey made in Python; the words are those of [[camera]] in a survey file.
+
+    Example:
+        >>> import sfm
+        >>> sfm.CameraSetup(name="olympus", images="P*.JPG", c_mm=7.3, free=["c", "x0", "y0", "K1"]).free
+        ('c', 'x0', 'y0', 'K1')
+    """
+
+    def __init__(self, **settings: Any) -> None:
+        try:
+            super().__init__(**_plain(settings))
+        except ValidationError as error:
+            where = f"camera {settings.get('name', '')}".strip()
+            raise SurveyFileError(first_error(where, "", error, CameraSettings)) from None
+
+
+@dataclass(frozen=True, kw_only=True, eq=False, repr=False)
+class Survey:
+    """What is to be measured and adjusted, and everything that is known beforehand.
+
+    Photographs, or observations in place of them. Settings may be given as dictionaries in the words of the
+    survey file: `targets={"codes": "ring14"}`.
+
+    Example:
+        >>> import sfm
+        >>> camera = sfm.CameraSetup(name="olympus", images="P*.JPG", c_mm=7.3, free=["c", "K1"])
+        >>> bar = sfm.ScaleBar("506", "507", 1389.688, 0.010)
+        >>> sfm.Survey(name="hall", unit="mm", cameras=[camera], scale_bars=[bar])
+        <Survey hall: 1 camera, targets of codes none, 1 scale bar, datum free>
+    """
+
+    name: str
+    cameras: tuple[CameraSettings, ...]  # a CameraSetup each
+    unit: str = "m"  # object unit, for people and reports
+    targets: TargetSettings = field(default_factory=TargetSettings)
+    tie_points: TiePointSettings | None = None  # natural texture in place of targets
+    datum: DatumSettings = field(default_factory=DatumSettings)  # or a Datum with points by name
+    adjust: AdjustSettings = field(default_factory=AdjustSettings)  # the stochastic model
+    compare: CompareSettings = field(default_factory=CompareSettings)  # other programs beside the survey
+    control: KnownPoints | None = None
+    exterior: ObservedExterior | None = None
+    scale_bars: tuple[ScaleBar, ...] = ()
+    observations: Observations | None = None  # measured image points in place of photographs
+    diameters: Diameters | None = None  # of single targets
+    start_orientations: StartOrientations | None = None
+    start_points: KnownPoints | None = None
+    folder: Path = Path()  # that the globs of the photographs are relative to
+    allow_outside: bool = True  # whether photographs may lie outside the folder
+    source: str = ""  # what messages call the survey; else its name
+
+    def __post_init__(self) -> None:
+        """Turn what was given in Python into settings, and refuse what does not go together."""
+        where = self.source or as_plain(f"survey {self.name}")
+        head = _section(Head, {"name": self.name, "unit": self.unit}, where)
+        cameras = tuple(_section(CameraSettings, one, f"{where}: camera") for one in self.cameras)
+        if not cameras:
+            raise SurveyFileError(f"{where}: no cameras, at least one is needed")
+        datum: object = self.datum
+        if isinstance(datum, Datum):
+            datum = {"kind": datum.kind, "points": () if datum.points is None else datum.points}
+        values = {
+            "name": head.name,
+            "unit": head.unit,
+            "source": where,
+            "cameras": cameras,
+            "scale_bars": tuple(self.scale_bars),
+            "folder": Path(self.folder),
+            "datum": _section(DatumSettings, datum, f"{where}: datum"),
+            "targets": _section(TargetSettings, self.targets, f"{where}: targets"),
+            "adjust": _section(AdjustSettings, self.adjust, f"{where}: adjust"),
+            "compare": _section(CompareSettings, self.compare, f"{where}: compare"),
+        }
+        if self.tie_points is not None:
+            values["tie_points"] = _section(TiePointSettings, self.tie_points, f"{where}: tie_points")
+        for name, value in values.items():
+            object.__setattr__(self, name, value)
+        refuse_contradictions(self)
+
+    @property
+    def reject(self) -> str:
+        """How gross errors are treated; given observations are adjusted as they are unless it is said."""
+        return self.adjust.reject or ("tau" if self.observations is None else "none")
+
+    @property
+    def codes(self) -> str:
+        """Code family, or the path of the table file."""
+        codes = self.targets.codes
+        return codes if codes in FAMILIES else str(self.folder / codes)
+
+    @cached_property
+    def family(self) -> Family | None:
+        """Codes of the targets, None where they have none; a table is read once.
+
+        Raises:
+            SurveyFileError: the code table is unreadable.
+        """
+        return survey_family(self.targets, self.codes)
+
+    def __repr__(self) -> str:
+        count = len(self.cameras)
+        what = [f"{count} camera{'s' if count > 1 else ''}"]
+        if self.observations is not None:
+            what.append(f"{len(self.observations.xy)} image points")
+        elif self.tie_points is not None:
+            what.append("tie points of natural texture")
+        else:
+            what.append(f"targets of codes {self.targets.codes}")
+        if self.control is not None:
+            what.append(f"{len(self.control.names)} control points")
+        if self.scale_bars:
+            what.append(f"{len(self.scale_bars)} scale bar{'s' if len(self.scale_bars) > 1 else ''}")
+        return f"<Survey {self.name}: {', '.join(what)}, datum {self.datum.kind}>"
+
+
+def read_survey(path: str | Path, *, allow_outside: bool = False) -> Survey:
+    """Read a survey file and the tables that it names, each once.
+
+    Args:
+        path: the TOML file; every path in it is relative to it.
+        allow_outside: whether these paths may lead out of its folder; a file from a stranger should not.
+
+    Raises:
+        SurveyFileError: the file or a table is unreadable, has an unknown key or column, a wrong type, or
+            settings that contradict one another; the line names the file, the place, what was found and what
+            was needed.
+
+    Example:
+        >>> import sfm
+        >>> sfm.read_survey("datasets/demo/survey.toml")
+        <Survey demo: 1 camera, targets of codes ring14, 2 scale bars, datum free>
+    """
+    file = read_survey_file(Path(path), allow_outside=allow_outside)
+
+    def read(reader: Callable[[Path], T], name: str | None) -> T | None:
+        return None if name is None else reader(file.beside(name))
+
+    return Survey(
+        name=file.name,
+        unit=file.unit,
+        cameras=file.cameras,
+        targets=file.targets,
+        tie_points=file.tie_points,
+        datum=file.datum,
+        adjust=file.adjust,
+        compare=file.compare,
+        control=read(read_control, file.control.file if file.control else None),
+        exterior=read(read_observed_exterior, file.exterior.file if file.exterior else None),
+        scale_bars=tuple(ScaleBar(bar.start, bar.end, bar.length, bar.sigma) for bar in file.scale_bars),
+        observations=read(read_image_points, file.observations.file if file.observations else None),
+        diameters=read(read_diameters, file.targets.diameters),
+        start_orientations=read(read_exterior, file.approximate.images),
+        start_points=read(read_points, file.approximate.points),
+        folder=file.folder,
+        allow_outside=allow_outside,
+        source=file.source,
+    )
+
+
+def survey_family(targets: TargetSettings, codes: str) -> Family | None:
+    """Return the codes of a survey, rings with the radii that it states, None where targets have none.
+
+    Args:
+        targets: what the survey says of them.
+        codes: name of the family, or path of the table.
+
+    Raises:
+        SurveyFileError: the code table is unreadable.
+    """
+    family = code_family(codes)
+    if targets.ring_radii is not None and isinstance(family, CodeFamily):
+        return replace(family, inner=targets.ring_radii[0], outer=targets.ring_radii[1])
+    return family
+
+
+def _section(kind: type[S], value: object, where: str) -> S:
+    """Return settings as they are, or of a dictionary in the words of the survey file."""
+    if isinstance(value, kind):
+        return value
+    if not isinstance(value, Mapping):
+        raise SurveyFileError(f"{where}: found {value!r:.60}, needed settings as in the survey file")
+    try:
+        return kind.model_validate(_plain(value))
+    except ValidationError as error:
+        raise SurveyFileError(first_error(where, "", error, kind)) from None
+
+
+def _plain(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Return settings with the lists and numbers of Python in place of numpy's."""
+    return {key: value.tolist() if hasattr(value, "tolist") else value for key, value in settings.items()}

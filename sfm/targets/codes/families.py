@@ -1,0 +1,46 @@
+"""The code families by name: what a survey file, a sheet or `find_targets` can ask for.
+
+A family of rings with a table in a file needs that file only. One that follows the rule of
+`ring_patterns` is a row in `rings.RINGS`, a dictionary of square tags a row in `tags.DICTIONARIES`. Another
+kind of code is a module beside these with a type for its families, a row below, and its reading in
+`sfm.targets.detect`, behind that of rings (numbers for measured dots) or of tags (points of its own).
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+from sfm.errors import SurveyFileError
+from sfm.targets.codes.rings import RINGS, CodeFamily, read_code_table, ring_family
+from sfm.targets.codes.tags import DICTIONARIES, TagFamily, tag_family
+
+Family = CodeFamily | TagFamily
+FAMILIES: dict[str, Callable[[], Family | None]] = {
+    **{name: partial(ring_family, name) for name in RINGS},
+    "none": lambda: None,
+    **{name: partial(tag_family, name) for name in DICTIONARIES},
+}
+
+
+def code_family(codes: str | Family) -> Family | None:
+    """Return the code family of a name or of a table file; None for "none".
+
+    Args:
+        codes: a name in FAMILIES, the path of a table file, or a family, which is returned as it is.
+
+    Returns:
+        The family, or None where targets are not coded.
+
+    Raises:
+        SurveyFileError: neither a known family nor a readable table.
+    """
+    if not isinstance(codes, str):
+        return codes
+    if codes in FAMILIES:
+        return FAMILIES[codes]()
+    if not os.path.exists(codes):
+        raise SurveyFileError(f"codes: {codes!r} is neither one of {', '.join(FAMILIES)} nor a table file")
+    return read_code_table(Path(codes))

@@ -1,0 +1,196 @@
+"""Rejection: which of the fitted candidates are no targets, and why."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
+from sfm.kernels.options import compiled
+from sfm.kernels.sampling import bilinear
+from sfm.targets.codes.ring_reading import UNCODED
+from sfm.targets.codes.rings import CodeFamily
+from sfm.targets.edge_rays import RAYS
+from sfm.targets.flags import Flag
+from sfm.targets.measure import EllipseFit, axes_from_shape
+from sfm.targets.outlines import LEAST_AXIS_RATIO, LEAST_STEP, STEP_SIGMAS
+
+# Largest RMS of the residuals and largest mean residual on an eighth of the edge, over the contrast.
+POOR_FIT = 0.12
+UNEVEN_EDGE = 0.18
+# Largest lobes of an outline, in radii, for noise so many sigma of a component more (four of them are seen);
+# only half of it where the background is a thin stroke on more than this share of the circumference.
+LOBES, LOBES_SIGMAS, STROKES = 0.02, 5.0, 0.5
+# Centres nearer than this share of the smaller radius belong to concentric targets.
+CONCENTRIC = 0.5
+# Parts of an unreadable code are smaller than this share of its dot.
+PART_OF_DOT = 0.75
+# Softest edge: this share of the minor semi-axis, or this blur in px where that is more.
+SOFTEST_EDGE = 0.35
+SOFTEST_EDGE_PX = 1.3
+# Share of the rays on which a stroke ends, and on which something else begins behind it. No ring of up to 20
+# cells is set on so much of the circumference: even parity leaves at least two of them clear.
+CLOSED, CROWDED = 0.95, 0.08
+# Least median and largest width of the stroke, radii of the counter; rims of the retro-panel have up to 0.46.
+LEAST_STROKE, LARGEST_STROKE = 0.5, 1.75
+# So far behind a stroke its neighbours are looked for, radii; what is so many contrasts bright is glare.
+NEIGHBOURS, GLARE = 2.0, 1.5
+_STEP_PX, _RISE_PX = 0.5, 3.0
+
+
+def judge_fits(
+    fit: EllipseFit, *, noise: float, scale: float, min_diameter_px: float, max_diameter_px: float
+) -> IntArray:
+    """Return the first reason against each fitted candidate.
+
+    Args:
+        fit: the candidates as they were fitted.
+        noise: standard deviation of the intensities of the photograph.
+        scale: largest intensity that the photograph can hold.
+        min_diameter_px: least minor axis of a target.
+        max_diameter_px: largest major axis of a target.
+
+    Returns:
+        Flags, see `sfm.targets.flags.Flag`, 0 where nothing is against a candidate, shape (k,).
+    """
+    a, b = np.full(len(fit.xy), np.nan), np.full(len(fit.xy), np.nan)
+    defined = fit.shape[:, 0] * fit.shape[:, 2] > fit.shape[:, 1] ** 2
+    if defined.any():
+        a[defined], b[defined] = axes_from_shape(fit.shape[defined])[0].T
+    contrast = np.abs(fit.contrast)
+    lobes = LOBES + LOBES_SIGMAS * fit.lobes_sigma
+    border = (fit.flag & Flag.CUT_BY_BORDER) != 0
+    with np.errstate(divide="ignore", invalid="ignore"):
+        tests = [
+            (Flag.CUT_BY_BORDER, border),
+            (Flag.NOT_ELLIPTIC, (fit.flag & Flag.NOT_ELLIPTIC) != 0),
+            (Flag.NO_CONVERGENCE, (fit.flag & Flag.NO_CONVERGENCE) != 0),
+            (Flag.TOO_SMALL, ~(2 * b >= min_diameter_px)),
+            (Flag.TOO_LARGE, ~(2 * a <= max_diameter_px)),
+            (Flag.TOO_OBLIQUE, b / a < LEAST_AXIS_RATIO),
+            (Flag.LOW_CONTRAST, contrast < np.maximum(STEP_SIGMAS * noise, LEAST_STEP * scale)),
+            (Flag.BLURRED, fit.blur > np.maximum(SOFTEST_EDGE * b, SOFTEST_EDGE_PX)),
+            (Flag.UNEVEN_EDGE, fit.unevenness > UNEVEN_EDGE + 3 * noise / contrast),
+            (Flag.LOBED, fit.lobes > lobes),
+            (Flag.THIN_BACKGROUND, (fit.strokes > STROKES) & (fit.lobes > lobes / 2)),
+            (Flag.POOR_FIT, fit.noise / contrast > POOR_FIT + noise / contrast),
+        ]
+    reason = np.zeros(len(fit.xy), dtype=np.int64)
+    for flag, against in tests:
+        reason[(reason == 0) & against] = flag.value
+    return reason
+
+
+def find_duplicates(fit: EllipseFit, reason: IntArray) -> BoolArray:
+    """Return which of the good candidates surround another one: of concentric ellipses the smallest is kept.
+
+    A retro-reflective dot with a dark rim in glare is seen as bright dot and, larger, as the dark rim.
+    """
+    duplicate = np.zeros(len(fit.xy), dtype=bool)
+    good = np.flatnonzero(reason == 0)
+    p, q, r = fit.shape[good].T
+    radius = (p * r - q * q) ** -0.5
+    order = np.argsort(fit.xy[good, 0], kind="stable")
+    duplicate[good[order]] = _surrounds(fit.xy[good][order], radius[order])
+    return duplicate
+
+
+@compiled
+def _surrounds(xy: FloatArray, radius: FloatArray) -> BoolArray:
+    """Return which of the circles, in order of x, have the centre of a smaller one near their own."""
+    outer = np.zeros(len(xy), dtype=np.bool_)
+    widest = radius.max() if len(radius) else 0.0
+    for i in range(len(xy)):
+        for j in range(i + 1, len(xy)):
+            if xy[j, 0] - xy[i, 0] > widest:
+                break
+            small, large = (i, j) if radius[i] <= radius[j] else (j, i)
+            if math.hypot(xy[j, 0] - xy[i, 0], xy[j, 1] - xy[i, 1]) < CONCENTRIC * radius[small]:
+                outer[large] = True
+    return outer
+
+
+def find_parts_of_codes(
+    fit: EllipseFit, code: IntArray, confidence: FloatArray, family: CodeFamily
+) -> BoolArray:
+    """Return which candidates lie in the code ring of another target, hence are parts of its code.
+
+    Codes are taken from the most confident to those that could not be read, and a part of one code does not
+    count afterwards: an arc that resembles a dot does not take the dot of its own ring away. About a dot
+    whose code was not read only what is clearly smaller than the dot is a part.
+    """
+    inside = np.zeros(len(fit.xy), dtype=bool)
+    size = np.sqrt(np.abs(fit.shape[:, 0] * fit.shape[:, 2] - fit.shape[:, 1] ** 2))  # 1 / mean semi-axis
+    coded = np.flatnonzero(code != UNCODED)
+    for k in coded[np.lexsort((size[coded], -confidence[coded], code[coded] < 0))]:
+        if inside[k]:
+            continue
+        p, q, r = fit.shape[k]
+        dx, dy = (fit.xy - fit.xy[k]).T
+        rho = np.hypot(p * dx + q * dy, q * dx + r * dy)
+        part = (rho > 1) & (rho < family.outer + 0.2)
+        inside |= part if code[k] >= 0 else part & (size * PART_OF_DOT > size[k])
+    return inside
+
+
+@compiled
+def find_counters(image: AnyArray, xy: FloatArray, shape: FloatArray, levels: FloatArray) -> BoolArray:
+    """Return which candidates are counters: the white inside of letters such as o, e and 8.
+
+    It looks like a target on the stroke of the letter. The background of a counter is a closed stroke, behind
+    which the paper begins again, and next to a letter there are others. A target in a dark rim of its own is
+    not like that: its rim is thinner than half its radius, or the surroundings of the rim are free. Nor is a
+    dot in the ring of a code, which always has clear cells.
+
+    Args:
+        image: intensities, shape (H, W).
+        xy: centres, px, shape (k, 2).
+        shape: (p, q, r) of S, 1/px, shape (k, 3).
+        levels: intensity of the background and its step to the target, shape (k, 2).
+
+    Returns:
+        Which candidates are counters, shape (k,).
+    """
+    counter = np.zeros(len(xy), np.bool_)
+    for k in range(len(xy)):
+        p, q, r = shape[k]
+        det = p * r - q * q
+        closed, wide, crowded = 0, 0, 0
+        for i in range(RAYS):
+            c, s = math.cos(2 * math.pi * i / RAYS), math.sin(2 * math.pi * i / RAYS)
+            ex, ey = (r * c - q * s) / det, (p * s - q * c) / det
+            R = math.hypot(ex, ey)
+            width, behind = _stroke(image, xy[k], ex / R, ey / R, R, levels[k])
+            closed += width <= LARGEST_STROKE * R
+            wide += LEAST_STROKE * R <= width <= LARGEST_STROKE * R
+            crowded += behind
+        counter[k] = closed >= CLOSED * RAYS and wide >= RAYS // 2 and crowded >= CROWDED * RAYS
+    return counter
+
+
+@compiled
+def _stroke(
+    image: AnyArray, xy: FloatArray, ux: float, uy: float, R: float, levels: FloatArray
+) -> tuple[float, bool]:
+    """Return the width of the background on a ray, px, inf where it does not end, and if more is behind."""
+    h, w = image.shape
+    left, width, highest, t = -1.0, math.inf, 0.0, 0.0
+    while t < (LARGEST_STROKE + 1) * R + 1 if width == math.inf else t < left + width + NEIGHBOURS * R:
+        x, y = xy[0] + (R + t) * ux, xy[1] + (R + t) * uy
+        if x < 0 or y < 0 or x >= w - 1 or y >= h - 1:
+            break
+        level = (bilinear(image, x, y) - levels[0]) / levels[1]
+        if left < 0:
+            if level < 0.5:
+                left = t
+        elif width == math.inf:
+            if level > 0.5:
+                width = t - left
+        else:
+            if t < left + width + _RISE_PX:
+                highest = max(highest, level)
+            if level < 0.5:
+                return (math.inf if highest >= GLARE else width), True
+        t += _STEP_PX
+    return (math.inf if highest >= GLARE else width), False

@@ -1,0 +1,340 @@
+"""`import sfm`: the list of public names, their examples, and a survey from Python from start to end."""
+
+from __future__ import annotations
+
+import ast
+import doctest
+import inspect
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+import sfm
+from adapters.colmap.camera_models import write_model
+from sfm.comparison.camera_conversion import convert_cameras
+from sfm.errors import UnknownNameError
+from sfm.files import csv_tables
+from sfm.result import SurveyResult
+from tests.surveys import write_observed_survey, write_photograph_survey
+
+ROOT = Path(sfm.__file__).resolve().parent
+PUBLIC = {
+    *("Adjustment", "Camera", "CameraSetup", "Datum", "Estimate", "KnownPoints", "KolinearError", "Network"),
+    *("Observations", "ObservedExterior", "ScaleBar", "Similarity", "StoredResult", "Survey", "SurveyResult"),
+    *(
+        "Targets",
+        "adjust",
+        "empty_estimate",
+        "camera_from_values",
+        "change_datum",
+        "compare",
+        "find_targets",
+        "fit_similarity",
+        "network_from_colmap",
+    ),
+    *("orient", "read_photograph", "read_result", "read_survey", "run_survey", "write_result"),
+}
+
+
+@pytest.fixture(scope="module")
+def observed_survey(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = write_observed_survey(tmp_path_factory.mktemp("public") / "observed", "observed")
+    bar = '[[scale_bar]]\nfrom = "1"\nto = "2"\nlength = 1.0\nsigma = 0.1\n'
+    path.write_text(path.read_text(encoding="utf-8") + bar, encoding="utf-8")
+    return path
+
+
+@pytest.fixture(scope="module")
+def result(observed_survey: Path) -> SurveyResult:
+    return sfm.run_survey(sfm.read_survey(observed_survey), compare_with="none")
+
+
+@pytest.fixture(scope="module")
+def result_folder(result: SurveyResult, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return result.write(tmp_path_factory.mktemp("public") / "out").parent
+
+
+@pytest.fixture(scope="module")
+def colmap_model(result: SurveyResult, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("colmap")
+    estimate, _ = convert_cameras(result.estimate, ("full_opencv",))
+    write_model(folder, result.network, estimate)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def photograph_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_photograph_survey(tmp_path_factory.mktemp("photo") / "s", "s").parent / "photo 1.png"
+
+
+def test_the_public_names_are_these() -> None:
+    assert set(sfm.__all__) == set(dir(sfm)) == PUBLIC
+    stub = ast.parse((ROOT / "__init__.pyi").read_text(encoding="utf-8"))
+    imports = [node for node in stub.body if isinstance(node, ast.ImportFrom)]
+    listed = {alias.asname: node.module for node in imports for alias in node.names}
+    assert listed.keys() == PUBLIC, "__init__.pyi lists other names than __init__.py"
+    assert {name: getattr(sfm, name).__module__ for name in PUBLIC} == listed
+    assert (ROOT / "py.typed").is_file()
+    with pytest.raises(AttributeError, match="no attribute 'adjusted'"):
+        sfm.adjusted  # noqa: B018
+
+
+def test_importing_sfm_imports_no_library() -> None:
+    code = "import sys, sfm; print([m for m in ('numpy', 'numba', 'cv2', 'pydantic') if m in sys.modules])"
+    told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert told.stdout.strip() == "[]"
+
+
+@pytest.mark.parametrize("name", sorted(PUBLIC))
+def test_every_public_name_is_explained_and_its_example_runs(
+    name: str,
+    observed_survey: Path,
+    result_folder: Path,
+    result: SurveyResult,
+    colmap_model: Path,
+    photograph_file: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(ROOT.parent)
+    value = getattr(sfm, name)
+    assert inspect.getdoc(value), f"{name} has no docstring"
+    given = {
+        **vars(sys.modules[value.__module__]),
+        "sfm": sfm,
+        "np": np,
+        "observed_survey": observed_survey,
+        "result_folder": result_folder,
+        "result": result,
+        "colmap_model": colmap_model,
+        "photograph_file": photograph_file,
+    }
+    finder = doctest.DocTestFinder(recurse=False)
+    examples = [one for one in finder.find(value, name, globs=given) if one.examples]
+    assert examples or name in ("KolinearError", "Targets", "Camera"), f"{name} has no example"
+    for example in examples:
+        assert doctest.DocTestRunner(optionflags=doctest.ELLIPSIS).run(example).failed == 0
+
+
+def test_what_the_readme_shows_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The first Python block of README.md, on a survey of rendered photographs."""
+    path = write_photograph_survey(tmp_path / "readme", "readme", suffix=".jpg")
+    folder = path.parent
+    bar = '[[scale_bar]]\nfrom = "{}"\nto = "{}"\nlength = 100.0\nsigma = 0.1\n'
+    first = sfm.run_survey(sfm.read_survey(path), compare_with="none")
+    names = first.points.names
+    path.write_text(path.read_text(encoding="utf-8") + bar.format(*names[:2]), encoding="utf-8")
+    monkeypatch.chdir(folder)
+    (folder / "photo 1.jpg").rename(folder / "a.jpg")
+    first.write("out/last")
+    readme = (ROOT.parent / "README.md").read_text(encoding="utf-8")
+    code = readme[readme.index("```python\n") + len("```python\n") :].split("```")[0]
+    assert "sfm.change_datum(again" in code and "result.write(" in code
+    for shown, own in zip(("501", "502", "503", "506"), names, strict=False):
+        code = code.replace(f'"{shown}"', f'"{own}"')
+    try:
+        import pandas  # noqa: F401
+    except ImportError:
+        code = code.replace("result.points.to_pandas()", "")
+    given: dict[str, object] = {}
+    exec(compile(code, "README.md", "exec"), given)
+    moved = given["moved"]
+    assert isinstance(moved, sfm.Adjustment) and moved.datum == "minimal"
+    assert (folder / "out" / "today" / "report.html").is_file()
+
+
+def test_a_survey_made_in_python_is_that_of_its_file(observed_survey: Path, result: SurveyResult) -> None:
+    said = sfm.read_survey(observed_survey)
+    given = said.observations
+    assert given is not None
+    camera = dict(said.cameras[0])
+    made = sfm.Survey(
+        name=said.name,
+        unit=said.unit,
+        cameras=[sfm.CameraSetup(**{**camera, "size_px": np.array(camera["size_px"])})],  # type: ignore[arg-type]
+        observations=sfm.Observations.from_arrays(given.image, given.point, given.xy),
+        scale_bars=[sfm.ScaleBar("1", "2", 1.0, 0.1)],  # type: ignore[arg-type]
+    )
+    again = sfm.run_survey(made, compare_with="none")
+    for one, other in ((again, result),):
+        np.testing.assert_array_equal(one.points.xyz, other.points.xyz)
+        np.testing.assert_array_equal(one.points.covariance, other.points.covariance)
+        assert one.warnings == other.warnings
+
+
+def test_photographs_of_a_survey_made_in_python(tmp_path: Path) -> None:
+    path = write_photograph_survey(tmp_path / "s", "s")
+    camera = sfm.CameraSetup(name="small", images="*.png", pixel_mm=[0.01, 0.01], c_mm=8.0, free=["c"])
+    made = sfm.Survey(
+        name="s",
+        unit="mm",
+        cameras=[camera],  # type: ignore[arg-type]
+        targets={"polarity": "dark", "codes": "ring14"},  # type: ignore[arg-type]
+        folder=path.parent,
+    )
+    a = sfm.run_survey(made, compare_with="none", store=tmp_path / "store")
+    b = sfm.run_survey(sfm.read_survey(path), compare_with="none", store=tmp_path / "store")
+    np.testing.assert_array_equal(a.points.xyz, b.points.xyz)
+    assert sfm.compare(a, b).same_share == 1
+
+
+@pytest.mark.parametrize(
+    ("wrong", "match"),
+    [
+        ({"cameras": []}, "survey s: no cameras"),
+        (
+            {"targets": {"polarity": "grey"}},
+            r"survey s: targets: polarity: found 'grey', needed one of 'dark'",
+        ),
+        ({"targets": {"code": "x"}}, r"survey s: targets: unknown key 'code' in it, known are polarity"),
+        ({"targets": "ring14"}, "survey s: targets: found 'ring14', needed settings as in the survey file"),
+        ({"name": "a\nb"}, "needed plain text"),
+        ({"datum": {"kind": "control"}}, "datum kind 'control' needs"),
+    ],
+)
+def test_what_is_wrong_in_a_survey_made_in_python_is_one_line(wrong: dict[str, object], match: str) -> None:
+    camera = sfm.CameraSetup(name="one", images="*.jpg")
+    with pytest.raises(sfm.KolinearError, match=match) as caught:
+        sfm.Survey(**{"name": "s", "cameras": [camera], **wrong})  # type: ignore[arg-type]
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("make", "match"),
+    [
+        (lambda: sfm.CameraSetup(name="one", c_mm=-1.0), "camera one: c_mm: found -1.0, needed more than 0"),
+        (
+            lambda: sfm.KnownPoints.from_arrays(["1", "1"], np.zeros((2, 3))),
+            "control, row 2: id '1' stands on",
+        ),
+        (lambda: sfm.KnownPoints.from_arrays(["1"], [[0, 0, np.nan]]), "control, row 1: column Z holds nan"),
+        (lambda: sfm.KnownPoints.from_arrays(["1"], [[0, 0]]), r"X, Y, Z have the shape \(1, 2\), expected"),
+        (lambda: sfm.KnownPoints.from_arrays(["1"], np.zeros((1, 3)), -1), "column sX holds -1, needed 0"),
+        (lambda: sfm.Observations.from_arrays(["a"], ["1", "2"], [[1, 2]]), "2 values of point, expected 1"),
+        (
+            lambda: sfm.Observations.from_arrays(["a"], ["1"], [[1, 2]], unit="m"),
+            "unit 'm', expected px or mm",
+        ),
+        (lambda: sfm.ObservedExterior.from_arrays(["a"], [[0, 0, 0]], -1), "column sX holds -1"),
+        (lambda: sfm.ScaleBar("1", "2", -1.0, 0.1), "scale bar 1 - 2: length -1.0, needed more than 0"),
+        (lambda: sfm.Network.from_arrays(["a"], ["1"], [1, 2]), "expected k names, k names and finite"),
+        (lambda: sfm.run_survey(None, compare_with="x"), "compare_with 'x', expected one of colmap, none"),
+    ],
+)
+def test_bad_arrays_are_refused(make: object, match: str) -> None:
+    with pytest.raises(sfm.KolinearError, match=match):
+        make()  # type: ignore[operator]
+
+
+def test_networks_from_arrays_are_adjusted(result: SurveyResult) -> None:
+    seen = result.stored.network.image_points
+    network = sfm.Network.from_arrays(
+        [result.network.images[i] for i in seen.image],
+        [result.network.points[j] for j in seen.point],
+        seen.xy,
+        sigma_px=np.sqrt(np.einsum("kii->ki", seen.covariance)),
+    ).with_scale_bar("1", "2", 1.0, 0.1)
+    assert network.points == result.network.points
+    again = sfm.adjust(network, result.estimate, reject="none")
+    np.testing.assert_allclose(again.estimate.points, result.points.xyz, atol=1e-6)
+
+
+def test_names_are_indices(result: SurveyResult) -> None:
+    table = result.points
+    assert table["3"].name == "3" and "3" in table and len(table[["1", "3"]]) == 2
+    np.testing.assert_array_equal(table[table.rays >= 2].xyz, table.xyz)
+    np.testing.assert_array_equal(result.point("3").xyz, table[table.index("3")].xyz)
+    assert result.image("image 1").rotation.shape == (3, 3)
+    assert result.camera("synthetic").model == "brown"
+    for ask in (result.point, result.image, result.camera):
+        with pytest.raises(UnknownNameError, match="'<x>', expected one of"):
+            ask("<x>")
+
+
+def test_notebooks_show_tables_in_which_names_are_escaped(result: SurveyResult) -> None:
+    assert "sigma0" in repr(result) and "<table>" in result._repr_html_()
+    point = sfm.StoredResult("<script>", result.network, result.estimate)
+    assert "<script>" not in point._repr_html_() and "&lt;script&gt;" in point._repr_html_()
+    assert repr(result.points).splitlines()[1].split() == ["point", "X", "Y", "Z", "sX", "sY", "sZ", "rays"]
+    for value in (result.network, result.estimate, result.adjustment, result.point("1"), result.stored):
+        assert 20 < len(repr(value)) < 500, type(value)
+
+
+def test_a_pycolmap_reconstruction_is_a_network(result: SurveyResult, colmap_model: Path) -> None:
+    pycolmap = pytest.importorskip("pycolmap")
+    network, found = sfm.network_from_colmap(pycolmap.Reconstruction(str(colmap_model)))
+    assert network.images == result.network.images
+    np.testing.assert_allclose(found.points, result.points.xyz, atol=1e-9)
+    named, _ = sfm.network_from_colmap(colmap_model)
+    assert named.points == result.network.points
+
+
+def test_every_table_of_a_survey_is_read_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = write_observed_survey(tmp_path / "s", "s")
+    first = sfm.run_survey(sfm.read_survey(path), compare_with="none")
+    first.write(tmp_path / "out")
+    text = path.read_text(encoding="utf-8")
+    for name in ("images", "points"):
+        (path.parent / f"{name}.csv").write_bytes((tmp_path / "out" / f"{name}.csv").read_bytes())
+    rows = "".join(f"{p.name},{','.join(repr(float(v)) for v in p.xyz)}\n" for p in first.points)
+    (path.parent / "control.csv").write_text(f"id,X,Y,Z\n{rows}", encoding="utf-8")
+    (path.parent / "diameters.csv").write_text("id,diameter\n1,0.1\n", encoding="utf-8")
+    text += (
+        '[control]\nfile = "control.csv"\n[exterior]\nfile = "images.csv"\n[targets]\n'
+        'diameters = "diameters.csv"\n'
+        '[approximate]\npoints = "points.csv"\n[datum]\nkind = "control"\n'
+    )
+    path.write_text(text, encoding="utf-8")
+    opened: list[str] = []
+    original = csv_tables._rows
+
+    def counted(file: Path, columns: int) -> object:
+        opened.append(file.name)
+        return original(file, columns)
+
+    monkeypatch.setattr(csv_tables, "_rows", counted)
+    sfm.run_survey(sfm.read_survey(path), compare_with="none")
+    assert sorted(opened) == ["control.csv", "diameters.csv", "image_points.csv", "images.csv", "points.csv"]
+
+
+@pytest.mark.parametrize("file", ["sfm/binarysearch.py", "adapters/composition.py"])
+def test_files_of_another_project_are_noticed(tmp_path: Path, file: str) -> None:
+    """Copies of our packages beside a planted file, as two installations in one environment would leave."""
+    for package in ("sfm", "adapters"):
+        (tmp_path / package).mkdir()
+        for source in (ROOT.parent / package).rglob("*.py"):
+            copy = tmp_path / source.relative_to(ROOT.parent)
+            copy.parent.mkdir(parents=True, exist_ok=True)
+            copy.write_bytes(source.read_bytes())
+    told = [sys.executable, "-I", "-c", f"import sys; sys.path.insert(0, {str(tmp_path)!r}); import sfm"]
+    assert subprocess.run(told, capture_output=True, check=False).returncode == 0
+    (tmp_path / file).write_text("", encoding="utf-8")
+    failed = subprocess.run(told, capture_output=True, text=True, check=False)
+    last = failed.stderr.strip().splitlines()[-1]
+    assert failed.returncode == 1 and "InstallationError" in last
+    assert file in last and "an environment of its own" in last
+    command = told[3].replace("import sfm", "sys.argv = ['kolinear', '--help']; import sfm.cli")
+    line = subprocess.run([*told[:3], command], capture_output=True, text=True, check=False)
+    assert line.returncode == 2 and line.stderr.count("\n") == 1 and line.stderr.startswith("kolinear: ")
+
+
+def test_photographs_and_targets_are_arrays(tmp_path: Path) -> None:
+    folder = write_photograph_survey(tmp_path / "s", "s", photographs=1).parent
+    photograph = sfm.read_photograph(folder / "photo 1.png")
+    found = sfm.find_targets(photograph, codes="ring14")
+    assert found.xy.shape == (len(found), 2) and (found.code >= 0).sum() >= 5
+    with pytest.raises(sfm.KolinearError, match="expected"):
+        sfm.find_targets(cv2.cvtColor(photograph, cv2.COLOR_GRAY2BGR))
+    with pytest.raises(sfm.KolinearError, match="polarity"):
+        sfm.find_targets(photograph, polarity="grey")
+
+
+def test_summary_of_a_written_result_is_read_back(result: SurveyResult, result_folder: Path) -> None:
+    stored = sfm.read_result(result_folder)
+    np.testing.assert_array_equal(stored.points.xyz, result.points.xyz)
+    np.testing.assert_allclose(stored.points.sigma, result.points.sigma, rtol=1e-12)
+    assert json.loads((result_folder / "summary.json").read_text(encoding="utf-8"))["survey"] == result.name
