@@ -119,15 +119,6 @@ class Adjustment:
         used = self.residuals[~self.rejected]
         return float((used**2).sum(axis=1).max() ** 0.5)
 
-
-def scaled_covariance(covariance: FloatArray, sigma_factor: FloatArray) -> FloatArray:
-    """Return covariances (k, 2, 2) of standard deviations multiplied by a factor of each, (k,)."""
-    return np.asarray(covariance * sigma_factor[:, None, None] ** 2)
-
-
-def _rms_sigma(covariance: FloatArray) -> float:
-    return float((np.trace(covariance, axis1=1, axis2=2).mean() / 2) ** 0.5)
-
     def _rows(self) -> list[tuple[str, str]]:
         state = "converged" if self.converged else "did NOT converge"
         rows = [
@@ -143,3 +134,12 @@ def _rms_sigma(covariance: FloatArray) -> float:
 
     def _repr_html_(self) -> str:
         return html_table("Adjustment", ("", ""), self._rows())
+
+
+def scaled_covariance(covariance: FloatArray, sigma_factor: FloatArray) -> FloatArray:
+    """Return covariances (k, 2, 2) of standard deviations multiplied by a factor of each, (k,)."""
+    return np.asarray(covariance * sigma_factor[:, None, None] ** 2)
+
+
+def _rms_sigma(covariance: FloatArray) -> float:
+    return float((np.trace(covariance, axis1=1, axis2=2).mean() / 2) ** 0.5)
