@@ -40,7 +40,7 @@ def test_another_pipeline_stands_beside_the_survey(
     a = alone.adjustment
 
     def mapper(folder: Path, cameras: tuple[tuple[str, ...], ...]) -> MapperBaseline:
-        assert folder == survey.path.parent
+        assert folder == survey.folder
         assert cameras == (tuple(f"photo {k}.png" for k in range(1, 7)),)
         theirs = TURN.apply_estimate(a.estimate)
         c = theirs.cameras[0]
