@@ -27,7 +27,7 @@ import numpy as np
 
 TIMES = ("seconds",)  # keys of summary.json
 TIMED_SECTION = "process"  # of report.html, whose table is of times
-IGNORED = ("log.jsonl",)
+IGNORED = ("log.jsonl", "manifest.json")  # times, and the hashes of files that hold times
 MAX_TOLD = 5  # differences of a file that are told one by one
 NUMBER = re.compile(r"[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?")
 PICTURES = (".png", ".jpg")

@@ -275,7 +275,7 @@ def test_wrong_survey_files(
 
 
 def test_no_survey_file(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    assert "none.toml: the survey file cannot be read" in refused(monkeypatch, capsys, "run", "none.toml")
+    assert "none.toml: a survey file cannot be read" in refused(monkeypatch, capsys, "run", "none.toml")
 
 
 def test_run_and_adjust_know_their_surveys(

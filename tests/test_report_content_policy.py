@@ -16,7 +16,7 @@ from sfm.batch.pages import render_index
 from sfm.batch.survey import SurveyRow
 from sfm.comparison.adjuster_validation import SAME, Trial, Validation
 from sfm.comparison.random_network import Plan
-from sfm.comparison.significance import Result, compare_results
+from sfm.comparison.significance import compare_results
 from sfm.pipeline import run_survey
 from sfm.report.differences import write_differences
 from sfm.report.findings.findings import findings_of
@@ -24,6 +24,7 @@ from sfm.report.html.content_policy import content_policy
 from sfm.report.html.page import render
 from sfm.report.output import write_result
 from sfm.report.validation import write_validation
+from sfm.stored_result import StoredResult
 from sfm.survey.inputs.survey import read_survey
 from tests.surveys import write_photograph_survey
 from tests.synthetic import make_network, seed_of
@@ -100,7 +101,7 @@ def validation_page(folder: Path) -> str:
 
 def differences_page(folder: Path) -> str:
     network, truth = make_network(seed_of("policy"), model="opencv", images=5, points=20)
-    found = compare_results(Result(EVIL, network, truth), Result("b", network, truth))
+    found = compare_results(StoredResult(EVIL, network, truth), StoredResult("b", network, truth))
     return write_differences(found, truth.points, folder / "out").read_text(encoding="utf-8")
 
 

@@ -133,9 +133,9 @@ def test_bad_input_is_one_line(photographs: tuple[Path, Path], tmp_path: Path) -
         match_command(*photographs, point="12")
     with pytest.raises(GeometryError, match="window of 20 px, needed an odd number"):
         match_command(*photographs, point="80,80", template_px=20)
-    with pytest.raises(GeometryError, match="method 'sift' is none of"):
+    with pytest.raises(GeometryError, match="method 'sift', expected one of"):
         match_command(*photographs, point="80,80", method="sift")
-    with pytest.raises(GeometryError, match="needed bilinear, bicubic or six_tap"):
+    with pytest.raises(GeometryError, match="expected one of bilinear, bicubic, six_tap"):
         match_command(*photographs, point="80,80", interpolation="nearest")
     with pytest.raises(PhotographError, match=r"LEFT \.: a folder"):
         match_command(Path(), photographs[1], point="80,80")

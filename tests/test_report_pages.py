@@ -14,12 +14,13 @@ import pytest
 
 from sfm.comparison.adjuster_validation import SAME, Trial, Validation
 from sfm.comparison.random_network import Plan
-from sfm.comparison.significance import Result, ResultComparison, compare_results
+from sfm.comparison.significance import ResultComparison, compare_results
 from sfm.errors import GeometryError, OutputError
 from sfm.files.whole_files import remove_leftovers
 from sfm.network import Network
 from sfm.report.differences import largest_difference, words_of_test, write_differences
 from sfm.report.validation import COLUMNS, write_validation
+from sfm.stored_result import StoredResult
 from tests.synthetic import make_network, seed_of
 
 PLAN = Plan("ring", 8, 60, False, 0.8, 0.1, "opencv", 1, "all", "free")
@@ -122,8 +123,8 @@ def moved() -> tuple[ResultComparison, np.ndarray]:
     covariance = np.tile(np.eye(3) * 1e-8, (20, 1, 1))
     points = truth.points.copy()
     points[4] += 0.003
-    a = Result("before", network, truth, covariance, redundancy=100, unit="m")
-    b = Result(
+    a = StoredResult("before", network, truth, covariance, redundancy=100, unit="m")
+    b = StoredResult(
         "after <b>", measured_again(network), replace(truth, points=points), covariance, redundancy=100
     )
     found = compare_results(a, b, align="control", control=("1", "2", "9", "15"))
@@ -154,7 +155,9 @@ def test_comparison_is_written_with_every_point(
 
 def test_comparison_without_sigmas_says_so(tmp_path: Path) -> None:
     network, truth = make_network(seed_of("bare"), model="opencv", images=5, points=20)
-    found = compare_results(Result("a", network, truth), Result("b", measured_again(network), truth))
+    found = compare_results(
+        StoredResult("a", network, truth), StoredResult("b", measured_again(network), truth)
+    )
     page = write_differences(found, truth.points, tmp_path / "out").read_text()
     assert "Not tested: neither result knows its standard deviations." in page
     assert json.loads((tmp_path / "out" / "comparison.json").read_text())["changed"] is None
@@ -163,7 +166,7 @@ def test_comparison_without_sigmas_says_so(tmp_path: Path) -> None:
 def test_results_of_the_same_image_points_are_not_tested(tmp_path: Path) -> None:
     network, truth = make_network(seed_of("same"), model="opencv", images=5, points=20)
     covariance = np.tile(np.eye(3) * 1e-8, (20, 1, 1))
-    a, b = (Result(name, network, truth, covariance) for name in "ab")
+    a, b = (StoredResult(name, network, truth, covariance) for name in "ab")
     found = compare_results(a, b)
     assert found.same_share == 1.0 and found.changed is None and not found.significant.any()
     page = write_differences(found, truth.points, tmp_path / "out").read_text()
@@ -180,10 +183,10 @@ def test_nothing_in_common_is_no_agreement(tmp_path: Path) -> None:
     )
     for align in ("points", "cameras", "none"):
         with pytest.raises(GeometryError, match="a and b have neither points nor photographs of the same"):
-            compare_results(Result("a", network, truth), Result("b", other, truth), align=align)
+            compare_results(StoredResult("a", network, truth), StoredResult("b", other, truth), align=align)
     photographs_only = compare_results(
-        Result("a", network, truth),
-        Result("b", replace(other, images=network.images), truth),
+        StoredResult("a", network, truth),
+        StoredResult("b", replace(other, images=network.images), truth),
         align="cameras",
     )
     assert words_of_test(photographs_only)[0].startswith("No points in common")
@@ -197,8 +200,8 @@ def test_sigmas_of_one_result_are_enough() -> None:
     unknown = np.full((20, 3, 3), np.nan)
     some = covariance.copy()
     some[3] = np.nan
-    a = Result("a", network, truth, some)
-    b = Result("b", measured_again(network), truth, unknown)
+    a = StoredResult("a", network, truth, some)
+    b = StoredResult("b", measured_again(network), truth, unknown)
     found = compare_results(a, b)
     assert found.has_sigma == (True, False)
     assert np.isnan(found.statistic).tolist() == [j == 3 for j in range(20)]

@@ -98,19 +98,22 @@ def _run_survey(
         from sfm.report.findings.findings import findings_of
         from sfm.report.log import SurveyLog
         from sfm.report.output import write_result
-        from sfm.survey.inputs.survey import read_survey
+        from sfm.survey.inputs.survey import survey_of_file
+        from sfm.survey.inputs.survey_file import read_survey_file
         from sfm.survey.target_store import TargetStore
 
     with working_on(str(survey_file)):
-        survey = read_survey(survey_file, allow_outside=allow_outside)
-    if from_photographs and survey.observations is not None:
+        described = read_survey_file(survey_file, allow_outside=allow_outside)
+    if from_photographs and described.observations is not None:
         raise KolinearError(
             f"{survey_file}: it has [observations] in place of photographs: kolinear adjust {survey_file}"
         )
-    if not from_photographs and survey.observations is None:
+    if not from_photographs and described.observations is None:
         raise KolinearError(
             f"{survey_file}: it has no [observations]; with photographs: kolinear run {survey_file}"
         )
+    with working_on(str(survey_file)):
+        survey = survey_of_file(described)
     others = programs_of(survey.compare.backend, survey.compare.baseline)
     folder = _folder(survey, out)
     workers = (jobs or cores()) if from_photographs else 1

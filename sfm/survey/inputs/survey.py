@@ -38,7 +38,7 @@ from sfm.survey.inputs.settings import (
     TiePointSettings,
 )
 from sfm.survey.inputs.settings_errors import first_error
-from sfm.survey.inputs.survey_file import read_survey_file
+from sfm.survey.inputs.survey_file import SurveyFile, read_survey_file
 from sfm.targets.codes.families import FAMILIES, Family, code_family
 from sfm.targets.codes.rings import CodeFamily
 
@@ -178,7 +178,15 @@ def read_survey(path: str | Path, *, allow_outside: bool = False) -> Survey:
         >>> sfm.read_survey("datasets/demo/survey.toml")
         <Survey demo: 1 camera, targets of codes ring14, 2 scale bars, datum free>
     """
-    file = read_survey_file(Path(path), allow_outside=allow_outside)
+    return survey_of_file(read_survey_file(Path(path), allow_outside=allow_outside))
+
+
+def survey_of_file(file: SurveyFile) -> Survey:
+    """Return the survey that a survey file describes, with the tables that it names, each read once.
+
+    Raises:
+        SurveyFileError: a table is unreadable.
+    """
 
     def read(reader: Callable[[Path], T], name: str | None) -> T | None:
         return None if name is None else reader(file.beside(name))
@@ -200,7 +208,7 @@ def read_survey(path: str | Path, *, allow_outside: bool = False) -> Survey:
         start_orientations=read(read_exterior, file.approximate.images),
         start_points=read(read_points, file.approximate.points),
         folder=file.folder,
-        allow_outside=allow_outside,
+        allow_outside=file.allow_outside,
         source=file.source,
     )
 
