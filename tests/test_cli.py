@@ -285,6 +285,9 @@ def test_run_and_adjust_know_their_surveys(
     text = survey.read_text(encoding="utf-8") + '[observations]\nfile = "image_points.csv"\n'
     survey.write_text(text, encoding="utf-8")
     assert "kolinear adjust" in refused(monkeypatch, capsys, "run", survey)
+    (survey.parent / "image_points.csv").write_text(
+        "image,point,x_px,y_px\nphoto 1.png,1,5,5\n", encoding="utf-8"
+    )
     line = refused(monkeypatch, capsys, "adjust", survey)
     assert "kamera: size_px = [width, height] is needed" in line
 

@@ -62,7 +62,7 @@ def test_another_pipeline_stands_beside_the_survey(
     assert summary["images"] == {"kolinear": 6, "COLMAP mapper": 6, "total": 6}
     assert summary["point_rms"] == pytest.approx(found.point_rms)
     text = page.read_text(encoding="utf-8")
-    assert "And COLMAP by itself?" in text and "12.0" in text
+    assert "And COLMAP mapper by itself?" in text and "12.0" in text
 
 
 def test_a_pipeline_that_fails_does_not_lose_the_survey(survey: Survey, tmp_path: Path) -> None:
@@ -73,7 +73,7 @@ def test_a_pipeline_that_fails_does_not_lose_the_survey(survey: Survey, tmp_path
     assert result.baseline is None
     assert "the comparison with the other pipeline failed: COLMAP's mapper found no model" in result.warnings
     page = write_result(findings_of(result), tmp_path / "out").read_text(encoding="utf-8")
-    assert "And COLMAP by itself?" not in page and "found no model" in page
+    assert "And COLMAP mapper by itself?" not in page and "found no model" in page
 
 
 def test_another_pipeline_needs_photographs(tmp_path: Path) -> None:
