@@ -33,7 +33,8 @@ class _First(Listener):
 
     def on_start(self, event: Event) -> None:
         """A function is compiled; those of numba and other libraries are none of ours."""
-        if self._tell is not None and event.data["dispatcher"].py_func.__module__.startswith("sfm."):
+        module = event.data["dispatcher"].py_func.__module__ or ""  # none for what numba itself writes
+        if self._tell is not None and module.startswith("sfm."):
             tell, self._tell = self._tell, None
             tell()
 
