@@ -17,8 +17,9 @@ from sfm.result import SurveyResult
 from sfm.similarity import fit_similarity
 from sfm.survey.comparison import OtherPrograms
 from sfm.survey.inputs.survey import read_survey
+from tests.places import ROOT
 
-DEMO = Path(__file__).resolve().parents[1] / "datasets" / "demo"
+DEMO = ROOT / "datasets" / "demo"
 SAME_MM = 1.0  # a point farther than this from every target is none; targets are 30 mm apart
 
 
