@@ -15,8 +15,8 @@ from sfm.rendering.render import write_photographs
 from sfm.rendering.scene_file import Staging, read_scene
 from sfm.result import SurveyResult
 from sfm.similarity import fit_similarity
-from sfm.survey.comparison import OtherPrograms
 from sfm.survey.inputs.survey import read_survey
+from sfm.survey.other_programs import OtherPrograms
 from tests.places import ROOT
 
 DEMO = ROOT / "datasets" / "demo"

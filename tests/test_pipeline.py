@@ -13,8 +13,8 @@ from adapters.formats.photomodeler import read_photomodeler
 from sfm.pipeline import run_survey
 from sfm.result import SurveyResult
 from sfm.similarity import fit_similarity
-from sfm.survey.comparison import OtherPrograms
 from sfm.survey.inputs.survey import read_survey
+from sfm.survey.other_programs import OtherPrograms
 from tests.places import ROOT
 
 DATASETS = ROOT / "datasets"

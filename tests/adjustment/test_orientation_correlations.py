@@ -16,10 +16,10 @@ from sfm.camera import camera_from_values, project
 from sfm.conventions import FloatArray, rotation_from_angles
 from sfm.network import Estimate, ImagePoints, Network, ObjectPoints
 from sfm.report.findings.findings import findings_of
-from sfm.report.html.report import report_page
+from sfm.report.html.report_page import report_page
 from sfm.report.tables.summary import summary
-from sfm.report.text.lines import WIDTH
-from sfm.report.text.report import text_report
+from sfm.report.text.filters import WIDTH
+from sfm.report.text.text_report import text_report
 from sfm.result import SurveyResult
 from tests.synthetic import PIXEL_MM, SIZE_PX, make_network, seed_of
 

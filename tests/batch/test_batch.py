@@ -23,13 +23,13 @@ from dask.distributed import KilledWorker
 from threadpoolctl import threadpool_info
 
 from adapters.dask_cluster import DaskEngine, _event, _OneThread, fitting_workers, local_engine, remote_engine
+from sfm.batch.job import LOCK, SurveyJob, SurveyRow, reconstruct
 from sfm.batch.pages import render_index
 from sfm.batch.run import calls_of, find_surveys, run_batch
-from sfm.batch.survey import LOCK, SurveyJob, SurveyRow, reconstruct
 from sfm.errors import BackendError, KolinearError, OutputError, SurveyFileError
-from sfm.executor import Call, Done, Lost, Work
 from sfm.files.folder_lock import Owner, locked
 from sfm.report.log import read_log
+from sfm.runtime.executor import Call, Done, Lost, Work
 from tests.engines import ALONE, HERE, KILLER, Notes, points_of, raise_unforeseen, return_nothing
 from tests.places import ROOT
 from tests.surveys import write_observed_survey, write_photograph_survey
@@ -274,7 +274,7 @@ def test_a_worker_whose_run_is_over_writes_nothing(
         reconstruct(job, ALONE, [], tell=lambda _: None)
     assert not (out / "logs").exists()
     owners = iter([job.owner, None])  # it ends while the survey is computed
-    monkeypatch.setattr("sfm.batch.survey.owner_of", lambda _: next(owners))
+    monkeypatch.setattr("sfm.batch.job.owner_of", lambda _: next(owners))
     with pytest.raises(OutputError, match="the run that asked for survey third is over"):
         reconstruct(job, ALONE, [], tell=lambda _: None)
     assert {path.name for path in out.iterdir()} == {"logs"}
@@ -368,7 +368,7 @@ def test_a_second_batch_in_the_same_folder_is_refused(finished: Path, surveys: t
 def test_a_fault_of_ours_is_a_row_with_a_trace(
     surveys: tuple[Path, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("sfm.batch.survey.run_survey", lambda *_, **__: [][0])
+    monkeypatch.setattr("sfm.batch.job.run_survey", lambda *_, **__: [][0])
     (row,) = run_batch([surveys[2]], tmp_path / "out", HERE, ALONE, Notes())
     assert row.reason.startswith("a fault of Kolinear: IndexError")
     (log,) = (tmp_path / "out" / "logs").iterdir()

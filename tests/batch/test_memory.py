@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from adapters.dask_cluster import local_engine
-from sfm.batch.survey import SurveyJob, reconstruct
-from sfm.executor import Call, Done, Tell, Work
+from sfm.batch.job import SurveyJob, reconstruct
+from sfm.runtime.executor import Call, Done, Tell, Work
 from tests.engines import ALONE
 from tests.surveys import write_observed_survey
 

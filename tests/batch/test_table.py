@@ -7,7 +7,7 @@ import io
 import pytest
 from rich.console import Console
 
-from sfm.batch.survey import SurveyRow
+from sfm.batch.job import SurveyRow
 from sfm.batch.table import BatchTable
 
 

@@ -17,8 +17,8 @@ from sfm.batch.run import run_batch
 from sfm.cli import starting
 from sfm.cli.app import app
 from sfm.errors import KolinearError
-from sfm.faults import told_of_error, working_on
 from sfm.report.log import read_log
+from sfm.runtime.faults import told_of_error, working_on
 from tests.engines import ALONE, HERE, Notes
 from tests.places import ROOT
 from tests.surveys import write_observed_survey, write_photograph_survey
@@ -110,7 +110,7 @@ def test_memory_that_is_not_enough_says_for_which_photograph(
     error: MemoryError, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     survey = write_photograph_survey(tmp_path / "survey", "huge", photographs=2)
-    monkeypatch.setattr("sfm.survey.targets.find_targets", raising(error))
+    monkeypatch.setattr("sfm.survey.measuring.targets.find_targets", raising(error))
     code, (line,) = kolinear(monkeypatch, capsys, "run", survey, "--out", tmp_path / "out", "--jobs", 1)
     own = f" ({error})" if str(error) else ""
     assert line == f"kolinear: not enough memory for photograph photo 1.png, stage targets{own}"
@@ -162,7 +162,7 @@ def test_a_fault_in_one_survey_of_a_batch_fails_it_alone(
     faulty = fails(getattr(sys.modules[module], name))
     monkeypatch.setattr(f"{module}.{name}", faulty)
     if name == "measure_photograph":  # as the survey itself does, once more
-        monkeypatch.setattr("sfm.survey.targets.measure_photograph", faulty)
+        monkeypatch.setattr("sfm.survey.measuring.targets.measure_photograph", faulty)
     monkeypatch.setattr("adapters.dask_cluster.local_engine", lambda workers: HERE)
     out = tmp_path / "out"
     code, _ = kolinear(monkeypatch, capsys, "batch", first, second, "--out", out)

@@ -22,7 +22,7 @@ from sfm.errors import FolderInUseError, OutputError
 from sfm.files.folder_lock import locked, owner_of
 from sfm.files.whole_files import remove_leftovers
 from sfm.report.log import SurveyLog, read_log
-from sfm.survey.target_store import TargetStore, target_key
+from sfm.survey.measuring.target_store import TargetStore, target_key
 from sfm.targets.codes.families import code_family
 from sfm.targets.detect import Targets, find_targets
 from tests.engines import points_of

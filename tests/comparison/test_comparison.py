@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from adapters.colmap.adjuster import adjust_with_colmap
-from adapters.colmap.covariance import adjust_with_covariance
+from adapters.colmap.validation_backend import adjust_with_covariance
 from adapters.formats.photomodeler import read_photomodeler
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.solve import adjust

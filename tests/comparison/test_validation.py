@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from adapters.colmap.adjuster import adjust_with_colmap
-from adapters.colmap.covariance import ColmapBackend
+from adapters.colmap.validation_backend import ColmapBackend
 from sfm.comparison.adjuster_validation import (
     BOTH_FAILED,
     OURS_FAILED,

@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from sfm.batch.job import SurveyRow
 from sfm.batch.pages import render_index
-from sfm.batch.survey import SurveyRow
 from sfm.comparison.adjuster_validation import SAME, Trial, Validation
 from sfm.comparison.random_network import Plan
 from sfm.comparison.significance import compare_results

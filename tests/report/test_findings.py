@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+import sfm.report.findings.bundle_statistics as statistics
 import sfm.report.findings.checks as checks
 import sfm.report.findings.findings as findings_module
-import sfm.report.findings.statistics as statistics
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.solve import adjust
 from sfm.cli.console import tell_result
@@ -138,7 +138,7 @@ def test_missing_files_and_other_folders_are_told(folders: tuple[Path, Path], tm
 
 
 def test_a_bar_in_a_name_is_no_column(result: SurveyResult) -> None:
-    from sfm.report.text.report import text_report
+    from sfm.report.text.text_report import text_report
 
     network = result.adjustment.network
     named = replace(network, images=("a|b", *network.images[1:]))

@@ -27,13 +27,13 @@ from sfm.report.figures.plots import all_plots, plan_axes
 from sfm.report.findings.findings import findings_of
 from sfm.report.findings.geometry import geometry_of
 from sfm.report.html.page import environment
-from sfm.report.html.report import report_page
+from sfm.report.html.report_page import report_page
 from sfm.report.numbers import finer_unit, significant, to_precision, with_exponent
 from sfm.report.output import WRITTEN, write_result
 from sfm.report.tables.csv_files import write_tables
 from sfm.report.tables.summary import summary, write_summary
-from sfm.report.text.lines import WIDTH
-from sfm.report.text.report import text_report
+from sfm.report.text.filters import WIDTH
+from sfm.report.text.text_report import text_report
 from sfm.result import ControlCheck, FailedImage, PhotographTargets, StageTime, SurveyResult
 from sfm.survey.inputs.given import read_exterior, read_image_points, read_points
 from sfm.targets.flags import Flag

@@ -22,6 +22,7 @@ from sfm.camera import Camera
 from sfm.comparison.adjusters import AdjusterComparison, BackendAdjustment, compare_adjusters
 from sfm.network import Estimate, InteriorObservations, Network, ObjectPoints, ScaleBars
 from sfm.report.figures.plots import all_plots, plan_axes
+from sfm.report.findings.bundle_statistics import statistics_of
 from sfm.report.findings.checks import (
     LISTED,
     count_observations,
@@ -30,17 +31,16 @@ from sfm.report.findings.checks import (
     sigma0_of,
 )
 from sfm.report.findings.findings import findings_of
-from sfm.report.findings.given import bar_residuals, control_residuals, interior_residuals
-from sfm.report.findings.interior import families, interior_parameters, parameter_sigmas
+from sfm.report.findings.given_residuals import bar_residuals, control_residuals, interior_residuals
+from sfm.report.findings.interior_parameters import families, interior_parameters, parameter_sigmas
 from sfm.report.findings.precision import point_precision, precision_of
-from sfm.report.findings.statistics import statistics_of
-from sfm.report.html.report import report_page
+from sfm.report.html.report_page import report_page
 from sfm.report.numbers import signed, significant
 from sfm.report.phrases import words_of_fixed, words_of_sigma0, words_of_test, words_of_weights
 from sfm.report.tables.csv_files import write_tables
 from sfm.report.tables.summary import summary
-from sfm.report.text.lines import WIDTH
-from sfm.report.text.report import text_report
+from sfm.report.text.filters import WIDTH
+from sfm.report.text.text_report import text_report
 from sfm.result import ControlCheck, Eccentricity, SurveyResult
 from tests.synthetic import make_network, seed_of
 

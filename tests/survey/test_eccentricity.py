@@ -15,7 +15,7 @@ from sfm.result import SurveyResult
 from sfm.similarity import fit_similarity
 from sfm.survey.inputs.given import read_diameters
 from sfm.survey.inputs.survey import read_survey
-from sfm.survey.measurements import MeasuredPhotographs
+from sfm.survey.measuring.measurements import MeasuredPhotographs
 from sfm.targets.detect import Targets
 
 C_PX, DISTANCE_MM, TILT = 4000.0, 600.0, np.radians(60)
@@ -123,7 +123,7 @@ def surveyed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, targets: str, seed
     measured = photographs(seed)
     for name in measured.names:
         (tmp_path / name).touch()
-    monkeypatch.setattr("sfm.survey.network.measure_photographs", lambda *given, **more: measured)
+    monkeypatch.setattr("sfm.survey.target_network.measure_photographs", lambda *given, **more: measured)
     return pipeline.run_survey(read_survey(tmp_path / "survey.toml"))
 
 

@@ -16,10 +16,10 @@ from sfm.errors import GeometryError, SurveyFileError
 from sfm.network import Estimate
 from sfm.pipeline import run_survey
 from sfm.report.findings.findings import findings_of
-from sfm.report.findings.given import exterior_residuals
-from sfm.report.html.report import report_page
+from sfm.report.findings.given_residuals import exterior_residuals
+from sfm.report.html.report_page import report_page
 from sfm.report.output import write_result
-from sfm.report.text.report import text_report
+from sfm.report.text.text_report import text_report
 from sfm.result import SurveyResult
 from sfm.survey.inputs.exterior_table import read_observed_exterior
 from sfm.survey.inputs.survey import read_survey

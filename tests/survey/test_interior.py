@@ -18,10 +18,10 @@ from sfm.network import Estimate, Network
 from sfm.pipeline import run_survey
 from sfm.report.findings.findings import findings_of
 from sfm.report.tables.summary import summary
-from sfm.report.text.report import text_report
+from sfm.report.text.text_report import text_report
 from sfm.result import SurveyResult
-from sfm.survey.comparison import OtherPrograms
 from sfm.survey.inputs.survey import read_survey
+from sfm.survey.other_programs import OtherPrograms
 from tests.synthetic import PIXEL_MM, SIZE_PX, make_network, seed_of
 
 IMAGES = 8

@@ -14,7 +14,7 @@ from sfm.errors import GeometryError, SurveyFileError
 from sfm.pipeline import run_survey
 from sfm.result import SurveyResult
 from sfm.survey.inputs.survey import read_survey
-from sfm.survey.target_store import TargetStore
+from sfm.survey.measuring.target_store import TargetStore
 from tests.surveys import write_observed_survey, write_photograph_survey
 from tests.synthetic import make_network, seed_of
 

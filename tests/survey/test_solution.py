@@ -16,12 +16,12 @@ from sfm.adjustment.solve import adjust
 from sfm.errors import BackendError
 from sfm.network import Estimate, Network, ObjectPoints, ScaleBars
 from sfm.pipeline import run_survey
+from sfm.report.findings.bundle_statistics import statistics_of
 from sfm.report.findings.findings import findings_of
-from sfm.report.findings.statistics import statistics_of
 from sfm.report.tables.csv_files import write_tables
-from sfm.survey.comparison import OtherPrograms
-from sfm.survey.datum import find_contradiction, object_scale
+from sfm.survey.datum_definition import find_contradiction, object_scale
 from sfm.survey.inputs.survey import read_survey
+from sfm.survey.other_programs import OtherPrograms
 from tests.surveys import write_observed_survey
 from tests.synthetic import make_network, seed_of
 

@@ -23,7 +23,7 @@ from sfm.files.whole_files import remove_leftovers, whole_file, whole_folder
 from sfm.kernels.compiling import COMPILING
 from sfm.report.log import SurveyLog, read_log
 from sfm.report.output import folder_name
-from sfm.survey.target_store import TargetStore, measuring_sources
+from sfm.survey.measuring.target_store import TargetStore, measuring_sources
 from sfm.targets.detect import Targets, find_targets
 from tests.engines import ALONE, HERE, Notes
 from tests.surveys import pictures, write_observed_survey, write_photograph_survey
@@ -358,7 +358,7 @@ def test_targets_travel_between_workers_that_have_no_common_store(
     (cache / "kolinear").touch()  # root could write otherwise
     measured: list[int] = []
     monkeypatch.setattr(
-        "sfm.survey.targets.find_targets",
+        "sfm.survey.measuring.targets.find_targets",
         lambda *given, **options: measured.append(1) or find_targets(*given, **options),
     )
     survey = write_photograph_survey(tmp_path / "s", "s")

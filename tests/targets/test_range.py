@@ -10,7 +10,7 @@ import pytest
 
 from sfm.conventions import AnyArray
 from sfm.survey.inputs.settings import TargetSettings
-from sfm.survey.targets import measure_photograph
+from sfm.survey.measuring.targets import measure_photograph
 from sfm.targets.detect import find_targets
 from sfm.targets.flags import Flag
 from tests.targets.test_bound import coverage

@@ -16,10 +16,10 @@ import numpy as np
 import pytest
 
 from adapters.colmap.database import write_database
-from adapters.formats import lines
-from adapters.formats.lines import Lines
+from adapters.formats import text_lines as lines
 from adapters.formats.registry import FORMATS, read_any, write_any
 from adapters.formats.result_tables import read_result, write_tables
+from adapters.formats.text_lines import Lines
 from adapters.formats.xml_lines import read_xml
 from sfm.errors import OutputError, SurveyFileError
 from sfm.network import Estimate, Network

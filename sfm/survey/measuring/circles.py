@@ -11,11 +11,11 @@ from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
 from sfm.network import Estimate, ImagePoints, Network
 from sfm.orientation.eccentricity import CircleViews, ellipse_shape, fit_circles
 from sfm.result import Eccentricity
-from sfm.survey.datum import object_scale
+from sfm.survey.datum_definition import object_scale
 from sfm.survey.inputs.given import Diameters
 from sfm.survey.inputs.survey import Survey
-from sfm.survey.measurements import MeasuredPhotographs, Naming
-from sfm.survey.network import UNNAMED
+from sfm.survey.measuring.measurements import MeasuredPhotographs, Naming
+from sfm.survey.target_network import UNNAMED
 from sfm.targets.flags import Flag
 
 NOT_A_CIRCLE = (

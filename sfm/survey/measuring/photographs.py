@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import TypeVar
 
 from sfm.errors import GeometryError, PhotographError
-from sfm.faults import working_on
-from sfm.progress import SILENT, Progress
 from sfm.result import FailedImage
+from sfm.runtime.faults import working_on
+from sfm.runtime.progress import SILENT, Progress
 from sfm.survey.inputs.photograph_list import PhotographList
-from sfm.survey.target_store import content_hash
+from sfm.survey.measuring.target_store import content_hash
 
 T = TypeVar("T")
 MIN_PHOTOGRAPHS = 2

@@ -18,7 +18,7 @@ from adapters.colmap.adjuster import (
     load_pycolmap,
     quiet,
 )
-from adapters.colmap.scene import reconstruction
+from adapters.colmap.reconstruction import reconstruction
 from sfm.conventions import FloatArray
 from sfm.network import Estimate, Network
 

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Protocol
 
-from sfm.faults import working_on
+from sfm.runtime.faults import working_on
 
 
 class Progress(Protocol):

@@ -21,7 +21,7 @@ def refuse_foreign_files(root: str | None = None) -> None:
     Args:
         root: folder of the packages; that of this one if not given.
     """
-    root = root or os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
+    root = root or os.path.abspath(os.path.join(__file__, *[os.pardir] * 3))
     for file in FOREIGN:
         path = os.path.join(root, file)
         if os.path.exists(path):

@@ -10,14 +10,14 @@ from sfm.camera import project
 from sfm.conventions import FloatArray, IntArray
 from sfm.matching.tracks.correspondence import match_targets
 from sfm.network import Estimate, ImagePoints, Network, ScaleBars
-from sfm.progress import SILENT, Progress
+from sfm.runtime.progress import SILENT, Progress
 from sfm.survey.inputs.photograph_list import PhotographList
 from sfm.survey.inputs.settings import TargetSettings
 from sfm.survey.inputs.start import control_points, scale_bars
 from sfm.survey.inputs.survey import Survey
-from sfm.survey.measurements import MeasuredPhotographs, Measurements, Naming
-from sfm.survey.target_store import TargetStore
-from sfm.survey.targets import image_point_covariance, measure_photographs
+from sfm.survey.measuring.measurements import MeasuredPhotographs, Measurements, Naming
+from sfm.survey.measuring.target_store import TargetStore
+from sfm.survey.measuring.targets import image_point_covariance, measure_photographs
 from sfm.targets.codes.tags import CORNERS, corner_name
 from sfm.targets.flags import Flag
 

@@ -10,7 +10,7 @@ from sfm.comparison.adjusters import AdjusterComparison, BackendAdjustment, comp
 from sfm.comparison.baseline import Baseline, BaselineComparison, compare_baseline
 from sfm.errors import KolinearError
 from sfm.network import Estimate, Network
-from sfm.progress import StageClock
+from sfm.runtime.progress import StageClock
 from sfm.survey.inputs.photograph_list import PhotographList
 from sfm.survey.solution import Solution
 

@@ -13,15 +13,15 @@ from sfm.matching.tracks.feature_tracks import find_tie_points
 from sfm.network import ImagePoints, Network
 from sfm.photographs.exif import Metadata, read_metadata
 from sfm.photographs.reading import read_photograph
-from sfm.progress import SILENT, Progress
 from sfm.result import PhotographTargets
+from sfm.runtime.progress import SILENT, Progress
 from sfm.survey.inputs.cameras import start_cameras
 from sfm.survey.inputs.photograph_list import PhotographList
 from sfm.survey.inputs.settings import TiePointSettings
 from sfm.survey.inputs.start import control_points, scale_bars
 from sfm.survey.inputs.survey import Survey
-from sfm.survey.measurements import Measurements
-from sfm.survey.photographs import each_photograph
+from sfm.survey.measuring.measurements import Measurements
+from sfm.survey.measuring.photographs import each_photograph
 
 MIN_RAYS = 3  # photographs that must agree on a tie point; two rays cannot contradict each other
 

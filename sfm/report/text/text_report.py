@@ -16,7 +16,7 @@ from sfm.adjustment.quality.statistics import STRONG
 from sfm.report.findings.findings import Findings
 from sfm.report.numbers import FILTERS, finer_unit, finer_unit_of
 from sfm.report.phrases import PHRASES
-from sfm.report.text import lines
+from sfm.report.text import filters as lines
 
 MAX_ROWS = 12  # of a list; the rest is in the tables of the result
 WORST = 5  # residuals and photographs

@@ -9,14 +9,14 @@ import numpy as np
 from sfm.conventions import FloatArray
 from sfm.photographs.exif import Metadata, read_metadata
 from sfm.photographs.reading import read_photograph
-from sfm.progress import SILENT, Progress
+from sfm.runtime.progress import SILENT, Progress
 from sfm.survey.inputs.cameras import start_cameras
 from sfm.survey.inputs.photograph_list import PhotographList
 from sfm.survey.inputs.settings import TargetSettings
 from sfm.survey.inputs.survey import Survey
-from sfm.survey.measurements import MeasuredPhotographs
-from sfm.survey.photographs import each_photograph
-from sfm.survey.target_store import TargetStore, target_key
+from sfm.survey.measuring.measurements import MeasuredPhotographs
+from sfm.survey.measuring.photographs import each_photograph
+from sfm.survey.measuring.target_store import TargetStore, target_key
 from sfm.targets.codes.families import Family
 from sfm.targets.detect import Targets, find_targets
 

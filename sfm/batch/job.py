@@ -13,8 +13,6 @@ from pathlib import Path
 from typing import Any
 
 from sfm.errors import FolderInUseError, OutputError
-from sfm.executor import Tell
-from sfm.faults import is_fault, told_of_error
 from sfm.files.folder_lock import Owner, locked, owner_of
 from sfm.files.plain_text import as_plain
 from sfm.kernels.compiling import when_compiling
@@ -23,12 +21,14 @@ from sfm.report.findings.findings import findings_of
 from sfm.report.log import LOG, SurveyLog, read_log, remove_log, result_entries
 from sfm.report.output import write_result
 from sfm.result import SurveyResult
-from sfm.survey.comparison import OtherPrograms
+from sfm.runtime.executor import Tell
+from sfm.runtime.faults import is_fault, told_of_error
 from sfm.survey.inputs.photograph_list import find_photographs
 from sfm.survey.inputs.survey import Survey, read_survey, survey_family
 from sfm.survey.inputs.survey_file import SurveyFile
-from sfm.survey.target_store import TargetStore
-from sfm.survey.targets import measure_photograph
+from sfm.survey.measuring.target_store import TargetStore
+from sfm.survey.measuring.targets import measure_photograph
+from sfm.survey.other_programs import OtherPrograms
 from sfm.targets.detect import Targets
 
 LOCK = ".lock"  # of the batch
