@@ -12,15 +12,8 @@ from tests.places import ROOT
 LAYERS = (
     (
         *("sfm.conventions", "sfm.errors", "sfm.camera", "sfm.distortion", "sfm.network", "sfm.similarity"),
-        *(
-            "sfm.runtime.progress",
-            "sfm.runtime.executor",
-            "sfm.runtime.faults",
-            "sfm.files",
-            "sfm.kernels",
-            "sfm.photographs",
-        ),
-        *("sfm.point_table", "sfm.stored_result", "sfm.display", "sfm.runtime.installation"),
+        *("sfm.runtime", "sfm.files", "sfm.kernels", "sfm.photographs"),
+        *("sfm.point_table", "sfm.stored_result", "sfm.display"),
     ),
     ("sfm.targets", "sfm.matching", "sfm.orientation", "sfm.adjustment"),
     ("sfm.comparison", "sfm.geometry", "sfm.epochs", "sfm.planning", "sfm.rendering", "sfm.printing"),
