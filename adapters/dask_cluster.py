@@ -40,7 +40,7 @@ from distributed.security import Security
 from threadpoolctl import threadpool_limits
 
 from sfm.errors import BackendError, KolinearError
-from sfm.executor import Call, Done, Event, Lost, Told, Work
+from sfm.runtime.executor import Call, Done, Event, Lost, Told, Work
 
 # Deaths of workers that a call may be near before Dask gives it up: once is bad luck, and is tried elsewhere.
 ALLOWED_FAILURES = 1
@@ -237,7 +237,7 @@ class DaskEngine:
         return max(1, sum(self.client.nthreads().values()))
 
     def run(self, works: Iterable[Work], *, at_a_time: int) -> Iterator[Event]:
-        """Run all work and yield what happens, see sfm.executor.Engine.
+        """Run all work and yield what happens, see sfm.runtime.executor.Engine.
 
         Raises:
             BackendError: the scheduler or all workers are gone, or the workers have no Kolinear.

@@ -7,12 +7,20 @@ from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).resolve().parents[1]
+from tests.places import ROOT
+
 LAYERS = (
     (
         *("sfm.conventions", "sfm.errors", "sfm.camera", "sfm.distortion", "sfm.network", "sfm.similarity"),
-        *("sfm.progress", "sfm.executor", "sfm.faults", "sfm.files", "sfm.kernels", "sfm.photographs"),
-        *("sfm.point_table", "sfm.stored_result", "sfm.display", "sfm.installation"),
+        *(
+            "sfm.runtime.progress",
+            "sfm.runtime.executor",
+            "sfm.runtime.faults",
+            "sfm.files",
+            "sfm.kernels",
+            "sfm.photographs",
+        ),
+        *("sfm.point_table", "sfm.stored_result", "sfm.display", "sfm.runtime.installation"),
     ),
     ("sfm.targets", "sfm.matching", "sfm.orientation", "sfm.adjustment"),
     ("sfm.comparison", "sfm.geometry", "sfm.epochs", "sfm.planning", "sfm.rendering", "sfm.printing"),

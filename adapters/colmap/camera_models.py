@@ -19,7 +19,7 @@ import numpy as np
 from adapters.colmap.adjuster import load_pycolmap, quiet, told
 from adapters.colmap.model_files import check_model_files
 from adapters.colmap.names import SIDE_FILE, Names, read_side_file, write_side_file
-from adapters.colmap.scene import AXES, HALF_PIXEL, camera_of, reconstruction
+from adapters.colmap.reconstruction import AXES, HALF_PIXEL, camera_of, reconstruction
 from sfm.conventions import BoolArray
 from sfm.errors import OutputError, SurveyFileError
 from sfm.files.plain_text import MAX_NAME, is_name, shown

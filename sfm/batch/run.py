@@ -17,8 +17,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from sfm.batch.finished import note_finished, remove_old_notes, was_finished
-from sfm.batch.pages import PAGES, refuse_foreign_pages, write_batch_pages
-from sfm.batch.survey import (
+from sfm.batch.job import (
     LOCK,
     LOGS,
     Comparers,
@@ -31,19 +30,20 @@ from sfm.batch.survey import (
     measure_one,
     reconstruct,
 )
+from sfm.batch.pages import PAGES, refuse_foreign_pages, write_batch_pages
 from sfm.errors import BackendError, FolderInUseError, SurveyFileError
-from sfm.executor import Call, Done, Engine, Lost, Told, Work
 from sfm.files.folder_lock import locked, owner_of
 from sfm.files.globs import BELOW, find_files
 from sfm.files.plain_text import as_plain
 from sfm.files.whole_files import MANIFEST, refuse_foreign_folder, remove_leftovers
 from sfm.report.log import SurveyLog, refuse_other_log, remove_log
 from sfm.report.output import folder_name
+from sfm.runtime.executor import Call, Done, Engine, Lost, Told, Work
 from sfm.survey.inputs.photograph_list import find_photographs
 from sfm.survey.inputs.start import refuse_unknown_photographs
 from sfm.survey.inputs.survey import read_survey
 from sfm.survey.inputs.survey_file import SurveyFile, read_survey_file
-from sfm.survey.target_store import TargetStore
+from sfm.survey.measuring.target_store import TargetStore
 
 SURVEY_NAME = "survey.toml"  # what a folder is searched for
 

@@ -9,7 +9,7 @@ import typer
 
 from sfm.cli.starting import loading
 from sfm.errors import OutputError
-from sfm.faults import working_on
+from sfm.runtime.faults import working_on
 
 
 def refine(

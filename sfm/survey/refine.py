@@ -19,7 +19,7 @@ from sfm.matching.match_flags import LsmFlag, in_words
 from sfm.matching.radiometry import odd_window
 from sfm.network import Estimate, ImagePoints, Network, reduce_network
 from sfm.photographs.reading import read_photograph
-from sfm.progress import SILENT, Progress
+from sfm.runtime.progress import SILENT, Progress
 from sfm.survey.solution import FALSE_ALARM, TOLERANCE_FACTOR, determined, merge_estimate
 
 MIN_RAYS = 3
