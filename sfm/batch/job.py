@@ -12,6 +12,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+from sfm.batch.finished import note_finished
 from sfm.errors import FolderInUseError, OutputError
 from sfm.files.folder_lock import Owner, locked, owner_of
 from sfm.files.plain_text import as_plain
@@ -252,6 +253,7 @@ def _run(
         write_result(
             findings, job.out / job.folder, write_colmap=comparers.writer_of(result), finish=close_log
         )
+        note_finished(job.out / job.folder)  # at once, in case the batch is killed now
     return row[0]
 
 

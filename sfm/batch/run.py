@@ -16,6 +16,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol
 
+from sfm.batch.finished import note_finished, remove_old_notes, was_finished
 from sfm.batch.job import (
     LOCK,
     LOGS,
@@ -110,6 +111,7 @@ def run_batch(
     for plan in plans:
         refuse_other_log(out / LOGS / f"{plan.folder}.jsonl")
     TargetStore.of_user().remove_old()
+    remove_old_notes()
     with _no_empty_folders(out), locked(out / LOCK, out) as before:
         if before is not None:
             watch.remark(f"an earlier run was cut off ({before}); what it had finished is safe")
@@ -247,6 +249,8 @@ def _run(
     works: dict[str, Work] = {}
 
     def finish(name: str, row: SurveyRow, *, kept: bool = False) -> None:
+        if row.status == "done" and not kept:
+            note_finished(out / name)  # here, too: workers on other computers have another cache folder
         rows[name] = row
         works.pop(name, None)
         watch.finished(name, row, kept=kept)
@@ -260,6 +264,12 @@ def _run(
                 inputs = fingerprint(plan.survey)
                 job = SurveyJob(plan.file, out, plan.folder, inputs, allow_outside, owner_of(out / LOCK))
                 earlier = finished_row(job) if resume else None
+                if earlier is not None and not was_finished(out / plan.folder):
+                    watch.remark(
+                        f"{out / plan.folder}: no run of yours is known to have finished this result, it is "
+                        "computed again"
+                    )
+                    earlier = None
                 if earlier is None:
                     works[plan.folder] = _work(job, plan.survey, comparers)
             except Exception as error:

@@ -7,13 +7,13 @@ import gc
 import json
 import logging
 import os
+import shutil
 import subprocess
 import sys
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, nullcontext, suppress
 from http.client import HTTPException
-from importlib.metadata import version
 from pathlib import Path
 from urllib.request import urlopen
 
@@ -23,11 +23,13 @@ from dask.distributed import KilledWorker
 from threadpoolctl import threadpool_info
 
 from adapters.dask_cluster import DaskEngine, _event, _OneThread, fitting_workers, local_engine, remote_engine
+from sfm.batch.finished import note_finished
 from sfm.batch.job import LOCK, SurveyJob, SurveyRow, reconstruct
 from sfm.batch.pages import render_index
 from sfm.batch.run import calls_of, find_surveys, run_batch
 from sfm.errors import BackendError, KolinearError, OutputError, SurveyFileError
 from sfm.files.folder_lock import Owner, locked
+from sfm.files.whole_files import MANIFEST, sha256_of, write_manifest
 from sfm.report.log import read_log
 from sfm.runtime.executor import Call, Done, Lost, Work
 from tests.engines import ALONE, HERE, KILLER, Notes, points_of, raise_unforeseen, return_nothing
@@ -309,21 +311,46 @@ def test_resume_runs_again_what_has_a_log_of_somebody_else(
     lines = [json.loads(line) for line in log.read_text(encoding="utf-8").splitlines()]
     lines[-1][key] = value
     log.write_text("\n".join(json.dumps(line) for line in lines), encoding="utf-8")
+    sign(out / "third")
+    note_finished(out / "third")
     again = Notes()
     run_batch([surveys[2]], out, HERE, ALONE, again, resume=True)
-    assert [kept for _, kept in again.finished_rows] == [False]
+    assert [(row.status, kept) for row, kept in again.finished_rows] == [("done", False)]
+
+
+def sign(folder: Path) -> None:
+    """Give a folder the manifest that whoever changed it would give it."""
+    files = [path for path in folder.rglob("*") if path.is_file() and path.name != MANIFEST]
+    write_manifest(folder, {path.relative_to(folder).as_posix(): [sha256_of(path)] for path in files})
+
+
+def test_resume_computes_again_what_came_with_the_survey(surveys: tuple[Path, ...], tmp_path: Path) -> None:
+    """A result whose log, inputs and hashes fit, but which no run of this user has finished as it is now."""
+    out = tmp_path / "out"
+    run_batch([surveys[2]], out, HERE, ALONE, Notes())
+    true = (out / "third" / "points.csv").read_bytes()
+    (out / "third" / "points.csv").write_bytes(true.replace(b"0.", b"1."))
+    sign(out / "third")
+    (tmp_path / "moved").mkdir()
+    shutil.copytree(out / "third", tmp_path / "moved" / "third")
+    for given in (out, tmp_path / "moved"):
+        again = Notes()
+        run_batch([surveys[2]], given, HERE, ALONE, again, resume=True)
+        assert [(row.status, kept) for row, kept in again.finished_rows] == [("done", False)]
+        assert len(again.remarks) == 1
+        assert again.remarks[0].startswith(f"{given / 'third'}: no run of yours is known to have finished")
+        assert (given / "third" / "points.csv").read_bytes() == true
+        kept_now = Notes()
+        run_batch([surveys[2]], given, HERE, ALONE, kept_now, resume=True)
+        assert [kept for _, kept in kept_now.finished_rows] == [True] and not kept_now.remarks
 
 
 def test_resume_runs_again_what_another_version_has_finished(
-    surveys: tuple[Path, ...], tmp_path: Path
+    surveys: tuple[Path, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     out = tmp_path / "out"
     run_batch([surveys[2]], out, HERE, ALONE, Notes())
-    log = out / "third" / "log.jsonl"
-    first, *others = log.read_text(encoding="utf-8").splitlines()
-    entry = json.loads(first)
-    assert entry["version"] == version("kolinear")
-    log.write_text("\n".join([json.dumps({**entry, "version": "0.0.1"}), *others]), encoding="utf-8")
+    monkeypatch.setattr("sfm.batch.job.version", lambda _: "0.0.1")
     again = Notes()
     run_batch([surveys[2]], out, HERE, ALONE, again, resume=True)
     assert [kept for _, kept in again.finished_rows] == [False]

@@ -324,6 +324,15 @@ def test_very_many_photographs_are_refused(tmp_path: Path) -> None:
     assert time.process_time() - begun < SECONDS
 
 
+@pytest.mark.parametrize("pixel", ["[0.005, 5e9]", "[5e9, 0.005]", "[2000.0, 2000.0]", "[1e-9, 2e-8]"])
+def test_pixels_that_no_sensor_has_are_refused(tmp_path: Path, pixel: str) -> None:
+    """The orientation of photographs with such pixels tried all it could, 0.7 s a pair."""
+    path = write_survey(tmp_path, ["i1", "i2"])
+    path.write_text(path.read_text().replace("[0.005, 0.005]", pixel))
+    with pytest.raises(SurveyFileError, match=r"camera c: a pixel of .* mm, expected sides of at most 1000"):
+        measurements_from_observations(read_survey(path))
+
+
 def test_control_and_bars_of_different_units_are_refused(tmp_path: Path) -> None:
     network, truth = make_network(seed_of("units"), images=8, points=40)
     seen, xyz, camera = network.image_points, truth.points, truth.cameras[0]

@@ -11,9 +11,6 @@ import hashlib
 import io
 import os
 import re
-import shutil
-import stat
-import time
 import zipfile
 from contextlib import suppress
 from dataclasses import dataclass, field, fields
@@ -23,17 +20,15 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from platformdirs import user_cache_path
 
 from sfm.errors import OutputError, PhotographError
+from sfm.files.user_cache import make_user_folder, remove_unused, user_folder
 from sfm.files.whole_files import whole_file
 from sfm.targets.codes.rings import CodeFamily
 from sfm.targets.codes.tags import TagFamily
 from sfm.targets.detect import Targets
 
 MAX_ENTRY_BYTES = 100_000_000  # some 400,000 targets; bounded before any memory is taken
-KEPT_SECONDS = 90 * 86400  # entries that nobody has asked for are removed then
-WRITING_SECONDS = 86400  # what is half-written for longer was left by a killed run
 MEASURING = ("sfm.photographs.reading", "sfm.targets.detect")  # what is measured depends on these
 
 
@@ -52,17 +47,7 @@ class TargetStore:
         Raises:
             OutputError: others can write into it.
         """
-        folder = user_cache_path("kolinear", appauthor=False).resolve() / "targets"
-        with suppress(OSError):  # there is none
-            status = folder.lstat()
-            if hasattr(os, "geteuid") and (
-                not stat.S_ISDIR(status.st_mode) or status.st_uid != os.geteuid() or status.st_mode & 0o077
-            ):
-                raise OutputError(
-                    f"{folder}: measured targets are kept here, but others may write here; remove it, or set "
-                    "XDG_CACHE_HOME to another folder"
-                )
-        return cls(folder)
+        return cls(user_folder("targets", "measured targets"))
 
     def load(self, key: str) -> Targets | None:
         """Return the targets of a key; None if they are not there or not whole."""
@@ -81,20 +66,13 @@ class TargetStore:
         data = io.BytesIO()
         np.savez(data, allow_pickle=False, **{f.name: getattr(targets, f.name) for f in fields(Targets)})
         with suppress(OSError, OutputError):
-            self.folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+            make_user_folder(self.folder)
             with whole_file(self._path(key)) as part:
                 part.write_bytes(data.getbuffer())
 
     def remove_old(self) -> None:
         """Remove what nobody has asked for in months, and what a killed run left half-written."""
-        now = time.time()
-        for path in self.folder.glob("*/*"):
-            with suppress(OSError):
-                age = now - path.stat().st_mtime
-                if path.is_dir() and age > WRITING_SECONDS:
-                    shutil.rmtree(path)
-                elif age > KEPT_SECONDS:
-                    path.unlink()
+        remove_unused(self.folder)
 
     def _path(self, key: str) -> Path:
         return self.folder / key[:2] / f"{key}.npz"
