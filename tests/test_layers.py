@@ -28,6 +28,7 @@ CV2_ROOMS = (
     *("sfm.orientation", "sfm.survey"),
 )
 CV2_THREADS = "adapters.dask_cluster"  # holds OpenCV to one thread per worker, as it does BLAS
+TERMINAL = ("sfm.batch.table", "sfm.runtime.progress_bar")
 ROOMS = LAYERS[1]  # of which none knows another
 
 
@@ -121,7 +122,7 @@ def test_libraries_stay_in_their_rooms() -> None:
         if libraries & {"matplotlib"}:
             assert name.startswith("sfm.report"), f"{name} imports matplotlib"
         if libraries & {"typer", "rich"}:
-            assert belongs(name, "sfm.cli") or name == "sfm.batch.table", (
+            assert belongs(name, "sfm.cli") or name in TERMINAL, (
                 f"{name} imports the command line's libraries"
             )
 
