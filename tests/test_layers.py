@@ -123,7 +123,7 @@ def test_libraries_stay_in_their_rooms() -> None:
             assert name.startswith("sfm.report"), f"{name} imports matplotlib"
         if libraries & {"typer", "rich"}:
             assert belongs(name, "sfm.cli") or name in TERMINAL, (
-                f"{name} imports the command line's libraries"
+                f"{name} imports libraries of the terminal"
             )
 
 
