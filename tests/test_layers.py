@@ -11,7 +11,15 @@ from tests.places import ROOT
 
 LAYERS = (
     (
-        *("sfm.conventions", "sfm.errors", "sfm.camera", "sfm.distortion", "sfm.network", "sfm.similarity"),
+        *(
+            "sfm.conventions",
+            "sfm.errors",
+            "sfm.camera",
+            "sfm.distortion",
+            "sfm.network",
+            "sfm.reduced_network",
+            "sfm.similarity",
+        ),
         *("sfm.runtime", "sfm.files", "sfm.kernels", "sfm.photographs"),
         *("sfm.point_table", "sfm.stored_result", "sfm.display"),
     ),
@@ -122,9 +130,7 @@ def test_libraries_stay_in_their_rooms() -> None:
         if libraries & {"matplotlib"}:
             assert name.startswith("sfm.report"), f"{name} imports matplotlib"
         if libraries & {"typer", "rich"}:
-            assert belongs(name, "sfm.cli") or name in TERMINAL, (
-                f"{name} imports libraries of the terminal"
-            )
+            assert belongs(name, "sfm.cli") or name in TERMINAL, f"{name} imports libraries of the terminal"
 
 
 def test_the_rules_would_notice() -> None:

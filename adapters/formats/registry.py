@@ -35,7 +35,8 @@ from sfm.camera import Camera
 from sfm.distortion.models import MODELS
 from sfm.errors import KolinearError, OutputError, SurveyFileError
 from sfm.files.whole_files import whole_folder
-from sfm.network import Estimate, Network, empty_estimate, reduce_network
+from sfm.network import Estimate, Network, empty_estimate
+from sfm.reduced_network import reduce_network
 from sfm.stored_result import StoredResult
 
 Reader = Callable[[Path], tuple[Network, Estimate]]
