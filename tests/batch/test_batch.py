@@ -29,7 +29,8 @@ from sfm.batch.pages import render_index
 from sfm.batch.run import calls_of, find_surveys, run_batch
 from sfm.errors import BackendError, KolinearError, OutputError, SurveyFileError
 from sfm.files.folder_lock import Owner, locked
-from sfm.files.whole_files import MANIFEST, sha256_of, write_manifest
+from sfm.files.manifest import MANIFEST, sha256_of
+from sfm.files.whole_files import write_manifest
 from sfm.report.log import read_log
 from sfm.runtime.executor import Call, Done, Lost, Work
 from tests.engines import ALONE, HERE, KILLER, Notes, points_of, raise_unforeseen, return_nothing
