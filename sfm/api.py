@@ -64,7 +64,7 @@ def run_survey(
         stack.enter_context(one_blas_thread())
         told: Progress = SILENT
         if progress is True:
-            from sfm.cli.console import drawn_progress
+            from sfm.runtime.progress_bar import drawn_progress
 
             told = stack.enter_context(drawn_progress())
         elif progress is not False:

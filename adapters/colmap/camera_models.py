@@ -41,7 +41,8 @@ def write_model(
 
     Args:
         folder: made if it is not there.
-        network, estimate: cameras in an opencv model; photographs without orientation are left out.
+        network: what was measured.
+        estimate: cameras in an opencv model; photographs without orientation are left out.
         rejected: image points that no point shall claim, (k,).
         text: text files instead of binary ones.
 

@@ -100,7 +100,8 @@ def write_bal(path: Path, network: Network, estimate: Estimate) -> None:
 
     Args:
         path: file to write.
-        network, estimate: complete; cameras in model opencv with one focal length and no decentring.
+        network: what was measured.
+        estimate: complete; cameras in model opencv with one focal length and no decentring.
 
     Raises:
         OutputError: what BAL has no place for, or the file cannot be written.

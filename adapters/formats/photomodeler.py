@@ -253,7 +253,7 @@ def write_photomodeler(path: Path, network: Network, estimate: Estimate, *, titl
 
 
 def _inner(camera: Camera) -> list[float]:
-    """c xp yp xs ys K1 K2 K3 P1 P2 of a camera."""
+    """Return c xp yp xs ys K1 K2 K3 P1 P2 of a camera."""
     xs, ys = np.array(camera.size_px) * camera.pixel_mm
     c, x0, y0, *distortion = camera.parameters[:8]
     return [c, xs / 2 + x0, ys / 2 - y0, xs, ys, *distortion]

@@ -34,8 +34,8 @@ def refine(
     """
     with loading():
         from adapters.colmap.camera_models import read_model, write_model
-        from sfm.cli.console import drawn_progress
         from sfm.files.whole_files import refuse_existing, whole_folder
+        from sfm.runtime.progress_bar import drawn_progress
         from sfm.survey.refine import refine_model, refinement_text
 
     if out is not None:

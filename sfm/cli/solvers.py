@@ -27,10 +27,10 @@ def validate(
     """
     with loading():
         from adapters.colmap.validation_backend import ColmapBackend
-        from sfm.cli.console import drawn_progress
         from sfm.comparison.adjuster_validation import validate as validate_networks
         from sfm.files.manifest import refuse_foreign_folder
         from sfm.report.validation import in_words, largest, write_validation
+        from sfm.runtime.progress_bar import drawn_progress
 
     refuse_foreign_folder(out)
     with drawn_progress() as progress:

@@ -93,11 +93,12 @@ def _run_survey(
     begun = time.perf_counter()
     with loading():
         from sfm.api import colmap_writer, cores, one_blas_thread, programs_of
-        from sfm.cli.console import drawn_progress, tell_result
+        from sfm.cli.console import tell_result
         from sfm.pipeline import run_survey
         from sfm.report.findings.findings import findings_of
         from sfm.report.log import SurveyLog
         from sfm.report.output import write_result
+        from sfm.runtime.progress_bar import drawn_progress
         from sfm.survey.inputs.survey import survey_of_file
         from sfm.survey.inputs.survey_file import read_survey_file
         from sfm.survey.measuring.target_store import TargetStore

@@ -95,8 +95,10 @@ def move(source: Path, source_folder: int | None, target: Path, target_folder: i
     """Rename a file or folder, which replaces a file or an empty folder and follows no link.
 
     Args:
-        source, target: its paths.
-        source_folder, target_folder: handles of the folders that they are in.
+        source: its path.
+        source_folder: handle of the folder that it is in.
+        target: its path afterwards.
+        target_folder: handle of the folder that this is in.
 
     Raises:
         OSError: it cannot be moved.

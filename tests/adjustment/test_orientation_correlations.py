@@ -62,7 +62,7 @@ def controlled(network: Network, truth: Estimate) -> Network:
     )
 
 
-def test_c_hangs_together_with_Z0_in_a_flat_parallel_network() -> None:
+def test_c_is_strongly_correlated_with_the_height_in_a_flat_parallel_network() -> None:
     network, truth = strip("flat", relief=0.2, free=("c",))
     a = adjust(controlled(network, truth), truth, datum=Datum("control"), reject="none")
     (found,) = orientation_correlations(a)
@@ -72,7 +72,7 @@ def test_c_hangs_together_with_Z0_in_a_flat_parallel_network() -> None:
     assert "Z0 of 6 photographs" in found.partners
 
 
-def test_convergent_photographs_tell_c_from_Z0() -> None:
+def test_convergent_photographs_tell_c_from_the_height() -> None:
     network, truth = make_network(seed_of("convergent"), images=8, points=40, planar=True, free=("c",))
     convergent = adjust(network, truth, datum=Datum("free"), reject="none")
     flat, start = strip("flat", relief=0.2, free=("c",))

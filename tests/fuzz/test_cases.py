@@ -7,6 +7,7 @@ import random
 import struct
 import time
 import zlib
+from contextlib import suppress
 from pathlib import Path
 
 import cv2
@@ -66,7 +67,7 @@ def test_any_text_as_survey_or_table(tmp_path: Path, text: str) -> None:
     for content in (text, "[survey]\n" + text, "image,point,x_px,y_px\n" + text):
         path.write_text(content, encoding="utf-8", errors="surrogatepass", newline="")
         for read in (read_survey, read_image_points):
-            with pytest.raises(KolinearError) if content is text else _either():
+            with pytest.raises(KolinearError) if content is text else suppress(KolinearError):
                 read(path)
 
 
@@ -79,18 +80,8 @@ def test_any_bytes_as_photograph(tmp_path: Path, data: bytes, start: bytes) -> N
     path = tmp_path / "any.jpg"
     path.write_bytes(start + data)
     for read in (read_metadata, read_photograph):
-        with _either():
+        with suppress(KolinearError):
             read(path)
-
-
-class _either:
-    """Lets through what is read and what is refused."""
-
-    def __enter__(self) -> None:
-        return None
-
-    def __exit__(self, kind: type[BaseException] | None, error: object, trace: object) -> bool:
-        return kind is not None and issubclass(kind, KolinearError)
 
 
 def png(width: int, height: int, rows: bytes) -> bytes:

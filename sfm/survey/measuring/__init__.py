@@ -1,1 +1,1 @@
-"""What is measured in the photographs of a survey, side by side: targets or natural texture; and its store."""
+"""What is measured in the photographs of a survey, targets or natural texture, and its store."""
