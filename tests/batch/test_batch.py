@@ -256,10 +256,10 @@ def test_a_page_that_no_batch_has_written_is_left_alone(surveys: tuple[Path, ...
     with pytest.raises(OutputError, match=r"a\\xff: the path is no plain text; needed another --out"):
         run_batch(surveys, tmp_path / os.fsdecode(b"a\xff"), HERE, ALONE, Notes())
     (tmp_path / "index.html").write_text("my own", encoding="utf-8")
-    with pytest.raises(OutputError, match=r"holds 'index.html', which no batch has written"):
+    with pytest.raises(OutputError, match=r"holds 'index.html'; which would be replaced"):
         run_batch(surveys, tmp_path, HERE, ALONE, Notes())
     (tmp_path / "batch.json").write_text("[]", encoding="utf-8")
-    with pytest.raises(OutputError, match="which no batch has written"):
+    with pytest.raises(OutputError, match=r"holds 'batch.json'; 'index.html'; which would"):
         run_batch(surveys, tmp_path, HERE, ALONE, Notes())
     assert sorted(path.name for path in tmp_path.iterdir()) == ["batch.json", "index.html"]
 
