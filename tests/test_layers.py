@@ -11,7 +11,15 @@ from tests.places import ROOT
 
 LAYERS = (
     (
-        *("sfm.conventions", "sfm.errors", "sfm.camera", "sfm.distortion", "sfm.network", "sfm.similarity"),
+        *(
+            "sfm.conventions",
+            "sfm.errors",
+            "sfm.camera",
+            "sfm.distortion",
+            "sfm.network",
+            "sfm.reduced_network",
+            "sfm.similarity",
+        ),
         *("sfm.runtime", "sfm.files", "sfm.kernels", "sfm.photographs"),
         *("sfm.point_table", "sfm.stored_result", "sfm.display"),
     ),

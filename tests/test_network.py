@@ -6,7 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from sfm.network import ExteriorObservations, ObjectPoints, ScaleBars, reduce_network
+from sfm.network import ExteriorObservations, ObjectPoints, ScaleBars
+from sfm.reduced_network import reduce_network
 from tests.synthetic import make_network, seed_of
 
 

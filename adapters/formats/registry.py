@@ -37,7 +37,8 @@ from sfm.distortion.models import MODELS
 from sfm.errors import KolinearError, OutputError, SurveyFileError
 from sfm.files.open_folders import refuse_links
 from sfm.files.whole_files import whole_folder
-from sfm.network import Estimate, Network, empty_estimate, reduce_network
+from sfm.network import Estimate, Network, empty_estimate
+from sfm.reduced_network import reduce_network
 from sfm.stored_result import StoredResult
 
 Reader = Callable[[Path], tuple[Network, Estimate]]

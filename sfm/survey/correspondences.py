@@ -7,8 +7,9 @@ import numpy as np
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.solve import adjust
 from sfm.conventions import MAD_TO_SIGMA
-from sfm.network import Estimate, Network, reduce_network
+from sfm.network import Estimate, Network
 from sfm.orientation.sequence import Orientation
+from sfm.reduced_network import reduce_network
 from sfm.survey.inputs.survey import Survey
 from sfm.survey.measuring.circles import check_circles
 from sfm.survey.measuring.measurements import MeasuredPhotographs, Measurements, Naming

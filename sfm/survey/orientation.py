@@ -9,10 +9,11 @@ import numpy as np
 from sfm.camera import tangents_from_pixel
 from sfm.conventions import BoolArray
 from sfm.errors import GeometryError
-from sfm.network import Estimate, Network, reduce_network
+from sfm.network import Estimate, Network
 from sfm.orientation.intersection import intersect
 from sfm.orientation.sequence import MIN_POINTS, Orientation, orient
 from sfm.photographs.reading import read_photograph
+from sfm.reduced_network import reduce_network
 from sfm.survey.inputs.start import start_values
 from sfm.survey.inputs.survey import Survey
 from sfm.survey.measuring.measurements import MeasuredPhotographs, Measurements

@@ -14,7 +14,8 @@ from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.errors import GeometryError
-from sfm.network import Estimate, Network, reduce_network, supported
+from sfm.network import Estimate, Network
+from sfm.reduced_network import reduce_network, supported
 from sfm.result import ControlCheck, Eccentricity
 from sfm.survey.datum_definition import (
     Contradiction,
