@@ -9,7 +9,8 @@ from dataclasses import replace
 from pathlib import Path
 
 from sfm.files.covariance_file import write_covariance
-from sfm.files.whole_files import MANIFEST, refuse_foreign_folder, whole_folder
+from sfm.files.manifest import MANIFEST, refuse_foreign_folder
+from sfm.files.whole_files import whole_folder
 from sfm.report.figures.overlays import draw_overlays
 from sfm.report.figures.plots import all_plots
 from sfm.report.findings.findings import Findings
@@ -28,6 +29,7 @@ WRITTEN = (
     "images.csv",
     "cameras.csv",
     "image_points.csv",
+    "point_covariance.npy",
     "given.csv",
     "reliability.csv",
     "variance_components.csv",
