@@ -27,6 +27,7 @@ WRITTEN = (
     "images.csv",
     "cameras.csv",
     "image_points.csv",
+    "left_out.csv",
     "given.csv",
     "reliability.csv",
     "variance_components.csv",
