@@ -14,10 +14,11 @@ from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.errors import GeometryError
-from sfm.network import Estimate, Network, reduce_network, supported
+from sfm.network import Estimate, Network
 from sfm.orientation.ray_angles import ray_angles
+from sfm.reduced_network import reduce_network, supported
 from sfm.result import ControlCheck, Eccentricity, LeftOutPoint
-from sfm.survey.datum import (
+from sfm.survey.datum_definition import (
     Contradiction,
     datum_warnings,
     find_contradiction,
@@ -31,7 +32,7 @@ from sfm.survey.inputs.interior import split_cameras, without_idle_cameras
 from sfm.survey.inputs.start import given_values
 from sfm.survey.inputs.survey import Survey
 from sfm.survey.left_out import datum_carriers, left_out_points, unused_image_points, words_of_left_out
-from sfm.survey.measurements import Naming
+from sfm.survey.measuring.measurements import Naming
 
 TOLERANCE_FACTOR = 6.0  # of the robust spread of the residuals
 FALSE_ALARM = 0.05  # chance that a survey without any outlier loses an image coordinate; Pope (1976)

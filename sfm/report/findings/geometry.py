@@ -17,7 +17,7 @@ from scipy.spatial import ConvexHull, QhullError
 from sfm.adjustment.result import Adjustment
 from sfm.conventions import FloatArray, IntArray
 from sfm.orientation.ray_angles import ray_angles
-from sfm.report.findings.interior import families, family_of_photographs
+from sfm.report.findings.interior_parameters import families, family_of_photographs
 
 WEAK_DEG = 10.0  # below it a point is eleven times less precise along its rays than across
 
