@@ -32,7 +32,7 @@ from pathlib import Path
 import numpy as np
 
 from adapters.formats.json_files import MAX_SIDE_PX
-from adapters.formats.text_lines import MAX_IMAGE_POINTS, MAX_PHOTOGRAPHS, Lines, write_lines
+from adapters.formats.text_lines import MAX_BLOCK_LINES, MAX_PHOTOGRAPHS, Lines, write_lines
 from sfm.camera import Camera, camera_from_values
 from sfm.conventions import FloatArray, angles_from_rotation, rotation_from_angles
 from sfm.errors import OutputError, SurveyFileError
@@ -186,7 +186,7 @@ def _read_control(path: Path) -> list[tuple[str, str, FloatArray]]:
     while (line := text.maybe_line()) is not None:
         if not line.strip() or line.lstrip().startswith("#"):
             continue
-        text.refuse_more(len(rows) + 1, MAX_IMAGE_POINTS, "control points")
+        text.refuse_more(len(rows) + 1, MAX_BLOCK_LINES, "control points")
         parts = [part.strip() for part in line.split(",")]
         if len(parts) not in (5, 8):
             raise text.error(f"{len(parts)} fields, needed id,label,X,Y,Z or id,label,X,Y,Z,sX,sY,sZ")

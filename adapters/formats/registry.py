@@ -8,6 +8,7 @@ Source: the module of each format names its own.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -34,6 +35,7 @@ from adapters.formats.text_lines import Lines
 from sfm.camera import Camera
 from sfm.distortion.models import MODELS
 from sfm.errors import KolinearError, OutputError, SurveyFileError
+from sfm.files.open_folders import refuse_links
 from sfm.files.whole_files import whole_folder
 from sfm.network import Estimate, Network, empty_estimate
 from sfm.reduced_network import reduce_network
@@ -230,9 +232,7 @@ def write_any(path: Path, name: str, network: Network, estimate: Estimate) -> No
         KolinearError: the format cannot hold it, or it cannot be written.
     """
     form = format_named(name)
-    if path.exists() and (form.folder != path.is_dir() or (form.folder and any(path.iterdir()))):
-        needed = "a new or empty folder" if form.folder else "a new file"
-        raise OutputError(f"{path}: it is there already; format {name} needs {needed}")
+    refuse_taken(path, form)
     _refuse_cameras(form, estimate.cameras)
     if form.placed:
         points_only = not form.models
@@ -247,6 +247,15 @@ def write_any(path: Path, name: str, network: Network, estimate: Estimate) -> No
             form.write(folder, network, estimate, **title)
     else:
         form.write(path, network, estimate, **title)
+
+
+def refuse_taken(path: Path, form: FileFormat) -> None:
+    """Raise OutputError where something is in the place of what a format writes, but an empty folder."""
+    refuse_links(path)
+    empty = form.folder and path.is_dir() and not any(path.iterdir())
+    if os.path.lexists(path) and not empty:
+        needed = "a new or empty folder" if form.folder else "a new file"
+        raise OutputError(f"{path}: it is there already and is left alone; format {form.name} needs {needed}")
 
 
 def _refuse_cameras(form: FileFormat, cameras: tuple[Camera, ...]) -> None:

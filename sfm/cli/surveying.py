@@ -221,7 +221,7 @@ def _others_of_worker(survey: Survey) -> OtherPrograms:
 
 def _folder(survey: Survey, out: Path | None) -> Path:
     """Return the folder of the result, before any work is done for one that cannot be used."""
-    from sfm.files.whole_files import refuse_foreign_folder
+    from sfm.files.manifest import refuse_foreign_folder
     from sfm.report.output import folder_name
 
     out = Path("out") / folder_name(survey.name) if out is None else out

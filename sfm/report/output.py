@@ -8,7 +8,8 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-from sfm.files.whole_files import MANIFEST, refuse_foreign_folder, whole_folder
+from sfm.files.manifest import MANIFEST, refuse_foreign_folder
+from sfm.files.whole_files import whole_folder
 from sfm.report.figures.overlays import draw_overlays
 from sfm.report.figures.plots import all_plots
 from sfm.report.findings.findings import Findings

@@ -20,7 +20,7 @@ from sfm.adjustment.solve import adjust
 from sfm.cli.console import tell_result
 from sfm.conventions import angles_from_rotation
 from sfm.errors import OutputError
-from sfm.files.whole_files import refuse_foreign_folder
+from sfm.files.manifest import refuse_foreign_folder
 from sfm.network import Network, ObjectPoints, ScaleBars
 from sfm.report.figures.overlays import USED, draw_photograph, overlay_names
 from sfm.report.figures.plots import all_plots, plan_axes
