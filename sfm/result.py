@@ -33,6 +33,15 @@ class FailedImage:
 
 
 @dataclass(frozen=True)
+class LeftOutPoint:
+    """A measured point that is not part of the result."""
+
+    point: str  # name of the point
+    image_points: int  # measured of it
+    reason: str  # one line: what was found and what was needed
+
+
+@dataclass(frozen=True)
 class StageTime:
     """How long a stage took."""
 
@@ -126,6 +135,8 @@ class SurveyResult:
     warnings: tuple[str, ...] = ()  # one line each, in words
     eccentricity: Eccentricity | None = None  # None where it was not corrected
     no_circles: tuple[str, ...] = ()  # uncoded points left out: their outlines are not images of one circle
+    left_out: tuple[LeftOutPoint, ...] = ()  # measured points that are not in the result
+    unused_image_points: int = 0  # of points or photographs that are not in the result, in no other count
     orientation_correlations: tuple[OrientationCorrelation, ...] = ()  # of camera parameters with exterior
     # orientation, the strong ones
     seconds: tuple[StageTime, ...] = field(default_factory=tuple)  # in the order of the stages
@@ -219,7 +230,7 @@ class SurveyResult:
         rows = [
             ("photographs", f"{len(a.network.images)} of {self.images_total} oriented"),
             ("points", f"{len(a.network.points)}, {int((self.code >= 0).sum())} coded"),
-            ("image points", f"{int((~a.rejected).sum())} accepted, {int(a.rejected.sum())} rejected"),
+            ("image points", self.image_point_counts),
             ("adjustment", f"{state}, datum {a.datum}, redundancy {a.redundancy}"),
             ("sigma0", f"{a.sigma0_px:.4f} px"),
             ("RMS sigma of points", f"{', '.join(f'{s:.3g}' for s in sigma)} {self.length_unit}"),
@@ -233,6 +244,17 @@ class SurveyResult:
 
     def _repr_html_(self) -> str:
         return html_table(f"Survey {self.survey}", ("", ""), self._rows())
+
+    @property
+    def image_point_counts(self) -> str:
+        """How many image points were accepted, rejected and of no use, in words."""
+        rejected = int(self.adjustment.rejected.sum())
+        words = f"{len(self.adjustment.rejected) - rejected} accepted, {rejected} rejected"
+        unused = self.unused_image_points
+        if not unused:
+            return words
+        points = f"of {len(self.left_out)} points" if self.left_out else "of photographs"
+        return f"{words}, {unused} not in the result ({points})"
 
     @property
     def has_scale(self) -> bool:

@@ -30,6 +30,7 @@ WRITTEN = (
     "cameras.csv",
     "image_points.csv",
     "point_covariance.npy",
+    "left_out.csv",
     "given.csv",
     "reliability.csv",
     "variance_components.csv",

@@ -41,6 +41,8 @@ def assemble_result(
         warnings=start.warnings + matched.warnings + solution.warnings + compared.failures,
         eccentricity=matched.eccentricity,
         no_circles=matched.no_circles,
+        left_out=solution.left_out,
+        unused_image_points=solution.unused_image_points,
         reject=survey.reject,
         orientation_correlations=orientation_correlations(adjustment),
         seconds=tuple(StageTime(*one) for one in clock.seconds),

@@ -68,7 +68,10 @@ def scale_to_bars(network: Network, estimate: Estimate, datum: Datum) -> Estimat
     if datum.kind == "control":
         return estimate
     scale = object_scale(network, estimate)
-    return Similarity(scale, np.eye(3), np.zeros(3)).apply_estimate(estimate) if scale > 0 else estimate
+    if not scale > 0:
+        return estimate
+    centre = np.nanmean(estimate.points, axis=0)
+    return Similarity(scale, np.eye(3), (1 - scale) * centre).apply_estimate(estimate)
 
 
 def place_on_control(network: Network, estimate: Estimate) -> tuple[Estimate, ControlCheck]:
@@ -80,6 +83,35 @@ def place_on_control(network: Network, estimate: Estimate) -> tuple[Estimate, Co
     scale = fitted.scale if len(network.scale_bars) else 1.0
     names = tuple(network.points[j] for j in control.point)
     return placing.apply_estimate(estimate), ControlCheck(names, placing.apply(points) - control.xyz, scale)
+
+
+def place_on_frame(
+    network: Network, estimate: Estimate, frame: Estimate, carriers: BoolArray | None
+) -> Estimate:
+    """Place an adjusted free network on the coordinates that its inner constraints refer to.
+
+    The similarity of least squares over the datum points meets the inner constraints exactly, however
+    far the network moved in between: the sum of the differences and their turning and scaling moments are 0.
+    Scale bars keep the scale, and so do two control points.
+
+    Args:
+        network: what was adjusted, in a free datum.
+        estimate: adjusted.
+        frame: coordinates to refer to, NaN where there are none; with fewer than three points those of
+            the projection centres count.
+        carriers: points that carry the datum, all if None, (n,).
+    """
+    on = frame.determined if carriers is None else frame.determined & carriers
+    source, target = estimate.points[on], frame.points[on]
+    if on.sum() < MIN_CONTROL:
+        both = frame.oriented & estimate.oriented
+        source, target = estimate.position[both], frame.position[both]
+    keep = len(network.scale_bars) > 0 or len(network.control) == MIN_CONTROL - 1
+    scale = object_scale(network, estimate) if len(network.control) and not len(network.scale_bars) else 1.0
+    try:
+        return fit_similarity(source, target, scale=scale if keep else None).apply_estimate(estimate)
+    except GeometryError:  # too few of them, or on a line: the adjustment has kept what they say
+        return estimate
 
 
 @dataclass(frozen=True)
