@@ -161,18 +161,13 @@ class SurveyResult:
     def stored(self) -> StoredResult:
         """The result as files hold it: accepted image points, solution and standard deviations."""
         a = self.adjustment
-        sigmas = []
-        for camera, covariance in zip(a.estimate.cameras, a.covariance.interior, strict=True):
-            sigma = np.full(len(camera.names), np.nan)
-            sigma[camera.free] = np.sqrt(np.diagonal(covariance))
-            sigmas.append(sigma)
         return StoredResult(
             self.survey,
             replace(a.network, image_points=a.network.image_points.select(~a.rejected)),
             a.estimate,
             a.covariance.points,
             a.covariance.exterior[:, :3, :3],
-            tuple(sigmas),
+            tuple(a.interior_sigma(k) for k in range(len(a.estimate.cameras))),
             a.redundancy,
             self.length_unit,
             datum=a.datum,

@@ -61,6 +61,7 @@ class Adjustment:
     image_sigma_factor: FloatArray = field(default_factory=lambda: np.ones(0))  # by which the stated standard
     # deviations of each image point were multiplied for its weight, (k,)
     datum_points: BoolArray | None = None  # object points that carry the datum; all if None, (n,)
+    unknown_counts: tuple[int, int, int] = (0, 0, 0)  # of exterior orientation, interior orientation, points
     remarks: tuple[str, ...] = ()  # what of the robust test could not be carried through, one line each
 
     @property
@@ -118,6 +119,15 @@ class Adjustment:
         """Longest residual vector among the accepted image points, px."""
         used = self.residuals[~self.rejected]
         return float((used**2).sum(axis=1).max() ** 0.5)
+
+    def interior_sigma(self, camera: int) -> FloatArray:
+        """Return the standard deviation of each parameter of a camera, NaN for those not adjusted, (p,)."""
+        free = np.flatnonzero(self.estimate.cameras[camera].free)
+        sigma = np.full(len(self.estimate.cameras[camera].free), np.nan)
+        variance = np.diagonal(self.covariance.interior[camera])
+        if len(variance):  # a camera without photographs in the network has none
+            sigma[free] = np.sqrt(np.where(variance >= 0, variance, np.nan))
+        return sigma
 
     def _rows(self) -> list[tuple[str, str]]:
         state = "converged" if self.converged else "did NOT converge"

@@ -177,6 +177,7 @@ def _result(
         sigma0=sigma0,
         redundancy=redundancy,
         unknowns=layout.count,
+        unknown_counts=layout.counts,
         observations=observations,
         covariance=result,
         standardised=standardised,

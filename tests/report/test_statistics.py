@@ -32,7 +32,7 @@ from sfm.report.findings.checks import (
 )
 from sfm.report.findings.findings import findings_of
 from sfm.report.findings.given_residuals import bar_residuals, control_residuals, interior_residuals
-from sfm.report.findings.interior_parameters import families, interior_parameters, parameter_sigmas
+from sfm.report.findings.interior_parameters import families, interior_parameters
 from sfm.report.findings.precision import point_precision, precision_of
 from sfm.report.html.report_page import report_page
 from sfm.report.numbers import signed, significant
@@ -806,5 +806,5 @@ def test_a_camera_without_photographs_in_the_network_has_no_sigmas() -> None:
     network, truth = make_network(seed_of("idle"), images=6, points=20, cameras=2)
     network = replace(network, camera=np.zeros(6, dtype=np.int64))
     a = adjust(network, replace(truth, cameras=(truth.cameras[0], truth.cameras[1])), datum=Datum("free"))
-    assert np.isnan(parameter_sigmas(a, 1)).all()
+    assert np.isnan(a.interior_sigma(1)).all()
     assert "camera 2" in report_page(findings_of(result_of(a)), (), ())

@@ -53,8 +53,13 @@ class Unknowns:
     @property
     def count(self) -> int:
         """Number of free unknowns."""
+        return sum(self.counts)
+
+    @property
+    def counts(self) -> tuple[int, int, int]:
+        """Numbers of free unknowns: exterior orientation, interior orientation, coordinates of points."""
         interior = self.kept_start - self.exterior_free.size
-        return int(self.exterior_free.sum()) + interior + int(self.point_free.sum())
+        return int(self.exterior_free.sum()), interior, int(self.point_free.sum())
 
     @property
     def all_free(self) -> bool:

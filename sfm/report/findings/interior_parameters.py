@@ -75,7 +75,7 @@ def interior_of(adjustment: Adjustment) -> InteriorOrientation:
             for name, camera in listed
         ),
         tuple(one for one in parameters if one.owner not in common),
-        tuple(parameter_sigmas(adjustment, a) for a in range(len(adjustment.estimate.cameras))),
+        tuple(adjustment.interior_sigma(a) for a in range(len(adjustment.estimate.cameras))),
         family_of_photographs(adjustment),
     )
 
@@ -86,7 +86,7 @@ def interior_parameters(adjustment: Adjustment) -> tuple[InteriorParameter, ...]
     used = np.bincount(network.camera, minlength=len(adjustment.estimate.cameras))
     found: dict[tuple[str, str, int], InteriorParameter] = {}
     for a, camera in enumerate(adjustment.estimate.cameras):
-        sigma = parameter_sigmas(adjustment, a)
+        sigma = adjustment.interior_sigma(a)
         for s, name in enumerate(camera.names):
             value = float(camera.parameters[s])
             if not camera.free[s] and value == 0:
@@ -111,13 +111,3 @@ def family_of_photographs(adjustment: Adjustment) -> IntArray:
     """Return the index of the family of cameras that each photograph was taken with, (m,)."""
     network = adjustment.network
     return camera_families(adjustment.estimate.cameras, network.camera)[1][network.camera]
-
-
-def parameter_sigmas(adjustment: Adjustment, camera: int) -> FloatArray:
-    """Return the standard deviation of each parameter of a camera, NaN for those not adjusted, (p,)."""
-    free = np.flatnonzero(adjustment.estimate.cameras[camera].free)
-    sigma = np.full(len(adjustment.estimate.cameras[camera].free), np.nan)
-    variance = np.diagonal(adjustment.covariance.interior[camera])
-    if len(variance):  # a camera without photographs in the network has none
-        sigma[free] = np.sqrt(np.where(variance >= 0, variance, np.nan))
-    return sigma

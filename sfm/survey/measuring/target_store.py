@@ -10,12 +10,10 @@ from __future__ import annotations
 import hashlib
 import io
 import os
-import re
 import zipfile
 from contextlib import suppress
 from dataclasses import dataclass, field, fields
 from functools import cache
-from importlib.util import find_spec
 from pathlib import Path
 
 import cv2
@@ -24,6 +22,7 @@ import numpy as np
 from sfm.errors import OutputError, PhotographError
 from sfm.files.user_cache import make_user_folder, remove_unused, user_folder
 from sfm.files.whole_files import whole_file
+from sfm.kernels.sources import sources_of
 from sfm.targets.codes.rings import CodeFamily
 from sfm.targets.codes.tags import TagFamily
 from sfm.targets.detect import Targets
@@ -119,22 +118,9 @@ def content_hash(path: Path) -> str:
 def _code_version() -> str:
     """Return a fingerprint of the code that measures: its own sources and the library that decodes."""
     digest = hashlib.sha256(f"{cv2.__version__} {np.__version__}".encode())
-    for _, source in sorted(measuring_sources().items()):
+    for _, source in sorted(sources_of(*MEASURING).items()):
         digest.update(source.encode())
     return digest.hexdigest()
-
-
-def measuring_sources() -> dict[str, str]:
-    """Return the source of every module that measuring depends on, by its name: all that they import."""
-    found: dict[str, str] = {}
-    left = list(MEASURING)
-    while left:
-        name = left.pop()
-        spec = None if name in found else find_spec(name)
-        if spec is not None and spec.origin is not None:
-            found[name] = Path(spec.origin).read_text(encoding="utf-8")
-            left += re.findall(r"^\s*from (sfm[\w.]*) import", found[name], re.MULTILINE)
-    return found
 
 
 def _targets(data: bytes) -> Targets:
