@@ -20,7 +20,7 @@ from sfm.pipeline import run_survey as run_stages
 from sfm.result import SurveyResult
 from sfm.runtime.progress import SILENT, Progress
 from sfm.stored_result import StoredResult
-from sfm.survey.inputs.survey import Survey
+from sfm.survey.inputs.survey import Survey, read_survey
 from sfm.survey.measuring.target_store import TargetStore
 from sfm.survey.other_programs import OtherPrograms
 
@@ -28,7 +28,7 @@ BACKENDS = ("colmap", "none")
 
 
 def run_survey(
-    survey: Survey,
+    survey: Survey | str | Path,
     *,
     images: str | Path | None = None,
     compare_with: str | None = None,
@@ -39,7 +39,7 @@ def run_survey(
     """Run a survey from its photographs, or from the image points that it gives in place of them.
 
     Args:
-        survey: settings and given data.
+        survey: settings and given data, or the survey file.
         images: folder of the photographs in place of the survey's own.
         compare_with: "colmap" (its adjuster on the same network) or "none"; else what the survey says.
         jobs: photographs measured at a time; as many as there are cores if not given.
@@ -55,6 +55,8 @@ def run_survey(
         >>> sfm.run_survey(survey, compare_with="none").adjustment.converged
         True
     """
+    if not isinstance(survey, Survey):
+        survey = read_survey(survey)
     if compare_with not in (*BACKENDS, None):
         raise SurveyFileError(f"compare_with '{compare_with}', expected one of {', '.join(BACKENDS)}")
     others = programs_of(
@@ -151,7 +153,9 @@ def compare(
         np.True_
     """
     first, second = (one.with_covariance if isinstance(one, SurveyResult) else one for one in (a, b))
-    return compare_results(first, second, align=align, control=tuple(control))
+    return compare_results(
+        first, second, align=align, control=(control,) if isinstance(control, str) else tuple(control)
+    )
 
 
 def network_from_colmap(model: str | Path | Any) -> tuple[Network, Estimate]:

@@ -121,7 +121,7 @@ def camera_from_values(
             point of opencv models is the centre of the photograph.
 
     Raises:
-        SurveyFileError: unknown model or parameter name.
+        SurveyFileError: unknown model or parameter name, or sizes that are not positive.
 
     Example:
         >>> camera = camera_from_values("D3", "brown", (6000, 4000), (0.004, 0.004), c_mm=20.0, free=("c",))
@@ -130,7 +130,14 @@ def camera_from_values(
     """
     if model not in MODELS:
         raise SurveyFileError(f"camera {name}: model '{model}', expected one of {', '.join(MODELS)}")
+    size, pixel = np.asarray(size_px, dtype=float), np.asarray(pixel_mm, dtype=float)
+    for what, value, count in (("size_px", size, 2), ("pixel_mm", pixel, 2), ("c_mm", np.asarray([c_mm]), 1)):
+        if value.shape != (count,) or not (np.isfinite(value) & (value > 0)).all():
+            raise SurveyFileError(
+                f"camera {name}: {what} {value.tolist()}, expected {count} positive number{'s' * (count > 1)}"
+            )
     names = MODELS[model].names
+    free = (free,) if isinstance(free, str) else free
     for given in (*free, *(key for key, _ in values)):
         if given not in names:
             raise SurveyFileError(

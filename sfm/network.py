@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from difflib import get_close_matches
 
 import numpy as np
 import numpy.typing as npt
@@ -182,10 +183,16 @@ class Network:
 
         Raises:
             UnknownNameError: a point is not in the network.
+            GeometryError: arrays of another shape.
         """
         index = np.array([self.point_index(name) for name in names], dtype=np.int64)
-        s = np.broadcast_to(np.asarray(sigma, dtype=float), (len(index), 3))
-        known = np.asarray(xyz, dtype=float).reshape(len(index), 3)
+        known, s = np.asarray(xyz, dtype=float), np.asarray(sigma, dtype=float)
+        if known.shape != (len(index), 3) or s.shape not in ((), (3,), (len(index), 1), known.shape):
+            raise GeometryError(
+                f"control: coordinates {known.shape} and sigmas {s.shape} of {len(index)} points, expected "
+                f"({len(index)}, 3) and the same or one number"
+            )
+        s = np.broadcast_to(s, known.shape)
         return replace(self, control=ObjectPoints(index, known, np.eye(3) * s[:, None, :] ** 2))
 
     def with_scale_bar(self, start: str, end: str, length: float, sigma: float) -> Network:
@@ -299,7 +306,8 @@ def index_of(names: Sequence[str], name: object, what: str) -> int:
         UnknownNameError: it is not among them.
     """
     try:
-        return names.index(name)
+        return names.index(str(name))
     except ValueError:
-        some = ", ".join(names[:MOST_NAMES]) + (" ..." if len(names) > MOST_NAMES else "")
+        close = get_close_matches(str(name), names, n=MOST_NAMES) or names
+        some = ", ".join(close[:MOST_NAMES]) + (" ..." if len(close) > MOST_NAMES else "")
         raise UnknownNameError(f"unknown {what} '{name}', expected one of {some or 'none'}") from None

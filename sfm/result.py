@@ -190,7 +190,7 @@ class SurveyResult:
         """The adjusted object points, by name."""
         return self.stored.points
 
-    def point(self, name: str) -> Point:
+    def point(self, name: str | int) -> Point:
         """Return an object point; UnknownNameError if there is none of that name."""
         return self.stored.point(name)
 

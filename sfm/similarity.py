@@ -65,7 +65,7 @@ def fit_similarity(
         scale: scale to keep, target unit per source unit; fitted too if not given.
 
     Raises:
-        GeometryError: fewer than three points, or all points on a line.
+        GeometryError: fewer than three points, all points on a line, or arrays of another shape.
 
     Example:
         >>> import sfm
@@ -76,6 +76,11 @@ def fit_similarity(
     Source: Horn (1987), J. Opt. Soc. Am. A 4(4), by the singular value decomposition of Umeyama
     (1991), IEEE PAMI 13(4), eqs. 40-42.
     """
+    source, target = np.asarray(source, dtype=float), np.asarray(target, dtype=float)
+    if source.ndim != 2 or source.shape[1] != 3 or source.shape != target.shape:
+        raise GeometryError(f"similarity: points {source.shape} and {target.shape}, expected (n, 3) twice")
+    if not (np.isfinite(source).all() and np.isfinite(target).all()):
+        raise GeometryError("similarity: NaN or infinity among the coordinates, expected finite numbers")
     n = len(source)
     if n < 3:
         raise GeometryError(f"similarity: {n} common points, at least 3 are needed")

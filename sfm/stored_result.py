@@ -54,13 +54,13 @@ class StoredResult:
             self.network.points, self.estimate.points, covariance, self.network.rays(), self.unit
         )
 
-    def point(self, name: str) -> Point:
-        """Return an object point.
+    def point(self, name: str | int) -> Point:
+        """Return an object point by its name, which of a coded target is its number.
 
         Raises:
             UnknownNameError: there is none of that name.
         """
-        found: Point = self.points[name]
+        found: Point = self.points[str(name)]
         return found
 
     def _rows(self) -> list[tuple[str, str]]:

@@ -18,6 +18,7 @@ LAYERS = (
             "sfm.distortion",
             "sfm.network",
             "sfm.reduced_network",
+            "sfm.network_check",
             "sfm.similarity",
         ),
         *("sfm.runtime", "sfm.files", "sfm.kernels", "sfm.photographs"),

@@ -117,7 +117,7 @@ def marginal_of(adjustment: Adjustment, *, datum: Datum | None = None, cross: bo
     return Marginal(adjustment, layout, weighted, optimum, cofactors(optimum, layout, cross=cross))
 
 
-def change_datum(adjustment: Adjustment, datum: Datum) -> Adjustment:
+def change_datum(adjustment: Adjustment, datum: Datum | str) -> Adjustment:
     """Return the adjustment carried into another datum by an S-transformation, without adjusting again.
 
     The result is that of `adjust` in this datum with the adjusted coordinates as approximate values: they
@@ -125,7 +125,7 @@ def change_datum(adjustment: Adjustment, datum: Datum) -> Adjustment:
 
     Args:
         adjustment: what `adjust` returned.
-        datum: free or minimal, on all points or on some, by name, index or mask.
+        datum: free or minimal, on all points or on some, by name, index or mask; or only its kind.
 
     Raises:
         GeometryError: a change between control and a datum without, unknown points, or points that cannot
@@ -138,6 +138,9 @@ def change_datum(adjustment: Adjustment, datum: Datum) -> Adjustment:
 
     Source: Baarda (1973), S-transformations and criterion matrices.
     """
+    datum = Datum(datum) if isinstance(datum, str) else datum
+    if not isinstance(adjustment, Adjustment):
+        raise GeometryError(f"change_datum: {type(adjustment).__name__}, expected an Adjustment")
     with own_threads():
         m = marginal_of(adjustment, datum=datum, cross=False)
         covariance = marginal_covariance(m.optimum, m.layout, m.cofactors, adjustment.sigma0**2)

@@ -58,7 +58,8 @@ class Datum:
         """
         if self.points is None:
             return ResolvedDatum(self.kind, None)
-        n, given = len(network.points), np.asarray(self.points)
+        n = len(network.points)
+        given = np.asarray([self.points] if isinstance(self.points, str) else self.points)
         if given.dtype == np.bool_:
             if given.shape != (n,):
                 raise GeometryError(

@@ -43,6 +43,7 @@ from sfm.conventions import FloatArray
 from sfm.errors import GeometryError
 from sfm.kernels.threads import own_threads
 from sfm.network import Estimate, Network
+from sfm.network_check import check_network, check_number
 
 FREE = Datum("free")
 SLOPES = {"huber": huber_slopes, "tukey": tukey_slopes}  # of the M-estimators
@@ -52,7 +53,7 @@ def adjust(
     network: Network,
     estimate: Estimate,
     *,
-    datum: Datum = FREE,
+    datum: Datum | str = FREE,
     sigma_px: float = 0.1,
     image_sigma_factor: float | FloatArray = 1.0,
     reject: str = "tau",
@@ -71,8 +72,9 @@ def adjust(
     Args:
         network: what was measured.
         estimate: start values; NaN where a photograph or point has none (it is held out and named).
-        datum: how position, attitude and scale are decided.
-        sigma_px: standard deviation of unit weight, in which sigma0_px is told, px.
+        datum: how position, attitude and scale are decided; or only its kind.
+        sigma_px: standard deviation of unit weight, px; weights are stated by the network, so that it changes
+            sigma0 and not sigma0_px.
         image_sigma_factor: on the stated standard deviations of the image points, of all or of each, (k,);
             the network of the result keeps those stated.
         reject: "tau" (data snooping by Pope's test), "huber" or "tukey" (reweighting; Tukey's biweight,
@@ -94,13 +96,21 @@ def adjust(
         >>> sfm.adjust(result.network, result.estimate, reject="huber").converged
         True
     """
+    datum = Datum(datum) if isinstance(datum, str) else datum
+    check_network(network, estimate)
+    check_number("sigma_px", sigma_px, 0.0)
+    check_number("alpha", alpha, 0.0, 1.0)
     if reject not in REJECTS:
         raise GeometryError(f"adjustment: reject '{reject}', expected one of {', '.join(REJECTS)}")
     if method not in METHODS:
         raise GeometryError(f"adjustment: method '{method}', expected one of {', '.join(METHODS)}")
     use_control = datum.kind == "control"
     local = local_of(network, estimate, datum.resolve(network))
-    factor = np.broadcast_to(np.asarray(image_sigma_factor, dtype=float), (len(network.image_points),))
+    k = len(network.image_points)
+    given = np.asarray(image_sigma_factor, dtype=float)
+    if given.shape not in ((), (k,)) or not (np.isfinite(given) & (given > 0)).all():
+        raise GeometryError(f"image_sigma_factor of shape {given.shape}, expected positive numbers, 1 or {k}")
+    factor = np.broadcast_to(given, (k,))
     layout, state = unknowns_of(
         local.network, local.estimate, use_control=use_control, image_sigma_factor=factor
     )

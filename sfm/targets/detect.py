@@ -99,7 +99,7 @@ def find_targets(
     Raises:
         PhotographError: not a grey photograph of 8 or 16 bit.
         SurveyFileError: neither a known code family nor a readable table.
-        KolinearError: unknown polarity or way to measure centres.
+        KolinearError: unknown polarity or way to measure centres, or diameters that cannot be.
 
     Example:
         >>> y, x = np.mgrid[:60, :80]
@@ -112,13 +112,23 @@ def find_targets(
         >>> bool(np.sqrt(targets.covariance[0, 0, 0]) < 0.02)  # px
         True
     """
-    if photograph.ndim != 2 or photograph.dtype not in (np.uint8, np.uint16):
+    if not isinstance(photograph, np.ndarray):
+        raise PhotographError(
+            f"photograph is {type(photograph).__name__}, expected an array, which read_photograph(file) gives"
+        )
+    if photograph.ndim != 2 or not photograph.size or photograph.dtype not in (np.uint8, np.uint16):
         raise PhotographError(
             f"photograph is {photograph.dtype} of shape {photograph.shape}, expected uint8 or uint16 (H, W)"
         )
     for name, given, known in (("polarity", polarity, tuple(SIGNS)), ("centres", centres, CENTRES)):
         if given not in known:
             raise KolinearError(f"{name} {given!r}, expected one of {', '.join(known)}")
+    if not 0 < min_diameter_px < max_diameter_px:
+        raise KolinearError(
+            f"diameters from {min_diameter_px} to {max_diameter_px} px, expected positive ones in order"
+        )
+    if not isinstance(codes, str | CodeFamily | TagFamily):
+        raise KolinearError(f"codes {codes!r}, expected the name of a family, as 'ring14' or 'none'")
     family = code_family(codes)
     noise, scale = estimate_noise(photograph), scale_of(photograph)
     limits = {"min_diameter_px": min_diameter_px, "max_diameter_px": max_diameter_px}

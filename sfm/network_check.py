@@ -1,0 +1,121 @@
+"""What an adjustment is given from Python, checked as files are: shapes, indices, numbers, covariances.
+
+The first thing that is wrong is named, with what was expected.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sfm.conventions import BoolArray, FloatArray, IntArray
+from sfm.errors import GeometryError
+from sfm.network import Estimate, Network
+
+
+def check_network(network: Network, estimate: Estimate) -> None:
+    """Refuse a network and an estimate that do not belong together or hold what no adjustment can use.
+
+    Args:
+        network: what was measured.
+        estimate: start values; NaN where there is none.
+
+    Raises:
+        GeometryError: what was found, where, and what was expected.
+    """
+    if not isinstance(network, Network) or not isinstance(estimate, Estimate):
+        found = f"{type(network).__name__} and {type(estimate).__name__}"
+        raise GeometryError(f"adjustment: {found}, expected a Network and an Estimate")
+    m, n = len(network.images), len(network.points)
+    seen = network.image_points
+    k = len(seen)
+    for what, array, shape in (
+        ("projection centres", estimate.position, (m, 3)),
+        ("rotations", estimate.rotation, (m, 3, 3)),
+        ("object points", estimate.points, (n, 3)),
+        ("cameras of the photographs", network.camera, (m,)),
+        ("image points", seen.xy, (k, 2)),
+        ("covariances of the image points", seen.covariance, (k, 2, 2)),
+        ("photographs of the image points", seen.image, (k,)),
+        ("object points of the image points", seen.point, (k,)),
+    ):
+        if np.shape(array) != shape:
+            raise GeometryError(f"network: {what} of shape {np.shape(array)}, expected {shape}")
+    for what, index, count in (
+        ("camera", network.camera, len(estimate.cameras)),
+        ("photograph", seen.image, m),
+        ("object point", seen.point, n),
+        ("object point", network.control.point, n),
+        ("object point", network.scale_bars.start, n),
+        ("object point", network.scale_bars.end, n),
+        ("photograph", network.exterior.image, m),
+    ):
+        wrong = _first((index < 0) | (index >= count))
+        if wrong is not None:
+            raise GeometryError(f"network: index {index[wrong]} of a {what}, expected 0 to {count - 1}")
+
+    def of_row(row: int) -> str:
+        return f"image {network.images[seen.image[row]]}, point {network.points[seen.point[row]]}"
+
+    wrong = _first(np.asarray(~np.isfinite(seen.xy).all(axis=1)))
+    if wrong is not None:
+        raise GeometryError(
+            f"{of_row(wrong)}: image coordinates {_said(seen.xy[wrong])} px, expected numbers"
+        )
+    wrong = _first(~_positive_definite(seen.covariance))
+    if wrong is not None:
+        raise GeometryError(
+            f"{of_row(wrong)}: covariance {_said(seen.covariance[wrong])} px^2, expected a symmetric "
+            "positive definite matrix"
+        )
+    control, bars = network.control, network.scale_bars
+    points = np.asarray(network.points, dtype=object)
+    wrong = _first(~np.isfinite(control.xyz).all(axis=1) | ~_not_negative(control.covariance))
+    if wrong is not None:
+        raise GeometryError(
+            f"control point {points[control.point[wrong]]}: expected finite coordinates and a symmetric "
+            "covariance without negative variances"
+        )
+    twice = np.flatnonzero(np.bincount(control.point, minlength=n) > 1)
+    if len(twice):
+        raise GeometryError(f"control point {points[twice[0]]}: duplicate, expected each point once")
+    good = np.isfinite(bars.length) & (bars.length > 0) & np.isfinite(bars.sigma) & (bars.sigma > 0)
+    wrong = _first(~good | (bars.start == bars.end))
+    if wrong is not None:
+        raise GeometryError(
+            f"scale bar {points[bars.start[wrong]]} - {points[bars.end[wrong]]}: length "
+            f"{bars.length[wrong]:g}, sigma {bars.sigma[wrong]:g}, expected two points and positive numbers"
+        )
+
+
+def check_number(what: str, value: float, low: float, high: float = np.inf) -> None:
+    """Refuse a number that is not between two others, the bounds left out.
+
+    Raises:
+        GeometryError: with what was found and expected.
+    """
+    if not isinstance(value, int | float | np.number) or not low < value < high:
+        expected = f"more than {low:g}" if np.isinf(high) else f"between {low:g} and {high:g}"
+        raise GeometryError(f"{what} = {value}, expected a number {expected}")
+
+
+def _first(wrong: BoolArray) -> int | None:
+    rows: IntArray = np.flatnonzero(wrong)
+    return int(rows[0]) if len(rows) else None
+
+
+def _said(values: FloatArray) -> str:
+    return " ".join(f"{value:g}" for value in np.ravel(values))
+
+
+def _positive_definite(covariance: FloatArray) -> BoolArray:
+    """Return which covariances (k, 2, 2) are symmetric and positive definite."""
+    a, b, c = covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]
+    symmetric = np.abs(b - covariance[:, 1, 0]) <= 1e-9 * np.sqrt(np.abs(a * c))
+    return np.asarray(np.isfinite(covariance).all(axis=(1, 2)) & symmetric & (a > 0) & (a * c > b * b))
+
+
+def _not_negative(covariance: FloatArray) -> BoolArray:
+    """Return which covariances (c, 3, 3) are symmetric and have no negative variance."""
+    finite = np.isfinite(covariance).all(axis=(1, 2))
+    symmetric = np.isclose(covariance, np.swapaxes(covariance, 1, 2), rtol=1e-9, atol=0).all(axis=(1, 2))
+    return np.asarray(finite & symmetric & (np.diagonal(covariance, axis1=1, axis2=2) >= 0).all(axis=1))
