@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from sfm.adjustment.covariance import marginal_of
 from sfm.adjustment.quality.correlations import OrientationCorrelation
 from sfm.adjustment.result import Adjustment
 from sfm.camera import Camera
@@ -15,12 +16,12 @@ from sfm.comparison.adjusters import AdjusterComparison
 from sfm.comparison.baseline import BaselineComparison
 from sfm.conventions import FloatArray, IntArray, angles_from_rotation
 from sfm.display import html_table, text_table
+from sfm.errors import GeometryError
+from sfm.files.covariance_file import MAX_POINTS
 from sfm.network import Estimate, Network, index_of
 from sfm.point_table import Point, PointTable
-from sfm.stored_result import StoredResult
+from sfm.stored_result import NO_SCALE, StoredResult
 from sfm.targets.flags import count_flags
-
-NO_SCALE = "network units"
 
 
 @dataclass(frozen=True)
@@ -194,7 +195,20 @@ class SurveyResult:
             tuple(sigmas),
             a.redundancy,
             self.length_unit,
+            datum=a.datum,
         )
+
+    @cached_property
+    def with_covariance(self) -> StoredResult:
+        """The same with the covariance of all points together, for no more than `MAX_POINTS` of them."""
+        n = len(self.adjustment.network.points)
+        if n > MAX_POINTS:
+            return self.stored
+        try:
+            joint = marginal_of(self.adjustment).joint(np.zeros(0, dtype=np.int64), np.arange(n))
+        except GeometryError:  # normal equations that cannot be solved have no covariance at all
+            return self.stored
+        return replace(self.stored, covariance=joint) if np.isfinite(joint).all() else self.stored
 
     @property
     def points(self) -> PointTable:
