@@ -4,7 +4,8 @@
     images.csv          image,X,Y,Z,omega_deg,phi_deg,kappa_deg[,sX,sY,sZ],camera
     cameras.csv         camera,parameter,value[,sigma],unit
     image_points.csv    image,point,x_px,y_px[,sx_px,sy_px][,rejected]
-    summary.json        name of the survey, model, size and pixel of each camera, redundancy
+    point_covariance.npy    of all points together, see `sfm.files.covariance_file`
+    summary.json        name of the survey, model, size and pixel of each camera, redundancy, datum
 
 These are the tables that `kolinear run` writes; other columns are passed over. What a summary does not say of
 size and pixel is taken from the COLMAP model in the folder `colmap`.
@@ -29,6 +30,7 @@ from sfm.camera import Camera
 from sfm.conventions import FloatArray, angles_from_rotation, rotation_from_angles
 from sfm.distortion.models import MODELS
 from sfm.errors import OutputError, SurveyFileError
+from sfm.files.covariance_file import read_covariance, write_covariance
 from sfm.files.csv_tables import CsvTable, read_header, read_table
 from sfm.files.plain_text import csv_text
 from sfm.network import Estimate, ImagePoints, Network
@@ -71,6 +73,8 @@ def read_result(folder: Path) -> StoredResult:
         sigmas,
         summary.redundancy,
         summary.length_unit or "",
+        read_covariance(folder, table.values[:, 3:]) if table.values.shape[1] > 3 else None,
+        summary.datum.kind if summary.datum else "",
     )
 
 
@@ -108,6 +112,7 @@ def write_tables(folder: Path, result: StoredResult) -> None:
         "survey": result.name,
         "redundancy": result.redundancy,
         "length_unit": result.unit,
+        "datum": {"kind": result.datum},
         "cameras": [
             {
                 "name": camera.name,
@@ -148,6 +153,8 @@ def write_tables(folder: Path, result: StoredResult) -> None:
                 for i, j, xy, s in zip(seen.image, seen.point, seen.xy, sigma, strict=True)
             ),
         )
+        if result.covariance is not None:
+            write_covariance(folder, result.covariance)
         text = json.dumps(summary, indent=2, ensure_ascii=False)
         (folder / "summary.json").write_text(text + "\n", encoding="utf-8")
     except OSError as error:
@@ -163,11 +170,18 @@ class _CameraEntry(Content):
     pixel_mm: tuple[Pixel, Pixel] | None = None
 
 
+class _DatumEntry(Content):
+    """The datum as the summary names it."""
+
+    kind: Literal["free", "minimal", "control", ""]
+
+
 class _Summary(Content):
     """What is read of summary.json."""
 
     survey: Text | None = None
     length_unit: Text | None = None
+    datum: _DatumEntry | None = None
     redundancy: Annotated[int, Field(ge=0, strict=True)] | None = None
     cameras: Annotated[tuple[_CameraEntry, ...], Field(min_length=1)]
 

@@ -71,7 +71,13 @@ def compare(
         from adapters.formats.registry import read_comparable
         from sfm.comparison.significance import compare_results
         from sfm.files.manifest import refuse_foreign_folder
-        from sfm.report.differences import largest_difference, words_of_test, write_differences
+        from sfm.report.differences import (
+            largest_difference,
+            words_of_pairing,
+            words_of_scale,
+            words_of_test,
+            write_differences,
+        )
 
     refuse_foreign_folder(out)
     with working_on(str(a)):
@@ -83,8 +89,8 @@ def compare(
     place = {name: j for j, name in enumerate(first.network.points)}
     xyz = first.estimate.points[[place[name] for name in found.points]]
     page = write_differences(found, xyz, out)
+    print(f"{words_of_pairing(found)}, {len(found.images)} common photographs; {words_of_scale(found)}")
     print(words_of_test(found)[0])
-    print(f"{len(found.points)} common points, {len(found.images)} common photographs")
     if found.points:
         print(f"largest difference of a point: {largest_difference(found)}")
     print(f"Report: {page}")

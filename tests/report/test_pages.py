@@ -149,7 +149,7 @@ def test_comparison_is_written_with_every_point(
     summary = json.loads((tmp_path / "out" / "comparison.json").read_text())
     assert summary["significant"] == ["5"] and summary["changed"] is True
     page = path.read_text(encoding="utf-8")
-    assert "The points differ significantly, 1 of them singly." in page
+    assert "The points differ significantly: 1 of 20 moved." in page
     assert largest_difference(moved[0]) == "5.20 mm"
     assert "after &lt;b&gt;" in page and "after <b>" not in page
 
@@ -183,7 +183,7 @@ def test_nothing_in_common_is_no_agreement(tmp_path: Path) -> None:
         images=tuple(f"other {name}" for name in network.images),
     )
     for align in ("points", "cameras", "none"):
-        with pytest.raises(GeometryError, match="a and b have neither points nor photographs of the same"):
+        with pytest.raises(GeometryError, match="a and b have no points and no photographs in common"):
             compare_results(StoredResult("a", network, truth), StoredResult("b", other, truth), align=align)
     photographs_only = compare_results(
         StoredResult("a", network, truth),

@@ -1,4 +1,4 @@
-"""The tables of a result: points, images, cameras, image points, given values, reliability, groups.
+"""The tables of a result: points, images, cameras, image points, what was left out, given values, tests.
 
 Degrees in files, the object unit of the survey, sigmas are standard deviations a posteriori (those of image
 points: as measured). Numbers are written with enough digits to give the same number back.
@@ -35,6 +35,7 @@ def write_tables(findings: Findings, folder: Path) -> None:
             "image,point,x_px,y_px,sx_px,sy_px,vx_px,vy_px,rejected",
             image_point_rows(adjustment),
         ),
+        ("left_out", "kind,name,image_points,reason", left_out_rows(findings)),
         ("given", "kind,name,coordinate,unit,given,difference,sigma,r,w", given_rows(findings.given)),
         (
             "reliability",
@@ -82,6 +83,14 @@ def image_point_rows(adjustment: Adjustment) -> Iterable[Sequence[object]]:
             *adjustment.residuals[k],
             int(adjustment.rejected[k]),
         )
+
+
+def left_out_rows(findings: Findings) -> Iterable[Sequence[object]]:
+    """Return kind, name, image points and reason of every photograph and point that is not in the result."""
+    for failed in findings.result.failed:
+        yield ("photograph", failed.image, None, failed.reason)
+    for one in findings.result.left_out:
+        yield ("point", one.point, one.image_points, one.reason)
 
 
 def given_rows(given: Given) -> Iterable[Sequence[object]]:

@@ -81,6 +81,21 @@ class StartOrientations:
 
 
 @dataclass(frozen=True)
+class StartCameras:
+    """Approximate values of interior orientation, as cameras.csv of a result holds them."""
+
+    camera: tuple[str, ...]  # camera of each row, or photograph or group of one with its own values, (k,)
+    parameter: tuple[str, ...]  # (k,)
+    value: FloatArray  # in the parameter's unit, (k,)
+    table: CsvTable  # where they stand, for messages
+
+    def of(self, camera: str) -> dict[str, float]:
+        """Return the values of one camera, by parameter."""
+        rows = zip(self.camera, self.parameter, self.value.tolist(), strict=True)
+        return {parameter: value for name, parameter, value in rows if name == camera}
+
+
+@dataclass(frozen=True)
 class Observations:
     """Measured image points in place of photographs.
 
@@ -231,6 +246,18 @@ def _start_orientations(table: CsvTable) -> StartOrientations:
     return StartOrientations(
         table.keys("image"), table.values[:, :3], np.reshape(rotation, (-1, 3, 3)), table
     )
+
+
+def read_start_cameras(path: Path) -> StartCameras:
+    """Read interior orientation: camera,parameter,value; cameras.csv of a result is welcome.
+
+    Raises:
+        SurveyFileError: unreadable, wrong columns, not a finite number, or one parameter of a camera twice.
+    """
+    table = read_table(path, ("camera", "parameter"), ("value",), ignored=("sigma", "unit"))
+    camera, parameter = table.texts
+    table.refuse_duplicates(tuple(zip(camera, parameter, strict=True)), ("camera", "parameter"))
+    return StartCameras(camera, parameter, table.values[:, 0], table)
 
 
 def read_image_points(path: Path) -> Observations:
