@@ -42,6 +42,24 @@ class LeftOutPoint:
 
 
 @dataclass(frozen=True)
+class TakenOut:
+    """Control or a scale bar that the survey gives and that was not used, since it does not fit."""
+
+    what: str  # such as "scale bar 506 - 507"
+    relative: float  # by how much it is off, over its length or the size of the object
+    resolved: bool  # whether the others tell that it is the one that is wrong
+
+
+@dataclass(frozen=True)
+class FreeNetwork:
+    """Adjustment of the accepted image points without control, bars and observed exterior orientation."""
+
+    points: FloatArray  # in a frame of their own, (n, 3)
+    vPv: float  # with the weights of the adjustment that it is held against
+    redundancy: int
+
+
+@dataclass(frozen=True)
 class StageTime:
     """How long a stage took."""
 
@@ -136,6 +154,8 @@ class SurveyResult:
     eccentricity: Eccentricity | None = None  # None where it was not corrected
     no_circles: tuple[str, ...] = ()  # uncoded points left out: their outlines are not images of one circle
     left_out: tuple[LeftOutPoint, ...] = ()  # measured points that are not in the result
+    free_network: FreeNetwork | None = None  # None where nothing else took part, or where it has no result
+    taken_out: tuple[TakenOut, ...] = ()  # control and scale bars that do not fit and were not used
     unused_image_points: int = 0  # of points or photographs that are not in the result, in no other count
     orientation_correlations: tuple[OrientationCorrelation, ...] = ()  # of camera parameters with exterior
     # orientation, the strong ones

@@ -42,6 +42,8 @@ def assemble_result(
         eccentricity=matched.eccentricity,
         no_circles=matched.no_circles,
         left_out=solution.left_out,
+        free_network=solution.free_network,
+        taken_out=solution.taken_out,
         unused_image_points=solution.unused_image_points,
         reject=survey.reject,
         orientation_correlations=orientation_correlations(adjustment),

@@ -14,10 +14,10 @@ from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.errors import GeometryError
-from sfm.network import Estimate, Network
+from sfm.network import Estimate, ExteriorObservations, Network, ObjectPoints, ScaleBars
 from sfm.orientation.ray_angles import ray_angles
 from sfm.reduced_network import reduce_network, supported
-from sfm.result import ControlCheck, Eccentricity, LeftOutPoint
+from sfm.result import ControlCheck, Eccentricity, FreeNetwork, LeftOutPoint, TakenOut
 from sfm.survey.datum_definition import (
     Contradiction,
     datum_warnings,
@@ -33,6 +33,7 @@ from sfm.survey.inputs.start import given_values
 from sfm.survey.inputs.survey import Survey
 from sfm.survey.left_out import datum_carriers, left_out_points, unused_image_points, words_of_left_out
 from sfm.survey.measuring.measurements import Naming
+from sfm.survey.scale_check import check_scales
 
 TOLERANCE_FACTOR = 6.0  # of the robust spread of the residuals
 FALSE_ALARM = 0.05  # chance that a survey without any outlier loses an image coordinate; Pope (1976)
@@ -68,6 +69,8 @@ class Solution:
     warnings: tuple[str, ...]  # one line each
     left_out: tuple[LeftOutPoint, ...]  # measured points that are not in it
     unused_image_points: int  # of points and photographs that are not in it
+    taken_out: tuple[TakenOut, ...]  # control and scale bars that do not fit
+    free_network: FreeNetwork | None  # of the image points alone; None where nothing else took part
 
 
 def refine(network: Network, estimate: Estimate) -> Estimate:
@@ -95,10 +98,12 @@ def solve_survey(survey: Survey, matched: Correspondences) -> Solution:
     if datum.kind == "control" and len(network.control) == len(network.exterior) == 0:
         raise GeometryError("datum 'control', but no control point was measured")
     refuse_other_units(survey, network, estimate)
+    scales = check_scales(network, estimate, held=datum.kind == "control")
+    network = scales.network
     needed = matched.min_rays.copy()
     if datum.kind == "control":
         needed[network.control.point] = 1
-    whole, known = network, estimate.determined
+    whole, known = placed.network, estimate.determined
     oriented = estimate.oriented
     if datum.kind == "minimal" and matched.given:  # what it holds are the given coordinates
         given = given_values(survey, network)
@@ -111,7 +116,7 @@ def solve_survey(survey: Survey, matched: Correspondences) -> Solution:
     task = _Task(survey, datum, network, needed, least, survey.reject)
     every = np.ones(len(network.image_points), dtype=bool)
     iterations = 0
-    contradictions: list[str] = []
+    contradictions, taken_out = list(scales.lines), list(scales.taken_out)
     while True:
         settled = _settle(task, estimate)
         iterations += settled.iterations
@@ -129,6 +134,7 @@ def solve_survey(survey: Survey, matched: Correspondences) -> Solution:
         if found is None:
             break
         contradictions.append(found.line)
+        taken_out += [] if found.taken_out is None else [found.taken_out]
         task = _resolved(task, found, settled.accepted)
     dropped = tuple(
         (name, f"fewer than {fewest} accepted image points of the network")
@@ -148,7 +154,33 @@ def solve_survey(survey: Survey, matched: Correspondences) -> Solution:
     warnings = (*placed.warnings, *contradictions, *_warnings(survey, told, len(whole.points), final))
     in_result = np.isin(whole.points, final.network.points)
     unused = unused_image_points(whole, settled.images, in_result)
-    return Solution(final, check, dropped, warnings, left_out, unused)
+    if len(whole.scale_bars) and not len(final.network.scale_bars) and datum.kind == "control":
+        # every bar is against the control: nothing says which of the two is right
+        taken_out = [replace(one, resolved=False) for one in taken_out]
+    alone = _free_network(task, final)
+    return Solution(final, check, dropped, warnings, left_out, unused, tuple(taken_out), alone)
+
+
+def _free_network(task: _Task, final: Adjustment) -> FreeNetwork | None:
+    """Adjust the accepted image points of an adjustment alone, with the same weights."""
+    network, accepted = final.network, ~final.rejected
+    held = (len(network.control) + len(network.exterior)) if task.datum.kind == "control" else 0
+    if not final.converged or not (held or len(network.scale_bars)):
+        return None
+    alone = replace(
+        network,
+        image_points=network.image_points.select(accepted),
+        control=ObjectPoints(),
+        scale_bars=ScaleBars(),
+        exterior=ExteriorObservations(),
+    )
+    factor = final.image_sigma_factor[accepted]
+    try:
+        free = adjust(alone, final.estimate, image_sigma_factor=factor, reject="none", covariance=False)
+    except GeometryError:
+        return None
+    sound = free.converged and not free.undetermined
+    return FreeNetwork(free.estimate.points, free.vPv, free.redundancy) if sound else None
 
 
 def _among(left_out: tuple[LeftOutPoint, ...], whole: Network, known: BoolArray) -> tuple[LeftOutPoint, ...]:
