@@ -17,10 +17,10 @@ from sfm.result import SurveyResult
 from sfm.runtime.progress import SILENT, Progress, StageClock
 from sfm.survey.assembly import assemble_result
 from sfm.survey.correspondences import find_correspondences
+from sfm.survey.inputs.measurements import Measurements
 from sfm.survey.inputs.photograph_list import find_photographs
 from sfm.survey.inputs.start import measurements_from_observations, refuse_unknown_photographs
 from sfm.survey.inputs.survey import Survey
-from sfm.survey.measuring.measurements import Measurements
 from sfm.survey.measuring.target_store import TargetStore
 from sfm.survey.measuring.tie_points import tie_photographs
 from sfm.survey.orientation import orient_survey

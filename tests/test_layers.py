@@ -139,3 +139,19 @@ def test_the_rules_would_notice() -> None:
     assert layer_of("sfm.survey.inputs.start") == 4
     assert layer_of("sfm.surveying") is None
     assert "sfm.errors" in imported(MODULES["sfm.cli"])
+
+
+def test_no_two_rooms_import_one_another() -> None:
+    """Of rooms neither of which lies in the other."""
+    arrows: dict[tuple[str, str], str] = {}
+    for name, path in MODULES.items():
+        own = room_of(name)
+        for other in imported(path) & MODULES.keys():
+            arrows[own, room_of(other)] = f"{name} imports {other}"
+    for (a, b), words in arrows.items():
+        if a != b and (b, a) in arrows and not belongs(a, b) and not belongs(b, a):
+            raise AssertionError(f"{words}, and {arrows[b, a]}")
+
+
+def room_of(name: str) -> str:
+    return name if MODULES[name].name == "__init__.py" else name.rpartition(".")[0]

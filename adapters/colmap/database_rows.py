@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from adapters.colmap.model_files import MAX_ID, MODELS
-from adapters.formats.json_files import MAX_SIDE_PX
+from adapters.reading.json_files import MAX_SIDE_PX
 from sfm.conventions import AnyArray, FloatArray, IntArray
 from sfm.errors import SurveyFileError
 from sfm.files.csv_tables import MAX_NUMBER, MAX_ROWS, MAX_TABLE_BYTES

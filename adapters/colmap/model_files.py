@@ -16,8 +16,8 @@ from typing import Any
 
 import numpy as np
 
-from adapters.formats.json_files import MAX_SIDE_PX
-from adapters.formats.text_lines import Lines
+from adapters.reading.json_files import MAX_SIDE_PX
+from adapters.reading.text_lines import Lines
 from sfm.errors import SurveyFileError
 from sfm.files.csv_tables import MAX_NUMBER, MAX_TABLE_BYTES
 

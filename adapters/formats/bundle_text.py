@@ -30,7 +30,7 @@ from pathlib import Path
 
 import numpy as np
 
-from adapters.formats.text_lines import MAX_IMAGE_POINTS, MAX_PHOTOGRAPHS, Lines, write_lines
+from adapters.reading.text_lines import MAX_IMAGE_POINTS, MAX_PHOTOGRAPHS, Lines, write_lines
 from sfm.camera import camera_from_values
 from sfm.conventions import (
     FloatArray,

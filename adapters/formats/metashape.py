@@ -29,10 +29,10 @@ from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
-from adapters.formats.json_files import MAX_PIXEL_MM
 from adapters.formats.metashape_markers import HALF_PIXEL, Markers
-from adapters.formats.text_lines import write_lines
-from adapters.formats.xml_lines import Node, read_xml
+from adapters.reading.json_files import MAX_PIXEL_MM
+from adapters.reading.text_lines import write_lines
+from adapters.reading.xml_lines import Node, read_xml
 from sfm.camera import Camera, camera_from_values
 from sfm.conventions import FloatArray
 from sfm.errors import OutputError

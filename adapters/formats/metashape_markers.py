@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from adapters.formats.text_lines import MAX_IMAGE_POINTS, MAX_PHOTOGRAPHS, MAX_POINTS
-from adapters.formats.xml_lines import Node, Taken
+from adapters.reading.text_lines import MAX_IMAGE_POINTS, MAX_PHOTOGRAPHS, MAX_POINTS
+from adapters.reading.xml_lines import Node, Taken
 from sfm.conventions import FloatArray
 from sfm.errors import SurveyFileError
 from sfm.network import ImagePoints, ObjectPoints

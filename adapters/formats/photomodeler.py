@@ -31,8 +31,8 @@ from pathlib import Path
 
 import numpy as np
 
-from adapters.formats.json_files import MAX_SIDE_PX
-from adapters.formats.text_lines import MAX_BLOCK_LINES, MAX_PHOTOGRAPHS, Lines, write_lines
+from adapters.reading.json_files import MAX_SIDE_PX
+from adapters.reading.text_lines import MAX_BLOCK_LINES, MAX_PHOTOGRAPHS, Lines, write_lines
 from sfm.camera import Camera, camera_from_values
 from sfm.conventions import FloatArray, angles_from_rotation, rotation_from_angles
 from sfm.errors import OutputError, SurveyFileError

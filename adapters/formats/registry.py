@@ -32,7 +32,7 @@ from adapters.formats.photomodeler import read_photomodeler, write_photomodeler
 from adapters.formats.ply import write_ply
 from adapters.formats.result_tables import read_result, write_tables
 from adapters.formats.sba_text import read_sba_text, sba_files, write_sba_text
-from adapters.formats.text_lines import Lines
+from adapters.reading.text_lines import Lines
 from sfm.camera import Camera
 from sfm.distortion.models import MODELS
 from sfm.errors import KolinearError, OutputError, SurveyFileError

@@ -25,7 +25,7 @@ import numpy as np
 from pydantic import Field
 
 from adapters.colmap.names import SIDE_FILE, NamedCamera, read_side_file
-from adapters.formats.json_files import Content, Name, Pixel, Side, Text, read_json
+from adapters.reading.json_files import Content, Name, Pixel, Side, Text, read_json
 from sfm.camera import Camera
 from sfm.conventions import FloatArray, angles_from_rotation, rotation_from_angles
 from sfm.distortion.models import MODELS

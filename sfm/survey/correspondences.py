@@ -10,9 +10,9 @@ from sfm.conventions import MAD_TO_SIGMA
 from sfm.network import Estimate, Network
 from sfm.orientation.sequence import Orientation
 from sfm.reduced_network import reduce_network
+from sfm.survey.circles import check_circles
+from sfm.survey.inputs.measurements import MeasuredPhotographs, Measurements, Naming
 from sfm.survey.inputs.survey import Survey
-from sfm.survey.measuring.circles import check_circles
-from sfm.survey.measuring.measurements import MeasuredPhotographs, Measurements, Naming
 from sfm.survey.solution import TOLERANCE_FACTOR, Correspondences, determined, merge_estimate
 from sfm.survey.target_network import build_network, match_uncoded, min_rays
 

@@ -29,10 +29,10 @@ from sfm.survey.datum_definition import (
 )
 from sfm.survey.exterior import add_exterior
 from sfm.survey.inputs.interior import split_cameras, without_idle_cameras
+from sfm.survey.inputs.measurements import Naming
 from sfm.survey.inputs.start import given_values
 from sfm.survey.inputs.survey import Survey
 from sfm.survey.left_out import datum_carriers, left_out_points, unused_image_points, words_of_left_out
-from sfm.survey.measuring.measurements import Naming
 from sfm.survey.scale_check import check_scales
 
 TOLERANCE_FACTOR = 6.0  # of the robust spread of the residuals

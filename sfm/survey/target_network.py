@@ -11,11 +11,11 @@ from sfm.conventions import FloatArray, IntArray
 from sfm.matching.tracks.correspondence import match_targets
 from sfm.network import Estimate, ImagePoints, Network, ScaleBars
 from sfm.runtime.progress import SILENT, Progress
+from sfm.survey.inputs.measurements import MeasuredPhotographs, Measurements, Naming
 from sfm.survey.inputs.photograph_list import PhotographList
 from sfm.survey.inputs.settings import TargetSettings
 from sfm.survey.inputs.start import control_points, scale_bars
 from sfm.survey.inputs.survey import Survey
-from sfm.survey.measuring.measurements import MeasuredPhotographs, Measurements, Naming
 from sfm.survey.measuring.target_store import TargetStore
 from sfm.survey.measuring.targets import image_point_covariance, measure_photographs
 from sfm.targets.codes.tags import CORNERS, corner_name

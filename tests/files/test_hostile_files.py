@@ -60,7 +60,7 @@ def attributes(count: int) -> str:
 def test_large_xml_is_read_in_time_that_grows_with_it(
     tmp_path: Path, text: str, match: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("adapters.formats.xml_lines.MAX_KEPT_BYTES", 10_000_000)
+    monkeypatch.setattr("adapters.reading.xml_lines.MAX_KEPT_BYTES", 10_000_000)
     (tmp_path / "a.xml").write_text(text, encoding="utf-8")
     begun = time.process_time()
     with pytest.raises(SurveyFileError, match=match):
@@ -79,7 +79,7 @@ def test_image_points_of_an_export_take_memory_only_as_numbers(tmp_path: Path) -
     more = f'<frame id="1"><markers>{often * 20_000}</markers></frame></frames>'
     (tmp_path / "a.xml").write_text(text.replace("</frames>", more))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("adapters.formats.xml_lines.MAX_KEPT_BYTES", 1_000_000)
+        patch.setattr("adapters.reading.xml_lines.MAX_KEPT_BYTES", 1_000_000)
         again, _ = read_metashape(tmp_path / "a.xml")
     assert len(again.image_points) == len(network.image_points)  # those of the first frame
     (tmp_path / "a.xml").write_text(text.replace(marker, often * 20_000 + marker))

@@ -14,8 +14,8 @@ from sfm.errors import SurveyFileError
 from sfm.result import SurveyResult
 from sfm.similarity import fit_similarity
 from sfm.survey.inputs.given import read_diameters
+from sfm.survey.inputs.measurements import MeasuredPhotographs
 from sfm.survey.inputs.survey import read_survey
-from sfm.survey.measuring.measurements import MeasuredPhotographs
 from sfm.targets.detect import Targets
 
 C_PX, DISTANCE_MM, TILT = 4000.0, 600.0, np.radians(60)

@@ -13,9 +13,9 @@ from sfm.network import Estimate, ImagePoints, Network, ObjectPoints, ScaleBars
 from sfm.survey.inputs.cameras import camera_of_image, refuse_unknown_cameras, start_cameras
 from sfm.survey.inputs.given import KnownPoints, Observations, ScaleBar
 from sfm.survey.inputs.interior import refuse_ungrouped
+from sfm.survey.inputs.measurements import Measurements
 from sfm.survey.inputs.photograph_list import refuse_many
 from sfm.survey.inputs.survey import Survey
-from sfm.survey.measuring.measurements import Measurements
 
 MIN_RAYS = 2  # photographs that a point with a name needs
 

@@ -16,11 +16,11 @@ from sfm.photographs.reading import read_photograph
 from sfm.result import PhotographTargets
 from sfm.runtime.progress import SILENT, Progress
 from sfm.survey.inputs.cameras import start_cameras
+from sfm.survey.inputs.measurements import Measurements
 from sfm.survey.inputs.photograph_list import PhotographList
 from sfm.survey.inputs.settings import TiePointSettings
 from sfm.survey.inputs.start import control_points, scale_bars
 from sfm.survey.inputs.survey import Survey
-from sfm.survey.measuring.measurements import Measurements
 from sfm.survey.measuring.photographs import each_photograph
 
 MIN_RAYS = 3  # photographs that must agree on a tie point; two rays cannot contradict each other

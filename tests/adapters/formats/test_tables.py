@@ -16,11 +16,11 @@ import numpy as np
 import pytest
 
 from adapters.colmap.database import write_database
-from adapters.formats import text_lines as lines
 from adapters.formats.registry import FORMATS, read_any, write_any
 from adapters.formats.result_tables import read_result, write_tables
-from adapters.formats.text_lines import Lines
-from adapters.formats.xml_lines import read_xml
+from adapters.reading import text_lines as lines
+from adapters.reading.text_lines import Lines
+from adapters.reading.xml_lines import read_xml
 from sfm.errors import OutputError, SurveyFileError
 from sfm.network import Estimate, Network
 from sfm.stored_result import StoredResult

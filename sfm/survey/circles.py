@@ -13,8 +13,8 @@ from sfm.orientation.eccentricity import CircleViews, ellipse_shape, fit_circles
 from sfm.result import Eccentricity
 from sfm.survey.datum_definition import object_scale
 from sfm.survey.inputs.given import Diameters
+from sfm.survey.inputs.measurements import MeasuredPhotographs, Naming
 from sfm.survey.inputs.survey import Survey
-from sfm.survey.measuring.measurements import MeasuredPhotographs, Naming
 from sfm.survey.target_network import UNNAMED
 from sfm.targets.flags import Flag
 

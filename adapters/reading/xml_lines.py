@@ -14,7 +14,7 @@ from xml.parsers import expat
 
 import numpy as np
 
-from adapters.formats.json_files import MAX_SIDE_PX
+from adapters.reading.json_files import MAX_SIDE_PX
 from sfm.conventions import FloatArray
 from sfm.errors import SurveyFileError, one_line
 from sfm.files.csv_tables import MAX_NUMBER
