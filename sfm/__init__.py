@@ -9,9 +9,9 @@ Every public name is listed in `__init__.pyi` and is imported when it is first a
 
 from __future__ import annotations
 
-from sfm.runtime.installation import refuse_foreign_files
+from sfm.runtime.installation import refuse_mixed_installation
 
-refuse_foreign_files()
+refuse_mixed_installation()
 
 _MODULES = {
     "sfm.adjustment.covariance": ("change_datum",),

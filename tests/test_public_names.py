@@ -320,6 +320,14 @@ def test_files_of_another_project_are_noticed(tmp_path: Path, file: str) -> None
     command = told[3].replace("import sfm", "sys.argv = ['kolinear', '--help']; import sfm.cli")
     line = subprocess.run([*told[:3], command], capture_output=True, text=True, check=False)
     assert line.returncode == 2 and line.stderr.count("\n") == 1 and line.stderr.startswith("kolinear: ")
+    (tmp_path / "sfm" / "__init__.py").write_text("", encoding="utf-8")  # the other one was installed last
+    line = subprocess.run(
+        [*told[:3], command.replace("sfm.cli", "sfm.cli; sfm.cli.main()")],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert line.returncode == 2 and line.stderr.count("\n") == 1 and "of its own" in line.stderr
 
 
 def test_photographs_and_targets_are_arrays(tmp_path: Path) -> None:

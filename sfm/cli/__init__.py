@@ -10,6 +10,7 @@ import sys
 from sfm.cli.outlets import guard_outlets
 from sfm.cli.starting import INTERRUPTED, INTERRUPTED_TEXT, loading, stopped_once
 from sfm.errors import KolinearError
+from sfm.runtime.installation import refuse_mixed_installation
 
 BAD_INPUT = 2  # exit code where a person must put something right
 
@@ -36,11 +37,12 @@ def main() -> None:
         print(INTERRUPTED_TEXT, file=sys.stderr)
         raise SystemExit(INTERRUPTED) from None
     except Exception as error:
-        _own_up(error)
+        _report_fault(error)
 
 
 def _run() -> None:
     """Run the command that the arguments name."""
+    refuse_mixed_installation()  # asked here too: the other project's sfm/__init__.py may lie over ours
     with loading():
         from sfm.cli.app import USAGE_ERROR, app
     try:
@@ -57,7 +59,7 @@ def _run() -> None:
         raise SystemExit(code)
 
 
-def _own_up(error: Exception) -> None:
+def _report_fault(error: Exception) -> None:
     """End with one line about what nobody has foreseen; not enough memory is something to put right."""
     from sfm.runtime.faults import FAULT, is_fault, keep_traceback, told_of_error
 

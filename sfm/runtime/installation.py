@@ -15,7 +15,7 @@ COMMANDS = ("kolinear", "kolinear.exe", "-m")  # who starts these reads one line
 BAD_INPUT = 2
 
 
-def refuse_foreign_files(root: str | None = None) -> None:
+def refuse_mixed_installation(root: str | None = None) -> None:
     """Raise InstallationError where another project's files lie in Kolinear's packages; two calls of stat.
 
     Args:
