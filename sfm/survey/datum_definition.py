@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from itertools import combinations
 
 import numpy as np
 
@@ -20,6 +21,7 @@ CONTRADICTED = 0.5  # share of its rays that the test rejects, above which contr
 CLEARLY = 0.25  # of the misfit that the best choice removes: by how much more than the second it must remove
 MOST_CANDIDATES = 10  # control points and bars that are taken out in turn, those that lose most rays first
 OTHER_UNIT = 8.0  # factor between scales that no start values explain: mm, cm, m, km differ by ten or more
+WELL_APART = 10.0  # standard deviations of their distance between places that tell a scale
 MIN_CONTROL = 3  # points that a control datum needs
 
 
@@ -39,21 +41,38 @@ def object_scale(network: Network, estimate: Estimate) -> float:
 
 
 def refuse_other_units(survey: Survey, network: Network, estimate: Estimate) -> None:
-    """Raise GeometryError where the scales of control and scale bars differ by a power of ten.
+    """Raise GeometryError where scales of control, observed exterior orientation and bars differ as units do.
 
-    Both are taken from the start values, whatever frame these are in, and by medians, so that a single wrong
-    value is left to the tests.
+    All are taken from the start values, whatever frame these are in, and by medians, so that a single wrong
+    value is left to the tests. Outside of a datum of control, control and exterior orientation only check.
     """
-    bars, control = network.scale_bars, network.control
-    given = control.xyz[estimate.determined[control.point]]
-    found = estimate.points[control.point[estimate.determined[control.point]]]
-    by_bars = _scale(bars.length, estimate.points[bars.end] - estimate.points[bars.start])
-    by_control = _scale(np.linalg.norm(np.diff(given, axis=0), axis=1), np.diff(found, axis=0))
-    factor = by_control / by_bars
-    if survey.datum.kind == "control" and not (np.isnan(factor) or 1 / OTHER_UNIT < factor < OTHER_UNIT):
-        raise GeometryError(
-            f"lengths by the control are {factor:.4g} times those by the bars; are both in {survey.unit}?"
-        )
+    if survey.datum.kind != "control":
+        return
+    bars, control, exterior = network.scale_bars, network.control, network.exterior
+    known, oriented = estimate.determined[control.point], estimate.oriented[exterior.image]
+    points, centres = estimate.points[control.point], estimate.position[exterior.image]
+    scales = {
+        "control": _scale_by(control.xyz[known], control.covariance[known], points[known]),
+        "exterior orientation": _scale_by(
+            exterior.position[oriented], exterior.covariance[oriented, :3, :3], centres[oriented]
+        ),
+        "scale bars": _scale(bars.length, estimate.points[bars.end] - estimate.points[bars.start]),
+    }
+    given = [(name, scale) for name, scale in scales.items() if scale > 0]
+    for (one, first), (other, second) in combinations(given, 2):
+        if not 1 / OTHER_UNIT < first / second < OTHER_UNIT:
+            raise GeometryError(
+                f"lengths by the {one} are {first / second:.4g} times those by the {other}; are both in "
+                f"{survey.unit}?"
+            )
+
+
+def _scale_by(given: FloatArray, covariance: FloatArray, found: FloatArray) -> float:
+    """Return the scale between places, one after the other; those that are not well apart say nothing."""
+    length = np.linalg.norm(np.diff(given, axis=0), axis=1)
+    variance = np.einsum("nii->n", covariance)
+    apart = length**2 > WELL_APART**2 * (variance[1:] + variance[:-1])
+    return _scale(length[apart], np.diff(found, axis=0)[apart])
 
 
 def _scale(length: FloatArray, difference: FloatArray) -> float:
