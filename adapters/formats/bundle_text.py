@@ -323,6 +323,7 @@ def _network(
             np.array(point, dtype=np.int64),
             pixel_from_image(xy, size, pixel),
             np.eye(2) * (sigma / pixel)[:, None, :] ** 2,
+            None if sigma_mm is not None else np.zeros(len(xy), dtype=bool),
         ),
     )
     rotation = np.array([rotation_from_angles(*np.deg2rad(row[:3])) for row in table])

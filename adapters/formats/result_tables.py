@@ -38,6 +38,7 @@ from sfm.stored_result import StoredResult
 
 EXTERIOR = ("X", "Y", "Z", "omega_deg", "phi_deg", "kappa_deg")
 SIGMAS = ("sX", "sY", "sZ")
+SIGMAS_PX = ("sx_px", "sy_px")
 PRINCIPAL_DISTANCES = ("c", "fx", "fy")
 COLMAP_SIDE_FILE = f"colmap/{SIDE_FILE}"
 
@@ -99,7 +100,9 @@ def write_tables(folder: Path, result: StoredResult) -> None:
     point_sigma, sigmas_of_points = _sigma_of(result.point_covariance, len(network.points))
     position_sigma, sigmas_of_images = _sigma_of(result.position_covariance, len(network.images))
     seen = network.image_points
-    sigma = np.sqrt(np.diagonal(seen.covariance, axis1=1, axis2=2))
+    sigma = seen.stated_sigma
+    sigmas_of_image_points = SIGMAS_PX if np.isfinite(sigma).any() else ()
+    sigma = sigma[:, : len(sigmas_of_image_points)]
     camera_rows = []
     for k, camera in enumerate(estimate.cameras):
         known = np.full(len(camera.names), np.nan)
@@ -147,7 +150,7 @@ def write_tables(folder: Path, result: StoredResult) -> None:
         _write(folder / "cameras.csv", ("camera", "parameter", "value", "sigma", "unit"), camera_rows)
         _write(
             folder / "image_points.csv",
-            ("image", "point", "x_px", "y_px", "sx_px", "sy_px"),
+            ("image", "point", "x_px", "y_px", *sigmas_of_image_points),
             (
                 (network.images[i], network.points[j], *xy, *s)
                 for i, j, xy, s in zip(seen.image, seen.point, seen.xy, sigma, strict=True)
@@ -253,8 +256,10 @@ def _size(
 def _image_points(folder: Path, images: tuple[str, ...], points: tuple[str, ...]) -> ImagePoints:
     path = folder / "image_points.csv"
     flagged = ("rejected",) if "rejected" in read_header(path) else ()
-    sigmas = ("sx_px", "sy_px")
-    table = read_table(path, ("image", "point"), ("x_px", "y_px", *flagged), sigmas, ignored=None)
+    sigmas = SIGMAS_PX
+    table = read_table(
+        path, ("image", "point"), ("x_px", "y_px", *flagged), sigmas, ignored=None, blank=sigmas
+    )
     table.refuse_duplicates(tuple(zip(*table.texts, strict=True)), ("image", "point"))
     index = []
     files = ("images.csv", "points.csv")
@@ -267,9 +272,11 @@ def _image_points(folder: Path, images: tuple[str, ...], points: tuple[str, ...]
     rejected, sigma = table.values[:, 2 : 2 + len(flagged)], table.values[:, 2 + len(flagged) :]
     table.refuse(rejected, (rejected != 0) & (rejected != 1), flagged, "0 or 1")
     table.refuse(sigma, sigma <= 0, sigmas, "more than 0")
-    sigma = sigma if sigma.size else np.ones((len(table.line), 2))
+    sigma = sigma if sigma.size else np.full((len(table.line), 2), np.nan)
     image, point = index
-    found = ImagePoints(image, point, table.values[:, :2].copy(), np.eye(2) * sigma[:, None, :] ** 2)
+    stated = np.asarray(np.isfinite(sigma).all(axis=1))
+    sigma = np.where(stated[:, None], sigma, 1.0)
+    found = ImagePoints(image, point, table.values[:, :2].copy(), np.eye(2) * sigma[:, None, :] ** 2, stated)
     return found.select(rejected[:, 0] == 0) if flagged else found
 
 

@@ -174,6 +174,7 @@ def _calibration(path: Path) -> FloatArray:
 
 
 def _points(path: Path, frames: int) -> tuple[ImagePoints, FloatArray]:
+    stated: list[bool] = []
     image, point, xy, covariance, xyz = array("q"), array("q"), array("d"), array("d"), array("d")
     for number, values in _rows(path):
         if len(values) < 4 or values[3] < 0 or values[3] != int(values[3]):
@@ -197,6 +198,7 @@ def _points(path: Path, frames: int) -> tuple[ImagePoints, FloatArray]:
                     "positive definite"
                 )
             xy.extend(own[1:3])
+            stated.append(width == WITH_COVARIANCE)
             covariance.extend(own[3:7] if width == WITH_COVARIANCE else (SIGMA_PX**2, 0.0, 0.0, SIGMA_PX**2))
         xyz.extend(values[:3])
         if len(image) + len(xyz) // 3 > MAX_IMAGE_POINTS:
@@ -211,6 +213,7 @@ def _points(path: Path, frames: int) -> tuple[ImagePoints, FloatArray]:
             np.array(point, dtype=np.int64),
             np.array(xy).reshape(-1, 2),
             np.array(covariance).reshape(-1, 2, 2),
+            np.array(stated, dtype=bool),
         ),
         np.array(xyz).reshape(-1, 3),
     )

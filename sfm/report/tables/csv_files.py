@@ -9,8 +9,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
-import numpy as np
-
 from sfm.adjustment.result import Adjustment
 from sfm.files.plain_text import csv_text
 from sfm.report.findings.bundle_statistics import Statistics
@@ -70,10 +68,10 @@ def camera_rows(findings: Findings) -> Iterable[Sequence[object]]:
 
 
 def image_point_rows(adjustment: Adjustment) -> Iterable[Sequence[object]]:
-    """Return image, point, position, sigmas as measured, residuals and 0 or 1 for rejected."""
+    """Return image, point, position, sigmas as stated (else empty), residuals and 0 or 1 for rejected."""
     network = adjustment.network
     seen = network.image_points
-    sigma = np.sqrt(np.einsum("kii->ki", seen.covariance))
+    sigma = seen.stated_sigma
     for k in range(len(seen)):
         yield (
             network.images[seen.image[k]],

@@ -10,14 +10,17 @@ from sfm.camera import Camera
 from sfm.conventions import FloatArray, IntArray, pixel_from_image
 from sfm.errors import SurveyFileError
 from sfm.network import Estimate, ImagePoints, Network, ObjectPoints, ScaleBars
+from sfm.result import LeftOutPoint
 from sfm.survey.inputs.cameras import camera_of_image, refuse_unknown_cameras, start_cameras
 from sfm.survey.inputs.given import KnownPoints, Observations, ScaleBar
 from sfm.survey.inputs.interior import refuse_ungrouped
 from sfm.survey.inputs.measurements import Measurements
 from sfm.survey.inputs.photograph_list import refuse_many
+from sfm.survey.inputs.repeated_image_points import merge_repeated
 from sfm.survey.inputs.survey import Survey
 
 MIN_RAYS = 2  # photographs that a point with a name needs
+CONTRADICTING = "it stands there more than once, at places that contradict one another"
 
 
 def measurements_from_observations(survey: Survey) -> Measurements:
@@ -49,15 +52,28 @@ def measurements_from_observations(survey: Survey) -> Measurements:
     )
     _refuse_far_outside(given, xy, cameras, owner[image])
     refuse_unknown_photographs(survey, images)
+    stated = np.zeros(len(xy), dtype=bool) if given.sigma is None else np.isfinite(given.sigma).all(axis=1)
+    merged = merge_repeated(ImagePoints(image, point, xy, covariance, stated))
     network = Network(
         images,
         owner,
         points,
-        ImagePoints(image, point, xy, covariance),
+        merged.image_points,
         control=control_points(survey.control, points),
         scale_bars=scale_bars(survey.scale_bars, points),
     )
-    return Measurements(network, cameras, images, np.full(len(points), MIN_RAYS))
+    contradicting = tuple(
+        LeftOutPoint(f"{points[j]} in {images[i]}", int(((image == i) & (point == j)).sum()), CONTRADICTING)
+        for i, j in merged.dropped
+    )
+    return Measurements(
+        network,
+        cameras,
+        images,
+        np.full(len(points), MIN_RAYS),
+        warnings=merged.lines(images, points),
+        left_out=contradicting,
+    )
 
 
 def control_points(control: KnownPoints | None, points: Sequence[str]) -> ObjectPoints:
@@ -169,6 +185,7 @@ def _in_pixels(
             xy_px[rows] = pixel_from_image(xy[rows], own.size_px, own.pixel_mm)
             if sigma is not None:
                 s[rows] = sigma[rows] / own.pixel_mm
+    s = np.where(np.isnan(s), sigma_px, s)
     covariance = np.zeros((len(xy), 2, 2))
     covariance[:, range(2), range(2)] = s**2
     return xy_px, covariance
