@@ -87,7 +87,7 @@ def _figures(findings: Findings) -> tuple[tuple[str, str], ...]:
         rows.append(("check at control", words_of_check(findings.check, result.length_unit)))
     both = result.comparison
     if both is not None:
-        word = "agrees" if both.agree else "DIFFERS"
+        word = "stopped early, same optimum" if both.stopped_early else "agrees" if both.agree else "DIFFERS"
         rms = both.comparison.rms_px
         rows.append(
             (

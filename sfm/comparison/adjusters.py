@@ -20,7 +20,7 @@ from typing import Protocol
 import numpy as np
 
 from sfm.adjustment.datum import Datum
-from sfm.adjustment.result import Adjustment
+from sfm.adjustment.result import Adjustment, Covariance
 from sfm.adjustment.solve import adjust
 from sfm.camera import Camera, pixel_from_tangents, project, tangents_from_pixel
 from sfm.comparison.camera_conversion import Conversion
@@ -31,17 +31,8 @@ from sfm.network import Estimate, Network
 from sfm.similarity import Similarity, fit_similarity
 
 EFFECT_STEPS = 9  # places along each side of the photograph where interior orientations are compared
+SAME_SIGMAS = 0.01  # standard deviations up to which two solutions are the same optimum
 MAX_ITERATIONS = 200  # the weak directions of full_opencv take more steps than a survey
-
-
-@dataclass(frozen=True)
-class Thresholds:
-    """Largest differences with which two solutions are the same optimum."""
-
-    rms_px: float = 1e-6  # px
-    rotation_deg: float = 1e-6  # deg
-    position: float = 1e-7  # of the object size
-    point: float = 1e-7  # of the object size
 
 
 @dataclass(frozen=True)
@@ -60,11 +51,26 @@ class Comparison:
     interior_px: FloatArray  # largest shift of a ray in the photograph, px, (cameras,)
     rms_px: tuple[float, float]  # root mean square residual per coordinate of a and b, px
     cost: tuple[float, float]  # half the sum of squared residuals of a and b, px^2
-    exceeded: tuple[str, ...]  # thresholds that were exceeded, in words; empty if they agree
+    sigmas: tuple[tuple[str, float], ...]  # what differs most of each kind, and by how many of its standard
+    # deviations in a; kinds of which none is known are left out
+
+    @property
+    def max_sigmas(self) -> float:
+        """Largest difference of any parameter, in its standard deviations."""
+        return max((value for _, value in self.sigmas), default=0.0)
+
+    @property
+    def exceeded(self) -> tuple[str, ...]:
+        """What differs by more than two solutions of the same optimum may, in words; empty if they agree."""
+        return tuple(
+            f"{what} differs by {value:.2g} of its standard deviation, {SAME_SIGMAS:g} is allowed"
+            for what, value in self.sigmas
+            if not value <= SAME_SIGMAS
+        )
 
     @property
     def agree(self) -> bool:
-        """Whether both are the same optimum within all thresholds."""
+        """Whether both are the same optimum."""
         return not self.exceeded
 
     @property
@@ -103,11 +109,14 @@ class AdjusterComparison:
     )  # the other's covariances of the points with photographs and cameras held
     # (conditional), scaled by our sigma0, object unit^2, (n, 3, 3); None where it has none
     unshared: tuple[str, ...] = ()  # what cameras share in the survey and was held at its result, in words
+    stopped_early: bool = False  # whether going on from the other's solution leads to the in-house one
 
     @property
     def agree(self) -> bool:
-        """Whether both converged to the same optimum."""
-        return self.comparison.agree and self.adjustment.converged and self.backend_converged
+        """Whether both found the same optimum, though the other adjuster may have stopped short of it."""
+        if not self.adjustment.converged:
+            return False
+        return self.stopped_early or (self.comparison.agree and self.backend_converged)
 
 
 class BackendAdjustment(Protocol):
@@ -139,8 +148,8 @@ def compare(
     b: Estimate,
     network: Network,
     *,
+    covariance: Covariance,
     names: tuple[str, str] = ("kolinear", "colmap"),
-    thresholds: Thresholds | None = None,
 ) -> Comparison:
     """Compare two solutions of the same network, whatever datum each is in.
 
@@ -148,11 +157,11 @@ def compare(
         a: first solution.
         b: second solution; photographs and points that only one of them has are not compared.
         network: the image points for the residuals of both.
+        covariance: of the first in a free datum on all points: differences are judged by it.
         names: what to call a and b.
-        thresholds: differences up to which they agree.
 
     Returns:
-        Differences b - a after a similarity of b onto a, and which thresholds they exceed.
+        Differences b - a after a similarity of b onto a.
 
     Raises:
         GeometryError: fewer than three points in common, or all of them on a line.
@@ -160,7 +169,6 @@ def compare(
     Source: the 7-parameter similarity of Horn (1987) over all points, as for any two free networks: Caspary
     (2000), Concepts of network and deformation analysis, sec. 7.
     """
-    limits = Thresholds() if thresholds is None else thresholds
     both = a.determined & b.determined
     a_from_b = fit_similarity(b.points[both], a.points[both])
     moved = a_from_b.apply_estimate(b)
@@ -172,12 +180,7 @@ def compare(
     angle[images] = rotation_angle_deg(a.rotation[images], moved.rotation[images])
     squares = [(reprojection(network, estimate) ** 2).ravel() for estimate in (a, b)]
     rms = tuple(float(np.sqrt(np.mean(s))) if len(s) else 0.0 for s in squares)
-    found = (
-        ("RMS", abs(rms[0] - rms[1]), limits.rms_px, "px"),
-        ("rotation", float(np.nanmax(angle, initial=0.0)), limits.rotation_deg, "deg"),
-        ("position", _longest(position) / size, limits.position, "of the object size"),
-        ("point", _longest(points) / size, limits.point, "of the object size"),
-    )
+    interior = tuple(_difference(p, q) for p, q in zip(a.cameras, b.cameras, strict=True))
     return Comparison(
         names,
         a,
@@ -187,16 +190,54 @@ def compare(
         position,
         angle,
         points,
-        tuple(_difference(p, q) for p, q in zip(a.cameras, b.cameras, strict=True)),
+        interior,
         np.array([interior_effect_px(p, q) for p, q in zip(a.cameras, b.cameras, strict=True)]),
         (rms[0], rms[1]),
         (float(squares[0].sum() / 2), float(squares[1].sum() / 2)),
-        tuple(
-            f"{what} differs by {value:.2g} {unit}, {limit:.2g} is allowed"
-            for what, value, limit, unit in found
-            if not value <= limit
-        ),
+        _in_sigmas(network, a, covariance, points, position, np.deg2rad(angle), interior),
     )
+
+
+def _in_sigmas(
+    network: Network,
+    a: Estimate,
+    covariance: Covariance,
+    points: FloatArray,
+    position: FloatArray,
+    angle: FloatArray,
+    interior: tuple[FloatArray, ...],
+) -> tuple[tuple[str, float], ...]:
+    """Return the largest difference of each kind in standard deviations, and of what it is.
+
+    A rotation is judged by the smallest standard deviation of the three angles of its photograph.
+    """
+    exterior = np.diagonal(covariance.exterior, axis1=1, axis2=2)
+    kinds: list[tuple[tuple[str, ...], FloatArray, FloatArray]] = [
+        (
+            tuple(f"object point {name}" for name in network.points),
+            points,
+            np.diagonal(covariance.points, axis1=1, axis2=2),
+        ),
+        (tuple(f"projection centre of {name}" for name in network.images), position, exterior[:, :3]),
+        (
+            tuple(f"rotation of {name}" for name in network.images),
+            angle[:, None],
+            exterior[:, 3:].min(axis=1, keepdims=True),
+        ),
+    ]
+    for camera, difference, Q in zip(a.cameras, interior, covariance.interior, strict=True):
+        free = np.flatnonzero(camera.free)
+        if len(Q) == len(free):
+            names = tuple(f"{camera.names[k]} of camera {camera.name}" for k in free)
+            kinds.append((names, difference[free, None], np.diagonal(Q)[:, None]))
+    found = []
+    for names, difference, variance in kinds:
+        known = np.isfinite(difference) & (variance > 0)
+        if known.any():
+            ratio = np.where(known, np.abs(difference), 0.0) / np.sqrt(np.where(known, variance, 1.0))
+            worst = int(np.argmax(ratio.max(axis=1)))
+            found.append((names[worst], float(ratio[worst].max())))
+    return tuple(found)
 
 
 def compare_adjusters(
@@ -205,7 +246,6 @@ def compare_adjusters(
     *,
     name: str = "colmap",
     model: str | None = None,
-    thresholds: Thresholds | None = None,
 ) -> AdjusterComparison:
     """Run the in-house adjuster and another one on the accepted image points of a survey.
 
@@ -217,7 +257,6 @@ def compare_adjusters(
         backend: the other adjuster, a function of network and start values.
         name: of the backend.
         model: functional model of both; that of the survey if it is an opencv one, else full_opencv.
-        thresholds: differences up to which they agree.
 
     Raises:
         GeometryError: nothing is left to compare.
@@ -237,6 +276,14 @@ def compare_adjusters(
         ours = _adjusted(network, start, adjustment.sigma_px)
     theirs = backend(network, start)
     conditional = theirs.point_covariance
+
+    def against_ours(estimate: Estimate) -> Comparison:
+        return compare(ours.estimate, estimate, network, covariance=ours.covariance, names=("kolinear", name))
+
+    found, stopped_early = against_ours(theirs.estimate), False
+    if ours.converged and not (found.agree and theirs.converged):
+        further = _adjusted(network, theirs.estimate, adjustment.sigma_px)
+        stopped_early = further.converged and against_ours(further.estimate).agree
     return AdjusterComparison(
         name,
         start.cameras[0].model,
@@ -248,9 +295,10 @@ def compare_adjusters(
         theirs.iterations,
         theirs.converged,
         theirs.seconds,
-        compare(ours.estimate, theirs.estimate, network, names=("kolinear", name), thresholds=thresholds),
+        found,
         None if conditional is None else (ours.sigma0 * ours.sigma_px) ** 2 * conditional,
         unshared,
+        stopped_early,
     )
 
 

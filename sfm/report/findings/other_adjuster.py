@@ -43,6 +43,8 @@ def comparison_of(result: SurveyResult) -> ComparisonFindings | None:
     reasons: list[str] = []
     if not both.agree:
         reasons += both.comparison.exceeded
+        if both.comparison.exceeded and both.adjustment.converged:
+            reasons.append(_other_minimum(both))
         reasons += [] if both.adjustment.converged else ["kolinear did not converge in this model"]
         reasons += [] if both.backend_converged else [f"{both.backend} did not converge"]
     covariance, other = both.adjustment.covariance, both.backend_points
@@ -55,6 +57,17 @@ def comparison_of(result: SurveyResult) -> ComparisonFindings | None:
         _point_sigma(covariance.points),
         _point_sigma(covariance.points_limiting),
         None if other is None else _point_sigma(other),
+    )
+
+
+def _other_minimum(both: AdjusterComparison) -> str:
+    """Return in words which of two minima is the lower one."""
+    ours, theirs = both.comparison.cost
+    lower = "kolinear" if ours < theirs else both.backend
+    ratio = max(ours, theirs) / min(ours, theirs) if min(ours, theirs) > 0 else np.inf
+    return (
+        f"going on from {both.backend}'s solution does not lead to kolinear's: these are two minima, and that "
+        f"of {lower} is the lower one, by a factor of {ratio:.6g} in the sum of squares"
     )
 
 

@@ -290,6 +290,8 @@ def _comparison(findings: Findings) -> dict[str, Any] | None:
         "backend": both.backend,
         "agree": both.agree,
         "model": both.model,
+        "stopped_early": both.stopped_early,
+        "max_sigmas": or_none(difference.max_sigmas),
         "max_position": or_none(difference.max_position),
         "max_rotation_deg": or_none(difference.max_rotation_deg),
         "max_point": or_none(difference.max_point),
