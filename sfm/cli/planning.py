@@ -10,8 +10,6 @@ from sfm.cli.starting import loading
 from sfm.errors import SurveyFileError
 from sfm.planning.target_size import LEAST_PIXELS, target_size
 
-UNITS = ("mm", "cm", "m", "km", "in", "ft")  # of distances, and so of the answer
-
 plan = typer.Typer(name="plan", help="Plan a survey before the photographs are taken.")
 
 
@@ -41,7 +39,7 @@ def target_size_command(
         str, typer.Option("--family", help="Rings around the dots: ring12, ring14, ring20 or arcs.")
     ] = "ring14",
     unit: Annotated[
-        str, typer.Option("--unit", help="Unit of the distance: mm, cm, m, km, in or ft.")
+        str, typer.Option("--unit", help="Unit of the distance: km, m, dm, cm, mm, um, in or ft.")
     ] = "mm",
 ) -> None:
     """Tell how large targets must be for a camera and a distance.
@@ -49,11 +47,17 @@ def target_size_command(
     diameter = pixels x sensor width x distance / (c x photograph width), over the cosine of the tilt.
     """
     with loading():
+        from sfm.conventions import METRES
         from sfm.targets.codes.families import code_family
         from sfm.targets.codes.rings import CodeFamily
 
-    if unit not in UNITS:
-        raise SurveyFileError(f"--unit {unit}: needed {', '.join(UNITS[:-1])} or {UNITS[-1]}")
+    if unit not in METRES:
+        raise SurveyFileError(f"--unit {unit}: expected one of {', '.join(METRES)}")
+    if METRES[unit] * distance <= c / 1000:
+        raise SurveyFileError(
+            f"--distance {distance:g} {unit}: not farther than the principal distance of {c:g} mm; expected "
+            "that of the object, in another unit with --unit"
+        )
     codes = code_family(family)
     if not isinstance(codes, CodeFamily):
         raise SurveyFileError(f"--family {family}: needed rings, such as ring14")

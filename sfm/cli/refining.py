@@ -52,3 +52,5 @@ def refine(
         with whole_folder(out) as folder:
             write_model(folder, a.network, a.estimate, rejected=a.rejected)
         print(f"Model: {out}")
+    else:
+        print("Nothing was saved: --out DIR keeps the refined model.")

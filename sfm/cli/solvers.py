@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from sfm.cli.starting import loading
+from sfm.errors import SurveyFileError
 from sfm.runtime.faults import working_on
 
 WORSE = 1  # exit code where the in-house adjuster was ever the worse one
@@ -118,6 +119,7 @@ def convert(
     with loading():
         from adapters.formats.registry import (
             ENDINGS,
+            FORMATS,
             format_named,
             read_any,
             refuse_taken,
@@ -127,7 +129,13 @@ def convert(
         from sfm.comparison.camera_conversion import Conversion, convert_cameras
         from sfm.comparison.undistortion import undistort
 
-    form = format_named(to_format or ENDINGS.get(target.suffix.lower(), "tables"))
+    ending = target.suffix.lower()
+    if to_format is None and ending and ending not in ENDINGS:
+        raise SurveyFileError(
+            f"{target}: unknown ending {ending}, expected {', '.join(ENDINGS)}, a folder for tables, or --to "
+            f"with one of {', '.join(one.name for one in FORMATS)}"
+        )
+    form = format_named(to_format or ENDINGS.get(ending, "tables"))
     refuse_taken(target, form)
     with working_on(str(source)):
         network, estimate = read_any(source, from_format)

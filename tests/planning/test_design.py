@@ -67,4 +67,6 @@ def test_command() -> None:
         [sys.executable, "-c", "from sfm.cli import main; main()", *bad], capture_output=True, text=True
     )
     assert done.returncode == 2
-    assert done.stderr.strip() == "kolinear: --unit furlong: needed mm, cm, m, km, in or ft"
+    assert (
+        done.stderr.strip() == "kolinear: --unit furlong: expected one of km, m, dm, cm, mm, um, µm, in, ft"
+    )

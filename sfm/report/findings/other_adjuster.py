@@ -66,8 +66,8 @@ def _other_minimum(both: AdjusterComparison) -> str:
     lower = "kolinear" if ours < theirs else both.backend
     ratio = max(ours, theirs) / min(ours, theirs) if min(ours, theirs) > 0 else np.inf
     return (
-        f"going on from {both.backend}'s solution does not lead to kolinear's: these are two minima, and that "
-        f"of {lower} is the lower one, by a factor of {ratio:.6g} in the sum of squares"
+        f"going on from {both.backend}'s solution does not lead to kolinear's: these are two minima, and "
+        f"that of {lower} is the lower one, by a factor of {ratio:.6g} in the sum of squares"
     )
 
 

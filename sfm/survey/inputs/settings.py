@@ -63,7 +63,7 @@ class Head(Section):
     """[survey]: what the survey is called."""
 
     name: Name
-    unit: Name  # object unit, for people and reports
+    unit: Literal["km", "m", "dm", "cm", "mm", "um", "µm", "in", "ft"]  # of the object coordinates
 
 
 class CameraSettings(Section):

@@ -53,7 +53,8 @@ def first_error(path: Path | str, text: str, error: ValidationError, whole: type
         found = _found(list(first["input"]))
         return f"{where}{_key(location[:-1])}: found {found}, needed {location[-1] + 1} values"
     if kind == "missing":
-        return f"{where}{key} is missing"
+        every = [_key(one["loc"]) for one in errors if one["type"] == "missing"]
+        return f"{where}{', '.join(every)} {'is' if len(every) == 1 else 'are'} missing"
     if kind == "tuple_type" and len(location) == 1 and isinstance(first["input"], dict):
         return f"{where}found [{key}], needed [[{key}]] in double brackets, since there may be several"
     needed = dict(_NEEDED).get(kind)
