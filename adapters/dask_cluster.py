@@ -40,7 +40,7 @@ from distributed.security import Security
 from threadpoolctl import threadpool_limits
 
 from sfm.errors import BackendError, KolinearError
-from sfm.executor import Call, Done, Event, Lost, Told, Work
+from sfm.runtime.executor import Call, Done, Event, Lost, Told, Work
 
 # Deaths of workers that a call may be near before Dask gives it up: once is bad luck, and is tried elsewhere.
 ALLOWED_FAILURES = 1
@@ -234,10 +234,11 @@ class DaskEngine:
     @property
     def workers(self) -> int:
         """How many calls run at a time, at least 1 while workers are still to come."""
-        return max(1, sum(self.client.nthreads().values()))
+        threads: dict[str, int] = self.client.nthreads()
+        return max(1, sum(threads.values()))
 
     def run(self, works: Iterable[Work], *, at_a_time: int) -> Iterator[Event]:
-        """Run all work and yield what happens, see sfm.executor.Engine.
+        """Run all work and yield what happens, see sfm.runtime.executor.Engine.
 
         Raises:
             BackendError: the scheduler or all workers are gone, or the workers have no Kolinear.
@@ -245,7 +246,7 @@ class DaskEngine:
         """
         events: queue.SimpleQueue[tuple[str, Any]] = queue.SimpleQueue()
         run = f"kolinear-{uuid.uuid4().hex}"
-        running: dict[str, list[Future]] = {}  # the future of the whole comes first
+        running: dict[str, list[Future[Any]]] = {}  # the future of the whole comes first
         left, turn = iter(works), count()
 
         def start(work: Work) -> None:
@@ -275,13 +276,13 @@ class DaskEngine:
                 self.client.cancel([future for futures in running.values() for future in futures], force=True)
                 self.client.unsubscribe_topic(run)
 
-    def _submit(self, work: Work, run: str, *, priority: int) -> list[Future]:
+    def _submit(self, work: Work, run: str, *, priority: int) -> list[Future[Any]]:
         """Submit the parts of a piece of work and then its whole, which comes first in the list.
 
         Keys are without the name of the work: the scheduler remembers forever what stands before the digits.
         """
 
-        def submit(call: Call, name: str, *more: Any) -> Future:
+        def submit(call: Call, name: str, *more: Any) -> Future[Any]:
             return self.client.submit(
                 _call,
                 call,
@@ -357,7 +358,7 @@ class _OneThread:
 _HELD = _OneThread()  # libraries of this process
 
 
-def _event(key: str, future: Future) -> Event:
+def _event(key: str, future: Future[Any]) -> Event:
     """Return how a piece of work ended, or raise what ends them all.
 
     A result that is lost with its worker before it is here is computed again, and may then fail.

@@ -9,7 +9,7 @@ Every public name is listed in `__init__.pyi` and is imported when it is first a
 
 from __future__ import annotations
 
-from sfm.installation import refuse_foreign_files
+from sfm.runtime.installation import refuse_foreign_files
 
 refuse_foreign_files()
 

@@ -17,12 +17,12 @@ from sfm.comparison.significance import ResultComparison, compare_results
 from sfm.errors import SurveyFileError
 from sfm.network import Estimate, Network
 from sfm.pipeline import run_survey as run_stages
-from sfm.progress import SILENT, Progress
 from sfm.result import SurveyResult
+from sfm.runtime.progress import SILENT, Progress
 from sfm.stored_result import StoredResult
-from sfm.survey.comparison import OtherPrograms
 from sfm.survey.inputs.survey import Survey
-from sfm.survey.target_store import TargetStore
+from sfm.survey.measuring.target_store import TargetStore
+from sfm.survey.other_programs import OtherPrograms
 
 BACKENDS = ("colmap", "none")
 
@@ -64,7 +64,7 @@ def run_survey(
         stack.enter_context(one_blas_thread())
         told: Progress = SILENT
         if progress is True:
-            from sfm.cli.console import drawn_progress
+            from sfm.runtime.progress_bar import drawn_progress
 
             told = stack.enter_context(drawn_progress())
         elif progress is not False:
@@ -185,7 +185,7 @@ def programs_of(backend: str, baseline: str, *, threads: int = -1) -> OtherProgr
     """
     others = OtherPrograms()
     if backend == "colmap":
-        from adapters.colmap.covariance import adjust_with_covariance
+        from adapters.colmap.validation_backend import adjust_with_covariance
 
         others = replace(others, adjuster=adjust_with_covariance)
     if baseline == "mapper":

@@ -13,20 +13,20 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from sfm.errors import GeometryError
-from sfm.progress import SILENT, Progress, StageClock
 from sfm.result import SurveyResult
+from sfm.runtime.progress import SILENT, Progress, StageClock
 from sfm.survey.assembly import assemble_result
-from sfm.survey.comparison import ALONE, OtherPrograms, compare_solution
 from sfm.survey.correspondences import find_correspondences
 from sfm.survey.inputs.photograph_list import find_photographs
 from sfm.survey.inputs.start import measurements_from_observations, refuse_unknown_photographs
 from sfm.survey.inputs.survey import Survey
-from sfm.survey.measurements import Measurements
-from sfm.survey.network import measure_targets
+from sfm.survey.measuring.measurements import Measurements
+from sfm.survey.measuring.target_store import TargetStore
+from sfm.survey.measuring.tie_points import tie_photographs
 from sfm.survey.orientation import orient_survey
+from sfm.survey.other_programs import ALONE, OtherPrograms, compare_solution
 from sfm.survey.solution import solve_survey
-from sfm.survey.target_store import TargetStore
-from sfm.survey.tie_points import tie_photographs
+from sfm.survey.target_network import measure_targets
 
 
 def run_survey(

@@ -11,7 +11,9 @@ from pathlib import Path
 import matplotlib
 import pytest
 
-SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"
+from tests.places import SHARED
+
+SHARED = SHARED / "data"
 
 os.environ.setdefault("MPLCONFIGDIR", matplotlib.get_cachedir())  # its list of fonts takes long
 os.environ["XDG_CACHE_HOME"] = tempfile.mkdtemp(prefix="kolinear-tests-")  # never that of the user

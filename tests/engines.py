@@ -11,11 +11,11 @@ from typing import Any, NoReturn
 
 from threadpoolctl import threadpool_limits
 
-from sfm.batch.survey import Comparers, SurveyRow
-from sfm.executor import Done, Event, Tell, Told, Work
+from sfm.batch.job import Comparers, SurveyRow
 from sfm.result import SurveyResult
-from sfm.survey.comparison import OtherPrograms
+from sfm.runtime.executor import Done, Event, Tell, Told, Work
 from sfm.survey.inputs.survey import Survey
+from sfm.survey.other_programs import OtherPrograms
 
 KILLER = "killer"  # a survey of this name kills whoever works on it
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from numba import njit
-from synthetic import DISTORTION, FREE, PIXEL_MM, SIZE_PX, seed_of
 
 from sfm.camera import (
     Camera,
@@ -17,6 +16,7 @@ from sfm.camera import (
 )
 from sfm.distortion.models import ALL, MAX_PARAMETERS, MODELS, Model, one_of
 from sfm.errors import SurveyFileError
+from tests.synthetic import DISTORTION, FREE, PIXEL_MM, SIZE_PX, seed_of
 
 
 def lens(model: str) -> Camera:

@@ -15,10 +15,11 @@ from sfm.rendering.render import write_photographs
 from sfm.rendering.scene_file import Staging, read_scene
 from sfm.result import SurveyResult
 from sfm.similarity import fit_similarity
-from sfm.survey.comparison import OtherPrograms
 from sfm.survey.inputs.survey import read_survey
+from sfm.survey.other_programs import OtherPrograms
+from tests.places import ROOT
 
-DEMO = Path(__file__).resolve().parents[1] / "datasets" / "demo"
+DEMO = ROOT / "datasets" / "demo"
 SAME_MM = 1.0  # a point farther than this from every target is none; targets are 30 mm apart
 
 

@@ -7,12 +7,21 @@ from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).resolve().parents[1]
+from tests.places import ROOT
+
 LAYERS = (
     (
-        *("sfm.conventions", "sfm.errors", "sfm.camera", "sfm.distortion", "sfm.network", "sfm.similarity"),
-        *("sfm.progress", "sfm.executor", "sfm.faults", "sfm.files", "sfm.kernels", "sfm.photographs"),
-        *("sfm.point_table", "sfm.stored_result", "sfm.display", "sfm.installation"),
+        *(
+            "sfm.conventions",
+            "sfm.errors",
+            "sfm.camera",
+            "sfm.distortion",
+            "sfm.network",
+            "sfm.reduced_network",
+            "sfm.similarity",
+        ),
+        *("sfm.runtime", "sfm.files", "sfm.kernels", "sfm.photographs"),
+        *("sfm.point_table", "sfm.stored_result", "sfm.display"),
     ),
     ("sfm.targets", "sfm.matching", "sfm.orientation", "sfm.adjustment"),
     ("sfm.comparison", "sfm.geometry", "sfm.epochs", "sfm.planning", "sfm.rendering", "sfm.printing"),
@@ -27,6 +36,7 @@ CV2_ROOMS = (
     *("sfm.orientation", "sfm.survey"),
 )
 CV2_THREADS = "adapters.dask_cluster"  # holds OpenCV to one thread per worker, as it does BLAS
+TERMINAL = ("sfm.batch.table", "sfm.runtime.progress_bar")
 ROOMS = LAYERS[1]  # of which none knows another
 
 
@@ -120,9 +130,7 @@ def test_libraries_stay_in_their_rooms() -> None:
         if libraries & {"matplotlib"}:
             assert name.startswith("sfm.report"), f"{name} imports matplotlib"
         if libraries & {"typer", "rich"}:
-            assert belongs(name, "sfm.cli") or name == "sfm.batch.table", (
-                f"{name} imports the command line's libraries"
-            )
+            assert belongs(name, "sfm.cli") or name in TERMINAL, f"{name} imports libraries of the terminal"
 
 
 def test_the_rules_would_notice() -> None:

@@ -7,11 +7,12 @@ import inspect
 import pkgutil
 import re
 import types
-from pathlib import Path
 
 import pytest
 
-PAGE = (Path(__file__).resolve().parents[1] / "docs" / "methods.md").read_text(encoding="utf-8")
+from tests.places import ROOT
+
+PAGE = (ROOT / "docs" / "methods.md").read_text(encoding="utf-8")
 ROOMS = ("sfm.orientation", "sfm.matching", "sfm.comparison", "sfm.planning")
 MENTIONED = tuple(dict.fromkeys(re.findall(r"`(sfm(?:\.\w+)+)`", PAGE)))
 

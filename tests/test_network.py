@@ -5,9 +5,10 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from synthetic import make_network, seed_of
 
-from sfm.network import ExteriorObservations, ObjectPoints, ScaleBars, reduce_network
+from sfm.network import ExteriorObservations, ObjectPoints, ScaleBars
+from sfm.reduced_network import reduce_network
+from tests.synthetic import make_network, seed_of
 
 
 def test_reduced_network_keeps_measurements_of_what_is_left() -> None:

@@ -11,8 +11,8 @@ from sfm.cli.app import app
 from sfm.report.output import WRITTEN
 from sfm.survey.inputs.settings import Section
 from sfm.survey.inputs.survey_file import SurveyFile, read_survey_file
+from tests.places import ROOT
 
-ROOT = Path(__file__).resolve().parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 FIRST_SCREEN = "\n".join(README.splitlines()[:30])
 

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from synthetic import make_network, seed_of
 
 from sfm.camera import project
 from sfm.conventions import rotation_from_angles
 from sfm.errors import GeometryError
 from sfm.similarity import Similarity, fit_similarity
+from tests.synthetic import make_network, seed_of
 
 TRUE = Similarity(2.5, rotation_from_angles(0.3, -1.1, 2.9), np.array([10.0, -4.0, 7.0]))
 

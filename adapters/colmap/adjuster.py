@@ -5,7 +5,7 @@ The only module that imports pycolmap. What its adjuster knows less of than Koli
     weights        COLMAP's adjuster gives every image coordinate the same weight
     constants      COLMAP frees focal lengths, principal points and distortion in groups, for all cameras
 
-Pixel origin and axes are turned in adapters.colmap.scene.
+Pixel origin and axes are turned in adapters.colmap.reconstruction.
 
 Source: COLMAP 4.2 documentation, "Output Format" and "Camera Models".
 """
@@ -22,7 +22,7 @@ from typing import Any
 
 import numpy as np
 
-from adapters.colmap.scene import (
+from adapters.colmap.reconstruction import (
     estimate_of,
     reconstruction,
     residuals_of,

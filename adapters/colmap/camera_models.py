@@ -19,7 +19,7 @@ import numpy as np
 from adapters.colmap.adjuster import load_pycolmap, quiet, told
 from adapters.colmap.model_files import check_model_files
 from adapters.colmap.names import SIDE_FILE, Names, read_side_file, write_side_file
-from adapters.colmap.scene import AXES, HALF_PIXEL, camera_of, reconstruction
+from adapters.colmap.reconstruction import AXES, HALF_PIXEL, camera_of, reconstruction
 from sfm.conventions import BoolArray
 from sfm.errors import OutputError, SurveyFileError
 from sfm.files.plain_text import MAX_NAME, is_name, shown
@@ -41,7 +41,8 @@ def write_model(
 
     Args:
         folder: made if it is not there.
-        network, estimate: cameras in an opencv model; photographs without orientation are left out.
+        network: what was measured.
+        estimate: cameras in an opencv model; photographs without orientation are left out.
         rejected: image points that no point shall claim, (k,).
         text: text files instead of binary ones.
 

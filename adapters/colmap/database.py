@@ -19,7 +19,7 @@ from scipy.sparse.csgraph import connected_components
 
 from adapters.colmap.adjuster import load_pycolmap, quiet, told
 from adapters.colmap.database_rows import read_rows
-from adapters.colmap.scene import HALF_PIXEL, camera_of, colmap_camera
+from adapters.colmap.reconstruction import HALF_PIXEL, camera_of, colmap_camera
 from sfm.camera import Camera
 from sfm.conventions import IntArray
 from sfm.errors import OutputError

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from adapters.formats.json_files import MAX_SIDE_PX
-from adapters.formats.lines import Lines
+from adapters.formats.text_lines import Lines
 from sfm.errors import SurveyFileError
 from sfm.files.csv_tables import MAX_NUMBER, MAX_TABLE_BYTES
 

@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from adapters.formats.lines import MAX_LINES, MAX_PHOTOGRAPHS, Lines, write_lines
+from adapters.formats.text_lines import MAX_LINES, MAX_PHOTOGRAPHS, Lines, write_lines
 from sfm.camera import Camera, camera_from_values
 from sfm.conventions import FloatArray
 from sfm.errors import OutputError
@@ -100,7 +100,8 @@ def write_bal(path: Path, network: Network, estimate: Estimate) -> None:
 
     Args:
         path: file to write.
-        network, estimate: complete; cameras in model opencv with one focal length and no decentring.
+        network: what was measured.
+        estimate: complete; cameras in model opencv with one focal length and no decentring.
 
     Raises:
         OutputError: what BAL has no place for, or the file cannot be written.

@@ -29,7 +29,7 @@ from pathlib import Path
 
 import numpy as np
 
-from adapters.formats.lines import MAX_IMAGE_POINTS, MAX_PHOTOGRAPHS, Lines, write_lines
+from adapters.formats.text_lines import MAX_IMAGE_POINTS, MAX_PHOTOGRAPHS, Lines, write_lines
 from sfm.camera import camera_from_values
 from sfm.conventions import (
     FloatArray,
@@ -60,8 +60,12 @@ def read_bundle_matlab(
     """Read the files of the MATLAB program as a network and its start values; points are named from 1.
 
     Args:
-        cameras, points, sigmas: the three files; without sigmas they are one pixel.
-        c_mm, x0_mm, y0_mm: interior orientation, which the program asks for, mm.
+        cameras: file of the photographs.
+        points: file of the object points and their image points.
+        sigmas: file of the standard deviations; without it they are one pixel.
+        c_mm: principal distance, which the program asks for, mm.
+        x0_mm: principal point, mm.
+        y0_mm: principal point, mm.
         pixel_mm: nominal size of a pixel, mm.
 
     Raises:

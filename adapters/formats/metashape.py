@@ -30,7 +30,7 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 
 from adapters.formats.json_files import MAX_PIXEL_MM
-from adapters.formats.lines import write_lines
+from adapters.formats.text_lines import write_lines
 from adapters.formats.xml_lines import Node, read_xml
 from sfm.camera import Camera, camera_from_values
 from sfm.conventions import FloatArray

@@ -32,7 +32,7 @@ from pathlib import Path
 import numpy as np
 
 from adapters.formats.json_files import MAX_SIDE_PX
-from adapters.formats.lines import MAX_IMAGE_POINTS, MAX_PHOTOGRAPHS, Lines, write_lines
+from adapters.formats.text_lines import MAX_IMAGE_POINTS, MAX_PHOTOGRAPHS, Lines, write_lines
 from sfm.camera import Camera, camera_from_values
 from sfm.conventions import FloatArray, angles_from_rotation, rotation_from_angles
 from sfm.errors import OutputError, SurveyFileError
@@ -253,7 +253,7 @@ def write_photomodeler(path: Path, network: Network, estimate: Estimate, *, titl
 
 
 def _inner(camera: Camera) -> list[float]:
-    """c xp yp xs ys K1 K2 K3 P1 P2 of a camera."""
+    """Return c xp yp xs ys K1 K2 K3 P1 P2 of a camera."""
     xs, ys = np.array(camera.size_px) * camera.pixel_mm
     c, x0, y0, *distortion = camera.parameters[:8]
     return [c, xs / 2 + x0, ys / 2 - y0, xs, ys, *distortion]

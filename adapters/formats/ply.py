@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from adapters.formats.lines import Lines, write_lines
+from adapters.formats.text_lines import Lines, write_lines
 from sfm.conventions import FloatArray
 from sfm.errors import OutputError
 from sfm.files.csv_tables import MAX_ROWS

@@ -25,17 +25,18 @@ from adapters.formats.bundle_text import (
     write_bundle_csharp,
     write_bundle_matlab_folder,
 )
-from adapters.formats.lines import Lines
 from adapters.formats.metashape import read_metashape, write_metashape
 from adapters.formats.photomodeler import read_photomodeler, write_photomodeler
 from adapters.formats.ply import write_ply
 from adapters.formats.result_tables import read_result, write_tables
 from adapters.formats.sba_text import read_sba_text, sba_files, write_sba_text
+from adapters.formats.text_lines import Lines
 from sfm.camera import Camera
 from sfm.distortion.models import MODELS
 from sfm.errors import KolinearError, OutputError, SurveyFileError
 from sfm.files.whole_files import whole_folder
-from sfm.network import Estimate, Network, empty_estimate, reduce_network
+from sfm.network import Estimate, Network, empty_estimate
+from sfm.reduced_network import reduce_network
 from sfm.stored_result import StoredResult
 
 Reader = Callable[[Path], tuple[Network, Estimate]]

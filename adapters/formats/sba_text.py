@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from adapters.formats.lines import MAX_IMAGE_POINTS, MAX_LINES, MAX_PHOTOGRAPHS, Lines, write_lines
+from adapters.formats.text_lines import MAX_IMAGE_POINTS, MAX_LINES, MAX_PHOTOGRAPHS, Lines, write_lines
 from sfm.camera import Camera, camera_from_values
 from sfm.conventions import FloatArray
 from sfm.errors import OutputError, SurveyFileError

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, fields
 from pathlib import Path
 
-from sfm.batch.survey import LOGS, SurveyRow
+from sfm.batch.job import LOGS, SurveyRow
 from sfm.errors import OutputError
 from sfm.files.plain_text import as_plain, csv_text, is_plain
 from sfm.files.whole_files import MANIFEST, read_manifest, refuse_links, sha256_of, whole_file, write_manifest

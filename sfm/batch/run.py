@@ -16,8 +16,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol
 
-from sfm.batch.pages import PAGES, refuse_foreign_pages, write_batch_pages
-from sfm.batch.survey import (
+from sfm.batch.finished import note_finished, remove_old_notes, was_finished
+from sfm.batch.job import (
     LOCK,
     LOGS,
     Comparers,
@@ -30,19 +30,20 @@ from sfm.batch.survey import (
     measure_one,
     reconstruct,
 )
+from sfm.batch.pages import PAGES, refuse_foreign_pages, write_batch_pages
 from sfm.errors import BackendError, FolderInUseError, SurveyFileError
-from sfm.executor import Call, Done, Engine, Lost, Told, Work
 from sfm.files.folder_lock import locked, owner_of
 from sfm.files.globs import BELOW, find_files
 from sfm.files.plain_text import as_plain
 from sfm.files.whole_files import MANIFEST, refuse_foreign_folder, remove_leftovers
 from sfm.report.log import SurveyLog, refuse_other_log, remove_log
 from sfm.report.output import folder_name
+from sfm.runtime.executor import Call, Done, Engine, Lost, Told, Work
 from sfm.survey.inputs.photograph_list import find_photographs
 from sfm.survey.inputs.start import refuse_unknown_photographs
 from sfm.survey.inputs.survey import read_survey
 from sfm.survey.inputs.survey_file import SurveyFile, read_survey_file
-from sfm.survey.target_store import TargetStore
+from sfm.survey.measuring.target_store import TargetStore
 
 SURVEY_NAME = "survey.toml"  # what a folder is searched for
 
@@ -110,6 +111,7 @@ def run_batch(
     for plan in plans:
         refuse_other_log(out / LOGS / f"{plan.folder}.jsonl")
     TargetStore.of_user().remove_old()
+    remove_old_notes()
     with _no_empty_folders(out), locked(out / LOCK, out) as before:
         if before is not None:
             watch.remark(f"an earlier run was cut off ({before}); what it had finished is safe")
@@ -247,6 +249,8 @@ def _run(
     works: dict[str, Work] = {}
 
     def finish(name: str, row: SurveyRow, *, kept: bool = False) -> None:
+        if row.status == "done" and not kept:
+            note_finished(out / name)  # here, too: workers on other computers have another cache folder
         rows[name] = row
         works.pop(name, None)
         watch.finished(name, row, kept=kept)
@@ -260,6 +264,12 @@ def _run(
                 inputs = fingerprint(plan.survey)
                 job = SurveyJob(plan.file, out, plan.folder, inputs, allow_outside, owner_of(out / LOCK))
                 earlier = finished_row(job) if resume else None
+                if earlier is not None and not was_finished(out / plan.folder):
+                    watch.remark(
+                        f"{out / plan.folder}: no run of yours is known to have finished this result, it is "
+                        "computed again"
+                    )
+                    earlier = None
                 if earlier is None:
                     works[plan.folder] = _work(job, plan.survey, comparers)
             except Exception as error:

@@ -16,8 +16,8 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
+from sfm.batch.job import SurveyRow
 from sfm.batch.pages import totals
-from sfm.batch.survey import SurveyRow
 from sfm.kernels.compiling import COMPILING
 
 COLOURS = {"good": "green", "fair": "yellow", "bad": "red", "": "red"}

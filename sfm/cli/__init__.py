@@ -59,7 +59,7 @@ def _run() -> None:
 
 def _own_up(error: Exception) -> None:
     """End with one line about what nobody has foreseen; not enough memory is something to put right."""
-    from sfm.faults import FAULT, is_fault, keep_traceback, told_of_error
+    from sfm.runtime.faults import FAULT, is_fault, keep_traceback, told_of_error
 
     told = told_of_error(error)
     if not is_fault(error):

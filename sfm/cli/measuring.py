@@ -10,8 +10,8 @@ import typer
 
 from sfm.cli.starting import loading
 from sfm.errors import GeometryError, SurveyFileError
-from sfm.faults import working_on
 from sfm.orientation.resection import METHODS
+from sfm.runtime.faults import working_on
 
 if TYPE_CHECKING:
     from sfm.conventions import IntArray

@@ -23,7 +23,7 @@ def guard_outlets() -> None:
         sys.stderr = _guarded(sys.stderr, ends_program=False)
 
 
-def _guarded(outlet: Any, *, ends_program: bool) -> TextIO:
+def _guarded(outlet: TextIO | None, *, ends_program: bool) -> TextIO | None:
     """Return what writes to the same file, pipe or socket; terminals and absent outlets stay as they are."""
     if not isinstance(outlet, io.TextIOWrapper) or outlet.isatty():
         return outlet

@@ -9,7 +9,7 @@ import typer
 
 from sfm.cli.starting import loading
 from sfm.errors import OutputError
-from sfm.faults import working_on
+from sfm.runtime.faults import working_on
 
 
 def refine(
@@ -35,8 +35,8 @@ def refine(
     """
     with loading():
         from adapters.colmap.camera_models import read_model, write_model
-        from sfm.cli.console import drawn_progress
         from sfm.files.whole_files import refuse_links, whole_folder
+        from sfm.runtime.progress_bar import drawn_progress
         from sfm.survey.refine import refine_model, refinement_text
 
     if out is not None:

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from sfm.cli.starting import loading
-from sfm.faults import working_on
+from sfm.runtime.faults import working_on
 
 WORSE = 1  # exit code where the in-house adjuster was ever the worse one
 
@@ -26,11 +26,11 @@ def validate(
     Exit code 1 if the in-house adjuster was ever the worse one.
     """
     with loading():
-        from adapters.colmap.covariance import ColmapBackend
-        from sfm.cli.console import drawn_progress
+        from adapters.colmap.validation_backend import ColmapBackend
         from sfm.comparison.adjuster_validation import validate as validate_networks
         from sfm.files.whole_files import refuse_foreign_folder
         from sfm.report.validation import in_words, largest, write_validation
+        from sfm.runtime.progress_bar import drawn_progress
 
     refuse_foreign_folder(out)
     with drawn_progress() as progress:

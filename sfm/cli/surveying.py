@@ -12,11 +12,11 @@ import typer
 
 from sfm.cli.starting import loading
 from sfm.errors import KolinearError
-from sfm.faults import FAULT, working_on
+from sfm.runtime.faults import FAULT, working_on
 
 if TYPE_CHECKING:
-    from sfm.survey.comparison import OtherPrograms
     from sfm.survey.inputs.survey import Survey
+    from sfm.survey.other_programs import OtherPrograms
 
 FAILED = 1  # exit code where a survey, or one of a batch, has no dependable result
 
@@ -93,14 +93,15 @@ def _run_survey(
     begun = time.perf_counter()
     with loading():
         from sfm.api import colmap_writer, cores, one_blas_thread, programs_of
-        from sfm.cli.console import drawn_progress, tell_result
+        from sfm.cli.console import tell_result
         from sfm.pipeline import run_survey
         from sfm.report.findings.findings import findings_of
         from sfm.report.log import SurveyLog
         from sfm.report.output import write_result
+        from sfm.runtime.progress_bar import drawn_progress
         from sfm.survey.inputs.survey import survey_of_file
         from sfm.survey.inputs.survey_file import read_survey_file
-        from sfm.survey.target_store import TargetStore
+        from sfm.survey.measuring.target_store import TargetStore
 
     with working_on(str(survey_file)):
         described = read_survey_file(survey_file, allow_outside=allow_outside)
@@ -184,8 +185,8 @@ def batch(
 
         from adapters.dask_cluster import fitting_workers, local_engine, remote_engine
         from sfm.api import colmap_writer
+        from sfm.batch.job import Comparers
         from sfm.batch.run import calls_of, find_surveys, run_batch
-        from sfm.batch.survey import Comparers
         from sfm.batch.table import BatchTable, print_batch, stopping_at_terminate
 
     files = find_surveys(surveys)

@@ -29,7 +29,7 @@ from sfm.comparison.random_network import Plan, RandomNetwork, random_network
 from sfm.conventions import BoolArray, FloatArray
 from sfm.errors import KolinearError
 from sfm.network import Estimate, Network
-from sfm.progress import SILENT, Progress
+from sfm.runtime.progress import SILENT, Progress
 from sfm.similarity import fit_similarity
 
 T = TypeVar("T")

@@ -11,7 +11,8 @@ from sfm.camera import Camera
 from sfm.comparison.camera_conversion import Conversion, convert_camera
 from sfm.conventions import BoolArray
 from sfm.errors import GeometryError
-from sfm.network import Estimate, ImagePoints, Network, reduce_network, supported
+from sfm.network import Estimate, ImagePoints, Network
+from sfm.reduced_network import reduce_network, supported
 
 MIN_RAYS, MIN_POINTS = 2, 3  # photographs that determine a point, points that determine a photograph
 GROUPS = (slice(0, 2), slice(2, 4), slice(4, None))  # focal lengths, principal point, distortion

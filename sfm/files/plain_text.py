@@ -83,7 +83,7 @@ def shown(text: str) -> str:
 
 
 def as_plain(text: str) -> str:
-    """Return a text with what is not plain in it written out, as \\xff or \\n."""
+    r"""Return a text with what is not plain in it written out, as \xff or \n."""
     return _HIDDEN.sub(lambda found: ascii(found[0])[1:-1].replace("\\udc", "\\x"), text)
 
 

@@ -10,11 +10,12 @@ import numpy as np
 from sfm.camera import Camera, project, tangents_from_pixel
 from sfm.conventions import MAD_TO_SIGMA, FloatArray
 from sfm.errors import GeometryError
-from sfm.network import Estimate, Network, empty_estimate, reduce_network, rows_of
+from sfm.network import Estimate, Network, empty_estimate, rows_of
 from sfm.orientation.intersection import intersect
 from sfm.orientation.resection.ransac import fewest_fitting, resect_robust
 from sfm.orientation.starting_pair import Start, best_start
 from sfm.orientation.support import photograph_support
+from sfm.reduced_network import reduce_network
 
 FIRST_ADJUSTMENT = 4  # photographs
 MIN_ANGLE_DEG = 2.0  # smallest ray angle of a point that others are oriented on

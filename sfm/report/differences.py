@@ -16,7 +16,7 @@ from sfm.report.figures.comparisons import difference_figure
 from sfm.report.figures.plots import Plot, png
 from sfm.report.html.page import render
 from sfm.report.numbers import finer_unit, significant
-from sfm.report.pages import write_files
+from sfm.report.page_files import write_files
 
 COLUMNS = ("id", "dX", "dY", "dZ", "sdX", "sdY", "sdZ", "T", "significant")
 FILES = ("differences.csv", "comparison.json", "comparison.html")

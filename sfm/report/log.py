@@ -26,8 +26,8 @@ from typing import Any, Self
 
 from sfm.errors import OutputError
 from sfm.files.whole_files import make_folder, open_own
-from sfm.progress import SILENT, Progress
 from sfm.report.findings.findings import Findings
+from sfm.runtime.progress import SILENT, Progress
 
 LOG = "log.jsonl"  # in the folder of a result
 MAX_LOG_BYTES = 50_000_000  # of a log that is read back

@@ -26,7 +26,8 @@ def refuse_outputs(
     """Refuse outputs of another ending, and those that would take the place of anything but earlier ones.
 
     Args:
-        out, picture: table and picture to be written, or None.
+        out: table to be written, or None.
+        picture: picture to be written, or None.
         inputs: files that are read.
         columns: header of a table.
         as_json: whether JSON is asked for.

@@ -54,11 +54,17 @@ def match_command(
     """Match points of two photograph files.
 
     Args:
-        left_path, right_path: the photographs.
+        left_path: the photograph in which points are given.
+        right_path: the photograph in which they are found.
         point: "COL,ROW" in the left photograph, px; either this or `points`.
         points: table of points, see `read_points_to_match`.
-        method, template_px, search_px, equalise, interpolation, min_correlation, back_px: see
-            `sfm.matching.conjugate.match_points`.
+        method: this and the next six as in `sfm.matching.conjugate.match_points`.
+        template_px: width of the template, px.
+        search_px: width of the search area, px.
+        equalise: whether the histograms of both photographs are equalised before.
+        interpolation: between pixels.
+        min_correlation: least correlation coefficient.
+        back_px: largest distance of matching back, px; None for no matching back.
         as_json: JSON in place of the table.
         out: file .csv or .json that gets the table, in place of the terminal.
         picture: PNG file that gets template, matched patch and their difference.

@@ -9,15 +9,15 @@ from dataclasses import replace
 from pathlib import Path
 
 from sfm.files.whole_files import MANIFEST, refuse_foreign_folder, whole_folder
-from sfm.progress import SILENT, Progress
 from sfm.report.figures.overlays import draw_overlays
 from sfm.report.figures.plots import all_plots
 from sfm.report.findings.findings import Findings
-from sfm.report.html.report import report_page
+from sfm.report.html.report_page import report_page
 from sfm.report.tables.csv_files import write_tables
 from sfm.report.tables.summary import write_summary
-from sfm.report.text.report import text_report
+from sfm.report.text.text_report import text_report
 from sfm.result import StageTime
+from sfm.runtime.progress import SILENT, Progress
 
 MAX_FOLDER_BYTES = 100  # of the name of a survey's folder; disks take 255, endings included
 

@@ -16,7 +16,7 @@ from sfm.files.plain_text import csv_text, or_none
 from sfm.report.figures.comparisons import time_figure
 from sfm.report.figures.plots import Plot, png
 from sfm.report.html.page import render
-from sfm.report.pages import write_files
+from sfm.report.page_files import write_files
 
 FILES = ("validation.csv", "validation.json", "validation.html")
 COLUMNS = (

@@ -6,11 +6,11 @@ import numpy as np
 
 from sfm.adjustment.quality.correlations import orientation_correlations
 from sfm.orientation.sequence import Orientation
-from sfm.progress import StageClock
 from sfm.result import FailedImage, StageTime, SurveyResult
-from sfm.survey.comparison import SurveyComparison
+from sfm.runtime.progress import StageClock
 from sfm.survey.inputs.survey import Survey
-from sfm.survey.measurements import Measurements
+from sfm.survey.measuring.measurements import Measurements
+from sfm.survey.other_programs import SurveyComparison
 from sfm.survey.solution import Correspondences, Solution
 
 

@@ -7,13 +7,14 @@ import numpy as np
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.solve import adjust
 from sfm.conventions import MAD_TO_SIGMA
-from sfm.network import Estimate, Network, reduce_network
+from sfm.network import Estimate, Network
 from sfm.orientation.sequence import Orientation
-from sfm.survey.circles import check_circles
+from sfm.reduced_network import reduce_network
 from sfm.survey.inputs.survey import Survey
-from sfm.survey.measurements import MeasuredPhotographs, Measurements, Naming
-from sfm.survey.network import build_network, match_uncoded, min_rays
+from sfm.survey.measuring.circles import check_circles
+from sfm.survey.measuring.measurements import MeasuredPhotographs, Measurements, Naming
 from sfm.survey.solution import TOLERANCE_FACTOR, Correspondences, determined, merge_estimate
+from sfm.survey.target_network import build_network, match_uncoded, min_rays
 
 ROUNDS = 3  # matching with the orientation at hand, with the adjusted one, and once more to confirm
 MIN_TOLERANCE_PX = 1.0  # below it a difference is for the statistical test, not for the matching

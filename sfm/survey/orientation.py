@@ -9,13 +9,14 @@ import numpy as np
 from sfm.camera import tangents_from_pixel
 from sfm.conventions import BoolArray
 from sfm.errors import GeometryError
-from sfm.network import Estimate, Network, reduce_network
+from sfm.network import Estimate, Network
 from sfm.orientation.intersection import intersect
 from sfm.orientation.sequence import MIN_POINTS, Orientation, orient
 from sfm.photographs.reading import read_photograph
+from sfm.reduced_network import reduce_network
 from sfm.survey.inputs.start import start_values
 from sfm.survey.inputs.survey import Survey
-from sfm.survey.measurements import MeasuredPhotographs, Measurements
+from sfm.survey.measuring.measurements import MeasuredPhotographs, Measurements
 from sfm.survey.solution import refine
 from sfm.targets.codes.rings import RINGS
 from sfm.targets.detect import find_targets

@@ -17,9 +17,10 @@ from sfm.matching.lsm.multi_photo import match_multi
 from sfm.matching.lsm.projected_points import pictures_of
 from sfm.matching.match_flags import LsmFlag, in_words
 from sfm.matching.radiometry import odd_window
-from sfm.network import Estimate, ImagePoints, Network, reduce_network
+from sfm.network import Estimate, ImagePoints, Network
 from sfm.photographs.reading import read_photograph
-from sfm.progress import SILENT, Progress
+from sfm.reduced_network import reduce_network
+from sfm.runtime.progress import SILENT, Progress
 from sfm.survey.solution import FALSE_ALARM, TOLERANCE_FACTOR, determined, merge_estimate
 
 MIN_RAYS = 3

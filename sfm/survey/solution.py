@@ -14,9 +14,10 @@ from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.errors import GeometryError
-from sfm.network import Estimate, Network, reduce_network, supported
+from sfm.network import Estimate, Network
+from sfm.reduced_network import reduce_network, supported
 from sfm.result import ControlCheck, Eccentricity
-from sfm.survey.datum import (
+from sfm.survey.datum_definition import (
     Contradiction,
     datum_warnings,
     find_contradiction,
@@ -27,7 +28,7 @@ from sfm.survey.datum import (
 from sfm.survey.exterior import add_exterior
 from sfm.survey.inputs.interior import split_cameras, without_idle_cameras
 from sfm.survey.inputs.survey import Survey
-from sfm.survey.measurements import Naming
+from sfm.survey.measuring.measurements import Naming
 
 TOLERANCE_FACTOR = 6.0  # of the robust spread of the residuals
 FALSE_ALARM = 0.05  # chance that a survey without any outlier loses an image coordinate; Pope (1976)

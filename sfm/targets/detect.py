@@ -8,6 +8,7 @@ import numpy as np
 
 from sfm.conventions import AnyArray, FloatArray, IntArray
 from sfm.errors import KolinearError, PhotographError
+from sfm.targets.candidates import find_counters, find_duplicates, find_parts_of_codes, judge_fits
 from sfm.targets.codes.families import Family, code_family
 from sfm.targets.codes.ring_reading import UNCODED, UNREADABLE, read_codes
 from sfm.targets.codes.rings import CodeFamily
@@ -17,7 +18,6 @@ from sfm.targets.fits.edge_ellipse import measure_edge_ellipses
 from sfm.targets.flags import Flag
 from sfm.targets.measure import EllipseFit, axes_covariance, axes_from_shape, fit_ellipse_model
 from sfm.targets.outlines import estimate_noise, find_outlines, scale_of
-from sfm.targets.rejection import find_counters, find_duplicates, find_parts_of_codes, judge_fits
 
 SIGNS = {"dark": (-1,), "bright": (1,), "auto": (1, -1)}
 CENTRES = ("model", "edges", *WEIGHTS)

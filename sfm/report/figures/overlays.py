@@ -12,8 +12,8 @@ from sfm.adjustment.result import Adjustment
 from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
 from sfm.errors import PhotographError
 from sfm.photographs.reading import read_photograph
-from sfm.progress import SILENT, Progress
 from sfm.result import PhotographTargets, SurveyResult, in_words
+from sfm.runtime.progress import SILENT, Progress
 from sfm.targets.flags import Flag
 
 MAX_SIDE_PX = 2400  # longer photographs are drawn smaller

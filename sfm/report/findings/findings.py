@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from sfm.report.findings.bundle_statistics import Statistics, statistics_of
 from sfm.report.findings.checks import (
     CheckedControl,
     LargeResidual,
@@ -21,14 +22,13 @@ from sfm.report.findings.checks import (
     object_size,
     sigma0_of,
 )
-from sfm.report.findings.comparison import ComparisonFindings, comparison_of
 from sfm.report.findings.geometry import Geometry, geometry_of
-from sfm.report.findings.given import Given, given_of
-from sfm.report.findings.interior import InteriorOrientation, interior_of
+from sfm.report.findings.given_residuals import Given, given_of
+from sfm.report.findings.interior_parameters import InteriorOrientation, interior_of
+from sfm.report.findings.other_adjuster import ComparisonFindings, comparison_of
 from sfm.report.findings.precision import Precision, precision_of
 from sfm.report.findings.rejected import Rejected, rejected_of
-from sfm.report.findings.solution import PhotographRow, PointRow, photographs_of, points_of
-from sfm.report.findings.statistics import Statistics, statistics_of
+from sfm.report.findings.solution_rows import PhotographRow, PointRow, photographs_of, points_of
 from sfm.report.findings.verdict import Evidence, Verdict, judge
 from sfm.result import SurveyResult
 

@@ -16,7 +16,7 @@ from scipy.spatial import ConvexHull, QhullError
 
 from sfm.adjustment.result import Adjustment
 from sfm.conventions import FloatArray, IntArray
-from sfm.report.findings.interior import families, family_of_photographs
+from sfm.report.findings.interior_parameters import families, family_of_photographs
 
 WEAK_DEG = 10.0  # below it a point is eleven times less precise along its rays than across
 MOST_PAIRS = 4_000_000  # of rays that are compared at a time

@@ -10,9 +10,9 @@ import numpy as np
 from sfm.adjustment.quality.statistics import ALPHA, GlobalTest, component_tests
 from sfm.adjustment.quality.variance_components import IMAGE_POINTS
 from sfm.conventions import MAD_TO_SIGMA
+from sfm.report.findings.bundle_statistics import Statistics
 from sfm.report.findings.checks import CheckedControl, LongestResidual, Sigma0
-from sfm.report.findings.given import Given, GivenResiduals, GivenValue
-from sfm.report.findings.statistics import Statistics
+from sfm.report.findings.given_residuals import Given, GivenResiduals, GivenValue
 from sfm.report.numbers import finer_unit, significant
 from sfm.result import SurveyResult
 

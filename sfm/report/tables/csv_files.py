@@ -13,9 +13,9 @@ import numpy as np
 
 from sfm.adjustment.result import Adjustment
 from sfm.files.plain_text import csv_text
+from sfm.report.findings.bundle_statistics import Statistics
 from sfm.report.findings.findings import Findings
-from sfm.report.findings.given import Given
-from sfm.report.findings.statistics import Statistics
+from sfm.report.findings.given_residuals import Given
 
 
 def write_tables(findings: Findings, folder: Path) -> None:

@@ -11,9 +11,9 @@ from sfm.adjustment.quality.variance_components import VarianceComponents
 from sfm.adjustment.result import Adjustment
 from sfm.conventions import FloatArray
 from sfm.files.plain_text import or_none
+from sfm.report.findings.bundle_statistics import Spread, spread
 from sfm.report.findings.findings import Findings
-from sfm.report.findings.given import GivenResiduals
-from sfm.report.findings.statistics import Spread, spread
+from sfm.report.findings.given_residuals import GivenResiduals
 from sfm.report.phrases import words_of_test, words_of_weights
 from sfm.result import SurveyResult
 

@@ -13,6 +13,9 @@ from sfm.errors import PhotographError, SurveyFileError
 from sfm.photographs.exif import Metadata
 from sfm.survey.inputs.settings import CameraSettings
 
+MAX_PIXEL_MM = 1000.0  # side of a pixel; of models without a size it is 1 mm
+MAX_PIXEL_RATIO = 10.0  # of its sides; anamorphic lenses and line scanners stay below 3
+
 
 def camera_of_image(cameras: Sequence[CameraSettings], image: str, source: str) -> int:
     """Return the index of the camera whose glob an image name matches.
@@ -78,6 +81,11 @@ def start_cameras(
         if pixel is None:
             raise SurveyFileError(
                 f"{where}: no photograph's EXIF data tell the pixel size, pixel_mm or sensor_mm is needed"
+            )
+        if max(pixel) > min(MAX_PIXEL_MM, MAX_PIXEL_RATIO * min(pixel)):
+            raise SurveyFileError(
+                f"{where}: a pixel of {pixel[0]:g} x {pixel[1]:g} mm, expected sides of at most "
+                f"{MAX_PIXEL_MM:g} mm that differ by a factor of at most {MAX_PIXEL_RATIO:g}"
             )
         if focal is None and "fx" in known:
             focal = known["fx"] * pixel[0]

@@ -15,7 +15,7 @@ from sfm.survey.inputs.given import KnownPoints, Observations, ScaleBar
 from sfm.survey.inputs.interior import refuse_ungrouped
 from sfm.survey.inputs.photograph_list import refuse_many
 from sfm.survey.inputs.survey import Survey
-from sfm.survey.measurements import Measurements
+from sfm.survey.measuring.measurements import Measurements
 
 MIN_RAYS = 2  # photographs that a point with a name needs
 

@@ -1,0 +1,286 @@
+"""One survey of a batch, as a worker runs it: its photographs one by one, then the rest, into one folder."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import time
+import traceback
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, fields, replace
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from sfm.batch.finished import note_finished
+from sfm.errors import FolderInUseError, OutputError
+from sfm.files.folder_lock import Owner, locked, owner_of
+from sfm.files.plain_text import as_plain
+from sfm.kernels.compiling import when_compiling
+from sfm.pipeline import run_survey
+from sfm.report.findings.findings import findings_of
+from sfm.report.log import LOG, SurveyLog, read_log, remove_log, result_entries
+from sfm.report.output import write_result
+from sfm.result import SurveyResult
+from sfm.runtime.executor import Tell
+from sfm.runtime.faults import is_fault, told_of_error
+from sfm.survey.inputs.photograph_list import find_photographs
+from sfm.survey.inputs.survey import Survey, read_survey, survey_family
+from sfm.survey.inputs.survey_file import SurveyFile
+from sfm.survey.measuring.target_store import TargetStore
+from sfm.survey.measuring.targets import measure_photograph
+from sfm.survey.other_programs import OtherPrograms
+from sfm.targets.detect import Targets
+
+LOCK = ".lock"  # of the batch
+VERDICTS = ("good", "fair", "bad")
+LOGS = "logs"  # folder of the logs of surveys that have no result
+
+
+@dataclass(frozen=True)
+class SurveyJob:
+    """What a worker must know to run a survey."""
+
+    file: Path  # the survey file
+    out: Path  # folder of the batch
+    folder: str  # name of the survey's folder in it
+    inputs: str  # fingerprint of everything that the survey reads
+    allow_outside: bool  # whether the survey file may name files outside its folder
+    owner: Owner | None  # of the folder of the batch, who asked for this
+
+
+@dataclass(frozen=True)
+class Comparers:
+    """What surveys are compared with: functions of a module, so that they travel to workers."""
+
+    others_of: Callable[[Survey], OtherPrograms]  # those that a survey asks for
+    writer_of: Callable[[SurveyResult], Callable[[Path], None] | None]  # writes its model
+
+
+@dataclass(frozen=True)
+class PhotographNote:
+    """What came of a photograph, for the log."""
+
+    image: str
+    targets: int = 0
+    rejected: int = 0  # candidates
+    stored: bool = False  # measured in an earlier run
+    seconds: float = 0.0
+    failed: str = ""  # why it could not be read
+
+
+@dataclass(frozen=True)
+class MeasuredPhotograph:
+    """A photograph as the worker that measured it hands it to the one that goes on."""
+
+    note: PhotographNote
+    held: dict[str, tuple[Targets, bool]]  # as of a TargetStore; computers may have no common one
+
+
+@dataclass(frozen=True)
+class SurveyRow:
+    """A survey in the tables of a batch; None where there is no result."""
+
+    survey: str  # its name
+    file: str  # survey file
+    folder: str  # folder of the result or of the log
+    status: str  # done | failed | set aside
+    verdict: str = ""  # good | fair | bad
+    sigma0_px: float | None = None
+    rms_px: float | None = None
+    photographs: int | None = None  # oriented
+    photographs_total: int | None = None
+    points: int | None = None
+    comparison: str = ""  # agrees | differs | none
+    seconds: float = 0.0  # of computing, photographs included
+    reason: str = ""  # why there is no result, one line
+    fault: bool = False  # whether that is an error of the program, not of the survey
+
+    @property
+    def succeeded(self) -> bool:
+        """Whether there is a result that can be depended on."""
+        return self.status == "done" and self.verdict != "bad"
+
+
+def lock_of(out: Path, folder: str) -> Path:
+    """Return the lock of a survey's folder, the same as that of a single run into it."""
+    return out / f".{folder}.lock"
+
+
+def measure_one(
+    job: SurveyJob, survey: SurveyFile, image: str, path: Path, *, tell: Tell
+) -> MeasuredPhotograph:
+    """Measure one photograph; why it cannot be read is part of what is returned."""
+    begun = time.perf_counter()
+    store = TargetStore.of_user()
+    try:
+        family = survey_family(survey.targets, survey.codes)
+        with when_compiling(lambda: tell({"compiling": True})):
+            targets, stored = measure_photograph(path, survey.targets, family, store)
+    except Exception as error:  # one that nobody has foreseen fails the survey, which comes upon it again
+        note = PhotographNote(image, failed=as_plain(told_of_error(error)))
+    else:
+        note = PhotographNote(image, len(targets), len(targets.rejected_xy), stored)
+    tell({"photograph": image})
+    return MeasuredPhotograph(replace(note, seconds=round(time.perf_counter() - begun, 4)), store.held)
+
+
+def reconstruct(
+    job: SurveyJob, comparers: Comparers, photographs: list[MeasuredPhotograph], *, tell: Tell
+) -> SurveyRow:
+    """Run a survey whose photographs are measured, and write its result.
+
+    Args:
+        job: the survey.
+        comparers: what to compare it with.
+        photographs: what came of its photographs.
+        tell: is told the stages.
+
+    Returns:
+        Its row, with a reason if there is no result.
+
+    Raises:
+        OutputError: the result or the log cannot be written.
+    """
+    begun = time.perf_counter()
+    _refuse_ended(job)
+    name = job.folder
+    live = job.out / LOGS / f"{job.folder}.jsonl"
+    with SurveyLog(live, watch=_Telling(tell)) as log, when_compiling(lambda: tell({"compiling": True})):
+        log.start(name, job.file, inputs=job.inputs)
+        for photograph in photographs:
+            log.note("photograph", **asdict(photograph.note))
+        before = sum(photograph.note.seconds for photograph in photographs)
+        held = {key: found for photograph in photographs for key, found in photograph.held.items()}
+        try:
+            survey = read_survey(job.file, allow_outside=job.allow_outside)
+            name = survey.name
+            row = _run(job, survey, comparers, held, log, lambda: before + time.perf_counter() - begun)
+        except Exception as error:
+            if isinstance(error, OutputError) and not isinstance(error, FolderInUseError):
+                log.note("failed", reason=str(error))  # others will not be written, either
+                raise
+            seconds = round(before + time.perf_counter() - begun, 3)
+            row = SurveyRow(name, str(job.file), job.folder, "failed", seconds=seconds)
+            return failed_row(log, error, row)
+    remove_log(live)  # the result has it
+    return row
+
+
+def failed_row(log: SurveyLog, error: Exception, row: SurveyRow) -> SurveyRow:
+    """Return the row of a survey that an error has ended, and write the error into its log.
+
+    Raises:
+        OutputError: the log cannot be written.
+    """
+    reason, fault = as_plain(told_of_error(error)), is_fault(error)
+    trace = {"trace": traceback.format_exception(error)} if fault else {}
+    log.note("failed", survey=row.survey, file=as_plain(row.file), reason=reason, **trace)
+    if fault:
+        reason += f"; its traceback is in {LOGS}/{row.folder}.jsonl"
+    return replace(row, reason=reason, fault=fault)
+
+
+def fingerprint(survey: SurveyFile) -> str:
+    """Return a SHA-256 of what a survey reads: tables by content, photographs by name, size and date.
+
+    Raises:
+        KolinearError: photographs are missing.
+        OSError: a file cannot be read.
+    """
+    digest = hashlib.sha256(survey.path.read_bytes())
+    for table in survey.tables():
+        if table.is_file():  # what cannot be read is said by who reads it; a pipe would never end
+            with table.open("rb") as file:
+                digest.update(hashlib.file_digest(file, "sha256").digest())
+    if survey.observations is None:
+        found = find_photographs(survey)
+        for name, path in zip(found.names, found.paths, strict=True):
+            status = path.stat() if path.exists() else path.lstat()  # a link that leads nowhere
+            digest.update(f"{name}\0{status.st_size}\0{status.st_mtime_ns}\0".encode())
+    return digest.hexdigest()
+
+
+def finished_row(job: SurveyJob) -> SurveyRow | None:
+    """Return the row of a result that this version has written from the same inputs, None without one."""
+    try:
+        entries = read_log(job.out / job.folder / LOG)
+    except OSError:
+        return None
+    begun = {"event": "start", "inputs": job.inputs, "version": version("kolinear")}
+    same = [entry for entry in entries if begun.items() <= entry.items()]
+    results = [entry for entry in entries if entry.get("event") == "result"]
+    if not same or not results:
+        return None
+    try:
+        row = _row(job, results[-1], float(results[-1].get("seconds", 0.0)))
+    except (TypeError, ValueError):
+        return None
+    return row if _is_sound(row) else None
+
+
+def _is_sound(row: SurveyRow) -> bool:
+    """Whether the values of a row that was read are such as this program writes."""
+    numbers = (row.sigma0_px, row.rms_px, row.photographs, row.photographs_total, row.points, row.seconds)
+    return (
+        row.verdict in VERDICTS
+        and all(isinstance(text, str) for text in (row.survey, row.comparison, row.reason))
+        and all(n is None or (isinstance(n, int | float) and math.isfinite(n)) for n in numbers)
+    )
+
+
+def _run(
+    job: SurveyJob,
+    survey: Survey,
+    comparers: Comparers,
+    held: dict[str, tuple[Targets, bool]],
+    log: SurveyLog,
+    seconds: Callable[[], float],
+) -> SurveyRow:
+    others = comparers.others_of(survey)
+    store = replace(TargetStore.of_user(), held=held)
+    result = run_survey(survey, others=others, store=store, progress=log)
+    log.stage("report")
+    findings = findings_of(result)
+    row: list[SurveyRow] = []
+
+    def close_log(folder: Path) -> None:
+        _refuse_ended(job)
+        row.append(_row(job, result_entries(findings), round(seconds(), 3)))
+        log.close_into(folder, findings, seconds=row[0].seconds)
+
+    with locked(lock_of(job.out, job.folder), job.out / job.folder):
+        write_result(
+            findings, job.out / job.folder, write_colmap=comparers.writer_of(result), finish=close_log
+        )
+        note_finished(job.out / job.folder)  # at once, in case the batch is killed now
+    return row[0]
+
+
+def _refuse_ended(job: SurveyJob) -> None:
+    """Raise OutputError where the run that asked for a survey is over.
+
+    Workers of a cluster work on when it was killed, and another run may have the folder by now.
+    """
+    if owner_of(job.out / LOCK) != job.owner:
+        raise OutputError(f"{job.out}: the run that asked for survey {job.folder} is over")
+
+
+def _row(job: SurveyJob, entries: dict[str, Any], seconds: float) -> SurveyRow:
+    """Return the row of a survey from the last line of its log; TypeError if that is something else."""
+    names = {field.name for field in fields(SurveyRow)} - {"file", "folder", "status", "seconds", "fault"}
+    known = {key: value for key, value in entries.items() if key in names}
+    return SurveyRow(file=str(job.file), folder=job.folder, status="done", seconds=seconds, **known)
+
+
+@dataclass(frozen=True)
+class _Telling:
+    """Progress that tells whoever watches the batch which stage begins."""
+
+    tell: Tell
+
+    def stage(self, name: str, total: int | None = None) -> None:
+        self.tell({"stage": name})
+
+    def advance(self, step: str = "") -> None:
+        """Photographs are told where they are measured."""

@@ -1,0 +1,88 @@
+"""A part of a network: some of its photographs, points and image points, counted anew."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from sfm.conventions import BoolArray, IntArray
+from sfm.network import Estimate, ExteriorObservations, Network, ObjectPoints, ScaleBars
+
+
+def reduce_network(
+    network: Network, estimate: Estimate, images: BoolArray, points: BoolArray, image_points: BoolArray
+) -> tuple[Network, Estimate]:
+    """Return the network and estimate of some photographs, points and image points only.
+
+    Args:
+        network: of m photographs, n points and k image points.
+        estimate: of the same.
+        images: photographs to keep, (m,).
+        points: points to keep, (n,).
+        image_points: image points to keep (those of dropped photographs and points go anyway), (k,).
+
+    Returns:
+        Reduced network and estimate, counted anew; control and scale bars of dropped points are gone.
+    """
+    image_index = np.cumsum(images) - 1
+    point_index = np.cumsum(points) - 1
+    seen = network.image_points.select(
+        image_points & images[network.image_points.image] & points[network.image_points.point]
+    )
+    control, bars, exterior = network.control, network.scale_bars, network.exterior
+    c = points[control.point]
+    e = images[exterior.image]
+    b = points[bars.start] & points[bars.end]
+    reduced = replace(
+        network,
+        images=tuple(name for name, keep in zip(network.images, images, strict=True) if keep),
+        camera=network.camera[images],
+        points=tuple(name for name, keep in zip(network.points, points, strict=True) if keep),
+        image_points=replace(seen, image=image_index[seen.image], point=point_index[seen.point]),
+        control=ObjectPoints(point_index[control.point[c]], control.xyz[c], control.covariance[c]),
+        scale_bars=ScaleBars(
+            point_index[bars.start[b]], point_index[bars.end[b]], bars.length[b], bars.sigma[b]
+        ),
+        exterior=ExteriorObservations(
+            image_index[exterior.image[e]], exterior.position[e], exterior.angles[e], exterior.covariance[e]
+        ),
+    )
+    return reduced, replace(
+        estimate,
+        position=estimate.position[images],
+        rotation=estimate.rotation[images],
+        points=estimate.points[points],
+    )
+
+
+def supported(
+    network: Network,
+    estimate: Estimate,
+    accepted: BoolArray,
+    *,
+    min_points: int,
+    min_rays: int | IntArray,
+) -> tuple[BoolArray, BoolArray]:
+    """Return the photographs and points that are left when those with too few image points go, in turn.
+
+    Args:
+        network: of m photographs, n points and k image points.
+        estimate: of the same.
+        accepted: image points that count, (k,).
+        min_points: image points that a photograph needs.
+        min_rays: image points that a point needs, of all or of each, (n,).
+
+    Returns:
+        Photographs (m,) and points (n,); of those, oriented and determined ones only.
+    """
+    seen = network.image_points
+    images, points = estimate.oriented, estimate.determined
+    while True:
+        used = accepted & images[seen.image] & points[seen.point]
+        shown = np.bincount(seen.image[used], minlength=len(images))
+        rays = np.bincount(seen.point[used], minlength=len(points))
+        still_images, still_points = images & (shown >= min_points), points & (rays >= min_rays)
+        if (still_images == images).all() and (still_points == points).all():
+            return images, points
+        images, points = still_images, still_points

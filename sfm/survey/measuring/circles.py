@@ -1,0 +1,182 @@
+"""The targets of a survey as circles in space: what is none, and the eccentricity of what is one."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from sfm.camera import pixel_jacobian
+from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
+from sfm.network import Estimate, ImagePoints, Network
+from sfm.orientation.eccentricity import CircleViews, ellipse_shape, fit_circles
+from sfm.result import Eccentricity
+from sfm.survey.datum_definition import object_scale
+from sfm.survey.inputs.given import Diameters
+from sfm.survey.inputs.survey import Survey
+from sfm.survey.measuring.measurements import MeasuredPhotographs, Naming
+from sfm.survey.target_network import UNNAMED
+from sfm.targets.flags import Flag
+
+NOT_A_CIRCLE = (
+    0.1  # relative misfit of the semi-axes; targets have 0.003 to 0.03, letters and leaves over 0.2
+)
+
+
+OTHER_SIZE = 0.1  # relative difference of a stated diameter from that of the ellipses, which know 1 to 3 %
+MOST_NAMED = 10  # ids in a warning
+
+
+@dataclass(frozen=True)
+class CircleCheck:
+    """The network after its targets were compared with circles in space."""
+
+    network: Network  # image points of the circles' centres
+    estimate: Estimate  # without the points that are no circles
+    no_circles: tuple[str, ...]  # uncoded points left out: their outlines are not images of one circle
+    eccentricity: Eccentricity | None  # what was corrected; None where nothing was
+    warnings: tuple[str, ...] = ()  # on stated diameters, one line each
+
+
+def check_circles(
+    survey: Survey, photographs: MeasuredPhotographs, naming: Naming, network: Network, estimate: Estimate
+) -> CircleCheck:
+    """Leave out uncoded points that are no circles, and correct the others for eccentricity.
+
+    Radius and normal of every target come from its ellipses; a diameter that the survey gives replaces the
+    radius. The covariance of the correction is added to that of the image point.
+
+    Args:
+        survey: says whether to correct the eccentricity, and the diameter if it is known.
+        photographs: the targets that `network` was built from.
+        naming: which point each of them is.
+        network: all image points.
+        estimate: adjusted, in any datum and scale.
+
+    """
+    seen = network.image_points
+    rows = estimate.oriented[seen.image] & estimate.determined[seen.point]
+    rows &= _named(photographs, naming, [(found.flag & Flag.CORNER) == 0 for found in photographs.targets])
+    rays = np.bincount(seen.point[rows], minlength=len(network.points))
+    rows &= rays[seen.point] >= 2
+    numbers, point = np.unique(seen.point[rows], return_inverse=True)
+    if not len(numbers):
+        return CircleCheck(network, estimate, (), None)
+    views = _views(photographs, naming, network, estimate, rows, point)
+    circles = fit_circles(views, len(numbers))
+    no_circle = numbers[(circles.misfit > NOT_A_CIRCLE) & (naming.code[numbers] < 0)]
+    points = estimate.points.copy()
+    points[no_circle] = np.nan
+    estimate = replace(estimate, points=points)
+    names = tuple(network.points[j] for j in no_circle)
+    if not survey.targets.eccentricity:
+        return CircleCheck(network, estimate, names, None)
+    names_of_circles = tuple(network.points[j] for j in numbers)
+    known, warnings = _known_radius(survey, names_of_circles), _unknown_ids(survey.diameters, network.points)
+    if np.isfinite(known).any():
+        scale = object_scale(network, estimate)
+        if np.isfinite(scale):
+            warnings += _other_sizes(survey, names_of_circles, known, scale * circles.radius)
+        else:  # then the targets themselves tell the scale
+            scale = float(np.nanmedian(known / circles.radius))
+        circles = fit_circles(views, len(numbers), radius=known / scale)
+    xy, covariance = seen.xy.copy(), seen.covariance.copy()
+    xy[rows] -= circles.shift
+    covariance[rows] += circles.shift_covariance
+    corrected = replace(network, image_points=ImagePoints(seen.image, seen.point, xy, covariance))
+    kept = np.isin(numbers, no_circle, invert=True)[point]
+    length = np.linalg.norm(circles.shift[kept], axis=1)
+    sigma = np.trace(circles.shift_covariance[kept], axis1=1, axis2=2) / 2
+    summary = Eccentricity(
+        float(length.max(initial=0.0)),
+        float(np.sqrt(np.sum(length**2) / max(2 * len(length), 1))),
+        float(np.sqrt(np.sum(sigma) / max(len(sigma), 1))),
+    )
+    return CircleCheck(corrected, estimate, names, summary, warnings)
+
+
+def _known_radius(survey: Survey, points: tuple[str, ...]) -> FloatArray:
+    """Return the radius of each target that the survey states, NaN where it does not, object unit, (n,)."""
+    diameter = survey.targets.diameter
+    radius = np.full(len(points), np.nan if diameter is None else diameter / 2)
+    if survey.diameters is not None:
+        stated = dict(zip(survey.diameters.names, survey.diameters.diameter.tolist(), strict=True))
+        radius = np.array([stated.get(p, 2 * r) / 2 for p, r in zip(points, radius, strict=True)])
+    return radius
+
+
+def _unknown_ids(given: Diameters | None, points: tuple[str, ...]) -> tuple[str, ...]:
+    """Return a warning on the ids of the table of diameters that no target of the survey has."""
+    known = set(points)
+    unknown = [name for name in given.names if name not in known] if given is not None else []
+    if given is None or not unknown:
+        return ()
+    more = f" and {len(unknown) - MOST_NAMED} more" if len(unknown) > MOST_NAMED else ""
+    return (
+        f"{given.source}: diameters of targets that are not in the survey: "
+        f"{', '.join(unknown[:MOST_NAMED])}{more}",
+    )
+
+
+def _other_sizes(
+    survey: Survey, points: tuple[str, ...], stated: FloatArray, found: FloatArray
+) -> tuple[str, ...]:
+    """Return warnings on stated diameters that the ellipses contradict.
+
+    The one diameter of all targets is judged by their median, since other round things may be among the
+    uncoded ones; those of a table are judged one by one.
+
+    Args:
+        survey: says which diameters are of single targets.
+        points: names of the targets, (n,).
+        stated: their radii, NaN where not stated, object unit, (n,).
+        found: their radii by the ellipses, object unit, (n,).
+    """
+    single = np.zeros(len(points), dtype=bool)
+    if survey.diameters is not None:
+        single = np.isin(points, survey.diameters.names)
+    lines = []
+    common = ~single & np.isfinite(stated)
+    if common.any():
+        given, seen = 2 * stated[common][0], 2 * float(np.median(found[common]))
+        if abs(np.log(given / seen)) > np.log1p(OTHER_SIZE):
+            lines.append(
+                f"targets.diameter is {given:.3g} {survey.unit}, but the ellipses of {common.sum()} targets "
+                f"give {seen:.3g} {survey.unit}"
+            )
+    differs = single & (np.abs(np.log(stated / found)) > np.log1p(OTHER_SIZE))
+    if differs.any() and survey.diameters is not None:
+        worst = int(np.nanargmax(np.where(differs, np.abs(np.log(stated / found)), np.nan)))
+        lines.append(
+            f"{survey.diameters.source}: the diameter of target {points[worst]} is {2 * stated[worst]:.3g} "
+            f"{survey.unit}, but its ellipses give {2 * found[worst]:.3g} {survey.unit} "
+            f"(more than {100 * OTHER_SIZE:g} % apart: {differs.sum()} of {single.sum()} targets)"
+        )
+    return tuple(lines)
+
+
+def _named(photographs: MeasuredPhotographs, naming: Naming, values: list[AnyArray]) -> AnyArray:
+    """Return what is known of the targets of each photograph for the image points made of them, (k, ...)."""
+    targets = zip(values, naming.point, strict=True)
+    return np.concatenate([of_photograph[named != UNNAMED] for of_photograph, named in targets])
+
+
+def _views(
+    photographs: MeasuredPhotographs,
+    naming: Naming,
+    network: Network,
+    estimate: Estimate,
+    rows: BoolArray,
+    point: IntArray,
+) -> CircleViews:
+    """Return the ellipses of some image points with the rays they were seen along."""
+    shapes = [ellipse_shape(found.semi_axes, found.angle) for found in photographs.targets]
+    shape = _named(photographs, naming, shapes)[rows]
+    seen = network.image_points.select(rows)
+    rotation = estimate.rotation[seen.image]
+    outward = estimate.points[seen.point] - estimate.position[seen.image]
+    jacobian = np.empty((len(seen), 2, 2))
+    for index, camera in enumerate(estimate.cameras):
+        own = network.camera[seen.image] == index
+        jacobian[own] = pixel_jacobian(camera, seen.xy[own])
+    return CircleViews(point, shape, np.einsum("kji,kj->ki", rotation, outward), rotation, jacobian)

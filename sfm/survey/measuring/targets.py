@@ -1,0 +1,121 @@
+"""The targets of all photographs of a survey, measured side by side."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from sfm.conventions import FloatArray
+from sfm.photographs.exif import Metadata, read_metadata
+from sfm.photographs.reading import read_photograph
+from sfm.runtime.progress import SILENT, Progress
+from sfm.survey.inputs.cameras import start_cameras
+from sfm.survey.inputs.photograph_list import PhotographList
+from sfm.survey.inputs.settings import TargetSettings
+from sfm.survey.inputs.survey import Survey
+from sfm.survey.measuring.measurements import MeasuredPhotographs
+from sfm.survey.measuring.photographs import each_photograph
+from sfm.survey.measuring.target_store import TargetStore, target_key
+from sfm.targets.codes.families import Family
+from sfm.targets.detect import Targets, find_targets
+
+
+def measure_photographs(
+    survey: Survey,
+    photographs: PhotographList,
+    *,
+    jobs: int = 1,
+    store: TargetStore | None = None,
+    progress: Progress = SILENT,
+) -> MeasuredPhotographs:
+    """Read the photographs, find, measure and decode their targets.
+
+    A photograph that cannot be read does not stop the others; it is named with the reason, as is one whose
+    file is a copy of another.
+
+    Args:
+        survey: says what the targets look like and what is known of the cameras.
+        photographs: the files.
+        jobs: how many photographs are worked on at a time.
+        store: keeps what is measured and spares measuring it again; None to measure everything.
+        progress: told of every photograph.
+
+    Raises:
+        GeometryError: fewer than two readable photographs.
+        PhotographError: photographs of different size under one camera.
+        SurveyFileError: the code table or the start values of a camera are unusable.
+    """
+    family = survey.family
+    found, failed = each_photograph(
+        photographs,
+        lambda path: _read_and_measure(path, survey.targets, family, store),
+        jobs=jobs,
+        progress=progress,
+    )
+    order = sorted(found)
+    names = tuple(photographs.names[k] for k in order)
+    camera = photographs.camera[order]
+    return MeasuredPhotographs(
+        names,
+        tuple(photographs.paths[k] for k in order),
+        camera,
+        start_cameras(survey.cameras, survey.source, tuple(found[k][0] for k in order), camera, names),
+        tuple(found[k][1] for k in order),
+        failed,
+        tuple(found[k][2] for k in order),
+    )
+
+
+def _read_and_measure(
+    path: Path, settings: TargetSettings, family: Family | None, store: TargetStore | None
+) -> tuple[Metadata, Targets, bool]:
+    targets, stored = measure_photograph(path, settings, family, store)  # says best what is wrong with a file
+    return read_metadata(path), targets, stored
+
+
+def measure_photograph(
+    path: Path,
+    settings: TargetSettings,
+    family: Family | None,
+    store: TargetStore | None = None,
+) -> tuple[Targets, bool]:
+    """Return the targets of one photograph and whether an earlier run has measured them.
+
+    The pixels are let go at once.
+
+    Args:
+        path: the photograph.
+        settings: what the targets look like.
+        family: their codes, None where they have none.
+        store: is asked first, and keeps and holds what had to be measured.
+
+    Raises:
+        PhotographError: the photograph cannot be read.
+    """
+    measured = settings.model_dump_json(include={"channel", "polarity", "min_diameter_px"})
+    key = "" if store is None else target_key(path, measured, family)
+    if store is not None:
+        if key not in store.held and (kept := store.load(key)) is not None:
+            store.held[key] = kept, True
+        if key in store.held:
+            return store.held[key]
+    targets = find_targets(
+        read_photograph(path, channel=settings.channel),
+        polarity=settings.polarity,
+        codes=family if family is not None else "none",
+        min_diameter_px=settings.min_diameter_px,
+    )
+    if store is not None:
+        store.save(key, targets)
+        store.held[key] = targets, False
+    return targets, False
+
+
+def image_point_covariance(targets: Targets, sigma_px: float) -> FloatArray:
+    """Return the covariance of image points for the adjustment, px^2, shape (k, 2, 2).
+
+    The fit of a target knows the noise of the photograph only. What it cannot know (JPEG, print, lens,
+    a sheet that is not flat) comes on top with the survey's sigma of an image coordinate.
+    """
+    return np.asarray(targets.covariance + sigma_px**2 * np.eye(2))

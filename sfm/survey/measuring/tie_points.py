@@ -1,0 +1,102 @@
+"""The tie points of all photographs of a survey without targets, as a network."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from sfm.conventions import AnyArray, IntArray
+from sfm.errors import GeometryError
+from sfm.matching.tracks.feature_tracks import find_tie_points
+from sfm.network import ImagePoints, Network
+from sfm.photographs.exif import Metadata, read_metadata
+from sfm.photographs.reading import read_photograph
+from sfm.result import PhotographTargets
+from sfm.runtime.progress import SILENT, Progress
+from sfm.survey.inputs.cameras import start_cameras
+from sfm.survey.inputs.photograph_list import PhotographList
+from sfm.survey.inputs.settings import TiePointSettings
+from sfm.survey.inputs.start import control_points, scale_bars
+from sfm.survey.inputs.survey import Survey
+from sfm.survey.measuring.measurements import Measurements
+from sfm.survey.measuring.photographs import each_photograph
+
+MIN_RAYS = 3  # photographs that must agree on a tie point; two rays cannot contradict each other
+
+
+def tie_photographs(
+    survey: Survey, photographs: PhotographList, *, jobs: int = 1, progress: Progress = SILENT
+) -> Measurements:
+    """Read the photographs and measure the points of natural texture that they have in common.
+
+    All photographs are in memory at the same time, since points are matched between any two of them. One
+    that cannot be read does not stop the others; it is named with the reason, as is a copy of another.
+
+    Args:
+        survey: says detector and windows, what is known of the cameras, and the sigma of an image coordinate.
+        photographs: the files.
+        jobs: how many photographs are worked on at a time.
+        progress: told of every photograph.
+
+    Raises:
+        GeometryError: fewer than two readable photographs, or no point that three of them have in common.
+        PhotographError: photographs of different size under one camera.
+        SurveyFileError: the start values of a camera are incomplete.
+    """
+    settings = survey.tie_points or TiePointSettings()
+    found, failed = each_photograph(photographs, _read, jobs=jobs, progress=progress)
+    read = sorted(found)
+    names = tuple(photographs.names[k] for k in read)
+    camera: IntArray = photographs.camera[read]
+    cameras = start_cameras(survey.cameras, survey.source, tuple(found[k][0] for k in read), camera, names)
+    tied = find_tie_points(
+        [found[k][1] for k in read],
+        detector=settings.detector,
+        window_px=settings.window_px,
+        max_features=settings.max_features,
+        min_rays=MIN_RAYS,
+        threads=jobs,
+    )
+    if not len(tied):
+        raise GeometryError(
+            f"no texture that {MIN_RAYS} photographs have in common; more overlap or "
+            "smaller steps between the photographs are needed"
+        )
+    points = tuple(f"t{j + 1:05d}" for j in range(int(tied.point.max()) + 1))
+    covariance = tied.covariance + survey.adjust.sigma_px**2 * np.eye(2)
+    network = Network(
+        names,
+        camera,
+        points,
+        ImagePoints(tied.image, tied.point, tied.xy, covariance),
+        control=control_points(survey.control, points),
+        scale_bars=scale_bars(survey.scale_bars, points),
+    )
+    paths = tuple(photographs.paths[k] for k in read)
+    return Measurements(
+        network,
+        cameras,
+        photographs.names,
+        np.full(len(points), MIN_RAYS),
+        failed,
+        _overlays(network, paths, settings.window_px),
+        photographs,
+    )
+
+
+def _overlays(network: Network, paths: Sequence[Path], window_px: int) -> tuple[PhotographTargets, ...]:
+    """Return what the report draws into each photograph: circles as wide as the windows."""
+    seen = network.image_points
+    drawn = []
+    for i, (name, path) in enumerate(zip(network.images, paths, strict=True)):
+        xy = seen.xy[seen.image == i]
+        radius = np.full((len(xy), 2), window_px / 2)
+        none = np.zeros(0, dtype=np.int64)
+        drawn.append(PhotographTargets(name, path, xy, radius, np.zeros(len(xy)), np.zeros((0, 2)), none))
+    return tuple(drawn)
+
+
+def _read(path: Path) -> tuple[Metadata, AnyArray]:
+    return read_metadata(path), read_photograph(path)

@@ -1,0 +1,74 @@
+"""The survey beside other programs: another adjuster on its network, another pipeline on its photographs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from sfm.comparison.adjusters import AdjusterComparison, BackendAdjustment, compare_adjusters
+from sfm.comparison.baseline import Baseline, BaselineComparison, compare_baseline
+from sfm.errors import KolinearError
+from sfm.network import Estimate, Network
+from sfm.runtime.progress import StageClock
+from sfm.survey.inputs.photograph_list import PhotographList
+from sfm.survey.solution import Solution
+
+Adjuster = Callable[[Network, Estimate], BackendAdjustment]
+"""another adjuster: network and start values in, its solution out"""
+Mapper = Callable[[Path, tuple[tuple[str, ...], ...]], Baseline]
+"""another pipeline: folder, and for each camera the names of its photographs in it, in; its solution out"""
+
+
+@dataclass(frozen=True)
+class OtherPrograms:
+    """What a survey is compared with; functions, so that the survey knows none of their libraries."""
+
+    adjuster: Adjuster | None = None
+    mapper: Mapper | None = None
+
+
+ALONE = OtherPrograms()
+"""compare with nothing"""
+
+
+@dataclass(frozen=True)
+class SurveyComparison:
+    """The survey beside what it was compared with; None where there is nothing."""
+
+    adjusters: AdjusterComparison | None = None
+    baseline: BaselineComparison | None = None
+    failures: tuple[str, ...] = ()  # why a comparison that was asked for is missing, one line each
+
+
+def compare_solution(
+    solution: Solution, others: OtherPrograms, clock: StageClock, *, files: PhotographList | None = None
+) -> SurveyComparison:
+    """Compare a solution with those of other programs.
+
+    The survey stands without them: a library that is missing or refuses is a line in the result and does
+    not lose it.
+
+    Args:
+        solution: of the survey.
+        others: what to compare with.
+        clock: of the survey; the stages it has timed so far are the survey's own time.
+        files: the photographs, for another pipeline.
+    """
+    own_seconds = sum(seconds for _, seconds in clock.seconds)
+    adjusters = baseline = None
+    failures = []
+    if others.adjuster is not None:
+        with clock.stage("comparison"):
+            try:
+                adjusters = compare_adjusters(solution.adjustment, others.adjuster)
+            except KolinearError as error:
+                failures.append(f"the comparison with the other adjuster failed: {error}")
+    if others.mapper is not None and files is not None:
+        with clock.stage("baseline"):
+            try:
+                mapped = others.mapper(files.folder, files.by_camera())
+                baseline = compare_baseline(solution.adjustment, mapped, seconds=own_seconds)
+            except KolinearError as error:
+                failures.append(f"the comparison with the other pipeline failed: {error}")
+    return SurveyComparison(adjusters, baseline, tuple(failures))

@@ -1,0 +1,194 @@
+"""From the targets of single photographs to the network: which target is which object point."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from sfm.camera import project
+from sfm.conventions import FloatArray, IntArray
+from sfm.matching.tracks.correspondence import match_targets
+from sfm.network import Estimate, ImagePoints, Network, ScaleBars
+from sfm.runtime.progress import SILENT, Progress
+from sfm.survey.inputs.photograph_list import PhotographList
+from sfm.survey.inputs.settings import TargetSettings
+from sfm.survey.inputs.start import control_points, scale_bars
+from sfm.survey.inputs.survey import Survey
+from sfm.survey.measuring.measurements import MeasuredPhotographs, Measurements, Naming
+from sfm.survey.measuring.target_store import TargetStore
+from sfm.survey.measuring.targets import image_point_covariance, measure_photographs
+from sfm.targets.codes.tags import CORNERS, corner_name
+from sfm.targets.flags import Flag
+
+UNNAMED = -1
+# Standard deviation of the size of tags where the survey states none, in parts of it: what desktop printers
+# and the setting "fit to page" by mistake are apart from true scale once the ruler was checked.
+TAG_SIGMA = 0.002
+MIN_RAYS = 3  # photographs that must agree on an uncoded point; two rays cannot contradict each other
+
+
+def measure_targets(
+    survey: Survey,
+    files: PhotographList,
+    *,
+    jobs: int = 1,
+    store: TargetStore | None = None,
+    progress: Progress = SILENT,
+) -> Measurements:
+    """Return the network of the coded targets of a survey, and the uncoded ones still without a name.
+
+    Args, Raises: as `measure_photographs`.
+    """
+    photographs = measure_photographs(survey, files, jobs=jobs, store=store, progress=progress)
+    naming = name_coded(photographs)
+    return Measurements(
+        build_network(survey, photographs, naming),
+        photographs.cameras,
+        files.names,
+        min_rays(naming),
+        photographs.failed,
+        photographs.overlays(),
+        files,
+        photographs,
+        naming,
+    )
+
+
+def min_rays(naming: Naming) -> IntArray:
+    """Return how many photographs each point needs: codes confirm themselves, uncoded points do not, (n,)."""
+    return np.where(naming.code >= 0, 2, MIN_RAYS)
+
+
+def name_coded(photographs: MeasuredPhotographs) -> Naming:
+    """Name the coded targets by their code; a code read twice in one photograph names nothing there."""
+    codes = [found.code for found in photographs.targets]
+    numbers = np.unique(np.concatenate([code[code >= 0] for code in codes]))
+    point = []
+    for code in codes:
+        values, first, count = np.unique(code, return_index=True, return_counts=True)
+        once = first[(values >= 0) & (count == 1)]
+        named = np.full(len(code), UNNAMED)
+        named[once] = np.searchsorted(numbers, code[once])
+        point.append(named)
+    corners = any(bool((found.flag & Flag.CORNER).any()) for found in photographs.targets)
+    names = tuple(corner_name(int(n)) if corners else str(n) for n in numbers)
+    return Naming(names, numbers.astype(np.int64), tuple(point), corners)
+
+
+def build_network(survey: Survey, photographs: MeasuredPhotographs, naming: Naming) -> Network:
+    """Return the network of all named targets, with control and scale bars among them."""
+    named = [np.flatnonzero(point != UNNAMED) for point in naming.point]
+    image = np.repeat(np.arange(len(named)), [len(rows) for rows in named])
+    targets = list(zip(photographs.targets, named, strict=True))
+    covariance = [image_point_covariance(found, survey.adjust.sigma_px)[rows] for found, rows in targets]
+    network = Network(
+        photographs.names,
+        photographs.camera,
+        naming.names,
+        ImagePoints(
+            image,
+            np.concatenate([point[rows] for point, rows in zip(naming.point, named, strict=True)]),
+            np.concatenate([found.xy[rows] for found, rows in targets]),
+            np.concatenate(covariance),
+        ),
+    )
+    bars = scale_bars(survey.scale_bars, naming.names)
+    if not survey.scale_bars and survey.control is None:
+        bars = tag_bars(survey.targets, naming)
+    return replace(network, control=control_points(survey.control, naming.names), scale_bars=bars)
+
+
+def tag_bars(targets: TargetSettings, naming: Naming) -> ScaleBars:
+    """Return the diagonals of all tags as scale bars, none without the size of the tags.
+
+    The scale of a print is the same for all its tags, so that they together know the scale no better than
+    one of them: each of n bars has the standard deviation of one times the root of n.
+    """
+    size, sigma = targets.tag_size, targets.tag_sigma
+    if size is None or not naming.corners:
+        return ScaleBars()
+    row = dict(zip(naming.code.tolist(), range(len(naming.code)), strict=True))
+    ends = [
+        (row[first], row[first + 2])
+        for first in row
+        if first >= 0 and first % len(CORNERS) < 2 and first + 2 in row  # a to c and b to d
+    ]
+    start, end = np.array(ends, dtype=np.int64).reshape(-1, 2).T
+    one = sigma if sigma is not None else TAG_SIGMA * size
+    n = len(start)
+    return ScaleBars(start, end, np.full(n, np.sqrt(2) * size), np.full(n, np.sqrt(2 * n) * one))
+
+
+def match_uncoded(
+    photographs: MeasuredPhotographs, naming: Naming, estimate: Estimate, *, tolerance_px: float
+) -> tuple[Naming, Estimate]:
+    """Name the uncoded targets anew by their agreement over all oriented photographs.
+
+    Coded targets keep their names where they are seen within the tolerance of their point; those that are
+    not, and targets whose code was not read, take the name of the coded point they coincide with or else
+    join the uncoded ones.
+
+    Args:
+        photographs: m photographs with their targets.
+        naming: names so far; its uncoded points are forgotten.
+        estimate: orientation, and the points of `naming`.
+        tolerance_px: largest distance of a target from its projected point.
+
+    Returns:
+        The naming with uncoded points behind the coded ones, and the estimate with their coordinates.
+    """
+    coded = np.flatnonzero(naming.code >= 0)
+    known = estimate.points[coded]
+    oriented = estimate.oriented
+    point = []
+    for i, found in enumerate(photographs.targets):
+        named = np.full(len(found), UNNAMED)
+        if oriented[i]:
+            camera = estimate.cameras[photographs.camera[i]]
+            projected = project(camera, estimate.position[i], estimate.rotation[i], known)
+            named = _nearest(found.xy, projected, found.code, naming.code[coded], tolerance_px)
+        point.append(named)
+    free = [np.flatnonzero(named == UNNAMED) for named in point]
+    matches = match_targets(
+        estimate,
+        photographs.camera,
+        [found.xy[rows] for found, rows in zip(photographs.targets, free, strict=True)],
+        tolerance_px=tolerance_px,
+        min_rays=MIN_RAYS,
+        diameters_px=[
+            2 * found.semi_axes[rows, 0] for found, rows in zip(photographs.targets, free, strict=True)
+        ],
+    )
+    for i, rows in enumerate(free):
+        own = matches.image == i
+        point[i][rows[matches.target[own]]] = len(coded) + matches.point[own]
+    uncoded = len(matches.points)
+    return (
+        replace(
+            naming,
+            names=tuple(naming.names[j] for j in coded) + tuple(f"u{k + 1:03d}" for k in range(uncoded)),
+            code=np.concatenate([naming.code[coded], np.full(uncoded, -1)]),
+            point=tuple(point),
+        ),
+        replace(estimate, points=np.vstack([known, matches.points])),
+    )
+
+
+def _nearest(
+    xy: FloatArray, projected: FloatArray, code: IntArray, point_code: IntArray, tolerance_px: float
+) -> IntArray:
+    """Return the coded point that each target coincides with, or UNNAMED; one target a point.
+
+    A target whose own code says another number is never renamed: one of the two is wrong.
+    """
+    named = np.full(len(xy), UNNAMED)
+    if not len(xy):
+        return named
+    for j in np.flatnonzero(np.isfinite(projected).all(axis=1)):
+        distance = np.hypot(*(xy - projected[j]).T)
+        distance[(code >= 0) & (code != point_code[j])] = np.inf
+        k = int(np.argmin(distance))
+        if distance[k] <= tolerance_px and named[k] == UNNAMED:
+            named[k] = j
+    return named

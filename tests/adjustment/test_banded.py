@@ -1,0 +1,339 @@
+"""Blocks of photographs: banded normal equations, and the covariance from them, against the full ones."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from threadpoolctl import threadpool_limits
+
+from sfm.adjustment.covariance import Marginal, marginal_of
+from sfm.adjustment.datum import Datum
+from sfm.adjustment.engine import iterate, normals
+from sfm.adjustment.engine.cofactors import hat_complement, marginal_covariance
+from sfm.adjustment.engine.normals import HALVED, Equations
+from sfm.adjustment.engine.solvers import choice
+from sfm.adjustment.engine.solvers.banded import BandSolver
+from sfm.adjustment.engine.solvers.banded_factor import BandFactor
+from sfm.adjustment.engine.solvers.banded_inverse import band_inverse
+from sfm.adjustment.engine.solvers.choice import choose_solver
+from sfm.adjustment.engine.solvers.dense import DenseFactor, DenseSolver
+from sfm.adjustment.engine.solvers.pairs import pairs_of
+from sfm.adjustment.engine.solvers.protocol import Solver
+from sfm.adjustment.engine.unknowns import Unknowns, unknowns_of
+from sfm.adjustment.quality.rank import null_motions
+from sfm.adjustment.result import Adjustment
+from sfm.adjustment.solve import adjust
+from sfm.camera import Camera, camera_from_values, project
+from sfm.conventions import FloatArray, IntArray, rotation_from_vector
+from sfm.errors import GeometryError
+from sfm.network import Estimate, ImagePoints, Network, ScaleBars
+from tests.synthetic import seed_of
+
+SIZE_PX, NOISE_PX = (2000, 1500), 0.1
+HEIGHT, FOOTPRINT = 100.0, np.array([100.0, 75.0])
+FREE = ("c", "x0", "y0", "K1", "P1", "P2")
+
+
+def lens(free: tuple[str, ...] = FREE) -> Camera:
+    return camera_from_values(
+        "A", "brown", SIZE_PX, (0.005, 0.005), c_mm=10.0, free=free, values=(("K1", -1e-4),)
+    )
+
+
+def aerial(
+    name: str,
+    strips: int,
+    per_strip: int,
+    points: int,
+    *,
+    rays: float = 6.0,
+    tilt: float = 0.05,
+    hills: float = 8.0,
+    noise_px: float = NOISE_PX,
+) -> tuple[Network, Estimate]:
+    """A block of near-nadir photographs in strips, and its truth."""
+    rng = np.random.default_rng(seed_of(name))
+    m = strips * per_strip
+    step = np.sqrt(FOOTPRINT.prod() / rays) * np.array([1.1, 1 / 1.1])
+    strip, place = np.divmod(np.arange(m), per_strip)
+    shuffled = rng.permutation(m)  # the order in which photographs are named says nothing
+    X0 = np.stack([place * step[0], strip * step[1], np.full(m, HEIGHT)], axis=1)[shuffled]
+    X0 += rng.normal(0, 1, X0.shape) * (tilt > 0)
+    R = rotation_from_vector(rng.normal(0, 1, (m, 3)) * tilt)
+    X = np.empty((points, 3))
+    X[:, :2] = rng.uniform(-FOOTPRINT / 4, np.array([per_strip, strips]) * step, (points, 2))
+    X[:, 2] = hills * np.sin(X[:, 0] / 37) * np.cos(X[:, 1] / 29)
+    return photographed(Estimate((lens(),), X0, R, X), np.ones((m, points), dtype=bool), rng, noise_px)
+
+
+def unordered(name: str, photographs: int, points: int, rays: int) -> tuple[Network, Estimate]:
+    """Photographs all around a cloud of points, each point seen in a few photographs at random."""
+    rng = np.random.default_rng(seed_of(name))
+    z = rng.normal(size=(photographs, 3))
+    z /= np.linalg.norm(z, axis=1, keepdims=True)
+    x = np.cross([0.1, 0.2, 1.0], z)
+    x /= np.linalg.norm(x, axis=1, keepdims=True)
+    R = np.stack([x, np.cross(z, x), z], axis=2)
+    X = rng.uniform(-0.7, 0.7, (points, 3))
+    seen = rng.random((photographs, points)).argsort(axis=0) < rays
+    return photographed(Estimate((lens(),), 4 * z, R, X), seen, rng)
+
+
+def photographed(
+    truth: Estimate, seen: IntArray, rng: np.random.Generator, noise_px: float = NOISE_PX
+) -> tuple[Network, Estimate]:
+    """The noisy image points of points with at least two rays, and the truth of these."""
+    image, point, xy = [], [], []
+    for i, on in enumerate(seen):
+        j = np.flatnonzero(on)
+        pixel = project(truth.cameras[0], truth.position[i], truth.rotation[i], truth.points[j])
+        inside = ((pixel > 0) & (pixel < np.array(SIZE_PX) - 1)).all(axis=1)
+        image.append(np.full(inside.sum(), i))
+        point.append(j[inside])
+        xy.append(pixel[inside] + noise_px * rng.standard_normal((inside.sum(), 2)))
+    i, j, measured = (np.concatenate(part) for part in (image, point, xy))
+    used = np.bincount(j, minlength=len(truth.points)) >= 2
+    on, number = used[j], np.cumsum(used) - 1
+    k = int(on.sum())
+    network = Network(
+        tuple(f"{i}" for i in range(len(seen))),
+        np.zeros(len(seen), dtype=np.int64),
+        tuple(f"{j}" for j in range(used.sum())),
+        ImagePoints(i[on], number[j[on]], measured[on], np.tile(np.eye(2) * NOISE_PX**2, (k, 1, 1))),
+    )
+    return network, replace(truth, points=truth.points[used])
+
+
+def spoiled(truth: Estimate, name: str, size: float) -> Estimate:
+    """Start values: positions and points off by a share of the distance, 0.3 deg, c by 0.5 %."""
+    rng = np.random.default_rng(seed_of(name + " start"))
+    c = truth.cameras[0]
+    factors = np.where(np.arange(len(c.parameters)) == 0, 1.005, 0)
+    return Estimate(
+        (c.with_parameters(c.parameters * factors),),
+        truth.position + rng.normal(0, size, truth.position.shape),
+        truth.rotation @ rotation_from_vector(rng.normal(0, 0.005, truth.position.shape)),
+        truth.points + rng.normal(0, size, truth.points.shape),
+    )
+
+
+def run(network: Network, start: Estimate, **options: object) -> Adjustment:
+    return adjust(network, start, datum=Datum("free"), reject="none", **options)  # type: ignore[arg-type]
+
+
+def solver_for(network: Network, estimate: Estimate) -> Solver:
+    return choose_solver(unknowns_of(network, estimate, use_control=False)[0])
+
+
+def pair_by_pair(layout: Unknowns) -> DenseSolver:
+    return DenseSolver(layout, pairs_of(layout.observations))
+
+
+def in_sigmas(Q: FloatArray, reference: FloatArray) -> float:
+    """Largest difference of two covariances over the product of the standard deviations."""
+    sigma = np.sqrt(np.diagonal(reference, axis1=-2, axis2=-1))
+    return float(np.abs((Q - reference) / (sigma[..., :, None] * sigma[..., None, :])).max())
+
+
+def test_inverse_within_the_band_equals_that_of_the_whole() -> None:
+    rng = np.random.default_rng(seed_of("band"))
+    for n, band in ((7, 2), (300, 17), (250, 120), (97, 96)):
+        L = np.tril(np.triu(rng.normal(size=(n, n)), -band))
+        L[np.arange(n), np.arange(n)] = rng.uniform(2, 3, n) * np.sqrt(band)
+        stored = np.zeros((n, band + 1))
+        inverse, expected = np.linalg.inv(L @ L.T), np.zeros((n, band + 1))
+        for d in range(band + 1):
+            stored[: n - d, d] = np.diagonal(L, -d)
+            expected[: n - d, d] = np.diagonal(inverse, -d)
+        assert np.abs(band_inverse(stored) - expected).max() < 1e-12 * np.abs(expected).max()
+
+
+def test_blocks_take_the_band_and_networks_of_many_rays_the_product_of_full_rows() -> None:
+    band = solver_for(*aerial("choice", 6, 14, 1700))
+    assert isinstance(band, BandSolver)
+    assert band.width < 84 / 3
+    pairs = solver_for(*unordered("some seen", 70, 300, 20))
+    assert isinstance(pairs, DenseSolver) and pairs.pairs is not None and not pairs.has_coarse
+    product = solver_for(*unordered("all seen", 70, 100, 70))
+    assert isinstance(product, DenseSolver) and product.pairs is None and product.has_coarse
+    small = solver_for(*aerial("small", 3, 8, 300))
+    assert isinstance(small, DenseSolver) and small.pairs is None
+
+
+@pytest.mark.parametrize("bars", [False, True])
+@pytest.mark.parametrize("kind", ["free", "minimal"])
+@pytest.mark.parametrize("pattern", ["band", "pairs"])
+def test_covariance_of_band_and_pairs_equals_that_of_the_product_of_full_rows(
+    pattern: str, kind: str, bars: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    network, truth = aerial("covariance", 6, 14, 1700)
+    twice = np.arange(0, len(network.image_points), 50)  # measured twice in a photograph
+    network = replace(
+        network,
+        image_points=network.image_points.select(np.append(np.arange(len(network.image_points)), twice)),
+    )
+    if bars:  # kept points in the border; the scale is no longer free
+        length = np.linalg.norm(truth.points[5] - truth.points[900])
+        ends = np.array([5]), np.array([900])
+        network = replace(network, scale_bars=ScaleBars(*ends, np.array([length]), np.array([0.01])))
+    a = run(network, truth, covariance=False, tolerance=1e-9)
+    if pattern == "pairs":
+        monkeypatch.setattr(iterate, "choose_solver", pair_by_pair)
+    band = marginal_of(a, datum=Datum(kind))
+    monkeypatch.setattr(iterate, "choose_solver", DenseSolver)
+    full = marginal_of(a, datum=Datum(kind))
+    if isinstance(band.optimum.factor, BandFactor):
+        assert pattern == "band"
+    else:
+        assert isinstance(band.optimum.factor, DenseFactor) and pattern == "pairs"
+        assert band.optimum.factor.pairs is not None
+        assert band.optimum.factor.pairs.tiles > 1
+    assert isinstance(full.optimum.factor, DenseFactor)
+    assert full.optimum.factor.pairs is None
+    for found in (band, full):
+        assert null_motions(found.optimum, found.layout) == (6 if bars else 7)
+    Q, reference = (marginal_covariance(m.optimum, m.layout, m.cofactors, 1.0) for m in (band, full))
+    free = np.diagonal(reference.points, axis1=1, axis2=2).all(axis=1)  # a minimal datum fixes some
+    assert in_sigmas(Q.points[free], reference.points[free]) < 1e-9
+    assert in_sigmas(Q.exterior, reference.exterior) < 1e-9
+    assert in_sigmas(Q.interior[0], reference.interior[0]) < 1e-9
+    assert np.abs(complement_of(band) - complement_of(full)).max() < 1e-9
+    some = np.arange(0, 500, 37), np.array([5, 77, 1200])
+    assert in_sigmas(band.joint(*some), full.joint(*some)) < 1e-9
+
+
+def complement_of(m: Marginal) -> FloatArray:
+    return hat_complement(m.optimum, m.layout, m.cofactors, np.ones(len(m.layout.order)))
+
+
+@pytest.mark.parametrize(("free", "defect"), [(("c", "x0", "y0"), 8), (FREE, 10)])
+def test_what_a_flat_nadir_block_leaves_open_is_found_in_the_band_too(
+    free: tuple[str, ...], defect: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Parallel views of flat ground: c goes with Z0, and x0, y0 with X0, Y0 where P1, P2 make up for K1."""
+    network, truth = aerial("flat", 6, 14, 1700, tilt=0.0, hills=0.0, noise_px=0.0)
+    truth = replace(truth, cameras=(lens(free),))
+    band = run(network, truth)
+    monkeypatch.setattr(iterate, "choose_solver", DenseSolver)
+    full = run(network, truth)
+    assert band.defect == full.defect == defect
+    assert len(band.undetermined) == len(full.undetermined) == defect - 7
+    assert any("c of camera A" in words for words in band.undetermined)
+    assert band.redundancy == full.redundancy
+    assert np.abs(band.redundancy_numbers - full.redundancy_numbers).max() < 1e-6
+
+
+@pytest.mark.parametrize(
+    ("strips", "per_strip", "points"),
+    [(6, 14, 1700), pytest.param(25, 40, 99000, marks=pytest.mark.slow)],
+)
+def test_a_weak_block_near_nadir_converges(strips: int, per_strip: int, points: int) -> None:
+    network, truth = aerial(f"weak {strips}", strips, per_strip, points, rays=5.0)
+    assert isinstance(solver_for(network, truth), BandSolver)
+    a = run(network, spoiled(truth, "weak", 0.25), covariance=False)
+    assert a.converged
+    assert abs(a.sigma0 - 1) < 5 / np.sqrt(2 * a.redundancy)
+
+
+@pytest.mark.parametrize(
+    ("photographs", "points"), [(90, 1200), pytest.param(500, 30000, marks=pytest.mark.slow)]
+)
+def test_an_unordered_collection_converges(photographs: int, points: int) -> None:
+    network, truth = unordered(f"unordered {photographs}", photographs, points, 6)
+    a = run(network, spoiled(truth, "unordered", 0.01), covariance=False)
+    assert a.converged
+    assert abs(a.sigma0 - 1) < 5 / np.sqrt(2 * a.redundancy)
+
+
+@pytest.mark.parametrize("method", ["gauss-newton", "levenberg-marquardt"])
+def test_a_step_to_where_nothing_can_be_solved_is_shortened(
+    method: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    network, truth = aerial("refused", 3, 5, 120)
+    start = spoiled(truth, "refused", 0.25)
+    expected = run(network, start, method=method, covariance=False)
+    calls = 0
+    solvable = DenseSolver.factor
+
+    def failing_once(*args: object, **options: object) -> object:
+        nonlocal calls
+        calls += 1
+        return None if calls == 2 else solvable(*args, **options)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(DenseSolver, "factor", failing_once)
+    a = run(network, start, method=method, covariance=False)
+    assert a.converged
+    assert a.vPv == pytest.approx(expected.vPv, rel=1e-9)
+
+
+def test_nowhere_to_go_ends_as_not_converged_and_bad_start_values_are_refused(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    network, truth = aerial("refused", 3, 5, 120)
+    start = spoiled(truth, "refused", 0.25)
+    at_start = start.position[0].copy()
+    solvable = DenseSolver.factor
+
+    def only_at_start(solver: DenseSolver, equations: Equations, *args: object, **options: object) -> object:
+        near = abs(equations.vPv - first) < 1e-6 * first
+        return solvable(solver, equations, *args, **options) if near else None  # type: ignore[arg-type]
+
+    def noted(solver: DenseSolver, equations: Equations, *args: object, **options: object) -> object:
+        seen.append(equations.vPv)
+        return solvable(solver, equations, *args, **options)  # type: ignore[arg-type]
+
+    first = np.inf
+    seen: list[float] = []
+    monkeypatch.setattr(DenseSolver, "factor", noted)
+    run(network, start, method="gauss-newton", covariance=False)
+    first = seen[0]
+    monkeypatch.setattr(DenseSolver, "factor", only_at_start)
+    a = run(network, start, method="gauss-newton", covariance=False)
+    assert not a.converged
+    assert np.allclose(a.estimate.position[0], at_start)
+    monkeypatch.setattr(DenseSolver, "factor", lambda *args, **options: None)
+    with pytest.raises(GeometryError, match="start values"):
+        run(network, start, method="gauss-newton", covariance=False)
+
+
+@pytest.mark.parametrize("way", ["chosen", "band", "pairs", "product"])
+def test_two_threads_give_the_same_to_the_last_bit(way: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a network large enough that a second thread takes half of the sums and of the products."""
+    if way == "pairs":
+        monkeypatch.setattr(iterate, "choose_solver", pair_by_pair)
+    elif way == "product":
+        monkeypatch.setattr(iterate, "choose_solver", DenseSolver)
+    elif way == "band":
+        monkeypatch.setattr(choice, "SMALL", 0)
+        monkeypatch.setattr(choice, "FACTOR_RATE", 1e-3)
+    network, truth = aerial("threads", 4, 14, 600, rays=40.0)
+    assert len(network.image_points) >= HALVED
+    results = []
+    for threads in (1, 2):
+        with threadpool_limits(threads):
+            a = run(network, truth)
+        results.append(a.estimate.points.tobytes() + a.covariance.points.tobytes())
+    assert results[0] == results[1]
+    monkeypatch.setattr(normals, "HALVED", len(network.image_points) + 1)
+    whole = run(network, truth)  # the sums in another order
+    assert np.abs(whole.estimate.points - a.estimate.points).max() < 1e-9 * HEIGHT
+
+
+@pytest.mark.parametrize("tolerance", [1e-3, 1e-6])
+@pytest.mark.parametrize("rays", [20, 50])
+def test_values_without_covariance_are_those_with_it(tolerance: float, rays: int) -> None:
+    """Their last step may be taken with the reduced matrix before it; the defect is found all the same."""
+    network, truth = unordered(f"simplified {rays}", 70, 300, rays)
+    start = spoiled(truth, "simplified", 0.02)
+    options = {"method": "gauss-newton", "tolerance": tolerance}
+    quick = run(network, start, covariance=False, **options)
+    whole = run(network, start, **options)
+    assert quick.converged
+    assert whole.converged
+    assert quick.defect == whole.defect == 7
+    assert quick.vPv == pytest.approx(whole.vPv, rel=1e-9)
+    moved = np.linalg.norm(quick.estimate.points - whole.estimate.points, axis=1)
+    sigma = np.sqrt(np.trace(whole.covariance.points, axis1=1, axis2=2))
+    assert (moved / sigma).max() < 10 * tolerance

@@ -1,0 +1,100 @@
+"""Rank defects: found, counted and named; the rest is adjusted all the same."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from sfm.adjustment.datum import Datum
+from sfm.adjustment.solve import adjust
+from sfm.camera import camera_from_values, project
+from sfm.conventions import BoolArray, rotation_from_angles
+from sfm.network import Estimate, ImagePoints, Network, ObjectPoints
+from tests.synthetic import C_MM, PIXEL_MM, SIZE_PX, make_network, seed_of
+
+FREE = Datum("free")
+
+
+def thinned(network: Network, keep: BoolArray) -> Network:
+    return replace(network, image_points=network.image_points.select(keep))
+
+
+def test_point_with_one_ray_and_photograph_with_two_points_are_named() -> None:
+    network, truth = make_network(seed_of("thin"), images=7, points=25)
+    k = network.image_points
+    keep = ~((k.point == 4) & (k.image != 2)) & ~((k.image == 5) & (k.point > 1))
+    a = adjust(thinned(network, keep), truth, datum=FREE, reject="none")
+    assert a.converged
+    assert a.undetermined == ("point 5: 1 ray, 2 are needed", "photograph image 6: 2 points, 3 are needed")
+    assert (a.defect, a.expected_defect) == (7 + 1 + 2, 7)
+    assert np.isnan(a.covariance.points[4]).all()
+    assert np.isnan(a.covariance.exterior[5]).all()
+    assert a.rejected.sum() == 3
+    assert a.redundancy == a.observations - a.unknowns + 7
+
+
+def flat_parallel_network() -> tuple[Network, Estimate]:
+    """Parallel vertical photographs of a plane: c and the flying height cannot be told apart."""
+    camera = camera_from_values("A", "brown", SIZE_PX, PIXEL_MM, c_mm=C_MM, free=("c",))
+    x, y = np.meshgrid(np.linspace(-1, 1, 5), np.linspace(-1, 1, 5))
+    points = np.stack([x.ravel(), y.ravel(), np.zeros(25)], axis=1)
+    position = np.array([[0, 0, 4.0], [0.3, 0, 4.0], [0, 0.3, 4.0], [-0.3, -0.2, 4.0]])
+    rotation = np.stack([rotation_from_angles(0, 0, kappa) for kappa in (0.0, 1.5, 3.0, 4.5)])
+    xy = np.concatenate([project(camera, X0, R, points) for X0, R in zip(position, rotation, strict=True)])
+    image, point = np.repeat(np.arange(4), 25), np.tile(np.arange(25), 4)
+    network = Network(
+        ("1", "2", "3", "4"),
+        np.zeros(4, dtype=np.int64),
+        tuple(str(j) for j in range(25)),
+        ImagePoints(image, point, xy, np.tile(0.01 * np.eye(2), (100, 1, 1))),
+    )
+    return network, Estimate((camera,), position, rotation, points)
+
+
+def test_c_and_height_of_a_flat_parallel_network_are_named() -> None:
+    network, truth = flat_parallel_network()
+    network = replace(network, control=ObjectPoints(np.arange(25), truth.points, np.zeros((25, 3, 3))))
+    a = adjust(network, truth, datum=Datum("control"), reject="none")
+    assert (a.defect, a.expected_defect) == (1, 0)
+    assert len(a.undetermined) == 1
+    assert a.undetermined[0].startswith("not separable: c of camera A")
+    assert "Z0 of 4 photographs" in a.undetermined[0]
+
+
+def test_two_control_points_leave_a_turn_open() -> None:
+    network, truth = make_network(seed_of("two"), images=5, points=15)
+    network = replace(network, control=ObjectPoints(np.arange(2), truth.points[:2], np.zeros((2, 3, 3))))
+    a = adjust(network, truth, datum=Datum("control"), reject="none")
+    assert a.converged
+    assert (a.defect, a.expected_defect) == (1, 0)  # control is meant to fix all seven
+    assert a.undetermined == (
+        "datum: 1 of the seven of position, attitude and scale are not determined by the control",
+    )
+
+
+def test_points_on_parallel_rays_are_named() -> None:
+    network, truth = make_network(seed_of("parallel"), images=2, points=20, free=())
+    position, rotation = truth.position.copy(), truth.rotation.copy()
+    position[1], rotation[1] = position[0], rotation[0]
+    truth = replace(truth, position=position, rotation=rotation)
+    k = network.image_points
+    xy = project(truth.cameras[0], position[0], rotation[0], truth.points)[k.point]
+    network = replace(network, image_points=replace(k, xy=xy))
+    a = adjust(network, truth, datum=FREE, reject="none", max_iterations=2)
+    assert sum("rays are parallel" in words for words in a.undetermined) >= 19
+
+
+@pytest.mark.parametrize("missing", ["image", "point"])
+def test_missing_start_values_are_named(missing: str) -> None:
+    network, truth = make_network(seed_of("missing"), images=6, points=15)
+    position, points = truth.position.copy(), truth.points.copy()
+    if missing == "image":
+        position[3] = np.nan
+    else:
+        points[3] = np.nan
+    a = adjust(network, replace(truth, position=position, points=points), datum=FREE)
+    name = "photograph image 4" if missing == "image" else "point 4"
+    assert a.undetermined == (f"{name}: no start value",)
+    assert a.converged

@@ -1,0 +1,168 @@
+"""Validation over random networks: the networks, the verdicts, and both adjusters on some of them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+
+from adapters.colmap.adjuster import adjust_with_colmap
+from adapters.colmap.validation_backend import ColmapBackend
+from sfm.comparison.adjuster_validation import (
+    BOTH_FAILED,
+    OURS_FAILED,
+    SAME,
+    Validation,
+    _judge,
+    make_trial,
+    validate,
+)
+from sfm.comparison.adjusters import reprojection
+from sfm.comparison.random_network import (
+    ARRANGEMENTS,
+    IMAGES,
+    MIN_POINTS,
+    NOISE_PX,
+    SIZE_PX,
+    random_network,
+)
+from sfm.errors import BackendError
+from sfm.network import Estimate, Network
+
+NETWORKS = 60
+
+
+@pytest.fixture(scope="module")
+def drawn() -> list:
+    return [random_network(np.random.default_rng([5, k])) for k in range(NETWORKS)]
+
+
+def test_networks_are_of_every_kind_and_size(drawn: list) -> None:
+    plans = [made.plan for made in drawn]
+    assert {plan.arrangement for plan in plans} == set(ARRANGEMENTS)
+    assert {plan.model for plan in plans} == {"opencv", "full_opencv"}
+    assert {plan.datum for plan in plans} == {"free", "control"}
+    assert {plan.interior for plan in plans} == {"fixed", "focal and principal point", "all"}
+    assert {plan.planar for plan in plans} == {False, True}
+    assert {plan.cameras for plan in plans} == {1, 2, 3}
+    for made in drawn:
+        assert IMAGES[0] <= made.plan.images <= IMAGES[1]
+        assert NOISE_PX[0] <= made.plan.noise_px <= NOISE_PX[1]
+        assert len(made.network.points) >= MIN_POINTS
+
+
+def test_truth_fits_with_the_noise_and_the_start_does_not(drawn: list) -> None:
+    for made in drawn:
+        v = reprojection(made.network, made.truth)
+        assert len(v) == len(made.network.image_points)
+        # RMS of 2k normal deviates: within five of its standard deviations
+        tolerance = 5 / np.sqrt(2 * v.size)
+        assert np.sqrt((v**2).mean()) == pytest.approx(made.plan.noise_px, rel=tolerance)
+        assert np.sqrt((reprojection(made.network, made.start) ** 2).mean()) > 3 * made.plan.noise_px
+        xy = made.network.image_points.xy
+        assert (xy > -6).all() and (xy < np.array(SIZE_PX) + 6).all()
+        assert made.network.rays().min() >= 2
+        assert np.bincount(made.network.image_points.image, minlength=made.plan.images).min() >= 4
+
+
+def test_networks_repeat() -> None:
+    a, b = (random_network(np.random.default_rng([5, 3])) for _ in range(2))
+    assert a.plan == b.plan
+    np.testing.assert_array_equal(a.network.image_points.xy, b.network.image_points.xy)
+    np.testing.assert_array_equal(a.start.points, b.start.points)
+
+
+def test_control_is_exact_at_truth_and_start(drawn: list) -> None:
+    for made in drawn:
+        control = made.network.control
+        assert (len(control) == 0) == (made.plan.datum == "free")
+        np.testing.assert_array_equal(made.truth.points[control.point], control.xyz)
+        np.testing.assert_array_equal(made.start.points[control.point], control.xyz)
+
+
+@pytest.mark.parametrize(
+    ("a", "b", "same", "ours", "theirs", "verdict", "worse"),
+    [
+        (1.0, 1.0, True, False, False, SAME, False),
+        (1.0, 1.0, True, True, False, SAME, False),
+        (1.0, 2.0, False, False, False, "different optima, kolinear lower", False),
+        (2.0, 1.0, False, False, False, "different optima, {name} lower", True),
+        (2.0, 1.0, False, True, False, OURS_FAILED, True),
+        (np.nan, 1.0, False, False, False, OURS_FAILED, True),
+        (1.0, np.nan, False, False, True, "{name} failed", False),
+        (1.0, np.nan, False, False, False, "{name} failed", False),
+        (np.nan, np.nan, False, True, True, BOTH_FAILED, False),
+    ],
+)
+def test_verdicts(
+    a: float, b: float, same: bool, ours: bool, theirs: bool, verdict: str, worse: bool
+) -> None:
+    assert _judge(a, b, same, ours, theirs) == (verdict, worse)
+
+
+def test_both_adjusters_end_at_the_same_optimum_with_the_same_covariances() -> None:
+    found = validate(ColmapBackend(), networks=12, seed=2)
+    assert found.passed
+    assert found.counts() == ((SAME, 12),)
+    for trial in found.trials:
+        for name in ("position_sigmas", "rotation_sigmas", "point_sigmas"):
+            assert getattr(trial, name) < 1e-3  # of a standard deviation
+        free = trial.plan.interior != "fixed"
+        assert trial.interior_sigmas < 1e-3 if free else np.isnan(trial.interior_sigmas)
+        assert trial.conditional_difference < 1e-5
+        assert not trial.interior_difference > 1e-5
+        assert trial.rms_px[0] == pytest.approx(trial.rms_px[1], rel=1e-9)
+
+
+@dataclass(frozen=True)
+class Spoiled:
+    """A backend that stops beside the optimum, refuses, or loses points."""
+
+    kind: str
+    name: str = "spoiled"
+
+    def adjust(self, network: Network, start: Estimate, *, control: bool) -> object:
+        if self.kind == "refuses":
+            raise BackendError("out of order")
+        found = adjust_with_colmap(network, start, gauge="control" if control else "free")
+        points = found.estimate.points.copy()
+        points[0] += {"beside": 1e-4, "lost": np.nan}[self.kind]
+        return replace(found, estimate=replace(found.estimate, points=points))
+
+    def covariance(self, network: Network, estimate: Estimate, *, control: bool) -> None:
+        return None
+
+
+@pytest.mark.parametrize(
+    ("kind", "verdict"),
+    [
+        ("beside", "different optima, kolinear lower"),
+        ("refuses", "spoiled failed"),
+        ("lost", "spoiled failed"),
+    ],
+)
+def test_a_bad_backend_is_found_out(kind: str, verdict: str) -> None:
+    trial = make_trial(2, 1, Spoiled(kind))  # type: ignore[arg-type]
+    assert trial.verdict == verdict
+    assert not trial.worse
+    assert ("out of order" in trial.reason) == (kind == "refuses")
+
+
+def test_a_worse_in_house_adjuster_fails_the_run() -> None:
+    trial = make_trial(2, 1, ColmapBackend())
+    assert Validation("colmap", 1, (trial,)).passed
+    assert not Validation("colmap", 1, (trial, replace(trial, worse=True))).passed
+
+
+def test_processes_give_what_one_gives() -> None:
+    one = validate(ColmapBackend(), networks=3, seed=4)
+    two = validate(ColmapBackend(), networks=3, seed=4, jobs=2)
+    assert [t.cost for t in one.trials] == [t.cost for t in two.trials]
+
+
+@pytest.mark.slow
+def test_two_hundred_networks() -> None:
+    found = validate(ColmapBackend(), networks=200, seed=1, jobs=2)
+    assert found.passed
+    assert all(trial.verdict in (SAME, "colmap failed", BOTH_FAILED) for trial in found.trials)

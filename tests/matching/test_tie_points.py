@@ -1,0 +1,500 @@
+"""Interest points, tie points, multi-photo matching and the survey without targets."""
+
+from __future__ import annotations
+
+import csv
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from adapters.colmap.adjuster import adjust_with_colmap
+from adapters.colmap.camera_models import read_model
+from adapters.colmap.mapper import map_photographs
+from datasets.textured import render
+from sfm.adjustment.result import Adjustment
+from sfm.batch.run import run_batch
+from sfm.camera import Camera, project, tangents_from_pixel
+from sfm.conventions import AnyArray, FloatArray, angles_from_rotation
+from sfm.errors import GeometryError, PhotographError, SurveyFileError
+from sfm.matching.correlation.along_line import match_along_line
+from sfm.matching.epipolar import epipolar_paths
+from sfm.matching.lsm.multi_photo import match_multi
+from sfm.matching.lsm.two_photo import match_lsm
+from sfm.matching.match_flags import LsmFlag
+from sfm.matching.tracks.feature_tracks import Features, find_tie_points, link_features
+from sfm.matching.tracks.interest import foerstner_points
+from sfm.network import Estimate, ImagePoints, Network
+from sfm.orientation.relative import relative_orientations
+from sfm.pipeline import run_survey
+from sfm.similarity import fit_similarity
+from sfm.survey.inputs.survey import read_survey
+from sfm.survey.other_programs import OtherPrograms
+from sfm.survey.refine import refine_model, refinement_text
+from tests.engines import ALONE, HERE, Notes
+from tests.textures import random_texture, with_noise
+
+
+def test_corners_of_a_chessboard() -> None:
+    board = np.kron(np.indices((6, 6)).sum(axis=0) % 2, np.ones((16, 16))) * 160 + 40
+    shifted = cv2.GaussianBlur(board, (0, 0), 0.8)
+    found = foerstner_points(with_noise(shifted, 1.0, 1), min_distance_px=8)
+    corners = np.stack(np.meshgrid(np.arange(1, 6) * 16 - 0.5, np.arange(1, 6) * 16 - 0.5), axis=-1).reshape(
+        -1, 2
+    )
+    distance = np.linalg.norm(found.xy[:, None] - corners[None], axis=2).min(axis=0)
+    # between pixels a window of whole pixels has more of the edges on one side
+    assert distance.max() < 0.2
+    assert (found.roundness[:25] > 0.8).all() and (np.diff(found.weight) <= 0).all()
+    assert (np.linalg.eigvalsh(found.covariance) > 0).all()
+
+
+def test_interest_points_keep_their_distance_and_number() -> None:
+    y, x = np.mgrid[0:120, 0:160].astype(float)
+    photograph = with_noise(random_texture(np.random.default_rng(2), 2.0).value(x, y), 2.0, 1)
+    found = foerstner_points(photograph, min_distance_px=12, max_points=30, border_px=15)
+    assert len(found) == 30
+    apart = np.linalg.norm(found.xy[:, None] - found.xy[None], axis=2) + 99 * np.eye(30)
+    assert apart.min() > 12 - 2 * 3.5  # pixels keep the distance, edges meet within the window of 7 px
+    assert len(foerstner_points(np.full((50, 50), 9, np.uint8))) == 0
+
+
+def test_features_that_contradict_each_other_are_no_point() -> None:
+    rng = np.random.default_rng(4)
+    descriptor = rng.random((40, 128)).astype(np.float32)
+    descriptor /= np.linalg.norm(descriptor, axis=1, keepdims=True)
+    xyz = rng.uniform([-1, -1, 3], [1, 1, 5], (40, 3))
+
+    def view(shift: float) -> Features:
+        xy = 800 * (xyz[:, :2] - [shift, 0.1 * shift]) / xyz[:, 2:] + 500
+        return Features(xy, np.full(40, 4.0), np.zeros(40), descriptor)
+
+    views = [view(0.0), view(0.5), view(-0.5)]
+    tracks = link_features(views)
+    assert np.bincount(tracks.point).tolist() == [3] * 40
+    assert (tracks.feature.reshape(40, 3) == tracks.feature.reshape(40, 3)[:, :1]).all()
+    swapped = views[2].descriptor.copy()
+    swapped[[0, 1]] = swapped[[1, 0]]  # two wrong matches, off their epipolar lines
+    views[2] = Features(views[2].xy, views[2].scale, views[2].angle, swapped)
+    assert set(np.unique(link_features(views).feature)) == set(range(2, 40))
+
+
+SIZE = (480, 360)
+
+
+def _pictures(lens: Camera, position: FloatArray, rotation: FloatArray) -> list[AnyArray]:
+    """Photographs of the textured surface, with noise."""
+    skin = cv2.GaussianBlur(render.texture(), (0, 0), 1.8)
+    pictures = []
+    for i, (X0, R) in enumerate(zip(position, rotation, strict=True)):
+        y, x = np.mgrid[0 : SIZE[1], 0 : SIZE[0]]
+        uv = tangents_from_pixel(lens, np.column_stack([x.ravel(), y.ravel()]))
+        rays = np.column_stack([uv, -np.ones(len(uv))]) @ R.T
+        at = render.surface_points(X0, rays)[:, :2] / render.TEXEL_M + len(skin) / 2
+        at = at.astype(np.float32).reshape(SIZE[1], SIZE[0], 2)
+        light = cv2.remap(skin, at[..., 0], at[..., 1], cv2.INTER_LINEAR)
+        pictures.append(with_noise(255 * light, render.NOISE, i).clip(0, 255).astype(np.float32))
+    return pictures
+
+
+@cache
+def _scene() -> tuple[tuple[AnyArray, ...], Estimate, FloatArray]:
+    """Three small photographs of the textured surface, their orientation, and points on the surface."""
+    lens = render.camera_from_values("lens", "opencv", SIZE, render.PIXEL_MM, c_mm=render.C_MM)
+    position, rotation = (part[[0, 1, 7]] for part in render.stations())
+    photographs = _pictures(lens, position, rotation)
+    x, y = np.meshgrid(np.arange(120, 361, 40.0), np.arange(100, 261, 40.0))
+    uv = tangents_from_pixel(lens, np.column_stack([x.ravel(), y.ravel()]))
+    points = render.surface_points(position[0], np.column_stack([uv, -np.ones(len(uv))]) @ rotation[0].T)
+    return (
+        tuple(photographs),
+        Estimate((lens,), position, rotation, points),
+        np.column_stack([x.ravel(), y.ravel()]),
+    )
+
+
+@pytest.mark.parametrize(("orientation_px", "limit"), [(None, 4.0), (0.02, 1.5)])
+def test_multi_photo_matching(orientation_px: float | None, limit: float) -> None:
+    photographs, truth, at = _scene()
+    n = len(at)
+    rng = np.random.default_rng(7)
+    points = truth.points + rng.normal(0, 5e-4, truth.points.shape)
+    start = Estimate(truth.cameras, truth.position, truth.rotation, points)
+    pictures = [project(truth.cameras[0], truth.position[i], truth.rotation[i], points) for i in (1, 2)]
+    matches = match_multi(
+        photographs,
+        start,
+        np.zeros(3, dtype=np.int64),
+        np.repeat(np.arange(3), n),
+        np.tile(np.arange(n), 3),
+        np.concatenate([at, *pictures]),
+        np.arange(n),
+        orientation_px=orientation_px,
+    )
+    assert matches.good.mean() > 0.9
+    seen = np.concatenate(
+        [project(truth.cameras[0], truth.position[i], truth.rotation[i], truth.points) for i in range(3)]
+    )
+    e = matches.xy - seen
+    # half of the noise is the template's, counted with the reference; curvature of the surface on top
+    sigma = np.sqrt(2 * np.nanmean(matches.covariance[n:, [0, 1], [0, 1]]))
+    assert np.sqrt(np.nanmedian(e[n:] ** 2)) / 0.6745 < limit * sigma
+    distance = np.linalg.norm(matches.points - truth.points, axis=1)
+    assert np.nanmedian(distance) < 1e-4  # a tenth of a pixel on the object; it began at 8e-4
+
+
+def test_multi_photo_matching_says_what_is_lost() -> None:
+    photographs, truth, _ = _scene()
+    image, point = np.repeat(np.arange(3), 2), np.tile(np.arange(2), 3)
+    xy = np.concatenate(
+        [project(truth.cameras[0], truth.position[i], truth.rotation[i], truth.points[:2]) for i in range(3)]
+    )
+    xy[2] = [2.0, 2.0]
+    start = Estimate(truth.cameras, truth.position, truth.rotation, truth.points[:2])
+    cameras = np.zeros(3, dtype=np.int64)
+    flat = [*photographs[:2], np.full_like(photographs[2], 80.0)]
+    matches = match_multi(flat, start, cameras, image, point, xy, np.arange(2))
+    assert matches.flag[2] == LsmFlag.OUTSIDE and matches.flag[4] != 0
+    assert np.isnan(matches.points[0]).all()  # no second ray is left
+    with pytest.raises(GeometryError, match="photograph 3 has no orientation"):
+        lost = Estimate(truth.cameras, truth.position * [[1], [1], [np.nan]], truth.rotation, truth.points)
+        match_multi(photographs, lost, cameras, image, point, xy, np.arange(2))
+
+
+def test_tie_points_of_three_photographs() -> None:
+    photographs, truth, _ = _scene()
+    found = find_tie_points(photographs, max_features=600)
+    n = len(found.reference)
+    assert n > 40 and (np.bincount(found.point) == 3).all()
+    at = found.xy[found.image == found.reference[found.point]]
+    points = np.full((n, 3), np.nan)
+    for i in range(3):
+        own = np.flatnonzero(found.reference == i)
+        uv = tangents_from_pixel(truth.cameras[0], at[own])
+        rays = np.column_stack([uv, -np.ones(len(own))]) @ truth.rotation[i].T
+        points[own] = render.surface_points(truth.position[i], rays)
+    e = np.array(
+        [
+            project(truth.cameras[0], truth.position[i], truth.rotation[i], points[j : j + 1])[0] - xy
+            for i, j, xy in zip(found.image, found.point, found.xy, strict=True)
+        ]
+    )
+    others = found.image != found.reference[found.point]
+    assert np.median(np.linalg.norm(e[others], axis=1)) < 0.1
+    with pytest.raises(GeometryError, match="detector 'orb', expected one of"):
+        find_tie_points(photographs, detector="orb")
+    assert len(find_tie_points([np.zeros((90, 90), np.uint8)] * 3)) == 0
+
+
+def test_along_epipolar_lines_of_an_orientation_computed_from_the_photographs() -> None:
+    lens = render.camera_from_values("lens", "opencv", SIZE, render.PIXEL_MM, c_mm=render.C_MM)
+    position = np.array([[-0.06, 0.0, 1.6], [0.06, 0.05, 1.65]])
+    left, right = _pictures(lens, position, np.tile(np.eye(3), (2, 1, 1)))
+    found = find_tie_points([left, right], max_features=600, min_rays=2)
+    xy = [found.xy[found.image == i][np.argsort(found.point[found.image == i])] for i in range(2)]
+    uv = [tangents_from_pixel(lens, one) for one in xy]
+    pair = relative_orientations(uv[0], uv[1], tolerance=1.0 / lens.c_px)[0]
+    assert pair.kind == "spatial"
+    computed = Estimate(
+        (lens,), np.stack([np.zeros(3), pair.base]), np.stack([np.eye(3), pair.rotation]), np.zeros((0, 3))
+    )
+    x, y = np.meshgrid(np.arange(180, 440, 40.0), np.arange(60, 301, 40.0))
+    at = np.column_stack([x.ravel(), y.ravel()])
+    cameras = np.zeros(2, dtype=np.int64)
+    paths = epipolar_paths(computed, cameras, 0, 1, at, nearest=6.0, farthest=20.0)  # in bases
+    along = match_along_line(left, right, at, paths)
+    rays = np.column_stack([tangents_from_pixel(lens, at), -np.ones(len(at))])
+    truth = project(lens, position[1], np.eye(3), render.surface_points(position[0], rays))
+    inside = ((truth > 20) & (truth < np.array(SIZE) - 21)).all(axis=1)
+    assert inside.sum() > 25 and along.good[inside].mean() > 0.9
+    assert np.nanmax(np.linalg.norm(along.xy - truth, axis=1)[inside]) < 0.5
+
+
+def test_survey_file_refuses_contradictions(tmp_path: Path) -> None:
+    text = (Path(render.__file__).parent / "survey.toml").read_text(encoding="utf-8")
+    survey = tmp_path / "survey.toml"
+    survey.write_text(text.replace('codes = "none"', 'codes = "arcs"'), encoding="utf-8")
+    with pytest.raises(SurveyFileError, match=r"tie_points.*take the place of targets"):
+        read_survey(survey)
+    survey.write_text(text.replace('detector = "foerstner"', "window_px = 14"), encoding="utf-8")
+    with pytest.raises(SurveyFileError, match="window_px = 14, needed an odd number"):
+        read_survey(survey)
+    survey.write_text(text.replace('"foerstner"', '"orb"'), encoding="utf-8")
+    with pytest.raises(SurveyFileError, match="detector"):
+        read_survey(survey)
+
+
+def _write_small_survey(folder: Path, name: str, *, side: int = 1) -> Path:
+    """Write three small photographs, a copy of one, a broken one, and a survey that knows their stations.
+
+    Side -1 puts the stations on the other side of the origin, where they look away from the surface.
+    """
+    photographs, truth, _ = _scene()
+    folder.mkdir(parents=True)
+    for i, one in enumerate(photographs):
+        cv2.imwrite(str(folder / f"{i + 1}.png"), np.rint(one).astype(np.uint8))
+    (folder / "copy.png").write_bytes((folder / "2.png").read_bytes())
+    (folder / "broken.png").write_bytes(b"no photograph")
+    angles = [angles_from_rotation(R) for R in truth.rotation]
+    rows = [
+        f"{i + 1}.png," + ",".join(f"{v:.6f}" for v in (*(side * X0), *np.degrees(w)))
+        for i, (X0, w) in enumerate(zip(truth.position, angles, strict=True))
+    ]
+    table = "\n".join(["image,X,Y,Z,omega_deg,phi_deg,kappa_deg", *rows]) + "\n"
+    (folder / "images.csv").write_text(table, encoding="utf-8")
+    survey = folder / "survey.toml"
+    survey.write_text(
+        f"""
+[survey]
+name = "{name}"
+unit = "m"
+[[camera]]
+name = "lens"
+images = "*.png"
+pixel_mm = [{render.PIXEL_MM[0]}, {render.PIXEL_MM[1]}]
+c_mm = {render.C_MM}
+model = "opencv"
+free = []
+[targets]
+codes = "none"
+[tie_points]
+max_features = 600
+[approximate]
+images = "images.csv"
+[adjust]
+sigma_px = 0.02
+[compare]
+backend = "none"
+""",
+        encoding="utf-8",
+    )
+    return survey
+
+
+def test_small_survey_names_copies_and_reasons_and_starts_from_given_values(tmp_path: Path) -> None:
+    survey = _write_small_survey(tmp_path / "a", "small")
+    result = run_survey(read_survey(survey))
+    a = result.adjustment
+    assert a.network.images == ("1.png", "2.png", "3.png") and a.converged
+    reasons = {one.image: one.reason for one in result.failed}
+    assert reasons["copy.png"] == "identical to 2.png"
+    assert reasons["broken.png"] and "broken.png" not in reasons["broken.png"]  # the name stands beside it
+    # the given values hold the datum of a free network up to what its inner constraints move
+    _, truth, _ = _scene()
+    assert np.abs(a.estimate.position - truth.position).max() < 0.02
+    table = survey.parent / "images.csv"
+    table.write_text(table.read_text(encoding="utf-8").replace("3.png", "9.png"), encoding="utf-8")
+    with pytest.raises(SurveyFileError, match=r"image '9\.png' is no photograph of the survey"):
+        run_survey(read_survey(survey))
+    away = run_survey(read_survey(_write_small_survey(tmp_path / "b", "away", side=-1)))
+    assert any(line.startswith("[approximate]: ") for line in away.warnings)
+
+
+def test_batch_of_a_survey_without_targets_is_that_survey(tmp_path: Path) -> None:
+    survey = _write_small_survey(tmp_path / "a", "small")
+    out = tmp_path / "out"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("sfm.report.output.all_plots", lambda *_: [])
+        (row,) = run_batch([survey], out, HERE, ALONE, Notes())
+    assert row.status == "done" and row.photographs == 3 and row.photographs_total == 5
+    alone = run_survey(read_survey(survey)).adjustment
+    with (out / "small" / "points.csv").open(encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    assert [one["id"] for one in rows] == list(alone.network.points)
+    xyz = np.array([[float(one[axis]) for axis in "XYZ"] for one in rows])
+    assert xyz == pytest.approx(alone.estimate.points, abs=1e-9)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    rendered = tmp_path_factory.mktemp("textured")
+    render.render(rendered)
+    return rendered
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("detector", ["foerstner", "sift"])
+def test_textured_survey_from_photographs_to_result(folder: Path, tmp_path: Path, detector: str) -> None:
+    survey = folder / f"{detector}.toml"
+    text = (folder / "survey.toml").read_text(encoding="utf-8")
+    survey.write_text(text.replace('"foerstner"', f'"{detector}"'), encoding="utf-8")
+    result = run_survey(read_survey(survey), jobs=2, others=OtherPrograms(adjust_with_colmap))
+    a = result.adjustment
+    assert len(a.network.images) == render.PHOTOGRAPHS and not result.failed
+    assert a.converged and len(a.network.points) > 2000
+    assert result.comparison is not None and result.comparison.agree
+    assert a.estimate.cameras[0].value("fx") == pytest.approx(render.C_MM / render.PIXEL_MM[0], abs=0.1)
+    assert a.covariance is not None
+    share, z_rms = _from_surface(a.network, a.estimate, a.covariance.points)
+    assert share >= 0.99
+    assert 0.8 < z_rms < 1.25
+    near, z2, noise, stated = _from_their_places(a, folder)
+    assert near >= 0.99
+    # surfaces that are not plane and differences of blur move all pictures of a point by 0.01 px together
+    assert 0.8 < z2 < 1.7
+    assert noise == pytest.approx(stated, rel=0.2)
+
+
+def _from_surface(network: Network, estimate: Estimate, covariance: FloatArray) -> tuple[float, float]:
+    """Share of points within 3 sigma of the surface, along its normal, and RMS of distance over sigma."""
+    position, _ = render.stations()
+    place = fit_similarity(estimate.position, position)
+    start = place.apply(estimate.points)
+    foot = np.column_stack([start[:, :2], render.height(start[:, 0], start[:, 1])])
+    place = fit_similarity(estimate.points, foot)  # finer: all points on the surface they are near to
+    X = place.apply(estimate.points)
+    h = 1e-6
+    slope = [
+        (render.height(X[:, 0] + dx, X[:, 1] + dy) - render.height(X[:, 0] - dx, X[:, 1] - dy)) / (2 * h)
+        for dx, dy in ((h, 0.0), (0.0, h))
+    ]
+    normal = np.column_stack([-slope[0], -slope[1], np.ones(len(X))])
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    in_model = place.scale * normal @ place.rotation
+    sigma = np.sqrt(np.einsum("ki,kij,kj->k", in_model, covariance, in_model))
+    z = (X[:, 2] - render.height(X[:, 0], X[:, 1])) * normal[:, 2] / sigma
+    return float((np.abs(z) < 3).mean()), float(np.sqrt((z**2).mean()))
+
+
+def _from_their_places(a: Adjustment, folder: Path) -> tuple[float, float, float, float]:
+    """Compare object points in space with the places of the surface that their templates show.
+
+    What a template shows is not quite what is at its middle: its noise has a shift too, which goes into all
+    matches of the point. Without noise its own photograph tells the shift.
+
+    Returns:
+        Share of points within three times their point error sqrt(sX2 + sY2 + sZ2), mean of the squares of
+        normalised coordinates, and the shift of templates, RMS and as stated by their covariance, px.
+    """
+    seen, skin = a.network.image_points, render.texture()
+    whole = np.flatnonzero((seen.xy == np.rint(seen.xy)).all(axis=1) & ~a.rejected)  # templates are
+    point, X = seen.point[whole], np.full((len(whole), 3), np.nan)
+    shift = np.full((len(whole), 2), np.nan)
+    for i in range(render.PHOTOGRAPHS):
+        own = np.flatnonzero(seen.image[whole] == i)
+        at = seen.xy[whole[own]]
+        noisy = cv2.imread(str(folder / f"surface_{i + 1}.png"), cv2.IMREAD_UNCHANGED)
+        shift[own] = match_lsm(noisy, render.intensities(i, skin), at, at, window_px=15).xy - at
+        X[own] = render.surface_at(i, at + shift[own])
+    assert a.covariance is not None and len(np.unique(point)) == len(point) > 2000
+    known = np.isfinite(X).all(axis=1)
+    X, point = X[known], point[known]
+    place = fit_similarity(a.estimate.points[point], X)
+    C = place.scale**2 * place.rotation @ a.covariance.points[point] @ place.rotation.T
+    e = place.apply(a.estimate.points[point]) - X
+    near = np.linalg.norm(e, axis=1) < 3 * np.sqrt(np.trace(C, axis1=1, axis2=2))
+    z2 = np.einsum("ki,kij,kj->k", e, np.linalg.inv(C), e) / 3
+    stated = a.sigma0 * np.sqrt(seen.covariance[whole][:, [0, 1], [0, 1]].mean())
+    return float(near.mean()), float(z2.mean()), float(np.sqrt((shift[known] ** 2).mean())), float(stated)
+
+
+def test_refining_what_another_program_wrote(tmp_path: Path) -> None:
+    """A simple radial camera, folders, a photograph not registered, points with two rays or far astray."""
+    pycolmap = pytest.importorskip("pycolmap")
+    photographs, truth, _ = _scene()
+    rng = np.random.default_rng(9)
+    scene = pycolmap.Reconstruction()
+    width, height = SIZE
+    focal = render.C_MM / render.PIXEL_MM[0]
+    lens = pycolmap.Camera(
+        model="SIMPLE_RADIAL",
+        width=width,
+        height=height,
+        camera_id=1,
+        params=[focal, 240, 180, 0],
+    )
+    scene.add_camera_with_trivial_rig(lens)
+    seen = [
+        project(truth.cameras[0], truth.position[i], truth.rotation[i], truth.points)
+        + rng.normal(0, 0.3, (len(truth.points), 2))
+        for i in range(3)
+    ]
+    for i, one in enumerate(photographs):
+        M = np.diag([1.0, -1.0, -1.0]) @ truth.rotation[i].T
+        pose = pycolmap.Rigid3d(pycolmap.Rotation3d(M), -M @ truth.position[i])
+        name = f"{'ab'[i // 2]}/{i}.png"
+        image = pycolmap.Image(name=name, keypoints=seen[i] + 0.5, camera_id=1, image_id=i + 1)
+        scene.add_image_with_trivial_frame(image, pose)
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        cv2.imwrite(str(tmp_path / name), np.rint(one).astype(np.uint8))
+    for j, xyz in enumerate(truth.points):
+        images = (1, 2) if j < 5 else (1, 2, 3)
+        xyz = 50 * xyz if j == 9 else xyz  # behind the photographs
+        scene.add_point3D(
+            xyz, pycolmap.Track([pycolmap.TrackElement(i, j) for i in images]), np.zeros(3, np.uint8)
+        )
+    (tmp_path / "model").mkdir()
+    scene.write_binary(str(tmp_path / "model"))
+    network, estimate = read_model(tmp_path / "model")
+    lost = replace(estimate, position=np.vstack([estimate.position, np.full(3, np.nan)]))
+    lost = replace(lost, rotation=np.vstack([estimate.rotation, np.full((1, 3, 3), np.nan)]))
+    beside = replace(network, images=(*network.images, "not registered.png"), camera=np.zeros(4, np.int64))
+    result = refine_model(beside, lost, tmp_path)
+    reasons = dict(result.reasons)
+    assert reasons["of a point that fewer than 3 photographs see"] == 13  # one is behind all of them
+    assert result.refined >= 0.8 * (result.key_points - 13) and result.after_px < 0.1 < result.before_px
+    text = refinement_text(result)
+    assert "RMS before" in text and "RMS after" in text
+    (tmp_path / "b" / "2.png").unlink()
+    with pytest.raises(SurveyFileError, match=r"photograph 'b/2\.png' of the model is not in this folder"):
+        refine_model(network, estimate, tmp_path)
+    cv2.imwrite(str(tmp_path / "b" / "2.png"), np.zeros((50, 60), np.uint8))
+    with pytest.raises(PhotographError, match="60 x 50 px, its camera has 480 x 360 px"):
+        refine_model(network, estimate, tmp_path)
+    (tmp_path / "b" / "2.png").unlink()  # what is refused now is refused before any photograph is read
+    for wrong, message in (
+        ({"window_px": 301}, "window is 301 px, needed at most 101 px"),
+        ({"window_px": 16}, "16"),
+        ({"min_correlation": float("nan")}, "smallest correlation is nan, needed 0 to 1"),
+        ({"min_correlation": 7.0}, "smallest correlation is 7, needed 0 to 1"),
+    ):
+        with pytest.raises(GeometryError, match=message):
+            refine_model(network, estimate, tmp_path, **wrong)
+    nothing = replace(estimate, points=estimate.points * np.nan)
+    with pytest.raises(GeometryError, match="nothing to refine"):
+        refine_model(network, nothing, tmp_path)
+
+
+@pytest.mark.slow
+def test_refining_a_model(folder: Path) -> None:
+    """Key points of a solved model with 0.5 px of noise become points of a few hundredths."""
+    position, rotation = render.stations()
+    lens = render.camera()
+    rng = np.random.default_rng(3)
+    x, y = np.meshgrid(np.linspace(-0.3, 0.3, 16), np.linspace(-0.3, 0.3, 16))
+    points = np.column_stack([x.ravel(), y.ravel(), render.height(x.ravel(), y.ravel())])
+    m, n = render.PHOTOGRAPHS, len(points)
+    seen = np.concatenate([project(lens, position[i], rotation[i], points) for i in range(m)])
+    inside = ((seen > 15) & (seen < np.array(render.SIZE_PX) - 16)).all(axis=1)
+    image, point = np.repeat(np.arange(m), n)[inside], np.tile(np.arange(n), m)[inside]
+    network = Network(
+        tuple(f"surface_{i + 1}.png" for i in range(m)),
+        np.zeros(m, dtype=np.int64),
+        tuple(str(j) for j in range(n)),
+        ImagePoints(
+            image,
+            point,
+            seen[inside] + rng.normal(0, 0.5, (len(image), 2)),
+            np.tile(np.eye(2), (len(image), 1, 1)),
+        ),
+    )
+    result = refine_model(network, Estimate((lens,), position, rotation, points), folder)
+    assert result.before_px == pytest.approx(0.5, rel=0.1)
+    assert result.after_px < 0.05
+    assert result.refined > 0.8 * result.key_points
+    with pytest.raises(
+        SurveyFileError, match=r"photograph 'surface_1.png' of the model is not in this folder"
+    ):
+        refine_model(network, Estimate((lens,), position, rotation, points), folder / "..")
+
+
+@pytest.mark.slow
+def test_refining_the_model_of_colmaps_mapper(folder: Path) -> None:
+    names = tuple(f"surface_{i + 1}.png" for i in range(render.PHOTOGRAPHS))
+    mapped = map_photographs(folder, (names,), threads=1)
+    result = refine_model(mapped.network, mapped.estimate, folder)
+    assert result.before_px > 0.15
+    assert result.after_px < 0.06 and result.refined > 0.9 * result.key_points

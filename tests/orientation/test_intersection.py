@@ -1,0 +1,97 @@
+"""Intersection: document 002, covariance, wrong rays, points that are not determined."""
+
+import numpy as np
+import pytest
+
+from sfm.camera import tangents_from_pixel
+from sfm.conventions import rotation_from_angles
+from sfm.orientation.intersection import intersect
+from tests.places import ROOT
+from tests.synthetic import make_network, seed_of
+
+STEREO = ROOT / "datasets/stereo10/stereo10_points.csv"
+C = 18.5558
+LEFT = (-0.342, -1.8718, -0.0908, 0.3346, 0.6424, -0.0338)
+RIGHT = (-2.9792, 0.1888, 0.2852, -0.5369, -0.3954, 1.0051)
+
+
+def test_document_002():
+    table = np.loadtxt(STEREO, delimiter=",", skiprows=1)
+    tangents = np.concatenate([table[:, 5:7], table[:, 7:9]]) / C
+    image, point = np.repeat([0, 1], 10), np.tile(np.arange(10), 2)
+    positions = np.array([LEFT[:3], RIGHT[:3]])
+    rotations = np.stack([rotation_from_angles(*LEFT[3:]), rotation_from_angles(*RIGHT[3:])])
+    result = intersect(tangents, image, point, positions, rotations)
+    assert result.redundancy == 10
+    assert result.sigma0 * C == pytest.approx(0.05108, abs=5e-6)
+    # the document takes the radians of its angles for degrees: its printed So follows from that
+    wrong = np.stack(
+        [rotation_from_angles(*np.radians(LEFT[3:])), rotation_from_angles(*np.radians(RIGHT[3:]))]
+    )
+    printed = intersect(tangents, image, point, positions, wrong)
+    assert np.isnan(printed.sigma0) or printed.sigma0 * C > 1
+
+
+def _rays(noise_px=0.1, **kw):
+    network, truth = make_network(seed_of("intersection"), noise_px=noise_px, **kw)
+    seen = network.image_points
+    uv = np.concatenate([tangents_from_pixel(truth.cameras[0], xy[None]) for xy in seen.xy])
+    return network, truth, uv, noise_px / truth.cameras[0].c_px
+
+
+def test_points_lie_within_their_covariance():
+    network, truth, uv, sigma = _rays(points=300)
+    seen = network.image_points
+    result = intersect(uv, seen.image, seen.point, truth.position, truth.rotation)
+    assert result.used.all() and result.redundancy == 2 * len(uv) - 3 * 300
+    # distorted pixels have tangents of slightly different weight: within 5 %
+    assert result.sigma0 == pytest.approx(sigma, rel=0.05)
+    d = result.points - truth.points
+    squares = np.einsum("ni,nij,nj->n", d, np.linalg.inv(result.covariance), d)
+    assert squares.mean() == pytest.approx(3, abs=4 * np.sqrt(6 / 300))
+    assert (result.angle > np.radians(20)).all()
+
+
+def test_wrong_rays_are_left_out():
+    network, truth, uv, sigma = _rays(points=100)
+    seen = network.image_points
+    rng = seed_of("wrong rays")
+    wrong = rng.random(len(uv)) < 0.2
+    uv[wrong] += rng.choice([-1, 1], (wrong.sum(), 2)) * rng.uniform(0.02, 0.1, (wrong.sum(), 2))
+    result = intersect(uv, seen.image, seen.point, truth.position, truth.rotation, tolerance=6 * sigma)
+    assert not result.used[wrong].any() and result.used[~wrong].mean() > 0.999
+    assert np.abs(result.points - truth.points).max() < 0.005
+
+
+def test_weights_pull_the_point():
+    positions = np.array([[0.0, 0, 5], [2, 0, 5], [-2, 0, 5]])
+    rotations = np.stack([np.eye(3)] * 3)
+    X = np.array([0.3, 0.2, 0.0])
+    uv = -(X - positions)[:, :2] / (X - positions)[:, 2:]
+    uv[2] += 0.01
+    image, point = np.arange(3), np.zeros(3, dtype=int)
+    light = np.stack([np.eye(2), np.eye(2), 1e-8 * np.eye(2)])
+    free = intersect(uv, image, point, positions, rotations).points[0]
+    pulled = intersect(uv, image, point, positions, rotations, weights=light).points[0]
+    assert np.linalg.norm(pulled - X) < 1e-6 < np.linalg.norm(free - X)
+
+
+def test_undetermined_points_are_nan():
+    positions = np.array([[0.0, 0, 5], [0.01, 0, 5], [np.nan] * 3])
+    rotations = np.stack([np.eye(3), np.eye(3), np.full((3, 3), np.nan)])
+    uv = np.array([[0.1, 0.0], [0.098, 0.0], [0.1, 0.0], [0.2, 0.1], [0.0, 0.0], [0.0, 0.0]])
+    image = np.array([0, 1, 0, 2, 0, 1])
+    point = np.array([0, 0, 1, 1, 2, 2])
+    result = intersect(uv, image, point, positions, rotations, n_points=4, min_angle_deg=1)
+    assert np.isnan(result.points).all() and not result.used.any() and (result.rays == 0).all()
+    wide = intersect(uv, image, point, positions, rotations, n_points=4)
+    assert np.isfinite(wide.points[0]).all() and np.isnan(wide.points[1:]).all()
+    np.testing.assert_allclose(wide.points[0], [0.5, 0, 0], atol=1e-9)
+
+
+def test_rays_that_meet_behind_the_cameras_do_not_intersect():
+    positions = np.array([[-1.0, 0, 0], [1, 0, 0]])
+    rotations = np.stack([np.eye(3)] * 2)
+    diverging = np.array([[-0.2, 0.0], [0.2, 0.0]])
+    result = intersect(diverging, np.arange(2), np.zeros(2, dtype=int), positions, rotations)
+    assert np.isnan(result.points).all() and not result.used.any()

@@ -1,0 +1,10 @@
+"""Where things lie that tests read."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+DATASETS = ROOT / "datasets"
+SHARED = ROOT.parent / "shared"
+"""public reference data and figures, which are not part of the project; may be absent"""

@@ -1,0 +1,432 @@
+"""The report: what is written can be read back, says the same everywhere, and appears whole or not at all."""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Iterator
+from dataclasses import replace
+from html.parser import HTMLParser
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from jinja2 import UndefinedError
+
+from sfm.adjustment.datum import Datum
+from sfm.adjustment.result import Adjustment
+from sfm.adjustment.solve import adjust
+from sfm.cli.console import tell_result
+from sfm.conventions import angles_from_rotation
+from sfm.errors import OutputError
+from sfm.files.whole_files import refuse_foreign_folder
+from sfm.network import Network, ObjectPoints, ScaleBars
+from sfm.report.figures.overlays import USED, draw_photograph, overlay_names
+from sfm.report.figures.plots import all_plots, plan_axes
+from sfm.report.findings.findings import findings_of
+from sfm.report.findings.geometry import geometry_of
+from sfm.report.html.page import environment
+from sfm.report.html.report_page import report_page
+from sfm.report.numbers import finer_unit, significant, to_precision, with_exponent
+from sfm.report.output import WRITTEN, write_result
+from sfm.report.tables.csv_files import write_tables
+from sfm.report.tables.summary import summary, write_summary
+from sfm.report.text.filters import WIDTH
+from sfm.report.text.text_report import text_report
+from sfm.result import ControlCheck, FailedImage, PhotographTargets, StageTime, SurveyResult
+from sfm.survey.inputs.given import read_exterior, read_image_points, read_points
+from sfm.targets.flags import Flag
+from tests.synthetic import make_network, seed_of
+
+EVIL = "<script>alert('x')</script>&\"é€"
+
+
+@pytest.fixture(scope="module")
+def adjustment() -> Adjustment:
+    network, truth = make_network(seed_of("report"), images=8, points=40, noise_px=0.1)
+    seen = network.image_points
+    xy = seen.xy.copy()
+    xy[7] += (3.0, -2.0)
+    return adjust(replace(network, image_points=replace(seen, xy=xy)), truth, datum=Datum("free"))
+
+
+@pytest.fixture(scope="module")
+def result(adjustment: Adjustment, tmp_path_factory: pytest.TempPathFactory) -> SurveyResult:
+    folder = tmp_path_factory.mktemp("photographs")
+    network = adjustment.network
+    photographs = []
+    for i, name in enumerate(network.images):
+        width, height = adjustment.estimate.cameras[0].size_px
+        path = folder / f"{name}.png"
+        cv2.imencode(".png", np.full((height, width), 128, np.uint8))[1].tofile(path)
+        xy = network.image_points.xy[network.image_points.image == i]
+        k = len(xy)
+        photographs.append(
+            PhotographTargets(
+                name,
+                path,
+                xy,
+                np.full((k, 2), 6.0),
+                np.zeros(k),
+                np.array([[10.0, 20.0], [30.0, 40.0], [50.0, 60.0]]),
+                np.array([Flag.TOO_SMALL.value, Flag.TOO_SMALL.value, Flag.CUT_BY_BORDER.value]),
+            )
+        )
+    return SurveyResult(
+        survey="synthetic " + EVIL,
+        unit="m",
+        images_total=9,
+        failed=(FailedImage(EVIL + ".jpg", "not a photograph that can be decoded (3 bytes)"),),
+        adjustment=adjustment,
+        code=np.where(np.arange(len(network.points)) < 10, np.arange(len(network.points)), -1),
+        comparison=None,
+        photographs=tuple(photographs),
+        control_check=ControlCheck(("1", "2"), np.array([[3e-5, 0, 4e-5], [-3e-5, 0, -4e-5]]), 1.5),
+        warnings=("scale bar 1 - 2 was not measured",),
+        seconds=(StageTime("targets", 1.25),),
+    )
+
+
+def rows_of(path: Path) -> list[dict[str, str]]:
+    with path.open(encoding="utf-8", newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def test_tables_give_back_every_number(result: SurveyResult, tmp_path: Path) -> None:
+    write_tables(findings_of(result), tmp_path)
+    a = result.adjustment
+    points = rows_of(tmp_path / "points.csv")
+    assert list(points[0]) == ["id", "X", "Y", "Z", "sX", "sY", "sZ", "rays", "code", "angle_deg", "rms_px"]
+    assert [row["id"] for row in points] == list(a.network.points)
+    np.testing.assert_array_equal([[float(row[c]) for c in "XYZ"] for row in points], a.estimate.points)
+    variances = np.array([[float(row[f"s{c}"]) for c in "XYZ"] for row in points]) ** 2
+    np.testing.assert_allclose(variances, np.einsum("nii->ni", a.covariance.points), rtol=1e-14)
+    assert sum(int(row["rays"]) for row in points) == int((~a.rejected).sum())
+    assert [row["code"] for row in points[9:11]] == ["9", ""]
+
+    images = rows_of(tmp_path / "images.csv")
+    degrees = [[float(row[f"{c}_deg"]) for c in ("omega", "phi", "kappa")] for row in images]
+    np.testing.assert_allclose(degrees, np.degrees(angles_from_rotation(a.estimate.rotation)), rtol=1e-14)
+    sigma = [[float(row[f"s{c}_deg"]) for c in ("omega", "phi", "kappa")] for row in images]
+    np.testing.assert_allclose(
+        np.radians(sigma) ** 2, np.einsum("nii->ni", a.covariance.exterior)[:, 3:], rtol=1e-13
+    )
+
+    cameras = rows_of(tmp_path / "cameras.csv")
+    camera = a.estimate.cameras[0]
+    assert [row["parameter"] for row in cameras] == list(camera.names)
+    assert [row["unit"] for row in cameras] == list(camera.units)
+    np.testing.assert_array_equal([float(row["value"]) for row in cameras], camera.parameters)
+    assert [row["sigma"] != "" for row in cameras] == camera.free.tolist()
+
+    measured = rows_of(tmp_path / "image_points.csv")
+    np.testing.assert_array_equal(
+        [[float(row["vx_px"]), float(row["vy_px"])] for row in measured], a.residuals
+    )
+    assert [row["rejected"] == "1" for row in measured] == a.rejected.tolist()
+    assert a.rejected[7]
+
+
+def test_tables_of_a_result_can_be_input_of_another_survey(result: SurveyResult, tmp_path: Path) -> None:
+    write_tables(findings_of(result), tmp_path)
+    a = result.adjustment
+    np.testing.assert_array_equal(read_points(tmp_path / "points.csv").xyz, a.estimate.points)
+    np.testing.assert_allclose(
+        read_exterior(tmp_path / "images.csv").rotation, a.estimate.rotation, atol=1e-14
+    )
+    observed = read_image_points(tmp_path / "image_points.csv")
+    np.testing.assert_array_equal(observed.xy, a.network.image_points.xy)
+    assert observed.sigma is not None
+
+
+def test_summary_says_what_the_adjustment_says(result: SurveyResult, tmp_path: Path) -> None:
+    write_tables(findings_of(result), tmp_path)
+    write_summary(findings_of(result), tmp_path)
+    a = result.adjustment
+    text = json.loads((tmp_path / "summary.json").read_text(encoding="utf-8"))
+    assert text == json.loads(json.dumps(summary(findings_of(result))))
+    assert text["survey"] == result.survey
+    assert text["images"] == {
+        "used": 8,
+        "total": 9,
+        "failed": [{"image": result.failed[0].image, "reason": result.failed[0].reason}],
+    }
+    assert text["points"] == {"total": 40, "coded": 10, "uncoded": 30}
+    assert text["observations"]["used"] + text["observations"]["rejected"] == len(a.rejected)
+    assert text["datum"]["kind"] == "free"
+    assert text["datum"]["defect"] == 7
+    assert (text["unknowns"], text["redundancy"]) == (a.unknowns, a.redundancy)
+    assert text["sigma0_px"] == pytest.approx(a.sigma0 * 0.1, rel=1e-15)
+    assert text["rms_px"] == a.rms_px
+    assert text["max_residual_px"] == a.max_residual_px
+    c = text["cameras"][0]["parameters"]["c"]
+    assert c["value"] == a.estimate.cameras[0].value("c")
+    assert c["sigma"] == pytest.approx(np.sqrt(a.covariance.interior[0][0, 0]), rel=1e-15)
+    assert c["unit"] == "mm"
+    assert text["cameras"][0]["parameters"]["b2"]["sigma"] is None
+    assert text["comparison"] is None
+    assert text["seconds"] == {"targets": 1.25}
+
+
+def test_unknown_numbers_are_null_and_empty_cells(result: SurveyResult, tmp_path: Path) -> None:
+    covariance = replace(
+        result.adjustment.covariance, points=np.full_like(result.adjustment.covariance.points, np.nan)
+    )
+    unknown = replace(
+        result, adjustment=replace(result.adjustment, covariance=covariance, sigma0=float("nan"))
+    )
+    write_tables(findings_of(unknown), tmp_path)
+    write_summary(findings_of(unknown), tmp_path)
+    text = (tmp_path / "summary.json").read_text(encoding="utf-8")
+    assert json.loads(text, parse_constant=lambda name: pytest.fail(name))["sigma0_px"] is None
+    assert rows_of(tmp_path / "points.csv")[0]["sX"] == ""
+
+
+def test_points_as_ply(result: SurveyResult, tmp_path: Path) -> None:
+    write_tables(findings_of(replace(result, unit="µm\nend_header")), tmp_path)
+    lines = (tmp_path / "points.ply").read_text(encoding="ascii").splitlines()
+    assert lines[0] == "ply"
+    assert "element vertex 40" in lines
+    body = lines[lines.index("end_header") + 1 :]
+    xyz = [[float(value) for value in line.split()[:3]] for line in body]
+    np.testing.assert_array_equal(xyz, result.adjustment.estimate.points)
+
+
+def test_image_rms_adds_up_to_that_of_the_network(adjustment: Adjustment) -> None:
+    rms, count = (geometry := geometry_of(adjustment)).image_rms_px, geometry.image_points
+    assert count.sum() == (~adjustment.rejected).sum()
+    assert np.sqrt((rms**2 * count).sum() / count.sum()) == pytest.approx(adjustment.rms_px, rel=1e-12)
+
+
+class Tags(HTMLParser):
+    """Collects tags and what they point to."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.tags: list[str] = []
+        self.sources: list[str] = []
+        self.text = ""
+        self.open: list[str] = []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append(tag)
+        self.sources += [value or "" for name, value in attrs if name in ("src", "href")]
+        if tag not in ("meta", "img", "br"):
+            self.open.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        self.text += data
+
+
+def test_page_is_whole_escaped_and_self_contained(result: SurveyResult) -> None:
+    page = report_page(findings_of(result), all_plots(findings_of(result)), ())
+    tags = Tags()
+    tags.feed(page)
+    assert tags.open == []
+    assert "script" not in tags.tags
+    assert EVIL in tags.text
+    assert EVIL + ".jpg" in tags.text
+    assert tags.tags.count("img") == 4
+    for source in tags.sources:
+        assert source.startswith(("data:image/png;base64,", "#")) or source.rstrip("/") in WRITTEN, source
+    for question in (
+        "Did it work?",
+        "How good is it?",
+        "What was rejected, and why?",
+        "Does the other adjuster agree?",
+        "Where are my coordinates?",
+    ):
+        assert question in tags.text
+    assert "too small" in tags.text
+    assert "1 of 9 photographs are not in the result." in tags.text
+    assert f"{result.adjustment.sigma0_px:.4f} px" in tags.text
+
+
+def test_a_network_without_scale_has_no_metric_unit(result: SurveyResult) -> None:
+    free = replace(result, control_check=None)
+    assert not free.has_scale
+    known = ObjectPoints(np.arange(2), free.adjustment.estimate.points[:2], np.zeros((2, 3, 3)))
+    network = replace(free.adjustment.network, control=known)
+    assert replace(free, adjustment=replace(free.adjustment, network=network)).length_unit == "m"
+    assert "network units" in report_page(findings_of(free), (), ())
+    bars = ScaleBars(np.array([0]), np.array([1]), np.array([1.0]), np.array([0.1]))
+    network = replace(free.adjustment.network, scale_bars=bars)
+    assert replace(free, adjustment=replace(free.adjustment, network=network)).length_unit == "m"
+
+
+def test_verdict(result: SurveyResult) -> None:
+    assert findings_of(result).verdict.level == "fair"
+    assert findings_of(result).verdict.remarks[-1] == "Warning: scale bar 1 - 2 was not measured."
+    more = replace(result, warnings=("one thing.", "another", "a third"))
+    assert findings_of(more).verdict.remarks[-1] == "Warning: one thing (2 more warnings, see below)."
+    fine = replace(result, images_total=8, failed=(), warnings=())
+    assert findings_of(fine).verdict.level == "good"
+    assert (
+        findings_of(fine).verdict.headline
+        == "The survey worked: 8 of 8 photographs oriented, 40 object points."
+    )
+    lost = replace(fine, adjustment=replace(fine.adjustment, converged=False))
+    assert findings_of(lost).verdict.level == "bad"
+    weak = replace(fine, adjustment=replace(fine.adjustment, undetermined=("camera 1 c",), defect=8))
+    assert "Rank defect 8, expected 7" in findings_of(weak).verdict.remarks[0]
+    many = replace(fine, adjustment=replace(fine.adjustment, rejected=np.arange(320) < 100))
+    assert findings_of(many).verdict.level == "fair"
+
+
+def test_every_warning_is_told_once_where_the_remark_says_so(
+    result: SurveyResult, capsys: pytest.CaptureFixture[str]
+) -> None:
+    more = replace(result, warnings=("one thing", "another, " + "and so on " * 20 + "to its end", "a third"))
+    text = text_report(findings_of(more))
+    assert max(map(len, text.splitlines())) <= WIDTH
+    words = " ".join(text[text.index("\nWarnings ") : text.index("\nNetwork and rank ")].split())
+    assert all(warning in words for warning in more.warnings)
+    assert f"{result.failed[0].image}: {result.failed[0].reason}" in " ".join(text.split())
+    assert "\nWarnings " not in text_report(findings_of(result))
+    tell_result(findings_of(more), Path("report.html"), seconds=1.0, verbose=False)
+    told = capsys.readouterr().out
+    assert all(told.count(warning) == 1 for warning in more.warnings)
+
+
+def test_overlay_shows_targets_where_they_are(result: SurveyResult) -> None:
+    photograph = result.photographs[0]
+    picture = draw_photograph(photograph, result.adjustment, 100.0)
+    width, height = result.adjustment.estimate.cameras[0].size_px
+    assert picture.shape == (height, width, 3)
+    # Of the outline one row or column of pixels beside the target is green to the right, left, up and down.
+    seen = 0
+    for x, y in photograph.xy:
+        for dx, dy in ((8, 0), (-8, 0), (0, 8), (0, -8)):
+            column, row = round(x + dx), round(y + dy)
+            if 1 <= column < width - 1 and 1 <= row < height - 1:
+                patch = picture[row - 1 : row + 2, column - 1 : column + 2].reshape(-1, 3).astype(int)
+                seen += bool((np.abs(patch - USED).sum(axis=1) < 150).any())
+    assert seen > 0.7 * 4 * len(photograph.xy)  # names and vectors cover some
+
+
+def test_overlays_have_different_names() -> None:
+    names = overlay_names(("a.jpg", "A.png", "sub/a.jpg", "ä b.JPG", "a_2.tif", ".jpg"))
+    assert len({name.lower() for name in names}) == 6
+    assert names[0] == "a.jpg"
+    assert names[3] == "ä b.jpg"
+    assert all("/" not in name for name in names)
+
+
+def test_result_appears_whole_and_replaces_an_earlier_one(result: SurveyResult, tmp_path: Path) -> None:
+    out = tmp_path / "deep" / "out"
+    page = write_result(
+        findings_of(result), out, write_colmap=lambda folder: (folder / "x.bin").touch(), jobs=2
+    )
+    assert page == out / "report.html"
+    assert {path.name for path in out.iterdir()} == set(WRITTEN) - {
+        "log.jsonl"
+    }  # the run itself adds the log
+    assert len(list((out / "overlays").iterdir())) == 8
+    assert [path.name for path in out.parent.iterdir()] == ["out"]
+    before = (out / "points.csv").read_bytes()
+    write_result(findings_of(replace(result, survey="again")), out, jobs=2)
+    assert json.loads((out / "summary.json").read_text(encoding="utf-8"))["survey"] == "again"
+    assert not (out / "colmap").exists()
+    assert (out / "points.csv").read_bytes() == before
+    assert [path.name for path in out.parent.iterdir()] == ["out"]
+
+
+def test_a_failure_leaves_nothing_and_the_earlier_result(result: SurveyResult, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    small = replace(result, photographs=())
+    write_result(findings_of(small), out)
+
+    def fail(folder: Path) -> None:
+        raise OSError(28, "No space left on device")
+
+    with pytest.raises(OutputError, match="out: the result cannot be written: No space left on device"):
+        write_result(findings_of(replace(small, survey="new")), out, write_colmap=fail)
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]
+    assert json.loads((out / "summary.json").read_text(encoding="utf-8"))["survey"] == result.survey
+
+
+def test_other_peoples_folders_are_not_touched(tmp_path: Path) -> None:
+    refuse_foreign_folder(tmp_path / "new")
+    refuse_foreign_folder(tmp_path)
+    (tmp_path / "file").touch()
+    with pytest.raises(OutputError, match="a file is in the way"):
+        refuse_foreign_folder(tmp_path / "file")
+    with pytest.raises(OutputError, match="the folder holds 'file'; --out needs a new or empty folder"):
+        refuse_foreign_folder(tmp_path)
+    (tmp_path / "file").rename(tmp_path / "summary.json")
+    with pytest.raises(OutputError, match=r"holds 'summary.json'; --out needs"):
+        refuse_foreign_folder(tmp_path)
+
+
+@pytest.fixture
+def locked(tmp_path: Path) -> Iterator[Path]:
+    """A folder that a part of the path is a file in, which nobody can write below, root neither."""
+    (tmp_path / "file").touch()
+    yield tmp_path / "file" / "out"
+
+
+def test_a_place_that_cannot_be_written(result: SurveyResult, locked: Path) -> None:
+    with pytest.raises(OutputError, match=r"out: the result cannot be written here: (File exists|Not a dir)"):
+        write_result(findings_of(replace(result, photographs=())), locked)
+
+
+def test_plan_of_an_upright_wall_is_seen_from_its_front() -> None:
+    rng = seed_of("wall")
+    wall = rng.uniform(-1, 1, (30, 3)) * (5.0, 0.1, 3.0)
+    axes, names = plan_axes(wall)
+    np.testing.assert_allclose(axes @ axes.T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(axes) == pytest.approx(1.0)
+    assert abs(axes[2, 1]) > 0.9
+    assert names[0] == "along"
+    assert plan_axes(wall[:, [0, 2, 1]])[1] == ("X", "Y", "Z")
+
+
+def test_plots_of_small_and_plain_results() -> None:
+    network, truth = make_network(seed_of("plots"), images=3, points=12, noise_px=0.0, cameras=2, free=())
+    names = tuple(f"$x_{k}^ä.jpg" for k in range(3))
+    bars = ScaleBars(np.array([0]), np.array([1]), np.array([1.0]), np.array([0.1]))
+    plain: Network = replace(network, images=names, scale_bars=bars)
+    a = adjust(plain, truth, datum=Datum("free"))
+    plots = all_plots(findings_of(SurveyResult("plots", "$m", 3, (), a, np.full(12, -1), None)))
+    assert [plot.stem for plot in plots] == ["network", "residuals", "distribution", "photographs"]
+    assert all(plot.png.startswith(b"\x89PNG") for plot in plots)
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [(0.0, "0"), (123456.0, "123456"), (0.00123456, "0.00123"), (1.5e-9, "1.50e-09"), (np.nan, "not known")],
+)
+def test_significant_digits(value: float, text: str) -> None:
+    assert significant(value) == text
+
+
+def test_numbers_end_where_their_sigma_does() -> None:
+    assert to_precision(1.23456789, 0.0012) == "1.2346"
+    assert to_precision(1.23456789, float("nan")) == "1.234568"
+    assert with_exponent(7.456893, 0.00105) == ("7.4569", "0.0010")
+    assert with_exponent(-4.5135e-5, 2.2e-6) == ("-4.51e-5", "0.22e-5")
+    assert with_exponent(0.5, float("nan")) == ("0.5", "held fixed")
+
+
+def test_lengths_are_shown_in_a_unit_that_reads_well() -> None:
+    assert finer_unit("m", 3.2e-5) == (pytest.approx(1e6), "µm")
+    assert finer_unit("mm", 0.5) == (pytest.approx(1e3), "µm")
+    assert finer_unit("m", 0.012) == (pytest.approx(1e3), "mm")
+    assert finer_unit("ft", 1e-5) == (1.0, "ft")
+
+
+def test_table_escapes_and_aligns() -> None:
+    template = environment().from_string(
+        '{% import "macros.html" as t %}{% call t.table(("a", ">b [px]")) %}'
+        "{% for row in rows %}{{ t.row(*row) }}{% endfor %}{% endcall %}"
+    )
+    text = template.render(rows=[("<x>", "1.5"), ("y", "")])
+    assert "&lt;x&gt;" in text
+    with pytest.raises(UndefinedError, match="'rows' is undefined"):
+        template.render()
+    assert "<th class=n>b [px]</th>" in text
+    assert "<td class=n>1.5</td>" in text

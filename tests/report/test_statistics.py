@@ -1,0 +1,810 @@
+"""Verdict and statistics of the report: broken surveys are called broken, statistics are what they say."""
+
+from __future__ import annotations
+
+import csv
+import json
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from markupsafe import escape
+from scipy import stats
+
+from sfm.adjustment.datum import Datum
+from sfm.adjustment.quality.statistics import component_tests, global_test, reliability, tau_test, w_test
+from sfm.adjustment.quality.variance_components import by_kind
+from sfm.adjustment.result import Adjustment
+from sfm.adjustment.solve import adjust
+from sfm.camera import Camera
+from sfm.comparison.adjusters import AdjusterComparison, BackendAdjustment, compare_adjusters
+from sfm.network import Estimate, InteriorObservations, Network, ObjectPoints, ScaleBars
+from sfm.report.figures.plots import all_plots, plan_axes
+from sfm.report.findings.bundle_statistics import statistics_of
+from sfm.report.findings.checks import (
+    LISTED,
+    count_observations,
+    largest_residuals,
+    longest_residual,
+    sigma0_of,
+)
+from sfm.report.findings.findings import findings_of
+from sfm.report.findings.given_residuals import bar_residuals, control_residuals, interior_residuals
+from sfm.report.findings.interior_parameters import families, interior_parameters, parameter_sigmas
+from sfm.report.findings.precision import point_precision, precision_of
+from sfm.report.html.report_page import report_page
+from sfm.report.numbers import signed, significant
+from sfm.report.phrases import words_of_fixed, words_of_sigma0, words_of_test, words_of_weights
+from sfm.report.tables.csv_files import write_tables
+from sfm.report.tables.summary import summary
+from sfm.report.text.filters import WIDTH
+from sfm.report.text.text_report import text_report
+from sfm.result import ControlCheck, Eccentricity, SurveyResult
+from tests.synthetic import make_network, seed_of
+
+NOISE_PX = 0.1
+
+
+def multiplied(adjustment: Adjustment, factor: float) -> Adjustment:
+    """Return the same adjustment of standard deviations stated that much smaller, and multiplied for it."""
+    seen = adjustment.network.image_points
+    stated = replace(seen, covariance=seen.covariance / factor**2)
+    return replace(
+        adjustment,
+        network=replace(adjustment.network, image_points=stated),
+        image_sigma_factor=np.full(len(seen), factor),
+    )
+
+
+def result_of(adjustment: Adjustment, **other: object) -> SurveyResult:
+    return SurveyResult(
+        "synthetic",
+        "m",
+        len(adjustment.network.images),
+        (),
+        adjustment,
+        np.full(len(adjustment.network.points), -1),
+        None,
+        **other,  # type: ignore[arg-type]
+    )
+
+
+@pytest.fixture(scope="module")
+def synthetic() -> tuple[Network, Estimate]:
+    return make_network(seed_of("statistics"), images=8, points=40, noise_px=NOISE_PX)
+
+
+def with_control(network: Network, xyz: np.ndarray, sigma: float) -> Network:
+    covariance = np.tile(np.eye(3) * sigma**2, (len(xyz), 1, 1))
+    return replace(network, control=ObjectPoints(np.arange(len(xyz)), xyz, covariance))
+
+
+def with_bars(network: Network, truth: Estimate, errors: tuple[float, ...], sigma: float) -> Network:
+    start, end = np.arange(len(errors)), np.arange(len(errors)) + 10
+    length = np.linalg.norm(truth.points[end] - truth.points[start], axis=1) * (1 + np.array(errors))
+    return replace(network, scale_bars=ScaleBars(start, end, length, np.full(len(errors), sigma)))
+
+
+def spoiled(camera: Camera, factor: float) -> Camera:
+    parameters = camera.parameters.copy()
+    parameters[camera.names.index("c")] *= factor
+    return replace(camera, parameters=parameters)
+
+
+def test_a_good_survey_is_called_good(synthetic: tuple[Network, Estimate]) -> None:
+    network, truth = synthetic
+    for one, datum in (
+        (network, "free"),
+        (with_control(network, truth.points[:6], 1e-4), "control"),
+        (with_bars(network, truth, (0.0, 1e-4), 1e-4), "free"),
+    ):
+        verdict = findings_of(result_of(adjust(one, truth, datum=Datum(datum)))).verdict  # type: ignore[arg-type]
+        assert verdict.level == "good", verdict
+
+
+@pytest.mark.parametrize("sigma", [0.0, 1e-3])
+def test_swapped_control_is_no_result(synthetic: tuple[Network, Estimate], sigma: float) -> None:
+    network, truth = synthetic
+    swapped = with_control(network, truth.points[[1, 0, 2, 3, 4, 5]], sigma)
+    verdict = findings_of(result_of(adjust(swapped, truth, datum=Datum("control"), reject="none"))).verdict
+    assert verdict.level == "bad"
+    assert verdict.headline == "The survey has no dependable result."
+    assert any("Sigma0 is" in line or "Control point" in line for line in verdict.remarks)
+
+
+def test_a_scale_bar_that_contradicts_another_is_no_result(synthetic: tuple[Network, Estimate]) -> None:
+    network, truth = synthetic
+    barred = with_bars(network, truth, (0.0, 0.05), 1e-4)
+    a = adjust(barred, truth, datum=Datum("free"), reject="none")
+    verdict = findings_of(result_of(a)).verdict
+    assert verdict.level == "bad"
+    assert any(line.startswith("Scale bar ") for line in verdict.remarks), verdict.remarks
+
+
+@pytest.mark.parametrize(("sigmas", "level"), [(0.5, "good"), (50.0, "fair"), (200.0, "bad")])
+def test_a_false_calibration_certificate_is_noticed(sigmas: float, level: str) -> None:
+    network, truth = make_network(seed_of("certificate"), images=8, points=40, noise_px=NOISE_PX, free=("c",))
+    camera = truth.cameras[0]
+    s = camera.names.index("c")
+    sigma = 1e-3  # mm; the photographs know c a few times worse
+    one = np.zeros(1, dtype=np.int64)
+    given = np.array([camera.parameters[s] + sigmas * sigma])
+    certificate = InteriorObservations(one, one + s, given, np.array([sigma]))
+    result = result_of(
+        adjust(replace(network, interior=certificate), truth, datum=Datum("free"), reject="none")
+    )
+    found = interior_residuals(result)
+    assert found is not None and found.names == (f"c of camera {camera.name}",)
+    v = -sigmas * sigma  # of the parameter, if the photographs had no error
+    own = adjust(network, truth, datum=Datum("free"), reject="none")
+    q = own.covariance.interior[0][0, 0] / own.sigma0**2
+    expected = v / np.sqrt(sigma**2 + q)  # independent: misclosure over its standard deviation
+    assert found.w[0, 0] == pytest.approx(expected, abs=4, rel=0.05)
+    assert found.r[0, 0] == pytest.approx(sigma**2 / (sigma**2 + q), rel=0.1)  # as c moves
+    verdict = findings_of(result).verdict
+    assert verdict.level == level, verdict
+    assert any("The given c of camera" in line for line in verdict.remarks) == (level != "good")
+    assert re.search(f"interior  c of camera {camera.name} .* mm ", text_report(findings_of(result)))
+    page = report_page(findings_of(result), (), ())
+    table = page[page.index("<h4>Observed interior orientation</h4>") :].split("</table>")[0]
+    assert f"c of camera {camera.name}" in table and f"{found.w[0, 0]:+.2f}" in table
+    assert signed(float(found.difference[0, 0])) in table and f"{found.r[0, 0]:.3f}" in table
+    assert summary(findings_of(result))["weighted_interior"][0]["w"] == pytest.approx(found.w[0, 0])
+
+
+@pytest.mark.parametrize("fixed", [0, 1, 4])
+def test_fixed_coordinates_do_not_make_the_points_look_more_precise(fixed: int) -> None:
+    network, truth = make_network(seed_of("fixed points"), images=8, points=20, noise_px=NOISE_PX, free=())
+    rows = np.arange(6)
+    covariance = np.tile(1e-6 * np.eye(3), (6, 1, 1))
+    covariance[:fixed] = 0.0
+    control = ObjectPoints(rows, truth.points[rows], covariance)
+    result = result_of(
+        adjust(replace(network, control=control), truth, datum=Datum("control"), reject="none")
+    )
+    a = result.adjustment
+    sigma = np.sqrt(np.einsum("nii->ni", a.covariance.points[fixed:]))
+    rms = point_precision(a)[0]
+    np.testing.assert_allclose(rms[:3], np.sqrt((sigma**2).mean(axis=0)), rtol=1e-12)
+    assert rms[3] == pytest.approx(float(np.sqrt((sigma**2).mean())))
+    words = {
+        0: "",
+        1: "without the fixed coordinates of 1 point",
+        4: "without the fixed coordinates of 4 points",
+    }
+    assert words_of_fixed(precision_of(a)) == words[fixed]
+    assert ("without the fixed" in text_report(findings_of(result))) == (fixed > 0)
+    assert ("without the fixed" in report_page(findings_of(result), (), ())) == (fixed > 0)
+
+
+def test_precision_where_everything_is_fixed_is_not_known() -> None:
+    network, truth = make_network(seed_of("all fixed"), images=4, points=12, noise_px=NOISE_PX, free=())
+    control = ObjectPoints(np.arange(12), truth.points, np.zeros((12, 3, 3)))
+    a = adjust(replace(network, control=control), truth, datum=Datum("control"), reject="none")
+    assert np.isnan(point_precision(a)).all()
+    assert "not known" in text_report(findings_of(result_of(a))) and "not known" in report_page(
+        findings_of(result_of(a)), (), ()
+    )
+
+
+def test_a_limiting_precision_above_the_achieved_one_is_explained(
+    synthetic: tuple[Network, Estimate],
+) -> None:
+    network, truth = synthetic
+    a = adjust(network, truth, datum=Datum("free"))
+    words = "The limiting precision is in the datum of the cameras"
+    for factor, explained in ((0.5, False), (3.0, True)):
+        covariance = replace(a.covariance, points_limiting=factor**2 * a.covariance.points)
+        result = result_of(replace(a, covariance=covariance))
+        assert (words in " ".join(text_report(findings_of(result)).split())) is explained
+        assert (words in report_page(findings_of(result), (), ())) is explained
+
+
+def test_a_point_that_lost_most_of_its_rays_is_named(synthetic: tuple[Network, Estimate]) -> None:
+    network, truth = synthetic
+    a = adjust(network, truth, datum=Datum("free"), reject="none")
+    of_point = np.flatnonzero(network.image_points.point == 4)
+    for lost, level in ((len(of_point) // 2, "good"), (len(of_point) // 2 + 1, "fair")):
+        rejected = a.rejected.copy()
+        rejected[of_point[:lost]] = True
+        verdict = findings_of(result_of(replace(a, rejected=rejected))).verdict
+        assert verdict.level == level
+        told = any(f"{network.points[4]} ({lost} of {len(of_point)})" in line for line in verdict.remarks)
+        assert told == (level == "fair")
+
+
+def test_a_wrong_fixed_camera_is_no_result() -> None:
+    network, truth = make_network(seed_of("fixed"), images=8, points=40, noise_px=NOISE_PX, free=())
+    wrong = replace(truth, cameras=tuple(spoiled(camera, 1.05) for camera in truth.cameras))
+    a = adjust(network, wrong, datum=Datum("free"), reject="none")
+    assert a.sigma0 > 5
+    assert findings_of(result_of(a)).verdict.level == "bad"
+
+
+def test_blunders_left_in_are_no_result(synthetic: tuple[Network, Estimate]) -> None:
+    network, truth = synthetic
+    seen = network.image_points
+    xy = seen.xy.copy()
+    blunders = seed_of("blunders").choice(len(xy), 3, replace=False)
+    xy[blunders] += (8.0, -8.0)
+    a = adjust(replace(network, image_points=replace(seen, xy=xy)), truth, datum=Datum("free"), reject="none")
+    verdict = findings_of(result_of(a)).verdict
+    assert verdict.level == "bad"
+    assert any("was not rejected" in line for line in verdict.remarks)
+    worst = longest_residual(a)
+    named = {(network.images[seen.image[k]], network.points[seen.point[k]]) for k in blunders}
+    assert (worst.image, worst.point) in named
+
+
+def test_a_residual_with_a_lowered_weight_is_told_with_and_without_it(
+    synthetic: tuple[Network, Estimate],
+) -> None:
+    network, truth = synthetic
+    seen = network.image_points
+    xy = seen.xy.copy()
+    xy[7] += (20.0, 0.0)
+    a = adjust(
+        replace(network, image_points=replace(seen, xy=xy)), truth, datum=Datum("free"), reject="huber"
+    )
+    result = result_of(a)
+    (remark,) = (line for line in findings_of(result).verdict.remarks if "lowered" in line)
+    found = re.search(r"residual of ([\d.]+) px, ([\d.]+) times .* ([\d.]+) times with its lowered", remark)
+    assert found is not None, remark
+    length, plain, lowered = (float(word) for word in found.groups())
+    assert plain == pytest.approx(length / NOISE_PX, rel=0.02) and plain > 150
+    assert lowered == pytest.approx(longest_residual(a).over_sigma, rel=0.01)
+    assert longest_residual(a).weight == pytest.approx((lowered / plain) ** 2, rel=0.02)
+
+
+def test_sigma_px_is_only_a_guess(synthetic: tuple[Network, Estimate]) -> None:
+    network, truth = synthetic
+    seen = network.image_points
+    levels = {}
+    for guess in (4.0, 1 / 1.5, 1 / 3, 1 / 8):  # of the true standard deviation
+        stated = replace(network, image_points=replace(seen, covariance=seen.covariance * guess**2))
+        a = adjust(stated, truth, datum=Datum("free"), reject="none")
+        assert not global_test(a).passed
+        levels[guess] = findings_of(result_of(a)).verdict.level
+    assert levels == {4.0: "good", 1 / 1.5: "good", 1 / 3: "fair", 1 / 8: "bad"}
+
+
+@pytest.mark.parametrize(("guess", "told"), [(1.0, False), (1.8, False), (2.2, True), (4.0, True)])
+def test_a_sigma_that_is_far_too_large_is_told_with_what_it_would_be(
+    synthetic: tuple[Network, Estimate], guess: float, told: bool
+) -> None:
+    network, truth = synthetic
+    seen = network.image_points
+    stated = replace(network, image_points=replace(seen, covariance=seen.covariance * guess**2))
+    a = adjust(stated, truth, datum=Datum("free"), reject="none")
+    lines = findings_of(result_of(a)).verdict.remarks
+    ratio = a.sigma0
+    line = (
+        f"The stated standard deviation of the image points, {significant(guess * NOISE_PX)} px, is "
+        f"pessimistic: their residuals show {significant(ratio * guess * NOISE_PX)} px."
+    )
+    assert list(lines) == ([line] if told else [])
+    # the same where the image points were weighted by their own component before
+    b = adjust(stated, truth, datum=Datum("free"), reject="none", image_sigma_factor=ratio)
+    assert b.sigma0 == pytest.approx(1)
+    assert findings_of(result_of(b)).verdict.remarks == lines
+
+
+@pytest.mark.parametrize(
+    ("bad", "guess", "told"), [(0, 1.0, ""), (6, 1.0, "w"), (6, 5.0, "tau"), (0, 0.5, "")]
+)
+def test_gross_errors_that_nobody_looked_for_are_counted(
+    synthetic: tuple[Network, Estimate], bad: int, guess: float, told: str
+) -> None:
+    """Of 1 px; where sigma is stated five times too large only tau sees them; too small, none is seen."""
+    network, truth = synthetic
+    seen = network.image_points
+    xy = seen.xy.copy()
+    xy[seed_of("not looked for").choice(len(xy), bad, replace=False), 0] += 1.0
+    spoiled = replace(seen, xy=xy, covariance=guess**2 * seen.covariance)
+    a = adjust(replace(network, image_points=spoiled), truth, datum=Datum("free"), reject="none")
+    lines = [
+        line for line in findings_of(result_of(a, reject="none")).verdict.remarks if "adjust.reject" in line
+    ]
+    assert not any("adjust.reject" in line for line in findings_of(result_of(a)).verdict.remarks)
+    if not told:
+        assert lines == []
+        return
+    test = {"tau": tau_test, "w": w_test}[told](a)
+    assert test.beyond >= bad
+    assert lines == [
+        f"{test.beyond} of {test.tested} image coordinates have |{told}| beyond {test.critical:.2f} "
+        f'({test.expected:.1f} by chance), none was rejected: adjust.reject = "tau" takes out gross errors.'
+    ]
+
+
+def test_weights_found_from_the_residuals_do_not_hide_sigma0(synthetic: tuple[Network, Estimate]) -> None:
+    network, truth = synthetic
+    a = adjust(network, truth, datum=Datum("free"))
+    assert findings_of(result_of(multiplied(a, 3.0))).verdict.level == "fair"
+    bad = findings_of(result_of(multiplied(a, 200.0))).verdict
+    assert bad.level == "bad"
+    assert "expected standard deviation of an image coordinate (0.0005" in bad.remarks[0]
+    text = summary(findings_of(result_of(multiplied(a, 3.0))))
+    assert text["statistics"]["sigma0_ratio"] == pytest.approx(3 * a.sigma0)
+
+
+def test_control_that_contradicts_is_told_apart_from_the_image_points(
+    synthetic: tuple[Network, Estimate],
+) -> None:
+    network, truth = synthetic
+    xyz = truth.points[:6].copy()
+    xyz[0, 0] += 0.02
+    a = adjust(with_control(network, xyz, 1e-3), truth, datum=Datum("control"), reject="none")
+    result = result_of(a)
+    own = sigma0_of(result).image_points_px
+    assert a.sigma0_px > 1.05 * own
+    assert own == pytest.approx(NOISE_PX, rel=0.1)  # whatever the control does
+    figure, words = words_of_sigma0(sigma0_of(result))
+    assert figure == f"{a.sigma0_px:.4f} px"
+    assert f"image points by themselves {own:.4f} px" in words
+    page = " ".join(report_page(findings_of(result), (), ()).split())
+    assert figure in page and words in page
+    assert f"{own:.5f} px, by themselves" in " ".join(text_report(findings_of(result)).split())
+    written = summary(findings_of(result))["statistics"]
+    assert written["image_points_px"] == pytest.approx(own) and written["stated_px"] == pytest.approx(
+        NOISE_PX
+    )
+    free = result_of(adjust(network, truth, datum=Datum("free")))
+    assert "by themselves" not in " ".join(words_of_sigma0(sigma0_of(free)))
+
+
+def test_each_kind_is_tested_against_what_was_stated_in_the_same_words_everywhere(
+    synthetic: tuple[Network, Estimate],
+) -> None:
+    network, truth = synthetic
+    a = adjust(with_bars(network, truth, (0.0, 1e-5), 1e-4), truth, datum=Datum("free"))
+    for factor, passed in ((1.0, True), (0.8, False), (1.25, False)):
+        result = result_of(multiplied(a, factor))
+        image, bars = statistics_of(result).global_tests
+        assert image.passed is passed and bars.passed
+        r = float(np.nansum(a.redundancy_numbers))
+        seen = a.network.image_points
+        squares = (a.residuals[~a.rejected] ** 2).sum() / NOISE_PX**2 * factor**2
+        assert image.redundancy == pytest.approx(r) and image.statistic == pytest.approx(squares)
+        assert len(seen) > 100
+        text = " ".join(text_report(findings_of(result)).split())
+        page, written = report_page(findings_of(result), (), ()), summary(findings_of(result))["statistics"]
+        for test, one in zip((image, bars), written["global_tests"], strict=True):
+            words = words_of_test(test)
+            assert words in text and escape(words) in page and words == one["words"]
+            assert one["passed"] is test.passed
+            assert ("better than stated" in words) == (test is image and factor < 1)
+            assert ("worse than stated" in words) == (test is image and factor > 1)
+        words = words_of_weights(result)
+        assert (words == "") == (factor == 1)
+        assert words in text and words in page and words == written["weights"]
+        assert written["sigma0_by_kind"]["image points"] == pytest.approx(written["sigma0_ratio"], rel=1e-6)
+
+
+@pytest.mark.parametrize("reject", ["huber", "tukey"])
+def test_the_global_test_of_an_m_estimator_is_left_out_with_the_reason(
+    synthetic: tuple[Network, Estimate], reject: str
+) -> None:
+    network, truth = synthetic
+    reason = "not tested, the weights come from the residuals, so that v'Pv is not chi-square distributed"
+    for one, of in (
+        (network, "all observations"),
+        (with_bars(network, truth, (0.0, 1e-5), 1e-4), "image points"),
+    ):
+        result = result_of(adjust(one, truth, datum=Datum("free"), reject=reject))
+        first, *other = statistics_of(result).global_tests
+        assert first.passed is None and all(test.passed for test in other)
+        assert words_of_test(first) == f"{of}: {reason}"
+        written = summary(findings_of(result))["statistics"]["global_tests"][0]
+        assert written["passed"] is None and written["words"] == words_of_test(first)
+        assert words_of_test(first) in " ".join(text_report(findings_of(result)).split())
+        assert escape(words_of_test(first)) in report_page(findings_of(result), (), ())
+        assert len(other) == len(one.scale_bars) // 2
+        assert findings_of(result).verdict.level == "good"
+
+
+def test_bars_that_are_all_a_little_too_bad_are_noticed(synthetic: tuple[Network, Estimate]) -> None:
+    network, truth = synthetic
+    errors = 3e-4 * np.array([1, -1, 1, -1, 1, -1])
+    a = adjust(with_bars(network, truth, tuple(errors), 1e-4), truth, datum=Datum("free"))
+    bars = bar_residuals(result_of(a))
+    assert bars is not None and np.abs(bars.w).max() < 5
+    verdict = findings_of(result_of(a)).verdict
+    assert verdict.level == "fair" and len(verdict.remarks) == 1
+    assert verdict.remarks[0].startswith("The residuals of the scale bars are"), verdict.remarks
+
+
+@pytest.mark.parametrize(("sigma", "limit"), [(0.0, 100.0), (1e-5, 5.0)])
+def test_control_that_only_checks(sigma: float, limit: float) -> None:
+    network, truth = make_network(seed_of("checks"), images=8, points=40, noise_px=0.02)
+    known = with_control(network, truth.points[:4], sigma)
+    a = adjust(known, truth, datum=Datum("free"))
+    names = a.network.points[:4]
+
+    def level(differences: float, *, scale: float = 1.0, bars: bool = False) -> str:
+        d = np.zeros((4, 3))
+        d[2] = (differences, 0, 0)
+        one = a
+        if bars:
+            one = adjust(with_bars(known, truth, (0.0,), 1e-4), truth, datum=Datum("free"))
+        return findings_of(result_of(one, control_check=ControlCheck(names, d, scale))).verdict.level
+
+    expected = np.sqrt(np.trace(a.covariance.points[2]) / 3 + sigma**2)
+    assert level(2 * expected) == "good"
+    size = np.linalg.norm(np.ptp(a.estimate.points, axis=0))
+    assert 120 * expected < 0.009 * size
+    assert level(0.8 * limit * expected) == "good"
+    assert level(1.2 * limit * expected) == "fair"
+    assert level(0.05) == "bad"
+    assert level(2 * expected, scale=1.001, bars=True) == "good"
+    assert level(2 * expected, scale=1.05, bars=True) == "bad"
+
+
+def test_words_for_the_scale_of_the_control(synthetic: tuple[Network, Estimate]) -> None:
+    network, truth = synthetic
+    known = with_control(network, truth.points[:4], 1e-4)
+    check = ControlCheck(network.points[:4], np.full((4, 3), 1e-4), 1.0025)
+    free = result_of(adjust(known, truth, datum=Datum("free")), control_check=check)
+    assert "scale was taken from the control" in report_page(findings_of(free), (), ())
+    bars = with_bars(known, truth, (0.0,), 1e-4)
+    barred = result_of(adjust(bars, truth, datum=Datum("free")), control_check=check)
+    page = " ".join(report_page(findings_of(barred), (), ()).split())
+    assert "the control says lengths are 1.0025 times those of the scale bars" in page
+    assert f"100 µm in X, Y, Z at 4 points; largest 173 µm at {network.points[0]}" in text_report(
+        findings_of(barred)
+    )
+    assert "A single bar gives the scale" in page
+
+
+def test_residuals_of_control_and_bars_are_adjusted_minus_given(
+    synthetic: tuple[Network, Estimate],
+) -> None:
+    network, truth = synthetic
+    known = with_bars(with_control(network, truth.points[:6] + 2e-4, 1e-3), truth, (1e-4, -1e-4), 1e-4)
+    a = adjust(known, truth, datum=Datum("control"))
+    control, bars = control_residuals(result_of(a)), bar_residuals(result_of(a))
+    assert control is not None and bars is not None
+    np.testing.assert_allclose(control.difference, a.estimate.points[:6] - truth.points[:6] - 2e-4)
+    np.testing.assert_allclose(control.w, control.difference / (1e-3 * np.sqrt(control.r)))
+    np.testing.assert_allclose(bars.w, bars.difference / (1e-4 * np.sqrt(bars.r)))
+    adjusted = np.linalg.norm(a.estimate.points[[10, 11]] - a.estimate.points[[0, 1]], axis=1)
+    np.testing.assert_allclose(bars.difference[:, 0], adjusted - known.scale_bars.length, atol=1e-15)
+    text = summary(findings_of(result_of(a)))
+    assert text["control"]["role"] == "datum"
+    assert text["control"]["points"][0]["w"] == pytest.approx(control.w[0].tolist())
+    assert text["control"]["points"][0]["r"] == pytest.approx(control.r[0].tolist())
+    assert text["scale_bars"][1]["from"] == "2" and text["scale_bars"][1]["to"] == "12"
+    assert text["scale_bars"][1]["w"] == pytest.approx(bars.w[1, 0])
+    assert text["scale_bars"][1]["r"] == pytest.approx(bars.r[1, 0])
+    page = report_page(findings_of(result_of(a)), (), ())
+    assert "<h3>Control</h3>" in page and "<h3>Scale bars</h3>" in page and "2 - 12" in page
+    counts = count_observations(a)
+    assert (counts.control, counts.scale_bars, counts.constraints) == (18, 2, 0)
+    assert counts.image + counts.control + counts.scale_bars == counts.total == a.observations
+
+
+def test_w_of_given_values_is_standard_normal() -> None:
+    """Control with correlated coordinates and scale bars, as good as the photographs find the points."""
+    network, truth = make_network(seed_of("given"), images=6, points=12, noise_px=0.0, free=())
+    rng, k = seed_of("noise of the given"), network.image_points
+    factor = 3e-4 * np.array([[1.0, 0, 0], [0.7, 0.7, 0], [0.2, -0.3, 0.9]])
+    start, end = np.arange(4), np.arange(4) + 6
+    length, w, r, plain = np.linalg.norm(truth.points[end] - truth.points[start], axis=1), [], [], []
+    for _ in range(60):
+        xyz = truth.points[:5] + rng.standard_normal((5, 3)) @ factor.T
+        one = replace(
+            network,
+            image_points=replace(k, xy=k.xy + rng.normal(0, 0.1, k.xy.shape)),
+            control=ObjectPoints(np.arange(5), xyz, np.tile(factor @ factor.T, (5, 1, 1))),
+            scale_bars=ScaleBars(start, end, length + rng.normal(0, 3e-4, 4), np.full(4, 3e-4)),
+        )
+        result = result_of(adjust(one, truth, datum=Datum("control"), reject="none"))
+        control, bars = control_residuals(result), bar_residuals(result)
+        assert control is not None and bars is not None
+        w.append(np.concatenate([control.w.ravel(), bars.w.ravel()]))
+        r.append(np.concatenate([control.r.ravel(), bars.r.ravel()]))
+        plain.append((bars.difference / bars.sigma).ravel())
+    assert 0.1 < np.mean(r) < 0.9  # some are well checked, some are not
+    for part in (np.array(w)[:, :15], np.array(w)[:, 15:]):
+        assert stats.kstest(part.ravel(), "norm").pvalue > 0.01
+    assert np.std(plain) < 0.9
+
+
+def test_the_worst_control_stands_in_the_text_with_residual_and_w(
+    synthetic: tuple[Network, Estimate],
+) -> None:
+    network, truth = synthetic
+    xyz = truth.points[:6].copy()
+    xyz[3, 1] += 5e-3
+    result = result_of(adjust(with_control(network, xyz, 1e-3), truth, datum=Datum("control")))
+    control = control_residuals(result)
+    assert control is not None
+    text = text_report(findings_of(result))
+    section = text[text.index("Control, scale") :].splitlines()
+    assert max(map(len, section)) <= WIDTH and "6 points, RMS" in section[1]
+    name, axis, v, sigma, unit, r, w = section[3].split()
+    assert (name, axis, unit) == (network.points[3], "Y", "mm")
+    assert float(v) == pytest.approx(1000 * control.difference[3, 1], rel=0.01) and float(sigma) == 1
+    assert float(r) == pytest.approx(control.r[3, 1], abs=1e-3)
+    assert float(w) == pytest.approx(control.w[3, 1], abs=0.01)
+    assert "the 12 with the largest w of 18; all in given.csv" in text
+    fixed = with_control(network, truth.points[:6], 0.0)
+    words = text_report(findings_of(result_of(adjust(fixed, truth, datum=Datum("control")))))
+    assert "6 points without standard deviation: not checked" in words
+
+
+def test_what_is_met_exactly_is_not_checked(synthetic: tuple[Network, Estimate], tmp_path: Path) -> None:
+    network, truth = synthetic
+    single = result_of(adjust(with_bars(network, truth, (0.3,), 1e-4), truth, datum=Datum("free")))
+    bars = bar_residuals(single)
+    assert bars is not None and np.isnan(bars.w).all() and bars.r[0, 0] < 1e-6
+    assert findings_of(single).verdict.level == "good"
+    assert re.search(r"scale bar  1 - 11 .* m  0\.000  not checked", text_report(findings_of(single)))
+    assert summary(findings_of(single))["scale_bars"][0]["w"] is None
+    assert "<td>not checked" in report_page(findings_of(single), (), ())
+    write_tables(findings_of(single), tmp_path)
+    with (tmp_path / "given.csv").open(encoding="utf-8") as file:
+        (row,) = csv.DictReader(file)
+    assert row["kind"] == "scale bar" and row["name"] == "1 - 11" and row["w"] == ""
+    assert float(row["given"]) == bars.given[0, 0] and row["unit"] == "m"
+
+
+def test_every_given_value_stands_in_its_table(synthetic: tuple[Network, Estimate], tmp_path: Path) -> None:
+    network, truth = synthetic
+    known = with_bars(with_control(network, truth.points[:6] + 2e-4, 1e-3), truth, (1e-4, -1e-4), 1e-4)
+    result = result_of(adjust(known, truth, datum=Datum("control")))
+    control = control_residuals(result)
+    assert control is not None
+    write_tables(findings_of(result), tmp_path)
+    with (tmp_path / "given.csv").open(encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    assert [row["kind"] for row in rows] == ["control point"] * 18 + ["scale bar"] * 2
+    assert [row["coordinate"] for row in rows[:3]] == ["X", "Y", "Z"]
+    for column, values in (("w", control.w), ("r", control.r), ("difference", control.difference)):
+        assert [float(row[column]) for row in rows[:18]] == values.ravel().tolist()
+
+
+def test_fixed_control_has_no_ratio(synthetic: tuple[Network, Estimate]) -> None:
+    network, truth = synthetic
+    a = adjust(with_control(network, truth.points[:6], 0.0), truth, datum=Datum("control"))
+    text = summary(findings_of(result_of(a)))
+    assert text["control"]["points"][0]["w"] == [None, None, None]
+    assert "6 points without standard deviation: not checked" in text_report(findings_of(result_of(a)))
+    assert count_observations(a).control == 0
+    assert "fixed" in report_page(findings_of(result_of(a)), (), ())
+
+
+def test_statistics_are_shown_and_written(synthetic: tuple[Network, Estimate]) -> None:
+    network, truth = synthetic
+    a = adjust(network, truth, datum=Datum("free"))
+    result = result_of(a)
+    page, text = (
+        report_page(findings_of(result), (), ()),
+        json.loads(json.dumps(summary(findings_of(result)))),
+    )
+    test = global_test(a)
+    found = text["statistics"]
+    (written,) = found["global_tests"]
+    assert written["of"] == "all observations" and written["passed"] is test.passed
+    assert written["lower"] == test.lower and written["upper"] == test.upper
+    assert f"{test.lower:.2f}" in page and f"{test.upper:.2f}" in page
+    assert found["observations"]["constraints"] == 7
+    assert found["redundancy_number"]["min"] == pytest.approx(np.nanmin(a.redundancy_numbers))
+    assert set(found["sigma0_by_photograph"]) == set(a.network.images)
+    assert "The 10 largest residuals" in page and "Variance components" in page
+    assert text["length_unit"] == "network units"
+    assert text["verdict"] == {
+        "level": "good",
+        "headline": findings_of(result).verdict.headline,
+        "remarks": [],
+    }
+    worst = largest_residuals(a)
+    assert len(worst) == LISTED == 10
+    w = np.abs(np.where(a.rejected[:, None], 0, a.standardised))
+    assert abs(worst[0].w) == w.max()
+    np.testing.assert_array_equal(np.sort(w.max(axis=1))[::-1][:10], [abs(one.w) for one in worst])
+    assert f"{worst[9].w:+.2f}" in page
+    for pair in statistics_of(result).camera_correlations:
+        assert "of camera" in pair.first and f"{100 * pair.value:+.1f}" in page
+
+
+def test_parameters_that_mean_nothing_are_named() -> None:
+    network, truth = make_network(
+        seed_of("insignificant"), images=8, points=40, noise_px=NOISE_PX, free=("c", "K1", "b2")
+    )
+    a = adjust(network, truth, datum=Datum("free"))
+    camera = a.estimate.cameras[0]
+    t = abs(camera.value("b2")) / np.sqrt(a.covariance.interior[0][-1, -1])
+    assert t < 2  # its true value is 0
+    page = report_page(findings_of(result_of(a)), (), ())
+    assert f"b2 of camera 1 ({t:.1f})" in page
+    named = summary(findings_of(result_of(a)))["statistics"]["not_significant"]
+    assert [one["parameter"] for one in named] == ["b2"]
+
+
+def test_only_what_may_be_0_is_told_over_its_standard_deviation(
+    synthetic: tuple[Network, Estimate],
+) -> None:
+    network, truth = synthetic
+    a = adjust(network, truth, datum=Datum("free"))
+    told = {one.name: one.t for one in interior_parameters(a) if one.sigma > 0}
+    assert told["c"] is None and len(told) > 3
+    by_name = {test.parameter: test for test in statistics_of(result_of(a)).significance}
+    assert {name: t for name, t in told.items() if t is not None} == {
+        name: test.t for name, test in by_name.items()
+    }
+
+
+def test_circles_are_told(synthetic: tuple[Network, Estimate]) -> None:
+    network, truth = synthetic
+    a = adjust(network, truth, datum=Datum("free"))
+    found = result_of(a, eccentricity=Eccentricity(0.1641, 0.0443, 0.0003), no_circles=("u007", "u<9"))
+    text = summary(findings_of(found))
+    assert text["eccentricity"] == {"largest_px": 0.1641, "rms_px": 0.0443, "sigma_px": 0.0003}
+    assert text["no_circles"] == ["u007", "u<9"]
+    page = report_page(findings_of(found), (), ())
+    assert "u007, u&lt;9" in page and "0.0443 px RMS" in page
+    none = summary(findings_of(result_of(a)))
+    assert none["eccentricity"] is None and none["no_circles"] == []
+
+
+@pytest.fixture(scope="module")
+def compared(synthetic: tuple[Network, Estimate]) -> tuple[Adjustment, AdjusterComparison]:
+    network, truth = synthetic
+    a = adjust(network, truth, datum=Datum("free"))
+
+    class Same:
+        iterations, converged, seconds, point_covariance = 1, True, 0.1, None
+
+        def __init__(self, estimate: Estimate) -> None:
+            self.estimate = estimate
+
+    def backend(part: Network, start: Estimate) -> BackendAdjustment:
+        return Same(adjust(part, start, datum=Datum("free"), reject="none").estimate)
+
+    return a, compare_adjusters(a, backend)
+
+
+def test_comparison_tells_what_it_changed(compared: tuple[Adjustment, AdjusterComparison]) -> None:
+    a, both = compared
+    both = replace(both, held=("k<4> of camera 1",), freed=("camera 1: k3",))
+    result = replace(result_of(a), comparison=both)
+    page = report_page(findings_of(result), (), ())
+    assert "k&lt;4&gt; of camera 1" in page and "camera 1: k3" in page
+    assert f"{both.conversions[0].rms_px:.4f}" in page and "Cameras written in another model" in page
+    text = summary(findings_of(result))["comparison"]
+    assert text["conversions"][0]["max_px"] == both.conversions[0].max_px
+    assert text["held"] == ["k<4> of camera 1"] and text["freed"] == ["camera 1: k3"]
+
+
+def test_the_model_is_linked_where_it_is(compared: tuple[Adjustment, AdjusterComparison]) -> None:
+    result = replace(result_of(compared[0]), comparison=compared[1])
+    assert 'href="colmap/"' not in report_page(findings_of(result), (), ())
+    page = " ".join(report_page(findings_of(result), (), (), has_model=True).split())
+    assert 'href="colmap/"' in page and "free datum, equal weights" in page
+
+
+def test_plan_is_seen_from_the_cameras() -> None:
+    rng = seed_of("plan")
+    level = rng.uniform(-1, 1, (30, 3)) * (5.0, 3.0, 0.1)
+    wall = level[:, [0, 2, 1]]
+    for points, towards in ((level, (0, 0, 4)), (level, (0, 0, -4)), (wall, (0, 4, 1)), (wall, (0, -4, 1))):
+        position = np.array(towards) + rng.uniform(-1, 1, (5, 3))
+        axes, names = plan_axes(points, position)
+        assert np.linalg.det(axes) == pytest.approx(1.0)
+        assert ((position - points.mean(axis=0)) @ axes[2]).mean() > 0
+        assert len(names) == 3
+    assert plan_axes(level, np.array([[0, 0, -4.0]]))[1] == ("X", "-Y", "-Z")
+
+
+def test_names_that_the_font_lacks_give_no_warning(
+    synthetic: tuple[Network, Estimate], recwarn: pytest.WarningsRecorder, tmp_path: Path
+) -> None:
+    network, truth = synthetic
+    names = tuple(f"写真{k}$.jpg" for k in range(len(network.images)))
+    cameras = tuple(replace(camera, name="相機_$x") for camera in truth.cameras)
+    network = with_bars(replace(network, images=names), truth, (0.0,), 1e-4)
+    a = adjust(network, replace(truth, cameras=cameras), datum=Datum("free"))
+    all_plots(findings_of(replace(result_of(a), unit="米")))
+    assert not recwarn.list
+
+
+def test_text_report_is_one_page_with_the_figures_of_the_adjustment(
+    synthetic: tuple[Network, Estimate],
+) -> None:
+    network, truth = synthetic
+    network = with_bars(network, truth, (0.0, 1e-5), 1e-4)
+    a = adjust(network, truth, datum=Datum("free"))
+    text = text_report(findings_of(result_of(a)))
+    lines = text.splitlines()
+    assert len(lines) < 100 and max(map(len, lines)) <= WIDTH
+    assert f"{a.sigma0_px:.5f} px" in text and "rank defect 6, as expected" in text
+    assert f"{a.observations} ({2 * int((~a.rejected).sum())} image coordinates, 2 scale bars)" in text
+    for test in component_tests(by_kind(a)):
+        assert " ".join(words_of_test(test).split()) in " ".join(text.split())
+    numbers = re.search(r"sum ([\d.]+), of all observations ([\d.]+); mean", text)
+    assert numbers is not None
+    assert float(numbers[1]) == pytest.approx(np.nansum(a.redundancy_numbers), abs=0.06)
+    assert float(numbers[2]) == pytest.approx(a.redundancy, abs=0.06)
+    assert f"beyond {w_test(a).critical:.2f}" in text and f"beyond {tau_test(a).critical:.2f}" in text
+    for words in ("minimal bias", "external reliability", "Variance components", "correlations over 95 %"):
+        assert words in text
+    assert text == text_report(findings_of(result_of(a)))
+
+
+def test_what_cannot_be_determined_stands_in_every_report() -> None:
+    network, truth = make_network(seed_of("one ray"), images=6, points=20)
+    k = network.image_points
+    keep = (k.point != 7) | (k.image == 0)
+    a = adjust(replace(network, image_points=k.select(keep)), truth, datum=Datum("free"))
+    words = "point 8: 1 ray, 2 are needed"
+    assert a.undetermined == (words,)
+    result = result_of(a)
+    assert f"NOT DETERMINED: {words}" in text_report(findings_of(result))
+    assert words in report_page(findings_of(result), (), ())
+    assert summary(findings_of(result))["datum"]["undetermined"] == [words]
+
+
+def test_tables_of_reliability_and_variance_components(
+    synthetic: tuple[Network, Estimate], tmp_path: Path
+) -> None:
+    network, truth = synthetic
+    k = network.image_points
+    xy = k.xy.copy()
+    xy[3] += 5.0
+    network = with_bars(replace(network, image_points=replace(k, xy=xy)), truth, (0.0, 1e-5), 1e-4)
+    a = adjust(network, truth, datum=Datum("free"))
+    assert a.rejected[3]
+    write_tables(findings_of(result_of(a)), tmp_path)
+    with (tmp_path / "reliability.csv").open(encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == len(k)
+    assert rows[3]["rejected"] == "1" and rows[3]["rx"] == rows[3]["mdbx_px"] == rows[3]["extx"] == ""
+    found = reliability(a)
+    for row, index in ((rows[0], 0), (rows[40], 40)):
+        assert float(row["rx"]) == a.redundancy_numbers[index, 0]
+        assert float(row["wy"]) == a.standardised[index, 1]
+        assert float(row["tauy"]) == a.tau[index, 1]
+        assert float(row["mdbx_px"]) == pytest.approx(4.1324 * 0.1 / np.sqrt(float(row["rx"])), rel=1e-4)
+        assert float(row["exty"]) == found.external[index, 1]
+    numbers = sum(float(row[c]) for row in rows for c in ("rx", "ry") if row[c])
+    with (tmp_path / "variance_components.csv").open(encoding="utf-8") as file:
+        components = list(csv.DictReader(file))
+    kinds = {row["group"]: row for row in components if row["kind"] == "kind"}
+    assert set(kinds) == {"image points", "scale bars"}
+    assert float(kinds["image points"]["redundancy"]) == pytest.approx(numbers, rel=1e-9)
+    assert sum(float(row["redundancy"]) for row in kinds.values()) == pytest.approx(a.redundancy, abs=1e-3)
+    photographs = [row for row in components if row["kind"] == "photograph"]
+    assert [row["group"] for row in photographs] == list(a.network.images)
+
+
+def test_shared_parameters_are_told_once(synthetic: tuple[Network, Estimate]) -> None:
+    network, truth = synthetic
+    m = len(network.images)
+    cameras = tuple(
+        replace(
+            truth.cameras[0],
+            name=f"A image {i + 1}",
+            shared=tuple("" if name == "c" else "A" for name in truth.cameras[0].names),
+        )
+        for i in range(m)
+    )
+    a = adjust(replace(network, camera=np.arange(m)), replace(truth, cameras=cameras), datum=Datum("free"))
+    once = interior_parameters(a)
+    assert [one.owner for one in once if one.name == "c"] == [camera.name for camera in cameras]
+    assert [(one.owner, one.photographs) for one in once if one.name == "K1"] == [("A", m)]
+    assert [name for name, _ in families(a)] == ["A"]
+    page = report_page(findings_of(result_of(a)), (), ())
+    assert page.count("<h4>A</h4>") == 1 and f"{m} parameters of single photographs and groups" in page
+    tests = summary(findings_of(result_of(a)))["statistics"]["significance"]
+    assert [one["camera"] for one in tests if one["parameter"] == "K1"] == ["A"]
+
+
+def test_a_camera_without_photographs_in_the_network_has_no_sigmas() -> None:
+    network, truth = make_network(seed_of("idle"), images=6, points=20, cameras=2)
+    network = replace(network, camera=np.zeros(6, dtype=np.int64))
+    a = adjust(network, replace(truth, cameras=(truth.cameras[0], truth.cameras[1])), datum=Datum("free"))
+    assert np.isnan(parameter_sigmas(a, 1)).all()
+    assert "camera 2" in report_page(findings_of(result_of(a)), (), ())

@@ -1,0 +1,377 @@
+"""A survey folder made by a stranger: no command writes through its links, or removes what is not ours."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from collections.abc import Callable
+from dataclasses import fields
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+import sfm.cli
+from adapters.colmap.camera_models import write_model
+from adapters.colmap.database import read_database, write_database
+from sfm.batch.run import run_batch
+from sfm.errors import OutputError
+from sfm.files.folder_lock import locked
+from sfm.files.whole_files import remove_leftovers, whole_file, whole_folder
+from sfm.kernels.compiling import COMPILING
+from sfm.report.log import SurveyLog, read_log
+from sfm.report.output import folder_name
+from sfm.survey.measuring.target_store import TargetStore, measuring_sources
+from sfm.targets.detect import Targets, find_targets
+from tests.engines import ALONE, HERE, Notes
+from tests.surveys import pictures, write_observed_survey, write_photograph_survey
+from tests.synthetic import make_network, seed_of
+
+OWN = "the user's own text\n"
+SHELL = "x$(touch owned)"  # as the name of a survey: a line that a shell would run
+Command = tuple[Callable[[Path], tuple[object, ...]], tuple[str, ...]]
+
+
+@pytest.fixture(autouse=True)
+def no_plots(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sfm.report.output.all_plots", lambda *_: [])
+
+
+@pytest.fixture
+def home(tmp_path: Path) -> Path:
+    """The user's own folder, which nothing may change."""
+    folder = tmp_path / "home"
+    (folder / "below" / "result").mkdir(parents=True)
+    for name in (".profile", "below/thesis.txt", "below/result/points.csv"):
+        (folder / name).write_text(OWN, encoding="utf-8")
+    return folder
+
+
+def content(folder: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def kolinear(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
+    monkeypatch.setattr("sys.argv", ["kolinear", *map(str, arguments)])
+    try:
+        sfm.cli.main()
+    except SystemExit as end:
+        return int(end.code or 0)
+    return 0
+
+
+def observed(folder: Path) -> Path:
+    return write_observed_survey(folder / "s", "s")
+
+
+def model(folder: Path) -> Path:
+    network, estimate = make_network(seed_of("model"), model="opencv", images=4, points=20)
+    write_model(folder / "model", network, estimate)
+    return folder / "model"
+
+
+def photographs(folder: Path) -> tuple[Path, Path]:
+    for k in (0, 1):
+        cv2.imwrite(str(folder / f"{k}.png"), np.rint(pictures()[0]).astype(np.uint8))
+    return folder / "0.png", folder / "1.png"
+
+
+COMMANDS: dict[str, Command] = {
+    "adjust": (lambda f: ("adjust", observed(f)), ("out", "out/s", "out/.s.lock")),
+    "run": (
+        lambda f: ("run", write_photograph_survey(f / "s", "s", photographs=3)),
+        ("out", "out/s", "out/.s.lock"),
+    ),
+    "batch": (
+        lambda f: ("batch", observed(f), "--jobs", 1),
+        (
+            *("out", "out/batch", "out/batch/.lock", "out/batch/.s.lock", "out/batch/s", "out/batch/logs"),
+            *(
+                "out/batch/logs/s.jsonl",
+                "out/batch/index.html",
+                "out/batch/batch.json",
+                "out/batch/batch.csv",
+            ),
+            "out/batch/manifest.json",
+        ),
+    ),
+    "targets": (lambda f: ("targets", "--out", "new/a.pdf", "--ids", "1"), ("new", "new/a.pdf")),
+    "match": (
+        lambda f: (
+            "match",
+            *photographs(f),
+            "--point",
+            "100,100",
+            "--out",
+            "new/a.csv",
+            "--picture",
+            "new/a.png",
+        ),
+        ("new", "new/a.csv", "new/a.png"),
+    ),
+    "compare": (
+        lambda f: ("compare", model(f), f / "model"),
+        ("out", "out/comparison", "out/.comparison.lock"),
+    ),
+    "validate": (
+        lambda f: ("validate", "--networks", 1, "--jobs", 1),
+        ("out", "out/validation", "out/.validation.lock"),
+    ),
+    "refine": (lambda f: ("refine", model(f), "--images", f, "--out", "new/a"), ("new", "new/a")),
+    "convert to a file": (lambda f: ("convert", model(f), "new/a.xml"), ("new", "new/a.xml")),
+    "convert to a database": (lambda f: ("convert", model(f), "new/a.db"), ("new", "new/a.db")),
+    "convert to a folder": (lambda f: ("convert", model(f), "new/a"), ("new", "new/a")),
+}
+
+
+@pytest.mark.parametrize("dangling", [False, True])
+@pytest.mark.parametrize(
+    ("command", "place"), [(name, place) for name, (_, places) in COMMANDS.items() for place in places]
+)
+def test_no_command_writes_through_a_link(
+    command: str,
+    place: str,
+    dangling: bool,
+    home: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    folder = tmp_path / "given"
+    folder.mkdir()
+    monkeypatch.chdir(folder)
+    arguments = COMMANDS[command][0](folder)
+    is_file = "." in Path(place).name
+    link = folder / place
+    link.parent.mkdir(parents=True, exist_ok=True)
+    link.symlink_to(home / "absent" if dangling else home / ".profile" if is_file else home / "below")
+    before, names = content(home), sorted(home.rglob("*"))
+    of_one_survey = place == "out/batch/s"  # which fails, the batch goes on
+    assert kolinear(monkeypatch, *arguments) == (1 if of_one_survey else 2)
+    told = capsys.readouterr()
+    said = told.out if of_one_survey else told.err
+    refused = ("is a link to", "is there already", "already is a file", "exists a")
+    assert link.name in said and any(words in said for words in refused), told
+    lines = [line for line in told.err.splitlines() if COMPILING not in line]
+    assert of_one_survey or (len(lines) == 1 and told.out == "")
+    assert content(home) == before and sorted(home.rglob("*")) == names
+    assert link.is_symlink()  # left alone
+
+
+@pytest.mark.parametrize("kind", ["link", "second name", "text"])
+def test_a_log_that_came_with_the_folder_is_not_appended_to(kind: str, home: Path, tmp_path: Path) -> None:
+    survey = write_observed_survey(tmp_path / "given", "s")
+    survey.write_text(survey.read_text().replace('name = "s"', f'name = "{SHELL}"\nunknown = 1'))
+    log = tmp_path / "given" / "out" / "logs" / f"{folder_name('given')}.jsonl"
+    log.parent.mkdir(parents=True)
+    if kind == "link":
+        log.symlink_to(home / ".profile")
+    elif kind == "second name":
+        os.link(home / ".profile", log)
+    else:
+        log.write_text(OWN)
+    with pytest.raises(OutputError, match=r"given\.jsonl: "):
+        run_batch([survey], tmp_path / "given" / "out", HERE, ALONE, Notes())
+    with pytest.raises(OutputError, match=r"given\.jsonl: "), SurveyLog(log, append=True):
+        pass
+    assert (home / ".profile").read_text() == OWN
+    assert log.read_text() == OWN
+
+
+@pytest.mark.parametrize("kind", ["second name", "text", "pipe"])
+def test_a_lock_that_came_with_the_folder_is_not_written(kind: str, home: Path, tmp_path: Path) -> None:
+    lock = tmp_path / ".s.lock"
+    if kind == "second name":
+        os.link(home / ".profile", lock)
+    elif kind == "text":
+        lock.write_text(OWN)
+    else:
+        os.mkfifo(lock)
+    with pytest.raises(OutputError, match=r"\.s\.lock: is (not a regular|no lock of)"), locked(lock):
+        pass
+    assert (home / ".profile").read_text() == OWN
+    assert kind != "text" or lock.read_text() == OWN
+
+
+@pytest.mark.parametrize("whole", [whole_file, whole_folder])
+def test_names_that_are_known_before_are_not_used(
+    whole: Callable[..., object], home: Path, tmp_path: Path
+) -> None:
+    """Links at what killed runs leave are neither followed nor taken for a result."""
+    given = tmp_path / "given"
+    given.mkdir()
+    for ending in ("old", "part"):
+        (given / f".s.abcdefgh.{ending}").symlink_to(home / "below")
+    (given / ".s.mp4.part").mkdir()
+    (given / ".s.ijklmnop.old").mkdir()
+    (given / ".s.ijklmnop.old" / "result").symlink_to(home / "below")
+    before = content(home)
+    remove_leftovers(given / "s")
+    assert content(home) == before
+    assert not os.path.lexists(given / "s")
+    assert (given / ".s.mp4.part").is_dir()
+    (given / "s").symlink_to(home / ("below" if whole is whole_folder else ".profile"))
+    with pytest.raises(OutputError, match="nothing is written through links"), whole(given / "s"):  # type: ignore[attr-defined]
+        raise AssertionError
+    assert content(home) == before
+
+
+@pytest.fixture
+def result(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Path, Path]:
+    """A survey and the folder of its result."""
+    survey = write_observed_survey(tmp_path / "s", "s", backend="colmap")
+    assert kolinear(monkeypatch, "adjust", survey, "--out", tmp_path / "out") == 0
+    return survey, tmp_path / "out"
+
+
+@pytest.mark.parametrize(
+    ("name", "told"),
+    [
+        ("plots/mine.png", "holds 'plots/mine.png'; "),
+        ("overlays/notes/mine.jpg", "holds 'overlays/notes/mine.jpg'; "),
+        ("colmap/project.ini", "holds 'colmap/project.ini'; "),
+        ("points.csv", "holds 'points.csv', changed since Kolinear wrote it; "),
+        ("report.html", "holds 'report.html', changed since Kolinear wrote it; "),
+        ("manifest.json", "holds 'cameras.csv'; 'colmap/cameras.bin'; "),
+        ("link", "holds 'link'; "),
+    ],
+)
+def test_files_of_the_user_in_a_result_are_kept_and_named(
+    name: str,
+    told: str,
+    result: tuple[Path, Path],
+    home: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    survey, out = result
+    capsys.readouterr()
+    path = out / name
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if name == "link":
+        path.symlink_to(home / "below")
+    else:
+        path.write_text(OWN)
+    before = content(out)
+    assert kolinear(monkeypatch, "adjust", survey, "--out", out) == 2
+    err = capsys.readouterr().err
+    assert told in err and err.count("\n") == 1, err
+    assert content(out) == before
+
+
+def test_an_unchanged_result_is_replaced_though_a_system_has_left_its_files(
+    result: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    survey, out = result
+    manifest = json.loads((out / "manifest.json").read_text())["files"]
+    assert manifest.keys() == content(out).keys() - {"manifest.json"}
+    (out / "plots" / ".DS_Store").touch()
+    (out / "points.ply").unlink()
+    assert kolinear(monkeypatch, "adjust", survey, "--out", out) == 0
+    assert (out / "points.ply").is_file()
+
+
+def test_a_result_folder_of_a_stranger_is_left_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """It has all names of a result, and a user's file has one of them."""
+    survey, out = observed(tmp_path), tmp_path / "out"
+    (out / "plots").mkdir(parents=True)
+    summary = {"survey": "s", "images": {}, "points": {}, "observations": {}}
+    (out / "summary.json").write_text(json.dumps(summary))
+    (out / "plots" / "holiday.png").write_text(OWN)
+    assert kolinear(monkeypatch, "adjust", survey, "--out", out) == 2
+    assert "holds 'plots/holiday.png'; 'summary.json'; " in capsys.readouterr().err
+    assert (out / "plots" / "holiday.png").read_text() == OWN
+
+
+@pytest.mark.parametrize("name", ["index.html", "batch.csv", "batch.json", "manifest.json"])
+def test_pages_of_a_batch_that_a_person_has_changed_are_kept(name: str, tmp_path: Path) -> None:
+    survey, out = observed(tmp_path), tmp_path / "out"
+    for _ in range(2):
+        run_batch([survey], out, HERE, ALONE, Notes())
+    (out / name).write_text(OWN)
+    with pytest.raises(OutputError, match=r"which no batch has written, or not as it is now"):
+        run_batch([survey], out, HERE, ALONE, Notes())
+    assert (out / name).read_text() == OWN
+
+
+def test_targets_that_came_with_the_folder_are_not_believed(
+    tmp_path: Path, cache: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """All centres are stretched by 2 %, in a store where the program once kept its own."""
+    survey = write_photograph_survey(tmp_path / "given" / "s", "s")
+    monkeypatch.chdir(tmp_path / "given")
+    out = tmp_path / "given" / "out" / "s"
+    assert kolinear(monkeypatch, "run", survey) == 0
+    true = (out / "points.csv").read_bytes()
+    assert read_log(out / "log.jsonl")[-1]["stored_photographs"] == []
+    kept = tmp_path / "given" / "out" / ".kolinear" / "targets"
+    if not kept.is_dir():
+        shutil.copytree(cache / "kolinear" / "targets", kept)
+        shutil.rmtree(cache / "kolinear")
+    for entry in kept.rglob("*.npz"):
+        with np.load(entry) as found:
+            arrays = {f.name: found[f.name] for f in fields(Targets)}
+        arrays["xy"] = (arrays["xy"] - 300) * 1.02 + 300
+        np.savez(entry, **arrays)
+    assert kolinear(monkeypatch, "run", survey) == 0
+    assert (out / "points.csv").read_bytes() == true
+    assert kolinear(monkeypatch, "run", survey) == 0  # now from the user's own
+    stored = read_log(out / "log.jsonl")[-1]["stored_photographs"]
+    assert stored == [f"photo {k}.png" for k in range(1, 7)]
+    assert (cache / "kolinear" / "targets").stat().st_mode & 0o777 == 0o700
+
+
+@pytest.mark.parametrize("fault", ["mode", "owner", "link"])
+def test_a_store_that_others_can_write_is_refused(
+    fault: str, cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = cache / "kolinear" / "targets"
+    folder.parent.mkdir()
+    if fault == "link":
+        (tmp_path / "other").mkdir(mode=0o700)
+        folder.symlink_to(tmp_path / "other")
+    else:
+        folder.mkdir(mode=0o700)
+    assert fault == "link" or TargetStore.of_user().folder == folder
+    if fault == "mode":
+        folder.chmod(0o770)
+    elif fault == "owner":
+        monkeypatch.setattr("os.geteuid", lambda: 12345)
+    with pytest.raises(OutputError, match="measured targets are kept here, but others may write here"):
+        TargetStore.of_user()
+
+
+def test_what_is_measured_is_known_by_what_measures() -> None:
+    names = measuring_sources().keys()
+    assert {"sfm.photographs.reading", "sfm.targets.measure", "sfm.targets.codes.rings"} <= names
+    assert not [name for name in names if name.startswith(("sfm.printing", "sfm.rendering", "sfm.survey"))]
+
+
+def test_targets_travel_between_workers_that_have_no_common_store(
+    tmp_path: Path, cache: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cache.chmod(0o500)
+    (cache / "kolinear").touch()  # root could write otherwise
+    measured: list[int] = []
+    monkeypatch.setattr(
+        "sfm.survey.measuring.targets.find_targets",
+        lambda *given, **options: measured.append(1) or find_targets(*given, **options),
+    )
+    survey = write_photograph_survey(tmp_path / "s", "s")
+    (row,) = run_batch([survey], tmp_path / "out", HERE, ALONE, Notes())
+    assert row.status == "done" and len(measured) == 6
+
+
+def test_reading_a_database_writes_nothing_beside_it(tmp_path: Path) -> None:
+    network, estimate = make_network(seed_of("database"), model="opencv", images=3, points=20)
+    path = tmp_path / "a.db"
+    write_database(path, network, estimate.cameras)
+    before, when = content(tmp_path), path.stat().st_mtime_ns
+    tmp_path.chmod(0o500)
+    assert len(read_database(path)[0].images) == 3
+    assert content(tmp_path) == before and path.stat().st_mtime_ns == when
+    tmp_path.chmod(0o700)

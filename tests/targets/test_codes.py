@@ -1,0 +1,201 @@
+"""Tables of ring codes and the reading of codes from drawn rings."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from sfm.conventions import AnyArray, FloatArray
+from sfm.errors import SurveyFileError
+from sfm.targets.codes.families import FAMILIES, code_family
+from sfm.targets.codes.ring_reading import UNCODED, UNREADABLE, read_codes
+from sfm.targets.codes.rings import CodeFamily, read_code_table, ring_patterns, smallest_rotation
+from sfm.targets.measure import shape_from_axes
+from tests.places import SHARED
+
+PUBLISHED = SHARED / "data" / "retro-panel"
+SUPER = 5
+
+
+def draw(
+    family: CodeFamily, bits: list[tuple[float, float]], affine: FloatArray, size: int = 120
+) -> AnyArray:
+    """Draw a dot of radius 1 and ring sectors (from, to, degrees clockwise) through an affine map in px."""
+    y, x = (np.mgrid[: size * SUPER, : size * SUPER] + 0.5) / SUPER - 0.5
+    centre = (size - 1) / 2
+    u, v = np.einsum("ij,jkl->ikl", np.linalg.inv(affine), np.stack([x - centre, y - centre]))
+    rho, angle = np.hypot(u, v), np.degrees(np.arctan2(v, u)) % 360
+    inside = rho < 1
+    ring = (rho > family.inner) & (rho < family.outer)
+    for start, end in bits:
+        inside |= ring & ((angle - start) % 360 < end - start)
+    coverage = cv2.resize(inside.astype(np.float32), (size, size), interpolation=cv2.INTER_AREA)
+    return cv2.GaussianBlur(coverage, (0, 0), 0.7)
+
+
+def sectors(pattern: int, cells: int, turn: float) -> list[tuple[float, float]]:
+    """Return the sectors of the set cells, most significant bit first and clockwise, turned by an angle."""
+    cell = 360 / cells
+    return [(k * cell + turn, (k + 1) * cell + turn) for k in range(cells) if pattern >> (cells - 1 - k) & 1]
+
+
+def read(picture: AnyArray, family: CodeFamily, affine: FloatArray, dark: float, bright: float) -> int:
+    """Read one code of a picture with the true outline of the dot."""
+    a, s, _ = np.linalg.svd(affine)
+    shape = shape_from_axes(s[None], np.arctan2(a[1, 0], a[0, 0])[None])
+    centre = np.full((1, 2), (picture.shape[0] - 1) / 2)
+    scaled = np.round(dark + (bright - dark) * picture).clip(0, 255).astype(np.uint8)
+    code, _ = read_codes(scaled, centre, shape, np.array([[dark, bright - dark]]), family)
+    return int(code[0])
+
+
+@pytest.mark.parametrize(
+    ("cells", "count", "first", "last"),
+    [(12, 147, 65, 2015), (14, 516, 129, 8127), (20, 24793, 1025, 523775)],
+)
+def test_tables_have_the_published_size_and_ends(cells: int, count: int, first: int, last: int) -> None:
+    pattern = ring_patterns(cells)
+    assert (len(pattern), pattern[0], pattern[-1]) == (count, first, last)
+    assert (np.diff(pattern) > 0).all()
+
+
+@pytest.mark.parametrize("cells", [12, 14])
+def test_tables_follow_the_rule(cells: int) -> None:
+    def belongs(value: int) -> bool:
+        turns = [((value << k) | (value >> (cells - k))) & ((1 << cells) - 1) for k in range(cells)]
+        opposite = any(value >> k & 1 and value >> (k + cells // 2) & 1 for k in range(cells // 2))
+        return value == min(turns) and value.bit_count() % 2 == 0 and opposite and value != (1 << cells) - 1
+
+    assert ring_patterns(cells).tolist() == [v for v in range(1 << cells) if belongs(v)]
+
+
+@pytest.mark.skipif(not PUBLISHED.exists(), reason="../shared/data is absent")
+@pytest.mark.parametrize("cells", [12, 14, 20])
+def test_tables_equal_the_published_ones(cells: int) -> None:
+    table = np.loadtxt(PUBLISHED / f"{cells}bit_lookup.txt", dtype=int)
+    table = table[table[:, 1] > 0]  # the 20 bit file ends with a dummy row
+    family = code_family(f"ring{cells}")
+    assert family is not None
+    np.testing.assert_array_equal(np.column_stack([family.number, family.pattern]), table)
+    read_back = read_code_table(PUBLISHED / f"{cells}bit_lookup.txt")
+    assert read_back.cells == cells
+    np.testing.assert_array_equal(read_back.pattern, family.pattern)
+
+
+def test_smallest_rotation_ignores_the_start() -> None:
+    value = np.array([0b00101101, 0b01011010, 0b10110100, 0b01101001])
+    assert set(smallest_rotation(value, 8).tolist()) == {0b00101101}
+
+
+@pytest.mark.parametrize("name", ["ring12", "ring14", "ring20"])
+@pytest.mark.parametrize(("dark", "bright"), [(20.0, 200.0), (210.0, 40.0)])
+def test_rings_are_read_at_any_rotation_and_tilt(name: str, dark: float, bright: float) -> None:
+    family = code_family(name)
+    assert family is not None
+    rng = np.random.default_rng(20)
+    for _ in range(12):
+        k = rng.integers(len(family.pattern))
+        tilt, turn = rng.uniform(0, np.radians(60)), rng.uniform(0, np.pi)
+        rotation = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+        affine = 12 * rotation @ np.diag([1, np.cos(tilt)])
+        picture = draw(family, sectors(int(family.pattern[k]), family.cells, rng.uniform(0, 360)), affine)
+        assert read(picture, family, affine, dark, bright) == family.number[k]
+
+
+def test_a_mirrored_ring_is_another_code() -> None:
+    family = code_family("ring14")
+    assert family is not None
+    mirrored = [smallest_rotation(np.array([int(f"{p:014b}"[::-1], 2)]), 14)[0] for p in family.pattern]
+    k = int(np.flatnonzero(np.array(mirrored) != family.pattern)[0])
+    affine = 12.0 * np.eye(2)
+    picture = draw(family, sectors(int(family.pattern[k]), 14, 10), affine)
+    assert read(picture, family, affine, 20, 200) == family.number[k]
+    assert read(picture[:, ::-1], family, affine, 20, 200) != family.number[k]
+
+
+def test_a_dot_without_a_ring_is_uncoded() -> None:
+    affine = 12.0 * np.eye(2)
+    for name in ("arcs", "ring14"):
+        family = code_family(name)
+        assert family is not None
+        assert read(draw(family, [], affine), family, affine, 20, 200) == UNCODED
+
+
+def test_a_shadow_across_the_ring_does_no_harm() -> None:
+    family = code_family("ring14")
+    assert family is not None
+    affine = 12.0 * np.eye(2)
+    picture = draw(family, sectors(int(family.pattern[77]), 14, 33), affine)
+    shade = np.linspace(0.5, 1.3, picture.shape[1])[None, :]
+    assert read(picture * shade, family, affine, 10, 160) == 78
+
+
+@pytest.mark.parametrize("damage", ["half cell", "smeared", "gap"])
+def test_damaged_rings_are_rejected(damage: str) -> None:
+    family = code_family("ring14")
+    assert family is not None
+    affine = 12.0 * np.eye(2)
+    bits = sectors(int(family.pattern[100]), 14, 0)
+    cell = 360 / 14
+    if damage == "half cell":  # one more cell is half set
+        clear = next(k for k in range(14) if not int(family.pattern[100]) >> (13 - k) & 1)
+        bits.append(((clear + 0.25) * cell, (clear + 0.75) * cell))
+        picture = draw(family, bits, affine)
+    else:
+        picture = draw(family, bits, affine)
+        y, x = np.mgrid[: len(picture), : len(picture)] - (len(picture) - 1) / 2
+        if damage == "smeared":
+            picture = np.where((x > 30) & (abs(y) < 12), 0.55, picture)
+        else:
+            picture = np.where(abs(np.hypot(x, y) - 21) < 4, 1.0, picture)
+    assert read(picture, family, affine, 20, 200) == UNREADABLE
+
+
+@pytest.mark.parametrize("arcs", [1, 2, 3, 4])
+def test_arcs_are_counted(arcs: int) -> None:
+    family = code_family("arcs")
+    assert family is not None
+    span = {1: 180, 2: 75, 3: 45, 4: 45}[arcs]
+    affine = np.array([[12.0, 2.0], [-1.0, 7.0]])
+    bits = [(k * 360 / arcs + 20, k * 360 / arcs + 20 + span) for k in range(arcs)]
+    assert read(draw(family, bits, affine), family, affine, 200, 30) == arcs
+    assert read(draw(family, [(0, 360)], affine), family, affine, 200, 30) == UNREADABLE
+
+
+def test_tables_are_read_from_files(tmp_path: Path) -> None:
+    path = tmp_path / "my table.txt"
+    path.write_text("# cells 14\n7 135\n\n3 129\n")
+    family = code_family(str(path))
+    assert family is not None
+    assert (family.cells, family.number.tolist(), family.pattern.tolist()) == (14, [3, 7], [129, 135])
+    affine = 12.0 * np.eye(2)
+    assert read(draw(family, sectors(135, 14, 5), affine), family, affine, 20, 200) == 7
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("1 129\nx 3\n", "line 2: found 'x 3'"),
+        ("", "no codes found"),
+        ("# cells 14\n1 258\n", "258 is not the smallest rotation"),
+    ],
+)
+def test_wrong_tables_are_refused(tmp_path: Path, text: str, message: str) -> None:
+    (tmp_path / "t.txt").write_text(text)
+    with pytest.raises(SurveyFileError, match=message):
+        code_family(str(tmp_path / "t.txt"))
+
+
+def test_every_name_of_the_registry_is_a_family() -> None:
+    for name in FAMILIES:
+        family = code_family(name)
+        assert family is None if name == "none" else family is not None and family.name == name
+        assert code_family(family if family is not None else "none") is family
+
+
+def test_an_unknown_family_is_refused() -> None:
+    with pytest.raises(SurveyFileError, match="'ring13' is neither one of arcs, ring12"):
+        code_family("ring13")
