@@ -16,7 +16,7 @@ from sfm.errors import SurveyFileError
 from sfm.kernels.options import compiled
 
 FIXED_POINT_STEPS = 100
-PIXEL_TOLERANCE = 1e-11
+PIXEL_TOLERANCE = 1e-10
 
 
 @dataclass(frozen=True)

@@ -14,9 +14,13 @@ from __future__ import annotations
 from sfm.conventions import FloatArray
 from sfm.kernels.options import inlined, kernel
 
-LOCATED_PX = 0.25  # Newton's step after which one more leaves nothing: its error is curvature times its square
+LOCATED_PX = (
+    0.25  # Newton's step after which one more leaves nothing: its error is curvature times its square
+)
 STEPS = 20  # Newton's steps at most
-FOLDED = 0.01  # determinant of d(corrected)/d(measured), 1 without distortion, below which corrections fold over
+FOLDED = (
+    0.01  # determinant of d(corrected)/d(measured), 1 without distortion, below which corrections fold over
+)
 
 
 @inlined
