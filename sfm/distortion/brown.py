@@ -1,10 +1,10 @@
 """Corrections of the measured point in mm, with residuals in the measured or in the corrected plane.
 
-In the measured plane, where frame[4] is 1, the point is found whose correction meets the ray, so that residuals
-are those of what was measured and its standard deviations are their weights. In the corrected plane, as DBAT
-has it (Boerlin and Grussenmeyer, 2013, Photogrammetric Record 28(144)), the residual is the difference between
-the ray and the corrected point: affinity and distortion that shrink that plane shrink v'Pv too, which biases
-them and all that is correlated with them (`tests/test_plane_of_residuals.py`).
+In the measured plane, where frame[4] is 1, the point is found whose correction meets the ray, so that
+residuals are those of what was measured and its standard deviations are their weights. In the corrected
+plane, as DBAT has it (Boerlin and Grussenmeyer, 2013, Photogrammetric Record 28(144)), the residual is the
+difference between the ray and the corrected point: affinity and distortion that shrink that plane shrink v'Pv
+too, which biases them and all that is correlated with them (`tests/adjustment/test_plane_of_residuals.py`).
 
 Signs as PhotoModeler and DBAT. What a model fills is said in `sfm.distortion.models`.
 """
@@ -110,13 +110,9 @@ def _inverse(
 ) -> tuple[float, float, float, float]:
     """Return what carries differences in the corrected plane, mm, y up, to px, y down.
 
-    It is D^-1 with D = d(corrected)/d(measured): where e is left in the corrected plane, the point that should
-    have been measured is D^-1 e away, and with the unknowns it moves by D^-1 J.
-
-    Args:
-        carried: whether to the measured plane; else only the unit changes.
-        frame: of the camera.
-        dxx, dxy, dyx, dyy: D; where it folds over it is taken as 1.
+    It is D^-1 with D = d(corrected)/d(measured): where e is left in the corrected plane, the point that
+    should have been measured is D^-1 e away, and with the unknowns it moves by D^-1 J. Where D folds over, or
+    differences are not to be carried to the measured plane, only the unit changes.
     """
     fx, fy = 1.0 / frame[2], -1.0 / frame[3]
     det = dxx * dyy - dxy * dyx
@@ -173,27 +169,21 @@ def _measured(
 ) -> tuple[float, float]:  # fmt: skip
     """Return the point that Brown's corrections move to (xc, yc), by Newton's method, mm.
 
-    It is short of one more step, for which the caller has the derivatives. Where the corrections fold over
-    on the way, as they may at bad start values, no such point is known and the start is returned: that one
-    step is then the whole residual.
-
-    Args:
-        x, y: where to start: the measured point, which is near.
-        xc, yc: corrected point.
-        located: length of a step at which to end, mm.
-        K1, K2, K3, P1, P2: corrections.
+    It is short of one more step, for which the caller has the derivatives. It starts at (x, y), the measured
+    point, which is near, and ends at a step of the length `located`. Where the corrections fold over on the
+    way, as they may at bad start values, no such point is known and the start is returned: that one step is
+    then the whole residual.
     """
     xh, yh = x, y
     for _ in range(STEPS):
         x_now, y_now, xx, xy, yy, _r2 = _corrected(xh, yh, K1, K2, K3, P1, P2)
         det = xx * yy - xy * xy
         if not (det > FOLDED and xx + yy > 0.0):
-            xh, yh = x, y
             break
         inverse, ex, ey = 1.0 / det, xc - x_now, yc - y_now
         dx, dy = (yy * ex - xy * ey) * inverse, (xx * ey - xy * ex) * inverse
         xh += dx
         yh += dy
         if abs(dx) + abs(dy) < located:
-            break
-    return xh, yh
+            return xh, yh
+    return x, y

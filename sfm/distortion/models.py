@@ -2,8 +2,8 @@
 
 A model is one compiled function `model(frame, p, x, y, u, v, residual, Ju, Jp)`. It is given
 
-    frame (5,)      centre of the photograph, px, width and height of a pixel, mm, and 1 if residuals are to be
-                    those of the measured point, 0 if of the corrected one
+    frame (5,)      centre of the photograph, px, width and height of a pixel, mm, and 1 if residuals are to
+                    be those of the measured point, 0 if of the corrected one
     p     (n,)      parameters in the order of the model's names
     x, y            measured pixel
     u, v            tangents of the ray in the image frame (u = -U/W, v = -V/W, y up)
@@ -16,8 +16,8 @@ and fills
 
 The models of photogrammetry correct the measured point, those of computer vision distort the ideal
 one; in both cases the residual vanishes at the true parameters and is one of the measured point, but for
-the models named after DBAT, whose residuals lie in the corrected plane. To add a model: write its function in a
-module beside `brown` and give it a row in `ALL`; adjustment, resection, conversion, survey file and reports
+the models named after DBAT, whose residuals lie in the corrected plane. To add a model: write its function in
+a module beside `brown` and give it a row in `ALL`; adjustment, resection, conversion, survey file and reports
 follow from that row, and the tests of derivatives and inverse run over it.
 """
 

@@ -315,7 +315,7 @@ def dbat_residuals(number: int, p: dict[str, float], xy: np.ndarray, uv: np.ndar
 @needs_camcal
 @pytest.mark.parametrize("number", DBAT_MODELS)
 def test_camcal_with_the_six_camera_models_of_dbat(number: int) -> None:
-    """Models 1 and 2 are `brown_dbat` without affinity, 3 is the report's, 5 is 3 with another principal point."""
+    """Models 1 and 2 are `brown_dbat` without affinity, 3 is the report's, 5 has another principal point."""
     model, free, redundancy, sigma0_px, c = DBAT_MODELS[number]
     network, start = read_photomodeler(CAMCAL / "camcal-pmexport.txt", control=CAMCAL / "camcal-fixed.txt")
     s = 5.43764 / 1704

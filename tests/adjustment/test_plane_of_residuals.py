@@ -1,4 +1,4 @@
-"""Statistics of `brown`: sigma0 is chi-square distributed, b1 unbiased, and w is as wide at the edge as inside.
+"""Statistics of `brown`: sigma0 is chi-square distributed, b1 unbiased, w as wide at the edge as inside.
 
 Five networks with a lens whose corrections shrink or stretch the edge of the photograph by up to a tenth,
 where residuals in the corrected plane (`brown_dbat`) are too small or too large by as much.
@@ -45,10 +45,12 @@ class Copies:
     points: float  # root mean square of coordinate errors over standard deviation
 
 
-def exact_network(kind: str, lens: tuple[tuple[str, float], ...], free: tuple[str, ...], model: str):
+def exact_network(
+    kind: str, lens: tuple[tuple[str, float], ...], free: tuple[str, ...], model: str
+) -> tuple[Network, Estimate]:
     """Return a network without noise and its truth; distances in m."""
     rng = seed_of(f"plane of residuals {kind}")
-    if kind == "front":  # three photographs side by side over two, in one plane before the object and upright
+    if kind == "front":  # three photographs side by side over two, upright, in one plane before it
         x, y = np.meshgrid(np.linspace(-1, 1, 9), np.linspace(-0.7, 0.7, 7))
         points = np.stack([x.ravel(), y.ravel(), rng.normal(0, 0.1, x.size)], axis=1)
         base = np.array([[a, b, 3.0] for a in (-0.4, 0.0, 0.4) for b in (-0.25, 0.25)])
