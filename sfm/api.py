@@ -150,7 +150,7 @@ def compare(
         >>> sfm.compare(result, result).point_difference.max() < 1e-9
         np.True_
     """
-    first, second = (one.stored if isinstance(one, SurveyResult) else one for one in (a, b))
+    first, second = (one.with_covariance if isinstance(one, SurveyResult) else one for one in (a, b))
     return compare_results(first, second, align=align, control=tuple(control))
 
 

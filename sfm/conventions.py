@@ -25,6 +25,18 @@ IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
 AnyArray = NDArray[Any]
 
+METRES = {
+    "km": 1e3,
+    "m": 1.0,
+    "dm": 0.1,
+    "cm": 1e-2,
+    "mm": 1e-3,
+    "um": 1e-6,
+    "µm": 1e-6,
+    "in": 0.0254,
+    "ft": 0.3048,
+}
+"""units of length and their length in metres"""
 MAD_TO_SIGMA = 1.4826
 """standard deviation of a normal variable over its median absolute deviation; Hampel (1974), JASA 69"""
 

@@ -36,13 +36,22 @@ class ImagePoints:
     point: IntArray  # index of the object point, (k,)
     xy: FloatArray  # measured position in the pixel frame, px, (k, 2)
     covariance: FloatArray  # of xy, px^2, (k, 2, 2)
+    stated: BoolArray | None = None  # which covariances were stated with the image points and are no default
+    # of the program that reads them; all if None, (k,)
 
     def __len__(self) -> int:
         return len(self.image)
 
     def select(self, mask: BoolArray | IntArray) -> ImagePoints:
         """Return the image points that a mask or an index names."""
-        return ImagePoints(self.image[mask], self.point[mask], self.xy[mask], self.covariance[mask])
+        stated = None if self.stated is None else self.stated[mask]
+        return ImagePoints(self.image[mask], self.point[mask], self.xy[mask], self.covariance[mask], stated)
+
+    @property
+    def stated_sigma(self) -> FloatArray:
+        """Standard deviations of x and y, px; NaN where none was stated, (k, 2)."""
+        sigma = np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2))
+        return sigma if self.stated is None else np.where(self.stated[:, None], sigma, np.nan)
 
 
 @dataclass(frozen=True)

@@ -61,7 +61,7 @@ def supported(
     estimate: Estimate,
     accepted: BoolArray,
     *,
-    min_points: int,
+    min_points: int | IntArray,
     min_rays: int | IntArray,
 ) -> tuple[BoolArray, BoolArray]:
     """Return the photographs and points that are left when those with too few image points go, in turn.
@@ -70,7 +70,7 @@ def supported(
         network: of m photographs, n points and k image points.
         estimate: of the same.
         accepted: image points that count, (k,).
-        min_points: image points that a photograph needs.
+        min_points: image points that a photograph needs, of all or of each, (m,).
         min_rays: image points that a point needs, of all or of each, (n,).
 
     Returns:

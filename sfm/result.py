@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from sfm.adjustment.covariance import marginal_of
 from sfm.adjustment.quality.correlations import OrientationCorrelation
 from sfm.adjustment.result import Adjustment
 from sfm.camera import Camera
@@ -15,12 +16,12 @@ from sfm.comparison.adjusters import AdjusterComparison
 from sfm.comparison.baseline import BaselineComparison
 from sfm.conventions import FloatArray, IntArray, angles_from_rotation
 from sfm.display import html_table, text_table
+from sfm.errors import GeometryError
+from sfm.files.covariance_file import MAX_POINTS
 from sfm.network import Estimate, Network, index_of
 from sfm.point_table import Point, PointTable
-from sfm.stored_result import StoredResult
+from sfm.stored_result import NO_SCALE, StoredResult
 from sfm.targets.flags import count_flags
-
-NO_SCALE = "network units"
 
 
 @dataclass(frozen=True)
@@ -29,6 +30,33 @@ class FailedImage:
 
     image: str  # name of the photograph
     reason: str  # one line: what was found and what was needed
+
+
+@dataclass(frozen=True)
+class LeftOutPoint:
+    """A measured point that is not part of the result."""
+
+    point: str  # name of the point
+    image_points: int  # measured of it
+    reason: str  # one line: what was found and what was needed
+
+
+@dataclass(frozen=True)
+class TakenOut:
+    """Control or a scale bar that the survey gives and that was not used, since it does not fit."""
+
+    what: str  # such as "scale bar 506 - 507"
+    relative: float  # by how much it is off, over its length or the size of the object
+    resolved: bool  # whether the others tell that it is the one that is wrong
+
+
+@dataclass(frozen=True)
+class FreeNetwork:
+    """Adjustment of the accepted image points without control, bars and observed exterior orientation."""
+
+    points: FloatArray  # in a frame of their own, (n, 3)
+    vPv: float  # with the weights of the adjustment that it is held against
+    redundancy: int
 
 
 @dataclass(frozen=True)
@@ -125,6 +153,10 @@ class SurveyResult:
     warnings: tuple[str, ...] = ()  # one line each, in words
     eccentricity: Eccentricity | None = None  # None where it was not corrected
     no_circles: tuple[str, ...] = ()  # uncoded points left out: their outlines are not images of one circle
+    left_out: tuple[LeftOutPoint, ...] = ()  # measured points that are not in the result
+    free_network: FreeNetwork | None = None  # None where nothing else took part, or where it has no result
+    taken_out: tuple[TakenOut, ...] = ()  # control and scale bars that do not fit and were not used
+    unused_image_points: int = 0  # of points or photographs that are not in the result, in no other count
     orientation_correlations: tuple[OrientationCorrelation, ...] = ()  # of camera parameters with exterior
     # orientation, the strong ones
     seconds: tuple[StageTime, ...] = field(default_factory=tuple)  # in the order of the stages
@@ -163,7 +195,20 @@ class SurveyResult:
             tuple(sigmas),
             a.redundancy,
             self.length_unit,
+            datum=a.datum,
         )
+
+    @cached_property
+    def with_covariance(self) -> StoredResult:
+        """The same with the covariance of all points together, for no more than `MAX_POINTS` of them."""
+        n = len(self.adjustment.network.points)
+        if n > MAX_POINTS:
+            return self.stored
+        try:
+            joint = marginal_of(self.adjustment).joint(np.zeros(0, dtype=np.int64), np.arange(n))
+        except GeometryError:  # normal equations that cannot be solved have no covariance at all
+            return self.stored
+        return replace(self.stored, covariance=joint) if np.isfinite(joint).all() else self.stored
 
     @property
     def points(self) -> PointTable:
@@ -205,7 +250,7 @@ class SurveyResult:
         rows = [
             ("photographs", f"{len(a.network.images)} of {self.images_total} oriented"),
             ("points", f"{len(a.network.points)}, {int((self.code >= 0).sum())} coded"),
-            ("image points", f"{int((~a.rejected).sum())} accepted, {int(a.rejected.sum())} rejected"),
+            ("image points", self.image_point_counts),
             ("adjustment", f"{state}, datum {a.datum}, redundancy {a.redundancy}"),
             ("sigma0", f"{a.sigma0_px:.4f} px"),
             ("RMS sigma of points", f"{', '.join(f'{s:.3g}' for s in sigma)} {self.length_unit}"),
@@ -219,6 +264,17 @@ class SurveyResult:
 
     def _repr_html_(self) -> str:
         return html_table(f"Survey {self.survey}", ("", ""), self._rows())
+
+    @property
+    def image_point_counts(self) -> str:
+        """How many image points were accepted, rejected and of no use, in words."""
+        rejected = int(self.adjustment.rejected.sum())
+        words = f"{len(self.adjustment.rejected) - rejected} accepted, {rejected} rejected"
+        unused = self.unused_image_points
+        if not unused:
+            return words
+        points = f"of {len(self.left_out)} points" if self.left_out else "of photographs"
+        return f"{words}, {unused} not in the result ({points})"
 
     @property
     def has_scale(self) -> bool:

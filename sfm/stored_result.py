@@ -11,6 +11,9 @@ from sfm.display import html_table, text_table
 from sfm.network import Estimate, Network
 from sfm.point_table import Point, PointTable
 
+NO_SCALE = "network units"
+"""unit of lengths in a network whose scale is undefined"""
+
 
 @dataclass(frozen=True, repr=False, eq=False)
 class StoredResult:
@@ -30,6 +33,15 @@ class StoredResult:
     interior_sigma: tuple[FloatArray, ...] | None = None  # of each parameter, NaN where fixed
     redundancy: int | None = None  # of the adjustment, for the degrees of freedom of tests
     unit: str = ""  # of lengths, as people call it; empty where nobody knows
+    covariance: FloatArray | None = None  # of all object coordinates together, object unit^2, (3n, 3n)
+    datum: str = ""  # free | minimal | control; empty where nobody knows
+    points_named: bool = True  # whether names of points identify them, or are mere numbers
+    images_named: bool = True  # likewise of photographs
+
+    @property
+    def has_scale(self) -> bool:
+        """Whether lengths are in a known unit, from scale bars or control."""
+        return self.unit not in ("", NO_SCALE)
 
     @property
     def points(self) -> PointTable:

@@ -4,15 +4,20 @@ from __future__ import annotations
 
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 
 from sfm.camera import Camera, camera_from_values
-from sfm.conventions import AnyArray, FloatArray
+from sfm.conventions import AnyArray, FloatArray, angles_from_rotation
+from sfm.network import Estimate, Network
 from sfm.rendering.render import render_photographs
 from sfm.rendering.scene import CircularTargets, Faces, Marks, Optics, Scene, coded_ring, join_marks
+from sfm.survey.inputs.given import KnownPoints, Observations, StartOrientations
+from sfm.survey.inputs.survey import CameraSetup, Survey
 from sfm.targets.codes.families import code_family
+from sfm.targets.codes.rings import CodeFamily
 from tests.synthetic import make_network, seed_of
 
 SIZE_PX = (640, 480)
@@ -119,7 +124,7 @@ def stations(count: int) -> tuple[FloatArray, FloatArray]:
 
 def _scene() -> Scene:
     family = code_family("ring14")
-    assert family is not None
+    assert isinstance(family, CodeFamily)
     axes = np.tile(np.eye(3)[:2], (2, 1, 1))
     faces = Faces(
         np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 60.0]]),
@@ -145,3 +150,55 @@ def _scene() -> Scene:
         5 + 3 * np.arange(len(places)),
     )
     return Scene(faces, join_marks(marks), targets)
+
+
+def survey_of(
+    network: Network,
+    truth: Estimate,
+    *,
+    name: str = "observed",
+    free: tuple[str, ...] = ("c",),
+    start: Estimate | None = None,
+    sigma: bool = False,
+    **given: Any,
+) -> Survey:
+    """Return a survey of the image points of a synthetic network with one camera.
+
+    Args:
+        network: gives names and image points.
+        truth: gives the camera: what is not free is fixed at its value.
+        name: of the survey.
+        free: parameters that are adjusted, from 0 but for c.
+        start: approximate values of photographs and points, those that are not NaN; none if not given.
+        sigma: whether the image points state their standard deviations.
+        given: further arguments of Survey.
+    """
+    seen, camera = network.image_points, truth.cameras[0]
+    fixed = {
+        n: float(v) for n, v in zip(camera.names, camera.parameters, strict=True) if n not in (*free, "c")
+    }
+    settings: dict[str, Any] = {
+        "name": "synthetic",
+        "size_px": camera.size_px,
+        "pixel_mm": tuple(camera.pixel_mm.tolist()),
+        "model": camera.model,
+        "free": free,
+        "fixed": fixed,
+        "c_mm": camera.value("c"),
+    }
+    if start is not None:
+        images, points = np.flatnonzero(start.oriented), np.flatnonzero(start.determined)
+        if len(images):
+            angles = np.degrees([angles_from_rotation(start.rotation[i]) for i in images])
+            names = [network.images[i] for i in images]
+            given["start_orientations"] = StartOrientations.from_arrays(names, start.position[images], angles)
+        if len(points):
+            names = [network.points[j] for j in points]
+            given["start_points"] = KnownPoints.from_arrays(names, start.points[points])
+    observations = Observations.from_arrays(
+        [network.images[i] for i in seen.image],
+        [network.points[j] for j in seen.point],
+        seen.xy,
+        np.sqrt(np.diagonal(seen.covariance, axis1=1, axis2=2)) if sigma else None,
+    )
+    return Survey(name=name, cameras=(CameraSetup(**settings),), observations=observations, **given)

@@ -192,3 +192,38 @@ def _spoiled(camera: Camera, scale: float, distortion: bool) -> Camera:
         loose = np.array([k >= lengths for k in range(len(MODELS[camera.model].names))]) & camera.free
         p[loose] = fresh.parameters[loose]
     return camera.with_parameters(p)
+
+
+def add_narrow_points(
+    network: Network, truth: Estimate, rng: np.random.Generator, count: int, *, noise_px: float = 0.1
+) -> tuple[Network, Estimate]:
+    """Return a network with a photograph beside its first one, and points that only these two see.
+
+    The two stand 0.05 m apart at 4 m, so that the rays of those points, w1, w2 ..., meet at 0.7 degrees.
+    """
+    camera, m, n = truth.cameras[0], len(network.images), len(network.points)
+    position = np.vstack([truth.position, truth.position[0] + 0.05 * truth.rotation[0][:, 0]])
+    rotation = np.concatenate([truth.rotation, truth.rotation[:1]])
+    far = rng.uniform(-0.6, 0.6, (count, 3))
+    all_points = np.vstack([truth.points, far])
+    seen = network.image_points
+    image, point, xy = [seen.image], [seen.point], [seen.xy]
+    for i, own in ((m, np.arange(n)), (0, n + np.arange(count)), (m, n + np.arange(count))):
+        found = project(camera, position[i], rotation[i], all_points[own])
+        inside = np.isfinite(found).all(1) & (found > 0).all(1) & (found < np.array(SIZE_PX) - 1).all(1)
+        image.append(np.full(int(inside.sum()), i))
+        point.append(own[inside])
+        xy.append(found[inside] + noise_px * rng.standard_normal((int(inside.sum()), 2)))
+    measured = np.concatenate(xy)
+    network = Network(
+        (*network.images, "beside"),
+        np.append(network.camera, network.camera[0]),
+        (*network.points, *(f"w{k + 1}" for k in range(count))),
+        ImagePoints(
+            np.concatenate(image),
+            np.concatenate(point),
+            measured,
+            np.tile(noise_px**2 * np.eye(2), (len(measured), 1, 1)),
+        ),
+    )
+    return network, Estimate(truth.cameras, position, rotation, all_points)

@@ -200,6 +200,7 @@ def network_of_scene(scene: Any, side: Names | None = None) -> tuple[Network, Es
             table[:, 1].astype(np.int64),
             table[:, 2:] - HALF_PIXEL,
             np.tile(np.eye(2), (len(table), 1, 1)),
+            np.zeros(len(table), dtype=bool),
         ),
     )
     points = np.array([scene.point3D(j).xyz for j in point_ids]).reshape(-1, 3)

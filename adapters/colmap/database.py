@@ -81,7 +81,13 @@ def read_database(path: Path) -> tuple[Network, tuple[Camera, ...]]:
         rows.images,
         rows.camera,
         tuple(f"{j + 1}" for j in range(count)),
-        ImagePoints(image[kept], point[kept], xy[kept], np.tile(np.eye(2), (len(kept), 1, 1))),
+        ImagePoints(
+            image[kept],
+            point[kept],
+            xy[kept],
+            np.tile(np.eye(2), (len(kept), 1, 1)),
+            np.zeros(len(kept), dtype=bool),
+        ),
     )
     return network, tuple(camera_of(camera) for camera in rows.cameras)
 

@@ -84,7 +84,9 @@ def read_bal(path: Path, *, size_px: tuple[int, int] | None = None) -> tuple[Net
         tuple(f"{i}" for i in range(m)),
         np.arange(m, dtype=np.int64),
         tuple(f"{j}" for j in range(n)),
-        ImagePoints(image, point, _centre(size) + xy * (1, -1), np.tile(np.eye(2), (k, 1, 1))),
+        ImagePoints(
+            image, point, _centre(size) + xy * (1, -1), np.tile(np.eye(2), (k, 1, 1)), np.zeros(k, dtype=bool)
+        ),
     )
     position = -np.einsum("iba,ib->ia", M, cams[:, 3:6])
     return network, Estimate(

@@ -25,6 +25,7 @@ app. B for the C# file, app. C for the MATLAB files.
 
 from __future__ import annotations
 
+from array import array
 from pathlib import Path
 
 import numpy as np
@@ -33,6 +34,7 @@ from adapters.formats.text_lines import MAX_IMAGE_POINTS, MAX_PHOTOGRAPHS, Lines
 from sfm.camera import camera_from_values
 from sfm.conventions import (
     FloatArray,
+    IntArray,
     angles_from_rotation,
     image_from_pixel,
     pixel_from_image,
@@ -75,32 +77,34 @@ def read_bundle_matlab(
     names, exterior = _exterior(text, None)
     m = len(names)
     text = Lines.of(points)
-    image, point, xy, xyz, seen_in = [], [], [], [], []
+    image, point, xy, xyz = array("q"), array("q"), array("d"), array("d")
+    ends = array("q", [0])  # image points up to each point
     while (words := text.row()) is not None:
         if len(words) < 4:
             raise text.error(f"{len(words)} words, a point is X Y Z frames (frame x y)...")
-        xyz.append([text.number_of(word) for word in words[:3]])
+        xyz.extend(text.number_of(word) for word in words[:3])
         frames, values = _frames(text, words[3:], m)
-        image += frames
-        point += [len(xyz) - 1] * len(frames)
-        xy += values
-        seen_in.append(frames)
-        text.refuse_more(len(image) + len(xyz), MAX_IMAGE_POINTS, "points and image points")
+        image.extend(frames)
+        point.extend([len(ends) - 1] * len(frames))
+        xy.extend(values)
+        ends.append(len(image))
+        text.refuse_more(len(image) + len(ends), MAX_IMAGE_POINTS, "points and image points")
     if not xyz:
         raise text.error("no points")
     sigma = None
     if sigmas is not None:
-        text, sigma = Lines.of(sigmas), []
-        for j, frames in enumerate(seen_in):
+        text, sigma = Lines.of(sigmas), array("d")
+        for j in range(len(ends) - 1):
+            frames = image[ends[j] : ends[j + 1]].tolist()
             given, values = _frames(text, text.due_row(f"sigmas of point {j + 1}"), m)
             if given != frames:
                 raise text.error(
                     f"frames {given!s:.100}, the point on line {j + 1} of {points} has {frames!s:.100}"
                 )
-            sigma += [_positive(text, pair) for pair in values]
+            sigma.extend(_positive(text, values))
         text.end()
     interior = (c_mm, x0_mm, y0_mm)
-    labels = tuple(f"{j + 1}" for j in range(len(xyz)))
+    labels = tuple(f"{j + 1}" for j in range(len(ends) - 1))
     return _network(names, exterior, labels, xyz, image, point, xy, sigma, interior, pixel_mm)
 
 
@@ -192,7 +196,7 @@ def read_bundle_csharp(path: Path, *, pixel_mm: float = PIXEL_MM) -> tuple[Netwo
     text.refuse_more(m * n, MAX_IMAGE_POINTS, "image points")
     labels: list[str] = []
     known: set[str] = set()
-    xyz, xy, sigma = [], [], []
+    xyz, xy, sigma = array("d"), array("d"), array("d")
     for _ in range(n):
         words = text.due_row(f"point {len(labels) + 1} of {n}")
         if len(words) != 4 + 2 * m:
@@ -202,8 +206,8 @@ def read_bundle_csharp(path: Path, *, pixel_mm: float = PIXEL_MM) -> tuple[Netwo
         known.add(text.name_of(words[0], "the id of a point"))
         labels.append(words[0])
         values = [text.number_of(word) for word in words[1:]]
-        xyz.append(values[:3])
-        xy += [values[3 + 2 * i : 5 + 2 * i] for i in range(m)]
+        xyz.extend(values[:3])
+        xy.extend(values[3:])
     words = text.due_row("the sigmas of the first point")
     if len(words) == 1:  # the program's reader allows their number to stand before them
         words = text.due_row("the sigmas of the first point")
@@ -213,10 +217,9 @@ def read_bundle_csharp(path: Path, *, pixel_mm: float = PIXEL_MM) -> tuple[Netwo
         if len(words) != 1 + 2 * m or words[0] != label:
             raise text.error(f"'{shown(' '.join(words))}' where {label} and {2 * m} sigmas were due")
         values = [text.number_of(word) for word in words[1:]]
-        sigma += [_positive(text, values[2 * i : 2 + 2 * i]) for i in range(m)]
+        sigma.extend(_positive(text, values))
     text.end()
-    image = list(range(m)) * n
-    point = [j for j in range(n) for _ in range(m)]
+    image, point = np.tile(np.arange(m), n), np.repeat(np.arange(n), m)
     return _network(names, exterior, tuple(labels), xyz, image, point, xy, sigma, (c, x0, y0), pixel_mm)
 
 
@@ -272,32 +275,32 @@ def _exterior(text: Lines, count: int | None) -> tuple[list[str], list[list[floa
     return names, exterior
 
 
-def _frames(text: Lines, words: list[str], m: int) -> tuple[list[int], list[list[float]]]:
-    """Frames and pairs of numbers of "count (frame a b)*"."""
+def _frames(text: Lines, words: list[str], m: int) -> tuple[list[int], list[float]]:
+    """Frames and both of the pairs of numbers of "count (frame a b)*"."""
     count = text.count_of(words[0], "frames")
     if len(words) != 1 + 3 * count:
         raise text.error(f"{len(words) - 1} words after {count} frames, needed {3 * count}")
     frames = [text.index_of(words[1 + 3 * k], m, "frame") for k in range(count)]
     if len(set(frames)) < count:
         raise text.error("a frame stands twice")
-    return frames, [[text.number_of(word) for word in words[2 + 3 * k : 4 + 3 * k]] for k in range(count)]
+    return frames, [text.number_of(word) for k in range(count) for word in words[2 + 3 * k : 4 + 3 * k]]
 
 
-def _positive(text: Lines, pair: list[float]) -> list[float]:
-    if min(pair) <= 0:
-        raise text.error(f"standard deviation {min(pair):g} mm, it must be positive")
-    return pair
+def _positive(text: Lines, values: list[float]) -> list[float]:
+    if min(values) <= 0:
+        raise text.error(f"standard deviation {min(values):g} mm, it must be positive")
+    return values
 
 
 def _network(
     names: list[str],
     exterior: list[list[float]],
     points: tuple[str, ...],
-    xyz: list[list[float]],
-    image: list[int],
-    point: list[int],
-    xy_mm: list[list[float]],
-    sigma_mm: list[list[float]] | None,
+    xyz: array[float],
+    image: IntArray | array[int],
+    point: IntArray | array[int],
+    xy_mm: array[float],
+    sigma_mm: array[float] | None,
     interior: tuple[float, float, float],
     pixel_mm: float,
 ) -> tuple[Network, Estimate]:
@@ -320,10 +323,11 @@ def _network(
             np.array(point, dtype=np.int64),
             pixel_from_image(xy, size, pixel),
             np.eye(2) * (sigma / pixel)[:, None, :] ** 2,
+            None if sigma_mm is not None else np.zeros(len(xy), dtype=bool),
         ),
     )
     rotation = np.array([rotation_from_angles(*np.deg2rad(row[:3])) for row in table])
-    return network, Estimate((camera,), table[:, 3:].copy(), rotation, np.array(xyz))
+    return network, Estimate((camera,), table[:, 3:].copy(), rotation, np.array(xyz).reshape(-1, 3))
 
 
 def _millimetres(network: Network, estimate: Estimate) -> tuple[FloatArray, FloatArray]:

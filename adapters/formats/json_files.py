@@ -20,7 +20,7 @@ from pydantic import (
 from sfm.errors import SurveyFileError
 from sfm.files.plain_text import MAX_NAME, SHOWN, as_plain, is_plain
 
-MAX_JSON_BYTES = 25_000_000  # names of a million points, for which reading takes 0.5 GB
+MAX_JSON_BYTES = 100_000_000  # names of four million points, for which reading takes 2 GB
 MAX_SIDE_PX = 1_000_000  # of a photograph; no sensor and no scan is larger
 MAX_PIXEL_MM = 1e3  # of a pixel; COLMAP's models without a size have 1 mm
 

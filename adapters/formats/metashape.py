@@ -30,18 +30,17 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 
 from adapters.formats.json_files import MAX_PIXEL_MM
+from adapters.formats.metashape_markers import HALF_PIXEL, Markers
 from adapters.formats.text_lines import write_lines
 from adapters.formats.xml_lines import Node, read_xml
 from sfm.camera import Camera, camera_from_values
 from sfm.conventions import FloatArray
-from sfm.errors import OutputError, SurveyFileError
-from sfm.network import Estimate, ImagePoints, Network, ObjectPoints, rows_of
+from sfm.errors import OutputError
+from sfm.network import Estimate, Network, rows_of
 from sfm.similarity import Similarity
 
-HALF_PIXEL = 0.5  # Metashape's pixel coordinates minus ours, px
 AXES = np.diag([1.0, -1.0, -1.0])  # Metashape's camera axes in ours
 CALIBRATION = ("f", "cx", "cy", "b1", "b2", "k1", "k2", "k3", "k4", "p1", "p2")
-MARKER_SIGMA_PX = 0.1  # Metashape's own default for markers placed by hand
 
 
 def read_metashape(path: Path) -> tuple[Network, Estimate]:
@@ -53,7 +52,8 @@ def read_metashape(path: Path) -> tuple[Network, Estimate]:
     Raises:
         SurveyFileError: what is wrong, with file and line number.
     """
-    root = read_xml(path)
+    markers = Markers(path)
+    root = read_xml(path, markers.taken())
     chunk = root if root.tag == "chunk" else root.one("chunk")
     sensors = chunk.one("sensors").all("sensor")
     if not sensors:
@@ -80,22 +80,15 @@ def read_metashape(path: Path) -> tuple[Network, Estimate]:
             T = transform.numbers(16).reshape(4, 4)
             position[i] = object_from_chunk.apply(T[:3, 3])
             rotation[i] = object_from_chunk.rotation @ T[:3, :3] @ AXES
-    labels, xyz, control = _markers(chunk)
-    seen = _locations(chunk, labels, images)
-    index = {identifier: j for j, identifier in enumerate(labels)}
+    control = markers.control()
     network = Network(
         tuple(node.name("label") for node in nodes),
         camera_index,
-        tuple(labels.values()),
-        ImagePoints(
-            np.array([images[camera] for camera, _, _ in seen], dtype=np.int64),
-            np.array([index[marker] for _, marker, _ in seen], dtype=np.int64),
-            np.array([xy for _, _, xy in seen]).reshape(-1, 2) - HALF_PIXEL,
-            np.tile(MARKER_SIGMA_PX**2 * np.eye(2), (len(seen), 1, 1)),
-        ),
+        tuple(markers.labels),
+        markers.image_points(images),
         control,
     )
-    return network, Estimate(cameras, position, rotation, xyz)
+    return network, Estimate(cameras, position, rotation, markers.coordinates())
 
 
 def write_metashape(path: Path, network: Network, estimate: Estimate) -> None:
@@ -278,53 +271,6 @@ def _chunk_transform(chunk: Node) -> Similarity:
         node.one("rotation").numbers(9).reshape(3, 3),
         node.one("translation").numbers(3),
     )
-
-
-def _markers(chunk: Node) -> tuple[dict[str, str], FloatArray, ObjectPoints]:
-    """Labels of the markers by id, their coordinates, and those that are control."""
-    markers = chunk.maybe("markers")
-    nodes = [] if markers is None else markers.all("marker")
-    labels: dict[str, str] = {}
-    xyz = np.full((len(nodes), 3), np.nan)
-    control, sigma = [], []
-    for j, node in enumerate(nodes):
-        identifier = node.attribute("id")
-        if identifier in labels:
-            raise node.error(f"marker id {identifier} stands twice")
-        labels[identifier] = node.name("label")
-        reference = node.maybe("reference")
-        if reference is None or "x" not in reference.attributes:
-            continue
-        xyz[j] = [reference.number(axis) for axis in "xyz"]
-        if reference.attributes.get("enabled") in ("true", "1"):
-            control.append(j)
-            named = [f"s{axis}" for axis in "xyz"]
-            sigma.append([reference.number(n) if n in reference.attributes else 0.0 for n in named])
-    covariance = np.eye(3) * np.array(sigma).reshape(-1, 1, 3) ** 2
-    chosen = np.array(control, dtype=np.int64)
-    return labels, xyz, ObjectPoints(chosen, xyz[chosen], covariance)
-
-
-def _locations(
-    chunk: Node, labels: dict[str, str], images: dict[str, int]
-) -> list[tuple[str, str, tuple[float, float]]]:
-    """Image points as (camera id, marker id, x y as they stand there)."""
-    frames = chunk.maybe("frames")
-    found = []
-    for frame in [] if frames is None else frames.all("frame")[:1]:
-        group = frame.maybe("markers")
-        for marker in [] if group is None else group.all("marker"):
-            identifier = marker.attribute("marker_id")
-            if identifier not in labels:
-                raise marker.error(f"marker_id {identifier}, there is no such marker")
-            for node in marker.all("location"):
-                camera = node.attribute("camera_id")
-                if camera not in images:
-                    raise node.error(f"camera_id {camera}, there is no such camera")
-                found.append((camera, identifier, (node.number("x"), node.number("y"))))
-    if len({(camera, marker) for camera, marker, _ in found}) < len(found):
-        raise SurveyFileError(f"{chunk.path}: a marker stands twice in one camera")
-    return found
 
 
 def _reference(xyz: FloatArray, sigma: FloatArray | None) -> str:

@@ -32,7 +32,7 @@ from pathlib import Path
 import numpy as np
 
 from adapters.formats.json_files import MAX_SIDE_PX
-from adapters.formats.text_lines import MAX_IMAGE_POINTS, MAX_PHOTOGRAPHS, Lines, write_lines
+from adapters.formats.text_lines import MAX_BLOCK_LINES, MAX_PHOTOGRAPHS, Lines, write_lines
 from sfm.camera import Camera, camera_from_values
 from sfm.conventions import FloatArray, angles_from_rotation, rotation_from_angles
 from sfm.errors import OutputError, SurveyFileError
@@ -50,7 +50,8 @@ def read_photomodeler(
     """Read a PhotoModeler text export as a network and its start values.
 
     Photographs with the same interior orientation share a camera, in model `brown` with everything but
-    the shear free. The covariance of an image point is that of the file, 1 px^2 where it gives none.
+    the shear free. The covariance of an image point is that of the file, 1 px^2 where it gives none. An image
+    point that is repeated stands once; one with two positions stands with both, for whoever adjusts it.
 
     Args:
         path: the export.
@@ -104,21 +105,22 @@ def read_photomodeler(
         known.setdefault(key, row[:3])
     points = list(known)
     index = {key: j for j, key in enumerate(points)}
-    image, point, xy, covariance = [], [], [], []
-    measured: set[tuple[int, str]] = set()
+    image, point, xy, covariance, stated = [], [], [], [], []
+    measured: set[tuple[int, str, float, float]] = set()
     for where, key, row in mark_rows:
         photograph, point_name = int(key), f"{row[0]:.0f}"
         if not 0 <= photograph < len(names):
             raise SurveyFileError(f"{where}: photograph {key}, there are 0 to {len(names) - 1}")
-        if (photograph, point_name) in measured:
-            raise SurveyFileError(f"{where}: point {point_name} stands twice in photograph {key}")
-        measured.add((photograph, point_name))
+        if (photograph, point_name, *row[1:3].tolist()) in measured:  # the same row again
+            continue
+        measured.add((photograph, point_name, *row[1:3].tolist()))
         if point_name not in index:
             index[point_name] = len(points)
             points.append(point_name)
         image.append(photograph)
         point.append(index[point_name])
         xy.append(row[1:3] - HALF_PIXEL)
+        stated.append(bool((row[3:5] > 0).all()))
         covariance.append(np.diag(np.where(row[3:5] > 0, row[3:5], 1.0) ** 2))
     cameras, camera_index = _cameras(np.array(inner).reshape(-1, INNER), default, size_px)
     exterior = np.array(outer).reshape(-1, 6)
@@ -135,6 +137,7 @@ def read_photomodeler(
             np.array(point, dtype=np.int64),
             np.array(xy).reshape(-1, 2),
             np.array(covariance).reshape(-1, 2, 2),
+            np.array(stated, dtype=bool),
         ),
         ObjectPoints(
             np.array([index[key] for _, key, _ in control_rows], dtype=np.int64),
@@ -186,7 +189,7 @@ def _read_control(path: Path) -> list[tuple[str, str, FloatArray]]:
     while (line := text.maybe_line()) is not None:
         if not line.strip() or line.lstrip().startswith("#"):
             continue
-        text.refuse_more(len(rows) + 1, MAX_IMAGE_POINTS, "control points")
+        text.refuse_more(len(rows) + 1, MAX_BLOCK_LINES, "control points")
         parts = [part.strip() for part in line.split(",")]
         if len(parts) not in (5, 8):
             raise text.error(f"{len(parts)} fields, needed id,label,X,Y,Z or id,label,X,Y,Z,sX,sY,sZ")

@@ -8,6 +8,7 @@ Source: the module of each format names its own.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -17,6 +18,7 @@ import numpy as np
 
 from adapters.colmap.camera_models import read_model, write_model
 from adapters.colmap.database import read_database, write_database
+from adapters.colmap.names import SIDE_FILE
 from adapters.formats.bal import read_bal, write_bal
 from adapters.formats.bundle_text import (
     INTERIOR,
@@ -34,6 +36,7 @@ from adapters.formats.text_lines import Lines
 from sfm.camera import Camera
 from sfm.distortion.models import MODELS
 from sfm.errors import KolinearError, OutputError, SurveyFileError
+from sfm.files.open_folders import refuse_links
 from sfm.files.whole_files import whole_folder
 from sfm.network import Estimate, Network, empty_estimate
 from sfm.reduced_network import reduce_network
@@ -57,6 +60,7 @@ class FileFormat:
     straight: tuple[str, ...] = ()  # parameters that it has no place for and nothing can stand in
     one_focal: bool = False  # whether fx and fy must be the same
     titled: bool = False  # whether it holds the name of what is written
+    names: tuple[bool, bool] = (True, True)  # whether it names points, and photographs; else it numbers them
 
     @property
     def readable(self) -> bool:
@@ -100,6 +104,7 @@ def _write_ply(path: Path, network: Network, estimate: Estimate) -> None:
 _COLMAP = ("full_opencv", "opencv")
 _OPENCV_DISTORTION = ("k1", "k2", "p1", "p2")
 _BROWN_DISTORTION = MODELS["brown"].names[3:]
+NUMBERS = (False, False)
 FORMATS = (
     FileFormat(
         *("colmap", _COLMAP, partial(read_model, text=False), partial(write_model, text=False)),
@@ -120,16 +125,24 @@ FORMATS = (
         lacks=("b1", "b2", "k4", "k5", "k6"),
     ),
     FileFormat("photomodeler", ("brown",), read_photomodeler, write_photomodeler, lacks=("b1", "b2")),
-    FileFormat("bal", ("opencv",), read_bal, write_bal, straight=("p1", "p2"), one_focal=True),
+    FileFormat("bal", ("opencv",), read_bal, write_bal, straight=("p1", "p2"), one_focal=True, names=NUMBERS),
     FileFormat(
-        *("bundle-csharp", ("brown",), read_bundle_csharp, write_bundle_csharp), straight=_BROWN_DISTORTION
+        *("bundle-csharp", ("brown",), read_bundle_csharp, write_bundle_csharp),
+        straight=_BROWN_DISTORTION,
+        names=NUMBERS,
     ),
     FileFormat(
         *("bundle-matlab", ("brown",), read_bundle_matlab_folder, write_bundle_matlab_folder),
         folder=True,
         straight=_BROWN_DISTORTION,
+        names=NUMBERS,
     ),
-    FileFormat("sba", ("opencv",), _read_sba, _write_sba, folder=True, straight=_OPENCV_DISTORTION),
+    FileFormat(
+        *("sba", ("opencv",), _read_sba, _write_sba),
+        folder=True,
+        straight=_OPENCV_DISTORTION,
+        names=NUMBERS,
+    ),
     FileFormat("ply", (), None, _write_ply, placed=True),
 )
 ENDINGS = {".xml": "metashape", ".ply": "ply", ".db": "colmap-database"}
@@ -220,7 +233,10 @@ def read_comparable(path: Path, name: str | None = None) -> StoredResult:
             f"{path}: {len(network.image_points)} image points as format {form.name}, but no coordinates of "
             "photographs or points that could be compared"
         )
-    return StoredResult(path.name, network, estimate)
+    points_named, images_named = form.names
+    if form.name in ("colmap", "colmap-text"):  # names lie beside a model that Kolinear has written
+        points_named = (path / SIDE_FILE).is_file()
+    return StoredResult(path.name, network, estimate, points_named=points_named, images_named=images_named)
 
 
 def write_any(path: Path, name: str, network: Network, estimate: Estimate) -> None:
@@ -230,9 +246,7 @@ def write_any(path: Path, name: str, network: Network, estimate: Estimate) -> No
         KolinearError: the format cannot hold it, or it cannot be written.
     """
     form = format_named(name)
-    if path.exists() and (form.folder != path.is_dir() or (form.folder and any(path.iterdir()))):
-        needed = "a new or empty folder" if form.folder else "a new file"
-        raise OutputError(f"{path}: it is there already; format {name} needs {needed}")
+    refuse_taken(path, form)
     _refuse_cameras(form, estimate.cameras)
     if form.placed:
         points_only = not form.models
@@ -247,6 +261,15 @@ def write_any(path: Path, name: str, network: Network, estimate: Estimate) -> No
             form.write(folder, network, estimate, **title)
     else:
         form.write(path, network, estimate, **title)
+
+
+def refuse_taken(path: Path, form: FileFormat) -> None:
+    """Raise OutputError where something is in the place of what a format writes, but an empty folder."""
+    refuse_links(path)
+    empty = form.folder and path.is_dir() and not any(path.iterdir())
+    if os.path.lexists(path) and not empty:
+        needed = "a new or empty folder" if form.folder else "a new file"
+        raise OutputError(f"{path}: it is there already and is left alone; format {form.name} needs {needed}")
 
 
 def _refuse_cameras(form: FileFormat, cameras: tuple[Camera, ...]) -> None:

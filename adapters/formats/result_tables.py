@@ -4,7 +4,8 @@
     images.csv          image,X,Y,Z,omega_deg,phi_deg,kappa_deg[,sX,sY,sZ],camera
     cameras.csv         camera,parameter,value[,sigma],unit
     image_points.csv    image,point,x_px,y_px[,sx_px,sy_px][,rejected]
-    summary.json        name of the survey, model, size and pixel of each camera, redundancy
+    point_covariance.npy    of all points together, see `sfm.files.covariance_file`
+    summary.json        name of the survey, model, size and pixel of each camera, redundancy, datum
 
 These are the tables that `kolinear run` writes; other columns are passed over. What a summary does not say of
 size and pixel is taken from the COLMAP model in the folder `colmap`.
@@ -29,6 +30,7 @@ from sfm.camera import Camera
 from sfm.conventions import FloatArray, angles_from_rotation, rotation_from_angles
 from sfm.distortion.models import MODELS
 from sfm.errors import OutputError, SurveyFileError
+from sfm.files.covariance_file import read_covariance, write_covariance
 from sfm.files.csv_tables import CsvTable, read_header, read_table
 from sfm.files.plain_text import csv_text
 from sfm.network import Estimate, ImagePoints, Network
@@ -36,6 +38,7 @@ from sfm.stored_result import StoredResult
 
 EXTERIOR = ("X", "Y", "Z", "omega_deg", "phi_deg", "kappa_deg")
 SIGMAS = ("sX", "sY", "sZ")
+SIGMAS_PX = ("sx_px", "sy_px")
 PRINCIPAL_DISTANCES = ("c", "fx", "fy")
 COLMAP_SIDE_FILE = f"colmap/{SIDE_FILE}"
 
@@ -71,6 +74,8 @@ def read_result(folder: Path) -> StoredResult:
         sigmas,
         summary.redundancy,
         summary.length_unit or "",
+        read_covariance(folder, table.values[:, 3:]) if table.values.shape[1] > 3 else None,
+        summary.datum.kind if summary.datum else "",
     )
 
 
@@ -95,7 +100,9 @@ def write_tables(folder: Path, result: StoredResult) -> None:
     point_sigma, sigmas_of_points = _sigma_of(result.point_covariance, len(network.points))
     position_sigma, sigmas_of_images = _sigma_of(result.position_covariance, len(network.images))
     seen = network.image_points
-    sigma = np.sqrt(np.diagonal(seen.covariance, axis1=1, axis2=2))
+    sigma = seen.stated_sigma
+    sigmas_of_image_points = SIGMAS_PX if np.isfinite(sigma).any() else ()
+    sigma = sigma[:, : len(sigmas_of_image_points)]
     camera_rows = []
     for k, camera in enumerate(estimate.cameras):
         known = np.full(len(camera.names), np.nan)
@@ -108,6 +115,7 @@ def write_tables(folder: Path, result: StoredResult) -> None:
         "survey": result.name,
         "redundancy": result.redundancy,
         "length_unit": result.unit,
+        "datum": {"kind": result.datum},
         "cameras": [
             {
                 "name": camera.name,
@@ -142,12 +150,14 @@ def write_tables(folder: Path, result: StoredResult) -> None:
         _write(folder / "cameras.csv", ("camera", "parameter", "value", "sigma", "unit"), camera_rows)
         _write(
             folder / "image_points.csv",
-            ("image", "point", "x_px", "y_px", "sx_px", "sy_px"),
+            ("image", "point", "x_px", "y_px", *sigmas_of_image_points),
             (
                 (network.images[i], network.points[j], *xy, *s)
                 for i, j, xy, s in zip(seen.image, seen.point, seen.xy, sigma, strict=True)
             ),
         )
+        if result.covariance is not None:
+            write_covariance(folder, result.covariance)
         text = json.dumps(summary, indent=2, ensure_ascii=False)
         (folder / "summary.json").write_text(text + "\n", encoding="utf-8")
     except OSError as error:
@@ -163,11 +173,18 @@ class _CameraEntry(Content):
     pixel_mm: tuple[Pixel, Pixel] | None = None
 
 
+class _DatumEntry(Content):
+    """The datum as the summary names it."""
+
+    kind: Literal["free", "minimal", "control", ""]
+
+
 class _Summary(Content):
     """What is read of summary.json."""
 
     survey: Text | None = None
     length_unit: Text | None = None
+    datum: _DatumEntry | None = None
     redundancy: Annotated[int, Field(ge=0, strict=True)] | None = None
     cameras: Annotated[tuple[_CameraEntry, ...], Field(min_length=1)]
 
@@ -239,8 +256,10 @@ def _size(
 def _image_points(folder: Path, images: tuple[str, ...], points: tuple[str, ...]) -> ImagePoints:
     path = folder / "image_points.csv"
     flagged = ("rejected",) if "rejected" in read_header(path) else ()
-    sigmas = ("sx_px", "sy_px")
-    table = read_table(path, ("image", "point"), ("x_px", "y_px", *flagged), sigmas, ignored=None)
+    sigmas = SIGMAS_PX
+    table = read_table(
+        path, ("image", "point"), ("x_px", "y_px", *flagged), sigmas, ignored=None, blank=sigmas
+    )
     table.refuse_duplicates(tuple(zip(*table.texts, strict=True)), ("image", "point"))
     index = []
     files = ("images.csv", "points.csv")
@@ -253,9 +272,11 @@ def _image_points(folder: Path, images: tuple[str, ...], points: tuple[str, ...]
     rejected, sigma = table.values[:, 2 : 2 + len(flagged)], table.values[:, 2 + len(flagged) :]
     table.refuse(rejected, (rejected != 0) & (rejected != 1), flagged, "0 or 1")
     table.refuse(sigma, sigma <= 0, sigmas, "more than 0")
-    sigma = sigma if sigma.size else np.ones((len(table.line), 2))
+    sigma = sigma if sigma.size else np.full((len(table.line), 2), np.nan)
     image, point = index
-    found = ImagePoints(image, point, table.values[:, :2].copy(), np.eye(2) * sigma[:, None, :] ** 2)
+    stated = np.asarray(np.isfinite(sigma).all(axis=1))
+    sigma = np.where(stated[:, None], sigma, 1.0)
+    found = ImagePoints(image, point, table.values[:, :2].copy(), np.eye(2) * sigma[:, None, :] ** 2, stated)
     return found.select(rejected[:, 0] == 0) if flagged else found
 
 

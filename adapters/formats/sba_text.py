@@ -174,8 +174,8 @@ def _calibration(path: Path) -> FloatArray:
 
 
 def _points(path: Path, frames: int) -> tuple[ImagePoints, FloatArray]:
-    image, point, xy, covariance = [], [], [], []
-    xyz: list[list[float]] = []
+    stated: list[bool] = []
+    image, point, xy, covariance, xyz = array("q"), array("q"), array("d"), array("d"), array("d")
     for number, values in _rows(path):
         if len(values) < 4 or values[3] < 0 or values[3] != int(values[3]):
             raise SurveyFileError(f"{path}, line {number}: X Y Z and a number of projections are needed")
@@ -191,16 +191,17 @@ def _points(path: Path, frames: int) -> tuple[ImagePoints, FloatArray]:
             if not 0 <= own[0] < frames:
                 raise SurveyFileError(f"{path}, line {number}: frame {own[0]:g}, there are {frames} cameras")
             image.append(int(own[0]))
-            point.append(len(xyz))
+            point.append(len(xyz) // 3)
             if width == WITH_COVARIANCE and not _is_covariance(own[3:7]):
                 raise SurveyFileError(
                     f"{path}, line {number}: covariance {own[3:7]} of frame {own[0]:g} is not symmetric and "
                     "positive definite"
                 )
-            xy.append(own[1:3])
-            covariance.append(own[3:7] if width == WITH_COVARIANCE else [SIGMA_PX**2, 0.0, 0.0, SIGMA_PX**2])
-        xyz.append(values[:3])
-        if len(image) + len(xyz) > MAX_IMAGE_POINTS:
+            xy.extend(own[1:3])
+            stated.append(width == WITH_COVARIANCE)
+            covariance.extend(own[3:7] if width == WITH_COVARIANCE else (SIGMA_PX**2, 0.0, 0.0, SIGMA_PX**2))
+        xyz.extend(values[:3])
+        if len(image) + len(xyz) // 3 > MAX_IMAGE_POINTS:
             raise SurveyFileError(
                 f"{path}, line {number}: more than {MAX_IMAGE_POINTS} points and projections"
             )
@@ -210,10 +211,11 @@ def _points(path: Path, frames: int) -> tuple[ImagePoints, FloatArray]:
         ImagePoints(
             np.array(image, dtype=np.int64),
             np.array(point, dtype=np.int64),
-            np.array(xy),
+            np.array(xy).reshape(-1, 2),
             np.array(covariance).reshape(-1, 2, 2),
+            np.array(stated, dtype=bool),
         ),
-        np.array(xyz),
+        np.array(xyz).reshape(-1, 3),
     )
 
 

@@ -18,7 +18,9 @@ MAX_LINES = 2 * MAX_ROWS  # as of tables
 MAX_LINE = 10_000_000  # characters; the image points of a photograph can stand on one
 MAX_DIGITS = 20  # of a whole number; COLMAP's largest have as many
 MAX_PHOTOGRAPHS = 100_000
-MAX_IMAGE_POINTS = 2_000_000  # where they are kept one by one, some 0.5 GB
+MAX_POINTS = 5_000_000  # of which a name is kept
+MAX_IMAGE_POINTS = 20_000_000  # some 100 to 200 bytes each
+MAX_BLOCK_LINES = 2_000_000  # that are kept one by one, some 0.5 GB
 
 
 @dataclass
@@ -172,7 +174,7 @@ class Lines:
         while self.line().strip():
             self.put_back()
             row = self.numbers(count, count)
-            self.refuse_more(len(rows) + 1, MAX_IMAGE_POINTS, "lines of a block")
+            self.refuse_more(len(rows) + 1, MAX_BLOCK_LINES, "lines of a block")
             rows.append((self.where, f"{row[0]:.0f}", row[1:]))
         return rows
 

@@ -1,7 +1,12 @@
-"""XML read into nodes that remember their line, so that whatever is wrong is named with file and line."""
+"""XML read into nodes that remember their line, so that whatever is wrong is named with file and line.
+
+Elements that come in millions are handed over one by one while the file is read, and are not kept; the rest
+is kept as long as it needs no more memory than a limit.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import BinaryIO
@@ -15,8 +20,10 @@ from sfm.errors import SurveyFileError, one_line
 from sfm.files.csv_tables import MAX_NUMBER
 from sfm.files.plain_text import MAX_NAME, is_name, shown
 
-MAX_XML_BYTES = 100_000_000
-MAX_ELEMENTS, MAX_ALL_ATTRIBUTES = 500_000, 5_000_000  # some 500 MB; markers of 1000 photographs have fewer
+MAX_XML_BYTES = 4_000_000_000
+MAX_KEPT_BYTES = 1_000_000_000  # of memory; 100,000 cameras with all that is exported of them take half of it
+NODE_BYTES, ATTRIBUTE_BYTES = 400, 60  # of memory, without letters
+MAX_TEXT = 10_000_000  # characters of an element
 MAX_DEPTH = 100  # of elements in one another; exports have about ten
 MAX_ATTRIBUTES = 100  # of an element
 MAX_TAG_BYTES = 1_000_000  # of what expat can only read whole
@@ -97,8 +104,16 @@ class Node:
         return int(value)
 
 
-def read_xml(path: Path) -> Node:
+Taken = Mapping[tuple[str, str], Callable[[list[Node]], None]]
+
+
+def read_xml(path: Path, taken: Taken | None = None) -> Node:
     """Read a file and return its root.
+
+    Args:
+        path: the file.
+        taken: by the tags of a parent and its child: what is called when such a child has ended, with the
+            open elements from the root to it; it is not kept then.
 
     Raises:
         SurveyFileError: the file cannot be read, is larger in any way than exports are, or is not
@@ -109,7 +124,7 @@ def read_xml(path: Path) -> Node:
         if size > MAX_XML_BYTES:
             raise SurveyFileError(f"{path}: {size} bytes, at most {MAX_XML_BYTES} are read")
         with path.open("rb") as file:
-            return _Reader(path).read(file)
+            return _Reader(path, taken or {}).read(file)
     except OSError as error:
         raise SurveyFileError(f"{path}: cannot be read ({error.strerror})") from error
 
@@ -117,21 +132,24 @@ def read_xml(path: Path) -> Node:
 class _Reader:
     """Makes nodes of what expat tells."""
 
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        self.open_nodes = [Node(path, 0, "", {})]
+    def __init__(self, path: Path, taken: Taken) -> None:
+        self.path, self.taken = path, taken
+        self.top = Node(path, 0, "", {})
+        self.open_nodes: list[Node] = []  # from the root
         self.texts: list[str] = []  # of the innermost element, as long as it has no children
-        self.elements, self.attributes = 0, 0
+        self.characters = 0  # of them
+        self.kept = 0  # bytes of memory
+        self.kept_before: list[int] = []  # each of the open elements
         self.parser = expat.ParserCreate()
         self.parser.buffer_text = True  # else every line is a piece of its own
         self.parser.StartElementHandler = self.start
         self.parser.EndElementHandler = self.end
-        self.parser.CharacterDataHandler = self.texts.append
+        self.parser.CharacterDataHandler = self.text
         self.parser.StartDoctypeDeclHandler = self.refuse_doctype
 
     def read(self, file: BinaryIO) -> Node:
         """Read a file in pieces, so that nothing in it that is too large is held whole."""
-        top, given = self.open_nodes[0], 0
+        given = 0
         try:
             while data := file.read(PIECE_BYTES):
                 self.parser.Parse(data, False)
@@ -147,7 +165,7 @@ class _Reader:
             raise SurveyFileError(
                 f"{self.path}, line 1: the encoding is none that can be read ({one_line(error):.100})"
             ) from error
-        return top.children[0]
+        return self.top.children[0]
 
     def error(self, message: str) -> SurveyFileError:
         """Return the error of the line that is read."""
@@ -155,26 +173,46 @@ class _Reader:
 
     def start(self, tag: str, attributes: dict[str, str]) -> None:
         """Open an element."""
-        self.elements, self.attributes = self.elements + 1, self.attributes + len(attributes)
-        if len(self.open_nodes) > MAX_DEPTH:
+        if len(self.open_nodes) >= MAX_DEPTH:
             raise self.error(f"elements more than {MAX_DEPTH} deep in one another")
-        if self.elements > MAX_ELEMENTS:
-            raise self.error(f"more than {MAX_ELEMENTS} elements, no more are read")
         if len(attributes) > MAX_ATTRIBUTES:
             raise self.error(f"{len(attributes)} attributes of an element, at most {MAX_ATTRIBUTES} are read")
-        if self.attributes > MAX_ALL_ATTRIBUTES:
-            raise self.error(f"more than {MAX_ALL_ATTRIBUTES} attributes, no more are read")
         node = Node(self.path, self.parser.CurrentLineNumber, tag, attributes)
-        self.open_nodes[-1].children.append(node)
+        (self.open_nodes[-1] if self.open_nodes else self.top).children.append(node)
         self.open_nodes.append(node)
+        self.kept_before.append(self.kept)
+        self.keep(NODE_BYTES + sum(ATTRIBUTE_BYTES + len(value) for value in attributes.values()))
         self.texts.clear()
+        self.characters = 0
+
+    def text(self, piece: str) -> None:
+        """Add to the text of the innermost element."""
+        self.texts.append(piece)
+        self.characters += len(piece)
+        if self.characters > MAX_TEXT:
+            raise self.error(f"more than {MAX_TEXT} characters of text")
 
     def end(self, _: str) -> None:
         """Close the innermost element, which has either children or text."""
-        node = self.open_nodes.pop()
+        node = self.open_nodes[-1]
         if not node.children:
             node.text = "".join(self.texts)
+            self.keep(len(node.text))
         self.texts.clear()
+        self.characters = 0
+        before = self.kept_before.pop()
+        take = self.taken.get((self.open_nodes[-2].tag, node.tag)) if len(self.open_nodes) > 1 else None
+        if take is not None:
+            take(self.open_nodes)
+            self.open_nodes[-2].children.pop()
+            self.kept = before
+        self.open_nodes.pop()
+
+    def keep(self, count: int) -> None:
+        """Count bytes of memory."""
+        self.kept += count
+        if self.kept > MAX_KEPT_BYTES:
+            raise self.error(f"what stands up to here takes more than {MAX_KEPT_BYTES} bytes of memory")
 
     def refuse_doctype(self, *_: object) -> None:
         """Refuse entities, which can blow a small file up to gigabytes; no exporter writes any."""

@@ -13,8 +13,9 @@ from contextlib import suppress
 from pathlib import Path
 
 from sfm.errors import OutputError
+from sfm.files.manifest import MANIFEST, sha256_of
 from sfm.files.user_cache import make_user_folder, remove_unused, user_folder
-from sfm.files.whole_files import MANIFEST, sha256_of, whole_file
+from sfm.files.whole_files import whole_file
 
 
 def note_finished(folder: Path) -> None:
@@ -22,7 +23,7 @@ def note_finished(folder: Path) -> None:
     with suppress(OSError, OutputError):
         entry = _entry(folder)
         make_user_folder(entry.parents[1])
-        with whole_file(entry) as part:
+        with whole_file(entry, replaces=True) as part:
             part.touch()
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 from collections import Counter
@@ -12,8 +11,9 @@ from pathlib import Path
 
 from sfm.batch.job import LOGS, SurveyRow
 from sfm.errors import OutputError
+from sfm.files.manifest import MANIFEST, read_manifest, refuse_foreign_files
 from sfm.files.plain_text import as_plain, csv_text, is_plain
-from sfm.files.whole_files import MANIFEST, read_manifest, refuse_links, sha256_of, whole_file, write_manifest
+from sfm.files.whole_files import whole_files
 from sfm.report.html.page import render
 
 PAGES = ("batch.json", "batch.csv", "index.html")  # the first tells whose they are
@@ -36,14 +36,9 @@ def write_batch_pages(rows: Sequence[SurveyRow], out: Path) -> None:
         csv_text(names, [tuple(asdict(row).values()) for row in rows]),
         render_index(rows, out.name),
     )
-    texts = {name: text.encode() for name, text in zip(PAGES, pages, strict=True)}
-    there = {name: [sha256_of(out / name)] for name in PAGES if (out / name).exists()}
-    # Listed before they are written, beside those that are there: whatever ends the run, they are known.
-    new = {name: hashlib.sha256(text).hexdigest() for name, text in texts.items()}
-    write_manifest(out, {name: [*there.get(name, ()), new[name]] for name in PAGES})
-    for name, text in texts.items():
-        with whole_file(out / name) as part:
-            part.write_bytes(text)
+    with whole_files(out) as part:
+        for name, text in zip(PAGES, pages, strict=True):
+            (part / name).write_bytes(text.encode())
 
 
 def refuse_foreign_pages(out: Path) -> None:
@@ -53,20 +48,9 @@ def refuse_foreign_pages(out: Path) -> None:
     """
     if not is_plain(str(out)):
         raise OutputError(f"{as_plain(str(out))}: the path is no plain text; needed another --out")
-    for name in (MANIFEST, *PAGES):
-        refuse_links(out / name)
-    known = read_manifest(out)
-    try:
-        there = {name: sha256_of(out / name) for name in (MANIFEST, *PAGES) if (out / name).exists()}
-    except OSError as error:
-        raise OutputError(f"{out}: the folder cannot be read: {error.strerror}") from error
-    foreign = [name for name, digest in there.items() if digest not in known.get(name, ())]
-    foreign += [] if known.keys() <= {MANIFEST, *PAGES} else [MANIFEST]
-    if foreign:
-        raise OutputError(
-            f"{out}: the folder holds '{foreign[-1]}', which no batch has written, or not as it is "
-            "now; needed another --out"
-        )
+    if not read_manifest(out).keys() <= {MANIFEST, *PAGES}:
+        raise OutputError(f"{out}: the folder holds '{MANIFEST}' of a result, no batch; needed another --out")
+    refuse_foreign_files(out, PAGES)
 
 
 def totals(rows: Sequence[SurveyRow]) -> dict[str, int]:

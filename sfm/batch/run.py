@@ -34,8 +34,9 @@ from sfm.batch.pages import PAGES, refuse_foreign_pages, write_batch_pages
 from sfm.errors import BackendError, FolderInUseError, SurveyFileError
 from sfm.files.folder_lock import locked, owner_of
 from sfm.files.globs import BELOW, find_files
+from sfm.files.manifest import MANIFEST, refuse_foreign_folder
 from sfm.files.plain_text import as_plain
-from sfm.files.whole_files import MANIFEST, refuse_foreign_folder, remove_leftovers
+from sfm.files.whole_files import remove_leftovers
 from sfm.report.log import SurveyLog, refuse_other_log, remove_log
 from sfm.report.output import folder_name
 from sfm.runtime.executor import Call, Done, Engine, Lost, Told, Work

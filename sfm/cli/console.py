@@ -62,7 +62,6 @@ def _figures(findings: Findings) -> tuple[tuple[str, str], ...]:
     result, precision = findings.result, findings.precision
     a = result.adjustment
     coded = int((result.code >= 0).sum())
-    rejected = int(a.rejected.sum())
     typical, largest = float(precision.rms[3]), float(precision.largest[3])
     factor, unit = finer_unit(result.length_unit, largest)
     rows = [
@@ -71,7 +70,7 @@ def _figures(findings: Findings) -> tuple[tuple[str, str], ...]:
             "object points",
             f"{len(a.network.points)} ({coded} coded, {len(a.network.points) - coded} uncoded)",
         ),
-        ("image points", f"{len(a.rejected) - rejected} accepted, {rejected} rejected"),
+        ("image points", result.image_point_counts),
         ("adjustment", f"{'converged' if a.converged else 'NOT converged'}, {a.steps}"),
         ("datum", f"{a.datum}, rank defect {a.defect} (expected {a.expected_defect})"),
         (

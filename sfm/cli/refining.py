@@ -8,7 +8,6 @@ from typing import Annotated
 import typer
 
 from sfm.cli.starting import loading
-from sfm.errors import OutputError
 from sfm.runtime.faults import working_on
 
 
@@ -35,17 +34,15 @@ def refine(
     """
     with loading():
         from adapters.colmap.camera_models import read_model, write_model
-        from sfm.files.whole_files import refuse_links, whole_folder
+        from sfm.files.whole_files import refuse_existing, whole_folder
         from sfm.runtime.progress_bar import drawn_progress
         from sfm.survey.refine import refine_model, refinement_text
 
     if out is not None:
-        refuse_links(out)
-        if out.exists():
-            raise OutputError(f"{out}: exists already, the refined model needs a new folder")
+        refuse_existing(out)
     with working_on(str(model)):
         network, estimate = read_model(model)
-    with drawn_progress() as progress:
+    with working_on(str(model)), drawn_progress() as progress:
         found = refine_model(
             network, estimate, images, window_px=window, min_correlation=min_correlation, progress=progress
         )

@@ -28,7 +28,7 @@ def validate(
     with loading():
         from adapters.colmap.validation_backend import ColmapBackend
         from sfm.comparison.adjuster_validation import validate as validate_networks
-        from sfm.files.whole_files import refuse_foreign_folder
+        from sfm.files.manifest import refuse_foreign_folder
         from sfm.report.validation import in_words, largest, write_validation
         from sfm.runtime.progress_bar import drawn_progress
 
@@ -70,8 +70,14 @@ def compare(
     with loading():
         from adapters.formats.registry import read_comparable
         from sfm.comparison.significance import compare_results
-        from sfm.files.whole_files import refuse_foreign_folder
-        from sfm.report.differences import largest_difference, words_of_test, write_differences
+        from sfm.files.manifest import refuse_foreign_folder
+        from sfm.report.differences import (
+            largest_difference,
+            words_of_pairing,
+            words_of_scale,
+            words_of_test,
+            write_differences,
+        )
 
     refuse_foreign_folder(out)
     with working_on(str(a)):
@@ -83,8 +89,8 @@ def compare(
     place = {name: j for j, name in enumerate(first.network.points)}
     xyz = first.estimate.points[[place[name] for name in found.points]]
     page = write_differences(found, xyz, out)
+    print(f"{words_of_pairing(found)}, {len(found.images)} common photographs; {words_of_scale(found)}")
     print(words_of_test(found)[0])
-    print(f"{len(found.points)} common points, {len(found.images)} common photographs")
     if found.points:
         print(f"largest difference of a point: {largest_difference(found)}")
     print(f"Report: {page}")
@@ -110,11 +116,19 @@ def convert(
     A camera is converted where the format lacks its model.
     """
     with loading():
-        from adapters.formats.registry import ENDINGS, format_named, read_any, write_any, written
+        from adapters.formats.registry import (
+            ENDINGS,
+            format_named,
+            read_any,
+            refuse_taken,
+            write_any,
+            written,
+        )
         from sfm.comparison.camera_conversion import Conversion, convert_cameras
         from sfm.comparison.undistortion import undistort
 
     form = format_named(to_format or ENDINGS.get(target.suffix.lower(), "tables"))
+    refuse_taken(target, form)
     with working_on(str(source)):
         network, estimate = read_any(source, from_format)
     cameras = estimate.cameras

@@ -122,7 +122,13 @@ def _run_survey(
     if from_photographs:
         store = TargetStore.of_user()
         store.remove_old()
-    with drawn_progress() as drawn, one_blas_thread(), _written(folder), SurveyLog(watch=drawn) as log:
+    with (
+        working_on(str(survey_file)),
+        drawn_progress() as drawn,
+        one_blas_thread(),
+        _written(folder),
+        SurveyLog(watch=drawn) as log,
+    ):
         log.start(survey.name, survey_file)
         result = run_survey(survey, images_dir=images, jobs=workers, others=others, store=store, progress=log)
         findings = findings_of(result)
@@ -221,7 +227,7 @@ def _others_of_worker(survey: Survey) -> OtherPrograms:
 
 def _folder(survey: Survey, out: Path | None) -> Path:
     """Return the folder of the result, before any work is done for one that cannot be used."""
-    from sfm.files.whole_files import refuse_foreign_folder
+    from sfm.files.manifest import refuse_foreign_folder
     from sfm.report.output import folder_name
 
     out = Path("out") / folder_name(survey.name) if out is None else out

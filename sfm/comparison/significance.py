@@ -1,11 +1,12 @@
 """Differences of two results of one object, with their standard deviations and tests.
 
-Results are brought together by names of points or photographs. After an alignment (similarity over common
-points or projection centres, or over control, or none) each difference d of a point is tested by
-T = d' (Qa + Qb)^-1 d / 3, which under no change follows Fisher's F with 3 and the redundancy's degrees of
-freedom (chi-square over 3 where that is not known). The covariance of the aligned result is turned and scaled
-with it; the uncertainty of the alignment itself is left out, which makes the tests a little strict for few
-points. Results that were adjusted from the same image points are not independent and are not tested.
+Points and photographs are paired as `sfm.comparison.pairing` says, and b is aligned to a: over common points,
+projection centres or control, or not at all. The scale is estimated only where one of them has none. Where
+the covariance of all points together is known, both are brought into one datum and tested by
+`sfm.comparison.congruency`, which also finds the points that moved; then the alignment is over those that did
+not. Where only the covariance of each single point is known, each difference d is tested by
+T = d' (Qa + Qb)^-1 d / 3, an approximation that is made for free networks only. Results that were adjusted
+from the same image points are not independent and are not tested.
 
 Source: Luhmann et al. (2020), Close-Range Photogrammetry and 3D Imaging, sec. 2.4.2; Caspary (2000),
 Concepts of network and deformation analysis, sec. 7.
@@ -16,11 +17,12 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.stats import chi2, f
 
 from sfm.comparison.adjusters import rotation_angle_deg
 from sfm.comparison.camera_conversion import Conversion, convert_camera
-from sfm.conventions import BoolArray, FloatArray, IntArray
+from sfm.comparison.congruency import Congruency, congruency, critical_value
+from sfm.comparison.pairing import Pairing, pair_results
+from sfm.conventions import METRES, BoolArray, FloatArray, IntArray
 from sfm.errors import GeometryError
 from sfm.network import Network
 from sfm.similarity import Similarity, fit_similarity
@@ -28,6 +30,8 @@ from sfm.stored_result import StoredResult
 
 ALIGNMENTS = ("points", "cameras", "control", "none")
 SAME_PX = 1e-3  # image points closer than this are one measurement
+FREE_DATUMS = ("free", "")  # in which the covariance of single points says about what the whole one does
+HELD = 1e-12  # variance over the mean one below which a coordinate is held
 SAME_SHARE = 0.5  # of a's image points that b has too, from which on they are not independent
 ALPHA = 0.05  # level of the global test; single points are tested at ALPHA / number of points (Bonferroni)
 
@@ -53,17 +57,23 @@ class ResultComparison:
     unit: str  # of a's lengths, as people call it; empty where nobody knows
     has_sigma: tuple[bool, bool]  # whether standard deviations of points of a and of b are known
     same_share: float  # of a's image points that b has too; NaN if a has none
+    pairing: Pairing  # what is common, by index, and how it was recognised
     alignment: str  # points | cameras | control | none
+    scale_estimated: bool  # in the alignment, since not both results have a scale of their own
     a_from_b: Similarity
-    points: tuple[str, ...]  # names of the common points, n of them
+    points: tuple[str, ...]  # names in a of the common points, n of them
     point_difference: FloatArray  # object unit of a, (n, 3)
     point_sigma: FloatArray  # of the differences, NaN where not known, (n, 3)
-    statistic: FloatArray  # T of each point, NaN where not known, (n,)
-    critical: float  # of T for one point among all; NaN if no covariance is known
-    significant: BoolArray  # points with T above it, (n,)
-    global_statistic: float  # mean of T over all points
-    global_critical: float  # of the global test; NaN if no covariance is known
-    images: tuple[str, ...]  # names of the common photographs, m of them
+    untested: str  # why no test is made; empty where one is
+    approximate: bool  # whether the tests know the covariance of single points only
+    statistic: FloatArray  # T of each point, NaN where not tested, (n,)
+    critical: float  # of T for one point among all; NaN without tests
+    significant: BoolArray  # points that moved, (n,)
+    global_statistic: float  # of all points together over its degrees of freedom; NaN without tests
+    global_critical: float  # of the global test; NaN without tests
+    stable: BoolArray  # points that the alignment is over, (n,); all of them where nothing moved
+    majority: bool  # whether most of the points agree; if not, nobody knows which of them moved
+    images: tuple[str, ...]  # names in a of the common photographs, m of them
     position_difference: FloatArray  # of projection centres, object unit of a, (m, 3)
     rotation_deg: FloatArray  # angle between the rotations, deg, (m,)
     interior: tuple[InteriorDifference, ...]  # of cameras that share photographs
@@ -75,10 +85,10 @@ class ResultComparison:
 
     @property
     def changed(self) -> bool | None:
-        """Whether the points differ significantly as a whole; None if that is not tested."""
-        if np.isnan(self.global_critical):
+        """Whether the points differ significantly, as a whole or singly; None if that is not tested."""
+        if self.untested:
             return None
-        return bool(self.global_statistic > self.global_critical)
+        return bool(self.global_statistic > self.global_critical or self.significant.any())
 
 
 def compare_results(
@@ -93,9 +103,10 @@ def compare_results(
 
     Args:
         a: first result.
-        b: second result; points and photographs are recognised by their names.
-        align: points (all common ones), cameras (projection centres), control (the named points) or none.
-        control: names of the points for align = control.
+        b: second result.
+        align: points (all common ones that did not move), cameras (projection centres), control (the named
+            points) or none.
+        control: names in a of the points for align = control.
         alpha: probability of calling something a change that is none.
 
     Raises:
@@ -103,99 +114,224 @@ def compare_results(
     """
     if align not in ALIGNMENTS:
         raise GeometryError(f"comparison: align '{align}', expected one of {', '.join(ALIGNMENTS)}")
-    pa, pb = _common(a.network.points, a.estimate.determined, b.network.points, b.estimate.determined)
-    ia, ib = _common(a.network.images, a.estimate.oriented, b.network.images, b.estimate.oriented)
-    point_names = tuple(a.network.points[j] for j in pa)
+    pairing = pair_results(a, b)
+    pa, pb = pairing.points.T
+    ia, ib = pairing.images.T
+    names = tuple(a.network.points[j] for j in pa)
     if not len(pa) and not len(ia):
         raise GeometryError(
-            f"{a.name} and {b.name} have neither points nor photographs of the same names, so there is "
-            "nothing to compare"
+            f"{a.name} and {b.name} have no points and no photographs in common: neither names, nor image "
+            "points, nor places in the object are the same"
         )
-    transform = _align(a, b, align, (pa, pb), (ia, ib), point_names, control)
+    chosen = _chosen(names, align, control)
+    scale = _known_scale(a, b)
+    transform = _align(a, b, align, pairing, chosen, scale)
+    same_share = _same_share(a.network, b.network, pairing)
     moved = transform.apply_estimate(b.estimate)
-    difference = moved.points[pb] - a.estimate.points[pa]
-    covariance = _sum(a.point_covariance, b.point_covariance, pa, pb, transform)
-    same_share = _same_share(a.network, b.network)
+    test = _test(a, b, pairing, transform, moved.points[pb] - a.estimate.points[pa], align, chosen, alpha)
     if same_share > SAME_SHARE:
-        statistic, critical, global_critical = np.full(len(pa), np.nan), np.nan, np.nan
-    else:
-        statistic, critical, global_critical = _tests(a, b, difference, covariance, alpha)
-    variance = np.einsum("njj->nj", covariance)
+        test = replace(test, untested="same image points")
+    stable = chosen & test.stable if align == "control" else test.stable
+    if align == "points" and not test.untested and not stable.all():
+        transform = fit_similarity(b.estimate.points[pb[stable]], a.estimate.points[pa[stable]], scale=scale)
+        moved = transform.apply_estimate(b.estimate)
+    tested = not test.untested
+    nothing = np.full(len(pa), np.nan)
     return ResultComparison(
-        (a.name, b.name),
-        a.unit,
-        (_has_sigma(a), _has_sigma(b)),
-        same_share,
-        align,
-        transform,
-        point_names,
-        difference,
-        np.sqrt(np.where(variance >= 0, variance, np.nan)),
-        statistic,
-        critical,
-        statistic > critical,
-        float(np.nanmean(statistic)) if np.isfinite(statistic).any() else np.nan,
-        global_critical,
-        tuple(a.network.images[i] for i in ia),
-        moved.position[ib] - a.estimate.position[ia],
-        rotation_angle_deg(a.estimate.rotation[ia], moved.rotation[ib]),
-        _interior(a, b, ia, ib),
+        names=(a.name, b.name),
+        unit=a.unit,
+        has_sigma=(_has_sigma(a), _has_sigma(b)),
+        same_share=same_share,
+        pairing=pairing,
+        alignment=align,
+        scale_estimated=scale is None and align != "none",
+        a_from_b=transform,
+        points=names,
+        point_difference=moved.points[pb] - a.estimate.points[pa],
+        point_sigma=test.sigma,
+        untested=test.untested,
+        approximate=test.approximate,
+        statistic=test.statistic if tested else nothing,
+        critical=test.critical if tested else np.nan,
+        significant=test.significant & tested,
+        global_statistic=test.global_statistic if tested else np.nan,
+        global_critical=test.global_critical if tested else np.nan,
+        stable=stable | (not tested),
+        majority=test.majority,
+        images=tuple(a.network.images[i] for i in ia),
+        position_difference=moved.position[ib] - a.estimate.position[ia],
+        rotation_deg=rotation_angle_deg(a.estimate.rotation[ia], moved.rotation[ib]),
+        interior=_interior(a, b, ia, ib),
     )
 
 
-def _common(
-    a: tuple[str, ...], a_known: BoolArray, b: tuple[str, ...], b_known: BoolArray
-) -> tuple[IntArray, IntArray]:
-    """Indices of what both know, in the order of a."""
-    index = {name: k for k, name in enumerate(b) if b_known[k]}
-    rows = [(k, index[name]) for k, name in enumerate(a) if a_known[k] and name in index]
-    table = np.array(rows, dtype=np.int64).reshape(-1, 2)
-    return table[:, 0], table[:, 1]
+def _chosen(names: tuple[str, ...], align: str, control: tuple[str, ...]) -> BoolArray:
+    """Return which common points the alignment may be over, (n,)."""
+    if align != "control":
+        return np.ones(len(names), dtype=bool)
+    for name in control:
+        if name not in names:
+            raise GeometryError(f"comparison: control point {name} is not in both results")
+    return np.isin(np.array(names, dtype=object), list(control))
+
+
+def _known_scale(a: StoredResult, b: StoredResult) -> float | None:
+    """Return the scale of a over b where both have one, None where it has to be estimated."""
+    if not (a.has_scale and b.has_scale):
+        return None
+    if a.unit == b.unit:
+        return 1.0
+    return METRES[b.unit] / METRES[a.unit] if a.unit in METRES and b.unit in METRES else None
 
 
 def _align(
-    a: StoredResult,
-    b: StoredResult,
-    align: str,
-    points: tuple[IntArray, IntArray],
-    images: tuple[IntArray, IntArray],
-    names: tuple[str, ...],
-    control: tuple[str, ...],
+    a: StoredResult, b: StoredResult, align: str, pairing: Pairing, chosen: BoolArray, scale: float | None
 ) -> Similarity:
     if align == "none":
         return Similarity(1.0, np.eye(3), np.zeros(3))
     if align == "cameras":
-        source, target = b.estimate.position[images[1]], a.estimate.position[images[0]]
+        source, target = b.estimate.position[pairing.images[:, 1]], a.estimate.position[pairing.images[:, 0]]
         what = "photographs"
     else:
-        missing = [name for name in control if name not in names]
-        if align == "control" and missing:
-            raise GeometryError(f"comparison: control point {missing[0]} is not in both results")
-        chosen = np.array([align == "points" or name in control for name in names], dtype=bool)
-        source, target = b.estimate.points[points[1][chosen]], a.estimate.points[points[0][chosen]]
+        pairs = pairing.points[chosen]
+        source, target = b.estimate.points[pairs[:, 1]], a.estimate.points[pairs[:, 0]]
         what = "points" if align == "points" else "control points"
     if len(source) < 3:
         raise GeometryError(f"comparison: {len(source)} {what} in common, alignment needs 3")
-    return fit_similarity(source, target)
+    return fit_similarity(source, target, scale=scale)
 
 
 def _has_sigma(result: StoredResult) -> bool:
     return result.point_covariance is not None and bool(np.isfinite(result.point_covariance).any())
 
 
-def _same_share(a: Network, b: Network) -> float:
+def _same_share(a: Network, b: Network, pairing: Pairing) -> float:
     """Share of a's image points that b has too, at the same place of the same photograph; NaN without any."""
     ours, theirs = a.image_points, b.image_points
     if not len(ours):
         return np.nan
-    place = {
-        (b.images[i], b.points[j]): xy for i, j, xy in zip(theirs.image, theirs.point, theirs.xy, strict=True)
-    }
-    same = 0
-    for i, j, xy in zip(ours.image, ours.point, ours.xy, strict=True):
-        other = place.get((a.images[i], a.points[j]))
-        same += other is not None and bool(np.abs(other - xy).max() < SAME_PX)
-    return same / len(ours)
+    image = np.full(len(b.images), -1)
+    image[pairing.images[:, 1]] = pairing.images[:, 0]
+    point = np.full(len(b.points), -1)
+    point[pairing.points[:, 1]] = pairing.points[:, 0]
+    n = len(a.points)
+    key_a = ours.image * n + ours.point
+    known = (image[theirs.image] >= 0) & (point[theirs.point] >= 0)
+    key_b = (image[theirs.image] * n + point[theirs.point])[known]
+    _, i, j = np.intersect1d(key_a, key_b, return_indices=True)
+    same = np.abs(ours.xy[i] - theirs.xy[known][j]).max(axis=1) < SAME_PX
+    return float(same.sum() / len(ours))
+
+
+@dataclass(frozen=True)
+class _Test:
+    """What the tests of the points say."""
+
+    sigma: FloatArray  # of the differences, NaN where not known, (n, 3)
+    untested: str
+    statistic: FloatArray
+    critical: float
+    significant: BoolArray
+    global_statistic: float
+    global_critical: float
+    stable: BoolArray
+    approximate: bool = False
+    majority: bool = True
+
+
+def _test(
+    a: StoredResult,
+    b: StoredResult,
+    pairing: Pairing,
+    transform: Similarity,
+    difference: FloatArray,
+    align: str,
+    chosen: BoolArray,
+    alpha: float,
+) -> _Test:
+    """Test the differences of the common points with all that is known of their covariance."""
+    pa, pb = pairing.points.T
+    n = len(pa)
+    blocks = _sum(a.point_covariance, b.point_covariance, pa, pb, transform)
+    variance = np.einsum("njj->nj", blocks)
+    sigma = np.sqrt(np.where(variance >= 0, variance, np.nan))
+    nothing = np.full(n, np.nan)
+    every = np.ones(n, dtype=bool)
+
+    def without(why: str) -> _Test:
+        return _Test(sigma, why, nothing, np.nan, ~every, np.nan, np.nan, every)
+
+    if not n:
+        return without("no common points")
+    if not any(_has_sigma(one) for one in (a, b)):
+        return without("no standard deviations")
+    known = [one for one in (a, b) if _has_sigma(one)]
+    redundancies = [one.redundancy for one in (a, b) if one.redundancy is not None]
+    redundancy = sum(redundancies) if redundancies else None
+    in_control = all(one.datum == "control" for one in known)
+    if all(one.covariance is not None for one in known):
+        if align == "none" and not in_control:
+            return without("no common datum")
+        Q = _joint(a, pa, 1.0, np.eye(3)) + _joint(b, pb, transform.scale, transform.rotation)
+        free = ~_held(Q) if in_control else every
+        rows = np.repeat(free, 3)
+        try:
+            found = congruency(
+                difference[free],
+                Q[np.ix_(rows, rows)],
+                a.estimate.points[pa[free]],
+                motion="none" if align == "none" else "similarity" if _known_scale(a, b) is None else "rigid",
+                redundancy=redundancy,
+                datum=chosen[free],
+                alpha=alpha,
+            )
+        except GeometryError as error:
+            return without(str(error))
+        return _of_congruency(found, free)
+    if not all(one.datum in FREE_DATUMS for one in known):
+        return without("covariance of single points only")
+    statistic, critical, global_critical = _single_tests(difference, blocks, redundancy, alpha)
+    if not np.isfinite(statistic).any():
+        return without("no standard deviations of common points")
+    together = float(np.nanmean(statistic))
+    return _Test(
+        *(sigma, "", statistic, critical, statistic > critical, together, global_critical, every),
+        approximate=True,
+    )
+
+
+def _of_congruency(found: Congruency, tested: BoolArray) -> _Test:
+    """Return the test of all points where some, held in both results, took no part."""
+    n = len(tested)
+    sigma, statistic = np.zeros((n, 3)), np.full(n, np.nan)
+    sigma[tested] = np.sqrt(np.einsum("njj->nj", found.covariance).clip(0))
+    statistic[tested] = found.statistic
+    stable = np.ones(n, dtype=bool)
+    stable[tested] = found.stable
+    significant = np.zeros(n, dtype=bool)
+    significant[tested] = found.moved
+    return _Test(
+        *(sigma, "", statistic, found.critical, significant, found.global_statistic, found.global_critical),
+        *(stable, False, found.agreed),
+    )
+
+
+def _joint(result: StoredResult, points: IntArray, scale: float, rotation: FloatArray) -> FloatArray:
+    """Covariance of some points together, scaled and turned, (3 n, 3 n); 0 where none is known."""
+    n = len(points)
+    if result.covariance is None:
+        return np.zeros((3 * n, 3 * n))
+    rows = (3 * points[:, None] + np.arange(3)).ravel()
+    Q = result.covariance[np.ix_(rows, rows)].reshape(n, 3, n, 3)
+    J = scale * rotation
+    moved: FloatArray = np.einsum("xa,iajb,yb->ixjy", J, Q, J, optimize=True)
+    return moved.reshape(3 * n, 3 * n)
+
+
+def _held(Q: FloatArray) -> BoolArray:
+    """Whether a coordinate of a point is known without error, so that nothing is left to test, (n,)."""
+    variance = np.diagonal(Q).reshape(-1, 3)
+    return np.asarray((variance <= HELD * variance.mean()).any(axis=1))
 
 
 def _sum(
@@ -212,13 +348,11 @@ def _sum(
     return np.where(first | second, total, np.nan)
 
 
-def _tests(
-    a: StoredResult, b: StoredResult, difference: FloatArray, covariance: FloatArray, alpha: float
+def _single_tests(
+    difference: FloatArray, covariance: FloatArray, redundancy: int | None, alpha: float
 ) -> tuple[FloatArray, float, float]:
     """T of each point, its critical value for one of all points, and that of the mean of T."""
-    n = len(difference)
-    statistic = np.full(n, np.nan)
-    # held points have covariance 0 on both sides and no test
+    statistic = np.full(len(difference), np.nan)
     testable = np.isfinite(covariance).all(axis=(1, 2)) & (
         np.linalg.matrix_rank(np.nan_to_num(covariance)) == 3
     )
@@ -226,15 +360,9 @@ def _tests(
     statistic[testable] = (
         np.einsum("ni,ni->n", d, np.linalg.solve(covariance[testable], d[..., None])[..., 0]) / 3
     )
-    tested = int(testable.sum())
-    if not tested:
-        return statistic, np.nan, np.nan
-    redundancies = [r.redundancy for r in (a, b) if r.redundancy is not None]
-    one, every = alpha / tested, alpha
-    if not redundancies:
-        return statistic, float(chi2.isf(one, 3) / 3), float(chi2.isf(every, 3 * tested) / (3 * tested))
-    freedom = sum(redundancies)
-    return statistic, float(f.isf(one, 3, freedom)), float(f.isf(every, 3 * tested, freedom))
+    tested = max(1, int(testable.sum()))
+    single = critical_value(alpha / 2 / tested, 3, redundancy)
+    return statistic, single, critical_value(alpha / 2, 3 * tested, redundancy)
 
 
 def _interior(a: StoredResult, b: StoredResult, ia: IntArray, ib: IntArray) -> tuple[InteriorDifference, ...]:

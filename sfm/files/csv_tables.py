@@ -22,9 +22,9 @@ from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.errors import SurveyFileError
 from sfm.files.plain_text import MAX_NAME, as_plain, from_cell, is_plain
 
-# Room for the largest networks that are adjusted here, some 300 MB of memory at most.
-MAX_TABLE_BYTES = 500_000_000
-MAX_ROWS = 5_000_000
+# Room for the largest networks that are adjusted here; memory grows with the rows, some 100 bytes each.
+MAX_TABLE_BYTES = 2_000_000_000
+MAX_ROWS = 20_000_000
 MAX_LINE = 10_000  # characters
 MAX_NUMBER = 1e12  # no length, angle or pixel is larger; squares and products of larger ones overflow
 

@@ -19,7 +19,7 @@ from pathlib import Path
 from filelock import lock_descriptor, unlock_descriptor
 
 from sfm.errors import FolderInUseError, OutputError
-from sfm.files.whole_files import make_folder, open_own
+from sfm.files.open_folders import make_folder, open_own
 
 MAX_OWNER_BYTES = 10_000  # of the text in a lock file
 TEXT_AT = 1  # Windows keeps others from reading the locked byte, the first

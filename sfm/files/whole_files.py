@@ -1,36 +1,35 @@
 """Files and folders that appear whole or not at all, and never by way of a link that somebody has laid there.
 
-A folder that comes from somebody else may hold links at every path that is written. So no part of such a path
-may be a link but those of the system in its root folder (as /tmp of macOS); what is new is made under names
-that nobody can know before, and moved to its place by one rename, which follows no link.
-
-A folder that may be replaced has a list of its files with their hashes, manifest.json. It is replaced only
-while it holds these files, unchanged, and nothing else: files that were added, edited or linked by a person
-are named, and left alone.
+What is new is made under names that nobody can know before, and moved to its place by one rename, which
+follows no link. What is there already is replaced only where it is known as the program's own.
 """
 
 from __future__ import annotations
 
-import hashlib
-import json
 import os
 import re
+import secrets
 import shutil
-import stat
 import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from sfm.errors import KolinearError, OutputError
+from sfm.files.manifest import (
+    MANIFEST,
+    manifest_text,
+    names_below,
+    read_manifest,
+    refuse_foreign_files,
+    refuse_foreign_folder,
+    sha256_of,
+)
+from sfm.files.open_folders import move, open_folder, open_new_folder, refuse_links
 
-MANIFEST = "manifest.json"  # lists the files of a folder
-MAX_MANIFEST_BYTES = 20_000_000  # some 100,000 files
-LITTER = (".DS_Store", "Thumbs.db")  # which systems leave in every folder that is looked at
-NAMED = 3  # files that a message names
 ROOM_BYTES = 1 << 20  # what is written on trial to learn why a library could not write
-RANDOM = r"\.[a-z0-9_]{8}\."  # of mkdtemp, in the name of what is being written
+RANDOM = r"\.[a-z0-9_]{8}\."  # in the name of what is being written
 
 
 @contextmanager
@@ -49,129 +48,89 @@ def whole_folder(out: Path, what: str = "", *, replaceable: bool = False) -> Ite
         OutputError: the folder cannot be written; nothing is left of it then.
     """
     refuse_foreign_folder(out)
-    folder = _beside(out, what)
-    try:
-        with _told_of(out, folder, what):
-            folder.chmod(0o755)  # mkdtemp makes it for the owner alone
-            yield folder
-            if replaceable:
-                write_manifest(folder, {name: [sha256_of(folder / name)] for name in _names(folder)})
-            for path in (*folder.rglob("*"), folder):
-                _sync(path)
-            refuse_foreign_folder(out)  # as it is now
-            _put_in_place(folder, out)
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)
+    with _new_folder(out, what) as part, _told_of(out, part.path, what):
+        part.path.chmod(0o755)  # it was made for the user alone
+        yield part.path
+        if replaceable:
+            write_manifest(part.path, {n: [sha256_of(part.path / n)] for n in names_below(part.path)})
+        for path in (*part.path.rglob("*"), part.path):
+            _sync(path)
+        refuse_foreign_folder(out)  # as it is now
+        _put_in_place(part, out)
 
 
 @contextmanager
-def whole_file(path: Path, what: str = "") -> Iterator[Path]:
-    """Give a file to write, which takes the place of `path` when it is finished.
+def whole_file(path: Path, what: str = "", *, replaces: bool = False) -> Iterator[Path]:
+    """Give a file to write, which is at `path` when it is finished.
 
     It lies in a folder of its own, so that what a library leaves beside its file goes with it.
 
     Args:
-        path: the file; an earlier one is replaced.
+        path: the file.
         what: what is written, for the message, if the path alone does not say it.
+        replaces: whether the caller knows an earlier file to be the program's own, which is replaced.
 
     Yields:
         Path of the file to write.
 
     Raises:
-        OutputError: the file cannot be written; nothing is left of it then.
+        OutputError: the file cannot be written, or another is there; nothing is left of it then.
     """
-    folder = _beside(path, what)
-    try:
-        with _told_of(path, folder / path.name, what):
-            yield folder / path.name
-            _sync(folder / path.name)
-            (folder / path.name).replace(path)
-            _sync(path.parent)
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)
+    if not replaces:
+        refuse_existing(path)
+    with _new_folder(path, what) as part, _told_of(path, part.path / path.name, what):
+        yield part.path / path.name
+        _sync(part.path / path.name)
+        if not replaces:
+            refuse_existing(path)  # as it is now
+        part.refuse_exchanged()
+        move(part.path / path.name, part.handle, path, part.beside)
+        _sync(path.parent)
 
 
-def open_own(path: Path, flags: int) -> int:
-    """Open a regular file that has no second name, following no link, and return its handle.
+@contextmanager
+def whole_files(folder: Path, what: str = "") -> Iterator[Path]:
+    """Give a folder to write files into, which then go into `folder`, beside files of other names.
 
     Args:
-        path: the file.
-        flags: of os.open; what they create is new or the program's own, by the caller's check.
+        folder: it gets a list of them, by which later ones may take their place.
+        what: what is written, for the message, if the path alone does not say it.
+
+    Yields:
+        An empty folder; what is made in it is files.
 
     Raises:
-        OutputError: a link is in the path, or it is no such file.
-        OSError: it cannot be opened.
+        OutputError: they cannot be written, or files of these names are there that Kolinear has not written.
     """
+    with _new_folder(folder / MANIFEST, what) as part, _told_of(folder, part.path, what):
+        yield part.path
+        names = names_below(part.path)
+        refuse_foreign_files(folder, names)
+        hashes = read_manifest(folder)
+        hashes.pop(MANIFEST, None)
+        for name in names:
+            _sync(part.path / name)
+            # Listed before they are there, beside those that are: whatever ends the run, they are known.
+            there = [sha256_of(folder / name)] if name in hashes and (folder / name).exists() else []
+            hashes[name] = [*there, sha256_of(part.path / name)]
+        write_manifest(folder, hashes)
+        part.refuse_exchanged()
+        for name in names:
+            move(part.path / name, part.handle, folder / name, part.beside)
+        _sync(folder)
+
+
+def refuse_existing(path: Path) -> None:
+    """Raise OutputError if something is where a new file is to be written."""
     refuse_links(path)
-    flags |= getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
-    handle = os.open(path, flags, 0o644)
-    status = os.fstat(handle)
-    if stat.S_ISREG(status.st_mode) and status.st_nlink <= 1:  # 0: its owner has just removed it
-        return handle
-    os.close(handle)
-    raise OutputError(f"{path}: is not a regular file with one name, and is left alone")
-
-
-def refuse_links(path: Path) -> None:
-    """Raise OutputError if a part of a path that is to be written is a symbolic link or a junction."""
-    absolute = Path.cwd() / path
-    for part in (*reversed(absolute.parents), absolute):
-        link = part.is_symlink() or getattr(os.path, "isjunction", lambda _: False)(part)
-        if link and part.parent != Path(part.anchor):
-            leads = os.fsdecode(os.readlink(part))
-            raise OutputError(
-                f"{path}: '{part.name}' is a link to '{leads}', and nothing is written through links; "
-                "name the folder itself"
-            )
-
-
-def refuse_foreign_folder(out: Path) -> None:
-    """Raise OutputError unless a folder is absent, empty, or as Kolinear wrote it, by its manifest.
-
-    It is called before the work starts, too, so that nobody waits for a result that has no place.
-    """
-    refuse_links(out)
-    try:
-        mode = out.lstat().st_mode
-    except (FileNotFoundError, NotADirectoryError):  # which is told where it is to be made
-        return
-    if not stat.S_ISDIR(mode):
-        raise OutputError(f"{out}: a file is in the way, --out needs a folder")
-    try:
-        known, foreign = read_manifest(out), []
-        for name in _names(out):
-            if name not in known:
-                foreign.append(f"'{name}'")
-            elif sha256_of(out / name) not in known[name]:
-                foreign.append(f"'{name}', changed since Kolinear wrote it")
-    except OSError as error:
-        raise OutputError(f"{out}: the folder cannot be read: {error.strerror}") from error
-    if foreign:
-        more = f" and {len(foreign) - NAMED} more" if len(foreign) > NAMED else ""
-        raise OutputError(
-            f"{out}: the folder holds {'; '.join(foreign[:NAMED])}{more}; --out needs a new or empty folder "
-            "or an unchanged earlier result"
-        )
+    if os.path.lexists(path):
+        raise OutputError(f"{path}: is there already and is left alone, a new name is needed")
 
 
 def write_manifest(folder: Path, hashes: dict[str, list[str]]) -> None:
     """List files of a folder with the SHA-256 that each may have."""
-    text = json.dumps({"written_by": "kolinear", "files": hashes}, indent=1, ensure_ascii=True)
-    with whole_file(folder / MANIFEST) as part:
-        part.write_text(text + "\n", encoding="utf-8")
-
-
-def read_manifest(folder: Path) -> dict[str, list[str]]:
-    """Return the hashes that files of a folder may have, by name; none without a list that can be read."""
-    try:
-        handle = open_own(folder / MANIFEST, os.O_RDONLY)
-        with os.fdopen(handle, "rb") as file:
-            found: Any = json.loads(file.read(MAX_MANIFEST_BYTES))["files"]
-        if all(isinstance(hashes, list) for hashes in found.values()):
-            return {**found, MANIFEST: [sha256_of(folder / MANIFEST)]}  # it is ours if it can be read
-    except (OSError, OutputError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
-        pass
-    return {}
+    with whole_file(folder / MANIFEST, replaces=True) as part:
+        part.write_text(manifest_text(hashes), encoding="utf-8")
 
 
 def remove_leftovers(out: Path) -> None:
@@ -203,54 +162,36 @@ def refuse_full(folder: Path) -> None:
         os.fsync(file.fileno())
 
 
-def make_folder(path: Path) -> None:
-    """Make a folder and what is above it, if they are not there.
+@dataclass(frozen=True)
+class _Part:
+    """A new folder under a name that nobody can know before, and the folder it lies in."""
 
-    Raises:
-        OutputError: a link is in the path.
-        OSError: it cannot be made.
-    """
-    refuse_links(path)
-    path.mkdir(parents=True, exist_ok=True)
+    path: Path
+    handle: int | None  # of it; None where the system has none
+    beside: int | None  # of the folder it lies in
 
-
-def _names(folder: Path) -> list[str]:
-    """Return the names of all that is in and below a folder but folders; a link to one is none.
-
-    Raises:
-        OSError: a folder cannot be read.
-    """
-
-    def fail(error: OSError) -> None:
-        raise error
-
-    found = []
-    for where, below, files in os.walk(folder, onerror=fail):
-        for name in (*below, *files):
-            path = Path(where, name)
-            if (path.is_symlink() or not path.is_dir()) and name not in LITTER:
-                found.append(path.relative_to(folder).as_posix())
-    return sorted(found)
+    def refuse_exchanged(self) -> None:
+        """Raise OutputError if another folder is now where libraries have written by its path."""
+        if self.handle is not None and not os.path.samestat(os.fstat(self.handle), os.stat(self.path)):
+            raise OutputError(f"{self.path}: was exchanged while it was written")
 
 
-def sha256_of(path: Path) -> str:
-    """Return the SHA-256 of a file; of anything that is not a regular one, a text that is none."""
-    if not stat.S_ISREG(path.lstat().st_mode):
-        return f"no file {os.urandom(16).hex()}"  # which no list can hold
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
-
-
-def _beside(out: Path, what: str) -> Path:
-    """Make an empty folder beside a place that is to be written, and what is above it."""
+@contextmanager
+def _new_folder(out: Path, what: str, ending: str = "part") -> Iterator[_Part]:
+    """Make an empty folder beside a place that is to be written, and what is above it; it goes afterwards."""
     refuse_links(out)
-    try:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        return Path(tempfile.mkdtemp(prefix=f".{out.name}.", suffix=".part", dir=out.parent))
-    except OSError as error:
-        raise OutputError(
-            f"{out}: {_subject(what)}cannot be written here: {error.strerror or error}"
-        ) from error
+    path = out.parent / f".{out.name}.{secrets.token_hex(4)}.{ending}"
+    with ExitStack() as stack:
+        try:
+            beside = stack.enter_context(open_folder(out.parent, make=True))
+            handle = open_new_folder(path, beside)
+        except OSError as error:
+            reason = error.strerror or error
+            raise OutputError(f"{out}: {_subject(what)}cannot be written here: {reason}") from error
+        stack.callback(shutil.rmtree, path, ignore_errors=True)
+        if handle is not None:
+            stack.callback(os.close, handle)
+        yield _Part(path, handle, beside)
 
 
 @contextmanager
@@ -281,20 +222,18 @@ def _sync(path: Path) -> None:
         os.close(handle)
 
 
-def _put_in_place(folder: Path, out: Path) -> None:
+def _put_in_place(part: _Part, out: Path) -> None:
     """Rename the finished folder to its place; an earlier one is kept until the new one is there."""
+    part.refuse_exchanged()
     if not out.exists():
-        folder.rename(out)
+        move(part.path, part.beside, out, part.beside)
         _sync(out.parent)
         return
-    old = Path(tempfile.mkdtemp(prefix=f".{out.name}.", suffix=".old", dir=out.parent))
-    try:
-        out.rename(old / "result")
+    with _new_folder(out, "", "old") as old:
+        move(out, part.beside, old.path / "result", old.handle)
         try:
-            folder.rename(out)
+            move(part.path, part.beside, out, part.beside)
         except OSError:
-            (old / "result").rename(out)
+            move(old.path / "result", old.handle, out, part.beside)
             raise
         _sync(out.parent)
-    finally:
-        shutil.rmtree(old, ignore_errors=True)

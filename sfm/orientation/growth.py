@@ -124,17 +124,26 @@ class Growth:
             return 0
         best = count[waiting].max()
         order = waiting[np.argsort(-count[waiting], kind="stable")].tolist()
-        added = self._resect([i for i in order if count[i] >= max(self.min_points, best / 2)])
+        added = self.resect([i for i in order if count[i] >= max(self.min_points, best / 2)])
         if not added:
-            added = self._resect([i for i in order if count[i] < best / 2])
+            added = self.resect([i for i in order if count[i] < best / 2])
         return added
 
     def resect_all(self, *, only_new: bool = False) -> None:
         """Resect the photographs anew on the present points; oriented ones keep what fits better."""
         left_out = self.dropped | (self.estimate.oriented if only_new else False)
-        self._resect(np.flatnonzero(~left_out).tolist())
+        self.resect(np.flatnonzero(~left_out).tolist())
 
-    def _resect(self, images: list[int]) -> int:
+    def share_fitting(self) -> FloatArray:
+        """Share of the image points of each photograph, of determined points, that fit, (m,)."""
+        seen, m = self.network.image_points, len(self.network.images)
+        known = self.estimate.determined[seen.point] & self.estimate.oriented[seen.image]
+        fits = self.residuals_px() <= self.tolerance_px[self.network.camera[seen.image]]
+        count = np.bincount(seen.image[known], minlength=m)
+        return np.asarray(np.bincount(seen.image[known & fits], minlength=m) / np.maximum(count, 1))
+
+    def resect(self, images: list[int]) -> int:
+        """Resect photographs, of which oriented ones keep what fits better; return how many are new."""
         uv, tolerance = self.tangents(), self.tolerance()
         position, rotation = self.estimate.position.copy(), self.estimate.rotation.copy()
         seen = self.network.image_points
@@ -169,8 +178,8 @@ class Growth:
         self.estimate = replace(self.estimate, position=position, rotation=rotation)
         return added
 
-    def intersect(self) -> None:
-        """Intersect all points that are not control anew from the oriented photographs."""
+    def intersect(self, *, only_missing: bool = False) -> None:
+        """Intersect the points that are not control from the oriented photographs, all or those missing."""
         seen = self.network.image_points
         result = intersect(
             self.tangents(),
@@ -185,20 +194,27 @@ class Growth:
         # rays of a point that is somewhere else in every photograph meet by twos, here and there
         rays = np.bincount(seen.point[self.estimate.oriented[seen.image]], minlength=len(self.network.points))
         points = np.where((result.rays >= MIN_SHARE * rays)[:, None], result.points, np.nan)
-        points = np.where(self.fixed[:, None], self.estimate.points, points)
+        stay = self.fixed | self.estimate.determined if only_missing else self.fixed
+        points = np.where(stay[:, None], self.estimate.points, points)
         self.estimate = replace(self.estimate, points=points)
 
-    def refined(self, refine: Refine | None) -> bool:
+    def refined(self, refine: Refine | None, *, everything: bool = False) -> bool:
         """Let the caller adjust what is determined; keep the result if the image points fit better.
 
-        Returns whether there was anything new to adjust.
+        Args:
+            refine: the caller's adjustment.
+            everything: whether image points beyond the tolerance take part, as from rough start values.
+
+        Returns:
+            Whether there was anything new to adjust.
         """
         if refine is None:
             return False
         seen = self.network.image_points
         residuals = self.residuals_px()
         limit = self.tolerance_px[self.network.camera[seen.image]]
-        fits = residuals <= limit
+        fits = np.isfinite(residuals) if everything else residuals <= limit
+        limit = np.full(len(limit), np.inf) if everything else limit
         rays = np.bincount(seen.point[fits], minlength=len(self.network.points))
         points = self.estimate.determined & ((rays >= 2) | self.fixed)
         count = np.bincount(seen.image[fits & points[seen.point]], minlength=len(self.network.images))

@@ -5,7 +5,8 @@ whose model most other photographs can be resected on. Planar pairs have two sol
 is taken that the other photographs confirm. After that: resection of every photograph that sees enough
 points, intersection of all points, and adjustment by a function of the caller, so that the interior
 orientation is learnt while the network grows. At last photographs that the others contradict leave. Given
-values that lead nowhere are put aside for a start without them.
+values are start values: they are completed and adjusted as they are, and only where the image points do not
+fit the result are photographs oriented anew, with them or, if they lead nowhere, without them.
 """
 
 from __future__ import annotations
@@ -18,7 +19,9 @@ from sfm.camera import Camera
 from sfm.conventions import BoolArray, FloatArray
 from sfm.errors import GeometryError
 from sfm.network import Estimate, Network, empty_estimate
+from sfm.orientation.given_values import start_from_given
 from sfm.orientation.growth import FIRST_ADJUSTMENT, Growth, Refine, has_given_values
+from sfm.orientation.remaining_points import intersect_remaining
 from sfm.orientation.starting_pair import Start
 from sfm.similarity import fit_similarity
 
@@ -36,12 +39,13 @@ class Orientation:
 
     estimate: Estimate  # NaN for photographs and points that are not determined
     failures: tuple[tuple[str, str], ...]  # (name of the photograph, reason)
+    point_failures: tuple[tuple[str, str], ...]  # (name of the point, reason)
     pair: tuple[str, str] | None  # photographs it started from; None: from control or given values
     kind: str  # start: spatial | planar | control | given
     fits: BoolArray  # image points within the tolerance, (k,)
     rms_px: float  # over these, per coordinate, px
     tolerance_px: FloatArray  # last tolerance of each camera, px, one per camera
-    warnings: tuple[str, ...] = ()  # one line each: given values that were of no use
+    warnings: tuple[str, ...] = ()  # one line each: given values that were of no use or replaced
 
 
 def orient(
@@ -53,6 +57,7 @@ def orient(
     start_tolerance: float = START_TOLERANCE,
     final_tolerance_px: float = FINAL_TOLERANCE_PX,
     min_points: int = MIN_POINTS,
+    contradicting: bool = False,
 ) -> Orientation:
     """Return exterior orientations and points of a network, from its image points.
 
@@ -66,9 +71,12 @@ def orient(
         start_tolerance: largest residual at the beginning, as a fraction of the photograph's diagonal.
         final_tolerance_px: the tolerance follows the residuals down to this, px.
         min_points: points that a photograph must share with the network, at least 4.
+        contradicting: whether points whose rays do not meet within the tolerance get coordinates, too, for
+            an adjustment that is to judge them.
 
     Returns:
-        The orientation, NaN with a reason for every photograph that could not be oriented.
+        The orientation, NaN with a reason for every photograph that could not be oriented, and for every
+        point that its rays do not determine.
 
     Raises:
         GeometryError: no two photographs could be oriented, with the given values or without them.
@@ -83,14 +91,21 @@ def orient(
         ()
     """
 
+    def begin(values: Estimate) -> Growth:
+        diagonal = np.array([np.hypot(*camera.size_px) for camera in values.cameras])
+        return Growth(network, values, seed, start_tolerance * diagonal, max(min_points, MIN_POINTS))
+
     def grow(values: Estimate) -> Orientation:
-        cameras = values.cameras
-        diagonal = np.array([np.hypot(*camera.size_px) for camera in cameras])
-        growth = Growth(network, values, seed, start_tolerance * diagonal, max(min_points, MIN_POINTS))
-        return _grown(growth, refine, final_tolerance_px)
+        return _grown(begin(values), refine, final_tolerance_px, contradicting=contradicting)
 
     if not has_given_values(network, estimate):
         return grow(estimate)
+    growth = begin(estimate)
+    kept = start_from_given(growth, refine, final_tolerance_px)
+    if kept is not None:
+        given = Start(None, "given", kept.estimate.position, kept.estimate.rotation, kept.estimate.points)
+        oriented = _finish(growth, given, estimate.cameras, contradicting=contradicting)
+        return replace(oriented, warnings=kept.replaced)
     try:
         with_given = grow(estimate)
     except GeometryError:
@@ -122,7 +137,9 @@ def _holds_control(network: Network, found: Orientation) -> bool:
     return bool(np.isin(control.point[measured], seen.point[found.fits]).all())
 
 
-def _grown(growth: Growth, refine: Refine | None, final_tolerance_px: float) -> Orientation:
+def _grown(
+    growth: Growth, refine: Refine | None, final_tolerance_px: float, *, contradicting: bool
+) -> Orientation:
     """Start, resect and intersect until nothing more comes, and let go what does not belong."""
     cameras = growth.estimate.cameras
     start = growth.begin()
@@ -142,7 +159,7 @@ def _grown(growth: Growth, refine: Refine | None, final_tolerance_px: float) -> 
     if growth.drop_unsupported():
         _settled(growth, refine, final_tolerance_px)
         growth.drop_unsupported()
-    return _finish(growth, start, cameras)
+    return _finish(growth, start, cameras, contradicting=contradicting)
 
 
 def _settled(growth: Growth, refine: Refine | None, final_tolerance_px: float) -> None:
@@ -155,8 +172,9 @@ def _settled(growth: Growth, refine: Refine | None, final_tolerance_px: float) -
             break
 
 
-def _finish(growth: Growth, start: Start, cameras: tuple[Camera, ...]) -> Orientation:
-    """Bring the network onto control if it started free, and report."""
+def _finish(growth: Growth, start: Start, cameras: tuple[Camera, ...], *, contradicting: bool) -> Orientation:
+    """Intersect the remaining points, bring the network onto control if it started free, and report."""
+    lost = intersect_remaining(growth, contradicting=contradicting)
     network, control = growth.network, growth.network.control
     seen = network.image_points
     residuals = growth.residuals_px()
@@ -182,4 +200,4 @@ def _finish(growth: Growth, start: Start, cameras: tuple[Camera, ...]) -> Orient
         replace(new, free=old.free) for new, old in zip(growth.estimate.cameras, cameras, strict=True)
     )
     estimate = replace(growth.estimate, cameras=restored)
-    return Orientation(estimate, failures, pair, start.kind, fits, rms, growth.tolerance_px)
+    return Orientation(estimate, failures, lost, pair, start.kind, fits, rms, growth.tolerance_px)

@@ -35,6 +35,7 @@ CLEAR = 1.35
 # Printers of 600 dots per inch put 24 dots across the smallest target, 6 across a module of the smallest tag.
 SMALLEST_DOT_MM, SMALLEST_MODULE_MM = 1.0, 0.25
 MOST_LETTERS = 40  # of the name of a code table, so that the line with it stays on the page
+MAX_SHEET_BYTES = 100_000_000  # of 10,000 targets
 CHECK = "print without scaling and check"  # stands on every page; a file with it is an earlier sheet
 
 
@@ -171,7 +172,7 @@ def write_sheet(sheet: Sheet, path: Path) -> tuple[Path, ...]:
         _refuse_other_files(name)
     with ExitStack() as files:
         for name, content in zip(names, contents, strict=True):
-            files.enter_context(whole_file(name, "the sheet")).write_bytes(content)
+            files.enter_context(whole_file(name, "the sheet", replaces=True)).write_bytes(content)
     return tuple(names)
 
 
@@ -180,10 +181,16 @@ def _refuse_other_files(path: Path) -> None:
     try:
         if path.is_dir():
             raise OutputError(f"{path}: is a folder, needed the name of a file")
-        if path.exists() and CHECK.encode() not in path.read_bytes():
+        if path.exists() and not (path.is_file() and CHECK.encode() in _head(path)):
             raise OutputError(f"{path}: exists and is no earlier sheet, needed another name")
     except OSError as error:
         raise OutputError(f"{path}: the sheet cannot be written: {error.strerror or error}") from error
+
+
+def _head(path: Path) -> bytes:
+    """Return as much of a file as a sheet can have."""
+    with path.open("rb") as file:
+        return file.read(MAX_SHEET_BYTES)
 
 
 @dataclass(frozen=True)

@@ -12,9 +12,7 @@ from __future__ import annotations
 
 import argparse
 import math
-import os
 import sys
-import tempfile
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -24,13 +22,16 @@ import numpy as np
 from sfm.camera import Camera, project, tangents_from_pixel
 from sfm.conventions import AnyArray, FloatArray, IntArray, angles_from_rotation
 from sfm.errors import GeometryError, KolinearError, OutputError
+from sfm.files.manifest import refuse_foreign_files
 from sfm.files.plain_text import csv_text
-from sfm.files.whole_files import make_folder
+from sfm.files.whole_files import whole_files
 from sfm.rendering.area import Lamp, fill_face, paint_mark
 from sfm.rendering.painting_order import painting_order
 from sfm.rendering.scene import ARC, DISC, UNCODED, Optics, Scene
 from sfm.rendering.scene_file import Staging, read_scene
 from sfm.rendering.visibility import ProjectedTargets, project_targets
+
+TRUTH = ("truth_points.csv", "truth_images.csv", "truth_image_points.csv")
 
 
 def render_photograph(
@@ -238,6 +239,7 @@ def write_photographs(staging: Staging, folder: Path) -> None:
     Raises:
         OutputError: a file cannot be written.
     """
+    refuse_foreign_files(folder, (*staging.names, *TRUTH))
     scene = staging.scene
     photographs, projected = render_photographs(
         scene, staging.camera, staging.positions, staging.rotations, optics=staging.optics, seed=staging.seed
@@ -246,37 +248,29 @@ def write_photographs(staging: Staging, folder: Path) -> None:
     code = scene.targets.code
     names = [f"t{k + 1:03d}" if code[k] == UNCODED else str(code[k]) for k in range(len(code))]
     angles = np.degrees(angles_from_rotation(staging.rotations))
-    try:
-        make_folder(folder)
-        with tempfile.TemporaryDirectory(dir=folder, prefix=".part") as part:
-            for name, photograph in zip(staging.names, photographs, strict=True):
-                if not cv2.imwrite(
-                    str(Path(part) / name), photograph, [cv2.IMWRITE_JPEG_QUALITY, staging.quality]
-                ):
-                    raise OutputError(f"{folder / name}: the photograph could not be written")
-            _write_table(
-                Path(part) / "truth_points.csv",
-                ("target", "code", "X", "Y", "Z", "radius"),
-                [(n, c, *X, r) for n, c, X, r in zip(names, code, places, scene.targets.radius, strict=True)],
-            )
-            _write_table(
-                Path(part) / "truth_images.csv",
-                ("image", "X", "Y", "Z", "omega_deg", "phi_deg", "kappa_deg"),
-                [(n, *X0, *a) for n, X0, a in zip(staging.names, staging.positions, angles, strict=True)],
-            )
-            _write_table(
-                Path(part) / "truth_image_points.csv",
-                ("image", "target", "x_px", "y_px", "outline_x_px", "outline_y_px", "diameter_px"),
-                [
-                    (image, names[k], *targets.centre[k], *targets.outline_centre[k], targets.diameter[k])
-                    for image, targets in zip(staging.names, projected, strict=True)
-                    for k in np.flatnonzero(targets.visible)
-                ],
-            )
-            for file in sorted(Path(part).iterdir()):
-                os.replace(file, folder / file.name)
-    except OSError as error:
-        raise OutputError(f"{folder}: {error}") from error
+    with whole_files(folder, "the photographs") as part:
+        for name, photograph in zip(staging.names, photographs, strict=True):
+            if not cv2.imwrite(str(part / name), photograph, [cv2.IMWRITE_JPEG_QUALITY, staging.quality]):
+                raise OutputError(f"{folder / name}: the photograph could not be written")
+        _write_table(
+            part / TRUTH[0],
+            ("target", "code", "X", "Y", "Z", "radius"),
+            [(n, c, *X, r) for n, c, X, r in zip(names, code, places, scene.targets.radius, strict=True)],
+        )
+        _write_table(
+            part / TRUTH[1],
+            ("image", "X", "Y", "Z", "omega_deg", "phi_deg", "kappa_deg"),
+            [(n, *X0, *a) for n, X0, a in zip(staging.names, staging.positions, angles, strict=True)],
+        )
+        _write_table(
+            part / TRUTH[2],
+            ("image", "target", "x_px", "y_px", "outline_x_px", "outline_y_px", "diameter_px"),
+            [
+                (image, names[k], *targets.centre[k], *targets.outline_centre[k], targets.diameter[k])
+                for image, targets in zip(staging.names, projected, strict=True)
+                for k in np.flatnonzero(targets.visible)
+            ],
+        )
 
 
 def _write_table(path: Path, header: tuple[str, ...], rows: list[tuple[object, ...]]) -> None:

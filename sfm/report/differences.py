@@ -19,6 +19,14 @@ from sfm.report.numbers import finer_unit, significant
 from sfm.report.page_files import write_files
 
 COLUMNS = ("id", "dX", "dY", "dZ", "sdX", "sdY", "sdZ", "T", "significant")
+WHY_UNTESTED = {
+    "no standard deviations": "neither result knows its standard deviations",
+    "no standard deviations of common points": "the standard deviations of the common points are not known",
+    "no common datum": "without an alignment only results in the datum of control are in one frame",
+    "covariance of single points only": "the covariance between the points is not known, which a result of "
+    "this version with up to 1000 points keeps; in a minimal datum or one of control, and between different "
+    "datums, nothing can be said without",
+}
 FILES = ("differences.csv", "comparison.json", "comparison.html")
 PICTURE = (
     "Differences of the points: arrows in the object's main plane, significant ones in red; the colour of "
@@ -60,7 +68,14 @@ def differences_summary(found: ResultComparison) -> dict[str, Any]:
         "length_unit": found.unit,
         "standard_deviations": list(found.has_sigma),
         "same_image_points": or_none(found.same_share),
+        "paired": {
+            "points_by_name": found.pairing.points_by_name,
+            "points_by_image_points": found.pairing.points_by_image_points,
+            "points_by_place": found.pairing.points_by_place,
+            "images_by_name": found.pairing.images_by_name,
+        },
         "alignment": found.alignment,
+        "scale_estimated": found.scale_estimated,
         "scale": or_none(found.a_from_b.scale),
         "points": len(found.points),
         "images": len(found.images),
@@ -69,6 +84,8 @@ def differences_summary(found: ResultComparison) -> dict[str, Any]:
         "rms_position": or_none(_rms(found.position_difference)),
         "max_rotation_deg": or_none(_largest(found.rotation_deg)),
         "changed": found.changed,
+        "untested": found.untested or None,
+        "approximate": found.approximate,
         "tested": _tested(found),
         "global_test": {
             "statistic": or_none(found.global_statistic),
@@ -104,15 +121,41 @@ def words_of_test(found: ResultComparison) -> tuple[str, str]:
             f"{found.names[1]}. The differences are those of adjusters, models and datum.",
             "fair",
         )
-    if not any(found.has_sigma):
-        return "Not tested: neither result knows its standard deviations.", "fair"
-    if found.changed is None:
-        return "Not tested: the standard deviations of the common points are not known.", "fair"
+    if found.untested:
+        return f"Not tested: {WHY_UNTESTED.get(found.untested, found.untested)}.", "fair"
+    about = " Approximate: the covariance between points is not known." if found.approximate else ""
+    moved = int(found.significant.sum())
+    if not found.majority:
+        return f"The points differ significantly, and no half of them agree.{about}", "bad"
+    if moved:
+        return (
+            f"The points differ significantly: {moved} of {len(found.points)} moved.{about}",
+            "bad",
+        )
     if found.changed:
-        return f"The points differ significantly, {int(found.significant.sum())} of them singly.", "bad"
-    single = int(found.significant.sum())
-    alone = f", but {single} of them singly" if single else ""
-    return f"The points do not differ significantly as a whole{alone}.", "fair" if single else "good"
+        return f"The points differ significantly as a whole, none of them singly.{about}", "bad"
+    return f"The points do not differ significantly.{about}", "good"
+
+
+def words_of_pairing(found: ResultComparison) -> str:
+    """Return in words how many points are common and by what they were recognised."""
+    pairing = found.pairing
+    ways = [
+        (pairing.points_by_name, "by name"),
+        (pairing.points_by_image_points, "by their image points"),
+        (pairing.points_by_place, "by their place"),
+    ]
+    said = ", ".join(f"{count} {way}" for count, way in ways if count)
+    return f"{len(found.points)} common points{f' ({said})' if said else ''}"
+
+
+def words_of_scale(found: ResultComparison) -> str:
+    """Return in words what became of the scale in the alignment."""
+    if found.alignment == "none":
+        return "not aligned"
+    if not found.scale_estimated:
+        return "scale kept: both results have one"
+    return f"scale estimated, {found.a_from_b.scale:.9g}: not both results have one"
 
 
 def largest_difference(found: ResultComparison) -> str:
@@ -129,6 +172,8 @@ def differences_page(found: ResultComparison, xyz: FloatArray) -> str:
     return render(
         "comparison.html",
         headline=verdict,
+        paired=words_of_pairing(found),
+        scale=words_of_scale(found),
         level=level,
         found=found,
         size={

@@ -25,7 +25,7 @@ from types import TracebackType
 from typing import Any, Self
 
 from sfm.errors import OutputError
-from sfm.files.whole_files import make_folder, open_own
+from sfm.files.open_folders import make_folder, open_own
 from sfm.report.findings.findings import Findings
 from sfm.runtime.progress import SILENT, Progress
 

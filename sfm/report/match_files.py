@@ -53,8 +53,8 @@ def whole_outputs(out: Path | None, picture: Path | None) -> Iterator[tuple[Path
     """
     with ExitStack() as stack:
         yield (
-            None if out is None else stack.enter_context(whole_file(out)),
-            None if picture is None else stack.enter_context(whole_file(picture)),
+            None if out is None else stack.enter_context(whole_file(out, replaces=True)),
+            None if picture is None else stack.enter_context(whole_file(picture, replaces=True)),
         )
 
 

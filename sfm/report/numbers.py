@@ -7,10 +7,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from sfm.conventions import FloatArray
+from sfm.conventions import METRES, FloatArray
 
 METRIC = (("km", 1e3), ("m", 1.0), ("mm", 1e-3), ("µm", 1e-6))
 """metric units and their length in metres, largest first"""
+IMPERIAL = ("in", "ft")
 SMALL = 1e-3
 """parameters below it are written with an exponent"""
 SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
@@ -100,8 +101,8 @@ def finer_unit(unit: str, value: float) -> tuple[float, str]:
         unit: object unit of the survey; lengths in a unit that is not metric stay as they are.
         value: the largest of the lengths, in that unit.
     """
-    metres = dict((*METRIC, ("cm", 1e-2), ("dm", 1e-1))).get(unit)
-    if metres is None or not np.isfinite(value) or value <= 0:
+    metres = METRES.get(unit)
+    if metres is None or unit in IMPERIAL or not np.isfinite(value) or value <= 0:
         return 1.0, unit
     name, size = next(((n, s) for n, s in METRIC if value * metres >= s), METRIC[-1])
     return metres / size, name

@@ -8,7 +8,9 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-from sfm.files.whole_files import MANIFEST, refuse_foreign_folder, whole_folder
+from sfm.files.covariance_file import write_covariance
+from sfm.files.manifest import MANIFEST, refuse_foreign_folder
+from sfm.files.whole_files import whole_folder
 from sfm.report.figures.overlays import draw_overlays
 from sfm.report.figures.plots import all_plots
 from sfm.report.findings.findings import Findings
@@ -27,6 +29,8 @@ WRITTEN = (
     "images.csv",
     "cameras.csv",
     "image_points.csv",
+    "point_covariance.npy",
+    "left_out.csv",
     "given.csv",
     "reliability.csv",
     "variance_components.csv",
@@ -88,6 +92,9 @@ def write_result(
         timed = replace(findings, result=replace(result, seconds=(*result.seconds, report_time)))
         write_tables(timed, folder)
         write_summary(timed, folder)
+        covariance = result.with_covariance.covariance
+        if covariance is not None:
+            write_covariance(folder, covariance)
         (folder / "report.txt").write_text(text_report(timed), encoding="utf-8")
         page = report_page(timed, plots, overlays, has_model=write_colmap is not None)
         (folder / "report.html").write_text(page, encoding="utf-8")

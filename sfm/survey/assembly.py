@@ -38,9 +38,17 @@ def assemble_result(
         baseline=compared.baseline,
         photographs=measured.overlays,
         control_check=solution.control_check,
-        warnings=start.warnings + matched.warnings + solution.warnings + compared.failures,
+        warnings=measured.warnings
+        + start.warnings
+        + matched.warnings
+        + solution.warnings
+        + compared.failures,
         eccentricity=matched.eccentricity,
         no_circles=matched.no_circles,
+        left_out=(*measured.left_out, *solution.left_out),
+        free_network=solution.free_network,
+        taken_out=solution.taken_out,
+        unused_image_points=solution.unused_image_points + sum(one.image_points for one in measured.left_out),
         reject=survey.reject,
         orientation_correlations=orientation_correlations(adjustment),
         seconds=tuple(StageTime(*one) for one in clock.seconds),

@@ -33,7 +33,13 @@ def find_correspondences(survey: Survey, measured: Measurements, start: Orientat
     """
     photographs, naming = measured.photographs, measured.naming
     if photographs is None or naming is None:
-        return Correspondences(measured.network, start.estimate, measured.min_rays)
+        return Correspondences(
+            measured.network,
+            start.estimate,
+            measured.min_rays,
+            point_failures=start.point_failures,
+            given=start.kind == "given",
+        )
     naming, network, estimate = _match_and_adjust(survey, photographs, naming, start)
     circles = check_circles(survey, photographs, naming, network, estimate)
     return Correspondences(
@@ -44,6 +50,8 @@ def find_correspondences(survey: Survey, measured: Measurements, start: Orientat
         circles.eccentricity,
         circles.no_circles,
         circles.warnings,
+        start.point_failures,
+        start.kind == "given",
     )
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from itertools import combinations
 
 import numpy as np
 
@@ -12,7 +13,7 @@ from sfm.adjustment.result import Adjustment
 from sfm.conventions import BoolArray, FloatArray
 from sfm.errors import GeometryError
 from sfm.network import Estimate, Network, ObjectPoints, ScaleBars
-from sfm.result import ControlCheck
+from sfm.result import ControlCheck, TakenOut
 from sfm.similarity import Similarity, fit_similarity
 from sfm.survey.inputs.survey import Survey
 
@@ -20,6 +21,7 @@ CONTRADICTED = 0.5  # share of its rays that the test rejects, above which contr
 CLEARLY = 0.25  # of the misfit that the best choice removes: by how much more than the second it must remove
 MOST_CANDIDATES = 10  # control points and bars that are taken out in turn, those that lose most rays first
 OTHER_UNIT = 8.0  # factor between scales that no start values explain: mm, cm, m, km differ by ten or more
+WELL_APART = 10.0  # standard deviations of their distance between places that tell a scale
 MIN_CONTROL = 3  # points that a control datum needs
 
 
@@ -39,21 +41,38 @@ def object_scale(network: Network, estimate: Estimate) -> float:
 
 
 def refuse_other_units(survey: Survey, network: Network, estimate: Estimate) -> None:
-    """Raise GeometryError where the scales of control and scale bars differ by a power of ten.
+    """Raise GeometryError where scales of control, observed exterior orientation and bars differ as units do.
 
-    Both are taken from the start values, whatever frame these are in, and by medians, so that a single wrong
-    value is left to the tests.
+    All are taken from the start values, whatever frame these are in, and by medians, so that a single wrong
+    value is left to the tests. Outside of a datum of control, control and exterior orientation only check.
     """
-    bars, control = network.scale_bars, network.control
-    given = control.xyz[estimate.determined[control.point]]
-    found = estimate.points[control.point[estimate.determined[control.point]]]
-    by_bars = _scale(bars.length, estimate.points[bars.end] - estimate.points[bars.start])
-    by_control = _scale(np.linalg.norm(np.diff(given, axis=0), axis=1), np.diff(found, axis=0))
-    factor = by_control / by_bars
-    if survey.datum.kind == "control" and not (np.isnan(factor) or 1 / OTHER_UNIT < factor < OTHER_UNIT):
-        raise GeometryError(
-            f"lengths by the control are {factor:.4g} times those by the bars; are both in {survey.unit}?"
-        )
+    if survey.datum.kind != "control":
+        return
+    bars, control, exterior = network.scale_bars, network.control, network.exterior
+    known, oriented = estimate.determined[control.point], estimate.oriented[exterior.image]
+    points, centres = estimate.points[control.point], estimate.position[exterior.image]
+    scales = {
+        "control": _scale_by(control.xyz[known], control.covariance[known], points[known]),
+        "exterior orientation": _scale_by(
+            exterior.position[oriented], exterior.covariance[oriented, :3, :3], centres[oriented]
+        ),
+        "scale bars": _scale(bars.length, estimate.points[bars.end] - estimate.points[bars.start]),
+    }
+    given = [(name, scale) for name, scale in scales.items() if scale > 0]
+    for (one, first), (other, second) in combinations(given, 2):
+        if not 1 / OTHER_UNIT < first / second < OTHER_UNIT:
+            raise GeometryError(
+                f"lengths by the {one} are {first / second:.4g} times those by the {other}; are both in "
+                f"{survey.unit}?"
+            )
+
+
+def _scale_by(given: FloatArray, covariance: FloatArray, found: FloatArray) -> float:
+    """Return the scale between places, one after the other; those that are not well apart say nothing."""
+    length = np.linalg.norm(np.diff(given, axis=0), axis=1)
+    variance = np.einsum("nii->n", covariance)
+    apart = length**2 > WELL_APART**2 * (variance[1:] + variance[:-1])
+    return _scale(length[apart], np.diff(found, axis=0)[apart])
 
 
 def _scale(length: FloatArray, difference: FloatArray) -> float:
@@ -68,7 +87,10 @@ def scale_to_bars(network: Network, estimate: Estimate, datum: Datum) -> Estimat
     if datum.kind == "control":
         return estimate
     scale = object_scale(network, estimate)
-    return Similarity(scale, np.eye(3), np.zeros(3)).apply_estimate(estimate) if scale > 0 else estimate
+    if not scale > 0:
+        return estimate
+    centre = np.nanmean(estimate.points, axis=0)
+    return Similarity(scale, np.eye(3), (1 - scale) * centre).apply_estimate(estimate)
 
 
 def place_on_control(network: Network, estimate: Estimate) -> tuple[Estimate, ControlCheck]:
@@ -82,6 +104,35 @@ def place_on_control(network: Network, estimate: Estimate) -> tuple[Estimate, Co
     return placing.apply_estimate(estimate), ControlCheck(names, placing.apply(points) - control.xyz, scale)
 
 
+def place_on_frame(
+    network: Network, estimate: Estimate, frame: Estimate, carriers: BoolArray | None
+) -> Estimate:
+    """Place an adjusted free network on the coordinates that its inner constraints refer to.
+
+    The similarity of least squares over the datum points meets the inner constraints exactly, however
+    far the network moved in between: the sum of the differences and their turning and scaling moments are 0.
+    Scale bars keep the scale, and so do two control points.
+
+    Args:
+        network: what was adjusted, in a free datum.
+        estimate: adjusted.
+        frame: coordinates to refer to, NaN where there are none; with fewer than three points those of
+            the projection centres count.
+        carriers: points that carry the datum, all if None, (n,).
+    """
+    on = frame.determined if carriers is None else frame.determined & carriers
+    source, target = estimate.points[on], frame.points[on]
+    if on.sum() < MIN_CONTROL:
+        both = frame.oriented & estimate.oriented
+        source, target = estimate.position[both], frame.position[both]
+    keep = len(network.scale_bars) > 0 or len(network.control) == MIN_CONTROL - 1
+    scale = object_scale(network, estimate) if len(network.control) and not len(network.scale_bars) else 1.0
+    try:
+        return fit_similarity(source, target, scale=scale if keep else None).apply_estimate(estimate)
+    except GeometryError:  # too few of them, or on a line: the adjustment has kept what they say
+        return estimate
+
+
 @dataclass(frozen=True)
 class Contradiction:
     """Control or a scale bar that most rays of a point contradict."""
@@ -89,6 +140,7 @@ class Contradiction:
     freed: Network | None  # without the one to blame; None where it cannot be told
     protected: BoolArray  # points whose rays the test would sacrifice: all of control and bars, (n,)
     line: str  # in words
+    taken_out: TakenOut | None = None  # the one to blame
 
 
 def find_contradiction(
@@ -135,9 +187,11 @@ def find_contradiction(
         what = " and ".join(
             name for name, some in (("control points", len(held)), ("scale bars", len(ends))) if some
         )
+        near = [k for k in order if misfit[k] - best.vPv < CLEARLY * (total - best.vPv)]
+        names = ", ".join(suspects[k].name for k in near)
         line = (
-            f"the {what} contradict one another, and which one is wrong cannot be told; all were kept, and "
-            "none of their image points was tested"
+            f"the {what} contradict one another, and which one is wrong cannot be told ({names}); all were "
+            "kept, and none of their image points was tested"
         )
         known = {part.points[j] for j in np.flatnonzero(carriers)}
         return Contradiction(None, np.array([name in known for name in network.points]), line)
@@ -146,6 +200,7 @@ def find_contradiction(
         blamed.without(network),
         np.zeros(len(network.points), dtype=bool),
         blamed.line(best.estimate.points, unit),
+        TakenOut(blamed.name, blamed.relative(best.estimate.points), resolved=True),
     )
 
 
@@ -169,16 +224,29 @@ class _Suspect:
         left = ScaleBars(bars.start[keep], bars.end[keep], bars.length[keep], bars.sigma[keep])
         return replace(network, scale_bars=left)
 
+    @property
+    def name(self) -> str:
+        """What it is called."""
+        one = len(self.names) == 1
+        return f"control point {self.names[0]}" if one else f"scale bar {self.names[0]} - {self.names[1]}"
+
+    def relative(self, X: FloatArray) -> float:
+        """Return by how much it is off from adjusted points, (n, 3), over the object or its own length."""
+        at = X[list(self.indices)]
+        if len(at) == 1:
+            return float(np.linalg.norm(at[0] - self.given) / np.linalg.norm(np.ptp(X, axis=0)))
+        return float(abs(np.linalg.norm(at[1] - at[0]) / self.given[0] - 1))
+
     def line(self, X: FloatArray, unit: str) -> str:
         """Return in words by how much it is off from the adjusted object points, object unit, (n, 3)."""
         at = X[list(self.indices)]
         if len(at) == 1:
-            name, treated = f"control point {self.names[0]}", "it was adjusted as a new point"
+            treated = "it was adjusted as a new point"
             by = f"{np.linalg.norm(at[0] - self.given):.3g}"
         else:
-            name, treated = f"scale bar {self.names[0]} - {self.names[1]}", "it was taken out"
+            treated = "it was taken out"
             by = f"{self.given[0] - np.linalg.norm(at[1] - at[0]):+.3g}"
-        return f"{name} does not fit: by the others and the photographs it is {by} {unit} off; {treated}"
+        return f"{self.name} does not fit: by the others and the photographs it is {by} {unit} off; {treated}"
 
 
 def _suspect_control(part: Network, held: FloatArray) -> Iterator[_Suspect]:
@@ -210,11 +278,12 @@ def _suspect_bars(part: Network, ends: FloatArray, *, alone: bool) -> Iterator[_
 
 
 def _readjusted(readjust: Callable[[Network], Adjustment], network: Network) -> Adjustment | None:
-    """Return the adjustment of a network, None where it holds too little."""
+    """Return the adjustment of a network, None where it holds too little or is no evidence."""
     try:
-        return readjust(network)
+        adjustment = readjust(network)
     except GeometryError:
         return None
+    return adjustment if adjustment.converged else None
 
 
 def lost_share(adjustment: Adjustment) -> FloatArray:

@@ -40,7 +40,10 @@ def orient_survey(survey: Survey, measured: Measurements) -> Orientation:
     network = measured.network
     estimate = start_values(survey, network, measured.cameras)
     try:
-        found = _orient_strongest(network, estimate) if survey.tie_points else _orient(network, estimate)
+        if survey.tie_points:
+            found = _orient_strongest(network, estimate)
+        else:  # given image points are adjusted as they are, and judged by the adjustment
+            found = _orient(network, estimate, contradicting=survey.observations is not None)
     except GeometryError as error:
         if measured.photographs is not None and _most_in_common(network) < MIN_POINTS:
             raise GeometryError(_codes_found(survey, measured.photographs)) from error
@@ -50,9 +53,9 @@ def orient_survey(survey: Survey, measured: Measurements) -> Orientation:
     return replace(found, warnings=tuple(f"[approximate]: {line}" for line in found.warnings))
 
 
-def _orient(network: Network, estimate: Estimate) -> Orientation:
+def _orient(network: Network, estimate: Estimate, *, contradicting: bool = False) -> Orientation:
     """Orient all photographs on all points."""
-    return orient(network, estimate, refine=refine)
+    return orient(network, estimate, refine=refine, contradicting=contradicting)
 
 
 def _orient_strongest(network: Network, estimate: Estimate) -> Orientation:
@@ -78,7 +81,7 @@ def _orient_strongest(network: Network, estimate: Estimate) -> Orientation:
         n_points=len(network.points),
         tolerance=float(found.tolerance_px.max()) / c,
     )
-    return replace(found, estimate=replace(estimate, points=rays.points))
+    return replace(found, estimate=replace(estimate, points=rays.points), point_failures=())
 
 
 def _strongest(network: Network) -> BoolArray:

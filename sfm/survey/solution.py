@@ -14,26 +14,33 @@ from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.errors import GeometryError
-from sfm.network import Estimate, Network
+from sfm.network import Estimate, ExteriorObservations, Network, ObjectPoints, ScaleBars
+from sfm.orientation.ray_angles import ray_angles
 from sfm.reduced_network import reduce_network, supported
-from sfm.result import ControlCheck, Eccentricity
+from sfm.result import ControlCheck, Eccentricity, FreeNetwork, LeftOutPoint, TakenOut
 from sfm.survey.datum_definition import (
     Contradiction,
     datum_warnings,
     find_contradiction,
     place_on_control,
+    place_on_frame,
     refuse_other_units,
     scale_to_bars,
 )
 from sfm.survey.exterior import add_exterior
 from sfm.survey.inputs.interior import split_cameras, without_idle_cameras
+from sfm.survey.inputs.start import given_values
 from sfm.survey.inputs.survey import Survey
+from sfm.survey.left_out import datum_carriers, left_out_points, unused_image_points, words_of_left_out
 from sfm.survey.measuring.measurements import Naming
+from sfm.survey.scale_check import check_scales
 
 TOLERANCE_FACTOR = 6.0  # of the robust spread of the residuals
 FALSE_ALARM = 0.05  # chance that a survey without any outlier loses an image coordinate; Pope (1976)
 MIN_IMAGE_POINTS = 4  # of a photograph in the final adjustment: three determine it, the fourth checks
+GIVEN_IMAGE_POINTS = 3  # of one whose given orientation tells which of the four solutions is meant
 MIN_DATUM_POINTS = 3  # that fix position, attitude and scale
+CARRYING_DEG = 2.0  # largest angle between two rays of a point below which it carries no free datum
 MOST_NAMES = 10  # points named in one line
 
 
@@ -48,6 +55,8 @@ class Correspondences:
     eccentricity: Eccentricity | None = None  # what was corrected; None where nothing was
     no_circles: tuple[str, ...] = ()  # uncoded points left out: their outlines are not images of one circle
     warnings: tuple[str, ...] = ()  # one line each
+    point_failures: tuple[tuple[str, str], ...] = ()  # points without approximate values, with the reason
+    given: bool = False  # whether the survey's own approximate values were what the orientation started from
 
 
 @dataclass(frozen=True)
@@ -58,6 +67,10 @@ class Solution:
     control_check: ControlCheck | None  # None without control or where the datum is control
     dropped_images: tuple[tuple[str, str], ...]  # photographs that lost their points, with the reason
     warnings: tuple[str, ...]  # one line each
+    left_out: tuple[LeftOutPoint, ...]  # measured points that are not in it
+    unused_image_points: int  # of points and photographs that are not in it
+    taken_out: tuple[TakenOut, ...]  # control and scale bars that do not fit
+    free_network: FreeNetwork | None  # of the image points alone; None where nothing else took part
 
 
 def refine(network: Network, estimate: Estimate) -> Estimate:
@@ -85,17 +98,25 @@ def solve_survey(survey: Survey, matched: Correspondences) -> Solution:
     if datum.kind == "control" and len(network.control) == len(network.exterior) == 0:
         raise GeometryError("datum 'control', but no control point was measured")
     refuse_other_units(survey, network, estimate)
+    scales = check_scales(network, estimate, held=datum.kind == "control")
+    network = scales.network
     needed = matched.min_rays.copy()
     if datum.kind == "control":
         needed[network.control.point] = 1
-    known = tuple(name for name, is_in in zip(network.points, estimate.determined, strict=True) if is_in)
-    single = tuple(network.points[j] for j in np.flatnonzero((network.rays() == 1) & (needed > 1)))
+    whole, known = placed.network, estimate.determined
     oriented = estimate.oriented
+    if datum.kind == "minimal" and matched.given:  # what it holds are the given coordinates
+        given = given_values(survey, network)
+        held = np.where(given.determined[:, None], given.points, estimate.points)
+        estimate = replace(estimate, points=np.where(estimate.determined[:, None], held, np.nan))
     estimate = scale_to_bars(network, estimate, datum)
-    network, estimate = split_cameras(survey.cameras, network, estimate)
-    task = _Task(survey, datum, network, needed, survey.reject)
+    frame = given_values(survey, network) if matched.given else estimate
+    network, estimate = split_cameras(survey.cameras, network, estimate, survey.start_cameras)
+    least = np.where(given_values(survey, network).oriented, GIVEN_IMAGE_POINTS, MIN_IMAGE_POINTS)
+    task = _Task(survey, datum, network, needed, least, survey.reject)
+    every = np.ones(len(network.image_points), dtype=bool)
     iterations = 0
-    contradictions: list[str] = []
+    contradictions, taken_out = list(scales.lines), list(scales.taken_out)
     while True:
         settled = _settle(task, estimate)
         iterations += settled.iterations
@@ -104,20 +125,68 @@ def solve_survey(survey: Survey, matched: Correspondences) -> Solution:
             last, check = settled.estimate, None
             if datum.kind != "control" and len(settled.part.control) >= 3:
                 last, check = place_on_control(settled.part, last)
+            elif datum.kind == "free":
+                carriers = _on_points(survey, settled.part, last, datum).resolve(settled.part).points
+                part_of_frame = reduce_network(network, frame, settled.images, settled.points, every)[1]
+                last = place_on_frame(settled.part, last, part_of_frame, carriers)
             final = _final(task, settled.part, last)
             found = _contradiction(task, final)
         if found is None:
             break
         contradictions.append(found.line)
+        taken_out += [] if found.taken_out is None else [found.taken_out]
         task = _resolved(task, found, settled.accepted)
     dropped = tuple(
-        (name, f"fewer than {MIN_IMAGE_POINTS} accepted image points of the network")
-        for name, was, is_in in zip(network.images, oriented, settled.images, strict=True)
+        (name, f"fewer than {fewest} accepted image points of the network")
+        for name, was, is_in, fewest in zip(network.images, oriented, settled.images, least, strict=True)
         if was and not is_in
     )
     final = replace(final, iterations=iterations + final.iterations)
-    warnings = (*placed.warnings, *contradictions, *_warnings(survey, known, single, final))
-    return Solution(final, check, dropped, warnings)
+    left_out = left_out_points(
+        whole,
+        final.network.points,
+        reasons=matched.point_failures,
+        accepted_rays=settled.rays,
+        needed=needed,
+    )
+    # natural texture has points in plenty, of which only those that were lost on the way are worth a line
+    told = left_out if survey.tie_points is None else _among(left_out, whole, known)
+    warnings = (*placed.warnings, *contradictions, *_warnings(survey, told, len(whole.points), final))
+    in_result = np.isin(whole.points, final.network.points)
+    unused = unused_image_points(whole, settled.images, in_result)
+    if len(whole.scale_bars) and not len(final.network.scale_bars) and datum.kind == "control":
+        # every bar is against the control: nothing says which of the two is right
+        taken_out = [replace(one, resolved=False) for one in taken_out]
+    alone = _free_network(task, final)
+    return Solution(final, check, dropped, warnings, left_out, unused, tuple(taken_out), alone)
+
+
+def _free_network(task: _Task, final: Adjustment) -> FreeNetwork | None:
+    """Adjust the accepted image points of an adjustment alone, with the same weights."""
+    network, accepted = final.network, ~final.rejected
+    held = (len(network.control) + len(network.exterior)) if task.datum.kind == "control" else 0
+    if not final.converged or not (held or len(network.scale_bars)):
+        return None
+    alone = replace(
+        network,
+        image_points=network.image_points.select(accepted),
+        control=ObjectPoints(),
+        scale_bars=ScaleBars(),
+        exterior=ExteriorObservations(),
+    )
+    factor = final.image_sigma_factor[accepted]
+    try:
+        free = adjust(alone, final.estimate, image_sigma_factor=factor, reject="none", covariance=False)
+    except GeometryError:
+        return None
+    sound = free.converged and not free.undetermined
+    return FreeNetwork(free.estimate.points, free.vPv, free.redundancy) if sound else None
+
+
+def _among(left_out: tuple[LeftOutPoint, ...], whole: Network, known: BoolArray) -> tuple[LeftOutPoint, ...]:
+    """Return those of the points that had approximate values."""
+    names = {name for name, is_in in zip(whole.points, known, strict=True) if is_in}
+    return tuple(one for one in left_out if one.point in names)
 
 
 @dataclass(frozen=True)
@@ -128,6 +197,7 @@ class _Task:
     datum: Datum
     network: Network
     needed: IntArray  # rays that each point needs to stay, (n,)
+    least: IntArray  # image points that each photograph needs to stay, (m,)
     reject: str  # how gross errors are treated
 
 
@@ -138,16 +208,19 @@ class _Settled:
     part: Network  # what was adjusted
     estimate: Estimate  # of it
     images: BoolArray  # photographs in it, (m,)
+    points: BoolArray  # points in it, (n,)
     accepted: BoolArray  # image points of the whole network, (k,)
     contradiction: Contradiction | None
     iterations: int  # of all adjustments on the way
+    rays: IntArray  # accepted rays of each point, of those that left when they left, (n,)
 
 
 def _settle(task: _Task, estimate: Estimate) -> _Settled:
     """Adjust until the points and photographs that are left stay, or control or a bar is contradicted."""
     network, iterations = task.network, 0
     accepted = np.ones(len(network.image_points), dtype=bool)
-    images, points = determined(network, estimate, accepted, task.needed)
+    rays = network.rays()
+    images, points = determined(network, estimate, accepted, task.needed, task.least)
     while True:
         part, start = reduce_network(network, estimate, images, points, np.ones_like(accepted))
         adjustment = _tested(task, part, start, covariance=False)
@@ -155,9 +228,11 @@ def _settle(task: _Task, estimate: Estimate) -> _Settled:
         found = _contradiction(task, adjustment)
         estimate = merge_estimate(estimate, adjustment.estimate, images, points)
         accepted = _accepted(network, adjustment, images, points)
-        left_images, left_points = determined(network, estimate, accepted, task.needed)
+        now = np.bincount(network.image_points.point[accepted], minlength=len(points))
+        rays = np.where(points, now, rays)
+        left_images, left_points = determined(network, estimate, accepted, task.needed, task.least)
         if found is not None or ((left_images == images).all() and (left_points == points).all()):
-            return _Settled(part, adjustment.estimate, images, accepted, found, iterations)
+            return _Settled(part, adjustment.estimate, images, points, accepted, found, iterations, rays)
         images, points = left_images, left_points
 
 
@@ -212,7 +287,7 @@ def _tested(
     return adjust(
         network,
         estimate,
-        datum=_on_points(task.survey, network, task.datum),
+        datum=_on_points(task.survey, network, estimate, task.datum),
         sigma_px=task.survey.adjust.sigma_px,
         image_sigma_factor=factor,
         reject=task.reject,
@@ -221,15 +296,18 @@ def _tested(
     )
 
 
-def _on_points(survey: Survey, network: Network, datum: Datum) -> Datum:
-    """Return the datum on the points that the survey names, on all if it names none.
+def _on_points(survey: Survey, network: Network, estimate: Estimate, datum: Datum) -> Datum:
+    """Return the datum on the points that the survey names, else on all but those at very small angles.
 
     Raises:
-        GeometryError: fewer than three of them are in the network.
+        GeometryError: fewer than three of the named ones are in the network.
     """
     named = survey.datum.points
-    if not named:
+    if not named and datum.kind == "control":
         return datum
+    if not named:
+        angles = ray_angles(network, estimate, np.ones(len(network.image_points), dtype=bool))
+        return replace(datum, points=datum_carriers(angles, CARRYING_DEG))
     on = np.isin(network.points, named)
     if on.sum() < MIN_DATUM_POINTS:
         raise GeometryError(
@@ -257,14 +335,18 @@ def _weighed(adjust_part: Callable[[FloatArray], Adjustment], count: int) -> Adj
 
 
 def determined(
-    network: Network, estimate: Estimate, accepted: BoolArray, min_rays: IntArray
+    network: Network,
+    estimate: Estimate,
+    accepted: BoolArray,
+    min_rays: IntArray,
+    min_points: int | IntArray = MIN_IMAGE_POINTS,
 ) -> tuple[BoolArray, BoolArray]:
     """Return the photographs (m,) and points (n,) that accepted image points determine.
 
     Raises:
         GeometryError: fewer than two photographs are left.
     """
-    images, points = supported(network, estimate, accepted, min_points=MIN_IMAGE_POINTS, min_rays=min_rays)
+    images, points = supported(network, estimate, accepted, min_points=min_points, min_rays=min_rays)
     if images.sum() < 2:
         raise GeometryError(
             f"{images.sum()} of {len(images)} photographs see at least {MIN_IMAGE_POINTS} points of the "
@@ -291,7 +373,7 @@ def _accepted(network: Network, adjustment: Adjustment, images: BoolArray, point
 
 
 def _warnings(
-    survey: Survey, known: tuple[str, ...], single: tuple[str, ...], adjustment: Adjustment
+    survey: Survey, left_out: tuple[LeftOutPoint, ...], measured: int, adjustment: Adjustment
 ) -> tuple[str, ...]:
     """Return what a person must know beyond the numbers."""
     lines = list(adjustment.remarks)
@@ -299,13 +381,8 @@ def _warnings(
         lines.append(f"the adjustment did NOT converge within {adjustment.iterations} iterations")
     if adjustment.undetermined:
         lines.append(f"not determined by the observations: {', '.join(adjustment.undetermined)}")
-    gone = [name for name in known if name not in set(adjustment.network.points)]
-    if gone:
-        shown = ", ".join(gone[:MOST_NAMES]) + (" ..." if len(gone) > MOST_NAMES else "")
-        lines.append(f"{len(gone)} points left out, too few of their image points were accepted: {shown}")
-    if single:
-        shown = "; ".join(f"point {name}: 1 ray, 2 are needed" for name in single[:MOST_NAMES])
-        lines.append(shown + (f"; and {len(single) - MOST_NAMES} more" if len(single) > MOST_NAMES else ""))
+    if left_out:
+        lines.append(words_of_left_out(left_out, measured))
     absent = [name for name in survey.datum.points if name not in set(adjustment.network.points)]
     if absent:
         lines.append(f"datum points that are not in the network: {', '.join(absent[:MOST_NAMES])}")

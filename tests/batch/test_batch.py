@@ -29,7 +29,8 @@ from sfm.batch.pages import render_index
 from sfm.batch.run import calls_of, find_surveys, run_batch
 from sfm.errors import BackendError, KolinearError, OutputError, SurveyFileError
 from sfm.files.folder_lock import Owner, locked
-from sfm.files.whole_files import MANIFEST, sha256_of, write_manifest
+from sfm.files.manifest import MANIFEST, sha256_of
+from sfm.files.whole_files import write_manifest
 from sfm.report.log import read_log
 from sfm.runtime.executor import Call, Done, Lost, Work
 from tests.engines import ALONE, HERE, KILLER, Notes, points_of, raise_unforeseen, return_nothing
@@ -255,10 +256,10 @@ def test_a_page_that_no_batch_has_written_is_left_alone(surveys: tuple[Path, ...
     with pytest.raises(OutputError, match=r"a\\xff: the path is no plain text; needed another --out"):
         run_batch(surveys, tmp_path / os.fsdecode(b"a\xff"), HERE, ALONE, Notes())
     (tmp_path / "index.html").write_text("my own", encoding="utf-8")
-    with pytest.raises(OutputError, match=r"holds 'index.html', which no batch has written"):
+    with pytest.raises(OutputError, match=r"holds 'index.html'; which would be replaced"):
         run_batch(surveys, tmp_path, HERE, ALONE, Notes())
     (tmp_path / "batch.json").write_text("[]", encoding="utf-8")
-    with pytest.raises(OutputError, match="which no batch has written"):
+    with pytest.raises(OutputError, match=r"holds 'batch.json'; 'index.html'; which would"):
         run_batch(surveys, tmp_path, HERE, ALONE, Notes())
     assert sorted(path.name for path in tmp_path.iterdir()) == ["batch.json", "index.html"]
 

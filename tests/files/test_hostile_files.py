@@ -14,7 +14,7 @@ import pytest
 
 from adapters.colmap.camera_models import read_model, write_model
 from adapters.colmap.database import read_database, write_database
-from adapters.formats.metashape import read_metashape
+from adapters.formats.metashape import read_metashape, write_metashape
 from adapters.formats.ply import read_ply
 from adapters.formats.registry import read_any
 from sfm.batch.run import find_surveys
@@ -52,17 +52,39 @@ def attributes(count: int) -> str:
             "<document><!--" + "x" * 20_000_000 + "--></document>",
             r"a tag or comment of more than 1000000 bytes",
         ),
-        ("<document>" + "<a/>" * 1_000_000 + "</document>", r"more than 500000 elements, no more are read"),
+        ("<document>" + "<a/>" * 100_000 + "</document>", r"takes more than 10000000 bytes of memory"),
         ('<!DOCTYPE a [<!ENTITY b "c">]><document>&b;</document>', r"a document type is not allowed here"),
     ],
     ids=["newlines", "attributes", "some-attributes", "comment", "elements", "entities"],
 )
-def test_large_xml_is_read_in_time_that_grows_with_it(tmp_path: Path, text: str, match: str) -> None:
+def test_large_xml_is_read_in_time_that_grows_with_it(
+    tmp_path: Path, text: str, match: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("adapters.formats.xml_lines.MAX_KEPT_BYTES", 10_000_000)
     (tmp_path / "a.xml").write_text(text, encoding="utf-8")
     begun = time.process_time()
     with pytest.raises(SurveyFileError, match=match):
         read_metashape(tmp_path / "a.xml")
     assert time.process_time() - begun < SECONDS
+
+
+def test_image_points_of_an_export_take_memory_only_as_numbers(tmp_path: Path) -> None:
+    """More of them than its elements could take."""
+    network, truth = make_network(seed_of("many"), images=3, points=8, model="opencv")
+    write_metashape(tmp_path / "a.xml", network, truth)
+    text = (tmp_path / "a.xml").read_text()
+    marker = '<marker marker_id="0">'
+    found = text.partition(marker)[2].partition("<location ")[2].partition("/>")[0]
+    often = f"{marker}<location {found}/></marker>"
+    more = f'<frame id="1"><markers>{often * 20_000}</markers></frame></frames>'
+    (tmp_path / "a.xml").write_text(text.replace("</frames>", more))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("adapters.formats.xml_lines.MAX_KEPT_BYTES", 1_000_000)
+        again, _ = read_metashape(tmp_path / "a.xml")
+    assert len(again.image_points) == len(network.image_points)  # those of the first frame
+    (tmp_path / "a.xml").write_text(text.replace(marker, often * 20_000 + marker))
+    with pytest.raises(SurveyFileError, match="a marker stands twice in one camera"):
+        read_metashape(tmp_path / "a.xml")
 
 
 def test_hidden_characters_in_labels_are_refused(tmp_path: Path) -> None:
@@ -244,7 +266,7 @@ def test_refine_stays_in_its_folder(tmp_path: Path, name: str) -> None:
         ("a.txt", "1 1 1\n" + "1 " * 6_000_000, "bal", r"line 2: more than 10000000 characters"),
         (
             "a.txt",
-            "2 10 0 0\n1 0 0 0 0 0 0\n2 0 0 0 0 0 0\n9000000\n",
+            "2 10 0 0\n1 0 0 0 0 0 0\n2 0 0 0 0 0 0\n11000000\n",
             "bundle-csharp",
             r"image points, no",
         ),
@@ -315,10 +337,10 @@ def write_survey(folder: Path, images: list[str], datum: str = "") -> Path:
 
 
 def test_very_many_photographs_are_refused(tmp_path: Path) -> None:
-    path = write_survey(tmp_path, [f"i{k}" for k in range(20_000)])
+    path = write_survey(tmp_path, [f"i{k}" for k in range(20_001)])
     begun = time.process_time()
     with pytest.raises(
-        SurveyFileError, match=r"obs\.csv: 20000 photographs, at most 5000 are adjusted together"
+        SurveyFileError, match=r"obs\.csv: 20001 photographs, at most 20000 are adjusted together"
     ):
         measurements_from_observations(read_survey(path))
     assert time.process_time() - begun < SECONDS
@@ -333,26 +355,52 @@ def test_pixels_that_no_sensor_has_are_refused(tmp_path: Path, pixel: str) -> No
         measurements_from_observations(read_survey(path))
 
 
-def test_control_and_bars_of_different_units_are_refused(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("given", "told"),
+    [
+        (
+            ("control", "bars"),
+            r"lengths by the control are (1000|999|1001)[.0-9]* times those by the scale bars",
+        ),
+        (
+            ("exterior", "bars"),
+            r"lengths by the exterior orientation are (99\d|1000)[.0-9]* times those by the scale",
+        ),
+        (
+            ("small control", "exterior"),
+            r"lengths by the control are 0\.00[01]\d* times those by the exterior o",
+        ),
+    ],
+)
+def test_lengths_of_different_units_are_refused(given: tuple[str, ...], told: str, tmp_path: Path) -> None:
+    """Of those that hold the datum; such an adjustment took minutes, or did not converge."""
     network, truth = make_network(seed_of("units"), images=8, points=40)
     seen, xyz, camera = network.image_points, truth.points, truth.cameras[0]
     rows = zip(seen.image, seen.point, seen.xy, strict=True)
     points = "".join(f"{network.images[i]},{network.points[j]},{x},{y}\n" for i, j, (x, y) in rows)
-    control = "".join(f"{network.points[j]},{','.join(map(str, 1000 * xyz[j]))},1,1,1\n" for j in range(8))
-    bars = "".join(
-        f'[[scale_bar]]\nfrom = "{network.points[j]}"\nto = "{network.points[j + 1]}"\n'
-        f"length = {np.linalg.norm(xyz[j] - xyz[j + 1])}\nsigma = 0.001\n"
-        for j in range(10, 14)
-    )
-    path = write_survey(tmp_path, [], f'[datum]\nkind = "control"\n[control]\nfile = "control.csv"\n{bars}')
+    more = '[datum]\nkind = "control"\n'
+    if given[0].endswith("control"):
+        scale = 1000 if given[0] == "control" else 1
+        given_control = ((network.points[j], *scale * xyz[j], *[scale * 1e-3] * 3) for j in range(8))
+        control = "".join(",".join(map(str, row)) + "\n" for row in given_control)
+        (tmp_path / "control.csv").write_text("id,X,Y,Z,sX,sY,sZ\n" + control)
+        more += '[control]\nfile = "control.csv"\n'
+    if "exterior" in given:
+        centres = zip(network.images, 1000 * truth.position, strict=True)
+        exterior = "".join(f"{name},{','.join(map(str, X))},1,1,1\n" for name, X in centres)
+        (tmp_path / "exterior.csv").write_text("image,X,Y,Z,sX,sY,sZ\n" + exterior)
+        more += '[exterior]\nfile = "exterior.csv"\n'
+    if "bars" in given:
+        more += "".join(
+            f'[[scale_bar]]\nfrom = "{network.points[j]}"\nto = "{network.points[j + 1]}"\n'
+            f"length = {np.linalg.norm(xyz[j] - xyz[j + 1])}\nsigma = 0.001\n"
+            for j in range(10, 14)
+        )
+    path = write_survey(tmp_path, [], more)
     (tmp_path / "obs.csv").write_text("image,point,x_px,y_px\n" + points)
-    (tmp_path / "control.csv").write_text("id,X,Y,Z,sX,sY,sZ\n" + control)
     text = path.read_text().replace("10.0", f"{camera.value('c')}")
     path.write_text(text.replace("[2000, 1500]", str(list(camera.size_px))))
-    with pytest.raises(
-        GeometryError,
-        match=r"lengths by the control are (1000|999|1001)[.0-9]* times those by the bars; are both in m",
-    ):
+    with pytest.raises(GeometryError, match=told + r".*; are both in m"):
         run_survey(read_survey(path))
 
 

@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+import os
+import tempfile
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
 
 from sfm.errors import BackendError, OutputError
-from sfm.files.whole_files import refuse_full, whole_file, whole_folder
+from sfm.files import open_folders
+from sfm.files.whole_files import refuse_full, whole_file, whole_files, whole_folder
+
+NOBODY = 65534  # a user of no rights
 
 
 def test_a_folder_takes_the_place_of_an_earlier_one_when_it_is_finished(tmp_path: Path) -> None:
@@ -20,6 +26,74 @@ def test_a_folder_takes_the_place_of_an_earlier_one_when_it_is_finished(tmp_path
             assert not out.exists() or (out / "inner" / "file").read_text() == "old"
     assert (out / "inner" / "file").read_text() == "new"
     assert list(out.parent.iterdir()) == [out]
+
+
+@pytest.fixture(params=[True, False], ids=["handles", "paths"])
+def handles(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> bool:
+    """Whether files are opened in open folders, or by their paths as on Windows."""
+    has = bool(request.param) and open_folders.HAS_HANDLES
+    monkeypatch.setattr(open_folders, "HAS_HANDLES", has)
+    return has
+
+
+def test_files_and_folders_are_written_with_and_without_handles(handles: bool, tmp_path: Path) -> None:
+    for text in ("old", "new"):
+        with whole_folder(tmp_path / "a" / "out", replaceable=True) as folder:
+            (folder / "file").write_text(text)
+        with whole_files(tmp_path / "b" / "out") as folder:
+            (folder / "file").write_text(text)
+        with whole_file(tmp_path / "c" / "file", replaces=True) as part:
+            part.write_text(text)
+        for path in ("a/out/file", "b/out/file", "c/file"):
+            assert (tmp_path / path).read_text() == text
+    assert sorted(path.name for path in tmp_path.glob("*/*")) == ["file", "out", "out"]
+    with pytest.raises(OutputError, match="file: is there already"), whole_file(tmp_path / "c" / "file"):
+        raise AssertionError
+    (tmp_path / "link").symlink_to(tmp_path / "a")
+    for whole in (whole_folder, whole_files, whole_file):
+        with pytest.raises(OutputError, match="'link' is a link to"), whole(tmp_path / "link" / "x"):
+            raise AssertionError
+
+
+@pytest.mark.skipif(not hasattr(os, "O_PATH") or os.geteuid() != 0, reason="Linux, and root as who tests")
+def test_a_folder_that_one_may_pass_but_not_list_is_passed() -> None:
+    """As /home often is."""
+    with tempfile.TemporaryDirectory() as name:
+        (Path(name) / "own").mkdir()
+        (Path(name) / "own").chmod(0o777)
+        Path(name).chmod(0o711)
+        os.seteuid(NOBODY)
+        try:
+            with whole_file(Path(name) / "own" / "file") as part:
+                part.write_text("data")
+        finally:
+            os.seteuid(0)
+        assert (Path(name) / "own" / "file").read_text() == "data"
+
+
+@pytest.mark.skipif(not open_folders.HAS_HANDLES, reason="the system opens no files in open folders")
+@pytest.mark.parametrize("whole", [whole_folder, whole_files, whole_file])
+def test_a_link_that_is_laid_meanwhile_is_not_followed(whole, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
+    """The folder is exchanged for a link to the user's own, after it was checked."""
+    home, out = tmp_path / "home", tmp_path / "given" / "sub" / "out"
+    home.mkdir()
+    with suppress(OutputError), whole(out) as part:
+        (part if part.is_dir() else part.parent).joinpath("out").write_text("data")
+        out.parent.rename(tmp_path / "given" / "old")
+        out.parent.symlink_to(home)
+    assert list(home.iterdir()) == []
+
+
+@pytest.mark.skipif(not open_folders.HAS_HANDLES, reason="the system opens no files in open folders")
+def test_a_part_that_is_exchanged_meanwhile_is_not_moved(tmp_path: Path) -> None:
+    out = tmp_path / "given" / "file"
+    (tmp_path / "home").mkdir()
+    (tmp_path / "home" / "file").write_text("of the user")
+    with pytest.raises(OutputError, match="was exchanged while it was written"), whole_file(out) as part:
+        part.parent.rename(tmp_path / "given" / "other")
+        part.parent.symlink_to(tmp_path / "home")
+    assert (tmp_path / "home" / "file").read_text() == "of the user"
+    assert not out.exists()
 
 
 def test_a_file_leaves_nothing_beside_it(tmp_path: Path) -> None:
@@ -43,7 +117,7 @@ def test_failures_leave_nothing_and_speak_of_the_place_asked_for(whole, tmp_path
     assert not list(tmp_path.iterdir())
     (tmp_path / "file").touch()
     with (
-        pytest.raises(OutputError, match="x: the model cannot be written here: "),
+        pytest.raises(OutputError, match=r"x: (the model )?cannot be written here: "),
         whole(tmp_path / "file" / "x", "the model"),
     ):
         raise AssertionError

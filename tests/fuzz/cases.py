@@ -256,17 +256,18 @@ def _reader_of(name: str, form: str) -> Callable[[Path, random.Random], None]:
     return lambda folder, _: _drop(read_any(folder / name, form))
 
 
-def run_case(seed: Seed, folder: Path, rng: random.Random) -> str:
-    """Read one mutated file; return "" or what went wrong. The good file is put back."""
-    path = folder / seed.name
+def mutated(seed: Seed, rng: random.Random) -> bytes:
+    """Return the content of a file with something wrong."""
     if isinstance(seed.content, bytes):
-        good = seed.content
-        data = mutate_bytes(rng, good)
-    else:
-        good = seed.content.encode()
-        data = mutate_text(rng, seed.content).encode("utf-8", "surrogatepass")
-        if rng.random() < 0.1:
-            data = mutate_bytes(rng, data)
+        return mutate_bytes(rng, seed.content)
+    data = mutate_text(rng, seed.content).encode("utf-8", "surrogatepass")
+    return mutate_bytes(rng, data) if rng.random() < 0.1 else data
+
+
+def run_case(seed: Seed, data: bytes, folder: Path, rng: random.Random) -> str:
+    """Read a file with other content; return "" or what went wrong. The good file is put back."""
+    path = folder / seed.name
+    good = seed.content if isinstance(seed.content, bytes) else seed.content.encode()
     path.write_bytes(data)
     try:
         with warnings.catch_warnings():

@@ -23,7 +23,7 @@ from sfm.photographs.file_checks import BOMB_PX_PER_BYTE
 from sfm.photographs.reading import read_photograph
 from sfm.survey.inputs.given import read_image_points
 from sfm.survey.inputs.survey import read_survey
-from tests.fuzz.cases import Seed, make_seeds, run_case
+from tests.fuzz.cases import Seed, make_seeds, mutated, run_case
 
 SHORT = settings(
     max_examples=60,
@@ -56,7 +56,8 @@ def test_mutated_files_are_read_or_refused(
 ) -> None:
     folder, seeds = good
     rng = _NeverFar(number)
-    assert run_case(rng.choice([seed for seed in seeds if seed.kind == kind]), folder, rng) == ""
+    seed = rng.choice([seed for seed in seeds if seed.kind == kind])
+    assert run_case(seed, mutated(seed, rng), folder, rng) == ""
 
 
 @given(text=st.text(max_size=300))

@@ -320,7 +320,7 @@ def test_a_scene_file_gives_photographs_and_their_truth(tmp_path):
     np.testing.assert_allclose(centre, [[79.5, 59.5]], atol=1e-9)
     write_photographs(staging, tmp_path / "out")
     assert sorted(p.name for p in (tmp_path / "out").iterdir()) == [
-        "p1.png", "p2.png", "truth_image_points.csv", "truth_images.csv", "truth_points.csv",
+        "manifest.json", "p1.png", "p2.png", "truth_image_points.csv", "truth_images.csv", "truth_points.csv",
     ]  # fmt: skip
     with (tmp_path / "out/truth_points.csv").open() as file:
         points = list(csv.DictReader(file))

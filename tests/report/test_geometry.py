@@ -14,8 +14,9 @@ from sfm.adjustment.datum import Datum
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.network import ObjectPoints
+from sfm.orientation.ray_angles import ray_angles
 from sfm.report.findings.findings import findings_of
-from sfm.report.findings.geometry import Geometry, geometry_of, hull_area, intersection_angles
+from sfm.report.findings.geometry import Geometry, geometry_of, hull_area
 from sfm.report.html.report_page import report_page
 from sfm.report.phrases import MAX_BINS, points_by_rays
 from sfm.report.tables.csv_files import write_tables
@@ -75,7 +76,7 @@ def test_angles_by_hand() -> None:
     def angle_seen_by(*images: int) -> float:
         rejected = (seen.point == 0) & ~np.isin(seen.image, images)
         estimate = replace(a.estimate, position=position, points=points)
-        return float(intersection_angles(replace(a, estimate=estimate, rejected=rejected))[0])
+        return float(ray_angles(a.network, estimate, ~rejected)[0])
 
     assert angle_seen_by(0, 1) == pytest.approx(90)
     assert angle_seen_by(0, 2) == pytest.approx(0, abs=1e-6)

@@ -183,7 +183,7 @@ def test_a_point_with_one_ray_is_named(tmp_path: Path) -> None:
     table.write_text("\n".join(left) + "\n", encoding="utf-8")
     result = run_survey(read_survey(path))
     assert name not in result.adjustment.network.points
-    assert f"point {name}: 1 ray, 2 are needed" in result.warnings
+    assert any(f"point {name}: 1 ray, 2 are needed" in line for line in result.warnings)
 
 
 @pytest.mark.parametrize("bars", [3, 2])

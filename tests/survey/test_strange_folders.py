@@ -14,8 +14,10 @@ import numpy as np
 import pytest
 
 import sfm.cli
+import sfm.rendering.render
 from adapters.colmap.camera_models import write_model
 from adapters.colmap.database import read_database, write_database
+from adapters.formats.registry import FORMATS
 from sfm.batch.run import run_batch
 from sfm.errors import OutputError
 from sfm.files.folder_lock import locked
@@ -35,8 +37,9 @@ Command = tuple[Callable[[Path], tuple[object, ...]], tuple[str, ...]]
 
 
 @pytest.fixture(autouse=True)
-def no_plots(monkeypatch: pytest.MonkeyPatch) -> None:
+def no_plots_and_processes(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("sfm.report.output.all_plots", lambda *_: [])
+    monkeypatch.setattr("adapters.dask_cluster.local_engine", lambda *_, **__: HERE)
 
 
 @pytest.fixture
@@ -55,6 +58,9 @@ def content(folder: Path) -> dict[str, bytes]:
 
 def kolinear(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
     monkeypatch.setattr("sys.argv", ["kolinear", *map(str, arguments)])
+    if arguments[0] == "render":
+        monkeypatch.setattr("sys.argv", ["render", *map(str, arguments[1:])])
+        return sfm.rendering.render.main()
     try:
         sfm.cli.main()
     except SystemExit as end:
@@ -76,6 +82,20 @@ def photographs(folder: Path) -> tuple[Path, Path]:
     for k in (0, 1):
         cv2.imwrite(str(folder / f"{k}.png"), np.rint(pictures()[0]).astype(np.uint8))
     return folder / "0.png", folder / "1.png"
+
+
+def scene(folder: Path) -> Path:
+    """A scene file of a single photograph, small and dark."""
+    path = folder / "scene.toml"
+    path.write_text(
+        '[scene]\nphotographs = "p{}.jpg"\n'
+        '[camera]\nmodel = "brown"\nsize_px = [64, 48]\npixel_mm = [0.1, 0.1]\nc_mm = 8.0\n'
+        '[[face]]\nname = "wall"\ncentre = [0, 0, 0]\na = [1, 0, 0]\nb = [0, 1, 0]\nsize = [10, 10]\n'
+        "reflectance = 0.5\n"
+        "[[station]]\nposition = [0, 0, 20]\nlook_at = [0, 0, 0]\n",
+        encoding="utf-8",
+    )
+    return path
 
 
 COMMANDS: dict[str, Command] = {
@@ -120,6 +140,10 @@ COMMANDS: dict[str, Command] = {
         ("out", "out/validation", "out/.validation.lock"),
     ),
     "refine": (lambda f: ("refine", model(f), "--images", f, "--out", "new/a"), ("new", "new/a")),
+    "render": (
+        lambda f: ("render", scene(f), "new/a"),
+        ("new", "new/a", "new/a/p1.jpg", "new/a/truth_points.csv", "new/a/manifest.json"),
+    ),
     "convert to a file": (lambda f: ("convert", model(f), "new/a.xml"), ("new", "new/a.xml")),
     "convert to a database": (lambda f: ("convert", model(f), "new/a.db"), ("new", "new/a.db")),
     "convert to a folder": (lambda f: ("convert", model(f), "new/a"), ("new", "new/a")),
@@ -158,6 +182,78 @@ def test_no_command_writes_through_a_link(
     assert of_one_survey or (len(lines) == 1 and told.out == "")
     assert content(home) == before and sorted(home.rglob("*")) == names
     assert link.is_symlink()  # left alone
+
+
+SHARED = ("out", "new", "out/batch", "out/batch/logs")  # folders that may hold other files, too
+LATER = (("render", "new/a", "folder"), ("refine", "new", "file"))  # beside it; photographs come before it
+NAMED = ("is there already", "cannot be", "holds '", "left alone", "exists", "in the way", "is a folder")
+
+
+@pytest.mark.parametrize(
+    ("command", "place", "kind"),
+    [
+        (name, place, kind)
+        for name, (_, places) in COMMANDS.items()
+        for place in places
+        for kind in ("file", "folder")
+        if (kind == "file" or place not in SHARED) and (name, place, kind) not in LATER
+    ],
+)
+def test_no_command_writes_over_files_of_the_user(
+    command: str,
+    place: str,
+    kind: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """A file, or a folder with one in it, stands where the command line says or where a command writes."""
+    folder = tmp_path / "given"
+    folder.mkdir()
+    monkeypatch.chdir(folder)
+    arguments = COMMANDS[command][0](folder)
+    mine = folder / place / "mine.txt" if kind == "folder" else folder / place
+    mine.parent.mkdir(parents=True, exist_ok=True)
+    mine.write_text(OWN)
+    number = kolinear(monkeypatch, *arguments)
+    assert mine.read_text() == OWN
+    told = capsys.readouterr()
+    of_one_survey = place == "out/batch/s"  # which fails, the batch goes on
+    assert number == (1 if of_one_survey else 2)
+    said = told.out if of_one_survey else told.err
+    assert Path(place).name in said and any(words in said for words in NAMED), told
+    lines = [line for line in told.err.splitlines() if COMPILING not in line]
+    assert of_one_survey or (len(lines) == 1 and told.out == "")
+    left = [path for path in (folder / place).parent.iterdir() if path.name.endswith((".part", ".old"))]
+    assert left == []
+
+
+@pytest.mark.parametrize("form", [form.name for form in FORMATS])
+def test_no_format_is_written_over_a_file_of_the_user(
+    form: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    given, mine = model(tmp_path), tmp_path / "mine.txt"
+    mine.write_text(OWN)
+    for target in (mine, given):
+        assert kolinear(monkeypatch, "convert", given, target, "--to", form) == 2
+        assert f"{target}: it is there already and is left alone" in capsys.readouterr().err
+    assert mine.read_text() == OWN
+
+
+def test_photographs_that_were_rendered_are_replaced_and_no_others(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "survey.toml").write_text(OWN)
+    for _ in range(2):
+        assert kolinear(monkeypatch, "render", scene(tmp_path), out) == 0
+    before = content(out)
+    (out / "p1.jpg").write_text(OWN)
+    assert kolinear(monkeypatch, "render", scene(tmp_path), out) == 2
+    assert "holds 'p1.jpg', changed since Kolinear wrote it; " in capsys.readouterr().err
+    assert content(out) == {**before, "p1.jpg": OWN.encode()}
+    assert (out / "survey.toml").read_text() == OWN
 
 
 @pytest.mark.parametrize("kind", ["link", "second name", "text"])
@@ -293,7 +389,12 @@ def test_pages_of_a_batch_that_a_person_has_changed_are_kept(name: str, tmp_path
     for _ in range(2):
         run_batch([survey], out, HERE, ALONE, Notes())
     (out / name).write_text(OWN)
-    with pytest.raises(OutputError, match=r"which no batch has written, or not as it is now"):
+    told = (
+        "'index.html' and 1 more; which"
+        if name == "manifest.json"
+        else f"'{name}', changed since Kolinear wrote it"
+    )
+    with pytest.raises(OutputError, match=told):
         run_batch([survey], out, HERE, ALONE, Notes())
     assert (out / name).read_text() == OWN
 

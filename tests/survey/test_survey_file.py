@@ -401,7 +401,6 @@ GOOD = "image,point,x_px,y_px\n1,a,10,20\n"
         (GOOD + "1,b,nan,3\n", r"line 3: column x_px holds 'nan', a finite number is needed"),
         (GOOD + "1,b,1,1e999\n", r"line 3: column y_px holds '1e999'"),
         (GOOD + "1,b,1,2px\n", r"line 3: column y_px holds '2px'"),
-        (GOOD + "\n\n1,a,1,2\n", r"line 5: image '1', point 'a' stands on line 2 already"),
         (GOOD + "1,b,1\n", r"line 3: 3 columns, the header has 4"),
         (GOOD + "1,,1,2\n", r"line 3: column point is empty"),
         ("image,point,x_px,y_px\n", r"no rows below the header"),

@@ -14,16 +14,24 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sfm.adjustment.engine.cofactors import cofactors, hat_complement
-from sfm.adjustment.engine.collinearity import State, behind_camera, residuals
+from sfm.adjustment.engine.collinearity import Observations, State, behind_camera, residuals
 from sfm.adjustment.engine.iterate import Optimum, Problem, iterate, optimum_at
 from sfm.adjustment.engine.unknowns import start_weights
-from sfm.adjustment.quality.robust import huber_weights, robust_scale, snoop, tukey_weights
-from sfm.conventions import FloatArray
+from sfm.adjustment.quality.robust import (
+    huber_weights,
+    residual_lengths,
+    robust_scale,
+    snoop,
+    tukey_weights,
+)
+from sfm.conventions import BoolArray, FloatArray
 from sfm.errors import GeometryError
 
 MAX_ROUNDS = 200  # of data snooping
 ROUND_TOLERANCE = 1e-3  # |A dx| / |v| that is near enough to judge gross errors
 BENT = 2.0  # spread of residuals over that with the start values, above which gross errors bend the network
+BENT_ALONE = 10.0  # the same of one photograph, over the median of all photographs
+FAR_OFF = 100.0  # median residuals beyond which an image point has no influence with any estimator
 REWEIGHTINGS = 30
 REWEIGHTED = 1e-3  # largest change of a weight at which reweighting ends
 REJECTS = ("tau", "huber", "tukey", "none")
@@ -49,9 +57,15 @@ def find_optimum(run: Run, state: State, *, reject: str, alpha: float) -> tuple[
     if reject == "tau":
         optimum, weight = _snoop_all(run, optimum, weight, alpha)
     else:
-        optimum, weight = _reweight(run, optimum, weight, huber_weights)
+        robust, factor = _reweight(run, optimum, weight, huber_weights)
+        if _bent_photographs(run, state, robust.state).any():
+            robust, factor = optimum, weight
+            if reject == "huber":
+                bends = _bending(run, optimum, weight)
+                robust, factor = _reweight(run, optimum, weight, huber_weights, out=bends)
         if reject == "tukey":
-            optimum, weight = _reweight(run, optimum, weight, tukey_weights)
+            robust, factor = _reweight(run, robust, factor, tukey_weights)
+        optimum, weight = robust, factor
     if run.tolerance > wanted:
         run.tolerance = wanted
         optimum = run.again(optimum, weight)
@@ -117,8 +131,9 @@ def _sound(run: Run, state: State, weight: FloatArray) -> tuple[Optimum, FloatAr
     """Return the optimum from which gross errors are judged: of all image points, unless they bend it.
 
     An error of hundreds of pixels can turn a photograph over or let the principal distance collapse. Then
-    the adjustment does not converge, or most image points fit worse than with the start values; it is
-    begun again there by Huber's and Tukey's weights, and what Tukey's weigh 0 is left out.
+    the adjustment does not converge, or most image points, of all or of one photograph, fit worse than with
+    the start values; it is begun again there by Huber's and Tukey's weights, and what Tukey's weigh 0 is left
+    out.
 
     Raises:
         GeometryError: neither can be solved.
@@ -136,20 +151,56 @@ def _sound(run: Run, state: State, weight: FloatArray) -> tuple[Optimum, FloatAr
         if begun is None:
             raise
         optimum, plain = replace(begun, converged=False), weight
-    limit = spread(optimum.state)
-    if optimum.converged and limit <= BENT * spread(state):
+    limit, first = spread(optimum.state), spread(state)
+
+    def sound(found: Optimum) -> bool:
+        fits = spread(found.state) <= BENT * first
+        return found.converged and fits and not _bent_photographs(run, state, found.state).any()
+
+    if sound(optimum):
         return optimum, plain
     begun = begun or optimum_at(run.problem, state, weight)
     if begun is None:
         return optimum, plain
-    try:
-        robust, factor = _reweight(run, begun, weight, huber_weights)
-        robust, factor = _reweight(run, robust, factor, tukey_weights)
-        factor = (factor > 0).astype(float)
-        robust = run.again(robust, factor)
-    except GeometryError:
-        return optimum, plain
-    return (robust, factor) if robust.converged and spread(robust.state) < limit else (optimum, plain)
+    # Huber's weights leave an error a bounded influence, which may still turn over a photograph of a few
+    # image points; Tukey's leave none where the start values are good
+    for estimators in ((tukey_weights,), (huber_weights, tukey_weights)):
+        robust, factor = begun, weight
+        try:
+            for weights in estimators:
+                robust, factor = _reweight(run, robust, factor, weights)
+            factor = (factor > 0).astype(float)
+            robust = run.again(robust, factor)
+        except GeometryError:
+            continue
+        last = estimators[0] is huber_weights
+        if sound(robust) or (last and robust.converged and spread(robust.state) < limit):
+            return robust, factor
+    return optimum, plain
+
+
+def _bent_photographs(run: Run, start: State, end: State) -> BoolArray:
+    """Return the photographs most of whose image points fit far worse at the end than at the start, (m,).
+
+    Worse than before, and than the others: an error in one of six image points bends its photograph alone,
+    and the median over all others does not show it.
+    """
+    observations, active = run.problem.layout.observations, run.problem.layout.active
+    before, after = (_median_lengths(observations, at, active) for at in (start, end))
+    return np.asarray(after > np.maximum(BENT * before, BENT_ALONE * np.nanmedian(after)))
+
+
+def _median_lengths(observations: Observations, state: State, active: BoolArray) -> FloatArray:
+    """Return the median length of the residuals of each photograph, in standard deviations, (m,)."""
+    length = residual_lengths(observations, residuals(observations, state))
+    length = np.where(active & np.isfinite(length), length, np.inf)
+    out = np.full(len(state.position), np.nan)
+    order = np.lexsort((length, observations.image))
+    count = np.bincount(observations.image, minlength=len(out))
+    first = np.cumsum(count) - count
+    seen = count > 0
+    out[seen] = length[order][(first + (count - 1) // 2)[seen]]
+    return out
 
 
 def _snoop_all(run: Run, optimum: Optimum, weight: FloatArray, alpha: float) -> tuple[Optimum, FloatArray]:
@@ -193,12 +244,37 @@ def _snoop_all(run: Run, optimum: Optimum, weight: FloatArray, alpha: float) -> 
     return optimum, weight
 
 
+def _bending(run: Run, optimum: Optimum, weight: FloatArray) -> BoolArray:
+    """Return the image points that a robust start has left out and that lie far off, (k,).
+
+    They bend their photograph even with the bounded influence that Huber's weights leave them.
+    """
+    layout = run.problem.layout
+    length = residual_lengths(layout.observations, residuals(layout.observations, optimum.state))
+    return np.asarray(layout.active & (weight == 0) & (length > FAR_OFF * np.nanmedian(length)))
+
+
 def _reweight(
-    run: Run, optimum: Optimum, weight: FloatArray, weights: Callable[..., FloatArray]
+    run: Run,
+    optimum: Optimum,
+    weight: FloatArray,
+    weights: Callable[..., FloatArray],
+    *,
+    out: BoolArray | None = None,
 ) -> tuple[Optimum, FloatArray]:
-    """Return the optimum of an M-estimator by reweighting; a scale from the median goes with every round."""
+    """Return the optimum of an M-estimator by reweighting; a scale from the median goes with every round.
+
+    Args:
+        run: what is adjusted, and how.
+        optimum: where to start.
+        weight: factor on the weight of each image point there, (k,).
+        weights: of the estimator.
+        out: image points that take no part, (k,).
+    """
     layout = run.problem.layout
     ready = layout.active & ~behind_camera(layout.observations, optimum.state)
+    if out is not None:
+        ready &= ~out
     count = 2 * int(ready.sum()) + run.problem.weighted.count
     freedom = run.redundancy(optimum, ready.astype(float)) / max(count, 1)
     for _ in range(REWEIGHTINGS):

@@ -73,7 +73,7 @@ def huber_weights(observations: Observations, residuals: FloatArray, *, sigma0: 
         residuals: v, px, shape (k, 2).
         sigma0: standard deviation of unit weight.
     """
-    size = _lengths(observations, residuals) / sigma0
+    size = residual_lengths(observations, residuals) / sigma0
     return np.where(size > HUBER, HUBER / np.maximum(size, HUBER), 1.0)
 
 
@@ -85,7 +85,7 @@ def tukey_weights(observations: Observations, residuals: FloatArray, *, sigma0: 
         residuals: v, px, shape (k, 2).
         sigma0: standard deviation of unit weight.
     """
-    share = _lengths(observations, residuals) / (TUKEY * sigma0)
+    share = residual_lengths(observations, residuals) / (TUKEY * sigma0)
     return np.where(share < 1.0, (1.0 - share**2) ** 2, 0.0)
 
 
@@ -131,7 +131,7 @@ def inflation(
     used = weight > 0
     w = weight[used]
     others = count - 2 * len(w)
-    psi2 = vPv - float((w * (1 - w)) @ _lengths(observations, residuals)[used] ** 2)
+    psi2 = vPv - float((w * (1 - w)) @ residual_lengths(observations, residuals)[used] ** 2)
     slope = np.concatenate([slopes[used].ravel(), np.ones(others)])
     mean = float(slope.mean())
     K = 1 + (count - redundancy) / count * float(slope.var()) / mean**2
@@ -161,7 +161,7 @@ def robust_scale(
     return float(max(scale, np.finfo(float).tiny))
 
 
-def _lengths(observations: Observations, residuals: FloatArray) -> FloatArray:
+def residual_lengths(observations: Observations, residuals: FloatArray) -> FloatArray:
     """Return the lengths of the residuals in their standard deviations, infinite behind the camera, (k,)."""
     a, b, c = observations.whitening.T
     length = np.hypot(a * residuals[:, 0], b * residuals[:, 0] + c * residuals[:, 1])

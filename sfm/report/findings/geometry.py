@@ -16,10 +16,10 @@ from scipy.spatial import ConvexHull, QhullError
 
 from sfm.adjustment.result import Adjustment
 from sfm.conventions import FloatArray, IntArray
+from sfm.orientation.ray_angles import ray_angles
 from sfm.report.findings.interior_parameters import families, family_of_photographs
 
 WEAK_DEG = 10.0  # below it a point is eleven times less precise along its rays than across
-MOST_PAIRS = 4_000_000  # of rays that are compared at a time
 
 
 @dataclass(frozen=True)
@@ -77,30 +77,8 @@ def geometry_of(adjustment: Adjustment) -> Geometry:
     v = adjustment.residuals[~adjustment.rejected]
     image_rms, image_points = _rms(used.image, v, m)
     point_rms, rays = _rms(used.point, v, n)
-    return Geometry(rays, intersection_angles(adjustment), point_rms, image_rms, hull, coverage, image_points)
-
-
-def intersection_angles(adjustment: Adjustment) -> FloatArray:
-    """Return the largest angle between two accepted rays of each point, deg, NaN with fewer than two, (n,).
-
-    Rays that meet head on are as parallel as those side by side, so that no angle is above 90 degrees.
-    """
-    network, estimate = adjustment.network, adjustment.estimate
-    seen = network.image_points.select(~adjustment.rejected)
-    order = np.argsort(seen.point, kind="stable")
-    image, point = seen.image[order], seen.point[order]
-    ray = estimate.points[point] - estimate.position[image]
-    ray /= np.linalg.norm(ray, axis=1, keepdims=True)
-    count = np.bincount(point, minlength=len(network.points))
-    first = np.concatenate([[0], np.cumsum(count)[:-1]])
-    angle = np.full(len(network.points), np.nan)
-    for r in np.unique(count[count >= 2]):
-        points = np.flatnonzero(count == r)
-        for some in np.array_split(points, 1 + len(points) * r * r // MOST_PAIRS):
-            u = ray[first[some][:, None] + np.arange(r)]
-            sine = np.sqrt(np.maximum(1 - np.einsum("nia,nja->nij", u, u) ** 2, 0))
-            angle[some] = np.degrees(np.arcsin(np.minimum(sine.max(axis=(1, 2)), 1)))
-    return angle
+    angle = ray_angles(adjustment.network, adjustment.estimate, ~adjustment.rejected)
+    return Geometry(rays, angle, point_rms, image_rms, hull, coverage, image_points)
 
 
 def hull_area(xy: FloatArray) -> float:

@@ -13,6 +13,7 @@ from sfm.conventions import MAD_TO_SIGMA
 from sfm.report.findings.bundle_statistics import Statistics
 from sfm.report.findings.checks import CheckedControl, LongestResidual, Sigma0
 from sfm.report.findings.given_residuals import Given, GivenResiduals, GivenValue
+from sfm.report.findings.scale import given_test, scale_difference
 from sfm.report.numbers import finer_unit, significant
 from sfm.result import SurveyResult
 
@@ -82,7 +83,10 @@ def judge(evidence: Evidence) -> Verdict:
             f"Rank defect {a.defect}, expected {a.expected_defect}; not everything can be determined{what}."
         )
     remarks: list[str] = []
-    kinds = (_sigma0, _residual, _untested, _rays, _control, _bars, _interior, _exterior, _kinds, _check)
+    kinds = (
+        *(_sigma0, _residual, _untested, _rays, _taken_out, _scale),
+        *(_control, _bars, _interior, _exterior, _kinds, _check),
+    )
     for judge_kind in kinds:
         for is_bad, line in judge_kind(evidence):
             (serious if is_bad else remarks).append(line)
@@ -254,6 +258,44 @@ def _rays(evidence: Evidence) -> Judged:
     shown = ", ".join(f"{network.points[j]} ({lost[j]} of {rays[j]})" for j in most[:MOST_NAMES])
     more = " ..." if len(most) > MOST_NAMES else ""
     return [(False, f"Most rays were rejected of {len(most)} point(s): {shown}{more}.")]
+
+
+def _taken_out(evidence: Evidence) -> Judged:
+    """Judge control and bars that were not used: as if they were kept, or worse where nothing is resolved."""
+    judged: Judged = []
+    for one in evidence.result.taken_out:
+        if not one.resolved:
+            judged.append(
+                (True, f"{_capital(one.what)} was not used: what it contradicts may be what is wrong.")
+            )
+        elif one.relative > MISCLOSURE_BAD:
+            off = significant(100 * one.relative)
+            judged.append((True, f"{_capital(one.what)} was not used: it is {off} % off."))
+    return judged
+
+
+def _scale(evidence: Evidence) -> Judged:
+    """Judge the scale of the bars against that of the control, and all that was given by the F-test."""
+    judged: Judged = []
+    test = given_test(evidence.result)
+    if test is not None and test.probability < ALPHA:
+        line = (
+            f"What was given beside the image points contradicts them: F {significant(test.statistic)} with "
+            f"{test.redundancy} degrees of freedom, by chance in fewer than {100 * ALPHA:g} % of surveys."
+        )
+        judged.append((False, line))
+    found = scale_difference(evidence.result)
+    if found is None or not found.over_sigma > WEIGHTED_REMARK:
+        return judged
+    line = (
+        f"Lengths by the control are {significant(100 * found.relative)} % larger than by the scale bars, "
+        f"{significant(found.over_sigma)} times the standard deviation of that difference."
+    )
+    return [*judged, (found.over_sigma > WEIGHTED_BAD, line)]
+
+
+def _capital(text: str) -> str:
+    return text[:1].upper() + text[1:]
 
 
 def _check(evidence: Evidence) -> Judged:

@@ -1,4 +1,4 @@
-"""The tables of a result: points, images, cameras, image points, given values, reliability, groups.
+"""The tables of a result: points, images, cameras, image points, what was left out, given values, tests.
 
 Degrees in files, the object unit of the survey, sigmas are standard deviations a posteriori (those of image
 points: as measured). Numbers are written with enough digits to give the same number back.
@@ -8,8 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-
-import numpy as np
 
 from sfm.adjustment.result import Adjustment
 from sfm.files.plain_text import csv_text
@@ -35,6 +33,7 @@ def write_tables(findings: Findings, folder: Path) -> None:
             "image,point,x_px,y_px,sx_px,sy_px,vx_px,vy_px,rejected",
             image_point_rows(adjustment),
         ),
+        ("left_out", "kind,name,image_points,reason", left_out_rows(findings)),
         ("given", "kind,name,coordinate,unit,given,difference,sigma,r,w", given_rows(findings.given)),
         (
             "reliability",
@@ -69,10 +68,10 @@ def camera_rows(findings: Findings) -> Iterable[Sequence[object]]:
 
 
 def image_point_rows(adjustment: Adjustment) -> Iterable[Sequence[object]]:
-    """Return image, point, position, sigmas as measured, residuals and 0 or 1 for rejected."""
+    """Return image, point, position, sigmas as stated (else empty), residuals and 0 or 1 for rejected."""
     network = adjustment.network
     seen = network.image_points
-    sigma = np.sqrt(np.einsum("kii->ki", seen.covariance))
+    sigma = seen.stated_sigma
     for k in range(len(seen)):
         yield (
             network.images[seen.image[k]],
@@ -82,6 +81,14 @@ def image_point_rows(adjustment: Adjustment) -> Iterable[Sequence[object]]:
             *adjustment.residuals[k],
             int(adjustment.rejected[k]),
         )
+
+
+def left_out_rows(findings: Findings) -> Iterable[Sequence[object]]:
+    """Return kind, name, image points and reason of every photograph and point that is not in the result."""
+    for failed in findings.result.failed:
+        yield ("photograph", failed.image, None, failed.reason)
+    for one in findings.result.left_out:
+        yield ("point", one.point, one.image_points, one.reason)
 
 
 def given_rows(given: Given) -> Iterable[Sequence[object]]:

@@ -49,7 +49,12 @@ def summary(findings: Findings) -> dict[str, Any]:
         "observations": {
             "used": int((~adjustment.rejected).sum()),
             "rejected": int(adjustment.rejected.sum()),
+            "not_in_result": result.unused_image_points,
         },
+        "left_out": [
+            {"point": one.point, "image_points": one.image_points, "reason": one.reason}
+            for one in result.left_out
+        ],
         "unknowns": adjustment.unknowns,
         "redundancy": adjustment.redundancy,
         "datum": {

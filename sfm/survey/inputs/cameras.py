@@ -11,6 +11,7 @@ from sfm.camera import Camera, camera_from_values
 from sfm.conventions import IntArray
 from sfm.errors import PhotographError, SurveyFileError
 from sfm.photographs.exif import Metadata
+from sfm.survey.inputs.given import StartCameras
 from sfm.survey.inputs.settings import CameraSettings
 
 MAX_PIXEL_MM = 1000.0  # side of a pixel; of models without a size it is 1 mm
@@ -48,6 +49,7 @@ def start_cameras(
     metadata: tuple[Metadata, ...] = (),
     camera: IntArray | None = None,
     names: tuple[str, ...] = (),
+    given: StartCameras | None = None,
 ) -> tuple[Camera, ...]:
     """Return the cameras with their start values, in the order of the survey file.
 
@@ -57,6 +59,7 @@ def start_cameras(
         metadata: size and EXIF data of the readable photographs, (m,); none with [observations].
         camera: index of the camera of each photograph, (m,).
         names: names of the photographs, (m,).
+        given: start values of [approximate] for parameters that are adjusted freely, before all others.
 
     Raises:
         PhotographError: photographs of one camera differ in size from one another or from size_px.
@@ -74,6 +77,7 @@ def start_cameras(
         if one.sensor_mm is not None:
             pixel = one.sensor_mm[0] / size[0], one.sensor_mm[1] / size[1]
         known = {**dict(one.fixed), **{name: value for name, (value, _) in one.weighted}}
+        known |= dict(one.start) | free_start_values(one, one.name, given)
         if pixel is None:
             pixel = next((metadata[k].pixel_mm for k in own if metadata[k].pixel_mm), None)
         if focal is None:
@@ -103,6 +107,33 @@ def start_cameras(
             )
         )
     return tuple(cameras)
+
+
+def free_start_values(settings: CameraSettings, name: str, given: StartCameras | None) -> dict[str, float]:
+    """Return the start values of [approximate] for what is free of a camera, by parameter.
+
+    Args:
+        settings: say what is free.
+        name: of the camera in the table, or of one of its photographs or groups with values of their own.
+        given: the table, None without.
+    """
+    values = given.of(name) if given is not None else {}
+    return {parameter: value for parameter, value in values.items() if parameter in settings.free}
+
+
+def refuse_unknown_cameras(settings: Sequence[CameraSettings], given: StartCameras | None) -> None:
+    """Raise SurveyFileError if start values are of a camera that is none of the survey's.
+
+    Values of a photograph or group begin with the name of its camera.
+    """
+    for row, name in enumerate(given.camera if given is not None else ()):
+        if given is not None and not any(
+            name == one.name or name.startswith(f"{one.name} ") for one in settings
+        ):
+            raise SurveyFileError(
+                f"{given.table.place(row)}: camera '{name}' is none of the survey's, expected one of "
+                f"{', '.join(one.name for one in settings)}"
+            )
 
 
 def _common_size(

@@ -170,9 +170,9 @@ def _refuse_contradicting_sizes(targets: TargetSettings, where: str, unit: str) 
 def _refuse_contradictions_of_camera(camera: CameraSettings, at: str) -> None:
     """Raise SurveyFileError where the settings of a camera do not go together."""
     known = MODELS[camera.model].names
-    fixed, weighted = dict(camera.fixed), dict(camera.weighted)
+    fixed, weighted, start = dict(camera.fixed), dict(camera.weighted), dict(camera.start)
     varying = (*camera.per_photograph, *camera.per_group)
-    for parameter in (*camera.free, *fixed, *weighted, *varying):
+    for parameter in (*camera.free, *fixed, *weighted, *start, *varying):
         if parameter not in known:
             raise SurveyFileError(
                 f"{at}: model {camera.model} has no parameter '{parameter}', it has {', '.join(known)}"
@@ -196,6 +196,9 @@ def _refuse_contradictions_of_camera(camera: CameraSettings, at: str) -> None:
     ):
         for parameter in sorted(both):
             raise SurveyFileError(f"{at}: parameter '{parameter}' is both {one} and {other}")
+    for parameter in start:
+        if parameter not in camera.free:
+            raise SurveyFileError(f"{at}: start.{parameter} is given, but '{parameter}' is not in free")
     for parameter in varying:
         if parameter not in camera.adjusted:
             key = "per_photograph" if parameter in camera.per_photograph else "per_group"
@@ -208,6 +211,6 @@ def _refuse_contradictions_of_camera(camera: CameraSettings, at: str) -> None:
         raise SurveyFileError(f"{at}: {given} is given, {missing} is needed with it")
     if camera.pixel_mm is not None and camera.sensor_mm is not None:
         raise SurveyFileError(f"{at}: pixel_mm and sensor_mm are both given, one is needed")
-    for key, values in (("fixed", fixed), ("weighted", weighted)):
+    for key, values in (("fixed", fixed), ("weighted", weighted), ("start", start)):
         if camera.c_mm is not None and "c" in values:
             raise SurveyFileError(f"{at}: c_mm and {key}.c are both given, one is needed")

@@ -81,6 +81,21 @@ class StartOrientations:
 
 
 @dataclass(frozen=True)
+class StartCameras:
+    """Approximate values of interior orientation, as cameras.csv of a result holds them."""
+
+    camera: tuple[str, ...]  # camera of each row, or photograph or group of one with its own values, (k,)
+    parameter: tuple[str, ...]  # (k,)
+    value: FloatArray  # in the parameter's unit, (k,)
+    table: CsvTable  # where they stand, for messages
+
+    def of(self, camera: str) -> dict[str, float]:
+        """Return the values of one camera, by parameter."""
+        rows = zip(self.camera, self.parameter, self.value.tolist(), strict=True)
+        return {parameter: value for name, parameter, value in rows if name == camera}
+
+
+@dataclass(frozen=True)
 class Observations:
     """Measured image points in place of photographs.
 
@@ -94,7 +109,8 @@ class Observations:
     image: tuple[str, ...]  # photograph of each row, (k,)
     point: tuple[str, ...]  # point of each row, (k,)
     xy: FloatArray  # px in the pixel frame or mm in the image frame, (k, 2)
-    sigma: FloatArray | None  # standard deviations in the same unit, None if there are none, (k, 2)
+    sigma: FloatArray | None  # standard deviations in the same unit, NaN where there is none, None without
+    # any, (k, 2)
     unit: str  # px | mm
     table: CsvTable  # where they stand, for messages
 
@@ -233,20 +249,39 @@ def _start_orientations(table: CsvTable) -> StartOrientations:
     )
 
 
+def read_start_cameras(path: Path) -> StartCameras:
+    """Read interior orientation: camera,parameter,value; cameras.csv of a result is welcome.
+
+    Raises:
+        SurveyFileError: unreadable, wrong columns, not a finite number, or one parameter of a camera twice.
+    """
+    table = read_table(path, ("camera", "parameter"), ("value",), ignored=("sigma", "unit"))
+    camera, parameter = table.texts
+    table.refuse_duplicates(tuple(zip(camera, parameter, strict=True)), ("camera", "parameter"))
+    return StartCameras(camera, parameter, table.values[:, 0], table)
+
+
 def read_image_points(path: Path) -> Observations:
     """Read image points: image,point,x_px,y_px[,sx_px,sy_px] or image,point,x_mm,y_mm[,sx_mm,sy_mm].
+
+    Sigmas may be empty where none is known. A point that stands twice in an image is left to
+    `sfm.survey.inputs.repeated_image_points`.
 
     image_points.csv of a result is welcome; its residuals and rejections are passed over, everything is
     taken as measured.
 
     Raises:
-        SurveyFileError: unreadable, wrong columns, not a finite number, a sigma that is not positive, or the
-            same point twice in one image.
+        SurveyFileError: unreadable, wrong columns, not a finite number, or a sigma that is not positive.
     """
     unit = "mm" if "x_mm" in read_header(path) else "px"
     sigmas = (f"sx_{unit}", f"sy_{unit}")
     table = read_table(
-        path, ("image", "point"), (f"x_{unit}", f"y_{unit}"), sigmas, ignored=("vx_px", "vy_px", "rejected")
+        path,
+        ("image", "point"),
+        (f"x_{unit}", f"y_{unit}"),
+        sigmas,
+        ignored=("vx_px", "vy_px", "rejected"),
+        blank=sigmas,
     )
     return _observations(table, unit)
 
@@ -256,9 +291,14 @@ def _observations(table: CsvTable, unit: str) -> Observations:
     xy, sigma = table.values[:, :2], table.values[:, 2:]
     sigmas = (f"sx_{unit}", f"sy_{unit}")
     table.refuse(sigma, sigma < MIN_SIGMA, sigmas, f"more than 0, at least {MIN_SIGMA:g}")
+    table.refuse(
+        sigma,
+        np.isnan(sigma) != np.isnan(sigma[:, ::-1]),
+        sigmas,
+        "both standard deviations of an image point or none",
+    )
     image, point = table.texts
-    table.refuse_duplicates(tuple(zip(image, point, strict=True)), ("image", "point"))
-    return Observations(image, point, xy, sigma if sigma.size else None, unit, table)
+    return Observations(image, point, xy, sigma if np.isfinite(sigma).any() else None, unit, table)
 
 
 def columns_of(

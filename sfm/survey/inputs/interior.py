@@ -19,11 +19,16 @@ from sfm.camera import Camera
 from sfm.conventions import IntArray
 from sfm.errors import SurveyFileError
 from sfm.network import Estimate, InteriorObservations, Network
+from sfm.survey.inputs.cameras import free_start_values
+from sfm.survey.inputs.given import StartCameras
 from sfm.survey.inputs.settings import CameraSettings
 
 
 def split_cameras(
-    cameras: Sequence[CameraSettings], network: Network, estimate: Estimate
+    cameras: Sequence[CameraSettings],
+    network: Network,
+    estimate: Estimate,
+    given: StartCameras | None = None,
 ) -> tuple[Network, Estimate]:
     """Return the network and estimate with the interior orientations that the final adjustment has.
 
@@ -31,6 +36,7 @@ def split_cameras(
         cameras: of the survey; they say which parameters are observed, of each photograph, or of each group.
         network: with one camera for each of the survey's, in their order.
         estimate: of the same.
+        given: start values of single photographs or groups.
 
     Returns:
         The same with a camera for each photograph or group where parameters of it are its own; the others
@@ -48,7 +54,7 @@ def split_cameras(
         images = np.flatnonzero(network.camera == a)
         first = len(variants)
         made, member = _variants(settings, estimate.cameras[a], [network.images[i] for i in images])
-        variants += made
+        variants += [_started(camera, settings, given) for camera in made]
         owner[images] = first + member
         for name, (value, sigma) in settings.weighted:
             s = made[0].names.index(name)
@@ -65,6 +71,19 @@ def split_cameras(
         replace(network, camera=owner, interior=interior),
         replace(estimate, cameras=tuple(variants)),
     )
+
+
+def _started(camera: Camera, settings: CameraSettings, given: StartCameras | None) -> Camera:
+    """Return the camera of a photograph or group with the start values given for it.
+
+    A parameter that several cameras share starts from one value, that of the camera of the survey file.
+    """
+    p = camera.parameters.copy()
+    for name, value in free_start_values(settings, camera.name, given).items():
+        s = camera.names.index(name)
+        if not camera.group_of(s):
+            p[s] = value
+    return camera.with_parameters(p)
 
 
 def without_idle_cameras(network: Network, estimate: Estimate, *, cameras: int) -> tuple[Network, Estimate]:

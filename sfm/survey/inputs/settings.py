@@ -78,6 +78,7 @@ class CameraSettings(Section):
     model: Literal[tuple(MODELS)] = "brown"  # type: ignore[valid-type]
     free: Names = ()  # parameters to be adjusted; none = a calibrated camera
     fixed: Values = ()  # (parameter, value) of what is not free, in the model's units
+    start: Values = ()  # (parameter, value) that a free one starts from, in the model's units; else 0
     weighted: Observed = ()  # (parameter, (value, sigma)): adjusted, with this as an observation
     per_photograph: Names = ()  # adjusted parameters of which every photograph has a value of its own
     per_group: Names = ()  # adjusted parameters of which every group of photographs has a value of its own
@@ -149,10 +150,11 @@ class ObservationSettings(Section):
 
 
 class ApproximateSettings(Section):
-    """[approximate]: start values of exterior orientation and object points."""
+    """[approximate]: start values of exterior orientation, object points and interior orientation."""
 
     images: Name | None = None  # image,X,Y,Z,omega_deg,phi_deg,kappa_deg
     points: Name | None = None  # point,X,Y,Z
+    cameras: Name | None = None  # camera,parameter,value
 
 
 class AdjustSettings(Section):

@@ -10,14 +10,17 @@ from sfm.camera import Camera
 from sfm.conventions import FloatArray, IntArray, pixel_from_image
 from sfm.errors import SurveyFileError
 from sfm.network import Estimate, ImagePoints, Network, ObjectPoints, ScaleBars
-from sfm.survey.inputs.cameras import camera_of_image, start_cameras
+from sfm.result import LeftOutPoint
+from sfm.survey.inputs.cameras import camera_of_image, refuse_unknown_cameras, start_cameras
 from sfm.survey.inputs.given import KnownPoints, Observations, ScaleBar
 from sfm.survey.inputs.interior import refuse_ungrouped
 from sfm.survey.inputs.photograph_list import refuse_many
+from sfm.survey.inputs.repeated_image_points import merge_repeated
 from sfm.survey.inputs.survey import Survey
 from sfm.survey.measuring.measurements import Measurements
 
 MIN_RAYS = 2  # photographs that a point with a name needs
+CONTRADICTING = "it stands there more than once, at places that contradict one another"
 
 
 def measurements_from_observations(survey: Survey) -> Measurements:
@@ -36,7 +39,7 @@ def measurements_from_observations(survey: Survey) -> Measurements:
     given = survey.observations
     if given is None:
         raise SurveyFileError(f"{survey.source}: [observations] with a file of image points is needed")
-    cameras = start_cameras(survey.cameras, survey.source)
+    cameras = start_cameras(survey.cameras, survey.source, given=survey.start_cameras)
     images, image = _numbered(given.image)
     refuse_many(str(given.table.path), images)
     points, point = _numbered(given.point)
@@ -49,15 +52,28 @@ def measurements_from_observations(survey: Survey) -> Measurements:
     )
     _refuse_far_outside(given, xy, cameras, owner[image])
     refuse_unknown_photographs(survey, images)
+    stated = np.zeros(len(xy), dtype=bool) if given.sigma is None else np.isfinite(given.sigma).all(axis=1)
+    merged = merge_repeated(ImagePoints(image, point, xy, covariance, stated))
     network = Network(
         images,
         owner,
         points,
-        ImagePoints(image, point, xy, covariance),
+        merged.image_points,
         control=control_points(survey.control, points),
         scale_bars=scale_bars(survey.scale_bars, points),
     )
-    return Measurements(network, cameras, images, np.full(len(points), MIN_RAYS))
+    contradicting = tuple(
+        LeftOutPoint(f"{points[j]} in {images[i]}", int(((image == i) & (point == j)).sum()), CONTRADICTING)
+        for i, j in merged.dropped
+    )
+    return Measurements(
+        network,
+        cameras,
+        images,
+        np.full(len(points), MIN_RAYS),
+        warnings=merged.lines(images, points),
+        left_out=contradicting,
+    )
 
 
 def control_points(control: KnownPoints | None, points: Sequence[str]) -> ObjectPoints:
@@ -88,12 +104,13 @@ def scale_bars(bars: Sequence[ScaleBar], points: Sequence[str]) -> ScaleBars:
 
 
 def refuse_unknown_photographs(survey: Survey, images: Sequence[str]) -> None:
-    """Raise SurveyFileError if given orientations are of photographs that are none of the survey's.
+    """Raise SurveyFileError if given orientations or cameras are none of the survey's.
 
     Args:
         survey: with observed and approximate exterior orientations, or none.
         images: all photographs of the survey, also those that cannot be read.
     """
+    refuse_unknown_cameras(survey.cameras, survey.start_cameras)
     known = set(images)
     lacks = "has no observations" if survey.observations else "is no photograph of the survey"
     for given, what in ((survey.exterior, "column image:"), (survey.start_orientations, "image")):
@@ -112,6 +129,20 @@ def start_values(survey: Survey, network: Network, cameras: tuple[Camera, ...]) 
         network: photographs and points that get their values by name.
         cameras: with their start values.
     """
+    found = given_values(survey, network, cameras)
+    if survey.datum.kind == "control":
+        found.points[network.control.point] = network.control.xyz
+    return found
+
+
+def given_values(survey: Survey, network: Network, cameras: tuple[Camera, ...] = ()) -> Estimate:
+    """Return what [approximate] says of photographs and points; NaN for all others.
+
+    Args:
+        survey: gives them.
+        network: photographs and points that get their values by name.
+        cameras: with their start values.
+    """
     m, n = len(network.images), len(network.points)
     position, rotation = np.full((m, 3), np.nan), np.full((m, 3, 3), np.nan)
     points = np.full((n, 3), np.nan)
@@ -127,8 +158,6 @@ def start_values(survey: Survey, network: Network, cameras: tuple[Camera, ...]) 
         for j, name in enumerate(network.points):
             if name in row:
                 points[j] = places.xyz[row[name]]
-    if survey.datum.kind == "control":
-        points[network.control.point] = network.control.xyz
     return Estimate(cameras, position, rotation, points)
 
 
@@ -156,6 +185,7 @@ def _in_pixels(
             xy_px[rows] = pixel_from_image(xy[rows], own.size_px, own.pixel_mm)
             if sigma is not None:
                 s[rows] = sigma[rows] / own.pixel_mm
+    s = np.where(np.isnan(s), sigma_px, s)
     covariance = np.zeros((len(xy), 2, 2))
     covariance[:, range(2), range(2)] = s**2
     return xy_px, covariance

@@ -20,12 +20,14 @@ from sfm.survey.inputs.given import (
     KnownPoints,
     Observations,
     ScaleBar,
+    StartCameras,
     StartOrientations,
     read_control,
     read_diameters,
     read_exterior,
     read_image_points,
     read_points,
+    read_start_cameras,
 )
 from sfm.survey.inputs.settings import (
     AdjustSettings,
@@ -93,6 +95,7 @@ class Survey:
     diameters: Diameters | None = None  # of single targets
     start_orientations: StartOrientations | None = None
     start_points: KnownPoints | None = None
+    start_cameras: StartCameras | None = None
     folder: Path = Path()  # that the globs of the photographs are relative to
     allow_outside: bool = True  # whether photographs may lie outside the folder
     source: str = ""  # what messages call the survey; else its name
@@ -207,6 +210,7 @@ def survey_of_file(file: SurveyFile) -> Survey:
         diameters=read(read_diameters, file.targets.diameters),
         start_orientations=read(read_exterior, file.approximate.images),
         start_points=read(read_points, file.approximate.points),
+        start_cameras=read(read_start_cameras, file.approximate.cameras),
         folder=file.folder,
         allow_outside=file.allow_outside,
         source=file.source,

@@ -107,6 +107,7 @@ class SurveyFile(Section):
             self.observations.file if self.observations else None,
             self.approximate.images,
             self.approximate.points,
+            self.approximate.cameras,
             None if self.targets.codes in FAMILIES else self.targets.codes,
             self.targets.diameters,
         ]

@@ -67,7 +67,7 @@ class TargetStore:
         np.savez(data, allow_pickle=False, **{f.name: getattr(targets, f.name) for f in fields(Targets)})
         with suppress(OSError, OutputError):
             make_user_folder(self.folder)
-            with whole_file(self._path(key)) as part:
+            with whole_file(self._path(key), replaces=True) as part:
                 part.write_bytes(data.getbuffer())
 
     def remove_old(self) -> None:

@@ -50,7 +50,9 @@ def tie_photographs(
     read = sorted(found)
     names = tuple(photographs.names[k] for k in read)
     camera: IntArray = photographs.camera[read]
-    cameras = start_cameras(survey.cameras, survey.source, tuple(found[k][0] for k in read), camera, names)
+    cameras = start_cameras(
+        survey.cameras, survey.source, tuple(found[k][0] for k in read), camera, names, survey.start_cameras
+    )
     tied = find_tie_points(
         [found[k][1] for k in read],
         detector=settings.detector,

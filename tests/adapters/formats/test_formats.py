@@ -284,6 +284,7 @@ def test_ply_round_trip_and_damage(tmp_path: Path) -> None:
     write_ply(path, names, xyz, sigma)
     for found, truth in zip(read_ply(path), (names, xyz, sigma), strict=True):
         np.testing.assert_array_equal(found, truth)
+    path.unlink()
     write_ply(path, names, xyz)
     assert np.isnan(read_ply(path)[2]).all()
     text = path.read_text(encoding="utf-8")

@@ -103,11 +103,6 @@ def test_control_file_takes_the_place_of_the_control_block(tmp_path: Path) -> No
         ("   1 two.jpg", "   2 two.jpg", "line 12: '2 two.jpg' where photograph 1 and its file were due"),
         ("   0    0.100    0.200", "   1    0.100    0.200", "line 7: '1' at the start, needed the number 0"),
         ("   0        8 1300.0000", "   0        8 13OO.0000", "line 26: '13OO.0000' is not a number"),
-        (
-            "   0        8 1300.0000",
-            "   0        7 1300.0000",
-            "line 26: point 7 stands twice in photograph 0",
-        ),
         ("   1       12", "   5       12", "line 28: photograph 5, there are 0 to 1"),
         ("       9    0.00000", "       8    0.00000", "line 23: point 8 stands twice"),
         ("  0.10000  0.20000\n", "  0.10000\n", "line 25: 5 numbers, needed 6"),

@@ -1,0 +1,160 @@
+"""Congruency of two sets of coordinates of the same points: which of them moved, tested in one datum.
+
+The differences d of two independent solutions are projected with the S-transformation of the points F that
+are taken as stable,
+
+    S = I - G (G_F' G_F)^-1 G_F',  d_S = S d,  Q_S = S (Q_a + Q_b) S',
+
+G being the translations, small rotations and, where the scale is not defined by both, the scale of the whole.
+What the datum of either solution holds or leaves undefined drops out. Under no change Omega = d' Q_S^+ d over
+F follows chi-square with 3 n_F - u degrees of freedom, Omega / (3 n_F - u) Fisher's F where the variances are
+estimated. The point whose removal from F lowers Omega most is taken to have moved, until the rest agrees.
+
+Source: Caspary (2000), Concepts of network and deformation analysis, secs. 7 and 8; Pelzer (1971), Zur
+Analyse geodaetischer Deformationsmessungen; Baarda (1973), S-transformations and criterion matrices.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import cho_factor, cho_solve
+from scipy.stats import chi2, f
+
+from sfm.conventions import BoolArray, FloatArray
+from sfm.errors import GeometryError
+
+MOTIONS = {"none": 0, "rigid": 6, "similarity": 7}  # parameters of what is no change
+LEAST_STABLE = 4  # points that a datum needs to be checked by at least one more than it takes
+STABLE_FRACTION = 0.5  # of the points that must agree for the others to be called moved
+
+
+@dataclass(frozen=True)
+class Congruency:
+    """Differences of the points in the datum of those that did not move."""
+
+    difference: FloatArray  # d_S, (n, 3)
+    covariance: FloatArray  # blocks of Q_S, (n, 3, 3)
+    stable: BoolArray  # points that carry the datum, (n,)
+    moved: BoolArray  # points that do not agree with the stable ones, (n,)
+    statistic: FloatArray  # T of each point, its drop of Omega (stable) or its own test, over 3, (n,)
+    critical: float  # of the largest T
+    global_statistic: float  # Omega over its degrees of freedom, of all points before any was removed
+    global_critical: float
+    agreed: bool  # whether the stable points agree; else no majority of them does
+
+
+def congruency(
+    difference: FloatArray,
+    covariance: FloatArray,
+    xyz: FloatArray,
+    *,
+    motion: str = "rigid",
+    redundancy: int | None = None,
+    datum: BoolArray | None = None,
+    alpha: float = 0.05,
+) -> Congruency:
+    """Test whether points have moved, and find those that have.
+
+    Half of alpha is spent on the test of all points together and half on the largest of the single points.
+
+    Args:
+        difference: second minus first coordinates after any alignment, (n, 3).
+        covariance: Q_a + Q_b of all coordinates together, (3 n, 3 n).
+        xyz: coordinates, (n, 3).
+        motion: what of the whole is no change: rigid (translation and rotation), similarity (the scale too,
+            where not both have one of their own), or none (both in the datum of control).
+        redundancy: of both adjustments together; None if the variances are known.
+        datum: points that may carry the datum, (n,); all if not given.
+        alpha: probability of calling something a change that is none.
+
+    Raises:
+        GeometryError: too few points, or a covariance that is singular beyond the datum.
+    """
+    n = len(xyz)
+    stable = np.ones(n, dtype=bool) if datum is None else datum.copy()
+    u = MOTIONS[motion]
+    if stable.sum() < LEAST_STABLE:
+        raise GeometryError(f"congruency: {int(stable.sum())} points, expected {LEAST_STABLE} or more")
+    first = int(stable.sum())
+    G = motions(xyz)[:, :u]
+    single = critical_value(alpha / 2 / first, 3, redundancy)
+    global_statistic, global_critical, agreed = 0.0, 0.0, False
+    while True:
+        d, Q, omega, drops = _in_datum(difference, covariance, G, stable)
+        freedom = 3 * int(stable.sum()) - u
+        limit = critical_value(alpha / 2, freedom, redundancy)
+        if stable.sum() == first:
+            global_statistic, global_critical = omega / freedom, limit
+        agreed = omega / freedom <= limit and drops[stable].max() <= single
+        if agreed or stable.sum() - 1 < max(LEAST_STABLE, STABLE_FRACTION * first):
+            break
+        stable[np.argmax(np.where(stable, drops, -np.inf))] = False
+    moved = ~stable & (np.ones(n, dtype=bool) if datum is None else datum)
+    if datum is not None:  # points that carry no datum are judged in it
+        others = critical_value(alpha / 2 / max(1, n - first), 3, redundancy)
+        moved |= ~datum & (drops > others)
+    return Congruency(d, Q, stable, moved, drops, single, global_statistic, global_critical, bool(agreed))
+
+
+def motions(xyz: FloatArray) -> FloatArray:
+    """Return G: how coordinates change with translations, small rotations and the scale, (3 n, 7)."""
+    x = xyz - xyz.mean(axis=0)
+    x = x / np.sqrt(np.mean(np.sum(x**2, axis=1)))
+    G = np.zeros((len(x), 3, 7))
+    G[:, :, :3] = np.eye(3)
+    for k in range(3):
+        G[:, :, 3 + k] = np.cross(np.eye(3)[k], x)
+    G[:, :, 6] = x
+    return G.reshape(3 * len(x), 7)
+
+
+def _in_datum(
+    difference: FloatArray, covariance: FloatArray, G: FloatArray, stable: BoolArray
+) -> tuple[FloatArray, FloatArray, float, FloatArray]:
+    """Return d_S, blocks of Q_S, Omega over the stable points, and T of each point."""
+    n = len(difference)
+    rows = np.repeat(stable, 3)
+    basis, triangle = np.linalg.qr(G[rows])  # orthonormal over the stable points
+    G = np.linalg.solve(triangle.T, G.T).T
+    d = difference.ravel() - G @ (basis.T @ difference.ravel()[rows])
+    # S Q S' = Q - G A' - A G' + G (B' Q_FF B) G' with A = Q_F' B
+    A = covariance[:, rows] @ basis
+    Q = covariance - G @ A.T - A @ G.T + G @ (basis.T @ A[rows]) @ G.T
+    blocks = np.stack([Q[3 * j : 3 * j + 3, 3 * j : 3 * j + 3] for j in range(n)])
+    inner = Q[np.ix_(rows, rows)]
+    level = float(np.trace(inner)) / len(inner)
+    try:
+        factor = cho_factor(inner + level * basis @ basis.T, lower=True)
+    except np.linalg.LinAlgError as error:
+        raise GeometryError(
+            "congruency: the covariance of the points is singular beyond its datum"
+        ) from error
+    P = cho_solve(factor, np.eye(len(inner))) - basis @ basis.T / level
+    w = P @ d[rows]
+    omega = float(d[rows] @ w)
+    T = np.full(n, np.nan)
+    own = np.stack([P[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] for k in range(len(inner) // 3)])
+    # the drop of Omega without point k: w_k' P_kk^-1 w_k
+    w3 = w.reshape(-1, 3)
+    T[stable] = np.einsum("ki,ki->k", w3, np.linalg.solve(own, w3[..., None])[..., 0]) / 3
+    moved = ~stable
+    d3 = d.reshape(-1, 3)
+    T[moved] = (
+        np.einsum("ki,ki->k", d3[moved], np.linalg.solve(blocks[moved], d3[moved][..., None])[..., 0]) / 3
+    )
+    return d3, blocks, omega, T
+
+
+def critical_value(alpha: float, freedom: int, redundancy: int | None) -> float:
+    """Return the value that a mean of `freedom` squares exceeds with probability alpha under no change.
+
+    Args:
+        alpha: error probability.
+        freedom: degrees of freedom of the statistic.
+        redundancy: of the variances; None if they are known.
+    """
+    if redundancy is None:
+        return float(chi2.isf(alpha, freedom) / freedom)
+    return float(f.isf(alpha, freedom, redundancy))

@@ -1,0 +1,244 @@
+"""Which point and which photograph of one result is which of another.
+
+Names are believed where they identify something: codes, control, given observations, file names. Uncoded
+targets and tie points are numbered anew in every run, and some formats hold no names at all; what bears such
+a number is recognised by its image points, where both results have the same photographs, or else by its
+place, after an alignment on what is already paired. A number that identifies nothing is never compared with
+another.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from sfm.conventions import BoolArray, FloatArray, IntArray
+from sfm.errors import GeometryError
+from sfm.similarity import Similarity, fit_similarity
+from sfm.stored_result import StoredResult
+
+UNCODED = re.compile(r"u\d+")  # names that Kolinear gives to points without one
+SAME_PX = 1e-2  # image points closer than this are one measurement, as files round it
+NEAR_PX = 1.0  # measurements of one target or one piece of texture by two programs lie closer than this
+MAJORITY = 0.5  # of the rays in common photographs on which two points must lie together
+AMBIGUOUS = 0.3  # of the distance to the next neighbour: what is farther away is not recognised by place
+SAME_PLACE = 0.5  # of the points that must coincide for two results to be in one frame as they are
+
+
+@dataclass(frozen=True)
+class Pairing:
+    """What two results have in common, by index, and how each pair was recognised."""
+
+    points: IntArray  # of a and of b, (n, 2)
+    images: IntArray  # of a and of b, (m, 2)
+    points_by_name: int
+    points_by_image_points: int
+    points_by_place: int
+    images_by_name: int
+
+
+def pair_results(a: StoredResult, b: StoredResult) -> Pairing:
+    """Return which points and photographs of a are which of b.
+
+    Args:
+        a: first result.
+        b: second result.
+    """
+    images = _by_name(
+        *(a.network.images, a.estimate.oriented & a.images_named),
+        *(b.network.images, b.estimate.oriented & b.images_named),
+    )
+    by_name = len(images)
+    images = _with(images, _images_by_image_points(a, b, images))
+    ours, theirs = identified(a), identified(b)
+    points = _by_name(a.network.points, ours, b.network.points, theirs)
+    named = len(points)
+    found = _points_by_image_points(a, b, images, points)
+    points = _with(points, found[~(ours[found[:, 0]] & theirs[found[:, 1]])])
+    seen = len(points)
+    transform = _frame(a, b, points, images)
+    if transform is not None:
+        moved = transform.apply_estimate(b.estimate)
+        found = _by_place(
+            (a.estimate.points, a.estimate.determined), (moved.points, moved.determined), points
+        )
+        points = _with(points, found[~(ours[found[:, 0]] & theirs[found[:, 1]])])
+        if not (a.images_named and b.images_named):
+            found = _by_place(
+                (a.estimate.position, a.estimate.oriented), (moved.position, moved.oriented), images
+            )
+            images = _with(images, found)
+    return Pairing(
+        points[np.argsort(points[:, 0], kind="stable")],
+        images[np.argsort(images[:, 0], kind="stable")],
+        named,
+        seen - named,
+        len(points) - seen,
+        by_name,
+    )
+
+
+def identified(result: StoredResult) -> BoolArray:
+    """Return whether the name of each determined point identifies it, (n,)."""
+    if not result.points_named:
+        return np.zeros(len(result.network.points), dtype=bool)
+    named = np.array([UNCODED.fullmatch(name) is None for name in result.network.points], dtype=bool)
+    return named & result.estimate.determined
+
+
+def _by_name(a: tuple[str, ...], a_known: BoolArray, b: tuple[str, ...], b_known: BoolArray) -> IntArray:
+    index = {name: k for k, name in enumerate(b) if b_known[k]}
+    rows = [(k, index[name]) for k, name in enumerate(a) if a_known[k] and name in index]
+    return np.array(rows, dtype=np.int64).reshape(-1, 2)
+
+
+def _with(pairs: IntArray, more: IntArray) -> IntArray:
+    return np.concatenate([pairs, more])
+
+
+def _free(count: int, taken: IntArray) -> BoolArray:
+    free = np.ones(count, dtype=bool)
+    free[taken] = False
+    return free
+
+
+def _best(votes: IntArray, weight: IntArray, enough: FloatArray) -> IntArray:
+    """Return the pairs (i, j) with more votes than any other of i and of j, and with enough of them.
+
+    Args:
+        votes: pairs, each once, (v, 2).
+        weight: votes of each, (v,).
+        enough: votes that each needs, (v,).
+    """
+    if not len(votes):
+        return votes
+    most_i = np.zeros(votes[:, 0].max() + 1)
+    most_j = np.zeros(votes[:, 1].max() + 1)
+    np.maximum.at(most_i, votes[:, 0], weight)
+    np.maximum.at(most_j, votes[:, 1], weight)
+    good = (weight >= enough) & (weight == most_i[votes[:, 0]]) & (weight == most_j[votes[:, 1]])
+    pairs: IntArray = votes[good]
+    once = (np.bincount(pairs[:, 0])[pairs[:, 0]] == 1) & (np.bincount(pairs[:, 1])[pairs[:, 1]] == 1)
+    return pairs[once] if len(pairs) else pairs
+
+
+def _images_by_image_points(a: StoredResult, b: StoredResult, images: IntArray) -> IntArray:
+    """Pair photographs without names by measurements at the same places."""
+    none = np.empty((0, 2), dtype=np.int64)
+    if a.images_named and b.images_named:
+        return none
+    ours, theirs = a.network.image_points, b.network.image_points
+    free_a = (_free(len(a.network.images), images[:, 0]) & a.estimate.oriented)[ours.image]
+    free_b = (_free(len(b.network.images), images[:, 1]) & b.estimate.oriented)[theirs.image]
+    rows_a, rows_b = np.flatnonzero(free_a), np.flatnonzero(free_b)
+    if not len(rows_a) or not len(rows_b):
+        return none
+    near = cKDTree(ours.xy[rows_a]).query_ball_tree(cKDTree(theirs.xy[rows_b]), SAME_PX)
+    found = [(ours.image[i], theirs.image[j]) for i, js in zip(rows_a, near, strict=True) for j in rows_b[js]]
+    if not found:
+        return none
+    votes, weight = np.unique(np.array(found), axis=0, return_counts=True)
+    count_a, count_b = np.bincount(ours.image), np.bincount(theirs.image)
+    return _best(votes, weight, MAJORITY * np.minimum(count_a[votes[:, 0]], count_b[votes[:, 1]]))
+
+
+def _points_by_image_points(a: StoredResult, b: StoredResult, images: IntArray, points: IntArray) -> IntArray:
+    """Pair points that lie on the same image points in most of the common photographs that see them."""
+    ours, theirs = a.network.image_points, b.network.image_points
+    free_a = _free(len(a.network.points), points[:, 0]) & a.estimate.determined
+    free_b = _free(len(b.network.points), points[:, 1]) & b.estimate.determined
+    found = []
+    for i, j in images:
+        rows_a = np.flatnonzero((ours.image == i) & free_a[ours.point])
+        rows_b = np.flatnonzero((theirs.image == j) & free_b[theirs.point])
+        if not len(rows_a) or not len(rows_b):
+            continue
+        there = cKDTree(theirs.xy[rows_b]).query(ours.xy[rows_a], distance_upper_bound=NEAR_PX)[1]
+        back = cKDTree(ours.xy[rows_a]).query(theirs.xy[rows_b], distance_upper_bound=NEAR_PX)[1]
+        k = np.flatnonzero(there < len(rows_b))
+        k = k[back[there[k]] == k]
+        found.append(np.stack([ours.point[rows_a[k]], theirs.point[rows_b[there[k]]]], axis=1))
+    if not found or not sum(map(len, found)):
+        return np.empty((0, 2), dtype=np.int64)
+    votes, weight = np.unique(np.concatenate(found), axis=0, return_counts=True)
+    shared_a = np.bincount(ours.point[np.isin(ours.image, images[:, 0])], minlength=len(free_a))
+    shared_b = np.bincount(theirs.point[np.isin(theirs.image, images[:, 1])], minlength=len(free_b))
+    return _best(votes, weight, MAJORITY * np.minimum(shared_a[votes[:, 0]], shared_b[votes[:, 1]]))
+
+
+def _frame(a: StoredResult, b: StoredResult, points: IntArray, images: IntArray) -> Similarity | None:
+    """Return a_from_b by what is paired so far, or as they are if they coincide; None where nothing tells."""
+    for pairs, ours, theirs in (
+        (points, a.estimate.points, b.estimate.points),
+        (images, a.estimate.position, b.estimate.position),
+    ):
+        if len(pairs) >= 3:
+            try:
+                return fit_robustly(theirs[pairs[:, 1]], ours[pairs[:, 0]])
+            except GeometryError:
+                continue
+    as_they_are = Similarity(1.0, np.eye(3), np.zeros(3))
+    pairs = _by_place(
+        (a.estimate.points, a.estimate.determined), (b.estimate.points, b.estimate.determined), points
+    )
+    least = SAME_PLACE * min(int(a.estimate.determined.sum()), int(b.estimate.determined.sum()))
+    return as_they_are if len(pairs) >= max(3.0, least) else None
+
+
+def fit_robustly(
+    source: FloatArray, target: FloatArray, *, scale: float | None = None, rounds: int = 20
+) -> Similarity:
+    """Return the similarity that most of the points agree on: iterated weights 1 / distance (L1 norm).
+
+    Args:
+        source: points in the source frame, source unit, (n, 3).
+        target: the same points in the target frame, target unit, (n, 3).
+        scale: scale to keep; fitted too if not given.
+        rounds: of weighting.
+
+    Raises:
+        GeometryError: fewer than three points, or all points on a line.
+
+    Source: Caspary (2000), Concepts of network and deformation analysis, sec. 8.3 (robust transformation).
+    """
+    found = fit_similarity(source, target, scale=scale)
+    for _ in range(rounds):
+        length = np.linalg.norm(found.apply(source) - target, axis=1)
+        least = 1e-3 * np.median(length)
+        if not least > 0:
+            break
+        found = fit_similarity(source, target, scale=scale, weights=1 / np.maximum(length, least))
+    return found
+
+
+def _by_place(a: tuple[FloatArray, BoolArray], b: tuple[FloatArray, BoolArray], pairs: IntArray) -> IntArray:
+    """Pair what is each other's nearest and far nearer than the next neighbour of either.
+
+    Args:
+        a: places in a's frame, (n, 3), and which are known, (n,).
+        b: places in a's frame, and which are known.
+        pairs: what is paired already.
+    """
+    rows_a = np.flatnonzero(a[1] & _free(len(a[0]), pairs[:, 0]))
+    rows_b = np.flatnonzero(b[1] & _free(len(b[0]), pairs[:, 1]))
+    if not len(rows_a) or not len(rows_b):
+        return np.empty((0, 2), dtype=np.int64)
+    ours, theirs = a[0][rows_a], b[0][rows_b]
+    tree_a, tree_b = cKDTree(ours), cKDTree(theirs)
+    distance, there = tree_b.query(ours)
+    back = tree_a.query(theirs)[1]
+    k = np.flatnonzero(back[there] == np.arange(len(ours)))
+    good = distance[k] < AMBIGUOUS * np.minimum(_spacing(a, rows_a[k]), _spacing(b, rows_b[there[k]]))
+    found: IntArray = np.stack([rows_a[k], rows_b[there[k]]], axis=1)[good]
+    return found
+
+
+def _spacing(one: tuple[FloatArray, BoolArray], rows: IntArray) -> FloatArray:
+    """Return the distance of each to its nearest neighbour in its own result; infinite for a single one."""
+    places = one[0][one[1]]
+    if len(places) < 2:
+        return np.full(len(rows), np.inf)
+    return np.asarray(cKDTree(places).query(one[0][rows], k=2)[0][:, 1])

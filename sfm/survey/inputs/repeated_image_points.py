@@ -1,0 +1,77 @@
+"""Image points that stand more than once in a table: one point measured twice in one photograph."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import stats
+
+from sfm.conventions import BoolArray, IntArray
+from sfm.network import ImagePoints
+
+ALPHA = 0.001  # probability with which measurements that say the same are taken for contradicting ones
+MOST_NAMES = 5  # named in one line
+
+
+@dataclass(frozen=True)
+class Merged:
+    """Image points of which each stands once."""
+
+    image_points: ImagePoints
+    same: tuple[tuple[int, int], ...]  # (photograph, point) of identical ones, merged
+    averaged: tuple[tuple[int, int], ...]  # of those that differ by no more than chance, averaged
+    dropped: tuple[tuple[int, int], ...]  # of those that contradict one another, left out
+    dropped_rows: int  # image points that are left out
+
+    def lines(self, images: tuple[str, ...], points: tuple[str, ...]) -> tuple[str, ...]:
+        """Return what was done, one line for each kind."""
+        kinds = (
+            (self.same, "identical ones were merged"),
+            (self.averaged, "they differ by no more than chance and were averaged"),
+            (self.dropped, "they contradict one another and were left out"),
+        )
+        out = []
+        for pairs, done in kinds:
+            named = ", ".join(f"{points[j]} in {images[i]}" for i, j in pairs[:MOST_NAMES])
+            more = f" and {len(pairs) - MOST_NAMES} more" if len(pairs) > MOST_NAMES else ""
+            if pairs:
+                out.append(f"image points that stand more than once: {named}{more}; {done}")
+        return tuple(out)
+
+
+def merge_repeated(seen: ImagePoints) -> Merged:
+    """Return image points of which each stands once in its photograph, where it stood first.
+
+    Identical positions are one measurement that was written twice. Different ones are two measurements:
+    their weighted mean, if a chi-square test of their differences passes; else nobody knows which is right.
+    """
+    key = seen.image * (int(seen.point.max(initial=0)) + 1) + seen.point
+    _, first, group, count = np.unique(key, return_index=True, return_inverse=True, return_counts=True)
+    if (count == 1).all():
+        return Merged(seen, (), (), (), 0)
+    xy, covariance = seen.xy.copy(), seen.covariance.copy()
+    keep: BoolArray = np.zeros(len(seen), dtype=bool)
+    keep[first] = True
+    kinds: tuple[list[tuple[int, int]], ...] = ([], [], [])
+    dropped = 0
+    for g in np.flatnonzero(count > 1):
+        rows: IntArray = np.flatnonzero(group == g)
+        one = rows[0]
+        different = np.unique(seen.xy[rows], axis=0, return_index=True)[1]
+        kind = 0
+        if len(different) > 1:
+            P = np.linalg.inv(seen.covariance[rows[different]])
+            Q = np.linalg.inv(P.sum(axis=0))
+            mean = Q @ np.einsum("nab,nb->a", P, seen.xy[rows[different]])
+            d = seen.xy[rows[different]] - mean
+            chi2 = float(np.einsum("na,nab,nb->", d, P, d))
+            kind = 1 if chi2 <= stats.chi2.ppf(1 - ALPHA, 2 * (len(different) - 1)) else 2
+            xy[one], covariance[one] = mean, Q
+        if kind == 2:
+            keep[one] = False
+            dropped += len(rows)
+        kinds[kind].append((int(seen.image[one]), int(seen.point[one])))
+    merged = ImagePoints(seen.image, seen.point, xy, covariance, seen.stated).select(keep)
+    same, averaged, contradicting = (tuple(pairs) for pairs in kinds)
+    return Merged(merged, same, averaged, contradicting, dropped)

@@ -1,0 +1,172 @@
+"""Congruency of two results: one datum for both, points that moved, nothing lost to the datum of either."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+from itertools import combinations_with_replacement
+
+import numpy as np
+import pytest
+
+from sfm.adjustment.covariance import marginal_of
+from sfm.adjustment.datum import Datum
+from sfm.adjustment.solve import adjust
+from sfm.camera import project
+from sfm.comparison.congruency import congruency, motions
+from sfm.comparison.significance import ResultComparison, compare_results
+from sfm.conventions import FloatArray
+from sfm.errors import GeometryError
+from sfm.network import Estimate, Network
+from sfm.report.differences import words_of_scale, words_of_test
+from sfm.stored_result import StoredResult
+from tests.synthetic import make_network, seed_of
+
+DATUMS = ("free", "minimal", "control")
+PAIRS = tuple(combinations_with_replacement(DATUMS, 2))
+CONTROL = ("1", "10", "20", "30", "40", "50")
+MOVED = [5, 17, 22, 41, 58]
+
+
+@cache
+def scene() -> tuple[Network, Estimate]:
+    return make_network(seed_of("congruency"), images=8, points=60, model="opencv", noise_px=0.0)
+
+
+def epoch(seed: int, datum: str, shift: FloatArray | None = None, *, bar: float = 1.0) -> StoredResult:
+    """One epoch, adjusted in a datum; its scale bar is `bar` times as long as stated."""
+    network, truth = scene()
+    rng = np.random.default_rng(seed)
+    moved = truth if shift is None else replace(truth, points=truth.points + shift)
+    seen = network.image_points
+    xy = np.array(seen.xy)
+    for i in range(len(network.images)):
+        rows = seen.image == i
+        xy[rows] = project(
+            moved.cameras[0], moved.position[i], moved.rotation[i], moved.points[seen.point[rows]]
+        )
+    xy += 0.1 * rng.standard_normal(xy.shape)
+    network = replace(network, image_points=replace(seen, xy=xy))
+    length = float(np.linalg.norm(moved.points[3] - moved.points[43])) * bar
+    network = network.with_scale_bar("4", "44", length + 1e-4 * rng.standard_normal(), 1e-4)
+    kind = Datum(datum, points=[["1", "2", "3"], ["7", "15", "33"]][seed % 2] if datum == "minimal" else None)
+    if datum == "control":
+        given = moved.points[[int(name) - 1 for name in CONTROL]] + 0.001 * rng.standard_normal((6, 3))
+        network = network.with_control(CONTROL, given, 0.001)
+    a = adjust(network, moved, datum=kind, sigma_px=0.1, reject="none")
+    covariance = marginal_of(a).joint(np.zeros(0, dtype=np.int64), np.arange(60))
+    return StoredResult(
+        *(f"{datum} {seed}", network, a.estimate, a.covariance.points, None, None, a.redundancy, "m"),
+        covariance=covariance,
+        datum=a.datum,
+    )
+
+
+def compared(first: str, second: str, shift: FloatArray | None = None) -> ResultComparison:
+    return compare_results(epoch(4, first), epoch(5, second, shift))
+
+
+def test_the_statistic_does_not_depend_on_the_datum() -> None:
+    """Free and minimal are S-transformations of one another; weak control adds observations of its own."""
+    statistics = {pair: compared(*pair).global_statistic for pair in combinations_with_replacement(DATUMS, 2)}
+    free = statistics["free", "free"]
+    assert statistics["free", "minimal"] == pytest.approx(free, rel=1e-4)
+    assert statistics["minimal", "minimal"] == pytest.approx(free, rel=1e-4)
+    for statistic in statistics.values():  # 174 degrees of freedom: a standard deviation of 0.11
+        assert abs(statistic - 1) < 0.4
+
+
+@pytest.mark.parametrize("datums", PAIRS)
+def test_points_that_moved_are_found_and_no_others(datums: tuple[str, str]) -> None:
+    shift = np.zeros((60, 3))
+    shift[MOVED] = [0.004, -0.002, 0.003]
+    found = compared(*datums, shift)
+    assert found.changed is True and found.majority
+    assert list(np.flatnonzero(found.significant)) == MOVED
+    assert found.point_difference[MOVED] == pytest.approx(shift[MOVED], abs=1.5e-3)
+    still = np.setdiff1d(np.arange(60), MOVED)
+    assert np.abs(found.point_difference[still] / found.point_sigma[still]).max() < 4.5
+    assert words_of_test(found) == ("The points differ significantly: 5 of 60 moved.", "bad")
+
+
+def test_a_change_of_size_is_a_change_where_both_have_a_scale() -> None:
+    longer = epoch(3, "free", bar=1.01)
+    found = compare_results(epoch(2, "free"), longer)
+    assert found.changed is True and found.a_from_b.scale == 1.0
+    assert words_of_scale(found) == "scale kept: both results have one"
+    unscaled = compare_results(epoch(2, "free"), replace(longer, unit=""))
+    assert unscaled.changed is False and unscaled.scale_estimated
+    assert unscaled.a_from_b.scale == pytest.approx(1 / 1.01, rel=1e-3)
+    assert words_of_scale(unscaled).startswith("scale estimated, 0.99")
+
+
+def test_units_are_carried_over() -> None:
+    metres = epoch(2, "free")
+    thousand = replace(
+        metres.estimate, points=1000 * metres.estimate.points, position=1000 * metres.estimate.position
+    )
+    assert metres.covariance is not None and metres.point_covariance is not None
+    millimetres = replace(
+        metres,
+        estimate=thousand,
+        unit="mm",
+        point_covariance=1e6 * metres.point_covariance,
+        covariance=1e6 * metres.covariance,
+    )
+    found = compare_results(metres, millimetres)
+    assert found.a_from_b.scale == 1e-3
+    assert np.abs(found.point_difference).max() < 1e-12
+
+
+def test_without_a_common_datum_or_correlations_no_verdict_is_given() -> None:
+    first, second = epoch(2, "minimal"), epoch(3, "minimal")
+    assert compare_results(first, second, align="none").untested == "no common datum"
+    found = compare_results(replace(first, covariance=None), replace(second, covariance=None))
+    assert found.changed is None and "covariance between the points" in words_of_test(found)[0]
+    approximate = compare_results(*(replace(epoch(k, "free"), covariance=None) for k in (2, 3)))
+    assert approximate.approximate and approximate.changed is False
+    held = compare_results(epoch(2, "control"), epoch(3, "control"), align="none")
+    assert held.changed is False and held.statistic.shape == (60,)
+
+
+def test_the_motion_of_the_whole_is_no_change() -> None:
+    rng = seed_of("motions")
+    xyz = rng.uniform(-1, 1, (12, 3))
+    A = rng.standard_normal((36, 36))
+    Q = A @ A.T
+    G = motions(xyz)
+    whole = (G @ rng.standard_normal(7)).reshape(12, 3)
+    found = congruency(whole, Q, xyz, motion="similarity")
+    assert found.global_statistic < 1e-20 and np.abs(found.difference).max() < 1e-12
+    grown = G[:, 6].reshape(12, 3)
+    assert congruency(100 * grown, Q, xyz, motion="rigid").global_statistic > 1
+
+
+def test_the_drop_of_omega_is_that_of_leaving_the_point_out() -> None:
+    rng = seed_of("drop")
+    xyz = rng.uniform(-1, 1, (10, 3))
+    A = rng.standard_normal((30, 30))
+    Q, d = A @ A.T, rng.standard_normal((10, 3))
+    whole = congruency(d, Q, xyz, alpha=1e-12)
+    for k in range(10):
+        rest = np.delete(np.arange(10), k)
+        rows = (3 * rest[:, None] + np.arange(3)).ravel()
+        part = congruency(d[rest], Q[np.ix_(rows, rows)], xyz[rest], alpha=1e-12)
+        drop = whole.global_statistic * 24 - part.global_statistic * 21
+        assert whole.statistic[k] * 3 == pytest.approx(drop, rel=1e-6)
+
+
+def test_too_few_points_are_refused() -> None:
+    with pytest.raises(GeometryError, match="congruency: 3 points, expected 4 or more"):
+        congruency(np.zeros((3, 3)), np.eye(9), np.eye(3))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("datums", PAIRS)
+def test_false_alarms_are_as_rare_as_stated(datums: tuple[str, str]) -> None:
+    """200 pairs of epochs without a change: 10 alarms expected, with a standard deviation of 3.1."""
+    alarms = sum(
+        bool(compare_results(epoch(2 * r, datums[0]), epoch(2 * r + 1, datums[1])).changed)
+        for r in range(10, 210)
+    )
+    assert 1 <= alarms <= 20

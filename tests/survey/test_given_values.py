@@ -1,0 +1,212 @@
+"""Given approximate values: adjusted first, judged after; the free datum is that of the given coordinates."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from datasets.camcal.reference import prepare
+from sfm.errors import SurveyFileError
+from sfm.network import Estimate, Network
+from sfm.pipeline import run_survey
+from sfm.report.findings.findings import findings_of
+from sfm.report.tables.csv_files import write_tables
+from sfm.result import SurveyResult
+from sfm.similarity import fit_similarity
+from sfm.survey.inputs.given import (
+    KnownPoints,
+    ScaleBar,
+    StartOrientations,
+    read_exterior,
+    read_points,
+    read_start_cameras,
+)
+from sfm.survey.inputs.start import measurements_from_observations
+from sfm.survey.inputs.survey import CameraSetup, Survey, read_survey
+from tests.places import DATASETS, SHARED
+from tests.surveys import survey_of
+from tests.synthetic import make_network, seed_of
+
+CAMCAL, RETRO = SHARED / "data" / "camcal", SHARED / "data" / "retro-panel"
+FREE = ("c", "x0", "y0", "K1", "K2", "P1", "P2")
+SAME = 1e-6  # standard deviations
+
+
+@pytest.mark.parametrize("reject", ["tau", "tukey", "huber"])
+@pytest.mark.parametrize("name", ["six", "eight", "nine"])
+def test_a_photograph_with_five_good_points_and_a_wild_one_is_kept(reject: str, name: str) -> None:
+    network, truth = _with_a_wild_point(name)
+    result = run_survey(survey_of(network, truth, start=truth, adjust={"reject": reject}))
+    i = result.network.image_index("image 8")
+    rows = result.network.image_points.image == i
+    residual = np.linalg.norm(result.adjustment.residuals[rows], axis=1)
+    assert result.adjustment.converged and len(residual) == 6
+    assert sorted(residual)[4] < 1.0 and max(residual) > 2000
+    sigma = np.sqrt(np.diagonal(result.adjustment.covariance.exterior[i])[:3])
+    index = [network.point_index(point) for point in result.network.points]
+    placing = fit_similarity(result.estimate.points, truth.points[index])
+    error = placing.apply(result.estimate.position[i]) - truth.position[7]
+    assert np.abs(error).max() < 5 * placing.scale * sigma.max()
+
+
+def _with_a_wild_point(name: str) -> tuple[Network, Estimate]:
+    """Eight photographs, the last with six image points of which one is 2,865 px wrong."""
+    network, truth = make_network(seed_of(name), images=8, points=60, visibility=0.8)
+    seen = network.image_points
+    keep = np.ones(len(seen), dtype=bool)
+    keep[np.flatnonzero(seen.image == 7)[6:]] = False
+    seen = seen.select(keep)
+    xy = seen.xy.copy()
+    xy[np.flatnonzero(seen.image == 7)[2]] += (2500, -1400)
+    return replace(network, image_points=replace(seen, xy=xy)), truth
+
+
+def test_a_photograph_with_a_wrong_given_orientation_is_oriented_anew_and_told() -> None:
+    network, truth = make_network(seed_of("wrong one"), images=8, points=40)
+    rotation, position = truth.rotation.copy(), truth.position.copy()
+    rotation[3], position[3] = rotation[6], position[6]
+    result = run_survey(survey_of(network, truth, start=replace(truth, position=position, rotation=rotation)))
+    assert len(result.network.images) == 8 and result.adjustment.converged
+    assert findings_of(result).longest.over_sigma < 6
+    assert any("image 4: the given orientation was replaced" in line for line in result.warnings)
+
+
+def test_a_photograph_of_three_points_with_a_given_orientation_takes_part() -> None:
+    network, truth = make_network(seed_of("three points"), images=8, points=40)
+    seen = network.image_points
+    keep = np.ones(len(seen), dtype=bool)
+    keep[np.flatnonzero(seen.image == 7)[3:]] = False
+    network = replace(network, image_points=seen.select(keep))
+    result = run_survey(survey_of(network, truth, start=truth))
+    assert "image 8" in result.network.images and result.failed == ()
+    without = run_survey(survey_of(network, truth))
+    assert [one.image for one in without.failed] == ["image 8"]
+
+
+def _restart(survey: Survey, folder: Path, *, cameras: bool = True) -> tuple[SurveyResult, float]:
+    """Return the result of a survey, and by how many sigmas it moves when started from its own tables."""
+    first = run_survey(survey)
+    folder.mkdir()
+    write_tables(findings_of(first), folder)
+    again = run_survey(
+        replace(
+            survey,
+            start_orientations=read_exterior(folder / "images.csv"),
+            start_points=read_points(folder / "points.csv"),
+            start_cameras=read_start_cameras(folder / "cameras.csv") if cameras else None,
+        )
+    )
+    assert again.network.points == first.network.points and again.adjustment.converged
+    assert (again.adjustment.rejected == first.adjustment.rejected).all()
+    sigma = np.sqrt(np.diagonal(first.adjustment.covariance.points, axis1=1, axis2=2))
+    moved = np.abs(again.estimate.points - first.estimate.points)
+    return first, float((moved[sigma > 0] / sigma[sigma > 0]).max())
+
+
+@pytest.mark.parametrize("what", ["cameras", "no cameras", "bars", "check", "two", "control", "minimal"])
+def test_a_restart_from_the_own_result_reproduces_it(what: str, tmp_path: Path) -> None:
+    rng = seed_of("restart")
+    network, truth = make_network(rng, images=10, points=40, visibility=0.6)
+    X = truth.points
+
+    def length(i: int, j: int) -> float:
+        return float(np.linalg.norm(X[i] - X[j]) + 1e-5 * rng.standard_normal())
+
+    def control(count: int) -> KnownPoints:
+        noisy = X[:count] + 1e-5 * rng.standard_normal((count, 3))
+        return KnownPoints.from_arrays([str(k + 1) for k in range(count)], noisy, 1e-5)
+
+    given: dict[str, object] = {}
+    if what == "bars":
+        ends = ((0, 1), (2, 3), (4, 5))
+        given = {"scale_bars": tuple(ScaleBar(str(i + 1), str(j + 1), length(i, j), 1e-5) for i, j in ends)}
+    elif what in ("check", "two", "control"):
+        given = {"control": control(2 if what == "two" else 5)}
+    if what in ("control", "minimal"):
+        given["datum"] = {"kind": what}
+    survey = survey_of(network, truth, free=FREE, **given)
+    _, moved = _restart(survey, tmp_path / "first", cameras=what == "cameras")
+    assert moved < SAME
+
+
+def test_inner_constraints_refer_to_the_given_coordinates() -> None:
+    rng = seed_of("frame")
+    network, truth = make_network(rng, images=10, points=40)
+    given = truth.points + 0.003 * rng.standard_normal(truth.points.shape)
+    start = replace(truth, points=given)
+    result = run_survey(survey_of(network, truth, free=FREE, start=start))
+    index = [network.point_index(point) for point in result.network.points]
+    d, X = result.estimate.points - given[index], result.estimate.points
+    for moment in (d.sum(axis=0), np.cross(X, d).sum(axis=0), (X * d).sum()):
+        np.testing.assert_allclose(moment, 0, atol=1e-9)
+
+
+@pytest.mark.skipif(not CAMCAL.exists(), reason="../shared/data/camcal is absent")
+@pytest.mark.parametrize("name", ["reference_free", "reference_fixed"])
+def test_camcal_restarts(name: str, tmp_path: Path) -> None:
+    prepare(CAMCAL, tmp_path / "camcal")
+    survey = read_survey(tmp_path / "camcal" / f"{name}.toml")
+    _, moved = _restart(survey, tmp_path / "first", cameras=False)
+    assert moved < SAME
+
+
+@pytest.mark.skipif(not RETRO.exists(), reason="../shared/data/retro-panel is absent")
+def test_retro_panel_restarts(tmp_path: Path) -> None:
+    (tmp_path / "points.csv").write_text(_retro_points(), encoding="utf-8")
+    text = (DATASETS / "retro-panel" / "survey.toml").read_text("utf-8")
+    head, tail = text.split("[targets]")
+    file = tmp_path / "survey.toml"
+    file.write_text(head + '[observations]\nfile = "points.csv"\n[datum]' + tail.split("[datum]")[1], "utf-8")
+    first, moved = _restart(read_survey(file), tmp_path / "first", cameras=False)
+    assert moved < SAME and len(first.network.points) > 50
+
+
+def _retro_points() -> str:
+    """MicMac's image points in the columns of [observations]."""
+    return (RETRO / "reference-image-points.csv").read_text("utf-8")
+
+
+def test_start_values_of_cameras_are_read_and_refused(tmp_path: Path) -> None:
+    network, truth = make_network(seed_of("start"), images=6, points=20)
+    survey = survey_of(network, truth, free=("c", "K1"))
+    table = tmp_path / "cameras.csv"
+
+    def started(text: str) -> Survey:
+        table.write_text(text, encoding="utf-8")
+        return replace(survey, start_cameras=read_start_cameras(table))
+
+    good = started("camera,parameter,value,sigma,unit\nsynthetic,c,10.1,,mm\nsynthetic,K1,8e-4,1e-6,mm^-2\n")
+    assert run_survey(good).adjustment.converged
+    with pytest.raises(SurveyFileError, match=r"line 2: camera 'other' is none of the survey's"):
+        run_survey(started("camera,parameter,value\nother,c,10.1\n"))
+    with pytest.raises(SurveyFileError, match="stands on line 2 already"):
+        started("camera,parameter,value\nsynthetic,c,10.1\nsynthetic,c,10.1\n")
+    settings = {"name": "a", "images": "*", "size_px": [100, 80], "pixel_mm": [0.01, 0.01]}
+    with pytest.raises(SurveyFileError, match="'K1' is not in free"):
+        Survey(
+            name="x",
+            cameras=(CameraSetup(**settings, c_mm=10.0, free=["c"], start={"K1": 1e-4}),),
+            observations=survey.observations,
+        )
+
+
+def test_start_values_of_distortion_are_where_the_adjustment_begins() -> None:
+    network, truth = make_network(seed_of("lens"), images=6, points=20)
+    survey = survey_of(network, truth, free=("c", "K1", "K2"))
+    camera = survey.cameras[0].model_copy(update={"start": (("K1", 8e-4), ("K2", -4e-6))})
+    measured = measurements_from_observations(replace(survey, cameras=(camera,)))
+    assert measured.cameras[0].value("K1") == 8e-4 and measured.cameras[0].value("K2") == -4e-6
+    assert measurements_from_observations(survey).cameras[0].value("K1") == 0.0
+
+
+def test_start_orientations_alone_are_enough() -> None:
+    network, truth = make_network(seed_of("alone"), images=6, points=20)
+    survey = survey_of(network, truth, start=replace(truth, points=np.full_like(truth.points, np.nan)))
+    assert isinstance(survey.start_orientations, StartOrientations) and survey.start_points is None
+    result = run_survey(survey)
+    np.testing.assert_allclose(  # the frame is that of the given stations
+        result.estimate.position.mean(axis=0), truth.position.mean(axis=0), atol=1e-9
+    )

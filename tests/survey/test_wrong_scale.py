@@ -1,0 +1,93 @@
+"""Wrong bars and wrong control never end as fair: both of two are named, neither is believed."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from sfm.network import Estimate, Network
+from sfm.pipeline import run_survey
+from sfm.report.findings.findings import findings_of
+from sfm.survey.inputs.given import KnownPoints, ScaleBar
+from tests.surveys import survey_of
+from tests.synthetic import make_network, seed_of
+
+
+def _scene(name: str) -> tuple[Network, Estimate]:
+    return make_network(seed_of(name), images=8, points=30, visibility=0.8)
+
+
+def _bars(truth: Estimate, factors: list[float]) -> tuple[ScaleBar, ...]:
+    def length(b: int) -> float:
+        return float(np.linalg.norm(truth.points[b] - truth.points[b + 10]))
+
+    return tuple(
+        ScaleBar(str(b + 1), str(b + 11), factor * length(b), 1e-4 * max(1.0, factor))
+        for b, factor in enumerate(factors)
+    )
+
+
+@pytest.mark.parametrize("reject", ["tau", "none"])
+@pytest.mark.parametrize("factor", [0.1, 1.02, 10.0, 1000.0])
+def test_of_two_bars_neither_is_believed(factor: float, reject: str) -> None:
+    network, truth = _scene("two bars")
+    survey = survey_of(network, truth, scale_bars=_bars(truth, [1.0, factor]), adjust={"reject": reject})
+    result = run_survey(survey)
+    verdict = findings_of(result).verdict
+    assert verdict.level == "bad" and result.adjustment.converged
+    told = " ".join((*verdict.remarks, *result.warnings))
+    if factor != 1.02 or reject == "tau":
+        assert "1 - 11" in told and "2 - 12" in told
+    if factor != 1.02:
+        assert len(result.network.scale_bars) == 0 and len(result.taken_out) == 2
+        assert any("scale is undefined" in line for line in result.warnings)
+        assert findings_of(result).sigma0.ratio < 1.2  # nothing is bent
+
+
+@pytest.mark.parametrize("factor", [0.5, 10.0, 1000.0])
+def test_of_three_bars_the_wrong_one_is_taken_out_and_told_as_bad(factor: float) -> None:
+    network, truth = _scene("three bars")
+    result = run_survey(survey_of(network, truth, scale_bars=_bars(truth, [1.0, factor, 1.0])))
+    assert [one.what for one in result.taken_out] == ["scale bar 2 - 12"]
+    assert result.network.points[result.network.scale_bars.start[0]] == "1"
+    index = [network.point_index(name) for name in result.network.points]
+    size = np.linalg.norm(np.ptp(result.estimate.points, axis=0)) / np.linalg.norm(
+        np.ptp(truth.points[index], axis=0)
+    )
+    assert 0.5 < size < 2
+    assert findings_of(result).verdict.level == "bad"  # as where it is kept
+
+
+@pytest.mark.parametrize("reject", ["tau", "none"])
+def test_control_that_is_too_large_for_both_bars_is_bad(reject: str) -> None:
+    network, truth = _scene("large control")
+    names = [str(k + 1) for k in range(20, 26)]
+    control = KnownPoints.from_arrays(names, 1.01 * truth.points[20:26], 1e-4)
+    survey = survey_of(
+        network,
+        truth,
+        control=control,
+        scale_bars=_bars(truth, [1.0, 1.0]),
+        datum={"kind": "control"},
+        adjust={"reject": reject},
+    )
+    assert findings_of(run_survey(survey)).verdict.level == "bad"
+
+
+@pytest.mark.parametrize("reject", ["tau", "none"])
+def test_right_bars_and_control_are_no_remark(reject: str) -> None:
+    network, truth = _scene("right")
+    rng = seed_of("right noise")
+    names = [str(k + 1) for k in range(20, 26)]
+    noisy = truth.points[20:26] + 1e-4 * rng.standard_normal((6, 3))
+    survey = survey_of(
+        network,
+        truth,
+        control=KnownPoints.from_arrays(names, noisy, 1e-4),
+        scale_bars=_bars(truth, [1.0, 1.0]),
+        datum={"kind": "control"},
+        adjust={"reject": reject},
+    )
+    result = run_survey(survey)
+    assert result.taken_out == () and len(result.network.scale_bars) == 2
+    assert findings_of(result).verdict.level == "good"
