@@ -42,7 +42,7 @@ def refine(
         refuse_existing(out)
     with working_on(str(model)):
         network, estimate = read_model(model)
-    with drawn_progress() as progress:
+    with working_on(str(model)), drawn_progress() as progress:
         found = refine_model(
             network, estimate, images, window_px=window, min_correlation=min_correlation, progress=progress
         )

@@ -122,7 +122,13 @@ def _run_survey(
     if from_photographs:
         store = TargetStore.of_user()
         store.remove_old()
-    with drawn_progress() as drawn, one_blas_thread(), _written(folder), SurveyLog(watch=drawn) as log:
+    with (
+        working_on(str(survey_file)),
+        drawn_progress() as drawn,
+        one_blas_thread(),
+        _written(folder),
+        SurveyLog(watch=drawn) as log,
+    ):
         log.start(survey.name, survey_file)
         result = run_survey(survey, images_dir=images, jobs=workers, others=others, store=store, progress=log)
         findings = findings_of(result)

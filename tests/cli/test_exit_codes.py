@@ -113,7 +113,7 @@ def test_memory_that_is_not_enough_says_for_which_photograph(
     monkeypatch.setattr("sfm.survey.measuring.targets.find_targets", raising(error))
     code, (line,) = kolinear(monkeypatch, capsys, "run", survey, "--out", tmp_path / "out", "--jobs", 1)
     own = f" ({error})" if str(error) else ""
-    assert line == f"kolinear: not enough memory for photograph photo 1.png, stage targets{own}"
+    assert line == f"kolinear: not enough memory for photograph photo 1.png, stage targets, {survey}{own}"
     assert code == 2
     assert [path.name for path in tmp_path.iterdir()] == ["survey"]
 
@@ -141,7 +141,7 @@ def test_errors_of_kolinear_are_told_as_they_are() -> None:
 
 
 @pytest.mark.parametrize(
-    "place", ["batch.survey.measure_photograph", "batch.run.read_survey", "batch.run.fingerprint"]
+    "place", ["batch.job.measure_photograph", "batch.run.read_survey", "batch.run.fingerprint"]
 )
 def test_a_fault_in_one_survey_of_a_batch_fails_it_alone(
     place: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
