@@ -16,7 +16,7 @@ from sfm.errors import SurveyFileError
 from sfm.kernels.options import compiled
 
 FIXED_POINT_STEPS = 100
-PIXEL_TOLERANCE = 1e-11
+PIXEL_TOLERANCE = 1e-10
 
 
 @dataclass(frozen=True)
@@ -72,9 +72,17 @@ class Camera:
 
     @property
     def frame(self) -> FloatArray:
-        """Centre of the photograph (px) and pixel size (mm) as compiled code takes them, (4,)."""
+        """Centre (px), pixel size (mm) and plane of residuals as compiled code takes them, (5,)."""
         width, height = self.size_px
-        return np.array([(width - 1) / 2, (height - 1) / 2, self.pixel_mm[0], self.pixel_mm[1]])
+        plane = 0.0 if MODELS[self.model].corrected_plane else 1.0
+        return np.array([(width - 1) / 2, (height - 1) / 2, self.pixel_mm[0], self.pixel_mm[1], plane])
+
+    @property
+    def linear_frame(self) -> FloatArray:
+        """`frame` with residuals in the corrected plane, where those of corrections are linear in the ray."""
+        frame = self.frame
+        frame[4] = 0.0
+        return frame
 
     @property
     def c_px(self) -> float:
@@ -200,7 +208,7 @@ def tangents_from_pixel(camera: Camera, xy_px: FloatArray) -> FloatArray:
     Source: collinearity, Kraus (2007), sec. 4.2.1; the distortion model of the camera (`sfm.distortion`).
     """
     xy = np.ascontiguousarray(xy_px, dtype=float).reshape(-1, 2)
-    return _tangents(camera.index, camera.frame, camera.parameters, xy)
+    return _tangents(camera.index, camera.linear_frame, camera.parameters, xy)
 
 
 def pixel_from_tangents(camera: Camera, uv: FloatArray) -> FloatArray:
@@ -214,7 +222,7 @@ def pixel_from_tangents(camera: Camera, uv: FloatArray) -> FloatArray:
         Pixel coordinates, shape (k, 2), px; NaN where the distortion folds over.
     """
     rays = np.ascontiguousarray(uv, dtype=float).reshape(-1, 2)
-    return _pixels(camera.index, camera.frame, camera.parameters, rays)
+    return _pixels(camera.index, camera.linear_frame, camera.parameters, rays)
 
 
 def project(camera: Camera, position: FloatArray, rotation: FloatArray, points: FloatArray) -> FloatArray:
@@ -261,7 +269,7 @@ def pixel_jacobian(camera: Camera, xy_px: FloatArray) -> FloatArray:
 
 @compiled
 def _tangents(model: int, frame: FloatArray, p: FloatArray, xy: FloatArray) -> FloatArray:
-    """Return the tangents by Newton's method; one step is exact for `brown`, which is linear in u, v."""
+    """Return the tangents by Newton's method; one step is exact for corrections, which are linear in u, v."""
     residual, Ju, Jp = np.empty(2), np.empty((2, 2)), np.empty((2, MAX_PARAMETERS))
     uv = np.empty_like(xy)
     for i in range(len(xy)):
@@ -287,7 +295,7 @@ def _tangents(model: int, frame: FloatArray, p: FloatArray, xy: FloatArray) -> F
 
 @compiled
 def _pixels(model: int, frame: FloatArray, p: FloatArray, uv: FloatArray) -> FloatArray:
-    """Return the pixels by the fixed point x <- x + residual(x), which gradients of distortion contract."""
+    """Return the pixels by the fixed point x <- x + residual(x), which distortion contracts."""
     residual, Ju, Jp = np.empty(2), np.empty((2, 2)), np.empty((2, MAX_PARAMETERS))
     xy = np.empty_like(uv)
     for i in range(len(uv)):

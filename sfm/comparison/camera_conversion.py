@@ -84,9 +84,9 @@ def convert_camera(
     start = start.with_parameters(np.where(fitted, start.parameters, 0.0))
     # The start is scaled by the effect of each parameter in px, so that the tolerance means the same to all.
     fit = least_squares(
-        lambda p: _residuals(start.index, start.frame, _filled(p, fitted), xy, uv)[0].ravel(),
+        lambda p: _residuals(start.index, start.linear_frame, _filled(p, fitted), xy, uv)[0].ravel(),
         start.parameters[fitted],
-        jac=lambda p: _residuals(start.index, start.frame, _filled(p, fitted), xy, uv)[1].reshape(
+        jac=lambda p: _residuals(start.index, start.linear_frame, _filled(p, fitted), xy, uv)[1].reshape(
             2 * len(xy), -1
         )[:, fitted],
         method="lm",

@@ -1,4 +1,10 @@
-"""The models of photogrammetry, in mm: corrections of the measured point, or distortion of the ideal one.
+"""Corrections of the measured point in mm, with residuals in the measured or in the corrected plane.
+
+In the measured plane, where frame[4] is 1, the point is found whose correction meets the ray, so that
+residuals are those of what was measured and its standard deviations are their weights. In the corrected
+plane, as DBAT has it (Boerlin and Grussenmeyer, 2013, Photogrammetric Record 28(144)), the residual is the
+difference between the ray and the corrected point: affinity and distortion that shrink that plane shrink v'Pv
+too, which biases them and all that is correlated with them (`tests/adjustment/test_plane_of_residuals.py`).
 
 Signs as PhotoModeler and DBAT. What a model fills is said in `sfm.distortion.models`.
 """
@@ -6,7 +12,15 @@ Signs as PhotoModeler and DBAT. What a model fills is said in `sfm.distortion.mo
 from __future__ import annotations
 
 from sfm.conventions import FloatArray
-from sfm.kernels.options import inlined
+from sfm.kernels.options import inlined, kernel
+
+LOCATED_PX = (
+    0.25  # Newton's step after which one more leaves nothing: its error is curvature times its square
+)
+STEPS = 20  # Newton's steps at most
+FOLDED = (
+    0.01  # determinant of d(corrected)/d(measured), 1 without distortion, below which corrections fold over
+)
 
 
 @inlined
@@ -19,35 +33,29 @@ def brown(
     Source: Brown (1971), Photogramm. Eng. 37(8); affinity before the distortion as DBAT's model 3:
     xb = (1 + b1)(x - x0) + b2 (y - y0), yb = y - y0; (xc, yc) = Brown(xb, yb) = c (u, v).
     """
-    sx, sy = frame[2], frame[3]
-    c, x0, y0, b1, b2 = p[0], p[1], p[2], p[8], p[9]
-    xm = (x - frame[0]) * sx - x0
-    yb = -(y - frame[1]) * sy - y0
-    xb = (1.0 + b1) * xm + b2 * yb
-    xc, yc, xx, xy, yy, r2 = _corrected(xb, yb, p)
-    fx, fy = 1.0 / sx, -1.0 / sy  # mm, y up -> px, y down
-    residual[0] = fx * (c * u - xc)
-    residual[1] = fy * (c * v - yc)
-    _pinhole_mm(fx, fy, c, u, v, Ju, Jp)
-    Jp[0, 1] = fx * xx * (1.0 + b1)
-    Jp[1, 1] = fy * xy * (1.0 + b1)
-    Jp[0, 2] = fx * (xx * b2 + xy)
-    Jp[1, 2] = fy * (xy * b2 + yy)
-    r4 = r2 * r2
-    Jp[0, 3] = -fx * xb * r2
-    Jp[1, 3] = -fy * yb * r2
-    Jp[0, 4] = -fx * xb * r4
-    Jp[1, 4] = -fy * yb * r4
-    Jp[0, 5] = -fx * xb * r4 * r2
-    Jp[1, 5] = -fy * yb * r4 * r2
-    Jp[0, 6] = -fx * (r2 + 2.0 * xb * xb)
-    Jp[1, 6] = -fy * 2.0 * xb * yb
-    Jp[0, 7] = -fx * 2.0 * xb * yb
-    Jp[1, 7] = -fy * (r2 + 2.0 * yb * yb)
-    Jp[0, 8] = -fx * xx * xm
-    Jp[1, 8] = -fy * xy * xm
-    Jp[0, 9] = -fx * xx * yb
-    Jp[1, 9] = -fy * xy * yb
+    c, a1, b2 = p[0], 1.0 + p[8], p[9]
+    K1, K2, K3, P1, P2 = p[3], p[4], p[5], p[6], p[7]
+    xm = (x - frame[0]) * frame[2] - p[1]
+    ym = -(y - frame[1]) * frame[3] - p[2]
+    carried = frame[4] > 0.0
+    xb, yb = a1 * xm + b2 * ym, ym
+    xh, yh = xm, ym
+    if carried:
+        xb, yb = _measured(xb, yb, c * u, c * v, LOCATED_PX * frame[2], K1, K2, K3, P1, P2)
+        xh, yh = (xb - b2 * yb) / a1, yb
+    xc, yc, xx, xy, yy, r2 = _corrected(xb, yb, K1, K2, K3, P1, P2)
+    # d(corrected)/d(measured), and its inverse in px: x right, y down
+    dxx, dxy, dyx, dyy = xx * a1, xx * b2 + xy, xy * a1, xy * b2 + yy
+    fxx, fxy, fyx, fyy = _inverse(carried, frame, dxx, dxy, dyx, dyy)
+    ex, ey = c * u - xc, c * v - yc
+    residual[0] = (xh - xm) / frame[2] + fxx * ex + fxy * ey
+    residual[1] = (ym - yh) / frame[3] + fyx * ex + fyy * ey
+    _pinhole(c, u, v, dxx, dxy, dyx, dyy, fxx, fxy, fyx, fyy, Ju, Jp)
+    _radial(xb, yb, r2, fxx, fxy, fyx, fyy, Jp)
+    _decentring(r2 + 2.0 * xb * xb, 2.0 * xb * yb, r2 + 2.0 * yb * yb, fxx, fxy, fyx, fyy, Jp)
+    gx, gy = fxx * xx + fxy * xy, fyx * xx + fyy * xy
+    Jp[0, 8], Jp[1, 8] = -gx * xh, -gy * xh
+    Jp[0, 9], Jp[1, 9] = -gx * yh, -gy * yh
 
 
 @inlined
@@ -59,99 +67,89 @@ def brown_affine(
 
     Source: DBAT's model 4: (xd, yd) = Brown(x - x0, y - y0), (1 + b1) xd + b2 yd = c u, yd = c v.
     """
-    sx, sy = frame[2], frame[3]
-    c, x0, y0, a1, b2 = p[0], p[1], p[2], 1.0 + p[8], p[9]
-    xm = (x - frame[0]) * sx - x0
-    ym = -(y - frame[1]) * sy - y0
-    xd, yd, xx, xy, yy, r2 = _corrected(xm, ym, p)
-    fx, fy = 1.0 / sx, -1.0 / sy
-    residual[0] = fx * (c * u - a1 * xd - b2 * yd)
-    residual[1] = fy * (c * v - yd)
-    _pinhole_mm(fx, fy, c, u, v, Ju, Jp)
-    Jp[0, 1] = fx * (a1 * xx + b2 * xy)
-    Jp[1, 1] = fy * xy
-    Jp[0, 2] = fx * (a1 * xy + b2 * yy)
-    Jp[1, 2] = fy * yy
-    power = r2
-    for s in range(3, 6):
-        Jp[0, s] = -fx * (a1 * xm + b2 * ym) * power
-        Jp[1, s] = -fy * ym * power
-        power *= r2
-    Jp[0, 6] = -fx * (a1 * (r2 + 2.0 * xm * xm) + b2 * 2.0 * xm * ym)
-    Jp[1, 6] = -fy * 2.0 * xm * ym
-    Jp[0, 7] = -fx * (a1 * 2.0 * xm * ym + b2 * (r2 + 2.0 * ym * ym))
-    Jp[1, 7] = -fy * (r2 + 2.0 * ym * ym)
-    Jp[0, 8] = -fx * xd
-    Jp[1, 8] = 0.0
-    Jp[0, 9] = -fx * yd
-    Jp[1, 9] = 0.0
+    c, a1, b2 = p[0], 1.0 + p[8], p[9]
+    K1, K2, K3, P1, P2 = p[3], p[4], p[5], p[6], p[7]
+    xm = (x - frame[0]) * frame[2] - p[1]
+    ym = -(y - frame[1]) * frame[3] - p[2]
+    carried = frame[4] > 0.0
+    xh, yh = xm, ym
+    if carried:
+        x_lens, y_lens = c * (u - b2 * v) / a1, c * v
+        xh, yh = _measured(xm, ym, x_lens, y_lens, LOCATED_PX * frame[2], K1, K2, K3, P1, P2)
+    xd, yd, xx, xy, yy, r2 = _corrected(xh, yh, K1, K2, K3, P1, P2)
+    dxx, dxy, dyx, dyy = a1 * xx + b2 * xy, a1 * xy + b2 * yy, xy, yy
+    fxx, fxy, fyx, fyy = _inverse(carried, frame, dxx, dxy, dyx, dyy)
+    ex, ey = c * u - a1 * xd - b2 * yd, c * v - yd
+    residual[0] = (xh - xm) / frame[2] + fxx * ex + fxy * ey
+    residual[1] = (ym - yh) / frame[3] + fyx * ex + fyy * ey
+    _pinhole(c, u, v, dxx, dxy, dyx, dyy, fxx, fxy, fyx, fyy, Ju, Jp)
+    # affinity and shear act on the corrections: (1 + b1) dx + b2 dy
+    gxx, gxy, gyx, gyy = fxx * a1, fxx * b2 + fxy, fyx * a1, fyx * b2 + fyy
+    _radial(xh, yh, r2, gxx, gxy, gyx, gyy, Jp)
+    _decentring(r2 + 2.0 * xh * xh, 2.0 * xh * yh, r2 + 2.0 * yh * yh, gxx, gxy, gyx, gyy, Jp)
+    Jp[0, 8], Jp[1, 8] = -fxx * xd, -fyx * xd
+    Jp[0, 9], Jp[1, 9] = -fxx * yd, -fyx * yd
 
 
 @inlined
-def brown_forward(
-    frame: FloatArray, p: FloatArray, x: float, y: float, u: float, v: float,
-    residual: FloatArray, Ju: FloatArray, Jp: FloatArray,
+def _pinhole(
+    c: float, u: float, v: float, dxx: float, dxy: float, dyx: float, dyy: float,
+    fxx: float, fxy: float, fyx: float, fyy: float, Ju: FloatArray, Jp: FloatArray,
 ) -> None:  # fmt: skip
-    """Distortion of the ideal point in mm: c, x0, y0, K1-K4, P1, P2, affinity b1, shear b2.
-
-    Source: Agisoft Metashape manual, app. D, frame camera (there in units of c), and AICON; in mm
-    X = c u, Y = c v, r2 = X^2 + Y^2, x = x0 + X (1 + K1 r2 + ... + K4 r8) + P1 (r2 + 2 X^2)
-    + 2 P2 X Y + b1 X + b2 Y, y = y0 + Y (1 + ...) + P2 (r2 + 2 Y^2) + 2 P1 X Y.
-    """
-    sx, sy = frame[2], frame[3]
-    c, x0, y0, K1, K2, K3, K4 = p[0], p[1], p[2], p[3], p[4], p[5], p[6]
-    P1, P2, b1, b2 = p[7], p[8], p[9], p[10]
-    X, Y = c * u, c * v
-    r2 = X * X + Y * Y
-    r4 = r2 * r2
-    r6 = r4 * r2
-    r8 = r4 * r4
-    radial = 1.0 + K1 * r2 + K2 * r4 + K3 * r6 + K4 * r8
-    slope = 2.0 * (K1 + 2.0 * K2 * r2 + 3.0 * K3 * r4 + 4.0 * K4 * r6)
-    xd = x0 + X * radial + P1 * (r2 + 2.0 * X * X) + 2.0 * P2 * X * Y + b1 * X + b2 * Y
-    yd = y0 + Y * radial + P2 * (r2 + 2.0 * Y * Y) + 2.0 * P1 * X * Y
-    xX = radial + slope * X * X + 6.0 * P1 * X + 2.0 * P2 * Y + b1
-    xY = slope * X * Y + 2.0 * P1 * Y + 2.0 * P2 * X + b2
-    yX = slope * X * Y + 2.0 * P1 * Y + 2.0 * P2 * X
-    yY = radial + slope * Y * Y + 6.0 * P2 * Y + 2.0 * P1 * X
-    fx, fy = 1.0 / sx, -1.0 / sy
-    residual[0] = fx * xd + frame[0] - x
-    residual[1] = fy * yd + frame[1] - y
-    Ju[0, 0] = fx * xX * c
-    Ju[0, 1] = fx * xY * c
-    Ju[1, 0] = fy * yX * c
-    Ju[1, 1] = fy * yY * c
-    Jp[0, 0] = fx * (xX * u + xY * v)
-    Jp[1, 0] = fy * (yX * u + yY * v)
-    Jp[0, 1] = fx
-    Jp[1, 1] = 0.0
-    Jp[0, 2] = 0.0
-    Jp[1, 2] = fy
-    Jp[0, 3] = fx * X * r2
-    Jp[1, 3] = fy * Y * r2
-    Jp[0, 4] = fx * X * r4
-    Jp[1, 4] = fy * Y * r4
-    Jp[0, 5] = fx * X * r6
-    Jp[1, 5] = fy * Y * r6
-    Jp[0, 6] = fx * X * r8
-    Jp[1, 6] = fy * Y * r8
-    Jp[0, 7] = fx * (r2 + 2.0 * X * X)
-    Jp[1, 7] = fy * 2.0 * X * Y
-    Jp[0, 8] = fx * 2.0 * X * Y
-    Jp[1, 8] = fy * (r2 + 2.0 * Y * Y)
-    Jp[0, 9] = fx * X
-    Jp[1, 9] = 0.0
-    Jp[0, 10] = fx * Y
-    Jp[1, 10] = 0.0
+    """Fill the derivatives by u and v, c, and x0 and y0, which move the corrected point by D."""
+    Ju[0, 0], Ju[1, 0] = fxx * c, fyx * c
+    Ju[0, 1], Ju[1, 1] = fxy * c, fyy * c
+    Jp[0, 0], Jp[1, 0] = fxx * u + fxy * v, fyx * u + fyy * v
+    Jp[0, 1], Jp[1, 1] = fxx * dxx + fxy * dyx, fyx * dxx + fyy * dyx
+    Jp[0, 2], Jp[1, 2] = fxx * dxy + fxy * dyy, fyx * dxy + fyy * dyy
 
 
 @inlined
-def _corrected(x: float, y: float, p: FloatArray) -> tuple[float, float, float, float, float, float]:
+def _inverse(
+    carried: bool, frame: FloatArray, dxx: float, dxy: float, dyx: float, dyy: float
+) -> tuple[float, float, float, float]:
+    """Return what carries differences in the corrected plane, mm, y up, to px, y down.
+
+    It is D^-1 with D = d(corrected)/d(measured): where e is left in the corrected plane, the point that
+    should have been measured is D^-1 e away, and with the unknowns it moves by D^-1 J. Where D folds over, or
+    differences are not to be carried to the measured plane, only the unit changes.
+    """
+    fx, fy = 1.0 / frame[2], -1.0 / frame[3]
+    det = dxx * dyy - dxy * dyx
+    if carried and det > FOLDED:
+        inverse = 1.0 / det
+        return fx * dyy * inverse, -fx * dxy * inverse, -fy * dyx * inverse, fy * dxx * inverse
+    return fx, 0.0, 0.0, fy
+
+
+@inlined
+def _radial(
+    x: float, y: float, r2: float, fxx: float, fxy: float, fyx: float, fyy: float, Jp: FloatArray
+) -> None:
+    """Fill the derivatives by K1, K2, K3."""
+    kx, ky = -(fxx * x + fxy * y) * r2, -(fyx * x + fyy * y) * r2
+    Jp[0, 3], Jp[1, 3] = kx, ky
+    Jp[0, 4], Jp[1, 4] = kx * r2, ky * r2
+    Jp[0, 5], Jp[1, 5] = kx * r2 * r2, ky * r2 * r2
+
+
+@inlined
+def _decentring(
+    xx: float, xy: float, yy: float, fxx: float, fxy: float, fyx: float, fyy: float, Jp: FloatArray
+) -> None:
+    """Fill the derivatives by P1 and P2 from r2 + 2 x^2, 2 x y and r2 + 2 y^2."""
+    Jp[0, 6], Jp[1, 6] = -(fxx * xx + fxy * xy), -(fyx * xx + fyy * xy)
+    Jp[0, 7], Jp[1, 7] = -(fxx * xy + fxy * yy), -(fyx * xy + fyy * yy)
+
+
+@inlined
+def _corrected(
+    x: float, y: float, K1: float, K2: float, K3: float, P1: float, P2: float
+) -> tuple[float, float, float, float, float, float]:
     """Return Brown's corrected point, its derivatives by the point (xx, xy = yx, yy) and r2.
 
     r2 = x^2 + y^2, xc = x (1 + K1 r2 + K2 r4 + K3 r6) + P1 (r2 + 2 x^2) + 2 P2 x y, yc likewise.
     """
-    K1, K2, K3, P1, P2 = p[3], p[4], p[5], p[6], p[7]
     r2 = x * x + y * y
     r4 = r2 * r2
     radial = 1.0 + K1 * r2 + K2 * r4 + K3 * (r4 * r2)
@@ -164,12 +162,28 @@ def _corrected(x: float, y: float, p: FloatArray) -> tuple[float, float, float, 
     return xc, yc, xx, xy, yy, r2
 
 
-@inlined
-def _pinhole_mm(fx: float, fy: float, c: float, u: float, v: float, Ju: FloatArray, Jp: FloatArray) -> None:
-    """Fill the derivatives of (fx c u, fy c v) by u, v and by c."""
-    Ju[0, 0] = fx * c
-    Ju[0, 1] = 0.0
-    Ju[1, 0] = 0.0
-    Ju[1, 1] = fy * c
-    Jp[0, 0] = fx * u
-    Jp[1, 0] = fy * v
+@kernel
+def _measured(
+    x: float, y: float, xc: float, yc: float, located: float,
+    K1: float, K2: float, K3: float, P1: float, P2: float,
+) -> tuple[float, float]:  # fmt: skip
+    """Return the point that Brown's corrections move to (xc, yc), by Newton's method, mm.
+
+    It is short of one more step, for which the caller has the derivatives. It starts at (x, y), the measured
+    point, which is near, and ends at a step of the length `located`. Where the corrections fold over on the
+    way, as they may at bad start values, no such point is known and the start is returned: that one step is
+    then the whole residual.
+    """
+    xh, yh = x, y
+    for _ in range(STEPS):
+        x_now, y_now, xx, xy, yy, _r2 = _corrected(xh, yh, K1, K2, K3, P1, P2)
+        det = xx * yy - xy * xy
+        if not (det > FOLDED and xx + yy > 0.0):
+            break
+        inverse, ex, ey = 1.0 / det, xc - x_now, yc - y_now
+        dx, dy = (yy * ex - xy * ey) * inverse, (xx * ey - xy * ex) * inverse
+        xh += dx
+        yh += dy
+        if abs(dx) + abs(dy) < located:
+            return xh, yh
+    return x, y

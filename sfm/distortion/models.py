@@ -2,7 +2,8 @@
 
 A model is one compiled function `model(frame, p, x, y, u, v, residual, Ju, Jp)`. It is given
 
-    frame (4,)      centre of the photograph, px, and width and height of a pixel, mm
+    frame (5,)      centre of the photograph, px, width and height of a pixel, mm, and 1 if residuals are to
+                    be those of the measured point, 0 if of the corrected one
     p     (n,)      parameters in the order of the model's names
     x, y            measured pixel
     u, v            tangents of the ray in the image frame (u = -U/W, v = -V/W, y up)
@@ -14,8 +15,9 @@ and fills
     Jp (2, n)       its derivatives by the parameters
 
 The models of photogrammetry correct the measured point, those of computer vision distort the ideal
-one; in both cases the residual vanishes at the true parameters. To add a model: write its function in a
-module beside `brown` and give it a row in `ALL`; adjustment, resection, conversion, survey file and reports
+one; in both cases the residual vanishes at the true parameters and is one of the measured point, but for
+the models named after DBAT, whose residuals lie in the corrected plane. To add a model: write its function in
+a module beside `brown` and give it a row in `ALL`; adjustment, resection, conversion, survey file and reports
 follow from that row, and the tests of derivatives and inverse run over it.
 """
 
@@ -27,7 +29,8 @@ from typing import Any
 
 from numba import njit
 
-from sfm.distortion.brown import brown, brown_affine, brown_forward
+from sfm.distortion.brown import brown, brown_affine
+from sfm.distortion.forward import brown_forward
 from sfm.distortion.opencv import full_opencv, opencv
 
 
@@ -45,6 +48,8 @@ class Model:
     """their units, in the same order"""
     corrects: bool = False
     """whether it corrects the measured point; else it distorts the ideal one"""
+    corrected_plane: bool = False
+    """whether residuals are those of the corrected point instead of the measured one"""
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -69,6 +74,8 @@ ALL = (
     Model("opencv", opencv, "fx fy cx cy k1 k2 p1 p2", "px px px px 1 1 1 1"),
     Model("full_opencv", full_opencv, "fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6", "px px px px 1 1 1 1 1 1 1 1"),
     Model("brown_affine", brown_affine, *_BROWN, corrects=True),
+    Model("brown_dbat", brown, *_BROWN, corrects=True, corrected_plane=True),
+    Model("brown_affine_dbat", brown_affine, *_BROWN, corrects=True, corrected_plane=True),
 )
 MODELS = {model.name: model for model in ALL}
 MAX_PARAMETERS = max(len(model.names) for model in ALL)
@@ -89,9 +96,14 @@ def one_of(models: tuple[Model, ...]) -> Callable[..., None]:
     arguments = "frame, p, x, y, u, v, residual, Ju, Jp"
     lines = [f"def observe(number, {arguments}):"]
     names: dict[str, Any] = {}
+    numbers: dict[Callable[..., None], list[int]] = {}
     for number, model in enumerate(models):
-        names[model.name] = model.function
-        lines.append(f"    {'elif' if number else 'if'} number == {number}: {model.name}({arguments})")
+        numbers.setdefault(model.function, []).append(number)
+    for function, own in numbers.items():
+        name = models[own[0]].name
+        names[name] = function
+        test = " or ".join(f"number == {number}" for number in own)
+        lines.append(f"    {'elif' if len(lines) > 1 else 'if'} {test}: {name}({arguments})")
     exec("\n".join(lines), names)
     compiled: Callable[..., None] = njit(inline="always", error_model="numpy")(names["observe"])
     return compiled

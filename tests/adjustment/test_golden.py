@@ -110,7 +110,7 @@ def test_lab2_resections_in_one_network() -> None:
     values = {row["parameter"]: float(row["value"]) for row in table(LAB2 / "lab2_camera.csv")}
     camera = camera_from_values(
         "lab 2",
-        "brown",
+        "brown_dbat",
         GRID_PX,
         (GRID_MM[0], GRID_MM[1]),
         c_mm=values.pop("c"),
@@ -206,7 +206,7 @@ def test_camcal_with_fixed_control_prints_as_the_report_of_dbat(method: str) -> 
     c = start.cameras[0]
     pixel = np.full(2, 5.43764 / 1704)  # DBAT's affinity is relative to square pixels of the format height
     rough = replace(
-        camera_from_values(c.name, "brown", c.size_px, (pixel[0], pixel[1]), c_mm=7.3), free=c.free
+        camera_from_values(c.name, "brown_dbat", c.size_px, (pixel[0], pixel[1]), c_mm=7.3), free=c.free
     )
     start = replace(start, cameras=(rough,))
     a = adjust(network, start, datum=Datum("control"), reject="none", method=method)
@@ -258,7 +258,7 @@ def test_camcal_with_fixed_control_prints_as_the_report_of_dbat(method: str) -> 
 def test_camcal_as_a_free_network() -> None:
     network, start = read_photomodeler(CAMCAL / "camcal-pmexport.txt", control=CAMCAL / "camcal-fixed.txt")
     pixel = np.full(2, 5.43764 / 1704)
-    start = replace(start, cameras=(replace(start.cameras[0], pixel_mm=pixel),))
+    start = replace(start, cameras=(replace(start.cameras[0], model="brown_dbat", pixel_mm=pixel),))
     a = adjust(network, start, datum=Datum("free"), reject="none")
     assert (a.redundancy, a.unknowns, a.defect) == (3720, 435, 7)
     assert agrees(a.sigma0_px, "0.142614")
@@ -272,11 +272,11 @@ def test_camcal_as_a_free_network() -> None:
 
 BROWN_FREE = ("c", "x0", "y0", "K1", "K2", "K3", "P1", "P2")
 DBAT_MODELS = {  # number: our model, free parameters, redundancy, sigma0 in px, c in mm, with fixed control
-    1: ("brown", BROWN_FREE, 3726, 0.168901, 7.457396),
-    2: ("brown", BROWN_FREE, 3726, 0.168901, 7.457396),
-    3: ("brown", (*BROWN_FREE, "b1"), 3725, 0.161480, 7.456995),
-    4: ("brown_affine", (*BROWN_FREE, "b1"), 3725, 0.161247, 7.457019),
-    5: ("brown", (*BROWN_FREE, "b1"), 3725, 0.161480, 7.456995),
+    1: ("brown_dbat", BROWN_FREE, 3726, 0.168901, 7.457396),
+    2: ("brown_dbat", BROWN_FREE, 3726, 0.168901, 7.457396),
+    3: ("brown_dbat", (*BROWN_FREE, "b1"), 3725, 0.161480, 7.456995),
+    4: ("brown_affine_dbat", (*BROWN_FREE, "b1"), 3725, 0.161247, 7.457019),
+    5: ("brown_dbat", (*BROWN_FREE, "b1"), 3725, 0.161480, 7.456995),
     -1: ("brown_forward", BROWN_FREE, 3726, 0.162168, 7.457482),
 }
 
@@ -315,7 +315,7 @@ def dbat_residuals(number: int, p: dict[str, float], xy: np.ndarray, uv: np.ndar
 @needs_camcal
 @pytest.mark.parametrize("number", DBAT_MODELS)
 def test_camcal_with_the_six_camera_models_of_dbat(number: int) -> None:
-    """Models 1 and 2 are `brown` without affinity, 3 is the report's, 5 is 3 with another principal point."""
+    """Models 1 and 2 are `brown_dbat` without affinity, 3 is the report's, 5 has another principal point."""
     model, free, redundancy, sigma0_px, c = DBAT_MODELS[number]
     network, start = read_photomodeler(CAMCAL / "camcal-pmexport.txt", control=CAMCAL / "camcal-fixed.txt")
     s = 5.43764 / 1704
