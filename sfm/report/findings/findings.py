@@ -22,6 +22,7 @@ from sfm.report.findings.checks import (
     object_size,
     sigma0_of,
 )
+from sfm.report.findings.consistency import Consistency, consistency_of
 from sfm.report.findings.geometry import Geometry, geometry_of
 from sfm.report.findings.given_residuals import Given, given_of
 from sfm.report.findings.interior_parameters import InteriorOrientation, interior_of
@@ -54,6 +55,7 @@ class Findings:
     rejected: Rejected
     comparison: ComparisonFindings | None
     object_size: float  # diagonal of the box around the points, object unit
+    consistency: Consistency  # tests of points, photographs and the format
 
 
 def findings_of(result: SurveyResult) -> Findings:
@@ -61,10 +63,11 @@ def findings_of(result: SurveyResult) -> Findings:
     a = result.adjustment
     sigma0, longest, statistics = sigma0_of(result), longest_residual(a), statistics_of(result)
     given, check, size = given_of(result), checked_control(result), object_size(a.estimate.points)
+    consistency = consistency_of(a)
     geometry, precision = geometry_of(a), precision_of(a)
     return Findings(
         result=result,
-        verdict=judge(Evidence(result, sigma0, longest, statistics, given, check, size)),
+        verdict=judge(Evidence(result, sigma0, longest, statistics, given, check, size, consistency)),
         sigma0=sigma0,
         counts=count_observations(a),
         longest=longest,
@@ -80,4 +83,5 @@ def findings_of(result: SurveyResult) -> Findings:
         rejected=rejected_of(result, geometry),
         comparison=comparison_of(result),
         object_size=size,
+        consistency=consistency,
     )
