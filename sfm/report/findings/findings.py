@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from sfm.adjustment.quality.held_camera import HeldParameter, held_parameters
 from sfm.report.findings.bundle_statistics import Statistics, statistics_of
 from sfm.report.findings.checks import (
     CheckedControl,
@@ -54,6 +55,7 @@ class Findings:
     rejected: Rejected
     comparison: ComparisonFindings | None
     object_size: float  # diagonal of the box around the points, object unit
+    held: tuple[HeldParameter, ...]  # interior parameters held at values that the photographs contradict
 
 
 def findings_of(result: SurveyResult) -> Findings:
@@ -61,10 +63,10 @@ def findings_of(result: SurveyResult) -> Findings:
     a = result.adjustment
     sigma0, longest, statistics = sigma0_of(result), longest_residual(a), statistics_of(result)
     given, check, size = given_of(result), checked_control(result), object_size(a.estimate.points)
-    geometry, precision = geometry_of(a), precision_of(a)
+    geometry, precision, held = geometry_of(a), precision_of(a), held_parameters(a)
     return Findings(
         result=result,
-        verdict=judge(Evidence(result, sigma0, longest, statistics, given, check, size)),
+        verdict=judge(Evidence(result, sigma0, longest, statistics, given, check, size, held)),
         sigma0=sigma0,
         counts=count_observations(a),
         longest=longest,
@@ -80,4 +82,5 @@ def findings_of(result: SurveyResult) -> Findings:
         rejected=rejected_of(result, geometry),
         comparison=comparison_of(result),
         object_size=size,
+        held=held,
     )
