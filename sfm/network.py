@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 import numpy.typing as npt
-from scipy.sparse import csr_matrix
+from scipy.sparse import csr_matrix, triu
 
 from sfm.camera import Camera
 from sfm.conventions import BoolArray, FloatArray, IntArray
@@ -224,14 +224,24 @@ class Network:
         """Return in how many photographs each point was measured, (n,)."""
         return np.bincount(self.image_points.point, minlength=len(self.points))
 
-    def common_points(self, usable: BoolArray) -> IntArray:
-        """Return how many points each two photographs share among usable image points, (m, m)."""
+    def common_points(self, usable: BoolArray) -> tuple[IntArray, IntArray, IntArray]:
+        """Return the pairs of photographs that share points, and how many, among usable image points.
+
+        Args:
+            usable: of the image points, (k,).
+
+        Returns:
+            Index of the first and of the second photograph, which is larger, and the number of points, (p,).
+        """
         seen = self.image_points.select(usable)
         shape = (len(self.images), len(self.points))
         sees = csr_matrix((np.ones(len(seen), dtype=np.int32), (seen.image, seen.point)), shape=shape)
         sees.sum_duplicates()
         sees.data[:] = 1
-        return np.asarray((sees @ sees.T).toarray())
+        common = triu(sees @ sees.T, 1).tocsr()  # a table of all pairs would take gigabytes
+        common.sort_indices()
+        pairs = common.tocoo()
+        return pairs.row.astype(np.int64), pairs.col.astype(np.int64), pairs.data.astype(np.int64)
 
     def __repr__(self) -> str:
         counted = (

@@ -64,3 +64,12 @@ def test_undetermined_parts_of_an_estimate_are_nan() -> None:
     estimate = replace(truth, position=position, points=points)
     assert list(np.flatnonzero(~estimate.oriented)) == [1]
     assert list(np.flatnonzero(~estimate.determined)) == [3]
+
+
+def test_pairs_of_photographs_that_share_points_are_counted_without_a_table_of_all() -> None:
+    network, _ = make_network(seed_of("pairs"), images=7, points=30, visibility=0.4)
+    seen = network.image_points
+    usable = seed_of("usable").random(len(seen)) < 0.7
+    sees = [set(seen.point[usable & (seen.image == i)].tolist()) for i in range(7)]
+    true = [(i, j, len(sees[i] & sees[j])) for i in range(7) for j in range(i + 1, 7) if sees[i] & sees[j]]
+    assert list(zip(*(part.tolist() for part in network.common_points(usable)), strict=True)) == true

@@ -89,9 +89,9 @@ def _promising_pairs(network: Network, own: list[IntArray]) -> list[tuple[int, i
     m = len(own)
     usable = np.zeros(len(network.image_points), dtype=bool)
     usable[np.concatenate(own)] = True
-    common = np.triu(network.common_points(usable), 1)
-    first, second = np.nonzero(common >= PLANAR_POINTS)
-    count = common[first, second]
+    first, second, count = network.common_points(usable)
+    enough = count >= PLANAR_POINTS
+    first, second, count = first[enough], second[enough], count[enough]
     # equal counts in the order of j - i, so that a cut takes pairs from all over the survey
     order = np.lexsort((second, first, (second - first) % max(2, m // 3), -count))
     if len(order) > MAX_PAIRS:

@@ -100,8 +100,7 @@ def _strongest(network: Network) -> BoolArray:
 
 def _most_in_common(network: Network) -> int:
     """Return how many points the two photographs with most in common share."""
-    common = network.common_points(np.ones(len(network.image_points), dtype=bool))
-    np.fill_diagonal(common, 0)
+    common = network.common_points(np.ones(len(network.image_points), dtype=bool))[2]
     return int(common.max(initial=0))
 
 

@@ -202,11 +202,11 @@ def test_a_limiting_precision_above_the_achieved_one_is_explained(
         assert (words in report_page(findings_of(result), (), ())) is explained
 
 
-def test_a_point_that_lost_most_of_its_rays_is_named(synthetic: tuple[Network, Estimate]) -> None:
+def test_a_point_that_lost_a_third_of_its_rays_is_named(synthetic: tuple[Network, Estimate]) -> None:
     network, truth = synthetic
     a = adjust(network, truth, datum=Datum("free"), reject="none")
     of_point = np.flatnonzero(network.image_points.point == 4)
-    for lost, level in ((len(of_point) // 2, "good"), (len(of_point) // 2 + 1, "fair")):
+    for lost, level in (((len(of_point) - 1) // 3, "good"), (-(-len(of_point) // 3), "fair")):
         rejected = a.rejected.copy()
         rejected[of_point[:lost]] = True
         verdict = findings_of(result_of(replace(a, rejected=rejected))).verdict

@@ -23,6 +23,7 @@ from sfm.report.findings.checks import (
     object_size,
     sigma0_of,
 )
+from sfm.report.findings.consistency import Consistency, consistency_of
 from sfm.report.findings.geometry import Geometry, geometry_of
 from sfm.report.findings.given_residuals import Given, given_of
 from sfm.report.findings.interior_parameters import InteriorOrientation, interior_of
@@ -56,6 +57,7 @@ class Findings:
     comparison: ComparisonFindings | None
     object_size: float  # diagonal of the box around the points, object unit
     held: tuple[HeldParameter, ...]  # interior parameters held at values that the photographs contradict
+    consistency: Consistency  # tests of points, photographs and the format
 
 
 def findings_of(result: SurveyResult) -> Findings:
@@ -63,10 +65,12 @@ def findings_of(result: SurveyResult) -> Findings:
     a = result.adjustment
     sigma0, longest, statistics = sigma0_of(result), longest_residual(a), statistics_of(result)
     given, check, size = given_of(result), checked_control(result), object_size(a.estimate.points)
-    geometry, precision, held = geometry_of(a), precision_of(a), held_parameters(a)
+    consistency, held = consistency_of(a), held_parameters(a)
+    geometry, precision = geometry_of(a), precision_of(a)
+    evidence = Evidence(result, sigma0, longest, statistics, given, check, size, consistency, held)
     return Findings(
         result=result,
-        verdict=judge(Evidence(result, sigma0, longest, statistics, given, check, size, held)),
+        verdict=judge(evidence),
         sigma0=sigma0,
         counts=count_observations(a),
         longest=longest,
@@ -83,4 +87,5 @@ def findings_of(result: SurveyResult) -> Findings:
         comparison=comparison_of(result),
         object_size=size,
         held=held,
+        consistency=consistency,
     )

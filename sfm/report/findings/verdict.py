@@ -13,13 +13,15 @@ from sfm.adjustment.quality.variance_components import IMAGE_POINTS
 from sfm.conventions import MAD_TO_SIGMA
 from sfm.report.findings.bundle_statistics import Statistics
 from sfm.report.findings.checks import CheckedControl, LongestResidual, Sigma0
+from sfm.report.findings.consistency import Consistency
 from sfm.report.findings.given_residuals import Given, GivenResiduals, GivenValue
 from sfm.report.findings.scale import given_test, scale_difference
 from sfm.report.numbers import finer_unit, significant
 from sfm.result import SurveyResult
 
 MUCH_REJECTED = 0.05  # share of rejected image points above which a person should look
-MOST_RAYS = 0.5  # share of the rays of a point: most of them say something else than the result
+MANY_RAYS = 1 / 3  # share of the rays of a point: so many of them say something else than the result
+FEW_RAYS = 2  # that are left of a point of which others were rejected check it no more
 MOST_NAMES = 5  # points named in one remark
 # sigma_px is a rough guess, so the global test alone says little. Twice the guess is worth a look; five
 # times is no precision that anybody expected, but a wrong model, wrong names or wrong control.
@@ -57,6 +59,7 @@ class Evidence:
     given: Given
     check: CheckedControl | None
     object_size: float  # diagonal of the box around the points, object unit
+    consistency: Consistency
     held: tuple[HeldParameter, ...] = ()  # interior parameters held at values that the photographs contradict
 
     @property
@@ -88,7 +91,7 @@ def judge(evidence: Evidence) -> Verdict:
         )
     remarks: list[str] = []
     kinds = (
-        *(_sigma0, _residual, _untested, _rays, _taken_out, _scale),
+        *(_sigma0, _residual, _untested, _rays, _consistency, _taken_out, _scale),
         *(_control, _bars, _interior, _held, _principal_point, _exterior, _kinds, _check),
     )
     for judge_kind in kinds:
@@ -286,17 +289,53 @@ def _kinds(evidence: Evidence) -> Judged:
 
 
 def _rays(evidence: Evidence) -> Judged:
-    """Judge the points that lost most of their rays to rejection."""
+    """Judge the points that lost many of their rays to rejection, or all but two."""
     adjustment = evidence.result.adjustment
     network, rejected = adjustment.network, adjustment.rejected
     n, point = len(network.points), network.image_points.point
     lost, rays = np.bincount(point[rejected], minlength=n), network.rays()
-    most = np.flatnonzero(lost > MOST_RAYS * rays)
+    most = np.flatnonzero((lost > 0) & ((lost >= MANY_RAYS * rays) | (rays - lost <= FEW_RAYS)))
     if not len(most):
         return []
     shown = ", ".join(f"{network.points[j]} ({lost[j]} of {rays[j]})" for j in most[:MOST_NAMES])
     more = " ..." if len(most) > MOST_NAMES else ""
-    return [(False, f"Most rays were rejected of {len(most)} point(s): {shown}{more}.")]
+    line = f"A third of the rays or more were rejected, or only two are left, of {len(most)} point(s)"
+    return [(False, f"{line}: {shown}{more}.")]
+
+
+def _consistency(evidence: Evidence) -> Judged:
+    """Judge the tests inside the result: points, photographs, the format."""
+    found, result = evidence.consistency, evidence.result
+    lines = []
+    for one in found.two_positions[:MOST_NAMES]:
+        factor, unit = finer_unit(result.length_unit, one.distance)
+        lines.append(
+            f"Point {one.point} is at two positions, {significant(factor * one.distance)} {unit} apart "
+            f"({significant(one.over_sigma)} standard deviations): one in {len(one.first)} photographs from "
+            f"{one.first[0]} on, the other in {len(one.second)} from {one.second[0]} on. It moved, or two "
+            "bear its name."
+        )
+    if len(found.two_positions) > MOST_NAMES:
+        lines.append(f"{len(found.two_positions) - MOST_NAMES} more points are at two positions.")
+    if found.large:
+        more = " ..." if len(found.large) > MOST_NAMES else ""
+        lines.append(
+            f"The residuals of {len(found.large)} point(s) are together larger than chance: "
+            f"{', '.join(found.large[:MOST_NAMES])}{more}."
+        )
+    uneven = found.uneven
+    if uneven is not None:
+        lines.append(
+            f"The photographs are not alike (Bartlett's test, p {uneven.probability:.1g}): sigma0 of "
+            f"{uneven.worst} is {significant(uneven.largest / uneven.median)} times the median."
+        )
+    lines += [
+        f"The residuals of camera {one.camera} depend on the place in the photograph "
+        f"(p {one.probability:.1g}): its cells explain {100 * one.explained:.0f} % of their squares, the "
+        f"longest mean is {significant(one.largest_px)} px."
+        for one in found.patterns
+    ]
+    return [(False, line) for line in lines]
 
 
 def _taken_out(evidence: Evidence) -> Judged:

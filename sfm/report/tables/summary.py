@@ -14,6 +14,7 @@ from sfm.files.plain_text import or_none
 from sfm.report.findings.bundle_statistics import Spread, spread
 from sfm.report.findings.findings import Findings
 from sfm.report.findings.given_residuals import GivenResiduals
+from sfm.report.findings.scale import given_test
 from sfm.report.phrases import words_of_test, words_of_weights
 from sfm.result import SurveyResult
 
@@ -87,6 +88,7 @@ def summary(findings: Findings) -> dict[str, Any]:
             for index, camera in enumerate(adjustment.estimate.cameras)
         ],
         "statistics": _statistics(findings),
+        "consistency": _consistency(findings),
         "geometry": _geometry(findings),
         "control": _control(findings),
         "scale_bars": _scale_bars(findings),
@@ -177,6 +179,48 @@ def _statistics(findings: Findings) -> dict[str, Any]:
             {"camera": test.camera, "parameter": test.parameter, "t": or_none(test.t)}
             for test in found.not_significant
         ],
+    }
+
+
+def _consistency(findings: Findings) -> dict[str, Any]:
+    """Return what the tests of points, photographs and the format have found."""
+    found, test = findings.consistency, given_test(findings.result)
+    return {
+        "two_positions": [
+            {
+                "point": one.point,
+                "distance": or_none(one.distance),
+                "over_sigma": or_none(one.over_sigma),
+                "first": list(one.first),
+                "second": list(one.second),
+            }
+            for one in found.two_positions
+        ],
+        "large_residuals": list(found.large),
+        "uneven_photographs": None
+        if found.uneven is None
+        else {
+            "probability": or_none(found.uneven.probability),
+            "worst": found.uneven.worst,
+            "largest": or_none(found.uneven.largest),
+            "median": or_none(found.uneven.median),
+        },
+        "patterns": [
+            {
+                "camera": one.camera,
+                "probability": or_none(one.probability),
+                "explained": or_none(one.explained),
+                "largest_px": or_none(one.largest_px),
+            }
+            for one in found.patterns
+        ],
+        "given_against_free_network": None
+        if test is None
+        else {
+            "F": or_none(test.statistic),
+            "redundancy": test.redundancy,
+            "probability": or_none(test.probability),
+        },
     }
 
 

@@ -52,7 +52,8 @@ def measurements_from_observations(survey: Survey) -> Measurements:
     )
     _refuse_far_outside(given, xy, cameras, owner[image])
     refuse_unknown_photographs(survey, images)
-    stated = np.zeros(len(xy), dtype=bool) if given.sigma is None else np.isfinite(given.sigma).all(axis=1)
+    sigma = np.full(xy.shape, np.nan) if given.sigma is None else given.sigma
+    stated = np.asarray(np.isfinite(sigma).all(axis=1))
     merged = merge_repeated(ImagePoints(image, point, xy, covariance, stated))
     network = Network(
         images,
