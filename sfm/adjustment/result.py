@@ -62,6 +62,8 @@ class Adjustment:
     # deviations of each image point were multiplied for its weight, (k,)
     datum_points: BoolArray | None = None  # object points that carry the datum; all if None, (n,)
     unknown_counts: tuple[int, int, int] = (0, 0, 0)  # of exterior orientation, interior orientation, points
+    test_alpha: float = 0.001  # probability with which the test that was applied rejects a good image
+    # coordinate; Baarda's usual one where none was
     remarks: tuple[str, ...] = ()  # what of the robust test could not be carried through, one line each
 
     @property
