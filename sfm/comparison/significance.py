@@ -20,9 +20,9 @@ import numpy as np
 
 from sfm.comparison.adjusters import rotation_angle_deg
 from sfm.comparison.camera_conversion import Conversion, convert_camera
-from sfm.comparison.congruency import Congruency, congruency, critical_value
 from sfm.comparison.pairing import Pairing, pair_results
-from sfm.conventions import METRES, BoolArray, FloatArray, IntArray
+from sfm.comparison.point_tests import has_sigma, judge_points, known_scale
+from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.errors import GeometryError
 from sfm.network import Network
 from sfm.similarity import Similarity, fit_similarity
@@ -30,8 +30,6 @@ from sfm.stored_result import StoredResult
 
 ALIGNMENTS = ("points", "cameras", "control", "none")
 SAME_PX = 1e-3  # image points closer than this are one measurement
-FREE_DATUMS = ("free", "")  # in which the covariance of single points says about what the whole one does
-HELD = 1e-12  # variance over the mean one below which a coordinate is held
 SAME_SHARE = 0.5  # of a's image points that b has too, from which on they are not independent
 ALPHA = 0.05  # level of the global test; single points are tested at ALPHA / number of points (Bonferroni)
 
@@ -124,11 +122,13 @@ def compare_results(
             "points, nor places in the object are the same"
         )
     chosen = _chosen(names, align, control)
-    scale = _known_scale(a, b)
+    scale = known_scale(a, b)
     transform = _align(a, b, align, pairing, chosen, scale)
     same_share = _same_share(a.network, b.network, pairing)
     moved = transform.apply_estimate(b.estimate)
-    test = _test(a, b, pairing, transform, moved.points[pb] - a.estimate.points[pa], align, chosen, alpha)
+    test = judge_points(
+        a, b, pairing, transform, moved.points[pb] - a.estimate.points[pa], align, chosen, alpha
+    )
     if same_share > SAME_SHARE:
         test = replace(test, untested="same image points")
     stable = chosen & test.stable if align == "control" else test.stable
@@ -140,7 +140,7 @@ def compare_results(
     return ResultComparison(
         names=(a.name, b.name),
         unit=a.unit,
-        has_sigma=(_has_sigma(a), _has_sigma(b)),
+        has_sigma=(has_sigma(a), has_sigma(b)),
         same_share=same_share,
         pairing=pairing,
         alignment=align,
@@ -175,15 +175,6 @@ def _chosen(names: tuple[str, ...], align: str, control: tuple[str, ...]) -> Boo
     return np.isin(np.array(names, dtype=object), list(control))
 
 
-def _known_scale(a: StoredResult, b: StoredResult) -> float | None:
-    """Return the scale of a over b where both have one, None where it has to be estimated."""
-    if not (a.has_scale and b.has_scale):
-        return None
-    if a.unit == b.unit:
-        return 1.0
-    return METRES[b.unit] / METRES[a.unit] if a.unit in METRES and b.unit in METRES else None
-
-
 def _align(
     a: StoredResult, b: StoredResult, align: str, pairing: Pairing, chosen: BoolArray, scale: float | None
 ) -> Similarity:
@@ -199,10 +190,6 @@ def _align(
     if len(source) < 3:
         raise GeometryError(f"comparison: {len(source)} {what} in common, alignment needs 3")
     return fit_similarity(source, target, scale=scale)
-
-
-def _has_sigma(result: StoredResult) -> bool:
-    return result.point_covariance is not None and bool(np.isfinite(result.point_covariance).any())
 
 
 def _same_share(a: Network, b: Network, pairing: Pairing) -> float:
@@ -221,148 +208,6 @@ def _same_share(a: Network, b: Network, pairing: Pairing) -> float:
     _, i, j = np.intersect1d(key_a, key_b, return_indices=True)
     same = np.abs(ours.xy[i] - theirs.xy[known][j]).max(axis=1) < SAME_PX
     return float(same.sum() / len(ours))
-
-
-@dataclass(frozen=True)
-class _Test:
-    """What the tests of the points say."""
-
-    sigma: FloatArray  # of the differences, NaN where not known, (n, 3)
-    untested: str
-    statistic: FloatArray
-    critical: float
-    significant: BoolArray
-    global_statistic: float
-    global_critical: float
-    stable: BoolArray
-    approximate: bool = False
-    majority: bool = True
-
-
-def _test(
-    a: StoredResult,
-    b: StoredResult,
-    pairing: Pairing,
-    transform: Similarity,
-    difference: FloatArray,
-    align: str,
-    chosen: BoolArray,
-    alpha: float,
-) -> _Test:
-    """Test the differences of the common points with all that is known of their covariance."""
-    pa, pb = pairing.points.T
-    n = len(pa)
-    blocks = _sum(a.point_covariance, b.point_covariance, pa, pb, transform)
-    variance = np.einsum("njj->nj", blocks)
-    sigma = np.sqrt(np.where(variance >= 0, variance, np.nan))
-    nothing = np.full(n, np.nan)
-    every = np.ones(n, dtype=bool)
-
-    def without(why: str) -> _Test:
-        return _Test(sigma, why, nothing, np.nan, ~every, np.nan, np.nan, every)
-
-    if not n:
-        return without("no common points")
-    if not any(_has_sigma(one) for one in (a, b)):
-        return without("no standard deviations")
-    known = [one for one in (a, b) if _has_sigma(one)]
-    redundancies = [one.redundancy for one in (a, b) if one.redundancy is not None]
-    redundancy = sum(redundancies) if redundancies else None
-    in_control = all(one.datum == "control" for one in known)
-    if all(one.covariance is not None for one in known):
-        if align == "none" and not in_control:
-            return without("no common datum")
-        Q = _joint(a, pa, 1.0, np.eye(3)) + _joint(b, pb, transform.scale, transform.rotation)
-        free = ~_held(Q) if in_control else every
-        rows = np.repeat(free, 3)
-        try:
-            found = congruency(
-                difference[free],
-                Q[np.ix_(rows, rows)],
-                a.estimate.points[pa[free]],
-                motion="none" if align == "none" else "similarity" if _known_scale(a, b) is None else "rigid",
-                redundancy=redundancy,
-                datum=chosen[free],
-                alpha=alpha,
-            )
-        except GeometryError as error:
-            return without(str(error))
-        return _of_congruency(found, free)
-    if not all(one.datum in FREE_DATUMS for one in known):
-        return without("covariance of single points only")
-    statistic, critical, global_critical = _single_tests(difference, blocks, redundancy, alpha)
-    if not np.isfinite(statistic).any():
-        return without("no standard deviations of common points")
-    together = float(np.nanmean(statistic))
-    return _Test(
-        *(sigma, "", statistic, critical, statistic > critical, together, global_critical, every),
-        approximate=True,
-    )
-
-
-def _of_congruency(found: Congruency, tested: BoolArray) -> _Test:
-    """Return the test of all points where some, held in both results, took no part."""
-    n = len(tested)
-    sigma, statistic = np.zeros((n, 3)), np.full(n, np.nan)
-    sigma[tested] = np.sqrt(np.einsum("njj->nj", found.covariance).clip(0))
-    statistic[tested] = found.statistic
-    stable = np.ones(n, dtype=bool)
-    stable[tested] = found.stable
-    significant = np.zeros(n, dtype=bool)
-    significant[tested] = found.moved
-    return _Test(
-        *(sigma, "", statistic, found.critical, significant, found.global_statistic, found.global_critical),
-        *(stable, False, found.agreed),
-    )
-
-
-def _joint(result: StoredResult, points: IntArray, scale: float, rotation: FloatArray) -> FloatArray:
-    """Covariance of some points together, scaled and turned, (3 n, 3 n); 0 where none is known."""
-    n = len(points)
-    if result.covariance is None:
-        return np.zeros((3 * n, 3 * n))
-    rows = (3 * points[:, None] + np.arange(3)).ravel()
-    Q = result.covariance[np.ix_(rows, rows)].reshape(n, 3, n, 3)
-    J = scale * rotation
-    moved: FloatArray = np.einsum("xa,iajb,yb->ixjy", J, Q, J, optimize=True)
-    return moved.reshape(3 * n, 3 * n)
-
-
-def _held(Q: FloatArray) -> BoolArray:
-    """Whether a coordinate of a point is known without error, so that nothing is left to test, (n,)."""
-    variance = np.diagonal(Q).reshape(-1, 3)
-    return np.asarray((variance <= HELD * variance.mean()).any(axis=1))
-
-
-def _sum(
-    a: FloatArray | None, b: FloatArray | None, pa: IntArray, pb: IntArray, transform: Similarity
-) -> FloatArray:
-    """Covariance of the differences, NaN where neither is known; one that is not known counts as 0."""
-    unknown = np.full((len(pa), 3, 3), np.nan)
-    J = transform.scale * transform.rotation
-    ours = unknown if a is None else a[pa]
-    theirs = unknown if b is None else J @ b[pb] @ J.T
-    first = np.isfinite(ours).all(axis=(1, 2), keepdims=True)
-    second = np.isfinite(theirs).all(axis=(1, 2), keepdims=True)
-    total = np.where(first, ours, 0.0) + np.where(second, theirs, 0.0)
-    return np.where(first | second, total, np.nan)
-
-
-def _single_tests(
-    difference: FloatArray, covariance: FloatArray, redundancy: int | None, alpha: float
-) -> tuple[FloatArray, float, float]:
-    """T of each point, its critical value for one of all points, and that of the mean of T."""
-    statistic = np.full(len(difference), np.nan)
-    testable = np.isfinite(covariance).all(axis=(1, 2)) & (
-        np.linalg.matrix_rank(np.nan_to_num(covariance)) == 3
-    )
-    d = difference[testable]
-    statistic[testable] = (
-        np.einsum("ni,ni->n", d, np.linalg.solve(covariance[testable], d[..., None])[..., 0]) / 3
-    )
-    tested = max(1, int(testable.sum()))
-    single = critical_value(alpha / 2 / tested, 3, redundancy)
-    return statistic, single, critical_value(alpha / 2, 3 * tested, redundancy)
 
 
 def _interior(a: StoredResult, b: StoredResult, ia: IntArray, ib: IntArray) -> tuple[InteriorDifference, ...]:

@@ -1,0 +1,176 @@
+"""The test of the points of two results with all that is known of their covariance.
+
+Source: Caspary (2000), Concepts of network and deformation analysis, sec. 7.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sfm.comparison.congruency import Congruency, congruency, critical_value
+from sfm.comparison.pairing import Pairing
+from sfm.conventions import METRES, BoolArray, FloatArray, IntArray
+from sfm.errors import GeometryError
+from sfm.similarity import Similarity
+from sfm.stored_result import StoredResult
+
+FREE_DATUMS = ("free", "")  # in which the covariance of single points says about what the whole one does
+HELD = 1e-12  # variance over the mean one below which a coordinate is held
+
+
+@dataclass(frozen=True)
+class PointTest:
+    """What the tests of the points say."""
+
+    sigma: FloatArray  # of the differences, NaN where not known, (n, 3)
+    untested: str
+    statistic: FloatArray
+    critical: float
+    significant: BoolArray
+    global_statistic: float
+    global_critical: float
+    stable: BoolArray
+    approximate: bool = False
+    majority: bool = True
+
+
+def judge_points(
+    a: StoredResult,
+    b: StoredResult,
+    pairing: Pairing,
+    transform: Similarity,
+    difference: FloatArray,
+    align: str,
+    chosen: BoolArray,
+    alpha: float,
+) -> PointTest:
+    """Test the differences of the common points with all that is known of their covariance."""
+    pa, pb = pairing.points.T
+    n = len(pa)
+    blocks = _sum(a.point_covariance, b.point_covariance, pa, pb, transform)
+    variance = np.einsum("njj->nj", blocks)
+    sigma = np.sqrt(np.where(variance >= 0, variance, np.nan))
+    nothing = np.full(n, np.nan)
+    every = np.ones(n, dtype=bool)
+
+    def without(why: str) -> PointTest:
+        return PointTest(sigma, why, nothing, np.nan, ~every, np.nan, np.nan, every)
+
+    if not n:
+        return without("no common points")
+    if not any(has_sigma(one) for one in (a, b)):
+        return without("no standard deviations")
+    known = [one for one in (a, b) if has_sigma(one)]
+    redundancies = [one.redundancy for one in (a, b) if one.redundancy is not None]
+    redundancy = sum(redundancies) if redundancies else None
+    in_control = all(one.datum == "control" for one in known)
+    if all(one.covariance is not None for one in known):
+        if align == "none" and not in_control:
+            return without("no common datum")
+        Q = _joint(a, pa, 1.0, np.eye(3)) + _joint(b, pb, transform.scale, transform.rotation)
+        free = ~_held(Q) if in_control else every
+        rows = np.repeat(free, 3)
+        try:
+            found = congruency(
+                difference[free],
+                Q[np.ix_(rows, rows)],
+                a.estimate.points[pa[free]],
+                motion="none" if align == "none" else "similarity" if known_scale(a, b) is None else "rigid",
+                redundancy=redundancy,
+                datum=chosen[free],
+                alpha=alpha,
+            )
+        except GeometryError as error:
+            return without(str(error))
+        return _of_congruency(found, free)
+    if not all(one.datum in FREE_DATUMS for one in known):
+        return without("covariance of single points only")
+    statistic, critical, global_critical = _single_tests(difference, blocks, redundancy, alpha)
+    if not np.isfinite(statistic).any():
+        return without("no standard deviations of common points")
+    together = float(np.nanmean(statistic))
+    return PointTest(
+        *(sigma, "", statistic, critical, statistic > critical, together, global_critical, every),
+        approximate=True,
+    )
+
+
+def _of_congruency(found: Congruency, tested: BoolArray) -> PointTest:
+    """Return the test of all points where some, held in both results, took no part."""
+    n = len(tested)
+    sigma, statistic = np.zeros((n, 3)), np.full(n, np.nan)
+    sigma[tested] = np.sqrt(np.einsum("njj->nj", found.covariance).clip(0))
+    statistic[tested] = found.statistic
+    stable = np.ones(n, dtype=bool)
+    stable[tested] = found.stable
+    significant = np.zeros(n, dtype=bool)
+    significant[tested] = found.moved
+    return PointTest(
+        *(sigma, "", statistic, found.critical, significant, found.global_statistic, found.global_critical),
+        *(stable, False, found.agreed),
+    )
+
+
+def _joint(result: StoredResult, points: IntArray, scale: float, rotation: FloatArray) -> FloatArray:
+    """Covariance of some points together, scaled and turned, (3 n, 3 n); 0 where none is known."""
+    n = len(points)
+    if result.covariance is None:
+        return np.zeros((3 * n, 3 * n))
+    rows = (3 * points[:, None] + np.arange(3)).ravel()
+    Q = result.covariance[np.ix_(rows, rows)].reshape(n, 3, n, 3)
+    J = scale * rotation
+    moved: FloatArray = np.einsum("xa,iajb,yb->ixjy", J, Q, J, optimize=True)
+    return moved.reshape(3 * n, 3 * n)
+
+
+def _held(Q: FloatArray) -> BoolArray:
+    """Whether a coordinate of a point is known without error, so that nothing is left to test, (n,)."""
+    variance = np.diagonal(Q).reshape(-1, 3)
+    return np.asarray((variance <= HELD * variance.mean()).any(axis=1))
+
+
+def _sum(
+    a: FloatArray | None, b: FloatArray | None, pa: IntArray, pb: IntArray, transform: Similarity
+) -> FloatArray:
+    """Covariance of the differences, NaN where neither is known; one that is not known counts as 0."""
+    unknown = np.full((len(pa), 3, 3), np.nan)
+    J = transform.scale * transform.rotation
+    ours = unknown if a is None else a[pa]
+    theirs = unknown if b is None else J @ b[pb] @ J.T
+    first = np.isfinite(ours).all(axis=(1, 2), keepdims=True)
+    second = np.isfinite(theirs).all(axis=(1, 2), keepdims=True)
+    total = np.where(first, ours, 0.0) + np.where(second, theirs, 0.0)
+    return np.where(first | second, total, np.nan)
+
+
+def _single_tests(
+    difference: FloatArray, covariance: FloatArray, redundancy: int | None, alpha: float
+) -> tuple[FloatArray, float, float]:
+    """T of each point, its critical value for one of all points, and that of the mean of T."""
+    statistic = np.full(len(difference), np.nan)
+    testable = np.isfinite(covariance).all(axis=(1, 2)) & (
+        np.linalg.matrix_rank(np.nan_to_num(covariance)) == 3
+    )
+    d = difference[testable]
+    statistic[testable] = (
+        np.einsum("ni,ni->n", d, np.linalg.solve(covariance[testable], d[..., None])[..., 0]) / 3
+    )
+    tested = max(1, int(testable.sum()))
+    single = critical_value(alpha / 2 / tested, 3, redundancy)
+    return statistic, single, critical_value(alpha / 2, 3 * tested, redundancy)
+
+
+def known_scale(a: StoredResult, b: StoredResult) -> float | None:
+    """Return the scale of a over b where both have one, None where it has to be estimated."""
+    if not (a.has_scale and b.has_scale):
+        return None
+    if a.unit == b.unit:
+        return 1.0
+    return METRES[b.unit] / METRES[a.unit] if a.unit in METRES and b.unit in METRES else None
+
+
+def has_sigma(result: StoredResult) -> bool:
+    """Whether the standard deviation of any point is known."""
+    return result.point_covariance is not None and bool(np.isfinite(result.point_covariance).any())
