@@ -33,6 +33,7 @@ from sfm.survey.inputs.start import given_values
 from sfm.survey.inputs.survey import Survey
 from sfm.survey.left_out import datum_carriers, left_out_points, unused_image_points, words_of_left_out
 from sfm.survey.measuring.measurements import Naming
+from sfm.survey.principal_distance import far_principal_distances
 from sfm.survey.scale_check import check_scales
 
 TOLERANCE_FACTOR = 6.0  # of the robust spread of the residuals
@@ -386,4 +387,5 @@ def _warnings(
     absent = [name for name in survey.datum.points if name not in set(adjustment.network.points)]
     if absent:
         lines.append(f"datum points that are not in the network: {', '.join(absent[:MOST_NAMES])}")
+    lines += far_principal_distances(survey, adjustment.estimate)
     return (*lines, *datum_warnings(survey, adjustment.network))
