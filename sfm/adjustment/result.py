@@ -61,6 +61,8 @@ class Adjustment:
     image_sigma_factor: FloatArray = field(default_factory=lambda: np.ones(0))  # by which the stated standard
     # deviations of each image point were multiplied for its weight, (k,)
     datum_points: BoolArray | None = None  # object points that carry the datum; all if None, (n,)
+    test_alpha: float = 0.001  # probability with which the test that was applied rejects a good image
+    # coordinate; Baarda's usual one where none was
     remarks: tuple[str, ...] = ()  # what of the robust test could not be carried through, one line each
 
     @property

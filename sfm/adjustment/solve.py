@@ -10,6 +10,7 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
+from scipy import stats
 
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.engine.cofactors import (
@@ -34,6 +35,7 @@ from sfm.adjustment.quality.rejection import REJECTS, Run, find_optimum
 from sfm.adjustment.quality.reliability import redundancy_numbers as numbers_of
 from sfm.adjustment.quality.reliability import redundancy_of_bars, standardised_residuals
 from sfm.adjustment.quality.robust import (
+    TUKEY,
     huber_slopes,
     inflation,
     tukey_slopes,
@@ -111,7 +113,16 @@ def adjust(
         optimum, weight = find_optimum(run, state, reject=reject, alpha=alpha)
         Q = cofactors(optimum, layout, cross=redundancy_numbers) if covariance else None
         result = _result(local, run, optimum, weight, Q, sigma_px, SLOPES.get(reject))
-        return local.back(replace(result, image_sigma_factor=factor))
+        return local.back(
+            replace(result, image_sigma_factor=factor, test_alpha=_level_of(reject, alpha, result.test_alpha))
+        )
+
+
+def _level_of(reject: str, alpha: float, usual: float) -> float:
+    """Return the probability with which a good image coordinate is rejected; the usual one if none is."""
+    if reject == "tukey":
+        return float(2 * stats.norm.sf(TUKEY))
+    return alpha if reject == "tau" else usual
 
 
 def _result(

@@ -59,14 +59,10 @@ def _run() -> None:
 
 def _own_up(error: Exception) -> None:
     """End with one line about what nobody has foreseen; not enough memory is something to put right."""
-    from sfm.runtime.faults import FAULT, is_fault, keep_traceback, told_of_error
+    from sfm.runtime.faults import ending_of
 
-    told = told_of_error(error)
-    if not is_fault(error):
-        _refuse(told)
-    path = keep_traceback(error)
-    where = "its traceback cannot be written" if path is None else f"its traceback is in {path}"
-    _refuse(f"{told}; {where}", code=FAULT)
+    message, code = ending_of(error)
+    _refuse(message, code=code)
 
 
 def _refuse(message: str, *, code: int = BAD_INPUT) -> None:

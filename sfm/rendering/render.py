@@ -21,7 +21,7 @@ import numpy as np
 
 from sfm.camera import Camera, project, tangents_from_pixel
 from sfm.conventions import AnyArray, FloatArray, IntArray, angles_from_rotation
-from sfm.errors import GeometryError, KolinearError, OutputError
+from sfm.errors import GeometryError, OutputError
 from sfm.files.manifest import refuse_foreign_files
 from sfm.files.plain_text import csv_text
 from sfm.files.whole_files import whole_files
@@ -30,6 +30,7 @@ from sfm.rendering.painting_order import painting_order
 from sfm.rendering.scene import ARC, DISC, UNCODED, Optics, Scene
 from sfm.rendering.scene_file import Staging, read_scene
 from sfm.rendering.visibility import ProjectedTargets, project_targets
+from sfm.runtime.faults import ending_of
 
 TRUTH = ("truth_points.csv", "truth_images.csv", "truth_image_points.csv")
 
@@ -289,9 +290,10 @@ def main() -> int:
     try:
         staging = read_scene(given.scene)
         write_photographs(staging, given.folder)
-    except KolinearError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
+    except Exception as error:
+        message, code = ending_of(error)
+        print(f"error: {message}", file=sys.stderr)
+        return code
     print(f"{len(staging.names)} photographs of {len(staging.scene.targets)} targets in {given.folder}")
     return 0
 

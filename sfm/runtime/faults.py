@@ -17,6 +17,7 @@ from pathlib import Path
 
 from sfm.errors import KolinearError, one_line
 
+BAD_INPUT = 2  # exit code where a person must put something right
 FAULT = 70  # exit code; EX_SOFTWARE of sysexits.h
 OPENCV_NO_MEMORY = -4  # cv::Error::StsNoMem
 MAX_LETTERS = 200  # of an error's own message
@@ -53,6 +54,16 @@ def told_of_error(error: Exception) -> str:
     kind = type(error).__name__
     told = kind if message == kind else f"{kind}: {message}"
     return f"a fault of Kolinear: {told}{place}{f', at {at_work}' if at_work else ''}"
+
+
+def ending_of(error: Exception) -> tuple[str, int]:
+    """Return the line that a program ends with, and its exit code; the traceback of a fault is kept."""
+    told = told_of_error(error)
+    if not is_fault(error):
+        return told, BAD_INPUT
+    path = keep_traceback(error)
+    where = "its traceback cannot be written" if path is None else f"its traceback is in {path}"
+    return f"{told}; {where}", FAULT
 
 
 def keep_traceback(error: Exception) -> Path | None:

@@ -26,7 +26,7 @@ from sfm.errors import KolinearError
 
 LIMIT_SECONDS = 10.0
 HANG_SECONDS = 600.0  # of the clock, after which a case is ended; a busy computer compiles kernels for long
-START_SECONDS = 300.0  # imports and the first compilation of kernels
+START_SECONDS = 1200.0  # imports and the first compilation of kernels
 LIMIT_MIB = 1024
 SHARES = {
     **{"surveys": 0.2, "tables": 0.18, "photographs": 0.24, "models": 0.13, "results": 0.14, "codes": 0.03},

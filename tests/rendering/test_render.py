@@ -12,6 +12,7 @@ from sfm.camera import camera_from_values, project
 from sfm.conventions import rotation_from_angles
 from sfm.errors import GeometryError, SurveyFileError
 from sfm.rendering.render import (
+    main,
     painting_order,
     project_targets,
     render_photograph,
@@ -367,6 +368,19 @@ def test_the_command_refuses_in_one_line(tmp_path):
     assert run.returncode == 2
     assert run.stderr.startswith("error: ")
     assert run.stderr.count("\n") == 1
+
+
+def test_a_fault_of_the_command_is_one_line_and_its_own_exit_code(tmp_path, monkeypatch, capsys):
+    def fail(_):
+        raise ZeroDivisionError("division by zero")
+
+    monkeypatch.setattr("sfm.rendering.render.read_scene", fail)
+    monkeypatch.setattr("sys.argv", ["render", "a.toml", str(tmp_path / "out")])
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    assert main() == 70
+    told = capsys.readouterr().err
+    assert told.startswith("error: a fault of Kolinear: ZeroDivisionError: division by zero (test_render.py")
+    assert told.count("\n") == 1 and len(list(tmp_path.glob("kolinear-fault-*.txt"))) == 1
 
 
 def test_the_demo_scene_shows_most_targets_in_most_photographs():

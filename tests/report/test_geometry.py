@@ -45,6 +45,7 @@ def result_of(a: Adjustment) -> SurveyResult:
 @pytest.mark.skipif(not CAMCAL.is_dir(), reason="needs ../shared/data/camcal")
 def test_camcal_has_the_geometry_that_dbat_reports() -> None:
     network, start = read_photomodeler(CAMCAL / "camcal-pmexport.txt", control=CAMCAL / "camcal-fixed.txt")
+    start = replace(start, cameras=tuple(replace(one, model="brown_dbat") for one in start.cameras))
     a = adjust(network, start, datum=Datum("control"), reject="none")
     found, names = geometry_of(a), a.network.points
     control = np.isin(np.arange(len(names)), network.control.point)

@@ -71,6 +71,7 @@ class Reliability:
     """How well gross errors of image coordinates can be found, and what the others do."""
 
     delta0: float  # non-centrality of the test for alpha and power
+    critical: float  # value of that test
     minimal_bias: FloatArray  # smallest gross error found with the given power, px, (k, 2); inf: none is
     external: (
         FloatArray  # largest effect that error can have on a function of the unknowns, over its sigma, (k, 2)
@@ -172,16 +173,19 @@ def non_centrality(alpha: float = ALPHA, power: float = POWER) -> float:
     return float(stats.norm.ppf(1 - alpha / 2) + stats.norm.ppf(power))
 
 
-def reliability(adjustment: Adjustment, *, alpha: float = ALPHA, power: float = POWER) -> Reliability:
+def reliability(adjustment: Adjustment, *, alpha: float | None = None, power: float = POWER) -> Reliability:
     """Return internal and external reliability of each image coordinate; NaN where rejected.
 
     Args:
         adjustment: the adjustment.
-        alpha: probability with which the test that is to find the error rejects a good observation.
+        alpha: probability with which the test that is to find the error rejects a good observation; that of
+            the test by which the adjustment rejected, if not given.
         power: probability with which it finds an error of the minimal size.
 
     Source: Baarda (1968): delta0 sigma / sqrt(r); effect bounded by delta0 sqrt((1 - r)/r).
     """
+    alpha = adjustment.test_alpha if alpha is None else alpha
+    critical = float(stats.norm.ppf(1 - alpha / 2))
     delta0 = non_centrality(alpha, power)
     r = np.clip(adjustment.redundancy_numbers, 0, 1)
     sigma = np.sqrt(np.diagonal(adjustment.image_covariance, axis1=1, axis2=2))
@@ -193,7 +197,7 @@ def reliability(adjustment: Adjustment, *, alpha: float = ALPHA, power: float = 
         return np.where(unknown, np.nan, np.where(controlled, values, np.inf))
 
     return Reliability(
-        delta0, where(delta0 * sigma / np.sqrt(safe)), where(delta0 * np.sqrt((1 - safe) / safe))
+        delta0, critical, where(delta0 * sigma / np.sqrt(safe)), where(delta0 * np.sqrt((1 - safe) / safe))
     )
 
 

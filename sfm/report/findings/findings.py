@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from sfm.adjustment.quality.held_camera import HeldParameter, held_parameters
 from sfm.report.findings.bundle_statistics import Statistics, statistics_of
 from sfm.report.findings.checks import (
     CheckedControl,
@@ -55,6 +56,7 @@ class Findings:
     rejected: Rejected
     comparison: ComparisonFindings | None
     object_size: float  # diagonal of the box around the points, object unit
+    held: tuple[HeldParameter, ...]  # interior parameters held at values that the photographs contradict
     consistency: Consistency  # tests of points, photographs and the format
 
 
@@ -63,11 +65,12 @@ def findings_of(result: SurveyResult) -> Findings:
     a = result.adjustment
     sigma0, longest, statistics = sigma0_of(result), longest_residual(a), statistics_of(result)
     given, check, size = given_of(result), checked_control(result), object_size(a.estimate.points)
-    consistency = consistency_of(a)
+    consistency, held = consistency_of(a), held_parameters(a)
     geometry, precision = geometry_of(a), precision_of(a)
+    evidence = Evidence(result, sigma0, longest, statistics, given, check, size, consistency, held)
     return Findings(
         result=result,
-        verdict=judge(Evidence(result, sigma0, longest, statistics, given, check, size, consistency)),
+        verdict=judge(evidence),
         sigma0=sigma0,
         counts=count_observations(a),
         longest=longest,
@@ -83,5 +86,6 @@ def findings_of(result: SurveyResult) -> Findings:
         rejected=rejected_of(result, geometry),
         comparison=comparison_of(result),
         object_size=size,
+        held=held,
         consistency=consistency,
     )

@@ -7,6 +7,7 @@ from typing import Literal
 
 import numpy as np
 
+from sfm.adjustment.quality.held_camera import HeldParameter
 from sfm.adjustment.quality.reliability import UNCONTROLLED
 from sfm.adjustment.quality.statistics import ALPHA, GlobalTest, component_tests
 from sfm.adjustment.quality.variance_components import IMAGE_POINTS
@@ -34,6 +35,8 @@ WEIGHTED_REMARK, WEIGHTED_BAD = 5.0, 30.0  # w of control, scale bars, interior 
 # Differences at control that took no part, in sigmas. Control without standard deviations is a print or a
 # drawing, never as good as the network; control that states them must keep to them.
 CHECK_REMARK = 100.0
+HELD_BAD = 5.0  # standard deviations by which a held camera moves the points (RMS): a wrong result
+PRINCIPAL_POINT_REMARK = 0.1  # share of the diagonal; a decentred lens or sensor has 1 or 2 %
 MISCLOSURE_BAD = 0.01  # of the size of the object, or of a length: no measurement, a mistake
 
 
@@ -58,6 +61,7 @@ class Evidence:
     check: CheckedControl | None
     object_size: float  # diagonal of the box around the points, object unit
     consistency: Consistency
+    held: tuple[HeldParameter, ...] = ()  # interior parameters held at values that the photographs contradict
 
     @property
     def kind_tests(self) -> tuple[GlobalTest, ...]:
@@ -89,7 +93,7 @@ def judge(evidence: Evidence) -> Verdict:
     remarks: list[str] = []
     kinds = (
         *(_sigma0, _residual, _untested, _rays, _consistency, _taken_out, _scale),
-        *(_control, _bars, _interior, _exterior, _kinds, _check),
+        *(_control, _bars, _interior, _held, _principal_point, _exterior, _kinds, _check),
     )
     for judge_kind in kinds:
         for is_bad, line in judge_kind(evidence):
@@ -235,6 +239,41 @@ def _interior(evidence: Evidence) -> Judged:
             f"{significant(abs(worst.w))} times the standard deviation of that difference."
         )
         judged.append((abs(worst.w) > WEIGHTED_BAD, line))
+    return judged
+
+
+def _held(evidence: Evidence) -> Judged:
+    """Judge the interior parameters that were held: the clearest, since those that go with it follow."""
+    if not evidence.held:
+        return []
+    worst, more = evidence.held[0], len(evidence.held) - 1
+    unit = "" if worst.unit == "1" else f" {worst.unit}"
+    others = f" {more} other{'s' if more > 1 else ''} would help as well." if more else ""
+    line = (
+        f"{worst.parameter} of camera {worst.camera} is held at {worst.value:.6g}{unit}; the photographs say "
+        f"{worst.value + worst.change:.6g}{unit}, {significant(abs(worst.t))} standard deviations off, and "
+        f"points are wrong by {significant(worst.moved)} of theirs (RMS): free it.{others}"
+    )
+    return [(worst.moved > HELD_BAD, line)]
+
+
+def _principal_point(evidence: Evidence) -> Judged:
+    """Judge adjusted principal points that lie where no lens has them."""
+    judged: Judged = []
+    for camera in evidence.result.adjustment.estimate.cameras:
+        names = ("x0", "y0") if camera.in_mm else ("cx", "cy")
+        x, y = (camera.value(name) for name in names)
+        size = np.array(camera.size_px) * (camera.pixel_mm if camera.in_mm else 1.0)
+        if not camera.in_mm:
+            x, y = x - (camera.size_px[0] - 1) / 2, y - (camera.size_px[1] - 1) / 2
+        away = float(np.hypot(x, y) / np.linalg.norm(size))
+        if away > PRINCIPAL_POINT_REMARK and camera.free[[camera.names.index(name) for name in names]].any():
+            line = (
+                f"The principal point of camera {camera.name} was adjusted to {significant(100 * away)} % of "
+                "the diagonal of the photograph from its centre, farther than lenses have it: the network "
+                "hardly determines it, hold it or add photographs turned by 90 degrees."
+            )
+            judged.append((False, line))
     return judged
 
 

@@ -1,0 +1,46 @@
+"""Remarks on cameras: held at values that the photographs contradict, or adjusted to where no lens is."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from sfm.adjustment.datum import Datum
+from sfm.adjustment.result import Adjustment
+from sfm.adjustment.solve import adjust
+from sfm.report.findings.findings import findings_of
+from sfm.report.findings.verdict import Verdict
+from sfm.result import SurveyResult
+from tests.synthetic import make_network, seed_of
+
+
+def verdict_of(a: Adjustment) -> Verdict:
+    result = SurveyResult(
+        "cameras", "m", len(a.network.images), (), a, np.full(len(a.network.points), -1), None
+    )
+    return findings_of(result).verdict
+
+
+def test_a_held_camera_that_is_wrong_is_no_good_survey() -> None:
+    network, truth = make_network(seed_of("held and wrong"), images=10, points=50, free=())
+    assert verdict_of(adjust(network, truth, datum=Datum("free"))).level == "good"
+    camera = truth.cameras[0]
+    for name, factor in (("c", 1.01), ("K1", 1.4)):
+        p = camera.parameters.copy()
+        p[camera.names.index(name)] *= factor
+        start = replace(truth, cameras=(camera.with_parameters(p),))
+        found = verdict_of(adjust(network, start, datum=Datum("free")))
+        assert found.level != "good"
+        assert any(f"{name} of camera camera 1 is held at" in line for line in found.remarks)
+
+
+def test_a_principal_point_far_from_the_centre_is_told() -> None:
+    network, truth = make_network(seed_of("far centre"), images=8, points=40)
+    a = adjust(network, truth, datum=Datum("free"))
+    assert verdict_of(a).level == "good"
+    camera = a.estimate.cameras[0]
+    p = camera.parameters.copy()
+    p[camera.names.index("x0")] = 0.12 * np.hypot(10.0, 7.5)
+    moved = replace(a, estimate=replace(a.estimate, cameras=(camera.with_parameters(p),)))
+    assert any("The principal point of camera camera 1" in line for line in verdict_of(moved).remarks)
