@@ -30,6 +30,7 @@ from adapters.colmap.reconstruction import (
 from sfm.camera import Camera
 from sfm.conventions import FloatArray
 from sfm.errors import BackendError, one_line
+from sfm.files.plain_text import as_plain
 from sfm.network import Estimate, Network
 
 NEEDED_VERSION = (4, 2)
@@ -41,6 +42,7 @@ MAX_RADIUS = 1e32
 MIN_LM_DIAGONAL = 1e-30
 STILL = 1e-13  # relative decrease of the cost below which another run of Ceres has nothing to add
 MAX_RUNS = 8
+MAX_TOLD = 200  # characters of what COLMAP says of an error
 DENSE_LIMIT = 200  # photographs up to which the reduced normal matrix is factorised densely
 
 
@@ -228,6 +230,10 @@ def adjustment_config(pycolmap: ModuleType, network: Network, estimate: Estimate
 
 
 def told(error: BaseException) -> str:
-    """What COLMAP says of an error, without the places in its own source and its own words for them."""
+    """What COLMAP says of an error, without the places in its own source and its own words for them.
+
+    It repeats what files hold, whatever that is and however long.
+    """
     text = re.sub(r"\[\S+\.(cc|h):\d+\] *", "", one_line(error))
-    return re.sub(r"^Check failed: *", "COLMAP expected ", text)
+    text = re.sub(r"^Check failed: *", "COLMAP expected ", text)
+    return as_plain(text if len(text) <= MAX_TOLD else text[:MAX_TOLD] + "...")

@@ -8,6 +8,7 @@ from typing import Literal
 import numpy as np
 
 from sfm.adjustment.quality.held_camera import HeldParameter
+from sfm.adjustment.quality.reliability import UNCONTROLLED
 from sfm.adjustment.quality.statistics import ALPHA, GlobalTest, component_tests
 from sfm.adjustment.quality.variance_components import IMAGE_POINTS
 from sfm.conventions import MAD_TO_SIGMA
@@ -108,7 +109,7 @@ def judge(evidence: Evidence) -> Verdict:
         more = len(result.warnings) - 1
         other = f" ({more} more warning{'s' if more > 1 else ''}, see below)" if more else ""
         remarks.append(f"Warning: {result.warnings[0].rstrip('.')}{other}.")
-    notes = _pessimistic(evidence)
+    notes = (*_pessimistic(evidence), *_unchecked(evidence))
     if serious:
         return Verdict("bad", "The survey has no dependable result.", (*serious, *remarks, *notes))
     found = f"{oriented} of {total} photographs oriented, {len(a.network.points)} object points"
@@ -179,6 +180,28 @@ def _pessimistic(evidence: Evidence) -> tuple[str, ...]:
         f"The stated standard deviation of the image points, {significant(sigma0.stated_px)} px, is "
         f"pessimistic: their residuals show {significant(sigma0.image_points_px)} px.",
     )
+
+
+def _unchecked(evidence: Evidence) -> tuple[str, ...]:
+    """Say what nothing in the survey checks, which is no fault that anybody could see in the result."""
+    result, a = evidence.result, evidence.result.adjustment
+    lines = []
+    bars, free = evidence.given.bars, result.free_network
+    if bars is not None and not (bars.r > UNCONTROLLED).any():
+        which = f"scale bar {bars.names[0]}" if len(bars.names) == 1 else "scale bars"
+        lines.append(f"The scale rests on the {which}, which nothing checks.")
+    if a.datum == "control" and free is not None and len(a.network.control):
+        added = a.redundancy - free.redundancy
+        if added <= 0:
+            lines.append("Position, attitude and scale rest on the control, which nothing checks.")
+    rays = np.bincount(a.network.image_points.point[~a.rejected], minlength=len(a.network.points))
+    two = int((rays == 2).sum())
+    if two:
+        lines.append(
+            f"{two} of {len(rays)} points have two rays: errors of their image points along the epipolar "
+            "line are not found."
+        )
+    return tuple(lines)
 
 
 def _control(evidence: Evidence) -> Judged:
