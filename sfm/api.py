@@ -218,7 +218,7 @@ def cores() -> int:
 
 @contextmanager
 def one_blas_thread() -> Iterator[None]:
-    """Hold BLAS to one thread: photographs are worked on side by side, and two BLAS pools in turn fight."""
+    """Hold BLAS to one thread: photographs are worked on side by side, and BLAS pools would compete."""
     from threadpoolctl import threadpool_limits
 
     with threadpool_limits(limits=1, user_api="blas"):

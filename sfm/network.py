@@ -18,7 +18,7 @@ from sfm.camera import Camera
 from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.errors import GeometryError, UnknownNameError
 
-MOST_NAMES = 10  # in a message
+MAX_NAMES = 10  # in a message
 
 
 def _empty(*shape: int) -> FloatArray:
@@ -327,6 +327,6 @@ def index_of(names: Sequence[str], name: object, what: str) -> int:
     try:
         return names.index(str(name))
     except ValueError:
-        close = get_close_matches(str(name), names, n=MOST_NAMES) or names
-        some = ", ".join(close[:MOST_NAMES]) + (" ..." if len(close) > MOST_NAMES else "")
+        close = get_close_matches(str(name), names, n=MAX_NAMES) or names
+        some = ", ".join(close[:MAX_NAMES]) + (" ..." if len(close) > MAX_NAMES else "")
         raise UnknownNameError(f"unknown {what} '{name}', expected one of {some or 'none'}") from None

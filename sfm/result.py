@@ -279,7 +279,7 @@ class SurveyResult:
 
     @property
     def length_unit(self) -> str:
-        """What lengths are measured in: the object unit, or nothing that anybody knows."""
+        """What lengths are measured in: the object unit, or network units where the scale is undefined."""
         return self.unit if self.has_scale else NO_SCALE
 
 

@@ -1,6 +1,6 @@
 """COLMAP's models, binary and text, written and read.
 
-COLMAP has no place for names of cameras and points or the size of a pixel; they lie beside a model in
+COLMAP cannot hold names of cameras and points or the size of a pixel; they lie beside a model in
 kolinear.json.
 
 Source: COLMAP 4.2 documentation, "Output Format".
@@ -152,7 +152,7 @@ def network_of_scene(scene: Any, side: Names | None = None) -> tuple[Network, Es
 
     Args:
         scene: the reconstruction.
-        side: names that COLMAP has no place for; none if not given.
+        side: names that COLMAP cannot hold; none if not given.
 
     Returns:
         The network, with a covariance of 1 px^2 of every image point, since COLMAP keeps none, and what was
@@ -160,7 +160,7 @@ def network_of_scene(scene: Any, side: Names | None = None) -> tuple[Network, Es
 
     Raises:
         BackendError: a camera model that Kolinear has no equal of.
-        SurveyFileError: the name of a photograph is no plain text.
+        SurveyFileError: the name of a photograph has control or invisible characters.
     """
     side = side or Names()
     camera_ids = sorted(scene.cameras)

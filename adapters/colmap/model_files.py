@@ -254,7 +254,7 @@ class _Bytes:
 
     def skip(self, count: int) -> None:
         if self.at + count > len(self.content):
-            raise self.error(f"the file ends here, {count} more bytes were due")
+            raise self.error(f"the file ends here, {count} more bytes were expected")
         self.at += count
 
     def skip_name(self) -> None:

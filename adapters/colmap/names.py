@@ -1,4 +1,4 @@
-"""kolinear.json beside a COLMAP model: what COLMAP has no place for.
+"""kolinear.json beside a COLMAP model: what COLMAP cannot hold.
 
 Names of cameras, photographs and points, the size of a pixel, and which parameters are free.
 """
@@ -45,7 +45,7 @@ def read_side_file(path: Path) -> Names:
 
 
 def write_side_file(path: Path, network: Network, estimate: Estimate) -> None:
-    """Write what COLMAP has no place for."""
+    """Write what COLMAP cannot hold."""
     side = {
         "cameras": [
             {

@@ -70,7 +70,7 @@ def read_bal(path: Path, *, size_px: tuple[int, int] | None = None) -> tuple[Net
         what = f"value {row} of {len(values)}"
         words = text.due_row(what)
         if len(words) != 1:
-            raise text.error(f"{len(words)} words, {what} was due")
+            raise text.error(f"{len(words)} words, {what} was expected")
         values[row] = text.number_of(words[0])
         if row < CAMERA_VALUES * m and row % CAMERA_VALUES == FOCAL and values[row] <= 0:
             raise text.error(f"focal length {values[row]:g} px, it must be positive")
@@ -106,7 +106,7 @@ def write_bal(path: Path, network: Network, estimate: Estimate) -> None:
         estimate: complete; cameras in model opencv with one focal length and no decentring.
 
     Raises:
-        OutputError: what BAL has no place for, or the file cannot be written.
+        OutputError: what BAL cannot hold, or the file cannot be written.
     """
     for camera in estimate.cameras:
         if camera.model != "opencv" or camera.value("fx") != camera.value("fy"):
@@ -114,7 +114,7 @@ def write_bal(path: Path, network: Network, estimate: Estimate) -> None:
                 f"camera {camera.name}: BAL knows one focal length with k1, k2 and nothing else"
             )
         if camera.value("p1") or camera.value("p2"):
-            raise OutputError(f"camera {camera.name}: BAL has no place for p1 and p2")
+            raise OutputError(f"camera {camera.name}: BAL cannot hold p1 and p2")
     if not (estimate.oriented.all() and estimate.determined.all()):
         raise OutputError("BAL wants start values of all photographs and points, some have none")
     seen = network.image_points

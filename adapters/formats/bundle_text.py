@@ -202,7 +202,7 @@ def read_bundle_csharp(path: Path, *, pixel_mm: float = PIXEL_MM) -> tuple[Netwo
         if len(words) != 4 + 2 * m:
             raise text.error(f"{len(words)} words, needed id X Y Z and x y of {m} photographs")
         if words[0] in known:
-            raise text.error(f"point {shown(words[0])} stands twice")
+            raise text.error(f"point {shown(words[0])} is a duplicate")
         known.add(text.name_of(words[0], "the id of a point"))
         labels.append(words[0])
         values = [text.number_of(word) for word in words[1:]]
@@ -215,7 +215,7 @@ def read_bundle_csharp(path: Path, *, pixel_mm: float = PIXEL_MM) -> tuple[Netwo
         if j:
             words = text.due_row(f"the sigmas of point {label}")
         if len(words) != 1 + 2 * m or words[0] != label:
-            raise text.error(f"'{shown(' '.join(words))}' where {label} and {2 * m} sigmas were due")
+            raise text.error(f"'{shown(' '.join(words))}' where {label} and {2 * m} sigmas were expected")
         values = [text.number_of(word) for word in words[1:]]
         sigma.extend(_positive(text, values))
     text.end()
@@ -227,7 +227,7 @@ def write_bundle_csharp(path: Path, network: Network, estimate: Estimate) -> Non
     """Write a network as the file of the C# program, which wants every point in every photograph.
 
     Raises:
-        OutputError: what the file has no place for, or it cannot be written.
+        OutputError: what the file cannot hold, or it cannot be written.
     """
     xy, sigma = _millimetres(network, estimate)
     seen = network.image_points
@@ -265,7 +265,7 @@ def _exterior(text: Lines, count: int | None) -> tuple[list[str], list[list[floa
         if len(words) != 7:
             raise text.error(f"{len(words)} words, a photograph is id omega phi kappa XL YL ZL")
         if words[0] in known:
-            raise text.error(f"photograph {shown(words[0])} stands twice")
+            raise text.error(f"photograph {shown(words[0])} is a duplicate")
         known.add(text.name_of(words[0], "the id of a photograph"))
         text.refuse_more(len(known), MAX_PHOTOGRAPHS, "photographs")
         names.append(words[0])
@@ -282,7 +282,7 @@ def _frames(text: Lines, words: list[str], m: int) -> tuple[list[int], list[floa
         raise text.error(f"{len(words) - 1} words after {count} frames, needed {3 * count}")
     frames = [text.index_of(words[1 + 3 * k], m, "frame") for k in range(count)]
     if len(set(frames)) < count:
-        raise text.error("a frame stands twice")
+        raise text.error("a frame is a duplicate")
     return frames, [text.number_of(word) for k in range(count) for word in words[2 + 3 * k : 4 + 3 * k]]
 
 

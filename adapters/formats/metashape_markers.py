@@ -74,7 +74,7 @@ class Markers:
                 )
         point, image = found
         if len(np.unique(image * len(self.labels) + point)) < len(point):
-            raise SurveyFileError(f"{self.path}: a marker stands twice in one camera")
+            raise SurveyFileError(f"{self.path}: a marker is a duplicate in one camera")
         covariance = np.tile(MARKER_SIGMA_PX**2 * np.eye(2), (len(seen), 1, 1))
         return ImagePoints(image, point, np.array(self._xy).reshape(-1, 2) - HALF_PIXEL, covariance)
 
@@ -84,7 +84,7 @@ class Markers:
         node, j = nodes[-1], len(self.labels)
         identifier = node.attribute("id")
         if identifier in self._index:
-            raise node.error(f"marker id {identifier} stands twice")
+            raise node.error(f"marker id {identifier} is a duplicate")
         if j == MAX_POINTS:
             raise node.error(f"more than {MAX_POINTS} markers, no more are read")
         self._index[identifier] = j

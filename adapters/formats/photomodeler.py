@@ -83,7 +83,9 @@ def read_photomodeler(
             break
         number, _, name = line.strip().partition(" ")
         if number != str(len(names)) or not name.strip():
-            raise text.error(f"'{shown(line.strip())}' where photograph {len(names)} and its file were due")
+            raise text.error(
+                f"'{shown(line.strip())}' where photograph {len(names)} and its file were expected"
+            )
         text.refuse_more(len(names) + 1, MAX_PHOTOGRAPHS, "photographs")
         file = name.strip().replace("\\", "/").rsplit("/", 1)[-1]
         names.append(text.name_of(file, "the file of a photograph"))
@@ -101,7 +103,7 @@ def read_photomodeler(
     controls = {key for _, key, _ in control_rows}
     for where, key, row in (*object_rows, *control_rows):
         if key in known and key not in controls:
-            raise SurveyFileError(f"{where}: point {key} stands twice")
+            raise SurveyFileError(f"{where}: point {key} is a duplicate")
         known.setdefault(key, row[:3])
     points = list(known)
     index = {key: j for j, key in enumerate(points)}
@@ -205,12 +207,12 @@ def write_photomodeler(path: Path, network: Network, estimate: Estimate, *, titl
     Photographs without orientation are refused, points without coordinates have image points only.
 
     Raises:
-        OutputError: what the export has no place for, or the file cannot be written.
+        OutputError: what the export cannot hold, or the file cannot be written.
     """
     for camera in estimate.cameras:
         if camera.model != "brown" or camera.value("b1") or camera.value("b2"):
             raise OutputError(
-                f"camera {camera.name}: PhotoModeler has no place for model {camera.model} with affinity; "
+                f"camera {camera.name}: PhotoModeler cannot hold model {camera.model} with affinity; "
                 "convert it to brown with b1 in the pixel size"
             )
     sizes = {camera.size_px for camera in estimate.cameras}

@@ -56,8 +56,8 @@ class FileFormat:
     write: Writer  # to a new file, or into an empty folder
     folder: bool = False  # whether it is a folder of files
     placed: bool = False  # whether it leaves out what has no coordinates in the object
-    lacks: tuple[str, ...] = ()  # parameters of these models that it has no place for, others can stand in
-    straight: tuple[str, ...] = ()  # parameters that it has no place for and nothing can stand in
+    lacks: tuple[str, ...] = ()  # parameters of these models that it cannot hold, others can stand in
+    straight: tuple[str, ...] = ()  # parameters that it cannot hold and nothing can stand in
     one_focal: bool = False  # whether fx and fy must be the same
     titled: bool = False  # whether it holds the name of what is written
     names: tuple[bool, bool] = (True, True)  # whether it names points, and photographs; else it numbers them
@@ -269,7 +269,7 @@ def refuse_taken(path: Path, form: FileFormat) -> None:
     empty = form.folder and path.is_dir() and not any(path.iterdir())
     if os.path.lexists(path) and not empty:
         needed = "a new or empty folder" if form.folder else "a new file"
-        raise OutputError(f"{path}: it is there already and is left alone; format {form.name} needs {needed}")
+        raise OutputError(f"{path}: already exists and is left alone; format {form.name} needs {needed}")
 
 
 def _refuse_cameras(form: FileFormat, cameras: tuple[Camera, ...]) -> None:
@@ -288,7 +288,7 @@ def _refuse_cameras(form: FileFormat, cameras: tuple[Camera, ...]) -> None:
         if left:
             remedy = "; --undistort corrects the image points for it" if form.straight else ""
             raise KolinearError(
-                f"camera {camera.name}: format {form.name} has no place for {', '.join(left)} of "
+                f"camera {camera.name}: format {form.name} cannot hold {', '.join(left)} of "
                 f"{camera.model}{remedy}"
             )
 

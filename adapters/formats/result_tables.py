@@ -190,12 +190,12 @@ class _Summary(Content):
 
 
 def _summary(path: Path) -> _Summary:
-    """Read the summary, in which no camera may stand twice."""
+    """Read the summary, in which no camera may occur twice."""
     summary = read_json(path, _Summary, "the summary of a result")
     names = [camera.name for camera in summary.cameras]
     for name, count in Counter(names).items():
         if count > 1:
-            raise SurveyFileError(f"{path}: camera '{name}' stands twice")
+            raise SurveyFileError(f"{path}: camera '{name}' is a duplicate")
     return summary
 
 

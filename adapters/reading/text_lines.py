@@ -81,7 +81,7 @@ class Lines:
         line = self.maybe_line()
         if line is None:
             self.number += 1
-            raise self.error("the file ends here, more was due")
+            raise self.error("the file ends here, more was expected")
         return line
 
     def put_back(self) -> None:
@@ -101,7 +101,7 @@ class Lines:
         words = self.row()
         if words is None:
             self.number += 1
-            raise self.error(f"the file ends here, {what} was due")
+            raise self.error(f"the file ends here, {what} was expected")
         return words
 
     def due_words(self, count: int, what: str) -> list[str]:

@@ -47,7 +47,9 @@ def refuse_foreign_pages(out: Path) -> None:
     So it does where the path is no text that can stand in them, or leads through a link.
     """
     if not is_plain(str(out)):
-        raise OutputError(f"{as_plain(str(out))}: the path is no plain text; needed another --out")
+        raise OutputError(
+            f"{as_plain(str(out))}: the path has control or invisible characters; needed another --out"
+        )
     if not read_manifest(out).keys() <= {MANIFEST, *PAGES}:
         raise OutputError(f"{out}: the folder holds '{MANIFEST}' of a result, no batch; needed another --out")
     refuse_foreign_files(out, PAGES)

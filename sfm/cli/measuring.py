@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from sfm.survey.inputs.resection_points import Task
 
 NONE_MATCHED = 1  # exit code
-MOST_TARGETS = 10_000  # on one sheet; no family has more codes
+MAX_TARGETS = 10_000  # on one sheet; no family has more codes
 
 
 def match(
@@ -222,9 +222,9 @@ def _numbers(text: str) -> IntArray:
         if not first.isdecimal() or (dash and not last.isdecimal()):
             raise SurveyFileError(f"--ids {text}: '{part}' is neither a number nor a range such as 1-100")
         begin, end = int(first), int(last if dash else first)
-        if end < begin or end - begin >= MOST_TARGETS or len(numbers) + end - begin >= MOST_TARGETS:
+        if end < begin or end - begin >= MAX_TARGETS or len(numbers) + end - begin >= MAX_TARGETS:
             raise SurveyFileError(
-                f"--ids {text}: '{part}' must run upwards, and a sheet holds at most {MOST_TARGETS} targets"
+                f"--ids {text}: '{part}' must run upwards, and a sheet holds at most {MAX_TARGETS} targets"
             )
         numbers += range(begin, end + 1)
     return np.array(numbers, dtype=np.int64)

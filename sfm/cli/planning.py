@@ -8,7 +8,7 @@ import typer
 
 from sfm.cli.starting import loading
 from sfm.errors import SurveyFileError
-from sfm.planning.target_size import LEAST_PIXELS, target_size
+from sfm.planning.target_size import MIN_PIXELS, target_size
 
 plan = typer.Typer(name="plan", help="Plan a survey before the photographs are taken.")
 
@@ -31,7 +31,7 @@ def target_size_command(
     columns: Annotated[int, typer.Option("--width-px", metavar="N", help="Width of the photographs, px.")],
     pixels: Annotated[
         float, typer.Option("--pixels", metavar="P", help="Pixels across a target, at least.")
-    ] = LEAST_PIXELS,
+    ] = MIN_PIXELS,
     tilt: Annotated[
         float, typer.Option("--tilt-deg", metavar="DEG", help="Largest tilt of a target to its ray, deg.")
     ] = 0.0,

@@ -26,7 +26,7 @@ from sfm.conventions import BoolArray, FloatArray
 from sfm.errors import GeometryError
 
 MOTIONS = {"none": 0, "rigid": 6, "similarity": 7}  # parameters of what is no change
-LEAST_STABLE = 4  # points that a datum needs to be checked by at least one more than it takes
+MIN_STABLE = 4  # points that a datum needs to be checked by at least one more than it takes
 STABLE_FRACTION = 0.5  # of the points that must agree for the others to be called moved
 
 
@@ -75,8 +75,8 @@ def congruency(
     n = len(xyz)
     stable = np.ones(n, dtype=bool) if datum is None else datum.copy()
     u = MOTIONS[motion]
-    if stable.sum() < LEAST_STABLE:
-        raise GeometryError(f"congruency: {int(stable.sum())} points, expected {LEAST_STABLE} or more")
+    if stable.sum() < MIN_STABLE:
+        raise GeometryError(f"congruency: {int(stable.sum())} points, expected {MIN_STABLE} or more")
     first = int(stable.sum())
     G = motions(xyz)[:, :u]
     single = critical_value(alpha / 2 / first, 3, redundancy)
@@ -88,7 +88,7 @@ def congruency(
         if stable.sum() == first:
             global_statistic, global_critical = omega / freedom, limit
         agreed = omega / freedom <= limit and drops[stable].max() <= single
-        if agreed or stable.sum() - 1 < max(LEAST_STABLE, STABLE_FRACTION * first):
+        if agreed or stable.sum() - 1 < max(MIN_STABLE, STABLE_FRACTION * first):
             break
         stable[np.argmax(np.where(stable, drops, -np.inf))] = False
     moved = ~stable & (np.ones(n, dtype=bool) if datum is None else datum)

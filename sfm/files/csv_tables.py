@@ -100,7 +100,7 @@ def read_table(
     shape = ",".join(wanted) + (f"[,{','.join(optional)}]" if optional else "")
     for name in header:
         if header.count(name) > 1:
-            raise SurveyFileError(f"{path}, line 1: column {name!r:.60} stands twice in the header")
+            raise SurveyFileError(f"{path}, line 1: column {name!r:.60} is a duplicate in the header")
         if ignored is not None and name not in (*wanted, *optional, *ignored):
             hint = "; commas must separate the columns" if ";" in name or "\t" in name else ""
             raise SurveyFileError(f"{path}, line 1: unknown column {name!r:.60}, needed {shape}{hint}")

@@ -37,7 +37,7 @@ def refuse_foreign_folder(out: Path) -> None:
     except OSError as error:  # a file is above it
         raise OutputError(f"{out}: cannot be written here: {error.strerror}") from error
     if not stat.S_ISDIR(mode):
-        raise OutputError(f"{out}: a file is in the way, --out needs a folder")
+        raise OutputError(f"{out}: a file has this name, --out needs a folder")
     try:
         foreign = _foreign(out, names_below(out))
     except OSError as error:

@@ -134,7 +134,7 @@ def write_manifest(folder: Path, hashes: dict[str, list[str]]) -> None:
 
 
 def remove_leftovers(out: Path) -> None:
-    """Remove what killed runs have left beside a place, and put back there what they had moved away.
+    """Remove what killed runs have left beside a place, and restore what they had moved away.
 
     Only for who knows that nobody is writing there, by a lock.
     """

@@ -32,7 +32,7 @@ class _First(Listener):
         self._tell: Callable[[], None] | None = tell
 
     def on_start(self, event: Event) -> None:
-        """A function is compiled; those of numba and other libraries are none of ours."""
+        """A function is compiled; those of numba and other libraries do not count."""
         module = event.data["dispatcher"].py_func.__module__ or ""  # none for what numba itself writes
         if self._tell is not None and module.startswith("sfm."):
             tell, self._tell = self._tell, None

@@ -1,4 +1,4 @@
-"""Threads of the linear algebra during an adjustment, set on purpose and put back afterwards.
+"""Threads of the linear algebra during an adjustment, set on purpose and restored afterwards.
 
 numpy and scipy bring a BLAS pool each, whose threads spin while they wait. On two cores 100 photographs took
 464 ms with two threads and 219 ms with one, and a symmetric product of 6000 x 1208 took 160 against 129 ms:

@@ -14,7 +14,7 @@ LEVELS_8, LEVELS_16 = 256, 65536
 FULL_SCALE_8, FULL_SCALE_16 = LEVELS_8 - 1.0, LEVELS_16 - 1.0
 # Rec. 601, as cv2 turns colour into grey; photographs in memory are red, green, blue here.
 LUMINANCE = (0.299, 0.587, 0.114)
-SMALLEST_WINDOW_PX = 3
+MIN_WINDOW_PX = 3
 
 
 @dataclass(frozen=True)
@@ -70,9 +70,9 @@ def odd_window(what: str, side_px: int) -> int:
     Raises:
         GeometryError: an even side, or less than 3.
     """
-    if side_px < SMALLEST_WINDOW_PX or side_px % 2 == 0:
+    if side_px < MIN_WINDOW_PX or side_px % 2 == 0:
         raise GeometryError(
-            f"{what}: a window of {side_px} px, needed an odd number of at least {SMALLEST_WINDOW_PX}"
+            f"{what}: a window of {side_px} px, needed an odd number of at least {MIN_WINDOW_PX}"
         )
     return int(side_px)
 

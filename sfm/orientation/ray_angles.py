@@ -7,7 +7,7 @@ import numpy as np
 from sfm.conventions import BoolArray, FloatArray
 from sfm.network import Estimate, Network
 
-MOST_PAIRS = 4_000_000  # of rays that are compared at a time
+MAX_PAIRS = 4_000_000  # of rays that are compared at a time
 
 
 def ray_angles(network: Network, estimate: Estimate, used: BoolArray) -> FloatArray:
@@ -30,7 +30,7 @@ def ray_angles(network: Network, estimate: Estimate, used: BoolArray) -> FloatAr
     angle = np.full(len(network.points), np.nan)
     for r in np.unique(count[count >= 2]):
         points = np.flatnonzero(count == r)
-        for some in np.array_split(points, 1 + len(points) * r * r // MOST_PAIRS):
+        for some in np.array_split(points, 1 + len(points) * r * r // MAX_PAIRS):
             u = ray[first[some][:, None] + np.arange(r)]
             sine = np.sqrt(np.maximum(1 - np.einsum("nia,nja->nij", u, u) ** 2, 0))
             angle[some] = np.degrees(np.arcsin(np.minimum(sine.max(axis=(1, 2)), 1)))

@@ -33,8 +33,8 @@ LABEL_MM = 4.0  # room for the id below a target
 # Radius that stays clear around a target, in radii of its ring, so that neighbours are not taken for code.
 CLEAR = 1.35
 # Printers of 600 dots per inch put 24 dots across the smallest target, 6 across a module of the smallest tag.
-SMALLEST_DOT_MM, SMALLEST_MODULE_MM = 1.0, 0.25
-MOST_LETTERS = 40  # of the name of a code table, so that the line with it stays on the page
+MIN_DOT_MM, MIN_MODULE_MM = 1.0, 0.25
+MAX_LETTERS = 40  # of the name of a code table, so that the line with it stays on the page
 MAX_SHEET_BYTES = 100_000_000  # of 10,000 targets
 CHECK = "print without scaling and check"  # stands on every page; a file with it is an earlier sheet
 
@@ -97,9 +97,9 @@ def lay_out_sheet(
         raise SurveyFileError(f"targets: diameter is {diameter_mm} mm, needed more than 0")
     width, height = PAGES_MM[page]
     if isinstance(codes, TagFamily):
-        smallest = SMALLEST_MODULE_MM * codes.modules
+        smallest = MIN_MODULE_MM * codes.modules
     else:
-        smallest = SMALLEST_DOT_MM
+        smallest = MIN_DOT_MM
     if diameter_mm < smallest:
         raise SurveyFileError(
             f"targets: diameter is {diameter_mm:g} mm, needed at least {smallest:g} mm for {codes.name} to "
@@ -271,8 +271,8 @@ def _texts(sheet: Sheet, k: int) -> list[tuple[float, float, float, str]]:
     if sheet.tags:
         size = f"square {sheet.diameter_mm:g} mm"
     family = "".join(letter if letter.isprintable() else "?" for letter in sheet.family)
-    if len(family) > MOST_LETTERS:
-        family = family[: MOST_LETTERS - 3] + "..."
+    if len(family) > MAX_LETTERS:
+        family = family[: MAX_LETTERS - 3] + "..."
     note = f"{family}, {size}, page {k + 1} of {len(sheet.pages)}; ruler {RULER_MM:g} mm: {CHECK}"
     return [*texts, (sheet.size_mm[0] / 2, MARGIN_MM + 7.5, height, note)]
 

@@ -113,7 +113,7 @@ def _run(task: Task, method: str) -> dict[str, Any]:
             return _robust(task)
         case "least-squares":
             return _least_squares(task)
-    raise GeometryError(f"resect: method '{method}' is none of {', '.join(METHODS)}, all")
+    raise GeometryError(f"resect: method '{method}', expected one of {', '.join(METHODS)}, all")
 
 
 def _church(task: Task) -> dict[str, Any]:

@@ -24,7 +24,7 @@ NOT_A_CIRCLE = (
 
 
 OTHER_SIZE = 0.1  # relative difference of a stated diameter from that of the ellipses, which know 1 to 3 %
-MOST_NAMED = 10  # ids in a warning
+MAX_NAMED = 10  # ids in a warning
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class CircleCheck:
     """The network after its targets were compared with circles in space."""
 
     network: Network  # image points of the circles' centres
-    estimate: Estimate  # without the points that are no circles
+    estimate: Estimate  # without the points that are not circles
     no_circles: tuple[str, ...]  # uncoded points left out: their outlines are not images of one circle
     eccentricity: Eccentricity | None  # what was corrected; None where nothing was
     warnings: tuple[str, ...] = ()  # on stated diameters, one line each
@@ -41,7 +41,7 @@ class CircleCheck:
 def check_circles(
     survey: Survey, photographs: MeasuredPhotographs, naming: Naming, network: Network, estimate: Estimate
 ) -> CircleCheck:
-    """Leave out uncoded points that are no circles, and correct the others for eccentricity.
+    """Leave out uncoded points that are not circles, and correct the others for eccentricity.
 
     Radius and normal of every target come from its ellipses; a diameter that the survey gives replaces the
     radius. The covariance of the correction is added to that of the image point.
@@ -111,10 +111,10 @@ def _unknown_ids(given: Diameters | None, points: tuple[str, ...]) -> tuple[str,
     unknown = [name for name in given.names if name not in known] if given is not None else []
     if given is None or not unknown:
         return ()
-    more = f" and {len(unknown) - MOST_NAMED} more" if len(unknown) > MOST_NAMED else ""
+    more = f" and {len(unknown) - MAX_NAMED} more" if len(unknown) > MAX_NAMED else ""
     return (
         f"{given.source}: diameters of targets that are not in the survey: "
-        f"{', '.join(unknown[:MOST_NAMED])}{more}",
+        f"{', '.join(unknown[:MAX_NAMED])}{more}",
     )
 
 

@@ -19,7 +19,7 @@ from sfm.survey.inputs.survey import Survey
 
 CONTRADICTED = 0.5  # share of its rays that the test rejects, above which control or a bar is to blame
 CLEARLY = 0.25  # of the misfit that the best choice removes: by how much more than the second it must remove
-MOST_CANDIDATES = 10  # control points and bars that are taken out in turn, those that lose most rays first
+MAX_CANDIDATES = 10  # control points and bars that are taken out in turn, those that lose most rays first
 OTHER_UNIT = 8.0  # factor between scales that no start values explain: mm, cm, m, km differ by ten or more
 WELL_APART = 10.0  # standard deviations of their distance between places that tell a scale
 MIN_CONTROL = 3  # points that a control datum needs
@@ -257,7 +257,7 @@ def _suspect_control(part: Network, held: FloatArray) -> Iterator[_Suspect]:
         held: share of its rays that each control point lost, none in a datum without control.
     """
     if len(held) > MIN_CONTROL:
-        for k in np.argsort(-held, kind="stable")[:MOST_CANDIDATES]:
+        for k in np.argsort(-held, kind="stable")[:MAX_CANDIDATES]:
             point = int(part.control.point[k])
             yield _Suspect((part.points[point],), (point,), part.control.xyz[k])
 
@@ -272,7 +272,7 @@ def _suspect_bars(part: Network, ends: FloatArray, *, alone: bool) -> Iterator[_
     """
     bars = part.scale_bars
     if len(bars) > 1 or not alone:
-        for b in np.argsort(-ends, kind="stable")[:MOST_CANDIDATES]:
+        for b in np.argsort(-ends, kind="stable")[:MAX_CANDIDATES]:
             at = int(bars.start[b]), int(bars.end[b])
             yield _Suspect((part.points[at[0]], part.points[at[1]]), at, bars.length[b : b + 1])
 

@@ -8,7 +8,7 @@ from sfm.conventions import BoolArray, IntArray
 from sfm.network import Network
 from sfm.result import LeftOutPoint
 
-MOST_NAMES = 10  # points named in one line
+MAX_NAMES = 10  # points named in one line
 
 
 def left_out_points(
@@ -52,8 +52,8 @@ def unused_image_points(whole: Network, images: BoolArray, points: BoolArray) ->
 
 def words_of_left_out(left_out: tuple[LeftOutPoint, ...], measured: int) -> str:
     """Return in one line which of so many measured points are not in the result, and why."""
-    named = "; ".join(f"point {one.point}: {one.reason}" for one in left_out[:MOST_NAMES])
-    more = f"; and {len(left_out) - MOST_NAMES} more" if len(left_out) > MOST_NAMES else ""
+    named = "; ".join(f"point {one.point}: {one.reason}" for one in left_out[:MAX_NAMES])
+    more = f"; and {len(left_out) - MAX_NAMES} more" if len(left_out) > MAX_NAMES else ""
     rows = sum(one.image_points for one in left_out)
     return (
         f"{len(left_out)} of {measured} measured points are not in the result, with {rows} image points: "

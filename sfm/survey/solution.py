@@ -33,6 +33,7 @@ from sfm.survey.inputs.measurements import Naming
 from sfm.survey.inputs.start import given_values
 from sfm.survey.inputs.survey import Survey
 from sfm.survey.left_out import datum_carriers, left_out_points, unused_image_points, words_of_left_out
+from sfm.survey.principal_distance import far_principal_distances
 from sfm.survey.scale_check import check_scales
 
 TOLERANCE_FACTOR = 6.0  # of the robust spread of the residuals
@@ -41,7 +42,7 @@ MIN_IMAGE_POINTS = 4  # of a photograph in the final adjustment: three determine
 GIVEN_IMAGE_POINTS = 3  # of one whose given orientation tells which of the four solutions is meant
 MIN_DATUM_POINTS = 3  # that fix position, attitude and scale
 CARRYING_DEG = 2.0  # largest angle between two rays of a point below which it carries no free datum
-MOST_NAMES = 10  # points named in one line
+MAX_NAMES = 10  # points named in one line
 
 
 @dataclass(frozen=True)
@@ -385,5 +386,6 @@ def _warnings(
         lines.append(words_of_left_out(left_out, measured))
     absent = [name for name in survey.datum.points if name not in set(adjustment.network.points)]
     if absent:
-        lines.append(f"datum points that are not in the network: {', '.join(absent[:MOST_NAMES])}")
+        lines.append(f"datum points that are not in the network: {', '.join(absent[:MAX_NAMES])}")
+    lines += far_principal_distances(survey, adjustment.estimate)
     return (*lines, *datum_warnings(survey, adjustment.network))

@@ -14,7 +14,7 @@ from sfm.targets.codes.rings import CodeFamily
 from sfm.targets.edge_rays import RAYS
 from sfm.targets.flags import Flag
 from sfm.targets.measure import EllipseFit, axes_from_shape
-from sfm.targets.outlines import LEAST_AXIS_RATIO, LEAST_STEP, STEP_SIGMAS
+from sfm.targets.outlines import MIN_AXIS_RATIO, MIN_STEP, STEP_SIGMAS
 
 # Largest RMS of the residuals and largest mean residual on an eighth of the edge, over the contrast.
 POOR_FIT = 0.12
@@ -33,7 +33,7 @@ SOFTEST_EDGE_PX = 1.3
 # cells is set on so much of the circumference: even parity leaves at least two of them clear.
 CLOSED, CROWDED = 0.95, 0.08
 # Least median and largest width of the stroke, radii of the counter; rims of the retro-panel have up to 0.46.
-LEAST_STROKE, LARGEST_STROKE = 0.5, 1.75
+MIN_STROKE, MAX_STROKE = 0.5, 1.75
 # So far behind a stroke its neighbours are looked for, radii; what is so many contrasts bright is glare.
 NEIGHBOURS, GLARE = 2.0, 1.5
 _STEP_PX, _RISE_PX = 0.5, 3.0
@@ -68,8 +68,8 @@ def judge_fits(
             (Flag.NO_CONVERGENCE, (fit.flag & Flag.NO_CONVERGENCE) != 0),
             (Flag.TOO_SMALL, ~(2 * b >= min_diameter_px)),
             (Flag.TOO_LARGE, ~(2 * a <= max_diameter_px)),
-            (Flag.TOO_OBLIQUE, b / a < LEAST_AXIS_RATIO),
-            (Flag.LOW_CONTRAST, contrast < np.maximum(STEP_SIGMAS * noise, LEAST_STEP * scale)),
+            (Flag.TOO_OBLIQUE, b / a < MIN_AXIS_RATIO),
+            (Flag.LOW_CONTRAST, contrast < np.maximum(STEP_SIGMAS * noise, MIN_STEP * scale)),
             (Flag.BLURRED, fit.blur > np.maximum(SOFTEST_EDGE * b, SOFTEST_EDGE_PX)),
             (Flag.UNEVEN_EDGE, fit.unevenness > UNEVEN_EDGE + 3 * noise / contrast),
             (Flag.LOBED, fit.lobes > lobes),
@@ -162,8 +162,8 @@ def find_counters(image: AnyArray, xy: FloatArray, shape: FloatArray, levels: Fl
             ex, ey = (r * c - q * s) / det, (p * s - q * c) / det
             R = math.hypot(ex, ey)
             width, behind = _stroke(image, xy[k], ex / R, ey / R, R, levels[k])
-            closed += width <= LARGEST_STROKE * R
-            wide += LEAST_STROKE * R <= width <= LARGEST_STROKE * R
+            closed += width <= MAX_STROKE * R
+            wide += MIN_STROKE * R <= width <= MAX_STROKE * R
             crowded += behind
         counter[k] = closed >= CLOSED * RAYS and wide >= RAYS // 2 and crowded >= CROWDED * RAYS
     return counter
@@ -176,7 +176,7 @@ def _stroke(
     """Return the width of the background on a ray, px, inf where it does not end, and if more is behind."""
     h, w = image.shape
     left, width, highest, t = -1.0, math.inf, 0.0, 0.0
-    while t < (LARGEST_STROKE + 1) * R + 1 if width == math.inf else t < left + width + NEIGHBOURS * R:
+    while t < (MAX_STROKE + 1) * R + 1 if width == math.inf else t < left + width + NEIGHBOURS * R:
         x, y = xy[0] + (R + t) * ux, xy[1] + (R + t) * uy
         if x < 0 or y < 0 or x >= w - 1 or y >= h - 1:
             break

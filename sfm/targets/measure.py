@@ -19,7 +19,7 @@ from sfm.targets.flags import Flag
 QUANTISATION = 1 / 12
 # From so many targets on, the shading of a photograph is estimated from them; a target whose own gain is more
 # than so many sigma away from that keeps its own.
-LEAST_FOR_SHADING, OWN_GAIN_SIGMAS = 10, 3.0
+MIN_FOR_SHADING, OWN_GAIN_SIGMAS = 10, 3.0
 # A halo is above this share of the contrast (9 of 10 of the retro-panel are below) and so many of its
 # sigmas. Flare is a background of which more than this share is saturated, that has glare behind it on more
 # than this share of the circumference, or that changes by more than this share of the contrast.
@@ -182,7 +182,7 @@ def _shrink_gain(
     gain = theta[:, gains] / length[:, None]
     gain_variance = (variance / length**2)[:, None] * np.diagonal(cofactor, axis1=1, axis2=2)[:, gains]
     shaded = np.any(gain**2 > OWN_GAIN_SIGMAS**2 * gain_variance, axis=1)
-    if len(theta) >= LEAST_FOR_SHADING:
+    if len(theta) >= MIN_FOR_SHADING:
         w = gain_variance**-2
         tau2 = max(float((w * (gain**2 - gain_variance)).sum() / w.sum()), NO_GAIN**2)
         own = np.any(gain**2 > OWN_GAIN_SIGMAS**2 * (gain_variance + tau2), axis=1)

@@ -21,9 +21,9 @@ MEAN_CELLS = 3
 # 1 2 1 x 1 2 1 leaves 3/8 of it), at least this share of the scale.
 STEP_SIGMAS = 6.0
 SMOOTHED_NOISE = 3 / 8
-LEAST_STEP = 4 / 255
+MIN_STEP = 4 / 255
 # Minor over major axis: 75 degrees of tilt give 0.26; room for perspective, and for blobs that are ellipses.
-LEAST_AXIS_RATIO = 0.14
+MIN_AXIS_RATIO = 0.14
 # Outlines farther than this from their ellipse (in radii, plus so many px for the grid) are not elliptic.
 OUTLINE_TOLERANCE, GRID_TOLERANCE_PX = 0.2, 1.5
 # The noise is estimated from about so many rows.
@@ -74,7 +74,7 @@ def find_outlines(
     """
     # Outlines need no more than 8 bits; the measurement uses all of them.
     image = photograph if photograph.dtype == np.uint8 else cv2.convertScaleAbs(photograph, alpha=255 / scale)
-    step = 255 / scale * max(STEP_SIGMAS * SMOOTHED_NOISE * noise, LEAST_STEP * scale)
+    step = 255 / scale * max(STEP_SIGMAS * SMOOTHED_NOISE * noise, MIN_STEP * scale)
     mean, band = _local_mean(image), np.empty_like(image)
     ellipses, kept_signs, rejected_xy, rejected_flag = [], [], [], []
     for sign in signs:
@@ -230,7 +230,7 @@ def _ellipses_of_contours(
         if 2 * a - 2 > largest:
             reason[c] = Flag.TOO_LARGE.value
             continue
-        if (b + 0.5) / a < LEAST_AXIS_RATIO:
+        if (b + 0.5) / a < MIN_AXIS_RATIO:
             reason[c] = Flag.TOO_OBLIQUE.value
             continue
         angle = 0.5 * math.atan2(2 * xy, xx - yy)

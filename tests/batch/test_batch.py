@@ -216,8 +216,8 @@ def test_names_that_disks_and_tables_do_not_take_fail_alone(
     rows = run_batch([*long, bad_folder, bad_photograph, surveys[2]], out, HERE, ALONE, Notes())
     assert [row.status for row in rows] == ["done", "done", "failed", "failed", "done"]
     assert rows[2].file == str(tmp_path / r"bad\xff" / "survey.toml")
-    assert rows[2].reason.endswith("the path is no plain text; rename the file or folder")
-    assert r"'photo\xff.png' is no plain text" in rows[3].reason
+    assert rows[2].reason.endswith("the path has control or invisible characters; rename the file or folder")
+    assert r"'photo\xff.png' has control or invisible characters" in rows[3].reason
     assert "3 of 5 surveys" in (out / "index.html").read_text(encoding="utf-8")
 
 
@@ -253,7 +253,9 @@ def test_photographs_that_are_no_files_are_told_and_do_not_stop_the_others(tmp_p
 
 
 def test_a_page_that_no_batch_has_written_is_left_alone(surveys: tuple[Path, ...], tmp_path: Path) -> None:
-    with pytest.raises(OutputError, match=r"a\\xff: the path is no plain text; needed another --out"):
+    with pytest.raises(
+        OutputError, match=r"a\\xff: the path has control or invisible characters; needed another --out"
+    ):
         run_batch(surveys, tmp_path / os.fsdecode(b"a\xff"), HERE, ALONE, Notes())
     (tmp_path / "index.html").write_text("my own", encoding="utf-8")
     with pytest.raises(OutputError, match=r"holds 'index.html'; which would be replaced"):

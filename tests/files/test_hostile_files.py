@@ -84,7 +84,7 @@ def test_image_points_of_an_export_take_memory_only_as_numbers(tmp_path: Path) -
         again, _ = read_metashape(tmp_path / "a.xml")
     assert len(again.image_points) == len(network.image_points)  # those of the first frame
     (tmp_path / "a.xml").write_text(text.replace(marker, often * 20_000 + marker))
-    with pytest.raises(SurveyFileError, match="a marker stands twice in one camera"):
+    with pytest.raises(SurveyFileError, match="a marker is a duplicate in one camera"):
         read_metashape(tmp_path / "a.xml")
 
 

@@ -353,7 +353,7 @@ def test_other_peoples_folders_are_not_touched(tmp_path: Path) -> None:
     refuse_foreign_folder(tmp_path / "new")
     refuse_foreign_folder(tmp_path)
     (tmp_path / "file").touch()
-    with pytest.raises(OutputError, match="a file is in the way"):
+    with pytest.raises(OutputError, match="a file has this name"):
         refuse_foreign_folder(tmp_path / "file")
     with pytest.raises(OutputError, match="the folder holds 'file'; --out needs a new or empty folder"):
         refuse_foreign_folder(tmp_path)

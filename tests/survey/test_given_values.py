@@ -180,7 +180,7 @@ def test_start_values_of_cameras_are_read_and_refused(tmp_path: Path) -> None:
 
     good = started("camera,parameter,value,sigma,unit\nsynthetic,c,10.1,,mm\nsynthetic,K1,8e-4,1e-6,mm^-2\n")
     assert run_survey(good).adjustment.converged
-    with pytest.raises(SurveyFileError, match=r"line 2: camera 'other' is none of the survey's"):
+    with pytest.raises(SurveyFileError, match=r"line 2: camera 'other' is not in the survey"):
         run_survey(started("camera,parameter,value\nother,c,10.1\n"))
     with pytest.raises(SurveyFileError, match="stands on line 2 already"):
         started("camera,parameter,value\nsynthetic,c,10.1\nsynthetic,c,10.1\n")

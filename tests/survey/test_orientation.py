@@ -64,6 +64,18 @@ def test_copies_of_a_photograph_are_no_observations(
     assert result.adjustment.redundancy == plain.adjustment.redundancy
 
 
+def test_a_copy_with_another_byte_is_no_observation(
+    plain: SurveyResult, survey_file: Path, store: TargetStore, tmp_path: Path
+) -> None:
+    folder = changed(survey_file, tmp_path / "saved again")
+    (folder / "photo 2 again.png").write_bytes((folder / "photo 2.png").read_bytes() + b"\0")
+    result = run_survey(read_survey(folder / "survey.toml"), store=store)
+    assert [(f.image, f.reason) for f in result.failed] == [
+        ("photo 2.png", "the same picture as photo 2 again.png")
+    ]
+    assert result.adjustment.redundancy == plain.adjustment.redundancy
+
+
 def test_a_mirrored_photograph_does_not_get_in(
     plain: SurveyResult, survey_file: Path, store: TargetStore, tmp_path: Path
 ) -> None:

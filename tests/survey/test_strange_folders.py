@@ -236,7 +236,7 @@ def test_no_format_is_written_over_a_file_of_the_user(
     mine.write_text(OWN)
     for target in (mine, given):
         assert kolinear(monkeypatch, "convert", given, target, "--to", form) == 2
-        assert f"{target}: it is there already and is left alone" in capsys.readouterr().err
+        assert f"{target}: already exists and is left alone" in capsys.readouterr().err
     assert mine.read_text() == OWN
 
 

@@ -260,7 +260,9 @@ def test_a_photograph_whose_name_is_no_plain_text_is_refused(tmp_path: Path) -> 
         odd.touch()
     except OSError:
         pytest.skip("this disk takes names in UTF-8 only")
-    with pytest.raises(SurveyFileError, match=r"photograph 'P825\\xff\\n.JPG' is no plain text; rename"):
+    with pytest.raises(
+        SurveyFileError, match=r"photograph 'P825\\xff\\n.JPG' has control or invisible characters; rename"
+    ):
         find_photographs(survey)
     odd.rename(tmp_path / "P825 ü,'<b>.JPG")
     assert find_photographs(survey).names == ("P825 ü,'<b>.JPG",)
@@ -396,7 +398,7 @@ GOOD = "image,point,x_px,y_px\n1,a,10,20\n"
             GOOD.replace(",", ";"),
             r"line 1: unknown column 'image;point;.*; commas must separate the columns$",
         ),
-        (GOOD.replace("y_px", "x_px"), r"line 1: column 'x_px' stands twice"),
+        (GOOD.replace("y_px", "x_px"), r"line 1: column 'x_px' is a duplicate"),
         (GOOD.replace("y_px", "y_px,sx_px").replace("20", "20,1"), r"line 1: no column sy_px"),
         (GOOD + "1,b,nan,3\n", r"line 3: column x_px holds 'nan', a finite number is needed"),
         (GOOD + "1,b,1,1e999\n", r"line 3: column y_px holds '1e999'"),

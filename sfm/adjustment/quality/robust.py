@@ -26,7 +26,7 @@ from sfm.conventions import MAD_TO_SIGMA, BoolArray, FloatArray
 # in the plane (for a single coordinate they would be 1.345 and 4.685).
 HUBER = 1.501
 TUKEY = 5.123
-LEAST_FREEDOM = 0.05  # of redundancy over observations, so that a network without redundancy has a scale
+MIN_FREEDOM = 0.05  # of redundancy over observations, so that a network without redundancy has a scale
 
 
 def snoop(
@@ -157,7 +157,7 @@ def robust_scale(
     a, b, c = observations.whitening[used].T
     v = residuals[used]
     whitened = np.abs(np.concatenate([a * v[:, 0], b * v[:, 0] + c * v[:, 1]]))
-    scale = MAD_TO_SIGMA * float(np.median(whitened)) / np.sqrt(max(freedom, LEAST_FREEDOM))
+    scale = MAD_TO_SIGMA * float(np.median(whitened)) / np.sqrt(max(freedom, MIN_FREEDOM))
     return float(max(scale, np.finfo(float).tiny))
 
 

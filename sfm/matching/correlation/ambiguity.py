@@ -8,7 +8,7 @@ from sfm.conventions import AnyArray, BoolArray, FloatArray
 from sfm.matching.correlation.ncc import template_corners
 
 QUANTILE = 1.645  # of the normal distribution, one-sided, 5 %
-LARGEST_R = 1.0 - 1e-12  # above it Fisher's z is infinite
+MAX_R = 1.0 - 1e-12  # above it Fisher's z is infinite
 
 
 def ambiguous(best: FloatArray, second: FloatArray, pixels: FloatArray) -> BoolArray:
@@ -24,7 +24,7 @@ def ambiguous(best: FloatArray, second: FloatArray, pixels: FloatArray) -> BoolA
 
     Source: Fisher (1921), Metron 1, pp. 3-32.
     """
-    z = np.arctanh(np.clip([best, second], -LARGEST_R, LARGEST_R))
+    z = np.arctanh(np.clip([best, second], -MAX_R, MAX_R))
     deviates = (z[0] - z[1]) * np.sqrt(np.maximum(pixels - 3.0, 0.0) / 2.0)
     return np.asarray((second > -1.0) & ~(deviates >= QUANTILE))
 

@@ -34,7 +34,7 @@ from sfm.matching.match_flags import NccFlag
 from sfm.matching.radiometry import full_scale, grey_of, odd_window
 
 # Standard deviation below which a template is flat, part of the full scale of 8 bit (of 16 bit alike).
-LEAST_CONTRAST = 1.0 / 255.0
+MIN_CONTRAST = 1.0 / 255.0
 
 
 @dataclass(frozen=True)
@@ -136,7 +136,7 @@ def matches_of(out: FloatArray, origin: FloatArray | IntArray, xy_left: FloatArr
 
 def least_deviations(left: AnyArray, right: AnyArray) -> tuple[float, float]:
     """Return the standard deviations of intensities below which a template, and a window, are flat."""
-    return LEAST_CONTRAST * full_scale(left), LEAST_CONTRAST * full_scale(right)
+    return MIN_CONTRAST * full_scale(left), MIN_CONTRAST * full_scale(right)
 
 
 def _corners(

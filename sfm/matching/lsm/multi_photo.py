@@ -31,7 +31,7 @@ MAX_STEPS = 15
 STOP_PX = 0.005
 SIZE = MODELS["affine"] + RADIOMETRIC
 LAST_FLAG = STEPS  # steps are counted for all windows together: the column holds the flag of the last one
-LEAST_EIGENVALUE = 1e-12  # part of the largest, what rounding leaves of parallel rays
+MIN_EIGENVALUE = 1e-12  # part of the largest, what rounding leaves of parallel rays
 
 
 @dataclass(frozen=True)
@@ -215,7 +215,7 @@ def _intersect(
 def _regular(N: FloatArray) -> BoolArray:
     """Return which normal matrices determine their point: rays that are parallel do not, (n,)."""
     values = np.linalg.eigvalsh(N)
-    return np.asarray(values[:, 0] > LEAST_EIGENVALUE * values[:, 2])
+    return np.asarray(values[:, 0] > MIN_EIGENVALUE * values[:, 2])
 
 
 def _give_way(

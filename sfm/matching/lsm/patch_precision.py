@@ -13,7 +13,7 @@ from sfm.matching.lsm.warp import area_ratio
 from sfm.matching.match_flags import FLAT_TEXTURE, LOW_CORRELATION, MATCHED
 
 # Texture is flat in a direction in which its gradients have less than this many times the energy of noise.
-LEAST_TEXTURE = 3.0
+MIN_TEXTURE = 3.0
 # Columns of what is found out about a patch: place with its covariances, gain, offset, r, sigma0, steps.
 OUTPUTS = 11
 FLAG, X, Y, CXX, CXY, CYY, GAIN, OFFSET, R, SIGMA0, STEPS = range(OUTPUTS)
@@ -60,7 +60,7 @@ def judge(work: Workspace, min_r: float, H: FloatArray, out: FloatArray) -> int:
         ix, iy = H[i, 0] - H[i, 2] * H[2, 0], H[i, 1] - H[i, 2] * H[2, 1]
         jx, jy = H[j, 0] - H[j, 2] * H[2, 0], H[j, 1] - H[j, 2] * H[2, 1]
         out[CXX + k] = variance * (ix * (cxx * jx + cxy * jy) + iy * (cxy * jx + cyy * jy))
-    if weakest < LEAST_TEXTURE * noise:
+    if weakest < MIN_TEXTURE * noise:
         return FLAT_TEXTURE
     return LOW_CORRELATION if r < min_r else MATCHED
 

@@ -3,7 +3,7 @@
 Two rays meet within the tolerance everywhere along an epipolar line, so a pair is only a hypothesis: its
 intersection is projected into all photographs, and what is found there decides. A hypothesis is judged
 by the number of points as good that chance would give: few where many photographs agree closely, many
-where the point ought to be seen and is not. The best are taken first, their targets leave the game, and
+where the point ought to be seen and is not. The best are taken first, their targets are used up, and
 the rest is judged anew among what remains.
 """
 

@@ -11,7 +11,7 @@ from sfm.errors import GeometryError
 
 COINCIDENT = 1e-9  # of the extent of the points
 COLLINEAR = 1e-7  # second singular value over the first
-FEWEST_TO_CHOOSE = 4  # three points are fitted by every solution
+MIN_TO_CHOOSE = 4  # three points are fitted by every solution
 
 
 @dataclass(frozen=True)
@@ -72,8 +72,8 @@ def choose_by_line(
     Source: document 001, secs. 4.2.1 and 5.1: the unique solution of the P3P by fitting a line through at
     least four points. The document names the principle without formulas; this is our reading of it.
     """
-    if len(tangents) < FEWEST_TO_CHOOSE:
-        raise GeometryError(f"line fitting: {len(tangents)} points, at least {FEWEST_TO_CHOOSE} are needed")
+    if len(tangents) < MIN_TO_CHOOSE:
+        raise GeometryError(f"line fitting: {len(tangents)} points, at least {MIN_TO_CHOOSE} are needed")
     lines = tuple(_fit(tangents.ravel(), (tangents + solution.residuals).ravel()) for solution in solutions)
     departures = [line.departure for line in lines]
     if not np.isfinite(departures).any():

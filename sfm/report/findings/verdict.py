@@ -8,6 +8,7 @@ from typing import Literal
 import numpy as np
 
 from sfm.adjustment.quality.held_camera import HeldParameter
+from sfm.adjustment.quality.reliability import UNCONTROLLED
 from sfm.adjustment.quality.statistics import ALPHA, GlobalTest, component_tests
 from sfm.adjustment.quality.variance_components import IMAGE_POINTS
 from sfm.conventions import MAD_TO_SIGMA
@@ -22,7 +23,7 @@ from sfm.result import SurveyResult
 MUCH_REJECTED = 0.05  # share of rejected image points above which a person should look
 MANY_RAYS = 1 / 3  # share of the rays of a point: so many of them say something else than the result
 FEW_RAYS = 2  # that are left of a point of which others were rejected check it no more
-MOST_NAMES = 5  # points named in one remark
+MAX_NAMES = 5  # points named in one remark
 # sigma_px is a rough guess, so the global test alone says little. Twice the guess is worth a look; five
 # times is no precision that anybody expected, but a wrong model, wrong names or wrong control.
 SIGMA0_REMARK, SIGMA0_BAD = 2.0, 5.0
@@ -108,7 +109,7 @@ def judge(evidence: Evidence) -> Verdict:
         more = len(result.warnings) - 1
         other = f" ({more} more warning{'s' if more > 1 else ''}, see below)" if more else ""
         remarks.append(f"Warning: {result.warnings[0].rstrip('.')}{other}.")
-    notes = _pessimistic(evidence)
+    notes = (*_pessimistic(evidence), *_unchecked(evidence))
     if serious:
         return Verdict("bad", "The survey has no dependable result.", (*serious, *remarks, *notes))
     found = f"{oriented} of {total} photographs oriented, {len(a.network.points)} object points"
@@ -179,6 +180,28 @@ def _pessimistic(evidence: Evidence) -> tuple[str, ...]:
         f"The stated standard deviation of the image points, {significant(sigma0.stated_px)} px, is "
         f"pessimistic: their residuals show {significant(sigma0.image_points_px)} px.",
     )
+
+
+def _unchecked(evidence: Evidence) -> tuple[str, ...]:
+    """Say what nothing in the survey checks, which is no fault that anybody could see in the result."""
+    result, a = evidence.result, evidence.result.adjustment
+    lines = []
+    bars, free = evidence.given.bars, result.free_network
+    if bars is not None and not (bars.r > UNCONTROLLED).any():
+        which = f"scale bar {bars.names[0]}" if len(bars.names) == 1 else "scale bars"
+        lines.append(f"The scale rests on the {which}, which nothing checks.")
+    if a.datum == "control" and free is not None and len(a.network.control):
+        added = a.redundancy - free.redundancy
+        if added <= 0:
+            lines.append("Position, attitude and scale rest on the control, which nothing checks.")
+    rays = np.bincount(a.network.image_points.point[~a.rejected], minlength=len(a.network.points))
+    two = int((rays == 2).sum())
+    if two:
+        lines.append(
+            f"{two} of {len(rays)} points have two rays: errors of their image points along the epipolar "
+            "line are not found."
+        )
+    return tuple(lines)
 
 
 def _control(evidence: Evidence) -> Judged:
@@ -297,8 +320,8 @@ def _rays(evidence: Evidence) -> Judged:
     most = np.flatnonzero((lost > 0) & ((lost >= MANY_RAYS * rays) | (rays - lost <= FEW_RAYS)))
     if not len(most):
         return []
-    shown = ", ".join(f"{network.points[j]} ({lost[j]} of {rays[j]})" for j in most[:MOST_NAMES])
-    more = " ..." if len(most) > MOST_NAMES else ""
+    shown = ", ".join(f"{network.points[j]} ({lost[j]} of {rays[j]})" for j in most[:MAX_NAMES])
+    more = " ..." if len(most) > MAX_NAMES else ""
     line = f"A third of the rays or more were rejected, or only two are left, of {len(most)} point(s)"
     return [(False, f"{line}: {shown}{more}.")]
 
@@ -307,7 +330,7 @@ def _consistency(evidence: Evidence) -> Judged:
     """Judge the tests inside the result: points, photographs, the format."""
     found, result = evidence.consistency, evidence.result
     lines = []
-    for one in found.two_positions[:MOST_NAMES]:
+    for one in found.two_positions[:MAX_NAMES]:
         factor, unit = finer_unit(result.length_unit, one.distance)
         lines.append(
             f"Point {one.point} is at two positions, {significant(factor * one.distance)} {unit} apart "
@@ -315,13 +338,13 @@ def _consistency(evidence: Evidence) -> Judged:
             f"{one.first[0]} on, the other in {len(one.second)} from {one.second[0]} on. It moved, or two "
             "bear its name."
         )
-    if len(found.two_positions) > MOST_NAMES:
-        lines.append(f"{len(found.two_positions) - MOST_NAMES} more points are at two positions.")
+    if len(found.two_positions) > MAX_NAMES:
+        lines.append(f"{len(found.two_positions) - MAX_NAMES} more points are at two positions.")
     if found.large:
-        more = " ..." if len(found.large) > MOST_NAMES else ""
+        more = " ..." if len(found.large) > MAX_NAMES else ""
         lines.append(
             f"The residuals of {len(found.large)} point(s) are together larger than chance: "
-            f"{', '.join(found.large[:MOST_NAMES])}{more}."
+            f"{', '.join(found.large[:MAX_NAMES])}{more}."
         )
     uneven = found.uneven
     if uneven is not None:

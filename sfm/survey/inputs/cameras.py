@@ -122,7 +122,7 @@ def free_start_values(settings: CameraSettings, name: str, given: StartCameras |
 
 
 def refuse_unknown_cameras(settings: Sequence[CameraSettings], given: StartCameras | None) -> None:
-    """Raise SurveyFileError if start values are of a camera that is none of the survey's.
+    """Raise SurveyFileError if start values are of a camera that is not in the survey.
 
     Values of a photograph or group begin with the name of its camera.
     """
@@ -131,7 +131,7 @@ def refuse_unknown_cameras(settings: Sequence[CameraSettings], given: StartCamer
             name == one.name or name.startswith(f"{one.name} ") for one in settings
         ):
             raise SurveyFileError(
-                f"{given.table.place(row)}: camera '{name}' is none of the survey's, expected one of "
+                f"{given.table.place(row)}: camera '{name}' is not in the survey, expected one of "
                 f"{', '.join(one.name for one in settings)}"
             )
 

@@ -23,7 +23,7 @@ from sfm.survey.inputs.given import (
 )
 
 FULL_TURN = 360.0  # deg
-LEAST_COS_PHI = 0.01  # nearer to phi = +-90 deg omega and kappa say nearly the same
+MIN_COS_PHI = 0.01  # nearer to phi = +-90 deg omega and kappa say nearly the same
 
 
 @dataclass(frozen=True)
@@ -147,7 +147,7 @@ def _refuse_impossible(table: CsvTable, value: FloatArray, sigma: FloatArray) ->
     fixed = sigma[:, 3:] == 0
     some = fixed & ~fixed.all(axis=1, keepdims=True)
     table.refuse(sigma[:, 3:], some, SIGMAS_OF_ANGLES, "omega, phi, kappa fixed together or none of them")
-    phi = np.abs(np.cos(np.radians(angles[:, 1]))) < LEAST_COS_PHI
+    phi = np.abs(np.cos(np.radians(angles[:, 1]))) < MIN_COS_PHI
     table.refuse(
         angles,
         phi[:, None] & np.array([False, True, False]),

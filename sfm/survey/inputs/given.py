@@ -264,7 +264,7 @@ def read_start_cameras(path: Path) -> StartCameras:
 def read_image_points(path: Path) -> Observations:
     """Read image points: image,point,x_px,y_px[,sx_px,sy_px] or image,point,x_mm,y_mm[,sx_mm,sy_mm].
 
-    Sigmas may be empty where none is known. A point that stands twice in an image is left to
+    Sigmas may be empty where none is known. A point that is a duplicate in an image is left to
     `sfm.survey.inputs.repeated_image_points`.
 
     image_points.csv of a result is welcome; its residuals and rejections are passed over, everything is

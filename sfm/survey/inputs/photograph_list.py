@@ -48,7 +48,7 @@ def find_photographs(survey: SurveySettings, *, images_dir: Path | None = None) 
 
     Raises:
         SurveyFileError: no such folder, a camera without photographs, a photograph of two cameras, of no
-            group where its camera has groups, or with a name that is no plain text.
+            group where its camera has groups, or with a name with control or invisible characters.
     """
     folder = Path(images_dir) if images_dir is not None else survey.folder
     if not folder.is_dir():
@@ -77,8 +77,8 @@ def find_photographs(survey: SurveySettings, *, images_dir: Path | None = None) 
         for name in (path.relative_to(folder).as_posix() for path in found):
             if not is_plain(name):
                 raise SurveyFileError(
-                    f"{survey.source}: the name of photograph '{as_plain(name)}' is no plain text; "
-                    "rename the file"
+                    f"{survey.source}: the name of photograph '{as_plain(name)}' has control or invisible "
+                    "characters; rename the file"
                 )
         owner += [(path.relative_to(folder).as_posix(), path, index) for path in found]
     seen: dict[str, int] = {}

@@ -11,7 +11,7 @@ from sfm.conventions import BoolArray, IntArray
 from sfm.network import ImagePoints
 
 ALPHA = 0.001  # probability with which measurements that say the same are taken for contradicting ones
-MOST_NAMES = 5  # named in one line
+MAX_NAMES = 5  # named in one line
 
 
 @dataclass(frozen=True)
@@ -33,8 +33,8 @@ class Merged:
         )
         out = []
         for pairs, done in kinds:
-            named = ", ".join(f"{points[j]} in {images[i]}" for i, j in pairs[:MOST_NAMES])
-            more = f" and {len(pairs) - MOST_NAMES} more" if len(pairs) > MOST_NAMES else ""
+            named = ", ".join(f"{points[j]} in {images[i]}" for i, j in pairs[:MAX_NAMES])
+            more = f" and {len(pairs) - MAX_NAMES} more" if len(pairs) > MAX_NAMES else ""
             if pairs:
                 out.append(f"image points that stand more than once: {named}{more}; {done}")
         return tuple(out)

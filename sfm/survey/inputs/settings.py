@@ -26,7 +26,7 @@ def _plain(value: str) -> str:
 
 # Beyond these no length, sigma or parameter makes sense in any unit, and their squares or inverses overflow.
 SMALLEST, LARGEST = 1e-9, 1e12
-SMALLEST_SIGMA = 1e-30  # of a distortion parameter, mm^-8
+MIN_SIGMA = 1e-30  # of a distortion parameter, mm^-8
 MAX_SIDE_PX = 1_000_000
 MAX_CAMERAS, MAX_GROUPS = 1000, 1000  # each is tried on every photograph
 MAX_LENGTH_PER_SIGMA = 1e6  # no scale bar is calibrated to better than a millionth of its length
@@ -42,7 +42,7 @@ Values = Annotated[
     Field(strict=False),
     BeforeValidator(_pairs),
 ]
-Sigma = Annotated[float, Field(ge=SMALLEST_SIGMA, le=LARGEST)]
+Sigma = Annotated[float, Field(ge=MIN_SIGMA, le=LARGEST)]
 ValueAndSigma = Annotated[tuple[Value, Sigma], Field(strict=False)]
 Observed = Annotated[
     tuple[Annotated[tuple[Name, ValueAndSigma], Field(strict=False)], ...],

@@ -10,13 +10,14 @@ from sfm.camera import Camera
 from sfm.conventions import FloatArray, IntArray, pixel_from_image
 from sfm.errors import SurveyFileError
 from sfm.network import Estimate, ImagePoints, Network, ObjectPoints, ScaleBars
-from sfm.result import LeftOutPoint
+from sfm.result import FailedImage, LeftOutPoint
 from sfm.survey.inputs.cameras import camera_of_image, refuse_unknown_cameras, start_cameras
 from sfm.survey.inputs.given import KnownPoints, Observations, ScaleBar
 from sfm.survey.inputs.interior import refuse_ungrouped
 from sfm.survey.inputs.measurements import Measurements
 from sfm.survey.inputs.photograph_list import refuse_many
 from sfm.survey.inputs.repeated_image_points import merge_repeated
+from sfm.survey.inputs.same_photographs import same_photographs
 from sfm.survey.inputs.survey import Survey
 
 MIN_RAYS = 2  # photographs that a point with a name needs
@@ -54,7 +55,17 @@ def measurements_from_observations(survey: Survey) -> Measurements:
     refuse_unknown_photographs(survey, images)
     sigma = np.full(xy.shape, np.nan) if given.sigma is None else given.sigma
     stated = np.asarray(np.isfinite(sigma).all(axis=1))
-    merged = merge_repeated(ImagePoints(image, point, xy, covariance, stated))
+    every = images
+    copies = same_photographs(image, point, xy, owner)
+    own = np.isin(np.arange(len(images)), list(copies), invert=True)
+    rows = own[image]
+    number = np.cumsum(own) - 1
+    failed = tuple(
+        FailedImage(every[i], f"its image points are those of {every[j]}") for i, j in copies.items()
+    )
+    images, owner = tuple(name for name, keep in zip(images, own, strict=True) if keep), owner[own]
+    image, point = number[image[rows]], point[rows]
+    merged = merge_repeated(ImagePoints(image, point, xy[rows], covariance[rows], stated[rows]))
     network = Network(
         images,
         owner,
@@ -70,8 +81,9 @@ def measurements_from_observations(survey: Survey) -> Measurements:
     return Measurements(
         network,
         cameras,
-        images,
+        every,
         np.full(len(points), MIN_RAYS),
+        failed,
         warnings=merged.lines(images, points),
         left_out=contradicting,
     )

@@ -153,7 +153,9 @@ def read_survey_file(path: Path, *, allow_outside: bool = False) -> SurveyFile:
     """
     path = Path(path)
     if not is_plain(str(path)):
-        raise SurveyFileError(f"{as_plain(str(path))}: the path is no plain text; rename the file or folder")
+        raise SurveyFileError(
+            f"{as_plain(str(path))}: the path has control or invisible characters; rename the file or folder"
+        )
     text, table = read_toml(path, "a survey file")
     try:
         survey = SurveyFile.model_validate(table)

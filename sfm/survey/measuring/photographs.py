@@ -24,6 +24,7 @@ def each_photograph(
     photographs: PhotographList,
     work: Callable[[Path], T],
     *,
+    picture: Callable[[T], bytes] | None = None,
     jobs: int = 1,
     progress: Progress = SILENT,
 ) -> tuple[dict[int, T], tuple[FailedImage, ...]]:
@@ -35,6 +36,8 @@ def each_photograph(
     Args:
         photographs: the files.
         work: what is done with a file; PhotographError says why it cannot be read.
+        picture: what tells the picture from all others in what came of it, as a copy that was saved again
+            has other bytes; empty where it does not tell.
         jobs: how many photographs are worked on at a time.
         progress: told of every photograph.
 
@@ -71,6 +74,13 @@ def each_photograph(
         except BaseException:  # Ctrl-C among them: nobody waits for photographs that are not begun
             pool.shutdown(wait=False, cancel_futures=True)
             raise
+    pictures: dict[bytes, int] = {}
+    for k in sorted(found):
+        shown = b"" if picture is None else picture(found[k])
+        first = pictures.setdefault(shown, k) if shown else k
+        if first != k:
+            failed[k] = FailedImage(photographs.names[k], f"the same picture as {photographs.names[first]}")
+            del found[k]
     in_order = tuple(failed[k] for k in sorted(failed))
     if len(found) < MIN_PHOTOGRAPHS:
         raise GeometryError(

@@ -13,6 +13,7 @@ from sfm.runtime.progress import SILENT, Progress
 from sfm.survey.inputs.cameras import start_cameras
 from sfm.survey.inputs.measurements import MeasuredPhotographs
 from sfm.survey.inputs.photograph_list import PhotographList
+from sfm.survey.inputs.same_photographs import MIN_COMMON
 from sfm.survey.inputs.settings import TargetSettings
 from sfm.survey.inputs.survey import Survey
 from sfm.survey.measuring.photographs import each_photograph
@@ -50,6 +51,7 @@ def measure_photographs(
     found, failed = each_photograph(
         photographs,
         lambda path: _read_and_measure(path, survey.targets, family, store),
+        picture=lambda one: one[1].xy.tobytes() if len(one[1]) >= MIN_COMMON else b"",
         jobs=jobs,
         progress=progress,
     )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from hashlib import sha256
 from pathlib import Path
 
 import numpy as np
@@ -46,7 +47,13 @@ def tie_photographs(
         SurveyFileError: the start values of a camera are incomplete.
     """
     settings = survey.tie_points or TiePointSettings()
-    found, failed = each_photograph(photographs, _read, jobs=jobs, progress=progress)
+    found, failed = each_photograph(
+        photographs,
+        _read,
+        picture=lambda one: sha256(one[1].tobytes()).digest(),
+        jobs=jobs,
+        progress=progress,
+    )
     read = sorted(found)
     names = tuple(photographs.names[k] for k in read)
     camera: IntArray = photographs.camera[read]

@@ -22,10 +22,10 @@ RADII = np.array([-0.45, 0.25, 0.5, 0.75, 1.4])
 HALF = 0.5
 MARGIN = 0.15
 # What is around a dot is no code where nothing in the ring is above this level.
-LEAST_SET = 0.3
+MIN_SET = 0.3
 # Step from clear to set cells in units of that from background to dot, and the least gap between the levels
 # of set and clear cells, in steps. Codes of the retro-panel: 0.89 to 1.05 and 0.61.
-LEAST_STEP, LARGEST_STEP, LEAST_JUMP = 0.6, 1.5, 0.4
+MIN_STEP, MAX_STEP, MIN_JUMP = 0.6, 1.5, 0.4
 # Largest deviations, in steps, and the worst of the retro-panel: of a clear cell from the background (0.08),
 # or under glare (0.18) from the mean of what is before and behind it (0.06); of what is beside the ring from
 # the background (0.12); of a set cell from shading (0.08), with the sigma of its change over the radius; of a
@@ -75,7 +75,7 @@ def read_codes(
         return _read_arcs(polar)
     code, confidence = np.full(len(xy), UNCODED, dtype=np.int64), np.zeros(len(xy))
     body = polar[:, 1:4]
-    ring = np.flatnonzero((body > LEAST_SET).any(axis=(1, 2)))  # nan is not above
+    ring = np.flatnonzero((body > MIN_SET).any(axis=(1, 2)))  # nan is not above
     code[ring] = UNREADABLE
     ring = ring[np.isfinite(body[ring]).all(axis=(1, 2))]
     blur = np.full(len(xy), SHARP_PX) if blur_px is None else np.asarray(blur_px, dtype=float)
@@ -157,7 +157,7 @@ def _read_cells(found: FloatArray, family: CodeFamily) -> tuple[int, float]:
     at = jump.argmax()
     bits = level > (order[at] + order[at + 1]) / 2
     step = level[bits].mean() - level[~bits].mean()
-    if not LEAST_STEP <= step <= LARGEST_STEP or jump[at] < LEAST_JUMP * step:
+    if not MIN_STEP <= step <= MAX_STEP or jump[at] < MIN_JUMP * step:
         return UNREADABLE, 0.0
     # Shading makes the levels of the set cells a plane, with a prior so that few cells do not fit any plane.
     angle = 2 * np.pi * np.arange(family.cells) / family.cells

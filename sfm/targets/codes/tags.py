@@ -25,12 +25,12 @@ DICTIONARIES = {
 }
 CORNERS = "abcd"
 # A black module narrower than this is not told apart from the code behind it.
-LEAST_MODULE_PX = 3.0
+MIN_MODULE_PX = 3.0
 # Share of the bits that the dictionary could correct and that may be wrong: a wrong id costs more than a tag.
 CORRECTED, WRONG_IN_BORDER = 0.2, 0.1
 # A corner is refused if its residuals are beyond this share of the contrast, if an edge is softer than this
 # share of a module, or if its contrast is less than this share of the tag's.
-POOR_FIT, SOFTEST_EDGE, LEAST_CONTRAST = 0.1, 0.4, 0.3
+POOR_FIT, SOFTEST_EDGE, MIN_CONTRAST = 0.1, 0.4, 0.3
 # Radius of the circle that stands for a corner where outlines are drawn, px.
 DRAWN_PX = 4.0
 
@@ -115,7 +115,7 @@ def find_tags(photograph: AnyArray, family: TagFamily, *, polarity: str, scale: 
     settings = cv2.aruco.DetectorParameters()
     settings.errorCorrectionRate = CORRECTED
     settings.maxErroneousBitsInBorderRate = WRONG_IN_BORDER
-    settings.minMarkerPerimeterRate = 4 * LEAST_MODULE_PX * family.modules / max(grey.shape)
+    settings.minMarkerPerimeterRate = 4 * MIN_MODULE_PX * family.modules / max(grey.shape)
     detector = cv2.aruco.ArucoDetector(_dictionary(family.name), settings)
     # OpenCV's own search for inverted tags loses upright ones, so that the photograph is inverted instead.
     pictures = {"dark": (grey,), "bright": (255 - grey,)}.get(polarity, (grey, 255 - grey))
@@ -133,9 +133,9 @@ def find_tags(photograph: AnyArray, family: TagFamily, *, polarity: str, scale: 
     with np.errstate(divide="ignore", invalid="ignore"):
         tests = (
             (Flag.CUT_BY_BORDER, (flag & Flag.CUT_BY_BORDER) != 0),
-            (Flag.TOO_SMALL, module < LEAST_MODULE_PX),
+            (Flag.TOO_SMALL, module < MIN_MODULE_PX),
             (Flag.NO_CONVERGENCE, (flag & Flag.NO_CONVERGENCE) != 0),
-            (Flag.LOW_CONTRAST, contrast / typical < LEAST_CONTRAST),
+            (Flag.LOW_CONTRAST, contrast / typical < MIN_CONTRAST),
             (Flag.BLURRED, blur > SOFTEST_EDGE * module),
             (Flag.POOR_FIT, noise / np.abs(contrast) > POOR_FIT),
         )

@@ -27,7 +27,7 @@ from sfm.targets.flags import Flag
 UNKNOWNS = 9
 X0, Y0, NORMAL_1, NORMAL_2, BACKGROUND, CONTRAST, BLUR, GAIN_X, GAIN_Y = range(UNKNOWNS)
 # Pixels where both edges are nearer than this are the tip; farther than this from an edge nothing is learnt.
-TIP_PX, BAND_PX, LEAST_BAND_PX = 2.5, 4.0, 1.5
+TIP_PX, BAND_PX, MIN_BAND_PX = 2.5, 4.0, 1.5
 # Edges are followed for this share of a side, at most so far: distortion bends them by less than 0.01 px.
 REACH_SHARE, REACH_PX = 0.45, 20.0
 # What lies behind the border of one module (the code) is kept at this distance.
@@ -35,7 +35,7 @@ CODE_PX = 2.5
 # A priori sigma of the change of gain over L, as for circular targets; it only keeps the fit regular.
 GAIN_SIGMA = 0.3
 # Blur at the start and its limits; the last step; the farthest that a corner is from where it was expected.
-BLUR_START, BLUR_LEAST, BLUR_MOST, LAST_STEP_PX, MAX_STEPS, FARTHEST_PX = 0.9, 0.25, 4.0, 1e-3, 30, 4.0
+BLUR_START, MIN_BLUR, MAX_BLUR, LAST_STEP_PX, MAX_STEPS, FARTHEST_PX = 0.9, 0.25, 4.0, 1e-3, 30, 4.0
 _DENSITY_0 = 1 / math.sqrt(2 * math.pi)
 _CUT_BY_BORDER = int(Flag.CUT_BY_BORDER)
 _NO_CONVERGENCE = int(Flag.NO_CONVERGENCE)
@@ -105,7 +105,7 @@ def _fit_one(
         theta[NORMAL_1 + k] = math.atan2(ny, nx)
         depth = min(depth, abs(inside) / length)
         depth = min(depth, abs(nx * (opposite[0] - corner[0]) + ny * (opposite[1] - corner[1])) / length)
-    band = min(BAND_PX, max(LEAST_BAND_PX, depth / modules - CODE_PX))
+    band = min(BAND_PX, max(MIN_BAND_PX, depth / modules - CODE_PX))
     reach = min(REACH_PX, REACH_SHARE * depth)
     pixels = np.empty((3, int((2 * FARTHEST_PX + 2 * (reach + band) * 4) ** 2) + 16))
     flag, noise = 0, math.nan
@@ -204,7 +204,7 @@ def _iterate(
             return total, 0
         shift = max(abs(trial[X0]), abs(trial[Y0]))
         trial += theta
-        trial[BLUR] = min(max(trial[BLUR], BLUR_LEAST), BLUR_MOST)
+        trial[BLUR] = min(max(trial[BLUR], MIN_BLUR), MAX_BLUR)
         squares, used_trial = _normal_equations(pixels, n, trial, saturation, length, N_trial, g_trial)
         if squares > total * (1 + 1e-9) and used_trial == used:
             damping = max(damping, 1e-3) * 10

@@ -16,7 +16,7 @@ TRACES = 3
 # Unknowns of an ellipse.
 UNKNOWNS = 5
 # Share of the rays that must agree with the ellipse.
-LEAST_AGREEMENT = 0.7
+MIN_AGREEMENT = 0.7
 MARGIN_PX = 3.0
 # Edges farther from the ellipse than this, in radii, do not count.
 TOLERANCE = 0.15
@@ -85,9 +85,9 @@ def _fit_edges(
         for _ in range(TRACES):
             trace_rays(image, theta[t], sign[t], noise, MARGIN_PX, edge, limit, window)
             agree, _change = improve_outline(theta[t], edge)
-            if agree < LEAST_AGREEMENT:
+            if agree < MIN_AGREEMENT:
                 break
-        if agree < LEAST_AGREEMENT:
+        if agree < MIN_AGREEMENT:
             theta[t] = math.nan
             continue
         trace_rays(image, theta[t], sign[t], noise, MARGIN_PX, edge, limit, window)

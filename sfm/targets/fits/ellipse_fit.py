@@ -26,9 +26,9 @@ MARGIN_PX, MARGIN_SHARE, MARGIN_MAX_PX = 4.0, 0.25, 10.0
 # Of targets larger than this (mean semi-axis) only a band inside the edge is used: the rest tells nothing.
 LARGE_PX, BAND_PX = 25.0, 15.0
 # Blur of the edge at the start and its limits.
-BLUR_START, BLUR_LEAST = 0.9, 0.25
+BLUR_START, MIN_BLUR = 0.9, 0.25
 # The outline is traced again if it changed by more than this share of the radius; so many rays must agree.
-MAX_TRACES, SMALL_CHANGE, LEAST_AGREEMENT = 2, 0.08, 0.7
+MAX_TRACES, SMALL_CHANGE, MIN_AGREEMENT = 2, 0.08, 0.7
 _NONE = int(Flag.NONE)
 _SATURATED = int(Flag.SATURATED)
 _CLOSE_NEIGHBOUR = int(Flag.CLOSE_NEIGHBOUR)
@@ -95,7 +95,7 @@ def _fit_one(
         margin = min(MARGIN_MAX_PX, MARGIN_PX + MARGIN_SHARE * mean)
         step = trace_rays(image, theta, sign, noise, margin, edge, limit)
         agree, change = improve_outline(theta, edge)
-        if agree < LEAST_AGREEMENT or step <= 0:
+        if agree < MIN_AGREEMENT or step <= 0:
             return _NOT_ELLIPTIC
         if change < SMALL_CHANGE:
             break
@@ -136,7 +136,7 @@ def _fit_one(
         shift = max(abs(trial[model.X0]), abs(trial[model.Y0]))
         for i in range(model.UNKNOWNS):
             trial[i] += theta[i]
-        trial[model.BLUR] = min(max(trial[model.BLUR], BLUR_LEAST), 2 * mean)
+        trial[model.BLUR] = min(max(trial[model.BLUR], MIN_BLUR), 2 * mean)
         if (
             trial[model.P] * trial[model.R] - trial[model.Q] ** 2 <= 0
             or trial[model.P] <= 0

@@ -387,7 +387,7 @@ def test_what_a_format_cannot_hold_is_refused(tmp_path: Path) -> None:
         write_metashape(path, network, truth)
     with pytest.raises(OutputError, match="BAL knows one focal length"):
         write_bal(path, network, truth)
-    with pytest.raises(OutputError, match="PhotoModeler has no place for model full_opencv"):
+    with pytest.raises(OutputError, match="PhotoModeler cannot hold model full_opencv"):
         write_photomodeler(path, network, truth)
     with pytest.raises(OutputError, match="one camera, in model brown"):
         write_bundle_csharp(path, network, truth)
@@ -444,7 +444,7 @@ def test_image_points_are_corrected_for_formats_without_distortion(name: str, tm
     network = spaceless(network)
     form = format_named(name)
     bent, _ = convert_cameras(truth, form.models, held=form.lacks)
-    with pytest.raises(KolinearError, match=f"format {name} has no place for .*; --undistort corrects"):
+    with pytest.raises(KolinearError, match=f"format {name} cannot hold .*; --undistort corrects"):
         write_any(tmp_path / "out", name, network, bent)
     straight, ideal = undistort(network, truth, form.models)
     write_any(tmp_path / "out", name, straight, ideal)
@@ -598,7 +598,7 @@ def test_published_start_values_of_the_bridge_pier_in_its_own_format(tmp_path: P
         ("10 0.03\n", r"interior\.txt, line 1: 2 words, needed 3: c x0 y0"),
         ("# c x0 y0\n-10 0.03 0\n", r"interior\.txt, line 2: c is -10 mm, it must be positive"),
         ("10 0.03 0\n1\n", r"interior\.txt, line 2: '1' after the end"),
-        ("", r"interior\.txt, line 1: the file ends here, c x0 y0 \(mm\) was due"),
+        ("", r"interior\.txt, line 1: the file ends here, c x0 y0 \(mm\) was expected"),
     ],
 )
 def test_bad_interior_orientation_names_its_line(text: str, message: str, tmp_path: Path) -> None:

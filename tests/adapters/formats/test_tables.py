@@ -73,7 +73,7 @@ def with_camera(**changed: Any) -> str:
         (with_camera(size_px=None), "tells size and pixel of camera camera 1"),
         ('{"redundancy": -3, ' + with_camera()[1:], "redundancy is -3, needed greater than or equal to 0"),
         ('{"redundancy": "abc", ' + with_camera()[1:], "redundancy is 'abc', needed a valid integer"),
-        (with_camera()[:-2] + ", " + with_camera()[13:], "camera 'camera 1' stands twice"),
+        (with_camera()[:-2] + ", " + with_camera()[13:], "camera 'camera 1' is a duplicate"),
     ],
 )
 def test_bad_summaries_are_refused(folder: Path, text: str, message: str) -> None:

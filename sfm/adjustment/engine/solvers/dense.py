@@ -44,7 +44,7 @@ from sfm.kernels.threads import at_once
 NULL = 1e-12  # eigenvalue of the scaled matrix (diagonal at most 1) taken as 0; rounding leaves 1e-15
 WEAK_PIVOT = 1e-11  # squared pivot below which the eigenvalues are looked at
 WEAK_SINGLE = 1e-5  # the same in single precision, whose rounding leaves 1e-6
-LARGEST_BYTES = 6e9  # of the full matrix; larger ones would swap
+MAX_BYTES = 6e9  # of the full matrix; larger ones would swap
 SINGLE_FROM = 200  # reduced unknowns from which the product in single precision saves time
 
 
@@ -169,10 +169,10 @@ def schur_complement(
         GeometryError: the matrix would not fit in memory.
     """
     size = 8.0 * layout.reduced**2
-    if size > LARGEST_BYTES:
+    if size > MAX_BYTES:
         raise GeometryError(
             f"adjustment: {layout.reduced} unknowns that are all connected need {size / 1e9:.0f} GB in one "
-            f"dense system, at most {LARGEST_BYTES / 1e9:.0f} GB are taken"
+            f"dense system, at most {MAX_BYTES / 1e9:.0f} GB are taken"
         )
     b, parts = equations.blocks, equations.parts
     dtype = np.float32 if single else np.float64

@@ -1,0 +1,43 @@
+"""A principal distance that was adjusted far from its start value is told."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+from sfm.pipeline import run_survey
+from sfm.report.findings.findings import findings_of
+from sfm.survey.principal_distance import far_principal_distances
+from tests.surveys import survey_of
+from tests.synthetic import make_network, seed_of
+
+
+@pytest.mark.parametrize("model", ["brown", "opencv"])
+def test_c_far_from_its_start_value_is_told(model: str) -> None:
+    _, truth = make_network(seed_of("far c"), images=3, points=12, model=model)
+    name = replace(truth.cameras[0], name="synthetic")
+    estimate = replace(truth, cameras=(name,))
+    network, brown = make_network(seed_of("far c"), images=3, points=12)
+    survey = survey_of(network, brown)  # says c_mm = 10
+    assert far_principal_distances(survey, estimate) == ()
+    p = name.parameters.copy()
+    p[: 1 if name.in_mm else 2] *= 0.22
+    far = replace(estimate, cameras=(name.with_parameters(p),))
+    (line,) = far_principal_distances(survey, far)
+    assert line.startswith("camera synthetic: c was adjusted from 10 to 2.2 mm, by -78 %")
+    held = replace(estimate, cameras=(replace(far.cameras[0], free=name.free & False),))
+    assert far_principal_distances(survey, held) == ()
+
+
+def test_a_survey_whose_c_was_given_wrongly_is_not_good() -> None:
+    network, truth = make_network(seed_of("wrongly given"), images=8, points=40)
+    camera = truth.cameras[0]
+    p = camera.parameters.copy()
+    p[0] *= 1.4
+    free = ("c", "x0", "y0", "K1", "K2", "P1", "P2")
+    wrong = replace(truth, cameras=(camera.with_parameters(p),))
+    result = run_survey(survey_of(network, wrong, free=free, start=truth))
+    assert result.estimate.cameras[0].value("c") == pytest.approx(10.0, rel=1e-2)
+    assert any("c was adjusted from 14 to" in line for line in result.warnings)
+    assert findings_of(result).verdict.level == "fair"
