@@ -71,7 +71,7 @@ class LongestResidual:
     image: str
     point: str
     length_px: float
-    over_sigma: float  # its length in standard deviations, with the weight that it had
+    over_sigma: float  # its length in standard deviations, times the factor on its weight
     weight: float  # factor on its weight, below 1 by reweighting
 
 
@@ -106,7 +106,8 @@ def sigma0_of(result: SurveyResult) -> Sigma0:
 def longest_residual(adjustment: Adjustment) -> LongestResidual:
     """Return the longest residual in standard deviations; of length 0 without image points.
 
-    A residual of a reweighted image point counts as much as it did in the adjustment. The standard
+    A residual of a reweighted image point counts by its influence, weight times length, which Huber's weights
+    bound. The standard
     deviation is the a priori one, or that which the median of the residuals shows if it is larger, so
     that a cautious guess of it makes no good image point an outlier.
     """
@@ -117,7 +118,7 @@ def longest_residual(adjustment: Adjustment) -> LongestResidual:
     P = np.linalg.inv(adjustment.image_covariance[used])
     length = np.sqrt(np.einsum("ka,kab,kb->k", v, P, v))
     if len(adjustment.weights):
-        length = length * np.sqrt(adjustment.weights[used])
+        length = length * adjustment.weights[used]
     shown = float(np.median(length)) / MEDIAN_LENGTH
     worst = int(np.argmax(length))
     row = int(used[worst])

@@ -32,6 +32,9 @@ AS_STATED = 1.5  # standard deviation of w by its median, up to which image poin
 # Data snooping leaves nothing beyond 4 or 5 sigma; ten is an outlier, thirty is a mistake that was kept.
 RESIDUAL_REMARK, RESIDUAL_BAD = 10.0, 30.0
 WEIGHTED_REMARK, WEIGHTED_BAD = 5.0, 30.0  # w of control, scale bars, interior orientation
+# An observation of a smaller redundancy number determines itself: what is left of its error is less than the
+# rounding and the neglected second order of the others, and w magnifies that.
+TESTABLE = 1e-3
 # Differences at control that took no part, in sigmas. Control without standard deviations is a print or a
 # drawing, never as good as the network; control that states them must keep to them.
 CHECK_REMARK = 100.0
@@ -140,14 +143,11 @@ def _residual(evidence: Evidence) -> Judged:
     worst = evidence.longest
     if not worst.over_sigma > RESIDUAL_REMARK:
         return []
-    ratio, weight = worst.over_sigma, worst.weight
-    lowered = f", {significant(ratio)} times with its lowered weight," if weight < 1 else ""
     line = (
         f"Point {worst.point} in {worst.image} has a residual of {significant(worst.length_px)} px, "
-        f"{significant(ratio / np.sqrt(weight))} times the standard deviation{lowered or ','} and was not "
-        "rejected."
+        f"{significant(worst.over_sigma)} times the standard deviation, and was not rejected."
     )
-    return [(ratio > RESIDUAL_BAD, line)]
+    return [(worst.over_sigma > RESIDUAL_BAD, line)]
 
 
 def _untested(evidence: Evidence) -> Judged:
@@ -292,8 +292,10 @@ def _exterior(evidence: Evidence) -> Judged:
 
 def _remarkable(found: GivenResiduals | None) -> tuple[GivenValue, ...]:
     """Return the given value with the largest |w| if that is worth a remark."""
-    worst = found.worst if found is not None else None
-    return () if worst is None or not abs(worst.w) > WEIGHTED_REMARK else (worst,)
+    if found is None:
+        return ()
+    tested = (one for one in found.by_w if np.isfinite(one.w) and not one.r < TESTABLE)
+    return tuple(one for one in tested if abs(one.w) > WEIGHTED_REMARK)[:1]
 
 
 def _kinds(evidence: Evidence) -> Judged:

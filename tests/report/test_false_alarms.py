@@ -1,0 +1,55 @@
+"""Results that are true are not doubted."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from sfm.adjustment.datum import Datum
+from sfm.adjustment.solve import adjust
+from sfm.network import ScaleBars
+from sfm.report.findings.findings import Findings, findings_of
+from sfm.report.findings.verdict import Evidence, judge
+from sfm.result import SurveyResult
+from tests.synthetic import make_network, seed_of
+
+
+def findings(reject: str, *, error_px: float = 0.0, bar: bool = False) -> Findings:
+    network, truth = make_network(seed_of("false alarms"), images=8, points=40)
+    xy = network.image_points.xy.copy()
+    xy[5, 0] += error_px
+    network = replace(network, image_points=replace(network.image_points, xy=xy))
+    if bar:
+        length = np.linalg.norm(truth.points[[0, 1]] - truth.points[[2, 3]], axis=1)
+        bars = ScaleBars(np.array([0, 1]), np.array([2, 3]), length, np.full(2, 1e-3))
+        network = replace(network, scale_bars=bars)
+    a = adjust(network, truth, datum=Datum("free"), reject=reject)
+    return findings_of(SurveyResult("alarms", "m", 8, (), a, np.full(40, -1), None, reject=reject))
+
+
+def test_huber_with_a_gross_error_whose_influence_it_bounds_is_good() -> None:
+    found = findings("huber", error_px=30.0)
+    assert 0 < found.longest.weight < 0.1 or found.longest.over_sigma < 10
+    assert not any("was not rejected" in line for line in found.verdict.remarks)
+    kept = findings("none", error_px=30.0)
+    assert any("was not rejected" in line for line in kept.verdict.remarks)
+
+
+def test_a_bar_that_nothing_checks_is_no_contradiction() -> None:
+    found = findings("tau", bar=True)
+    bars = found.given.bars
+    assert bars is not None
+
+    def remarks(r: float) -> list[str]:
+        given = replace(
+            found.given, bars=replace(bars, w=np.full(bars.w.shape, 5.7), r=np.full(bars.r.shape, r))
+        )
+        evidence = Evidence(
+            found.result, found.sigma0, found.longest, found.statistics, given, found.check,
+            found.object_size, found.consistency, found.held,
+        )  # fmt: skip
+        return [line for line in judge(evidence).remarks if line.startswith("Scale bar")]
+
+    assert remarks(1e-4) == []
+    assert len(remarks(0.3)) == 1
