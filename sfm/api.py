@@ -55,10 +55,10 @@ def run_survey(
         >>> sfm.run_survey(survey, compare_with="none").adjustment.converged
         True
     """
-    if not isinstance(survey, Survey):
-        survey = read_survey(survey)
     if compare_with not in (*BACKENDS, None):
         raise SurveyFileError(f"compare_with '{compare_with}', expected one of {', '.join(BACKENDS)}")
+    if not isinstance(survey, Survey):
+        survey = read_survey(survey)
     others = programs_of(
         compare_with or survey.compare.backend, "none" if compare_with == "none" else survey.compare.baseline
     )

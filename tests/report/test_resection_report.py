@@ -133,7 +133,7 @@ def test_bad_files(tmp_path, four):
 
 def test_bad_geometry(tmp_path, four):
     task = read_task(four, c_mm=24)
-    with pytest.raises(GeometryError, match="method 'magic' is none of fischler-bolles"):
+    with pytest.raises(GeometryError, match="method 'magic', expected one of fischler-bolles"):
         resect_json(task, "magic")
     with pytest.raises(GeometryError, match="church: a start position is needed"):
         resect_json(task, "church")

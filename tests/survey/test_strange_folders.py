@@ -23,9 +23,10 @@ from sfm.errors import OutputError
 from sfm.files.folder_lock import locked
 from sfm.files.whole_files import remove_leftovers, whole_file, whole_folder
 from sfm.kernels.compiling import COMPILING
+from sfm.kernels.sources import sources_of
 from sfm.report.log import SurveyLog, read_log
 from sfm.report.output import folder_name
-from sfm.survey.measuring.target_store import TargetStore, measuring_sources
+from sfm.survey.measuring.target_store import MEASURING, TargetStore
 from sfm.targets.detect import Targets, find_targets
 from tests.engines import ALONE, HERE, Notes
 from tests.surveys import pictures, write_observed_survey, write_photograph_survey
@@ -186,7 +187,7 @@ def test_no_command_writes_through_a_link(
 
 SHARED = ("out", "new", "out/batch", "out/batch/logs")  # folders that may hold other files, too
 LATER = (("render", "new/a", "folder"), ("refine", "new", "file"))  # beside it; photographs come before it
-NAMED = ("is there already", "cannot be", "holds '", "left alone", "exists", "in the way", "is a folder")
+NAMED = ("is there already", "cannot be", "holds '", "left alone", "exists", "has this name", "is a folder")
 
 
 @pytest.mark.parametrize(
@@ -447,7 +448,7 @@ def test_a_store_that_others_can_write_is_refused(
 
 
 def test_what_is_measured_is_known_by_what_measures() -> None:
-    names = measuring_sources().keys()
+    names = sources_of(*MEASURING).keys()
     assert {"sfm.photographs.reading", "sfm.targets.measure", "sfm.targets.codes.rings"} <= names
     assert not [name for name in names if name.startswith(("sfm.printing", "sfm.rendering", "sfm.survey"))]
 

@@ -32,6 +32,10 @@ MAX_CAMERAS, MAX_GROUPS = 1000, 1000  # each is tried on every photograph
 MAX_LENGTH_PER_SIGMA = 1e6  # no scale bar is calibrated to better than a millionth of its length
 Length = Annotated[float, Field(ge=SMALLEST, le=LARGEST)]
 Name = Annotated[str, BeforeValidator(lambda v: _plain(v) if isinstance(v, str) else v)]
+Unit = Annotated[
+    Literal["km", "m", "dm", "cm", "mm", "um", "µm", "in", "ft"],
+    BeforeValidator(lambda v: _plain(v) if isinstance(v, str) else v),
+]
 TwoLengths = Annotated[tuple[Length, Length], Field(strict=False)]
 Side = Annotated[int, Field(gt=0, le=MAX_SIDE_PX)]
 TwoCounts = Annotated[tuple[Side, Side], Field(strict=False)]
@@ -63,7 +67,7 @@ class Head(Section):
     """[survey]: what the survey is called."""
 
     name: Name
-    unit: Literal["km", "m", "dm", "cm", "mm", "um", "µm", "in", "ft"]  # of the object coordinates
+    unit: Unit  # of the object coordinates
 
 
 class CameraSettings(Section):
