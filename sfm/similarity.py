@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sfm.conventions import FloatArray
+from sfm.conventions import FloatArray, skew
 from sfm.errors import GeometryError
 from sfm.network import Estimate
 
@@ -96,3 +96,23 @@ def fit_similarity(
     R = (U * sign) @ Vt
     fitted = float((d * sign).sum() / (w @ (s**2).sum(axis=1))) if scale is None else scale
     return Similarity(fitted, R, centre_t - fitted * R @ centre_s)
+
+
+def similarity_motions(xyz: FloatArray, *, centre: FloatArray, size: float = 1.0) -> FloatArray:
+    """Return how points move with shifts, small rotations about a centre and the scale, (n, 3, 7).
+
+    Args:
+        xyz: points, (n, 3).
+        centre: of rotations and scale, (3,).
+        size: over which rotations and scale are taken, so that all seven motions can be of one order.
+
+    Source: Luhmann et al., Close-Range Photogrammetry (2020), sec. 4.4.3.
+    """
+    x = xyz - centre
+    shift = np.broadcast_to(np.eye(3), (len(x), 3, 3))
+    return np.concatenate([shift, -skew(x) / size, x[:, :, None] / size], axis=2)
+
+
+def mean_distance(xyz: FloatArray) -> float:
+    """Return the root mean square distance of points (n, 3) from their centroid."""
+    return float(np.sqrt(((xyz - xyz.mean(axis=0)) ** 2).sum(axis=1).mean()))

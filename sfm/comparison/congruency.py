@@ -24,6 +24,7 @@ from scipy.stats import chi2, f
 
 from sfm.conventions import BoolArray, FloatArray
 from sfm.errors import GeometryError
+from sfm.similarity import mean_distance, similarity_motions
 
 MOTIONS = {"none": 0, "rigid": 6, "similarity": 7}  # parameters of what is no change
 MIN_STABLE = 4  # points that a datum needs to be checked by at least one more than it takes
@@ -100,14 +101,8 @@ def congruency(
 
 def motions(xyz: FloatArray) -> FloatArray:
     """Return G: how coordinates change with translations, small rotations and the scale, (3 n, 7)."""
-    x = xyz - xyz.mean(axis=0)
-    x = x / np.sqrt(np.mean(np.sum(x**2, axis=1)))
-    G = np.zeros((len(x), 3, 7))
-    G[:, :, :3] = np.eye(3)
-    for k in range(3):
-        G[:, :, 3 + k] = np.cross(np.eye(3)[k], x)
-    G[:, :, 6] = x
-    return G.reshape(3 * len(x), 7)
+    G = similarity_motions(xyz, centre=xyz.mean(axis=0), size=mean_distance(xyz))
+    return G.reshape(3 * len(xyz), 7)
 
 
 def _in_datum(

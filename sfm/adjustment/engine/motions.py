@@ -20,8 +20,9 @@ from sfm.adjustment.datum import ResolvedDatum
 from sfm.adjustment.engine.collinearity import State
 from sfm.adjustment.engine.observed_unknowns import Weighted, bar_directions, exterior_misclosure
 from sfm.adjustment.engine.unknowns import Unknowns
-from sfm.conventions import BoolArray, FloatArray, skew
+from sfm.conventions import BoolArray, FloatArray
 from sfm.errors import GeometryError
+from sfm.similarity import mean_distance, similarity_motions
 
 DETERMINED = 1e-9  # relative effect on an observed unknown above which it takes part in the datum
 
@@ -105,13 +106,10 @@ def free_motions(layout: Unknowns, state: State) -> tuple[FloatArray, FloatArray
     seven are of the same order.
     """
     cloud = state.points[layout.point_on]
-    centre = cloud.mean(axis=0)
-    size = max(float(np.sqrt(((cloud - centre) ** 2).sum(axis=1).mean())), np.finfo(float).tiny)
+    centre, size = cloud.mean(axis=0), max(mean_distance(cloud), np.finfo(float).tiny)
 
     def motion(xyz: FloatArray) -> FloatArray:
-        x = np.where(np.isfinite(xyz), xyz, centre) - centre
-        shift = np.broadcast_to(np.eye(3), (len(x), 3, 3))
-        return np.concatenate([shift, -skew(x) / size, x[:, :, None] / size], axis=2)
+        return similarity_motions(np.where(np.isfinite(xyz), xyz, centre), centre=centre, size=size)
 
     exterior = np.zeros((len(state.position), 6, 7))
     exterior[:, :3] = motion(state.position)
