@@ -16,8 +16,8 @@ import numpy as np
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.solve import adjust
 from sfm.camera import camera_from_values, project
-from sfm.comparison.adjusters import reprojection
 from sfm.comparison.common_problem import common_problem
+from sfm.comparison.solutions import reprojection
 from sfm.conventions import AnyArray
 from sfm.matching.conjugate import METHODS, match_points
 from sfm.matching.tracks.correspondence import match_targets

@@ -13,7 +13,7 @@ import numpy as np
 
 from sfm.adjustment.result import Adjustment
 from sfm.camera import tangents_from_pixel
-from sfm.comparison.adjusters import reprojection, rotation_angle_deg
+from sfm.comparison.solutions import reprojection, rotation_angle_deg
 from sfm.conventions import FloatArray
 from sfm.errors import GeometryError
 from sfm.network import Estimate, ImagePoints, Network

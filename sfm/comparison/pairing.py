@@ -52,12 +52,12 @@ def pair_results(a: StoredResult, b: StoredResult) -> Pairing:
         *(b.network.images, b.estimate.oriented & b.images_named),
     )
     by_name = len(images)
-    images = _with(images, _images_by_image_points(a, b, images))
+    images = np.concatenate([images, _images_by_image_points(a, b, images)])
     ours, theirs = identified(a), identified(b)
     points = _by_name(a.network.points, ours, b.network.points, theirs)
     named = len(points)
     found = _points_by_image_points(a, b, images, points)
-    points = _with(points, found[~(ours[found[:, 0]] & theirs[found[:, 1]])])
+    points = np.concatenate([points, found[~(ours[found[:, 0]] & theirs[found[:, 1]])]])
     seen = len(points)
     transform = _frame(a, b, points, images)
     if transform is not None:
@@ -65,12 +65,12 @@ def pair_results(a: StoredResult, b: StoredResult) -> Pairing:
         found = _by_place(
             (a.estimate.points, a.estimate.determined), (moved.points, moved.determined), points
         )
-        points = _with(points, found[~(ours[found[:, 0]] & theirs[found[:, 1]])])
+        points = np.concatenate([points, found[~(ours[found[:, 0]] & theirs[found[:, 1]])]])
         if not (a.images_named and b.images_named):
             found = _by_place(
                 (a.estimate.position, a.estimate.oriented), (moved.position, moved.oriented), images
             )
-            images = _with(images, found)
+            images = np.concatenate([images, found])
     return Pairing(
         points[np.argsort(points[:, 0], kind="stable")],
         images[np.argsort(images[:, 0], kind="stable")],
@@ -93,10 +93,6 @@ def _by_name(a: tuple[str, ...], a_known: BoolArray, b: tuple[str, ...], b_known
     index = {name: k for k, name in enumerate(b) if b_known[k]}
     rows = [(k, index[name]) for k, name in enumerate(a) if a_known[k] and name in index]
     return np.array(rows, dtype=np.int64).reshape(-1, 2)
-
-
-def _with(pairs: IntArray, more: IntArray) -> IntArray:
-    return np.concatenate([pairs, more])
 
 
 def _free(count: int, taken: IntArray) -> BoolArray:

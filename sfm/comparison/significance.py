@@ -18,10 +18,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sfm.comparison.adjusters import rotation_angle_deg
 from sfm.comparison.camera_conversion import Conversion, convert_camera
 from sfm.comparison.pairing import Pairing, pair_results
 from sfm.comparison.point_tests import has_sigma, judge_points, known_scale
+from sfm.comparison.solutions import rotation_angle_deg
 from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.errors import GeometryError
 from sfm.network import Network

@@ -18,7 +18,6 @@ from sfm.comparison.adjuster_validation import (
     make_trial,
     validate,
 )
-from sfm.comparison.adjusters import reprojection
 from sfm.comparison.random_network import (
     ARRANGEMENTS,
     IMAGES,
@@ -27,6 +26,7 @@ from sfm.comparison.random_network import (
     SIZE_PX,
     random_network,
 )
+from sfm.comparison.solutions import reprojection
 from sfm.errors import BackendError
 from sfm.network import Estimate, Network
 

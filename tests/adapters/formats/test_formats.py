@@ -28,9 +28,9 @@ from adapters.formats.registry import format_named, format_of, read_any, read_co
 from adapters.formats.sba_text import read_sba_text, write_sba_text
 from sfm.camera import Camera, camera_from_values, pixel_jacobian
 from sfm.cli.solvers import convert
-from sfm.comparison.adjusters import reprojection
 from sfm.comparison.camera_conversion import convert_camera, convert_cameras
 from sfm.comparison.significance import compare_results
+from sfm.comparison.solutions import reprojection
 from sfm.comparison.undistortion import undistort
 from sfm.errors import KolinearError, OutputError, SurveyFileError
 from sfm.network import Estimate, Network, ObjectPoints

@@ -1,0 +1,217 @@
+"""Comparison of two solutions of one network.
+
+The datum is no part of a solution: one is brought onto the other by a 7-parameter similarity over the
+object points before anything is subtracted. Differences are judged in standard deviations.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sfm.adjustment.result import Covariance
+from sfm.camera import Camera, pixel_from_tangents, project, tangents_from_pixel
+from sfm.conventions import FloatArray, IntArray
+from sfm.network import Estimate, Network
+from sfm.similarity import Similarity, fit_similarity
+
+EFFECT_STEPS = 9  # places along each side of the photograph where interior orientations are compared
+SAME_SIGMAS = 0.01  # standard deviations up to which two solutions are the same optimum
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Differences b - a of two solutions of one network after a similarity of b onto a."""
+
+    names: tuple[str, str]  # of a and b
+    a: Estimate  # first solution
+    b: Estimate  # second solution, in the datum of the first
+    a_from_b: Similarity
+    object_size: float  # diagonal of the box around the object points, object unit
+    position: FloatArray  # of the projection centres, object unit, (m, 3)
+    rotation_deg: FloatArray  # angle between the two rotations of each photograph, deg, (m,)
+    points: FloatArray  # of the object points, object unit, (n, 3)
+    interior: tuple[FloatArray, ...]  # of the parameters of each camera, their units; NaN across models
+    interior_px: FloatArray  # largest shift of a ray in the photograph, px, (cameras,)
+    rms_px: tuple[float, float]  # root mean square residual per coordinate of a and b, px
+    cost: tuple[float, float]  # half the sum of squared residuals of a and b, px^2
+    sigmas: tuple[tuple[str, float], ...]  # what differs most of each kind, and by how many of its standard
+    # deviations in a; kinds of which none is known are left out
+
+    @property
+    def max_sigmas(self) -> float:
+        """Largest difference of any parameter, in its standard deviations."""
+        return max((value for _, value in self.sigmas), default=0.0)
+
+    @property
+    def exceeded(self) -> tuple[str, ...]:
+        """What differs by more than two solutions of the same optimum may, in words; empty if they agree."""
+        return tuple(
+            f"{what} differs by {value:.2g} of its standard deviation, {SAME_SIGMAS:g} is allowed"
+            for what, value in self.sigmas
+            if not value <= SAME_SIGMAS
+        )
+
+    @property
+    def agree(self) -> bool:
+        """Whether both are the same optimum."""
+        return not self.exceeded
+
+    @property
+    def max_position(self) -> float:
+        """Largest difference of a projection centre, object unit."""
+        return _longest(self.position)
+
+    @property
+    def max_rotation_deg(self) -> float:
+        """Largest angle between two rotations, deg."""
+        return float(np.max(self.rotation_deg, initial=0.0))
+
+    @property
+    def max_point(self) -> float:
+        """Largest difference of an object point, object unit."""
+        return _longest(self.points)
+
+
+def compare(
+    a: Estimate,
+    b: Estimate,
+    network: Network,
+    *,
+    covariance: Covariance,
+    names: tuple[str, str] = ("kolinear", "colmap"),
+) -> Comparison:
+    """Compare two solutions of the same network, whatever datum each is in.
+
+    Args:
+        a: first solution.
+        b: second solution; photographs and points that only one of them has are not compared.
+        network: the image points for the residuals of both.
+        covariance: of the first in a free datum on all points: differences are judged by it.
+        names: what to call a and b.
+
+    Returns:
+        Differences b - a after a similarity of b onto a.
+
+    Raises:
+        GeometryError: fewer than three points in common, or all of them on a line.
+
+    Source: the 7-parameter similarity of Horn (1987) over all points, as for any two free networks: Caspary
+    (2000), Concepts of network and deformation analysis, sec. 7.
+    """
+    both = a.determined & b.determined
+    a_from_b = fit_similarity(b.points[both], a.points[both])
+    moved = a_from_b.apply_estimate(b)
+    images = a.oriented & b.oriented
+    size = float(np.linalg.norm(np.ptp(a.points[both], axis=0)))
+    position = np.where(images[:, None], moved.position - a.position, np.nan)
+    points = np.where(both[:, None], moved.points - a.points, np.nan)
+    angle = np.full(len(images), np.nan)
+    angle[images] = rotation_angle_deg(a.rotation[images], moved.rotation[images])
+    squares = [(reprojection(network, estimate) ** 2).ravel() for estimate in (a, b)]
+    rms = tuple(float(np.sqrt(np.mean(s))) if len(s) else 0.0 for s in squares)
+    interior = tuple(_difference(p, q) for p, q in zip(a.cameras, b.cameras, strict=True))
+    return Comparison(
+        names,
+        a,
+        moved,
+        a_from_b,
+        size,
+        position,
+        angle,
+        points,
+        interior,
+        np.array([interior_effect_px(p, q) for p, q in zip(a.cameras, b.cameras, strict=True)]),
+        (rms[0], rms[1]),
+        (float(squares[0].sum() / 2), float(squares[1].sum() / 2)),
+        _in_sigmas(network, a, covariance, points, position, np.deg2rad(angle), interior),
+    )
+
+
+def _in_sigmas(
+    network: Network,
+    a: Estimate,
+    covariance: Covariance,
+    points: FloatArray,
+    position: FloatArray,
+    angle: FloatArray,
+    interior: tuple[FloatArray, ...],
+) -> tuple[tuple[str, float], ...]:
+    """Return the largest difference of each kind in standard deviations, and of what it is.
+
+    A rotation is judged by the smallest standard deviation of the three angles of its photograph.
+    """
+    exterior = np.diagonal(covariance.exterior, axis1=1, axis2=2)
+    kinds: list[tuple[tuple[str, ...], FloatArray, FloatArray]] = [
+        (
+            tuple(f"object point {name}" for name in network.points),
+            points,
+            np.diagonal(covariance.points, axis1=1, axis2=2),
+        ),
+        (tuple(f"projection centre of {name}" for name in network.images), position, exterior[:, :3]),
+        (
+            tuple(f"rotation of {name}" for name in network.images),
+            angle[:, None],
+            exterior[:, 3:].min(axis=1, keepdims=True),
+        ),
+    ]
+    for camera, difference, Q in zip(a.cameras, interior, covariance.interior, strict=True):
+        free = np.flatnonzero(camera.free)
+        if len(Q) == len(free):
+            names = tuple(f"{camera.names[k]} of camera {camera.name}" for k in free)
+            kinds.append((names, difference[free, None], np.diagonal(Q)[:, None]))
+    found = []
+    for names, difference, variance in kinds:
+        known = np.isfinite(difference) & (variance > 0)
+        if known.any():
+            ratio = np.where(known, np.abs(difference), 0.0) / np.sqrt(np.where(known, variance, 1.0))
+            worst = int(np.argmax(ratio.max(axis=1)))
+            found.append((names[worst], float(ratio[worst].max())))
+    return tuple(found)
+
+
+def reprojection(network: Network, estimate: Estimate) -> FloatArray:
+    """Return computed minus measured pixels of the image points that the estimate determines, (k, 2)."""
+    seen = network.image_points
+    use = estimate.oriented[seen.image] & estimate.determined[seen.point]
+    v = np.zeros((len(seen), 2))
+    for i in np.unique(seen.image[use]):
+        rows: IntArray = np.flatnonzero(use & (seen.image == i))
+        computed = project(
+            estimate.cameras[network.camera[i]],
+            estimate.position[i],
+            estimate.rotation[i],
+            estimate.points[seen.point[rows]],
+        )
+        v[rows] = computed - seen.xy[rows]
+    return v[use]
+
+
+def rotation_angle_deg(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Return the angle between rotations, shape (k, 3, 3) each, deg; exact to rounding near 0."""
+    D = np.einsum("kji,kjl->kil", a, b)
+    sine = np.stack([D[:, 2, 1] - D[:, 1, 2], D[:, 0, 2] - D[:, 2, 0], D[:, 1, 0] - D[:, 0, 1]], axis=1) / 2
+    cosine = (np.trace(D, axis1=1, axis2=2) - 1) / 2
+    return np.asarray(np.rad2deg(np.arctan2(np.linalg.norm(sine, axis=1), cosine)))
+
+
+def interior_effect_px(a: Camera, b: Camera) -> float:
+    """Return the largest shift between two interior orientations of a ray in the photograph, px."""
+    width, height = a.size_px
+    x = np.linspace(-0.5, width - 0.5, EFFECT_STEPS)
+    y = np.linspace(-0.5, height - 0.5, EFFECT_STEPS)
+    xy = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+    shift = pixel_from_tangents(b, tangents_from_pixel(a, xy)) - xy
+    return _longest(shift)
+
+
+def _difference(a: Camera, b: Camera) -> FloatArray:
+    if a.model != b.model:
+        return np.full(len(a.parameters), np.nan)
+    return b.parameters - a.parameters
+
+
+def _longest(vectors: FloatArray) -> float:
+    """Length of the longest vector; those with NaN do not count."""
+    return float(np.nanmax(np.linalg.norm(vectors, axis=1), initial=0.0))
