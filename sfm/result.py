@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from sfm.adjustment.covariance import marginal_of
+from sfm.adjustment.quality.against_free import FreeNetwork
 from sfm.adjustment.quality.correlations import OrientationCorrelation
 from sfm.adjustment.result import Adjustment
 from sfm.camera import Camera
@@ -48,15 +49,6 @@ class TakenOut:
     what: str  # such as "scale bar 506 - 507"
     relative: float  # by how much it is off, over its length or the size of the object
     resolved: bool  # whether the others tell that it is the one that is wrong
-
-
-@dataclass(frozen=True)
-class FreeNetwork:
-    """Adjustment of the accepted image points without control, bars and observed exterior orientation."""
-
-    points: FloatArray  # in a frame of their own, (n, 3)
-    vPv: float  # with the weights of the adjustment that it is held against
-    redundancy: int
 
 
 @dataclass(frozen=True)

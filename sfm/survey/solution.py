@@ -9,15 +9,16 @@ import numpy as np
 
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.engine.observed_unknowns import observed
+from sfm.adjustment.quality.against_free import FreeNetwork, free_network_of
 from sfm.adjustment.quality.variance_components import IMAGE_POINTS, estimate_components
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.errors import GeometryError
-from sfm.network import Estimate, ExteriorObservations, Network, ObjectPoints, ScaleBars
+from sfm.network import Estimate, Network
 from sfm.orientation.ray_angles import ray_angles
 from sfm.reduced_network import reduce_network, supported
-from sfm.result import ControlCheck, Eccentricity, FreeNetwork, LeftOutPoint, TakenOut
+from sfm.result import ControlCheck, Eccentricity, LeftOutPoint, TakenOut
 from sfm.survey.datum_definition import (
     Contradiction,
     datum_warnings,
@@ -158,30 +159,8 @@ def solve_survey(survey: Survey, matched: Correspondences) -> Solution:
     if len(whole.scale_bars) and not len(final.network.scale_bars) and datum.kind == "control":
         # every bar is against the control: nothing says which of the two is right
         taken_out = [replace(one, resolved=False) for one in taken_out]
-    alone = _free_network(task, final)
+    alone = free_network_of(final)
     return Solution(final, check, dropped, warnings, left_out, unused, tuple(taken_out), alone)
-
-
-def _free_network(task: _Task, final: Adjustment) -> FreeNetwork | None:
-    """Adjust the accepted image points of an adjustment alone, with the same weights."""
-    network, accepted = final.network, ~final.rejected
-    held = (len(network.control) + len(network.exterior)) if task.datum.kind == "control" else 0
-    if not final.converged or not (held or len(network.scale_bars)):
-        return None
-    alone = replace(
-        network,
-        image_points=network.image_points.select(accepted),
-        control=ObjectPoints(),
-        scale_bars=ScaleBars(),
-        exterior=ExteriorObservations(),
-    )
-    factor = final.image_sigma_factor[accepted]
-    try:
-        free = adjust(alone, final.estimate, image_sigma_factor=factor, reject="none", covariance=False)
-    except GeometryError:
-        return None
-    sound = free.converged and not free.undetermined
-    return FreeNetwork(free.estimate.points, free.vPv, free.redundancy) if sound else None
 
 
 def _among(left_out: tuple[LeftOutPoint, ...], whole: Network, known: BoolArray) -> tuple[LeftOutPoint, ...]:

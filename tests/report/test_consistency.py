@@ -8,12 +8,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from sfm.adjustment.quality.consistency import consistency_of
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.camera import project
 from sfm.network import Estimate, Network
 from sfm.pipeline import run_survey
-from sfm.report.findings.consistency import consistency_of
 from sfm.report.findings.findings import findings_of
 from tests.surveys import survey_of
 from tests.synthetic import make_network, seed_of

@@ -6,10 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 
+from sfm.adjustment.quality.against_free import given_test
 from sfm.network import Estimate, ImagePoints, Network
 from sfm.pipeline import run_survey
 from sfm.report.findings.findings import findings_of
-from sfm.report.findings.scale import given_test
 from sfm.survey.inputs.given import KnownPoints, ScaleBar
 from sfm.survey.inputs.same_photographs import same_photographs
 from tests.surveys import survey_of
@@ -44,7 +44,7 @@ def test_fixed_control_is_held_against_the_free_network() -> None:
         xyz = truth.points[:6] + error * seed_of("error").standard_normal((6, 3))
         control = KnownPoints.from_arrays(names, xyz)
         result = run_survey(survey_of(network, truth, control=control, datum={"kind": "control"}))
-        test = given_test(result)
+        test = given_test(result.adjustment, result.free_network)
         assert test is not None and test.redundancy == 11  # 18 coordinates less seven
         assert (test.probability < 0.001) == contradicts
         told = " ".join(findings_of(result).verdict.remarks)
@@ -57,7 +57,8 @@ def test_the_level_of_the_f_test() -> None:
         network, truth = make_network(seed_of(f"F {k}"), images=5, points=15)
         names = [str(j + 1) for j in range(5)]
         control = KnownPoints.from_arrays(names, truth.points[:5])
-        test = given_test(run_survey(survey_of(network, truth, control=control, datum={"kind": "control"})))
+        result = run_survey(survey_of(network, truth, control=control, datum={"kind": "control"}))
+        test = given_test(result.adjustment, result.free_network)
         assert test is not None
         low += test.probability < 0.05
     assert low <= 4  # 0.6 expected

@@ -8,6 +8,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from sfm.adjustment.quality.against_free import GivenTest, given_test, scale_difference
+from sfm.adjustment.quality.consistency import Consistency, consistency_of
 from sfm.adjustment.quality.held_camera import HeldParameter, held_parameters
 from sfm.report.findings.bundle_statistics import Statistics, statistics_of
 from sfm.report.findings.checks import (
@@ -23,7 +25,7 @@ from sfm.report.findings.checks import (
     object_size,
     sigma0_of,
 )
-from sfm.report.findings.consistency import Consistency, consistency_of
+from sfm.report.findings.evidence import Evidence
 from sfm.report.findings.geometry import Geometry, geometry_of
 from sfm.report.findings.given_residuals import Given, given_of
 from sfm.report.findings.interior_parameters import InteriorOrientation, interior_of
@@ -31,7 +33,7 @@ from sfm.report.findings.other_adjuster import ComparisonFindings, comparison_of
 from sfm.report.findings.precision import Precision, precision_of
 from sfm.report.findings.rejected import Rejected, rejected_of
 from sfm.report.findings.solution_rows import PhotographRow, PointRow, photographs_of, points_of
-from sfm.report.findings.verdict import Evidence, Verdict, judge
+from sfm.report.findings.verdict import Verdict, judge
 from sfm.result import SurveyResult
 
 
@@ -58,6 +60,7 @@ class Findings:
     object_size: float  # diagonal of the box around the points, object unit
     held: tuple[HeldParameter, ...]  # interior parameters held at values that the photographs contradict
     consistency: Consistency  # tests of points, photographs and the format
+    given_test: GivenTest | None  # of all that was given against the free network
 
 
 def findings_of(result: SurveyResult) -> Findings:
@@ -67,7 +70,12 @@ def findings_of(result: SurveyResult) -> Findings:
     given, check, size = given_of(result), checked_control(result), object_size(a.estimate.points)
     consistency, held = consistency_of(a), held_parameters(a)
     geometry, precision = geometry_of(a), precision_of(a)
-    evidence = Evidence(result, sigma0, longest, statistics, given, check, size, consistency, held)
+    against_free = given_test(a, result.free_network)
+    evidence = Evidence(
+        *(result, sigma0, longest, statistics, given, check, size, consistency, held),
+        against_free,
+        scale_difference(a, result.free_network),
+    )
     return Findings(
         result=result,
         verdict=judge(evidence),
@@ -88,4 +96,5 @@ def findings_of(result: SurveyResult) -> Findings:
         object_size=size,
         held=held,
         consistency=consistency,
+        given_test=against_free,
     )

@@ -14,7 +14,6 @@ from sfm.files.plain_text import or_none
 from sfm.report.findings.bundle_statistics import Spread, spread
 from sfm.report.findings.findings import Findings
 from sfm.report.findings.given_residuals import GivenResiduals
-from sfm.report.findings.scale import given_test
 from sfm.report.phrases import words_of_test, words_of_weights
 from sfm.result import SurveyResult
 
@@ -184,7 +183,7 @@ def _statistics(findings: Findings) -> dict[str, Any]:
 
 def _consistency(findings: Findings) -> dict[str, Any]:
     """Return what the tests of points, photographs and the format have found."""
-    found, test = findings.consistency, given_test(findings.result)
+    found, test = findings.consistency, findings.given_test
     return {
         "two_positions": [
             {

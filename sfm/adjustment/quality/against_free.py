@@ -9,15 +9,18 @@ Source: Foerstner and Wrobel (2016), Photogrammetric Computer Vision, sec. 4.2.3
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import stats
 
 from sfm.adjustment.engine.observed_unknowns import inverse_of_observed
+from sfm.adjustment.result import Adjustment
+from sfm.adjustment.solve import adjust
 from sfm.conventions import FloatArray
-from sfm.result import SurveyResult
-from sfm.similarity import fit_similarity
+from sfm.errors import GeometryError
+from sfm.network import ExteriorObservations, ObjectPoints, ScaleBars
+from sfm.similarity import fit_similarity, similarity_motions
 
 MIN_CONTROL = 4  # points whose residuals after a similarity say how good they are
 SIMILARITY = 7  # parameters
@@ -45,9 +48,39 @@ class GivenTest:
     probability: float  # of an F so large by chance
 
 
-def given_test(result: SurveyResult) -> GivenTest | None:
+@dataclass(frozen=True)
+class FreeNetwork:
+    """Adjustment of the accepted image points without control, bars and observed exterior orientation."""
+
+    points: FloatArray  # in a frame of their own, (n, 3)
+    vPv: float  # with the weights of the adjustment that it is held against
+    redundancy: int
+
+
+def free_network_of(final: Adjustment) -> FreeNetwork | None:
+    """Adjust the accepted image points of an adjustment alone, with the same weights; None if in vain."""
+    network, accepted = final.network, ~final.rejected
+    held = (len(network.control) + len(network.exterior)) if final.datum == "control" else 0
+    if not final.converged or not (held or len(network.scale_bars)):
+        return None
+    alone = replace(
+        network,
+        image_points=network.image_points.select(accepted),
+        control=ObjectPoints(),
+        scale_bars=ScaleBars(),
+        exterior=ExteriorObservations(),
+    )
+    factor = final.image_sigma_factor[accepted]
+    try:
+        free = adjust(alone, final.estimate, image_sigma_factor=factor, reject="none", covariance=False)
+    except GeometryError:
+        return None
+    sound = free.converged and not free.undetermined
+    return FreeNetwork(free.estimate.points, free.vPv, free.redundancy) if sound else None
+
+
+def given_test(a: Adjustment, free: FreeNetwork | None) -> GivenTest | None:
     """Return the F-test of control, bars and orientation; None where nothing was added that is checked."""
-    a, free = result.adjustment, result.free_network
     if free is None or a.reweighted or free.redundancy < 1 or a.redundancy <= free.redundancy:
         return None
     added = a.redundancy - free.redundancy
@@ -55,13 +88,12 @@ def given_test(result: SurveyResult) -> GivenTest | None:
     return GivenTest(statistic, added, float(stats.f.sf(statistic, added, free.redundancy)))
 
 
-def scale_difference(result: SurveyResult) -> ScaleDifference | None:
+def scale_difference(a: Adjustment, free: FreeNetwork | None) -> ScaleDifference | None:
     """Return the difference of scale between control and bars; None where not both take part.
 
     Its standard deviation comes from what was stated for control and bars or, where that is larger, from
     their own residuals: control that is worse than stated is no contradiction of scale.
     """
-    a, free = result.adjustment, result.free_network
     control, bars = a.network.control, a.network.scale_bars
     if free is None or a.datum != "control" or len(control) < MIN_CONTROL or not len(bars):
         return None
@@ -78,13 +110,7 @@ def scale_difference(result: SurveyResult) -> ScaleDifference | None:
 
 def _scale_of_control(given: FloatArray, adjusted: FloatArray, weight: FloatArray) -> tuple[float, float]:
     """Return the scale of given over adjusted control less 1, and its variance, by a linear similarity."""
-    x = adjusted - adjusted.mean(axis=0)
-    A = np.zeros((len(x), 3, SIMILARITY))
-    A[:, :, :3] = np.eye(3)
-    A[:, 0, 4], A[:, 0, 5] = x[:, 2], -x[:, 1]
-    A[:, 1, 3], A[:, 1, 5] = -x[:, 2], x[:, 0]
-    A[:, 2, 3], A[:, 2, 4] = x[:, 1], -x[:, 0]
-    A[:, :, 6] = x
+    A = similarity_motions(adjusted, centre=adjusted.mean(axis=0))
     d = given - adjusted
     fixed = not weight.any()
     P = np.broadcast_to(np.eye(3), weight.shape) if fixed else weight

@@ -1,0 +1,208 @@
+"""What the verdict says of what was given beside the image points: control, bars, cameras, orientation."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sfm.adjustment.quality.statistics import ALPHA
+from sfm.adjustment.quality.variance_components import IMAGE_POINTS
+from sfm.report.findings.evidence import Evidence, Judged
+from sfm.report.findings.given_residuals import GivenResiduals, GivenValue
+from sfm.report.numbers import finer_unit, significant
+
+WEIGHTED_REMARK, WEIGHTED_BAD = 5.0, 30.0  # w of control, scale bars, interior orientation
+# An observation of a smaller redundancy number determines itself: what is left of its error is less than the
+# rounding and the neglected second order of the others, and w magnifies that.
+TESTABLE = 1e-3
+# Differences at control that took no part, in sigmas. Control without standard deviations is a print or a
+# drawing, never as good as the network; control that states them must keep to them.
+CHECK_REMARK = 100.0
+HELD_BAD = 5.0  # standard deviations by which a held camera moves the points (RMS): a wrong result
+PRINCIPAL_POINT_REMARK = 0.1  # share of the diagonal; a decentred lens or sensor has 1 or 2 %
+MISCLOSURE_BAD = 0.01  # of the size of the object, or of a length: no measurement, a mistake
+
+
+def judge_given(evidence: Evidence) -> Judged:
+    """Judge everything that was given, kind by kind."""
+    kinds = (
+        *(_taken_out, _scale, _control, _bars, _interior),
+        *(_held, _principal_point, _exterior, _kinds, _check),
+    )
+    return [judged for judge_kind in kinds for judged in judge_kind(evidence)]
+
+
+def _taken_out(evidence: Evidence) -> Judged:
+    """Judge control and bars that were not used: as if they were kept, or worse where nothing is resolved."""
+    judged: Judged = []
+    for one in evidence.result.taken_out:
+        if not one.resolved:
+            judged.append(
+                (True, f"{_capital(one.what)} was not used: what it contradicts may be what is wrong.")
+            )
+        elif one.relative > MISCLOSURE_BAD:
+            off = significant(100 * one.relative)
+            judged.append((True, f"{_capital(one.what)} was not used: it is {off} % off."))
+    return judged
+
+
+def _scale(evidence: Evidence) -> Judged:
+    """Judge the scale of the bars against that of the control, and all that was given by the F-test."""
+    judged: Judged = []
+    test = evidence.given_test
+    if test is not None and test.probability < ALPHA:
+        line = (
+            f"What was given beside the image points contradicts them: F {significant(test.statistic)} with "
+            f"{test.redundancy} degrees of freedom, by chance in fewer than {100 * ALPHA:g} % of surveys."
+        )
+        judged.append((False, line))
+    found = evidence.scale_difference
+    if found is None or not found.over_sigma > WEIGHTED_REMARK:
+        return judged
+    line = (
+        f"Lengths by the control are {significant(100 * found.relative)} % larger than by the scale bars, "
+        f"{significant(found.over_sigma)} times the standard deviation of that difference."
+    )
+    return [*judged, (found.over_sigma > WEIGHTED_BAD, line)]
+
+
+def _control(evidence: Evidence) -> Judged:
+    """Judge the residuals of weighted control."""
+    return [
+        (
+            abs(worst.w) > WEIGHTED_BAD,
+            f"Control point {worst.name} differs from its given coordinates by {significant(abs(worst.w))} "
+            "times the standard deviation of that difference.",
+        )
+        for worst in _remarkable(evidence.given.control)
+    ]
+
+
+def _bars(evidence: Evidence) -> Judged:
+    """Judge the residuals of scale bars."""
+    judged: Judged = []
+    for worst in _remarkable(evidence.given.bars):
+        relative = abs(worst.difference / worst.given)
+        line = (
+            f"Scale bar {worst.name} differs from its given length by {significant(abs(worst.w))} "
+            f"times the standard deviation of that difference ({significant(100 * relative)} %)."
+        )
+        judged.append((abs(worst.w) > WEIGHTED_BAD or relative > MISCLOSURE_BAD, line))
+    return judged
+
+
+def _interior(evidence: Evidence) -> Judged:
+    """Judge the residuals of weighted interior orientation, as of a calibration certificate."""
+    judged: Judged = []
+    for worst in _remarkable(evidence.given.interior):
+        unit = "" if worst.unit == "1" else f" {worst.unit}"
+        line = (
+            f"The given {worst.name}, {worst.given:.6g}{unit}, differs from the adjusted one by "
+            f"{significant(abs(worst.w))} times the standard deviation of that difference."
+        )
+        judged.append((abs(worst.w) > WEIGHTED_BAD, line))
+    return judged
+
+
+def _held(evidence: Evidence) -> Judged:
+    """Judge the interior parameters that were held: the clearest, since those that go with it follow."""
+    if not evidence.held:
+        return []
+    worst, more = evidence.held[0], len(evidence.held) - 1
+    unit = "" if worst.unit == "1" else f" {worst.unit}"
+    others = f" {more} other{'s' if more > 1 else ''} would help as well." if more else ""
+    line = (
+        f"{worst.parameter} of camera {worst.camera} is held at {worst.value:.6g}{unit}; the photographs say "
+        f"{worst.value + worst.change:.6g}{unit}, {significant(abs(worst.t))} standard deviations off, and "
+        f"points are wrong by {significant(worst.moved)} of theirs (RMS): free it.{others}"
+    )
+    return [(worst.moved > HELD_BAD, line)]
+
+
+def _principal_point(evidence: Evidence) -> Judged:
+    """Judge adjusted principal points that lie where no lens has them."""
+    judged: Judged = []
+    for camera in evidence.result.adjustment.estimate.cameras:
+        names = ("x0", "y0") if camera.in_mm else ("cx", "cy")
+        x, y = (camera.value(name) for name in names)
+        size = np.array(camera.size_px) * (camera.pixel_mm if camera.in_mm else 1.0)
+        if not camera.in_mm:
+            x, y = x - (camera.size_px[0] - 1) / 2, y - (camera.size_px[1] - 1) / 2
+        away = float(np.hypot(x, y) / np.linalg.norm(size))
+        if away > PRINCIPAL_POINT_REMARK and camera.free[[camera.names.index(name) for name in names]].any():
+            line = (
+                f"The principal point of camera {camera.name} was adjusted to {significant(100 * away)} % of "
+                "the diagonal of the photograph from its centre, farther than lenses have it: the network "
+                "hardly determines it, hold it or add photographs turned by 90 degrees."
+            )
+            judged.append((False, line))
+    return judged
+
+
+def _exterior(evidence: Evidence) -> Judged:
+    """Judge the residuals of observed exterior orientation."""
+    return [
+        (
+            abs(worst.w) > WEIGHTED_BAD,
+            f"The given {worst.coordinate} of photograph {worst.name} differs from the adjusted one by "
+            f"{significant(abs(worst.w))} times the standard deviation of its residual.",
+        )
+        for found in (evidence.given.position, evidence.given.rotation)
+        for worst in _remarkable(found)
+    ]
+
+
+def _kinds(evidence: Evidence) -> Judged:
+    """Judge control, bars and interior orientation as a whole by their variance components."""
+    found = evidence.statistics.kinds
+    judged: Judged = []
+    for g, test in enumerate(evidence.kind_tests):
+        if test.of == IMAGE_POINTS or found.count[g] < 2 or not test.statistic > test.upper:
+            continue
+        line = (
+            f"The residuals of the {test.of} are {significant(float(found.sigma0[g]))} times what the "
+            f"standard deviations stated for them give, more than chance (redundancy {test.redundancy:.1f})."
+        )
+        judged.append((False, line))
+    return judged
+
+
+def _check(evidence: Evidence) -> Judged:
+    """Judge the differences at control that took no part."""
+    found = evidence.check
+    if found is None:
+        return []
+    judged: Judged = []
+    check, result = found.check, evidence.result
+    if result.adjustment.network.scale_bars and abs(check.scale - 1) > MISCLOSURE_BAD:
+        line = f"The control says lengths are {check.scale:.6g} times those of the scale bars."
+        judged.append((True, line))
+
+    def differs(point: int) -> str:
+        factor, unit = finer_unit(result.length_unit, float(found.length[point]))
+        apart = significant(float(found.length[point]) * factor)
+        return f"Control point {check.points[point]} differs from its given place by {apart} {unit}"
+
+    part = float(found.length[found.worst]) / evidence.object_size
+    beyond = np.nan_to_num(found.over_sigma) / np.where(found.stated, WEIGHTED_REMARK, CHECK_REMARK)
+    if part > MISCLOSURE_BAD:
+        judged.append((True, f"{differs(found.worst)}, {significant(100 * part)} % of the object."))
+    elif beyond.max(initial=0.0) > 1:
+        worst = int(np.argmax(beyond))
+        line = (
+            f"{differs(worst)}, {significant(float(found.over_sigma[worst]))} times the standard deviation "
+            f"of {'both' if found.stated[worst] else 'its adjusted place'} in a coordinate."
+        )
+        judged.append((False, line))
+    return judged
+
+
+def _remarkable(found: GivenResiduals | None) -> tuple[GivenValue, ...]:
+    """Return the given value with the largest |w| if that is worth a remark."""
+    if found is None:
+        return ()
+    tested = (one for one in found.by_w if np.isfinite(one.w) and not one.r < TESTABLE)
+    return tuple(one for one in tested if abs(one.w) > WEIGHTED_REMARK)[:1]
+
+
+def _capital(text: str) -> str:
+    return text[:1].upper() + text[1:]
