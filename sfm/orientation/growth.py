@@ -8,7 +8,8 @@ from dataclasses import replace
 import numpy as np
 
 from sfm.camera import Camera, project, tangents_from_pixel
-from sfm.conventions import MAD_TO_SIGMA, FloatArray
+from sfm.conventions import MAD_TO_SIGMA, BoolArray, FloatArray
+from sfm.distortion.models import Role
 from sfm.errors import GeometryError
 from sfm.network import Estimate, Network, empty_estimate, rows_of
 from sfm.orientation.intersection import intersect
@@ -21,7 +22,6 @@ FIRST_ADJUSTMENT = 4  # photographs
 MIN_ANGLE_DEG = 2.0  # smallest ray angle of a point that others are oriented on
 MIN_SHARE = 0.5  # of the rays of a point must meet in it
 TOLERANCE_FACTOR = 6.0  # times the robust spread of the residuals
-EARLY = ("c", "fx", "fy", "K1", "k1")  # parameters that few photographs determine
 ALL_FREE_PHOTOGRAPHS = 6  # from which on all parameters are adjusted
 SURPLUS_PER_PARAMETER = 3  # observations beyond the exterior orientations for each free parameter
 
@@ -350,12 +350,19 @@ def _staged(camera: Camera, network: Network, index: int) -> Camera:
     n, m = len(network.points), len(network.images)
     redundancy = 2 * len(network.image_points) - 6 * m - 3 * n + 7
     surplus = min(2 * int(own[network.image_points.image].sum()) - 6 * int(own.sum()), redundancy)
-    early = camera.free & np.array([name in EARLY for name in camera.names])
+    early = camera.free & _determined_early(camera)
     if m >= ALL_FREE_PHOTOGRAPHS and surplus >= SURPLUS_PER_PARAMETER * camera.free.sum():
         return camera
     if m >= FIRST_ADJUSTMENT and surplus >= SURPLUS_PER_PARAMETER * early.sum():
         return replace(camera, free=early)
     return replace(camera, free=np.zeros_like(camera.free))
+
+
+def _determined_early(camera: Camera) -> BoolArray:
+    """Parameters that few photographs determine: focal lengths and the first of radial distortion, (n,)."""
+    early = camera.plays(Role.FOCAL)
+    early[np.flatnonzero(camera.plays(Role.RADIAL))[:1]] = True
+    return early
 
 
 def _too_few(count: int, needed: int) -> str:
