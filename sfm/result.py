@@ -143,6 +143,7 @@ class SurveyResult:
     photographs: tuple[PhotographTargets, ...] = ()  # of every readable photograph; none with [observations]
     control_check: ControlCheck | None = None  # None without control, or where the datum is control
     warnings: tuple[str, ...] = ()  # one line each, in words
+    notes: tuple[str, ...] = ()  # what was chosen where the survey says nothing, and is no fault, likewise
     eccentricity: Eccentricity | None = None  # None where it was not corrected
     no_circles: tuple[str, ...] = ()  # uncoded points left out: their outlines are not images of one circle
     left_out: tuple[LeftOutPoint, ...] = ()  # measured points that are not in the result

@@ -46,6 +46,7 @@ def assemble_result(
         eccentricity=matched.eccentricity,
         no_circles=matched.no_circles,
         left_out=(*measured.left_out, *solution.left_out),
+        notes=solution.notes,
         free_network=solution.free_network,
         taken_out=solution.taken_out,
         unused_image_points=solution.unused_image_points + sum(one.image_points for one in measured.left_out),

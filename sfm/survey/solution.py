@@ -29,6 +29,7 @@ from sfm.survey.datum_definition import (
     scale_to_bars,
 )
 from sfm.survey.exterior import add_exterior
+from sfm.survey.free_parameters import choose_free_parameters
 from sfm.survey.inputs.interior import split_cameras, without_idle_cameras
 from sfm.survey.inputs.measurements import Naming
 from sfm.survey.inputs.start import given_values
@@ -73,6 +74,7 @@ class Solution:
     unused_image_points: int  # of points and photographs that are not in it
     taken_out: tuple[TakenOut, ...]  # control and scale bars that do not fit
     free_network: FreeNetwork | None  # of the image points alone; None where nothing else took part
+    notes: tuple[str, ...]  # what was chosen where the survey says nothing, one line each
 
 
 def refine(network: Network, estimate: Estimate) -> Estimate:
@@ -113,6 +115,8 @@ def solve_survey(survey: Survey, matched: Correspondences) -> Solution:
         estimate = replace(estimate, points=np.where(estimate.determined[:, None], held, np.nan))
     estimate = scale_to_bars(network, estimate, datum)
     frame = given_values(survey, network) if matched.given else estimate
+    chosen = choose_free_parameters(survey, network, estimate, datum=datum.kind)
+    survey, estimate = replace(survey, cameras=chosen.cameras), chosen.estimate
     network, estimate = split_cameras(survey.cameras, network, estimate, survey.start_cameras)
     least = np.where(given_values(survey, network).oriented, GIVEN_IMAGE_POINTS, MIN_IMAGE_POINTS)
     task = _Task(survey, datum, network, needed, least, survey.reject)
@@ -160,7 +164,7 @@ def solve_survey(survey: Survey, matched: Correspondences) -> Solution:
         # every bar is against the control: nothing says which of the two is right
         taken_out = [replace(one, resolved=False) for one in taken_out]
     alone = free_network_of(final)
-    return Solution(final, check, dropped, warnings, left_out, unused, tuple(taken_out), alone)
+    return Solution(final, check, dropped, warnings, left_out, unused, tuple(taken_out), alone, chosen.notes)
 
 
 def _among(left_out: tuple[LeftOutPoint, ...], whole: Network, known: BoolArray) -> tuple[LeftOutPoint, ...]:
