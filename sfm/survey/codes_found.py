@@ -12,6 +12,7 @@ from sfm.targets.codes.families import Family
 from sfm.targets.codes.rings import RINGS
 from sfm.targets.detect import find_targets
 
+MAX_NAMES = 10  # photographs in a message
 POLARITIES = ("dark", "bright")
 
 
@@ -24,10 +25,20 @@ def words_of_codes(survey: Survey, photographs: MeasuredPhotographs) -> str:
     return (
         f"no two photographs have {MIN_POINTS} coded targets in common, which their orientation needs: "
         f"{sum(targets)} targets were found in {len(targets)} photographs, {sum(codes)} codes were read in "
-        f"{with_codes} of them; check in [targets] codes = '{settings.codes}', "
+        f"{with_codes} of them{_by_photograph(photographs, codes)}; check in [targets] "
+        f"codes = '{settings.codes}', "
         f"polarity = '{settings.polarity}' and min_diameter_px = {settings.min_diameter_px:g}"
         f"{_other_settings(survey, photographs)}"
     )
+
+
+def _by_photograph(photographs: MeasuredPhotographs, codes: list[int]) -> str:
+    """Say how many codes were read in each of the first photographs, if any were."""
+    if not any(codes):
+        return ""
+    shown = zip(photographs.names[:MAX_NAMES], codes, strict=False)
+    more = " ..." if len(codes) > MAX_NAMES else ""
+    return f" ({', '.join(f'{name}: {count}' for name, count in shown)}{more})"
 
 
 def _other_settings(survey: Survey, photographs: MeasuredPhotographs) -> str:

@@ -11,8 +11,9 @@ from sfm.conventions import BoolArray
 from sfm.errors import GeometryError
 from sfm.network import Estimate, Network
 from sfm.orientation.intersection import intersect
-from sfm.orientation.sequence import MIN_POINTS, Orientation, orient
+from sfm.orientation.sequence import MIN_POINTS, Judge, Orientation, orient
 from sfm.reduced_network import reduce_network
+from sfm.survey.circles import circle_misfit
 from sfm.survey.codes_found import words_of_codes
 from sfm.survey.free_parameters import choose_free_parameters
 from sfm.survey.inputs.measurements import Measurements
@@ -24,6 +25,7 @@ from sfm.survey.solution import refine
 ORIENTATION_POINTS = (
     400  # of natural texture that take part in the orientation, those with the most rays, and
 )
+CONTROL_OF_CAMERA = 6  # control points in the datum with which two photographs determine their camera
 POINTS_PER_PHOTOGRAPH = 100  # of every photograph at least so many
 
 
@@ -45,7 +47,7 @@ def orient_survey(survey: Survey, measured: Measurements) -> Orientation:
         if survey.tie_points:
             return _orient_strongest(network, values)
         # given image points are adjusted as they are, and judged by the adjustment
-        return _orient(network, values, contradicting=survey.observations is not None)
+        return _orient(network, values, contradicting=survey.observations is not None, judge=_judge(measured))
 
     found, failure = None, None
     try:
@@ -61,15 +63,58 @@ def orient_survey(survey: Survey, measured: Measurements) -> Orientation:
         hint = " (correct or complete [approximate], or leave it out)" if given else ""
         hint += f"; {line}" if line else ""
         raise GeometryError(f"{failure}{hint}") from failure
-    warnings = tuple(f"[approximate]: {line}" for line in found.warnings) if given else found.warnings
-    found = tell_lost_photographs(network, replace(found, warnings=(*warnings, *([line] if line else []))))
+    warnings = tuple(f"[approximate]: {line}" for line in found.warnings)
+    warnings += (*found.remarks, *([line] if line else []))
     chosen = choose_free_parameters(survey, network, found.estimate, extend=False)
-    return replace(found, estimate=chosen.estimate)
+    found, held = _hold_cameras_of_two(survey, network, replace(found, estimate=chosen.estimate))
+    return tell_lost_photographs(network, replace(found, warnings=warnings + held))
 
 
-def _orient(network: Network, estimate: Estimate, *, contradicting: bool = False) -> Orientation:
+def _orient(
+    network: Network, estimate: Estimate, *, contradicting: bool = False, judge: Judge | None = None
+) -> Orientation:
     """Orient all photographs on all points."""
-    return orient(network, estimate, refine=refine, contradicting=contradicting)
+    return orient(network, estimate, refine=refine, contradicting=contradicting, judge=judge)
+
+
+def _hold_cameras_of_two(
+    survey: Survey, network: Network, found: Orientation
+) -> tuple[Orientation, tuple[str, ...]]:
+    """Hold the free parameters of interior orientation where two photographs are all there is, and say so.
+
+    The image points of a pair determine seven parameters, five of them the relative orientation (Hartley and
+    Zisserman 2003, sec. 11.1): hardly c, and neither principal point nor distortion, which bend the object
+    instead. A control field in the datum determines them, and observed parameters have their own precision.
+    """
+    estimate = found.estimate
+    fixed = len(network.control) if survey.datum.kind == "control" else 0
+    if estimate.oriented.sum() != 2 or fixed >= CONTROL_OF_CAMERA:
+        return found, ()
+    used = np.unique(network.camera[estimate.oriented])
+    lines = []
+    cameras = list(estimate.cameras)
+    for index in used.tolist():
+        camera = cameras[index]
+        names = [name for name, free in zip(camera.names, camera.free, strict=True) if free]
+        if names:
+            cameras[index] = replace(camera, free=np.zeros_like(camera.free))
+            lines.append(
+                f"camera {camera.name}: {', '.join(names)} held at the start values: two photographs do not "
+                "determine them; an error of c scales the depth, one of the distortion bends the object"
+            )
+    return replace(found, estimate=replace(estimate, cameras=tuple(cameras))), tuple(lines)
+
+
+def _judge(measured: Measurements) -> Judge | None:
+    """Return how little the outlines of the targets are images of circles; None without such targets."""
+    photographs, naming = measured.photographs, measured.naming
+    if photographs is None or naming is None or naming.corners:
+        return None
+
+    def misfit(estimate: Estimate) -> float:
+        return circle_misfit(photographs, naming, measured.network, estimate)
+
+    return misfit
 
 
 def _orient_strongest(network: Network, estimate: Estimate) -> Orientation:
