@@ -73,8 +73,11 @@ class Growth:
 
     # --- steps -------------------------------------------------------------------------------------
 
-    def begin(self) -> Start:
+    def begin(self, judge: Callable[[Estimate], float] | None = None) -> Start:
         """Find a start and take it over.
+
+        Args:
+            judge: misfit of an estimate with what the caller knows besides, see `best_start`.
 
         Raises:
             GeometryError: nothing orients two photographs; with given values these are not enough.
@@ -102,7 +105,18 @@ class Growth:
         # no control or too little of it in any photograph: a free start, later brought onto control
         self.estimate = empty_estimate(network, self.estimate.cameras)
         self.fixed[:] = False
-        start = best_start(network, self.tangents(), self.tolerance(), seed=self.seed)
+
+        def judged(start: Start) -> float:
+            assert judge is not None
+            return judge(Estimate(self.estimate.cameras, start.position, start.rotation, start.points))
+
+        start = best_start(
+            network,
+            self.tangents(),
+            self.tolerance(),
+            seed=self.seed,
+            judge=None if judge is None else judged,
+        )
         self.estimate = replace(
             self.estimate, position=start.position, rotation=start.rotation, points=start.points
         )
@@ -277,7 +291,8 @@ class Growth:
                 )
             else:
                 reason = (
-                    f"{found.confirmed[i]} of its points fit the network, {found.against[i]} contradict it: "
+                    f"{found.confirmed[i]} conditions of its points confirm the network, "
+                    f"{found.against[i]} of its points contradict it: "
                     "another object, a mirrored picture or wrong codes"
                 )
             position, rotation = self.estimate.position.copy(), self.estimate.rotation.copy()
