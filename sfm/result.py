@@ -11,6 +11,7 @@ import numpy as np
 from sfm.adjustment.covariance import marginal_of
 from sfm.adjustment.quality.against_free import FreeNetwork
 from sfm.adjustment.quality.correlations import OrientationCorrelation
+from sfm.adjustment.quality.other_solutions import OtherSolution
 from sfm.adjustment.result import Adjustment
 from sfm.camera import Camera
 from sfm.comparison.adjusters import AdjusterComparison
@@ -148,6 +149,7 @@ class SurveyResult:
     left_out: tuple[LeftOutPoint, ...] = ()  # measured points that are not in the result
     free_network: FreeNetwork | None = None  # None where nothing else took part, or where it has no result
     taken_out: tuple[TakenOut, ...] = ()  # control and scale bars that do not fit and were not used
+    other_solutions: tuple[OtherSolution, ...] = ()  # that the image points allow as well
     unused_image_points: int = 0  # of points or photographs that are not in the result, in no other count
     orientation_correlations: tuple[OrientationCorrelation, ...] = ()  # of camera parameters with exterior
     # orientation, the strong ones

@@ -48,6 +48,7 @@ def assemble_result(
         left_out=(*measured.left_out, *solution.left_out),
         free_network=solution.free_network,
         taken_out=solution.taken_out,
+        other_solutions=solution.others,
         unused_image_points=solution.unused_image_points + sum(one.image_points for one in measured.left_out),
         reject=survey.reject,
         orientation_correlations=orientation_correlations(adjustment),

@@ -10,6 +10,7 @@ import numpy as np
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.engine.observed_unknowns import observed
 from sfm.adjustment.quality.against_free import FreeNetwork, free_network_of
+from sfm.adjustment.quality.other_solutions import OtherSolution, other_solutions
 from sfm.adjustment.quality.variance_components import IMAGE_POINTS, estimate_components
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
@@ -73,6 +74,7 @@ class Solution:
     unused_image_points: int  # of points and photographs that are not in it
     taken_out: tuple[TakenOut, ...]  # control and scale bars that do not fit
     free_network: FreeNetwork | None  # of the image points alone; None where nothing else took part
+    others: tuple[OtherSolution, ...]  # that the image points allow as well
 
 
 def refine(network: Network, estimate: Estimate) -> Estimate:
@@ -119,6 +121,8 @@ def solve_survey(survey: Survey, matched: Correspondences) -> Solution:
     every = np.ones(len(network.image_points), dtype=bool)
     iterations = 0
     contradictions, taken_out = list(scales.lines), list(scales.taken_out)
+    better: tuple[str, ...] = ()
+    first: tuple[_Settled, Adjustment, ControlCheck | None, tuple[OtherSolution, ...]] | None = None
     while True:
         settled = _settle(task, estimate)
         iterations += settled.iterations
@@ -134,7 +138,16 @@ def solve_survey(survey: Survey, matched: Correspondences) -> Solution:
             final = _final(task, settled.part, last)
             found = _contradiction(task, final)
         if found is None:
-            break
+            others = other_solutions(final)
+            if first is not None and not final.converged:  # what seemed better is none: as it was
+                (settled, final, check, others), better = first, ()
+                break
+            if first is not None or not others or others[0].vPv >= 1:
+                break
+            first = settled, final, check, others
+            better = (_words_of_better(final, others[0]),)
+            estimate = merge_estimate(estimate, others[0].estimate, settled.images, settled.points)
+            continue
         contradictions.append(found.line)
         taken_out += [] if found.taken_out is None else [found.taken_out]
         task = _resolved(task, found, settled.accepted)
@@ -153,14 +166,24 @@ def solve_survey(survey: Survey, matched: Correspondences) -> Solution:
     )
     # natural texture has points in plenty, of which only those that were lost on the way are worth a line
     told = left_out if survey.tie_points is None else _among(left_out, whole, known)
-    warnings = (*placed.warnings, *contradictions, *_warnings(survey, told, len(whole.points), final))
+    warnings = (*placed.warnings, *contradictions, *better)
+    warnings += _warnings(survey, told, len(whole.points), final)
     in_result = np.isin(whole.points, final.network.points)
     unused = unused_image_points(whole, settled.images, in_result)
     if len(whole.scale_bars) and not len(final.network.scale_bars) and datum.kind == "control":
         # every bar is against the control: nothing says which of the two is right
         taken_out = [replace(one, resolved=False) for one in taken_out]
     alone = free_network_of(final)
-    return Solution(final, check, dropped, warnings, left_out, unused, tuple(taken_out), alone)
+    return Solution(final, check, dropped, warnings, left_out, unused, tuple(taken_out), alone, others)
+
+
+def _words_of_better(final: Adjustment, other: OtherSolution) -> str:
+    """Say that the network was adjusted anew from a solution of smaller v'Pv than that found first."""
+    first = final.estimate.cameras[[one.name for one in final.estimate.cameras].index(other.camera)]
+    return (
+        f"two solutions: c of camera {other.camera} was {first.parameters[0]:.5g} {other.unit} at first; "
+        f"from {other.c:.5g} {other.unit} v'Pv is {other.vPv:.3g} times as large, which was taken"
+    )
 
 
 def _among(left_out: tuple[LeftOutPoint, ...], whole: Network, known: BoolArray) -> tuple[LeftOutPoint, ...]:

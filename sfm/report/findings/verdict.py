@@ -17,6 +17,8 @@ MUCH_REJECTED = 0.05  # share of rejected image points above which a person shou
 MANY_RAYS = 1 / 3  # share of the rays of a point: so many of them say something else than the result
 FEW_RAYS = 2  # that are left of a point of which others were rejected check it no more
 MAX_NAMES = 5  # points named in one remark
+MAX_SOLUTIONS = 2  # of about the same v'Pv that are told
+SOLUTION_BAD = 3.0  # standard deviations by which points differ in another solution: theirs say nothing then
 # sigma_px is a rough guess, so the global test alone says little. Twice the guess is worth a look; five
 # times is no precision that anybody expected, but a wrong model, wrong names or wrong control.
 SIGMA0_REMARK, SIGMA0_BAD = 2.0, 5.0
@@ -57,7 +59,7 @@ def judge(evidence: Evidence) -> Verdict:
             f"Rank defect {a.defect}, expected {a.expected_defect}; not everything can be determined{what}."
         )
     remarks: list[str] = []
-    kinds = (_sigma0, _residual, _untested, _rays, _consistency, judge_given)
+    kinds = (_other_solutions, _sigma0, _residual, _untested, _rays, _consistency, judge_given)
     for judge_kind in kinds:
         for is_bad, line in judge_kind(evidence):
             (serious if is_bad else remarks).append(line)
@@ -79,6 +81,24 @@ def judge(evidence: Evidence) -> Verdict:
     if remarks:
         return Verdict("fair", f"The survey worked, with remarks: {found}.", (*remarks, *notes))
     return Verdict("good", f"The survey worked: {found}.", notes)
+
+
+def _other_solutions(evidence: Evidence) -> Judged:
+    """Judge whether the image points allow another solution: which of them is true they do not say."""
+    judged = []
+    for other in evidence.result.other_solutions[:MAX_SOLUTIONS]:
+        what = (
+            "turned inside out in depth"
+            if other.reflected
+            else f"with c of camera {other.camera} at {other.c:.5g} {other.unit}"
+        )
+        line = (
+            f"Another solution, {what}, fits as well (v'Pv {other.vPv:.3g} times that of the result), and "
+            f"its points differ by {significant(other.moved)} times their standard deviations (RMS): hold c "
+            "at a calibrated value, or add photographs at larger angles and other distances."
+        )
+        judged.append((other.moved > SOLUTION_BAD, line))
+    return judged
 
 
 def _sigma0(evidence: Evidence) -> Judged:
@@ -195,6 +215,15 @@ def _consistency(evidence: Evidence) -> Judged:
         )
     if len(found.two_positions) > MAX_NAMES:
         lines.append(f"{len(found.two_positions) - MAX_NAMES} more points are at two positions.")
+    if found.doubtful:
+        shown = ", ".join(
+            f"{one.point} ({one.rejected} rejected, or {one.instead})" for one in found.doubtful[:MAX_NAMES]
+        )
+        more = " ..." if len(found.doubtful) > MAX_NAMES else ""
+        lines.append(
+            f"Which ray is wrong cannot be told of {len(found.doubtful)} point(s), whose coordinates are "
+            f"doubtful: {shown}{more}."
+        )
     if found.large:
         more = " ..." if len(found.large) > MAX_NAMES else ""
         lines.append(
