@@ -10,6 +10,7 @@ from sfm.distortion.models import MODELS
 from sfm.errors import SurveyFileError
 from sfm.survey.inputs.given import ScaleBar
 from sfm.survey.inputs.settings import (
+    MAX_GLOBS,
     MAX_LENGTH_PER_SIGMA,
     CameraSettings,
     CompareSettings,
@@ -109,6 +110,9 @@ def refuse_contradictions(survey: SurveySettings) -> None:
             raise SurveyFileError(
                 f"{where}: camera {camera.name}: images is missing, the glob of its photographs is needed"
             )
+    globs = sum(len(camera.images or ()) for camera in survey.cameras)
+    if globs > MAX_GLOBS:
+        raise SurveyFileError(f"{where}: {globs} globs of photographs, at most {MAX_GLOBS} are looked for")
     if survey.compare.baseline != "none" and survey.observations is not None:
         raise SurveyFileError(
             f"{where}: compare.baseline = '{survey.compare.baseline}' needs photographs, the survey has "

@@ -15,6 +15,11 @@ def _pairs(value: Any) -> Any:
     return tuple(value.items()) if isinstance(value, dict) else value
 
 
+def _listed(value: Any) -> Any:
+    """Turn one text into a list of one."""
+    return (value,) if isinstance(value, str) else value
+
+
 def _plain(value: str) -> str:
     if not value.strip():
         raise ValueError("found an empty text")
@@ -31,6 +36,7 @@ MAX_SIDE_PX = 1_000_000
 MAX_CAMERAS, MAX_GROUPS = 1000, 1000  # each is tried on every photograph
 # parameters that are adjusted where a survey says nothing, as far as its photographs determine them
 FREED_FIRST = ("c", "x0", "y0", "K1", "K2", "fx", "fy", "cx", "cy", "k1", "k2")
+MAX_GLOBS = 1000  # of the photographs of all cameras
 MAX_LENGTH_PER_SIGMA = 1e6  # no scale bar is calibrated to better than a millionth of its length
 Length = Annotated[float, Field(ge=SMALLEST, le=LARGEST)]
 Name = Annotated[str, BeforeValidator(lambda v: _plain(v) if isinstance(v, str) else v)]
@@ -42,6 +48,9 @@ TwoLengths = Annotated[tuple[Length, Length], Field(strict=False)]
 Side = Annotated[int, Field(gt=0, le=MAX_SIDE_PX)]
 TwoCounts = Annotated[tuple[Side, Side], Field(strict=False)]
 Names = Annotated[tuple[Name, ...], Field(strict=False)]
+Globs = Annotated[
+    tuple[Name, ...], Field(strict=False, min_length=1, max_length=MAX_GLOBS), BeforeValidator(_listed)
+]
 Value = Annotated[float, Field(ge=-LARGEST, le=LARGEST)]
 Values = Annotated[
     tuple[Annotated[tuple[Name, Value], Field(strict=False)], ...],
@@ -76,7 +85,7 @@ class CameraSettings(Section):
     """[[camera]]: one camera, its photographs and what is known of its interior orientation."""
 
     name: Name
-    images: Name | None = None  # glob of its photographs; may be left out with [observations] and one camera
+    images: Globs | None = None  # of its photographs; may be left out with [observations] and one camera
     size_px: TwoCounts | None = None  # else from the photographs, px
     pixel_mm: TwoLengths | None = None  # width and height of a pixel, else from sensor_mm or EXIF, mm
     sensor_mm: TwoLengths | None = None  # width and height of the sensor, mm
