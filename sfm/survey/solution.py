@@ -31,6 +31,7 @@ from sfm.survey.datum_definition import (
 )
 from sfm.survey.exterior import add_exterior
 from sfm.survey.free_parameters import choose_free_parameters
+from sfm.survey.inputs.incomplete_cameras import unlike_squares
 from sfm.survey.inputs.interior import split_cameras, without_idle_cameras
 from sfm.survey.inputs.measurements import Naming
 from sfm.survey.inputs.start import given_values
@@ -372,6 +373,15 @@ def merge_estimate(estimate: Estimate, part: Estimate, images: BoolArray, points
     return Estimate(part.cameras, position, rotation, xyz)
 
 
+def _pixels_unlike_squares(survey: Survey, estimate: Estimate) -> tuple[str, ...]:
+    """Return what is told of pixels by nominal sensor sizes, of the first camera of each of the survey's."""
+    first = {one.name: camera for one in survey.cameras for camera in reversed(estimate.cameras)
+             if camera.name == one.name or camera.name.startswith(f"{one.name} ")}  # fmt: skip
+    settings = [one for one in survey.cameras if one.name in first]
+    pixels = [(float(first[one.name].pixel_mm[0]), float(first[one.name].pixel_mm[1])) for one in settings]
+    return unlike_squares(settings, pixels, [one.adjusted for one in settings])
+
+
 def _accepted(network: Network, adjustment: Adjustment, images: BoolArray, points: BoolArray) -> BoolArray:
     """Return which image points of the whole network the adjustment of a part of it accepted."""
     seen = network.image_points
@@ -396,4 +406,5 @@ def _warnings(
     if absent:
         lines.append(f"datum points that are not in the network: {', '.join(absent[:MAX_NAMES])}")
     lines += far_principal_distances(survey, adjustment.estimate)
+    lines += _pixels_unlike_squares(survey, adjustment.estimate)
     return (*lines, *datum_warnings(survey, adjustment.network))
