@@ -9,7 +9,7 @@ import numpy as np
 from sfm.camera import tangents_from_pixel
 from sfm.conventions import BoolArray
 from sfm.errors import GeometryError
-from sfm.network import Estimate, Network
+from sfm.network import Estimate, Network, rows_of
 from sfm.orientation.intersection import intersect
 from sfm.orientation.sequence import MIN_POINTS, Orientation, orient
 from sfm.photographs.reading import read_photograph
@@ -92,8 +92,8 @@ def _strongest(network: Network) -> BoolArray:
     chosen[order[:ORIENTATION_POINTS]] = True
     rank = np.empty(len(order), dtype=np.int64)
     rank[order] = np.arange(len(order))
-    for i in range(len(network.images)):
-        own = seen.point[seen.image == i]
+    for rows in rows_of(seen.image, len(network.images)):
+        own = seen.point[rows]
         chosen[own[np.argsort(rank[own], kind="stable")][:POINTS_PER_PHOTOGRAPH]] = True
     return chosen
 

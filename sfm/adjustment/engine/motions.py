@@ -18,7 +18,7 @@ from scipy.linalg import qr
 
 from sfm.adjustment.datum import ResolvedDatum
 from sfm.adjustment.engine.collinearity import State
-from sfm.adjustment.engine.observed_unknowns import Weighted, bar_directions, exterior_misclosure
+from sfm.adjustment.engine.observed_unknowns import Weighted, bar_directions, exterior_jacobian
 from sfm.adjustment.engine.unknowns import Unknowns
 from sfm.conventions import BoolArray, FloatArray
 from sfm.errors import GeometryError
@@ -157,7 +157,7 @@ def _seen_by_datum(
     ]
     for p, j in enumerate(weighted.point):
         rows.append(points[j][np.diagonal(weighted.point_weight[p]) > 0])
-    _, J = exterior_misclosure(weighted, state)
+    J = exterior_jacobian(weighted, state)
     rows += [
         (J[e] @ exterior[i])[np.diagonal(weighted.exterior_weight[e]) > 0]
         for e, i in enumerate(weighted.image)
