@@ -55,10 +55,9 @@ class Growth:
     def tangents(self) -> FloatArray:
         """Tangents of all image points with the present interior orientations, (k, 2)."""
         seen = self.network.image_points
-        camera = self.network.camera[seen.image]
         uv = np.full((len(seen), 2), np.nan)
-        for index, one in enumerate(self.estimate.cameras):
-            own = camera == index
+        of_camera = rows_of(self.network.camera[seen.image], len(self.estimate.cameras))
+        for one, own in zip(self.estimate.cameras, of_camera, strict=True):
             uv[own] = tangents_from_pixel(one, seen.xy[own])
         return uv
 
@@ -292,8 +291,8 @@ class Growth:
         camera = self.network.camera[self.network.image_points.image]
         residuals = self.residuals_px()
         tolerance = self.tolerance_px.copy()
-        for index in range(len(tolerance)):
-            own = residuals[(camera == index) & np.isfinite(residuals)]
+        for index, rows in enumerate(rows_of(camera, len(tolerance))):
+            own = residuals[rows][np.isfinite(residuals[rows])]
             if len(own):
                 spread = MAD_TO_SIGMA * float(np.median(own))
                 tolerance[index] = np.clip(

@@ -68,8 +68,8 @@ def _orient_strongest(network: Network, estimate: Estimate) -> Orientation:
     found = _orient(*reduce_network(network, estimate, images, _strongest(network), image_points))
     seen, estimate = network.image_points, found.estimate
     uv = np.full((len(seen), 2), np.nan)
-    for index, camera in enumerate(estimate.cameras):
-        own = network.camera[seen.image] == index
+    of_camera = rows_of(network.camera[seen.image], len(estimate.cameras))
+    for camera, own in zip(estimate.cameras, of_camera, strict=True):
         uv[own] = tangents_from_pixel(camera, seen.xy[own])
     c = min(camera.c_px for camera in estimate.cameras)
     rays = intersect(

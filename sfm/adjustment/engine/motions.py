@@ -68,7 +68,8 @@ def motions_of(layout: Unknowns, weighted: Weighted, state: State, datum: Resolv
     H = np.vstack([exterior.reshape(-1, 7), np.zeros((inner, 7)), kept])
     seen = _seen_by_datum(layout, weighted, state, exterior, points)
     if len(seen):
-        _, singular, Vt = np.linalg.svd(seen)
+        # U would have a column for every row, of which control alone brings three a point
+        _, singular, Vt = np.linalg.svd(seen, full_matrices=len(seen) < 7)
         rank = int((singular > DETERMINED * max(1.0, singular[0])).sum())
         open_motions = Vt[rank:].T
     else:

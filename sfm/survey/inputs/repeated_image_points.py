@@ -55,8 +55,10 @@ def merge_repeated(seen: ImagePoints) -> Merged:
     keep[first] = True
     kinds: tuple[list[tuple[int, int]], ...] = ([], [], [])
     dropped = 0
-    for g in np.flatnonzero(count > 1):
-        rows: IntArray = np.flatnonzero(group == g)
+    repeated = np.flatnonzero(count > 1)
+    of_group = rows_of(group, len(count))
+    for g in repeated:
+        rows: IntArray = of_group[g]
         one = rows[0]
         different = np.unique(seen.xy[rows], axis=0, return_index=True)[1]
         kind = 0
