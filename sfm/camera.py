@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from sfm.conventions import BoolArray, FloatArray, IntArray
-from sfm.distortion.models import MAX_PARAMETERS, MODELS, number_of, observe
+from sfm.distortion.models import MAX_PARAMETERS, MODELS, Role, number_of, observe
 from sfm.errors import SurveyFileError
 from sfm.kernels.options import compiled
 
@@ -58,7 +58,11 @@ class Camera:
     @property
     def units(self) -> tuple[str, ...]:
         """Units of the parameters, in order."""
-        return tuple(MODELS[self.model].units.split())
+        return MODELS[self.model].units
+
+    def plays(self, *roles: Role) -> BoolArray:
+        """Return which parameters play one of some parts, such as radial distortion, (n,)."""
+        return np.array([parameter.role in roles for parameter in MODELS[self.model].parameters])
 
     @property
     def in_mm(self) -> bool:

@@ -122,6 +122,16 @@ def stations(count: int) -> tuple[FloatArray, FloatArray]:
     return position, rotation
 
 
+def code_centres() -> dict[int, FloatArray]:
+    """Return where the codes of the rendered photographs are by number, mm."""
+    scene = _scene()
+    height = np.array([0.0, 60.0])
+    return {
+        int(code): np.array([*xy, height[face]])
+        for code, face, xy in zip(scene.targets.code, scene.targets.face, scene.targets.centre, strict=True)
+    }
+
+
 def _scene() -> Scene:
     family = code_family("ring14")
     assert isinstance(family, CodeFamily)

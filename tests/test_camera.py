@@ -14,7 +14,7 @@ from sfm.camera import (
     project,
     tangents_from_pixel,
 )
-from sfm.distortion.models import ALL, MAX_PARAMETERS, MODELS, Model, one_of
+from sfm.distortion.models import ALL, MAX_PARAMETERS, MODELS, Model, Parameter, Role, one_of
 from sfm.errors import SurveyFileError
 from tests.synthetic import DISTORTION, FREE, PIXEL_MM, SIZE_PX, seed_of
 
@@ -74,7 +74,7 @@ def test_a_model_is_a_function_and_a_row() -> None:
         r[0] = p[0] * np.arctan(u) - x
         r[1] = p[0] * np.arctan(v) - y
 
-    further = Model("fisheye", fisheye, "f", "px")
+    further = Model("fisheye", fisheye, (Parameter("f", "px", Role.FOCAL),))
     assert (further.names, further.in_mm) == (("f",), False)
     observe = one_of((*ALL, further)).py_func
     r, Ju, Jp = np.zeros(2), np.zeros((2, 2)), np.zeros((2, MAX_PARAMETERS))

@@ -9,13 +9,12 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from sfm.cli.starting import loading
-from sfm.errors import GeometryError, SurveyFileError
+from sfm.errors import SurveyFileError
 from sfm.orientation.resection import METHODS
 from sfm.runtime.faults import working_on
 
 if TYPE_CHECKING:
     from sfm.conventions import IntArray
-    from sfm.survey.inputs.resection_points import Task
 
 NONE_MATCHED = 1  # exit code
 MAX_TARGETS = 10_000  # on one sheet; no family has more codes
@@ -75,8 +74,8 @@ def match(
     code 1 if no point was matched.
     """
     with loading():
+        from sfm.cli.matching import match_command
         from sfm.matching.conjugate import BACK_PX
-        from sfm.report.matching import match_command
 
     with working_on(f"{left} and {right}"):
         text, matched = match_command(
@@ -125,26 +124,21 @@ def resect(
     By any of the methods, or all of them for a comparison.
     """
     with loading():
-        from sfm.report.resection import resect_json, resect_table
+        from sfm.orientation.resection.by_method import resect as resect_by
+        from sfm.orientation.resection.by_method import resect_by_all
+        from sfm.report.resection import comparison_json, comparison_table, resection_json, resection_text
         from sfm.survey.inputs.resection_points import read_task
 
     with working_on(str(points)):
         task = read_task(points, c_mm=c, camera_file=camera, start=start, tolerance_mm=tolerance)
-    if not as_json:
-        print(resect_table(task, method))
-        return
-    found = [_tried(task, one) for one in METHODS] if method == "all" else resect_json(task, method)
-    print(json.dumps(found, indent=2, allow_nan=False))
-
-
-def _tried(task: Task, method: str) -> dict[str, object]:
-    """Return what one of all methods finds, or why it finds nothing."""
-    from sfm.report.resection import resect_json
-
-    try:
-        return resect_json(task, method)
-    except GeometryError as error:
-        return {"method": method, "error": str(error)}
+    if method == "all":
+        found = resect_by_all(task)
+        text = comparison_table(found, task.c)
+        values: object = comparison_json(found, task.c)
+    else:
+        one = resect_by(task, method)
+        text, values = resection_text(one, task.c), resection_json(one, task.c)
+    print(json.dumps(values, indent=2, allow_nan=False) if as_json else text)
 
 
 def targets(

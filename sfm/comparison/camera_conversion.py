@@ -14,28 +14,13 @@ from scipy.optimize import least_squares
 
 from sfm.camera import Camera, camera_from_values, pixel_from_tangents, tangents_from_pixel
 from sfm.conventions import BoolArray, FloatArray
-from sfm.distortion.models import MAX_PARAMETERS, MODELS, observe
+from sfm.distortion.models import MAX_PARAMETERS, MODELS, Model, Role, observe
 from sfm.errors import GeometryError, SurveyFileError
 from sfm.kernels.options import compiled
 from sfm.network import Estimate
 
 GRID_STEPS = 32  # fit points along the longer side: the misfit varies as r^9 at most, four of them per period
 FIT_TOLERANCE = 1e-15  # relative; the fit is small, so it runs to the end of double precision
-
-# What stands for what: a parameter of the target is free when one of these of the source is.
-_RADIAL = ("K1", "K2", "K3", "K4", "k1", "k2", "k3", "k4", "k5", "k6")
-_DECENTRING = ("P1", "P2", "p1", "p2")
-_FOCAL = ("c", "fx", "fy", "b1")
-_KIN = {
-    **dict.fromkeys(_RADIAL, _RADIAL),
-    **dict.fromkeys(_DECENTRING, _DECENTRING),
-    **dict.fromkeys(("fx", "fy"), _FOCAL),
-    "c": ("c", "fx", "fy"),
-    "b1": ("b1", "fx", "fy"),
-    "b2": ("b2",),
-    **dict.fromkeys(("x0", "cx"), ("x0", "cx")),
-    **dict.fromkeys(("y0", "cy"), ("y0", "cy")),
-}
 
 
 @dataclass(frozen=True)
@@ -210,11 +195,25 @@ def start_values(camera: Camera, model: str) -> Camera:
 def corresponding_free(camera: Camera, model: str) -> BoolArray:
     """Return which parameters of another model take over the part of the free ones of the camera, (n,).
 
-    A parameter is free when one that it stands for is: a free K1 frees every radial term, since a series
-    cut short on one side is not cut short on the other.
+    A parameter is free when one that plays the same part is: a free K1 frees every radial term, since a
+    series cut short on one side is not cut short on the other. Where a model has two focal lengths in place
+    of one and an affinity, each stands for both.
     """
-    free = {name for name, is_free in zip(camera.names, camera.free, strict=True) if is_free}
-    return np.array([bool(free.intersection(_KIN.get(name, (name,)))) for name in MODELS[model].names])
+    source, target = MODELS[camera.model], MODELS[model]
+    free = {one.role for one, is_free in zip(source.parameters, camera.free, strict=True) if is_free}
+    return np.array([bool(free & _counterparts(one.role, source, target)) for one in target.parameters])
+
+
+def _counterparts(role: Role, source: Model, target: Model) -> set[Role]:
+    """Parts in a source model that a parameter of a target model takes over."""
+    radial = {Role.RADIAL, Role.DENOMINATOR}
+    if role in radial:
+        return radial
+    if role is Role.FOCAL and not target.names_of(Role.AFFINITY):
+        return {Role.FOCAL, Role.AFFINITY}
+    if role is Role.AFFINITY and not source.names_of(Role.AFFINITY):
+        return {Role.FOCAL}
+    return {role}
 
 
 def _reversed(a: float, b: float, c: float) -> tuple[float, float, float]:

@@ -12,10 +12,11 @@ import numpy as np
 
 from sfm.camera import Camera, camera_from_values, pixel_from_tangents, pixel_jacobian, tangents_from_pixel
 from sfm.comparison.camera_conversion import corresponding_free
+from sfm.distortion.models import Role
 from sfm.errors import GeometryError
 from sfm.network import Estimate, Network
 
-PINHOLE = ("c", "x0", "y0", "fx", "fy", "cx", "cy")  # parameters of a camera without distortion
+PINHOLE = (Role.FOCAL, Role.X0, Role.Y0)  # parts that a camera without distortion has
 
 
 def undistort(network: Network, estimate: Estimate, models: tuple[str, ...]) -> tuple[Network, Estimate]:
@@ -78,5 +79,4 @@ def ideal_camera(camera: Camera, models: tuple[str, ...]) -> Camera:
         c_mm=c,
         values=tuple((name, float(value)) for name, value in values),
     )
-    pinhole = np.array([name in PINHOLE for name in ideal.names])
-    return replace(ideal, free=corresponding_free(camera, model) & pinhole)
+    return replace(ideal, free=corresponding_free(camera, model) & ideal.plays(*PINHOLE))

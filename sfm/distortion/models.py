@@ -18,14 +18,16 @@ The models of photogrammetry correct the measured point, those of computer visio
 one; in both cases the residual vanishes at the true parameters and is one of the measured point, but for
 the models named after DBAT, whose residuals lie in the corrected plane. To add a model: write its function in
 a module beside `brown` and give it a row in `ALL`; adjustment, resection, conversion, survey file and reports
-follow from that row, and the tests of derivatives and inverse run over it.
+follow from that row and from the part that each parameter plays in it, and the tests of derivatives and
+inverse run over it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from enum import Enum
+from typing import Any, NamedTuple
 
 from numba import njit
 
@@ -34,18 +36,42 @@ from sfm.distortion.forward import brown_forward
 from sfm.distortion.opencv import full_opencv, opencv
 
 
+class Role(Enum):
+    """The part that a parameter plays; parameters of two models correspond if they play the same."""
+
+    FOCAL = "principal distance or focal length"
+    X0 = "principal point, to the right"
+    Y0 = "principal point, up or down"
+    RADIAL = "radial distortion"
+    DENOMINATOR = "radial distortion, in the denominator of a fraction"
+    DECENTRING = "decentring distortion"
+    AFFINITY = "ratio of the scales along x and y"
+    SHEAR = "angle between the axes"
+
+
+class Parameter(NamedTuple):
+    """A parameter of interior orientation."""
+
+    name: str
+    unit: str
+    role: Role
+
+    @property
+    def has_null_hypothesis(self) -> bool:
+        """Whether 0 is a value that the parameter could have: not a focal length, nor a place in px."""
+        return self.role is not Role.FOCAL and not (self.role in (Role.X0, Role.Y0) and self.unit == "px")
+
+
 @dataclass(frozen=True)
 class Model:
-    """A distortion model and what its parameters are called and measured in."""
+    """A distortion model and its parameters."""
 
     name: str
     """as survey files and `Camera.model` have it"""
     function: Callable[..., None]
     """residual and Jacobian, compiled"""
-    parameters: str
-    """names of the parameters in the order of the vector, separated by blanks"""
-    units: str
-    """their units, in the same order"""
+    parameters: tuple[Parameter, ...]
+    """in the order of the vector"""
     corrects: bool = False
     """whether it corrects the measured point; else it distorts the ideal one"""
     corrected_plane: bool = False
@@ -54,7 +80,16 @@ class Model:
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the parameters in the order of the vector."""
-        return tuple(self.parameters.split())
+        return tuple(parameter.name for parameter in self.parameters)
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        """Their units, in the same order."""
+        return tuple(parameter.unit for parameter in self.parameters)
+
+    def names_of(self, *roles: Role) -> tuple[str, ...]:
+        """Return the names of the parameters that play one of some parts, in the order of the vector."""
+        return tuple(parameter.name for parameter in self.parameters if parameter.role in roles)
 
     @property
     def in_mm(self) -> bool:
@@ -62,20 +97,45 @@ class Model:
         return "c" in self.names
 
 
-_BROWN = ("c x0 y0 K1 K2 K3 P1 P2 b1 b2", "mm mm mm mm^-2 mm^-4 mm^-6 mm^-1 mm^-1 1 1")
+def _parameters(role: Role, names: str, *units: str) -> tuple[Parameter, ...]:
+    """Parameters of one part, from their names separated by blanks and their units or the unit of all."""
+    each = names.split()
+    return tuple(
+        Parameter(name, unit, role)
+        for name, unit in zip(each, units if len(units) > 1 else units * len(each), strict=True)
+    )
+
+
+_CENTRE_MM = (
+    *_parameters(Role.FOCAL, "c", "mm"),
+    *_parameters(Role.X0, "x0", "mm"),
+    *_parameters(Role.Y0, "y0", "mm"),
+)
+_PLANE_MM = (
+    *_parameters(Role.DECENTRING, "P1 P2", "mm^-1"),
+    *_parameters(Role.AFFINITY, "b1", "1"),
+    *_parameters(Role.SHEAR, "b2", "1"),
+)
+_RADIAL_MM = _parameters(Role.RADIAL, "K1 K2 K3", "mm^-2", "mm^-4", "mm^-6")
+_BROWN = (*_CENTRE_MM, *_RADIAL_MM, *_PLANE_MM)
+_FORWARD = (*_CENTRE_MM, *_RADIAL_MM, *_parameters(Role.RADIAL, "K4", "mm^-8"), *_PLANE_MM)
+_OPENCV = (
+    *_parameters(Role.FOCAL, "fx fy", "px"),
+    *_parameters(Role.X0, "cx", "px"),
+    *_parameters(Role.Y0, "cy", "px"),
+    *_parameters(Role.RADIAL, "k1 k2", "1"),
+    *_parameters(Role.DECENTRING, "p1 p2", "1"),
+)
+_FRACTION = (*_parameters(Role.RADIAL, "k3", "1"), *_parameters(Role.DENOMINATOR, "k4 k5 k6", "1"))
+
 ALL = (
-    Model("brown", brown, *_BROWN, corrects=True),
-    Model(
-        "brown_forward",
-        brown_forward,
-        "c x0 y0 K1 K2 K3 K4 P1 P2 b1 b2",
-        "mm mm mm mm^-2 mm^-4 mm^-6 mm^-8 mm^-1 mm^-1 1 1",
-    ),
-    Model("opencv", opencv, "fx fy cx cy k1 k2 p1 p2", "px px px px 1 1 1 1"),
-    Model("full_opencv", full_opencv, "fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6", "px px px px 1 1 1 1 1 1 1 1"),
-    Model("brown_affine", brown_affine, *_BROWN, corrects=True),
-    Model("brown_dbat", brown, *_BROWN, corrects=True, corrected_plane=True),
-    Model("brown_affine_dbat", brown_affine, *_BROWN, corrects=True, corrected_plane=True),
+    Model("brown", brown, _BROWN, corrects=True),
+    Model("brown_forward", brown_forward, _FORWARD),
+    Model("opencv", opencv, _OPENCV),
+    Model("full_opencv", full_opencv, (*_OPENCV, *_FRACTION)),
+    Model("brown_affine", brown_affine, _BROWN, corrects=True),
+    Model("brown_dbat", brown, _BROWN, corrects=True, corrected_plane=True),
+    Model("brown_affine_dbat", brown_affine, _BROWN, corrects=True, corrected_plane=True),
 )
 MODELS = {model.name: model for model in ALL}
 MAX_PARAMETERS = max(len(model.names) for model in ALL)

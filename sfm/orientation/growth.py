@@ -8,7 +8,8 @@ from dataclasses import replace
 import numpy as np
 
 from sfm.camera import Camera, project, tangents_from_pixel
-from sfm.conventions import MAD_TO_SIGMA, FloatArray
+from sfm.conventions import MAD_TO_SIGMA, BoolArray, FloatArray
+from sfm.distortion.models import Role
 from sfm.errors import GeometryError
 from sfm.network import Estimate, Network, empty_estimate, rows_of
 from sfm.orientation.intersection import intersect
@@ -21,7 +22,6 @@ FIRST_ADJUSTMENT = 4  # photographs
 MIN_ANGLE_DEG = 2.0  # smallest ray angle of a point that others are oriented on
 MIN_SHARE = 0.5  # of the rays of a point must meet in it
 TOLERANCE_FACTOR = 6.0  # times the robust spread of the residuals
-EARLY = ("c", "fx", "fy", "K1", "k1")  # parameters that few photographs determine
 ALL_FREE_PHOTOGRAPHS = 6  # from which on all parameters are adjusted
 SURPLUS_PER_PARAMETER = 3  # observations beyond the exterior orientations for each free parameter
 
@@ -72,8 +72,11 @@ class Growth:
 
     # --- steps -------------------------------------------------------------------------------------
 
-    def begin(self) -> Start:
+    def begin(self, judge: Callable[[Estimate], float] | None = None) -> Start:
         """Find a start and take it over.
+
+        Args:
+            judge: misfit of an estimate with what the caller knows besides, see `best_start`.
 
         Raises:
             GeometryError: nothing orients two photographs; with given values these are not enough.
@@ -101,7 +104,18 @@ class Growth:
         # no control or too little of it in any photograph: a free start, later brought onto control
         self.estimate = empty_estimate(network, self.estimate.cameras)
         self.fixed[:] = False
-        start = best_start(network, self.tangents(), self.tolerance(), seed=self.seed)
+
+        def judged(start: Start) -> float:
+            assert judge is not None
+            return judge(Estimate(self.estimate.cameras, start.position, start.rotation, start.points))
+
+        start = best_start(
+            network,
+            self.tangents(),
+            self.tolerance(),
+            seed=self.seed,
+            judge=None if judge is None else judged,
+        )
         self.estimate = replace(
             self.estimate, position=start.position, rotation=start.rotation, points=start.points
         )
@@ -276,7 +290,8 @@ class Growth:
                 )
             else:
                 reason = (
-                    f"{found.confirmed[i]} of its points fit the network, {found.against[i]} contradict it: "
+                    f"{found.confirmed[i]} conditions of its points confirm the network, "
+                    f"{found.against[i]} of its points contradict it: "
                     "another object, a mirrored picture or wrong codes"
                 )
             position, rotation = self.estimate.position.copy(), self.estimate.rotation.copy()
@@ -334,12 +349,19 @@ def _staged(camera: Camera, network: Network, index: int) -> Camera:
     n, m = len(network.points), len(network.images)
     redundancy = 2 * len(network.image_points) - 6 * m - 3 * n + 7
     surplus = min(2 * int(own[network.image_points.image].sum()) - 6 * int(own.sum()), redundancy)
-    early = camera.free & np.array([name in EARLY for name in camera.names])
+    early = camera.free & _determined_early(camera)
     if m >= ALL_FREE_PHOTOGRAPHS and surplus >= SURPLUS_PER_PARAMETER * camera.free.sum():
         return camera
     if m >= FIRST_ADJUSTMENT and surplus >= SURPLUS_PER_PARAMETER * early.sum():
         return replace(camera, free=early)
     return replace(camera, free=np.zeros_like(camera.free))
+
+
+def _determined_early(camera: Camera) -> BoolArray:
+    """Parameters that few photographs determine: focal lengths and the first of radial distortion, (n,)."""
+    early = camera.plays(Role.FOCAL)
+    early[np.flatnonzero(camera.plays(Role.RADIAL))[:1]] = True
+    return early
 
 
 def _too_few(count: int, needed: int) -> str:

@@ -27,6 +27,8 @@ from sfm.orientation.resection.candidates import rotation_from_position
 SPATIAL_POINTS = 6  # five points give up to ten solutions, the sixth tells them apart
 PLANAR_SHARE = 0.8  # share of the pairs that must lie on one homography for a planar solution
 INFINITE_SHARE = 0.1  # of the tolerance: residuals of a mere rotation below which a base means nothing
+BASE_EXPLAINS = 5.0  # ratio of sigma0 without and with a base; distortion, which both lack, does not reach it
+NARROW = 0.1  # part of the tolerance in which a small base is looked for
 CONFIDENCE = 0.999  # of the tests whether a simpler scene explains the rays as well
 RANSAC_CONFIDENCE = 0.9999
 RANSAC_TRIALS = 2000
@@ -85,16 +87,21 @@ def relative_orientations(
     if n < PLANAR_POINTS or len(uv2) != n:
         raise GeometryError(f"relative orientation: {n} common points, at least {PLANAR_POINTS} are needed")
     H, on_plane = fit_homography(uv1, uv2, tolerance=tolerance, seed=seed)
+    spatial: RelativeOrientation | None = None
     planar: list[RelativeOrientation] = []
     if on_plane.sum() >= max(PLANAR_POINTS, PLANAR_SHARE * n):
         infinite = _infinite(H, uv1, uv2, on_plane, tolerance)
         if infinite is not None:
-            return (infinite,)
+            # within a wide tolerance a false base fits every pair of a small one
+            spatial = _spatial(uv1, uv2, NARROW * tolerance, seed) if n >= SPATIAL_POINTS else None
+            if spatial is None or not BASE_EXPLAINS * spatial.sigma0 < infinite.sigma0:
+                return (infinite,)
         planar = [
             _evaluate("planar", base, R, normal, uv1, uv2, on_plane)
             for base, R, normal in decompose_homography(H, uv1[on_plane], uv2[on_plane])
         ]
-    spatial = _spatial(uv1, uv2, tolerance, seed) if n >= SPATIAL_POINTS else None
+    if spatial is None and n >= SPATIAL_POINTS:
+        spatial = _spatial(uv1, uv2, tolerance, seed)
     if spatial is None:
         if not planar:
             raise GeometryError(

@@ -11,6 +11,7 @@ fit the result are photographs oriented anew, with them or, if they lead nowhere
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -25,9 +26,12 @@ from sfm.orientation.remaining_points import intersect_remaining
 from sfm.orientation.starting_pair import Start
 from sfm.similarity import fit_similarity
 
+Judge = Callable[[Estimate], float]
+
 MIN_POINTS = 4  # of a photograph: three are always fitted by P3P, the fourth checks it
 START_TOLERANCE = 0.03  # of the photograph's diagonal: what an unknown distortion leaves after resection
 FINAL_TOLERANCE_PX = 4.0  # below this no image point is put aside here; the adjustment tests further
+MAX_NAMES = 10  # of photographs for one reason, and reasons, in a message
 GROWTH = 1.25  # the network is adjusted when it has this many times the photographs of last time
 MAX_ROUNDS = 200
 FINAL_ROUNDS = 3  # of resection, intersection and adjustment of all, while image points come or go
@@ -46,6 +50,7 @@ class Orientation:
     rms_px: float  # over these, per coordinate, px
     tolerance_px: FloatArray  # last tolerance of each camera, px, one per camera
     warnings: tuple[str, ...] = ()  # one line each: given values that were of no use or replaced
+    remarks: tuple[str, ...] = ()  # one line each: what the image points do not decide
 
 
 def orient(
@@ -58,6 +63,7 @@ def orient(
     final_tolerance_px: float = FINAL_TOLERANCE_PX,
     min_points: int = MIN_POINTS,
     contradicting: bool = False,
+    judge: Judge | None = None,
 ) -> Orientation:
     """Return exterior orientations and points of a network, from its image points.
 
@@ -73,6 +79,8 @@ def orient(
         min_points: points that a photograph must share with the network, at least 4.
         contradicting: whether points whose rays do not meet within the tolerance get coordinates, too, for
             an adjustment that is to judge them.
+        judge: returns the misfit of an estimate with what is known besides the image points; it is asked
+            where two photographs of points in a plane have two orientations that fit alike.
 
     Returns:
         The orientation, NaN with a reason for every photograph that could not be oriented, and for every
@@ -96,7 +104,7 @@ def orient(
         return Growth(network, values, seed, start_tolerance * diagonal, max(min_points, MIN_POINTS))
 
     def grow(values: Estimate) -> Orientation:
-        return _grown(begin(values), refine, final_tolerance_px, contradicting=contradicting)
+        return _grown(begin(values), refine, final_tolerance_px, judge, contradicting=contradicting)
 
     if not has_given_values(network, estimate):
         return grow(estimate)
@@ -138,11 +146,16 @@ def _holds_control(network: Network, found: Orientation) -> bool:
 
 
 def _grown(
-    growth: Growth, refine: Refine | None, final_tolerance_px: float, *, contradicting: bool
+    growth: Growth,
+    refine: Refine | None,
+    final_tolerance_px: float,
+    judge: Judge | None,
+    *,
+    contradicting: bool,
 ) -> Orientation:
     """Start, resect and intersect until nothing more comes, and let go what does not belong."""
     cameras = growth.estimate.cameras
-    start = growth.begin()
+    start = growth.begin(judge)
     adjusted = 0
     for _ in range(MAX_ROUNDS):
         added = growth.resect_next()
@@ -182,17 +195,14 @@ def _finish(growth: Growth, start: Start, cameras: tuple[Camera, ...], *, contra
     if growth.estimate.oriented.sum() < 2:
         raise GeometryError(
             f"orientation: {growth.estimate.oriented.sum()} of {len(network.images)} photographs could be "
-            "oriented, at least 2 are needed"
+            f"oriented, at least 2 are needed: {_words_of_failures(_failures(growth))}"
         )
     if start.pair is not None and len(control) >= 3:
         known = growth.estimate.determined[control.point]
         if known.sum() >= 3:
             model = growth.estimate.points[control.point[known]]
             growth.estimate = fit_similarity(model, control.xyz[known]).apply_estimate(growth.estimate)
-    failures = tuple(
-        (network.images[i], growth.reasons.get(int(i), "shares too few points with the others"))
-        for i in np.flatnonzero(~growth.estimate.oriented)
-    )
+    failures = _failures(growth)
     pair = None if start.pair is None else (network.images[start.pair[0]], network.images[start.pair[1]])
     used = residuals[fits]
     rms = float(np.sqrt(np.mean(used**2) / 2)) if len(used) else np.nan
@@ -200,4 +210,33 @@ def _finish(growth: Growth, start: Start, cameras: tuple[Camera, ...], *, contra
         replace(new, free=old.free) for new, old in zip(growth.estimate.cameras, cameras, strict=True)
     )
     estimate = replace(growth.estimate, cameras=restored)
-    return Orientation(estimate, failures, lost, pair, start.kind, fits, rms, growth.tolerance_px)
+    remarks: tuple[str, ...] = ()
+    if start.twofold and pair is not None:
+        remarks = (
+            f"the common points of {pair[0]} and {pair[1]} lie in a plane, and two orientations fit them "
+            "alike: which one is true is not decided; points off the plane or a third photograph decide",
+        )
+    return Orientation(
+        estimate, failures, lost, pair, start.kind, fits, rms, growth.tolerance_px, remarks=remarks
+    )
+
+
+def _failures(growth: Growth) -> tuple[tuple[str, str], ...]:
+    """Return (name, reason) of every photograph that is not oriented."""
+    return tuple(
+        (growth.network.images[i], growth.reasons.get(int(i), "shares too few points with the others"))
+        for i in np.flatnonzero(~growth.estimate.oriented)
+    )
+
+
+def _words_of_failures(failures: tuple[tuple[str, str], ...]) -> str:
+    """Return the reasons with the photographs that they are of, each reason once."""
+    of_reason: dict[str, list[str]] = {}
+    for name, reason in failures:
+        of_reason.setdefault(reason, []).append(name)
+    groups = [(names[:MAX_NAMES], len(names) - MAX_NAMES, reason) for reason, names in of_reason.items()]
+    words = [
+        f"{', '.join(names)}{f' and {more} more' if more > 0 else ''}: {reason}"
+        for names, more, reason in groups
+    ]
+    return "; ".join(words[:MAX_NAMES]) + (" ..." if len(words) > MAX_NAMES else "")

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -16,6 +17,9 @@ from sfm.orientation.resection.ransac import resect_robust
 
 MAX_PAIRS = 60  # pairs whose solutions are tried on the other photographs
 MIN_MEDIAN_ANGLE_DEG = 5.0  # median ray angle of a pair that is worth starting from
+MIN_ANGLE_OF_TWO_DEG = 3.0  # of a survey of two photographs, which has no other pair
+MAX_NAMES = 10  # photographs in a message
+TWOFOLD = 2.0  # ratio of two misfits from which the smaller is the true one
 SCREEN_TRIALS = 200  # triples per photograph while solutions are compared
 SCREEN_POINTS = 30  # points per photograph, and photographs per solution, that take part in it
 SCREEN_PHOTOGRAPHS = 40
@@ -30,9 +34,32 @@ class Start:
     position: FloatArray  # (m, 3)
     rotation: FloatArray  # (m, 3, 3)
     points: FloatArray  # (n, 3)
+    twofold: bool = (
+        False  # the points lie in a plane, another start fits as well and no third photograph decides
+    )
 
 
-def best_start(network: Network, tangents: FloatArray, tolerance: FloatArray, *, seed: int = 0) -> Start:
+Judge = Callable[[Start], float]
+
+
+@dataclass(frozen=True)
+class _Candidate:
+    """One solution of one pair."""
+
+    start: Start
+    score: float  # see _support
+    resected: int  # photographs besides the pair that fit it
+    favoured: bool  # of the kind that the conjugate rays themselves speak for
+
+
+def best_start(
+    network: Network,
+    tangents: FloatArray,
+    tolerance: FloatArray,
+    *,
+    seed: int = 0,
+    judge: Judge | None = None,
+) -> Start:
     """Return the pair solution on which most image points of all other photographs can be resected.
 
     Args:
@@ -40,6 +67,8 @@ def best_start(network: Network, tangents: FloatArray, tolerance: FloatArray, *,
         tangents: of all image points, shape (k, 2).
         tolerance: largest residual in each photograph, tangents, shape (m,).
         seed: of the random samples.
+        judge: misfit of a start with what else is known, where no third photograph tells the two of a plane
+            apart; what is clearly smaller (TWOFOLD) is taken.
 
     Raises:
         GeometryError: no two photographs have four points in common, or none of their geometries holds.
@@ -53,9 +82,10 @@ def best_start(network: Network, tangents: FloatArray, tolerance: FloatArray, *,
     if not pairs:
         raise GeometryError(
             f"orientation: no two of the {len(network.images)} photographs have {PLANAR_POINTS} points in "
-            "common"
+            f"common: {_words_of_common(network, own)}"
         )
-    best: tuple[float, Start] | None = None
+    found: list[_Candidate] = []
+    widest, least_angle = 0.0, MIN_MEDIAN_ANGLE_DEG if len(network.images) > 2 else MIN_ANGLE_OF_TWO_DEG
     for i, j in pairs:
         points, first, second = _common(network, tangents, own[i], own[j])
         limit = float(max(tolerance[i], tolerance[j]))
@@ -66,15 +96,34 @@ def best_start(network: Network, tangents: FloatArray, tolerance: FloatArray, *,
         for solution in solutions:
             if solution.kind == "infinite":
                 continue
-            candidate = _model(network, (i, j), points, first, second, solution)
-            if candidate is None:
+            start, angle = _model(network, (i, j), points, first, second, solution)
+            widest = max(widest, angle)
+            if start is None or angle < least_angle:
                 continue
-            score = _support(network, tangents, tolerance, own, candidate, seed)
-            if best is None or score > best[0]:
-                best = (score, candidate)
-    if best is None:
-        raise GeometryError("orientation: no pair of photographs has a base, or rays that intersect well")
-    return best[1]
+            score, resected = _support(network, tangents, tolerance, own, start, seed)
+            found.append(_Candidate(start, score, resected, solution.kind == solutions[0].kind))
+    if not found:
+        seen = f": {widest:.1f} degrees at most (median), {least_angle:g} are needed" if widest > 0 else ""
+        raise GeometryError(
+            f"orientation: no pair of photographs has a base, or rays that intersect well{seen}"
+        )
+    return _choose(found, judge)
+
+
+def _choose(found: list[_Candidate], judge: Judge | None) -> Start:
+    """Return the start with the best score, or of two that no other photograph tells apart the judge's."""
+    best = max(found, key=lambda one: one.score)
+    if best.resected:
+        return best.start
+    rivals = [one for one in found if one.start.pair == best.start.pair and one.favoured]
+    if len(rivals) < 2 or rivals[0].start.kind != "planar":
+        return max(rivals or [best], key=lambda one: one.score).start
+    if judge is None:
+        return replace(max(rivals, key=lambda one: one.score).start, twofold=True)
+    misfit = [judge(one.start) for one in rivals]
+    least, other = np.sort(misfit)[:2]
+    chosen = rivals[int(np.argmin(misfit))].start
+    return replace(chosen, twofold=not TWOFOLD * least < other)
 
 
 def _sorted_rows(network: Network, tangents: FloatArray) -> list[IntArray]:
@@ -82,6 +131,25 @@ def _sorted_rows(network: Network, tangents: FloatArray) -> list[IntArray]:
     seen = network.image_points
     usable = np.flatnonzero(np.isfinite(tangents).all(axis=1))
     return [usable[rows] for rows in rows_of(seen.image[usable], len(network.images))]
+
+
+def _words_of_common(network: Network, own: list[IntArray]) -> str:
+    """Say for each photograph with which other it has most points in common."""
+    usable = np.zeros(len(network.image_points), dtype=bool)
+    usable[np.concatenate(own)] = True
+    first, second, count = network.common_points(usable)
+    words = []
+    for i in range(min(len(own), MAX_NAMES)):
+        pairs = np.flatnonzero((first == i) | (second == i))
+        if not len(own[i]):
+            words.append(f"{network.images[i]}: no points")
+        elif not len(pairs):
+            words.append(f"{network.images[i]}: none of its {len(own[i])} points is in another photograph")
+        else:
+            p = int(pairs[np.argmax(count[pairs])])
+            other = network.images[int(second[p] if first[p] == i else first[p])]
+            words.append(f"{network.images[i]}: {count[p]} points in common with {other}")
+    return "; ".join(words) + (" ..." if len(own) > MAX_NAMES else "")
 
 
 def _promising_pairs(network: Network, own: list[IntArray]) -> list[tuple[int, int]]:
@@ -118,24 +186,23 @@ def _model(
     first: FloatArray,
     second: FloatArray,
     solution: RelativeOrientation,
-) -> Start | None:
-    """Pair and its model points as a start; None if too few rays intersect, or at too small angles."""
+) -> tuple[Start | None, float]:
+    """Return a pair and its model points as a start, None if too few rays intersect, and their angle, deg."""
     xyz = model_points(first, second, solution)
     usable = np.isfinite(xyz).all(axis=1)
     if usable.sum() < PLANAR_POINTS:
-        return None
+        return None, 0.0
     to_first, to_second = xyz[usable], xyz[usable] - solution.base
     cosine = np.sum(to_first * to_second, axis=1) / (
         np.linalg.norm(to_first, axis=1) * np.linalg.norm(to_second, axis=1)
     )
-    if np.degrees(np.arccos(np.clip(np.median(cosine), -1, 1))) < MIN_MEDIAN_ANGLE_DEG:
-        return None
+    angle = float(np.degrees(np.arccos(np.clip(np.median(cosine), -1, 1))))
     m, n = len(network.images), len(network.points)
     position, rotation, model = np.full((m, 3), np.nan), np.full((m, 3, 3), np.nan), np.full((n, 3), np.nan)
     position[pair[0]], rotation[pair[0]] = 0.0, np.eye(3)
     position[pair[1]], rotation[pair[1]] = solution.base, solution.rotation
     model[points] = xyz
-    return Start(pair, solution.kind, position, rotation, model)
+    return Start(pair, solution.kind, position, rotation, model), angle
 
 
 def _support(
@@ -145,8 +212,10 @@ def _support(
     own: list[IntArray],
     start: Start,
     seed: int,
-) -> float:
-    """Number of image points that fit a start, each counted 1 - squared residual in tolerances.
+) -> tuple[float, int]:
+    """Return how many image points fit a start, and how many photographs can be resected on it.
+
+    An image point counts 1 - squared residual in tolerances.
 
     The photographs that share most points with the model are resected on it, then the points are
     intersected again from all of them, which tells a true plane from a bent one.
@@ -179,4 +248,5 @@ def _support(
         tolerance=float(tolerance.max()),
     )
     squares = np.sum(again.residuals**2, axis=1) / tolerance[seen.image[some]] ** 2
-    return float(np.sum(1 - np.minimum(squares[np.isfinite(squares)], 1.0)))
+    score = float(np.sum(1 - np.minimum(squares[np.isfinite(squares)], 1.0)))
+    return score, int(oriented.sum()) - len(start.pair or ())

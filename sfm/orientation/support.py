@@ -11,6 +11,8 @@ from sfm.camera import project
 from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.network import Estimate, Network, rows_of
 
+RELATIVE_UNKNOWNS = 5  # of a relative orientation
+
 
 @dataclass(frozen=True)
 class Support:
@@ -18,7 +20,7 @@ class Support:
 
     fitting: IntArray  # image points within the tolerance, (m,)
     known: IntArray  # image points of determined points, (m,)
-    confirmed: IntArray  # fitting image points whose object point does not rest on this photograph, (m,)
+    confirmed: IntArray  # conditions beyond those that the orientation and its points take up, (m,)
     against: (
         IntArray  # image points that lie elsewhere, or in the midst of points that should know them, (m,)
     )
@@ -38,8 +40,10 @@ def photograph_support(
 ) -> Support:
     """Count the image points of each photograph that speak for its orientation, and those against it.
 
-    A point that this photograph and one other see was intersected from the two and fits both by itself, so
-    it confirms nothing. An image point in the midst of the network that has no place in it contradicts: a
+    A point of three rays does not rest on this photograph and confirms it. Points that this photograph and
+    one other see were intersected from the two: each leaves one condition, that its rays meet, and five of
+    these the relative orientation takes up (Luhmann et al. 2020, sec. 4.3.3); the surplus confirms. An image
+    point in the midst of the network that has no place in it contradicts: a
     mirrored photograph fits, seen from behind, the few coplanar codes that a mirror leaves as they are, and
     all its other codes nobody else has seen. Outside the network nothing is expected of the others.
 
@@ -54,9 +58,20 @@ def photograph_support(
     fits = residuals_px <= limit_px
     rays = np.bincount(seen.point[fits], minlength=len(network.points))
     known = estimate.determined[seen.point] & estimate.oriented[seen.image]
-    confirmed = fits & ((rays[seen.point] >= 3) | fixed[seen.point])
+    alone = fits & ((rays[seen.point] >= 3) | fixed[seen.point])
+    confirmed = _count(alone, seen.image, m) + _surplus_of_pairs(network, fits & ~alone)
     against = ~fits & (known | _amidst(network, estimate))
-    return Support(*(_count(rows, seen.image, m) for rows in (fits, known, confirmed, against)))
+    fitting, known_count, against_count = (_count(rows, seen.image, m) for rows in (fits, known, against))
+    return Support(fitting, known_count, confirmed, against_count)
+
+
+def _surplus_of_pairs(network: Network, two_rays: BoolArray) -> IntArray:
+    """Return the conditions that the pairs of each photograph have beyond a relative orientation, (m,)."""
+    first, second, count = network.common_points(two_rays)
+    surplus = np.maximum(count - RELATIVE_UNKNOWNS, 0)
+    m = len(network.images)
+    both = np.bincount(first, surplus, minlength=m) + np.bincount(second, surplus, minlength=m)
+    return np.asarray(both, dtype=np.int64)
 
 
 def _amidst(network: Network, estimate: Estimate) -> BoolArray:

@@ -1,22 +1,15 @@
-"""Conjugate points for people: the table, JSON and the picture of `kolinear match`."""
+"""Conjugate points for people: the table and JSON of `kolinear match`."""
 
 from __future__ import annotations
 
 import json
 import math
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from sfm.conventions import AnyArray, FloatArray
-from sfm.errors import PhotographError, SurveyFileError
-from sfm.files.csv_tables import read_table
 from sfm.files.plain_text import csv_text
-from sfm.matching.conjugate import BACK_PX, MIN_CORRELATION, ConjugatePoints, match_points
-from sfm.photographs.reading import read_photograph
-from sfm.report.figures.patches import draw_patches
-from sfm.report.match_files import picture_file, refuse_outputs, whole_outputs
+from sfm.matching.conjugate import ConjugatePoints
 
 COLUMNS = (
     "point",
@@ -32,99 +25,6 @@ COLUMNS = (
     "reason",
 )
 NO_SECOND = -1.0  # r of the second-best place where there is none
-
-
-def match_command(
-    left_path: Path,
-    right_path: Path,
-    *,
-    point: str | None = None,
-    points: Path | None = None,
-    method: str = "lsm",
-    template_px: int = 21,
-    search_px: int = 121,
-    equalise: bool = False,
-    interpolation: str = "six_tap",
-    min_correlation: float = MIN_CORRELATION,
-    back_px: float | None = BACK_PX,
-    as_json: bool = False,
-    out: Path | None = None,
-    picture: Path | None = None,
-) -> tuple[str, bool]:
-    """Match points of two photograph files.
-
-    Args:
-        left_path: the photograph in which points are given.
-        right_path: the photograph in which they are found.
-        point: "COL,ROW" in the left photograph, px; either this or `points`.
-        points: table of points, see `read_points_to_match`.
-        method: this and the next six as in `sfm.matching.conjugate.match_points`.
-        template_px: width of the template, px.
-        search_px: width of the search area, px.
-        equalise: whether the histograms of both photographs are equalised before.
-        interpolation: between pixels.
-        min_correlation: least correlation coefficient.
-        back_px: largest distance of matching back, px; None for no matching back.
-        as_json: JSON in place of the table.
-        out: file .csv or .json that gets the table, in place of the terminal.
-        picture: PNG file that gets template, matched patch and their difference.
-
-    Returns:
-        What the command line prints, and whether any point was matched.
-
-    Raises:
-        KolinearError: unreadable photographs, points or table, even windows, or files that cannot be written.
-    """
-    if (point is None) == (points is None):
-        raise SurveyFileError("match: give either --point COL,ROW or --points FILE")
-    if not 0.0 <= min_correlation <= 1.0:
-        raise SurveyFileError(f"match: --min-correlation {min_correlation:g}, needed 0 to 1")
-    inputs = (left_path, right_path, *(() if points is None else (points,)))
-    refuse_outputs(out, picture, inputs, COLUMNS, as_json)
-    if points is not None:
-        names, xy, start = read_points_to_match(points)
-    else:
-        names, xy, start = ("1",), _parse_point(str(point)), None
-    left, right = _photograph("LEFT", left_path), _photograph("RIGHT", right_path)
-    with whole_outputs(out, picture) as (table_file, picture_part):
-        found = match_points(
-            left,
-            right,
-            xy,
-            xy_right=start,
-            method=method,
-            template_px=template_px,
-            search_px=search_px,
-            equalise=equalise,
-            interpolation=interpolation,
-            min_correlation=min_correlation,
-            back_px=back_px,
-        )
-        as_json = as_json or (out is not None and out.suffix.lower() == ".json")
-        if picture_part is not None:
-            drawing = draw_patches(names, left, right, found, template_px)
-            picture_part.write_bytes(picture_file(drawing))
-        if table_file is not None:
-            text = matches_json(names, found) if as_json else matches_csv(names, found)
-            table_file.write_bytes(text.encode())
-    matched = int(found.good.sum())
-    if out is not None:
-        return f"{matched} of {len(found)} points matched: {out}\n", matched > 0
-    return matches_json(names, found) if as_json else matches_text(names, found), matched > 0
-
-
-def read_points_to_match(path: Path) -> tuple[tuple[str, ...], FloatArray, FloatArray | None]:
-    """Read point,x_px,y_px[,x_right_px,y_right_px]; the last two are centres of the search windows.
-
-    Returns:
-        Names, left points (k, 2) and centres (k, 2) or None, px.
-
-    Raises:
-        SurveyFileError: unreadable, wrong columns, no rows, a name twice, or not a finite number.
-    """
-    table = read_table(path, COLUMNS[:1], COLUMNS[1:3], COLUMNS[3:5])
-    values = table.values
-    return table.keys("point"), values[:, :2], values[:, 2:] if values.shape[1] > 2 else None
 
 
 def matches_text(names: tuple[str, ...], found: ConjugatePoints) -> str:
@@ -179,20 +79,3 @@ def _text_rows(names: tuple[str, ...], found: ConjugatePoints) -> list[tuple[str
         next_best = f"{second:.2f}" if second > NO_SECOND else "-"
         rows.append((name, f"{x:.2f}, {y:.2f}", place, sigma, quality, next_best, str(steps), str(why)))
     return rows
-
-
-def _photograph(which: str, path: Path) -> AnyArray:
-    """Read a photograph; a folder has no name to be called by, so the argument is named."""
-    if path.is_dir():
-        raise PhotographError(f"{which} {path}: a folder, a photograph is needed")
-    return read_photograph(path)
-
-
-def _parse_point(text: str) -> FloatArray:
-    try:
-        xy = np.array([[float(part) for part in text.split(",")]])
-    except ValueError:
-        xy = np.zeros((1, 0))
-    if xy.shape != (1, 2) or not np.isfinite(xy).all():
-        raise SurveyFileError(f"match: --point {text!r}, needed COL,ROW such as 812.5,403")
-    return xy

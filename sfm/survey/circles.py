@@ -55,10 +55,7 @@ def check_circles(
 
     """
     seen = network.image_points
-    rows = estimate.oriented[seen.image] & estimate.determined[seen.point]
-    rows &= _named(photographs, naming, [(found.flag & Flag.CORNER) == 0 for found in photographs.targets])
-    rays = np.bincount(seen.point[rows], minlength=len(network.points))
-    rows &= rays[seen.point] >= 2
+    rows = _seen_twice(photographs, naming, network, estimate)
     numbers, point = np.unique(seen.point[rows], return_inverse=True)
     if not len(numbers):
         return CircleCheck(network, estimate, (), None)
@@ -93,6 +90,38 @@ def check_circles(
         float(np.sqrt(np.sum(sigma) / max(len(sigma), 1))),
     )
     return CircleCheck(corrected, estimate, names, summary, warnings)
+
+
+def circle_misfit(
+    photographs: MeasuredPhotographs, naming: Naming, network: Network, estimate: Estimate
+) -> float:
+    """Return the median misfit of the targets as circles, relative to their size; infinite without any.
+
+    The misfits of a wrong solution of a plane are its distortion: there its circles are ellipses.
+
+    Args:
+        photographs: the targets that `network` was built from.
+        naming: which point each of them is.
+        network: all image points.
+        estimate: in any datum and scale; what is NaN in it is left out.
+    """
+    rows = _seen_twice(photographs, naming, network, estimate)
+    numbers, point = np.unique(network.image_points.point[rows], return_inverse=True)
+    if not len(numbers):
+        return float("inf")
+    circles = fit_circles(_views(photographs, naming, network, estimate, rows, point), len(numbers))
+    return float(np.median(circles.misfit))
+
+
+def _seen_twice(
+    photographs: MeasuredPhotographs, naming: Naming, network: Network, estimate: Estimate
+) -> BoolArray:
+    """Return which image points are of targets with an outline in two oriented photographs or more, (k,)."""
+    seen = network.image_points
+    rows = estimate.oriented[seen.image] & estimate.determined[seen.point]
+    rows &= _named(photographs, naming, [(found.flag & Flag.CORNER) == 0 for found in photographs.targets])
+    rays = np.bincount(seen.point[rows], minlength=len(network.points))
+    return np.asarray(rows & (rays[seen.point] >= 2))
 
 
 def _known_radius(survey: Survey, points: tuple[str, ...]) -> FloatArray:

@@ -12,6 +12,7 @@ from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.camera import Camera
 from sfm.conventions import MAD_TO_SIGMA, BoolArray, FloatArray, IntArray
+from sfm.distortion.models import Role
 from sfm.errors import GeometryError, PhotographError, SurveyFileError
 from sfm.matching.lsm.multi_photo import match_multi
 from sfm.matching.lsm.projected_points import pictures_of
@@ -170,8 +171,8 @@ def _freed(camera: Camera) -> Camera:
     """Free what the model itself has estimated: the principal distances and distortion that is not zero."""
     if camera.free.any():
         return camera
-    distortion = np.array([name[0] in "kpKP" for name in camera.names]) & (camera.parameters != 0)
-    return replace(camera, free=np.array([name in ("fx", "fy", "c") for name in camera.names]) | distortion)
+    distortion = camera.plays(Role.RADIAL, Role.DENOMINATOR, Role.DECENTRING) & (camera.parameters != 0)
+    return replace(camera, free=camera.plays(Role.FOCAL) | distortion)
 
 
 def _references(network: Network, estimate: Estimate) -> IntArray:

@@ -226,7 +226,7 @@ def test_a_photograph_that_fits_four_points_only_is_let_go():
     result = orient(replace(network, points=names, image_points=moved), start)
     (failure,) = result.failures
     assert failure[0] == network.images[4]
-    assert "4 of its points fit the network" in failure[1] and "contradict it" in failure[1]
+    assert "4 conditions of its points confirm the network" in failure[1] and "contradict it" in failure[1]
 
 
 def test_points_outside_the_network_do_not_speak_against_a_photograph():

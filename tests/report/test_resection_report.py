@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 
 from sfm.errors import GeometryError, SurveyFileError
-from sfm.report.resection import METHODS, resect_json, resect_table
+from sfm.orientation.resection import METHODS
+from sfm.orientation.resection.by_method import resect, resect_by_all
+from sfm.report.resection import comparison_table, resection_json, resection_text
 from sfm.survey.inputs.resection_points import read_task
 from tests.orientation.resection.test_least_squares import LAB2, TRUTH
 from tests.places import ROOT
@@ -22,6 +24,16 @@ PRINTED_9 = """
 2.1529e-05 -5.9816e-07 -5.0113e-07 2.0314e-07 4.9247e-06 1.0929e-06
 5.0135e-06 5.4154e-07 -3.3482e-07 -6.5548e-08 1.0929e-06 8.1437e-07
 """
+
+
+def resect_json(task, method):
+    return resection_json(resect(task, method), task.c)
+
+
+def resect_table(task, method):
+    if method == "all":
+        return comparison_table(resect_by_all(task), task.c)
+    return resection_text(resect(task, method), task.c)
 
 
 def write_points(path, rows):

@@ -21,12 +21,12 @@ from sfm.adjustment.engine.observed_unknowns import weighted_of
 from sfm.adjustment.engine.unknowns import unknowns_of
 from sfm.adjustment.result import Adjustment
 from sfm.camera import Camera
+from sfm.distortion.models import Role
 
 ALPHA = 0.001  # probability with which right values are suspected, of all parameters together
 MOVED = 1.0  # standard deviations by which the points must move (root mean square) for it to matter
 MAX_TESTED = 24  # parameters that are freed one by one, a solution of the normal equations each
 SMALLEST = 1e-3  # of v'Pv that may be left, over sigma0^2: residuals of exact observations are rounding
-UNTESTED = ("k4", "k5", "k6")  # the denominator of a fraction whose numerator says the same
 
 
 @dataclass(frozen=True)
@@ -91,9 +91,9 @@ def _held(cameras: tuple[Camera, ...], used: set[int]) -> tuple[tuple[str, int],
     """Return (camera or group, index) of each held parameter of the cameras that took part."""
     seen: dict[tuple[str, int], None] = {}
     for number, camera in enumerate(cameras):
-        for s in np.flatnonzero(~camera.free) if number in used else ():
-            if camera.names[s] not in UNTESTED:
-                seen[camera.group_of(int(s)) or camera.name, int(s)] = None
+        # the denominator of a fraction says the same as its numerator
+        for s in np.flatnonzero(~camera.free & ~camera.plays(Role.DENOMINATOR)) if number in used else ():
+            seen[camera.group_of(int(s)) or camera.name, int(s)] = None
     return tuple(seen)
 
 

@@ -19,6 +19,7 @@ from sfm.adjustment.quality.variance_components import IMAGE_POINTS, VarianceCom
 from sfm.adjustment.result import Adjustment
 from sfm.camera import Camera
 from sfm.conventions import FloatArray, IntArray
+from sfm.distortion.models import MODELS
 
 ALPHA = 0.001  # Baarda's usual probability of rejecting a good observation
 REWEIGHTED = "the weights come from the residuals, so that v'Pv is not chi-square distributed"
@@ -26,7 +27,6 @@ FAR_MORE = 2.0  # coordinates beyond the critical value over those expected by c
 GLOBAL_ALPHA = 0.05  # of the global test and of the significance of parameters
 POWER = 0.8  # and of finding a gross error of the minimal detectable size
 STRONG = 0.95  # correlation from which two parameters are reported
-UNTESTED = ("c", "fx", "fy", "cx", "cy")  # parameters for which 0 is no sensible null hypothesis
 
 
 @dataclass(frozen=True)
@@ -214,7 +214,7 @@ def significance(adjustment: Adjustment, *, alpha: float = GLOBAL_ALPHA) -> tupl
     for camera, Q in zip(adjustment.estimate.cameras, adjustment.covariance.interior, strict=True):
         for s, sigma in zip(_free(camera, Q), np.sqrt(np.diagonal(Q)), strict=True):
             name, owner = camera.names[s], camera.group_of(s) or camera.name
-            if name in UNTESTED or not sigma > 0:
+            if not MODELS[camera.model].parameters[s].has_null_hypothesis or not sigma > 0:
                 continue
             value = float(camera.parameters[s])
             t = abs(value) / float(sigma)

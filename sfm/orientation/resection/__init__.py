@@ -9,6 +9,7 @@ image coordinates in mm, and answer in the frame of the object points.
 - `church.resect_church`: three points and an approximate position.
 - `dlt.resect_dlt`: with the interior orientation, from six points on.
 - `least_squares.resect_least_squares`: the adjustment, with dispersion matrix and history.
+- `by_method.resect`: any of them by its name, and all of them side by side.
 - `candidates.choose_by_line`, `critical_cylinder.cylinder_distance`: which solution is the true one, and
   whether the three points determine it well.
 """

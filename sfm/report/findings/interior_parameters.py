@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sfm.adjustment.quality.statistics import UNTESTED
 from sfm.adjustment.result import Adjustment
 from sfm.camera import Camera, camera_families
 from sfm.conventions import FloatArray, IntArray
+from sfm.distortion.models import MODELS, Parameter
 
 
 @dataclass(frozen=True)
@@ -18,15 +18,25 @@ class InteriorParameter:
 
     owner: str  # camera, or group of photographs that have it in common
     photographs: int  # how many have it
-    name: str
+    parameter: Parameter
     value: float
     sigma: float  # NaN where it was not adjusted
-    unit: str
+
+    @property
+    def name(self) -> str:
+        """What the parameter is called."""
+        return self.parameter.name
+
+    @property
+    def unit(self) -> str:
+        """What it is measured in."""
+        return self.parameter.unit
 
     @property
     def t(self) -> float | None:
         """The parameter over its standard deviation; None where 0 is no sensible value, as for c."""
-        return abs(self.value) / self.sigma if self.sigma > 0 and self.name not in UNTESTED else None
+        tested = self.sigma > 0 and self.parameter.has_null_hypothesis
+        return abs(self.value) / self.sigma if tested else None
 
 
 @dataclass(frozen=True)
@@ -87,15 +97,15 @@ def interior_parameters(adjustment: Adjustment) -> tuple[InteriorParameter, ...]
     found: dict[tuple[str, str, int], InteriorParameter] = {}
     for a, camera in enumerate(adjustment.estimate.cameras):
         sigma = adjustment.interior_sigma(a)
-        for s, name in enumerate(camera.names):
+        for s, parameter in enumerate(MODELS[camera.model].parameters):
             value = float(camera.parameters[s])
             if not camera.free[s] and value == 0:
                 continue
             owner = camera.group_of(s) or camera.name
-            key = (owner, name, -1 if camera.group_of(s) else a)
+            key = (owner, parameter.name, -1 if camera.group_of(s) else a)
             known = found.get(key)
             count = int(used[a]) + (known.photographs if known else 0)
-            found[key] = InteriorParameter(owner, count, name, value, float(sigma[s]), camera.units[s])
+            found[key] = InteriorParameter(owner, count, parameter, value, float(sigma[s]))
     common = {name for name, _ in families(adjustment)}
     return tuple(sorted(found.values(), key=lambda one: one.owner not in common))
 

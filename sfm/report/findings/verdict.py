@@ -151,6 +151,11 @@ def _unchecked(evidence: Evidence) -> tuple[str, ...]:
         added = a.redundancy - free.redundancy
         if added <= 0:
             lines.append("Position, attitude and scale rest on the control, which nothing checks.")
+    if len(a.network.images) == 2:
+        lines.append(
+            "Two photographs: no third ray checks a point, uncoded targets are not in the result, and the "
+            "camera is only as good as its given values."
+        )
     rays = np.bincount(a.network.image_points.point[~a.rejected], minlength=len(a.network.points))
     two = int((rays == 2).sum())
     if two:

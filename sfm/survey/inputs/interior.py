@@ -144,7 +144,8 @@ def group_of_image(settings: CameraSettings, image: str, source: str = "survey")
 
 def _variants(settings: CameraSettings, camera: Camera, images: list[str]) -> tuple[list[Camera], IntArray]:
     """Return a camera for each photograph or group with parameters of its own, and whose is whose."""
-    camera = replace(camera, free=np.array([name in settings.adjusted for name in camera.names]))
+    observed = [name for name, _ in settings.weighted]
+    camera = replace(camera, free=camera.free | np.array([name in observed for name in camera.names]))
     grouped = [group_of_image(settings, image) if settings.groups else 0 for image in images]
     if not images or not (settings.per_photograph or settings.per_group):
         return [camera], np.zeros(len(images), dtype=np.int64)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -11,23 +10,11 @@ from sfm.camera import camera_from_values, tangents_from_pixel
 from sfm.conventions import FloatArray, pixel_from_image
 from sfm.errors import SurveyFileError
 from sfm.files.csv_tables import read_table
+from sfm.orientation.resection.by_method import Task
 
 TOLERANCE = 1e-3  # of c: the tolerance of `robust` if none is given, some px of a usual camera
 _CAMERA = ("c", "x0", "y0", "K1", "K2", "K3", "P1", "P2", "b1", "b2")
 _UNIT_PIXEL = np.array([1.0, 1.0])
-
-
-@dataclass(frozen=True)
-class Task:
-    """Image and object points of one photograph, ready for any method."""
-
-    names: tuple[str, ...]  # of the points
-    xy_mm: FloatArray  # measured image coordinates, mm, (n, 2)
-    tangents: FloatArray  # of the rays, interior orientation applied, (n, 2)
-    points: FloatArray  # object points, object unit, (n, 3)
-    c: float  # principal distance, mm
-    start: FloatArray | None  # X0, Y0, Z0 [, omega, phi, kappa in rad], (3,) or (6,)
-    tolerance_mm: float  # of `robust`, mm
 
 
 def read_task(

@@ -1,0 +1,204 @@
+"""Resection by the name of a method: one photograph's points in, what that method finds out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from sfm.conventions import FloatArray, rotation_from_angles
+from sfm.errors import GeometryError
+from sfm.orientation.resection.candidates import (
+    LineFit,
+    Solution,
+    checked_points,
+    choose_by_line,
+    rotation_from_position,
+)
+from sfm.orientation.resection.church import resect_church
+from sfm.orientation.resection.critical_cylinder import cylinder_warning
+from sfm.orientation.resection.dlt import DirectLinearTransformation, resect_dlt
+from sfm.orientation.resection.fischler_bolles import resect_fischler_bolles
+from sfm.orientation.resection.least_squares import resect_least_squares
+from sfm.orientation.resection.p4p import resect_p4p
+from sfm.orientation.resection.rampal import resect_rampal
+from sfm.orientation.resection.ransac import resect_robust
+from sfm.orientation.resection.zeng_wang import resect_zeng_wang
+
+START_TOLERANCE = 0.1  # of c: what the start of least squares may be off
+ALL_POINTS = 3  # fewest points of any method
+ON_A_LINE = ("fischler-bolles", "zeng-wang")  # methods whose solutions a fourth point tells apart
+ON_A_CYLINDER = ("fischler-bolles", "church", "zeng-wang", "rampal")  # methods of the first three points
+
+
+@dataclass(frozen=True)
+class Task:
+    """Image and object points of one photograph, ready for any method."""
+
+    names: tuple[str, ...]  # of the points
+    xy_mm: FloatArray  # measured image coordinates, mm, (n, 2)
+    tangents: FloatArray  # of the rays, interior orientation applied, (n, 2)
+    points: FloatArray  # object points, object unit, (n, 3)
+    c: float  # principal distance, mm
+    start: FloatArray | None  # X0, Y0, Z0 [, omega, phi, kappa in rad], (3,) or (6,)
+    tolerance_mm: float  # of `robust`, mm
+
+
+@dataclass(frozen=True)
+class Resected:
+    """What one method finds; None is what it does not tell. Lengths in the object unit, angles in rad."""
+
+    method: str
+    points: int  # how many were given
+    solutions: tuple[Solution, ...]  # the best first
+    sigma0_mm: float | None = None  # of an image coordinate, mm; NaN without redundancy
+    redundancy: int | None = None
+    dispersion: FloatArray | None = None  # of X0, Y0, Z0, omega, phi, kappa, (6, 6)
+    history: FloatArray | None = None  # the unknowns of each iteration
+    residuals_mm: FloatArray | None = None  # of the image points, mm, (n, 2)
+    interior: DirectLinearTransformation | None = None  # interior orientation, of the DLT
+    rejected: tuple[str, ...] | None = None  # names of the points
+    trials: int | None = None  # of the random sample consensus
+    line_fit: tuple[LineFit, ...] = ()  # of each solution, by which the true one is known
+    warning: str = ""  # where the three points hardly determine the position
+
+
+def resect(task: Task, method: str) -> Resected:
+    """Return the exterior orientation of a photograph by one of `resection.METHODS`.
+
+    Args:
+        task: its points.
+        method: one of METHODS.
+
+    Raises:
+        GeometryError: unknown method, or the points do not allow it.
+
+    Source: of each method, in its own module; the fourth point that tells the solutions apart, document 001,
+    sec. 3.3.1 and 4.1.1.
+    """
+    if method not in _FUNCTIONS:
+        raise GeometryError(f"resect: method '{method}', expected one of {', '.join(_FUNCTIONS)}, all")
+    found = _FUNCTIONS[method](task)
+    solutions = tuple(one for one in found.solutions if np.isfinite(one.rms) or method == "robust")
+    if not solutions:
+        raise GeometryError(f"{method}: points lie behind the camera in every solution")
+    lines: tuple[LineFit, ...] = ()
+    if len(task.points) >= 4 and method in ON_A_LINE:
+        lines = choose_by_line(solutions, task.tangents)[1]
+    warning = cylinder_warning(solutions[0].position, task.points[:3]) if method in ON_A_CYLINDER else ""
+    return replace(found, solutions=solutions, line_fit=lines, warning=warning)
+
+
+def resect_by_all(task: Task) -> dict[str, Resected | GeometryError]:
+    """Return what each method finds, or why it finds nothing, by its name.
+
+    Church's method starts from what Fischler and Bolles find where no start is given.
+
+    Args:
+        task: the points of the photograph.
+
+    Source: the comparison of the methods in document 001, sec. 4.1.
+    """
+    found: dict[str, Resected | GeometryError] = {}
+    for method in _FUNCTIONS:
+        first = found.get("fischler-bolles")
+        if task.start is None and method == "church" and isinstance(first, Resected):
+            started = replace(task, start=first.solutions[0].position)
+        else:
+            started = task
+        try:
+            found[method] = resect(started, method)
+        except GeometryError as error:
+            found[method] = error
+    return found
+
+
+def _closed(
+    method: str, function: Callable[[FloatArray, FloatArray], tuple[Solution, ...]]
+) -> Callable[[Task], Resected]:
+    return lambda task: Resected(method, len(task.points), function(task.tangents, task.points))
+
+
+def _church(task: Task) -> Resected:
+    if task.start is None:
+        raise GeometryError("church: a start position is needed (--start X,Y,Z)")
+    result = resect_church(task.tangents, task.points, task.start[:3])
+    return Resected("church", len(task.points), (result.solution,), history=result.history)
+
+
+def _dlt(task: Task) -> Resected:
+    checked_points("dlt", task.xy_mm, task.points, needed=6)
+    result = resect_dlt(task.xy_mm, task.points)
+    solution = Solution(result.position, result.rotation, result.residuals / task.c)
+    return Resected(
+        "dlt",
+        len(task.points),
+        (solution,),
+        sigma0_mm=result.sigma0,
+        redundancy=result.redundancy,
+        interior=result,
+    )
+
+
+def _robust(task: Task) -> Resected:
+    uv, xyz = checked_points("robust", task.tangents, task.points, needed=4)
+    result = resect_robust(uv, xyz, tolerance=task.tolerance_mm / task.c)
+    if not result.found:
+        raise GeometryError(f"robust: {result.reason}")
+    return Resected(
+        "robust",
+        len(task.points),
+        (Solution(result.position, result.rotation, result.residuals[result.inliers]),),
+        sigma0_mm=result.sigma0 * task.c,
+        redundancy=int(2 * result.inliers.sum() - 6),
+        dispersion=result.covariance,
+        residuals_mm=result.residuals * task.c,
+        rejected=tuple(name for name, fits in zip(task.names, result.inliers, strict=True) if not fits),
+        trials=result.trials,
+    )
+
+
+def _least_squares(task: Task) -> Resected:
+    uv, xyz = checked_points("least-squares", task.tangents, task.points, needed=3)
+    position, rotation = _start(task)
+    result = resect_least_squares(uv, xyz, position, rotation)
+    if not result.converged:
+        raise GeometryError("least-squares: no convergence from this start, a nearer one is needed")
+    return Resected(
+        "least-squares",
+        len(task.points),
+        (Solution(result.position, result.rotation, result.residuals),),
+        sigma0_mm=result.sigma0 * task.c,
+        redundancy=result.redundancy,
+        dispersion=result.covariance,
+        history=result.history,
+        residuals_mm=result.residuals * task.c,
+    )
+
+
+def _start(task: Task) -> tuple[FloatArray, FloatArray]:
+    """Start of least squares: as given, with the rotation from the rays if need be, or by P3P."""
+    if task.start is None:
+        if len(task.points) == ALL_POINTS:
+            solution = resect_fischler_bolles(task.tangents, task.points)[0]
+            return solution.position, solution.rotation
+        result = resect_robust(task.tangents, task.points, tolerance=START_TOLERANCE)
+        if not result.found:
+            raise GeometryError(f"least-squares: no start found ({result.reason}), give one (--start)")
+        return result.position, result.rotation
+    if len(task.start) == 6:
+        return task.start[:3], rotation_from_angles(*task.start[3:])
+    return task.start, rotation_from_position(task.tangents, task.points, task.start)
+
+
+_FUNCTIONS: dict[str, Callable[[Task], Resected]] = {
+    "fischler-bolles": _closed("fischler-bolles", resect_fischler_bolles),
+    "p4p": _closed("p4p", resect_p4p),
+    "church": _church,
+    "zeng-wang": _closed("zeng-wang", resect_zeng_wang),
+    "rampal": _closed("rampal", resect_rampal),
+    "dlt": _dlt,
+    "robust": _robust,
+    "least-squares": _least_squares,
+}
