@@ -16,8 +16,8 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from sfm.conventions import BoolArray, FloatArray, IntArray
-from sfm.network import rows_of
 from sfm.errors import GeometryError
+from sfm.network import rows_of
 from sfm.similarity import Similarity, fit_similarity
 from sfm.stored_result import StoredResult
 

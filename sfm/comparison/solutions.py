@@ -12,7 +12,7 @@ import numpy as np
 
 from sfm.adjustment.result import Covariance
 from sfm.camera import Camera, pixel_from_tangents, project, tangents_from_pixel
-from sfm.conventions import FloatArray, IntArray
+from sfm.conventions import FloatArray
 from sfm.network import Estimate, Network, rows_of
 from sfm.similarity import Similarity, fit_similarity
 

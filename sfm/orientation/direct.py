@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from sfm.conventions import BoolArray, FloatArray, IntArray, rotation_from_vector, skew
-from sfm.network import rows_of
 from sfm.errors import GeometryError
+from sfm.network import rows_of
 from sfm.orientation.intersection import intersect
 from sfm.orientation.resection.least_squares import resect_least_squares
 from sfm.orientation.resection.ransac import resect_robust

@@ -23,6 +23,7 @@ MIN_ANGLE_DEG = 2.0  # smallest ray angle of a point that others are oriented on
 MIN_SHARE = 0.5  # of the rays of a point must meet in it
 TOLERANCE_FACTOR = 6.0  # times the robust spread of the residuals
 ALL_FREE_PHOTOGRAPHS = 6  # from which on all parameters are adjusted
+WEAK_PER_ROUND = 20  # of so many unsupported photographs one is let go before the others are judged anew
 SURPLUS_PER_PARAMETER = 3  # observations beyond the exterior orientations for each free parameter
 
 Refine = Callable[[Network, Estimate], Estimate]
@@ -282,22 +283,22 @@ class Growth:
             if not len(weak):
                 break
             share = found.fitting / np.maximum(found.fitting + found.against, 1)
-            i = int(weak[np.argmin(share[weak])])
-            if few[i]:
-                reason = (
-                    f"only {found.fitting[i]} of its {found.known[i]} points fit the network, "
-                    f"{needed[i]} are needed"
-                )
-            else:
-                reason = (
-                    f"{found.confirmed[i]} conditions of its points confirm the network, "
-                    f"{found.against[i]} of its points contradict it: "
-                    "another object, a mirrored picture or wrong codes"
-                )
+            worst = weak[np.argsort(share[weak], kind="stable")][: max(1, len(weak) // WEAK_PER_ROUND)]
             position, rotation = self.estimate.position.copy(), self.estimate.rotation.copy()
-            position[i], rotation[i] = np.nan, np.nan
+            for i in worst.tolist():
+                if few[i]:
+                    self.reasons[i] = (
+                        f"only {found.fitting[i]} of its {found.known[i]} points fit the network, "
+                        f"{needed[i]} are needed"
+                    )
+                else:
+                    self.reasons[i] = (
+                        f"{found.confirmed[i]} conditions of its points confirm the network, "
+                        f"{found.against[i]} of its points contradict it: "
+                        "another object, a mirrored picture or wrong codes"
+                    )
+            position[worst], rotation[worst], self.dropped[worst] = np.nan, np.nan, True
             self.estimate = replace(self.estimate, position=position, rotation=rotation)
-            self.dropped[i], self.reasons[i] = True, reason
             self.intersect()
         return int(self.dropped.sum())
 

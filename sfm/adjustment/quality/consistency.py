@@ -20,7 +20,8 @@ from scipy import stats
 from sfm.adjustment.quality.variance_components import VarianceComponents, by_photograph
 from sfm.adjustment.result import Adjustment
 from sfm.camera import pixel_jacobian
-from sfm.conventions import BoolArray, FloatArray, IntArray
+from sfm.conventions import FloatArray, IntArray
+from sfm.network import rows_of
 
 FAMILY = 0.01  # chance with which each test says anything of a survey in which nothing is wrong
 EXPLAINED = 0.001  # chance with which two positions that are right do not explain the residuals
@@ -102,9 +103,9 @@ def _normals(adjustment: Adjustment) -> _Normals:
     W = UVW[:, 2]
     uv = -UVW[:, :2] / W[:, None]
     A = -(np.swapaxes(R, 1, 2)[:, :2] + uv[:, :, None] * R[:, None, :, 2]) / W[:, None, None]
-    for index, camera in enumerate(estimate.cameras):
-        own = network.camera[seen.image] == index
-        if own.any():
+    of_camera = rows_of(network.camera[seen.image], len(estimate.cameras))
+    for camera, own in zip(estimate.cameras, of_camera, strict=True):
+        if len(own):
             A[own] = pixel_jacobian(camera, seen.xy[own]) @ A[own]
     P = np.linalg.inv(adjustment.image_covariance) / adjustment.sigma0**2
     v = adjustment.residuals
@@ -202,14 +203,15 @@ def _patterns(adjustment: Adjustment) -> tuple[Pattern, ...]:
     seen, used = network.image_points, ~adjustment.rejected
     whitened = _whitened(adjustment)
     out = []
-    for index, camera in enumerate(estimate.cameras):
-        own: BoolArray = used & (network.camera[seen.image] == index)
+    of_camera = rows_of(network.camera[seen.image], len(estimate.cameras))
+    for camera, rows in zip(estimate.cameras, of_camera, strict=True):
+        own = rows[used[rows]]
         width, height = camera.size_px
         column = np.clip((CELLS * seen.xy[own, 0] / width).astype(np.int64), 0, CELLS - 1)
         row = np.clip((CELLS * seen.xy[own, 1] / height).astype(np.int64), 0, CELLS - 1)
         cell = CELLS * row + column
         count = np.bincount(cell, minlength=CELLS**2)
-        if (count > 0).sum() < 3 or own.sum() < 2 * CELLS**2:
+        if (count > 0).sum() < 3 or len(own) < 2 * CELLS**2:
             continue
         mean, in_px = (_means(values[own], cell, count) for values in (whitened, adjustment.residuals))
         between = float((count[:, None] * mean**2).sum())

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from sfm.adjustment.result import Adjustment
-from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
+from sfm.conventions import AnyArray, FloatArray, IntArray
 from sfm.errors import PhotographError
 from sfm.photographs.reading import read_photograph
 from sfm.result import PhotographTargets, SurveyResult, in_words
