@@ -90,7 +90,7 @@ def test_many_unsupported_photographs_are_let_go_in_few_rounds(monkeypatch: pyte
     monkeypatch.setattr(growing, "photograph_support", counted)
     assert growth.drop_unsupported() == 120
     assert not growth.estimate.oriented.any() and len(growth.reasons) == 120
-    assert rounds < 60
+    assert rounds < 80
 
 
 def test_the_fewest_fitting_of_a_million_points_are_found_by_halving(monkeypatch: pytest.MonkeyPatch) -> None:
