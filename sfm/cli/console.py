@@ -88,6 +88,8 @@ def _figures(findings: Findings) -> tuple[tuple[str, str], ...]:
     both = result.comparison
     if both is not None:
         word = "stopped early, same optimum" if both.stopped_early else "agrees" if both.agree else "DIFFERS"
+        if both.better is not None and both.agree:
+            word = f"free {', '.join(both.better.free)}: fits {both.better.times:.3g} times better"
         rms = both.comparison.rms_px
         rows.append(
             (

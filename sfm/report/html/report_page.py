@@ -13,10 +13,16 @@ from sfm.report.figures.overlays import Overlay
 from sfm.report.figures.plots import Plot
 from sfm.report.findings.findings import Findings
 from sfm.report.html.page import render
+from sfm.report.viewer.embedded import Viewer
 
 
 def report_page(
-    findings: Findings, plots: Sequence[Plot], overlays: Sequence[Overlay], *, has_model: bool = False
+    findings: Findings,
+    plots: Sequence[Plot],
+    overlays: Sequence[Overlay],
+    *,
+    has_model: bool = False,
+    viewer: Viewer | None = None,
 ) -> str:
     """Return the report as one HTML page.
 
@@ -25,9 +31,12 @@ def report_page(
         plots: the pictures of the adjustment.
         overlays: the drawn photographs; their thumbnails are embedded, links lead to the overlays folder.
         has_model: whether the folder holds the compared solution as a COLMAP model.
+        viewer: the scene to explore, whose pictures may lie beside the page; None leaves it out.
     """
     return render(
         "report.html",
+        viewer=viewer,
+        pictures_beside=viewer is not None,
         f=findings,
         r=findings.result,
         a=findings.result.adjustment,
