@@ -9,7 +9,7 @@ import numpy as np
 from sfm.camera import tangents_from_pixel
 from sfm.conventions import BoolArray
 from sfm.errors import GeometryError
-from sfm.network import Estimate, Network
+from sfm.network import Estimate, Network, rows_of
 from sfm.orientation.intersection import intersect
 from sfm.orientation.sequence import MIN_POINTS, Judge, Orientation, orient
 from sfm.reduced_network import reduce_network
@@ -127,8 +127,8 @@ def _orient_strongest(network: Network, estimate: Estimate) -> Orientation:
     found = _orient(*reduce_network(network, estimate, images, _strongest(network), image_points))
     seen, estimate = network.image_points, found.estimate
     uv = np.full((len(seen), 2), np.nan)
-    for index, camera in enumerate(estimate.cameras):
-        own = network.camera[seen.image] == index
+    of_camera = rows_of(network.camera[seen.image], len(estimate.cameras))
+    for camera, own in zip(estimate.cameras, of_camera, strict=True):
         uv[own] = tangents_from_pixel(camera, seen.xy[own])
     c = min(camera.c_px for camera in estimate.cameras)
     rays = intersect(
@@ -151,8 +151,8 @@ def _strongest(network: Network) -> BoolArray:
     chosen[order[:ORIENTATION_POINTS]] = True
     rank = np.empty(len(order), dtype=np.int64)
     rank[order] = np.arange(len(order))
-    for i in range(len(network.images)):
-        own = seen.point[seen.image == i]
+    for rows in rows_of(seen.image, len(network.images)):
+        own = seen.point[rows]
         chosen[own[np.argsort(rank[own], kind="stable")][:POINTS_PER_PHOTOGRAPH]] = True
     return chosen
 
