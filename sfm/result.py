@@ -144,6 +144,7 @@ class SurveyResult:
     photographs: tuple[PhotographTargets, ...] = ()  # of every readable photograph; none with [observations]
     control_check: ControlCheck | None = None  # None without control, or where the datum is control
     warnings: tuple[str, ...] = ()  # one line each, in words
+    notes: tuple[str, ...] = ()  # what was chosen where the survey says nothing, and is no fault, likewise
     eccentricity: Eccentricity | None = None  # None where it was not corrected
     no_circles: tuple[str, ...] = ()  # uncoded points left out: their outlines are not images of one circle
     left_out: tuple[LeftOutPoint, ...] = ()  # measured points that are not in the result
@@ -154,6 +155,7 @@ class SurveyResult:
     orientation_correlations: tuple[OrientationCorrelation, ...] = ()  # of camera parameters with exterior
     # orientation, the strong ones
     seconds: tuple[StageTime, ...] = field(default_factory=tuple)  # in the order of the stages
+    settings: tuple[tuple[str, str], ...] = ()  # (table of the survey file, what it says) of the survey
     reject: str = "tau"  # how the survey treats gross errors: tau | huber | tukey | none
 
     @property

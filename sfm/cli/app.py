@@ -6,7 +6,7 @@ from typing import Any
 
 import typer
 
-from sfm.cli import measuring, planning, refining, solvers, surveying, viewing
+from sfm.cli import drafting, measuring, planning, refining, solvers, surveying, viewing
 
 USAGE_ERROR: Any = typer.BadParameter.__base__  # of all that typer says of wrong arguments; it has no name
 
@@ -27,6 +27,7 @@ def _commands() -> None:
 
 for _command in (
     surveying.run,
+    drafting.init,
     surveying.adjust,
     surveying.batch,
     measuring.resect,

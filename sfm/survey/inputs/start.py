@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 
 import numpy as np
@@ -9,7 +10,7 @@ import numpy as np
 from sfm.camera import Camera
 from sfm.conventions import FloatArray, IntArray, pixel_from_image
 from sfm.errors import SurveyFileError
-from sfm.network import Estimate, ImagePoints, Network, ObjectPoints, ScaleBars
+from sfm.network import Estimate, ImagePoints, Network, ObjectPoints, ScaleBars, rows_of
 from sfm.result import FailedImage, LeftOutPoint
 from sfm.survey.inputs.cameras import camera_of_image, refuse_unknown_cameras, start_cameras
 from sfm.survey.inputs.given import KnownPoints, Observations, ScaleBar
@@ -72,9 +73,9 @@ def measurements_from_observations(survey: Survey) -> Measurements:
         control=control_points(survey.control, points),
         scale_bars=scale_bars(survey.scale_bars, points),
     )
+    times = Counter(zip(image.tolist(), point.tolist(), strict=True)) if merged.dropped else Counter()
     contradicting = tuple(
-        LeftOutPoint(f"{points[j]} in {images[i]}", int(((image == i) & (point == j)).sum()), CONTRADICTING)
-        for i, j in merged.dropped
+        LeftOutPoint(f"{points[j]} in {images[i]}", times[i, j], CONTRADICTING) for i, j in merged.dropped
     )
     return Measurements(
         network,
@@ -191,8 +192,7 @@ def _in_pixels(
     xy_px = xy.copy()
     s = np.full(xy.shape, sigma_px) if sigma is None else sigma.copy()
     if given.unit == "mm":
-        for index, own in enumerate(cameras):
-            rows = camera == index
+        for own, rows in zip(cameras, rows_of(camera, len(cameras)), strict=True):
             xy_px[rows] = pixel_from_image(xy[rows], own.size_px, own.pixel_mm)
             if sigma is not None:
                 s[rows] = sigma[rows] / own.pixel_mm
