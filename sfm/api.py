@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from sfm.comparison.significance import ResultComparison, compare_results
-from sfm.errors import SurveyFileError
+from sfm.errors import BackendError, SurveyFileError
 from sfm.network import Estimate, Network
 from sfm.pipeline import run_survey as run_stages
 from sfm.result import SurveyResult
@@ -197,6 +197,22 @@ def programs_of(backend: str, baseline: str, *, threads: int = -1) -> OtherProgr
 
         others = replace(others, mapper=partial(map_photographs, threads=threads))
     return others
+
+
+def sensor_widths() -> Callable[[str, str], float | None]:
+    """Return COLMAP's list of the widths of camera sensors, mm, by make and model.
+
+    Where pycolmap is not installed no camera is known.
+    """
+    from adapters.colmap.sensor_widths import sensor_width_mm
+
+    def width(make: str, model: str) -> float | None:
+        try:
+            return sensor_width_mm(make, model)
+        except BackendError:
+            return None
+
+    return width
 
 
 def colmap_writer(result: SurveyResult) -> Callable[[Path], Any] | None:

@@ -27,7 +27,7 @@ from pydantic import Field
 from adapters.colmap.names import SIDE_FILE, NamedCamera, read_side_file
 from adapters.reading.json_files import Content, Name, Pixel, Side, Text, read_json
 from sfm.camera import Camera
-from sfm.conventions import FloatArray, angles_from_rotation, rotation_from_angles
+from sfm.conventions import BoolArray, FloatArray, angles_from_rotation, rotation_from_angles
 from sfm.distortion.models import MODELS
 from sfm.errors import OutputError, SurveyFileError
 from sfm.files.covariance_file import read_covariance, write_covariance
@@ -64,7 +64,8 @@ def read_result(folder: Path) -> StoredResult:
     position, position_covariance = table.values[:, :3].copy(), _covariance(table, table.values[:, 6:])
     table = read_table(folder / "points.csv", ("id",), ("X", "Y", "Z"), SIGMAS, ignored=None, blank=SIGMAS)
     points = table.keys("id")
-    network = Network(images, camera, points, _image_points(folder, images, points))
+    seen, rejected = _image_points(folder, images, points)
+    network = Network(images, camera, points, seen.select(~rejected))
     return StoredResult(
         summary.survey or folder.name,
         network,
@@ -77,6 +78,32 @@ def read_result(folder: Path) -> StoredResult:
         read_covariance(folder, table.values[:, 3:]) if table.values.shape[1] > 3 else None,
         summary.datum.kind if summary.datum else "",
     )
+
+
+def read_image_points(folder: Path, network: Network) -> tuple[ImagePoints, BoolArray, FloatArray]:
+    """Read all image points of a result, rejected ones included.
+
+    Args:
+        folder: of the result.
+        network: what `read_result` has read of it.
+
+    Returns:
+        The k image points, which of them were rejected, and Baarda's w of both coordinates (k, 2), NaN where
+        there is no reliability.csv.
+
+    Raises:
+        SurveyFileError: what is missing or wrong, with file and line number.
+    """
+    seen, rejected = _image_points(folder, network.images, network.points)
+    path = folder / "reliability.csv"
+    if not path.is_file():
+        return seen, rejected, np.full((len(seen), 2), np.nan)
+    columns = ("wx", "wy")
+    table = read_table(path, ("image", "point"), columns, ignored=None, blank=columns)
+    keys = [(network.images[i], network.points[j]) for i, j in zip(seen.image, seen.point, strict=True)]
+    if keys != list(zip(*table.texts, strict=True)):
+        raise SurveyFileError(f"{path}: its rows are not those of image_points.csv beside it")
+    return seen, rejected, table.values
 
 
 def write_tables(folder: Path, result: StoredResult) -> None:
@@ -253,7 +280,10 @@ def _size(
     return size, np.array(pixel)
 
 
-def _image_points(folder: Path, images: tuple[str, ...], points: tuple[str, ...]) -> ImagePoints:
+def _image_points(
+    folder: Path, images: tuple[str, ...], points: tuple[str, ...]
+) -> tuple[ImagePoints, BoolArray]:
+    """Read the image points, and which of them were rejected."""
     path = folder / "image_points.csv"
     flagged = ("rejected",) if "rejected" in read_header(path) else ()
     sigmas = SIGMAS_PX
@@ -277,7 +307,7 @@ def _image_points(folder: Path, images: tuple[str, ...], points: tuple[str, ...]
     stated = np.asarray(np.isfinite(sigma).all(axis=1))
     sigma = np.where(stated[:, None], sigma, 1.0)
     found = ImagePoints(image, point, table.values[:, :2].copy(), np.eye(2) * sigma[:, None, :] ** 2, stated)
-    return found.select(rejected[:, 0] == 0) if flagged else found
+    return found, rejected[:, 0] == 1 if flagged else np.zeros(len(found), dtype=bool)
 
 
 def _covariance(table: CsvTable, sigma: FloatArray) -> FloatArray | None:

@@ -6,7 +6,7 @@ from typing import Any
 
 import typer
 
-from sfm.cli import measuring, planning, refining, solvers, surveying
+from sfm.cli import drafting, measuring, planning, refining, solvers, surveying, viewing
 
 USAGE_ERROR: Any = typer.BadParameter.__base__  # of all that typer says of wrong arguments; it has no name
 
@@ -27,6 +27,7 @@ def _commands() -> None:
 
 for _command in (
     surveying.run,
+    drafting.init,
     surveying.adjust,
     surveying.batch,
     measuring.resect,
@@ -36,6 +37,7 @@ for _command in (
     solvers.compare,
     solvers.convert,
     refining.refine,
+    viewing.view,
 ):
     app.command()(_command)
 app.add_typer(planning.plan)

@@ -18,6 +18,8 @@ SAME_PRESS_SECONDS = 1.0  # `timeout` sends the signal of one Ctrl-C twice
 
 _running = ExitStack()
 """what lasts as long as the command"""
+_told: list[bool] = []
+"""holds something once somebody listens for compiling"""
 
 
 @contextmanager
@@ -51,6 +53,7 @@ def stopped_once() -> Iterator[None]:
         with _running:
             yield
     finally:
+        _told.clear()
         if signal.getsignal(signal.SIGINT) is _stop:
             signal.signal(signal.SIGINT, before)
         atexit.register(signal.signal, signal.SIGINT, signal.SIG_IGN)  # what is done is done
@@ -75,9 +78,10 @@ def _end(number: int, frame: FrameType | None, *, text: str = INTERRUPTED_TEXT) 
 
 def _tell_of_compiling() -> None:
     """Say on stderr when kernels are compiled, for as long as the command runs; numba is loaded."""
-    if "numba" in sys.modules:
+    if "numba" in sys.modules and not _told:
         from sfm.kernels.compiling import COMPILING, when_compiling
 
+        _told.append(True)
         _running.enter_context(
             when_compiling(lambda: print(f"kolinear: the {COMPILING}", file=sys.stderr, flush=True))
         )

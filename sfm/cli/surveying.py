@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -10,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from sfm.cli.drafting import drafted_beside
 from sfm.cli.starting import loading
 from sfm.errors import KolinearError
 from sfm.runtime.faults import FAULT, working_on
@@ -20,8 +22,18 @@ if TYPE_CHECKING:
 
 FAILED = 1  # exit code where a survey, or one of a batch, has no dependable result
 
+SURVEY_FILE = "survey.toml"  # in a folder of photographs
+
 SurveyFile = Annotated[
     Path, typer.Argument(metavar="SURVEY.toml", help="The survey file; its paths are relative to it.")
+]
+SurveyOrPhotographs = Annotated[
+    Path,
+    typer.Argument(
+        metavar="SURVEY.toml|PHOTOS",
+        help="The survey file, whose paths are relative to it, or a folder of photographs, for which one is "
+        "drafted.",
+    ),
 ]
 Out = Annotated[
     Path | None,
@@ -36,6 +48,15 @@ Jobs = Annotated[
     int | None,
     typer.Option("--jobs", metavar="N", min=1, help="Photographs worked on at a time.  [default: all cores]"),
 ]
+PicturesMb = Annotated[
+    float,
+    typer.Option(
+        "--pictures-mb",
+        metavar="MB",
+        min=0.0,
+        help="What the photographs and crops inside report.html may take; the rest lies in pictures/.",
+    ),
+]
 Verbose = Annotated[bool, typer.Option("--verbose", "-v", help="Tell more: every photograph and warning.")]
 AllowOutside = Annotated[
     bool,
@@ -47,7 +68,7 @@ AllowOutside = Annotated[
 
 
 def run(
-    survey_file: SurveyFile,
+    survey_file: SurveyOrPhotographs,
     images: Annotated[
         Path | None,
         typer.Option(
@@ -56,15 +77,30 @@ def run(
     ] = None,
     out: Out = None,
     jobs: Jobs = None,
+    pictures_mb: PicturesMb = 15.0,
     allow_outside: AllowOutside = False,
     verbose: Verbose = False,
 ) -> None:
     """Run a survey from its photographs to the report.
 
+    With a folder, its survey.toml is run, or a survey file is drafted from the photographs, written beside
+    the result and run; change it there and run it again with --images PHOTOS.
+
     Exit code 0 with a result, remarks or none; 1 if the result cannot be depended on, the report says
     why; 2 where a person must put something right.
     """
-    _run_survey(survey_file, images, out, jobs, allow_outside, verbose, from_photographs=True)
+    if survey_file.is_dir():
+        if images is not None:
+            raise KolinearError(f"{survey_file}: a folder of photographs needs no --images {images}")
+        if (survey_file / SURVEY_FILE).is_file():
+            survey_file = survey_file / SURVEY_FILE
+            print(f"Running {survey_file}", file=sys.stderr)
+        else:
+            images = survey_file
+            survey_file, out = drafted_beside(images, out)
+    _run_survey(
+        survey_file, images, out, jobs, allow_outside, verbose, from_photographs=True, pictures_mb=pictures_mb
+    )
 
 
 def adjust(
@@ -88,6 +124,7 @@ def _run_survey(
     verbose: bool,
     *,
     from_photographs: bool,
+    pictures_mb: float = 0.0,
 ) -> None:
     """Run a survey, write its result and tell it; `from_photographs` is what the command is for."""
     begun = time.perf_counter()
@@ -138,6 +175,7 @@ def _run_survey(
             write_colmap=colmap_writer(result),
             finish=lambda part: log.close_into(part, findings),
             jobs=workers,
+            budget_mb=pictures_mb,
             progress=log,
         )
     if not tell_result(findings, page, seconds=time.perf_counter() - begun, verbose=verbose):

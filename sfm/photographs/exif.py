@@ -34,6 +34,12 @@ class Metadata:
     """width and height of a pixel, from the resolution of the focal plane or the 35 mm equivalent, mm"""
     orientation: int
     """EXIF orientation, 1 = as stored; never applied to the pixels"""
+    serial: str | None = None
+    """serial number of the camera"""
+    lens: str | None = None
+    """model of the lens"""
+    taken_px: tuple[int, int] | None = None
+    """width and height as the camera says it took them, px"""
 
 
 def read_metadata(path: str | Path) -> Metadata:
@@ -62,12 +68,21 @@ def read_metadata(path: str | Path) -> Metadata:
     return Metadata(
         size_px=size,
         make=_text(exif.get(ExifTags.Base.Make)),
-        model=_text(exif.get(ExifTags.Base.Model)),
+        model=_text(exif.get(ExifTags.Base.Model)) or _text(exif.get(ExifTags.Base.UniqueCameraModel)),
         focal_mm=focal,
         focal_35mm=equivalent,
         pixel_mm=_pixel_from_exif(size, camera, focal, equivalent),
         orientation=orientation if isinstance(orientation, int) and 1 <= orientation <= 8 else 1,
+        serial=_text(camera.get(ExifTags.Base.BodySerialNumber)),
+        lens=_text(camera.get(ExifTags.Base.LensModel)),
+        taken_px=_size_taken(camera),
     )
+
+
+def _size_taken(camera: Any) -> tuple[int, int] | None:
+    width = _positive(camera.get(ExifTags.Base.ExifImageWidth))
+    height = _positive(camera.get(ExifTags.Base.ExifImageHeight))
+    return (round(width), round(height)) if width and height else None
 
 
 def _pixel_from_exif(

@@ -18,6 +18,9 @@ from sfm.report.html.report_page import report_page
 from sfm.report.tables.csv_files import write_tables
 from sfm.report.tables.summary import write_summary
 from sfm.report.text.text_report import text_report
+from sfm.report.viewer.embedded import viewer_of
+from sfm.report.viewer.pictures import BUDGET_MB, cut_pictures
+from sfm.report.viewer.result_scene import scene_of_result
 from sfm.result import StageTime
 from sfm.runtime.progress import SILENT, Progress
 
@@ -39,6 +42,7 @@ WRITTEN = (
     "report.html",
     "colmap",
     "overlays",
+    "pictures",
     "plots",
     "log.jsonl",
     MANIFEST,
@@ -52,6 +56,7 @@ def write_result(
     write_colmap: Callable[[Path], None] | None = None,
     finish: Callable[[Path], None] | None = None,
     jobs: int = 1,
+    budget_mb: float = BUDGET_MB,
     progress: Progress = SILENT,
 ) -> Path:
     """Write everything that a survey gives into one folder, whole or not at all.
@@ -62,6 +67,7 @@ def write_result(
         write_colmap: fills the folder `colmap`, which it is given; None leaves it out.
         finish: is given the folder when all else is in it, and may add log.jsonl.
         jobs: photographs drawn at the same time.
+        budget_mb: what the pictures inside report.html may take, 10^6 bytes.
         progress: is told of every photograph.
 
     Returns:
@@ -74,7 +80,7 @@ def write_result(
     refuse_foreign_folder(out)
     started = time.perf_counter()
     result = findings.result
-    progress.stage("report", len(result.photographs))
+    progress.stage("report", 2 * len(result.photographs))
     with whole_folder(out, "the result", replaceable=True) as folder:
         if write_colmap is not None:
             (folder / "colmap").mkdir()
@@ -84,6 +90,15 @@ def write_result(
             (folder / "overlays").mkdir()
         for overlay in overlays:
             (folder / "overlays" / overlay.file_name).write_bytes(overlay.jpeg)
+        scene = scene_of_result(findings)
+        files = {one.image: one.path for one in result.photographs}
+        pictures = cut_pictures(
+            scene, files, budget_mb=budget_mb, beside="pictures", jobs=jobs, progress=progress
+        )
+        if pictures.beside:
+            (folder / "pictures").mkdir()
+        for name, content in pictures.beside.items():
+            (folder / "pictures" / name).write_bytes(content)
         plots = all_plots(findings)
         (folder / "plots").mkdir()
         for plot in plots:
@@ -96,7 +111,9 @@ def write_result(
         if covariance is not None:
             write_covariance(folder, covariance)
         (folder / "report.txt").write_text(text_report(timed), encoding="utf-8")
-        page = report_page(timed, plots, overlays, has_model=write_colmap is not None)
+        page = report_page(
+            timed, plots, overlays, has_model=write_colmap is not None, viewer=viewer_of(scene, pictures)
+        )
         (folder / "report.html").write_text(page, encoding="utf-8")
         if finish is not None:
             finish(folder)

@@ -10,6 +10,7 @@ import numpy as np
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.engine.observed_unknowns import observed
 from sfm.adjustment.quality.against_free import FreeNetwork, free_network_of
+from sfm.adjustment.quality.other_solutions import OtherSolution, other_solutions
 from sfm.adjustment.quality.variance_components import IMAGE_POINTS, estimate_components
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
@@ -29,6 +30,8 @@ from sfm.survey.datum_definition import (
     scale_to_bars,
 )
 from sfm.survey.exterior import add_exterior
+from sfm.survey.free_parameters import choose_free_parameters
+from sfm.survey.inputs.incomplete_cameras import unlike_squares
 from sfm.survey.inputs.interior import split_cameras, without_idle_cameras
 from sfm.survey.inputs.measurements import Naming
 from sfm.survey.inputs.start import given_values
@@ -74,6 +77,8 @@ class Solution:
     unused_image_points: int  # of points and photographs that are not in it
     taken_out: tuple[TakenOut, ...]  # control and scale bars that do not fit
     free_network: FreeNetwork | None  # of the image points alone; None where nothing else took part
+    others: tuple[OtherSolution, ...]  # that the image points allow as well
+    notes: tuple[str, ...]  # what was chosen where the survey says nothing, one line each
 
 
 def refine(network: Network, estimate: Estimate) -> Estimate:
@@ -105,7 +110,7 @@ def solve_survey(survey: Survey, matched: Correspondences) -> Solution:
     network = scales.network
     needed = matched.min_rays.copy()
     if datum.kind == "control":
-        needed[network.control.point] = 1
+        needed[network.control.complete.point] = 1
     whole, known = placed.network, estimate.determined
     oriented = estimate.oriented
     if datum.kind == "minimal" and matched.given:  # what it holds are the given coordinates
@@ -114,24 +119,30 @@ def solve_survey(survey: Survey, matched: Correspondences) -> Solution:
         estimate = replace(estimate, points=np.where(estimate.determined[:, None], held, np.nan))
     estimate = scale_to_bars(network, estimate, datum)
     frame = given_values(survey, network) if matched.given else estimate
+    chosen = choose_free_parameters(survey, network, estimate, datum=datum.kind)
+    survey, estimate = replace(survey, cameras=chosen.cameras), chosen.estimate
     network, estimate = split_cameras(survey.cameras, network, estimate, survey.start_cameras)
     least = np.where(given_values(survey, network).oriented, GIVEN_IMAGE_POINTS, MIN_IMAGE_POINTS)
     task = _Task(survey, datum, network, needed, least, survey.reject)
     every = np.ones(len(network.image_points), dtype=bool)
     iterations = 0
     contradictions, taken_out = list(scales.lines), list(scales.taken_out)
+    better: tuple[str, ...] = ()
+    first: tuple[_Settled, Adjustment, ControlCheck | None, tuple[OtherSolution, ...]] | None = None
     settled = _settle(task, estimate)
+    ready: _Settled | None = settled
     treated = _treated(task, settled, estimate, oriented)
     if treated is not None:
         iterations += settled.iterations
-        task, estimate = replace(task, network=treated.network), treated.estimate
-        settled = _settle(task, estimate)
+        task, estimate, ready = replace(task, network=treated.network), treated.estimate, None
     while True:
+        settled = _settle(task, estimate) if ready is None else ready
+        ready = None
         iterations += settled.iterations
         found = settled.contradiction
         if found is None:
             last, check = settled.estimate, None
-            if datum.kind != "control" and len(settled.part.control) >= 3:
+            if datum.kind != "control" and len(settled.part.control.complete) >= 3:
                 last, check = place_on_control(settled.part, last)
             elif datum.kind == "free":
                 carriers = _on_points(survey, settled.part, last, datum).resolve(settled.part).points
@@ -140,11 +151,19 @@ def solve_survey(survey: Survey, matched: Correspondences) -> Solution:
             final = _final(task, settled.part, last)
             found = _contradiction(task, final)
         if found is None:
-            break
+            others = other_solutions(final)
+            if first is not None and not final.converged:  # what seemed better is none: as it was
+                (settled, final, check, others), better = first, ()
+                break
+            if first is not None or not others or not others[0].converges:
+                break
+            first = settled, final, check, others
+            better = (_words_of_better(final, others[0]),)
+            estimate = merge_estimate(estimate, others[0].estimate, settled.images, settled.points)
+            continue
         contradictions.append(found.line)
         taken_out += [] if found.taken_out is None else [found.taken_out]
         task = _resolved(task, found, settled.accepted)
-        settled = _settle(task, estimate)
     reasons = {} if treated is None else dict(treated.left_out)
     dropped = tuple(
         (name, reasons.get(name, f"fewer than {fewest} accepted image points of the network"))
@@ -162,14 +181,26 @@ def solve_survey(survey: Survey, matched: Correspondences) -> Solution:
     # natural texture has points in plenty, of which only those that were lost on the way are worth a line
     told = left_out if survey.tie_points is None else _among(left_out, whole, known)
     own = () if treated is None else treated.lines
-    warnings = (*placed.warnings, *own, *contradictions, *_warnings(survey, told, len(whole.points), final))
+    warnings = (*placed.warnings, *own, *contradictions, *better)
+    warnings += _warnings(survey, told, len(whole.points), final)
     in_result = np.isin(whole.points, final.network.points)
     unused = unused_image_points(whole, settled.images, in_result)
     if len(whole.scale_bars) and not len(final.network.scale_bars) and datum.kind == "control":
         # every bar is against the control: nothing says which of the two is right
         taken_out = [replace(one, resolved=False) for one in taken_out]
     alone = free_network_of(final)
-    return Solution(final, check, dropped, warnings, left_out, unused, tuple(taken_out), alone)
+    return Solution(
+        final, check, dropped, warnings, left_out, unused, tuple(taken_out), alone, others, chosen.notes
+    )
+
+
+def _words_of_better(final: Adjustment, other: OtherSolution) -> str:
+    """Say that the network was adjusted anew from a solution of smaller v'Pv than that found first."""
+    first = final.estimate.cameras[[one.name for one in final.estimate.cameras].index(other.camera)]
+    return (
+        f"two solutions: c of camera {other.camera} was {first.parameters[0]:.5g} {other.unit} at first; "
+        f"from {other.c:.5g} {other.unit} v'Pv is {other.vPv:.3g} times as large, which was taken"
+    )
 
 
 def _among(left_out: tuple[LeftOutPoint, ...], whole: Network, known: BoolArray) -> tuple[LeftOutPoint, ...]:
@@ -374,6 +405,15 @@ def merge_estimate(estimate: Estimate, part: Estimate, images: BoolArray, points
     return Estimate(part.cameras, position, rotation, xyz)
 
 
+def _pixels_unlike_squares(survey: Survey, estimate: Estimate) -> tuple[str, ...]:
+    """Return what is told of pixels by nominal sensor sizes, of the first camera of each of the survey's."""
+    first = {one.name: camera for one in survey.cameras for camera in reversed(estimate.cameras)
+             if camera.name == one.name or camera.name.startswith(f"{one.name} ")}  # fmt: skip
+    settings = [one for one in survey.cameras if one.name in first]
+    pixels = [(float(first[one.name].pixel_mm[0]), float(first[one.name].pixel_mm[1])) for one in settings]
+    return unlike_squares(settings, pixels, [one.adjusted for one in settings])
+
+
 def _accepted(network: Network, adjustment: Adjustment, images: BoolArray, points: BoolArray) -> BoolArray:
     """Return which image points of the whole network the adjustment of a part of it accepted."""
     seen = network.image_points
@@ -398,4 +438,5 @@ def _warnings(
     if absent:
         lines.append(f"datum points that are not in the network: {', '.join(absent[:MAX_NAMES])}")
     lines += far_principal_distances(survey, adjustment.estimate)
+    lines += _pixels_unlike_squares(survey, adjustment.estimate)
     return (*lines, *datum_warnings(survey, adjustment.network))

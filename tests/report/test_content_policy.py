@@ -44,6 +44,7 @@ class Held(HTMLParser):
     links: list[str] = field(default_factory=list)
     attributes: set[str] = field(default_factory=set)
     elements: set[str] = field(default_factory=set)
+    inert: list[str] = field(default_factory=list)  # types of script elements that no browser runs
     before_policy: list[str] = field(default_factory=list)
     inside: str = ""
 
@@ -60,7 +61,9 @@ class Held(HTMLParser):
         self.attributes |= values.keys()
         self.sources += [values[name] for name in ("src", "srcset", "data", "poster") if name in values]
         self.links += [values["href"]] if "href" in values else []
-        if tag in self.inline:
+        if tag == "script" and values.get("type"):
+            self.inert.append(values["type"])
+        elif tag in self.inline:
             self.inline[tag].append("")
             self.inside = tag
 
@@ -117,7 +120,9 @@ def test_a_page_allows_what_it_holds_and_nothing_else(write: Callable[[Path], st
     for kind, texts in held.inline.items():
         hashes = [base64.b64encode(hashlib.sha256(text.encode()).digest()).decode() for text in texts]
         assert directives.pop(f"{kind}-src") == ([f"'sha256-{one}'" for one in hashes] or NOTHING)
-    assert directives.pop("img-src") == ["data:"]
+    beside = ["'self'"] if write is report_page else []  # photographs and crops lie beside the report
+    assert directives.pop("img-src") == ["data:", *beside]
+    assert set(held.inert) <= {"application/x-kolinear"}
     assert directives == dict.fromkeys(("default-src", "base-uri", "form-action"), NOTHING)
     assert held.inline["style"] and all(source.startswith("data:image/") for source in held.sources)
     assert not held.elements & {"link", "iframe", "object", "embed", "base", "form"}

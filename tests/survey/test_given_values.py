@@ -35,14 +35,19 @@ FREE = ("c", "x0", "y0", "K1", "K2", "P1", "P2")
 SAME = 1e-6  # standard deviations
 
 
+SIX = [pytest.param(f"six {k}", marks=pytest.mark.slow) for k in range(20)]
+
+
 @pytest.mark.parametrize("reject", ["tau", "tukey", "huber"])
-@pytest.mark.parametrize("name", ["six", "eight", "nine"])
+@pytest.mark.parametrize("name", ["six", "eight", "nine", *SIX])
 def test_a_photograph_with_five_good_points_and_a_wild_one_is_kept(reject: str, name: str) -> None:
+    """Before, it was lost by tau and tukey and left 1763 px wrong by huber."""
     network, truth = _with_a_wild_point(name)
     result = run_survey(survey_of(network, truth, start=truth, adjust={"reject": reject}))
     i = result.network.image_index("image 8")
     rows = result.network.image_points.image == i
     residual = np.linalg.norm(result.adjustment.residuals[rows], axis=1)
+    print(f"{name}, {reject}: residuals {', '.join(f'{v:.2f}' for v in sorted(residual))} px")
     assert result.adjustment.converged and len(residual) == 6
     assert sorted(residual)[4] < 1.0 and max(residual) > 2000
     sigma = np.sqrt(np.diagonal(result.adjustment.covariance.exterior[i])[:3])
@@ -103,7 +108,11 @@ def _restart(survey: Survey, folder: Path, *, cameras: bool = True) -> tuple[Sur
     assert (again.adjustment.rejected == first.adjustment.rejected).all()
     sigma = np.sqrt(np.diagonal(first.adjustment.covariance.points, axis1=1, axis2=2))
     moved = np.abs(again.estimate.points - first.estimate.points)
-    return first, float((moved[sigma > 0] / sigma[sigma > 0]).max())
+    largest = float((moved[sigma > 0] / sigma[sigma > 0]).max())
+    print(
+        f"{survey.name}: {len(first.network.points)} points, started again they move by {largest:.1e} sigma"
+    )
+    return first, largest
 
 
 @pytest.mark.parametrize("what", ["cameras", "no cameras", "bars", "check", "two", "control", "minimal"])

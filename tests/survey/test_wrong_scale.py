@@ -44,6 +44,42 @@ def test_of_two_bars_neither_is_believed(factor: float, reject: str) -> None:
         assert findings_of(result).sigma0.ratio < 1.2  # nothing is bent
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("factor", [10.0, 100.0, 1000.0])
+def test_two_bars_of_many_networks_end_as_bad(factor: float) -> None:
+    """Before, the right one was taken out in 5 of 8, fair, the network as many times wrong."""
+    bad, sizes = 0, []
+    for k in range(16):
+        network, truth = _scene(f"two bars {k}")
+        reject = "tau" if k % 2 else "none"
+        bars = _bars(truth, [1.0, factor] if k % 4 < 2 else [factor, 1.0])
+        result = run_survey(survey_of(network, truth, scale_bars=bars, adjust={"reject": reject}))
+        bad += findings_of(result).verdict.level == "bad"
+        sizes.append(len(result.network.scale_bars))
+    print(f"two bars, one {factor:g} times too long: {bad} of 16 bad, bars believed in {sum(sizes)}")
+    assert bad == 16 and sum(sizes) == 0
+
+
+@pytest.mark.slow
+def test_control_too_large_for_the_bars_of_many_networks_is_bad() -> None:
+    """Before, both right bars were taken out and the survey was fair."""
+    bad = 0
+    for k in range(16):
+        network, truth = _scene(f"large control {k}")
+        names = [str(j + 1) for j in range(20, 26)]
+        survey = survey_of(
+            network,
+            truth,
+            control=KnownPoints.from_arrays(names, 1.01 * truth.points[20:26], 1e-4),
+            scale_bars=_bars(truth, [1.0, 1.0]),
+            datum={"kind": "control"},
+            adjust={"reject": "tau" if k % 2 else "none"},
+        )
+        bad += findings_of(run_survey(survey)).verdict.level == "bad"
+    print(f"control 1 % too large for two bars: {bad} of 16 bad")
+    assert bad == 16
+
+
 @pytest.mark.parametrize("factor", [0.5, 10.0, 1000.0])
 def test_of_three_bars_the_wrong_one_is_taken_out_and_told_as_bad(factor: float) -> None:
     network, truth = _scene("three bars")

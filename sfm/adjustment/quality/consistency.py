@@ -17,10 +17,12 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import stats
 
+from sfm.adjustment.quality.doubtful_rays import DoubtfulPoint, doubtful_points
+from sfm.adjustment.quality.point_normals import PointNormals, intersected, point_normals
 from sfm.adjustment.quality.variance_components import VarianceComponents, by_photograph
 from sfm.adjustment.result import Adjustment
-from sfm.camera import pixel_jacobian
-from sfm.conventions import BoolArray, FloatArray, IntArray
+from sfm.conventions import FloatArray, IntArray
+from sfm.network import rows_of
 
 FAMILY = 0.01  # chance with which each test says anything of a survey in which nothing is wrong
 EXPLAINED = 0.001  # chance with which two positions that are right do not explain the residuals
@@ -70,61 +72,29 @@ class Consistency:
     large: tuple[str, ...]  # points whose residuals are larger than chance, without that explanation
     uneven: Uneven | None  # None where the photographs are alike
     patterns: tuple[Pattern, ...]
+    doubtful: tuple[DoubtfulPoint, ...] = ()  # points of which another ray may be the wrong one
 
 
 def consistency_of(adjustment: Adjustment) -> Consistency:
     """Return what the tests of points, photographs and the format find; nothing without a covariance."""
     if not np.isfinite(adjustment.redundancy_numbers).any() or not adjustment.sigma0 > 0:
         return Consistency((), (), None, ())
-    two, large = _points(adjustment)
-    return Consistency(two, large, _uneven(by_photograph(adjustment)), _patterns(adjustment))
+    parts = point_normals(adjustment)
+    rays = parts.rows_of_points(adjustment)
+    two, large = _points(adjustment, parts, rays)
+    doubtful = doubtful_points(adjustment, parts, rays)
+    return Consistency(two, large, _uneven(by_photograph(adjustment)), _patterns(adjustment), doubtful)
 
 
-@dataclass(frozen=True)
-class _Normals:
-    """Contribution of each image point to the normal equations of its object point, over sigma0^2."""
-
-    N: FloatArray  # (k, 3, 3)
-    b: FloatArray  # A'Pv, (k, 3)
-    q: FloatArray  # v'Pv, (k,)
-
-    def misfit(self, rows: IntArray) -> float:
-        """Return v'Pv after a fit of the point to these rows alone."""
-        N, b = self.N[rows].sum(axis=0), self.b[rows].sum(axis=0)
-        return float(self.q[rows].sum() - b @ np.linalg.lstsq(N, b, rcond=None)[0])
-
-
-def _normals(adjustment: Adjustment) -> _Normals:
-    network, estimate = adjustment.network, adjustment.estimate
-    seen = network.image_points
-    R, X = estimate.rotation[seen.image], estimate.points[seen.point] - estimate.position[seen.image]
-    UVW = np.einsum("kji,kj->ki", R, X)
-    W = UVW[:, 2]
-    uv = -UVW[:, :2] / W[:, None]
-    A = -(np.swapaxes(R, 1, 2)[:, :2] + uv[:, :, None] * R[:, None, :, 2]) / W[:, None, None]
-    for index, camera in enumerate(estimate.cameras):
-        own = network.camera[seen.image] == index
-        if own.any():
-            A[own] = pixel_jacobian(camera, seen.xy[own]) @ A[own]
-    P = np.linalg.inv(adjustment.image_covariance) / adjustment.sigma0**2
-    v = adjustment.residuals
-    AP = np.einsum("kai,kab->kib", A, P)
-    return _Normals(AP @ A, np.einsum("kib,kb->ki", AP, v), np.einsum("ka,kab,kb->k", v, P, v))
-
-
-def _points(adjustment: Adjustment) -> tuple[tuple[TwoPositions, ...], tuple[str, ...]]:
+def _points(
+    adjustment: Adjustment, parts: PointNormals, rays: list[IntArray]
+) -> tuple[tuple[TwoPositions, ...], tuple[str, ...]]:
     """Test every point: one position for all its rays, two positions, and the size of its residuals."""
-    network, seen = adjustment.network, adjustment.network.image_points
-    parts, n = _normals(adjustment), len(network.points)
-    usable = np.isfinite(parts.q) & np.isfinite(parts.b).all(axis=1)
-    order = np.lexsort((seen.image, seen.point))
-    order = order[usable[order]]
-    bounds = np.searchsorted(seen.point[order], np.arange(n + 1))
+    network, n = adjustment.network, len(adjustment.network.points)
     level = 1 - (1 - FAMILY) ** (1 / max(n, 1))
     two: list[TwoPositions] = []
     large: list[str] = []
-    for j in range(n):
-        rows = order[bounds[j] : bounds[j + 1]]
+    for j, rows in enumerate(rays):
         accepted = rows[~adjustment.rejected[rows]]
         found = _two_positions(adjustment, parts, rows, level) if len(rows) >= 4 else None
         if found is not None:
@@ -137,7 +107,7 @@ def _points(adjustment: Adjustment) -> tuple[tuple[TwoPositions, ...], tuple[str
 
 
 def _two_positions(
-    adjustment: Adjustment, parts: _Normals, rows: IntArray, level: float
+    adjustment: Adjustment, parts: PointNormals, rows: IntArray, level: float
 ) -> TwoPositions | None:
     """Return the two positions of a point of these rows, in order of photographs; None where one will do.
 
@@ -159,20 +129,21 @@ def _two_positions(
     split, left = splits[best], float(misfit[best])
     if stats.chi2.sf(one - left, 3) * len(splits) > level:
         return None
+    if rejected.any() and stats.chi2.sf(left, 2 * m - 6) < EXPLAINED:
+        split = ~rejected  # far apart: by the rays that the test has told from one another
+        if not 2 <= split.sum() <= m - 2:
+            return None
+    groups = [intersected(adjustment, rows[split]), intersected(adjustment, rows[~split])]
+    left = groups[0][2] + groups[1][2]
     if stats.chi2.sf(left, 2 * m - 6) < EXPLAINED:
         return None
     without = min(parts.misfit(np.delete(rows, k)) for k in range(m))
     if stats.chi2.sf(without - left, 1) * len(splits) > level:
         return None
     network, seen = adjustment.network, adjustment.network.image_points
-    places, cofactors = [], []
-    for group in (rows[split], rows[~split]):
-        Q = np.linalg.pinv(parts.N[group].sum(axis=0))
-        places.append(-Q @ parts.b[group].sum(axis=0))
-        cofactors.append(Q)
-    apart = places[1] - places[0]
+    apart = groups[1][0] - groups[0][0]
     distance = float(np.linalg.norm(apart))
-    over_sigma = float(np.sqrt(apart @ np.linalg.pinv(cofactors[0] + cofactors[1]) @ apart))
+    over_sigma = float(np.sqrt(apart @ np.linalg.pinv(groups[0][1] + groups[1][1]) @ apart))
     names = [tuple(network.images[i] for i in seen.image[rows[s]]) for s in (split, ~split)]
     return TwoPositions(network.points[seen.point[rows[0]]], distance, over_sigma, names[0], names[1])
 
@@ -202,14 +173,15 @@ def _patterns(adjustment: Adjustment) -> tuple[Pattern, ...]:
     seen, used = network.image_points, ~adjustment.rejected
     whitened = _whitened(adjustment)
     out = []
-    for index, camera in enumerate(estimate.cameras):
-        own: BoolArray = used & (network.camera[seen.image] == index)
+    of_camera = rows_of(network.camera[seen.image], len(estimate.cameras))
+    for camera, rows in zip(estimate.cameras, of_camera, strict=True):
+        own = rows[used[rows]]
         width, height = camera.size_px
         column = np.clip((CELLS * seen.xy[own, 0] / width).astype(np.int64), 0, CELLS - 1)
         row = np.clip((CELLS * seen.xy[own, 1] / height).astype(np.int64), 0, CELLS - 1)
         cell = CELLS * row + column
         count = np.bincount(cell, minlength=CELLS**2)
-        if (count > 0).sum() < 3 or own.sum() < 2 * CELLS**2:
+        if (count > 0).sum() < 3 or len(own) < 2 * CELLS**2:
             continue
         mean, in_px = (_means(values[own], cell, count) for values in (whitened, adjustment.residuals))
         between = float((count[:, None] * mean**2).sum())

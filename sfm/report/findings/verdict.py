@@ -10,13 +10,16 @@ import numpy as np
 from sfm.adjustment.quality.reliability import UNCONTROLLED
 from sfm.conventions import MAD_TO_SIGMA
 from sfm.report.findings.evidence import Evidence, Judged
-from sfm.report.findings.verdict_of_given import judge_given
+from sfm.report.findings.other_adjuster import words_of_better_fit
+from sfm.report.findings.verdict_of_given import free_line, judge_given
 from sfm.report.numbers import finer_unit, significant
 
 MUCH_REJECTED = 0.05  # share of rejected image points above which a person should look
 MANY_RAYS = 1 / 3  # share of the rays of a point: so many of them say something else than the result
 FEW_RAYS = 2  # that are left of a point of which others were rejected check it no more
 MAX_NAMES = 5  # points named in one remark
+MAX_SOLUTIONS = 2  # of about the same v'Pv that are told
+SOLUTION_BAD = 3.0  # standard deviations by which points differ in another solution: theirs say nothing then
 # sigma_px is a rough guess, so the global test alone says little. Twice the guess is worth a look; five
 # times is no precision that anybody expected, but a wrong model, wrong names or wrong control.
 SIGMA0_REMARK, SIGMA0_BAD = 2.0, 5.0
@@ -56,29 +59,53 @@ def judge(evidence: Evidence) -> Verdict:
         serious.append(
             f"Rank defect {a.defect}, expected {a.expected_defect}; not everything can be determined{what}."
         )
+    if 2 * oriented < total:
+        serious.append(
+            f"The larger part of the photographs, {total - oriented} of {total}, is not in the result."
+        )
     remarks: list[str] = []
-    kinds = (_sigma0, _residual, _untested, _rays, _consistency, judge_given)
+    kinds = (_other_solutions, _sigma0, _residual, _untested, _rays, _consistency, judge_given)
     for judge_kind in kinds:
         for is_bad, line in judge_kind(evidence):
             (serious if is_bad else remarks).append(line)
-    if oriented < total:
+    if oriented < total <= 2 * oriented:
         remarks.append(f"{total - oriented} of {total} photographs are not in the result.")
     rejected = int(a.rejected.sum())
     if len(a.rejected) and rejected > MUCH_REJECTED * len(a.rejected):
         remarks.append(f"{rejected} of {len(a.rejected)} image points were rejected.")
     if result.comparison is not None and not result.comparison.agree:
         remarks.append(f"{result.comparison.backend} does not agree with the adjustment.")
+    if better := words_of_better_fit(result.comparison):
+        remarks.append(better)
     if result.warnings:
         more = len(result.warnings) - 1
         other = f" ({more} more warning{'s' if more > 1 else ''}, see below)" if more else ""
         remarks.append(f"Warning: {result.warnings[0].rstrip('.')}{other}.")
-    notes = (*_pessimistic(evidence), *_unchecked(evidence))
+    notes = (*result.notes, *_pessimistic(evidence), *_unchecked(evidence))
     if serious:
         return Verdict("bad", "The survey has no dependable result.", (*serious, *remarks, *notes))
     found = f"{oriented} of {total} photographs oriented, {len(a.network.points)} object points"
     if remarks:
         return Verdict("fair", f"The survey worked, with remarks: {found}.", (*remarks, *notes))
     return Verdict("good", f"The survey worked: {found}.", notes)
+
+
+def _other_solutions(evidence: Evidence) -> Judged:
+    """Judge whether the image points allow another solution: which of them is true they do not say."""
+    judged = []
+    for other in evidence.result.other_solutions[:MAX_SOLUTIONS]:
+        what = (
+            "turned inside out in depth"
+            if other.reflected
+            else f"with c of camera {other.camera} at {other.c:.5g} {other.unit}"
+        )
+        line = (
+            f"Another solution, {what}, fits as well (v'Pv {other.vPv:.3g} times that of the result), and "
+            f"its points differ by {significant(other.moved)} times their standard deviations (RMS): hold c "
+            "at a calibrated value, or add photographs at larger angles and other distances."
+        )
+        judged.append((other.moved > SOLUTION_BAD, line))
+    return judged
 
 
 def _sigma0(evidence: Evidence) -> Judged:
@@ -90,8 +117,13 @@ def _sigma0(evidence: Evidence) -> Judged:
         f"Sigma0 is {significant(ratio)} times the expected standard deviation of an image coordinate "
         f"({significant(evidence.sigma0.stated_px)} px): "
     )
+    cameras = evidence.result.adjustment.estimate.cameras
+    if evidence.held:
+        line += "most likely the camera, which is held at values that do not fit (below)."
+        return [(ratio > SIGMA0_BAD, line)]
     if ratio > SIGMA0_BAD:
-        return [(True, line + "points, control or the camera contradict the photographs.")]
+        held = "" if any(one.free.any() for one in cameras) else f" (it is held: try {free_line(evidence)})"
+        return [(True, f"{line}points, control or the camera{held} contradict the photographs.")]
     return [(False, line + "see the residuals, or set sigma_px to what the photographs give.")]
 
 
@@ -195,6 +227,15 @@ def _consistency(evidence: Evidence) -> Judged:
         )
     if len(found.two_positions) > MAX_NAMES:
         lines.append(f"{len(found.two_positions) - MAX_NAMES} more points are at two positions.")
+    if found.doubtful:
+        shown = ", ".join(
+            f"{one.point} ({one.rejected} rejected, or {one.instead})" for one in found.doubtful[:MAX_NAMES]
+        )
+        more = " ..." if len(found.doubtful) > MAX_NAMES else ""
+        lines.append(
+            f"Which ray is wrong cannot be told of {len(found.doubtful)} point(s), whose coordinates are "
+            f"doubtful: {shown}{more}."
+        )
     if found.large:
         more = " ..." if len(found.large) > MAX_NAMES else ""
         lines.append(

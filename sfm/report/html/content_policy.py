@@ -15,18 +15,21 @@ from collections.abc import Sequence
 NOTHING = "'none'"
 
 
-def content_policy(styles: Sequence[str], scripts: Sequence[str] = ()) -> str:
+def content_policy(
+    styles: Sequence[str], scripts: Sequence[str] = (), *, pictures_beside: bool = False
+) -> str:
     """Return the policy of a page with these style sheets and scripts inside it, and pictures as data URLs.
 
     Attributes `style` and `on...` are allowed nowhere: they would need 'unsafe-inline'.
 
     Args:
         styles: content of each style element, to the letter.
-        scripts: content of each script element, to the letter.
+        scripts: content of each script element that is run, to the letter.
+        pictures_beside: whether it shows pictures that lie beside it, which the policy calls 'self'.
     """
     allowed = {
         "default-src": [NOTHING],
-        "img-src": ["data:"],
+        "img-src": ["data:", "'self'"] if pictures_beside else ["data:"],
         "style-src": [_hash(text) for text in styles],
         "script-src": [_hash(text) for text in scripts],
         "base-uri": [NOTHING],

@@ -19,15 +19,23 @@ from sfm.adjustment.quality.statistics import STRONG
 from sfm.report.html.content_policy import content_policy
 from sfm.report.numbers import FILTERS, finer_unit, finer_unit_of, is_number
 from sfm.report.phrases import PHRASES
+from sfm.report.viewer.embedded import Viewer
 
 
-def render(template: str, **context: Any) -> str:
+def render(
+    template: str, *, viewer: Viewer | None = None, pictures_beside: bool = False, **context: Any
+) -> str:
     """Return an HTML page with everything that it shows inside it.
 
     Args:
         template: name of a template that extends `base.html`.
-        context: what it asks for.
+        viewer: the scene to explore, if the page has one.
+        pictures_beside: whether the scene shows pictures that lie beside the page, too.
+        context: what the template asks for.
     """
+    if viewer is not None:
+        policy = content_policy([_style(), viewer.style], [viewer.script], pictures_beside=pictures_beside)
+        context |= {"viewer": viewer, "policy": policy}
     return environment().get_template(template).render(context)
 
 
@@ -39,7 +47,7 @@ def data_url(data: bytes, kind: str) -> str:
 @cache
 def environment() -> Environment:
     """Return what the templates are rendered with: escaping, no undefined names, our filters and phrases."""
-    style = files("sfm.report.html").joinpath("templates/report.css").read_text(encoding="utf-8")
+    style = _style()
     made = Environment(
         loader=PackageLoader("sfm.report.html"),
         autoescape=True,
@@ -58,3 +66,8 @@ def environment() -> Environment:
         "policy": content_policy([style]),
     }
     return made
+
+
+@cache
+def _style() -> str:
+    return files("sfm.report.html").joinpath("templates/report.css").read_text(encoding="utf-8")

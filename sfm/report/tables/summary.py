@@ -125,7 +125,7 @@ def _statistics(findings: Findings) -> dict[str, Any]:
                 "lower": or_none(test.lower),
                 "upper": or_none(test.upper),
                 "passed": test.passed,
-                "words": words_of_test(test),
+                "words": words_of_test(test, result.adjustment),
             }
             for test in found.global_tests
         ],
@@ -196,6 +196,16 @@ def _consistency(findings: Findings) -> dict[str, Any]:
             for one in found.two_positions
         ],
         "large_residuals": list(found.large),
+        "doubtful": [
+            {
+                "point": one.point,
+                "rejected": one.rejected,
+                "instead": one.instead,
+                "misfit": or_none(one.misfit),
+                "other": or_none(one.other),
+            }
+            for one in found.doubtful
+        ],
         "uneven_photographs": None
         if found.uneven is None
         else {
@@ -212,6 +222,17 @@ def _consistency(findings: Findings) -> dict[str, Any]:
                 "largest_px": or_none(one.largest_px),
             }
             for one in found.patterns
+        ],
+        "other_solutions": [
+            {
+                "camera": one.camera,
+                "c": or_none(one.c),
+                "unit": one.unit,
+                "reflected": one.reflected,
+                "moved_over_sigma": or_none(one.moved),
+                "vPv_ratio": or_none(one.vPv),
+            }
+            for one in findings.result.other_solutions
         ],
         "given_against_free_network": None
         if test is None

@@ -34,10 +34,10 @@ def camera_of_image(cameras: Sequence[CameraSettings], image: str, source: str) 
     matches = [
         index
         for index, camera in enumerate(cameras)
-        if camera.images is not None and fnmatch.fnmatchcase(image, camera.images)
+        if any(fnmatch.fnmatchcase(image, glob) for glob in camera.images or ())
     ]
     if len(matches) != 1:
-        globs = ", ".join(f"{c.name} '{c.images}'" for c in cameras)
+        globs = ", ".join(f"{c.name} {', '.join(map(repr, c.images or ()))}" for c in cameras)
         many = "no camera" if not matches else f"{len(matches)} cameras"
         raise SurveyFileError(f"{source}: image '{image}' matches the glob of {many}: {globs}")
     return matches[0]
@@ -102,7 +102,7 @@ def start_cameras(
                 size,
                 pixel,
                 c_mm=focal,
-                free=one.free,
+                free=one.may_be_free,
                 values=tuple(known.items()),
             )
         )
@@ -118,7 +118,7 @@ def free_start_values(settings: CameraSettings, name: str, given: StartCameras |
         given: the table, None without.
     """
     values = given.of(name) if given is not None else {}
-    return {parameter: value for parameter, value in values.items() if parameter in settings.free}
+    return {parameter: value for parameter, value in values.items() if parameter in settings.may_be_free}
 
 
 def refuse_unknown_cameras(settings: Sequence[CameraSettings], given: StartCameras | None) -> None:

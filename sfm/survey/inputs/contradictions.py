@@ -10,6 +10,7 @@ from sfm.distortion.models import MODELS
 from sfm.errors import SurveyFileError
 from sfm.survey.inputs.given import ScaleBar
 from sfm.survey.inputs.settings import (
+    MAX_GLOBS,
     MAX_LENGTH_PER_SIGMA,
     CameraSettings,
     CompareSettings,
@@ -109,6 +110,9 @@ def refuse_contradictions(survey: SurveySettings) -> None:
             raise SurveyFileError(
                 f"{where}: camera {camera.name}: images is missing, the glob of its photographs is needed"
             )
+    globs = sum(len(camera.images or ()) for camera in survey.cameras)
+    if globs > MAX_GLOBS:
+        raise SurveyFileError(f"{where}: {globs} globs of photographs, at most {MAX_GLOBS} are looked for")
     if survey.compare.baseline != "none" and survey.observations is not None:
         raise SurveyFileError(
             f"{where}: compare.baseline = '{survey.compare.baseline}' needs photographs, the survey has "
@@ -197,7 +201,7 @@ def _refuse_contradictions_of_camera(camera: CameraSettings, at: str) -> None:
         for parameter in sorted(both):
             raise SurveyFileError(f"{at}: parameter '{parameter}' is both {one} and {other}")
     for parameter in start:
-        if parameter not in camera.free:
+        if parameter not in camera.may_be_free:
             raise SurveyFileError(f"{at}: start.{parameter} is given, but '{parameter}' is not in free")
     for parameter in varying:
         if parameter not in camera.adjusted:

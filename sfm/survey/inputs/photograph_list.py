@@ -58,22 +58,25 @@ def find_photographs(survey: SurveySettings, *, images_dir: Path | None = None) 
         name = path.relative_to(folder).as_posix()
         inside(folder, name, survey.source, allow_outside=survey.allow_outside)
 
-    owner: list[tuple[str, Path, int]] = []
-    for index, camera in enumerate(survey.cameras):
-        pattern = camera.images or ""
+    def matching(camera: str, glob: str) -> list[Path]:
         try:
-            found = find_files(folder, pattern, enter=refuse_outside)
+            found = find_files(folder, glob, enter=refuse_outside)
         except ValueError as error:
             raise SurveyFileError(
-                f"{survey.source}: camera {camera.name}: images = '{pattern}' is no glob relative to {folder}"
+                f"{survey.source}: camera {camera}: images = '{glob}' is no glob relative to {folder}"
             ) from error
+        if not found:
+            raise SurveyFileError(
+                f"no photographs found: camera {camera} needs '{glob}' in {folder}, {_holds(folder)}"
+            )
+        return found
+
+    owner: list[tuple[str, Path, int]] = []
+    for index, camera in enumerate(survey.cameras):
+        found = sorted({path for glob in camera.images or () for path in matching(camera.name, glob)})
         if not survey.allow_outside:
             for path in found:
                 refuse_outside(path)
-        if not found:
-            raise SurveyFileError(
-                f"no photographs found: camera {camera.name} needs '{pattern}' in {folder}, {_holds(folder)}"
-            )
         for name in (path.relative_to(folder).as_posix() for path in found):
             if not is_plain(name):
                 raise SurveyFileError(

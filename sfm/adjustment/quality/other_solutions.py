@@ -1,0 +1,238 @@
+"""Other solutions of the same image points: principal distances tried from a fraction to a multiple.
+
+In weak networks the sum of squares has several minima: of few photographs with small angles c and the
+distance go together, and relief or tilt can be turned inside out as in a drawing of a cube. Each minimum has
+a small standard deviation of its own, which says nothing of the others. The network is therefore followed
+along c in both directions, from the result and from its reflection in depth, with c held; where v'Pv is as
+small as that of the result, c is freed and the network adjusted.
+
+Source: Foerstner and Wrobel (2016), Photogrammetric Computer Vision, sec. 4.8 (approximate values); Luhmann
+et al., Close-Range Photogrammetry (2020), sec. 7.3.2 (correlated interior and exterior orientation); Szeliski
+and Kang (1997), IEEE PAMI 19(5), for the reversal of depth.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy import stats
+
+from sfm.adjustment.datum import Datum
+from sfm.adjustment.engine.iterate import TOLERANCE
+from sfm.adjustment.result import Adjustment
+from sfm.adjustment.solve import adjust
+from sfm.camera import Camera
+from sfm.conventions import BoolArray, FloatArray
+from sfm.errors import GeometryError
+from sfm.network import Estimate, Network
+from sfm.similarity import fit_similarity
+
+STEP = 1.3  # from one principal distance that is tried to the next
+STEPS = 6  # in each direction: c from a fifth to the fivefold
+ALPHA = 0.001  # chance of so much larger a v'Pv where the other solution is the true one
+WEAK_C = 5e-4  # relative standard deviation of c below which a network is not weak, and
+FEW_PHOTOGRAPHS = 5  # from so many photographs on
+LARGE = 4000  # image points from which on a network is not weak
+BARRIER = 3e3  # times v'Pv of the result: what lies beyond is not looked for
+APART = 1.0  # standard deviations (root mean square) between solutions that are not the same
+MAX_ITERATIONS = 20
+NEAR = 1e-3  # |A dx| / |v| at which the network is followed to the next c
+
+
+@dataclass(frozen=True)
+class OtherSolution:
+    """A solution that the image points allow as well as the result, or better."""
+
+    camera: str  # the first one whose c is free
+    c: float  # its principal distance there, mm or px
+    unit: str  # of c
+    reflected: bool  # whether it is another one than the result in depth rather than in c
+    moved: float  # by how much points differ, over their standard deviations in the result, RMS
+    vPv: float  # over that of the result
+    estimate: Estimate
+    converges: bool  # whether an adjustment of all observations from there ends
+
+
+def other_solutions(adjustment: Adjustment) -> tuple[OtherSolution, ...]:
+    """Return other solutions of about the same v'Pv, and better ones, the smallest v'Pv first.
+
+    Args:
+        adjustment: the result, with its covariance.
+
+    Returns:
+        None where the network is strong, the result did not converge, or nothing is redundant.
+    """
+    a = adjustment
+    if not a.converged or a.redundancy < 1 or len(a.network.image_points) > LARGE or not _weak(a):
+        return ()
+    alone = replace(a.network, image_points=a.network.image_points.select(~a.rejected))
+    search = _Search(alone, Datum(a.datum, a.datum_points), a.image_sigma_factor[~a.rejected])
+    base = search.adjusted(a.estimate)
+    if base is None or base.redundancy < 1 or not base.vPv > 0:
+        return ()
+    limit = 1 + float(stats.f.isf(ALPHA, 1, base.redundancy)) / base.redundancy
+    sigma = np.sqrt(np.trace(a.covariance.points, axis1=1, axis2=2) / 3)
+    own = _principal_distance(a.estimate.cameras)
+    found: list[OtherSolution] = []
+    candidates = sorted(search.candidates(a.estimate, base.vPv, limit), key=lambda one: one.vPv)
+    for candidate in candidates:
+        points = candidate.estimate.points
+        moved = _apart(points, a.estimate.points, sigma)
+        known = any(_apart(points, one.estimate.points, sigma) < APART for one in found)
+        if candidate.vPv > base.vPv * limit or not moved > APART or known:
+            continue
+        camera, c, unit = _principal_distance(candidate.estimate.cameras)
+        reflected = abs(np.log(c / own[1])) < np.log(STEP) / 2
+        found.append(
+            OtherSolution(
+                *(
+                    camera,
+                    c,
+                    unit,
+                    bool(reflected),
+                    moved,
+                    candidate.vPv / base.vPv,
+                    candidate.estimate,
+                    False,
+                )
+            )
+        )
+    if found and found[0].vPv < 1:
+        ended = search.adjusted(found[0].estimate, tolerance=TOLERANCE)
+        found[0] = replace(found[0], converges=ended is not None and ended.converged)
+    return tuple(found)
+
+
+def _weak(a: Adjustment) -> bool:
+    """Return whether there are few photographs, or a principal distance is not well determined."""
+    if len(a.network.images) < FEW_PHOTOGRAPHS:
+        return True
+    for number in set(a.network.camera.tolist()):
+        camera = a.estimate.cameras[number]
+        if camera.free[0] and not a.interior_sigma(number)[0] < WEAK_C * abs(camera.parameters[0]):
+            return True
+    return False
+
+
+@dataclass(frozen=True)
+class _Candidate:
+    estimate: Estimate
+    vPv: float
+
+
+@dataclass(frozen=True)
+class _Search:
+    """Adjustments of the accepted image points from other start values."""
+
+    network: Network
+    datum: Datum
+    factor: FloatArray  # on the standard deviations of the image points, (k,)
+
+    def adjusted(self, start: Estimate, *, held: bool = False, tolerance: float = NEAR) -> Adjustment | None:
+        """Return the adjustment, with c free or held; None where it has no solution."""
+        cameras = tuple(_with_c_held(camera) for camera in start.cameras) if held else start.cameras
+        try:
+            a = adjust(
+                self.network,
+                replace(start, cameras=cameras),
+                datum=self.datum,
+                image_sigma_factor=self.factor,
+                reject="none",
+                max_iterations=MAX_ITERATIONS,
+                tolerance=tolerance,
+                covariance=False,
+            )
+        except GeometryError:
+            return None
+        return a if np.isfinite(a.vPv) and not a.rejected.any() else None
+
+    def candidates(self, result: Estimate, vPv: float, limit: float) -> Iterator[_Candidate]:
+        """Return solutions and places of about the same v'Pv along c, and minima beyond them."""
+        free = [camera.free for camera in result.cameras]
+        steps = STEPS if any(one[0] for one in free) else 0
+        starts = [result] if self.datum.kind == "control" else [result, _reflected(result)]
+        for start in starts:
+            for direction in (STEP, 1 / STEP) if steps else (1.0,):
+                track = self._along(start, direction, steps, vPv)
+                heights = [one.vPv for one in track]
+                for k, one in enumerate(track):
+                    lower = heights[k] <= min(heights[max(k - 1, 0) : k + 2])
+                    if one.vPv <= limit * vPv:
+                        yield _Candidate(_with_free(one.estimate, free), one.vPv)
+                    if lower and (k or start is not result):
+                        ended = self.adjusted(_with_free(one.estimate, free))
+                        if ended is not None and ended.converged:
+                            yield _Candidate(_with_free(ended.estimate, free), ended.vPv)
+
+    def _along(self, start: Estimate, factor: float, steps: int, vPv: float) -> list[_Candidate]:
+        """Follow the network with c held at multiples of the start's, while v'Pv is not too large."""
+        track: list[_Candidate] = []
+        estimate = start
+        for k in range(steps + 1):
+            found = self.adjusted(_scaled(estimate, factor) if k else estimate, held=steps > 0)
+            if found is None:
+                break
+            estimate = found.estimate
+            track.append(_Candidate(estimate, found.vPv))
+            if found.vPv > BARRIER * vPv:
+                break
+        return track
+
+
+def _with_c_held(camera: Camera) -> Camera:
+    free = camera.free.copy()
+    free[: 1 if camera.in_mm else 2] = False
+    return replace(camera, free=free)
+
+
+def _with_free(estimate: Estimate, free: list[BoolArray]) -> Estimate:
+    """Return the estimate with these parameters of its cameras free."""
+    cameras = tuple(replace(one, free=own) for one, own in zip(estimate.cameras, free, strict=True))
+    return replace(estimate, cameras=cameras)
+
+
+def _scaled(estimate: Estimate, factor: float) -> Estimate:
+    """Return the estimate with multiples of c, and photographs as many times as far from the object."""
+    cameras = []
+    for camera in estimate.cameras:
+        p = camera.parameters.copy()
+        p[: 1 if camera.in_mm else 2] *= factor
+        cameras.append(camera.with_parameters(p))
+    centre = estimate.points.mean(axis=0)
+    return replace(estimate, cameras=tuple(cameras), position=centre + factor * (estimate.position - centre))
+
+
+def _reflected(estimate: Estimate) -> Estimate:
+    """Return the estimate reflected in depth: exact where all rays of a photograph are parallel."""
+    d = estimate.rotation[:, :, 2].mean(axis=0)
+    F = np.eye(3) - 2 * np.outer(d, d) / (d @ d)
+    centre = estimate.points.mean(axis=0)
+    R = F @ estimate.rotation * np.array([1.0, 1.0, -1.0])
+    from_centre = np.einsum("mji,mj->mi", estimate.rotation, estimate.position - centre)
+    return replace(
+        estimate,
+        position=centre + np.einsum("mij,mj->mi", R, from_centre),
+        rotation=R,
+        points=centre + (estimate.points - centre) @ F,
+    )
+
+
+def _principal_distance(cameras: tuple[Camera, ...]) -> tuple[str, float, str]:
+    """Return name, principal distance and its unit of the first camera whose c is free, else of the first."""
+    camera = next((one for one in cameras if one.free[0]), cameras[0])
+    return camera.name, float(camera.parameters[0]), camera.units[0]
+
+
+def _apart(points: FloatArray, others: FloatArray, sigma: FloatArray) -> float:
+    """Return the difference of two sets of points after a similarity over their sigmas (n,), RMS."""
+    known = np.isfinite(sigma) & (sigma > 0)
+    if known.sum() < 3:
+        return 0.0
+    try:
+        placed = fit_similarity(points[known], others[known], weights=1 / sigma[known] ** 2)
+    except GeometryError:
+        return np.inf
+    off = (placed.apply(points[known]) - others[known]) / sigma[known, None]
+    return float(np.sqrt((off**2).mean()))

@@ -1,0 +1,102 @@
+"""Command about surveys that nobody has described yet: a survey file drafted from photographs."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from sfm.cli.starting import loading
+from sfm.errors import OutputError
+from sfm.runtime.faults import working_on
+
+if TYPE_CHECKING:
+    from sfm.survey.drafting.draft import Draft
+
+
+def init(
+    photographs: Annotated[
+        Path, typer.Argument(metavar="PHOTOS", help="Folder of the photographs, directly in it.")
+    ],
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--out",
+            metavar="FILE.toml",
+            help="File to write; no other is replaced.  [default: PHOTOS/survey.toml]",
+        ),
+    ] = None,
+) -> None:
+    """Draft a survey file from a folder of photographs.
+
+    Cameras by what the files say of them, targets by trying a few photographs; every value with where it
+    comes from.  Nothing is measured or adjusted: kolinear run does that.
+    """
+    from sfm.files.whole_files import refuse_existing
+
+    file = photographs / "survey.toml" if out is None else out
+    refuse_existing(file)
+    draft = _draft(photographs)
+    _write(draft, file)
+    beside = file.parent.resolve() == photographs.resolve()
+    print(f"Run it: kolinear run {file}{'' if beside else f' --images {photographs}'}")
+
+
+def drafted_beside(photographs: Path, out: Path | None) -> tuple[Path, Path]:
+    """Draft the survey of a folder of photographs, unless a file beside the result has it already.
+
+    Args:
+        photographs: the folder.
+        out: folder of the result, None for out/NAME OF THE FOLDER.
+
+    Returns:
+        The survey file, and the folder of the result.
+
+    Raises:
+        KolinearError: no photographs, or the file cannot be written.
+    """
+    with loading():
+        from sfm.report.output import folder_name
+
+    out = Path("out") / folder_name(photographs.resolve().name) if out is None else out
+    file = out.parent / f"{out.name}.toml"
+    if file.exists():
+        print(f"Running {file}, which is there already; remove it to draft a new one", file=sys.stderr)
+        return file, out
+    draft = _draft(photographs)
+    out.parent.mkdir(parents=True, exist_ok=True)
+    _write(draft, file)
+    return file, out
+
+
+def _draft(photographs: Path) -> Draft:
+    with loading():
+        from sfm.api import one_blas_thread, sensor_widths
+        from sfm.runtime.progress_bar import drawn_progress
+        from sfm.survey.drafting.draft import draft_survey
+        from sfm.survey.measuring.target_store import TargetStore
+
+    with working_on(str(photographs)), drawn_progress() as drawn, one_blas_thread():
+        return draft_survey(
+            photographs, sensor_width=sensor_widths(), store=TargetStore.of_user(), progress=drawn
+        )
+
+
+def _write(draft: Draft, file: Path) -> None:
+    """Write a drafted survey, and tell on stderr what was found."""
+    from sfm.files.whole_files import whole_file
+
+    with whole_file(file) as part:
+        try:
+            part.write_text(draft.text, encoding="utf-8")
+        except UnicodeEncodeError as error:
+            raise OutputError(f"{file}: a name in it is no text in UTF-8") from error
+    for subject, finding in draft.found:
+        print(f"{subject}: {finding}", file=sys.stderr)
+    for remark in draft.remarks:
+        print(f"! {remark}", file=sys.stderr)
+    for name, why in draft.left_out:
+        print(f"  left out: {name}: {why}", file=sys.stderr)
+    print(f"Survey file: {file}", file=sys.stderr)

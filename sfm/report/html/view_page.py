@@ -1,0 +1,92 @@
+"""The page of `kolinear view`: any stored result to explore, in one file."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from contextlib import suppress
+from pathlib import Path
+
+from sfm.errors import OutputError
+from sfm.files.whole_files import refuse_existing, whole_file
+from sfm.report.html.page import render
+from sfm.report.viewer.embedded import viewer_of
+from sfm.report.viewer.pictures import BUDGET_MB, Pictures, cut_pictures
+from sfm.report.viewer.scene import ViewerScene
+from sfm.runtime.progress import SILENT, Progress
+
+MARK = b"<!DOCTYPE html>\n<!-- kolinear view -->\n"
+"""by which an earlier page is known, which a new one may replace"""
+
+
+def view_page(scene: ViewerScene, pictures: Pictures, source: str) -> str:
+    """Return the page of a scene.
+
+    Args:
+        scene: what is shown.
+        pictures: of its photographs.
+        source: what it was read from.
+    """
+    page = render(
+        "view.html",
+        viewer=viewer_of(scene, pictures),
+        pictures_beside=bool(pictures.beside),
+        s=scene,
+        source=source,
+        cameras=", ".join(f"{camera.name} ({camera.model})" for camera in scene.cameras),
+    )
+    return page.replace("<!DOCTYPE html>\n", MARK.decode(), 1)
+
+
+def write_view(
+    scene: ViewerScene,
+    out: Path,
+    *,
+    source: str,
+    paths: Mapping[str, Path],
+    budget_mb: float = BUDGET_MB,
+    jobs: int = 1,
+    progress: Progress = SILENT,
+) -> Path:
+    """Write the page of a scene, whole or not at all.
+
+    Args:
+        scene: what is shown.
+        out: the page; an earlier one is replaced, anything else in its place is an error.
+        source: what it was read from.
+        paths: files of the photographs by name.
+        budget_mb: what the pictures inside may take, 10^6 bytes.
+        jobs: photographs cut at the same time.
+        progress: is told of every photograph.
+
+    Raises:
+        OutputError: something else is in its place, or it cannot be written.
+    """
+    refuse_foreign_page(out)
+    pictures = cut_pictures(scene, paths, budget_mb=budget_mb, jobs=jobs, progress=progress)
+    with whole_file(out, "the page", replaces=True) as part:
+        part.write_text(view_page(scene, pictures, source), encoding="utf-8")
+    return out
+
+
+def refuse_foreign_page(out: Path) -> None:
+    """Raise OutputError where something is in the place of a page that `kolinear view` has not written."""
+    if out.is_file() and not out.is_symlink():
+        try:
+            with out.open("rb") as file:
+                if file.read(len(MARK)) == MARK:
+                    return
+        except OSError as error:
+            raise OutputError(f"{out}: cannot be read: {error.strerror}") from error
+    refuse_existing(out)
+
+
+def photographs_in(folder: Path, names: tuple[str, ...]) -> dict[str, Path]:
+    """Return the photographs of some names that are in a folder; names that lead out of it have none."""
+    root = folder.resolve()
+    found = {}
+    for name in names:
+        with suppress(OSError, ValueError):  # a name that is no name of a file here
+            path = (root / name).resolve()
+            if path.is_relative_to(root) and path.is_file():
+                found[name] = path
+    return found

@@ -1,0 +1,296 @@
+"""Pictures of a page to explore: thumbnails, photographs and crops about the targets, within a budget.
+
+Thumbnails come first, then photographs, then crops, those of the largest residuals first. What has no room in
+the page lies in files beside it: every photograph, and the crops of each in one picture of cells.
+"""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from sfm.conventions import AnyArray, FloatArray, IntArray
+from sfm.errors import PhotographError
+from sfm.photographs.reading import read_photograph
+from sfm.report.figures.overlays import overlay_names
+from sfm.report.viewer.scene import ViewerScene
+from sfm.runtime.progress import SILENT, Progress
+
+BUDGET_MB = 15.0
+"""what the pictures of a page may take, 10^6 bytes of base64 text"""
+THUMBNAIL_PX = 160
+VIEW_PX = 1400  # longer side of an embedded photograph
+FILE_PX = 2400  # of one beside the page
+CROP_PX = 64  # side of a stored crop; larger ones are averaged
+COLUMNS = 32  # of the cells of a file of crops
+CROP_DIAMETERS = 2.2  # side of a crop over the target's larger diameter
+MIN_SIDE_PX, MAX_SIDE_PX = 20, 240  # of a crop in the photograph
+SIDE_PX = 40  # of a crop about a point without an outline
+THUMBNAIL_QUALITY, VIEW_QUALITY, FILE_QUALITY, CROP_QUALITY = 70, 75, 85, 78
+MAX_CROP_BYTES = 4500  # of a stored crop, noise included
+THUMBNAILS_PART = 0.3  # of the budget at most
+VIEWS_PART = 0.6  # of what thumbnails leave
+
+
+@dataclass(frozen=True)
+class Pictures:
+    """Pictures inside a page, and the names of those beside it."""
+
+    base64: str = ""  # all that are embedded, one after the other
+    count: int = 0  # photographs that were read
+    files: tuple[str, ...] = ()  # of each photograph beside the page, "" for none, (m,)
+    crop_files: tuple[str, ...] = ()  # of the crops of each photograph, likewise
+    beside: Mapping[str, bytes] = field(default_factory=dict)  # content of these files by name
+    thumbnail: IntArray = field(
+        default_factory=lambda: np.zeros((0, 2), np.int64)
+    )  # start and length, (m, 2)
+    view: IntArray = field(default_factory=lambda: np.zeros((0, 2), np.int64))  # likewise
+    ray: IntArray = field(default_factory=lambda: np.zeros(0, np.int64))  # of each crop, (c,)
+    frame: FloatArray = field(default_factory=lambda: np.zeros((0, 4)))  # left and top edge, side, px of the
+    # photograph, and side of the stored crop, px, (c, 4)
+    crop: IntArray = field(default_factory=lambda: _none(0))  # start and length, (c, 2)
+    cell: IntArray = field(default_factory=lambda: np.zeros(0, np.int64))  # in the file of crops, (c,)
+    notes: tuple[str, ...] = ()  # what the page leaves out
+
+    def arrays(self) -> dict[str, tuple[str, AnyArray]]:
+        """Return what `container` packs; starts and lengths count groups of four characters of base64."""
+        return {
+            **{
+                f"{name}.{part}": ("u4", values[:, k])
+                for name, values in (("thumbnail", self.thumbnail), ("view", self.view), ("crop", self.crop))
+                for k, part in enumerate(("start", "length"))
+            },
+            "crop.ray": ("u4", self.ray),
+            "crop.frame": ("f4", self.frame),
+            "crop.cell": ("u4", self.cell),
+        }
+
+
+@dataclass(frozen=True)
+class _Cut:
+    """What is cut out of one photograph."""
+
+    thumbnail: bytes
+    view: bytes
+    file: bytes
+    crops: dict[int, bytes]  # by ray
+    frames: dict[int, tuple[float, float, float, int]]  # see Pictures.frame
+    cells: bytes
+
+
+def cut_pictures(
+    scene: ViewerScene,
+    paths: Mapping[str, Path],
+    *,
+    budget_mb: float = BUDGET_MB,
+    beside: str = "",
+    jobs: int = 1,
+    progress: Progress = SILENT,
+) -> Pictures:
+    """Cut thumbnails, photographs and crops of a scene out of its photographs.
+
+    Args:
+        scene: what is shown.
+        paths: files of the photographs by name; those that can no longer be read are left out.
+        budget_mb: what the embedded pictures may take, 10^6 bytes of the page.
+        beside: folder of the files beside the page, as the page names it; "" if there are none.
+        jobs: photographs cut at the same time.
+        progress: is told of every photograph.
+    """
+    m, rays = len(scene.photographs), scene.rays
+    if not any(name in paths for name in scene.photographs):
+        return Pictures(files=("",) * m, crop_files=("",) * m, thumbnail=_none(m), view=_none(m))
+    order = rays.worst_first()
+    budget = int(budget_mb * 1e6 / 4 * 3)
+    scarce = len(rays) * MAX_CROP_BYTES > 0.3 * budget
+    wanted = np.zeros(len(rays), dtype=bool)
+    wanted[order[: budget // 500] if scarce else order] = True
+    rows_of = np.split(
+        np.argsort(rays.photo, kind="stable"), np.cumsum(np.bincount(rays.photo, minlength=m))[:-1]
+    )
+
+    def cut(i: int) -> _Cut | None:
+        path = paths.get(scene.photographs[i])
+        if path is None:
+            return None
+        try:
+            grey = read_photograph(path)
+        except PhotographError:
+            return None
+        grey = (grey >> 8).astype(np.uint8) if grey.dtype == np.uint16 else grey
+        return _cut(grey, scene, rows_of[i], wanted, with_files=bool(beside), with_cells=scarce)
+
+    cuts: list[_Cut | None] = []
+    with ThreadPoolExecutor(max_workers=max(1, jobs)) as pool:
+        for name, one in zip(scene.photographs, pool.map(cut, range(m)), strict=True):
+            cuts.append(one)
+            progress.advance(name)
+    return _embed(scene, cuts, order, budget, beside)
+
+
+def _cut(
+    grey: AnyArray,
+    scene: ViewerScene,
+    rows: IntArray,
+    wanted: AnyArray,
+    *,
+    with_files: bool,
+    with_cells: bool,
+) -> _Cut:
+    crops: dict[int, bytes] = {}
+    frames: dict[int, tuple[float, float, float, int]] = {}
+    cells = []
+    for k in rows:
+        camera = scene.cameras[scene.camera[scene.rays.photo[k]]]
+        scale = grey.shape[1] / camera.size_px[0]  # below 1 where a smaller picture stands for the photograph
+        left, top, side = _frame(scene, int(k), grey.shape, scale)
+        patch = grey[top : top + side, left : left + side]
+        if side > CROP_PX:
+            patch = cv2.resize(patch, (CROP_PX, CROP_PX), interpolation=cv2.INTER_AREA)
+        frames[int(k)] = (left / scale - 0.5, top / scale - 0.5, side / scale, len(patch))
+        if wanted[k]:
+            crops[int(k)] = _jpeg(patch, CROP_QUALITY)
+        if with_files and with_cells:
+            cells.append(patch)
+    return _Cut(
+        _jpeg(_fit(grey, THUMBNAIL_PX), THUMBNAIL_QUALITY),
+        _jpeg(_fit(grey, VIEW_PX), VIEW_QUALITY),
+        _jpeg(_fit(grey, FILE_PX), FILE_QUALITY) if with_files else b"",
+        crops,
+        frames,
+        _sheet(cells) if cells else b"",
+    )
+
+
+def _frame(scene: ViewerScene, k: int, shape: tuple[int, ...], scale: float) -> tuple[int, int, int]:
+    """Return first column, first row and side of the crop of a ray, px of a picture, inside of it."""
+    semi = scene.rays.ellipse[k, 0]
+    wanted = 2 * semi * CROP_DIAMETERS if np.isfinite(semi) else SIDE_PX
+    side = min(round(scale * min(max(wanted, MIN_SIDE_PX), MAX_SIDE_PX)), *shape[:2])
+    corner = [
+        min(max(round(scale * (float(x) + 0.5) - side / 2), 0), size - side)
+        for x, size in zip(scene.rays.xy[k], shape[1::-1], strict=True)
+    ]
+    return corner[0], corner[1], side
+
+
+def _sheet(patches: list[AnyArray]) -> bytes:
+    """Return crops as cells of one picture, by rows."""
+    sheet = np.zeros((CROP_PX * -(-len(patches) // COLUMNS), CROP_PX * COLUMNS), np.uint8)
+    for k, patch in enumerate(patches):
+        y, x = CROP_PX * (k // COLUMNS), CROP_PX * (k % COLUMNS)
+        sheet[y : y + patch.shape[0], x : x + patch.shape[1]] = patch
+    return _jpeg(sheet, CROP_QUALITY)
+
+
+def _embed(
+    scene: ViewerScene, cuts: list[_Cut | None], order: IntArray, budget: int, beside: str
+) -> Pictures:
+    """Choose what has room in the page, and name the rest."""
+    m = len(cuts)
+    store = _Store()
+    read = [(i, one) for i, one in enumerate(cuts) if one is not None]
+    thumbnail, view = _none(m), _none(m)
+    room = int(THUMBNAILS_PART * budget)
+    for i, one in read:
+        if store.size + len(one.thumbnail) <= room:
+            thumbnail[i] = store.add(one.thumbnail)
+    room = store.size + int(VIEWS_PART * (budget - store.size))
+    worst = sorted(read, key=lambda pair: -np.nan_to_num(scene.photo_rms_px[pair[0]]))
+    views = 0
+    for i, one in worst:
+        if store.size + len(one.view) <= room:
+            view[i] = store.add(one.view)
+            views += 1
+    kept: dict[int, tuple[int, int]] = {}
+    for k in order.tolist():
+        found = cuts[scene.rays.photo[k]]
+        crop = found.crops.get(k) if found else None
+        if crop is not None and store.size + len(crop) + 2 <= budget:
+            kept[k] = store.add(crop)
+    names = overlay_names(scene.photographs)
+    folder = f"{beside}/" if beside else ""
+    files = tuple(f"{folder}{names[i]}" if one and one.file else "" for i, one in enumerate(cuts))
+    crop_files = tuple(f"{folder}crops_{names[i]}" if one and one.cells else "" for i, one in enumerate(cuts))
+    content = {names[i]: one.file for i, one in read if one.file}
+    content |= {f"crops_{names[i]}": one.cells for i, one in read if one.cells}
+    ray, frame, crop_of, cell = [], [], [], []
+    for i, one in read:
+        for number, (k, place) in enumerate(one.frames.items()):
+            if k in kept or crop_files[i]:
+                ray.append(k)
+                frame.append(place)
+                crop_of.append(kept.get(k, (0, 0)))
+                cell.append(number)
+    return Pictures(
+        store.text(),
+        len(read),
+        files,
+        crop_files,
+        content,
+        thumbnail,
+        view,
+        np.array(ray, dtype=np.int64),
+        np.array(frame, dtype=float).reshape(-1, 4),
+        np.array(crop_of, dtype=np.int64).reshape(-1, 2),
+        np.array(cell, dtype=np.int64),
+        tuple(
+            _left_out(len(read), m, views, len(kept), sum(len(one.frames) for _, one in read), bool(beside))
+        ),
+    )
+
+
+def _left_out(read: int, m: int, views: int, crops: int, rays: int, beside: bool) -> list[str]:
+    """Return in words what the page does not hold."""
+    rest = "the rest lies in the folder pictures beside it" if beside else "there was no room for the rest"
+    lines = []
+    if read < m:
+        lines.append(f"{m - read} of {m} photographs could not be read: they have no picture here.")
+    if views < read:
+        lines.append(f"This page holds {views} of {read} photographs, those of the largest RMS; {rest}.")
+    if crops < rays and read:
+        lines.append(f"This page holds crops of {crops} of {rays} image points, the worst; {rest}.")
+    return lines
+
+
+class _Store:
+    """Pictures one after the other, each filled up to whole groups of base64."""
+
+    def __init__(self) -> None:
+        self.parts: list[bytes] = []
+        self.size = 0
+
+    def add(self, data: bytes) -> tuple[int, int]:
+        """Add a picture; return start and length in groups of three bytes, four characters of base64."""
+        data += bytes(-len(data) % 3)
+        start = self.size // 3
+        self.parts.append(data)
+        self.size += len(data)
+        return start, len(data) // 3
+
+    def text(self) -> str:
+        return base64.b64encode(b"".join(self.parts)).decode()
+
+
+def _none(count: int) -> IntArray:
+    return np.zeros((count, 2), dtype=np.int64)
+
+
+def _fit(picture: AnyArray, side: int) -> AnyArray:
+    """Return a picture whose longer side is at most `side` px, averaged over areas."""
+    scale = side / max(picture.shape[:2])
+    if scale >= 1:
+        return picture
+    size = round(picture.shape[1] * scale), round(picture.shape[0] * scale)
+    return np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA))
+
+
+def _jpeg(picture: AnyArray, quality: int) -> bytes:
+    _, data = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, quality])
+    return bytes(data.tobytes())

@@ -1,0 +1,110 @@
+"""The scene of any stored result: tables, a COLMAP model or another program's; residuals by projection."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sfm.camera import project
+from sfm.conventions import BoolArray, FloatArray, IntArray
+from sfm.network import ImagePoints
+from sfm.orientation.ray_angles import ray_angles
+from sfm.report.viewer.scene import Bar, Marks, Rays, ViewerScene, distance_sigmas
+from sfm.stored_result import StoredResult
+
+
+def scene_of_stored(
+    stored: StoredResult, *, w: FloatArray | None = None, rejected: BoolArray | None = None
+) -> ViewerScene:
+    """Return what the viewer shows of a result; photographs and points without coordinates are left out.
+
+    Args:
+        stored: the result, rejected image points included where `rejected` names them.
+        w: Baarda's w of its image points, where known, (k, 2).
+        rejected: which of its image points took no part; none if not given, (k,).
+    """
+    network, estimate = stored.network, stored.estimate
+    seen = network.image_points
+    oriented, determined = np.flatnonzero(estimate.oriented), np.flatnonzero(estimate.determined)
+    rejected = np.zeros(len(seen), dtype=bool) if rejected is None else rejected
+    w = np.full((len(seen), 2), np.nan) if w is None else w
+    kept = np.flatnonzero(estimate.oriented[seen.image] & estimate.determined[seen.point])
+    kept = kept[np.lexsort((seen.image[kept], seen.point[kept]))]
+    v = _residuals(stored, seen)[kept]
+    point = np.searchsorted(determined, seen.point[kept])
+    photo = np.searchsorted(oriented, seen.image[kept])
+    used = ~rejected[kept]
+    no_ellipse = np.full((len(kept), 3), np.nan)
+    rays = Rays(point, photo, seen.xy[kept], v, w[kept], ~used, no_ellipse)
+    use = np.zeros(len(seen), dtype=bool)
+    use[kept[used]] = True
+    n, m = len(determined), len(oriented)
+    xyz = estimate.points[determined]
+    covariance = np.full((n, 3, 3), np.nan)
+    if stored.point_covariance is not None:
+        covariance = stored.point_covariance[determined]
+    sigma = np.full((m, 6), np.nan)
+    if stored.position_covariance is not None:
+        sigma[:, :3] = np.sqrt(np.diagonal(stored.position_covariance[oriented], axis1=1, axis2=2))
+    joint = stored.covariance
+    bars, place = network.scale_bars, {int(j): k for k, j in enumerate(determined)}
+    notes = []
+    for kind, found, names in (
+        ("photographs", oriented, network.images),
+        ("points", determined, network.points),
+    ):
+        if len(found) < len(names):
+            notes.append(f"{len(names) - len(found)} of {len(names)} {kind} have no coordinates: left out.")
+    return ViewerScene(
+        stored.name,
+        stored.unit or "object units",
+        estimate.cameras,
+        tuple(network.points[j] for j in determined),
+        xyz,
+        covariance,
+        np.bincount(point[used], minlength=n),
+        ray_angles(network, estimate, use)[determined],
+        _rms(point[used], v[used], n),
+        tuple(network.images[i] for i in oriented),
+        network.camera[oriented],
+        estimate.position[oriented],
+        estimate.rotation[oriented],
+        sigma,
+        _rms(photo[used], v[used], m),
+        np.bincount(photo[used], minlength=m),
+        rays,
+        Marks.none(),
+        tuple(
+            Bar(place[i], place[j], length, s, float(np.linalg.norm(xyz[place[i]] - xyz[place[j]])) - length)
+            for i, j, length, s in zip(
+                *(x.tolist() for x in (bars.start, bars.end, bars.length, bars.sigma)), strict=True
+            )
+            if i in place and j in place
+        ),
+        tuple(place[int(j)] for j in network.control.point if int(j) in place),
+        None if joint is None or n < len(network.points) else distance_sigmas(xyz, joint),
+        float(np.sqrt(np.nanmean(v[used] ** 2))) if used.any() else np.nan,
+        tuple(notes),
+    )
+
+
+def _residuals(stored: StoredResult, seen: ImagePoints) -> FloatArray:
+    """Return computed minus measured position of every image point, px; NaN where not known, (k, 2)."""
+    network, estimate = stored.network, stored.estimate
+    computed = np.full(seen.xy.shape, np.nan)
+    order = np.argsort(seen.image, kind="stable")
+    ends = np.searchsorted(seen.image[order], np.arange(1, len(network.images)))
+    for i, rows in enumerate(np.split(order, ends)):
+        if len(rows) and estimate.oriented[i]:
+            camera = estimate.cameras[network.camera[i]]
+            where = estimate.position[i], estimate.rotation[i], estimate.points[seen.point[rows]]
+            computed[rows] = project(camera, *where)
+    return computed - seen.xy
+
+
+def _rms(index: IntArray, v: FloatArray, count: int) -> FloatArray:
+    """Return the RMS residual per coordinate of each photograph or point, NaN where there is none."""
+    known = np.isfinite(v).all(axis=1)
+    number = np.bincount(index[known], minlength=count)
+    total = np.bincount(index[known], weights=(v[known] ** 2).sum(axis=1), minlength=count)
+    mean = np.divide(total, 2 * number, out=np.full(count, np.nan), where=number > 0)
+    return np.asarray(np.sqrt(mean))

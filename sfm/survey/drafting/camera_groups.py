@@ -1,0 +1,191 @@
+"""Which photographs of a folder were taken with one camera, and what their files say of it."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+from glob import escape
+
+from sfm.photographs.exif import Metadata
+
+FOCAL_PER_SIDE = 1.2  # focal length over the longer side of the photograph, where nothing tells it
+FULL_FRAME_MM = 36.0  # longer side of the sensor, where nothing tells it
+MIN_IN_GROUP = 2  # photographs that a camera is kept with if another has more
+
+SensorWidth = Callable[[str, str], float | None]
+"""width of the sensor (mm) of a camera by make and model; None where it is unknown"""
+
+
+@dataclass(frozen=True)
+class CameraGroup:
+    """Photographs of one camera in one setting, and what is known of it."""
+
+    name: str
+    photographs: tuple[str, ...]  # file names
+    globs: tuple[str, ...]  # that name them and no other photograph of the folder
+    size_px: tuple[int, int]
+    pixel_mm: tuple[float, float]
+    pixel_source: str  # where it comes from, for people
+    c_mm: float
+    c_source: str
+    assumed: bool  # whether pixel or principal distance is known from nowhere
+    remarks: tuple[str, ...]  # what a person should know of the photographs
+
+
+@dataclass(frozen=True)
+class Grouping:
+    """The cameras of a folder, and photographs that are of no use to a survey of them."""
+
+    cameras: tuple[CameraGroup, ...]  # the one with most photographs first
+    left_out: tuple[tuple[str, str], ...]  # name, reason
+
+
+def group_photographs(
+    metadata: dict[str, Metadata], sensor_width: SensorWidth = lambda make, model: None
+) -> Grouping:
+    """Return the cameras that photographs were taken with.
+
+    Photographs belong together that agree in make, model, serial number, lens, focal length and size. Where
+    no file names the maker, the part of the names before their last number stands for the camera.
+
+    Args:
+        metadata: of every readable photograph, by its file name.
+        sensor_width: a list of cameras, asked where EXIF data do not tell the pixel size.
+    """
+    groups: dict[tuple[object, ...], list[str]] = {}
+    by_name = not any(one.make for one in metadata.values())
+    for name, one in sorted(metadata.items()):
+        key = (one.make, one.model, one.serial, one.lens, _rounded(one.focal_mm), one.size_px)
+        groups.setdefault((*key, _series(name) if by_name else ""), []).append(name)
+    largest = max((len(names) for names in groups.values()), default=0)
+    kept, left_out = [], []
+    for names in sorted(groups.values(), key=lambda names: (-len(names), names)):
+        if len(names) >= MIN_IN_GROUP or largest < MIN_IN_GROUP:
+            kept.append(names)
+        else:
+            left_out += [(name, _alone(metadata[name], metadata[kept[0][0]])) for name in names]
+    labels = _labels([metadata[names[0]] for names in kept])
+    return Grouping(
+        tuple(
+            _group(label, tuple(names), metadata, sensor_width)
+            for label, names in zip(labels, kept, strict=True)
+        ),
+        tuple(left_out),
+    )
+
+
+def _group(
+    label: str, names: tuple[str, ...], metadata: dict[str, Metadata], sensor_width: SensorWidth
+) -> CameraGroup:
+    first = metadata[names[0]]
+    pixel, pixel_source = _pixel(first, sensor_width)
+    side = max(first.size_px)
+    assumed = pixel is None
+    if first.focal_mm is not None:
+        c, c_source = first.focal_mm, "EXIF focal length"
+        if pixel is None:
+            pixel = c / (FOCAL_PER_SIDE * side)
+            pixel_source = f"ASSUMED from a focal length of {FOCAL_PER_SIDE:g} times the longer side"
+    else:
+        if pixel is None:
+            pixel = FULL_FRAME_MM / side
+            pixel_source = f"ASSUMED from a sensor {FULL_FRAME_MM:g} mm wide"
+        c = FOCAL_PER_SIDE * side * pixel
+        c_source = f"ASSUMED, {FOCAL_PER_SIDE:g} times the longer side; the adjustment finds it"
+        assumed = True
+    return CameraGroup(
+        label,
+        names,
+        _globs(names, tuple(metadata)),
+        first.size_px,
+        (pixel, pixel),
+        pixel_source,
+        c,
+        c_source,
+        assumed,
+        _remarks([metadata[name] for name in names]),
+    )
+
+
+def _pixel(one: Metadata, sensor_width: SensorWidth) -> tuple[float | None, str]:
+    """Side of a pixel, mm, and where it comes from."""
+    if one.pixel_mm is not None:
+        return sum(one.pixel_mm) / 2, "EXIF data"
+    width = sensor_width(one.make, one.model) if one.make and one.model else None
+    if width is not None:
+        return width / max(one.size_px), f"{one.make} {one.model} in COLMAP's list of cameras"
+    return None, ""
+
+
+def _remarks(own: list[Metadata]) -> tuple[str, ...]:
+    """What the files say that a survey should know."""
+    found = []
+    width, height = own[0].size_px
+    taken = [one.taken_px for one in own if one.taken_px and sorted(one.taken_px) != sorted(one.size_px)]
+    if taken:
+        found.append(
+            f"{len(taken)} of {len(own)} photographs are {width} x {height} px, their camera took "
+            f"{taken[0][0]} x {taken[0][1]} px: resampled or cropped, originals are better"
+        )
+    turned = sum(1 for one in own if one.orientation != 1)
+    if turned:
+        found.append(
+            f"{turned} of {len(own)} photographs are marked as turned; pixels are taken as they are stored, "
+            "as it must be for one camera"
+        )
+    return tuple(found)
+
+
+def _alone(one: Metadata, main: Metadata) -> str:
+    """Why a single photograph of a camera is left out."""
+    if one.size_px == main.size_px[::-1] and (one.make, one.model) == (main.make, main.model):
+        return "the only one stored upright; a photograph turned by a program has lost its camera"
+    if one.size_px != main.size_px:
+        return (
+            f"the only one of {one.size_px[0]} x {one.size_px[1]} px, the others have "
+            f"{main.size_px[0]} x {main.size_px[1]} px"
+        )
+    if _rounded(one.focal_mm) != _rounded(main.focal_mm):
+        return f"the only one with c = {one.focal_mm or 0:g} mm, the others have {main.focal_mm or 0:g} mm"
+    return f"the only one of camera {one.make or ''} {one.model or ''} {one.serial or ''}".rstrip()
+
+
+def _rounded(focal: float | None) -> float | None:
+    return None if focal is None else float(f"{focal:.3g}")
+
+
+def _series(name: str) -> str:
+    """The part of a name before its last number, where that is no date."""
+    found = re.fullmatch(r"(.*?)\d+(\D*)", name)
+    prefix = found[1] if found else ""
+    return "" if re.search(r"(19|20)\d{6}", prefix) else prefix
+
+
+def _labels(firsts: list[Metadata]) -> list[str]:
+    """Names of cameras, each once."""
+    words = [re.sub(r"[^A-Za-z0-9]+", "-", one.model or "").strip("-").lower() for one in firsts]
+    plain = [word or "camera" for word in words]
+    total, seen = Counter(plain), Counter[str]()
+    labels = []
+    for name in plain:
+        seen[name] += 1
+        labels.append(name if total[name] == 1 else f"{name}-{seen[name]}")
+    return labels
+
+
+def _globs(names: tuple[str, ...], everything: tuple[str, ...]) -> tuple[str, ...]:
+    """A glob of just these photographs, or their names."""
+    first, last = min(names), max(names)
+    start = 0
+    while start < min(len(first), len(last)) and first[start] == last[start]:
+        start += 1
+    prefix = first[:start].rstrip("0123456789") if start < len(first) else first
+    endings = {name.rpartition(".")[2] for name in names}
+    if len(endings) == 1:
+        glob = f"{escape(prefix)}*.{escape(endings.pop())}"
+        if {name for name in everything if fnmatchcase(name, glob)} == set(names):
+            return (glob,)
+    return tuple(escape(name) for name in sorted(names))

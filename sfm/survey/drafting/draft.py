@@ -1,0 +1,212 @@
+"""A survey file drafted from a folder of photographs: every value with where it comes from."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from sfm.errors import GeometryError, PhotographError, SurveyFileError
+from sfm.files.plain_text import as_plain, is_plain
+from sfm.photographs.exif import Metadata, read_metadata
+from sfm.runtime.progress import SILENT, Progress
+from sfm.survey.drafting.camera_groups import CameraGroup, Grouping, SensorWidth, group_photographs
+from sfm.survey.drafting.target_trial import BLURRED_PX, MANY_TARGETS, TargetTrial, try_targets
+from sfm.survey.measuring.target_store import TargetStore
+
+SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".ppm", ".pgm", ".webp")
+FREE = ("c", "x0", "y0", "K1", "K2", "K3", "P1", "P2", "b1", "b2")
+SIGMA_PX, TIE_SIGMA_PX = 0.05, 0.1
+UNIT = "mm"
+SHOWN = 8  # names that a line lists
+
+
+@dataclass(frozen=True)
+class Draft:
+    """A drafted survey."""
+
+    name: str
+    text: str  # of the survey file
+    found: tuple[tuple[str, str], ...]  # what was found, for the terminal: subject, finding
+    remarks: tuple[str, ...]  # what a person should look at
+    left_out: tuple[tuple[str, str], ...]  # photographs and why
+
+
+def draft_survey(
+    folder: Path,
+    *,
+    sensor_width: SensorWidth = lambda make, model: None,
+    store: TargetStore | None = None,
+    progress: Progress = SILENT,
+) -> Draft:
+    """Draft a survey file for the photographs in a folder.
+
+    Args:
+        folder: the photographs, directly in it.
+        sensor_width: a list of cameras, asked where EXIF data do not tell the pixel size.
+        store: keeps the targets measured on trial.
+        progress: told of what is tried.
+
+    Raises:
+        SurveyFileError: no folder, or one without photographs.
+        GeometryError: fewer than two readable photographs.
+    """
+    metadata, unreadable = _metadata(folder)
+    grouping = group_photographs(metadata, sensor_width)
+    used = [name for camera in grouping.cameras for name in camera.photographs]
+    if len(used) < 2:
+        raise GeometryError(
+            f"{folder}: {len(used)} photographs of one camera, at least 2 are needed"
+            + "".join(f"; {name}: {why}" for name, why in (*unreadable, *grouping.left_out)[:SHOWN])
+        )
+    trial = try_targets([folder / name for name in used], store=store, progress=progress)
+    name = as_plain(folder.resolve().name) or "survey"
+    left_out = (*unreadable, *grouping.left_out)
+    return Draft(
+        name,
+        _text(name, folder, grouping, trial, left_out),
+        _found(grouping, trial),
+        _remarks(grouping, trial),
+        left_out,
+    )
+
+
+def _metadata(folder: Path) -> tuple[dict[str, Metadata], tuple[tuple[str, str], ...]]:
+    """Size and EXIF data of the photographs of a folder, and which cannot be read."""
+    if not folder.is_dir():
+        raise SurveyFileError(f"{folder}: no such folder")
+    files = sorted(path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES and path.is_file())
+    if not files:
+        others = sorted(path.name for path in folder.iterdir())
+        holds = f"it holds {', '.join(map(as_plain, others[:SHOWN]))}" if others else "it is empty"
+        raise SurveyFileError(f"{folder}: no photographs ({', '.join(SUFFIXES)}), {holds}")
+    metadata, unreadable = {}, []
+    for path in files:
+        if not is_plain(path.name):
+            unreadable.append((as_plain(path.name), "its name has control or invisible characters"))
+            continue
+        try:
+            metadata[path.name] = read_metadata(path)
+        except PhotographError as error:
+            unreadable.append((path.name, str(error).removeprefix(f"{path.name}: ")))
+    return metadata, tuple(unreadable)
+
+
+def _text(
+    name: str, folder: Path, grouping: Grouping, trial: TargetTrial, left_out: Sequence[tuple[str, str]]
+) -> str:
+    lines = [
+        "# Drafted from the photographs; every value may be changed, and what is measured already is kept.",
+        "[survey]",
+        f"name = {_quoted(name)}",
+        f"unit = {_quoted(UNIT)}  # of the object coordinates; write the one of your scale bars",
+    ]
+    for camera in grouping.cameras:
+        lines += ["", *_camera_lines(camera)]
+    if left_out:
+        lines += ["", "# Left out:"]
+        lines += [f"#   {name}: {as_plain(why)}" for name, why in left_out]
+    lines += ["", *_target_lines(trial)]
+    lines += ["", "[datum]", 'kind = "free"  # shape first; "control" with known points']
+    lines += ["", *_example_lines(trial)]
+    sigma = SIGMA_PX if trial.codes != "none" else TIE_SIGMA_PX
+    lines += [
+        "",
+        "[adjust]",
+        f"sigma_px = {sigma:g}  # of an image coordinate before adjusting; the report says what fits",
+        "",
+        "[compare]",
+        'backend = "colmap"  # adjust with COLMAP too and compare; "none" saves the time',
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def _camera_lines(camera: CameraGroup) -> list[str]:
+    globs = camera.globs[0] if len(camera.globs) == 1 else list(camera.globs)
+    lines = [
+        f"# {len(camera.photographs)} photographs of {camera.size_px[0]} x {camera.size_px[1]} px",
+        "[[camera]]",
+        f"name = {_quoted(camera.name)}",
+        f"images = {json.dumps(globs, ensure_ascii=False)}",
+        f"pixel_mm = [{camera.pixel_mm[0]:.7g}, {camera.pixel_mm[1]:.7g}]  # {camera.pixel_source}",
+        f"c_mm = {camera.c_mm:.6g}  # start value: {camera.c_source}",
+        'model = "brown"',
+        f"free = {json.dumps(list(FREE))}",
+    ]
+    return lines + [f"# {as_plain(remark)}" for remark in camera.remarks]
+
+
+def _target_lines(trial: TargetTrial) -> list[str]:
+    counted = ", ".join(f"{family} {count}" for family, count in trial.counts)
+    lines = [f"# Tried on {', '.join(trial.photographs)}; codes that two of them have in common: {counted}"]
+    if trial.codes == "none":
+        return [*lines, "# No coded targets: points of natural texture take their place.", "[tie_points]"]
+    return [*lines, "[targets]", f"codes = {_quoted(trial.codes)}", f"polarity = {_quoted(trial.polarity)}"]
+
+
+def _example_lines(trial: TargetTrial) -> list[str]:
+    first, second = trial.repeated[:2] if len(trial.repeated) > 1 else ("1", "2")
+    return [
+        "# The scale comes from a measured distance between two targets (repeat the section for more):",
+        "# [[scale_bar]]",
+        f"# from = {_quoted(first)}",
+        f"# to = {_quoted(second)}",
+        f"# length = 1000.0  # {UNIT}",
+        f"# sigma = 0.05  # {UNIT}",
+        "#",
+        "# Known coordinates, a table id,X,Y,Z[,sX,sY,sZ] beside this file:",
+        "# [control]",
+        '# file = "control.csv"',
+    ]
+
+
+def _found(grouping: Grouping, trial: TargetTrial) -> tuple[tuple[str, str], ...]:
+    """What was found, for the terminal."""
+    found = [
+        (
+            f"camera {camera.name}",
+            f"{len(camera.photographs)} photographs, {camera.size_px[0]} x {camera.size_px[1]} px, c "
+            f"{camera.c_mm:.4g} mm ({camera.c_source}), pixel {1000 * camera.pixel_mm[0]:.4g} um "
+            f"({camera.pixel_source})",
+        )
+        for camera in grouping.cameras
+    ]
+    if trial.codes != "none":
+        repeated = f"{len(trial.repeated)} codes that two of {len(trial.photographs)} photographs have"
+        found.append(("targets", f"{trial.codes}, {trial.polarity}; {repeated}"))
+    else:
+        found.append(("targets", "none with codes: points of natural texture"))
+    return tuple(found)
+
+
+def _remarks(grouping: Grouping, trial: TargetTrial) -> tuple[str, ...]:
+    remarks = [f"camera {camera.name}: {line}" for camera in grouping.cameras for line in camera.remarks]
+    assumed = [camera.name for camera in grouping.cameras if camera.assumed]
+    if assumed:
+        remarks.append(
+            f"camera {', '.join(assumed)}: the files do not tell the size of the pixels or the focal length; "
+            "shapes and angles do not depend on that, c in mm does. If it matters, give sensor_mm = [width, "
+            "height] and c_mm"
+        )
+    if len(grouping.cameras) > 1:
+        each = "; ".join(f"{camera.name} {len(camera.photographs)}" for camera in grouping.cameras)
+        remarks.append(
+            f"{len(grouping.cameras)} cameras or settings (photographs: {each}); make them one [[camera]] if "
+            "they are one"
+        )
+    if trial.blur_px > BLURRED_PX:
+        remarks.append(
+            f"edges of targets are blurred by {trial.blur_px:.1f} px (sigma): out of focus or shaken"
+        )
+    if trial.codes == "none" and trial.circles >= MANY_TARGETS:
+        remarks.append(
+            f"{trial.circles:.0f} circles in a photograph, but no codes of a known family: photographs are "
+            "oriented by texture; coded targets among the circles would do it better"
+        )
+    return tuple(remarks)
+
+
+def _quoted(text: str) -> str:
+    """A TOML basic string; JSON writes a subset of them."""
+    return json.dumps(text, ensure_ascii=False)

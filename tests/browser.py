@@ -1,0 +1,64 @@
+"""A real browser for tests of pages: Debian's chromium driven by playwright, without a graphics card."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+ARGUMENTS = [
+    "--no-sandbox",
+    "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader",
+    "--disable-gpu-sandbox",
+]
+WAIT_MS = 60_000  # for a page on a busy machine
+MISSING = "no chromium or no playwright here: pages are not tried in a real browser"
+
+
+@contextmanager
+def chromium() -> Iterator[Any]:
+    """Give a running browser; the test is skipped where there is none."""
+    path = shutil.which("chromium") or shutil.which("chromium-browser")
+    try:
+        from playwright.sync_api import sync_playwright
+    except ImportError:
+        path = None
+    if path is None:
+        pytest.skip(MISSING)
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=path, args=ARGUMENTS)
+        yield browser
+        browser.close()
+
+
+class Tab:
+    """A page in the browser, with everything that it complained of and asked for."""
+
+    def __init__(self, browser: Any, file: Path, *, width: int = 1300, **context: Any) -> None:
+        self.context = browser.new_context(viewport={"width": width, "height": 900}, **context)
+        self.page = self.context.new_page()
+        self.complaints: list[str] = []
+        self.requests: list[str] = []
+        self.page.on("console", self._hear)
+        self.page.on("pageerror", lambda error: self.complaints.append(str(error)))
+        self.page.on("request", lambda request: self.requests.append(request.url))
+        self.page.set_default_timeout(WAIT_MS)
+        self.page.goto(file.as_uri())
+
+    def _hear(self, message: Any) -> None:
+        own = "willReadFrequently" in message.text  # tests read the pixels of the page's pictures
+        if message.type in ("error", "warning") and not own:
+            self.complaints.append(message.text)
+
+    def ready(self) -> Any:
+        """Wait until the viewer is there, and return the page."""
+        self.page.wait_for_selector("#explore[data-ready]")
+        return self.page
+
+    def close(self) -> None:
+        self.context.close()

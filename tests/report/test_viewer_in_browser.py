@@ -1,0 +1,306 @@
+"""The viewer in a real browser: chromium with software rendering, from file://, as a person would use it."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from sfm.conventions import IntArray
+from sfm.report.html.view_page import view_page, write_view
+from sfm.report.viewer.pictures import cut_pictures
+from sfm.report.viewer.scene import Bar, Marks, ViewerScene, distance_sigmas
+from sfm.report.viewer.stored_scene import scene_of_stored
+from sfm.stored_result import StoredResult
+from tests.browser import Tab, chromium
+from tests.synthetic import SIZE_PX, make_network, seed_of
+
+EVIL = "<img src=https://example.org/x onerror=document.title='broken'>"
+IMAGES, POINTS = 5, 24
+RADIUS_PX = 9
+REJECTED = 3  # a ray
+
+SELECT = "([kind, index]) => document.getElementById('explore').viewer.hub.tell('select', {kind, index})"
+PLACE = """(j) => {
+  const { scene, model } = document.getElementById('explore').viewer
+  const at = scene.project(scene.local(model.xyz(j)))
+  const box = scene.canvas.getBoundingClientRect()
+  return [box.left + at[0], box.top + at[1]]
+}"""
+PIXELS = """() => {
+  const { scene, model } = document.getElementById('explore').viewer
+  scene.select(null)
+  const over = [scene.photographs.object, scene.given, scene.control, scene.distance]
+  for (const part of over) part.visible = false
+  scene.draw()
+  const copy = document.createElement('canvas')
+  Object.assign(copy, { width: scene.canvas.width, height: scene.canvas.height })
+  const context = copy.getContext('2d')
+  context.drawImage(scene.canvas, 0, 0)
+  const ratio = scene.canvas.width / scene.canvas.clientWidth
+  const seen = model.points.map((_, j) => {
+    const [x, y] = scene.project(scene.local(model.xyz(j)))
+    return [...context.getImageData(x * ratio, y * ratio, 1, 1).data].slice(0, 3)
+  })
+  for (const part of over) part.visible = true
+  return seen
+}"""
+
+
+def grey_of(j: int) -> int:
+    """Return the intensity by which the target of a point is known again."""
+    return 60 + 8 * j
+
+
+def small_scene() -> ViewerScene:
+    network, truth = make_network(seed_of("viewer"), images=IMAGES, points=POINTS, planar=True, noise_px=0.2)
+    rng = seed_of("viewer covariance")
+    spread = np.repeat(np.geomspace(2e-5, 5e-4, POINTS), 3)  # so that points differ in colour
+    root = spread[:, None] * rng.normal(0, 1, (3 * POINTS, 3 * POINTS))
+    joint = root @ root.T / POINTS
+    own = np.array([joint[3 * j : 3 * j + 3, 3 * j : 3 * j + 3] for j in range(POINTS)])
+    network = replace(network, points=(EVIL, *network.points[1:]), images=(EVIL, *network.images[1:]))
+    rejected = np.zeros(len(network.image_points), dtype=bool)
+    rejected[REJECTED] = True
+    stored = StoredResult("viewer", network, truth, own, unit="m", covariance=joint)
+    made = scene_of_stored(stored, rejected=rejected)
+    ellipse = np.tile([float(RADIUS_PX), float(RADIUS_PX), 0.0], (len(made.rays), 1))
+    marks = Marks(np.array([0, 0]), np.array([[50.0, 60.0], [80.0, 60.0]]), np.array([0, 0]), ("too small",))
+    bar = Bar(1, 2, 0.5, 1e-4, 2e-5)
+    return replace(made, rays=replace(made.rays, ellipse=ellipse), marks=marks, bars=(bar,), control=(3,))
+
+
+def photographs(scene: ViewerScene, folder: Path) -> dict[str, Path]:
+    """Draw every target as a disc of the intensity of its point."""
+    found = {}
+    for i, name in enumerate(scene.photographs):
+        picture = np.full(SIZE_PX[::-1], 30, np.uint8)
+        rows: IntArray = np.flatnonzero(scene.rays.photo == i)
+        for k in rows:
+            centre = tuple(int(x) for x in np.rint(scene.rays.xy[k]))
+            cv2.circle(picture, centre, RADIUS_PX, grey_of(int(scene.rays.point[k])), -1)
+        found[name] = folder / f"{i}.png"
+        cv2.imwrite(str(found[name]), picture)
+    return found
+
+
+@pytest.fixture(scope="module")
+def scene() -> ViewerScene:
+    return small_scene()
+
+
+@pytest.fixture(scope="module")
+def page_file(scene: ViewerScene, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("viewer")
+    return write_view(scene, folder / "page.html", source="here", paths=photographs(scene, folder))
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    with chromium() as running:
+        yield running
+
+
+@pytest.fixture(scope="module")
+def tab(browser: Any, page_file: Path) -> Iterator[Tab]:
+    opened = Tab(browser, page_file)
+    opened.ready()
+    yield opened
+    assert opened.complaints == []
+    assert opened.requests[:1] == [page_file.as_uri()]
+    assert all(url.startswith("data:image/jpeg;base64,") for url in opened.requests[1:])
+    assert opened.page.title() == "viewer - Kolinear"  # no name has become markup
+    opened.close()
+
+
+def test_a_click_on_a_point_shows_its_crops(tab: Tab, scene: ViewerScene) -> None:
+    page = tab.page
+    for j in (5, 11):
+        page.mouse.click(*page.evaluate(PLACE, j))
+        page.wait_for_selector(f".v-title:text-is('Point {scene.points[j]}')")
+        own = np.flatnonzero(scene.rays.point == j)
+        shown = page.locator(".v-crop").evaluate_all("cards => cards.map((card) => Number(card.dataset.ray))")
+        assert sorted(shown) == own.tolist()
+        page.wait_for_function(
+            "n => document.querySelectorAll('.v-crop canvas[data-ready]').length === n", arg=len(own)
+        )
+        # Away from the cross in the middle and the vector, inside the disc, its intensity is the point's.
+        greys = page.locator(".v-crop canvas").evaluate_all(
+            "all => all.map((c) => { const d = c.getContext('2d').getImageData(0, 0, c.width, c.height).data;"
+            " const m = []; for (let y = 0.4; y < 0.6; y += 0.01) for (let x = 0.4; x < 0.6; x += 0.01)"
+            " m.push(d[4 * (Math.floor(y * c.height) * c.width + Math.floor(x * c.width))]);"
+            " return m.sort((a, b) => a - b)[m.length >> 1] })"
+        )
+        assert np.abs(np.array(greys) - grey_of(j)).max() <= 3
+
+
+def test_colours_follow_the_legend(tab: Tab, scene: ViewerScene) -> None:
+    page = tab.page
+    bar = page.evaluate(
+        "() => { const c = document.querySelector('.v-legend canvas');"
+        " return Array.from(c.getContext('2d').getImageData(0, 0, c.width, 1).data) }"
+    )
+    colours = np.array(bar).reshape(-1, 4)[:, :3]
+    sigma = np.sqrt(np.trace(scene.covariance, axis1=1, axis2=2) / 3)
+    low, high = page.evaluate(
+        "() => { const { point } = document.getElementById('explore').viewer.scene.scales;"
+        " return [point.from, point.to] }"
+    )
+    assert low <= sigma.min() < sigma.max() <= high
+    for value in (low, high):  # whole decades of the unit of the legend, here µm
+        assert np.log10(value * 1e6) == pytest.approx(round(np.log10(value * 1e6)), abs=1e-9)
+    places = np.log(sigma / low) / np.log(high / low) * (len(colours) - 1)
+    away = np.abs(colours[np.rint(places).astype(int)] - np.array(page.evaluate(PIXELS))).max(axis=1)
+    assert (away <= 6).mean() >= 0.8  # some points lie behind others
+    assert np.abs(colours[0].astype(int) - colours[-1]).max() > 100
+    page.select_option("#points-by", "rays")
+    assert page.locator(".v-legend-name").first.inner_text() == "rays of a point"
+    page.select_option("#points-by", "sigma")
+
+
+def test_tables_are_sorted_filtered_and_walked_through(tab: Tab, scene: ViewerScene) -> None:
+    page = tab.page
+    table = page.locator(".v-table").first
+    table.get_by_role("button", name="RMS [px]").click()
+    first = table.locator("tbody tr[data-row]").first
+    assert int(first.get_attribute("data-row")) == int(np.argmax(scene.point_rms_px))
+    assert table.locator("th[aria-sort=descending]").count() == 1
+    table.get_by_role("button", name="RMS [px]").click()
+    assert int(first.get_attribute("data-row")) == int(np.argmin(scene.point_rms_px))
+    median = float(np.median(scene.point_rms_px))
+    table.locator("input[type=search]").fill(f"rms > {median!r}")
+    above = int((scene.point_rms_px.astype(np.float32) > median).sum())
+    assert table.locator(".v-count").inner_text() == f"{above} of {POINTS}"
+    table.locator("input[type=search]").fill("nothing >> 3")
+    assert table.locator("input.v-wrong").count() == 1
+    table.locator("input[type=search]").fill("")
+    table.get_by_role("button", name="point", exact=True).click()
+    table.locator(".v-rows").focus()
+    page.keyboard.press("Home")
+    page.keyboard.press("ArrowDown")
+    chosen = int(table.locator("tr.v-chosen").get_attribute("data-row"))
+    assert page.locator(".v-title").inner_text() == f"Point {scene.points[chosen]}"
+
+
+def test_tables_are_copied_as_csv(browser: Any, page_file: Path, scene: ViewerScene) -> None:
+    tab = Tab(browser, page_file)
+    page = tab.ready()
+    page.evaluate("() => { navigator.clipboard.writeText = async (text) => { window.copied = text } }")
+    page.locator(".v-table").first.get_by_role("button", name="Copy as CSV").click()
+    page.wait_for_function("window.copied")
+    rows = list(csv.reader(io.StringIO(page.evaluate("window.copied"))))
+    assert [row[0] for row in rows[1:]] == list(scene.points)
+    assert rows[0][:4] == ["point", "X [m]", "Y [m]", "Z [m]"]
+    xyz = np.array([[float(x) for x in row[1:4]] for row in rows[1:]])
+    np.testing.assert_allclose(xyz, scene.xyz, rtol=1e-11)
+    tab.close()
+
+
+def test_a_row_a_search_and_a_photograph_choose_the_same(tab: Tab, scene: ViewerScene) -> None:
+    page = tab.page
+    find = page.get_by_label("find by name")
+    find.fill("image 3")
+    find.press("Enter")
+    page.wait_for_selector(".v-title:text-is('Photograph image 3')")
+    page.wait_for_selector(".v-photo[data-ready='1']")
+    assert page.locator(".v-rays").count() == 0
+    box = page.locator(".v-photo").bounding_box()
+    k = int(np.flatnonzero(scene.rays.photo == 2)[4])
+    x, y = (scene.rays.xy[k] + 0.5) / SIZE_PX
+    page.mouse.click(box["x"] + x * box["width"], box["y"] + y * box["height"])
+    page.wait_for_selector(f".v-title:text-is('Point {scene.points[scene.rays.point[k]]}')")
+
+
+def test_rejected_candidates_tell_their_reason(tab: Tab) -> None:
+    page = tab.page
+    page.evaluate(SELECT, ["photograph", 0])
+    page.wait_for_selector(".v-photo[data-ready='1']")
+    assert page.locator(".v-title").inner_text() == f"Photograph {EVIL}"
+    box = page.locator(".v-photo").bounding_box()
+    page.mouse.move(box["x"] + 50.5 / SIZE_PX[0] * box["width"], box["y"] + 60.5 / SIZE_PX[1] * box["height"])
+    assert page.locator(".v-told").inner_text() == "x 50.0, y 60.0 px: too small"
+
+
+def test_distance_has_its_sigma_from_the_joint_covariance(tab: Tab, scene: ViewerScene) -> None:
+    page = tab.page
+    page.evaluate(SELECT, ["point", 4])
+    page.get_by_role("button", name="Measure a distance from here").click()
+    page.evaluate(SELECT, ["point", 9])
+    words = page.locator(".v-length").inner_text()
+    length = float(np.linalg.norm(scene.xyz[9] - scene.xyz[4]))
+    assert float(words.split()[0]) == pytest.approx(length, abs=1e-4)
+    assert scene.distance_sigma is not None
+    n = POINTS
+    sigma = scene.distance_sigma[4 * n - 4 * 5 // 2 + 9 - 5]
+    assert float(words.split("sigma ")[1].split()[0]) == pytest.approx(sigma * 1e6, rel=0.006)
+    assert "covariance of all points" in words
+
+
+def test_sigma_of_a_distance_is_that_of_the_law_of_propagation() -> None:
+    rng = seed_of("distance")
+    xyz = rng.normal(size=(4, 3))
+    root = rng.normal(0, 1e-3, (12, 12))
+    joint = root @ root.T
+    drawn = xyz.ravel() + rng.multivariate_normal(np.zeros(12), joint, 40_000)
+    drawn = drawn.reshape(-1, 4, 3)
+    pairs = [(i, j) for i in range(4) for j in range(i + 1, 4)]
+    spread = [np.linalg.norm(drawn[:, j] - drawn[:, i], axis=1).std() for i, j in pairs]
+    np.testing.assert_allclose(distance_sigmas(xyz, joint), spread, rtol=0.03)
+
+
+def test_crops_without_room_are_shown_from_beside_the_page(
+    browser: Any, scene: ViewerScene, tmp_path: Path
+) -> None:
+    pictures = cut_pictures(scene, photographs(scene, tmp_path), budget_mb=0.0, beside="pictures")
+    (tmp_path / "pictures").mkdir()
+    for name, content in pictures.beside.items():
+        (tmp_path / "pictures" / name).write_bytes(content)
+    (tmp_path / "page.html").write_text(view_page(scene, pictures, "here"), encoding="utf-8")
+    tab = Tab(browser, tmp_path / "page.html")
+    page = tab.ready()
+    for j in (7, 20):
+        page.evaluate(SELECT, ["point", j])
+        page.wait_for_function("document.querySelectorAll('.v-crop canvas:not([data-ready])').length === 0")
+        crop = page.locator(".v-crop canvas").first
+        data = np.frombuffer(crop.screenshot(), np.uint8)
+        seen = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE)
+        h, w = seen.shape
+        middle = seen[int(0.4 * h) : int(0.6 * h), int(0.4 * w) : int(0.6 * w)]
+        assert abs(float(np.median(middle)) - grey_of(j)) <= 4
+    assert tab.complaints == []
+    assert all(url.startswith(tmp_path.as_uri() + "/") for url in tab.requests)
+    tab.close()
+    for path in (tmp_path / "pictures").iterdir():  # as where the page alone was mailed
+        path.unlink()
+    alone = Tab(browser, tmp_path / "page.html")
+    page = alone.ready()
+    page.evaluate(SELECT, ["point", 9])
+    page.locator(".v-nocrop", has_text="not beside this page").first.wait_for()
+    alone.close()
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_narrow_screens_need_no_sideways_scrolling(browser: Any, page_file: Path, scheme: str) -> None:
+    tab = Tab(browser, page_file, width=400, color_scheme=scheme)
+    page = tab.ready()
+    for chosen in (["point", 5], ["photograph", 1]):
+        page.evaluate(SELECT, chosen)
+        assert page.evaluate("document.documentElement.scrollWidth") <= 400
+    assert tab.complaints == []
+    tab.close()
+
+
+def test_without_a_script_the_page_still_tells_its_figures(browser: Any, page_file: Path) -> None:
+    tab = Tab(browser, page_file, java_script_enabled=False)
+    text = tab.page.inner_text("body")
+    assert f"{IMAGES} photographs, {POINTS} points" in text
+    assert "RMS residual" in text
+    assert not tab.page.locator("#explore").is_visible()
+    tab.close()

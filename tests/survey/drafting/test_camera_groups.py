@@ -1,0 +1,87 @@
+"""Which photographs were taken with one camera, by what their files and names say."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+from sfm.photographs.exif import Metadata
+from sfm.survey.drafting.camera_groups import group_photographs
+
+PHONE = Metadata((4000, 3000), "Maker", "Phone 7", 4.2, None, (0.0015, 0.0015), 1)
+BARE = Metadata((2000, 1333), None, None, None, None, None, 1)
+
+
+def photographs(*of: tuple[str, Metadata]) -> dict[str, Metadata]:
+    return dict(of)
+
+
+def test_make_model_serial_lens_focal_length_and_size_tell_cameras_apart() -> None:
+    for other in (
+        replace(PHONE, make="Other"),
+        replace(PHONE, model="Phone 8"),
+        replace(PHONE, serial="2"),
+        replace(PHONE, lens="wide"),
+        replace(PHONE, focal_mm=6.3),
+        replace(PHONE, size_px=(2000, 1500)),
+    ):
+        taken = {f"a{k}.jpg": PHONE for k in range(3)} | {f"b{k}.jpg": other for k in range(2)}
+        found = group_photographs(taken)
+        assert [len(one.photographs) for one in found.cameras] == [3, 2]
+        assert [one.globs for one in found.cameras] == [("a*.jpg",), ("b*.jpg",)]
+        assert len({one.name for one in found.cameras}) == 2 and not found.left_out
+
+
+def test_photographs_of_interleaved_names_are_listed() -> None:
+    wide = replace(PHONE, focal_mm=2.1)
+    taken = {f"IMG_{k}.jpg": (wide if k % 2 else PHONE) for k in range(6)}
+    first, second = group_photographs(taken).cameras
+    assert first.globs == ("IMG_0.jpg", "IMG_2.jpg", "IMG_4.jpg")
+    assert second.globs == ("IMG_1.jpg", "IMG_3.jpg", "IMG_5.jpg")
+
+
+def test_names_stand_for_cameras_where_no_file_names_one() -> None:
+    taken = {name: BARE for name in ("043_1.tif", "043_2.tif", "671_1.tif", "671_2.tif", "671_3.tif")}
+    assert [one.globs for one in group_photographs(taken).cameras] == [("671_*.tif",), ("043_*.tif",)]
+    taken = {name: BARE for name in ("IMG_20240101_1.jpg", "IMG_20240101_2.jpg", "IMG_20240102_1.jpg")}
+    assert [one.globs for one in group_photographs(taken).cameras] == [("IMG_*.jpg",)]
+
+
+@pytest.mark.parametrize(
+    ("odd", "why"),
+    [
+        (replace(PHONE, size_px=(3000, 4000)), "upright"),
+        (replace(PHONE, size_px=(800, 600)), "800 x 600 px, the others have 4000 x 3000 px"),
+        (replace(PHONE, focal_mm=8.0), "c = 8 mm, the others have 4.2 mm"),
+        (replace(PHONE, serial="77"), "camera Maker Phone 7 77"),
+    ],
+)
+def test_a_single_photograph_of_another_camera_is_left_out(odd: Metadata, why: str) -> None:
+    found = group_photographs({f"a{k}.jpg": PHONE for k in range(3)} | {"odd.jpg": odd})
+    assert [one.photographs for one in found.cameras] == [("a0.jpg", "a1.jpg", "a2.jpg")]
+    ((name, reason),) = found.left_out
+    assert name == "odd.jpg" and why in reason
+
+
+def test_where_pixel_and_principal_distance_come_from() -> None:
+    def camera(one: Metadata, width: float | None = None) -> tuple[float, float, str, bool]:
+        (found,) = group_photographs({"a.jpg": one, "b.jpg": one}, lambda make, model: width).cameras
+        return found.pixel_mm[0], found.c_mm, found.pixel_source, found.assumed
+
+    assert camera(PHONE) == (0.0015, 4.2, "EXIF data", False)
+    silent = replace(PHONE, pixel_mm=None)
+    assert camera(silent, 6.0) == (6.0 / 4000, 4.2, "Maker Phone 7 in COLMAP's list of cameras", False)
+    pixel, c, source, assumed = camera(silent)
+    assert assumed and c == 4.2 and c / pixel == pytest.approx(1.2 * 4000) and "ASSUMED" in source
+    pixel, c, source, assumed = camera(BARE)
+    assert assumed and c / pixel == pytest.approx(1.2 * 2000) and pixel == 36 / 2000
+
+
+def test_resampled_and_turned_photographs_are_told() -> None:
+    small = replace(PHONE, taken_px=(8000, 6000))
+    (found,) = group_photographs({"a.jpg": small, "b.jpg": replace(small, orientation=6)}).cameras
+    assert any("took 8000 x 6000 px: resampled or cropped" in line for line in found.remarks)
+    assert any("1 of 2 photographs are marked as turned" in line for line in found.remarks)
+    (found,) = group_photographs({"a.jpg": replace(PHONE, taken_px=(3000, 4000)), "b.jpg": PHONE}).cameras
+    assert found.remarks == ()

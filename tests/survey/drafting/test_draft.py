@@ -1,0 +1,133 @@
+"""From a folder of photographs to a result, with no file written by hand."""
+
+from __future__ import annotations
+
+import csv
+import sys
+import tomllib
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from PIL import ExifTags, Image
+from PIL.TiffImagePlugin import IFDRational
+
+from adapters.colmap.sensor_widths import sensor_width_mm
+from sfm import cli
+from sfm.survey.drafting.draft import draft_survey
+from sfm.survey.inputs.survey_file import read_survey_file
+from tests.surveys import write_photograph_survey
+
+
+def kolinear(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
+    monkeypatch.setattr(sys, "argv", ["kolinear", *map(str, arguments)])
+    try:
+        cli.main()
+    except SystemExit as end:
+        return int(end.code or 0)
+    return 0
+
+
+def sizes(result: Path) -> np.ndarray:
+    """Distances between all coded points, in units of their mean: what a free network without scale has."""
+    with (result / "points.csv").open(newline="") as file:
+        rows = sorted((row["id"], *(float(row[a]) for a in "XYZ")) for row in csv.DictReader(file))
+    xyz = np.array([row[1:] for row in rows if row[0].isdigit()])
+    distance = np.linalg.norm(xyz[:, None] - xyz, axis=-1)
+    return distance / distance.mean()
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Photographs with what lies about in such folders; no survey file."""
+    photographs = tmp_path_factory.mktemp("drafting") / 'plate "A"'
+    write_photograph_survey(photographs, "drafted").unlink()
+    (photographs / "notes.txt").write_text("lunch at 12")
+    (photographs / "broken.jpg").write_bytes(b"no photograph")
+    cv2.imwrite(str(photographs / "screenshot.png"), np.full((300, 200), 90, dtype=np.uint8))
+    return photographs
+
+
+def test_a_folder_becomes_a_result(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert kolinear(monkeypatch, "run", folder, "--out", "mine/first") == 0
+    told = capsys.readouterr()
+    assert (
+        "broken.jpg: not a photograph" in told.err and "screenshot.png: the only one of 200 x 300" in told.err
+    )
+    assert "targets: ring14, dark" in told.err and "scale is undefined" in told.out
+    first = sizes(tmp_path / "mine/first")
+    assert len(first) == 20 and "112 accepted, 0 rejected" in told.out
+
+    survey = tmp_path / "mine/first.toml"
+    survey.write_text(survey.read_text().replace('kind = "free"', 'kind = "minimal"'))
+    capsys.readouterr()
+    assert kolinear(monkeypatch, "run", folder, "--out", "mine/first") == 0
+    told = capsys.readouterr()
+    assert f"Running {Path('mine/first.toml')}, which is there already" in told.err
+    assert "minimal" in told.out, "the file that a person changed is run as it is"
+    np.testing.assert_allclose(sizes(tmp_path / "mine/first"), first, atol=1e-9)
+
+
+def test_init_writes_only_the_file_and_replaces_none(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert kolinear(monkeypatch, "init", folder, "--out", "draft.toml") == 0
+    assert [path.name for path in tmp_path.iterdir()] == ["draft.toml"]
+    described = read_survey_file(tmp_path / "draft.toml")
+    assert described.name == 'plate "A"' and described.targets.codes == "ring14"
+    assert described.cameras[0].images == ("photo *.png",)
+    assert tomllib.loads((tmp_path / "draft.toml").read_text())["datum"] == {"kind": "free"}
+    capsys.readouterr()
+    assert kolinear(monkeypatch, "init", folder, "--out", "draft.toml") == 2
+    assert "draft.toml" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("names", "line"),
+    [
+        ((), "no photographs"),
+        (("a.txt",), "no photographs"),
+        (("a.jpg", "b.jpg"), "at least 2 are needed"),
+    ],
+)
+def test_folders_that_are_no_survey(
+    names: tuple[str, ...],
+    line: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    photographs = tmp_path / "photographs"
+    photographs.mkdir()
+    for name in names:
+        (photographs / name).write_bytes(b"nothing")
+    monkeypatch.chdir(tmp_path)
+    assert kolinear(monkeypatch, "run", photographs) == 2
+    error = capsys.readouterr().err
+    assert line in error and error.count("\n") == 1
+    assert [path.name for path in tmp_path.iterdir()] == ["photographs"], "nothing is left behind"
+
+
+def test_a_changed_focal_length_and_hostile_names_make_a_file_that_reads(tmp_path: Path) -> None:
+    for k in range(6):
+        exif = Image.Exif()
+        exif[ExifTags.Base.Make], exif[ExifTags.Base.Model] = "Ma]ker", 'X"\n[[camera]]'
+        exif[ExifTags.IFD.Exif] = {ExifTags.Base.FocalLength: IFDRational(50 if k < 4 else 85, 1)}
+        name = f'a [{k}] "*" # \\{k}.jpg'
+        Image.new("L", (120, 80), 10 * k).save(tmp_path / name, exif=exif)
+    draft = draft_survey(tmp_path)
+    (tmp_path / "survey.toml").write_text(draft.text, encoding="utf-8")
+    described = read_survey_file(tmp_path / "survey.toml")
+    assert [len(one.images or ()) for one in described.cameras] == [4, 2]
+    assert [one.c_mm for one in described.cameras] == [50.0, 85.0]
+    assert described.tie_points is not None, "there is no target"
+
+
+def test_colmap_knows_the_width_of_a_sensor() -> None:
+    assert sensor_width_mm("OLYMPUS OPTICAL CO.,LTD", "C4040Z") == pytest.approx(7.11)
+    assert sensor_width_mm("Nobody", "Nothing 1") is None

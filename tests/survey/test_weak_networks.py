@@ -1,0 +1,59 @@
+"""Weak networks from scratch: none is wrong by more than 5 sigma and called good or fair."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from sfm.adjustment.datum import Datum
+from sfm.adjustment.quality.other_solutions import other_solutions
+from sfm.adjustment.solve import adjust
+from sfm.camera import camera_from_values, project
+from tests.survey.weak_networks import outcome_of, study
+from tests.synthetic import make_network, seed_of
+
+
+def test_a_second_solution_of_equal_cost_makes_the_survey_bad() -> None:
+    """Three photographs of a plane, c 17.1 mm: 27.8 mm, 8 sigma wrong and called fair without the search."""
+    found = outcome_of(72)
+    assert found.level == "bad"
+    assert any("Another solution, with c of camera synthetic at 5.7" in line for line in found.remarks)
+
+
+def test_a_narrow_relief_can_be_turned_inside_out() -> None:
+    """Three photographs with a long lens from within 4 degrees: the reflected object fits as well."""
+    network, truth = make_network(seed_of("narrow"), images=3, points=20, planar=True, free=())
+    rng = seed_of("narrow noise")
+    camera = camera_from_values("A", "brown", (2000, 1500), (0.005, 0.005), c_mm=1000.0)
+    xyz = truth.points + np.array([0.0, 0.0, 0.1]) * rng.standard_normal((20, 1))
+    position = np.array([[25.0, 0.0, 500.0], [-25.0, 8.0, 500.0], [0.0, -25.0, 500.0]])
+    rotation = np.stack([_towards(place) for place in position])
+    seen = network.image_points
+    rows = zip(seen.image, seen.point, strict=True)
+    xy = np.concatenate([project(camera, position[i], rotation[i], xyz[[j]]) for i, j in rows])
+    noisy = replace(network, image_points=replace(seen, xy=xy + 0.3 * rng.standard_normal(xy.shape)))
+    estimate = replace(truth, cameras=(camera,), position=position, rotation=rotation, points=xyz)
+    a = adjust(noisy, estimate, datum=Datum("free"), sigma_px=0.3, reject="none", max_iterations=500)
+    (other,) = other_solutions(a)
+    assert other.reflected and other.moved > 3
+
+
+def _towards(place: np.ndarray) -> np.ndarray:
+    """R of a photograph at a place, looking at the origin."""
+    z = place / np.linalg.norm(place)
+    x = np.cross([0.0, 1.0, 0.0], z)
+    x /= np.linalg.norm(x)
+    return np.stack([x, np.cross(z, x), z], axis=1)
+
+
+def test_a_strong_network_has_one_solution() -> None:
+    network, truth = make_network(seed_of("strong"), images=4, points=30, free=("c",))
+    assert other_solutions(adjust(network, truth, datum=Datum("free"))) == ()
+
+
+@pytest.mark.slow
+def test_no_weak_network_is_wrong_and_believed() -> None:
+    found = study(range(1500))
+    assert not [one.number for one in found if one.is_wrong_and_believed]

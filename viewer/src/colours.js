@@ -1,0 +1,119 @@
+// Values as colours on absolute scales: the same value has the same colour in every report.
+
+import { significant } from "./numbers.js"
+
+// Viridis (Smith and van der Walt 2015): light and dark in order of the value, also in grey; without its darkest
+// tenth, which nobody sees on a dark page.
+const STEPS = [
+  [72, 40, 120], [66, 64, 134], [54, 92, 141], [42, 118, 142], [33, 145, 140],
+  [39, 173, 129], [92, 200, 99], [170, 220, 50], [253, 231, 37],
+]
+const UNKNOWN = [128, 134, 142]
+
+/** A scale of colours from one value to another, in equal parts or in equal ratios. */
+export class Scale {
+  constructor(name, unit, from, to, { log = false, factor = 1, reversed = false } = {}) {
+    Object.assign(this, { name, unit, from, to, log, factor, reversed })
+  }
+
+  /** Place of a value on the scale, 0 to 1. */
+  place(value) {
+    const of = this.log ? (x) => Math.log(Math.max(x, 1e-300)) : (x) => x
+    return Math.min(1, Math.max(0, (of(value) - of(this.from)) / (of(this.to) - of(this.from))))
+  }
+
+  /** Red, green, blue of a value, 0 to 255. */
+  colour(value) {
+    return Number.isFinite(value) ? shade(this.reversed ? 1 - this.place(value) : this.place(value)) : UNKNOWN
+  }
+
+  /** Round values between the ends of the scale. */
+  ticks() {
+    const found = []
+    if (this.log) {
+      const wide = this.to / this.from > 20
+      for (let power = 10 ** Math.floor(Math.log10(this.from)); power <= this.to * 1.001; power *= 10) {
+        for (const step of wide ? [1] : [1, 2, 5]) found.push(step * power)
+      }
+    } else {
+      const step = (this.to - this.from) / 3
+      for (let k = 0; k <= 3; k++) found.push(this.from + k * step)
+    }
+    return found.filter((x) => x >= this.from * 0.999 && x <= this.to * 1.001)
+  }
+
+  words(value) {
+    const shown = value * this.factor
+    if (shown !== 0 && Math.abs(shown) < 1e-3) return shown.toExponential(1).replace(".0e", "e")
+    return `${+significant(shown, 3)}`
+  }
+}
+
+function shade(part) {
+  const at = part * (STEPS.length - 1)
+  const k = Math.min(STEPS.length - 2, Math.floor(at))
+  return STEPS[k].map((low, c) => Math.round(low + (at - k) * (STEPS[k + 1][c] - low)))
+}
+
+/** Scales of the points; that of sigma takes whole decades of the survey's unit. */
+export function pointScales(model) {
+  const sigma = Float64Array.from({ length: model.pointCount }, (_, j) => model.sigma(j))
+  const known = sigma.filter((s) => s > 0).sort()
+  const decade = (x, round) => 10 ** round(Math.log10(x * model.fine.factor)) / model.fine.factor
+  const low = known.length ? decade(known[Math.floor(0.02 * known.length)], Math.floor) : 1e-3
+  const high = known.length ? decade(known[Math.floor(0.98 * known.length)] * 1.0001, Math.ceil) : 1
+  const rms = model.a["point.rms"]
+  const scales = {
+    sigma: new Scale("sigma of a point", model.fine.unit, low, Math.max(high, 10 * low), {
+      log: true,
+      factor: model.fine.factor,
+    }),
+    rays: new Scale("rays of a point", "", 2, 20, { reversed: true }),
+    rms: new Scale("RMS residual of a point", "px", 0.01, 1, { log: true }),
+    angle: new Scale("intersection angle", "deg", 0, 90, { reversed: true }),
+  }
+  const values = { sigma, rays: model.a["point.rays"], rms, angle: model.a["point.angle"] }
+  if (!known.length) delete scales.sigma
+  return { scales, values }
+}
+
+export function photoScale() {
+  return new Scale("RMS residual of a photograph", "px", 0.01, 1, { log: true })
+}
+
+/** Draw a scale with its labels; its ends can be typed. */
+export function drawLegend(scale, element, make, onchange) {
+  const bar = make("canvas", { width: 240, height: 1, className: "v-bar" })
+  const context = bar.getContext("2d")
+  for (let x = 0; x < bar.width; x++) {
+    const part = x / (bar.width - 1)
+    context.fillStyle = `rgb(${shade(scale.reversed ? 1 - part : part).join()})`
+    context.fillRect(x, 0, 1, 1)
+  }
+  const ticks = make("div", { className: "v-ticks" })
+  for (const value of scale.ticks()) {
+    const label = make("span", {}, scale.words(value))
+    label.style.left = `${100 * scale.place(value)}%`
+    ticks.append(label)
+  }
+  const end = (key, words) => {
+    const input = make("input", {
+      className: "v-end",
+      value: scale.words(scale[key]),
+      "aria-label": `${words} of the scale of ${scale.name}`,
+    })
+    input.addEventListener("change", () => {
+      const typed = Number(input.value) / scale.factor
+      const other = scale[key === "from" ? "to" : "from"]
+      const sound = Number.isFinite(typed) && (key === "from" ? typed < other : typed > other)
+      if (sound && !(scale.log && typed <= 0)) scale[key] = typed
+      onchange()
+    })
+    return input
+  }
+  const unit = scale.unit ? ` [${scale.unit}]` : ""
+  element.replaceChildren(
+    make("div", { className: "v-legend-name" }, scale.name + unit),
+    make("div", { className: "v-legend-row" }, end("from", "lower end"), make("div", { className: "v-scale" }, bar, ticks), end("to", "upper end")),
+  )
+}

@@ -1,0 +1,214 @@
+// The viewer of a report: puts scene, panel and tables into the page, and lets each know what is chosen.
+
+import * as THREE from "three"
+import { drawLegend, photoScale, pointScales } from "./colours.js"
+import { MAX_ELLIPSOIDS } from "./ellipsoids.js"
+import { unpack } from "./data.js"
+import { button, choice, Hub, make, tick } from "./page.js"
+import { Panel } from "./panel.js"
+import { roundStep, significant } from "./numbers.js"
+import { Scene } from "./scene.js"
+import { tablesOf } from "./columns.js"
+
+THREE.ColorManagement.enabled = false // colours are those of the legend, to the digit
+
+async function start() {
+  const begun = performance.now()
+  const root = document.getElementById("explore")
+  if (!root) return
+  const model = await unpack("viewer-data")
+  root.hidden = false
+  document.querySelector("nav")?.prepend(make("a", { href: "#explore" }, "Explore"))
+  const hub = new Hub()
+  const canvas = make("canvas", { className: "v-scene", tabIndex: 0 })
+  canvas.setAttribute("role", "application")
+  canvas.setAttribute("aria-label", "Scene in space: arrow keys turn, + and - zoom, Home goes back")
+  const overlay = make("canvas", { className: "v-overlay", "aria-hidden": "true" })
+  const hover = make("div", { className: "v-hover", hidden: true })
+  const legends = make("div", { className: "v-legends" })
+  const stage = make("div", { className: "v-stage" }, canvas, overlay, legends, hover)
+  const tools = make("div", { className: "v-tools v-top" })
+  const panel = make("div", { className: "v-panel", tabIndex: 0, role: "region", "aria-label": "what is chosen" })
+  const tables = make("div", { className: "v-tables" })
+  root.querySelector(".v-app").replaceChildren(tools, make("div", { className: "v-main" }, stage, panel), tables)
+
+  let scene = null
+  try {
+    scene = new Scene(model, canvas, overlay, hub)
+  } catch (error) {
+    stage.replaceChildren(make("p", { className: "v-nogl" }, `This browser shows no WebGL, so there is no scene: ${error.message}`))
+  }
+  if (scene) {
+    scene.renderer.outputColorSpace = THREE.LinearSRGBColorSpace
+    toolbar(model, scene, hub, tools, legends)
+    const thin = make("div", { className: "v-thin", hidden: true })
+    stage.append(thin)
+    hub.on("thin", (part) => {
+      thin.hidden = part === 1
+      if (part > 1) thin.textContent = `one point in ${part} while the scene turns`
+    })
+    hub.on("hover", (told) => showHover(model, stage, hover, told))
+    hub.on("select", (found) => scene.select(found))
+  }
+  new Panel(model, panel, hub, scene ?? { measure() {} })
+  tablesOf(model, hub, tables, scene)
+  document.addEventListener("keydown", (event) => {
+    if (event.key === "Escape" && root.contains(event.target)) hub.tell("select", null)
+  })
+  matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => scene?.invalidate())
+  const print = (on) => {
+    if (!scene) return
+    scene.printing = on
+    scene.draw()
+  }
+  window.addEventListener("beforeprint", () => print(true))
+  window.addEventListener("afterprint", () => print(false))
+  matchMedia("print").addEventListener("change", () => scene?.invalidate())
+  requestAnimationFrame(() => requestAnimationFrame(() => (root.dataset.ready = (performance.now() - begun).toFixed(0))))
+  root.viewer = { model, scene, hub } // for who writes a test
+}
+
+function toolbar(model, scene, hub, tools, legends) {
+  const { scales, values } = pointScales(model)
+  const photos = photoScale()
+  const own = make("div", { className: "v-legend" })
+  const other = make("div", { className: "v-legend" })
+  legends.append(own, other)
+  let by = scales.sigma ? "sigma" : "rms"
+  let byPhoto = "rms"
+  const paint = () => {
+    scene.points.paint(values[by], scales[by])
+    scene.photographs.paint(model.a["photo.rms"], byPhoto === "rms" ? photos : null)
+    drawLegend(scales[by], own, make, paint)
+    other.hidden = byPhoto !== "rms"
+    if (byPhoto === "rms") drawLegend(photos, other, make, paint)
+    scene.scales = { point: scales[by], photograph: photos, values: values[by] }
+    scene.invalidate()
+  }
+  const find = make("input", { type: "search", placeholder: "name of a point or photograph", "aria-label": "find by name" })
+  find.setAttribute("list", "viewer-names")
+  const names = make("datalist", { id: "viewer-names" })
+  find.addEventListener("input", () => suggest(model, find.value, names))
+  find.addEventListener("change", () => findName(model, scene, hub, find))
+  const words = { sigma: "sigma", rays: "rays", rms: "RMS", angle: "intersection angle" }
+  const options = Object.keys(scales).map((key) => [key, words[key]])
+  const views = [["", "view ..."], ["home", "oblique"], ...["+X", "-X", "+Y", "-Y", "+Z", "-Z"].map((v) => [v, `from ${v}`])]
+  const standard = choice("", views, (name) => {
+    if (name) scene.standard(name)
+    standard.firstElementChild.value = ""
+  }, { "aria-label": "standard views" })
+  tools.append(
+    find,
+    names,
+    choice("points by", options, (value) => (by = value) && paint(), { value: by, id: "points-by" }),
+    choice("photographs by", [["rms", "RMS"], ["", "one colour"]], (value) => {
+      byPhoto = value
+      paint()
+    }),
+    standard,
+    tick("orthographic", false, (on) => scene.setOrthographic(on)),
+    tick("names", false, (on) => {
+      scene.names = on
+      scene.invalidate()
+    }),
+    tick("photographs", true, (on) => {
+      scene.photographs.object.visible = on
+      scene.invalidate()
+    }),
+    tick("rays of what is chosen", true, (on) => {
+      scene.rays.on = on
+      scene.select(scene.selected ?? null)
+    }),
+    tick("all rejected rays", false, (on) => {
+      scene.rays.showRejected(on)
+      scene.invalidate()
+    }),
+    ...ellipsoidTools(model, scene),
+    button("save picture", () => savePicture(scene, model.name)),
+  )
+  paint()
+}
+
+/** The box and the slider of the ellipsoids, and by what they are enlarged. */
+function ellipsoidTools(model, scene) {
+  const { ellipsoids } = scene
+  if (!ellipsoids.known) return []
+  const start = Math.log10((0.03 * scene.objectRadius) / ellipsoids.typical)
+  const slider = make("input", { type: "range", min: 0, max: Math.max(1, start + 1.5), step: 0.01, value: start, disabled: true })
+  slider.setAttribute("aria-label", "by what the ellipsoids are enlarged")
+  const told = make("span", { className: "v-count" })
+  const change = () => {
+    const factor = roundStep(10 ** Number(slider.value))
+    ellipsoids.scale(factor)
+    const some = ellipsoids.known > ellipsoids.shown.length ? `, the ${MAX_ELLIPSOIDS} largest of ${ellipsoids.known}` : ""
+    told.textContent = ellipsoids.object.visible ? `1 sigma, ${significant(factor, 1)} times enlarged${some}` : ""
+    scene.invalidate()
+  }
+  slider.addEventListener("input", change)
+  const box = tick("error ellipsoids", false, (on) => {
+    ellipsoids.object.visible = on
+    slider.disabled = !on
+    change()
+  })
+  return [box, slider, told]
+}
+
+function savePicture(scene, name) {
+  scene.draw() // what is drawn is kept only until the browser shows it
+  const whole = make("canvas", { width: scene.canvas.width, height: scene.canvas.height })
+  const context = whole.getContext("2d")
+  context.drawImage(scene.canvas, 0, 0)
+  context.drawImage(scene.overlay, 0, 0)
+  make("a", { href: whole.toDataURL("image/png"), download: `${name.replace(/[^\w.-]+/g, "_")}.png` }).click()
+}
+
+const SUGGESTED = 12
+
+function suggest(model, text, list) {
+  const wanted = text.toLowerCase()
+  const found = []
+  for (const name of [...model.points, ...model.photographs]) {
+    if (found.length === SUGGESTED) break
+    if (name.toLowerCase().includes(wanted)) found.push(make("option", { value: name }))
+  }
+  list.replaceChildren(...found)
+}
+
+function findName(model, scene, hub, input) {
+  const wanted = input.value.trim().toLowerCase()
+  if (!wanted) return
+  for (const exact of [true, false]) {
+    for (const [kind, names] of [["point", model.points], ["photograph", model.photographs]]) {
+      const index = names.findIndex((name) => (exact ? name.toLowerCase() === wanted : name.toLowerCase().includes(wanted)))
+      if (index < 0) continue
+      input.classList.remove("v-wrong")
+      hub.tell("select", { kind, index })
+      scene.centre(kind === "point" ? model.xyz(index) : model.centre(index))
+      return
+    }
+  }
+  input.classList.add("v-wrong")
+}
+
+function showHover(model, stage, box, { found, x, y }) {
+  box.hidden = !found
+  if (!found) return
+  const { kind, index } = found
+  if (kind === "point") {
+    const s = model.sigma(index)
+    const words = Number.isFinite(s) ? `sigma ${significant(s * model.fine.factor)} ${model.fine.unit}, ` : ""
+    box.replaceChildren(make("b", {}, model.points[index]), ` ${words}${model.a["point.rays"][index]} rays, RMS ${significant(model.a["point.rms"][index])} px`)
+  } else {
+    const address = model.picture("thumbnail", index)
+    const words = ` ${model.a["photo.points"][index]} points, RMS ${significant(model.a["photo.rms"][index])} px`
+    box.replaceChildren(make("b", {}, model.photographs[index]), words)
+    if (address) box.append(make("img", { src: address, alt: "", width: 160 }))
+  }
+  const left = x > stage.clientWidth / 2
+  box.style.left = left ? "" : `${x + 14}px`
+  box.style.right = left ? `${stage.clientWidth - x + 14}px` : ""
+  box.style.top = y > stage.clientHeight / 2 ? "" : `${y + 10}px`
+  box.style.bottom = y > stage.clientHeight / 2 ? `${stage.clientHeight - y + 10}px` : ""
+}
+
+start()

@@ -1,0 +1,151 @@
+// What is chosen, in words and pictures: a point with its crops, a photograph with its targets.
+
+import { cropCard, cropFactor, cropLegend } from "./crops.js"
+import { button, facts, make } from "./page.js"
+import { fixed, significant, toPrecision, UNKNOWN } from "./numbers.js"
+import { PhotographView } from "./photoview.js"
+
+const MAX_CROPS = 60 // cards at once; more are shown on demand
+
+export class Panel {
+  constructor(model, element, hub, scene) {
+    Object.assign(this, { model, element, hub, scene, from: -1 })
+    hub.on("select", (found) => this.show(found))
+    this.show(null)
+  }
+
+  show(found) {
+    this.view?.close()
+    this.view = null
+    if (!found) this.empty()
+    else if (found.kind === "point") this.point(found.index)
+    else this.photograph(found.index)
+    this.element.scrollTop = 0
+  }
+
+  empty() {
+    this.element.replaceChildren(
+      make("h3", {}, "Nothing chosen"),
+      make("p", {}, "Click a point or a photograph in the scene, or a row of the tables below."),
+      make(
+        "p",
+        { className: "note" },
+        "Drag: turn. Wheel or + and -: nearer and farther. Right button, or two fingers: move. Arrow keys turn, Home goes back, Escape chooses nothing.",
+      ),
+      ...this.model.notes.page.map((words) => make("p", { className: "note" }, words)),
+    )
+  }
+
+  point(j) {
+    const model = this.model
+    const { unit } = model
+    const s = model.sigmas(j)
+    const [x, y, z] = model.xyz(j)
+    const rays = [...model.raysOfPoint(j)].sort((a, b) => order(model, b) - order(model, a))
+    const rejected = rays.filter((k) => model.rejected(k)).length
+    const fine = (v) => (Number.isFinite(v) ? `${significant(v * model.fine.factor)} ${model.fine.unit}` : UNKNOWN)
+    const coordinates = [x, y, z].map((v, c) => [
+      "XYZ"[c],
+      `${toPrecision(v, s[c])} ${unit}, sigma ${s[c] === 0 ? "fixed" : fine(s[c])}`,
+    ])
+    const factor = cropFactor(model, rays)
+    const cards = make("div", { className: "v-crops" })
+    const add = (from) => {
+      rays.slice(from, from + MAX_CROPS).forEach((k) => cards.append(cropCard(model, k, this.hub, factor)))
+      const left = rays.length - from - MAX_CROPS
+      if (left > 0) {
+        const more = button(`${left} more`, () => {
+          more.remove()
+          add(from + MAX_CROPS)
+        })
+        cards.append(more)
+      }
+    }
+    add(0)
+    this.element.replaceChildren(
+      make("h3", { className: "v-title" }, `Point ${model.points[j]}`),
+      facts([
+        ...coordinates,
+        ["rays", `${rays.length - rejected} accepted${rejected ? `, ${rejected} rejected` : ""}`],
+        ["intersection angle", `${fixed(model.a["point.angle"][j], 1)} deg`],
+        ["RMS residual", `${fixed(model.a["point.rms"][j], 4)} px`],
+        model.control.includes(j) ? ["given as", "control point"] : null,
+      ]),
+      this.distance(j),
+      make("h4", {}, "In the photographs, largest |w| first"),
+      make("p", { className: "note" }, cropLegend(factor)),
+      cards,
+    )
+  }
+
+  /** The distance to another point, from here or to here. */
+  distance(j) {
+    const model = this.model
+    const box = make("div", { className: "v-distance" })
+    const from = this.from
+    if (from >= 0 && from !== j) {
+      box.append(...this.distanceWords(from, j))
+      this.scene.measure(from, j)
+      this.from = -1
+    } else if (from < 0) this.scene.measure(-1, -1)
+    const begin = button("Measure a distance from here", () => {
+      this.from = j
+      begin.replaceWith(make("p", { className: "v-hint" }, `Now choose the other point (from ${model.points[j]}).`))
+    })
+    box.append(begin)
+    return box
+  }
+
+  distanceWords(i, j) {
+    const model = this.model
+    const a = model.xyz(i)
+    const b = model.xyz(j)
+    const d = Math.hypot(b[0] - a[0], b[1] - a[1], b[2] - a[2])
+    const joint = model.distanceSigma(i, j)
+    const alone = model.distanceSigmaAlone(i, j)
+    const sigma = Number.isFinite(joint) ? joint : alone
+    const fine = (v) => `${significant(v * model.fine.factor)} ${model.fine.unit}`
+    const words = Number.isFinite(joint)
+      ? `sigma ${fine(joint)}, from the covariance of all points together.`
+      : Number.isFinite(alone)
+        ? `sigma ${fine(alone)}, from the covariances of the two points alone: ${model.notes.covariance}`
+        : "Its standard deviation is not known: the result has no covariances."
+    const step = [0, 1, 2].map((c) => `d${"XYZ"[c]} ${toPrecision(b[c] - a[c], sigma)}`).join(", ")
+    return [
+      make("h4", {}, `${model.points[i]} \u2013 ${model.points[j]}`),
+      make("p", { className: "v-length" }, make("b", {}, `${toPrecision(d, sigma)} ${model.unit}`), ` ${words}`),
+      make("p", { className: "note" }, `${step} ${model.unit}`),
+    ]
+  }
+
+  photograph(i) {
+    const model = this.model
+    const [x, y, z] = model.centre(i)
+    const s = model.a["photo.sigma"].subarray(6 * i, 6 * i + 6)
+    const angles = model.a["photo.angles"].subarray(3 * i, 3 * i + 3)
+    const rays = model.raysOfPhoto(i)
+    const rejected = rays.filter((k) => model.rejected(k)).length
+    const pair = (value, sigma, unit) =>
+      `${toPrecision(value, sigma)} ${unit}${sigma > 0 ? `, sigma ${significant(sigma)} ${unit}` : ""}`
+    this.view = new PhotographView(model, i, this.hub)
+    this.element.replaceChildren(
+      make("h3", { className: "v-title" }, `Photograph ${model.photographs[i]}`),
+      this.view.element,
+      facts([
+        ["camera", model.camera(i).name],
+        ...[x, y, z].map((v, c) => [`${"XYZ"[c]}0`, pair(v, s[c], model.unit)]),
+        ...["omega", "phi", "kappa"].map((name, c) => [name, pair(angles[c], s[3 + c], "deg")]),
+        ["image points", `${rays.length - rejected} accepted${rejected ? `, ${rejected} rejected` : ""}`],
+        ["RMS residual", `${fixed(model.a["photo.rms"][i], 4)} px`],
+      ]),
+      this.view.reasons(),
+    )
+    this.view.resize()
+  }
+}
+
+/** Rejected rays first, then by |w|, then by the length of the residual. */
+function order(model, k) {
+  const w = model.worstW(k)
+  return (model.rejected(k) ? 1e9 : 0) + (Number.isFinite(w) ? w : model.residual(k))
+}
