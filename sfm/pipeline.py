@@ -17,6 +17,7 @@ from sfm.result import SurveyResult
 from sfm.runtime.progress import SILENT, Progress, StageClock
 from sfm.survey.assembly import assemble_result
 from sfm.survey.correspondences import find_correspondences
+from sfm.survey.inputs.incomplete_cameras import refuse_incomplete_cameras
 from sfm.survey.inputs.measurements import Measurements
 from sfm.survey.inputs.photograph_list import find_photographs
 from sfm.survey.inputs.start import measurements_from_observations, refuse_unknown_photographs
@@ -72,6 +73,8 @@ def _measure(
         return measurements_from_observations(survey)
     files = find_photographs(survey, images_dir=images_dir)
     refuse_unknown_photographs(survey, files.names)
+    if survey.start_cameras is None:
+        refuse_incomplete_cameras(survey.cameras, survey.source, files)
     if survey.tie_points is not None:
         with clock.stage("tie points"):
             return tie_photographs(survey, files, jobs=jobs, progress=clock.progress)

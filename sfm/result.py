@@ -144,16 +144,19 @@ class SurveyResult:
     photographs: tuple[PhotographTargets, ...] = ()  # of every readable photograph; none with [observations]
     control_check: ControlCheck | None = None  # None without control, or where the datum is control
     warnings: tuple[str, ...] = ()  # one line each, in words
+    notes: tuple[str, ...] = ()  # what was chosen where the survey says nothing, and is no fault, likewise
     eccentricity: Eccentricity | None = None  # None where it was not corrected
     no_circles: tuple[str, ...] = ()  # uncoded points left out: their outlines are not images of one circle
     left_out: tuple[LeftOutPoint, ...] = ()  # measured points that are not in the result
     free_network: FreeNetwork | None = None  # None where nothing else took part, or where it has no result
     taken_out: tuple[TakenOut, ...] = ()  # control and scale bars that do not fit and were not used
     other_solutions: tuple[OtherSolution, ...] = ()  # that the image points allow as well
+    undecided: tuple[str, ...] = ()  # of the orientation: which of two is true, one line each
     unused_image_points: int = 0  # of points or photographs that are not in the result, in no other count
     orientation_correlations: tuple[OrientationCorrelation, ...] = ()  # of camera parameters with exterior
     # orientation, the strong ones
     seconds: tuple[StageTime, ...] = field(default_factory=tuple)  # in the order of the stages
+    settings: tuple[tuple[str, str], ...] = ()  # (table of the survey file, what it says) of the survey
     reject: str = "tau"  # how the survey treats gross errors: tau | huber | tukey | none
 
     @property

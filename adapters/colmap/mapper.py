@@ -20,7 +20,7 @@ from adapters.colmap.adjuster import load_pycolmap, quiet
 from adapters.colmap.camera_models import read_model
 from sfm.camera import project
 from sfm.errors import BackendError, one_line
-from sfm.network import Estimate, Network
+from sfm.network import Estimate, Network, rows_of
 
 MODEL = "OPENCV"  # of COLMAP's models the one that calibrates a lens as a survey does
 RANDOM_SEED = 0  # of RANSAC, so that a run repeats as far as threads allow
@@ -98,8 +98,7 @@ def map_photographs(
 def _rms(network: Network, estimate: Estimate) -> float:
     seen = network.image_points
     squares = []
-    for i in range(len(network.images)):
-        rows = np.flatnonzero(seen.image == i)
+    for i, rows in enumerate(rows_of(seen.image, len(network.images))):
         camera = estimate.cameras[network.camera[i]]
         xy = project(camera, estimate.position[i], estimate.rotation[i], estimate.points[seen.point[rows]])
         squares.append(((xy - seen.xy[rows]) ** 2).ravel())

@@ -36,6 +36,7 @@ from adapters.reading.xml_lines import Node, read_xml
 from sfm.camera import Camera, camera_from_values
 from sfm.conventions import FloatArray
 from sfm.errors import OutputError
+from sfm.files.plain_text import shown
 from sfm.network import Estimate, Network, rows_of
 from sfm.similarity import Similarity
 
@@ -59,19 +60,19 @@ def read_metashape(path: Path) -> tuple[Network, Estimate]:
     if not sensors:
         raise chunk.error("no sensors")
     cameras = tuple(_camera(sensor) for sensor in sensors)
-    sensor_index = {sensor.attribute("id"): k for k, sensor in enumerate(sensors)}
+    sensor_index = {sensor.name("id"): k for k, sensor in enumerate(sensors)}
     object_from_chunk = _chunk_transform(chunk)
     nodes = [
         node
         for group in (chunk.one("cameras"), *chunk.one("cameras").all("group"))
         for node in group.all("camera")
     ]
-    images = {node.attribute("id"): i for i, node in enumerate(nodes)}
+    images = {node.name("id"): i for i, node in enumerate(nodes)}
     m = len(nodes)
     position, rotation = np.full((m, 3), np.nan), np.full((m, 3, 3), np.nan)
     camera_index = np.empty(m, dtype=np.int64)
     for i, node in enumerate(nodes):
-        sensor = node.attribute("sensor_id")
+        sensor = node.name("sensor_id")
         if sensor not in sensor_index:
             raise node.error(f"sensor_id {sensor}, there is no such sensor")
         camera_index[i] = sensor_index[sensor]
@@ -157,7 +158,9 @@ def write_metashape(path: Path, network: Network, estimate: Estimate) -> None:
 def _camera(sensor: Node) -> Camera:
     """Read a sensor in the model that says the same."""
     if sensor.attributes.get("type", "frame") != "frame":
-        raise sensor.error(f"sensor of type {sensor.attributes['type']}, only frame sensors can be read")
+        raise sensor.error(
+            f"sensor of type {shown(sensor.attributes['type'])}, only frame sensors can be read"
+        )
     resolution = sensor.one("resolution")
     size = (resolution.side_px("width"), resolution.side_px("height"))
     given = {node.attribute("name"): node for node in sensor.all("property")}

@@ -82,7 +82,7 @@ class Markers:
         if self._below_chunk(nodes) != MARKER:
             return
         node, j = nodes[-1], len(self.labels)
-        identifier = node.attribute("id")
+        identifier = node.name("id")
         if identifier in self._index:
             raise node.error(f"marker id {identifier} is a duplicate")
         if j == MAX_POINTS:
@@ -125,7 +125,7 @@ class Markers:
 
 def _number_of(node: Node, attribute: str, numbers: dict[str, int], most: int) -> int:
     """Return the number of an id, a new one if it is new."""
-    identifier = node.attribute(attribute)
+    identifier = node.name(attribute)
     number = numbers.setdefault(identifier, len(numbers))
     if number == most:
         raise node.error(f"more than {most} different {attribute}, no more are read")

@@ -88,6 +88,8 @@ def _figures(findings: Findings) -> tuple[tuple[str, str], ...]:
     both = result.comparison
     if both is not None:
         word = "stopped early, same optimum" if both.stopped_early else "agrees" if both.agree else "DIFFERS"
+        if both.better is not None and both.agree:
+            word = f"free {', '.join(both.better.free)}: fits {both.better.times:.3g} times better"
         rms = both.comparison.rms_px
         rows.append(
             (
@@ -117,7 +119,7 @@ def _details(findings: Findings) -> tuple[tuple[str, str], ...]:
     rows = [
         ("observations", f"{counts.total}: {counts.image} image coordinates, {counts.control} of control, "
          f"{counts.scale_bars} scale bars; {counts.constraints} constraints, {a.unknowns} unknowns"),
-        *(("global test", words_of_test(test)) for test in findings.statistics.global_tests),
+        *(("global test", words_of_test(test, a)) for test in findings.statistics.global_tests),
     ]  # fmt: skip
     found = result.eccentricity
     if found is not None:

@@ -21,6 +21,7 @@ from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.comparison.camera_conversion import Conversion
 from sfm.comparison.common_problem import common_problem, distortion_held
+from sfm.comparison.own_camera import BetterFit, better_fit
 from sfm.comparison.solutions import Comparison, compare
 from sfm.comparison.unshared import without_sharing
 from sfm.conventions import FloatArray
@@ -49,6 +50,7 @@ class AdjusterComparison:
     )  # the other's covariances of the points with photographs and cameras held
     # (conditional), scaled by our sigma0, object unit^2, (n, 3, 3); None where it has none
     unshared: tuple[str, ...] = ()  # what cameras share in the survey and was held at its result, in words
+    better: BetterFit | None = None  # than the survey's own camera, where the compared one has more free
     stopped_early: bool = False  # whether going on from the other's solution leads to the in-house one
 
     @property
@@ -141,6 +143,7 @@ def compare_adjusters(
         found,
         None if conditional is None else (ours.sigma0 * ours.sigma_px) ** 2 * conditional,
         unshared,
+        better_fit(adjustment, network, ours),
         stopped_early,
     )
 

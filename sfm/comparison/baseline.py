@@ -16,7 +16,7 @@ from sfm.camera import tangents_from_pixel
 from sfm.comparison.solutions import reprojection, rotation_angle_deg
 from sfm.conventions import FloatArray
 from sfm.errors import GeometryError
-from sfm.network import Estimate, ImagePoints, Network
+from sfm.network import Estimate, ImagePoints, Network, rows_of
 from sfm.orientation.intersection import intersect
 from sfm.similarity import Similarity, fit_similarity
 
@@ -112,8 +112,8 @@ def compare_baseline(adjustment: Adjustment, baseline: Baseline, *, seconds: flo
     seen = seen.select(use)
     image = of_survey[seen.image]
     tangents = np.full((len(image), 2), np.nan)
-    for k, camera in enumerate(estimate.cameras):
-        rows = network.camera[image] == k
+    of_camera = rows_of(network.camera[image], len(estimate.cameras))
+    for camera, rows in zip(estimate.cameras, of_camera, strict=True):
         tangents[rows] = tangents_from_pixel(camera, seen.xy[rows])
     known = np.isfinite(tangents).all(axis=1)
     found = intersect(

@@ -17,6 +17,7 @@ from scipy.spatial import cKDTree
 
 from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.errors import GeometryError
+from sfm.network import rows_of
 from sfm.similarity import Similarity, fit_similarity
 from sfm.stored_result import StoredResult
 
@@ -147,9 +148,11 @@ def _points_by_image_points(a: StoredResult, b: StoredResult, images: IntArray, 
     free_a = _free(len(a.network.points), points[:, 0]) & a.estimate.determined
     free_b = _free(len(b.network.points), points[:, 1]) & b.estimate.determined
     found = []
+    of_image_a = rows_of(ours.image, len(a.network.images))
+    of_image_b = rows_of(theirs.image, len(b.network.images))
     for i, j in images:
-        rows_a = np.flatnonzero((ours.image == i) & free_a[ours.point])
-        rows_b = np.flatnonzero((theirs.image == j) & free_b[theirs.point])
+        rows_a = of_image_a[i][free_a[ours.point[of_image_a[i]]]]
+        rows_b = of_image_b[j][free_b[theirs.point[of_image_b[j]]]]
         if not len(rows_a) or not len(rows_b):
             continue
         there = cKDTree(theirs.xy[rows_b]).query(ours.xy[rows_a], distance_upper_bound=NEAR_PX)[1]

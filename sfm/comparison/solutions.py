@@ -12,8 +12,8 @@ import numpy as np
 
 from sfm.adjustment.result import Covariance
 from sfm.camera import Camera, pixel_from_tangents, project, tangents_from_pixel
-from sfm.conventions import FloatArray, IntArray
-from sfm.network import Estimate, Network
+from sfm.conventions import FloatArray
+from sfm.network import Estimate, Network, rows_of
 from sfm.similarity import Similarity, fit_similarity
 
 EFFECT_STEPS = 9  # places along each side of the photograph where interior orientations are compared
@@ -176,8 +176,10 @@ def reprojection(network: Network, estimate: Estimate) -> FloatArray:
     seen = network.image_points
     use = estimate.oriented[seen.image] & estimate.determined[seen.point]
     v = np.zeros((len(seen), 2))
-    for i in np.unique(seen.image[use]):
-        rows: IntArray = np.flatnonzero(use & (seen.image == i))
+    for i, own in enumerate(rows_of(seen.image, len(network.images))):
+        rows = own[use[own]]
+        if not len(rows):
+            continue
         computed = project(
             estimate.cameras[network.camera[i]],
             estimate.position[i],

@@ -14,7 +14,7 @@ from sfm.camera import Camera, camera_from_values, pixel_from_tangents, pixel_ja
 from sfm.comparison.camera_conversion import corresponding_free
 from sfm.distortion.models import Role
 from sfm.errors import GeometryError
-from sfm.network import Estimate, Network
+from sfm.network import Estimate, Network, rows_of
 
 PINHOLE = (Role.FOCAL, Role.X0, Role.Y0)  # parts that a camera without distortion has
 
@@ -35,8 +35,8 @@ def undistort(network: Network, estimate: Estimate, models: tuple[str, ...]) -> 
     seen = network.image_points
     xy, covariance = seen.xy.copy(), seen.covariance.copy()
     ideal = tuple(ideal_camera(camera, models) for camera in estimate.cameras)
-    for k, camera in enumerate(estimate.cameras):
-        rows = np.flatnonzero(network.camera[seen.image] == k)
+    of_camera = rows_of(network.camera[seen.image], len(estimate.cameras))
+    for k, (camera, rows) in enumerate(zip(estimate.cameras, of_camera, strict=True)):
         if not len(rows):
             continue
         uv = tangents_from_pixel(camera, seen.xy[rows])

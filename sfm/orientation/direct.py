@@ -9,6 +9,7 @@ import numpy as np
 
 from sfm.conventions import BoolArray, FloatArray, IntArray, rotation_from_vector, skew
 from sfm.errors import GeometryError
+from sfm.network import rows_of
 from sfm.orientation.intersection import intersect
 from sfm.orientation.resection.least_squares import resect_least_squares
 from sfm.orientation.resection.ransac import resect_robust
@@ -95,8 +96,8 @@ def _resected(
 ) -> tuple[FloatArray, FloatArray]:
     """Start of every photograph by resection on its control points."""
     positions, rotations = np.empty((m, 3)), np.empty((m, 3, 3))
-    for i in range(m):
-        own = (image == i) & known[point]
+    for i, rows in enumerate(rows_of(image, m)):
+        own = rows[known[point[rows]]]
         result = resect_robust(uv[own], control[point[own]], tolerance=START_TOLERANCE)
         if not result.found:
             raise GeometryError(f"direct orientation: photograph {i}: {result.reason}")

@@ -23,6 +23,7 @@ MIN_ANGLE_DEG = 2.0  # smallest ray angle of a point that others are oriented on
 MIN_SHARE = 0.5  # of the rays of a point must meet in it
 TOLERANCE_FACTOR = 6.0  # times the robust spread of the residuals
 ALL_FREE_PHOTOGRAPHS = 6  # from which on all parameters are adjusted
+WEAK_PER_ROUND = 20  # of so many unsupported photographs one is let go before the others are judged anew
 SURPLUS_PER_PARAMETER = 3  # observations beyond the exterior orientations for each free parameter
 
 Refine = Callable[[Network, Estimate], Estimate]
@@ -44,7 +45,7 @@ class Growth:
         self.dropped = np.zeros(len(network.images), dtype=bool)  # does not belong, (m,)
         area = [np.prod(camera.size_px) / camera.c_px**2 for camera in estimate.cameras]
         self.field = np.array(area)[network.camera]  # area of each photograph, squared tangents, (m,)
-        control = network.control
+        control = network.control.complete
         # control that the estimate does not hold to its coordinates is intersected like any other point
         self.fixed = np.zeros(len(network.points), dtype=bool)
         self.fixed[control.point] = (estimate.points[control.point] == control.xyz).all(axis=1)
@@ -55,10 +56,9 @@ class Growth:
     def tangents(self) -> FloatArray:
         """Tangents of all image points with the present interior orientations, (k, 2)."""
         seen = self.network.image_points
-        camera = self.network.camera[seen.image]
         uv = np.full((len(seen), 2), np.nan)
-        for index, one in enumerate(self.estimate.cameras):
-            own = camera == index
+        of_camera = rows_of(self.network.camera[seen.image], len(self.estimate.cameras))
+        for one, own in zip(self.estimate.cameras, of_camera, strict=True):
             uv[own] = tangents_from_pixel(one, seen.xy[own])
         return uv
 
@@ -82,7 +82,7 @@ class Growth:
         Raises:
             GeometryError: nothing orients two photographs; with given values these are not enough.
         """
-        network, control = self.network, self.network.control
+        network, control = self.network, self.network.control.complete
         given = has_given_values(network, self.estimate)
         if given or len(control) >= 3:
             if not given:
@@ -283,22 +283,22 @@ class Growth:
             if not len(weak):
                 break
             share = found.fitting / np.maximum(found.fitting + found.against, 1)
-            i = int(weak[np.argmin(share[weak])])
-            if few[i]:
-                reason = (
-                    f"only {found.fitting[i]} of its {found.known[i]} points fit the network, "
-                    f"{needed[i]} are needed"
-                )
-            else:
-                reason = (
-                    f"{found.confirmed[i]} conditions of its points confirm the network, "
-                    f"{found.against[i]} of its points contradict it: "
-                    "another object, a mirrored picture or wrong codes"
-                )
+            worst = weak[np.argsort(share[weak], kind="stable")][: max(1, len(weak) // WEAK_PER_ROUND)]
             position, rotation = self.estimate.position.copy(), self.estimate.rotation.copy()
-            position[i], rotation[i] = np.nan, np.nan
+            for i in worst.tolist():
+                if few[i]:
+                    self.reasons[i] = (
+                        f"only {found.fitting[i]} of its {found.known[i]} points fit the network, "
+                        f"{needed[i]} are needed"
+                    )
+                else:
+                    self.reasons[i] = (
+                        f"{found.confirmed[i]} conditions of its points confirm the network, "
+                        f"{found.against[i]} of its points contradict it: "
+                        "another object, a mirrored picture or wrong codes"
+                    )
+            position[worst], rotation[worst], self.dropped[worst] = np.nan, np.nan, True
             self.estimate = replace(self.estimate, position=position, rotation=rotation)
-            self.dropped[i], self.reasons[i] = True, reason
             self.intersect()
         return int(self.dropped.sum())
 
@@ -307,8 +307,8 @@ class Growth:
         camera = self.network.camera[self.network.image_points.image]
         residuals = self.residuals_px()
         tolerance = self.tolerance_px.copy()
-        for index in range(len(tolerance)):
-            own = residuals[(camera == index) & np.isfinite(residuals)]
+        for index, rows in enumerate(rows_of(camera, len(tolerance))):
+            own = residuals[rows][np.isfinite(residuals[rows])]
             if len(own):
                 spread = MAD_TO_SIGMA * float(np.median(own))
                 tolerance[index] = np.clip(
@@ -319,7 +319,7 @@ class Growth:
 
 def has_given_values(network: Network, estimate: Estimate) -> bool:
     """Return whether an estimate holds more than cameras and the coordinates of control."""
-    control = network.control
+    control = network.control.complete
     other = estimate.determined
     other[control.point] &= (estimate.points[control.point] != control.xyz).any(axis=1)
     return bool(estimate.oriented.any() or other.any())

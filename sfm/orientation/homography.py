@@ -88,7 +88,7 @@ def _direct_homography(first: FloatArray, second: FloatArray) -> FloatArray:
     T1, T2 = _conditioner(first), _conditioner(second)
     r1, r2 = rays_of(first) @ T1.T, rays_of(second) @ T2.T
     rows = np.einsum("nij,nk->nijk", skew(r2), r1).reshape(-1, 9)
-    h = np.linalg.svd(rows)[2][-1].reshape(3, 3)
+    h = np.linalg.svd(rows, full_matrices=False)[2][-1].reshape(3, 3)
     return np.asarray(np.linalg.inv(T2) @ h @ T1)
 
 

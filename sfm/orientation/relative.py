@@ -58,7 +58,12 @@ class RelativeOrientation:
 
 
 def relative_orientations(
-    first: FloatArray, second: FloatArray, *, tolerance: float, seed: int = 0
+    first: FloatArray,
+    second: FloatArray,
+    *,
+    tolerance: float,
+    seed: int = 0,
+    max_trials: int = RANSAC_TRIALS,
 ) -> tuple[RelativeOrientation, ...]:
     """Return the relative orientations that conjugate rays allow, from nothing but the rays.
 
@@ -67,6 +72,7 @@ def relative_orientations(
         second: the conjugate rays of photograph 2, shape (n, 2).
         tolerance: largest residual of a fitting pair, tangents.
         seed: of the random samples.
+        max_trials: most samples of five points that are tried.
 
     Returns:
         The kind of the first tells what the scene is. Infinite: a rotation explains the rays. Planar: both
@@ -93,7 +99,9 @@ def relative_orientations(
         infinite = _infinite(H, uv1, uv2, on_plane, tolerance)
         if infinite is not None:
             # within a wide tolerance a false base fits every pair of a small one
-            spatial = _spatial(uv1, uv2, NARROW * tolerance, seed) if n >= SPATIAL_POINTS else None
+            spatial = (
+                _spatial(uv1, uv2, NARROW * tolerance, seed, max_trials) if n >= SPATIAL_POINTS else None
+            )
             if spatial is None or not BASE_EXPLAINS * spatial.sigma0 < infinite.sigma0:
                 return (infinite,)
         planar = [
@@ -101,7 +109,7 @@ def relative_orientations(
             for base, R, normal in decompose_homography(H, uv1[on_plane], uv2[on_plane])
         ]
     if spatial is None and n >= SPATIAL_POINTS:
-        spatial = _spatial(uv1, uv2, tolerance, seed)
+        spatial = _spatial(uv1, uv2, tolerance, seed, max_trials)
     if spatial is None:
         if not planar:
             raise GeometryError(
@@ -168,7 +176,9 @@ def _is_planar(H: FloatArray, uv1: FloatArray, uv2: FloatArray, spatial: Relativ
     return bool(ratio <= fdtri(2 * n - 8, spatial.redundancy, CONFIDENCE))
 
 
-def _spatial(uv1: FloatArray, uv2: FloatArray, tolerance: float, seed: int) -> RelativeOrientation | None:
+def _spatial(
+    uv1: FloatArray, uv2: FloatArray, tolerance: float, seed: int, max_trials: int
+) -> RelativeOrientation | None:
     """Five-point start and adjustment by coplanarity; None if fewer than six pairs fit."""
     down = np.array([1.0, -1.0])
     cv2.setRNGSeed(seed)
@@ -179,7 +189,7 @@ def _spatial(uv1: FloatArray, uv2: FloatArray, tolerance: float, seed: int) -> R
         method=cv2.RANSAC,
         prob=RANSAC_CONFIDENCE,
         threshold=tolerance,
-        maxIters=RANSAC_TRIALS,
+        maxIters=max_trials,
     )
     if E is None or E.shape != (3, 3) or mask.sum() < SPATIAL_POINTS:
         return None

@@ -12,6 +12,7 @@ from sfm.survey.inputs.measurements import Measurements
 from sfm.survey.inputs.survey import Survey
 from sfm.survey.other_programs import SurveyComparison
 from sfm.survey.solution import Correspondences, Solution
+from sfm.survey.told_settings import told_settings
 
 
 def assemble_result(
@@ -46,9 +47,12 @@ def assemble_result(
         eccentricity=matched.eccentricity,
         no_circles=matched.no_circles,
         left_out=(*measured.left_out, *solution.left_out),
+        notes=solution.notes,
+        settings=told_settings(survey),
         free_network=solution.free_network,
         taken_out=solution.taken_out,
         other_solutions=solution.others,
+        undecided=start.remarks,
         unused_image_points=solution.unused_image_points + sum(one.image_points for one in measured.left_out),
         reject=survey.reject,
         orientation_correlations=orientation_correlations(adjustment),

@@ -8,7 +8,7 @@ import numpy as np
 
 from sfm.camera import pixel_jacobian
 from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
-from sfm.network import Estimate, ImagePoints, Network
+from sfm.network import Estimate, ImagePoints, Network, rows_of
 from sfm.orientation.eccentricity import CircleViews, ellipse_shape, fit_circles
 from sfm.result import Eccentricity
 from sfm.survey.datum_definition import object_scale
@@ -205,7 +205,7 @@ def _views(
     rotation = estimate.rotation[seen.image]
     outward = estimate.points[seen.point] - estimate.position[seen.image]
     jacobian = np.empty((len(seen), 2, 2))
-    for index, camera in enumerate(estimate.cameras):
-        own = network.camera[seen.image] == index
+    of_camera = rows_of(network.camera[seen.image], len(estimate.cameras))
+    for camera, own in zip(estimate.cameras, of_camera, strict=True):
         jacobian[own] = pixel_jacobian(camera, seen.xy[own])
     return CircleViews(point, shape, np.einsum("kji,kj->ki", rotation, outward), rotation, jacobian)

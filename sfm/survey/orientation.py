@@ -9,24 +9,23 @@ import numpy as np
 from sfm.camera import tangents_from_pixel
 from sfm.conventions import BoolArray
 from sfm.errors import GeometryError
-from sfm.network import Estimate, Network
+from sfm.network import Estimate, Network, rows_of
 from sfm.orientation.intersection import intersect
 from sfm.orientation.sequence import MIN_POINTS, Judge, Orientation, orient
-from sfm.photographs.reading import read_photograph
 from sfm.reduced_network import reduce_network
 from sfm.survey.circles import circle_misfit
-from sfm.survey.inputs.measurements import MeasuredPhotographs, Measurements
+from sfm.survey.codes_found import words_of_codes
+from sfm.survey.free_parameters import choose_free_parameters
+from sfm.survey.inputs.measurements import Measurements
 from sfm.survey.inputs.start import start_values
 from sfm.survey.inputs.survey import Survey
+from sfm.survey.lost_photographs import tell_lost_photographs, try_other_principal_distances
 from sfm.survey.solution import refine
-from sfm.targets.codes.rings import RINGS
-from sfm.targets.detect import find_targets
 
 ORIENTATION_POINTS = (
     400  # of natural texture that take part in the orientation, those with the most rays, and
 )
 CONTROL_OF_CAMERA = 6  # control points in the datum with which two photographs determine their camera
-MAX_NAMES = 10  # photographs in a message
 POINTS_PER_PHOTOGRAPH = 100  # of every photograph at least so many
 
 
@@ -42,22 +41,33 @@ def orient_survey(survey: Survey, measured: Measurements) -> Orientation:
     """
     network = measured.network
     estimate = start_values(survey, network, measured.cameras)
-    try:
+    given = survey.start_orientations is not None or survey.start_points is not None
+
+    def orient_from(values: Estimate) -> Orientation:
         if survey.tie_points:
-            found = _orient_strongest(network, estimate)
-        else:  # given image points are adjusted as they are, and judged by the adjustment
-            found = _orient(
-                network, estimate, contradicting=survey.observations is not None, judge=_judge(measured)
-            )
+            return _orient_strongest(network, values)
+        # given image points are adjusted as they are, and judged by the adjustment
+        return _orient(network, values, contradicting=survey.observations is not None, judge=_judge(measured))
+
+    found, failure = None, None
+    try:
+        found = orient_from(estimate)
     except GeometryError as error:
+        failure = error
         if measured.photographs is not None and _most_in_common(network) < MIN_POINTS:
-            raise GeometryError(_codes_found(survey, measured.photographs)) from error
-        given = survey.start_orientations is not None or survey.start_points is not None
+            raise GeometryError(words_of_codes(survey, measured.photographs)) from error
+    line = ""
+    if not given:
+        found, line = try_other_principal_distances(network, estimate, found, orient_from)
+    if found is None:
         hint = " (correct or complete [approximate], or leave it out)" if given else ""
-        raise GeometryError(f"{error}{hint}") from error
+        hint += f"; {line}" if line else ""
+        raise GeometryError(f"{failure}{hint}") from failure
     warnings = tuple(f"[approximate]: {line}" for line in found.warnings)
-    found, held = _hold_cameras_of_two(survey, network, found)
-    return replace(found, warnings=warnings + found.remarks + held)
+    warnings += (*found.remarks, *([line] if line else []))
+    chosen = choose_free_parameters(survey, network, found.estimate, extend=False)
+    found, held = _hold_cameras_of_two(survey, network, replace(found, estimate=chosen.estimate))
+    return tell_lost_photographs(network, replace(found, warnings=warnings + held))
 
 
 def _orient(
@@ -117,8 +127,8 @@ def _orient_strongest(network: Network, estimate: Estimate) -> Orientation:
     found = _orient(*reduce_network(network, estimate, images, _strongest(network), image_points))
     seen, estimate = network.image_points, found.estimate
     uv = np.full((len(seen), 2), np.nan)
-    for index, camera in enumerate(estimate.cameras):
-        own = network.camera[seen.image] == index
+    of_camera = rows_of(network.camera[seen.image], len(estimate.cameras))
+    for camera, own in zip(estimate.cameras, of_camera, strict=True):
         uv[own] = tangents_from_pixel(camera, seen.xy[own])
     c = min(camera.c_px for camera in estimate.cameras)
     rays = intersect(
@@ -141,8 +151,8 @@ def _strongest(network: Network) -> BoolArray:
     chosen[order[:ORIENTATION_POINTS]] = True
     rank = np.empty(len(order), dtype=np.int64)
     rank[order] = np.arange(len(order))
-    for i in range(len(network.images)):
-        own = seen.point[seen.image == i]
+    for rows in rows_of(seen.image, len(network.images)):
+        own = seen.point[rows]
         chosen[own[np.argsort(rank[own], kind="stable")][:POINTS_PER_PHOTOGRAPH]] = True
     return chosen
 
@@ -151,53 +161,3 @@ def _most_in_common(network: Network) -> int:
     """Return how many points the two photographs with most in common share."""
     common = network.common_points(np.ones(len(network.image_points), dtype=bool))[2]
     return int(common.max(initial=0))
-
-
-def _codes_found(survey: Survey, photographs: MeasuredPhotographs) -> str:
-    """Say how many targets and codes were found where more codes were needed, and what decides on that."""
-    targets = [len(found) for found in photographs.targets]
-    codes = [int((found.code >= 0).sum()) for found in photographs.targets]
-    with_codes = sum(count > 0 for count in codes)
-    settings = survey.targets
-    other = _other_family(survey, photographs)
-    return (
-        f"no two photographs have {MIN_POINTS} coded targets in common, which their orientation needs: "
-        f"{sum(targets)} targets were found in {len(targets)} photographs, {sum(codes)} codes were read in "
-        f"{with_codes} of them{_by_photograph(photographs, codes)}; check in [targets] "
-        f"codes = '{settings.codes}', "
-        f"polarity = '{settings.polarity}' and min_diameter_px = {settings.min_diameter_px:g}{other}"
-    )
-
-
-def _by_photograph(photographs: MeasuredPhotographs, codes: list[int]) -> str:
-    """Say how many codes were read in each of the first photographs, if any were."""
-    if not any(codes):
-        return ""
-    shown = zip(photographs.names[:MAX_NAMES], codes, strict=False)
-    more = " ..." if len(codes) > MAX_NAMES else ""
-    return f" ({', '.join(f'{name}: {count}' for name, count in shown)}{more})"
-
-
-def _other_family(survey: Survey, photographs: MeasuredPhotographs) -> str:
-    """Say which other rings or arcs read more in the photograph with most targets, if any do."""
-    settings = survey.targets
-    if settings.codes not in (*RINGS, "none"):
-        return ""
-    fullest = int(np.argmax([len(found) for found in photographs.targets]))
-    photograph = read_photograph(photographs.paths[fullest], channel=settings.channel)
-    counts = []
-    for family in RINGS:
-        if family == settings.codes:
-            continue
-        found = find_targets(
-            photograph,
-            polarity=settings.polarity,
-            codes=family,
-            min_diameter_px=settings.min_diameter_px,
-        )
-        counts.append((len(np.unique(found.code[found.code >= 0])), family))
-    most, best = max(counts)
-    own = photographs.targets[fullest].code
-    if most < MIN_POINTS or most <= len(np.unique(own[own >= 0])):
-        return ""
-    return f"; in {photographs.names[fullest]} codes = '{best}' reads {most} codes"

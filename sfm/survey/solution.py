@@ -30,6 +30,8 @@ from sfm.survey.datum_definition import (
     scale_to_bars,
 )
 from sfm.survey.exterior import add_exterior
+from sfm.survey.free_parameters import choose_free_parameters
+from sfm.survey.inputs.incomplete_cameras import unlike_squares
 from sfm.survey.inputs.interior import split_cameras, without_idle_cameras
 from sfm.survey.inputs.measurements import Naming
 from sfm.survey.inputs.start import given_values
@@ -75,6 +77,7 @@ class Solution:
     taken_out: tuple[TakenOut, ...]  # control and scale bars that do not fit
     free_network: FreeNetwork | None  # of the image points alone; None where nothing else took part
     others: tuple[OtherSolution, ...]  # that the image points allow as well
+    notes: tuple[str, ...]  # what was chosen where the survey says nothing, one line each
 
 
 def refine(network: Network, estimate: Estimate) -> Estimate:
@@ -106,7 +109,7 @@ def solve_survey(survey: Survey, matched: Correspondences) -> Solution:
     network = scales.network
     needed = matched.min_rays.copy()
     if datum.kind == "control":
-        needed[network.control.point] = 1
+        needed[network.control.complete.point] = 1
     whole, known = placed.network, estimate.determined
     oriented = estimate.oriented
     if datum.kind == "minimal" and matched.given:  # what it holds are the given coordinates
@@ -115,6 +118,8 @@ def solve_survey(survey: Survey, matched: Correspondences) -> Solution:
         estimate = replace(estimate, points=np.where(estimate.determined[:, None], held, np.nan))
     estimate = scale_to_bars(network, estimate, datum)
     frame = given_values(survey, network) if matched.given else estimate
+    chosen = choose_free_parameters(survey, network, estimate, datum=datum.kind)
+    survey, estimate = replace(survey, cameras=chosen.cameras), chosen.estimate
     network, estimate = split_cameras(survey.cameras, network, estimate, survey.start_cameras)
     least = np.where(given_values(survey, network).oriented, GIVEN_IMAGE_POINTS, MIN_IMAGE_POINTS)
     task = _Task(survey, datum, network, needed, least, survey.reject)
@@ -129,7 +134,7 @@ def solve_survey(survey: Survey, matched: Correspondences) -> Solution:
         found = settled.contradiction
         if found is None:
             last, check = settled.estimate, None
-            if datum.kind != "control" and len(settled.part.control) >= 3:
+            if datum.kind != "control" and len(settled.part.control.complete) >= 3:
                 last, check = place_on_control(settled.part, last)
             elif datum.kind == "free":
                 carriers = _on_points(survey, settled.part, last, datum).resolve(settled.part).points
@@ -142,7 +147,7 @@ def solve_survey(survey: Survey, matched: Correspondences) -> Solution:
             if first is not None and not final.converged:  # what seemed better is none: as it was
                 (settled, final, check, others), better = first, ()
                 break
-            if first is not None or not others or others[0].vPv >= 1:
+            if first is not None or not others or not others[0].converges:
                 break
             first = settled, final, check, others
             better = (_words_of_better(final, others[0]),)
@@ -174,7 +179,9 @@ def solve_survey(survey: Survey, matched: Correspondences) -> Solution:
         # every bar is against the control: nothing says which of the two is right
         taken_out = [replace(one, resolved=False) for one in taken_out]
     alone = free_network_of(final)
-    return Solution(final, check, dropped, warnings, left_out, unused, tuple(taken_out), alone, others)
+    return Solution(
+        final, check, dropped, warnings, left_out, unused, tuple(taken_out), alone, others, chosen.notes
+    )
 
 
 def _words_of_better(final: Adjustment, other: OtherSolution) -> str:
@@ -366,6 +373,15 @@ def merge_estimate(estimate: Estimate, part: Estimate, images: BoolArray, points
     return Estimate(part.cameras, position, rotation, xyz)
 
 
+def _pixels_unlike_squares(survey: Survey, estimate: Estimate) -> tuple[str, ...]:
+    """Return what is told of pixels by nominal sensor sizes, of the first camera of each of the survey's."""
+    first = {one.name: camera for one in survey.cameras for camera in reversed(estimate.cameras)
+             if camera.name == one.name or camera.name.startswith(f"{one.name} ")}  # fmt: skip
+    settings = [one for one in survey.cameras if one.name in first]
+    pixels = [(float(first[one.name].pixel_mm[0]), float(first[one.name].pixel_mm[1])) for one in settings]
+    return unlike_squares(settings, pixels, [one.adjusted for one in settings])
+
+
 def _accepted(network: Network, adjustment: Adjustment, images: BoolArray, points: BoolArray) -> BoolArray:
     """Return which image points of the whole network the adjustment of a part of it accepted."""
     seen = network.image_points
@@ -390,4 +406,5 @@ def _warnings(
     if absent:
         lines.append(f"datum points that are not in the network: {', '.join(absent[:MAX_NAMES])}")
     lines += far_principal_distances(survey, adjustment.estimate)
+    lines += _pixels_unlike_squares(survey, adjustment.estimate)
     return (*lines, *datum_warnings(survey, adjustment.network))

@@ -139,6 +139,36 @@ def test_weights_of_two_cameras_are_estimated() -> None:
     assert a.sigma0 == pytest.approx(1, abs=2e-3)
 
 
+def test_weights_that_come_back_in_a_cycle_end_their_estimation(plain: Adjustment) -> None:
+    """Larger standard deviations reject other image points and are not borne out by those that are left."""
+    group = np.zeros(len(plain.rejected), dtype=np.int64)
+    some = np.arange(len(group)) < 10
+    factors: list[float] = []
+
+    def run(factor: FloatArray) -> Adjustment:
+        factors.append(factor[0])
+        few = factor[0] > 10
+        residuals = plain.residuals * (1 if few else 30)
+        return replace(plain, residuals=residuals, rejected=some & few, image_sigma_factor=factor)
+
+    a, factor, settled = estimate_components(run, group, ("all",))
+    assert len(factors) == 3 and not settled
+    assert not a.rejected.any()  # of the adjustments of the cycle the one that rejects fewest
+    assert factor[0] == a.image_sigma_factor[0] < 10
+
+
+def test_weights_that_swing_into_place_are_no_cycle(plain: Adjustment) -> None:
+    group = np.zeros(len(plain.rejected), dtype=np.int64)
+
+    def run(factor: FloatArray) -> Adjustment:
+        return replace(plain, residuals=plain.residuals * 2 / np.sqrt(factor[0]), image_sigma_factor=factor)
+
+    a, factor, settled = estimate_components(run, group, ("all",))
+    assert settled
+    assert factor[0] == pytest.approx(2 ** (2 / 3), rel=0.05)
+    assert by_camera(a).sigma0 / factor == pytest.approx([1, 1], rel=0.1)
+
+
 def test_kinds_of_observation_share_the_redundancy() -> None:
     rng = seed_of("kinds")
     network, truth = make_network(rng, images=8, points=30)

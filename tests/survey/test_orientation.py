@@ -116,7 +116,10 @@ def test_unreadable_files_are_named_once_with_their_reason(
             {"codes": '"ring20"'},
             r"codes = 'ring20', .*; in photo \d\.png codes = 'ring14' reads \d\d? codes$",
         ),
-        ({"polarity": '"bright"'}, r"polarity = 'bright' and min_diameter_px = 6"),
+        (
+            {"polarity": '"bright"'},
+            r"polarity = 'bright' .*; in photo \d\.png polarity = 'dark' reads \d\d? codes$",
+        ),
     ],
 )
 def test_without_codes_the_settings_are_named(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -120,3 +121,18 @@ def test_stated_sigmas_come_back(tmp_path: Path) -> None:
     found = read_image_points(tmp_path / "image_points.csv")
     assert found.sigma is not None
     np.testing.assert_allclose(found.sigma, 0.2)
+
+
+def test_repeated_image_points_are_looked_up_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    network, _ = make_network(seed_of("many repeated"), images=3, points=200)
+    seen = _repeated(network, list(range(500)), [0.0] * 500).image_points
+    looked = 0
+
+    def counted(values: np.ndarray, real: Any = np.flatnonzero) -> np.ndarray:
+        nonlocal looked
+        looked += len(values)
+        return real(values)
+
+    monkeypatch.setattr(np, "flatnonzero", counted)
+    assert len(merge_repeated(seen).same) == 500
+    assert looked <= len(seen)  # not once for each of them

@@ -2,9 +2,10 @@
 
 import { significant } from "./numbers.js"
 
-// Viridis in nine steps (Smith and van der Walt 2015): light and dark in order of the value, also in grey.
+// Viridis (Smith and van der Walt 2015): light and dark in order of the value, also in grey; without its darkest
+// tenth, which nobody sees on a dark page.
 const STEPS = [
-  [68, 1, 84], [71, 44, 122], [59, 81, 139], [44, 113, 142], [33, 144, 141],
+  [72, 40, 120], [66, 64, 134], [54, 92, 141], [42, 118, 142], [33, 145, 140],
   [39, 173, 129], [92, 200, 99], [170, 220, 50], [253, 231, 37],
 ]
 const UNKNOWN = [128, 134, 142]
@@ -42,7 +43,9 @@ export class Scale {
   }
 
   words(value) {
-    return `${+significant(value * this.factor, 3)}`
+    const shown = value * this.factor
+    if (shown !== 0 && Math.abs(shown) < 1e-3) return shown.toExponential(1).replace(".0e", "e")
+    return `${+significant(shown, 3)}`
   }
 }
 

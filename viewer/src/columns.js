@@ -1,5 +1,6 @@
 // The tables below the scene: points, photographs, image points, what was rejected, scale bars.
 
+import { range } from "./data.js"
 import { make } from "./page.js"
 import { fixed, significant, toPrecision } from "./numbers.js"
 import { Table } from "./tables.js"
@@ -14,7 +15,7 @@ export function tablesOf(model, hub, element, scene) {
   const add = (what, columns, rows, found, kind) => {
     if (rows.length) made.push({ what, kind, table: new Table(what, columns, rows, found, hub) })
   }
-  const every = (count) => Array.from({ length: count }, (_, k) => k)
+  const every = (count) => range(0, count)
   add(
     "points",
     [

@@ -15,7 +15,7 @@ export function arrowFactor(model, length) {
 }
 
 /** A crop with its caption, or what is known of the ray where there is no picture of it. */
-export function cropCard(model, k, hub) {
+export function cropCard(model, k, hub, factor) {
   const i = model.a["ray.photo"][k]
   const j = model.a["ray.point"][k]
   const [vx, vy] = model.pair("ray.v", k)
@@ -24,7 +24,7 @@ export function cropCard(model, k, hub) {
   const card = make("figure", { className: model.rejected(k) ? "v-crop v-rejected" : "v-crop" })
   card.dataset.ray = k
   const crop = model.cropOfRay.get(k)
-  if (crop !== undefined) card.append(drawn(model, k, crop))
+  if (crop !== undefined) card.append(drawn(model, k, crop, factor))
   else card.append(make("div", { className: "v-nocrop" }, model.notes.no_crop))
   const known = Number.isFinite(wx)
   card.append(
@@ -50,14 +50,14 @@ function go(event, hub, i) {
   hub.tell("select", { kind: "photograph", index: i })
 }
 
-function drawn(model, k, crop) {
+function drawn(model, k, crop, factor) {
   const canvas = make("canvas", { width: 2 * SIDE_PX, height: 2 * SIDE_PX, className: "v-crop-picture" })
   const [left, top, side] = model.a["crop.frame"].subarray(4 * crop, 4 * crop + 3)
   const scale = canvas.width / side
   const context = canvas.getContext("2d")
   const lay = () => {
     const at = ([u, v]) => [(u - left) * scale, (v - top) * scale]
-    drawTarget(context, model, k, at, scale, arrowFactor(model, ARROW_PART * side))
+    drawTarget(context, model, k, at, scale, factor)
     canvas.dataset.ready = "1"
   }
   const picture = new Image()
@@ -101,10 +101,14 @@ export function drawTarget(context, model, k, at, scale, factor, { width = 2 } =
   context.stroke()
 }
 
-/** What the marks in crops mean, with the scale of the residual vectors. */
-export function cropLegend(model, k) {
-  const crop = model.cropOfRay.get(k)
-  if (crop === undefined) return ""
-  const factor = arrowFactor(model, ARROW_PART * model.a["crop.frame"][4 * crop + 2])
-  return `Green: measured centre and fitted ellipse (red: rejected). Yellow: residual vector v, computed minus measured, in the first crop ${significant(factor, 1)} times enlarged; crops scale with their target.`
+/** By what the residual vectors in the crops of some rays are enlarged; 0 where there are no crops. */
+export function cropFactor(model, rays) {
+  const sides = rays.filter((k) => model.cropOfRay.has(k)).map((k) => model.a["crop.frame"][4 * model.cropOfRay.get(k) + 2])
+  if (!sides.length) return 0
+  return arrowFactor(model, ARROW_PART * sides.sort((a, b) => a - b)[sides.length >> 1])
+}
+
+export function cropLegend(factor) {
+  if (!factor) return ""
+  return `Green: measured centre and fitted ellipse (red: rejected). Yellow: residual vector v, computed minus measured, ${significant(factor, 1)} times enlarged. A crop is as wide as 2.2 diameters of its target.`
 }

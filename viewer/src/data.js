@@ -9,7 +9,7 @@ export async function unpack(id) {
   if (!text) return null
   const binary = atob(text)
   const packed = new Uint8Array(binary.length)
-  for (let k = 0; k < binary.length; k++) packed[k] = binary.charCodeAt(k)
+  for (let k = 0; k < packed.length; k++) packed[k] = binary.charCodeAt(k)
   const stream = new Blob([packed]).stream().pipeThrough(new DecompressionStream("gzip"))
   const buffer = await new Response(stream).arrayBuffer()
   const size = new DataView(buffer).getUint32(0, true)
@@ -30,12 +30,14 @@ class Model {
     this.photoCount = this.photographs.length
     this.rayCount = arrays["ray.point"].length
     this.firstOfPoint = starts(arrays["ray.point"], this.pointCount)
-    const order = Uint32Array.from({ length: this.rayCount }, (_, k) => k)
     const photo = arrays["ray.photo"]
-    this.rayOrder = order.sort((i, j) => photo[i] - photo[j] || i - j)
     this.firstOfPhoto = starts(photo, this.photoCount)
+    this.rayOrder = new Uint32Array(this.rayCount)
+    const next = this.firstOfPhoto.slice()
+    for (let k = 0; k < this.rayCount; k++) this.rayOrder[next[photo[k]]++] = k
     this.firstMark = starts(arrays["mark.photo"], this.photoCount)
-    this.cropOfRay = new Map(Array.from(arrays["crop.ray"], (ray, k) => [ray, k]))
+    this.cropOfRay = new Map()
+    arrays["crop.ray"].forEach((ray, k) => this.cropOfRay.set(ray, k))
   }
 
   /** Coordinates of a point, object unit. */
@@ -154,6 +156,9 @@ function starts(index, count) {
   return first
 }
 
-function range(start, end) {
-  return Uint32Array.from({ length: end - start }, (_, k) => start + k)
+/** The numbers from a first one to before an end. */
+export function range(start, end) {
+  const found = new Uint32Array(end - start)
+  for (let k = 0; k < found.length; k++) found[k] = start + k
+  return found
 }

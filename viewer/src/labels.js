@@ -16,7 +16,7 @@ export function drawLabels(scene, dark) {
   context.clearRect(0, 0, width, height)
   context.font = FONT
   const ink = dark ? "#e6edf5" : "#1b2430"
-  const paper = dark ? "rgba(18,23,30,.8)" : "rgba(255,255,255,.8)"
+  const paper = dark ? "rgba(40,48,58,.8)" : "rgba(255,255,255,.8)"
   const taken = new Set()
   let left = MAX_NAMES
   const put = (text, position, must = false) => {

@@ -18,6 +18,7 @@ async function start() {
   if (!root) return
   const model = await unpack("viewer-data")
   root.hidden = false
+  document.querySelector("nav")?.prepend(make("a", { href: "#explore" }, "Explore"))
   const hub = new Hub()
   const canvas = make("canvas", { className: "v-scene", tabIndex: 0 })
   canvas.setAttribute("role", "application")
@@ -40,6 +41,12 @@ async function start() {
   if (scene) {
     scene.renderer.outputColorSpace = THREE.LinearSRGBColorSpace
     toolbar(model, scene, hub, tools, legends)
+    const thin = make("div", { className: "v-thin", hidden: true })
+    stage.append(thin)
+    hub.on("thin", (part) => {
+      thin.hidden = part === 1
+      if (part > 1) thin.textContent = `one point in ${part} while the scene turns`
+    })
     hub.on("hover", (told) => showHover(model, stage, hover, told))
     hub.on("select", (found) => scene.select(found))
   }
@@ -49,7 +56,14 @@ async function start() {
     if (event.key === "Escape" && root.contains(event.target)) hub.tell("select", null)
   })
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => scene?.invalidate())
-  window.addEventListener("beforeprint", () => scene?.draw())
+  const print = (on) => {
+    if (!scene) return
+    scene.printing = on
+    scene.draw()
+  }
+  window.addEventListener("beforeprint", () => print(true))
+  window.addEventListener("afterprint", () => print(false))
+  matchMedia("print").addEventListener("change", () => scene?.invalidate())
   requestAnimationFrame(() => requestAnimationFrame(() => (root.dataset.ready = (performance.now() - begun).toFixed(0))))
   root.viewer = { model, scene, hub } // for who writes a test
 }
@@ -140,7 +154,7 @@ function ellipsoidTools(model, scene) {
 }
 
 function savePicture(scene, name) {
-  scene.draw()
+  scene.draw() // what is drawn is kept only until the browser shows it
   const whole = make("canvas", { width: scene.canvas.width, height: scene.canvas.height })
   const context = whole.getContext("2d")
   context.drawImage(scene.canvas, 0, 0)

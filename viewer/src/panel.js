@@ -1,8 +1,8 @@
 // What is chosen, in words and pictures: a point with its crops, a photograph with its targets.
 
-import { cropCard, cropLegend } from "./crops.js"
+import { cropCard, cropFactor, cropLegend } from "./crops.js"
 import { button, facts, make } from "./page.js"
-import { byName, fixed, significant, toPrecision, UNKNOWN } from "./numbers.js"
+import { fixed, significant, toPrecision, UNKNOWN } from "./numbers.js"
 import { PhotographView } from "./photoview.js"
 
 const MAX_CROPS = 60 // cards at once; more are shown on demand
@@ -48,9 +48,10 @@ export class Panel {
       "XYZ"[c],
       `${toPrecision(v, s[c])} ${unit}, sigma ${s[c] === 0 ? "fixed" : fine(s[c])}`,
     ])
+    const factor = cropFactor(model, rays)
     const cards = make("div", { className: "v-crops" })
     const add = (from) => {
-      rays.slice(from, from + MAX_CROPS).forEach((k) => cards.append(cropCard(model, k, this.hub)))
+      rays.slice(from, from + MAX_CROPS).forEach((k) => cards.append(cropCard(model, k, this.hub, factor)))
       const left = rays.length - from - MAX_CROPS
       if (left > 0) {
         const more = button(`${left} more`, () => {
@@ -61,7 +62,6 @@ export class Panel {
       }
     }
     add(0)
-    const shown = rays.find((k) => model.cropOfRay.has(k))
     this.element.replaceChildren(
       make("h3", { className: "v-title" }, `Point ${model.points[j]}`),
       facts([
@@ -73,7 +73,7 @@ export class Panel {
       ]),
       this.distance(j),
       make("h4", {}, "In the photographs, largest |w| first"),
-      make("p", { className: "note" }, shown === undefined ? "" : cropLegend(model, shown)),
+      make("p", { className: "note" }, cropLegend(factor)),
       cards,
     )
   }
@@ -128,12 +128,6 @@ export class Panel {
     const pair = (value, sigma, unit) =>
       `${toPrecision(value, sigma)} ${unit}${sigma > 0 ? `, sigma ${significant(sigma)} ${unit}` : ""}`
     this.view = new PhotographView(model, i, this.hub)
-    const reasons = new Map()
-    for (const k of model.marksOfPhoto(i)) {
-      const words = model.reasons[model.a["mark.reason"][k]]
-      reasons.set(words, (reasons.get(words) ?? 0) + 1)
-    }
-    const marks = [...reasons].sort((a, b) => b[1] - a[1] || byName(a[0], b[0]))
     this.element.replaceChildren(
       make("h3", { className: "v-title" }, `Photograph ${model.photographs[i]}`),
       this.view.element,
@@ -144,8 +138,7 @@ export class Panel {
         ["image points", `${rays.length - rejected} accepted${rejected ? `, ${rejected} rejected` : ""}`],
         ["RMS residual", `${fixed(model.a["photo.rms"][i], 4)} px`],
       ]),
-      marks.length ? make("h4", {}, "Seen and not used") : "",
-      facts(marks.map(([words, count]) => [words, String(count)])),
+      this.view.reasons(),
     )
     this.view.resize()
   }

@@ -48,8 +48,6 @@ export class Photographs {
     this.chosen = index
     this.chosenFaces.setIndex(index < 0 ? [] : FACES.map((k) => k + CORNERS * index))
   }
-
-  setDark() {}
 }
 
 function corners(model, i, origin, size) {

@@ -4,15 +4,22 @@ import { arrowFactor, drawTarget, GREEN, RED } from "./crops.js"
 import { button, make, tick } from "./page.js"
 import { significant, signed } from "./numbers.js"
 
-const ARROW_PX = 24 // length on the page of a residual of the size of the RMS
+const ARROW_PX = 16 // length on the page of a residual of the size of the RMS
 const MARK = "#5ab4ff"
 const MAX_ZOOM = 40
 const NEAR_PX = 12 // of the pointer: what is told and chosen
-const MANY = 400 // image points; the names of more are shown only when enlarged
+const MANY = 150 // candidates of one reason; more are hidden until they are asked for
+const CELL_PX = 14 // names in one cell would cover one another
 
 export class PhotographView {
   constructor(model, i, hub) {
-    Object.assign(this, { model, i, hub, zoom: 1, offset: [0, 0], names: true, marks: true, vectors: true })
+    Object.assign(this, { model, i, hub, zoom: 1, offset: [0, 0], names: true, vectors: true })
+    this.counts = new Map()
+    for (const k of model.marksOfPhoto(i)) {
+      const reason = model.a["mark.reason"][k]
+      this.counts.set(reason, (this.counts.get(reason) ?? 0) + 1)
+    }
+    this.hidden = new Set([...this.counts].filter(([, count]) => count > MANY).map(([reason]) => reason))
     const camera = model.camera(i)
     this.size = [camera.width, camera.height]
     this.canvas = make("canvas", { className: "v-photo", tabIndex: 0 })
@@ -30,7 +37,7 @@ export class PhotographView {
         button("all", () => this.fit(), { title: "the whole photograph" }),
         tick("names", this.names, (on) => (this.names = on) | again()),
         tick("residuals", this.vectors, (on) => (this.vectors = on) | again()),
-        tick("not used", this.marks, (on) => (this.marks = on) | again()),
+        button("wide", () => this.widen(), { title: "more room for the photograph, less for the scene" }),
       ),
       this.canvas,
       this.told,
@@ -105,25 +112,30 @@ export class PhotographView {
       context.fillText(this.missing, 10, 20)
     }
     const model = this.model
-    if (this.marks) this.drawMarks(context)
+    this.drawMarks(context)
     const at = (xy) => this.at(xy)
     const factor = this.vectors ? arrowFactor(model, ARROW_PX / this.fitScale) / this.zoom : 0
     const rays = model.raysOfPhoto(this.i)
-    const named = this.names && (rays.length <= MANY || this.zoom > 3)
+    const taken = new Set()
     context.font = "12px system-ui, sans-serif"
     for (const k of rays) {
       const [x, y] = this.at(model.pair("ray.xy", k))
       if (x < -50 || y < -50 || x > w + 50 || y > h + 50) continue
       drawTarget(context, model, k, at, this.scale, factor, { width: 1.2 })
-      if (named) {
+      const text = model.points[model.a["ray.point"][k]]
+      const cells = [0, 1, 2, 3].map((c) => `${Math.floor((x + c * CELL_PX) / CELL_PX)},${Math.floor(y / CELL_PX)}`)
+      if (this.names && !cells.some((cell) => taken.has(cell))) {
+        cells.forEach((cell) => taken.add(cell))
         context.strokeStyle = "rgba(0,0,0,.75)"
         context.lineWidth = 3
-        context.strokeText(model.points[model.a["ray.point"][k]], x + 8, y - 6)
+        context.strokeText(text, x + 8, y - 6)
         context.fillStyle = model.rejected(k) ? RED : GREEN
-        context.fillText(model.points[model.a["ray.point"][k]], x + 8, y - 6)
+        context.fillText(text, x + 8, y - 6)
       }
     }
+    const first = !this.factor && factor
     this.factor = factor
+    if (first) this.tell(null)
     this.canvas.dataset.ready = this.picture ? "1" : ""
   }
 
@@ -131,14 +143,37 @@ export class PhotographView {
     context.strokeStyle = MARK
     context.lineWidth = 1.2
     context.beginPath()
-    for (const k of this.model.marksOfPhoto(this.i)) {
+    for (const k of this.shownMarks()) {
       const [x, y] = this.at(this.model.pair("mark.xy", k))
-      context.moveTo(x - 4, y - 4)
-      context.lineTo(x + 4, y + 4)
-      context.moveTo(x - 4, y + 4)
-      context.lineTo(x + 4, y - 4)
+      context.moveTo(x - 3, y - 3)
+      context.lineTo(x + 3, y + 3)
+      context.moveTo(x - 3, y + 3)
+      context.lineTo(x + 3, y - 3)
     }
     context.stroke()
+  }
+
+  shownMarks() {
+    return this.model.marksOfPhoto(this.i).filter((k) => !this.hidden.has(this.model.a["mark.reason"][k]))
+  }
+
+  /** Candidates that were not used, by reason, with boxes that show them. */
+  reasons() {
+    if (!this.counts.size) return ""
+    const box = make("div", { className: "v-reasons" }, make("h4", {}, "Seen and not used (blue)"))
+    for (const [reason, count] of [...this.counts].sort((a, b) => a[1] - b[1])) {
+      const change = (on) => {
+        if (on) this.hidden.delete(reason)
+        else this.hidden.add(reason)
+        this.draw()
+      }
+      box.append(tick(`${this.model.reasons[reason]}: ${count}`, !this.hidden.has(reason), change))
+    }
+    return box
+  }
+
+  widen() {
+    this.element.closest(".v-main").classList.toggle("v-wide")
   }
 
   /** What is nearest to a place on the canvas. */
@@ -152,7 +187,7 @@ export class PhotographView {
       }
     }
     look("ray", this.model.raysOfPhoto(this.i), "ray.xy")
-    if (this.marks) look("mark", this.model.marksOfPhoto(this.i), "mark.xy")
+    look("mark", this.shownMarks(), "mark.xy")
     return best.kind ? best : null
   }
 

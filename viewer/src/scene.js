@@ -6,17 +6,20 @@ import { Ellipsoids } from "./ellipsoids.js"
 import { drawLabels } from "./labels.js"
 import { Picker } from "./picking.js"
 import { Photographs } from "./photographs.js"
-import { Points } from "./points.js"
+import { MANY, Points } from "./points.js"
 import { lines, Rays } from "./rays.js"
 
 const FIELD_DEG = 40 // of the perspective camera
 const STEP_RAD = 0.12 // that an arrow key turns
+const SLOW_MS = 36 // from frame to frame: then fewer points are drawn while the scene turns
+const MAX_THIN = 16
+const REST_MS = 250 // after which all points are drawn again
 
 export class Scene {
   constructor(model, canvas, overlay, hub) {
     Object.assign(this, { model, canvas, overlay, hub })
     this.place(model)
-    this.renderer = new THREE.WebGLRenderer({ canvas, antialias: true, preserveDrawingBuffer: true })
+    this.renderer = new THREE.WebGLRenderer({ canvas, antialias: model.pointCount <= MANY && model.photoCount <= MANY / 20 })
     this.renderer.setPixelRatio(Math.min(window.devicePixelRatio, 2))
     this.world = new THREE.Scene()
     this.world.add(new THREE.AmbientLight(0xffffff, 2), new THREE.DirectionalLight(0xffffff, 1.5))
@@ -149,7 +152,7 @@ export class Scene {
     if (new THREE.Vector3().crossVectors(up, turned).length() > 0.05 * turned.length()) offset.copy(turned)
     this.camera.position.copy(target).add(offset)
     this.controls.update()
-    this.invalidate()
+    this.moved()
   }
 
   zoom(factor) {
@@ -165,7 +168,9 @@ export class Scene {
 
   /** Look at the centre from a direction, so that everything is seen. */
   look(direction, up, target = this.middle.clone(), radius = this.allRadius) {
-    const distance = radius / Math.sin((FIELD_DEG / 2) * (Math.PI / 180))
+    const { clientWidth, clientHeight } = this.canvas.parentElement
+    const narrow = Math.max(1, clientHeight / Math.max(1, clientWidth))
+    const distance = (narrow * radius) / Math.sin((FIELD_DEG / 2) * (Math.PI / 180))
     for (const camera of [this.perspective, this.orthographic]) {
       camera.up.copy(up)
       camera.position.copy(direction).normalize().multiplyScalar(distance).add(target)
@@ -181,7 +186,7 @@ export class Scene {
     this.controls = new OrbitControls(this.camera, this.canvas)
     this.controls.zoomToCursor = true
     this.controls.target.copy(target)
-    this.controls.addEventListener("change", () => this.invalidate())
+    this.controls.addEventListener("change", () => this.moved())
     this.controls.update()
   }
 
@@ -264,13 +269,47 @@ export class Scene {
     requestAnimationFrame(() => this.draw())
   }
 
+  /** Draw soon, with fewer points where all of them would take too long, and all when the view is at rest. */
+  moved() {
+    clearTimeout(this.rest)
+    this.moving = true
+    this.rest = setTimeout(() => {
+      this.moving = false
+      this.last = 0
+      this.invalidate()
+    }, REST_MS)
+    this.invalidate()
+  }
+
+  /** Draw one point in so many that a frame takes no longer than it may. */
+  pace() {
+    const now = performance.now()
+    const took = this.last ? now - this.last : 0
+    this.last = now
+    if (!this.moving || this.model.pointCount < MANY) return this.setThin(1)
+    this.mean = took ? 0.6 * (this.mean ?? took) + 0.4 * took : this.mean
+    this.part ??= 1
+    if (this.mean > SLOW_MS && this.part < MAX_THIN) {
+      this.part *= 2
+      this.mean = SLOW_MS / 2
+    }
+    this.setThin(this.part)
+  }
+
+  setThin(part) {
+    this.points.thin(part)
+    this.overlay.hidden = part > 2 // a second layer costs as much as thousands of points
+    this.hub.tell("thin", part)
+  }
+
   draw() {
     this.due = false
-    const dark = matchMedia("(prefers-color-scheme: dark)").matches
-    this.renderer.setClearColor(dark ? 0x12171e : 0xf7f9fb)
-    this.photographs.setDark(dark)
+    this.pace()
+    const dark = matchMedia("screen and (prefers-color-scheme: dark)").matches && !this.printing
+    this.renderer.setClearColor(dark ? 0x333c47 : 0xf7f9fb)
+    this.points.setDark(dark)
     this.renderer.render(this.world, this.camera)
-    drawLabels(this, dark)
+    if (!this.overlay.hidden) drawLabels(this, dark)
   }
 
   /** Where on the canvas a position is seen, px; null behind the camera. */

@@ -53,9 +53,11 @@ export class Table {
     if (column) {
       const sign = this.down ? -1 : 1
       const last = (x) => (Number.isNaN(x) ? 1 : 0)
-      this.rows = [...this.rows].sort((a, b) => {
-        const [x, y] = [column.value(a), column.value(b)]
-        if (!column.words) return sign * byName(x, y)
+      const values = new Map()
+      for (const k of this.rows) values.set(k, column.value(k))
+      this.rows = this.rows.slice().sort((a, b) => {
+        const [x, y] = [values.get(a), values.get(b)]
+        if (!column.words) return sign * byName(x, y) || a - b
         return last(x) - last(y) || sign * (x - y) || a - b
       })
     }
@@ -125,7 +127,7 @@ export class Table {
   copy(target) {
     const line = (cells) => cells.map(quoted).join(",")
     const header = this.columns.map((c) => (c.unit ? `${c.name} [${c.unit}]` : c.name))
-    const rows = this.rows.map((k) => line(this.columns.map((c) => cell(c.value(k)))))
+    const rows = Array.from(this.rows, (k) => line(this.columns.map((c) => cell(c.value(k)))))
     copyText([line(header), ...rows].join("\n") + "\n").then(() => {
       const words = target.textContent
       target.textContent = `${this.rows.length} rows copied`

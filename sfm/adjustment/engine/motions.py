@@ -18,7 +18,7 @@ from scipy.linalg import qr
 
 from sfm.adjustment.datum import ResolvedDatum
 from sfm.adjustment.engine.collinearity import State
-from sfm.adjustment.engine.observed_unknowns import Weighted, bar_directions, exterior_misclosure
+from sfm.adjustment.engine.observed_unknowns import Weighted, bar_directions, exterior_jacobian
 from sfm.adjustment.engine.unknowns import Unknowns
 from sfm.conventions import BoolArray, FloatArray
 from sfm.errors import GeometryError
@@ -68,7 +68,8 @@ def motions_of(layout: Unknowns, weighted: Weighted, state: State, datum: Resolv
     H = np.vstack([exterior.reshape(-1, 7), np.zeros((inner, 7)), kept])
     seen = _seen_by_datum(layout, weighted, state, exterior, points)
     if len(seen):
-        _, singular, Vt = np.linalg.svd(seen)
+        # U would have a column for every row, of which control alone brings three a point
+        _, singular, Vt = np.linalg.svd(seen, full_matrices=len(seen) < 7)
         rank = int((singular > DETERMINED * max(1.0, singular[0])).sum())
         open_motions = Vt[rank:].T
     else:
@@ -157,7 +158,7 @@ def _seen_by_datum(
     ]
     for p, j in enumerate(weighted.point):
         rows.append(points[j][np.diagonal(weighted.point_weight[p]) > 0])
-    _, J = exterior_misclosure(weighted, state)
+    J = exterior_jacobian(weighted, state)
     rows += [
         (J[e] @ exterior[i])[np.diagonal(weighted.exterior_weight[e]) > 0]
         for e, i in enumerate(weighted.image)

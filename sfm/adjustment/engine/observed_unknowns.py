@@ -102,7 +102,20 @@ def weighted_vPv(weighted: Weighted, layout: Unknowns, state: State) -> float:
     """Return v'Pv of the observed unknowns and distances."""
     if weighted.count == 0:
         return 0.0
-    return weighted_terms(weighted, layout, state).vPv
+    e = exterior_misclosure(weighted, state) * layout.exterior_free[weighted.image]
+    return _vPv(weighted, state, e, bar_directions(weighted, layout, state)[1])
+
+
+def _vPv(weighted: Weighted, state: State, exterior: FloatArray, bars: FloatArray) -> float:
+    """Return v'Pv from the misclosures of exterior orientations (e, 6) and of scale bars (b,)."""
+    dp = state.parameters[weighted.camera, weighted.parameter] - weighted.value
+    dX = state.points[weighted.point] - weighted.xyz
+    return (
+        float(weighted.length_weight @ bars**2)
+        + float(np.einsum("ea,eab,eb->", exterior, weighted.exterior_weight, exterior))
+        + float(weighted.interior_weight @ dp**2)
+        + float(np.einsum("pa,pab,pb->", dX, weighted.point_weight, dX))
+    )
 
 
 def weighted_terms(weighted: Weighted, layout: Unknowns, state: State) -> WeightedTerms:
@@ -114,23 +127,20 @@ def weighted_terms(weighted: Weighted, layout: Unknowns, state: State) -> Weight
         s = 3 * len(layout.kept)
         none = np.zeros(0)
         return WeightedTerms(np.zeros((0, 6, 6)), np.zeros((0, 6)), none, np.zeros((s, s)), np.zeros(s), 0.0)
-    e, J = exterior_misclosure(weighted, state)
-    e *= layout.exterior_free[weighted.image]
-    J = J * layout.exterior_free[weighted.image][:, None, :]
+    free = layout.exterior_free[weighted.image]
+    e = exterior_misclosure(weighted, state) * free
+    J = exterior_jacobian(weighted, state) * free[:, None, :]
     PJ = weighted.exterior_weight @ J
     dp = state.parameters[weighted.camera, weighted.parameter] - weighted.value
-    N, g, vPv = _bar_terms(weighted, layout, state)
-    dX = state.points[weighted.point] - weighted.xyz
+    rows, length = bar_rows(weighted, layout, state)
+    Pa = weighted.length_weight[:, None] * rows
     return WeightedTerms(
         exterior=np.swapaxes(J, 1, 2) @ PJ,
         exterior_g=np.einsum("eab,ea->eb", PJ, e),
         interior_g=weighted.interior_weight * dp,
-        kept=N,
-        kept_g=g,
-        vPv=vPv
-        + float(np.einsum("ea,eab,eb->", e, weighted.exterior_weight, e))
-        + float(weighted.interior_weight @ dp**2)
-        + float(np.einsum("pa,pab,pb->", dX, weighted.point_weight, dX)),
+        kept=rows.T @ Pa,
+        kept_g=Pa.T @ length,
+        vPv=_vPv(weighted, state, e, length),
     )
 
 
@@ -144,17 +154,22 @@ def point_terms(weighted: Weighted, state: State) -> tuple[FloatArray, FloatArra
     return N, g
 
 
-def exterior_misclosure(weighted: Weighted, state: State) -> tuple[FloatArray, FloatArray]:
-    """Return state minus observed X0, omega, phi, kappa (e, 6) and its derivative by X0, w (e, 6, 6)."""
+def exterior_misclosure(weighted: Weighted, state: State) -> FloatArray:
+    """Return state minus observed X0, omega, phi, kappa, (e, 6)."""
     M = state.M[weighted.image]
     angles = angles_from_rotation(np.swapaxes(M, 1, 2)) - weighted.angles
-    e = np.hstack(
+    return np.hstack(
         [state.position[weighted.image] - weighted.position, (angles + np.pi) % (2 * np.pi) - np.pi]
     )
+
+
+def exterior_jacobian(weighted: Weighted, state: State) -> FloatArray:
+    """Return the derivative of X0, omega, phi, kappa of observed photographs by X0, w, (e, 6, 6)."""
+    M = state.M[weighted.image]
     J = np.zeros((len(M), 6, 6))
     J[:, :3, :3] = np.eye(3)
     J[:, 3:, 3:] = angle_jacobian(M)
-    return e, J
+    return J
 
 
 def bar_directions(weighted: Weighted, layout: Unknowns, state: State) -> tuple[FloatArray, FloatArray]:
@@ -173,12 +188,6 @@ def bar_rows(weighted: Weighted, layout: Unknowns, state: State) -> tuple[FloatA
     a[bar, weighted.end] = direction
     a[bar, weighted.start] = -direction
     return a.reshape(len(bar), 3 * s) * layout.point_free[layout.kept].ravel(), misclosure
-
-
-def _bar_terms(weighted: Weighted, layout: Unknowns, state: State) -> tuple[FloatArray, FloatArray, float]:
-    rows, misclosure = bar_rows(weighted, layout, state)
-    Pa = weighted.length_weight[:, None] * rows
-    return rows.T @ Pa, Pa.T @ misclosure, float(weighted.length_weight @ misclosure**2)
 
 
 def inverse_of_observed(covariance: FloatArray) -> tuple[FloatArray, int]:

@@ -21,7 +21,8 @@ from sfm.adjustment.quality.doubtful_rays import DoubtfulPoint, doubtful_points
 from sfm.adjustment.quality.point_normals import PointNormals, intersected, point_normals
 from sfm.adjustment.quality.variance_components import VarianceComponents, by_photograph
 from sfm.adjustment.result import Adjustment
-from sfm.conventions import BoolArray, FloatArray, IntArray
+from sfm.conventions import FloatArray, IntArray
+from sfm.network import rows_of
 
 FAMILY = 0.01  # chance with which each test says anything of a survey in which nothing is wrong
 EXPLAINED = 0.001  # chance with which two positions that are right do not explain the residuals
@@ -79,21 +80,21 @@ def consistency_of(adjustment: Adjustment) -> Consistency:
     if not np.isfinite(adjustment.redundancy_numbers).any() or not adjustment.sigma0 > 0:
         return Consistency((), (), None, ())
     parts = point_normals(adjustment)
-    rows_of = parts.rows_of_points(adjustment)
-    two, large = _points(adjustment, parts, rows_of)
-    doubtful = doubtful_points(adjustment, parts, rows_of)
+    rays = parts.rows_of_points(adjustment)
+    two, large = _points(adjustment, parts, rays)
+    doubtful = doubtful_points(adjustment, parts, rays)
     return Consistency(two, large, _uneven(by_photograph(adjustment)), _patterns(adjustment), doubtful)
 
 
 def _points(
-    adjustment: Adjustment, parts: PointNormals, rows_of: list[IntArray]
+    adjustment: Adjustment, parts: PointNormals, rays: list[IntArray]
 ) -> tuple[tuple[TwoPositions, ...], tuple[str, ...]]:
     """Test every point: one position for all its rays, two positions, and the size of its residuals."""
     network, n = adjustment.network, len(adjustment.network.points)
     level = 1 - (1 - FAMILY) ** (1 / max(n, 1))
     two: list[TwoPositions] = []
     large: list[str] = []
-    for j, rows in enumerate(rows_of):
+    for j, rows in enumerate(rays):
         accepted = rows[~adjustment.rejected[rows]]
         found = _two_positions(adjustment, parts, rows, level) if len(rows) >= 4 else None
         if found is not None:
@@ -172,14 +173,15 @@ def _patterns(adjustment: Adjustment) -> tuple[Pattern, ...]:
     seen, used = network.image_points, ~adjustment.rejected
     whitened = _whitened(adjustment)
     out = []
-    for index, camera in enumerate(estimate.cameras):
-        own: BoolArray = used & (network.camera[seen.image] == index)
+    of_camera = rows_of(network.camera[seen.image], len(estimate.cameras))
+    for camera, rows in zip(estimate.cameras, of_camera, strict=True):
+        own = rows[used[rows]]
         width, height = camera.size_px
         column = np.clip((CELLS * seen.xy[own, 0] / width).astype(np.int64), 0, CELLS - 1)
         row = np.clip((CELLS * seen.xy[own, 1] / height).astype(np.int64), 0, CELLS - 1)
         cell = CELLS * row + column
         count = np.bincount(cell, minlength=CELLS**2)
-        if (count > 0).sum() < 3 or own.sum() < 2 * CELLS**2:
+        if (count > 0).sum() < 3 or len(own) < 2 * CELLS**2:
             continue
         mean, in_px = (_means(values[own], cell, count) for values in (whitened, adjustment.residuals))
         between = float((count[:, None] * mean**2).sum())

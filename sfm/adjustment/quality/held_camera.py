@@ -42,15 +42,18 @@ class HeldParameter:
     moved: float  # by how much points would move, over their standard deviations with it freed, RMS
 
 
-def held_parameters(adjustment: Adjustment, *, alpha: float = ALPHA) -> tuple[HeldParameter, ...]:
+def held_parameters(
+    adjustment: Adjustment, *, alpha: float = ALPHA, min_moved: float = MOVED
+) -> tuple[HeldParameter, ...]:
     """Return the held interior parameters that the image points contradict, the clearest first.
 
     Args:
         adjustment: the adjustment, with its covariance.
         alpha: probability of naming any where all values are right.
+        min_moved: standard deviations by which freeing it must move the points (root mean square).
 
     Returns:
-        Those whose freeing would lower v'Pv significantly and move points by more than a standard deviation;
+        Those whose freeing would lower v'Pv significantly and move points by more than that;
         none where the redundancy is too small, or weights come from the residuals.
     """
     a = adjustment
@@ -71,7 +74,7 @@ def held_parameters(adjustment: Adjustment, *, alpha: float = ALPHA) -> tuple[He
         # with sigma0 of the adjustment with the parameter freed
         share = (a.redundancy - 1) / max(a.redundancy - reduction, SMALLEST)
         f, moved = reduction * share, moved * float(np.sqrt(share))
-        if f > limit and moved > MOVED:
+        if f > limit and moved > min_moved:
             camera = next(c for c in a.estimate.cameras if (c.group_of(one[1]) or c.name) == one[0])
             found.append(
                 HeldParameter(

@@ -12,7 +12,7 @@ import numpy as np
 from sfm.adjustment.result import Adjustment
 from sfm.camera import pixel_jacobian, project
 from sfm.conventions import FloatArray, IntArray
-from sfm.network import Estimate
+from sfm.network import Estimate, rows_of
 
 
 @dataclass(frozen=True)
@@ -99,9 +99,9 @@ def point_normals(adjustment: Adjustment) -> PointNormals:
     W = UVW[:, 2]
     uv = -UVW[:, :2] / W[:, None]
     A = -(np.swapaxes(R, 1, 2)[:, :2] + uv[:, :, None] * R[:, None, :, 2]) / W[:, None, None]
-    for index, camera in enumerate(estimate.cameras):
-        own = network.camera[seen.image] == index
-        if own.any():
+    of_camera = rows_of(network.camera[seen.image], len(estimate.cameras))
+    for camera, own in zip(estimate.cameras, of_camera, strict=True):
+        if len(own):
             A[own] = pixel_jacobian(camera, seen.xy[own]) @ A[own]
     P = np.linalg.inv(adjustment.image_covariance) / adjustment.sigma0**2
     v = adjustment.residuals

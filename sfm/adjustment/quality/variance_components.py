@@ -19,7 +19,7 @@ from sfm.adjustment.engine.observed_unknowns import exterior_misclosure, weighte
 from sfm.adjustment.engine.unknowns import unknowns_of
 from sfm.adjustment.result import Adjustment
 from sfm.camera import camera_families
-from sfm.conventions import FloatArray, IntArray
+from sfm.conventions import BoolArray, FloatArray, IntArray
 
 SETTLED = 1e-3  # relative change of a variance component at which its estimation ends
 MAX_ROUNDS = 20
@@ -102,7 +102,7 @@ def by_kind(adjustment: Adjustment) -> VarianceComponents:
     image = _components(a, network.image_points.covariance, whole, (IMAGE_POINTS,), few=FEW_OF_A_KIND)
     Q_points, Q_exterior = a.covariance.points[w.point], a.covariance.exterior[w.image]
     dX = state.points[w.point] - w.xyz
-    e, _ = exterior_misclosure(w, state)
+    e = exterior_misclosure(w, state)
     dp = state.parameters[w.camera, w.parameter] - w.value
     where = [
         int(np.flatnonzero(layout.interior_free[c] == s)[0])
@@ -162,15 +162,37 @@ def estimate_components(
 
     Returns:
         Last adjustment, standard deviation of each group over that stated, shape (g,), and whether the
-        factors converged.
+        factors converged. Where factors come back because every weighting rejects other image points, the
+        adjustment of that cycle which rejects fewest.
     """
     factor = np.ones(len(names))
     adjustment = adjust_with(factor[group])
+    tried, rejected = [factor], [adjustment.rejected]
     for _ in range(MAX_ROUNDS):
         found = _components(adjustment, adjustment.image_covariance, group, names, few=FEW).sigma0
         found = np.where(np.isfinite(found) & (found > 0), found, 1.0)
         if np.abs(found - 1).max() <= SETTLED:
             return adjustment, factor, True
         factor = factor * found
+        first = _cycle_start(tried, rejected, factor)
+        if first is not None:
+            chosen = min(range(first, len(tried)), key=lambda at: int(rejected[at].sum()))
+            if chosen < len(tried) - 1:
+                adjustment = adjust_with(tried[chosen][group])
+            return adjustment, tried[chosen], False
         adjustment = adjust_with(factor[group])
+        tried.append(factor)
+        rejected.append(adjustment.rejected)
     return adjustment, factor, False
+
+
+def _cycle_start(tried: list[FloatArray], rejected: list[BoolArray], factor: FloatArray) -> int | None:
+    """Return the round that had these factors and after which other image points were rejected.
+
+    All rounds start from the same values, so that the same factors lead to the same adjustments again.
+    """
+    for at in reversed(range(len(tried))):
+        others = any(not np.array_equal(rejected[at], one) for one in rejected[at + 1 :])
+        if others and np.abs(factor / tried[at] - 1).max() <= SETTLED:
+            return at
+    return None

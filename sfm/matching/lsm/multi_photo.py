@@ -25,7 +25,7 @@ from sfm.matching.lsm.warp import put_step
 from sfm.matching.lsm.window import resample_patch
 from sfm.matching.match_flags import DIVERGED, FLAT_TEXTURE, LOW_CORRELATION, MATCHED, OUTSIDE, TOO_FAR
 from sfm.matching.radiometry import grey_of, odd_window
-from sfm.network import Estimate
+from sfm.network import Estimate, rows_of
 
 MAX_STEPS = 15
 STOP_PX = 0.005
@@ -107,8 +107,10 @@ def match_multi(
     warp[:, :2, :2], warp[:, :2, 2], warp[:, 2, 2] = linear, xy, 1.0
     out = np.zeros((len(image), OUTPUTS))
     length = np.full(len(image), np.inf)
-    pairs = np.unique(np.column_stack([image[ref[windows]], image[windows]]), axis=0)
-    groups = [(i, j, windows[(image[ref[windows]] == i) & (image[windows] == j)]) for i, j in pairs.tolist()]
+    both = np.column_stack([image[ref[windows]], image[windows]])
+    pairs, pair = np.unique(both, axis=0, return_inverse=True)
+    rows_of_pair = rows_of(pair.ravel(), len(pairs))
+    groups = [(i, j, windows[own]) for (i, j), own in zip(pairs.tolist(), rows_of_pair, strict=False)]
     step = 0
     q, follow = np.zeros((len(image), SIZE)), np.zeros((len(image), SIZE, 2))
     moving = np.ones(len(X), dtype=bool)  # points with a window that still moves

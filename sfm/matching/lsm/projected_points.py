@@ -6,7 +6,7 @@ import numpy as np
 
 from sfm.camera import pixel_jacobian, project
 from sfm.conventions import FloatArray, IntArray
-from sfm.network import Estimate
+from sfm.network import Estimate, rows_of
 
 
 def facing_warps(
@@ -31,8 +31,9 @@ def facing_warps(
 def derivatives(estimate: Estimate, camera: IntArray, image: IntArray, points: FloatArray) -> FloatArray:
     """Return d (x, y) / d X of each image point, px per object unit, (k, 2, 3)."""
     out = np.full((len(image), 2, 3), np.nan)
-    for i in np.unique(image):
-        rows = np.flatnonzero(image == i)
+    for i, rows in enumerate(rows_of(image, len(estimate.position))):
+        if not len(rows):
+            continue
         lens, R = estimate.cameras[camera[i]], estimate.rotation[i]
         UVW = (points[rows] - estimate.position[i]) @ R
         u, v = -UVW[:, 0] / UVW[:, 2], -UVW[:, 1] / UVW[:, 2]
@@ -47,8 +48,9 @@ def derivatives(estimate: Estimate, camera: IntArray, image: IntArray, points: F
 def pictures_of(estimate: Estimate, camera: IntArray, image: IntArray, points: FloatArray) -> FloatArray:
     """Return the picture of one object point for each row, px, (k, 2)."""
     out = np.full((len(image), 2), np.nan)
-    for i in np.unique(image):
-        rows = np.flatnonzero(image == i)
+    for i, rows in enumerate(rows_of(image, len(estimate.position))):
+        if not len(rows):
+            continue
         lens = estimate.cameras[camera[i]]
         out[rows] = project(lens, estimate.position[i], estimate.rotation[i], points[rows])
     return out

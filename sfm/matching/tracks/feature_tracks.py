@@ -20,6 +20,7 @@ from sfm.errors import GeometryError
 from sfm.matching.lsm.two_photo import match_lsm
 from sfm.matching.radiometry import FULL_SCALE_8, full_scale, grey_of
 from sfm.matching.tracks.interest import foerstner_points
+from sfm.network import rows_of
 
 DETECTORS = ("foerstner", "sift")
 RATIO = 0.8  # of the distances to the nearest and the second-nearest descriptor; Lowe (2004), IJCV 60(2)
@@ -229,7 +230,6 @@ def measure_tracks(
         min_correlation: smallest coefficient r of a match.
         threads: patches worked on at a time.
     """
-    m = len(photographs)
     greys = [grey_of(one) for one in photographs]
     xy = np.array([features[i].xy[f] for i, f in zip(tracks.image, tracks.feature, strict=True)])
     scale = np.array([features[i].scale[f] for i, f in zip(tracks.image, tracks.feature, strict=True)])
@@ -250,26 +250,25 @@ def measure_tracks(
     start = xy + np.einsum("kij,kj->ki", A, offset)
     measured, covariance = np.full((len(xy), 2), np.nan), np.full((len(xy), 2, 2), np.nan)
     at_reference = np.full((len(xy), 2, 2), np.nan)
-    for i in range(m):
-        for j in range(m):
-            rows = np.flatnonzero(
-                (tracks.image[ref] == i) & (tracks.image == j) & (ref != np.arange(len(xy)))
-            )
-            if i == j or not len(rows):
-                continue
-            found = match_lsm(
-                greys[i],
-                greys[j],
-                place[tracks.point[rows]],
-                start[rows],
-                window_px=window_px,
-                start=A[rows],
-                min_correlation=min_correlation,
-                threads=threads,
-            )
-            measured[rows], covariance[rows] = found.xy, found.covariance / 2
-            back = np.linalg.inv(found.warp[:, :2, :2])
-            at_reference[rows] = back @ (found.covariance / 2) @ back.transpose(0, 2, 1)
+    others = np.flatnonzero(tracks.image[ref] != tracks.image)
+    pairs, pair = np.unique(
+        np.column_stack([tracks.image[ref], tracks.image])[others], axis=0, return_inverse=True
+    )
+    for (i, j), own in zip(pairs.tolist(), rows_of(pair.ravel(), len(pairs)), strict=False):
+        rows = others[own]
+        found = match_lsm(
+            greys[i],
+            greys[j],
+            place[tracks.point[rows]],
+            start[rows],
+            window_px=window_px,
+            start=A[rows],
+            min_correlation=min_correlation,
+            threads=threads,
+        )
+        measured[rows], covariance[rows] = found.xy, found.covariance / 2
+        back = np.linalg.inv(found.warp[:, :2, :2])
+        at_reference[rows] = back @ (found.covariance / 2) @ back.transpose(0, 2, 1)
     good = np.isfinite(measured).all(axis=1)
     matched = np.bincount(tracks.point[good], minlength=n)
     for a in range(2):

@@ -120,7 +120,7 @@ def _solve_linear(xy: FloatArray, X: FloatArray, columns: list[int]) -> tuple[Fl
             rows = rows[:, :12]
         # unit norm of the 12 parameters: homogeneous, solved through the smallest singular vector
         scale = np.linalg.norm(rows, axis=0)
-        _, s, Vt = np.linalg.svd(rows / scale)
+        _, s, Vt = np.linalg.svd(rows / scale, full_matrices=len(rows) < rows.shape[1])
         if s[min(len(s), rows.shape[1] - 1) - 1] <= SINGULAR * s[0]:
             raise GeometryError("dlt: the points do not determine the parameters (a critical arrangement)")
         h = Vt[-1] / scale

@@ -42,7 +42,7 @@ def resect_p4p(tangents: FloatArray, points: FloatArray) -> tuple[Solution, ...]
             "use robust, or dlt from six points on"
         )
     origin = xyz.mean(axis=0)
-    axes = np.linalg.svd(xyz - origin)[2]
+    axes = np.linalg.svd(xyz - origin, full_matrices=False)[2]
     axes[2] = np.cross(axes[0], axes[1])
     Q = (xyz - origin) @ axes[:2].T
     T = _collineation(Q, uv)
@@ -65,7 +65,7 @@ def _collineation(Q: FloatArray, uv: FloatArray) -> FloatArray:
     N = np.array([[1, 0, -uv[:, 0].mean()], [0, 1, -uv[:, 1].mean()], [0, 0, spread]]) / spread
     p = np.concatenate([uv, np.ones((len(uv), 1))], axis=1) @ N.T
     rows = np.einsum("nij,nk->nijk", skew(p), q).reshape(-1, 9)
-    _, s, Vt = np.linalg.svd(rows)
+    _, s, Vt = np.linalg.svd(rows, full_matrices=False)
     if s[7] <= 1e-9 * s[0]:
         raise GeometryError("p4p: three of the four points lie on one line")
     T = np.linalg.inv(N) @ Vt[8].reshape(3, 3) @ np.diag([1 / scale, 1 / scale, 1.0])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from dataclasses import dataclass, replace
 from math import comb
 
@@ -137,9 +138,13 @@ def fewest_fitting(n: int, tolerance: float, field: float, *, minimum: int = SAM
     needed = max(minimum, SAMPLE + 1)
     chance = min(1.0, np.pi * tolerance**2 / field)
     tests = MAX_SOLUTIONS * comb(n, SAMPLE)
-    while needed < n and tests * bdtrc(needed - SAMPLE - 1, n - SAMPLE, chance) > CHANCE:
-        needed += 1
-    return needed
+    if needed >= n:
+        return needed
+
+    def enough(fitting: int) -> bool:
+        return bool(tests * bdtrc(fitting - SAMPLE - 1, n - SAMPLE, chance) <= CHANCE)
+
+    return bisect_left(range(n), True, lo=needed, key=enough)
 
 
 def expected_trials(w: float, n: int) -> tuple[float, float]:

@@ -7,9 +7,10 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from scipy.spatial import cKDTree
 
 from sfm.adjustment.result import Adjustment
-from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
+from sfm.conventions import AnyArray, FloatArray, IntArray
 from sfm.errors import PhotographError
 from sfm.photographs.reading import read_photograph
 from sfm.result import PhotographTargets, SurveyResult, in_words
@@ -198,10 +199,8 @@ def _nearest(xy: FloatArray, measured: FloatArray) -> IntArray:
     """Return for each target the image point that was made of it, -1 for none, (k,)."""
     if len(xy) == 0 or len(measured) == 0:
         return np.full(len(xy), -1, dtype=np.int64)
-    distance = np.linalg.norm(xy[:, None] - measured[None], axis=2)
-    nearest = distance.argmin(axis=1)
-    close: BoolArray = distance[np.arange(len(xy)), nearest] < 0.5  # half a pixel: re-measuring may move it
-    return np.where(close, nearest, -1)
+    distance, nearest = cKDTree(measured).query(xy)
+    return np.where(distance < 0.5, nearest, -1)  # half a pixel: re-measuring may move it
 
 
 def _remarks(photograph: PhotographTargets) -> IntArray:

@@ -60,6 +60,18 @@ def comparison_of(result: SurveyResult) -> ComparisonFindings | None:
     )
 
 
+def words_of_better_fit(both: AdjusterComparison | None) -> str:
+    """Say that the camera of the comparison fits better, and what to free; empty where it does not."""
+    found = None if both is None else both.better
+    if both is None or found is None:
+        return ""
+    return (
+        f"Free {', '.join(found.free)}: with {'it' if len(found.free) == 1 else 'them'} the camera of the "
+        f"comparison with {both.backend} fits {found.times:.3g} times better ({found.rms_px:.4f} px RMS, "
+        f"with the survey's own camera {found.own_rms_px:.4f} px)."
+    )
+
+
 def _other_minimum(both: AdjusterComparison) -> str:
     """Return in words which of two minima is the lower one."""
     ours, theirs = both.comparison.cost

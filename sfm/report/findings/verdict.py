@@ -10,7 +10,8 @@ import numpy as np
 from sfm.adjustment.quality.reliability import UNCONTROLLED
 from sfm.conventions import MAD_TO_SIGMA
 from sfm.report.findings.evidence import Evidence, Judged
-from sfm.report.findings.verdict_of_given import judge_given
+from sfm.report.findings.other_adjuster import words_of_better_fit
+from sfm.report.findings.verdict_of_given import free_line, judge_given
 from sfm.report.numbers import finer_unit, significant
 
 MUCH_REJECTED = 0.05  # share of rejected image points above which a person should look
@@ -58,23 +59,30 @@ def judge(evidence: Evidence) -> Verdict:
         serious.append(
             f"Rank defect {a.defect}, expected {a.expected_defect}; not everything can be determined{what}."
         )
+    if 2 * oriented < total:
+        serious.append(
+            f"The larger part of the photographs, {total - oriented} of {total}, is not in the result."
+        )
+    serious += [f"Not decided: {line}." for line in result.undecided]
     remarks: list[str] = []
     kinds = (_other_solutions, _sigma0, _residual, _untested, _rays, _consistency, judge_given)
     for judge_kind in kinds:
         for is_bad, line in judge_kind(evidence):
             (serious if is_bad else remarks).append(line)
-    if oriented < total:
+    if oriented < total <= 2 * oriented:
         remarks.append(f"{total - oriented} of {total} photographs are not in the result.")
     rejected = int(a.rejected.sum())
     if len(a.rejected) and rejected > MUCH_REJECTED * len(a.rejected):
         remarks.append(f"{rejected} of {len(a.rejected)} image points were rejected.")
     if result.comparison is not None and not result.comparison.agree:
         remarks.append(f"{result.comparison.backend} does not agree with the adjustment.")
+    if better := words_of_better_fit(result.comparison):
+        remarks.append(better)
     if result.warnings:
         more = len(result.warnings) - 1
         other = f" ({more} more warning{'s' if more > 1 else ''}, see below)" if more else ""
         remarks.append(f"Warning: {result.warnings[0].rstrip('.')}{other}.")
-    notes = (*_pessimistic(evidence), *_unchecked(evidence))
+    notes = (*result.notes, *_pessimistic(evidence), *_unchecked(evidence))
     if serious:
         return Verdict("bad", "The survey has no dependable result.", (*serious, *remarks, *notes))
     found = f"{oriented} of {total} photographs oriented, {len(a.network.points)} object points"
@@ -110,8 +118,13 @@ def _sigma0(evidence: Evidence) -> Judged:
         f"Sigma0 is {significant(ratio)} times the expected standard deviation of an image coordinate "
         f"({significant(evidence.sigma0.stated_px)} px): "
     )
+    cameras = evidence.result.adjustment.estimate.cameras
+    if evidence.held:
+        line += "most likely the camera, which is held at values that do not fit (below)."
+        return [(ratio > SIGMA0_BAD, line)]
     if ratio > SIGMA0_BAD:
-        return [(True, line + "points, control or the camera contradict the photographs.")]
+        held = "" if any(one.free.any() for one in cameras) else f" (it is held: try {free_line(evidence)})"
+        return [(True, f"{line}points, control or the camera{held} contradict the photographs.")]
     return [(False, line + "see the residuals, or set sigma_px to what the photographs give.")]
 
 

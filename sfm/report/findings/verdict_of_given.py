@@ -9,6 +9,7 @@ from sfm.adjustment.quality.variance_components import IMAGE_POINTS
 from sfm.report.findings.evidence import Evidence, Judged
 from sfm.report.findings.given_residuals import GivenResiduals, GivenValue
 from sfm.report.numbers import finer_unit, significant
+from sfm.survey.inputs.settings import FREED_FIRST
 
 WEIGHTED_REMARK, WEIGHTED_BAD = 5.0, 30.0  # w of control, scale bars, interior orientation
 # An observation of a smaller redundancy number determines itself: what is left of its error is less than the
@@ -113,9 +114,22 @@ def _held(evidence: Evidence) -> Judged:
     line = (
         f"{worst.parameter} of camera {worst.camera} is held at {worst.value:.6g}{unit}; the photographs say "
         f"{worst.value + worst.change:.6g}{unit}, {significant(abs(worst.t))} standard deviations off, and "
-        f"points are wrong by {significant(worst.moved)} of theirs (RMS): free it.{others}"
+        f"points are wrong by {significant(worst.moved)} of theirs (RMS): write "
+        f"{free_line(evidence)}.{others}"
     )
     return [(worst.moved > HELD_BAD, line)]
+
+
+def free_line(evidence: Evidence) -> str:
+    """Return what to write into the survey file so that the camera fits: the usual ones, those named."""
+    named = {one.parameter for one in evidence.held}
+    camera = evidence.result.adjustment.estimate.cameras[0]
+    for one in evidence.result.adjustment.estimate.cameras:
+        if evidence.held and evidence.held[0].camera in (one.name, *one.shared):
+            camera = one
+    free = {name for name, on in zip(camera.names, camera.free, strict=True) if on}
+    written = [f'"{name}"' for name in camera.names if name in {*free, *named, *FREED_FIRST}]
+    return f"free = [{', '.join(written)}] for camera {camera.name}"
 
 
 def _principal_point(evidence: Evidence) -> Judged:

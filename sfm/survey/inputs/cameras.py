@@ -102,7 +102,7 @@ def start_cameras(
                 size,
                 pixel,
                 c_mm=focal,
-                free=one.free,
+                free=one.may_be_free,
                 values=tuple(known.items()),
             )
         )
@@ -118,7 +118,7 @@ def free_start_values(settings: CameraSettings, name: str, given: StartCameras |
         given: the table, None without.
     """
     values = given.of(name) if given is not None else {}
-    return {parameter: value for parameter, value in values.items() if parameter in settings.free}
+    return {parameter: value for parameter, value in values.items() if parameter in settings.may_be_free}
 
 
 def refuse_unknown_cameras(settings: Sequence[CameraSettings], given: StartCameras | None) -> None:

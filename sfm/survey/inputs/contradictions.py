@@ -201,7 +201,7 @@ def _refuse_contradictions_of_camera(camera: CameraSettings, at: str) -> None:
         for parameter in sorted(both):
             raise SurveyFileError(f"{at}: parameter '{parameter}' is both {one} and {other}")
     for parameter in start:
-        if parameter not in camera.free:
+        if parameter not in camera.may_be_free:
             raise SurveyFileError(f"{at}: start.{parameter} is given, but '{parameter}' is not in free")
     for parameter in varying:
         if parameter not in camera.adjusted:

@@ -59,7 +59,8 @@ def split_cameras(
         for name, (value, sigma) in settings.weighted:
             s = made[0].names.index(name)
             groups = [camera.group_of(s) or camera.name for camera in made]
-            observed += [(first + groups.index(group), s, value, sigma) for group in dict.fromkeys(groups)]
+            first_of = {group: k for k, group in reversed(list(enumerate(groups)))}
+            observed += [(first + first_of[group], s, value, sigma) for group in dict.fromkeys(groups)]
     columns = list(zip(*observed, strict=True)) or [(), (), (), ()]
     interior = InteriorObservations(
         np.array(columns[0], dtype=np.int64),
@@ -161,5 +162,5 @@ def _variants(settings: CameraSettings, camera: Camera, images: list[str]) -> tu
         name: replace(camera, name=name, shared=tuple(shared(p, label) for p in camera.names))
         for name, label in zip(names, labels, strict=True)
     }
-    order = list(made)
-    return list(made.values()), np.array([order.index(name) for name in names], dtype=np.int64)
+    number = {name: k for k, name in enumerate(made)}
+    return list(made.values()), np.array([number[name] for name in names], dtype=np.int64)

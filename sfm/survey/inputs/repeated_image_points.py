@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import stats
 
-from sfm.conventions import BoolArray, IntArray
-from sfm.network import ImagePoints
+from sfm.conventions import BoolArray
+from sfm.network import ImagePoints, rows_of
 
 ALPHA = 0.001  # probability with which measurements that say the same are taken for contradicting ones
 MAX_NAMES = 5  # named in one line
@@ -55,8 +55,9 @@ def merge_repeated(seen: ImagePoints) -> Merged:
     keep[first] = True
     kinds: tuple[list[tuple[int, int]], ...] = ([], [], [])
     dropped = 0
+    of_group = rows_of(group, len(count))
     for g in np.flatnonzero(count > 1):
-        rows: IntArray = np.flatnonzero(group == g)
+        rows = of_group[g]
         one = rows[0]
         different = np.unique(seen.xy[rows], axis=0, return_index=True)[1]
         kind = 0

@@ -34,6 +34,8 @@ SMALLEST, LARGEST = 1e-9, 1e12
 MIN_SIGMA = 1e-30  # of a distortion parameter, mm^-8
 MAX_SIDE_PX = 1_000_000
 MAX_CAMERAS, MAX_GROUPS = 1000, 1000  # each is tried on every photograph
+# parameters that are adjusted where a survey says nothing, as far as its photographs determine them
+FREED_FIRST = ("c", "x0", "y0", "K1", "K2", "fx", "fy", "cx", "cy", "k1", "k2")
 MAX_GLOBS = 1000  # of the photographs of all cameras
 MAX_LENGTH_PER_SIGMA = 1e6  # no scale bar is calibrated to better than a millionth of its length
 Length = Annotated[float, Field(ge=SMALLEST, le=LARGEST)]
@@ -89,7 +91,7 @@ class CameraSettings(Section):
     sensor_mm: TwoLengths | None = None  # width and height of the sensor, mm
     c_mm: Length | None = None  # start value of the principal distance, else the EXIF focal length, mm
     model: Literal[tuple(MODELS)] = "brown"  # type: ignore[valid-type]
-    free: Names = ()  # parameters to be adjusted; none = a calibrated camera
+    free: Names = ()  # parameters to be adjusted; () = a calibrated camera; see `says_what_is_free`
     fixed: Values = ()  # (parameter, value) of what is not free, in the model's units
     start: Values = ()  # (parameter, value) that a free one starts from, in the model's units; else 0
     weighted: Observed = ()  # (parameter, (value, sigma)): adjusted, with this as an observation
@@ -101,6 +103,19 @@ class CameraSettings(Section):
     def adjusted(self) -> tuple[str, ...]:
         """Parameters that are adjusted, with or without an observation of them."""
         return (*self.free, *(name for name, _ in self.weighted))
+
+    @property
+    def says_what_is_free(self) -> bool:
+        """Whether `free` is there, empty or not, or a calibration; else the photographs decide."""
+        varying = self.per_photograph or self.per_group
+        return bool("free" in self.model_fields_set or self.fixed or self.weighted or varying)
+
+    @property
+    def may_be_free(self) -> tuple[str, ...]:
+        """Parameters that are adjusted without an observation, or may be where nothing is said."""
+        if self.says_what_is_free:
+            return self.free
+        return tuple(name for name in MODELS[self.model].names if name in FREED_FIRST)
 
 
 class TargetSettings(Section):

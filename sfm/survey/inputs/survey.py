@@ -107,6 +107,11 @@ class Survey:
         cameras = tuple(_section(CameraSettings, one, f"{where}: camera") for one in self.cameras)
         if not cameras:
             raise SurveyFileError(f"{where}: no cameras, at least one is needed")
+        if (
+            self.observations is not None
+        ):  # they are adjusted as they are, with the camera that goes with them
+            said = [one if one.says_what_is_free else one.model_copy(update={"free": ()}) for one in cameras]
+            cameras = tuple(said)
         datum: object = self.datum
         if isinstance(datum, Datum):
             datum = {"kind": datum.kind, "points": () if datum.points is None else datum.points}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import suppress
@@ -98,8 +99,9 @@ def find_copies(photographs: PhotographList) -> tuple[int, ...]:
     first = list(range(len(photographs)))
     seen: dict[tuple[int, str], int] = {}
     sizes = [path.stat().st_size if path.is_file() else 0 for path in photographs.paths]
+    number = Counter(sizes)
     for k, path in enumerate(photographs.paths):
-        if sizes[k] and sizes.count(sizes[k]) > 1:
+        if sizes[k] and number[sizes[k]] > 1:
             with suppress(PhotographError):  # what cannot be read is said where it is measured
                 first[k] = seen.setdefault((sizes[k], content_hash(path)), k)
     return tuple(first)

@@ -11,7 +11,7 @@ import numpy as np
 from sfm.conventions import AnyArray, IntArray
 from sfm.errors import GeometryError
 from sfm.matching.tracks.feature_tracks import find_tie_points
-from sfm.network import ImagePoints, Network
+from sfm.network import ImagePoints, Network, rows_of
 from sfm.photographs.exif import Metadata, read_metadata
 from sfm.photographs.reading import read_photograph
 from sfm.result import PhotographTargets
@@ -99,8 +99,9 @@ def _overlays(network: Network, paths: Sequence[Path], window_px: int) -> tuple[
     """Return what the report draws into each photograph: circles as wide as the windows."""
     seen = network.image_points
     drawn = []
-    for i, (name, path) in enumerate(zip(network.images, paths, strict=True)):
-        xy = seen.xy[seen.image == i]
+    of_image = rows_of(seen.image, len(network.images))
+    for name, path, rows in zip(network.images, paths, of_image, strict=True):
+        xy = seen.xy[rows]
         radius = np.full((len(xy), 2), window_px / 2)
         none = np.zeros(0, dtype=np.int64)
         drawn.append(PhotographTargets(name, path, xy, radius, np.zeros(len(xy)), np.zeros((0, 2)), none))

@@ -361,6 +361,8 @@ def test_metashape_chunk_transform_and_missing_orientation(tmp_path: Path) -> No
         ("<f>", "<f>x", "line 11: 'x"),
         ("<f>", "<f>-", "line 9: f = -"),
         ('camera_id="4"', 'camera_id="44"', "camera_id 44, there is no such camera"),
+        ('camera_id="4"', f'camera_id="{"#" * 12_000}"', "camera_id is '#{40}', needed plain text"),
+        ('<camera id="4"', f'<camera id="{"#" * 12_000}"', "id is '#{40}', needed plain text"),
         ("</cameras>", "</camera>", "not well-formed XML"),
         ('encoding="UTF-8"', 'encoding="UTF-99"', "line 1: the encoding is none that can be read"),
         ('encoding="UTF-8"', 'encoding="GBK"', "line 1: the encoding is none that can be read"),

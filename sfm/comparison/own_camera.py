@@ -1,0 +1,78 @@
+"""Whether the other adjuster's camera fits the image points better than the survey's own, and what to free.
+
+COLMAP frees fx and fy, the principal point and the distortion in groups. Two adjusters can agree on a camera
+that has more free than the survey's; that they agree then says nothing about the survey.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy import stats
+
+from sfm.adjustment.datum import Datum
+from sfm.adjustment.quality.held_camera import held_parameters
+from sfm.adjustment.result import Adjustment
+from sfm.adjustment.solve import adjust
+from sfm.camera import Camera
+from sfm.comparison.camera_conversion import corresponding_free
+from sfm.network import Estimate, Network
+
+ALPHA = 0.001  # probability of the F-test where both cameras fit alike
+BETTER = 1.1  # times; below it nobody would see the difference in the coordinates
+
+
+@dataclass(frozen=True)
+class BetterFit:
+    """A camera with more free parameters that fits the image points significantly better."""
+
+    own_rms_px: float  # per coordinate, the survey's camera, equal weights, px
+    rms_px: float  # the camera of the comparison, px
+    free: tuple[str, ...]  # what of the survey's cameras is held and should be free: "b1", clearest first
+
+    @property
+    def times(self) -> float:
+        """How many times smaller the residuals are."""
+        return self.own_rms_px / self.rms_px if self.rms_px > 0 else np.inf
+
+
+def better_fit(survey: Adjustment, network: Network, compared: Adjustment) -> BetterFit | None:
+    """Return by how much the camera of the comparison fits better; None where it does not.
+
+    Args:
+        survey: adjustment of the survey, with its own cameras.
+        network: image points with equal weights, as both adjusters had them.
+        compared: the in-house adjustment of that network with the cameras of the comparison.
+    """
+    own_cameras = survey.estimate.cameras
+    more = _held_there(own_cameras, compared.estimate.cameras)
+    if not more or not compared.converged:
+        return None
+    start = replace(compared.estimate, cameras=own_cameras)
+    own = _adjusted(network, start, survey.sigma_px, covariance=False)
+    freed = own.redundancy - compared.redundancy
+    if not own.converged or freed <= 0 or compared.redundancy <= 0:
+        return None
+    F = (own.vPv - compared.vPv) / freed / compared.sigma0**2 if compared.sigma0 > 0 else np.inf
+    found = BetterFit(own.rms_px, compared.rms_px, more)
+    if stats.f.isf(ALPHA, freed, compared.redundancy) > F or found.times < BETTER:
+        return None
+    tested = held_parameters(_adjusted(network, own.estimate, survey.sigma_px, covariance=True))
+    clear = tuple(dict.fromkeys(one.parameter for one in tested if one.parameter in more))
+    return replace(found, free=clear or more)
+
+
+def _held_there(own: tuple[Camera, ...], compared: tuple[Camera, ...]) -> tuple[str, ...]:
+    """Return the parameters that the survey holds and the comparison has free under another name."""
+    names: dict[str, None] = {}
+    for ours, theirs in zip(own, compared, strict=True):
+        free = corresponding_free(theirs, ours.model) & ~ours.free
+        names |= dict.fromkeys(name for name, on in zip(ours.names, free, strict=True) if on)
+    return tuple(names)
+
+
+def _adjusted(network: Network, start: Estimate, sigma_px: float, *, covariance: bool) -> Adjustment:
+    return adjust(
+        network, start, datum=Datum("free"), sigma_px=sigma_px, reject="none", covariance=covariance
+    )

@@ -1,0 +1,82 @@
+"""What is told where too few codes were read: what was found, and which other settings read more."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sfm.orientation.sequence import MIN_POINTS
+from sfm.photographs.reading import read_photograph
+from sfm.survey.inputs.measurements import MeasuredPhotographs
+from sfm.survey.inputs.survey import Survey
+from sfm.targets.codes.families import Family
+from sfm.targets.codes.rings import RINGS
+from sfm.targets.detect import find_targets
+
+MAX_NAMES = 10  # photographs in a message
+POLARITIES = ("dark", "bright")
+
+
+def words_of_codes(survey: Survey, photographs: MeasuredPhotographs) -> str:
+    """Say how many targets and codes were found where more codes were needed, and what decides on that."""
+    targets = [len(found) for found in photographs.targets]
+    codes = [int((found.code >= 0).sum()) for found in photographs.targets]
+    with_codes = sum(count > 0 for count in codes)
+    settings = survey.targets
+    return (
+        f"no two photographs have {MIN_POINTS} coded targets in common, which their orientation needs: "
+        f"{sum(targets)} targets were found in {len(targets)} photographs, {sum(codes)} codes were read in "
+        f"{with_codes} of them{_by_photograph(photographs, codes)}; check in [targets] "
+        f"codes = '{settings.codes}', "
+        f"polarity = '{settings.polarity}' and min_diameter_px = {settings.min_diameter_px:g}"
+        f"{_other_settings(survey, photographs)}"
+    )
+
+
+def _by_photograph(photographs: MeasuredPhotographs, codes: list[int]) -> str:
+    """Say how many codes were read in each of the first photographs, if any were."""
+    if not any(codes):
+        return ""
+    shown = zip(photographs.names[:MAX_NAMES], codes, strict=False)
+    more = " ..." if len(codes) > MAX_NAMES else ""
+    return f" ({', '.join(f'{name}: {count}' for name, count in shown)}{more})"
+
+
+def _other_settings(survey: Survey, photographs: MeasuredPhotographs) -> str:
+    """Say which other rings or arcs, or which polarity, read more codes, if any do.
+
+    In the photograph with most codes, or, where none has any, with most targets.
+    """
+    settings = survey.targets
+    read = [len(np.unique(found.code[found.code >= 0])) for found in photographs.targets]
+    order = [(count, len(found)) for count, found in zip(read, photographs.targets, strict=True)]
+    fullest = max(range(len(order)), key=order.__getitem__)
+    photograph = read_photograph(photographs.paths[fullest], channel=settings.channel)
+    known = settings.codes in (*RINGS, "none")
+    families = RINGS if known else ()
+    polarities = [one for one in POLARITIES if settings.polarity in (one, "auto")]
+    others = [one for one in POLARITIES if one not in polarities]
+    tried: list[tuple[str | Family | None, str]]
+    tried = [(family, settings.polarity) for family in families if family != settings.codes]
+    tried += [
+        (family, polarity)
+        for polarity in others
+        for family in dict.fromkeys((survey.family if not known else settings.codes, *families))
+        if family != "none"
+    ]
+    best, words = read[fullest], ""
+    for family, polarity in tried:
+        found = find_targets(
+            photograph,
+            polarity=polarity,
+            codes=family if family is not None else "none",
+            min_diameter_px=settings.min_diameter_px,
+        )
+        count = len(np.unique(found.code[found.code >= 0]))
+        if count >= MIN_POINTS and count > best:
+            best, differ = count, []
+            if polarity != settings.polarity:
+                differ.append(f"polarity = '{polarity}'")
+            if family != settings.codes and isinstance(family, str):
+                differ.append(f"codes = '{family}'")
+            words = f"; in {photographs.names[fullest]} {' and '.join(differ)} reads {count} codes"
+    return words

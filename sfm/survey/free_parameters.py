@@ -1,0 +1,178 @@
+"""Which interior parameters are adjusted where the survey does not say: those that its network determines.
+
+A lens that is held at nominal values bends the network; parameters that a network does not determine take
+its precision and may lead to a false minimum. Candidates are c, x0, y0, K1 and K2. The one that the network
+determines worst is held until all others are known better than they are of any camera; then what else the
+image points demand is freed, by the test of held parameters.
+
+Source: Luhmann et al., Close-Range Photogrammetry and 3D Imaging (2020), sec. 7.3.2 (self-calibration).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from sfm.adjustment.datum import Datum
+from sfm.adjustment.quality.held_camera import held_parameters
+from sfm.adjustment.result import Adjustment
+from sfm.adjustment.solve import adjust
+from sfm.camera import pixel_from_tangents, tangents_from_pixel
+from sfm.distortion.models import MODELS
+from sfm.errors import GeometryError
+from sfm.network import Estimate, Network
+from sfm.reduced_network import reduce_network, supported
+from sfm.survey.inputs.settings import CameraSettings
+from sfm.survey.inputs.survey import Survey
+
+# Of the half diagonal, at the corner of the photograph: what nominal focal lengths, sensors and lenses are
+# apart from true ones. A parameter that the network knows worse is better held.
+KNOWN_WITHOUT = 0.01
+MIN_PHOTOGRAPHS = 4  # of a free network; fewer fit many a camera, with another shape of the object each
+MIN_RAYS, MIN_IMAGE_POINTS = 2, 4  # of a point, and of a photograph, that take part in the decision
+ROUNDS = 3  # of tests of what is still held
+FIRST_HELD = ("K2", "k2", "y0", "x0", "cy", "cx")  # where nothing tells which; then the others
+
+Chosen = list[set[str] | None]  # free parameters of each camera; None where the survey says what is free
+
+
+@dataclass(frozen=True)
+class FreeParameters:
+    """What is adjusted of the cameras of a survey."""
+
+    cameras: tuple[CameraSettings, ...]  # all of which say what is free
+    estimate: Estimate  # with the same freed in its cameras
+    notes: tuple[str, ...]  # a line for each camera that the survey says nothing about
+
+
+def choose_free_parameters(
+    survey: Survey, network: Network, estimate: Estimate, *, datum: str = "free", extend: bool = True
+) -> FreeParameters:
+    """Return the interior parameters to adjust, of every camera of a survey.
+
+    Args:
+        survey: says what is free of its cameras, or does not.
+        network: with one camera for each of the survey's, in their order.
+        estimate: start values; photographs and points without any take no part in the decision.
+        datum: kind of datum; control determines cameras that photographs by themselves do not.
+        extend: whether parameters beyond the candidates are tried.
+
+    Returns:
+        The settings with what is free in each, and the estimate. Both as they were where the survey says it
+        of every camera.
+    """
+    silent = [a for a, one in enumerate(survey.cameras) if not one.says_what_is_free]
+    if not silent:
+        return FreeParameters(survey.cameras, estimate, ())
+    names: Chosen = [set(one.may_be_free) if a in silent else None for a, one in enumerate(survey.cameras)]
+    estimate = _with_free(estimate, names)
+    everything = np.ones(len(network.image_points), dtype=bool)
+    images, points = supported(
+        network, estimate, everything, min_points=MIN_IMAGE_POINTS,
+        min_rays=np.full(len(network.points), MIN_RAYS),
+    )  # fmt: skip
+    if images.sum() < (1 if datum == "control" else MIN_PHOTOGRAPHS):
+        names = [one if one is None else set() for one in names]
+    else:
+        part, start = reduce_network(network, estimate, images, points, everything)
+        names = _determined(part, start, names, datum, extend=extend)
+    cameras = tuple(
+        one if chosen is None else one.model_copy(update={"free": _in_order(one, chosen)})
+        for one, chosen in zip(survey.cameras, names, strict=True)
+    )
+    notes = tuple(_note(cameras[a], int(images[network.camera == a].sum())) for a in silent)
+    return FreeParameters(cameras, _with_free(estimate, names), notes)
+
+
+def _determined(part: Network, start: Estimate, names: Chosen, datum: str, *, extend: bool) -> Chosen:
+    """Return the candidates that a network determines, and what else its image points demand."""
+    names, adjusted = _held_back(part, start, names, datum)
+    index = {camera.name: a for a, camera in enumerate(start.cameras) if names[a]}
+    for _ in range(ROUNDS if extend else 0):
+        demanded = () if adjusted is None else held_parameters(adjusted, min_moved=0.0)
+        wider = list(names)
+        for one in demanded:
+            if one.camera in index:
+                wider[index[one.camera]] = (wider[index[one.camera]] or set()) | {one.parameter}
+        if adjusted is None or wider == names:
+            break
+        tried, adjusted = _held_back(part, adjusted.estimate, wider, datum)
+        if adjusted is None or tried == names:
+            break
+        names = tried
+    return names
+
+
+def _held_back(part: Network, start: Estimate, names: Chosen, datum: str) -> tuple[Chosen, Adjustment | None]:
+    """Hold the worst determined parameter until all others are known well enough; the last adjustment."""
+    while any(names):
+        adjusted = _adjusted(part, _with_free(start, names), datum)
+        worst, reach = None, KNOWN_WITHOUT
+        for a, chosen in enumerate(names):
+            for name in sorted(chosen or (), key=_rank):
+                now = np.inf if adjusted is None else _reach(adjusted, a, name)
+                if now > reach:
+                    worst, reach = (a, name), now
+        if worst is None:
+            return names, adjusted
+        names = [
+            None if one is None else one - {worst[1]} if a == worst[0] else one for a, one in enumerate(names)
+        ]
+    return names, None
+
+
+def _adjusted(part: Network, start: Estimate, datum: str) -> Adjustment | None:
+    """Adjust with what is free, None where that cannot be done or does not determine everything."""
+    try:
+        found = adjust(part, start, datum=Datum(datum), reject="tau", redundancy_numbers=False)
+    except (GeometryError, np.linalg.LinAlgError):
+        return None
+    return found if found.converged and found.defect <= found.expected_defect else None
+
+
+def _reach(adjusted: Adjustment, a: int, name: str) -> float:
+    """Return by how much a standard deviation of a parameter moves the corner, over the half diagonal."""
+    camera = adjusted.estimate.cameras[a]
+    s = camera.names.index(name)
+    sigma = float(adjusted.interior_sigma(a)[s])
+    if not np.isfinite(sigma):
+        return np.inf
+    corner = np.zeros((1, 2))
+    p = camera.parameters.copy()
+    p[s] += sigma
+    moved = pixel_from_tangents(camera.with_parameters(p), tangents_from_pixel(camera, corner)) - corner
+    reach = 2 * float(np.hypot(*moved[0])) / float(np.hypot(*camera.size_px))
+    return reach if np.isfinite(reach) else np.inf
+
+
+def _with_free(estimate: Estimate, names: Chosen) -> Estimate:
+    """Return the estimate with the chosen parameters free, those of other cameras as they are."""
+    cameras = tuple(
+        camera if one is None else replace(camera, free=np.array([name in one for name in camera.names]))
+        for camera, one in zip(estimate.cameras, names, strict=True)
+    )
+    return replace(estimate, cameras=cameras)
+
+
+def _rank(name: str) -> int:
+    """Return the place of a parameter in the order in which they are held where nothing tells which."""
+    return FIRST_HELD.index(name) if name in FIRST_HELD else len(FIRST_HELD)
+
+
+def _in_order(settings: CameraSettings, chosen: set[str]) -> tuple[str, ...]:
+    return tuple(name for name in MODELS[settings.model].names if name in chosen)
+
+
+def _note(settings: CameraSettings, photographs: int) -> str:
+    """Say what was chosen, and what to write for another choice."""
+    if settings.free:
+        return (
+            f"Camera {settings.name}: {', '.join(settings.free)} were adjusted, as its {photographs} "
+            "photographs determine them and the survey does not say what is free; free = [] holds them all."
+        )
+    return (
+        f"Camera {settings.name}: its interior orientation was held, since its {photographs} photographs do "
+        "not determine it: state a calibration in [camera.fixed], or add photographs, some turned by 90 "
+        "degrees and from other distances."
+    )

@@ -1,0 +1,170 @@
+"""Photographs that could not be oriented: which are not connected, and whether c is what lost them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.sparse import csr_matrix
+from scipy.sparse.csgraph import connected_components
+
+from sfm.conventions import BoolArray, IntArray
+from sfm.errors import GeometryError
+from sfm.network import Estimate, Network
+from sfm.orientation.sequence import MIN_POINTS, Orientation
+
+MANY = 0.1  # part of the photographs whose loss, though they are connected, has one cause for all
+C_FACTORS = (1.4, 0.7, 2.0, 0.5)  # on the given principal distance: a crop factor, an extender, a zoom
+MAX_GROUPS, MAX_NAMES = 4, 4  # told one by one
+
+
+@dataclass(frozen=True)
+class Lost:
+    """Photographs without orientation that belong together."""
+
+    images: IntArray  # indices of the photographs
+    shared: IntArray  # points that they have in common with oriented photographs
+    connected: bool  # whether one of them shows enough of these to be oriented
+
+
+def tell_lost_photographs(network: Network, found: Orientation) -> Orientation:
+    """Return the orientation with what is missing between the groups of photographs that are not connected.
+
+    Args:
+        network: image points that have names.
+        found: its orientation.
+    """
+    groups = [one for one in lost_groups(network, found.estimate) if not one.connected]
+    if not groups:
+        return found
+    oriented = found.estimate.oriented
+    reasons = dict(found.failures)
+    for group in groups:
+        for i in group.images:
+            count = int(np.isin(_points_of(network, [i]), group.shared).sum())
+            reasons[network.images[i]] = (
+                f"not connected: it has {count} point{'' if count == 1 else 's'} in common with the oriented "
+                f"photographs, at least {MIN_POINTS} are needed"
+            )
+    groups.sort(key=lambda one: -len(one.images))
+    lines = [_words(network, oriented, group) for group in groups[:MAX_GROUPS]]
+    more = sum(len(one.images) for one in groups[MAX_GROUPS:])
+    if more:
+        lines.append(f"{more} more photographs in {len(groups) - MAX_GROUPS} groups are not connected either")
+    failures = tuple((image, reasons[image]) for image, _ in found.failures)
+    return replace(found, failures=failures, warnings=(*found.warnings, *lines))
+
+
+def lost_groups(network: Network, estimate: Estimate) -> list[Lost]:
+    """Return the photographs without orientation in groups that could be oriented among themselves."""
+    oriented, seen = estimate.oriented, network.image_points
+    lost = np.flatnonzero(~oriented)
+    in_network = np.zeros(len(network.points), dtype=bool)
+    in_network[seen.point[oriented[seen.image]]] = True
+    first, second, common = network.common_points(np.ones(len(seen), dtype=bool))
+    linked = (common >= MIN_POINTS) & ~oriented[first] & ~oriented[second]
+    m = len(network.images)
+    links = csr_matrix((np.ones(int(linked.sum())), (first[linked], second[linked])), shape=(m, m))
+    label = connected_components(links, directed=False)[1]
+    groups = []
+    for number in np.unique(label[lost]):
+        images = lost[label[lost] == number]
+        points = _points_of(network, images)
+        most = max(int(in_network[_points_of(network, [i])].sum()) for i in images)
+        groups.append(Lost(images, points[in_network[points]], most >= MIN_POINTS))
+    return groups
+
+
+def try_other_principal_distances(
+    network: Network, estimate: Estimate, found: Orientation | None, orient: Callable[[Estimate], Orientation]
+) -> tuple[Orientation | None, str]:
+    """Return the orientation with another principal distance if that orients more photographs, and a line.
+
+    Tried where photographs are lost that show enough points of the others.
+
+    Args:
+        network: image points that have names.
+        estimate: start values.
+        found: the orientation with the given principal distance; None if there was none.
+        orient: returns the orientation from start values.
+
+    Returns:
+        The better orientation where the survey adjusts c; else that which was given. The line is empty where
+        no other principal distance is better.
+    """
+    m = len(network.images)
+    now = 0 if found is None else int(found.estimate.oriented.sum())
+    lost = m if found is None else sum(
+        len(one.images) for one in lost_groups(network, found.estimate) if one.connected
+    )  # fmt: skip
+    if lost <= MANY * m or not len(network.image_points):
+        return found, ""
+    best, most = None, now + max(1, int(MANY * m))
+    for factor in C_FACTORS:
+        try:
+            other = orient(_with_c(estimate, factor))
+        except GeometryError:
+            continue
+        count = int(other.estimate.oriented.sum())
+        if count > most or (best is not None and count == most and other.rms_px < best.rms_px):
+            best, most = other, count
+        if count == m:
+            break
+    if best is None:
+        return found, ""
+    lines = []
+    for given, better in zip(estimate.cameras, best.estimate.cameras, strict=True):
+        pixel = float(np.mean(given.pixel_mm))
+        lines.append(f"c = {given.c_px * pixel:.4g} mm of camera {given.name} looks wrong: "
+                     f"from {better.c_px * pixel:.4g} mm")  # fmt: skip
+    line = f"{', '.join(lines)} on {most} of {m} photographs can be oriented, in place of {now}"
+    adjusted = all(camera.free[0] for camera in estimate.cameras)
+    if not adjusted:
+        return found, f"{line}; it is held: correct c_mm, or free c"
+    restored = tuple(
+        replace(new, free=old.free) for new, old in zip(best.estimate.cameras, estimate.cameras, strict=True)
+    )
+    return replace(best, estimate=replace(best.estimate, cameras=restored)), line
+
+
+def _with_c(estimate: Estimate, factor: float) -> Estimate:
+    """Return start values with another principal distance, which is free."""
+    cameras = []
+    for camera in estimate.cameras:
+        p, free = camera.parameters.copy(), camera.free.copy()
+        focal = slice(0, 1 if camera.in_mm else 2)
+        p[focal] *= factor
+        free[focal] = True
+        cameras.append(replace(camera.with_parameters(p), free=free))
+    return replace(estimate, cameras=tuple(cameras))
+
+
+def _words(network: Network, oriented: BoolArray, group: Lost) -> str:
+    """Say which photographs are not connected with the others, and by which points they could be."""
+    n = len(group.images)
+    names = ", ".join(network.images[i] for i in group.images[:MAX_NAMES])
+    names += f" and {n - MAX_NAMES} more" if n > MAX_NAMES else ""
+    shared = ", ".join(network.points[j] for j in group.shared[:MAX_NAMES])
+    common = f"have only {shared} in common" if shared else "have no point in common"
+    own = _often_seen(network, group.images)
+    others = _often_seen(network, np.flatnonzero(oriented))
+    return (
+        f"{names}: {n} photograph{'s are' if n > 1 else ' is'} not connected with the {int(oriented.sum())} "
+        f"oriented ones; they {common}, {MIN_POINTS} in one photograph are needed. A photograph that shows "
+        f"{MIN_POINTS} of {own} ... and {MIN_POINTS} of {others} ... would connect them"
+    )
+
+
+def _often_seen(network: Network, images: IntArray) -> str:
+    """Return the names of the points that photographs show most often."""
+    seen = network.image_points
+    rays = np.bincount(seen.point[np.isin(seen.image, images)], minlength=len(network.points))
+    order = np.argsort(-rays, kind="stable")[: MIN_POINTS + 2]
+    return ", ".join(network.points[j] for j in order if rays[j])
+
+
+def _points_of(network: Network, images: IntArray | list[int]) -> IntArray:
+    """Return the points that photographs show."""
+    seen = network.image_points
+    return np.unique(seen.point[np.isin(seen.image, images)])

@@ -1,0 +1,62 @@
+"""Two adjusters agree on a camera with fx and fy of its own: whether the survey's fits as well is told."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+
+from sfm.adjustment.datum import Datum
+from sfm.adjustment.solve import adjust
+from sfm.comparison.adjusters import AdjusterComparison, compare_adjusters
+from sfm.conventions import FloatArray
+from sfm.network import Estimate, Network
+from sfm.report.findings.findings import findings_of
+from sfm.report.findings.other_adjuster import words_of_better_fit
+from sfm.result import SurveyResult
+from tests.synthetic import make_network, seed_of
+
+
+@dataclass(frozen=True)
+class Other:
+    estimate: Estimate
+    iterations: int = 1
+    converged: bool = True
+    seconds: float = 0.0
+    point_covariance: FloatArray | None = None
+
+
+def in_house(network: Network, start: Estimate) -> Other:
+    """Stand in for the other adjuster: it finds the same optimum."""
+    return Other(adjust(network, start, datum=Datum("free"), reject="none", covariance=False).estimate)
+
+
+def compared(stretch: float, free: tuple[str, ...]) -> tuple[AdjusterComparison, SurveyResult]:
+    """Adjust and compare photographs whose pixels are wider than the survey says, by a factor."""
+    network, truth = make_network(seed_of("better"), images=10, points=50, model="brown_forward", free=free)
+    camera = truth.cameras[0]
+    start = replace(truth, cameras=(replace(camera, pixel_mm=camera.pixel_mm * np.array([stretch, 1.0])),))
+    a = adjust(network, start, datum=Datum("free"), reject="none")
+    both = compare_adjusters(a, in_house, name="other", model="opencv")
+    codes = np.full(len(network.points), -1)
+    return both, SurveyResult("s", "m", len(network.images), (), a, codes, both)
+
+
+USUAL = ("c", "x0", "y0", "K1", "K2", "P1", "P2")
+
+
+def test_a_camera_that_fits_many_times_better_is_no_agreement() -> None:
+    both, result = compared(1.007, USUAL)
+    assert both.agree and both.better is not None
+    assert both.better.free == ("b1",)
+    assert both.better.rms_px == pytest.approx(0.1, rel=0.1) and both.better.times > 5
+    words = words_of_better_fit(both)
+    assert words.startswith("Free b1: with it the camera of the comparison with other fits ")
+    assert words in findings_of(result).verdict.remarks
+
+
+@pytest.mark.parametrize(("stretch", "free"), [(1.0, USUAL), (1.007, (*USUAL, "b1"))])
+def test_a_camera_that_fits_as_well_is_not_told(stretch: float, free: tuple[str, ...]) -> None:
+    both, _ = compared(stretch, free)
+    assert both.agree and both.better is None and words_of_better_fit(both) == ""

@@ -1,0 +1,111 @@
+"""A survey that does not say what is free: the photographs decide, and a line says what was chosen."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from sfm.adjustment.datum import Datum
+from sfm.adjustment.solve import adjust
+from sfm.camera import camera_from_values, project
+from sfm.conventions import FloatArray
+from sfm.network import Estimate, ImagePoints, Network, ObjectPoints
+from sfm.survey.free_parameters import FreeParameters, choose_free_parameters
+from sfm.survey.inputs.survey import CameraSetup, Survey
+from tests.surveys import survey_of
+from tests.synthetic import make_network, seed_of
+
+USUAL = {"c", "x0", "y0", "K1", "K2"}
+
+
+def survey_with(**camera: Any) -> Survey:
+    return Survey(name="s", cameras=(CameraSetup(name="a", images="*.jpg", **camera),))
+
+
+def nominal(network: Network, truth: Estimate) -> Estimate:
+    """Return start values with the camera as a data sheet has it, adjusted to the image points."""
+    known = truth.cameras[0]
+    pixel = (float(known.pixel_mm[0]), float(known.pixel_mm[1]))
+    camera = camera_from_values("a", "brown", known.size_px, pixel, c_mm=10.2)
+    return replace(truth, cameras=(camera,))
+
+
+def chosen(network: Network, truth: Estimate, **options: Any) -> FreeParameters:
+    return choose_free_parameters(survey_with(), network, nominal(network, truth), **options)
+
+
+def planar(rng: np.random.Generator, count: int, *, tilt: float) -> tuple[Network, Estimate]:
+    """Return photographs of a plane from above, none of them turned about its axis."""
+    network, truth = make_network(rng, images=count, points=40, planar=True)
+    position = np.column_stack([rng.uniform(-0.6, 0.6, (count, 2)), np.full(count, 4.0)])
+    angle = tilt * rng.standard_normal((count, 2))
+    rotation = np.stack([_turned(x, y) for x, y in angle])
+    seen = network.image_points
+    xy = np.array(
+        [
+            project(truth.cameras[0], position[i], rotation[i], truth.points[j : j + 1])[0]
+            for i, j in zip(seen.image, seen.point, strict=True)
+        ]
+    )
+    xy += 0.1 * rng.standard_normal(xy.shape)
+    keep = np.isfinite(xy).all(axis=1)
+    points = ImagePoints(seen.image[keep], seen.point[keep], xy[keep], seen.covariance[keep])
+    return replace(network, image_points=points), replace(truth, position=position, rotation=rotation)
+
+
+def _turned(x: float, y: float) -> FloatArray:
+    X = np.array([[1, 0, 0], [0, np.cos(x), -np.sin(x)], [0, np.sin(x), np.cos(x)]])
+    return np.asarray(X @ np.array([[np.cos(y), 0, np.sin(y)], [0, 1, 0], [-np.sin(y), 0, np.cos(y)]]))
+
+
+def test_a_convergent_network_frees_what_it_determines_and_demands() -> None:
+    network, truth = make_network(seed_of("free by default"), images=12, points=50)
+    found = chosen(network, truth)
+    free = set(found.cameras[0].free)
+    assert free >= USUAL | {"b1"}  # b1 is 2e-4, a third of a pixel at the edge
+    assert "were adjusted, as its 12 photographs determine them" in found.notes[0]
+    assert "free = [] holds them all" in found.notes[0]
+    a = adjust(network, found.estimate, datum=Datum("free"), reject="none")
+    assert a.sigma0 < 1.1
+    assert abs(a.estimate.cameras[0].value("c") - 10.0) < 4 * a.interior_sigma(0)[0]
+    assert set(chosen(network, truth, extend=False).cameras[0].free) == USUAL
+
+
+def test_what_a_network_does_not_determine_is_held() -> None:
+    network, truth = planar(seed_of("parallel photographs of a plane"), 8, tilt=0.005)
+    assert not {"c", "x0", "y0"} & set(chosen(network, truth).cameras[0].free)
+
+
+def test_three_photographs_hold_the_camera_and_say_so() -> None:
+    network, truth = make_network(seed_of("three photographs"), images=3, points=40)
+    found = chosen(network, truth)
+    assert found.cameras[0].free == ()
+    assert "was held, since its 3 photographs do not determine it" in found.notes[0]
+
+
+def test_control_determines_what_three_photographs_do_not() -> None:
+    network, truth = make_network(seed_of("three photographs and control"), images=3, points=40)
+    given = np.arange(0, 40, 2)
+    control = ObjectPoints(given, truth.points[given], np.zeros((len(given), 3, 3)))
+    found = chosen(replace(network, control=control), truth, datum="control")
+    assert {"c", "K1"} <= set(found.cameras[0].free)
+
+
+def test_a_camera_that_the_survey_describes_stays_as_described() -> None:
+    network, truth = make_network(seed_of("described"), images=12, points=40)
+    for camera in ({"free": []}, {"free": ["c"]}, {"fixed": {"K1": 1e-4}}, {"weighted": {"c": (10.0, 0.1)}}):
+        survey = survey_with(**camera)
+        found = choose_free_parameters(survey, network, truth)
+        assert found.cameras == survey.cameras and found.estimate is truth and not found.notes
+
+
+def test_image_points_that_are_given_keep_the_camera_given_with_them() -> None:
+    network, truth = make_network(seed_of("given"), images=8, points=20, free=())
+    camera = CameraSetup(
+        name="a", size_px=truth.cameras[0].size_px, pixel_mm=truth.cameras[0].pixel_mm.tolist(), c_mm=10.0
+    )
+    assert not camera.says_what_is_free
+    survey = replace(survey_of(network, truth), cameras=(camera,))
+    assert survey.cameras[0].says_what_is_free and survey.cameras[0].free == ()

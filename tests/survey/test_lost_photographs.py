@@ -1,0 +1,109 @@
+"""Photographs that are lost are told in groups, with what would connect them, or with a wrong c."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import sfm
+from sfm.camera import camera_from_values
+from sfm.conventions import BoolArray
+from sfm.errors import GeometryError
+from sfm.network import Estimate, Network, empty_estimate
+from sfm.orientation.sequence import Orientation
+from sfm.report.findings.findings import findings_of
+from sfm.survey.inputs.survey import Survey
+from sfm.survey.lost_photographs import (
+    lost_groups,
+    tell_lost_photographs,
+    try_other_principal_distances,
+)
+from tests.surveys import survey_of
+from tests.synthetic import make_network, seed_of
+
+IMAGES, POINTS = 10, 40
+
+
+def split_network() -> tuple[Network, Estimate]:
+    """Return photographs of which the last four see other points than the first six, but for two."""
+    network, truth = make_network(seed_of("two halves"), images=IMAGES, points=POINTS)
+    seen = network.image_points
+    own = np.where(seen.image < 6, seen.point < 22, seen.point >= 20)
+    return replace(network, image_points=seen.select(own)), truth
+
+
+def partly(truth: Estimate, oriented: BoolArray) -> Estimate:
+    position, rotation = truth.position.copy(), truth.rotation.copy()
+    position[~oriented], rotation[~oriented] = np.nan, np.nan
+    return replace(truth, position=position, rotation=rotation)
+
+
+def orientation(network: Network, estimate: Estimate) -> Orientation:
+    failures = tuple(
+        (network.images[i], "0 points of the network seen, resection needs 4")
+        for i in np.flatnonzero(~estimate.oriented)
+    )
+    fits = np.ones(len(network.image_points), dtype=bool)
+    return Orientation(estimate, failures, (), None, "given", fits, 0.1, np.full(1, 4.0))
+
+
+def test_groups_that_are_not_connected_are_told_with_what_would_connect_them() -> None:
+    network, truth = split_network()
+    estimate = partly(truth, np.arange(IMAGES) < 6)
+    (group,) = lost_groups(network, estimate)
+    assert group.images.tolist() == [6, 7, 8, 9] and not group.connected
+    assert [network.points[j] for j in group.shared] == ["21", "22"]
+    found = tell_lost_photographs(network, orientation(network, estimate))
+    (line,) = found.warnings
+    assert line.startswith("image 7, image 8, image 9, image 10: 4 photographs are not connected with the 6 ")
+    assert "they have only 21, 22 in common, 4 in one photograph are needed" in line
+    assert "would connect them" in line
+    assert found.failures[0] == (
+        "image 7",
+        "not connected: it has 2 points in common with the oriented photographs, at least 4 are needed",
+    )
+
+
+def test_photographs_that_are_connected_are_no_group_of_their_own() -> None:
+    network, truth = make_network(seed_of("connected"), images=IMAGES, points=POINTS)
+    estimate = partly(truth, np.arange(IMAGES) < 6)
+    assert all(group.connected for group in lost_groups(network, estimate))
+    found = orientation(network, estimate)
+    assert tell_lost_photographs(network, found) is found
+
+
+@pytest.mark.parametrize("free", [True, False])
+def test_a_principal_distance_that_loses_photographs_is_told(free: bool) -> None:
+    network, truth = make_network(seed_of("lost by c"), images=IMAGES, points=POINTS)
+    camera = truth.cameras[0]
+    given = camera_from_values(
+        "a", "brown", camera.size_px, (0.005, 0.005), c_mm=7.0, free=("c",) if free else ()
+    )
+    start = empty_estimate(network, (given,))
+    few = orientation(network, replace(partly(truth, np.arange(IMAGES) < 3), cameras=(given,)))
+
+    def orient_from(values: Estimate) -> Orientation:
+        if values.cameras[0].value("c") < 9:
+            raise GeometryError("none")
+        return orientation(network, truth)
+
+    found, line = try_other_principal_distances(network, start, few, orient_from)
+    assert "c = 7 mm of camera a looks wrong: from 10 mm on 10 of 10 photographs can be oriented" in line
+    assert found is not None and found.estimate.oriented.sum() == (10 if free else 3)
+    assert ("it is held: correct c_mm, or free c" in line) != free
+
+
+def test_a_survey_that_lost_the_larger_part_is_no_dependable_one() -> None:
+    network, truth = split_network()
+    seen = network.image_points
+    network = replace(network, image_points=seen.select((seen.image < 4) | (seen.image >= 6)))
+    survey: Survey = survey_of(network, truth, free=())
+    result = sfm.run_survey(survey, compare_with="none")
+    lost = result.images_total - len(result.adjustment.network.images)
+    assert 0 < lost <= result.images_total / 2
+    whole = replace(result, images_total=2 * len(result.adjustment.network.images) + 1)
+    verdict = findings_of(whole).verdict
+    assert verdict.level == "bad"
+    assert "The larger part of the photographs" in verdict.remarks[0]
