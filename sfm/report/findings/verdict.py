@@ -63,6 +63,7 @@ def judge(evidence: Evidence) -> Verdict:
         serious.append(
             f"The larger part of the photographs, {total - oriented} of {total}, is not in the result."
         )
+    serious += [f"Not decided: {line}." for line in result.undecided]
     remarks: list[str] = []
     kinds = (_other_solutions, _sigma0, _residual, _untested, _rays, _consistency, judge_given)
     for judge_kind in kinds:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 
 from sfm.errors import OutputError
@@ -28,6 +29,7 @@ def view_page(scene: ViewerScene, pictures: Pictures, source: str) -> str:
     page = render(
         "view.html",
         viewer=viewer_of(scene, pictures),
+        pictures_beside=bool(pictures.beside),
         s=scene,
         source=source,
         cameras=", ".join(f"{camera.name} ({camera.model})" for camera in scene.cameras),
@@ -83,7 +85,8 @@ def photographs_in(folder: Path, names: tuple[str, ...]) -> dict[str, Path]:
     root = folder.resolve()
     found = {}
     for name in names:
-        path = (root / name).resolve()
-        if path.is_relative_to(root) and path.is_file():
-            found[name] = path
+        with suppress(OSError, ValueError):  # a name that is no name of a file here
+            path = (root / name).resolve()
+            if path.is_relative_to(root) and path.is_file():
+                found[name] = path
     return found
