@@ -52,6 +52,7 @@ def assemble_result(
         free_network=solution.free_network,
         taken_out=solution.taken_out,
         other_solutions=solution.others,
+        undecided=start.remarks,
         unused_image_points=solution.unused_image_points + sum(one.image_points for one in measured.left_out),
         reject=survey.reject,
         orientation_correlations=orientation_correlations(adjustment),

@@ -37,6 +37,7 @@ from sfm.survey.inputs.measurements import Naming
 from sfm.survey.inputs.start import given_values
 from sfm.survey.inputs.survey import Survey
 from sfm.survey.left_out import datum_carriers, left_out_points, unused_image_points, words_of_left_out
+from sfm.survey.observation_count import refuse_too_few_observations
 from sfm.survey.principal_distance import far_principal_distances
 from sfm.survey.scale_check import check_scales
 
@@ -233,6 +234,7 @@ def _settle(task: _Task, estimate: Estimate) -> _Settled:
     images, points = determined(network, estimate, accepted, task.needed, task.least)
     while True:
         part, start = reduce_network(network, estimate, images, points, np.ones_like(accepted))
+        refuse_too_few_observations(part, start, task.datum.kind)
         adjustment = _tested(task, part, start, covariance=False)
         iterations += adjustment.iterations
         found = _contradiction(task, adjustment)
