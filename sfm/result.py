@@ -25,6 +25,8 @@ from sfm.point_table import Point, PointTable
 from sfm.stored_result import NO_SCALE, StoredResult
 from sfm.targets.flags import count_flags
 
+EXPLAINS = 1.5  # ratio of sigma0 without and with a cause from which it explains something
+
 
 @dataclass(frozen=True)
 class FailedImage:
@@ -77,6 +79,20 @@ class PhotographTargets:
     def reasons(self) -> list[tuple[str, int]]:
         """Return (reason, number of candidates) of this photograph, most frequent first."""
         return [(in_words(name), count) for name, count in count_flags(self.rejected_flag)]
+
+
+@dataclass(frozen=True)
+class Explanation:
+    """A cause of large residuals that was tried on the finished network."""
+
+    cause: str  # what was given more freedom, in words
+    before_px: float  # sigma0 without it, of all image points, px
+    after_px: float  # sigma0 with it, of the same, px
+
+    @property
+    def explains(self) -> bool:
+        """Whether it takes away a good part of the residuals."""
+        return self.after_px * EXPLAINS < self.before_px
 
 
 @dataclass(frozen=True)
@@ -153,6 +169,7 @@ class SurveyResult:
     other_solutions: tuple[OtherSolution, ...] = ()  # that the image points allow as well
     undecided: tuple[str, ...] = ()  # of the orientation: which of two is true, one line each
     unused_image_points: int = 0  # of points or photographs that are not in the result, in no other count
+    explanations: tuple[Explanation, ...] = ()  # of large residuals that were tried, the likeliest first
     orientation_correlations: tuple[OrientationCorrelation, ...] = ()  # of camera parameters with exterior
     # orientation, the strong ones
     seconds: tuple[StageTime, ...] = field(default_factory=tuple)  # in the order of the stages

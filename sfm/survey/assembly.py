@@ -54,6 +54,7 @@ def assemble_result(
         settings=told_settings(survey),
         free_network=solution.free_network,
         taken_out=solution.taken_out,
+        explanations=solution.explanations,
         other_solutions=solution.others,
         undecided=start.remarks,
         unused_image_points=solution.unused_image_points + sum(one.image_points for one in measured.left_out),

@@ -19,7 +19,7 @@ from sfm.errors import GeometryError
 from sfm.network import Estimate, Network
 from sfm.orientation.ray_angles import ray_angles
 from sfm.reduced_network import reduce_network, supported
-from sfm.result import ControlCheck, Eccentricity, LeftOutPoint, TakenOut
+from sfm.result import ControlCheck, Eccentricity, Explanation, LeftOutPoint, TakenOut
 from sfm.survey.datum_definition import (
     Contradiction,
     datum_warnings,
@@ -29,6 +29,7 @@ from sfm.survey.datum_definition import (
     refuse_other_units,
     scale_to_bars,
 )
+from sfm.survey.explanations import explain_residuals
 from sfm.survey.exterior import add_exterior
 from sfm.survey.free_parameters import choose_free_parameters
 from sfm.survey.inputs.incomplete_cameras import unlike_squares
@@ -80,6 +81,7 @@ class Solution:
     free_network: FreeNetwork | None  # of the image points alone; None where nothing else took part
     others: tuple[OtherSolution, ...]  # that the image points allow as well
     notes: tuple[str, ...]  # what was chosen where the survey says nothing, one line each
+    explanations: tuple[Explanation, ...]  # of large residuals, tried on the finished network
 
 
 def refine(network: Network, estimate: Estimate) -> Estimate:
@@ -191,7 +193,17 @@ def solve_survey(survey: Survey, matched: Correspondences) -> Solution:
         taken_out = [replace(one, resolved=False) for one in taken_out]
     alone = free_network_of(final)
     return Solution(
-        final, check, dropped, warnings, left_out, unused, tuple(taken_out), alone, others, chosen.notes
+        final,
+        check,
+        dropped,
+        warnings,
+        left_out,
+        unused,
+        tuple(taken_out),
+        alone,
+        others,
+        chosen.notes,
+        explain_residuals(final),
     )
 
 

@@ -112,6 +112,14 @@ def _other_solutions(evidence: Evidence) -> Judged:
 def _sigma0(evidence: Evidence) -> Judged:
     """Judge sigma0 a posteriori over a priori."""
     ratio = evidence.sigma0.ratio
+    tried = evidence.result.explanations
+    if tried and tried[0].explains:
+        cause = tried[0]
+        explained = (
+            f"Sigma0 of all image points falls from {significant(cause.before_px)} to "
+            f"{significant(cause.after_px)} px with {cause.cause}: most likely that is what does not fit."
+        )
+        return [(ratio > SIGMA0_BAD, explained)]
     if not ratio > SIGMA0_REMARK:
         return []
     line = (
@@ -125,6 +133,11 @@ def _sigma0(evidence: Evidence) -> Judged:
     if ratio > SIGMA0_BAD:
         held = "" if any(one.free.any() for one in cameras) else f" (it is held: try {free_line(evidence)})"
         return [(True, f"{line}points, control or the camera{held} contradict the photographs.")]
+    if tried:
+        causes = "; ".join(f"{one.cause} ({significant(one.after_px)} px)" for one in tried)
+        line += (
+            f"none of the obvious causes explains it, from {significant(tried[0].before_px)} px: {causes}. "
+        )
     return [(False, line + "see the residuals, or set sigma_px to what the photographs give.")]
 
 
