@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import os
 import shutil
+import subprocess
+import sys
 from collections.abc import Callable
 from dataclasses import fields
 from pathlib import Path
@@ -29,6 +31,7 @@ from sfm.report.output import folder_name
 from sfm.survey.measuring.target_store import MEASURING, TargetStore
 from sfm.targets.detect import Targets, find_targets
 from tests.engines import ALONE, HERE, Notes
+from tests.places import ROOT
 from tests.surveys import pictures, write_observed_survey, write_photograph_survey
 from tests.synthetic import make_network, seed_of
 
@@ -149,6 +152,37 @@ COMMANDS: dict[str, Command] = {
     "convert to a database": (lambda f: ("convert", model(f), "new/a.db"), ("new", "new/a.db")),
     "convert to a folder": (lambda f: ("convert", model(f), "new/a"), ("new", "new/a")),
 }
+
+
+@pytest.mark.parametrize("name", [".numba_config.yaml", "matplotlibrc"])
+@pytest.mark.parametrize("command", ["adjust", "batch", "render"])
+def test_settings_of_libraries_in_the_current_folder_are_refused(
+    command: str,
+    name: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """numba takes compiled functions from the folder that its settings name, and they are pickles."""
+    monkeypatch.chdir(tmp_path)
+    arguments = COMMANDS[command][0](tmp_path)
+    (tmp_path / name).symlink_to("nowhere")
+    before = sorted(tmp_path.rglob("*"))
+    assert kolinear(monkeypatch, *arguments) == 2
+    told = capsys.readouterr().err
+    assert told.count("\n") == 1 and f"holds '{name}', by which it would decide" in told
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_nothing_that_takes_settings_is_imported_before_the_folder_is_looked_at(tmp_path: Path) -> None:
+    (tmp_path / ".numba_config.yaml").write_text("opt: no number\n")
+    script = "import sys; from sfm.cli import main; sys.argv[1:] = ['validate']; main()"
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    run = subprocess.run(
+        [sys.executable, "-c", script], cwd=tmp_path, env=environment, capture_output=True, text=True
+    )
+    assert run.returncode == 2
+    assert run.stderr.startswith("kolinear: the current folder, ")
 
 
 @pytest.mark.parametrize("dangling", [False, True])
