@@ -155,6 +155,7 @@ class SurveyResult:
     orientation_correlations: tuple[OrientationCorrelation, ...] = ()  # of camera parameters with exterior
     # orientation, the strong ones
     seconds: tuple[StageTime, ...] = field(default_factory=tuple)  # in the order of the stages
+    settings: tuple[tuple[str, str], ...] = ()  # (table of the survey file, what it says) of the survey
     reject: str = "tau"  # how the survey treats gross errors: tau | huber | tukey | none
 
     @property

@@ -119,7 +119,7 @@ def _details(findings: Findings) -> tuple[tuple[str, str], ...]:
     rows = [
         ("observations", f"{counts.total}: {counts.image} image coordinates, {counts.control} of control, "
          f"{counts.scale_bars} scale bars; {counts.constraints} constraints, {a.unknowns} unknowns"),
-        *(("global test", words_of_test(test)) for test in findings.statistics.global_tests),
+        *(("global test", words_of_test(test, a)) for test in findings.statistics.global_tests),
     ]  # fmt: skip
     found = result.eccentricity
     if found is not None:

@@ -48,6 +48,15 @@ Jobs = Annotated[
     int | None,
     typer.Option("--jobs", metavar="N", min=1, help="Photographs worked on at a time.  [default: all cores]"),
 ]
+PicturesMb = Annotated[
+    float,
+    typer.Option(
+        "--pictures-mb",
+        metavar="MB",
+        min=0.0,
+        help="What the photographs and crops inside report.html may take; the rest lies in pictures/.",
+    ),
+]
 Verbose = Annotated[bool, typer.Option("--verbose", "-v", help="Tell more: every photograph and warning.")]
 AllowOutside = Annotated[
     bool,
@@ -68,6 +77,7 @@ def run(
     ] = None,
     out: Out = None,
     jobs: Jobs = None,
+    pictures_mb: PicturesMb = 15.0,
     allow_outside: AllowOutside = False,
     verbose: Verbose = False,
 ) -> None:
@@ -88,7 +98,9 @@ def run(
         else:
             images = survey_file
             survey_file, out = drafted_beside(images, out)
-    _run_survey(survey_file, images, out, jobs, allow_outside, verbose, from_photographs=True)
+    _run_survey(
+        survey_file, images, out, jobs, allow_outside, verbose, from_photographs=True, pictures_mb=pictures_mb
+    )
 
 
 def adjust(
@@ -112,6 +124,7 @@ def _run_survey(
     verbose: bool,
     *,
     from_photographs: bool,
+    pictures_mb: float = 0.0,
 ) -> None:
     """Run a survey, write its result and tell it; `from_photographs` is what the command is for."""
     begun = time.perf_counter()
@@ -162,6 +175,7 @@ def _run_survey(
             write_colmap=colmap_writer(result),
             finish=lambda part: log.close_into(part, findings),
             jobs=workers,
+            budget_mb=pictures_mb,
             progress=log,
         )
     if not tell_result(findings, page, seconds=time.perf_counter() - begun, verbose=verbose):

@@ -27,17 +27,34 @@ def words_of_sigma0(sigma0: Sigma0) -> tuple[str, str]:
     return f"{sigma0.px:.4f} px", own if sigma0.differs else times
 
 
-def words_of_test(test: GlobalTest) -> str:
-    """Return what a global test says."""
+def words_of_test(test: GlobalTest, adjustment: Adjustment | None = None) -> str:
+    """Return what a global test says, with what would fit where the stated values are too cautious.
+
+    Args:
+        test: of all observations, or of a kind.
+        adjustment: tells what sigma_px was; None to say a factor.
+    """
     if test.passed is None:
         return f"{test.of}: not tested, {test.reason}"
     r = f"{test.redundancy:.1f}".removesuffix(".0")
-    side = "better" if test.statistic < test.lower else "worse"
-    said = "passed" if test.passed else f"NOT passed, {side} than stated"
+    said = "passed" if test.passed else "NOT passed, worse than stated"
+    if not test.passed and test.statistic < test.lower:
+        said = f"better than stated, {_fitting(test, adjustment)} would fit"
     return (
         f"{test.of}: {said}; v'Pv = {test.statistic:.2f}, chi-square of {r} between {test.lower:.2f} and "
         f"{test.upper:.2f} ({100 * (1 - GLOBAL_ALPHA):.0f} %)"
     )
+
+
+def _fitting(test: GlobalTest, a: Adjustment | None) -> str:
+    """Return the stated standard deviations with which a test would pass, as sigma_px where that decides."""
+    factor = float(np.sqrt(test.statistic / test.redundancy))
+    if a is not None and a.observations == 2 * int((~a.rejected).sum()):
+        measured = a.stated_px**2 - a.sigma_px**2  # what targets state of their own; sigma_px comes on top
+        left = (factor * a.stated_px) ** 2 - measured
+        if 0 <= measured < 0.5 * a.stated_px**2 and left > 0:
+            return f"sigma_px = {significant(float(np.sqrt(left)))}"
+    return f"{significant(factor)} times the stated standard deviations"
 
 
 def words_of_weights(result: SurveyResult) -> str:

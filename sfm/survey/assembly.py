@@ -12,6 +12,7 @@ from sfm.survey.inputs.measurements import Measurements
 from sfm.survey.inputs.survey import Survey
 from sfm.survey.other_programs import SurveyComparison
 from sfm.survey.solution import Correspondences, Solution
+from sfm.survey.told_settings import told_settings
 
 
 def assemble_result(
@@ -47,6 +48,7 @@ def assemble_result(
         no_circles=matched.no_circles,
         left_out=(*measured.left_out, *solution.left_out),
         notes=solution.notes,
+        settings=told_settings(survey),
         free_network=solution.free_network,
         taken_out=solution.taken_out,
         other_solutions=solution.others,

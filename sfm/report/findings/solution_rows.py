@@ -27,6 +27,11 @@ class PointRow:
     angle_deg: float  # largest angle between two rays; NaN with fewer than two
     rms_px: float  # root mean square residual per coordinate
 
+    @property
+    def sigma_length(self) -> float:
+        """Length of the vector of its standard deviations, object unit; 0 where not known."""
+        return float(np.linalg.norm(np.nan_to_num(self.sigma)))
+
 
 @dataclass(frozen=True)
 class PhotographRow:

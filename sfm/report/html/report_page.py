@@ -8,6 +8,8 @@ other adjuster agree, where are my coordinates. What it says stands in `template
 from __future__ import annotations
 
 from collections.abc import Sequence
+from datetime import datetime
+from importlib.metadata import version
 
 from sfm.report.figures.overlays import Overlay
 from sfm.report.figures.plots import Plot
@@ -43,4 +45,6 @@ def report_page(
         pictures={plot.stem: plot for plot in plots},
         overlays=overlays,
         has_model=has_model,
+        written=datetime.now().astimezone().strftime("%Y-%m-%d %H:%M %Z"),
+        version=version("kolinear"),
     )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 
 from sfm.errors import OutputError
@@ -83,7 +84,8 @@ def photographs_in(folder: Path, names: tuple[str, ...]) -> dict[str, Path]:
     root = folder.resolve()
     found = {}
     for name in names:
-        path = (root / name).resolve()
-        if path.is_relative_to(root) and path.is_file():
-            found[name] = path
+        with suppress(OSError, ValueError):  # a name that is no name of a file here
+            path = (root / name).resolve()
+            if path.is_relative_to(root) and path.is_file():
+                found[name] = path
     return found

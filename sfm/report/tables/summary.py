@@ -125,7 +125,7 @@ def _statistics(findings: Findings) -> dict[str, Any]:
                 "lower": or_none(test.lower),
                 "upper": or_none(test.upper),
                 "passed": test.passed,
-                "words": words_of_test(test),
+                "words": words_of_test(test, result.adjustment),
             }
             for test in found.global_tests
         ],
