@@ -185,6 +185,26 @@ def test_nothing_that_takes_settings_is_imported_before_the_folder_is_looked_at(
     assert run.stderr.startswith("kolinear: the current folder, ")
 
 
+@pytest.mark.skipif(os.name == "nt", reason="Windows has another path of libraries")
+@pytest.mark.parametrize("given", [None, "", "/a::/b:"])
+def test_no_process_looks_for_libraries_in_the_current_folder(
+    given: str | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What cv2 does to the path when it is imported would add it."""
+    script = (
+        "import contextlib, os, sys; from sfm.cli import main; sys.argv[1:] = ['--help']\n"
+        "with contextlib.suppress(SystemExit): main()\n"
+        "import cv2; print(); print(os.environ['LD_LIBRARY_PATH'])"
+    )
+    environment = {name: value for name, value in os.environ.items() if name != "LD_LIBRARY_PATH"}
+    environment |= {"PYTHONPATH": str(ROOT)} | ({} if given is None else {"LD_LIBRARY_PATH": given})
+    command = [sys.executable, "-c", script]
+    run = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=True)
+    folders = run.stdout.splitlines()[-1].split(":")
+    assert "" not in folders and all(Path(folder).is_absolute() for folder in folders)
+    assert given != "/a::/b:" or folders[-2:] == ["/a", "/b"]
+
+
 @pytest.mark.parametrize("dangling", [False, True])
 @pytest.mark.parametrize(
     ("command", "place"), [(name, place) for name, (_, places) in COMMANDS.items() for place in places]
