@@ -68,6 +68,12 @@ class ObjectPoints:
     def __len__(self) -> int:
         return len(self.point)
 
+    @property
+    def complete(self) -> ObjectPoints:
+        """Those of which all three coordinates are known."""
+        known = np.isfinite(np.einsum("nii->ni", self.covariance)).all(axis=1)
+        return ObjectPoints(self.point[known], self.xyz[known], self.covariance[known])
+
 
 @dataclass(frozen=True)
 class ScaleBars:

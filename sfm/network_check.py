@@ -116,6 +116,7 @@ def _positive_definite(covariance: FloatArray) -> BoolArray:
 
 def _not_negative(covariance: FloatArray) -> BoolArray:
     """Return which covariances (c, 3, 3) are symmetric and have no negative variance."""
-    finite = np.isfinite(covariance).all(axis=(1, 2))
+    unknown = np.eye(3, dtype=bool) & np.isposinf(covariance)  # a variance may be infinite
+    finite = (np.isfinite(covariance) | unknown).all(axis=(1, 2))
     symmetric = np.isclose(covariance, np.swapaxes(covariance, 1, 2), rtol=1e-9, atol=0).all(axis=(1, 2))
     return np.asarray(finite & symmetric & (np.diagonal(covariance, axis1=1, axis2=2) >= 0).all(axis=1))

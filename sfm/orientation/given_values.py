@@ -36,7 +36,7 @@ def start_from_given(growth: Growth, refine: Refine | None, final_tolerance_px: 
         refine: the caller's adjustment.
         final_tolerance_px: below this no image point is put aside, px.
     """
-    control = growth.network.control
+    control = growth.network.control.complete
     held = control.point[growth.fixed[control.point]]
     _complete(growth)
     start = growth.estimate

@@ -45,7 +45,7 @@ class Growth:
         self.dropped = np.zeros(len(network.images), dtype=bool)  # does not belong, (m,)
         area = [np.prod(camera.size_px) / camera.c_px**2 for camera in estimate.cameras]
         self.field = np.array(area)[network.camera]  # area of each photograph, squared tangents, (m,)
-        control = network.control
+        control = network.control.complete
         # control that the estimate does not hold to its coordinates is intersected like any other point
         self.fixed = np.zeros(len(network.points), dtype=bool)
         self.fixed[control.point] = (estimate.points[control.point] == control.xyz).all(axis=1)
@@ -82,7 +82,7 @@ class Growth:
         Raises:
             GeometryError: nothing orients two photographs; with given values these are not enough.
         """
-        network, control = self.network, self.network.control
+        network, control = self.network, self.network.control.complete
         given = has_given_values(network, self.estimate)
         if given or len(control) >= 3:
             if not given:
@@ -319,7 +319,7 @@ class Growth:
 
 def has_given_values(network: Network, estimate: Estimate) -> bool:
     """Return whether an estimate holds more than cameras and the coordinates of control."""
-    control = network.control
+    control = network.control.complete
     other = estimate.determined
     other[control.point] &= (estimate.points[control.point] != control.xyz).any(axis=1)
     return bool(estimate.oriented.any() or other.any())

@@ -140,7 +140,7 @@ def orient(
 
 def _holds_control(network: Network, found: Orientation) -> bool:
     """Return whether every control point that is measured fits in some photograph."""
-    control, seen = network.control, network.image_points
+    control, seen = network.control.complete, network.image_points
     measured = np.isin(control.point, seen.point[found.estimate.oriented[seen.image]])
     return bool(np.isin(control.point[measured], seen.point[found.fits]).all())
 
@@ -188,7 +188,7 @@ def _settled(growth: Growth, refine: Refine | None, final_tolerance_px: float) -
 def _finish(growth: Growth, start: Start, cameras: tuple[Camera, ...], *, contradicting: bool) -> Orientation:
     """Intersect the remaining points, bring the network onto control if it started free, and report."""
     lost = intersect_remaining(growth, contradicting=contradicting)
-    network, control = growth.network, growth.network.control
+    network, control = growth.network, growth.network.control.complete
     seen = network.image_points
     residuals = growth.residuals_px()
     fits = residuals <= growth.tolerance_px[network.camera[seen.image]]

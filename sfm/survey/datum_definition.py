@@ -27,7 +27,7 @@ MIN_CONTROL = 3  # points that a control datum needs
 
 def object_scale(network: Network, estimate: Estimate) -> float:
     """Return object units per unit of an estimate by its scale bars, else its control, else NaN."""
-    bars, control = network.scale_bars, network.control
+    bars, control = network.scale_bars, network.control.complete
     length = np.linalg.norm(estimate.points[bars.end] - estimate.points[bars.start], axis=1)
     usable = np.isfinite(length) & (length > 0)
     if usable.any():
@@ -48,7 +48,7 @@ def refuse_other_units(survey: Survey, network: Network, estimate: Estimate) -> 
     """
     if survey.datum.kind != "control":
         return
-    bars, control, exterior = network.scale_bars, network.control, network.exterior
+    bars, control, exterior = network.scale_bars, network.control.complete, network.exterior
     known, oriented = estimate.determined[control.point], estimate.oriented[exterior.image]
     points, centres = estimate.points[control.point], estimate.position[exterior.image]
     scales = {
@@ -95,7 +95,7 @@ def scale_to_bars(network: Network, estimate: Estimate, datum: Datum) -> Estimat
 
 def place_on_control(network: Network, estimate: Estimate) -> tuple[Estimate, ControlCheck]:
     """Place an adjusted network on its control; scale bars, where there are some, keep its scale."""
-    control = network.control
+    control = network.control.complete
     points = estimate.points[control.point]
     fitted = fit_similarity(points, control.xyz)
     placing = fit_similarity(points, control.xyz, scale=1.0) if len(network.scale_bars) else fitted

@@ -89,7 +89,7 @@ def _placed(
     sigma: FloatArray,
 ) -> Estimate:
     """Return the start values in the frame of control and observed exterior orientation."""
-    control = network.control
+    control = network.control.complete
     known = estimate.determined[control.point]
     length, breadth = _extents(control.xyz[known], np.ones(int(known.sum())))
     if known.sum() >= MIN_POINTS and breadth >= NARROW * length:

@@ -81,10 +81,11 @@ def _agree(scale: FloatArray, one: float) -> BoolArray:
 
 def _scale_of_control(network: Network, estimate: Estimate) -> tuple[float, int]:
     """Return the scale by the distances between control points, and by how many bars it counts."""
-    known = np.flatnonzero(estimate.determined[network.control.point])
+    control = network.control.complete
+    known = np.flatnonzero(estimate.determined[control.point])
     if len(known) < MIN_CONTROL:
         return float("nan"), 0
-    given, point = network.control.xyz[known], network.control.point[known]
+    given, point = control.xyz[known], control.point[known]
     length = np.linalg.norm(np.diff(given, axis=0), axis=1)
     found = np.linalg.norm(np.diff(estimate.points[point], axis=0), axis=1)
     usable = (length > 0) & (found > 0)

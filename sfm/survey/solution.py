@@ -109,7 +109,7 @@ def solve_survey(survey: Survey, matched: Correspondences) -> Solution:
     network = scales.network
     needed = matched.min_rays.copy()
     if datum.kind == "control":
-        needed[network.control.point] = 1
+        needed[network.control.complete.point] = 1
     whole, known = placed.network, estimate.determined
     oriented = estimate.oriented
     if datum.kind == "minimal" and matched.given:  # what it holds are the given coordinates
@@ -134,7 +134,7 @@ def solve_survey(survey: Survey, matched: Correspondences) -> Solution:
         found = settled.contradiction
         if found is None:
             last, check = settled.estimate, None
-            if datum.kind != "control" and len(settled.part.control) >= 3:
+            if datum.kind != "control" and len(settled.part.control.complete) >= 3:
                 last, check = place_on_control(settled.part, last)
             elif datum.kind == "free":
                 carriers = _on_points(survey, settled.part, last, datum).resolve(settled.part).points
@@ -147,7 +147,7 @@ def solve_survey(survey: Survey, matched: Correspondences) -> Solution:
             if first is not None and not final.converged:  # what seemed better is none: as it was
                 (settled, final, check, others), better = first, ()
                 break
-            if first is not None or not others or others[0].vPv >= 1:
+            if first is not None or not others or not others[0].converges:
                 break
             first = settled, final, check, others
             better = (_words_of_better(final, others[0]),)

@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 
 from sfm.conventions import IntArray
-from sfm.report.html.view_page import write_view
+from sfm.report.html.view_page import view_page, write_view
+from sfm.report.viewer.pictures import cut_pictures
 from sfm.report.viewer.scene import Bar, Marks, ViewerScene, distance_sigmas
 from sfm.report.viewer.stored_scene import scene_of_stored
 from sfm.stored_result import StoredResult
@@ -252,6 +253,37 @@ def test_sigma_of_a_distance_is_that_of_the_law_of_propagation() -> None:
     pairs = [(i, j) for i in range(4) for j in range(i + 1, 4)]
     spread = [np.linalg.norm(drawn[:, j] - drawn[:, i], axis=1).std() for i, j in pairs]
     np.testing.assert_allclose(distance_sigmas(xyz, joint), spread, rtol=0.03)
+
+
+def test_crops_without_room_are_shown_from_beside_the_page(
+    browser: Any, scene: ViewerScene, tmp_path: Path
+) -> None:
+    pictures = cut_pictures(scene, photographs(scene, tmp_path), budget_mb=0.0, beside="pictures")
+    (tmp_path / "pictures").mkdir()
+    for name, content in pictures.beside.items():
+        (tmp_path / "pictures" / name).write_bytes(content)
+    (tmp_path / "page.html").write_text(view_page(scene, pictures, "here"), encoding="utf-8")
+    tab = Tab(browser, tmp_path / "page.html")
+    page = tab.ready()
+    for j in (7, 20):
+        page.evaluate(SELECT, ["point", j])
+        page.wait_for_function("document.querySelectorAll('.v-crop canvas:not([data-ready])').length === 0")
+        crop = page.locator(".v-crop canvas").first
+        data = np.frombuffer(crop.screenshot(), np.uint8)
+        seen = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE)
+        h, w = seen.shape
+        middle = seen[int(0.4 * h) : int(0.6 * h), int(0.4 * w) : int(0.6 * w)]
+        assert abs(float(np.median(middle)) - grey_of(j)) <= 4
+    assert tab.complaints == []
+    assert all(url.startswith(tmp_path.as_uri() + "/") for url in tab.requests)
+    tab.close()
+    for path in (tmp_path / "pictures").iterdir():  # as where the page alone was mailed
+        path.unlink()
+    alone = Tab(browser, tmp_path / "page.html")
+    page = alone.ready()
+    page.evaluate(SELECT, ["point", 9])
+    page.locator(".v-nocrop", has_text="not beside this page").first.wait_for()
+    alone.close()
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])

@@ -56,7 +56,14 @@ async function start() {
     if (event.key === "Escape" && root.contains(event.target)) hub.tell("select", null)
   })
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => scene?.invalidate())
-  window.addEventListener("beforeprint", () => scene?.draw())
+  const print = (on) => {
+    if (!scene) return
+    scene.printing = on
+    scene.draw()
+  }
+  window.addEventListener("beforeprint", () => print(true))
+  window.addEventListener("afterprint", () => print(false))
+  matchMedia("print").addEventListener("change", () => scene?.invalidate())
   requestAnimationFrame(() => requestAnimationFrame(() => (root.dataset.ready = (performance.now() - begun).toFixed(0))))
   root.viewer = { model, scene, hub } // for who writes a test
 }

@@ -2,7 +2,7 @@
 
 import * as THREE from "three"
 
-const SIZE_PX = 9
+const SIZES_PX = [[500, 9], [2000, 6], [Infinity, 4]] // up to so many points, of this size
 export const MANY = 5000 // more points than this are drawn as small squares without a rim
 const SIZE_OF_MANY_PX = 3
 
@@ -31,7 +31,7 @@ export class Points {
     const n = model.pointCount
     const position = new Float32Array(3 * n)
     for (let k = 0; k < 3 * n; k++) position[k] = model.a["point.xyz"][k] - origin[k % 3]
-    this.size = n > MANY ? SIZE_OF_MANY_PX : SIZE_PX
+    this.size = n > MANY ? SIZE_OF_MANY_PX : SIZES_PX.find(([most]) => n <= most)[1]
     this.geometry = new THREE.BufferGeometry()
     this.geometry.setAttribute("position", new THREE.BufferAttribute(position, 3))
     this.geometry.setAttribute("color", new THREE.BufferAttribute(new Uint8Array(3 * n), 3, true))

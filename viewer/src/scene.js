@@ -168,7 +168,9 @@ export class Scene {
 
   /** Look at the centre from a direction, so that everything is seen. */
   look(direction, up, target = this.middle.clone(), radius = this.allRadius) {
-    const distance = radius / Math.sin((FIELD_DEG / 2) * (Math.PI / 180))
+    const { clientWidth, clientHeight } = this.canvas.parentElement
+    const narrow = Math.max(1, clientHeight / Math.max(1, clientWidth))
+    const distance = (narrow * radius) / Math.sin((FIELD_DEG / 2) * (Math.PI / 180))
     for (const camera of [this.perspective, this.orthographic]) {
       camera.up.copy(up)
       camera.position.copy(direction).normalize().multiplyScalar(distance).add(target)
@@ -303,7 +305,7 @@ export class Scene {
   draw() {
     this.due = false
     this.pace()
-    const dark = matchMedia("(prefers-color-scheme: dark)").matches
+    const dark = matchMedia("screen and (prefers-color-scheme: dark)").matches && !this.printing
     this.renderer.setClearColor(dark ? 0x333c47 : 0xf7f9fb)
     this.points.setDark(dark)
     this.renderer.render(this.world, this.camera)

@@ -94,7 +94,7 @@ def scale_difference(a: Adjustment, free: FreeNetwork | None) -> ScaleDifference
     Its standard deviation comes from what was stated for control and bars or, where that is larger, from
     their own residuals: control that is worse than stated is no contradiction of scale.
     """
-    control, bars = a.network.control, a.network.scale_bars
+    control, bars = a.network.control.complete, a.network.scale_bars
     if free is None or a.datum != "control" or len(control) < MIN_CONTROL or not len(bars):
         return None
     X = fit_similarity(free.points[control.point], control.xyz).apply(free.points)

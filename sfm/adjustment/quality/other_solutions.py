@@ -20,6 +20,7 @@ import numpy as np
 from scipy import stats
 
 from sfm.adjustment.datum import Datum
+from sfm.adjustment.engine.iterate import TOLERANCE
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.camera import Camera
@@ -51,6 +52,7 @@ class OtherSolution:
     moved: float  # by how much points differ, over their standard deviations in the result, RMS
     vPv: float  # over that of the result
     estimate: Estimate
+    converges: bool  # whether an adjustment of all observations from there ends
 
 
 def other_solutions(adjustment: Adjustment) -> tuple[OtherSolution, ...]:
@@ -85,9 +87,21 @@ def other_solutions(adjustment: Adjustment) -> tuple[OtherSolution, ...]:
         reflected = abs(np.log(c / own[1])) < np.log(STEP) / 2
         found.append(
             OtherSolution(
-                camera, c, unit, bool(reflected), moved, candidate.vPv / base.vPv, candidate.estimate
+                *(
+                    camera,
+                    c,
+                    unit,
+                    bool(reflected),
+                    moved,
+                    candidate.vPv / base.vPv,
+                    candidate.estimate,
+                    False,
+                )
             )
         )
+    if found and found[0].vPv < 1:
+        ended = search.adjusted(found[0].estimate, tolerance=TOLERANCE)
+        found[0] = replace(found[0], converges=ended is not None and ended.converged)
     return tuple(found)
 
 
@@ -116,7 +130,7 @@ class _Search:
     datum: Datum
     factor: FloatArray  # on the standard deviations of the image points, (k,)
 
-    def adjusted(self, start: Estimate, *, held: bool = False) -> Adjustment | None:
+    def adjusted(self, start: Estimate, *, held: bool = False, tolerance: float = NEAR) -> Adjustment | None:
         """Return the adjustment, with c free or held; None where it has no solution."""
         cameras = tuple(_with_c_held(camera) for camera in start.cameras) if held else start.cameras
         try:
@@ -127,7 +141,7 @@ class _Search:
                 image_sigma_factor=self.factor,
                 reject="none",
                 max_iterations=MAX_ITERATIONS,
-                tolerance=NEAR,
+                tolerance=tolerance,
                 covariance=False,
             )
         except GeometryError:

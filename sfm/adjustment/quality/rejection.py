@@ -28,6 +28,7 @@ from sfm.conventions import BoolArray, FloatArray
 from sfm.errors import GeometryError
 
 MAX_ROUNDS = 200  # of data snooping
+MAX_VAGUE = 5  # of them that did not converge: residuals of no optimum tell no gross errors
 ROUND_TOLERANCE = 1e-3  # |A dx| / |v| that is near enough to judge gross errors
 BENT = 2.0  # spread of residuals over that with the start values, above which gross errors bend the network
 BENT_ALONE = 10.0  # the same of one photograph, over the median of all photographs
@@ -209,8 +210,12 @@ def _snoop_all(run: Run, optimum: Optimum, weight: FloatArray, alpha: float) -> 
     Ends with the last round that could be solved where the next one cannot.
     """
     layout = run.problem.layout
-    returned = np.zeros(len(weight), dtype=bool)
+    returned, vague = np.zeros(len(weight), dtype=bool), 0
     for _ in range(MAX_ROUNDS):
+        vague += not optimum.converged
+        if vague > MAX_VAGUE:
+            run.remarks = (f"data snooping ended after {MAX_VAGUE} rounds that did not converge",)
+            break
         redundancy = run.redundancy(optimum, weight)
         if redundancy < 2:
             break

@@ -105,7 +105,7 @@ def network_figure(findings: Findings) -> Figure:
     plan.set_ylabel(f"{labels[1]} [{_plain(unit)}]")
     plan.set_title("Plan")
     plan.grid(color="#ddd", linewidth=0.5)
-    plan.legend(loc="best", fontsize=7)
+    plan.legend(loc="upper right", fontsize=7)
     space.set_aspect("equal", adjustable="datalim")
     space.set_box_aspect(None, zoom=0.85)  # else the name of the third axis is cut off
     space.set_title("In space")

@@ -29,6 +29,7 @@ def view_page(scene: ViewerScene, pictures: Pictures, source: str) -> str:
     page = render(
         "view.html",
         viewer=viewer_of(scene, pictures),
+        pictures_beside=bool(pictures.beside),
         s=scene,
         source=source,
         cameras=", ".join(f"{camera.name} ({camera.model})" for camera in scene.cameras),

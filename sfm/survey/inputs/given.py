@@ -14,12 +14,14 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from sfm.conventions import FloatArray, rotation_from_angles
+from sfm.conventions import BoolArray, FloatArray, rotation_from_angles
 from sfm.errors import SurveyFileError
 from sfm.files.csv_tables import MAX_NUMBER, CsvTable, array_table, read_header, read_table
 
 MIN_SIGMA = 1e-9  # in any unit used here less than an atom
 MAX_EXTENT_PER_SIGMA = 1e6  # no control is known to better than a millionth of its extent
+CORRELATION_LIMIT = 0.999999  # beyond it a covariance matrix is no longer regular in floating point
+COVARIANCES = ("cXY", "cXZ", "cYZ")  # of control, object unit^2
 AXES, ANGLES = ("X", "Y", "Z"), ("omega_deg", "phi_deg", "kappa_deg")
 SIGMAS_OF_AXES, SIGMAS_OF_ANGLES = ("sX", "sY", "sZ"), ("somega_deg", "sphi_deg", "skappa_deg")
 
@@ -37,8 +39,19 @@ class KnownPoints:
     """
 
     names: tuple[str, ...]  # (n,)
-    xyz: FloatArray  # object unit, (n, 3)
-    sigma: FloatArray  # standard deviations, 0 = fixed, object unit, (n, 3)
+    xyz: FloatArray  # object unit, NaN where a coordinate is not known, (n, 3)
+    sigma: FloatArray  # standard deviations, 0 = fixed, infinite = not known, object unit, (n, 3)
+    covariances: FloatArray | None = None  # of X and Y, X and Z, Y and Z, object unit^2, 0 if None, (n, 3)
+
+    @property
+    def covariance(self) -> FloatArray:
+        """Covariance matrices, object unit^2; variance 0 = fixed, infinite = not known, (n, 3, 3)."""
+        C = np.zeros((len(self.names), 3, 3))
+        C[:, range(3), range(3)] = self.sigma**2
+        if self.covariances is not None:
+            for k, (row, column) in enumerate(((0, 1), (0, 2), (1, 2))):
+                C[:, row, column] = C[:, column, row] = self.covariances[:, k]
+        return C
 
     @classmethod
     def from_arrays(cls, names: Sequence[str], xyz: npt.ArrayLike, sigma: npt.ArrayLike = 0.0) -> KnownPoints:
@@ -113,6 +126,7 @@ class Observations:
     # any, (k, 2)
     unit: str  # px | mm
     table: CsvTable  # where they stand, for messages
+    covariance: FloatArray | None = None  # of x and y in the square of the unit, 0 if None, (k,)
 
     @classmethod
     def from_arrays(
@@ -178,22 +192,38 @@ class ScaleBar:
 
 
 def read_control(path: Path) -> KnownPoints:
-    """Read known object points: id,X,Y,Z[,sX,sY,sZ]; no sigma or 0 means fixed.
+    """Read known object points: id,X,Y,Z[,sX,sY,sZ[,cXY,cXZ,cYZ]]; no sigma or 0 means fixed.
+
+    An empty cell among X, Y, Z is a coordinate that is not known; its sigma is empty or not looked at. cXY,
+    cXZ and cYZ are covariances, empty or 0 where there are none.
 
     Raises:
         SurveyFileError: unreadable, wrong columns, not a finite number, a duplicate id, a negative sigma, or
-            one that is so small beside the coordinates that its unit must be another.
+            one that is so small beside the coordinates that its unit must be another, covariances that are
+            larger than the sigmas allow.
     """
-    return _known_points(read_table(path, ("id",), AXES, SIGMAS_OF_AXES, aliases=(("point", "id"),)))
+    more = COVARIANCES if COVARIANCES[0] in read_header(path) else ()
+    table = read_table(
+        *(path, ("id",), AXES, (*SIGMAS_OF_AXES, *more)),
+        aliases=(("point", "id"),),
+        blank=(*AXES, *SIGMAS_OF_AXES, *more),
+    )
+    return _known_points(table)
 
 
 def _known_points(table: CsvTable) -> KnownPoints:
     """Return the points of a table with or without sigmas."""
-    xyz, sigma = table.values[:, :3], table.values[:, 3:]
+    xyz, sigma, covariances = np.split(table.values, (3, 6), axis=1)
     if not sigma.size:
         sigma = np.zeros_like(xyz)
+    unknown: BoolArray = np.isnan(xyz)
+    table.refuse(
+        xyz, unknown & unknown.all(axis=1, keepdims=True), AXES, "at least one coordinate of a point"
+    )
+    table.refuse(sigma, np.isnan(sigma) & ~unknown, SIGMAS_OF_AXES, "a number where the coordinate is given")
+    sigma = np.where(unknown, np.inf, sigma)
     table.refuse(sigma, sigma < 0, SIGMAS_OF_AXES, "0 (fixed) or more")
-    extent = float(np.ptp(xyz, axis=0).max())
+    extent = max(float(np.ptp(axis[np.isfinite(axis)])) for axis in xyz.T if np.isfinite(axis).any())
     table.refuse(
         sigma,
         (sigma > 0) & (sigma * MAX_EXTENT_PER_SIGMA < extent),
@@ -201,7 +231,28 @@ def _known_points(table: CsvTable) -> KnownPoints:
         f"at least a millionth of the extent of the points, {extent:g}: coordinates and sigmas in one unit; "
         "0 for a fixed coordinate",
     )
-    return KnownPoints(table.keys("id"), xyz, sigma)
+    return KnownPoints(table.keys("id"), xyz, sigma, _covariances(table, sigma, covariances))
+
+
+def _covariances(table: CsvTable, sigma: FloatArray, given: FloatArray) -> FloatArray | None:
+    """Return the covariances of control, 0 where empty; None without any.
+
+    Raises:
+        SurveyFileError: of a coordinate that is fixed or not known, or as large as no covariance can be.
+    """
+    if not given.size:
+        return None
+    given = np.nan_to_num(given)
+    pairs = sigma[:, [0, 0, 1]] * sigma[:, [1, 2, 2]]
+    usable = np.isfinite(pairs) & (pairs > 0)
+    table.refuse(given, (given != 0) & ~usable, COVARIANCES, "0 or empty for a coordinate fixed or not known")
+    table.refuse(
+        given,
+        np.abs(given) > CORRELATION_LIMIT * np.where(usable, pairs, np.inf),
+        COVARIANCES,
+        "a correlation below 1 with the sigmas of the row",
+    )
+    return given
 
 
 def read_diameters(path: Path) -> Diameters:
@@ -262,10 +313,10 @@ def read_start_cameras(path: Path) -> StartCameras:
 
 
 def read_image_points(path: Path) -> Observations:
-    """Read image points: image,point,x_px,y_px[,sx_px,sy_px] or image,point,x_mm,y_mm[,sx_mm,sy_mm].
+    """Read image points: image,point,x_px,y_px[,sx_px,sy_px[,cxy_px2]], or with mm in place of px.
 
-    Sigmas may be empty where none is known. A point that is a duplicate in an image is left to
-    `sfm.survey.inputs.repeated_image_points`.
+    Sigmas may be empty where none is known; cxy is the covariance of x and y, empty or 0 where there is none.
+    A point that is a duplicate in an image is left to `sfm.survey.inputs.repeated_image_points`.
 
     image_points.csv of a result is welcome; its residuals and rejections are passed over, everything is
     taken as measured.
@@ -274,7 +325,9 @@ def read_image_points(path: Path) -> Observations:
         SurveyFileError: unreadable, wrong columns, not a finite number, or a sigma that is not positive.
     """
     unit = "mm" if "x_mm" in read_header(path) else "px"
-    sigmas = (f"sx_{unit}", f"sy_{unit}")
+    sigmas: tuple[str, ...] = (f"sx_{unit}", f"sy_{unit}")
+    if f"cxy_{unit}2" in read_header(path):
+        sigmas += (f"cxy_{unit}2",)
     table = read_table(
         path,
         ("image", "point"),
@@ -288,7 +341,7 @@ def read_image_points(path: Path) -> Observations:
 
 def _observations(table: CsvTable, unit: str) -> Observations:
     """Return the image points of a table with or without sigmas."""
-    xy, sigma = table.values[:, :2], table.values[:, 2:]
+    xy, sigma, covariance = np.split(table.values, (2, 4), axis=1)
     sigmas = (f"sx_{unit}", f"sy_{unit}")
     table.refuse(sigma, sigma < MIN_SIGMA, sigmas, f"more than 0, at least {MIN_SIGMA:g}")
     table.refuse(
@@ -297,8 +350,17 @@ def _observations(table: CsvTable, unit: str) -> Observations:
         sigmas,
         "both standard deviations of an image point or none",
     )
+    covariance = np.nan_to_num(covariance)
+    table.refuse(
+        covariance,
+        (covariance != 0) & ~(np.abs(covariance) <= CORRELATION_LIMIT * sigma.prod(axis=1, keepdims=True)),
+        (f"cxy_{unit}2",),
+        "a correlation below 1 with the sigmas of the row",
+    )
     image, point = table.texts
-    return Observations(image, point, xy, sigma if np.isfinite(sigma).any() else None, unit, table)
+    stated = sigma if np.isfinite(sigma).any() else None
+    own = covariance[:, 0] if covariance.any() else None
+    return Observations(image, point, xy, stated, unit, table, own)
 
 
 def columns_of(

@@ -49,9 +49,7 @@ def measurements_from_observations(survey: Survey) -> Measurements:
         [camera_of_image(survey.cameras, name, survey.source) for name in images], dtype=np.int64
     )
     refuse_ungrouped(survey.cameras, images, owner, survey.source)
-    xy, covariance = _in_pixels(
-        given.xy, given.sigma, given.unit, cameras, owner[image], survey.adjust.sigma_px
-    )
+    xy, covariance = _in_pixels(given, cameras, owner[image], survey.adjust.sigma_px)
     _refuse_far_outside(given, xy, cameras, owner[image])
     refuse_unknown_photographs(survey, images)
     sigma = np.full(xy.shape, np.nan) if given.sigma is None else given.sigma
@@ -96,12 +94,14 @@ def control_points(control: KnownPoints | None, points: Sequence[str]) -> Object
         return ObjectPoints()
     index = {name: k for k, name in enumerate(points)}
     known = np.array([name in index for name in control.names], dtype=bool)
-    covariance = np.zeros((len(control.names), 3, 3))
-    covariance[:, range(3), range(3)] = control.sigma**2
+    given = np.isfinite(control.xyz)
+    # an unknown coordinate has any finite value, here the mean of the others, and no weight
+    count = np.maximum(given.sum(axis=0), 1)
+    mean = np.where(given, control.xyz, 0.0).sum(axis=0) / count
     return ObjectPoints(
         np.array([index[name] for name in control.names if name in index], dtype=np.int64),
-        control.xyz[known],
-        covariance[known],
+        np.where(given, control.xyz, mean)[known],
+        control.covariance[known],
     )
 
 
@@ -145,7 +145,8 @@ def start_values(survey: Survey, network: Network, cameras: tuple[Camera, ...]) 
     """
     found = given_values(survey, network, cameras)
     if survey.datum.kind == "control":
-        found.points[network.control.point] = network.control.xyz
+        control = network.control.complete
+        found.points[control.point] = control.xyz
     return found
 
 
@@ -183,24 +184,23 @@ def _numbered(names: tuple[str, ...]) -> tuple[tuple[str, ...], IntArray]:
 
 
 def _in_pixels(
-    xy: FloatArray,
-    sigma: FloatArray | None,
-    unit: str,
-    cameras: tuple[Camera, ...],
-    camera: IntArray,
-    sigma_px: float,
+    given: Observations, cameras: tuple[Camera, ...], camera: IntArray, sigma_px: float
 ) -> tuple[FloatArray, FloatArray]:
     """Return positions (k, 2) in px and their covariance (k, 2, 2) in px^2 of rows in px or mm."""
+    xy, sigma = given.xy, given.sigma
+    between = np.zeros(len(xy)) if given.covariance is None else given.covariance.copy()
     xy_px = xy.copy()
     s = np.full(xy.shape, sigma_px) if sigma is None else sigma.copy()
-    if unit == "mm":
+    if given.unit == "mm":
         for own, rows in zip(cameras, rows_of(camera, len(cameras)), strict=True):
             xy_px[rows] = pixel_from_image(xy[rows], own.size_px, own.pixel_mm)
             if sigma is not None:
                 s[rows] = sigma[rows] / own.pixel_mm
+                between[rows] /= -own.pixel_mm.prod()  # y is up in the image frame, down in px
     s = np.where(np.isnan(s), sigma_px, s)
     covariance = np.zeros((len(xy), 2, 2))
     covariance[:, range(2), range(2)] = s**2
+    covariance[:, 0, 1] = covariance[:, 1, 0] = between
     return xy_px, covariance
 
 
