@@ -7,9 +7,11 @@ import os
 import shutil
 import subprocess
 import sys
+import tomllib
 from collections.abc import Callable
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -26,6 +28,7 @@ from sfm.files.folder_lock import locked
 from sfm.files.whole_files import remove_leftovers, whole_file, whole_folder
 from sfm.kernels.compiling import COMPILING
 from sfm.kernels.sources import sources_of
+from sfm.photographs.exif import Metadata, read_metadata
 from sfm.report.log import SurveyLog, read_log
 from sfm.report.output import folder_name
 from sfm.survey.measuring.target_store import MEASURING, TargetStore
@@ -148,6 +151,17 @@ COMMANDS: dict[str, Command] = {
         lambda f: ("render", scene(f), "new/a"),
         ("new", "new/a", "new/a/p1.jpg", "new/a/truth_points.csv", "new/a/manifest.json"),
     ),
+    "init": (
+        lambda f: ("init", photographs(f)[0].parent, "--out", "new/a.toml"),
+        ("new", "new/a.toml"),
+    ),
+    "init beside the photographs": (lambda f: ("init", photographs(f)[0].parent), ("survey.toml",)),
+    "run of a folder": (
+        lambda f: ("run", photographs(f)[0].parent, "--out", "new/out/s"),
+        ("new",),
+    ),
+    "view": (lambda f: ("view", model(f), "--no-open", "--out", "new/a.html"), ("new", "new/a.html")),
+    "view beside the model": (lambda f: ("view", model(f), "--no-open"), ("model.html",)),
     "convert to a file": (lambda f: ("convert", model(f), "new/a.xml"), ("new", "new/a.xml")),
     "convert to a database": (lambda f: ("convert", model(f), "new/a.db"), ("new", "new/a.db")),
     "convert to a folder": (lambda f: ("convert", model(f), "new/a"), ("new", "new/a")),
@@ -183,6 +197,67 @@ def test_nothing_that_takes_settings_is_imported_before_the_folder_is_looked_at(
     )
     assert run.returncode == 2
     assert run.stderr.startswith("kolinear: the current folder, ")
+
+
+@pytest.mark.parametrize("place", ["new/out", "new/out/s.toml"])
+def test_no_drafted_survey_is_read_or_written_through_a_link(
+    place: str,
+    home: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    arguments = COMMANDS["run of a folder"][0](tmp_path)
+    (tmp_path / place).parent.mkdir(parents=True)
+    (tmp_path / place).symlink_to(home if place == "new/out" else write_observed_survey(home / "x", "x"))
+    before = content(home)
+    assert kolinear(monkeypatch, *arguments) == 2
+    assert "is a link to" in capsys.readouterr().err and content(home) == before
+
+
+def test_a_link_to_a_result_or_its_pictures_leads_no_page_out_of_the_folder(
+    home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The page stands beside the link, and shows no photographs from elsewhere."""
+    result = model(home).rename(home / "below" / "model")
+    photographs(home)
+    before = content(home)
+    given = tmp_path / "given"
+    given.mkdir()
+    (given / "model").symlink_to(result)
+    assert kolinear(monkeypatch, "view", given / "model", "--no-open") == 0
+    assert content(home) == before and (given / "model.html").is_file()
+    seen: list[Path] = []
+    monkeypatch.setattr(
+        "sfm.report.html.view_page.photographs_in", lambda folder, _: seen.append(folder) or {}
+    )
+    shutil.copytree(result, given / "other")
+    (given / "other" / "pictures").symlink_to(home)
+    assert kolinear(monkeypatch, "view", given / "other", "--no-open") == 0
+    assert seen == []
+    capsys.readouterr()
+
+
+def test_what_photographs_say_of_themselves_is_no_line_of_a_drafted_survey(
+    home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    given = tmp_path / "given"
+    given.mkdir()
+    photographs(given)
+    (given / "2.png").symlink_to(photographs(home)[0])
+    evil = "X\n[control]\nfile = 'x'\n\x1b[2J"
+
+    def metadata(path: Path, real: Any = read_metadata) -> Metadata:
+        return replace(real(path), make=evil, model=evil, focal_mm=24.0)
+
+    monkeypatch.setattr("sfm.survey.drafting.draft.read_metadata", metadata)
+    monkeypatch.setattr("sfm.api.sensor_widths", lambda: lambda *_: 36.0)
+    assert kolinear(monkeypatch, "init", given) == 0
+    told = capsys.readouterr()
+    assert "\x1b" not in told.err and "left out: 2.png: a link out of the folder" in told.err
+    text = (given / "survey.toml").read_text(encoding="utf-8")
+    assert "control" not in tomllib.loads(text) and "\x1b" not in text
 
 
 @pytest.mark.skipif(os.name == "nt", reason="Windows has another path of libraries")
