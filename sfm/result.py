@@ -151,6 +151,7 @@ class SurveyResult:
     free_network: FreeNetwork | None = None  # None where nothing else took part, or where it has no result
     taken_out: tuple[TakenOut, ...] = ()  # control and scale bars that do not fit and were not used
     other_solutions: tuple[OtherSolution, ...] = ()  # that the image points allow as well
+    undecided: tuple[str, ...] = ()  # of the orientation: which of two is true, one line each
     unused_image_points: int = 0  # of points or photographs that are not in the result, in no other count
     orientation_correlations: tuple[OrientationCorrelation, ...] = ()  # of camera parameters with exterior
     # orientation, the strong ones

@@ -32,6 +32,7 @@ from adapters.formats.photomodeler import read_photomodeler, write_photomodeler
 from adapters.formats.ply import write_ply
 from adapters.formats.result_tables import read_result, write_tables
 from adapters.formats.sba_text import read_sba_text, sba_files, write_sba_text
+from adapters.formats.survey_file import write_survey_file
 from adapters.reading.text_lines import Lines
 from sfm.camera import Camera
 from sfm.distortion.models import MODELS
@@ -86,6 +87,7 @@ def _write_tables(folder: Path, network: Network, estimate: Estimate, *, title: 
     every = np.ones(len(network.image_points), dtype=bool)
     placed = reduce_network(network, estimate, estimate.oriented, estimate.determined, every)
     write_tables(folder, StoredResult(title, *placed))
+    write_survey_file(folder, *placed, title=title)
 
 
 def _read_sba(path: Path) -> tuple[Network, Estimate]:

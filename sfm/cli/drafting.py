@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from sfm.cli.first_use import compile_first
 from sfm.cli.starting import loading
 from sfm.errors import OutputError
 from sfm.runtime.faults import working_on
@@ -79,6 +80,7 @@ def _draft(photographs: Path) -> Draft:
         from sfm.survey.drafting.draft import draft_survey
         from sfm.survey.measuring.target_store import TargetStore
 
+    compile_first()
     with working_on(str(photographs)), drawn_progress() as drawn, one_blas_thread():
         return draft_survey(
             photographs, sensor_width=sensor_widths(), store=TargetStore.of_user(), progress=drawn

@@ -22,6 +22,12 @@ def test_a_second_solution_of_equal_cost_makes_the_survey_bad() -> None:
     assert any("Another solution, with c of camera synthetic at 5.7" in line for line in found.remarks)
 
 
+def test_two_photographs_of_a_plane_are_bad() -> None:
+    """12 sigma wrong and called fair: two orientations fit alike."""
+    found = outcome_of(59)
+    assert found.level == "bad" and any("Not decided" in line for line in found.remarks)
+
+
 def test_a_narrow_relief_can_be_turned_inside_out() -> None:
     """Three photographs with a long lens from within 4 degrees: the reflected object fits as well."""
     network, truth = make_network(seed_of("narrow"), images=3, points=20, planar=True, free=())

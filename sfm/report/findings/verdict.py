@@ -63,6 +63,7 @@ def judge(evidence: Evidence) -> Verdict:
         serious.append(
             f"The larger part of the photographs, {total - oriented} of {total}, is not in the result."
         )
+    serious += [f"Not decided: {line}." for line in result.undecided]
     remarks: list[str] = []
     kinds = (_other_solutions, _sigma0, _residual, _untested, _rays, _consistency, judge_given)
     for judge_kind in kinds:
@@ -119,7 +120,7 @@ def _sigma0(evidence: Evidence) -> Judged:
     )
     cameras = evidence.result.adjustment.estimate.cameras
     if evidence.held:
-        line += "most likely the camera, which is held at values that do not fit (below)."
+        line += "most likely the camera, which is held at values that do not fit."
         return [(ratio > SIGMA0_BAD, line)]
     if ratio > SIGMA0_BAD:
         held = "" if any(one.free.any() for one in cameras) else f" (it is held: try {free_line(evidence)})"
