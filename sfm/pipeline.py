@@ -76,9 +76,9 @@ def _measure(
     if survey.start_cameras is None:
         refuse_incomplete_cameras(survey.cameras, survey.source, files)
     if survey.tie_points is not None:
-        with clock.stage("tie points"):
+        with clock.stage("tie points", len(files)):
             return tie_photographs(survey, files, jobs=jobs, progress=clock.progress)
-    with clock.stage("targets"):
+    with clock.stage("targets", len(files)):
         return measure_targets(survey, files, jobs=jobs, store=store, progress=clock.progress)
 
 

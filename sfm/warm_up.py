@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import os
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from multiprocessing import get_context
 
 import numpy as np
@@ -19,11 +19,14 @@ from sfm.camera import camera_from_values, project
 from sfm.comparison.common_problem import common_problem
 from sfm.comparison.solutions import reprojection
 from sfm.conventions import AnyArray
+from sfm.kernels.warmed import set_warm
 from sfm.matching.conjugate import METHODS, match_points
 from sfm.matching.tracks.correspondence import match_targets
 from sfm.matching.tracks.interest import foerstner_points
 from sfm.network import Estimate, ImagePoints, Network, empty_estimate
 from sfm.orientation.sequence import orient
+from sfm.runtime.folder_settings import close_library_path
+from sfm.runtime.progress import SILENT, Progress
 from sfm.targets.codes.rings import ring_family
 from sfm.targets.detect import find_targets
 
@@ -31,6 +34,7 @@ IMAGES, POINTS = 8, 40
 SIZE_PX, PIXEL_MM, C_MM = (1000, 800), (0.01, 0.01), 10.0
 DISTANCE = 4.0  # of the cameras, the points lie within 1 of the origin
 NOISE_PX = 0.05
+DOTS = ((60.3, 60.7), (180.1, 60.2), (60.4, 180.5), (180.6, 180.3))  # centres in the drawn photograph, px
 FREE = ("c", "x0", "y0", "K1", "P1", "P2")
 
 
@@ -38,12 +42,12 @@ def compile_targets() -> None:
     """Find dark and bright targets in a drawn photograph, with rings of cells, with arcs and with tags."""
     for bright in (False, True):
         for codes in ("ring14", "arcs", "apriltag36h11"):
-            find_targets(_photograph(bright), polarity="auto", codes=codes)
+            find_targets(drawn_photograph(bright), polarity="auto", codes=codes)
 
 
 def compile_orientation() -> None:
     """Orient a network from nothing but its image points, and match them without their names."""
-    network, truth = _network()
+    network, truth = made_up_network()
     orient(network, empty_estimate(network, truth.cameras), refine=lambda _, estimate: estimate)
     seen = network.image_points
     match_targets(
@@ -57,7 +61,7 @@ def compile_orientation() -> None:
 
 def compile_adjustment() -> None:
     """Adjust a network in every way that a survey does, and prepare its comparison."""
-    network, truth = _network()
+    network, truth = made_up_network()
     adjust(network, truth, datum=Datum("free"), reject="huber", covariance=False)
     adjustment = adjust(network, truth, datum=Datum("free"), reject="tau")
     part, start, _, _ = common_problem(adjustment)
@@ -67,7 +71,7 @@ def compile_adjustment() -> None:
 
 def compile_matching() -> None:
     """Find interest points, and match some by correlation and by least squares in every model."""
-    photograph = _photograph(False)
+    photograph = drawn_photograph(False)
     at = foerstner_points(photograph, border_px=30).xy[:4]
     for method in METHODS:
         match_points(photograph, photograph, at, method=method, search_px=41)
@@ -76,15 +80,23 @@ def compile_matching() -> None:
 PARTS = (compile_orientation, compile_adjustment, compile_targets, compile_matching)  # the longest first
 
 
-def main() -> None:
-    """Compile all parts, as many at a time as there are cores."""
+def main(progress: Progress = SILENT) -> None:
+    """Compile all parts, as many at a time as there are cores.
+
+    Args:
+        progress: told of every part that is done.
+    """
+    progress.stage("compiling", len(PARTS))
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    close_library_path()
     with ProcessPoolExecutor(min(cores, len(PARTS)), mp_context=get_context("spawn")) as pool:
-        for done in [pool.submit(part) for part in PARTS]:
+        for done in as_completed([pool.submit(part) for part in PARTS]):
             done.result()
+            progress.advance()
+    set_warm()
 
 
-def _network() -> tuple[Network, Estimate]:
+def made_up_network() -> tuple[Network, Estimate]:
     """Return a convergent network with a little noise, and its truth."""
     rng = np.random.default_rng(1)
     camera = camera_from_values(
@@ -95,7 +107,9 @@ def _network() -> tuple[Network, Estimate]:
     position = DISTANCE * np.stack([0.7 * np.cos(angle), 0.7 * np.sin(angle), np.full(IMAGES, 0.7)], axis=1)
     back = position / np.linalg.norm(position, axis=1)[:, None]
     right = np.stack([-np.sin(angle), np.cos(angle), np.zeros(IMAGES)], axis=1)
-    rotation = np.stack([right, np.cross(back, right), back], axis=2)
+    down = np.cross(back, right)
+    rotation = np.stack([right, down, back], axis=2)
+    rotation[1::2] = np.stack([down, -right, back], axis=2)[1::2]  # rolled, so that the camera is determined
     xy = np.stack(
         [project(camera, X0, R, points) for X0, R in zip(position, rotation, strict=True)]
     ) + rng.normal(0, NOISE_PX, (IMAGES, POINTS, 2))
@@ -114,13 +128,13 @@ def _network() -> tuple[Network, Estimate]:
     return network, Estimate((camera,), position, rotation, points)
 
 
-def _photograph(bright: bool) -> AnyArray:
+def drawn_photograph(bright: bool) -> AnyArray:
     """Return a small photograph with four dots, one of them in a ring of cells."""
     family = ring_family("ring14")
     pattern = int(family.pattern[20])
     y, x = np.mgrid[:240, :240]
     light = np.zeros((240, 240))
-    for cx, cy in ((60.3, 60.7), (180.1, 60.2), (60.4, 180.5), (180.6, 180.3)):
+    for cx, cy in DOTS:
         light += np.clip(8.5 - np.hypot(x - cx, y - cy), 0, 1)
     r, angle = np.hypot(x - 60.3, y - 60.7), np.arctan2(y - 60.7, x - 60.3) % (2 * math.pi)
     cell = (angle / (2 * math.pi) * family.cells).astype(int)

@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from sfm.cli.first_use import compile_first
 from sfm.cli.starting import loading
 from sfm.runtime.faults import working_on
 
@@ -42,6 +43,7 @@ def refine(
         refuse_existing(out)
     with working_on(str(model)):
         network, estimate = read_model(model)
+    compile_first()
     with working_on(str(model)), drawn_progress() as progress:
         found = refine_model(
             network, estimate, images, window_px=window, min_correlation=min_correlation, progress=progress

@@ -102,7 +102,12 @@ def convert(
     target: Annotated[Path, typer.Argument(metavar="OUT", help="File or folder to write.")],
     to_format: Annotated[
         str | None,
-        typer.Option("--to", metavar="F", help="Format to write; else by the ending of OUT.  See README."),
+        typer.Option(
+            "--to",
+            metavar="F",
+            help="Format to write; else by the ending of OUT: .xml metashape, .ply ply, .db colmap-database, "
+            "none tables.",
+        ),
     ] = None,
     from_format: Annotated[
         str | None, typer.Option("--from", metavar="F", help="Format to read; else by what is there.")
@@ -114,7 +119,8 @@ def convert(
 ) -> None:
     """Carry a survey between programs.
 
-    A camera is converted where the format lacks its model.
+    A camera is converted where the format lacks its model. Formats: colmap, colmap-text, colmap-database,
+    tables, metashape, photomodeler, bal, sba, bundle-matlab, bundle-csharp and ply.
     """
     with loading():
         from adapters.formats.registry import (

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from sfm.cli.drafting import drafted_beside
+from sfm.cli.first_use import compile_first
 from sfm.cli.starting import loading
 from sfm.errors import KolinearError
 from sfm.runtime.faults import FAULT, working_on
@@ -154,6 +155,7 @@ def _run_survey(
         survey = survey_of_file(described)
     others = programs_of(survey.compare.backend, survey.compare.baseline)
     folder = _folder(survey, out)
+    compile_first()
     workers = (jobs or cores()) if from_photographs else 1
     store = None
     if from_photographs:
@@ -234,6 +236,7 @@ def batch(
         from sfm.batch.table import BatchTable, print_batch, stopping_at_terminate
 
     files = find_surveys(surveys)
+    compile_first()
     if cluster is not None:
         engine = remote_engine(cluster)
     else:

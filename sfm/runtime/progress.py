@@ -41,9 +41,9 @@ class StageClock:
         self.seconds: list[tuple[str, float]] = []
 
     @contextmanager
-    def stage(self, name: str) -> Iterator[None]:
-        """Announce a stage and time what is done in it."""
-        self.progress.stage(name)
+    def stage(self, name: str, total: int | None = None) -> Iterator[None]:
+        """Announce a stage and how many steps it has, if that is known, and time what is done in it."""
+        self.progress.stage(name, total)
         begun = time.perf_counter()
         with working_on(f"stage {name}"):
             yield

@@ -146,12 +146,13 @@ def _words(network: Network, oriented: BoolArray, group: Lost) -> str:
     names = ", ".join(network.images[i] for i in group.images[:MAX_NAMES])
     names += f" and {n - MAX_NAMES} more" if n > MAX_NAMES else ""
     shared = ", ".join(network.points[j] for j in group.shared[:MAX_NAMES])
-    common = f"have only {shared} in common" if shared else "have no point in common"
+    who = "they have" if n > 1 else "it has"
+    common = f"{who} only {shared} in common" if shared else f"{who} no point in common"
     own = _often_seen(network, group.images)
     others = _often_seen(network, np.flatnonzero(oriented))
     return (
         f"{names}: {n} photograph{'s are' if n > 1 else ' is'} not connected with the {int(oriented.sum())} "
-        f"oriented ones; they {common}, {MIN_POINTS} in one photograph are needed. A photograph that shows "
+        f"oriented ones; {common}, {MIN_POINTS} in one photograph are needed. A photograph that shows "
         f"{MIN_POINTS} of {own} ... and {MIN_POINTS} of {others} ... would connect them"
     )
 

@@ -8,35 +8,32 @@ from typing import get_args
 import pytest
 from typer.testing import CliRunner
 
+from adapters.formats.registry import ENDINGS, FORMATS
 from sfm.cli.app import app
 from sfm.conventions import METRES
 from sfm.errors import SurveyFileError
 from sfm.survey.inputs.settings import Head
 from sfm.survey.inputs.survey_file import read_survey_file
+from tests.first_tries import TRIES, Try, answer
 from tests.surveys import write_observed_survey
 
-CAMERA = ["--c-mm", "24", "--sensor-width-mm", "36", "--width-px", "6000"]
+
+@pytest.mark.parametrize(
+    "one",
+    [pytest.param(one, id=one.name, marks=[pytest.mark.slow] * one.photographs) for one in TRIES],
+)
+def test_a_first_try_is_told_what_is_wrong(one: Try, tmp_path: Path) -> None:
+    found = answer(one, tmp_path)
+    assert found.code == one.code, found.text
+    for words in one.told:
+        assert words in found.text
+    assert "nan" not in found.text and "Warning:" not in found.text.replace("! Warning:", "")
+    assert [path.name for path in tmp_path.iterdir() if path.name not in ("s", "out")] == []
 
 
-def refused(*words: str) -> str:
-    """Return the message with which a command refuses."""
-    with pytest.raises(SurveyFileError) as error:
-        CliRunner().invoke(app, list(words), catch_exceptions=False)
-    return str(error.value)
-
-
-def test_an_unknown_ending_is_no_folder(tmp_path: Path) -> None:
-    line = refused("convert", str(tmp_path), str(tmp_path / "x.dxf"))
-    assert "x.dxf: unknown ending .dxf, expected .xml, .ply, .db, a folder for tables, or --to with" in line
-    assert "photomodeler" in line and not (tmp_path / "x.dxf").exists()
-
-
-def test_a_distance_in_the_wrong_unit_is_noticed() -> None:
-    line = refused("plan", "target-size", "--distance", "3", *CAMERA)
-    assert "--distance 3 mm: not farther than the principal distance of 24 mm" in line
-    assert "expected one of km, m" in refused(
-        "plan", "target-size", "--distance", "3", "--unit", "yd", *CAMERA
-    )
+def test_the_help_of_convert_lists_every_format() -> None:
+    text = CliRunner().invoke(app, ["convert", "--help"]).output
+    assert all(one.name in text for one in FORMATS) and all(ending in text for ending in ENDINGS)
 
 
 def test_units_are_known_ones(tmp_path: Path) -> None:

@@ -47,7 +47,7 @@ def test_parts_run() -> None:
 
 def test_drawn_photograph_has_four_dots_and_one_code() -> None:
     for bright in (False, True):
-        found = find_targets(warm_up._photograph(bright), polarity="auto", codes="ring14")
+        found = find_targets(warm_up.drawn_photograph(bright), polarity="auto", codes="ring14")
         assert len(found) == 4
         assert sorted(found.code)[:3] == [-1, -1, -1]
         assert (found.polarity == (1 if bright else -1)).all()

@@ -85,4 +85,5 @@ def _other_minimum(both: AdjusterComparison) -> str:
 
 def _point_sigma(covariance: FloatArray) -> PointSigma:
     sigma = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
-    return PointSigma(root_mean_square(sigma), float(np.nanmax(sigma)))
+    known = sigma[np.isfinite(sigma)]
+    return PointSigma(root_mean_square(sigma), float(known.max()) if len(known) else float("nan"))

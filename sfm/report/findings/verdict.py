@@ -120,7 +120,7 @@ def _sigma0(evidence: Evidence) -> Judged:
     )
     cameras = evidence.result.adjustment.estimate.cameras
     if evidence.held:
-        line += "most likely the camera, which is held at values that do not fit (below)."
+        line += "most likely the camera, which is held at values that do not fit."
         return [(ratio > SIGMA0_BAD, line)]
     if ratio > SIGMA0_BAD:
         held = "" if any(one.free.any() for one in cameras) else f" (it is held: try {free_line(evidence)})"

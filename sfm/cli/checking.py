@@ -1,0 +1,152 @@
+"""The command that looks at an installation: what is there, where things are kept, whether it measures."""
+
+from __future__ import annotations
+
+import os
+import platform
+import shutil
+import time
+from collections.abc import Callable
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+from rich.console import Console
+from rich.table import Table
+
+from sfm.cli.first_use import compile_first
+from sfm.cli.starting import loading
+from sfm.errors import KolinearError
+
+FAILED = 1  # exit code where a check fails
+LIBRARIES = (
+    "kolinear",
+    "numpy",
+    "scipy",
+    "opencv-contrib-python-headless",
+    "numba",
+    "pycolmap",
+    "distributed",
+)
+BROWSERS = ("chromium", "chromium-browser", "google-chrome", "firefox", "safari", "msedge")
+MIN_FREE_GB = 1.0
+CENTRE_PX = 0.1  # largest error of a drawn dot
+TESTED_SIGMAS = 5.0  # largest error of a point of the tested network, in standard deviations
+
+
+def doctor() -> None:
+    """Check this installation: versions, cores, folders, and a short measurement and adjustment.
+
+    Exit code 1 if a check fails; the line says what to do.
+    """
+    with loading():
+        from sfm.api import cores
+        from sfm.files.user_cache import user_folder
+        from sfm.kernels.options import KEPT
+        from sfm.kernels.warmed import is_warm
+
+    console = Console(highlight=False)
+    table = Table(show_header=False, box=None, padding=(0, 2, 0, 0))
+    table.add_row("python", f"{platform.python_version()}, {platform.system()} {platform.machine()}")
+    for name in LIBRARIES:
+        table.add_row(name, _version(name))
+    table.add_row("cores", str(cores()))
+    table.add_row("memory", _memory())
+    table.add_row("browser", next((name for name in BROWSERS if shutil.which(name)), "none found by name"))
+    table.add_row("kernels", f"{KEPT}, {'compiled' if is_warm() else 'not yet compiled'}")
+    store = user_folder("targets", "measured targets")
+    table.add_row("measured targets", f"{store}, {_megabytes(store):.0f} MB")
+    free = shutil.disk_usage(Path.cwd()).free / 1e9
+    table.add_row("free space", f"{free:.1f} GB in {Path.cwd()}")
+    console.print(table)
+    failed = [] if free > MIN_FREE_GB else [f"only {free:.1f} GB are free here, results need room"]
+    compile_first()
+    begun = time.perf_counter()
+    for name, check in CHECKS:
+        try:
+            console.print(f"{name}: {check()}")
+        except KolinearError as error:
+            failed.append(f"{name}: {error}")
+    console.print(f"self-test: {time.perf_counter() - begun:.1f} s")
+    for line in failed:
+        console.print(f"! {line}", style="red")
+    if failed:
+        raise SystemExit(FAILED)
+    console.print("This installation works.", style="green")
+
+
+def _check_targets() -> str:
+    """Measure four drawn dots of known places."""
+    import numpy as np
+
+    from sfm.targets.detect import find_targets
+    from sfm.warm_up import DOTS, drawn_photograph
+
+    found = find_targets(drawn_photograph(False), polarity="dark", codes="ring14")
+    if len(found) != len(DOTS):
+        raise KolinearError(f"{len(found)} of {len(DOTS)} dots found")
+    centres = np.array(DOTS)
+    error = np.linalg.norm(found.xy[:, None] - centres, axis=2).min(axis=1).max()
+    if error > CENTRE_PX:
+        raise KolinearError(f"a dot is {error:.3f} px off, expected {CENTRE_PX} px at most")
+    return f"{len(found)} dots measured, {error:.4f} px off at most"
+
+
+def _check_adjustment() -> str:
+    """Orient and adjust a made-up network, and compare it with the truth."""
+    import numpy as np
+
+    from sfm.adjustment.datum import Datum
+    from sfm.adjustment.solve import adjust
+    from sfm.warm_up import made_up_network
+
+    network, truth = made_up_network()
+    found = adjust(network, truth, datum=Datum("free"))
+    if not found.converged:
+        raise KolinearError("the adjustment did not converge")
+    moved = np.linalg.norm(found.estimate.points - truth.points, axis=1)
+    sigma = np.sqrt(np.trace(found.covariance.points, axis1=1, axis2=2))
+    worst = float((moved / sigma).max())
+    if worst > TESTED_SIGMAS:
+        raise KolinearError(f"a point is {worst:.1f} standard deviations off")
+    return f"{len(network.points)} points, worst {worst:.1f} standard deviations off"
+
+
+def _check_colmap() -> str:
+    """Adjust the same network by COLMAP and compare."""
+    from sfm.adjustment.datum import Datum
+    from sfm.adjustment.solve import adjust
+    from sfm.api import programs_of
+    from sfm.comparison.adjusters import compare_adjusters
+    from sfm.warm_up import made_up_network
+
+    adjuster = programs_of("colmap", "none").adjuster
+    assert adjuster is not None
+    network, truth = made_up_network()
+    found = compare_adjusters(adjust(network, truth, datum=Datum("free")), adjuster)
+    if not found.agree:
+        raise KolinearError("its adjustment of a made-up network differs from Kolinear's")
+    return f"version {_version('pycolmap')} agrees on the same network"
+
+
+CHECKS: tuple[tuple[str, Callable[[], str]], ...] = (
+    ("targets", _check_targets),
+    ("adjustment", _check_adjustment),
+    ("colmap", _check_colmap),
+)
+
+
+def _version(name: str) -> str:
+    try:
+        return version(name)
+    except PackageNotFoundError:
+        return "not installed"
+
+
+def _memory() -> str:
+    if not hasattr(os, "sysconf") or "SC_PHYS_PAGES" not in os.sysconf_names:
+        return "unknown"
+    return f"{os.sysconf('SC_PHYS_PAGES') * os.sysconf('SC_PAGE_SIZE') / 2**30:.1f} GiB"
+
+
+def _megabytes(folder: Path) -> float:
+    return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file()) / 1e6
