@@ -25,8 +25,9 @@ def test_folded_tables_are_printed_whole(tmp_path: Path) -> None:
     printed = tmp_path / "page.pdf"
     subprocess.run(
         [
-            str(CHROMIUM), "--headless", "--no-sandbox", "--disable-gpu", f"--user-data-dir={tmp_path}/profile",
-            f"--print-to-pdf={printed}", (tmp_path / "page.html").as_uri(),
+            str(CHROMIUM), "--headless", "--no-sandbox", "--disable-gpu",
+            f"--user-data-dir={tmp_path}/profile", f"--print-to-pdf={printed}",
+            (tmp_path / "page.html").as_uri(),
         ],
         check=True, capture_output=True, timeout=120,
     )  # fmt: skip
