@@ -27,7 +27,10 @@ def assemble_result(
     """Return everything that a survey ends with; each argument is what the stage of that name returned."""
     adjustment, naming = solution.adjustment, matched.naming
     points = adjustment.network.points
-    failed = tuple(FailedImage(*one) for one in (*start.failures, *solution.dropped_images))
+    is_in = set(adjustment.network.images)  # a photograph may fit at last, with a camera of its own
+    failed = tuple(
+        FailedImage(*one) for one in (*start.failures, *solution.dropped_images) if one[0] not in is_in
+    )
     return SurveyResult(
         survey=survey.name,
         unit=survey.unit,
