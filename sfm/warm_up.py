@@ -25,6 +25,7 @@ from sfm.matching.tracks.correspondence import match_targets
 from sfm.matching.tracks.interest import foerstner_points
 from sfm.network import Estimate, ImagePoints, Network, empty_estimate
 from sfm.orientation.sequence import orient
+from sfm.runtime.folder_settings import close_library_path
 from sfm.runtime.progress import SILENT, Progress
 from sfm.targets.codes.rings import ring_family
 from sfm.targets.detect import find_targets
@@ -87,6 +88,7 @@ def main(progress: Progress = SILENT) -> None:
     """
     progress.stage("compiling", len(PARTS))
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    close_library_path()
     with ProcessPoolExecutor(min(cores, len(PARTS)), mp_context=get_context("spawn")) as pool:
         for done in as_completed([pool.submit(part) for part in PARTS]):
             done.result()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -59,6 +60,13 @@ class Tab:
         """Wait until the viewer is there, and return the page."""
         self.page.wait_for_selector("#explore[data-ready]")
         return self.page
+
+    def until(self, expression: str, argument: object = None) -> None:
+        """Wait until a JavaScript function returns something; the page's policy lets no text be evaluated."""
+        end = time.monotonic() + WAIT_MS / 1000
+        while not self.page.evaluate(expression, argument):
+            assert time.monotonic() < end, f"waited in vain for {expression}"
+            self.page.wait_for_timeout(30)
 
     def close(self) -> None:
         self.context.close()

@@ -10,6 +10,7 @@ import sys
 from sfm.cli.outlets import guard_outlets
 from sfm.cli.starting import INTERRUPTED, INTERRUPTED_TEXT, loading, stopped_once
 from sfm.errors import KolinearError
+from sfm.runtime.folder_settings import close_library_path, refuse_folder_settings
 from sfm.runtime.installation import refuse_mixed_installation
 
 BAD_INPUT = 2  # exit code where a person must put something right
@@ -43,6 +44,8 @@ def main() -> None:
 def _run() -> None:
     """Run the command that the arguments name."""
     refuse_mixed_installation()  # asked here too: the other project's sfm/__init__.py may lie over ours
+    refuse_folder_settings()
+    close_library_path()
     with loading():
         from sfm.cli.app import USAGE_ERROR, app
     try:

@@ -59,15 +59,16 @@ def drafted_beside(photographs: Path, out: Path | None) -> tuple[Path, Path]:
         KolinearError: no photographs, or the file cannot be written.
     """
     with loading():
+        from sfm.files.open_folders import refuse_links
         from sfm.report.output import folder_name
 
     out = Path("out") / folder_name(photographs.resolve().name) if out is None else out
     file = out.parent / f"{out.name}.toml"
+    refuse_links(file)
     if file.exists():
         print(f"Running {file}, which is there already; remove it to draft a new one", file=sys.stderr)
         return file, out
     draft = _draft(photographs)
-    out.parent.mkdir(parents=True, exist_ok=True)
     _write(draft, file)
     return file, out
 
@@ -88,6 +89,7 @@ def _draft(photographs: Path) -> Draft:
 
 def _write(draft: Draft, file: Path) -> None:
     """Write a drafted survey, and tell on stderr what was found."""
+    from sfm.files.plain_text import as_plain
     from sfm.files.whole_files import whole_file
 
     with whole_file(file) as part:
@@ -96,9 +98,9 @@ def _write(draft: Draft, file: Path) -> None:
         except UnicodeEncodeError as error:
             raise OutputError(f"{file}: a name in it is no text in UTF-8") from error
     for subject, finding in draft.found:
-        print(f"{subject}: {finding}", file=sys.stderr)
+        print(as_plain(f"{subject}: {finding}"), file=sys.stderr)
     for remark in draft.remarks:
-        print(f"! {remark}", file=sys.stderr)
+        print(as_plain(f"! {remark}"), file=sys.stderr)
     for name, why in draft.left_out:
-        print(f"  left out: {name}: {why}", file=sys.stderr)
+        print(as_plain(f"  left out: {name}: {why}"), file=sys.stderr)
     print(f"Survey file: {file}", file=sys.stderr)

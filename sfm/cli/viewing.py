@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -64,7 +65,8 @@ def view(
         from sfm.report.viewer.stored_scene import scene_of_stored
         from sfm.runtime.progress_bar import drawn_progress
 
-    page = source.resolve().with_name(f"{source.resolve().name}.html") if out is None else out
+    place = Path(os.path.abspath(source))  # through no link, as pages are written
+    page = place.with_name(f"{place.name}.html") if out is None else out
     refuse_foreign_page(page)
     if images is not None and not images.is_dir():
         raise OutputError(f"--images {images}: is no folder")
@@ -76,7 +78,7 @@ def view(
         scene = scene_of_stored(stored, w=w, rejected=rejected)
     if images is not None:
         paths = photographs_in(images, scene.photographs)
-    elif (source / PICTURES).is_dir():
+    elif (source / PICTURES).is_dir() and (source / PICTURES).resolve().is_relative_to(source.resolve()):
         names = overlay_names(scene.photographs)
         found = photographs_in(source / PICTURES, names)
         paths = {

@@ -8,8 +8,10 @@ from pathlib import Path
 from typing import Any
 
 from sfm.errors import SurveyFileError
+from sfm.files.plain_text import as_plain
 
 MAX_TOML_BYTES = 1_000_000  # such a file is written by people; anything larger is another file
+MAX_SAID = 200  # characters of what the parser says
 MAX_KEY_PARTS = 16  # of a dotted key: the parser takes time and memory with their square; 3 are of use
 
 _PART = r"""(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')"""
@@ -46,7 +48,15 @@ def read_toml(path: Path, what: str) -> tuple[str, dict[str, Any]]:
     try:
         return text, tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
-        raise SurveyFileError(f"{path}: not a TOML file: {error}") from error
+        raise SurveyFileError(f"{path}: not a TOML file: {_cut(str(error))}") from error
     except (ValueError, RecursionError) as error:
         told = "brackets nested too deeply" if isinstance(error, RecursionError) else "a number is too long"
         raise SurveyFileError(f"{path}: not a TOML file: {told}") from error
+
+
+def _cut(message: str) -> str:
+    """Return what the parser says without the middle of a long key; where it stands comes last."""
+    kept = (
+        message if len(message) <= MAX_SAID else f"{message[: MAX_SAID // 2]} ... {message[-MAX_SAID // 2 :]}"
+    )
+    return as_plain(kept)

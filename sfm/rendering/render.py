@@ -31,6 +31,7 @@ from sfm.rendering.scene import ARC, DISC, UNCODED, Optics, Scene
 from sfm.rendering.scene_file import Staging, read_scene
 from sfm.rendering.visibility import ProjectedTargets, project_targets
 from sfm.runtime.faults import ending_of
+from sfm.runtime.folder_settings import refuse_folder_settings
 
 TRUTH = ("truth_points.csv", "truth_images.csv", "truth_image_points.csv")
 
@@ -288,6 +289,7 @@ def main() -> int:
     parser.add_argument("folder", type=Path, help="where the photographs and the truth go")
     given = parser.parse_args()
     try:
+        refuse_folder_settings()
         staging = read_scene(given.scene)
         write_photographs(staging, given.folder)
     except Exception as error:

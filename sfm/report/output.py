@@ -16,6 +16,7 @@ from sfm.report.figures.plots import all_plots
 from sfm.report.findings.findings import Findings
 from sfm.report.html.report_page import report_page
 from sfm.report.tables.csv_files import write_tables
+from sfm.report.tables.protocol_files import write_protocol
 from sfm.report.tables.summary import write_summary
 from sfm.report.text.text_report import text_report
 from sfm.report.viewer.embedded import viewer_of
@@ -37,6 +38,12 @@ WRITTEN = (
     "given.csv",
     "reliability.csv",
     "variance_components.csv",
+    "residuals.csv",
+    "control_points.csv",
+    "interior_correlations.csv",
+    "point_covariances.csv",
+    "image_covariances.csv",
+    "covariances.npz",
     "report.txt",
     "points.ply",
     "report.html",
@@ -106,6 +113,7 @@ def write_result(
         report_time = StageTime("report", time.perf_counter() - started)
         timed = replace(findings, result=replace(result, seconds=(*result.seconds, report_time)))
         write_tables(timed, folder)
+        write_protocol(timed, folder)
         write_summary(timed, folder)
         covariance = result.with_covariance.covariance
         if covariance is not None:

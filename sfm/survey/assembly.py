@@ -27,7 +27,10 @@ def assemble_result(
     """Return everything that a survey ends with; each argument is what the stage of that name returned."""
     adjustment, naming = solution.adjustment, matched.naming
     points = adjustment.network.points
-    failed = tuple(FailedImage(*one) for one in (*start.failures, *solution.dropped_images))
+    is_in = set(adjustment.network.images)  # a photograph may fit at last, with a camera of its own
+    failed = tuple(
+        FailedImage(*one) for one in (*start.failures, *solution.dropped_images) if one[0] not in is_in
+    )
     return SurveyResult(
         survey=survey.name,
         unit=survey.unit,
@@ -55,6 +58,7 @@ def assemble_result(
         undecided=start.remarks,
         unused_image_points=solution.unused_image_points + sum(one.image_points for one in measured.left_out),
         reject=survey.reject,
+        weights=survey.adjust.weights,
         orientation_correlations=orientation_correlations(adjustment),
         seconds=tuple(StageTime(*one) for one in clock.seconds),
     )

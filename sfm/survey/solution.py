@@ -38,6 +38,7 @@ from sfm.survey.inputs.start import given_values
 from sfm.survey.inputs.survey import Survey
 from sfm.survey.left_out import datum_carriers, left_out_points, unused_image_points, words_of_left_out
 from sfm.survey.observation_count import refuse_too_few_observations
+from sfm.survey.own_camera import Treated, treat_lost
 from sfm.survey.principal_distance import far_principal_distances
 from sfm.survey.scale_check import check_scales
 
@@ -129,8 +130,15 @@ def solve_survey(survey: Survey, matched: Correspondences) -> Solution:
     contradictions, taken_out = list(scales.lines), list(scales.taken_out)
     better: tuple[str, ...] = ()
     first: tuple[_Settled, Adjustment, ControlCheck | None, tuple[OtherSolution, ...]] | None = None
+    settled = _settle(task, estimate)
+    ready: _Settled | None = settled
+    treated = _treated(task, settled, estimate, oriented)
+    if treated is not None:
+        iterations += settled.iterations
+        task, estimate, ready = replace(task, network=treated.network), treated.estimate, None
     while True:
-        settled = _settle(task, estimate)
+        settled = _settle(task, estimate) if ready is None else ready
+        ready = None
         iterations += settled.iterations
         found = settled.contradiction
         if found is None:
@@ -157,8 +165,9 @@ def solve_survey(survey: Survey, matched: Correspondences) -> Solution:
         contradictions.append(found.line)
         taken_out += [] if found.taken_out is None else [found.taken_out]
         task = _resolved(task, found, settled.accepted)
+    reasons = {} if treated is None else dict(treated.left_out)
     dropped = tuple(
-        (name, f"fewer than {fewest} accepted image points of the network")
+        (name, reasons.get(name, f"fewer than {fewest} accepted image points of the network"))
         for name, was, is_in, fewest in zip(network.images, oriented, settled.images, least, strict=True)
         if was and not is_in
     )
@@ -172,7 +181,8 @@ def solve_survey(survey: Survey, matched: Correspondences) -> Solution:
     )
     # natural texture has points in plenty, of which only those that were lost on the way are worth a line
     told = left_out if survey.tie_points is None else _among(left_out, whole, known)
-    warnings = (*placed.warnings, *contradictions, *better)
+    own = () if treated is None else treated.lines
+    warnings = (*placed.warnings, *own, *contradictions, *better)
     warnings += _warnings(survey, told, len(whole.points), final)
     in_result = np.isin(whole.points, final.network.points)
     unused = unused_image_points(whole, settled.images, in_result)
@@ -248,6 +258,28 @@ def _settle(task: _Task, estimate: Estimate) -> _Settled:
         images, points = left_images, left_points
 
 
+def _treated(task: _Task, settled: _Settled, start: Estimate, oriented: BoolArray) -> Treated | None:
+    """Return the network with cameras of their own for the photographs that fit with them, others left out.
+
+    Args:
+        task: what was adjusted; without tests nothing tells a photograph that does not fit.
+        settled: the adjustment.
+        start: approximate values, which what has left the adjustment starts from again.
+        oriented: photographs that had an exterior orientation, (m,).
+    """
+    if task.reject == "none" or settled.contradiction is not None:
+        return None
+    adjusted = merge_estimate(start, settled.estimate, settled.images, settled.points)
+    found = treat_lost(task.network, adjusted, settled.accepted, oriented=oriented)
+    if found is None:
+        return None
+    one, again = found.estimate, ~found.estimate.oriented & ~found.without
+    position = np.where(again[:, None], start.position, one.position)
+    rotation = np.where(again[:, None, None], start.rotation, one.rotation)
+    points = np.where(one.determined[:, None], one.points, start.points)
+    return replace(found, estimate=replace(one, position=position, rotation=rotation, points=points))
+
+
 def _resolved(task: _Task, found: Contradiction, accepted: BoolArray) -> _Task:
     """Return the task without what is to blame, or, where that cannot be told, without any more tests."""
     network = task.network
@@ -265,7 +297,8 @@ def _resolved(task: _Task, found: Contradiction, accepted: BoolArray) -> _Task:
 def _final(task: _Task, part: Network, estimate: Estimate) -> Adjustment:
     """Return the last adjustment with its covariance.
 
-    Where other observations take part, the image points are weighted by their own variance component.
+    Where other observations take part, the image points are weighted by their own variance component, unless
+    the survey wants all weights as stated.
     """
     part, estimate = without_idle_cameras(part, estimate, cameras=len(task.survey.cameras))
 
@@ -274,7 +307,8 @@ def _final(task: _Task, part: Network, estimate: Estimate) -> Adjustment:
 
     outer = (part.control, part.exterior) if task.datum.kind == "control" else ()
     weighted = any(observed(np.einsum("nii->ni", one.covariance)).any() for one in outer)
-    if len(part.scale_bars) or len(part.interior) or weighted:
+    others = len(part.scale_bars) or len(part.interior) or weighted
+    if others and task.survey.adjust.weights == "components":
         return _weighed(adjust_part, len(part.image_points))
     return _tested(task, part, estimate, covariance=True)
 

@@ -36,6 +36,8 @@ COMMANDS = {
     "adjust": ("survey.toml",),
     "batch": ("survey.toml",),
     "resect": ("points.csv",),
+    "init": ("photographs",),
+    "view": ("result",),
     "match": ("left.png", "right.png"),
     "targets": ("--out", "sheet.pdf"),
     "validate": (),
@@ -83,7 +85,7 @@ def test_what_nobody_has_foreseen_is_one_line_with_its_traceback_in_a_file(
     command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
-    for module in ("surveying", "measuring", "solvers", "refining", "planning"):
+    for module in ("surveying", "measuring", "solvers", "refining", "planning", "drafting", "viewing"):
         monkeypatch.setattr(f"sfm.cli.{module}.loading", raising(ValueError("new\nline \x1b[31m")))
     code, lines = kolinear(monkeypatch, capsys, command, *COMMANDS[command])
     (path,) = tmp_path.iterdir()

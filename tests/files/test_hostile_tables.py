@@ -127,6 +127,30 @@ def test_a_very_long_key_is_cut(tmp_path: Path) -> None:
     assert len(str(refused.value)) < 500
 
 
+def test_blanks_in_a_header_are_read_once(tmp_path: Path) -> None:
+    text = SURVEY + "[" + " " * 3000 + '"observations"]\nfile = 1\n'
+    (tmp_path / "s.toml").write_text(text, encoding="utf-8")
+    begun = time.process_time()
+    with pytest.raises(SurveyFileError, match=r"observations.file: found 1, needed"):
+        read_survey(tmp_path / "s.toml")
+    assert time.process_time() - begun < 2  # with the third power of the blanks it took minutes
+
+
+def test_of_very_many_missing_keys_some_are_named(tmp_path: Path) -> None:
+    (tmp_path / "s.toml").write_text(SURVEY + "[[scale_bar]]\n" * 5000, encoding="utf-8")
+    with pytest.raises(SurveyFileError, match=r"scale_bar 1.from, .* and 19990 more are missing") as refused:
+        read_survey(tmp_path / "s.toml")
+    assert len(str(refused.value)) < 500
+
+
+def test_what_the_parser_says_of_a_long_key_is_cut(tmp_path: Path) -> None:
+    key = f"[{'x' * 5000}]\n"
+    (tmp_path / "s.toml").write_text(key + key, encoding="utf-8")
+    with pytest.raises(SurveyFileError, match=r"not a TOML file: .*xxx \.\.\. .*\(at line 2, ") as refused:
+        read_survey(tmp_path / "s.toml")
+    assert len(str(refused.value)) < 500
+
+
 def test_numbers_of_a_table_stay_numbers() -> None:
     assert (
         csv_text(("a",), [(np.float64(-2.5),), (-3,), (float("-inf"),), (None,)]) == 'a\n-2.5\n-3\n""\n""\n'

@@ -198,7 +198,7 @@ def _read_folder(folder: Path, rng: random.Random) -> None:
                 link.symlink_to(target)
         survey = read_survey(inner / "survey.toml")
         pattern = rng.choice(("**/*", "sub/**/*", "*/*/*", "sub/*", "a/**/image*", "**/sub/**/x*", "im*"))
-        cameras = tuple(camera.model_copy(update={"images": pattern}) for camera in survey.cameras)
+        cameras = tuple(camera.model_copy(update={"images": (pattern,)}) for camera in survey.cameras)
         found = replace(survey, cameras=cameras)
         if rng.random() < 0.3:
             measurements_from_observations(found)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import re
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -31,6 +32,14 @@ SELECT = "([kind, index]) => document.getElementById('explore').viewer.hub.tell(
 PLACE = """(j) => {
   const { scene, model } = document.getElementById('explore').viewer
   const at = scene.project(scene.local(model.xyz(j)))
+  const box = scene.canvas.getBoundingClientRect()
+  return [box.left + at[0], box.top + at[1]]
+}"""
+IN_PYRAMID = """(i) => {
+  const { scene, model } = document.getElementById('explore').viewer
+  const [c, R] = [model.centre(i), model.rotation(i)]
+  const inside = [0, 1, 2].map((r) => c[r] - 0.6 * scene.pyramid * R[3 * r + 2])
+  const at = scene.project(scene.local(inside))
   const box = scene.canvas.getBoundingClientRect()
   return [box.left + at[0], box.top + at[1]]
 }"""
@@ -128,9 +137,7 @@ def test_a_click_on_a_point_shows_its_crops(tab: Tab, scene: ViewerScene) -> Non
         own = np.flatnonzero(scene.rays.point == j)
         shown = page.locator(".v-crop").evaluate_all("cards => cards.map((card) => Number(card.dataset.ray))")
         assert sorted(shown) == own.tolist()
-        page.wait_for_function(
-            "n => document.querySelectorAll('.v-crop canvas[data-ready]').length === n", arg=len(own)
-        )
+        tab.until("n => document.querySelectorAll('.v-crop canvas[data-ready]').length === n", len(own))
         # Away from the cross in the middle and the vector, inside the disc, its intensity is the point's.
         greys = page.locator(".v-crop canvas").evaluate_all(
             "all => all.map((c) => { const d = c.getContext('2d').getImageData(0, 0, c.width, c.height).data;"
@@ -194,7 +201,7 @@ def test_tables_are_copied_as_csv(browser: Any, page_file: Path, scene: ViewerSc
     page = tab.ready()
     page.evaluate("() => { navigator.clipboard.writeText = async (text) => { window.copied = text } }")
     page.locator(".v-table").first.get_by_role("button", name="Copy as CSV").click()
-    page.wait_for_function("window.copied")
+    tab.until("() => window.copied")
     rows = list(csv.reader(io.StringIO(page.evaluate("window.copied"))))
     assert [row[0] for row in rows[1:]] == list(scene.points)
     assert rows[0][:4] == ["point", "X [m]", "Y [m]", "Z [m]"]
@@ -255,6 +262,41 @@ def test_sigma_of_a_distance_is_that_of_the_law_of_propagation() -> None:
     np.testing.assert_allclose(distance_sigmas(xyz, joint), spread, rtol=0.03)
 
 
+def test_a_photograph_shows_its_thumbnail_under_the_pointer(tab: Tab, scene: ViewerScene) -> None:
+    page = tab.page
+    page.evaluate("document.getElementById('explore').viewer.hub.tell('select', null)")
+    page.locator(".v-scene").scroll_into_view_if_needed()
+    seen = set()
+    for i in range(IMAGES):
+        page.mouse.move(*page.evaluate(IN_PYRAMID, i))
+        page.wait_for_timeout(150)
+        if page.locator(".v-hover img").count():
+            assert page.locator(".v-hover img").evaluate("one => one.complete && one.naturalWidth") == 160
+            seen.add(page.locator(".v-hover b").inner_text())
+    assert seen <= set(scene.photographs) and len(seen) >= 3  # some lie behind others or outside
+
+
+def test_large_scenes_turn_with_fewer_points_and_say_so(browser: Any, tmp_path: Path) -> None:
+    network, truth = make_network(seed_of("many"), images=3, points=6000, planar=True, visibility=0.5)
+    many = scene_of_stored(StoredResult("many", network, truth, unit="m"))
+    tab = Tab(browser, write_view(many, tmp_path / "many.html", source="here", paths={}))
+    page = tab.ready()
+    page.evaluate("() => { document.getElementById('explore').viewer.scene.mean = 1000 }")  # a slow machine
+    page.evaluate(
+        "() => { const { scene } = document.getElementById('explore').viewer; scene.turn(0.1, 0);"
+        " scene.turn(0.1, 0); scene.draw(); window.told = document.querySelector('.v-thin').textContent;"
+        " window.drawn = scene.points.geometry.drawRange.count }"
+    )
+    n = len(many.points)
+    told = re.fullmatch(r"one point in (\d+) while the scene turns", page.evaluate("window.told"))
+    assert told is not None and int(told[1]) >= 2
+    assert page.evaluate("window.drawn") == -(-n // int(told[1]))
+    tab.until("n => document.getElementById('explore').viewer.scene.points.geometry.drawRange.count === n", n)
+    assert not page.locator(".v-thin").is_visible()
+    assert tab.complaints == []
+    tab.close()
+
+
 def test_crops_without_room_are_shown_from_beside_the_page(
     browser: Any, scene: ViewerScene, tmp_path: Path
 ) -> None:
@@ -267,7 +309,7 @@ def test_crops_without_room_are_shown_from_beside_the_page(
     page = tab.ready()
     for j in (7, 20):
         page.evaluate(SELECT, ["point", j])
-        page.wait_for_function("document.querySelectorAll('.v-crop canvas:not([data-ready])').length === 0")
+        tab.until("() => document.querySelectorAll('.v-crop canvas:not([data-ready])').length === 0")
         crop = page.locator(".v-crop canvas").first
         data = np.frombuffer(crop.screenshot(), np.uint8)
         seen = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE)

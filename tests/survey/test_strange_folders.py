@@ -5,9 +5,13 @@ from __future__ import annotations
 import json
 import os
 import shutil
+import subprocess
+import sys
+import tomllib
 from collections.abc import Callable
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -24,11 +28,13 @@ from sfm.files.folder_lock import locked
 from sfm.files.whole_files import remove_leftovers, whole_file, whole_folder
 from sfm.kernels.compiling import COMPILING
 from sfm.kernels.sources import sources_of
+from sfm.photographs.exif import Metadata, read_metadata
 from sfm.report.log import SurveyLog, read_log
 from sfm.report.output import folder_name
 from sfm.survey.measuring.target_store import MEASURING, TargetStore
 from sfm.targets.detect import Targets, find_targets
 from tests.engines import ALONE, HERE, Notes
+from tests.places import ROOT
 from tests.surveys import pictures, write_observed_survey, write_photograph_survey
 from tests.synthetic import make_network, seed_of
 
@@ -145,10 +151,133 @@ COMMANDS: dict[str, Command] = {
         lambda f: ("render", scene(f), "new/a"),
         ("new", "new/a", "new/a/p1.jpg", "new/a/truth_points.csv", "new/a/manifest.json"),
     ),
+    "init": (
+        lambda f: ("init", photographs(f)[0].parent, "--out", "new/a.toml"),
+        ("new", "new/a.toml"),
+    ),
+    "init beside the photographs": (lambda f: ("init", photographs(f)[0].parent), ("survey.toml",)),
+    "run of a folder": (
+        lambda f: ("run", photographs(f)[0].parent, "--out", "new/out/s"),
+        ("new",),
+    ),
+    "view": (lambda f: ("view", model(f), "--no-open", "--out", "new/a.html"), ("new", "new/a.html")),
+    "view beside the model": (lambda f: ("view", model(f), "--no-open"), ("model.html",)),
     "convert to a file": (lambda f: ("convert", model(f), "new/a.xml"), ("new", "new/a.xml")),
     "convert to a database": (lambda f: ("convert", model(f), "new/a.db"), ("new", "new/a.db")),
     "convert to a folder": (lambda f: ("convert", model(f), "new/a"), ("new", "new/a")),
 }
+
+
+@pytest.mark.parametrize("name", [".numba_config.yaml", "matplotlibrc"])
+@pytest.mark.parametrize("command", ["adjust", "batch", "render"])
+def test_settings_of_libraries_in_the_current_folder_are_refused(
+    command: str,
+    name: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """numba takes compiled functions from the folder that its settings name, and they are pickles."""
+    monkeypatch.chdir(tmp_path)
+    arguments = COMMANDS[command][0](tmp_path)
+    (tmp_path / name).symlink_to("nowhere")
+    before = sorted(tmp_path.rglob("*"))
+    assert kolinear(monkeypatch, *arguments) == 2
+    told = capsys.readouterr().err
+    assert told.count("\n") == 1 and f"holds '{name}', by which it would decide" in told
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_nothing_that_takes_settings_is_imported_before_the_folder_is_looked_at(tmp_path: Path) -> None:
+    (tmp_path / ".numba_config.yaml").write_text("opt: no number\n")
+    script = "import sys; from sfm.cli import main; sys.argv[1:] = ['validate']; main()"
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    run = subprocess.run(
+        [sys.executable, "-c", script], cwd=tmp_path, env=environment, capture_output=True, text=True
+    )
+    assert run.returncode == 2
+    assert run.stderr.startswith("kolinear: the current folder, ")
+
+
+@pytest.mark.parametrize("place", ["new/out", "new/out/s.toml"])
+def test_no_drafted_survey_is_read_or_written_through_a_link(
+    place: str,
+    home: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    arguments = COMMANDS["run of a folder"][0](tmp_path)
+    (tmp_path / place).parent.mkdir(parents=True)
+    (tmp_path / place).symlink_to(home if place == "new/out" else write_observed_survey(home / "x", "x"))
+    before = content(home)
+    assert kolinear(monkeypatch, *arguments) == 2
+    assert "is a link to" in capsys.readouterr().err and content(home) == before
+
+
+def test_a_link_to_a_result_or_its_pictures_leads_no_page_out_of_the_folder(
+    home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The page stands beside the link, and shows no photographs from elsewhere."""
+    result = model(home).rename(home / "below" / "model")
+    photographs(home)
+    before = content(home)
+    given = tmp_path / "given"
+    given.mkdir()
+    (given / "model").symlink_to(result)
+    assert kolinear(monkeypatch, "view", given / "model", "--no-open") == 0
+    assert content(home) == before and (given / "model.html").is_file()
+    seen: list[Path] = []
+    monkeypatch.setattr(
+        "sfm.report.html.view_page.photographs_in", lambda folder, _: seen.append(folder) or {}
+    )
+    shutil.copytree(result, given / "other")
+    (given / "other" / "pictures").symlink_to(home)
+    assert kolinear(monkeypatch, "view", given / "other", "--no-open") == 0
+    assert seen == []
+    capsys.readouterr()
+
+
+def test_what_photographs_say_of_themselves_is_no_line_of_a_drafted_survey(
+    home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    given = tmp_path / "given"
+    given.mkdir()
+    photographs(given)
+    (given / "2.png").symlink_to(photographs(home)[0])
+    evil = "X\n[control]\nfile = 'x'\n\x1b[2J"
+
+    def metadata(path: Path, real: Any = read_metadata) -> Metadata:
+        return replace(real(path), make=evil, model=evil, focal_mm=24.0)
+
+    monkeypatch.setattr("sfm.survey.drafting.draft.read_metadata", metadata)
+    monkeypatch.setattr("sfm.api.sensor_widths", lambda: lambda *_: 36.0)
+    assert kolinear(monkeypatch, "init", given) == 0
+    told = capsys.readouterr()
+    assert "\x1b" not in told.err and "left out: 2.png: a link out of the folder" in told.err
+    text = (given / "survey.toml").read_text(encoding="utf-8")
+    assert "control" not in tomllib.loads(text) and "\x1b" not in text
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows has another path of libraries")
+@pytest.mark.parametrize("given", [None, "", "/a::/b:"])
+def test_no_process_looks_for_libraries_in_the_current_folder(
+    given: str | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What cv2 does to the path when it is imported would add it."""
+    script = (
+        "import contextlib, os, sys; from sfm.cli import main; sys.argv[1:] = ['--help']\n"
+        "with contextlib.suppress(SystemExit): main()\n"
+        "import cv2; print(); print(os.environ['LD_LIBRARY_PATH'])"
+    )
+    environment = {name: value for name, value in os.environ.items() if name != "LD_LIBRARY_PATH"}
+    environment |= {"PYTHONPATH": str(ROOT)} | ({} if given is None else {"LD_LIBRARY_PATH": given})
+    command = [sys.executable, "-c", script]
+    run = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=True)
+    folders = run.stdout.splitlines()[-1].split(":")
+    assert "" not in folders and all(Path(folder).is_absolute() for folder in folders)
+    assert given != "/a::/b:" or folders[-2:] == ["/a", "/b"]
 
 
 @pytest.mark.parametrize("dangling", [False, True])

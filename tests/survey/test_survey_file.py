@@ -101,7 +101,7 @@ def test_every_key_of_the_survey_file_is_read(tmp_path: Path) -> None:
     survey = read_survey_file(write(tmp_path, FULL))
     assert (survey.name, survey.unit, survey.path.name) == ("camcal", "m", "survey.toml")
     camera = survey.cameras[0]
-    assert (camera.name, camera.images, camera.size_px) == ("olympus", "P825*.JPG", (2272, 1704))
+    assert (camera.name, camera.images, camera.size_px) == ("olympus", ("P825*.JPG",), (2272, 1704))
     assert camera.pixel_mm == (0.0031923, 0.0031911)
     assert (camera.c_mm, camera.model, camera.fixed) == (7.3, "brown", (("b2", 1e-5),))
     assert camera.free == ("c", "x0", "y0", "K1", "K2", "K3", "P1", "P2", "b1")

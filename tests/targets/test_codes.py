@@ -15,6 +15,7 @@ from sfm.targets.codes.ring_reading import UNCODED, UNREADABLE, read_codes
 from sfm.targets.codes.rings import CodeFamily, read_code_table, ring_patterns, smallest_rotation
 from sfm.targets.measure import shape_from_axes
 from tests.places import SHARED
+from tests.synthetic import seed_of
 
 PUBLISHED = SHARED / "data" / "retro-panel"
 SUPER = 5
@@ -88,6 +89,28 @@ def test_tables_equal_the_published_ones(cells: int) -> None:
 def test_smallest_rotation_ignores_the_start() -> None:
     value = np.array([0b00101101, 0b01011010, 0b10110100, 0b01101001])
     assert set(smallest_rotation(value, 8).tolist()) == {0b00101101}
+
+
+@pytest.mark.parametrize(("cells", "count"), [(8, 34), (10, 106), (12, 350)])
+def test_necklaces_are_all_rings_but_the_empty_and_the_full_one(cells: int, count: int) -> None:
+    """Counts by Burnside's lemma, two left out."""
+    family = code_family(f"necklace{cells}")
+    assert isinstance(family, CodeFamily)
+    assert len(family.pattern) == count and family.number.tolist() == list(range(1, count + 1))
+    turns = {smallest_rotation(np.array([p << 1 & ((1 << cells) - 1) | p >> (cells - 1)]), cells)[0]
+             for p in family.pattern.tolist()}  # fmt: skip
+    assert turns == set(family.pattern.tolist())
+
+
+@pytest.mark.parametrize("name", ["ring14", "necklace10"])
+def test_a_mirrored_family_reads_the_mirrored_ring(name: str) -> None:
+    family, mirrored = code_family(name), code_family(f"{name}-mirrored")
+    assert isinstance(family, CodeFamily) and isinstance(mirrored, CodeFamily)
+    affine = 12.0 * np.eye(2)
+    for k in seed_of(name).integers(len(family.pattern), size=5):
+        picture = draw(family, sectors(int(family.pattern[k]), family.cells, 10), affine)
+        assert read(picture, family, affine, 20, 200) == family.number[k]
+        assert read(picture[:, ::-1], mirrored, affine, 20, 200) == family.number[k]
 
 
 @pytest.mark.parametrize("name", ["ring12", "ring14", "ring20"])

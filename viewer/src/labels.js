@@ -4,7 +4,7 @@ import * as THREE from "three"
 import { roundStep, significant } from "./numbers.js"
 
 const FONT = "12px system-ui, sans-serif"
-const CELL_PX = 16 // names keep this apart in height
+const CELL_PX = 16 // side of the cells of which each belongs to one name
 const MAX_NAMES = 400
 const MAX_LETTERS = 24
 
@@ -49,7 +49,7 @@ export function drawLabels(scene, dark) {
 
 function cellsOf([x, y], width) {
   const found = []
-  for (let k = 0; k * 40 <= width + 7; k++) found.push(`${Math.floor(x / 40) + k},${Math.floor(y / CELL_PX)}`)
+  for (let k = 0; k * CELL_PX <= width + 7; k++) found.push(`${Math.floor(x / CELL_PX) + k},${Math.floor(y / CELL_PX)}`)
   return found
 }
 

@@ -133,7 +133,7 @@ function toolbar(model, scene, hub, tools, legends) {
 function ellipsoidTools(model, scene) {
   const { ellipsoids } = scene
   if (!ellipsoids.known) return []
-  const start = Math.log10((0.03 * scene.objectRadius) / ellipsoids.typical)
+  const start = Math.log10((0.08 * scene.objectRadius) / ellipsoids.typical)
   const slider = make("input", { type: "range", min: 0, max: Math.max(1, start + 1.5), step: 0.01, value: start, disabled: true })
   slider.setAttribute("aria-label", "by what the ellipsoids are enlarged")
   const told = make("span", { className: "v-count" })

@@ -26,7 +26,7 @@ REWEIGHTED = "the weights come from the residuals, so that v'Pv is not chi-squar
 FAR_MORE = 2.0  # coordinates beyond the critical value over those expected by chance
 GLOBAL_ALPHA = 0.05  # of the global test and of the significance of parameters
 POWER = 0.8  # and of finding a gross error of the minimal detectable size
-STRONG = 0.95  # correlation from which two parameters are reported
+STRONG = 0.9  # correlation from which two parameters are reported
 
 
 @dataclass(frozen=True)

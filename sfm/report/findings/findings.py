@@ -31,6 +31,7 @@ from sfm.report.findings.given_residuals import Given, given_of
 from sfm.report.findings.interior_parameters import InteriorOrientation, interior_of
 from sfm.report.findings.other_adjuster import ComparisonFindings, comparison_of
 from sfm.report.findings.precision import Precision, precision_of
+from sfm.report.findings.protocol import Protocol, protocol_of
 from sfm.report.findings.rejected import Rejected, rejected_of
 from sfm.report.findings.solution_rows import PhotographRow, PointRow, photographs_of, points_of
 from sfm.report.findings.verdict import Verdict, judge
@@ -61,6 +62,7 @@ class Findings:
     held: tuple[HeldParameter, ...]  # interior parameters held at values that the photographs contradict
     consistency: Consistency  # tests of points, photographs and the format
     given_test: GivenTest | None  # of all that was given against the free network
+    protocol: Protocol  # entries of a bundle protocol
 
 
 def findings_of(result: SurveyResult) -> Findings:
@@ -97,4 +99,5 @@ def findings_of(result: SurveyResult) -> Findings:
         held=held,
         consistency=consistency,
         given_test=against_free,
+        protocol=protocol_of(result, given, check),
     )

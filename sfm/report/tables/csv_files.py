@@ -9,7 +9,11 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
+import numpy as np
+
+from sfm.adjustment.quality.reliability import UNCONTROLLED
 from sfm.adjustment.result import Adjustment
+from sfm.conventions import FloatArray
 from sfm.files.plain_text import csv_text
 from sfm.report.findings.bundle_statistics import Statistics
 from sfm.report.findings.findings import Findings
@@ -37,7 +41,8 @@ def write_tables(findings: Findings, folder: Path) -> None:
         ("given", "kind,name,coordinate,unit,given,difference,sigma,r,w", given_rows(findings.given)),
         (
             "reliability",
-            "image,point,vx_px,vy_px,rx,ry,wx,wy,taux,tauy,mdbx_px,mdby_px,extx,exty,weight,rejected",
+            "image,point,vx_px,vy_px,rx,ry,wx,wy,taux,tauy,mdbx_px,mdby_px,extx,exty,weight,rejected,"
+            "errorx_px,errory_px",
             reliability_rows(adjustment, statistics),
         ),
         ("variance_components", "kind,group,observations,redundancy,sigma0", component_rows(statistics)),
@@ -119,7 +124,14 @@ def reliability_rows(adjustment: Adjustment, statistics: Statistics) -> Iterable
             *found.external[k],
             float(adjustment.weights[k]),
             int(adjustment.rejected[k]),
+            *_gross_error(adjustment.residuals[k], adjustment.redundancy_numbers[k]),
         )
+
+
+def _gross_error(v: FloatArray, r: FloatArray) -> FloatArray:
+    """Return the size that an error would have, v / r, NaN where nothing checks it, px, (2,)."""
+    checked = r > UNCONTROLLED
+    return np.where(checked, v / np.where(checked, r, 1.0), np.nan)
 
 
 def component_rows(statistics: Statistics) -> Iterable[Sequence[object]]:

@@ -86,6 +86,9 @@ def _metadata(folder: Path) -> tuple[dict[str, Metadata], tuple[tuple[str, str],
         if not is_plain(path.name):
             unreadable.append((as_plain(path.name), "its name has control or invisible characters"))
             continue
+        if not path.resolve().is_relative_to(folder.resolve()):
+            unreadable.append((path.name, "a link out of the folder"))
+            continue
         try:
             metadata[path.name] = read_metadata(path)
         except PhotographError as error:
@@ -129,7 +132,7 @@ def _camera_lines(camera: CameraGroup) -> list[str]:
         "[[camera]]",
         f"name = {_quoted(camera.name)}",
         f"images = {json.dumps(globs, ensure_ascii=False)}",
-        f"pixel_mm = [{camera.pixel_mm[0]:.7g}, {camera.pixel_mm[1]:.7g}]  # {camera.pixel_source}",
+        f"pixel_mm = [{camera.pixel_mm[0]:.7g}, {camera.pixel_mm[1]:.7g}]  # {as_plain(camera.pixel_source)}",
         f"c_mm = {camera.c_mm:.6g}  # start value: {camera.c_source}",
         'model = "brown"',
         f"free = {json.dumps(list(FREE))}",

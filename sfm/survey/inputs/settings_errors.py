@@ -12,6 +12,7 @@ from sfm.files.plain_text import as_plain
 from sfm.survey.inputs.settings import Section
 
 MAX_SHOWN = 60  # characters of a key
+MAX_TOLD = 10  # keys that one line names
 FEW = 3  # values of a list that has a fixed number of them
 
 _NEEDED = (
@@ -54,7 +55,8 @@ def first_error(path: Path | str, text: str, error: ValidationError, whole: type
         return f"{where}{_key(location[:-1])}: found {found}, needed {location[-1] + 1} values"
     if kind == "missing":
         every = [_key(one["loc"]) for one in errors if one["type"] == "missing"]
-        return f"{where}{', '.join(every)} {'is' if len(every) == 1 else 'are'} missing"
+        more = f" and {len(every) - MAX_TOLD} more" if len(every) > MAX_TOLD else ""
+        return f"{where}{', '.join(every[:MAX_TOLD])}{more} {'is' if len(every) == 1 else 'are'} missing"
     if kind == "tuple_type" and len(location) == 1 and isinstance(first["input"], dict):
         return f"{where}found [{key}], needed [[{key}]] in double brackets, since there may be several"
     needed = dict(_NEEDED).get(kind)
@@ -119,9 +121,9 @@ def _line_of(text: str, location: tuple[str | int, ...]) -> int | None:
     count: dict[str, int] = {}
     table, last = "", None
     for k, line in enumerate(text.splitlines(), 1):
-        header = re.match(r"\s*\[\[?\s*([\w.\- ]+?)\s*\]\]?", line)
+        header = re.match(r"\s*\[\[?([\w.\- \t]+)\]", line)  # without two parts that may share blanks
         if header:
-            table = header[1]
+            table = header[1].strip()
             count[table] = count.get(table, -1) + 1
             if table == ".".join(keys) and count[table] == number:
                 return k

@@ -1,9 +1,10 @@
 """The code families by name: what a survey file, a sheet or `find_targets` can ask for.
 
 A family of rings with a table in a file needs that file only. One that follows the rule of
-`ring_patterns` is a row in `rings.RINGS`, a dictionary of square tags a row in `tags.DICTIONARIES`. Another
-kind of code is a module beside these with a type for its families, a row below, and its reading in
-`sfm.targets.detect`, behind that of rings (numbers for measured dots) or of tags (points of its own).
+`ring_patterns` is a row in `rings.RINGS`, one of all necklaces in `rings.NECKLACES`, a dictionary of square
+tags a row in `tags.DICTIONARIES`. Another kind of code is a module beside these with a type for its families,
+a row below, and its reading in `sfm.targets.detect`, behind that of rings (numbers for measured dots) or of
+tags (points of its own).
 """
 
 from __future__ import annotations
@@ -14,12 +15,12 @@ from functools import partial
 from pathlib import Path
 
 from sfm.errors import SurveyFileError
-from sfm.targets.codes.rings import RINGS, CodeFamily, read_code_table, ring_family
+from sfm.targets.codes.rings import RING_NAMES, CodeFamily, read_code_table, ring_family
 from sfm.targets.codes.tags import DICTIONARIES, TagFamily, tag_family
 
 Family = CodeFamily | TagFamily
 FAMILIES: dict[str, Callable[[], Family | None]] = {
-    **{name: partial(ring_family, name) for name in RINGS},
+    **{name: partial(ring_family, name) for name in RING_NAMES},
     "none": lambda: None,
     **{name: partial(tag_family, name) for name in DICTIONARIES},
 }

@@ -22,8 +22,18 @@ INTERPOLATION = 1 / 6
 # The position of the cells is judged by the residuals of the samples and by how far the levels of the cells
 # are from being two: their sigmas in units of the step to the dot.
 _SAMPLE_SIGMA, _CELL_SIGMA = 0.05, 0.15
+# Every edge of what is printed lies outwards by the spread of the ink, every edge of a light mark by that of
+# the light; in radii of the dot as it is measured. Ink of 0.3 mm around a dot of 6 mm is 0.09.
+MIN_SPREAD, MAX_SPREAD = -0.08, 0.14
+# What the spread and the blur of the cells' ends over that of the dot are before the ring is looked at: 0 and
+# 1 with these standard deviations, the second of its logarithm.
+_SPREAD_SIGMA, _BLUR_SIGMA = 0.05, 0.25
+# First steps of the search for the place of the first cell (in cells), spread and ln blur; halvings of them.
+_STEP_PLACE, _STEP_SPREAD, _STEP_BLUR, _HALVINGS = 1 / 24, 0.03, 0.15, 4
+# Least jump from clear to set, in steps to the dot, of a ring that is worth the search.
+_WORTH = 0.25
 # Rows of the result after the levels.
-_RESIDUAL, _GAP, _BEHIND_RING, _SIGMA, ROWS = 3, 4, 5, 6, 7
+_RESIDUAL, _GAP, _BEHIND_RING, _SIGMA, SPREAD, ROWS = 3, 4, 5, 6, 7, 8
 
 
 @compiled
@@ -40,7 +50,9 @@ def fit_cells(
     """Return what is in the cells of the ring about each dot; nan where the photograph cuts the ring.
 
     Samples on ellipses similar to that of the dot are modelled as sum of the cells' levels, each blurred as
-    the edge of the dot is; the position of the first cell is the one that explains them best by two levels.
+    the edge of the dot is. Of twelve places of the first cell the one is taken that explains them best by two
+    levels; then its place, a widening of the set cells along and across the ring, as ink spreads, and the
+    blur are improved.
 
     Args:
         image: intensities, shape (H, W).
@@ -55,60 +67,142 @@ def fit_cells(
     Returns:
         For each dot and cell, clockwise, with 0 the background and 1 the dot: three levels of the cell,
         inside, middle and outside; RMS of the residuals in the cell; deviation from what is expected in the
-        clear ring before the cell and behind it; and sigma of the level for residuals of 1; (k, 7, cells).
+        clear ring before the cell and behind it; sigma of the level for residuals of 1; and the spread of the
+        ink in radii of the dot; (k, 8, cells).
     """
     m = cells * SAMPLES
     out = np.full((len(xy), ROWS, cells), math.nan)
     samples = np.empty((len(IN_RING) + 2, m))
     sigma, ring_part = np.empty(m), np.empty((len(IN_RING) + 2, m))
     dot_part = np.empty((len(IN_RING) + 2, m))
-    W, best_W = np.empty((m, cells)), np.empty((m, cells))
-    N, best_N = np.empty((cells, cells)), np.empty((cells, cells))
+    W, N = np.empty((m, cells)), np.empty((cells, cells))
     c, best_c = np.empty((len(IN_RING), cells)), np.empty((len(IN_RING), cells))
-    g = np.empty(cells)
+    nothing = np.zeros(cells)
     for k in range(len(xy)):
         if not _sample(
             image, xy[k], shape[k], levels[k], blur[k], inner, outer, samples, sigma, ring_part, dot_part
         ):
             continue
-        least = math.inf
+        least, place = math.inf, 0.0
         for phase in range(PHASES):
-            _mixture(sigma, phase / PHASES, W)
-            N[:] = 0.0
-            for i in range(m):
-                for a in range(cells):
-                    if W[i, a] != 0.0:
-                        for b in range(a + 1):
-                            N[a, b] += W[i, a] * W[i, b]
-            if not invert_symmetric(N):
-                continue
-            squares = 0.0
-            for row in range(len(IN_RING)):
-                g[:] = 0.0
-                for i in range(m):
-                    for a in range(cells):
-                        g[a] += W[i, a] * (samples[row, i] - dot_part[row, i]) / ring_part[row, i]
-                for a in range(cells):
-                    c[row, a] = 0.0
-                    for b in range(cells):
-                        c[row, a] += N[a, b] * g[b]
-                for i in range(m):
-                    v = (samples[row, i] - dot_part[row, i]) / ring_part[row, i]
-                    for a in range(cells):
-                        v -= W[i, a] * c[row, a]
-                    squares += v * v
-            cost = squares + (_SAMPLE_SIGMA / _CELL_SIGMA) ** 2 * _scatter(c)
+            _mixture(sigma, phase / PHASES, nothing, W)
+            cost = _solve(samples, ring_part, dot_part, W, N, c)
             if cost < least:
-                least = cost
-                best_W[:], best_N[:], best_c[:] = W, N, c
-        if least < math.inf:
-            _compare(samples, ring_part, dot_part, best_W, best_N, best_c, out[k])
+                least, place = cost, phase / PHASES
+                best_c[:] = c
+        if least == math.inf:
+            continue
+        bits, step, jump = _two_levels(best_c)
+        spread, ratio = 0.0, 0.0
+        if jump >= _WORTH * step and step >= _WORTH:
+            d_place, d_spread, d_ratio = _STEP_PLACE, _STEP_SPREAD, _STEP_BLUR
+            for _ in range(_HALVINGS):
+                for parameter in range(3):
+                    for sign in (-1.0, 1.0):
+                        tried_place = place + sign * d_place if parameter == 0 else place
+                        tried_spread = spread + sign * d_spread if parameter == 1 else spread
+                        tried_ratio = ratio + sign * d_ratio if parameter == 2 else ratio
+                        if not MIN_SPREAD <= tried_spread <= MAX_SPREAD:
+                            continue
+                        near, far = _spread_ring(inner, outer, tried_spread)
+                        s = blur[k] * math.exp(tried_ratio)
+                        if not _sample(
+                            image,
+                            xy[k],
+                            shape[k],
+                            levels[k],
+                            s,
+                            near,
+                            far,
+                            samples,
+                            sigma,
+                            ring_part,
+                            dot_part,
+                        ):
+                            continue
+                        _mixture(sigma, tried_place, _shifts(bits, tried_spread, near, far), W)
+                        cost = _solve(samples, ring_part, dot_part, W, N, c)
+                        cost += _SAMPLE_SIGMA**2 * (
+                            (tried_spread / _SPREAD_SIGMA) ** 2 + (tried_ratio / _BLUR_SIGMA) ** 2
+                        )
+                        if cost < least:
+                            least = cost
+                            place, spread, ratio = tried_place, tried_spread, tried_ratio
+                            break
+                d_place, d_spread, d_ratio = d_place / 2, d_spread / 2, d_ratio / 2
+        near, far = _spread_ring(inner, outer, spread)
+        s = blur[k] * math.exp(ratio)
+        if not _sample(image, xy[k], shape[k], levels[k], s, near, far, samples, sigma, ring_part, dot_part):
+            continue
+        _mixture(sigma, place, _shifts(bits, spread, near, far), W)
+        if _solve(samples, ring_part, dot_part, W, N, c) < math.inf:
+            _compare(samples, ring_part, dot_part, W, N, c, out[k])
+            out[k, SPREAD] = spread
     return out
 
 
 @compiled
-def _scatter(c: FloatArray) -> float:
-    """Return the sum of squares of the levels about the means of set and of clear cells, for all radii."""
+def _spread_ring(inner: float, outer: float, spread: float) -> tuple[float, float]:
+    """Return the radii of the ring in radii of the dot as measured, all edges outwards by the spread."""
+    return inner * (1 - spread) - spread, outer * (1 - spread) + spread
+
+
+@compiled
+def _shifts(bits: FloatArray, spread: float, inner: float, outer: float) -> FloatArray:
+    """Return how far the beginning of each cell is turned where a set cell meets a clear one, in cells."""
+    cells = len(bits)
+    turn = spread / ((inner + outer) / 2) / (2 * math.pi / cells)
+    out = np.empty(cells)
+    for a in range(cells):
+        out[a] = turn * (bits[a - 1] - bits[a])
+    return out
+
+
+@compiled
+def _solve(
+    samples: FloatArray,
+    ring_part: FloatArray,
+    dot_part: FloatArray,
+    W: FloatArray,
+    N: FloatArray,
+    c: FloatArray,
+) -> float:
+    """Write the levels of the cells by least squares and their cofactors; return their cost.
+
+    That is the sum of squares of the residuals and of the scatter of the levels, infinite without a solution.
+    """
+    m, cells = W.shape
+    g = np.empty(cells)
+    N[:] = 0.0
+    for i in range(m):
+        for a in range(cells):
+            if W[i, a] != 0.0:
+                for b in range(a + 1):
+                    N[a, b] += W[i, a] * W[i, b]
+    if not invert_symmetric(N):
+        return math.inf
+    squares = 0.0
+    for row in range(len(IN_RING)):
+        g[:] = 0.0
+        for i in range(m):
+            v = (samples[row, i] - dot_part[row, i]) / ring_part[row, i]
+            for a in range(cells):
+                g[a] += W[i, a] * v
+        for a in range(cells):
+            c[row, a] = 0.0
+            for b in range(cells):
+                c[row, a] += N[a, b] * g[b]
+        for i in range(m):
+            v = (samples[row, i] - dot_part[row, i]) / ring_part[row, i]
+            for a in range(cells):
+                v -= W[i, a] * c[row, a]
+            squares += v * v
+    return squares + (_SAMPLE_SIGMA / _CELL_SIGMA) ** 2 * _scatter(c)
+
+
+@compiled
+def _two_levels(c: FloatArray) -> tuple[FloatArray, float, float]:
+    """Return which cells are set (1.0), by the widest gap between their mean levels, the step and the gap."""
     radii, cells = c.shape
     level = np.zeros(cells)
     for a in range(cells):
@@ -116,12 +210,25 @@ def _scatter(c: FloatArray) -> float:
             level[a] += c[row, a] / radii
     order = np.sort(level)
     at = int(np.argmax(order[1:] - order[:-1])) + 1
-    low, high = order[:at].mean(), order[at:].mean()
+    bits = np.where(level >= order[at], 1.0, 0.0)
+    return bits, order[at:].mean() - order[:at].mean(), order[at] - order[at - 1]
+
+
+@compiled
+def _scatter(c: FloatArray) -> float:
+    """Return the sum of squares of the levels about the means of set and of clear cells, for all radii."""
+    radii, cells = c.shape
+    bits, step, _ = _two_levels(c)
+    high, number = 0.0, 0.0
+    for a in range(cells):
+        number += bits[a]
+        for row in range(radii):
+            high += bits[a] * c[row, a] / radii
+    high /= number
     squares = 0.0
     for a in range(cells):
-        mean = high if level[a] >= order[at] else low
         for row in range(radii):
-            squares += (c[row, a] - mean) ** 2
+            squares += (c[row, a] - high + (1 - bits[a]) * step) ** 2
     return squares
 
 
@@ -179,8 +286,15 @@ def _sample(
 
 
 @compiled
-def _mixture(sigma: FloatArray, phase: float, W: FloatArray) -> None:
-    """Write the share of each cell in each sample; phase is where the first cell begins, in cells."""
+def _mixture(sigma: FloatArray, phase: float, shift: FloatArray, W: FloatArray) -> None:
+    """Write the share of each cell in each sample.
+
+    Args:
+        sigma: blur of a cell's end at each sample, rad, (m,).
+        phase: where the first cell begins, in cells.
+        shift: how far the beginning of each cell lies behind its nominal place, in cells, (cells,).
+        W: shares, (m, cells).
+    """
     m, cells = W.shape
     width = 2 * math.pi / cells
     for i in range(m):
@@ -189,7 +303,8 @@ def _mixture(sigma: FloatArray, phase: float, W: FloatArray) -> None:
             away = (
                 position - a - 0.5 + cells / 2
             ) % cells - cells / 2  # from the middle of the cell, in cells
-            near, far = (away - 0.5) * width / sigma[i], (away + 0.5) * width / sigma[i]
+            near = (away - 0.5 - shift[(a + 1) % cells]) * width / sigma[i]
+            far = (away + 0.5 - shift[a]) * width / sigma[i]
             W[i, a] = _phi(far) - _phi(near) if near < 4 and far > -4 else 0.0
 
 

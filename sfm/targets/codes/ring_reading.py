@@ -29,10 +29,10 @@ MIN_STEP, MAX_STEP, MIN_JUMP = 0.6, 1.5, 0.4
 # Largest deviations, in steps, and the worst of the retro-panel: of a clear cell from the background (0.08),
 # or under glare (0.18) from the mean of what is before and behind it (0.06); of what is beside the ring from
 # the background (0.12); of a set cell from shading (0.08), with the sigma of its change over the radius; of a
-# cell on one radius from its mean (0.05, and 0.18 at the limit of resolution); of the samples (0.10).
+# cell on one radius from its mean (0.05, and 0.18 at the limit of resolution); of the samples (0.04).
 CLEAR_TOLERANCE, GLARE, GLARE_TOLERANCE = 0.1, 0.25, 0.07
 GAP_TOLERANCE, SET_TOLERANCE, SHADING = 0.15, 0.1, 0.15
-RADIAL_TOLERANCE, RESIDUAL_TOLERANCE, NOISE_SIGMAS = 0.2, 0.15, 3.0
+RADIAL_TOLERANCE, RESIDUAL_TOLERANCE, NOISE_SIGMAS = 0.2, 0.1, 3.0
 # Part of the circle just behind the ring that other things may cover, and what there may be behind a set
 # cell, in steps (0.24 at the limit of resolution): what makes a clear cell look set mostly reaches out.
 OUTSIDE_CLUTTER, BEHIND_SET = 0.25, 0.3
@@ -150,7 +150,7 @@ def _read_cells(found: FloatArray, family: CodeFamily) -> tuple[int, float]:
     """
     if not np.isfinite(found).all():
         return UNREADABLE, 0.0
-    at_radii, (residual, gap, behind, sigma) = found[:3], found[3:]
+    at_radii, (residual, gap, behind, sigma) = found[:3], found[3:7]
     level = at_radii.mean(axis=0)
     order = np.sort(level)
     jump = np.diff(order)

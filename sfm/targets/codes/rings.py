@@ -16,7 +16,7 @@ class CodeFamily:
     """Geometry and table of one family of coded targets."""
 
     name: str
-    """arcs, ring12, ring14, ring20 or the name of a table file"""
+    """one of RING_NAMES or the name of a table file"""
     cells: int
     """number of cells of the ring; 0 for arcs, where the number of arcs is the code"""
     number: IntArray
@@ -36,15 +36,54 @@ MAX_CELLS = 32  # of a ring in a table file; the published codes end at 20
 MAX_TABLE_BYTES = 10_000_000
 # The families of rings by name, and the cells of each; the number of arcs is a code itself.
 RINGS = {"arcs": 0, "ring12": 12, "ring14": 14, "ring20": 20}
+# Rings of other makers that use all necklaces, without parity: a cell read wrong is another code.
+NECKLACES = {"necklace8": 8, "necklace10": 10, "necklace12": 12}
+MIRRORED = "-mirrored"  # behind a name: cells are counted counter-clockwise in the image
+RING_NAMES = (
+    *RINGS,
+    *NECKLACES,
+    *(name + MIRRORED for name in (*RINGS, *NECKLACES) if name != "arcs"),
+)
 
 
 def ring_family(name: str) -> CodeFamily:
-    """Return the family of a name in RINGS: numbers are places in the table of all patterns, from 1 on."""
-    if not RINGS[name]:
+    """Return the family of a name in RING_NAMES: numbers are places in its table of all patterns, from 1 on.
+
+    A mirrored family has the numbers of its table for the patterns read the other way round.
+    """
+    plain = name.removesuffix(MIRRORED)
+    if plain == "arcs":
         none = np.zeros(0, dtype=np.int64)
         return CodeFamily(name, 0, none, none, ARCS_INNER, ARCS_OUTER)
-    pattern = ring_patterns(RINGS[name])
-    return CodeFamily(name, RINGS[name], np.arange(1, len(pattern) + 1), pattern, RING_INNER, RING_OUTER)
+    cells = NECKLACES[plain] if plain in NECKLACES else RINGS[plain]
+    pattern = necklaces(cells) if plain in NECKLACES else ring_patterns(cells)
+    number = np.arange(1, len(pattern) + 1)
+    if plain != name:
+        pattern = smallest_rotation(mirrored_patterns(pattern, cells), cells)
+        order = np.argsort(pattern)
+        pattern, number = pattern[order], number[order]
+    return CodeFamily(name, cells, number, pattern, RING_INNER, RING_OUTER)
+
+
+def necklaces(cells: int) -> IntArray:
+    """Return all patterns of a ring that differ by more than a turn, ascending, but the empty and full one.
+
+    Args:
+        cells: number of cells of the ring.
+
+    Returns:
+        Patterns, each the smallest of its rotations, shape (m,).
+    """
+    value = np.arange(1, 1 << (cells - 1), dtype=np.int64)
+    return np.asarray(value[smallest_rotation(value, cells) == value])
+
+
+def mirrored_patterns(pattern: IntArray, cells: int) -> IntArray:
+    """Return the patterns with their cells in the opposite order, shape (m,)."""
+    out = np.zeros_like(pattern)
+    for k in range(cells):
+        out |= ((pattern >> k) & 1) << (cells - 1 - k)
+    return out
 
 
 def ring_patterns(cells: int) -> IntArray:

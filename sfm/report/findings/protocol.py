@@ -1,0 +1,282 @@
+"""Entries of a bundle protocol that people know from other programs.
+
+Residuals by photograph and by point, rejected rays by point, control before and after, points by kind and
+rays, distortion and field of view of the cameras, radial distortion tested term by term.
+
+Source: the protocols of DBAT (Boerlin and Grussenmeyer 2013, Photogramm. Record 28(144)) and of AICON 3D
+Studio.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import stats
+
+from sfm.adjustment.quality.reliability import tau_critical
+from sfm.adjustment.quality.robust import HUBER, TUKEY
+from sfm.adjustment.result import Adjustment
+from sfm.camera import Camera, pixel_from_tangents, tangents_from_pixel
+from sfm.conventions import FloatArray, IntArray
+from sfm.report.findings.checks import CheckedControl
+from sfm.report.findings.given_residuals import Given
+from sfm.result import SurveyResult
+
+RADIAL = (("K1", "K2", "K3", "K4"), ("k1", "k2", "k3"))
+EDGE_STEPS = 9  # places along a side of the photograph at which distortion is taken
+
+
+@dataclass(frozen=True)
+class ResidualGroup:
+    """Residuals of the accepted image points of one photograph or point."""
+
+    kind: str  # photograph | point
+    name: str
+    accepted: int
+    rejected: int
+    rms_px: FloatArray  # in x and y, NaN without any, (2,)
+    largest_px: FloatArray  # largest absolute residual in x and y, NaN without any, (2,)
+    largest_at: tuple[str, str]  # the point or photograph of each, "" without any
+
+
+@dataclass(frozen=True)
+class RejectedRays:
+    """Rejected rays of one point."""
+
+    point: str
+    images: tuple[str, ...]
+    rays: int  # of the point, rejected ones included
+
+
+@dataclass(frozen=True)
+class ControlCoordinate:
+    """A coordinate of control or of a check point, before and after."""
+
+    use: str  # control | check
+    point: str
+    coordinate: str
+    given: float  # object unit
+    prior: float  # stated standard deviation, 0 fixed, object unit
+    adjusted: float  # object unit
+    posterior: float  # standard deviation of the adjusted coordinate, object unit
+    difference: float  # adjusted minus given, object unit
+    test: float  # difference over the standard deviation expected of it, NaN where nothing checks it
+
+
+@dataclass(frozen=True)
+class Lens:
+    """Distortion and field of view of a camera."""
+
+    camera: str
+    largest_px: float  # displacement by distortion along the edge of the photograph
+    field_of_view_deg: FloatArray  # horizontal, vertical, diagonal, (3,)
+
+
+@dataclass(frozen=True)
+class CumulativeTest:
+    """F-test of a radial parameter together with all higher ones against 0."""
+
+    camera: str
+    parameters: str  # such as "K2, K3"
+    statistic: float
+    probability: float  # of an F so large by chance
+
+
+@dataclass(frozen=True)
+class Protocol:
+    """All these entries."""
+
+    residuals: tuple[ResidualGroup, ...]
+    rejected: tuple[RejectedRays, ...]
+    limits: str  # of rejection, in words
+    control: tuple[ControlCoordinate, ...]
+    rays_by_kind: tuple[tuple[str, int, float, int], ...]  # kind of point, points, mean rays, fewest rays
+    lenses: tuple[Lens, ...]
+    cumulative: tuple[CumulativeTest, ...]
+
+
+def protocol_of(result: SurveyResult, given: Given, check: CheckedControl | None) -> Protocol:
+    """Return the protocol entries of a result."""
+    a = result.adjustment
+    seen = a.network.image_points
+    return Protocol(
+        residuals=(
+            *_groups(a, "photograph", seen.image, a.network.images, seen.point, a.network.points),
+            *_groups(a, "point", seen.point, a.network.points, seen.image, a.network.images),
+        ),
+        rejected=_rejected(a),
+        limits=_limits(result),
+        control=(*_control(a, given), *_checked(a, check)),
+        rays_by_kind=_rays_by_kind(result),
+        lenses=tuple(_lens(one) for k, one in enumerate(a.estimate.cameras) if (a.network.camera == k).any()),
+        cumulative=_cumulative(a),
+    )
+
+
+def _groups(
+    a: Adjustment,
+    kind: str,
+    index: IntArray,
+    names: tuple[str, ...],
+    other: IntArray,
+    others: tuple[str, ...],
+) -> list[ResidualGroup]:
+    order = np.argsort(index, kind="stable")
+    bounds = np.searchsorted(index[order], np.arange(1, len(names)))
+    out = []
+    for name, rows in zip(names, np.split(order, bounds), strict=True):
+        kept = rows[~a.rejected[rows]]
+        v = np.abs(a.residuals[kept])
+        if len(kept):
+            worst = v.argmax(axis=0)
+            at = (others[other[kept[worst[0]]]], others[other[kept[worst[1]]]])
+            rms, largest = np.sqrt((v**2).mean(axis=0)), v.max(axis=0)
+        else:
+            at, rms, largest = ("", ""), np.full(2, np.nan), np.full(2, np.nan)
+        out.append(ResidualGroup(kind, name, len(kept), len(rows) - len(kept), rms, largest, at))
+    return out
+
+
+def _rejected(a: Adjustment) -> tuple[RejectedRays, ...]:
+    seen, rays = a.network.image_points, a.network.rays()
+    found: dict[int, list[str]] = {}
+    for k in np.flatnonzero(a.rejected):
+        found.setdefault(int(seen.point[k]), []).append(a.network.images[seen.image[k]])
+    return tuple(
+        RejectedRays(a.network.points[j], tuple(images), int(rays[j]))
+        for j, images in sorted(found.items(), key=lambda one: -len(one[1]))
+    )
+
+
+def _limits(result: SurveyResult) -> str:
+    """Return from which residual on image points are rejected, and up to which they are taken back."""
+    a = result.adjustment
+    if result.reject == "tau":
+        critical = tau_critical(a.test_alpha, a.redundancy)
+        return f"where |tau| is beyond {critical:.2f} (level {a.test_alpha:.2g}), taken back where it is not"
+    if result.reject == "tukey":
+        return f"weight 0 beyond {TUKEY:g} standard deviations, taken back below"
+    if result.reject == "huber":
+        return f"none rejected; weight below 1 beyond {HUBER:g} standard deviations"
+    return "none rejected"
+
+
+def _control(a: Adjustment, given: Given) -> list[ControlCoordinate]:
+    found = given.control
+    if found is None:
+        return []
+    points = a.network.control.point
+    posterior = np.sqrt(np.maximum(np.einsum("nii->ni", a.covariance.points[points]), 0.0))
+    return [
+        ControlCoordinate(
+            "control",
+            name,
+            axis,
+            *(float(found.given[k, c]), float(found.sigma[k, c])),
+            *(float(a.estimate.points[points[k], c]), float(posterior[k, c])),
+            *(float(found.difference[k, c]), float(found.w[k, c])),
+        )
+        for k, name in enumerate(found.names)
+        for c, axis in enumerate("XYZ")
+        if np.isfinite(found.sigma[k, c])
+    ]
+
+
+def _checked(a: Adjustment, check: CheckedControl | None) -> list[ControlCoordinate]:
+    if check is None:
+        return []
+    place = {a.network.points[j]: k for k, j in enumerate(a.network.control.point)}
+    rows = []
+    for n, name in enumerate(check.check.points):
+        k = place.get(name)
+        if k is None:
+            continue
+        j = a.network.control.point[k]
+        prior = np.sqrt(np.diagonal(a.network.control.covariance[k]))
+        posterior = np.sqrt(np.maximum(np.diagonal(a.covariance.points[j]), 0.0))
+        for c, axis in enumerate("XYZ"):
+            difference = float(check.check.differences[n, c])
+            expected = float(np.hypot(prior[c], posterior[c]))
+            known = float(a.network.control.xyz[k, c])
+            rows.append(
+                ControlCoordinate(
+                    *("check", name, axis, known, float(prior[c]), known + difference),
+                    *(float(posterior[c]), difference, difference / expected if expected > 0 else np.nan),
+                )
+            )
+    return rows
+
+
+def _rays_by_kind(result: SurveyResult) -> tuple[tuple[str, int, float, int], ...]:
+    a = result.adjustment
+    seen = a.network.image_points
+    n = len(a.network.points)
+    rays = np.bincount(seen.point[~a.rejected], minlength=n)
+    control = np.zeros(n, dtype=bool)
+    control[a.network.control.point] = True
+    coded = result.code >= 0
+    kinds = (
+        ("control points", control),
+        ("coded points", coded & ~control),
+        ("other points", ~coded & ~control),
+    )
+    return tuple(
+        (name, int(own.sum()), float(rays[own].mean()), int(rays[own].min()))
+        for name, own in kinds
+        if own.any()
+    )
+
+
+def _lens(camera: Camera) -> Lens:
+    """Return distortion along the edge, c and principal point kept, and the field of view of the rays."""
+    width, height = camera.size_px
+    along = np.linspace(0.0, 1.0, EDGE_STEPS)
+    x, y = (width - 1) * along, (height - 1) * along
+    zero, one = np.zeros(EDGE_STEPS), np.ones(EDGE_STEPS)
+    edge = np.concatenate(
+        [
+            np.stack(side, axis=1)
+            for side in ((x, zero), (x, one * (height - 1)), (zero, y), (one * (width - 1), y))
+        ]
+    )
+    straight = camera.with_parameters(
+        np.where([name[0] in "KPkpb" for name in camera.names], 0.0, camera.parameters)
+    )
+    rays = tangents_from_pixel(camera, edge)
+    moved = np.linalg.norm(pixel_from_tangents(straight, rays) - edge, axis=1)
+    middle = np.array([[0.0, (height - 1) / 2], [width - 1.0, (height - 1) / 2]])
+    upright = np.array([[(width - 1) / 2, 0.0], [(width - 1) / 2, height - 1.0]])
+    corners = np.array([[0.0, 0.0], [width - 1.0, height - 1.0]])
+    angles = [_angle(tangents_from_pixel(camera, pair)) for pair in (middle, upright, corners)]
+    largest = float(moved[np.isfinite(moved)].max(initial=0.0)) if np.isfinite(moved).any() else np.nan
+    return Lens(camera.name, largest, np.degrees(angles))
+
+
+def _angle(tangents: FloatArray) -> float:
+    """Return the angle between two rays, rad."""
+    rays = np.concatenate([tangents, -np.ones((2, 1))], axis=1)
+    first, second = rays / np.linalg.norm(rays, axis=1, keepdims=True)
+    return float(np.arccos(np.clip(first @ second, -1.0, 1.0)))
+
+
+def _cumulative(a: Adjustment) -> tuple[CumulativeTest, ...]:
+    tests: dict[tuple[str, str], CumulativeTest] = {}
+    for camera, Q in zip(a.estimate.cameras, a.covariance.interior, strict=True):
+        free = np.flatnonzero(camera.free)[: len(Q)]
+        names = [camera.names[s] for s in free]
+        for radial in RADIAL:
+            own = [names.index(name) for name in radial if name in names]
+            for first in range(len(own)):
+                some = own[first:]
+                value = camera.parameters[free[some]]
+                scale = np.sqrt(np.diagonal(Q)[some])
+                if not (scale > 0).all() or a.redundancy < 1:
+                    continue
+                normed = Q[np.ix_(some, some)] / scale[:, None] / scale
+                statistic = float((value / scale) @ np.linalg.solve(normed, value / scale)) / len(some)
+                p = float(stats.f.sf(statistic, len(some), a.redundancy))
+                owner = camera.group_of(int(free[some[0]])) or camera.name
+                which = ", ".join(names[s] for s in some)
+                tests[owner, which] = CumulativeTest(owner, which, statistic, p)
+    return tuple(tests.values())

@@ -1,0 +1,36 @@
+"""Settings of libraries and libraries themselves in the current folder, which may have come with a survey.
+
+numba reads `.numba_config.yaml` there, which can name a folder of compiled functions; they are pickles, and
+so programs. matplotlib reads `matplotlibrc` there, which can have every text set by LaTeX. And cv2 puts its
+libraries and a colon before LD_LIBRARY_PATH; where that is empty, nothing follows the colon, by which the
+linker of every process that is started afterwards understands the current folder.
+"""
+
+from __future__ import annotations
+
+import os
+
+from sfm.errors import KolinearError
+
+SETTINGS = (".numba_config.yaml", "matplotlibrc")
+LIBRARIES = "LD_LIBRARY_PATH"
+
+
+def refuse_folder_settings() -> None:
+    """Raise KolinearError where the current folder holds settings of a library; before any is imported."""
+    for name in SETTINGS:
+        if os.path.lexists(name):
+            raise KolinearError(
+                f"the current folder, {os.getcwd()}, holds '{name}', by which it would decide what is "
+                "computed or run; start Kolinear from another folder, or remove the file"
+            )
+
+
+def close_library_path() -> None:
+    """Take the current folder out of where processes that are started look for libraries; see above.
+
+    The path is never left empty, so that OpenCV can be imported before or after.
+    """
+    if os.name != "nt":
+        folders = [folder for folder in os.environ.get(LIBRARIES, "").split(os.pathsep) if folder]
+        os.environ[LIBRARIES] = os.pathsep.join(folders) or os.path.dirname(os.path.abspath(__file__))

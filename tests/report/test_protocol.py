@@ -1,0 +1,104 @@
+"""Entries of the protocol against what they are computed from in another way."""
+
+from __future__ import annotations
+
+import csv
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sfm.adjustment.datum import Datum
+from sfm.adjustment.solve import adjust
+from sfm.pipeline import run_survey
+from sfm.report.findings.findings import Findings, findings_of
+from sfm.report.tables.protocol_files import write_protocol
+from sfm.report.text.text_report import text_report
+from sfm.survey.inputs.given import KnownPoints
+from tests.surveys import survey_of
+from tests.synthetic import make_network, seed_of
+
+
+@pytest.fixture(scope="module")
+def found() -> Findings:
+    """Eight photographs with control, two gross errors and a lens of known distortion."""
+    rng = seed_of("protocol")
+    network, truth = make_network(rng, images=8, points=30)
+    xy = network.image_points.xy.copy()
+    xy[[5, 40]] += (20.0, -15.0)
+    network = replace(network, image_points=replace(network.image_points, xy=xy))
+    noisy = truth.points[:5] + 1e-4 * rng.standard_normal((5, 3))
+    control = KnownPoints.from_arrays([str(k + 1) for k in range(5)], noisy, 1e-4)
+    free = ("c", "x0", "y0", "K1", "K2")
+    given = {"control": control, "datum": {"kind": "control"}, "adjust": {"reject": "tau"}}
+    survey = survey_of(network, truth, free=free, **given)
+    return findings_of(run_survey(survey))
+
+
+def test_residuals_by_photograph_and_point_are_those_of_the_image_points(found: Findings) -> None:
+    a = found.result.adjustment
+    one = next(group for group in found.protocol.residuals if group.name == "image 3")
+    own = (a.network.image_points.image == a.network.image_index("image 3")) & ~a.rejected
+    v = a.residuals[own]
+    np.testing.assert_allclose(one.rms_px, np.sqrt((v**2).mean(axis=0)))
+    np.testing.assert_allclose(one.largest_px, np.abs(v).max(axis=0))
+    assert sum(group.rejected for group in found.protocol.residuals) == 2 * a.rejected.sum()
+
+
+def test_rejected_rays_stand_in_the_text_report_by_point(found: Findings) -> None:
+    a = found.result.adjustment
+    assert {ray.point for ray in found.protocol.rejected} == {
+        a.network.points[j] for j in a.network.image_points.point[a.rejected]
+    }
+    text = text_report(found)
+    assert "Rejected rays by point" in text and f"point {found.protocol.rejected[0].point}: 1 of" in text
+    assert "where |tau| is beyond" in text
+
+
+def test_control_has_its_standard_deviation_before_and_after(found: Findings) -> None:
+    rows = found.protocol.control
+    assert len(rows) == 15 and {row.use for row in rows} == {"control"}
+    assert all(row.prior == pytest.approx(1e-4) and row.posterior < row.prior for row in rows)
+
+
+def test_check_points_have_difference_and_test() -> None:
+    rng = seed_of("protocol check")
+    network, truth = make_network(rng, images=8, points=30)
+    noisy = truth.points[:5] + 1e-4 * rng.standard_normal((5, 3))
+    control = KnownPoints.from_arrays([str(k + 1) for k in range(5)], noisy, 1e-4)
+    rows = findings_of(run_survey(survey_of(network, truth, control=control))).protocol.control
+    assert len(rows) == 15 and {row.use for row in rows} == {"check"}
+    assert all(abs(row.test) < 5 for row in rows)
+    assert all(row.adjusted - row.given == pytest.approx(row.difference) for row in rows)
+
+
+def test_the_field_of_view_and_the_distortion_are_those_of_the_lens(found: Findings) -> None:
+    (lens,) = found.protocol.lenses
+    # 10 mm by 7.5 mm at c = 10 mm, 32 px of distortion in the corners
+    assert lens.field_of_view_deg[0] == pytest.approx(53.1, abs=2.0)
+    assert 10 < lens.largest_px < 60
+
+
+def test_radial_parameters_are_tested_together() -> None:
+    network, truth = make_network(seed_of("cumulative"), images=8, points=40)
+    found = adjust(network, truth, datum=Datum("free"))
+    from sfm.report.findings.protocol import _cumulative
+
+    tests = {one.parameters: one for one in _cumulative(found)}
+    assert set(tests) == {"K1, K2", "K2"}
+    assert tests["K1, K2"].probability < 1e-6
+
+
+def test_the_files_hold_all_covariances(found: Findings, tmp_path: Path) -> None:
+    write_protocol(found, tmp_path)
+    a = found.result.adjustment
+    with np.load(tmp_path / "covariances.npz") as stored:
+        np.testing.assert_array_equal(stored["points"], a.covariance.points)
+        np.testing.assert_array_equal(stored["interior_0"], a.covariance.interior[0])
+    with (tmp_path / "point_covariances.csv").open(encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    assert float(rows[2]["X_Z"]) == a.covariance.points[2, 0, 2]
+    with (tmp_path / "interior_correlations.csv").open(encoding="utf-8") as file:
+        pairs = list(csv.DictReader(file))
+    assert len(pairs) == 10 and all(-1 <= float(pair["correlation"]) <= 1 for pair in pairs)

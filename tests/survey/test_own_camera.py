@@ -1,0 +1,72 @@
+"""Photographs that do not fit the others: zoomed ones get their own camera, strange ones are left out."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from sfm.camera import project
+from sfm.network import Estimate, Network
+from sfm.pipeline import run_survey
+from sfm.report.findings.findings import findings_of
+from sfm.survey.inputs.settings import AdjustSettings
+from tests.surveys import survey_of
+from tests.synthetic import make_network, seed_of
+
+TAU = AdjustSettings(reject="tau")
+
+
+def with_zoom(name: str, factors: dict[int, float], *, images: int = 10) -> tuple[Network, Estimate]:
+    """Return a network of which some photographs were taken with another c."""
+    network, truth = make_network(seed_of(name), images=images, points=60, free=("c",))
+    seen, rng = network.image_points, seed_of(f"{name} noise")
+    xy = seen.xy.copy()
+    for i, factor in factors.items():
+        p = truth.cameras[0].parameters.copy()
+        p[0] *= factor
+        rows = np.flatnonzero(seen.image == i)
+        camera = truth.cameras[0].with_parameters(p)
+        xy[rows] = project(camera, truth.position[i], truth.rotation[i], truth.points[seen.point[rows]])
+        xy[rows] += 0.1 * rng.standard_normal((len(rows), 2))
+    return replace(network, image_points=replace(seen, xy=xy)), truth
+
+
+@pytest.mark.parametrize("factor", [0.95, 1.1])
+def test_a_zoomed_photograph_gets_its_own_c(factor: float) -> None:
+    network, truth = with_zoom(f"zoomed {factor}", {7: factor})
+    result = run_survey(survey_of(network, truth, adjust=TAU))
+    a = result.adjustment
+    assert result.failed == () and a.rejected.sum() <= 3
+    # the other photographs' precision, as if the zoom were known
+    assert a.sigma0_px == pytest.approx(0.1, rel=0.1)
+    own = {camera.name: camera for camera in a.estimate.cameras}
+    assert own["synthetic image 8"].value("c") == pytest.approx(factor * 10.0, rel=2e-3)
+    assert own["synthetic"].value("c") == pytest.approx(10.0, rel=2e-3)
+    (line,) = [one for one in result.warnings if one.startswith("image 8 does not fit camera synthetic")]
+    assert "with c of its own" in line and "zoomed" in line
+    assert findings_of(result).verdict.level == "fair"
+
+
+def test_a_photograph_of_another_state_is_left_out() -> None:
+    """Forty of sixty points lie elsewhere in one photograph: no c explains that."""
+    network, truth = with_zoom("moved", {})
+    seen, rng = network.image_points, seed_of("moved elsewhere")
+    rows = np.flatnonzero(seen.image == 4)
+    moved = rows[rng.permutation(len(rows))[: 2 * len(rows) // 3]]
+    xy = seen.xy.copy()
+    xy[moved] += rng.uniform(10, 40, (len(moved), 2))
+    network = replace(network, image_points=replace(seen, xy=xy))
+    result = run_survey(survey_of(network, truth, adjust=TAU))
+    (failed,) = result.failed
+    assert failed.image == "image 5"
+    assert "no c of its own explains them" in failed.reason or "contradict it" in failed.reason
+    assert result.adjustment.sigma0_px == pytest.approx(0.1, rel=0.1)
+
+
+def test_photographs_that_fit_keep_their_camera() -> None:
+    network, truth = with_zoom("fits", {})
+    result = run_survey(survey_of(network, truth, adjust=TAU))
+    assert len(result.adjustment.estimate.cameras) == 1 and result.failed == ()
+    assert not [line for line in result.warnings if "does not fit camera" in line]
