@@ -37,6 +37,8 @@ def check_network(network: Network, estimate: Estimate) -> None:
         ("covariances of the image points", seen.covariance, (k, 2, 2)),
         ("photographs of the image points", seen.image, (k,)),
         ("object points of the image points", seen.point, (k,)),
+        ("control coordinates", network.control.xyz, (len(network.control), 3)),
+        ("covariances of the control", network.control.covariance, (len(network.control), 3, 3)),
     ):
         if np.shape(array) != shape:
             raise GeometryError(f"network: {what} of shape {np.shape(array)}, expected {shape}")
@@ -49,6 +51,10 @@ def check_network(network: Network, estimate: Estimate) -> None:
         ("object point", network.scale_bars.end, n),
         ("photograph", network.exterior.image, m),
     ):
+        if not np.issubdtype(np.asarray(index).dtype, np.integer):
+            raise GeometryError(
+                f"network: indices of a {what} of type {np.asarray(index).dtype}, expected whole numbers"
+            )
         wrong = _first((index < 0) | (index >= count))
         if wrong is not None:
             raise GeometryError(f"network: index {index[wrong]} of a {what}, expected 0 to {count - 1}")

@@ -174,6 +174,7 @@ class SurveyResult:
     # orientation, the strong ones
     seconds: tuple[StageTime, ...] = field(default_factory=tuple)  # in the order of the stages
     settings: tuple[tuple[str, str], ...] = ()  # (table of the survey file, what it says) of the survey
+    weights: str = "components"  # of image points beside other observations: components | stated
     reject: str = "tau"  # how the survey treats gross errors: tau | huber | tukey | none
 
     @property

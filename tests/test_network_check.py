@@ -11,7 +11,7 @@ import pytest
 
 import sfm
 from sfm.errors import GeometryError, KolinearError
-from sfm.network import Estimate, Network
+from sfm.network import Estimate, Network, ObjectPoints
 from tests.synthetic import make_network, seed_of
 
 Spoil = Callable[[Network, Estimate], tuple[Network, Estimate]]
@@ -39,6 +39,17 @@ SPOILED: tuple[tuple[Spoil, str], ...] = (
     (lambda n, e: (seen(n, covariance=n.image_points.covariance[:, 0]), e), r"of shape \(\d+, 2\), expected"),
     (lambda n, e: (seen(n, image=with_value(n.image_points.image, 0, 99)), e), "index 99 of a photograph"),
     (lambda n, e: (seen(n, point=with_value(n.image_points.point, 0, -1)), e), "index -1 of a object point"),
+    (
+        lambda n, e: (seen(n, image=n.image_points.image.astype(float)), e),
+        "indices of a photograph of type float64, expected whole numbers",
+    ),
+    (
+        lambda n, e: (
+            replace(n, control=ObjectPoints(np.arange(3), e.points[:3], np.zeros((3, 3)))),
+            e,
+        ),
+        r"covariances of the control of shape \(3, 3\), expected \(3, 3, 3\)",
+    ),
     (lambda n, e: (replace(n, camera=n.camera + 5), e), "index 5 of a camera, expected 0 to 0"),
     (lambda n, e: (n, replace(e, points=e.points[:-1])), r"object points of shape \(19, 3\), expected"),
     (lambda n, e: (n.with_control(["1"], [[0, 0, np.nan]], 0.1), e), "control point 1: expected finite"),

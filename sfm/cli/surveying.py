@@ -68,6 +68,16 @@ AllowOutside = Annotated[
 ]
 
 
+Calibration = Annotated[
+    Path | None,
+    typer.Option(
+        "--camera",
+        metavar="RESULT",
+        help="Hold the interior orientation at that of an earlier result, by the names of the cameras.",
+    ),
+]
+
+
 def run(
     survey_file: SurveyOrPhotographs,
     images: Annotated[
@@ -76,6 +86,7 @@ def run(
             "--images", metavar="DIR", help="Folder of the photographs, in place of that of the survey file."
         ),
     ] = None,
+    camera: Calibration = None,
     out: Out = None,
     jobs: Jobs = None,
     pictures_mb: PicturesMb = 15.0,
@@ -100,12 +111,24 @@ def run(
             images = survey_file
             survey_file, out = drafted_beside(images, out)
     _run_survey(
-        survey_file, images, out, jobs, allow_outside, verbose, from_photographs=True, pictures_mb=pictures_mb
+        survey_file,
+        images,
+        out,
+        jobs,
+        allow_outside,
+        verbose,
+        from_photographs=True,
+        camera=camera,
+        pictures_mb=pictures_mb,
     )
 
 
 def adjust(
-    survey_file: SurveyFile, out: Out = None, allow_outside: AllowOutside = False, verbose: Verbose = False
+    survey_file: SurveyFile,
+    camera: Calibration = None,
+    out: Out = None,
+    allow_outside: AllowOutside = False,
+    verbose: Verbose = False,
 ) -> None:
     """Run a survey from measured image points to the report.
 
@@ -113,7 +136,7 @@ def adjust(
     result, remarks or none; 1 if the result cannot be depended on, the report says why; 2 where a person
     must put something right.
     """
-    _run_survey(survey_file, None, out, None, allow_outside, verbose, from_photographs=False)
+    _run_survey(survey_file, None, out, None, allow_outside, verbose, from_photographs=False, camera=camera)
 
 
 def _run_survey(
@@ -125,18 +148,20 @@ def _run_survey(
     verbose: bool,
     *,
     from_photographs: bool,
+    camera: Path | None,
     pictures_mb: float = 0.0,
 ) -> None:
     """Run a survey, write its result and tell it; `from_photographs` is what the command is for."""
     begun = time.perf_counter()
     with loading():
-        from sfm.api import colmap_writer, cores, one_blas_thread, programs_of
+        from sfm.api import colmap_writer, cores, one_blas_thread, programs_of, read_result
         from sfm.cli.console import tell_result
         from sfm.pipeline import run_survey
         from sfm.report.findings.findings import findings_of
         from sfm.report.log import SurveyLog
         from sfm.report.output import write_result
         from sfm.runtime.progress_bar import drawn_progress
+        from sfm.survey.inputs.calibration import with_calibration
         from sfm.survey.inputs.survey import survey_of_file
         from sfm.survey.inputs.survey_file import read_survey_file
         from sfm.survey.measuring.target_store import TargetStore
@@ -153,6 +178,9 @@ def _run_survey(
         )
     with working_on(str(survey_file)):
         survey = survey_of_file(described)
+    if camera is not None:
+        with working_on(str(camera)):
+            survey = with_calibration(survey, read_result(camera).estimate.cameras, str(camera))
     others = programs_of(survey.compare.backend, survey.compare.baseline)
     folder = _folder(survey, out)
     compile_first()

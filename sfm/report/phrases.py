@@ -58,8 +58,10 @@ def _fitting(test: GlobalTest, a: Adjustment | None) -> str:
 
 
 def words_of_weights(result: SurveyResult) -> str:
-    """Return which weights the image points have, and what follows for the tests; empty if as stated."""
+    """Return which weights the image points have, and what follows for the tests; empty if nothing chose."""
     factor = result.adjustment.weight_factor
+    if result.weights == "stated":
+        return "Weights: those stated for all observations, with one sigma0 for all standard deviations."
     if factor == 1:
         return ""
     return (

@@ -59,6 +59,7 @@ def assemble_result(
         undecided=start.remarks,
         unused_image_points=solution.unused_image_points + sum(one.image_points for one in measured.left_out),
         reject=survey.reject,
+        weights=survey.adjust.weights,
         orientation_correlations=orientation_correlations(adjustment),
         seconds=tuple(StageTime(*one) for one in clock.seconds),
     )

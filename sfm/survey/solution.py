@@ -309,7 +309,8 @@ def _resolved(task: _Task, found: Contradiction, accepted: BoolArray) -> _Task:
 def _final(task: _Task, part: Network, estimate: Estimate) -> Adjustment:
     """Return the last adjustment with its covariance.
 
-    Where other observations take part, the image points are weighted by their own variance component.
+    Where other observations take part, the image points are weighted by their own variance component, unless
+    the survey wants all weights as stated.
     """
     part, estimate = without_idle_cameras(part, estimate, cameras=len(task.survey.cameras))
 
@@ -318,7 +319,8 @@ def _final(task: _Task, part: Network, estimate: Estimate) -> Adjustment:
 
     outer = (part.control, part.exterior) if task.datum.kind == "control" else ()
     weighted = any(observed(np.einsum("nii->ni", one.covariance)).any() for one in outer)
-    if len(part.scale_bars) or len(part.interior) or weighted:
+    others = len(part.scale_bars) or len(part.interior) or weighted
+    if others and task.survey.adjust.weights == "components":
         return _weighed(adjust_part, len(part.image_points))
     return _tested(task, part, estimate, covariance=True)
 

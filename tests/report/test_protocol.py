@@ -52,8 +52,8 @@ def test_rejected_rays_stand_in_the_text_report_by_point(found: Findings) -> Non
         a.network.points[j] for j in a.network.image_points.point[a.rejected]
     }
     text = text_report(found)
-    assert "Rejected rays" in text and f"point {found.protocol.rejected[0].point}: 1 of" in text
-    assert "|tau| is beyond" in text
+    assert "Rejected rays by point" in text and f"point {found.protocol.rejected[0].point}: 1 of" in text
+    assert "where |tau| is beyond" in text
 
 
 def test_control_has_its_standard_deviation_before_and_after(found: Findings) -> None:

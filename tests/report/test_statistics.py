@@ -715,7 +715,7 @@ def test_text_report_is_one_page_with_the_figures_of_the_adjustment(
     a = adjust(network, truth, datum=Datum("free"))
     text = text_report(findings_of(result_of(a)))
     lines = text.splitlines()
-    assert len(lines) < 100 and max(map(len, lines)) <= WIDTH
+    assert len(lines) < 110 and max(map(len, lines)) <= WIDTH
     assert f"{a.sigma0_px:.5f} px" in text and "rank defect 6, as expected" in text
     assert f"{a.observations} ({2 * int((~a.rejected).sum())} image coordinates, 2 scale bars)" in text
     for test in component_tests(by_kind(a)):
@@ -725,7 +725,7 @@ def test_text_report_is_one_page_with_the_figures_of_the_adjustment(
     assert float(numbers[1]) == pytest.approx(np.nansum(a.redundancy_numbers), abs=0.06)
     assert float(numbers[2]) == pytest.approx(a.redundancy, abs=0.06)
     assert f"beyond {w_test(a).critical:.2f}" in text and f"beyond {tau_test(a).critical:.2f}" in text
-    for words in ("minimal bias", "external reliability", "Variance components", "correlations over 95 %"):
+    for words in ("minimal bias", "external reliability", "Variance components", "correlations over 90 %"):
         assert words in text
     assert text == text_report(findings_of(result_of(a)))
 

@@ -73,9 +73,9 @@ export function tablesOf(model, hub, element, scene) {
     "scale bars",
     [
       text("name", "scale bar", (b) => `${model.points[model.bars[b].from]} - ${model.points[model.bars[b].to]}`),
-      number("length", "length", (b) => model.bars[b].length, (v) => significant(v, 9), unit),
+      number("length", "length", (b) => model.bars[b].length ?? NaN, (v) => significant(v, 9), unit),
       number("difference", "adjusted minus given", (b) => (model.bars[b].difference ?? NaN) * fine.factor, short, fine.unit),
-      number("sigma", "sigma given", (b) => model.bars[b].sigma * fine.factor, short, fine.unit),
+      number("sigma", "sigma given", (b) => (model.bars[b].sigma ?? NaN) * fine.factor, short, fine.unit),
     ],
     every(model.bars.length),
     (b) => ({ kind: "point", index: model.bars[b].from, from: "table" }),

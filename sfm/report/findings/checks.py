@@ -41,6 +41,12 @@ class Sigma0:
     px: float  # a posteriori, of all observations together: control that contradicts raises it, px
     ratio: float  # of the image points by themselves, a posteriori over that stated
     stated_px: float  # a priori, px
+    pixel_mm: float = float("nan")  # mean size of a pixel over the image points, mm
+
+    @property
+    def mm(self) -> float:
+        """A posteriori, of all observations together, on the sensor, mm."""
+        return self.px * self.pixel_mm
 
     @property
     def image_points_px(self) -> float:
@@ -100,7 +106,9 @@ def sigma0_of(result: SurveyResult) -> Sigma0:
     a = result.adjustment
     own = variance_components(a, np.zeros(len(a.rejected), dtype=np.int64), (IMAGE_POINTS,)).sigma0[0]
     ratio = float(own if np.isfinite(own) else a.sigma0_px / a.stated_px)
-    return Sigma0(a.sigma0_px, ratio, a.stated_px)
+    size = np.array([camera.pixel_mm.mean() for camera in a.estimate.cameras])
+    used = a.network.camera[a.network.image_points.image[~a.rejected]]
+    return Sigma0(a.sigma0_px, ratio, a.stated_px, float(size[used].mean()) if len(used) else float("nan"))
 
 
 def longest_residual(adjustment: Adjustment) -> LongestResidual:

@@ -154,10 +154,7 @@ def _limits(result: SurveyResult) -> str:
     a = result.adjustment
     if result.reject == "tau":
         critical = tau_critical(a.test_alpha, a.redundancy)
-        return (
-            f"rejected where |tau| is beyond {critical:.3f} (level {a.test_alpha:.2g} of a coordinate), "
-            "taken back where that of the predicted residual is not"
-        )
+        return f"where |tau| is beyond {critical:.2f} (level {a.test_alpha:.2g}), taken back where it is not"
     if result.reject == "tukey":
         return f"weight 0 beyond {TUKEY:g} standard deviations, taken back below"
     if result.reject == "huber":

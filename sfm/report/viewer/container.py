@@ -20,6 +20,7 @@ import numpy as np
 
 from sfm.conventions import AnyArray, angles_from_rotation
 from sfm.files.covariance_file import MAX_POINTS
+from sfm.files.plain_text import or_none
 from sfm.report.numbers import finer_unit
 from sfm.report.viewer.pictures import COLUMNS, CROP_PX, Pictures
 from sfm.report.viewer.scene import ViewerScene
@@ -84,9 +85,9 @@ def _header(scene: ViewerScene, pictures: Pictures) -> dict[str, Any]:
             {
                 "from": one.start,
                 "to": one.end,
-                "length": one.length,
-                "sigma": one.sigma,
-                "difference": one.difference,
+                "length": or_none(one.length),
+                "sigma": or_none(one.sigma),
+                "difference": or_none(one.difference),
             }
             for one in scene.bars
         ],

@@ -190,6 +190,7 @@ class AdjustSettings(Section):
 
     sigma_px: Length = 0.1  # a priori standard deviation of an image coordinate, px
     reject: Literal["tau", "huber", "tukey", "none"] | None = None  # else tau; none with [observations]
+    weights: Literal["components", "stated"] = "components"  # of image points beside other observations
 
 
 class CompareSettings(Section):

@@ -1,0 +1,47 @@
+"""The interior orientation of one result holds the cameras of another survey."""
+
+from __future__ import annotations
+
+import csv
+import sys
+from pathlib import Path
+
+import pytest
+
+from sfm import cli
+from tests.surveys import write_observed_survey
+
+
+def adjust(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
+    monkeypatch.setattr(sys, "argv", ["kolinear", "adjust", *map(str, arguments)])
+    try:
+        cli.main()
+    except SystemExit as end:
+        return int(end.code or 0)
+    return 0
+
+
+def parameters(result: Path) -> dict[str, tuple[str, str]]:
+    with (result / "cameras.csv").open(newline="") as file:
+        return {row["parameter"]: (row["value"], row["sigma"]) for row in csv.DictReader(file)}
+
+
+def test_a_calibration_travels_and_is_held(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    first = write_observed_survey(tmp_path / "first", "first")
+    assert adjust(monkeypatch, first, "--out", tmp_path / "calibrated") == 0
+    second = write_observed_survey(tmp_path / "second", "second")
+    second.write_text(second.read_text().replace("c_mm = 10.0", "c_mm = 10.3"))
+    assert adjust(monkeypatch, second, "--camera", tmp_path / "calibrated", "--out", tmp_path / "held") == 0
+    given, held = parameters(tmp_path / "calibrated"), parameters(tmp_path / "held")
+    assert given["c"][1] and {name: value for name, (value, _) in given.items()} == {
+        name: value for name, (value, _) in held.items()
+    }
+    assert not any(sigma for _, sigma in held.values())
+
+    second.write_text(second.read_text().replace("[2000, 1500]", "[2000, 1600]"))
+    capsys.readouterr()
+    assert adjust(monkeypatch, second, "--camera", tmp_path / "calibrated", "--out", tmp_path / "other") == 2
+    error = capsys.readouterr().err
+    assert "has 2000 x 1600 px" in error and error.count("\n") == 1 and not (tmp_path / "other").exists()

@@ -1,0 +1,40 @@
+"""Weights of the image points beside other observations: by their variance component, or all as stated."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from sfm.pipeline import run_survey
+from sfm.report.findings.findings import findings_of
+from sfm.report.phrases import words_of_weights
+from sfm.report.text.text_report import text_report
+from sfm.survey.inputs.given import KnownPoints
+from tests.surveys import survey_of
+from tests.synthetic import make_network, seed_of
+
+
+@pytest.mark.parametrize("weights", ["components", "stated"])
+def test_stated_weights_have_one_sigma0_for_all(weights: str) -> None:
+    """Image points are stated three times too cautious: as stated, that also shrinks what control says."""
+    rng = seed_of("weights")
+    network, truth = make_network(rng, images=8, points=30)
+    control = KnownPoints.from_arrays(
+        [str(k + 1) for k in range(6)], truth.points[:6] + 2e-4 * rng.standard_normal((6, 3)), 2e-4
+    )
+    adjust = {"sigma_px": 0.3, "reject": "none", "weights": weights}
+    survey = survey_of(network, truth, control=control, datum={"kind": "control"}, adjust=adjust)
+    result = run_survey(survey)
+    a, said = result.adjustment, words_of_weights(result)
+    assert a.sigma0_px == pytest.approx(0.1, rel=0.15)
+    if weights == "stated":
+        assert (a.image_sigma_factor == 1).all() and "those stated for all observations" in said
+        assert a.sigma0 == pytest.approx(1 / 3, rel=0.15)
+    else:
+        assert a.weight_factor == pytest.approx(1 / 3, rel=0.15) and "variance component" in said
+        assert a.sigma0 == pytest.approx(1.0, rel=0.1)
+    found = findings_of(result)
+    assert found.sigma0.mm == pytest.approx(a.sigma0_px * 0.005)
+    text = text_report(found)
+    assert f"{a.sigma0:.4f} times the standard deviations that the weights rest on" in text
+    assert np.isfinite(a.covariance.points).all()
