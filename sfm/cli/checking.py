@@ -34,9 +34,9 @@ TESTED_SIGMAS = 5.0  # largest error of a point of the tested network, in standa
 
 
 def doctor() -> None:
-    """Check this installation: versions, cores, folders, and a short measurement and adjustment.
+    """Check this installation by a short measurement and adjustment.
 
-    Exit code 1 if a check fails; the line says what to do.
+    Prints versions, cores and folders, too. Exit code 1 if a check fails; the line says what to do.
     """
     with loading():
         from sfm.api import cores

@@ -13,7 +13,8 @@ from sfm.reduced_network import reduce_network
 from sfm.survey.circles import check_circles
 from sfm.survey.inputs.measurements import MeasuredPhotographs, Measurements, Naming
 from sfm.survey.inputs.survey import Survey
-from sfm.survey.solution import TOLERANCE_FACTOR, Correspondences, determined, merge_estimate
+from sfm.survey.settling import determined, merge_estimate
+from sfm.survey.solution import TOLERANCE_FACTOR, Correspondences
 from sfm.survey.target_network import build_network, match_uncoded, min_rays
 
 ROUNDS = 3  # matching with the orientation at hand, with the adjusted one, and once more to confirm

@@ -296,7 +296,7 @@ def test_usage_errors_are_one_line_with_exit_code_2(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     line = refused(monkeypatch, capsys, "run")
-    assert line == "kolinear: Missing argument 'SURVEY.toml' (see kolinear run --help)"
+    assert line == "kolinear: Missing argument 'SURVEY.toml|PHOTOS' (see kolinear run --help)"
     assert "--jobs" in refused(monkeypatch, capsys, "run", "a.toml", "--jobs", "0")
     assert "No such command 'fly'" in refused(monkeypatch, capsys, "fly")
     assert "No such option: --bogus" in refused(monkeypatch, capsys, "run", "a.toml", "--bogus")

@@ -41,6 +41,7 @@ COMMANDS = {
     "match": ("left.png", "right.png"),
     "targets": ("--out", "sheet.pdf"),
     "validate": (),
+    "doctor": (),
     "compare": ("a", "b"),
     "convert": ("a", "b"),
     "refine": ("model", "--images", "photographs"),
@@ -85,7 +86,16 @@ def test_what_nobody_has_foreseen_is_one_line_with_its_traceback_in_a_file(
     command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
-    for module in ("surveying", "measuring", "solvers", "refining", "planning", "drafting", "viewing"):
+    for module in (
+        "surveying",
+        "measuring",
+        "solvers",
+        "refining",
+        "planning",
+        "drafting",
+        "viewing",
+        "checking",
+    ):
         monkeypatch.setattr(f"sfm.cli.{module}.loading", raising(ValueError("new\nline \x1b[31m")))
     code, lines = kolinear(monkeypatch, capsys, command, *COMMANDS[command])
     (path,) = tmp_path.iterdir()

@@ -11,7 +11,7 @@ from sfm.adjustment.datum import Datum
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.network import Estimate, Network
-from sfm.survey.explanations import explain_residuals
+from sfm.survey.diagnosis.explanations import explain_residuals
 from tests.survey.test_own_camera import with_zoom
 from tests.synthetic import make_network, perturb, seed_of
 

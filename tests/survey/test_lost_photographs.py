@@ -14,12 +14,12 @@ from sfm.errors import GeometryError
 from sfm.network import Estimate, Network, empty_estimate
 from sfm.orientation.sequence import Orientation
 from sfm.report.findings.findings import findings_of
-from sfm.survey.inputs.survey import Survey
-from sfm.survey.lost_photographs import (
+from sfm.survey.diagnosis.lost_photographs import (
     lost_groups,
     tell_lost_photographs,
     try_other_principal_distances,
 )
+from sfm.survey.inputs.survey import Survey
 from tests.surveys import survey_of
 from tests.synthetic import make_network, seed_of
 

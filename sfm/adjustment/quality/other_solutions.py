@@ -32,6 +32,7 @@ from sfm.similarity import fit_similarity
 STEP = 1.3  # from one principal distance that is tried to the next
 STEPS = 6  # in each direction: c from a fifth to the fivefold
 ALPHA = 0.001  # chance of so much larger a v'Pv where the other solution is the true one
+STATED_FREEDOM = 10  # observations that the stated weights count as in the estimate of the variance
 WEAK_C = 5e-4  # relative standard deviation of c below which a network is not weak, and
 FEW_PHOTOGRAPHS = 5  # from so many photographs on
 LARGE = 4000  # image points from which on a network is not weak
@@ -72,7 +73,7 @@ def other_solutions(adjustment: Adjustment) -> tuple[OtherSolution, ...]:
     base = search.adjusted(a.estimate)
     if base is None or base.redundancy < 1 or not base.vPv > 0:
         return ()
-    limit = 1 + float(stats.f.isf(ALPHA, 1, base.redundancy)) / base.redundancy
+    limit = 1 + _allowed(base) / base.vPv
     sigma = np.sqrt(np.trace(a.covariance.points, axis1=1, axis2=2) / 3)
     own = _principal_distance(a.estimate.cameras)
     found: list[OtherSolution] = []
@@ -87,22 +88,31 @@ def other_solutions(adjustment: Adjustment) -> tuple[OtherSolution, ...]:
         reflected = abs(np.log(c / own[1])) < np.log(STEP) / 2
         found.append(
             OtherSolution(
-                *(
-                    camera,
-                    c,
-                    unit,
-                    bool(reflected),
-                    moved,
-                    candidate.vPv / base.vPv,
-                    candidate.estimate,
-                    False,
-                )
+                camera,
+                c,
+                unit,
+                reflected=bool(reflected),
+                moved=moved,
+                vPv=candidate.vPv / base.vPv,
+                estimate=candidate.estimate,
+                converges=False,
             )
         )
     if found and found[0].vPv < 1:
         ended = search.adjusted(found[0].estimate, tolerance=TOLERANCE)
         found[0] = replace(found[0], converges=ended is not None and ended.converged)
     return tuple(found)
+
+
+def _allowed(base: Adjustment) -> float:
+    """Return by how much v'Pv of another solution may be larger.
+
+    With hardly any redundancy v'Pv says little of the weights, and any other solution would pass; they are
+    believed as stated, with the weight of some observations.
+    """
+    freedom = base.redundancy + STATED_FREEDOM
+    variance = (base.vPv + STATED_FREEDOM) / freedom
+    return float(variance * stats.f.isf(ALPHA, 1, freedom))
 
 
 def _weak(a: Adjustment) -> bool:

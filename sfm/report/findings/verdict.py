@@ -116,19 +116,24 @@ def _sigma0(evidence: Evidence) -> Judged:
     if tried and tried[0].explains:
         cause = tried[0]
         explained = (
-            f"Sigma0 of all image points falls from {significant(cause.before_px)} to "
-            f"{significant(cause.after_px)} px with {cause.cause}: most likely that is what does not fit."
+            f"sigma0 of all image points falls from {significant(cause.before_px)} to "
+            f"{significant(cause.after_px)} px with {cause.cause}, most likely that is what does not fit."
         )
-        return [(ratio > SIGMA0_BAD, explained)]
-    if not ratio > SIGMA0_REMARK:
+        if not ratio > SIGMA0_REMARK:
+            return [(False, explained[0].upper() + explained[1:])]
+    elif not ratio > SIGMA0_REMARK:
         return []
     line = (
         f"Sigma0 is {significant(ratio)} times the expected standard deviation of an image coordinate "
         f"({significant(evidence.sigma0.stated_px)} px): "
     )
+    if tried and tried[0].explains and not evidence.held:
+        return [(ratio > SIGMA0_BAD, line + explained)]
     cameras = evidence.result.adjustment.estimate.cameras
     if evidence.held:
         line += "most likely the camera, which is held at values that do not fit."
+        if tried and tried[0].explains:
+            line = f"{line[:-1]}; {explained}"
         return [(ratio > SIGMA0_BAD, line)]
     if ratio > SIGMA0_BAD:
         held = "" if any(one.free.any() for one in cameras) else f" (it is held: try {free_line(evidence)})"

@@ -1,0 +1,238 @@
+"""Adjusting a survey until nothing leaves it any more: points, photographs, control, bars, weights."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from sfm.adjustment.datum import Datum
+from sfm.adjustment.engine.observed_unknowns import observed
+from sfm.adjustment.quality.variance_components import IMAGE_POINTS, estimate_components
+from sfm.adjustment.result import Adjustment
+from sfm.adjustment.solve import adjust
+from sfm.conventions import BoolArray, FloatArray, IntArray
+from sfm.errors import GeometryError
+from sfm.network import Estimate, Network
+from sfm.orientation.ray_angles import ray_angles
+from sfm.reduced_network import reduce_network, supported
+from sfm.survey.datum_definition import Contradiction, find_contradiction
+from sfm.survey.diagnosis.left_out import datum_carriers
+from sfm.survey.diagnosis.observation_count import refuse_too_few_observations
+from sfm.survey.diagnosis.own_camera import Treated, treat_lost
+from sfm.survey.inputs.interior import without_idle_cameras
+from sfm.survey.inputs.survey import Survey
+
+FALSE_ALARM = 0.05  # chance that a survey without any outlier loses an image coordinate; Pope (1976)
+MIN_IMAGE_POINTS = 4  # of a photograph in the final adjustment: three determine it, the fourth checks
+MIN_DATUM_POINTS = 3  # that fix position, attitude and scale
+CARRYING_DEG = 2.0  # largest angle between two rays of a point below which it carries no free datum
+
+
+@dataclass(frozen=True)
+class Task:
+    """What is adjusted and how; contradictions change it."""
+
+    survey: Survey
+    datum: Datum
+    network: Network
+    needed: IntArray  # rays that each point needs to stay, (n,)
+    least: IntArray  # image points that each photograph needs to stay, (m,)
+    reject: str  # how gross errors are treated
+
+
+@dataclass(frozen=True)
+class Settled:
+    """An adjustment after which no point or photograph leaves, or in which there is a contradiction."""
+
+    part: Network  # what was adjusted
+    estimate: Estimate  # of it
+    images: BoolArray  # photographs in it, (m,)
+    points: BoolArray  # points in it, (n,)
+    accepted: BoolArray  # image points of the whole network, (k,)
+    contradiction: Contradiction | None
+    iterations: int  # of all adjustments on the way
+    rays: IntArray  # accepted rays of each point, of those that left when they left, (n,)
+
+
+def settle(task: Task, estimate: Estimate) -> Settled:
+    """Adjust until the points and photographs that are left stay, or control or a bar is contradicted."""
+    network, iterations = task.network, 0
+    accepted = np.ones(len(network.image_points), dtype=bool)
+    rays = network.rays()
+    images, points = determined(network, estimate, accepted, task.needed, task.least)
+    while True:
+        part, start = reduce_network(network, estimate, images, points, np.ones_like(accepted))
+        refuse_too_few_observations(part, start, task.datum.kind)
+        adjustment = _tested(task, part, start, covariance=False)
+        iterations += adjustment.iterations
+        found = contradiction_in(task, adjustment)
+        estimate = merge_estimate(estimate, adjustment.estimate, images, points)
+        accepted = _accepted(network, adjustment, images, points)
+        now = np.bincount(network.image_points.point[accepted], minlength=len(points))
+        rays = np.where(points, now, rays)
+        left_images, left_points = determined(network, estimate, accepted, task.needed, task.least)
+        if found is not None or ((left_images == images).all() and (left_points == points).all()):
+            return Settled(part, adjustment.estimate, images, points, accepted, found, iterations, rays)
+        images, points = left_images, left_points
+
+
+def treat(task: Task, settled: Settled, start: Estimate, oriented: BoolArray) -> Treated | None:
+    """Return the network with cameras of their own for the photographs that fit with them, others left out.
+
+    Args:
+        task: what was adjusted; without tests nothing tells a photograph that does not fit.
+        settled: the adjustment.
+        start: approximate values, which what has left the adjustment starts from again.
+        oriented: photographs that had an exterior orientation, (m,).
+    """
+    if task.reject == "none" or settled.contradiction is not None:
+        return None
+    adjusted = merge_estimate(start, settled.estimate, settled.images, settled.points)
+    found = treat_lost(task.network, adjusted, settled.accepted, oriented=oriented)
+    if found is None:
+        return None
+    one, again = found.estimate, ~found.estimate.oriented & ~found.without
+    position = np.where(again[:, None], start.position, one.position)
+    rotation = np.where(again[:, None, None], start.rotation, one.rotation)
+    points = np.where(one.determined[:, None], one.points, start.points)
+    return replace(found, estimate=replace(one, position=position, rotation=rotation, points=points))
+
+
+def without_contradiction(task: Task, found: Contradiction, accepted: BoolArray) -> Task:
+    """Return the task without what is to blame, or, where that cannot be told, without any more tests."""
+    network = task.network
+    if found.freed is not None:
+        needed = task.needed.copy()
+        needed[np.setdiff1d(network.control.point, found.freed.control.point)] = 2
+        return replace(task, network=found.freed, needed=needed)
+    # what the test holds against the other image points stands
+    keep = accepted | found.protected[network.image_points.point]
+    return replace(
+        task, network=replace(network, image_points=network.image_points.select(keep)), reject="none"
+    )
+
+
+def adjust_finally(task: Task, part: Network, estimate: Estimate) -> Adjustment:
+    """Return the last adjustment with its covariance.
+
+    Where other observations take part, the image points are weighted by their own variance component, unless
+    the survey wants all weights as stated.
+    """
+    part, estimate = without_idle_cameras(part, estimate, cameras=len(task.survey.cameras))
+
+    def adjust_part(factor: FloatArray) -> Adjustment:
+        return _tested(task, part, estimate, covariance=True, factor=factor)
+
+    outer = (part.control, part.exterior) if task.datum.kind == "control" else ()
+    weighted = any(observed(np.einsum("nii->ni", one.covariance)).any() for one in outer)
+    others = len(part.scale_bars) or len(part.interior) or weighted
+    if others and task.survey.adjust.weights == "components":
+        return _weighed(adjust_part, len(part.image_points))
+    return _tested(task, part, estimate, covariance=True)
+
+
+def contradiction_in(task: Task, adjustment: Adjustment) -> Contradiction | None:
+    """Return control or a scale bar that cost a point most of its rays; None where nothing was tested."""
+    if task.reject == "none":
+        return None
+    untested, factor = replace(task, reject="none"), adjustment.weight_factor
+
+    def readjust(one: Network) -> Adjustment:
+        return _tested(untested, one, adjustment.estimate, covariance=False, factor=factor)
+
+    return find_contradiction(task.network, adjustment, readjust, unit=task.survey.unit)
+
+
+def _tested(
+    task: Task, network: Network, estimate: Estimate, *, covariance: bool, factor: float | FloatArray = 1.0
+) -> Adjustment:
+    """Adjust with data snooping, the level of the single test shared out among all image coordinates."""
+    tests = 2 * len(network.image_points)
+    return adjust(
+        network,
+        estimate,
+        datum=on_points(task.survey, network, estimate, task.datum),
+        sigma_px=task.survey.adjust.sigma_px,
+        image_sigma_factor=factor,
+        reject=task.reject,
+        alpha=1 - (1 - FALSE_ALARM) ** (1 / tests),
+        covariance=covariance,
+    )
+
+
+def on_points(survey: Survey, network: Network, estimate: Estimate, datum: Datum) -> Datum:
+    """Return the datum on the points that the survey names, else on all but those at very small angles.
+
+    Raises:
+        GeometryError: fewer than three of the named ones are in the network.
+    """
+    named = survey.datum.points
+    if not named and datum.kind == "control":
+        return datum
+    if not named:
+        angles = ray_angles(network, estimate, np.ones(len(network.image_points), dtype=bool))
+        return replace(datum, points=datum_carriers(angles, CARRYING_DEG))
+    on = np.isin(network.points, named)
+    if on.sum() < MIN_DATUM_POINTS:
+        raise GeometryError(
+            f"{on.sum()} of the {len(named)} datum.points are in the network, at least "
+            f"{MIN_DATUM_POINTS} are needed"
+        )
+    return replace(datum, points=on)
+
+
+def _weighed(adjust_part: Callable[[FloatArray], Adjustment], count: int) -> Adjustment:
+    """Return the adjustment with the image points weighted by their own variance component.
+
+    Lengths and control have the standard deviations that were stated for them; without this, sigma0 a
+    posteriori, which the image points decide, would scale these too. The component is that of the image
+    points that the last adjustment accepts.
+
+    Source: Foerstner and Wrobel (2016), Photogrammetric Computer Vision, sec. 4.2.4.
+    """
+    group = np.zeros(count, dtype=np.int64)
+    final, _, settled = estimate_components(adjust_part, group, (IMAGE_POINTS,))
+    if not settled:
+        line = "the weights of the image points did not converge: each of them rejects other image points"
+        final = replace(final, remarks=(*final.remarks, line))
+    return final
+
+
+def determined(
+    network: Network,
+    estimate: Estimate,
+    accepted: BoolArray,
+    min_rays: IntArray,
+    min_points: int | IntArray = MIN_IMAGE_POINTS,
+) -> tuple[BoolArray, BoolArray]:
+    """Return the photographs (m,) and points (n,) that accepted image points determine.
+
+    Raises:
+        GeometryError: fewer than two photographs are left.
+    """
+    images, points = supported(network, estimate, accepted, min_points=min_points, min_rays=min_rays)
+    if images.sum() < 2:
+        raise GeometryError(
+            f"{images.sum()} of {len(images)} photographs see at least {MIN_IMAGE_POINTS} points of the "
+            "network, at least 2 photographs are needed"
+        )
+    return images, points
+
+
+def merge_estimate(estimate: Estimate, part: Estimate, images: BoolArray, points: BoolArray) -> Estimate:
+    """Return the estimate of all photographs and points with an adjusted part of it put in; NaN elsewhere."""
+    position, rotation = np.full_like(estimate.position, np.nan), np.full_like(estimate.rotation, np.nan)
+    xyz = np.full_like(estimate.points, np.nan)
+    position[images], rotation[images], xyz[points] = part.position, part.rotation, part.points
+    return Estimate(part.cameras, position, rotation, xyz)
+
+
+def _accepted(network: Network, adjustment: Adjustment, images: BoolArray, points: BoolArray) -> BoolArray:
+    """Return which image points of the whole network the adjustment of a part of it accepted."""
+    seen = network.image_points
+    part = images[seen.image] & points[seen.point]
+    accepted = part.copy()
+    accepted[part] = ~adjustment.rejected
+    return accepted
