@@ -18,7 +18,7 @@ test: $(READY)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
-	$(BIN)/python -m pytest -n 2 --dist loadfile
+	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
 
 study: $(READY)
 	$(BIN)/python -m pytest -m slow
@@ -35,7 +35,8 @@ $(READY): constraints.txt pyproject.toml
 	@echo "Setting up $(VENV) (once) ..."
 	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	@$(BIN)/python -m pip install -q --disable-pip-version-check --no-compile -c constraints.txt -e '.[dev]'
-	@echo "Compiling the kernels (once) ..."
+	@echo "Compiling the libraries and kernels (once) ..."
+	@$(BIN)/python -m compileall -q -j 0 $(VENV)/lib sfm adapters
 	@$(BIN)/python -m sfm.warm_up
 	@touch $@
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 from scipy.spatial import cKDTree
 
@@ -110,6 +112,7 @@ def _join(photograph: PhotographTargets, xy: FloatArray) -> IntArray:
     return np.where(np.isfinite(distance), nearest, -1)
 
 
+@cache
 def _reason(flag: int) -> str:
     """Return in words why a candidate was not measured."""
     names = [in_words(str(one.name).lower()) for one in Flag if one.value and flag & one.value]
