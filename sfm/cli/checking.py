@@ -7,8 +7,10 @@ import platform
 import shutil
 import time
 from collections.abc import Callable
+from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from rich.console import Console
 from rich.table import Table
@@ -16,6 +18,10 @@ from rich.table import Table
 from sfm.cli.first_use import compile_first
 from sfm.cli.starting import loading
 from sfm.errors import KolinearError
+
+if TYPE_CHECKING:
+    from sfm.adjustment.result import Adjustment
+    from sfm.network import Estimate
 
 FAILED = 1  # exit code where a check fails
 LIBRARIES = (
@@ -91,16 +97,22 @@ def _check_targets() -> str:
     return f"{len(found)} dots measured, {error:.4f} px off at most"
 
 
-def _check_adjustment() -> str:
-    """Orient and adjust a made-up network, and compare it with the truth."""
-    import numpy as np
-
+@cache
+def _tested_network() -> tuple[Adjustment, Estimate]:
+    """Adjust a made-up network; with its truth, for both checks of it."""
     from sfm.adjustment.datum import Datum
     from sfm.adjustment.solve import adjust
     from sfm.warm_up import made_up_network
 
     network, truth = made_up_network()
-    found = adjust(network, truth, datum=Datum("free"))
+    return adjust(network, truth, datum=Datum("free")), truth
+
+
+def _check_adjustment() -> str:
+    """Compare the adjustment of a made-up network with the truth."""
+    import numpy as np
+
+    found, truth = _tested_network()
     if not found.converged:
         raise KolinearError("the adjustment did not converge")
     moved = np.linalg.norm(found.estimate.points - truth.points, axis=1)
@@ -108,22 +120,17 @@ def _check_adjustment() -> str:
     worst = float((moved / sigma).max())
     if worst > TESTED_SIGMAS:
         raise KolinearError(f"a point is {worst:.1f} standard deviations off")
-    return f"{len(network.points)} points, worst {worst:.1f} standard deviations off"
+    return f"{len(truth.points)} points, worst {worst:.1f} standard deviations off"
 
 
 def _check_colmap() -> str:
     """Adjust the same network by COLMAP and compare."""
-    from sfm.adjustment.datum import Datum
-    from sfm.adjustment.solve import adjust
     from sfm.api import programs_of
     from sfm.comparison.adjusters import compare_adjusters
-    from sfm.warm_up import made_up_network
 
     adjuster = programs_of("colmap", "none").adjuster
     assert adjuster is not None
-    network, truth = made_up_network()
-    found = compare_adjusters(adjust(network, truth, datum=Datum("free")), adjuster)
-    if not found.agree:
+    if not compare_adjusters(_tested_network()[0], adjuster).agree:
         raise KolinearError("its adjustment of a made-up network differs from Kolinear's")
     return f"version {_version('pycolmap')} agrees on the same network"
 
