@@ -22,7 +22,7 @@ _MODULES = {
     "sfm.camera": ("Camera", "camera_from_values"),
     "sfm.errors": ("KolinearError",),
     "sfm.network": ("Estimate", "Network", "empty_estimate"),
-    "sfm.orientation.sequence": ("orient",),
+    "sfm.orientation.incremental.sequence": ("orient",),
     "sfm.photographs.reading": ("read_photograph",),
     "sfm.result": ("SurveyResult",),
     "sfm.similarity": ("Similarity", "fit_similarity"),

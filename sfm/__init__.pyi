@@ -15,7 +15,7 @@ from sfm.errors import KolinearError as KolinearError
 from sfm.network import Estimate as Estimate
 from sfm.network import Network as Network
 from sfm.network import empty_estimate as empty_estimate
-from sfm.orientation.sequence import orient as orient
+from sfm.orientation.incremental.sequence import orient as orient
 from sfm.photographs.reading import read_photograph as read_photograph
 from sfm.result import SurveyResult as SurveyResult
 from sfm.similarity import Similarity as Similarity

@@ -15,9 +15,10 @@ from pathlib import Path
 from sfm.errors import GeometryError
 from sfm.result import SurveyResult
 from sfm.runtime.progress import SILENT, Progress, StageClock
+from sfm.survey.adjusting.solution import solve_survey
 from sfm.survey.assembly import assemble_result
 from sfm.survey.correspondences import find_correspondences
-from sfm.survey.inputs.incomplete_cameras import refuse_incomplete_cameras
+from sfm.survey.inputs.checks.incomplete_cameras import refuse_incomplete_cameras
 from sfm.survey.inputs.measurements import Measurements
 from sfm.survey.inputs.photograph_list import find_photographs
 from sfm.survey.inputs.start import measurements_from_observations, refuse_unknown_photographs
@@ -26,7 +27,6 @@ from sfm.survey.measuring.target_store import TargetStore
 from sfm.survey.measuring.tie_points import tie_photographs
 from sfm.survey.orientation import orient_survey
 from sfm.survey.other_programs import ALONE, OtherPrograms, compare_solution
-from sfm.survey.solution import solve_survey
 from sfm.survey.target_network import measure_targets
 
 

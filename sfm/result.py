@@ -14,8 +14,8 @@ from sfm.adjustment.quality.correlations import OrientationCorrelation
 from sfm.adjustment.quality.other_solutions import OtherSolution
 from sfm.adjustment.result import Adjustment
 from sfm.camera import Camera
-from sfm.comparison.adjusters import AdjusterComparison
 from sfm.comparison.baseline import BaselineComparison
+from sfm.comparison.two_adjusters.adjusters import AdjusterComparison
 from sfm.conventions import FloatArray, IntArray, angles_from_rotation
 from sfm.display import html_table, text_table
 from sfm.errors import GeometryError

@@ -16,15 +16,15 @@ import numpy as np
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.solve import adjust
 from sfm.camera import camera_from_values, project
-from sfm.comparison.common_problem import common_problem
 from sfm.comparison.solutions import reprojection
+from sfm.comparison.two_adjusters.common_problem import common_problem
 from sfm.conventions import AnyArray
 from sfm.kernels.warmed import set_warm
 from sfm.matching.conjugate import METHODS, match_points
 from sfm.matching.tracks.correspondence import match_targets
 from sfm.matching.tracks.interest import foerstner_points
 from sfm.network import Estimate, ImagePoints, Network, empty_estimate
-from sfm.orientation.sequence import orient
+from sfm.orientation.incremental.sequence import orient
 from sfm.runtime.folder_settings import close_library_path
 from sfm.runtime.progress import SILENT, Progress
 from sfm.targets.codes.rings import ring_family

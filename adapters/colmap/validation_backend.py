@@ -1,4 +1,4 @@
-"""COLMAP as the other adjuster of `sfm.comparison.adjuster_validation`: adjustment and covariances.
+"""COLMAP as the other adjuster of a validation: adjustment and covariances.
 
 Source: COLMAP 4.2, estimate_ba_covariance.
 """
@@ -84,7 +84,7 @@ def adjust_with_covariance(network: Network, start: Estimate, *, threads: int = 
 
 @dataclass(frozen=True)
 class ColmapBackend:
-    """COLMAP as the other adjuster of a validation (sfm.comparison.adjuster_validation)."""
+    """COLMAP as the other adjuster of a validation (sfm.comparison.two_adjusters.adjuster_validation)."""
 
     name: str = "colmap"
 

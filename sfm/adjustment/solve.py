@@ -30,16 +30,16 @@ from sfm.adjustment.engine.iterate import (
 from sfm.adjustment.engine.local_frame import Local, local_of
 from sfm.adjustment.engine.observed_unknowns import weighted_of
 from sfm.adjustment.engine.unknowns import estimate_of, unknowns_of
-from sfm.adjustment.quality.rank import rank_defect, undetermined_of
-from sfm.adjustment.quality.rejection import REJECTS, Run, find_optimum
-from sfm.adjustment.quality.reliability import redundancy_numbers as numbers_of
-from sfm.adjustment.quality.reliability import redundancy_of_bars, standardised_residuals
-from sfm.adjustment.quality.robust import (
+from sfm.adjustment.quality.gross_errors.rejection import REJECTS, Run, find_optimum
+from sfm.adjustment.quality.gross_errors.robust import (
     TUKEY,
     huber_slopes,
     inflation,
     tukey_slopes,
 )
+from sfm.adjustment.quality.rank import rank_defect, undetermined_of
+from sfm.adjustment.quality.reliability import redundancy_numbers as numbers_of
+from sfm.adjustment.quality.reliability import redundancy_of_bars, standardised_residuals
 from sfm.adjustment.result import Adjustment, Covariance
 from sfm.conventions import FloatArray
 from sfm.errors import GeometryError

@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import sys
 
+from sfm.cli.commands.starting import INTERRUPTED, INTERRUPTED_TEXT, loading, stopped_once
 from sfm.cli.outlets import guard_outlets
-from sfm.cli.starting import INTERRUPTED, INTERRUPTED_TEXT, loading, stopped_once
 from sfm.errors import KolinearError
 from sfm.runtime.folder_settings import close_library_path, refuse_folder_settings
 from sfm.runtime.installation import refuse_mixed_installation

@@ -6,7 +6,7 @@ from typing import Any
 
 import typer
 
-from sfm.cli import checking, drafting, measuring, planning, refining, solvers, surveying, viewing
+from sfm.cli.commands import checking, drafting, measuring, planning, refining, solvers, surveying, viewing
 
 USAGE_ERROR: Any = typer.BadParameter.__base__  # of all that typer says of wrong arguments; it has no name
 

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from sfm.comparison.adjuster_validation import SAME, SAME_COST, Trial, Validation
+from sfm.comparison.two_adjusters.adjuster_validation import SAME, SAME_COST, Trial, Validation
 from sfm.files.plain_text import csv_text, or_none
 from sfm.report.figures.comparisons import time_figure
 from sfm.report.figures.plots import Plot, png

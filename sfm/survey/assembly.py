@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 
 from sfm.adjustment.quality.correlations import orientation_correlations
-from sfm.orientation.sequence import Orientation
+from sfm.orientation.incremental.sequence import Orientation
 from sfm.result import FailedImage, StageTime, SurveyResult
 from sfm.runtime.progress import StageClock
+from sfm.survey.adjusting.solution import Correspondences, Solution
 from sfm.survey.inputs.measurements import Measurements
 from sfm.survey.inputs.survey import Survey
 from sfm.survey.other_programs import SurveyComparison
-from sfm.survey.solution import Correspondences, Solution
 from sfm.survey.told_settings import told_settings
 
 

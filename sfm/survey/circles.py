@@ -11,7 +11,7 @@ from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
 from sfm.network import Estimate, ImagePoints, Network, rows_of
 from sfm.orientation.eccentricity import CircleViews, ellipse_shape, fit_circles
 from sfm.result import Eccentricity
-from sfm.survey.datum_definition import object_scale
+from sfm.survey.adjusting.datum_definition import object_scale
 from sfm.survey.inputs.given import Diameters
 from sfm.survey.inputs.measurements import MeasuredPhotographs, Naming
 from sfm.survey.inputs.survey import Survey

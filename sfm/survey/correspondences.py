@@ -8,13 +8,13 @@ from sfm.adjustment.datum import Datum
 from sfm.adjustment.solve import adjust
 from sfm.conventions import MAD_TO_SIGMA
 from sfm.network import Estimate, Network
-from sfm.orientation.sequence import Orientation
+from sfm.orientation.incremental.sequence import Orientation
 from sfm.reduced_network import reduce_network
+from sfm.survey.adjusting.settling import determined, merge_estimate
+from sfm.survey.adjusting.solution import TOLERANCE_FACTOR, Correspondences
 from sfm.survey.circles import check_circles
 from sfm.survey.inputs.measurements import MeasuredPhotographs, Measurements, Naming
 from sfm.survey.inputs.survey import Survey
-from sfm.survey.settling import determined, merge_estimate
-from sfm.survey.solution import TOLERANCE_FACTOR, Correspondences
 from sfm.survey.target_network import build_network, match_uncoded, min_rays
 
 ROUNDS = 3  # matching with the orientation at hand, with the adjusted one, and once more to confirm

@@ -10,17 +10,17 @@ from sfm.camera import tangents_from_pixel
 from sfm.conventions import BoolArray
 from sfm.errors import GeometryError
 from sfm.network import Estimate, Network, rows_of
+from sfm.orientation.incremental.sequence import MIN_POINTS, Judge, Orientation, orient
 from sfm.orientation.intersection import intersect
-from sfm.orientation.sequence import MIN_POINTS, Judge, Orientation, orient
 from sfm.reduced_network import reduce_network
+from sfm.survey.adjusting.free_parameters import choose_free_parameters
+from sfm.survey.adjusting.solution import refine
 from sfm.survey.circles import circle_misfit
 from sfm.survey.diagnosis.codes_found import words_of_codes
 from sfm.survey.diagnosis.lost_photographs import tell_lost_photographs, try_other_principal_distances
-from sfm.survey.free_parameters import choose_free_parameters
 from sfm.survey.inputs.measurements import Measurements
 from sfm.survey.inputs.start import start_values
 from sfm.survey.inputs.survey import Survey
-from sfm.survey.solution import refine
 
 ORIENTATION_POINTS = (
     400  # of natural texture that take part in the orientation, those with the most rays, and

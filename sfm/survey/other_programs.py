@@ -6,13 +6,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from sfm.comparison.adjusters import AdjusterComparison, BackendAdjustment, compare_adjusters
 from sfm.comparison.baseline import Baseline, BaselineComparison, compare_baseline
+from sfm.comparison.two_adjusters.adjusters import AdjusterComparison, BackendAdjustment, compare_adjusters
 from sfm.errors import KolinearError
 from sfm.network import Estimate, Network
 from sfm.runtime.progress import StageClock
+from sfm.survey.adjusting.solution import Solution
 from sfm.survey.inputs.photograph_list import PhotographList
-from sfm.survey.solution import Solution
 
 Adjuster = Callable[[Network, Estimate], BackendAdjustment]
 """another adjuster: network and start values in, its solution out"""

@@ -22,8 +22,8 @@ from sfm.network import Estimate, ImagePoints, Network
 from sfm.photographs.reading import read_photograph
 from sfm.reduced_network import reduce_network
 from sfm.runtime.progress import SILENT, Progress
-from sfm.survey.settling import FALSE_ALARM, determined, merge_estimate
-from sfm.survey.solution import TOLERANCE_FACTOR
+from sfm.survey.adjusting.settling import FALSE_ALARM, determined, merge_estimate
+from sfm.survey.adjusting.solution import TOLERANCE_FACTOR
 
 MIN_RAYS = 3
 # Over larger windows no surface is a plane, and memory and time grow with the square of the side.

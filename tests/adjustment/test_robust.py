@@ -10,9 +10,8 @@ import pytest
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.engine.collinearity import residuals
 from sfm.adjustment.engine.unknowns import unknowns_of
-from sfm.adjustment.quality import rejection
-from sfm.adjustment.quality.reliability import tau_critical
-from sfm.adjustment.quality.robust import (
+from sfm.adjustment.quality.gross_errors import rejection
+from sfm.adjustment.quality.gross_errors.robust import (
     HUBER,
     TUKEY,
     huber_slopes,
@@ -21,6 +20,7 @@ from sfm.adjustment.quality.robust import (
     tukey_slopes,
     tukey_weights,
 )
+from sfm.adjustment.quality.reliability import tau_critical
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.conventions import BoolArray, FloatArray

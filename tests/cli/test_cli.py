@@ -17,7 +17,8 @@ import numpy as np
 import pytest
 
 from sfm import cli
-from sfm.cli import app, starting
+from sfm.cli import app
+from sfm.cli.commands import starting
 from sfm.rendering.render import write_photographs
 from sfm.rendering.scene_file import read_scene
 from sfm.report.output import write_result
@@ -352,7 +353,7 @@ def test_compiling_is_told_when_it_happens_and_only_then(tmp_path: Path) -> None
     (tmp_path / "kernel.py").write_text(text, encoding="utf-8")
     code = (
         "import importlib.util, sys\n"
-        "from sfm.cli.starting import loading, stopped_once\n"
+        "from sfm.cli.commands.starting import loading, stopped_once\n"
         "spec = importlib.util.spec_from_file_location('sfm.kernel', 'kernel.py')\n"
         "kernel = sys.modules['sfm.kernel'] = importlib.util.module_from_spec(spec)\n"
         "with stopped_once():\n"

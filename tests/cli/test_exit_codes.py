@@ -14,8 +14,8 @@ import pytest
 
 from sfm import cli
 from sfm.batch.run import run_batch
-from sfm.cli import starting
 from sfm.cli.app import app
+from sfm.cli.commands import starting
 from sfm.errors import KolinearError
 from sfm.report.log import read_log
 from sfm.runtime.faults import told_of_error, working_on
@@ -112,7 +112,7 @@ def test_a_traceback_that_cannot_be_kept_is_said(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr("tempfile.tempdir", "/nowhere")
-    monkeypatch.setattr("sfm.cli.solvers.loading", raising(KeyError("x")))
+    monkeypatch.setattr("sfm.cli.commands.solvers.loading", raising(KeyError("x")))
     code, (line,) = kolinear(monkeypatch, capsys, "compare", "a", "b")
     assert code == 70 and line.endswith("; its traceback cannot be written")
 

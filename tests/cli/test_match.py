@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
-from sfm.cli.matching import match_command
+from sfm.cli.commands.matching import match_command
 from sfm.errors import GeometryError, OutputError, PhotographError, SurveyFileError
 from sfm.report.figures.patches import LINE, MAX_PICTURES
 from tests.textures import random_texture, with_noise

@@ -15,7 +15,7 @@ import pytest
 
 from adapters.formats.registry import write_any
 from adapters.formats.result_tables import read_result
-from sfm.cli.viewing import view
+from sfm.cli.commands.viewing import view
 from sfm.errors import OutputError, SurveyFileError
 from sfm.pipeline import run_survey
 from sfm.report.findings.findings import findings_of

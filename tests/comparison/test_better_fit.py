@@ -9,7 +9,7 @@ import pytest
 
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.solve import adjust
-from sfm.comparison.adjusters import AdjusterComparison, compare_adjusters
+from sfm.comparison.two_adjusters.adjusters import AdjusterComparison, compare_adjusters
 from sfm.conventions import FloatArray
 from sfm.network import Estimate, Network
 from sfm.report.findings.findings import findings_of

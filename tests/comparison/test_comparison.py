@@ -17,9 +17,9 @@ from sfm.adjustment.datum import Datum
 from sfm.adjustment.result import Covariance
 from sfm.adjustment.solve import adjust
 from sfm.camera import camera_from_values
-from sfm.comparison.adjusters import compare_adjusters
-from sfm.comparison.common_problem import common_problem, grouped_free
 from sfm.comparison.solutions import compare, interior_effect_px, rotation_angle_deg
+from sfm.comparison.two_adjusters.adjusters import compare_adjusters
+from sfm.comparison.two_adjusters.common_problem import common_problem, grouped_free
 from sfm.conventions import rotation_from_vector
 from sfm.distortion.models import MODELS as CAMERA_MODELS
 from sfm.errors import GeometryError

@@ -9,7 +9,8 @@ import pytest
 
 from adapters.colmap.adjuster import adjust_with_colmap
 from adapters.colmap.validation_backend import ColmapBackend
-from sfm.comparison.adjuster_validation import (
+from sfm.comparison.solutions import reprojection
+from sfm.comparison.two_adjusters.adjuster_validation import (
     BOTH_FAILED,
     OURS_FAILED,
     SAME,
@@ -18,7 +19,7 @@ from sfm.comparison.adjuster_validation import (
     make_trial,
     validate,
 )
-from sfm.comparison.random_network import (
+from sfm.comparison.two_adjusters.random_network import (
     ARRANGEMENTS,
     IMAGES,
     MIN_POINTS,
@@ -26,7 +27,6 @@ from sfm.comparison.random_network import (
     SIZE_PX,
     random_network,
 )
-from sfm.comparison.solutions import reprojection
 from sfm.errors import BackendError
 from sfm.network import Estimate, Network
 

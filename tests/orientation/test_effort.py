@@ -15,10 +15,10 @@ from sfm.adjustment.engine.observed_unknowns import weighted_of
 from sfm.adjustment.engine.unknowns import unknowns_of
 from sfm.errors import GeometryError
 from sfm.network import Estimate, Network, ObjectPoints
-from sfm.orientation import growth as growing
-from sfm.orientation import starting_pair
-from sfm.orientation.growth import Growth
 from sfm.orientation.homography import fit_homography
+from sfm.orientation.incremental import growth as growing
+from sfm.orientation.incremental import starting_pair
+from sfm.orientation.incremental.growth import Growth
 from sfm.orientation.resection.ransac import fewest_fitting
 from tests.synthetic import make_network, seed_of
 

@@ -9,7 +9,7 @@ import pytest
 
 from sfm.errors import GeometryError
 from sfm.network import Estimate, ImagePoints, Network, empty_estimate
-from sfm.orientation.sequence import orient
+from sfm.orientation.incremental.sequence import orient
 from sfm.similarity import fit_similarity
 from tests.synthetic import make_network, seed_of
 

@@ -10,7 +10,7 @@ from sfm.adjustment.solve import adjust
 from sfm.camera import camera_from_values
 from sfm.errors import GeometryError
 from sfm.network import Estimate, ImagePoints, Network, ObjectPoints
-from sfm.orientation.sequence import orient
+from sfm.orientation.incremental.sequence import orient
 from sfm.similarity import fit_similarity
 from tests.places import SHARED
 from tests.synthetic import make_network, perturb, seed_of

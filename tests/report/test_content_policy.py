@@ -14,9 +14,9 @@ import pytest
 
 from sfm.batch.job import SurveyRow
 from sfm.batch.pages import render_index
-from sfm.comparison.adjuster_validation import SAME, Trial, Validation
-from sfm.comparison.random_network import Plan
 from sfm.comparison.significance import compare_results
+from sfm.comparison.two_adjusters.adjuster_validation import SAME, Trial, Validation
+from sfm.comparison.two_adjusters.random_network import Plan
 from sfm.pipeline import run_survey
 from sfm.report.differences import write_differences
 from sfm.report.findings.findings import findings_of

@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sfm.comparison.adjuster_validation import SAME, Trial, Validation
-from sfm.comparison.random_network import Plan
 from sfm.comparison.significance import ResultComparison, compare_results
+from sfm.comparison.two_adjusters.adjuster_validation import SAME, Trial, Validation
+from sfm.comparison.two_adjusters.random_network import Plan
 from sfm.errors import GeometryError, OutputError
 from sfm.files.open_folders import move
 from sfm.files.whole_files import remove_leftovers

@@ -19,7 +19,7 @@ from sfm.adjustment.quality.variance_components import by_kind
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.camera import Camera
-from sfm.comparison.adjusters import AdjusterComparison, BackendAdjustment, compare_adjusters
+from sfm.comparison.two_adjusters.adjusters import AdjusterComparison, BackendAdjustment, compare_adjusters
 from sfm.network import Estimate, InteriorObservations, Network, ObjectPoints, ScaleBars
 from sfm.report.figures.plots import all_plots, plan_axes
 from sfm.report.findings.bundle_statistics import statistics_of

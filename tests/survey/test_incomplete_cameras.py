@@ -10,7 +10,7 @@ import pytest
 
 import sfm
 from sfm.errors import SurveyFileError
-from sfm.survey.inputs.incomplete_cameras import unlike_squares
+from sfm.survey.inputs.checks.incomplete_cameras import unlike_squares
 from sfm.survey.inputs.survey import CameraSetup
 
 

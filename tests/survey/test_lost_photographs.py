@@ -12,7 +12,7 @@ from sfm.camera import camera_from_values
 from sfm.conventions import BoolArray
 from sfm.errors import GeometryError
 from sfm.network import Estimate, Network, empty_estimate
-from sfm.orientation.sequence import Orientation
+from sfm.orientation.incremental.sequence import Orientation
 from sfm.report.findings.findings import findings_of
 from sfm.survey.diagnosis.lost_photographs import (
     lost_groups,

@@ -17,8 +17,8 @@ from sfm.pipeline import run_survey
 from sfm.report.findings.findings import findings_of
 from sfm.report.tables.csv_files import write_tables as write_result_tables
 from sfm.stored_result import StoredResult
+from sfm.survey.inputs.checks.repeated_image_points import merge_repeated
 from sfm.survey.inputs.given import read_image_points
-from sfm.survey.inputs.repeated_image_points import merge_repeated
 from tests.surveys import survey_of
 from tests.synthetic import make_network, seed_of
 

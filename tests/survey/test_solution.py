@@ -19,7 +19,7 @@ from sfm.pipeline import run_survey
 from sfm.report.findings.bundle_statistics import statistics_of
 from sfm.report.findings.findings import findings_of
 from sfm.report.tables.csv_files import write_tables
-from sfm.survey.datum_definition import find_contradiction, object_scale
+from sfm.survey.adjusting.datum_definition import find_contradiction, object_scale
 from sfm.survey.inputs.survey import read_survey
 from sfm.survey.other_programs import OtherPrograms
 from tests.surveys import write_observed_survey

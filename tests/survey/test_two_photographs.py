@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from sfm.errors import GeometryError
-from sfm.orientation.starting_pair import TWOFOLD
+from sfm.orientation.incremental.starting_pair import TWOFOLD
 from sfm.pipeline import run_survey
 from sfm.report.findings.findings import findings_of
 from sfm.result import SurveyResult

@@ -10,8 +10,8 @@ from sfm.adjustment.quality.against_free import given_test
 from sfm.network import Estimate, ImagePoints, Network
 from sfm.pipeline import run_survey
 from sfm.report.findings.findings import findings_of
+from sfm.survey.inputs.checks.same_photographs import same_photographs
 from sfm.survey.inputs.given import KnownPoints, ScaleBar
-from sfm.survey.inputs.same_photographs import same_photographs
 from tests.surveys import survey_of
 from tests.synthetic import add_narrow_points, make_network, seed_of
 

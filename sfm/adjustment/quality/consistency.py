@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import stats
 
-from sfm.adjustment.quality.doubtful_rays import DoubtfulPoint, doubtful_points
+from sfm.adjustment.quality.gross_errors.doubtful_rays import DoubtfulPoint, doubtful_points
 from sfm.adjustment.quality.point_normals import PointNormals, intersected, point_normals
 from sfm.adjustment.quality.variance_components import VarianceComponents, by_photograph
 from sfm.adjustment.result import Adjustment

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from matplotlib.figure import Figure
 
-from sfm.comparison.adjuster_validation import Validation
 from sfm.comparison.significance import ResultComparison
+from sfm.comparison.two_adjusters.adjuster_validation import Validation
 from sfm.conventions import FloatArray
 from sfm.report.figures.plots import BLUE, RED, plan_axes
 from sfm.report.numbers import finer_unit, significant

@@ -25,7 +25,6 @@ from sfm.report.findings.checks import (
     object_size,
     sigma0_of,
 )
-from sfm.report.findings.evidence import Evidence
 from sfm.report.findings.geometry import Geometry, geometry_of
 from sfm.report.findings.given_residuals import Given, given_of
 from sfm.report.findings.interior_parameters import InteriorOrientation, interior_of
@@ -34,7 +33,8 @@ from sfm.report.findings.precision import Precision, precision_of
 from sfm.report.findings.protocol import Protocol, protocol_of
 from sfm.report.findings.rejected import Rejected, rejected_of
 from sfm.report.findings.solution_rows import PhotographRow, PointRow, photographs_of, points_of
-from sfm.report.findings.verdict import Verdict, judge
+from sfm.report.findings.verdicts.evidence import Evidence
+from sfm.report.findings.verdicts.verdict import Verdict, judge
 from sfm.result import SurveyResult
 
 

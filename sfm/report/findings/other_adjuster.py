@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sfm.comparison.adjusters import AdjusterComparison
 from sfm.comparison.camera_conversion import Conversion
+from sfm.comparison.two_adjusters.adjusters import AdjusterComparison
 from sfm.conventions import FloatArray
 from sfm.report.findings.precision import root_mean_square
 from sfm.result import SurveyResult

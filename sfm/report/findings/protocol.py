@@ -14,8 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import stats
 
+from sfm.adjustment.quality.gross_errors.robust import HUBER, TUKEY
 from sfm.adjustment.quality.reliability import tau_critical
-from sfm.adjustment.quality.robust import HUBER, TUKEY
 from sfm.adjustment.result import Adjustment
 from sfm.camera import Camera, pixel_from_tangents, tangents_from_pixel
 from sfm.conventions import FloatArray, IntArray

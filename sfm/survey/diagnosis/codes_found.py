@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from sfm.orientation.sequence import MIN_POINTS
+from sfm.orientation.incremental.sequence import MIN_POINTS
 from sfm.photographs.reading import read_photograph
 from sfm.survey.inputs.measurements import MeasuredPhotographs
 from sfm.survey.inputs.survey import Survey

@@ -12,7 +12,7 @@ from scipy.sparse.csgraph import connected_components
 from sfm.conventions import BoolArray, IntArray
 from sfm.errors import GeometryError
 from sfm.network import Estimate, Network
-from sfm.orientation.sequence import MIN_POINTS, Orientation
+from sfm.orientation.incremental.sequence import MIN_POINTS, Orientation
 
 MANY = 0.1  # part of the photographs whose loss, though they are connected, has one cause for all
 C_FACTORS = (1.4, 0.7, 2.0, 0.5)  # on the given principal distance: a crop factor, an extender, a zoom

@@ -18,7 +18,7 @@ from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.distortion.models import Role
 from sfm.errors import GeometryError
 from sfm.network import Estimate, ImagePoints, Network, ObjectPoints, rows_of
-from sfm.orientation.growth import residual_lengths
+from sfm.orientation.incremental.growth import residual_lengths
 from sfm.orientation.resection.ransac import resect_robust
 
 LOST = 0.5  # share of the image points of a photograph without which the rest does not speak for it

@@ -12,7 +12,7 @@ from sfm.conventions import IntArray
 from sfm.errors import SurveyFileError
 from sfm.files.globs import find_files
 from sfm.files.plain_text import as_plain, is_plain
-from sfm.survey.inputs.contradictions import SurveySettings
+from sfm.survey.inputs.checks.contradictions import SurveySettings
 from sfm.survey.inputs.interior import refuse_ungrouped
 from sfm.survey.inputs.survey_file import inside
 

@@ -13,12 +13,12 @@ from sfm.errors import SurveyFileError
 from sfm.network import Estimate, ImagePoints, Network, ObjectPoints, ScaleBars, rows_of
 from sfm.result import FailedImage, LeftOutPoint
 from sfm.survey.inputs.cameras import camera_of_image, refuse_unknown_cameras, start_cameras
+from sfm.survey.inputs.checks.repeated_image_points import merge_repeated
+from sfm.survey.inputs.checks.same_photographs import same_photographs
 from sfm.survey.inputs.given import KnownPoints, Observations, ScaleBar
 from sfm.survey.inputs.interior import refuse_ungrouped
 from sfm.survey.inputs.measurements import Measurements
 from sfm.survey.inputs.photograph_list import refuse_many
-from sfm.survey.inputs.repeated_image_points import merge_repeated
-from sfm.survey.inputs.same_photographs import same_photographs
 from sfm.survey.inputs.survey import Survey
 
 MIN_RAYS = 2  # photographs that a point with a name needs

@@ -13,7 +13,8 @@ from pydantic import ValidationError
 from sfm.adjustment.datum import Datum
 from sfm.errors import SurveyFileError
 from sfm.files.plain_text import as_plain
-from sfm.survey.inputs.contradictions import refuse_contradictions
+from sfm.survey.inputs.checks.contradictions import refuse_contradictions
+from sfm.survey.inputs.checks.settings_errors import first_error
 from sfm.survey.inputs.exterior_table import ObservedExterior, read_observed_exterior
 from sfm.survey.inputs.given import (
     Diameters,
@@ -39,7 +40,6 @@ from sfm.survey.inputs.settings import (
     TargetSettings,
     TiePointSettings,
 )
-from sfm.survey.inputs.settings_errors import first_error
 from sfm.survey.inputs.survey_file import SurveyFile, read_survey_file
 from sfm.targets.codes.families import FAMILIES, Family, code_family
 from sfm.targets.codes.rings import CodeFamily

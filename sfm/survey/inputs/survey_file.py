@@ -10,7 +10,8 @@ from pydantic import Field, PrivateAttr, ValidationError
 from sfm.errors import SurveyFileError
 from sfm.files.plain_text import as_plain, is_plain
 from sfm.files.toml_files import read_toml
-from sfm.survey.inputs.contradictions import refuse_contradictions
+from sfm.survey.inputs.checks.contradictions import refuse_contradictions
+from sfm.survey.inputs.checks.settings_errors import first_error
 from sfm.survey.inputs.settings import (
     MAX_CAMERAS,
     AdjustSettings,
@@ -27,7 +28,6 @@ from sfm.survey.inputs.settings import (
     TargetSettings,
     TiePointSettings,
 )
-from sfm.survey.inputs.settings_errors import first_error
 from sfm.targets.codes.families import FAMILIES
 
 

@@ -27,7 +27,7 @@ from adapters.formats.registry import FORMATS as FILE_FORMATS
 from adapters.formats.registry import format_named, format_of, read_any, read_comparable, write_any, written
 from adapters.formats.sba_text import read_sba_text, write_sba_text
 from sfm.camera import Camera, camera_from_values, pixel_jacobian
-from sfm.cli.solvers import convert
+from sfm.cli.commands.solvers import convert
 from sfm.comparison.camera_conversion import convert_camera, convert_cameras
 from sfm.comparison.significance import compare_results
 from sfm.comparison.solutions import reprojection

@@ -20,10 +20,10 @@ from sfm.camera import Camera
 from sfm.conventions import BoolArray, FloatArray
 from sfm.errors import GeometryError
 from sfm.network import Estimate, Network, empty_estimate
-from sfm.orientation.given_values import start_from_given
-from sfm.orientation.growth import FIRST_ADJUSTMENT, Growth, Refine, has_given_values
-from sfm.orientation.remaining_points import intersect_remaining
-from sfm.orientation.starting_pair import Start
+from sfm.orientation.incremental.given_values import start_from_given
+from sfm.orientation.incremental.growth import FIRST_ADJUSTMENT, Growth, Refine, has_given_values
+from sfm.orientation.incremental.remaining_points import intersect_remaining
+from sfm.orientation.incremental.starting_pair import Start
 from sfm.similarity import fit_similarity
 
 Judge = Callable[[Estimate], float]

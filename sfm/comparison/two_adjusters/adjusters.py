@@ -20,10 +20,10 @@ from sfm.adjustment.datum import Datum
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.comparison.camera_conversion import Conversion
-from sfm.comparison.common_problem import common_problem, distortion_held
-from sfm.comparison.own_camera import BetterFit, better_fit
 from sfm.comparison.solutions import Comparison, compare
-from sfm.comparison.unshared import without_sharing
+from sfm.comparison.two_adjusters.better_fit import BetterFit, better_fit
+from sfm.comparison.two_adjusters.common_problem import common_problem, distortion_held
+from sfm.comparison.two_adjusters.unshared import without_sharing
 from sfm.conventions import FloatArray
 from sfm.network import Estimate, Network
 

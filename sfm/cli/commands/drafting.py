@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from sfm.cli.commands.starting import loading
 from sfm.cli.first_use import compile_first
-from sfm.cli.starting import loading
 from sfm.errors import OutputError
 from sfm.runtime.faults import working_on
 

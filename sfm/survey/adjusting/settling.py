@@ -17,7 +17,7 @@ from sfm.errors import GeometryError
 from sfm.network import Estimate, Network
 from sfm.orientation.ray_angles import ray_angles
 from sfm.reduced_network import reduce_network, supported
-from sfm.survey.datum_definition import Contradiction, find_contradiction
+from sfm.survey.adjusting.datum_definition import Contradiction, find_contradiction
 from sfm.survey.diagnosis.left_out import datum_carriers
 from sfm.survey.diagnosis.observation_count import refuse_too_few_observations
 from sfm.survey.diagnosis.own_camera import Treated, treat_lost

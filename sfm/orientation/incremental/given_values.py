@@ -12,7 +12,7 @@ import numpy as np
 
 from sfm.conventions import IntArray
 from sfm.network import Estimate
-from sfm.orientation.growth import MIN_SHARE, Growth, Refine, residual_lengths
+from sfm.orientation.incremental.growth import MIN_SHARE, Growth, Refine, residual_lengths
 
 MAX_COMPLETIONS = 50  # rounds of resection and intersection of what no values were given for
 KEPT_SHARE = 0.5  # of the photographs must fit, each with most of its image points, for given values to stay

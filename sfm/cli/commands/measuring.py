@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from sfm.cli.starting import loading
+from sfm.cli.commands.starting import loading
 from sfm.errors import SurveyFileError
 from sfm.orientation.resection import METHODS
 from sfm.runtime.faults import working_on
@@ -74,7 +74,7 @@ def match(
     code 1 if no point was matched.
     """
     with loading():
-        from sfm.cli.matching import match_command
+        from sfm.cli.commands.matching import match_command
         from sfm.matching.conjugate import BACK_PX
 
     with working_on(f"{left} and {right}"):

@@ -14,7 +14,7 @@ from sfm.conventions import FloatArray, IntArray, rotation_from_angles
 from sfm.errors import GeometryError
 from sfm.network import Estimate, ExteriorObservations, Network
 from sfm.similarity import Similarity, fit_similarity
-from sfm.survey.datum_definition import object_scale
+from sfm.survey.adjusting.datum_definition import object_scale
 from sfm.survey.inputs.exterior_table import ObservedExterior
 
 MIN_POINTS = 3  # that fix position, attitude and scale

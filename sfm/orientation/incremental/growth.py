@@ -12,10 +12,10 @@ from sfm.conventions import MAD_TO_SIGMA, BoolArray, FloatArray
 from sfm.distortion.models import Role
 from sfm.errors import GeometryError
 from sfm.network import Estimate, Network, empty_estimate, rows_of
+from sfm.orientation.incremental.starting_pair import Start, best_start
+from sfm.orientation.incremental.support import photograph_support
 from sfm.orientation.intersection import intersect
 from sfm.orientation.resection.ransac import fewest_fitting, resect_robust
-from sfm.orientation.starting_pair import Start, best_start
-from sfm.orientation.support import photograph_support
 from sfm.reduced_network import reduce_network
 
 FIRST_ADJUSTMENT = 4  # photographs

@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING
 from rich.console import Console
 from rich.table import Table
 
+from sfm.cli.commands.starting import loading
 from sfm.cli.first_use import compile_first
-from sfm.cli.starting import loading
 from sfm.errors import KolinearError
 
 if TYPE_CHECKING:
@@ -126,7 +126,7 @@ def _check_adjustment() -> str:
 def _check_colmap() -> str:
     """Adjust the same network by COLMAP and compare."""
     from sfm.api import programs_of
-    from sfm.comparison.adjusters import compare_adjusters
+    from sfm.comparison.two_adjusters.adjusters import compare_adjusters
 
     adjuster = programs_of("colmap", "none").adjuster
     assert adjuster is not None

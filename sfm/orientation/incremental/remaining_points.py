@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from sfm.orientation.growth import Growth
+from sfm.orientation.incremental.growth import Growth
 from sfm.orientation.intersection import intersect
 
 PARALLEL_SIGMAS = 4.0  # standard deviations of its angle by which two rays must differ from parallel ones

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from sfm.cli.starting import loading
+from sfm.cli.commands.starting import loading
 from sfm.errors import OutputError
 from sfm.runtime.faults import working_on
 

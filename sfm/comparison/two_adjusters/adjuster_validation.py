@@ -24,9 +24,9 @@ from threadpoolctl import threadpool_limits
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
-from sfm.comparison.adjusters import BackendAdjustment
-from sfm.comparison.random_network import Plan, RandomNetwork, random_network
 from sfm.comparison.solutions import reprojection, rotation_angle_deg
+from sfm.comparison.two_adjusters.adjusters import BackendAdjustment
+from sfm.comparison.two_adjusters.random_network import Plan, RandomNetwork, random_network
 from sfm.conventions import BoolArray, FloatArray
 from sfm.errors import KolinearError
 from sfm.network import Estimate, Network

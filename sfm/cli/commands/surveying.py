@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from sfm.cli.drafting import drafted_beside
+from sfm.cli.commands.drafting import drafted_beside
+from sfm.cli.commands.starting import loading
 from sfm.cli.first_use import compile_first
-from sfm.cli.starting import loading
 from sfm.errors import KolinearError
 from sfm.runtime.faults import FAULT, working_on
 

@@ -7,8 +7,8 @@ from typing import Annotated
 
 import typer
 
+from sfm.cli.commands.starting import loading
 from sfm.cli.first_use import compile_first
-from sfm.cli.starting import loading
 from sfm.runtime.faults import working_on
 
 

@@ -6,8 +6,8 @@ import numpy as np
 
 from sfm.adjustment.quality.statistics import ALPHA
 from sfm.adjustment.quality.variance_components import IMAGE_POINTS
-from sfm.report.findings.evidence import Evidence, Judged
 from sfm.report.findings.given_residuals import GivenResiduals, GivenValue
+from sfm.report.findings.verdicts.evidence import Evidence, Judged
 from sfm.report.numbers import finer_unit, significant
 from sfm.survey.inputs.settings import FREED_FIRST
 

@@ -17,7 +17,7 @@ from sfm.adjustment.engine.cofactors import cofactors, hat_complement
 from sfm.adjustment.engine.collinearity import Observations, State, behind_camera, residuals
 from sfm.adjustment.engine.iterate import Optimum, Problem, iterate, optimum_at
 from sfm.adjustment.engine.unknowns import start_weights
-from sfm.adjustment.quality.robust import (
+from sfm.adjustment.quality.gross_errors.robust import (
     huber_weights,
     residual_lengths,
     robust_scale,

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from sfm.cli.starting import loading
+from sfm.cli.commands.starting import loading
 from sfm.errors import SurveyFileError
 from sfm.planning.target_size import MIN_PIXELS, target_size
 

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from sfm.cli.starting import loading
+from sfm.cli.commands.starting import loading
 from sfm.errors import SurveyFileError
 from sfm.runtime.faults import working_on
 
@@ -28,7 +28,7 @@ def validate(
     """
     with loading():
         from adapters.colmap.validation_backend import ColmapBackend
-        from sfm.comparison.adjuster_validation import validate as validate_networks
+        from sfm.comparison.two_adjusters.adjuster_validation import validate as validate_networks
         from sfm.files.manifest import refuse_foreign_folder
         from sfm.report.validation import in_words, largest, write_validation
         from sfm.runtime.progress_bar import drawn_progress

@@ -9,9 +9,9 @@ import numpy as np
 
 from sfm.adjustment.quality.reliability import UNCONTROLLED
 from sfm.conventions import MAD_TO_SIGMA
-from sfm.report.findings.evidence import Evidence, Judged
 from sfm.report.findings.other_adjuster import words_of_better_fit
-from sfm.report.findings.verdict_of_given import free_line, judge_given
+from sfm.report.findings.verdicts.evidence import Evidence, Judged
+from sfm.report.findings.verdicts.verdict_of_given import free_line, judge_given
 from sfm.report.numbers import finer_unit, significant
 
 MUCH_REJECTED = 0.05  # share of rejected image points above which a person should look

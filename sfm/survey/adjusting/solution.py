@@ -16,26 +16,16 @@ from sfm.errors import GeometryError
 from sfm.network import Estimate, Network
 from sfm.reduced_network import reduce_network
 from sfm.result import ControlCheck, Eccentricity, Explanation, LeftOutPoint, TakenOut
-from sfm.survey.datum_definition import (
+from sfm.survey.adjusting.datum_definition import (
     datum_warnings,
     place_on_control,
     place_on_frame,
     refuse_other_units,
     scale_to_bars,
 )
-from sfm.survey.diagnosis.explanations import explain_residuals
-from sfm.survey.diagnosis.left_out import left_out_points, unused_image_points, words_of_left_out
-from sfm.survey.diagnosis.own_camera import Treated
-from sfm.survey.diagnosis.principal_distance import far_principal_distances
-from sfm.survey.diagnosis.scale_check import check_scales
-from sfm.survey.exterior import add_exterior
-from sfm.survey.free_parameters import choose_free_parameters
-from sfm.survey.inputs.incomplete_cameras import unlike_squares
-from sfm.survey.inputs.interior import split_cameras
-from sfm.survey.inputs.measurements import Naming
-from sfm.survey.inputs.start import given_values
-from sfm.survey.inputs.survey import Survey
-from sfm.survey.settling import (
+from sfm.survey.adjusting.exterior import add_exterior
+from sfm.survey.adjusting.free_parameters import choose_free_parameters
+from sfm.survey.adjusting.settling import (
     MIN_IMAGE_POINTS,
     Settled,
     Task,
@@ -47,6 +37,16 @@ from sfm.survey.settling import (
     treat,
     without_contradiction,
 )
+from sfm.survey.diagnosis.explanations import explain_residuals
+from sfm.survey.diagnosis.left_out import left_out_points, unused_image_points, words_of_left_out
+from sfm.survey.diagnosis.own_camera import Treated
+from sfm.survey.diagnosis.principal_distance import far_principal_distances
+from sfm.survey.diagnosis.scale_check import check_scales
+from sfm.survey.inputs.checks.incomplete_cameras import unlike_squares
+from sfm.survey.inputs.interior import split_cameras
+from sfm.survey.inputs.measurements import Naming
+from sfm.survey.inputs.start import given_values
+from sfm.survey.inputs.survey import Survey
 
 TOLERANCE_FACTOR = 6.0  # of the robust spread of the residuals
 MIN_CONTROL = 3  # points that place a free network

@@ -1,0 +1,1 @@
+"""Orientation of a set of photographs: a pair to start from, then one photograph after the other."""

@@ -1,0 +1,1 @@
+"""The verdict on a survey, and what it is judged by."""

@@ -1,0 +1,1 @@
+"""What is wrong with the input: contradictions, repetitions and missing settings."""
