@@ -46,7 +46,9 @@ class ShapeFit:
     parameters: Parameters  # names, values and what they are
     function: Function  # the parameters by the coordinates of its points
     covariance: FloatArray  # of the parameters, (p, p); NaN where nothing tells
-    from_residuals: bool  # whether the covariance comes from the residuals, since that of the points is not known
+    from_residuals: (
+        bool  # whether the covariance comes from the residuals, since that of the points is not known
+    )
     distances: FloatArray  # signed distances of the points, object unit, (m, c)
     sigma: FloatArray  # of the distance of each point, object unit; NaN where not known, (m,)
     w: FloatArray  # standardised: the root of T of each point; NaN where not known, (m,)
@@ -176,11 +178,11 @@ def _fit(
         )
     else:
         shape = _best_start(kind, x, free, off, origin, axis, form, placed)
-    shape, cost, converged = refine_orthogonal(shape, x[used], free=free, offset=off, placed=placed)
     if axis is None or kind.name in ("cone", "paraboloid"):
-        shape = shape.turned()
+        shape = shape.turned()  # before the offset counts, whose sign is that of the normal
     elif shape.axis @ axis < 0:
         shape = replace(shape, rotation=shape.rotation * np.array([1.0, -1, -1]))
+    shape, cost, converged = refine_orthogonal(shape, x[used], free=free, offset=off, placed=placed)
     d, B, A = shape.design(x[used])
     A = A[..., free].reshape(d.size, -1)
     _refuse_rank(kind, A, d.size)
@@ -188,6 +190,7 @@ def _fit(
     n = len(rows)
     linear = np.zeros((A.shape[1], n, 3))
     w = np.full(n, np.nan)
+    C: FloatArray
     statistic = critical = np.nan
     if weights == "network":
         assert Q is not None
@@ -201,7 +204,7 @@ def _fit(
         if redundancy:
             statistic, critical = fit.omega / redundancy, _critical(redundancy, points.redundancy)
     else:
-        inverse = np.linalg.inv(A.T @ A)
+        inverse: FloatArray = np.asarray(np.linalg.inv(A.T @ A))
         linear[:, used] = -np.einsum("up,pnc,nci->uni", inverse, A.T.reshape(-1, *d.shape), B)
         sigma0 = float(np.sqrt(cost / redundancy)) * size if redundancy else np.nan
         flat = linear.reshape(A.shape[1], -1)
@@ -276,7 +279,9 @@ def _held(
             of_cone = [one for one in known if not (kind.name == "cone" and one == "radius")]
             raise GeometryError(f"hold '{name}', expected one of {', '.join(of_cone)}")
         if numbers.size != wanted or not np.isfinite(numbers).all():
-            raise GeometryError(f"hold {name}: found {value}, expected {wanted} finite number{'s' * (wanted > 1)}")
+            raise GeometryError(
+                f"hold {name}: found {value}, expected {wanted} finite number{'s' * (wanted > 1)}"
+            )
         if name == kind.place:
             origin = (numbers - centroid) / size
             free[:3] = False
@@ -313,7 +318,7 @@ def _best_start(
     some = x
     if len(x) > START_POINTS:
         some = x[np.linspace(0, len(x) - 1, START_POINTS).astype(np.int64)]
-    found = []
+    found: list[tuple[float, int, Shape]] = []
     first = free.copy()  # a held form has false optima: it starts from the free one (0: an apex)
     first[6:] = form != 0
     for start in start_shapes(kind, some, origin=origin, axis=axis)[:STARTS]:

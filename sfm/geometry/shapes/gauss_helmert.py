@@ -6,7 +6,8 @@ Q_w = B Q B': for a single point its normal weighs n' Q n.
 
 The covariance of a free network is singular, and Q_w is so where a motion of the network is one of the shape
 (all points on one plane). W = Q_w + A U A' takes its place: estimates, residuals and v' Q^-1 v are those of
-Q_w, and the covariance of the parameters is (A' W^-1 A)^-1 - U.
+Q_w, and the covariance of the parameters is (A' W^-1 A)^-1 - U. In another datum of the network the adjusted
+points and the shape are moved together: its form, v' Q^-1 v and the tests of the points are the same.
 
 Source: Helmert (1907), Die Ausgleichungsrechnung; Pope (1972), Some pitfalls to be avoided in the iterative
 adjustment of nonlinear problems; Rao (1973), Linear Statistical Inference, sec. 4i (unified theory).
@@ -26,6 +27,7 @@ from sfm.geometry.shapes.shape import Shape
 
 ITERATIONS = 100
 CONVERGED = 1e-13  # of steps over the unit size of the points
+SINGULAR = 1e-6  # standard deviation of a constraint over the largest, of what others leave of it
 UNCHECKED = 1e-9  # redundancy of a constraint below which nothing checks it
 
 
@@ -40,7 +42,9 @@ class Weighted:
     linear: FloatArray  # F, of the parameters by the coordinates, (u, 3 n)
     covariance: FloatArray  # of the free parameters, (u, u)
     omega: float  # v' Q^-1 v
-    standardised: FloatArray  # the largest of the tests of each point: w, or the root of T of two constraints, (n,)
+    standardised: (
+        FloatArray  # the largest of the tests of each point: w, or the root of T of two constraints, (n,)
+    )
     converged: bool
 
 
@@ -92,14 +96,15 @@ def refine_weighted(
         if change <= CONVERGED * max(1.0, float(np.abs(shape.form).max(initial=0.0))):
             converged = True
             break
-    inverse = np.linalg.inv(N)
+    inverse: FloatArray = np.asarray(np.linalg.inv(N))
     linear = -(inverse @ PA.T)
+    by_point = linear.reshape(len(dp), n, -1)
     return Weighted(
         shape,
         adjusted,
         B,
         A,
-        np.einsum("unc,nci->uni", linear.reshape(len(dp), n, -1), B).reshape(len(dp), 3 * n),
+        np.asarray(np.einsum("unc,nci->uni", by_point, B).reshape(len(dp), 3 * n)),
         inverse - np.diag(unit**2),
         max(float(-k @ (w + A @ dp)), 0.0),
         _tests(k, solve, PA, inverse, n),
@@ -110,10 +115,10 @@ def refine_weighted(
 def constraint_covariance(covariance: FloatArray, normals: FloatArray) -> FloatArray:
     """Return Q_w = B Q B', of all constraints together (n c, n c), or of each point's by itself (n, c, c)."""
     if covariance.ndim == 3:
-        return np.einsum("nai,nij,nbj->nab", normals, covariance, normals)
+        return np.asarray(np.einsum("nai,nij,nbj->nab", normals, covariance, normals))
     n, c, _ = normals.shape
     half = np.einsum("nci,nik->nck", normals, covariance.reshape(n, 3, 3 * n)).reshape(n * c, n, 3)
-    return np.einsum("kni,nci->knc", half, normals).reshape(n * c, n * c)
+    return np.asarray(np.einsum("kni,nci->knc", half, normals).reshape(n * c, n * c))
 
 
 def times_covariance(covariance: FloatArray, normals: FloatArray, k: FloatArray) -> FloatArray:
@@ -121,12 +126,12 @@ def times_covariance(covariance: FloatArray, normals: FloatArray, k: FloatArray)
     n, c, _ = normals.shape
     back = np.einsum("nci,nc->ni", normals, k.reshape(n, c))
     if covariance.ndim == 3:
-        return np.einsum("nij,nj->ni", covariance, back)
+        return np.asarray(np.einsum("nij,nj->ni", covariance, back))
     return np.asarray((covariance @ back.ravel()).reshape(n, 3))
 
 
 def _unit(Qw: FloatArray, A: FloatArray) -> FloatArray:
-    """Return the roots of the diagonal U: of each parameter what a typical constraint would determine of it."""
+    """Return the roots of the diagonal U: what a typical constraint would determine of each parameter."""
     variance = float(np.einsum("nii->", Qw) / len(A) if Qw.ndim == 3 else np.trace(Qw) / len(A))
     return np.asarray(np.sqrt(variance / np.maximum((A**2).mean(axis=0), 1e-300)))
 
@@ -143,7 +148,7 @@ class _Blocks:
 
     def _own(self, b: FloatArray) -> FloatArray:
         n, c, _ = self.inverse.shape
-        return np.einsum("nab,nbk->nak", self.inverse, b.reshape(n, c, -1)).reshape(n * c, -1)
+        return np.asarray(np.einsum("nab,nbk->nak", self.inverse, b.reshape(n, c, -1)).reshape(n * c, -1))
 
     def __call__(self, b: FloatArray) -> FloatArray:
         x = self._own(b)
@@ -167,7 +172,7 @@ def _factor(Qw: FloatArray, AU: FloatArray) -> _Blocks | _Dense:
             return _Blocks(Qw, AU)
         solve = _Dense(Qw, AU)
         diagonal = np.diagonal(solve.factor[0])
-        if diagonal.min() < 1e-7 * diagonal.max():
+        if diagonal.min() < SINGULAR * diagonal.max():
             raise LinAlgError
         return solve
     except LinAlgError as error:
@@ -177,9 +182,7 @@ def _factor(Qw: FloatArray, AU: FloatArray) -> _Blocks | _Dense:
         ) from error
 
 
-def _tests(
-    k: FloatArray, solve: _Blocks | _Dense, PA: FloatArray, inverse: FloatArray, n: int
-) -> FloatArray:
+def _tests(k: FloatArray, solve: _Blocks | _Dense, PA: FloatArray, inverse: FloatArray, n: int) -> FloatArray:
     """Return of each point the root of k' Q_kk^-1 k over its constraints: Baarda's w of one, (n,)."""
     c = len(k) // n
     if isinstance(solve, _Blocks):

@@ -1,13 +1,13 @@
 """The kinds of shapes: orthogonal distance of points in the shape's own axes, with its derivatives.
 
-Each shape stands in its own axes y = R' (x - c): its axis or normal is y3. A kind says which of the six motions
-of these axes change it (a sphere has no direction, a cylinder no place along its axis), which form parameters
-it has, and one function: the signed distance d of points, its gradient g by the point, a unit vector, and its
-derivative by the form parameters. A curve in space has two distances, in its plane and off it. The derivative
-by a motion follows for all kinds alike from g (`shape.design`).
+Each shape stands in its own axes y = R' (x - c): its axis or normal is y3. A kind says which of the six
+motions of these axes change it (a sphere has no direction, a cylinder no place along its axis), which form
+parameters it has, and one function: the signed distance d of points, its gradient g by the point, a unit
+vector, and its derivative by the form parameters. A curve in space has two distances, in its plane and off
+it. The derivative by a motion follows for all kinds alike from g (`shape.design`).
 
-Source: Ahn (2004), Least Squares Orthogonal Distance Fitting of Curves and Surfaces in Space, ch. 3; Foerstner
-and Wrobel (2016), Photogrammetric Computer Vision, sec. 4.8.
+Source: Ahn (2004), Least Squares Orthogonal Distance Fitting of Curves and Surfaces in Space, ch. 3;
+Foerstner and Wrobel (2016), Photogrammetric Computer Vision, sec. 4.8.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Orthogonal-distance fits with equal or single weights, by Levenberg and Marquardt.
 
-Source: Ahn (2004), Least Squares Orthogonal Distance Fitting of Curves and Surfaces in Space, ch. 3; Marquardt
-(1963), SIAM J. 11(2); Nielsen (1999), Damping parameter in Marquardt's method.
+Source: Ahn (2004), Least Squares Orthogonal Distance Fitting of Curves and Surfaces in Space, ch. 3;
+Marquardt (1963), SIAM J. 11(2); Nielsen (1999), Damping parameter in Marquardt's method.
 """
 
 from __future__ import annotations
@@ -46,7 +46,9 @@ def refine_orthogonal(
 
     def system(one: Shape) -> tuple[FloatArray, FloatArray]:
         d, _, A = one.design(xyz)
-        return ((d - offset) * root[:, None]).ravel(), (A[..., free] * root[:, None, None]).reshape(d.size, -1)
+        return ((d - offset) * root[:, None]).ravel(), (A[..., free] * root[:, None, None]).reshape(
+            d.size, -1
+        )
 
     e, A = system(shape)
     cost = float(e @ e)

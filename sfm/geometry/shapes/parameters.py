@@ -33,8 +33,8 @@ def parameters_of(shape: Shape) -> tuple[Parameters, FloatArray, FloatArray]:
         shape: in object units.
 
     Returns:
-        What they are, their values (p,), and their derivatives by shifts and rotations in the shape's own axes
-        and by its form, (p, 6 + q).
+        What they are, their values (p,), and their derivatives by shifts and rotations in the shape's own
+        axes and by its form, (p, 6 + q).
     """
     kind, R, form = shape.kind, shape.rotation, shape.form
     q = len(form)

@@ -37,8 +37,8 @@ class Shape:
             xyz: points, object unit, (n, 3).
 
         Returns:
-            Distances, normals, and derivatives by shifts and rotations of the shape in its own axes and by its
-            form, (n, c, 6 + q).
+            Distances, normals, and derivatives by shifts and rotations of the shape in its own axes and by
+            its form, (n, c, 6 + q).
         """
         y = (xyz - self.origin) @ self.rotation
         d, g, of_form = self.kind.distance(y, self.form)

@@ -1,11 +1,11 @@
 """Start values of shapes from their points alone, by algebraic fits.
 
-A line, plane, circle, ellipse and sphere have a direct solution. A cylinder, cone, torus and paraboloid become
-linear, or a circle, once their axis is known: directions all over the half sphere are tried, and the best are
-refined by orthogonal distances.
+A line, plane, circle, ellipse and sphere have a direct solution. A cylinder, cone, torus and paraboloid
+become linear, or a circle, once their axis is known: directions all over the half sphere are tried, and the
+best are refined by orthogonal distances.
 
-Source: Foerstner and Wrobel (2016), Photogrammetric Computer Vision, sec. 4.9 (direct fits); Halir and Flusser
-(1998), Numerically stable direct least squares fitting of ellipses.
+Source: Foerstner and Wrobel (2016), Photogrammetric Computer Vision, sec. 4.9 (direct fits); Halir and
+Flusser (1998), Numerically stable direct least squares fitting of ellipses.
 """
 
 from __future__ import annotations
@@ -24,7 +24,12 @@ MAX_ANGLE = np.deg2rad(89.0)  # half angle of a cone
 
 
 def start_shapes(
-    kind: Kind, xyz: FloatArray, *, origin: FloatArray | None = None, axis: FloatArray | None = None
+    kind: Kind,
+    xyz: FloatArray,
+    *,
+    origin: FloatArray | None = None,
+    axis: FloatArray | None = None,
+    directions: int = DIRECTIONS,
 ) -> list[Shape]:
     """Return shapes to start from, the likeliest first; none where the points determine none.
 
@@ -33,18 +38,19 @@ def start_shapes(
         xyz: points about their centroid, of unit size, (n, 3).
         origin: where the shape must lie, if it is held.
         axis: its direction, if it is held.
+        directions: of an axis that are tried.
     """
     normal, along = principal_directions(xyz)
     if kind.name in DIRECT:
         direction = along if kind.name == "line" else normal
         return DIRECT[kind.name](xyz, axes_along(direction if axis is None else axis))
     if axis is not None:
-        directions = np.stack([axis, -axis])
+        tried = np.stack([axis, -axis])
     else:
-        directions = np.vstack([[normal, along, np.cross(normal, along)], half_sphere(DIRECTIONS)])
+        tried = np.vstack([[normal, along, np.cross(normal, along)], half_sphere(directions)])
     if kind.name == "cone" and origin is not None:
-        return _cones_at(xyz, origin, directions)
-    found = [shape for one in directions for shape in WITH_AXIS[kind.name](xyz, axes_along(one))]
+        return _cones_at(xyz, origin, tried)
+    found = [shape for one in tried for shape in WITH_AXIS[kind.name](xyz, axes_along(one))]
     return _best_first(found, xyz)
 
 
