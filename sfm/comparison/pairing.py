@@ -23,6 +23,7 @@ from sfm.stored_result import StoredResult
 
 UNCODED = re.compile(r"u\d+")  # names that Kolinear gives to points without one
 SAME_PX = 1e-2  # image points closer than this are one measurement, as files round it
+SAME_RAY_PX = 0.1  # likewise of directions, which differ by what the conversion of a camera costs
 NEAR_PX = 1.0  # measurements of one target or one piece of texture by two programs lie closer than this
 MAJORITY = 0.5  # of the rays in common photographs on which two points must lie together
 AMBIGUOUS = 0.3  # of the distance to the next neighbour: what is farther away is not recognised by place

@@ -34,6 +34,7 @@ class PointTest:
     stable: BoolArray
     approximate: bool = False
     majority: bool = True
+    smooth: float = 0.0
 
 
 def judge_points(
@@ -109,7 +110,7 @@ def _of_congruency(found: Congruency, tested: BoolArray) -> PointTest:
     significant[tested] = found.moved
     return PointTest(
         *(sigma, "", statistic, found.critical, significant, found.global_statistic, found.global_critical),
-        *(stable, False, found.agreed),
+        *(stable, False, found.agreed, found.smooth),
     )
 
 
