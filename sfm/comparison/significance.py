@@ -20,7 +20,7 @@ import numpy as np
 
 from sfm.camera import Camera
 from sfm.comparison.camera_conversion import Conversion, convert_camera
-from sfm.comparison.pairing import Pairing, pair_results
+from sfm.comparison.pairing import SAME_RAY_PX, Pairing, pair_results
 from sfm.comparison.point_tests import has_sigma, judge_points, known_scale
 from sfm.comparison.solutions import rotation_angle_deg
 from sfm.conventions import BoolArray, FloatArray, IntArray
@@ -211,7 +211,8 @@ def _same_share(a: Network, b: Network, pairing: Pairing) -> float:
     known = (image[theirs.image] >= 0) & (point[theirs.point] >= 0)
     key_b = (image[theirs.image] * n + point[theirs.point])[known]
     _, i, j = np.intersect1d(key_a, key_b, return_indices=True)
-    same = np.abs(ours.xy[i] - theirs.xy[known][j]).max(axis=1) < SAME_PX
+    same_px = SAME_PX if pairing.xy[0] is ours.xy else SAME_RAY_PX
+    same = np.abs(pairing.xy[0][i] - pairing.xy[1][known][j]).max(axis=1) < same_px
     return float(same.sum() / len(ours))
 
 

@@ -95,5 +95,8 @@ def test_a_result_is_its_own_model_in_other_formats(
     found = compare_results(first, read_comparable(target, form), align="points", control=())
     print(form, words_of_pairing(found), words_of_test(found), sep="\n")
     assert len(found.points) == len(first.network.points)
+    if form != "colmap-text":
+        assert found.pairing.points_by_image_points == len(found.points)
+    assert found.same_share > 0.99 and found.images == first.network.images
     length = np.linalg.norm(np.asarray(found.point_difference), axis=1)
     assert length.max() < 1e-6
