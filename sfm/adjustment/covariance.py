@@ -27,6 +27,8 @@ from sfm.conventions import FloatArray, IntArray
 from sfm.errors import GeometryError
 from sfm.kernels.threads import own_threads
 
+COLUMNS = 192  # of the points that are worked on at a time, which bounds the memory
+
 
 @dataclass(frozen=True)
 class Marginal:
@@ -56,10 +58,14 @@ class Marginal:
         observations, first, u = self.layout.observations, self.layout.kept_start, len(unknowns)
         rows = (3 * np.asarray(points)[:, None] + np.arange(3)).ravel()
         # dx of each as a linear function of the reduced unknowns: themselves, or -L^-T Y' of a point
-        h = np.zeros((len(b.L), 3, len(rows)))
-        h.reshape(3 * len(h), len(rows))[rows, np.arange(len(rows))] = 1.0
         through = np.zeros((self.layout.reduced, len(rows)))
-        times_points(observations, b, solve_lower(b.L, h), through)
+        for start in range(0, len(rows), COLUMNS):
+            own_rows = rows[start : start + COLUMNS]
+            h = np.zeros((len(b.L), 3, len(own_rows)))
+            h.reshape(3 * len(h), len(own_rows))[own_rows, np.arange(len(own_rows))] = 1.0
+            part = np.zeros((self.layout.reduced, len(own_rows)))
+            times_points(observations, b, solve_lower(b.L, h), part)
+            through[:, start : start + COLUMNS] = part
         E = np.zeros((self.layout.reduced, u + len(rows)))
         E[unknowns, np.arange(u)] = 1.0
         E[:, u:] = -through

@@ -135,7 +135,8 @@ def bending(xyz: FloatArray) -> FloatArray:
     along = ((xyz - xyz.mean(axis=0)) @ axes.T / mean_distance(xyz))[:, extent > THIN * extent[0]]
     i, j = np.triu_indices(along.shape[1])
     terms = np.hstack([along, along[:, i] * along[:, j]])
-    return np.einsum("nk,xy->nxky", terms, np.eye(3)).reshape(3 * len(xyz), -1)
+    shapes: FloatArray = np.einsum("nk,xy->nxky", terms, np.eye(3))
+    return shapes.reshape(3 * len(xyz), -1)
 
 
 def _smooth_fraction(

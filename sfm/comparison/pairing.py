@@ -9,7 +9,6 @@ another.
 
 from __future__ import annotations
 
-import re
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,11 +17,11 @@ from scipy.spatial import cKDTree
 from sfm.camera import tangents_from_pixel
 from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.errors import GeometryError
+from sfm.files.covariance_file import UNCODED
 from sfm.network import rows_of
 from sfm.similarity import Similarity, fit_similarity
 from sfm.stored_result import StoredResult
 
-UNCODED = re.compile(r"u\d+")  # names that Kolinear gives to points without one
 SAME_PX = 1e-2  # image points closer than this are one measurement, as files round it
 SAME_RAY_PX = 0.1  # likewise of directions, which differ by what the conversion of a camera costs
 NEAR_PX = 1.0  # measurements of one target or one piece of texture by two programs lie closer than this

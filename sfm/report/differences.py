@@ -12,6 +12,7 @@ import numpy as np
 from sfm.comparison.significance import InteriorDifference, ResultComparison
 from sfm.conventions import FloatArray
 from sfm.distortion.models import MODELS, Role
+from sfm.files.covariance_file import MAX_POINTS
 from sfm.files.plain_text import csv_text, or_none
 from sfm.report.figures.comparisons import difference_figure
 from sfm.report.figures.plots import Plot, png
@@ -25,9 +26,10 @@ WHY_UNTESTED = {
     "no standard deviations of common points": "the standard deviations of the common points are not known",
     "no common datum": "without an alignment only results in the datum of control are in one frame",
     "covariance of single points only": "the covariance between the points is not known, which a result of "
-    "this version with up to 1000 points keeps; in a minimal datum or one of control, and between different "
-    "datums, nothing can be said without",
+    "this version keeps; in a minimal datum or one of control, and between different datums, nothing can be "
+    "said without",
 }
+MANY = MAX_POINTS + 1  # points of which only a sample is kept with its covariance
 SMOOTH = 0.5  # fraction that a bending explains from which on a camera is the likely cause
 OTHER_SIGMAS = 5.0  # standard deviations from which on an interior orientation is another one
 FILES = ("differences.csv", "comparison.json", "comparison.html")
@@ -129,12 +131,18 @@ def words_of_test(found: ResultComparison) -> tuple[str, str]:
     if found.untested:
         return f"Not tested: {WHY_UNTESTED.get(found.untested, found.untested)}.", "fair"
     about = " Approximate: the covariance between points is not known." if found.approximate else ""
+    tested, of = _tested(found), len(found.points)
+    if tested < MANY <= of:
+        of = tested
+        about = (
+            f" Tested: {tested} of {len(found.points)} points, whose covariance together both results keep."
+        )
     moved = int(found.significant.sum())
     if not found.majority:
         return f"The points differ significantly, and no half of them agree.{about}", "bad"
     if moved:
         return (
-            f"The points differ significantly: {moved} of {len(found.points)} moved.{about}",
+            f"The points differ significantly: {moved} of {of} moved.{about}",
             "bad",
         )
     if found.changed:

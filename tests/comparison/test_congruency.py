@@ -66,6 +66,13 @@ def epoch(seed: int, datum: str, shift: FloatArray | None = None, *, bar: float 
     )
 
 
+def sampled(result: StoredResult, points: np.ndarray) -> StoredResult:
+    """The same with the covariance of some points only."""
+    assert result.covariance is not None
+    rows = (3 * points[:, None] + np.arange(3)).ravel()
+    return replace(result, covariance=result.covariance[np.ix_(rows, rows)], covariance_points=points)
+
+
 def _interior_sigma(a: Adjustment) -> FloatArray:
     camera = a.estimate.cameras[0]
     sigma = np.full(len(camera.names), np.nan)
@@ -123,6 +130,20 @@ def test_another_interior_orientation_is_told() -> None:
     second = replace(second, estimate=replace(second.estimate, cameras=(other,)))
     said = " ".join(words_of_cause(compare_results(first, second)))
     assert f"Camera {camera.name} has another interior orientation: cx differs by" in said
+
+
+def test_where_a_sample_is_kept_the_points_of_both_samples_are_tested() -> None:
+    shift = np.zeros((60, 3))
+    shift[MOVED] = [0.004, -0.002, 0.003]
+    first = sampled(epoch(4, "free"), np.arange(0, 45))
+    second = sampled(epoch(5, "minimal", shift), np.arange(10, 60))
+    found = compare_results(first, second)
+    assert list(np.flatnonzero(np.isfinite(found.statistic))) == list(range(10, 45))
+    assert list(np.flatnonzero(found.significant)) == [17, 22, 41]  # of 5, 17, 22, 41, 58
+    assert found.point_difference[MOVED] == pytest.approx(shift[MOVED], abs=1.5e-3)
+    assert compare_results(sampled(epoch(4, "free"), np.arange(3)), second).untested.startswith(
+        "congruency: 0"
+    )
 
 
 def test_where_no_half_agrees_no_point_is_blamed() -> None:
