@@ -19,15 +19,12 @@ from sfm.adjustment.engine.local_frame import centroid_of, shifted
 from sfm.adjustment.engine.motions import motions_of
 from sfm.adjustment.engine.normals import solve_lower
 from sfm.adjustment.engine.observed_unknowns import Weighted, weighted_of
-from sfm.adjustment.engine.products import times_points
 from sfm.adjustment.engine.unknowns import Unknowns, unknowns_of
 from sfm.adjustment.quality.rank import reduced_names
 from sfm.adjustment.result import Adjustment
 from sfm.conventions import FloatArray, IntArray
 from sfm.errors import GeometryError
 from sfm.kernels.threads import own_threads
-
-COLUMNS = 192  # of the points that are worked on at a time, which bounds the memory
 
 
 @dataclass(frozen=True)
@@ -59,13 +56,15 @@ class Marginal:
         rows = (3 * np.asarray(points)[:, None] + np.arange(3)).ravel()
         # dx of each as a linear function of the reduced unknowns: themselves, or -L^-T Y' of a point
         through = np.zeros((self.layout.reduced, len(rows)))
-        for start in range(0, len(rows), COLUMNS):
-            own_rows = rows[start : start + COLUMNS]
-            h = np.zeros((len(b.L), 3, len(own_rows)))
-            h.reshape(3 * len(h), len(own_rows))[own_rows, np.arange(len(own_rows))] = 1.0
-            part = np.zeros((self.layout.reduced, len(own_rows)))
-            times_points(observations, b, solve_lower(b.L, h), part)
-            through[:, start : start + COLUMNS] = part
+        of_photographs = through[: 6 * len(observations.camera)].reshape(-1, 6, len(rows))
+        of_interior = through[len(of_photographs) * 6 :][: b.Y_interior.shape[2]]
+        inverse = solve_lower(b.L[points], np.tile(np.eye(3), (len(points), 1, 1)))
+        for s, j in enumerate(points):
+            seen = slice(observations.start[j], observations.start[j + 1])
+            own = slice(3 * s, 3 * s + 3)
+            rays = np.swapaxes(b.Y[seen], 1, 2) @ inverse[s]
+            np.add.at(of_photographs[:, :, own], observations.image[seen], rays)
+            of_interior[:, own] = b.Y_interior[j].T @ inverse[s]
         E = np.zeros((self.layout.reduced, u + len(rows)))
         E[unknowns, np.arange(u)] = 1.0
         E[:, u:] = -through
