@@ -20,9 +20,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
-from scipy.stats import chi2, f
 
 from sfm.conventions import BoolArray, FloatArray
+from sfm.distributions import chi2_isf, f_isf
 from sfm.errors import GeometryError
 from sfm.similarity import mean_distance, similarity_motions
 
@@ -206,5 +206,5 @@ def critical_value(alpha: float, freedom: int, redundancy: int | None) -> float:
         redundancy: of the variances; None if they are known.
     """
     if redundancy is None:
-        return float(chi2.isf(alpha, freedom) / freedom)
-    return float(f.isf(alpha, freedom, redundancy))
+        return float(chi2_isf(alpha, freedom) / freedom)
+    return float(f_isf(alpha, freedom, redundancy))
