@@ -56,8 +56,9 @@ class Marginal:
         rows = (3 * np.asarray(points)[:, None] + np.arange(3)).ravel()
         # dx of each as a linear function of the reduced unknowns: themselves, or -L^-T Y' of a point
         through = np.zeros((self.layout.reduced, len(rows)))
-        of_photographs = through[: 6 * len(observations.camera)].reshape(-1, 6, len(rows))
-        of_interior = through[len(of_photographs) * 6 :][: b.Y_interior.shape[2]]
+        m = len(observations.camera)
+        of_photographs = through[: 6 * m].reshape(m, 6, len(rows))
+        of_interior = through[6 * m :][: b.Y_interior.shape[2]]
         inverse = solve_lower(b.L[points], np.tile(np.eye(3), (len(points), 1, 1)))
         for s, j in enumerate(points):
             seen = slice(observations.start[j], observations.start[j + 1])
