@@ -67,6 +67,7 @@ class Correspondences:
     warnings: tuple[str, ...] = ()  # one line each
     point_failures: tuple[tuple[str, str], ...] = ()  # points without approximate values, with the reason
     given: bool = False  # whether the survey's own approximate values were what the orientation started from
+    left_out: tuple[tuple[str, str], ...] = ()  # photographs of another object, with the reason
 
 
 @dataclass(frozen=True)
