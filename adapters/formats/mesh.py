@@ -3,7 +3,8 @@
 Polygons of PLY are cut into triangles from their first corner. What a file says of its own size is
 checked against its size before memory is taken.
 
-Source: 3D Systems (1989), StereoLithography Interface Specification; Turk (1994), The PLY polygon file format.
+Source: 3D Systems (1989), StereoLithography Interface Specification; Turk (1994), The PLY polygon file
+format.
 """
 
 from __future__ import annotations
@@ -155,8 +156,8 @@ class _Values:
             rows = self._words(count * len(names)).reshape(count, len(names))
             return rows[:, [names.index(axis) for axis in "xyz"]]
         record = np.dtype([(f"{k}", self.order + TYPES[one[0]]) for k, one in enumerate(properties)])
-        rows = np.frombuffer(self._bytes(count * record.itemsize), dtype=record)
-        return np.stack([rows[f"{names.index(axis)}"] for axis in "xyz"], axis=1).astype(float)
+        packed = np.frombuffer(self._bytes(count * record.itemsize), dtype=record)
+        return np.stack([packed[f"{names.index(axis)}"] for axis in "xyz"], axis=1).astype(float)
 
     def faces(self, count: int, properties: list[tuple[str, ...]], keep: bool = True) -> IntArray:
         """Read an element with lists row by row; return the polygons of the first list as triangles."""

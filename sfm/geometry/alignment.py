@@ -124,6 +124,8 @@ def align_321(points: MeasuredPoints, plane: list[str], line: list[str], origin:
     Raises:
         UnknownNameError: there is no point of a name.
         GeometryError: points that do not determine the system.
+
+    Source: Luhmann et al. (2020), Close-Range Photogrammetry and 3D Imaging, sec. 6.2.3.
     """
     if len(plane) != 3 or len(line) != 2:
         raise GeometryError(
@@ -158,6 +160,8 @@ def align_features(
 
     Raises:
         GeometryError: directions that are parallel.
+
+    Source: Luhmann et al. (2020), Close-Range Photogrammetry and 3D Imaging, sec. 6.2.3.
     """
     rotation = _axes(z_axis.value, x_axis.value, "by features")
     at = rotation @ origin.value
@@ -193,6 +197,8 @@ def align_points(
 
     Raises:
         GeometryError: fewer than three points in common, or all of them on a line.
+
+    Source: Horn (1987), J. Opt. Soc. Am. A 4(4); Caspary (2000), sec. 7, for both covariances.
     """
     common = [name for name in nominal.names if name in points.names]
     if len(common) < 3:
@@ -265,7 +271,7 @@ def _refine(
                     'weights = "equal"'
                 ) from error
             PM = cho_solve(factor, M)
-        pull = np.linalg.solve(M.T @ PM, PM.T)
+        pull: FloatArray = np.asarray(np.linalg.solve(M.T @ PM, PM.T))
         step = -pull @ d
         T = _stepped(T, step)
         if np.abs(step[:3]).max() < CONVERGED * size and np.abs(step[3:]).max() < CONVERGED:

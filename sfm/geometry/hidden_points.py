@@ -30,6 +30,8 @@ def with_hidden_point(
     Raises:
         UnknownNameError: a target is not there.
         GeometryError: the name is taken, or both targets are in one place.
+
+    Source: Luhmann et al. (2020), sec. 6.6.
     """
     if name in points.names:
         raise GeometryError(f"hidden point {name}: there is a point of that name already")

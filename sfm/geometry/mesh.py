@@ -94,7 +94,7 @@ def _feet(p: FloatArray, corners: FloatArray) -> FloatArray:
     plane = a + v[:, None] * ab + w[:, None] * ac
     on_edges = np.stack([_on_edge(p, a, b), _on_edge(p, b, c), _on_edge(p, c, a)], axis=1)
     nearest = np.argmin(np.linalg.norm(on_edges - p, axis=2), axis=1)
-    return np.where(inside[:, None], plane, on_edges[np.arange(len(a)), nearest])
+    return np.asarray(np.where(inside[:, None], plane, on_edges[np.arange(len(a)), nearest]))
 
 
 def _on_edge(p: FloatArray, a: FloatArray, b: FloatArray) -> FloatArray:

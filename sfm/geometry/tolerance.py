@@ -66,6 +66,8 @@ def deviations_from_points(
 
     Raises:
         GeometryError: none of them was measured.
+
+    Source: ISO 14253-1:2017 for the decisions; law of propagation of covariances.
     """
     wanted = set(points.names if chosen is None else [points.names[j] for j in chosen])
     common = [one for one in nominal.names if one in points.names and one in wanted]
@@ -112,6 +114,8 @@ def deviations_from_mesh(
 
     Raises:
         GeometryError: a mesh without triangles.
+
+    Source: ISO 14253-1:2017 for the decisions; law of propagation of covariances.
     """
     found = distances_from_mesh(points.xyz[chosen], mesh)
     value = found.distance - offset
@@ -140,6 +144,8 @@ def deviations_from_shape(
         lower: smallest distance, object unit.
         upper: largest distance, object unit.
         coverage: k of the expanded uncertainty.
+
+    Source: ISO 14253-1:2017 for the decisions; law of propagation of covariances.
     """
     _, normals, _ = fit.shape.design(points.xyz[fit.points])
     vector = np.einsum("nc,nci->ni", fit.distances, normals)

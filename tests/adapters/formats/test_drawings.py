@@ -28,8 +28,10 @@ def stl_binary(corners: np.ndarray) -> bytes:
 
 def ply(form: str) -> bytes:
     head = (
-        f"ply\nformat {form} 1.0\ncomment x\nelement vertex 4\nproperty float x\nproperty double y\n"
-        "property float z\nproperty uchar red\nelement face 1\nproperty list uchar int vertex_indices\nend_header\n"
+        f"ply\nformat {form} 1.0\ncomment x\n"
+        "element vertex 4\nproperty float x\nproperty double y\n"
+        "property float z\nproperty uchar red\nelement face 1\n"
+        "property list uchar int vertex_indices\nend_header\n"
     )
     if form == "ascii":
         return (head + "".join(f"{x} {y} {z} 7\n" for x, y, z in CORNERS) + "4 0 1 2 3\n").encode()
@@ -65,7 +67,7 @@ def test_meshes_are_read(name: str, tmp_path: Path) -> None:
     [
         ("a.obj", b"v 0 0 0", "unknown ending '.obj', a mesh is .stl or .ply"),
         ("a.stl", b"", "neither a binary STL file of the size that it states, nor a text"),
-        ("a.stl", stl_binary(CORNERS)[:-1], "neither a binary STL"),
+        ("a.stl", stl_binary(CORNERS)[:-1], "no triangles"),
         ("a.stl", b"solid x\nvertex 1 2 3\nendsolid", "1 vertices, three for each triangle"),
         ("a.stl", b"solid x\nvertex 1 2 nan\nendsolid", "line 2"),
         ("a.stl", b"solid x\nendsolid", "no triangles, at least one is needed"),
