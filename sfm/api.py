@@ -5,7 +5,6 @@ Everything public is named in `sfm/__init__.pyi`. Adapters are imported where th
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
@@ -18,6 +17,7 @@ from sfm.errors import BackendError, SurveyFileError
 from sfm.network import Estimate, Network
 from sfm.pipeline import run_survey as run_stages
 from sfm.result import SurveyResult
+from sfm.runtime.cores import cores
 from sfm.runtime.progress import SILENT, Progress
 from sfm.stored_result import StoredResult
 from sfm.survey.inputs.survey import Survey, read_survey
@@ -223,13 +223,6 @@ def colmap_writer(result: SurveyResult) -> Callable[[Path], Any] | None:
     from adapters.colmap.camera_models import write_model
 
     return lambda folder: write_model(folder, both.network, both.adjustment.estimate)
-
-
-def cores() -> int:
-    """Return how many processor cores this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
 
 
 @contextmanager

@@ -154,12 +154,13 @@ def _run_survey(
     """Run a survey, write its result and tell it; `from_photographs` is what the command is for."""
     begun = time.perf_counter()
     with loading():
-        from sfm.api import colmap_writer, cores, one_blas_thread, programs_of, read_result
+        from sfm.api import colmap_writer, one_blas_thread, programs_of, read_result
         from sfm.cli.console import tell_result
         from sfm.pipeline import run_survey
         from sfm.report.findings.findings import findings_of
         from sfm.report.log import SurveyLog
         from sfm.report.output import write_result
+        from sfm.runtime.cores import cores
         from sfm.runtime.progress_bar import drawn_progress
         from sfm.survey.inputs.calibration import with_calibration
         from sfm.survey.inputs.survey import survey_of_file

@@ -11,9 +11,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.stats import chi2, f
 
 from sfm.conventions import BoolArray, FloatArray, IntArray
+from sfm.distributions import chi2_isf, f_isf
 from sfm.errors import GeometryError
 from sfm.geometry.measured import Function, MeasuredPoints
 from sfm.geometry.shapes.gauss_helmert import constraint_covariance, refine_weighted
@@ -363,8 +363,8 @@ def _refuse_rank(kind: Kind, A: FloatArray, constraints: int) -> None:
 
 def _critical(redundancy: int, of_variances: int | None) -> float:
     if of_variances is None:
-        return float(chi2.isf(ALPHA, redundancy) / redundancy)
-    return float(f.isf(ALPHA, redundancy, of_variances))
+        return float(chi2_isf(ALPHA, redundancy) / redundancy)
+    return float(f_isf(ALPHA, redundancy, of_variances))
 
 
 def _sigma_of_distances(
