@@ -17,8 +17,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
-from scipy.stats import chi2, f
 
+from sfm.comparison.congruency import critical_value
 from sfm.comparison.pairing import fit_robustly
 from sfm.conventions import BoolArray, FloatArray, IntArray, rotation_from_vector
 from sfm.errors import GeometryError
@@ -226,10 +226,7 @@ def align_points(
     statistic = critical = np.nan
     if weights == "network" and redundancy:
         statistic = omega / redundancy
-        r = points.redundancy
-        critical = float(
-            chi2.isf(ALPHA, redundancy) / redundancy if r is None else f.isf(ALPHA, redundancy, r)
-        )
+        critical = critical_value(ALPHA, redundancy, points.redundancy)
     sigma0 = float(np.sqrt(omega / redundancy)) if redundancy else np.nan
     fit = BestFit(tuple(common), used, difference, T.scale, sigma0, redundancy, float(statistic), critical)
     return Alignment("points", T, rows[used], linear, of_nominal, scale, fit)

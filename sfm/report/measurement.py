@@ -70,7 +70,7 @@ def write_measurement(
                 (folder / name).write_text(content, encoding="utf-8", newline="")
             covariance = found.points.covariance
             if covariance is not None and covariance.ndim == 2 and len(found.points.names) <= MAX_POINTS:
-                write_covariance(folder, covariance)
+                write_covariance(folder, covariance, found.points.names, None)
             for name, write in drawings:
                 write(folder / name)
     return out / PAGE
