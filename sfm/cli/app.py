@@ -44,6 +44,7 @@ for _command in (
     measuring.match,
     measuring.targets,
     inspecting.measure,
+    inspecting.accept,
     solvers.validate,
     solvers.compare,
     solvers.convert,

@@ -39,6 +39,7 @@ COMMANDS = {
     "init": ("photographs",),
     "view": ("result",),
     "measure": ("result",),
+    "accept": ("result", "lengths.csv", "--limit-a", "0.1"),
     "match": ("left.png", "right.png"),
     "targets": ("--out", "sheet.pdf"),
     "validate": (),

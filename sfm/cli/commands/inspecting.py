@@ -10,6 +10,8 @@ import typer
 from sfm.cli.commands.starting import loading
 from sfm.runtime.faults import working_on
 
+NOT_KEPT = 1  # exit code where a limit is proven not to be kept
+
 if TYPE_CHECKING:
     from collections.abc import Callable
 
@@ -71,6 +73,66 @@ def measure(
     for remark in found.remarks:
         print(f"! {remark}")
     print(f"Report: {page}")
+
+
+def accept(
+    source: Annotated[Path, typer.Argument(metavar="RESULT", help="Result folder of a survey.")],
+    lengths: Annotated[
+        Path, typer.Argument(metavar="LENGTHS.csv", help="Calibrated lengths: line,from,to,length[,sigma].")
+    ],
+    a: Annotated[float, typer.Option("--limit-a", metavar="A", help="A of the limit A + K L, object unit.")],
+    k: Annotated[float, typer.Option("--limit-k", metavar="K", help="K of it, such as 2e-5.")] = 0.0,
+    b: Annotated[
+        float | None, typer.Option("--limit-b", metavar="B", help="What the limit is at most, object unit.")
+    ] = None,
+    coverage: Annotated[
+        float, typer.Option("--coverage", metavar="k", min=1.0, help="k of U = k sigma of the calibration.")
+    ] = 2.0,
+    diagonal: Annotated[
+        float | None,
+        typer.Option(
+            "--diagonal",
+            metavar="D",
+            help="Body diagonal of the measuring volume, object unit; else of the box around all points.",
+        ),
+    ] = None,
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder of table and page.")] = Path(
+        "out/acceptance"
+    ),
+) -> None:
+    """Test a result against calibrated lengths (VDI/VDE 2634 part 1).
+
+    The scale must come from other bars than those tested. Exit code 1 if the limit is proven not to be kept.
+    """
+    with loading():
+        from adapters.formats.result_tables import read_result, read_scale_sources
+        from sfm.files.manifest import refuse_foreign_folder
+        from sfm.inspection.acceptance import accept_result, read_lengths
+        from sfm.report.acceptance import write_acceptance
+
+    refuse_foreign_folder(out)
+    with working_on(str(source)):
+        result = read_result(source)
+        bars, control = read_scale_sources(source)
+    found = accept_result(
+        result,
+        read_lengths(lengths),
+        a=a,
+        k=k,
+        b=float("inf") if b is None else b,
+        bars=bars,
+        control=control,
+        coverage=coverage,
+        diagonal=diagonal,
+    )
+    page = write_acceptance(found, out)
+    print(found.headline)
+    print(f"largest error of a length: {found.largest:.4g} {found.unit}")
+    for line in found.lacking:
+        print(f"! {line}")
+    print(f"Report: {page}")
+    if found.verdict == "bad":
+        raise SystemExit(NOT_KEPT)
 
 
 def _drawings(found: Measurement) -> list[tuple[str, Callable[[Path], None]]]:

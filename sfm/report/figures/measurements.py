@@ -6,6 +6,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from sfm.geometry.tolerance import IN, OUT, Deviations
+from sfm.inspection.acceptance import Acceptance
 from sfm.report.figures.plots import BLUE, GREEN, GREY, ORANGE, RED
 from sfm.report.numbers import finer_unit
 
@@ -46,4 +47,35 @@ def deviation_figure(found: Deviations, unit: str) -> Figure:
     right.set_xlabel("points in order of their deviation")
     right.set_ylabel(f"deviation and U [{fine}]")
     right.legend(fontsize=8, loc="upper left")
+    return picture
+
+
+def length_error_figure(found: Acceptance) -> Figure:
+    """Draw the errors of length measurement over the length, with their limit."""
+    length, error = found.lengths.length, found.error
+    U = found.coverage * np.nan_to_num(found.lengths.sigma)
+    factor, fine = finer_unit(found.unit, float(max(np.abs(error).max(), found.limit.max())))
+    picture = Figure(figsize=(8.5, 4.2), layout="constrained")
+    axes = picture.subplots()
+    x = np.linspace(0, 1.05 * float(length.max()), 200)
+    limit = np.minimum(found.a + found.k * x, found.b) * factor
+    axes.plot(x, limit, color=GREY, lw=1.2)
+    axes.plot(x, -limit, color=GREY, lw=1.2)
+    axes.axhline(0, color=GREY, lw=0.6)
+    decision = np.array(found.decision)
+    for name in dict.fromkeys(found.decision):
+        rows = decision == name
+        axes.errorbar(
+            length[rows],
+            error[rows] * factor,
+            yerr=U[rows] * factor,
+            fmt="o",
+            ms=4,
+            lw=0.8,
+            color=dict(COLOURS).get(name, ORANGE),
+            label=f"{name} ({rows.sum()})",
+        )
+    axes.set_xlabel(f"calibrated length [{found.unit}]")
+    axes.set_ylabel(f"measured minus calibrated [{fine}]")
+    axes.legend(fontsize=8)
     return picture
