@@ -109,6 +109,32 @@ def read_image_points(folder: Path, network: Network) -> tuple[ImagePoints, Bool
     return seen, rejected, table.values
 
 
+def read_scale_sources(folder: Path) -> tuple[tuple[str, ...] | None, tuple[str, ...]]:
+    """Read what gave a result its scale, from given.csv.
+
+    Args:
+        folder: of the result.
+
+    Returns:
+        "start - end" of its scale bars, None without a given.csv, and the names of its control points.
+
+    Raises:
+        SurveyFileError: the table is damaged.
+    """
+    path = folder / "given.csv"
+    if not path.is_file():
+        return None, ()
+    if not path.read_text(encoding="utf-8").strip().partition("\n")[2]:
+        return (), ()
+    table = read_table(path, ("kind", "name"), (), ignored=None)
+    kinds, names = table.texts
+    found = {
+        kind: tuple(dict.fromkeys(n for k, n in zip(kinds, names, strict=True) if k == kind))
+        for kind in ("scale bar", "control point")
+    }
+    return found["scale bar"], found["control point"]
+
+
 def write_tables(folder: Path, result: StoredResult) -> None:
     """Write a result as tables with named columns; standard deviations only where any is known.
 
