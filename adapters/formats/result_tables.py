@@ -25,13 +25,13 @@ import numpy as np
 from pydantic import Field
 
 from adapters.colmap.names import SIDE_FILE, NamedCamera, read_side_file
-from adapters.reading.json_files import Content, Name, Pixel, Side, Text, read_json
 from sfm.camera import Camera
 from sfm.conventions import BoolArray, FloatArray, angles_from_rotation, rotation_from_angles
 from sfm.distortion.models import MODELS
 from sfm.errors import OutputError, SurveyFileError
 from sfm.files.covariance_file import read_covariance, write_covariance
 from sfm.files.csv_tables import CsvTable, read_header, read_table
+from sfm.files.json_files import Content, Name, Pixel, Side, Text, read_json
 from sfm.files.plain_text import csv_text
 from sfm.network import Estimate, ImagePoints, Network
 from sfm.stored_result import StoredResult

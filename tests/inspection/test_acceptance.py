@@ -64,6 +64,7 @@ def test_a_complete_test_is_proven(tmp_path: Path) -> None:
     found = accepted(*volume())
     assert found.verdict == "good" and found.lacking == () and found.count("in") == 35
     assert found.headline == "The limit is kept: all 35 lengths are proven to be inside."
+    assert found.diagonal == pytest.approx(np.sqrt(3) * 1000)
     longest = int(np.argmax(found.lengths.length))
     assert found.limit[longest] == pytest.approx(0.02 + 2e-5 * np.sqrt(3) * 1000, rel=1e-5)
     assert accepted(*volume(), b=0.03).limit.max() == 0.03
