@@ -265,6 +265,7 @@ def batch(
             "its workers need Kolinear and see the same folders.",
         ),
     ] = None,
+    pictures_mb: PicturesMb = 15.0,
     resume: Annotated[
         bool, typer.Option("--resume", help="Keep what an earlier run finished, if its inputs are the same.")
     ] = False,
@@ -303,6 +304,7 @@ def batch(
             table,
             resume=resume,
             allow_outside=allow_outside,
+            pictures_mb=pictures_mb,
         )
     print_batch(Console(highlight=False), rows, out / "index.html")
     if any(row.fault for row in rows):
