@@ -16,14 +16,19 @@ Analyse geodaetischer Deformationsmessungen; Baarda (1973), S-transformations an
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve
 
+from sfm.comparison.stable_points import (
+    critical_value,
+    find_stable_points,
+    in_datum,
+    point_blocks,
+    single_tests,
+)
 from sfm.conventions import BoolArray, FloatArray
-from sfm.distributions import chi2_isf, f_isf
-from sfm.errors import GeometryError
 from sfm.similarity import mean_distance, similarity_motions
 
 MOTIONS = {"none": 0, "rigid": 6, "similarity": 7}  # parameters of what is no change
@@ -74,82 +79,40 @@ def congruency(
         GeometryError: too few points, or a covariance that is singular beyond the datum.
     """
     n = len(xyz)
-    stable = np.ones(n, dtype=bool) if datum is None else datum.copy()
-    u = MOTIONS[motion]
-    if stable.sum() < MIN_STABLE:
-        raise GeometryError(f"congruency: {int(stable.sum())} points, expected {MIN_STABLE} or more")
-    first = int(stable.sum())
-    G = motions(xyz)[:, :u]
-    single = critical_value(alpha / 2 / first, 3, redundancy)
-    global_statistic, global_critical, agreed = 0.0, 0.0, False
-    while True:
-        d, Q, omega, drops = _in_datum(difference, covariance, G, stable)
-        freedom = 3 * int(stable.sum()) - u
-        limit = critical_value(alpha / 2, freedom, redundancy)
-        if stable.sum() == first:
-            global_statistic, global_critical = omega / freedom, limit
-        agreed = omega / freedom <= limit and drops[stable].max() <= single
-        if agreed or stable.sum() - 1 < max(MIN_STABLE, STABLE_FRACTION * first):
-            break
-        stable[np.argmax(np.where(stable, drops, -np.inf))] = False
-    moved = ~stable & (np.ones(n, dtype=bool) if datum is None else datum)
+    every = np.ones(n, dtype=bool)
+    candidates = every if datum is None else datum.copy()
+    first = int(candidates.sum())
+    G = motions(xyz)[:, : MOTIONS[motion]]
+    found = find_stable_points(
+        difference,
+        covariance,
+        G,
+        candidates=candidates,
+        least=max(MIN_STABLE, math.ceil(STABLE_FRACTION * first)),
+        redundancy=redundancy,
+        alpha=alpha / 2,
+        alpha_single=alpha / 2,
+    )
+    d, Q = in_datum(difference, covariance, G, found.stable.astype(float))
+    T = np.where(found.stable, found.drops, single_tests(d, Q))
+    moved = ~found.stable & candidates
     if datum is not None:  # points that carry no datum are judged in it
-        others = critical_value(alpha / 2 / max(1, n - first), 3, redundancy)
-        moved |= ~datum & (drops > others)
-    return Congruency(d, Q, stable, moved, drops, single, global_statistic, global_critical, bool(agreed))
+        moved |= ~datum & (critical_value(alpha / 2 / max(1, n - first), 3, redundancy) < T)
+    start = found.steps[0]
+    return Congruency(
+        difference=d,
+        covariance=point_blocks(Q, 3),
+        stable=found.stable,
+        moved=moved,
+        statistic=T,
+        critical=critical_value(alpha / 2 / first, 3, redundancy),
+        global_statistic=start.statistic,
+        global_critical=start.critical,
+        agreed=found.agreed,
+    )
 
 
 def motions(xyz: FloatArray) -> FloatArray:
     """Return G: how coordinates change with translations, small rotations and the scale, (3 n, 7)."""
     G = similarity_motions(xyz, centre=xyz.mean(axis=0), size=mean_distance(xyz))
     return G.reshape(3 * len(xyz), 7)
-
-
-def _in_datum(
-    difference: FloatArray, covariance: FloatArray, G: FloatArray, stable: BoolArray
-) -> tuple[FloatArray, FloatArray, float, FloatArray]:
-    """Return d_S, blocks of Q_S, Omega over the stable points, and T of each point."""
-    n = len(difference)
-    rows = np.repeat(stable, 3)
-    basis, triangle = np.linalg.qr(G[rows])  # orthonormal over the stable points
-    G = np.linalg.solve(triangle.T, G.T).T
-    d = difference.ravel() - G @ (basis.T @ difference.ravel()[rows])
-    # S Q S' = Q - G A' - A G' + G (B' Q_FF B) G' with A = Q_F' B
-    A = covariance[:, rows] @ basis
-    Q = covariance - G @ A.T - A @ G.T + G @ (basis.T @ A[rows]) @ G.T
-    blocks = np.stack([Q[3 * j : 3 * j + 3, 3 * j : 3 * j + 3] for j in range(n)])
-    inner = Q[np.ix_(rows, rows)]
-    level = float(np.trace(inner)) / len(inner)
-    try:
-        factor = cho_factor(inner + level * basis @ basis.T, lower=True)
-    except np.linalg.LinAlgError as error:
-        raise GeometryError(
-            "congruency: the covariance of the points is singular beyond its datum"
-        ) from error
-    P = cho_solve(factor, np.eye(len(inner))) - basis @ basis.T / level
-    w = P @ d[rows]
-    omega = float(d[rows] @ w)
-    T = np.full(n, np.nan)
-    own = np.stack([P[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] for k in range(len(inner) // 3)])
-    # the drop of Omega without point k: w_k' P_kk^-1 w_k
-    w3 = w.reshape(-1, 3)
-    T[stable] = np.einsum("ki,ki->k", w3, np.linalg.solve(own, w3[..., None])[..., 0]) / 3
-    moved = ~stable
-    d3 = d.reshape(-1, 3)
-    T[moved] = (
-        np.einsum("ki,ki->k", d3[moved], np.linalg.solve(blocks[moved], d3[moved][..., None])[..., 0]) / 3
-    )
-    return d3, blocks, omega, T
-
-
-def critical_value(alpha: float, freedom: int, redundancy: int | None) -> float:
-    """Return the value that a mean of `freedom` squares exceeds with probability alpha under no change.
-
-    Args:
-        alpha: error probability.
-        freedom: degrees of freedom of the statistic.
-        redundancy: of the variances; None if they are known.
-    """
-    if redundancy is None:
-        return float(chi2_isf(alpha, freedom) / freedom)
-    return float(f_isf(alpha, freedom, redundancy))

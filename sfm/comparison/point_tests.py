@@ -9,8 +9,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sfm.comparison.congruency import Congruency, congruency, critical_value
+from sfm.comparison.congruency import Congruency, congruency
 from sfm.comparison.pairing import Pairing
+from sfm.comparison.stable_points import critical_value
 from sfm.conventions import METRES, BoolArray, FloatArray, IntArray
 from sfm.errors import GeometryError
 from sfm.similarity import Similarity
