@@ -56,7 +56,7 @@ def epoch(
     network = replace(network, image_points=replace(seen, xy=xy))
     errors = BAR_SIGMA * rng.standard_normal(2) if bar_errors is None else bar_errors
     for (a, b), error in zip(BARS, errors.tolist(), strict=True):
-        length = float(np.linalg.norm(truth.points[int(a) - 1] - truth.points[int(b) - 1]))
+        length = float(np.linalg.norm(now.points[int(a) - 1] - now.points[int(b) - 1]))
         network = network.with_scale_bar(a, b, length + error + given, BAR_SIGMA)
     kind = Datum(datum, points=["1", "2", "3"] if datum == "minimal" else None)
     a = adjust(network, now, datum=kind, sigma_px=NOISE_PX, reject="none")
