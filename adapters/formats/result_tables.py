@@ -4,7 +4,7 @@
     images.csv          image,X,Y,Z,omega_deg,phi_deg,kappa_deg[,sX,sY,sZ],camera
     cameras.csv         camera,parameter,value[,sigma],unit
     image_points.csv    image,point,x_px,y_px[,sx_px,sy_px][,rejected]
-    point_covariance.npy    of all points together, see `sfm.files.covariance_file`
+    point_covariance.npy    of the points together, see `sfm.files.covariance_file`
     summary.json        name of the survey, model, size and pixel of each camera, redundancy, datum
 
 These are the tables that `kolinear run` writes; other columns are passed over. What a summary does not say of
@@ -66,6 +66,8 @@ def read_result(folder: Path) -> StoredResult:
     points = table.keys("id")
     seen, rejected = _image_points(folder, images, points)
     network = Network(images, camera, points, seen.select(~rejected))
+    known = table.values.shape[1] > 3
+    joint, of_points = read_covariance(folder, points, table.values[:, 3:]) if known else (None, None)
     return StoredResult(
         summary.survey or folder.name,
         network,
@@ -75,8 +77,9 @@ def read_result(folder: Path) -> StoredResult:
         sigmas,
         summary.redundancy,
         summary.length_unit or "",
-        read_covariance(folder, table.values[:, 3:]) if table.values.shape[1] > 3 else None,
+        joint,
         summary.datum.kind if summary.datum else "",
+        covariance_points=of_points,
     )
 
 
@@ -184,7 +187,7 @@ def write_tables(folder: Path, result: StoredResult) -> None:
             ),
         )
         if result.covariance is not None:
-            write_covariance(folder, result.covariance)
+            write_covariance(folder, result.covariance, network.points, result.covariance_points)
         text = json.dumps(summary, indent=2, ensure_ascii=False)
         (folder / "summary.json").write_text(text + "\n", encoding="utf-8")
     except OSError as error:

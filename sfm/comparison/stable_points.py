@@ -50,6 +50,7 @@ class StablePoints:
     agreed: bool  # whether they pass the test; else no majority does
     steps: tuple[Step, ...]
     drops: FloatArray  # T of each stable point, NaN of the others, (n,)
+    drops_of_all: FloatArray  # T of each candidate before any was removed, NaN of the others, (n,)
 
 
 def find_stable_points(
@@ -92,6 +93,8 @@ def find_stable_points(
     left = np.ones(len(chosen), dtype=bool)
     single = None if alpha_single is None else critical_value(alpha_single / len(chosen), m, redundancy)
     steps: list[Step] = []
+    of_all = np.full(n, np.nan)
+    of_all[chosen] = _drops(P, w, left, m)
     while True:
         omega, freedom = float(d @ w), m * int(left.sum()) - u
         drops = _drops(P, w, left, m)
@@ -112,7 +115,7 @@ def find_stable_points(
     stable, T = np.zeros(n, dtype=bool), np.full(n, np.nan)
     stable[chosen[left]] = True
     T[chosen] = drops
-    return StablePoints(stable, bool(agreed), tuple(steps), T)
+    return StablePoints(stable, bool(agreed), tuple(steps), T, of_all)
 
 
 def in_datum(

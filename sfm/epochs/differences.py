@@ -58,6 +58,7 @@ class Differences:
     only_first: tuple[str, ...]  # points that the second epoch lacks
     only_second: tuple[str, ...]
     by_place: int  # points recognised by their place
+    untested: tuple[str, ...]  # common points of which one result did not keep the covariance
     shared: tuple[str, ...]  # given values that both epochs share, in words
 
     @property
@@ -87,6 +88,11 @@ def epoch_differences(first: Epoch, second: Epoch) -> Differences:
     a, b = _of_own_photographs(first.result, "a"), _of_own_photographs(second.result, "b")
     pairing = pair_results(a, b)
     pa, pb = pairing.points.T
+    kept = (a.covariance_rows(pa) >= 0) & (b.covariance_rows(pb) >= 0)
+    untested = tuple(a.network.points[j] for j in pa[~kept])
+    pairs = pairing.points[kept]
+    others = _others(a, pa), _others(b, pb)
+    pa, pb = pairs.T
     if len(pa) < 4:
         raise GeometryError(
             f"{first.name} and {second.name} have {len(pa)} points in common, a test needs 4 or more"
@@ -98,7 +104,7 @@ def epoch_differences(first: Epoch, second: Epoch) -> Differences:
     xyz = a.estimate.points[pa]
     turn = moved.scale * moved.rotation
     Q = _covariance(a, pa, np.eye(3)) + _covariance(b, pb, turn)
-    influence_a, influence_b, shared = _shared(first, second, pairing.points, moved)
+    influence_a, influence_b, shared = _shared(first, second, pairs, moved)
     C = influence_a @ influence_b.T
     Q -= C
     Q -= C.T
@@ -112,9 +118,10 @@ def epoch_differences(first: Epoch, second: Epoch) -> Differences:
         covariance=Q,
         motion="similarity" if scale is None else "rigid",
         redundancy=sum(known) if known else None,
-        only_first=_others(a, pa),
-        only_second=_others(b, pb),
+        only_first=others[0],
+        only_second=others[1],
         by_place=pairing.points_by_place,
+        untested=untested,
         shared=shared,
     )
 
@@ -136,15 +143,10 @@ def _covariance(result: StoredResult, points: IntArray, turn: FloatArray) -> Flo
     """Covariance of some points together after a rotation and a scale, (3 n, 3 n)."""
     assert result.covariance is not None  # refused before
     n = len(points)
-    rows = _rows(points)
+    rows = (3 * result.covariance_rows(points)[:, None] + np.arange(3)).ravel()
     Q = result.covariance[np.ix_(rows, rows)]
     Q = (Q.reshape(-1, 3) @ turn.T).reshape(3 * n, 3 * n)
     return np.ascontiguousarray((Q.T.reshape(-1, 3) @ turn.T).reshape(3 * n, 3 * n))
-
-
-def _rows(points: IntArray) -> IntArray:
-    rows: IntArray = (3 * points[:, None] + np.arange(3)).ravel()
-    return rows
 
 
 def _refuse_shared_calibration(first: Epoch, second: Epoch) -> None:
@@ -197,15 +199,17 @@ Observed = tuple[list[tuple[int, float]], float, float]  # gradient by column, s
 def _observations(epoch: Epoch) -> Iterable[tuple[str, Observed]]:
     """Bars and coordinates of control that an epoch was given with a standard deviation, by their names."""
     names, x = epoch.result.network.points, epoch.result.estimate.points
-    bars = epoch.bars
+    bars, row = epoch.bars, epoch.result.covariance_rows(np.arange(len(names)))
     for i, j, length, sigma in zip(bars.start, bars.end, bars.length, bars.sigma, strict=True):
+        if not (sigma > 0 and row[i] >= 0 and row[j] >= 0):
+            continue
         u = (x[j] - x[i]) / np.linalg.norm(x[j] - x[i])
-        gradient = [(3 * i + k, -u[k]) for k in range(3)] + [(3 * j + k, u[k]) for k in range(3)]
-        if sigma > 0:
-            yield f"bar {' - '.join(sorted((names[i], names[j])))}", (gradient, float(sigma), float(length))
+        gradient = [(3 * int(row[i]) + k, -float(u[k])) for k in range(3)]
+        gradient += [(3 * int(row[j]) + k, float(u[k])) for k in range(3)]
+        yield f"bar {' - '.join(sorted((names[i], names[j])))}", (gradient, float(sigma), float(length))
     control = epoch.control
     for j, given, C in zip(control.point, control.xyz, control.covariance, strict=True):
         for k in range(3):
-            if 0 < C[k, k] < np.inf:
+            if 0 < C[k, k] < np.inf and row[j] >= 0:
                 key = f"{'XYZ'[k]} of control point {names[j]}"
-                yield key, ([(3 * int(j) + k, 1.0)], float(np.sqrt(C[k, k])), float(given[k]))
+                yield key, ([(3 * int(row[j]) + k, 1.0)], float(np.sqrt(C[k, k])), float(given[k]))

@@ -140,6 +140,20 @@ def inside(folder: Path, name: str, where: str, *, allow_outside: bool = False) 
     return path
 
 
+def is_own_file(path: Path) -> bool:
+    """Return whether a link leads to a file in the user's home folder, and through no hidden folder there.
+
+    Links to photographs in a folder that the user names are how photographs are put together, and no attack.
+    """
+    try:
+        target, home = path.resolve(), Path.home().resolve()
+    except (OSError, RuntimeError):
+        return False
+    if not (target.is_file() and target.is_relative_to(home)):
+        return False
+    return not any(part.startswith(".") for part in target.relative_to(home).parts)
+
+
 def read_survey_file(path: Path, *, allow_outside: bool = False) -> SurveyFile:
     """Read and check a survey file, without the tables that it names.
 
