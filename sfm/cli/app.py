@@ -6,7 +6,17 @@ from typing import Any
 
 import typer
 
-from sfm.cli.commands import checking, drafting, measuring, planning, refining, solvers, surveying, viewing
+from sfm.cli.commands import (
+    checking,
+    comparing_epochs,
+    drafting,
+    measuring,
+    planning,
+    refining,
+    solvers,
+    surveying,
+    viewing,
+)
 
 USAGE_ERROR: Any = typer.BadParameter.__base__  # of all that typer says of wrong arguments; it has no name
 
@@ -35,6 +45,7 @@ for _command in (
     measuring.targets,
     solvers.validate,
     solvers.compare,
+    comparing_epochs.epochs,
     solvers.convert,
     refining.refine,
     checking.doctor,

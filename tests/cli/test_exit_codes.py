@@ -43,6 +43,7 @@ COMMANDS = {
     "validate": (),
     "doctor": (),
     "compare": ("a", "b"),
+    "epochs": ("a", "b"),
     "convert": ("a", "b"),
     "refine": ("model", "--images", "photographs"),
     "plan": (
@@ -88,6 +89,7 @@ def test_what_nobody_has_foreseen_is_one_line_with_its_traceback_in_a_file(
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     for module in (
         "surveying",
+        "comparing_epochs",
         "measuring",
         "solvers",
         "refining",
@@ -96,7 +98,7 @@ def test_what_nobody_has_foreseen_is_one_line_with_its_traceback_in_a_file(
         "viewing",
         "checking",
     ):
-        monkeypatch.setattr(f"sfm.cli.{module}.loading", raising(ValueError("new\nline \x1b[31m")))
+        monkeypatch.setattr(f"sfm.cli.commands.{module}.loading", raising(ValueError("new\nline \x1b[31m")))
     code, lines = kolinear(monkeypatch, capsys, command, *COMMANDS[command])
     (path,) = tmp_path.iterdir()
     assert code == 70

@@ -72,7 +72,7 @@ def test_rates() -> None:
 def test_a_point_of_reference_that_moved_is_found_and_the_datum_does_without_it() -> None:
     shift = shift_of((10,), 8.0, 1)
     reference = np.arange(POINTS) < 20
-    found = compared(3, shift, reference=reference)
+    found = compared(9, shift, reference=reference)
     assert found.moved.tolist() == [j == 10 for j in range(POINTS)] and not found.stable[10]
     step = found.search.steps[0]
     assert step.removed == 10 and step.statistic > step.critical
