@@ -29,7 +29,7 @@ LAYERS = (
     ("sfm.targets", "sfm.matching", "sfm.orientation", "sfm.adjustment"),
     ("sfm.comparison", "sfm.geometry", "sfm.epochs", "sfm.planning", "sfm.rendering", "sfm.printing"),
     ("sfm.result",),
-    ("sfm.survey",),
+    ("sfm.survey", "sfm.inspection"),
     ("sfm.report",),
     ("sfm.pipeline",),
     ("sfm.batch", "sfm.cli", "sfm.api", "sfm.warm_up"),

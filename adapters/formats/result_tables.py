@@ -25,13 +25,13 @@ import numpy as np
 from pydantic import Field
 
 from adapters.colmap.names import SIDE_FILE, NamedCamera, read_side_file
-from adapters.reading.json_files import Content, Name, Pixel, Side, Text, read_json
 from sfm.camera import Camera
 from sfm.conventions import BoolArray, FloatArray, angles_from_rotation, rotation_from_angles
 from sfm.distortion.models import MODELS
 from sfm.errors import OutputError, SurveyFileError
 from sfm.files.covariance_file import read_covariance, write_covariance
 from sfm.files.csv_tables import CsvTable, read_header, read_table
+from sfm.files.json_files import Content, Name, Pixel, Side, Text, read_json
 from sfm.files.plain_text import csv_text
 from sfm.network import Estimate, ImagePoints, Network
 from sfm.stored_result import StoredResult
@@ -107,6 +107,32 @@ def read_image_points(folder: Path, network: Network) -> tuple[ImagePoints, Bool
     if keys != list(zip(*table.texts, strict=True)):
         raise SurveyFileError(f"{path}: its rows are not those of image_points.csv beside it")
     return seen, rejected, table.values
+
+
+def read_scale_sources(folder: Path) -> tuple[tuple[str, ...] | None, tuple[str, ...]]:
+    """Read what gave a result its scale, from given.csv.
+
+    Args:
+        folder: of the result.
+
+    Returns:
+        "start - end" of its scale bars, None without a given.csv, and the names of its control points.
+
+    Raises:
+        SurveyFileError: the table is damaged.
+    """
+    path = folder / "given.csv"
+    if not path.is_file():
+        return None, ()
+    if not path.read_text(encoding="utf-8").strip().partition("\n")[2]:
+        return (), ()
+    table = read_table(path, ("kind", "name"), (), ignored=None)
+    kinds, names = table.texts
+    found = {
+        kind: tuple(dict.fromkeys(n for k, n in zip(kinds, names, strict=True) if k == kind))
+        for kind in ("scale bar", "control point")
+    }
+    return found["scale bar"], found["control point"]
 
 
 def write_tables(folder: Path, result: StoredResult) -> None:

@@ -78,6 +78,8 @@ def find_stable_points(
 
     Raises:
         GeometryError: fewer candidates than `least`, or a covariance that is singular beyond G.
+
+    Source: Caspary (2000), Concepts of network and deformation analysis, sec. 8.2.
     """
     n, m = difference.shape
     u = G.shape[1]

@@ -46,6 +46,8 @@ def distance(a: Function, b: Function) -> Function:
 
     Raises:
         GeometryError: both are in one place, so that the distance has no derivative.
+
+    Source: law of propagation of covariances; Luhmann et al. (2020), sec. 2.4.
     """
     d = b.value - a.value
     length = float(np.linalg.norm(d))
@@ -70,6 +72,8 @@ def angle_of_directions(a: Function, b: Function, *, undirected: bool = False) -
 
     Raises:
         GeometryError: parallel vectors, whose angle has no derivative, or one without length.
+
+    Source: law of propagation of covariances; Luhmann et al. (2020), sec. 2.4.
     """
     p, q = a.value, b.value
     lp, lq = float(np.linalg.norm(p)), float(np.linalg.norm(q))
@@ -88,7 +92,15 @@ def angle_of_directions(a: Function, b: Function, *, undirected: bool = False) -
 
 
 def angle_at(vertex: Function, a: Function, b: Function) -> Function:
-    """Return the angle at a point between two others (rad)."""
+    """Return the angle at a point between two others (rad).
+
+    Args:
+        vertex: coordinates of the point.
+        a: coordinates of the first of the others.
+        b: coordinates of the second.
+
+    Source: law of propagation of covariances; Luhmann et al. (2020), sec. 2.4.
+    """
     return angle_of_directions(difference(vertex, a), difference(vertex, b))
 
 
@@ -99,6 +111,8 @@ def height(point: Function, origin: Function, direction: Function) -> Function:
         point: coordinates.
         origin: of a point of the plane.
         direction: normal of the plane, of unit length.
+
+    Source: law of propagation of covariances; Luhmann et al. (2020), sec. 2.4.
     """
     n, d = direction.value, point.value - origin.value
     # the normal keeps its length of 1: what of its derivative is along itself is rounding
@@ -116,6 +130,8 @@ def distance_from_axis(point: Function, origin: Function, direction: Function) -
 
     Raises:
         GeometryError: the point is on the line, so that the distance has no derivative.
+
+    Source: law of propagation of covariances; Luhmann et al. (2020), sec. 2.4.
     """
     a, d = direction.value, point.value - origin.value
     along = float(d @ a)
@@ -142,6 +158,8 @@ def coordinates_in(
 
     Raises:
         UnknownNameError: there is no point of a name.
+
+    Source: law of propagation of covariances; Luhmann et al. (2020), sec. 2.4.
     """
     rows = np.array([points.index(name) for name in names], dtype=np.int64)
     value = scale * (points.xyz[rows] - origin) @ rotation

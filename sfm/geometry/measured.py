@@ -145,15 +145,20 @@ class MeasuredPoints:
 
 
 def measured_points(result: StoredResult) -> MeasuredPoints:
-    """Return the points of a result that have coordinates, with the covariance that is known of them."""
+    """Return the points of a result that have coordinates, with the covariance that is known of them.
+
+    Where only that of a sample of the points is known together, each counts by itself.
+    """
     kept = np.flatnonzero(result.estimate.determined)
     covariance = result.covariance
-    if covariance is not None:
+    if covariance is not None and result.covariance_points is None:
         rows = coordinates_of(kept)
         covariance = covariance[np.ix_(rows, rows)]
     elif result.point_covariance is not None:
         blocks = result.point_covariance[kept]
         covariance = blocks if np.isfinite(blocks).all() else None
+    else:
+        covariance = None
     return MeasuredPoints(
         tuple(result.network.points[j] for j in kept),
         result.estimate.points[kept],

@@ -38,6 +38,8 @@ COMMANDS = {
     "resect": ("points.csv",),
     "init": ("photographs",),
     "view": ("result",),
+    "measure": ("result",),
+    "accept": ("result", "lengths.csv", "--limit-a", "0.1"),
     "match": ("left.png", "right.png"),
     "targets": ("--out", "sheet.pdf"),
     "validate": (),
@@ -97,6 +99,7 @@ def test_what_nobody_has_foreseen_is_one_line_with_its_traceback_in_a_file(
         "drafting",
         "viewing",
         "checking",
+        "inspecting",
     ):
         monkeypatch.setattr(f"sfm.cli.commands.{module}.loading", raising(ValueError("new\nline \x1b[31m")))
     code, lines = kolinear(monkeypatch, capsys, command, *COMMANDS[command])

@@ -12,8 +12,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from sfm.comparison.congruency import critical_value
 from sfm.conventions import BoolArray, FloatArray, IntArray
-from sfm.distributions import chi2_isf, f_isf
 from sfm.errors import GeometryError
 from sfm.geometry.measured import Function, MeasuredPoints
 from sfm.geometry.shapes.gauss_helmert import constraint_covariance, refine_weighted
@@ -202,7 +202,7 @@ def _fit(
         w[used] = fit.standardised
         sigma0 = np.sqrt(fit.omega / redundancy) if redundancy else np.nan
         if redundancy:
-            statistic, critical = fit.omega / redundancy, _critical(redundancy, points.redundancy)
+            statistic, critical = fit.omega / redundancy, critical_value(ALPHA, redundancy, points.redundancy)
     else:
         inverse: FloatArray = np.asarray(np.linalg.inv(A.T @ A))
         linear[:, used] = -np.einsum("up,pnc,nci->uni", inverse, A.T.reshape(-1, *d.shape), B)
@@ -359,12 +359,6 @@ def _refuse_rank(kind: Kind, A: FloatArray, constraints: int) -> None:
     rank = int((values > RANK * values[0]).sum())
     if rank < u:
         raise GeometryError(f"its points determine {rank} of its {u} parameters")
-
-
-def _critical(redundancy: int, of_variances: int | None) -> float:
-    if of_variances is None:
-        return float(chi2_isf(ALPHA, redundancy) / redundancy)
-    return float(f_isf(ALPHA, redundancy, of_variances))
 
 
 def _sigma_of_distances(

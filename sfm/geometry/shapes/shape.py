@@ -42,7 +42,7 @@ class Shape:
         """
         y = (xyz - self.origin) @ self.rotation
         d, g, of_form = self.kind.distance(y, self.form)
-        return d, g @ self.rotation.T, np.concatenate([-g, -np.cross(y[:, None], g), of_form], axis=2)
+        return d, g @ self.rotation.T, np.concatenate([-g, -_cross(y, g), of_form], axis=2)
 
     def moved(self, step: FloatArray, centroid: FloatArray) -> Shape:
         """Return the shape after a step, its origin abreast of a point where it may be anywhere.
@@ -100,8 +100,19 @@ class Shape:
 
 
 def axes_along(direction: FloatArray) -> FloatArray:
-    """Return right-handed axes as columns, the third along a direction, (3, 3)."""
-    z = direction / np.linalg.norm(direction)
-    x = np.cross(np.eye(3)[np.argmin(np.abs(z))], z)
-    x /= np.linalg.norm(x)
-    return np.stack([x, np.cross(z, x), z], axis=1)
+    """Return right-handed axes as columns, the third along a direction, (3, 3).
+
+    Source: Duff et al. (2017), Building an orthonormal basis, revisited, JCGT 6(1).
+    """
+    x, y, z = direction / np.linalg.norm(direction)
+    sign = np.copysign(1.0, z)
+    a = -1 / (sign + z)
+    b = x * y * a
+    return np.array([[1 + sign * x * x * a, b, x], [sign * b, sign + y * y * a, y], [-sign * x, -y, z]])
+
+
+def _cross(y: FloatArray, g: FloatArray) -> FloatArray:
+    """Return y x g of points (n, 3) and vectors (n, c, 3)."""
+    a, b, c = (y[:, None, k] for k in range(3))
+    p, q, r = (g[..., k] for k in range(3))
+    return np.stack([b * r - c * q, c * p - a * r, a * q - b * p], axis=2)

@@ -10,6 +10,7 @@ from pydantic import Field, PrivateAttr, ValidationError
 from sfm.errors import SurveyFileError
 from sfm.files.plain_text import as_plain, is_plain
 from sfm.files.toml_files import read_toml
+from sfm.survey.inputs.calibration import TABLES
 from sfm.survey.inputs.checks.contradictions import refuse_contradictions
 from sfm.survey.inputs.checks.settings_errors import first_error
 from sfm.survey.inputs.settings import (
@@ -111,6 +112,9 @@ class SurveyFile(Section):
             None if self.targets.codes in FAMILIES else self.targets.codes,
             self.targets.diameters,
         ]
+        for camera in self.cameras:
+            if camera.calibration is not None:
+                names += [f"{camera.calibration}/{name}" for name in TABLES]
         return tuple(self.beside(name) for name in names if name is not None)
 
 
