@@ -65,6 +65,8 @@ def analyse_epochs(
     Raises:
         GeometryError: fewer than two epochs, two of one name, a point of reference that an epoch lacks, too
             few points, or what `epoch_differences` and `block_motion` refuse.
+
+    Source: Niemeier (2008), Ausgleichungsrechnung, sec. 12.
     """
     if len(epochs) < 2:
         raise GeometryError(f"epochs: {len(epochs)} given, expected 2 or more")
