@@ -102,7 +102,7 @@ def congruency(
     start = found.steps[0]
     smooth = 0.0
     if start.statistic > start.critical:
-        smooth = _smooth_fraction(difference, covariance, G, bending(xyz), candidates)
+        smooth = smooth_fraction(difference, covariance, G, bending(xyz), candidates)
     stable, drops = (found.stable, found.drops) if found.agreed else (candidates, found.drops_of_all)
     d, Q = in_datum(difference, covariance, G, stable.astype(float))
     T = np.where(stable, drops, single_tests(d, Q))
@@ -149,7 +149,7 @@ def bending(xyz: FloatArray) -> FloatArray:
     return shapes.reshape(3 * len(xyz), -1)
 
 
-def _smooth_fraction(
+def smooth_fraction(
     difference: FloatArray, covariance: FloatArray, G: FloatArray, shapes: FloatArray, points: BoolArray
 ) -> float:
     """Return which fraction of Omega goes where the shapes may be fitted to the differences; 0 if too few."""

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import ncfdtr
 
-from sfm.comparison.congruency import MIN_STABLE, STABLE_FRACTION
+from sfm.comparison.congruency import MIN_STABLE, STABLE_FRACTION, bending, smooth_fraction
 from sfm.comparison.stable_points import (
     StablePoints,
     critical_value,
@@ -56,6 +56,7 @@ class Displacements:
     detectable: (
         FloatArray  # smallest displacement, in its worst direction, found with POWER, object unit, (n,)
     )
+    smooth: float  # fraction of Omega of the reference that a bending of the whole takes away
     alpha: float
 
     @property
@@ -120,6 +121,7 @@ def displacements(
         and (not whole.agreed or robust.stable.sum() > whole.stable.sum())
     ):
         best = robust
+    smooth = 0.0 if best.agreed else smooth_fraction(d, Q, G, bending(found.xyz), candidates)
     d_S, Q_S = in_datum(d, Q, G, best.stable.astype(float))
     T = np.where(best.stable, best.drops, single_tests(d_S, Q_S))
     level = np.where(candidates, alpha / 2 / first, alpha / 2 / max(1, n - first))
@@ -139,6 +141,7 @@ def displacements(
         detectable=_detectable(
             Q_S, np.where(candidates, alpha / 2 / first, alpha / 2 / max(1, n - first)), found
         ),
+        smooth=smooth,
         alpha=alpha,
     )
 

@@ -18,8 +18,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
-from sfm.comparison.congruency import critical_value
 from sfm.comparison.pairing import fit_robustly
+from sfm.comparison.stable_points import critical_value
 from sfm.conventions import BoolArray, FloatArray, IntArray, rotation_from_vector
 from sfm.errors import GeometryError
 from sfm.geometry.functions import joined

@@ -28,6 +28,7 @@ COLUMNS = (
 SERIES = ("id", "epoch", "dX", "dY", "dZ", "sdX", "sdY", "sdZ", "moved")
 DRAWN = 12  # points of a series that are drawn, those that moved farthest
 NAMED = 12  # points that a sentence names
+MOSTLY = 0.5  # of Omega: what a bending takes away of it is told from here on
 PICTURE = (
     "Displacements: arrows in the object's main plane, points that moved in red; the colour of the dots is "
     "the displacement out of the plane."
@@ -65,11 +66,12 @@ def words_of_pair(found: Displacements) -> tuple[str, str]:
     first, second = found.differences.names
     between = f"{first} to {second}"
     if not found.agreed:
-        return (
-            f"{between}: the points of reference moved against one another, and no half of them agrees; name "
-            "points that are known to be stable",
-            "bad",
+        cause = (
+            f"; {found.smooth:.0%} of it is a bending of the whole, as a wrongly described camera makes it"
+            if found.smooth > MOSTLY
+            else ""
         )
+        return f"{between}: the points of reference differ, and no half of them agrees{cause}", "bad"
     names = [n for n, moved in zip(found.differences.points, found.moved, strict=True) if moved]
     if not names:
         return f"{between}: no displacement is significant", "good"
@@ -84,6 +86,11 @@ def words_of_pair(found: Displacements) -> tuple[str, str]:
 
 def words_of_stable(found: Displacements) -> str:
     """Return in words which points carry the datum, and how they were found."""
+    if not found.agreed:
+        return (
+            "No stable set is proposed; what is shown is in the datum of the points left last. Name "
+            "stable ones with --reference."
+        )
     removed = [found.differences.points[s.removed] for s in found.search.steps if s.removed is not None]
     count, all_of_them = int(found.stable.sum()), int(found.reference.sum())
     if count == all_of_them:

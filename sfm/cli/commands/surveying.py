@@ -161,9 +161,11 @@ def run_file(survey_file: Path) -> Path:
 
     with working_on(str(survey_file)):
         described = read_survey_file(survey_file, allow_outside=False)
-    with_photographs = described.observations is None
     return _run_survey(
-        survey_file, None, None, None, False, False, from_photographs=with_photographs, camera=None
+        *(survey_file, None, None, None, False, False),
+        from_photographs=described.observations is None,
+        camera=None,
+        weighted=False,
     )
 
 

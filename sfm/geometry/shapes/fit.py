@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sfm.comparison.congruency import critical_value
+from sfm.comparison.stable_points import critical_value
 from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.errors import GeometryError
 from sfm.geometry.measured import Function, MeasuredPoints
