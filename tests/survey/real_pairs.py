@@ -23,7 +23,7 @@ from sfm.pipeline import run_survey
 from sfm.report.findings.findings import findings_of
 from sfm.result import SurveyResult
 from sfm.similarity import fit_similarity
-from sfm.survey.inputs.calibration import with_calibration
+from sfm.survey.inputs.calibration import Calibration, with_calibration
 from sfm.survey.inputs.survey import Survey, read_survey
 from sfm.survey.measuring.target_store import TargetStore
 from tests.places import DATASETS, SHARED
@@ -67,7 +67,8 @@ def pairs_of(dataset: str, store: Path) -> Iterator[Outcome]:
     names = sorted(path.name for path in folder.glob(GLOBS[dataset]))
     rng = np.random.default_rng(SEED)
     every = [(a, b) for i, a in enumerate(names) for b in names[i + 1 :]]
-    calibrated = with_calibration(survey, whole.adjustment.estimate.cameras, "the whole survey")
+    cameras = tuple(Calibration.of_camera(one) for one in whole.adjustment.estimate.cameras)
+    calibrated = with_calibration(survey, cameras, "the whole survey")
     for k in rng.permutation(len(every))[:PAIRS]:
         yield outcome(dataset, _only(survey, every[k]), folder, store, whole, every[k])
         yield outcome(f"{dataset} *", _only(calibrated, every[k]), folder, store, whole, every[k])
