@@ -76,10 +76,11 @@ class Camera:
 
     @property
     def frame(self) -> FloatArray:
-        """Centre (px), pixel size (mm) and plane of residuals as compiled code takes them, (5,)."""
-        width, height = self.size_px
-        plane = 0.0 if MODELS[self.model].corrected_plane else 1.0
-        return np.array([(width - 1) / 2, (height - 1) / 2, self.pixel_mm[0], self.pixel_mm[1], plane])
+        """Centre (px), pixel size (mm), planes of residuals and affinity for compiled code, (6,)."""
+        (width, height), model = self.size_px, MODELS[self.model]
+        measured_plane = model.corrects and not model.corrected_plane
+        centre = ((width - 1) / 2, (height - 1) / 2)
+        return np.array([*centre, *self.pixel_mm, float(measured_plane), float(model.distorted_affinity)])
 
     @property
     def linear_frame(self) -> FloatArray:

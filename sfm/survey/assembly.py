@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from sfm.adjustment.quality.correlations import orientation_correlations
+from sfm.adjustment.quality.correlations import exterior_correlations, strong_correlations
 from sfm.orientation.incremental.sequence import Orientation
 from sfm.result import FailedImage, StageTime, SurveyResult
 from sfm.runtime.progress import StageClock
@@ -31,6 +31,7 @@ def assemble_result(
     failed = tuple(
         FailedImage(*one) for one in (*start.failures, *solution.dropped_images) if one[0] not in is_in
     )
+    correlations = exterior_correlations(adjustment)
     return SurveyResult(
         survey=survey.name,
         unit=survey.unit,
@@ -60,6 +61,10 @@ def assemble_result(
         unused_image_points=solution.unused_image_points + sum(one.image_points for one in measured.left_out),
         reject=survey.reject,
         weights=survey.adjust.weights,
-        orientation_correlations=orientation_correlations(adjustment),
+        balance_radius_mm=tuple(
+            (one.name, dict(one.balanced)["R0"]) for one in survey.cameras if one.balanced
+        ),
+        exterior_correlations=correlations,
+        orientation_correlations=strong_correlations(correlations),
         seconds=tuple(StageTime(*one) for one in clock.seconds),
     )

@@ -8,7 +8,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from sfm.adjustment.quality.against_free import GivenTest, given_test, scale_difference
+from sfm.adjustment.quality.against_free import (
+    GivenTest,
+    control_apart,
+    given_test,
+    scale_difference,
+)
 from sfm.adjustment.quality.consistency import Consistency, consistency_of
 from sfm.adjustment.quality.held_camera import HeldParameter, held_parameters
 from sfm.report.findings.bundle_statistics import Statistics, statistics_of
@@ -77,6 +82,7 @@ def findings_of(result: SurveyResult) -> Findings:
         *(result, sigma0, longest, statistics, given, check, size, consistency, held),
         against_free,
         scale_difference(a, result.free_network),
+        control_apart(a, result.free_network),
     )
     return Findings(
         result=result,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from sfm.adjustment.quality.against_free import GivenTest, ScaleDifference
+from sfm.adjustment.quality.against_free import ControlApart, GivenTest, ScaleDifference
 from sfm.adjustment.quality.consistency import Consistency
 from sfm.adjustment.quality.held_camera import HeldParameter
 from sfm.adjustment.quality.statistics import ALPHA, GlobalTest, component_tests
@@ -31,6 +31,7 @@ class Evidence:
     held: tuple[HeldParameter, ...] = ()  # interior parameters held at values that the photographs contradict
     given_test: GivenTest | None = None  # of all that was given against the free network
     scale_difference: ScaleDifference | None = None  # of control and bars
+    control_apart: tuple[ControlApart, ...] = ()  # control that does not fit the free network as others
 
     @property
     def kind_tests(self) -> tuple[GlobalTest, ...]:
