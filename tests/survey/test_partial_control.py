@@ -129,3 +129,37 @@ def test_covariances_of_image_points_come_back_from_the_tables(tmp_path: Path) -
     write_stored(tmp_path / "stored", stored)
     twice = read_result(tmp_path / "stored").network.image_points.covariance
     np.testing.assert_allclose(twice, stored.network.image_points.covariance, rtol=1e-12)
+
+
+def test_heights_check_points_of_which_place_is_control(tmp_path: Path) -> None:
+    """X and Y of five points hold the network with four full points, their Z only check it."""
+    network, truth = make_network(seed_of("heights check"), images=8, points=30)
+    rng = seed_of("heights check noise")
+    X = truth.points[:9] + 1e-4 * rng.standard_normal((9, 3))
+    header = "id,X,Y,Z,sX,sY,sZ,checkX,checkY,checkZ\n"
+    for wrong in (0.0, 0.01):
+        X[6, 2] += wrong
+        rows = [f"{j + 1},{','.join(map(str, X[j]))},1e-4,1e-4,1e-4,,,{int(j >= 4)}" for j in range(9)]
+        control = _control(tmp_path / "control.csv", header + "\n".join(rows) + "\n")
+        result = run_survey(survey_of(network, truth, control=control, datum={"kind": "control"}))
+        found = findings_of(result)
+        assert found.counts.control == 4 * 3 + 5 * 2
+        rows_of_check = [row for row in found.protocol.control if row.use == "check"]
+        assert [(row.point, row.coordinate) for row in rows_of_check] == [(str(j), "Z") for j in range(5, 10)]
+        tests = np.array([row.test for row in rows_of_check])
+        assert (np.abs(np.delete(tests, 2)) < 4).all()
+        told = [line for line in found.verdict.remarks if "Z of check point 7" in line]
+        assert (abs(tests[2]) > 30 and told and found.verdict.level == "bad") if wrong else not told
+        assert wrong or found.verdict.level == "good"
+
+
+@pytest.mark.parametrize(
+    ("row", "message"),
+    [("1,0,0,,1,1,,,,1", "checkZ holds 1"), ("1,0,0,0,1,1,1,2,,", "column checkX holds 2, needed 0, 1")],
+)
+def test_checks_without_sense_are_refused(row: str, message: str, tmp_path: Path) -> None:
+    with pytest.raises(SurveyFileError, match=message):
+        _control(
+            tmp_path / "control.csv",
+            f"id,X,Y,Z,sX,sY,sZ,checkX,checkY,checkZ\n{row}\n2,5,6,7,1,1,1,,,\n",
+        )

@@ -11,6 +11,7 @@ from sfm.adjustment.quality.statistics import ALPHA, GlobalTest, component_tests
 from sfm.report.findings.bundle_statistics import Statistics
 from sfm.report.findings.checks import CheckedControl, LongestResidual, Sigma0
 from sfm.report.findings.given_residuals import Given
+from sfm.report.findings.protocol import ControlCoordinate
 from sfm.result import SurveyResult
 
 Judged = list[tuple[bool, str]]  # whether the result cannot be depended on, and why
@@ -31,6 +32,7 @@ class Evidence:
     held: tuple[HeldParameter, ...] = ()  # interior parameters held at values that the photographs contradict
     given_test: GivenTest | None = None  # of all that was given against the free network
     scale_difference: ScaleDifference | None = None  # of control and bars
+    check_coordinates: tuple[ControlCoordinate, ...] = ()  # that took no part beside control
     control_apart: tuple[ControlApart, ...] = ()  # control that does not fit the free network as others
 
     @property

@@ -29,7 +29,7 @@ def judge_given(evidence: Evidence) -> Judged:
     """Judge everything that was given, kind by kind."""
     kinds = (
         *(_taken_out, _scale, _control_apart, _control, _bars, _interior),
-        *(_held, _hardly_determined, _principal_point, _exterior, _kinds, _check),
+        *(_held, _hardly_determined, _principal_point, _exterior, _kinds, _check, _check_coordinates),
     )
     return [judged for judge_kind in kinds for judged in judge_kind(evidence)]
 
@@ -65,7 +65,7 @@ def _scale(evidence: Evidence) -> Judged:
         f"Lengths by the control are {significant(100 * found.relative)} % larger than by the scale bars, "
         f"{significant(found.over_sigma)} times the standard deviation of that difference."
     )
-    return [*judged, (found.over_sigma > WEIGHTED_BAD, line)]
+    return [*judged, (found.over_sigma > WEIGHTED_BAD or abs(found.relative) > MISCLOSURE_BAD, line)]
 
 
 def _control_apart(evidence: Evidence) -> Judged:
@@ -252,6 +252,21 @@ def _check(evidence: Evidence) -> Judged:
         )
         judged.append((False, line))
     return judged
+
+
+def _check_coordinates(evidence: Evidence) -> Judged:
+    """Judge the single coordinates that check a datum of control: the worst in its standard deviations."""
+    tested = [one for one in evidence.check_coordinates if np.isfinite(one.test)]
+    worst = max(tested, key=lambda one: abs(one.test), default=None)
+    if worst is None or not abs(worst.test) > WEIGHTED_REMARK:
+        return []
+    factor, unit = finer_unit(evidence.result.length_unit, abs(worst.difference))
+    line = (
+        f"{worst.coordinate} of check point {worst.point} differs from its given value by "
+        f"{significant(factor * abs(worst.difference))} {unit}, {significant(abs(worst.test))} times the "
+        "standard deviation of both."
+    )
+    return [(abs(worst.test) > WEIGHTED_BAD, line)]
 
 
 def _remarkable(found: GivenResiduals | None) -> tuple[GivenValue, ...]:
