@@ -5,6 +5,8 @@ from sfm.adjustment.datum import Datum as Datum
 from sfm.adjustment.result import Adjustment as Adjustment
 from sfm.adjustment.solve import adjust as adjust
 from sfm.api import compare as compare
+from sfm.api import fit_shape as fit_shape
+from sfm.api import measure as measure
 from sfm.api import network_from_colmap as network_from_colmap
 from sfm.api import read_result as read_result
 from sfm.api import run_survey as run_survey

@@ -5,8 +5,7 @@ Everything public is named in `sfm/__init__.pyi`. Adapters are imported where th
 
 from __future__ import annotations
 
-import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from functools import partial
@@ -15,9 +14,15 @@ from typing import Any
 
 from sfm.comparison.significance import ResultComparison, compare_results
 from sfm.errors import BackendError, SurveyFileError
+from sfm.geometry.measured import measured_points
+from sfm.geometry.shapes.fit import ShapeFit
+from sfm.geometry.shapes.fit import fit_shape as fit_points
+from sfm.inspection.features_file import read_features_file
+from sfm.inspection.measure import Measurement, measure_result
 from sfm.network import Estimate, Network
 from sfm.pipeline import run_survey as run_stages
 from sfm.result import SurveyResult
+from sfm.runtime.cores import cores
 from sfm.runtime.progress import SILENT, Progress
 from sfm.stored_result import StoredResult
 from sfm.survey.inputs.survey import Survey, read_survey
@@ -158,6 +163,69 @@ def compare(
     )
 
 
+def fit_shape(
+    result: SurveyResult | StoredResult,
+    kind: str,
+    points: Sequence[str] | None = None,
+    *,
+    weights: str = "network",
+    hold: Mapping[str, float | Sequence[float]] | None = None,
+    robust: bool = False,
+    offset: float = 0.0,
+) -> ShapeFit:
+    """Fit a shape to points of a result by orthogonal distances, with the covariance of the network.
+
+    Args:
+        result: of a survey, or read from files.
+        kind: line, plane, circle, ellipse, sphere, cylinder, cone, torus or paraboloid (of revolution).
+        points: names or patterns such as `10*`; all if not given.
+        weights: network (the covariance of the points) or equal.
+        hold: values that are not fitted: `direction`, `centre` (also `point`, `apex`, `vertex`), `radius`,
+            `diameter` and the like; lengths in the object unit, angles in rad.
+        robust: whether points that most of the others contradict are left out.
+        offset: of the targets from the shape, on the side of its normal positive, object unit.
+
+    Raises:
+        GeometryError: too few points, points that do not determine the shape, or unknown names.
+
+    Example:
+        >>> import sfm
+        >>> sfm.fit_shape(result, "plane", ["1", "2", "3", "4"]).redundancy
+        1
+    """
+    stored = result.with_covariance if isinstance(result, SurveyResult) else result
+    measured = measured_points(stored)
+    chosen = None if points is None else measured.matching(points, f"{kind}: points")
+    return fit_points(measured, kind, chosen, weights=weights, hold=hold, robust=robust, offset=offset)
+
+
+def measure(
+    result: SurveyResult | StoredResult, features: str | Path | None = None, *, allow_outside: bool = False
+) -> Measurement:
+    """Measure a result: hidden points, alignment, shapes, distances, angles and tolerances.
+
+    Args:
+        result: of a survey, or read from files.
+        features: the features file that says what is asked for, docs/measuring.md; points alone if not given.
+        allow_outside: whether it may name files outside its own folder.
+
+    Raises:
+        KolinearError: what it asks for cannot be done; the message says why.
+
+    Example:
+        >>> import sfm
+        >>> len(sfm.measure(result).points.names) == len(result.points)
+        True
+    """
+    from adapters.formats.mesh import read_mesh
+
+    stored = result.with_covariance if isinstance(result, SurveyResult) else result
+    asked, paths = (
+        (None, {}) if features is None else read_features_file(Path(features), allow_outside=allow_outside)
+    )
+    return measure_result(stored, asked, paths=paths, read_mesh=read_mesh)
+
+
 def network_from_colmap(model: str | Path | Any) -> tuple[Network, Estimate]:
     """Return a COLMAP model as a network and its solution; each image point has a sigma of 1 px.
 
@@ -223,13 +291,6 @@ def colmap_writer(result: SurveyResult) -> Callable[[Path], Any] | None:
     from adapters.colmap.camera_models import write_model
 
     return lambda folder: write_model(folder, both.network, both.adjustment.estimate)
-
-
-def cores() -> int:
-    """Return how many processor cores this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
 
 
 @contextmanager

@@ -120,9 +120,16 @@ class InteriorObservations:
     parameter: IntArray = field(default_factory=_no_index)  # index among the camera's names, (p,)
     value: FloatArray = field(default_factory=lambda: np.zeros(0))  # in the parameter's unit, (p,)
     sigma: FloatArray = field(default_factory=lambda: np.zeros(0))  # in the parameter's unit, (p,)
+    correlation: FloatArray | None = None  # of all of them together; independent where not given, (p, p)
 
     def __len__(self) -> int:
         return len(self.camera)
+
+    def weight_of(self, rows: IntArray) -> FloatArray:
+        """Return the inverse of the covariance of some of the values, (r, r)."""
+        sigma = self.sigma[rows]
+        R = np.eye(len(rows)) if self.correlation is None else self.correlation[np.ix_(rows, rows)]
+        return np.asarray(np.linalg.inv(R) / np.outer(sigma, sigma))
 
 
 @dataclass(frozen=True, repr=False)

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 from sfm.errors import GeometryError
@@ -23,6 +24,7 @@ from sfm.survey.inputs.measurements import Measurements
 from sfm.survey.inputs.photograph_list import find_photographs
 from sfm.survey.inputs.start import measurements_from_observations, refuse_unknown_photographs
 from sfm.survey.inputs.survey import Survey
+from sfm.survey.measuring.other_sizes import separate_sizes
 from sfm.survey.measuring.target_store import TargetStore
 from sfm.survey.measuring.tie_points import tie_photographs
 from sfm.survey.orientation import orient_survey
@@ -54,7 +56,7 @@ def run_survey(
     """
     clock = StageClock(progress)
     with _naming(survey):
-        measured = _measure(survey, images_dir, jobs, store, clock)
+        survey, measured = _measure(survey, images_dir, jobs, store, clock)
         with clock.stage("orientation"):
             start = orient_survey(survey, measured)
         with clock.stage("matching"):
@@ -67,19 +69,28 @@ def run_survey(
 
 def _measure(
     survey: Survey, images_dir: Path | None, jobs: int, store: TargetStore | None, clock: StageClock
-) -> Measurements:
-    """Return the image points of a survey, from what it has."""
+) -> tuple[Survey, Measurements]:
+    """Return the survey, with a camera for each size of photographs, and its image points."""
     if survey.observations is not None:
-        return measurements_from_observations(survey)
+        return survey, measurements_from_observations(survey)
     files = find_photographs(survey, images_dir=images_dir)
     refuse_unknown_photographs(survey, files.names)
+    sizes = separate_sizes(survey, files)
+    survey = sizes.survey
     if survey.start_cameras is None:
-        refuse_incomplete_cameras(survey.cameras, survey.source, files)
+        refuse_incomplete_cameras(survey.cameras, survey.source, sizes.files)
     if survey.tie_points is not None:
-        with clock.stage("tie points", len(files)):
-            return tie_photographs(survey, files, jobs=jobs, progress=clock.progress)
-    with clock.stage("targets", len(files)):
-        return measure_targets(survey, files, jobs=jobs, store=store, progress=clock.progress)
+        with clock.stage("tie points", len(sizes.files)):
+            measured = tie_photographs(survey, sizes.files, jobs=jobs, progress=clock.progress)
+    else:
+        with clock.stage("targets", len(sizes.files)):
+            measured = measure_targets(survey, sizes.files, jobs=jobs, store=store, progress=clock.progress)
+    return survey, replace(
+        measured,
+        images=files.names,
+        failed=sizes.left_out + measured.failed,
+        warnings=sizes.lines + measured.warnings,
+    )
 
 
 @contextmanager

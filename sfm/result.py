@@ -19,7 +19,7 @@ from sfm.comparison.two_adjusters.adjusters import AdjusterComparison
 from sfm.conventions import FloatArray, IntArray, angles_from_rotation
 from sfm.display import html_table, text_table
 from sfm.errors import GeometryError
-from sfm.files.covariance_file import MAX_POINTS
+from sfm.files.covariance_file import points_kept_together
 from sfm.network import Estimate, Network, index_of
 from sfm.point_table import Point, PointTable
 from sfm.stored_result import NO_SCALE, StoredResult
@@ -222,15 +222,16 @@ class SurveyResult:
 
     @cached_property
     def with_covariance(self) -> StoredResult:
-        """The same with the covariance of all points together, for no more than `MAX_POINTS` of them."""
-        n = len(self.adjustment.network.points)
-        if n > MAX_POINTS:
-            return self.stored
+        """The same with the covariance of all points together, or of a sample of many of them."""
+        some = points_kept_together(self.adjustment.network.points)
         try:
-            joint = marginal_of(self.adjustment).joint(np.zeros(0, dtype=np.int64), np.arange(n))
+            joint = marginal_of(self.adjustment).joint(np.zeros(0, dtype=np.int64), some)
         except GeometryError:  # normal equations that cannot be solved have no covariance at all
             return self.stored
-        return replace(self.stored, covariance=joint) if np.isfinite(joint).all() else self.stored
+        if not np.isfinite(joint).all():
+            return self.stored
+        every = len(some) == len(self.adjustment.network.points)
+        return replace(self.stored, covariance=joint, covariance_points=None if every else some)
 
     @property
     def points(self) -> PointTable:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sfm.conventions import FloatArray
+from sfm.conventions import FloatArray, IntArray
 from sfm.display import html_table, text_table
 from sfm.network import Estimate, Network
 from sfm.point_table import Point, PointTable
@@ -33,10 +33,13 @@ class StoredResult:
     interior_sigma: tuple[FloatArray, ...] | None = None  # of each parameter, NaN where fixed
     redundancy: int | None = None  # of the adjustment, for the degrees of freedom of tests
     unit: str = ""  # of lengths, as people call it; empty where nobody knows
-    covariance: FloatArray | None = None  # of all object coordinates together, object unit^2, (3n, 3n)
+    covariance: FloatArray | None = None  # of all coordinates of points together, object unit^2, (3k, 3k)
     datum: str = ""  # free | minimal | control; empty where nobody knows
     points_named: bool = True  # whether names of points identify them, or are mere numbers
     images_named: bool = True  # likewise of photographs
+    covariance_points: IntArray | None = (
+        None  # of which k points `covariance` is, all n where not given, (k,)
+    )
 
     @property
     def has_scale(self) -> bool:

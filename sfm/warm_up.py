@@ -7,7 +7,6 @@ works on a small made-up problem in a process of its own, since numba compiles o
 from __future__ import annotations
 
 import math
-import os
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from multiprocessing import get_context
 
@@ -25,6 +24,7 @@ from sfm.matching.tracks.correspondence import match_targets
 from sfm.matching.tracks.interest import foerstner_points
 from sfm.network import Estimate, ImagePoints, Network, empty_estimate
 from sfm.orientation.incremental.sequence import orient
+from sfm.runtime.cores import cores
 from sfm.runtime.folder_settings import close_library_path
 from sfm.runtime.progress import SILENT, Progress
 from sfm.targets.codes.rings import ring_family
@@ -87,9 +87,8 @@ def main(progress: Progress = SILENT) -> None:
         progress: told of every part that is done.
     """
     progress.stage("compiling", len(PARTS))
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     close_library_path()
-    with ProcessPoolExecutor(min(cores, len(PARTS)), mp_context=get_context("spawn")) as pool:
+    with ProcessPoolExecutor(min(cores(), len(PARTS)), mp_context=get_context("spawn")) as pool:
         for done in as_completed([pool.submit(part) for part in PARTS]):
             done.result()
             progress.advance()

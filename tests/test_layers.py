@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import re
 from pathlib import Path
 
 import pytest
@@ -14,6 +15,7 @@ LAYERS = (
         *(
             "sfm.conventions",
             "sfm.errors",
+            "sfm.distributions",
             "sfm.camera",
             "sfm.distortion",
             "sfm.network",
@@ -27,7 +29,7 @@ LAYERS = (
     ("sfm.targets", "sfm.matching", "sfm.orientation", "sfm.adjustment"),
     ("sfm.comparison", "sfm.geometry", "sfm.epochs", "sfm.planning", "sfm.rendering", "sfm.printing"),
     ("sfm.result",),
-    ("sfm.survey",),
+    ("sfm.survey", "sfm.inspection"),
     ("sfm.report",),
     ("sfm.pipeline",),
     ("sfm.batch", "sfm.cli", "sfm.api", "sfm.warm_up"),
@@ -128,6 +130,9 @@ def test_libraries_stay_in_their_rooms() -> None:
             assert name == CV2_THREADS or any(belongs(name, room) for room in CV2_ROOMS), (
                 f"{name} imports cv2"
             )
+        assert not re.search(
+            r"^(from|import) scipy(\.| import )stats", path.read_text(encoding="utf-8"), re.MULTILINE
+        ), f"{name}: sfm.distributions spares a second of importing"
         if libraries & {"matplotlib"}:
             assert name.startswith("sfm.report"), f"{name} imports matplotlib"
         if libraries & {"typer", "rich"}:

@@ -13,7 +13,7 @@ import pytest
 from tests.places import ROOT
 
 PAGE = (ROOT / "docs" / "methods.md").read_text(encoding="utf-8")
-ROOMS = ("sfm.orientation", "sfm.matching", "sfm.comparison", "sfm.planning")
+ROOMS = ("sfm.orientation", "sfm.matching", "sfm.comparison", "sfm.planning", "sfm.geometry")
 MENTIONED = tuple(dict.fromkeys(re.findall(r"`(sfm(?:\.\w+)+)`", PAGE)))
 
 

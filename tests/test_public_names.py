@@ -34,6 +34,8 @@ PUBLIC = {
         "change_datum",
         "compare",
         "find_targets",
+        "fit_shape",
+        "measure",
         "fit_similarity",
         "network_from_colmap",
     ),

@@ -19,10 +19,10 @@ from typing import Any
 import numpy as np
 
 from adapters.colmap.model_files import MAX_ID, MODELS
-from adapters.reading.json_files import MAX_SIDE_PX
 from sfm.conventions import AnyArray, FloatArray, IntArray
 from sfm.errors import SurveyFileError
 from sfm.files.csv_tables import MAX_NUMBER, MAX_ROWS, MAX_TABLE_BYTES
+from sfm.files.json_files import MAX_SIDE_PX
 from sfm.files.plain_text import MAX_NAME, as_plain, is_name
 
 TABLES = ("cameras", "images", "keypoints", "matches", "two_view_geometries")

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from pydantic import Field
 
-from adapters.reading.json_files import Content, Name, Pixel, Side, read_json
+from sfm.files.json_files import Content, Name, Pixel, Side, read_json
 from sfm.network import Estimate, Network
 
 SIDE_FILE = "kolinear.json"

@@ -28,12 +28,12 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 
 from adapters.formats.metashape_markers import HALF_PIXEL, Markers
-from adapters.reading.json_files import MAX_PIXEL_MM
 from adapters.reading.text_lines import write_lines
 from adapters.reading.xml_lines import Node, read_xml
 from sfm.camera import Camera, camera_from_values
 from sfm.conventions import FloatArray
 from sfm.errors import OutputError
+from sfm.files.json_files import MAX_PIXEL_MM
 from sfm.files.plain_text import shown
 from sfm.network import Estimate, Network, rows_of
 from sfm.similarity import Similarity

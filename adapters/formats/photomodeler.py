@@ -31,11 +31,11 @@ from pathlib import Path
 
 import numpy as np
 
-from adapters.reading.json_files import MAX_SIDE_PX
 from adapters.reading.text_lines import MAX_BLOCK_LINES, MAX_PHOTOGRAPHS, Lines, write_lines
 from sfm.camera import Camera, camera_from_values
 from sfm.conventions import FloatArray, angles_from_rotation, rotation_from_angles
 from sfm.errors import OutputError, SurveyFileError
+from sfm.files.json_files import MAX_SIDE_PX
 from sfm.files.plain_text import shown
 from sfm.network import Estimate, ImagePoints, Network, ObjectPoints
 

@@ -4,7 +4,7 @@
     images.csv          image,X,Y,Z,omega_deg,phi_deg,kappa_deg[,sX,sY,sZ],camera
     cameras.csv         camera,parameter,value[,sigma],unit
     image_points.csv    image,point,x_px,y_px[,sx_px,sy_px[,cxy_px2]][,rejected]
-    point_covariance.npy    of all points together, see `sfm.files.covariance_file`
+    point_covariance.npy    of the points together, see `sfm.files.covariance_file`
     summary.json        name of the survey, model, size and pixel of each camera, redundancy, datum
 
 These are the tables that `kolinear run` writes; other columns are passed over. What a summary does not say of
@@ -25,13 +25,13 @@ import numpy as np
 from pydantic import Field
 
 from adapters.colmap.names import SIDE_FILE, NamedCamera, read_side_file
-from adapters.reading.json_files import Content, Name, Pixel, Side, Text, read_json
 from sfm.camera import Camera
 from sfm.conventions import BoolArray, FloatArray, angles_from_rotation, rotation_from_angles
 from sfm.distortion.models import MODELS
 from sfm.errors import OutputError, SurveyFileError
 from sfm.files.covariance_file import read_covariance, write_covariance
 from sfm.files.csv_tables import CsvTable, read_header, read_table
+from sfm.files.json_files import Content, Name, Pixel, Side, Text, read_json
 from sfm.files.plain_text import csv_text
 from sfm.network import Estimate, ImagePoints, Network
 from sfm.stored_result import StoredResult
@@ -68,6 +68,8 @@ def read_result(folder: Path) -> StoredResult:
     points = table.keys("id")
     seen, rejected = _image_points(folder, images, points)
     network = Network(images, camera, points, seen.select(~rejected))
+    known = table.values.shape[1] > 3
+    joint, of_points = read_covariance(folder, points, table.values[:, 3:]) if known else (None, None)
     return StoredResult(
         summary.survey or folder.name,
         network,
@@ -77,8 +79,9 @@ def read_result(folder: Path) -> StoredResult:
         sigmas,
         summary.redundancy,
         summary.length_unit or "",
-        read_covariance(folder, table.values[:, 3:]) if table.values.shape[1] > 3 else None,
+        joint,
         summary.datum.kind if summary.datum else "",
+        covariance_points=of_points,
     )
 
 
@@ -106,6 +109,32 @@ def read_image_points(folder: Path, network: Network) -> tuple[ImagePoints, Bool
     if keys != list(zip(*table.texts, strict=True)):
         raise SurveyFileError(f"{path}: its rows are not those of image_points.csv beside it")
     return seen, rejected, table.values
+
+
+def read_scale_sources(folder: Path) -> tuple[tuple[str, ...] | None, tuple[str, ...]]:
+    """Read what gave a result its scale, from given.csv.
+
+    Args:
+        folder: of the result.
+
+    Returns:
+        "start - end" of its scale bars, None without a given.csv, and the names of its control points.
+
+    Raises:
+        SurveyFileError: the table is damaged.
+    """
+    path = folder / "given.csv"
+    if not path.is_file():
+        return None, ()
+    if not path.read_text(encoding="utf-8").strip().partition("\n")[2]:
+        return (), ()
+    table = read_table(path, ("kind", "name"), (), ignored=None)
+    kinds, names = table.texts
+    found = {
+        kind: tuple(dict.fromkeys(n for k, n in zip(kinds, names, strict=True) if k == kind))
+        for kind in ("scale bar", "control point")
+    }
+    return found["scale bar"], found["control point"]
 
 
 def write_tables(folder: Path, result: StoredResult) -> None:
@@ -189,7 +218,7 @@ def write_tables(folder: Path, result: StoredResult) -> None:
             ),
         )
         if result.covariance is not None:
-            write_covariance(folder, result.covariance)
+            write_covariance(folder, result.covariance, network.points, result.covariance_points)
         text = json.dumps(summary, indent=2, ensure_ascii=False)
         (folder / "summary.json").write_text(text + "\n", encoding="utf-8")
     except OSError as error:

@@ -14,10 +14,10 @@ from xml.parsers import expat
 
 import numpy as np
 
-from adapters.reading.json_files import MAX_SIDE_PX
 from sfm.conventions import FloatArray
 from sfm.errors import SurveyFileError, one_line
 from sfm.files.csv_tables import MAX_NUMBER
+from sfm.files.json_files import MAX_SIDE_PX
 from sfm.files.plain_text import MAX_NAME, is_name, shown
 
 MAX_XML_BYTES = 4_000_000_000

@@ -19,7 +19,6 @@ from sfm.adjustment.engine.local_frame import centroid_of, shifted
 from sfm.adjustment.engine.motions import motions_of
 from sfm.adjustment.engine.normals import solve_lower
 from sfm.adjustment.engine.observed_unknowns import Weighted, weighted_of
-from sfm.adjustment.engine.products import times_points
 from sfm.adjustment.engine.unknowns import Unknowns, unknowns_of
 from sfm.adjustment.quality.rank import reduced_names
 from sfm.adjustment.result import Adjustment
@@ -56,10 +55,17 @@ class Marginal:
         observations, first, u = self.layout.observations, self.layout.kept_start, len(unknowns)
         rows = (3 * np.asarray(points)[:, None] + np.arange(3)).ravel()
         # dx of each as a linear function of the reduced unknowns: themselves, or -L^-T Y' of a point
-        h = np.zeros((len(b.L), 3, len(rows)))
-        h.reshape(3 * len(h), len(rows))[rows, np.arange(len(rows))] = 1.0
         through = np.zeros((self.layout.reduced, len(rows)))
-        times_points(observations, b, solve_lower(b.L, h), through)
+        m = len(observations.camera)
+        of_photographs = through[: 6 * m].reshape(m, 6, len(rows))
+        of_interior = through[6 * m :][: b.Y_interior.shape[2]]
+        inverse = solve_lower(b.L[points], np.tile(np.eye(3), (len(points), 1, 1)))
+        for s, j in enumerate(points):
+            seen = slice(observations.start[j], observations.start[j + 1])
+            own = slice(3 * s, 3 * s + 3)
+            rays = np.swapaxes(b.Y[seen], 1, 2) @ inverse[s]
+            np.add.at(of_photographs[:, :, own], observations.image[seen], rays)
+            of_interior[:, own] = b.Y_interior[j].T @ inverse[s]
         E = np.zeros((self.layout.reduced, u + len(rows)))
         E[unknowns, np.arange(u)] = 1.0
         E[:, u:] = -through

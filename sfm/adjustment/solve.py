@@ -10,7 +10,6 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
-from scipy import stats
 
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.engine.cofactors import (
@@ -42,6 +41,7 @@ from sfm.adjustment.quality.reliability import redundancy_numbers as numbers_of
 from sfm.adjustment.quality.reliability import redundancy_of_bars, standardised_residuals
 from sfm.adjustment.result import Adjustment, Covariance
 from sfm.conventions import FloatArray
+from sfm.distributions import normal_sf
 from sfm.errors import GeometryError
 from sfm.kernels.threads import own_threads
 from sfm.network import Estimate, Network
@@ -131,7 +131,7 @@ def adjust(
 def _level_of(reject: str, alpha: float, usual: float) -> float:
     """Return the probability with which a good image coordinate is rejected; the usual one if none is."""
     if reject == "tukey":
-        return float(2 * stats.norm.sf(TUKEY))
+        return float(2 * normal_sf(TUKEY))
     return alpha if reject == "tau" else usual
 
 

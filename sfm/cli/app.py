@@ -6,7 +6,17 @@ from typing import Any
 
 import typer
 
-from sfm.cli.commands import checking, drafting, measuring, planning, refining, solvers, surveying, viewing
+from sfm.cli.commands import (
+    checking,
+    drafting,
+    inspecting,
+    measuring,
+    planning,
+    refining,
+    solvers,
+    surveying,
+    viewing,
+)
 
 USAGE_ERROR: Any = typer.BadParameter.__base__  # of all that typer says of wrong arguments; it has no name
 
@@ -33,6 +43,8 @@ for _command in (
     measuring.resect,
     measuring.match,
     measuring.targets,
+    inspecting.measure,
+    inspecting.accept,
     solvers.validate,
     solvers.compare,
     solvers.convert,

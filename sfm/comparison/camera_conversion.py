@@ -10,7 +10,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.optimize import least_squares
 
 from sfm.camera import Camera, camera_from_values, pixel_from_tangents, tangents_from_pixel
 from sfm.conventions import BoolArray, FloatArray
@@ -67,6 +66,8 @@ def convert_camera(
     start = start_values(_affinity_in_pixels(camera) if "b1" in held else camera, model)
     fitted = np.array([name not in held for name in start.names])
     start = start.with_parameters(np.where(fitted, start.parameters, 0.0))
+    from scipy.optimize import least_squares  # takes half a second, which most commands never need
+
     # The start is scaled by the effect of each parameter in px, so that the tolerance means the same to all.
     fit = least_squares(
         lambda p: _residuals(start.index, start.linear_frame, _filled(p, fitted), xy, uv)[0].ravel(),

@@ -20,15 +20,17 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
-from scipy.stats import chi2, f
 
 from sfm.conventions import BoolArray, FloatArray
+from sfm.distributions import chi2_isf, f_isf
 from sfm.errors import GeometryError
 from sfm.similarity import mean_distance, similarity_motions
 
 MOTIONS = {"none": 0, "rigid": 6, "similarity": 7}  # parameters of what is no change
 MIN_STABLE = 4  # points that a datum needs to be checked by at least one more than it takes
 STABLE_FRACTION = 0.5  # of the points that must agree for the others to be called moved
+THIN = 0.05  # extent over the longest one below which an object has no depth to bend along
+SAME_COLUMN = 1e-6  # singular value over the largest one below which a way to deform is no way of its own
 
 
 @dataclass(frozen=True)
@@ -37,13 +39,14 @@ class Congruency:
 
     difference: FloatArray  # d_S, (n, 3)
     covariance: FloatArray  # blocks of Q_S, (n, 3, 3)
-    stable: BoolArray  # points that carry the datum, (n,)
-    moved: BoolArray  # points that do not agree with the stable ones, (n,)
+    stable: BoolArray  # points that carry the datum, (n,); all that may where no majority of them agrees
+    moved: BoolArray  # points that do not agree with the stable ones, (n,); none where nobody knows which
     statistic: FloatArray  # T of each point, its drop of Omega (stable) or its own test, over 3, (n,)
     critical: float  # of the largest T
     global_statistic: float  # Omega over its degrees of freedom, of all points before any was removed
     global_critical: float
     agreed: bool  # whether the stable points agree; else no majority of them does
+    smooth: float  # fraction of Omega of all points that a bending of the whole takes away, see `bending`
 
 
 def congruency(
@@ -81,28 +84,80 @@ def congruency(
     first = int(stable.sum())
     G = motions(xyz)[:, :u]
     single = critical_value(alpha / 2 / first, 3, redundancy)
-    global_statistic, global_critical, agreed = 0.0, 0.0, False
+    carriers = stable.copy()
+    of_all = None
+    global_statistic, global_critical, agreed, smooth = 0.0, 0.0, False, 0.0
     while True:
         d, Q, omega, drops = _in_datum(difference, covariance, G, stable)
         freedom = 3 * int(stable.sum()) - u
         limit = critical_value(alpha / 2, freedom, redundancy)
         if stable.sum() == first:
             global_statistic, global_critical = omega / freedom, limit
+            of_all = d, Q, drops
+            smooth = 0.0
+            if omega / freedom > limit:
+                smooth = _smooth_fraction(difference, covariance, G, bending(xyz), stable)
         agreed = omega / freedom <= limit and drops[stable].max() <= single
         if agreed or stable.sum() - 1 < max(MIN_STABLE, STABLE_FRACTION * first):
             break
         stable[np.argmax(np.where(stable, drops, -np.inf))] = False
-    moved = ~stable & (np.ones(n, dtype=bool) if datum is None else datum)
-    if datum is not None:  # points that carry no datum are judged in it
+    if not agreed and of_all is not None:
+        d, Q, drops = of_all
+        stable = carriers
+    moved = carriers & ~stable
+    if agreed and datum is not None:  # points that carry no datum are judged in it
         others = critical_value(alpha / 2 / max(1, n - first), 3, redundancy)
         moved |= ~datum & (drops > others)
-    return Congruency(d, Q, stable, moved, drops, single, global_statistic, global_critical, bool(agreed))
+    return Congruency(
+        d, Q, stable, moved, drops, single, global_statistic, global_critical, bool(agreed), smooth
+    )
 
 
 def motions(xyz: FloatArray) -> FloatArray:
     """Return G: how coordinates change with translations, small rotations and the scale, (3 n, 7)."""
     G = similarity_motions(xyz, centre=xyz.mean(axis=0), size=mean_distance(xyz))
     return G.reshape(3 * len(xyz), 7)
+
+
+def bending(xyz: FloatArray) -> FloatArray:
+    """Return how coordinates change with a bending of the whole, of the second degree, (3 n, k).
+
+    What a camera that is described wrongly does to all points together: a dome, a saddle, an affinity; the
+    polynomials are of the axes along which the object extends.
+
+    Args:
+        xyz: coordinates, (n, 3).
+
+    Source: James and Robson (2014), Mitigating systematic error in topographic models derived from UAV and
+    ground-based image networks (dome by errors of the radial distortion).
+    """
+    _, extent, axes = np.linalg.svd(xyz - xyz.mean(axis=0), full_matrices=False)
+    along = ((xyz - xyz.mean(axis=0)) @ axes.T / mean_distance(xyz))[:, extent > THIN * extent[0]]
+    i, j = np.triu_indices(along.shape[1])
+    terms = np.hstack([along, along[:, i] * along[:, j]])
+    shapes: FloatArray = np.einsum("nk,xy->nxky", terms, np.eye(3))
+    return shapes.reshape(3 * len(xyz), -1)
+
+
+def _smooth_fraction(
+    difference: FloatArray, covariance: FloatArray, G: FloatArray, shapes: FloatArray, points: BoolArray
+) -> float:
+    """Return which fraction of Omega goes where the shapes may be fitted to the differences; 0 if too few."""
+    rows = np.repeat(points, 3)
+    basis = np.linalg.qr(G[rows])[0]
+    B = shapes[rows] - basis @ (basis.T @ shapes[rows])
+    left, size, _ = np.linalg.svd(B, full_matrices=False)
+    B = left[:, size > SAME_COLUMN * size[0]]
+    if 2 * (B.shape[1] + basis.shape[1]) > len(B):
+        return 0.0
+    d = difference.ravel()[rows] - basis @ (basis.T @ difference.ravel()[rows])
+    Q = covariance[np.ix_(rows, rows)]
+    Q = Q - basis @ (basis.T @ Q)
+    Q = Q - (Q @ basis) @ basis.T
+    factor = cho_factor(Q + float(np.trace(Q)) / len(Q) * basis @ basis.T, lower=True)
+    w, W = cho_solve(factor, d), cho_solve(factor, B)  # d and B have no part along the basis
+    b = B.T @ w
+    return float(b @ np.linalg.solve(B.T @ W, b) / (d @ w))
 
 
 def _in_datum(
@@ -151,5 +206,5 @@ def critical_value(alpha: float, freedom: int, redundancy: int | None) -> float:
         redundancy: of the variances; None if they are known.
     """
     if redundancy is None:
-        return float(chi2.isf(alpha, freedom) / freedom)
-    return float(f.isf(alpha, freedom, redundancy))
+        return float(chi2_isf(alpha, freedom) / freedom)
+    return float(f_isf(alpha, freedom, redundancy))

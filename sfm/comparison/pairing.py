@@ -9,20 +9,21 @@ another.
 
 from __future__ import annotations
 
-import re
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial import cKDTree
 
+from sfm.camera import tangents_from_pixel
 from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.errors import GeometryError
+from sfm.files.covariance_file import UNCODED
 from sfm.network import rows_of
 from sfm.similarity import Similarity, fit_similarity
 from sfm.stored_result import StoredResult
 
-UNCODED = re.compile(r"u\d+")  # names that Kolinear gives to points without one
 SAME_PX = 1e-2  # image points closer than this are one measurement, as files round it
+SAME_RAY_PX = 0.1  # likewise of directions, which differ by what the conversion of a camera costs
 NEAR_PX = 1.0  # measurements of one target or one piece of texture by two programs lie closer than this
 MAJORITY = 0.5  # of the rays in common photographs on which two points must lie together
 AMBIGUOUS = 0.3  # of the distance to the next neighbour: what is farther away is not recognised by place
@@ -39,6 +40,10 @@ class Pairing:
     points_by_image_points: int
     points_by_place: int
     images_by_name: int
+    xy: tuple[
+        FloatArray, FloatArray
+    ]  # image points of a and of b in one frame, px, (k, 2) each: as they are,
+    # or as directions where one of them is corrected for distortion or counted from another origin
 
 
 def pair_results(a: StoredResult, b: StoredResult) -> Pairing:
@@ -53,11 +58,11 @@ def pair_results(a: StoredResult, b: StoredResult) -> Pairing:
         *(b.network.images, b.estimate.oriented & b.images_named),
     )
     by_name = len(images)
-    images = np.concatenate([images, _images_by_image_points(a, b, images)])
+    images, xy = _images_by_image_points(a, b, images)
     ours, theirs = identified(a), identified(b)
     points = _by_name(a.network.points, ours, b.network.points, theirs)
     named = len(points)
-    found = _points_by_image_points(a, b, images, points)
+    found = _points_by_image_points(a, b, xy, images, points)
     points = np.concatenate([points, found[~(ours[found[:, 0]] & theirs[found[:, 1]])]])
     seen = len(points)
     transform = _frame(a, b, points, images)
@@ -79,6 +84,7 @@ def pair_results(a: StoredResult, b: StoredResult) -> Pairing:
         seen - named,
         len(points) - seen,
         by_name,
+        xy,
     )
 
 
@@ -122,18 +128,49 @@ def _best(votes: IntArray, weight: IntArray, enough: FloatArray) -> IntArray:
     return pairs[once] if len(pairs) else pairs
 
 
-def _images_by_image_points(a: StoredResult, b: StoredResult, images: IntArray) -> IntArray:
-    """Pair photographs without names by measurements at the same places."""
-    none = np.empty((0, 2), dtype=np.int64)
+def _images_by_image_points(
+    a: StoredResult, b: StoredResult, images: IntArray
+) -> tuple[IntArray, tuple[FloatArray, FloatArray]]:
+    """Pair photographs without names by measurements at the same places, then by rays of the same direction.
+
+    Returns:
+        Pairs, those given first, (m, 2), and the image points in the frame in which they agree.
+    """
+    as_they_are = a.network.image_points.xy, b.network.image_points.xy
     if a.images_named and b.images_named:
-        return none
+        return images, as_they_are
+    found = _images_of_places(a, b, as_they_are, images, SAME_PX)
+    if len(found):
+        return np.concatenate([images, found]), as_they_are
+    c_px = float(np.median([camera.c_px for camera in a.estimate.cameras]))
+    of_rays = c_px * directions(a), c_px * directions(b)
+    found = _images_of_places(a, b, of_rays, images, SAME_RAY_PX)
+    return np.concatenate([images, found]), of_rays if len(found) else as_they_are
+
+
+def directions(result: StoredResult) -> FloatArray:
+    """Return the tangents of the rays of all image points, NaN where distortion is not invertible, (k, 2)."""
+    seen = result.network.image_points
+    uv = np.full(seen.xy.shape, np.nan)
+    of_camera = rows_of(result.network.camera[seen.image], len(result.estimate.cameras))
+    for camera, rows in zip(result.estimate.cameras, of_camera, strict=True):
+        uv[rows] = tangents_from_pixel(camera, seen.xy[rows])
+    return uv
+
+
+def _images_of_places(
+    a: StoredResult, b: StoredResult, xy: tuple[FloatArray, FloatArray], images: IntArray, same_px: float
+) -> IntArray:
+    """Pair photographs, of which none is paired yet, by image points that lie at the same places."""
+    none = np.empty((0, 2), dtype=np.int64)
     ours, theirs = a.network.image_points, b.network.image_points
     free_a = (_free(len(a.network.images), images[:, 0]) & a.estimate.oriented)[ours.image]
     free_b = (_free(len(b.network.images), images[:, 1]) & b.estimate.oriented)[theirs.image]
-    rows_a, rows_b = np.flatnonzero(free_a), np.flatnonzero(free_b)
+    rows_a = np.flatnonzero(free_a & np.isfinite(xy[0]).all(axis=1))
+    rows_b = np.flatnonzero(free_b & np.isfinite(xy[1]).all(axis=1))
     if not len(rows_a) or not len(rows_b):
         return none
-    near = cKDTree(ours.xy[rows_a]).query_ball_tree(cKDTree(theirs.xy[rows_b]), SAME_PX)
+    near = cKDTree(xy[0][rows_a]).query_ball_tree(cKDTree(xy[1][rows_b]), same_px)
     found = [(ours.image[i], theirs.image[j]) for i, js in zip(rows_a, near, strict=True) for j in rows_b[js]]
     if not found:
         return none
@@ -142,21 +179,29 @@ def _images_by_image_points(a: StoredResult, b: StoredResult, images: IntArray) 
     return _best(votes, weight, MAJORITY * np.minimum(count_a[votes[:, 0]], count_b[votes[:, 1]]))
 
 
-def _points_by_image_points(a: StoredResult, b: StoredResult, images: IntArray, points: IntArray) -> IntArray:
+def _points_by_image_points(
+    a: StoredResult,
+    b: StoredResult,
+    xy: tuple[FloatArray, FloatArray],
+    images: IntArray,
+    points: IntArray,
+) -> IntArray:
     """Pair points that lie on the same image points in most of the common photographs that see them."""
     ours, theirs = a.network.image_points, b.network.image_points
     free_a = _free(len(a.network.points), points[:, 0]) & a.estimate.determined
     free_b = _free(len(b.network.points), points[:, 1]) & b.estimate.determined
+    use_a = free_a[ours.point] & np.isfinite(xy[0]).all(axis=1)
+    use_b = free_b[theirs.point] & np.isfinite(xy[1]).all(axis=1)
     found = []
     of_image_a = rows_of(ours.image, len(a.network.images))
     of_image_b = rows_of(theirs.image, len(b.network.images))
     for i, j in images:
-        rows_a = of_image_a[i][free_a[ours.point[of_image_a[i]]]]
-        rows_b = of_image_b[j][free_b[theirs.point[of_image_b[j]]]]
+        rows_a = of_image_a[i][use_a[of_image_a[i]]]
+        rows_b = of_image_b[j][use_b[of_image_b[j]]]
         if not len(rows_a) or not len(rows_b):
             continue
-        there = cKDTree(theirs.xy[rows_b]).query(ours.xy[rows_a], distance_upper_bound=NEAR_PX)[1]
-        back = cKDTree(ours.xy[rows_a]).query(theirs.xy[rows_b], distance_upper_bound=NEAR_PX)[1]
+        there = cKDTree(xy[1][rows_b]).query(xy[0][rows_a], distance_upper_bound=NEAR_PX)[1]
+        back = cKDTree(xy[0][rows_a]).query(xy[1][rows_b], distance_upper_bound=NEAR_PX)[1]
         k = np.flatnonzero(there < len(rows_b))
         k = k[back[there[k]] == k]
         found.append(np.stack([ours.point[rows_a[k]], theirs.point[rows_b[there[k]]]], axis=1))

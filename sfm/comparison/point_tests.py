@@ -34,6 +34,7 @@ class PointTest:
     stable: BoolArray
     approximate: bool = False
     majority: bool = True
+    smooth: float = 0.0
 
 
 def judge_points(
@@ -69,9 +70,12 @@ def judge_points(
     if all(one.covariance is not None for one in known):
         if align == "none" and not in_control:
             return without("no common datum")
-        Q = _joint(a, pa, 1.0, np.eye(3)) + _joint(b, pb, transform.scale, transform.rotation)
-        free = ~_held(Q) if in_control else every
-        rows = np.repeat(free, 3)
+        rows_a, rows_b = _rows_of_points(a, pa), _rows_of_points(b, pb)
+        both = np.flatnonzero((rows_a >= 0) & (rows_b >= 0))
+        Q = _joint(a, rows_a[both], 1.0, np.eye(3))
+        Q += _joint(b, rows_b[both], transform.scale, transform.rotation)
+        kept = ~_held(Q) if in_control else every[: len(both)]
+        rows, free = np.repeat(kept, 3), both[kept]
         try:
             found = congruency(
                 difference[free],
@@ -84,7 +88,8 @@ def judge_points(
             )
         except GeometryError as error:
             return without(str(error))
-        return _of_congruency(found, free)
+        sigma[both] = 0.0  # held in both, or written over
+        return _of_congruency(found, free, sigma, np.isin(np.arange(n), both))
     if not all(one.datum in FREE_DATUMS for one in known):
         return without("covariance of single points only")
     statistic, critical, global_critical = _single_tests(difference, blocks, redundancy, alpha)
@@ -97,24 +102,38 @@ def judge_points(
     )
 
 
-def _of_congruency(found: Congruency, tested: BoolArray) -> PointTest:
-    """Return the test of all points where some, held in both results, took no part."""
-    n = len(tested)
-    sigma, statistic = np.zeros((n, 3)), np.full(n, np.nan)
+def _of_congruency(found: Congruency, tested: IntArray, sigma: FloatArray, together: BoolArray) -> PointTest:
+    """Return the test of all points where some took no part, held in both results or of unknown correlation.
+
+    Args:
+        found: of the tested points.
+        tested: their indices.
+        sigma: of all differences, written over where tested, (n, 3).
+        together: points whose covariance together is known, on which alone an alignment may rest, (n,).
+    """
+    n = len(together)
+    statistic = np.full(n, np.nan)
     sigma[tested] = np.sqrt(np.einsum("njj->nj", found.covariance).clip(0))
     statistic[tested] = found.statistic
-    stable = np.ones(n, dtype=bool)
+    stable = together.copy()
     stable[tested] = found.stable
     significant = np.zeros(n, dtype=bool)
     significant[tested] = found.moved
     return PointTest(
         *(sigma, "", statistic, found.critical, significant, found.global_statistic, found.global_critical),
-        *(stable, False, found.agreed),
+        *(stable, False, found.agreed, found.smooth),
     )
 
 
 def _joint(result: StoredResult, points: IntArray, scale: float, rotation: FloatArray) -> FloatArray:
-    """Covariance of some points together, scaled and turned, (3 n, 3 n); 0 where none is known."""
+    """Covariance of some points together, scaled and turned, (3 n, 3 n); 0 where none is known.
+
+    Args:
+        result: with its covariance.
+        points: rows of the covariance, see `_rows_of_points`, (n,).
+        scale: factor of lengths.
+        rotation: of the axes, (3, 3).
+    """
     n = len(points)
     if result.covariance is None:
         return np.zeros((3 * n, 3 * n))
@@ -123,6 +142,15 @@ def _joint(result: StoredResult, points: IntArray, scale: float, rotation: Float
     J = scale * rotation
     moved: FloatArray = np.einsum("xa,iajb,yb->ixjy", J, Q, J, optimize=True)
     return moved.reshape(3 * n, 3 * n)
+
+
+def _rows_of_points(result: StoredResult, points: IntArray) -> IntArray:
+    """Return the row of each point in the covariance of points together, -1 where it is not in it, (n,)."""
+    if result.covariance_points is None:
+        return points
+    row = np.full(len(result.network.points), -1, dtype=np.int64)
+    row[result.covariance_points] = np.arange(len(result.covariance_points))
+    return np.asarray(row[points])
 
 
 def _held(Q: FloatArray) -> BoolArray:

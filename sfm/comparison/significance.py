@@ -18,8 +18,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from sfm.camera import Camera
 from sfm.comparison.camera_conversion import Conversion, convert_camera
-from sfm.comparison.pairing import Pairing, pair_results
+from sfm.comparison.pairing import SAME_RAY_PX, Pairing, pair_results
 from sfm.comparison.point_tests import has_sigma, judge_points, known_scale
 from sfm.comparison.solutions import rotation_angle_deg
 from sfm.conventions import BoolArray, FloatArray, IntArray
@@ -71,6 +72,7 @@ class ResultComparison:
     global_critical: float  # of the global test; NaN without tests
     stable: BoolArray  # points that the alignment is over, (n,); all of them where nothing moved
     majority: bool  # whether most of the points agree; if not, nobody knows which of them moved
+    smooth: float  # fraction of the square sum of a significant change that a bending of the whole explains
     images: tuple[str, ...]  # names in a of the common photographs, m of them
     position_difference: FloatArray  # of projection centres, object unit of a, (m, 3)
     rotation_deg: FloatArray  # angle between the rotations, deg, (m,)
@@ -86,7 +88,9 @@ class ResultComparison:
         """Whether the points differ significantly, as a whole or singly; None if that is not tested."""
         if self.untested:
             return None
-        return bool(self.global_statistic > self.global_critical or self.significant.any())
+        return bool(
+            self.global_statistic > self.global_critical or self.significant.any() or not self.majority
+        )
 
 
 def compare_results(
@@ -158,6 +162,7 @@ def compare_results(
         global_critical=test.global_critical if tested else np.nan,
         stable=stable | (not tested),
         majority=test.majority,
+        smooth=test.smooth if tested else 0.0,
         images=tuple(a.network.images[i] for i in ia),
         position_difference=moved.position[ib] - a.estimate.position[ia],
         rotation_deg=rotation_angle_deg(a.estimate.rotation[ia], moved.rotation[ib]),
@@ -206,14 +211,17 @@ def _same_share(a: Network, b: Network, pairing: Pairing) -> float:
     known = (image[theirs.image] >= 0) & (point[theirs.point] >= 0)
     key_b = (image[theirs.image] * n + point[theirs.point])[known]
     _, i, j = np.intersect1d(key_a, key_b, return_indices=True)
-    same = np.abs(ours.xy[i] - theirs.xy[known][j]).max(axis=1) < SAME_PX
+    same_px = SAME_PX if pairing.xy[0] is ours.xy else SAME_RAY_PX
+    same = np.abs(pairing.xy[0][i] - pairing.xy[1][known][j]).max(axis=1) < same_px
     return float(same.sum() / len(ours))
 
 
 def _interior(a: StoredResult, b: StoredResult, ia: IntArray, ib: IntArray) -> tuple[InteriorDifference, ...]:
-    """Differences of the cameras that took the same photographs, each pair once."""
+    """Differences of the cameras that took the same photographs, or bear one name, each pair once."""
     found = []
     pairs = dict.fromkeys(zip(a.network.camera[ia].tolist(), b.network.camera[ib].tolist(), strict=True))
+    if a.images_named and b.images_named:
+        pairs |= dict.fromkeys(_of_one_name(a.estimate.cameras, b.estimate.cameras, set(pairs)))
     for p, q in pairs:
         ours, theirs = a.estimate.cameras[p], b.estimate.cameras[q]
         conversion = None
@@ -241,6 +249,19 @@ def _interior(a: StoredResult, b: StoredResult, ia: IntArray, ib: IntArray) -> t
             )
         )
     return tuple(found)
+
+
+def _of_one_name(
+    a: tuple[Camera, ...], b: tuple[Camera, ...], paired: set[tuple[int, int]]
+) -> list[tuple[int, int]]:
+    """Pair cameras of one name and one size of photographs, neither of which is paired yet."""
+    ours, theirs = {p for p, _ in paired}, {q for _, q in paired}
+    index = {(one.name, one.size_px): q for q, one in enumerate(b) if q not in theirs}
+    return [
+        (p, index[one.name, one.size_px])
+        for p, one in enumerate(a)
+        if p not in ours and (one.name, one.size_px) in index
+    ]
 
 
 def _either(a: FloatArray | None, b: FloatArray | None, unknown: FloatArray) -> FloatArray:

@@ -200,9 +200,9 @@ def _drop(own: IntArray, used: BoolArray) -> None:
 
 
 @compiled
-def _direction(rays: _Rays, k: int, out: FloatArray) -> None:
-    """Fill the unit vector of ray k in object axes."""
-    uv, R = rays.tangents[k], rays.rotations[rays.image[k]]
+def _direction(rays: _Rays, ray: int, out: FloatArray) -> None:
+    """Fill the unit vector of a ray in object axes."""
+    uv, R = rays.tangents[ray], rays.rotations[rays.image[ray]]
     norm = np.sqrt(uv[0] * uv[0] + uv[1] * uv[1] + 1.0)
     for d in range(3):
         out[d] = (R[d, 0] * uv[0] + R[d, 1] * uv[1] - R[d, 2]) / norm
@@ -276,9 +276,9 @@ def _best_pair(
 
 
 @compiled
-def _square(rays: _Rays, k: int, X: FloatArray) -> float:
-    """Return the squared image residual of ray k; inf for a point behind the camera."""
-    uv, C, R = rays.tangents[k], rays.positions[rays.image[k]], rays.rotations[rays.image[k]]
+def _square(rays: _Rays, ray: int, X: FloatArray) -> float:
+    """Return the squared image residual of a ray; inf for a point behind the camera."""
+    uv, C, R = rays.tangents[ray], rays.positions[rays.image[ray]], rays.rotations[rays.image[ray]]
     dx, dy, dz = X[0] - C[0], X[1] - C[1], X[2] - C[2]
     W = R[0, 2] * dx + R[1, 2] * dy + R[2, 2] * dz
     if not W < 0.0:
@@ -289,14 +289,14 @@ def _square(rays: _Rays, k: int, X: FloatArray) -> float:
 
 
 @compiled
-def _residual(rays: _Rays, k: int, X: FloatArray, r: FloatArray) -> None:
-    """Fill the image residual of ray k, (2,); nothing for a point behind the camera."""
-    uv, C, R = rays.tangents[k], rays.positions[rays.image[k]], rays.rotations[rays.image[k]]
+def _residual(rays: _Rays, ray: int, X: FloatArray, residual: FloatArray) -> None:
+    """Fill the image residual of a ray, (2,); nothing for a point behind the camera."""
+    uv, C, R = rays.tangents[ray], rays.positions[rays.image[ray]], rays.rotations[rays.image[ray]]
     dx, dy, dz = X[0] - C[0], X[1] - C[1], X[2] - C[2]
     W = R[0, 2] * dx + R[1, 2] * dy + R[2, 2] * dz
     if W < 0.0:
-        r[0] = -(R[0, 0] * dx + R[1, 0] * dy + R[2, 0] * dz) / W - uv[0]
-        r[1] = -(R[0, 1] * dx + R[1, 1] * dy + R[2, 1] * dz) / W - uv[1]
+        residual[0] = -(R[0, 0] * dx + R[1, 0] * dy + R[2, 0] * dz) / W - uv[0]
+        residual[1] = -(R[0, 1] * dx + R[1, 1] * dy + R[2, 1] * dz) / W - uv[1]
 
 
 @compiled

@@ -18,6 +18,10 @@ _PILLOW = Lock()
 
 FORMATS = ("JPEG", "PNG", "TIFF", "BMP", "PPM", "WEBP")  # by the names of Pillow, which finds none unasked
 Image.init()
+# Endings of what cameras and telephones write and is not read, and what makes photographs of it.
+PHONE = (".heic", ".heif", ".hif", ".avif")
+RAW = (".3fr", ".arw", ".cr2", ".cr3", ".crw", ".dng", ".erf", ".iiq", ".kdc", ".mrw", ".nef", ".nrw", ".orf",
+       ".pef", ".raf", ".raw", ".rw2", ".srw", ".x3f")  # fmt: skip
 MAX_FILE_BYTES = 2**30
 MAX_PIXELS = 250_000_000  # the largest aerial scans; digital backs have 151 million
 # A larger picture in fewer bytes is a decompression bomb; one sole grey value is 250 px per byte in a JPEG.
@@ -31,6 +35,7 @@ def read_bytes(path: Path) -> bytes:
     Raises:
         PhotographError: no such file, an empty one, or more than a photograph can have.
     """
+    _refuse_unconverted(path)
     try:
         if path.exists() and not path.is_file():  # reading a pipe would never end
             raise PhotographError(f"{path.name}: not a file, a photograph is needed")
@@ -46,6 +51,27 @@ def read_bytes(path: Path) -> bytes:
     return data
 
 
+def conversion_of(path: Path) -> str:
+    """Return what a file is that must be converted first, by its ending, and how; empty for all others."""
+    if path.suffix.lower() in PHONE:
+        return (
+            "a HEIF file, which is not read; convert all at full size and quality, such as with "
+            "heif-convert -q 100 IN.heic OUT.jpg"
+        )
+    if path.suffix.lower() in RAW:
+        return (
+            "a raw file, which is not read; develop all alike to TIFF, without lens correction, cropping or "
+            "turning, such as with dcraw -T -t 0 FILE"
+        )
+    return ""
+
+
+def _refuse_unconverted(path: Path) -> None:
+    """Refuse files that must be converted first; some raw files would be read as their small preview."""
+    if words := conversion_of(path):
+        raise PhotographError(f"{path.name}: {words}")
+
+
 @contextmanager
 def opened_header(path: Path, source: Path | io.BytesIO) -> Iterator[Image.Image]:
     """Open the header of a photograph; nothing is decoded.
@@ -53,6 +79,7 @@ def opened_header(path: Path, source: Path | io.BytesIO) -> Iterator[Image.Image
     Raises:
         PhotographError: no such file, no photograph of a known format, or one that claims to be too large.
     """
+    _refuse_unconverted(path)
     with _PILLOW, warnings.catch_warnings(action="ignore"):
         try:
             if source is path and path.exists() and not path.is_file():  # reading a pipe would never end

@@ -9,13 +9,15 @@ from typing import Any
 
 import numpy as np
 
-from sfm.comparison.significance import ResultComparison
+from sfm.comparison.significance import InteriorDifference, ResultComparison
 from sfm.conventions import FloatArray
+from sfm.distortion.models import MODELS, Role
+from sfm.files.covariance_file import MAX_POINTS
 from sfm.files.plain_text import csv_text, or_none
 from sfm.report.figures.comparisons import difference_figure
 from sfm.report.figures.plots import Plot, png
 from sfm.report.html.page import render
-from sfm.report.numbers import finer_unit, significant
+from sfm.report.numbers import finer_unit, general, significant
 from sfm.report.page_files import write_files
 
 COLUMNS = ("id", "dX", "dY", "dZ", "sdX", "sdY", "sdZ", "T", "significant")
@@ -24,9 +26,12 @@ WHY_UNTESTED = {
     "no standard deviations of common points": "the standard deviations of the common points are not known",
     "no common datum": "without an alignment only results in the datum of control are in one frame",
     "covariance of single points only": "the covariance between the points is not known, which a result of "
-    "this version with up to 1000 points keeps; in a minimal datum or one of control, and between different "
-    "datums, nothing can be said without",
+    "this version keeps; in a minimal datum or one of control, and between different datums, nothing can be "
+    "said without",
 }
+MANY = MAX_POINTS + 1  # points of which only a sample is kept with its covariance
+SMOOTH = 0.5  # fraction that a bending explains from which on a camera is the likely cause
+OTHER_SIGMAS = 5.0  # standard deviations from which on an interior orientation is another one
 FILES = ("differences.csv", "comparison.json", "comparison.html")
 PICTURE = (
     "Differences of the points: arrows in the object's main plane, significant ones in red; the colour of "
@@ -84,6 +89,8 @@ def differences_summary(found: ResultComparison) -> dict[str, Any]:
         "rms_position": or_none(_rms(found.position_difference)),
         "max_rotation_deg": or_none(_largest(found.rotation_deg)),
         "changed": found.changed,
+        "bending": found.smooth,
+        "causes": list(words_of_cause(found)),
         "untested": found.untested or None,
         "approximate": found.approximate,
         "tested": _tested(found),
@@ -124,17 +131,69 @@ def words_of_test(found: ResultComparison) -> tuple[str, str]:
     if found.untested:
         return f"Not tested: {WHY_UNTESTED.get(found.untested, found.untested)}.", "fair"
     about = " Approximate: the covariance between points is not known." if found.approximate else ""
+    tested, of = _tested(found), len(found.points)
+    if tested < MANY <= of:
+        of = tested
+        about = (
+            f" Tested: {tested} of {len(found.points)} points, whose covariance together both results keep."
+        )
     moved = int(found.significant.sum())
     if not found.majority:
         return f"The points differ significantly, and no half of them agree.{about}", "bad"
     if moved:
         return (
-            f"The points differ significantly: {moved} of {len(found.points)} moved.{about}",
+            f"The points differ significantly: {moved} of {of} moved.{about}",
             "bad",
         )
     if found.changed:
         return f"The points differ significantly as a whole, none of them singly.{about}", "bad"
     return f"The points do not differ significantly.{about}", "good"
+
+
+def words_of_cause(found: ResultComparison) -> tuple[str, ...]:
+    """Return what besides a change of the object may be the cause of significant differences, in sentences.
+
+    Unmodelled motion of a lens bends an object as a whole and shows as interior orientations of one camera
+    that differ by many standard deviations.
+    """
+    if not found.changed or not found.independent:
+        return ()
+    lines = []
+    bent = found.smooth > SMOOTH
+    if bent:
+        lines.append(
+            f"A bending of the whole explains {found.smooth:.0%} of the weighted square sum: a camera that "
+            "is not described well does that, single points that move do not."
+        )
+    others = [line for one in found.interior if (line := _words_of_interior(one))]
+    lines += others
+    if bent or others:
+        names = dict.fromkeys(
+            name
+            for one in found.interior
+            for name in MODELS[one.model].names_of(Role.FOCAL, Role.X0, Role.Y0)
+            if name in one.names
+        ) or ("c", "x0", "y0")
+        written = ", ".join(f'"{name}"' for name in names)
+        lines.append(
+            "If a lens was zoomed, focused or loose between photographs, adjust both with "
+            f"per_photograph = [{written}] and compare again before calling it a change of the object."
+        )
+    return tuple(lines)
+
+
+def _words_of_interior(one: InteriorDifference) -> str:
+    """Return in words by how much the interior orientation of a camera is another one, empty if it is not."""
+    with np.errstate(invalid="ignore", divide="ignore"):
+        sigmas = np.where(one.sigma > 0, np.abs(one.difference) / one.sigma, 0.0)
+    worst = int(np.argmax(sigmas))
+    if sigmas[worst] < OTHER_SIGMAS:
+        return ""
+    unit = f" {one.units[worst]}" if one.units[worst] else ""
+    return (
+        f"Camera {one.camera} has another interior orientation: {one.names[worst]} differs by "
+        f"{general(abs(one.difference[worst]), 3)}{unit}, {sigmas[worst]:.0f} standard deviations."
+    )
 
 
 def words_of_pairing(found: ResultComparison) -> str:
@@ -172,6 +231,7 @@ def differences_page(found: ResultComparison, xyz: FloatArray) -> str:
     return render(
         "comparison.html",
         headline=verdict,
+        causes=words_of_cause(found),
         paired=words_of_pairing(found),
         scale=words_of_scale(found),
         level=level,

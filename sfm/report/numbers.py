@@ -77,6 +77,18 @@ def with_exponent(value: float, sigma: float) -> tuple[str, str]:
     return f"{mantissa:.{decimals}f}e{power}", f"{sigma / 10.0**power:.{decimals}f}e{power}"
 
 
+def with_sigma(value: float, sigma: float) -> tuple[str, str]:
+    """Write a value to the second digit of its standard deviation, and the latter.
+
+    Args:
+        value: of any unit.
+        sigma: its standard deviation, 0 if it was held, NaN if it is not known.
+    """
+    if np.isfinite(sigma) and sigma > 1e-13 * (1 + abs(value)):
+        return to_precision(value, sigma), significant(sigma, 2)
+    return f"{value:.9g}", "not known" if np.isnan(sigma) else "held"
+
+
 def to_precision(value: float, sigma: float) -> str:
     """Write a coordinate to the second digit of its standard deviation, six decimals if that is not known."""
     if not np.isfinite(value):
@@ -120,6 +132,16 @@ def is_number(text: str) -> bool:
 
 FILTERS = {
     one.__name__: one
-    for one in (fixed, plus, scientific, general, significant, signed, or_unlimited, with_exponent)
+    for one in (
+        fixed,
+        plus,
+        scientific,
+        general,
+        significant,
+        signed,
+        or_unlimited,
+        with_exponent,
+        with_sigma,
+    )
 } | {one.__name__: one for one in (to_precision, raised)}
 """what the templates call"""

@@ -35,6 +35,7 @@ WRITTEN = (
     "cameras_balanced.csv",
     "image_points.csv",
     "point_covariance.npy",
+    "point_covariance_points.csv",
     "left_out.csv",
     "given.csv",
     "reliability.csv",
@@ -117,9 +118,9 @@ def write_result(
         write_tables(timed, folder)
         write_protocol(timed, folder)
         write_summary(timed, folder)
-        covariance = result.with_covariance.covariance
-        if covariance is not None:
-            write_covariance(folder, covariance)
+        joint = result.with_covariance
+        if joint.covariance is not None:
+            write_covariance(folder, joint.covariance, joint.network.points, joint.covariance_points)
         (folder / "report.txt").write_text(text_report(timed), encoding="utf-8")
         page = report_page(
             timed, plots, overlays, has_model=write_colmap is not None, viewer=viewer_of(scene, pictures)

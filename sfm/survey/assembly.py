@@ -29,7 +29,9 @@ def assemble_result(
     points = adjustment.network.points
     is_in = set(adjustment.network.images)  # a photograph may fit at last, with a camera of its own
     failed = tuple(
-        FailedImage(*one) for one in (*start.failures, *solution.dropped_images) if one[0] not in is_in
+        FailedImage(*one)
+        for one in (*start.failures, *matched.left_out, *solution.dropped_images)
+        if one[0] not in is_in
     )
     correlations = exterior_correlations(adjustment)
     return SurveyResult(

@@ -2,17 +2,28 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
+
 import numpy as np
 
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.solve import adjust
+from sfm.camera import tangents_from_pixel
 from sfm.conventions import MAD_TO_SIGMA
 from sfm.network import Estimate, Network
+from sfm.orientation.incremental.growth import residual_lengths
 from sfm.orientation.incremental.sequence import Orientation
+from sfm.orientation.intersection import intersect
 from sfm.reduced_network import reduce_network
 from sfm.survey.adjusting.settling import determined, merge_estimate
 from sfm.survey.adjusting.solution import TOLERANCE_FACTOR, Correspondences
 from sfm.survey.circles import check_circles
+from sfm.survey.diagnosis.contradicting_codes import (
+    ContestedCodes,
+    find_contested_codes,
+    words_of_contested,
+)
+from sfm.survey.diagnosis.own_camera import treat_lost
 from sfm.survey.inputs.measurements import MeasuredPhotographs, Measurements, Naming
 from sfm.survey.inputs.survey import Survey
 from sfm.survey.target_network import build_network, match_uncoded, min_rays
@@ -41,7 +52,8 @@ def find_correspondences(survey: Survey, measured: Measurements, start: Orientat
             point_failures=start.point_failures,
             given=start.kind == "given",
         )
-    naming, network, estimate = _match_and_adjust(survey, photographs, naming, start)
+    matched, left_out, lines = _without_other_objects(survey, photographs, naming, start)
+    naming, network, estimate = matched.naming, matched.network, matched.estimate
     circles = check_circles(survey, photographs, naming, network, estimate)
     return Correspondences(
         circles.network,
@@ -50,15 +62,75 @@ def find_correspondences(survey: Survey, measured: Measurements, start: Orientat
         naming,
         circles.eccentricity,
         circles.no_circles,
-        circles.warnings,
+        (*circles.warnings, *lines),
         start.point_failures,
         start.kind == "given",
+        left_out,
+        matched.suspected,
     )
+
+
+@dataclass(frozen=True)
+class _Matched:
+    """All targets with their names, the network that they make, and its adjustment."""
+
+    naming: Naming
+    network: Network
+    estimate: Estimate
+    suspected: tuple[str, ...]  # photographs that were matched with a camera of their own
+
+
+def _without_other_objects(
+    survey: Survey, photographs: MeasuredPhotographs, naming: Naming, start: Orientation
+) -> tuple[_Matched, tuple[tuple[str, str], ...], tuple[str, ...]]:
+    """Match, leave out the photographs whose codes contradict the others, and match the others again.
+
+    Returns:
+        What was matched; photographs that are left out, with the reason; lines on codes that are at several
+        places still.
+    """
+    matched = _match_and_adjust(survey, photographs, naming, start)
+    found = find_contested_codes(photographs, matched.naming)
+    reasons = tuple((photographs.names[i], reason) for i, reason in sorted(found.left_out.items()))
+    if found.left_out or found.main.keys() - matched.naming.code[list(found.main.values())]:
+        estimate = _without_contested(photographs, matched.naming, matched.estimate, found)
+        matched = _match_and_adjust(survey, photographs, matched.naming, replace(start, estimate=estimate))
+        found = find_contested_codes(photographs, matched.naming)
+    return matched, reasons, words_of_contested(found, photographs, matched.naming)
+
+
+def _without_contested(
+    photographs: MeasuredPhotographs, naming: Naming, estimate: Estimate, found: ContestedCodes
+) -> Estimate:
+    """Return the estimate without photographs of other objects, contested codes where the rest has them."""
+    position, rotation, points = estimate.position.copy(), estimate.rotation.copy(), estimate.points.copy()
+    out = list(found.left_out)
+    position[out], rotation[out] = np.nan, np.nan
+    estimate = replace(estimate, position=position, rotation=rotation)
+    kept = np.flatnonzero(estimate.oriented).tolist()
+    for code in found.places:
+        of_code = [photographs.targets[i].xy[photographs.targets[i].code == code] for i in kept]
+        image = np.repeat(kept, [len(xy) for xy in of_code])
+        uv = [
+            tangents_from_pixel(estimate.cameras[photographs.camera[i]], xy)
+            for i, xy in zip(kept, of_code, strict=True)
+        ]
+        c_px = min(camera.c_px for camera in estimate.cameras)
+        points[np.flatnonzero(naming.code == code)] = intersect(
+            np.concatenate(uv),
+            image,
+            np.zeros(len(image), dtype=np.int64),
+            position,
+            rotation,
+            n_points=1,
+            tolerance=MIN_TOLERANCE_PX / c_px,
+        ).points[0]
+    return replace(estimate, points=points)
 
 
 def _match_and_adjust(
     survey: Survey, photographs: MeasuredPhotographs, naming: Naming, start: Orientation
-) -> tuple[Naming, Network, Estimate]:
+) -> _Matched:
     """Name the uncoded targets and adjust in turn, with a tolerance that shrinks with the residuals.
 
     Args:
@@ -81,4 +153,23 @@ def _match_and_adjust(
         estimate = merge_estimate(estimate, adjusted.estimate, images, points)
         spread = MAD_TO_SIGMA * float(np.median(np.abs(adjusted.residuals)))
         tolerance_px = float(np.clip(TOLERANCE_FACTOR * spread, MIN_TOLERANCE_PX, tolerance_px))
-    return naming, network, estimate
+    return _with_own_cameras(survey, photographs, _Matched(naming, network, estimate, ()), tolerance_px)
+
+
+def _with_own_cameras(
+    survey: Survey, photographs: MeasuredPhotographs, matched: _Matched, tolerance_px: float
+) -> _Matched:
+    """Match photographs that fit only with a camera of their own by that camera; else return what is there.
+
+    Which camera they have is for the adjustment; with the one of the others their targets lie beyond the
+    tolerance and would make points of their own.
+    """
+    estimate = matched.estimate
+    accepted = residual_lengths(matched.network, estimate) <= tolerance_px
+    treated = treat_lost(matched.network, estimate, accepted, oriented=estimate.oriented)
+    if treated is None or not treated.own:
+        return matched
+    own = replace(photographs, camera=treated.network.camera)
+    naming, found = match_uncoded(own, matched.naming, treated.estimate, tolerance_px=tolerance_px)
+    network = build_network(survey, photographs, naming)
+    return _Matched(naming, network, replace(found, cameras=estimate.cameras), treated.own)

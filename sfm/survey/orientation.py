@@ -18,6 +18,7 @@ from sfm.survey.adjusting.solution import refine
 from sfm.survey.circles import circle_misfit
 from sfm.survey.diagnosis.codes_found import words_of_codes
 from sfm.survey.diagnosis.lost_photographs import tell_lost_photographs, try_other_principal_distances
+from sfm.survey.diagnosis.second_object import SecondObject, find_second_objects, tell_second_objects
 from sfm.survey.inputs.measurements import Measurements
 from sfm.survey.inputs.start import start_values
 from sfm.survey.inputs.survey import Survey
@@ -56,9 +57,10 @@ def orient_survey(survey: Survey, measured: Measurements) -> Orientation:
         failure = error
         if measured.photographs is not None and _most_in_common(network) < MIN_POINTS:
             raise GeometryError(words_of_codes(survey, measured.photographs)) from error
-    line = ""
-    if not given:
+    line, others = "", _second_objects(survey, network, found)
+    if not given and not (others and all(one.certain for one in others)):
         found, line = try_other_principal_distances(network, estimate, found, orient_from)
+        others = _second_objects(survey, network, found) if line else others
     if found is None:
         hint = " (correct or complete [approximate], or leave it out)" if given else ""
         hint += f"; {line}" if line else ""
@@ -67,7 +69,15 @@ def orient_survey(survey: Survey, measured: Measurements) -> Orientation:
     warnings += (*found.remarks, *([line] if line else []))
     chosen = choose_free_parameters(survey, network, found.estimate, extend=False)
     found, held = _hold_cameras_of_two(survey, network, replace(found, estimate=chosen.estimate))
-    return tell_lost_photographs(network, replace(found, warnings=warnings + held))
+    found = tell_lost_photographs(network, replace(found, warnings=warnings + held))
+    return tell_second_objects(found, others)
+
+
+def _second_objects(survey: Survey, network: Network, found: Orientation | None) -> tuple[SecondObject, ...]:
+    """Return the photographs of targets that fit one another and not the others."""
+    if found is None or survey.tie_points:
+        return ()
+    return find_second_objects(network, found, _orient)
 
 
 def _orient(

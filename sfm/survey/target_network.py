@@ -25,6 +25,7 @@ UNNAMED = -1
 # Standard deviation of the size of tags where the survey states none, in parts of it: what desktop printers
 # and the setting "fit to page" by mistake are apart from true scale once the ruler was checked.
 TAG_SIGMA = 0.002
+FAR = 4.0  # semi-axes of a target: what is nearer to its point is not another target
 MIN_RAYS = 3  # photographs that must agree on an uncoded point; two rays cannot contradict each other
 
 
@@ -147,7 +148,9 @@ def match_uncoded(
         if oriented[i]:
             camera = estimate.cameras[photographs.camera[i]]
             projected = project(camera, estimate.position[i], estimate.rotation[i], known)
-            named = _nearest(found.xy, projected, found.code, naming.code[coded], tolerance_px)
+            named = _nearest(
+                found.xy, projected, found.code, naming.code[coded], tolerance_px, FAR * found.semi_axes[:, 0]
+            )
         point.append(named)
     free = [np.flatnonzero(named == UNNAMED) for named in point]
     matches = match_targets(
@@ -176,11 +179,18 @@ def match_uncoded(
 
 
 def _nearest(
-    xy: FloatArray, projected: FloatArray, code: IntArray, point_code: IntArray, tolerance_px: float
+    xy: FloatArray,
+    projected: FloatArray,
+    code: IntArray,
+    point_code: IntArray,
+    tolerance_px: float,
+    far_px: FloatArray,
 ) -> IntArray:
     """Return the coded point that each target coincides with, or UNNAMED; one target a point.
 
-    A target whose own code says another number is never renamed: one of the two is wrong.
+    A target whose own code says another number is never renamed: one of the two is wrong. One with the code
+    of the point keeps its name also beyond the tolerance, for the adjustment to judge, unless it is so far
+    away that it is another target.
     """
     named = np.full(len(xy), UNNAMED)
     if not len(xy):
@@ -188,7 +198,8 @@ def _nearest(
     for j in np.flatnonzero(np.isfinite(projected).all(axis=1)):
         distance = np.hypot(*(xy - projected[j]).T)
         distance[(code >= 0) & (code != point_code[j])] = np.inf
-        k = int(np.argmin(distance))
-        if distance[k] <= tolerance_px and named[k] == UNNAMED:
+        own = np.flatnonzero((code == point_code[j]) & (distance <= far_px))
+        k = int(own[np.argmin(distance[own])]) if len(own) else int(np.argmin(distance))
+        if (len(own) or distance[k] <= tolerance_px) and named[k] == UNNAMED:
             named[k] = j
     return named

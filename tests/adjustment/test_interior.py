@@ -16,6 +16,7 @@ from sfm.adjustment.engine.solvers import choice
 from sfm.adjustment.engine.solvers.banded import BandSolver
 from sfm.adjustment.engine.solvers.dense import schur_complement
 from sfm.adjustment.engine.unknowns import interior_names, start_weights, step, unknowns_of
+from sfm.adjustment.result import Adjustment
 from sfm.adjustment.separate import adjust_separately
 from sfm.adjustment.solve import adjust
 from sfm.camera import Camera, project
@@ -225,6 +226,48 @@ def test_parameters_are_free_fixed_or_weighted_one_by_one() -> None:
         assert camera.value("K1") == pytest.approx(8.5e-4, abs=1e-7)
         assert (camera.value("P1"), camera.value("P2")) == (was.value("P1"), was.value("P2"))
         assert Q[0, 0] / a.sigma0**2 < min(1e-6, before[0, 0] / free.sigma0**2)
+
+
+def test_a_calibration_and_a_survey_one_after_the_other_are_both_together() -> None:
+    """With the full covariance of the calibration as observation; its diagonal alone does not do it.
+
+    What is left is of second order: 0.065, 0.006, 0.0006 sigma with a noise of 0.1, 0.01, 0.001 px.
+    """
+    network, truth = make_network(seed_of("two steps"), images=8, points=30, model="brown", noise_px=0.01)
+    control = ObjectPoints(np.arange(30), truth.points, np.zeros((30, 3, 3)))
+    network = replace(network, control=control)
+    seen = network.image_points
+
+    def part(chosen: np.ndarray, interior: InteriorObservations | None = None) -> Adjustment:
+        images = np.flatnonzero(chosen)
+        rows = np.flatnonzero(chosen[seen.image])
+        points = replace(seen.select(rows), image=np.searchsorted(images, seen.image[rows]))
+        own = replace(
+            network,
+            images=tuple(network.images[i] for i in images),
+            camera=network.camera[images],
+            image_points=points,
+            interior=interior or InteriorObservations(),
+        )
+        start = replace(truth, position=truth.position[images], rotation=truth.rotation[images])
+        return adjust(own, start, datum=Datum("control"), sigma_px=0.1, reject="none")
+
+    together = part(np.ones(8, dtype=bool))
+    first = part(np.arange(8) < 4)
+    camera, Q = first.estimate.cameras[0], first.covariance.interior[0] / first.sigma0**2
+    free = np.flatnonzero(camera.free)
+    sigma = np.sqrt(np.diagonal(Q))
+    R = Q / np.outer(sigma, sigma)
+    values = np.zeros(len(free), dtype=np.int64), free, camera.parameters[free], sigma
+    due = together.covariance.interior[0] / together.sigma0**2
+    unit = np.sqrt(np.diagonal(due))
+    for correlation, same in ((R, True), (None, False)):
+        second = part(np.arange(8) >= 4, InteriorObservations(*values, correlation))
+        found = second.covariance.interior[0] / second.sigma0**2
+        off = (second.estimate.cameras[0].parameters - together.estimate.cameras[0].parameters)[free] / unit
+        assert (np.abs(off).max() < 0.01) is same
+        assert (np.abs(np.sqrt(np.diagonal(found)) / unit - 1).max() < 0.01) is same
+    assert second.observations == together.observations - first.observations + len(free)
 
 
 def test_tables_of_groups_are_as_long_as_the_parameters() -> None:

@@ -38,6 +38,8 @@ COMMANDS = {
     "resect": ("points.csv",),
     "init": ("photographs",),
     "view": ("result",),
+    "measure": ("result",),
+    "accept": ("result", "lengths.csv", "--limit-a", "0.1"),
     "match": ("left.png", "right.png"),
     "targets": ("--out", "sheet.pdf"),
     "validate": (),
@@ -95,8 +97,9 @@ def test_what_nobody_has_foreseen_is_one_line_with_its_traceback_in_a_file(
         "drafting",
         "viewing",
         "checking",
+        "inspecting",
     ):
-        monkeypatch.setattr(f"sfm.cli.{module}.loading", raising(ValueError("new\nline \x1b[31m")))
+        monkeypatch.setattr(f"sfm.cli.commands.{module}.loading", raising(ValueError("new\nline \x1b[31m")))
     code, lines = kolinear(monkeypatch, capsys, command, *COMMANDS[command])
     (path,) = tmp_path.iterdir()
     assert code == 70

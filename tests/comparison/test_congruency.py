@@ -11,14 +11,16 @@ import pytest
 
 from sfm.adjustment.covariance import marginal_of
 from sfm.adjustment.datum import Datum
+from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.camera import project
 from sfm.comparison.congruency import congruency, motions
 from sfm.comparison.significance import ResultComparison, compare_results
 from sfm.conventions import FloatArray
+from sfm.distortion.models import Role
 from sfm.errors import GeometryError
 from sfm.network import Estimate, Network
-from sfm.report.differences import words_of_scale, words_of_test
+from sfm.report.differences import words_of_cause, words_of_scale, words_of_test
 from sfm.stored_result import StoredResult
 from tests.synthetic import make_network, seed_of
 
@@ -56,10 +58,26 @@ def epoch(seed: int, datum: str, shift: FloatArray | None = None, *, bar: float 
     a = adjust(network, moved, datum=kind, sigma_px=0.1, reject="none")
     covariance = marginal_of(a).joint(np.zeros(0, dtype=np.int64), np.arange(60))
     return StoredResult(
-        *(f"{datum} {seed}", network, a.estimate, a.covariance.points, None, None, a.redundancy, "m"),
+        *(f"{datum} {seed}", network, a.estimate, a.covariance.points, None),
+        (_interior_sigma(a),),
+        *(a.redundancy, "m"),
         covariance=covariance,
         datum=a.datum,
     )
+
+
+def sampled(result: StoredResult, points: np.ndarray) -> StoredResult:
+    """The same with the covariance of some points only."""
+    assert result.covariance is not None
+    rows = (3 * points[:, None] + np.arange(3)).ravel()
+    return replace(result, covariance=result.covariance[np.ix_(rows, rows)], covariance_points=points)
+
+
+def _interior_sigma(a: Adjustment) -> FloatArray:
+    camera = a.estimate.cameras[0]
+    sigma = np.full(len(camera.names), np.nan)
+    sigma[camera.free] = np.sqrt(np.diagonal(a.covariance.interior[0]))
+    return sigma
 
 
 def compared(first: str, second: str, shift: FloatArray | None = None) -> ResultComparison:
@@ -87,6 +105,53 @@ def test_points_that_moved_are_found_and_no_others(datums: tuple[str, str]) -> N
     still = np.setdiff1d(np.arange(60), MOVED)
     assert np.abs(found.point_difference[still] / found.point_sigma[still]).max() < 4.5
     assert words_of_test(found) == ("The points differ significantly: 5 of 60 moved.", "bad")
+
+
+def test_a_bending_of_the_whole_is_told_from_points_that_move() -> None:
+    xyz = scene()[1].points
+    dome = np.zeros((60, 3))
+    dome[:, 2] = 0.01 * (xyz[:, :2] ** 2).sum(axis=1)
+    bent = compared("free", "control", dome)
+    assert bent.changed is True and bent.smooth > 0.8
+    said = " ".join(words_of_cause(bent))
+    assert "A bending of the whole explains" in said
+    assert 'per_photograph = ["fx", "fy", "cx", "cy"]' in said
+    shift = np.zeros((60, 3))
+    shift[MOVED] = [0.004, -0.002, 0.003]
+    moved = compared("free", "minimal", shift)
+    assert moved.changed is True and moved.smooth < 0.5 and words_of_cause(moved) == ()
+    assert words_of_cause(compared("free", "free")) == ()
+
+
+def test_another_interior_orientation_is_told() -> None:
+    first, second = epoch(4, "free"), epoch(5, "free", 0.01 * scene()[1].points[:, :1] ** 2 * [0.0, 0.0, 1.0])
+    camera = second.estimate.cameras[0]
+    other = camera.with_parameters(camera.parameters + 50.0 * camera.plays(Role.X0))
+    second = replace(second, estimate=replace(second.estimate, cameras=(other,)))
+    said = " ".join(words_of_cause(compare_results(first, second)))
+    assert f"Camera {camera.name} has another interior orientation: cx differs by" in said
+
+
+def test_where_a_sample_is_kept_the_points_of_both_samples_are_tested() -> None:
+    shift = np.zeros((60, 3))
+    shift[MOVED] = [0.004, -0.002, 0.003]
+    first = sampled(epoch(4, "free"), np.arange(0, 45))
+    second = sampled(epoch(5, "minimal", shift), np.arange(10, 60))
+    found = compare_results(first, second)
+    assert list(np.flatnonzero(np.isfinite(found.statistic))) == list(range(10, 45))
+    assert list(np.flatnonzero(found.significant)) == [17, 22, 41]  # of 5, 17, 22, 41, 58
+    assert found.point_difference[MOVED] == pytest.approx(shift[MOVED], abs=1.5e-3)
+    assert compare_results(sampled(epoch(4, "free"), np.arange(3)), second).untested.startswith(
+        "congruency: 0"
+    )
+
+
+def test_where_no_half_agrees_no_point_is_blamed() -> None:
+    rng = seed_of("scattered")
+    found = compared("free", "free", 0.02 * rng.standard_normal((60, 3)))
+    assert found.changed is True and not found.majority
+    assert not found.significant.any() and found.stable.all()
+    assert words_of_test(found) == ("The points differ significantly, and no half of them agree.", "bad")
 
 
 def test_a_change_of_size_is_a_change_where_both_have_a_scale() -> None:

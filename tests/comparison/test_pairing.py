@@ -8,9 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from adapters.formats.registry import read_comparable, write_any
+from adapters.formats.registry import format_named, read_comparable, write_any
+from sfm.comparison.camera_conversion import convert_cameras
 from sfm.comparison.pairing import pair_results
 from sfm.comparison.significance import compare_results
+from sfm.comparison.undistortion import undistort
 from sfm.conventions import rotation_from_vector
 from sfm.errors import GeometryError
 from sfm.network import Estimate, Network
@@ -107,6 +109,26 @@ def test_a_result_is_paired_with_its_own_file_of_any_format(form: str, tmp_path:
     assert np.abs(found.point_difference).max() < 1e-6
     if form in ("bal", "sba"):
         assert found.pairing.points_by_name == 0 and found.pairing.images_by_name == 0
+        assert found.pairing.points_by_image_points == 40
+        assert found.same_share == 1.0  # not tested as if it were an independent result
+
+
+@pytest.mark.parametrize("form", ["bal", "sba"])
+def test_image_points_corrected_for_distortion_are_recognised_by_their_rays(
+    form: str, tmp_path: Path
+) -> None:
+    """In another frame and without a name: neither names nor places nor pixels are the same."""
+    network, truth = make_network(seed_of("rays"), images=6, points=40, model="brown", noise_px=0.1)
+    kind = format_named(form)
+    straight, ideal = undistort(network, truth, kind.models)
+    ideal, _ = convert_cameras(ideal, kind.models, held=kind.lacks)
+    turn = Similarity(2.0, rotation_from_vector(np.array([0.3, -0.8, 0.2])), np.array([3.0, 1.0, -2.0]))
+    path = tmp_path / ("net.txt" if form == "bal" else "files")
+    write_any(path, form, straight, turn.apply_estimate(ideal))
+    found = compare_results(StoredResult("own", network, truth), read_comparable(path, form))
+    assert found.pairing.points_by_image_points == 40 and found.points == network.points
+    assert found.images == network.images and found.same_share == 1.0
+    assert np.abs(found.point_difference).max() < 1e-6
 
 
 def test_pairs_are_one_to_one(run: tuple[Network, Estimate]) -> None:

@@ -136,7 +136,7 @@ def test_a_survey_is_frozen(tmp_path: Path) -> None:
         ),
         ("sigma_px =", "sigma =", r"unknown key 'sigma' in \[adjust\], known are sigma_px, reject, weights$"),
         ('name = "camcal"\n', "", r"line 1: survey.name is missing"),
-        ("[datum]", "[date]", r"line 18: unknown key 'date' in the survey file, known are survey, camera,"),
+        ("[datum]", "[date]", r"line 18: unknown key 'date' in the file, known are survey, camera,"),
         ("c_mm = 7.3", 'c_mm = "7.3"', r"line 9: camera 1.c_mm: found '7.3', needed a number"),
         ("c_mm = 7.3", "c_mm = nan", r"line 9: camera 1.c_mm: found nan, needed a finite number"),
         ("c_mm = 7.3", "c_mm = -7.3", r"line 9: camera 1.c_mm: found -7.3, needed more than 0"),

@@ -14,7 +14,17 @@ from sfm.errors import GeometryError, SurveyFileError
 from sfm.pipeline import run_survey
 from sfm.printing.sheet import lay_out_sheet
 from sfm.rendering.render import render_photograph, render_photographs
-from sfm.rendering.scene import CircularTargets, Faces, Marks, Optics, Scene, discs, join_marks, square_tag
+from sfm.rendering.scene import (
+    CircularTargets,
+    Faces,
+    Marks,
+    Optics,
+    Scene,
+    discs,
+    join_marks,
+    rectangles,
+    square_tag,
+)
 from sfm.similarity import fit_similarity
 from sfm.survey.inputs.survey import read_survey
 from sfm.targets.codes.tags import DICTIONARIES, corner_name, tag_family
@@ -56,18 +66,36 @@ def oblique_camera(tilt: float, azimuth: float, distance: float) -> tuple[FloatA
 
 
 def photographed(
-    name: str, number: int, half: float, tilt: float, rng: np.random.Generator, *, inverted: bool = False
+    name: str,
+    number: int,
+    half: float,
+    tilt: float,
+    rng: np.random.Generator,
+    *,
+    inverted: bool = False,
+    touched: bool = False,
+    blur_px: tuple[float, float] = (0.6, 0.9),
+    noise: float = 2 / 255,
 ) -> tuple[AnyArray, FloatArray]:
-    """Return a photograph of one tag, 1 px per unit at the origin, and its corners."""
+    """Return a photograph of one tag, 1 px per unit at the origin, and its corners.
+
+    With `touched` black squares touch the corners, as on the boards for calibration.
+    """
     family = tag_family(name)
     assert family is not None
     low, high = (HIGH, LOW) if inverted else (LOW, HIGH)
     turn = rng.uniform(0, 2 * np.pi)
     tag = square_tag(0, np.zeros(2), half, number, family, low, high, turn=turn)
+    if touched:
+        module = 2 * half / family.modules
+        squares = (half + module) * turned(turn)
+        tag = join_marks(
+            [tag, rectangles(0, squares, np.full((4, 2), module), np.full(4, turn), np.full(4, low))]
+        )
     scene = Scene(plates([(12 * half, 12 * half)], [0.0], high), tag, NO_TARGETS)
     camera = camera_from_values("one", "brown", (320, 320), (0.01, 0.01), c_mm=10.0)
     position, rotation = oblique_camera(tilt, rng.uniform(0, 2 * np.pi), 1000.0)
-    optics = Optics(blur_px=rng.uniform(0.6, 0.9), exposure=0.9, noise=2 / 255)
+    optics = Optics(blur_px=rng.uniform(*blur_px), exposure=0.9, noise=noise)
     picture, _ = render_photograph(scene, camera, position, rotation, optics=optics, rng=rng)
     corners = np.column_stack([half * turned(turn), np.zeros(4)])
     return picture, project(camera, position, rotation, corners)
@@ -95,6 +123,54 @@ def test_corners_are_as_good_as_their_covariance_says(half: float, inverted: boo
     assert np.sqrt(np.mean(np.square(errors))) < 0.025
     # 150 coordinates: the mean normalised square is known to 12 %; obliqueness and pixel area add a little
     assert np.mean(squares) == pytest.approx(1.0, abs=0.4)
+
+
+def sharpened(picture: AnyArray, amount: float, mask_px: float) -> AnyArray:
+    """Return the picture after unsharp masking."""
+    wide = cv2.GaussianBlur(picture.astype(float), (0, 0), mask_px)
+    return np.clip(np.rint(picture + amount * (picture - wide)), 0, 255).astype(np.uint8)
+
+
+@pytest.mark.parametrize(
+    ("half", "blur_px", "mask_px", "touched"),
+    [
+        ((20, 45), (0.6, 0.9), 0.0, False),
+        ((18, 21), (0.6, 0.9), 0.0, False),
+        ((22, 45), (1.2, 1.5), 0.0, False),
+        ((20, 45), (0.6, 0.9), 1.0, False),
+        ((20, 45), (0.6, 0.9), 2.0, False),
+        ((20, 45), (0.6, 0.9), 0.0, True),
+    ],
+    ids=["plain", "small", "blurred", "sharpened", "sharpened by 2 px", "touched by squares"],
+)
+def test_corners_have_no_bias_along_the_diagonals(
+    half: tuple[int, int], blur_px: tuple[float, float], mask_px: float, touched: bool
+) -> None:
+    """What shifts edges moves all corners of a tag outwards, and the scale of the survey with them."""
+    rng = np.random.default_rng(21)
+    outwards = []
+    for k in range(8):
+        picture, truth = photographed(
+            "apriltag36h11",
+            40 + k,
+            rng.uniform(*half),
+            np.radians(rng.uniform(0, 30)),
+            rng,
+            touched=touched,
+            blur_px=blur_px,
+            noise=0.3 / 255,
+        )
+        picture = sharpened(picture, 0.8, mask_px) if mask_px else picture
+        found = find_targets(picture, polarity="dark", codes="apriltag36h11")
+        corner = (found.flag & Flag.CORNER) != 0
+        at = truth[found.code[corner] % 4]
+        away = at - truth.mean(axis=0)
+        away /= np.linalg.norm(away, axis=1, keepdims=True)
+        outwards += np.sum((found.xy[corner] - at) * away, axis=1).tolist()
+    assert len(outwards) >= 28
+    # 3e-3 px is 0.01 % of the half diagonal of a tag 42 px wide
+    assert abs(np.mean(outwards)) < 3e-3 + 3 * np.std(outwards) / np.sqrt(len(outwards))
+    assert np.sqrt(np.mean(np.square(outwards))) < 0.02
 
 
 @pytest.mark.parametrize("name", DICTIONARIES)

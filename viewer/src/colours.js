@@ -8,12 +8,16 @@ const STEPS = [
   [72, 40, 120], [66, 64, 134], [54, 92, 141], [42, 118, 142], [33, 145, 140],
   [39, 173, 129], [92, 200, 99], [170, 220, 50], [253, 231, 37],
 ]
+// Blue, grey, red for deviations: neither sign is the better one (after Moreland 2009).
+const SIGNED = [
+  [33, 82, 196], [92, 134, 222], [150, 172, 214], [190, 190, 190], [226, 160, 130], [221, 100, 76], [178, 24, 43],
+]
 const UNKNOWN = [128, 134, 142]
 
 /** A scale of colours from one value to another, in equal parts or in equal ratios. */
 export class Scale {
-  constructor(name, unit, from, to, { log = false, factor = 1, reversed = false } = {}) {
-    Object.assign(this, { name, unit, from, to, log, factor, reversed })
+  constructor(name, unit, from, to, { log = false, factor = 1, reversed = false, steps = STEPS } = {}) {
+    Object.assign(this, { name, unit, from, to, log, factor, reversed, steps })
   }
 
   /** Place of a value on the scale, 0 to 1. */
@@ -24,7 +28,14 @@ export class Scale {
 
   /** Red, green, blue of a value, 0 to 255. */
   colour(value) {
-    return Number.isFinite(value) ? shade(this.reversed ? 1 - this.place(value) : this.place(value)) : UNKNOWN
+    return Number.isFinite(value) ? this.shade(this.place(value)) : UNKNOWN
+  }
+
+  /** Red, green, blue of a place on the scale. */
+  shade(place) {
+    const at = (this.reversed ? 1 - place : place) * (this.steps.length - 1)
+    const k = Math.min(this.steps.length - 2, Math.floor(at))
+    return this.steps[k].map((low, c) => Math.round(low + (at - k) * (this.steps[k + 1][c] - low)))
   }
 
   /** Round values between the ends of the scale. */
@@ -39,7 +50,8 @@ export class Scale {
       const step = (this.to - this.from) / 3
       for (let k = 0; k <= 3; k++) found.push(this.from + k * step)
     }
-    return found.filter((x) => x >= this.from * 0.999 && x <= this.to * 1.001)
+    const slack = this.log ? 0 : 1e-3 * (this.to - this.from)
+    return found.filter((x) => x >= this.from * (this.log ? 0.999 : 1) - slack && x <= this.to * (this.log ? 1.001 : 1) + slack)
   }
 
   words(value) {
@@ -47,12 +59,6 @@ export class Scale {
     if (shown !== 0 && Math.abs(shown) < 1e-3) return shown.toExponential(1).replace(".0e", "e")
     return `${+significant(shown, 3)}`
   }
-}
-
-function shade(part) {
-  const at = part * (STEPS.length - 1)
-  const k = Math.min(STEPS.length - 2, Math.floor(at))
-  return STEPS[k].map((low, c) => Math.round(low + (at - k) * (STEPS[k + 1][c] - low)))
 }
 
 /** Scales of the points; that of sigma takes whole decades of the survey's unit. */
@@ -74,6 +80,15 @@ export function pointScales(model) {
   }
   const values = { sigma, rays: model.a["point.rays"], rms, angle: model.a["point.angle"] }
   if (!known.length) delete scales.sigma
+  const deviation = model.a["point.deviation"]
+  if (deviation) {
+    const size = deviation.reduce((most, d) => (Math.abs(d) > most ? Math.abs(d) : most), 0) || 1
+    const step = 10 ** Math.floor(Math.log10(size * model.fine.factor)) / model.fine.factor
+    const most = step * Math.ceil(size / step)
+    const options = { factor: model.fine.factor, steps: SIGNED }
+    const first = new Scale("deviation of a point", model.fine.unit, -most, most, options)
+    return { scales: { deviation: first, ...scales }, values: { deviation, ...values } }
+  }
   return { scales, values }
 }
 
@@ -87,7 +102,7 @@ export function drawLegend(scale, element, make, onchange) {
   const context = bar.getContext("2d")
   for (let x = 0; x < bar.width; x++) {
     const part = x / (bar.width - 1)
-    context.fillStyle = `rgb(${shade(scale.reversed ? 1 - part : part).join()})`
+    context.fillStyle = `rgb(${scale.shade(part).join()})`
     context.fillRect(x, 0, 1, 1)
   }
   const ticks = make("div", { className: "v-ticks" })

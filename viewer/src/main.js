@@ -74,7 +74,7 @@ function toolbar(model, scene, hub, tools, legends) {
   const own = make("div", { className: "v-legend" })
   const other = make("div", { className: "v-legend" })
   legends.append(own, other)
-  let by = scales.sigma ? "sigma" : "rms"
+  let by = scales.deviation ? "deviation" : scales.sigma ? "sigma" : "rms"
   let byPhoto = "rms"
   const paint = () => {
     scene.points.paint(values[by], scales[by])
@@ -90,7 +90,7 @@ function toolbar(model, scene, hub, tools, legends) {
   const names = make("datalist", { id: "viewer-names" })
   find.addEventListener("input", () => suggest(model, find.value, names))
   find.addEventListener("change", () => findName(model, scene, hub, find))
-  const words = { sigma: "sigma", rays: "rays", rms: "RMS", angle: "intersection angle" }
+  const words = { sigma: "sigma", rays: "rays", rms: "RMS", angle: "intersection angle", deviation: "deviation" }
   const options = Object.keys(scales).map((key) => [key, words[key]])
   const views = [["", "view ..."], ["home", "oblique"], ...["+X", "-X", "+Y", "-Y", "+Z", "-Z"].map((v) => [v, `from ${v}`])]
   const standard = choice("", views, (name) => {

@@ -69,6 +69,7 @@ export class Panel {
         ["rays", `${rays.length - rejected} accepted${rejected ? `, ${rejected} rejected` : ""}`],
         ["intersection angle", `${fixed(model.a["point.angle"][j], 1)} deg`],
         ["RMS residual", `${fixed(model.a["point.rms"][j], 4)} px`],
+        Number.isFinite(model.a["point.deviation"]?.[j]) ? ["deviation", `${fixed(model.a["point.deviation"][j] * model.fine.factor, 4)} ${model.fine.unit}`] : null,
         model.control.includes(j) ? ["given as", "control point"] : null,
       ]),
       this.distance(j),

@@ -122,7 +122,8 @@ def _parts(layout: Unknowns, weighted: Weighted, terms: WeightedTerms, b: Blocks
     g = np.zeros(layout.reduced)
     gather_interior(layout.observations, b, border, corner, g)
     if len(weighted.column):
-        np.add.at(corner, (weighted.column - first, weighted.column - first), weighted.interior_weight)
+        column = weighted.column - first
+        np.add.at(corner, (column[:, None], column[None]), weighted.interior_weight)
         np.add.at(g, weighted.column, terms.interior_g)
     if len(layout.kept):
         border[:, inner:] = b.K[:, :first].T

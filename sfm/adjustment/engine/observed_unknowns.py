@@ -34,7 +34,7 @@ class Weighted:
     parameter: IntArray  # index of the parameter in its camera, (q,)
     column: IntArray  # its column among the reduced unknowns, (q,)
     value: FloatArray  # (q,)
-    interior_weight: FloatArray  # (q,)
+    interior_weight: FloatArray  # (q, q)
     start: IntArray  # first kept point of each scale bar, (b,)
     end: IntArray  # second kept point of each scale bar, (b,)
     length: FloatArray  # (b,)
@@ -89,7 +89,7 @@ def weighted_of(network: Network, layout: Unknowns, *, use_control: bool) -> Wei
         parameter=interior.parameter[used],
         column=np.array(columns, dtype=np.int64),
         value=interior.value[used],
-        interior_weight=1 / interior.sigma[used] ** 2,
+        interior_weight=interior.weight_of(np.array(used, dtype=np.int64)),
         start=slot[bars.start[b]],
         end=slot[bars.end[b]],
         length=bars.length[b],
@@ -113,7 +113,7 @@ def _vPv(weighted: Weighted, state: State, exterior: FloatArray, bars: FloatArra
     return (
         float(weighted.length_weight @ bars**2)
         + float(np.einsum("ea,eab,eb->", exterior, weighted.exterior_weight, exterior))
-        + float(weighted.interior_weight @ dp**2)
+        + float(dp @ weighted.interior_weight @ dp)
         + float(np.einsum("pa,pab,pb->", dX, weighted.point_weight, dX))
     )
 
@@ -137,7 +137,7 @@ def weighted_terms(weighted: Weighted, layout: Unknowns, state: State) -> Weight
     return WeightedTerms(
         exterior=np.swapaxes(J, 1, 2) @ PJ,
         exterior_g=np.einsum("eab,ea->eb", PJ, e),
-        interior_g=weighted.interior_weight * dp,
+        interior_g=weighted.interior_weight @ dp,
         kept=rows.T @ Pa,
         kept_g=Pa.T @ length,
         vPv=_vPv(weighted, state, e, length),

@@ -62,10 +62,10 @@ def _sort(key: IntArray, before: IntArray, place: IntArray, order: IntArray) -> 
 
 
 @compiled
-def _whiten(covariance: FloatArray, order: IntArray, F: FloatArray) -> None:
-    for s in range(len(order)):
-        o = order[s]
+def _whiten(covariance: FloatArray, order: IntArray, factor: FloatArray) -> None:
+    for row in range(len(order)):
+        o = order[row]
         a = 1.0 / np.sqrt(covariance[o, 0, 0])
         slope = covariance[o, 0, 1] * a
         c = 1.0 / np.sqrt(covariance[o, 1, 1] - slope * slope)
-        F[s, 0], F[s, 1], F[s, 2] = a, -slope * a * c, c
+        factor[row, 0], factor[row, 1], factor[row, 2] = a, -slope * a * c, c

@@ -12,12 +12,12 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import stats
 
 from sfm.adjustment.engine.observed_unknowns import inverse_of_observed
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.conventions import FloatArray
+from sfm.distributions import f_sf
 from sfm.errors import GeometryError
 from sfm.network import ExteriorObservations, ObjectPoints, ScaleBars
 from sfm.similarity import fit_similarity, similarity_motions
@@ -97,7 +97,7 @@ def given_test(a: Adjustment, free: FreeNetwork | None) -> GivenTest | None:
         return None
     added = a.redundancy - free.redundancy
     statistic = max(a.vPv - free.vPv, 0.0) / added / (free.vPv / free.redundancy)
-    return GivenTest(statistic, added, float(stats.f.sf(statistic, added, free.redundancy)))
+    return GivenTest(statistic, added, float(f_sf(statistic, added, free.redundancy)))
 
 
 def control_apart(a: Adjustment, free: FreeNetwork | None) -> tuple[ControlApart, ...]:

@@ -15,13 +15,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import stats
 
 from sfm.adjustment.quality.gross_errors.doubtful_rays import DoubtfulPoint, doubtful_points
 from sfm.adjustment.quality.point_normals import PointNormals, intersected, point_normals
 from sfm.adjustment.quality.variance_components import VarianceComponents, by_photograph
 from sfm.adjustment.result import Adjustment
 from sfm.conventions import FloatArray, IntArray
+from sfm.distributions import chi2_sf
 from sfm.network import rows_of
 
 FAMILY = 0.01  # chance with which each test says anything of a survey in which nothing is wrong
@@ -102,7 +102,7 @@ def _points(
             two.append(found)
             continue
         r = float(adjustment.redundancy_numbers[accepted].sum())
-        if r > 1 and stats.chi2.sf(parts.q[accepted].sum(), r) < level:
+        if r > 1 and chi2_sf(parts.q[accepted].sum(), r) < level:
             large.append(network.points[j])
     return tuple(sorted(two, key=lambda one: -one.over_sigma)), tuple(large)
 
@@ -117,29 +117,29 @@ def _two_positions(
     """
     m = len(rows)
     one = parts.misfit(rows)
-    if len(adjustment.network.points) > MANY and stats.chi2.sf(one, 2 * m - 3) > CONSPICUOUS:
+    if len(adjustment.network.points) > MANY and chi2_sf(one, 2 * m - 3) > CONSPICUOUS:
         return None
     splits = [np.arange(m) < k for k in range(2, m - 1)]
     rejected = adjustment.rejected[rows]
     if 2 <= rejected.sum() <= m - 2:
         splits.append(~rejected)
-    if stats.chi2.sf(one, 3) * len(splits) > level:  # all of it could not be enough
+    if chi2_sf(one, 3) * len(splits) > level:  # all of it could not be enough
         return None
     misfit = np.array([parts.misfit(rows[split]) + parts.misfit(rows[~split]) for split in splits])
     best = int(np.argmin(misfit))
     split, left = splits[best], float(misfit[best])
-    if stats.chi2.sf(one - left, 3) * len(splits) > level:
+    if chi2_sf(one - left, 3) * len(splits) > level:
         return None
-    if rejected.any() and stats.chi2.sf(left, 2 * m - 6) < EXPLAINED:
+    if rejected.any() and chi2_sf(left, 2 * m - 6) < EXPLAINED:
         split = ~rejected  # far apart: by the rays that the test has told from one another
         if not 2 <= split.sum() <= m - 2:
             return None
     groups = [intersected(adjustment, rows[split]), intersected(adjustment, rows[~split])]
     left = groups[0][2] + groups[1][2]
-    if stats.chi2.sf(left, 2 * m - 6) < EXPLAINED:
+    if chi2_sf(left, 2 * m - 6) < EXPLAINED:
         return None
     without = min(parts.misfit(np.delete(rows, k)) for k in range(m))
-    if stats.chi2.sf(without - left, 1) * len(splits) > level:
+    if chi2_sf(without - left, 1) * len(splits) > level:
         return None
     network, seen = adjustment.network, adjustment.network.image_points
     apart = groups[1][0] - groups[0][0]
@@ -161,7 +161,7 @@ def _uneven(photographs: VarianceComponents) -> Uneven | None:
     pooled = float(r @ s2 / total)
     correction = 1 + (float((1 / r).sum()) - 1 / total) / (3 * (g - 1))
     statistic = (total * np.log(pooled) - float(r @ np.log(s2))) / correction
-    probability = float(stats.chi2.sf(statistic, g - 1))
+    probability = float(chi2_sf(statistic, g - 1))
     sigma = np.sqrt(s2)
     worst, median = int(np.argmax(sigma)), float(np.median(sigma))
     if probability > FAMILY or sigma[worst] < UNEVEN * median:
@@ -188,7 +188,7 @@ def _patterns(adjustment: Adjustment) -> tuple[Pattern, ...]:
             continue
         mean, in_px = (_means(values[own], cell, count) for values in (whitened, adjustment.residuals))
         between = float((count[:, None] * mean**2).sum())
-        probability = float(stats.chi2.sf(between, 2 * int((count > 0).sum())))
+        probability = float(chi2_sf(between, 2 * int((count > 0).sum())))
         explained = between / float((whitened[own] ** 2).sum())
         if probability < FAMILY / len(estimate.cameras) and explained > PATTERN:
             longest = float(np.linalg.norm(in_px, axis=1).max())

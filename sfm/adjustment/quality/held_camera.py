@@ -12,7 +12,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import stats
 
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.engine.iterate import newton_step, problem_of
@@ -22,6 +21,7 @@ from sfm.adjustment.engine.unknowns import unknowns_of
 from sfm.adjustment.result import Adjustment
 from sfm.camera import Camera
 from sfm.distortion.models import Role
+from sfm.distributions import f_isf
 
 ALPHA = 0.001  # probability with which right values are suspected, of all parameters together
 MOVED = 1.0  # standard deviations by which the points must move (root mean square) for it to matter
@@ -61,7 +61,7 @@ def held_parameters(
     if not held or a.reweighted or a.redundancy < 2 or not a.converged or not np.isfinite(a.sigma0):
         return ()
     found = []
-    limit = float(stats.f.isf(alpha / len(held), 1, a.redundancy - 1))
+    limit = float(f_isf(alpha / len(held), 1, a.redundancy - 1))
     if len(held) > 1:  # all at once first: seldom is there more to do
         whole = _freed(a, held)
         if whole is not None and whole[0] < limit:

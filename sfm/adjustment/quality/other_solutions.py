@@ -17,7 +17,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import stats
 
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.engine.iterate import TOLERANCE
@@ -25,6 +24,7 @@ from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.camera import Camera
 from sfm.conventions import BoolArray, FloatArray
+from sfm.distributions import f_isf
 from sfm.errors import GeometryError
 from sfm.network import Estimate, Network
 from sfm.similarity import fit_similarity
@@ -112,7 +112,7 @@ def _allowed(base: Adjustment) -> float:
     """
     freedom = base.redundancy + STATED_FREEDOM
     variance = (base.vPv + STATED_FREEDOM) / freedom
-    return float(variance * stats.f.isf(ALPHA, 1, freedom))
+    return float(variance * f_isf(ALPHA, 1, freedom))
 
 
 def _weak(a: Adjustment) -> bool:

@@ -11,12 +11,12 @@ NGS 1; Foerstner and Wrobel (2016), sec. 4.6.
 from __future__ import annotations
 
 import numpy as np
-from scipy import stats
 
 from sfm.adjustment.engine.collinearity import State
 from sfm.adjustment.engine.observed_unknowns import Weighted, bar_rows
 from sfm.adjustment.engine.unknowns import Unknowns
 from sfm.conventions import FloatArray
+from sfm.distributions import t_ppf
 
 
 def redundancy_numbers(complement: FloatArray, whitening: FloatArray) -> FloatArray:
@@ -100,7 +100,7 @@ def tau_critical(alpha: float, redundancy: int) -> float:
     """
     if redundancy < 2:
         return np.inf
-    t = stats.t.ppf(1 - alpha / 2, redundancy - 1)
+    t = t_ppf(1 - alpha / 2, redundancy - 1)
     return float(t * np.sqrt(redundancy) / np.sqrt(redundancy - 1 + t**2))
 
 

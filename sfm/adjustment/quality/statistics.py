@@ -12,7 +12,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import stats
 
 from sfm.adjustment.quality.reliability import UNCONTROLLED, tau_critical
 from sfm.adjustment.quality.variance_components import IMAGE_POINTS, VarianceComponents
@@ -20,6 +19,7 @@ from sfm.adjustment.result import Adjustment
 from sfm.camera import Camera
 from sfm.conventions import FloatArray, IntArray
 from sfm.distortion.models import MODELS
+from sfm.distributions import chi2_ppf, normal_ppf, poisson_sf, t_sf
 
 ALPHA = 0.001  # Baarda's usual probability of rejecting a good observation
 REWEIGHTED = "the weights come from the residuals, so that v'Pv is not chi-square distributed"
@@ -61,8 +61,7 @@ class CoordinateTest:
     def far_more(self) -> bool:
         """Whether far more are beyond it: more than FAR_MORE times as many, by chance once in 1 / ALPHA."""
         return bool(
-            self.beyond > FAR_MORE * self.expected
-            and stats.poisson.sf(self.beyond - 1, self.expected) < ALPHA
+            self.beyond > FAR_MORE * self.expected and poisson_sf(self.beyond - 1, self.expected) < ALPHA
         )
 
 
@@ -143,13 +142,13 @@ def _chi_square(of: str, sigma0: float, redundancy: float, alpha: float) -> Glob
         reason = f"its redundancy, {redundancy:.2g}, is too small"
         return GlobalTest(of, np.nan, redundancy, np.nan, np.nan, None, reason)
     statistic = float(sigma0**2 * redundancy)
-    lower, upper = (float(x) for x in stats.chi2.ppf([alpha / 2, 1 - alpha / 2], redundancy))
+    lower, upper = (float(x) for x in chi2_ppf([alpha / 2, 1 - alpha / 2], redundancy))
     return GlobalTest(of, statistic, redundancy, lower, upper, lower <= statistic <= upper)
 
 
 def w_test(adjustment: Adjustment, *, alpha: float = ALPHA) -> CoordinateTest:
     """Return Baarda's test of each image coordinate: w is standard normal where sigma0 is as stated."""
-    return _coordinate_test(adjustment, adjustment.standardised, float(stats.norm.ppf(1 - alpha / 2)), alpha)
+    return _coordinate_test(adjustment, adjustment.standardised, float(normal_ppf(1 - alpha / 2)), alpha)
 
 
 def tau_test(adjustment: Adjustment, *, alpha: float = ALPHA) -> CoordinateTest:
@@ -170,7 +169,7 @@ def _coordinate_test(
 
 def non_centrality(alpha: float = ALPHA, power: float = POWER) -> float:
     """Return delta0, by which a test of size alpha finds an error with the given power."""
-    return float(stats.norm.ppf(1 - alpha / 2) + stats.norm.ppf(power))
+    return float(normal_ppf(1 - alpha / 2) + normal_ppf(power))
 
 
 def reliability(adjustment: Adjustment, *, alpha: float | None = None, power: float = POWER) -> Reliability:
@@ -185,7 +184,7 @@ def reliability(adjustment: Adjustment, *, alpha: float | None = None, power: fl
     Source: Baarda (1968): delta0 sigma / sqrt(r); effect bounded by delta0 sqrt((1 - r)/r).
     """
     alpha = adjustment.test_alpha if alpha is None else alpha
-    critical = float(stats.norm.ppf(1 - alpha / 2))
+    critical = float(normal_ppf(1 - alpha / 2))
     delta0 = non_centrality(alpha, power)
     r = np.clip(adjustment.redundancy_numbers, 0, 1)
     sigma = np.sqrt(np.diagonal(adjustment.image_covariance, axis1=1, axis2=2))
@@ -218,7 +217,7 @@ def significance(adjustment: Adjustment, *, alpha: float = GLOBAL_ALPHA) -> tupl
                 continue
             value = float(camera.parameters[s])
             t = abs(value) / float(sigma)
-            p = float(2 * stats.t.sf(t, adjustment.redundancy))
+            p = float(2 * t_sf(t, adjustment.redundancy))
             tests[owner, name] = Significance(owner, name, value, float(sigma), t, p, p < alpha)
     return tuple(tests.values())
 

@@ -104,11 +104,16 @@ def by_kind(adjustment: Adjustment) -> VarianceComponents:
     dX = state.points[w.point] - w.xyz
     e = exterior_misclosure(w, state)
     dp = state.parameters[w.camera, w.parameter] - w.value
-    where = [
+    slots = [
         int(np.flatnonzero(layout.interior_free[c] == s)[0])
         for c, s in zip(w.camera, w.parameter, strict=True)
     ]
-    Q_interior = [a.covariance.interior[c][s, s] for c, s in zip(w.camera, where, strict=True)]
+    where = np.array(slots, dtype=np.int64)
+    Q_interior = np.zeros((len(where), len(where)))
+    for c in np.unique(w.camera):  # values of different cameras are not correlated
+        of_camera = np.flatnonzero(w.camera == c)
+        rows = where[of_camera]
+        Q_interior[np.ix_(of_camera, of_camera)] = a.covariance.interior[c][np.ix_(rows, rows)]
     bars = network.scale_bars
     ends = a.estimate.points[bars.end[layout.bars]] - a.estimate.points[bars.start[layout.bars]]
     length = np.linalg.norm(ends, axis=1) - w.length
@@ -129,8 +134,8 @@ def by_kind(adjustment: Adjustment) -> VarianceComponents:
         (
             "interior orientation",
             len(w.column),
-            float(w.interior_weight @ dp**2),
-            float(w.interior_weight @ np.array(Q_interior, dtype=float)) / unit,
+            float(dp @ w.interior_weight @ dp),
+            float((w.interior_weight * Q_interior).sum()) / unit,
         ),
     ]
     taken = len(length) - float(a.bar_redundancy[layout.bars].sum())

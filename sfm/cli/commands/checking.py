@@ -45,10 +45,10 @@ def doctor() -> None:
     Prints versions, cores and folders, too. Exit code 1 if a check fails; the line says what to do.
     """
     with loading():
-        from sfm.api import cores
         from sfm.files.user_cache import user_folder
         from sfm.kernels.options import KEPT
         from sfm.kernels.warmed import is_warm
+        from sfm.runtime.cores import cores
 
     console = Console(highlight=False)
     table = Table(show_header=False, box=None, padding=(0, 2, 0, 0))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -74,6 +75,7 @@ def compare(
         from sfm.files.manifest import refuse_foreign_folder
         from sfm.report.differences import (
             largest_difference,
+            words_of_cause,
             words_of_pairing,
             words_of_scale,
             words_of_test,
@@ -85,13 +87,16 @@ def compare(
         first = read_comparable(a, a_format)
     with working_on(str(b)):
         second = read_comparable(b, b_format)
+    if first.name == second.name:
+        first, second = replace(first, name=str(a)), replace(second, name=str(b))
     names = tuple(name.strip() for name in control.split(",") if name.strip())
     found = compare_results(first, second, align=align, control=names)
     place = {name: j for j, name in enumerate(first.network.points)}
     xyz = first.estimate.points[[place[name] for name in found.points]]
     page = write_differences(found, xyz, out)
     print(f"{words_of_pairing(found)}, {len(found.images)} common photographs; {words_of_scale(found)}")
-    print(words_of_test(found)[0])
+    for line in (words_of_test(found)[0], *words_of_cause(found)):
+        print(line)
     if found.points:
         print(f"largest difference of a point: {largest_difference(found)}")
     print(f"Report: {page}")

@@ -76,6 +76,13 @@ Calibration = Annotated[
         help="Hold the interior orientation at that of an earlier result, by the names of the cameras.",
     ),
 ]
+Weighted = Annotated[
+    bool,
+    typer.Option(
+        "--camera-weighted",
+        help="Adjust what --camera adjusted, with its values and their full covariance as an observation.",
+    ),
+]
 
 
 def run(
@@ -87,6 +94,7 @@ def run(
         ),
     ] = None,
     camera: Calibration = None,
+    camera_weighted: Weighted = False,
     out: Out = None,
     jobs: Jobs = None,
     pictures_mb: PicturesMb = 15.0,
@@ -119,6 +127,7 @@ def run(
         verbose,
         from_photographs=True,
         camera=camera,
+        weighted=camera_weighted,
         pictures_mb=pictures_mb,
     )
 
@@ -126,6 +135,7 @@ def run(
 def adjust(
     survey_file: SurveyFile,
     camera: Calibration = None,
+    camera_weighted: Weighted = False,
     out: Out = None,
     allow_outside: AllowOutside = False,
     verbose: Verbose = False,
@@ -136,7 +146,12 @@ def adjust(
     result, remarks or none; 1 if the result cannot be depended on, the report says why; 2 where a person
     must put something right.
     """
-    _run_survey(survey_file, None, out, None, allow_outside, verbose, from_photographs=False, camera=camera)
+    _run_survey(
+        *(survey_file, None, out, None, allow_outside, verbose),
+        from_photographs=False,
+        camera=camera,
+        weighted=camera_weighted,
+    )
 
 
 def _run_survey(
@@ -149,19 +164,21 @@ def _run_survey(
     *,
     from_photographs: bool,
     camera: Path | None,
+    weighted: bool,
     pictures_mb: float = 0.0,
 ) -> None:
     """Run a survey, write its result and tell it; `from_photographs` is what the command is for."""
     begun = time.perf_counter()
     with loading():
-        from sfm.api import colmap_writer, cores, one_blas_thread, programs_of, read_result
+        from sfm.api import colmap_writer, one_blas_thread, programs_of, read_result
         from sfm.cli.console import tell_result
         from sfm.pipeline import run_survey
         from sfm.report.findings.findings import findings_of
         from sfm.report.log import SurveyLog
         from sfm.report.output import write_result
+        from sfm.runtime.cores import cores
         from sfm.runtime.progress_bar import drawn_progress
-        from sfm.survey.inputs.calibration import with_calibration
+        from sfm.survey.inputs.calibration import Calibration, read_calibrations, with_calibration
         from sfm.survey.inputs.survey import survey_of_file
         from sfm.survey.inputs.survey_file import read_survey_file
         from sfm.survey.measuring.target_store import TargetStore
@@ -180,7 +197,14 @@ def _run_survey(
         survey = survey_of_file(described)
     if camera is not None:
         with working_on(str(camera)):
-            survey = with_calibration(survey, read_result(camera).estimate.cameras, str(camera))
+            if (camera / "cameras.csv").is_file():
+                calibrations = read_calibrations(camera)
+            else:
+                cameras = read_result(camera).estimate.cameras
+                calibrations = tuple(Calibration.of_camera(one) for one in cameras)
+            survey = with_calibration(survey, calibrations, str(camera), weighted=weighted)
+    elif weighted:
+        raise KolinearError("--camera-weighted: expected --camera RESULT with it")
     others = programs_of(survey.compare.backend, survey.compare.baseline)
     folder = _folder(survey, out)
     compile_first()

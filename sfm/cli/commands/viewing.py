@@ -59,10 +59,10 @@ def view(
         import webbrowser
 
         from adapters.formats.registry import format_of, read_comparable
-        from sfm.api import cores
         from sfm.report.figures.overlays import overlay_names
         from sfm.report.html.view_page import photographs_in, refuse_foreign_page, write_view
         from sfm.report.viewer.stored_scene import scene_of_stored
+        from sfm.runtime.cores import cores
         from sfm.runtime.progress_bar import drawn_progress
 
     place = Path(os.path.abspath(source))  # through no link, as pages are written

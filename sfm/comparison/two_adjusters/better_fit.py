@@ -9,7 +9,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import stats
 
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.quality.held_camera import held_parameters
@@ -17,6 +16,7 @@ from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.camera import Camera
 from sfm.comparison.camera_conversion import corresponding_free
+from sfm.distributions import f_isf
 from sfm.network import Estimate, Network
 
 ALPHA = 0.001  # probability of the F-test where both cameras fit alike
@@ -56,7 +56,7 @@ def better_fit(survey: Adjustment, network: Network, compared: Adjustment) -> Be
         return None
     F = (own.vPv - compared.vPv) / freed / compared.sigma0**2 if compared.sigma0 > 0 else np.inf
     found = BetterFit(own.rms_px, compared.rms_px, more)
-    if stats.f.isf(ALPHA, freed, compared.redundancy) > F or found.times < BETTER:
+    if f_isf(ALPHA, freed, compared.redundancy) > F or found.times < BETTER:
         return None
     tested = held_parameters(_adjusted(network, own.estimate, survey.sigma_px, covariance=True))
     clear = tuple(dict.fromkeys(one.parameter for one in tested if one.parameter in more))

@@ -141,12 +141,28 @@ def grow(
 
 
 @compiled
-def meet(scene: Scene, a: int, b: int, i: int, j: int, cos_angle: float, X: FloatArray) -> bool:
+def meet(
+    scene: Scene,
+    target: int,
+    other_target: int,
+    image: int,
+    other_image: int,
+    cos_angle: float,
+    X: FloatArray,
+) -> bool:
     """Fill X with the midpoint of the shortest line between two rays; False if it is of no use."""
     di, dj = np.empty(3), np.empty(3)
     for k in range(3):
-        di[k] = scene.M[i, 0, k] * scene.uv[a, 0] + scene.M[i, 1, k] * scene.uv[a, 1] - scene.M[i, 2, k]
-        dj[k] = scene.M[j, 0, k] * scene.uv[b, 0] + scene.M[j, 1, k] * scene.uv[b, 1] - scene.M[j, 2, k]
+        di[k] = (
+            scene.M[image, 0, k] * scene.uv[target, 0]
+            + scene.M[image, 1, k] * scene.uv[target, 1]
+            - scene.M[image, 2, k]
+        )
+        dj[k] = (
+            scene.M[other_image, 0, k] * scene.uv[other_target, 0]
+            + scene.M[other_image, 1, k] * scene.uv[other_target, 1]
+            - scene.M[other_image, 2, k]
+        )
     di /= np.sqrt(di[0] ** 2 + di[1] ** 2 + di[2] ** 2)
     dj /= np.sqrt(dj[0] ** 2 + dj[1] ** 2 + dj[2] ** 2)
     cosine = di[0] * dj[0] + di[1] * dj[1] + di[2] * dj[2]
@@ -154,7 +170,7 @@ def meet(scene: Scene, a: int, b: int, i: int, j: int, cos_angle: float, X: Floa
         return False
     ei = ej = 0.0
     for k in range(3):
-        base = scene.position[j, k] - scene.position[i, k]
+        base = scene.position[other_image, k] - scene.position[image, k]
         ei += di[k] * base
         ej += dj[k] * base
     below = 1.0 - cosine * cosine
@@ -165,17 +181,19 @@ def meet(scene: Scene, a: int, b: int, i: int, j: int, cos_angle: float, X: Floa
     if along_i <= 0 or along_j <= 0:
         return False
     for k in range(3):
-        X[k] = 0.5 * (scene.position[i, k] + along_i * di[k] + scene.position[j, k] + along_j * dj[k])
+        X[k] = 0.5 * (
+            scene.position[image, k] + along_i * di[k] + scene.position[other_image, k] + along_j * dj[k]
+        )
     return True
 
 
 @compiled
-def tangents(scene: Scene, i: int, X: FloatArray) -> tuple[float, float, float]:
-    """Return u, v and the depth -W of a point in photograph i."""
-    x = X[0] - scene.position[i, 0]
-    y = X[1] - scene.position[i, 1]
-    z = X[2] - scene.position[i, 2]
-    M = scene.M[i]
+def tangents(scene: Scene, image: int, X: FloatArray) -> tuple[float, float, float]:
+    """Return u, v and the depth -W of a point in a photograph."""
+    x = X[0] - scene.position[image, 0]
+    y = X[1] - scene.position[image, 1]
+    z = X[2] - scene.position[image, 2]
+    M = scene.M[image]
     depth = -(M[2, 0] * x + M[2, 1] * y + M[2, 2] * z)
     U = M[0, 0] * x + M[0, 1] * y + M[0, 2] * z
     V = M[1, 0] * x + M[1, 1] * y + M[1, 2] * z
@@ -183,9 +201,9 @@ def tangents(scene: Scene, i: int, X: FloatArray) -> tuple[float, float, float]:
 
 
 @compiled
-def object_size(scene: Scene, a: int, i: int, X: FloatArray) -> float:
+def object_size(scene: Scene, target: int, image: int, X: FloatArray) -> float:
     """Return the diameter of a target at the object, 0 where it is unknown."""
-    size: float = scene.size[a] * tangents(scene, i, X)[2]
+    size: float = scene.size[target] * tangents(scene, image, X)[2]
     return size
 
 
@@ -308,12 +326,12 @@ def same_target(
 
 
 @compiled
-def in_view(scene: Scene, i: int, X: FloatArray) -> bool:
-    """Return whether a point falls inside photograph i."""
-    if not scene.oriented[i]:
+def in_view(scene: Scene, image: int, X: FloatArray) -> bool:
+    """Return whether a point falls inside a photograph."""
+    if not scene.oriented[image]:
         return False
-    u, v, depth = tangents(scene, i, X)
-    w = scene.window[i]
+    u, v, depth = tangents(scene, image, X)
+    w = scene.window[image]
     return depth > 0 and w[0] < u < w[2] and w[1] < v < w[3]
 
 

@@ -169,22 +169,29 @@ def bar_residuals(result: SurveyResult) -> GivenResiduals | None:
 def interior_residuals(result: SurveyResult) -> GivenResiduals | None:
     """Return by how much weighted interior orientation differs from its given values; None without."""
     adjustment, found = result.adjustment, result.adjustment.network.interior
-    names, units, rows, cofactors = [], [], [], []
-    for a, s, given, sigma in zip(found.camera, found.parameter, found.value, found.sigma, strict=True):
+    names, units, parts = [], [], []
+    for a in np.unique(found.camera):
         camera, Q = adjustment.estimate.cameras[a], adjustment.covariance.interior[a]
-        where = np.flatnonzero(np.flatnonzero(camera.free) == s)
-        if not len(where) or not 0 < sigma < np.inf:
+        column = {int(s): k for k, s in enumerate(np.flatnonzero(camera.free))}
+        rows = [
+            int(q)
+            for q in np.flatnonzero(found.camera == a)
+            if found.parameter[q] in column and 0 < found.sigma[q] < np.inf
+        ]
+        if not rows:
             continue
-        names.append(f"{camera.names[s]} of camera {camera.group_of(s) or camera.name}")
-        units.append(camera.units[s])
-        rows.append((given, camera.parameters[s] - given, sigma))
-        cofactors.append(Q[where[0], where[0]] / adjustment.sigma0**2 if len(Q) else np.nan)
-    if not rows:
+        own = found.parameter[rows]
+        names += [f"{camera.names[s]} of camera {camera.group_of(s) or camera.name}" for s in own]
+        units += [camera.units[s] for s in own]
+        at = [column[int(s)] for s in own]
+        cofactor = Q[np.ix_(at, at)] / adjustment.sigma0**2 if len(Q) else np.full((len(at),) * 2, np.nan)
+        given, difference = found.value[rows], camera.parameters[own] - found.value[rows]
+        weight = found.weight_of(np.array(rows))
+        w, r = standardised_of_given(difference[None], weight[None], cofactor[None])
+        parts.append(np.stack([given, difference, found.sigma[rows], r[0], w[0]]))
+    if not parts:
         return None
-    given, difference, sigma = np.array(rows, dtype=float).T[:, :, None]
-    w, r = standardised_of_given(
-        difference, 1 / sigma[:, :, None] ** 2, np.array(cofactors, dtype=float)[:, None, None]
-    )
+    given, difference, sigma, r, w = np.hstack(parts)[:, :, None]
     kind, words = "interior orientation", (tuple(names), tuple(units))
     return GivenResiduals(kind, ("value",), *words, given, difference, sigma, r, w)
 

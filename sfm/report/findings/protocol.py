@@ -12,13 +12,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import stats
 
 from sfm.adjustment.quality.gross_errors.robust import HUBER, TUKEY
 from sfm.adjustment.quality.reliability import tau_critical
 from sfm.adjustment.result import Adjustment
 from sfm.camera import Camera, pixel_from_tangents, tangents_from_pixel
 from sfm.conventions import FloatArray, IntArray
+from sfm.distributions import f_sf
 from sfm.report.findings.checks import CheckedControl
 from sfm.report.findings.given_residuals import Given
 from sfm.result import SurveyResult
@@ -301,7 +301,7 @@ def _cumulative(a: Adjustment) -> tuple[CumulativeTest, ...]:
                     continue
                 normed = Q[np.ix_(some, some)] / scale[:, None] / scale
                 statistic = float((value / scale) @ np.linalg.solve(normed, value / scale)) / len(some)
-                p = float(stats.f.sf(statistic, len(some), a.redundancy))
+                p = float(f_sf(statistic, len(some), a.redundancy))
                 owner = camera.group_of(int(free[some[0]])) or camera.name
                 which = ", ".join(names[s] for s in some)
                 tests[owner, which] = CumulativeTest(owner, which, statistic, p)

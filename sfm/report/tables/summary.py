@@ -6,16 +6,14 @@ import json
 from pathlib import Path
 from typing import Any
 
-from sfm.adjustment.quality.statistics import CoordinateTest
-from sfm.adjustment.quality.variance_components import VarianceComponents
 from sfm.adjustment.result import Adjustment
 from sfm.conventions import FloatArray
 from sfm.files.plain_text import or_none
-from sfm.report.findings.bundle_statistics import Spread, spread
+from sfm.report.findings.bundle_statistics import spread
 from sfm.report.findings.findings import Findings
 from sfm.report.findings.given_residuals import GivenResiduals
-from sfm.report.phrases import words_of_test, words_of_weights
-from sfm.result import SurveyResult
+from sfm.report.tables.summary_of_others import summary_of_baseline, summary_of_comparison
+from sfm.report.tables.summary_of_statistics import summary_of_consistency, summary_of_statistics
 
 
 def write_summary(findings: Findings, folder: Path) -> None:
@@ -87,8 +85,8 @@ def summary(findings: Findings) -> dict[str, Any]:
             }
             for index, camera in enumerate(adjustment.estimate.cameras)
         ],
-        "statistics": _statistics(findings),
-        "consistency": _consistency(findings),
+        "statistics": summary_of_statistics(findings),
+        "consistency": summary_of_consistency(findings),
         "geometry": _geometry(findings),
         "control": _control(findings),
         "scale_bars": _scale_bars(findings),
@@ -103,145 +101,10 @@ def summary(findings: Findings) -> dict[str, Any]:
             name: or_none(getattr(result.eccentricity, name)) for name in ("largest_px", "rms_px", "sigma_px")
         },
         "no_circles": list(result.no_circles),
-        "comparison": _comparison(findings),
-        "baseline": _baseline(result),
+        "comparison": summary_of_comparison(findings),
+        "baseline": summary_of_baseline(result),
         "warnings": list(result.warnings),
         "seconds": {time.stage: round(time.seconds, 3) for time in result.seconds},
-    }
-
-
-def _statistics(findings: Findings) -> dict[str, Any]:
-    result, found, sigma0, counts = findings.result, findings.statistics, findings.sigma0, findings.counts
-    return {
-        "sigma0_ratio": or_none(sigma0.ratio),
-        "image_points_px": or_none(sigma0.image_points_px),
-        "stated_px": or_none(sigma0.stated_px),
-        "weight_factor": result.adjustment.weight_factor,
-        "weights": words_of_weights(result),
-        "global_tests": [
-            {
-                "of": test.of,
-                "vPv": or_none(test.statistic),
-                "redundancy": test.redundancy,
-                "lower": or_none(test.lower),
-                "upper": or_none(test.upper),
-                "passed": test.passed,
-                "words": words_of_test(test, result.adjustment),
-            }
-            for test in found.global_tests
-        ],
-        "w_test": _coordinate_test(found.w, found.largest_w),
-        "tau_test": _coordinate_test(found.tau, found.largest_tau),
-        "observations": {
-            "image_coordinates": counts.image,
-            "control": counts.control,
-            "exterior": counts.exterior,
-            "interior": counts.interior,
-            "scale_bars": counts.scale_bars,
-            "constraints": counts.constraints,
-            "total": counts.total,
-        },
-        "redundancy_number": {
-            "sum": or_none(found.redundancy_sum),
-            "mean": or_none(found.redundancy.mean),
-            "min": or_none(found.redundancy.smallest),
-        },
-        "minimal_detectable_bias_px": _median_and_max(found.minimal_bias),
-        "external_reliability_sigmas": _median_and_max(found.external),
-        "sigma0_by_kind": _components(found.kinds),
-        "sigma0_by_camera": _components(found.cameras),
-        "sigma0_by_photograph": _components(found.photographs),
-        "correlations": [
-            {"first": pair.first, "second": pair.second, "value": or_none(pair.value)}
-            for pair in found.correlations
-        ],
-        "orientation_correlations": [
-            {
-                "parameter": one.parameter,
-                "with": one.part,
-                "image": one.image,
-                "value": one.largest,
-                "photographs": dict(one.counts),
-            }
-            for one in result.orientation_correlations
-        ],
-        "significance": [
-            {
-                "camera": test.camera,
-                "parameter": test.parameter,
-                "t": or_none(test.t),
-                "probability": or_none(test.probability),
-                "significant": bool(test.significant),
-            }
-            for test in found.significance
-        ],
-        "not_significant": [
-            {"camera": test.camera, "parameter": test.parameter, "t": or_none(test.t)}
-            for test in found.not_significant
-        ],
-    }
-
-
-def _consistency(findings: Findings) -> dict[str, Any]:
-    """Return what the tests of points, photographs and the format have found."""
-    found, test = findings.consistency, findings.given_test
-    return {
-        "two_positions": [
-            {
-                "point": one.point,
-                "distance": or_none(one.distance),
-                "over_sigma": or_none(one.over_sigma),
-                "first": list(one.first),
-                "second": list(one.second),
-            }
-            for one in found.two_positions
-        ],
-        "large_residuals": list(found.large),
-        "doubtful": [
-            {
-                "point": one.point,
-                "rejected": one.rejected,
-                "instead": one.instead,
-                "misfit": or_none(one.misfit),
-                "other": or_none(one.other),
-            }
-            for one in found.doubtful
-        ],
-        "uneven_photographs": None
-        if found.uneven is None
-        else {
-            "probability": or_none(found.uneven.probability),
-            "worst": found.uneven.worst,
-            "largest": or_none(found.uneven.largest),
-            "median": or_none(found.uneven.median),
-        },
-        "patterns": [
-            {
-                "camera": one.camera,
-                "probability": or_none(one.probability),
-                "explained": or_none(one.explained),
-                "largest_px": or_none(one.largest_px),
-            }
-            for one in found.patterns
-        ],
-        "other_solutions": [
-            {
-                "camera": one.camera,
-                "c": or_none(one.c),
-                "unit": one.unit,
-                "reflected": one.reflected,
-                "moved_over_sigma": or_none(one.moved),
-                "vPv_ratio": or_none(one.vPv),
-            }
-            for one in findings.result.other_solutions
-        ],
-        "given_against_free_network": None
-        if test is None
-        else {
-            "F": or_none(test.statistic),
-            "redundancy": test.redundancy,
-            "probability": or_none(test.probability),
-        },
     }
 
 
@@ -251,25 +114,6 @@ def _datum_points(adjustment: Adjustment) -> list[str] | None:
         return None
     names = adjustment.network.points
     return [name for name, on in zip(names, adjustment.datum_points, strict=True) if on]
-
-
-def _median_and_max(values: Spread) -> dict[str, float | None]:
-    return {"median": or_none(values.median), "max": or_none(values.largest)}
-
-
-def _coordinate_test(test: CoordinateTest, largest: float) -> dict[str, Any]:
-    return {
-        "alpha": test.alpha,
-        "critical": or_none(test.critical),
-        "tested": test.tested,
-        "beyond": test.beyond,
-        "expected": test.expected,
-        "max": or_none(largest),
-    }
-
-
-def _components(components: VarianceComponents) -> dict[str, float | None]:
-    return {name: or_none(float(s)) for name, s in zip(components.names, components.sigma0, strict=True)}
 
 
 def _geometry(findings: Findings) -> dict[str, Any]:
@@ -342,68 +186,3 @@ def _given_values(found: GivenResiduals | None, *keys: str) -> list[dict[str, An
         | {number: or_none(getattr(one, number)) for number in numbers}
         for one in (found.values if found is not None else ())
     ]
-
-
-def _comparison(findings: Findings) -> dict[str, Any] | None:
-    """Return the comparison with the other adjuster, None without one."""
-    found = findings.comparison
-    if found is None:
-        return None
-    both, difference = found.both, found.both.comparison
-    other = found.backend_conditional
-    return {
-        "backend": both.backend,
-        "agree": both.agree,
-        "model": both.model,
-        "stopped_early": both.stopped_early,
-        "max_sigmas": or_none(difference.max_sigmas),
-        "max_position": or_none(difference.max_position),
-        "max_rotation_deg": or_none(difference.max_rotation_deg),
-        "max_point": or_none(difference.max_point),
-        "max_interior_px": or_none(found.max_interior_px),
-        "object_size": or_none(difference.object_size),
-        "rms_px": {"kolinear": difference.rms_px[0], both.backend: difference.rms_px[1]},
-        "cost": {"kolinear": difference.cost[0], both.backend: difference.cost[1]},
-        "point_sigma_rms": {
-            "kolinear_marginal": or_none(found.marginal.rms),
-            "kolinear_conditional": or_none(found.conditional.rms),
-            f"{both.backend}_conditional": None if other is None else or_none(other.rms),
-        },
-        "exceeded": list(difference.exceeded),
-        "held": list(both.held),
-        "unshared": list(both.unshared),
-        "freed": list(both.freed),
-        "conversions": [
-            {
-                "camera": one.camera.name,
-                "from": one.source_model,
-                "to": one.camera.model,
-                "rms_px": or_none(one.rms_px),
-                "max_px": or_none(one.max_px),
-            }
-            for one in both.conversions
-        ],
-    }
-
-
-def _baseline(result: SurveyResult) -> dict[str, Any] | None:
-    """Return the comparison with the other pipeline, None without one."""
-    found = result.baseline
-    if found is None:
-        return None
-
-    def pair(values: tuple[float, float]) -> dict[str, float | None]:
-        return {"kolinear": or_none(values[0]), found.name: or_none(values[1])}
-
-    return {
-        "pipeline": found.name,
-        "images": {"kolinear": found.photographs[0], found.name: found.photographs[1], "total": found.total},
-        "rms_px": pair(found.rms_px),
-        "seconds": pair(found.seconds),
-        "targets": found.targets,
-        "target_rms_px": or_none(found.target_rms_px),
-        "point_rms": or_none(found.point_rms),
-        "max_point": or_none(found.max_point),
-        "position_rms": or_none(found.position_rms),
-        "max_rotation_deg": or_none(found.max_rotation_deg),
-    }

@@ -63,6 +63,8 @@ def packed_scene(scene: ViewerScene, pictures: Pictures) -> str:
     }
     if scene.distance_sigma is not None:
         arrays["pair.sigma"] = ("f4", scene.distance_sigma)
+    if scene.deviation is not None:
+        arrays["point.deviation"] = ("f4", scene.deviation)
     return _packed(_header(scene, pictures), arrays)
 
 

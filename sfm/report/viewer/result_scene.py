@@ -34,7 +34,7 @@ def scene_of_result(findings: Findings) -> ViewerScene:
         a.rejected[order],
         ellipse[order],
     )
-    joint = result.with_covariance.covariance
+    joint = result.with_covariance
     bars = network.scale_bars
     length = np.linalg.norm(estimate.points[bars.end] - estimate.points[bars.start], axis=1)
     return ViewerScene(
@@ -63,7 +63,9 @@ def scene_of_result(findings: Findings) -> ViewerScene:
             )
         ),
         tuple(map(int, network.control.point)) or _checked(findings),
-        None if joint is None else distance_sigmas(estimate.points, joint),
+        None
+        if joint.covariance is None or joint.covariance_points is not None
+        else distance_sigmas(estimate.points, joint.covariance),
         a.rms_px,
     )
 

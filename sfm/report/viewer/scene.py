@@ -90,6 +90,9 @@ class ViewerScene:
     distance_sigma: FloatArray | None  # of the distance of each pair of points i < j, by rows, object unit
     rms_px: float  # residual per coordinate over the accepted image points
     notes: tuple[str, ...] = ()  # what the page leaves out, one line each
+    deviation: FloatArray | None = (
+        None  # of points from what is nominal, object unit; NaN where unknown, (n,)
+    )
 
 
 def distance_sigmas(xyz: FloatArray, covariance: FloatArray) -> FloatArray:

@@ -81,7 +81,9 @@ def scene_of_stored(
             if i in place and j in place
         ),
         tuple(place[int(j)] for j in network.control.point if int(j) in place),
-        None if joint is None or n < len(network.points) else distance_sigmas(xyz, joint),
+        None
+        if joint is None or stored.covariance_points is not None or n < len(network.points)
+        else distance_sigmas(xyz, joint),
         float(np.sqrt(np.nanmean(v[used] ** 2))) if used.any() else np.nan,
         tuple(notes),
     )

@@ -46,6 +46,7 @@ class Task:
     needed: IntArray  # rays that each point needs to stay, (n,)
     least: IntArray  # image points that each photograph needs to stay, (m,)
     reject: str  # how gross errors are treated
+    suspected: tuple[str, ...] = ()  # photographs that could be matched with a camera of their own only
 
 
 @dataclass(frozen=True)
@@ -106,7 +107,7 @@ def treat(task: Task, settled: Settled, start: Estimate, oriented: BoolArray) ->
     if task.reject == "none" or settled.contradiction is not None:
         return None
     adjusted = merge_estimate(start, settled.estimate, settled.images, settled.points)
-    found = treat_lost(task.network, adjusted, settled.accepted, oriented=oriented)
+    found = treat_lost(task.network, adjusted, settled.accepted, oriented=oriented, suspected=task.suspected)
     if found is None:
         return None
     one, again = found.estimate, ~found.estimate.oriented & ~found.without

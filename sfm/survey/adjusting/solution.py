@@ -67,6 +67,8 @@ class Correspondences:
     warnings: tuple[str, ...] = ()  # one line each
     point_failures: tuple[tuple[str, str], ...] = ()  # points without approximate values, with the reason
     given: bool = False  # whether the survey's own approximate values were what the orientation started from
+    left_out: tuple[tuple[str, str], ...] = ()  # photographs of another object, with the reason
+    suspected: tuple[str, ...] = ()  # photographs that could be matched with a camera of their own only
 
 
 @dataclass(frozen=True)
@@ -192,7 +194,7 @@ def _prepared(survey: Survey, matched: Correspondences) -> _Prepared:
     network, estimate = split_cameras(survey.cameras, network, estimate, survey.start_cameras)
     least = np.where(given_values(survey, network).oriented, GIVEN_IMAGE_POINTS, MIN_IMAGE_POINTS)
     return _Prepared(
-        Task(survey, datum, network, needed, least, survey.reject),
+        Task(survey, datum, network, needed, least, survey.reject, matched.suspected),
         estimate,
         frame,
         placed.network,

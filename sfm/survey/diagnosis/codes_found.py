@@ -4,15 +4,19 @@ from __future__ import annotations
 
 import numpy as np
 
+from sfm.conventions import AnyArray
 from sfm.orientation.incremental.sequence import MIN_POINTS
 from sfm.photographs.reading import read_photograph
 from sfm.survey.inputs.measurements import MeasuredPhotographs
 from sfm.survey.inputs.survey import Survey
 from sfm.targets.codes.families import Family
 from sfm.targets.codes.rings import RINGS
+from sfm.targets.codes.tags import CORNERS, DICTIONARIES, find_tags, tag_family
 from sfm.targets.detect import find_targets
+from sfm.targets.outlines import scale_of
 
 MAX_NAMES = 10  # photographs in a message
+MIN_TAGS = 2  # of a family in a photograph that are no chance; a dictionary may be part of a larger one
 POLARITIES = ("dark", "bright")
 
 
@@ -79,4 +83,17 @@ def _other_settings(survey: Survey, photographs: MeasuredPhotographs) -> str:
             if family != settings.codes and isinstance(family, str):
                 differ.append(f"codes = '{family}'")
             words = f"; in {photographs.names[fullest]} {' and '.join(differ)} reads {count} codes"
+    return words or _tags(photograph, photographs.names[fullest], settings.codes)
+
+
+def _tags(photograph: AnyArray, name: str, codes: str) -> str:
+    """Say which family of square tags a photograph shows, if any."""
+    best, words = MIN_TAGS - 1, ""
+    for family in DICTIONARIES:
+        if family == codes:
+            continue
+        tags = find_tags(photograph, tag_family(family), polarity="auto", scale=scale_of(photograph))
+        count = len(np.unique(tags.code // len(CORNERS)))
+        if count > best:
+            best, words = count, f"; {name} shows {count} square tags: codes = '{family}' reads them"
     return words

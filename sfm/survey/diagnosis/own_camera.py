@@ -42,6 +42,7 @@ class Treated:
     estimate: Estimate
     left_out: tuple[tuple[str, str], ...]  # (name of the photograph, reason)
     lines: tuple[str, ...]  # on those with a camera of their own
+    own: tuple[str, ...]  # names of these
     without: BoolArray  # photographs that are left out, (m,)
 
 
@@ -57,7 +58,12 @@ class _Fit:
 
 
 def treat_lost(
-    network: Network, estimate: Estimate, accepted: BoolArray, *, oriented: BoolArray
+    network: Network,
+    estimate: Estimate,
+    accepted: BoolArray,
+    *,
+    oriented: BoolArray,
+    suspected: tuple[str, ...] = (),
 ) -> Treated | None:
     """Give photographs that lost most of their points a camera of their own, or leave them out.
 
@@ -66,6 +72,8 @@ def treat_lost(
         estimate: adjusted; NaN for photographs and points that left it.
         accepted: image points that the adjustment accepted, (k,).
         oriented: photographs that had an exterior orientation before the adjustment, (m,).
+        suspected: names of photographs that fitted with a camera of their own before; all their points
+            together may bend the others so much that none of them looks wrong.
 
     Returns:
         The network, and the estimate with start values of the new cameras; None where nothing is to be done.
@@ -82,16 +90,18 @@ def treat_lost(
         [np.median(length[rows]) if len(rows) else np.inf for rows in _finite_rows(seen, length, m)]
     )
     unlike = enough & estimate.oriented & (median > UNLIKE * np.median(median[estimate.oriented]))
-    doubtful = lost | unlike
+    known_before = np.isin(network.images, suspected)
+    doubtful = lost | unlike | (enough & known_before & estimate.oriented)
     if not doubtful.any() or doubtful.sum() > MOST_PHOTOGRAPHS * m:
         return None
     cameras, owner = list(estimate.cameras), network.camera.copy()
     position, rotation = estimate.position.copy(), estimate.rotation.copy()
-    left, lines = [], []
+    left, lines, with_own = [], [], []
     out = np.zeros(m, dtype=bool)
     for i in np.flatnonzero(doubtful).tolist():
         rows = np.flatnonzero((seen.image == i) & known)
-        fit = _own_camera(network, estimate, i, rows, BETTER * median[i])
+        better = median[i] if known_before[i] else BETTER * median[i]
+        fit = _own_camera(network, estimate, i, rows, better)
         name = network.images[i]
         if fit is None and not lost[i]:
             continue  # told as not like the others, with all its points
@@ -110,6 +120,7 @@ def treat_lost(
         cameras.append(fit.camera)
         owner[i] = len(cameras) - 1
         position[i], rotation[i] = fit.position, fit.rotation
+        with_own.append(name)
         own = [n for n, group in zip(fit.camera.names, fit.camera.shared, strict=True) if not group]
         share = fit.camera.c_px / before.c_px - 1
         lines.append(
@@ -128,6 +139,7 @@ def treat_lost(
         replace(estimate, cameras=tuple(cameras), position=position, rotation=rotation),
         tuple(left),
         tuple(lines),
+        tuple(with_own),
         out,
     )
 

@@ -10,9 +10,11 @@ from pathlib import Path
 from sfm.errors import GeometryError, PhotographError, SurveyFileError
 from sfm.files.plain_text import as_plain, is_plain
 from sfm.photographs.exif import Metadata, read_metadata
+from sfm.photographs.file_checks import conversion_of
 from sfm.runtime.progress import SILENT, Progress
 from sfm.survey.drafting.camera_groups import CameraGroup, Grouping, SensorWidth, group_photographs
 from sfm.survey.drafting.target_trial import BLURRED_PX, MANY_TARGETS, TargetTrial, try_targets
+from sfm.survey.inputs.survey_file import is_own_file
 from sfm.survey.measuring.target_store import TargetStore
 
 SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".ppm", ".pgm", ".webp")
@@ -76,18 +78,23 @@ def _metadata(folder: Path) -> tuple[dict[str, Metadata], tuple[tuple[str, str],
     """Size and EXIF data of the photographs of a folder, and which cannot be read."""
     if not folder.is_dir():
         raise SurveyFileError(f"{folder}: no such folder")
-    files = sorted(path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES and path.is_file())
-    if not files:
-        others = sorted(path.name for path in folder.iterdir())
-        holds = f"it holds {', '.join(map(as_plain, others[:SHOWN]))}" if others else "it is empty"
+    every = sorted(folder.iterdir())
+    files = [
+        path for path in every if (path.suffix.lower() in SUFFIXES or conversion_of(path)) and path.is_file()
+    ]
+    if all(conversion_of(path) for path in files):
+        holds = (
+            f"it holds {', '.join(as_plain(path.name) for path in every[:SHOWN])}" if every else "it is empty"
+        )
+        holds += f": {conversion_of(files[0])}" if files else ""
         raise SurveyFileError(f"{folder}: no photographs ({', '.join(SUFFIXES)}), {holds}")
     metadata, unreadable = {}, []
     for path in files:
         if not is_plain(path.name):
             unreadable.append((as_plain(path.name), "its name has control or invisible characters"))
             continue
-        if not path.resolve().is_relative_to(folder.resolve()):
-            unreadable.append((path.name, "a link out of the folder"))
+        if not (path.resolve().is_relative_to(folder.resolve()) or is_own_file(path)):
+            unreadable.append((path.name, "a link out of the folder, and not to a file in your home folder"))
             continue
         try:
             metadata[path.name] = read_metadata(path)

@@ -1,52 +1,191 @@
-"""A survey with the interior orientation of an earlier result, held as it was found there."""
+"""Interior orientation of an earlier result: held in another survey, or an observation in it.
+
+    summary.json                model, size and pixel of each camera
+    cameras.csv                 camera,parameter,value,sigma of each parameter; without sigma it was held
+    interior_correlations.csv   camera,first,second,correlation of those that were adjusted
+
+As an observation it counts with the full covariance of its parameters, so that a calibration and a survey
+adjusted one after the other give what both give adjusted together, as far as they share nothing else.
+
+Source: Mikhail, Bethel and McGlone, Modern Photogrammetry (2001), sec. 5.6 (a priori parameter constraints).
+"""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections import Counter
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import numpy as np
+from pydantic import Field
 
 from sfm.camera import Camera
+from sfm.distortion.models import MODELS
 from sfm.errors import SurveyFileError
+from sfm.files.csv_tables import read_table
+from sfm.files.json_files import Content, Name, Pixel, Side, read_json
 from sfm.survey.inputs.settings import CameraSettings
-from sfm.survey.inputs.survey import Survey
+
+if TYPE_CHECKING:
+    from sfm.survey.inputs.survey import Survey
+
+TABLES = ("summary.json", "cameras.csv", "interior_correlations.csv")
 
 
-def with_calibration(survey: Survey, cameras: tuple[Camera, ...], source: str) -> Survey:
-    """Return the survey with its cameras held at a calibration.
+@dataclass(frozen=True)
+class Calibration:
+    """The interior orientation of one camera of a result."""
+
+    name: str
+    model: str
+    size_px: tuple[int, int]
+    pixel_mm: tuple[float, float]
+    values: dict[str, float]  # of all parameters of the model, in its units
+    sigma: dict[str, float] = field(default_factory=dict)  # of those that were adjusted
+    correlations: tuple[tuple[str, str, float], ...] = ()  # of pairs of these
+
+    @classmethod
+    def of_camera(cls, camera: Camera) -> Calibration:
+        """Return that of a camera, as far as a camera tells: without standard deviations."""
+        sides = (float(camera.pixel_mm[0]), float(camera.pixel_mm[1]))
+        values = dict(zip(camera.names, camera.parameters.tolist(), strict=True))
+        return cls(camera.name, camera.model, camera.size_px, sides, values)
+
+
+class _Camera(Content):
+    """A camera in the summary of a result."""
+
+    name: Name
+    model: Literal[tuple(MODELS)]  # type: ignore[valid-type]
+    size_px: tuple[Side, Side]
+    pixel_mm: tuple[Pixel, Pixel]
+
+
+class _Summary(Content):
+    """What is read of summary.json."""
+
+    cameras: Annotated[tuple[_Camera, ...], Field(min_length=1)]
+
+
+def read_calibrations(folder: Path) -> tuple[Calibration, ...]:
+    """Read the interior orientations of the folder of a result.
+
+    Raises:
+        SurveyFileError: what is missing or wrong, with file and line number.
+    """
+    summary = read_json(folder / "summary.json", _Summary, "the summary of a result")
+    table = read_table(
+        folder / "cameras.csv", ("camera", "parameter"), ("value", "sigma"), ignored=None, blank=("sigma",)
+    )
+    keys = tuple(zip(*table.texts, strict=True))
+    table.refuse_duplicates(keys, ("camera", "parameter"))
+    sigma = table.values[:, 1:2]
+    table.refuse(sigma, sigma < 0, ("sigma",), "0 or more, or nothing")
+    rows = dict(zip(keys, table.values.tolist(), strict=True))
+    path = folder / "interior_correlations.csv"
+    correlations: dict[str, list[tuple[str, str, float]]] = {}
+    adjusted_of = Counter(camera for (camera, _), (_, s) in rows.items() if np.isfinite(s) and s > 0)
+    if path.is_file() and max(adjusted_of.values(), default=0) > 1:
+        pairs = read_table(path, ("camera", "first", "second"), ("correlation",), blank=("correlation",))
+        rho = pairs.values[:, :1]
+        pairs.refuse(rho, np.abs(rho) > 1, ("correlation",), "from -1 to 1")
+        for camera, first, second, value in zip(*pairs.texts, rho[:, 0].tolist(), strict=True):
+            correlations.setdefault(camera, []).append((first, second, value))
+    found = []
+    for one in summary.cameras:
+        missing = [name for name in MODELS[one.model].names if (one.name, name) not in rows]
+        if missing:
+            raise SurveyFileError(
+                f"{table.path}: camera {one.name} has no {', '.join(missing)}, model {one.model} needs it"
+            )
+        own = {name: rows[one.name, name] for name in MODELS[one.model].names}
+        adjusted = {name: s for name, (_, s) in own.items() if np.isfinite(s) and s > 0}
+        found.append(
+            Calibration(
+                *(one.name, one.model, one.size_px, one.pixel_mm),
+                {name: value for name, (value, _) in own.items()},
+                adjusted,
+                tuple(
+                    (p, q, value)
+                    for p, q, value in correlations.get(one.name, ())
+                    if p in adjusted and q in adjusted and np.isfinite(value)
+                ),
+            )
+        )
+    return tuple(found)
+
+
+def with_calibration(
+    survey: Survey, calibrations: tuple[Calibration, ...], source: str, *, weighted: bool = False
+) -> Survey:
+    """Return the survey with its cameras held at a calibration, or with it as an observation.
 
     A camera of the survey takes that of its name; if the calibration has one camera only, all take it.
 
     Args:
-        survey: whose cameras are to be held; what it says of them besides photographs and name is not used.
-        cameras: of an earlier result.
+        survey: what it says of its cameras besides photographs and name is not used.
+        calibrations: of an earlier result.
         source: what messages call that result.
+        weighted: adjusted, with the calibration and its covariance as an observation; else held.
 
     Raises:
-        SurveyFileError: no camera of that name among several, or photographs of another size.
+        SurveyFileError: no camera of that name among several, photographs of another size, or no standard
+            deviations to weight by.
     """
-    return replace(survey, cameras=tuple(_held(one, cameras, survey, source) for one in survey.cameras))
+    cameras = tuple(
+        calibrated(one, calibrations, survey.source, source, weighted=weighted) for one in survey.cameras
+    )
+    return replace(survey, cameras=cameras)
 
 
-def _held(
-    settings: CameraSettings, cameras: tuple[Camera, ...], survey: Survey, source: str
+def calibrated(
+    settings: CameraSettings,
+    calibrations: tuple[Calibration, ...],
+    where: str,
+    source: str,
+    *,
+    weighted: bool = False,
 ) -> CameraSettings:
-    named = [camera for camera in cameras if camera.name == settings.name]
-    if not named and len(cameras) > 1:
+    """Return the settings of one camera with a calibration, see `with_calibration`.
+
+    Args:
+        settings: of the camera.
+        calibrations: of an earlier result.
+        where: what messages call the survey.
+        source: what they call that result.
+        weighted: adjusted, with the calibration as an observation; else held.
+
+    Raises:
+        SurveyFileError: no camera of that name among several, photographs of another size, or no standard
+            deviations to weight by.
+    """
+    named = [one for one in calibrations if one.name == settings.name]
+    if not named and len(calibrations) > 1:
         raise SurveyFileError(
-            f"{survey.source}: camera {settings.name} is not in {source}, expected one of "
-            f"{', '.join(camera.name for camera in cameras)}"
+            f"{where}: camera {settings.name} is not in {source}, expected one of "
+            f"{', '.join(one.name for one in calibrations)}"
         )
-    camera = (named or list(cameras))[0]
-    if settings.size_px is not None and settings.size_px != camera.size_px:
+    found = (named or list(calibrations))[0]
+    if settings.size_px is not None and settings.size_px != found.size_px:
         raise SurveyFileError(
-            f"{survey.source}: camera {settings.name} has {settings.size_px[0]} x {settings.size_px[1]} px, "
-            f"{camera.name} of {source} {camera.size_px[0]} x {camera.size_px[1]} px"
+            f"{where}: camera {settings.name} has {settings.size_px[0]} x {settings.size_px[1]} px, "
+            f"{found.name} of {source} {found.size_px[0]} x {found.size_px[1]} px"
         )
+    if weighted and not found.sigma:
+        raise SurveyFileError(
+            f"{where}: {source} has no standard deviations of camera {found.name}, so that it can be "
+            "held but not weighted"
+        )
+    observed = found.sigma if weighted else {}
     return CameraSettings(
         name=settings.name,
         images=settings.images,
-        size_px=camera.size_px,
-        pixel_mm=(float(camera.pixel_mm[0]), float(camera.pixel_mm[1])),
-        model=camera.model,
+        size_px=found.size_px,
+        pixel_mm=found.pixel_mm,
+        model=found.model,
         free=(),
-        fixed=tuple(zip(camera.names, camera.parameters.tolist(), strict=True)),
+        fixed=tuple((name, value) for name, value in found.values.items() if name not in observed),
+        weighted=tuple((name, (found.values[name], sigma)) for name, sigma in observed.items()),
+        correlations=found.correlations if weighted else (),
     )

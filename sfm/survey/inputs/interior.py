@@ -16,12 +16,14 @@ from dataclasses import replace
 import numpy as np
 
 from sfm.camera import Camera
-from sfm.conventions import IntArray
+from sfm.conventions import FloatArray, IntArray
 from sfm.errors import SurveyFileError
 from sfm.network import Estimate, InteriorObservations, Network
 from sfm.survey.inputs.cameras import free_start_values
 from sfm.survey.inputs.given import StartCameras
 from sfm.survey.inputs.settings import CameraSettings
+
+SINGULAR = 1e-12  # smallest eigenvalue of a matrix of correlations below which it is none
 
 
 def split_cameras(
@@ -50,6 +52,7 @@ def split_cameras(
     variants: list[Camera] = []
     owner = np.empty(len(network.images), dtype=np.int64)
     observed: list[tuple[int, int, float, float]] = []
+    rho: dict[tuple[int, int, int], float] = {}
     for a, settings in enumerate(cameras):
         images = np.flatnonzero(network.camera == a)
         first = len(variants)
@@ -61,17 +64,40 @@ def split_cameras(
             groups = [camera.group_of(s) or camera.name for camera in made]
             first_of = {group: k for k, group in reversed(list(enumerate(groups)))}
             observed += [(first + first_of[group], s, value, sigma) for group in dict.fromkeys(groups)]
+        place = made[0].names.index
+        rho |= {(first, place(p), place(q)): value for p, q, value in settings.correlations}
     columns = list(zip(*observed, strict=True)) or [(), (), (), ()]
     interior = InteriorObservations(
         np.array(columns[0], dtype=np.int64),
         np.array(columns[1], dtype=np.int64),
         np.array(columns[2], dtype=float),
         np.array(columns[3], dtype=float),
+        np.array(_correlation(observed, rho)) if rho else None,
     )
     return (
         replace(network, camera=owner, interior=interior),
         replace(estimate, cameras=tuple(variants)),
     )
+
+
+def _correlation(
+    observed: list[tuple[int, int, float, float]], rho: dict[tuple[int, int, int], float]
+) -> FloatArray:
+    """Return the correlations of the observed parameters, by camera and index of both, (p, p).
+
+    Raises:
+        SurveyFileError: they belong to no covariance matrix.
+    """
+    R = np.eye(len(observed))
+    place = {(camera, parameter): k for k, (camera, parameter, _, _) in enumerate(observed)}
+    for (camera, p, q), value in rho.items():
+        j, k = place[camera, p], place[camera, q]
+        R[j, k] = R[k, j] = value
+    if np.linalg.eigvalsh(R).min() <= SINGULAR:
+        raise SurveyFileError(
+            "correlations of the weighted interior orientation: no such covariance matrix exists"
+        )
+    return R
 
 
 def _started(camera: Camera, settings: CameraSettings, given: StartCameras | None) -> Camera:
@@ -103,7 +129,8 @@ def without_idle_cameras(network: Network, estimate: Estimate, *, cameras: int) 
     seen = network.interior
     keep = used[seen.camera]
     interior = InteriorObservations(
-        number[seen.camera[keep]], seen.parameter[keep], seen.value[keep], seen.sigma[keep]
+        *(number[seen.camera[keep]], seen.parameter[keep], seen.value[keep], seen.sigma[keep]),
+        None if seen.correlation is None else seen.correlation[np.ix_(keep, keep)],
     )
     return (
         replace(network, camera=number[network.camera], interior=interior),

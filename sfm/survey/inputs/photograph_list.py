@@ -14,7 +14,7 @@ from sfm.files.globs import find_files
 from sfm.files.plain_text import as_plain, is_plain
 from sfm.survey.inputs.checks.contradictions import SurveySettings
 from sfm.survey.inputs.interior import refuse_ungrouped
-from sfm.survey.inputs.survey_file import inside
+from sfm.survey.inputs.survey_file import inside, is_own_file
 
 MAX_PHOTOGRAPHS = 20_000  # a table of a byte for each pair takes 400 MB
 
@@ -44,7 +44,8 @@ def find_photographs(survey: SurveySettings, *, images_dir: Path | None = None) 
 
     Args:
         survey: a survey with photographs, or its file.
-        images_dir: folder of the photographs in place of the survey's own.
+        images_dir: folder of the photographs in place of the survey's own; photographs in a folder that the
+            user names may be links to files in the user's home folder.
 
     Raises:
         SurveyFileError: no such folder, a camera without photographs, a photograph of two cameras, of no
@@ -55,6 +56,8 @@ def find_photographs(survey: SurveySettings, *, images_dir: Path | None = None) 
         raise SurveyFileError(f"{folder}: no such folder; photographs of survey {survey.name} were needed")
 
     def refuse_outside(path: Path) -> None:
+        if images_dir is not None and is_own_file(path):
+            return
         name = path.relative_to(folder).as_posix()
         inside(folder, name, survey.source, allow_outside=survey.allow_outside)
 

@@ -33,6 +33,7 @@ def _plain(value: str) -> str:
 SMALLEST, LARGEST = 1e-9, 1e12
 MIN_SIGMA = 1e-30  # of a distortion parameter, mm^-8
 MAX_SIDE_PX = 1_000_000
+MAX_CORRELATIONS = 200  # of the parameters of one camera
 MAX_CAMERAS, MAX_GROUPS = 1000, 1000  # each is tried on every photograph
 # parameters that are adjusted where a survey says nothing, as far as its photographs determine them
 FREED_FIRST = ("c", "x0", "y0", "K1", "K2", "fx", "fy", "cx", "cy", "k1", "k2")
@@ -63,6 +64,12 @@ Observed = Annotated[
     tuple[Annotated[tuple[Name, ValueAndSigma], Field(strict=False)], ...],
     Field(strict=False),
     BeforeValidator(_pairs),
+]
+
+Correlation = Annotated[float, Field(ge=-1, le=1)]
+Correlations = Annotated[
+    tuple[Annotated[tuple[Name, Name, Correlation], Field(strict=False)], ...],
+    Field(strict=False, max_length=MAX_CORRELATIONS),
 ]
 
 
@@ -96,6 +103,9 @@ class CameraSettings(Section):
     start: Values = ()  # (parameter, value) that a free one starts from, in the model's units; else 0
     balanced: Values = ()  # (parameter, value) in AICON's form with R0, in place of fixed and start
     weighted: Observed = ()  # (parameter, (value, sigma)): adjusted, with this as an observation
+    correlations: Correlations = ()  # (parameter, parameter, correlation) of weighted ones; 0 if not given
+    calibration: Name | None = None  # folder of an earlier result, relative to the survey file
+    calibration_use: Literal["fixed", "weighted"] = "fixed"  # held, or an observation with its covariance
     per_photograph: Names = ()  # adjusted parameters of which every photograph has a value of its own
     per_group: Names = ()  # adjusted parameters of which every group of photographs has a value of its own
     groups: Annotated[Names, Field(max_length=MAX_GROUPS)] = ()  # globs of these groups of photographs

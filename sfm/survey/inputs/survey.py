@@ -13,6 +13,7 @@ from pydantic import ValidationError
 from sfm.adjustment.datum import Datum
 from sfm.errors import SurveyFileError
 from sfm.files.plain_text import as_plain
+from sfm.survey.inputs.calibration import calibrated, read_calibrations
 from sfm.survey.inputs.checks.contradictions import refuse_contradictions
 from sfm.survey.inputs.checks.settings_errors import first_error
 from sfm.survey.inputs.exterior_table import ObservedExterior, read_observed_exterior
@@ -202,7 +203,7 @@ def survey_of_file(file: SurveyFile) -> Survey:
     return Survey(
         name=file.name,
         unit=file.unit,
-        cameras=file.cameras,
+        cameras=tuple(_with_calibration(one, file) for one in file.cameras),
         targets=file.targets,
         tie_points=file.tie_points,
         datum=file.datum,
@@ -220,6 +221,15 @@ def survey_of_file(file: SurveyFile) -> Survey:
         allow_outside=file.allow_outside,
         source=file.source,
     )
+
+
+def _with_calibration(camera: CameraSettings, file: SurveyFile) -> CameraSettings:
+    """Return the settings of a camera with the calibration that they name, if they name one."""
+    if camera.calibration is None:
+        return camera
+    folder = file.beside(camera.calibration)
+    weighted = camera.calibration_use == "weighted"
+    return calibrated(camera, read_calibrations(folder), file.source, camera.calibration, weighted=weighted)
 
 
 def survey_family(targets: TargetSettings, codes: str) -> Family | None:

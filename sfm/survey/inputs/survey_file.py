@@ -10,6 +10,7 @@ from pydantic import Field, PrivateAttr, ValidationError
 from sfm.errors import SurveyFileError
 from sfm.files.plain_text import as_plain, is_plain
 from sfm.files.toml_files import read_toml
+from sfm.survey.inputs.calibration import TABLES
 from sfm.survey.inputs.checks.contradictions import refuse_contradictions
 from sfm.survey.inputs.checks.settings_errors import first_error
 from sfm.survey.inputs.settings import (
@@ -111,6 +112,9 @@ class SurveyFile(Section):
             None if self.targets.codes in FAMILIES else self.targets.codes,
             self.targets.diameters,
         ]
+        for camera in self.cameras:
+            if camera.calibration is not None:
+                names += [f"{camera.calibration}/{name}" for name in TABLES]
         return tuple(self.beside(name) for name in names if name is not None)
 
 
@@ -138,6 +142,20 @@ def inside(folder: Path, name: str, where: str, *, allow_outside: bool = False) 
             "for survey files that you trust"
         )
     return path
+
+
+def is_own_file(path: Path) -> bool:
+    """Return whether a link leads to a file in the user's home folder, and through no hidden folder there.
+
+    Links to photographs in a folder that the user names are how photographs are put together, and no attack.
+    """
+    try:
+        target, home = path.resolve(), Path.home().resolve()
+    except (OSError, RuntimeError):
+        return False
+    if not (target.is_file() and target.is_relative_to(home)):
+        return False
+    return not any(part.startswith(".") for part in target.relative_to(home).parts)
 
 
 def read_survey_file(path: Path, *, allow_outside: bool = False) -> SurveyFile:

@@ -13,7 +13,7 @@ import numpy as np
 
 from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
 from sfm.errors import GeometryError
-from sfm.targets.fits.corner import BACKGROUND, BLUR, CONTRAST, fit_corners
+from sfm.targets.fits.corner import BACKGROUND, BLUR, CONTRAST, CornerFits, fit_corners
 from sfm.targets.flags import Flag
 
 # OpenCV's dictionary behind each name that a survey file uses.
@@ -31,6 +31,7 @@ CORRECTED, WRONG_IN_BORDER = 0.2, 0.1
 # A corner is refused if its residuals are beyond this share of the contrast, if an edge is softer than this
 # share of a module, or if its contrast is less than this share of the tag's.
 POOR_FIT, SOFTEST_EDGE, MIN_CONTRAST = 0.1, 0.4, 0.3
+NO_CORNER = int(Flag.CUT_BY_BORDER | Flag.NO_CONVERGENCE)
 # Radius of the circle that stands for a corner where outlines are drawn, px.
 DRAWN_PX = 4.0
 
@@ -124,7 +125,7 @@ def find_tags(photograph: AnyArray, family: TagFamily, *, polarity: str, scale: 
     number = np.concatenate([ids for _, ids in found])
     order = np.argsort(number, kind="stable")
     quads, number = quads[order], number[order]
-    fits = fit_corners(photograph, quads, family.modules, float(scale))
+    fits = _fitted(photograph, quads, number, family, float(scale))
     flag, noise = fits.flag, fits.noise
     contrast, blur = fits.theta[..., CONTRAST], fits.theta[..., BLUR]
     side = np.linalg.norm(quads - np.roll(quads, 1, axis=1), axis=2).min(axis=1, initial=np.inf)
@@ -161,6 +162,21 @@ def find_tags(photograph: AnyArray, family: TagFamily, *, polarity: str, scale: 
         reason[~good],
         quads,
     )
+
+
+def _fitted(
+    photograph: AnyArray, quads: FloatArray, number: IntArray, family: TagFamily, scale: float
+) -> CornerFits:
+    """Fit the corners of tags twice, the second time with their codes where the first corners place them."""
+    m = family.modules
+    clear = np.array([~tag_modules(family, int(one)) for one in number]).reshape(-1, m, m)
+    square = np.array([[0, 0], [m, 0], [m, m], [0, m]], dtype=np.float32)
+    for _ in range(2):
+        H = [cv2.getPerspectiveTransform(quad.astype(np.float32), square) for quad in quads]
+        fits = fit_corners(photograph, quads, np.array(H, dtype=float).reshape(-1, 3, 3), clear, scale)
+        found = np.isfinite(fits.covariance[..., 0, 0]) & (fits.flag & NO_CORNER == 0)
+        quads = np.where(found[..., None], fits.theta[..., :2], quads)
+    return fits
 
 
 def _detect(detector: cv2.aruco.ArucoDetector, picture: AnyArray) -> tuple[FloatArray, IntArray]:

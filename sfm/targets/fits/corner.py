@@ -4,10 +4,14 @@ Model of the intensity at pixel (x, y), with d1, d2 the signed distances from tw
 (x0, y0), negative on the side of the tag, s the blur of the edges, B the intensity around the tag, A the step
 to its border, g the change of the gain over L:
 
-    I = (B + A Phi(-d1 / s) Phi(-d2 / s)) (1 + gx (x - x0) / L + gy (y - y0) / L)
+    I = (B + A ((1 + a) P(s) - a P(t))) (1 + gx (x - x0) / L + gy (y - y0) / L)
+    P(s) = Phi(-d1 / s) Phi(-d2 / s) - C(s),    t^2 = s^2 + h^2
 
-The tip, where both edges act and the model would depend on the angle between them, is left out: the corner is
-where the two edges meet. The fit stays so near to it that distortion does not bend the edges.
+a is the sharpening of the camera (unsharp masking), whose halo would else be taken for a change of the gain
+and shift the edge. C is what the clear modules behind the border add, as blurred rectangles at their places
+in the tag; it is computed anew with the blur and the corners that were found. The tip, where both edges act
+and other print may touch the tag, is left out: the corner is where the two edges meet. The fit stays so near
+to it that distortion does not bend the edges.
 """
 
 from __future__ import annotations
@@ -17,23 +21,27 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sfm.conventions import AnyArray, FloatArray, IntArray
+from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
 from sfm.kernels.cholesky import invert_symmetric, solve_symmetric
 from sfm.kernels.options import compiled
 from sfm.targets.fits.blurred_ellipse import edge_profile
 from sfm.targets.flags import Flag
 
-# Unknowns of the fit in their order: x0, y0, directions of the two normals, B, A, s, gx, gy.
-UNKNOWNS = 9
-X0, Y0, NORMAL_1, NORMAL_2, BACKGROUND, CONTRAST, BLUR, GAIN_X, GAIN_Y = range(UNKNOWNS)
-# Pixels where both edges are nearer than this are the tip; farther than this from an edge nothing is learnt.
-TIP_PX, BAND_PX, MIN_BAND_PX = 2.5, 4.0, 1.5
+# Unknowns of the fit in their order: x0, y0, directions of the two normals, B, A, s, gx, gy, a.
+UNKNOWNS = 10
+X0, Y0, NORMAL_1, NORMAL_2, BACKGROUND, CONTRAST, BLUR, GAIN_X, GAIN_Y, SHARPENING = range(UNKNOWNS)
+# What is not farther than this behind one of the edges is the tip, shorter for small tags (share of a side).
+TIP_PX, TIP_SHARE, MIN_TIP_PX = 4.0, 0.1, 2.5
+# Farther than this from an edge nothing is learnt; at first the code is kept away from, its blur is unknown.
+BAND_PX, MIN_BAND_PX, CODE_PX = 4.0, 1.5, 2.5
 # Edges are followed for this share of a side, at most so far: distortion bends them by less than 0.01 px.
 REACH_SHARE, REACH_PX = 0.45, 20.0
-# What lies behind the border of one module (the code) is kept at this distance.
-CODE_PX = 2.5
+CODE_SIGMAS = 3.5  # of the blur beyond which a module does not act
+ROUNDS = 3
 # A priori sigma of the change of gain over L, as for circular targets; it only keeps the fit regular.
 GAIN_SIGMA = 0.3
+# The same of the sharpening, and the width h of its mask, px; cameras use 0.5 to 2 px.
+SHARPENING_SIGMA, MASK_PX = 0.5, 1.5
 # Blur at the start and its limits; the last step; the farthest that a corner is from where it was expected.
 BLUR_START, MIN_BLUR, MAX_BLUR, LAST_STEP_PX, MAX_STEPS, FARTHEST_PX = 0.9, 0.25, 4.0, 1e-3, 30, 4.0
 _DENSITY_0 = 1 / math.sqrt(2 * math.pi)
@@ -46,9 +54,9 @@ class CornerFits(NamedTuple):
     """Fits of the model to the four corners of k tags."""
 
     theta: FloatArray
-    """unknowns, shape (k, 4, 9)"""
+    """unknowns, shape (k, 4, 10)"""
     covariance: FloatArray
-    """their covariance, nan where the fit failed, shape (k, 4, 9, 9)"""
+    """their covariance, nan where the fit failed, shape (k, 4, 10, 10)"""
     noise: FloatArray
     """standard deviation of the intensities about the fit, shape (k, 4)"""
     flag: IntArray
@@ -56,13 +64,17 @@ class CornerFits(NamedTuple):
 
 
 @compiled
-def fit_corners(image: AnyArray, quads: FloatArray, modules: int, saturation: float) -> CornerFits:
+def fit_corners(
+    image: AnyArray, quads: FloatArray, tag_from_pixel: FloatArray, clear: BoolArray, saturation: float
+) -> CornerFits:
     """Fit the four corners of every tag.
 
     Args:
         image: intensities, shape (H, W).
         quads: approximate corners of the black squares in turn, px, shape (k, 4, 2).
-        modules: modules along a side, border included.
+        tag_from_pixel: homographies from pixels to modules, from the first corner along the first two
+            sides, shape (k, 3, 3).
+        clear: modules of each tag that are not of the colour of its border, row by row, (k, m, m).
         saturation: intensities from here on are censored.
     """
     k = len(quads)
@@ -75,7 +87,7 @@ def fit_corners(image: AnyArray, quads: FloatArray, modules: int, saturation: fl
             quad = quads[i]
             flag[i, j], noise[i, j] = _fit_one(
                 image, quad[j], quad[(j + 1) % 4], quad[(j + 2) % 4], quad[(j + 3) % 4],
-                modules, saturation, theta[i, j], covariance[i, j],
+                tag_from_pixel[i], clear[i], saturation, theta[i, j], covariance[i, j],
             )  # fmt: skip
     return CornerFits(theta, covariance, noise, flag)
 
@@ -87,7 +99,8 @@ def _fit_one(
     following: FloatArray,
     opposite: FloatArray,
     previous: FloatArray,
-    modules: int,
+    tag_from_pixel: FloatArray,
+    clear: BoolArray,
     saturation: float,
     theta: FloatArray,
     covariance: FloatArray,
@@ -105,12 +118,14 @@ def _fit_one(
         theta[NORMAL_1 + k] = math.atan2(ny, nx)
         depth = min(depth, abs(inside) / length)
         depth = min(depth, abs(nx * (opposite[0] - corner[0]) + ny * (opposite[1] - corner[1])) / length)
-    band = min(BAND_PX, max(MIN_BAND_PX, depth / modules - CODE_PX))
     reach = min(REACH_PX, REACH_SHARE * depth)
-    pixels = np.empty((3, int((2 * FARTHEST_PX + 2 * (reach + band) * 4) ** 2) + 16))
+    tip = min(TIP_PX, max(MIN_TIP_PX, TIP_SHARE * depth))
+    pixels = np.empty((5, int((2 * FARTHEST_PX + 2 * (reach + BAND_PX) * 4) ** 2) + 16))
     flag, noise = 0, math.nan
-    for round_ in range(2):  # the pixels are chosen anew about the corner that was found
-        n, censored = _collect(image, theta, band, reach, saturation, pixels)
+    theta[BLUR] = BLUR_START
+    for round_ in range(ROUNDS):  # the pixels are chosen anew about the corner that was found
+        band = min(BAND_PX, max(MIN_BAND_PX, depth / len(clear) - CODE_PX)) if round_ == 0 else BAND_PX
+        n, censored = _collect(image, theta, band, reach, tip, saturation, pixels)
         if n < 0:
             return _CUT_BY_BORDER, noise
         if censored:
@@ -119,6 +134,8 @@ def _fit_one(
             return flag | _NO_CONVERGENCE, noise
         if round_ == 0:
             _start_levels(pixels, n, theta)
+        _add_code(pixels, n, tag_from_pixel, clear, theta[BLUR], 3)
+        _add_code(pixels, n, tag_from_pixel, clear, math.hypot(theta[BLUR], MASK_PX), 4)
         squares, used = _iterate(pixels, n, theta, saturation, reach, covariance)
         if used <= UNKNOWNS or math.hypot(theta[X0] - corner[0], theta[Y0] - corner[1]) > FARTHEST_PX:
             covariance[:] = math.nan
@@ -131,7 +148,13 @@ def _fit_one(
 
 @compiled
 def _collect(
-    image: AnyArray, theta: FloatArray, band: float, reach: float, saturation: float, pixels: FloatArray
+    image: AnyArray,
+    theta: FloatArray,
+    band: float,
+    reach: float,
+    tip: float,
+    saturation: float,
+    pixels: FloatArray,
 ) -> tuple[int, bool]:
     """Collect x, y and intensity along the two edges; return how many, -1 where the border cuts them off."""
     h, w = image.shape
@@ -152,7 +175,7 @@ def _collect(
             d1, d2 = c1 * (j - x0) + s1 * (i - y0), c2 * (j - x0) + s2 * (i - y0)
             if max(d1, d2) > band or min(d1, d2) < -reach or min(abs(d1), abs(d2)) > band:
                 continue
-            if abs(d1) < TIP_PX and abs(d2) < TIP_PX:
+            if min(d1, d2) > -tip:
                 continue
             if n == pixels.shape[1]:
                 return n, censored
@@ -160,6 +183,27 @@ def _collect(
             censored = censored or image[i, j] >= saturation
             n += 1
     return n, censored
+
+
+@compiled
+def _add_code(pixels: FloatArray, n: int, H: FloatArray, clear: BoolArray, blur: float, row: int) -> None:
+    """Set a row of the pixels to the part of the clear modules in them, 0 to 1."""
+    modules = len(clear)
+    for k in range(n):
+        x, y = pixels[0, k], pixels[1, k]
+        w = H[2, 0] * x + H[2, 1] * y + H[2, 2]
+        u = (H[0, 0] * x + H[0, 1] * y + H[0, 2]) / w
+        v = (H[1, 0] * x + H[1, 1] * y + H[1, 2]) / w
+        su = blur * math.hypot(H[0, 0] - u * H[2, 0], H[0, 1] - u * H[2, 1]) / abs(w)
+        sv = blur * math.hypot(H[1, 0] - v * H[2, 0], H[1, 1] - v * H[2, 1]) / abs(w)
+        part = 0.0
+        for i in range(max(0, int(v - CODE_SIGMAS * sv)), min(modules, int(v + CODE_SIGMAS * sv) + 1)):
+            for j in range(max(0, int(u - CODE_SIGMAS * su)), min(modules, int(u + CODE_SIGMAS * su) + 1)):
+                if clear[i, j]:
+                    across = edge_profile((u - j) / su)[0] - edge_profile((u - j - 1) / su)[0]
+                    down = edge_profile((v - i) / sv)[0] - edge_profile((v - i - 1) / sv)[0]
+                    part += across * down
+        pixels[row, k] = part
 
 
 @compiled
@@ -179,7 +223,7 @@ def _start_levels(pixels: FloatArray, n: int, theta: FloatArray) -> None:
         counts[side] += 1
     theta[BACKGROUND] = sums[0] / max(counts[0], 1)
     theta[CONTRAST] = sums[1] / max(counts[1], 1) - theta[BACKGROUND]
-    theta[BLUR], theta[GAIN_X], theta[GAIN_Y] = BLUR_START, 0.0, 0.0
+    theta[BLUR], theta[GAIN_X], theta[GAIN_Y], theta[SHARPENING] = BLUR_START, 0.0, 0.0, 0.0
 
 
 @compiled
@@ -234,7 +278,8 @@ def _normal_equations(
 ) -> tuple[float, int]:
     """Sum up N = J'J and g = J'v with the prior of the gain; return v'v and the number of pixels used."""
     x0, y0, B, A, s = theta[X0], theta[Y0], theta[BACKGROUND], theta[CONTRAST], theta[BLUR]
-    gx, gy = theta[GAIN_X] / length, theta[GAIN_Y] / length
+    gx, gy, a = theta[GAIN_X] / length, theta[GAIN_Y] / length, theta[SHARPENING]
+    t = math.hypot(s, MASK_PX)
     c1, s1, c2, s2 = (
         math.cos(theta[NORMAL_1]),
         math.sin(theta[NORMAL_1]),
@@ -249,20 +294,28 @@ def _normal_equations(
         d1, d2 = c1 * dx + s1 * dy, c2 * dx + s2 * dy
         phi1, e1 = edge_profile(-d1 / s)
         phi2, e2 = edge_profile(-d2 / s)
+        wide1, h1 = edge_profile(-d1 / t)
+        wide2, h2 = edge_profile(-d2 / t)
         gain = 1 + gx * dx + gy * dy
-        level = B + A * phi1 * phi2
+        share, mask = phi1 * phi2 - pixels[3, i], wide1 * wide2 - pixels[4, i]
+        profile = (1 + a) * share - a * mask
+        level = B + A * profile
         model = level * gain
         if (value >= saturation and model >= saturation) or (value <= 0 and model <= 0):
             continue  # no more is known of it (censored observation)
-        f1 = -A * _DENSITY_0 * e1 * phi2 * gain / s  # dI / d d1
-        f2 = -A * _DENSITY_0 * e2 * phi1 * gain / s
+        # dI / d d1 and d2, by the edges and by the mask
+        scale = -A * _DENSITY_0 * gain
+        f1, f2 = scale * (1 + a) * e1 * phi2 / s, scale * (1 + a) * e2 * phi1 / s
+        m1, m2 = -scale * a * h1 * wide2 / t, -scale * a * h2 * wide1 / t
+        J[BLUR] = -(f1 * d1 + f2 * d2) / s - (m1 * d1 + m2 * d2) * s / (t * t)
+        J[SHARPENING] = A * (share - mask) * gain
+        f1, f2 = f1 + m1, f2 + m2
         J[X0] = -f1 * c1 - f2 * c2 - level * gx
         J[Y0] = -f1 * s1 - f2 * s2 - level * gy
         J[NORMAL_1] = f1 * (c1 * dy - s1 * dx)
         J[NORMAL_2] = f2 * (c2 * dy - s2 * dx)
         J[BACKGROUND] = gain
-        J[CONTRAST] = phi1 * phi2 * gain
-        J[BLUR] = -(f1 * d1 + f2 * d2) / s
+        J[CONTRAST] = profile * gain
         J[GAIN_X] = level * dx / length
         J[GAIN_Y] = level * dy / length
         v = value - model
@@ -272,8 +325,9 @@ def _normal_equations(
             g[j] += J[j] * v
             for k in range(j + 1):
                 N[j, k] += J[j] * J[k]
-    prior = (squares / max(used - UNKNOWNS, 1) + 1 / 12) / GAIN_SIGMA**2
-    for j in (GAIN_X, GAIN_Y):
+    variance = squares / max(used - UNKNOWNS, 1) + 1 / 12
+    for j in (GAIN_X, GAIN_Y, SHARPENING):
+        prior = variance / (SHARPENING_SIGMA if j == SHARPENING else GAIN_SIGMA) ** 2
         N[j, j] += prior
         g[j] -= prior * theta[j]
     return squares, used

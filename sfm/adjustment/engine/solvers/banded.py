@@ -257,20 +257,20 @@ def _add_triangle(flat: FloatArray, column: int, stride: int, Y: FloatArray, s: 
 
 
 @compiled
-def _scale_band(A: FloatArray, scale: FloatArray, stretch: float) -> None:
+def _scale_band(band: FloatArray, scale: FloatArray, stretch: float) -> None:
     """Scale a band by rows and columns; its diagonal was 1 before anything was taken off."""
-    for c in range(len(A)):
-        for d in range(min(A.shape[1], len(A) - c)):
-            A[c, d] *= scale[c] * scale[c + d]
-        A[c, 0] += stretch - 1.0
+    for column in range(len(band)):
+        for below in range(min(band.shape[1], len(band) - column)):
+            band[column, below] *= scale[column] * scale[column + below]
+        band[column, 0] += stretch - 1.0
 
 
 @compiled
-def _band_times(A: FloatArray, V: FloatArray, out: FloatArray) -> None:
+def _band_times(band: FloatArray, vectors: FloatArray, out: FloatArray) -> None:
     """Add the product of a symmetric band and vectors (6 m, e) to out."""
-    for c in range(len(A)):
-        for d in range(min(A.shape[1], len(A) - c)):
-            for e in range(V.shape[1]):
-                out[c + d, e] += A[c, d] * V[c, e]
-                if d > 0:
-                    out[c, e] += A[c, d] * V[c + d, e]
+    for column in range(len(band)):
+        for below in range(min(band.shape[1], len(band) - column)):
+            for e in range(vectors.shape[1]):
+                out[column + below, e] += band[column, below] * vectors[column, e]
+                if below > 0:
+                    out[column, e] += band[column, below] * vectors[column + below, e]

@@ -84,11 +84,11 @@ class BandFactor:
 
 
 @compiled
-def _scale_inverse(Z: FloatArray, scale: FloatArray) -> None:
+def _scale_inverse(band: FloatArray, scale: FloatArray) -> None:
     """Scale a band by rows and columns."""
-    for c in range(len(Z)):
-        for d in range(min(Z.shape[1], len(Z) - c)):
-            Z[c, d] *= scale[c] * scale[c + d]
+    for column in range(len(band)):
+        for below in range(min(band.shape[1], len(band) - column)):
+            band[column, below] *= scale[column] * scale[column + below]
 
 
 @compiled

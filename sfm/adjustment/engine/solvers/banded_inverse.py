@@ -56,16 +56,16 @@ def band_inverse(L: FloatArray) -> FloatArray:
 
 
 @compiled
-def _unpack(L: FloatArray, start: int, panel: FloatArray) -> None:
+def _unpack(band: FloatArray, start: int, panel: FloatArray) -> None:
     """Copy columns of a band, from start, into a dense panel whose first row is start."""
-    for c in range(panel.shape[1]):
-        for d in range(min(L.shape[1], len(panel) - c)):
-            panel[c + d, c] = L[start + c, d]
+    for column in range(panel.shape[1]):
+        for below in range(min(band.shape[1], len(panel) - column)):
+            panel[column + below, column] = band[start + column, below]
 
 
 @compiled
-def _pack(panel: FloatArray, start: int, Z: FloatArray) -> None:
+def _pack(panel: FloatArray, start: int, band: FloatArray) -> None:
     """Copy a dense panel whose first row is start into columns of a band."""
-    for c in range(panel.shape[1]):
-        for d in range(min(Z.shape[1], len(panel) - c)):
-            Z[start + c, d] = panel[c + d, c]
+    for column in range(panel.shape[1]):
+        for below in range(min(band.shape[1], len(panel) - column)):
+            band[start + column, below] = panel[column + below, column]

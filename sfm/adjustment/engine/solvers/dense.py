@@ -209,11 +209,11 @@ def _add_blocks(
 
 
 @compiled
-def _mirror(Q: FloatArray) -> None:
+def _mirror(matrix: FloatArray) -> None:
     """Copy the upper triangle to the lower one."""
-    for q in range(len(Q)):
-        for p in range(q):
-            Q[q, p] = Q[p, q]
+    for row in range(len(matrix)):
+        for column in range(row):
+            matrix[row, column] = matrix[column, row]
 
 
 @kernel

@@ -13,11 +13,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import stats
 
 from sfm.adjustment.quality.point_normals import PointNormals
 from sfm.adjustment.result import Adjustment
 from sfm.conventions import IntArray
+from sfm.distributions import chi2_isf
 
 CHANCE = 1e-3  # of so much larger a misfit where the other explanation is the true one
 MOVED = 3.0  # standard deviations by which the other explanation moves the point, for it to matter
@@ -45,7 +45,7 @@ def doubtful_points(
         rows_of: usable image points of each object point.
     """
     images, seen = adjustment.network.images, adjustment.network.image_points
-    limit = float(stats.chi2.isf(CHANCE, 1))
+    limit = float(chi2_isf(CHANCE, 1))
     found = []
     for j in np.unique(seen.point[adjustment.rejected]).tolist():
         rows = rows_of[j]

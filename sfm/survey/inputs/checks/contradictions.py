@@ -25,6 +25,8 @@ from sfm.survey.inputs.settings import (
 from sfm.targets.codes.families import FAMILIES
 from sfm.targets.codes.tags import DICTIONARIES
 
+CALIBRATION_KEYS = {"calibration", "calibration_use"}
+
 
 class SurveySettings(Protocol):
     """What a survey file and a survey with its tables have in common."""
@@ -232,6 +234,20 @@ def _refuse_contradictions_of_camera(camera: CameraSettings, at: str) -> None:
     ):
         for parameter in sorted(both):
             raise SurveyFileError(f"{at}: parameter '{parameter}' is both {one} and {other}")
+    for first, second, _ in camera.correlations:
+        if first == second or first not in weighted or second not in weighted:
+            raise SurveyFileError(
+                f"{at}: correlation of {first} and {second}, expected two weighted parameters"
+            )
+    if camera.correlations and varying:
+        raise SurveyFileError(
+            f"{at}: correlations go with one value for all photographs, not with per_photograph"
+        )
+    if camera.calibration is not None:
+        for key in sorted(camera.model_fields_set - {"name", "images", "size_px", *CALIBRATION_KEYS}):
+            raise SurveyFileError(f"{at}: {key} and calibration are both given; a calibration says it all")
+    elif "calibration_use" in camera.model_fields_set:
+        raise SurveyFileError(f"{at}: calibration_use is given, calibration is needed with it")
     for parameter in start:
         if parameter not in camera.may_be_free:
             raise SurveyFileError(f"{at}: start.{parameter} is given, but '{parameter}' is not in free")

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import stats
 
 from sfm.conventions import BoolArray
+from sfm.distributions import chi2_ppf
 from sfm.network import ImagePoints, rows_of
 
 ALPHA = 0.001  # probability with which measurements that say the same are taken for contradicting ones
@@ -67,7 +67,7 @@ def merge_repeated(seen: ImagePoints) -> Merged:
             mean = Q @ np.einsum("nab,nb->a", P, seen.xy[rows[different]])
             d = seen.xy[rows[different]] - mean
             chi2 = float(np.einsum("na,nab,nb->", d, P, d))
-            kind = 1 if chi2 <= stats.chi2.ppf(1 - ALPHA, 2 * (len(different) - 1)) else 2
+            kind = 1 if chi2 <= chi2_ppf(1 - ALPHA, 2 * (len(different) - 1)) else 2
             xy[one], covariance[one] = mean, Q
         if kind == 2:
             keep[one] = False

@@ -47,7 +47,7 @@ def first_error(path: Path | str, text: str, error: ValidationError, whole: type
     key = _key(location)
     if kind == "extra_forbidden":
         table = _key(location[:-1])
-        inside = f"[{table}]" if table else "the survey file" if text else "it"
+        inside = f"[{table}]" if table else "the file" if text else "it"
         known = _known(location[:-1], whole)
         return f"{where}unknown key '{_key(location[-1:])}' in {inside}, known are {known}"
     if kind == "missing" and isinstance(location[-1], int) and isinstance(first["input"], list | tuple):

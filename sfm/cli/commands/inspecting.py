@@ -1,0 +1,166 @@
+"""Commands on finished results: what their coordinates say of the object, and acceptance tests."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from sfm.cli.commands.starting import loading
+from sfm.runtime.faults import working_on
+
+NOT_KEPT = 1  # exit code where a limit is proven not to be kept
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from sfm.inspection.measure import Measurement
+
+
+def measure(
+    source: Annotated[
+        Path,
+        typer.Argument(
+            metavar="RESULT", help="Result folder, COLMAP model, or another format that is known."
+        ),
+    ],
+    features: Annotated[
+        Path | None,
+        typer.Option("--features", metavar="FILE.toml", help="Shapes, alignment, distances and tolerances."),
+    ] = None,
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder of tables and page.")] = Path(
+        "out/measurement"
+    ),
+    from_format: Annotated[
+        str | None, typer.Option("--from", metavar="F", help="Format of RESULT; else by what is there.")
+    ] = None,
+    outside: Annotated[
+        bool, typer.Option("--allow-outside", help="Let the features file name files outside its folder.")
+    ] = False,
+) -> None:
+    """Measure a result: best-fit shapes, distances, alignment, tolerances.
+
+    Every value with the standard deviation that follows from the covariance of all points.
+    """
+    with loading():
+        from adapters.formats.mesh import read_mesh
+        from adapters.formats.registry import read_comparable
+        from sfm.files.manifest import refuse_foreign_folder
+        from sfm.inspection.features_file import read_features_file
+        from sfm.inspection.measure import measure_result
+        from sfm.report.measurement import headline, parameter_rows, quantity_rows, write_measurement
+        from sfm.report.numbers import with_sigma
+
+    refuse_foreign_folder(out)
+    asked, paths = (None, {}) if features is None else read_features_file(features, allow_outside=outside)
+    with working_on(str(source)):
+        result = read_comparable(source, from_format)
+        found = measure_result(result, asked, paths=paths, read_mesh=read_mesh)
+    page = write_measurement(found, result, out, drawings=_drawings(found))
+    print(headline(found))
+    for fit in found.shapes:
+        said = [
+            f"{name} {' +- '.join(with_sigma(value, sigma))} {unit}"
+            for name, axis, value, sigma, unit in parameter_rows(fit, found.unit)
+            if not axis
+        ]
+        what = f"{fit.shape.kind.name} {fit.name}: {', '.join((*said, ''))}"
+        print(f"{what}form error {fit.form_error:.3g} {found.unit}, {fit.used.sum()} points")
+    for name, what, value, sigma, unit, remark in quantity_rows(found):
+        told = f"{name} ({what}): {' +- '.join(with_sigma(value, sigma))} {unit}"
+        print(f"{told}{f'; {remark}' if remark else ''}")
+    for remark in found.remarks:
+        print(f"! {remark}")
+    print(f"Report: {page}")
+
+
+def accept(
+    source: Annotated[Path, typer.Argument(metavar="RESULT", help="Result folder of a survey.")],
+    lengths: Annotated[
+        Path, typer.Argument(metavar="LENGTHS.csv", help="Calibrated lengths: line,from,to,length[,sigma].")
+    ],
+    a: Annotated[float, typer.Option("--limit-a", metavar="A", help="A of the limit A + K L, object unit.")],
+    k: Annotated[float, typer.Option("--limit-k", metavar="K", help="K of it, such as 2e-5.")] = 0.0,
+    b: Annotated[
+        float | None, typer.Option("--limit-b", metavar="B", help="What the limit is at most, object unit.")
+    ] = None,
+    coverage: Annotated[
+        float, typer.Option("--coverage", metavar="k", min=1.0, help="k of U = k sigma of the calibration.")
+    ] = 2.0,
+    diagonal: Annotated[
+        float | None,
+        typer.Option(
+            "--diagonal",
+            metavar="D",
+            help="Body diagonal of the measuring volume, object unit; else of the box around all points.",
+        ),
+    ] = None,
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder of table and page.")] = Path(
+        "out/acceptance"
+    ),
+) -> None:
+    """Test a result against calibrated lengths (VDI/VDE 2634 part 1).
+
+    The scale must come from other bars than those tested. Exit code 1 if the limit is proven not to be kept.
+    """
+    with loading():
+        from adapters.formats.result_tables import read_result, read_scale_sources
+        from sfm.files.manifest import refuse_foreign_folder
+        from sfm.inspection.acceptance import accept_result, read_lengths
+        from sfm.report.acceptance import write_acceptance
+
+    refuse_foreign_folder(out)
+    with working_on(str(source)):
+        result = read_result(source)
+        bars, control = read_scale_sources(source)
+    found = accept_result(
+        result,
+        read_lengths(lengths),
+        a=a,
+        k=k,
+        b=float("inf") if b is None else b,
+        bars=bars,
+        control=control,
+        coverage=coverage,
+        diagonal=diagonal,
+    )
+    page = write_acceptance(found, out)
+    print(found.headline)
+    print(f"largest error of a length: {found.largest:.4g} {found.unit}")
+    for line in found.lacking:
+        print(f"! {line}")
+    print(f"Report: {page}")
+    if found.verdict == "bad":
+        raise SystemExit(NOT_KEPT)
+
+
+def _drawings(found: Measurement) -> list[tuple[str, Callable[[Path], None]]]:
+    """Return the files of other programs that go with a measurement."""
+    from functools import partial
+
+    import numpy as np
+
+    from adapters.formats.dxf import DxfCircle, DxfLine, write_dxf
+    from adapters.formats.ply import write_ply
+    from sfm.report.measurement import point_sigma
+
+    points = found.points
+    sigma = point_sigma(found)
+    layers = [found.group_of(j) or "points" for j in range(len(points.names))]
+    lines, circles, texts = [], [], []
+    for fit in found.shapes:
+        shape = fit.shape
+        texts.append((fit.name, f"{shape.kind.name} {fit.name}", shape.origin))
+        if shape.kind.name in ("line", "cylinder", "cone", "paraboloid"):
+            along = (points.xyz[fit.points] - shape.origin) @ shape.axis
+            ends = (shape.origin + x * shape.axis for x in (along.min(), along.max()))
+            lines.append(DxfLine(fit.name, *ends))
+        if shape.kind.name in ("circle", "cylinder", "torus"):
+            circles.append(DxfCircle(fit.name, shape.origin, shape.axis, float(shape.form[0])))
+    return [
+        ("points.ply", partial(write_ply, names=points.names, xyz=points.xyz,
+                               sigma=sigma if np.isfinite(sigma).all() else None)),
+        ("measurement.dxf", partial(write_dxf, names=points.names, xyz=points.xyz, layers=layers, lines=lines,
+                                    circles=circles, texts=texts)),
+    ]  # fmt: skip

@@ -1,0 +1,63 @@
+"""The distributions of test statistics, from special functions: `scipy.stats` takes a second to import.
+
+Names as in `scipy.stats`: sf is the probability of more than x, isf its inverse, ppf the quantile. They take
+numbers or arrays, and say NaN where their arguments mean nothing.
+
+Source: Abramowitz, Stegun (1964), Handbook of Mathematical Functions, 26.4, 26.6, 26.7.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from scipy import special
+
+
+def chi2_sf(x: Any, r: Any) -> Any:
+    """Probability that chi-square of redundancy r is larger than x."""
+    return special.chdtrc(r, x)
+
+
+def chi2_isf(probability: Any, r: Any) -> Any:
+    """Value that chi-square of redundancy r exceeds with a probability."""
+    return special.chdtri(r, probability)
+
+
+def chi2_ppf(probability: Any, r: Any) -> Any:
+    """Value that chi-square of redundancy r stays below with a probability."""
+    return 2 * special.gammaincinv(r / 2, probability)
+
+
+def f_sf(x: Any, r1: Any, r2: Any) -> Any:
+    """Probability that F of redundancies r1 and r2 is larger than x."""
+    return special.fdtrc(r1, r2, x)
+
+
+def f_isf(probability: Any, r1: Any, r2: Any) -> Any:
+    """Value that F of redundancies r1 and r2 exceeds with a probability: 1 / F of r2 and r1 stays below."""
+    return 1 / special.fdtri(r2, r1, probability)
+
+
+def t_sf(x: Any, r: Any) -> Any:
+    """Probability that Student's t of redundancy r is larger than x."""
+    return special.stdtr(r, -x)
+
+
+def t_ppf(probability: Any, r: Any) -> Any:
+    """Value that Student's t of redundancy r stays below with a probability."""
+    return special.stdtrit(r, probability)
+
+
+def normal_sf(x: Any) -> Any:
+    """Probability that a standard normal variable is larger than x."""
+    return special.ndtr(-x)
+
+
+def normal_ppf(probability: Any) -> Any:
+    """Value that a standard normal variable stays below with a probability."""
+    return special.ndtri(probability)
+
+
+def poisson_sf(k: Any, expected: Any) -> Any:
+    """Probability of more than k events where a number of them is expected."""
+    return special.pdtrc(k, expected)

@@ -1,0 +1,341 @@
+"""Alignment of a result: 3-2-1, by features, or by best fit to nominal points; its covariance goes along.
+
+A transformation x' = s R x + t that is computed from the points themselves makes their errors part of it:
+dx' = s R dx + M dT with dT = F dx, so that Q' = (D + M F) Q (D + M F)', the S-transformation to the new
+datum. What it is defined by has no variance afterwards.
+
+A best fit is weighted with the covariance of the points as it is in their datum: in another datum of the same
+network it lies elsewhere within its uncertainty, and its test is the same.
+
+Source: Baarda (1973), S-transformations and criterion matrices; Luhmann et al. (2020), Close-Range
+Photogrammetry and 3D Imaging, secs. 2.2.4 and 6.2.3; Horn (1987) for the start of the best fit.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.linalg import LinAlgError, cho_factor, cho_solve
+
+from sfm.comparison.congruency import critical_value
+from sfm.comparison.pairing import fit_robustly
+from sfm.conventions import BoolArray, FloatArray, IntArray, rotation_from_vector
+from sfm.errors import GeometryError
+from sfm.geometry.functions import joined
+from sfm.geometry.measured import Function, MeasuredPoints, coordinates_of
+from sfm.similarity import Similarity, fit_similarity, similarity_motions
+
+ITERATIONS = 50
+CONVERGED = 1e-13
+REJECTED = 4.685  # robust standard deviations beyond which a point takes no part
+MEDIAN_OF_LENGTH = 1.538  # median length of a vector of three independent normal deviations, over their sigma
+ALPHA = 0.05  # level of the global test
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """A transformation into another system, and how it depends on the points that define it."""
+
+    method: str  # 3-2-1 | features | points
+    aligned_from_object: Similarity
+    points: IntArray  # indices of the points that it is computed from, (m,)
+    linear: FloatArray  # F: shifts, rotations, scale in the new system by their coordinates, (7, 3 m)
+    covariance_of_nominal: FloatArray  # what nominal points add to that of the seven, (7, 7)
+    scaled: bool  # whether the scale was fitted
+    fitted: BestFit | None = None
+
+    def apply(self, points: MeasuredPoints) -> MeasuredPoints:
+        """Return points in the new system with their covariance."""
+        T = self.aligned_from_object
+        xyz = T.apply(points.xyz)
+        if points.covariance is None:
+            covariance = None
+        elif points.covariance.ndim == 2:
+            covariance = self._moved_covariance(points.covariance, xyz)
+        else:
+            covariance = self._moved_blocks(points.covariance, xyz)
+        has_scale = points.has_scale or self.scaled
+        return replace(points, xyz=xyz, covariance=covariance, datum="aligned", has_scale=has_scale)
+
+    def _moved_covariance(self, Q: FloatArray, xyz: FloatArray) -> FloatArray:
+        D, M = self._derivatives(xyz)
+        n = len(xyz)
+        M = M.reshape(3 * n, 7)
+        rows = coordinates_of(self.points)
+        # (D + M F) Q (D + M F)' = D Q D' + M (F Q D') + (F Q D')' M' + M (F Q F') M'
+        cross = _right(self.linear @ Q[rows], D)
+        middle = self.linear @ Q[np.ix_(rows, rows)] @ self.linear.T + self.covariance_of_nominal
+        moved = _right(_right(Q, D).T, D)
+        half = M @ (cross + middle @ M.T / 2)
+        return np.asarray(moved + half + half.T)
+
+    def _moved_blocks(self, Q: FloatArray, xyz: FloatArray) -> FloatArray:
+        D, M = self._derivatives(xyz)
+        F = np.zeros((7, len(xyz), 3))
+        F[:, self.points] = self.linear.reshape(7, -1, 3)
+        FQ = np.einsum("uni,nij->unj", F, Q)
+        middle = np.einsum("uni,vni->uv", FQ, F) + self.covariance_of_nominal
+        half = np.einsum("nau,unj,bj->nab", M, FQ, D)
+        return np.asarray(
+            np.einsum("ai,nij,bj->nab", D, Q, D)
+            + half
+            + half.transpose(0, 2, 1)
+            + np.einsum("nau,uv,nbv->nab", M, middle, M)
+        )
+
+    def _derivatives(self, xyz: FloatArray) -> tuple[FloatArray, FloatArray]:
+        T = self.aligned_from_object
+        return T.scale * T.rotation, similarity_motions(xyz, centre=np.zeros(3))
+
+
+@dataclass(frozen=True)
+class BestFit:
+    """How well nominal points are met."""
+
+    names: tuple[str, ...]  # of the points that were given, (n,)
+    used: BoolArray  # which of them took part, (n,)
+    difference: FloatArray  # aligned minus nominal, object unit, (n, 3)
+    scale: float
+    sigma0: float  # of weights "network" a ratio, of equal ones in object units; NaN without redundancy
+    redundancy: int
+    statistic: float  # of the global test; NaN where not tested
+    critical: float
+
+
+@dataclass(frozen=True)
+class Nominal:
+    """Points of a drawing, or of anything else that is the reference."""
+
+    names: tuple[str, ...]  # (n,)
+    xyz: FloatArray  # object unit, (n, 3)
+    covariance: FloatArray | None = None  # of each, object unit^2; exactly known if not given, (n, 3, 3)
+
+
+def align_321(points: MeasuredPoints, plane: list[str], line: list[str], origin: str) -> Alignment:
+    """Return the 3-2-1 alignment: three points on Z = 0, two on Y = 0, one on X = 0.
+
+    Args:
+        points: of a result.
+        plane: names of the three; Z is on the side from which they go round counter-clockwise.
+        line: names of the two; X leads from the first to the second.
+        origin: name of the one.
+
+    Raises:
+        UnknownNameError: there is no point of a name.
+        GeometryError: points that do not determine the system.
+
+    Source: Luhmann et al. (2020), Close-Range Photogrammetry and 3D Imaging, sec. 6.2.3.
+    """
+    if len(plane) != 3 or len(line) != 2:
+        raise GeometryError(
+            f"alignment 3-2-1: {len(plane)} points of the plane and {len(line)} of the line, expected 3 and 2"
+        )
+    a, b, c = (points.xyz[points.index(name)] for name in plane)
+    d, e = (points.xyz[points.index(name)] for name in line)
+    normal = np.cross(b - a, c - a)
+    if not np.linalg.norm(normal) > 1e-9 * np.linalg.norm(b - a) * np.linalg.norm(c - a):
+        raise GeometryError(f"alignment 3-2-1: points {', '.join(plane)} of the plane lie on a line")
+    rotation = _axes(normal, e - d, "3-2-1")
+    at = points.index(origin)
+    t = -np.array([rotation[0] @ points.xyz[at], rotation[1] @ d, rotation[2] @ a])
+    rows = [(name, axis) for names, axis in ((plane, 2), (line, 1), ([origin], 0)) for name in names]
+    entities = [
+        (Function(points.xyz[points.index(name)], np.array([points.index(name)]), np.eye(3)), False, axis)
+        for name, axis in rows
+    ]
+    return _defined("3-2-1", Similarity(1.0, rotation, t), entities)
+
+
+def align_features(
+    z_axis: Function, x_axis: Function, origin: Function, *, on_plane: Function | None = None
+) -> Alignment:
+    """Return the alignment by features: a direction to Z, another to X, a place to the origin.
+
+    Args:
+        z_axis: direction that becomes Z, such as the normal of a plane.
+        x_axis: direction that becomes X after projection along Z.
+        origin: place whose X and Y are 0, and Z too if there is no plane.
+        on_plane: a place whose Z is 0, on the plane of Z = 0.
+
+    Raises:
+        GeometryError: directions that are parallel.
+
+    Source: Luhmann et al. (2020), Close-Range Photogrammetry and 3D Imaging, sec. 6.2.3.
+    """
+    rotation = _axes(z_axis.value, x_axis.value, "by features")
+    at = rotation @ origin.value
+    if on_plane is not None:
+        at[2] = float(rotation[2] @ on_plane.value)
+    entities = [
+        (z_axis, True, 0),
+        (z_axis, True, 1),
+        (x_axis, True, 1),
+        (origin, False, 0),
+        (origin, False, 1),
+        (origin if on_plane is None else on_plane, False, 2),
+    ]
+    return _defined("features", Similarity(1.0, rotation, -at), entities)
+
+
+def align_points(
+    points: MeasuredPoints,
+    nominal: Nominal,
+    *,
+    scale: bool = False,
+    weights: str = "network",
+    robust: bool = False,
+) -> Alignment:
+    """Return the best fit of points to nominal ones of the same names.
+
+    Args:
+        points: of a result.
+        nominal: reference points; those that were not measured do not count.
+        scale: whether the scale is fitted, too.
+        weights: network (the covariance of both) or equal.
+        robust: whether points that most of the others contradict are held out.
+
+    Raises:
+        GeometryError: fewer than three points in common, or all of them on a line.
+
+    Source: Horn (1987), J. Opt. Soc. Am. A 4(4); Caspary (2000), sec. 7, for both covariances.
+    """
+    common = [name for name in nominal.names if name in points.names]
+    if len(common) < 3:
+        raise GeometryError(f"alignment: {len(common)} nominal points were measured, a best fit needs 3")
+    rows = np.array([points.index(name) for name in common], dtype=np.int64)
+    own = np.array([nominal.names.index(name) for name in common], dtype=np.int64)
+    target = nominal.xyz[own]
+    fixed = None if scale else 1.0
+    if weights == "network" and points.covariance is None and nominal.covariance is None:
+        raise GeometryError(
+            "alignment: neither measured nor nominal points have standard deviations, expected weights = "
+            '"equal"'
+        )
+    blocks = np.nan_to_num(points.blocks[rows])
+    if nominal.covariance is not None:
+        blocks = blocks + nominal.covariance[own]
+    used = np.ones(len(rows), dtype=bool)
+    if robust:
+        used = _agreeing(points.xyz[rows], target, fixed, blocks if weights == "network" else None)
+    first = fit_similarity(points.xyz[rows[used]], target[used], scale=fixed)
+    Qn = None if nominal.covariance is None else nominal.covariance[own[used]]
+    T, linear, of_nominal, omega = _refine(points, rows[used], target[used], Qn, first, scale, weights)
+    difference = T.apply(points.xyz[rows]) - target
+    redundancy = 3 * int(used.sum()) - (7 if scale else 6)
+    statistic = critical = np.nan
+    if weights == "network" and redundancy:
+        statistic = omega / redundancy
+        critical = critical_value(ALPHA, redundancy, points.redundancy)
+    sigma0 = float(np.sqrt(omega / redundancy)) if redundancy else np.nan
+    fit = BestFit(tuple(common), used, difference, T.scale, sigma0, redundancy, float(statistic), critical)
+    return Alignment("points", T, rows[used], linear, of_nominal, scale, fit)
+
+
+def _refine(
+    points: MeasuredPoints,
+    rows: IntArray,
+    target: FloatArray,
+    Qn: FloatArray | None,
+    T: Similarity,
+    scale: bool,
+    weights: str,
+) -> tuple[Similarity, FloatArray, FloatArray, float]:
+    """Return the best fit, F, what the nominal points add to the covariance of the seven, and v' P v."""
+    source, n = points.xyz[rows], len(rows)
+    u = 7 if scale else 6
+    Q = None if points.covariance is None else points.covariance_of(rows)
+    size = float(np.sqrt(((target - target.mean(axis=0)) ** 2).sum(axis=1).mean()))
+    spread = np.zeros((3 * n, 3 * n))
+    if Qn is not None:
+        for k in range(n):
+            spread[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] = Qn[k]
+    for _ in range(ITERATIONS):
+        xyz = T.apply(source)
+        D = T.scale * T.rotation
+        M = similarity_motions(xyz, centre=np.zeros(3)).reshape(3 * n, 7)[:, :u]
+        d = (xyz - target).ravel()
+        if weights == "equal":
+            PM = M
+        else:
+            Qd = spread if Q is None else spread + _right(_right(Q, D).T, D)
+            unit = np.sqrt(np.trace(Qd) / len(Qd) / (M**2).mean(axis=0))
+            try:
+                factor = cho_factor(Qd + (M * unit) @ (M * unit).T, lower=True)
+            except LinAlgError as error:
+                raise GeometryError(
+                    "alignment: the covariance of the points is singular beyond its datum, expected "
+                    'weights = "equal"'
+                ) from error
+            PM = cho_solve(factor, M)
+        pull: FloatArray = np.asarray(np.linalg.solve(M.T @ PM, PM.T))
+        step = -pull @ d
+        T = _stepped(T, step)
+        if np.abs(step[:3]).max() < CONVERGED * size and np.abs(step[3:]).max() < CONVERGED:
+            break
+    d = (T.apply(source) - target).ravel()
+    omega = float(d @ d) if weights == "equal" else float(d @ cho_solve(factor, d))
+    linear, of_nominal = np.zeros((7, 3 * n)), np.zeros((7, 7))
+    linear[:u] = -_right(pull, D.T)
+    of_nominal[:u, :u] = pull @ spread @ pull.T
+    return T, linear, of_nominal, omega
+
+
+def _stepped(T: Similarity, step: FloatArray) -> Similarity:
+    """Return a transformation after small shifts, rotations and a change of scale in the new system."""
+    spin = rotation_from_vector(step[3:6])
+    factor = 1 + (step[6] if len(step) > 6 else 0.0)
+    return Similarity(T.scale * factor, spin @ T.rotation, factor * spin @ T.translation + step[:3])
+
+
+def _agreeing(
+    source: FloatArray, target: FloatArray, scale: float | None, blocks: FloatArray | None
+) -> BoolArray:
+    """Return the points that most of the others agree with, (n,)."""
+    n = len(source)
+    if n < 5:
+        raise GeometryError(f"alignment: {n} common points, a robust best fit needs 5 or more")
+    d = fit_robustly(source, target, scale=scale).apply(source) - target
+    length = np.linalg.norm(d, axis=1)
+    if blocks is not None:
+        length = length / np.sqrt(np.einsum("nii->n", blocks) / 3)
+    sigma = (1 + 5 / (3 * n - 6)) * float(np.median(length)) / MEDIAN_OF_LENGTH
+    return np.asarray(length <= max(REJECTED * sigma, 1e-12))
+
+
+def _axes(z: FloatArray, x: FloatArray, what: str) -> FloatArray:
+    """Return the axes of the new system as rows: Z along z, X along x as far as it is square to that."""
+    z = z / np.linalg.norm(z)
+    across = x - (x @ z) * z
+    if not np.linalg.norm(across) > 1e-9 * np.linalg.norm(x):
+        raise GeometryError(f"alignment {what}: the direction of X is that of Z")
+    across = across / np.linalg.norm(across)
+    return np.stack([across, np.cross(z, across), z])
+
+
+def _defined(method: str, T: Similarity, entities: list[tuple[Function, bool, int]]) -> Alignment:
+    """Return the alignment that holds one coordinate each of six places or directions.
+
+    Args:
+        method: its name.
+        T: the transformation.
+        entities: place or direction, whether it is a direction, and the axis along which it is held.
+    """
+    held = joined([one for one, _, _ in entities])
+    moves, own = np.zeros((6, 7)), np.zeros((6, len(held.value)))
+    for k, (one, is_direction, axis) in enumerate(entities):
+        value = T.rotation @ one.value if is_direction else T.apply(one.value)
+        motions = similarity_motions(value[None], centre=np.zeros(3))[0]
+        if is_direction:
+            motions = motions * np.array([0.0, 0, 0, 1, 1, 1, 0])
+        moves[k] = motions[axis]
+        own[k, 3 * k : 3 * k + 3] = T.rotation[axis]
+    # a coordinate that is held does not change: moves dT + own dx = 0
+    linear = np.zeros((7, held.jacobian.shape[1]))
+    linear[:6] = -np.linalg.solve(moves[:, :6], own @ held.jacobian)
+    return Alignment(method, T, held.points, linear, np.zeros((7, 7)), False)
+
+
+def _right(matrix: FloatArray, D: FloatArray) -> FloatArray:
+    """Return matrix diag(D, D, ...)', (k, 3 n)."""
+    return np.asarray((matrix.reshape(len(matrix), -1, 3) @ D.T).reshape(matrix.shape))

@@ -1,0 +1,190 @@
+"""Measured points with their covariance, and functions of their coordinates.
+
+A function keeps its values and its derivatives by the coordinates, so that its covariance, and that of any
+functions together, is J Q J'. In a free network only what does not change with the motions that the datum
+leaves open has a covariance that means something: J G = 0, with G the shifts, rotations and, without a scale,
+the scale of the whole.
+
+Source: Baarda (1973), S-transformations and criterion matrices; Caspary (2000), Concepts of network and
+deformation analysis, sec. 6 (estimable functions).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from fnmatch import fnmatchcase
+
+import numpy as np
+
+from sfm.conventions import BoolArray, FloatArray, IntArray
+from sfm.errors import GeometryError
+from sfm.network import index_of
+from sfm.similarity import similarity_motions
+from sfm.stored_result import StoredResult
+
+# Change with a motion over the largest that derivatives of this size could have, below which there is none:
+# those of a fit are taken at adjusted points, so that residuals of a hundredth of the size still pass.
+INVARIANT = 1e-2
+OWN_DATUM = ("control", "aligned")  # datums that coordinates are meant in
+
+
+@dataclass(frozen=True)
+class Function:
+    """Values computed from coordinates, with their derivatives."""
+
+    value: FloatArray  # (q,)
+    points: IntArray  # indices of the points that it depends on, (m,)
+    jacobian: FloatArray  # by X Y Z of each of them, (q, 3 m)
+
+    def __getitem__(self, rows: slice | IntArray) -> Function:
+        return Function(self.value[rows], self.points, self.jacobian[rows])
+
+    def times(self, matrix: FloatArray, value: FloatArray) -> Function:
+        """Return a function of this one, by its value and its derivatives by these values (r, q)."""
+        return Function(np.atleast_1d(value), self.points, matrix @ self.jacobian)
+
+
+@dataclass(frozen=True)
+class MeasuredPoints:
+    """Points of a result, or of anything else that gives coordinates."""
+
+    names: tuple[str, ...]  # (n,)
+    xyz: FloatArray  # object unit, (n, 3)
+    covariance: FloatArray | None  # of all together (3 n, 3 n), or of each by itself (n, 3, 3), object unit^2
+    unit: str = ""  # of lengths, as people call it
+    datum: str = ""  # free | minimal | control | aligned; empty where nobody knows
+    has_scale: bool = True  # whether lengths are in a known unit
+    redundancy: int | None = None  # of the variances; None where they count as known
+
+    @property
+    def correlated(self) -> bool:
+        """Whether the covariance between points is known."""
+        return self.covariance is not None and self.covariance.ndim == 2
+
+    @property
+    def blocks(self) -> FloatArray:
+        """Covariance of each point by itself, NaN where not known, (n, 3, 3)."""
+        n = len(self.names)
+        if self.covariance is None:
+            return np.full((n, 3, 3), np.nan)
+        if self.covariance.ndim == 3:
+            return self.covariance
+        return np.stack([self.covariance[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] for k in range(n)])
+
+    def index(self, name: str) -> int:
+        """Return the number of a point; UnknownNameError if there is none of that name."""
+        return index_of(self.names, name, "point")
+
+    def matching(self, patterns: Sequence[str], what: str) -> IntArray:
+        """Return the points that any of some names or patterns (`*`, `?`, `[...]`) names, in their order.
+
+        Args:
+            patterns: names, patterns, or ranges of numbers such as 101-120.
+            what: asks for them, for messages.
+
+        Raises:
+            GeometryError: a pattern that names none.
+        """
+        chosen = np.zeros(len(self.names), dtype=bool)
+        for pattern in patterns:
+            own = np.array([matches(name, pattern) for name in self.names], dtype=bool)
+            if not own.any():
+                raise GeometryError(f"{what}: '{pattern}' is the name of no point, and no pattern of any")
+            chosen |= own
+        return np.flatnonzero(chosen)
+
+    def covariance_of(self, points: IntArray) -> FloatArray:
+        """Return the covariance of some points together, object unit^2, (3 m, 3 m).
+
+        Raises:
+            GeometryError: nobody knows it.
+        """
+        if self.covariance is None:
+            raise GeometryError("covariance: that of the points is not known")
+        if self.covariance.ndim == 2:
+            rows = coordinates_of(points)
+            return self.covariance[np.ix_(rows, rows)]
+        Q = np.zeros((3 * len(points), 3 * len(points)))
+        for k, j in enumerate(points):
+            Q[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] = self.covariance[j]
+        return Q
+
+    def covariance_between(self, functions: Sequence[Function]) -> FloatArray:
+        """Return the covariance of the values of some functions together; NaN where nobody knows it.
+
+        Args:
+            functions: of the coordinates, q values in all.
+
+        Returns:
+            Covariance, (q, q).
+        """
+        q = sum(len(one.value) for one in functions)
+        if self.covariance is None:
+            return np.full((q, q), np.nan)
+        points = np.unique(np.concatenate([one.points for one in functions]))
+        J = np.vstack([self._spread(one, points) for one in functions])
+        return np.asarray(J @ self.covariance_of(points) @ J.T)
+
+    def _spread(self, one: Function, points: IntArray) -> FloatArray:
+        J = np.zeros((len(one.value), 3 * len(points)))
+        np.add.at(J.T, coordinates_of(np.searchsorted(points, one.points)), one.jacobian.T)
+        return J
+
+    def depends_on_datum(self, one: Function) -> BoolArray:
+        """Return which values change with a motion of the whole that the datum only assumes, (q,)."""
+        if self.datum in OWN_DATUM:
+            return np.zeros(len(one.value), dtype=bool)
+        xyz = self.xyz[one.points]
+        size = max(float(np.linalg.norm(xyz - xyz.mean(axis=0), axis=1).max(initial=0.0)), 1e-300)
+        G = similarity_motions(xyz, centre=xyz.mean(axis=0), size=size).reshape(-1, 7)
+        G = G[:, : 6 if self.has_scale else 7]
+        change = np.abs(one.jacobian @ G)
+        most = np.abs(one.jacobian) @ np.abs(G)
+        return np.asarray((change > INVARIANT * most.max(axis=1, keepdims=True)).any(axis=1))
+
+
+def measured_points(result: StoredResult) -> MeasuredPoints:
+    """Return the points of a result that have coordinates, with the covariance that is known of them.
+
+    Where only that of a sample of the points is known together, each counts by itself.
+    """
+    kept = np.flatnonzero(result.estimate.determined)
+    covariance = result.covariance
+    if covariance is not None and result.covariance_points is None:
+        rows = coordinates_of(kept)
+        covariance = covariance[np.ix_(rows, rows)]
+    elif result.point_covariance is not None:
+        blocks = result.point_covariance[kept]
+        covariance = blocks if np.isfinite(blocks).all() else None
+    else:
+        covariance = None
+    return MeasuredPoints(
+        tuple(result.network.points[j] for j in kept),
+        result.estimate.points[kept],
+        covariance,
+        result.unit,
+        result.datum,
+        result.has_scale,
+        result.redundancy,
+    )
+
+
+def with_covariance(points: MeasuredPoints, covariance: FloatArray | None) -> MeasuredPoints:
+    """Return the points with another covariance."""
+    return replace(points, covariance=covariance)
+
+
+def coordinates_of(points: IntArray) -> IntArray:
+    """Return the rows of X Y Z of some points among those of all, (3 m,)."""
+    return np.asarray((3 * np.asarray(points)[:, None] + np.arange(3)).ravel())
+
+
+def matches(name: str, pattern: str) -> bool:
+    """Whether a name is a pattern's: the name itself, `*` and `?`, or a range of numbers such as 101-120."""
+    if name == pattern or fnmatchcase(name, pattern):
+        return True
+    low, dash, high = pattern.partition("-")
+    if not (dash and low.isdecimal() and high.isdecimal() and name.isdecimal()):
+        return False
+    return int(low) <= int(name) <= int(high)

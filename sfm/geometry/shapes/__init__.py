@@ -1,0 +1,1 @@
+"""Best-fit shapes by orthogonal distances: `fit.fit_shape` is the entrance."""

@@ -1,0 +1,384 @@
+"""Best-fit shapes by orthogonal distances: with the covariance of the network, or with equal weights.
+
+Source: Ahn (2004), Least Squares Orthogonal Distance Fitting of Curves and Surfaces in Space; Foerstner and
+Wrobel (2016), Photogrammetric Computer Vision, secs. 4.8 and 10.6; Luhmann et al. (2020), Close-Range
+Photogrammetry and 3D Imaging, sec. 2.3.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from sfm.comparison.congruency import critical_value
+from sfm.conventions import BoolArray, FloatArray, IntArray
+from sfm.errors import GeometryError
+from sfm.geometry.measured import Function, MeasuredPoints
+from sfm.geometry.shapes.gauss_helmert import constraint_covariance, refine_weighted
+from sfm.geometry.shapes.kinds import KINDS, Kind
+from sfm.geometry.shapes.orthogonal import refine_orthogonal
+from sfm.geometry.shapes.parameters import Parameters, parameters_of
+from sfm.geometry.shapes.robust import robust_shape, with_held
+from sfm.geometry.shapes.shape import Shape
+from sfm.geometry.shapes.start import start_shapes
+
+WEIGHTS = ("network", "equal")
+STARTS = 4  # of the likeliest start values that are refined
+START_POINTS = 300  # that start values are found from
+START_STEPS = 25
+COLLINEAR = 1e-9  # spread of points over their size below which they lie on a line or plane
+UNCERTAIN = 3.0  # spread over the standard deviation of the points, likewise
+RANK = 1e-9  # smallest singular value over the largest of the design, each parameter of one size
+ALPHA = 0.05  # level of the global test
+
+
+@dataclass(frozen=True)
+class ShapeFit:
+    """A best-fit shape."""
+
+    name: str
+    shape: Shape
+    weights: str  # network | equal
+    points: IntArray  # indices of its points, (m,)
+    used: BoolArray  # which of them a robust fit has kept, (m,)
+    parameters: Parameters  # names, values and what they are
+    function: Function  # the parameters by the coordinates of its points
+    covariance: FloatArray  # of the parameters, (p, p); NaN where nothing tells
+    from_residuals: (
+        bool  # whether the covariance comes from the residuals, since that of the points is not known
+    )
+    distances: FloatArray  # signed distances of the points, object unit, (m, c)
+    sigma: FloatArray  # of the distance of each point, object unit; NaN where not known, (m,)
+    w: FloatArray  # standardised: the root of T of each point; NaN where not known, (m,)
+    sigma0: float  # of weights "network" a ratio, of equal ones in object units; NaN without redundancy
+    redundancy: int
+    statistic: float  # v' Q^-1 v over the redundancy; NaN where not tested
+    critical: float  # of the global test; NaN where not tested
+    converged: bool
+    offset: float = 0.0  # of the targets from the shape along its normal, object unit
+
+    @property
+    def deviation(self) -> FloatArray:
+        """Distance of each point from the shape, signed of a surface, object unit, (m,)."""
+        if self.distances.shape[1] == 1:
+            return self.distances[:, 0]
+        return np.asarray(np.linalg.norm(self.distances, axis=1))
+
+    @property
+    def rms(self) -> float:
+        """Root mean square distance of the points that were used, object unit."""
+        return float(np.sqrt((self.deviation[self.used] ** 2).mean()))
+
+    @property
+    def form_error(self) -> float:
+        """Largest minus smallest distance of the points that were used; of a curve twice the largest."""
+        own = self.deviation[self.used]
+        return float(2 * own.max() if self.distances.shape[1] == 2 else np.ptp(own))
+
+    @property
+    def fits(self) -> bool | None:
+        """Whether the residuals are as the covariance of the points says; None where that is not tested."""
+        return None if np.isnan(self.statistic) else bool(self.statistic <= self.critical)
+
+    @property
+    def parameter_sigma(self) -> FloatArray:
+        """Standard deviations of the parameters, 0 where held, (p,)."""
+        return np.asarray(np.sqrt(np.maximum(np.diagonal(self.covariance), 0.0)))
+
+    def value(self, name: str) -> float:
+        """Return a parameter that is one number, such as `diameter`."""
+        return float(self.function.value[self.parameters.rows(name)][0])
+
+    def sigma_of(self, name: str) -> float:
+        """Return the standard deviation of such a parameter."""
+        return float(self.parameter_sigma[self.parameters.rows(name)][0])
+
+
+def fit_shape(
+    points: MeasuredPoints,
+    kind: str,
+    chosen: Sequence[str] | IntArray | None = None,
+    *,
+    name: str = "",
+    weights: str = "network",
+    hold: Mapping[str, float | Sequence[float]] | None = None,
+    robust: bool = False,
+    offset: float = 0.0,
+) -> ShapeFit:
+    """Fit a shape to points by orthogonal distances.
+
+    Args:
+        points: of a result.
+        kind: line, plane, circle, ellipse, sphere, cylinder, cone, torus or paraboloid.
+        chosen: names or indices of the points; all if not given.
+        name: of the shape, for messages; its kind if empty.
+        weights: network (the covariance of the points) or equal.
+        hold: values of what is held: `direction` (three numbers), where it lies (`point`, `centre`, `apex` or
+            `vertex`, three numbers), form parameters (object unit, rad) or `diameter`.
+        robust: whether points that most of the others contradict are left out.
+        offset: signed distance of the targets from the shape: on the side of its normal or outside positive.
+
+    Raises:
+        GeometryError: too few points, points that do not determine the shape, or nothing known of it.
+
+    Source: Ahn (2004), ch. 3; the general case of least squares as in `refine_weighted`.
+    """
+    if kind not in KINDS:
+        raise GeometryError(f"shape '{name or kind}': kind '{kind}', expected one of {', '.join(KINDS)}")
+    what = f"{kind} {name}".strip()
+    rows = _rows(points, chosen)
+    try:
+        return _fit(points, KINDS[kind], rows, name or kind, weights, dict(hold or {}), robust, offset)
+    except GeometryError as error:
+        raise GeometryError(f"{what}: {error}") from error
+
+
+def _rows(points: MeasuredPoints, chosen: Sequence[str] | IntArray | None) -> IntArray:
+    if chosen is None:
+        return np.arange(len(points.names))
+    if isinstance(chosen, np.ndarray):
+        return np.asarray(chosen, dtype=np.int64)
+    return np.array([points.index(one) for one in chosen], dtype=np.int64)
+
+
+def _fit(
+    points: MeasuredPoints,
+    kind: Kind,
+    rows: IntArray,
+    name: str,
+    weights: str,
+    hold: dict[str, float | Sequence[float]],
+    robust: bool,
+    offset: float,
+) -> ShapeFit:
+    if weights not in WEIGHTS:
+        raise GeometryError(f"weights '{weights}', expected one of {', '.join(WEIGHTS)}")
+    if weights == "network" and points.covariance is None:
+        raise GeometryError('the standard deviations of the points are not known, expected weights = "equal"')
+    xyz = points.xyz[rows]
+    if len(rows) < kind.min_points:
+        raise GeometryError(f"{len(rows)} points, a {kind.name} needs {kind.min_points}")
+    centroid = xyz.mean(axis=0)
+    size = float(np.sqrt(((xyz - centroid) ** 2).sum(axis=1).mean()))
+    if not size > 0:
+        raise GeometryError(f"its {len(rows)} points coincide")
+    x = (xyz - centroid) / size
+    Q = None if points.covariance is None else _covariance(points, rows) / size**2
+    _refuse_flat(kind, x, points.blocks[rows] / size**2, axis_held="direction" in hold)
+    free, origin, axis, form = _held(kind, hold, centroid, size)
+    placed = origin is None
+    off = np.zeros(kind.constraints)
+    off[-1] = offset / size
+    used = np.ones(len(rows), dtype=bool)
+    if robust:
+        shape, used = robust_shape(
+            kind, x, free=free, offset=off, origin=origin, axis=axis, form=form, placed=placed
+        )
+    else:
+        shape = _best_start(kind, x, free, off, origin, axis, form, placed)
+    if axis is None or kind.name in ("cone", "paraboloid"):
+        shape = shape.turned()  # before the offset counts, whose sign is that of the normal
+    elif shape.axis @ axis < 0:
+        shape = replace(shape, rotation=shape.rotation * np.array([1.0, -1, -1]))
+    shape, cost, converged = refine_orthogonal(shape, x[used], free=free, offset=off, placed=placed)
+    d, B, A = shape.design(x[used])
+    A = A[..., free].reshape(d.size, -1)
+    _refuse_rank(kind, A, d.size)
+    redundancy = d.size - A.shape[1]
+    n = len(rows)
+    linear = np.zeros((A.shape[1], n, 3))
+    w = np.full(n, np.nan)
+    C: FloatArray
+    statistic = critical = np.nan
+    if weights == "network":
+        assert Q is not None
+        own = Q[used] if Q.ndim == 3 else Q[np.ix_(np.repeat(used, 3), np.repeat(used, 3))]
+        fit = refine_weighted(shape, x[used], own, free=free, offset=off, placed=placed)
+        shape, converged = fit.shape, fit.converged
+        linear[:, used] = fit.linear.reshape(A.shape[1], -1, 3)
+        C = fit.covariance
+        w[used] = fit.standardised
+        sigma0 = np.sqrt(fit.omega / redundancy) if redundancy else np.nan
+        if redundancy:
+            statistic, critical = fit.omega / redundancy, critical_value(ALPHA, redundancy, points.redundancy)
+    else:
+        inverse: FloatArray = np.asarray(np.linalg.inv(A.T @ A))
+        linear[:, used] = -np.einsum("up,pnc,nci->uni", inverse, A.T.reshape(-1, *d.shape), B)
+        sigma0 = float(np.sqrt(cost / redundancy)) * size if redundancy else np.nan
+        flat = linear.reshape(A.shape[1], -1)
+        if Q is None:
+            C = inverse * (sigma0 / size) ** 2
+        else:
+            C = _product(flat, Q)
+    d, B, A = shape.design(x)
+    sigma = _sigma_of_distances(Q, d - off, B, A[..., free], linear, C)
+    # back to object units: shifts and lengths grow with the size, angles do not
+    units = np.concatenate([np.full(3, size), np.ones(3), _lengths(kind, size)])[free]
+    parameters, value, by_local = parameters_of(shape.scaled(size, centroid))
+    J = by_local[:, free]
+    linear = linear.reshape(len(units), -1) * (units / size)[:, None]
+    return ShapeFit(
+        name,
+        shape.scaled(size, centroid),
+        weights,
+        rows,
+        used,
+        parameters,
+        Function(value, rows, J @ linear),
+        J @ (C * np.outer(units, units)) @ J.T,
+        weights == "equal" and Q is None,
+        (d - off) * size,
+        sigma * size,
+        w,
+        float(sigma0),
+        redundancy,
+        float(statistic),
+        float(critical),
+        converged,
+        offset,
+    )
+
+
+def _covariance(points: MeasuredPoints, rows: IntArray) -> FloatArray:
+    if points.correlated:
+        return points.covariance_of(rows)
+    return points.blocks[rows]
+
+
+def _product(J: FloatArray, Q: FloatArray) -> FloatArray:
+    """Return J Q J' of a covariance of all coordinates, or of each point's by itself."""
+    if Q.ndim == 2:
+        return np.asarray(J @ Q @ J.T)
+    own = J.reshape(len(J), -1, 3)
+    return np.asarray(np.einsum("uni,nij,vnj->uv", own, Q, own))
+
+
+def _lengths(kind: Kind, size: float) -> FloatArray:
+    return np.array([1.0 if name == "half_angle" else size for name in kind.form])
+
+
+def _held(
+    kind: Kind, hold: dict[str, float | Sequence[float]], centroid: FloatArray, size: float
+) -> tuple[BoolArray, FloatArray | None, FloatArray | None, FloatArray]:
+    """Return what is free (6 + q,), and the held origin, direction and form in the frame of the points."""
+    free = np.zeros(6 + len(kind.form), dtype=bool)
+    free[list(kind.moves)] = True
+    free[6:] = True
+    form = np.full(len(kind.form), np.nan)
+    if "diameter" in hold and "radius" in kind.form:
+        hold["radius"] = float(np.asarray(hold.pop("diameter"))) / 2
+    directed = kind.name != "sphere"
+    known = (kind.place, *(("direction",) if directed else ()), *kind.form)
+    origin = axis = None
+    for name, value in hold.items():
+        numbers = np.asarray(value, dtype=float)
+        wanted = 3 if name in (kind.place, "direction") else 1
+        if name not in known or (kind.name == "cone" and name == "radius"):
+            of_cone = [one for one in known if not (kind.name == "cone" and one == "radius")]
+            raise GeometryError(f"hold '{name}', expected one of {', '.join(of_cone)}")
+        if numbers.size != wanted or not np.isfinite(numbers).all():
+            raise GeometryError(
+                f"hold {name}: found {value}, expected {wanted} finite number{'s' * (wanted > 1)}"
+            )
+        if name == kind.place:
+            origin = (numbers - centroid) / size
+            free[:3] = False
+        elif name == "direction":
+            if not np.linalg.norm(numbers) > 0:
+                raise GeometryError(f"hold direction: found {value}, expected a vector that is not 0")
+            axis = numbers / np.linalg.norm(numbers)
+            free[3:5] = False
+        else:
+            if not numbers > 0:
+                raise GeometryError(f"hold {name}: found {value}, expected more than 0")
+            k = kind.form.index(name)
+            form[k] = float(numbers) / _lengths(kind, size)[k]
+            free[6 + k] = False
+    if kind.name == "cone" and origin is not None:  # its apex is the origin: the radius there is 0
+        form[0] = 0.0
+        free[6] = False
+    if not free.any():
+        raise GeometryError("everything is held, nothing is left to be fitted")
+    return free, origin, axis, form
+
+
+def _best_start(
+    kind: Kind,
+    x: FloatArray,
+    free: BoolArray,
+    offset: FloatArray,
+    origin: FloatArray | None,
+    axis: FloatArray | None,
+    form: FloatArray,
+    placed: bool,
+) -> Shape:
+    """Return the best of the likeliest starts, each refined a little."""
+    some = x
+    if len(x) > START_POINTS:
+        some = x[np.linspace(0, len(x) - 1, START_POINTS).astype(np.int64)]
+    found: list[tuple[float, int, Shape]] = []
+    first = free.copy()  # a held form has false optima: it starts from the free one (0: an apex)
+    first[6:] = form != 0
+    for start in start_shapes(kind, some, origin=origin, axis=axis)[:STARTS]:
+        shape = with_held(start, origin, np.full(len(form), np.nan))
+        for own in (first, free) if (first != free).any() else (free,):
+            shape, cost, _ = refine_orthogonal(
+                shape, some, free=own, offset=offset, placed=placed, iterations=START_STEPS
+            )
+            if own is not free:
+                shape = with_held(shape, origin, form)
+        if np.isfinite(cost) and np.isfinite(shape.form).all():
+            found.append((cost, len(found), shape))
+    if not found:
+        raise GeometryError(f"its points determine no {kind.name}")
+    return min(found, key=lambda one: one[:2])[2]
+
+
+def _refuse_flat(kind: Kind, x: FloatArray, blocks: FloatArray, *, axis_held: bool) -> None:
+    """Refuse points on a line, or on a plane where a shape needs points in space; within their precision."""
+    spread = np.linalg.svd(x, compute_uv=False) / np.sqrt(len(x))
+    known = np.einsum("nii->n", blocks) / 3
+    sigma = float(np.sqrt(known.mean())) if np.isfinite(known).all() else 0.0
+    limit = max(COLLINEAR * spread[0], min(UNCERTAIN * sigma, 0.1 * spread[0]))
+    if kind.name != "line" and not axis_held and (len(spread) < 2 or spread[1] <= limit):
+        raise GeometryError(f"its {len(x)} points lie on a line")
+    flat = kind.name in ("sphere", "cylinder", "cone", "torus", "paraboloid")
+    if flat and not axis_held and (len(spread) < 3 or spread[2] <= limit):
+        raise GeometryError(f"its {len(x)} points lie on a plane, a {kind.name} needs points in space")
+
+
+def _refuse_rank(kind: Kind, A: FloatArray, constraints: int) -> None:
+    """Refuse points that do not determine all parameters."""
+    u = A.shape[1]
+    if constraints < u:
+        raise GeometryError(f"{constraints} distances for {u} parameters")
+    scale = np.maximum(np.linalg.norm(A, axis=0), 1e-300)
+    values = np.linalg.svd(A / scale, compute_uv=False)
+    rank = int((values > RANK * values[0]).sum())
+    if rank < u:
+        raise GeometryError(f"its points determine {rank} of its {u} parameters")
+
+
+def _sigma_of_distances(
+    Q: FloatArray | None, d: FloatArray, B: FloatArray, A: FloatArray, linear: FloatArray, C: FloatArray
+) -> FloatArray:
+    """Return the standard deviation of each distance, of a curve along it: of B dx + A F dx, (n,)."""
+    n, c, u = A.shape
+    if Q is None:
+        return np.full(n, np.nan)
+    if Q.ndim == 3:
+        own = constraint_covariance(Q, B)
+        cross = np.einsum("nci,nij,unj->ncu", B, Q, linear)
+    else:
+        blocks = np.stack([Q[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] for k in range(n)])
+        own = np.einsum("nai,nij,nbj->nab", B, blocks, B)
+        cross = np.einsum("nci,niu->ncu", B, (Q @ linear.reshape(u, -1).T).reshape(n, 3, u))
+    half = np.einsum("ncu,nku->nck", cross, A)
+    S = own + half + half.transpose(0, 2, 1) + np.einsum("ncu,uv,nkv->nck", A, C, A)
+    if c == 1:
+        return np.asarray(np.sqrt(np.maximum(S[:, 0, 0], 0.0)))
+    length = np.linalg.norm(d, axis=1, keepdims=True)
+    along = np.divide(d, length, out=np.full_like(d, np.sqrt(0.5)), where=length > 0)
+    return np.asarray(np.sqrt(np.maximum(np.einsum("na,nab,nb->n", along, S, along), 0.0)))

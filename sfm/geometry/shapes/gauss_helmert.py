@@ -1,0 +1,202 @@
+"""Best-fit shapes with the covariance of their points: the general case of least squares.
+
+Each point x has constraints d(x + v, p) = 0, and v' Q^-1 v is least. Linearised at the adjusted points,
+B v + A dp + w = 0 with w = d + B (x - x_adjusted); the equivalent weights of the constraints are those of
+Q_w = B Q B': for a single point its normal weighs n' Q n.
+
+The covariance of a free network is singular, and Q_w is so where a motion of the network is one of the shape
+(all points on one plane). W = Q_w + A U A' takes its place: estimates, residuals and v' Q^-1 v are those of
+Q_w, and the covariance of the parameters is (A' W^-1 A)^-1 - U. In another datum of the network the adjusted
+points and the shape are moved together: its form, v' Q^-1 v and the tests of the points are the same.
+
+Source: Helmert (1907), Die Ausgleichungsrechnung; Pope (1972), Some pitfalls to be avoided in the iterative
+adjustment of nonlinear problems; Rao (1973), Linear Statistical Inference, sec. 4i (unified theory).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import LinAlgError, cho_factor, cho_solve
+
+from sfm.conventions import BoolArray, FloatArray
+from sfm.errors import GeometryError
+from sfm.geometry.shapes.orthogonal import moved_in_place
+from sfm.geometry.shapes.shape import Shape
+
+ITERATIONS = 100
+CONVERGED = 1e-13  # of steps over the unit size of the points
+SINGULAR = 1e-6  # standard deviation of a constraint over the largest, of what others leave of it
+UNCHECKED = 1e-9  # redundancy of a constraint below which nothing checks it
+
+
+@dataclass(frozen=True)
+class Weighted:
+    """A shape adjusted with the covariance of its points, and its equations there."""
+
+    shape: Shape
+    adjusted: FloatArray  # points on the shape, (n, 3)
+    normals: FloatArray  # B, of each constraint by its point, (n, c, 3)
+    design: FloatArray  # A, of the constraints by the free parameters, (n c, u)
+    linear: FloatArray  # F, of the parameters by the coordinates, (u, 3 n)
+    covariance: FloatArray  # of the free parameters, (u, u)
+    omega: float  # v' Q^-1 v
+    standardised: (
+        FloatArray  # the largest of the tests of each point: w, or the root of T of two constraints, (n,)
+    )
+    converged: bool
+
+
+def refine_weighted(
+    start: Shape,
+    xyz: FloatArray,
+    covariance: FloatArray,
+    *,
+    free: BoolArray,
+    offset: FloatArray,
+    placed: bool = True,
+) -> Weighted:
+    """Return the shape of the least v' Q^-1 v near a start.
+
+    Args:
+        start: the fit with equal weights.
+        xyz: points about their centroid, of unit size, (n, 3).
+        covariance: Q of all coordinates together (3 n, 3 n), or of each point by itself (n, 3, 3).
+        free: which of the six motions and the form are adjusted, (6 + q,).
+        offset: signed distances that the points shall have, (c,).
+        placed: whether the origin may stand anywhere along the axis.
+
+    Raises:
+        GeometryError: the covariance is singular beyond what the free parameters take up.
+    """
+    n = len(xyz)
+    nothing = np.zeros(3)
+    shape = start.placed(nothing) if placed else start
+    d, B, _ = shape.design(xyz)
+    adjusted = xyz - np.einsum("nc,nci->ni", d - offset, B)
+    converged = False
+    for _ in range(ITERATIONS):
+        d, B, A = shape.design(adjusted)
+        w = (d - offset + np.einsum("nci,ni->nc", B, xyz - adjusted)).ravel()
+        A = A[..., free].reshape(len(w), -1)
+        Qw = constraint_covariance(covariance, B)
+        unit = _unit(Qw, A)
+        solve = _factor(Qw, A * unit)
+        PA = solve(A)
+        N = A.T @ PA
+        dp = -np.linalg.solve(N, PA.T @ w)
+        k = -solve(w + A @ dp)
+        v = times_covariance(covariance, B, k)
+        step = np.zeros(len(free))
+        step[free] = dp
+        shape = shape.moved(step, nothing) if placed else moved_in_place(shape, step)
+        change = max(float(np.abs(step).max()), float(np.abs(xyz + v - adjusted).max()))
+        adjusted = xyz + v
+        if change <= CONVERGED * max(1.0, float(np.abs(shape.form).max(initial=0.0))):
+            converged = True
+            break
+    inverse: FloatArray = np.asarray(np.linalg.inv(N))
+    linear = -(inverse @ PA.T)
+    by_point = linear.reshape(len(dp), n, -1)
+    return Weighted(
+        shape,
+        adjusted,
+        B,
+        A,
+        np.asarray(np.einsum("unc,nci->uni", by_point, B).reshape(len(dp), 3 * n)),
+        inverse - np.diag(unit**2),
+        max(float(-k @ (w + A @ dp)), 0.0),
+        _tests(k, solve, PA, inverse, n),
+        converged,
+    )
+
+
+def constraint_covariance(covariance: FloatArray, normals: FloatArray) -> FloatArray:
+    """Return Q_w = B Q B', of all constraints together (n c, n c), or of each point's by itself (n, c, c)."""
+    if covariance.ndim == 3:
+        return np.asarray(np.einsum("nai,nij,nbj->nab", normals, covariance, normals))
+    n, c, _ = normals.shape
+    half = np.einsum("nci,nik->nck", normals, covariance.reshape(n, 3, 3 * n)).reshape(n * c, n, 3)
+    return np.asarray(np.einsum("kni,nci->knc", half, normals).reshape(n * c, n * c))
+
+
+def times_covariance(covariance: FloatArray, normals: FloatArray, k: FloatArray) -> FloatArray:
+    """Return v = Q B' k, (n, 3), of correlates k (n c,)."""
+    n, c, _ = normals.shape
+    back = np.einsum("nci,nc->ni", normals, k.reshape(n, c))
+    if covariance.ndim == 3:
+        return np.asarray(np.einsum("nij,nj->ni", covariance, back))
+    return np.asarray((covariance @ back.ravel()).reshape(n, 3))
+
+
+def _unit(Qw: FloatArray, A: FloatArray) -> FloatArray:
+    """Return the roots of the diagonal U: what a typical constraint would determine of each parameter."""
+    variance = float(np.einsum("nii->", Qw) / len(A) if Qw.ndim == 3 else np.trace(Qw) / len(A))
+    return np.asarray(np.sqrt(variance / np.maximum((A**2).mean(axis=0), 1e-300)))
+
+
+class _Blocks:
+    """W of points that are not correlated: Q_w block by block, and A U A' by Woodbury's formula."""
+
+    def __init__(self, Qw: FloatArray, AU: FloatArray) -> None:
+        self.inverse = np.linalg.inv(Qw)
+        self.AU = AU
+        own = self._own(AU)
+        self.core = np.linalg.inv(np.eye(AU.shape[1]) + AU.T @ own)
+        self.own = own
+
+    def _own(self, b: FloatArray) -> FloatArray:
+        n, c, _ = self.inverse.shape
+        return np.asarray(np.einsum("nab,nbk->nak", self.inverse, b.reshape(n, c, -1)).reshape(n * c, -1))
+
+    def __call__(self, b: FloatArray) -> FloatArray:
+        x = self._own(b)
+        x = x - self.own @ (self.core @ (self.AU.T @ x))
+        return x[:, 0] if b.ndim == 1 else x
+
+
+class _Dense:
+    """W of correlated points."""
+
+    def __init__(self, Qw: FloatArray, AU: FloatArray) -> None:
+        self.factor = cho_factor(Qw + AU @ AU.T, lower=True)
+
+    def __call__(self, b: FloatArray) -> FloatArray:
+        return np.asarray(cho_solve(self.factor, b))
+
+
+def _factor(Qw: FloatArray, AU: FloatArray) -> _Blocks | _Dense:
+    try:
+        if Qw.ndim == 3:
+            return _Blocks(Qw, AU)
+        solve = _Dense(Qw, AU)
+        diagonal = np.diagonal(solve.factor[0])
+        if diagonal.min() < SINGULAR * diagonal.max():
+            raise LinAlgError
+        return solve
+    except LinAlgError as error:
+        raise GeometryError(
+            "the covariance of its points is singular: what is held of a shape cannot be known of a free "
+            'network, or points are exactly known; expected weights = "equal"'
+        ) from error
+
+
+def _tests(k: FloatArray, solve: _Blocks | _Dense, PA: FloatArray, inverse: FloatArray, n: int) -> FloatArray:
+    """Return of each point the root of k' Q_kk^-1 k over its constraints: Baarda's w of one, (n,)."""
+    c = len(k) // n
+    if isinstance(solve, _Blocks):
+        AU = solve.own.reshape(n, c, -1)
+        blocks = solve.inverse - np.einsum("nau,uv,nbv->nab", AU, solve.core, AU)
+    else:
+        W = solve(np.eye(len(k))).reshape(n, c, n, c)
+        blocks = W[np.arange(n), :, np.arange(n), :]
+    scale = np.einsum("naa->n", blocks)[:, None]
+    own = PA.reshape(n, c, -1)
+    blocks = blocks - np.einsum("nau,uv,nbv->nab", own, inverse, own)
+    ks = k.reshape(n, c)
+    values, vectors = np.linalg.eigh(blocks)
+    along = np.einsum("nab,na->nb", vectors, ks)
+    checked = values > UNCHECKED * scale
+    squares = np.where(checked, along**2 / np.where(checked, values, 1.0), 0.0).sum(axis=1)
+    return np.where(checked.any(axis=1), np.sqrt(squares / np.maximum(checked.sum(axis=1), 1)), np.nan)

@@ -1,0 +1,204 @@
+"""Start values of shapes from their points alone, by algebraic fits.
+
+A line, plane, circle, ellipse and sphere have a direct solution. A cylinder, cone, torus and paraboloid
+become linear, or a circle, once their axis is known: directions all over the half sphere are tried, and the
+best are refined by orthogonal distances.
+
+Source: Foerstner and Wrobel (2016), Photogrammetric Computer Vision, sec. 4.9 (direct fits); Halir and
+Flusser (1998), Numerically stable direct least squares fitting of ellipses.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from scipy.linalg import eig
+
+from sfm.conventions import FloatArray
+from sfm.geometry.shapes.kinds import KINDS, Kind
+from sfm.geometry.shapes.shape import Shape, axes_along
+
+DIRECTIONS = 120  # over the half sphere, some 13 degrees apart
+MAX_ANGLE = np.deg2rad(89.0)  # half angle of a cone
+
+
+def start_shapes(
+    kind: Kind,
+    xyz: FloatArray,
+    *,
+    origin: FloatArray | None = None,
+    axis: FloatArray | None = None,
+    directions: int = DIRECTIONS,
+) -> list[Shape]:
+    """Return shapes to start from, the likeliest first; none where the points determine none.
+
+    Args:
+        kind: of the shape.
+        xyz: points about their centroid, of unit size, (n, 3).
+        origin: where the shape must lie, if it is held.
+        axis: its direction, if it is held.
+        directions: of an axis that are tried.
+    """
+    normal, along = principal_directions(xyz)
+    if kind.name in DIRECT:
+        direction = along if kind.name == "line" else normal
+        return DIRECT[kind.name](xyz, axes_along(direction if axis is None else axis))
+    if axis is not None:
+        tried = np.stack([axis, -axis])
+    else:
+        tried = np.vstack([[normal, along, np.cross(normal, along)], half_sphere(directions)])
+    if kind.name == "cone" and origin is not None:
+        return _cones_at(xyz, origin, tried)
+    found = [shape for one in tried for shape in WITH_AXIS[kind.name](xyz, axes_along(one))]
+    return _best_first(found, xyz)
+
+
+def _best_first(found: list[Shape], xyz: FloatArray) -> list[Shape]:
+    """Return shapes by their sum of squared distances, those without one left out."""
+    costs = [float((shape.distances(xyz) ** 2).sum()) for shape in found]
+    return [found[k] for k in np.argsort(costs, kind="stable") if np.isfinite(costs[k])]
+
+
+def principal_directions(xyz: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the directions in which points about their centroid spread least and most, (3,) each."""
+    _, _, Vt = np.linalg.svd(xyz, full_matrices=True)
+    return Vt[2], Vt[0]
+
+
+def half_sphere(count: int) -> FloatArray:
+    """Return directions spread evenly over half a sphere, (count, 3).
+
+    Source: Gonzalez (2010), Measurement of areas on a sphere using Fibonacci and latitude-longitude lattices.
+    """
+    k = np.arange(count)
+    z = (k + 0.5) / count
+    turn = k * np.pi * (3 - np.sqrt(5))
+    rho = np.sqrt(1 - z * z)
+    return np.stack([rho * np.cos(turn), rho * np.sin(turn), z], axis=1)
+
+
+def _least_squares(A: FloatArray, b: FloatArray) -> FloatArray:
+    return np.asarray(np.linalg.lstsq(A, b, rcond=None)[0])
+
+
+def _circle_in_plane(xy: FloatArray) -> tuple[FloatArray, float]:
+    """Return centre and radius of the algebraic circle (Kasa's)."""
+    u = _least_squares(np.column_stack([2 * xy, np.ones(len(xy))]), (xy**2).sum(axis=1))
+    return u[:2], float(np.sqrt(max(u[2] + u[:2] @ u[:2], 0.0)))
+
+
+def _straight(name: str) -> Callable[[FloatArray, FloatArray], list[Shape]]:
+    return lambda xyz, R: [Shape(KINDS[name], np.zeros(3), R, np.zeros(0))]
+
+
+def _circles(xyz: FloatArray, R: FloatArray) -> list[Shape]:
+    centre, radius = _circle_in_plane((xyz @ R)[:, :2])
+    return [Shape(KINDS["circle"], R[:, :2] @ centre, R, np.array([radius]))]
+
+
+def _spheres(xyz: FloatArray, R: FloatArray) -> list[Shape]:
+    u = _least_squares(np.column_stack([2 * xyz, np.ones(len(xyz))]), (xyz**2).sum(axis=1))
+    radius = np.sqrt(max(u[3] + u[:3] @ u[:3], 0.0))
+    return [Shape(KINDS["sphere"], u[:3], np.eye(3), np.array([radius]))]
+
+
+def _ellipses(xyz: FloatArray, R: FloatArray) -> list[Shape]:
+    """Return the ellipse of Halir and Flusser, and that of the circle's centre where it has none."""
+    x, y = (xyz @ R)[:, :2].T
+    D1, D2 = np.column_stack([x * x, x * y, y * y]), np.column_stack([x, y, np.ones_like(x)])
+    S1, S2, S3 = D1.T @ D1, D1.T @ D2, D2.T @ D2
+    T = -np.linalg.lstsq(S3, S2.T, rcond=None)[0]
+    M = np.array([[0, 0, 0.5], [0, -1, 0], [0.5, 0, 0]]) @ (S1 + S2 @ T)
+    _, vectors = eig(M)
+    vectors = vectors.real
+    inside = 4 * vectors[0] * vectors[2] - vectors[1] ** 2
+    found = []
+    if (inside > 0).any():
+        first = vectors[:, np.argmax(inside)]
+        a, b, c, d, e, f = np.concatenate([first, T @ first])
+        C = np.array([[a, b / 2], [b / 2, c]])
+        centre = np.linalg.solve(C, [-d / 2, -e / 2])
+        level = -(f + centre @ [d, e] / 2)
+        values, turn = np.linalg.eigh(C)
+        squares = level / values
+        if (squares > 0).all():
+            if np.linalg.det(turn) < 0:
+                turn = turn * [1, -1]
+            axes = R.copy()
+            axes[:, :2] = R[:, :2] @ turn
+            found.append(Shape(KINDS["ellipse"], R[:, :2] @ centre, axes, np.sqrt(squares)))
+    circle = _circles(xyz, R)[0]
+    radius = circle.form[0]
+    for stretch in (1.3, 1 / 1.3):
+        form = radius * np.array([stretch, 1 / stretch])
+        found.append(Shape(KINDS["ellipse"], circle.origin, R, form))
+    return found
+
+
+def _cylinders(xyz: FloatArray, R: FloatArray) -> list[Shape]:
+    centre, radius = _circle_in_plane((xyz @ R)[:, :2])
+    return [Shape(KINDS["cylinder"], R[:, :2] @ centre, R, np.array([radius]))]
+
+
+def _cones(xyz: FloatArray, R: FloatArray) -> list[Shape]:
+    """Return the cone with this axis: (x - x0)^2 + (y - y0)^2 = (r + z tan)^2 is linear in five unknowns."""
+    y = xyz @ R
+    A = np.column_stack([2 * y[:, :2], np.ones(len(y)), y[:, 2], y[:, 2] ** 2])
+    u = _least_squares(A, (y[:, :2] ** 2).sum(axis=1))
+    square = u[2] + u[:2] @ u[:2]
+    if not (square > 0 and u[4] > 0):
+        return []
+    slope = np.sqrt(u[4])
+    radius = u[3] / (2 * slope)
+    if radius < 0:
+        slope, radius = -slope, -radius
+    return [Shape(KINDS["cone"], R[:, :2] @ u[:2], R, np.array([radius, np.arctan(slope)]))]
+
+
+def _cones_at(xyz: FloatArray, apex: FloatArray, directions: FloatArray) -> list[Shape]:
+    """Return cones with a given apex: of each direction the mean angle to the points."""
+    y = xyz - apex
+    found = []
+    for axis in np.vstack([directions, -directions]):
+        along = y @ axis
+        angle = np.arctan2(np.linalg.norm(y - along[:, None] * axis, axis=1), along).mean()
+        if angle < MAX_ANGLE:
+            found.append(Shape(KINDS["cone"], apex, axes_along(axis), np.array([0.0, angle])))
+    return _best_first(found, xyz)
+
+
+def _tori(xyz: FloatArray, R: FloatArray) -> list[Shape]:
+    """Return the torus about the circle that the points have as seen along this axis."""
+    y = xyz @ R
+    centre, major = _circle_in_plane(y[:, :2])
+    found = []
+    for height in (y[:, 2].mean(), (y[:, 2].min() + y[:, 2].max()) / 2):
+        ring = np.hypot(*(y[:, :2] - centre).T) - major
+        minor = float(np.sqrt((ring**2 + (y[:, 2] - height) ** 2).mean()))
+        origin = R @ np.array([*centre, height])
+        found.append(Shape(KINDS["torus"], origin, R, np.array([major, minor])))
+    return found
+
+
+def _paraboloids(xyz: FloatArray, R: FloatArray) -> list[Shape]:
+    """Return the paraboloid z = (x^2 + y^2) / (4 f) + linear terms, opening along this axis or against it."""
+    y = xyz @ R
+    A = np.column_stack([(y[:, :2] ** 2).sum(axis=1), y[:, :2], np.ones(len(y))])
+    k, bx, by, c = _least_squares(A, y[:, 2])
+    if not abs(k) > 1e-9:
+        return []
+    if k < 0:  # turned about its first axis: y2 and y3 change sign
+        R, k, bx, c = R * np.array([1.0, -1, -1]), -k, -bx, -c
+    vertex = np.array([-bx / (2 * k), -by / (2 * k), c - (bx * bx + by * by) / (4 * k)])
+    return [Shape(KINDS["paraboloid"], R @ vertex, R, np.array([1 / (4 * k)]))]
+
+
+DIRECT = {
+    "line": _straight("line"),
+    "plane": _straight("plane"),
+    "circle": _circles,
+    "ellipse": _ellipses,
+    "sphere": _spheres,
+}
+WITH_AXIS = {"cylinder": _cylinders, "cone": _cones, "torus": _tori, "paraboloid": _paraboloids}

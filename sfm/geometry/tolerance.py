@@ -1,0 +1,180 @@
+"""Deviations from nominal points, a mesh or a fitted shape, and the decision whether they are in tolerance.
+
+A value conforms if it is inside the limits by its expanded uncertainty U = k sigma, does not if it is outside
+by that, and nothing is decided in between.
+
+Source: ISO 14253-1:2017, Decision rules for verifying conformity or nonconformity with specifications.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sfm.conventions import FloatArray, IntArray
+from sfm.errors import GeometryError
+from sfm.geometry.alignment import Nominal
+from sfm.geometry.measured import MeasuredPoints
+from sfm.geometry.mesh import Mesh, distances_from_mesh
+from sfm.geometry.shapes.fit import ShapeFit
+
+IN, OUT, UNDECIDED, UNKNOWN = "in", "out", "undecided", "not known"
+DECISIONS = (IN, UNDECIDED, OUT, UNKNOWN)
+COVERAGE = 2.0  # k of the expanded uncertainty, for about 95 %
+
+
+@dataclass(frozen=True)
+class Deviations:
+    """Deviations of points with their limits."""
+
+    name: str
+    against: str  # what they are deviations from, in words
+    points: IntArray  # indices, (m,)
+    value: FloatArray  # object unit, (m,)
+    sigma: FloatArray  # object unit; NaN where not known, (m,)
+    vector: FloatArray  # measured minus nearest nominal point, object unit, (m, 3)
+    lower: float  # limits, object unit
+    upper: float
+    coverage: float  # k
+    decision: tuple[str, ...]  # in | out | undecided | not known, of each point
+    missing: tuple[str, ...] = ()  # nominal points that were not measured
+
+    def count(self, decision: str) -> int:
+        """Return how many points have a decision."""
+        return self.decision.count(decision)
+
+
+def deviations_from_points(
+    points: MeasuredPoints,
+    nominal: Nominal,
+    *,
+    name: str,
+    upper: float,
+    coverage: float = COVERAGE,
+    chosen: IntArray | None = None,
+) -> Deviations:
+    """Return the distances of measured points from nominal ones of the same names.
+
+    Args:
+        points: aligned to the system of the nominal ones.
+        nominal: reference points; their covariance counts.
+        name: of the tolerance.
+        upper: largest distance, object unit.
+        coverage: k of the expanded uncertainty.
+        chosen: indices of the points to judge; all that have a nominal one if not given.
+
+    Raises:
+        GeometryError: none of them was measured.
+
+    Source: ISO 14253-1:2017 for the decisions; law of propagation of covariances.
+    """
+    wanted = set(points.names if chosen is None else [points.names[j] for j in chosen])
+    common = [one for one in nominal.names if one in points.names and one in wanted]
+    if not common:
+        raise GeometryError(f"tolerance {name}: no nominal point was measured")
+    rows = np.array([points.index(one) for one in common], dtype=np.int64)
+    own = np.array([nominal.names.index(one) for one in common], dtype=np.int64)
+    d = points.xyz[rows] - nominal.xyz[own]
+    Q = points.blocks[rows]
+    if nominal.covariance is not None:
+        Q = Q + nominal.covariance[own]
+    length = np.linalg.norm(d, axis=1)
+    u = np.divide(d, length[:, None], out=np.zeros_like(d), where=length[:, None] > 0)
+    sigma = np.sqrt(np.maximum(np.einsum("ni,nij,nj->n", u, Q, u), 0.0))
+    missing = tuple(one for one in nominal.names if one not in points.names)
+    decision = decide(length, sigma, -np.inf, upper, coverage)
+    return Deviations(name, "nominal points", rows, length, sigma, d, 0.0, upper, coverage, decision, missing)
+
+
+def deviations_from_mesh(
+    points: MeasuredPoints,
+    mesh: Mesh,
+    chosen: IntArray,
+    *,
+    name: str,
+    against: str,
+    lower: float,
+    upper: float,
+    coverage: float = COVERAGE,
+    offset: float = 0.0,
+) -> Deviations:
+    """Return the signed distances of points from a mesh, positive outside.
+
+    Args:
+        points: aligned to the system of the mesh.
+        mesh: nominal surface.
+        chosen: indices of the points to judge.
+        name: of the tolerance.
+        against: what the mesh is called.
+        lower: smallest distance, object unit.
+        upper: largest distance, object unit.
+        coverage: k of the expanded uncertainty.
+        offset: of the targets from the surface along its normal, object unit.
+
+    Raises:
+        GeometryError: a mesh without triangles.
+
+    Source: ISO 14253-1:2017 for the decisions; law of propagation of covariances.
+    """
+    found = distances_from_mesh(points.xyz[chosen], mesh)
+    value = found.distance - offset
+    variance = np.einsum("ni,nij,nj->n", found.normal, points.blocks[chosen], found.normal)
+    sigma = np.sqrt(np.maximum(variance, 0.0))
+    decision = decide(value, sigma, lower, upper, coverage)
+    vector = value[:, None] * found.normal
+    return Deviations(name, against, chosen, value, sigma, vector, lower, upper, coverage, decision)
+
+
+def deviations_from_shape(
+    points: MeasuredPoints,
+    fit: ShapeFit,
+    *,
+    name: str,
+    lower: float,
+    upper: float,
+    coverage: float = COVERAGE,
+) -> Deviations:
+    """Return the distances of the points of a fitted shape from it, with the uncertainty of both.
+
+    Args:
+        points: that it was fitted to.
+        fit: the shape.
+        name: of the tolerance.
+        lower: smallest distance, object unit.
+        upper: largest distance, object unit.
+        coverage: k of the expanded uncertainty.
+
+    Source: ISO 14253-1:2017 for the decisions; law of propagation of covariances.
+    """
+    _, normals, _ = fit.shape.design(points.xyz[fit.points])
+    vector = np.einsum("nc,nci->ni", fit.distances, normals)
+    value = fit.deviation
+    decision = decide(value, fit.sigma, lower, upper, coverage)
+    against = f"{fit.shape.kind.name} {fit.name}"
+    return Deviations(name, against, fit.points, value, fit.sigma, vector, lower, upper, coverage, decision)
+
+
+def decide(
+    value: FloatArray, sigma: FloatArray, lower: float, upper: float, coverage: float
+) -> tuple[str, ...]:
+    """Return for each value whether it is proven to be in or out of tolerance.
+
+    Args:
+        value: measured, (m,).
+        sigma: their standard deviations; NaN where not known, (m,).
+        lower: limit, -infinity for none.
+        upper: limit.
+        coverage: k of the expanded uncertainty U = k sigma.
+
+    Source: ISO 14253-1:2017, secs. 4 to 6.
+    """
+    U = coverage * np.asarray(sigma, dtype=float)
+    value = np.asarray(value, dtype=float)
+    known = np.isfinite(U) & np.isfinite(value)
+    inside = (value - U >= lower) & (value + U <= upper)
+    outside = (value + U < lower) | (value - U > upper)
+    return tuple(
+        UNKNOWN if not k else IN if a else OUT if b else UNDECIDED
+        for k, a, b in zip(known, inside, outside, strict=True)
+    )

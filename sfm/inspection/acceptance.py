@@ -1,0 +1,249 @@
+"""Acceptance test of a measuring system by calibrated lengths: VDI/VDE 2634 part 1.
+
+The error of a length measurement is the measured minus the calibrated length. It may be A + K L, and no more
+than B. Whether it is proven to be, ISO 14253-1 says with the uncertainty of the calibration. What part 1 asks
+for and the data lack is listed. It is no test by ISO 10360-13, which is for area scanners.
+
+Source: VDI/VDE 2634 part 1 (2002), Optical 3D measuring systems: imaging systems with point-by-point probing,
+secs. 3 and 4; ISO 14253-1:2017.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from sfm.conventions import FloatArray
+from sfm.errors import GeometryError, SurveyFileError, UnknownNameError
+from sfm.files.csv_tables import read_table
+from sfm.geometry.functions import distance, point_function
+from sfm.geometry.measured import measured_points
+from sfm.geometry.tolerance import COVERAGE, DECISIONS, decide
+from sfm.stored_result import StoredResult
+
+MIN_LINES = 7
+MIN_LENGTHS = 5  # of a line
+MIN_LONGEST = 2 / 3  # of the body diagonal of the measuring volume
+SAME_DIRECTION_DEG = 5.0  # below which two lines have one direction
+NOT_KNOWN = "Not known here: the temperature of the lengths and whether they were corrected for it."
+
+
+@dataclass(frozen=True)
+class CalibratedLengths:
+    """Lengths between targets as a calibration gives them."""
+
+    line: tuple[str, ...]  # measuring line that each is on, k of them
+    start: tuple[str, ...]  # names of points
+    end: tuple[str, ...]
+    length: FloatArray  # object unit, (k,)
+    sigma: FloatArray  # standard deviation of the calibration, object unit; NaN where not stated, (k,)
+
+
+@dataclass(frozen=True)
+class Acceptance:
+    """Errors of length measurement and what they prove."""
+
+    name: str  # of the result
+    unit: str
+    lengths: CalibratedLengths
+    error: FloatArray  # measured minus calibrated, object unit, (k,)
+    sigma: FloatArray  # of the measured lengths by the network's covariance; NaN where not known, (k,)
+    limit: FloatArray  # A + K L, at most B, object unit, (k,)
+    a: float  # object unit
+    k: float  # pure number
+    b: float  # object unit; infinite without
+    coverage: float  # k of U = k sigma of the calibration
+    decision: tuple[str, ...]  # in | out | undecided | not known, of each length
+    diagonal: float  # of the measuring volume, object unit
+    lacking: tuple[str, ...]  # what part 1 asks for and the data lack, one line each
+
+    def count(self, decision: str) -> int:
+        """Return how many lengths have a decision."""
+        return self.decision.count(decision)
+
+    @property
+    def largest(self) -> float:
+        """Largest absolute error, object unit."""
+        return float(np.abs(self.error).max())
+
+    @property
+    def verdict(self) -> str:
+        """Return good (proven to be kept, nothing lacking), fair or bad (proven not to be kept)."""
+        if self.count("out"):
+            return "bad"
+        return "good" if self.count("in") == len(self.error) and not self.lacking else "fair"
+
+    @property
+    def headline(self) -> str:
+        """What the test says, in one line."""
+        n = len(self.error)
+        if self.count("out"):
+            return f"The limit is not kept: {self.count('out')} of {n} lengths are proven to be outside."
+        if self.count("in") == n:
+            less = ", but the test is not complete" if self.lacking else ""
+            return f"The limit is kept: all {n} lengths are proven to be inside{less}."
+        told = ", ".join(f"{self.count(one)} {one}" for one in DECISIONS if self.count(one))
+        return f"Nothing is proven: of {n} lengths {told}."
+
+
+def read_lengths(path: Path) -> CalibratedLengths:
+    """Read calibrated lengths: line,from,to,length[,sigma].
+
+    Raises:
+        SurveyFileError: what is wrong, with file and line number.
+    """
+    table = read_table(path, ("line", "from", "to"), ("length",), ("sigma",), blank=("sigma",))
+    lines, start, end = table.texts
+    table.refuse(table.values[:, :1], table.values[:, :1] <= 0, ("length",), "more than 0")
+    sigma = table.values[:, 1:]
+    table.refuse(sigma, sigma <= 0, ("sigma",), "more than 0, or nothing")
+    for k, (a, b) in enumerate(zip(start, end, strict=True)):
+        if a == b:
+            raise SurveyFileError(f"{table.place(k)}: both ends are point {a}, two points are needed")
+    table.refuse_duplicates(
+        tuple(tuple(sorted(pair)) for pair in zip(start, end, strict=True)), ("from", "to")
+    )
+    known = sigma[:, 0] if sigma.size else np.full(len(lines), np.nan)
+    return CalibratedLengths(lines, start, end, table.values[:, 0].copy(), known)
+
+
+def accept_result(
+    result: StoredResult,
+    lengths: CalibratedLengths,
+    *,
+    a: float,
+    k: float,
+    b: float = np.inf,
+    bars: Sequence[str] | None,
+    control: Sequence[str] = (),
+    coverage: float = COVERAGE,
+    diagonal: float | None = None,
+) -> Acceptance:
+    """Test a result against calibrated lengths.
+
+    Args:
+        result: of a survey with a scale from other bars.
+        lengths: calibrated, between points of the result.
+        a: A of the limit A + K L, object unit.
+        k: K of it, a pure number.
+        b: what the limit is at most, object unit.
+        bars: "start - end" of the scale bars that gave the scale; None where nobody knows.
+        control: names of control points that gave it.
+        coverage: k of the expanded uncertainty of the calibration.
+        diagonal: of the measuring volume, object unit; that of the box around all points if not given.
+
+    Raises:
+        GeometryError: no scale, one from the lengths to be tested, or limits that are none.
+        UnknownNameError: an end of a length is not in the result.
+    """
+    if not (a >= 0 and k >= 0 and a + k > 0 and b > 0):
+        raise GeometryError(
+            f"limit: A = {a:g}, K = {k:g}, B = {b:g}, expected A and K not negative, one above 0"
+        )
+    points = measured_points(result)
+    if not points.has_scale:
+        raise GeometryError(
+            f"{result.name}: its scale is undefined, lengths are tested in a unit that comes from other bars"
+        )
+    for name in (*lengths.start, *lengths.end):
+        if name not in points.names:
+            raise UnknownNameError(f"lengths: point {name} is not in the result {result.name}")
+    _refuse_own_scale(result.name, lengths, bars, control)
+    functions = [
+        distance(point_function(points, start), point_function(points, end))
+        for start, end in zip(lengths.start, lengths.end, strict=True)
+    ]
+    measured = np.array([one.value[0] for one in functions])
+    variance = np.array([points.covariance_between([one])[0, 0] for one in functions])
+    error = measured - lengths.length
+    limit = np.minimum(a + k * lengths.length, b)
+    # |error| against its own limit of each length: scaled, all limits are 1
+    decision = decide(np.abs(error) / limit, lengths.sigma / limit, -np.inf, 1.0, coverage)
+    if diagonal is None:  # of the smaller box: along the axes of the system, or along those of the object
+        _, _, own = np.linalg.svd(points.xyz - points.xyz.mean(axis=0), full_matrices=False)
+        boxes = [np.ptp(points.xyz @ axes.T, axis=0) for axes in (np.eye(3), own)]
+        diagonal = float(min(np.linalg.norm(box) for box in boxes))
+    directions = np.array(
+        [
+            points.xyz[points.index(end)] - points.xyz[points.index(start)]
+            for start, end in zip(lengths.start, lengths.end, strict=True)
+        ]
+    )
+    return Acceptance(
+        result.name,
+        result.unit,
+        lengths,
+        error,
+        np.sqrt(np.maximum(variance, 0.0)),
+        limit,
+        a,
+        k,
+        b,
+        coverage,
+        decision,
+        diagonal,
+        tuple(_lacking(lengths, directions, diagonal, result.unit)),
+    )
+
+
+def _refuse_own_scale(
+    name: str, lengths: CalibratedLengths, bars: Sequence[str] | None, control: Sequence[str]
+) -> None:
+    """Refuse lengths on a bar that gave the scale."""
+    if bars is None or not (bars or control):
+        raise GeometryError(
+            f"{name}: nothing says what its scale comes from, it must come from other bars than those tested"
+        )
+    given, fixed = set(bars), set(control)
+    for line in dict.fromkeys(lengths.line):
+        rows = [k for k, one in enumerate(lengths.line) if one == line]
+        ends = sorted({one for k in rows for one in (lengths.start[k], lengths.end[k])})
+        for i in ends:
+            for j in ends:
+                if i != j and f"{i} - {j}" in given:
+                    raise GeometryError(
+                        f"line {line}: bar {i} - {j} gave the scale of the result, it must come from other "
+                        "bars than those tested"
+                    )
+        for k in rows:
+            if lengths.start[k] in fixed and lengths.end[k] in fixed:
+                raise GeometryError(
+                    f"line {line}: {lengths.start[k]} and {lengths.end[k]} are control points of the result, "
+                    "its scale must come from elsewhere"
+                )
+
+
+def _lacking(lengths: CalibratedLengths, directions: FloatArray, diagonal: float, unit: str) -> list[str]:
+    """Return what part 1 asks for and the data lack."""
+    lines = list(dict.fromkeys(lengths.line))
+    found = []
+    if len(lines) < MIN_LINES:
+        found.append(f"{len(lines)} measuring lines, part 1 asks for at least {MIN_LINES}")
+    of_line: dict[str, FloatArray] = {}
+    for line in lines:
+        rows = np.array([k for k, one in enumerate(lengths.line) if one == line])
+        if len(rows) < MIN_LENGTHS:
+            found.append(f"line {line}: {len(rows)} lengths, part 1 asks for at least {MIN_LENGTHS}")
+        longest = directions[rows[np.argmax(lengths.length[rows])]]
+        of_line[line] = longest / np.linalg.norm(longest)
+        off = np.linalg.norm(np.cross(directions[rows], of_line[line]), axis=1)
+        if (off > np.sin(np.deg2rad(SAME_DIRECTION_DEG)) * np.linalg.norm(directions[rows], axis=1)).any():
+            found.append(f"line {line}: its lengths are not on one line")
+    for i, first in enumerate(lines):
+        for second in lines[i + 1 :]:
+            cosine = min(1.0, abs(float(of_line[first] @ of_line[second])))
+            if np.rad2deg(np.arccos(cosine)) < SAME_DIRECTION_DEG:
+                found.append(f"lines {first} and {second} have one direction, part 1 asks for different ones")
+    longest = float(lengths.length.max())
+    if longest < MIN_LONGEST * diagonal:
+        found.append(
+            f"longest length {longest:.6g} {unit}, part 1 asks for two thirds of the body diagonal of "
+            f"{diagonal:.6g} {unit}"
+        )
+    missing = int(np.isnan(lengths.sigma).sum())
+    if missing:
+        found.append(f"{missing} lengths without standard deviation of their calibration: nothing is decided")
+    return found

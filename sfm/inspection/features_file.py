@@ -1,0 +1,245 @@
+"""The features file (TOML) of `kolinear measure`: groups, shapes, alignment, functions and tolerances."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import BeforeValidator, Field, ValidationError
+
+from sfm.errors import SurveyFileError
+from sfm.files.toml_files import read_toml
+from sfm.geometry.shapes.kinds import KINDS
+from sfm.survey.inputs.checks.settings_errors import first_error
+from sfm.survey.inputs.settings import LARGEST, Length, Name, Section, Value
+from sfm.survey.inputs.survey_file import inside
+
+MAX_ENTRIES = 10_000  # of one kind
+
+
+def _listed(value: Any) -> Any:
+    return (value,) if isinstance(value, str) else value
+
+
+Patterns = Annotated[
+    tuple[Name, ...], Field(strict=False, min_length=1, max_length=MAX_ENTRIES), BeforeValidator(_listed)
+]
+Numbers = Annotated[tuple[Value, ...], Field(strict=False, min_length=3, max_length=3)]
+NotNegative = Annotated[float, Field(ge=0, le=LARGEST)]
+Coverage = Annotated[float, Field(ge=1, le=10)]
+Weights = Literal["network", "equal"]
+
+
+class GroupSettings(Section):
+    """[[group]]: points by names, patterns or ranges of numbers."""
+
+    name: Name
+    points: Patterns
+
+
+class HiddenPointSettings(Section):
+    """[[hidden_point]]: a point behind two targets of a probe."""
+
+    name: Name
+    start: Name = Field(alias="from")  # the farther target
+    end: Name = Field(alias="to")  # the nearer one
+    distance: Length  # from that to the hidden point, object unit
+    sigma: NotNegative = 0.0  # of the distance, object unit
+
+
+class HeldSettings(Section):
+    """hold = {...} of a shape: what is not fitted."""
+
+    point: Numbers | None = None
+    centre: Numbers | None = None
+    apex: Numbers | None = None
+    vertex: Numbers | None = None
+    direction: Numbers | None = None
+    radius: Length | None = None
+    diameter: Length | None = None
+    semi_major: Length | None = None
+    semi_minor: Length | None = None
+    half_angle_deg: Annotated[float, Field(gt=0, lt=90)] | None = None
+    major_radius: Length | None = None
+    minor_radius: Length | None = None
+    focal_length: Length | None = None
+
+
+class ShapeSettings(Section):
+    """[[shape]]: a best-fit shape."""
+
+    name: Name
+    kind: Literal[tuple(KINDS)]  # type: ignore[valid-type]
+    points: Patterns
+    weights: Weights | None = None  # else that of [measure]
+    robust: bool = False
+    hold: HeldSettings = HeldSettings()
+    offset: NotNegative = 0.0  # of the targets from the surface, along its normal, object unit
+    side: Name = "cameras"  # on which the targets are: that of the cameras, or of the point of this name
+
+
+class AlignmentSettings(Section):
+    """[alignment]: the system in which coordinates and directions are given."""
+
+    method: Literal["3-2-1", "features", "points"]
+    plane: Patterns | None = None  # 3-2-1: three points of Z = 0
+    line: Patterns | None = None  # 3-2-1: two points of Y = 0
+    origin: Name | None = None  # 3-2-1: point of X = 0; features: point or shape at the origin
+    z_axis: Name | None = None  # features: shape whose direction becomes Z; a plane lies at Z = 0
+    x_axis: Patterns | None = None  # features: shape whose direction becomes X, or two points or shapes
+    nominal: Name | None = None  # points: table id,X,Y,Z[,sX,sY,sZ]
+    points: Patterns | None = None  # points: those that count; all of the table if not given
+    scale: bool = False  # points: whether it is fitted
+    robust: bool = False  # points: whether those that others contradict are held out
+    weights: Weights | None = None  # points; else that of [measure]
+
+
+class DistanceSettings(Section):
+    """[[distance]]: of points, or of a point from a plane or an axis."""
+
+    name: Name
+    start: Name = Field(alias="from")  # point or shape
+    end: Name = Field(alias="to")  # point or shape
+
+
+class AngleSettings(Section):
+    """[[angle]]: at a point between two others, or between the directions of two shapes."""
+
+    name: Name
+    between: Annotated[tuple[Name, Name], Field(strict=False)]  # points, or shapes
+    at: Name | None = None  # the vertex, for points
+
+
+class HeightSettings(Section):
+    """[[height]]: of points above a plane."""
+
+    name: Name
+    above: Name  # shape of kind plane
+    points: Patterns
+
+
+class ToleranceSettings(Section):
+    """[[tolerance]]: limits of deviations from a shape, nominal points or a mesh."""
+
+    name: Name
+    shape: Name | None = None
+    nominal: Name | None = None  # table id,X,Y,Z[,sX,sY,sZ]
+    mesh: Name | None = None  # .stl or .ply
+    points: Patterns | None = None  # to be judged: of a mesh those named, else all of the shape or table
+    lower: Value | None = None  # object unit; -upper if not given
+    upper: Annotated[float, Field(gt=-LARGEST, le=LARGEST)]
+    offset: Value = 0.0  # mesh: of the targets from the surface, along its normal, object unit
+    coverage: Coverage | None = None  # k of the uncertainty U = k sigma; else that of [measure]
+
+
+class MeasureSettings(Section):
+    """[measure]: what holds for all."""
+
+    weights: Weights = "network"
+    coverage: Coverage = 2.0
+
+
+class FeaturesFile(Section):
+    """What a features file says; the tables and meshes that it names are not read yet."""
+
+    measure: MeasureSettings = MeasureSettings()
+    groups: Annotated[
+        tuple[GroupSettings, ...], Field(strict=False, max_length=MAX_ENTRIES, alias="group")
+    ] = ()
+    hidden_points: Annotated[
+        tuple[HiddenPointSettings, ...], Field(strict=False, max_length=MAX_ENTRIES, alias="hidden_point")
+    ] = ()
+    shapes: Annotated[
+        tuple[ShapeSettings, ...], Field(strict=False, max_length=MAX_ENTRIES, alias="shape")
+    ] = ()
+    alignment: AlignmentSettings | None = None
+    distances: Annotated[
+        tuple[DistanceSettings, ...], Field(strict=False, max_length=MAX_ENTRIES, alias="distance")
+    ] = ()
+    angles: Annotated[
+        tuple[AngleSettings, ...], Field(strict=False, max_length=MAX_ENTRIES, alias="angle")
+    ] = ()
+    heights: Annotated[
+        tuple[HeightSettings, ...], Field(strict=False, max_length=MAX_ENTRIES, alias="height")
+    ] = ()
+    tolerances: Annotated[
+        tuple[ToleranceSettings, ...], Field(strict=False, max_length=MAX_ENTRIES, alias="tolerance")
+    ] = ()
+
+    def tables(self) -> tuple[str, ...]:
+        """Return the names of the tables of nominal points."""
+        named = [
+            self.alignment.nominal if self.alignment else None,
+            *(one.nominal for one in self.tolerances),
+        ]
+        return tuple(dict.fromkeys(name for name in named if name is not None))
+
+    def meshes(self) -> tuple[str, ...]:
+        """Return the names of the meshes."""
+        return tuple(dict.fromkeys(one.mesh for one in self.tolerances if one.mesh is not None))
+
+
+NEEDED = {
+    "3-2-1": ("plane", "line", "origin"),
+    "features": ("z_axis", "x_axis", "origin"),
+    "points": ("nominal",),
+}
+
+
+def read_features_file(path: Path, *, allow_outside: bool = False) -> tuple[FeaturesFile, dict[str, Path]]:
+    """Read and check a features file.
+
+    Args:
+        path: the TOML file; every path in it is relative to it.
+        allow_outside: whether these paths may lead out of its folder.
+
+    Returns:
+        What it says, and the paths of the tables and meshes that it names.
+
+    Raises:
+        SurveyFileError: unreadable, no TOML, an unknown key, a wrong type, or a contradiction; the line names
+            the file, the key, what was found and what was needed.
+    """
+    path = Path(path)
+    text, table = read_toml(path, "a features file")
+    try:
+        features = FeaturesFile.model_validate(table)
+    except ValidationError as error:
+        raise SurveyFileError(first_error(path, text, error, FeaturesFile)) from error
+    _refuse_contradictions(path, features)
+    paths = {
+        name: inside(path.parent, name, str(path), allow_outside=allow_outside)
+        for name in (*features.tables(), *features.meshes())
+    }
+    return features, paths
+
+
+def _refuse_contradictions(path: Path, features: FeaturesFile) -> None:
+    kinds: tuple[tuple[str, tuple[GroupSettings | ShapeSettings | ToleranceSettings, ...]], ...]
+    kinds = (("group", features.groups), ("shape", features.shapes), ("tolerance", features.tolerances))
+    for kind, entries in kinds:
+        seen: set[str] = set()
+        for one in entries:
+            if one.name in seen:
+                raise SurveyFileError(f"{path}: {kind} '{one.name}' is a duplicate")
+            seen.add(one.name)
+    alignment = features.alignment
+    if alignment is not None:
+        for key in NEEDED[alignment.method]:
+            if getattr(alignment, key) is None:
+                raise SurveyFileError(f'{path}: alignment: method "{alignment.method}" needs {key}')
+    for tolerance in features.tolerances:
+        given = [key for key in ("shape", "nominal", "mesh") if getattr(tolerance, key) is not None]
+        if len(given) != 1:
+            found = " and ".join(given) or "none"
+            raise SurveyFileError(
+                f"{path}: tolerance {tolerance.name}: found {found}, needed one of shape, nominal and mesh"
+            )
+        if tolerance.mesh is not None and tolerance.points is None:
+            raise SurveyFileError(f"{path}: tolerance {tolerance.name}: a mesh needs the points to be judged")
+        lower = -tolerance.upper if tolerance.lower is None else tolerance.lower
+        if not lower < tolerance.upper:
+            raise SurveyFileError(
+                f"{path}: tolerance {tolerance.name}: lower limit {lower:g}, upper {tolerance.upper:g}, "
+                "needed lower below upper"
+            )

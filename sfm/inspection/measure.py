@@ -1,0 +1,414 @@
+"""Measuring a result: hidden points, alignment, shapes, functions and tolerances, in this order.
+
+Source: Luhmann et al. (2020), Close-Range Photogrammetry and 3D Imaging, chs. 6 and 8; the module of each
+step names its own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from sfm.conventions import FloatArray, IntArray
+from sfm.errors import GeometryError, SurveyFileError
+from sfm.files.csv_tables import read_table
+from sfm.geometry.alignment import Alignment, Nominal, align_321, align_features, align_points
+from sfm.geometry.functions import (
+    angle_at,
+    angle_of_directions,
+    difference,
+    distance,
+    distance_from_axis,
+    height,
+    point_function,
+)
+from sfm.geometry.hidden_points import with_hidden_point
+from sfm.geometry.measured import Function, MeasuredPoints, measured_points
+from sfm.geometry.mesh import Mesh
+from sfm.geometry.shapes.fit import ShapeFit, fit_shape
+from sfm.geometry.tolerance import (
+    Deviations,
+    deviations_from_mesh,
+    deviations_from_points,
+    deviations_from_shape,
+)
+from sfm.inspection.features_file import (
+    AlignmentSettings,
+    FeaturesFile,
+    HeldSettings,
+    ShapeSettings,
+    ToleranceSettings,
+)
+from sfm.stored_result import StoredResult
+
+SIGMAS = ("sX", "sY", "sZ")
+WITH_AXIS = ("line", "cylinder", "cone", "torus", "paraboloid")
+MAX_NAMED = 5  # in a remark
+SEEN_FROM = 0.8  # of the rays of targets that come from their own side of a surface, at least
+MeshReader = Callable[[Path], tuple[FloatArray, IntArray]]
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """A distance, an angle or a height."""
+
+    name: str
+    what: str  # of what, in words
+    kind: str  # length | angle
+    value: float  # object unit, rad
+    sigma: float  # NaN where not known
+    remark: str = ""  # why the sigma means less than it seems; empty where it does not
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """A measured result."""
+
+    name: str  # of the result
+    points: MeasuredPoints  # in the system of the alignment, hidden points included
+    groups: tuple[tuple[str, IntArray], ...]  # name and points of each
+    alignment: Alignment | None
+    shapes: tuple[ShapeFit, ...]
+    quantities: tuple[Quantity, ...]
+    tolerances: tuple[Deviations, ...]
+    coverage: float  # k of the uncertainties
+    remarks: tuple[str, ...]  # one line each
+
+    @property
+    def unit(self) -> str:
+        """What lengths are in."""
+        return self.points.unit or "object units"
+
+    def group_of(self, point: int) -> str:
+        """Return the name of the first group that a point is in, empty where it is in none."""
+        return next((name for name, members in self.groups if point in members), "")
+
+    @property
+    def verdict(self) -> str:
+        """Return good, fair or bad: whether all tolerances are proven to be kept."""
+        if any(one.count("out") for one in self.tolerances):
+            return "bad"
+        if any(one.count("undecided") or one.count("not known") or one.missing for one in self.tolerances):
+            return "fair"
+        return "fair" if self.remarks else "good"
+
+
+def measure_result(
+    result: StoredResult,
+    features: FeaturesFile | None = None,
+    *,
+    paths: Mapping[str, Path] | None = None,
+    read_mesh: MeshReader | None = None,
+) -> Measurement:
+    """Measure a result.
+
+    Args:
+        result: of a survey, or read from another program.
+        features: what is asked for; only the coordinates if not given.
+        paths: of the tables and meshes that it names.
+        read_mesh: reads the vertices and triangles of a mesh.
+
+    Raises:
+        KolinearError: a feature that its points do not determine, names that are unknown, or tables that
+            cannot be read.
+    """
+    features = FeaturesFile() if features is None else features
+    paths = {} if paths is None else paths
+    points = measured_points(result)
+    if not len(points.names):
+        raise GeometryError(f"{result.name}: no point has coordinates, nothing can be measured")
+    for one in features.hidden_points:
+        points = with_hidden_point(points, one.name, one.start, one.end, one.distance, one.sigma)
+    work = _Work(result, features, paths, read_mesh, points)
+    return work.measured()
+
+
+class _Work:
+    """What is known while a result is measured."""
+
+    def __init__(
+        self,
+        result: StoredResult,
+        features: FeaturesFile,
+        paths: Mapping[str, Path],
+        read_mesh: MeshReader | None,
+        points: MeasuredPoints,
+    ) -> None:
+        self.result, self.features, self.paths, self.read_mesh = result, features, paths, read_mesh
+        self.points = points
+        self.patterns = {one.name: one.points for one in features.groups}
+        self.shapes: dict[str, ShapeFit] = {}
+        self.tables = {name: _nominal(paths[name]) for name in features.tables()}
+        self.rays = _rays(result)
+
+    def measured(self) -> Measurement:
+        features = self.features
+        groups = tuple((one.name, self.chosen((one.name,), f"group {one.name}")) for one in features.groups)
+        alignment = None
+        if features.alignment is not None:
+            if features.alignment.method == "features":
+                self.fit_shapes()
+            alignment = self.aligned(features.alignment)
+            self.points = alignment.apply(self.points)
+            self.rays = self.rays[0], alignment.aligned_from_object.apply(self.rays[1])
+        self.fit_shapes()
+        quantities = tuple(self.quantities())
+        tolerances = tuple(self.tolerance(one) for one in features.tolerances)
+        return Measurement(
+            self.result.name,
+            self.points,
+            groups,
+            alignment,
+            tuple(self.shapes.values()),
+            quantities,
+            tolerances,
+            features.measure.coverage,
+            tuple(self.remarks(quantities, tolerances)),
+        )
+
+    def chosen(self, patterns: tuple[str, ...], what: str) -> IntArray:
+        """Return the points of names, patterns and groups."""
+        flat = [one for pattern in patterns for one in self.patterns.get(pattern, (pattern,))]
+        return self.points.matching(flat, what)
+
+    def fit_shapes(self) -> None:
+        self.shapes = {one.name: self.shape(one) for one in self.features.shapes}
+
+    def shape(self, one: ShapeSettings) -> ShapeFit:
+        rows = self.chosen(one.points, f"shape {one.name}")
+        weights = one.weights or self.features.measure.weights
+
+        def fitted(offset: float) -> ShapeFit:
+            return fit_shape(
+                self.points,
+                one.kind,
+                rows,
+                name=one.name,
+                weights=weights,
+                hold=_held(one.hold),
+                robust=one.robust,
+                offset=offset,
+            )
+
+        first = fitted(0.0)
+        return first if one.offset == 0 else fitted(one.offset * self.side(one, first))
+
+    def side(self, one: ShapeSettings, fit: ShapeFit) -> float:
+        """Return on which side of a shape its targets are, 1 on that of its normals."""
+        xyz = self.points.xyz[fit.points]
+        normals = fit.shape.design(xyz)[1][:, -1]
+        if one.side != "cameras":
+            view = self.points.xyz[self.points.index(one.side)]
+            return 1.0 if float(np.einsum("ni,ni->n", view - xyz, normals).mean()) >= 0 else -1.0
+        point, camera = self.rays
+        place = np.full(len(self.points.names), -1)
+        place[fit.points] = np.arange(len(fit.points))
+        k = place[point]
+        towards = np.einsum("ri,ri->r", camera - xyz[k], normals[k])[k >= 0]
+        share = float((towards > 0).mean()) if len(towards) else 0.5
+        if max(share, 1 - share) < SEEN_FROM:
+            found = f"{share:.0%} of the rays come from one side" if len(towards) else "no photographs"
+            raise GeometryError(
+                f"shape {one.name}: offset: {found}; needed side with the name of a point on that of the "
+                "targets"
+            )
+        return 1.0 if share > 0.5 else -1.0
+
+    def aligned(self, one: AlignmentSettings) -> Alignment:
+        if one.method == "3-2-1":
+            assert one.plane is not None and one.line is not None and one.origin is not None
+            return align_321(self.points, list(one.plane), list(one.line), one.origin)
+        if one.method == "features":
+            assert one.z_axis is not None and one.x_axis is not None and one.origin is not None
+            primary = self.shape_named(one.z_axis, "alignment: z_axis")
+            if len(one.x_axis) == 1:
+                x_axis = self.direction(self.shape_named(one.x_axis[0], "alignment: x_axis"))
+            elif len(one.x_axis) == 2:
+                x_axis = difference(*(self.place(name) for name in one.x_axis))
+            else:
+                raise GeometryError(
+                    f"alignment: x_axis names {len(one.x_axis)}, expected one shape or two points or shapes"
+                )
+            flat = primary.shape.kind.name == "plane"
+            return align_features(
+                self.direction(primary),
+                x_axis,
+                self.place(one.origin),
+                on_plane=primary.function[primary.parameters.rows("point")] if flat else None,
+            )
+        assert one.nominal is not None
+        nominal = self.tables[one.nominal]
+        if one.points is not None:
+            wanted = {self.points.names[j] for j in self.chosen(one.points, "alignment: points")}
+            rows = np.array([k for k, name in enumerate(nominal.names) if name in wanted], dtype=np.int64)
+            covariance = None if nominal.covariance is None else nominal.covariance[rows]
+            nominal = Nominal(tuple(nominal.names[k] for k in rows), nominal.xyz[rows], covariance)
+        weights = one.weights or self.features.measure.weights
+        return align_points(self.points, nominal, scale=one.scale, weights=weights, robust=one.robust)
+
+    def shape_named(self, name: str, what: str) -> ShapeFit:
+        if name not in self.shapes:
+            known = ", ".join(self.shapes) or "none"
+            raise GeometryError(f"{what}: unknown shape '{name}', expected one of {known}")
+        return self.shapes[name]
+
+    def direction(self, fit: ShapeFit) -> Function:
+        if "direction" not in fit.parameters.names:
+            raise GeometryError(f"shape {fit.name}: a {fit.shape.kind.name} has no direction")
+        return fit.function[fit.parameters.rows("direction")]
+
+    def place(self, name: str) -> Function:
+        """Return the coordinates of a point, or of where a shape lies."""
+        if name in self.shapes:
+            fit = self.shapes[name]
+            return fit.function[fit.parameters.rows(fit.shape.kind.place)]
+        return point_function(self.points, name)
+
+    def quantities(self) -> list[Quantity]:
+        found = []
+        for one in self.features.distances:
+            function = self.distance(one.start, one.end)
+            found.append(self.quantity(one.name, f"distance {one.start} to {one.end}", "length", function))
+        for angle in self.features.angles:
+            a, b = angle.between
+            if angle.at is not None:
+                function = angle_at(self.place(angle.at), self.place(a), self.place(b))
+                what = f"angle at {angle.at} between {a} and {b}"
+            else:
+                fits = [self.shape_named(name, f"angle {angle.name}") for name in (a, b)]
+                function = angle_of_directions(*map(self.direction, fits), undirected=True)
+                if sum(fit.shape.kind.name == "plane" for fit in fits) == 1:  # of a plane's normal it is not
+                    flip = np.array([[-1.0]])
+                    function = function.times(flip, np.pi / 2 - function.value)
+                what = f"angle between {a} and {b}"
+            found.append(self.quantity(angle.name, what, "angle", function))
+        for asked in self.features.heights:
+            plane = self.shape_named(asked.above, f"height {asked.name}")
+            if plane.shape.kind.name != "plane":
+                raise GeometryError(
+                    f"height {asked.name}: {asked.above} is a {plane.shape.kind.name}, expected a plane"
+                )
+            place = plane.function[plane.parameters.rows("point")]
+            for j in self.chosen(asked.points, f"height {asked.name}"):
+                name = self.points.names[j]
+                function = height(point_function(self.points, name), place, self.direction(plane))
+                what = f"height of {name} above {asked.above}"
+                found.append(self.quantity(f"{asked.name} {name}", what, "length", function))
+        return found
+
+    def distance(self, start: str, end: str) -> Function:
+        """Return the distance of two places, or of a place from a plane or an axis."""
+        for one, other in ((start, end), (end, start)):
+            fit = self.shapes.get(other)
+            if fit is None or (one in self.shapes and self.shapes[one].shape.kind.name in WITH_AXIS):
+                continue
+            where = fit.function[fit.parameters.rows(fit.shape.kind.place)]
+            if fit.shape.kind.name == "plane":
+                found = height(self.place(one), where, self.direction(fit))
+                return found.times(np.array([[1.0 if found.value[0] >= 0 else -1.0]]), np.abs(found.value))
+            if fit.shape.kind.name in ("line", "cylinder"):
+                return distance_from_axis(self.place(one), where, self.direction(fit))
+        return distance(self.place(start), self.place(end))
+
+    def quantity(self, name: str, what: str, kind: str, function: Function) -> Quantity:
+        variance = float(self.points.covariance_between([function])[0, 0])
+        remarks = []
+        if not np.isnan(variance):
+            if self.points.depends_on_datum(function).any():
+                remarks.append("depends on the datum of a free network")
+            if not self.points.correlated:
+                remarks.append("correlations of the points not known")
+        sigma = float(np.sqrt(max(variance, 0.0))) if not np.isnan(variance) else float("nan")
+        return Quantity(name, what, kind, float(function.value[0]), sigma, "; ".join(remarks))
+
+    def tolerance(self, one: ToleranceSettings) -> Deviations:
+        lower = -one.upper if one.lower is None else one.lower
+        coverage = one.coverage or self.features.measure.coverage
+        chosen = None if one.points is None else self.chosen(one.points, f"tolerance {one.name}")
+        if one.shape is not None:
+            fit = self.shape_named(one.shape, f"tolerance {one.name}")
+            return deviations_from_shape(
+                self.points, fit, name=one.name, lower=lower, upper=one.upper, coverage=coverage
+            )
+        if one.nominal is not None:
+            nominal = self.tables[one.nominal]
+            return deviations_from_points(
+                self.points, nominal, name=one.name, upper=one.upper, coverage=coverage, chosen=chosen
+            )
+        assert one.mesh is not None and chosen is not None
+        if self.read_mesh is None:
+            raise GeometryError(f"tolerance {one.name}: nothing here reads the mesh {one.mesh}")
+        return deviations_from_mesh(
+            self.points,
+            Mesh(*self.read_mesh(self.paths[one.mesh])),
+            chosen,
+            name=one.name,
+            against=one.mesh,
+            lower=lower,
+            upper=one.upper,
+            coverage=coverage,
+            offset=one.offset,
+        )
+
+    def remarks(self, quantities: tuple[Quantity, ...], tolerances: tuple[Deviations, ...]) -> list[str]:
+        found = []
+        if self.points.covariance is None:
+            found.append("The result has no standard deviations: nothing is tested or decided.")
+        elif not self.points.correlated:
+            found.append(
+                "Only the covariance of each point by itself is known: standard deviations of shapes and "
+                "distances leave out the correlations of the points."
+            )
+        if not self.points.has_scale:
+            found.append("The scale is undefined: lengths are in network units.")
+        for fit in self.shapes.values():
+            what = f"{fit.shape.kind.name} {fit.name}"
+            if not fit.converged:
+                found.append(f"{what} did not converge")
+            if fit.fits is False:
+                found.append(
+                    f"{what}: residuals are {fit.sigma0:.3g} times what the precision of the points allows "
+                    f"(limit {np.sqrt(fit.critical):.3g}): its points deviate from this form"
+                )
+            if not fit.used.all():
+                left = [self.points.names[j] for j in fit.points[~fit.used]]
+                more = f" and {len(left) - MAX_NAMED} more" if len(left) > MAX_NAMED else ""
+                found.append(f"{what}: left out {', '.join(left[:MAX_NAMED])}{more}")
+        for one in tolerances:
+            if one.missing:
+                more = f" and {len(one.missing) - MAX_NAMED} more" if len(one.missing) > MAX_NAMED else ""
+                found.append(f"{one.name}: not measured: {', '.join(one.missing[:MAX_NAMED])}{more}")
+        return found
+
+
+def _held(hold: HeldSettings) -> dict[str, float | tuple[float, ...]]:
+    held = {key: value for key, value in hold.model_dump().items() if value is not None}
+    if "half_angle_deg" in held:
+        held["half_angle"] = float(np.deg2rad(held.pop("half_angle_deg")))
+    return held
+
+
+def _nominal(path: Path) -> Nominal:
+    """Read nominal points; a table with standard deviations gives their covariance."""
+    table = read_table(path, ("id",), ("X", "Y", "Z"), SIGMAS, ignored=None, blank=SIGMAS)
+    names = table.keys("id")
+    sigma = table.values[:, 3:]
+    table.refuse(sigma, sigma < 0, SIGMAS, "0 or more, or nothing")
+    covariance = None
+    if sigma.size:
+        if not np.isfinite(sigma).all():
+            raise SurveyFileError(f"{path}: standard deviations of some points only, expected all or none")
+        covariance = np.eye(3) * sigma[:, None, :] ** 2
+    return Nominal(names, table.values[:, :3].copy(), covariance)
+
+
+def _rays(result: StoredResult) -> tuple[IntArray, FloatArray]:
+    """Return point and camera position of each ray; points count among those with coordinates."""
+    network, estimate = result.network, result.estimate
+    seen = network.image_points
+    number = np.cumsum(estimate.determined) - 1
+    kept = estimate.oriented[seen.image] & estimate.determined[seen.point]
+    return number[seen.point[kept]], estimate.position[seen.image[kept]]

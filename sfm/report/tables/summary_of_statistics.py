@@ -1,0 +1,167 @@
+"""What summary.json says of the statistics of a result, and of what its observations contradict."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from sfm.adjustment.quality.statistics import CoordinateTest
+from sfm.adjustment.quality.variance_components import VarianceComponents
+from sfm.files.plain_text import or_none
+from sfm.report.findings.bundle_statistics import Spread
+from sfm.report.findings.findings import Findings
+from sfm.report.phrases import words_of_test, words_of_weights
+
+
+def summary_of_statistics(findings: Findings) -> dict[str, Any]:
+    """Return the tests, reliability, components, correlations and significance of a result."""
+    result, found, sigma0, counts = findings.result, findings.statistics, findings.sigma0, findings.counts
+    return {
+        "sigma0_ratio": or_none(sigma0.ratio),
+        "image_points_px": or_none(sigma0.image_points_px),
+        "stated_px": or_none(sigma0.stated_px),
+        "weight_factor": result.adjustment.weight_factor,
+        "weights": words_of_weights(result),
+        "global_tests": [
+            {
+                "of": test.of,
+                "vPv": or_none(test.statistic),
+                "redundancy": test.redundancy,
+                "lower": or_none(test.lower),
+                "upper": or_none(test.upper),
+                "passed": test.passed,
+                "words": words_of_test(test, result.adjustment),
+            }
+            for test in found.global_tests
+        ],
+        "w_test": _coordinate_test(found.w, found.largest_w),
+        "tau_test": _coordinate_test(found.tau, found.largest_tau),
+        "observations": {
+            "image_coordinates": counts.image,
+            "control": counts.control,
+            "exterior": counts.exterior,
+            "interior": counts.interior,
+            "scale_bars": counts.scale_bars,
+            "constraints": counts.constraints,
+            "total": counts.total,
+        },
+        "redundancy_number": {
+            "sum": or_none(found.redundancy_sum),
+            "mean": or_none(found.redundancy.mean),
+            "min": or_none(found.redundancy.smallest),
+        },
+        "minimal_detectable_bias_px": _median_and_max(found.minimal_bias),
+        "external_reliability_sigmas": _median_and_max(found.external),
+        "sigma0_by_kind": _components(found.kinds),
+        "sigma0_by_camera": _components(found.cameras),
+        "sigma0_by_photograph": _components(found.photographs),
+        "correlations": [
+            {"first": pair.first, "second": pair.second, "value": or_none(pair.value)}
+            for pair in found.correlations
+        ],
+        "orientation_correlations": [
+            {
+                "parameter": one.parameter,
+                "with": one.part,
+                "image": one.image,
+                "value": one.largest,
+                "photographs": dict(one.counts),
+            }
+            for one in result.orientation_correlations
+        ],
+        "significance": [
+            {
+                "camera": test.camera,
+                "parameter": test.parameter,
+                "t": or_none(test.t),
+                "probability": or_none(test.probability),
+                "significant": bool(test.significant),
+            }
+            for test in found.significance
+        ],
+        "not_significant": [
+            {"camera": test.camera, "parameter": test.parameter, "t": or_none(test.t)}
+            for test in found.not_significant
+        ],
+    }
+
+
+def summary_of_consistency(findings: Findings) -> dict[str, Any]:
+    """Return what the tests of points, photographs and the format have found."""
+    found, test = findings.consistency, findings.given_test
+    return {
+        "two_positions": [
+            {
+                "point": one.point,
+                "distance": or_none(one.distance),
+                "over_sigma": or_none(one.over_sigma),
+                "first": list(one.first),
+                "second": list(one.second),
+            }
+            for one in found.two_positions
+        ],
+        "large_residuals": list(found.large),
+        "doubtful": [
+            {
+                "point": one.point,
+                "rejected": one.rejected,
+                "instead": one.instead,
+                "misfit": or_none(one.misfit),
+                "other": or_none(one.other),
+            }
+            for one in found.doubtful
+        ],
+        "uneven_photographs": None
+        if found.uneven is None
+        else {
+            "probability": or_none(found.uneven.probability),
+            "worst": found.uneven.worst,
+            "largest": or_none(found.uneven.largest),
+            "median": or_none(found.uneven.median),
+        },
+        "patterns": [
+            {
+                "camera": one.camera,
+                "probability": or_none(one.probability),
+                "explained": or_none(one.explained),
+                "largest_px": or_none(one.largest_px),
+            }
+            for one in found.patterns
+        ],
+        "other_solutions": [
+            {
+                "camera": one.camera,
+                "c": or_none(one.c),
+                "unit": one.unit,
+                "reflected": one.reflected,
+                "moved_over_sigma": or_none(one.moved),
+                "vPv_ratio": or_none(one.vPv),
+            }
+            for one in findings.result.other_solutions
+        ],
+        "given_against_free_network": None
+        if test is None
+        else {
+            "F": or_none(test.statistic),
+            "redundancy": test.redundancy,
+            "probability": or_none(test.probability),
+        },
+    }
+
+
+def _median_and_max(values: Spread) -> dict[str, float | None]:
+    return {"median": or_none(values.median), "max": or_none(values.largest)}
+
+
+def _coordinate_test(test: CoordinateTest, largest: float) -> dict[str, Any]:
+    return {
+        "alpha": test.alpha,
+        "critical": or_none(test.critical),
+        "tested": test.tested,
+        "beyond": test.beyond,
+        "expected": test.expected,
+        "max": or_none(largest),
+    }
+
+
+def _components(components: VarianceComponents) -> dict[str, float | None]:
+    return {name: or_none(float(s)) for name, s in zip(components.names, components.sigma0, strict=True)}

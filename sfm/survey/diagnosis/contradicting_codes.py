@@ -1,0 +1,185 @@
+"""Codes that are read at several places of the object: photographs of another object, or single targets.
+
+A sheet of codes that two objects carry orients the photographs of both alike, and every other code that the
+two have in common is at two places. Photographs are put together by the places at which they show such codes;
+those that do not agree with the largest group leave, and what is contested after that is told.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+from sfm.survey.inputs.measurements import MeasuredPhotographs, Naming
+from sfm.survey.target_network import UNNAMED
+from sfm.targets.codes.tags import CORNERS
+
+MIN_ELSEWHERE = 3  # contradicting codes of a photograph of another object: one or two are moved or misread
+SHARE_ELSEWHERE = 0.1  # of the codes that a photograph shows of the object, at least so many contradict it
+MAX_ROUNDS = 10  # of putting a group together
+MAX_NAMES = 5  # codes or photographs in a line
+
+
+@dataclass(frozen=True)
+class ContestedCodes:
+    """Codes that photographs show at different places."""
+
+    places: dict[int, dict[int, frozenset[int]]]
+    """of each such code, by photograph, the points that it is read at; none where its ray meets no others"""
+    left_out: dict[int, str]
+    """photographs that show another object, with the reason"""
+    main: dict[int, int]
+    """point that is the place of a code in the largest group, where it has one"""
+
+
+def find_contested_codes(photographs: MeasuredPhotographs, naming: Naming) -> ContestedCodes:
+    """Return the codes that are read at several places, and which photographs show another object.
+
+    Args:
+        photographs: all measured targets.
+        naming: which point each of them is in the adjusted network.
+    """
+    whole, shown = _places(photographs, naming)
+    contested = {code: places for code, places in whole.items() if _is_contested(code, places, naming)}
+    groups = _groups(contested)
+    own = groups[0] if groups else frozenset()
+    accepted = _accepted(contested, own)
+    elsewhere: dict[int, set[int]] = {}
+    for code, places in contested.items():
+        for image, at in places.items():
+            if accepted[code] and not at & accepted[code]:
+                elsewhere.setdefault(image, set()).add(_number(code, naming))
+    foreign = {
+        image: codes
+        for image, codes in elsewhere.items()
+        if len(codes) >= max(MIN_ELSEWHERE, SHARE_ELSEWHERE * shown[image])
+    }
+    left_out = {}
+    for image, codes in foreign.items():
+        group = next(one for one in groups if image in one)
+        others = [photographs.names[k] for k in sorted(group & foreign.keys() - {image})]
+        left_out[image] = _words_of_foreign(codes, others)
+    main = {code: place for code, places in contested.items() if (place := _most(places, own)) != UNNAMED}
+    return ContestedCodes(contested, left_out, main)
+
+
+def words_of_contested(
+    found: ContestedCodes, photographs: MeasuredPhotographs, naming: Naming
+) -> tuple[str, ...]:
+    """Say where each contested code was read, one line each for the first of them."""
+    lines = []
+    for code, places in sorted(found.places.items()):
+        own = found.main.get(code, UNNAMED)
+        away = sorted(image for image, at in places.items() if own not in at or len(at) > 1)
+        points = sorted({naming.names[k] for i in away for k in places[i] if k not in (own, UNNAMED)})
+        named = _some(photographs.names[i] for i in away)
+        rest = len(places) - len(away)
+        where = (
+            f"{named} show{'s' if len(away) == 1 else ''} it elsewhere than {rest} other photographs"
+            + (f", at {_some(points)}" if points else "")
+            if own != UNNAMED
+            else f"its rays from {named} do not meet"
+        )
+        lines.append(
+            f"code {_number(code, naming)} is read at several places, {where}: a target that was moved, two "
+            "of one number, or a misread code"
+        )
+    numbers = sorted({_number(code, naming) for code in found.places})
+    if len(lines) > MAX_NAMES:
+        lines[MAX_NAMES:] = [f"so are {len(numbers) - MAX_NAMES} more codes"]
+    return tuple(lines)
+
+
+def _places(
+    photographs: MeasuredPhotographs, naming: Naming
+) -> tuple[dict[int, dict[int, frozenset[int]]], Counter[int]]:
+    """Return at which points each code is read, by code and photograph, and the codes of each photograph."""
+    found: dict[int, dict[int, frozenset[int]]] = {}
+    shown: Counter[int] = Counter()
+    for image, (targets, point) in enumerate(zip(photographs.targets, naming.point, strict=True)):
+        if not (point != UNNAMED).any():
+            continue  # not oriented
+        coded = targets.code >= 0
+        numbers = {_number(code, naming) for code in targets.code[coded].tolist()}
+        shown[image] = len(numbers)
+        for code, place in zip(targets.code[coded].tolist(), point[coded].tolist(), strict=True):
+            before = found.setdefault(code, {}).get(image, frozenset())
+            found[code][image] = before | {place}
+    return found, shown
+
+
+def _is_contested(code: int, places: dict[int, frozenset[int]], naming: Naming) -> bool:
+    """Return whether photographs show a code at more than one place, or at none that has its name."""
+    every = frozenset[int]().union(*places.values())
+    return len(places) > 1 and {int(naming.code[k]) if k != UNNAMED else UNNAMED for k in every} != {code}
+
+
+def _groups(contested: dict[int, dict[int, frozenset[int]]]) -> list[frozenset[int]]:
+    """Return photographs in groups that agree on the places of the contested codes, the largest first.
+
+    Within a group a code may have several places, as two targets of one number that a photograph shows
+    together; a photograph joins that agrees on more codes than it contradicts.
+    """
+    of_image: dict[int, dict[int, frozenset[int]]] = {}
+    for code, places in contested.items():
+        for image, at in places.items():
+            of_image.setdefault(image, {})[code] = at
+    left = set(of_image)
+    groups = []
+    while left:
+        seed = max(left, key=lambda image: (len(of_image[image]), -image))
+        group = frozenset({seed})
+        for _ in range(MAX_ROUNDS):
+            accepted = _accepted(contested, group)
+            agreeing = {seed}
+            for image in left:
+                same = sum(bool(at & accepted[code]) for code, at in of_image[image].items())
+                against = sum(
+                    bool(accepted[code]) and not at & accepted[code] for code, at in of_image[image].items()
+                )
+                if same > against:
+                    agreeing.add(image)
+            if agreeing == group:
+                break
+            group = frozenset(agreeing)
+        groups.append(group)
+        left -= group
+    return sorted(groups, key=lambda one: (-len(one), min(one)))
+
+
+def _accepted(
+    contested: dict[int, dict[int, frozenset[int]]], group: frozenset[int]
+) -> dict[int, frozenset[int]]:
+    """Return the places at which the photographs of a group show each contested code."""
+    return {
+        code: frozenset[int]().union(*(at for image, at in places.items() if image in group)) - {UNNAMED}
+        for code, places in contested.items()
+    }
+
+
+def _most(places: dict[int, frozenset[int]], group: frozenset[int]) -> int:
+    """Return the place at which most photographs of a group show a code, UNNAMED without one."""
+    counted = Counter(k for image, at in places.items() if image in group for k in at if k != UNNAMED)
+    return min(counted, key=lambda k: (-counted[k], k)) if counted else UNNAMED
+
+
+def _words_of_foreign(codes: set[int], others: list[str]) -> str:
+    named = f"{len(codes)} of its codes ({_some(map(str, sorted(codes)))}) are elsewhere than in the others"
+    if others:
+        return (
+            f"{named}, and {_some(others)} agree{'s' if len(others) == 1 else ''} with it: a second object "
+            "with the same codes, or this one in another state; survey it by itself"
+        )
+    return f"{named}: another object with the same codes, this one in another state, or wrong codes"
+
+
+def _number(code: int, naming: Naming) -> int:
+    """Return the number of a code, or the tag of a corner."""
+    return code // len(CORNERS) if naming.corners else code
+
+
+def _some(names: Iterable[str]) -> str:
+    listed = list(names)
+    more = f" and {len(listed) - MAX_NAMES} more" if len(listed) > MAX_NAMES else ""
+    return ", ".join(listed[:MAX_NAMES]) + more

@@ -1,0 +1,151 @@
+"""Photographs of another size, of other files than photographs, and links in a folder that the user names."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from sfm.errors import GeometryError, PhotographError, SurveyFileError
+from sfm.photographs.reading import read_photograph
+from sfm.pipeline import run_survey
+from sfm.survey.drafting.draft import draft_survey
+from sfm.survey.inputs.photograph_list import find_photographs
+from sfm.survey.inputs.survey import Survey, read_survey
+from sfm.survey.measuring.other_sizes import OtherSizes, separate_sizes
+from sfm.targets.codes.tags import tag_family, tag_modules
+from tests.surveys import SIZE_PX, write_photograph_survey
+
+WIDTH, HEIGHT = SIZE_PX
+
+
+def sized(folder: Path, sizes: dict[str, tuple[int, int]], *, camera: str = "") -> OtherSizes:
+    """Return what is made of a survey of grey photographs of these sizes."""
+    folder.mkdir()
+    for name, (width, height) in sizes.items():
+        cv2.imwrite(str(folder / name), np.full((height, width), 90, dtype=np.uint8))
+    text = f"""[survey]
+name = "sizes"
+unit = "mm"
+[[camera]]
+name = "small"
+images = "*.png"
+pixel_mm = [0.01, 0.02]
+c_mm = 8.0
+{camera}
+"""
+    (folder / "survey.toml").write_text(text, encoding="utf-8")
+    survey = read_survey(folder / "survey.toml")
+    return separate_sizes(survey, find_photographs(survey))
+
+
+@pytest.mark.parametrize(
+    ("size", "kind", "pixel_mm"),
+    [
+        ((30, 40), "stored upright", (0.02, 0.01)),
+        ((80, 60), "resampled", (0.005, 0.01)),
+        ((36, 30), "cropped or from another sensor", (0.01, 0.02)),
+    ],
+)
+def test_photographs_of_another_size_are_a_second_camera(
+    size: tuple[int, int], kind: str, pixel_mm: tuple[float, float], tmp_path: Path
+) -> None:
+    sizes = {f"a{k}.png": (40, 30) for k in range(4)} | {f"b{k}.png": size for k in range(3)}
+    found = sized(tmp_path / "s", sizes)
+    assert [camera.name for camera in found.survey.cameras] == ["small", f"small {size[0]}x{size[1]}"]
+    assert found.files.camera.tolist() == [0] * 4 + [1] * 3 and found.left_out == ()
+    assert found.survey.cameras[1].pixel_mm == pytest.approx(pixel_mm)
+    (line,) = found.lines
+    assert line.startswith("3 photographs of camera small (b0.png, b1.png, b2.png) have") and kind in line
+
+
+@pytest.mark.parametrize(
+    ("count", "camera", "told"),
+    [
+        (1, "", "stored upright, which is another camera; 3 of them would be one"),
+        (3, "fixed = {K1 = 1e-4}", "its calibration does not hold there"),
+    ],
+)
+def test_too_few_of_them_are_left_out_with_a_remark(
+    count: int, camera: str, told: str, tmp_path: Path
+) -> None:
+    sizes = {f"a{k}.png": (40, 30) for k in range(4)} | {f"b{k}.png": (30, 40) for k in range(count)}
+    found = sized(tmp_path / "s", sizes, camera=camera)
+    assert [one.image for one in found.left_out] == [f"b{k}.png" for k in range(count)]
+    assert all(one.reason.endswith(told) for one in found.left_out)
+    assert len(found.survey.cameras) == 1 and len(found.files) == 4
+
+
+def test_sizes_that_agree_change_nothing(tmp_path: Path) -> None:
+    found = sized(tmp_path / "s", {"a.png": (40, 30), "b.png": (40, 30), "c.png": (40, 30)})
+    assert isinstance(found.survey, Survey) and found.lines == () and len(found.files) == 3
+
+
+def test_a_survey_with_a_crop_goes_on(tmp_path: Path) -> None:
+    path = write_photograph_survey(tmp_path / "s", "crop")
+    crop = cv2.imread(str(path.parent / "photo 3.png"), cv2.IMREAD_GRAYSCALE)
+    assert crop is not None
+    cv2.imwrite(str(path.parent / "photo 3.png"), crop[10 : HEIGHT - 20, 20 : WIDTH - 10])
+    result = run_survey(read_survey(path))
+    (failed,) = result.failed
+    assert failed.image == "photo 3.png" and "610 x 450 px, the others of camera small have" in failed.reason
+    assert result.images_total == 6 and len(result.network.images) == 5
+
+
+@pytest.mark.parametrize(
+    ("name", "told"),
+    [
+        ("a.HEIC", "a HEIF file, .* heif-convert"),
+        ("a.nef", "a raw file, .* dcraw -T -t 0"),
+        ("a.dng", "a raw file"),
+    ],
+)
+def test_what_must_be_converted_is_told_with_how(name: str, told: str, tmp_path: Path) -> None:
+    """Raw files are TIFF files whose first picture is a small preview."""
+    cv2.imwrite(str(tmp_path / "a.tif"), np.full((30, 40), 90, dtype=np.uint8))
+    (tmp_path / "a.tif").rename(tmp_path / name)
+    with pytest.raises(PhotographError, match=told):
+        read_photograph(tmp_path / name)
+    with pytest.raises(SurveyFileError, match=f"no photographs .* it holds {name}: {told}"):
+        draft_survey(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("at", "named", "allowed"),
+    [("photos", True, True), (".secret", True, False), ("photos", False, False), ("", True, False)],
+)
+def test_links_to_photographs_of_ones_own_are_read_in_a_folder_that_is_named(
+    at: str, named: bool, allowed: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    monkeypatch.setenv("USERPROFILE", str(tmp_path / "home"))
+    own = tmp_path / "home" / at if at else tmp_path / "elsewhere"
+    own.mkdir(parents=True)
+    given = tmp_path / "given"
+    given.mkdir()
+    for k in range(2):
+        cv2.imwrite(str(own / f"{k}.png"), np.full((30, 40), 90, dtype=np.uint8))
+        (given / f"{k}.png").symlink_to(own / f"{k}.png")
+    text = '[survey]\nname = "s"\nunit = "mm"\n[[camera]]\nname = "c"\nimages = "*.png"\nc_mm = 8.0\n'
+    (given / "survey.toml").write_text(text, encoding="utf-8")
+    survey = read_survey(given / "survey.toml")
+    if allowed:
+        assert find_photographs(survey, images_dir=given).names == ("0.png", "1.png")
+    else:
+        with pytest.raises(SurveyFileError, match="leaves the survey's folder"):
+            find_photographs(survey, images_dir=given if named else None)
+
+
+def test_tags_in_place_of_the_rings_that_were_asked_for_are_told(tmp_path: Path) -> None:
+    path = write_photograph_survey(tmp_path / "s", "no rings", photographs=2)
+    family = tag_family("aruco4x4_50")
+    for k in (1, 2):
+        sheet = np.full((HEIGHT, WIDTH), 220, dtype=np.uint8)
+        for number, (x, y) in enumerate(((60, 50), (300, 60 + 40 * k), (80, 250), (400, 280))):
+            tag = np.where(tag_modules(family, number), 20, 220).astype(np.uint8)
+            sheet[y : y + 120, x : x + 120] = np.kron(tag, np.ones((20, 20), dtype=np.uint8))
+        cv2.imwrite(str(path.parent / f"photo {k}.png"), cv2.GaussianBlur(sheet, (0, 0), 0.8))
+    with pytest.raises(GeometryError, match="shows 4 square tags: codes = 'aruco4x4_50' reads them"):
+        run_survey(read_survey(path))

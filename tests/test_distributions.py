@@ -1,0 +1,47 @@
+"""The distributions of test statistics are those of scipy.stats, far into their tails."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from sfm import distributions
+
+X = np.array([1e-6, 0.01, 0.5, 1.0, 4.0, 30.0, 250.0])
+P = np.array([1e-12, 1e-6, 1e-3, 0.05, 0.5, 0.95, 1 - 1e-6])
+
+
+@pytest.mark.parametrize(
+    ("ours", "theirs", "at", "redundancies"),
+    [
+        (distributions.chi2_sf, stats.chi2.sf, X, [(1,), (3,), (250,), (100_000,)]),
+        (distributions.chi2_isf, stats.chi2.isf, P, [(1,), (3,), (250,), (100_000,)]),
+        (distributions.chi2_ppf, stats.chi2.ppf, P, [(1,), (3,), (250,), (100_000,)]),
+        (distributions.f_sf, stats.f.sf, X, [(1, 2), (3, 40), (200, 100_000)]),
+        (distributions.t_sf, stats.t.sf, X, [(1,), (8,), (100_000,)]),
+        (distributions.t_ppf, stats.t.ppf, P, [(1,), (8,), (100_000,)]),
+        (distributions.normal_sf, stats.norm.sf, X, [()]),
+        (distributions.normal_ppf, stats.norm.ppf, P, [()]),
+    ],
+)
+def test_distributions_are_those_of_scipy(
+    ours: Callable[..., Any], theirs: Callable[..., Any], at: Any, redundancies: list[tuple[int, ...]]
+) -> None:
+    for r in redundancies:
+        np.testing.assert_allclose(ours(at, *r), theirs(at, *r), rtol=1e-9, atol=1e-300)
+
+
+def test_poisson() -> None:
+    np.testing.assert_allclose(
+        distributions.poisson_sf(np.arange(9), 2.5), stats.poisson.sf(np.arange(9), 2.5), rtol=1e-12
+    )
+
+
+def test_f_is_exceeded_with_the_probability_asked_for() -> None:
+    """scipy's own isf is the quantile of 1 - p, which loses five digits in the tail."""
+    for r in ((1, 2), (3, 40), (200, 100_000)):
+        np.testing.assert_allclose(stats.f.sf(distributions.f_isf(P, *r), *r), P, rtol=1e-9)
