@@ -128,7 +128,7 @@ def test_the_first_and_the_last_error_are_told() -> None:
     a = adjust(network, start, datum=Datum("free"), reject="none")
     v = residuals_of(network, start) / 0.1
     assert a.start_sigma0 == pytest.approx(np.sqrt((v**2).sum() / a.redundancy), rel=1e-9)
-    assert a.start_sigma0 > 50 * a.sigma0
+    assert a.start_sigma0 > 20 * a.sigma0
     found = findings_of(run_survey(survey_of(network, truth, free=(), start=start)))
     assert found.result.adjustment.start_sigma0 == pytest.approx(a.start_sigma0, rel=0.3)
     assert "at the start values" in text_report(found)

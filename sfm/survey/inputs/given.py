@@ -237,7 +237,7 @@ def _known_points(table: CsvTable, covariances: int = 0) -> KnownPoints:
         f"at least a millionth of the extent of the points, {extent:g}: coordinates and sigmas in one unit; "
         "0 for a fixed coordinate",
     )
-    check = np.nan_to_num(check)
+    check = np.nan_to_num(check) if check.size else np.zeros_like(xyz)
     table.refuse(check, (check != 0) & (check != 1), CHECKS, "0, 1 or nothing")
     table.refuse(check, (check == 1) & unknown, CHECKS, "0 or nothing for a coordinate that is not known")
     return KnownPoints(

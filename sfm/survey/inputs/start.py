@@ -97,7 +97,8 @@ def control_points(control: KnownPoints | None, points: Sequence[str]) -> Object
     if control.check is not None:  # as if it were not known
         given = given & ~control.check
         covariance = np.where(control.check[:, :, None] | control.check[:, None, :], 0.0, covariance)
-        covariance += np.einsum("nj,jk->njk", np.where(control.check, np.inf, 0.0), np.eye(3))
+        point, axis = np.nonzero(control.check)
+        covariance[point, axis, axis] = np.inf
     known = np.array([name in index for name in control.names], dtype=bool) & given.any(axis=1)
     # an unknown coordinate has any finite value, here the mean of the others, and no weight
     count = np.maximum(given.sum(axis=0), 1)
