@@ -105,13 +105,16 @@ def read_result(path: str | Path) -> StoredResult:
     return read_comparable(Path(path))
 
 
-def write_result(result: SurveyResult, folder: str | Path, *, jobs: int | None = None) -> Path:
+def write_result(
+    result: SurveyResult, folder: str | Path, *, jobs: int | None = None, pictures_mb: float = 15.0
+) -> Path:
     """Write tables, figures and the report of a result into a folder, whole or not at all.
 
     Args:
         result: of a survey.
         folder: an earlier result in it is replaced, anything else in it is an error.
         jobs: photographs drawn at the same time; as many as there are cores if not given.
+        pictures_mb: what the pictures inside report.html may take, 10^6 bytes; the rest lies in pictures/.
 
     Returns:
         The path of report.html.
@@ -129,7 +132,11 @@ def write_result(result: SurveyResult, folder: str | Path, *, jobs: int | None =
 
     with one_blas_thread():
         return write(
-            findings_of(result), Path(folder), write_colmap=colmap_writer(result), jobs=jobs or cores()
+            findings_of(result),
+            Path(folder),
+            write_colmap=colmap_writer(result),
+            jobs=jobs or cores(),
+            budget_mb=pictures_mb,
         )
 
 

@@ -254,15 +254,19 @@ class SurveyResult:
         cameras = self.adjustment.estimate.cameras
         return cameras[index_of([camera.name for camera in cameras], name, "camera")]
 
-    def write(self, folder: str | Path) -> Path:
+    def write(self, folder: str | Path, *, pictures_mb: float = 15.0) -> Path:
         """Write tables, figures and the report into a folder, whole or not at all; return report.html.
+
+        Args:
+            folder: an earlier result in it is replaced, anything else in it is an error.
+            pictures_mb: what the pictures inside report.html may take, 10^6 bytes; the rest lies beside it.
 
         Raises:
             OutputError: the folder cannot be written, or holds something else than an earlier result.
         """
         import sfm  # the report stands above the result, and is reached by its public name
 
-        page: Path = sfm.write_result(self, folder)
+        page: Path = sfm.write_result(self, folder, pictures_mb=pictures_mb)
         return page
 
     def _rows(self) -> list[tuple[str, str]]:

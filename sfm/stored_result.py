@@ -46,6 +46,18 @@ class StoredResult:
         """Whether lengths are in a known unit, from scale bars or control."""
         return self.unit not in ("", NO_SCALE)
 
+    def covariance_rows(self, points: IntArray) -> IntArray:
+        """Return the row of points among those that `covariance` is of, -1 where it is not of them.
+
+        Args:
+            points: indices, (k,).
+        """
+        if self.covariance_points is None:
+            return points
+        row = np.full(len(self.network.points), -1, dtype=np.int64)
+        row[self.covariance_points] = np.arange(len(self.covariance_points))
+        return np.asarray(row[points])
+
     @property
     def points(self) -> PointTable:
         """The object points by name."""

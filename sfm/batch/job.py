@@ -21,6 +21,7 @@ from sfm.pipeline import run_survey
 from sfm.report.findings.findings import findings_of
 from sfm.report.log import LOG, SurveyLog, read_log, remove_log, result_entries
 from sfm.report.output import write_result
+from sfm.report.viewer.pictures import BUDGET_MB
 from sfm.result import SurveyResult
 from sfm.runtime.executor import Tell
 from sfm.runtime.faults import is_fault, told_of_error
@@ -47,6 +48,7 @@ class SurveyJob:
     inputs: str  # fingerprint of everything that the survey reads
     allow_outside: bool  # whether the survey file may name files outside its folder
     owner: Owner | None  # of the folder of the batch, who asked for this
+    pictures_mb: float = BUDGET_MB  # what the pictures inside a report may take, 10^6 bytes
 
 
 @dataclass(frozen=True)
@@ -251,7 +253,11 @@ def _run(
 
     with locked(lock_of(job.out, job.folder), job.out / job.folder):
         write_result(
-            findings, job.out / job.folder, write_colmap=comparers.writer_of(result), finish=close_log
+            findings,
+            job.out / job.folder,
+            write_colmap=comparers.writer_of(result),
+            finish=close_log,
+            budget_mb=job.pictures_mb,
         )
         note_finished(job.out / job.folder)  # at once, in case the batch is killed now
     return row[0]

@@ -39,6 +39,7 @@ from sfm.files.plain_text import as_plain
 from sfm.files.whole_files import remove_leftovers
 from sfm.report.log import SurveyLog, refuse_other_log, remove_log
 from sfm.report.output import folder_name
+from sfm.report.viewer.pictures import BUDGET_MB
 from sfm.runtime.executor import Call, Done, Engine, Lost, Told, Work
 from sfm.survey.inputs.photograph_list import find_photographs
 from sfm.survey.inputs.start import refuse_unknown_photographs
@@ -86,6 +87,7 @@ def run_batch(
     *,
     resume: bool = False,
     allow_outside: bool = False,
+    pictures_mb: float = BUDGET_MB,
 ) -> tuple[SurveyRow, ...]:
     """Run surveys and write batch.csv, batch.json and index.html beside their results.
 
@@ -98,6 +100,7 @@ def run_batch(
         resume: keep what an earlier run finished from the same inputs; else everything is run, and only
             measured targets are taken from an earlier run.
         allow_outside: whether survey files may name files outside their folders.
+        pictures_mb: what the pictures inside a report may take, 10^6 bytes; the rest lies beside it.
 
     Returns:
         One row per survey in the order of the files.
@@ -120,7 +123,12 @@ def run_batch(
         watch.planned([plan.folder for plan in plans])
         try:
             with engine as running:
-                rows = _run(plans, out, running, comparers, watch, resume=resume, allow_outside=allow_outside)
+                rows = _run(
+                    *(plans, out, running, comparers, watch),
+                    resume=resume,
+                    allow_outside=allow_outside,
+                    pictures_mb=pictures_mb,
+                )
         finally:
             _clean(out, plans)
         ordered = tuple(rows[plan.folder] for plan in plans)
@@ -244,6 +252,7 @@ def _run(
     *,
     resume: bool,
     allow_outside: bool,
+    pictures_mb: float,
 ) -> dict[str, SurveyRow]:
     """Run what is not finished; what was near dying workers is run again alone, to see whose fault it is."""
     rows: dict[str, SurveyRow] = {}
@@ -263,7 +272,9 @@ def _run(
                     raise plan.survey
                 refuse_foreign_folder(out / plan.folder)
                 inputs = fingerprint(plan.survey)
-                job = SurveyJob(plan.file, out, plan.folder, inputs, allow_outside, owner_of(out / LOCK))
+                job = SurveyJob(
+                    *(plan.file, out, plan.folder, inputs, allow_outside, owner_of(out / LOCK)), pictures_mb
+                )
                 earlier = finished_row(job) if resume else None
                 if earlier is not None and not was_finished(out / plan.folder):
                     watch.remark(

@@ -8,6 +8,7 @@ import typer
 
 from sfm.cli.commands import (
     checking,
+    comparing_epochs,
     drafting,
     inspecting,
     measuring,
@@ -47,6 +48,7 @@ for _command in (
     inspecting.accept,
     solvers.validate,
     solvers.compare,
+    comparing_epochs.epochs,
     solvers.convert,
     refining.refine,
     checking.doctor,

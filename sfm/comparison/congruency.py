@@ -16,13 +16,20 @@ Analyse geodaetischer Deformationsmessungen; Baarda (1973), S-transformations an
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
+from sfm.comparison.stable_points import (
+    critical_value,
+    find_stable_points,
+    in_datum,
+    point_blocks,
+    single_tests,
+)
 from sfm.conventions import BoolArray, FloatArray
-from sfm.distributions import chi2_isf, f_isf
 from sfm.errors import GeometryError
 from sfm.similarity import mean_distance, similarity_motions
 
@@ -77,39 +84,42 @@ def congruency(
         GeometryError: too few points, or a covariance that is singular beyond the datum.
     """
     n = len(xyz)
-    stable = np.ones(n, dtype=bool) if datum is None else datum.copy()
-    u = MOTIONS[motion]
-    if stable.sum() < MIN_STABLE:
-        raise GeometryError(f"congruency: {int(stable.sum())} points, expected {MIN_STABLE} or more")
-    first = int(stable.sum())
-    G = motions(xyz)[:, :u]
-    single = critical_value(alpha / 2 / first, 3, redundancy)
-    carriers = stable.copy()
-    of_all = None
-    global_statistic, global_critical, agreed, smooth = 0.0, 0.0, False, 0.0
-    while True:
-        d, Q, omega, drops = _in_datum(difference, covariance, G, stable)
-        freedom = 3 * int(stable.sum()) - u
-        limit = critical_value(alpha / 2, freedom, redundancy)
-        if stable.sum() == first:
-            global_statistic, global_critical = omega / freedom, limit
-            of_all = d, Q, drops
-            smooth = 0.0
-            if omega / freedom > limit:
-                smooth = _smooth_fraction(difference, covariance, G, bending(xyz), stable)
-        agreed = omega / freedom <= limit and drops[stable].max() <= single
-        if agreed or stable.sum() - 1 < max(MIN_STABLE, STABLE_FRACTION * first):
-            break
-        stable[np.argmax(np.where(stable, drops, -np.inf))] = False
-    if not agreed and of_all is not None:
-        d, Q, drops = of_all
-        stable = carriers
-    moved = carriers & ~stable
-    if agreed and datum is not None:  # points that carry no datum are judged in it
-        others = critical_value(alpha / 2 / max(1, n - first), 3, redundancy)
-        moved |= ~datum & (drops > others)
+    candidates = np.ones(n, dtype=bool) if datum is None else datum.copy()
+    first = int(candidates.sum())
+    if first < MIN_STABLE:
+        raise GeometryError(f"congruency: {first} points, expected {MIN_STABLE} or more")
+    G = motions(xyz)[:, : MOTIONS[motion]]
+    found = find_stable_points(
+        difference,
+        covariance,
+        G,
+        candidates=candidates,
+        least=max(MIN_STABLE, math.ceil(STABLE_FRACTION * first)),
+        redundancy=redundancy,
+        alpha=alpha / 2,
+        alpha_single=alpha / 2,
+    )
+    start = found.steps[0]
+    smooth = 0.0
+    if start.statistic > start.critical:
+        smooth = smooth_fraction(difference, covariance, G, bending(xyz), candidates)
+    stable, drops = (found.stable, found.drops) if found.agreed else (candidates, found.drops_of_all)
+    d, Q = in_datum(difference, covariance, G, stable.astype(float))
+    T = np.where(stable, drops, single_tests(d, Q))
+    moved = candidates & ~stable
+    if found.agreed and datum is not None:  # points that carry no datum are judged in it
+        moved |= ~datum & (critical_value(alpha / 2 / max(1, n - first), 3, redundancy) < T)
     return Congruency(
-        d, Q, stable, moved, drops, single, global_statistic, global_critical, bool(agreed), smooth
+        difference=d,
+        covariance=point_blocks(Q, 3),
+        stable=stable,
+        moved=moved,
+        statistic=T,
+        critical=critical_value(alpha / 2 / first, 3, redundancy),
+        global_statistic=start.statistic,
+        global_critical=start.critical,
+        agreed=found.agreed,
+        smooth=smooth,
     )
 
 
@@ -139,7 +149,7 @@ def bending(xyz: FloatArray) -> FloatArray:
     return shapes.reshape(3 * len(xyz), -1)
 
 
-def _smooth_fraction(
+def smooth_fraction(
     difference: FloatArray, covariance: FloatArray, G: FloatArray, shapes: FloatArray, points: BoolArray
 ) -> float:
     """Return which fraction of Omega goes where the shapes may be fitted to the differences; 0 if too few."""
@@ -158,53 +168,3 @@ def _smooth_fraction(
     w, W = cho_solve(factor, d), cho_solve(factor, B)  # d and B have no part along the basis
     b = B.T @ w
     return float(b @ np.linalg.solve(B.T @ W, b) / (d @ w))
-
-
-def _in_datum(
-    difference: FloatArray, covariance: FloatArray, G: FloatArray, stable: BoolArray
-) -> tuple[FloatArray, FloatArray, float, FloatArray]:
-    """Return d_S, blocks of Q_S, Omega over the stable points, and T of each point."""
-    n = len(difference)
-    rows = np.repeat(stable, 3)
-    basis, triangle = np.linalg.qr(G[rows])  # orthonormal over the stable points
-    G = np.linalg.solve(triangle.T, G.T).T
-    d = difference.ravel() - G @ (basis.T @ difference.ravel()[rows])
-    # S Q S' = Q - G A' - A G' + G (B' Q_FF B) G' with A = Q_F' B
-    A = covariance[:, rows] @ basis
-    Q = covariance - G @ A.T - A @ G.T + G @ (basis.T @ A[rows]) @ G.T
-    blocks = np.stack([Q[3 * j : 3 * j + 3, 3 * j : 3 * j + 3] for j in range(n)])
-    inner = Q[np.ix_(rows, rows)]
-    level = float(np.trace(inner)) / len(inner)
-    try:
-        factor = cho_factor(inner + level * basis @ basis.T, lower=True)
-    except np.linalg.LinAlgError as error:
-        raise GeometryError(
-            "congruency: the covariance of the points is singular beyond its datum"
-        ) from error
-    P = cho_solve(factor, np.eye(len(inner))) - basis @ basis.T / level
-    w = P @ d[rows]
-    omega = float(d[rows] @ w)
-    T = np.full(n, np.nan)
-    own = np.stack([P[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] for k in range(len(inner) // 3)])
-    # the drop of Omega without point k: w_k' P_kk^-1 w_k
-    w3 = w.reshape(-1, 3)
-    T[stable] = np.einsum("ki,ki->k", w3, np.linalg.solve(own, w3[..., None])[..., 0]) / 3
-    moved = ~stable
-    d3 = d.reshape(-1, 3)
-    T[moved] = (
-        np.einsum("ki,ki->k", d3[moved], np.linalg.solve(blocks[moved], d3[moved][..., None])[..., 0]) / 3
-    )
-    return d3, blocks, omega, T
-
-
-def critical_value(alpha: float, freedom: int, redundancy: int | None) -> float:
-    """Return the value that a mean of `freedom` squares exceeds with probability alpha under no change.
-
-    Args:
-        alpha: error probability.
-        freedom: degrees of freedom of the statistic.
-        redundancy: of the variances; None if they are known.
-    """
-    if redundancy is None:
-        return float(chi2_isf(alpha, freedom) / freedom)
-    return float(f_isf(alpha, freedom, redundancy))

@@ -9,8 +9,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sfm.comparison.congruency import Congruency, congruency, critical_value
+from sfm.comparison.congruency import Congruency, congruency
 from sfm.comparison.pairing import Pairing
+from sfm.comparison.stable_points import critical_value
 from sfm.conventions import METRES, BoolArray, FloatArray, IntArray
 from sfm.errors import GeometryError
 from sfm.similarity import Similarity
@@ -70,7 +71,7 @@ def judge_points(
     if all(one.covariance is not None for one in known):
         if align == "none" and not in_control:
             return without("no common datum")
-        rows_a, rows_b = _rows_of_points(a, pa), _rows_of_points(b, pb)
+        rows_a, rows_b = a.covariance_rows(pa), b.covariance_rows(pb)
         both = np.flatnonzero((rows_a >= 0) & (rows_b >= 0))
         Q = _joint(a, rows_a[both], 1.0, np.eye(3))
         Q += _joint(b, rows_b[both], transform.scale, transform.rotation)
@@ -142,15 +143,6 @@ def _joint(result: StoredResult, points: IntArray, scale: float, rotation: Float
     J = scale * rotation
     moved: FloatArray = np.einsum("xa,iajb,yb->ixjy", J, Q, J, optimize=True)
     return moved.reshape(3 * n, 3 * n)
-
-
-def _rows_of_points(result: StoredResult, points: IntArray) -> IntArray:
-    """Return the row of each point in the covariance of points together, -1 where it is not in it, (n,)."""
-    if result.covariance_points is None:
-        return points
-    row = np.full(len(result.network.points), -1, dtype=np.int64)
-    row[result.covariance_points] = np.arange(len(result.covariance_points))
-    return np.asarray(row[points])
 
 
 def _held(Q: FloatArray) -> BoolArray:

@@ -18,8 +18,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
-from sfm.comparison.congruency import critical_value
 from sfm.comparison.pairing import fit_robustly
+from sfm.comparison.stable_points import critical_value
 from sfm.conventions import BoolArray, FloatArray, IntArray, rotation_from_vector
 from sfm.errors import GeometryError
 from sfm.geometry.functions import joined
@@ -250,29 +250,41 @@ def _refine(
     if Qn is not None:
         for k in range(n):
             spread[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] = Qn[k]
+    if weights == "network":
+        # from the start, which is so near that the weights do not change: turning Q takes the time
+        D, M = T.scale * T.rotation, similarity_motions(T.apply(source), centre=np.zeros(3))
+        M = M.reshape(3 * n, 7)[:, :u]
+        Qd = spread.copy() if Q is None else _right(_right(Q, D).T, D) + spread
+        unit = np.sqrt(np.trace(Qd) / len(Qd) / (M**2).mean(axis=0))
+        Qd += (M * unit) @ (M * unit).T
+        try:
+            factor = cho_factor(Qd, lower=True, overwrite_a=True, check_finite=False)
+        except LinAlgError as error:
+            raise GeometryError(
+                "alignment: the covariance of the points is singular beyond its datum, expected "
+                'weights = "equal"'
+            ) from error
     for _ in range(ITERATIONS):
         xyz = T.apply(source)
         D = T.scale * T.rotation
         M = similarity_motions(xyz, centre=np.zeros(3)).reshape(3 * n, 7)[:, :u]
         d = (xyz - target).ravel()
-        if weights == "equal":
-            PM = M
-        else:
-            Qd = spread if Q is None else spread + _right(_right(Q, D).T, D)
-            unit = np.sqrt(np.trace(Qd) / len(Qd) / (M**2).mean(axis=0))
-            try:
-                factor = cho_factor(Qd + (M * unit) @ (M * unit).T, lower=True)
-            except LinAlgError as error:
-                raise GeometryError(
-                    "alignment: the covariance of the points is singular beyond its datum, expected "
-                    'weights = "equal"'
-                ) from error
-            PM = cho_solve(factor, M)
+        PM = M if weights == "equal" else cho_solve(factor, M, check_finite=False)
         pull: FloatArray = np.asarray(np.linalg.solve(M.T @ PM, PM.T))
         step = -pull @ d
+        if not np.abs(step[3:]).max() < 1:
+            break
         T = _stepped(T, step)
         if np.abs(step[:3]).max() < CONVERGED * size and np.abs(step[3:]).max() < CONVERGED:
             break
+    else:
+        step = np.full(u, np.inf)
+    if not np.abs(step[3:]).max() < 1:
+        apart = float(np.sqrt(((T.apply(source) - target) ** 2).sum(axis=1).mean()))
+        raise GeometryError(
+            f"alignment: the best fit did not converge, measured and nominal points are {apart:.4g} apart "
+            "(RMS): another unit, other points, or a scale that is to be fitted"
+        )
     d = (T.apply(source) - target).ravel()
     omega = float(d @ d) if weights == "equal" else float(d @ cho_solve(factor, d))
     linear, of_nominal = np.zeros((7, 3 * n)), np.zeros((7, 7))

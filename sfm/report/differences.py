@@ -245,10 +245,13 @@ def differences_page(found: ResultComparison, xyz: FloatArray) -> str:
             "largest_statistic": _largest(found.statistic[np.isfinite(found.statistic)]),
         },
         known=[name for name, has in zip(found.names, found.has_sigma, strict=True) if has],
-        picture=Plot("differences", PICTURE, png(difference_figure(found, xyz)))
-        if len(found.points) >= 3 and largest > 0
-        else None,
+        picture=_picture(found, xyz) if len(found.points) >= 3 and largest > 0 else None,
     )
+
+
+def _picture(found: ResultComparison, xyz: FloatArray) -> Plot:
+    figure = difference_figure(xyz, found.point_difference, found.significant, found.unit)
+    return Plot("differences", PICTURE, png(figure))
 
 
 def _tested(found: ResultComparison) -> int:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
@@ -95,21 +96,23 @@ def write_result(
         if write_colmap is not None:
             (folder / "colmap").mkdir()
             write_colmap(folder / "colmap")
-        overlays = draw_overlays(result, jobs=jobs, progress=progress)
+        with ThreadPoolExecutor(max_workers=1) as beside:  # plots are drawn while others draw photographs
+            drawn = beside.submit(all_plots, findings)
+            overlays = draw_overlays(result, jobs=jobs, progress=progress)
+            scene = scene_of_result(findings)
+            files = {one.image: one.path for one in result.photographs}
+            pictures = cut_pictures(
+                scene, files, budget_mb=budget_mb, beside="pictures", jobs=jobs, progress=progress
+            )
+            plots = drawn.result()
         if overlays:
             (folder / "overlays").mkdir()
         for overlay in overlays:
             (folder / "overlays" / overlay.file_name).write_bytes(overlay.jpeg)
-        scene = scene_of_result(findings)
-        files = {one.image: one.path for one in result.photographs}
-        pictures = cut_pictures(
-            scene, files, budget_mb=budget_mb, beside="pictures", jobs=jobs, progress=progress
-        )
         if pictures.beside:
             (folder / "pictures").mkdir()
         for name, content in pictures.beside.items():
             (folder / "pictures" / name).write_bytes(content)
-        plots = all_plots(findings)
         (folder / "plots").mkdir()
         for plot in plots:
             (folder / "plots" / f"{plot.stem}.png").write_bytes(plot.png)

@@ -265,8 +265,8 @@ def test_a_calibration_and_a_survey_one_after_the_other_are_both_together() -> N
         second = part(np.arange(8) >= 4, InteriorObservations(*values, correlation))
         found = second.covariance.interior[0] / second.sigma0**2
         off = (second.estimate.cameras[0].parameters - together.estimate.cameras[0].parameters)[free] / unit
-        assert (np.abs(off).max() < 0.01) is same
-        assert (np.abs(np.sqrt(np.diagonal(found)) / unit - 1).max() < 0.01) is same
+        assert (np.abs(off).max() < 0.01) == same
+        assert (np.abs(np.sqrt(np.diagonal(found)) / unit - 1).max() < 0.01) == same
     assert second.observations == together.observations - first.observations + len(free)
 
 

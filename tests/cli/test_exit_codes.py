@@ -45,6 +45,7 @@ COMMANDS = {
     "validate": (),
     "doctor": (),
     "compare": ("a", "b"),
+    "epochs": ("a", "b"),
     "convert": ("a", "b"),
     "refine": ("model", "--images", "photographs"),
     "plan": (
@@ -90,6 +91,7 @@ def test_what_nobody_has_foreseen_is_one_line_with_its_traceback_in_a_file(
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     for module in (
         "surveying",
+        "comparing_epochs",
         "measuring",
         "solvers",
         "refining",

@@ -23,6 +23,7 @@ from sfm.pipeline import run_survey
 from sfm.report.findings.findings import findings_of
 from sfm.result import SurveyResult
 from sfm.similarity import fit_similarity
+from sfm.survey.inputs.calibration import with_calibration
 from sfm.survey.inputs.survey import Survey, read_survey
 from sfm.survey.measuring.target_store import TargetStore
 from tests.places import DATASETS, SHARED
@@ -57,14 +58,19 @@ class Outcome:
 
 
 def pairs_of(dataset: str, store: Path) -> Iterator[Outcome]:
-    """Survey random pairs of the photographs of a dataset, and compare with the survey of all of them."""
+    """Survey random pairs of the photographs of a dataset, and compare with the survey of all of them.
+
+    Each is surveyed with the start values of its cameras and, marked by a star, with the calibration of all.
+    """
     survey, folder = _survey(dataset), SHARED / "data" / dataset / "images"
     whole = _run(survey, folder, store)
     names = sorted(path.name for path in folder.glob(GLOBS[dataset]))
     rng = np.random.default_rng(SEED)
     every = [(a, b) for i, a in enumerate(names) for b in names[i + 1 :]]
+    calibrated = with_calibration(survey, whole.adjustment.estimate.cameras, "the whole survey")
     for k in rng.permutation(len(every))[:PAIRS]:
         yield outcome(dataset, _only(survey, every[k]), folder, store, whole, every[k])
+        yield outcome(f"{dataset} *", _only(calibrated, every[k]), folder, store, whole, every[k])
 
 
 def resampled(store: Path, folder: Path) -> Outcome:

@@ -22,6 +22,10 @@ import sfm.rendering.render
 from adapters.colmap.camera_models import write_model
 from adapters.colmap.database import read_database, write_database
 from adapters.formats.registry import FORMATS
+from adapters.formats.result_tables import write_tables
+from sfm.adjustment.covariance import marginal_of
+from sfm.adjustment.datum import Datum
+from sfm.adjustment.solve import adjust
 from sfm.batch.run import run_batch
 from sfm.errors import OutputError
 from sfm.files.folder_lock import locked
@@ -31,6 +35,7 @@ from sfm.kernels.sources import sources_of
 from sfm.photographs.exif import Metadata, read_metadata
 from sfm.report.log import SurveyLog, read_log
 from sfm.report.output import folder_name
+from sfm.stored_result import StoredResult
 from sfm.survey.measuring.target_store import MEASURING, TargetStore
 from sfm.targets.detect import Targets, find_targets
 from tests.engines import ALONE, HERE, Notes
@@ -83,6 +88,22 @@ def model(folder: Path) -> Path:
     network, estimate = make_network(seed_of("model"), model="opencv", images=4, points=20)
     write_model(folder / "model", network, estimate)
     return folder / "model"
+
+
+def results(folder: Path) -> tuple[Path, Path]:
+    """Tables of two results of one object."""
+    for seed in (1, 2):
+        network, truth = make_network(seed_of("results"), images=4, points=8, noise_px=0.0)
+        seen = network.image_points
+        noise = np.random.default_rng(seed).normal(0, 0.1, seen.xy.shape)
+        network = replace(network, image_points=replace(seen, xy=seen.xy + noise))
+        a = adjust(network, truth, datum=Datum("free"), sigma_px=0.1, reject="none")
+        joint = marginal_of(a).joint(np.zeros(0, dtype=np.int64), np.arange(8))
+        found = StoredResult(
+            *("r", network, a.estimate, a.covariance.points, None, None, a.redundancy, "m", joint, "free")
+        )
+        write_tables(folder / f"r{seed}", found)
+    return folder / "r1", folder / "r2"
 
 
 def photographs(folder: Path) -> tuple[Path, Path]:
@@ -141,6 +162,10 @@ COMMANDS: dict[str, Command] = {
     "compare": (
         lambda f: ("compare", model(f), f / "model"),
         ("out", "out/comparison", "out/.comparison.lock"),
+    ),
+    "epochs": (
+        lambda f: ("epochs", *results(f)),
+        ("out", "out/epochs", "out/.epochs.lock"),
     ),
     "validate": (
         lambda f: ("validate", "--networks", 1, "--jobs", 1),

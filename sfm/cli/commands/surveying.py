@@ -154,6 +154,21 @@ def adjust(
     )
 
 
+def run_file(survey_file: Path) -> Path:
+    """Run a survey file, with photographs or without, and return the folder of its result, out/NAME."""
+    with loading():
+        from sfm.survey.inputs.survey_file import read_survey_file
+
+    with working_on(str(survey_file)):
+        described = read_survey_file(survey_file, allow_outside=False)
+    return _run_survey(
+        *(survey_file, None, None, None, False, False),
+        from_photographs=described.observations is None,
+        camera=None,
+        weighted=False,
+    )
+
+
 def _run_survey(
     survey_file: Path,
     images: Path | None,
@@ -166,8 +181,8 @@ def _run_survey(
     camera: Path | None,
     weighted: bool,
     pictures_mb: float = 0.0,
-) -> None:
-    """Run a survey, write its result and tell it; `from_photographs` is what the command is for."""
+) -> Path:
+    """Run a survey, write and tell its result, return its folder; the command is for photographs or not."""
     begun = time.perf_counter()
     with loading():
         from sfm.api import colmap_writer, one_blas_thread, programs_of, read_result
@@ -234,6 +249,7 @@ def _run_survey(
         )
     if not tell_result(findings, page, seconds=time.perf_counter() - begun, verbose=verbose):
         raise SystemExit(FAILED)
+    return folder
 
 
 def batch(
@@ -265,6 +281,7 @@ def batch(
             "its workers need Kolinear and see the same folders.",
         ),
     ] = None,
+    pictures_mb: PicturesMb = 15.0,
     resume: Annotated[
         bool, typer.Option("--resume", help="Keep what an earlier run finished, if its inputs are the same.")
     ] = False,
@@ -303,6 +320,7 @@ def batch(
             table,
             resume=resume,
             allow_outside=allow_outside,
+            pictures_mb=pictures_mb,
         )
     print_batch(Console(highlight=False), rows, out / "index.html")
     if any(row.fault for row in rows):

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sfm.comparison.congruency import critical_value
+from sfm.comparison.stable_points import critical_value
 from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.errors import GeometryError
 from sfm.geometry.measured import Function, MeasuredPoints
@@ -165,7 +165,7 @@ def _fit(
     if not size > 0:
         raise GeometryError(f"its {len(rows)} points coincide")
     x = (xyz - centroid) / size
-    Q = None if points.covariance is None else _covariance(points, rows) / size**2
+    Q = None if points.covariance is None else _covariance(points, rows)
     _refuse_flat(kind, x, points.blocks[rows] / size**2, axis_held="direction" in hold)
     free, origin, axis, form = _held(kind, hold, centroid, size)
     placed = origin is None
@@ -194,11 +194,13 @@ def _fit(
     statistic = critical = np.nan
     if weights == "network":
         assert Q is not None
-        own = Q[used] if Q.ndim == 3 else Q[np.ix_(np.repeat(used, 3), np.repeat(used, 3))]
-        fit = refine_weighted(shape, x[used], own, free=free, offset=off, placed=placed)
+        own = Q
+        if not used.all():
+            own = Q[used] if Q.ndim == 3 else Q[np.ix_(np.repeat(used, 3), np.repeat(used, 3))]
+        fit = refine_weighted(shape, x[used], own, free=free, offset=off, size=size, placed=placed)
         shape, converged = fit.shape, fit.converged
         linear[:, used] = fit.linear.reshape(A.shape[1], -1, 3)
-        C = fit.covariance
+        C = _product(linear.reshape(len(linear), -1), Q) / size**2
         w[used] = fit.standardised
         sigma0 = np.sqrt(fit.omega / redundancy) if redundancy else np.nan
         if redundancy:
@@ -211,9 +213,9 @@ def _fit(
         if Q is None:
             C = inverse * (sigma0 / size) ** 2
         else:
-            C = _product(flat, Q)
+            C = _product(flat, Q) / size**2
     d, B, A = shape.design(x)
-    sigma = _sigma_of_distances(Q, d - off, B, A[..., free], linear, C)
+    sigma = _sigma_of_distances(Q, d - off, B, A[..., free], linear, C * size**2)
     # back to object units: shifts and lengths grow with the size, angles do not
     units = np.concatenate([np.full(3, size), np.ones(3), _lengths(kind, size)])[free]
     parameters, value, by_local = parameters_of(shape.scaled(size, centroid))
@@ -230,7 +232,7 @@ def _fit(
         J @ (C * np.outer(units, units)) @ J.T,
         weights == "equal" and Q is None,
         (d - off) * size,
-        sigma * size,
+        sigma,
         w,
         float(sigma0),
         redundancy,

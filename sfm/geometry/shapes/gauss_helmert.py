@@ -6,8 +6,8 @@ Q_w = B Q B': for a single point its normal weighs n' Q n.
 
 The covariance of a free network is singular, and Q_w is so where a motion of the network is one of the shape
 (all points on one plane). W = Q_w + A U A' takes its place: estimates, residuals and v' Q^-1 v are those of
-Q_w, and the covariance of the parameters is (A' W^-1 A)^-1 - U. In another datum of the network the adjusted
-points and the shape are moved together: its form, v' Q^-1 v and the tests of the points are the same.
+Q_w, and so is the covariance F Q F' = (A' W^-1 A)^-1 - U of the parameters. In another datum of the network
+the adjusted points and the shape are moved together: its form, v' Q^-1 v and the tests are the same.
 
 Source: Helmert (1907), Die Ausgleichungsrechnung; Pope (1972), Some pitfalls to be avoided in the iterative
 adjustment of nonlinear problems; Rao (1973), Linear Statistical Inference, sec. 4i (unified theory).
@@ -19,6 +19,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
+from scipy.linalg.lapack import dpotri
 
 from sfm.conventions import BoolArray, FloatArray
 from sfm.errors import GeometryError
@@ -27,6 +28,7 @@ from sfm.geometry.shapes.shape import Shape
 
 ITERATIONS = 100
 CONVERGED = 1e-13  # of steps over the unit size of the points
+SAME_NORMALS = 1e-9  # change of normals that leaves the weights as they are
 SINGULAR = 1e-6  # standard deviation of a constraint over the largest, of what others leave of it
 UNCHECKED = 1e-9  # redundancy of a constraint below which nothing checks it
 
@@ -40,7 +42,6 @@ class Weighted:
     normals: FloatArray  # B, of each constraint by its point, (n, c, 3)
     design: FloatArray  # A, of the constraints by the free parameters, (n c, u)
     linear: FloatArray  # F, of the parameters by the coordinates, (u, 3 n)
-    covariance: FloatArray  # of the free parameters, (u, u)
     omega: float  # v' Q^-1 v
     standardised: (
         FloatArray  # the largest of the tests of each point: w, or the root of T of two constraints, (n,)
@@ -55,6 +56,7 @@ def refine_weighted(
     *,
     free: BoolArray,
     offset: FloatArray,
+    size: float = 1.0,
     placed: bool = True,
 ) -> Weighted:
     """Return the shape of the least v' Q^-1 v near a start.
@@ -62,9 +64,11 @@ def refine_weighted(
     Args:
         start: the fit with equal weights.
         xyz: points about their centroid, of unit size, (n, 3).
-        covariance: Q of all coordinates together (3 n, 3 n), or of each point by itself (n, 3, 3).
+        covariance: Q of all coordinates together (3 n, 3 n), or of each point by itself (n, 3, 3), in units
+            of which `size` make one of the points.
         free: which of the six motions and the form are adjusted, (6 + q,).
         offset: signed distances that the points shall have, (c,).
+        size: unit of the points in those of the covariance.
         placed: whether the origin may stand anywhere along the axis.
 
     Raises:
@@ -76,18 +80,20 @@ def refine_weighted(
     d, B, _ = shape.design(xyz)
     adjusted = xyz - np.einsum("nc,nci->ni", d - offset, B)
     converged = False
+    factored = np.full_like(B, np.inf)  # normals that the weights were computed with
     for _ in range(ITERATIONS):
         d, B, A = shape.design(adjusted)
         w = (d - offset + np.einsum("nci,ni->nc", B, xyz - adjusted)).ravel()
         A = A[..., free].reshape(len(w), -1)
-        Qw = constraint_covariance(covariance, B)
-        unit = _unit(Qw, A)
-        solve = _factor(Qw, A * unit)
+        if not np.abs(B - factored).max(initial=0.0) < SAME_NORMALS:
+            Qw = constraint_covariance(covariance, B) / size**2
+            unit = _unit(Qw, A)
+            solve, factored = _factor(Qw, A * unit), B
         PA = solve(A)
         N = A.T @ PA
         dp = -np.linalg.solve(N, PA.T @ w)
         k = -solve(w + A @ dp)
-        v = times_covariance(covariance, B, k)
+        v = times_covariance(covariance, B, k) / size**2
         step = np.zeros(len(free))
         step[free] = dp
         shape = shape.moved(step, nothing) if placed else moved_in_place(shape, step)
@@ -105,7 +111,6 @@ def refine_weighted(
         B,
         A,
         np.asarray(np.einsum("unc,nci->uni", by_point, B).reshape(len(dp), 3 * n)),
-        inverse - np.diag(unit**2),
         max(float(-k @ (w + A @ dp)), 0.0),
         _tests(k, solve, PA, inverse, n),
         converged,
@@ -117,7 +122,7 @@ def constraint_covariance(covariance: FloatArray, normals: FloatArray) -> FloatA
     if covariance.ndim == 3:
         return np.asarray(np.einsum("nai,nij,nbj->nab", normals, covariance, normals))
     n, c, _ = normals.shape
-    half = np.einsum("nci,nik->nck", normals, covariance.reshape(n, 3, 3 * n)).reshape(n * c, n, 3)
+    half = (normals @ covariance.reshape(n, 3, 3 * n)).reshape(n * c, n, 3)
     return np.asarray(np.einsum("kni,nci->knc", half, normals).reshape(n * c, n * c))
 
 
@@ -160,10 +165,18 @@ class _Dense:
     """W of correlated points."""
 
     def __init__(self, Qw: FloatArray, AU: FloatArray) -> None:
-        self.factor = cho_factor(Qw + AU @ AU.T, lower=True)
+        W = AU @ AU.T
+        W += Qw
+        self.factor = cho_factor(W, lower=True, overwrite_a=True, check_finite=False)
+
+    def inverse_blocks(self, n: int, c: int) -> FloatArray:
+        """Return the blocks (n, c, c) on the diagonal of the inverse."""
+        lower, _ = dpotri(self.factor[0], lower=True)
+        W = lower.reshape(n, c, n, c)[np.arange(n), :, np.arange(n), :]
+        return np.asarray(np.tril(W) + np.tril(W, -1).transpose(0, 2, 1))
 
     def __call__(self, b: FloatArray) -> FloatArray:
-        return np.asarray(cho_solve(self.factor, b))
+        return np.asarray(cho_solve(self.factor, b, check_finite=False))
 
 
 def _factor(Qw: FloatArray, AU: FloatArray) -> _Blocks | _Dense:
@@ -189,8 +202,7 @@ def _tests(k: FloatArray, solve: _Blocks | _Dense, PA: FloatArray, inverse: Floa
         AU = solve.own.reshape(n, c, -1)
         blocks = solve.inverse - np.einsum("nau,uv,nbv->nab", AU, solve.core, AU)
     else:
-        W = solve(np.eye(len(k))).reshape(n, c, n, c)
-        blocks = W[np.arange(n), :, np.arange(n), :]
+        blocks = solve.inverse_blocks(n, c)
     scale = np.einsum("naa->n", blocks)[:, None]
     own = PA.reshape(n, c, -1)
     blocks = blocks - np.einsum("nau,uv,nbv->nab", own, inverse, own)

@@ -5,30 +5,38 @@ from __future__ import annotations
 import numpy as np
 from matplotlib.figure import Figure
 
-from sfm.comparison.significance import ResultComparison
 from sfm.comparison.two_adjusters.adjuster_validation import Validation
-from sfm.conventions import FloatArray
+from sfm.conventions import BoolArray, FloatArray
 from sfm.report.figures.plots import BLUE, RED, plan_axes
 from sfm.report.numbers import finer_unit, significant
 
 LONGEST_ARROW = 0.1  # of the object's size, that of the largest difference
 
 
-def difference_figure(found: ResultComparison, xyz: FloatArray) -> Figure:
-    """Draw the differences as arrows on the object's main plane, and across it as colours."""
+def difference_figure(
+    xyz: FloatArray, difference: FloatArray, significant_ones: BoolArray, unit: str
+) -> Figure:
+    """Draw differences as arrows on the object's main plane, and across it as colours.
+
+    Args:
+        xyz: coordinates, object unit, (n, 3).
+        difference: object unit, (n, 3).
+        significant_ones: drawn in red, (n,).
+        unit: the object unit, empty where nobody knows.
+    """
     plane, names = plan_axes(xyz)
-    turned, d = xyz @ plane.T, found.point_difference @ plane.T
+    turned, d = xyz @ plane.T, difference @ plane.T
     flat = turned[:, :2]
     size = float(np.linalg.norm(np.ptp(flat, axis=0)))
     longest = float(np.linalg.norm(d[:, :2], axis=1).max())
     across = float(np.abs(d[:, 2]).max())
     factor = LONGEST_ARROW * size / longest if longest > 0 else 1.0
-    finer, fine_unit = finer_unit(found.unit, max(longest, across))
+    finer, fine_unit = finer_unit(unit, max(longest, across))
     fine_unit = fine_unit or "object units"
     height = float(np.clip(8.5 * np.ptp(flat[:, 1]) / max(np.ptp(flat[:, 0]), 1e-12 * size), 2.5, 8.0))
     picture = Figure(figsize=(8.5, height + 0.8), layout="constrained")
     axes = picture.subplots()
-    colours = np.where(found.significant, RED, BLUE)
+    colours = np.where(significant_ones, RED, BLUE)
     arrows = axes.quiver(
         *flat.T, *(factor * d[:, :2]).T, color=colours, angles="xy", scale_units="xy", scale=1, width=0.002
     )
@@ -50,9 +58,9 @@ def difference_figure(found: ResultComparison, xyz: FloatArray) -> Figure:
         axes.quiverkey(arrows, 0.08, 1.03, factor * longest, label, labelpos="E", coordinates="axes")
     axes.plot(*(flat + factor * d[:, :2]).T, alpha=0.0)  # arrows do not widen the axes by themselves
     axes.set_aspect("equal")
-    unit = f" [{found.unit}]" if found.unit else ""
-    axes.set_xlabel(f"{names[0]}{unit}")
-    axes.set_ylabel(f"{names[1]}{unit}")
+    suffix = f" [{unit}]" if unit else ""
+    axes.set_xlabel(f"{names[0]}{suffix}")
+    axes.set_ylabel(f"{names[1]}{suffix}")
     return picture
 
 
@@ -68,4 +76,29 @@ def time_figure(validation: Validation) -> Figure:
     axes.set_ylabel("s")
     axes.grid(alpha=0.3)
     axes.legend(frameon=False)
+    return picture
+
+
+def series_figure(
+    names: tuple[str, ...], points: tuple[str, ...], length: FloatArray, sigma: FloatArray, unit: str
+) -> Figure:
+    """Draw the displacement of points from epoch to epoch, with the band of two standard deviations.
+
+    Args:
+        names: of the epochs, k of them.
+        points: names of p points.
+        length: displacement since the first epoch along its last direction, unit, (p, k).
+        sigma: standard deviations of these, unit, (p, k).
+        unit: of lengths.
+    """
+    picture = Figure(figsize=(8.5, 3.8), layout="constrained")
+    axes = picture.subplots()
+    at = np.arange(len(names))
+    for name, values, s in zip(points, length, sigma, strict=True):
+        (line,) = axes.plot(at, values, marker="o", ms=3, label=name)
+        axes.fill_between(at, values - 2 * s, values + 2 * s, color=line.get_color(), alpha=0.15, lw=0)
+    axes.axhline(0.0, color="grey", lw=0.8)
+    axes.set_xticks(at, names)
+    axes.set_ylabel(f"displacement [{unit}]")
+    axes.legend(fontsize=8, ncols=4)
     return picture

@@ -34,7 +34,9 @@ def render(
         context: what the template asks for.
     """
     if viewer is not None:
-        policy = content_policy([_style(), viewer.style], [viewer.script], pictures_beside=pictures_beside)
+        policy = content_policy(
+            [_style(), viewer.style], [viewer.script, _script()], pictures_beside=pictures_beside
+        )
         context |= {"viewer": viewer, "policy": policy}
     return environment().get_template(template).render(context)
 
@@ -63,9 +65,16 @@ def environment() -> Environment:
         "finer_unit_of": finer_unit_of,
         "strong": STRONG,
         "style": Markup(style),
-        "policy": content_policy([style]),
+        "tables_script": Markup(_script()),
+        "policy": content_policy([style], [_script()]),
     }
     return made
+
+
+@cache
+def _script() -> str:
+    """Return the script of the tables, which every page has."""
+    return files("sfm.report.html").joinpath("tables.js").read_text(encoding="utf-8")
 
 
 @cache

@@ -27,6 +27,8 @@ MARGIN_PX, MARGIN_SHARE, MARGIN_MAX_PX = 4.0, 0.25, 10.0
 LARGE_PX, BAND_PX = 25.0, 15.0
 # Blur of the edge at the start and its limits.
 BLUR_START, MIN_BLUR = 0.9, 0.25
+# A ray ends so far before the rise to a neighbour; with soft edges so many sigma, where 1 % of it are left.
+SKIRT_PX, SKIRT_SIGMAS = 1.0, 1.7
 # The outline is traced again if it changed by more than this share of the radius; so many rays must agree.
 MAX_TRACES, SMALL_CHANGE, MIN_AGREEMENT = 2, 0.08, 0.7
 _NONE = int(Flag.NONE)
@@ -115,14 +117,65 @@ def _fit_one(
     if theta[model.CONTRAST] * sign <= 0 or n < 2 * model.UNKNOWNS:
         return flag | _NO_CONVERGENCE
     prior = (noise / GAIN_SIGMA) ** 2
-    N, N_trial = np.empty((model.UNKNOWNS, model.UNKNOWNS)), np.empty((model.UNKNOWNS, model.UNKNOWNS))
+    N = np.empty((model.UNKNOWNS, model.UNKNOWNS))
+    steps = _iterate(pixels, n, theta, length, saturation, prior, J, N)
+    skirt = SKIRT_SIGMAS * theta[model.BLUR] - SKIRT_PX
+    if steps > 0 and skirt > SKIRT_PX and theta[model.CONTRAST] * sign > 0:
+        # the edges of neighbours are as soft: their skirts begin farther away from them than the rays say
+        wide = np.empty(RAYS)
+        trace_rays(image, theta, sign, noise, margin + skirt, edge, wide)
+        nearer = False
+        for k in range(RAYS):
+            if 0 <= wide[k] < limit[k] + skirt and wide[k] < margin + skirt:
+                limit[k], nearer = max(0.0, wide[k] - skirt), True
+        if nearer:
+            flag |= _CLOSE_NEIGHBOUR
+            n = _collect(image, theta, limit, margin, half_x, half_y, mean < LARGE_PX, pixels)
+            steps = (
+                _iterate(pixels, n, theta, length, saturation, prior, J, N) if n > 2 * model.UNKNOWNS else 0
+            )
+    done = steps > 0
+    goodness.judge_residuals(pixels, n, theta, length, saturation, J, statistics)
+    goodness.judge_background(image, theta, length, statistics)
+    goodness.judge_glow(pixels, n, theta, saturation, statistics)
+    statistics[goodness.STEPS] = abs(steps)
+    N[model.GAIN_X, model.GAIN_X] += prior
+    N[model.GAIN_Y, model.GAIN_Y] += prior
+    if (
+        not done
+        or theta[model.CONTRAST] * sign <= 0
+        or statistics[goodness.PIXELS] <= model.UNKNOWNS
+        or not invert_symmetric(N)
+    ):
+        return flag | _NO_CONVERGENCE
+    cofactor[:] = N
+    return flag
+
+
+@compiled
+def _iterate(
+    pixels: FloatArray,
+    n: int,
+    theta: FloatArray,
+    length: float,
+    saturation: float,
+    prior: float,
+    J: FloatArray,
+    N: FloatArray,
+) -> int:
+    """Improve theta by Levenberg-Marquardt steps; N is its normal equations, without the prior.
+
+    Returns:
+        The number of steps, negative or 0 where they did not converge.
+    """
+    mean = (theta[model.P] * theta[model.R] - theta[model.Q] ** 2) ** -0.5
+    N_trial = np.empty((model.UNKNOWNS, model.UNKNOWNS))
     L = np.empty((model.UNKNOWNS, model.UNKNOWNS))
     g, g_trial, trial = np.empty(model.UNKNOWNS), np.empty(model.UNKNOWNS), np.empty(model.UNKNOWNS)
     total, used = model.normal_equations(pixels, n, theta, length, saturation, J, N, g)
     damping = 1e-3
-    done = False
     steps = 0
-    while steps < MAX_STEPS and damping < 1e6 and not done:
+    while steps < MAX_STEPS and damping < 1e6:
         steps += 1
         for i in range(model.UNKNOWNS):
             for j in range(i + 1):
@@ -132,7 +185,7 @@ def _fit_one(
             L[i, i] *= 1 + damping
             trial[i] = g[i] - (prior * theta[i] if i >= model.GAIN_X else 0.0)
         if not solve_symmetric(L, trial):
-            return flag | _NO_CONVERGENCE
+            return -steps
         shift = max(abs(trial[model.X0]), abs(trial[model.Y0]))
         for i in range(model.UNKNOWNS):
             trial[i] += theta[i]
@@ -146,8 +199,7 @@ def _fit_one(
             continue
         if shift < LAST_STEP_PX and damping < 1e-3:
             theta[:] = trial
-            done = True
-            break
+            return steps
         squares, used_trial = model.normal_equations(
             pixels, n, trial, length, saturation, J, N_trial, g_trial
         )
@@ -159,21 +211,7 @@ def _fit_one(
             damping *= 0.1
         else:
             damping = max(damping, 1e-3) * 10
-    goodness.judge_residuals(pixels, n, theta, length, saturation, J, statistics)
-    goodness.judge_background(image, theta, length, statistics)
-    goodness.judge_glow(pixels, n, theta, saturation, statistics)
-    statistics[goodness.STEPS] = steps
-    N[model.GAIN_X, model.GAIN_X] += prior
-    N[model.GAIN_Y, model.GAIN_Y] += prior
-    if (
-        not done
-        or theta[model.CONTRAST] * sign <= 0
-        or statistics[goodness.PIXELS] <= model.UNKNOWNS
-        or not invert_symmetric(N)
-    ):
-        return flag | _NO_CONVERGENCE
-    cofactor[:] = N
-    return flag
+    return -steps
 
 
 @compiled

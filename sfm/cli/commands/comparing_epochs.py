@@ -1,0 +1,107 @@
+"""The command `epochs`: what moved between two or more surveys of one object."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from sfm.cli.commands.starting import loading
+from sfm.errors import SurveyFileError
+from sfm.runtime.faults import working_on
+
+if TYPE_CHECKING:
+    from sfm.epochs.differences import Epoch
+
+
+def epochs(
+    results: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="FIRST SECOND ...",
+            help="Result folders in their order; a survey file is run first, its result goes to out/NAME.",
+        ),
+    ],
+    reference: Annotated[
+        str,
+        typer.Option(
+            "--reference",
+            metavar="P,Q,...",
+            help="Points taken as stable until a test says otherwise: names, patterns such as R*, ranges "
+            "such as 501-520.  [default: all]",
+        ),
+    ] = "",
+    group: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--group",
+            metavar="NAME=P,Q,...",
+            help="Points whose motion as a block is asked for; may be given several times.",
+        ),
+    ] = None,
+    model: Annotated[
+        str, typer.Option("--model", help="How groups move: rigid, similarity or affine.")
+    ] = "rigid",
+    alpha: Annotated[
+        float,
+        typer.Option(
+            "--alpha", min=1e-6, max=0.5, help="Probability of saying that something moved where nothing did."
+        ),
+    ] = 0.05,
+    out: Annotated[
+        Path, typer.Option("--out", metavar="DIR", help="Folder of tables, JSON and page.")
+    ] = Path("out/epochs"),
+) -> None:
+    """Tell what moved between surveys of one object.
+
+    Congruency test, the points that are stable, displacements with their tests, and motion of groups.
+    """
+    with loading():
+        from sfm.epochs.series import analyse_epochs
+        from sfm.files.manifest import refuse_foreign_folder
+        from sfm.report.epochs import pairs_of, words_of_block, words_of_pair, words_of_stable, write_epochs
+
+    refuse_foreign_folder(out)
+    groups = {name: _listed(points) for name, points in map(_named, group or ())}
+    given = [_epoch(path) for path in results]
+    with working_on(" ".join(map(str, results))):
+        found = analyse_epochs(given, reference=_listed(reference), groups=groups, model=model, alpha=alpha)
+    page = write_epochs(found, out)
+    for pair in pairs_of(found):
+        print(words_of_pair(pair.displacements)[0])
+        print(f"  {words_of_stable(pair.displacements)}")
+        for block in (*pair.groups, *([pair.together] if pair.together is not None else [])):
+            print(f"  {words_of_block(block)}")
+    print(f"Report: {page}")
+
+
+def _epoch(path: Path) -> Epoch:
+    """Return an epoch of a result folder, or of a survey file, which is run."""
+    from adapters.formats.given_table import read_given
+    from adapters.formats.result_tables import read_result
+    from sfm.epochs.differences import Epoch
+
+    folder = _run(path) if path.is_file() else path
+    with working_on(str(folder)):
+        result = read_result(folder)
+        given = read_given(folder, result.network)
+    return Epoch(folder.name, result, given.bars, given.control, given.interior)
+
+
+def _run(survey_file: Path) -> Path:
+    """Run a survey and return the folder of its result."""
+    from sfm.cli.commands.surveying import run_file
+
+    return run_file(survey_file)
+
+
+def _named(text: str) -> tuple[str, str]:
+    name, equals, points = text.partition("=")
+    if not (name.strip() and equals and points.strip()):
+        raise SurveyFileError(f"--group {text}: expected a name and its points, such as pier=P*,17")
+    return name.strip(), points
+
+
+def _listed(text: str) -> list[str]:
+    return [part.strip() for part in text.split(",") if part.strip()]

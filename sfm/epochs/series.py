@@ -1,0 +1,137 @@
+"""Two or more epochs of one object: each against the first, and each against the one before.
+
+Source: Niemeier (2008), Ausgleichungsrechnung, sec. 12; Caspary (2000), Concepts of network and deformation
+analysis, sec. 7.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from sfm.conventions import BoolArray
+from sfm.epochs.blocks import MIN_POINTS, BlockMotion, block_motion
+from sfm.epochs.differences import Differences, Epoch, epoch_differences
+from sfm.epochs.displacements import ALPHA, Displacements, displacements
+from sfm.errors import GeometryError
+from sfm.geometry.measured import matches
+
+MOVED = "points that moved"
+
+
+@dataclass(frozen=True)
+class EpochPair:
+    """What moved between two epochs, by points and by groups."""
+
+    displacements: Displacements
+    groups: tuple[BlockMotion, ...]  # those asked for
+    together: BlockMotion | None  # of all points that moved, as one rigid block; None where they are too few
+
+
+@dataclass(frozen=True)
+class EpochSeries:
+    """Epochs of one object in their order."""
+
+    names: tuple[str, ...]
+    since_first: tuple[EpochPair, ...]  # of every epoch from the second on, against the first
+    since_previous: tuple[EpochPair, ...]  # against the one before
+
+    @property
+    def changed(self) -> bool:
+        """Whether anything moved between any two of them."""
+        return any(pair.displacements.changed for pair in (*self.since_first, *self.since_previous))
+
+
+def analyse_epochs(
+    epochs: Sequence[Epoch],
+    *,
+    reference: Sequence[str] = (),
+    groups: Mapping[str, Sequence[str]] | None = None,
+    model: str = "rigid",
+    alpha: float = ALPHA,
+) -> EpochSeries:
+    """Test what moved between epochs.
+
+    Args:
+        epochs: two or more, in their order.
+        reference: names or patterns (`R*`) of the points that may carry the datum; all common ones if empty.
+        groups: names or patterns of the points of each group whose motion is asked for.
+        model: of the motion of groups: rigid, similarity or affine.
+        alpha: level of the tests of every pair of epochs.
+
+    Raises:
+        GeometryError: fewer than two epochs, two of one name, a point of reference that an epoch lacks, too
+            few points, or what `epoch_differences` and `block_motion` refuse.
+
+    Source: Niemeier (2008), Ausgleichungsrechnung, sec. 12.
+    """
+    if len(epochs) < 2:
+        raise GeometryError(f"epochs: {len(epochs)} given, expected 2 or more")
+    names = tuple(epoch.name for epoch in epochs)
+    twice = next((name for k, name in enumerate(names) if name in names[:k]), None)
+    if twice is not None:
+        raise GeometryError(f"epochs: two of them are called '{twice}'; give each a name of its own")
+
+    def analysed(first: Epoch, second: Epoch) -> EpochPair:
+        found = epoch_differences(first, second)
+        chosen = _reference(found, reference, (first, second)) if reference else None
+        moved = displacements(found, reference=chosen, alpha=alpha)
+        return EpochPair(
+            moved,
+            tuple(
+                block_motion(moved, _group(found, name, patterns), name=name, model=model)
+                for name, patterns in (groups or {}).items()
+            ),
+            _together(moved),
+        )
+
+    first = [analysed(epochs[0], epoch) for epoch in epochs[1:]]
+    previous = [first[0]]
+    previous += [analysed(one, other) for one, other in pairwise(epochs[1:])]
+    return EpochSeries(names, tuple(first), tuple(previous))
+
+
+def _reference(found: Differences, patterns: Sequence[str], epochs: tuple[Epoch, Epoch]) -> BoolArray:
+    """Return the points of reference among the common ones; one that an epoch lacks is an error."""
+    chosen = np.zeros(len(found.points), dtype=bool)
+    for pattern in patterns:
+        hits = _matching(found.points, pattern)
+        chosen |= hits
+        if not hits.any():
+            lacking = [e.name for e in epochs if not _matching(e.result.network.points, pattern).any()]
+            raise GeometryError(
+                f"epochs: point of reference {pattern} is missing in {' and in '.join(lacking)}"
+                if lacking
+                else f"epochs: no point {pattern} is in both {epochs[0].name} and {epochs[1].name}"
+            )
+    return chosen
+
+
+def _group(found: Differences, name: str, patterns: Sequence[str]) -> BoolArray:
+    chosen = np.zeros(len(found.points), dtype=bool)
+    for pattern in patterns:
+        hits = _matching(found.points, pattern)
+        if not hits.any():
+            raise GeometryError(
+                f"group {name}: no point that {found.names[0]} and {found.names[1]} share is called "
+                f"'{pattern}'"
+            )
+        chosen |= hits
+    return chosen
+
+
+def _matching(names: tuple[str, ...], pattern: str) -> BoolArray:
+    return np.array([matches(name, pattern) for name in names], dtype=bool)
+
+
+def _together(found: Displacements) -> BlockMotion | None:
+    """Return the motion of all points that moved as one block; None where that says nothing."""
+    if found.moved.sum() <= MIN_POINTS["rigid"]:
+        return None
+    try:
+        return block_motion(found, found.moved, name=MOVED)
+    except GeometryError:  # they lie on a line: their rotation about it is not determined
+        return None

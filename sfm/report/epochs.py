@@ -1,0 +1,277 @@
+"""The analysis of epochs as displacements.csv, series.csv, epochs.json and epochs.html."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sfm.conventions import FloatArray
+from sfm.epochs.blocks import BlockMotion
+from sfm.epochs.displacements import POWER, Displacements
+from sfm.epochs.series import EpochPair, EpochSeries
+from sfm.files.plain_text import csv_text, or_none
+from sfm.report.figures.comparisons import difference_figure, series_figure
+from sfm.report.figures.plots import Plot, png
+from sfm.report.html.page import render
+from sfm.report.numbers import finer_unit, significant
+from sfm.report.page_files import write_files
+
+FILES = ("displacements.csv", "series.csv", "epochs.json", "epochs.html")
+COLUMNS = (
+    *("first", "second", "id", "dX", "dY", "dZ", "sdX", "sdY", "sdZ", "length", "T", "critical", "stable"),
+    *("moved", "detectable"),
+)
+SERIES = ("id", "epoch", "dX", "dY", "dZ", "sdX", "sdY", "sdZ", "moved")
+DRAWN = 12  # points of a series that are drawn, those that moved farthest
+NAMED = 12  # points that a sentence names
+MOSTLY = 0.5  # of Omega: what a bending takes away of it is told from here on
+PICTURE = (
+    "Displacements: arrows in the object's main plane, points that moved in red; the colour of the dots is "
+    "the displacement out of the plane."
+)
+BANDS = "Displacements since the first epoch along their last direction; bands of two standard deviations."
+
+
+def write_epochs(found: EpochSeries, out: Path) -> Path:
+    """Write an analysis of epochs into a folder and return the path of its page.
+
+    Args:
+        found: the analysis.
+        out: the folder.
+
+    Raises:
+        OutputError: the folder holds something else or cannot be written.
+    """
+    text = json.dumps(epochs_summary(found), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+    texts = (
+        csv_text(COLUMNS, (row for pair in pairs_of(found) for row in _rows(pair.displacements))),
+        csv_text(SERIES, _series_rows(found)),
+        text,
+        epochs_page(found),
+    )
+    return write_files(out, tuple(zip(FILES, texts, strict=True)), main=FILES[-1])
+
+
+def pairs_of(found: EpochSeries) -> tuple[EpochPair, ...]:
+    """Return every pair of epochs once: those with the first, then those with the one before."""
+    return (*found.since_first, *found.since_previous[1:])
+
+
+def words_of_pair(found: Displacements) -> tuple[str, str]:
+    """Return in words what moved between two epochs, and good | fair | bad for the colour of the page."""
+    first, second = found.differences.names
+    between = f"{first} to {second}"
+    if not found.agreed:
+        cause = (
+            f"; {found.smooth:.0%} of it is a bending of the whole, as a wrongly described camera makes it"
+            if found.smooth > MOSTLY
+            else ""
+        )
+        return f"{between}: the points of reference differ, and no half of them agrees{cause}", "bad"
+    names = [n for n, moved in zip(found.differences.points, found.moved, strict=True) if moved]
+    if not names:
+        return f"{between}: no displacement is significant", "good"
+    farthest = float(np.linalg.norm(found.displacement[found.moved], axis=1).max())
+    factor, unit = finer_unit(found.differences.unit, farthest)
+    length = f"{significant(farthest * factor)} {unit or 'object units'}"
+    return (
+        f"{between}: {len(names)} of {len(found.moved)} points moved, by up to {length} ({_names(names)})",
+        "fair",
+    )
+
+
+def words_of_stable(found: Displacements) -> str:
+    """Return in words which points carry the datum, and how they were found."""
+    if not found.agreed:
+        return (
+            "No stable set is proposed; what is shown is in the datum of the points left last. Name "
+            "stable ones with --reference."
+        )
+    removed = [found.differences.points[s.removed] for s in found.search.steps if s.removed is not None]
+    count, all_of_them = int(found.stable.sum()), int(found.reference.sum())
+    if count == all_of_them:
+        return f"All {count} points of reference agree."
+    by = " by removing one after the other" if found.robust is None or _same(found) else " by a robust start"
+    undecided = [n for n, u in zip(found.differences.points, found.undecided, strict=True) if u]
+    left = f" Left out, and not shown to have moved: {_names(undecided)}." if undecided else ""
+    gone = f" ({_names(removed)} in this order)" if removed and " one " in by else ""
+    return (
+        f"{count} of {all_of_them} points of reference are proposed as stable, found{by}{gone}.{left} Name "
+        "others with --reference if you know better."
+    )
+
+
+def words_of_block(block: BlockMotion) -> str:
+    """Return in words how a group moved."""
+    parts = [part.name for part in block.parts if part.significant]
+    how = " and ".join(parts) if parts else "nothing significant"
+    rest = "its points moved as one" if block.fits else "what is left is significant: it changed its shape"
+    return f"{block.name} ({len(block.points)} points, {block.model}): {how}; {rest}"
+
+
+def epochs_summary(found: EpochSeries) -> dict[str, Any]:
+    """Return what epochs.json holds: plain values only, None for what is not known."""
+    return {
+        "epochs": list(found.names),
+        "changed": found.changed,
+        "pairs": [_pair(p) for p in pairs_of(found)],
+    }
+
+
+def epochs_page(found: EpochSeries) -> str:
+    """Return the page: verdict, pairs of epochs with their tests, displacements and groups."""
+    pairs = pairs_of(found)
+    told = [words_of_pair(pair.displacements) for pair in pairs]
+    levels = [level for _, level in told]
+    level = next((one for one in ("bad", "fair") if one in levels), "good")
+    return render(
+        "epochs.html",
+        title=" - ".join((found.names[0], found.names[-1])),
+        headline=told[len(found.since_first) - 1][0],
+        remarks=[words for k, (words, _) in enumerate(told) if k != len(found.since_first) - 1],
+        level=level,
+        power=POWER,
+        pairs=[
+            {
+                "found": pair.displacements,
+                "title": " to ".join(pair.displacements.differences.names),
+                "stable": words_of_stable(pair.displacements),
+                "unit": finer_unit(pair.displacements.differences.unit, _typical(pair.displacements)),
+                "groups": [*pair.groups, *([pair.together] if pair.together is not None else [])],
+                "picture": _picture(pair.displacements, k),
+            }
+            for k, pair in enumerate(pairs)
+        ],
+        words_of_block=words_of_block,
+        names=_names,
+        series=_series_picture(found),
+    )
+
+
+def _pair(pair: EpochPair) -> dict[str, Any]:
+    found = pair.displacements
+    d = found.differences
+    names = np.array(d.points, dtype=object)
+    return {
+        "first": d.names[0],
+        "second": d.names[1],
+        "length_unit": d.unit,
+        "points": len(d.points),
+        "only_first": list(d.only_first),
+        "only_second": list(d.only_second),
+        "untested": list(d.untested),
+        "no_change": d.motion,
+        "shared_given_values": list(d.shared),
+        "alpha": found.alpha,
+        "agreed": found.agreed,
+        "stable": names[found.stable].tolist(),
+        "moved": names[found.moved].tolist(),
+        "undecided": names[found.undecided].tolist(),
+        "steps": [
+            {
+                "points": step.points,
+                "omega": or_none(step.omega),
+                "freedom": step.freedom,
+                "T": or_none(step.statistic),
+                "critical": or_none(step.critical),
+                "removed": None if step.removed is None else d.points[step.removed],
+            }
+            for step in found.search.steps
+        ],
+        "groups": [
+            {
+                "name": one.name,
+                "points": list(one.points),
+                "model": one.model,
+                "centre": one.centre.tolist(),
+                "parameters": {
+                    name: {"value": or_none(value), "sigma": or_none(sigma)}
+                    for name, value, sigma in zip(one.parameters, one.value, one.sigma, strict=True)
+                },
+                "significant": [part.name for part in one.parts if part.significant],
+                "moved_as_one": one.fits,
+            }
+            for one in (*pair.groups, *([pair.together] if pair.together is not None else []))
+        ],
+    }
+
+
+def _rows(found: Displacements) -> Iterable[tuple[object, ...]]:
+    d = found.differences
+    for k, name in enumerate(d.points):
+        yield (
+            *(*d.names, name, *found.displacement[k], *found.sigma[k]),
+            *(float(np.linalg.norm(found.displacement[k])), found.statistic[k], found.critical[k]),
+            *(int(found.stable[k]), int(found.moved[k]), found.detectable[k]),
+        )
+
+
+def _series_rows(found: EpochSeries) -> Iterable[tuple[object, ...]]:
+    for pair in found.since_first:
+        one = pair.displacements
+        for k, name in enumerate(one.differences.points):
+            yield (name, one.differences.names[1], *one.displacement[k], *one.sigma[k], int(one.moved[k]))
+
+
+def _picture(found: Displacements, number: int) -> Plot | None:
+    if not np.linalg.norm(found.displacement, axis=1).max() > 0:
+        return None
+    d = found.differences
+    figure = difference_figure(d.xyz, found.displacement, found.moved, d.unit)
+    return Plot(f"displacements-{number}", PICTURE, png(figure))
+
+
+def _series_picture(found: EpochSeries) -> Plot | None:
+    """Return the series of the points that moved farthest; None with two epochs, or where none moved."""
+    if len(found.names) < 3:
+        return None
+    pairs = [pair.displacements for pair in found.since_first]
+    moved: dict[str, float] = {}
+    for one in pairs:
+        for k in np.flatnonzero(one.moved):
+            name = one.differences.points[k]
+            moved[name] = max(moved.get(name, 0.0), float(np.linalg.norm(one.displacement[k])))
+    chosen = sorted(moved, key=lambda name: -moved[name])[:DRAWN]
+    if not chosen:
+        return None
+    factor, unit = finer_unit(pairs[0].differences.unit, max(moved.values()))
+    rows = [_along(name, pairs) for name in chosen]
+    length, sigma = (factor * np.array([row[k] for row in rows]) for k in (0, 1))
+    return Plot("series", BANDS, png(series_figure(found.names, tuple(chosen), length, sigma, unit)))
+
+
+def _along(name: str, pairs: list[Displacements]) -> tuple[list[float], list[float]]:
+    """Displacements of a point since the first epoch along its last direction, and their sigmas."""
+    rows = [one.differences.points.index(name) if name in one.differences.points else -1 for one in pairs]
+    last, k = next((one, k) for one, k in zip(reversed(pairs), reversed(rows), strict=True) if k >= 0)
+    direction = last.displacement[k] / max(float(np.linalg.norm(last.displacement[k])), 1e-300)
+    length, sigma = [0.0], [0.0]
+    for one, k in zip(pairs, rows, strict=True):
+        if k < 0:
+            length.append(np.nan)
+            sigma.append(np.nan)
+            continue
+        Q = one.covariance[3 * k : 3 * k + 3, 3 * k : 3 * k + 3]
+        length.append(float(one.displacement[k] @ direction))
+        sigma.append(float(np.sqrt(max(direction @ Q @ direction, 0.0))))
+    return length, sigma
+
+
+def _typical(found: Displacements) -> float:
+    lengths: FloatArray = np.linalg.norm(found.displacement, axis=1)
+    return float(max(np.median(found.detectable), lengths.max()))
+
+
+def _same(found: Displacements) -> bool:
+    """Whether the proposed set is the one from the search through all points."""
+    return bool((found.stable == found.search.stable).all())
+
+
+def _names(names: Iterable[str]) -> str:
+    all_of_them = list(names)
+    said = ", ".join(all_of_them[:NAMED])
+    return said if len(all_of_them) <= NAMED else f"{said} and {len(all_of_them) - NAMED} more"

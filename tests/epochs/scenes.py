@@ -1,0 +1,69 @@
+"""Epochs of a made-up object, adjusted from their image points."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+
+from sfm.adjustment.covariance import marginal_of
+from sfm.adjustment.datum import Datum
+from sfm.adjustment.solve import adjust
+from sfm.camera import project
+from sfm.conventions import FloatArray
+from sfm.epochs.differences import Epoch
+from sfm.network import Estimate, Network
+from sfm.stored_result import StoredResult
+from tests.synthetic import make_network, seed_of
+
+IMAGES, POINTS, NOISE_PX = 14, 60, 0.1
+BARS = (("1", "31"), ("12", "50"))
+BAR_SIGMA = 2e-4
+
+
+@cache
+def scene() -> tuple[Network, Estimate]:
+    return make_network(seed_of("epochs"), images=IMAGES, points=POINTS, model="opencv", noise_px=0.0)
+
+
+def epoch(
+    seed: int,
+    shift: FloatArray | None = None,
+    *,
+    bar_errors: FloatArray | None = None,
+    given: float = 0.0,
+    datum: str = "free",
+) -> Epoch:
+    """Return one epoch.
+
+    Args:
+        seed: of its noise.
+        shift: of the points from the first epoch, object unit, (n, 3).
+        bar_errors: of the lengths as stated, object unit, (2,); of its own if None.
+        given: added to the stated lengths, object unit, so that they are others.
+        datum: of the adjustment.
+    """
+    network, truth = scene()
+    rng = np.random.default_rng(seed)
+    now = truth if shift is None else replace(truth, points=truth.points + shift)
+    seen = network.image_points
+    xy = np.array(seen.xy)
+    for i in range(len(network.images)):
+        rows = seen.image == i
+        xy[rows] = project(now.cameras[0], now.position[i], now.rotation[i], now.points[seen.point[rows]])
+    xy += NOISE_PX * rng.standard_normal(xy.shape)
+    network = replace(network, image_points=replace(seen, xy=xy))
+    errors = BAR_SIGMA * rng.standard_normal(2) if bar_errors is None else bar_errors
+    for (a, b), error in zip(BARS, errors.tolist(), strict=True):
+        length = float(np.linalg.norm(now.points[int(a) - 1] - now.points[int(b) - 1]))
+        network = network.with_scale_bar(a, b, length + error + given, BAR_SIGMA)
+    kind = Datum(datum, points=["1", "2", "3"] if datum == "minimal" else None)
+    a = adjust(network, now, datum=kind, sigma_px=NOISE_PX, reject="none")
+    covariance = marginal_of(a).joint(np.zeros(0, dtype=np.int64), np.arange(POINTS))
+    result = StoredResult(
+        *(f"epoch {seed}", network, a.estimate, a.covariance.points, None, None, a.redundancy, "m"),
+        covariance=covariance,
+        datum=a.datum,
+    )
+    return Epoch(f"epoch {seed}", result, network.scale_bars)
