@@ -246,7 +246,7 @@ def _refuse_contradictions_of_camera(camera: CameraSettings, at: str) -> None:
     if camera.calibration is not None:
         for key in sorted(camera.model_fields_set - {"name", "images", "size_px", *CALIBRATION_KEYS}):
             raise SurveyFileError(f"{at}: {key} and calibration are both given; a calibration says it all")
-    elif "calibration_use" in camera.model_fields_set:
+    elif camera.calibration_use != "fixed":
         raise SurveyFileError(f"{at}: calibration_use is given, calibration is needed with it")
     for parameter in start:
         if parameter not in camera.may_be_free:
