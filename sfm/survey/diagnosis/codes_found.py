@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from sfm.conventions import AnyArray
@@ -12,11 +14,15 @@ from sfm.survey.inputs.survey import Survey
 from sfm.targets.codes.families import Family
 from sfm.targets.codes.rings import RINGS
 from sfm.targets.codes.tags import CORNERS, DICTIONARIES, find_tags, tag_family
-from sfm.targets.detect import find_targets
+from sfm.targets.detect import Targets, find_targets
+from sfm.targets.flags import Flag
 from sfm.targets.outlines import scale_of
 
 MAX_NAMES = 10  # photographs in a message
 MIN_TAGS = 2  # of a family in a photograph that are no chance; a dictionary may be part of a larger one
+# Least diameter of the dot of a ring that is read, px and standard deviations of its edges (rendered rings of
+# 12 to 20 cells: all of 49 are read from 6 px on at 0.75 px, from 8 or 9 px on at 1.25 px).
+LEAST_DOT_PX, LEAST_DOT_SIGMAS = 6.0, 7.0
 POLARITIES = ("dark", "bright")
 
 
@@ -32,7 +38,46 @@ def words_of_codes(survey: Survey, photographs: MeasuredPhotographs) -> str:
         f"{with_codes} of them{_by_photograph(photographs, codes)}; check in [targets] "
         f"codes = '{settings.codes}', "
         f"polarity = '{settings.polarity}' and min_diameter_px = {settings.min_diameter_px:g}"
-        f"{_other_settings(survey, photographs)}"
+        f"{_words_of_size(survey, photographs)}{_other_settings(survey, photographs)}"
+    )
+
+
+def words_of_small_codes(targets: Sequence[Targets]) -> str:
+    """Say that codes are too small to read, with the size that would do; empty where enough are read.
+
+    Args:
+        targets: of each photograph.
+    """
+    every = [found for found in targets if len(found)]
+    if not every:
+        return ""
+    unreadable = np.concatenate([(found.flag & Flag.CODE_UNREADABLE) != 0 for found in every])
+    diameter = 2 * np.concatenate([found.semi_axes[:, 1] for found in every])
+    blur = np.concatenate([found.blur for found in every])
+    coded = sum(int((found.code >= 0).sum()) for found in every)
+    small = unreadable & (diameter < np.maximum(LEAST_DOT_PX, LEAST_DOT_SIGMAS * blur))
+    if small.sum() < max(MIN_POINTS, coded):
+        return ""
+    now, soft = float(np.median(diameter[small])), float(np.median(blur[small]))
+    needed = max(LEAST_DOT_PX, LEAST_DOT_SIGMAS * soft)
+    return (
+        f"{small.sum()} targets have something like a code that is too small to read: their dots are "
+        f"{now:.1f} px across (median of the shorter axes) and their edges {soft:.1f} px soft, "
+        f"{needed:.0f} px are needed: print them {needed / now:.1f} times as large, go nearer or focus better"
+    )
+
+
+def _words_of_size(survey: Survey, photographs: MeasuredPhotographs) -> str:
+    """Say that codes are too small to read, or that candidates are below the least diameter, if so."""
+    words = words_of_small_codes(photographs.targets)
+    if words:
+        return f"; {words}"
+    count = sum(int((found.rejected_flag == Flag.TOO_SMALL).sum()) for found in photographs.targets)
+    if count < MIN_POINTS * len(photographs.targets):
+        return ""
+    return (
+        f"; {count} candidates are smaller than min_diameter_px = {survey.targets.min_diameter_px:g}; codes "
+        f"are read from dots of {LEAST_DOT_PX:g} px on in sharp photographs"
     )
 
 

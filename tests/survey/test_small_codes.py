@@ -1,0 +1,60 @@
+"""Codes that are too small to read are told, with the size that would do."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+import pytest
+
+from sfm.camera import camera_from_values
+from sfm.rendering.render import render_photograph
+from sfm.rendering.scene import CircularTargets, Faces, Optics, Scene, coded_ring, join_marks
+from sfm.survey.diagnosis.codes_found import words_of_small_codes
+from sfm.targets.codes.families import code_family
+from sfm.targets.codes.rings import CodeFamily
+from sfm.targets.detect import Targets, find_targets
+
+ACROSS, BLUR_PX = 5, 1.2
+
+
+def photographed(diameter_px: float) -> Targets:
+    """Return the targets of a photograph of 25 codes from the front, 1 px per unit."""
+    family = code_family("ring14")
+    assert isinstance(family, CodeFamily)
+    radius = diameter_px / 2
+    pitch = 2 * family.outer * radius + 11
+    at = (np.arange(ACROSS) - (ACROSS - 1) / 2) * pitch
+    places = np.stack(np.meshgrid(at, at), axis=-1).reshape(-1, 2)
+    marks = [coded_ring(0, xy + 0.1 * k, radius, 10 + k, family, 0.08, turn=k) for k, xy in enumerate(places)]
+    size = int(ACROSS * pitch)
+    one = np.zeros(1)
+    faces = Faces(np.zeros((1, 3)), np.eye(3)[None, :2], np.full((1, 2), size), one + 0.8, one, one + 1)
+    none = CircularTargets(np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros(0), np.zeros(0, np.int64))
+    picture, _ = render_photograph(
+        Scene(faces, join_marks(marks), none),
+        camera_from_values("one", "brown", (size, size), (0.01, 0.01), c_mm=10.0),
+        np.array([0.0, 0.0, 1000.0]),
+        np.eye(3),
+        optics=Optics(blur_px=BLUR_PX, noise=2 / 255),
+        rng=np.random.default_rng(7),
+    )
+    return find_targets(picture, polarity="dark", codes="ring14", min_diameter_px=4.0)
+
+
+def test_small_codes_are_told_with_what_would_do() -> None:
+    small = [photographed(6.5) for _ in range(2)]
+    words = words_of_small_codes(small)
+    told = re.search(
+        r"their dots are ([\d.]+) px across .* ([\d.]+) px are needed: print them ([\d.]+) times", words
+    )
+    assert told is not None, words
+    dots, needed, factor = map(float, told.groups())
+    assert 5 < dots < 7 and 7 < needed < 10 and factor == pytest.approx(needed / dots, abs=0.15)
+
+
+@pytest.mark.parametrize("diameter_px", [9.0, 12.0])
+def test_the_size_that_is_told_does(diameter_px: float) -> None:
+    found = photographed(diameter_px)
+    assert (found.code >= 0).sum() >= ACROSS**2 - 1
+    assert words_of_small_codes([found]) == "" and words_of_small_codes([]) == ""
