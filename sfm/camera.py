@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from sfm.conventions import BoolArray, FloatArray, IntArray
-from sfm.distortion.models import MAX_PARAMETERS, MODELS, Role, number_of, observe
+from sfm.distortion.models import MAX_PARAMETERS, MODELS, Role, number_of, observe_point
 from sfm.errors import SurveyFileError
 from sfm.kernels.options import compiled
 
@@ -76,10 +76,11 @@ class Camera:
 
     @property
     def frame(self) -> FloatArray:
-        """Centre (px), pixel size (mm) and plane of residuals as compiled code takes them, (5,)."""
-        width, height = self.size_px
-        plane = 0.0 if MODELS[self.model].corrected_plane else 1.0
-        return np.array([(width - 1) / 2, (height - 1) / 2, self.pixel_mm[0], self.pixel_mm[1], plane])
+        """Centre (px), pixel size (mm), planes of residuals and affinity for compiled code, (6,)."""
+        (width, height), model = self.size_px, MODELS[self.model]
+        measured_plane = model.corrects and not model.corrected_plane
+        centre = ((width - 1) / 2, (height - 1) / 2)
+        return np.array([*centre, *self.pixel_mm, float(measured_plane), float(model.distorted_affinity)])
 
     @property
     def linear_frame(self) -> FloatArray:
@@ -280,7 +281,7 @@ def _tangents(model: int, frame: FloatArray, p: FloatArray, xy: FloatArray) -> F
         u, v = 0.0, 0.0
         solved = False
         for _ in range(FIXED_POINT_STEPS):
-            observe(model, frame, p, xy[i, 0], xy[i, 1], u, v, residual, Ju, Jp)
+            observe_point(model, frame, p, xy[i, 0], xy[i, 1], u, v, residual, Ju, Jp)
             det = Ju[0, 0] * Ju[1, 1] - Ju[0, 1] * Ju[1, 0]
             du = (Ju[1, 1] * residual[0] - Ju[0, 1] * residual[1]) / det
             dv = (Ju[0, 0] * residual[1] - Ju[1, 0] * residual[0]) / det
@@ -306,7 +307,7 @@ def _pixels(model: int, frame: FloatArray, p: FloatArray, uv: FloatArray) -> Flo
         x, y = frame[0], frame[1]
         solved = False
         for _ in range(FIXED_POINT_STEPS):
-            observe(model, frame, p, x, y, uv[i, 0], uv[i, 1], residual, Ju, Jp)
+            observe_point(model, frame, p, x, y, uv[i, 0], uv[i, 1], residual, Ju, Jp)
             x += residual[0]
             y += residual[1]
             if abs(residual[0]) + abs(residual[1]) < PIXEL_TOLERANCE:

@@ -54,6 +54,15 @@ class ImagePoints:
         sigma = np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2))
         return sigma if self.stated is None else np.where(self.stated[:, None], sigma, np.nan)
 
+    @property
+    def stated_covariance(self) -> FloatArray:
+        """Covariances of x and y, px^2; 0 where none was stated, (k,)."""
+        return (
+            self.covariance[:, 0, 1]
+            if self.stated is None
+            else np.where(self.stated, self.covariance[:, 0, 1], 0.0)
+        )
+
 
 @dataclass(frozen=True)
 class ObjectPoints:

@@ -10,7 +10,7 @@ import numpy as np
 
 from sfm.adjustment.covariance import marginal_of
 from sfm.adjustment.quality.against_free import FreeNetwork
-from sfm.adjustment.quality.correlations import OrientationCorrelation
+from sfm.adjustment.quality.correlations import ExteriorCorrelations, OrientationCorrelation
 from sfm.adjustment.quality.other_solutions import OtherSolution
 from sfm.adjustment.result import Adjustment
 from sfm.camera import Camera
@@ -138,6 +138,15 @@ class Eccentricity:
     sigma_px: float  # root mean square of the standard deviations of a corrected coordinate, px
 
 
+@dataclass(frozen=True)
+class CheckPoint:
+    """A point with known coordinates that took no part in the adjustment."""
+
+    point: str
+    xyz: FloatArray  # object unit, NaN where the coordinate took part or is not known, (3,)
+    sigma: FloatArray  # stated standard deviations, object unit, (3,)
+
+
 @dataclass(frozen=True, repr=False, eq=False)
 class SurveyResult:
     """Result of a survey: the adjustment and what a person must know to judge it.
@@ -170,6 +179,9 @@ class SurveyResult:
     undecided: tuple[str, ...] = ()  # of the orientation: which of two is true, one line each
     unused_image_points: int = 0  # of points or photographs that are not in the result, in no other count
     explanations: tuple[Explanation, ...] = ()  # of large residuals that were tried, the likeliest first
+    check_points: tuple[CheckPoint, ...] = ()  # with coordinates that took no part
+    balance_radius_mm: tuple[tuple[str, float], ...] = ()  # R0 of the cameras given in AICON's form
+    exterior_correlations: ExteriorCorrelations | None = None  # of camera parameters, all of them
     orientation_correlations: tuple[OrientationCorrelation, ...] = ()  # of camera parameters with exterior
     # orientation, the strong ones
     seconds: tuple[StageTime, ...] = field(default_factory=tuple)  # in the order of the stages

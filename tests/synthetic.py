@@ -33,6 +33,7 @@ DISTORTION = {
     "opencv": (("k1", -0.08), ("k2", 0.04), ("p1", 3e-4), ("p2", -2e-4), ("cx", 1005.0), ("cy", 745.0)),
     "full_opencv": (("k1", -0.08), ("k2", 0.04), ("p1", 3e-4), ("p2", -2e-4), ("k4", 0.01), ("cx", 1005.0)),
 }  # a lens with up to 40 px of distortion in the corners
+DISTORTION["brown_forward_affine"] = (*DISTORTION["brown_forward"], ("b1", 2e-4), ("b2", -1e-4))
 for _corrections in ("brown_affine", "brown_dbat", "brown_affine_dbat"):
     DISTORTION[_corrections] = DISTORTION["brown"]
 FREE = {
@@ -42,6 +43,7 @@ FREE = {
     "full_opencv": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2"),
 }
 FREE["brown_dbat"] = FREE["brown"]
+FREE["brown_forward_affine"] = (*FREE["brown_forward"], "b1", "b2")
 FREE["brown_affine"] = FREE["brown_affine_dbat"] = (*FREE["brown"], "b1")
 
 

@@ -13,10 +13,8 @@ than Kolinear's. With x = X/Z, y = Y/Z of the camera axes and r2 = x2 + y2
     x' = x (1 + k1 r2 + k2 r4 + k3 r6 + k4 r8) + p1 (r2 + 2 x2) + 2 p2 x y,   y' with p1, p2 exchanged
     u = w/2 + cx + x' f + x' b1 + y' b2,   v = h/2 + cy + y' f
 
-which is `opencv` (k3 = k4 = b2 = 0) or `full_opencv` (k4 = b2 = 0) to the last digit, p1 and p2 exchanged,
-or with k4 `brown_forward` (b2 = 0), b1 being the ratio of the sides of a pixel. With b2 it is read as
-`brown_forward` with b1 and b2, which there act on the ideal point instead of the distorted: the difference,
-their product with the distortion, is a hundredth of a pixel for 100 px and 1e-4.
+which is `opencv` (k3 = k4 = b2 = 0) or `full_opencv` (k4 = b2 = 0), p1 and p2 exchanged, or with k4 or b2
+`brown_forward_affine`, all to the last digit.
 
 Source: Agisoft Metashape Professional user manual 2.x, app. D "Camera models"; structure of the file as
 exported by versions 1.5 to 2.1.
@@ -192,14 +190,10 @@ def _camera(sensor: Node) -> Camera:
         names |= {name: (name,) for name in ("cx", "cy", "k1", "k2")}
         names |= {"k3": ("k3",)} if model == "full_opencv" else {}
     else:
-        model = "brown_forward"
-        if p["b2"] == 0:
-            pixel = (pixel[1] * f / (f + p["b1"]), pixel[1])
-        elif not np.isclose(pixel[0], pixel[1], rtol=1e-9):
-            raise sensor.error("pixels that are not square together with b2 cannot be read")
+        model = "brown_forward_affine"
         c = f * pixel[1]
         values = {"x0": p["cx"] * pixel[0], "y0": -p["cy"] * pixel[1]}
-        values |= {"b1": p["b1"] / f, "b2": -p["b2"] / f} if p["b2"] else {}
+        values |= {"b1": (f + p["b1"]) * pixel[0] / c - 1, "b2": -p["b2"] * pixel[0] / c}
         values |= {f"K{i}": p[f"k{i}"] / c ** (2 * i) for i in (1, 2, 3, 4)}
         values |= {"P1": p["p1"] / c, "P2": -p["p2"] / c}
         names = {"f": ("c",), "cx": ("x0",), "cy": ("y0",)}
@@ -224,23 +218,27 @@ def _sensor_lines(number: int, camera: Camera) -> list[str]:
     if camera.model in ("opencv", "full_opencv"):
         if camera.model == "full_opencv" and any(camera.value(name) for name in ("k4", "k5", "k6")):
             raise OutputError(
-                f"camera {camera.name}: Metashape has no k4-k6 of full_opencv, convert it to brown_forward"
+                f"camera {camera.name}: Metashape has no k4-k6 of full_opencv, convert it to "
+                "brown_forward_affine"
             )
         p |= {"f": camera.value("fy"), "b1": camera.value("fx") - camera.value("fy")}
         p |= {"cx": camera.value("cx") - centre[0], "cy": camera.value("cy") - centre[1]}
         p |= {"k1": camera.value("k1"), "k2": camera.value("k2")}
         p |= {"p1": camera.value("p2"), "p2": camera.value("p1")}
         p |= {"k3": camera.value("k3")} if camera.model == "full_opencv" else {}
-    elif camera.model == "brown_forward" and not (camera.value("b1") or camera.value("b2")):
+    elif camera.model == "brown_forward_affine":
         c, (sx, sy) = camera.value("c"), camera.pixel_mm
-        p |= {"f": c / sy, "b1": c / sx - c / sy}
+        p |= {
+            "f": c / sy,
+            "b1": c * (1 + camera.value("b1")) / sx - c / sy,
+            "b2": -c * camera.value("b2") / sx,
+        }
         p |= {"cx": camera.value("x0") / sx, "cy": -camera.value("y0") / sy}
         p |= {f"k{i}": camera.value(f"K{i}") * c ** (2 * i) for i in (1, 2, 3, 4)}
         p |= {"p1": camera.value("P1") * c, "p2": -camera.value("P2") * c}
     else:
         raise OutputError(
-            f"camera {camera.name}: Metashape has no model {camera.model} with affinity of the ideal point, "
-            "convert it to brown_forward with affinity in the pixel size, or to opencv"
+            f"camera {camera.name}: Metashape has no model {camera.model}, convert it to brown_forward_affine"
         )
     resolution = f'<resolution width="{width}" height="{height}"/>'
     return [

@@ -123,8 +123,8 @@ FORMATS = (
         *("tables", tuple(MODELS), _read_tables, _write_tables), folder=True, placed=True, titled=True
     ),
     FileFormat(
-        *("metashape", ("brown_forward", "full_opencv", "opencv"), read_metashape, write_metashape),
-        lacks=("b1", "b2", "k4", "k5", "k6"),
+        *("metashape", ("brown_forward_affine", "full_opencv", "opencv"), read_metashape, write_metashape),
+        lacks=("k4", "k5", "k6"),
     ),
     FileFormat("photomodeler", ("brown",), read_photomodeler, write_photomodeler, lacks=("b1", "b2")),
     FileFormat("bal", ("opencv",), read_bal, write_bal, straight=("p1", "p2"), one_focal=True, names=NUMBERS),

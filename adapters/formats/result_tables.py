@@ -3,7 +3,7 @@
     points.csv          id,X,Y,Z[,sX,sY,sZ]
     images.csv          image,X,Y,Z,omega_deg,phi_deg,kappa_deg[,sX,sY,sZ],camera
     cameras.csv         camera,parameter,value[,sigma],unit
-    image_points.csv    image,point,x_px,y_px[,sx_px,sy_px][,rejected]
+    image_points.csv    image,point,x_px,y_px[,sx_px,sy_px[,cxy_px2]][,rejected]
     point_covariance.npy    of the points together, see `sfm.files.covariance_file`
     summary.json        name of the survey, model, size and pixel of each camera, redundancy, datum
 
@@ -39,6 +39,8 @@ from sfm.stored_result import StoredResult
 EXTERIOR = ("X", "Y", "Z", "omega_deg", "phi_deg", "kappa_deg")
 SIGMAS = ("sX", "sY", "sZ")
 SIGMAS_PX = ("sx_px", "sy_px")
+COVARIANCE_PX = "cxy_px2"
+CORRELATION_LIMIT = 0.999999  # beyond it a covariance matrix is no longer regular in floating point
 PRINCIPAL_DISTANCES = ("c", "fx", "fy")
 COLMAP_SIDE_FILE = f"colmap/{SIDE_FILE}"
 
@@ -157,8 +159,11 @@ def write_tables(folder: Path, result: StoredResult) -> None:
     position_sigma, sigmas_of_images = _sigma_of(result.position_covariance, len(network.images))
     seen = network.image_points
     sigma = seen.stated_sigma
-    sigmas_of_image_points = SIGMAS_PX if np.isfinite(sigma).any() else ()
+    sigmas_of_image_points: tuple[str, ...] = SIGMAS_PX if np.isfinite(sigma).any() else ()
     sigma = sigma[:, : len(sigmas_of_image_points)]
+    if seen.stated_covariance.any():
+        sigmas_of_image_points += (COVARIANCE_PX,)
+        sigma = np.concatenate([sigma, seen.stated_covariance[:, None]], axis=1)
     camera_rows = []
     for k, camera in enumerate(estimate.cameras):
         known = np.full(len(camera.names), np.nan)
@@ -315,9 +320,11 @@ def _image_points(
     """Read the image points, and which of them were rejected."""
     path = folder / "image_points.csv"
     flagged = ("rejected",) if "rejected" in read_header(path) else ()
-    sigmas = SIGMAS_PX
+    header, sigmas = read_header(path), SIGMAS_PX
+    with_covariance = sigmas[0] in header and COVARIANCE_PX in header
+    optional = (*sigmas, COVARIANCE_PX) if with_covariance else sigmas
     table = read_table(
-        path, ("image", "point"), ("x_px", "y_px", *flagged), sigmas, ignored=None, blank=sigmas
+        path, ("image", "point"), ("x_px", "y_px", *flagged), optional, ignored=None, blank=optional
     )
     table.refuse_duplicates(tuple(zip(*table.texts, strict=True)), ("image", "point"))
     index = []
@@ -328,14 +335,22 @@ def _image_points(
             if name not in place:
                 raise SurveyFileError(f"{path}, line {line}: {column} '{name}' is not in {file}")
         index.append(np.array([place[name] for name in names], dtype=np.int64))
-    rejected, sigma = table.values[:, 2 : 2 + len(flagged)], table.values[:, 2 + len(flagged) :]
+    rejected, sigma, mixed = np.split(table.values[:, 2:], (len(flagged), len(flagged) + 2), axis=1)
     table.refuse(rejected, (rejected != 0) & (rejected != 1), flagged, "0 or 1")
     table.refuse(sigma, sigma <= 0, sigmas, "more than 0")
     sigma = sigma if sigma.size else np.full((len(table.line), 2), np.nan)
     image, point = index
     stated = np.asarray(np.isfinite(sigma).all(axis=1))
     sigma = np.where(stated[:, None], sigma, 1.0)
-    found = ImagePoints(image, point, table.values[:, :2].copy(), np.eye(2) * sigma[:, None, :] ** 2, stated)
+    covariance = np.eye(2) * sigma[:, None, :] ** 2
+    if with_covariance:
+        mixed = np.where(stated[:, None], np.nan_to_num(mixed), 0.0)
+        largest = CORRELATION_LIMIT * sigma.prod(axis=1, keepdims=True)
+        table.refuse(
+            mixed, np.abs(mixed) > largest, (COVARIANCE_PX,), "a correlation below 1 with the sigmas"
+        )
+        covariance += (1 - np.eye(2)) * mixed[:, :, None]
+    found = ImagePoints(image, point, table.values[:, :2].copy(), covariance, stated)
     return found, rejected[:, 0] == 1 if flagged else np.zeros(len(found), dtype=bool)
 
 

@@ -64,6 +64,7 @@ class Adjustment:
     unknown_counts: tuple[int, int, int] = (0, 0, 0)  # of exterior orientation, interior orientation, points
     test_alpha: float = 0.001  # probability with which the test that was applied rejects a good image
     # coordinate; Baarda's usual one where none was
+    start_sigma0: float = float("nan")  # as sigma0, at the start values
     remarks: tuple[str, ...] = ()  # what of the robust test could not be carried through, one line each
 
     @property
@@ -102,13 +103,13 @@ class Adjustment:
 
     @property
     def sigma0_px(self) -> float:
-        """A posteriori standard deviation of an image coordinate, root mean square of the accepted, px."""
-        return self.sigma0 * _rms_sigma(self.image_covariance[~self.rejected])
+        """A posteriori standard deviation of an image coordinate, the median of the accepted, px."""
+        return self.sigma0 * _median_sigma(self.image_covariance[~self.rejected])
 
     @property
     def stated_px(self) -> float:
-        """Stated standard deviation of an image coordinate, root mean square of the accepted, px."""
-        return _rms_sigma(self.network.image_points.covariance[~self.rejected])
+        """Stated standard deviation of an image coordinate, the median of the accepted, px."""
+        return _median_sigma(self.network.image_points.covariance[~self.rejected])
 
     @property
     def rms_px(self) -> float:
@@ -153,5 +154,8 @@ def scaled_covariance(covariance: FloatArray, sigma_factor: FloatArray) -> Float
     return np.asarray(covariance * sigma_factor[:, None, None] ** 2)
 
 
-def _rms_sigma(covariance: FloatArray) -> float:
-    return float((np.trace(covariance, axis1=1, axis2=2).mean() / 2) ** 0.5)
+def _median_sigma(covariance: FloatArray) -> float:
+    """Return that of a coordinate, NaN of none: a few image points of little weight do not change it."""
+    if not len(covariance):
+        return float("nan")
+    return float((np.median(np.trace(covariance, axis1=1, axis2=2)) / 2) ** 0.5)

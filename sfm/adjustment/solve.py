@@ -207,4 +207,5 @@ def _result(
         bar_redundancy=of_bars,
         datum_points=run.problem.datum.points,
         remarks=run.remarks,
+        start_sigma0=float(np.sqrt(run.start_vPv / redundancy)) if redundancy > 0 else float("nan"),
     )

@@ -12,7 +12,7 @@ Signs as PhotoModeler and DBAT. What a model fills is said in `sfm.distortion.mo
 from __future__ import annotations
 
 from sfm.conventions import FloatArray
-from sfm.kernels.options import inlined, kernel
+from sfm.kernels.options import inlined
 
 LOCATED_PX = (
     0.25  # Newton's step after which one more leaves nothing: its error is curvature times its square
@@ -162,7 +162,7 @@ def _corrected(
     return xc, yc, xx, xy, yy, r2
 
 
-@kernel
+@inlined
 def _measured(
     x: float, y: float, xc: float, yc: float, located: float,
     K1: float, K2: float, K3: float, P1: float, P2: float,

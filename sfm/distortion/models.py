@@ -2,8 +2,9 @@
 
 A model is one compiled function `model(frame, p, x, y, u, v, residual, Ju, Jp)`. It is given
 
-    frame (5,)      centre of the photograph, px, width and height of a pixel, mm, and 1 if residuals are to
-                    be those of the measured point, 0 if of the corrected one
+    frame (6,)      centre of the photograph, px, width and height of a pixel, mm; of corrections 1 if
+                    residuals are to be those of the measured point, 0 if of the corrected one; of distortion
+                    1 if affinity and shear are those of the distorted point, 0 if of the ideal one
     p     (n,)      parameters in the order of the model's names
     x, y            measured pixel
     u, v            tangents of the ray in the image frame (u = -U/W, v = -V/W, y up)
@@ -31,9 +32,11 @@ from typing import Any, NamedTuple
 
 from numba import njit
 
+from sfm.conventions import FloatArray
 from sfm.distortion.brown import brown, brown_affine
 from sfm.distortion.forward import brown_forward
 from sfm.distortion.opencv import full_opencv, opencv
+from sfm.kernels.options import compiled
 
 
 class Role(Enum):
@@ -76,6 +79,8 @@ class Model:
     """whether it corrects the measured point; else it distorts the ideal one"""
     corrected_plane: bool = False
     """whether residuals are those of the corrected point instead of the measured one"""
+    distorted_affinity: bool = False
+    """whether affinity and shear of a distortion act on the distorted point instead of the ideal one"""
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -136,6 +141,7 @@ ALL = (
     Model("brown_affine", brown_affine, _BROWN, corrects=True),
     Model("brown_dbat", brown, _BROWN, corrects=True, corrected_plane=True),
     Model("brown_affine_dbat", brown_affine, _BROWN, corrects=True, corrected_plane=True),
+    Model("brown_forward_affine", brown_forward, _FORWARD, distorted_affinity=True),
 )
 MODELS = {model.name: model for model in ALL}
 MAX_PARAMETERS = max(len(model.names) for model in ALL)
@@ -170,3 +176,33 @@ def one_of(models: tuple[Model, ...]) -> Callable[..., None]:
 
 
 observe = one_of(ALL)
+
+
+@compiled
+def observe_point(
+    model: int,
+    frame: FloatArray,
+    p: FloatArray,
+    x: float,
+    y: float,
+    u: float,
+    v: float,
+    residual: FloatArray,
+    Ju: FloatArray,
+    Jp: FloatArray,
+) -> None:
+    """Do as `observe`, compiled once for all that call it outside of the adjustment.
+
+    Args:
+        model: number of the model.
+        frame: of the camera, see `sfm.camera`.
+        p: its parameters, (n,).
+        x: measured column, px.
+        y: measured row, px.
+        u: tangent of the ray to the right.
+        v: tangent of the ray upwards.
+        residual: receives the residual, px, (2,).
+        Ju: receives its derivatives by u and v, px, (2, 2).
+        Jp: receives its derivatives by the parameters, px per unit, (2, n).
+    """
+    observe(model, frame, p, x, y, u, v, residual, Ju, Jp)

@@ -13,6 +13,7 @@ METRIC = (("km", 1e3), ("m", 1.0), ("mm", 1e-3), ("µm", 1e-6))
 """metric units and their length in metres, largest first"""
 IMPERIAL = ("in", "ft")
 SMALL = 1e-3
+ROUNDING = 1e-10  # standard deviation over the value that is none
 """parameters below it are written with an exponent"""
 SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
@@ -82,11 +83,13 @@ def with_sigma(value: float, sigma: float) -> tuple[str, str]:
 
     Args:
         value: of any unit.
-        sigma: its standard deviation, 0 if it was held, NaN if it is not known.
+        sigma: its standard deviation, 0 if it was held or defines the system, NaN if it is not known.
     """
-    if np.isfinite(sigma) and sigma > 1e-13 * (1 + abs(value)):
+    if np.isnan(sigma):
+        return f"{value:.9g}", "not known"
+    if sigma > ROUNDING * (1 + abs(value)):
         return to_precision(value, sigma), significant(sigma, 2)
-    return f"{value:.9g}", "not known" if np.isnan(sigma) else "held"
+    return f"{round(value, 10) + 0.0:.9g}", "0"
 
 
 def to_precision(value: float, sigma: float) -> str:

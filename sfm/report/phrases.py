@@ -22,9 +22,9 @@ MAX_NAMES = 5  # weak points that are named
 
 def words_of_sigma0(sigma0: Sigma0) -> tuple[str, str]:
     """Return sigma0 and what it is to the stated one, with the image points where they show another."""
-    times = f"{sigma0.ratio:.3f} times the {significant(sigma0.stated_px)} px expected"
-    own = f"of all observations; image points by themselves {sigma0.image_points_px:.4f} px, {times}"
-    return f"{sigma0.px:.4f} px", own if sigma0.differs else times
+    times = f"{sigma0.px / sigma0.stated_px:.3f} times the {significant(sigma0.stated_px)} px expected"
+    own = f"image points by themselves {sigma0.image_points_px:.4f} px, {sigma0.ratio:.3f} times"
+    return f"{sigma0.px:.4f} px", f"{times}; {own}" if sigma0.differs else times
 
 
 def words_of_test(test: GlobalTest, adjustment: Adjustment | None = None) -> str:

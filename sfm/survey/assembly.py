@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from sfm.adjustment.quality.correlations import orientation_correlations
+from sfm.adjustment.quality.correlations import exterior_correlations, strong_correlations
 from sfm.orientation.incremental.sequence import Orientation
-from sfm.result import FailedImage, StageTime, SurveyResult
+from sfm.result import CheckPoint, FailedImage, StageTime, SurveyResult
 from sfm.runtime.progress import StageClock
 from sfm.survey.adjusting.solution import Correspondences, Solution
 from sfm.survey.inputs.measurements import Measurements
@@ -33,6 +33,7 @@ def assemble_result(
         for one in (*start.failures, *matched.left_out, *solution.dropped_images)
         if one[0] not in is_in
     )
+    correlations = exterior_correlations(adjustment)
     return SurveyResult(
         survey=survey.name,
         unit=survey.unit,
@@ -62,6 +63,22 @@ def assemble_result(
         unused_image_points=solution.unused_image_points + sum(one.image_points for one in measured.left_out),
         reject=survey.reject,
         weights=survey.adjust.weights,
-        orientation_correlations=orientation_correlations(adjustment),
+        check_points=_check_points(survey),
+        balance_radius_mm=tuple(
+            (one.name, dict(one.balanced)["R0"]) for one in survey.cameras if one.balanced
+        ),
+        exterior_correlations=correlations,
+        orientation_correlations=strong_correlations(correlations),
         seconds=tuple(StageTime(*one) for one in clock.seconds),
+    )
+
+
+def _check_points(survey: Survey) -> tuple[CheckPoint, ...]:
+    """Return the points of which the control table marks coordinates to check with."""
+    control = survey.control
+    if control is None or control.check is None:
+        return ()
+    return tuple(
+        CheckPoint(control.names[k], np.where(control.check[k], control.xyz[k], np.nan), control.sigma[k])
+        for k in np.flatnonzero(control.check.any(axis=1))
     )

@@ -69,9 +69,32 @@ def test_two_control_points_leave_a_turn_open() -> None:
     a = adjust(network, truth, datum=Datum("control"), reject="none")
     assert a.converged
     assert (a.defect, a.expected_defect) == (1, 0)  # control is meant to fix all seven
+    axis = truth.points[1] - truth.points[0]
+    axis *= np.sign(axis[np.argmax(np.abs(axis))]) / np.linalg.norm(axis)
     assert a.undetermined == (
-        "datum: 1 of the seven of position, attitude and scale are not determined by the control",
+        "datum: 1 of the seven of position, attitude and scale are not determined by the control: "
+        f"rotation about ({axis[0]:.2f}, {axis[1]:.2f}, {axis[2]:.2f})",
     )
+
+
+@pytest.mark.parametrize(
+    ("known", "words"),
+    [
+        (((0, "Z"), (1, "Z"), (2, "Z")), "shift along X and Y, rotation about Z, scale"),
+        (((0, "XYZ"),), "rotation about X, Y and Z, scale"),
+        (((0, "YZ"), (1, "YZ"), (2, "YZ")), "shift along X"),
+    ],
+)
+def test_motions_that_control_leaves_open_are_named(known: tuple[tuple[int, str], ...], words: str) -> None:
+    network, truth = make_network(seed_of("open"), images=5, points=15)
+    covariance = np.tile(np.diag(np.full(3, np.inf)), (len(known), 1, 1))
+    for k, (_, axes) in enumerate(known):
+        for axis in axes:
+            covariance[k, "XYZ".index(axis), "XYZ".index(axis)] = 1e-8
+    index = np.array([j for j, _ in known])
+    network = replace(network, control=ObjectPoints(index, truth.points[index], covariance))
+    a = adjust(network, truth, datum=Datum("control"), reject="none")
+    assert len(a.undetermined) == 1 and a.undetermined[0].endswith(f"by the control: {words}")
 
 
 def test_points_on_parallel_rays_are_named() -> None:

@@ -58,4 +58,5 @@ def test_95_percent_intervals_hold_the_truth_in_95_percent_of_networks() -> None
     error = 3 * np.sqrt(LEVEL * (1 - LEVEL) / networks)  # three standard deviations of a share
     for name, count in found.items():
         assert abs(count / networks - LEVEL) < error, (name, count)
-    assert abs(rejected / (3 * networks) - 0.05) < 3 * np.sqrt(0.05 * 0.95 / (3 * networks))
+    # the three fits of a network share its sigma0: they count as one
+    assert abs(rejected / (3 * networks) - 0.05) < 3 * np.sqrt(0.05 * 0.95 / networks)

@@ -10,7 +10,11 @@ import numpy as np
 import pytest
 
 from sfm.adjustment.datum import Datum
+from sfm.adjustment.quality.correlations import orientation_correlations
 from sfm.adjustment.solve import adjust
+from sfm.camera import project
+from sfm.conventions import FloatArray
+from sfm.network import Estimate, Network
 from sfm.pipeline import run_survey
 from sfm.report.findings.findings import Findings, findings_of
 from sfm.report.tables.protocol_files import write_protocol
@@ -102,3 +106,38 @@ def test_the_files_hold_all_covariances(found: Findings, tmp_path: Path) -> None
     with (tmp_path / "interior_correlations.csv").open(encoding="utf-8") as file:
         pairs = list(csv.DictReader(file))
     assert len(pairs) == 10 and all(-1 <= float(pair["correlation"]) <= 1 for pair in pairs)
+
+
+def test_correlations_with_every_photograph_are_a_table(found: Findings, tmp_path: Path) -> None:
+    write_protocol(found, tmp_path)
+    with (tmp_path / "exterior_correlations.csv").open(encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    a = found.result.adjustment
+    assert len(rows) == 5 * 8 and {row["camera"] for row in rows} == {"synthetic"}
+    assert [row["image"] for row in rows[:8]] == list(a.network.images)
+    size = max(abs(float(row[part])) for row in rows for part in ("X0", "Y0", "Z0", "omega", "phi", "kappa"))
+    (strongest, *_) = orientation_correlations(a, limit=0.0)
+    assert size == pytest.approx(abs(strongest.largest), rel=1e-9) and size < 1
+
+
+def test_the_first_and_the_last_error_are_told() -> None:
+    """Points 5 mm off at the start, some 10 px in the photographs of 0.1 px."""
+    rng = seed_of("first error")
+    network, truth = make_network(rng, images=8, points=30, free=())
+    start = replace(truth, points=truth.points + 5e-3 * rng.standard_normal(truth.points.shape))
+    a = adjust(network, start, datum=Datum("free"), reject="none")
+    v = residuals_of(network, start) / 0.1
+    assert a.start_sigma0 == pytest.approx(np.sqrt((v**2).sum() / a.redundancy), rel=1e-9)
+    assert a.start_sigma0 > 20 * a.sigma0
+    found = findings_of(run_survey(survey_of(network, truth, free=(), start=start)))
+    assert found.result.adjustment.start_sigma0 >= found.result.adjustment.sigma0  # after the orientation
+    assert "at the start values of the adjustment" in text_report(found)
+
+
+def residuals_of(network: Network, estimate: Estimate) -> FloatArray:
+    seen = network.image_points
+    xy = [
+        project(estimate.cameras[0], estimate.position[i], estimate.rotation[i], estimate.points[[j]])[0]
+        for i, j in zip(seen.image, seen.point, strict=True)
+    ]
+    return np.array(xy) - seen.xy

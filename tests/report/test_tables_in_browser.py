@@ -65,6 +65,10 @@ def test_tables_are_sorted_filtered_and_copied(page_file: Path) -> None:
         assert page.title() == "b minus a - Kolinear" and tab.complaints == []
         page.set_viewport_size({"width": 400, "height": 800})
         assert page.evaluate("document.documentElement.scrollWidth") <= 400
+        page.set_viewport_size({"width": 688, "height": 900})  # of a page of A4 within its margins
+        page.emulate_media(media="print")
+        assert page.evaluate("document.documentElement.scrollWidth") <= 688
+        assert not page.locator(".tools").first.is_visible()
         tab.close()
 
 

@@ -8,9 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from adapters.formats.result_tables import read_result
+from adapters.formats.result_tables import write_tables as write_stored
 from sfm.errors import SurveyFileError
 from sfm.pipeline import run_survey
 from sfm.report.findings.findings import findings_of
+from sfm.report.tables.csv_files import write_tables
+from sfm.report.tables.summary import write_summary
 from sfm.survey.inputs.given import KnownPoints, read_control, read_image_points
 from sfm.survey.inputs.start import measurements_from_observations
 from tests.surveys import survey_of
@@ -102,3 +106,60 @@ def test_covariances_of_image_coordinates_are_weights(unit: str, expected: float
     path.write_text(header + rows[0].rsplit(",", 1)[0] + ",1\n", encoding="utf-8")
     with pytest.raises(SurveyFileError, match="a correlation below 1"):
         read_image_points(path)
+
+
+def test_covariances_of_image_points_come_back_from_the_tables(tmp_path: Path) -> None:
+    network, truth = make_network(seed_of("correlated"), images=6, points=20)
+    C = np.array([[0.01, 0.004], [0.004, 0.02]])
+    survey = survey_of(network, truth, sigma=True)
+    given = survey.observations
+    assert given is not None
+    n = len(given.xy)
+    given = replace(given, sigma=np.tile(np.sqrt(np.diagonal(C)), (n, 1)), covariance=np.full(n, C[0, 1]))
+    result = run_survey(replace(survey, observations=given))
+    write_tables(findings_of(result), tmp_path)
+    again = read_image_points(tmp_path / "image_points.csv")
+    assert again.covariance is not None
+    np.testing.assert_allclose(again.covariance, C[0, 1], rtol=1e-14)
+    a, b = (run_survey(replace(survey, observations=one)).adjustment for one in (given, again))
+    np.testing.assert_allclose(b.estimate.points, a.estimate.points, atol=1e-9)
+    write_summary(findings_of(result), tmp_path)
+    stored = read_result(tmp_path)
+    np.testing.assert_allclose(stored.network.image_points.covariance, np.tile(C, (n, 1, 1)), rtol=1e-12)
+    write_stored(tmp_path / "stored", stored)
+    twice = read_result(tmp_path / "stored").network.image_points.covariance
+    np.testing.assert_allclose(twice, stored.network.image_points.covariance, rtol=1e-12)
+
+
+def test_heights_check_points_of_which_place_is_control(tmp_path: Path) -> None:
+    """X and Y of five points hold the network with four full points, their Z only check it."""
+    network, truth = make_network(seed_of("heights check"), images=8, points=30)
+    rng = seed_of("heights check noise")
+    X = truth.points[:9] + 1e-4 * rng.standard_normal((9, 3))
+    header = "id,X,Y,Z,sX,sY,sZ,checkX,checkY,checkZ\n"
+    for wrong in (0.0, 0.01):
+        X[6, 2] += wrong
+        rows = [f"{j + 1},{','.join(map(str, X[j]))},1e-4,1e-4,1e-4,,,{int(j >= 4)}" for j in range(9)]
+        control = _control(tmp_path / "control.csv", header + "\n".join(rows) + "\n")
+        result = run_survey(survey_of(network, truth, control=control, datum={"kind": "control"}))
+        found = findings_of(result)
+        assert found.counts.control == 4 * 3 + 5 * 2
+        rows_of_check = [row for row in found.protocol.control if row.use == "check"]
+        assert [(row.point, row.coordinate) for row in rows_of_check] == [(str(j), "Z") for j in range(5, 10)]
+        tests = np.array([row.test for row in rows_of_check])
+        assert (np.abs(np.delete(tests, 2)) < 4).all()
+        told = [line for line in found.verdict.remarks if "Z of check point 7" in line]
+        assert (abs(tests[2]) > 30 and told and found.verdict.level == "bad") if wrong else not told
+        assert wrong or found.verdict.level == "good"
+
+
+@pytest.mark.parametrize(
+    ("row", "message"),
+    [("1,0,0,,1,1,,,,1", "checkZ holds 1"), ("1,0,0,0,1,1,1,2,,", "column checkX holds 2, needed 0, 1")],
+)
+def test_checks_without_sense_are_refused(row: str, message: str, tmp_path: Path) -> None:
+    with pytest.raises(SurveyFileError, match=message):
+        _control(
+            tmp_path / "control.csv",
+            f"id,X,Y,Z,sX,sY,sZ,checkX,checkY,checkZ\n{row}\n2,5,6,7,1,1,1,,,\n",
+        )

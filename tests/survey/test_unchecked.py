@@ -5,8 +5,9 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
-from sfm.adjustment.quality.against_free import given_test
+from sfm.adjustment.quality.against_free import control_apart, given_test
 from sfm.network import Estimate, ImagePoints, Network
 from sfm.pipeline import run_survey
 from sfm.report.findings.findings import findings_of
@@ -102,3 +103,30 @@ def test_another_exposure_from_the_same_place_is_no_copy() -> None:
     xy[n : 2 * n] += 0.02 * rng.standard_normal((n, 2))
     assert same_photographs(image, point, xy, np.zeros(3, dtype=np.int64)) == {2: 0}
     assert same_photographs(image, point, xy, np.array([0, 0, 1])) == {}  # of another camera
+
+
+@pytest.mark.parametrize("reject", ["tau", "none"])
+def test_a_third_of_the_control_half_a_metre_off_is_named(reject: str) -> None:
+    """10 of 30 control points stated to 1 mm: sigma0 was 500 times too large, and no line said which."""
+    rng = seed_of("third of control")
+    network, truth = make_network(rng, images=6, points=40)
+    xyz = truth.points[:30] + 1e-3 * rng.standard_normal((30, 3))
+    moved = sorted(rng.permutation(30)[:10].tolist())
+    xyz[moved] += 0.5 * np.eye(3)[rng.integers(0, 3, 10)]
+    control = KnownPoints.from_arrays([str(k + 1) for k in range(30)], xyz, 1e-3)
+    given = {"control": control, "datum": {"kind": "control"}, "adjust": {"reject": reject}}
+    result = run_survey(survey_of(network, truth, **given))
+    found = control_apart(result.adjustment, result.free_network)
+    assert sorted(int(one.point) - 1 for one in found) == moved
+    assert all(one.distance == pytest.approx(0.5, abs=0.01) for one in found)
+    verdict = findings_of(result).verdict
+    assert verdict.level == "bad"
+    assert any("10 control point(s) do not fit" in line for line in verdict.remarks)
+
+
+def test_good_control_fits_the_free_network() -> None:
+    network, truth = _scene("good control")
+    noisy = truth.points[:8] + 1e-3 * seed_of("good control noise").standard_normal((8, 3))
+    control = KnownPoints.from_arrays([str(k + 1) for k in range(8)], noisy, 1e-3)
+    result = run_survey(survey_of(network, truth, control=control, datum={"kind": "control"}))
+    assert control_apart(result.adjustment, result.free_network) == ()

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from sfm.adjustment.datum import Datum
+from sfm.adjustment.solve import adjust
 from sfm.pipeline import run_survey
+from sfm.report.findings.checks import Sigma0
 from sfm.report.findings.findings import findings_of
-from sfm.report.phrases import words_of_weights
+from sfm.report.phrases import words_of_sigma0, words_of_weights
 from sfm.report.text.text_report import text_report
 from sfm.survey.inputs.given import KnownPoints
 from tests.surveys import survey_of
@@ -38,3 +43,17 @@ def test_stated_weights_have_one_sigma0_for_all(weights: str) -> None:
     text = text_report(found)
     assert f"{a.sigma0:.4f} times the standard deviations that the weights rest on" in text
     assert np.isfinite(a.covariance.points).all()
+
+
+def test_a_few_weak_points_do_not_change_sigma0_in_px() -> None:
+    """Four image points stated to 3 px among those of 0.1 px: their mean square made 0.1 px 0.4 px."""
+    network, truth = make_network(seed_of("weak points"), images=8, points=30)
+    plain = adjust(network, truth, datum=Datum("free"), reject="none")
+    covariance = network.image_points.covariance.copy()
+    covariance[[3, 50, 120, 200]] *= 900.0
+    weak = replace(network, image_points=replace(network.image_points, covariance=covariance))
+    a = adjust(weak, truth, datum=Datum("free"), reject="none")
+    assert a.stated_px == pytest.approx(0.1)
+    assert a.sigma0_px == pytest.approx(plain.sigma0_px, rel=0.02)
+    figure, words = words_of_sigma0(Sigma0(0.12, 1.195, 0.1))
+    assert figure == "0.1200 px" and words == "1.200 times the 0.100 px expected"  # both of all observations

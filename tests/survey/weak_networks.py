@@ -2,14 +2,18 @@
 
 `weak_network` makes one that depends on its number only; `study` runs surveys of many of them from scratch,
 and tells how wrong each result is and what was said of it. Object unit m.
+
+    python -m tests.survey.weak_networks FIRST END FILE    a line of FILE for each; none of FILE is repeated
 """
 
 from __future__ import annotations
 
+import json
 import sys
 from collections import Counter
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
 
 import numpy as np
 
@@ -157,12 +161,22 @@ def outcome_of(number: int) -> Outcome:
     return Outcome(number, verdict.level, rms / float(sigma), rms / size, c, weak.words, verdict.remarks)
 
 
-def study(numbers: Iterable[int]) -> list[Outcome]:
-    """Return the outcomes of weak networks, and print those that are wrong and believed."""
+def study(numbers: Iterable[int], kept: Path | None = None) -> list[Outcome]:
+    """Return the outcomes of weak networks, and print those that are wrong and believed.
+
+    Args:
+        numbers: numbers of the networks
+        kept: file that keeps the outcomes, a JSON line each; those that stand in it are not computed again.
+    """
+    lines = kept.read_text().splitlines() if kept is not None and kept.exists() else []
+    done = {one.number: one for one in (Outcome(**json.loads(line)) for line in lines)}
     found = []
     for number in numbers:
-        one = outcome_of(number)
+        one = done[number] if number in done else outcome_of(number)
         found.append(one)
+        if kept is not None and number not in done:
+            with kept.open("a") as file:
+                file.write(json.dumps(asdict(one)) + "\n")
         if one.is_wrong_and_believed:
             print(f"{number}: {one.level}, {one.over_sigma:.1f} sigma, c {one.c:.3f}; {one.words}")
             for line in one.remarks:
@@ -172,3 +186,7 @@ def study(numbers: Iterable[int]) -> list[Outcome]:
     wrong = Counter(one.level for one in found if one.over_sigma > WRONG)
     print(f"{len(found)} networks: {dict(levels)}, of them wrong by more than {WRONG:g} sigma: {dict(wrong)}")
     return found
+
+
+if __name__ == "__main__":
+    study(range(int(sys.argv[1]), int(sys.argv[2])), Path(sys.argv[3]))

@@ -30,7 +30,7 @@ class Observations(NamedTuple):
     whitening: FloatArray  # a, b, c of F = (a 0; b c) with F'F = inverse covariance, 1/px, (k, 3)
     camera: IntArray  # camera of each photograph, (m,)
     model: IntArray  # number of the distortion model of each camera, (a,)
-    frame: FloatArray  # photograph centre (px), pixel size (mm) and plane of residuals of each camera, (a, 5)
+    frame: FloatArray  # centre (px), pixel size (mm), planes of residuals and affinity of each camera, (a, 6)
     interior: IntArray  # how many parameters the model of each camera has, 0 if none is free, (a,)
     free_count: IntArray  # how many parameters of each camera are free, (a,)
     free_index: IntArray  # which they are, (a, MAX_PARAMETERS)

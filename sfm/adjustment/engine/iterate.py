@@ -56,6 +56,7 @@ class Optimum:
     converged: bool
     iterations: int
     vPv: float
+    start_vPv: float  # at the start values
 
 
 @dataclass(frozen=True)
@@ -133,8 +134,9 @@ def iterate(
     layout = problem.layout
     single = problem.solver.has_coarse and not near
     taken, first = 0, state
+    start_vPv: float | None = None
     if method == "levenberg-marquardt":
-        state, taken = _approach(problem, state, weight, max_iterations, single)
+        state, taken, start_vPv = _approach(problem, state, weight, max_iterations, single)
         single = False
     share = 1.0
     before: tuple[State, Move] | None = None
@@ -156,6 +158,7 @@ def iterate(
                 break
             (state, share), limit = better, np.inf
             continue
+        start_vPv = found.equations.vPv if start_vPv is None else start_vPv
         if found.within(tolerance) or taken >= max_iterations:
             break
         taken += 1
@@ -173,7 +176,8 @@ def iterate(
         reached = total(problem, moved, weight)
         if reached <= vPv * (1 + ROUNDING):
             state, vPv = moved, reached
-    return Optimum(state, found.equations, found.factor, found.motions, converged, taken, vPv)
+    start_vPv = vPv if start_vPv is None else start_vPv
+    return Optimum(state, found.equations, found.factor, found.motions, converged, taken, vPv, start_vPv)
 
 
 def _refuse(problem: Problem, state: State) -> NoReturn:
@@ -187,7 +191,8 @@ def optimum_at(problem: Problem, state: State, weight: FloatArray) -> Optimum | 
     found = _solve(problem, state, weight)
     if found is None:
         return None
-    return Optimum(state, found.equations, found.factor, found.motions, True, 0, found.equations.vPv)
+    vPv = found.equations.vPv
+    return Optimum(state, found.equations, found.factor, found.motions, True, 0, vPv, vPv)
 
 
 def newton_step(problem: Problem, state: State, weight: FloatArray) -> Step | None:
@@ -251,15 +256,17 @@ def _step(layout: Unknowns, equations: Equations, factor: Factor, motions: Motio
 
 def _approach(
     problem: Problem, state: State, weight: FloatArray, max_iterations: int, single: bool
-) -> tuple[State, int]:
-    """Return a state near the optimum by Levenberg-Marquardt, and how many steps were tried."""
+) -> tuple[State, int, float | None]:
+    """Return a state near the optimum by Levenberg-Marquardt, how many steps were tried, v'Pv at first."""
     damping, growth = START_DAMPING, 2.0
+    start_vPv: float | None = None
     for taken in range(max_iterations):
         found = _solve(problem, state, weight, damping=damping, single=single)
         gain = -1.0
         if found is not None:
+            start_vPv = found.equations.vPv if start_vPv is None else start_vPv
             if found.within(NEAR):
-                return state, taken
+                return state, taken, start_vPv
             moved = step(problem.layout, state, found.reduced, found.points)
             gain = (found.equations.vPv - total(problem, moved, weight)) / found.predicted
         if gain > ARMIJO:
@@ -271,7 +278,7 @@ def _approach(
             growth *= 2
         if damping > MAX_DAMPING:
             break
-    return state, max_iterations
+    return state, max_iterations, start_vPv
 
 
 def total(problem: Problem, state: State, weight: FloatArray) -> float:

@@ -24,6 +24,9 @@ from sfm.similarity import fit_similarity, similarity_motions
 
 MIN_CONTROL = 4  # points whose residuals after a similarity say how good they are
 SIMILARITY = 7  # parameters
+SIMILARITY_POINTS, TRIPLES = 3, 300  # of as many a similarity is tried, so often
+MEDIAN_LENGTH_IN_SPACE = 0.65  # sigma of a coordinate over the median length of a normal vector in space
+APART = 10.0  # standard deviations from which a control point does not fit
 
 
 @dataclass(frozen=True)
@@ -46,6 +49,15 @@ class GivenTest:
     statistic: float  # increase of v'Pv over its redundancy, over the variance factor of the free network
     redundancy: int  # that control, bars and observed orientation add
     probability: float  # of an F so large by chance
+
+
+@dataclass(frozen=True)
+class ControlApart:
+    """A control point that does not fit the shape of the free network as most of the others do."""
+
+    point: str
+    distance: float  # object unit
+    over_sigma: float  # over its stated standard deviation, or the scatter of the others if that is larger
 
 
 @dataclass(frozen=True)
@@ -86,6 +98,44 @@ def given_test(a: Adjustment, free: FreeNetwork | None) -> GivenTest | None:
     added = a.redundancy - free.redundancy
     statistic = max(a.vPv - free.vPv, 0.0) / added / (free.vPv / free.redundancy)
     return GivenTest(statistic, added, float(f_sf(statistic, added, free.redundancy)))
+
+
+def control_apart(a: Adjustment, free: FreeNetwork | None) -> tuple[ControlApart, ...]:
+    """Return the control points that do not fit the shape of the free network, the farthest first.
+
+    The free network is placed on the control that most points agree upon: of many similarities by three
+    of them that of the smallest median distance, then by all that fit.
+
+    Source: Rousseeuw (1984), J. Am. Stat. Assoc. 79(388), least median of squares.
+    """
+    control = a.network.control.complete
+    n = len(control)
+    if free is None or a.datum != "control" or n < MIN_CONTROL:
+        return ()
+    X, given = free.points[control.point], control.xyz
+    stated = np.sqrt(np.maximum(np.einsum("nii->ni", control.covariance).max(axis=1), 0.0))
+    rng = np.random.default_rng(n)
+    best, off = np.inf, np.zeros(n)
+    for _ in range(TRIPLES):
+        some = rng.choice(n, SIMILARITY_POINTS, replace=False)
+        try:
+            distance = np.linalg.norm(fit_similarity(X[some], given[some]).apply(X) - given, axis=1)
+        except GeometryError:
+            continue
+        if np.median(distance) < best:
+            best, off = float(np.median(distance)), distance
+    for _ in range(2):
+        scatter = MEDIAN_LENGTH_IN_SPACE * float(np.median(off))
+        fits = off <= APART * np.maximum(stated, scatter)
+        if 2 * fits.sum() <= n or fits.sum() < MIN_CONTROL:
+            return ()
+        off = np.linalg.norm(fit_similarity(X[fits], given[fits]).apply(X) - given, axis=1)
+    apart = off / np.maximum(stated, scatter)
+    return tuple(
+        ControlApart(a.network.points[control.point[k]], float(off[k]), float(apart[k]))
+        for k in np.argsort(-off)
+        if apart[k] > APART
+    )
 
 
 def scale_difference(a: Adjustment, free: FreeNetwork | None) -> ScaleDifference | None:

@@ -26,6 +26,7 @@ from sfm.network import rows_of
 
 FAMILY = 0.01  # chance with which each test says anything of a survey in which nothing is wrong
 EXPLAINED = 0.001  # chance with which two positions that are right do not explain the residuals
+APART = 3.0  # standard deviations of the distance of two positions, below which it may be none
 MANY = 20_000  # points from which only those are tried whose residuals are conspicuous by themselves
 CONSPICUOUS = 0.05
 UNEVEN = 1.5  # largest component of a photograph over their median, below which a difference is of no use
@@ -144,6 +145,8 @@ def _two_positions(
     apart = groups[1][0] - groups[0][0]
     distance = float(np.linalg.norm(apart))
     over_sigma = float(np.sqrt(apart @ np.linalg.pinv(groups[0][1] + groups[1][1]) @ apart))
+    if over_sigma < APART:
+        return None
     names = [tuple(network.images[i] for i in seen.image[rows[s]]) for s in (split, ~split)]
     return TwoPositions(network.points[seen.point[rows[0]]], distance, over_sigma, names[0], names[1])
 

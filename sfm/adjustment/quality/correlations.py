@@ -39,6 +39,29 @@ class OrientationCorrelation:
         return ", ".join(f"{part} of {n} photograph{'s' if n > 1 else ''}" for part, n in self.counts)
 
 
+@dataclass(frozen=True)
+class ExteriorCorrelations:
+    """Correlations of all adjusted camera parameters with the orientation of every photograph."""
+
+    parameters: tuple[tuple[str, str], ...]  # name, and camera in words, of each interior unknown, (i,)
+    images: tuple[str, ...]  # photographs, (m,)
+    rho: FloatArray  # with X0, Y0, Z0, omega, phi, kappa; 0 where one of the two was held, (m, 6, i)
+
+
+def exterior_correlations(adjustment: Adjustment) -> ExteriorCorrelations:
+    """Return the correlations of camera parameters with exterior orientation, in the datum of an adjustment.
+
+    Args:
+        adjustment: with its covariance.
+
+    Raises:
+        GeometryError: its normal equations cannot be solved.
+    """
+    with own_threads():
+        names, rho = _correlations(adjustment)
+    return ExteriorCorrelations(tuple(names), adjustment.network.images, rho)
+
+
 def orientation_correlations(
     adjustment: Adjustment, *, limit: float = STRONG
 ) -> tuple[OrientationCorrelation, ...]:
@@ -51,14 +74,24 @@ def orientation_correlations(
     Raises:
         GeometryError: its normal equations cannot be solved.
     """
-    with own_threads():
-        names, rho = _correlations(adjustment)
-    if not rho.size:
+    return strong_correlations(exterior_correlations(adjustment), limit=limit)
+
+
+def strong_correlations(
+    correlations: ExteriorCorrelations, *, limit: float = STRONG
+) -> tuple[OrientationCorrelation, ...]:
+    """Return the camera parameters with a correlation beyond a limit, strongest first.
+
+    Args:
+        correlations: with the exterior orientation of every photograph.
+        limit: absolute correlation from which a parameter is reported.
+    """
+    if not correlations.rho.size:
         return ()
-    images = adjustment.network.images
+    images = correlations.images
     found = []
-    for c, (parameter, camera) in enumerate(names):
-        size = np.abs(rho[:, :, c])
+    for c, (parameter, camera) in enumerate(correlations.parameters):
+        size = np.abs(correlations.rho[:, :, c])
         strong = size > limit
         if not strong.any():
             continue
@@ -66,7 +99,7 @@ def orientation_correlations(
         counts = tuple((part, int(n)) for part, n in zip(PARTS, strong.sum(axis=0), strict=True) if n)
         found.append(
             OrientationCorrelation(
-                f"{parameter} of {camera}", float(rho[i, p, c]), PARTS[p], images[i], counts
+                f"{parameter} of {camera}", float(correlations.rho[i, p, c]), PARTS[p], images[i], counts
             )
         )
     return tuple(sorted(found, key=lambda one: -abs(one.largest)))

@@ -162,7 +162,7 @@ class _Search:
         """Return solutions and places of about the same v'Pv along c, and minima beyond them."""
         free = [camera.free for camera in result.cameras]
         steps = STEPS if any(one[0] for one in free) else 0
-        starts = [result] if self.datum.kind == "control" else [result, _reflected(result)]
+        starts = [result] if self.datum.kind == "control" else [result, reflected(result)]
         for start in starts:
             for direction in (STEP, 1 / STEP) if steps else (1.0,):
                 track = self._along(start, direction, steps, vPv)
@@ -181,7 +181,7 @@ class _Search:
         track: list[_Candidate] = []
         estimate = start
         for k in range(steps + 1):
-            found = self.adjusted(_scaled(estimate, factor) if k else estimate, held=steps > 0)
+            found = self.adjusted(scaled(estimate, factor) if k else estimate, held=steps > 0)
             if found is None:
                 break
             estimate = found.estimate
@@ -203,7 +203,7 @@ def _with_free(estimate: Estimate, free: list[BoolArray]) -> Estimate:
     return replace(estimate, cameras=cameras)
 
 
-def _scaled(estimate: Estimate, factor: float) -> Estimate:
+def scaled(estimate: Estimate, factor: float) -> Estimate:
     """Return the estimate with multiples of c, and photographs as many times as far from the object."""
     cameras = []
     for camera in estimate.cameras:
@@ -214,7 +214,7 @@ def _scaled(estimate: Estimate, factor: float) -> Estimate:
     return replace(estimate, cameras=tuple(cameras), position=centre + factor * (estimate.position - centre))
 
 
-def _reflected(estimate: Estimate) -> Estimate:
+def reflected(estimate: Estimate) -> Estimate:
     """Return the estimate reflected in depth: exact where all rays of a photograph are parallel."""
     d = estimate.rotation[:, :, 2].mean(axis=0)
     F = np.eye(3) - 2 * np.outer(d, d) / (d @ d)

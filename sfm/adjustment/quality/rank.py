@@ -7,6 +7,7 @@ from collections import Counter
 import numpy as np
 
 from sfm.adjustment.engine.iterate import Optimum
+from sfm.adjustment.engine.motions import free_motions
 from sfm.adjustment.engine.products import times_points, times_reduced
 from sfm.adjustment.engine.unknowns import Unknowns, interior_names
 from sfm.conventions import BoolArray, FloatArray
@@ -14,6 +15,8 @@ from sfm.network import Estimate, Network
 
 MAPPED_TO_ZERO = 1e-6  # length of the image of a null vector of length 1, diagonal 1; rounding leaves 1e-13
 LEADING = 0.1  # share of the largest component of a null vector from which a parameter is named
+AXIS = 1e-3  # of length 1 that a direction may lack to be called that of a coordinate axis
+AXES = ("X", "Y", "Z")
 EXTERIOR = ("X0", "Y0", "Z0", "x rotation", "y rotation", "z rotation")
 
 
@@ -77,10 +80,57 @@ def undetermined_of(
     if optimum.motions.defect > allowed_motions:
         words.append(
             f"datum: {optimum.motions.defect - allowed_motions} of the seven of position, attitude and scale "
-            "are not determined by the control"
+            f"are not determined by the control: {words_of_motions(optimum, layout)}"
         )
     words += [_name(vector, layout, network, estimate) for vector in optimum.factor.further.T]
     return tuple(words)
+
+
+def words_of_motions(optimum: Optimum, layout: Unknowns) -> str:
+    """Return the motions that the observations leave open: "shift along X and Y, rotation about Z, scale".
+
+    A rotation about an axis that does not run through the centre of the points is a rotation here, the shift
+    that goes with it is not told.
+    """
+    generators = free_motions(layout, optimum.state)[1].reshape(-1, 7)
+    opened = optimum.motions.points.reshape(-1, optimum.motions.defect)
+    V = np.linalg.qr(np.linalg.lstsq(generators, opened, rcond=None)[0])[0]  # (7, d)
+    turns = _null_space(V[3:])  # those combinations that only shift
+    rest = _complement(turns, V.shape[1])
+    scales = rest @ _null_space(V[6:] @ rest)  # of the others those that do not scale
+    parts = []
+    if turns.shape[1]:
+        parts.append(f"shift along {_axes(V[:3] @ turns)}")
+    if scales.shape[1]:
+        parts.append(f"rotation about {_axes(V[3:6] @ scales)}")
+    if turns.shape[1] + scales.shape[1] < V.shape[1]:
+        parts.append("scale")
+    return ", ".join(parts)
+
+
+def _null_space(A: FloatArray) -> FloatArray:
+    """Return an orthonormal basis of what a matrix maps to zero."""
+    _, singular, Vt = np.linalg.svd(A, full_matrices=True)
+    return np.asarray(Vt[int((singular > MAPPED_TO_ZERO).sum()) :].T)
+
+
+def _complement(basis: FloatArray, size: int) -> FloatArray:
+    """Return an orthonormal basis of what is perpendicular to another one."""
+    return _null_space(basis.T) if basis.shape[1] else np.eye(size)
+
+
+def _axes(directions: FloatArray) -> str:
+    """Return the directions that some vectors in space span: axes by name, else by components."""
+    U = np.linalg.svd(directions, full_matrices=False)[0][:, : directions.shape[1]]
+    if U.shape[1] >= len(AXES):
+        return "X, Y and Z"
+    share = np.linalg.norm(U, axis=1)
+    named = [axis for axis, part in zip(AXES, share, strict=True) if part > 1 - AXIS]
+    if len(named) == U.shape[1]:
+        return " and ".join(named)
+    across = U[:, 0] if U.shape[1] == 1 else np.cross(U[:, 0], U[:, 1])
+    shown = ", ".join(f"{value:.2f}" for value in across * np.sign(across[np.argmax(np.abs(across))]))
+    return f"({shown})" if U.shape[1] == 1 else f"all directions across ({shown})"
 
 
 def reduced_names(layout: Unknowns, network: Network, estimate: Estimate) -> list[tuple[str, str]]:

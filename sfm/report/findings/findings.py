@@ -8,7 +8,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from sfm.adjustment.quality.against_free import GivenTest, given_test, scale_difference
+from sfm.adjustment.quality.against_free import (
+    GivenTest,
+    control_apart,
+    given_test,
+    scale_difference,
+)
 from sfm.adjustment.quality.consistency import Consistency, consistency_of
 from sfm.adjustment.quality.held_camera import HeldParameter, held_parameters
 from sfm.report.findings.bundle_statistics import Statistics, statistics_of
@@ -30,7 +35,7 @@ from sfm.report.findings.given_residuals import Given, given_of
 from sfm.report.findings.interior_parameters import InteriorOrientation, interior_of
 from sfm.report.findings.other_adjuster import ComparisonFindings, comparison_of
 from sfm.report.findings.precision import Precision, precision_of
-from sfm.report.findings.protocol import Protocol, protocol_of
+from sfm.report.findings.protocol import Protocol, check_coordinates, protocol_of
 from sfm.report.findings.rejected import Rejected, rejected_of
 from sfm.report.findings.solution_rows import PhotographRow, PointRow, photographs_of, points_of
 from sfm.report.findings.verdicts.evidence import Evidence
@@ -77,6 +82,8 @@ def findings_of(result: SurveyResult) -> Findings:
         *(result, sigma0, longest, statistics, given, check, size, consistency, held),
         against_free,
         scale_difference(a, result.free_network),
+        check_coordinates(result),
+        control_apart(a, result.free_network),
     )
     return Findings(
         result=result,

@@ -107,7 +107,7 @@ def protocol_of(result: SurveyResult, given: Given, check: CheckedControl | None
         ),
         rejected=_rejected(a),
         limits=_limits(result),
-        control=(*_control(a, given), *_checked(a, check)),
+        control=(*_control(a, given), *_checked(a, check), *check_coordinates(result)),
         rays_by_kind=_rays_by_kind(result),
         lenses=tuple(_lens(one) for k, one in enumerate(a.estimate.cameras) if (a.network.camera == k).any()),
         cumulative=_cumulative(a),
@@ -206,6 +206,32 @@ def _checked(a: Adjustment, check: CheckedControl | None) -> list[ControlCoordin
                 )
             )
     return rows
+
+
+def check_coordinates(result: SurveyResult) -> tuple[ControlCoordinate, ...]:
+    """Return the coordinates that check a datum of control, with the test of their differences."""
+    a = result.adjustment
+    if a.datum != "control":
+        return ()
+    rows = []
+    place = {name: j for j, name in enumerate(a.network.points)}
+    for one in result.check_points:
+        j = place.get(one.point)
+        if j is None:
+            continue
+        posterior = np.sqrt(np.maximum(np.diagonal(a.covariance.points[j]), 0.0))
+        for c in np.flatnonzero(np.isfinite(one.xyz)):
+            adjusted, known = float(a.estimate.points[j, c]), float(one.xyz[c])
+            prior, after = float(one.sigma[c]), float(posterior[c])
+            expected = float(np.hypot(prior, after))
+            test = (adjusted - known) / expected if expected > 0 else np.nan
+            rows.append(
+                ControlCoordinate(
+                    *("check", one.point, "XYZ"[c], known, prior, adjusted, after),
+                    *(adjusted - known, test),
+                )
+            )
+    return tuple(rows)
 
 
 def _rays_by_kind(result: SurveyResult) -> tuple[tuple[str, int, float, int], ...]:

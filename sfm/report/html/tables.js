@@ -35,7 +35,8 @@
     const fits = (row) => [...row.cells].every((cell) => cell.colSpan === 1) && row.cells.length === heads.length
     const last = body ? [...body.rows].filter((row) => row.classList.contains("sum")) : []
     const rows = body ? [...body.rows].filter((row) => !row.classList.contains("sum")) : []
-    if (table.closest("#explore") || rows.length < MIN_ROWS || !rows.every(fits)) return
+    const facts = heads.length === 0 || text(heads[0]) === "" // a list of figures, not of things of one kind
+    if (facts || table.closest("#explore") || rows.length < MIN_ROWS || !rows.every(fits)) return
 
     heads.forEach((head, column) => {
       const sort = make("button", { type: "button", className: "sort", title: "sort by this column" }, ...head.childNodes)

@@ -14,10 +14,14 @@ import numpy as np
 from sfm.adjustment.quality.reliability import UNCONTROLLED
 from sfm.adjustment.result import Adjustment
 from sfm.conventions import FloatArray
+from sfm.distortion.balanced import UNITS, to_balanced
+from sfm.errors import GeometryError
 from sfm.files.plain_text import csv_text
 from sfm.report.findings.bundle_statistics import Statistics
 from sfm.report.findings.findings import Findings
 from sfm.report.findings.given_residuals import Given
+
+USUAL_R0 = 2 / 3  # of the largest image radius
 
 
 def write_tables(findings: Findings, folder: Path) -> None:
@@ -34,9 +38,10 @@ def write_tables(findings: Findings, folder: Path) -> None:
         ("cameras", "camera,parameter,value,sigma,unit", camera_rows(findings)),
         (
             "image_points",
-            "image,point,x_px,y_px,sx_px,sy_px,vx_px,vy_px,rejected",
+            "image,point,x_px,y_px,sx_px,sy_px,cxy_px2,vx_px,vy_px,rejected",
             image_point_rows(adjustment),
         ),
+        ("cameras_balanced", "camera,parameter,value,unit", balanced_rows(findings)),
         ("left_out", "kind,name,image_points,reason", left_out_rows(findings)),
         ("given", "kind,name,coordinate,unit,given,difference,sigma,r,w", given_rows(findings.given)),
         (
@@ -47,6 +52,8 @@ def write_tables(findings: Findings, folder: Path) -> None:
         ),
         ("variance_components", "kind,group,observations,redundancy,sigma0", component_rows(statistics)),
     ):
+        if name == "cameras_balanced" and "brown_forward" not in findings.interior.models:
+            continue
         text = csv_text(header.split(","), rows)
         (folder / f"{name}.csv").write_text(text, encoding="utf-8", newline="")
     write_ply(folder / "points.ply", findings)
@@ -72,17 +79,42 @@ def camera_rows(findings: Findings) -> Iterable[Sequence[object]]:
             yield (camera.name, name, value, s, unit)
 
 
+def balanced_rows(findings: Findings) -> Iterable[Sequence[object]]:
+    """Return the cameras of model brown_forward in AICON's form, camera, parameter, value and unit.
+
+    R0 is that of the survey file, else two thirds of the largest image radius, as is usual. A camera that has
+    no such form, with K4 or distortion that cannot be balanced there, has no rows.
+    """
+    given = findings.result.balance_radius_mm
+    for camera in findings.result.adjustment.estimate.cameras:
+        if camera.model != "brown_forward":
+            continue
+        half = float(np.hypot(*(np.array(camera.size_px) * camera.pixel_mm))) / 2
+        of_survey = [R0 for name, R0 in given if camera.name == name or camera.name.startswith(f"{name} ")]
+        R0 = of_survey[0] if of_survey else USUAL_R0 * half
+        try:
+            rows = to_balanced(tuple(zip(camera.names, camera.parameters.tolist(), strict=True)), R0)
+        except GeometryError:
+            continue
+        for (name, value), unit in zip(rows, UNITS, strict=True):
+            yield (camera.name, name, value, unit)
+
+
 def image_point_rows(adjustment: Adjustment) -> Iterable[Sequence[object]]:
-    """Return image, point, position, sigmas as stated (else empty), residuals and 0 or 1 for rejected."""
+    """Return image, point, position, what was stated of it, residuals and 0 or 1 for rejected.
+
+    Standard deviations and covariance are empty where there are none.
+    """
     network = adjustment.network
     seen = network.image_points
-    sigma = seen.stated_sigma
+    sigma, covariance = seen.stated_sigma, seen.stated_covariance
     for k in range(len(seen)):
         yield (
             network.images[seen.image[k]],
             network.points[seen.point[k]],
             *seen.xy[k],
             *sigma[k],
+            covariance[k] or None,
             *adjustment.residuals[k],
             int(adjustment.rejected[k]),
         )

@@ -36,6 +36,11 @@ def write_protocol(findings: Findings, folder: Path) -> None:
             _control_rows(findings),
         ),
         ("interior_correlations", "camera,first,second,correlation", _correlation_rows(a)),
+        (
+            "exterior_correlations",
+            f"camera,parameter,image,{','.join(EXTERIOR)}",
+            _exterior_correlation_rows(findings),
+        ),
         ("point_covariances", _header("id", AXES), _covariance_rows(a.network.points, a.covariance.points)),
         (
             "image_covariances",
@@ -82,6 +87,16 @@ def _correlation_rows(a: Adjustment) -> Iterable[Sequence[object]]:
             for c in range(r + 1, len(names)):
                 known = sigma[r] * sigma[c]
                 yield camera.name, first, names[c], Q[r, c] / known if known > 0 else np.nan
+
+
+def _exterior_correlation_rows(findings: Findings) -> Iterable[Sequence[object]]:
+    """Yield the correlations of every interior parameter with every photograph."""
+    found = findings.result.exterior_correlations
+    if found is None:
+        return
+    for c, (parameter, camera) in enumerate(found.parameters):
+        for image, rho in zip(found.images, found.rho[:, :, c], strict=True):
+            yield (camera.removeprefix("camera "), parameter, image, *rho)
 
 
 def _header(name: str, parts: tuple[str, ...]) -> str:

@@ -38,6 +38,7 @@ def summary(findings: Findings) -> dict[str, Any]:
         },
         "converged": adjustment.converged,
         "iterations": adjustment.iterations,
+        "sigma0_at_start": or_none(adjustment.start_sigma0),
         "images": {
             "used": len(adjustment.network.images),
             "total": result.images_total,

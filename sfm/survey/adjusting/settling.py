@@ -13,11 +13,13 @@ from sfm.adjustment.quality.variance_components import IMAGE_POINTS, estimate_co
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.conventions import BoolArray, FloatArray, IntArray
+from sfm.distortion.models import Role
 from sfm.errors import GeometryError
 from sfm.network import Estimate, Network
 from sfm.orientation.ray_angles import ray_angles
 from sfm.reduced_network import reduce_network, supported
 from sfm.survey.adjusting.datum_definition import Contradiction, find_contradiction
+from sfm.survey.adjusting.nearer_start import nearer_start, words_of_held
 from sfm.survey.diagnosis.left_out import datum_carriers
 from sfm.survey.diagnosis.observation_count import refuse_too_few_observations
 from sfm.survey.diagnosis.own_camera import Treated, treat_lost
@@ -27,6 +29,10 @@ from sfm.survey.inputs.survey import Survey
 FALSE_ALARM = 0.05  # chance that a survey without any outlier loses an image coordinate; Pope (1976)
 MIN_IMAGE_POINTS = 4  # of a photograph in the final adjustment: three determine it, the fourth checks
 MIN_DATUM_POINTS = 3  # that fix position, attitude and scale
+MAX_ITERATIONS = 50  # of an adjustment from the usual start values
+MANY_ITERATIONS = 300  # from nearer ones, where it has not converged: along a flat valley steps are short
+# what is held where it does not converge with all: x0, y0 look like a rotation, c like another distance
+HELD_ONE_AFTER_ANOTHER = ((), (Role.X0, Role.Y0), (Role.X0, Role.Y0, Role.FOCAL))
 CARRYING_DEG = 2.0  # largest angle between two rays of a point below which it carries no free datum
 
 
@@ -55,11 +61,14 @@ class Settled:
     contradiction: Contradiction | None
     iterations: int  # of all adjustments on the way
     rays: IntArray  # accepted rays of each point, of those that left when they left, (n,)
+    start_sigma0: float  # at the start values
+    held: tuple[str, ...]  # parameters that were held because it did not converge with them, a line each
 
 
 def settle(task: Task, estimate: Estimate) -> Settled:
     """Adjust until the points and photographs that are left stay, or control or a bar is contradicted."""
-    network, iterations = task.network, 0
+    network, iterations, start_sigma0 = task.network, 0, np.nan
+    held: tuple[str, ...] = ()
     accepted = np.ones(len(network.image_points), dtype=bool)
     rays = network.rays()
     images, points = determined(network, estimate, accepted, task.needed, task.least)
@@ -67,7 +76,11 @@ def settle(task: Task, estimate: Estimate) -> Settled:
         part, start = reduce_network(network, estimate, images, points, np.ones_like(accepted))
         refuse_too_few_observations(part, start, task.datum.kind)
         adjustment = _tested(task, part, start, covariance=False)
+        start_sigma0 = start_sigma0 if iterations else adjustment.start_sigma0
         iterations += adjustment.iterations
+        if not adjustment.converged:
+            adjustment, held = _converged(task, part, start, adjustment)
+            iterations += adjustment.iterations
         found = contradiction_in(task, adjustment)
         estimate = merge_estimate(estimate, adjustment.estimate, images, points)
         accepted = _accepted(network, adjustment, images, points)
@@ -75,7 +88,10 @@ def settle(task: Task, estimate: Estimate) -> Settled:
         rays = np.where(points, now, rays)
         left_images, left_points = determined(network, estimate, accepted, task.needed, task.least)
         if found is not None or ((left_images == images).all() and (left_points == points).all()):
-            return Settled(part, adjustment.estimate, images, points, accepted, found, iterations, rays)
+            values = adjustment.estimate
+            return Settled(
+                *(part, values, images, points, accepted, found, iterations, rays, start_sigma0, held)
+            )
         images, points = left_images, left_points
 
 
@@ -146,8 +162,39 @@ def contradiction_in(task: Task, adjustment: Adjustment) -> Contradiction | None
     return find_contradiction(task.network, adjustment, readjust, unit=task.survey.unit)
 
 
+def _converged(
+    task: Task, part: Network, start: Estimate, ended: Adjustment
+) -> tuple[Adjustment, tuple[str, ...]]:
+    """Return the adjustment from nearer start values, and what had to be held for it to converge.
+
+    As it ended, where it does not converge from there either.
+    """
+    datum = on_points(task.survey, part, start, task.datum)
+    nearer = nearer_start(part, start, ended.estimate, datum)
+    if nearer is None:
+        return ended, ()
+    for held in HELD_ONE_AFTER_ANOTHER[: None if not len(part.interior) else 1]:
+        cameras = tuple(replace(one, free=one.free & ~one.plays(*held)) for one in nearer.cameras)
+        found = _tested(
+            *(task, part, replace(nearer, cameras=cameras)),
+            covariance=False,
+            method="gauss-newton",
+            max_iterations=MANY_ITERATIONS,
+        )
+        if found.converged:
+            return found, words_of_held(nearer.cameras, cameras)
+    return ended, ()
+
+
 def _tested(
-    task: Task, network: Network, estimate: Estimate, *, covariance: bool, factor: float | FloatArray = 1.0
+    task: Task,
+    network: Network,
+    estimate: Estimate,
+    *,
+    covariance: bool,
+    factor: float | FloatArray = 1.0,
+    method: str = "levenberg-marquardt",
+    max_iterations: int = MAX_ITERATIONS,
 ) -> Adjustment:
     """Adjust with data snooping, the level of the single test shared out among all image coordinates."""
     tests = 2 * len(network.image_points)
@@ -159,6 +206,8 @@ def _tested(
         image_sigma_factor=factor,
         reject=task.reject,
         alpha=1 - (1 - FALSE_ALARM) ** (1 / tests),
+        method=method,
+        max_iterations=max_iterations,
         covariance=covariance,
     )
 

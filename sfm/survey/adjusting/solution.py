@@ -216,7 +216,7 @@ def _solved(start: _Prepared) -> _Solved:
     first: tuple[Settled, Adjustment, ControlCheck | None, tuple[OtherSolution, ...]] | None = None
     settled = settle(task, estimate)
     ready: Settled | None = settled
-    iterations = 0
+    iterations, start_sigma0, first_held = 0, settled.start_sigma0, settled.held
     treated = treat(task, settled, estimate, start.oriented)
     if treated is not None:
         iterations += settled.iterations
@@ -244,14 +244,15 @@ def _solved(start: _Prepared) -> _Solved:
         better = (_words_of_better(final, others[0]),)
         estimate = merge_estimate(estimate, others[0].estimate, settled.images, settled.points)
     own = () if treated is None else treated.lines
+    held = first_held if settled.held == () else settled.held
     return _Solved(
-        replace(final, iterations=iterations + final.iterations),
+        replace(final, iterations=iterations + final.iterations, start_sigma0=start_sigma0),
         settled,
         check,
         others,
         treated,
         tuple(taken_out),
-        (*own, *contradictions, *better),
+        (*own, *contradictions, *better, *held),
     )
 
 

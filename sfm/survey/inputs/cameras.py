@@ -9,6 +9,7 @@ import numpy as np
 
 from sfm.camera import Camera, camera_from_values
 from sfm.conventions import IntArray
+from sfm.distortion.balanced import from_balanced
 from sfm.errors import PhotographError, SurveyFileError
 from sfm.photographs.exif import Metadata
 from sfm.survey.inputs.given import StartCameras
@@ -76,7 +77,8 @@ def start_cameras(
         pixel, focal = one.pixel_mm, one.c_mm
         if one.sensor_mm is not None:
             pixel = one.sensor_mm[0] / size[0], one.sensor_mm[1] / size[1]
-        known = {**dict(one.fixed), **{name: value for name, (value, _) in one.weighted}}
+        known = dict(from_balanced(one.balanced)) if one.balanced else {}
+        known |= {**dict(one.fixed), **{name: value for name, (value, _) in one.weighted}}
         known |= dict(one.start) | free_start_values(one, one.name, given)
         if pixel is None:
             pixel = next((metadata[k].pixel_mm for k in own if metadata[k].pixel_mm), None)

@@ -21,6 +21,7 @@ from sfm.files.csv_tables import MAX_NUMBER, CsvTable, array_table, read_header,
 MIN_SIGMA = 1e-9  # in any unit used here less than an atom
 MAX_EXTENT_PER_SIGMA = 1e6  # no control is known to better than a millionth of its extent
 CORRELATION_LIMIT = 0.999999  # beyond it a covariance matrix is no longer regular in floating point
+CHECKS = ("checkX", "checkY", "checkZ")  # of control: 1 for a coordinate that only checks
 COVARIANCES = ("cXY", "cXZ", "cYZ")  # of control, object unit^2
 AXES, ANGLES = ("X", "Y", "Z"), ("omega_deg", "phi_deg", "kappa_deg")
 SIGMAS_OF_AXES, SIGMAS_OF_ANGLES = ("sX", "sY", "sZ"), ("somega_deg", "sphi_deg", "skappa_deg")
@@ -42,6 +43,7 @@ class KnownPoints:
     xyz: FloatArray  # object unit, NaN where a coordinate is not known, (n, 3)
     sigma: FloatArray  # standard deviations, 0 = fixed, infinite = not known, object unit, (n, 3)
     covariances: FloatArray | None = None  # of X and Y, X and Z, Y and Z, object unit^2, 0 if None, (n, 3)
+    check: BoolArray | None = None  # coordinates that take no part but check the result; none if None, (n, 3)
 
     @property
     def covariance(self) -> FloatArray:
@@ -192,28 +194,32 @@ class ScaleBar:
 
 
 def read_control(path: Path) -> KnownPoints:
-    """Read known object points: id,X,Y,Z[,sX,sY,sZ[,cXY,cXZ,cYZ]]; no sigma or 0 means fixed.
+    """Read known object points: id,X,Y,Z[,sX,sY,sZ[,cXY,cXZ,cYZ][,checkX,checkY,checkZ]].
 
-    An empty cell among X, Y, Z is a coordinate that is not known; its sigma is empty or not looked at. cXY,
-    cXZ and cYZ are covariances, empty or 0 where there are none.
+    No sigma or 0 means fixed. Coordinates with 1 in checkX, checkY or checkZ take no part in the adjustment,
+    they check it. An empty cell among X, Y, Z is a coordinate that is not known, its sigma is not read.
+    cXY, cXZ and cYZ are covariances, empty or 0 where there are none.
 
     Raises:
         SurveyFileError: unreadable, wrong columns, not a finite number, a duplicate id, a negative sigma, or
             one that is so small beside the coordinates that its unit must be another, covariances that are
             larger than the sigmas allow.
     """
-    more = COVARIANCES if COVARIANCES[0] in read_header(path) else ()
+    header = read_header(path)
+    covariances = COVARIANCES if COVARIANCES[0] in header else ()
+    checks = CHECKS if CHECKS[0] in header else ()
+    more = (*covariances, *checks)
     table = read_table(
         *(path, ("id",), AXES, (*SIGMAS_OF_AXES, *more)),
         aliases=(("point", "id"),),
         blank=(*AXES, *SIGMAS_OF_AXES, *more),
     )
-    return _known_points(table)
+    return _known_points(table, len(covariances))
 
 
-def _known_points(table: CsvTable) -> KnownPoints:
-    """Return the points of a table with or without sigmas."""
-    xyz, sigma, covariances = np.split(table.values, (3, 6), axis=1)
+def _known_points(table: CsvTable, covariances: int = 0) -> KnownPoints:
+    """Return the points of a table with or without sigmas, so many columns of covariances, and checks."""
+    xyz, sigma, mixed, check = np.split(table.values, (3, 6, 6 + covariances), axis=1)
     if not sigma.size:
         sigma = np.zeros_like(xyz)
     unknown: BoolArray = np.isnan(xyz)
@@ -231,7 +237,14 @@ def _known_points(table: CsvTable) -> KnownPoints:
         f"at least a millionth of the extent of the points, {extent:g}: coordinates and sigmas in one unit; "
         "0 for a fixed coordinate",
     )
-    return KnownPoints(table.keys("id"), xyz, sigma, _covariances(table, sigma, covariances))
+    check = np.nan_to_num(check) if check.size else np.zeros_like(xyz)
+    table.refuse(check, (check != 0) & (check != 1), CHECKS, "0, 1 or nothing")
+    table.refuse(check, (check == 1) & unknown, CHECKS, "0 or nothing for a coordinate that is not known")
+    return KnownPoints(
+        table.keys("id"),
+        *(xyz, sigma, _covariances(table, sigma, mixed)),
+        check == 1 if check.any() else None,
+    )
 
 
 def _covariances(table: CsvTable, sigma: FloatArray, given: FloatArray) -> FloatArray | None:

@@ -101,6 +101,7 @@ class CameraSettings(Section):
     free: Names = ()  # parameters to be adjusted; () = a calibrated camera; see `says_what_is_free`
     fixed: Values = ()  # (parameter, value) of what is not free, in the model's units
     start: Values = ()  # (parameter, value) that a free one starts from, in the model's units; else 0
+    balanced: Values = ()  # (parameter, value) in AICON's form with R0, in place of fixed and start
     weighted: Observed = ()  # (parameter, (value, sigma)): adjusted, with this as an observation
     correlations: Correlations = ()  # (parameter, parameter, correlation) of weighted ones; 0 if not given
     calibration: Name | None = None  # folder of an earlier result, relative to the survey file
@@ -118,7 +119,9 @@ class CameraSettings(Section):
     def says_what_is_free(self) -> bool:
         """Whether `free` is there, empty or not, or a calibration; else the photographs decide."""
         varying = self.per_photograph or self.per_group
-        return bool("free" in self.model_fields_set or self.fixed or self.weighted or varying)
+        return bool(
+            "free" in self.model_fields_set or self.fixed or self.balanced or self.weighted or varying
+        )
 
     @property
     def may_be_free(self) -> tuple[str, ...]:

@@ -93,15 +93,20 @@ def control_points(control: KnownPoints | None, points: Sequence[str]) -> Object
     if control is None:
         return ObjectPoints()
     index = {name: k for k, name in enumerate(points)}
-    known = np.array([name in index for name in control.names], dtype=bool)
-    given = np.isfinite(control.xyz)
+    given, covariance = np.isfinite(control.xyz), control.covariance
+    if control.check is not None:  # as if it were not known
+        given = given & ~control.check
+        covariance = np.where(control.check[:, :, None] | control.check[:, None, :], 0.0, covariance)
+        point, axis = np.nonzero(control.check)
+        covariance[point, axis, axis] = np.inf
+    known = np.array([name in index for name in control.names], dtype=bool) & given.any(axis=1)
     # an unknown coordinate has any finite value, here the mean of the others, and no weight
     count = np.maximum(given.sum(axis=0), 1)
     mean = np.where(given, control.xyz, 0.0).sum(axis=0) / count
     return ObjectPoints(
-        np.array([index[name] for name in control.names if name in index], dtype=np.int64),
+        np.array([index[control.names[k]] for k in np.flatnonzero(known)], dtype=np.int64),
         np.where(given, control.xyz, mean)[known],
-        control.covariance[known],
+        covariance[known],
     )
 
 

@@ -141,10 +141,8 @@ FORMATS = (
         ("cameras.xml",),
     ),
     Format(
-        "metashape brown_forward",
-        network_in(
-            "brown_forward", values=(*(v for v in DISTORTION["brown_forward"] if v[0] != "b1"), ("K4", 1e-9))
-        ),
+        "metashape brown_forward_affine",
+        network_in("brown_forward_affine", values=(*DISTORTION["brown_forward_affine"], ("K4", 1e-9))),
         lambda folder, n, e: write_metashape(folder / "cameras.xml", n, e),
         lambda folder: read_metashape(folder / "cameras.xml"),
         ("cameras.xml",),
@@ -318,12 +316,13 @@ def test_metashape_decentring_and_affinity_have_their_own_order(tmp_path: Path) 
     assert estimate.cameras[0].model == "full_opencv"
     np.testing.assert_allclose(reprojection(network, estimate), 0, atol=1e-9)
     assert len(network.control) == 1
-    path.write_text(text.format(u=u, v=v).replace("<p2>", "<k4>0.001</k4><p2>"))
+    # k4 and b2 act on the distorted point: K4 moves it, b2 is Zhang's skew
+    xd, yd = xd + x * 0.001 * r2**4, yd + y * 0.001 * r2**4
+    u, v = 1000 + 5 + xd * 2000 + xd * 1.5 + yd * 30, 750 - 4 + yd * 2000
+    path.write_text(text.format(u=u, v=v).replace("<p2>", "<k4>0.001</k4><b2>30</b2><p2>"))
     network, estimate = read_metashape(path)
-    assert estimate.cameras[0].model == "brown_forward"
-    # k4 moves the point by 2000 * x * 0.001 * r^8, b1 by 1.5 px times the distortion of 0.5 %
-    expected = -2000 * np.array([x, y]) * 0.001 * r2**4
-    np.testing.assert_allclose(reprojection(network, estimate)[0], -expected, atol=0.002)
+    assert estimate.cameras[0].model == "brown_forward_affine"
+    np.testing.assert_allclose(reprojection(network, estimate), 0, atol=1e-9)
 
 
 def test_metashape_chunk_transform_and_missing_orientation(tmp_path: Path) -> None:
@@ -406,9 +405,11 @@ def test_what_a_format_cannot_hold_is_refused(tmp_path: Path) -> None:
 
 
 def test_conversion_opens_the_way_between_formats(tmp_path: Path) -> None:
-    """brown to Metashape by way of brown_forward: the misfit that is stated is the one that appears."""
+    """brown to Metashape: the misfit that is stated is the one that appears."""
     network, truth = network_in("brown")
-    conversion = convert_camera(truth.cameras[0], "brown_forward", held=format_named("metashape").lacks)
+    conversion = convert_camera(
+        truth.cameras[0], "brown_forward_affine", held=format_named("metashape").lacks
+    )
     assert conversion.max_px < 0.03  # affinity of 2e-4 and 40 px of distortion included
     write_metashape(tmp_path / "x.xml", network, replace(truth, cameras=(conversion.camera,)))
     again, estimate = read_metashape(tmp_path / "x.xml")
@@ -624,5 +625,5 @@ def test_convert_tells_what_it_did(tmp_path: Path, capsys: pytest.CaptureFixture
     name = truth.cameras[0].name
     assert told[0] == f"camera {name}: image points corrected for brown, ideal camera written"
     assert told[1] == f"{tmp_path / 'out'}: 6 photographs, 20 points, 120 image points as sba"
-    assert told[2].startswith(f"camera {name}: brown to brown_forward, misfit 0.0")
+    assert told[2].startswith(f"camera {name}: brown to brown_forward_affine, misfit 0.0")
     assert told[4:] == [f"{tmp_path / 'x.ply'}: 20 points as ply"]

@@ -83,6 +83,7 @@ class Run:
     tolerance: float
     exact: bool  # whether the factor must belong to the last normal equations
     iterations: int = 0
+    start_vPv: float = float("nan")  # with the first weights at the start values
     remarks: tuple[str, ...] = ()
 
     def start(self, state: State, weight: FloatArray) -> Optimum:
@@ -119,6 +120,8 @@ class Run:
             near=near,
             exact=self.exact,
         )
+        if not self.iterations and np.isnan(self.start_vPv):
+            self.start_vPv = optimum.start_vPv
         self.iterations += optimum.iterations
         return optimum
 

@@ -19,6 +19,8 @@ TESTABLE = 1e-3
 # drawing, never as good as the network; control that states them must keep to them.
 CHECK_REMARK = 100.0
 HELD_BAD = 5.0  # standard deviations by which a held camera moves the points (RMS): a wrong result
+HARDLY_DETERMINED = 0.05  # standard deviation of c over c from which the photographs hardly determine it
+MAX_NAMES = 5  # control points named in one remark
 PRINCIPAL_POINT_REMARK = 0.1  # share of the diagonal; a decentred lens or sensor has 1 or 2 %
 MISCLOSURE_BAD = 0.01  # of the size of the object, or of a length: no measurement, a mistake
 
@@ -26,8 +28,8 @@ MISCLOSURE_BAD = 0.01  # of the size of the object, or of a length: no measureme
 def judge_given(evidence: Evidence) -> Judged:
     """Judge everything that was given, kind by kind."""
     kinds = (
-        *(_taken_out, _scale, _control, _bars, _interior),
-        *(_held, _principal_point, _exterior, _kinds, _check),
+        *(_taken_out, _scale, _control_apart, _control, _bars, _interior),
+        *(_held, _hardly_determined, _principal_point, _exterior, _kinds, _check, _check_coordinates),
     )
     return [judged for judge_kind in kinds for judged in judge_kind(evidence)]
 
@@ -63,7 +65,25 @@ def _scale(evidence: Evidence) -> Judged:
         f"Lengths by the control are {significant(100 * found.relative)} % larger than by the scale bars, "
         f"{significant(found.over_sigma)} times the standard deviation of that difference."
     )
-    return [*judged, (found.over_sigma > WEIGHTED_BAD, line)]
+    return [*judged, (found.over_sigma > WEIGHTED_BAD or abs(found.relative) > MISCLOSURE_BAD, line)]
+
+
+def _control_apart(evidence: Evidence) -> Judged:
+    """Judge the control points that do not fit the shape that the image points give: a mistake, or moved."""
+    found = evidence.control_apart
+    if not found:
+        return []
+    factor, unit = finer_unit(evidence.result.length_unit, found[0].distance)
+    shown = ", ".join(
+        f"{one.point} ({significant(factor * one.distance)} {unit})" for one in found[:MAX_NAMES]
+    )
+    more = " ..." if len(found) > MAX_NAMES else ""
+    line = (
+        f"{len(found)} control point(s) do not fit the photographs as the others do: {shown}{more}; correct "
+        "them or take them out."
+    )
+    part = found[0].distance / evidence.object_size
+    return [(found[0].over_sigma > WEIGHTED_BAD or part > MISCLOSURE_BAD, line)]
 
 
 def _control(evidence: Evidence) -> Judged:
@@ -130,6 +150,30 @@ def free_line(evidence: Evidence) -> str:
     free = {name for name, on in zip(camera.names, camera.free, strict=True) if on}
     written = [f'"{name}"' for name in camera.names if name in {*free, *named, *FREED_FIRST}]
     return f"free = [{', '.join(written)}] for camera {camera.name}"
+
+
+def _hardly_determined(evidence: Evidence) -> Judged:
+    """Judge principal distances that the photographs hardly determine, as those of long lenses."""
+    judged: Judged = []
+    result = evidence.result
+    strong = {one.parameter: one.partners for one in result.orientation_correlations}
+    told = set()
+    for number, camera in enumerate(result.adjustment.estimate.cameras):
+        name, c = camera.names[0], float(camera.parameters[0])
+        sigma = float(result.adjustment.interior_sigma(number)[0])
+        owner = camera.group_of(0) or camera.name
+        if not sigma > HARDLY_DETERMINED * abs(c) or owner in told:
+            continue
+        told.add(owner)
+        partners = strong.get(f"{name} of camera {owner}")
+        correlated = f", strongly correlated with {partners}" if partners else ""
+        line = (
+            f"{name} of camera {owner} is known to {significant(100 * sigma / abs(c))} % only{correlated}: "
+            "hold it at a calibrated value (leave it out of free), or add photographs at larger angles and "
+            "other distances."
+        )
+        judged.append((False, line))
+    return judged
 
 
 def _principal_point(evidence: Evidence) -> Judged:
@@ -208,6 +252,21 @@ def _check(evidence: Evidence) -> Judged:
         )
         judged.append((False, line))
     return judged
+
+
+def _check_coordinates(evidence: Evidence) -> Judged:
+    """Judge the single coordinates that check a datum of control: the worst in its standard deviations."""
+    tested = [one for one in evidence.check_coordinates if np.isfinite(one.test)]
+    worst = max(tested, key=lambda one: abs(one.test), default=None)
+    if worst is None or not abs(worst.test) > WEIGHTED_REMARK:
+        return []
+    factor, unit = finer_unit(evidence.result.length_unit, abs(worst.difference))
+    line = (
+        f"{worst.coordinate} of check point {worst.point} differs from its given value by "
+        f"{significant(factor * abs(worst.difference))} {unit}, {significant(abs(worst.test))} times the "
+        "standard deviation of both."
+    )
+    return [(abs(worst.test) > WEIGHTED_BAD, line)]
 
 
 def _remarkable(found: GivenResiduals | None) -> tuple[GivenValue, ...]:

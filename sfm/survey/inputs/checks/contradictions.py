@@ -6,12 +6,15 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Protocol
 
+from sfm.distortion.balanced import BALANCED, from_balanced
 from sfm.distortion.models import MODELS
-from sfm.errors import SurveyFileError
+from sfm.errors import GeometryError, SurveyFileError
 from sfm.survey.inputs.given import ScaleBar
 from sfm.survey.inputs.settings import (
+    LARGEST,
     MAX_GLOBS,
     MAX_LENGTH_PER_SIGMA,
+    SMALLEST,
     CameraSettings,
     CompareSettings,
     DatumSettings,
@@ -173,9 +176,38 @@ def _refuse_contradicting_sizes(targets: TargetSettings, where: str, unit: str) 
             )
 
 
+def _refuse_contradictions_of_balanced(camera: CameraSettings, at: str) -> None:
+    """Raise SurveyFileError where a camera in AICON's form is incomplete or stands beside other values."""
+    given = dict(camera.balanced)
+    if camera.model != "brown_forward":
+        raise SurveyFileError(f"{at}: balanced is given, model {camera.model}, expected brown_forward")
+    for parameter in given:
+        if parameter not in BALANCED:
+            raise SurveyFileError(
+                f"{at}: balanced has no parameter '{parameter}', expected one of {', '.join(BALANCED)}"
+            )
+    for parameter in ("c", "R0"):
+        if parameter not in given:
+            raise SurveyFileError(f"{at}: balanced.{parameter} is missing")
+    if not SMALLEST <= abs(given["c"]) <= LARGEST or not 0 <= given["R0"] <= LARGEST:
+        raise SurveyFileError(
+            f"{at}: balanced.c = {given['c']:g} mm and R0 = {given['R0']:g} mm, expected c other than 0 and "
+            "R0 of 0 or more"
+        )
+    for name, both in (("fixed", camera.fixed), ("start", camera.start), ("c_mm", camera.c_mm)):
+        if both:
+            raise SurveyFileError(f"{at}: balanced and {name} are given, expected one of them")
+    try:
+        from_balanced(camera.balanced)
+    except GeometryError as error:
+        raise SurveyFileError(f"{at}: balanced: {error}") from error
+
+
 def _refuse_contradictions_of_camera(camera: CameraSettings, at: str) -> None:
     """Raise SurveyFileError where the settings of a camera do not go together."""
     known = MODELS[camera.model].names
+    if camera.balanced:
+        _refuse_contradictions_of_balanced(camera, at)
     fixed, weighted, start = dict(camera.fixed), dict(camera.weighted), dict(camera.start)
     varying = (*camera.per_photograph, *camera.per_group)
     for parameter in (*camera.free, *fixed, *weighted, *start, *varying):
@@ -214,7 +246,7 @@ def _refuse_contradictions_of_camera(camera: CameraSettings, at: str) -> None:
     if camera.calibration is not None:
         for key in sorted(camera.model_fields_set - {"name", "images", "size_px", *CALIBRATION_KEYS}):
             raise SurveyFileError(f"{at}: {key} and calibration are both given; a calibration says it all")
-    elif "calibration_use" in camera.model_fields_set:
+    elif camera.calibration_use != "fixed":
         raise SurveyFileError(f"{at}: calibration_use is given, calibration is needed with it")
     for parameter in start:
         if parameter not in camera.may_be_free:

@@ -69,7 +69,7 @@ def unlike_squares(
 
 def _wanted(one: CameraSettings) -> list[tuple[str, str]]:
     """Return (what to write, where EXIF data have it) of what a camera does not say."""
-    said = {name for name, _ in (*one.fixed, *one.start, *one.weighted)}
+    said = {name for name, _ in (*one.fixed, *one.start, *one.weighted, *one.balanced)}
     wanted = []
     if one.pixel_mm is None and one.sensor_mm is None:
         wanted.append(("pixel_mm or sensor_mm", "pixel_mm"))
