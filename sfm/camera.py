@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from sfm.conventions import BoolArray, FloatArray, IntArray
-from sfm.distortion.models import MAX_PARAMETERS, MODELS, Role, number_of, observe_point
+from sfm.distortion.models import MAX_PARAMETERS, MODELS, Role, number_of, observe
 from sfm.errors import SurveyFileError
 from sfm.kernels.options import compiled
 
@@ -281,7 +281,7 @@ def _tangents(model: int, frame: FloatArray, p: FloatArray, xy: FloatArray) -> F
         u, v = 0.0, 0.0
         solved = False
         for _ in range(FIXED_POINT_STEPS):
-            observe_point(model, frame, p, xy[i, 0], xy[i, 1], u, v, residual, Ju, Jp)
+            observe(model, frame, p, xy[i, 0], xy[i, 1], u, v, residual, Ju, Jp)
             det = Ju[0, 0] * Ju[1, 1] - Ju[0, 1] * Ju[1, 0]
             du = (Ju[1, 1] * residual[0] - Ju[0, 1] * residual[1]) / det
             dv = (Ju[0, 0] * residual[1] - Ju[1, 0] * residual[0]) / det
@@ -307,7 +307,7 @@ def _pixels(model: int, frame: FloatArray, p: FloatArray, uv: FloatArray) -> Flo
         x, y = frame[0], frame[1]
         solved = False
         for _ in range(FIXED_POINT_STEPS):
-            observe_point(model, frame, p, x, y, uv[i, 0], uv[i, 1], residual, Ju, Jp)
+            observe(model, frame, p, x, y, uv[i, 0], uv[i, 1], residual, Ju, Jp)
             x += residual[0]
             y += residual[1]
             if abs(residual[0]) + abs(residual[1]) < PIXEL_TOLERANCE:

@@ -13,7 +13,7 @@ import numpy as np
 
 from sfm.camera import Camera, camera_from_values, pixel_from_tangents, tangents_from_pixel
 from sfm.conventions import BoolArray, FloatArray
-from sfm.distortion.models import MAX_PARAMETERS, MODELS, Model, Role, observe_point
+from sfm.distortion.models import MAX_PARAMETERS, MODELS, Model, Role, observe
 from sfm.errors import GeometryError, SurveyFileError
 from sfm.kernels.options import compiled
 from sfm.network import Estimate
@@ -251,7 +251,7 @@ def _residuals(
     residuals = np.empty((len(xy), 2))
     jacobian = np.empty((len(xy), 2, len(p)))
     for i in range(len(xy)):
-        observe_point(model, frame, p, xy[i, 0], xy[i, 1], uv[i, 0], uv[i, 1], r, Ju, Jp)
+        observe(model, frame, p, xy[i, 0], xy[i, 1], uv[i, 0], uv[i, 1], r, Ju, Jp)
         residuals[i] = r
         jacobian[i] = Jp[:, : len(p)]
     return residuals, jacobian

@@ -32,11 +32,9 @@ from typing import Any, NamedTuple
 
 from numba import njit
 
-from sfm.conventions import FloatArray
 from sfm.distortion.brown import brown, brown_affine
 from sfm.distortion.forward import brown_forward
 from sfm.distortion.opencv import full_opencv, opencv
-from sfm.kernels.options import compiled
 
 
 class Role(Enum):
@@ -176,33 +174,3 @@ def one_of(models: tuple[Model, ...]) -> Callable[..., None]:
 
 
 observe = one_of(ALL)
-
-
-@compiled
-def observe_point(
-    model: int,
-    frame: FloatArray,
-    p: FloatArray,
-    x: float,
-    y: float,
-    u: float,
-    v: float,
-    residual: FloatArray,
-    Ju: FloatArray,
-    Jp: FloatArray,
-) -> None:
-    """Do as `observe`, compiled once for all that call it outside of the adjustment.
-
-    Args:
-        model: number of the model.
-        frame: of the camera, see `sfm.camera`.
-        p: its parameters, (n,).
-        x: measured column, px.
-        y: measured row, px.
-        u: tangent of the ray to the right.
-        v: tangent of the ray upwards.
-        residual: receives the residual, px, (2,).
-        Ju: receives its derivatives by u and v, px, (2, 2).
-        Jp: receives its derivatives by the parameters, px per unit, (2, n).
-    """
-    observe(model, frame, p, x, y, u, v, residual, Ju, Jp)
