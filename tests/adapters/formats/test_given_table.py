@@ -1,0 +1,49 @@
+"""What a survey was given, read back from its result."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from adapters.formats.given_table import read_given
+from sfm.errors import SurveyFileError
+from sfm.network import ImagePoints, Network
+
+HEADER = "kind,name,coordinate,unit,given,difference,sigma,r,w\n"
+ROWS = (
+    "control point,501,X,m,1.5,0.001,0.002,0.5,1\n"
+    "control point,501,Z,m,2.5,0.001,0,,\n"
+    "scale bar,a - b - 501,length,m,0.75,0.001,0.0001,0.5,1\n"
+    "scale bar,a - gone,length,m,0.75,0.001,0.0001,0.5,1\n"
+    "interior orientation,c of camera lens,value,mm,24.5,0.001,0.01,0.5,1\n"
+    "projection centre,1.jpg,X0,m,3.5,0.001,0.01,0.5,1\n"
+)
+
+
+def network() -> Network:
+    nothing = ImagePoints(*(np.zeros(0, dtype=np.int64),) * 2, np.zeros((0, 2)), np.zeros((0, 2, 2)))
+    return Network(("1.jpg",), np.zeros(1, dtype=np.int64), ("501", "a - b", "a"), nothing)
+
+
+def test_bars_control_and_interior_orientation(tmp_path: Path) -> None:
+    (tmp_path / "given.csv").write_text(HEADER + ROWS, encoding="utf-8")
+    given = read_given(tmp_path, network())
+    assert given.bars.start.tolist() == [1] and given.bars.end.tolist() == [0]  # the name holds a dash
+    assert given.bars.length.tolist() == [0.75] and given.bars.sigma.tolist() == [0.0001]
+    assert given.control.point.tolist() == [0]
+    assert given.control.xyz[0, [0, 2]].tolist() == [1.5, 2.5]
+    assert np.diagonal(given.control.covariance[0]).tolist() == [0.002**2, np.inf, 0.0]
+    assert given.interior == (("lens", "c", 24.5),)
+
+
+def test_a_result_without_the_table_was_given_nothing(tmp_path: Path) -> None:
+    given = read_given(tmp_path, network())
+    assert not len(given.bars) and not len(given.control) and given.interior == ()
+
+
+def test_a_damaged_table_is_one_line(tmp_path: Path) -> None:
+    (tmp_path / "given.csv").write_text(HEADER + ROWS.replace("0.002", "-1"), encoding="utf-8")
+    with pytest.raises(SurveyFileError, match=r"given.csv, line 2"):
+        read_given(tmp_path, network())
