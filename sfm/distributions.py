@@ -10,12 +10,13 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 from scipy import special
 
 
 def chi2_sf(x: Any, r: Any) -> Any:
     """Probability that chi-square of redundancy r is larger than x."""
-    return special.chdtrc(r, x)
+    return special.chdtrc(r, np.maximum(x, 0.0))  # rounding makes a difference of squares negative
 
 
 def chi2_isf(probability: Any, r: Any) -> Any:
@@ -30,7 +31,7 @@ def chi2_ppf(probability: Any, r: Any) -> Any:
 
 def f_sf(x: Any, r1: Any, r2: Any) -> Any:
     """Probability that F of redundancies r1 and r2 is larger than x."""
-    return special.fdtrc(r1, r2, x)
+    return special.fdtrc(r1, r2, np.maximum(x, 0.0))
 
 
 def f_isf(probability: Any, r1: Any, r2: Any) -> Any:
@@ -60,4 +61,4 @@ def normal_ppf(probability: Any) -> Any:
 
 def poisson_sf(k: Any, expected: Any) -> Any:
     """Probability of more than k events where a number of them is expected."""
-    return special.pdtrc(k, expected)
+    return np.where(np.asarray(k) < 0, 1.0, special.pdtrc(np.maximum(k, 0), expected))[()]

@@ -11,7 +11,7 @@ from scipy import stats
 
 from sfm import distributions
 
-X = np.array([1e-6, 0.01, 0.5, 1.0, 4.0, 30.0, 250.0])
+X = np.array([-2.0, -1e-9, 0.0, 1e-6, 0.01, 0.5, 1.0, 4.0, 30.0, 250.0])
 P = np.array([1e-12, 1e-6, 1e-3, 0.05, 0.5, 0.95, 1 - 1e-6])
 
 
@@ -37,7 +37,7 @@ def test_distributions_are_those_of_scipy(
 
 def test_poisson() -> None:
     np.testing.assert_allclose(
-        distributions.poisson_sf(np.arange(9), 2.5), stats.poisson.sf(np.arange(9), 2.5), rtol=1e-12
+        distributions.poisson_sf(np.arange(-2, 9), 2.5), stats.poisson.sf(np.arange(-2, 9), 2.5), rtol=1e-12
     )
 
 

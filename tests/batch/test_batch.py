@@ -381,7 +381,7 @@ def test_index_escapes_everything() -> None:
     row = SurveyRow(nasty, nasty, nasty, nasty, nasty, comparison=nasty, reason=nasty)
     for status in ("failed", "done"):
         page = render_index([SurveyRow(**{**row.__dict__, "status": status})], nasty)
-        assert "<script" not in page
+        assert page.count("<script") == render_index([], "").count("<script")
         assert 'href="' + nasty not in page
 
 

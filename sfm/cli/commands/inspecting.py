@@ -39,7 +39,7 @@ def measure(
         bool, typer.Option("--allow-outside", help="Let the features file name files outside its folder.")
     ] = False,
 ) -> None:
-    """Measure a result: best-fit shapes, distances, alignment, tolerances.
+    """Measure shapes, distances and tolerances in a result.
 
     Every value with the standard deviation that follows from the covariance of all points.
     """
