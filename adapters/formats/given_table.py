@@ -9,12 +9,21 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
+from pydantic import Field
 
 from sfm.conventions import FloatArray
 from sfm.files.csv_tables import read_table
+from sfm.files.json_files import Content, read_json
 from sfm.network import Network, ObjectPoints, ScaleBars
+
+
+class _Summary(Content):
+    """What is read of summary.json."""
+
+    sigma0: Annotated[float, Field(gt=0, lt=1e9)] | None = None
 
 
 @dataclass(frozen=True)
@@ -24,6 +33,7 @@ class GivenValues:
     bars: ScaleBars
     control: ObjectPoints
     interior: tuple[tuple[str, str, float], ...]  # camera, parameter, value
+    sigma0: float = 1.0  # of unit weight, by which the covariance of the result is scaled
 
 
 def read_given(folder: Path, network: Network) -> GivenValues:
@@ -68,7 +78,14 @@ def read_given(folder: Path, network: Network) -> GivenValues:
             np.array([np.diag(variance) for _, variance in control.values()]).reshape(-1, 3, 3),
         ),
         tuple(interior),
+        _sigma0(folder),
     )
+
+
+def _sigma0(folder: Path) -> float:
+    """Return sigma0 of unit weight as summary.json says it, 1 where it does not."""
+    summary = read_json(folder / "summary.json", _Summary, "the summary of a result")
+    return summary.sigma0 or 1.0
 
 
 def _ends(name: str, index: dict[str, int]) -> tuple[int, int] | None:

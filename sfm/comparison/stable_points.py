@@ -50,6 +50,7 @@ class StablePoints:
     agreed: bool  # whether they pass the test; else no majority does
     steps: tuple[Step, ...]
     drops: FloatArray  # T of each stable point, NaN of the others, (n,)
+    weights: FloatArray  # P_kk of each stable point, 0 of the others, (n, m, m)
     drops_of_all: FloatArray  # T of each candidate before any was removed, NaN of the others, (n,)
 
 
@@ -117,7 +118,9 @@ def find_stable_points(
     stable, T = np.zeros(n, dtype=bool), np.full(n, np.nan)
     stable[chosen[left]] = True
     T[chosen] = drops
-    return StablePoints(stable, bool(agreed), tuple(steps), T, of_all)
+    weights = np.zeros((n, m, m))
+    weights[chosen[left]] = point_blocks(P, m)[left]
+    return StablePoints(stable, bool(agreed), tuple(steps), T, weights, of_all)
 
 
 def in_datum(

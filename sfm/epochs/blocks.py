@@ -2,7 +2,8 @@
 
 The displacements of a group are d = t + omega x (X - c) + E (X - c), with a translation t of its centre c,
 small rotations omega and the symmetric strain E, or the part of it that is asked for. Least squares with the
-full covariance of the displacements; what is left says whether the group moved as the model says.
+full covariance of the displacements, in the datum of the stable points outside of the group; what is left
+says whether the group moved as the model says.
 
 Source: Chen (1983), Analysis of deformation surveys; Caspary (2000), Concepts of network and deformation
 analysis, sec. 9; Welsch, Heunecke, Kuhlmann (2000), Auswertung geodaetischer Ueberwachungsmessungen, sec. 6.
@@ -15,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
-from sfm.comparison.stable_points import critical_value
+from sfm.comparison.stable_points import critical_value, in_datum
 from sfm.conventions import BoolArray, FloatArray
 from sfm.epochs.displacements import Displacements
 from sfm.errors import GeometryError
@@ -95,23 +96,27 @@ def block_motion(
         raise GeometryError(
             f"group {name}: {len(chosen)} points, a {model} motion needs {MIN_POINTS[model]} or more"
         )
-    if not (found.stable & ~group).any():
+    d, Q, G = found.differences.difference, found.differences.covariance, found.differences.motions
+    outside = found.stable & ~group
+    if np.linalg.matrix_rank(G[np.repeat(outside, 3)], tol=RANK * np.linalg.norm(G, 2)) < G.shape[1]:
         raise GeometryError(
-            f"group {name} holds all stable points: there is nothing left against which it could move"
+            f"group {name}: {int(outside.sum())} stable points are outside of it, too few or on a line: "
+            "nothing is left against which it could move"
         )
+    d, Q = in_datum(d, Q, G, outside.astype(float))
     alpha = found.alpha if alpha is None else alpha
     parts = PARTS[: MODELS[model]]
     x = found.differences.xyz[chosen]
     centre = x.mean(axis=0)
     A = _columns(x, centre, MODELS[model])
-    spread = np.linalg.svd(A / np.linalg.norm(A, axis=0), compute_uv=False)
+    spread = np.linalg.svd(A / np.maximum(np.linalg.norm(A, axis=0), 1e-300), compute_uv=False)
     if spread[-1] < RANK * spread[0]:
         raise GeometryError(
             f"group {name}: its points lie on a line or in a plane, which does not determine a {model} motion"
         )
     rows = (3 * chosen[:, None] + np.arange(3)).ravel()
-    d = found.displacement[chosen].ravel()
-    factor = cho_factor(found.covariance[np.ix_(rows, rows)], lower=True)
+    d = d[chosen].ravel()
+    factor = cho_factor(Q[np.ix_(rows, rows)], lower=True)
     PA = cho_solve(factor, A)
     cofactor = np.linalg.inv(A.T @ PA)
     value = cofactor @ (PA.T @ d)

@@ -5,9 +5,10 @@ alignment. Q_d = Q_1 + Q_2 - C - C' where both epochs were given the same values
 wrong makes both epochs wrong alike. With an observation l of standard deviation s and gradient g, an epoch
 moves by Q g / s^2 for a unit of l, so that
 
-    C = (Q_1 g_1) (Q_2 g_2)' / s^2,
+    C = (Q_1 g_1) (Q_2 g_2)' / (s^2 s01 s02),
 
-summed over the bars, and over the coordinates of control, that both share.
+with the sigma0 of both that their covariances hold, summed over the bars, and over the coordinates of
+control, that both share.
 
 Source: Niemeier (2008), Ausgleichungsrechnung, sec. 12.2; Koch (1999), Parameter Estimation and Hypothesis
 Testing in Linear Models, sec. 3.2.3 (covariance of estimates and observations).
@@ -15,6 +16,7 @@ Testing in Linear Models, sec. 3.2.3 (covariance of estimates and observations).
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 
@@ -22,8 +24,8 @@ import numpy as np
 
 from sfm.comparison.congruency import MOTIONS, motions
 from sfm.comparison.pairing import fit_robustly, pair_results
-from sfm.comparison.point_tests import known_scale
-from sfm.conventions import FloatArray, IntArray
+from sfm.comparison.point_tests import HELD, known_scale
+from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.errors import GeometryError
 from sfm.network import ObjectPoints, ScaleBars
 from sfm.similarity import Similarity
@@ -41,6 +43,7 @@ class Epoch:
     bars: ScaleBars = field(default_factory=ScaleBars)  # that took part, by index of the result's points
     control: ObjectPoints = field(default_factory=ObjectPoints)  # that took part, as observed
     interior: tuple[tuple[str, str, float], ...] = ()  # camera, parameter and value observed with a sigma
+    sigma0: float = 1.0  # of unit weight, by which the covariance of the result is scaled
 
 
 @dataclass(frozen=True)
@@ -58,7 +61,7 @@ class Differences:
     only_first: tuple[str, ...]  # points that the second epoch lacks
     only_second: tuple[str, ...]
     by_place: int  # points recognised by their place
-    untested: tuple[str, ...]  # common points of which one result did not keep the covariance
+    untested: tuple[str, ...]  # common points that an epoch holds, or did not keep the covariance of
     shared: tuple[str, ...]  # given values that both epochs share, in words
 
     @property
@@ -79,6 +82,8 @@ def epoch_differences(first: Epoch, second: Epoch) -> Differences:
             that cannot be converted, or a weighted calibration that both share.
     """
     for epoch in (first, second):
+        if epoch.result.redundancy == 0:
+            raise GeometryError(f"{epoch.name}: redundancy 0, its standard deviations say nothing")
         if epoch.result.covariance is None:
             raise GeometryError(
                 f"{epoch.name}: the covariance of all points together (point_covariance.npy) is missing; run "
@@ -89,6 +94,7 @@ def epoch_differences(first: Epoch, second: Epoch) -> Differences:
     pairing = pair_results(a, b)
     pa, pb = pairing.points.T
     kept = (a.covariance_rows(pa) >= 0) & (b.covariance_rows(pb) >= 0)
+    kept[kept] = ~(_held(a, pa[kept]) | _held(b, pb[kept]))
     untested = tuple(a.network.points[j] for j in pa[~kept])
     pairs = pairing.points[kept]
     others = _others(a, pa), _others(b, pb)
@@ -124,6 +130,13 @@ def epoch_differences(first: Epoch, second: Epoch) -> Differences:
         untested=untested,
         shared=shared,
     )
+
+
+def _held(result: StoredResult, points: IntArray) -> BoolArray:
+    """Whether a coordinate of a point is known without error, as that of fixed control, (n,)."""
+    assert result.covariance is not None  # refused before
+    variance = np.diagonal(result.covariance).reshape(-1, 3)[result.covariance_rows(points)]
+    return np.asarray((variance <= HELD * np.diagonal(result.covariance).mean()).any(axis=1))
 
 
 def _of_own_photographs(result: StoredResult, prefix: str) -> StoredResult:
@@ -177,12 +190,12 @@ def _shared(
         for epoch, gradient, s, found in ((first, ours, sigma, mine), (second, other, other_sigma, yours)):
             Q = epoch.result.covariance
             assert Q is not None  # refused before
-            found.append(sum((Q[:, k] * g for k, g in gradient), start=np.zeros(len(Q))) / s)
+            found.append(sum((Q[:, k] * g for k, g in gradient), start=np.zeros(len(Q))) / (s * epoch.sigma0))
         words.append(key)
     if not words:
         nothing = np.zeros((3 * len(pairs), 0))
         return nothing, nothing, ()
-    pa, pb = pairs.T
+    pa, pb = (one.result.covariance_rows(p) for one, p in zip((first, second), pairs.T, strict=True))
     a, b = np.stack(mine, axis=1), np.stack(yours, axis=1)
     turn = frame.scale * frame.rotation
     turned = np.einsum("xi,nik->nxk", turn, b.reshape(-1, 3, len(words))[pb])
@@ -200,13 +213,17 @@ def _observations(epoch: Epoch) -> Iterable[tuple[str, Observed]]:
     """Bars and coordinates of control that an epoch was given with a standard deviation, by their names."""
     names, x = epoch.result.network.points, epoch.result.estimate.points
     bars, row = epoch.bars, epoch.result.covariance_rows(np.arange(len(names)))
+    count: Counter[str] = Counter()
     for i, j, length, sigma in zip(bars.start, bars.end, bars.length, bars.sigma, strict=True):
         if not (sigma > 0 and row[i] >= 0 and row[j] >= 0):
             continue
+        key = f"bar {' - '.join(sorted((names[i], names[j])))}"
+        count[key] += 1
         u = (x[j] - x[i]) / np.linalg.norm(x[j] - x[i])
         gradient = [(3 * int(row[i]) + k, -float(u[k])) for k in range(3)]
         gradient += [(3 * int(row[j]) + k, float(u[k])) for k in range(3)]
-        yield f"bar {' - '.join(sorted((names[i], names[j])))}", (gradient, float(sigma), float(length))
+        again = f" ({count[key]})" if count[key] > 1 else ""
+        yield key + again, (gradient, float(sigma), float(length))
     control = epoch.control
     for j, given, C in zip(control.point, control.xyz, control.covariance, strict=True):
         for k in range(3):

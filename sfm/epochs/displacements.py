@@ -35,6 +35,7 @@ from sfm.errors import GeometryError
 
 ALPHA = 0.05  # level of all tests of a pair of epochs together
 POWER = 0.8  # probability with which a displacement of the stated size would be found
+RANK = 1e-6  # of the largest singular value below which the points of reference are on a line
 MANY = 10**6  # redundancy above which Fisher's F is chi-square
 
 
@@ -98,6 +99,8 @@ def displacements(
     if first < MIN_STABLE:
         raise GeometryError(f"epochs: {first} points of reference, expected {MIN_STABLE} or more")
     d, Q, G = found.difference, found.covariance, found.motions
+    if np.linalg.matrix_rank(G[np.repeat(candidates, 3)], tol=RANK * np.linalg.norm(G, 2)) < G.shape[1]:
+        raise GeometryError("epochs: the points of reference lie on a line, which holds no rotation about it")
     least = max(MIN_STABLE, math.ceil(STABLE_FRACTION * first))
 
     def search(start: BoolArray) -> StablePoints:
@@ -137,10 +140,8 @@ def displacements(
         covariance=Q_S,
         statistic=T,
         critical=critical,
-        moved=np.where(candidates, ~best.stable, critical < T) & (best.agreed | ~candidates),
-        detectable=_detectable(
-            Q_S, np.where(candidates, alpha / 2 / first, alpha / 2 / max(1, n - first)), found
-        ),
+        moved=~best.stable & (critical < T) & best.agreed,
+        detectable=_detectable(Q_S, best, level, found),
         smooth=smooth,
         alpha=alpha,
     )
@@ -186,8 +187,13 @@ def _from_robust_start(
     return search(fits)
 
 
-def _detectable(Q: FloatArray, alpha: FloatArray, found: Differences) -> FloatArray:
-    """Return the smallest displacement of each point that would be found, in its worst direction, (n,)."""
+def _detectable(Q: FloatArray, best: StablePoints, alpha: FloatArray, found: Differences) -> FloatArray:
+    """Return the smallest displacement of each point that would be found, in its worst direction, (n,).
+
+    A stable point is found by the drop of Omega, another one by its own test in the datum.
+    """
     shift = {a: detectable_shift(a, POWER, 3, found.redundancy) for a in set(alpha.tolist())}
-    worst = np.sqrt(np.linalg.eigvalsh(point_blocks(Q, 3))[:, -1].clip(0))
+    variance = point_blocks(Q, 3)
+    variance[best.stable] = np.linalg.inv(best.weights[best.stable])
+    worst = np.sqrt(np.linalg.eigvalsh(variance)[:, -1].clip(0))
     return np.asarray(worst * np.array([shift[a] for a in alpha.tolist()]))

@@ -13,7 +13,7 @@ from itertools import pairwise
 import numpy as np
 
 from sfm.conventions import BoolArray
-from sfm.epochs.blocks import MIN_POINTS, BlockMotion, block_motion
+from sfm.epochs.blocks import MIN_POINTS, MODELS, BlockMotion, block_motion
 from sfm.epochs.differences import Differences, Epoch, epoch_differences
 from sfm.epochs.displacements import ALPHA, Displacements, displacements
 from sfm.errors import GeometryError
@@ -70,6 +70,8 @@ def analyse_epochs(
     """
     if len(epochs) < 2:
         raise GeometryError(f"epochs: {len(epochs)} given, expected 2 or more")
+    if model not in MODELS:
+        raise GeometryError(f"epochs: model '{model}', expected one of {', '.join(MODELS)}")
     names = tuple(epoch.name for epoch in epochs)
     twice = next((name for k, name in enumerate(names) if name in names[:k]), None)
     if twice is not None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -60,12 +62,12 @@ def test_five_points_that_moved_are_found() -> None:
 
 @pytest.mark.slow
 def test_rates() -> None:
-    """At 5 %, half of it for the global test: 10 and 20 of 400 expected, with sigmas of 3.1 and 4.4."""
+    """At 5 %, half of it for the global test: 10 of 400 expected, sigma 3.1; a point must be named, too."""
     whole, alarms = false_alarms(400)
     complete, others = finds(200)
     print(f"\n400 pairs without a change: global test {whole}, all tests {alarms}")
     print(f"200 pairs with 5 of 60 points moved by 5 sigma: all found in {complete}, {others} others named")
-    assert 1 <= whole <= 19 and 7 <= alarms <= 33
+    assert 1 <= whole <= 19 and alarms <= 33
     assert complete >= 180 and others <= 0.05 * 200 * (POINTS - len(MOVED))
 
 
@@ -165,6 +167,69 @@ def test_noncentrality_is_that_of_baarda() -> None:
     assert detectable_shift(0.05, 0.8, 1, 20) > detectable_shift(0.05, 0.8, 1, None)
 
 
+def test_a_bar_that_both_share_makes_no_difference_whatever_sigma0_is() -> None:
+    """With all weights stated wrong alike, covariances and sigma0 are scaled, and so is what is left."""
+    errors = np.array([3.0, -2.0]) * BAR_SIGMA
+    first, second = epoch(50, bar_errors=errors), epoch(51, bar_errors=errors)
+    Q = epoch_differences(first, second).covariance
+    for sigma0 in (0.5, 2.0):
+        scaled = [
+            replace(
+                one,
+                sigma0=sigma0,
+                result=replace(one.result, covariance=sigma0**2 * np.asarray(one.result.covariance)),
+            )
+            for one in (first, second)
+        ]
+        assert np.abs(epoch_differences(*scaled).covariance - sigma0**2 * Q).max() < 1e-12 * np.abs(Q).max()
+
+
+def test_results_that_keep_the_covariance_of_a_sample_share_bars_alike() -> None:
+    errors = np.array([3.0, -2.0]) * BAR_SIGMA
+    first, second = epoch(50, bar_errors=errors), epoch(51, bar_errors=errors)
+    kept = np.array([0, 2, 5, 11, 20, 30, 33, 40, 49, 55])
+    rows = (3 * kept[:, None] + np.arange(3)).ravel()
+    sampled = [
+        replace(
+            one,
+            result=replace(
+                one.result,
+                covariance=np.asarray(one.result.covariance)[np.ix_(rows, rows)],
+                covariance_points=kept,
+            ),
+        )
+        for one in (first, second)
+    ]
+    found, whole = epoch_differences(*sampled), epoch_differences(first, second)
+    assert found.points == tuple(whole.points[j] for j in kept) and len(found.untested) == 50
+    assert found.shared == whole.shared
+    # the frame is over the common points of either, so that they differ by some 1e-4 of a turn
+    assert (
+        np.abs(found.covariance - whole.covariance[np.ix_(rows, rows)]).max()
+        < 1e-3 * np.abs(whole.covariance).max()
+    )
+
+
+def test_points_of_reference_are_found_with_the_stated_power() -> None:
+    """With few of them a point that moved pulls the datum along, so that more is needed to find it."""
+    reference = np.isin(np.arange(POINTS), (5, 14, 22, 33, 41, 52))
+    first = compared(8, reference=reference)
+    weights = first.search.weights[5]
+    shift = np.zeros((POINTS, 3))
+    values, vectors = np.linalg.eigh(weights)
+    shift[5] = first.detectable[5] * vectors[:, 0]
+    assert first.stable[5] and values[0] > 0
+    found = sum(bool(compared(seed, shift, reference=reference).moved[5]) for seed in range(4000, 4012))
+    assert 6 <= found <= 12  # 9.6 expected, sigma 1.4
+
+
+def test_a_reference_on_a_line_is_refused() -> None:
+    found = epoch_differences(epoch(1), epoch(2))
+    line = replace(found, xyz=np.where(np.arange(POINTS)[:, None] < 5, found.xyz * [1.0, 0, 0], found.xyz))
+    with pytest.raises(GeometryError, match="lie on a line"):
+        displacements(line, reference=np.arange(POINTS) < 5)
+
+
 def test_bad_input_is_one_line() -> None:
     found = epoch_differences(epoch(1), epoch(2))
     with pytest.raises(GeometryError, match=r"3 points of reference, expected 4 or more"):
@@ -172,7 +237,7 @@ def test_bad_input_is_one_line() -> None:
     moved = displacements(found)
     with pytest.raises(GeometryError, match=r"group pier: 2 points, a rigid motion needs 3 or more"):
         block_motion(moved, np.arange(POINTS) < 2, name="pier")
-    with pytest.raises(GeometryError, match="holds all stable points"):
+    with pytest.raises(GeometryError, match="0 stable points are outside of it"):
         block_motion(moved, np.ones(POINTS, dtype=bool), name="all")
     with pytest.raises(GeometryError, match="expected one of rigid, similarity, affine"):
         block_motion(moved, np.arange(POINTS) < 9, name="pier", model="bent")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -63,8 +64,16 @@ def epochs(
         from sfm.report.epochs import pairs_of, words_of_block, words_of_pair, words_of_stable, write_epochs
 
     refuse_foreign_folder(out)
-    groups = {name: _listed(points) for name, points in map(_named, group or ())}
+    if len(results) < 2:
+        raise SurveyFileError(f"epochs: {len(results)} given, expected 2 or more")
+    groups: dict[str, list[str]] = {}
+    for name, points in map(_named, group or ()):
+        if name in groups:
+            raise SurveyFileError(f"--group {name} is given twice")
+        groups[name] = _listed(points)
     given = [_epoch(path) for path in results]
+    if len({epoch.name for epoch in given}) < len(given):  # folders of one name in different places
+        given = [replace(epoch, name=str(path)) for epoch, path in zip(given, results, strict=True)]
     with working_on(" ".join(map(str, results))):
         found = analyse_epochs(given, reference=_listed(reference), groups=groups, model=model, alpha=alpha)
     page = write_epochs(found, out)
@@ -86,7 +95,8 @@ def _epoch(path: Path) -> Epoch:
     with working_on(str(folder)):
         result = read_result(folder)
         given = read_given(folder, result.network)
-    return Epoch(folder.name, result, given.bars, given.control, given.interior)
+    name = folder.resolve().name
+    return Epoch(name, result, given.bars, given.control, given.interior, given.sigma0)
 
 
 def _run(survey_file: Path) -> Path:

@@ -63,6 +63,7 @@ def summary(findings: Findings) -> dict[str, Any]:
             "expected_defect": adjustment.expected_defect,
             "undetermined": list(adjustment.undetermined),
         },
+        "sigma0": or_none(adjustment.sigma0),
         "sigma0_px": or_none(adjustment.sigma0_px),
         "rms_px": or_none(adjustment.rms_px),
         "max_residual_px": or_none(adjustment.max_residual_px),

@@ -27,6 +27,11 @@ def network() -> Network:
     return Network(("1.jpg",), np.zeros(1, dtype=np.int64), ("501", "a - b", "a"), nothing)
 
 
+@pytest.fixture(autouse=True)
+def summary(tmp_path: Path) -> None:
+    (tmp_path / "summary.json").write_text('{"sigma0": 0.5}', encoding="utf-8")
+
+
 def test_bars_control_and_interior_orientation(tmp_path: Path) -> None:
     (tmp_path / "given.csv").write_text(HEADER + ROWS, encoding="utf-8")
     given = read_given(tmp_path, network())
@@ -35,7 +40,7 @@ def test_bars_control_and_interior_orientation(tmp_path: Path) -> None:
     assert given.control.point.tolist() == [0]
     assert given.control.xyz[0, [0, 2]].tolist() == [1.5, 2.5]
     assert np.diagonal(given.control.covariance[0]).tolist() == [0.002**2, np.inf, 0.0]
-    assert given.interior == (("lens", "c", 24.5),)
+    assert given.interior == (("lens", "c", 24.5),) and given.sigma0 == 0.5
 
 
 def test_a_result_without_the_table_was_given_nothing(tmp_path: Path) -> None:

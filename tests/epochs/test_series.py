@@ -1,0 +1,85 @@
+"""Three epochs of one object, from results to the page."""
+
+from __future__ import annotations
+
+import csv
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sfm.conventions import FloatArray
+from sfm.epochs.differences import Epoch
+from sfm.epochs.series import EpochSeries, analyse_epochs
+from sfm.errors import GeometryError
+from sfm.report.epochs import FILES, pairs_of, words_of_pair, words_of_stable, write_epochs
+from tests.epochs.scenes import POINTS, epoch
+
+
+def shift(size: float) -> FloatArray:
+    moved = np.zeros((POINTS, 3))
+    moved[[4, 16, 21, 40]] = [0.0, 0.0, size]
+    return moved
+
+
+def epochs() -> tuple[Epoch, ...]:
+    return epoch(70), epoch(71, shift(0.0)), epoch(72, shift(0.01))
+
+
+def series() -> EpochSeries:
+    return analyse_epochs(epochs(), groups={"span": ["5", "17", "22", "41"]})
+
+
+def test_each_epoch_stands_against_the_first_and_the_one_before(tmp_path: Path) -> None:
+    found = series()
+    assert [pair.displacements.differences.names for pair in pairs_of(found)] == [
+        ("epoch 70", "epoch 71"),
+        ("epoch 70", "epoch 72"),
+        ("epoch 71", "epoch 72"),
+    ]
+    still, since_first, since_previous = pairs_of(found)
+    assert not still.displacements.changed
+    for pair in (since_first, since_previous):
+        assert np.flatnonzero(pair.displacements.moved).tolist() == [4, 16, 21, 40]
+        (span,) = pair.groups
+        assert span.moved and span.fits and pair.together is not None
+        assert abs(span.value[2] - 0.01) < 4 * span.sigma[2]
+    page = write_epochs(found, tmp_path / "out")
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {*FILES, "manifest.json"}
+    text = page.read_text(encoding="utf-8")
+    assert "4 of 60 points moved" in text and "span" in text and "Series" in text
+    with (tmp_path / "out/displacements.csv").open(encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == 3 * POINTS and sum(int(row["moved"]) for row in rows) == 8
+    summary = json.loads((tmp_path / "out/epochs.json").read_text(encoding="utf-8"))
+    assert summary["changed"] and summary["pairs"][1]["moved"] == ["5", "17", "22", "41"]
+    assert len(summary["pairs"][1]["steps"]) == 5
+
+
+def test_words() -> None:
+    still, moved, _ = (pair.displacements for pair in pairs_of(series()))
+    assert words_of_pair(still) == ("epoch 70 to epoch 71: no displacement is significant", "good")
+    assert words_of_stable(still) == "All 60 points of reference agree."
+    assert words_of_pair(moved)[0].startswith("epoch 70 to epoch 72: 4 of 60 points moved, by up to ")
+    assert "56 of 60 points of reference are proposed as stable" in words_of_stable(moved)
+
+
+def test_refusals_are_one_line() -> None:
+    first, second, _ = epochs()
+    with pytest.raises(GeometryError, match="1 given, expected 2 or more"):
+        analyse_epochs([first])
+    with pytest.raises(GeometryError, match="two of them are called 'epoch 70'"):
+        analyse_epochs([first, first])
+    with pytest.raises(GeometryError, match="point of reference 99 is missing in epoch 70 and in epoch 71"):
+        analyse_epochs([first, second], reference=["1", "99"])
+    with pytest.raises(GeometryError, match=r"group pier: no point .* is called 'P\*'"):
+        analyse_epochs([first, second], groups={"pier": ["P*"]})
+    with pytest.raises(GeometryError, match="expected one of rigid, similarity, affine"):
+        analyse_epochs([first, second], model="bent")
+    bare = replace(second, result=replace(second.result, covariance=None))
+    with pytest.raises(GeometryError, match=r"epoch 71: the covariance of all points together"):
+        analyse_epochs([first, bare])
+    with pytest.raises(GeometryError, match="share the weighted c of camera lens"):
+        analyse_epochs([replace(one, interior=(("lens", "c", 24.0),)) for one in (first, second)])
