@@ -73,9 +73,9 @@ def judge_points(
             return without("no common datum")
         rows_a, rows_b = a.covariance_rows(pa), b.covariance_rows(pb)
         both = np.flatnonzero((rows_a >= 0) & (rows_b >= 0))
-        Q = _joint(a, rows_a[both], 1.0, np.eye(3))
-        Q += _joint(b, rows_b[both], transform.scale, transform.rotation)
-        kept = ~_held(Q) if in_control else every[: len(both)]
+        Q = joint_covariance(a, rows_a[both], 1.0, np.eye(3))
+        Q += joint_covariance(b, rows_b[both], transform.scale, transform.rotation)
+        kept = ~held_points(np.diagonal(Q).reshape(-1, 3)) if in_control else every[: len(both)]
         rows, free = np.repeat(kept, 3), both[kept]
         try:
             found = congruency(
@@ -126,12 +126,14 @@ def _of_congruency(found: Congruency, tested: IntArray, sigma: FloatArray, toget
     )
 
 
-def _joint(result: StoredResult, points: IntArray, scale: float, rotation: FloatArray) -> FloatArray:
-    """Covariance of some points together, scaled and turned, (3 n, 3 n); 0 where none is known.
+def joint_covariance(
+    result: StoredResult, points: IntArray, scale: float, rotation: FloatArray
+) -> FloatArray:
+    """Return the covariance of some points together, scaled and turned, (3 n, 3 n); 0 where none is known.
 
     Args:
         result: with its covariance.
-        points: rows of the covariance, see `_rows_of_points`, (n,).
+        points: rows of the covariance, see `StoredResult.covariance_rows`, (n,).
         scale: factor of lengths.
         rotation: of the axes, (3, 3).
     """
@@ -145,9 +147,12 @@ def _joint(result: StoredResult, points: IntArray, scale: float, rotation: Float
     return moved.reshape(3 * n, 3 * n)
 
 
-def _held(Q: FloatArray) -> BoolArray:
-    """Whether a coordinate of a point is known without error, so that nothing is left to test, (n,)."""
-    variance = np.diagonal(Q).reshape(-1, 3)
+def held_points(variance: FloatArray) -> BoolArray:
+    """Return whether a coordinate of a point is known without error, so that nothing is left to test, (n,).
+
+    Args:
+        variance: of the coordinates, object unit^2, (n, 3).
+    """
     return np.asarray((variance <= HELD * variance.mean()).any(axis=1))
 
 

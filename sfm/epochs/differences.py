@@ -24,8 +24,8 @@ import numpy as np
 
 from sfm.comparison.congruency import MOTIONS, motions
 from sfm.comparison.pairing import fit_robustly, pair_results
-from sfm.comparison.point_tests import HELD, known_scale
-from sfm.conventions import BoolArray, FloatArray, IntArray
+from sfm.comparison.point_tests import held_points, joint_covariance, known_scale
+from sfm.conventions import FloatArray, IntArray
 from sfm.errors import GeometryError
 from sfm.network import ObjectPoints, ScaleBars
 from sfm.similarity import Similarity
@@ -93,8 +93,12 @@ def epoch_differences(first: Epoch, second: Epoch) -> Differences:
     a, b = _of_own_photographs(first.result, "a"), _of_own_photographs(second.result, "b")
     pairing = pair_results(a, b)
     pa, pb = pairing.points.T
-    kept = (a.covariance_rows(pa) >= 0) & (b.covariance_rows(pb) >= 0)
-    kept[kept] = ~(_held(a, pa[kept]) | _held(b, pb[kept]))
+    rows_a, rows_b = a.covariance_rows(pa), b.covariance_rows(pb)
+    kept = (rows_a >= 0) & (rows_b >= 0)
+    for epoch, rows in ((first, rows_a), (second, rows_b)):
+        assert epoch.result.covariance is not None  # refused before
+        variance = np.diagonal(epoch.result.covariance).reshape(-1, 3)
+        kept[kept] = ~held_points(variance[rows[kept]])
     untested = tuple(a.network.points[j] for j in pa[~kept])
     pairs = pairing.points[kept]
     others = _others(a, pa), _others(b, pb)
@@ -108,8 +112,8 @@ def epoch_differences(first: Epoch, second: Epoch) -> Differences:
         raise GeometryError(f"{first.name} is in {a.unit} and {second.name} in {b.unit}: give both one unit")
     moved = fit_robustly(b.estimate.points[pb], a.estimate.points[pa], scale=scale)
     xyz = a.estimate.points[pa]
-    turn = moved.scale * moved.rotation
-    Q = _covariance(a, pa, np.eye(3)) + _covariance(b, pb, turn)
+    Q = joint_covariance(a, rows_a[kept], 1.0, np.eye(3))
+    Q += joint_covariance(b, rows_b[kept], moved.scale, moved.rotation)
     influence_a, influence_b, shared = _shared(first, second, pairs, moved)
     C = influence_a @ influence_b.T
     Q -= C
@@ -132,13 +136,6 @@ def epoch_differences(first: Epoch, second: Epoch) -> Differences:
     )
 
 
-def _held(result: StoredResult, points: IntArray) -> BoolArray:
-    """Whether a coordinate of a point is known without error, as that of fixed control, (n,)."""
-    assert result.covariance is not None  # refused before
-    variance = np.diagonal(result.covariance).reshape(-1, 3)[result.covariance_rows(points)]
-    return np.asarray((variance <= HELD * np.diagonal(result.covariance).mean()).any(axis=1))
-
-
 def _of_own_photographs(result: StoredResult, prefix: str) -> StoredResult:
     """Return a result whose photographs are told from those of another epoch, which may bear their names."""
     names = tuple(f"{prefix}/{name}" for name in result.network.images)
@@ -150,16 +147,6 @@ def _others(result: StoredResult, paired: IntArray) -> tuple[str, ...]:
     left[paired] = False
     left &= result.estimate.determined
     return tuple(result.network.points[j] for j in np.flatnonzero(left))
-
-
-def _covariance(result: StoredResult, points: IntArray, turn: FloatArray) -> FloatArray:
-    """Covariance of some points together after a rotation and a scale, (3 n, 3 n)."""
-    assert result.covariance is not None  # refused before
-    n = len(points)
-    rows = (3 * result.covariance_rows(points)[:, None] + np.arange(3)).ravel()
-    Q = result.covariance[np.ix_(rows, rows)]
-    Q = (Q.reshape(-1, 3) @ turn.T).reshape(3 * n, 3 * n)
-    return np.ascontiguousarray((Q.T.reshape(-1, 3) @ turn.T).reshape(3 * n, 3 * n))
 
 
 def _refuse_shared_calibration(first: Epoch, second: Epoch) -> None:

@@ -107,7 +107,7 @@ def displacements(
         return find_stable_points(
             *(d, Q, G),
             candidates=start,
-            least=min(least, int(start.sum())),
+            least=least,
             redundancy=found.redundancy,
             alpha=alpha / 2,
             alpha_single=alpha / 2,

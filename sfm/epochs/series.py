@@ -30,6 +30,11 @@ class EpochPair:
     groups: tuple[BlockMotion, ...]  # those asked for
     together: BlockMotion | None  # of all points that moved, as one rigid block; None where they are too few
 
+    @property
+    def blocks(self) -> tuple[BlockMotion, ...]:
+        """The groups asked for, and the points that moved."""
+        return self.groups if self.together is None else (*self.groups, self.together)
+
 
 @dataclass(frozen=True)
 class EpochSeries:

@@ -141,7 +141,7 @@ def epochs_page(found: EpochSeries) -> str:
                 "title": " to ".join(pair.displacements.differences.names),
                 "stable": words_of_stable(pair.displacements),
                 "unit": finer_unit(pair.displacements.differences.unit, _typical(pair.displacements)),
-                "groups": [*pair.groups, *([pair.together] if pair.together is not None else [])],
+                "groups": pair.blocks,
                 "picture": _picture(pair.displacements, k),
             }
             for k, pair in enumerate(pairs)
@@ -195,7 +195,7 @@ def _pair(pair: EpochPair) -> dict[str, Any]:
                 "significant": [part.name for part in one.parts if part.significant],
                 "moved_as_one": one.fits,
             }
-            for one in (*pair.groups, *([pair.together] if pair.together is not None else []))
+            for one in pair.blocks
         ],
     }
 

@@ -80,7 +80,7 @@ def epochs(
     for pair in pairs_of(found):
         print(words_of_pair(pair.displacements)[0])
         print(f"  {words_of_stable(pair.displacements)}")
-        for block in (*pair.groups, *([pair.together] if pair.together is not None else [])):
+        for block in pair.blocks:
             print(f"  {words_of_block(block)}")
     print(f"Report: {page}")
 
@@ -89,21 +89,15 @@ def _epoch(path: Path) -> Epoch:
     """Return an epoch of a result folder, or of a survey file, which is run."""
     from adapters.formats.given_table import read_given
     from adapters.formats.result_tables import read_result
+    from sfm.cli.commands.surveying import run_file
     from sfm.epochs.differences import Epoch
 
-    folder = _run(path) if path.is_file() else path
+    folder = run_file(path) if path.is_file() else path
     with working_on(str(folder)):
         result = read_result(folder)
         given = read_given(folder, result.network)
     name = folder.resolve().name
     return Epoch(name, result, given.bars, given.control, given.interior, given.sigma0)
-
-
-def _run(survey_file: Path) -> Path:
-    """Run a survey and return the folder of its result."""
-    from sfm.cli.commands.surveying import run_file
-
-    return run_file(survey_file)
 
 
 def _named(text: str) -> tuple[str, str]:

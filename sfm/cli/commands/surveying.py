@@ -156,14 +156,9 @@ def adjust(
 
 def run_file(survey_file: Path) -> Path:
     """Run a survey file, with photographs or without, and return the folder of its result, out/NAME."""
-    with loading():
-        from sfm.survey.inputs.survey_file import read_survey_file
-
-    with working_on(str(survey_file)):
-        described = read_survey_file(survey_file, allow_outside=False)
     return _run_survey(
         *(survey_file, None, None, None, False, False),
-        from_photographs=described.observations is None,
+        from_photographs=None,
         camera=None,
         weighted=False,
     )
@@ -177,7 +172,7 @@ def _run_survey(
     allow_outside: bool,
     verbose: bool,
     *,
-    from_photographs: bool,
+    from_photographs: bool | None,
     camera: Path | None,
     weighted: bool,
     pictures_mb: float = 0.0,
@@ -200,6 +195,8 @@ def _run_survey(
 
     with working_on(str(survey_file)):
         described = read_survey_file(survey_file, allow_outside=allow_outside)
+    if from_photographs is None:  # whichever it is
+        from_photographs = described.observations is None
     if from_photographs and described.observations is not None:
         raise KolinearError(
             f"{survey_file}: it has [observations] in place of photographs: kolinear adjust {survey_file}"
