@@ -47,7 +47,7 @@ def read_given(folder: Path, network: Network) -> GivenValues:
         SurveyFileError: what is missing or wrong, with file and line number.
     """
     path = folder / "given.csv"
-    if not path.is_file():
+    if not path.is_file() or not path.read_text(encoding="utf-8").strip().partition("\n")[2]:
         return GivenValues(ScaleBars(), ObjectPoints(), ())
     table = read_table(
         path, ("kind", "name", "coordinate"), ("given", "sigma"), ignored=None, blank=("sigma",)
