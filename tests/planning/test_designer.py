@@ -82,15 +82,15 @@ def compared(name: str, points: int, draws: int, count: int = 300) -> tuple[int,
 
 
 def test_fewer_photographs_than_a_ring_or_at_random() -> None:
-    kind, sizes, allowed, sigma = OBJECTS["plate"]
+    kind, sizes, allowed, sigma = OBJECTS["box"]
     planned, wanted = shape_object(kind, sizes, 24), Wanted(sigma=sigma)
-    found = design_network(planned, CAMERA, allowed, SEEING, wanted, count=40)
+    found = design_network(planned, CAMERA, allowed, SEEING, wanted, count=80)
     designed = len(found.prediction.stations)
     assert found.reached and found.shortfall <= 1
     assert needed(planned, wanted, lambda k: arrangement(f"ring:{k}", planned, CAMERA), designed) > designed
-    room = candidates(planned, CAMERA, allowed, SEEING, count=40)
-    order = seed_of("random").permutation(40)
-    order = np.where(np.arange(40) % 2 == 0, order, order + room.count)
+    room = candidates(planned, CAMERA, allowed, SEEING, count=80)
+    order = seed_of("random").permutation(80)
+    order = np.where(np.arange(80) % 2 == 0, order, order + room.count)
     assert needed(planned, wanted, lambda k: room.stations.of(order[:k]), designed) > designed
 
 
