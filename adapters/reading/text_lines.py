@@ -88,7 +88,7 @@ class Lines:
             raise self.error("the file ends here, more was expected")
         return line
 
-    def put_back(self) -> None:
+    def read_again(self) -> None:
         """Make the line read last the next one."""
         self.number, self.again = self.number - 1, True
 
@@ -208,7 +208,7 @@ class Lines:
         """Return lines of so many numbers up to an empty one, as (where, first, others)."""
         rows: list[tuple[str, str, FloatArray]] = []
         while self.line().strip():
-            self.put_back()
+            self.read_again()
             row = self.numbers(count, count)
             self.refuse_more(len(rows) + 1, MAX_BLOCK_LINES, "lines of a block")
             rows.append((self.where, f"{row[0]:.0f}", row[1:]))

@@ -1,1 +1,1 @@
-"""Distortion models: a function each in `brown`, `forward` and `opencv`, a row each in `models`, where to begin."""
+"""Distortion models: functions in `brown`, `forward` and `opencv`, a row each in `models`: begin there."""

@@ -18,6 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import ncfdtr
 
+from sfm.adjustment.quality.statistics import POWER
 from sfm.comparison.congruency import MIN_STABLE, STABLE_FRACTION, bending, smooth_fraction
 from sfm.comparison.stable_points import (
     StablePoints,
@@ -34,7 +35,6 @@ from sfm.epochs.differences import Differences
 from sfm.errors import GeometryError
 
 ALPHA = 0.05  # level of all tests of a pair of epochs together
-POWER = 0.8  # probability with which a displacement of the stated size would be found
 RANK = 1e-6  # of the largest singular value below which the points of reference are on a line
 MANY = 10**6  # redundancy above which Fisher's F is chi-square
 

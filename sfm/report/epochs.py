@@ -9,9 +9,11 @@ from typing import Any
 
 import numpy as np
 
+from sfm.adjustment.quality.statistics import POWER
 from sfm.conventions import FloatArray
+from sfm.display import listed
 from sfm.epochs.blocks import BlockMotion
-from sfm.epochs.displacements import POWER, Displacements
+from sfm.epochs.displacements import Displacements
 from sfm.epochs.series import EpochPair, EpochSeries
 from sfm.files.plain_text import csv_text, or_none
 from sfm.report.figures.comparisons import difference_figure, series_figure
@@ -20,6 +22,7 @@ from sfm.report.html.page import render
 from sfm.report.numbers import finer_unit, significant
 from sfm.report.page_files import write_files
 
+NAMED = 12  # points in a sentence
 FILES = ("displacements.csv", "series.csv", "epochs.json", "epochs.html")
 COLUMNS = (
     *("first", "second", "id", "dX", "dY", "dZ", "sdX", "sdY", "sdZ", "length", "T", "critical", "stable"),
@@ -27,7 +30,6 @@ COLUMNS = (
 )
 SERIES = ("id", "epoch", "dX", "dY", "dZ", "sdX", "sdY", "sdZ", "moved")
 DRAWN = 12  # points of a series that are drawn, those that moved farthest
-NAMED = 12  # points that a sentence names
 MOSTLY = 0.5  # of Omega: what a bending takes away of it is told from here on
 PICTURE = (
     "Displacements: arrows in the object's main plane, points that moved in red; the colour of the dots is "
@@ -272,6 +274,4 @@ def _same(found: Displacements) -> bool:
 
 
 def _names(names: Iterable[str]) -> str:
-    all_of_them = list(names)
-    said = ", ".join(all_of_them[:NAMED])
-    return said if len(all_of_them) <= NAMED else f"{said} and {len(all_of_them) - NAMED} more"
+    return listed(names, most=NAMED)

@@ -16,6 +16,7 @@ from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.camera import Camera
 from sfm.conventions import BoolArray
+from sfm.display import listed
 from sfm.distortion.models import Role
 from sfm.errors import GeometryError
 from sfm.network import Estimate, Network
@@ -25,8 +26,8 @@ from sfm.result import Explanation
 MUCH_REJECTED = 0.05  # share of rejected image points from which causes are looked for, too
 WORTH_A_TRY = 1.5  # sigma0 over the expected one from which causes are looked for
 NEAR_THE_BEST = 1.25  # of the least sigma0: what is simpler and reaches this is preferred
-LEAST_IN_GROUP = 3  # photographs that can show that the object moved before or behind them
-MOST_SPLITS = 12  # places in the order of the photographs at which the object is tried to have moved
+MIN_IN_GROUP = 3  # photographs that can show that the object moved before or behind them
+MAX_SPLITS = 12  # places in the order of the photographs at which the object is tried to have moved
 LENS = (Role.FOCAL, Role.X0, Role.Y0, Role.RADIAL, Role.DECENTRING, Role.AFFINITY)
 GROUP = (Role.FOCAL, Role.X0, Role.Y0, Role.RADIAL)
 
@@ -70,8 +71,8 @@ def _causes(network: Network, estimate: Estimate) -> Iterator[tuple[str, float]]
         if groups is not None:
             yield _words_of_groups(network, groups, adjusted), _sigma0(*_split(network, estimate, groups))
         yield "c of its own for each photograph (a zoom or focus that was not fixed)", sigma
-    splits = range(LEAST_IN_GROUP, len(network.images) - LEAST_IN_GROUP + 1)
-    moved = [(_apart(network, estimate, k), k) for k in splits[:: max(1, len(splits) // MOST_SPLITS)]]
+    splits = range(MIN_IN_GROUP, len(network.images) - MIN_IN_GROUP + 1)
+    moved = [(_apart(network, estimate, k), k) for k in splits[:: max(1, len(splits) // MAX_SPLITS)]]
     if moved:
         sigma, k = min(moved)
         yield (
@@ -121,12 +122,12 @@ def _two_groups(network: Network, adjusted: Estimate) -> BoolArray | None:
     c = np.array([adjusted.cameras[index].c_px for index in range(len(network.images))])
     order = np.argsort(c)
     gap = np.diff(c[order])
-    if len(c) < 2 * LEAST_IN_GROUP:
+    if len(c) < 2 * MIN_IN_GROUP:
         return None
-    inner = gap[LEAST_IN_GROUP - 1 : len(c) - LEAST_IN_GROUP]
+    inner = gap[MIN_IN_GROUP - 1 : len(c) - MIN_IN_GROUP]
     if not len(inner):
         return None
-    at = LEAST_IN_GROUP - 1 + int(np.argmax(inner))
+    at = MIN_IN_GROUP - 1 + int(np.argmax(inner))
     return np.asarray(c > (c[order[at]] + c[order[at + 1]]) / 2)
 
 
@@ -152,10 +153,9 @@ def _words_of_groups(network: Network, second: BoolArray, adjusted: Estimate) ->
     """Say who is in the smaller group and how far its c is from that of the others."""
     smaller = second if second.sum() <= len(second) / 2 else ~second
     names = [name for name, one in zip(network.images, smaller, strict=True) if one]
-    shown = ", ".join(names[:5]) + (f" and {len(names) - 5} more" if len(names) > 5 else "")
     c = np.array([adjusted.cameras[index].c_px for index in range(len(network.images))])
     ratio = float(np.median(c[smaller]) / np.median(c[~smaller]) - 1)
-    return f"two cameras or zooms under one name: {shown} with c {100 * ratio:+.1f} %"
+    return f"two cameras or zooms under one name: {listed(names)} with c {100 * ratio:+.1f} %"
 
 
 def _apart(network: Network, estimate: Estimate, k: int) -> float:
