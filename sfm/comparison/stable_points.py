@@ -52,6 +52,7 @@ class StablePoints:
     drops: FloatArray  # T of each stable point, NaN of the others, (n,)
     weights: FloatArray  # P_kk of each stable point, 0 of the others, (n, m, m)
     drops_of_all: FloatArray  # T of each candidate before any was removed, NaN of the others, (n,)
+    weights_of_all: FloatArray  # P_kk of each candidate before any was removed, 0 of the others, (n, m, m)
 
 
 def find_stable_points(
@@ -98,6 +99,8 @@ def find_stable_points(
     steps: list[Step] = []
     of_all = np.full(n, np.nan)
     of_all[chosen] = _drops(P, w, left, m)
+    weights_of_all = np.zeros((n, m, m))
+    weights_of_all[chosen] = point_blocks(P, m)
     while True:
         omega, freedom = float(d @ w), m * int(left.sum()) - u
         drops = _drops(P, w, left, m)
@@ -120,7 +123,7 @@ def find_stable_points(
     T[chosen] = drops
     weights = np.zeros((n, m, m))
     weights[chosen[left]] = point_blocks(P, m)[left]
-    return StablePoints(stable, bool(agreed), tuple(steps), T, weights, of_all)
+    return StablePoints(stable, bool(agreed), tuple(steps), T, weights, of_all, weights_of_all)
 
 
 def in_datum(

@@ -161,6 +161,7 @@ def run_file(survey_file: Path) -> Path:
         from_photographs=None,
         camera=None,
         weighted=False,
+        pictures_mb=15.0,
     )
 
 

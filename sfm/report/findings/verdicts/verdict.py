@@ -25,6 +25,7 @@ SOLUTION_BAD = 3.0  # standard deviations by which points differ in another solu
 SIGMA0_REMARK, SIGMA0_BAD = 2.0, 5.0
 SIGMA0_LOW = 0.5  # the same times too cautious
 AS_STATED = 1.5  # standard deviation of w by its median, up to which image points are about as stated
+EXPLAINED_BAD = 5.0  # standard deviations by which points move (RMS) with what explains the residuals: wrong
 # Data snooping leaves nothing beyond 4 or 5 sigma; ten is an outlier, thirty is a mistake that was kept.
 RESIDUAL_REMARK, RESIDUAL_BAD = 10.0, 30.0
 
@@ -115,12 +116,16 @@ def _sigma0(evidence: Evidence) -> Judged:
     tried = evidence.result.explanations
     if tried and tried[0].explains:
         cause = tried[0]
+        is_wrong = cause.moved > EXPLAINED_BAD
         explained = (
             f"sigma0 of all image points falls from {significant(cause.before_px)} to "
-            f"{significant(cause.after_px)} px with {cause.cause}, most likely that is what does not fit."
+            f"{significant(cause.after_px)} px with {cause.cause}, most likely that is what does not fit"
         )
+        if np.isfinite(cause.moved):
+            explained += f"; points then differ by {significant(cause.moved)} standard deviations (RMS)"
+        explained += "."
         if not ratio > SIGMA0_REMARK:
-            return [(False, explained[0].upper() + explained[1:])]
+            return [(is_wrong, explained[0].upper() + explained[1:])]
     elif not ratio > SIGMA0_REMARK:
         return []
     line = (
@@ -128,13 +133,14 @@ def _sigma0(evidence: Evidence) -> Judged:
         f"({significant(evidence.sigma0.stated_px)} px): "
     )
     if tried and tried[0].explains and not evidence.held:
-        return [(ratio > SIGMA0_BAD, line + explained)]
+        return [(is_wrong or ratio > SIGMA0_BAD, line + explained)]
     cameras = evidence.result.adjustment.estimate.cameras
     if evidence.held:
         line += "most likely the camera, which is held at values that do not fit."
+        is_bad = ratio > SIGMA0_BAD
         if tried and tried[0].explains:
-            line = f"{line[:-1]}; {explained}"
-        return [(ratio > SIGMA0_BAD, line)]
+            line, is_bad = f"{line[:-1]}; {explained}", is_bad or is_wrong
+        return [(is_bad, line)]
     if ratio > SIGMA0_BAD:
         held = "" if any(one.free.any() for one in cameras) else f" (it is held: try {free_line(evidence)})"
         return [(True, f"{line}points, control or the camera{held} contradict the photographs.")]
