@@ -26,6 +26,7 @@ from sfm.stored_result import NO_SCALE, StoredResult
 from sfm.targets.flags import count_flags
 
 EXPLAINS = 1.5  # ratio of sigma0 without and with a cause from which it explains something
+MATTERS = 0.5  # standard deviations by which points move (RMS) from which a significant cause is told, too
 
 
 @dataclass(frozen=True)
@@ -88,11 +89,14 @@ class Explanation:
     cause: str  # what was given more freedom, in words
     before_px: float  # sigma0 without it, of all image points, px
     after_px: float  # sigma0 with it, of the same, px
+    moved: float = np.nan  # standard deviations by which points then differ (RMS); NaN where that is unknown
+    significant: bool = False  # whether a test has found it beyond chance before it was tried
 
     @property
     def explains(self) -> bool:
-        """Whether it takes away a good part of the residuals."""
-        return self.after_px * EXPLAINS < self.before_px
+        """Whether it takes away a good part of the residuals, or is significant and moves the points."""
+        clear = self.after_px * EXPLAINS < self.before_px
+        return clear or (self.significant and self.after_px < self.before_px and self.moved > MATTERS)
 
 
 @dataclass(frozen=True)

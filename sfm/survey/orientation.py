@@ -110,7 +110,8 @@ def _hold_cameras_of_two(
             cameras[index] = replace(camera, free=np.zeros_like(camera.free))
             lines.append(
                 f"camera {camera.name}: {', '.join(names)} held at the start values: two photographs do not "
-                "determine them; an error of c scales the depth, one of the distortion bends the object"
+                "determine them; an error of c scales the depth, one of the distortion bends the object, and "
+                "the standard deviations do not contain it"
             )
     return replace(found, estimate=replace(estimate, cameras=tuple(cameras))), tuple(lines)
 

@@ -10,9 +10,14 @@ import pytest
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
+from sfm.camera import project
 from sfm.network import Estimate, Network
+from sfm.pipeline import run_survey
+from sfm.report.findings.findings import findings_of
 from sfm.survey.diagnosis.explanations import explain_residuals
-from tests.survey.test_own_camera import with_zoom
+from sfm.survey.diagnosis.two_groups import two_groups
+from tests.survey.test_own_camera import TAU, with_zoom
+from tests.surveys import survey_of
 from tests.synthetic import make_network, perturb, seed_of
 
 
@@ -35,7 +40,7 @@ def test_two_zooms_under_one_name() -> None:
     network, truth = with_zoom("two zooms", dict.fromkeys(range(4), 1.05))
     first, *others = explain_residuals(adjusted(network, truth, ("c",)))
     assert first.cause.startswith(
-        "two cameras or zooms under one name: image 1, image 2, image 3, image 4 with"
+        "two cameras, zooms or states of the lens under one name: image 1, image 2, image 3, image 4 with c"
     )
     assert first.explains and first.after_px == pytest.approx(0.1, rel=0.1)
     assert len(others) >= 2
@@ -53,8 +58,6 @@ def test_a_distortion_that_is_held() -> None:
 
 def test_half_of_the_object_moved() -> None:
     """Half of the points lie 20 mm away in the last four photographs."""
-    from sfm.camera import project
-
     network, truth = with_zoom("half moved", {})
     seen, rng = network.image_points, seed_of("half moved noise")
     moved, xy = truth.points.copy(), seen.xy.copy()
@@ -67,3 +70,52 @@ def test_half_of_the_object_moved() -> None:
     first = explain_residuals(adjusted(network, truth, ("c",)))[0]
     assert first.cause.startswith("two states of the object, one up to image 6 and one from image 7 on")
     assert first.explains and first.after_px == pytest.approx(0.1, rel=0.1)
+
+
+def test_two_cameras_of_nearly_the_same_c_are_told_apart() -> None:
+    """c 0.3 % and the principal point 15 px apart, far below a cautious sigma_px."""
+    network, truth = make_network(seed_of("two bodies"), images=8, points=60, free=("c", "x0", "y0"))
+    seen, rng, camera = network.image_points, seed_of("two bodies noise"), truth.cameras[0]
+    other = camera.parameters.copy()
+    other[0] *= 1.003
+    other[2] += 15 * camera.pixel_mm[1]
+    xy = seen.xy.copy()
+    for i in (1, 4, 6):
+        rows = np.flatnonzero(seen.image == i)
+        points = truth.points[seen.point[rows]]
+        xy[rows] = project(camera.with_parameters(other), truth.position[i], truth.rotation[i], points)
+        xy[rows] += 0.1 * rng.standard_normal((len(rows), 2))
+    cautious = replace(network, image_points=replace(seen, xy=xy, covariance=100 * seen.covariance))
+    found = adjusted(cautious, truth, ("c", "x0", "y0"))
+    assert found.sigma0 < 1
+    first = explain_residuals(found)[0]
+    assert "under one name: image 2, image 5, image 7 with c +0.3" in first.cause
+    assert first.explains and first.after_px == pytest.approx(0.1, rel=0.1) and first.moved < 1
+
+
+def test_photographs_of_one_camera_are_alike() -> None:
+    for k in range(8):
+        rng = seed_of(f"alike {k}")
+        network, truth = make_network(rng, images=int(rng.integers(4, 20)), points=40, planar=bool(k % 2))
+        assert two_groups(network, adjusted(network, truth, ("c", "x0", "y0", "K1")).estimate) is None
+
+
+def test_a_pair_with_a_camera_at_wrong_start_values_is_bad() -> None:
+    """Most of the error of c and K1 goes into the depth: sigma0 2.6 alone says only that it was too small."""
+    network, truth = make_network(seed_of("wrong pair"), images=2, points=40, free=("c", "K1"))
+    camera = truth.cameras[0]
+    p = camera.parameters.copy()
+    p[0] *= 1.02
+    p[camera.names.index("K1")] = 0.0
+    wrong = replace(truth, cameras=(replace(camera.with_parameters(p), free=camera.free),))
+    result = run_survey(survey_of(network, wrong, adjust=TAU))
+    verdict = findings_of(result).verdict
+    assert result.explanations[0].cause.startswith("another camera, near the values")
+    assert result.explanations[0].explains and result.explanations[0].moved > 5
+    assert verdict.level == "bad"
+
+
+def test_a_pair_with_a_right_camera_needs_no_explanation() -> None:
+    network, truth = make_network(seed_of("right pair"), images=2, points=40, free=("c", "K1"))
+    result = run_survey(survey_of(network, truth, adjust=TAU))
+    assert result.explanations == () and findings_of(result).verdict.level != "bad"

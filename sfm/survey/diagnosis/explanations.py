@@ -7,26 +7,32 @@ taken away what shows the cause. The simplest one that comes near the best is to
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
-from sfm.camera import Camera
-from sfm.conventions import BoolArray
+from sfm.camera import Camera, pixel_from_tangents, tangents_from_pixel
+from sfm.conventions import BoolArray, FloatArray
+from sfm.display import listed
 from sfm.distortion.models import Role
 from sfm.errors import GeometryError
-from sfm.network import Estimate, Network
+from sfm.network import Estimate, InteriorObservations, Network
 from sfm.reduced_network import reduce_network, supported
 from sfm.result import Explanation
+from sfm.similarity import fit_similarity
+from sfm.survey.diagnosis.two_groups import two_groups
 
 MUCH_REJECTED = 0.05  # share of rejected image points from which causes are looked for, too
 WORTH_A_TRY = 1.5  # sigma0 over the expected one from which causes are looked for
 NEAR_THE_BEST = 1.25  # of the least sigma0: what is simpler and reaches this is preferred
-LEAST_IN_GROUP = 3  # photographs that can show that the object moved before or behind them
-MOST_SPLITS = 12  # places in the order of the photographs at which the object is tried to have moved
+MIN_BEFORE = 3  # photographs that can show that the object moved before or behind them
+MAX_SPLITS = 12  # places in the order of the photographs at which the object is tried to have moved
+NOMINAL = (Role.FOCAL, Role.X0, Role.Y0, Role.RADIAL)
+NOMINAL_ERROR = 0.02  # of the half diagonal, at the corner: what nominal values are apart from true ones
+SMALL_MOVE_PX = 1.0  # of the corner, in which distortion is linear in its parameters
 LENS = (Role.FOCAL, Role.X0, Role.Y0, Role.RADIAL, Role.DECENTRING, Role.AFFINITY)
 GROUP = (Role.FOCAL, Role.X0, Role.Y0, Role.RADIAL)
 
@@ -38,12 +44,19 @@ def explain_residuals(found: Adjustment) -> tuple[Explanation, ...]:
         found: the finished adjustment; its sigma0 says whether there is anything to explain.
     """
     rejected = found.rejected.sum() > MUCH_REJECTED * len(found.rejected)
-    if not (rejected or found.sigma0_px > WORTH_A_TRY * found.stated_px):
-        return ()
+    conspicuous = rejected or found.sigma0_px > WORTH_A_TRY * found.stated_px
     network, estimate = found.network, found.estimate
-    before = _sigma0(network, estimate)
-    tried = [Explanation(words, before, after) for words, after in _causes(network, estimate)]
-    tried = [one for one in tried if np.isfinite(one.after_px)]
+    groups = _groups(network, estimate)
+    if not (conspicuous or groups is not None):
+        return ()
+    before = _adjusted(network, estimate)[0]
+
+    def explanation(one: _Cause) -> Explanation:
+        return Explanation(one.words, before, one.sigma0_px, _moved(found, one.estimate), one is groups)
+
+    if not conspicuous and not (groups and explanation(groups).explains):
+        return ()
+    tried = [explanation(one) for one in _causes(network, estimate, groups) if np.isfinite(one.sigma0_px)]
     if not tried:
         return ()
     best = min(one.after_px for one in tried)
@@ -51,8 +64,17 @@ def explain_residuals(found: Adjustment) -> tuple[Explanation, ...]:
     return (first, *(one for one in tried if one is not first))
 
 
-def _causes(network: Network, estimate: Estimate) -> Iterator[tuple[str, float]]:
-    """Return what each cause is called, and sigma0 with it, px; the simplest first."""
+@dataclass(frozen=True)
+class _Cause:
+    """A model with more freedom, adjusted."""
+
+    words: str
+    sigma0_px: float  # NaN where it could not be adjusted
+    estimate: Estimate | None = None  # of the same points; None where there is no single one
+
+
+def _causes(network: Network, estimate: Estimate, groups: _Cause | None) -> Iterator[_Cause]:
+    """Return the causes with what they leave of the residuals, the simplest first."""
     lens = _cameras(estimate.cameras, LENS)
     held = [
         name
@@ -61,40 +83,83 @@ def _causes(network: Network, estimate: Estimate) -> Iterator[tuple[str, float]]
         if newly
     ]
     if held:
-        freed = ", ".join(dict.fromkeys(held))
-        yield f"the camera, with free {freed}", _sigma0(network, replace(estimate, cameras=lens))
-    variants = _own_c(network, estimate)
-    sigma, adjusted = _adjusted(*variants)
-    if adjusted is not None:
-        groups = _two_groups(network, adjusted)
-        if groups is not None:
-            yield _words_of_groups(network, groups, adjusted), _sigma0(*_split(network, estimate, groups))
-        yield "c of its own for each photograph (a zoom or focus that was not fixed)", sigma
-    splits = range(LEAST_IN_GROUP, len(network.images) - LEAST_IN_GROUP + 1)
-    moved = [(_apart(network, estimate, k), k) for k in splits[:: max(1, len(splits) // MOST_SPLITS)]]
+        freed = _adjusted(network, replace(estimate, cameras=lens))
+        if freed[1] is not None:
+            yield _Cause(f"the camera, with free {', '.join(dict.fromkeys(held))}", *freed)
+        elif not any(camera.free.any() for camera in estimate.cameras):
+            words = "another camera, near the values at which it is held"
+            # where parameters are known by their weights only, steps along the valley are long
+            yield _Cause(words, *_adjusted(*_nominal(network, estimate), method="gauss-newton"))
+    if groups is not None:
+        yield groups
+    words = "c of its own for each photograph (a zoom or focus that was not fixed)"
+    yield _Cause(words, *_adjusted(*_own_c(network, estimate)))
+    splits = range(MIN_BEFORE, len(network.images) - MIN_BEFORE + 1)
+    moved = [(_apart(network, estimate, k), k) for k in splits[:: max(1, len(splits) // MAX_SPLITS)]]
     if moved:
         sigma, k = min(moved)
-        yield (
-            (
-                f"two states of the object, one up to {network.images[k - 1]} and one from "
-                f"{network.images[k]} on "
-                "(it moved, or was bent)"
-            ),
-            sigma,
+        words = (
+            f"two states of the object, one up to {network.images[k - 1]} and one from {network.images[k]} "
+            "on (it moved, or was bent)"
         )
+        yield _Cause(words, sigma)
 
 
-def _sigma0(network: Network, estimate: Estimate) -> float:
-    """Return sigma0 of an adjustment that rejects nothing, px; NaN where it cannot be had."""
-    return _adjusted(network, estimate)[0]
-
-
-def _adjusted(network: Network, estimate: Estimate) -> tuple[float, Estimate | None]:
+def _moved(found: Adjustment, estimate: Estimate | None) -> float:
+    """Return how far the points of an adjustment are from others, RMS over their standard deviations."""
+    if estimate is None:
+        return np.nan
+    mine, other = found.estimate.points, estimate.points
+    expected = float(np.trace(found.covariance.points, axis1=1, axis2=2).mean())
     try:
-        found = adjust(network, estimate, datum=Datum("free"), reject="none", covariance=False)
+        other = fit_similarity(other, mine).apply(other)
+    except GeometryError:  # points on a line
+        return np.nan
+    return float(np.sqrt(((other - mine) ** 2).sum(axis=1).mean() / expected)) if expected > 0 else np.nan
+
+
+def _adjusted(
+    network: Network, estimate: Estimate, method: str = "levenberg-marquardt"
+) -> tuple[float, Estimate | None]:
+    """Return sigma0 of an adjustment that rejects nothing, px, and its values; NaN and None without one."""
+    try:
+        found = adjust(network, estimate, datum=Datum("free"), reject="none", covariance=False, method=method)
     except (GeometryError, np.linalg.LinAlgError):
         return np.nan, None
     return (found.sigma0_px, found.estimate) if found.converged else (np.nan, None)
+
+
+def _nominal(network: Network, estimate: Estimate) -> tuple[Network, Estimate]:
+    """Return the network with c, x0, y0 and radial distortion known as well as nominal values are."""
+    cameras, observed = [], []
+    for index, camera in enumerate(estimate.cameras):
+        own = camera.plays(*NOMINAL)
+        half = float(np.hypot(*camera.size_px)) / 2
+        for s in np.flatnonzero(own).tolist():
+            value = float(camera.parameters[s])
+            observed.append((index, s, value, NOMINAL_ERROR * half * _per_corner_px(camera, s)))
+        cameras.append(replace(camera, free=own))
+    columns = list(zip(*observed, strict=True))
+    interior = InteriorObservations(
+        np.array(columns[0], dtype=np.int64),
+        np.array(columns[1], dtype=np.int64),
+        np.array(columns[2], dtype=float),
+        np.array(columns[3], dtype=float),
+    )
+    return replace(network, interior=interior), replace(estimate, cameras=tuple(cameras))
+
+
+def _per_corner_px(camera: Camera, s: int) -> float:
+    """Return by how much a parameter changes where the corner of the photograph moves by a pixel."""
+    corner = np.zeros((1, 2))
+    rays = tangents_from_pixel(camera, corner)
+    step, moved = 1.0, np.inf
+    while not moved < SMALL_MOVE_PX:  # NaN where the model has no inverse so far away
+        step /= 10
+        p = camera.parameters.copy()
+        p[s] += step
+        moved = float(np.hypot(*(pixel_from_tangents(camera.with_parameters(p), rays) - corner)[0]))
+    return step / moved
 
 
 def _cameras(cameras: tuple[Camera, ...], roles: tuple[Role, ...]) -> tuple[Camera, ...]:
@@ -116,18 +181,31 @@ def _own_c(network: Network, estimate: Estimate) -> tuple[Network, Estimate]:
     return replace(network, camera=owner), replace(estimate, cameras=tuple(cameras))
 
 
-def _two_groups(network: Network, adjusted: Estimate) -> BoolArray | None:
-    """Return which photographs belong to the second of two groups by their c, None without, (m,)."""
-    c = np.array([adjusted.cameras[index].c_px for index in range(len(network.images))])
-    order = np.argsort(c)
-    gap = np.diff(c[order])
-    if len(c) < 2 * LEAST_IN_GROUP:
+def _groups(network: Network, estimate: Estimate) -> _Cause | None:
+    """Return the photographs that seem to be of a second camera, adjusted with one of their own."""
+    found = two_groups(network, estimate)
+    if found is None:
         return None
-    inner = gap[LEAST_IN_GROUP - 1 : len(c) - LEAST_IN_GROUP]
-    if not len(inner):
+    split, start = _split(network, estimate, found.second)
+    sigma, adjusted = _adjusted(split, start)
+    if adjusted is None:
         return None
-    at = LEAST_IN_GROUP - 1 + int(np.argmax(inner))
-    return np.asarray(c > (c[order[at]] + c[order[at + 1]]) / 2)
+    second = int(np.flatnonzero(found.second)[0])
+    same = np.flatnonzero((network.camera == network.camera[second]) & ~found.second)
+    mine, others = adjusted.cameras[split.camera[second]], adjusted.cameras[split.camera[same[0]]]
+    away = float(np.hypot(*(_principal_point_px(mine) - _principal_point_px(others))))
+    names = [name for name, one in zip(network.images, found.second, strict=True) if one]
+    ratio = 100 * (mine.c_px / others.c_px - 1)
+    words = (
+        f"two cameras, zooms or states of the lens under one name: {listed(names)} with c {ratio:+.2f} % and "
+        f"the principal point {away:.2g} px from that of the others"
+    )
+    return _Cause(words, sigma, adjusted)
+
+
+def _principal_point_px(camera: Camera) -> FloatArray:
+    """Return the principal point, px, (2,)."""
+    return np.asarray(pixel_from_tangents(camera, np.zeros((1, 2)))[0])
 
 
 def _split(network: Network, estimate: Estimate, second: BoolArray) -> tuple[Network, Estimate]:
@@ -146,16 +224,6 @@ def _split(network: Network, estimate: Estimate, second: BoolArray) -> tuple[Net
     every = (*freed, *again)
     cameras = tuple(every[k] for k in used.tolist())
     return replace(network, camera=owner.astype(np.int64)), replace(estimate, cameras=cameras)
-
-
-def _words_of_groups(network: Network, second: BoolArray, adjusted: Estimate) -> str:
-    """Say who is in the smaller group and how far its c is from that of the others."""
-    smaller = second if second.sum() <= len(second) / 2 else ~second
-    names = [name for name, one in zip(network.images, smaller, strict=True) if one]
-    shown = ", ".join(names[:5]) + (f" and {len(names) - 5} more" if len(names) > 5 else "")
-    c = np.array([adjusted.cameras[index].c_px for index in range(len(network.images))])
-    ratio = float(np.median(c[smaller]) / np.median(c[~smaller]) - 1)
-    return f"two cameras or zooms under one name: {shown} with c {100 * ratio:+.1f} %"
 
 
 def _apart(network: Network, estimate: Estimate, k: int) -> float:

@@ -85,8 +85,8 @@ def tukey_weights(observations: Observations, residuals: FloatArray, *, sigma0: 
         residuals: v, px, shape (k, 2).
         sigma0: standard deviation of unit weight.
     """
-    share = residual_lengths(observations, residuals) / (TUKEY * sigma0)
-    return np.where(share < 1.0, (1.0 - share**2) ** 2, 0.0)
+    share = np.minimum(residual_lengths(observations, residuals) / (TUKEY * sigma0), 1.0)
+    return np.asarray((1.0 - share**2) ** 2)
 
 
 def huber_slopes(weight: FloatArray) -> FloatArray:
