@@ -83,7 +83,7 @@ def compared(name: str, points: int, draws: int, count: int = 300) -> tuple[int,
 
 def test_fewer_photographs_than_a_ring_or_at_random() -> None:
     kind, sizes, allowed, sigma = OBJECTS["box"]
-    planned, wanted = shape_object(kind, sizes, 24), Wanted(sigma=sigma)
+    planned, wanted = shape_object(kind, sizes, 40), Wanted(sigma=4 * sigma)
     found = design_network(planned, CAMERA, allowed, SEEING, wanted, count=80)
     designed = len(found.prediction.stations)
     assert found.reached and found.shortfall <= 1

@@ -32,6 +32,7 @@ SWEEPS = 3  # exchanges of all stations at most
 BETTER = 1e-3  # relative decrease of the cost from which an exchange is one
 MAX_RATIO = 25.0  # of the full over the limiting variance of a point that is believed
 NO_BETTER = 0.98  # of the shortfall: a round of additions that leaves more than this gains nothing
+ROUNDS = 6  # of additions and exchanges at most
 PATIENCE = 6  # photographs that gain nothing one after the other, until it is said what limits
 
 
@@ -108,14 +109,17 @@ class _Designer:
         chosen: list[int] = []
         while len(chosen) < min(FEWEST, self.most):
             chosen.append(self._next(chosen))
-        best = self._full(chosen)
-        idle = 0
-        while best[1] > 1 and len(chosen) < self.most and idle < PATIENCE:
-            chosen.append(self._next(chosen))
-            new = self._full(chosen)
-            idle = idle + 1 if new[1] > NO_BETTER * best[1] else 0
-            best = new if new[1] < best[1] or not np.isfinite(best[1]) else (new[0], min(best[1], new[1]))
-        chosen, prediction, short = self._exchanged(chosen)
+        short = self._full(chosen)[1]
+        for _ in range(ROUNDS):
+            before, idle = short, 0
+            while short > 1 and len(chosen) < self.most and idle < PATIENCE:
+                chosen.append(self._next(chosen))
+                new = self._full(chosen)[1]
+                idle = idle + 1 if new > NO_BETTER * short else 0
+                short = min(short, new)
+            chosen, prediction, short = self._exchanged(chosen)
+            if short <= 1 or len(chosen) >= self.most or short > NO_BETTER * before:
+                break
         if short <= 1:
             chosen, prediction, short = self._fewer(chosen, prediction, short)
         return Design(
