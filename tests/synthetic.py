@@ -11,10 +11,13 @@ from dataclasses import replace
 
 import numpy as np
 
+from sfm.adjustment.covariance import marginal_of
+from sfm.adjustment.result import Adjustment
 from sfm.camera import Camera, camera_from_values, project
 from sfm.conventions import BoolArray, FloatArray, rotation_from_vector
 from sfm.distortion.models import MODELS
 from sfm.network import Estimate, ImagePoints, Network
+from sfm.stored_result import StoredResult
 
 SIZE_PX = (2000, 1500)
 PIXEL_MM = (0.005, 0.005)
@@ -137,6 +140,29 @@ def perturb(
         position=estimate.position + position * distance * _directions(rng, m),
         rotation=estimate.rotation @ spin,
         points=estimate.points + points * distance.mean() * _directions(rng, n),
+    )
+
+
+def observed_anew(network: Network, truth: Estimate, noise_px: float, rng: np.random.Generator) -> Network:
+    """Return a network with its image points where a scene has them, and normal noise, px."""
+    seen = network.image_points
+    xy = np.array(seen.xy)
+    for i in range(len(network.images)):
+        rows = seen.image == i
+        camera = truth.cameras[network.camera[i]]
+        xy[rows] = project(camera, truth.position[i], truth.rotation[i], truth.points[seen.point[rows]])
+    return replace(network, image_points=replace(seen, xy=xy + noise_px * rng.standard_normal(xy.shape)))
+
+
+def stored_of(name: str, a: Adjustment) -> StoredResult:
+    """Return an adjustment in metres as a result, with the covariance of all points together."""
+    covariance = marginal_of(a).joint(np.zeros(0, dtype=np.int64), np.arange(len(a.network.points)))
+    return StoredResult(
+        *(name, a.network, a.estimate, a.covariance.points, None),
+        tuple(a.interior_sigma(k) for k in range(len(a.estimate.cameras))),
+        *(a.redundancy, "m"),
+        covariance=covariance,
+        datum=a.datum,
     )
 
 

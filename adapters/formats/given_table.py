@@ -24,6 +24,7 @@ class _Summary(Content):
     """What is read of summary.json."""
 
     sigma0: Annotated[float, Field(gt=0, lt=1e9)] | None = None
+    sigma0_px: Annotated[float, Field(gt=0, lt=1e9)] | None = None
 
 
 @dataclass(frozen=True)
@@ -32,8 +33,9 @@ class GivenValues:
 
     bars: ScaleBars
     control: ObjectPoints
-    interior: tuple[tuple[str, str, float], ...]  # camera, parameter, value
+    interior: tuple[tuple[str, str, float, float], ...]  # camera, parameter, value, sigma
     sigma0: float = 1.0  # of unit weight, by which the covariance of the result is scaled
+    sigma0_px: float | None = None  # a posteriori of an image coordinate, the median; None where not known
 
 
 def read_given(folder: Path, network: Network) -> GivenValues:
@@ -47,8 +49,9 @@ def read_given(folder: Path, network: Network) -> GivenValues:
         SurveyFileError: what is missing or wrong, with file and line number.
     """
     path = folder / "given.csv"
-    if not path.is_file():
-        return GivenValues(ScaleBars(), ObjectPoints(), ())
+    summary = read_json(folder / "summary.json", _Summary, "the summary of a result")
+    if not path.is_file() or not path.read_text(encoding="utf-8").strip().partition("\n")[2]:
+        return GivenValues(ScaleBars(), ObjectPoints(), (), summary.sigma0 or 1.0, summary.sigma0_px)
     table = read_table(
         path, ("kind", "name", "coordinate"), ("given", "sigma"), ignored=None, blank=("sigma",)
     )
@@ -68,7 +71,7 @@ def read_given(folder: Path, network: Network) -> GivenValues:
             xyz[k], variance[k] = given, sigma**2 if np.isfinite(sigma) else np.inf
         elif kind == "interior orientation":
             parameter, _, camera = name.partition(" of camera ")
-            interior.append((camera, parameter, given))
+            interior.append((camera, parameter, given, sigma))
     rows = np.array(bars, dtype=float).reshape(-1, 4)
     return GivenValues(
         ScaleBars(rows[:, 0].astype(np.int64), rows[:, 1].astype(np.int64), rows[:, 2], rows[:, 3]),
@@ -78,14 +81,9 @@ def read_given(folder: Path, network: Network) -> GivenValues:
             np.array([np.diag(variance) for _, variance in control.values()]).reshape(-1, 3, 3),
         ),
         tuple(interior),
-        _sigma0(folder),
+        summary.sigma0 or 1.0,
+        summary.sigma0_px,
     )
-
-
-def _sigma0(folder: Path) -> float:
-    """Return sigma0 of unit weight as summary.json says it, 1 where it does not."""
-    summary = read_json(folder / "summary.json", _Summary, "the summary of a result")
-    return summary.sigma0 or 1.0
 
 
 def _ends(name: str, index: dict[str, int]) -> tuple[int, int] | None:

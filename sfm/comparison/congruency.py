@@ -23,10 +23,12 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
 from sfm.comparison.stable_points import (
+    StablePoints,
+    Step,
     critical_value,
     find_stable_points,
     in_datum,
-    point_blocks,
+    robust_weights,
     single_tests,
 )
 from sfm.conventions import BoolArray, FloatArray
@@ -36,24 +38,37 @@ from sfm.similarity import mean_distance, similarity_motions
 MOTIONS = {"none": 0, "rigid": 6, "similarity": 7}  # parameters of what is no change
 MIN_STABLE = 4  # points that a datum needs to be checked by at least one more than it takes
 STABLE_FRACTION = 0.5  # of the points that must agree for the others to be called moved
+RANK = 1e-6  # of the largest singular value below which the points of reference are on a line
 THIN = 0.05  # extent over the longest one below which an object has no depth to bend along
 SAME_COLUMN = 1e-6  # singular value over the largest one below which a way to deform is no way of its own
 
 
 @dataclass(frozen=True)
 class Congruency:
-    """Differences of the points in the datum of those that did not move."""
+    """Differences of the points in the datum of those that did not move, and how these were found."""
 
+    reference: BoolArray  # points that may carry the datum, (n,)
+    search: StablePoints  # from all points of reference
+    robust: StablePoints | None  # from those that a robust alignment leaves; None where all agree, or too few
+    stable: BoolArray  # points that carry the datum, (n,); all of reference where no majority of them agrees
+    agreed: bool  # whether the stable points agree; else no majority does
     difference: FloatArray  # d_S, (n, 3)
-    covariance: FloatArray  # blocks of Q_S, (n, 3, 3)
-    stable: BoolArray  # points that carry the datum, (n,); all that may where no majority of them agrees
-    moved: BoolArray  # points that do not agree with the stable ones, (n,); none where nobody knows which
+    covariance: FloatArray  # Q_S of all coordinates together, (3 n, 3 n)
+    motions: FloatArray  # G: what is no change, (3 n, u)
     statistic: FloatArray  # T of each point, its drop of Omega (stable) or its own test, over 3, (n,)
-    critical: float  # of the largest T
-    global_statistic: float  # Omega over its degrees of freedom, of all points before any was removed
-    global_critical: float
-    agreed: bool  # whether the stable points agree; else no majority of them does
-    smooth: float  # fraction of Omega of all points that a bending of the whole takes away, see `bending`
+    level: FloatArray  # alpha of the test of each point, (n,)
+    critical: FloatArray  # of T, (n,)
+    weights: FloatArray  # P_kk of each stable point, from which its drop is, 0 of the others, (n, 3, 3)
+
+    @property
+    def moved(self) -> BoolArray:
+        """Points that do not agree with the stable ones, (n,); none where nobody knows which."""
+        return np.asarray(self.agreed & ~self.stable & (self.critical < self.statistic))
+
+    @property
+    def first_test(self) -> Step:
+        """The test of all points of reference together."""
+        return self.search.steps[0]
 
 
 def congruency(
@@ -63,12 +78,14 @@ def congruency(
     *,
     motion: str = "rigid",
     redundancy: int | None = None,
-    datum: BoolArray | None = None,
+    reference: BoolArray | None = None,
     alpha: float = 0.05,
 ) -> Congruency:
     """Test whether points have moved, and find those that have.
 
     Half of alpha is spent on the test of all points together and half on the largest of the single points.
+    Points that moved are removed one by one, once from all of reference and once from those that a robust
+    alignment leaves; the larger set that agrees is taken.
 
     Args:
         difference: second minus first coordinates after any alignment, (n, 3).
@@ -77,49 +94,65 @@ def congruency(
         motion: what of the whole is no change: rigid (translation and rotation), similarity (the scale too,
             where not both have one of their own), or none (both in the datum of control).
         redundancy: of both adjustments together; None if the variances are known.
-        datum: points that may carry the datum, (n,); all if not given.
+        reference: points that may carry the datum, (n,); all if not given.
         alpha: probability of calling something a change that is none.
 
     Raises:
-        GeometryError: too few points, or a covariance that is singular beyond the datum.
+        GeometryError: too few points, points on a line, or a covariance that is singular beyond the datum.
+
+    Source: Caspary (2000), Concepts of network and deformation analysis, secs. 7 and 8; Niemeier (2008),
+    Ausgleichungsrechnung, secs. 12.2 to 12.4.
     """
     n = len(xyz)
-    candidates = np.ones(n, dtype=bool) if datum is None else datum.copy()
-    first = int(candidates.sum())
+    reference = np.ones(n, dtype=bool) if reference is None else reference
+    first = int(reference.sum())
     if first < MIN_STABLE:
-        raise GeometryError(f"congruency: {first} points, expected {MIN_STABLE} or more")
+        raise GeometryError(f"congruency: {first} points of reference, expected {MIN_STABLE} or more")
     G = motions(xyz)[:, : MOTIONS[motion]]
-    found = find_stable_points(
-        difference,
-        covariance,
-        G,
-        candidates=candidates,
-        least=max(MIN_STABLE, math.ceil(STABLE_FRACTION * first)),
-        redundancy=redundancy,
-        alpha=alpha / 2,
-        alpha_single=alpha / 2,
-    )
-    start = found.steps[0]
-    smooth = 0.0
-    if start.statistic > start.critical:
-        smooth = smooth_fraction(difference, covariance, G, bending(xyz), candidates)
-    stable, drops = (found.stable, found.drops) if found.agreed else (candidates, found.drops_of_all)
+    sizes = np.linalg.svd(G[np.repeat(reference, 3)], compute_uv=False)
+    if (sizes < RANK * np.linalg.svd(G, compute_uv=False).max(initial=0.0)).any():
+        raise GeometryError(
+            "congruency: the points of reference lie on a line, which holds no rotation about it"
+        )
+    least = max(MIN_STABLE, math.ceil(STABLE_FRACTION * first))
+
+    def search(start: BoolArray) -> StablePoints:
+        return find_stable_points(
+            *(difference, covariance, G),
+            candidates=start,
+            least=least,
+            redundancy=redundancy,
+            alpha=alpha / 2,
+            alpha_single=alpha / 2,
+        )
+
+    level = np.where(reference, alpha / 2 / first, alpha / 2 / max(1, n - first))
+    value = {one: critical_value(one, 3, redundancy) for one in set(level.tolist())}
+    critical = np.array([value[one] for one in level.tolist()])
+    whole = best = search(reference)
+    robust = None
+    if len(whole.steps) > 1:
+        weight = robust_weights(difference, G, reference)
+        fits = reference & ~(critical < single_tests(*in_datum(difference, covariance, G, weight)))
+        if fits.sum() >= least:
+            robust = search(fits)
+            more = not whole.agreed or robust.stable.sum() > whole.stable.sum()
+            best = robust if robust.agreed and more else whole
+    stable, drops = (best.stable, best.drops) if best.agreed else (reference, whole.drops_of_all)
     d, Q = in_datum(difference, covariance, G, stable.astype(float))
-    T = np.where(stable, drops, single_tests(d, Q))
-    moved = candidates & ~stable
-    if found.agreed and datum is not None:  # points that carry no datum are judged in it
-        moved |= ~datum & (critical_value(alpha / 2 / max(1, n - first), 3, redundancy) < T)
     return Congruency(
-        difference=d,
-        covariance=point_blocks(Q, 3),
+        reference=reference,
+        search=whole,
+        robust=robust,
         stable=stable,
-        moved=moved,
-        statistic=T,
-        critical=critical_value(alpha / 2 / first, 3, redundancy),
-        global_statistic=start.statistic,
-        global_critical=start.critical,
-        agreed=found.agreed,
-        smooth=smooth,
+        agreed=best.agreed,
+        difference=d,
+        covariance=Q,
+        motions=G,
+        statistic=np.where(stable, drops, single_tests(d, Q)),
+        level=level,
+        critical=critical,
+        weights=best.weights if best.agreed else whole.weights_of_all,
     )
 
 
@@ -149,11 +182,19 @@ def bending(xyz: FloatArray) -> FloatArray:
     return shapes.reshape(3 * len(xyz), -1)
 
 
-def smooth_fraction(
-    difference: FloatArray, covariance: FloatArray, G: FloatArray, shapes: FloatArray, points: BoolArray
-) -> float:
-    """Return which fraction of Omega goes where the shapes may be fitted to the differences; 0 if too few."""
-    rows = np.repeat(points, 3)
+def smooth_fraction(found: Congruency, xyz: FloatArray) -> float:
+    """Return which fraction of Omega of all points of reference a bending of the whole takes away.
+
+    Args:
+        found: the differences and their test.
+        xyz: coordinates, (n, 3).
+
+    Returns:
+        The fraction; 0 where the points are too few to tell.
+    """
+    difference, covariance, G = found.difference, found.covariance, found.motions
+    shapes = bending(xyz)
+    rows = np.repeat(found.reference, 3)
     basis = np.linalg.qr(G[rows])[0]
     B = shapes[rows] - basis @ (basis.T @ shapes[rows])
     left, size, _ = np.linalg.svd(B, full_matrices=False)

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sfm.comparison.congruency import Congruency, congruency
+from sfm.comparison.congruency import Congruency, congruency, smooth_fraction
 from sfm.comparison.pairing import Pairing
 from sfm.comparison.stable_points import critical_value
 from sfm.conventions import METRES, BoolArray, FloatArray, IntArray
@@ -84,13 +84,13 @@ def judge_points(
                 a.estimate.points[pa[free]],
                 motion="none" if align == "none" else "similarity" if known_scale(a, b) is None else "rigid",
                 redundancy=redundancy,
-                datum=chosen[free],
+                reference=chosen[free],
                 alpha=alpha,
             )
         except GeometryError as error:
             return without(str(error))
         sigma[both] = 0.0  # held in both, or written over
-        return _of_congruency(found, free, sigma, np.isin(np.arange(n), both))
+        return _of_congruency(found, a.estimate.points[pa[free]], free, sigma, np.isin(np.arange(n), both))
     if not all(one.datum in FREE_DATUMS for one in known):
         return without("covariance of single points only")
     statistic, critical, global_critical = _single_tests(difference, blocks, redundancy, alpha)
@@ -103,26 +103,31 @@ def judge_points(
     )
 
 
-def _of_congruency(found: Congruency, tested: IntArray, sigma: FloatArray, together: BoolArray) -> PointTest:
+def _of_congruency(
+    found: Congruency, xyz: FloatArray, tested: IntArray, sigma: FloatArray, together: BoolArray
+) -> PointTest:
     """Return the test of all points where some took no part, held in both results or of unknown correlation.
 
     Args:
         found: of the tested points.
-        tested: their indices.
+        xyz: their coordinates, (k, 3).
+        tested: their indices, (k,).
         sigma: of all differences, written over where tested, (n, 3).
         together: points whose covariance together is known, on which alone an alignment may rest, (n,).
     """
     n = len(together)
     statistic = np.full(n, np.nan)
-    sigma[tested] = np.sqrt(np.einsum("njj->nj", found.covariance).clip(0))
+    sigma[tested] = np.sqrt(np.diagonal(found.covariance).reshape(-1, 3).clip(0))
     statistic[tested] = found.statistic
     stable = together.copy()
     stable[tested] = found.stable
     significant = np.zeros(n, dtype=bool)
     significant[tested] = found.moved
+    first, critical = found.first_test, float(found.critical[found.reference][0])
+    smooth = smooth_fraction(found, xyz) if first.statistic > first.critical else 0.0
     return PointTest(
-        *(sigma, "", statistic, found.critical, significant, found.global_statistic, found.global_critical),
-        *(stable, False, found.agreed, found.smooth),
+        *(sigma, "", statistic, critical, significant, first.statistic, first.critical),
+        *(stable, False, found.agreed, smooth),
     )
 
 

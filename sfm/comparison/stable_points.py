@@ -26,7 +26,7 @@ from sfm.distributions import chi2_isf, f_isf
 from sfm.errors import GeometryError
 
 ROBUST_ROUNDS = 100  # of weighting; it has come to its end long before
-LEAST_WEIGHTED = 1e-6  # of the median difference: what lies nearer has no more weight
+MIN_WEIGHTED = 1e-6  # of the median difference: what lies nearer has no more weight
 
 
 @dataclass(frozen=True)
@@ -52,6 +52,7 @@ class StablePoints:
     drops: FloatArray  # T of each stable point, NaN of the others, (n,)
     weights: FloatArray  # P_kk of each stable point, 0 of the others, (n, m, m)
     drops_of_all: FloatArray  # T of each candidate before any was removed, NaN of the others, (n,)
+    weights_of_all: FloatArray  # P_kk of each candidate before any was removed, 0 of the others, (n, m, m)
 
 
 def find_stable_points(
@@ -98,6 +99,8 @@ def find_stable_points(
     steps: list[Step] = []
     of_all = np.full(n, np.nan)
     of_all[chosen] = _drops(P, w, left, m)
+    weights_of_all = np.zeros((n, m, m))
+    weights_of_all[chosen] = point_blocks(P, m)
     while True:
         omega, freedom = float(d @ w), m * int(left.sum()) - u
         drops = _drops(P, w, left, m)
@@ -120,7 +123,7 @@ def find_stable_points(
     T[chosen] = drops
     weights = np.zeros((n, m, m))
     weights[chosen[left]] = point_blocks(P, m)[left]
-    return StablePoints(stable, bool(agreed), tuple(steps), T, weights, of_all)
+    return StablePoints(stable, bool(agreed), tuple(steps), T, weights, of_all, weights_of_all)
 
 
 def in_datum(
@@ -173,7 +176,7 @@ def robust_weights(difference: FloatArray, G: FloatArray, candidates: BoolArray)
         middle = float(np.median(length[candidates]))
         if not middle > 0:
             break
-        weight = np.where(candidates, 1 / np.maximum(length, LEAST_WEIGHTED * middle), 0.0)
+        weight = np.where(candidates, 1 / np.maximum(length, MIN_WEIGHTED * middle), 0.0)
         weight /= weight.max()
     return weight
 

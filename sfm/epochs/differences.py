@@ -16,9 +16,7 @@ Testing in Linear Models, sec. 3.2.3 (covariance of estimates and observations).
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Iterable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -26,24 +24,10 @@ from sfm.comparison.congruency import MOTIONS, motions
 from sfm.comparison.pairing import fit_robustly, pair_results
 from sfm.comparison.point_tests import held_points, joint_covariance, known_scale
 from sfm.conventions import FloatArray, IntArray
+from sfm.epochs.epoch import SAME, Epoch, given_observations
 from sfm.errors import GeometryError
-from sfm.network import ObjectPoints, ScaleBars
 from sfm.similarity import Similarity
 from sfm.stored_result import StoredResult
-
-SAME = 1e-9  # relative difference of two given values that are the same one
-
-
-@dataclass(frozen=True)
-class Epoch:
-    """One epoch: a result, and what it was given."""
-
-    name: str
-    result: StoredResult
-    bars: ScaleBars = field(default_factory=ScaleBars)  # that took part, by index of the result's points
-    control: ObjectPoints = field(default_factory=ObjectPoints)  # that took part, as observed
-    interior: tuple[tuple[str, str, float], ...] = ()  # camera, parameter and value observed with a sigma
-    sigma0: float = 1.0  # of unit weight, by which the covariance of the result is scaled
 
 
 @dataclass(frozen=True)
@@ -89,7 +73,9 @@ def epoch_differences(first: Epoch, second: Epoch) -> Differences:
                 f"{epoch.name}: the covariance of all points together (point_covariance.npy) is missing; run "
                 "the survey again with this version"
             )
-    _refuse_shared_calibration(first, second)
+    together = first.common is not None and second.common is not None
+    if not together:
+        _refuse_shared_calibration(first, second)
     a, b = _of_own_photographs(first.result, "a"), _of_own_photographs(second.result, "b")
     pairing = pair_results(a, b)
     pa, pb = pairing.points.T
@@ -98,7 +84,8 @@ def epoch_differences(first: Epoch, second: Epoch) -> Differences:
     for epoch, rows in ((first, rows_a), (second, rows_b)):
         assert epoch.result.covariance is not None  # refused before
         variance = np.diagonal(epoch.result.covariance).reshape(-1, 3)
-        kept[kept] = ~held_points(variance[rows[kept]])
+        if epoch.result.datum == "control":
+            kept[kept] = ~held_points(variance[rows[kept]])
     untested = tuple(a.network.points[j] for j in pa[~kept])
     pairs = pairing.points[kept]
     others = _others(a, pa), _others(b, pb)
@@ -114,8 +101,7 @@ def epoch_differences(first: Epoch, second: Epoch) -> Differences:
     xyz = a.estimate.points[pa]
     Q = joint_covariance(a, rows_a[kept], 1.0, np.eye(3))
     Q += joint_covariance(b, rows_b[kept], moved.scale, moved.rotation)
-    influence_a, influence_b, shared = _shared(first, second, pairs, moved)
-    C = influence_a @ influence_b.T
+    C, shared = (_correlated if together else _shared)(first, second, pairs, moved)
     Q -= C
     Q -= C.T
     known = [one.redundancy for one in (a, b) if one.redundancy is not None]
@@ -150,25 +136,39 @@ def _others(result: StoredResult, paired: IntArray) -> tuple[str, ...]:
 
 
 def _refuse_shared_calibration(first: Epoch, second: Epoch) -> None:
-    theirs = {(camera, parameter): value for camera, parameter, value in second.interior}
-    for camera, parameter, value in first.interior:
+    theirs = {(camera, parameter): value for camera, parameter, value, _ in second.interior}
+    for camera, parameter, value, _ in first.interior:
         other = theirs.get((camera, parameter))
         if other is not None and abs(other - value) <= SAME * abs(value):
             raise GeometryError(
                 f"{first.name} and {second.name} share the weighted {parameter} of camera {camera}, whose "
-                "error is in both: let every epoch determine its own (free), or hold it"
+                "error is in both: adjust the epochs together (--together), or let every epoch determine "
+                "its own (free)"
             )
+
+
+def _correlated(
+    first: Epoch, second: Epoch, pairs: IntArray, frame: Similarity
+) -> tuple[FloatArray, tuple[str, ...]]:
+    """Return C of two epochs that were adjusted together, and in words what both were given."""
+    assert first.common is not None and second.common is not None
+    a, b = first.common, second.common
+    given = np.flatnonzero(
+        a.columns[:, : len(a.given)].any(axis=0) & b.columns[:, : len(b.given)].any(axis=0)
+    )
+    words = tuple(a.given[k].partition(" = ")[0] for k in given)
+    return _covariance(first, second, a.columns * a.signs, b.columns, pairs, frame), words
 
 
 def _shared(
     first: Epoch, second: Epoch, pairs: IntArray, frame: Similarity
-) -> tuple[FloatArray, FloatArray, tuple[str, ...]]:
-    """Columns Q g / s of both epochs for each value that both were given, (3 n, k) each; and words."""
+) -> tuple[FloatArray, tuple[str, ...]]:
+    """Return C of two epochs that were given the same values, and these in words."""
     mine: list[FloatArray] = []
     yours: list[FloatArray] = []
     words: list[str] = []
-    theirs = dict(_observations(second))
-    for key, (ours, sigma, value) in _observations(first):
+    theirs = dict(given_observations(second))
+    for key, (ours, sigma, value) in given_observations(first):
         if key not in theirs:
             continue
         other, other_sigma, other_value = theirs[key]
@@ -180,40 +180,17 @@ def _shared(
             found.append(sum((Q[:, k] * g for k, g in gradient), start=np.zeros(len(Q))) / (s * epoch.sigma0))
         words.append(key)
     if not words:
-        nothing = np.zeros((3 * len(pairs), 0))
-        return nothing, nothing, ()
-    pa, pb = (one.result.covariance_rows(p) for one, p in zip((first, second), pairs.T, strict=True))
-    a, b = np.stack(mine, axis=1), np.stack(yours, axis=1)
-    turn = frame.scale * frame.rotation
-    turned = np.einsum("xi,nik->nxk", turn, b.reshape(-1, 3, len(words))[pb])
-    return (
-        a.reshape(-1, 3, len(words))[pa].reshape(3 * len(pa), -1),
-        turned.reshape(3 * len(pa), -1),
-        tuple(words),
+        return np.zeros((3 * len(pairs), 3 * len(pairs))), ()
+    return _covariance(first, second, np.stack(mine, axis=1), np.stack(yours, axis=1), pairs, frame), tuple(
+        words
     )
 
 
-Observed = tuple[list[tuple[int, float]], float, float]  # gradient by column, standard deviation, value
-
-
-def _observations(epoch: Epoch) -> Iterable[tuple[str, Observed]]:
-    """Bars and coordinates of control that an epoch was given with a standard deviation, by their names."""
-    names, x = epoch.result.network.points, epoch.result.estimate.points
-    bars, row = epoch.bars, epoch.result.covariance_rows(np.arange(len(names)))
-    count: Counter[str] = Counter()
-    for i, j, length, sigma in zip(bars.start, bars.end, bars.length, bars.sigma, strict=True):
-        if not (sigma > 0 and row[i] >= 0 and row[j] >= 0):
-            continue
-        key = f"bar {' - '.join(sorted((names[i], names[j])))}"
-        count[key] += 1
-        u = (x[j] - x[i]) / np.linalg.norm(x[j] - x[i])
-        gradient = [(3 * int(row[i]) + k, -float(u[k])) for k in range(3)]
-        gradient += [(3 * int(row[j]) + k, float(u[k])) for k in range(3)]
-        again = f" ({count[key]})" if count[key] > 1 else ""
-        yield key + again, (gradient, float(sigma), float(length))
-    control = epoch.control
-    for j, given, C in zip(control.point, control.xyz, control.covariance, strict=True):
-        for k in range(3):
-            if 0 < C[k, k] < np.inf and row[j] >= 0:
-                key = f"{'XYZ'[k]} of control point {names[j]}"
-                yield key, ([(3 * int(row[j]) + k, 1.0)], float(np.sqrt(C[k, k])), float(given[k]))
+def _covariance(
+    first: Epoch, second: Epoch, a: FloatArray, b: FloatArray, pairs: IntArray, frame: Similarity
+) -> FloatArray:
+    """Return a b' of the common points, the second epoch turned into the frame of the first, (3 n, 3 n)."""
+    pa, pb = (one.result.covariance_rows(p) for one, p in zip((first, second), pairs.T, strict=True))
+    turn, q = frame.scale * frame.rotation, a.shape[1]
+    turned = np.einsum("xi,nik->nxk", turn, b.reshape(-1, 3, q)[pb]).reshape(3 * len(pb), q)
+    return np.asarray(a.reshape(-1, 3, q)[pa].reshape(3 * len(pa), q) @ turned.T)

@@ -14,8 +14,10 @@ import numpy as np
 
 from sfm.conventions import BoolArray
 from sfm.epochs.blocks import MIN_POINTS, MODELS, BlockMotion, block_motion
-from sfm.epochs.differences import Differences, Epoch, epoch_differences
+from sfm.epochs.differences import Differences, epoch_differences
 from sfm.epochs.displacements import ALPHA, Displacements, displacements
+from sfm.epochs.epoch import Epoch
+from sfm.epochs.together import SharedCamera, adjust_together
 from sfm.errors import GeometryError
 from sfm.geometry.measured import matches
 
@@ -43,6 +45,7 @@ class EpochSeries:
     names: tuple[str, ...]
     since_first: tuple[EpochPair, ...]  # of every epoch from the second on, against the first
     since_previous: tuple[EpochPair, ...]  # against the one before
+    cameras: tuple[SharedCamera, ...] = ()  # with one interior orientation in all epochs adjusted together
 
     @property
     def changed(self) -> bool:
@@ -57,6 +60,7 @@ def analyse_epochs(
     groups: Mapping[str, Sequence[str]] | None = None,
     model: str = "rigid",
     alpha: float = ALPHA,
+    together: bool = False,
 ) -> EpochSeries:
     """Test what moved between epochs.
 
@@ -66,6 +70,8 @@ def analyse_epochs(
         groups: names or patterns of the points of each group whose motion is asked for.
         model: of the motion of groups: rigid, similarity or affine.
         alpha: level of the tests of every pair of epochs.
+        together: whether all epochs are adjusted as one, with one interior orientation of each camera that
+            took photographs of several, see `adjust_together`.
 
     Raises:
         GeometryError: fewer than two epochs, two of one name, a point of reference that an epoch lacks, too
@@ -81,6 +87,10 @@ def analyse_epochs(
     twice = next((name for k, name in enumerate(names) if name in names[:k]), None)
     if twice is not None:
         raise GeometryError(f"epochs: two of them are called '{twice}'; give each a name of its own")
+
+    cameras: tuple[SharedCamera, ...] = ()
+    if together:
+        epochs, cameras = adjust_together(epochs)
 
     def analysed(first: Epoch, second: Epoch) -> EpochPair:
         found = epoch_differences(first, second)
@@ -98,7 +108,7 @@ def analyse_epochs(
     first = [analysed(epochs[0], epoch) for epoch in epochs[1:]]
     previous = [first[0]]
     previous += [analysed(one, other) for one, other in pairwise(epochs[1:])]
-    return EpochSeries(names, tuple(first), tuple(previous))
+    return EpochSeries(names, tuple(first), tuple(previous), cameras)
 
 
 def _reference(found: Differences, patterns: Sequence[str], epochs: tuple[Epoch, Epoch]) -> BoolArray:

@@ -9,10 +9,13 @@ from typing import Any
 
 import numpy as np
 
+from sfm.adjustment.quality.statistics import POWER
 from sfm.conventions import FloatArray
+from sfm.display import listed
 from sfm.epochs.blocks import BlockMotion
-from sfm.epochs.displacements import POWER, Displacements
+from sfm.epochs.displacements import Displacements
 from sfm.epochs.series import EpochPair, EpochSeries
+from sfm.epochs.together import SharedCamera
 from sfm.files.plain_text import csv_text, or_none
 from sfm.report.figures.comparisons import difference_figure, series_figure
 from sfm.report.figures.plots import Plot, png
@@ -20,6 +23,7 @@ from sfm.report.html.page import render
 from sfm.report.numbers import finer_unit, significant
 from sfm.report.page_files import write_files
 
+NAMED = 12  # points in a sentence
 FILES = ("displacements.csv", "series.csv", "epochs.json", "epochs.html")
 COLUMNS = (
     *("first", "second", "id", "dX", "dY", "dZ", "sdX", "sdY", "sdZ", "length", "T", "critical", "stable"),
@@ -27,7 +31,6 @@ COLUMNS = (
 )
 SERIES = ("id", "epoch", "dX", "dY", "dZ", "sdX", "sdY", "sdZ", "moved")
 DRAWN = 12  # points of a series that are drawn, those that moved farthest
-NAMED = 12  # points that a sentence names
 MOSTLY = 0.5  # of Omega: what a bending takes away of it is told from here on
 PICTURE = (
     "Displacements: arrows in the object's main plane, points that moved in red; the colour of the dots is "
@@ -88,14 +91,20 @@ def words_of_stable(found: Displacements) -> str:
     """Return in words which points carry the datum, and how they were found."""
     if not found.agreed:
         return (
-            "No stable set is proposed; what is shown is in the datum of the points left last. Name "
+            "No stable set is proposed; what is shown is in the datum of all points of reference. Name "
             "stable ones with --reference."
         )
-    removed = [found.differences.points[s.removed] for s in found.search.steps if s.removed is not None]
+    removed = [
+        found.differences.points[s.removed] for s in found.congruency.search.steps if s.removed is not None
+    ]
     count, all_of_them = int(found.stable.sum()), int(found.reference.sum())
     if count == all_of_them:
         return f"All {count} points of reference agree."
-    by = " by removing one after the other" if found.robust is None or _same(found) else " by a robust start"
+    by = (
+        " by removing one after the other"
+        if found.congruency.robust is None or _same(found)
+        else " by a robust start"
+    )
     undecided = [n for n, u in zip(found.differences.points, found.undecided, strict=True) if u]
     left = f" Left out, and not shown to have moved: {_names(undecided)}." if undecided else ""
     gone = f" ({_names(removed)} in this order)" if removed and " one " in by else ""
@@ -113,11 +122,29 @@ def words_of_block(block: BlockMotion) -> str:
     return f"{block.name} ({len(block.points)} points, {block.model}): {how}; {rest}"
 
 
+def words_of_camera(camera: SharedCamera) -> str:
+    """Return in words that epochs were adjusted together with one camera."""
+    return (
+        f"Camera {camera.name} has one interior orientation in {', '.join(camera.epochs)}: they agree on it "
+        f"(T {significant(camera.statistic)}, limit {significant(camera.critical)})."
+    )
+
+
 def epochs_summary(found: EpochSeries) -> dict[str, Any]:
     """Return what epochs.json holds: plain values only, None for what is not known."""
     return {
         "epochs": list(found.names),
         "changed": found.changed,
+        "adjusted_together": [
+            {
+                "camera": one.name,
+                "epochs": list(one.epochs),
+                "parameters": list(one.parameters),
+                "T": or_none(one.statistic),
+                "critical": or_none(one.critical),
+            }
+            for one in found.cameras
+        ],
         "pairs": [_pair(p) for p in pairs_of(found)],
     }
 
@@ -135,6 +162,7 @@ def epochs_page(found: EpochSeries) -> str:
         remarks=[words for k, (words, _) in enumerate(told) if k != len(found.since_first) - 1],
         level=level,
         power=POWER,
+        cameras=[words_of_camera(one) for one in found.cameras],
         pairs=[
             {
                 "found": pair.displacements,
@@ -180,7 +208,7 @@ def _pair(pair: EpochPair) -> dict[str, Any]:
                 "critical": or_none(step.critical),
                 "removed": None if step.removed is None else d.points[step.removed],
             }
-            for step in found.search.steps
+            for step in found.congruency.search.steps
         ],
         "groups": [
             {
@@ -205,7 +233,11 @@ def _rows(found: Displacements) -> Iterable[tuple[object, ...]]:
     for k, name in enumerate(d.points):
         yield (
             *(*d.names, name, *found.displacement[k], *found.sigma[k]),
-            *(float(np.linalg.norm(found.displacement[k])), found.statistic[k], found.critical[k]),
+            *(
+                float(np.linalg.norm(found.displacement[k])),
+                found.congruency.statistic[k],
+                found.congruency.critical[k],
+            ),
             *(int(found.stable[k]), int(found.moved[k]), found.detectable[k]),
         )
 
@@ -268,10 +300,8 @@ def _typical(found: Displacements) -> float:
 
 def _same(found: Displacements) -> bool:
     """Whether the proposed set is the one from the search through all points."""
-    return bool((found.stable == found.search.stable).all())
+    return bool((found.stable == found.congruency.search.stable).all())
 
 
 def _names(names: Iterable[str]) -> str:
-    all_of_them = list(names)
-    said = ", ".join(all_of_them[:NAMED])
-    return said if len(all_of_them) <= NAMED else f"{said} and {len(all_of_them) - NAMED} more"
+    return listed(names, most=NAMED)

@@ -8,6 +8,7 @@ import numpy as np
 
 from sfm.camera import pixel_jacobian
 from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
+from sfm.display import listed
 from sfm.network import Estimate, ImagePoints, Network, rows_of
 from sfm.orientation.eccentricity import CircleViews, ellipse_shape, fit_circles
 from sfm.result import Eccentricity
@@ -26,7 +27,6 @@ NOT_A_CIRCLE = (
 
 
 OTHER_SIZE = 0.1  # relative difference of a stated diameter from that of the ellipses, which know 1 to 3 %
-MAX_NAMED = 10  # ids in a warning
 
 
 @dataclass(frozen=True)
@@ -142,11 +142,7 @@ def _unknown_ids(given: Diameters | None, points: tuple[str, ...]) -> tuple[str,
     unknown = [name for name in given.names if name not in known] if given is not None else []
     if given is None or not unknown:
         return ()
-    more = f" and {len(unknown) - MAX_NAMED} more" if len(unknown) > MAX_NAMED else ""
-    return (
-        f"{given.source}: diameters of targets that are not in the survey: "
-        f"{', '.join(unknown[:MAX_NAMED])}{more}",
-    )
+    return (f"{given.source}: diameters of targets that are not in the survey: {listed(unknown)}",)
 
 
 def _other_sizes(

@@ -9,11 +9,8 @@ from itertools import combinations_with_replacement
 import numpy as np
 import pytest
 
-from sfm.adjustment.covariance import marginal_of
 from sfm.adjustment.datum import Datum
-from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
-from sfm.camera import project
 from sfm.comparison.congruency import congruency, motions
 from sfm.comparison.significance import ResultComparison, compare_results
 from sfm.conventions import FloatArray
@@ -22,7 +19,7 @@ from sfm.errors import GeometryError
 from sfm.network import Estimate, Network
 from sfm.report.differences import words_of_cause, words_of_scale, words_of_test
 from sfm.stored_result import StoredResult
-from tests.synthetic import make_network, seed_of
+from tests.synthetic import make_network, observed_anew, seed_of, stored_of
 
 DATUMS = ("free", "minimal", "control")
 PAIRS = tuple(combinations_with_replacement(DATUMS, 2))
@@ -40,15 +37,7 @@ def epoch(seed: int, datum: str, shift: FloatArray | None = None, *, bar: float 
     network, truth = scene()
     rng = np.random.default_rng(seed)
     moved = truth if shift is None else replace(truth, points=truth.points + shift)
-    seen = network.image_points
-    xy = np.array(seen.xy)
-    for i in range(len(network.images)):
-        rows = seen.image == i
-        xy[rows] = project(
-            moved.cameras[0], moved.position[i], moved.rotation[i], moved.points[seen.point[rows]]
-        )
-    xy += 0.1 * rng.standard_normal(xy.shape)
-    network = replace(network, image_points=replace(seen, xy=xy))
+    network = observed_anew(network, moved, 0.1, rng)
     length = float(np.linalg.norm(moved.points[3] - moved.points[43])) * bar
     network = network.with_scale_bar("4", "44", length + 1e-4 * rng.standard_normal(), 1e-4)
     kind = Datum(datum, points=[["1", "2", "3"], ["7", "15", "33"]][seed % 2] if datum == "minimal" else None)
@@ -56,14 +45,7 @@ def epoch(seed: int, datum: str, shift: FloatArray | None = None, *, bar: float 
         given = moved.points[[int(name) - 1 for name in CONTROL]] + 0.001 * rng.standard_normal((6, 3))
         network = network.with_control(CONTROL, given, 0.001)
     a = adjust(network, moved, datum=kind, sigma_px=0.1, reject="none")
-    covariance = marginal_of(a).joint(np.zeros(0, dtype=np.int64), np.arange(60))
-    return StoredResult(
-        *(f"{datum} {seed}", network, a.estimate, a.covariance.points, None),
-        (_interior_sigma(a),),
-        *(a.redundancy, "m"),
-        covariance=covariance,
-        datum=a.datum,
-    )
+    return stored_of(f"{datum} {seed}", a)
 
 
 def sampled(result: StoredResult, points: np.ndarray) -> StoredResult:
@@ -71,13 +53,6 @@ def sampled(result: StoredResult, points: np.ndarray) -> StoredResult:
     assert result.covariance is not None
     rows = (3 * points[:, None] + np.arange(3)).ravel()
     return replace(result, covariance=result.covariance[np.ix_(rows, rows)], covariance_points=points)
-
-
-def _interior_sigma(a: Adjustment) -> FloatArray:
-    camera = a.estimate.cameras[0]
-    sigma = np.full(len(camera.names), np.nan)
-    sigma[camera.free] = np.sqrt(np.diagonal(a.covariance.interior[0]))
-    return sigma
 
 
 def compared(first: str, second: str, shift: FloatArray | None = None) -> ResultComparison:
@@ -202,9 +177,9 @@ def test_the_motion_of_the_whole_is_no_change() -> None:
     G = motions(xyz)
     whole = (G @ rng.standard_normal(7)).reshape(12, 3)
     found = congruency(whole, Q, xyz, motion="similarity")
-    assert found.global_statistic < 1e-20 and np.abs(found.difference).max() < 1e-12
+    assert found.first_test.statistic < 1e-20 and np.abs(found.difference).max() < 1e-12
     grown = G[:, 6].reshape(12, 3)
-    assert congruency(100 * grown, Q, xyz, motion="rigid").global_statistic > 1
+    assert congruency(100 * grown, Q, xyz, motion="rigid").first_test.statistic > 1
 
 
 def test_the_drop_of_omega_is_that_of_leaving_the_point_out() -> None:
@@ -217,12 +192,12 @@ def test_the_drop_of_omega_is_that_of_leaving_the_point_out() -> None:
         rest = np.delete(np.arange(10), k)
         rows = (3 * rest[:, None] + np.arange(3)).ravel()
         part = congruency(d[rest], Q[np.ix_(rows, rows)], xyz[rest], alpha=1e-12)
-        drop = whole.global_statistic * 24 - part.global_statistic * 21
+        drop = whole.first_test.statistic * 24 - part.first_test.statistic * 21
         assert whole.statistic[k] * 3 == pytest.approx(drop, rel=1e-6)
 
 
 def test_too_few_points_are_refused() -> None:
-    with pytest.raises(GeometryError, match="congruency: 3 points, expected 4 or more"):
+    with pytest.raises(GeometryError, match="congruency: 3 points of reference, expected 4 or more"):
         congruency(np.zeros((3, 3)), np.eye(9), np.eye(3))
 
 

@@ -7,15 +7,13 @@ from functools import cache
 
 import numpy as np
 
-from sfm.adjustment.covariance import marginal_of
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.solve import adjust
-from sfm.camera import project
 from sfm.conventions import FloatArray
-from sfm.epochs.differences import Epoch
+from sfm.distortion.models import Role
+from sfm.epochs.epoch import Epoch
 from sfm.network import Estimate, Network
-from sfm.stored_result import StoredResult
-from tests.synthetic import make_network, seed_of
+from tests.synthetic import make_network, observed_anew, seed_of, stored_of
 
 IMAGES, POINTS, NOISE_PX = 14, 60, 0.1
 BARS = (("1", "31"), ("12", "50"))
@@ -34,6 +32,7 @@ def epoch(
     bar_errors: FloatArray | None = None,
     given: float = 0.0,
     datum: str = "free",
+    longer: float = 0.0,
 ) -> Epoch:
     """Return one epoch.
 
@@ -43,27 +42,20 @@ def epoch(
         bar_errors: of the lengths as stated, object unit, (2,); of its own if None.
         given: added to the stated lengths, object unit, so that they are others.
         datum: of the adjustment.
+        longer: added to the focal lengths of its camera, px.
     """
     network, truth = scene()
     rng = np.random.default_rng(seed)
     now = truth if shift is None else replace(truth, points=truth.points + shift)
-    seen = network.image_points
-    xy = np.array(seen.xy)
-    for i in range(len(network.images)):
-        rows = seen.image == i
-        xy[rows] = project(now.cameras[0], now.position[i], now.rotation[i], now.points[seen.point[rows]])
-    xy += NOISE_PX * rng.standard_normal(xy.shape)
-    network = replace(network, image_points=replace(seen, xy=xy))
+    lens = now.cameras[0]
+    lens = lens.with_parameters(lens.parameters + longer * lens.plays(Role.FOCAL))
+    now = replace(now, cameras=(lens,))
+    network = observed_anew(network, now, NOISE_PX, rng)
     errors = BAR_SIGMA * rng.standard_normal(2) if bar_errors is None else bar_errors
     for (a, b), error in zip(BARS, errors.tolist(), strict=True):
         length = float(np.linalg.norm(now.points[int(a) - 1] - now.points[int(b) - 1]))
         network = network.with_scale_bar(a, b, length + error + given, BAR_SIGMA)
     kind = Datum(datum, points=["1", "2", "3"] if datum == "minimal" else None)
     a = adjust(network, now, datum=kind, sigma_px=NOISE_PX, reject="none")
-    covariance = marginal_of(a).joint(np.zeros(0, dtype=np.int64), np.arange(POINTS))
-    result = StoredResult(
-        *(f"epoch {seed}", network, a.estimate, a.covariance.points, None, None, a.redundancy, "m"),
-        covariance=covariance,
-        datum=a.datum,
-    )
-    return Epoch(f"epoch {seed}", result, network.scale_bars)
+    name = f"epoch {seed}"
+    return Epoch(name, stored_of(name, a), network.scale_bars, sigma0=a.sigma0, sigma0_px=a.sigma0_px)

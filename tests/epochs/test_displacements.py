@@ -37,7 +37,7 @@ def shift_of(points: tuple[int, ...], sigmas: float, seed: int) -> FloatArray:
 def false_alarms(runs: int) -> tuple[int, int]:
     """Return how often the global test and all tests together say that something moved where nothing did."""
     found = [compared(seed) for seed in range(1000, 1000 + runs)]
-    whole = sum(one.search.steps[0].statistic > one.search.steps[0].critical for one in found)
+    whole = sum(one.congruency.first_test.statistic > one.congruency.first_test.critical for one in found)
     return whole, sum(one.changed for one in found)
 
 
@@ -76,7 +76,7 @@ def test_a_point_of_reference_that_moved_is_found_and_the_datum_does_without_it(
     reference = np.arange(POINTS) < 20
     found = compared(9, shift, reference=reference)
     assert found.moved.tolist() == [j == 10 for j in range(POINTS)] and not found.stable[10]
-    step = found.search.steps[0]
+    step = found.congruency.first_test
     assert step.removed == 10 and step.statistic > step.critical
     T = (found.displacement[10] - shift[10]) @ np.linalg.solve(
         point_blocks(found.covariance, 3)[10], found.displacement[10] - shift[10]
@@ -176,7 +176,7 @@ def test_a_bar_that_both_share_makes_no_difference_whatever_sigma0_is() -> None:
         scaled = [
             replace(
                 one,
-                sigma0=sigma0,
+                sigma0=sigma0 * one.sigma0,
                 result=replace(one.result, covariance=sigma0**2 * np.asarray(one.result.covariance)),
             )
             for one in (first, second)
@@ -214,7 +214,7 @@ def test_points_of_reference_are_found_with_the_stated_power() -> None:
     """With few of them a point that moved pulls the datum along, so that more is needed to find it."""
     reference = np.isin(np.arange(POINTS), (5, 14, 22, 33, 41, 52))
     first = compared(8, reference=reference)
-    weights = first.search.weights[5]
+    weights = first.congruency.weights[5]
     shift = np.zeros((POINTS, 3))
     values, vectors = np.linalg.eigh(weights)
     shift[5] = first.detectable[5] * vectors[:, 0]

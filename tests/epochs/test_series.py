@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from sfm.conventions import FloatArray
-from sfm.epochs.differences import Epoch
+from sfm.epochs.epoch import Epoch
 from sfm.epochs.series import EpochSeries, analyse_epochs
 from sfm.errors import GeometryError
 from sfm.report.epochs import FILES, pairs_of, words_of_pair, words_of_stable, write_epochs
@@ -82,4 +82,4 @@ def test_refusals_are_one_line() -> None:
     with pytest.raises(GeometryError, match=r"epoch 71: the covariance of all points together"):
         analyse_epochs([first, bare])
     with pytest.raises(GeometryError, match="share the weighted c of camera lens"):
-        analyse_epochs([replace(one, interior=(("lens", "c", 24.0),)) for one in (first, second)])
+        analyse_epochs([replace(one, interior=(("lens", "c", 24.0, 0.01),)) for one in (first, second)])

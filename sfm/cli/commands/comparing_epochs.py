@@ -13,7 +13,7 @@ from sfm.errors import SurveyFileError
 from sfm.runtime.faults import working_on
 
 if TYPE_CHECKING:
-    from sfm.epochs.differences import Epoch
+    from sfm.epochs.epoch import Epoch
 
 
 def epochs(
@@ -50,6 +50,14 @@ def epochs(
             "--alpha", min=1e-6, max=0.5, help="Probability of saying that something moved where nothing did."
         ),
     ] = 0.05,
+    together: Annotated[
+        bool,
+        typer.Option(
+            "--together",
+            help="Adjust all epochs as one, with one interior orientation of each camera that took several "
+            "of them; one that changed is refused.",
+        ),
+    ] = False,
     out: Annotated[
         Path, typer.Option("--out", metavar="DIR", help="Folder of tables, JSON and page.")
     ] = Path("out/epochs"),
@@ -61,7 +69,14 @@ def epochs(
     with loading():
         from sfm.epochs.series import analyse_epochs
         from sfm.files.manifest import refuse_foreign_folder
-        from sfm.report.epochs import pairs_of, words_of_block, words_of_pair, words_of_stable, write_epochs
+        from sfm.report.epochs import (
+            pairs_of,
+            words_of_block,
+            words_of_camera,
+            words_of_pair,
+            words_of_stable,
+            write_epochs,
+        )
 
     refuse_foreign_folder(out)
     if len(results) < 2:
@@ -75,8 +90,17 @@ def epochs(
     if len({epoch.name for epoch in given}) < len(given):  # folders of one name in different places
         given = [replace(epoch, name=str(path)) for epoch, path in zip(given, results, strict=True)]
     with working_on(" ".join(map(str, results))):
-        found = analyse_epochs(given, reference=_listed(reference), groups=groups, model=model, alpha=alpha)
+        found = analyse_epochs(
+            given,
+            reference=_listed(reference),
+            groups=groups,
+            model=model,
+            alpha=alpha,
+            together=together,
+        )
     page = write_epochs(found, out)
+    for camera in found.cameras:
+        print(words_of_camera(camera))
     for pair in pairs_of(found):
         print(words_of_pair(pair.displacements)[0])
         print(f"  {words_of_stable(pair.displacements)}")
@@ -90,14 +114,14 @@ def _epoch(path: Path) -> Epoch:
     from adapters.formats.given_table import read_given
     from adapters.formats.result_tables import read_result
     from sfm.cli.commands.surveying import run_file
-    from sfm.epochs.differences import Epoch
+    from sfm.epochs.epoch import Epoch
 
     folder = run_file(path) if path.is_file() else path
     with working_on(str(folder)):
         result = read_result(folder)
         given = read_given(folder, result.network)
     name = folder.resolve().name
-    return Epoch(name, result, given.bars, given.control, given.interior, given.sigma0)
+    return Epoch(name, result, given.bars, given.control, given.interior, given.sigma0, given.sigma0_px)
 
 
 def _named(text: str) -> tuple[str, str]:

@@ -13,7 +13,7 @@ from pydantic import ValidationError
 from sfm.adjustment.datum import Datum
 from sfm.errors import SurveyFileError
 from sfm.files.plain_text import as_plain
-from sfm.survey.inputs.calibration import calibrated, read_calibrations
+from sfm.survey.inputs.calibration import Calibration, calibrated, read_calibrations
 from sfm.survey.inputs.checks.contradictions import refuse_contradictions
 from sfm.survey.inputs.checks.settings_errors import first_error
 from sfm.survey.inputs.exterior_table import ObservedExterior, read_observed_exterior
@@ -222,7 +222,7 @@ def survey_of_file(file: SurveyFile) -> Survey:
     return Survey(
         name=file.name,
         unit=file.unit,
-        cameras=tuple(_with_calibration(one, file) for one in file.cameras),
+        cameras=tuple(_calibrated_as_named(one, file) for one in file.cameras),
         targets=file.targets,
         tie_points=file.tie_points,
         datum=file.datum,
@@ -242,7 +242,27 @@ def survey_of_file(file: SurveyFile) -> Survey:
     )
 
 
-def _with_calibration(camera: CameraSettings, file: SurveyFile) -> CameraSettings:
+def with_calibration(
+    survey: Survey, calibrations: tuple[Calibration, ...], source: str, *, weighted: bool = False
+) -> Survey:
+    """Return the survey with each camera held at a calibration, or with it as an observation.
+
+    Args:
+        survey: a camera takes the calibration of its name, or the only one, see `calibrated`.
+        calibrations: of an earlier result.
+        source: what messages call that result.
+        weighted: adjusted, with the calibration and its covariance as an observation; else held.
+
+    Raises:
+        SurveyFileError: as `calibrated` does.
+    """
+    cameras = (
+        calibrated(one, calibrations, survey.source, source, weighted=weighted) for one in survey.cameras
+    )
+    return replace(survey, cameras=tuple(cameras))
+
+
+def _calibrated_as_named(camera: CameraSettings, file: SurveyFile) -> CameraSettings:
     """Return the settings of a camera with the calibration that they name, if they name one."""
     if camera.calibration is None:
         return camera

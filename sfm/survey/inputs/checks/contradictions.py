@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Protocol
 
 from sfm.distortion.balanced import BALANCED, from_balanced
+from sfm.distortion.balanced import MODEL as BALANCED_MODEL
 from sfm.distortion.models import MODELS
 from sfm.errors import GeometryError, SurveyFileError
 from sfm.survey.inputs.given import KnownPoints, ScaleBar
@@ -191,8 +192,8 @@ def _refuse_contradicting_sizes(targets: TargetSettings, where: str, unit: str) 
 def _refuse_contradictions_of_balanced(camera: CameraSettings, at: str) -> None:
     """Raise SurveyFileError where a camera in AICON's form is incomplete or stands beside other values."""
     given = dict(camera.balanced)
-    if camera.model != "brown_forward":
-        raise SurveyFileError(f"{at}: balanced is given, model {camera.model}, expected brown_forward")
+    if camera.model != BALANCED_MODEL:
+        raise SurveyFileError(f"{at}: balanced is given, model {camera.model}, expected {BALANCED_MODEL}")
     for parameter in given:
         if parameter not in BALANCED:
             raise SurveyFileError(

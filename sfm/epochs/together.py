@@ -1,0 +1,329 @@
+"""All epochs adjusted together, where one camera took their photographs.
+
+Every epoch is adjusted from its image points by itself; the conditions that its interior orientation c is the
+same in all of them, B x = 0, then make one adjustment of it. With the covariance Q of all epochs,
+
+    M = B Q B',  x' = x - Q B' M^-1 B x,  Q' = Q - Q B' M^-1 B Q,
+
+to the first order in the corrections, which are of the size of standard deviations. What epochs were given
+alike (bars, control, a calibration) is one observation and correlates them before. T = (B x)' M^-1 B x over
+the number of conditions tells whether the camera is the same at all.
+
+Source: Koch (1999), Parameter Estimation and Hypothesis Testing in Linear Models, secs. 3.2.7 (constraints)
+and 4.2 (their test); Niemeier (2008), Ausgleichungsrechnung, sec. 12.2.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.linalg import cho_factor, cho_solve, solve_triangular
+
+from sfm.adjustment.covariance import marginal_of
+from sfm.adjustment.result import Adjustment
+from sfm.adjustment.solve import adjust
+from sfm.comparison.stable_points import critical_value
+from sfm.conventions import FloatArray, IntArray
+from sfm.epochs.epoch import SAME, Common, Epoch, given_observations
+from sfm.errors import GeometryError
+from sfm.network import InteriorObservations, Network
+
+ALPHA = 0.01  # level of the test whether a camera is the same
+SAME_SIGMA = 0.05  # of a standard deviation, by which an adjustment from stored tables may differ, and of it
+
+
+@dataclass(frozen=True)
+class SharedCamera:
+    """A camera whose interior orientation was made one."""
+
+    name: str
+    epochs: tuple[str, ...]
+    parameters: tuple[str, ...]
+    statistic: float  # T
+    critical: float
+
+    @property
+    def same(self) -> bool:
+        """Whether the epochs agree on it."""
+        return self.statistic <= self.critical
+
+
+@dataclass(frozen=True)
+class _Alone:
+    """An epoch adjusted by itself."""
+
+    epoch: Epoch
+    points: IntArray  # of the covariance, (k,)
+    values: FloatArray  # of the parameters of shared cameras, (p,)
+    names: tuple[tuple[str, str], ...]  # camera and parameter of each
+    covariance: FloatArray  # of these, then of X Y Z of the points, (p + 3 k, p + 3 k)
+    given: dict[str, tuple[FloatArray, float]]  # Q g / s of each given value, (p + 3 k,), and the value
+
+
+def adjust_together(epochs: Sequence[Epoch]) -> tuple[tuple[Epoch, ...], tuple[SharedCamera, ...]]:
+    """Adjust epochs as one, with one interior orientation of each camera that took photographs of several.
+
+    Args:
+        epochs: two or more, with their image points and what they were given.
+
+    Returns:
+        The epochs with their common coordinates, covariances and what correlates them; and the cameras.
+
+    Raises:
+        GeometryError: no camera of one name in two epochs, one that is not described alike, one that changed
+            between them, or a result that its tables do not lead to again.
+
+    Source: Koch (1999), secs. 3.2.7 and 4.2.
+    """
+    shared = _shared_cameras(epochs)
+    alone = [_adjusted_alone(epoch, shared) for epoch in epochs]
+    keys = _shared_keys(alone)
+    conditions, owner = _conditions(alone, shared)
+    given = [_given_columns(one, keys) for one in alone]
+    q = len(owner)
+    sizes = [len(one.values) for one in alone]
+    M, w = np.zeros((q, q)), np.zeros(q)
+    left = []
+    for one, B, A, p in zip(alone, conditions, given, sizes, strict=True):
+        others = sum(
+            (A_j[:p_j].T @ B_j.T for B_j, A_j, p_j in zip(conditions, given, sizes, strict=True)),
+            start=np.zeros((len(keys), q)),
+        )
+        U = one.covariance[:, :p] @ B.T + A @ (others - A[:p].T @ B.T)
+        left.append(U)
+        M += B @ U[:p]
+        w += B @ one.values
+    scale = 1 / np.sqrt(np.diagonal(M))
+    M, w = M * np.outer(scale, scale), w * scale
+    factor = cho_factor(M, lower=True)
+    cameras = tuple(
+        _tested(name, [epochs[k].name for k in numbers], alone, owner, M, w)
+        for name, numbers in shared.items()
+    )
+    for camera in cameras:
+        if not camera.same:
+            raise GeometryError(_words_of_change(camera, alone))
+    out = []
+    correction = cho_solve(factor, w)
+    for one, U, A, p in zip(alone, left, given, sizes, strict=True):
+        U = U[p:] * scale
+        V = solve_triangular(factor[0], U.T, lower=True).T
+        result = one.epoch.result
+        points = np.array(result.estimate.points)
+        points[one.points] -= (U @ correction).reshape(-1, 3)
+        Q = one.covariance[p:, p:] - V @ V.T
+        every = len(one.points) == len(points)
+        result = replace(
+            result,
+            estimate=replace(result.estimate, points=points),
+            covariance=Q,
+            covariance_points=None if every else one.points,
+        )
+        signs = np.concatenate([np.ones(len(keys)), -np.ones(q)])
+        out.append(replace(one.epoch, result=result, common=Common(keys, np.hstack([A[p:], V]), signs)))
+    return tuple(out), cameras
+
+
+def _shared_cameras(epochs: Sequence[Epoch]) -> dict[str, list[int]]:
+    """Return the cameras of several epochs by name, and the numbers of these epochs."""
+    found: dict[str, list[int]] = {}
+    for k, epoch in enumerate(epochs):
+        for camera in epoch.result.estimate.cameras:
+            found.setdefault(camera.name, []).append(k)
+    shared = {name: numbers for name, numbers in found.items() if len(numbers) > 1}
+    if not shared:
+        raise GeometryError(
+            f"epochs together: no camera is in two of them ({', '.join(found)}); a camera that took several "
+            "epochs bears one name in their survey files"
+        )
+    kept = {}
+    for name, numbers in shared.items():
+        cameras = [
+            next(one for one in epochs[k].result.estimate.cameras if one.name == name) for k in numbers
+        ]
+        first = cameras[0]
+        for k, other in zip(numbers[1:], cameras[1:], strict=True):
+            alike = other.model == first.model and other.size_px == first.size_px
+            if not alike or (other.free != first.free).any():
+                raise GeometryError(
+                    f"epochs together: camera {name} has another model, size or other free parameters in "
+                    f"{epochs[k].name} than in {epochs[numbers[0]].name}"
+                )
+        if first.free.any():
+            kept[name] = numbers
+    if not kept:
+        raise GeometryError(
+            "epochs together: every shared camera is held, the epochs have nothing to adjust together"
+        )
+    return kept
+
+
+def _adjusted_alone(epoch: Epoch, shared: dict[str, list[int]]) -> _Alone:
+    """Adjust an epoch from its image points as its survey did, and say so where that leads elsewhere."""
+    result = epoch.result
+    network = _network_of(epoch)
+    control = result.datum == "control"
+    a = adjust(
+        network, result.estimate, datum="control" if control else "free", reject="none", covariance=True
+    )
+    m = marginal_of(a)
+    names = m.names()
+    place = {one: k for k, one in enumerate(names)}
+    wanted = [
+        (camera.name, parameter)
+        for camera in result.estimate.cameras
+        if camera.name in shared
+        for parameter, free in zip(camera.names, camera.free, strict=True)
+        if free
+    ]
+    unknowns = np.array([place[parameter, f"camera {camera}"] for camera, parameter in wanted], np.int64)
+    points = result.covariance_points
+    points = np.arange(len(network.points)) if points is None else points
+    joint = m.joint(unknowns, points)
+    _refuse_another(epoch, a, joint[len(wanted) :, len(wanted) :], points)
+    values = {
+        (camera.name, parameter): value
+        for camera in a.estimate.cameras
+        for parameter, value in zip(camera.names, camera.parameters.tolist(), strict=True)
+    }
+    own = replace(
+        epoch,
+        result=replace(result, estimate=a.estimate, covariance_points=points),
+        sigma0=a.sigma0,
+    )
+    given = {}
+    for key, (gradient, sigma, value) in given_observations(own):
+        column = sum((joint[:, len(wanted) + k] * g for k, g in gradient), start=np.zeros(len(joint)))
+        given[key] = (column / (sigma * a.sigma0), value)
+    for camera, parameter, value, sigma in epoch.interior:
+        if (camera, parameter) in wanted:
+            column = joint[:, wanted.index((camera, parameter))]
+            given[f"{parameter} of camera {camera}"] = (column / (sigma * a.sigma0), value)
+    found = np.array([values[one] for one in wanted])
+    return _Alone(own, points, found, tuple(wanted), joint, given)
+
+
+def _network_of(epoch: Epoch) -> Network:
+    """Return the network with what the survey was given, and with the weights that it used."""
+    result = epoch.result
+    seen = result.network.image_points
+    if epoch.sigma0_px is None:
+        raise GeometryError(f"{epoch.name}: its summary.json says no sigma0_px, which its weights come from")
+    median = float(np.sqrt(np.median(np.trace(seen.covariance, axis1=1, axis2=2)) / 2))
+    factor = epoch.sigma0_px / (epoch.sigma0 * median)
+    index = {camera.name: k for k, camera in enumerate(result.estimate.cameras)}
+    rows = [
+        (index[camera], result.estimate.cameras[index[camera]].names.index(parameter), value, sigma)
+        for camera, parameter, value, sigma in epoch.interior
+        if camera in index and parameter in result.estimate.cameras[index[camera]].names
+    ]
+    table = np.array(rows, dtype=float).reshape(-1, 4)
+    return replace(
+        result.network,
+        image_points=replace(seen, covariance=seen.covariance * factor**2, stated=None),
+        scale_bars=epoch.bars,
+        control=epoch.control,
+        interior=InteriorObservations(
+            table[:, 0].astype(np.int64), table[:, 1].astype(np.int64), table[:, 2], table[:, 3]
+        ),
+    )
+
+
+def _refuse_another(epoch: Epoch, a: Adjustment, Q: FloatArray, points: IntArray) -> None:
+    """Refuse an adjustment that is not the one of the result: other weights, or values nobody has kept."""
+    stored = epoch.result
+    sigma = np.sqrt(np.diagonal(Q).reshape(-1, 3).sum(axis=1))
+    moved = np.linalg.norm(a.estimate.points[points] - stored.estimate.points[points], axis=1)
+    off = float(np.median(moved / sigma))
+    if a.datum == stored.datum and stored.covariance is not None:
+        before = np.sqrt(np.diagonal(stored.covariance).reshape(-1, 3).sum(axis=1))
+        off = max(off, float(np.abs(np.median(sigma / before) - 1)))
+    if not (a.converged and off < SAME_SIGMA):
+        raise GeometryError(
+            f"{epoch.name}: adjusting its image points again leads {off:.2g} standard deviations away from "
+            "its result: it was given what its tables do not keep (weights by robust estimation or of single "
+            "photographs, correlated calibrations, exterior orientation), and cannot be adjusted together"
+        )
+
+
+def _shared_keys(alone: Sequence[_Alone]) -> tuple[str, ...]:
+    """Return what two epochs or more were given alike."""
+    keys: dict[str, None] = {}
+    for k, one in enumerate(alone):
+        for key, (_, value) in one.given.items():
+            for other in alone[:k]:
+                if key in other.given and _same(other.given[key][1], value):
+                    keys[f"{key} = {value:.12g}"] = None
+    return tuple(keys)
+
+
+def _given_columns(one: _Alone, keys: tuple[str, ...]) -> FloatArray:
+    """Return the columns of what is shared, zero where this epoch was not given it, (p + 3 k, g)."""
+    columns = {f"{key} = {value:.12g}": column for key, (column, value) in one.given.items()}
+    nothing = np.zeros(len(one.covariance))
+    found = [columns.get(key, nothing) for key in keys]
+    return np.stack(found, axis=1) if found else np.zeros((len(nothing), 0))
+
+
+def _conditions(
+    alone: Sequence[_Alone], shared: dict[str, list[int]]
+) -> tuple[list[FloatArray], list[tuple[str, int, str]]]:
+    """Return B of each epoch, (q, p), and camera, later epoch and parameter of each condition."""
+    rows: list[tuple[str, int, str]] = [
+        (name, later, parameter)
+        for name, (first, *others) in shared.items()
+        for later in others
+        for camera, parameter in alone[first].names
+        if camera == name
+    ]
+    B = [np.zeros((len(rows), len(one.names))) for one in alone]
+    for r, (name, later, parameter) in enumerate(rows):
+        for k, sign in ((shared[name][0], -1.0), (later, 1.0)):
+            B[k][r, alone[k].names.index((name, parameter))] = sign
+    return B, rows
+
+
+def _tested(
+    name: str,
+    epochs: list[str],
+    alone: Sequence[_Alone],
+    owner: list[tuple[str, int, str]],
+    M: FloatArray,
+    w: FloatArray,
+) -> SharedCamera:
+    rows = np.array([r for r, (camera, _, _) in enumerate(owner) if camera == name])
+    statistic = float(w[rows] @ np.linalg.solve(M[np.ix_(rows, rows)], w[rows])) / len(rows)
+    known = [one.epoch.result.redundancy for one in alone]
+    redundancy = None if None in known else sum(r for r in known if r is not None)
+    parameters = tuple(dict.fromkeys(owner[r][2] for r in rows))
+    return SharedCamera(
+        name, tuple(epochs), parameters, statistic, critical_value(ALPHA, len(rows), redundancy)
+    )
+
+
+def _words_of_change(camera: SharedCamera, alone: Sequence[_Alone]) -> str:
+    """Say of a camera that changed which parameter did so most."""
+    first, worst, which, where = None, 0.0, "", ""
+    for one in alone:
+        if one.epoch.name not in camera.epochs:
+            continue
+        if first is None:
+            first = one
+            continue
+        for parameter in camera.parameters:
+            i, j = (part.names.index((camera.name, parameter)) for part in (first, one))
+            sigma = np.sqrt(first.covariance[i, i] + one.covariance[j, j])
+            off = abs(float(one.values[j] - first.values[i])) / float(sigma)
+            if off > worst:
+                worst, which, where = off, parameter, f"{first.epoch.name} and {one.epoch.name}"
+    return (
+        f"epochs together: camera {camera.name} is not the same: T {camera.statistic:.3g}, limit "
+        f"{camera.critical:.3g}; {which} of {where} differs by {worst:.1f} standard deviations. Analyse the "
+        "epochs without --together, each with an interior orientation of its own"
+    )
+
+
+def _same(a: float, b: float) -> bool:
+    return abs(a - b) <= SAME * max(abs(a), 1.0)
