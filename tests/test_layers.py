@@ -21,6 +21,7 @@ LAYERS = (
             "sfm.network",
             "sfm.reduced_network",
             "sfm.network_check",
+            "sfm.depth_reversal",
             "sfm.similarity",
         ),
         *("sfm.runtime", "sfm.files", "sfm.kernels", "sfm.photographs"),

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from sfm.conventions import FloatArray, IntArray
+from sfm.display import listed
 from sfm.errors import GeometryError, SurveyFileError
 from sfm.files.csv_tables import read_table
 from sfm.geometry.alignment import Alignment, Nominal, align_321, align_features, align_points
@@ -46,7 +47,6 @@ from sfm.stored_result import StoredResult
 
 SIGMAS = ("sX", "sY", "sZ")
 WITH_AXIS = ("line", "cylinder", "cone", "torus", "paraboloid")
-MAX_NAMED = 5  # in a remark
 SEEN_FROM = 0.8  # of the rays of targets that come from their own side of a surface, at least
 MeshReader = Callable[[Path], tuple[FloatArray, IntArray]]
 
@@ -375,12 +375,8 @@ class _Work:
                 )
             if not fit.used.all():
                 left = [self.points.names[j] for j in fit.points[~fit.used]]
-                more = f" and {len(left) - MAX_NAMED} more" if len(left) > MAX_NAMED else ""
-                found.append(f"{what}: left out {', '.join(left[:MAX_NAMED])}{more}")
-        for one in tolerances:
-            if one.missing:
-                more = f" and {len(one.missing) - MAX_NAMED} more" if len(one.missing) > MAX_NAMED else ""
-                found.append(f"{one.name}: not measured: {', '.join(one.missing[:MAX_NAMED])}{more}")
+                found.append(f"{what}: left out {listed(left)}")
+        found += [f"{one.name}: not measured: {listed(one.missing)}" for one in tolerances if one.missing]
         return found
 
 

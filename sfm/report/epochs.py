@@ -9,9 +9,11 @@ from typing import Any
 
 import numpy as np
 
+from sfm.adjustment.quality.statistics import POWER
 from sfm.conventions import FloatArray
+from sfm.display import listed
 from sfm.epochs.blocks import BlockMotion
-from sfm.epochs.displacements import POWER, Displacements
+from sfm.epochs.displacements import Displacements
 from sfm.epochs.series import EpochPair, EpochSeries
 from sfm.epochs.together import SharedCamera
 from sfm.files.plain_text import csv_text, or_none
@@ -24,6 +26,7 @@ from sfm.report.viewer.displaced_scene import scene_of_displacements
 from sfm.report.viewer.embedded import Viewer, viewer_of
 from sfm.report.viewer.pictures import cut_pictures
 
+NAMED = 12  # points in a sentence
 FILES = ("displacements.csv", "series.csv", "epochs.json", "epochs.html")
 COLUMNS = (
     *("first", "second", "id", "dX", "dY", "dZ", "sdX", "sdY", "sdZ", "length", "T", "critical", "stable"),
@@ -31,7 +34,6 @@ COLUMNS = (
 )
 SERIES = ("id", "epoch", "dX", "dY", "dZ", "sdX", "sdY", "sdZ", "moved")
 DRAWN = 12  # points of a series that are drawn, those that moved farthest
-NAMED = 12  # points that a sentence names
 MOSTLY = 0.5  # of Omega: what a bending takes away of it is told from here on
 PICTURE = (
     "Displacements: arrows in the object's main plane, points that moved in red; the colour of the dots is "
@@ -314,6 +316,4 @@ def _same(found: Displacements) -> bool:
 
 
 def _names(names: Iterable[str]) -> str:
-    all_of_them = list(names)
-    said = ", ".join(all_of_them[:NAMED])
-    return said if len(all_of_them) <= NAMED else f"{said} and {len(all_of_them) - NAMED} more"
+    return listed(names, most=NAMED)

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from sfm.adjustment.datum import Datum
-from sfm.adjustment.quality.other_solutions import reflected, scaled
+from sfm.adjustment.quality.other_solutions import scaled
 from sfm.adjustment.solve import adjust
 from sfm.camera import camera_from_values
+from sfm.depth_reversal import reverse_depth
 from sfm.network import Estimate
 from sfm.pipeline import run_survey
 from sfm.report.findings.findings import findings_of
@@ -41,7 +42,7 @@ def test_a_long_lens_converges(free: tuple[str, ...]) -> None:
     # from the other depth and another c: back at the c of the start, and of the right depth
     datum = Datum("free")
     start = replace(a.estimate, cameras=truth.cameras)
-    found = nearer_start(a.network, start, reflected(scaled(start, 1.3)), datum)
+    found = nearer_start(a.network, start, reverse_depth(scaled(start, 1.3)), datum)
     assert found is not None and found.cameras == truth.cameras
     again = adjust(a.network, found, datum=datum, reject="none", method="gauss-newton")
     assert again.sigma0_px == pytest.approx(a.sigma0_px, rel=1e-6)

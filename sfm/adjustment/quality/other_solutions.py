@@ -24,6 +24,7 @@ from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.camera import Camera
 from sfm.conventions import BoolArray, FloatArray
+from sfm.depth_reversal import reverse_depth
 from sfm.distributions import f_isf
 from sfm.errors import GeometryError
 from sfm.network import Estimate, Network
@@ -162,7 +163,7 @@ class _Search:
         """Return solutions and places of about the same v'Pv along c, and minima beyond them."""
         free = [camera.free for camera in result.cameras]
         steps = STEPS if any(one[0] for one in free) else 0
-        starts = [result] if self.datum.kind == "control" else [result, reflected(result)]
+        starts = [result] if self.datum.kind == "control" else [result, reverse_depth(result)]
         for start in starts:
             for direction in (STEP, 1 / STEP) if steps else (1.0,):
                 track = self._along(start, direction, steps, vPv)
@@ -212,21 +213,6 @@ def scaled(estimate: Estimate, factor: float) -> Estimate:
         cameras.append(camera.with_parameters(p))
     centre = estimate.points.mean(axis=0)
     return replace(estimate, cameras=tuple(cameras), position=centre + factor * (estimate.position - centre))
-
-
-def reflected(estimate: Estimate) -> Estimate:
-    """Return the estimate reflected in depth: exact where all rays of a photograph are parallel."""
-    d = estimate.rotation[:, :, 2].mean(axis=0)
-    F = np.eye(3) - 2 * np.outer(d, d) / (d @ d)
-    centre = estimate.points.mean(axis=0)
-    R = F @ estimate.rotation * np.array([1.0, 1.0, -1.0])
-    from_centre = np.einsum("mji,mj->mi", estimate.rotation, estimate.position - centre)
-    return replace(
-        estimate,
-        position=centre + np.einsum("mij,mj->mi", R, from_centre),
-        rotation=R,
-        points=centre + (estimate.points - centre) @ F,
-    )
 
 
 def _principal_distance(cameras: tuple[Camera, ...]) -> tuple[str, float, str]:

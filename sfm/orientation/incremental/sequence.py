@@ -18,11 +18,19 @@ import numpy as np
 
 from sfm.camera import Camera
 from sfm.conventions import BoolArray, FloatArray
+from sfm.display import listed
 from sfm.errors import GeometryError
 from sfm.network import Estimate, Network, empty_estimate
 from sfm.orientation.incremental.given_values import start_from_given
 from sfm.orientation.incremental.growth import FIRST_ADJUSTMENT, Growth, Refine, has_given_values
 from sfm.orientation.incremental.remaining_points import intersect_remaining
+from sfm.orientation.incremental.rivals import (
+    SMALLER_TOLERANCES,
+    bounded_costs,
+    casts_doubt,
+    reversed_growth,
+    worst_photographs,
+)
 from sfm.orientation.incremental.starting_pair import Start
 from sfm.similarity import fit_similarity
 
@@ -31,7 +39,7 @@ Judge = Callable[[Estimate], float]
 MIN_POINTS = 4  # of a photograph: three are always fitted by P3P, the fourth checks it
 START_TOLERANCE = 0.03  # of the photograph's diagonal: what an unknown distortion leaves after resection
 FINAL_TOLERANCE_PX = 4.0  # below this no image point is put aside here; the adjustment tests further
-MAX_NAMES = 10  # of photographs for one reason, and reasons, in a message
+MIN_RIVALS = 3  # oriented photographs: of two, what is known besides decides, see `best_start`
 GROWTH = 1.25  # the network is adjusted when it has this many times the photographs of last time
 MAX_ROUNDS = 200
 FINAL_ROUNDS = 3  # of resection, intersection and adjustment of all, while image points come or go
@@ -99,12 +107,17 @@ def orient(
         ()
     """
 
-    def begin(values: Estimate) -> Growth:
+    def begin(values: Estimate, share: float = 1.0) -> Growth:
         diagonal = np.array([np.hypot(*camera.size_px) for camera in values.cameras])
-        return Growth(network, values, seed, start_tolerance * diagonal, max(min_points, MIN_POINTS))
+        tolerance_px = share * start_tolerance * diagonal
+        return Growth(network, values, seed, tolerance_px, max(min_points, MIN_POINTS))
 
     def grow(values: Estimate) -> Orientation:
-        return _grown(begin(values), refine, final_tolerance_px, judge, contradicting=contradicting)
+        growth = begin(values)
+        start = _grow(growth, refine, final_tolerance_px, judge)
+        if start.pair is not None and refine is not None:
+            growth, start = _best_of_rivals(growth, start, values, begin, refine, final_tolerance_px, judge)
+        return _finish(growth, start, values.cameras, contradicting=contradicting)
 
     if not has_given_values(network, estimate):
         return grow(estimate)
@@ -145,16 +158,59 @@ def _holds_control(network: Network, found: Orientation) -> bool:
     return bool(np.isin(control.point[measured], seen.point[found.fits]).all())
 
 
-def _grown(
+def _best_of_rivals(
     growth: Growth,
-    refine: Refine | None,
+    start: Start,
+    values: Estimate,
+    begin: Callable[[Estimate, float], Growth],
+    refine: Refine,
     final_tolerance_px: float,
     judge: Judge | None,
-    *,
-    contradicting: bool,
-) -> Orientation:
+) -> tuple[Growth, Start]:
+    """Return the solution with the smallest residuals, of that found first and, if in doubt, of its rivals.
+
+    In doubt is what its own reversal in depth hardly fits worse than, what leaves residuals beyond the final
+    tolerance, and what a photograph had to leave.
+
+    Args:
+        growth: with the first solution.
+        start: what it started from.
+        values: cameras to begin anew with.
+        begin: begins anew with a share of the start tolerance.
+        refine: the caller's adjustment.
+        final_tolerance_px: below this no image point is put aside, px.
+        judge: as in `orient`.
+    """
+    oriented = growth.estimate.oriented
+    if oriented.sum() < MIN_RIVALS:
+        return growth, start
+    image = growth.network.image_points.image
+    found, first = [(growth, start)], growth.residuals_px()
+    nobody = np.zeros(len(oriented), dtype=bool)
+    other_side = reversed_growth(growth, begin(values, 1.0), refine, nobody)
+    loose = bool((growth.tolerance_px > final_tolerance_px).any() or growth.dropped.any())
+    if not loose and not casts_doubt(first, other_side.residuals_px()):
+        return growth, start
+    rivals = [other_side]
+    worst = worst_photographs(first, image, len(oriented))
+    if worst.any() and (oriented & ~worst).sum() >= MIN_RIVALS:
+        rivals.append(reversed_growth(growth, begin(values, 1.0), refine, worst))
+    for rival in rivals:
+        _settled(rival, refine, final_tolerance_px)
+        if rival.drop_unsupported():
+            _settled(rival, refine, final_tolerance_px)
+        found.append((rival, start))
+    for share in SMALLER_TOLERANCES:
+        rival = begin(values, share)
+        try:
+            found.append((rival, _grow(rival, refine, final_tolerance_px, judge)))
+        except GeometryError:
+            continue
+    return found[int(np.argmin(bounded_costs([one.residuals_px() for one, _ in found], image)))]
+
+
+def _grow(growth: Growth, refine: Refine | None, final_tolerance_px: float, judge: Judge | None) -> Start:
     """Start, resect and intersect until nothing more comes, and let go what does not belong."""
-    cameras = growth.estimate.cameras
     start = growth.begin(judge)
     adjusted = 0
     for _ in range(MAX_ROUNDS):
@@ -172,7 +228,7 @@ def _grown(
     if growth.drop_unsupported():
         _settled(growth, refine, final_tolerance_px)
         growth.drop_unsupported()
-    return _finish(growth, start, cameras, contradicting=contradicting)
+    return start
 
 
 def _settled(growth: Growth, refine: Refine | None, final_tolerance_px: float) -> None:
@@ -234,9 +290,5 @@ def _words_of_failures(failures: tuple[tuple[str, str], ...]) -> str:
     of_reason: dict[str, list[str]] = {}
     for name, reason in failures:
         of_reason.setdefault(reason, []).append(name)
-    groups = [(names[:MAX_NAMES], len(names) - MAX_NAMES, reason) for reason, names in of_reason.items()]
-    words = [
-        f"{', '.join(names)}{f' and {more} more' if more > 0 else ''}: {reason}"
-        for names, more, reason in groups
-    ]
-    return "; ".join(words[:MAX_NAMES]) + (" ..." if len(words) > MAX_NAMES else "")
+    words = (f"{listed(names, most=10)}: {reason}" for reason, names in of_reason.items())
+    return listed(words, most=10, separator="; ")

@@ -14,6 +14,7 @@ import numpy as np
 from sfm.adjustment.quality.reliability import UNCONTROLLED
 from sfm.adjustment.result import Adjustment
 from sfm.conventions import FloatArray
+from sfm.distortion.balanced import MODEL as BALANCED_MODEL
 from sfm.distortion.balanced import UNITS, to_balanced
 from sfm.errors import GeometryError
 from sfm.files.plain_text import csv_text
@@ -54,7 +55,7 @@ def write_tables(findings: Findings, folder: Path) -> None:
         ),
         ("variance_components", "kind,group,observations,redundancy,sigma0", component_rows(statistics)),
     ):
-        if name == "cameras_balanced" and "brown_forward" not in findings.interior.models:
+        if name == "cameras_balanced" and BALANCED_MODEL not in findings.interior.models:
             continue
         if name == "targets" and not len(findings.result.seen_targets.image):
             continue
@@ -91,7 +92,7 @@ def balanced_rows(findings: Findings) -> Iterable[Sequence[object]]:
     """
     given = findings.result.balance_radius_mm
     for camera in findings.result.adjustment.estimate.cameras:
-        if camera.model != "brown_forward":
+        if camera.model != BALANCED_MODEL:
             continue
         half = float(np.hypot(*(np.array(camera.size_px) * camera.pixel_mm))) / 2
         of_survey = [R0 for name, R0 in given if camera.name == name or camera.name.startswith(f"{name} ")]

@@ -16,10 +16,11 @@ from dataclasses import replace
 import numpy as np
 
 from sfm.adjustment.datum import Datum
-from sfm.adjustment.quality.other_solutions import reflected, scaled
+from sfm.adjustment.quality.other_solutions import scaled
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.camera import Camera
+from sfm.depth_reversal import reverse_depth
 from sfm.errors import GeometryError
 from sfm.network import Estimate, Network
 
@@ -71,7 +72,7 @@ def _candidates(start: Estimate, ended: Estimate, datum: Datum) -> Iterator[Esti
     for one in (back, start):
         yield one
         if datum.kind != "control":
-            yield reflected(one)
+            yield reverse_depth(one)
 
 
 def _held(network: Network, start: Estimate, datum: Datum) -> Adjustment | None:
