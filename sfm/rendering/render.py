@@ -206,7 +206,7 @@ SQUARE = np.concatenate(
 def _windows(xy: FloatArray, shape: tuple[int, ...], n: int) -> IntArray:
     """Return first and last row and column of the cells around places (k, p, 2), (k, 4); in whole pixels."""
     whole = (0, shape[0], 0, shape[1])
-    in_front = np.isfinite(xy).all(axis=(1, 2))
+    in_front = np.asarray(np.isfinite(xy).all(axis=(1, 2)))
     seen = np.where(in_front[:, None, None], xy, 0.0)
     low = np.clip(np.floor(seen.min(axis=1) - 1).astype(np.int64) * n, 0, shape[::-1])
     high = np.clip(np.ceil(seen.max(axis=1) + 2).astype(np.int64) * n, 0, shape[::-1])
