@@ -13,8 +13,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sfm.adjustment.quality.statistics import POWER
 from sfm.conventions import BoolArray, FloatArray
-from sfm.epochs.displacements import POWER, detectable_shift
+from sfm.epochs.displacements import detectable_shift
 from sfm.errors import GeometryError
 from sfm.planning.planned_object import PlannedObject
 from sfm.planning.prediction import Prediction
