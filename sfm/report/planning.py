@@ -105,17 +105,17 @@ def headline(plan: Plan) -> str:
     lost = f", {n - known} of {n} points not determined" if known < n else ""
     worst = _length(plan, float(p.sigma[p.determined].max()))
     told = f"{m} photographs: sigma of points {_length(plan, p.rms_sigma)} RMS, {worst} at most{lost}"
+    if p.adjustment.undetermined:
+        told += ", and the network is NOT determined"
     few = int((p.rays < MIN_RAYS).sum())
     told += f", {few} with fewer than {MIN_RAYS} rays" if few else ""
     if not plan.wanted.anything:
         return told
     if plan.shortfall <= 1:
         return f"{told}; what is wanted is reached"
-    by = (
-        "points lack rays"
-        if not np.isfinite(plan.shortfall)
-        else f"{plan.shortfall:.2f} times what is wanted"
-    )
+    by = f"{plan.shortfall:.2f} times what is wanted"
+    if not np.isfinite(plan.shortfall):
+        by = "points lack rays, or the network is not determined"
     return f"{told}; what is wanted is NOT reached ({by})"
 
 
@@ -128,7 +128,8 @@ def remarks(plan: Plan) -> list[str]:
         said.append(f"Photographs that show too few points: {', '.join(plan.unusable[:NAMED])}.")
     c = plan.calibration
     if c is not None and not c.good:
-        reasons = "; ".join((*c.undetermined, *c.reasons)) or "too few image points over the photograph"
+        lacking = [*c.reasons, *([_first(c.undetermined)] if c.undetermined else [])]
+        reasons = "; ".join(lacking) or "too few image points over the photograph"
         said.append(
             f"The camera cannot be calibrated with this network: {reasons}. Calibrate it before, or hold it."
         )
@@ -187,7 +188,7 @@ def figures(plan: Plan) -> list[tuple[str, str]]:
         ("coded targets", f"{len(plan.coded)} give every photograph five, or all that it shows"),
     ]
     if a.undetermined:
-        rows.append(("not determined", "; ".join(a.undetermined)))
+        rows.append(("not determined", _first(a.undetermined)))
     return rows
 
 
@@ -202,7 +203,7 @@ def plan_page(plan: Plan) -> str:
         p=plan.prediction,
         title=plan.name,
         headline=headline(plan),
-        level="good" if plan.reached else "fair" if plan.prediction.determined.all() else "bad",
+        level=_level(plan),
         remarks=remarks(plan),
         figures=figures(plan),
         fine=fine,
@@ -317,6 +318,18 @@ def _points(plan: Plan) -> list[tuple[object, ...]]:
         )
         for j, name in enumerate(p.planned.names)
     ]
+
+
+def _level(plan: Plan) -> str:
+    if plan.prediction.adjustment.undetermined or not plan.prediction.determined.all():
+        return "bad"
+    return "good" if plan.reached else "fair"
+
+
+def _first(undetermined: tuple[str, ...]) -> str:
+    """Write the first of what is not determined, and how many more there are."""
+    more = len(undetermined) - 1
+    return undetermined[0] + (f"; and {more} more" if more else "")
 
 
 def _spread(values: FloatArray) -> str:
