@@ -19,6 +19,8 @@ from sfm.survey.inputs.survey import Survey
 from sfm.survey.target_network import UNNAMED
 from sfm.targets.flags import Flag
 
+NO_CIRCLE = Flag.CORNER | Flag.CROSSING
+
 NOT_A_CIRCLE = (
     0.1  # relative misfit of the semi-axes; targets have 0.003 to 0.03, letters and leaves over 0.2
 )
@@ -119,7 +121,7 @@ def _seen_twice(
     """Return which image points are of targets with an outline in two oriented photographs or more, (k,)."""
     seen = network.image_points
     rows = estimate.oriented[seen.image] & estimate.determined[seen.point]
-    rows &= _named(photographs, naming, [(found.flag & Flag.CORNER) == 0 for found in photographs.targets])
+    rows &= _named(photographs, naming, [(found.flag & NO_CIRCLE) == 0 for found in photographs.targets])
     rays = np.bincount(seen.point[rows], minlength=len(network.points))
     return np.asarray(rows & (rays[seen.point] >= 2))
 

@@ -10,6 +10,7 @@ from sfm.conventions import AnyArray
 from sfm.display import listed
 from sfm.orientation.incremental.sequence import MIN_POINTS
 from sfm.photographs.reading import read_photograph
+from sfm.survey.diagnosis.missing_plates import words_of_missing_plates
 from sfm.survey.inputs.measurements import MeasuredPhotographs
 from sfm.survey.inputs.survey import Survey
 from sfm.targets.codes.families import Family
@@ -28,6 +29,8 @@ POLARITIES = ("dark", "bright")
 
 def words_of_codes(survey: Survey, photographs: MeasuredPhotographs) -> str:
     """Say how many targets and codes were found where more codes were needed, and what decides on that."""
+    if plates := words_of_missing_plates(survey.family, photographs):
+        return plates
     targets = [len(found) for found in photographs.targets]
     codes = [int((found.code >= 0).sum()) for found in photographs.targets]
     with_codes = sum(count > 0 for count in codes)

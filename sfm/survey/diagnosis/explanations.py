@@ -60,7 +60,8 @@ def explain_residuals(found: Adjustment) -> tuple[Explanation, ...]:
     if not tried:
         return ()
     best = min(one.after_px for one in tried)
-    first = next(one for one in tried if one.after_px <= NEAR_THE_BEST * best)
+    near = [one for one in tried if one.after_px <= NEAR_THE_BEST * best]
+    first = next((one for one in near if one.explains), near[0])
     return (first, *(one for one in tried if one is not first))
 
 

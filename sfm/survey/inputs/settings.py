@@ -66,6 +66,10 @@ Observed = Annotated[
     BeforeValidator(_pairs),
 ]
 
+PlateSide = Annotated[int, Field(ge=2, le=500)]
+Marks = Annotated[
+    tuple[Annotated[tuple[int, int], Field(strict=False)], ...], Field(strict=False, max_length=1000)
+]
 Correlation = Annotated[float, Field(ge=-1, le=1)]
 Correlations = Annotated[
     tuple[Annotated[tuple[Name, Name, Correlation], Field(strict=False)], ...],
@@ -146,6 +150,12 @@ class TargetSettings(Section):
     diameters: Name | None = None  # a table id,diameter of single targets, before the one of all
     tag_size: Length | None = None  # side of the black square of all tags, object unit
     tag_sigma: Length | None = None  # its standard deviation, common to all tags of a print, object unit
+    rows: PlateSide | None = None  # of the dots of a plate, or of the crossings inside a board
+    columns: PlateSide | None = None  # of the same
+    pitch: Length | None = None  # distance of neighbouring dots or crossings, object unit
+    marks: Marks = ()  # [row, column], from 0, of the dots that are larger or rings
+    plate_sigma: Length | None = None  # standard deviation of its coordinates, true without, object unit
+    dictionary: Name | None = None  # tags of a ChArUco board, whose side is tag_size
 
 
 class TiePointSettings(Section):

@@ -18,7 +18,7 @@ from sfm.survey.inputs.settings import TargetSettings
 from sfm.survey.inputs.survey import Survey
 from sfm.survey.measuring.photographs import each_photograph
 from sfm.survey.measuring.target_store import TargetStore, target_key
-from sfm.targets.codes.families import Family
+from sfm.targets.codes.families import TargetFamily
 from sfm.targets.detect import Targets, find_targets
 
 
@@ -77,7 +77,7 @@ def measure_photographs(
 
 
 def _read_and_measure(
-    path: Path, settings: TargetSettings, family: Family | None, store: TargetStore | None
+    path: Path, settings: TargetSettings, family: TargetFamily | None, store: TargetStore | None
 ) -> tuple[Metadata, Targets, bool]:
     targets, stored = measure_photograph(path, settings, family, store)  # says best what is wrong with a file
     return read_metadata(path), targets, stored
@@ -86,7 +86,7 @@ def _read_and_measure(
 def measure_photograph(
     path: Path,
     settings: TargetSettings,
-    family: Family | None,
+    family: TargetFamily | None,
     store: TargetStore | None = None,
 ) -> tuple[Targets, bool]:
     """Return the targets of one photograph and whether an earlier run has measured them.
