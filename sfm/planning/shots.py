@@ -47,7 +47,7 @@ def shots(xyz: FloatArray, stations: Stations, seen: BoolArray, coded: IntArray)
             Shot(
                 name,
                 X0,
-                float(np.degrees(np.arctan2(axis[1], axis[0]))),
+                float(np.round(np.degrees(np.arctan2(axis[1], axis[0])), 9) + 0.0),
                 float(np.degrees(np.arcsin(np.clip(axis[2], -1, 1)))),
                 roll_deg(R),
                 float(depth.mean()) if len(depth) else np.nan,

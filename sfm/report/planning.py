@@ -174,12 +174,12 @@ def figures(plan: Plan) -> list[tuple[str, str]]:
             "redundancy",
             f"{a.redundancy}; redundancy numbers {abs(r.min()):.2f} to {r.max():.2f}, mean {r.mean():.2f}",
         ),
-        ("gross error that is found", f"{_spread(found.minimal_bias)} px"),
-        ("its effect if it is not found", f"{_spread(found.external)} sigmas of an unknown"),
+        ("gross error that is found", _spread(found.minimal_bias, "px")),
+        ("its effect if it is not found", _spread(found.external, "sigmas of an unknown")),
         (
             "rule of Fraser",
             f"sigma = q S sigma_image / sqrt(k): q {p.q:.2f}, S {per_mm:.4g} {plan.unit} per mm, "
-            f"k {p.photographs_per_station:.2g} photographs from a station",
+            f"k {p.photographs_per_station:.2g} (photographs over stations)",
         ),
         (
             "target diameter",
@@ -332,9 +332,10 @@ def _first(undetermined: tuple[str, ...]) -> str:
     return undetermined[0] + (f"; and {more} more" if more else "")
 
 
-def _spread(values: FloatArray) -> str:
+def _spread(values: FloatArray, unit: str) -> str:
     """Write median and largest of reliabilities, which are unlimited where nothing checks an image point."""
-    return f"{or_unlimited(float(np.median(values)))} (median), {or_unlimited(float(values.max()))} at most"
+    median, largest = (or_unlimited(float(value)) for value in (np.median(values), values.max()))
+    return f"{median} {unit} (median), {largest} at most"
 
 
 def _length(plan: Plan, value: float) -> str:
