@@ -22,6 +22,9 @@ from sfm.report.figures.plots import Plot, png
 from sfm.report.html.page import render
 from sfm.report.numbers import finer_unit, significant
 from sfm.report.page_files import write_files
+from sfm.report.viewer.displaced_scene import scene_of_displacements
+from sfm.report.viewer.embedded import Viewer, viewer_of
+from sfm.report.viewer.pictures import cut_pictures
 
 NAMED = 12  # points in a sentence
 FILES = ("displacements.csv", "series.csv", "epochs.json", "epochs.html")
@@ -162,6 +165,7 @@ def epochs_page(found: EpochSeries) -> str:
         remarks=[words for k, (words, _) in enumerate(told) if k != len(found.since_first) - 1],
         level=level,
         power=POWER,
+        viewer=_viewer(found),
         cameras=[words_of_camera(one) for one in found.cameras],
         pairs=[
             {
@@ -247,6 +251,14 @@ def _series_rows(found: EpochSeries) -> Iterable[tuple[object, ...]]:
         one = pair.displacements
         for k, name in enumerate(one.differences.points):
             yield (name, one.differences.names[1], *one.displacement[k], *one.sigma[k], int(one.moved[k]))
+
+
+def _viewer(found: EpochSeries) -> Viewer | None:
+    """Return the scene of the first epoch with the displacements to the last; None without photographs."""
+    if not found.first.result.estimate.oriented.any():
+        return None
+    scene = scene_of_displacements(found.since_first[-1].displacements, found.first.result)
+    return viewer_of(scene, cut_pictures(scene, {}, budget_mb=0.0))
 
 
 def _picture(found: Displacements, number: int) -> Plot | None:
