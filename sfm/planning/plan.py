@@ -48,7 +48,8 @@ class Plan:
     @property
     def reached(self) -> bool:
         """Whether all that is wanted is predicted, and every point is determined."""
-        return self.shortfall <= 1 and bool(self.prediction.determined.all())
+        whole = self.prediction.determined.all() and not self.prediction.adjustment.undetermined
+        return self.shortfall <= 1 and bool(whole)
 
 
 def plan_of(
@@ -108,7 +109,7 @@ def describe_plan(
         calibratability(prediction, seeing),
         size,
         coded,
-        shots(prediction, coded),
+        shots(prediction.planned.xyz, prediction.stations, seen, coded),
     )
 
 

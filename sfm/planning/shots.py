@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from sfm.conventions import BoolArray, FloatArray, IntArray
-from sfm.planning.prediction import Prediction
 from sfm.planning.sight.optics import best_focus
+from sfm.planning.stations import Stations
 
 CODED = 5  # targets in every photograph, by which it is oriented by resection
 
@@ -28,25 +28,26 @@ class Shot:
     coded: int  # of them coded
 
 
-def shots(prediction: Prediction, coded: IntArray) -> tuple[Shot, ...]:
+def shots(xyz: FloatArray, stations: Stations, seen: BoolArray, coded: IntArray) -> tuple[Shot, ...]:
     """Return the list of photographs of a plan.
 
     Args:
-        prediction: of the network.
+        xyz: points, object unit, (n, 3).
+        stations: of the m photographs.
+        seen: which photograph shows which point, (m, n).
         coded: which points are coded targets, see `choose_coded`.
     """
     found = []
-    stations, seen = prediction.stations, prediction.sight.seen
     for i, name in enumerate(stations.names):
         R, X0 = stations.rotation[i], stations.position[i]
         axis = -R[:, 2]
-        depth = (prediction.planned.xyz[seen[i]] - X0) @ axis
+        depth = (xyz[seen[i]] - X0) @ axis
         near, far = (float(depth.min()), float(depth.max())) if len(depth) else (np.nan, np.nan)
         found.append(
             Shot(
                 name,
                 X0,
-                float(np.degrees(np.arctan2(axis[1], axis[0]))),
+                float(np.round(np.degrees(np.arctan2(axis[1], axis[0])), 9) + 0.0),
                 float(np.degrees(np.arcsin(np.clip(axis[2], -1, 1)))),
                 roll_deg(R),
                 float(depth.mean()) if len(depth) else np.nan,

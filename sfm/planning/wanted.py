@@ -75,7 +75,7 @@ def found_displacement(prediction: Prediction) -> FloatArray:
 def short_of(prediction: Prediction, wanted: Wanted, points: BoolArray) -> float:
     """Return the largest of what is predicted over what is wanted; 1 or less where all of it is reached.
 
-    Infinite where a point has fewer than MIN_RAYS.
+    Infinite where a point has fewer than MIN_RAYS, or the network leaves something undetermined.
 
     Args:
         prediction: of a network.
@@ -85,7 +85,7 @@ def short_of(prediction: Prediction, wanted: Wanted, points: BoolArray) -> float
     if not points.any():
         raise GeometryError(f"plan: no point can be seen from {MIN_RAYS} stations")
     complete = prediction.determined[points].all() and (prediction.rays[points] >= MIN_RAYS).all()
-    short = [0.0 if complete else math.inf]
+    short = [0.0 if complete and not prediction.adjustment.undetermined else math.inf]
     if wanted.sigma is not None:
         short.append(float(prediction.sigma[points].max()) / wanted.sigma)
     if wanted.length_sigma is not None and math.isfinite(short[0]):

@@ -105,17 +105,17 @@ def headline(plan: Plan) -> str:
     lost = f", {n - known} of {n} points not determined" if known < n else ""
     worst = _length(plan, float(p.sigma[p.determined].max()))
     told = f"{m} photographs: sigma of points {_length(plan, p.rms_sigma)} RMS, {worst} at most{lost}"
+    if p.adjustment.undetermined:
+        told += ", and the network is NOT determined"
     few = int((p.rays < MIN_RAYS).sum())
     told += f", {few} with fewer than {MIN_RAYS} rays" if few else ""
     if not plan.wanted.anything:
         return told
     if plan.shortfall <= 1:
         return f"{told}; what is wanted is reached"
-    by = (
-        "points lack rays"
-        if not np.isfinite(plan.shortfall)
-        else f"{plan.shortfall:.2f} times what is wanted"
-    )
+    by = f"{plan.shortfall:.2f} times what is wanted"
+    if not np.isfinite(plan.shortfall):
+        by = "points lack rays, or the network is not determined"
     return f"{told}; what is wanted is NOT reached ({by})"
 
 
@@ -128,7 +128,8 @@ def remarks(plan: Plan) -> list[str]:
         said.append(f"Photographs that show too few points: {', '.join(plan.unusable[:NAMED])}.")
     c = plan.calibration
     if c is not None and not c.good:
-        reasons = "; ".join((*c.undetermined, *c.reasons)) or "too few image points over the photograph"
+        lacking = [*c.reasons, *([_first(c.undetermined)] if c.undetermined else [])]
+        reasons = "; ".join(lacking) or "too few image points over the photograph"
         said.append(
             f"The camera cannot be calibrated with this network: {reasons}. Calibrate it before, or hold it."
         )
@@ -173,12 +174,12 @@ def figures(plan: Plan) -> list[tuple[str, str]]:
             "redundancy",
             f"{a.redundancy}; redundancy numbers {abs(r.min()):.2f} to {r.max():.2f}, mean {r.mean():.2f}",
         ),
-        ("gross error that is found", f"{_spread(found.minimal_bias)} px"),
-        ("its effect if it is not found", f"{_spread(found.external)} sigmas of an unknown"),
+        ("gross error that is found", _spread(found.minimal_bias, "px")),
+        ("its effect if it is not found", _spread(found.external, "sigmas of an unknown")),
         (
             "rule of Fraser",
             f"sigma = q S sigma_image / sqrt(k): q {p.q:.2f}, S {per_mm:.4g} {plan.unit} per mm, "
-            f"k {p.photographs_per_station:.2g} photographs from a station",
+            f"k {p.photographs_per_station:.2g} (photographs over stations)",
         ),
         (
             "target diameter",
@@ -187,7 +188,7 @@ def figures(plan: Plan) -> list[tuple[str, str]]:
         ("coded targets", f"{len(plan.coded)} give every photograph five, or all that it shows"),
     ]
     if a.undetermined:
-        rows.append(("not determined", "; ".join(a.undetermined)))
+        rows.append(("not determined", _first(a.undetermined)))
     return rows
 
 
@@ -202,7 +203,7 @@ def plan_page(plan: Plan) -> str:
         p=plan.prediction,
         title=plan.name,
         headline=headline(plan),
-        level="good" if plan.reached else "fair" if plan.prediction.determined.all() else "bad",
+        level=_level(plan),
         remarks=remarks(plan),
         figures=figures(plan),
         fine=fine,
@@ -319,9 +320,22 @@ def _points(plan: Plan) -> list[tuple[object, ...]]:
     ]
 
 
-def _spread(values: FloatArray) -> str:
+def _level(plan: Plan) -> str:
+    if plan.prediction.adjustment.undetermined or not plan.prediction.determined.all():
+        return "bad"
+    return "good" if plan.reached else "fair"
+
+
+def _first(undetermined: tuple[str, ...]) -> str:
+    """Write the first of what is not determined, and how many more there are."""
+    more = len(undetermined) - 1
+    return undetermined[0] + (f"; and {more} more" if more else "")
+
+
+def _spread(values: FloatArray, unit: str) -> str:
     """Write median and largest of reliabilities, which are unlimited where nothing checks an image point."""
-    return f"{or_unlimited(float(np.median(values)))} (median), {or_unlimited(float(values.max()))} at most"
+    median, largest = (or_unlimited(float(value)) for value in (np.median(values), values.max()))
+    return f"{median} {unit} (median), {largest} at most"
 
 
 def _length(plan: Plan, value: float) -> str:

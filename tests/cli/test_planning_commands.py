@@ -10,16 +10,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from adapters.formats.result_tables import write_tables
 from sfm import cli
+from sfm.stored_result import StoredResult
 from tests.surveys import write_observed_survey
+from tests.synthetic import make_network, seed_of
 
 CAMERA = ("--camera", "full-frame-24", "--c-mm", "28")
 LENS = (*CAMERA, "--sigma-px", "0.05")
 
 
-def plan(*arguments: object) -> int:
+def plan(*arguments: object, command: str = "network") -> int:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(sys, "argv", ["kolinear", "plan", "network", *map(str, arguments)])
+        patch.setattr(sys, "argv", ["kolinear", "plan", command, *map(str, arguments)])
         try:
             cli.main()
         except SystemExit as end:
@@ -148,3 +151,30 @@ def test_the_camera_of_a_survey_file(tmp_path: Path, capsys: pytest.CaptureFixtu
     survey.write_text(text, encoding="utf-8")
     assert plan(*given, "--stations", "hemisphere:8") == 2
     assert "camera synthetic has no focal length, needed c_mm there or --c-mm" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("command", "file"), [("simulate", "plan.json"), ("more", "summary.json")])
+def test_a_folder_that_is_none_is_one_line(
+    command: str,
+    file: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert plan("nowhere", command=command) == 2
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 1 and f"nowhere/{file}: cannot be read" in lines[0]
+    assert not Path("out").exists()
+
+
+def test_more_photographs_for_a_result(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A result of the tables of a network; what its report says is how to ask for this."""
+    network, truth = make_network(seed_of("more"), images=5, points=25, free=())
+    write_tables(tmp_path / "five", StoredResult("five", network, truth, unit="m", redundancy=40))
+    out = tmp_path / "more"
+    assert plan(tmp_path / "five", "--photographs", 2, "--out", out, command="more") == 0
+    printed = capsys.readouterr().out
+    assert "2 more photographs: sigma of the worst point from" in printed and "new 2: " in printed
+    points = rows(out / "points.csv")
+    assert all(float(row["sigma_with_more"]) < float(row["sigma"]) for row in points)

@@ -106,9 +106,9 @@ def test_five_objects_need_fewer_photographs_than_rings_or_at_random(name: str) 
 @pytest.mark.slow
 def test_1000_points_and_300_candidates_are_designed_within_a_minute() -> None:
     planned = shape_object("box", (1.0, 0.6, 0.4), 1000)
-    start = time.perf_counter()
+    start = time.process_time()
     found = design_network(planned, CAMERA, Allowed(floor=0.0), SEEING, Wanted(sigma=1.5e-5))
-    seconds = time.perf_counter() - start
+    seconds = time.process_time() - start  # of one core; the machine may have other work
     print(f"{len(found.prediction.stations)} photographs in {seconds:.1f} s, reached {found.reached}")
     assert found.reached and found.photographs_tried == 600
     assert seconds < 60

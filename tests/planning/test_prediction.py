@@ -262,7 +262,7 @@ def test_demo_is_predicted_from_its_geometry(tmp_path: Path) -> None:
     write_photographs(staging, tmp_path / "photographs")
     result = sfm.run_survey(
         sfm.read_survey(DATASETS / "demo/survey.toml"),
-        images_dir=tmp_path / "photographs",
+        images=tmp_path / "photographs",
         compare_with="none",
     )
     scene, names = staging.scene, result.network.points
@@ -288,7 +288,7 @@ def test_demo_is_predicted_from_its_geometry(tmp_path: Path) -> None:
 def test_camcal_is_predicted_from_its_geometry() -> None:
     result = sfm.run_survey(
         sfm.read_survey(DATASETS / "camcal/survey.toml"),
-        images_dir=SHARED / "data/camcal/images",
+        images=SHARED / "data/camcal/images",
         compare_with="none",
     )
     points = result.estimate.points
@@ -308,7 +308,7 @@ def test_retro_panel_is_predicted_from_its_geometry() -> None:
     """Two cameras and a panel that moves: the rays are those that were measured, of equal precision."""
     result = sfm.run_survey(
         sfm.read_survey(DATASETS / "retro-panel/survey.toml"),
-        images_dir=SHARED / "data/retro-panel",
+        images=SHARED / "data/retro-panel",
         compare_with="none",
     )
     a = result.adjustment
