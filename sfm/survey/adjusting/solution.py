@@ -213,6 +213,7 @@ def _solved(start: _Prepared) -> _Solved:
     task, estimate = start.task, start.estimate
     contradictions, taken_out = list(start.contradictions), list(start.taken_out)
     better: tuple[str, ...] = ()
+    asked = {one.name for one in start.estimate.cameras if one.free[0]}
     first: tuple[Settled, Adjustment, ControlCheck | None, tuple[OtherSolution, ...]] | None = None
     settled = settle(task, estimate)
     ready: Settled | None = settled
@@ -234,7 +235,9 @@ def _solved(start: _Prepared) -> _Solved:
             taken_out += [] if found.taken_out is None else [found.taken_out]
             task = without_contradiction(task, found, settled.accepted)
             continue
-        others = other_solutions(final)
+        # c that had to be held is nobody's calibration: what its other values give is another solution
+        c_held = any(one.name in asked and not one.free[0] for one in final.estimate.cameras)
+        others = other_solutions(final, follow_c=c_held)
         if first is not None and not final.converged:  # what seemed better is none: as it was
             (settled, final, check, others), better = first, ()
             break

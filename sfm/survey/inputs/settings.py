@@ -140,6 +140,7 @@ class TargetSettings(Section):
 
     polarity: Literal["dark", "bright", "auto"] = "auto"
     channel: Literal["luminance", "red", "green", "blue"] = "luminance"  # of colour photographs
+    tone: Literal["linear", "srgb"] = "linear"  # tone curve of the photographs, taken back before measuring
     codes: Name = "none"  # a code family, or a table file relative to the survey file
     ring_radii: TwoLengths | None = (
         None  # of the ring, inner and outer, in those of the dot; else the family's

@@ -8,7 +8,7 @@ import numpy as np
 
 from sfm.conventions import FloatArray
 from sfm.photographs.exif import Metadata, read_metadata
-from sfm.photographs.reading import read_photograph
+from sfm.photographs.reading import read_photograph, take_back_srgb
 from sfm.runtime.progress import SILENT, Progress
 from sfm.survey.inputs.cameras import start_cameras
 from sfm.survey.inputs.checks.same_photographs import MIN_COMMON
@@ -102,15 +102,16 @@ def measure_photograph(
     Raises:
         PhotographError: the photograph cannot be read.
     """
-    measured = settings.model_dump_json(include={"channel", "polarity", "min_diameter_px"})
+    measured = settings.model_dump_json(include={"channel", "tone", "polarity", "min_diameter_px"})
     key = "" if store is None else target_key(path, measured, family)
     if store is not None:
         if key not in store.held and (kept := store.load(key)) is not None:
             store.held[key] = kept, True
         if key in store.held:
             return store.held[key]
+    photograph = read_photograph(path, channel=settings.channel)
     targets = find_targets(
-        read_photograph(path, channel=settings.channel),
+        take_back_srgb(photograph) if settings.tone == "srgb" else photograph,
         polarity=settings.polarity,
         codes=family if family is not None else "none",
         min_diameter_px=settings.min_diameter_px,
