@@ -319,7 +319,7 @@ class _Work:
         if not np.isnan(variance):
             if self.points.depends_on_datum(function).any():
                 remarks.append("depends on the datum of a free network")
-            if not self.points.correlated:
+            if not self.points.correlated_among(function.points):
                 remarks.append("correlations of the points not known")
         sigma = float(np.sqrt(max(variance, 0.0))) if not np.isnan(variance) else float("nan")
         return Quantity(name, what, kind, float(function.value[0]), sigma, "; ".join(remarks))
@@ -357,6 +357,12 @@ class _Work:
         found = []
         if self.points.covariance is None:
             found.append("The result has no standard deviations: nothing is tested or decided.")
+        elif self.points.sample is not None:
+            found.append(
+                f"The covariance between points is known of {len(self.points.sample)} of "
+                f"{len(self.points.names)} points, those with names first: standard deviations of shapes and "
+                "distances of any others leave out the correlations of the points."
+            )
         elif not self.points.correlated:
             found.append(
                 "Only the covariance of each point by itself is known: standard deviations of shapes and "
