@@ -152,7 +152,8 @@ def draw_photograph(photograph: PhotographTargets, adjustment: Adjustment, facto
     for row, name, right in zip(rows, names, reach, strict=True):
         xy = seen.xy[row]
         end = xy + factor / scale * adjustment.residuals[row]
-        _arrow(picture, xy, end, scale, thickness=1 if crowded else 2)
+        if np.isfinite(end).all():  # a rejected point behind the camera has no residual
+            _arrow(picture, xy, end, scale, thickness=1 if crowded else 2)
         if crowded:
             continue
         colour = DROPPED if adjustment.rejected[row] else USED
