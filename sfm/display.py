@@ -1,9 +1,10 @@
-"""Small tables for the prompt and for notebooks."""
+"""What is shown of much: small tables for the prompt and for notebooks, lists cut short for messages."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
+MAX_LISTED = 5  # of many in one message
 TEMPLATE = """\
 <table><caption>{{ title }}</caption>
 <thead><tr>{% for name in header %}<th>{{ name }}</th>{% endfor %}</tr></thead>
@@ -31,3 +32,20 @@ def text_table(title: str, header: Sequence[str], rows: Sequence[Sequence[str]])
         for line in lines
     ]
     return "\n".join([title, *told])
+
+
+def listed(texts: Iterable[str], *, most: int = MAX_LISTED, separator: str = ", ") -> str:
+    """Return texts one after the other, the first few of many, and how many more there are.
+
+    Args:
+        texts: names, or what is said of each.
+        most: so many are shown.
+        separator: between them.
+
+    Examples:
+        >>> listed(["501", "502", "503"], most=2)
+        '501, 502 and 1 more'
+    """
+    every = list(texts)
+    more = f" and {len(every) - most} more" if len(every) > most else ""
+    return separator.join(every[:most]) + more

@@ -16,6 +16,7 @@ from scipy.sparse import csr_matrix, triu
 
 from sfm.camera import Camera
 from sfm.conventions import BoolArray, FloatArray, IntArray
+from sfm.display import listed
 from sfm.errors import GeometryError, UnknownNameError
 
 MAX_NAMES = 10  # in a message
@@ -349,6 +350,5 @@ def index_of(names: Sequence[str], name: object, what: str) -> int:
     try:
         return names.index(str(name))
     except ValueError:
-        close = get_close_matches(str(name), names, n=MAX_NAMES) or names
-        some = ", ".join(close[:MAX_NAMES]) + (" ..." if len(close) > MAX_NAMES else "")
+        some = listed(get_close_matches(str(name), names, n=MAX_NAMES) or names, most=MAX_NAMES)
         raise UnknownNameError(f"unknown {what} '{name}', expected one of {some or 'none'}") from None

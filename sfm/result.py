@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cache, cached_property
 from pathlib import Path
 
 import numpy as np
@@ -22,8 +22,8 @@ from sfm.errors import GeometryError
 from sfm.files.covariance_file import points_kept_together
 from sfm.network import Estimate, Network, index_of
 from sfm.point_table import Point, PointTable
-from sfm.stored_result import NO_SCALE, StoredResult
-from sfm.targets.flags import count_flags
+from sfm.stored_result import NO_SCALE, SeenTargets, StoredResult
+from sfm.targets.flags import Flag, count_flags
 
 EXPLAINS = 1.5  # ratio of sigma0 without and with a cause from which it explains something
 MATTERS = 0.5  # standard deviations by which points move (RMS) from which a significant cause is told, too
@@ -209,6 +209,39 @@ class SurveyResult:
         return self.adjustment.estimate
 
     @cached_property
+    def seen_targets(self) -> SeenTargets:
+        """What was measured and rejected in the photographs of the result."""
+        index = {name: i for i, name in enumerate(self.network.images)}
+        own = [one for one in self.photographs if one.image in index]
+        own.sort(key=lambda one: index[one.image])
+        nothing = np.full((0, 3), np.nan)
+        return SeenTargets(
+            np.array(
+                [index[one.image] for one in own for _ in range(len(one.xy) + len(one.rejected_xy))],
+                dtype=np.int64,
+            ),
+            np.vstack([np.zeros((0, 2)), *(part for one in own for part in (one.xy, one.rejected_xy))]),
+            np.vstack(
+                [
+                    nothing,
+                    *(
+                        part
+                        for one in own
+                        for part in (
+                            np.column_stack([one.semi_axes, one.angle]),
+                            np.full((len(one.rejected_xy), 3), np.nan),
+                        )
+                    ),
+                ]
+            ),
+            tuple(
+                words
+                for one in own
+                for words in (*[""] * len(one.xy), *(_reason(int(flag)) for flag in one.rejected_flag))
+            ),
+        )
+
+    @cached_property
     def stored(self) -> StoredResult:
         """The result as files hold it: accepted image points, solution and standard deviations."""
         a = self.adjustment
@@ -317,6 +350,13 @@ class SurveyResult:
     def length_unit(self) -> str:
         """What lengths are measured in: the object unit, or network units where the scale is undefined."""
         return self.unit if self.has_scale else NO_SCALE
+
+
+@cache
+def _reason(flag: int) -> str:
+    """Return in words why a candidate was not measured."""
+    names = [in_words(str(one.name).lower()) for one in Flag if one.value and flag & one.value]
+    return ", ".join(names) or "no reason kept"
 
 
 def in_words(flag_name: str) -> str:

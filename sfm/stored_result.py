@@ -6,13 +6,32 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sfm.conventions import FloatArray, IntArray
+from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.display import html_table, text_table
 from sfm.network import Estimate, Network
 from sfm.point_table import Point, PointTable
 
 NO_SCALE = "network units"
 """unit of lengths in a network whose scale is undefined"""
+MEASURED = "measured"
+"""what targets.csv says of a target in the place of a reason for its rejection"""
+
+
+@dataclass(frozen=True)
+class SeenTargets:
+    """What was measured, and what was rejected, in the photographs of a result."""
+
+    image: IntArray  # index of the photograph in the network of the result, (k,)
+    xy: FloatArray  # centres, px, (k, 2)
+    ellipse: (
+        FloatArray  # semi-axes, larger first, px, and angle from x towards y, rad; NaN if rejected, (k, 3)
+    )
+    reason: tuple[str, ...]  # why it was not measured, in words; empty where it was, (k,)
+
+    @property
+    def measured(self) -> BoolArray:
+        """Which were measured, (k,)."""
+        return np.array([not words for words in self.reason], dtype=bool)
 
 
 @dataclass(frozen=True, repr=False, eq=False)

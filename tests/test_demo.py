@@ -9,10 +9,19 @@ import numpy as np
 import pytest
 
 from adapters.colmap.adjuster import adjust_with_colmap
+from adapters.formats.result_tables import read_image_points, read_result
+from adapters.formats.targets_table import read_targets
 from sfm.conventions import FloatArray, IntArray
+from sfm.errors import SurveyFileError
 from sfm.pipeline import run_survey
 from sfm.rendering.render import write_photographs
 from sfm.rendering.scene_file import Staging, read_scene
+from sfm.report.findings.findings import findings_of
+from sfm.report.tables.csv_files import write_tables
+from sfm.report.tables.summary import write_summary
+from sfm.report.viewer.result_scene import scene_of_result
+from sfm.report.viewer.scene import Marks
+from sfm.report.viewer.stored_scene import scene_of_stored
 from sfm.result import SurveyResult
 from sfm.similarity import fit_similarity
 from sfm.survey.inputs.survey import read_survey
@@ -117,3 +126,30 @@ def test_other_noise_gives_the_same_agreement(staging: Staging, tmp_path: Path) 
         squares.append(compare(run(other, tmp_path / str(seed)), other).normalised_square())
     assert 0.85 < np.mean(squares) < 1.25
     assert max(squares) < 1.4
+
+
+def test_a_stored_result_shows_the_ellipses_and_rejected_candidates_of_its_run(
+    demo: SurveyResult, tmp_path: Path
+) -> None:
+    findings = findings_of(demo)
+    write_tables(findings, tmp_path)
+    write_summary(findings, tmp_path)
+    stored = read_result(tmp_path)
+    seen, rejected, w = read_image_points(tmp_path, stored.network)
+    stored = replace(stored, network=replace(stored.network, image_points=seen))
+    targets = read_targets(tmp_path, stored.network)
+    assert targets is not None
+    again = scene_of_stored(stored, w=w, rejected=rejected, seen_targets=targets)
+    own = scene_of_result(findings)
+    assert again.marks.reasons and np.isfinite(own.rays.ellipse).all(axis=1).mean() > 0.95
+    rows = np.lexsort((again.rays.photo, again.rays.point)), np.lexsort((own.rays.photo, own.rays.point))
+    assert again.rays.ellipse[rows[0]] == pytest.approx(own.rays.ellipse[rows[1]], abs=1e-4, nan_ok=True)
+
+    def told(marks: Marks) -> list[tuple[int, str]]:
+        return sorted((int(i), marks.reasons[k]) for i, k in zip(marks.photo, marks.reason, strict=True))
+
+    assert told(again.marks) == told(own.marks)
+    damaged = tmp_path / "targets.csv"
+    damaged.write_text(damaged.read_text("utf-8").replace("part_01.jpg", "part_99.jpg", 1), encoding="utf-8")
+    with pytest.raises(SurveyFileError, match=r"targets\.csv, line 2: image 'part_99.jpg' is not in images"):
+        read_targets(tmp_path, stored.network)

@@ -155,7 +155,11 @@ def colmap_free(cameras: tuple[Camera, ...]) -> tuple[bool, bool, bool]:
 
 
 def load_pycolmap() -> ModuleType:
-    """Import pycolmap, or say what is needed."""
+    """Import pycolmap, or say what is needed.
+
+    Raises:
+        BackendError: pycolmap is missing, cannot be imported, or is another version.
+    """
     needed = ".".join(str(part) for part in NEEDED_VERSION)
     try:
         import pycolmap
@@ -208,7 +212,11 @@ def ceres_options(
 
 
 def adjustment_config(pycolmap: ModuleType, network: Network, estimate: Estimate, gauge: str) -> Any:
-    """Which photographs take part and what is held."""
+    """Which photographs take part and what is held.
+
+    Raises:
+        BackendError: an unknown gauge, or control with standard deviations.
+    """
     config = pycolmap.BundleAdjustmentConfig()
     for i in range(len(network.images)):
         config.add_image(i + 1)

@@ -143,7 +143,11 @@ class _Reader:
         self.path, self.database = path, database
 
     def cameras(self) -> tuple[DatabaseCamera, ...]:
-        """Return the cameras by number."""
+        """Return the cameras by number.
+
+        Raises:
+            SurveyFileError: a size or parameters that no camera has.
+        """
         found, names = [], tuple(MODELS)
         for where, row in self._rows("cameras", "camera_id, model, width, height, params"):
             number = self._whole(where, "camera_id", row[0], MAX_ID)
@@ -161,7 +165,11 @@ class _Reader:
         return tuple(found)
 
     def images(self, camera: dict[int, int]) -> tuple[list[int], tuple[str, ...], IntArray]:
-        """Return numbers and names of the photographs, and the index of the camera of each."""
+        """Return numbers and names of the photographs, and the index of the camera of each.
+
+        Raises:
+            SurveyFileError: a photograph of an unknown camera, or a name that is not plain text.
+        """
         numbers, names, owners = [], [], []
         for where, (number, name, camera_id) in self._rows("images", "image_id, name, camera_id"):
             numbers.append(self._whole(where, "image_id", number, PAIRS))
@@ -176,7 +184,11 @@ class _Reader:
         return numbers, tuple(names), np.array(owners, dtype=np.int64)
 
     def keypoints(self, images: tuple[str, ...], index: dict[int, int]) -> tuple[FloatArray, ...]:
-        """Return the keypoints of every photograph, none where it has no row."""
+        """Return the keypoints of every photograph, none where it has no row.
+
+        Raises:
+            SurveyFileError: keypoints of an unknown photograph, too many, or not finite.
+        """
         found: list[FloatArray] = [np.zeros((0, 2))] * len(images)
         count = 0
         for where, (number, rows, columns, data) in self._rows("keypoints", "image_id, rows, cols, data"):
@@ -199,7 +211,11 @@ class _Reader:
     def matches(
         self, table: str, index: dict[int, int], keypoints: tuple[FloatArray, ...]
     ) -> tuple[tuple[int, int, IntArray], ...]:
-        """Return the matches of every pair of photographs."""
+        """Return the matches of every pair of photographs.
+
+        Raises:
+            SurveyFileError: a pair of unknown photographs, a keypoint that is not there, or too many.
+        """
         found, count = [], 0
         for where, (number, rows, columns, data) in self._rows(table, "pair_id, rows, cols, data"):
             first, second = divmod(self._whole(where, "pair_id", number, PAIRS**2), PAIRS)

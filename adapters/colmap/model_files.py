@@ -237,7 +237,11 @@ class _Bytes:
         return struct.unpack_from("<" + layout, self.content, start)
 
     def numbers(self, layout: str) -> tuple[float, ...]:
-        """Take numbers that must be finite and of bearable size."""
+        """Take numbers that must be finite and of bearable size.
+
+        Raises:
+            SurveyFileError: a number that is not finite or too large.
+        """
         values = self.take(layout)
         for value in values:
             if not abs(value) <= MAX_NUMBER:
@@ -245,7 +249,11 @@ class _Bytes:
         return values
 
     def image_points(self, count: int) -> None:
-        """Pass image points, x y and the number of their object point, whose x and y must be sound."""
+        """Pass image points, x y and the number of their object point, whose x and y must be sound.
+
+        Raises:
+            SurveyFileError: a coordinate that is not finite or too large.
+        """
         start = self.at
         self.skip(24 * count)
         xy = np.frombuffer(self.content, "<f8", 3 * count, start).reshape(-1, 3)[:, :2]

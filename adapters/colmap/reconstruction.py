@@ -77,7 +77,11 @@ def reconstruction(
 
 
 def colmap_camera(pycolmap: ModuleType, camera: Camera, number: int) -> Any:
-    """Return a camera as a pycolmap.Camera of that number."""
+    """Return a camera as a pycolmap.Camera of that number.
+
+    Raises:
+        BackendError: a camera model that COLMAP does not have.
+    """
     if camera.model not in COLMAP_NAMES:
         raise BackendError(
             f"camera {camera.name}: COLMAP has no model {camera.model}, convert it to opencv or full_opencv"
@@ -91,7 +95,11 @@ def colmap_camera(pycolmap: ModuleType, camera: Camera, number: int) -> Any:
 
 
 def camera_of(found: Any) -> Camera:
-    """Return a COLMAP camera as ours, pixel size 1."""
+    """Return a COLMAP camera as ours, pixel size 1.
+
+    Raises:
+        BackendError: a model of COLMAP that is not read.
+    """
     if found.model_name not in READABLE:
         raise BackendError(
             f"camera {found.camera_id}: COLMAP's model {found.model_name}, expected one of "

@@ -50,7 +50,7 @@ def read_given(folder: Path, network: Network) -> GivenValues:
     """
     path = folder / "given.csv"
     summary = read_json(folder / "summary.json", _Summary, "the summary of a result")
-    if not path.is_file():
+    if not path.is_file() or not path.read_text(encoding="utf-8").strip().partition("\n")[2]:
         return GivenValues(ScaleBars(), ObjectPoints(), (), summary.sigma0 or 1.0, summary.sigma0_px)
     table = read_table(
         path, ("kind", "name", "coordinate"), ("given", "sigma"), ignored=None, blank=("sigma",)

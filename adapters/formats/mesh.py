@@ -148,7 +148,11 @@ class _Values:
         self.data = data
 
     def table(self, count: int, properties: list[tuple[str, ...]]) -> FloatArray:
-        """Read the vertices, which have no lists; return their coordinates."""
+        """Read the vertices, which have no lists; return their coordinates.
+
+        Raises:
+            SurveyFileError: vertices without x, y and z.
+        """
         names = [one[-1] for one in properties]
         if not {"x", "y", "z"} <= set(names) or any(one[0] == "list" for one in properties):
             raise SurveyFileError(f"{self.path}: the vertices have no x, y and z, or lists")
@@ -160,7 +164,11 @@ class _Values:
         return np.stack([packed[f"{names.index(axis)}"] for axis in "xyz"], axis=1).astype(float)
 
     def faces(self, count: int, properties: list[tuple[str, ...]], keep: bool = True) -> IntArray:
-        """Read an element with lists row by row; return the polygons of the first list as triangles."""
+        """Read an element with lists row by row; return the polygons of the first list as triangles.
+
+        Raises:
+            SurveyFileError: a polygon of too few or too many corners, or more elements than bytes.
+        """
         found: list[tuple[int, int, int]] = []
         if count * max(len(properties), 1) > len(self.data):
             raise SurveyFileError(f"{self.path}: {count} elements do not fit in {len(self.data)} bytes")

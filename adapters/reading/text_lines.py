@@ -77,14 +77,18 @@ class Lines:
         return self.current
 
     def line(self) -> str:
-        """Return the next line, which must be there."""
+        """Return the next line, which must be there.
+
+        Raises:
+            SurveyFileError: the file ends here.
+        """
         line = self.maybe_line()
         if line is None:
             self.number += 1
             raise self.error("the file ends here, more was expected")
         return line
 
-    def put_back(self) -> None:
+    def read_again(self) -> None:
         """Make the line read last the next one."""
         self.number, self.again = self.number - 1, True
 
@@ -97,7 +101,11 @@ class Lines:
         return None
 
     def due_row(self, what: str) -> list[str]:
-        """Return the words of the next row, which must be there."""
+        """Return the words of the next row, which must be there.
+
+        Raises:
+            SurveyFileError: the file ends here.
+        """
         words = self.row()
         if words is None:
             self.number += 1
@@ -105,20 +113,32 @@ class Lines:
         return words
 
     def due_words(self, count: int, what: str) -> list[str]:
-        """Return the next row, which must be there and have so many words."""
+        """Return the next row, which must be there and have so many words.
+
+        Raises:
+            SurveyFileError: the file ends here, or another number of words.
+        """
         words = self.due_row(what)
         if len(words) != count:
             raise self.error(f"{len(words)} words, needed {count}: {what}")
         return words
 
     def end(self) -> None:
-        """Refuse anything that follows."""
+        """Refuse anything that follows.
+
+        Raises:
+            SurveyFileError: something follows.
+        """
         words = self.row()
         if words is not None:
             raise self.error(f"'{shown(' '.join(words))}' after the end of the data")
 
     def number_of(self, text: str) -> float:
-        """Return a finite number of bearable size."""
+        """Return a finite number of bearable size.
+
+        Raises:
+            SurveyFileError: no number, not finite or too large.
+        """
         try:
             value = float(text) if text.isascii() and "_" not in text else np.nan
         except ValueError:
@@ -130,7 +150,11 @@ class Lines:
         return value
 
     def whole_of(self, text: str, fewest: int, most: int, what: str) -> int:
-        """Return a whole number within bounds."""
+        """Return a whole number within bounds.
+
+        Raises:
+            SurveyFileError: no whole number within the bounds.
+        """
         digits = text.removeprefix("-")
         sound = digits.isascii() and digits.isdecimal() and len(digits) <= MAX_DIGITS
         if not (sound and fewest <= int(text) <= most):
@@ -138,7 +162,11 @@ class Lines:
         return int(text)
 
     def name_of(self, text: str, what: str) -> str:
-        """Return a name, which must be plain text."""
+        """Return a name, which must be plain text.
+
+        Raises:
+            SurveyFileError: empty, too long or not plain text.
+        """
         if not is_name(text):
             raise self.error(f"{what} is '{shown(text)}', needed plain text of 1 to {MAX_NAME} characters")
         return text
@@ -152,12 +180,20 @@ class Lines:
         return self.whole_of(text, 1, most, f"the number of {what}")
 
     def refuse_more(self, count: int, most: int, what: str) -> None:
-        """Raise the error of the line read last if there are more of something than are read."""
+        """Raise the error of the line read last if there are more of something than are read.
+
+        Raises:
+            SurveyFileError: there are more.
+        """
         if count > most:
             raise self.error(f"more than {most} {what}, no more are read")
 
     def numbers(self, fewest: int, most: int, *, photograph: str | None = None) -> FloatArray:
-        """Return a line of numbers, the first of which is that of the photograph if given."""
+        """Return a line of numbers, the first of which is that of the photograph if given.
+
+        Raises:
+            SurveyFileError: another number of numbers, or of another photograph.
+        """
         parts = self.line().split()
         if not fewest <= len(parts) <= most:
             needed = f"{fewest}" if fewest == most else f"{fewest} to {most}"
@@ -172,7 +208,7 @@ class Lines:
         """Return lines of so many numbers up to an empty one, as (where, first, others)."""
         rows: list[tuple[str, str, FloatArray]] = []
         while self.line().strip():
-            self.put_back()
+            self.read_again()
             row = self.numbers(count, count)
             self.refuse_more(len(rows) + 1, MAX_BLOCK_LINES, "lines of a block")
             rows.append((self.where, f"{row[0]:.0f}", row[1:]))

@@ -54,20 +54,32 @@ class Node:
         return next(iter(self.all(tag)), None)
 
     def one(self, tag: str) -> Node:
-        """Return the first child of that name, which must be there."""
+        """Return the first child of that name, which must be there.
+
+        Raises:
+            SurveyFileError: there is none.
+        """
         found = self.maybe(tag)
         if found is None:
             raise self.error(f"<{self.tag}> without <{tag}>")
         return found
 
     def attribute(self, name: str) -> str:
-        """Return an attribute, which must be there."""
+        """Return an attribute, which must be there.
+
+        Raises:
+            SurveyFileError: there is none.
+        """
         if name not in self.attributes:
             raise self.error(f"<{self.tag}> without {name}")
         return self.attributes[name]
 
     def name(self, name: str) -> str:
-        """Return an attribute that is a name."""
+        """Return an attribute that is a name.
+
+        Raises:
+            SurveyFileError: empty, too long or not plain text.
+        """
         found = self.attribute(name)
         if not is_name(found):
             raise self.error(f"{name} is '{shown(found)}', needed plain text of 1 to {MAX_NAME} characters")
@@ -78,7 +90,11 @@ class Node:
         return self._number(self.attribute(name))
 
     def numbers(self, count: int) -> FloatArray:
-        """Return the text, which must be so many finite numbers."""
+        """Return the text, which must be so many finite numbers.
+
+        Raises:
+            SurveyFileError: another number of them, or not finite.
+        """
         words = self.text.split(maxsplit=count)
         if len(words) != count:
             found = f"more than {count}" if len(words) > count else f"{len(words)}"
@@ -97,7 +113,11 @@ class Node:
         return value
 
     def side_px(self, name: str) -> int:
-        """Return an attribute that is the side of a photograph, px."""
+        """Return an attribute that is the side of a photograph, px.
+
+        Raises:
+            SurveyFileError: not a whole number of pixels that a photograph can have.
+        """
         value = self.number(name)
         if not (1 <= value <= MAX_SIDE_PX and value == int(value)):
             raise self.error(f"{name} is {value:g} px, needed a whole number from 1 to {MAX_SIDE_PX}")
@@ -148,7 +168,11 @@ class _Reader:
         self.parser.StartDoctypeDeclHandler = self.refuse_doctype
 
     def read(self, file: BinaryIO) -> Node:
-        """Read a file in pieces, so that nothing in it that is too large is held whole."""
+        """Read a file in pieces, so that nothing in it that is too large is held whole.
+
+        Raises:
+            SurveyFileError: not well-formed XML, or larger than what is read.
+        """
         given = 0
         try:
             while data := file.read(PIECE_BYTES):
@@ -172,7 +196,11 @@ class _Reader:
         return SurveyFileError(f"{self.path}, line {self.parser.CurrentLineNumber}: {message}")
 
     def start(self, tag: str, attributes: dict[str, str]) -> None:
-        """Open an element."""
+        """Open an element.
+
+        Raises:
+            SurveyFileError: too many attributes or too deep.
+        """
         if len(self.open_nodes) >= MAX_DEPTH:
             raise self.error(f"elements more than {MAX_DEPTH} deep in one another")
         if len(attributes) > MAX_ATTRIBUTES:
@@ -186,7 +214,11 @@ class _Reader:
         self.characters = 0
 
     def text(self, piece: str) -> None:
-        """Add to the text of the innermost element."""
+        """Add to the text of the innermost element.
+
+        Raises:
+            SurveyFileError: more text than is read.
+        """
         self.texts.append(piece)
         self.characters += len(piece)
         if self.characters > MAX_TEXT:
@@ -209,11 +241,19 @@ class _Reader:
         self.open_nodes.pop()
 
     def keep(self, count: int) -> None:
-        """Count bytes of memory."""
+        """Count bytes of memory.
+
+        Raises:
+            SurveyFileError: more memory than is allowed.
+        """
         self.kept += count
         if self.kept > MAX_KEPT_BYTES:
             raise self.error(f"what stands up to here takes more than {MAX_KEPT_BYTES} bytes of memory")
 
     def refuse_doctype(self, *_: object) -> None:
-        """Refuse entities, which can blow a small file up to gigabytes; no exporter writes any."""
+        """Refuse entities, which can blow a small file up to gigabytes; no exporter writes any.
+
+        Raises:
+            SurveyFileError: always.
+        """
         raise self.error("a document type is not allowed here")

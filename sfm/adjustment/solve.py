@@ -24,6 +24,7 @@ from sfm.adjustment.engine.iterate import (
     METHODS,
     TOLERANCE,
     Optimum,
+    optimum_at,
     problem_of,
 )
 from sfm.adjustment.engine.local_frame import Local, local_of
@@ -128,6 +129,46 @@ def adjust(
         )
 
 
+def predict(
+    network: Network, estimate: Estimate, *, datum: Datum | str = FREE, sigma_px: float = 0.1
+) -> Adjustment:
+    """Return what an adjustment of a planned network will give: its covariance, redundancy and rank.
+
+    Nothing is adjusted. Covariances are those of sigma0 = 1, that is of the standard deviations that the
+    network states; residuals are 0 up to rounding where the image points are projected ones.
+
+    Args:
+        network: the planned image points with their standard deviations, scale bars and control.
+        estimate: the plan: cameras, exterior orientation and points.
+        datum: as of `adjust`.
+        sigma_px: standard deviation of unit weight, px.
+
+    Raises:
+        GeometryError: nothing to adjust, or datum points that cannot carry the datum.
+
+    Source: Grafarend (1974), first-order design; Fraser (1984), Photogramm. Eng. Remote Sens. 50(8).
+    """
+    datum = Datum(datum) if isinstance(datum, str) else datum
+    check_network(network, estimate)
+    check_number("sigma_px", sigma_px, 0.0)
+    use_control = datum.kind == "control"
+    local = local_of(network, estimate, datum.resolve(network))
+    factor = np.ones(len(network.image_points))
+    layout, state = unknowns_of(
+        local.network, local.estimate, use_control=use_control, image_sigma_factor=factor
+    )
+    weighted = weighted_of(local.network, layout, use_control=use_control)
+    run = Run(problem_of(layout, weighted, local.datum), METHODS[0], 0, TOLERANCE, exact=True)
+    weight = layout.active.astype(float)
+    with own_threads():
+        optimum = optimum_at(run.problem, state, weight)
+        if optimum is None:
+            raise GeometryError("plan: the normal equations of this network cannot be solved")
+        Q = cofactors(optimum, layout, cross=True)
+        result = _result(local, run, optimum, weight, Q, sigma_px, None, sigma0=1.0)
+        return local.back(replace(result, image_sigma_factor=factor))
+
+
 def _level_of(reject: str, alpha: float, usual: float) -> float:
     """Return the probability with which a good image coordinate is rejected; the usual one if none is."""
     if reject == "tukey":
@@ -143,6 +184,8 @@ def _result(
     Q: Cofactors | None,
     sigma_px: float,
     slopes: Callable[[FloatArray], FloatArray] | None,
+    *,
+    sigma0: float | None = None,  # in place of the one a posteriori
 ) -> Adjustment:
     layout, network, estimate = run.problem.layout, local.network, local.estimate
     of_control = run.problem.datum.kind == "control"
@@ -151,7 +194,8 @@ def _result(
     undetermined = undetermined_of(optimum, layout, network, estimate, allowed_motions=allowed)
     redundancy = run.redundancy(optimum, weight)
     observations = 2 * int((weight > 0).sum()) + run.problem.weighted.count
-    sigma0 = float(np.sqrt(optimum.vPv / redundancy)) if redundancy > 0 else float("nan")
+    if sigma0 is None:
+        sigma0 = float(np.sqrt(optimum.vPv / redundancy)) if redundancy > 0 else float("nan")
     v = residuals(layout.observations, optimum.state)
     factor = 1.0
     if slopes is not None and redundancy > 0:

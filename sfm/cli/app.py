@@ -13,6 +13,7 @@ from sfm.cli.commands import (
     inspecting,
     measuring,
     planning,
+    planning_surveys,
     refining,
     solvers,
     surveying,
@@ -55,4 +56,6 @@ for _command in (
     viewing.view,
 ):
     app.command()(_command)
+planning.plan.command("simulate")(planning_surveys.simulate_command)
+planning.plan.command("more")(planning_surveys.more_command)
 app.add_typer(planning.plan)

@@ -26,7 +26,7 @@ from sfm.distributions import chi2_isf, f_isf
 from sfm.errors import GeometryError
 
 ROBUST_ROUNDS = 100  # of weighting; it has come to its end long before
-LEAST_WEIGHTED = 1e-6  # of the median difference: what lies nearer has no more weight
+MIN_WEIGHTED = 1e-6  # of the median difference: what lies nearer has no more weight
 
 
 @dataclass(frozen=True)
@@ -176,7 +176,7 @@ def robust_weights(difference: FloatArray, G: FloatArray, candidates: BoolArray)
         middle = float(np.median(length[candidates]))
         if not middle > 0:
             break
-        weight = np.where(candidates, 1 / np.maximum(length, LEAST_WEIGHTED * middle), 0.0)
+        weight = np.where(candidates, 1 / np.maximum(length, MIN_WEIGHTED * middle), 0.0)
         weight /= weight.max()
     return weight
 

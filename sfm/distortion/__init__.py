@@ -1,1 +1,1 @@
-"""Distortion models: a function each in `brown` and `opencv`; begin with the registry, `models`."""
+"""Distortion models: functions in `brown`, `forward` and `opencv`, a row each in `models`: begin there."""

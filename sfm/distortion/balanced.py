@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from sfm.errors import GeometryError
 
+MODEL = "brown_forward"  # the model of this form
 BALANCED = ("c", "x0", "y0", "A1", "A2", "A3", "R0", "B1", "B2", "C1", "C2")
 UNITS = ("mm", "mm", "mm", "mm^-2", "mm^-4", "mm^-6", "mm", "mm^-1", "mm^-1", "1", "1")
 STEPS = 50  # of Newton's method at most

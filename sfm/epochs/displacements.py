@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import ncfdtr
 
+from sfm.adjustment.quality.statistics import POWER
 from sfm.comparison.congruency import Congruency, congruency, smooth_fraction
 from sfm.comparison.stable_points import critical_value, point_blocks
 from sfm.conventions import BoolArray, FloatArray
@@ -22,7 +23,6 @@ from sfm.distributions import chi2_isf
 from sfm.epochs.differences import Differences
 
 ALPHA = 0.05  # level of all tests of a pair of epochs together
-POWER = 0.8  # probability with which a displacement of the stated size would be found
 MANY = 10**6  # redundancy above which Fisher's F is chi-square
 
 

@@ -43,6 +43,7 @@ class EpochSeries:
     """Epochs of one object in their order."""
 
     names: tuple[str, ...]
+    first: Epoch  # of which displacements are, in its frame
     since_first: tuple[EpochPair, ...]  # of every epoch from the second on, against the first
     since_previous: tuple[EpochPair, ...]  # against the one before
     cameras: tuple[SharedCamera, ...] = ()  # with one interior orientation in all epochs adjusted together
@@ -108,7 +109,7 @@ def analyse_epochs(
     first = [analysed(epochs[0], epoch) for epoch in epochs[1:]]
     previous = [first[0]]
     previous += [analysed(one, other) for one, other in pairwise(epochs[1:])]
-    return EpochSeries(names, tuple(first), tuple(previous), cameras)
+    return EpochSeries(names, epochs[0], tuple(first), tuple(previous), cameras)
 
 
 def _reference(found: Differences, patterns: Sequence[str], epochs: tuple[Epoch, Epoch]) -> BoolArray:

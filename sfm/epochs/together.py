@@ -31,6 +31,7 @@ from sfm.errors import GeometryError
 from sfm.network import InteriorObservations, Network
 
 ALPHA = 0.01  # level of the test whether a camera is the same
+NAMED = 4  # cameras that a message names
 SAME_SIGMA = 0.05  # of a standard deviation, by which an adjustment from stored tables may differ, and of it
 
 
@@ -135,8 +136,9 @@ def _shared_cameras(epochs: Sequence[Epoch]) -> dict[str, list[int]]:
     shared = {name: numbers for name, numbers in found.items() if len(numbers) > 1}
     if not shared:
         raise GeometryError(
-            f"epochs together: no camera is in two of them ({', '.join(found)}); a camera that took several "
-            "epochs bears one name in their survey files"
+            f"epochs together: no camera is in two of them ({_some(tuple(found))}); a camera that took "
+            "several epochs bears one name in their survey files, and has no parameters of its own for each "
+            "photograph"
         )
     kept = {}
     for name, numbers in shared.items():
@@ -322,6 +324,14 @@ def _words_of_change(camera: SharedCamera, alone: Sequence[_Alone]) -> str:
         f"epochs together: camera {camera.name} is not the same: T {camera.statistic:.3g}, limit "
         f"{camera.critical:.3g}; {which} of {where} differs by {worst:.1f} standard deviations. Analyse the "
         "epochs without --together, each with an interior orientation of its own"
+    )
+
+
+def _some(names: tuple[str, ...]) -> str:
+    return (
+        ", ".join(names)
+        if len(names) <= NAMED
+        else f"{', '.join(names[:NAMED])} and {len(names) - NAMED} more"
     )
 
 

@@ -224,7 +224,11 @@ class _Lines:
 
 
 def read_header(path: Path) -> tuple[str, ...]:
-    """Return the names of the columns."""
+    """Return the names of the columns.
+
+    Raises:
+        SurveyFileError: the file cannot be read or is no CSV table.
+    """
     with _opened(path) as file:
         try:
             return tuple(name.strip() for name in next(csv.reader(_Lines(path, file)), []))

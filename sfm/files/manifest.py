@@ -14,6 +14,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+from sfm.display import listed
 from sfm.errors import OutputError
 from sfm.files.open_folders import open_own, refuse_links
 
@@ -75,8 +76,9 @@ def _foreign(folder: Path, names: Iterable[str]) -> list[str]:
 
 def _refuse(folder: Path, foreign: list[str], needed: str) -> None:
     if foreign:
-        more = f" and {len(foreign) - NAMED} more" if len(foreign) > NAMED else ""
-        raise OutputError(f"{folder}: the folder holds {'; '.join(foreign[:NAMED])}{more}; {needed}")
+        raise OutputError(
+            f"{folder}: the folder holds {listed(foreign, most=NAMED, separator='; ')}; {needed}"
+        )
 
 
 def manifest_text(hashes: dict[str, list[str]]) -> str:

@@ -55,8 +55,27 @@ class Alignment:
             covariance = self._moved_covariance(points.covariance, xyz)
         else:
             covariance = self._moved_blocks(points.covariance, xyz)
+        sample, known = points.sample, None
+        if sample is not None and points.sample_covariance is not None:
+            if points.correlated_among(self.points):
+                place = np.full(len(points.names), -1)
+                place[sample] = np.arange(len(sample))
+                own = replace(self, points=place[self.points])
+                known = own._moved_covariance(points.sample_covariance, xyz[sample])
+                assert covariance is not None  # a sample is of points that are known each by itself
+                covariance[sample] = [known[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] for k in range(len(sample))]
+            else:  # the system itself rests on points that are not known together with the others
+                sample = None
         has_scale = points.has_scale or self.scaled
-        return replace(points, xyz=xyz, covariance=covariance, datum="aligned", has_scale=has_scale)
+        return replace(
+            points,
+            xyz=xyz,
+            covariance=covariance,
+            datum="aligned",
+            has_scale=has_scale,
+            sample=sample,
+            sample_covariance=known,
+        )
 
     def _moved_covariance(self, Q: FloatArray, xyz: FloatArray) -> FloatArray:
         D, M = self._derivatives(xyz)

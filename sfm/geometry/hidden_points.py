@@ -50,6 +50,18 @@ def with_hidden_point(
     elif Q is not None:
         cross = found.jacobian @ Q[coordinates_of(found.points)]
         Q = np.block([[Q, cross.T], [cross, own]])
+    sample, known = points.sample, points.sample_covariance
+    if sample is not None and known is not None and points.correlated_among(found.points):
+        place = np.full(len(points.names), -1)
+        place[sample] = np.arange(len(sample))
+        cross = found.jacobian @ known[coordinates_of(place[found.points])]
+        known = np.block([[known, cross.T], [cross, own]])
+        sample = np.append(sample, len(points.names))
     return replace(
-        points, names=(*points.names, name), xyz=np.vstack([points.xyz, found.value]), covariance=Q
+        points,
+        names=(*points.names, name),
+        xyz=np.vstack([points.xyz, found.value]),
+        covariance=Q,
+        sample=sample,
+        sample_covariance=known,
     )

@@ -56,11 +56,17 @@ class MeasuredPoints:
     datum: str = ""  # free | minimal | control | aligned; empty where nobody knows
     has_scale: bool = True  # whether lengths are in a known unit
     redundancy: int | None = None  # of the variances; None where they count as known
+    sample: IntArray | None = None  # points that are known together where `covariance` is of each alone, (s,)
+    sample_covariance: FloatArray | None = None  # of these, object unit^2, (3 s, 3 s)
 
     @property
     def correlated(self) -> bool:
         """Whether the covariance between points is known."""
         return self.covariance is not None and self.covariance.ndim == 2
+
+    def correlated_among(self, points: IntArray) -> bool:
+        """Whether the covariance between some points is known."""
+        return self.correlated or bool(self.sample is not None and np.isin(points, self.sample).all())
 
     @property
     def blocks(self) -> FloatArray:
@@ -110,6 +116,12 @@ class MeasuredPoints:
         Q = np.zeros((3 * len(points), 3 * len(points)))
         for k, j in enumerate(points):
             Q[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] = self.covariance[j]
+        if self.sample is not None and self.sample_covariance is not None:
+            place = np.full(len(self.names), -1)
+            place[self.sample] = np.arange(len(self.sample))
+            known = np.flatnonzero(place[points] >= 0)
+            rows, own = coordinates_of(known), coordinates_of(place[points[known]])
+            Q[np.ix_(rows, rows)] = self.sample_covariance[np.ix_(own, own)]
         return Q
 
     def covariance_between(self, functions: Sequence[Function]) -> FloatArray:
@@ -149,16 +161,20 @@ class MeasuredPoints:
 def measured_points(result: StoredResult) -> MeasuredPoints:
     """Return the points of a result that have coordinates, with the covariance that is known of them.
 
-    Where only that of a sample of the points is known together, each counts by itself.
+    Where only that of a sample of the points is known together, all others count by themselves.
     """
     kept = np.flatnonzero(result.estimate.determined)
     covariance = result.covariance
+    sample = sample_covariance = None
     if covariance is not None and result.covariance_points is None:
         rows = coordinates_of(kept)
         covariance = covariance[np.ix_(rows, rows)]
     elif result.point_covariance is not None:
         blocks = result.point_covariance[kept]
         covariance = blocks if np.isfinite(blocks).all() else None
+        if covariance is not None and result.covariance_points is not None:
+            sample = np.searchsorted(kept, result.covariance_points)
+            sample_covariance = result.covariance
     else:
         covariance = None
     return MeasuredPoints(
@@ -169,6 +185,8 @@ def measured_points(result: StoredResult) -> MeasuredPoints:
         result.datum,
         result.has_scale,
         result.redundancy,
+        sample,
+        sample_covariance,
     )
 
 

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from sfm.conventions import FloatArray, IntArray
+from sfm.display import listed
 from sfm.errors import GeometryError, SurveyFileError
 from sfm.files.csv_tables import read_table
 from sfm.geometry.alignment import Alignment, Nominal, align_321, align_features, align_points
@@ -46,7 +47,6 @@ from sfm.stored_result import StoredResult
 
 SIGMAS = ("sX", "sY", "sZ")
 WITH_AXIS = ("line", "cylinder", "cone", "torus", "paraboloid")
-MAX_NAMED = 5  # in a remark
 SEEN_FROM = 0.8  # of the rays of targets that come from their own side of a surface, at least
 MeshReader = Callable[[Path], tuple[FloatArray, IntArray]]
 
@@ -319,7 +319,7 @@ class _Work:
         if not np.isnan(variance):
             if self.points.depends_on_datum(function).any():
                 remarks.append("depends on the datum of a free network")
-            if not self.points.correlated:
+            if not self.points.correlated_among(function.points):
                 remarks.append("correlations of the points not known")
         sigma = float(np.sqrt(max(variance, 0.0))) if not np.isnan(variance) else float("nan")
         return Quantity(name, what, kind, float(function.value[0]), sigma, "; ".join(remarks))
@@ -357,6 +357,12 @@ class _Work:
         found = []
         if self.points.covariance is None:
             found.append("The result has no standard deviations: nothing is tested or decided.")
+        elif self.points.sample is not None:
+            found.append(
+                f"The covariance between points is known of {len(self.points.sample)} of "
+                f"{len(self.points.names)} points, those with names first: standard deviations of shapes and "
+                "distances of any others leave out the correlations of the points."
+            )
         elif not self.points.correlated:
             found.append(
                 "Only the covariance of each point by itself is known: standard deviations of shapes and "
@@ -375,12 +381,8 @@ class _Work:
                 )
             if not fit.used.all():
                 left = [self.points.names[j] for j in fit.points[~fit.used]]
-                more = f" and {len(left) - MAX_NAMED} more" if len(left) > MAX_NAMED else ""
-                found.append(f"{what}: left out {', '.join(left[:MAX_NAMED])}{more}")
-        for one in tolerances:
-            if one.missing:
-                more = f" and {len(one.missing) - MAX_NAMED} more" if len(one.missing) > MAX_NAMED else ""
-                found.append(f"{one.name}: not measured: {', '.join(one.missing[:MAX_NAMED])}{more}")
+                found.append(f"{what}: left out {listed(left)}")
+        found += [f"{one.name}: not measured: {listed(one.missing)}" for one in tolerances if one.missing]
         return found
 
 

@@ -109,7 +109,11 @@ def _unbounded_open(source: Path | io.BytesIO) -> Image.Image:
 
 
 def refuse_bomb(path: Path, size: tuple[int, int], data: bytes) -> None:
-    """Refuse a file that claims far more pixels than its bytes can hold, or that takes too long to decode."""
+    """Refuse a file that claims far more pixels than its bytes can hold, or that takes too long to decode.
+
+    Raises:
+        PhotographError: more pixels than the bytes can hold, or too many scans.
+    """
     pixels = size[0] * size[1]
     if pixels > BOMB_PIXELS and pixels > BOMB_PX_PER_BYTE * len(data):
         raise PhotographError(
@@ -122,7 +126,11 @@ def refuse_bomb(path: Path, size: tuple[int, int], data: bytes) -> None:
 
 
 def refuse_truncated(path: Path, data: bytes) -> None:
-    """Refuse JPEG and PNG files whose end is missing; OpenCV would return them half grey."""
+    """Refuse JPEG and PNG files whose end is missing; OpenCV would return them half grey.
+
+    Raises:
+        PhotographError: the end is missing.
+    """
     if data.startswith(b"\xff\xd8"):
         at = 2
         while at + 4 <= len(data) and data[at] == 0xFF and data[at + 1] != 0xDA:  # segments before the scan

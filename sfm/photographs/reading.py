@@ -16,6 +16,8 @@ from sfm.photographs.file_checks import opened_header, read_bytes, refuse_bomb, 
 cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
 
 CHANNELS = ("luminance", "red", "green", "blue")
+# IEC 61966-2-1 (sRGB): linear below this signal, a power above it.
+SRGB_LINEAR, SRGB_SLOPE, SRGB_OFFSET, SRGB_POWER = 0.04045, 12.92, 0.055, 2.4
 
 
 def read_photograph(path: str | Path, *, channel: str = "luminance") -> AnyArray:
@@ -64,3 +66,21 @@ def read_photograph(path: str | Path, *, channel: str = "luminance") -> AnyArray
     if image.ndim == 3:
         image = np.ascontiguousarray(image[:, :, {"blue": 0, "green": 1, "red": 2}[channel]])
     return image
+
+
+def take_back_srgb(photograph: AnyArray) -> AnyArray:
+    """Return the light behind the intensities of a photograph with the tone curve of sRGB, as uint16.
+
+    A tone curve moves the place at which an edge is half bright, inwards around dark targets. Centres of
+    circles stay, corners of tags do not.
+
+    Args:
+        photograph: intensities, shape (H, W), uint8 or uint16.
+
+    Source: IEC 61966-2-1.
+    """
+    scale = np.iinfo(photograph.dtype).max
+    signal = np.arange(scale + 1) / scale
+    power = ((signal + SRGB_OFFSET) / (1 + SRGB_OFFSET)) ** SRGB_POWER
+    light = np.where(signal <= SRGB_LINEAR, signal / SRGB_SLOPE, power)
+    return np.asarray(np.rint(65535 * light).astype(np.uint16)[photograph])

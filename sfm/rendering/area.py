@@ -142,6 +142,23 @@ def paint_mark(
 
 
 @compiled
+def cover_with(fine: AnyArray, box: IntArray, value: AnyArray, cover: AnyArray) -> None:
+    """Blend a face into the cells of a photograph by the part of each that it covers.
+
+    Args:
+        fine: intensities of all cells.
+        box: first and last row and column of those of the face, (4,).
+        value: intensities of the face, (rows, columns) of the box.
+        cover: the parts inside the face, 0 to 1, of the same shape.
+    """
+    for i in range(value.shape[0]):
+        for j in range(value.shape[1]):
+            if cover[i, j] > 0:
+                below = fine[box[0] + i, box[2] + j]
+                fine[box[0] + i, box[2] + j] = below + cover[i, j] * (value[i, j] - below)
+
+
+@compiled
 def light_on(a: float, b: float, lamp: Lamp) -> float:
     """Return the light at a place of a face: ambient, and a lamp by the cosine and inverse square laws."""
     d2 = (a - lamp.a) ** 2 + (b - lamp.b) ** 2 + lamp.height**2

@@ -25,7 +25,7 @@ from sfm.errors import GeometryError, OutputError
 from sfm.files.manifest import refuse_foreign_files
 from sfm.files.plain_text import csv_text
 from sfm.files.whole_files import whole_files
-from sfm.rendering.area import Lamp, fill_face, paint_mark
+from sfm.rendering.area import Lamp, cover_with, fill_face, paint_mark
 from sfm.rendering.painting_order import painting_order
 from sfm.rendering.scene import ARC, DISC, UNCODED, Optics, Scene
 from sfm.rendering.scene_file import Staging, read_scene
@@ -69,8 +69,9 @@ def render_photograph(
     width, height = camera.size_px
     n = optics.oversampling
     fine = np.full((height * n, width * n), scene.background, dtype=np.float32)
+    scratch = np.empty((2, fine.size), dtype=np.float32)  # once for all faces: fresh memory is slow
     for face in painting_order(scene, position):
-        _paint_face(fine, scene, int(face), camera, position, rotation, rays, n)
+        _paint_face(fine, scene, int(face), camera, position, rotation, rays, n, scratch)
     sigma = optics.blur_px * n
     if sigma > 0:
         reach = 2 * math.ceil(5 * sigma) + 1
@@ -120,6 +121,9 @@ def corner_rays(camera: Camera) -> FloatArray:
     """Return the tangents (u, v) at the corners of all pixels, (height + 1, width + 1, 2).
 
     Between the corners of a pixel they are linear to 1e-4 px even where distortion reaches 100 px.
+
+    Raises:
+        GeometryError: the distortion cannot be inverted in all of the photograph.
     """
     width, height = camera.size_px
     x, y = np.meshgrid(np.arange(width + 1) - 0.5, np.arange(height + 1) - 0.5)
@@ -154,33 +158,37 @@ def _paint_face(
     rotation: FloatArray,
     rays: FloatArray,
     n: int,
+    scratch: AnyArray,
 ) -> None:
     """Paint one face with its marks and its light over what is there, n cells along a pixel."""
     faces, marks = scene.faces, scene.marks
     H = _plane_from_ray(scene, face, position, rotation)
 
-    def window(centre: FloatArray, half: FloatArray) -> IntArray:
-        place = faces.place(np.full(len(SQUARE), face), centre + half * SQUARE)
-        return _window(project(camera, position, rotation, place), fine.shape, n)
+    def windows(centre: FloatArray, half: FloatArray) -> IntArray:
+        around = (centre[:, None] + half[:, None] * SQUARE).reshape(-1, 2)
+        places = faces.place(np.full(len(around), face), around)
+        xy = project(camera, position, rotation, places).reshape(len(centre), len(SQUARE), 2)
+        return _windows(xy, fine.shape, n)
 
-    box = window(np.zeros(2), faces.half[face])
+    box = windows(np.zeros((1, 2)), faces.half[face][None])[0]
     if box[0] >= box[1] or box[2] >= box[3]:
         return
-    value = np.empty((box[1] - box[0], box[3] - box[2]), dtype=np.float32)
-    cover = np.empty_like(value)
+    shape_of_box = (box[1] - box[0], box[3] - box[2])
+    value, cover = (cells[: shape_of_box[0] * shape_of_box[1]].reshape(shape_of_box) for cells in scratch)
     rectangle = np.array([*faces.half[face], 0.0, 0.0])
     lamp = _lamp(scene, face)
     surface = faces.value[face], faces.texture[face], faces.grain[face]
     fill_face(value, cover, box, rays, H, rectangle, *surface, face, lamp, n)
-    for k in np.flatnonzero(marks.face == face):
-        shape, kind = marks.shape[k], int(marks.kind[k])
-        reach = shape[0] if kind == DISC else shape[1] if kind == ARC else math.hypot(shape[0], shape[1])
-        part = window(marks.centre[k], np.full(2, reach))
-        part[::2] = np.maximum(part[::2], box[::2])
-        part[1::2] = np.minimum(part[1::2], box[1::2])
-        paint_mark(value, box, part, rays, H, kind, marks.centre[k], shape, marks.value[k], lamp, n)
-    part = fine[box[0] : box[1], box[2] : box[3]]
-    part += cover * (value - part)
+    own = np.flatnonzero(marks.face == face)
+    kinds = (marks.kind[own] == DISC, marks.kind[own] == ARC)
+    reach = np.select(kinds, marks.shape[own, :2].T, np.hypot(*marks.shape[own, :2].T))
+    parts = windows(marks.centre[own], np.column_stack([reach, reach]))
+    parts[:, ::2] = np.maximum(parts[:, ::2], box[::2])
+    parts[:, 1::2] = np.minimum(parts[:, 1::2], box[1::2])
+    for k, part in zip(own, parts, strict=True):
+        kind = int(marks.kind[k])
+        paint_mark(value, box, part, rays, H, kind, marks.centre[k], marks.shape[k], marks.value[k], lamp, n)
+    cover_with(fine, box, value, cover)
 
 
 # A square of half length 1, points along its sides so that its image is bounded under distortion too.
@@ -195,14 +203,15 @@ SQUARE = np.concatenate(
 )
 
 
-def _window(xy: FloatArray, shape: tuple[int, ...], n: int) -> IntArray:
-    """Return the first and last row and column of the cells around some places, (4,); in whole pixels."""
-    if not np.isfinite(xy).all():  # partly behind the camera
-        return np.array([0, shape[0], 0, shape[1]])
-    low = np.floor(xy.min(axis=0) - 1).astype(np.int64) * n
-    high = np.ceil(xy.max(axis=0) + 2).astype(np.int64) * n
-    low, high = np.clip(low, 0, shape[::-1]), np.clip(high, 0, shape[::-1])
-    return np.array([low[1], high[1], low[0], high[0]])
+def _windows(xy: FloatArray, shape: tuple[int, ...], n: int) -> IntArray:
+    """Return first and last row and column of the cells around places (k, p, 2), (k, 4); in whole pixels."""
+    whole = (0, shape[0], 0, shape[1])
+    in_front = np.asarray(np.isfinite(xy).all(axis=(1, 2)))
+    seen = np.where(in_front[:, None, None], xy, 0.0)
+    low = np.clip(np.floor(seen.min(axis=1) - 1).astype(np.int64) * n, 0, shape[::-1])
+    high = np.clip(np.ceil(seen.max(axis=1) + 2).astype(np.int64) * n, 0, shape[::-1])
+    found = np.column_stack([low[:, 1], high[:, 1], low[:, 0], high[:, 0]])
+    return np.where(in_front[:, None], found, whole)  # partly behind the camera: anywhere
 
 
 def _lamp(scene: Scene, face: int) -> Lamp:

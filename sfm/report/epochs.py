@@ -9,9 +9,11 @@ from typing import Any
 
 import numpy as np
 
+from sfm.adjustment.quality.statistics import POWER
 from sfm.conventions import FloatArray
+from sfm.display import listed
 from sfm.epochs.blocks import BlockMotion
-from sfm.epochs.displacements import POWER, Displacements
+from sfm.epochs.displacements import Displacements
 from sfm.epochs.series import EpochPair, EpochSeries
 from sfm.epochs.together import SharedCamera
 from sfm.files.plain_text import csv_text, or_none
@@ -20,7 +22,11 @@ from sfm.report.figures.plots import Plot, png
 from sfm.report.html.page import render
 from sfm.report.numbers import finer_unit, significant
 from sfm.report.page_files import write_files
+from sfm.report.viewer.displaced_scene import scene_of_displacements
+from sfm.report.viewer.embedded import Viewer, viewer_of
+from sfm.report.viewer.pictures import cut_pictures
 
+NAMED = 12  # points in a sentence
 FILES = ("displacements.csv", "series.csv", "epochs.json", "epochs.html")
 COLUMNS = (
     *("first", "second", "id", "dX", "dY", "dZ", "sdX", "sdY", "sdZ", "length", "T", "critical", "stable"),
@@ -28,7 +34,6 @@ COLUMNS = (
 )
 SERIES = ("id", "epoch", "dX", "dY", "dZ", "sdX", "sdY", "sdZ", "moved")
 DRAWN = 12  # points of a series that are drawn, those that moved farthest
-NAMED = 12  # points that a sentence names
 MOSTLY = 0.5  # of Omega: what a bending takes away of it is told from here on
 PICTURE = (
     "Displacements: arrows in the object's main plane, points that moved in red; the colour of the dots is "
@@ -160,6 +165,7 @@ def epochs_page(found: EpochSeries) -> str:
         remarks=[words for k, (words, _) in enumerate(told) if k != len(found.since_first) - 1],
         level=level,
         power=POWER,
+        viewer=_viewer(found),
         cameras=[words_of_camera(one) for one in found.cameras],
         pairs=[
             {
@@ -247,6 +253,14 @@ def _series_rows(found: EpochSeries) -> Iterable[tuple[object, ...]]:
             yield (name, one.differences.names[1], *one.displacement[k], *one.sigma[k], int(one.moved[k]))
 
 
+def _viewer(found: EpochSeries) -> Viewer | None:
+    """Return the scene of the first epoch with the displacements to the last; None without photographs."""
+    if not found.first.result.estimate.oriented.any():
+        return None
+    scene = scene_of_displacements(found.since_first[-1].displacements, found.first.result)
+    return viewer_of(scene, cut_pictures(scene, {}, budget_mb=0.0))
+
+
 def _picture(found: Displacements, number: int) -> Plot | None:
     if not np.linalg.norm(found.displacement, axis=1).max() > 0:
         return None
@@ -302,6 +316,4 @@ def _same(found: Displacements) -> bool:
 
 
 def _names(names: Iterable[str]) -> str:
-    all_of_them = list(names)
-    said = ", ".join(all_of_them[:NAMED])
-    return said if len(all_of_them) <= NAMED else f"{said} and {len(all_of_them) - NAMED} more"
+    return listed(names, most=NAMED)

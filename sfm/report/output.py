@@ -37,6 +37,7 @@ WRITTEN = (
     "image_points.csv",
     "point_covariance.npy",
     "point_covariance_points.csv",
+    "targets.csv",
     "left_out.csv",
     "given.csv",
     "reliability.csv",

@@ -7,6 +7,7 @@ import numpy as np
 from sfm.adjustment.quality.statistics import GLOBAL_ALPHA, GlobalTest
 from sfm.adjustment.result import Adjustment
 from sfm.conventions import FloatArray
+from sfm.display import listed
 from sfm.report.findings.checks import CheckedControl, Sigma0
 from sfm.report.findings.findings import Findings
 from sfm.report.findings.geometry import WEAK_DEG, Coverage, Geometry
@@ -17,7 +18,6 @@ from sfm.result import SurveyResult
 
 NOT_CHECKED = "not checked"
 MAX_BINS = 12  # numbers of rays that are told one by one
-MAX_NAMES = 5  # weak points that are named
 
 
 def words_of_sigma0(sigma0: Sigma0) -> tuple[str, str]:
@@ -123,9 +123,8 @@ def words_of_geometry(findings: Findings) -> tuple[tuple[str, str], ...]:
     """Return what is told of the geometry of the network, and the words for it."""
     network, found = findings.result.adjustment.network, findings.geometry
     weak = found.weak
-    names = ", ".join(f"{network.points[j]} ({found.angle_deg[j]:.1f})" for j in weak[:MAX_NAMES])
-    more = " ..." if len(weak) > MAX_NAMES else ""
-    told = f"{len(weak)} points: {names}{more}" if len(weak) else "none"
+    names = listed(f"{network.points[j]} ({found.angle_deg[j]:.1f})" for j in weak)
+    told = f"{len(weak)} points: {names}" if len(weak) else "none"
     points = tuple(f"point {name}" for name in network.points)
     known = found.angle_deg[np.isfinite(found.angle_deg)]
     mean = f", mean {known.mean():.1f} deg; below {WEAK_DEG:g} deg: {told}" if len(known) else ""

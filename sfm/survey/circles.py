@@ -8,6 +8,7 @@ import numpy as np
 
 from sfm.camera import pixel_jacobian
 from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
+from sfm.display import listed
 from sfm.network import Estimate, ImagePoints, Network, rows_of
 from sfm.orientation.eccentricity import CircleViews, ellipse_shape, fit_circles
 from sfm.result import Eccentricity
@@ -18,13 +19,14 @@ from sfm.survey.inputs.survey import Survey
 from sfm.survey.target_network import UNNAMED
 from sfm.targets.flags import Flag
 
+NO_CIRCLE = Flag.CORNER | Flag.CROSSING
+
 NOT_A_CIRCLE = (
     0.1  # relative misfit of the semi-axes; targets have 0.003 to 0.03, letters and leaves over 0.2
 )
 
 
 OTHER_SIZE = 0.1  # relative difference of a stated diameter from that of the ellipses, which know 1 to 3 %
-MAX_NAMED = 10  # ids in a warning
 
 
 @dataclass(frozen=True)
@@ -119,7 +121,7 @@ def _seen_twice(
     """Return which image points are of targets with an outline in two oriented photographs or more, (k,)."""
     seen = network.image_points
     rows = estimate.oriented[seen.image] & estimate.determined[seen.point]
-    rows &= _named(photographs, naming, [(found.flag & Flag.CORNER) == 0 for found in photographs.targets])
+    rows &= _named(photographs, naming, [(found.flag & NO_CIRCLE) == 0 for found in photographs.targets])
     rays = np.bincount(seen.point[rows], minlength=len(network.points))
     return np.asarray(rows & (rays[seen.point] >= 2))
 
@@ -140,11 +142,7 @@ def _unknown_ids(given: Diameters | None, points: tuple[str, ...]) -> tuple[str,
     unknown = [name for name in given.names if name not in known] if given is not None else []
     if given is None or not unknown:
         return ()
-    more = f" and {len(unknown) - MAX_NAMED} more" if len(unknown) > MAX_NAMED else ""
-    return (
-        f"{given.source}: diameters of targets that are not in the survey: "
-        f"{', '.join(unknown[:MAX_NAMED])}{more}",
-    )
+    return (f"{given.source}: diameters of targets that are not in the survey: {listed(unknown)}",)
 
 
 def _other_sizes(

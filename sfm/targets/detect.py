@@ -6,15 +6,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sfm.conventions import AnyArray, FloatArray, IntArray
+from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
 from sfm.errors import KolinearError, PhotographError
 from sfm.targets.candidates import find_counters, find_duplicates, find_parts_of_codes, judge_fits
-from sfm.targets.codes.families import Family, code_family
+from sfm.targets.codes.families import TargetFamily, code_family
+from sfm.targets.codes.plates import PlateFamily, find_crossings, name_dots
 from sfm.targets.codes.ring_reading import UNCODED, UNREADABLE, read_codes
 from sfm.targets.codes.rings import CodeFamily
 from sfm.targets.codes.tags import DRAWN_PX, TagCorners, TagFamily, find_tags, inside_tags
 from sfm.targets.fits.centroid import WEIGHTS, measure_centroids
 from sfm.targets.fits.edge_ellipse import measure_edge_ellipses
+from sfm.targets.fits.saddle import Saddles
 from sfm.targets.flags import Flag
 from sfm.targets.measure import EllipseFit, axes_covariance, axes_from_shape, fit_ellipse_model
 from sfm.targets.outlines import estimate_noise, find_outlines, scale_of
@@ -72,7 +74,7 @@ def find_targets(
     photograph: AnyArray,
     *,
     polarity: str = "auto",
-    codes: str | Family = "none",
+    codes: str | TargetFamily = "none",
     centres: str = "model",
     min_diameter_px: float = 4.0,
     max_diameter_px: float = 250.0,
@@ -86,7 +88,7 @@ def find_targets(
         photograph: intensities, shape (H, W), uint8 or uint16.
         polarity: dark, bright or auto (both).
         codes: a name in `sfm.targets.codes.families.FAMILIES` (arcs, ring12, ring14, ring20, none, a family
-            of tags), the path of a code table, or a family.
+            of tags), the path of a code table, or a family, as that of a calibration plate.
         centres: how centres are measured: model (least squares fit of a blurred ellipse, the most precise),
             edges (ellipse through the edges on rays), or the centroid with binary, intensity or squared
             weights.
@@ -127,9 +129,9 @@ def find_targets(
         raise KolinearError(
             f"diameters from {min_diameter_px} to {max_diameter_px} px, expected positive ones in order"
         )
-    if not isinstance(codes, str | CodeFamily | TagFamily):
+    if not isinstance(codes, str | CodeFamily | TagFamily | PlateFamily):
         raise KolinearError(f"codes {codes!r}, expected the name of a family, as 'ring14' or 'none'")
-    family = code_family(codes)
+    family = codes if isinstance(codes, PlateFamily) else code_family(codes)
     noise, scale = estimate_noise(photograph), scale_of(photograph)
     limits = {"min_diameter_px": min_diameter_px, "max_diameter_px": max_diameter_px}
     outlines = find_outlines(photograph, SIGNS[polarity], noise=noise, scale=scale, **limits)
@@ -150,6 +152,10 @@ def find_targets(
             photograph, fit.xy[good], fit.shape[good], levels[good], family, blur_px=fit.blur[good]
         )
         reason[good & find_parts_of_codes(fit, code, confidence, family)] = Flag.PART_OF_CODE
+    if isinstance(family, PlateFamily):
+        code[good] = _name_dots(fit, outlines.sign, good, family)
+        confidence[code >= 0] = 1.0
+        reason[good & (code < 0)] = Flag.NOT_ON_PLATE.value
     free = np.flatnonzero((reason == 0) & (code < 0))
     counter = find_counters(photograph, fit.xy[free], fit.shape[free], levels[free])
     reason[free[counter]] = Flag.THIN_BACKGROUND.value
@@ -179,7 +185,19 @@ def find_targets(
         rejected_xy=np.vstack([outlines.rejected_xy, outlines.xy[reason != 0]]),
         rejected_flag=np.concatenate([outlines.rejected_flag, reason[reason != 0]]),
     )
+    if isinstance(family, PlateFamily) and family.name != "grid":
+        return _with_crossings(targets, *find_crossings(photograph, family, scale=scale, noise=noise))
     return targets if tags is None else _with_corners(targets, tags)
+
+
+def _name_dots(fit: EllipseFit, sign: IntArray, good: BoolArray, plate: PlateFamily) -> IntArray:
+    """Return which point of a plate each good target is; insides of rings are of the other polarity."""
+    if plate.name != "grid" or not good.any():
+        return np.full(int(good.sum()), UNCODED)
+    semi_axes, _ = axes_from_shape(fit.shape[good])
+    own = sign[good]
+    is_ring = own != (1 if (own > 0).sum() > len(own) / 2 else -1)
+    return name_dots(fit.xy[good], np.sqrt(semi_axes.prod(axis=1)), is_ring, plate)
 
 
 def _measure_centres(
@@ -190,6 +208,29 @@ def _measure_centres(
         edges = measure_edge_ellipses(photograph, fit.xy, fit.shape, sign, noise=noise)
         return edges.xy, edges.covariance
     return measure_centroids(photograph, fit.xy, fit.shape, sign, noise=noise, weights=centres)
+
+
+def _with_crossings(targets: Targets, found: Saddles, code: IntArray) -> Targets:
+    """Return the crossings of a board; circles have no place on it."""
+    k = len(found.xy)
+    return Targets(
+        xy=found.xy,
+        covariance=found.covariance,
+        axes_covariance=np.full((k, 3, 3), np.nan),
+        edge_covariance=np.full((k, 3, 3), np.nan),
+        semi_axes=np.full((k, 2), DRAWN_PX),
+        angle=np.zeros(k),
+        code=code,
+        confidence=np.ones(k),
+        polarity=np.ones(k, dtype=np.int64),
+        contrast=found.contrast,
+        background=np.full(k, np.nan),
+        blur=np.full(k, np.nan),
+        noise=np.full(k, np.nan),
+        flag=np.full(k, Flag.CROSSING.value),
+        rejected_xy=targets.rejected_xy,
+        rejected_flag=targets.rejected_flag,
+    )
 
 
 def _with_corners(targets: Targets, tags: TagCorners) -> Targets:

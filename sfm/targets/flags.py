@@ -23,6 +23,7 @@ class Flag(IntFlag):
     CORNER = 1 << 4  # the corner of a square tag, no circle
     HALO = 1 << 5  # the background falls off from the edge: light scattered about a retro-reflective target
     FLARE = 1 << 6  # the background is saturated or changes strongly across the target: glare on its surface
+    CROSSING = 1 << 7  # a crossing of a checkerboard, no circle
     # reasons for a rejection
     CUT_BY_BORDER = 1 << 8  # the border of the photograph cuts the target or its background
     TOO_SMALL = 1 << 9  # below min_diameter_px
@@ -38,6 +39,7 @@ class Flag(IntFlag):
     PART_OF_CODE = 1 << 19  # inside the code ring of another target
     LOBED = 1 << 20  # the outline deviates from the ellipse as bars and squares do
     THIN_BACKGROUND = 1 << 21  # the background is only a thin stroke, as in a letter "o"
+    NOT_ON_PLATE = 1 << 22  # no dot of the calibration plate
 
 
 def count_flags(flags: IntArray) -> list[tuple[str, int]]:

@@ -225,8 +225,6 @@ def test_a_reader_that_ends_early_is_no_error(tmp_path: Path) -> None:
     ):
         assert without_reader(*arguments) == (141, "", ""), arguments
     assert (tmp_path / "out" / "report.html").exists()
-    a = tmp_path / "out"
-    assert without_reader("compare", a, a, "--out", tmp_path / "both") == (141, "", "")
 
 
 def test_a_reader_of_errors_that_ends_early_changes_nothing(tmp_path: Path) -> None:

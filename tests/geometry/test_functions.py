@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from sfm.errors import GeometryError
+from sfm.geometry.alignment import align_321
 from sfm.geometry.functions import (
     angle_at,
     angle_of_directions,
@@ -19,9 +20,11 @@ from sfm.geometry.functions import (
     height,
     point_function,
 )
-from sfm.geometry.measured import Function, MeasuredPoints, matches
+from sfm.geometry.hidden_points import with_hidden_point
+from sfm.geometry.measured import Function, MeasuredPoints, matches, measured_points
 from sfm.geometry.shapes.fit import fit_shape
 from tests.geometry.simulated import in_free_datum, random_covariance
+from tests.inspection.benches import one_bench
 from tests.synthetic import seed_of
 
 NAMES = tuple("ABCDEFGH")
@@ -109,3 +112,37 @@ def test_what_has_no_derivative_is_refused() -> None:
         distance(p(measured, "A"), p(measured, "A"))
     with pytest.raises(GeometryError, match="parallel"):
         angle_of_directions(unit(measured), difference(p(measured, "B"), p(measured, "C")))
+
+
+def test_points_of_a_sample_are_known_together() -> None:
+    """As of a result of more than 1000 points: distances, hidden points, shapes and alignment."""
+    whole = measured_points(one_bench())
+    n = len(whole.names)
+    kept = np.flatnonzero([name[0] != "d" for name in whole.names])
+    some = measured_points(
+        replace(
+            one_bench(),
+            covariance=whole.covariance_of(kept),
+            covariance_points=kept,
+        )
+    )
+    assert some.sample is not None and not some.correlated and some.correlated_among(kept)
+    assert not some.correlated_among(np.arange(n))
+    inside, across = ("p3", "c7"), ("p3", "d4")
+    for names, same in ((inside, True), (across, False)):
+        functions = [distance(*(point_function(one, name) for name in names)) for one in (whole, some)]
+        variance = [
+            one.covariance_between([f])[0, 0] for one, f in zip((whole, some), functions, strict=True)
+        ]
+        assert (abs(variance[1] / variance[0] - 1) < 1e-12) == same
+    both = [with_hidden_point(one, "tip", "p1", "p2", 0.1, 1e-5) for one in (whole, some)]
+    aligned = [align_321(one, ["p1", "p5", "p25"], ["p1", "p5"], "p1").apply(one) for one in both]
+    for pair in (both, aligned):
+        fits = [fit_shape(one, "circle", one.matching(["c*"], "flange")).sigma_of("diameter") for one in pair]
+        assert fits[1] == pytest.approx(fits[0], rel=1e-9)
+        functions = [distance(point_function(one, "tip"), point_function(one, "z3")) for one in pair]
+        first, second = (one.covariance_between([f])[0, 0] for one, f in zip(pair, functions, strict=True))
+        assert second == pytest.approx(first, rel=1e-9)
+        assert pair[1].blocks[kept] == pytest.approx(pair[0].blocks[kept], rel=1e-9)
+    lost = align_321(some, ["d1", "d5", "d9"], ["d1", "d5"], "d1").apply(some)
+    assert lost.sample is None and not lost.correlated_among(kept)

@@ -72,9 +72,14 @@ def bench_network(seed: str, *, images: int = 10) -> tuple[Network, Estimate]:
 
 
 def bench_result(seed: str) -> StoredResult:
-    """Return an adjusted network as files hold it, with the covariance of all points."""
+    """Return an adjusted network as files hold it, with the covariance of all points.
+
+    Nothing is rejected: its noise has no gross errors. Data snooping at 0.1 % takes 1.8 good image points of
+    850 away, by which sigma0^2 falls by 1.5 % and the statistics of shapes rise by 3 % (46 in place of 37 of
+    600 fits rejected at 5 %).
+    """
     network, truth = bench_network(seed)
-    a = sfm.adjust(network, truth)
+    a = sfm.adjust(network, truth, reject="none")
     n = len(network.points)
     joint = marginal_of(a).joint(np.zeros(0, dtype=np.int64), np.arange(n))
     blocks = np.stack([joint[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] for k in range(n)])

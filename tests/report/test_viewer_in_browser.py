@@ -346,3 +346,49 @@ def test_without_a_script_the_page_still_tells_its_figures(browser: Any, page_fi
     assert "RMS residual" in text
     assert not tab.page.locator("#explore").is_visible()
     tab.close()
+
+
+def test_displacements_and_deviations_are_coloured_and_drawn(
+    browser: Any, scene: ViewerScene, tmp_path: Path
+) -> None:
+    """Colours follow the legend, moved points have red arrows, and the panel says the displacement."""
+    size = np.linspace(1e-4, 2.4e-3, POINTS)
+    displacement = np.zeros((POINTS, 3))
+    displacement[:, 2] = size
+    state = tuple("moved" if j % 2 else "stable" for j in range(POINTS))
+    values = np.linspace(-2e-3, 1e-3, POINTS)
+    pages = {
+        "displacement": replace(scene, displacement=displacement, state=state, notes=("of the epochs",)),
+        "deviation": replace(scene, deviation=values),
+    }
+    for kind, made in pages.items():
+        page = write_view(made, tmp_path / f"{kind}.html", source="here", paths={})
+        tab = Tab(browser, page)
+        tab.ready()
+        assert tab.page.locator("#points-by").input_value() == kind
+        assert f"{kind} of a point" in tab.page.locator(".v-legend-name").first.inner_text()
+        shades = tab.page.evaluate(
+            "() => { const { scene } = document.getElementById('explore').viewer;"
+            " return [...scene.scales.values].map((v) => scene.scales.point.colour(v)) }"
+        )
+        if kind == "displacement":  # whose arrows begin in the middle of the points
+            tab.page.get_by_label("displacements", exact=True).uncheck()
+        seen = np.array(tab.page.evaluate(PIXELS), dtype=float)
+        assert np.median(np.abs(seen - np.array(shades)).max(axis=1)) <= 6
+        first, last = np.array(shades[0]), np.array(shades[-1])
+        assert np.abs(first - last).max() > 80
+        if kind == "displacement":
+            assert "moved points in red" in tab.page.locator(".v-top").inner_text()
+            tab.page.evaluate(SELECT, ["point", 23])
+            panel = tab.page.locator(".v-panel").inner_text()
+            assert (
+                "2.40 mm (0.00, 0.00, 2.40), moved" in panel
+                or "2400.00 µm (0.00, 0.00, 2400.00), moved" in panel
+            )
+            ends = tab.page.evaluate(
+                "() => document.getElementById('explore').viewer.scene.displacements.object.children.map("
+                "(part) => part.geometry.attributes.position.count)"
+            )
+            assert ends == [6 * POINTS // 2, 6 * POINTS // 2]
+        assert tab.complaints == []
+        tab.close()

@@ -23,8 +23,8 @@ from sfm.pipeline import run_survey
 from sfm.report.findings.findings import findings_of
 from sfm.result import SurveyResult
 from sfm.similarity import fit_similarity
-from sfm.survey.inputs.calibration import Calibration, with_calibration
-from sfm.survey.inputs.survey import Survey, read_survey
+from sfm.survey.inputs.calibration import Calibration
+from sfm.survey.inputs.survey import Survey, read_survey, with_calibration
 from sfm.survey.measuring.target_store import TargetStore
 from tests.places import DATASETS, SHARED
 

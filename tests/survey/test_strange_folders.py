@@ -126,6 +126,18 @@ def scene(folder: Path) -> Path:
     return path
 
 
+PLANNED = (
+    "--camera",
+    "full-frame-24",
+    "--c-mm",
+    28,
+    "--sigma-px",
+    0.05,
+    "--stations",
+    "ring:5",
+    "--points",
+    12,
+)
 COMMANDS: dict[str, Command] = {
     "adjust": (lambda f: ("adjust", observed(f)), ("out", "out/s", "out/.s.lock")),
     "run": (
@@ -166,6 +178,10 @@ COMMANDS: dict[str, Command] = {
     "epochs": (
         lambda f: ("epochs", *results(f)),
         ("out", "out/epochs", "out/.epochs.lock"),
+    ),
+    "plan": (
+        lambda f: ("plan", "network", "plate:1000,700", *PLANNED),
+        ("out", "out/plan", "out/.plan.lock"),
     ),
     "validate": (
         lambda f: ("validate", "--networks", 1, "--jobs", 1),

@@ -22,6 +22,13 @@ def test_a_second_solution_of_equal_cost_makes_the_survey_bad() -> None:
     assert any("Another solution, with c of camera synthetic at 5.7" in line for line in found.remarks)
 
 
+def test_c_that_had_to_be_held_is_tried_at_other_values() -> None:
+    """A plane from within 14 degrees, c 88 % too long and held: 5.7 sigma wrong and called fair."""
+    found = outcome_of(309)
+    assert found.over_sigma > 5 and found.level == "bad"
+    assert any("Another solution, with c of camera synthetic at" in line for line in found.remarks)
+
+
 def test_two_photographs_of_a_plane_are_bad() -> None:
     """12 sigma wrong and called fair: two orientations fit alike."""
     found = outcome_of(59)

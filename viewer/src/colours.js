@@ -80,16 +80,28 @@ export function pointScales(model) {
   }
   const values = { sigma, rays: model.a["point.rays"], rms, angle: model.a["point.angle"] }
   if (!known.length) delete scales.sigma
+  if (model.a["point.displacement"]) {
+    const displacement = Float64Array.from({ length: model.pointCount }, (_, j) => model.displacement(j))
+    const first = new Scale("displacement of a point", model.fine.unit, 0, roundAbove(displacement, model.fine.factor), {
+      factor: model.fine.factor,
+    })
+    return { scales: { displacement: first, ...scales }, values: { displacement, ...values } }
+  }
   const deviation = model.a["point.deviation"]
   if (deviation) {
-    const size = deviation.reduce((most, d) => (Math.abs(d) > most ? Math.abs(d) : most), 0) || 1
-    const step = 10 ** Math.floor(Math.log10(size * model.fine.factor)) / model.fine.factor
-    const most = step * Math.ceil(size / step)
+    const most = roundAbove(deviation, model.fine.factor)
     const options = { factor: model.fine.factor, steps: SIGNED }
     const first = new Scale("deviation of a point", model.fine.unit, -most, most, options)
     return { scales: { deviation: first, ...scales }, values: { deviation, ...values } }
   }
   return { scales, values }
+}
+
+/** A round number of the fine unit that no value is larger than. */
+function roundAbove(values, factor) {
+  const size = values.reduce((most, d) => (Math.abs(d) > most ? Math.abs(d) : most), 0) || 1
+  const step = 10 ** Math.floor(Math.log10(size * factor)) / factor
+  return step * Math.ceil(size / step)
 }
 
 export function photoScale() {

@@ -26,6 +26,12 @@ export function tablesOf(model, hub, element, scene) {
       number("rays", "rays", (j) => a["point.rays"][j], String),
       number("angle", "angle", (j) => a["point.angle"][j], (v) => (Number.isFinite(v) ? v.toFixed(1) : ""), "deg"),
       number("rms", "RMS", (j) => a["point.rms"][j], short, "px"),
+      ...(a["point.displacement"]
+        ? [
+            number("displacement", "displacement", (j) => model.displacement(j) * fine.factor, short, fine.unit),
+            text("state", "", (j) => model.states[a["point.state"][j]]),
+          ]
+        : []),
       ...(a["point.deviation"] ? [number("deviation", "deviation", (j) => a["point.deviation"][j] * fine.factor, short, fine.unit)] : []),
     ],
     every(model.pointCount),

@@ -83,6 +83,11 @@ class Model {
     return Math.max(Math.abs(x), Math.abs(y))
   }
 
+  /** Length of the displacement of a point; NaN where not known. */
+  displacement(j) {
+    return Math.hypot(...this.a["point.displacement"].subarray(3 * j, 3 * j + 3))
+  }
+
   residual(k) {
     return Math.hypot(...this.pair("ray.v", k))
   }

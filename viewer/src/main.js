@@ -74,7 +74,7 @@ function toolbar(model, scene, hub, tools, legends) {
   const own = make("div", { className: "v-legend" })
   const other = make("div", { className: "v-legend" })
   legends.append(own, other)
-  let by = scales.deviation ? "deviation" : scales.sigma ? "sigma" : "rms"
+  let by = scales.displacement ? "displacement" : scales.deviation ? "deviation" : scales.sigma ? "sigma" : "rms"
   let byPhoto = "rms"
   const paint = () => {
     scene.points.paint(values[by], scales[by])
@@ -90,7 +90,7 @@ function toolbar(model, scene, hub, tools, legends) {
   const names = make("datalist", { id: "viewer-names" })
   find.addEventListener("input", () => suggest(model, find.value, names))
   find.addEventListener("change", () => findName(model, scene, hub, find))
-  const words = { sigma: "sigma", rays: "rays", rms: "RMS", angle: "intersection angle", deviation: "deviation" }
+  const words = { sigma: "sigma", rays: "rays", rms: "RMS", angle: "intersection angle", deviation: "deviation", displacement: "displacement" }
   const options = Object.keys(scales).map((key) => [key, words[key]])
   const views = [["", "view ..."], ["home", "oblique"], ...["+X", "-X", "+Y", "-Y", "+Z", "-Z"].map((v) => [v, `from ${v}`])]
   const standard = choice("", views, (name) => {
@@ -123,10 +123,22 @@ function toolbar(model, scene, hub, tools, legends) {
       scene.rays.showRejected(on)
       scene.invalidate()
     }),
+    ...displacementTools(scene),
     ...ellipsoidTools(model, scene),
     button("save picture", () => savePicture(scene, model.name)),
   )
   paint()
+}
+
+/** The box of the displacements, and by what they are enlarged. */
+function displacementTools(scene) {
+  const { displacements } = scene
+  if (!displacements.known) return []
+  const box = tick("displacements", true, (on) => {
+    displacements.object.visible = on
+    scene.invalidate()
+  })
+  return [box, make("span", { className: "v-count" }, `${significant(displacements.factor, 1)} times enlarged, moved points in red`)]
 }
 
 /** The box and the slider of the ellipsoids, and by what they are enlarged. */

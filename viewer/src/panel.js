@@ -70,6 +70,7 @@ export class Panel {
         ["intersection angle", `${fixed(model.a["point.angle"][j], 1)} deg`],
         ["RMS residual", `${fixed(model.a["point.rms"][j], 4)} px`],
         Number.isFinite(model.a["point.deviation"]?.[j]) ? ["deviation", `${fixed(model.a["point.deviation"][j] * model.fine.factor, 4)} ${model.fine.unit}`] : null,
+        model.a["point.displacement"] && Number.isFinite(model.displacement(j)) ? ["displacement", this.displacementWords(j)] : null,
         model.control.includes(j) ? ["given as", "control point"] : null,
       ]),
       this.distance(j),
@@ -77,6 +78,15 @@ export class Panel {
       make("p", { className: "note" }, cropLegend(factor)),
       cards,
     )
+  }
+
+  /** Length and parts of the displacement of a point, and what the test says of it. */
+  displacementWords(j) {
+    const { model } = this
+    const { factor, unit } = model.fine
+    const parts = [0, 1, 2].map((c) => fixed(model.a["point.displacement"][3 * j + c] * factor, 2))
+    const state = model.states[model.a["point.state"][j]]
+    return `${fixed(model.displacement(j) * factor, 2)} ${unit} (${parts.join(", ")})${state ? `, ${state}` : ""}`
   }
 
   /** The distance to another point, from here or to here. */

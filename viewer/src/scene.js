@@ -2,6 +2,7 @@
 
 import * as THREE from "three"
 import { OrbitControls } from "three/examples/jsm/controls/OrbitControls.js"
+import { Displacements } from "./displacements.js"
 import { Ellipsoids } from "./ellipsoids.js"
 import { drawLabels } from "./labels.js"
 import { Picker } from "./picking.js"
@@ -27,11 +28,12 @@ export class Scene {
     this.photographs = new Photographs(model, this.origin, this.pyramid)
     this.rays = new Rays(model, this.origin)
     this.ellipsoids = new Ellipsoids(model, this.origin)
+    this.displacements = new Displacements(model, this.origin, this.objectRadius)
     this.given = lines(this.barEnds(), "#e07b1a")
     this.control = this.controlMarks()
     this.distance = lines([], "#d4358b")
     this.distance.renderOrder = 2
-    for (const part of [this.points, this.photographs, this.rays, this.ellipsoids]) this.world.add(part.object)
+    for (const part of [this.points, this.photographs, this.rays, this.ellipsoids, this.displacements]) this.world.add(part.object)
     this.world.add(this.given, this.control, this.distance)
     this.perspective = new THREE.PerspectiveCamera(FIELD_DEG, 1, this.radius / 1000, this.radius * 100)
     this.orthographic = new THREE.OrthographicCamera(-1, 1, 1, -1, -this.radius * 50, this.radius * 100)
@@ -306,7 +308,7 @@ export class Scene {
     this.due = false
     this.pace()
     const dark = matchMedia("screen and (prefers-color-scheme: dark)").matches && !this.printing
-    this.renderer.setClearColor(dark ? 0x333c47 : 0xf7f9fb)
+    this.renderer.setClearColor(dark ? 0x10151b : 0xf7f9fb)
     this.points.setDark(dark)
     this.renderer.render(this.world, this.camera)
     if (!this.overlay.hidden) drawLabels(this, dark)

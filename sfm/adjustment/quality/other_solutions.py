@@ -57,11 +57,13 @@ class OtherSolution:
     converges: bool  # whether an adjustment of all observations from there ends
 
 
-def other_solutions(adjustment: Adjustment) -> tuple[OtherSolution, ...]:
+def other_solutions(adjustment: Adjustment, *, follow_c: bool = False) -> tuple[OtherSolution, ...]:
     """Return other solutions of about the same v'Pv, and better ones, the smallest v'Pv first.
 
     Args:
         adjustment: the result, with its covariance.
+        follow_c: whether c is tried at other values where it is held, too, as it is where an adjustment
+            does not converge with c free; none of these is taken in place of the result.
 
     Returns:
         None where the network is strong, the result did not converge, or nothing is redundant.
@@ -78,7 +80,8 @@ def other_solutions(adjustment: Adjustment) -> tuple[OtherSolution, ...]:
     sigma = np.sqrt(np.trace(a.covariance.points, axis1=1, axis2=2) / 3)
     own = _principal_distance(a.estimate.cameras)
     found: list[OtherSolution] = []
-    candidates = sorted(search.candidates(a.estimate, base.vPv, limit), key=lambda one: one.vPv)
+    tried = search.candidates(a.estimate, base.vPv, limit, follow_c=follow_c)
+    candidates = sorted(tried, key=lambda one: one.vPv)
     for candidate in candidates:
         points = candidate.estimate.points
         moved = _apart(points, a.estimate.points, sigma)
@@ -99,7 +102,7 @@ def other_solutions(adjustment: Adjustment) -> tuple[OtherSolution, ...]:
                 converges=False,
             )
         )
-    if found and found[0].vPv < 1:
+    if found and found[0].vPv < 1 and not follow_c:
         ended = search.adjusted(found[0].estimate, tolerance=TOLERANCE)
         found[0] = replace(found[0], converges=ended is not None and ended.converged)
     return tuple(found)
@@ -159,10 +162,12 @@ class _Search:
             return None
         return a if np.isfinite(a.vPv) and not a.rejected.any() else None
 
-    def candidates(self, result: Estimate, vPv: float, limit: float) -> Iterator[_Candidate]:
+    def candidates(
+        self, result: Estimate, vPv: float, limit: float, *, follow_c: bool
+    ) -> Iterator[_Candidate]:
         """Return solutions and places of about the same v'Pv along c, and minima beyond them."""
         free = [camera.free for camera in result.cameras]
-        steps = STEPS if any(one[0] for one in free) else 0
+        steps = STEPS if follow_c or any(one[0] for one in free) else 0
         starts = [result] if self.datum.kind == "control" else [result, reverse_depth(result)]
         for start in starts:
             for direction in (STEP, 1 / STEP) if steps else (1.0,):

@@ -11,6 +11,7 @@ from sfm.cli.commands.starting import loading
 from sfm.runtime.faults import working_on
 
 NOT_KEPT = 1  # exit code where a limit is proven not to be kept
+MAX_PRINTED = 40  # distances, angles and heights; all of them stand in quantities.csv
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -67,9 +68,12 @@ def measure(
         ]
         what = f"{fit.shape.kind.name} {fit.name}: {', '.join((*said, ''))}"
         print(f"{what}form error {fit.form_error:.3g} {found.unit}, {fit.used.sum()} points")
-    for name, what, value, sigma, unit, remark in quantity_rows(found):
+    rows = quantity_rows(found)
+    for name, what, value, sigma, unit, remark in rows[:MAX_PRINTED]:
         told = f"{name} ({what}): {' +- '.join(with_sigma(value, sigma))} {unit}"
         print(f"{told}{f'; {remark}' if remark else ''}")
+    if len(rows) > MAX_PRINTED:
+        print(f"and {len(rows) - MAX_PRINTED} more in {page.with_name('quantities.csv')}")
     for remark in found.remarks:
         print(f"! {remark}")
     print(f"Report: {page}")

@@ -1,14 +1,25 @@
-"""Commands before a survey: how large its targets must be."""
+"""Commands before a survey: where to stand, what that will give, and how large targets must be."""
 
 from __future__ import annotations
 
-from typing import Annotated
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
 
+import numpy as np
 import typer
 
+from sfm.cli.commands.planning_inputs import bars_of, camera_of, numbers, object_of, stations_of
 from sfm.cli.commands.starting import loading
 from sfm.errors import SurveyFileError
 from sfm.planning.target_size import MIN_PIXELS, target_size
+from sfm.runtime.faults import working_on
+
+if TYPE_CHECKING:
+    from sfm.camera import Camera
+    from sfm.conventions import FloatArray
+    from sfm.planning.sight.optics import DepthOfField
+
+MAX_WEAK = 5  # points that the terminal names
 
 plan = typer.Typer(name="plan", help="Plan a survey before the photographs are taken.")
 
@@ -67,3 +78,198 @@ def target_size_command(
     print(f"diameter of the dot   {size.diameter:.4g} {unit}, {pixels:g} px across at {tilt:g} deg tilt")
     print(f"ring of the code      {size.ring:.4g} {unit} outer diameter ({codes.name})")
     print(f"a pixel at the object {size.pixel:.4g} {unit}")
+
+
+@plan.command("network")
+def network_command(
+    planned: Annotated[
+        str,
+        typer.Argument(
+            metavar="OBJECT",
+            help="Points (.csv: id,X,Y,Z[,nX,nY,nZ]), a mesh (.stl, .ply), or box:LX,LY,LZ, "
+            "cylinder:DIAMETER,HEIGHT, plate:LX,LY, wall:LENGTH,HEIGHT, dish:DIAMETER,DEPTH.",
+        ),
+    ],
+    camera: Annotated[
+        str,
+        typer.Option(
+            "--camera",
+            metavar="CAMERA",
+            help="Survey file, result folder, or a camera of the list, such as full-frame-24.",
+        ),
+    ],
+    c: Annotated[
+        float | None, typer.Option("--c-mm", metavar="MM", help="Principal distance (focal length), mm.")
+    ] = None,
+    camera_name: Annotated[
+        str | None, typer.Option("--camera-name", metavar="NAME", help="Which of several cameras.")
+    ] = None,
+    free: Annotated[
+        str | None,
+        typer.Option("--free", metavar="P,Q,...", help="Camera parameters to be adjusted, or none."),
+    ] = None,
+    unit: Annotated[
+        str, typer.Option("--unit", help="Unit of lengths: km, m, dm, cm, mm, um, in or ft.")
+    ] = "mm",
+    points: Annotated[
+        int, typer.Option("--points", metavar="N", min=3, max=20000, help="Points on a mesh or a shape.")
+    ] = 200,
+    open_mesh: Annotated[
+        bool, typer.Option("--open-mesh", help="The mesh is an open surface, seen from outside.")
+    ] = False,
+    stations: Annotated[
+        str | None,
+        typer.Option(
+            "--stations",
+            metavar="STATIONS",
+            help="CSV (image,X,Y,Z,omega_deg,phi_deg,kappa_deg) or ring:N, two-rings:N, hemisphere:N, "
+            "strips:NxM, four-stations, left-right, front-back.  [default: designed for what is wanted]",
+        ),
+    ] = None,
+    sigma: Annotated[
+        float | None, typer.Option("--sigma", metavar="S", help="Wanted: sigma of every point.")
+    ] = None,
+    length_sigma: Annotated[
+        float | None, typer.Option("--length-sigma", metavar="S", help="Wanted: sigma of every length.")
+    ] = None,
+    displacement: Annotated[
+        float | None,
+        typer.Option("--displacement", metavar="D", help="Wanted: displacement found between two surveys."),
+    ] = None,
+    sigma_px: Annotated[
+        float | None,
+        typer.Option("--sigma-px", metavar="PX", help="Of an image coordinate.  [default: from the targets]"),
+    ] = None,
+    diameter: Annotated[
+        float | None, typer.Option("--target-diameter", metavar="D", help="Of the targets.")
+    ] = None,
+    contrast: Annotated[
+        float, typer.Option("--contrast", help="Grey values between target and surroundings.")
+    ] = 120.0,
+    noise: Annotated[float, typer.Option("--noise", help="Standard deviation of a grey value.")] = 2.0,
+    blur: Annotated[float, typer.Option("--blur-px", help="Standard deviation of an edge, px.")] = 0.8,
+    incidence: Annotated[
+        float, typer.Option("--max-incidence-deg", metavar="DEG", help="Of a ray to the normal.")
+    ] = 60.0,
+    f_number: Annotated[
+        float | None, typer.Option("--f-number", metavar="N", help="For the depth of field; needs --focus.")
+    ] = None,
+    focus: Annotated[
+        float | None, typer.Option("--focus", metavar="D", help="Focus distance, in the unit of --unit.")
+    ] = None,
+    confusion: Annotated[
+        float | None,
+        typer.Option("--confusion-um", metavar="UM", help="Circle of confusion.  [default: two pixels]"),
+    ] = None,
+    distance: Annotated[
+        str | None,
+        typer.Option("--distance", metavar="MIN,MAX", help="Of stations from the nearest point."),
+    ] = None,
+    space: Annotated[
+        str | None,
+        typer.Option("--space", metavar="X0,X1,Y0,Y1,Z0,Z1", help="Where one can stand."),
+    ] = None,
+    floor: Annotated[float | None, typer.Option("--floor", metavar="Z", help="No station is below.")] = None,
+    photographs: Annotated[
+        int, typer.Option("--photographs", metavar="N", min=4, max=1000, help="Photographs at most.")
+    ] = 60,
+    scale_bar: Annotated[
+        list[str] | None,
+        typer.Option("--scale-bar", metavar="FROM,TO,SIGMA", help="Scale bar between two points."),
+    ] = None,
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder of page and tables.")] = Path(
+        "out/plan"
+    ),
+) -> None:
+    """Tell what a network will give, or design one for what is wanted.
+
+    Predicted standard deviations of points, weak points with the reason, whether the camera can be
+    calibrated, a page with the stations in space, and a list of photographs to take along. Lengths in the
+    unit of --unit.
+    """
+    with loading():
+        from sfm.conventions import METRES
+        from sfm.files.manifest import refuse_foreign_folder
+        from sfm.planning.design.candidates import Allowed
+        from sfm.planning.design.designer import design_network
+        from sfm.planning.plan import describe_plan, plan_of
+        from sfm.planning.sight.image_precision import TargetImage
+        from sfm.planning.sight.visibility import Seeing
+        from sfm.planning.wanted import Wanted
+        from sfm.report.planning import figures, headline, remarks, write_plan
+
+    refuse_foreign_folder(out)
+    if unit not in METRES:
+        raise SurveyFileError(f"--unit {unit}: expected one of {', '.join(METRES)}")
+    wanted = Wanted(sigma, length_sigma, displacement)
+    if stations is None and not wanted.anything:
+        raise SurveyFileError(
+            "plan: neither --stations nor what is wanted; needed one of --stations, --sigma, "
+            "--length-sigma and --displacement"
+        )
+    if sigma_px is None and diameter is None:
+        raise SurveyFileError(
+            "plan: needed --sigma-px or --target-diameter, which say how precise image points are"
+        )
+    to_mm = METRES[unit] * 1000
+    with working_on(planned):
+        object_ = object_of(planned, points, open_mesh=open_mesh)
+        one = camera_of(camera, camera_name, c, free)
+        depth = _depth(one, f_number, focus, confusion, to_mm)
+        seeing = Seeing(
+            max_incidence_deg=incidence,
+            diameter=diameter,
+            depth=depth,
+            sigma_px=sigma_px,
+            target=TargetImage(contrast, noise, blur),
+        )
+        bars = bars_of(scale_bar)
+        name = Path(planned).stem if ":" not in planned else planned
+        if stations is not None:
+            given = stations_of(stations, object_, one)
+            found = plan_of(name, unit, object_, one, given, seeing, wanted=wanted, bars=bars)
+        else:
+            allowed = Allowed(
+                None if distance is None else _two(numbers("--distance", distance, 2)),
+                None if space is None else _space(space),
+                floor,
+            )
+            design = design_network(
+                object_, one, allowed, seeing, wanted, max_photographs=photographs, bars=bars
+            )
+            found = describe_plan(name, unit, design.prediction, seeing, wanted, design.shortfall, design)
+    page = write_plan(found, out)
+    print(headline(found))
+    for what, value in figures(found):
+        print(f"  {what}: {value}")
+    for weak in found.weak[:MAX_WEAK]:
+        print(f"  weak: point {weak.name}: {weak.reason}")
+    if len(found.weak) > MAX_WEAK:
+        print(f"  ... and {len(found.weak) - MAX_WEAK} more weak points, in the page")
+    for remark in remarks(found):
+        print(f"! {remark}")
+    print(f"Report: {page}")
+
+
+def _depth(
+    camera: Camera, f_number: float | None, focus: float | None, confusion_um: float | None, to_mm: float
+) -> DepthOfField | None:
+    """Return the depth of field in the object unit; None where no aperture is given."""
+    from sfm.planning.sight.optics import DepthOfField, Lens, depth_of_field
+
+    if (f_number is None) != (focus is None):
+        raise SurveyFileError("plan: --f-number and --focus are needed together for the depth of field")
+    if f_number is None or focus is None:
+        return None
+    pixel = float(camera.pixel_mm.mean())
+    confusion = 2 * pixel if confusion_um is None else confusion_um / 1000
+    found = depth_of_field(Lens(f_number, focus * to_mm, confusion), camera.c_px * pixel)
+    return DepthOfField(found.near / to_mm, found.far / to_mm)
+
+
+def _two(values: tuple[float, ...]) -> tuple[float, float]:
+    return values[0], values[1]
+
+
+def _space(text: str) -> FloatArray:
+    return np.array(numbers("--space", text, 6)).reshape(3, 2).T

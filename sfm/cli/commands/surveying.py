@@ -189,8 +189,8 @@ def _run_survey(
         from sfm.report.output import write_result
         from sfm.runtime.cores import cores
         from sfm.runtime.progress_bar import drawn_progress
-        from sfm.survey.inputs.calibration import Calibration, read_calibrations, with_calibration
-        from sfm.survey.inputs.survey import survey_of_file
+        from sfm.survey.inputs.calibration import Calibration, read_calibrations
+        from sfm.survey.inputs.survey import survey_of_file, with_calibration
         from sfm.survey.inputs.survey_file import read_survey_file
         from sfm.survey.measuring.target_store import TargetStore
 

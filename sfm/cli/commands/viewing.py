@@ -59,6 +59,7 @@ def view(
         import webbrowser
 
         from adapters.formats.registry import format_of, read_comparable
+        from adapters.formats.targets_table import read_targets
         from sfm.report.figures.overlays import overlay_names
         from sfm.report.html.view_page import photographs_in, refuse_foreign_page, write_view
         from sfm.report.viewer.stored_scene import scene_of_stored
@@ -72,10 +73,11 @@ def view(
         raise OutputError(f"--images {images}: is no folder")
     with working_on(str(source)):
         stored = read_comparable(source, from_format)
-        rejected = w = None
+        rejected = w = seen = None
         if (from_format or format_of(source).name) == "tables":
             stored, rejected, w = _with_rejected(source, stored)
-        scene = scene_of_stored(stored, w=w, rejected=rejected)
+            seen = read_targets(source, stored.network)
+        scene = scene_of_stored(stored, w=w, rejected=rejected, seen_targets=seen)
     if images is not None:
         paths = photographs_in(images, scene.photographs)
     elif (source / PICTURES).is_dir() and (source / PICTURES).resolve().is_relative_to(source.resolve()):

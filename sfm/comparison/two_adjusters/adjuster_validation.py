@@ -26,7 +26,7 @@ from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.comparison.solutions import reprojection, rotation_angle_deg
 from sfm.comparison.two_adjusters.adjusters import BackendAdjustment
-from sfm.comparison.two_adjusters.random_network import Plan, RandomNetwork, random_network
+from sfm.comparison.two_adjusters.random_network import MODELS, Plan, RandomNetwork, random_network
 from sfm.conventions import BoolArray, FloatArray
 from sfm.errors import KolinearError
 from sfm.network import Estimate, Network
@@ -232,7 +232,7 @@ def _begin(backend: ValidationBackend) -> None:
 
 def warm_up(backend: ValidationBackend) -> None:
     """Adjust a network of every camera model once, so that loading and compiling is not in the seconds."""
-    waiting = {"opencv", "full_opencv"}
+    waiting = set(MODELS)
     for number in count():
         made = random_network(np.random.default_rng([WARM_UP_SEED, number]))
         if made.plan.model in waiting and len(made.network.image_points) < WARM_UP_IMAGE_POINTS:

@@ -25,6 +25,7 @@ from sfm.comparison.two_adjusters.better_fit import BetterFit, better_fit
 from sfm.comparison.two_adjusters.common_problem import common_problem, distortion_held
 from sfm.comparison.two_adjusters.unshared import without_sharing
 from sfm.conventions import FloatArray
+from sfm.distortion.models import Role
 from sfm.network import Estimate, Network
 
 MAX_ITERATIONS = 200  # the weak directions of full_opencv take more steps than a survey
@@ -112,7 +113,7 @@ def compare_adjusters(
     network, start, conversions, freed = common_problem(adjustment, model=model)
     ours = _adjusted(network, start, adjustment.sigma_px)
     held: tuple[str, ...] = ()
-    if start.cameras[0].model == "full_opencv" and (ours.undetermined or not ours.converged):
+    if start.cameras[0].plays(Role.DENOMINATOR).any() and (ours.undetermined or not ours.converged):
         held = ours.undetermined or (
             f"k1 to k6 still grow together after {MAX_ITERATIONS} iterations, numerator and denominator of "
             "the rational distortion cancelling",

@@ -27,13 +27,14 @@ def common_problem(
     image points, each with the covariance sigma_px^2 I. Parameters of a group that COLMAP frees as a
     whole (focal lengths, principal point, distortion) are all free if one of them is, and in all cameras
     that are not fixed.
+
+    Raises:
+        GeometryError: fewer than two photographs with accepted image points.
     """
     estimate = adjustment.estimate
     cameras = estimate.cameras
     if model is None:
-        forward = {camera.model for camera in cameras if not camera.model.startswith("brown")}
-        all_opencv = forward == {"opencv"} and not any(c.model.startswith("brown") for c in cameras)
-        model = "opencv" if all_opencv else "full_opencv"
+        model = "opencv" if all(camera.model == "opencv" for camera in cameras) else "full_opencv"
     conversions = tuple(convert_camera(camera, model) for camera in cameras)
     converted = tuple(conversion.camera for conversion in conversions)
     grouped = grouped_free(converted)

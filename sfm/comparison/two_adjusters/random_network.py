@@ -14,6 +14,7 @@ from sfm.camera import Camera, camera_from_values, project
 from sfm.conventions import BoolArray, FloatArray, rotation_from_vector
 from sfm.network import Estimate, ImagePoints, Network, ObjectPoints
 
+MODELS = ("opencv", "full_opencv")  # those that COLMAP has as well
 ARRANGEMENTS = ("ring", "hemisphere", "strip", "close pairs")
 IMAGES = (4, 60)
 POINTS = (20, 2000)
@@ -113,7 +114,7 @@ def _draw(rng: np.random.Generator) -> Plan:
     if arrangement == "close pairs":
         images += images % 2
     cameras = int(rng.choice([1, 1, 2, 3]))
-    model = str(rng.choice(["opencv", "full_opencv"]))
+    model = str(rng.choice(MODELS))
     may_calibrate = arrangement in SELF_CALIBRATING and images >= SELF_CALIBRATION_IMAGES * cameras
     interior = "fixed"
     if may_calibrate and rng.random() < 0.7:

@@ -244,7 +244,7 @@ def _fit(
 
 
 def _covariance(points: MeasuredPoints, rows: IntArray) -> FloatArray:
-    if points.correlated:
+    if points.correlated_among(rows):
         return points.covariance_of(rows)
     return points.blocks[rows]
 

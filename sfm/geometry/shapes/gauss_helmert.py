@@ -122,8 +122,15 @@ def constraint_covariance(covariance: FloatArray, normals: FloatArray) -> FloatA
     if covariance.ndim == 3:
         return np.asarray(np.einsum("nai,nij,nbj->nab", normals, covariance, normals))
     n, c, _ = normals.shape
-    half = (normals @ covariance.reshape(n, 3, 3 * n)).reshape(n * c, n, 3)
-    return np.asarray(np.einsum("kni,nci->knc", half, normals).reshape(n * c, n * c))
+    Qw = np.empty((n, c, n, c))
+    for a in range(c):
+        half = sum((normals[:, a, i, None] * covariance[i::3] for i in range(3)), start=np.zeros(()))
+        for b in range(a, c):
+            block = sum((half[:, i::3] * normals[:, b, i] for i in range(3)), start=np.zeros(()))
+            Qw[:, a, :, b] = block
+            if b > a:
+                Qw[:, b, :, a] = block.T
+    return np.asarray(Qw.reshape(n * c, n * c))
 
 
 def times_covariance(covariance: FloatArray, normals: FloatArray, k: FloatArray) -> FloatArray:

@@ -58,6 +58,9 @@ def foerstner_points(
         The points; the sigma of an intensity for the ellipses is that of the misfit of the window's edges.
 
     Source: Foerstner and Guelch (1987), ISPRS Intercommission Workshop Interlaken, p. 281.
+
+    Raises:
+        GeometryError: max_points is below 1.
     """
     side = odd_window("interest operator", window_px)
     if max_points < 1:

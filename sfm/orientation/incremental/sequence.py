@@ -18,6 +18,7 @@ import numpy as np
 
 from sfm.camera import Camera
 from sfm.conventions import BoolArray, FloatArray
+from sfm.display import listed
 from sfm.errors import GeometryError
 from sfm.network import Estimate, Network, empty_estimate
 from sfm.orientation.incremental.given_values import start_from_given
@@ -39,7 +40,6 @@ MIN_POINTS = 4  # of a photograph: three are always fitted by P3P, the fourth ch
 START_TOLERANCE = 0.03  # of the photograph's diagonal: what an unknown distortion leaves after resection
 FINAL_TOLERANCE_PX = 4.0  # below this no image point is put aside here; the adjustment tests further
 MIN_RIVALS = 3  # oriented photographs: of two, what is known besides decides, see `best_start`
-MAX_NAMES = 10  # of photographs for one reason, and reasons, in a message
 GROWTH = 1.25  # the network is adjusted when it has this many times the photographs of last time
 MAX_ROUNDS = 200
 FINAL_ROUNDS = 3  # of resection, intersection and adjustment of all, while image points come or go
@@ -290,9 +290,5 @@ def _words_of_failures(failures: tuple[tuple[str, str], ...]) -> str:
     of_reason: dict[str, list[str]] = {}
     for name, reason in failures:
         of_reason.setdefault(reason, []).append(name)
-    groups = [(names[:MAX_NAMES], len(names) - MAX_NAMES, reason) for reason, names in of_reason.items()]
-    words = [
-        f"{', '.join(names)}{f' and {more} more' if more > 0 else ''}: {reason}"
-        for names, more, reason in groups
-    ]
-    return "; ".join(words[:MAX_NAMES]) + (" ..." if len(words) > MAX_NAMES else "")
+    words = (f"{listed(names, most=10)}: {reason}" for reason, names in of_reason.items())
+    return listed(words, most=10, separator="; ")

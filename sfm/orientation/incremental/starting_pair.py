@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sfm.conventions import FloatArray, IntArray
+from sfm.display import listed
 from sfm.errors import GeometryError
 from sfm.network import Network, rows_of
 from sfm.orientation.homography import PLANAR_POINTS
@@ -21,7 +22,6 @@ PAIR_TRIALS = 500  # samples of five points in a pair: enough where 45 % of its 
 PAIR_POINTS = 1000  # common points of a pair that take part in its orientation
 MIN_MEDIAN_ANGLE_DEG = 5.0  # median ray angle of a pair that is worth starting from
 MIN_ANGLE_OF_TWO_DEG = 3.0  # of a survey of two photographs, which has no other pair
-MAX_NAMES = 10  # photographs in a message
 TWOFOLD = 2.0  # ratio of two misfits from which the smaller is the true one
 SCREEN_TRIALS = 200  # triples per photograph while solutions are compared
 SCREEN_POINTS = 30  # points per photograph, and photographs per solution, that take part in it
@@ -155,7 +155,7 @@ def _words_of_common(network: Network, own: list[IntArray]) -> str:
     usable[np.concatenate(own)] = True
     first, second, count = network.common_points(usable)
     words = []
-    for i in range(min(len(own), MAX_NAMES)):
+    for i in range(len(own)):
         pairs = np.flatnonzero((first == i) | (second == i))
         if not len(own[i]):
             words.append(f"{network.images[i]}: no points")
@@ -165,7 +165,7 @@ def _words_of_common(network: Network, own: list[IntArray]) -> str:
             p = int(pairs[np.argmax(count[pairs])])
             other = network.images[int(second[p] if first[p] == i else first[p])]
             words.append(f"{network.images[i]}: {count[p]} points in common with {other}")
-    return "; ".join(words) + (" ..." if len(own) > MAX_NAMES else "")
+    return listed(words, most=10, separator="; ")
 
 
 def _promising_pairs(network: Network, own: list[IntArray]) -> list[tuple[int, int]]:

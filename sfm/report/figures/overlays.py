@@ -94,8 +94,8 @@ def draw_overlays(result: SurveyResult, *, jobs: int = 1, progress: Progress = S
         return Overlay(
             photograph.image,
             names[index],
-            _jpeg(np.vstack([picture, legend])),
-            _jpeg(_fit(picture, THUMBNAIL_SIDE_PX)),
+            jpeg_of(np.vstack([picture, legend]), JPEG_QUALITY),
+            jpeg_of(fitted_picture(picture, THUMBNAIL_SIDE_PX), JPEG_QUALITY),
         )
 
     drawn = []
@@ -125,7 +125,7 @@ def draw_photograph(photograph: PhotographTargets, adjustment: Adjustment, facto
     if grey.dtype == np.uint16:
         grey = (grey >> 8).astype(np.uint8)
     scale = min(1.0, MAX_SIDE_PX / max(grey.shape))
-    picture = cv2.cvtColor(_fit(grey, MAX_SIDE_PX), cv2.COLOR_GRAY2BGR)
+    picture = cv2.cvtColor(fitted_picture(grey, MAX_SIDE_PX), cv2.COLOR_GRAY2BGR)
 
     rows, names = _image_points(photograph.image, adjustment)
     seen = adjustment.network.image_points
@@ -284,7 +284,7 @@ def _legend(width: int, factor: float, photograph: PhotographTargets) -> AnyArra
     return strip
 
 
-def _fit(picture: AnyArray, side: int) -> AnyArray:
+def fitted_picture(picture: AnyArray, side: int) -> AnyArray:
     """Return a picture whose longer side is at most `side` px, averaged over areas."""
     scale = side / max(picture.shape[:2])
     if scale >= 1:
@@ -293,6 +293,7 @@ def _fit(picture: AnyArray, side: int) -> AnyArray:
     return np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA))
 
 
-def _jpeg(picture: AnyArray) -> bytes:
-    _, data = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
+def jpeg_of(picture: AnyArray, quality: int) -> bytes:
+    """Return a picture as JPEG of a quality of 1 to 100."""
+    _, data = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, quality])
     return bytes(data.tobytes())

@@ -19,7 +19,11 @@ from sfm.report.findings.findings import Findings
 
 BLUE, RED, GREY, GREEN, ORANGE = "#1f5fa8", "#c8372d", "#8a8f98", "#2b7a4b", "#d98a1f"
 DPI = 110
+WIDTH_IN = 11.0  # of the pictures of the report
+LEFT_IN, RIGHT_IN, BOTTOM_IN, TOP_IN, BETWEEN_IN = 0.75, 0.15, 0.55, 0.35, 0.95  # margins
+LETTER_IN = 0.065  # width of a letter of the names of photographs
 CAMERA_COLOURS = (BLUE, ORANGE, GREEN, "#7a4fa3", "#b0567a")
+MAX_NAMED = 60  # photographs whose names are legible
 MAX_ARROWS = 4000  # more residual vectors than this only blacken the picture
 CELLS = 12  # of the grid of mean residuals along the longer side
 FLAT_COSINE = 0.94  # within 20 degrees of Z the object's main plane is drawn as X and Y
@@ -48,9 +52,24 @@ def all_plots(findings: Findings) -> tuple[Plot, ...]:
 def png(figure: Figure) -> bytes:
     """Return a picture as PNG."""
     buffer = io.BytesIO()
-    FigureCanvasAgg(figure)
-    figure.savefig(buffer, format="png", dpi=DPI)
+    figure.set_dpi(DPI)
+    FigureCanvasAgg(figure).print_png(buffer)  # type: ignore[no-untyped-call]  # savefig would draw it twice
     return buffer.getvalue()
+
+
+def panelled(height_in: float, *, rows: int = 1, bottom_in: float = BOTTOM_IN) -> Figure:
+    """Return a figure with margins for rows of two panels; matplotlib's own layouts draw everything twice."""
+    each_in = (height_in - TOP_IN - bottom_in - (rows - 1) * BETWEEN_IN) / rows
+    figure = Figure(figsize=(WIDTH_IN, height_in))
+    figure.subplots_adjust(
+        left=LEFT_IN / WIDTH_IN,
+        right=1 - RIGHT_IN / WIDTH_IN,
+        bottom=bottom_in / height_in,
+        top=1 - TOP_IN / height_in,
+        wspace=2 * BETWEEN_IN / (WIDTH_IN - LEFT_IN - RIGHT_IN - BETWEEN_IN),
+        hspace=BETWEEN_IN / each_in,
+    )
+    return figure
 
 
 _NETWORK = "Photographs (pyramids, looking where the camera looked) and object points."
@@ -70,7 +89,7 @@ def network_figure(findings: Findings) -> Figure:
     adjustment, unit = findings.result.adjustment, findings.result.length_unit
     estimate = adjustment.estimate
     axes_from_object, labels = plan_axes(estimate.points, estimate.position)
-    figure = Figure(figsize=(11, 5.2), layout="constrained")
+    figure = panelled(5.2)
     plan = figure.add_subplot(1, 2, 1)
     space = figure.add_subplot(1, 2, 2, projection="3d")
     points = estimate.points @ axes_from_object.T
@@ -83,13 +102,13 @@ def network_figure(findings: Findings) -> Figure:
         colour = CAMERA_COLOURS[k % len(CAMERA_COLOURS)]
         edges = _pyramids(estimate, own, camera.c_px, camera.size_px, size) @ axes_from_object.T
         plan.add_collection(LineCollection(list(edges[:, :, :2]), colors=colour, linewidths=0.8))
-        for edge in edges:
-            space.plot(*edge.T, color=colour, linewidth=0.7)
+        apart = np.concatenate([edges, np.full((len(edges), 1, 3), np.nan)], axis=1)
+        space.plot(*apart.reshape(-1, 3).T, color=colour, linewidth=0.7)
         plan.plot(
             position[own, 0], position[own, 1], "o", color=colour, markersize=4, label=_plain(family.name)
         )
     for name, x, y in zip(adjustment.network.images, position[:, 0], position[:, 1], strict=True):
-        if len(position) <= 60:
+        if len(position) <= MAX_NAMED:
             plan.annotate(
                 _plain(_short(name)),
                 (x, y),
@@ -119,7 +138,7 @@ def residual_figure(findings: Findings) -> Figure:
     """Draw residual vectors over the format of each camera, one by one and as means of cells."""
     adjustment, cameras = findings.result.adjustment, findings.interior.families
     network = adjustment.network
-    figure = Figure(figsize=(11, 4.4 * len(cameras)), layout="constrained")
+    figure = panelled(4.4 * len(cameras), rows=len(cameras))
     panels = figure.subplots(len(cameras), 2, squeeze=False)
     owner = findings.interior.family[network.image_points.image]
     for k, family in enumerate(cameras):
@@ -152,7 +171,7 @@ def distribution_figure(findings: Findings) -> Figure:
     used = ~adjustment.rejected
     seen = network.image_points.select(used)
     v = adjustment.residuals[used]
-    figure = Figure(figsize=(11, 3.8), layout="constrained")
+    figure = panelled(3.8)
     histogram, radial = figure.subplots(1, 2)
     z = standardised_residuals(adjustment)
     z = z[np.isfinite(z)]
@@ -190,17 +209,18 @@ def photograph_figure(findings: Findings) -> Figure:
     adjustment = findings.result.adjustment
     rms, count = findings.geometry.image_rms_px, findings.geometry.image_points
     m = len(rms)
-    figure = Figure(figsize=(11, 3.4), layout="constrained")
+    labels = [_plain(_short(name)) for name in adjustment.network.images] if m <= MAX_NAMED else []
+    names_in = LETTER_IN * max(map(len, labels), default=0)
+    figure = panelled(3.4 + max(0.0, names_in - 0.7), bottom_in=max(BOTTOM_IN, 0.2 + names_in))
     bars, numbers = figure.subplots(1, 2)
     x = np.arange(m)
-    labels = [_plain(_short(name)) for name in adjustment.network.images]
     for panel, values, colour, label in (
         (bars, rms, BLUE, "RMS residual per coordinate [px]"),
         (numbers, count, GREEN, "accepted image points"),
     ):
         panel.bar(x, np.nan_to_num(values), color=colour)
         panel.set_ylabel(label)
-        if m <= 60:
+        if labels:
             panel.set_xticks(x, labels, rotation=90, fontsize=7)
         else:
             panel.set_xlabel("photograph, in order")

@@ -14,12 +14,14 @@ import numpy as np
 from sfm.adjustment.quality.reliability import UNCONTROLLED
 from sfm.adjustment.result import Adjustment
 from sfm.conventions import FloatArray
+from sfm.distortion.balanced import MODEL as BALANCED_MODEL
 from sfm.distortion.balanced import UNITS, to_balanced
 from sfm.errors import GeometryError
 from sfm.files.plain_text import csv_text
 from sfm.report.findings.bundle_statistics import Statistics
 from sfm.report.findings.findings import Findings
 from sfm.report.findings.given_residuals import Given
+from sfm.stored_result import MEASURED
 
 USUAL_R0 = 2 / 3  # of the largest image radius
 
@@ -42,6 +44,7 @@ def write_tables(findings: Findings, folder: Path) -> None:
             image_point_rows(adjustment),
         ),
         ("cameras_balanced", "camera,parameter,value,unit", balanced_rows(findings)),
+        ("targets", "image,x_px,y_px,a_px,b_px,angle_deg,reason", target_rows(findings)),
         ("left_out", "kind,name,image_points,reason", left_out_rows(findings)),
         ("given", "kind,name,coordinate,unit,given,difference,sigma,r,w", given_rows(findings.given)),
         (
@@ -52,7 +55,9 @@ def write_tables(findings: Findings, folder: Path) -> None:
         ),
         ("variance_components", "kind,group,observations,redundancy,sigma0", component_rows(statistics)),
     ):
-        if name == "cameras_balanced" and "brown_forward" not in findings.interior.models:
+        if name == "cameras_balanced" and BALANCED_MODEL not in findings.interior.models:
+            continue
+        if name == "targets" and not len(findings.result.seen_targets.image):
             continue
         text = csv_text(header.split(","), rows)
         (folder / f"{name}.csv").write_text(text, encoding="utf-8", newline="")
@@ -87,7 +92,7 @@ def balanced_rows(findings: Findings) -> Iterable[Sequence[object]]:
     """
     given = findings.result.balance_radius_mm
     for camera in findings.result.adjustment.estimate.cameras:
-        if camera.model != "brown_forward":
+        if camera.model != BALANCED_MODEL:
             continue
         half = float(np.hypot(*(np.array(camera.size_px) * camera.pixel_mm))) / 2
         of_survey = [R0 for name, R0 in given if camera.name == name or camera.name.startswith(f"{name} ")]
@@ -118,6 +123,19 @@ def image_point_rows(adjustment: Adjustment) -> Iterable[Sequence[object]]:
             *adjustment.residuals[k],
             int(adjustment.rejected[k]),
         )
+
+
+def target_rows(findings: Findings) -> Iterable[Sequence[object]]:
+    """Return photograph, place and outline of every target, and why candidates were rejected.
+
+    Rejected candidates have no outline; to 1e-4 px and 1e-3 deg, as they are shown.
+    """
+    result = findings.result
+    seen, names = result.seen_targets, result.network.images
+    xy, axes = np.round(seen.xy, 4), np.round(seen.ellipse[:, :2], 4)
+    angle = np.round(np.rad2deg(seen.ellipse[:, 2]), 3)
+    for k, reason in enumerate(seen.reason):
+        yield (names[seen.image[k]], *xy[k], *axes[k], angle[k], reason or MEASURED)
 
 
 def left_out_rows(findings: Findings) -> Iterable[Sequence[object]]:

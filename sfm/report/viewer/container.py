@@ -63,6 +63,10 @@ def packed_scene(scene: ViewerScene, pictures: Pictures) -> str:
     }
     if scene.distance_sigma is not None:
         arrays["pair.sigma"] = ("f4", scene.distance_sigma)
+    if scene.displacement is not None:
+        states = sorted(set(scene.state))
+        arrays["point.displacement"] = ("f4", scene.displacement)
+        arrays["point.state"] = ("u1", np.array([states.index(one) for one in scene.state]))
     if scene.deviation is not None:
         arrays["point.deviation"] = ("f4", scene.deviation)
     return _packed(_header(scene, pictures), arrays)
@@ -94,6 +98,7 @@ def _header(scene: ViewerScene, pictures: Pictures) -> dict[str, Any]:
             for one in scene.bars
         ],
         "control": scene.control,
+        "states": sorted(set(scene.state)),
         "rms_px": scene.rms_px if np.isfinite(scene.rms_px) else 0,
         "crop_px": CROP_PX,
         "crop_columns": COLUMNS,

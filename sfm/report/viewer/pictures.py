@@ -18,7 +18,7 @@ import numpy as np
 from sfm.conventions import AnyArray, FloatArray, IntArray
 from sfm.errors import PhotographError
 from sfm.photographs.reading import read_photograph
-from sfm.report.figures.overlays import overlay_names
+from sfm.report.figures.overlays import fitted_picture, jpeg_of, overlay_names
 from sfm.report.viewer.scene import ViewerScene
 from sfm.runtime.progress import SILENT, Progress
 
@@ -155,13 +155,13 @@ def _cut(
             patch = cv2.resize(patch, (CROP_PX, CROP_PX), interpolation=cv2.INTER_AREA)
         frames[int(k)] = (left / scale - 0.5, top / scale - 0.5, side / scale, len(patch))
         if wanted[k]:
-            crops[int(k)] = _jpeg(patch, CROP_QUALITY)
+            crops[int(k)] = jpeg_of(patch, CROP_QUALITY)
         if with_files and with_cells:
             cells.append(patch)
     return _Cut(
-        _jpeg(_fit(grey, THUMBNAIL_PX), THUMBNAIL_QUALITY),
-        _jpeg(_fit(grey, VIEW_PX), VIEW_QUALITY),
-        _jpeg(_fit(grey, FILE_PX), FILE_QUALITY) if with_files else b"",
+        jpeg_of(fitted_picture(grey, THUMBNAIL_PX), THUMBNAIL_QUALITY),
+        jpeg_of(fitted_picture(grey, VIEW_PX), VIEW_QUALITY),
+        jpeg_of(fitted_picture(grey, FILE_PX), FILE_QUALITY) if with_files else b"",
         crops,
         frames,
         _sheet(cells) if cells else b"",
@@ -186,7 +186,7 @@ def _sheet(patches: list[AnyArray]) -> bytes:
     for k, patch in enumerate(patches):
         y, x = CROP_PX * (k // COLUMNS), CROP_PX * (k % COLUMNS)
         sheet[y : y + patch.shape[0], x : x + patch.shape[1]] = patch
-    return _jpeg(sheet, CROP_QUALITY)
+    return jpeg_of(sheet, CROP_QUALITY)
 
 
 def _embed(
@@ -280,17 +280,3 @@ class _Store:
 
 def _none(count: int) -> IntArray:
     return np.zeros((count, 2), dtype=np.int64)
-
-
-def _fit(picture: AnyArray, side: int) -> AnyArray:
-    """Return a picture whose longer side is at most `side` px, averaged over areas."""
-    scale = side / max(picture.shape[:2])
-    if scale >= 1:
-        return picture
-    size = round(picture.shape[1] * scale), round(picture.shape[0] * scale)
-    return np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA))
-
-
-def _jpeg(picture: AnyArray, quality: int) -> bytes:
-    _, data = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, quality])
-    return bytes(data.tobytes())

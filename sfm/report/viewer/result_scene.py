@@ -2,19 +2,12 @@
 
 from __future__ import annotations
 
-from functools import cache
-
 import numpy as np
-from scipy.spatial import cKDTree
 
-from sfm.conventions import FloatArray, IntArray
+from sfm.conventions import FloatArray
 from sfm.report.findings.findings import Findings
-from sfm.report.viewer.scene import Bar, Marks, Rays, ViewerScene, distance_sigmas
-from sfm.result import PhotographTargets, in_words
-from sfm.targets.flags import Flag
-
-SAME_PX = 0.5  # between a target and the image point made of it: re-measuring may move it
-UNUSED = "measured, not part of the result"
+from sfm.report.viewer.scene import Bar, Rays, ViewerScene, distance_sigmas
+from sfm.report.viewer.seen_targets import joined_targets
 
 
 def scene_of_result(findings: Findings) -> ViewerScene:
@@ -24,7 +17,7 @@ def scene_of_result(findings: Findings) -> ViewerScene:
     network, estimate = a.network, a.estimate
     seen = network.image_points
     order = np.lexsort((seen.image, seen.point))
-    ellipse, marks = _targets(findings, seen.image, seen.xy)
+    ellipse, marks = joined_targets(result.seen_targets, seen.image, seen.xy)
     rays = Rays(
         seen.point[order],
         seen.image[order],
@@ -79,43 +72,3 @@ def _checked(findings: Findings) -> tuple[int, ...]:
 def _or_nan(values: FloatArray, count: int) -> FloatArray:
     """Return values of image points (k, 2), NaN where the adjustment has none."""
     return values if len(values) == count else np.full((count, 2), np.nan)
-
-
-def _targets(findings: Findings, image: IntArray, xy: FloatArray) -> tuple[FloatArray, Marks]:
-    """Return the ellipse of each image point, (k, 3), and what else was seen in the photographs."""
-    result = findings.result
-    ellipse = np.full((len(xy), 3), np.nan)
-    index = {name: i for i, name in enumerate(result.adjustment.network.images)}
-    reasons: dict[str, int] = {}
-    found: list[tuple[int, FloatArray, IntArray]] = []
-    for one in result.photographs:
-        i = index.get(one.image)
-        if i is None:
-            continue
-        rows = np.flatnonzero(image == i)
-        used = _join(one, xy[rows])
-        ellipse[rows[used[used >= 0]]] = np.column_stack([one.semi_axes, one.angle])[used >= 0]
-        words = [UNUSED] * int((used < 0).sum()) + [_reason(int(flag)) for flag in one.rejected_flag]
-        numbers = np.array([reasons.setdefault(word, len(reasons)) for word in words], dtype=np.int64)
-        found.append((i, np.vstack([one.xy[used < 0], one.rejected_xy.reshape(-1, 2)]), numbers))
-    if not found:
-        return ellipse, Marks.none()
-    found.sort(key=lambda one: one[0])
-    photo = np.concatenate([np.full(len(numbers), i) for i, _, numbers in found])
-    where = np.concatenate([places for _, places, _ in found])
-    return ellipse, Marks(photo, where, np.concatenate([n for _, _, n in found]), tuple(reasons))
-
-
-def _join(photograph: PhotographTargets, xy: FloatArray) -> IntArray:
-    """Return for each target of a photograph the image point that was made of it, -1 for none, (k,)."""
-    if not len(photograph.xy) or not len(xy):
-        return np.full(len(photograph.xy), -1, dtype=np.int64)
-    distance, nearest = cKDTree(xy).query(photograph.xy, distance_upper_bound=SAME_PX)
-    return np.where(np.isfinite(distance), nearest, -1)
-
-
-@cache
-def _reason(flag: int) -> str:
-    """Return in words why a candidate was not measured."""
-    names = [in_words(str(one.name).lower()) for one in Flag if one.value and flag & one.value]
-    return ", ".join(names) or "no reason kept"

@@ -93,6 +93,10 @@ class ViewerScene:
     deviation: FloatArray | None = (
         None  # of points from what is nominal, object unit; NaN where unknown, (n,)
     )
+    displacement: FloatArray | None = (
+        None  # of points since an earlier epoch, object unit; NaN likewise, (n, 3)
+    )
+    state: tuple[str, ...] = ()  # what a test says of the displacement of each point, (n,)
 
 
 def distance_sigmas(xyz: FloatArray, covariance: FloatArray) -> FloatArray:

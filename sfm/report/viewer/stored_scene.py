@@ -9,11 +9,16 @@ from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.network import ImagePoints
 from sfm.orientation.ray_angles import ray_angles
 from sfm.report.viewer.scene import Bar, Marks, Rays, ViewerScene, distance_sigmas
-from sfm.stored_result import StoredResult
+from sfm.report.viewer.seen_targets import joined_targets
+from sfm.stored_result import SeenTargets, StoredResult
 
 
 def scene_of_stored(
-    stored: StoredResult, *, w: FloatArray | None = None, rejected: BoolArray | None = None
+    stored: StoredResult,
+    *,
+    w: FloatArray | None = None,
+    rejected: BoolArray | None = None,
+    seen_targets: SeenTargets | None = None,
 ) -> ViewerScene:
     """Return what the viewer shows of a result; photographs and points without coordinates are left out.
 
@@ -21,6 +26,7 @@ def scene_of_stored(
         stored: the result, rejected image points included where `rejected` names them.
         w: Baarda's w of its image points, where known, (k, 2).
         rejected: which of its image points took no part; none if not given, (k,).
+        seen_targets: outlines of its targets and what else was seen in its photographs, where known.
     """
     network, estimate = stored.network, stored.estimate
     seen = network.image_points
@@ -33,8 +39,17 @@ def scene_of_stored(
     point = np.searchsorted(determined, seen.point[kept])
     photo = np.searchsorted(oriented, seen.image[kept])
     used = ~rejected[kept]
-    no_ellipse = np.full((len(kept), 3), np.nan)
-    rays = Rays(point, photo, seen.xy[kept], v, w[kept], ~used, no_ellipse)
+    ellipse, marks = np.full((len(kept), 3), np.nan), Marks.none()
+    if seen_targets is not None:
+        own = np.flatnonzero(estimate.oriented[seen_targets.image])
+        shown = SeenTargets(
+            np.searchsorted(oriented, seen_targets.image[own]),
+            seen_targets.xy[own],
+            seen_targets.ellipse[own],
+            tuple(seen_targets.reason[k] for k in own),
+        )
+        ellipse, marks = joined_targets(shown, photo, seen.xy[kept])
+    rays = Rays(point, photo, seen.xy[kept], v, w[kept], ~used, ellipse)
     use = np.zeros(len(seen), dtype=bool)
     use[kept[used]] = True
     n, m = len(determined), len(oriented)
@@ -72,7 +87,7 @@ def scene_of_stored(
         _rms(photo[used], v[used], m),
         np.bincount(photo[used], minlength=m),
         rays,
-        Marks.none(),
+        marks,
         tuple(
             Bar(place[i], place[j], length, s, float(np.linalg.norm(xyz[place[i]] - xyz[place[j]])) - length)
             for i, j, length, s in zip(

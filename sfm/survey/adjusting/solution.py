@@ -12,6 +12,7 @@ from sfm.adjustment.quality.other_solutions import OtherSolution, other_solution
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.conventions import BoolArray, IntArray
+from sfm.display import listed
 from sfm.errors import GeometryError
 from sfm.network import Estimate, Network
 from sfm.reduced_network import reduce_network
@@ -51,7 +52,6 @@ from sfm.survey.inputs.survey import Survey
 TOLERANCE_FACTOR = 6.0  # of the robust spread of the residuals
 MIN_CONTROL = 3  # points that place a free network
 GIVEN_IMAGE_POINTS = 3  # of one whose given orientation tells which of the four solutions is meant
-MAX_NAMES = 10  # points named in one line
 
 
 @dataclass(frozen=True)
@@ -213,6 +213,7 @@ def _solved(start: _Prepared) -> _Solved:
     task, estimate = start.task, start.estimate
     contradictions, taken_out = list(start.contradictions), list(start.taken_out)
     better: tuple[str, ...] = ()
+    asked = {one.name for one in start.estimate.cameras if one.free[0]}
     first: tuple[Settled, Adjustment, ControlCheck | None, tuple[OtherSolution, ...]] | None = None
     settled = settle(task, estimate)
     ready: Settled | None = settled
@@ -234,7 +235,9 @@ def _solved(start: _Prepared) -> _Solved:
             taken_out += [] if found.taken_out is None else [found.taken_out]
             task = without_contradiction(task, found, settled.accepted)
             continue
-        others = other_solutions(final)
+        # c that had to be held is nobody's calibration: what its other values give is another solution
+        c_held = any(one.name in asked and not one.free[0] for one in final.estimate.cameras)
+        others = other_solutions(final, follow_c=c_held)
         if first is not None and not final.converged:  # what seemed better is none: as it was
             (settled, final, check, others), better = first, ()
             break
@@ -319,7 +322,7 @@ def _warnings(
         lines.append(words_of_left_out(left_out, measured))
     absent = [name for name in survey.datum.points if name not in set(adjustment.network.points)]
     if absent:
-        lines.append(f"datum points that are not in the network: {', '.join(absent[:MAX_NAMES])}")
+        lines.append(f"datum points that are not in the network: {listed(absent, most=10)}")
     lines += far_principal_distances(survey, adjustment.estimate)
     lines += _pixels_unlike_squares(survey, adjustment.estimate)
     return (*lines, *datum_warnings(survey, adjustment.network))

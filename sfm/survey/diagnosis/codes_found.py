@@ -7,8 +7,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from sfm.conventions import AnyArray
+from sfm.display import listed
 from sfm.orientation.incremental.sequence import MIN_POINTS
 from sfm.photographs.reading import read_photograph
+from sfm.survey.diagnosis.missing_plates import words_of_missing_plates
 from sfm.survey.inputs.measurements import MeasuredPhotographs
 from sfm.survey.inputs.survey import Survey
 from sfm.targets.codes.families import Family
@@ -18,16 +20,17 @@ from sfm.targets.detect import Targets, find_targets
 from sfm.targets.flags import Flag
 from sfm.targets.outlines import scale_of
 
-MAX_NAMES = 10  # photographs in a message
 MIN_TAGS = 2  # of a family in a photograph that are no chance; a dictionary may be part of a larger one
 # Least diameter of the dot of a ring that is read, px and standard deviations of its edges (rendered rings of
 # 12 to 20 cells: all of 49 are read from 6 px on at 0.75 px, from 8 or 9 px on at 1.25 px).
-LEAST_DOT_PX, LEAST_DOT_SIGMAS = 6.0, 7.0
+MIN_DOT_PX, MIN_DOT_SIGMAS = 6.0, 7.0
 POLARITIES = ("dark", "bright")
 
 
 def words_of_codes(survey: Survey, photographs: MeasuredPhotographs) -> str:
     """Say how many targets and codes were found where more codes were needed, and what decides on that."""
+    if plates := words_of_missing_plates(survey.family, photographs):
+        return plates
     targets = [len(found) for found in photographs.targets]
     codes = [int((found.code >= 0).sum()) for found in photographs.targets]
     with_codes = sum(count > 0 for count in codes)
@@ -55,11 +58,11 @@ def words_of_small_codes(targets: Sequence[Targets]) -> str:
     diameter = 2 * np.concatenate([found.semi_axes[:, 1] for found in every])
     blur = np.concatenate([found.blur for found in every])
     coded = sum(int((found.code >= 0).sum()) for found in every)
-    small = unreadable & (diameter < np.maximum(LEAST_DOT_PX, LEAST_DOT_SIGMAS * blur))
+    small = unreadable & (diameter < np.maximum(MIN_DOT_PX, MIN_DOT_SIGMAS * blur))
     if small.sum() < max(MIN_POINTS, coded):
         return ""
     now, soft = float(np.median(diameter[small])), float(np.median(blur[small]))
-    needed = max(LEAST_DOT_PX, LEAST_DOT_SIGMAS * soft)
+    needed = max(MIN_DOT_PX, MIN_DOT_SIGMAS * soft)
     return (
         f"{small.sum()} targets have something like a code that is too small to read: their dots are "
         f"{now:.1f} px across (median of the shorter axes) and their edges {soft:.1f} px soft, "
@@ -77,7 +80,7 @@ def _words_of_size(survey: Survey, photographs: MeasuredPhotographs) -> str:
         return ""
     return (
         f"; {count} candidates are smaller than min_diameter_px = {survey.targets.min_diameter_px:g}; codes "
-        f"are read from dots of {LEAST_DOT_PX:g} px on in sharp photographs"
+        f"are read from dots of {MIN_DOT_PX:g} px on in sharp photographs"
     )
 
 
@@ -85,9 +88,8 @@ def _by_photograph(photographs: MeasuredPhotographs, codes: list[int]) -> str:
     """Say how many codes were read in each of the first photographs, if any were."""
     if not any(codes):
         return ""
-    shown = zip(photographs.names[:MAX_NAMES], codes, strict=False)
-    more = " ..." if len(codes) > MAX_NAMES else ""
-    return f" ({', '.join(f'{name}: {count}' for name, count in shown)}{more})"
+    shown = (f"{name}: {count}" for name, count in zip(photographs.names, codes, strict=True))
+    return f" ({listed(shown, most=10)})"
 
 
 def _other_settings(survey: Survey, photographs: MeasuredPhotographs) -> str:

@@ -8,9 +8,9 @@ those that do not agree with the largest group leave, and what is contested afte
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable
 from dataclasses import dataclass
 
+from sfm.display import MAX_LISTED, listed
 from sfm.survey.inputs.measurements import MeasuredPhotographs, Naming
 from sfm.survey.target_network import UNNAMED
 from sfm.targets.codes.tags import CORNERS
@@ -18,7 +18,6 @@ from sfm.targets.codes.tags import CORNERS
 MIN_ELSEWHERE = 3  # contradicting codes of a photograph of another object: one or two are moved or misread
 SHARE_ELSEWHERE = 0.1  # of the codes that a photograph shows of the object, at least so many contradict it
 MAX_ROUNDS = 10  # of putting a group together
-MAX_NAMES = 5  # codes or photographs in a line
 
 
 @dataclass(frozen=True)
@@ -73,11 +72,11 @@ def words_of_contested(
         own = found.main.get(code, UNNAMED)
         away = sorted(image for image, at in places.items() if own not in at or len(at) > 1)
         points = sorted({naming.names[k] for i in away for k in places[i] if k not in (own, UNNAMED)})
-        named = _some(photographs.names[i] for i in away)
+        named = listed(photographs.names[i] for i in away)
         rest = len(places) - len(away)
         where = (
             f"{named} show{'s' if len(away) == 1 else ''} it elsewhere than {rest} other photographs"
-            + (f", at {_some(points)}" if points else "")
+            + (f", at {listed(points)}" if points else "")
             if own != UNNAMED
             else f"its rays from {named} do not meet"
         )
@@ -86,8 +85,8 @@ def words_of_contested(
             "of one number, or a misread code"
         )
     numbers = sorted({_number(code, naming) for code in found.places})
-    if len(lines) > MAX_NAMES:
-        lines[MAX_NAMES:] = [f"so are {len(numbers) - MAX_NAMES} more codes"]
+    if len(lines) > MAX_LISTED:
+        lines[MAX_LISTED:] = [f"so are {len(numbers) - MAX_LISTED} more codes"]
     return tuple(lines)
 
 
@@ -165,10 +164,10 @@ def _most(places: dict[int, frozenset[int]], group: frozenset[int]) -> int:
 
 
 def _words_of_foreign(codes: set[int], others: list[str]) -> str:
-    named = f"{len(codes)} of its codes ({_some(map(str, sorted(codes)))}) are elsewhere than in the others"
+    named = f"{len(codes)} of its codes ({listed(map(str, sorted(codes)))}) are elsewhere than in the others"
     if others:
         return (
-            f"{named}, and {_some(others)} agree{'s' if len(others) == 1 else ''} with it: a second object "
+            f"{named}, and {listed(others)} agree{'s' if len(others) == 1 else ''} with it: a second object "
             "with the same codes, or this one in another state; survey it by itself"
         )
     return f"{named}: another object with the same codes, this one in another state, or wrong codes"
@@ -177,9 +176,3 @@ def _words_of_foreign(codes: set[int], others: list[str]) -> str:
 def _number(code: int, naming: Naming) -> int:
     """Return the number of a code, or the tag of a corner."""
     return code // len(CORNERS) if naming.corners else code
-
-
-def _some(names: Iterable[str]) -> str:
-    listed = list(names)
-    more = f" and {len(listed) - MAX_NAMES} more" if len(listed) > MAX_NAMES else ""
-    return ", ".join(listed[:MAX_NAMES]) + more

@@ -16,6 +16,7 @@ from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.camera import Camera, pixel_from_tangents, tangents_from_pixel
 from sfm.conventions import BoolArray, FloatArray
+from sfm.display import listed
 from sfm.distortion.models import Role
 from sfm.errors import GeometryError
 from sfm.network import Estimate, InteriorObservations, Network
@@ -25,11 +26,11 @@ from sfm.similarity import fit_similarity
 from sfm.survey.diagnosis.two_groups import two_groups
 
 MUCH_REJECTED = 0.05  # share of rejected image points from which causes are looked for, too
+LARGE = 50_000  # image points from which on nothing is tried while sigma0 is as expected
 WORTH_A_TRY = 1.5  # sigma0 over the expected one from which causes are looked for
 NEAR_THE_BEST = 1.25  # of the least sigma0: what is simpler and reaches this is preferred
-LEAST_BEFORE = 3  # photographs that can show that the object moved before or behind them
-MAX_NAMES = 5  # photographs named in one line
-MOST_SPLITS = 12  # places in the order of the photographs at which the object is tried to have moved
+MIN_BEFORE = 3  # photographs that can show that the object moved before or behind them
+MAX_SPLITS = 12  # places in the order of the photographs at which the object is tried to have moved
 NOMINAL = (Role.FOCAL, Role.X0, Role.Y0, Role.RADIAL)
 NOMINAL_ERROR = 0.02  # of the half diagonal, at the corner: what nominal values are apart from true ones
 SMALL_MOVE_PX = 1.0  # of the corner, in which distortion is linear in its parameters
@@ -44,8 +45,10 @@ def explain_residuals(found: Adjustment) -> tuple[Explanation, ...]:
         found: the finished adjustment; its sigma0 says whether there is anything to explain.
     """
     rejected = found.rejected.sum() > MUCH_REJECTED * len(found.rejected)
-    conspicuous = rejected or found.sigma0_px > WORTH_A_TRY * found.stated_px
+    conspicuous = bool(rejected or found.sigma0_px > WORTH_A_TRY * found.stated_px)
     network, estimate = found.network, found.estimate
+    if not conspicuous and len(found.rejected) > LARGE:
+        return ()
     groups = _groups(network, estimate)
     if not (conspicuous or groups is not None):
         return ()
@@ -56,11 +59,13 @@ def explain_residuals(found: Adjustment) -> tuple[Explanation, ...]:
 
     if not conspicuous and not (groups and explanation(groups).explains):
         return ()
-    tried = [explanation(one) for one in _causes(network, estimate, groups) if np.isfinite(one.sigma0_px)]
+    causes = _causes(network, estimate, groups, states=conspicuous)
+    tried = [explanation(one) for one in causes if np.isfinite(one.sigma0_px)]
     if not tried:
         return ()
     best = min(one.after_px for one in tried)
-    first = next(one for one in tried if one.after_px <= NEAR_THE_BEST * best)
+    near = [one for one in tried if one.after_px <= NEAR_THE_BEST * best]
+    first = next((one for one in near if one.explains), near[0])
     return (first, *(one for one in tried if one is not first))
 
 
@@ -73,8 +78,8 @@ class _Cause:
     estimate: Estimate | None = None  # of the same points; None where there is no single one
 
 
-def _causes(network: Network, estimate: Estimate, groups: _Cause | None) -> Iterator[_Cause]:
-    """Return the causes with what they leave of the residuals, the simplest first."""
+def _causes(network: Network, estimate: Estimate, groups: _Cause | None, *, states: bool) -> Iterator[_Cause]:
+    """Return the causes with what they leave of the residuals, the simplest first; states take longest."""
     lens = _cameras(estimate.cameras, LENS)
     held = [
         name
@@ -94,8 +99,10 @@ def _causes(network: Network, estimate: Estimate, groups: _Cause | None) -> Iter
         yield groups
     words = "c of its own for each photograph (a zoom or focus that was not fixed)"
     yield _Cause(words, *_adjusted(*_own_c(network, estimate)))
-    splits = range(LEAST_BEFORE, len(network.images) - LEAST_BEFORE + 1)
-    moved = [(_apart(network, estimate, k), k) for k in splits[:: max(1, len(splits) // MOST_SPLITS)]]
+    if not states:
+        return
+    splits = range(MIN_BEFORE, len(network.images) - MIN_BEFORE + 1)
+    moved = [(_apart(network, estimate, k), k) for k in splits[:: max(1, len(splits) // MAX_SPLITS)]]
     if moved:
         sigma, k = min(moved)
         words = (
@@ -195,11 +202,9 @@ def _groups(network: Network, estimate: Estimate) -> _Cause | None:
     mine, others = adjusted.cameras[split.camera[second]], adjusted.cameras[split.camera[same[0]]]
     away = float(np.hypot(*(_principal_point_px(mine) - _principal_point_px(others))))
     names = [name for name, one in zip(network.images, found.second, strict=True) if one]
-    shown = ", ".join(names[:MAX_NAMES])
-    more = f" and {len(names) - MAX_NAMES} more" if len(names) > MAX_NAMES else ""
     ratio = 100 * (mine.c_px / others.c_px - 1)
     words = (
-        f"two cameras, zooms or states of the lens under one name: {shown}{more} with c {ratio:+.2f} % and "
+        f"two cameras, zooms or states of the lens under one name: {listed(names)} with c {ratio:+.2f} % and "
         f"the principal point {away:.2g} px from that of the others"
     )
     return _Cause(words, sigma, adjusted)

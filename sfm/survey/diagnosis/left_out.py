@@ -5,10 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from sfm.conventions import BoolArray, IntArray
+from sfm.display import listed
 from sfm.network import Network
 from sfm.result import LeftOutPoint
-
-MAX_NAMES = 10  # points named in one line
 
 
 def left_out_points(
@@ -52,12 +51,11 @@ def unused_image_points(whole: Network, images: BoolArray, points: BoolArray) ->
 
 def words_of_left_out(left_out: tuple[LeftOutPoint, ...], measured: int) -> str:
     """Return in one line which of so many measured points are not in the result, and why."""
-    named = "; ".join(f"point {one.point}: {one.reason}" for one in left_out[:MAX_NAMES])
-    more = f"; and {len(left_out) - MAX_NAMES} more" if len(left_out) > MAX_NAMES else ""
+    named = listed((f"point {one.point}: {one.reason}" for one in left_out), most=10, separator="; ")
     rows = sum(one.image_points for one in left_out)
     return (
         f"{len(left_out)} of {measured} measured points are not in the result, with {rows} image points: "
-        f"{named}{more}"
+        f"{named}"
     )
 
 

@@ -10,13 +10,14 @@ from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components
 
 from sfm.conventions import BoolArray, IntArray
+from sfm.display import listed
 from sfm.errors import GeometryError
 from sfm.network import Estimate, Network
 from sfm.orientation.incremental.sequence import MIN_POINTS, Orientation
 
 MANY = 0.1  # part of the photographs whose loss, though they are connected, has one cause for all
 C_FACTORS = (1.4, 0.7, 2.0, 0.5)  # on the given principal distance: a crop factor, an extender, a zoom
-MAX_GROUPS, MAX_NAMES = 4, 4  # told one by one
+MAX_GROUPS = 4  # told one by one
 
 
 @dataclass(frozen=True)
@@ -143,9 +144,8 @@ def _with_c(estimate: Estimate, factor: float) -> Estimate:
 def _words(network: Network, oriented: BoolArray, group: Lost) -> str:
     """Say which photographs are not connected with the others, and by which points they could be."""
     n = len(group.images)
-    names = ", ".join(network.images[i] for i in group.images[:MAX_NAMES])
-    names += f" and {n - MAX_NAMES} more" if n > MAX_NAMES else ""
-    shared = ", ".join(network.points[j] for j in group.shared[:MAX_NAMES])
+    names = listed(network.images[i] for i in group.images)
+    shared = listed(network.points[j] for j in group.shared)
     who = "they have" if n > 1 else "it has"
     common = f"{who} only {shared} in common" if shared else f"{who} no point in common"
     own = _often_seen(network, group.images)

@@ -25,8 +25,8 @@ LOST = 0.5  # share of the image points of a photograph without which the rest d
 EXPLAINED = 0.2  # of them that may still be rejected where a camera of its own explains the photograph
 UNLIKE = 3.0  # times the median residual of the others: a photograph of which no point need be rejected
 BETTER = 0.5  # of its median residual: what a camera of its own must reach
-LEAST_POINTS = 8  # of a photograph, for exterior orientation, c and some redundancy
-MOST_PHOTOGRAPHS = 1 / 3  # of the survey: if more do not fit, it is not the single photograph that is wrong
+MIN_POINTS = 8  # of a photograph, for exterior orientation, c and some redundancy
+MAX_FRACTION = 1 / 3  # of the survey: if more do not fit, it is not the single photograph that is wrong
 SCALES = np.geomspace(0.5, 2.0, 29)  # of c that are tried, 5 % apart
 TOLERANCE_PX = 8.0  # largest residual of a point that fits with c to 2.5 %; the adjustment follows
 TRIALS = 300  # triples for each scale
@@ -83,7 +83,7 @@ def treat_lost(
     count = np.bincount(seen.image[known], minlength=m)
     kept = np.bincount(seen.image[known & accepted], minlength=m)
     everything = np.bincount(seen.image, minlength=m)
-    enough = (count >= LEAST_POINTS) & (count > LOST * everything)
+    enough = (count >= MIN_POINTS) & (count > LOST * everything)
     lost = enough & (kept < (1 - LOST) * count)
     length = residual_lengths(network, estimate)
     median = np.array(
@@ -92,7 +92,7 @@ def treat_lost(
     unlike = enough & estimate.oriented & (median > UNLIKE * np.median(median[estimate.oriented]))
     known_before = np.isin(network.images, suspected)
     doubtful = lost | unlike | (enough & known_before & estimate.oriented)
-    if not doubtful.any() or doubtful.sum() > MOST_PHOTOGRAPHS * m:
+    if not doubtful.any() or doubtful.sum() > MAX_FRACTION * m:
         return None
     cameras, owner = list(estimate.cameras), network.camera.copy()
     position, rotation = estimate.position.copy(), estimate.rotation.copy()

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sfm.conventions import FloatArray
+from sfm.display import listed
 from sfm.errors import GeometryError
 from sfm.network import Estimate, Network, empty_estimate, rows_of
 from sfm.orientation.incremental.sequence import MIN_POINTS, Orientation
@@ -17,7 +18,6 @@ from sfm.similarity import fit_similarity
 FITTING = 0.8  # of the image points of a group that must fit in it for the group to confirm itself
 OTHER_SHAPE = 0.1  # misfit of common points over their spread, from which no wrong camera explains it
 SAME_SHAPE = 0.01  # misfit from which two groups show different states of an object
-MAX_NAMES = 4  # told one by one
 
 
 @dataclass(frozen=True)
@@ -36,10 +36,9 @@ class SecondObject:
     @property
     def reason(self) -> str:
         """What is said of each of the photographs."""
-        named = ", ".join(self.images[:MAX_NAMES])
-        more = f" and {len(self.images) - MAX_NAMES} more" if len(self.images) > MAX_NAMES else ""
+        named = listed(self.images)
         return (
-            f"{named}{more} fit one another and not the others: {self.points} common points differ by "
+            f"{named} fit one another and not the others: {self.points} common points differ by "
             f"{100 * self.misfit:.0f} % of their spread after a similarity: a second object with the same "
             "codes, or this one in another state; survey them by themselves"
         )

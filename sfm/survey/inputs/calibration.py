@@ -13,9 +13,9 @@ Source: Mikhail, Bethel and McGlone, Modern Photogrammetry (2001), sec. 5.6 (a p
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import Field
@@ -26,9 +26,6 @@ from sfm.errors import SurveyFileError
 from sfm.files.csv_tables import read_table
 from sfm.files.json_files import Content, Name, Pixel, Side, read_json
 from sfm.survey.inputs.settings import CameraSettings
-
-if TYPE_CHECKING:
-    from sfm.survey.inputs.survey import Survey
 
 TABLES = ("summary.json", "cameras.csv", "interior_correlations.csv")
 
@@ -116,29 +113,6 @@ def read_calibrations(folder: Path) -> tuple[Calibration, ...]:
     return tuple(found)
 
 
-def with_calibration(
-    survey: Survey, calibrations: tuple[Calibration, ...], source: str, *, weighted: bool = False
-) -> Survey:
-    """Return the survey with its cameras held at a calibration, or with it as an observation.
-
-    A camera of the survey takes that of its name; if the calibration has one camera only, all take it.
-
-    Args:
-        survey: what it says of its cameras besides photographs and name is not used.
-        calibrations: of an earlier result.
-        source: what messages call that result.
-        weighted: adjusted, with the calibration and its covariance as an observation; else held.
-
-    Raises:
-        SurveyFileError: no camera of that name among several, photographs of another size, or no standard
-            deviations to weight by.
-    """
-    cameras = tuple(
-        calibrated(one, calibrations, survey.source, source, weighted=weighted) for one in survey.cameras
-    )
-    return replace(survey, cameras=cameras)
-
-
 def calibrated(
     settings: CameraSettings,
     calibrations: tuple[Calibration, ...],
@@ -147,14 +121,16 @@ def calibrated(
     *,
     weighted: bool = False,
 ) -> CameraSettings:
-    """Return the settings of one camera with a calibration, see `with_calibration`.
+    """Return the settings of one camera, held at a calibration or with it as an observation.
+
+    The camera takes that of its name; if the calibration has one camera only, it takes that one.
 
     Args:
-        settings: of the camera.
+        settings: of the camera; besides name and photographs nothing of them is used.
         calibrations: of an earlier result.
         where: what messages call the survey.
         source: what they call that result.
-        weighted: adjusted, with the calibration as an observation; else held.
+        weighted: adjusted, with the calibration and its covariance as an observation; else held.
 
     Raises:
         SurveyFileError: no camera of that name among several, photographs of another size, or no standard

@@ -379,7 +379,11 @@ def _observations(table: CsvTable, unit: str) -> Observations:
 def columns_of(
     what: str, names: tuple[str, ...], rows: int, *given: tuple[npt.ArrayLike, int]
 ) -> dict[str, FloatArray]:
-    """Return arrays, each with the number of its columns, as named columns of so many rows."""
+    """Return arrays, each with the number of its columns, as named columns of so many rows.
+
+    Raises:
+        SurveyFileError: an array of another shape.
+    """
     columns: list[FloatArray] = []
     for values, width in given:
         try:

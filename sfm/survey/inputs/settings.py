@@ -66,6 +66,10 @@ Observed = Annotated[
     BeforeValidator(_pairs),
 ]
 
+PlateSide = Annotated[int, Field(ge=2, le=500)]
+Marks = Annotated[
+    tuple[Annotated[tuple[int, int], Field(strict=False)], ...], Field(strict=False, max_length=1000)
+]
 Correlation = Annotated[float, Field(ge=-1, le=1)]
 Correlations = Annotated[
     tuple[Annotated[tuple[Name, Name, Correlation], Field(strict=False)], ...],
@@ -136,6 +140,7 @@ class TargetSettings(Section):
 
     polarity: Literal["dark", "bright", "auto"] = "auto"
     channel: Literal["luminance", "red", "green", "blue"] = "luminance"  # of colour photographs
+    tone: Literal["linear", "srgb"] = "linear"  # tone curve of the photographs, taken back before measuring
     codes: Name = "none"  # a code family, or a table file relative to the survey file
     ring_radii: TwoLengths | None = (
         None  # of the ring, inner and outer, in those of the dot; else the family's
@@ -146,6 +151,12 @@ class TargetSettings(Section):
     diameters: Name | None = None  # a table id,diameter of single targets, before the one of all
     tag_size: Length | None = None  # side of the black square of all tags, object unit
     tag_sigma: Length | None = None  # its standard deviation, common to all tags of a print, object unit
+    rows: PlateSide | None = None  # of the dots of a plate, or of the crossings inside a board
+    columns: PlateSide | None = None  # of the same
+    pitch: Length | None = None  # distance of neighbouring dots or crossings, object unit
+    marks: Marks = ()  # [row, column], from 0, of the dots that are larger or rings
+    plate_sigma: Length | None = None  # standard deviation of its coordinates, true without, object unit
+    dictionary: Name | None = None  # tags of a ChArUco board, whose side is tag_size
 
 
 class TiePointSettings(Section):

@@ -13,7 +13,7 @@ from pydantic import ValidationError
 from sfm.adjustment.datum import Datum
 from sfm.errors import SurveyFileError
 from sfm.files.plain_text import as_plain
-from sfm.survey.inputs.calibration import calibrated, read_calibrations
+from sfm.survey.inputs.calibration import Calibration, calibrated, read_calibrations
 from sfm.survey.inputs.checks.contradictions import refuse_contradictions
 from sfm.survey.inputs.checks.settings_errors import first_error
 from sfm.survey.inputs.exterior_table import ObservedExterior, read_observed_exterior
@@ -31,6 +31,12 @@ from sfm.survey.inputs.given import (
     read_points,
     read_start_cameras,
 )
+from sfm.survey.inputs.plate import (
+    is_plate_control,
+    plate_control,
+    plate_family,
+    refuse_contradicting_plates,
+)
 from sfm.survey.inputs.settings import (
     AdjustSettings,
     CameraSettings,
@@ -42,7 +48,7 @@ from sfm.survey.inputs.settings import (
     TiePointSettings,
 )
 from sfm.survey.inputs.survey_file import SurveyFile, read_survey_file
-from sfm.targets.codes.families import FAMILIES, Family, code_family
+from sfm.targets.codes.families import TargetFamily, code_family, is_table
 from sfm.targets.codes.rings import CodeFamily
 
 T = TypeVar("T")
@@ -132,7 +138,20 @@ class Survey:
             values["tie_points"] = _section(TiePointSettings, self.tie_points, f"{where}: tie_points")
         for name, value in values.items():
             object.__setattr__(self, name, value)
+        self._place_plate(where)
         refuse_contradictions(self)
+
+    def _place_plate(self, where: str) -> None:
+        """Take the points of a calibration plate as control and, where there are none, as start values."""
+        refuse_contradicting_plates(self.targets, where)
+        plate = plate_control(self.targets)
+        if plate is None:
+            return
+        if self.control is not None and not is_plate_control(self.control, plate):
+            raise SurveyFileError(f"{where}: control beside a calibration plate, which is the control itself")
+        object.__setattr__(self, "control", plate)
+        if self.start_points is None:
+            object.__setattr__(self, "start_points", plate)
 
     @property
     def reject(self) -> str:
@@ -143,10 +162,10 @@ class Survey:
     def codes(self) -> str:
         """Code family, or the path of the table file."""
         codes = self.targets.codes
-        return codes if codes in FAMILIES else str(self.folder / codes)
+        return codes if not is_table(codes) else str(self.folder / codes)
 
     @cached_property
-    def family(self) -> Family | None:
+    def family(self) -> TargetFamily | None:
         """Codes of the targets, None where they have none; a table is read once.
 
         Raises:
@@ -203,7 +222,7 @@ def survey_of_file(file: SurveyFile) -> Survey:
     return Survey(
         name=file.name,
         unit=file.unit,
-        cameras=tuple(_with_calibration(one, file) for one in file.cameras),
+        cameras=tuple(_calibrated_as_named(one, file) for one in file.cameras),
         targets=file.targets,
         tie_points=file.tie_points,
         datum=file.datum,
@@ -223,7 +242,27 @@ def survey_of_file(file: SurveyFile) -> Survey:
     )
 
 
-def _with_calibration(camera: CameraSettings, file: SurveyFile) -> CameraSettings:
+def with_calibration(
+    survey: Survey, calibrations: tuple[Calibration, ...], source: str, *, weighted: bool = False
+) -> Survey:
+    """Return the survey with each camera held at a calibration, or with it as an observation.
+
+    Args:
+        survey: a camera takes the calibration of its name, or the only one, see `calibrated`.
+        calibrations: of an earlier result.
+        source: what messages call that result.
+        weighted: adjusted, with the calibration and its covariance as an observation; else held.
+
+    Raises:
+        SurveyFileError: as `calibrated` does.
+    """
+    cameras = (
+        calibrated(one, calibrations, survey.source, source, weighted=weighted) for one in survey.cameras
+    )
+    return replace(survey, cameras=tuple(cameras))
+
+
+def _calibrated_as_named(camera: CameraSettings, file: SurveyFile) -> CameraSettings:
     """Return the settings of a camera with the calibration that they name, if they name one."""
     if camera.calibration is None:
         return camera
@@ -232,7 +271,7 @@ def _with_calibration(camera: CameraSettings, file: SurveyFile) -> CameraSetting
     return calibrated(camera, read_calibrations(folder), file.source, camera.calibration, weighted=weighted)
 
 
-def survey_family(targets: TargetSettings, codes: str) -> Family | None:
+def survey_family(targets: TargetSettings, codes: str) -> TargetFamily | None:
     """Return the codes of a survey, rings with the radii that it states, None where targets have none.
 
     Args:
@@ -242,6 +281,9 @@ def survey_family(targets: TargetSettings, codes: str) -> Family | None:
     Raises:
         SurveyFileError: the code table is unreadable.
     """
+    plate = plate_family(targets)
+    if plate is not None:
+        return plate
     family = code_family(codes)
     if targets.ring_radii is not None and isinstance(family, CodeFamily):
         return replace(family, inner=targets.ring_radii[0], outer=targets.ring_radii[1])

@@ -29,7 +29,7 @@ from sfm.survey.inputs.settings import (
     TargetSettings,
     TiePointSettings,
 )
-from sfm.targets.codes.families import FAMILIES
+from sfm.targets.codes.families import is_table
 
 
 class SurveyFile(Section):
@@ -81,7 +81,7 @@ class SurveyFile(Section):
     def codes(self) -> str:
         """Code family, or the path of the table file."""
         codes = self.targets.codes
-        return codes if codes in FAMILIES else str(self.beside(codes))
+        return codes if not is_table(codes) else str(self.beside(codes))
 
     @property
     def allow_outside(self) -> bool:
@@ -109,7 +109,7 @@ class SurveyFile(Section):
             self.approximate.images,
             self.approximate.points,
             self.approximate.cameras,
-            None if self.targets.codes in FAMILIES else self.targets.codes,
+            self.targets.codes if is_table(self.targets.codes) else None,
             self.targets.diameters,
         ]
         for camera in self.cameras:

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from sfm.display import listed
 from sfm.errors import PhotographError
 from sfm.photographs.exif import read_metadata
 from sfm.result import FailedImage
@@ -18,7 +19,6 @@ from sfm.survey.inputs.survey import Survey
 
 MIN_OWN = 3  # photographs of one size that a camera of their own is worth
 SAME_ASPECT = 0.005  # relative difference of the ratio of the sides of a photograph that was resampled
-MAX_NAMES = 5  # photographs in a line
 RESAMPLED, UPRIGHT, CROPPED = "resampled", "stored upright", "cropped or from another sensor"
 
 Size = tuple[int, int]
@@ -73,7 +73,7 @@ def separate_sizes(survey: Survey, files: PhotographList) -> OtherSizes:
             cameras.append(_resized(camera, size, main, what, names))
             owner[rows] = len(cameras) - 1
             lines.append(
-                f"{len(rows)} photographs of camera {camera.name} ({_some(names)}) have "
+                f"{len(rows)} photographs of camera {camera.name} ({listed(names)}) have "
                 f"{size[0]} x {size[1]} px in place of {main[0]} x {main[1]} px, {what}: they are a camera "
                 f"of their own, {cameras[-1].name}"
             )
@@ -141,8 +141,3 @@ def _resized(
             "pixel_mm": pixel,
         }
     )
-
-
-def _some(names: Sequence[str]) -> str:
-    more = f" and {len(names) - MAX_NAMES} more" if len(names) > MAX_NAMES else ""
-    return ", ".join(names[:MAX_NAMES]) + more

@@ -9,6 +9,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TypeVar
 
+from sfm.display import listed
 from sfm.errors import GeometryError, PhotographError
 from sfm.result import FailedImage
 from sfm.runtime.faults import working_on
@@ -116,7 +117,4 @@ def in_brackets(failed: Sequence[FailedImage]) -> str:
     """Return which photographs could not be read and why, the first of many, to stand behind a message."""
     if not failed:
         return ""
-    told = [f"{one.image}: {one.reason}" for one in failed[:MAX_TOLD]]
-    if len(failed) > MAX_TOLD:
-        told.append(f"and {len(failed) - MAX_TOLD} more")
-    return f" ({'; '.join(told)})"
+    return f" ({listed((f'{one.image}: {one.reason}' for one in failed), most=MAX_TOLD, separator='; ')})"

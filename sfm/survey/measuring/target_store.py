@@ -23,7 +23,8 @@ from sfm.errors import OutputError, PhotographError
 from sfm.files.user_cache import make_user_folder, remove_unused, user_folder
 from sfm.files.whole_files import whole_file
 from sfm.kernels.sources import sources_of
-from sfm.targets.codes.rings import CodeFamily
+from sfm.targets.codes.families import TargetFamily
+from sfm.targets.codes.plates import PlateFamily
 from sfm.targets.codes.tags import TagFamily
 from sfm.targets.detect import Targets
 
@@ -77,7 +78,7 @@ class TargetStore:
         return self.folder / key[:2] / f"{key}.npz"
 
 
-def target_key(path: Path, settings: str, family: CodeFamily | TagFamily | None) -> str:
+def target_key(path: Path, settings: str, family: TargetFamily | None) -> str:
     """Return the key of a photograph's targets: a SHA-256 of everything that they depend on.
 
     Args:
@@ -91,6 +92,8 @@ def target_key(path: Path, settings: str, family: CodeFamily | TagFamily | None)
     codes = "none"
     if isinstance(family, TagFamily):
         codes = family.name
+    elif isinstance(family, PlateFamily):
+        codes = repr(family)
     elif family is not None:
         table = family.number.tobytes() + family.pattern.tobytes()
         codes = f"{family.cells} {family.inner} {family.outer} {hashlib.sha256(table).hexdigest()}"

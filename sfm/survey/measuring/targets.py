@@ -8,7 +8,7 @@ import numpy as np
 
 from sfm.conventions import FloatArray
 from sfm.photographs.exif import Metadata, read_metadata
-from sfm.photographs.reading import read_photograph
+from sfm.photographs.reading import read_photograph, take_back_srgb
 from sfm.runtime.progress import SILENT, Progress
 from sfm.survey.inputs.cameras import start_cameras
 from sfm.survey.inputs.checks.same_photographs import MIN_COMMON
@@ -18,7 +18,7 @@ from sfm.survey.inputs.settings import TargetSettings
 from sfm.survey.inputs.survey import Survey
 from sfm.survey.measuring.photographs import each_photograph
 from sfm.survey.measuring.target_store import TargetStore, target_key
-from sfm.targets.codes.families import Family
+from sfm.targets.codes.families import TargetFamily
 from sfm.targets.detect import Targets, find_targets
 
 
@@ -77,7 +77,7 @@ def measure_photographs(
 
 
 def _read_and_measure(
-    path: Path, settings: TargetSettings, family: Family | None, store: TargetStore | None
+    path: Path, settings: TargetSettings, family: TargetFamily | None, store: TargetStore | None
 ) -> tuple[Metadata, Targets, bool]:
     targets, stored = measure_photograph(path, settings, family, store)  # says best what is wrong with a file
     return read_metadata(path), targets, stored
@@ -86,7 +86,7 @@ def _read_and_measure(
 def measure_photograph(
     path: Path,
     settings: TargetSettings,
-    family: Family | None,
+    family: TargetFamily | None,
     store: TargetStore | None = None,
 ) -> tuple[Targets, bool]:
     """Return the targets of one photograph and whether an earlier run has measured them.
@@ -102,15 +102,16 @@ def measure_photograph(
     Raises:
         PhotographError: the photograph cannot be read.
     """
-    measured = settings.model_dump_json(include={"channel", "polarity", "min_diameter_px"})
+    measured = settings.model_dump_json(include={"channel", "tone", "polarity", "min_diameter_px"})
     key = "" if store is None else target_key(path, measured, family)
     if store is not None:
         if key not in store.held and (kept := store.load(key)) is not None:
             store.held[key] = kept, True
         if key in store.held:
             return store.held[key]
+    photograph = read_photograph(path, channel=settings.channel)
     targets = find_targets(
-        read_photograph(path, channel=settings.channel),
+        take_back_srgb(photograph) if settings.tone == "srgb" else photograph,
         polarity=settings.polarity,
         codes=family if family is not None else "none",
         min_diameter_px=settings.min_diameter_px,

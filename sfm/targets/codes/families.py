@@ -15,15 +15,22 @@ from functools import partial
 from pathlib import Path
 
 from sfm.errors import SurveyFileError
+from sfm.targets.codes.plates import PLATES, PlateFamily
 from sfm.targets.codes.rings import RING_NAMES, CodeFamily, read_code_table, ring_family
 from sfm.targets.codes.tags import DICTIONARIES, TagFamily, tag_family
 
 Family = CodeFamily | TagFamily
+TargetFamily = Family | PlateFamily  # a plate has no name that says all of it
 FAMILIES: dict[str, Callable[[], Family | None]] = {
     **{name: partial(ring_family, name) for name in RING_NAMES},
     "none": lambda: None,
     **{name: partial(tag_family, name) for name in DICTIONARIES},
 }
+
+
+def is_table(codes: str) -> bool:
+    """Return whether what a survey says of its codes is the path of a table and no name."""
+    return codes not in FAMILIES and codes not in PLATES
 
 
 def code_family(codes: str | Family) -> Family | None:
@@ -40,6 +47,8 @@ def code_family(codes: str | Family) -> Family | None:
     """
     if not isinstance(codes, str):
         return codes
+    if codes in PLATES:
+        raise SurveyFileError(f"codes {codes!r}, a plate with its rows and columns is needed (PlateFamily)")
     if codes in FAMILIES:
         return FAMILIES[codes]()
     if not os.path.exists(codes):

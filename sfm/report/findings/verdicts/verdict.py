@@ -9,6 +9,7 @@ import numpy as np
 
 from sfm.adjustment.quality.reliability import UNCONTROLLED
 from sfm.conventions import MAD_TO_SIGMA
+from sfm.display import MAX_LISTED, listed
 from sfm.report.findings.other_adjuster import words_of_better_fit
 from sfm.report.findings.verdicts.evidence import Evidence, Judged
 from sfm.report.findings.verdicts.verdict_of_given import free_line, judge_given
@@ -17,7 +18,6 @@ from sfm.report.numbers import finer_unit, significant
 MUCH_REJECTED = 0.05  # share of rejected image points above which a person should look
 MANY_RAYS = 1 / 3  # share of the rays of a point: so many of them say something else than the result
 FEW_RAYS = 2  # that are left of a point of which others were rejected check it no more
-MAX_NAMES = 5  # points named in one remark
 MAX_SOLUTIONS = 2  # of about the same v'Pv that are told
 SOLUTION_BAD = 3.0  # standard deviations by which points differ in another solution: theirs say nothing then
 # sigma_px is a rough guess, so the global test alone says little. Twice the guess is worth a look; five
@@ -232,17 +232,16 @@ def _rays(evidence: Evidence) -> Judged:
     most = np.flatnonzero((lost > 0) & ((lost >= MANY_RAYS * rays) | (rays - lost <= FEW_RAYS)))
     if not len(most):
         return []
-    shown = ", ".join(f"{network.points[j]} ({lost[j]} of {rays[j]})" for j in most[:MAX_NAMES])
-    more = " ..." if len(most) > MAX_NAMES else ""
+    shown = listed(f"{network.points[j]} ({lost[j]} of {rays[j]})" for j in most)
     line = f"A third of the rays or more were rejected, or only two are left, of {len(most)} point(s)"
-    return [(False, f"{line}: {shown}{more}.")]
+    return [(False, f"{line}: {shown}.")]
 
 
 def _consistency(evidence: Evidence) -> Judged:
     """Judge the tests inside the result: points, photographs, the format."""
     found, result = evidence.consistency, evidence.result
     lines = []
-    for one in found.two_positions[:MAX_NAMES]:
+    for one in found.two_positions[:MAX_LISTED]:
         factor, unit = finer_unit(result.length_unit, one.distance)
         lines.append(
             f"Point {one.point} is at two positions, {significant(factor * one.distance)} {unit} apart "
@@ -250,22 +249,18 @@ def _consistency(evidence: Evidence) -> Judged:
             f"{one.first[0]} on, the other in {len(one.second)} from {one.second[0]} on. It moved, or two "
             "bear its name."
         )
-    if len(found.two_positions) > MAX_NAMES:
-        lines.append(f"{len(found.two_positions) - MAX_NAMES} more points are at two positions.")
+    if len(found.two_positions) > MAX_LISTED:
+        lines.append(f"{len(found.two_positions) - MAX_LISTED} more points are at two positions.")
     if found.doubtful:
-        shown = ", ".join(
-            f"{one.point} ({one.rejected} rejected, or {one.instead})" for one in found.doubtful[:MAX_NAMES]
-        )
-        more = " ..." if len(found.doubtful) > MAX_NAMES else ""
+        shown = listed(f"{one.point} ({one.rejected} rejected, or {one.instead})" for one in found.doubtful)
         lines.append(
             f"Which ray is wrong cannot be told of {len(found.doubtful)} point(s), whose coordinates are "
-            f"doubtful: {shown}{more}."
+            f"doubtful: {shown}."
         )
     if found.large:
-        more = " ..." if len(found.large) > MAX_NAMES else ""
         lines.append(
             f"The residuals of {len(found.large)} point(s) are together larger than chance: "
-            f"{', '.join(found.large[:MAX_NAMES])}{more}."
+            f"{listed(found.large)}."
         )
     uneven = found.uneven
     if uneven is not None:

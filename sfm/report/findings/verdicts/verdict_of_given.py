@@ -6,6 +6,7 @@ import numpy as np
 
 from sfm.adjustment.quality.statistics import ALPHA
 from sfm.adjustment.quality.variance_components import IMAGE_POINTS
+from sfm.display import listed
 from sfm.report.findings.given_residuals import GivenResiduals, GivenValue
 from sfm.report.findings.verdicts.evidence import Evidence, Judged
 from sfm.report.numbers import finer_unit, significant
@@ -20,7 +21,6 @@ TESTABLE = 1e-3
 CHECK_REMARK = 100.0
 HELD_BAD = 5.0  # standard deviations by which a held camera moves the points (RMS): a wrong result
 HARDLY_DETERMINED = 0.05  # standard deviation of c over c from which the photographs hardly determine it
-MAX_NAMES = 5  # control points named in one remark
 PRINCIPAL_POINT_REMARK = 0.1  # share of the diagonal; a decentred lens or sensor has 1 or 2 %
 MISCLOSURE_BAD = 0.01  # of the size of the object, or of a length: no measurement, a mistake
 
@@ -74,12 +74,9 @@ def _control_apart(evidence: Evidence) -> Judged:
     if not found:
         return []
     factor, unit = finer_unit(evidence.result.length_unit, found[0].distance)
-    shown = ", ".join(
-        f"{one.point} ({significant(factor * one.distance)} {unit})" for one in found[:MAX_NAMES]
-    )
-    more = " ..." if len(found) > MAX_NAMES else ""
+    shown = listed(f"{one.point} ({significant(factor * one.distance)} {unit})" for one in found)
     line = (
-        f"{len(found)} control point(s) do not fit the photographs as the others do: {shown}{more}; correct "
+        f"{len(found)} control point(s) do not fit the photographs as the others do: {shown}; correct "
         "them or take them out."
     )
     part = found[0].distance / evidence.object_size

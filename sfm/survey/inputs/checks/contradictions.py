@@ -7,9 +7,15 @@ from pathlib import Path
 from typing import Protocol
 
 from sfm.distortion.balanced import BALANCED, from_balanced
+from sfm.distortion.balanced import MODEL as BALANCED_MODEL
 from sfm.distortion.models import MODELS
 from sfm.errors import GeometryError, SurveyFileError
-from sfm.survey.inputs.given import ScaleBar
+from sfm.survey.inputs.given import KnownPoints, ScaleBar
+from sfm.survey.inputs.plate import (
+    plate_control,
+    refuse_contradicting_plates,
+    refuse_free_points_without_turn,
+)
 from sfm.survey.inputs.settings import (
     LARGEST,
     MAX_GLOBS,
@@ -22,7 +28,8 @@ from sfm.survey.inputs.settings import (
     TargetSettings,
     TiePointSettings,
 )
-from sfm.targets.codes.families import FAMILIES
+from sfm.targets.codes.families import FAMILIES, is_table
+from sfm.targets.codes.plates import PLATES
 from sfm.targets.codes.tags import DICTIONARIES
 
 CALIBRATION_KEYS = {"calibration", "calibration_use"}
@@ -128,7 +135,13 @@ def refuse_contradictions(survey: SurveySettings) -> None:
             f"{where}: datum.points are for kind 'free' or 'minimal', in kind 'control' the control carries "
             "the datum"
         )
-    if survey.datum.kind == "control" and survey.control is None and survey.exterior is None:
+    refuse_contradicting_plates(survey.targets, where)
+    refuse_free_points_without_turn(survey.targets, survey.datum.kind, where)
+    plate = plate_control(survey.targets)
+    if plate is not None and survey.control is not None and not isinstance(survey.control, KnownPoints):
+        raise SurveyFileError(f"{where}: [control] beside a calibration plate, which is the control itself")
+    known = survey.control is not None or survey.exterior is not None or plate is not None
+    if survey.datum.kind == "control" and not known:
         raise SurveyFileError(
             f"{where}: datum kind 'control' needs [control] with the file of known points, or [exterior]"
         )
@@ -141,23 +154,23 @@ def refuse_contradictions(survey: SurveySettings) -> None:
                 f"times its sigma {bar.sigma:g}; are both in {survey.unit}?"
             )
     _refuse_contradicting_sizes(survey.targets, where, survey.unit)
-    if survey.targets.codes not in FAMILIES and not Path(survey.codes).is_file():
+    if is_table(survey.targets.codes) and not Path(survey.codes).is_file():
         raise SurveyFileError(
-            f"{where}: targets.codes = '{survey.targets.codes}' is neither one of {', '.join(FAMILIES)} "
-            f"nor a table file in {survey.folder}"
+            f"{where}: targets.codes = '{survey.targets.codes}' is neither one of "
+            f"{', '.join((*FAMILIES, *PLATES))} nor a table file in {survey.folder}"
         )
 
 
 def _refuse_contradicting_sizes(targets: TargetSettings, where: str, unit: str) -> None:
     """Raise SurveyFileError where sizes of tags or rings do not go with the codes or with one another."""
-    if targets.tag_size is not None and targets.codes not in DICTIONARIES:
+    if targets.tag_size is not None and targets.codes not in (*DICTIONARIES, "charuco"):
         raise SurveyFileError(
             f"{where}: targets.tag_size is the size of tags, codes = '{targets.codes}' has none; "
             f"tags are {', '.join(list(DICTIONARIES)[:4])} ..."
         )
     if targets.ring_radii is not None:
         inner, outer = targets.ring_radii
-        if targets.codes == "none" or targets.codes in DICTIONARIES:
+        if targets.codes in ("none", *DICTIONARIES, *PLATES):
             raise SurveyFileError(
                 f"{where}: targets.ring_radii are of rings, codes = '{targets.codes}' has none"
             )
@@ -179,8 +192,8 @@ def _refuse_contradicting_sizes(targets: TargetSettings, where: str, unit: str) 
 def _refuse_contradictions_of_balanced(camera: CameraSettings, at: str) -> None:
     """Raise SurveyFileError where a camera in AICON's form is incomplete or stands beside other values."""
     given = dict(camera.balanced)
-    if camera.model != "brown_forward":
-        raise SurveyFileError(f"{at}: balanced is given, model {camera.model}, expected brown_forward")
+    if camera.model != BALANCED_MODEL:
+        raise SurveyFileError(f"{at}: balanced is given, model {camera.model}, expected {BALANCED_MODEL}")
     for parameter in given:
         if parameter not in BALANCED:
             raise SurveyFileError(

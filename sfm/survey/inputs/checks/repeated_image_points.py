@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from sfm.conventions import BoolArray
+from sfm.display import listed
 from sfm.distributions import chi2_ppf
 from sfm.network import ImagePoints, rows_of
 
 ALPHA = 0.001  # probability with which measurements that say the same are taken for contradicting ones
-MAX_NAMES = 5  # named in one line
 
 
 @dataclass(frozen=True)
@@ -33,10 +33,9 @@ class Merged:
         )
         out = []
         for pairs, done in kinds:
-            named = ", ".join(f"{points[j]} in {images[i]}" for i, j in pairs[:MAX_NAMES])
-            more = f" and {len(pairs) - MAX_NAMES} more" if len(pairs) > MAX_NAMES else ""
             if pairs:
-                out.append(f"image points that stand more than once: {named}{more}; {done}")
+                named = listed(f"{points[j]} in {images[i]}" for i, j in pairs)
+                out.append(f"image points that stand more than once: {named}; {done}")
         return tuple(out)
 
 

@@ -8,6 +8,7 @@ from typing import Any, get_args
 
 from pydantic import ValidationError
 
+from sfm.display import listed
 from sfm.files.plain_text import as_plain
 from sfm.survey.inputs.settings import Section
 
@@ -55,8 +56,7 @@ def first_error(path: Path | str, text: str, error: ValidationError, whole: type
         return f"{where}{_key(location[:-1])}: found {found}, needed {location[-1] + 1} values"
     if kind == "missing":
         every = [_key(one["loc"]) for one in errors if one["type"] == "missing"]
-        more = f" and {len(every) - MAX_TOLD} more" if len(every) > MAX_TOLD else ""
-        return f"{where}{', '.join(every[:MAX_TOLD])}{more} {'is' if len(every) == 1 else 'are'} missing"
+        return f"{where}{listed(every, most=MAX_TOLD)} {'is' if len(every) == 1 else 'are'} missing"
     if kind == "tuple_type" and len(location) == 1 and isinstance(first["input"], dict):
         return f"{where}found [{key}], needed [[{key}]] in double brackets, since there may be several"
     needed = dict(_NEEDED).get(kind)

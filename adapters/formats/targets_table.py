@@ -1,0 +1,52 @@
+"""What was measured and rejected in the photographs, read from targets.csv of a result.
+
+    image,x_px,y_px,a_px,b_px,angle_deg,reason
+
+Source: RFC 4180 for CSV; the columns are described in the README.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from sfm.errors import SurveyFileError
+from sfm.files.csv_tables import read_table
+from sfm.network import Network
+from sfm.stored_result import MEASURED, SeenTargets
+
+OUTLINE = ("a_px", "b_px", "angle_deg")
+
+
+def read_targets(folder: Path, network: Network) -> SeenTargets | None:
+    """Read the targets and rejected candidates of a result; None where it has no such table.
+
+    Args:
+        folder: of the result.
+        network: what `read_result` has read of it.
+
+    Raises:
+        SurveyFileError: what is wrong, with file and line number.
+    """
+    path = folder / "targets.csv"
+    if not path.is_file():
+        return None
+    table = read_table(path, ("image", "reason"), ("x_px", "y_px", *OUTLINE), ignored=None, blank=OUTLINE)
+    index = {name: i for i, name in enumerate(network.images)}
+    images, reasons = table.texts
+    for line, name in zip(table.line, images, strict=True):
+        if name not in index:
+            raise SurveyFileError(f"{path}, line {line}: image '{name}' is not in images.csv")
+    axes = table.values[:, 2:4]
+    table.refuse(axes, axes <= 0, OUTLINE[:2], "more than 0, or nothing")
+    ellipse = np.column_stack([axes, np.deg2rad(table.values[:, 4])])
+    for line, reason, outline in zip(table.line, reasons, ellipse, strict=True):
+        if reason == MEASURED and not np.isfinite(outline).all():
+            raise SurveyFileError(f"{path}, line {line}: a measured target without a_px, b_px and angle_deg")
+    return SeenTargets(
+        np.array([index[name] for name in images], dtype=np.int64),
+        table.values[:, :2].copy(),
+        ellipse,
+        tuple("" if reason == MEASURED else reason for reason in reasons),
+    )

@@ -1,0 +1,180 @@
+"""What the commands of planning are given: object, camera, stations, and lists of numbers in one option."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from sfm.errors import SurveyFileError
+
+if TYPE_CHECKING:
+    from sfm.camera import Camera
+    from sfm.planning.planned_object import PlannedObject
+    from sfm.planning.prediction import ScaleBarPlan
+    from sfm.planning.stations import Stations
+
+
+def object_of(text: str, count: int, *, open_mesh: bool) -> PlannedObject:
+    """Return the object of a plan: a CSV of points, a mesh, or a shape with its sizes.
+
+    Args:
+        text: path, or such as box:2,1,0.5.
+        count: points on a mesh or a shape.
+        open_mesh: whether a mesh may have edges of one triangle only.
+
+    Raises:
+        KolinearError: what was found, and what was expected.
+    """
+    from adapters.formats.mesh import read_mesh
+    from sfm.geometry.mesh import Mesh
+    from sfm.planning.planned_object import SHAPES, object_of_mesh, object_of_points, shape_object
+
+    kind, colon, sizes = text.partition(":")
+    if colon and kind in SHAPES:
+        return shape_object(kind, numbers("OBJECT", sizes), count)
+    path = Path(text)
+    if path.suffix.lower() in (".stl", ".ply"):
+        vertices, triangles = read_mesh(path)
+        return object_of_mesh(Mesh(vertices, triangles), count, open_surface=open_mesh)
+    if path.suffix.lower() != ".csv":
+        shapes = ", ".join(f"{kind}:{','.join(sizes)}" for kind, sizes in SHAPES.items())
+        raise SurveyFileError(f"{text}: expected points (.csv), a mesh (.stl, .ply) or one of {shapes}")
+    from sfm.files.csv_tables import read_table
+
+    table = read_table(
+        path, ("id",), ("X", "Y", "Z"), ("nX", "nY", "nZ"), aliases=(("point", "id"),), ignored=None
+    )
+    normals = table.values[:, 3:] if table.values.shape[1] > 3 else None
+    return object_of_points(table.keys("id"), table.values[:, :3].copy(), normals)
+
+
+def camera_of(text: str, name: str | None, c_mm: float | None, free: str | None) -> Camera:
+    """Return the camera of a plan: one of the list, of a survey file, or as a result calibrated it.
+
+    Args:
+        text: name in the list, survey file, or result folder.
+        name: of one of several cameras.
+        c_mm: principal distance, in place of what is there, mm.
+        free: parameters to adjust, separated by commas, or none; as the camera has them if not given.
+
+    Raises:
+        KolinearError: what was found, and what was expected.
+    """
+    from sfm.planning.cameras import listed_camera
+
+    path = Path(text)
+    if path.is_dir():
+        from adapters.formats.result_tables import read_result
+
+        camera = _one_of(text, read_result(path).estimate.cameras, name)
+    elif path.suffix.lower() == ".toml":
+        camera = _of_survey(path, name, c_mm)
+    else:
+        camera = listed_camera(text, c_mm)
+    if c_mm is not None and camera.in_mm:
+        parameters = camera.parameters.copy()
+        parameters[0] = c_mm
+        camera = camera.with_parameters(parameters)
+    if free is None:
+        return camera
+    wanted = [] if free.strip() in ("", "none") else [one.strip() for one in free.split(",")]
+    unknown = [one for one in wanted if one not in camera.names]
+    if unknown:
+        raise SurveyFileError(
+            f"--free {unknown[0]:.40}: camera {camera.name} ({camera.model}) has {', '.join(camera.names)}"
+        )
+    return replace(camera, free=np.array([one in wanted for one in camera.names]))
+
+
+def stations_of(text: str, planned: PlannedObject, camera: Camera) -> Stations:
+    """Return given stations: a CSV of exterior orientation, or an arrangement such as ring:12.
+
+    Raises:
+        KolinearError: what was found, and what was expected.
+    """
+    from sfm.conventions import rotation_from_angles
+    from sfm.files.csv_tables import read_table
+    from sfm.planning.stations import Stations, arrangement
+
+    path = Path(text)
+    if path.suffix.lower() != ".csv":
+        return arrangement(text, planned, camera)
+    angles = ("omega_deg", "phi_deg", "kappa_deg")
+    table = read_table(path, ("image",), ("X", "Y", "Z", *angles), ignored=None)
+    rotation = np.array([rotation_from_angles(*np.radians(row)) for row in table.values[:, 3:]])
+    return Stations(table.keys("image"), table.values[:, :3].copy(), rotation)
+
+
+def bars_of(texts: list[str] | None) -> tuple[ScaleBarPlan, ...]:
+    """Return scale bars given as FROM,TO,SIGMA."""
+    from sfm.planning.prediction import ScaleBarPlan
+
+    found = []
+    for text in texts or ():
+        parts = [part.strip() for part in text.split(",")]
+        if len(parts) != 3:
+            raise SurveyFileError(f"--scale-bar {text:.60}: expected FROM,TO,SIGMA")
+        found.append(ScaleBarPlan(parts[0], parts[1], numbers("--scale-bar", parts[2], 1)[0]))
+    return tuple(found)
+
+
+def numbers(what: str, text: str, count: int | None = None) -> tuple[float, ...]:
+    """Return numbers separated by commas.
+
+    Args:
+        what: they are given as, for messages.
+        text: the numbers.
+        count: how many are expected; any if None.
+
+    Raises:
+        SurveyFileError: another number of them, or no finite numbers.
+    """
+    try:
+        found = tuple(float(part) for part in text.split(","))
+    except ValueError:
+        found = ()
+    if not found or not np.isfinite(found).all() or (count is not None and len(found) != count):
+        wanted = "numbers" if count is None else f"{count} number{'s' * (count > 1)}"
+        raise SurveyFileError(f"{what} {text:.60}: expected {wanted} separated by commas")
+    return found
+
+
+def _one_of(where: str, cameras: tuple[Camera, ...], name: str | None) -> Camera:
+    names = [camera.name for camera in cameras]
+    if name is None and len(cameras) > 1:
+        raise SurveyFileError(
+            f"{where}: {len(cameras)} cameras ({', '.join(names)[:80]}), say one with --camera-name"
+        )
+    found = [camera for camera in cameras if name in (None, camera.name)]
+    if not found:
+        raise SurveyFileError(f"--camera-name {name}: {where} has {', '.join(names)[:80]}")
+    return found[0]
+
+
+def _of_survey(path: Path, name: str | None, c_mm: float | None) -> Camera:
+    from sfm.camera import camera_from_values
+    from sfm.survey.inputs.survey import read_survey
+
+    setups = read_survey(path).cameras
+    found = [one for one in setups if name in (None, one.name)]
+    if len(found) != 1:
+        names = ", ".join(one.name for one in setups)
+        raise SurveyFileError(f"{path}: cameras {names:.80}, say one of them with --camera-name")
+    (one,) = found
+    c = c_mm if c_mm is not None else one.c_mm
+    if c is None:
+        raise SurveyFileError(f"{path}: camera {one.name} has no focal length, needed c_mm there or --c-mm")
+    pixel = one.pixel_mm
+    if pixel is None and one.sensor_mm is not None and one.size_px is not None:
+        pixel = (one.sensor_mm[0] / one.size_px[0], one.sensor_mm[1] / one.size_px[1])
+    if one.size_px is None or pixel is None:
+        raise SurveyFileError(
+            f"{path}: camera {one.name} has no size_px or no pixel_mm; a plan has no photographs to "
+            "take them from"
+        )
+    return camera_from_values(
+        one.name, one.model, one.size_px, pixel, c_mm=c, free=one.may_be_free, values=(*one.fixed, *one.start)
+    )

@@ -1,0 +1,1 @@
+"""Stations that a designer chooses: candidates, the choice one by one, exchanges."""

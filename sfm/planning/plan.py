@@ -1,0 +1,127 @@
+"""A plan: stations, what they will give, where that is weak, and what has to be taken along."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from sfm.camera import Camera
+from sfm.conventions import IntArray
+from sfm.planning.design.designer import Design
+from sfm.planning.planned_object import PlannedObject
+from sfm.planning.prediction import Prediction, ScaleBarPlan, predict_network
+from sfm.planning.shots import Shot, choose_coded, shots
+from sfm.planning.sight.visibility import Seeing
+from sfm.planning.stations import Stations
+from sfm.planning.target_size import MIN_PIXELS, TargetSize, target_size
+from sfm.planning.wanted import Wanted, short_of
+from sfm.planning.weakness import (
+    Calibratability,
+    WeakPoint,
+    calibratability,
+    unusable_photographs,
+    weak_points,
+)
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A planned network with all that is said of it."""
+
+    name: str
+    unit: str  # of lengths
+    prediction: Prediction
+    seeing: Seeing
+    wanted: Wanted
+    design: Design | None  # None where the stations were given
+    shortfall: float  # largest of predicted over wanted; 0 where nothing is wanted
+    weak: tuple[WeakPoint, ...]
+    unusable: tuple[str, ...]  # photographs that show too few points
+    calibration: Calibratability | None  # None where the camera is held
+    target: TargetSize  # that shows MIN_PIXELS from the farthest station
+    coded: IntArray  # points that are coded targets, so that every photograph has five
+    shots: tuple[Shot, ...]
+
+    @property
+    def reached(self) -> bool:
+        """Whether all that is wanted is predicted, and every point is determined."""
+        whole = self.prediction.determined.all() and not self.prediction.adjustment.undetermined
+        return self.shortfall <= 1 and bool(whole)
+
+
+def plan_of(
+    name: str,
+    unit: str,
+    planned: PlannedObject,
+    camera: Camera,
+    stations: Stations,
+    seeing: Seeing,
+    *,
+    wanted: Wanted,
+    bars: Sequence[ScaleBarPlan] = (),
+) -> Plan:
+    """Return the plan of given stations; arguments as of `predict_network`.
+
+    Raises:
+        GeometryError: as `predict_network`.
+    """
+    prediction = predict_network(planned, camera, stations, seeing, bars=bars)
+    every = np.ones(len(planned.names), dtype=bool)
+    return describe_plan(name, unit, prediction, seeing, wanted, short_of(prediction, wanted, every), None)
+
+
+def describe_plan(
+    name: str,
+    unit: str,
+    prediction: Prediction,
+    seeing: Seeing,
+    wanted: Wanted,
+    shortfall: float,
+    design: Design | None,
+) -> Plan:
+    """Return what is to be said of a prediction."""
+    seen = prediction.sight.seen
+    coded = choose_coded(seen)
+    camera = prediction.camera
+    far = max(float(d) for d in _distances(prediction))
+    width = camera.size_px[0]
+    size = target_size(
+        p=MIN_PIXELS,
+        w_mm=width * float(camera.pixel_mm[0]),
+        d=far,
+        c_mm=camera.c_px * float(np.mean(camera.pixel_mm)),
+        n=width,
+        tilt_deg=min(prediction_tilt(prediction, seeing), 75.0),
+    )
+    return Plan(
+        name,
+        unit,
+        prediction,
+        seeing,
+        wanted,
+        design,
+        shortfall,
+        weak_points(prediction),
+        unusable_photographs(prediction),
+        calibratability(prediction, seeing),
+        size,
+        coded,
+        shots(prediction.planned.xyz, prediction.stations, seen, coded),
+    )
+
+
+def prediction_tilt(prediction: Prediction, seeing: Seeing) -> float:
+    """Return the largest angle between a ray of a plan and the normal of its point, deg."""
+    m, n = np.nonzero(prediction.sight.seen)
+    ray = prediction.stations.position[m] - prediction.planned.xyz[n]
+    cosine = (ray * prediction.planned.normals[n]).sum(axis=1) / np.linalg.norm(ray, axis=1)
+    known = cosine[np.isfinite(cosine)]
+    return math.degrees(math.acos(min(float(known.min()), 1.0))) if len(known) else seeing.max_incidence_deg
+
+
+def _distances(prediction: Prediction) -> tuple[float, ...]:
+    m, n = np.nonzero(prediction.sight.seen)
+    return tuple(np.linalg.norm(prediction.planned.xyz[n] - prediction.stations.position[m], axis=1).tolist())

@@ -1,0 +1,226 @@
+"""The object of a plan: points with the directions they face, and the surface that hides them.
+
+A surface is sampled evenly: many random points of equal density, of which each next one is farthest from
+those taken before.
+
+Source: Gonzalez (1985), Theoretical Computer Science 38 (farthest point sampling).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from sfm.conventions import BoolArray, FloatArray, IntArray
+from sfm.errors import GeometryError
+from sfm.geometry.mesh import Mesh
+from sfm.planning.sight.occlusion import BoxTree, box_tree
+
+SEGMENTS = 48  # of a round shape: its facets lie 0.2 % of the radius inside
+PER_POINT = 20  # random points of a surface for each that is kept
+SAME_VERTEX = 1e-9  # of the size of a mesh: corners nearer than this are one
+SHAPES = {
+    "box": ("LX", "LY", "LZ"),
+    "cylinder": ("DIAMETER", "HEIGHT"),
+    "plate": ("LX", "LY"),
+    "wall": ("LENGTH", "HEIGHT"),
+    "dish": ("DIAMETER", "DEPTH"),
+}
+"""shapes by name, and the sizes that each has; `shape_object` makes them"""
+
+
+@dataclass(frozen=True)
+class PlannedObject:
+    """What is to be measured."""
+
+    names: tuple[str, ...]  # of the points, n of them
+    xyz: FloatArray  # object unit, (n, 3)
+    normals: FloatArray  # directions that the points face, length 1; NaN where not known, (n, 3)
+    mesh: Mesh | None = None  # what hides points; None = nothing does
+
+    @cached_property
+    def tree(self) -> BoxTree | None:
+        """The mesh sorted into boxes, None where nothing hides points."""
+        return None if self.mesh is None else box_tree(self.mesh)
+
+    @property
+    def centre(self) -> FloatArray:
+        """Middle of the box around the points, object unit, (3,)."""
+        return np.asarray((self.xyz.min(axis=0) + self.xyz.max(axis=0)) / 2)
+
+    @property
+    def size(self) -> float:
+        """Diagonal of the box around the points, object unit."""
+        return float(np.linalg.norm(np.ptp(self.xyz, axis=0)))
+
+
+def object_of_points(names: tuple[str, ...], xyz: FloatArray, normals: FloatArray | None) -> PlannedObject:
+    """Return points as an object without a surface.
+
+    Args:
+        names: of the points.
+        xyz: object unit, (n, 3).
+        normals: directions that they face, of any length, (n, 3); None where not known.
+
+    Raises:
+        GeometryError: fewer than 3 points, all in one place, or a normal of length 0.
+    """
+    if len(xyz) < 3 or not np.ptp(xyz, axis=0).any():
+        raise GeometryError(f"object: {len(xyz)} points, needed 3 or more that are apart")
+    if normals is None:
+        return PlannedObject(names, xyz, np.full(xyz.shape, np.nan))
+    length = np.linalg.norm(normals, axis=1)
+    if (length == 0).any():
+        raise GeometryError(f"object: point {names[int(np.argmin(length))]} has a normal of length 0")
+    return PlannedObject(names, xyz, normals / length[:, None])
+
+
+def object_of_mesh(
+    mesh: Mesh, count: int, *, open_surface: bool = False, bare: BoolArray | None = None
+) -> PlannedObject:
+    """Return points spread evenly over a mesh, which hides those behind it.
+
+    Args:
+        mesh: triangles; where it is closed they are turned so that they face outwards.
+        count: points.
+        open_surface: whether the mesh may have edges of one triangle only; it is seen from the side on which
+            its triangles run counter-clockwise.
+        bare: triangles without points, such as the bottom that something stands on, (t,).
+
+    Raises:
+        GeometryError: no area, fewer than 3 points asked for, or a mesh with holes not said to be open.
+    """
+    if count < 3:
+        raise GeometryError(f"object: {count} points asked for, needed 3 or more")
+    edges = open_edges(mesh)
+    if edges and not open_surface:
+        raise GeometryError(
+            f"mesh: {edges} edges belong to one triangle only: it has holes, or is an open surface, through "
+            "which points would be seen from behind; close it, or say --open-mesh"
+        )
+    corners = mesh.vertices[mesh.triangles]
+    if not edges and np.einsum("ti,ti->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) < 0:
+        mesh = replace(mesh, triangles=mesh.triangles[:, ::-1])
+        corners = mesh.vertices[mesh.triangles]
+    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    area = np.linalg.norm(across, axis=1)
+    share = np.where(bare, 0.0, area) if bare is not None else area
+    if not share.sum() > 0:
+        raise GeometryError("mesh: none of its triangles has an area")
+    rng = np.random.default_rng(0)
+    which = rng.choice(len(area), size=PER_POINT * count, p=share / share.sum())
+    u, v = np.sqrt(rng.random(len(which))), rng.random(len(which))
+    weight = np.stack([1 - u, u * (1 - v), u * v], axis=1)  # uniform over a triangle
+    xyz = np.einsum("ka,kai->ki", weight, corners[which])
+    kept = farthest_points(xyz, count)
+    names = tuple(f"{k + 1}" for k in range(count))
+    return PlannedObject(names, xyz[kept], (across / np.maximum(area, 1e-300)[:, None])[which[kept]], mesh)
+
+
+def shape_object(kind: str, sizes: tuple[float, ...], count: int) -> PlannedObject:
+    """Return points spread evenly over a simple shape.
+
+    Boxes and cylinders stand on Z = 0 about the Z axis, without points on the bottom. A plate lies in Z = 0
+    and faces up; a wall stands on Z = 0 in the plane Y = 0 and faces -Y; a dish is a paraboloid that opens
+    upwards, with its vertex at the origin.
+
+    Args:
+        kind: a name in SHAPES.
+        sizes: as SHAPES names them, object unit.
+        count: points.
+
+    Raises:
+        GeometryError: another shape, another number of sizes, or a size that is not positive.
+    """
+    if kind not in SHAPES:
+        raise GeometryError(f"object: shape '{kind}', expected one of {', '.join(SHAPES)}")
+    if len(sizes) != len(SHAPES[kind]) or not all(math.isfinite(s) and s > 0 for s in sizes):
+        raise GeometryError(
+            f"object: {kind} of {', '.join(f'{s:g}' for s in sizes) or 'no size'}, expected "
+            f"{len(SHAPES[kind])} positive sizes {','.join(SHAPES[kind])}"
+        )
+    if kind == "box":
+        mesh = _prism(np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) / 2 * sizes[:2], sizes[2])
+    elif kind == "cylinder":
+        mesh = _prism(sizes[0] / 2 * _circle(), sizes[1])
+    elif kind == "plate":
+        x, y = np.array(sizes) / 2
+        mesh = _rectangle([[-x, -y, 0], [x, -y, 0], [x, y, 0], [-x, y, 0]])
+    elif kind == "wall":
+        x, z = sizes[0] / 2, sizes[1]
+        mesh = _rectangle([[-x, 0, 0], [x, 0, 0], [x, 0, z], [-x, 0, z]])
+    else:
+        mesh = _dish(*sizes)
+    closed = kind in ("box", "cylinder")
+    corners = mesh.vertices[mesh.triangles]
+    bare = (corners[:, :, 2] == 0).all(axis=1) if closed else None
+    return object_of_mesh(mesh, count, open_surface=not closed, bare=bare)
+
+
+def open_edges(mesh: Mesh) -> int:
+    """Return how many edges belong to one triangle only; vertices in one place are one."""
+    step = SAME_VERTEX * max(float(np.abs(np.ptp(mesh.vertices, axis=0)).max()), 1e-300)
+    _, same = np.unique(np.round(mesh.vertices / step), axis=0, return_inverse=True)
+    t = same.reshape(-1)[mesh.triangles]
+    t = t[(t[:, 0] != t[:, 1]) & (t[:, 1] != t[:, 2]) & (t[:, 2] != t[:, 0])]
+    edges = np.sort(np.concatenate([t[:, [0, 1]], t[:, [1, 2]], t[:, [2, 0]]]), axis=1)
+    _, count = np.unique(edges, axis=0, return_counts=True)
+    return int((count == 1).sum())
+
+
+def farthest_points(xyz: FloatArray, count: int) -> IntArray:
+    """Return points of which each next one is farthest from those before, (count,); all of fewer.
+
+    The first is the one nearest to the middle.
+    """
+    count = min(count, len(xyz))
+    chosen = np.empty(count, dtype=np.int64)
+    chosen[0] = np.argmin(((xyz - xyz.mean(axis=0)) ** 2).sum(axis=1))
+    nearest = np.full(len(xyz), np.inf)
+    for k in range(1, count):
+        nearest = np.minimum(nearest, ((xyz - xyz[chosen[k - 1]]) ** 2).sum(axis=1))
+        chosen[k] = np.argmax(nearest)
+    return chosen
+
+
+def _circle() -> FloatArray:
+    angle = 2 * np.pi * np.arange(SEGMENTS) / SEGMENTS
+    return np.column_stack([np.cos(angle), np.sin(angle)])
+
+
+def _rectangle(corners: list[list[float]]) -> Mesh:
+    return Mesh(np.array(corners, dtype=float), np.array([[0, 1, 2], [0, 2, 3]], dtype=np.int64))
+
+
+def _prism(outline: FloatArray, height: float) -> Mesh:
+    """Return a closed prism on Z = 0 over a convex outline that runs counter-clockwise, (k, 2)."""
+    k = len(outline)
+    low = np.column_stack([outline, np.zeros(k)])
+    vertices = np.concatenate([low, low + np.array([0.0, 0.0, height])])
+    i, j = np.arange(k), (np.arange(k) + 1) % k
+    fan = np.arange(1, k - 1)
+    triangles = [
+        np.column_stack([i, j, j + k]),
+        np.column_stack([i, j + k, i + k]),
+        np.column_stack([np.zeros(k - 2, dtype=np.int64), fan + 1, fan]),
+        np.column_stack([np.full(k - 2, k), fan + k, fan + 1 + k]),
+    ]
+    return Mesh(vertices, np.concatenate(triangles).astype(np.int64))
+
+
+def _dish(diameter: float, depth: float) -> Mesh:
+    """Return z = depth (r / R)^2, seen from above."""
+    rings = SEGMENTS // 4
+    radius = np.arange(1, rings + 1) / rings
+    flat = (radius[:, None, None] * _circle()[None] * diameter / 2).reshape(-1, 2)
+    height = np.repeat(depth * radius**2, SEGMENTS)
+    vertices = np.concatenate([np.zeros((1, 3)), np.column_stack([flat, height])])
+    i, j = np.arange(SEGMENTS), (np.arange(SEGMENTS) + 1) % SEGMENTS
+    triangles = [np.column_stack([np.zeros(SEGMENTS, dtype=np.int64), 1 + i, 1 + j])]
+    for r in range(rings - 1):
+        a, b = 1 + r * SEGMENTS, 1 + (r + 1) * SEGMENTS
+        triangles += [np.column_stack([a + i, b + i, b + j]), np.column_stack([a + i, b + j, a + j])]
+    return Mesh(vertices, np.concatenate(triangles).astype(np.int64))

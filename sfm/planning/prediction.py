@@ -1,0 +1,244 @@
+"""What a planned network will give: covariance of its points, redundancy, and the rule people know.
+
+    sigma = q S sigma_image / sqrt(k)
+
+with the mean scale number S, k photographs from each station, and q that tells how strong the network is.
+
+Source: Fraser (1984), "Network design considerations for non-topographic photogrammetry", Photogramm. Eng.
+Remote Sens. 50(8); Luhmann et al., Close-Range Photogrammetry (2020), sec. 7.3.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from sfm.adjustment.covariance import marginal_of
+from sfm.adjustment.result import Adjustment
+from sfm.adjustment.solve import predict
+from sfm.camera import Camera
+from sfm.conventions import BoolArray, FloatArray, IntArray
+from sfm.errors import GeometryError
+from sfm.network import Estimate, ImagePoints, Network, ScaleBars, index_of
+from sfm.orientation.ray_angles import ray_angles
+from sfm.planning.planned_object import PlannedObject
+from sfm.planning.sight.visibility import Seeing, Sight, sight_of
+from sfm.planning.stations import Stations
+
+MIN_POINTS = 4  # that a photograph must show to be oriented
+MAX_JOINT = 1000  # points of whose joint covariance lengths are predicted; evenly spread ones of more
+
+
+@dataclass(frozen=True)
+class ScaleBarPlan:
+    """A scale bar between two points of the object."""
+
+    start: str
+    end: str
+    sigma: float  # of its length, object unit
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """What photographs of an object from some stations will give."""
+
+    planned: PlannedObject
+    camera: Camera
+    stations: Stations
+    sight: Sight
+    adjustment: Adjustment  # of the points that two or more usable photographs show, for sigma0 = 1
+    point: IntArray  # place of each point of the object in that network, -1 = not in it, (n,)
+    photograph: IntArray  # likewise of each photograph, (m,)
+
+    @cached_property
+    def covariance(self) -> FloatArray:
+        """Of each point, object unit^2; infinite variances where it is not determined, (n, 3, 3)."""
+        out = np.tile(np.diag(np.full(3, np.inf)), (len(self.point), 1, 1))
+        of_point = self.adjustment.covariance.points[self.point]
+        known = (self.point >= 0) & (np.trace(of_point, axis1=1, axis2=2) > 0)
+        out[known] = of_point[known]
+        return out
+
+    @cached_property
+    def sigma(self) -> FloatArray:
+        """Of each point, RMS of its three coordinates, object unit; infinite where not determined, (n,)."""
+        return np.asarray(np.sqrt(np.trace(self.covariance, axis1=1, axis2=2) / 3))
+
+    @cached_property
+    def largest_sigma(self) -> FloatArray:
+        """Of each point in its worst direction, object unit, (n,)."""
+        out = np.full(len(self.point), np.inf)
+        known = np.isfinite(self.sigma)
+        out[known] = np.sqrt(np.linalg.eigvalsh(self.covariance[known])[:, -1])
+        return out
+
+    @cached_property
+    def determined(self) -> BoolArray:
+        """Which points have coordinates, (n,)."""
+        return np.isfinite(self.sigma)
+
+    @cached_property
+    def rays(self) -> IntArray:
+        """In how many usable photographs each point is seen, (n,)."""
+        return np.asarray(self.sight.seen[self.photograph >= 0].sum(axis=0))
+
+    @cached_property
+    def angle_deg(self) -> FloatArray:
+        """Largest angle between two rays of each point, deg; NaN with fewer than two, (n,)."""
+        a = self.adjustment
+        angle = ray_angles(a.network, a.estimate, np.ones(len(a.network.image_points), dtype=bool))
+        return np.where(self.point >= 0, angle[self.point], np.nan)
+
+    @property
+    def rms_sigma(self) -> float:
+        """Of all determined points, RMS per coordinate, object unit."""
+        return float(np.sqrt((self.sigma[self.determined] ** 2).mean()))
+
+    @cached_property
+    def sigma_px(self) -> float:
+        """Of an image coordinate, the median, px."""
+        C = self.adjustment.network.image_points.covariance
+        return float(np.median(np.sqrt(np.trace(C, axis1=1, axis2=2) / 2)))
+
+    @cached_property
+    def scale_number(self) -> float:
+        """Mean S of distance along the axis over principal distance, over all rays, object unit per px."""
+        seen = self.sight.seen
+        m, n = np.nonzero(seen)
+        away = self.planned.xyz[n] - self.stations.position[m]
+        depth = -(away * self.stations.rotation[m, :, 2]).sum(axis=1)
+        return float(depth.mean() / self.camera.c_px)
+
+    @property
+    def photographs_per_station(self) -> float:
+        """K of Fraser's rule: photographs over different projection centres."""
+        return len(self.stations) / self.stations.places
+
+    @property
+    def q(self) -> float:
+        """Fraser's design factor: q = sigma sqrt(k) / (S sigma_image)."""
+        k = self.photographs_per_station
+        return self.rms_sigma * float(np.sqrt(k)) / (self.scale_number * self.sigma_px)
+
+    @cached_property
+    def length_sigma(self) -> float:
+        """Largest standard deviation of a length between two points, object unit; of at most MAX_JOINT."""
+        if not self.determined.all():
+            return float("inf")
+        a = self.adjustment
+        n = len(a.network.points)
+        some = np.unique(np.linspace(0, n - 1, min(n, MAX_JOINT)).astype(np.int64))
+        Q = marginal_of(a).joint(np.zeros(0, dtype=np.int64), some)
+        return largest_length_sigma(a.estimate.points[some], Q)
+
+
+def predict_network(
+    planned: PlannedObject,
+    camera: Camera,
+    stations: Stations,
+    seeing: Seeing,
+    *,
+    bars: Sequence[ScaleBarPlan] = (),
+    sight: Sight | None = None,
+) -> Prediction:
+    """Return what photographs from stations will give, adjusted with the free parameters of the camera.
+
+    The datum is free: inner constraints on all points, with the scale from bars where there are any.
+
+    Args:
+        planned: the object.
+        camera: interior orientation and which of its parameters are adjusted.
+        stations: where photographs are taken from.
+        seeing: limits and precision of image points.
+        bars: scale bars.
+        sight: of these stations, where it is known already.
+
+    Raises:
+        GeometryError: no photograph or no point that can be determined, or an unknown point of a bar.
+
+    Source: Grafarend (1974), Boll. Geod. Sci. Affini 33 (zero- and first-order design); Fraser (1984).
+    """
+    if sight is None:
+        sight = sight_of(planned, camera, stations.position, stations.rotation, seeing)
+    photographs, points = usable(sight.seen)
+    if len(photographs) < 2 or not len(points):
+        raise GeometryError(
+            f"plan: {len(photographs)} of {len(stations)} photographs show {MIN_POINTS} or more points that "
+            "two of them share, needed 2 photographs: see distance, incidence and depth of field"
+        )
+    place = np.full(len(planned.names), -1, dtype=np.int64)
+    place[points] = np.arange(len(points))
+    i, j = np.nonzero(sight.seen[np.ix_(photographs, points)])
+    rows, columns = photographs[i], points[j]
+    names = tuple(planned.names[k] for k in points)
+    seen = ImagePoints(i, j, sight.xy[rows, columns], sight.covariance[rows, columns])
+    network = Network(
+        tuple(stations.names[k] for k in photographs),
+        np.zeros(len(photographs), dtype=np.int64),
+        names,
+        seen,
+        scale_bars=_scale_bars(planned, place, bars),
+    )
+    estimate = Estimate(
+        (camera,), stations.position[photographs], stations.rotation[photographs], planned.xyz[points]
+    )
+    photograph = np.full(len(stations), -1, dtype=np.int64)
+    photograph[photographs] = np.arange(len(photographs))
+    return Prediction(planned, camera, stations, sight, predict(network, estimate), place, photograph)
+
+
+def usable(seen: BoolArray) -> tuple[IntArray, IntArray]:
+    """Return the photographs that can be oriented and the points that two of them show, as indices.
+
+    Args:
+        seen: which photograph shows which point, (m, n).
+    """
+    photographs = np.ones(len(seen), dtype=bool)
+    while True:
+        points = seen[photographs].sum(axis=0) >= 2
+        left = photographs & (seen[:, points].sum(axis=1) >= MIN_POINTS)
+        if (left == photographs).all():
+            return np.flatnonzero(photographs), np.flatnonzero(points)
+        photographs = left
+
+
+def largest_length_sigma(xyz: FloatArray, covariance: FloatArray) -> float:
+    """Return the largest standard deviation of a length between two of some points.
+
+    Args:
+        xyz: object unit, (n, 3).
+        covariance: of all coordinates together, object unit^2, (3 n, 3 n).
+    """
+    n = len(xyz)
+    Q = covariance.reshape(n, 3, n, 3).transpose(0, 2, 1, 3)
+    own = Q[np.arange(n), np.arange(n)]
+    largest = 0.0
+    for i in range(n - 1):
+        u = xyz[i + 1 :] - xyz[i]
+        length = np.linalg.norm(u, axis=1)
+        u = u[length > 0] / length[length > 0, None]
+        cross = Q[i, i + 1 :][length > 0]
+        of_difference = own[i] + own[i + 1 :][length > 0] - cross - cross.transpose(0, 2, 1)
+        variance = np.einsum("ja,jab,jb->j", u, of_difference, u)
+        largest = max(largest, float(variance.max(initial=0.0)))
+    return float(np.sqrt(largest))
+
+
+def _scale_bars(planned: PlannedObject, place: IntArray, bars: Sequence[ScaleBarPlan]) -> ScaleBars:
+    found: list[tuple[int, int, float, float]] = []
+    for bar in bars:
+        i, j = (index_of(planned.names, name, "point of a scale bar") for name in (bar.start, bar.end))
+        if i == j or not (np.isfinite(bar.sigma) and bar.sigma > 0):
+            raise GeometryError(
+                f"scale bar {bar.start} - {bar.end}: sigma {bar.sigma:g}, needed two points and one above 0"
+            )
+        if place[i] >= 0 and place[j] >= 0:
+            length = float(np.linalg.norm(planned.xyz[i] - planned.xyz[j]))
+            found.append((int(place[i]), int(place[j]), length, bar.sigma))
+    if not found:
+        return ScaleBars()
+    rows = np.array(found)
+    return ScaleBars(rows[:, 0].astype(np.int64), rows[:, 1].astype(np.int64), rows[:, 2], rows[:, 3])

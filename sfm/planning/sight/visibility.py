@@ -1,0 +1,196 @@
+"""Which point is seen from which station, and how well: the model of a photograph that nobody has taken yet.
+
+Source: Mason (1997), "Heuristic reasoning strategy for automated sensor placement", Photogramm. Eng. Remote
+Sens. 63(9) (constraints of format, incidence, occlusion, depth of field and resolution).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from enum import IntEnum
+
+import numpy as np
+
+from sfm.camera import Camera, pixel_jacobian, project
+from sfm.conventions import AnyArray, BoolArray, FloatArray
+from sfm.errors import GeometryError
+from sfm.planning.planned_object import PlannedObject
+from sfm.planning.sight.image_precision import TargetImage, centre_covariance
+from sfm.planning.sight.occlusion import hidden_points
+from sfm.planning.sight.optics import DepthOfField
+
+MAX_INCIDENCE_DEG = 60.0  # of a ray to the normal; beyond, targets are measured badly or not at all
+MIN_DIAMETER_PX = 5.0  # shorter axis of a target from which on it is measured
+BORDER_PX = 2.0  # between a target and the edge of the photograph
+
+
+class Why(IntEnum):
+    """Why a photograph does not show a point."""
+
+    SEEN = 0
+    OUTSIDE = 1  # the photograph or behind the camera
+    OBLIQUE = 2  # its ray is too far from the normal
+    HIDDEN = 3  # by the surface
+    UNSHARP = 4  # outside the depth of field
+    SMALL = 5  # its target shows too few pixels
+
+
+WORDS = {
+    Why.OUTSIDE: "outside the photograph",
+    Why.OBLIQUE: "too oblique",
+    Why.HIDDEN: "hidden by the surface",
+    Why.UNSHARP: "not sharp",
+    Why.SMALL: "too few pixels",
+}
+
+
+@dataclass(frozen=True)
+class Seeing:
+    """What decides whether a point is seen, and how precisely."""
+
+    max_incidence_deg: float = MAX_INCIDENCE_DEG
+    diameter: float | None = None  # of a target, object unit; None = any size is measured with `sigma_px`
+    min_diameter_px: float = MIN_DIAMETER_PX
+    depth: DepthOfField | None = None  # object unit; None = everything is sharp
+    sigma_px: float | None = None  # of an image coordinate; None = from diameter and `target`
+    target: TargetImage = field(default_factory=TargetImage)
+
+    def __post_init__(self) -> None:
+        if self.diameter is None and self.sigma_px is None:
+            raise GeometryError(
+                "plan: neither a standard deviation of image coordinates nor a diameter of targets"
+            )
+        for name, value in (("diameter of targets", self.diameter), ("sigma_px", self.sigma_px)):
+            if value is not None and not (np.isfinite(value) and value > 0):
+                raise GeometryError(f"plan: {name} is {value:g}, needed more than 0")
+        if not 0 < self.max_incidence_deg <= 90:
+            raise GeometryError(f"plan: incidence up to {self.max_incidence_deg:g} deg, needed 0 to 90 deg")
+
+
+@dataclass(frozen=True)
+class Sight:
+    """What m photographs show of n points."""
+
+    why: AnyArray  # a Why of each, (m, n)
+    xy: FloatArray  # where, px; NaN behind the camera, (m, n, 2)
+    covariance: FloatArray  # of an image point, px^2; NaN where it is not seen, (m, n, 2, 2)
+    diameter_px: FloatArray  # shorter axis of the target; NaN where its size or direction is unknown, (m, n)
+
+    @property
+    def seen(self) -> BoolArray:
+        """Which photograph shows which point, (m, n)."""
+        return np.asarray(self.why == Why.SEEN)
+
+    def of(self, photographs: AnyArray) -> Sight:
+        """Return what some of the photographs show."""
+        return replace(
+            self,
+            why=self.why[photographs],
+            xy=self.xy[photographs],
+            covariance=self.covariance[photographs],
+            diameter_px=self.diameter_px[photographs],
+        )
+
+
+def sight_of(
+    planned: PlannedObject, camera: Camera, position: FloatArray, rotation: FloatArray, seeing: Seeing
+) -> Sight:
+    """Return what photographs from some stations show.
+
+    A point without normal has no incidence: it counts as a target that faces the camera.
+
+    Args:
+        planned: points, normals and surface.
+        camera: interior orientation.
+        position: projection centres, object unit, (m, 3).
+        rotation: R, image to object axes, (m, 3, 3).
+        seeing: limits, and what targets are like.
+
+    Source: Mason (1997), Photogramm. Eng. Remote Sens. 63(9).
+    """
+    m, n = len(position), len(planned.xyz)
+    why = np.empty((m, n), dtype=np.uint8)
+    xy, covariance = np.empty((m, n, 2)), np.empty((m, n, 2, 2))
+    diameter = np.empty((m, n))
+    hidden: dict[bytes, BoolArray] = {}
+    for i in range(m):
+        key = position[i].tobytes()  # photographs of one station that differ in their roll
+        if key not in hidden:
+            hidden[key] = _turned_away_or_hidden(planned, position[i])
+        why[i], xy[i], covariance[i], diameter[i] = _photograph(
+            planned, camera, position[i], rotation[i], seeing, hidden[key]
+        )
+    return Sight(why, xy, covariance, diameter)
+
+
+def _turned_away_or_hidden(planned: PlannedObject, position: FloatArray) -> BoolArray:
+    away = planned.normals * (position - planned.xyz)
+    turned = away.sum(axis=1) <= 0  # NaN where the normal is unknown: not turned away
+    if planned.tree is not None:
+        turned |= hidden_points(planned.tree, position, planned.xyz)
+    return np.asarray(turned)
+
+
+def _photograph(
+    planned: PlannedObject,
+    camera: Camera,
+    position: FloatArray,
+    rotation: FloatArray,
+    seeing: Seeing,
+    hidden: BoolArray,
+) -> tuple[AnyArray, FloatArray, FloatArray, FloatArray]:
+    n = len(planned.xyz)
+    UVW = (planned.xyz - position) @ rotation
+    depth = -UVW[:, 2]
+    xy = project(camera, position, rotation, planned.xyz)
+    width, height = camera.size_px
+    border = BORDER_PX
+    inside = (xy > border).all(axis=1) & (xy < (width - 1 - border, height - 1 - border)).all(axis=1)
+    why = np.where(inside, Why.SEEN, Why.OUTSIDE).astype(np.uint8)
+    ray = position - planned.xyz
+    ray /= np.linalg.norm(ray, axis=1, keepdims=True)
+    cosine = (planned.normals * ray).sum(axis=1)
+    oblique = cosine < np.cos(np.radians(seeing.max_incidence_deg))
+    why[inside & oblique] = Why.OBLIQUE
+    why[inside & hidden & ~(oblique & (cosine > 0))] = Why.HIDDEN
+    why[inside & (cosine <= 0)] = Why.OBLIQUE
+    if seeing.depth is not None:
+        sharp = (depth >= seeing.depth.near) & (depth <= seeing.depth.far)
+        why[(why == Why.SEEN) & ~sharp] = Why.UNSHARP
+    covariance, shorter = np.full((n, 2, 2), np.nan), np.full(n, np.nan)
+    used = np.flatnonzero(why == Why.SEEN)
+    if seeing.diameter is not None and len(used):
+        axes = _outlines(planned, camera, rotation, seeing.diameter, used, UVW[used], xy[used], ray[used])
+        shorter[used] = 2 * np.linalg.svd(axes, compute_uv=False)[:, 1]
+        covariance[used] = centre_covariance(axes, seeing.target)
+        why[used[shorter[used] < seeing.min_diameter_px]] = Why.SMALL
+    if seeing.sigma_px is not None:
+        covariance[used] = seeing.sigma_px**2 * np.eye(2)
+    covariance[why != Why.SEEN] = np.nan
+    return why, xy, covariance, shorter
+
+
+def _outlines(
+    planned: PlannedObject,
+    camera: Camera,
+    rotation: FloatArray,
+    diameter: float,
+    used: AnyArray,
+    UVW: FloatArray,
+    xy: FloatArray,
+    ray: FloatArray,
+) -> FloatArray:
+    """Return J of the images of circles on the object, to first order, px, (k, 2, 2)."""
+    normal = planned.normals[used]
+    normal = np.where(np.isnan(normal), ray, normal)
+    helper = np.where(np.abs(normal[:, 2:]) < 0.9, [[0.0, 0.0, 1.0]], [[1.0, 0.0, 0.0]])
+    a = np.cross(helper, normal)
+    a /= np.linalg.norm(a, axis=1, keepdims=True)
+    b = np.cross(normal, a)
+    U, V, W = UVW.T
+    zero = np.zeros(len(U))
+    of_tangents = np.stack(  # of u = -U / W and v = -V / W
+        [np.stack([-1 / W, zero, U / W**2], axis=1), np.stack([zero, -1 / W, V / W**2], axis=1)], axis=1
+    )
+    plane = np.stack([a, b], axis=2)
+    return np.asarray(pixel_jacobian(camera, xy) @ of_tangents @ rotation.T @ plane * diameter / 2)

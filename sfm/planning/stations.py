@@ -1,0 +1,195 @@
+"""Stations of a plan: where photographs are taken from, and the arrangements that people know.
+
+Source: document 000, sec. 2.5.2 (designs left-right and front-back of V-STARS, four stations after Fraser),
+whose figures show them; Fraser (1984), Photogramm. Eng. Remote Sens. 50(8), for convergent networks.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sfm.camera import Camera
+from sfm.conventions import AnyArray, FloatArray
+from sfm.errors import GeometryError
+from sfm.planning.planned_object import PlannedObject
+
+FILLING = 0.9  # share of the format that the object fills
+RING_ELEVATION_DEG = 40.0
+TWO_RINGS_DEG = (25.0, 60.0)
+CONVERGENCE_DEG = 40.0  # of four stations to the axis, and of the designs of the documents
+ARRANGEMENTS = {
+    "ring": "COUNT: around the object, 40 deg above it",
+    "two-rings": "COUNT: half of them 25 and half 60 deg above it",
+    "hemisphere": "COUNT: spread over the half sphere above it",
+    "strips": "COLUMNSxROWS: parallel views of its largest face",
+    "four-stations": "four convergent stations about the axis of its largest face (Fraser)",
+    "left-right": "left and right of that axis, two photographs each",
+    "front-back": "in front of it and behind it, left and right, two photographs each",
+}
+
+
+@dataclass(frozen=True)
+class Stations:
+    """Exterior orientation of planned photographs."""
+
+    names: tuple[str, ...]
+    position: FloatArray  # projection centres, object unit, (m, 3)
+    rotation: FloatArray  # R, image to object axes, (m, 3, 3)
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def of(self, which: AnyArray) -> Stations:
+        """Return some of the stations, in this order."""
+        return Stations(tuple(self.names[i] for i in which), self.position[which], self.rotation[which])
+
+    def renamed(self) -> Stations:
+        """Return the stations with names that count them."""
+        return Stations(_numbered(len(self)), self.position, self.rotation)
+
+    @property
+    def places(self) -> int:
+        """How many different projection centres there are."""
+        return len(np.unique(np.round(self.position, 9), axis=0))
+
+
+def arrangement(text: str, planned: PlannedObject, camera: Camera) -> Stations:
+    """Return the stations of an arrangement that fills the photographs with the object.
+
+    Every second photograph is rolled by 90 degrees.
+
+    Args:
+        text: such as "ring:12", "strips:5x2" or "four-stations"; see ARRANGEMENTS.
+        planned: the object.
+        camera: whose photographs it fills.
+
+    Raises:
+        GeometryError: another arrangement, or a number that it cannot have.
+
+    Source: document 000, sec. 2.5.2, figures 2.12 to 2.15.
+    """
+    kind, _, number = text.partition(":")
+    if kind not in ARRANGEMENTS:
+        raise GeometryError(f"arrangement '{text:.40}', expected one of {', '.join(ARRANGEMENTS)}")
+    if kind == "strips":
+        return _strips(text, number, planned, camera)
+    axis, right, up = object_axes(planned)
+    if kind in ("four-stations", "left-right", "front-back"):
+        if number:
+            raise GeometryError(f"arrangement '{text:.40}': {kind} has no number")
+        tilt = np.radians(CONVERGENCE_DEG)
+        if kind == "four-stations":
+            turned = np.pi / 4 + np.pi / 2 * np.arange(4)
+            sideways = np.cos(turned)[:, None] * right + np.sin(turned)[:, None] * up
+        else:
+            sideways = np.repeat([-right, right], 2, axis=0)
+        away = np.cos(tilt) * axis + np.sin(tilt) * sideways
+        if kind == "front-back":
+            away = np.concatenate([away, -np.cos(tilt) * axis + np.sin(tilt) * sideways])
+        return around(planned, camera, away)
+    count = int(number) if number.isdecimal() and len(number) < 5 else 0
+    if count < 3:
+        raise GeometryError(f"arrangement '{text:.40}': needed {kind}:COUNT with a count of 3 or more")
+    if kind == "hemisphere":
+        k = np.arange(count)
+        elevation = np.arcsin((k + 0.5) / count)
+        azimuth = np.pi * (3 - np.sqrt(5)) * k
+    else:
+        rings = np.radians(TWO_RINGS_DEG if kind == "two-rings" else (RING_ELEVATION_DEG,))
+        elevation = rings[np.arange(count) % len(rings)]
+        azimuth = 2 * np.pi * np.arange(count) / count
+    flat = np.cos(elevation)
+    away = np.column_stack([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)])
+    return around(planned, camera, away)
+
+
+def around(planned: PlannedObject, camera: Camera, away: FloatArray) -> Stations:
+    """Return stations that look at the middle of an object from directions, as near as it fills the format.
+
+    Args:
+        planned: the object.
+        camera: whose photographs it fills.
+        away: from the object to the station, (m, 3).
+    """
+    rolls = np.pi / 2 * (np.arange(len(away)) % 2)
+    away = away / np.linalg.norm(away, axis=1, keepdims=True)
+    rotation = np.array([looking(-a, roll) for a, roll in zip(away, rolls, strict=True)])
+    distance = np.array([filling_distance(planned, camera, R) for R in rotation])
+    return Stations(_numbered(len(away)), planned.centre + distance[:, None] * away, rotation)
+
+
+def filling_distance(planned: PlannedObject, camera: Camera, rotation: FloatArray) -> float:
+    """Return the distance from the middle of an object at which it fills the format, object unit."""
+    half = np.array(camera.size_px) / 2 / camera.c_px * FILLING
+    local = (planned.xyz - planned.centre) @ rotation
+    return float((np.abs(local[:, :2]) / half + local[:, 2:]).max())
+
+
+def looking(direction: FloatArray, roll: float = 0.0) -> FloatArray:
+    """Return R of a camera that looks along a direction; with roll 0 the x axis of the image is horizontal.
+
+    Args:
+        direction: in which it looks, (3,).
+        roll: counter-clockwise about it, rad.
+    """
+    z = -direction / np.linalg.norm(direction)
+    right = np.cross([0.0, 0.0, 1.0], z)
+    if np.linalg.norm(right) < 1e-9:  # straight down: x of the image along X
+        right = np.array([1.0, 0.0, 0.0])
+    right /= np.linalg.norm(right)
+    x = np.cos(roll) * right + np.sin(roll) * np.cross(z, right)
+    return np.column_stack([x, np.cross(z, x), z])
+
+
+def rolled(rotation: FloatArray) -> FloatArray:
+    """Return rotations of the same cameras rolled by 90 degrees, (..., 3, 3)."""
+    return np.stack([rotation[..., 1], -rotation[..., 0], rotation[..., 2]], axis=-1)
+
+
+def object_axes(planned: PlannedObject) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return the direction that most of an object faces, and what is right and up when looking at it.
+
+    The mean of the normals, or where these cancel or are unknown the direction of least extent.
+    """
+    known = planned.normals[~np.isnan(planned.normals).any(axis=1)]
+    mean = known.mean(axis=0) if len(known) else np.zeros(3)
+    if np.linalg.norm(mean) < 0.5:
+        away = planned.xyz - planned.xyz.mean(axis=0)
+        axis = np.linalg.svd(away, full_matrices=False)[2][2]
+        if axis @ mean < 0 or (np.linalg.norm(mean) < 1e-9 and axis[np.argmax(np.abs(axis))] < 0):
+            axis = -axis
+    else:
+        axis = mean / np.linalg.norm(mean)
+    R = looking(-axis)
+    return axis, R[:, 0], R[:, 1]
+
+
+def _strips(text: str, number: str, planned: PlannedObject, camera: Camera) -> Stations:
+    columns, _, rows = number.partition("x")
+    if not all(part.isdecimal() and len(part) < 4 and int(part) > 0 for part in (columns, rows)):
+        raise GeometryError(f"arrangement '{text:.40}': needed strips:COLUMNSxROWS, such as strips:5x2")
+    axis, right, up = object_axes(planned)
+    a, b = int(columns), int(rows)
+    local = (planned.xyz - planned.centre) @ np.stack([right, up, axis], axis=1)
+    low, high = local.min(axis=0), local.max(axis=0)
+    # each photograph shows the part of the object that three of them would share
+    part = np.ptp(local[:, :2], axis=0) * np.minimum(1.0, 3 / (np.array([a, b]) + 2))
+    half = np.array(camera.size_px) / 2 / camera.c_px * FILLING
+    distance = float((part / 2 / half).max()) + high[2]
+    places = [
+        [
+            (low[0] + high[0]) / 2 + (high[0] - low[0] - part[0]) * ((i / (a - 1) if a > 1 else 0.5) - 0.5),
+            (low[1] + high[1]) / 2 + (high[1] - low[1] - part[1]) * ((j / (b - 1) if b > 1 else 0.5) - 0.5),
+        ]
+        for j in range(b)
+        for i in range(a)
+    ]
+    position = planned.centre + np.array(places) @ np.stack([right, up]) + distance * axis
+    rotation = np.array([looking(-axis, np.pi / 2 * (k % 2)) for k in range(a * b)])
+    return Stations(_numbered(a * b), position, rotation)
+
+
+def _numbered(count: int) -> tuple[str, ...]:
+    return tuple(f"S{k + 1:0{len(str(count))}d}" for k in range(count))

@@ -1,0 +1,198 @@
+"""Where a planned network is weak, and why: points, photographs, and the calibration of the camera.
+
+Source: Fraser (1997), ISPRS J. Photogramm. Remote Sens. 52(4) (what determines interior orientation:
+convergence, rolled photographs, depth of the object); Baarda (1968) for reliability.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from sfm.adjustment.quality.correlations import OrientationCorrelation, orientation_correlations
+from sfm.adjustment.quality.statistics import Correlation, Reliability, correlations, reliability
+from sfm.camera import Camera, project, tangents_from_pixel
+from sfm.conventions import FloatArray, rotation_from_vector
+from sfm.planning.prediction import MIN_POINTS, Prediction, predict_network
+from sfm.planning.sight.visibility import WORDS, Seeing, Why
+
+WEAK = 1.5  # times the median sigma from which a point is called weak
+FEW_RAYS = 4  # with fewer a gross error is hardly found, and hardly ever attributed
+FLAT_DEG = 40.0  # largest angle of rays below which depth is much weaker than the rest
+ROLLED_DEG = 45.0  # from the others, from which a photograph counts as rolled
+MIN_DEPTH = 0.1  # of the object over its distance, below which it is flat to the camera
+MAX_PLACES = 500  # image points at which the calibration is judged
+TURN = 1e-4  # rad, of a numerical derivative
+
+
+@dataclass(frozen=True)
+class WeakPoint:
+    """A point that is predicted worse than the others, or not at all."""
+
+    name: str
+    sigma: float  # RMS of its coordinates, object unit; infinite where not determined
+    reason: str
+
+
+@dataclass(frozen=True)
+class Calibratability:
+    """Whether a network determines the interior orientation of its camera."""
+
+    parameters: tuple[str, ...]  # that are adjusted
+    sigma: FloatArray  # predicted, in the units of the camera's model, NaN where not determined
+    contribution: (
+        float  # of their uncertainty to the angles between rays, RMS over the image points, in sigmas
+    )
+    # of an image coordinate: what is left in the photograph after a rotation of the camera
+    cost: float  # sigma of points over that with the camera held
+    rolled: float  # share of photographs that are rolled by about 90 deg against the others, at most 1/2
+    convergence_deg: float  # largest angle between two optical axes
+    depth: float  # largest depth of the object in a photograph over its mean distance there
+    correlations: tuple[Correlation, ...]  # strong ones of camera parameters with one another
+    with_exterior: tuple[OrientationCorrelation, ...]  # strong ones with exterior orientation
+    undetermined: tuple[str, ...]
+
+    @property
+    def good(self) -> bool:
+        """Whether it is: nothing is undetermined and it costs less than an image point does."""
+        return not self.undetermined and self.contribution <= 1.0
+
+    @property
+    def reasons(self) -> tuple[str, ...]:
+        """What the network lacks for it, in words."""
+        words = []
+        if self.rolled < 0.2:
+            words.append(f"{self.rolled:.0%} of the photographs are rolled by 90 deg, better half of them")
+        if self.convergence_deg < FLAT_DEG:
+            words.append(f"optical axes converge by {self.convergence_deg:.0f} deg at most")
+        if self.depth < MIN_DEPTH:
+            words.append(f"the object is {self.depth:.0%} of its distance deep")
+        return tuple(words)
+
+
+def weak_points(prediction: Prediction) -> tuple[WeakPoint, ...]:
+    """Return the points that are not determined and those much worse than the median, worst first."""
+    sigma, determined = prediction.sigma, prediction.determined
+    limit = WEAK * float(np.median(sigma[determined])) if determined.any() else 0.0
+    weak = np.flatnonzero(~determined | (sigma > limit) | (prediction.rays < 2))
+    order = weak[np.lexsort((prediction.rays[weak], -sigma[weak]))]
+    return tuple(
+        WeakPoint(prediction.planned.names[j], float(sigma[j]), reason_of(prediction, int(j))) for j in order
+    )
+
+
+def reason_of(prediction: Prediction, j: int) -> str:
+    """Return why a point is as weak as it is: "2 rays, 9 degrees"; where no ray is, why."""
+    rays, angle = int(prediction.rays[j]), float(prediction.angle_deg[j])
+    words = [f"{rays} ray{'s' if rays != 1 else ''}"]
+    if np.isfinite(angle):
+        words.append(f"{angle:.0f} degrees")
+    if rays < FEW_RAYS:
+        why = prediction.sight.why[:, j]
+        counts = [(int((why == kind).sum()), WORDS[kind]) for kind in Why if kind != Why.SEEN]
+        seen_by_few = int(((why == Why.SEEN) & (prediction.photograph < 0)).sum())
+        counts.append((seen_by_few, f"in photographs with fewer than {MIN_POINTS} points"))
+        words += [f"{what} in {count}" for count, what in sorted(counts, reverse=True) if count]
+    elif angle >= FLAT_DEG:
+        words.append(
+            f"far from the stations or seen by few (median of points: {_median_rays(prediction)} rays)"
+        )
+    return ", ".join(words)
+
+
+def unusable_photographs(prediction: Prediction) -> tuple[str, ...]:
+    """Return the photographs that show too few points to be oriented, by name."""
+    return tuple(
+        name for name, k in zip(prediction.stations.names, prediction.photograph, strict=True) if k < 0
+    )
+
+
+def reliability_of(prediction: Prediction) -> Reliability:
+    """Return predicted internal and external reliability of every image coordinate."""
+    return reliability(prediction.adjustment)
+
+
+def calibratability(prediction: Prediction, seeing: Seeing) -> Calibratability | None:
+    """Return whether the network determines the free parameters of its camera; None where it has none.
+
+    Args:
+        prediction: of the network.
+        seeing: by which it was predicted.
+
+    Source: Fraser (1997), ISPRS J. Photogramm. Remote Sens. 52(4).
+    """
+    a, camera = prediction.adjustment, prediction.camera
+    if not camera.free.any():
+        return None
+    held = replace(camera, free=np.zeros_like(camera.free))
+    fixed = predict_network(prediction.planned, held, prediction.stations, seeing, sight=prediction.sight)
+    free = predict_network(prediction.planned, camera, prediction.stations, seeing, sight=prediction.sight)
+    R, X0 = prediction.stations.rotation, prediction.stations.position
+    axes = R[:, :, 2]
+    depth = -((prediction.planned.xyz[None] - X0[:, None]) * axes[:, None]).sum(axis=2)
+    depth = np.where(prediction.sight.seen, depth, np.nan)[prediction.photograph >= 0]
+    names = tuple(n for n, f in zip(camera.names, camera.free, strict=True) if f)
+    sigma = a.interior_sigma(0)[camera.free]
+    rows = {f"{n} of camera {camera.name}" for n in names}
+    return Calibratability(
+        parameters=names,
+        sigma=np.where(sigma > 0, sigma, np.nan),
+        contribution=_contribution(camera, a.covariance.interior[0], a.network.image_points.xy)
+        / prediction.sigma_px,
+        cost=free.rms_sigma / fixed.rms_sigma,
+        rolled=rolled_share(R),
+        convergence_deg=float(np.degrees(np.arccos(np.clip(axes @ axes.T, -1, 1).min()))),
+        depth=float(
+            np.max((np.nanmax(depth, axis=1) - np.nanmin(depth, axis=1)) / np.nanmean(depth, axis=1))
+        ),
+        correlations=tuple(pair for pair in correlations(a) if pair.first in rows),
+        with_exterior=orientation_correlations(a),
+        undetermined=tuple(a.undetermined),
+    )
+
+
+def rolled_share(rotation: FloatArray) -> float:
+    """Return which share of photographs is rolled by about 90 deg against the others, at most 1/2.
+
+    The roll is that of the image's x axis out of the horizontal, of views straight down or up out of X.
+    """
+    z, x = rotation[:, :, 2], rotation[:, :, 0]
+    level = np.cross([0.0, 0.0, 1.0], z)
+    length = np.linalg.norm(level, axis=1, keepdims=True)
+    level = np.where(length > 1e-6, level / np.maximum(length, 1e-12), [1.0, 0.0, 0.0])
+    upright = np.abs((level * x).sum(axis=1)) < np.cos(np.radians(ROLLED_DEG))
+    return float(min(upright.mean(), 1 - upright.mean()))
+
+
+def _contribution(camera: Camera, covariance: FloatArray, xy: FloatArray) -> float:
+    """Return what the uncertainty of the interior orientation does to the angles between rays, RMS, px.
+
+    A principal point that is off by little and a camera that is turned by as much cannot be told apart, and
+    need not be: a rotation of the camera is taken off.
+    """
+    free = np.flatnonzero(camera.free)
+    uv = tangents_from_pixel(camera, xy[:: 1 + len(xy) // MAX_PLACES])
+    points = np.column_stack([uv, np.full(len(uv), -1.0)])
+    sigma = np.sqrt(np.maximum(np.diagonal(covariance), 0))
+    columns = []
+    for k, s in zip(free, sigma, strict=True):
+        ahead, behind = camera.parameters.copy(), camera.parameters.copy()
+        ahead[k] += s
+        behind[k] -= s
+        moved = [project(camera.with_parameters(p), np.zeros(3), np.eye(3), points) for p in (ahead, behind)]
+        columns.append((moved[0] - moved[1]).ravel() / 2)
+    turned = [
+        project(camera, np.zeros(3), rotation_from_vector(step), points)
+        - project(camera, np.zeros(3), rotation_from_vector(-step), points)
+        for step in TURN * np.eye(3)
+    ]
+    basis = np.linalg.qr(np.stack([one.ravel() for one in turned], axis=1))[0]
+    J = np.stack(columns, axis=1)
+    J -= basis @ (basis.T @ J)
+    R = covariance / np.maximum(np.outer(sigma, sigma), 1e-300)
+    return float(np.sqrt(np.einsum("ka,ab,kb->k", J, R, J).mean()))
+
+
+def _median_rays(prediction: Prediction) -> int:
+    return int(np.median(prediction.rays))

@@ -1,0 +1,344 @@
+"""A planned network as page, tables and JSON: what it will give, where it is weak, the photographs."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sfm.adjustment.quality.statistics import reliability
+from sfm.conventions import FloatArray, angles_from_rotation
+from sfm.files.plain_text import csv_text, or_none
+from sfm.network import Estimate, ImagePoints, Network
+from sfm.planning.plan import Plan
+from sfm.planning.wanted import MIN_RAYS, found_displacement
+from sfm.report.html.page import render
+from sfm.report.numbers import finer_unit, or_unlimited, significant
+from sfm.report.page_files import write_files
+from sfm.report.viewer.embedded import viewer_of
+from sfm.report.viewer.pictures import Pictures
+from sfm.report.viewer.scene import ViewerScene
+from sfm.report.viewer.stored_scene import scene_of_stored
+from sfm.stored_result import StoredResult
+
+FILES = ("points.csv", "image_points.csv", "exterior.csv", "shots.csv", "plan.json", "plan.html")
+POINTS = ("id", "X", "Y", "Z", "nX", "nY", "nZ", "sX", "sY", "sZ", "rays", "angle_deg", "coded")
+SHOTS = (
+    *(
+        "image",
+        "X",
+        "Y",
+        "Z",
+        "azimuth_deg",
+        "elevation_deg",
+        "roll_deg",
+        "distance",
+        "focus",
+        "points",
+        "coded",
+    ),
+)
+NAMED = 12  # weak points that are told
+
+
+def write_plan(plan: Plan, out: Path) -> Path:
+    """Write a plan into a folder and return the path of its page.
+
+    Args:
+        plan: the plan.
+        out: the folder.
+
+    Raises:
+        OutputError: the folder holds something else or cannot be written.
+    """
+    p = plan.prediction
+    m, n = np.nonzero(p.sight.seen)
+    deviation = np.sqrt(np.diagonal(p.sight.covariance[m, n], axis1=1, axis2=2))
+    angles = np.degrees(angles_from_rotation(p.stations.rotation))
+    texts = (
+        csv_text(POINTS, _points(plan)),
+        csv_text(
+            ("image", "point", "x_px", "y_px", "sx_px", "sy_px"),
+            (
+                (p.stations.names[i], p.planned.names[j], *p.sight.xy[i, j].tolist(), *s)
+                for i, j, s in zip(m, n, deviation.tolist(), strict=True)
+            ),
+        ),
+        csv_text(
+            ("image", "X", "Y", "Z", "omega_deg", "phi_deg", "kappa_deg"),
+            (
+                (name, *X0, *a)
+                for name, X0, a in zip(
+                    p.stations.names, p.stations.position.tolist(), angles.tolist(), strict=True
+                )
+            ),
+        ),
+        csv_text(
+            SHOTS,
+            (
+                (
+                    *(s.station, *np.round(s.position, 6).tolist(), round(s.azimuth_deg, 2)),
+                    *(
+                        round(s.elevation_deg, 2),
+                        round(s.roll_deg, 2),
+                        round(s.distance, 6),
+                        round(s.focus, 6),
+                    ),
+                    *(s.points, s.coded),
+                )
+                for s in plan.shots
+            ),
+        ),
+        json.dumps(plan_summary(plan), indent=2, ensure_ascii=False, allow_nan=False) + "\n",
+        plan_page(plan),
+    )
+    return write_files(out, tuple(zip(FILES, texts, strict=True)), main=FILES[-1])
+
+
+def headline(plan: Plan) -> str:
+    """Return what the plan comes to, in a sentence."""
+    p = plan.prediction
+    m, n = len(p.stations), len(p.planned.names)
+    known = int(p.determined.sum())
+    lost = f", {n - known} of {n} points not determined" if known < n else ""
+    worst = _length(plan, float(p.sigma[p.determined].max()))
+    told = f"{m} photographs: sigma of points {_length(plan, p.rms_sigma)} RMS, {worst} at most{lost}"
+    if p.adjustment.undetermined:
+        told += ", and the network is NOT determined"
+    few = int((p.rays < MIN_RAYS).sum())
+    told += f", {few} with fewer than {MIN_RAYS} rays" if few else ""
+    if not plan.wanted.anything:
+        return told
+    if plan.shortfall <= 1:
+        others = " at the others" if few or known < n else ""
+        return f"{told}; what is wanted is reached{others}"
+    by = f"{plan.shortfall:.2f} times what is wanted"
+    if not np.isfinite(plan.shortfall):
+        by = "points lack rays, or the network is not determined"
+    return f"{told}; what is wanted is NOT reached ({by})"
+
+
+def remarks(plan: Plan) -> list[str]:
+    """Return what limits the plan, one line each."""
+    said = []
+    if plan.design is not None and plan.design.limit:
+        said.append(f"What limits it: {plan.design.limit}.")
+    if plan.unusable:
+        said.append(f"Photographs that show too few points: {', '.join(plan.unusable[:NAMED])}.")
+    c = plan.calibration
+    if c is not None and not c.good:
+        lacking = [*c.reasons, *([_first(c.undetermined)] if c.undetermined else [])]
+        reasons = "; ".join(lacking) or "too few image points over the photograph"
+        said.append(
+            f"The camera cannot be calibrated with this network: {reasons}. Calibrate it before, or hold it."
+        )
+    few = [s.station for s in plan.shots if s.coded < 5]
+    if few:
+        said.append(f"Fewer than 5 points for coded targets in: {', '.join(few[:NAMED])}.")
+    if np.isnan(plan.prediction.planned.normals).any():
+        said.append("Points without normals count as seen from everywhere: give nX, nY, nZ.")
+    if plan.seeing.sigma_px is None:
+        said.append(
+            "Sigma of image coordinates is what the targets allow; lens and sensor add to it: give "
+            "--sigma-px from an earlier survey."
+        )
+    if plan.seeing.depth is None:
+        said.append("Depth of field is not looked at: give --f-number.")
+    return said
+
+
+def figures(plan: Plan) -> list[tuple[str, str]]:
+    """Return the figures of a plan, each with its unit."""
+    p, a = plan.prediction, plan.prediction.adjustment
+    found = reliability(a)
+    d = found_displacement(p)[p.determined]
+    r = a.redundancy_numbers[np.isfinite(a.redundancy_numbers)]
+    worst, along = float(p.sigma[p.determined].max()), float(p.largest_sigma[p.determined].max())
+    per_mm = p.scale_number / float(np.mean(p.camera.pixel_mm))
+    rows = [
+        ("photographs", f"{len(p.stations)} from {p.stations.places} stations"),
+        ("object points", f"{int(p.determined.sum())} of {len(p.planned.names)} determined"),
+        ("image points", f"{len(a.network.image_points)}, sigma {significant(p.sigma_px)} px (median)"),
+        ("rays of a point", f"{p.rays.min()} to {p.rays.max()}, median {np.median(p.rays):.0f}"),
+        (
+            "sigma of points",
+            f"{_length(plan, p.rms_sigma)} RMS per coordinate, {_length(plan, worst)} at the worst point, "
+            f"{_length(plan, along)} in its worst direction",
+        ),
+        (
+            "displacement found between two such surveys",
+            f"{_length(plan, float(np.median(d)))} (median), {_length(plan, float(d.max()))} (worst)",
+        ),
+        (
+            "redundancy",
+            f"{a.redundancy}; redundancy numbers {abs(r.min()):.2f} to {r.max():.2f}, mean {r.mean():.2f}",
+        ),
+        ("gross error that is found", _spread(found.minimal_bias, "px")),
+        ("its effect if it is not found", _spread(found.external, "sigmas of an unknown")),
+        (
+            "rule of Fraser",
+            f"sigma = q S sigma_image / sqrt(k): q {p.q:.2f}, S {per_mm:.4g} {plan.unit} per mm, "
+            f"k {p.photographs_per_station:.2g} (photographs over stations)",
+        ),
+        (
+            "target diameter",
+            f"{plan.target.diameter:.4g} {plan.unit} for 7 px from the farthest station at the steepest ray",
+        ),
+        ("coded targets", f"{len(plan.coded)} give every photograph five, or all that it shows"),
+    ]
+    if a.undetermined:
+        rows.append(("not determined", _first(a.undetermined)))
+    return rows
+
+
+def plan_page(plan: Plan) -> str:
+    """Return the page: the scene to explore, figures, list of photographs, weak points and the camera."""
+    scene = plan_scene(plan)
+    factor, fine = finer_unit(plan.unit, plan.prediction.rms_sigma)
+    return render(
+        "plan.html",
+        viewer=viewer_of(scene, Pictures()),
+        plan=plan,
+        p=plan.prediction,
+        title=plan.name,
+        headline=headline(plan),
+        level=_level(plan),
+        remarks=remarks(plan),
+        figures=figures(plan),
+        fine=fine,
+        factor=factor,
+        camera_rows=_camera_rows(plan),
+        named=NAMED,
+    )
+
+
+def plan_scene(plan: Plan) -> ViewerScene:
+    """Return the scene of a plan: stations, rays and all points, those not determined included."""
+    p = plan.prediction
+    a = p.adjustment
+    m, n = np.nonzero(p.sight.seen)
+    network = Network(
+        p.stations.names,
+        np.zeros(len(p.stations), dtype=np.int64),
+        p.planned.names,
+        ImagePoints(m, n, p.sight.xy[m, n], p.sight.covariance[m, n]),
+    )
+    estimate = Estimate((p.camera,), p.stations.position, p.stations.rotation, p.planned.xyz)
+    covariance = np.where(np.isfinite(p.covariance), p.covariance, np.nan)
+    of_position = np.full((len(p.stations), 3, 3), np.nan)
+    used = p.photograph >= 0
+    of_position[used] = a.covariance.exterior[p.photograph[used], :3, :3]
+    return scene_of_stored(
+        StoredResult(plan.name, network, estimate, covariance, of_position, unit=plan.unit)
+    )
+
+
+def plan_summary(plan: Plan) -> dict[str, Any]:
+    """Return what plan.json holds: plain values only, None for what is not known."""
+    p, c, camera = plan.prediction, plan.calibration, plan.prediction.camera
+    return {
+        "name": plan.name,
+        "unit": plan.unit,
+        "headline": headline(plan),
+        "reached": plan.reached,
+        "shortfall": or_none(plan.shortfall),
+        "limits": remarks(plan),
+        "wanted": {
+            "sigma": plan.wanted.sigma,
+            "length_sigma": plan.wanted.length_sigma,
+            "displacement": plan.wanted.displacement,
+        },
+        "photographs": len(p.stations),
+        "stations": p.stations.places,
+        "points": len(p.planned.names),
+        "determined": int(p.determined.sum()),
+        "sigma_rms": or_none(p.rms_sigma),
+        "sigma_largest": or_none(float(p.sigma.max())),
+        "sigma_px": p.sigma_px,
+        "redundancy": p.adjustment.redundancy,
+        "fraser": {"q": p.q, "k": p.photographs_per_station, "S_per_px": p.scale_number},
+        "target": {
+            "diameter": plan.seeing.diameter,
+            "diameter_for_7_px": plan.target.diameter,
+            "contrast": plan.seeing.target.contrast,
+            "noise": plan.seeing.target.noise,
+            "blur_px": plan.seeing.target.blur_px,
+        },
+        "coded_targets": len(plan.coded),
+        "camera": {
+            "name": camera.name,
+            "model": camera.model,
+            "size_px": list(camera.size_px),
+            "pixel_mm": camera.pixel_mm.tolist(),
+            "parameters": dict(zip(camera.names, camera.parameters.tolist(), strict=True)),
+            "free": [n for n, f in zip(camera.names, camera.free, strict=True) if f],
+            "can_be_calibrated": None if c is None else c.good,
+            "sigma": {} if c is None else {n: or_none(s) for n, s in zip(c.parameters, c.sigma, strict=True)},
+        },
+        "weak_points": [{"point": w.name, "sigma": or_none(w.sigma), "reason": w.reason} for w in plan.weak],
+    }
+
+
+def _camera_rows(plan: Plan) -> list[tuple[str, ...]]:
+    c, camera = plan.calibration, plan.prediction.camera
+    if c is None:
+        return []
+    units = dict(zip(camera.names, camera.units, strict=True))
+    rows: list[tuple[str, ...]] = []
+    for name, sigma in zip(c.parameters, c.sigma.tolist(), strict=True):
+        others = [
+            f"{pair.second if pair.first.startswith(name + ' ') else pair.first} ({pair.value:+.2f})"
+            for pair in c.correlations
+            if name in (pair.first.split(" ")[0], pair.second.split(" ")[0])
+        ]
+        outer = [
+            f"{one.partners} ({one.largest:+.2f})"
+            for one in c.with_exterior
+            if one.parameter.startswith(f"{name} ")
+        ]
+        shown = significant(sigma) if np.isfinite(sigma) else "not determined"
+        rows.append((name, shown, units[name], "; ".join((*others, *outer))))
+    return rows
+
+
+def _points(plan: Plan) -> list[tuple[object, ...]]:
+    p = plan.prediction
+    sigma = np.sqrt(np.diagonal(p.covariance, axis1=1, axis2=2))
+    coded = set(plan.coded.tolist())
+
+    def cell(value: float) -> object:
+        return value if np.isfinite(value) else ""
+
+    return [
+        (
+            *(name, *p.planned.xyz[j].tolist(), *map(cell, p.planned.normals[j].tolist())),
+            *map(cell, sigma[j].tolist()),
+            *(int(p.rays[j]), cell(float(p.angle_deg[j])), int(j in coded)),
+        )
+        for j, name in enumerate(p.planned.names)
+    ]
+
+
+def _level(plan: Plan) -> str:
+    if plan.prediction.adjustment.undetermined or not plan.prediction.determined.all():
+        return "bad"
+    return "good" if plan.reached else "fair"
+
+
+def _first(undetermined: tuple[str, ...]) -> str:
+    """Write the first of what is not determined, and how many more there are."""
+    more = len(undetermined) - 1
+    return undetermined[0] + (f"; and {more} more" if more else "")
+
+
+def _spread(values: FloatArray, unit: str) -> str:
+    """Write median and largest of reliabilities, which are unlimited where nothing checks an image point."""
+    median, largest = (or_unlimited(float(value)) for value in (np.median(values), values.max()))
+    return f"{median} {unit} (median), {largest} at most"
+
+
+def _length(plan: Plan, value: float) -> str:
+    factor, unit = finer_unit(plan.unit, value)
+    return f"{significant(value * factor)} {unit}"

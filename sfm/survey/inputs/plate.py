@@ -1,0 +1,100 @@
+"""The calibration plate of a survey: its family, and its points as control and start values."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sfm.errors import GeometryError, SurveyFileError
+from sfm.survey.inputs.given import KnownPoints
+from sfm.survey.inputs.settings import TargetSettings
+from sfm.targets.codes.plates import PLATES, PlateFamily, refuse_unusable_plate
+from sfm.targets.codes.tags import DICTIONARIES
+
+OF_PLATES = ("rows", "columns", "pitch", "marks", "plate_sigma", "dictionary")
+MIN_SIDE = 3  # rows or columns of a checkerboard that OpenCV finds
+
+
+def plate_family(targets: TargetSettings) -> PlateFamily | None:
+    """Return the plate that the targets are on; None where they are on none."""
+    if targets.codes not in PLATES or targets.rows is None or targets.columns is None:
+        return None
+    share = 0.0
+    if targets.tag_size is not None and targets.pitch is not None:
+        share = targets.tag_size / targets.pitch
+    return PlateFamily(
+        targets.codes, targets.rows, targets.columns, targets.marks, targets.dictionary or "", share
+    )
+
+
+def plate_control(targets: TargetSettings) -> KnownPoints | None:
+    """Return the points of the plate, flat and in their grid, as control; None without a plate.
+
+    The origin is the first point, X along the rows, Y up the columns, Z towards the camera.
+    """
+    plate = plate_family(targets)
+    if plate is None or targets.pitch is None:
+        return None
+    xyz = plate.plane(targets.pitch)
+    names = tuple(str(k) for k in range(plate.count))
+    return KnownPoints(names, xyz, np.full_like(xyz, targets.plate_sigma or 0.0))
+
+
+def is_plate_control(control: KnownPoints | None, plate: KnownPoints) -> bool:
+    """Return whether the control is that of the plate."""
+    if control is None or control.names != plate.names:
+        return False
+    return bool(np.array_equal(control.xyz, plate.xyz) and np.array_equal(control.sigma, plate.sigma))
+
+
+def refuse_contradicting_plates(targets: TargetSettings, where: str) -> None:
+    """Raise SurveyFileError where what is said of a plate is incomplete, or belongs to none."""
+    given = [name for name in OF_PLATES if name in targets.model_fields_set]
+    if targets.codes not in PLATES:
+        if given:
+            raise SurveyFileError(
+                f"{where}: targets.{given[0]} is of a calibration plate, codes = '{targets.codes}' is none; "
+                f"plates are {', '.join(PLATES)}"
+            )
+        return
+    for name in ("rows", "columns", "pitch"):
+        if getattr(targets, name) is None:
+            raise SurveyFileError(f"{where}: targets.{name} is missing, codes = '{targets.codes}' needs it")
+    plate = plate_family(targets)
+    assert plate is not None
+    board = targets.codes == "charuco"
+    if board and targets.dictionary not in DICTIONARIES:
+        raise SurveyFileError(
+            f"{where}: targets.dictionary = '{targets.dictionary or ''}', codes = 'charuco' needs one of "
+            f"{', '.join(DICTIONARIES)}"
+        )
+    if board and not 0 < plate.tag_share < 1:
+        raise SurveyFileError(
+            f"{where}: targets.tag_size is the side of the tags of a ChArUco board, needed between 0 and the "
+            "pitch"
+        )
+    if not board and targets.dictionary is not None:
+        raise SurveyFileError(f"{where}: targets.dictionary is of codes = 'charuco', found '{targets.codes}'")
+    if targets.codes != "grid" and targets.marks:
+        raise SurveyFileError(f"{where}: targets.marks are of codes = 'grid', found '{targets.codes}'")
+    if targets.codes == "checkerboard" and min(plate.rows, plate.columns) < MIN_SIDE:
+        raise SurveyFileError(
+            f"{where}: a checkerboard of {plate.rows} x {plate.columns} crossings, at least {MIN_SIDE} x "
+            f"{MIN_SIDE} are needed (rows and columns count crossings inside the board, not squares)"
+        )
+    try:
+        refuse_unusable_plate(plate)
+    except GeometryError as error:
+        raise SurveyFileError(f"{where}: targets.marks: {error}") from error
+
+
+def refuse_free_points_without_turn(targets: TargetSettings, datum: str, where: str) -> None:
+    """Raise SurveyFileError where each point has coordinates of its own, and which it is cannot be told."""
+    plate = plate_family(targets)
+    if plate is None or datum == "control" or targets.codes == "charuco" or plate.marks:
+        return
+    if targets.codes == "checkerboard" and (plate.rows + plate.columns) % 2:
+        return
+    raise SurveyFileError(
+        f"{where}: a plate that looks alike turned by 180 degrees has no points of its own; needed [datum] "
+        "kind = 'control', which takes the plate as flat and true, or a plate with marks"
+    )

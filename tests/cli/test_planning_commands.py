@@ -1,0 +1,180 @@
+"""`kolinear plan network`: what it writes, and bad input in one line."""
+
+from __future__ import annotations
+
+import csv
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from adapters.formats.result_tables import write_tables
+from sfm import cli
+from sfm.stored_result import StoredResult
+from tests.surveys import write_observed_survey
+from tests.synthetic import make_network, seed_of
+
+CAMERA = ("--camera", "full-frame-24", "--c-mm", "28")
+LENS = (*CAMERA, "--sigma-px", "0.05")
+
+
+def plan(*arguments: object, command: str = "network") -> int:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "argv", ["kolinear", "plan", command, *map(str, arguments)])
+        try:
+            cli.main()
+        except SystemExit as end:
+            return int(str(end.code or 0))
+    return 0
+
+
+def rows(path: Path) -> list[dict[str, str]]:
+    with path.open(encoding="utf-8") as file:
+        return list(csv.DictReader(file))
+
+
+def test_a_plan_is_written_with_page_tables_and_json(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "plan"
+    given = ("plate:1000,700", *CAMERA, "--points", 30, "--target-diameter", 10, "--out", out)
+    assert plan(*given, "--stations", "ring:6", "--sigma", "0.05") == 0
+    printed = capsys.readouterr().out
+    assert "6 photographs: sigma of points" in printed and "what is wanted is reached" in printed
+    assert "rule of Fraser: sigma = q S sigma_image / sqrt(k): q 0." in printed
+    found = json.loads((out / "plan.json").read_text(encoding="utf-8"))
+    assert found["reached"] and found["determined"] == 30 and found["fraser"]["k"] == 1
+    points = rows(out / "points.csv")
+    sigma = np.array([[float(row[k]) for k in ("sX", "sY", "sZ")] for row in points])
+    assert np.sqrt((sigma**2).mean()) == pytest.approx(found["sigma_rms"])
+    coded = {row["id"] for row in points if row["coded"] == "1"}
+    seen: dict[str, int] = {}
+    for row in rows(out / "image_points.csv"):
+        seen[row["image"]] = seen.get(row["image"], 0) + (row["point"] in coded)
+    assert min(seen.values()) >= 5
+    assert [row["coded"] for row in rows(out / "shots.csv")] == [str(seen[f"S{k}"]) for k in range(1, 7)]
+    assert {row["roll_deg"] for row in rows(out / "shots.csv")} == {"0.0", "90.0"}
+    page = (out / "plan.html").read_text(encoding="utf-8")
+    assert "viewer-data" in page and "azimuth [deg]" in page and "plate:1000,700" in page
+    # its exterior orientation is what --stations reads, and a plan of the points gives the same again
+    again = tmp_path / "again"
+    given = (
+        out / "points.csv",
+        *CAMERA,
+        "--target-diameter",
+        10,
+        "--stations",
+        out / "exterior.csv",
+        "--out",
+        again,
+    )
+    assert plan(*given) == 0
+    other = json.loads((again / "plan.json").read_text(encoding="utf-8"))
+    assert other["sigma_rms"] == pytest.approx(found["sigma_rms"], rel=1e-6)
+
+
+BAD = [
+    (("box:1,1", *LENS, "--stations", "ring:6"), "object: box of 1, 1, expected 3 positive sizes LX,LY,LZ"),
+    (("ball:1", *LENS, "--stations", "ring:6"), "expected points (.csv), a mesh (.stl, .ply) or one of box"),
+    (
+        ("plate:1,1", "--camera", "full-frame-24", "--sigma-px", "1", "--stations", "ring:6"),
+        "no focal length",
+    ),
+    (
+        ("plate:1,1", "--camera", "brownie", "--c-mm", "5", "--sigma-px", "1", "--stations", "ring:6"),
+        "one of full-frame-24",
+    ),
+    (("plate:1,1", *LENS), "neither --stations nor what is wanted"),
+    (("plate:1,1", *CAMERA, "--stations", "ring:6"), "needed --sigma-px or --target-diameter"),
+    (
+        ("plate:1,1", *LENS, "--stations", "ring:6", "--f-number", "8"),
+        "--f-number and --focus are needed together",
+    ),
+    (
+        ("plate:1,1", *LENS, "--stations", "ring:6", "--free", "c,K9"),
+        "--free K9: camera full-frame-24 (brown) has c, x0",
+    ),
+    (("plate:1,1", *LENS, "--stations", "ring:6", "--scale-bar", "1,2"), "expected FROM,TO,SIGMA"),
+    (("plate:1,1", *LENS, "--stations", "ring:6", "--unit", "parsec"), "--unit parsec: expected one of km"),
+    (
+        ("plate:1000,1000", *LENS, "--sigma", "1", "--space", "0,1,2"),
+        "expected 6 numbers separated by commas",
+    ),
+    (("plate:1000,1000", *LENS, "--sigma", "1", "--space=-9,9,-9,9,-9000,-100"), "the object faces away"),
+    (("plate:1000,1000", *LENS, "--sigma", "1", "--space", "5e4,6e4,5e4,6e4,5e4,6e4"), "no room within"),
+    (
+        ("plate:1000,1000", *LENS, "--stations", "ring:6", "--f-number", "2", "--focus", "10"),
+        "focus at 10 mm",
+    ),
+    (
+        ("plate:1000,1000", *LENS, "--stations", "ring:6", "--max-incidence-deg", "1"),
+        "0 of 6 photographs show",
+    ),
+    (("holes.stl", *LENS, "--stations", "ring:6"), "3 edges belong to one triangle only"),
+    (("no.csv", *LENS, "--stations", "ring:6"), "no.csv"),
+]
+
+
+@pytest.mark.parametrize(("arguments", "message"), BAD, ids=[message[:24] for _, message in BAD])
+def test_bad_input_is_one_line(
+    arguments: tuple[str, ...],
+    message: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    corners = [(0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1)]
+    facets = [(0, 2, 1), (0, 1, 3), (0, 3, 2)]  # a tetrahedron without its last side
+    text = "".join(
+        "facet normal 0 0 0\nouter loop\n"
+        + "".join(f"vertex {corners[k][0]} {corners[k][1]} {corners[k][2]}\n" for k in f)
+        + "endloop\nendfacet\n"
+        for f in facets
+    )
+    Path("holes.stl").write_text(f"solid holes\n{text}endsolid holes\n")
+    assert plan(*arguments) == 2
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 1 and message in lines[0]
+    assert not Path("out").exists()
+
+
+def test_the_camera_of_a_survey_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    survey = write_observed_survey(tmp_path / "s", "plan")
+    given = ("dish:2,0.4", "--unit", "m", "--camera", survey, "--sigma-px", "0.1", "--points", 20)
+    assert plan(*given, "--stations", "hemisphere:8", "--out", tmp_path / "plan") == 0
+    camera = json.loads((tmp_path / "plan" / "plan.json").read_text(encoding="utf-8"))["camera"]
+    assert camera["name"] == "synthetic" and camera["free"] == ["c"] and camera["parameters"]["K1"] == 8e-4
+    text = survey.read_text(encoding="utf-8").replace("c_mm = 10.0\n", "")
+    survey.write_text(text, encoding="utf-8")
+    assert plan(*given, "--stations", "hemisphere:8") == 2
+    assert "camera synthetic has no focal length, needed c_mm there or --c-mm" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("command", "file"), [("simulate", "plan.json"), ("more", "summary.json")])
+def test_a_folder_that_is_none_is_one_line(
+    command: str,
+    file: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert plan("nowhere", command=command) == 2
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 1 and f"nowhere/{file}: cannot be read" in lines[0]
+    assert not Path("out").exists()
+
+
+def test_more_photographs_for_a_result(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A result of the tables of a network; what its report says is how to ask for this."""
+    network, truth = make_network(seed_of("more"), images=5, points=25, free=())
+    write_tables(tmp_path / "five", StoredResult("five", network, truth, unit="m", redundancy=40))
+    out = tmp_path / "more"
+    assert plan(tmp_path / "five", "--photographs", 2, "--out", out, command="more") == 0
+    printed = capsys.readouterr().out
+    assert "2 more photographs: sigma of the worst point from" in printed and "new 2: " in printed
+    points = rows(out / "points.csv")
+    assert all(float(row["sigma_with_more"]) < float(row["sigma"]) for row in points)

@@ -1,0 +1,114 @@
+"""Photographs to add to a survey, and a plan photographed by rendering."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import sfm
+from sfm.adjustment.solve import predict
+from sfm.camera import camera_from_values
+from sfm.errors import GeometryError, SurveyFileError
+from sfm.inspection.planned_survey import achieved, read_plan, write_simulation
+from sfm.network import Estimate, Network
+from sfm.planning.further import further_photographs
+from sfm.planning.plan import plan_of
+from sfm.planning.planned_object import shape_object
+from sfm.planning.prediction import predict_network
+from sfm.planning.sight.image_precision import TargetImage
+from sfm.planning.sight.visibility import Seeing
+from sfm.planning.stations import Stations, arrangement
+from sfm.planning.wanted import Wanted
+from sfm.rendering.planned_targets import planned_scene
+from sfm.report.further import headline, weakest, write_further
+from sfm.report.planning import write_plan
+from sfm.stored_result import StoredResult
+from sfm.targets.codes.families import code_family
+from sfm.targets.codes.rings import CodeFamily
+
+CAMERA = camera_from_values("c", "brown", (3000, 2000), (0.006, 0.006), c_mm=18.0, free=("c", "x0", "y0"))
+
+
+def survey() -> tuple[Network, Estimate]:
+    """Return a survey of a plate from one side of it, so that its far end is weak."""
+    plate = shape_object("plate", (1.0, 0.7), 60)
+    ring = arrangement("ring:16", plate, CAMERA)
+    near = np.flatnonzero(ring.position[:, 0] > -0.2)[:6]
+    a = predict_network(plate, CAMERA, ring.of(near), Seeing(sigma_px=0.1)).adjustment
+    return a.network, a.estimate
+
+
+def test_further_photographs_help_the_weakest_points(tmp_path: Path) -> None:
+    network, estimate = survey()
+    found = further_photographs(network, estimate, sigma_px=0.1, count=2, candidate_count=60)
+    before = np.sqrt(np.trace(predict(network, estimate).covariance.points, axis1=1, axis2=2) / 3)
+    assert np.allclose(found.before, before)
+    assert found.points[0] == np.argmax(before)
+    assert (found.after < found.before * (1 + 1e-9)).all()
+    gain = found.before[found.points].max() / found.after[found.points].max()
+    assert gain > 1.15
+    # the network of both is what the adjuster makes of it, and the first photograph alone helps less
+    assert found.adjustment.network.images[-2:] == ("new 1", "new 2")
+    alone = further_photographs(network, estimate, sigma_px=0.1, count=1, candidate_count=60)
+    assert found.after.max() < alone.after.max() < before.max()
+    assert np.allclose(alone.stations.position[0], found.stations.position[0])
+    result = StoredResult("plate", network, estimate, unit="m")
+    page = write_further(found, result, tmp_path / "more").read_text(encoding="utf-8")
+    assert headline(found, result) in page and weakest(found, result)[0][1] in page
+    assert (tmp_path / "more" / "exterior.csv").read_text(encoding="utf-8").count("\n") == 3
+
+
+def test_what_cannot_be_helped_is_said() -> None:
+    network, estimate = survey()
+    with pytest.raises(GeometryError, match="0 further photographs, needed 1 or more"):
+        further_photographs(network, estimate, sigma_px=0.1, count=0)
+    lost = replace(estimate, position=np.full_like(estimate.position, np.nan))
+    with pytest.raises(GeometryError, match="0 photographs and 60 points of two rays, needed 2 and 3"):
+        further_photographs(network, lost, sigma_px=0.1)
+
+
+def test_a_plan_is_achieved_by_its_rendered_photographs(tmp_path: Path) -> None:
+    camera = camera_from_values("small", "brown", (900, 700), (0.005, 0.005), c_mm=6.0, free=("c",))
+    plate = shape_object("plate", (500.0, 380.0), 20)
+    target = TargetImage(contrast=120, noise=3, blur_px=0.8)
+    stations: Stations = arrangement("ring:8", plate, camera)
+    seeing = Seeing(diameter=12.0, target=target)
+    plan = plan_of("plate", "mm", plate, camera, stations, seeing, wanted=Wanted())
+    write_plan(plan, tmp_path / "plan")
+    read = read_plan(tmp_path / "plan")
+    assert (read.seen == plan.prediction.sight.seen).all() and read.camera.free.sum() == 1
+    assert np.allclose(read.stations.rotation, stations.rotation, atol=1e-9)
+    path = write_simulation(read, tmp_path)
+    result = sfm.run_survey(path, compare_with="none")
+    found = achieved(read, "ring14", result.stored, result.adjustment.sigma0_px)
+    assert found.points == found.planned == 20
+    # 60 coordinates, correlated through the datum: 10 % of sampling error, and sigma0 of some 200 redundancy
+    assert found.ratio == pytest.approx(1.0, abs=0.25) and found.error == pytest.approx(1.0, abs=0.35)
+    assert found.sigma_px == pytest.approx(found.predicted_px, rel=0.2)
+    (tmp_path / "plan" / "points.csv").write_text("id,X\n", encoding="utf-8")
+    with pytest.raises(SurveyFileError, match=r"points\.csv, line 1: no column Y"):
+        read_plan(tmp_path / "plan")
+
+
+def test_targets_that_overlap_are_refused(tmp_path: Path) -> None:
+    camera = camera_from_values("small", "brown", (900, 700), (0.005, 0.005), c_mm=6.0, free=("c",))
+    plate = shape_object("plate", (100.0, 100.0), 20)
+    seeing = Seeing(diameter=12.0)
+    plan = plan_of(
+        "plate", "mm", plate, camera, arrangement("ring:6", plate, camera), seeing, wanted=Wanted()
+    )
+    write_plan(plan, tmp_path / "plan")
+    with pytest.raises(GeometryError, match="overlap; needed fewer points or smaller targets"):
+        write_simulation(read_plan(tmp_path / "plan"), tmp_path)
+
+
+def test_a_planned_target_lies_where_its_point_is() -> None:
+    family = code_family("ring14")
+    assert isinstance(family, CodeFamily)
+    normals = np.array([[0.0, 0.0, 1.0], [0.6, 0.0, 0.8]])
+    scene = planned_scene(np.array([[1.0, 2, 3], [4, 5, 6]]), normals, np.array([-1, 5]), 2.0, family)
+    assert np.allclose(scene.faces.normals(), normals)
+    assert np.allclose(scene.faces.place(scene.targets.face, scene.targets.centre), scene.faces.centre)

@@ -1,0 +1,153 @@
+"""Rendered calibration plates with their truth: dots with marks, and checkerboards. Object unit mm."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from sfm.camera import Camera, camera_from_values
+from sfm.conventions import AnyArray, FloatArray, rotation_from_vector
+from sfm.rendering.render import render_photograph
+from sfm.rendering.scene import CircularTargets, Faces, Marks, Optics, Scene, discs, join_marks, rectangles
+from sfm.targets.codes.plates import PlateFamily
+
+PITCH = 12.0
+SIZE_PX, PIXEL_MM = (800, 600), 0.0075
+TRUTH = {"c": 8.137, "x0": 0.041, "y0": -0.033, "K1": -1.1e-3, "K2": 2.3e-5}
+MARKS = ((3, 3), (3, 5), (4, 7), (5, 4))
+GRID = PlateFamily("grid", 9, 11, MARKS)
+BOARD = PlateFamily("checkerboard", 8, 11)
+
+SURVEY = """
+[survey]
+name = "{name}"
+unit = "mm"
+
+[[camera]]
+name = "small"
+images = "*.png"
+pixel_mm = [{pixel}, {pixel}]
+c_mm = 8.0
+free = ["c", "x0", "y0", "K1", "K2"]
+
+[targets]
+polarity = "{polarity}"
+codes = "{codes}"
+rows = {rows}
+columns = {columns}
+pitch = {pitch}
+marks = {marks}
+
+[datum]
+kind = "{datum}"
+
+[adjust]
+sigma_px = 0.01
+
+[compare]
+backend = "none"
+"""
+
+
+def camera() -> Camera:
+    """Return the true camera."""
+    free = ("c", "x0", "y0", "K1", "K2")
+    values = [(name, value) for name, value in TRUTH.items() if name != "c"]
+    made = camera_from_values("small", "brown", SIZE_PX, (PIXEL_MM, PIXEL_MM), c_mm=TRUTH["c"], free=free)
+    p = made.parameters.copy()
+    for name, value in values:
+        p[made.names.index(name)] = value
+    return made.with_parameters(p)
+
+
+def plate_scene(plate: PlateFamily, *, rings: bool = False, move: FloatArray | None = None) -> Scene:
+    """Return a plate with its first point at the origin, X to the right, Y up; `move` shifts its points."""
+    xyz = plate.plane(PITCH) + (0.0 if move is None else move)
+    middle = plate.plane(PITCH).mean(axis=0)
+    half = np.array([[(plate.columns + 1) * PITCH / 2, (plate.rows + 1) * PITCH / 2]])
+    faces = Faces(middle[None], np.eye(3)[None, :2], half, np.array([0.85]), np.zeros(1), np.ones(1))
+    xy = (xyz - middle)[:, :2]
+    if plate.name == "grid":
+        is_mark = np.isin(np.arange(plate.count), [r * plate.columns + c for r, c in plate.marks])
+        marks: list[Marks] = [discs(0, xy[~is_mark], 3.0, 0.06), discs(0, xy[is_mark], 4.6, 0.06)]
+        radius = np.where(is_mark, 4.6, 3.0)
+        if rings:
+            marks.append(discs(0, xy[is_mark], 2.4, 0.85))
+            radius = np.where(is_mark, 2.4, 3.0)
+        targets = CircularTargets(np.zeros(plate.count, dtype=np.int64), xy, radius, np.arange(plate.count))
+        return Scene(faces, join_marks(marks), targets)
+    row, column = np.mgrid[-1 : plate.rows, -1 : plate.columns]
+    # the square right below the first crossing is dark
+    dark = (row + column) % 2 == 0
+    centre = np.stack([(column[dark] + 0.5) * PITCH, -(row[dark] + 0.5) * PITCH], axis=1) - middle[:2]
+    k = len(centre)
+    squares = rectangles(0, centre, np.full((k, 2), PITCH / 2), np.zeros(k), np.full(k, 0.06))
+    none = CircularTargets(
+        np.zeros(0, dtype=np.int64), np.zeros((0, 2)), np.zeros(0), np.zeros(0, dtype=np.int64)
+    )
+    return Scene(faces, squares, none)
+
+
+def stations(rng: np.random.Generator, count: int, plate: PlateFamily) -> tuple[FloatArray, FloatArray]:
+    """Return stations about the plate that show most or all of it, rolled by up to 180 degrees."""
+    middle = plate.plane(PITCH).mean(axis=0)
+    distance = rng.uniform(210, 250, count)
+    azimuth = 2 * np.pi * np.arange(count) / count + rng.uniform(0, 0.5)
+    tilt = np.radians(rng.uniform(18, 32, count))
+    tilt[0] = 0.02
+    position, rotation = np.empty((count, 3)), np.empty((count, 3, 3))
+    for i in range(count):
+        z = np.array(
+            [np.sin(tilt[i]) * np.cos(azimuth[i]), np.sin(tilt[i]) * np.sin(azimuth[i]), np.cos(tilt[i])]
+        )
+        x = np.cross([0.0, 1.0, 0.0], z)
+        x /= np.linalg.norm(x)
+        roll = rotation_from_vector(np.array([0.0, 0.0, [0.1, np.pi / 2, np.pi, -0.2][i % 4]]))
+        position[i] = middle + distance[i] * z
+        rotation[i] = np.stack([x, np.cross(z, x), z], axis=1) @ roll
+    return position, rotation
+
+
+def plate_pictures(
+    plate: PlateFamily, rng: np.random.Generator, count: int, *, rings: bool = False, noise: float = 0.02
+) -> list[AnyArray]:
+    """Return rendered photographs of a plate."""
+    scene, truth = plate_scene(plate, rings=rings), camera()
+    optics = Optics(blur_px=0.8, exposure=0.9, noise=noise, oversampling=3)
+    position, rotation = stations(rng, count, plate)
+    return [
+        render_photograph(scene, truth, position[i], rotation[i], optics=optics, rng=rng)[0]
+        for i in range(count)
+    ]
+
+
+def write_plate_survey(
+    folder: Path,
+    plate: PlateFamily,
+    rng: np.random.Generator,
+    *,
+    count: int = 6,
+    datum: str = "control",
+    rings: bool = False,
+) -> Path:
+    """Write a survey of rendered photographs of a plate; return its file."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for k, picture in enumerate(plate_pictures(plate, rng, count, rings=rings)):
+        cv2.imwrite(str(folder / f"photo {k + 1}.png"), picture, [cv2.IMWRITE_PNG_COMPRESSION, 1])
+    text = SURVEY.format(
+        name=folder.name,
+        polarity="auto" if rings else "dark",
+        pixel=PIXEL_MM,
+        codes=plate.name,
+        rows=plate.rows,
+        columns=plate.columns,
+        pitch=PITCH,
+        marks=[list(mark) for mark in plate.marks],
+        datum=datum,
+    )
+    if not plate.marks:
+        text = text.replace("marks = []\n", "")
+    (folder / "survey.toml").write_text(text, encoding="utf-8")
+    return folder / "survey.toml"

@@ -1,0 +1,101 @@
+"""Calibration from rendered photographs of plates; the optimum of cv2.calibrateCamera on the same points."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from sfm.adjustment.datum import Datum
+from sfm.adjustment.solve import adjust
+from sfm.camera import camera_from_values, project
+from sfm.errors import GeometryError
+from sfm.network import Estimate, ImagePoints, Network, ObjectPoints
+from sfm.pipeline import run_survey
+from sfm.report.findings.findings import findings_of
+from sfm.result import SurveyResult
+from sfm.survey.inputs.survey import read_survey
+from sfm.targets.codes.plates import PlateFamily
+from tests.plates import BOARD, GRID, PITCH, SIZE_PX, TRUTH, camera, stations, write_plate_survey
+from tests.synthetic import seed_of
+
+RUNS = 100
+
+
+def off(result: SurveyResult) -> np.ndarray:
+    """Return the errors of the free parameters over their standard deviations."""
+    adjusted, sigma = result.adjustment.estimate.cameras[0], result.adjustment.interior_sigma(0)
+    rows = [adjusted.names.index(name) for name in TRUTH]
+    truth = np.array(list(TRUTH.values()))
+    return np.asarray((adjusted.parameters[rows] - truth) / sigma[rows])
+
+
+def calibrated(folder: Path, plate: PlateFamily, name: str, **how: object) -> SurveyResult:
+    return run_survey(read_survey(write_plate_survey(folder, plate, seed_of(name), **how)))  # type: ignore[arg-type]
+
+
+def test_a_camera_is_calibrated_from_a_plate(tmp_path: Path) -> None:
+    result = calibrated(tmp_path / "plate", GRID, "calibrated", count=4)
+    assert result.failed == () and result.adjustment.converged and result.adjustment.datum == "control"
+    assert findings_of(result).verdict.level == "good"
+    assert np.abs(off(result)).max() < 4
+
+
+def test_photographs_without_the_plate_are_named(tmp_path: Path) -> None:
+    path = write_plate_survey(tmp_path / "plate", GRID, seed_of("without"), count=2)
+    path.write_text(path.read_text(encoding="utf-8").replace("rows = 9", "rows = 8"), encoding="utf-8")
+    with pytest.raises(GeometryError, match=r"plate was not found in 2 photo.*its marks must be seen"):
+        run_survey(read_survey(path))
+
+
+def test_the_optimum_is_that_of_opencv() -> None:
+    """fx, fy, cx, cy, k1, k2 and all orientations from the same points of equal weight."""
+    rng, plate = seed_of("beside OpenCV"), GRID
+    position, rotation = stations(rng, 8, plate)
+    points = plate.plane(PITCH)
+    xy = np.array([project(camera(), position[i], rotation[i], points) for i in range(8)])
+    xy += 0.1 * rng.standard_normal(xy.shape)
+    m, n = xy.shape[:2]
+    flags = cv2.CALIB_ZERO_TANGENT_DIST | cv2.CALIB_FIX_K3
+    both = [points.astype(np.float32)] * m, [one.astype(np.float32)[:, None] for one in xy]
+    rms, K, distortion, *_ = cv2.calibrateCamera(
+        *both, SIZE_PX, None, None, flags=flags, criteria=(3, 1000, 1e-15)
+    )  # type: ignore[call-overload]
+    free = ("fx", "fy", "cx", "cy", "k1", "k2")
+    start = camera_from_values("plate", "opencv", SIZE_PX, (1.0, 1.0), c_mm=1080.0, free=free)
+    network = Network(
+        tuple(f"photo {i}" for i in range(m)),
+        np.zeros(m, dtype=np.int64),
+        tuple(str(j) for j in range(n)),
+        ImagePoints(
+            np.repeat(np.arange(m), n),
+            np.tile(np.arange(n), m),
+            xy.astype(np.float32).reshape(-1, 2).astype(float),
+            np.tile(0.01 * np.eye(2), (m * n, 1, 1)),
+        ),
+        control=ObjectPoints(np.arange(n), points.astype(np.float32).astype(float), np.zeros((n, 3, 3))),
+    )
+    found = adjust(
+        network, Estimate((start,), position, rotation, points), datum=Datum("control"), reject="none"
+    )
+    mine = np.array([found.estimate.cameras[0].value(name) for name in free])
+    theirs = np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2], *distortion.ravel()[:2]])
+    sigma = found.interior_sigma(0)[[found.estimate.cameras[0].names.index(name) for name in free]]
+    assert np.sqrt((found.residuals**2).sum() / (m * n)) == pytest.approx(rms, rel=1e-6)
+    assert np.abs((mine - theirs) / sigma).max() < 1e-3
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("plate", "rings"), [(GRID, False), (GRID, True), (BOARD, False)])
+def test_parameters_are_inside_their_sigmas(tmp_path: Path, plate: PlateFamily, rings: bool) -> None:
+    """95 % of 100 runs of five parameters within 1.96 sigma: 457 to 491 of 500 with 3 sigma."""
+    inside, worst = 0, 0.0
+    for k in range(RUNS):
+        z = np.abs(off(calibrated(tmp_path / str(k), plate, f"run {plate.name} {k}", count=6, rings=rings)))
+        inside, worst = inside + int((z < 1.96).sum()), max(worst, float(z.max()))
+    print(
+        f"{plate.name}, rings {rings}: {inside} of {RUNS * len(TRUTH)} inside 1.96 sigma, worst {worst:.1f}"
+    )
+    assert inside >= 0.9 * RUNS * len(TRUTH)

@@ -1,0 +1,167 @@
+"""Calibration plates: which dot is which, crossings with their true sigma, and what is refused."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import lru_cache
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from sfm.camera import project
+from sfm.conventions import FloatArray, IntArray
+from sfm.errors import SurveyFileError
+from sfm.rendering.render import render_photograph
+from sfm.rendering.scene import Optics
+from sfm.survey.inputs.survey import read_survey
+from sfm.targets.codes.plates import PlateFamily, name_dots
+from sfm.targets.detect import Targets, find_targets
+from tests.plates import BOARD, GRID, PITCH, PIXEL_MM, SURVEY, camera, plate_scene, stations
+from tests.synthetic import seed_of
+
+NO_MARKS = replace(GRID, marks=())
+
+
+def seen(plate: PlateFamily, name: str) -> tuple[FloatArray, FloatArray, IntArray]:
+    """Return places, radii and true points of the dots in a photograph that shows a part of a plate."""
+    rng = seed_of(name)
+    position, rotation = stations(rng, 4, plate)
+    i = int(rng.integers(4))
+    xy = project(camera(), position[i], rotation[i], plate.plane(PITCH))
+    radius = 900 * 3.0 / np.linalg.norm(plate.plane(PITCH) - position[i], axis=1)
+    is_mark = np.isin(np.arange(plate.count), [r * plate.columns + c for r, c in plate.marks])
+    radius[is_mark] *= 1.5
+    return xy + 0.3 * rng.standard_normal(xy.shape), radius, np.arange(plate.count)
+
+
+@pytest.mark.parametrize("rings", [False, True])
+def test_dots_are_named_by_their_marks_however_the_plate_is_seen(rings: bool) -> None:
+    """Half of the plate beyond the border, a tenth of the dots not found, others that are none."""
+    named = 0
+    for k in range(20):
+        xy, radius, truth = seen(GRID, f"seen {k}")
+        rng = seed_of(f"lost {k}")
+        is_ring = np.isin(truth, [r * GRID.columns + c for r, c in GRID.marks]) & rings
+        kept = (rng.random(len(xy)) > 0.1) & (xy[:, 0] > rng.uniform(-100, 200))
+        kept |= np.isin(truth, [r * GRID.columns + c for r, c in GRID.marks])
+        strange = rng.uniform(0, 800, (6, 2))
+        code = name_dots(
+            np.vstack([xy[kept], strange]),
+            np.append(radius[kept], np.full(6, 9.0)),
+            np.append(is_ring[kept], np.zeros(6, dtype=bool)),
+            GRID,
+        )
+        right = code[: kept.sum()]
+        assert (right[right >= 0] == truth[kept][right >= 0]).all()
+        named += (right >= 0).mean() > 0.8
+    assert named >= 16
+
+
+def test_a_plate_whose_marks_are_not_seen_gets_no_names() -> None:
+    xy, radius, truth = seen(GRID, "no marks")
+    kept = truth % GRID.columns > 7
+    assert (name_dots(xy[kept], radius[kept], np.zeros(kept.sum(), dtype=bool), GRID) == -1).all()
+
+
+def test_a_plate_without_marks_must_be_whole() -> None:
+    xy, radius, truth = seen(NO_MARKS, "whole 3")
+    none = np.zeros(len(xy), dtype=bool)
+    code = name_dots(xy, radius, none, NO_MARKS)
+    assert (code == truth).all() or (code == truth[::-1]).all()  # it looks alike turned by 180 degrees
+    part = truth >= NO_MARKS.columns
+    assert (name_dots(xy[part], radius[part], none[part], NO_MARKS) == -1).all()
+
+
+@lru_cache
+def photographed(plate: PlateFamily, rings: bool) -> tuple[Targets, FloatArray]:
+    """Return the targets of a rendered plate upside down, and where its points are, px."""
+    rng = seed_of(f"photographed {plate.name} {rings}")
+    position, rotation = stations(rng, 4, plate)
+    optics = Optics(blur_px=0.8, exposure=0.9, noise=0.02, oversampling=3)
+    scene = plate_scene(plate, rings=rings)
+    picture, _ = render_photograph(scene, camera(), position[2], rotation[2], optics=optics, rng=rng)
+    found = find_targets(picture, polarity="auto" if rings else "dark", codes=plate)
+    return found, project(camera(), position[2], rotation[2], plate.plane(PITCH))
+
+
+@pytest.mark.parametrize("rings", [False, True])
+def test_rendered_dots_are_all_found(rings: bool) -> None:
+    found, xy = photographed(GRID, rings)
+    assert sorted(found.code.tolist()) == list(range(GRID.count))
+    assert np.abs(found.xy - xy[found.code]).max() < 0.25  # eccentricity, which the survey corrects
+
+
+def test_crossings_are_as_precise_as_they_say() -> None:
+    found, xy = photographed(BOARD, False)
+    assert found.code.tolist() == list(range(BOARD.count))
+    error = found.xy - xy
+    over = np.einsum("ka,kab,kb->k", error, np.linalg.inv(found.covariance), error)
+    assert np.sqrt((error**2).mean()) < 0.03
+    assert over.mean() / 2 == pytest.approx(1.0, abs=0.45)  # 88 of them, 2 degrees of freedom each
+
+
+def test_a_charuco_board_is_named_where_a_part_of_it_is_seen() -> None:
+    """OpenCV's own drawing of a board, seen obliquely, its right third beyond the border."""
+    plate = PlateFamily("charuco", 6, 8, dictionary="aruco4x4_50", tag_share=0.75)
+    dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
+    drawn = cv2.aruco.CharucoBoard((9, 7), 1.0, 0.75, dictionary).generateImage((1440, 1120), marginSize=0)
+    corners = np.array([[0, 0], [1440, 0], [1440, 1120], [0, 1120]], dtype=np.float32)
+    places = np.array([[60, 90], [950, 30], [1010, 700], [40, 620]], dtype=np.float32)
+    H = cv2.getPerspectiveTransform(corners, places)
+    # pixels of the drawing are squares: the centre of its first one is (0.5, 0.5) of the drawing
+    half = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1]])
+    drawn = cv2.GaussianBlur(drawn, (0, 0), 2.0)  # as sharp as the pixels of the photograph, which sample it
+    picture = cv2.warpPerspective(drawn, H @ half, (720, 760), flags=cv2.INTER_LINEAR, borderValue=255)
+    found = find_targets(picture, codes=plate)
+    row, column = np.divmod(np.arange(48), 8)
+    flat = np.stack([160.0 * (column + 1), 160.0 * (row + 1)], axis=1)
+    xy = cv2.perspectiveTransform(flat[None], H)[0]
+    assert 25 < len(found) < 40
+    assert np.abs(found.xy - xy[found.code]).max() < 0.15
+
+
+def survey_text(**changes: str) -> str:
+    text = SURVEY.format(
+        name="plate", polarity="dark", pixel=PIXEL_MM, codes="grid", rows=9, columns=11, pitch=12.0,
+        marks=[list(mark) for mark in GRID.marks], datum="control",
+    )  # fmt: skip
+    for old, new in changes.items():
+        lines = [new if line.startswith(f"{old} =") else line for line in text.splitlines()]
+        text = "\n".join(line for line in lines if line)
+    return text
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"pitch": ""}, "targets.pitch is missing, codes = 'grid' needs it"),
+        ({"codes": 'codes = "ring14"'}, "targets.rows is of a calibration plate, codes = 'ring14' is none"),
+        ({"marks": "marks = [[3, 3], [12, 4]]"}, r"mark \[12, 4\] is not on a plate of 9 rows"),
+        ({"marks": "marks = [[3, 3], [5, 3]]"}, "the marks look alike turned by 180 degrees"),
+        ({"marks": "", "kind": 'kind = "free"'}, "looks alike turned by 180 degrees has no"),
+        ({"codes": 'codes = "charuco"', "marks": ""}, "targets.dictionary = '', codes = 'charuco' needs"),
+        ({"codes": 'codes = "checkerboard"'}, "targets.marks are of codes = 'grid'"),
+        ({"codes": 'codes = "checkerboard"', "rows": "rows = 2", "marks": ""}, "board of 2 x 11 cross"),
+        ({"unit": 'unit = "mm"\n[control]\nfile = "c.csv"'}, r"\[control\] beside a calibration plate"),
+    ],
+)  # fmt: skip
+def test_plates_that_cannot_be_are_refused(tmp_path: Path, changes: dict[str, str], message: str) -> None:
+    (tmp_path / "c.csv").write_text("id,X,Y,Z\n1,0,0,0\n", encoding="utf-8")
+    path = tmp_path / "survey.toml"
+    path.write_text(survey_text(**changes), encoding="utf-8")
+    with pytest.raises(SurveyFileError, match=message):
+        read_survey(path)
+
+
+def test_the_plate_is_control_and_start_value(tmp_path: Path) -> None:
+    path = tmp_path / "survey.toml"
+    path.write_text(survey_text(pitch="pitch = 12.0\nplate_sigma = 0.004"), encoding="utf-8")
+    survey = read_survey(path)
+    assert (
+        survey.control is not None and len(survey.control.names) == 99 and survey.control.sigma[0, 0] == 0.004
+    )
+    assert survey.start_points is survey.control
+    assert np.allclose(survey.control.xyz[12], (12, -12, 0))
+    assert replace(survey, name="again").control is not None
