@@ -25,11 +25,13 @@ from scipy.linalg import cho_factor, cho_solve
 from sfm.comparison.stable_points import (
     StablePoints,
     Step,
+    candidates_of,
     critical_value,
     find_stable_points,
     in_datum,
     robust_weights,
     single_tests,
+    tests_in_datum,
 )
 from sfm.conventions import BoolArray, FloatArray
 from sfm.errors import GeometryError
@@ -116,11 +118,13 @@ def congruency(
         )
     least = max(MIN_STABLE, math.ceil(STABLE_FRACTION * first))
 
+    among = candidates_of(difference, covariance, G, reference)
+
     def search(start: BoolArray) -> StablePoints:
         return find_stable_points(
-            *(difference, covariance, G),
-            candidates=start,
+            among,
             least=least,
+            start=start,
             redundancy=redundancy,
             alpha=alpha / 2,
             alpha_single=alpha / 2,
@@ -133,7 +137,7 @@ def congruency(
     robust = None
     if len(whole.steps) > 1:
         weight = robust_weights(difference, G, reference)
-        fits = reference & ~(critical < single_tests(*in_datum(difference, covariance, G, weight)))
+        fits = reference & ~(critical < tests_in_datum(difference, covariance, G, weight))
         if fits.sum() >= least:
             robust = search(fits)
             more = not whole.agreed or robust.stable.sum() > whole.stable.sum()

@@ -21,7 +21,7 @@ import numpy as np
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
 from scipy.linalg.lapack import dpotri
 
-from sfm.conventions import BoolArray, FloatArray
+from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.distributions import chi2_isf, f_isf
 from sfm.errors import GeometryError
 
@@ -55,13 +55,44 @@ class StablePoints:
     weights_of_all: FloatArray  # P_kk of each candidate before any was removed, 0 of the others, (n, m, m)
 
 
+@dataclass(frozen=True)
+class Candidates:
+    """Points that may be stable, with what every search among them starts from."""
+
+    chosen: IntArray  # their indices, (k,)
+    difference: FloatArray  # of all points, (n, m)
+    d: FloatArray  # of the candidates without any motion of the whole, (k m,)
+    P: FloatArray  # weights of d, (k m, k m)
+    motions: int  # what is no change: columns of G
+
+
+def candidates_of(
+    difference: FloatArray, covariance: FloatArray, G: FloatArray, candidates: BoolArray
+) -> Candidates:
+    """Return the points that may be stable with their joint weights P.
+
+    Args:
+        difference: second minus first coordinates, (n, m).
+        covariance: of all of them together, (n m, n m).
+        G: what is no change, a column each, (n m, u).
+        candidates: points that may be stable, (n,).
+
+    Raises:
+        GeometryError: a covariance that is singular beyond G.
+    """
+    chosen = np.flatnonzero(candidates)
+    rows = _rows(chosen, difference.shape[1])
+    basis = np.linalg.qr(G[rows])[0]
+    d = difference[chosen].ravel()
+    d = d - basis @ (basis.T @ d)
+    return Candidates(chosen, difference, d, _weights(covariance[np.ix_(rows, rows)], basis), G.shape[1])
+
+
 def find_stable_points(
-    difference: FloatArray,
-    covariance: FloatArray,
-    G: FloatArray,
+    among: Candidates,
     *,
-    candidates: BoolArray,
     least: int,
+    start: BoolArray | None = None,
     redundancy: int | None = None,
     alpha: float = 0.05,
     alpha_single: float | None = None,
@@ -69,38 +100,34 @@ def find_stable_points(
     """Remove points until the rest passes the global test of congruency.
 
     Args:
-        difference: second minus first coordinates, (n, m).
-        covariance: of all of them together, (n m, n m).
-        G: what is no change, a column each, (n m, u).
-        candidates: points that may be stable, (n,).
+        among: the candidates.
         least: points that must be left.
+        start: those of the points that the search starts with, (n,); else all candidates.
         redundancy: of the variance in the covariance; None if it is known.
         alpha: level of the global test.
         alpha_single: level of the largest drop of all points, which is tested, too, unless None.
 
     Raises:
-        GeometryError: fewer candidates than `least`, or a covariance that is singular beyond G.
+        GeometryError: fewer points than `least` to start with.
 
     Source: Caspary (2000), Concepts of network and deformation analysis, sec. 8.2.
     """
-    n, m = difference.shape
-    u = G.shape[1]
-    chosen = np.flatnonzero(candidates)
-    if len(chosen) < least:
-        raise GeometryError(f"congruency: {len(chosen)} points, expected {least} or more")
-    rows = (m * chosen[:, None] + np.arange(m)).ravel()
-    basis = np.linalg.qr(G[rows])[0]
-    d = difference[chosen].ravel()
-    d = d - basis @ (basis.T @ d)
-    P = _weights(covariance[np.ix_(rows, rows)], basis)
+    n, m = among.difference.shape
+    chosen, d, u = among.chosen, among.d, among.motions
+    left = np.ones(len(chosen), dtype=bool) if start is None else start[chosen]
+    begun = int(left.sum())
+    if begun < least:
+        raise GeometryError(f"congruency: {begun} points, expected {least} or more")
+    P = among.P.copy()
     w = P @ d
-    left = np.ones(len(chosen), dtype=bool)
-    single = None if alpha_single is None else critical_value(alpha_single / len(chosen), m, redundancy)
+    if begun < len(chosen):
+        _remove(P, w, _rows(np.flatnonzero(~left), m))
+    single = None if alpha_single is None else critical_value(alpha_single / begun, m, redundancy)
     steps: list[Step] = []
     of_all = np.full(n, np.nan)
     of_all[chosen] = _drops(P, w, left, m)
     weights_of_all = np.zeros((n, m, m))
-    weights_of_all[chosen] = point_blocks(P, m)
+    weights_of_all[chosen[left]] = point_blocks(P, m)[left]
     while True:
         omega, freedom = float(d @ w), m * int(left.sum()) - u
         drops = _drops(P, w, left, m)
@@ -113,10 +140,7 @@ def find_stable_points(
         steps.append(Step(*tested, removed, float(drops[k])))
         if ended:
             break
-        block = slice(m * k, m * k + m)
-        own = np.linalg.solve(P[block, block], P[block])
-        w = w - own.T @ w[block]
-        P -= P[:, block] @ own
+        _remove(P, w, slice(m * k, m * k + m))
         left[k] = False
     stable, T = np.zeros(n, dtype=bool), np.full(n, np.nan)
     stable[chosen[left]] = True
@@ -124,6 +148,18 @@ def find_stable_points(
     weights = np.zeros((n, m, m))
     weights[chosen[left]] = point_blocks(P, m)[left]
     return StablePoints(stable, bool(agreed), tuple(steps), T, weights, of_all, weights_of_all)
+
+
+def _rows(points: IntArray, m: int) -> IntArray:
+    """Return the rows of the m coordinates of points, (k m,)."""
+    return np.asarray((m * points[:, None] + np.arange(m)).ravel())
+
+
+def _remove(P: FloatArray, w: FloatArray, rows: IntArray | slice) -> None:
+    """Give points displacements of their own: their rows of P and of w = P d become 0."""
+    own = np.linalg.solve(P[rows][:, rows], P[rows])
+    w -= own.T @ w[rows]
+    P -= P[:, rows] @ own
 
 
 def in_datum(
@@ -142,15 +178,44 @@ def in_datum(
 
     Source: Baarda (1973), S-transformations and criterion matrices.
     """
-    m = difference.shape[1]
-    EG = np.repeat(weight, m)[:, None] * G
-    H = np.linalg.solve(G.T @ EG, EG.T)  # t = H d
-    d = difference - (G @ (H @ difference.ravel())).reshape(-1, m)
+    H, d = _motion_in_datum(difference, G, weight)
     A = covariance @ H.T
     Q = covariance - G @ A.T
     Q -= A @ G.T
     Q += G @ ((H @ A) @ G.T)
     return d, Q
+
+
+def tests_in_datum(
+    difference: FloatArray, covariance: FloatArray, G: FloatArray, weight: FloatArray
+) -> FloatArray:
+    """Return T of each point by itself after the S-transformation to a datum, see `in_datum`, (n,).
+
+    Only the covariance of each point by itself is formed.
+
+    Args:
+        difference: (n, m).
+        covariance: (n m, n m).
+        G: what is no change, (n m, u).
+        weight: of each point in the datum, (n,).
+    """
+    n, m = difference.shape
+    H, d = _motion_in_datum(difference, G, weight)
+    A = covariance @ H.T
+    of_point, own = G.reshape(n, m, -1), A.reshape(n, m, -1)
+    mixed = np.einsum("niu,nju->nij", of_point, own)
+    spread = np.einsum("niu,uv,njv->nij", of_point, H @ A, of_point)
+    return _tests_of_blocks(d, point_blocks(covariance, m) - mixed - np.swapaxes(mixed, 1, 2) + spread)
+
+
+def _motion_in_datum(
+    difference: FloatArray, G: FloatArray, weight: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return H, the motion t = H d of the weighted points (u, n m), and d without it, (n, m)."""
+    m = difference.shape[1]
+    EG = np.repeat(weight, m)[:, None] * G
+    H = np.asarray(np.linalg.solve(G.T @ EG, EG.T), dtype=float)
+    return H, difference - (G @ (H @ difference.ravel())).reshape(-1, m)
 
 
 def robust_weights(difference: FloatArray, G: FloatArray, candidates: BoolArray) -> FloatArray:
@@ -183,8 +248,11 @@ def robust_weights(difference: FloatArray, G: FloatArray, candidates: BoolArray)
 
 def single_tests(difference: FloatArray, covariance: FloatArray) -> FloatArray:
     """Return T = d' Q_dd^-1 d / m of each point by itself, (n,); NaN where Q_dd is singular."""
+    return _tests_of_blocks(difference, point_blocks(covariance, difference.shape[1]))
+
+
+def _tests_of_blocks(difference: FloatArray, blocks: FloatArray) -> FloatArray:
     n, m = difference.shape
-    blocks = point_blocks(covariance, m)
     T = np.full(n, np.nan)
     size = np.einsum("nii->n", blocks)
     regular = np.linalg.eigvalsh(blocks)[:, 0] > 1e-12 * size

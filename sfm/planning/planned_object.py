@@ -10,12 +10,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
 from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.errors import GeometryError
 from sfm.geometry.mesh import Mesh
+from sfm.planning.sight.occlusion import BoxTree, box_tree
 
 SEGMENTS = 48  # of a round shape: its facets lie 0.2 % of the radius inside
 PER_POINT = 20  # random points of a surface for each that is kept
@@ -38,6 +40,11 @@ class PlannedObject:
     xyz: FloatArray  # object unit, (n, 3)
     normals: FloatArray  # directions that the points face, length 1; NaN where not known, (n, 3)
     mesh: Mesh | None = None  # what hides points; None = nothing does
+
+    @cached_property
+    def tree(self) -> BoxTree | None:
+        """The mesh sorted into boxes, None where nothing hides points."""
+        return None if self.mesh is None else box_tree(self.mesh)
 
     @property
     def centre(self) -> FloatArray:

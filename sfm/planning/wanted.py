@@ -44,7 +44,7 @@ class Wanted:
     @property
     def anything(self) -> bool:
         """Whether something is asked for."""
-        return not self.sigma is self.length_sigma is self.displacement is None
+        return any(x is not None for x in (self.sigma, self.length_sigma, self.displacement))
 
     def point_variance(self, planned: PlannedObject) -> FloatArray:
         """Return about what variance of a coordinate is enough at each point, object unit^2, (n,).

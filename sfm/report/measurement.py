@@ -223,7 +223,10 @@ def headline(found: Measurement) -> str:
         if found.shapes:
             parts.append(f"{len(found.shapes)} shape{'s' * (len(found.shapes) != 1)}")
         if found.quantities:
-            parts.append(f"{len(found.quantities)} distances, angles and heights")
+            count = len(found.quantities)
+            kinds = {one.kind for one in found.quantities}  # length, angle
+            words = f"{kinds.pop()}{'s' * (count != 1)}" if len(kinds) == 1 else "lengths and angles"
+            parts.append(f"{count} {words}")
         return ", ".join(parts) + "."
     counts = {one: sum(t.count(one) for t in found.tolerances) for one in DECISIONS}
     total = sum(counts.values())

@@ -112,7 +112,8 @@ def headline(plan: Plan) -> str:
     if not plan.wanted.anything:
         return told
     if plan.shortfall <= 1:
-        return f"{told}; what is wanted is reached"
+        others = " at the others" if few or known < n else ""
+        return f"{told}; what is wanted is reached{others}"
     by = f"{plan.shortfall:.2f} times what is wanted"
     if not np.isfinite(plan.shortfall):
         by = "points lack rays, or the network is not determined"

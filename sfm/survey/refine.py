@@ -26,6 +26,7 @@ from sfm.survey.adjusting.settling import FALSE_ALARM, determined, merge_estimat
 from sfm.survey.adjusting.solution import TOLERANCE_FACTOR
 
 MIN_RAYS = 3
+MIN_PHOTOGRAPHS = 4  # of a camera whose principal point is freed
 # Over larger windows no surface is a plane, and memory and time grow with the square of the side.
 MAX_WINDOW_PX = 101
 SIGMA_PX = 0.02  # of a matched point, on top of what matching knows: surfaces are not plane over a window
@@ -57,6 +58,7 @@ def refine_model(
     *,
     window_px: int = 15,
     min_correlation: float = 0.7,
+    fixed: tuple[str, ...] = (),
     progress: Progress = SILENT,
 ) -> Refinement:
     """Measure all image points of a solved model by multi-photo least squares matching and adjust it again.
@@ -67,12 +69,13 @@ def refine_model(
         images_dir: folder of its photographs.
         window_px: odd side of the windows, at most MAX_WINDOW_PX.
         min_correlation: smallest coefficient r of a window and its template, 0 to 1.
+        fixed: names of interior parameters that are held at the model's values, as fx, cx or k1.
         progress: told of stages and photographs.
 
     Raises:
         SurveyFileError: a photograph of the model is not in the folder.
         PhotographError: a photograph that cannot be read, or of another size than its camera.
-        GeometryError: an impossible window or correlation, or too little is left to adjust.
+        GeometryError: an impossible window, correlation or name to hold, or too little is left to adjust.
     """
     if odd_window("refine", window_px) > MAX_WINDOW_PX:
         raise GeometryError(f"refine: window is {window_px} px, needed at most {MAX_WINDOW_PX} px")
@@ -80,7 +83,12 @@ def refine_model(
         raise GeometryError(f"refine: smallest correlation is {min_correlation:g}, needed 0 to 1")
     seen = network.image_points
     everything = np.ones(len(seen), dtype=bool)
-    estimate = replace(estimate, cameras=tuple(_freed(camera) for camera in estimate.cameras))
+    photographs_of = np.bincount(network.camera[estimate.oriented], minlength=len(estimate.cameras))
+    cameras = tuple(
+        _freed(camera, int(count), fixed)
+        for camera, count in zip(estimate.cameras, photographs_of, strict=True)
+    )
+    estimate = replace(estimate, cameras=cameras)
     residuals = pictures_of(estimate, network.camera, seen.image, estimate.points[seen.point]) - seen.xy
     usable = np.isfinite(residuals).all(axis=1)
     if not usable.any():
@@ -168,12 +176,31 @@ def _part(
     return part, start, images, points
 
 
-def _freed(camera: Camera) -> Camera:
-    """Free what the model itself has estimated: the principal distances and distortion that is not zero."""
-    if camera.free.any():
-        return camera
-    distortion = camera.plays(Role.RADIAL, Role.DENOMINATOR, Role.DECENTRING) & (camera.parameters != 0)
-    return replace(camera, free=camera.plays(Role.FOCAL) | distortion)
+def _freed(camera: Camera, photographs: int, fixed: tuple[str, ...]) -> Camera:
+    """Free what the image points of a model determine, but for what is to be held.
+
+    Principal distances and principal point, and the distortion that the model has. COLMAP holds the principal
+    point unless it is told otherwise; held at a wrong place all photographs are turned to make up for it.
+
+    Args:
+        camera: of the model.
+        photographs: oriented ones of it; fewer than MIN_PHOTOGRAPHS do not tell the principal point from a
+            rotation.
+        fixed: names of parameters to hold.
+    """
+    unknown = [name for name in fixed if name not in camera.names]
+    if unknown:
+        raise GeometryError(
+            f"refine: parameter '{unknown[0]}' of camera {camera.name} is to be held, expected one of "
+            + ", ".join(camera.names)
+        )
+    free = camera.free
+    if not free.any():
+        free = camera.plays(Role.RADIAL, Role.DENOMINATOR, Role.DECENTRING) & (camera.parameters != 0)
+        free |= camera.plays(Role.FOCAL)
+        if photographs >= MIN_PHOTOGRAPHS:
+            free |= camera.plays(Role.X0, Role.Y0)
+    return replace(camera, free=free & ~np.isin(camera.names, fixed))
 
 
 def _references(network: Network, estimate: Estimate) -> IntArray:

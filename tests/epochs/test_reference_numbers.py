@@ -9,6 +9,7 @@ import pytest
 
 from sfm.comparison.stable_points import (
     StablePoints,
+    candidates_of,
     critical_value,
     find_stable_points,
     in_datum,
@@ -48,9 +49,8 @@ def levelling() -> tuple[FloatArray, FloatArray, float, list[float]]:
 
 def search(points: int = 6) -> tuple[StablePoints, FloatArray, FloatArray]:
     d, Q, variance, _ = levelling()
-    found = find_stable_points(
-        d, variance * Q, np.ones((6, 1)), candidates=np.arange(6) < points, least=3, redundancy=FREEDOM
-    )
+    among = candidates_of(d, variance * Q, np.ones((6, 1)), np.arange(6) < points)
+    found = find_stable_points(among, least=3, redundancy=FREEDOM)
     return found, d, variance * Q
 
 

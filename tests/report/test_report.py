@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import json
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -18,10 +18,11 @@ from sfm.adjustment.datum import Datum
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.cli.console import tell_result
-from sfm.conventions import angles_from_rotation
+from sfm.comparison.two_adjusters.adjusters import compare_adjusters
+from sfm.conventions import FloatArray, angles_from_rotation
 from sfm.errors import OutputError
 from sfm.files.manifest import refuse_foreign_folder
-from sfm.network import Network, ObjectPoints, ScaleBars
+from sfm.network import Estimate, Network, ObjectPoints, ScaleBars
 from sfm.report.figures.overlays import USED, draw_photograph, overlay_names
 from sfm.report.figures.plots import all_plots, plan_axes
 from sfm.report.findings.findings import findings_of
@@ -181,6 +182,44 @@ def test_unknown_numbers_are_null_and_empty_cells(result: SurveyResult, tmp_path
     text = (tmp_path / "summary.json").read_text(encoding="utf-8")
     assert json.loads(text, parse_constant=lambda name: pytest.fail(name))["sigma0_px"] is None
     assert rows_of(tmp_path / "points.csv")[0]["sX"] == ""
+
+
+def test_a_result_is_not_lost_to_figures_that_are_not_finite(result: SurveyResult, tmp_path: Path) -> None:
+    """A rejected point behind its camera has no residual, and COLMAP's RMS of a sound network can be NaN."""
+    a = result.adjustment
+    other = compare_adjusters(a, in_house_adjuster)
+    rows = np.flatnonzero(a.rejected)
+    assert len(rows)
+    residuals = a.residuals.copy()
+    residuals[rows] = np.nan
+    lost = replace(other.comparison, rms_px=(0.1, float("nan")), cost=(1.0, float("inf")))
+    bad = replace(
+        result,
+        adjustment=replace(a, residuals=residuals),
+        comparison=replace(other, comparison=lost),
+        photographs=result.photographs[:2] + result.photographs[-1:],
+    )
+    write_result(findings_of(bad), tmp_path / "out")
+    text = (tmp_path / "out" / "summary.json").read_text(encoding="utf-8")
+    found = json.loads(text, parse_constant=lambda name: pytest.fail(name))
+    assert found["comparison"]["rms_px"] == {"kolinear": 0.1, "colmap": None}
+    assert {"comparison.rms_px.colmap", "comparison.cost.colmap"} <= set(found["not_finite"])
+    assert len(list((tmp_path / "out" / "overlays").iterdir())) == 3
+
+
+@dataclass(frozen=True)
+class AnotherAdjustment:
+    """In place of another adjuster: the in-house one once more."""
+
+    estimate: Estimate
+    iterations: int = 3
+    converged: bool = True
+    seconds: float = 0.1
+    point_covariance: FloatArray | None = None
+
+
+def in_house_adjuster(network: Network, start: Estimate) -> AnotherAdjustment:
+    return AnotherAdjustment(adjust(network, start, datum=Datum("free"), reject="none").estimate)
 
 
 def test_points_as_ply(result: SurveyResult, tmp_path: Path) -> None:

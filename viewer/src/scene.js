@@ -308,7 +308,7 @@ export class Scene {
     this.due = false
     this.pace()
     const dark = matchMedia("screen and (prefers-color-scheme: dark)").matches && !this.printing
-    this.renderer.setClearColor(dark ? 0x333c47 : 0xf7f9fb)
+    this.renderer.setClearColor(dark ? 0x10151b : 0xf7f9fb)
     this.points.setDark(dark)
     this.renderer.render(this.world, this.camera)
     if (!this.overlay.hidden) drawLabels(this, dark)

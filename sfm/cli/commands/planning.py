@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import numpy as np
 import typer
 
 from sfm.cli.commands.planning_inputs import bars_of, camera_of, numbers, object_of, stations_of
@@ -272,4 +271,6 @@ def _two(values: tuple[float, ...]) -> tuple[float, float]:
 
 
 def _space(text: str) -> FloatArray:
+    import numpy as np
+
     return np.array(numbers("--space", text, 6)).reshape(3, 2).T

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
-
-import numpy as np
 
 from sfm.errors import SurveyFileError
 
@@ -63,6 +62,8 @@ def camera_of(text: str, name: str | None, c_mm: float | None, free: str | None)
     Raises:
         KolinearError: what was found, and what was expected.
     """
+    import numpy as np
+
     from sfm.planning.cameras import listed_camera
 
     path = Path(text)
@@ -95,6 +96,8 @@ def stations_of(text: str, planned: PlannedObject, camera: Camera) -> Stations:
     Raises:
         KolinearError: what was found, and what was expected.
     """
+    import numpy as np
+
     from sfm.conventions import rotation_from_angles
     from sfm.files.csv_tables import read_table
     from sfm.planning.stations import Stations, arrangement
@@ -136,7 +139,7 @@ def numbers(what: str, text: str, count: int | None = None) -> tuple[float, ...]
         found = tuple(float(part) for part in text.split(","))
     except ValueError:
         found = ()
-    if not found or not np.isfinite(found).all() or (count is not None and len(found) != count):
+    if not found or not all(map(math.isfinite, found)) or (count is not None and len(found) != count):
         wanted = "numbers" if count is None else f"{count} number{'s' * (count > 1)}"
         raise SurveyFileError(f"{what} {text:.60}: expected {wanted} separated by commas")
     return found

@@ -17,7 +17,9 @@ def refine(
     images: Annotated[Path, typer.Option("--images", metavar="DIR", help="Folder of its photographs.")],
     out: Annotated[
         Path | None,
-        typer.Option("--out", metavar="DIR", help="New folder for the refined model, COLMAP's format."),
+        typer.Option(
+            "--out", metavar="DIR", help="New folder for the refined model; beside the model if not given."
+        ),
     ] = None,
     window: Annotated[
         int, typer.Option("--window", metavar="N", help="Side of the windows, odd, 3 to 101 px.")
@@ -28,6 +30,9 @@ def refine(
             "--min-correlation", metavar="R", help="Smallest r of a window and its template, 0 to 1."
         ),
     ] = 0.7,
+    fix: Annotated[
+        str, typer.Option("--fix", metavar="NAMES", help="Interior parameters to hold, as fx,fy,cx,cy,k1.")
+    ] = "",
 ) -> None:
     """Measure the key points of a COLMAP model anew.
 
@@ -39,20 +44,23 @@ def refine(
         from sfm.runtime.progress_bar import drawn_progress
         from sfm.survey.refine import refine_model, refinement_text
 
-    if out is not None:
-        refuse_existing(out)
+    out = model.resolve().with_name(f"{model.resolve().name}_refined") if out is None else out
+    refuse_existing(out)
     with working_on(str(model)):
         network, estimate = read_model(model)
     compile_first()
     with working_on(str(model)), drawn_progress() as progress:
         found = refine_model(
-            network, estimate, images, window_px=window, min_correlation=min_correlation, progress=progress
+            network,
+            estimate,
+            images,
+            window_px=window,
+            min_correlation=min_correlation,
+            fixed=tuple(name.strip() for name in fix.split(",") if name.strip()),
+            progress=progress,
         )
     print(refinement_text(found), end="")
-    if out is not None:
-        a = found.adjustment
-        with whole_folder(out) as folder:
-            write_model(folder, a.network, a.estimate, rejected=a.rejected)
-        print(f"Model: {out}")
-    else:
-        print("Nothing was saved: --out DIR keeps the refined model.")
+    a = found.adjustment
+    with whole_folder(out) as folder:
+        write_model(folder, a.network, a.estimate, rejected=a.rejected)
+    print(f"Model: {out}")

@@ -16,7 +16,7 @@ from sfm.conventions import AnyArray, BoolArray, FloatArray
 from sfm.errors import GeometryError
 from sfm.planning.planned_object import PlannedObject
 from sfm.planning.sight.image_precision import TargetImage, centre_covariance
-from sfm.planning.sight.occlusion import BoxTree, box_tree, hidden_points
+from sfm.planning.sight.occlusion import hidden_points
 from sfm.planning.sight.optics import DepthOfField
 
 MAX_INCIDENCE_DEG = 60.0  # of a ray to the normal; beyond, targets are measured badly or not at all
@@ -108,7 +108,6 @@ def sight_of(
 
     Source: Mason (1997), Photogramm. Eng. Remote Sens. 63(9).
     """
-    tree = None if planned.mesh is None else box_tree(planned.mesh)
     m, n = len(position), len(planned.xyz)
     why = np.empty((m, n), dtype=np.uint8)
     xy, covariance = np.empty((m, n, 2)), np.empty((m, n, 2, 2))
@@ -117,17 +116,19 @@ def sight_of(
     for i in range(m):
         key = position[i].tobytes()  # photographs of one station that differ in their roll
         if key not in hidden:
-            hidden[key] = _turned_away_or_hidden(planned, tree, position[i])
+            hidden[key] = _turned_away_or_hidden(planned, position[i])
         why[i], xy[i], covariance[i], diameter[i] = _photograph(
             planned, camera, position[i], rotation[i], seeing, hidden[key]
         )
     return Sight(why, xy, covariance, diameter)
 
 
-def _turned_away_or_hidden(planned: PlannedObject, tree: BoxTree | None, position: FloatArray) -> BoolArray:
+def _turned_away_or_hidden(planned: PlannedObject, position: FloatArray) -> BoolArray:
     away = planned.normals * (position - planned.xyz)
     turned = away.sum(axis=1) <= 0  # NaN where the normal is unknown: not turned away
-    return np.asarray(turned if tree is None else turned | hidden_points(tree, position, planned.xyz))
+    if planned.tree is not None:
+        turned |= hidden_points(planned.tree, position, planned.xyz)
+    return np.asarray(turned)
 
 
 def _photograph(

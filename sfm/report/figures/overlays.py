@@ -51,6 +51,7 @@ REASON_COLOURS = (
     (Flag.PART_OF_CODE, (230, 150, 230)),
     (Flag.LOBED, (90, 200, 250)),
     (Flag.THIN_BACKGROUND, (40, 110, 40)),
+    (Flag.NOT_ON_PLATE, (110, 60, 20)),
 )
 # Remarks on measured targets, drawn as a second outline.
 REMARK_COLOURS = (
@@ -152,7 +153,8 @@ def draw_photograph(photograph: PhotographTargets, adjustment: Adjustment, facto
     for row, name, right in zip(rows, names, reach, strict=True):
         xy = seen.xy[row]
         end = xy + factor / scale * adjustment.residuals[row]
-        _arrow(picture, xy, end, scale, thickness=1 if crowded else 2)
+        if np.isfinite(end).all():  # a rejected point behind the camera has no residual
+            _arrow(picture, xy, end, scale, thickness=1 if crowded else 2)
         if crowded:
             continue
         colour = DROPPED if adjustment.rejected[row] else USED

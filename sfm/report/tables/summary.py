@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 from typing import Any
 
@@ -22,8 +23,33 @@ def write_summary(findings: Findings, folder: Path) -> None:
     (folder / "summary.json").write_text(text + "\n", encoding="utf-8")
 
 
+def _finite(value: Any, name: str, names: list[str]) -> Any:
+    """Return a value with None for every number that is not finite; the names of these are appended.
+
+    Args:
+        value: as for JSON.
+        name: of the value, the keys that lead to it joined by dots.
+        names: which numbers were not finite so far.
+    """
+    if isinstance(value, dict):
+        return {key: _finite(one, f"{name}.{key}".lstrip("."), names) for key, one in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(one, f"{name}[{k}]", names) for k, one in enumerate(value)]
+    if isinstance(value, float) and not math.isfinite(value):
+        names.append(name)
+        return None
+    return value
+
+
 def summary(findings: Findings) -> dict[str, Any]:
-    """Return what summary.json holds: plain values only, None for what is not known."""
+    """Return what summary.json holds: plain values only, None for what is not known or not finite."""
+    names: list[str] = []
+    figures: dict[str, Any] = _finite(_figures(findings), "", names)
+    return figures | {"not_finite": names}
+
+
+def _figures(findings: Findings) -> dict[str, Any]:
+    """Return the figures of a result, some of which may not be finite."""
     result, verdict = findings.result, findings.verdict
     adjustment, given = result.adjustment, findings.given
     coded = sum(point.code is not None for point in findings.points)

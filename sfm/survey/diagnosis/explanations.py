@@ -26,6 +26,7 @@ from sfm.similarity import fit_similarity
 from sfm.survey.diagnosis.two_groups import two_groups
 
 MUCH_REJECTED = 0.05  # share of rejected image points from which causes are looked for, too
+LARGE = 50_000  # image points from which on nothing is tried while sigma0 is as expected
 WORTH_A_TRY = 1.5  # sigma0 over the expected one from which causes are looked for
 NEAR_THE_BEST = 1.25  # of the least sigma0: what is simpler and reaches this is preferred
 MIN_BEFORE = 3  # photographs that can show that the object moved before or behind them
@@ -44,8 +45,10 @@ def explain_residuals(found: Adjustment) -> tuple[Explanation, ...]:
         found: the finished adjustment; its sigma0 says whether there is anything to explain.
     """
     rejected = found.rejected.sum() > MUCH_REJECTED * len(found.rejected)
-    conspicuous = rejected or found.sigma0_px > WORTH_A_TRY * found.stated_px
+    conspicuous = bool(rejected or found.sigma0_px > WORTH_A_TRY * found.stated_px)
     network, estimate = found.network, found.estimate
+    if not conspicuous and len(found.rejected) > LARGE:
+        return ()
     groups = _groups(network, estimate)
     if not (conspicuous or groups is not None):
         return ()
@@ -56,7 +59,8 @@ def explain_residuals(found: Adjustment) -> tuple[Explanation, ...]:
 
     if not conspicuous and not (groups and explanation(groups).explains):
         return ()
-    tried = [explanation(one) for one in _causes(network, estimate, groups) if np.isfinite(one.sigma0_px)]
+    causes = _causes(network, estimate, groups, states=conspicuous)
+    tried = [explanation(one) for one in causes if np.isfinite(one.sigma0_px)]
     if not tried:
         return ()
     best = min(one.after_px for one in tried)
@@ -74,8 +78,8 @@ class _Cause:
     estimate: Estimate | None = None  # of the same points; None where there is no single one
 
 
-def _causes(network: Network, estimate: Estimate, groups: _Cause | None) -> Iterator[_Cause]:
-    """Return the causes with what they leave of the residuals, the simplest first."""
+def _causes(network: Network, estimate: Estimate, groups: _Cause | None, *, states: bool) -> Iterator[_Cause]:
+    """Return the causes with what they leave of the residuals, the simplest first; states take longest."""
     lens = _cameras(estimate.cameras, LENS)
     held = [
         name
@@ -95,6 +99,8 @@ def _causes(network: Network, estimate: Estimate, groups: _Cause | None) -> Iter
         yield groups
     words = "c of its own for each photograph (a zoom or focus that was not fixed)"
     yield _Cause(words, *_adjusted(*_own_c(network, estimate)))
+    if not states:
+        return
     splits = range(MIN_BEFORE, len(network.images) - MIN_BEFORE + 1)
     moved = [(_apart(network, estimate, k), k) for k in splits[:: max(1, len(splits) // MAX_SPLITS)]]
     if moved:

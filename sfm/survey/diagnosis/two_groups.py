@@ -24,7 +24,8 @@ OWN = (Role.FOCAL, Role.X0, Role.Y0, Role.RADIAL)
 LEAST_IN_GROUP = 2  # photographs: a single one is tried with a camera of its own before
 LEAST_POINTS = 8  # of a photograph that has a vote
 SIGNIFICANT = 1e-6  # chance with which clusters of equal photographs are so far apart, before it is tried
-ROUNDS = 20  # of k-means
+ROUNDS, MOST_STARTS = 20, 50  # of k-means
+MOST_DOUBLINGS = 1000  # what a float holds
 SMALL_STEP = 1e-6  # of differences, in parts of the size of what is varied
 
 
@@ -130,7 +131,7 @@ def _clusters(votes: _Votes, m: int) -> TwoGroups | None:
         return None
     best: tuple[float, BoolArray] | None = None
     together = _gain(votes, np.ones(k, dtype=bool))
-    for first in range(k):  # from each photograph against all others
+    for first in range(0, k, max(1, k // MOST_STARTS)):  # from one photograph against all others
         group = np.arange(k) == first
         for _ in range(ROUNDS):
             means = [_mean(votes, mask) for mask in (group, ~group)]
@@ -148,7 +149,8 @@ def _clusters(votes: _Votes, m: int) -> TwoGroups | None:
             best = gain, group
     if best is None:
         return None
-    probability = float(chi2_sf(best[0], p)) * 2.0 ** (k - 1)  # that many divisions were possible
+    # that many divisions were possible
+    probability = float(chi2_sf(best[0], p)) * 2.0 ** min(k - 1, MOST_DOUBLINGS)
     if not probability < SIGNIFICANT:
         return None
     group = best[1] if best[1].sum() <= k / 2 else ~best[1]

@@ -2,7 +2,9 @@
 
 Data snooping takes out, round by round, the image points of the largest tau above the critical value:
 the largest of all, and with it others whose photograph and object point hold no larger one, so that
-none is judged beside a larger error. A rejected point is taken back when its predicted residual
+none is judged beside a larger error. In a photograph of many image points an error moves the residuals of
+the others by its leverage only, some hundredths of it: there all those go that are not much smaller than the
+largest. A rejected point is taken back when its predicted residual
 passes the test again.
 
 Huber's estimator bounds the influence of an image point, Tukey's biweight takes it back to nothing:
@@ -26,6 +28,10 @@ from sfm.conventions import MAD_TO_SIGMA, BoolArray, FloatArray
 # in the plane (for a single coordinate they would be 1.345 and 4.685).
 HUBER = 1.501
 TUKEY = 5.123
+# In a photograph of n image points an error moves the residual of another by about 6 / (2 n) of itself, at
+# most some times that: beside CROWDED points one of BESIDE of the largest tau is an error of its own.
+CROWDED = 60
+BESIDE = 0.4
 MIN_FREEDOM = 0.05  # of redundancy over observations, so that a network without redundancy has a scale
 
 
@@ -58,6 +64,8 @@ def snoop(
     suspect = used & (tau > critical)
     worst_image = np.zeros(len(observations.camera))
     np.maximum.at(worst_image, observations.image[suspect], tau[suspect])
+    crowded = np.bincount(observations.image[used], minlength=len(worst_image)) >= CROWDED
+    worst_image[crowded] *= BESIDE
     worst_point = np.zeros(len(observations.start) - 1)
     np.maximum.at(worst_point, observations.point[suspect], tau[suspect])
     out = suspect & (tau >= worst_image[observations.image]) & (tau >= worst_point[observations.point])

@@ -1,0 +1,148 @@
+"""Photographs of a textured surface with truth: three roughnesses, any number of photographs.
+
+    python -m benchmarks.textured_scenes smooth 20 build/smooth20
+
+A square of 2.4 m with hills, and on it ripples: none, 4 mm over 0.15 m or 8 mm over 0.08 m. The camera goes
+round it on a dome at several elevations, every other photograph turned by 90 degrees. Every pixel is the mean
+of rays over its area, blurred and with noise, as in datasets/textured.
+"""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from datasets.textured import render
+from sfm.camera import Camera, camera_from_values, tangents_from_pixel
+from sfm.conventions import AnyArray, FloatArray
+
+RIPPLES = {"smooth": (0.0, 1.0), "medium": (0.004, 0.15), "rough": (0.008, 0.08)}  # height and length, m
+SIZE_PX = (1024, 768)
+PIXEL_MM = 0.006
+C_MM = 8.0
+DISTANCE_M = 1.7
+ELEVATIONS_DEG = (48.0, 58.0, 70.0)
+MARCH, BISECT = 40, 12  # steps along a ray through the slab that holds the surface, and within one of them
+SLAB_M = 0.2  # half the height of that slab
+SURVEY = """[survey]
+name = "{name}"
+unit = "m"
+
+[[camera]]
+name = "lens"
+images = "surface_*.png"
+pixel_mm = [{pixel}, {pixel}]
+c_mm = 8.2
+model = "opencv"
+free = ["fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2"]
+
+[targets]
+codes = "none"
+
+[tie_points]
+
+[adjust]
+sigma_px = 0.02
+"""
+
+
+@dataclass(frozen=True)
+class TexturedScene:
+    """What is photographed, and from where."""
+
+    roughness: str  # smooth | medium | rough
+    position: FloatArray  # projection centres, m, (m, 3)
+    rotation: FloatArray  # (m, 3, 3)
+    camera: Camera
+
+
+def textured_scene(roughness: str, photographs: int) -> TexturedScene:
+    """Return the scene with its true orientation."""
+    position, rotation = [], []
+    for i in range(photographs):
+        azimuth = 2 * np.pi * i / photographs * (1 if photographs < 40 else 2)
+        elevation = np.radians(ELEVATIONS_DEG[i % 3])
+        outward = np.array(
+            [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
+        )
+        x = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
+        roll = np.radians(90 * (i // 2 % 2))
+        right = np.cos(roll) * x + np.sin(roll) * np.cross(outward, x)
+        position.append((DISTANCE_M + 0.08 * (i % 4)) * outward)
+        rotation.append(np.column_stack([right, np.cross(outward, right), outward]))
+    values = (("k1", -0.05), ("k2", 0.02), ("p1", 2e-4), ("p2", -1e-4), ("cx", 515.0), ("cy", 380.0))
+    camera = camera_from_values("lens", "opencv", SIZE_PX, (PIXEL_MM, PIXEL_MM), c_mm=C_MM, values=values)
+    return TexturedScene(roughness, np.array(position), np.array(rotation), camera)
+
+
+def height(roughness: str, x: FloatArray, y: FloatArray) -> FloatArray:
+    """Height of the surface, m."""
+    tall, long = RIPPLES[roughness]
+    k = 2 * np.pi / long
+    ripples = tall * np.sin(k * x + np.sin(1.3 * k * y)) * np.cos(0.8 * k * y) if tall else 0.0
+    return np.asarray(render.height(x, y) + ripples)
+
+
+def intensities(scene: TexturedScene, index: int, skin: AnyArray) -> AnyArray:
+    """Return one photograph as it would be without noise, float32, 0 to 255."""
+    width, rows = SIZE_PX
+    centre = scene.position[index]
+    y, x = np.mgrid[0:rows, 0:width]
+    grid = np.column_stack([x.ravel(), y.ravel()]).astype(float)
+
+    def rays(offset: tuple[float, float]) -> FloatArray:
+        uv = tangents_from_pixel(scene.camera, grid + offset)
+        return np.asarray(np.column_stack([uv, -np.ones(len(uv))]) @ scene.rotation[index].T)
+
+    def gap(t: FloatArray, d: FloatArray) -> FloatArray:
+        at = centre + t[:, None] * d
+        return np.asarray(at[:, 2] - height(scene.roughness, at[:, 0], at[:, 1]))
+
+    d = rays((0.0, 0.0))
+    first, last = (SLAB_M - centre[2]) / d[:, 2], (-SLAB_M - centre[2]) / d[:, 2]
+    above, below = first.copy(), last.copy()
+    open_rays = np.ones(len(d), dtype=bool)
+    for step in range(1, MARCH + 1):
+        t = first + (last - first) * step / MARCH
+        under = np.zeros(len(d), dtype=bool)
+        under[open_rays] = gap(t[open_rays], d[open_rays]) < 0
+        below[under] = t[under]
+        open_rays &= ~under
+        above[open_rays] = t[open_rays]
+    for _ in range(BISECT):
+        middle = (above + below) / 2
+        under = gap(middle, d) < 0
+        below, above = np.where(under, middle, below), np.where(under, above, middle)
+    centres = (above + below) / 2
+    light = np.zeros((rows, width), dtype=np.float32)
+    for offset in ((-0.25, -0.25), (0.25, -0.25), (-0.25, 0.25), (0.25, 0.25)):
+        d = rays(offset)
+        t = centres.copy()
+        for _ in range(3):  # Newton along the ray, from the middle of the pixel
+            slope = (gap(t + 1e-5, d) - gap(t, d)) / 1e-5
+            t -= np.clip(gap(t, d) / np.where(np.abs(slope) > 0.05, slope, -0.05), -0.01, 0.01)
+        at = (centre + t[:, None] * d)[:, :2] / render.TEXEL_M + len(skin) / 2
+        at = at.astype(np.float32).reshape(rows, width, 2)
+        light += cv2.remap(skin, at[..., 0], at[..., 1], cv2.INTER_LINEAR, borderValue=0.45)
+    light = cv2.GaussianBlur(light / 4, (0, 0), render.BLUR_PX)
+    return np.asarray(255 * light * (0.85 + 0.04 * (index % 4)))
+
+
+def render_scene(folder: Path, roughness: str, photographs: int) -> TexturedScene:
+    """Write the photographs and a survey file; return the scene."""
+    folder.mkdir(parents=True, exist_ok=True)
+    scene, skin = textured_scene(roughness, photographs), render.texture()
+    for index in range(photographs):
+        noise = np.random.default_rng((render.SEED, index)).normal(0, render.NOISE, SIZE_PX[::-1])
+        picture = np.rint(np.clip(intensities(scene, index, skin) + noise, 0, 255)).astype(np.uint8)
+        cv2.imwrite(str(folder / f"surface_{index + 1:03d}.png"), picture)
+    (folder / "survey.toml").write_text(SURVEY.format(name=folder.name, pixel=PIXEL_MM), encoding="utf-8")
+    return scene
+
+
+if __name__ == "__main__":
+    render_scene(Path(sys.argv[3]), sys.argv[1], int(sys.argv[2]))
