@@ -274,17 +274,19 @@ def programs_of(backend: str, baseline: str, *, threads: int = -1) -> OtherProgr
     return others
 
 
-def sensor_widths() -> Callable[[str, str], float | None]:
+def sensor_widths(tell: Callable[[str], None]) -> Callable[[str, str], float | None]:
     """Return COLMAP's list of the widths of camera sensors, mm, by make and model.
 
-    Where pycolmap is not installed no camera is known.
+    Args:
+        tell: is told in one line of a camera that could not be looked up, as without pycolmap.
     """
     from adapters.colmap.sensor_widths import sensor_width_mm
 
     def width(make: str, model: str) -> float | None:
         try:
             return sensor_width_mm(make, model)
-        except BackendError:
+        except BackendError as error:
+            tell(f"{make} {model} was not looked up in COLMAP's list of cameras: {error}")
             return None
 
     return width

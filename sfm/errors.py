@@ -8,7 +8,8 @@
     |-- InstallationError       files of another project lie among Kolinear's
     |-- OutputError             a result cannot be written
     |   `-- FolderInUseError    another run is writing there
-    `-- BackendError            an external program or library is missing or refuses
+    `-- BackendError            an external program or library is of another version, fails or refuses
+        `-- MissingLibraryError it is not installed: it belongs to an extra of Kolinear
 
 Rank, convergence and rejected observations are results, not exceptions.
 """
@@ -48,6 +49,10 @@ class FolderInUseError(OutputError):
 
 class BackendError(KolinearError):
     """An external library is missing, of the wrong version, or refuses the problem."""
+
+
+class MissingLibraryError(BackendError):
+    """A library that belongs to an extra of Kolinear is not installed; the message says how to install it."""
 
 
 def one_line(error: BaseException) -> str:

@@ -1,43 +1,25 @@
-"""An engine for tests without processes, and adjusters that travel to workers."""
+"""The engine without processes, for tests, and adjusters that travel to workers."""
 
 from __future__ import annotations
 
 import os
 import signal
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Sequence
 from contextlib import nullcontext
 from pathlib import Path
 from typing import Any, NoReturn
 
-from threadpoolctl import threadpool_limits
-
 from sfm.batch.job import Comparers, SurveyRow
 from sfm.result import SurveyResult
-from sfm.runtime.executor import Done, Event, Tell, Told, Work
+from sfm.runtime.executor import Tell
+from sfm.runtime.in_process import InProcess
 from sfm.survey.inputs.survey import Survey
 from sfm.survey.other_programs import OtherPrograms
 
 KILLER = "killer"  # a survey of this name kills whoever works on it
 
 
-class Here:
-    """Runs one piece of work after the other in this process."""
-
-    workers = 1
-
-    def run(self, works: Iterable[Work], *, at_a_time: int) -> Iterator[Event]:
-        for work in works:
-            said: list[dict[str, Any]] = []
-            with threadpool_limits(
-                limits=1
-            ):  # as in a worker: sums of several threads differ in the last bit
-                notes = [part.function(*part.arguments, tell=said.append) for part in work.parts]
-                value = work.whole.function(*work.whole.arguments, notes, tell=said.append)
-            yield from (Told(work.key, message) for message in said)
-            yield Done(work.key, value)
-
-
-HERE = nullcontext(Here())
+HERE = nullcontext(InProcess())
 
 
 class Notes:

@@ -29,7 +29,7 @@ from adapters.colmap.reconstruction import (
 )
 from sfm.camera import Camera
 from sfm.conventions import FloatArray
-from sfm.errors import BackendError, one_line
+from sfm.errors import BackendError, MissingLibraryError, one_line
 from sfm.files.plain_text import as_plain
 from sfm.network import Estimate, Network
 
@@ -158,13 +158,18 @@ def load_pycolmap() -> ModuleType:
     """Import pycolmap, or say what is needed.
 
     Raises:
-        BackendError: pycolmap is missing, cannot be imported, or is another version.
+        MissingLibraryError: pycolmap is not installed.
+        BackendError: pycolmap cannot be imported, or is another version.
     """
     needed = ".".join(str(part) for part in NEEDED_VERSION)
     try:
         import pycolmap
         import pycolmap.pyceres  # registers the types of the Ceres options
     except ImportError as error:
+        if isinstance(error, ModuleNotFoundError) and error.name == "pycolmap":
+            raise MissingLibraryError(
+                f"pycolmap is not installed: pip install 'pycolmap=={needed}.*', the extra kolinear[colmap]"
+            ) from error
         raise BackendError(
             f"pycolmap cannot be imported ({one_line(error)}): pip install 'pycolmap=={needed}.*'"
         ) from error

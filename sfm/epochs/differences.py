@@ -47,6 +47,8 @@ class Differences:
     by_place: int  # points recognised by their place
     untested: tuple[str, ...]  # common points that an epoch holds, or did not keep the covariance of
     shared: tuple[str, ...]  # given values that both epochs share, in words
+    held_alike: tuple[str, ...] = ()  # cameras with the same values held in both
+    held_apart: tuple[str, ...] = ()  # with values held in one only, or at others in either
 
     @property
     def motions(self) -> FloatArray:
@@ -62,8 +64,9 @@ def epoch_differences(first: Epoch, second: Epoch) -> Differences:
         second: a later one.
 
     Raises:
-        GeometryError: an epoch without the covariance of its points, fewer than four common points, units
-            that cannot be converted, or a weighted calibration that both share.
+        GeometryError: an epoch without the covariance of its points, image points that are those of the
+            other, fewer than four common points, units that cannot be converted, or a weighted calibration
+            that both share.
     """
     for epoch in (first, second):
         if epoch.result.redundancy == 0:
@@ -73,6 +76,7 @@ def epoch_differences(first: Epoch, second: Epoch) -> Differences:
                 f"{epoch.name}: the covariance of all points together (point_covariance.npy) is missing; run "
                 "the survey again with this version"
             )
+    _refuse_same_photographs(first, second)
     together = first.common is not None and second.common is not None
     if not together:
         _refuse_shared_calibration(first, second)
@@ -105,6 +109,7 @@ def epoch_differences(first: Epoch, second: Epoch) -> Differences:
     Q -= C
     Q -= C.T
     known = [one.redundancy for one in (a, b) if one.redundancy is not None]
+    held_alike, held_apart = _held_cameras(a, b)
     return Differences(
         names=(first.name, second.name),
         unit=a.unit,
@@ -119,6 +124,8 @@ def epoch_differences(first: Epoch, second: Epoch) -> Differences:
         by_place=pairing.points_by_place,
         untested=untested,
         shared=shared,
+        held_alike=held_alike,
+        held_apart=held_apart,
     )
 
 
@@ -133,6 +140,34 @@ def _others(result: StoredResult, paired: IntArray) -> tuple[str, ...]:
     left[paired] = False
     left &= result.estimate.determined
     return tuple(result.network.points[j] for j in np.flatnonzero(left))
+
+
+def _held_cameras(a: StoredResult, b: StoredResult) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Return cameras with values other than 0 held alike in both epochs, and those with others held."""
+    ours, theirs = _held_values(a), _held_values(b)
+    names = tuple(dict.fromkeys((*ours, *theirs)))
+    alike = tuple(name for name in names if name in ours and name in theirs and ours[name] == theirs[name])
+    return alike, tuple(name for name in names if name not in alike)
+
+
+def _held_values(result: StoredResult) -> dict[str, tuple[tuple[str, float], ...]]:
+    found = {}
+    for camera in result.estimate.cameras:
+        held = ~camera.free & (camera.parameters != 0)
+        if held.any():
+            found[camera.name] = tuple(
+                (camera.names[k], float(camera.parameters[k])) for k in np.flatnonzero(held)
+            )
+    return found
+
+
+def _refuse_same_photographs(first: Epoch, second: Epoch) -> None:
+    """Refuse one survey under two names: its displacements are 0, with a standard deviation of 0."""
+    a, b = (one.result.network.image_points.xy for one in (first, second))
+    if len(a) and a.shape == b.shape and np.array_equal(a, b):
+        raise GeometryError(
+            f"{first.name} and {second.name} have the same image points: they are one epoch, not two"
+        )
 
 
 def _refuse_shared_calibration(first: Epoch, second: Epoch) -> None:

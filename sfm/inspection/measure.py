@@ -270,7 +270,10 @@ class _Work:
     def quantities(self) -> list[Quantity]:
         found = []
         for one in self.features.distances:
-            function = self.distance(one.start, one.end)
+            try:
+                function = self.distance(one.start, one.end)
+            except GeometryError as error:
+                raise GeometryError(f"distance {one.name}: {error}") from error
             found.append(self.quantity(one.name, f"distance {one.start} to {one.end}", "length", function))
         for angle in self.features.angles:
             a, b = angle.between

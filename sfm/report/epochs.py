@@ -13,6 +13,7 @@ from sfm.adjustment.quality.statistics import POWER
 from sfm.conventions import FloatArray
 from sfm.display import listed
 from sfm.epochs.blocks import BlockMotion
+from sfm.epochs.differences import Differences
 from sfm.epochs.displacements import Displacements
 from sfm.epochs.series import EpochPair, EpochSeries
 from sfm.epochs.together import SharedCamera
@@ -35,6 +36,7 @@ COLUMNS = (
 SERIES = ("id", "epoch", "dX", "dY", "dZ", "sdX", "sdY", "sdZ", "moved")
 DRAWN = 12  # points of a series that are drawn, those that moved farthest
 MOSTLY = 0.5  # of Omega: what a bending takes away of it is told from here on
+OTHER_OBJECT = 0.1  # of the size of the object: median displacement from which it may be another one
 PICTURE = (
     "Displacements: arrows in the object's main plane, points that moved in red; the colour of the dots is "
     "the displacement out of the plane."
@@ -77,6 +79,9 @@ def words_of_pair(found: Displacements) -> tuple[str, str]:
             if found.smooth > MOSTLY
             else ""
         )
+        misfit = float(np.median(np.linalg.norm(found.displacement, axis=1)))
+        if misfit > OTHER_OBJECT * float(np.linalg.norm(np.ptp(found.differences.xyz, axis=0))):
+            cause = "; half of them by a tenth of the object or more: are they epochs of one object?"
         return f"{between}: the points of reference differ, and no half of them agrees{cause}", "bad"
     names = [n for n, moved in zip(found.differences.points, found.moved, strict=True) if moved]
     if not names:
@@ -123,6 +128,25 @@ def words_of_block(block: BlockMotion) -> str:
     how = " and ".join(parts) if parts else "nothing significant"
     rest = "its points moved as one" if block.fits else "what is left is significant: it changed its shape"
     return f"{block.name} ({len(block.points)} points, {block.model}): {how}; {rest}"
+
+
+def words_of_held(found: Differences) -> tuple[str, ...]:
+    """Return in words which calibrations were held, whose errors no standard deviation contains."""
+    told = []
+    if found.held_alike:
+        told.append(
+            f"Both epochs hold the same interior orientation of camera {_names(found.held_alike)}: its error "
+            "is in no standard deviation. What it does to both alike cancels; where photographs and object "
+            "are not the same, the rest can pass for a movement. Adjust it (free), or together from a "
+            "calibration with standard deviations (--together)."
+        )
+    if found.held_apart:
+        told.append(
+            f"Interior orientation of camera {_names(found.held_apart)} is held in one epoch only, or at "
+            "other values in the other: its error is in no standard deviation, does not cancel, and can pass "
+            "for a movement. Adjust it (free)."
+        )
+    return tuple(told)
 
 
 def words_of_camera(camera: SharedCamera) -> str:
@@ -179,6 +203,7 @@ def epochs_page(found: EpochSeries) -> str:
             for k, pair in enumerate(pairs)
         ],
         words_of_block=words_of_block,
+        words_of_held=words_of_held,
         names=_names,
         series=_series_picture(found),
     )
@@ -198,6 +223,8 @@ def _pair(pair: EpochPair) -> dict[str, Any]:
         "untested": list(d.untested),
         "no_change": d.motion,
         "shared_given_values": list(d.shared),
+        "held_alike": list(d.held_alike),
+        "held_apart": list(d.held_apart),
         "alpha": found.alpha,
         "agreed": found.agreed,
         "stable": names[found.stable].tolist(),

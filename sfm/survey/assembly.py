@@ -53,7 +53,7 @@ def assemble_result(
         eccentricity=matched.eccentricity,
         no_circles=matched.no_circles,
         left_out=(*measured.left_out, *solution.left_out),
-        notes=solution.notes,
+        notes=solution.notes + compared.notes,
         settings=told_settings(survey),
         free_network=solution.free_network,
         taken_out=solution.taken_out,

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from sfm.comparison.baseline import Baseline, BaselineComparison, compare_baseline
 from sfm.comparison.two_adjusters.adjusters import AdjusterComparison, BackendAdjustment, compare_adjusters
-from sfm.errors import KolinearError
+from sfm.errors import KolinearError, MissingLibraryError
 from sfm.network import Estimate, Network
 from sfm.runtime.progress import StageClock
 from sfm.survey.adjusting.solution import Solution
@@ -38,7 +38,8 @@ class SurveyComparison:
 
     adjusters: AdjusterComparison | None = None
     baseline: BaselineComparison | None = None
-    failures: tuple[str, ...] = ()  # why a comparison that was asked for is missing, one line each
+    failures: tuple[str, ...] = ()  # why a comparison that was asked for failed, one line each
+    notes: tuple[str, ...] = ()  # comparisons left out because a library is not installed, one line each
 
 
 def compare_solution(
@@ -46,8 +47,8 @@ def compare_solution(
 ) -> SurveyComparison:
     """Compare a solution with those of other programs.
 
-    The survey stands without them: a library that is missing or refuses is a line in the result and does
-    not lose it.
+    The survey stands without them: one that refuses is a warning in the result and does not lose it. A
+    library that is not installed is told without a warning's weight, since it says nothing of the survey.
 
     Args:
         solution: of the survey.
@@ -57,11 +58,14 @@ def compare_solution(
     """
     own_seconds = sum(seconds for _, seconds in clock.seconds)
     adjusters = baseline = None
-    failures = []
+    failures: list[str] = []
+    notes: list[str] = []
     if others.adjuster is not None:
         with clock.stage("comparison"):
             try:
                 adjusters = compare_adjusters(solution.adjustment, others.adjuster)
+            except MissingLibraryError as error:
+                notes.append(f"Not compared with another adjuster: {error}.")
             except KolinearError as error:
                 failures.append(f"the comparison with the other adjuster failed: {error}")
     if others.mapper is not None and files is not None:
@@ -69,6 +73,8 @@ def compare_solution(
             try:
                 mapped = others.mapper(files.folder, files.by_camera())
                 baseline = compare_baseline(solution.adjustment, mapped, seconds=own_seconds)
+            except MissingLibraryError as error:
+                notes.append(f"Not compared with another pipeline: {error}.")
             except KolinearError as error:
                 failures.append(f"the comparison with the other pipeline failed: {error}")
-    return SurveyComparison(adjusters, baseline, tuple(failures))
+    return SurveyComparison(adjusters, baseline, tuple(failures), tuple(notes))

@@ -12,12 +12,13 @@ from sfm.adjustment.solve import adjust
 from sfm.conventions import FloatArray
 from sfm.distortion.models import Role
 from sfm.epochs.epoch import Epoch
-from sfm.network import Estimate, Network
+from sfm.network import Estimate, InteriorObservations, Network
 from tests.synthetic import make_network, observed_anew, seed_of, stored_of
 
 IMAGES, POINTS, NOISE_PX = 14, 60, 0.1
 BARS = (("1", "31"), ("12", "50"))
 BAR_SIGMA = 2e-4
+CALIBRATION_SIGMA_PX = 0.05
 
 
 @cache
@@ -33,6 +34,7 @@ def epoch(
     given: float = 0.0,
     datum: str = "free",
     longer: float = 0.0,
+    calibration: FloatArray | None = None,
 ) -> Epoch:
     """Return one epoch.
 
@@ -43,6 +45,7 @@ def epoch(
         given: added to the stated lengths, object unit, so that they are others.
         datum: of the adjustment.
         longer: added to the focal lengths of its camera, px.
+        calibration: its focal lengths as a certificate states them, within CALIBRATION_SIGMA_PX, (2,).
     """
     network, truth = scene()
     rng = np.random.default_rng(seed)
@@ -55,7 +58,27 @@ def epoch(
     for (a, b), error in zip(BARS, errors.tolist(), strict=True):
         length = float(np.linalg.norm(now.points[int(a) - 1] - now.points[int(b) - 1]))
         network = network.with_scale_bar(a, b, length + error + given, BAR_SIGMA)
+    interior: tuple[tuple[str, str, float, float], ...] = ()
+    if calibration is not None:
+        rows = np.flatnonzero(lens.plays(Role.FOCAL))
+        network = replace(
+            network,
+            interior=InteriorObservations(
+                np.zeros(2, dtype=np.int64), rows, calibration, np.full(2, CALIBRATION_SIGMA_PX)
+            ),
+        )
+        interior = tuple(
+            (lens.name, lens.names[k], value, CALIBRATION_SIGMA_PX)
+            for k, value in zip(rows.tolist(), calibration.tolist(), strict=True)
+        )
     kind = Datum(datum, points=["1", "2", "3"] if datum == "minimal" else None)
     a = adjust(network, now, datum=kind, sigma_px=NOISE_PX, reject="none")
     name = f"epoch {seed}"
-    return Epoch(name, stored_of(name, a), network.scale_bars, sigma0=a.sigma0, sigma0_px=a.sigma0_px)
+    return Epoch(
+        name,
+        stored_of(name, a),
+        network.scale_bars,
+        interior=interior,
+        sigma0=a.sigma0,
+        sigma0_px=a.sigma0_px,
+    )

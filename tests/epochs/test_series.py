@@ -14,7 +14,7 @@ from sfm.conventions import FloatArray
 from sfm.epochs.epoch import Epoch
 from sfm.epochs.series import EpochSeries, analyse_epochs
 from sfm.errors import GeometryError
-from sfm.report.epochs import FILES, pairs_of, words_of_pair, words_of_stable, write_epochs
+from sfm.report.epochs import FILES, pairs_of, words_of_held, words_of_pair, words_of_stable, write_epochs
 from tests.epochs.scenes import POINTS, epoch
 
 
@@ -81,5 +81,45 @@ def test_refusals_are_one_line() -> None:
     bare = replace(second, result=replace(second.result, covariance=None))
     with pytest.raises(GeometryError, match=r"epoch 71: the covariance of all points together"):
         analyse_epochs([first, bare])
+    again = replace(first, name="copy")
+    with pytest.raises(GeometryError, match="epoch 70 and copy have the same image points: they are one"):
+        analyse_epochs([first, again])
     with pytest.raises(GeometryError, match="share the weighted c of camera lens"):
         analyse_epochs([replace(one, interior=(("lens", "c", 24.0, 0.01),)) for one in (first, second)])
+
+
+def held(one: Epoch, more: float = 0.0) -> Epoch:
+    """Return an epoch as if its interior orientation had been held."""
+    camera = one.result.estimate.cameras[0]
+    stated = epochs()[0].result.estimate.cameras[0].parameters + more
+    camera = replace(camera, parameters=stated, free=np.zeros_like(camera.free))
+    estimate = replace(one.result.estimate, cameras=(camera,))
+    return replace(one, result=replace(one.result, estimate=estimate))
+
+
+def test_a_calibration_that_is_held_is_told(tmp_path: Path) -> None:
+    """Its error is in no covariance: what both epochs have of it cancels in part, what one has does not."""
+    first, second, _ = epochs()
+    (name,) = (camera.name for camera in first.result.estimate.cameras)
+
+    def told(one: Epoch, other: Epoch) -> tuple[str, ...]:
+        found = analyse_epochs([one, other])
+        words = words_of_held(found.since_first[0].displacements.differences)
+        text = write_epochs(found, tmp_path / "out").read_text(encoding="utf-8")
+        assert all(one in text for one in words)
+        return words
+
+    assert told(first, second) == ()
+    (alike,) = told(held(first), held(second))
+    assert f"hold the same interior orientation of camera {name}: its error is in no" in alike
+    for other in (second, held(second, more=1e-3)):
+        (apart,) = told(held(first), other)
+        assert f"camera {name} is held in one epoch only" in apart and "does not cancel" in apart
+
+
+def test_epochs_of_two_objects_are_doubted() -> None:
+    first, second, _ = epochs()
+    points = second.result.estimate.points
+    mixed = replace(second.result.estimate, points=points[np.random.default_rng(1).permutation(POINTS)])
+    found = analyse_epochs([first, replace(second, result=replace(second.result, estimate=mixed))])
+    assert "are they epochs of one object?" in words_of_pair(found.since_first[0].displacements)[0]

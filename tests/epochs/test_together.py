@@ -11,14 +11,15 @@ from sfm.adjustment.covariance import marginal_of
 from sfm.adjustment.solve import adjust
 from sfm.comparison.stable_points import in_datum
 from sfm.conventions import FloatArray
+from sfm.distortion.models import Role
 from sfm.epochs.differences import Differences, epoch_differences
 from sfm.epochs.displacements import displacements
 from sfm.epochs.epoch import Epoch
 from sfm.epochs.series import analyse_epochs
 from sfm.epochs.together import adjust_together
 from sfm.errors import GeometryError
-from sfm.network import Estimate, ImagePoints, Network, ObjectPoints, ScaleBars
-from tests.epochs.scenes import BAR_SIGMA, POINTS, epoch
+from sfm.network import Estimate, ImagePoints, InteriorObservations, Network, ObjectPoints, ScaleBars
+from tests.epochs.scenes import BAR_SIGMA, POINTS, epoch, scene
 
 EVERY = np.ones(POINTS)
 
@@ -80,16 +81,7 @@ def test_it_is_one_adjustment_of_all_photographs() -> None:
     found = epoch_differences(first, second)
     d, Q = in_one_datum(found, found.difference, found.covariance)
 
-    network, estimate = merged(given)
-    a = adjust(network, estimate, datum="control", sigma_px=0.1, reject="none")
-    assert a.converged
-    joint = marginal_of(a).joint(np.zeros(0, dtype=np.int64), np.arange(2 * POINTS)) / a.sigma0**2
-    x = a.estimate.points
-    J = np.hstack([-np.eye(3 * POINTS), np.eye(3 * POINTS)])
-    turn = second_in_first(x)
-    J[:, 3 * POINTS :] = np.kron(np.eye(POINTS), turn[0])
-    moved = x[POINTS:] @ turn[0].T + turn[1]
-    expected, covariance = in_one_datum(found, moved - x[:POINTS], J @ joint @ J.T)
+    expected, covariance = adjusted_as_one(given, found)
     sigma = np.sqrt(np.diagonal(covariance).reshape(-1, 3))
     off = float(np.abs((d - expected) / sigma).max())
     assert off < 1e-3  # the condition is linear, and either epoch has its own sigma0
@@ -98,6 +90,48 @@ def test_it_is_one_adjustment_of_all_photographs() -> None:
     d_alone, Q_alone = in_one_datum(alone, alone.difference, alone.covariance)
     assert np.abs((d_alone - expected) / sigma).max() > 5 * off
     assert np.linalg.eigvalsh(Q_alone - Q)[0] > -1e-3 * np.diagonal(Q).mean()
+
+
+def test_a_weighted_calibration_stays_one_observation() -> None:
+    """Both epochs were given it; all photographs in one adjustment have it once."""
+    lens = scene()[1].cameras[0]
+    stated = lens.parameters[lens.plays(Role.FOCAL)] + 0.04
+    given = epoch(86, calibration=stated), epoch(87, given=1e-7, calibration=stated)
+    with pytest.raises(GeometryError, match=r"share the weighted fx of camera .*--together"):
+        epoch_differences(*given)
+    (first, second), _ = adjust_together(given)
+    found = epoch_differences(first, second)
+    assert [words for words in found.shared if words.startswith("fx of camera")]
+    d, Q = in_one_datum(found, found.difference, found.covariance)
+
+    expected, covariance = adjusted_as_one(given, found)
+    sigma = np.sqrt(np.diagonal(covariance).reshape(-1, 3))
+    assert np.abs((d - expected) / sigma).max() < 1e-3
+    assert np.abs(np.sqrt(np.diagonal(Q).reshape(-1, 3)) / sigma - 1).max() < 0.04
+
+
+def adjusted_as_one(given: tuple[Epoch, Epoch], found: Differences) -> tuple[FloatArray, FloatArray]:
+    """Return differences and covariance of one adjustment of all photographs, in the datum of all points."""
+    network, estimate = merged(given)
+    lens = estimate.cameras[0]
+    rows = given[0].interior
+    network = replace(
+        network,
+        interior=InteriorObservations(
+            np.zeros(len(rows), dtype=np.int64),
+            np.array([lens.names.index(parameter) for _, parameter, _, _ in rows], dtype=np.int64),
+            np.array([value for _, _, value, _ in rows]),
+            np.array([sigma for _, _, _, sigma in rows]),
+        ),
+    )
+    a = adjust(network, estimate, datum="control", sigma_px=0.1, reject="none")
+    assert a.converged
+    joint = marginal_of(a).joint(np.zeros(0, dtype=np.int64), np.arange(2 * POINTS)) / a.sigma0**2
+    x = a.estimate.points
+    J = np.hstack([-np.eye(3 * POINTS), np.eye(3 * POINTS)])
+    R, shift = second_in_first(x)
+    J[:, 3 * POINTS :] = np.kron(np.eye(POINTS), R)
+    return in_one_datum(found, x[POINTS:] @ R.T + shift - x[:POINTS], J @ joint @ J.T)
 
 
 def second_in_first(x: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -211,3 +211,32 @@ def test_what_cannot_be_known_of_a_free_network_cannot_be_held() -> None:
     Q = in_free_datum(random_covariance(COUNT, 1.0, rng), xyz)
     with pytest.raises(GeometryError, match='expected weights = "equal"'):
         fit_shape(measured(xyz, Q), "plane", hold={"direction": truth.axis.tolist()})
+
+
+@pytest.mark.parametrize("seed", [5, 9, 15])
+def test_few_points_far_from_a_cone_have_one_all_the_same(seed: int) -> None:
+    """Their squared distances from any axis fall with the height, so no quadric of them is a cone."""
+    rng = np.random.default_rng(seed)
+    truth = simulated_shape("cone", rng)
+    foot = points_on(truth, 20, rng)
+    Q = random_covariance(20, 100.0, rng)
+    xyz = foot + (np.linalg.cholesky(Q) @ rng.normal(size=60)).reshape(-1, 3)
+    fit = fit_shape(measured(xyz), "cone", weights="equal")
+    assert fit.converged and fit.rms <= np.sqrt((truth.distances(xyz) ** 2).mean())
+
+
+def test_a_point_beside_the_axis_of_an_ellipse_overflows_nothing() -> None:
+    """Its foot point lies where one denominator of its equation is 0."""
+    d, _, _ = KINDS["ellipse"].distance(
+        np.array([[1e-20, 0.0, 0.0], [0.0, 1e-20, 0.0]]), np.array([1.0, 2.0])
+    )
+    np.testing.assert_allclose(d[:, 0], -1.0)
+
+
+def test_a_diverging_fit_is_one_line() -> None:
+    """Twenty points all about, and a covariance as any."""
+    rng = np.random.default_rng(21)
+    xyz = rng.standard_normal((20, 3)) * [100.0, 80.0, 60.0]
+    A = 0.01 * rng.standard_normal((60, 60))
+    with pytest.raises(GeometryError, match="it diverges: they are too far from any cone"):
+        fit_shape(measured(xyz, A @ A.T), "cone")

@@ -323,6 +323,11 @@ def test_retro_panel_is_predicted_from_its_geometry() -> None:
     told("retro-panel", ratio)
     assert np.median(ratio) == pytest.approx(1, abs=0.03)
     assert (np.abs(ratio - 1) < 0.1).mean() > 0.96  # the others have image points of less weight
+    own = replace(seen, covariance=a.sigma0**2 * seen.covariance)
+    exact = ratios(
+        predict(replace(a.network, image_points=own), a.estimate).covariance.points, a.covariance.points
+    )
+    assert exact == pytest.approx(1, abs=1e-3)
 
 
 def test_a_survey_is_predicted_from_its_geometry() -> None:

@@ -293,7 +293,7 @@ def test_what_photographs_say_of_themselves_is_no_line_of_a_drafted_survey(
         return replace(real(path), make=evil, model=evil, focal_mm=24.0)
 
     monkeypatch.setattr("sfm.survey.drafting.draft.read_metadata", metadata)
-    monkeypatch.setattr("sfm.api.sensor_widths", lambda: lambda *_: 36.0)
+    monkeypatch.setattr("sfm.api.sensor_widths", lambda *_: lambda *_: 36.0)
     assert kolinear(monkeypatch, "init", given) == 0
     told = capsys.readouterr()
     assert "\x1b" not in told.err and "left out: 2.png: a link out of the folder" in told.err

@@ -73,6 +73,7 @@ def epochs(
             pairs_of,
             words_of_block,
             words_of_camera,
+            words_of_held,
             words_of_pair,
             words_of_stable,
             write_epochs,
@@ -86,6 +87,9 @@ def epochs(
         if name in groups:
             raise SurveyFileError(f"--group {name} is given twice")
         groups[name] = _listed(points)
+    for k, path in enumerate(results):
+        if path.resolve() in [one.resolve() for one in results[:k]]:
+            raise SurveyFileError(f"epochs: {path} is given twice")
     given = [_epoch(path) for path in results]
     if len({epoch.name for epoch in given}) < len(given):  # folders of one name in different places
         given = [replace(epoch, name=str(path)) for epoch, path in zip(given, results, strict=True)]
@@ -106,6 +110,9 @@ def epochs(
         print(f"  {words_of_stable(pair.displacements)}")
         for block in pair.blocks:
             print(f"  {words_of_block(block)}")
+    pairs = (pair.displacements.differences for pair in pairs_of(found))
+    for words in dict.fromkeys(words for pair in pairs for words in words_of_held(pair)):
+        print(f"! {words}")
     print(f"Report: {page}")
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -81,10 +82,15 @@ def _draft(photographs: Path) -> Draft:
         from sfm.survey.measuring.target_store import TargetStore
 
     compile_first()
+    unknown: list[str] = []
     with working_on(str(photographs)), drawn_progress() as drawn, one_blas_thread():
-        return draft_survey(
-            photographs, sensor_width=sensor_widths(), store=TargetStore.of_user(), progress=drawn
+        draft = draft_survey(
+            photographs,
+            sensor_width=sensor_widths(unknown.append),
+            store=TargetStore.of_user(),
+            progress=drawn,
         )
+    return replace(draft, remarks=(*draft.remarks, *unknown))
 
 
 def _write(draft: Draft, file: Path) -> None:

@@ -28,12 +28,14 @@ def validate(
     Exit code 1 if the in-house adjuster was ever the worse one.
     """
     with loading():
+        from adapters.colmap.adjuster import load_pycolmap
         from adapters.colmap.validation_backend import ColmapBackend
         from sfm.comparison.two_adjusters.adjuster_validation import validate as validate_networks
         from sfm.files.manifest import refuse_foreign_folder
         from sfm.report.validation import in_words, largest, write_validation
         from sfm.runtime.progress_bar import drawn_progress
 
+    load_pycolmap()  # without it there is nothing to compare, which is no verdict on a network
     refuse_foreign_folder(out)
     with drawn_progress() as progress:
         found = validate_networks(ColmapBackend(), networks=networks, seed=seed, jobs=jobs, progress=progress)

@@ -6,6 +6,7 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -296,19 +297,20 @@ def batch(
     with loading():
         from rich.console import Console
 
-        from adapters.dask_cluster import fitting_workers, local_engine, remote_engine
         from sfm.api import colmap_writer
         from sfm.batch.job import Comparers
         from sfm.batch.run import calls_of, find_surveys, run_batch
         from sfm.batch.table import BatchTable, print_batch, stopping_at_terminate
+        from sfm.cli.commands.batch_engine import batch_engine
 
     files = find_surveys(surveys)
     compile_first()
-    if cluster is not None:
-        engine = remote_engine(cluster)
-    else:
-        busy = calls_of(files, allow_outside=allow_outside)  # more would wait for nothing
-        engine = local_engine(min(jobs or fitting_workers(), busy))
+    engine = batch_engine(
+        partial(calls_of, files, allow_outside=allow_outside),
+        jobs=jobs,
+        cluster=cluster,
+        tell=partial(print, file=sys.stderr),
+    )
     with stopping_at_terminate(), BatchTable(Console(stderr=True), verbose=verbose) as table:
         rows = run_batch(
             files,

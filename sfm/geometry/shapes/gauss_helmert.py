@@ -72,7 +72,8 @@ def refine_weighted(
         placed: whether the origin may stand anywhere along the axis.
 
     Raises:
-        GeometryError: the covariance is singular beyond what the free parameters take up.
+        GeometryError: the covariance is singular beyond what the free parameters take up, or the adjustment
+            diverges.
     """
     n = len(xyz)
     nothing = np.zeros(3)
@@ -91,7 +92,15 @@ def refine_weighted(
             solve, factored = _factor(Qw, A * unit), B
         PA = solve(A)
         N = A.T @ PA
-        dp = -np.linalg.solve(N, PA.T @ w)
+        try:
+            dp = -np.linalg.solve(N, PA.T @ w)
+        except LinAlgError:
+            dp = np.full(len(N), np.nan)
+        if not np.isfinite(dp).all():
+            raise GeometryError(
+                "with the covariance of its points it diverges: they are too far from any "
+                f'{shape.kind.name}; expected weights = "equal"'
+            )
         k = -solve(w + A @ dp)
         v = times_covariance(covariance, B, k) / size**2
         step = np.zeros(len(free))

@@ -99,7 +99,7 @@ def _foot_on_ellipse(x: FloatArray, y: FloatArray, a: float, b: float) -> tuple[
     high = np.hypot(a * u, b * v) - least
     for _ in range(BISECTIONS):
         t = (low + high) / 2
-        above = (a * u / np.maximum(t + a * a, TINY)) ** 2 + (b * v / np.maximum(t + b * b, TINY)) ** 2 > 1
+        above = np.hypot(a * u / np.maximum(t + a * a, TINY), b * v / np.maximum(t + b * b, TINY)) > 1
         low, high = np.where(above, t, low), np.where(above, high, t)
     theta = np.arctan2(b * v * (high + a * a), a * u * (high + b * b))
     for _ in range(3):

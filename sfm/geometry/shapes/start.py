@@ -142,13 +142,20 @@ def _cylinders(xyz: FloatArray, R: FloatArray) -> list[Shape]:
 
 
 def _cones(xyz: FloatArray, R: FloatArray) -> list[Shape]:
-    """Return the cone with this axis: (x - x0)^2 + (y - y0)^2 = (r + z tan)^2 is linear in five unknowns."""
+    """Return the cone with this axis: (x - x0)^2 + (y - y0)^2 = (r + z tan)^2 is linear in five unknowns.
+
+    Few points far from a cone may have none; then that of the circle they make along the axis, and of the
+    straight line of their distances from its centre.
+    """
     y = xyz @ R
     A = np.column_stack([2 * y[:, :2], np.ones(len(y)), y[:, 2], y[:, 2] ** 2])
     u = _least_squares(A, (y[:, :2] ** 2).sum(axis=1))
     square = u[2] + u[:2] @ u[:2]
     if not (square > 0 and u[4] > 0):
-        return []
+        centre, _ = _circle_in_plane(y[:, :2])
+        rho = np.hypot(*(y[:, :2] - centre).T)
+        radius, slope = _least_squares(np.column_stack([np.ones(len(y)), y[:, 2]]), rho)
+        return [Shape(KINDS["cone"], R[:, :2] @ centre, R, np.array([radius, np.arctan(slope)]))]
     slope = np.sqrt(u[4])
     radius = u[3] / (2 * slope)
     if radius < 0:

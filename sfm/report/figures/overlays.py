@@ -51,6 +51,7 @@ REASON_COLOURS = (
     (Flag.PART_OF_CODE, (230, 150, 230)),
     (Flag.LOBED, (90, 200, 250)),
     (Flag.THIN_BACKGROUND, (40, 110, 40)),
+    (Flag.NOT_ON_PLATE, (110, 60, 20)),
 )
 # Remarks on measured targets, drawn as a second outline.
 REMARK_COLOURS = (

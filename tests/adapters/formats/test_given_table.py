@@ -40,7 +40,7 @@ def test_bars_control_and_interior_orientation(tmp_path: Path) -> None:
     assert given.control.point.tolist() == [0]
     assert given.control.xyz[0, [0, 2]].tolist() == [1.5, 2.5]
     assert np.diagonal(given.control.covariance[0]).tolist() == [0.002**2, np.inf, 0.0]
-    assert given.interior == (("lens", "c", 24.5),) and given.sigma0 == 0.5
+    assert given.interior == (("lens", "c", 24.5, 0.01),) and given.sigma0 == 0.5
 
 
 def test_a_result_without_the_table_was_given_nothing(tmp_path: Path) -> None:

@@ -1,0 +1,151 @@
+"""The core without its extras: surveys run without pycolmap and Dask, and each command says what it lacks."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+import pytest
+
+import sfm
+from sfm import cli
+from sfm.errors import BackendError, KolinearError, MissingLibraryError
+from sfm.kernels import warmed
+from sfm.runtime.executor import Call, Done, Event, Lost, Tell, Told, Work
+from sfm.runtime.in_process import in_process_engine
+from tests.surveys import write_observed_survey
+
+INSTALL_PYCOLMAP = "pycolmap is not installed: pip install 'pycolmap==4.2.*', the extra kolinear[colmap]"
+INSTALL_DASK = "pip install 'dask[distributed]' cryptography, the extra kolinear[cluster]"
+
+
+@pytest.fixture(autouse=True)
+def core_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Hide the libraries of the extras, and spare the drawing, which is not what is tested."""
+    for name in ("pycolmap", "pycolmap.pyceres", "dask", "distributed"):
+        monkeypatch.setitem(sys.modules, name, None)
+    monkeypatch.delitem(sys.modules, "adapters.dask_cluster", raising=False)
+    monkeypatch.delattr("adapters.dask_cluster", raising=False)
+    monkeypatch.setattr("sfm.report.output.all_plots", lambda *_: [])
+    monkeypatch.setattr(warmed, "is_warm", lambda: True)
+
+
+def kolinear(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], *arguments: object
+) -> tuple[int, str]:
+    """Return exit code and what is printed."""
+    monkeypatch.setattr(sys, "argv", ["kolinear", *map(str, arguments)])
+    code = 0
+    try:
+        cli.main()
+    except SystemExit as end:
+        code = int(end.code or 0)
+    told = capsys.readouterr()
+    return code, told.out + told.err
+
+
+def test_a_survey_is_not_compared_and_says_why(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    survey = write_observed_survey(tmp_path / "s", "alone", images=5, points=12, backend="colmap")
+    out = tmp_path / "out"
+    code, told = kolinear(monkeypatch, capsys, "adjust", survey, "--out", out)
+    assert code == 0 and INSTALL_PYCOLMAP in " ".join(told.split())
+    line = f"Not compared with another adjuster: {INSTALL_PYCOLMAP}."
+    summary = json.loads((out / "summary.json").read_text(encoding="utf-8"))
+    assert line in json.dumps(summary)
+    assert "pycolmap" not in json.dumps(summary["warnings"]), "it says nothing against the survey"
+    assert "Not compared with another adjuster: pycolmap" in (out / "report.html").read_text(encoding="utf-8")
+    assert line in " ".join((out / "report.txt").read_text(encoding="utf-8").split())
+
+
+@pytest.mark.parametrize("arguments", [("validate", "--networks", 1), ("refine", "MODEL", "--images", ".")])
+def test_commands_that_need_pycolmap_end_in_one_line(
+    arguments: tuple[object, ...],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "MODEL").mkdir()
+    for name in ("cameras", "images", "points3D"):
+        (tmp_path / "MODEL" / f"{name}.txt").write_text("")
+    code, told = kolinear(monkeypatch, capsys, *arguments)
+    assert code == 2 and told.count("\n") == 1 and INSTALL_PYCOLMAP in told
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["MODEL"]
+
+
+def test_a_broken_pycolmap_is_not_called_missing(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    (tmp_path / "pycolmap.py").write_text("raise ImportError('libceres.so: cannot open')")
+    monkeypatch.delitem(sys.modules, "pycolmap")
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(BackendError, match=r"cannot be imported \(libceres\.so") as told:
+        sfm.network_from_colmap(tmp_path)
+    assert not isinstance(told.value, MissingLibraryError)
+
+
+def test_a_batch_runs_in_this_process(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    surveys = [
+        write_observed_survey(tmp_path / name, name, images=5, points=12) for name in ("first", "second")
+    ]
+    code, told = kolinear(monkeypatch, capsys, "batch", *surveys, "--out", tmp_path / "out", "--jobs", 2)
+    assert code == 0, told
+    assert f"Dask is not installed: surveys run one after the other in this process; {INSTALL_DASK}" in told
+    for name in ("first", "second"):
+        assert (tmp_path / "out" / name / "report.html").exists()
+
+
+def test_a_scheduler_cannot_be_used(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    survey = write_observed_survey(tmp_path / "b", "second")
+    out = tmp_path / "out"
+    code, told = kolinear(monkeypatch, capsys, "batch", survey, "--out", out, "--cluster", "tcp://10.0.0.1:8")
+    assert code == 2 and f"--cluster tcp://10.0.0.1:8: Dask is not installed: {INSTALL_DASK}" in told
+    assert not out.exists()
+
+
+def test_doctor_calls_the_core_sound(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    code, told = kolinear(monkeypatch, capsys, "doctor")
+    assert code == 0 and "This installation works." in told
+    assert f"colmap: no comparison, {INSTALL_PYCOLMAP}" in " ".join(told.split())
+
+
+def test_a_camera_that_was_not_looked_up_is_told() -> None:
+    unknown: list[str] = []
+    assert sfm.api.sensor_widths(unknown.append)("OLYMPUS", "C4040Z") is None
+    assert unknown == [f"OLYMPUS C4040Z was not looked up in COLMAP's list of cameras: {INSTALL_PYCOLMAP}"]
+
+
+def double(value: int, *, tell: Tell) -> int:
+    tell({"photograph": str(value)})
+    return 2 * value
+
+
+def add(first: int, parts: list[int], *, tell: Tell) -> int:
+    tell({"stage": "sum"})
+    if first < 0:
+        raise ZeroDivisionError("nobody thought of it")
+    if not parts:
+        raise KolinearError("nothing to add")
+    return first + sum(parts)
+
+
+def test_the_engine_tells_in_order_and_one_fault_is_alone() -> None:
+    def events(first: int, *parts: int) -> list[Event]:
+        work = Work(f"w{first}", tuple(Call(double, (one,)) for one in parts), Call(add, (first,)))
+        with in_process_engine() as engine:
+            return list(engine.run([work, Work("after", work.parts, Call(add, (0,)))], at_a_time=3))
+
+    told = [Told("w1", {"photograph": "2"}), Told("w1", {"photograph": "3"}), Told("w1", {"stage": "sum"})]
+    assert events(1, 2, 3)[:4] == [*told, Done("w1", 11)]
+    found = events(-1, 2)
+    assert Lost("w-1", "it failed: ZeroDivisionError: nobody thought of it") in found
+    assert found[-1] == Done("after", 4)
+    with pytest.raises(KolinearError, match="nothing to add"):
+        events(1)
