@@ -51,7 +51,7 @@ def unused_image_points(whole: Network, images: BoolArray, points: BoolArray) ->
 
 def words_of_left_out(left_out: tuple[LeftOutPoint, ...], measured: int) -> str:
     """Return in one line which of so many measured points are not in the result, and why."""
-    named = listed((f"point {one.point}: {one.reason}" for one in left_out), most=10, separator="; ")
+    named = listed((f"point {one.point}: {one.reason}" for one in left_out), separator="; ")
     rows = sum(one.image_points for one in left_out)
     return (
         f"{len(left_out)} of {measured} measured points are not in the result, with {rows} image points: "

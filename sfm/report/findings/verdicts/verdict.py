@@ -241,13 +241,14 @@ def _consistency(evidence: Evidence) -> Judged:
     """Judge the tests inside the result: points, photographs, the format."""
     found, result = evidence.consistency, evidence.result
     lines = []
+    matched = any(table == "tie_points" for table, _ in result.settings)
+    cause = "Two points were matched as one" if matched else "It moved, or two bear its name"
     for one in found.two_positions[:MAX_LISTED]:
         factor, unit = finer_unit(result.length_unit, one.distance)
         lines.append(
             f"Point {one.point} is at two positions, {significant(factor * one.distance)} {unit} apart "
             f"({significant(one.over_sigma)} standard deviations): one in {len(one.first)} photographs from "
-            f"{one.first[0]} on, the other in {len(one.second)} from {one.second[0]} on. It moved, or two "
-            "bear its name."
+            f"{one.first[0]} on, the other in {len(one.second)} from {one.second[0]} on. {cause}."
         )
     if len(found.two_positions) > MAX_LISTED:
         lines.append(f"{len(found.two_positions) - MAX_LISTED} more points are at two positions.")
