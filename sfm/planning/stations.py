@@ -177,7 +177,7 @@ def _strips(text: str, number: str, planned: PlannedObject, camera: Camera) -> S
     # each photograph shows the part of the object that three of them would share
     part = np.ptp(local[:, :2], axis=0) * np.minimum(1.0, 3 / (np.array([a, b]) + 2))
     half = np.array(camera.size_px) / 2 / camera.c_px * FILLING
-    distance = float((part / 2 / half).max()) + high[2]
+    distances = np.array([(part / 2 / h).max() for h in (half, half[::-1])]) + high[2]  # upright, rolled
     places = [
         [
             (low[0] + high[0]) / 2 + (high[0] - low[0] - part[0]) * ((i / (a - 1) if a > 1 else 0.5) - 0.5),
@@ -186,8 +186,9 @@ def _strips(text: str, number: str, planned: PlannedObject, camera: Camera) -> S
         for j in range(b)
         for i in range(a)
     ]
-    position = planned.centre + np.array(places) @ np.stack([right, up]) + distance * axis
-    rotation = np.array([looking(-axis, np.pi / 2 * (k % 2)) for k in range(a * b)])
+    rolls = np.array([(i + j) % 2 for j in range(b) for i in range(a)])
+    position = planned.centre + np.array(places) @ np.stack([right, up]) + distances[rolls][:, None] * axis
+    rotation = np.array([looking(-axis, np.pi / 2 * roll) for roll in rolls])
     return Stations(_numbered(a * b), position, rotation)
 
 

@@ -162,3 +162,15 @@ def test_meshes_with_holes_are_refused_unless_open() -> None:
     assert (
         (inside_out.xyz - 0.5) * (0, 0, 1) + inside_out.xyz * (1, 1, 0) @ np.eye(3) * inside_out.normals
     ).sum() > 0
+
+
+def test_far_rays_that_a_distortion_folds_back_into_the_format_are_not_seen() -> None:
+    values = (("k1", -0.2),)
+    camera = camera_from_values("o", "opencv", (6000, 4000), (1.0, 1.0), c_mm=3000.0, values=values)
+    xyz = np.array([[0.0, 0, 0], [0.5, 0.2, 0], [2.0, 0, 0], [2.5, 0, 0]])
+    there, R = np.array([0.0, 0, 1]), np.eye(3)
+    xy = project(camera, there, R, xyz)
+    assert ((xy > 0) & (xy < (5999, 3999))).all()  # as far as the polynomial says
+    planned = object_of_points(("a", "b", "c", "d"), xyz, np.tile([0.0, 0, 1], (4, 1)))
+    sight = sight_of(planned, camera, there[None], R[None], Seeing(sigma_px=0.1, max_incidence_deg=80.0))
+    assert sight.seen[0].tolist() == [True, True, False, False]

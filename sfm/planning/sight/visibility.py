@@ -11,7 +11,7 @@ from enum import IntEnum
 
 import numpy as np
 
-from sfm.camera import Camera, pixel_jacobian, project
+from sfm.camera import Camera, pixel_jacobian, project, tangents_from_pixel
 from sfm.conventions import AnyArray, BoolArray, FloatArray
 from sfm.errors import GeometryError
 from sfm.planning.planned_object import PlannedObject
@@ -21,6 +21,7 @@ from sfm.planning.sight.optics import DepthOfField
 
 MAX_INCIDENCE_DEG = 60.0  # of a ray to the normal; beyond, targets are measured badly or not at all
 MIN_DIAMETER_PX = 5.0  # shorter axis of a target from which on it is measured
+SAME_RAY = 1e-6  # tangents of one ray; a polynomial folds far ones back into the format
 BORDER_PX = 2.0  # between a target and the edge of the photograph
 
 
@@ -145,7 +146,11 @@ def _photograph(
     xy = project(camera, position, rotation, planned.xyz)
     width, height = camera.size_px
     border = BORDER_PX
-    inside = (xy > border).all(axis=1) & (xy < (width - 1 - border, height - 1 - border)).all(axis=1)
+    within = (xy > border).all(axis=1) & (xy < (width - 1 - border, height - 1 - border)).all(axis=1)
+    inside = np.asarray(within)
+    looked_at = np.flatnonzero(inside)
+    back = tangents_from_pixel(camera, xy[looked_at]) - UVW[looked_at, :2] / -UVW[looked_at, 2:]
+    inside[looked_at] = np.abs(back).max(axis=1, initial=0.0) < SAME_RAY  # NaN is none, too
     why = np.where(inside, Why.SEEN, Why.OUTSIDE).astype(np.uint8)
     ray = position - planned.xyz
     ray /= np.maximum(np.linalg.norm(ray, axis=1, keepdims=True), 1e-300)  # a station at the point sees none
