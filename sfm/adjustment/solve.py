@@ -163,7 +163,7 @@ def predict(
     with own_threads():
         optimum = optimum_at(run.problem, state, weight)
         if optimum is None:
-            raise GeometryError("plan: the normal equations of this network cannot be solved")
+            raise GeometryError("the normal equations of this network cannot be solved")
         Q = cofactors(optimum, layout, cross=True)
         result = _result(local, run, optimum, weight, Q, sigma_px, None, sigma0=1.0)
         return local.back(replace(result, image_sigma_factor=factor))

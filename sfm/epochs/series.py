@@ -119,6 +119,11 @@ def _reference(found: Differences, patterns: Sequence[str], epochs: tuple[Epoch,
         hits = _matching(found.points, pattern)
         chosen |= hits
         if not hits.any():
+            if _matching(found.untested, pattern).any():
+                raise GeometryError(
+                    f"epochs: point of reference {pattern} cannot be tested in {epochs[0].name} and "
+                    f"{epochs[1].name}: one holds it as known, or did not keep its covariance with the others"
+                )
             lacking = [e.name for e in epochs if not _matching(e.result.network.points, pattern).any()]
             raise GeometryError(
                 f"epochs: point of reference {pattern} is missing in {' and in '.join(lacking)}"

@@ -49,6 +49,7 @@ class _Plan(Content):
     name: Text
     unit: Text
     sigma_px: Positive
+    scale_bars: Annotated[int, Field(ge=0)] = 0
     target: _Target
     camera: _Camera
 
@@ -93,6 +94,11 @@ def read_plan(folder: Path) -> PlannedSurvey:
         SurveyFileError: what is missing or wrong, with file and line.
     """
     plan = read_json(folder / "plan.json", _Plan, "a plan")
+    if plan.scale_bars:
+        raise SurveyFileError(
+            f"{folder / 'plan.json'}: planned with a scale bar, which a simulation has not, so that its "
+            "standard deviations cannot be compared; plan without --scale-bar"
+        )
     c = plan.camera
     if c.model not in MODELS or set(c.parameters) != set(MODELS[c.model].names):
         raise SurveyFileError(
@@ -282,7 +288,7 @@ def achieved(plan: PlannedSurvey, codes: str, result: StoredResult, sigma_px: fl
     away = np.linalg.norm(plan.xyz[:, None] - placed[None], axis=2)
     apart = np.linalg.norm(plan.xyz[:, None] - plan.xyz[None], axis=2)
     np.fill_diagonal(apart, np.inf)
-    nearest = np.nanargmin(away, axis=1)
+    nearest = np.where(np.isfinite(away), away, np.inf).argmin(axis=1)
     found = (away[np.arange(len(away)), nearest] < NEAR * apart.min(axis=1)) & np.isfinite(plan.sigma[:, 0])
     j, k = nearest[found], np.flatnonzero(found)
     motion = fit_similarity(xyz[j], plan.xyz[k])

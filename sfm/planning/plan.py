@@ -16,7 +16,7 @@ from sfm.planning.prediction import Prediction, ScaleBarPlan, predict_network
 from sfm.planning.shots import Shot, choose_coded, shots
 from sfm.planning.sight.visibility import Seeing
 from sfm.planning.stations import Stations
-from sfm.planning.target_size import MIN_PIXELS, TargetSize, target_size
+from sfm.planning.target_size import MIN_PIXELS, STEEPEST_DEG, TargetSize, target_size
 from sfm.planning.wanted import Wanted, short_of
 from sfm.planning.weakness import (
     Calibratability,
@@ -39,7 +39,7 @@ class Plan:
     design: Design | None  # None where the stations were given
     shortfall: float  # largest of predicted over wanted; 0 where nothing is wanted
     weak: tuple[WeakPoint, ...]
-    unusable: tuple[str, ...]  # photographs that show too few points
+    unusable: tuple[str, ...]  # photographs that share too few points with others
     calibration: Calibratability | None  # None where the camera is held
     target: TargetSize  # that shows MIN_PIXELS from the farthest station
     coded: IntArray  # points that are coded targets, so that every photograph has five
@@ -94,7 +94,7 @@ def describe_plan(
         d=far,
         c_mm=camera.c_px * float(np.mean(camera.pixel_mm)),
         n=width,
-        tilt_deg=min(prediction_tilt(prediction, seeing), 75.0),
+        tilt_deg=min(_tilt(prediction, seeing), STEEPEST_DEG),
     )
     return Plan(
         name,
@@ -109,11 +109,17 @@ def describe_plan(
         calibratability(prediction, seeing),
         size,
         coded,
-        shots(prediction.planned.xyz, prediction.stations, seen, coded),
+        shots(
+            prediction.planned.xyz,
+            prediction.stations,
+            seen,
+            coded,
+            focus=None if seeing.depth is None else seeing.depth.focus,
+        ),
     )
 
 
-def prediction_tilt(prediction: Prediction, seeing: Seeing) -> float:
+def _tilt(prediction: Prediction, seeing: Seeing) -> float:
     """Return the largest angle between a ray of a plan and the normal of its point, deg."""
     m, n = np.nonzero(prediction.sight.seen)
     ray = prediction.stations.position[m] - prediction.planned.xyz[n]

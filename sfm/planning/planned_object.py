@@ -22,6 +22,7 @@ from sfm.planning.sight.occlusion import BoxTree, box_tree
 SEGMENTS = 48  # of a round shape: its facets lie 0.2 % of the radius inside
 PER_POINT = 20  # random points of a surface for each that is kept
 SAME_VERTEX = 1e-9  # of the size of a mesh: corners nearer than this are one
+ON_LINE = 1e-9  # of the extent of points: they are on one line if they leave it by less
 SHAPES = {
     "box": ("LX", "LY", "LZ"),
     "cylinder": ("DIAMETER", "HEIGHT"),
@@ -66,15 +67,19 @@ def object_of_points(names: tuple[str, ...], xyz: FloatArray, normals: FloatArra
         normals: directions that they face, of any length, (n, 3); None where not known.
 
     Raises:
-        GeometryError: fewer than 3 points, all in one place, or a normal of length 0.
+        GeometryError: fewer than 3 points, all on one line, or a normal of length 0.
     """
-    if len(xyz) < 3 or not np.ptp(xyz, axis=0).any():
-        raise GeometryError(f"object: {len(xyz)} points, needed 3 or more that are apart")
+    count = f"{len(xyz)} point{'s' * (len(xyz) != 1)}"
+    if len(xyz) < 3:
+        raise GeometryError(f"object: {count}, needed 3 or more")
+    extent = np.linalg.svd(xyz - xyz.mean(axis=0), compute_uv=False)
+    if extent[1] <= ON_LINE * extent[0]:
+        raise GeometryError(f"object: {count} on one line, needed 3 or more that are not")
     if normals is None:
         return PlannedObject(names, xyz, np.full(xyz.shape, np.nan))
     length = np.linalg.norm(normals, axis=1)
     if (length == 0).any():
-        raise GeometryError(f"object: point {names[int(np.argmin(length))]} has a normal of length 0")
+        raise GeometryError(f"object: point {names[int(np.argmax(length == 0))]} has a normal of length 0")
     return PlannedObject(names, xyz, normals / length[:, None])
 
 
@@ -91,7 +96,8 @@ def object_of_mesh(
         bare: triangles without points, such as the bottom that something stands on, (t,).
 
     Raises:
-        GeometryError: no area, fewer than 3 points asked for, or a mesh with holes not said to be open.
+        GeometryError: no area, fewer than 3 points asked for, a mesh with holes not said to be open, or
+            triangles that do not run alike.
     """
     if count < 3:
         raise GeometryError(f"object: {count} points asked for, needed 3 or more")
@@ -100,6 +106,12 @@ def object_of_mesh(
         raise GeometryError(
             f"mesh: {edges} edges belong to one triangle only: it has holes, or is an open surface, through "
             "which points would be seen from behind; close it, or say --open-mesh"
+        )
+    reversed_ = _reversed_edges(mesh)
+    if reversed_:
+        raise GeometryError(
+            f"mesh: at {reversed_} edges neighbouring triangles run in opposite directions, so that inside "
+            "and outside are not known; turn its triangles to run alike"
         )
     corners = mesh.vertices[mesh.triangles]
     if not edges and np.einsum("ti,ti->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) < 0:
@@ -162,13 +174,25 @@ def shape_object(kind: str, sizes: tuple[float, ...], count: int) -> PlannedObje
 
 def open_edges(mesh: Mesh) -> int:
     """Return how many edges belong to one triangle only; vertices in one place are one."""
+    _, count = np.unique(np.sort(_edges(mesh), axis=1), axis=0, return_counts=True)
+    return int((count == 1).sum())
+
+
+def _reversed_edges(mesh: Mesh) -> int:
+    """Return at how many edges of two triangles both run through it in the same direction."""
+    edges = _edges(mesh)
+    _, of, count = np.unique(np.sort(edges, axis=1), axis=0, return_inverse=True, return_counts=True)
+    along = np.bincount(of.reshape(-1), weights=edges[:, 0] < edges[:, 1], minlength=len(count))
+    return int(((count == 2) & (along != 1)).sum())
+
+
+def _edges(mesh: Mesh) -> IntArray:
+    """Return the edges of the triangles as they run, vertices in one place as one, (3 t, 2)."""
     step = SAME_VERTEX * max(float(np.abs(np.ptp(mesh.vertices, axis=0)).max()), 1e-300)
     _, same = np.unique(np.round(mesh.vertices / step), axis=0, return_inverse=True)
     t = same.reshape(-1)[mesh.triangles]
     t = t[(t[:, 0] != t[:, 1]) & (t[:, 1] != t[:, 2]) & (t[:, 2] != t[:, 0])]
-    edges = np.sort(np.concatenate([t[:, [0, 1]], t[:, [1, 2]], t[:, [2, 0]]]), axis=1)
-    _, count = np.unique(edges, axis=0, return_counts=True)
-    return int((count == 1).sum())
+    return np.concatenate([t[:, [0, 1]], t[:, [1, 2]], t[:, [2, 0]]])
 
 
 def farthest_points(xyz: FloatArray, count: int) -> IntArray:

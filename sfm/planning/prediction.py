@@ -125,12 +125,11 @@ class Prediction:
 
     @cached_property
     def length_sigma(self) -> float:
-        """Largest standard deviation of a length between two points, object unit; of at most MAX_JOINT."""
-        if not self.determined.all():
-            return float("inf")
+        """Largest sigma of a length between two determined points, object unit; of at most MAX_JOINT."""
         a = self.adjustment
-        n = len(a.network.points)
-        some = np.unique(np.linspace(0, n - 1, min(n, MAX_JOINT)).astype(np.int64))
+        known = self.point[self.determined]
+        n = len(known)
+        some = known[np.unique(np.linspace(0, n - 1, min(n, MAX_JOINT)).astype(np.int64))]
         Q = marginal_of(a).joint(np.zeros(0, dtype=np.int64), some)
         return largest_length_sigma(a.estimate.points[some], Q)
 

@@ -23,26 +23,35 @@ class Shot:
     elevation_deg: float  # of the same, down is negative
     roll_deg: float  # counter-clockwise about it; 0 = upright
     distance: float  # mean along the axis of the points that it shows, object unit
-    focus: float  # at which the nearest and the farthest of them are sharp alike, object unit
+    focus: float  # of the lens, one for all photographs, object unit
     points: int  # that it shows
     coded: int  # of them coded
 
 
-def shots(xyz: FloatArray, stations: Stations, seen: BoolArray, coded: IntArray) -> tuple[Shot, ...]:
+def shots(
+    xyz: FloatArray, stations: Stations, seen: BoolArray, coded: IntArray, *, focus: float | None = None
+) -> tuple[Shot, ...]:
     """Return the list of photographs of a plan.
+
+    They have one focus, as they have one calibration: another focus is another principal distance.
 
     Args:
         xyz: points, object unit, (n, 3).
         stations: of the m photographs.
         seen: which photograph shows which point, (m, n).
         coded: which points are coded targets, see `choose_coded`.
+        focus: distance in focus, object unit; None = as sharp at the nearest point as at the farthest.
     """
     found = []
+    if focus is None:
+        depth = np.concatenate(
+            [(stations.position[i] - xyz[seen[i]]) @ stations.rotation[i, :, 2] for i in range(len(stations))]
+        )
+        focus = best_focus(float(depth.min()), float(depth.max())) if len(depth) else float("nan")
     for i, name in enumerate(stations.names):
         R, X0 = stations.rotation[i], stations.position[i]
         axis = -R[:, 2]
         depth = (xyz[seen[i]] - X0) @ axis
-        near, far = (float(depth.min()), float(depth.max())) if len(depth) else (np.nan, np.nan)
         found.append(
             Shot(
                 name,
@@ -51,7 +60,7 @@ def shots(xyz: FloatArray, stations: Stations, seen: BoolArray, coded: IntArray)
                 float(np.degrees(np.arcsin(np.clip(axis[2], -1, 1)))),
                 roll_deg(R),
                 float(depth.mean()) if len(depth) else np.nan,
-                best_focus(near, far),
+                focus,
                 len(depth),
                 int(seen[i, coded].sum()),
             )

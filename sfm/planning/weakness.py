@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sfm.adjustment.quality.correlations import OrientationCorrelation, orientation_correlations
-from sfm.adjustment.quality.statistics import Correlation, Reliability, correlations, reliability
+from sfm.adjustment.quality.statistics import Correlation, correlations
 from sfm.camera import Camera, project, tangents_from_pixel
 from sfm.conventions import FloatArray, rotation_from_vector
 from sfm.planning.prediction import MIN_POINTS, Prediction, predict_network
@@ -92,7 +92,7 @@ def reason_of(prediction: Prediction, j: int) -> str:
         why = prediction.sight.why[:, j]
         counts = [(int((why == kind).sum()), WORDS[kind]) for kind in Why if kind != Why.SEEN]
         seen_by_few = int(((why == Why.SEEN) & (prediction.photograph < 0)).sum())
-        counts.append((seen_by_few, f"in photographs with fewer than {MIN_POINTS} points"))
+        counts.append((seen_by_few, f"in photographs that share fewer than {MIN_POINTS} points with others"))
         words += [f"{what} in {count}" for count, what in sorted(counts, reverse=True) if count]
     elif angle >= FLAT_DEG:
         words.append(
@@ -102,15 +102,10 @@ def reason_of(prediction: Prediction, j: int) -> str:
 
 
 def unusable_photographs(prediction: Prediction) -> tuple[str, ...]:
-    """Return the photographs that show too few points to be oriented, by name."""
+    """Return the photographs that share too few points with others to be oriented, by name."""
     return tuple(
         name for name, k in zip(prediction.stations.names, prediction.photograph, strict=True) if k < 0
     )
-
-
-def reliability_of(prediction: Prediction) -> Reliability:
-    """Return predicted internal and external reliability of every image coordinate."""
-    return reliability(prediction.adjustment)
 
 
 def calibratability(prediction: Prediction, seeing: Seeing) -> Calibratability | None:
@@ -128,10 +123,11 @@ def calibratability(prediction: Prediction, seeing: Seeing) -> Calibratability |
     held = replace(camera, free=np.zeros_like(camera.free))
     fixed = predict_network(prediction.planned, held, prediction.stations, seeing, sight=prediction.sight)
     free = predict_network(prediction.planned, camera, prediction.stations, seeing, sight=prediction.sight)
-    R, X0 = prediction.stations.rotation, prediction.stations.position
+    used = prediction.photograph >= 0
+    R, X0 = prediction.stations.rotation[used], prediction.stations.position[used]
     axes = R[:, :, 2]
     depth = -((prediction.planned.xyz[None] - X0[:, None]) * axes[:, None]).sum(axis=2)
-    depth = np.where(prediction.sight.seen, depth, np.nan)[prediction.photograph >= 0]
+    depth = np.where(prediction.sight.seen[used], depth, np.nan)
     names = tuple(n for n, f in zip(camera.names, camera.free, strict=True) if f)
     sigma = a.interior_sigma(0)[camera.free]
     rows = {f"{n} of camera {camera.name}" for n in names}

@@ -59,7 +59,7 @@ def write_further(found: Further, result: StoredResult, out: Path) -> Path:
         "more.html",
         viewer=viewer_of(scene, Pictures()),
         title=result.name,
-        level="good",
+        level=_level(found),
         headline=headline(found, result),
         remarks=["What hides a point from a new station is not known: look before you photograph."],
         found=found,
@@ -80,6 +80,11 @@ def headline(found: Further, result: StoredResult) -> str:
     before, after = (_length(result, float(s[known].max())) for s in (found.before, found.after))
     count = len(found.stations)
     return f"{count} more photograph{'s' * (count > 1)}: sigma of the worst point from {before} to {after}"
+
+
+def _level(found: Further) -> str:
+    """Say "good" only of what is determined with them."""
+    return "bad" if found.adjustment.undetermined else "good"
 
 
 def weakest(found: Further, result: StoredResult) -> list[tuple[str, str, str]]:

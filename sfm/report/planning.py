@@ -8,12 +8,14 @@ from typing import Any
 
 import numpy as np
 
-from sfm.adjustment.quality.statistics import reliability
+from sfm.adjustment.quality.statistics import POWER, reliability
 from sfm.conventions import FloatArray, angles_from_rotation
 from sfm.files.plain_text import csv_text, or_none
 from sfm.network import Estimate, ImagePoints, Network
 from sfm.planning.plan import Plan
-from sfm.planning.wanted import MIN_RAYS, found_displacement
+from sfm.planning.prediction import MIN_POINTS
+from sfm.planning.target_size import MIN_PIXELS
+from sfm.planning.wanted import ALPHA, MIN_RAYS, found_displacement
 from sfm.report.html.page import render
 from sfm.report.numbers import finer_unit, or_unlimited, significant
 from sfm.report.page_files import write_files
@@ -105,8 +107,8 @@ def headline(plan: Plan) -> str:
     lost = f", {n - known} of {n} points not determined" if known < n else ""
     worst = _length(plan, float(p.sigma[p.determined].max()))
     told = f"{m} photographs: sigma of points {_length(plan, p.rms_sigma)} RMS, {worst} at most{lost}"
-    if p.adjustment.undetermined:
-        told += ", and the network is NOT determined"
+    if p.adjustment.undetermined:  # sigmas leave out what is not determined: nothing that is claimed
+        told = f"{m} photographs: the network is NOT determined ({_first(p.adjustment.undetermined)}){lost}"
     few = int((p.rays < MIN_RAYS).sum())
     told += f", {few} with fewer than {MIN_RAYS} rays" if few else ""
     if not plan.wanted.anything:
@@ -126,7 +128,10 @@ def remarks(plan: Plan) -> list[str]:
     if plan.design is not None and plan.design.limit:
         said.append(f"What limits it: {plan.design.limit}.")
     if plan.unusable:
-        said.append(f"Photographs that show too few points: {', '.join(plan.unusable[:NAMED])}.")
+        said.append(
+            f"Photographs that share fewer than {MIN_POINTS} points with others: "
+            f"{', '.join(plan.unusable[:NAMED])}."
+        )
     c = plan.calibration
     if c is not None and not c.good:
         lacking = [*c.reasons, *([_first(c.undetermined)] if c.undetermined else [])]
@@ -134,6 +139,13 @@ def remarks(plan: Plan) -> list[str]:
         said.append(
             f"The camera cannot be calibrated with this network: {reasons}. Calibrate it before, or hold it."
         )
+    if not len(plan.prediction.adjustment.network.scale_bars):
+        said.append(
+            "No scale bar: the scale is taken as known, and sigmas of points, lengths and displacements "
+            "leave it out; give --scale-bar."
+        )
+    if plan.prediction.planned.mesh is None:
+        said.append("Points without a surface: what hides them is not known.")
     few = [s.station for s in plan.shots if s.coded < 5]
     if few:
         said.append(f"Fewer than 5 points for coded targets in: {', '.join(few[:NAMED])}.")
@@ -145,7 +157,7 @@ def remarks(plan: Plan) -> list[str]:
             "--sigma-px from an earlier survey."
         )
     if plan.seeing.depth is None:
-        said.append("Depth of field is not looked at: give --f-number.")
+        said.append("Depth of field is not looked at: give --f-number and --focus.")
     return said
 
 
@@ -163,12 +175,12 @@ def figures(plan: Plan) -> list[tuple[str, str]]:
         ("image points", f"{len(a.network.image_points)}, sigma {significant(p.sigma_px)} px (median)"),
         ("rays of a point", f"{p.rays.min()} to {p.rays.max()}, median {np.median(p.rays):.0f}"),
         (
-            "sigma of points",
+            "sigma of points" + (", what is not determined left out" if a.undetermined else ""),
             f"{_length(plan, p.rms_sigma)} RMS per coordinate, {_length(plan, worst)} at the worst point, "
             f"{_length(plan, along)} in its worst direction",
         ),
         (
-            "displacement found between two such surveys",
+            f"displacement found between two such surveys ({POWER:.0%} power, {ALPHA:.1%} significance)",
             f"{_length(plan, float(np.median(d)))} (median), {_length(plan, float(d.max()))} (worst)",
         ),
         (
@@ -184,7 +196,8 @@ def figures(plan: Plan) -> list[tuple[str, str]]:
         ),
         (
             "target diameter",
-            f"{plan.target.diameter:.4g} {plan.unit} for 7 px from the farthest station at the steepest ray",
+            f"{plan.target.diameter:.4g} {plan.unit} for {MIN_PIXELS:g} px from the farthest station at the "
+            "steepest ray",
         ),
         ("coded targets", f"{len(plan.coded)} give every photograph five, or all that it shows"),
     ]
@@ -267,6 +280,7 @@ def plan_summary(plan: Plan) -> dict[str, Any]:
             "blur_px": plan.seeing.target.blur_px,
         },
         "coded_targets": len(plan.coded),
+        "scale_bars": len(p.adjustment.network.scale_bars),
         "camera": {
             "name": camera.name,
             "model": camera.model,
@@ -324,7 +338,8 @@ def _points(plan: Plan) -> list[tuple[object, ...]]:
 def _level(plan: Plan) -> str:
     if plan.prediction.adjustment.undetermined or not plan.prediction.determined.all():
         return "bad"
-    return "good" if plan.reached else "fair"
+    calibrated = plan.calibration is None or plan.calibration.good
+    return "good" if plan.reached and calibrated else "fair"
 
 
 def _first(undetermined: tuple[str, ...]) -> str:

@@ -75,6 +75,42 @@ def test_a_plan_is_written_with_page_tables_and_json(
     assert other["sigma_rms"] == pytest.approx(found["sigma_rms"], rel=1e-6)
 
 
+def test_what_is_not_determined_comes_first_and_without_precision(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    given = ("wall:4000,2000", *LENS, "--points", 60, "--stations", "strips:3x3", "--sigma", "10")
+    assert plan(*given, "--out", tmp_path / "plan") == 0
+    printed = capsys.readouterr().out
+    assert printed.startswith("9 photographs: the network is NOT determined (")
+    assert "sigma of points, what is not determined left out: " in printed
+    assert "what is wanted is NOT reached" in printed.splitlines()[0]
+
+
+def test_a_plan_has_one_focus_and_says_what_it_takes_as_known(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "plan"
+    Path(tmp_path / "points.csv").write_text(
+        "id,X,Y,Z,nX,nY,nZ\na,0,0,0,0,0,1\nb,90,0,9,,,\nc,0,70,0,0,0,1\nd,80,75,0,0,0,1\n"
+        "e,40,30,20,0,0,1\nf,20,60,4,0,0,1\ng,70,20,2,0,0,1\n"
+    )
+    given = (tmp_path / "points.csv", *LENS, "--free", "none", "--stations", "ring:6", "--out", out)
+    assert plan(*given) == 0
+    printed = capsys.readouterr().out
+    for words in ("No scale bar: ", "Points without a surface: ", "Points without normals "):
+        assert f"! {words}" in printed
+    assert len({row["focus"] for row in rows(out / "shots.csv")}) == 1
+    assert (
+        plan(*given, *("--f-number", 22, "--focus", 150, "--confusion-um", 200), "--scale-bar", "a,d,0.01")
+        == 0
+    )
+    assert "No scale bar" not in capsys.readouterr().out
+    assert {row["focus"] for row in rows(out / "shots.csv")} == {"150.0"}
+    # a simulation has no scale bar that it could be compared with
+    assert plan(out, "--out", tmp_path / "simulation", command="simulate") == 2
+    assert "planned with a scale bar" in capsys.readouterr().err
+
+
 BAD = [
     (("box:1,1", *LENS, "--stations", "ring:6"), "object: box of 1, 1, expected 3 positive sizes LX,LY,LZ"),
     (("ball:1", *LENS, "--stations", "ring:6"), "expected points (.csv), a mesh (.stl, .ply) or one of box"),
@@ -113,6 +149,10 @@ BAD = [
         "0 of 6 photographs show",
     ),
     (("holes.stl", *LENS, "--stations", "ring:6"), "3 edges belong to one triangle only"),
+    (("mixed.stl", *LENS, "--stations", "ring:6"), "at 3 edges neighbouring triangles run in opposite"),
+    (("line.csv", *LENS, "--stations", "ring:6"), "4 points on one line"),
+    (("zero.csv", *LENS, "--stations", "ring:6"), "point c has a normal of length 0"),
+    (("plate:1000,1000", *LENS, "--sigma", "1", "--floor", "nan"), "floor at nan"),
     (("no.csv", *LENS, "--stations", "ring:6"), "no.csv"),
 ]
 
@@ -128,13 +168,19 @@ def test_bad_input_is_one_line(
     monkeypatch.chdir(tmp_path)
     corners = [(0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1)]
     facets = [(0, 2, 1), (0, 1, 3), (0, 3, 2)]  # a tetrahedron without its last side
-    text = "".join(
-        "facet normal 0 0 0\nouter loop\n"
-        + "".join(f"vertex {corners[k][0]} {corners[k][1]} {corners[k][2]}\n" for k in f)
-        + "endloop\nendfacet\n"
-        for f in facets
-    )
-    Path("holes.stl").write_text(f"solid holes\n{text}endsolid holes\n")
+    for name, sides in (
+        ("holes", facets),
+        ("mixed", [*facets, (1, 3, 2)]),
+    ):  # and with it the wrong way round
+        text = "".join(
+            "facet normal 0 0 0\nouter loop\n"
+            + "".join(f"vertex {corners[k][0]} {corners[k][1]} {corners[k][2]}\n" for k in f)
+            + "endloop\nendfacet\n"
+            for f in sides
+        )
+        Path(f"{name}.stl").write_text(f"solid {name}\n{text}endsolid {name}\n")
+    Path("line.csv").write_text("id,X,Y,Z\na,0,0,0\nb,1,0,0\nc,2,0,0\nd,3,0,0\n")
+    Path("zero.csv").write_text("id,X,Y,Z,nX,nY,nZ\na,0,0,0,,,\nb,1,0,0,0,0,1\nc,0,1,0,0,0,0\n")
     assert plan(*arguments) == 2
     lines = capsys.readouterr().err.splitlines()
     assert len(lines) == 1 and message in lines[0]

@@ -74,6 +74,12 @@ def test_refusals_are_one_line() -> None:
         analyse_epochs([first, first])
     with pytest.raises(GeometryError, match="point of reference 99 is missing in epoch 70 and in epoch 71"):
         analyse_epochs([first, second], reference=["1", "99"])
+    kept = np.arange(1, POINTS)
+    some = replace(
+        second.result, covariance=np.asarray(second.result.covariance)[3:, 3:], covariance_points=kept
+    )
+    with pytest.raises(GeometryError, match="point of reference 1 cannot be tested in epoch 70 and epoch 71"):
+        analyse_epochs([first, replace(second, result=some)], reference=["1"])
     with pytest.raises(GeometryError, match=r"group pier: no point .* is called 'P\*'"):
         analyse_epochs([first, second], groups={"pier": ["P*"]})
     with pytest.raises(GeometryError, match="expected one of rigid, similarity, affine"):

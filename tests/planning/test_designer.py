@@ -193,6 +193,12 @@ def test_displacements_and_lengths_that_are_wanted() -> None:
     worst = float(found_displacement(p).max())
     assert short_of(p, Wanted(displacement=worst), every) == pytest.approx(1.0)
     assert short_of(p, Wanted(length_sigma=2 * p.length_sigma), every) == pytest.approx(0.5)
+    turned = replace(planned, normals=planned.normals * np.where(np.arange(20) == 4, -1.0, 1.0)[:, None])
+    unseen = predict_network(turned, CAMERA, p.stations, SEEING)  # lengths between the others count
+    assert not unseen.determined[4] and short_of(unseen, Wanted(length_sigma=1.0), every) == np.inf
+    assert short_of(unseen, Wanted(length_sigma=p.length_sigma), np.arange(20) != 4) == pytest.approx(
+        1, abs=0.2
+    )
     lonely = replace(p, sight=p.sight.of(np.arange(6)))
     lonely.sight.why[MIN_RAYS - 1 :, 0] = 1
     assert short_of(lonely, Wanted(sigma=1.0), every) == np.inf

@@ -98,7 +98,7 @@ def test_depth_of_field_by_the_rays_of_the_lens() -> None:
     assert depth_of_field(Lens(N, H, c), f).near == pytest.approx(H / 2, rel=0.01)
     assert best_focus(800.0, 1200.0) == pytest.approx(960.0)
     planned = object_of_points(tuple("abc"), np.array([[0.0, 0, 0], [0.1, 0, 0.2], [0, 0.1, -0.2]]), None)
-    seeing = Seeing(sigma_px=0.1, depth=DepthOfField(0.9, 1.1))
+    seeing = Seeing(sigma_px=0.1, depth=DepthOfField(0.9, 1.1, 1.0))
     why = sight_of(
         planned, CAMERA, np.array([[0.0, 0, 1]]), looking(np.array([0.0, 0, -1]))[None], seeing
     ).why[0]

@@ -263,7 +263,7 @@ def _depth(
     pixel = float(camera.pixel_mm.mean())
     confusion = 2 * pixel if confusion_um is None else confusion_um / 1000
     found = depth_of_field(Lens(f_number, focus * to_mm, confusion), camera.c_px * pixel)
-    return DepthOfField(found.near / to_mm, found.far / to_mm)
+    return DepthOfField(found.near / to_mm, found.far / to_mm, focus)
 
 
 def _two(values: tuple[float, ...]) -> tuple[float, float]:

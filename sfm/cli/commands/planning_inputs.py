@@ -16,6 +16,9 @@ if TYPE_CHECKING:
     from sfm.planning.stations import Stations
 
 
+NORMALS = ("nX", "nY", "nZ")
+
+
 def object_of(text: str, count: int, *, open_mesh: bool) -> PlannedObject:
     """Return the object of a plan: a CSV of points, a mesh, or a shape with its sizes.
 
@@ -44,7 +47,13 @@ def object_of(text: str, count: int, *, open_mesh: bool) -> PlannedObject:
     from sfm.files.csv_tables import read_table
 
     table = read_table(
-        path, ("id",), ("X", "Y", "Z"), ("nX", "nY", "nZ"), aliases=(("point", "id"),), ignored=None
+        path,
+        ("id",),
+        ("X", "Y", "Z"),
+        NORMALS,
+        aliases=(("point", "id"),),
+        ignored=None,
+        blank=NORMALS,
     )
     normals = table.values[:, 3:] if table.values.shape[1] > 3 else None
     return object_of_points(table.keys("id"), table.values[:, :3].copy(), normals)
@@ -75,7 +84,13 @@ def camera_of(text: str, name: str | None, c_mm: float | None, free: str | None)
         camera = _of_survey(path, name, c_mm)
     else:
         camera = listed_camera(text, c_mm)
-    if c_mm is not None and camera.in_mm:
+    if c_mm is not None:
+        if not camera.in_mm:
+            raise SurveyFileError(
+                f"--c-mm {c_mm:g}: camera {camera.name} ({camera.model}) has its principal distance in px"
+            )
+        if not (math.isfinite(c_mm) and c_mm > 0):
+            raise SurveyFileError(f"--c-mm {c_mm:g}: needed more than 0")
         parameters = camera.parameters.copy()
         parameters[0] = c_mm
         camera = camera.with_parameters(parameters)

@@ -125,6 +125,8 @@ def _room(planned: PlannedObject, allowed: Allowed, most: float) -> tuple[FloatA
             raise GeometryError("plan: the space to stand in has a side without length, needed X0 < X1")
         low, high = np.maximum(low, allowed.space[0]), np.minimum(high, allowed.space[1])
     if allowed.floor is not None:
+        if not np.isfinite(allowed.floor):
+            raise GeometryError(f"plan: floor at {allowed.floor:g}, expected a finite number")
         low[2] = max(low[2], allowed.floor)
     if not (low < high).all():
         raise GeometryError(

@@ -27,6 +27,7 @@ class DepthOfField:
 
     near: float
     far: float  # infinite beyond the hyperfocal distance
+    focus: float  # distance in focus
 
 
 def depth_of_field(lens: Lens, f_mm: float) -> DepthOfField:
@@ -55,7 +56,9 @@ def depth_of_field(lens: Lens, f_mm: float) -> DepthOfField:
             f"depth of field: focus at {s:g} mm, needed farther than the focal length {f_mm:g} mm"
         )
     H = f_mm**2 / (lens.f_number * lens.confusion_mm) + f_mm
-    return DepthOfField(s * (H - f_mm) / (H + s - 2 * f_mm), s * (H - f_mm) / (H - s) if s < H else math.inf)
+    return DepthOfField(
+        s * (H - f_mm) / (H + s - 2 * f_mm), s * (H - f_mm) / (H - s) if s < H else math.inf, s
+    )
 
 
 def best_focus(near: float, far: float) -> float:

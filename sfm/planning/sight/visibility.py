@@ -148,7 +148,7 @@ def _photograph(
     inside = (xy > border).all(axis=1) & (xy < (width - 1 - border, height - 1 - border)).all(axis=1)
     why = np.where(inside, Why.SEEN, Why.OUTSIDE).astype(np.uint8)
     ray = position - planned.xyz
-    ray /= np.linalg.norm(ray, axis=1, keepdims=True)
+    ray /= np.maximum(np.linalg.norm(ray, axis=1, keepdims=True), 1e-300)  # a station at the point sees none
     cosine = (planned.normals * ray).sum(axis=1)
     oblique = cosine < np.cos(np.radians(seeing.max_incidence_deg))
     why[inside & oblique] = Why.OBLIQUE
