@@ -31,7 +31,7 @@ NOT_SOURCE = shutil.ignore_patterns(
     ),
     ".hypothesis",
 )
-BUILD = "from setuptools import build_meta as b; import sys; print(getattr(b, sys.argv[1])(sys.argv[2]))"
+BUILD = "from setuptools import build_meta as b; import sys; getattr(b, sys.argv[1])(sys.argv[2])"
 MAX_BYTES = 3_000_000  # of the wheel and of the source distribution; a data set would not go unnoticed
 
 
@@ -69,13 +69,14 @@ def released(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     folder = tmp_path_factory.mktemp("release")
     programs = environment_in(folder / "tools", *("setuptools>=77", "wheel"))
     shutil.copytree(ROOT, folder / "tree", ignore=NOT_SOURCE, symlinks=True)
-    made = run(programs / "python", "-c", BUILD, "build_sdist", folder, folder=folder / "tree")
-    source = folder / made.splitlines()[-1]
+    run(programs / "python", "-c", BUILD, "build_sdist", folder, folder=folder / "tree")
+    (source,) = folder.glob("*.tar.gz")
     with tarfile.open(source) as archive:
         archive.extractall(folder / "unpacked", filter="data")
     (unpacked,) = (folder / "unpacked").iterdir()
-    made = run(programs / "python", "-c", BUILD, "build_wheel", folder, folder=unpacked)
-    return source, folder / made.splitlines()[-1]
+    run(programs / "python", "-c", BUILD, "build_wheel", folder, folder=unpacked)
+    (wheel,) = folder.glob("*.whl")
+    return source, wheel
 
 
 def test_the_source_distribution_has_the_tree(released: tuple[Path, Path]) -> None:
