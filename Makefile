@@ -1,5 +1,6 @@
 # make demo   set up, render a small survey, run it, say where the report is
 # make test   set up, run the tests, the linter and the type checker
+# make docs   build the documentation in build/docs, warnings are errors
 # make study  the longer studies        make bench  the timings
 # On Windows, or without make, see README.md.
 
@@ -8,7 +9,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
-.PHONY: demo test study bench setup clean
+.PHONY: demo test docs study bench setup clean
 
 demo: $(READY)
 	$(BIN)/python -m sfm.rendering.render datasets/demo/scene.toml build/demo
@@ -19,6 +20,12 @@ test: $(READY)
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
+
+# The site has an environment of its own, so that the program's has only what it needs.
+docs:
+	@test -x build/docs-env/bin/python || $(PYTHON) -m venv build/docs-env
+	@build/docs-env/bin/python -m pip install -q --disable-pip-version-check -c constraints.txt -e '.[docs]'
+	build/docs-env/bin/python -m sphinx -E -W --keep-going -n -b html docs build/docs
 
 study: $(READY)
 	$(BIN)/python -m pytest -m slow

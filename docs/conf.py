@@ -1,0 +1,16 @@
+"""The documentation site: `make docs`."""
+
+from __future__ import annotations
+
+import sys
+from importlib.metadata import version as version_of
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parent))
+
+project = "Kolinear"
+release = version = version_of("kolinear")
+extensions = ["myst_parser", "generated"]
+html_theme = "pydata_sphinx_theme"
+myst_heading_anchors = 3
+exclude_patterns = ["_build"]

@@ -1,0 +1,200 @@
+"""Pages that are made from the program when the site is built: survey file, commands, public names."""
+
+from __future__ import annotations
+
+import ast
+import inspect
+import re
+import typing
+from typing import Any, ClassVar
+
+import typer
+from docutils import nodes
+from pydantic_core import PydanticUndefined
+from sphinx.application import Sphinx
+from sphinx.util.docutils import SphinxDirective
+from typer.testing import CliRunner
+
+import sfm
+from sfm.cli.app import app
+from sfm.survey.inputs import settings
+from sfm.survey.inputs.settings import Section
+from sfm.survey.inputs.survey_file import SurveyFile
+
+
+def setup(sphinx: Sphinx) -> dict[str, Any]:
+    """Add the directives."""
+    sphinx.add_directive("survey-file", SurveyFileReference)
+    sphinx.add_directive("commands", CommandReference)
+    sphinx.add_directive("public-names", PythonReference)
+    return {"parallel_read_safe": True}
+
+
+class _Made(SphinxDirective):
+    """A directive whose content is the sections that `parts` returns."""
+
+    def run(self) -> list[nodes.Node]:
+        """Return one section for each part."""
+        sections: list[nodes.Node] = []
+        for title, content in self.parts():
+            section = nodes.section(ids=[re.sub(r"\W+", "-", title).strip("-").lower()])
+            section += nodes.title(title, title)
+            section += content
+            sections.append(section)
+        return sections
+
+    def parts(self) -> list[tuple[str, list[nodes.Node]]]:
+        """Return title and content of each section."""
+        raise NotImplementedError
+
+
+class SurveyFileReference(_Made):
+    """Every key of the survey file, from the models that check it."""
+
+    def parts(self) -> list[tuple[str, list[nodes.Node]]]:
+        """Return a table for each section of the file."""
+        found = []
+        for name, field in SurveyFile.model_fields.items():
+            section = section_of(field.annotation)
+            doc = (inspect.getdoc(section) or "").partition("]: ")[2] or inspect.getdoc(section) or ""
+            table = table_of(("key", "type", "default", "meaning"), rows_of(section))
+            found.append(
+                (f"[{field.alias or name}]", [nodes.paragraph("", doc.lstrip("]: ").capitalize()), table])
+            )
+        return found
+
+
+class CommandReference(_Made):
+    """What --help says of every command."""
+
+    HELP: ClassVar[CliRunner] = CliRunner()
+
+    def parts(self) -> list[tuple[str, list[nodes.Node]]]:
+        """Return the help of each command."""
+        return [
+            (f"kolinear {' '.join(words)}", [nodes.literal_block("", self.help_of(words), language="text")])
+            for words in command_names()
+        ]
+
+    def help_of(self, words: tuple[str, ...]) -> str:
+        """Return the help of a command.
+
+        Raises:
+            RuntimeError: the command has none.
+        """
+        said = self.HELP.invoke(app, [*words, "--help"], prog_name="kolinear", env={"COLUMNS": "100"})
+        if said.exit_code:
+            raise RuntimeError(f"kolinear {' '.join(words)} --help ended with {said.exit_code}")
+        return str(said.output).strip()
+
+
+class PythonReference(_Made):
+    """Signature and docstring of every public name."""
+
+    def parts(self) -> list[tuple[str, list[nodes.Node]]]:
+        """Return signature and docstring of each name."""
+        found = []
+        for name in sorted(sfm.__all__, key=str.lower):
+            value = getattr(sfm, name)
+            signature = name if inspect.isclass(value) else f"{name}{inspect.signature(value)}"
+            text = f"{signature}\n\n{inspect.getdoc(value)}"
+            found.append((f"sfm.{name}", [nodes.literal_block("", text, language="text")]))
+        return found
+
+
+def command_names() -> list[tuple[str, ...]]:
+    """Return the words of every command, those of groups behind the group."""
+    root: Any = typer.main.get_command(app)
+    found: list[tuple[str, ...]] = []
+    for name, command in root.commands.items():
+        found.append((name,))
+        found += [(name, inner) for inner in getattr(command, "commands", {})]
+    return found
+
+
+def section_of(annotation: Any) -> type[Section]:
+    """Return the section that a field of the survey file holds, one or several, there or not.
+
+    Raises:
+        TypeError: it holds none.
+    """
+    if inspect.isclass(annotation) and issubclass(annotation, Section):
+        return annotation
+    for inner in typing.get_args(annotation):
+        if inspect.isclass(inner) and issubclass(inner, Section):
+            return inner
+    raise TypeError(f"{annotation} holds no section")
+
+
+def rows_of(section: type[Section]) -> list[tuple[str, ...]]:
+    """Return key, type, default and meaning of every key of a section."""
+    comments = comments_of(section)
+    rows = []
+    for name, field in section.model_fields.items():
+        default = "required" if field.default is PydanticUndefined else shown(field.default)
+        rows.append((field.alias or name, type_of(field.annotation), default, comments.get(name, "")))
+    return rows
+
+
+def comments_of(section: type[Section]) -> dict[str, str]:
+    """Return the comment that stands behind each field of a section, on any of its own lines."""
+    source = inspect.getsource(section)
+    lines, found = source.splitlines(), {}
+    body: Any = ast.parse(source).body[0]
+    for one in body.body:
+        if isinstance(one, ast.AnnAssign) and isinstance(one.target, ast.Name):
+            said = [line.partition("  # ")[2] for line in lines[one.lineno - 1 : one.end_lineno]]
+            texts = [text for text in said if text and not text.startswith("type:")]
+            if texts:
+                found[one.target.id] = " ".join(texts)
+    return found
+
+
+def shown(value: Any) -> str:
+    """Return a default as the survey file would have it."""
+    if value is None:
+        return "none"
+    if isinstance(value, bool):
+        return str(value).lower()
+    return "[]" if value == () else f'"{value}"' if isinstance(value, str) else str(value)
+
+
+def type_of(annotation: Any) -> str:
+    """Return the type of a key in words."""
+    for name, words in WORDS.items():
+        known = getattr(settings, name)
+        bare = typing.get_args(known)[0]  # what pydantic leaves of a field without a default
+        if annotation == known or (annotation == bare and bare is not int):
+            return words
+    if typing.get_origin(annotation) is typing.Literal:
+        return " | ".join(str(one) for one in typing.get_args(annotation))
+    inner = [one for one in typing.get_args(annotation) if one is not type(None)]
+    if inner and type(None) in typing.get_args(annotation):
+        return " | ".join(type_of(one) for one in inner)
+    return {"bool": "true | false", "int": "integer", "float": "number", "str": "text"}[annotation.__name__]
+
+
+WORDS = {
+    "Length": "number above 0",
+    "Name": "text",
+    "TwoLengths": "two numbers above 0",
+    "TwoCounts": "two integers above 0",
+    "Observed": "table of parameter = [value, sigma]",
+    "Values": "table of parameter = value",
+    "Correlations": "list of [parameter, parameter, correlation]",
+    "Marks": "list of [row, column]",
+    "Names": "list of texts",
+    "Globs": "text or list of texts",
+    "PlateSide": "integer from 2",
+}
+
+
+def table_of(head: tuple[str, ...], rows: list[tuple[str, ...]]) -> nodes.table:
+    """Return a table."""
+    group = nodes.tgroup(cols=len(head))
+    group += [nodes.colspec(colwidth=width) for width in (2, 4, 2, 6)]
+    for kind, lines in ((nodes.thead(), [head]), (nodes.tbody(), rows)):
+        for line in lines:
+            kind += nodes.row("", *(nodes.entry("", nodes.paragraph("", cell)) for cell in line))
+        group += kind
+    return nodes.table("", group)
