@@ -14,3 +14,6 @@ extensions = ["myst_parser", "generated"]
 html_theme = "pydata_sphinx_theme"
 myst_heading_anchors = 3
 exclude_patterns = ["_build"]
+html_static_path = ["static"]
+html_css_files = ["site.css"]
+html_sidebars = {"**": []}  # the pages have one level
