@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,26 +10,11 @@ import pytest
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.solve import adjust
 from sfm.comparison.two_adjusters.adjusters import AdjusterComparison, compare_adjusters
-from sfm.conventions import FloatArray
-from sfm.network import Estimate, Network
 from sfm.report.findings.findings import findings_of
 from sfm.report.findings.other_adjuster import words_of_better_fit
 from sfm.result import SurveyResult
+from tests.other_adjuster import in_house_adjuster
 from tests.synthetic import make_network, seed_of
-
-
-@dataclass(frozen=True)
-class Other:
-    estimate: Estimate
-    iterations: int = 1
-    converged: bool = True
-    seconds: float = 0.0
-    point_covariance: FloatArray | None = None
-
-
-def in_house(network: Network, start: Estimate) -> Other:
-    """Stand in for the other adjuster: it finds the same optimum."""
-    return Other(adjust(network, start, datum=Datum("free"), reject="none", covariance=False).estimate)
 
 
 def compared(stretch: float, free: tuple[str, ...]) -> tuple[AdjusterComparison, SurveyResult]:
@@ -38,7 +23,7 @@ def compared(stretch: float, free: tuple[str, ...]) -> tuple[AdjusterComparison,
     camera = truth.cameras[0]
     start = replace(truth, cameras=(replace(camera, pixel_mm=camera.pixel_mm * np.array([stretch, 1.0])),))
     a = adjust(network, start, datum=Datum("free"), reject="none")
-    both = compare_adjusters(a, in_house, name="other", model="opencv")
+    both = compare_adjusters(a, in_house_adjuster, name="other", model="opencv")
     codes = np.full(len(network.points), -1)
     return both, SurveyResult("s", "m", len(network.images), (), a, codes, both)
 

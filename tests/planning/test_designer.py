@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 
 from sfm.camera import camera_from_values
+from sfm.conventions import FloatArray
 from sfm.errors import GeometryError
 from sfm.planning.design.candidates import Allowed, candidates
 from sfm.planning.design.designer import design_network
-from sfm.planning.design.gain import POWER, gains, image_rows, normal_matrices
+from sfm.planning.design.gain import POWER, gains, image_rows
 from sfm.planning.planned_object import PlannedObject, object_of_points, shape_object
 from sfm.planning.prediction import predict_network
 from sfm.planning.shots import choose_coded, roll_deg
@@ -112,6 +113,11 @@ def test_1000_points_and_300_candidates_are_designed_within_a_minute() -> None:
     print(f"{len(found.prediction.stations)} photographs in {seconds:.1f} s, reached {found.reached}")
     assert found.reached and found.photographs_tried == 600
     assert seconds < 60
+
+
+def normal_matrices(rows: FloatArray) -> FloatArray:
+    """Return the sum of A'PA of each point over some photographs, (n, 3, 3)."""
+    return np.asarray(np.einsum("mnai,mnaj->nij", rows, rows))
 
 
 def test_gains_are_those_of_inverses() -> None:

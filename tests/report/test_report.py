@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import json
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -19,10 +19,10 @@ from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.cli.console import tell_result
 from sfm.comparison.two_adjusters.adjusters import compare_adjusters
-from sfm.conventions import FloatArray, angles_from_rotation
+from sfm.conventions import angles_from_rotation
 from sfm.errors import OutputError
 from sfm.files.manifest import refuse_foreign_folder
-from sfm.network import Estimate, Network, ObjectPoints, ScaleBars
+from sfm.network import Network, ObjectPoints, ScaleBars
 from sfm.report.figures.overlays import USED, draw_photograph, overlay_names
 from sfm.report.figures.plots import all_plots, plan_axes
 from sfm.report.findings.findings import findings_of
@@ -38,6 +38,7 @@ from sfm.report.text.text_report import text_report
 from sfm.result import ControlCheck, FailedImage, PhotographTargets, StageTime, SurveyResult
 from sfm.survey.inputs.given import read_exterior, read_image_points, read_points
 from sfm.targets.flags import Flag
+from tests.other_adjuster import in_house_adjuster
 from tests.synthetic import make_network, seed_of
 
 EVIL = "<script>alert('x')</script>&\"é€"
@@ -205,21 +206,6 @@ def test_a_result_is_not_lost_to_figures_that_are_not_finite(result: SurveyResul
     assert found["comparison"]["rms_px"] == {"kolinear": 0.1, "colmap": None}
     assert {"comparison.rms_px.colmap", "comparison.cost.colmap"} <= set(found["not_finite"])
     assert len(list((tmp_path / "out" / "overlays").iterdir())) == 3
-
-
-@dataclass(frozen=True)
-class AnotherAdjustment:
-    """In place of another adjuster: the in-house one once more."""
-
-    estimate: Estimate
-    iterations: int = 3
-    converged: bool = True
-    seconds: float = 0.1
-    point_covariance: FloatArray | None = None
-
-
-def in_house_adjuster(network: Network, start: Estimate) -> AnotherAdjustment:
-    return AnotherAdjustment(adjust(network, start, datum=Datum("free"), reject="none").estimate)
 
 
 def test_points_as_ply(result: SurveyResult, tmp_path: Path) -> None:

@@ -45,7 +45,6 @@ class Design:
     reached: bool
     limit: str  # what limits it, in words; empty where it is reached
     photographs_tried: int  # candidates, upright and rolled
-    history: tuple[tuple[int, float], ...]  # photographs and shortfall after each full prediction
 
 
 def design_network(
@@ -103,7 +102,6 @@ class _Designer:
         self.seeable = found.sight.seen.sum(axis=0) >= 2 * MIN_RAYS  # upright and rolled
         self.scale = np.where(self.seeable, 1 / wanted.point_variance(planned), 0.0)
         self.ratio = np.ones(len(planned.names))
-        self.history: list[tuple[int, float]] = []
 
     def run(self) -> Design:
         chosen: list[int] = []
@@ -128,7 +126,6 @@ class _Designer:
             bool(short <= 1),
             "" if short <= 1 else self._limit(prediction, len(chosen)),
             len(self.found.stations),
-            tuple(self.history),
         )
 
     def _cofactors(self, chosen: Sequence[int]) -> FloatArray:
@@ -181,9 +178,7 @@ class _Designer:
         ratio = np.where(prediction.determined, prediction.sigma**2 / limiting, MAX_RATIO)
         ratio[prediction.rays < MIN_RAYS] = MAX_RATIO
         self.ratio = np.clip(ratio, 1.0, MAX_RATIO)
-        short = short_of(prediction, self.wanted, self.seeable)
-        self.history.append((len(chosen), short))
-        return prediction, short
+        return prediction, short_of(prediction, self.wanted, self.seeable)
 
     def _exchanged(self, chosen: list[int]) -> tuple[list[int], Prediction, float]:
         """Return the choice with stations exchanged for better ones, while the full prediction gains."""

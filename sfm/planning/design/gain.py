@@ -43,11 +43,6 @@ def image_rows(planned: PlannedObject, camera: Camera, stations: Stations, sight
     return rows
 
 
-def normal_matrices(rows: FloatArray) -> FloatArray:
-    """Return the sum of A'PA of each point over some photographs, (n, 3, 3)."""
-    return np.asarray(np.einsum("mnai,mnaj->nij", rows, rows))
-
-
 def cost_of(variance: FloatArray, scale: FloatArray) -> float:
     """Return the sum of the variances of points over what is wanted, each to a power."""
     return float(((variance * scale) ** POWER).sum())
