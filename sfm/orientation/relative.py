@@ -212,7 +212,7 @@ def _nearest_to_coplanar(
     uv2: FloatArray,
     tolerance: float,
 ) -> RelativeOrientation:
-    """Return the spatial orientation with the smallest residuals, that found first or one of a plane adjusted.
+    """Return the orientation with the smallest residuals, of that found first and those of a plane adjusted.
 
     Both orientations of a plane fit the rays of a shallow relief within a wide tolerance, and random samples
     take whichever comes first: the adjustment from it ends in a minimum of its own, with larger residuals.
@@ -224,7 +224,12 @@ def _nearest_to_coplanar(
 
 
 def _adjusted(
-    base: FloatArray, rotation: FloatArray, uv1: FloatArray, uv2: FloatArray, used: BoolArray, tolerance: float
+    base: FloatArray,
+    rotation: FloatArray,
+    uv1: FloatArray,
+    uv2: FloatArray,
+    used: BoolArray,
+    tolerance: float,
 ) -> RelativeOrientation:
     """Adjust a spatial orientation by coplanarity, and choose the fitting pairs anew until they stay."""
     best = _evaluate("spatial", base, rotation, _NAN, uv1, uv2, used)

@@ -69,7 +69,7 @@ def test_gross_errors_are_put_aside():
 
 @pytest.mark.parametrize("seed", range(6))
 def test_a_shallow_relief_within_a_wide_tolerance_is_not_taken_for_its_mirror_image(seed):
-    """Both orientations of the mean plane fit every pair within the tolerance; only one has small residuals."""
+    """Both orientations of the mean plane fit within the tolerance; only one has small residuals."""
     rng = seed_of(f"shallow relief {seed}")
     base = np.array([0.92, 0.38, 0.05]) / np.linalg.norm([0.92, 0.38, 0.05])
     uv1 = rng.uniform(-0.15, 0.15, (200, 2))
