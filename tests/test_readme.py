@@ -1,4 +1,4 @@
-"""README and pages keep their word: survey files are read, commands, formats and files are those there are."""
+"""README and pages keep their word: survey files are read; commands, formats, files are those there are."""
 
 from __future__ import annotations
 
