@@ -10,8 +10,10 @@ sys.path.insert(0, str(Path(__file__).parent))
 
 project = "Kolinear"
 release = version = version_of("kolinear")
-extensions = ["myst_parser", "generated"]
+extensions = ["myst_parser", "generated", "functions", "drawings", "formulas"]
 html_theme = "pydata_sphinx_theme"
+html_math_renderer = "mathml"
+myst_enable_extensions = ["dollarmath"]
 myst_heading_anchors = 3
 exclude_patterns = ["_build"]
 html_static_path = ["static"]

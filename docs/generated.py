@@ -12,6 +12,7 @@ import typer
 from docutils import nodes
 from pydantic_core import PydanticUndefined
 from sphinx.application import Sphinx
+from sphinx.domains.python import PythonDomain
 from sphinx.util.docutils import SphinxDirective
 from typer.testing import CliRunner
 
@@ -37,7 +38,7 @@ class _Made(SphinxDirective):
         """Return one section for each part."""
         sections: list[nodes.Node] = []
         for title, content in self.parts():
-            section = nodes.section(ids=[re.sub(r"\W+", "-", title).strip("-").lower()])
+            section = nodes.section(ids=[label_of(title)])
             section += nodes.title(title, title)
             section += content
             sections.append(section)
@@ -46,6 +47,11 @@ class _Made(SphinxDirective):
     def parts(self) -> list[tuple[str, list[nodes.Node]]]:
         """Return title and content of each section."""
         raise NotImplementedError
+
+
+def label_of(title: str) -> str:
+    """Return what a link to a section ends with."""
+    return re.sub(r"\W+", "-", title).strip("-").lower()
 
 
 class SurveyFileReference(_Made):
@@ -94,8 +100,11 @@ class PythonReference(_Made):
     def parts(self) -> list[tuple[str, list[nodes.Node]]]:
         """Return signature and docstring of each name."""
         found = []
+        domain = self.env.domains["py"]
+        assert isinstance(domain, PythonDomain)
         for name in sorted(sfm.__all__, key=str.lower):
             value = getattr(sfm, name)
+            domain.note_object(f"sfm.{name}", "function", label_of(f"sfm.{name}"))
             signature = name if inspect.isclass(value) else f"{name}{inspect.signature(value)}"
             text = f"{signature}\n\n{inspect.getdoc(value)}"
             found.append((f"sfm.{name}", [nodes.literal_block("", text, language="text")]))
