@@ -10,7 +10,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 
 project = "Kolinear"
 release = version = version_of("kolinear")
-extensions = ["myst_nb", "generated", "functions", "drawings", "formulas"]
+extensions = ["myst_nb", "generated", "functions", "drawings", "formulas", "links"]
 html_theme = "pydata_sphinx_theme"
 html_math_renderer = "mathml"
 myst_enable_extensions = ["dollarmath"]

@@ -14,7 +14,9 @@ LENS = (("K1", 4e-4), ("x0", 0.06), ("y0", -0.04))
 
 def lens(free: tuple[str, ...] = ("c", "x0", "y0", "K1"), model: str = "brown") -> sfm.Camera:
     """Return the true camera: 3000 x 2000 px of 8 µm, 20 mm, a barrel lens."""
-    return sfm.camera_from_values("lens", model, (3000, 2000), (0.008, 0.008), c_mm=20.0, free=free, values=LENS)
+    return sfm.camera_from_values(
+        "lens", model, (3000, 2000), (0.008, 0.008), c_mm=20.0, free=free, values=LENS
+    )
 
 
 def stations(count: int, distance: float, elevation_deg: float) -> tuple[FloatArray, FloatArray]:
