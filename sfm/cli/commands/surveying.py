@@ -191,6 +191,7 @@ def _run_survey(
         from sfm.runtime.cores import cores
         from sfm.runtime.progress_bar import drawn_progress
         from sfm.survey.inputs.calibration import Calibration, read_calibrations
+        from sfm.survey.inputs.photograph_list import find_photographs
         from sfm.survey.inputs.survey import survey_of_file, with_calibration
         from sfm.survey.inputs.survey_file import read_survey_file
         from sfm.survey.measuring.target_store import TargetStore
@@ -221,6 +222,8 @@ def _run_survey(
         raise KolinearError("--camera-weighted: expected --camera RESULT with it")
     others = programs_of(survey.compare.backend, survey.compare.baseline)
     folder = _folder(survey, out)
+    if from_photographs:
+        find_photographs(survey, images_dir=images)  # a wrong folder is told before anything is compiled
     compile_first()
     workers = (jobs or cores()) if from_photographs else 1
     store = None
