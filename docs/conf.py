@@ -23,4 +23,5 @@ nb_execution_timeout = 600
 nb_merge_streams = True
 html_static_path = ["static"]
 html_css_files = ["site.css"]
-html_sidebars = {"**": []}  # the pages have one level
+html_sidebars = {"**": ["globaltoc.html"]}  # every page shows all pages by their groups
+html_theme_options = {"header_links_before_dropdown": 4}
