@@ -6,6 +6,8 @@ import re
 import tomllib
 from pathlib import Path
 
+import typer
+
 from adapters.formats.registry import FORMATS
 from sfm.cli.app import app
 from sfm.distortion.models import MODELS
@@ -64,6 +66,30 @@ def test_commands_of_the_readme_exist() -> None:
     commands = {command.callback.__name__ for command in app.registered_commands if command.callback}
     commands |= {group.typer_instance.info.name for group in app.registered_groups if group.typer_instance}
     assert set(re.findall(r"^kolinear ([a-z]+) ", README, re.M)) == commands
+
+
+def shown_commands() -> list[str]:
+    """Return the lines of all pages that call the program, those that go on joined."""
+    pages = [ROOT / "README.md", *sorted(DOCS.rglob("*.md"))]
+    text = "\n".join(page.read_text(encoding="utf-8") for page in pages)
+    blocks = "\n".join(re.findall(r"^```(?:sh|bat)\n(.*?)^```", text, re.M | re.S)).replace("\\\n", " ")
+    return [line.partition("  #")[0] for line in blocks.splitlines() if line.startswith("kolinear ")]
+
+
+def test_commands_of_all_pages_have_the_options_that_are_shown() -> None:
+    root = typer.main.get_command(app)
+    lines = shown_commands()
+    assert len(lines) > 40
+    for line in lines:
+        words = line.split()[1:]
+        if words[0] == "COMMAND":
+            continue
+        command = root.commands[words[0]]  # type: ignore[attr-defined]
+        if hasattr(command, "commands"):
+            command = command.commands[words[1]]
+        known = {name for one in command.params for name in (*one.opts, *one.secondary_opts)} | {"--help"}
+        used = {word.partition("=")[0] for word in words if word.startswith("-") and not word[1:2].isdigit()}
+        assert used <= known, line
 
 
 def test_formats_of_the_page_are_those_there_are() -> None:

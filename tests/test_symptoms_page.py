@@ -93,7 +93,7 @@ def sentences(tree: ast.Module) -> Iterator[tuple[int, str]]:
 
 def messages() -> dict[str, str]:
     """Return where each message stands, by message."""
-    found = {}
+    found: dict[str, str] = {}
     for file, tree in trees("sfm", "adapters"):
         found |= {text: f"{file}:{line}" for line, text in error_messages(tree) if words(text) >= 2}
     for file, tree in trees(*JUDGING):
