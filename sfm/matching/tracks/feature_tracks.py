@@ -21,6 +21,7 @@ from sfm.kernels.options import compiled
 from sfm.matching.lsm.two_photo import match_lsm
 from sfm.matching.radiometry import FULL_SCALE_8, full_scale, grey_of
 from sfm.matching.tracks.interest import foerstner_points
+from sfm.matching.tracks.overlap import connected_parts, overlapping_pairs
 from sfm.network import rows_of
 
 DETECTORS = ("foerstner", "sift")
@@ -33,6 +34,9 @@ SNAP_PX = 6.0  # an interest point this close to a feature takes its place
 # Contrast of a feature over the full scale; OpenCV's 0.04 leaves a fifth of what a weak natural texture has.
 # Lowe (2004) has 0.03 of the range 0 to 1, before the division by the layers of an octave.
 MIN_CONTRAST = 0.01
+# Features are looked for in a picture of at most this side, and of half the photograph's: they start the
+# matching, which measures in the photograph itself. Where such a picture has too few, in finer ones.
+MAX_SIDE_PX = 1600
 CELLS = 12  # along the longer side of a photograph: each cell has its share of the features
 
 
@@ -77,7 +81,7 @@ def find_tie_points(
     *,
     detector: str = "foerstner",
     window_px: int = WINDOW_PX,
-    max_features: int = 4000,
+    max_features: int = 2000,
     min_rays: int = 3,
     min_correlation: float = 0.7,
     seed: int = 0,
@@ -89,7 +93,7 @@ def find_tie_points(
         photographs: (H, W), 8 or 16 bit, grey or colour, m of them.
         detector: foerstner moves each point to the best interest point nearby, sift leaves it.
         window_px: odd side of the window of least squares matching.
-        max_features: of each photograph, the strongest ones.
+        max_features: of each photograph, the strongest ones of all its parts.
         min_rays: fewest photographs of a point.
         min_correlation: smallest coefficient r of a match.
         seed: of the random samples.
@@ -124,7 +128,7 @@ def find_tie_points(
     )
 
 
-def sift_features(photograph: AnyArray, *, max_features: int = 4000) -> Features:
+def sift_features(photograph: AnyArray, *, max_features: int = 2000) -> Features:
     """Return SIFT features with root-normalised descriptors, spread over the photograph.
 
     Args:
@@ -135,17 +139,29 @@ def sift_features(photograph: AnyArray, *, max_features: int = 4000) -> Features
     """
     grey = grey_of(photograph) * (FULL_SCALE_8 / full_scale(photograph))
     eight_bit = np.rint(np.clip(grey, 0, FULL_SCALE_8)).astype(np.uint8)
-    sift = cv2.SIFT.create(contrastThreshold=MIN_CONTRAST)
-    points = sift.detect(eight_bit, None)
+    shrink = 2
+    while max(grey.shape) > shrink * MAX_SIDE_PX:
+        shrink *= 2
+    sift = cv2.SIFT.create(contrastThreshold=MIN_CONTRAST, enable_precise_upscale=True)
+    while True:
+        height, width = (max(1, side // shrink) for side in grey.shape)
+        # whole blocks of pixels: what is left at the border belongs to none
+        whole = eight_bit[: height * shrink, : width * shrink]
+        picture = cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA)
+        points = sift.detect(picture, None)
+        if shrink == 1 or len(points) >= max_features:
+            break
+        shrink //= 2
     xy = np.array([p.pt for p in points], dtype=float).reshape(-1, 2)
-    kept = _spread_out(xy, np.array([p.response for p in points]), eight_bit.shape, max_features)
-    points, descriptor = sift.compute(eight_bit, [points[k] for k in kept.tolist()])
+    kept = _spread_out(xy, np.array([p.response for p in points]), picture.shape, max_features)
+    points, descriptor = sift.compute(picture, [points[k] for k in kept.tolist()])
     if descriptor is None:
         descriptor = np.zeros((0, 128), np.float32)
     norm = np.maximum(descriptor.sum(axis=1, keepdims=True), 1e-12)
+    xy = np.array([p.pt for p in points], dtype=float).reshape(-1, 2)
     return Features(
-        np.array([p.pt for p in points], dtype=float).reshape(-1, 2),
-        np.array([p.size for p in points], dtype=float),
+        shrink * (xy + 0.5) - 0.5,
+        shrink * np.array([p.size for p in points], dtype=float),
         np.radians([p.angle for p in points]),
         np.sqrt(descriptor / norm),
     )
@@ -172,7 +188,9 @@ def _spread_out(xy: FloatArray, strength: FloatArray, shape: tuple[int, ...], mo
 def link_features(
     features: Sequence[Features], *, min_rays: int = 3, seed: int = 0, threads: int = 1
 ) -> Tracks:
-    """Match the features of all pairs of photographs and put together what belongs to one point.
+    """Match the features of photographs that overlap and put together what belongs to one point.
+
+    Where the matches leave the photographs in several parts, all pairs between these are matched, too.
 
     A point has one feature in a photograph: matches are taken the most distinctive first, and one that would
     put two features of a photograph together is left: a wrong match splits a track and does not lose it.
@@ -184,11 +202,25 @@ def link_features(
         threads: pairs worked on at a time.
     """
     first = np.concatenate([[0], np.cumsum([len(one) for one in features])]).astype(np.int64)
-    pairs = [(i, j) for i in range(len(features)) for j in range(i + 1, len(features))]
+    pairs = overlapping_pairs([one.descriptor for one in features], [one.scale for one in features])
     with ThreadPoolExecutor(max(1, threads)) as pool:
-        matched = list(pool.map(lambda p: _matched(features[p[0]], features[p[1]], seed=seed), pairs))
+
+        def matched_pairs(of: IntArray) -> list[tuple[IntArray, FloatArray]]:
+            return list(pool.map(lambda p: _matched(features[p[0]], features[p[1]], seed=seed), of))
+
+        matched = matched_pairs(pairs)
+        linked = pairs[np.array([len(rows) > 0 for rows, _ in matched], dtype=bool)]
+        part = connected_parts(linked, len(features))
+        if part.max(initial=0):
+            rest = np.column_stack(np.triu_indices(len(features), 1))
+            tried = np.isin(rest @ [len(features), 1], pairs @ [len(features), 1])
+            rest = rest[~tried & (part[rest[:, 0]] != part[rest[:, 1]])]
+            pairs, matched = np.concatenate([pairs, rest]), matched + matched_pairs(rest)
     edges = [np.zeros((0, 2), dtype=np.int64)]
-    edges += [rows + np.array([first[i], first[j]]) for (i, j), (rows, _) in zip(pairs, matched, strict=True)]
+    edges += [
+        rows + np.array([first[i], first[j]])
+        for (i, j), (rows, _) in zip(pairs.tolist(), matched, strict=True)
+    ]
     edge = np.concatenate(edges)
     distinct = np.concatenate([np.zeros(0), *(one for _, one in matched)])
     image = np.repeat(np.arange(len(features)), np.diff(first))
@@ -301,7 +333,6 @@ def measure_tracks(
         min_correlation: smallest coefficient r of a match.
         threads: patches worked on at a time.
     """
-    greys = [grey_of(one) for one in photographs]
     xy = np.array([features[i].xy[f] for i, f in zip(tracks.image, tracks.feature, strict=True)])
     scale = np.array([features[i].scale[f] for i, f in zip(tracks.image, tracks.feature, strict=True)])
     angle = np.array([features[i].angle[f] for i, f in zip(tracks.image, tracks.feature, strict=True)])
@@ -325,11 +356,14 @@ def measure_tracks(
     pairs, pair = np.unique(
         np.column_stack([tracks.image[ref], tracks.image])[others], axis=0, return_inverse=True
     )
+    template = -1
     for (i, j), own in zip(pairs.tolist(), rows_of(pair.ravel(), len(pairs)), strict=False):
         rows = others[own]
+        if i != template:  # pairs come reference by reference: two photographs at a time are enough
+            template, left = i, grey_of(photographs[i])
         found = match_lsm(
-            greys[i],
-            greys[j],
+            left,
+            grey_of(photographs[j]),
             place[tracks.point[rows]],
             start[rows],
             window_px=window_px,
