@@ -8,6 +8,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from sfm.display import program_name
 from sfm.report.findings.findings import Findings
 from sfm.report.numbers import finer_unit, significant
 from sfm.report.phrases import words_of_check, words_of_sigma0, words_of_test
@@ -90,11 +91,11 @@ def _figures(findings: Findings) -> tuple[tuple[str, str], ...]:
         word = "stopped early, same optimum" if both.stopped_early else "agrees" if both.agree else "DIFFERS"
         if both.better is not None and both.agree:
             word = f"free {', '.join(both.better.free)}: fits {both.better.times:.3g} times better"
-        rms = both.comparison.rms_px
+        rms, other = both.comparison.rms_px, program_name(both.backend)
         rows.append(
             (
-                both.backend,
-                f"{word}: RMS {rms[0]:.7f} px (kolinear), {rms[1]:.7f} px ({both.backend}), both with equal "
+                other,
+                f"{word}: RMS {rms[0]:.7f} px (Kolinear), {rms[1]:.7f} px ({other}), both with equal "
                 f"weights, free datum, {both.model}",
             )
         )
