@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 from rich.console import Console
@@ -65,6 +66,9 @@ def _figures(findings: Findings) -> tuple[tuple[str, str], ...]:
     coded = int((result.code >= 0).sum())
     typical, largest = float(precision.rms[3]), float(precision.largest[3])
     factor, unit = finer_unit(result.length_unit, largest)
+    told = f"{significant(typical * factor)} {unit} RMS, {significant(largest * factor)} {unit} at most"
+    if not math.isfinite(typical):
+        told = "all coordinates are fixed" if precision.fixed_points else "not known"
     rows = [
         ("photographs", f"{len(a.network.images)} of {result.images_total} oriented"),
         (
@@ -79,10 +83,7 @@ def _figures(findings: Findings) -> tuple[tuple[str, str], ...]:
             f"{', '.join(words_of_sigma0(findings.sigma0))}, redundancy {a.redundancy}",
         ),
         ("residuals", f"RMS {a.rms_px:.4f} px per coordinate, largest {a.max_residual_px:.3f} px"),
-        (
-            "point precision",
-            f"{significant(typical * factor)} {unit} RMS, {significant(largest * factor)} {unit} at most",
-        ),
+        ("point precision", told),
     ]
     if findings.check is not None:
         rows.append(("check at control", words_of_check(findings.check, result.length_unit)))
