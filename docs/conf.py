@@ -23,5 +23,17 @@ nb_execution_timeout = 600
 nb_merge_streams = True
 html_static_path = ["static"]
 html_css_files = ["site.css"]
-html_sidebars = {"**": ["globaltoc.html"]}  # every page shows all pages by their groups
+# pages that stand by themselves; those of a section have its pages beside them
+ALONE = (
+    "index",
+    "install",
+    "tutorial",
+    "reading-the-report",
+    "symptoms",
+    "architecture",
+    "search",
+    "genindex",
+)
+html_sidebars = {page: [] for page in ALONE}
+html_theme_options = {"header_links_before_dropdown": 9}
 html_theme_options = {"header_links_before_dropdown": 4}

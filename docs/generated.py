@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import re
+import typing
 from typing import Any, ClassVar
 
 import typer
@@ -60,9 +61,9 @@ class SurveyFileReference(_Made):
             section = section_of(field.annotation)
             doc = (inspect.getdoc(section) or "").partition("]: ")[2] or inspect.getdoc(section) or ""
             table = table_of(("key", "type", "default", "meaning"), rows_of(section))
-            found.append(
-                (f"[{field.alias or name}]", [nodes.paragraph("", doc.lstrip("]: ").capitalize()), table])
-            )
+            said = field.alias or name
+            title = f"[[{said}]]" if typing.get_origin(field.annotation) is tuple else f"[{said}]"
+            found.append((title, [nodes.paragraph("", doc.lstrip("]: ").capitalize()), table]))
         return found
 
 

@@ -48,6 +48,7 @@ def rows_of(section: type[Section]) -> list[tuple[str, ...]]:
     for name, field in section.model_fields.items():
         default = "required" if field.default is PydanticUndefined else shown(field.default)
         kind = type_of(field.annotation, field.metadata)
+        default = "{}" if default == "[]" and kind.startswith("table") else default
         rows.append((field.alias or name, kind, default, comments.get(name, "")))
     return rows
 

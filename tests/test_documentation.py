@@ -25,9 +25,10 @@ def load(name: str) -> types.ModuleType:
 def test_every_page_is_on_the_site() -> None:
     docs = ROOT / "docs"
     listed = {
-        str((page.parent / name).relative_to(docs))
+        name[1:] if name.startswith("/") else str((page.parent / name).relative_to(docs))
         for page in docs.rglob("index.md")
-        for name in re.findall(r"^([\w/-]+)$", page.read_text(encoding="utf-8"), re.M)
+        for tree in re.findall(r"^```{toctree}\n(.*?)^```", page.read_text(encoding="utf-8"), re.S | re.M)
+        for name in re.findall(r"^(?:[\w ]+ <)?([\w/-]+)>?$", tree, re.M)
     }
     pages = {str(page.relative_to(docs).with_suffix("")) for page in docs.rglob("*.md")} - {"index"}
     assert pages == listed

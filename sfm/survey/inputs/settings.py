@@ -103,12 +103,12 @@ class CameraSettings(Section):
     c_mm: Length | None = None  # start value of the principal distance, else the EXIF focal length, mm
     # distortion model: corrections of the measured point, or distortion of the ideal one
     model: Literal[tuple(MODELS)] = "brown"  # type: ignore[valid-type]
-    free: Names = ()  # parameters to be adjusted; () = a calibrated camera; see `says_what_is_free`
-    fixed: Values = ()  # (parameter, value) of what is not free, in the model's units
-    start: Values = ()  # (parameter, value) that a free one starts from, in the model's units; else 0
-    balanced: Values = ()  # (parameter, value) in AICON's form with R0, in place of fixed and start
-    weighted: Observed = ()  # (parameter, (value, sigma)): adjusted, with this as an observation
-    correlations: Correlations = ()  # (parameter, parameter, correlation) of weighted ones; 0 if not given
+    free: Names = ()  # parameters to be adjusted; [] = a calibrated camera; not given: the photographs decide
+    fixed: Values = ()  # what is not free, in the model's units; else 0
+    start: Values = ()  # values that free ones start from, in the model's units; else 0
+    balanced: Values = ()  # values in AICON's form with R0, in place of fixed and start
+    weighted: Observed = ()  # adjusted, with value and standard deviation as an observation
+    correlations: Correlations = ()  # of weighted parameters; 0 if not given
     calibration: Name | None = None  # folder of an earlier result, relative to the survey file
     calibration_use: Literal["fixed", "weighted"] = "fixed"  # held, or an observation with its covariance
     per_photograph: Names = ()  # adjusted parameters of which every photograph has a value of its own
