@@ -276,6 +276,24 @@ def test_a_photograph_shows_its_thumbnail_under_the_pointer(tab: Tab, scene: Vie
     assert seen <= set(scene.photographs) and len(seen) >= 3  # some lie behind others or outside
 
 
+def test_the_scene_is_on_paper(tab: Tab) -> None:
+    """The canvas of the scene is empty by the time its page is laid out for the printer: a copy stands there."""
+    page = tab.page
+    page.evaluate(SELECT, ["point", 3])
+    page.emulate_media(media="print")
+    page.evaluate("window.dispatchEvent(new Event('beforeprint'))")
+    copy = page.locator(".v-printed")
+    assert copy.is_visible() and not page.locator(".v-scene").is_visible()
+    colours = copy.evaluate(
+        "(c) => new Set(new Uint32Array("
+        "c.getContext('2d').getImageData(0, 0, c.width, c.height).data.buffer)).size"
+    )
+    assert colours > 20
+    page.evaluate("window.dispatchEvent(new Event('afterprint'))")
+    page.emulate_media(media="screen")
+    assert copy.count() == 0 and page.locator(".v-scene").is_visible()
+
+
 def test_large_scenes_turn_with_fewer_points_and_say_so(browser: Any, tmp_path: Path) -> None:
     network, truth = make_network(seed_of("many"), images=3, points=6000, planar=True, visibility=0.5)
     many = scene_of_stored(StoredResult("many", network, truth, unit="m"))

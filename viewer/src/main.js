@@ -56,10 +56,14 @@ async function start() {
     if (event.key === "Escape" && root.contains(event.target)) hub.tell("select", null)
   })
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => scene?.invalidate())
+  let printed = null // a copy, since the canvas of the scene is empty by the time its page is laid out on paper
   const print = (on) => {
     if (!scene) return
     scene.printing = on
-    scene.draw()
+    printed?.remove()
+    printed = on ? pictureOf(scene) : null
+    if (printed) stage.append(printed)
+    else scene.draw()
   }
   window.addEventListener("beforeprint", () => print(true))
   window.addEventListener("afterprint", () => print(false))
@@ -166,12 +170,18 @@ function ellipsoidTools(model, scene) {
 }
 
 function savePicture(scene, name) {
-  scene.draw() // what is drawn is kept only until the browser shows it
-  const whole = make("canvas", { width: scene.canvas.width, height: scene.canvas.height })
+  const picture = pictureOf(scene).toDataURL("image/png")
+  make("a", { href: picture, download: `${name.replace(/[^\w.-]+/g, "_")}.png` }).click()
+}
+
+/** A copy of scene and names; what is drawn is kept only until the browser shows it. */
+function pictureOf(scene) {
+  scene.draw()
+  const whole = make("canvas", { className: "v-printed", width: scene.canvas.width, height: scene.canvas.height })
   const context = whole.getContext("2d")
   context.drawImage(scene.canvas, 0, 0)
   context.drawImage(scene.overlay, 0, 0)
-  make("a", { href: whole.toDataURL("image/png"), download: `${name.replace(/[^\w.-]+/g, "_")}.png` }).click()
+  return whole
 }
 
 const SUGGESTED = 12

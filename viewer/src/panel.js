@@ -25,11 +25,11 @@ export class Panel {
 
   empty() {
     this.element.replaceChildren(
-      make("h3", {}, "Nothing chosen"),
-      make("p", {}, "Click a point or a photograph in the scene, or a row of the tables below."),
+      make("h3", { className: "v-hint" }, "Nothing chosen"),
+      make("p", { className: "v-hint" }, "Click a point or a photograph in the scene, or a row of the tables below."),
       make(
         "p",
-        { className: "note" },
+        { className: "note v-hint" },
         "Drag: turn. Wheel or + and -: nearer and farther. Right button, or two fingers: move. Arrow keys turn, Home goes back, Escape chooses nothing.",
       ),
       ...this.model.notes.page.map((words) => make("p", { className: "note" }, words)),
