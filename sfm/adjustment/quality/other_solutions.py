@@ -57,13 +57,15 @@ class OtherSolution:
     converges: bool  # whether an adjustment of all observations from there ends
 
 
-def other_solutions(adjustment: Adjustment, *, follow_c: bool = False) -> tuple[OtherSolution, ...]:
+def other_solutions(
+    adjustment: Adjustment, *, had_to_be_held: tuple[str, ...] = ()
+) -> tuple[OtherSolution, ...]:
     """Return other solutions of about the same v'Pv, and better ones, the smallest v'Pv first.
 
     Args:
         adjustment: the result, with its covariance.
-        follow_c: whether c is tried at other values where it is held, too, as it is where an adjustment
-            does not converge with c free; none of these is taken in place of the result.
+        had_to_be_held: cameras whose c is held because the adjustment does not converge with it; it is tried
+            at other values, and freed again from a better one.
 
     Returns:
         None where the network is strong, the result did not converge, or nothing is redundant.
@@ -80,7 +82,7 @@ def other_solutions(adjustment: Adjustment, *, follow_c: bool = False) -> tuple[
     sigma = np.sqrt(np.trace(a.covariance.points, axis1=1, axis2=2) / 3)
     own = _principal_distance(a.estimate.cameras)
     found: list[OtherSolution] = []
-    tried = search.candidates(a.estimate, base.vPv, limit, follow_c=follow_c)
+    tried = search.candidates(a.estimate, base.vPv, limit, follow_c=bool(had_to_be_held))
     candidates = sorted(tried, key=lambda one: one.vPv)
     for candidate in candidates:
         points = candidate.estimate.points
@@ -102,9 +104,11 @@ def other_solutions(adjustment: Adjustment, *, follow_c: bool = False) -> tuple[
                 converges=False,
             )
         )
-    if found and found[0].vPv < 1 and not follow_c:
-        ended = search.adjusted(found[0].estimate, tolerance=TOLERANCE)
-        found[0] = replace(found[0], converges=ended is not None and ended.converged)
+    if found and found[0].vPv < 1:
+        best = _with_c_freed(found[0].estimate, had_to_be_held)
+        ended = search.adjusted(best, tolerance=TOLERANCE)
+        if ended is not None and ended.converged:
+            found[0] = replace(found[0], estimate=ended.estimate, converges=True)
     return tuple(found)
 
 
@@ -145,22 +149,34 @@ class _Search:
     factor: FloatArray  # on the standard deviations of the image points, (k,)
 
     def adjusted(self, start: Estimate, *, held: bool = False, tolerance: float = NEAR) -> Adjustment | None:
-        """Return the adjustment, with c free or held; None where it has no solution."""
+        """Return the adjustment, with c free or held; None where it has no solution.
+
+        By Gauss-Newton, which in the bent valleys of weak networks takes a few steps where damping takes
+        fifty; damped where that does not converge.
+        """
         cameras = tuple(_with_c_held(camera) for camera in start.cameras) if held else start.cameras
-        try:
-            a = adjust(
-                self.network,
-                replace(start, cameras=cameras),
-                datum=self.datum,
-                image_sigma_factor=self.factor,
-                reject="none",
-                max_iterations=MAX_ITERATIONS,
-                tolerance=tolerance,
-                covariance=False,
-            )
-        except GeometryError:
-            return None
-        return a if np.isfinite(a.vPv) and not a.rejected.any() else None
+        found: list[Adjustment] = []
+        for method in ("gauss-newton", "levenberg-marquardt"):
+            try:
+                a = adjust(
+                    self.network,
+                    replace(start, cameras=cameras),
+                    datum=self.datum,
+                    image_sigma_factor=self.factor,
+                    reject="none",
+                    method=method,
+                    max_iterations=MAX_ITERATIONS,
+                    tolerance=tolerance,
+                    covariance=False,
+                )
+            except GeometryError:
+                continue
+            if not np.isfinite(a.vPv) or a.rejected.any():
+                continue
+            if a.converged:
+                return a
+            found.append(a)
+        return min(found, key=lambda one: one.vPv, default=None)
 
     def candidates(
         self, result: Estimate, vPv: float, limit: float, *, follow_c: bool
@@ -201,6 +217,15 @@ def _with_c_held(camera: Camera) -> Camera:
     free = camera.free.copy()
     free[: 1 if camera.in_mm else 2] = False
     return replace(camera, free=free)
+
+
+def _with_c_freed(estimate: Estimate, names: tuple[str, ...]) -> Estimate:
+    cameras = []
+    for camera in estimate.cameras:
+        free = camera.free.copy()
+        free[: 1 if camera.in_mm else 2] |= camera.name in names
+        cameras.append(replace(camera, free=free))
+    return replace(estimate, cameras=tuple(cameras))
 
 
 def _with_free(estimate: Estimate, free: list[BoolArray]) -> Estimate:

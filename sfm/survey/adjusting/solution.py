@@ -138,7 +138,7 @@ def solve_survey(survey: Survey, matched: Correspondences) -> Solution:
         solved.others,
         start.notes,
         explanations,
-        _contradicted(solved.c_held, explanations),
+        contradicted(solved.c_held, explanations),
     )
 
 
@@ -241,7 +241,7 @@ def _solved(start: _Prepared) -> _Solved:
             continue
         # c that had to be held is nobody's calibration: what its other values give is another solution
         c_held = tuple(one.name for one in final.estimate.cameras if one.name in asked and not one.free[0])
-        others = other_solutions(final, follow_c=bool(c_held))
+        others = other_solutions(final, had_to_be_held=c_held)
         if first is not None and not final.converged:  # what seemed better is none: as it was
             (settled, final, check, others), better = first, ()
             break
@@ -264,7 +264,7 @@ def _solved(start: _Prepared) -> _Solved:
     )
 
 
-def _contradicted(held: tuple[str, ...], explanations: tuple[Explanation, ...]) -> tuple[str, ...]:
+def contradicted(held: tuple[str, ...], explanations: tuple[Explanation, ...]) -> tuple[str, ...]:
     """Return a line where the residuals have a cause and c had to be held at a value that nobody measured."""
     if not held or not explanations or not explanations[0].explains:
         return ()
