@@ -89,7 +89,7 @@ def height(roughness: str, x: FloatArray, y: FloatArray) -> FloatArray:
 
 def intensities(scene: TexturedScene, index: int, skin: AnyArray) -> AnyArray:
     """Return one photograph as it would be without noise, float32, 0 to 255."""
-    width, rows = SIZE_PX
+    width, rows = scene.camera.size_px
     centre = scene.position[index]
     y, x = np.mgrid[0:rows, 0:width]
     grid = np.column_stack([x.ravel(), y.ravel()]).astype(float)
@@ -98,38 +98,53 @@ def intensities(scene: TexturedScene, index: int, skin: AnyArray) -> AnyArray:
         uv = tangents_from_pixel(scene.camera, grid + offset)
         return np.asarray(np.column_stack([uv, -np.ones(len(uv))]) @ scene.rotation[index].T)
 
-    def gap(t: FloatArray, d: FloatArray) -> FloatArray:
-        at = centre + t[:, None] * d
-        return np.asarray(at[:, 2] - height(scene.roughness, at[:, 0], at[:, 1]))
-
-    d = rays((0.0, 0.0))
-    first, last = (SLAB_M - centre[2]) / d[:, 2], (-SLAB_M - centre[2]) / d[:, 2]
-    above, below = first.copy(), last.copy()
-    open_rays = np.ones(len(d), dtype=bool)
-    for step in range(1, MARCH + 1):
-        t = first + (last - first) * step / MARCH
-        under = np.zeros(len(d), dtype=bool)
-        under[open_rays] = gap(t[open_rays], d[open_rays]) < 0
-        below[under] = t[under]
-        open_rays &= ~under
-        above[open_rays] = t[open_rays]
-    for _ in range(BISECT):
-        middle = (above + below) / 2
-        under = gap(middle, d) < 0
-        below, above = np.where(under, middle, below), np.where(under, above, middle)
-    centres = (above + below) / 2
+    centres = ray_lengths(scene, index, rays((0.0, 0.0)))
     light = np.zeros((rows, width), dtype=np.float32)
     for offset in ((-0.25, -0.25), (0.25, -0.25), (-0.25, 0.25), (0.25, 0.25)):
         d = rays(offset)
         t = centres.copy()
         for _ in range(3):  # Newton along the ray, from the middle of the pixel
-            slope = (gap(t + 1e-5, d) - gap(t, d)) / 1e-5
-            t -= np.clip(gap(t, d) / np.where(np.abs(slope) > 0.05, slope, -0.05), -0.01, 0.01)
+            gap = _gap(scene, index, t, d)
+            slope = (_gap(scene, index, t + 1e-5, d) - gap) / 1e-5
+            t -= np.clip(gap / np.where(np.abs(slope) > 0.05, slope, -0.05), -0.01, 0.01)
         at = (centre + t[:, None] * d)[:, :2] / render.TEXEL_M + len(skin) / 2
         at = at.astype(np.float32).reshape(rows, width, 2)
         light += cv2.remap(skin, at[..., 0], at[..., 1], cv2.INTER_LINEAR, borderValue=0.45)
     light = cv2.GaussianBlur(light / 4, (0, 0), render.BLUR_PX)
     return np.asarray(255 * light * (0.85 + 0.04 * (index % 4)))
+
+
+def surface_at(scene: TexturedScene, index: int, xy: FloatArray) -> FloatArray:
+    """Return where the surface is at places of a photograph, px, (k, 2); shape (k, 3), m."""
+    uv = tangents_from_pixel(scene.camera, xy)
+    d = np.column_stack([uv, -np.ones(len(uv))]) @ scene.rotation[index].T
+    return np.asarray(scene.position[index] + ray_lengths(scene, index, d)[:, None] * d)
+
+
+def ray_lengths(scene: TexturedScene, index: int, d: FloatArray) -> FloatArray:
+    """Return the lengths, in directions (k, 3), at which rays of a photograph meet the surface."""
+    height_m = scene.position[index][2]
+    first, last = (SLAB_M - height_m) / d[:, 2], (-SLAB_M - height_m) / d[:, 2]
+    above, below = first.copy(), last.copy()
+    open_rays = np.ones(len(d), dtype=bool)
+    for step in range(1, MARCH + 1):
+        t = first + (last - first) * step / MARCH
+        under = np.zeros(len(d), dtype=bool)
+        under[open_rays] = _gap(scene, index, t[open_rays], d[open_rays]) < 0
+        below[under] = t[under]
+        open_rays &= ~under
+        above[open_rays] = t[open_rays]
+    for _ in range(BISECT):
+        middle = (above + below) / 2
+        under = _gap(scene, index, middle, d) < 0
+        below, above = np.where(under, middle, below), np.where(under, above, middle)
+    return np.asarray((above + below) / 2)
+
+
+def _gap(scene: TexturedScene, index: int, t: FloatArray, d: FloatArray) -> FloatArray:
+    """Height above the surface of points along rays, m."""
+    at = scene.position[index] + t[:, None] * d
+    return np.asarray(at[:, 2] - height(scene.roughness, at[:, 0], at[:, 1]))
 
 
 def render_scene(folder: Path, roughness: str, photographs: int) -> TexturedScene:
