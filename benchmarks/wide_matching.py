@@ -5,7 +5,7 @@
 A textured surface of three roughnesses is photographed from the left and, at growing angles, from the right;
 then turned and scaled. Points at random places are matched with nothing else known (key points lead), without
 key points from a search window that is off by up to 20 px (turned templates), and as before, upright. A match
-is wrong if it is more than 1 px from the truth.
+is wrong if it is more than 1 px, and more than 4 of its standard deviations, from the truth.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ VIEWS = (
 LEFT_DEG = 25.0  # from the vertical
 METHODS = ("key points", "turned", "upright")
 OFF_PX = 20.0  # of the search windows that are given
-WRONG_PX = 1.0
+WRONG_PX, WRONG_SIGMAS = 1.0, 4.0
 BORDER_PX = 30
 
 
@@ -106,7 +106,9 @@ def count_matches(left: AnyArray, right: AnyArray, xy: FloatArray, truth: FloatA
             found = match_points(left, right, xy, xy_right=truth + off, wide=method == "turned")
     seconds = time.process_time() - begun
     error = np.linalg.norm(found.right - truth, axis=1)
-    right_ones = found.good & (error <= WRONG_PX)
+    with np.errstate(invalid="ignore"):
+        told = error < WRONG_SIGMAS * np.linalg.norm(found.sigma, axis=1)
+    right_ones = found.good & ((error <= WRONG_PX) | told)
     e = (found.right - truth)[right_ones]
     some = len(e) > 0
     return Counts(
