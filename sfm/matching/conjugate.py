@@ -91,7 +91,8 @@ def match_points(
         reach = np.clip(np.ceil(REACH_SIGMAS * maps.spread_px[known]), *REACH_PX).astype(np.int64)
         start = Starts(maps.xy[known], maps.linear[known], reach)
         again = match_warped(left, right, a[lost[known]], start, by)
-        matched = matched.with_rows(lost[known], confirmed(left, right, again, by, 2 * reach))
+        again = confirmed(left, right, again, by, 2 * reach)
+        matched = matched.with_rows(lost[known][again.good], again.rows(again.good))
         rest = lost[~known]
         if len(rest):
             again = match_turned(left, right, a[rest], b[rest], by)
