@@ -38,7 +38,7 @@ def refine(
         typer.Option("--masks", metavar="DIR", help="Folder of masks: NAME.png beside a photograph's NAME."),
     ] = None,
 ) -> None:
-    """Measure the key points of a COLMAP model anew.
+    """Remeasure the key points of a COLMAP model.
 
     By multi-photo least squares matching; then the model is adjusted again. The new model keeps numbers,
     colours, camera models, rigs and the points of two photographs, and has a page, refinement.html, and the
