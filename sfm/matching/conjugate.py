@@ -26,6 +26,7 @@ from sfm.matching.turned_templates import match_turned
 
 MIN_CORRELATION = 0.7  # half of the variance of one patch is then explained by the other
 BACK_PX = 1.0  # a point that leads back farther than this from where it came is another one
+MIN_TEMPLATE_PX = 7  # smaller ones look like anything once they are turned and scaled
 REACH_SIGMAS = 3.0  # of the place that key points tell
 REACH_PX = (4, 15)  # of that search, at least and at most
 
@@ -83,7 +84,7 @@ def match_points(
     by = Settings(method, template_px, search_px, equalise, interpolation, min_correlation, back_px)
     matched = confirmed(left, right, match_upright(left, right, a, b, by), by)
     lost = np.flatnonzero([bool(why) and "left photograph" not in why for why in matched.reason])
-    if wide and len(lost):
+    if wide and len(lost) and template_px >= MIN_TEMPLATE_PX:
         maps = local_affinities(left, right, a[lost])
         known = np.isfinite(maps.xy).all(axis=1)
         if xy_right is not None:
