@@ -1,4 +1,4 @@
-"""A plate whose points are free, with start values only; a stereo pair calibrated from photographs of a plate."""
+"""A plate whose points are free, from start values; a stereo pair calibrated from photographs of a plate."""
 
 from __future__ import annotations
 
