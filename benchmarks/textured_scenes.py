@@ -19,6 +19,7 @@ import numpy as np
 from datasets.textured import render
 from sfm.camera import Camera, camera_from_values, tangents_from_pixel
 from sfm.conventions import AnyArray, FloatArray
+from sfm.kernels.options import compiled
 
 RIPPLES = {"smooth": (0.0, 1.0), "medium": (0.004, 0.15), "rough": (0.008, 0.08)}  # height and length, m
 SIZE_PX = (1024, 768)
@@ -79,52 +80,77 @@ def textured_scene(roughness: str, photographs: int) -> TexturedScene:
     return TexturedScene(roughness, np.array(position), np.array(rotation), camera)
 
 
-def height(roughness: str, x: FloatArray, y: FloatArray) -> FloatArray:
-    """Height of the surface, m."""
-    tall, long = RIPPLES[roughness]
+@compiled
+def _height(tall: float, long: float, x: float, y: float) -> float:
+    """Height of the hills of datasets/textured with ripples of a height and length, m."""
+    hills = np.sin(1.7 * x + 0.4) * np.cos(1.4 * y) + 0.2 * np.sin(2.1 * (x - y))
     k = 2 * np.pi / long
-    ripples = tall * np.sin(k * x + np.sin(1.3 * k * y)) * np.cos(0.8 * k * y) if tall else 0.0
-    return np.asarray(render.height(x, y) + ripples)
+    ripples = tall * np.sin(k * x + np.sin(1.3 * k * y)) * np.cos(0.8 * k * y) if tall > 0 else 0.0
+    return float(render.HILL_M * hills + ripples)
+
+
+@compiled
+def _gap(tall: float, long: float, centre: FloatArray, d: FloatArray, t: float) -> float:
+    """Height of a place on a ray above the surface, m."""
+    return float(centre[2] + t * d[2] - _height(tall, long, centre[0] + t * d[0], centre[1] + t * d[1]))
+
+
+@compiled
+def _first_meeting(
+    tall: float, long: float, centre: FloatArray, rays: FloatArray, length: FloatArray
+) -> None:
+    """Fill how far along each ray it meets the surface first, by steps through its slab and bisection."""
+    for k in range(len(rays)):
+        d = rays[k]
+        first, last = (SLAB_M - centre[2]) / d[2], (-SLAB_M - centre[2]) / d[2]
+        above, below = first, last
+        for step in range(1, MARCH + 1):
+            t = first + (last - first) * step / MARCH
+            if _gap(tall, long, centre, d, t) < 0:
+                below = t
+                break
+            above = t
+        for _ in range(BISECT):
+            middle = (above + below) / 2
+            if _gap(tall, long, centre, d, middle) < 0:
+                below = middle
+            else:
+                above = middle
+        length[k] = (above + below) / 2
+
+
+@compiled
+def _nearby_meeting(
+    tall: float, long: float, centre: FloatArray, rays: FloatArray, length: FloatArray
+) -> None:
+    """Improve how far along each ray it meets the surface, by Newton's steps from nearby."""
+    for k in range(len(rays)):
+        t = length[k]
+        for _ in range(3):
+            gap = _gap(tall, long, centre, rays[k], t)
+            slope = (_gap(tall, long, centre, rays[k], t + 1e-5) - gap) / 1e-5
+            step = gap / (slope if abs(slope) > 0.05 else -0.05)
+            t -= min(max(step, -0.01), 0.01)
+        length[k] = t
 
 
 def intensities(scene: TexturedScene, index: int, skin: AnyArray) -> AnyArray:
     """Return one photograph as it would be without noise, float32, 0 to 255."""
     width, rows = SIZE_PX
-    centre = scene.position[index]
+    centre, (tall, long) = scene.position[index], RIPPLES[scene.roughness]
     y, x = np.mgrid[0:rows, 0:width]
     grid = np.column_stack([x.ravel(), y.ravel()]).astype(float)
 
     def rays(offset: tuple[float, float]) -> FloatArray:
         uv = tangents_from_pixel(scene.camera, grid + offset)
-        return np.asarray(np.column_stack([uv, -np.ones(len(uv))]) @ scene.rotation[index].T)
+        return np.ascontiguousarray(np.column_stack([uv, -np.ones(len(uv))]) @ scene.rotation[index].T)
 
-    def gap(t: FloatArray, d: FloatArray) -> FloatArray:
-        at = centre + t[:, None] * d
-        return np.asarray(at[:, 2] - height(scene.roughness, at[:, 0], at[:, 1]))
-
-    d = rays((0.0, 0.0))
-    first, last = (SLAB_M - centre[2]) / d[:, 2], (-SLAB_M - centre[2]) / d[:, 2]
-    above, below = first.copy(), last.copy()
-    open_rays = np.ones(len(d), dtype=bool)
-    for step in range(1, MARCH + 1):
-        t = first + (last - first) * step / MARCH
-        under = np.zeros(len(d), dtype=bool)
-        under[open_rays] = gap(t[open_rays], d[open_rays]) < 0
-        below[under] = t[under]
-        open_rays &= ~under
-        above[open_rays] = t[open_rays]
-    for _ in range(BISECT):
-        middle = (above + below) / 2
-        under = gap(middle, d) < 0
-        below, above = np.where(under, middle, below), np.where(under, above, middle)
-    centres = (above + below) / 2
+    middle = np.empty(len(grid))
+    _first_meeting(tall, long, centre, rays((0.0, 0.0)), middle)
     light = np.zeros((rows, width), dtype=np.float32)
     for offset in ((-0.25, -0.25), (0.25, -0.25), (-0.25, 0.25), (0.25, 0.25)):
-        d = rays(offset)
-        t = centres.copy()
-        for _ in range(3):  # Newton along the ray, from the middle of the pixel
-            slope = (gap(t + 1e-5, d) - gap(t, d)) / 1e-5
-            t -= np.clip(gap(t, d) / np.where(np.abs(slope) > 0.05, slope, -0.05), -0.01, 0.01)
+        d, t = rays(offset), middle.copy()
+        _nearby_meeting(tall, long, centre, d, t)
         at = (centre + t[:, None] * d)[:, :2] / render.TEXEL_M + len(skin) / 2
         at = at.astype(np.float32).reshape(rows, width, 2)
         light += cv2.remap(skin, at[..., 0], at[..., 1], cv2.INTER_LINEAR, borderValue=0.45)

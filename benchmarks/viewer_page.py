@@ -4,8 +4,9 @@
 
 Printed: time to write the page, its size, time until the scene is there (wall clock, and CPU time of all
 processes of the browser, which other programs disturb less), frames per second while it turns, and how many
-points are left out of a turning scene. Both ways of software rendering are timed: the graphics library alone
-without a graphics card, and the whole browser.
+points are left out of a turning scene; then the same with nothing drawn, which is what the browser itself
+takes. Both ways of software rendering are timed: the graphics library alone without a graphics card, and the
+whole browser.
 """
 
 from __future__ import annotations
@@ -86,6 +87,12 @@ def cpu_seconds() -> float:
     return total
 
 
+HIDE = """() => {
+  const { scene } = document.getElementById('explore').viewer
+  for (const part of scene.world.children) part.visible = false
+}"""
+
+
 def time_page(page_file: Path, browser: Any) -> None:
     """Print how long a page takes to open and to turn."""
     page = browser.new_page(viewport={"width": 1400, "height": 1000})
@@ -94,15 +101,18 @@ def time_page(page_file: Path, browser: Any) -> None:
     page.wait_for_selector("#explore[data-ready]", timeout=WAIT_MS)
     print(f"  open: {time.perf_counter() - begun:.2f} s, CPU {cpu_seconds() - cpu:.2f} s")
     page.evaluate(TURN, WARM_UP)
+    part = page.evaluate("document.getElementById('explore').viewer.scene.part ?? 1")
+    print(f"  turning: {_pace(page)}, 1 point in {part} drawn")
+    page.evaluate(HIDE)
+    print(f"  nothing drawn: {_pace(page)}")
+    page.close()
+
+
+def _pace(page: Any) -> str:
     cpu = cpu_seconds()
     milliseconds = page.evaluate(TURN, FRAMES)
-    part = page.evaluate("document.getElementById('explore').viewer.scene.part ?? 1")
     used = (cpu_seconds() - cpu) / FRAMES
-    print(
-        f"  turning: {1000 * FRAMES / milliseconds:.1f} frames per second, CPU {1000 * used:.0f} ms per "
-        f"frame, 1 point in {part} drawn"
-    )
-    page.close()
+    return f"{1000 * FRAMES / milliseconds:.1f} frames per second, CPU {1000 * used:.0f} ms per frame"
 
 
 def main() -> None:

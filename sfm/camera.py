@@ -18,6 +18,9 @@ from sfm.kernels.options import compiled
 FIXED_POINT_STEPS = 100
 PIXEL_TOLERANCE = 1e-10
 CURVATURE_STEP = 1e-3  # of tangents; a pixel or a few
+STEP_TOLERANCE = (
+    1e-11  # of tangents; what Newton's method leaves after such a step is its square, or rounding
+)
 
 
 @dataclass(frozen=True)
@@ -312,7 +315,7 @@ def _tangents(model: int, frame: FloatArray, p: FloatArray, xy: FloatArray) -> F
             u -= du
             v -= dv
             if (
-                abs(du) + abs(dv) < 1e-15 * (1.0 + abs(u) + abs(v))
+                abs(du) + abs(dv) < STEP_TOLERANCE * (1.0 + abs(u) + abs(v))
                 or abs(residual[0]) + abs(residual[1]) < PIXEL_TOLERANCE
             ):
                 solved = True

@@ -77,7 +77,7 @@ def compile_matching() -> None:
         match_points(photograph, photograph, at, method=method, search_px=41)
 
 
-PARTS = (compile_orientation, compile_adjustment, compile_targets, compile_matching)  # the longest first
+PARTS = (compile_orientation, compile_targets, compile_adjustment, compile_matching)  # the longest first
 
 
 def main(progress: Progress = SILENT) -> None:

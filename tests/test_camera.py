@@ -76,7 +76,7 @@ def test_a_model_is_a_function_and_a_row() -> None:
 
     further = Model("fisheye", fisheye, (Parameter("f", "px", Role.FOCAL),))
     assert (further.names, further.in_mm) == (("f",), False)
-    observe = one_of((*ALL, further)).py_func
+    observe = one_of((*ALL, further))
     r, Ju, Jp = np.zeros(2), np.zeros((2, 2)), np.zeros((2, MAX_PARAMETERS))
     observe(len(ALL), np.zeros(4), np.array([1000.0]), 1.0, 2.0, 0.5, -0.25, r, Ju, Jp)
     assert r == pytest.approx([1000 * np.arctan(0.5) - 1, 1000 * np.arctan(-0.25) - 2])
@@ -94,6 +94,23 @@ def test_rays_and_pixels_are_inverse(model: str) -> None:
     xy = seed_of("inverse").uniform((0, 0), SIZE_PX, (200, 2))
     uv = tangents_from_pixel(camera, xy)
     assert np.abs(pixel_from_tangents(camera, uv) - xy).max() < 1e-9
+
+
+def test_rays_are_found_where_a_model_is_badly_conditioned() -> None:
+    """A fraction of two large polynomials: rounding alone is 5e-9 px at the border, over the tolerance."""
+    names = MODELS["full_opencv"].names
+    values = (
+        2318.9480140959195, 2316.631409611496, 1150.0000265921674, 851.4999811407453,
+        -5.20101347502722, 6.529947834774356, 1.3353232903087897e-4, -1.8985929217992648e-4,
+        0.6056708355522757, -5.190179785106526, 6.472662701812773, 0.681379195975658,
+    )  # fmt: skip
+    camera = camera_from_values(
+        "mild", "full_opencv", (2272, 1704), (0.0032, 0.0032), c_mm=7.4,
+        values=tuple(zip(names, values, strict=True)),
+    )  # fmt: skip
+    x, y = np.meshgrid(np.linspace(0, 2271, 50), np.linspace(0, 1703, 50))
+    xy = np.column_stack([x.ravel(), y.ravel()])
+    assert np.abs(pixel_from_tangents(camera, tangents_from_pixel(camera, xy)) - xy).max() < 1e-6
 
 
 def test_ray_to_the_right_and_up_is_seen_right_and_up() -> None:

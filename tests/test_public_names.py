@@ -122,9 +122,9 @@ def test_every_public_name_is_explained_and_its_example_runs(
         assert doctest.DocTestRunner(optionflags=doctest.ELLIPSIS).run(example).failed == 0
 
 
-def test_what_the_readme_shows_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The first Python block of README.md, on a survey of rendered photographs."""
-    path = write_photograph_survey(tmp_path / "readme", "readme", suffix=".jpg")
+def test_what_the_page_on_python_shows_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The first Python block of docs/how-to/python.md, on a survey of rendered photographs."""
+    path = write_photograph_survey(tmp_path / "page", "page", suffix=".jpg")
     folder = path.parent
     bar = '[[scale_bar]]\nfrom = "{}"\nto = "{}"\nlength = 100.0\nsigma = 0.1\n'
     first = sfm.run_survey(sfm.read_survey(path), compare_with="none")
@@ -133,8 +133,8 @@ def test_what_the_readme_shows_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     monkeypatch.chdir(folder)
     (folder / "photo 1.jpg").rename(folder / "a.jpg")
     first.write("out/last")
-    readme = (ROOT.parent / "README.md").read_text(encoding="utf-8")
-    code = readme[readme.index("```python\n") + len("```python\n") :].split("```")[0]
+    page = (ROOT.parent / "docs" / "how-to" / "python.md").read_text(encoding="utf-8")
+    code = page[page.index("```python\n") + len("```python\n") :].split("```")[0]
     assert "sfm.change_datum(again" in code and "result.write(" in code
     for shown, own in zip(("501", "502", "503", "506"), names, strict=False):
         code = code.replace(f'"{shown}"', f'"{own}"')
@@ -143,7 +143,7 @@ def test_what_the_readme_shows_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     except ImportError:
         code = code.replace("result.points.to_pandas()", "")
     given: dict[str, object] = {}
-    exec(compile(code, "README.md", "exec"), given)
+    exec(compile(code, "python.md", "exec"), given)
     moved = given["moved"]
     assert isinstance(moved, sfm.Adjustment) and moved.datum == "minimal"
     assert (folder / "out" / "today" / "report.html").is_file()

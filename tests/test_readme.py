@@ -1,4 +1,4 @@
-"""The README keeps its word: its survey file is read, its commands exist, its folder is what is written."""
+"""README and pages keep their word: survey files are read; commands, formats, files are those there are."""
 
 from __future__ import annotations
 
@@ -6,28 +6,45 @@ import re
 import tomllib
 from pathlib import Path
 
+import typer
+
 from adapters.formats.registry import FORMATS
 from sfm.cli.app import app
+from sfm.distortion.models import MODELS
 from sfm.report.output import WRITTEN
+from sfm.runtime.faults import FAULT
 from sfm.survey.inputs.settings import Section
 from sfm.survey.inputs.survey_file import SurveyFile, read_survey_file
 from tests.places import ROOT
 
 README = (ROOT / "README.md").read_text(encoding="utf-8")
-FIRST_SCREEN = "\n".join(README.splitlines()[:30])
+DOCS = ROOT / "docs"
 
 
 def keys_of(section: type[Section]) -> set[str]:
     return {field.alias or name for name, field in section.model_fields.items()}
 
 
-def test_first_screen_has_both_commands_and_the_plain_lines() -> None:
-    for line in ("make demo", "make test", "py -m venv .venv", "pip install -c constraints.txt -e .[dev]"):
-        assert line in FIRST_SCREEN, line
+def page(name: str) -> str:
+    return (DOCS / name).read_text(encoding="utf-8")
 
 
-def test_survey_files_of_the_readme_are_read_and_show_every_key(tmp_path: Path) -> None:
-    blocks = re.findall(r"```toml\n(.*?)```", README, re.S)
+def test_readme_is_short_and_has_the_commands_to_install() -> None:
+    lines = README.splitlines()
+    assert len(lines) < 150
+    for line in ("make demo", "make test", "py -m venv .venv", "pip install -c constraints.txt -e .[all]"):
+        assert line in "\n".join(lines[:50]), line
+    for line in ("py -m venv .venv", "pip install -c constraints.txt -e .[dev]", "python -m sfm.warm_up"):
+        assert line in page("install.md"), line
+
+
+def test_what_the_readme_links_to_exists() -> None:
+    for target in re.findall(r"\]\((?!https?:)([^)#]+)", README):
+        assert (ROOT / target).is_file(), target
+
+
+def test_survey_files_of_the_examples_are_read_and_show_every_key(tmp_path: Path) -> None:
+    blocks = re.findall(r"```toml\n(.*?)```", page("reference/survey-examples.md"), re.S)
     assert blocks
     shown: dict[str, set[str]] = {}
     sections: dict[str, type[Section]] = {}
@@ -51,21 +68,62 @@ def test_commands_of_the_readme_exist() -> None:
     assert set(re.findall(r"^kolinear ([a-z]+) ", README, re.M)) == commands
 
 
-def test_formats_of_the_readme_exist() -> None:
-    line = README[README.index("Formats of `convert`") :].split("\n\n")[0]
-    named = set(re.findall(r"`([\w-]+)`", line)) - {"convert", "compare"}
-    assert named == {one.name for one in FORMATS}
+def shown_commands() -> list[str]:
+    """Return the lines of all pages that call the program, those that go on joined."""
+    pages = [ROOT / "README.md", *sorted(DOCS.rglob("*.md"))]
+    text = "\n".join(page.read_text(encoding="utf-8") for page in pages)
+    blocks = "\n".join(re.findall(r"^```(?:sh|bat)\n(.*?)^```", text, re.M | re.S)).replace("\\\n", " ")
+    return [line.partition("  #")[0] for line in blocks.splitlines() if line.startswith("kolinear ")]
+
+
+def test_commands_of_all_pages_have_the_options_that_are_shown() -> None:
+    root = typer.main.get_command(app)
+    lines = shown_commands()
+    assert len(lines) > 40
+    for line in lines:
+        words = line.split()[1:]
+        if words[0] == "COMMAND":
+            continue
+        command = root.commands[words[0]]  # type: ignore[attr-defined]
+        if hasattr(command, "commands"):
+            command = command.commands[words[1]]
+        known = {name for one in command.params for name in (*one.opts, *one.secondary_opts)} | {"--help"}
+        used = {word.partition("=")[0] for word in words if word.startswith("-") and not word[1:2].isdigit()}
+        assert used <= known, line
+
+
+def test_formats_of_the_page_are_those_there_are() -> None:
+    rows = re.findall(r"^\| `([\w-]+)` \|", page("how-to/other-programs.md"), re.M)
+    assert sorted(rows) == sorted(one.name for one in FORMATS)
 
 
 def test_everything_that_is_written_is_explained() -> None:
-    explained = set(re.findall(r"^\| `([\w.]+)/?` \|", README, re.M))
+    explained = set(re.findall(r"^\| `([\w.]+)/?` \|", page("reference/results.md"), re.M))
     assert explained == set(WRITTEN)
 
 
-def test_make_targets_of_the_readme_exist() -> None:
+def test_make_targets_of_the_pages_exist() -> None:
     makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
-    for target in set(re.findall(r"make (demo|test|study|bench)\b", README)):
+    text = README + page("install.md")
+    for target in set(re.findall(r"`?make (demo|test|docs|study|bench)\b", text)):
         assert re.search(rf"^{target}:", makefile, re.M), target
+
+
+def test_camera_models_of_the_examples_are_those_there_are() -> None:
+    table = (
+        page("reference/survey-examples.md")
+        .partition("## Camera models")[2]
+        .partition("\n`brown` in full")[0]
+    )
+    named = [
+        name for row in re.findall(r"^\| (`.*?) \|", table, re.M) for name in re.findall(r"`(\w+)`", row)
+    ]
+    assert sorted(named) == sorted(MODELS)
+
+
+def test_exit_codes_of_the_page_are_those_of_the_program() -> None:
+    codes = {int(code) for code in re.findall(r"^\| (\d+) \|", page("reference/verdict.md"), re.M)}
+    assert codes == {0, 1, 2, FAULT, 130, 141}
 
 
 def test_constraints_pin_every_requirement() -> None:

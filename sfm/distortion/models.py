@@ -30,11 +30,10 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import Any, NamedTuple
 
-from numba import njit
-
 from sfm.distortion.brown import brown, brown_affine
 from sfm.distortion.forward import brown_forward
 from sfm.distortion.opencv import full_opencv, opencv
+from sfm.kernels.options import kernel
 
 
 class Role(Enum):
@@ -151,15 +150,16 @@ def number_of(model: str) -> int:
 
 
 def one_of(models: tuple[Model, ...]) -> Callable[..., None]:
-    """Return one compiled function of all: observe(number, frame, p, x, y, u, v, residual, Ju, Jp).
+    """Return one function of all, to be compiled: observe(number, frame, p, x, y, u, v, residual, Ju, Jp).
 
     Its source, a branch for each model, is written here, because the compiler inlines the models only from
-    plain branches on their names; a chain of closures over them makes an adjustment a third slower. It has no
-    file to be cached with, so that it is compiled into its callers.
+    plain branches on their names; a chain of closures over them makes an adjustment a third slower. It is
+    compiled once and called: compiled into each of its callers it took three times as long to compile, and
+    an adjustment was no faster. This file stands for its source, so that it is kept as other kernels are.
     """
     arguments = "frame, p, x, y, u, v, residual, Ju, Jp"
     lines = [f"def observe(number, {arguments}):"]
-    names: dict[str, Any] = {}
+    names: dict[str, Any] = {"__name__": __name__}
     numbers: dict[Callable[..., None], list[int]] = {}
     for number, model in enumerate(models):
         numbers.setdefault(model.function, []).append(number)
@@ -168,9 +168,9 @@ def one_of(models: tuple[Model, ...]) -> Callable[..., None]:
         names[name] = function
         test = " or ".join(f"number == {number}" for number in own)
         lines.append(f"    {'elif' if len(lines) > 1 else 'if'} {test}: {name}({arguments})")
-    exec("\n".join(lines), names)
-    compiled: Callable[..., None] = njit(inline="always", error_model="numpy")(names["observe"])
-    return compiled
+    exec(compile("\n".join(lines), __file__, "exec"), names)
+    function_of_all: Callable[..., None] = names["observe"]
+    return function_of_all
 
 
-observe = one_of(ALL)
+observe = kernel(one_of(ALL))

@@ -17,6 +17,7 @@ import io
 import math
 import re
 from collections.abc import Iterable, Sequence
+from functools import lru_cache
 
 import numpy as np
 
@@ -88,8 +89,14 @@ def as_plain(text: str) -> str:
 
 
 def _cell(value: object) -> str:
-    if value is None:
-        return ""
     if isinstance(value, float | np.floating):
         return repr(float(value)) if math.isfinite(value) else ""
-    return as_cell(as_plain(value)) if isinstance(value, str) else str(value)
+    if isinstance(value, str):
+        return _text_cell(value)
+    return "" if value is None else str(value)
+
+
+@lru_cache(maxsize=4096)
+def _text_cell(text: str) -> str:
+    """Return the cell of a text; most are names of photographs that stand in thousands of rows."""
+    return as_cell(as_plain(text))

@@ -59,7 +59,7 @@ def assemble_result(
         taken_out=solution.taken_out,
         explanations=solution.explanations,
         other_solutions=solution.others,
-        undecided=start.remarks,
+        undecided=start.remarks + solution.undecided,
         unused_image_points=solution.unused_image_points + sum(one.image_points for one in measured.left_out),
         reject=survey.reject,
         weights=survey.adjust.weights,

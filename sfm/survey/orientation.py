@@ -69,6 +69,8 @@ def orient_survey(survey: Survey, measured: Measurements) -> Orientation:
     warnings += (*found.remarks, *([line] if line else []))
     chosen = choose_free_parameters(survey, network, found.estimate, extend=False)
     found, held = _hold_cameras_of_two(survey, network, replace(found, estimate=chosen.estimate))
+    if held and len(network.images) > 2:
+        found = replace(found, remarks=(*found.remarks, _words_of_last_two(len(network.images) - 2)))
     found = tell_lost_photographs(network, replace(found, warnings=warnings + held))
     return tell_second_objects(found, others)
 
@@ -114,6 +116,15 @@ def _hold_cameras_of_two(
                 "the standard deviations do not contain it"
             )
     return replace(found, estimate=replace(estimate, cameras=tuple(cameras))), tuple(lines)
+
+
+def _words_of_last_two(others: int) -> str:
+    """Say that the photographs which could check the camera of a pair do not fit."""
+    which = "the other photograph does" if others == 1 else f"the other {others} photographs do"
+    return (
+        f"the camera: two photographs that fit one another do not determine it, and {which} not fit at its "
+        "start values; give a calibrated camera, or add photographs between those that do not fit"
+    )
 
 
 def _judge(measured: Measurements) -> Judge | None:

@@ -25,7 +25,13 @@ from sfm.matching.epipolar import epipolar_paths
 from sfm.matching.lsm.multi_photo import match_multi
 from sfm.matching.lsm.two_photo import match_lsm
 from sfm.matching.match_flags import LsmFlag
-from sfm.matching.tracks.feature_tracks import Features, find_tie_points, link_features
+from sfm.matching.tracks.feature_tracks import (
+    Features,
+    find_tie_points,
+    joined_features,
+    link_features,
+    sift_features,
+)
 from sfm.matching.tracks.interest import foerstner_points
 from sfm.network import Estimate, ImagePoints, Network
 from sfm.orientation.relative import relative_orientations
@@ -62,6 +68,20 @@ def test_interest_points_keep_their_distance_and_number() -> None:
     assert len(foerstner_points(np.full((50, 50), 9, np.uint8))) == 0
 
 
+def test_a_weak_texture_has_features_everywhere() -> None:
+    """OpenCV's own threshold of contrast leaves a quarter of the photograph without any feature."""
+    y, x = np.mgrid[0:300, 0:400].astype(float)
+    light = 120 + (random_texture(np.random.default_rng(2), 2.0).value(x, y) - 128) * np.where(
+        x < 100, 0.08, 1.0
+    )
+    photograph = with_noise(light, 0.5, 1)
+    found = sift_features(photograph, max_features=400)
+    assert len(found) == 400
+    assert (found.xy[:, 0] < 100).sum() > 60
+    cells = np.unique((found.xy // 50).astype(int), axis=0)
+    assert len(cells) >= 46  # of 48
+
+
 def test_features_that_contradict_each_other_are_no_point() -> None:
     rng = np.random.default_rng(4)
     descriptor = rng.random((40, 128)).astype(np.float32)
@@ -80,6 +100,15 @@ def test_features_that_contradict_each_other_are_no_point() -> None:
     swapped[[0, 1]] = swapped[[1, 0]]  # two wrong matches, off their epipolar lines
     views[2] = Features(views[2].xy, views[2].scale, views[2].angle, swapped)
     assert set(np.unique(link_features(views).feature)) == set(range(2, 40))
+
+
+def test_a_wrong_match_splits_a_track_and_does_not_lose_it() -> None:
+    """One false match along the epipolar lines joins two points of three photographs each."""
+    image = np.tile(np.arange(3), 2)  # features 0, 1, 2 are one point, 3, 4, 5 the other
+    true = [[0, 1], [1, 2], [3, 4], [4, 5]]
+    assert joined_features(np.array([*true, [2, 4]]), image, 3).tolist() == [0, 0, 0, 3, 3, 3]
+    first = joined_features(np.array([[2, 4], *true]), image, 3)  # the false one is the most distinctive
+    assert all(len(set(image[first == g])) == (first == g).sum() for g in first)
 
 
 SIZE = (480, 360)

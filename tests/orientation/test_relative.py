@@ -67,6 +67,21 @@ def test_gross_errors_are_put_aside():
     assert best.sigma0 == pytest.approx(SIGMA, rel=0.3) and best.redundancy == best.inliers.sum() - 5
 
 
+@pytest.mark.parametrize("seed", range(6))
+def test_a_shallow_relief_within_a_wide_tolerance_is_not_taken_for_its_mirror_image(seed):
+    """Both orientations of the mean plane fit within the tolerance; only one has small residuals."""
+    rng = seed_of(f"shallow relief {seed}")
+    base = np.array([0.92, 0.38, 0.05]) / np.linalg.norm([0.92, 0.38, 0.05])
+    uv1 = rng.uniform(-0.15, 0.15, (200, 2))
+    depth = 12 * (1 + 0.2 * uv1[:, 0] + 0.3 * uv1[:, 1] + 0.6 * uv1[:, 0] * uv1[:, 1] - 0.8 * uv1[:, 1] ** 2)
+    points = np.c_[uv1, -np.ones(200)] * depth[:, None] - base
+    uv2 = -points[:, :2] / points[:, 2:]
+    uv1, uv2 = (uv + 1e-5 * rng.standard_normal(uv.shape) for uv in (uv1, uv2))
+    best = relative_orientations(uv1, uv2, tolerance=1e-3)[0]
+    assert best.kind == "spatial" and best.sigma0 == pytest.approx(1e-5, rel=0.2)
+    assert error_of(best, base, np.eye(3)) < 0.05
+
+
 def test_both_solutions_of_a_plane_fit_and_a_third_photograph_decides():
     rng = seed_of("plane")
     uv1, uv2, base, R, points = two_photographs(rng, 4, "planar", sigma=0)

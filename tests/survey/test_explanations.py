@@ -100,6 +100,11 @@ def test_photographs_of_one_camera_are_alike() -> None:
         assert two_groups(network, adjusted(network, truth, ("c", "x0", "y0", "K1")).estimate) is None
 
 
+def test_photographs_of_few_points_have_no_vote() -> None:
+    network, truth = make_network(seed_of("few points"), images=4, points=7)
+    assert two_groups(network, truth) is None
+
+
 def test_a_pair_with_a_camera_at_wrong_start_values_is_bad() -> None:
     """Most of the error of c and K1 goes into the depth: sigma0 2.6 alone says only that it was too small."""
     network, truth = make_network(seed_of("wrong pair"), images=2, points=40, free=("c", "K1"))

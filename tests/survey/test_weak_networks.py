@@ -35,6 +35,20 @@ def test_two_photographs_of_a_plane_are_bad() -> None:
     assert found.level == "bad" and any("Not decided" in line for line in found.remarks)
 
 
+def test_c_that_had_to_be_held_and_does_not_fit_is_bad() -> None:
+    """A plane, c 23 % too short: 5.4 sigma wrong and called fair, with sigma0 1.9 times the expected."""
+    found = outcome_of(141)
+    assert found.over_sigma > 5 and found.level == "bad"
+    assert found.remarks[0].startswith("Not decided: c of camera synthetic: it had to be held")
+
+
+def test_two_photographs_that_the_third_contradicts_are_bad() -> None:
+    """c given 4.9 times too long: 12 sigma wrong and called fair, since nothing could check c."""
+    found = outcome_of(99)
+    assert found.over_sigma > 5 and found.level == "bad"
+    assert found.remarks[0].startswith("Not decided: the camera: two photographs that fit one another")
+
+
 def test_a_narrow_relief_can_be_turned_inside_out() -> None:
     """Three photographs with a long lens from within 4 degrees: the reflected object fits as well."""
     network, truth = make_network(seed_of("narrow"), images=3, points=20, planar=True, free=())

@@ -22,7 +22,8 @@ from sfm.adjustment.engine.observed_unknowns import Weighted, bar_directions, ex
 from sfm.adjustment.engine.unknowns import Unknowns
 from sfm.conventions import BoolArray, FloatArray
 from sfm.errors import GeometryError
-from sfm.similarity import mean_distance, similarity_motions
+from sfm.kernels.options import kernel
+from sfm.similarity import mean_distance
 
 DETERMINED = 1e-9  # relative effect on an observed unknown above which it takes part in the datum
 
@@ -108,14 +109,25 @@ def free_motions(layout: Unknowns, state: State) -> tuple[FloatArray, FloatArray
     """
     cloud = state.points[layout.point_on]
     centre, size = cloud.mean(axis=0), max(mean_distance(cloud), np.finfo(float).tiny)
-
-    def motion(xyz: FloatArray) -> FloatArray:
-        return similarity_motions(np.where(np.isfinite(xyz), xyz, centre), centre=centre, size=size)
-
-    exterior = np.zeros((len(state.position), 6, 7))
-    exterior[:, :3] = motion(state.position)
+    exterior, points = np.zeros((len(state.position), 6, 7)), np.zeros((len(state.points), 3, 7))
+    _fill_motions(state.position, centre, size, exterior)
+    _fill_motions(state.points, centre, size, points)
     exterior[:, 3:, 3:6] = state.M / size
-    return exterior, motion(state.points)
+    return exterior, points
+
+
+@kernel
+def _fill_motions(xyz: FloatArray, centre: FloatArray, size: float, motions: FloatArray) -> None:
+    """Fill the motions of points (n, 3 or more, 7) by `similarity_motions`; the unknown ones only shift."""
+    for i in range(len(xyz)):
+        known = np.isfinite(xyz[i, 0]) and np.isfinite(xyz[i, 1]) and np.isfinite(xyz[i, 2])
+        x = (xyz[i, 0] - centre[0]) / size if known else 0.0
+        y = (xyz[i, 1] - centre[1]) / size if known else 0.0
+        z = (xyz[i, 2] - centre[2]) / size if known else 0.0
+        motions[i, 0, 0] = motions[i, 1, 1] = motions[i, 2, 2] = 1.0
+        motions[i, 0, 4], motions[i, 0, 5], motions[i, 0, 6] = z, -y, x
+        motions[i, 1, 3], motions[i, 1, 5], motions[i, 1, 6] = -z, x, y
+        motions[i, 2, 3], motions[i, 2, 4], motions[i, 2, 6] = y, -x, z
 
 
 def minimal_coordinates(motions: FloatArray, points: FloatArray, on: BoolArray) -> FloatArray:
@@ -136,10 +148,13 @@ def minimal_coordinates(motions: FloatArray, points: FloatArray, on: BoolArray) 
 
 
 def _regular_inverse(BH: FloatArray) -> FloatArray:
-    singular = np.linalg.svd(BH, compute_uv=False)
-    if not singular[-1] > DETERMINED * singular[0]:
+    try:
+        inverse = np.asarray(np.linalg.inv(BH))
+    except np.linalg.LinAlgError:
+        inverse = np.full_like(BH, np.inf)
+    if not np.linalg.norm(BH) * np.linalg.norm(inverse) * DETERMINED < 1.0:
         raise GeometryError("datum: the datum points cannot fix position, attitude and scale of the network")
-    return np.asarray(np.linalg.inv(BH))
+    return inverse
 
 
 def _seen_by_datum(

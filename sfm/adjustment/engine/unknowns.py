@@ -16,9 +16,11 @@ from sfm.adjustment.engine.collinearity import Observations, State, behind_camer
 from sfm.adjustment.engine.ordering import by_point, whitening_of
 from sfm.adjustment.result import scaled_covariance
 from sfm.camera import Camera
-from sfm.conventions import BoolArray, FloatArray, IntArray, angles_from_rotation, rotation_from_vector
+from sfm.conventions import BoolArray, FloatArray, IntArray, angles_from_rotation
 from sfm.distortion.models import MAX_PARAMETERS
 from sfm.errors import GeometryError
+from sfm.kernels.options import compiled
+from sfm.kernels.small_algebra import turn
 from sfm.network import Estimate, Network
 
 MIN_RAYS = 2  # per object point that is not known otherwise
@@ -183,15 +185,23 @@ def step(layout: Unknowns, state: State, reduced: FloatArray, points: FloatArray
     """
     m = len(state.position)
     exterior = reduced[: 6 * m].reshape(m, 6)
-    parameters = state.parameters.copy()
+    M, parameters = np.empty_like(state.M), state.parameters.copy()
+    _turn(state.M, exterior, M)
     for a, (free, column) in enumerate(zip(layout.interior_free, layout.interior_column, strict=True)):
         parameters[a, free] += reduced[column]
     return State(
         state.position + exterior[:, :3],
-        np.ascontiguousarray(rotation_from_vector(-exterior[:, 3:]) @ state.M),
+        M,
         parameters,
         state.points + points,
     )
+
+
+@compiled
+def _turn(M: FloatArray, exterior: FloatArray, turned: FloatArray) -> None:
+    """Fill turned (m, 3, 3) = exp(-[w]x) M, the inverse of R exp([w]x), with the steps (m, 6) of X0, w."""
+    for i in range(len(M)):
+        turn(M[i].T, exterior[i, 3], exterior[i, 4], exterior[i, 5], turned[i].T)
 
 
 def estimate_of(state: State, estimate: Estimate) -> Estimate:

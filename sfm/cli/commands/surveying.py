@@ -59,7 +59,7 @@ PicturesMb = Annotated[
         help="What the photographs and crops inside report.html may take; the rest lies in pictures/.",
     ),
 ]
-Verbose = Annotated[bool, typer.Option("--verbose", "-v", help="Tell more: every photograph and warning.")]
+Verbose = Annotated[bool, typer.Option("--verbose", "-v", help="Print more: every photograph and warning.")]
 AllowOutside = Annotated[
     bool,
     typer.Option(
@@ -74,7 +74,7 @@ Calibration = Annotated[
     typer.Option(
         "--camera",
         metavar="RESULT",
-        help="Hold the interior orientation at that of an earlier result, by the names of the cameras.",
+        help="Hold the interior orientation at that of an earlier result; cameras are matched by name.",
     ),
 ]
 Weighted = Annotated[
@@ -191,6 +191,7 @@ def _run_survey(
         from sfm.runtime.cores import cores
         from sfm.runtime.progress_bar import drawn_progress
         from sfm.survey.inputs.calibration import Calibration, read_calibrations
+        from sfm.survey.inputs.photograph_list import find_photographs
         from sfm.survey.inputs.survey import survey_of_file, with_calibration
         from sfm.survey.inputs.survey_file import read_survey_file
         from sfm.survey.measuring.target_store import TargetStore
@@ -221,6 +222,8 @@ def _run_survey(
         raise KolinearError("--camera-weighted: expected --camera RESULT with it")
     others = programs_of(survey.compare.backend, survey.compare.baseline)
     folder = _folder(survey, out)
+    if from_photographs:
+        find_photographs(survey, images_dir=images)  # a wrong folder is told before anything is compiled
     compile_first()
     workers = (jobs or cores()) if from_photographs else 1
     store = None
@@ -289,8 +292,8 @@ def batch(
 ) -> None:
     """Run many surveys side by side, each to its own report.
 
-    One table tells them all.  Exit code 0 if every survey has a dependable result, else 1; 70 if one came
-    upon a fault of the program; 2 where a person must put something right.
+    One table lists them all.  Exit code 0 if every survey has a dependable result, else 1; 70 if one met
+    a fault of the program; 2 where a person must put something right.
     """
     if cluster is not None and jobs is not None:
         raise KolinearError("--jobs is for processes on this computer, --cluster brings its own workers")

@@ -17,9 +17,11 @@ import numpy as np
 
 from sfm.conventions import AnyArray, FloatArray, IntArray
 from sfm.errors import GeometryError
+from sfm.kernels.options import compiled
 from sfm.matching.lsm.two_photo import match_lsm
 from sfm.matching.radiometry import FULL_SCALE_8, full_scale, grey_of
 from sfm.matching.tracks.interest import foerstner_points
+from sfm.matching.tracks.overlap import connected_parts, overlapping_pairs
 from sfm.network import rows_of
 
 DETECTORS = ("foerstner", "sift")
@@ -29,6 +31,13 @@ MIN_PAIR_MATCHES = 20  # with fewer the epipolar geometry of a pair is not trust
 RANSAC_CONFIDENCE, RANSAC_TRIALS = 0.999, 5000
 WINDOW_PX = 15  # larger ones are less noisy, but a curved surface is no affine warp over them
 SNAP_PX = 6.0  # an interest point this close to a feature takes its place
+# Contrast of a feature over the full scale; OpenCV's 0.04 leaves a fifth of what a weak natural texture has.
+# Lowe (2004) has 0.03 of the range 0 to 1, before the division by the layers of an octave.
+MIN_CONTRAST = 0.01
+# Features are looked for in a picture of at most this side, and of half the photograph's: they start the
+# matching, which measures in the photograph itself. Where such a picture has too few, in finer ones.
+MAX_SIDE_PX = 1600
+CELLS = 12  # along the longer side of a photograph: each cell has its share of the features
 
 
 @dataclass(frozen=True)
@@ -72,7 +81,7 @@ def find_tie_points(
     *,
     detector: str = "foerstner",
     window_px: int = WINDOW_PX,
-    max_features: int = 4000,
+    max_features: int = 2000,
     min_rays: int = 3,
     min_correlation: float = 0.7,
     seed: int = 0,
@@ -84,7 +93,7 @@ def find_tie_points(
         photographs: (H, W), 8 or 16 bit, grey or colour, m of them.
         detector: foerstner moves each point to the best interest point nearby, sift leaves it.
         window_px: odd side of the window of least squares matching.
-        max_features: of each photograph, the strongest ones.
+        max_features: of each photograph, the strongest ones of all its parts.
         min_rays: fewest photographs of a point.
         min_correlation: smallest coefficient r of a match.
         seed: of the random samples.
@@ -119,31 +128,72 @@ def find_tie_points(
     )
 
 
-def sift_features(photograph: AnyArray, *, max_features: int = 4000) -> Features:
-    """Return SIFT features with root-normalised descriptors.
+def sift_features(photograph: AnyArray, *, max_features: int = 2000) -> Features:
+    """Return SIFT features with root-normalised descriptors, spread over the photograph.
+
+    Args:
+        photograph: (H, W), 8 or 16 bit, grey or colour.
+        max_features: of more, every cell of a raster keeps its strongest.
 
     Source: Lowe (2004), IJCV 60(2); Arandjelovic and Zisserman (2012), CVPR (square roots).
     """
     grey = grey_of(photograph) * (FULL_SCALE_8 / full_scale(photograph))
     eight_bit = np.rint(np.clip(grey, 0, FULL_SCALE_8)).astype(np.uint8)
-    points, descriptor = cv2.SIFT.create(nfeatures=max_features).detectAndCompute(eight_bit, None)
+    shrink = 2
+    while max(grey.shape) > shrink * MAX_SIDE_PX:
+        shrink *= 2
+    sift = cv2.SIFT.create(contrastThreshold=MIN_CONTRAST, enable_precise_upscale=True)
+    while True:
+        height, width = (max(1, side // shrink) for side in grey.shape)
+        # whole blocks of pixels: what is left at the border belongs to none
+        whole = eight_bit[: height * shrink, : width * shrink]
+        picture = cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA)
+        points = sift.detect(picture, None)
+        if shrink == 1 or len(points) >= max_features:
+            break
+        shrink //= 2
+    xy = np.array([p.pt for p in points], dtype=float).reshape(-1, 2)
+    kept = _spread_out(xy, np.array([p.response for p in points]), picture.shape, max_features)
+    points, descriptor = sift.compute(picture, [points[k] for k in kept.tolist()])
     if descriptor is None:
         descriptor = np.zeros((0, 128), np.float32)
     norm = np.maximum(descriptor.sum(axis=1, keepdims=True), 1e-12)
+    xy = np.array([p.pt for p in points], dtype=float).reshape(-1, 2)
     return Features(
-        np.array([p.pt for p in points], dtype=float).reshape(-1, 2),
-        np.array([p.size for p in points], dtype=float),
+        shrink * (xy + 0.5) - 0.5,
+        shrink * np.array([p.size for p in points], dtype=float),
         np.radians([p.angle for p in points]),
         np.sqrt(descriptor / norm),
     )
 
 
+def _spread_out(xy: FloatArray, strength: FloatArray, shape: tuple[int, ...], most: int) -> IntArray:
+    """Return the rows of the features to keep: the strongest of every cell, then the next ones, up to `most`.
+
+    Args:
+        xy: features, px, (k, 2).
+        strength: of each, (k,).
+        shape: of the photograph, (H, W).
+        most: how many are kept.
+    """
+    cell_px = max(shape) / CELLS
+    cell = (xy[:, 1] // cell_px).astype(np.int64) * (CELLS + 1) + (xy[:, 0] // cell_px).astype(np.int64)
+    order = np.lexsort((-strength, cell))
+    starts = np.searchsorted(cell[order], cell[order])
+    rank = np.arange(len(order)) - starts  # place of each feature in its cell
+    chosen = order[np.lexsort((-strength[order], rank))][:most]
+    return np.sort(chosen)
+
+
 def link_features(
     features: Sequence[Features], *, min_rays: int = 3, seed: int = 0, threads: int = 1
 ) -> Tracks:
-    """Match the features of all pairs of photographs and put together what belongs to one point.
+    """Match the features of photographs that overlap and put together what belongs to one point.
 
-    A point with two features in one photograph is none and is left out.
+    Where the matches leave the photographs in several parts, all pairs between these are matched, too.
+
+    A point has one feature in a photograph: matches are taken the most distinctive first, and one that would
+    put two features of a photograph together is left: a wrong match splits a track and does not lose it.
 
     Args:
         features: of m photographs.
@@ -152,30 +202,80 @@ def link_features(
         threads: pairs worked on at a time.
     """
     first = np.concatenate([[0], np.cumsum([len(one) for one in features])]).astype(np.int64)
-    pairs = [(i, j) for i in range(len(features)) for j in range(i + 1, len(features))]
+    pairs = overlapping_pairs([one.descriptor for one in features], [one.scale for one in features])
     with ThreadPoolExecutor(max(1, threads)) as pool:
-        matched = list(pool.map(lambda p: match_features(features[p[0]], features[p[1]], seed=seed), pairs))
-    parent = np.arange(first[-1])
-    for (i, j), rows in zip(pairs, matched, strict=True):
-        for a, b in rows + np.array([first[i], first[j]]):
-            parent[_root(parent, a)] = _root(parent, b)
-    root = np.array([_root(parent, a) for a in range(len(parent))], dtype=np.int64)
+
+        def matched_pairs(of: IntArray) -> list[tuple[IntArray, FloatArray]]:
+            return list(pool.map(lambda p: _matched(features[p[0]], features[p[1]], seed=seed), of))
+
+        matched = matched_pairs(pairs)
+        linked = pairs[np.array([len(rows) > 0 for rows, _ in matched], dtype=bool)]
+        part = connected_parts(linked, len(features))
+        if part.max(initial=0):
+            rest = np.column_stack(np.triu_indices(len(features), 1))
+            tried = np.isin(rest @ [len(features), 1], pairs @ [len(features), 1])
+            rest = rest[~tried & (part[rest[:, 0]] != part[rest[:, 1]])]
+            pairs, matched = np.concatenate([pairs, rest]), matched + matched_pairs(rest)
+    edges = [np.zeros((0, 2), dtype=np.int64)]
+    edges += [
+        rows + np.array([first[i], first[j]])
+        for (i, j), (rows, _) in zip(pairs.tolist(), matched, strict=True)
+    ]
+    edge = np.concatenate(edges)
+    distinct = np.concatenate([np.zeros(0), *(one for _, one in matched)])
     image = np.repeat(np.arange(len(features)), np.diff(first))
-    _, group = np.unique(root, return_inverse=True)
-    size = np.bincount(group)
-    several = np.unique(group * len(features) + image)  # pairs of group and photograph, each once
-    photographs = np.bincount(several // len(features), minlength=len(size))
-    keep = ((photographs == size) & (size >= min_rays))[group]
-    rows = np.flatnonzero(keep)
+    group = joined_features(edge[np.argsort(-distinct, kind="stable")], image, len(features))
+    size = np.bincount(group, minlength=len(group))
+    rows = np.flatnonzero(size[group] >= min_rays)
     _, point = np.unique(group[rows], return_inverse=True)
     order = np.argsort(point, kind="stable")
     rows = rows[order]
     return Tracks(image[rows], rows - first[image[rows]], point[order])
 
 
+@compiled
+def joined_features(edge: IntArray, image: IntArray, m: int) -> IntArray:
+    """Return the group of every feature, the first one's number, no photograph twice in any, (k,).
+
+    Args:
+        edge: matches, the most distinctive first, (e, 2).
+        image: photograph of each feature, (k,).
+        m: number of photographs.
+    """
+    k = len(image)
+    group, following, last = np.arange(k), np.full(k, -1), np.arange(k)
+    stamp = np.full(m, -1)
+    for e in range(len(edge)):
+        a, b = group[edge[e, 0]], group[edge[e, 1]]
+        if a == b:
+            continue
+        one = a
+        while one >= 0:
+            stamp[image[one]] = e
+            one = following[one]
+        free, one = True, b
+        while one >= 0 and free:
+            free = stamp[image[one]] != e
+            one = following[one]
+        if not free:
+            continue
+        one = b
+        while one >= 0:
+            group[one] = a
+            one = following[one]
+        following[last[a]] = b
+        last[a] = last[b]
+    return group
+
+
 def match_features(a: Features, b: Features, *, seed: int = 0) -> IntArray:
     """Return pairs of features (k, 2) that choose each other and obey one epipolar geometry."""
-    none = np.zeros((0, 2), dtype=np.int64)
+    return _matched(a, b, seed=seed)[0]
+
+
+def _matched(a: Features, b: Features, *, seed: int) -> tuple[IntArray, FloatArray]:
+    """Return such pairs, and 1 - the ratio of the distances to the nearest and second-nearest one, (k,)."""
+    none = np.zeros((0, 2), dtype=np.int64), np.zeros(0)
     if min(len(a), len(b)) < MIN_PAIR_MATCHES:
         return none
     similarity = a.descriptor @ b.descriptor.T
@@ -185,7 +285,9 @@ def match_features(a: Features, b: Features, *, seed: int = 0) -> IntArray:
     similarity[rows, forth[rows]] = -1.0
     second = similarity[rows].max(axis=1)
     # of unit vectors the squared distance is 2 - 2 s
-    rows = rows[1 - best < RATIO**2 * (1 - second)]
+    clear = 1 - best < RATIO**2 * (1 - second)
+    rows, best, second = rows[clear], best[clear], second[clear]
+    distinct = 1 - np.sqrt(np.maximum(1 - best, 0.0) / np.maximum(1 - second, 1e-12))
     found = np.column_stack([rows, forth[rows]])
     if len(found) < MIN_PAIR_MATCHES:
         return none
@@ -200,7 +302,8 @@ def match_features(a: Features, b: Features, *, seed: int = 0) -> IntArray:
     )
     if fits is None or fits.sum() < MIN_PAIR_MATCHES:
         return none
-    return np.asarray(found[fits.ravel() > 0], dtype=np.int64)
+    kept = fits.ravel() > 0
+    return np.asarray(found[kept], dtype=np.int64), np.asarray(distinct[kept], dtype=float)
 
 
 def measure_tracks(
@@ -230,7 +333,6 @@ def measure_tracks(
         min_correlation: smallest coefficient r of a match.
         threads: patches worked on at a time.
     """
-    greys = [grey_of(one) for one in photographs]
     xy = np.array([features[i].xy[f] for i, f in zip(tracks.image, tracks.feature, strict=True)])
     scale = np.array([features[i].scale[f] for i, f in zip(tracks.image, tracks.feature, strict=True)])
     angle = np.array([features[i].angle[f] for i, f in zip(tracks.image, tracks.feature, strict=True)])
@@ -254,11 +356,14 @@ def measure_tracks(
     pairs, pair = np.unique(
         np.column_stack([tracks.image[ref], tracks.image])[others], axis=0, return_inverse=True
     )
+    template = -1
     for (i, j), own in zip(pairs.tolist(), rows_of(pair.ravel(), len(pairs)), strict=False):
         rows = others[own]
+        if i != template:  # pairs come reference by reference: two photographs at a time are enough
+            template, left = i, grey_of(photographs[i])
         found = match_lsm(
-            greys[i],
-            greys[j],
+            left,
+            grey_of(photographs[j]),
             place[tracks.point[rows]],
             start[rows],
             window_px=window_px,
@@ -298,11 +403,3 @@ def _snapped(xy: FloatArray, corners: FloatArray) -> FloatArray:
         return xy
     near = ((xy[:, None] - corners[None]) ** 2).sum(axis=2) < SNAP_PX**2
     return np.where(near.any(axis=1)[:, None], corners[near.argmax(axis=1)], xy)
-
-
-def _root(parent: IntArray, a: int) -> int:
-    """Return the representative of a feature's point, and shorten the way to it."""
-    while parent[a] != a:
-        parent[a] = parent[parent[a]]
-        a = parent[a]
-    return int(a)

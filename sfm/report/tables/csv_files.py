@@ -132,10 +132,10 @@ def target_rows(findings: Findings) -> Iterable[Sequence[object]]:
     """
     result = findings.result
     seen, names = result.seen_targets, result.network.images
-    xy, axes = np.round(seen.xy, 4), np.round(seen.ellipse[:, :2], 4)
-    angle = np.round(np.rad2deg(seen.ellipse[:, 2]), 3)
-    for k, reason in enumerate(seen.reason):
-        yield (names[seen.image[k]], *xy[k], *axes[k], angle[k], reason or MEASURED)
+    angle_deg = np.rad2deg(seen.ellipse[:, 2:])
+    rounded = np.hstack([np.round(seen.xy, 4), np.round(seen.ellipse[:, :2], 4), np.round(angle_deg, 3)])
+    for image, row, reason in zip(seen.image.tolist(), rounded.tolist(), seen.reason, strict=True):
+        yield (names[image], *row, reason or MEASURED)
 
 
 def left_out_rows(findings: Findings) -> Iterable[Sequence[object]]:

@@ -86,6 +86,7 @@ class Solution:
     others: tuple[OtherSolution, ...]  # that the image points allow as well
     notes: tuple[str, ...]  # what was chosen where the survey says nothing, one line each
     explanations: tuple[Explanation, ...]  # of large residuals, tried on the finished network
+    undecided: tuple[str, ...] = ()  # what the photographs contradict and do not determine, one line each
 
 
 def refine(network: Network, estimate: Estimate) -> Estimate:
@@ -124,6 +125,7 @@ def solve_survey(survey: Survey, matched: Correspondences) -> Solution:
         # every bar is against the control: nothing says which of the two is right
         taken_out = tuple(replace(one, resolved=False) for one in taken_out)
     lines = (*start.warnings, *solved.warnings)
+    explanations = explain_residuals(final)
     return Solution(
         final,
         solved.check,
@@ -135,7 +137,8 @@ def solve_survey(survey: Survey, matched: Correspondences) -> Solution:
         free_network_of(final),
         solved.others,
         start.notes,
-        explain_residuals(final),
+        explanations,
+        _contradicted(solved.c_held, explanations),
     )
 
 
@@ -167,6 +170,7 @@ class _Solved:
     treated: Treated | None
     taken_out: tuple[TakenOut, ...]
     warnings: tuple[str, ...]
+    c_held: tuple[str, ...]  # cameras whose c was to be free and had to be held
 
 
 def _prepared(survey: Survey, matched: Correspondences) -> _Prepared:
@@ -236,8 +240,8 @@ def _solved(start: _Prepared) -> _Solved:
             task = without_contradiction(task, found, settled.accepted)
             continue
         # c that had to be held is nobody's calibration: what its other values give is another solution
-        c_held = any(one.name in asked and not one.free[0] for one in final.estimate.cameras)
-        others = other_solutions(final, follow_c=c_held)
+        c_held = tuple(one.name for one in final.estimate.cameras if one.name in asked and not one.free[0])
+        others = other_solutions(final, follow_c=bool(c_held))
         if first is not None and not final.converged:  # what seemed better is none: as it was
             (settled, final, check, others), better = first, ()
             break
@@ -256,6 +260,17 @@ def _solved(start: _Prepared) -> _Solved:
         treated,
         tuple(taken_out),
         (*own, *contradictions, *better, *held),
+        c_held,
+    )
+
+
+def _contradicted(held: tuple[str, ...], explanations: tuple[Explanation, ...]) -> tuple[str, ...]:
+    """Return a line where the residuals have a cause and c had to be held at a value that nobody measured."""
+    if not held or not explanations or not explanations[0].explains:
+        return ()
+    return (
+        f"c of camera {', '.join(held)}: it had to be held at its start value, and the residuals say that "
+        "something does not fit; give a calibrated camera, or add photographs at larger angles",
     )
 
 

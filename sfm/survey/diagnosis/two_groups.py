@@ -57,15 +57,15 @@ def two_groups(network: Network, estimate: Estimate) -> TwoGroups | None:
         _votes(network, estimate, np.flatnonzero(network.camera == index).tolist())
         for index in range(len(estimate.cameras))
     ]
-    found = [one for vote in votes if (one := _clusters(vote, len(network.images))) is not None]
+    found = [one for vote in votes if vote and (one := _clusters(vote, len(network.images))) is not None]
     return min(found, key=lambda one: one.probability, default=None)
 
 
-def _votes(network: Network, estimate: Estimate, images: list[int]) -> _Votes:
-    """Return what each photograph says of an interior orientation of its own."""
+def _votes(network: Network, estimate: Estimate, images: list[int]) -> _Votes | None:
+    """Return what each photograph says of an interior orientation of its own; None if none has the points."""
     seen = network.image_points
     rows_by_image = rows_of(seen.image, len(network.images))
-    used, N, g, squares, count = [], [], [], [], 0
+    used, N, g, squares = [], [], [], []
     for i in images:
         rows = rows_by_image[i]
         camera = estimate.cameras[network.camera[i]]
@@ -81,10 +81,10 @@ def _votes(network: Network, estimate: Estimate, images: list[int]) -> _Votes:
         N.append(own.T @ own)
         g.append(own.T @ v)
         squares.append(float(np.median(np.abs(v))))
-        count += 1
-    sigma = max(float(np.median(squares)) / 0.6745, np.finfo(float).tiny) if count else 1.0
-    p = N[0].shape[0] if count else 0
-    return _Votes(used, np.array(N).reshape(-1, p, p) / sigma**2, np.array(g).reshape(-1, p) / sigma**2)
+    if not used:
+        return None
+    sigma = max(float(np.median(squares)) / 0.6745, np.finfo(float).tiny)
+    return _Votes(used, np.array(N) / sigma**2, np.array(g) / sigma**2)
 
 
 def _equations(

@@ -1,0 +1,159 @@
+"""docs/symptoms.md has every message: each remark, warning and error matches an entry, each entry a message.
+
+An entry is text in backticks in the first column of a table, … stands for what varies. The messages are read
+from the source: what every error of `sfm.errors` and every remark says, and the sentences of the rooms that
+judge a survey.
+"""
+
+from __future__ import annotations
+
+import ast
+import re
+from collections.abc import Iterator
+
+import pytest
+
+from sfm import errors
+from sfm.targets.flags import Flag
+from tests.places import ROOT
+
+VARIES = "…"
+MIN_WORDS = 4  # of what the rooms below say; shorter texts are parts of sentences, keys and units
+JUDGING = (
+    "sfm/report/findings/verdicts",
+    "sfm/report/findings/other_adjuster.py",
+    "sfm/survey/adjusting",
+    "sfm/survey/circles.py",
+    "sfm/survey/diagnosis",
+    "sfm/survey/drafting/camera_groups.py",
+    "sfm/survey/measuring/other_sizes.py",
+    "sfm/survey/measuring/photographs.py",
+    "sfm/survey/orientation.py",
+    "sfm/survey/other_programs.py",
+    "sfm/survey/inputs/checks/incomplete_cameras.py",
+    "sfm/survey/inputs/checks/repeated_image_points.py",
+    "sfm/survey/inputs/checks/settings_errors.py",
+    "sfm/orientation/incremental",
+    "sfm/pipeline.py",
+)
+ERRORS = {name for name, value in vars(errors).items() if isinstance(value, type)}
+PAGE = (ROOT / "docs" / "symptoms.md").read_text(encoding="utf-8")
+
+
+def text_of(node: ast.expr) -> str:
+    """Return what a message says, … for what varies."""
+    if isinstance(node, ast.Constant):
+        return node.value if isinstance(node.value, str) else VARIES
+    if isinstance(node, ast.JoinedStr):
+        return "".join(text_of(one) for one in node.values)
+    if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Add):
+        return text_of(node.left) + text_of(node.right)
+    return VARIES
+
+
+def words(text: str) -> int:
+    return len(re.findall(r"[A-Za-z0-9]{2,}", text))
+
+
+def called(node: ast.Call) -> str:
+    return node.func.id if isinstance(node.func, ast.Name) else getattr(node.func, "attr", "")
+
+
+def trees(*places: str) -> Iterator[tuple[str, ast.Module]]:
+    for place in places:
+        path = ROOT / place
+        assert path.exists(), f"{place} is not there any more: name where its messages went"
+        for file in [path] if path.is_file() else sorted(path.rglob("*.py")):
+            yield str(file.relative_to(ROOT)), ast.parse(file.read_text(encoding="utf-8"))
+
+
+def error_messages(tree: ast.Module) -> Iterator[tuple[int, str]]:
+    """Yield what errors say, and what is put into a list of remarks."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Call) and node.args:
+            target = node.func.value if isinstance(node.func, ast.Attribute) else None
+            is_remark = isinstance(target, ast.Name) and target.id == "remarks" and called(node) == "append"
+            if is_remark or called(node) in ERRORS:
+                yield node.lineno, text_of(node.args[0])
+
+
+def sentences(tree: ast.Module) -> Iterator[tuple[int, str]]:
+    """Yield the texts outside of docstrings, and outside of errors and longer texts."""
+    inside: set[int] = set()
+    for node in ast.walk(tree):
+        is_error = isinstance(node, ast.Call) and called(node) in ERRORS
+        is_docstring = isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant)
+        if is_error or is_docstring or isinstance(node, ast.JoinedStr):
+            inside |= {id(one) for one in ast.walk(node) if one is not node}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.JoinedStr | ast.Constant) and id(node) not in inside:
+            text = text_of(node)
+            if words(text) >= MIN_WORDS:
+                yield node.lineno, text
+
+
+def messages() -> dict[str, str]:
+    """Return where each message stands, by message."""
+    found: dict[str, str] = {}
+    for file, tree in trees("sfm", "adapters"):
+        found |= {text: f"{file}:{line}" for line, text in error_messages(tree) if words(text) >= 2}
+    for file, tree in trees(*JUDGING):
+        found |= {text: f"{file}:{line}" for line, text in sentences(tree)}
+    return found
+
+
+def entries() -> list[str]:
+    """Return the texts in backticks of the first columns, but for those of the candidates."""
+    rows = re.findall(r"^\| (.+?) \| ", PAGE.partition("## Candidates")[0], re.M)
+    return [phrase for row in rows for phrase in re.findall(r"`([^`]+)`", row)]
+
+
+def pattern_of(entry: str) -> re.Pattern[str]:
+    """Return what finds an entry in a message, as whole words."""
+    inner = ".*".join(re.escape(part) for part in entry.split(VARIES))
+    before, after = (r"\b" if one.isalnum() else "" for one in (entry[0], entry[-1]))
+    return re.compile(before + inner + after, re.S)
+
+
+MESSAGES, ENTRIES = messages(), entries()
+
+
+def test_every_message_has_an_entry() -> None:
+    assert len(MESSAGES) > 600
+    patterns = [pattern_of(entry) for entry in ENTRIES]
+    missing = [
+        f"{place}: {text}"
+        for text, place in MESSAGES.items()
+        if not any(one.search(text) for one in patterns)
+    ]
+    assert not missing, "docs/symptoms.md has no entry for\n" + "\n".join(missing)
+
+
+def test_every_entry_is_a_message() -> None:
+    wrong = [
+        entry
+        for entry in ENTRIES
+        if not any(pattern_of(entry).search(text) for text in MESSAGES) or words(entry) < 1
+    ]
+    assert not wrong, "no message of the program is\n" + "\n".join(wrong)
+    assert len(set(ENTRIES)) == len(ENTRIES)
+
+
+def test_every_reason_against_a_candidate_is_explained() -> None:
+    table = PAGE.partition("## Candidates")[2]
+    named = re.findall(r"^\| `([a-z ]+)` \|", table, re.M)
+    assert named == [str(one.name).lower().replace("_", " ") for one in Flag if one.value]
+
+
+@pytest.mark.parametrize(
+    "code",
+    [
+        'remarks.append("a new one")',
+        'raise GeometryError(f"a new one of {n}")',
+        'raise errors.OutputError("a new one")',
+    ],
+)
+def test_a_new_message_is_seen_and_has_no_entry(code: str) -> None:
+    said = [text for _, text in error_messages(ast.parse(code))]
+    assert len(said) == 1 and said[0].startswith("a new one")
+    assert not any(pattern_of(entry).search(said[0]) for entry in ENTRIES)
