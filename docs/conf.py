@@ -10,13 +10,30 @@ sys.path.insert(0, str(Path(__file__).parent))
 
 project = "Kolinear"
 release = version = version_of("kolinear")
-extensions = ["myst_parser", "generated", "functions", "drawings", "formulas"]
+extensions = ["myst_nb", "generated", "functions", "drawings", "formulas", "links"]
 html_theme = "pydata_sphinx_theme"
 html_math_renderer = "mathml"
 myst_enable_extensions = ["dollarmath"]
 myst_heading_anchors = 3
 exclude_patterns = ["_build"]
+nb_execution_mode = "force"  # each notebook is run when the site is built, by the program as it is
+nb_execution_raise_on_error = True
+nb_execution_show_tb = True
+nb_execution_timeout = 600
+nb_merge_streams = True
 html_static_path = ["static"]
 html_css_files = ["site.css"]
-html_sidebars = {"**": ["globaltoc.html"]}  # every page shows all pages by their groups
+# pages that stand by themselves; those of a section have its pages beside them
+ALONE = (
+    "index",
+    "install",
+    "tutorial",
+    "reading-the-report",
+    "symptoms",
+    "architecture",
+    "search",
+    "genindex",
+)
+html_sidebars = {page: [] for page in ALONE}
+html_theme_options = {"header_links_before_dropdown": 9}
 html_theme_options = {"header_links_before_dropdown": 4}

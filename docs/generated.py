@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ast
 import inspect
 import re
 import typing
@@ -10,16 +9,14 @@ from typing import Any, ClassVar
 
 import typer
 from docutils import nodes
-from pydantic_core import PydanticUndefined
 from sphinx.application import Sphinx
 from sphinx.domains.python import PythonDomain
 from sphinx.util.docutils import SphinxDirective
+from survey_keys import rows_of, section_of
 from typer.testing import CliRunner
 
 import sfm
 from sfm.cli.app import app
-from sfm.survey.inputs import settings
-from sfm.survey.inputs.settings import Section
 from sfm.survey.inputs.survey_file import SurveyFile
 
 
@@ -64,9 +61,9 @@ class SurveyFileReference(_Made):
             section = section_of(field.annotation)
             doc = (inspect.getdoc(section) or "").partition("]: ")[2] or inspect.getdoc(section) or ""
             table = table_of(("key", "type", "default", "meaning"), rows_of(section))
-            found.append(
-                (f"[{field.alias or name}]", [nodes.paragraph("", doc.lstrip("]: ").capitalize()), table])
-            )
+            said = field.alias or name
+            title = f"[[{said}]]" if typing.get_origin(field.annotation) is tuple else f"[{said}]"
+            found.append((title, [nodes.paragraph("", doc.lstrip("]: ").capitalize()), table]))
         return found
 
 
@@ -119,83 +116,6 @@ def command_names() -> list[tuple[str, ...]]:
         found.append((name,))
         found += [(name, inner) for inner in getattr(command, "commands", {})]
     return found
-
-
-def section_of(annotation: Any) -> type[Section]:
-    """Return the section that a field of the survey file holds, one or several, there or not.
-
-    Raises:
-        TypeError: it holds none.
-    """
-    if inspect.isclass(annotation) and issubclass(annotation, Section):
-        return annotation
-    for inner in typing.get_args(annotation):
-        if inspect.isclass(inner) and issubclass(inner, Section):
-            return inner
-    raise TypeError(f"{annotation} holds no section")
-
-
-def rows_of(section: type[Section]) -> list[tuple[str, ...]]:
-    """Return key, type, default and meaning of every key of a section."""
-    comments = comments_of(section)
-    rows = []
-    for name, field in section.model_fields.items():
-        default = "required" if field.default is PydanticUndefined else shown(field.default)
-        rows.append((field.alias or name, type_of(field.annotation), default, comments.get(name, "")))
-    return rows
-
-
-def comments_of(section: type[Section]) -> dict[str, str]:
-    """Return the comment that stands behind each field of a section, on any of its own lines."""
-    source = inspect.getsource(section)
-    lines, found = source.splitlines(), {}
-    body: Any = ast.parse(source).body[0]
-    for one in body.body:
-        if isinstance(one, ast.AnnAssign) and isinstance(one.target, ast.Name):
-            said = [line.partition("  # ")[2] for line in lines[one.lineno - 1 : one.end_lineno]]
-            texts = [text for text in said if text and not text.startswith("type:")]
-            if texts:
-                found[one.target.id] = " ".join(texts)
-    return found
-
-
-def shown(value: Any) -> str:
-    """Return a default as the survey file would have it."""
-    if value is None:
-        return "none"
-    if isinstance(value, bool):
-        return str(value).lower()
-    return "[]" if value == () else f'"{value}"' if isinstance(value, str) else str(value)
-
-
-def type_of(annotation: Any) -> str:
-    """Return the type of a key in words."""
-    for name, words in WORDS.items():
-        known = getattr(settings, name)
-        bare = typing.get_args(known)[0]  # what pydantic leaves of a field without a default
-        if annotation == known or (annotation == bare and bare is not int):
-            return words
-    if typing.get_origin(annotation) is typing.Literal:
-        return " | ".join(str(one) for one in typing.get_args(annotation))
-    inner = [one for one in typing.get_args(annotation) if one is not type(None)]
-    if inner and type(None) in typing.get_args(annotation):
-        return " | ".join(type_of(one) for one in inner)
-    return {"bool": "true | false", "int": "integer", "float": "number", "str": "text"}[annotation.__name__]
-
-
-WORDS = {
-    "Length": "number above 0",
-    "Name": "text",
-    "TwoLengths": "two numbers above 0",
-    "TwoCounts": "two integers above 0",
-    "Observed": "table of parameter = [value, sigma]",
-    "Values": "table of parameter = value",
-    "Correlations": "list of [parameter, parameter, correlation]",
-    "Marks": "list of [row, column]",
-    "Names": "list of texts",
-    "Globs": "text or list of texts",
-    "PlateSide": "integer from 2",
-}
 
 
 def table_of(head: tuple[str, ...], rows: list[tuple[str, ...]]) -> nodes.table:

@@ -5,11 +5,17 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 
 MAX_LISTED = 5  # of many in one message
+PROGRAMS = {"kolinear": "Kolinear", "colmap": "COLMAP"}  # as people write what survey files and tables name
 TEMPLATE = """\
 <table><caption>{{ title }}</caption>
 <thead><tr>{% for name in header %}<th>{{ name }}</th>{% endfor %}</tr></thead>
 <tbody>{% for row in rows %}<tr>{% for cell in row %}<td>{{ cell }}</td>{% endfor %}</tr>
 {% endfor %}</tbody></table>"""
+
+
+def program_name(key: str) -> str:
+    """Return the name of a program as people write it."""
+    return PROGRAMS.get(key, key)
 
 
 def html_table(title: str, header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:

@@ -2,16 +2,34 @@
 
 from __future__ import annotations
 
+import importlib.util
 import re
+import types
+from pathlib import Path
 
 import pytest
 
+from sfm.survey.inputs.survey_file import SurveyFile
 from tests.places import ROOT
+
+
+def load(name: str) -> types.ModuleType:
+    """Return a module of docs/, which is no package."""
+    spec = importlib.util.spec_from_file_location(name, ROOT / f"docs/{name}.py")
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
 
 
 def test_every_page_is_on_the_site() -> None:
     docs = ROOT / "docs"
-    listed = set(re.findall(r"^([\w/-]+)$", (docs / "index.md").read_text(encoding="utf-8"), re.M))
+    listed = {
+        name[1:] if name.startswith("/") else str((page.parent / name).relative_to(docs))
+        for page in docs.rglob("index.md")
+        for tree in re.findall(r"^```{toctree}\n(.*?)^```", page.read_text(encoding="utf-8"), re.S | re.M)
+        for name in re.findall(r"^(?:[\w ]+ <)?([\w/-]+)>?$", tree, re.M)
+    }
     pages = {str(page.relative_to(docs).with_suffix("")) for page in docs.rglob("*.md")} - {"index"}
     assert pages == listed
 
@@ -28,3 +46,38 @@ def test_commands_of_the_page_name_what_is_there(page: str) -> None:
             assert found.exists(), f"{page}: {span}"
             for word in re.findall(r" -k (\w+)", span):
                 assert re.search(rf"def test_\w*{word}", found.read_text(encoding="utf-8")), f"{page}: {span}"
+
+
+def test_every_key_of_the_survey_file_has_a_meaning_and_bounds() -> None:
+    keys = load("survey_keys")
+    rows = {}
+    for name, field in SurveyFile.model_fields.items():
+        for row in keys.rows_of(keys.section_of(field.annotation)):
+            rows[f"{field.alias or name}.{row[0]}"] = row
+    assert len(rows) > 50
+    assert not [key for key, row in rows.items() if len(row[3]) < 5], "keys without a comment in settings.py"
+    assert rows["tie_points.window_px"][1] == "integer, from 7 to 101"
+    assert rows["camera.c_mm"][1] == "number, from 1e-09 to 1e+12"
+    assert rows["camera.size_px"][1] == "[integer, integer], above 0 to 1e+06"
+    assert rows["camera.weighted"][1] == "table { parameter = [value, sigma] }, from 1e-30 to 1e+12"
+    assert rows["camera.correlations"][1].endswith("correlation], from -1 to 1, at most 200")
+    assert rows["targets.rows"][1] == "integer, from 2 to 500"
+    assert rows["targets.marks"][1] == "list of [row, column], at most 1000"
+    assert rows["adjust.reject"][1] == "tau | huber | tukey | none"
+
+
+def test_faults_of_a_site_are_found(tmp_path: Path) -> None:
+    links = load("links")
+    (tmp_path / "a.html").write_text(
+        '<h1 id="top">A</h1><a href="b.html#there">b</a><a href="#top">up</a>'
+        '<a href="https://elsewhere.org">x</a><a href="b.html#gone">b</a><a href="c.html">c</a>'
+        '<img src="missing.png"><img src="data:image/png;base64,">'
+        '<script src="https://elsewhere.org/x.js"></script><link rel="next" href="b.html">'
+    )
+    (tmp_path / "b.html").write_text('<p id="there">b</p>')
+    assert links.faults_of(tmp_path) == [
+        "a.html: missing.png is not there",
+        "a.html: loads https://elsewhere.org/x.js from elsewhere",
+        "a.html: link to b.html#gone, which has no such place",
+        "a.html: link to c.html, which is not there",
+    ]

@@ -62,6 +62,7 @@ def called(node: ast.Call) -> str:
 def trees(*places: str) -> Iterator[tuple[str, ast.Module]]:
     for place in places:
         path = ROOT / place
+        assert path.exists(), f"{place} is not there any more: name where its messages went"
         for file in [path] if path.is_file() else sorted(path.rglob("*.py")):
             yield str(file.relative_to(ROOT)), ast.parse(file.read_text(encoding="utf-8"))
 

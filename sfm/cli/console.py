@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from sfm.display import program_name
 from sfm.report.findings.findings import Findings
 from sfm.report.numbers import finer_unit, significant
 from sfm.report.phrases import words_of_check, words_of_sigma0, words_of_test
@@ -64,6 +66,9 @@ def _figures(findings: Findings) -> tuple[tuple[str, str], ...]:
     coded = int((result.code >= 0).sum())
     typical, largest = float(precision.rms[3]), float(precision.largest[3])
     factor, unit = finer_unit(result.length_unit, largest)
+    told = f"{significant(typical * factor)} {unit} RMS, {significant(largest * factor)} {unit} at most"
+    if not math.isfinite(typical):
+        told = "all coordinates are fixed" if precision.fixed_points else "not known"
     rows = [
         ("photographs", f"{len(a.network.images)} of {result.images_total} oriented"),
         (
@@ -78,10 +83,7 @@ def _figures(findings: Findings) -> tuple[tuple[str, str], ...]:
             f"{', '.join(words_of_sigma0(findings.sigma0))}, redundancy {a.redundancy}",
         ),
         ("residuals", f"RMS {a.rms_px:.4f} px per coordinate, largest {a.max_residual_px:.3f} px"),
-        (
-            "point precision",
-            f"{significant(typical * factor)} {unit} RMS, {significant(largest * factor)} {unit} at most",
-        ),
+        ("point precision", told),
     ]
     if findings.check is not None:
         rows.append(("check at control", words_of_check(findings.check, result.length_unit)))
@@ -90,11 +92,11 @@ def _figures(findings: Findings) -> tuple[tuple[str, str], ...]:
         word = "stopped early, same optimum" if both.stopped_early else "agrees" if both.agree else "DIFFERS"
         if both.better is not None and both.agree:
             word = f"free {', '.join(both.better.free)}: fits {both.better.times:.3g} times better"
-        rms = both.comparison.rms_px
+        rms, other = both.comparison.rms_px, program_name(both.backend)
         rows.append(
             (
-                both.backend,
-                f"{word}: RMS {rms[0]:.7f} px (kolinear), {rms[1]:.7f} px ({both.backend}), both with equal "
+                other,
+                f"{word}: RMS {rms[0]:.7f} px (Kolinear), {rms[1]:.7f} px ({other}), both with equal "
                 f"weights, free datum, {both.model}",
             )
         )

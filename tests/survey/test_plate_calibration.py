@@ -11,6 +11,7 @@ import pytest
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.solve import adjust
 from sfm.camera import camera_from_values, project
+from sfm.cli.console import tell_result
 from sfm.errors import GeometryError
 from sfm.network import Estimate, ImagePoints, Network, ObjectPoints
 from sfm.pipeline import run_survey
@@ -36,10 +37,13 @@ def calibrated(folder: Path, plate: PlateFamily, name: str, **how: object) -> Su
     return run_survey(read_survey(write_plate_survey(folder, plate, seed_of(name), **how)))  # type: ignore[arg-type]
 
 
-def test_a_camera_is_calibrated_from_a_plate(tmp_path: Path) -> None:
+def test_a_camera_is_calibrated_from_a_plate(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     result = calibrated(tmp_path / "plate", GRID, "calibrated", count=4)
     assert result.failed == () and result.adjustment.converged and result.adjustment.datum == "control"
-    assert findings_of(result).verdict.level == "good"
+    findings = findings_of(result)
+    assert findings.verdict.level == "good"
+    tell_result(findings, tmp_path / "report.html", seconds=0, verbose=False)
+    assert "all coordinates are fixed" in capsys.readouterr().out
     assert np.abs(off(result)).max() < 4
 
 

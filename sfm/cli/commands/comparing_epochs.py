@@ -62,7 +62,7 @@ def epochs(
         Path, typer.Option("--out", metavar="DIR", help="Folder of tables, JSON and page.")
     ] = Path("out/epochs"),
 ) -> None:
-    """Tell what moved between surveys of one object.
+    """Find what moved between surveys of one object.
 
     Congruency test, the points that are stable, displacements with their tests, and motion of groups.
     """

@@ -33,8 +33,8 @@ def init(
 ) -> None:
     """Draft a survey file from a folder of photographs.
 
-    Cameras by what the files say of them, targets by trying a few photographs; every value with where it
-    comes from.  Nothing is measured or adjusted: kolinear run does that.
+    Cameras are recognised by the metadata of the files, targets by trying a few photographs; a comment
+    says where each value comes from.  Nothing is measured or adjusted: kolinear run does that.
     """
     from sfm.files.whole_files import refuse_existing
 

@@ -52,7 +52,7 @@ def target_size_command(
         str, typer.Option("--unit", help="Unit of the distance: km, m, dm, cm, mm, um, in or ft.")
     ] = "mm",
 ) -> None:
-    """Tell how large targets must be for a camera and a distance.
+    """Compute how large targets must be for a camera and a distance.
 
     diameter = pixels x sensor width x distance / (c x photograph width), over the cosine of the tilt.
     """
@@ -180,7 +180,7 @@ def network_command(
         "out/plan"
     ),
 ) -> None:
-    """Tell what a network will give, or design one for what is wanted.
+    """Predict the precision of a network, or design a network.
 
     Predicted standard deviations of points, weak points with the reason, whether the camera can be
     calibrated, a page with the stations in space, and a list of photographs to take along. Lengths in the

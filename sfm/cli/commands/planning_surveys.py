@@ -64,9 +64,9 @@ def more_command(
         "out/more"
     ),
 ) -> None:
-    """Tell which few further photographs would help the weakest points.
+    """Propose further photographs that help the weakest points.
 
-    They are taken from where the survey was photographed from, about; what hides points there is not known.
+    They are taken from about as far as those of the survey; what hides points there is not known.
     """
     with loading():
         import numpy as np

@@ -34,7 +34,7 @@ def refine(
         str, typer.Option("--fix", metavar="NAMES", help="Interior parameters to hold, as fx,fy,cx,cy,k1.")
     ] = "",
 ) -> None:
-    """Measure the key points of a COLMAP model anew.
+    """Remeasure the key points of a COLMAP model.
 
     By multi-photo least squares matching; then the model is adjusted again.
     """

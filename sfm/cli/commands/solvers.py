@@ -54,7 +54,7 @@ def compare(
     a: Annotated[Path, typer.Argument(metavar="A", help="Result folder, COLMAP model, or another format.")],
     b: Annotated[Path, typer.Argument(metavar="B", help="What to compare it with.")],
     align: Annotated[
-        str, typer.Option("--align", help="points, cameras, control or none: what B is brought onto A by.")
+        str, typer.Option("--align", help="points, cameras, control or none: what B is aligned to A by.")
     ] = "points",
     control: Annotated[
         str, typer.Option("--control", metavar="P,Q,R", help="Names of the points for --align control.")
@@ -69,7 +69,7 @@ def compare(
 ) -> None:
     """Compare two results.
 
-    Differences, their standard deviations and what of them is significant.
+    Differences, their standard deviations, and which of them are significant.
     """
     with loading():
         from adapters.formats.registry import read_comparable
@@ -124,7 +124,7 @@ def convert(
         typer.Option("--undistort", help="Correct image points for distortion: for formats that hold none."),
     ] = False,
 ) -> None:
-    """Carry a survey between programs.
+    """Convert a survey from one program's format to another's.
 
     A camera is converted where the format lacks its model. Formats: colmap, colmap-text, colmap-database,
     tables, metashape, photomodeler, bal, sba, bundle-matlab, bundle-csharp and ply.

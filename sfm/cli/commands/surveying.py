@@ -59,7 +59,7 @@ PicturesMb = Annotated[
         help="What the photographs and crops inside report.html may take; the rest lies in pictures/.",
     ),
 ]
-Verbose = Annotated[bool, typer.Option("--verbose", "-v", help="Tell more: every photograph and warning.")]
+Verbose = Annotated[bool, typer.Option("--verbose", "-v", help="Print more: every photograph and warning.")]
 AllowOutside = Annotated[
     bool,
     typer.Option(
@@ -74,7 +74,7 @@ Calibration = Annotated[
     typer.Option(
         "--camera",
         metavar="RESULT",
-        help="Hold the interior orientation at that of an earlier result, by the names of the cameras.",
+        help="Hold the interior orientation at that of an earlier result; cameras are matched by name.",
     ),
 ]
 Weighted = Annotated[
@@ -292,8 +292,8 @@ def batch(
 ) -> None:
     """Run many surveys side by side, each to its own report.
 
-    One table tells them all.  Exit code 0 if every survey has a dependable result, else 1; 70 if one came
-    upon a fault of the program; 2 where a person must put something right.
+    One table lists them all.  Exit code 0 if every survey has a dependable result, else 1; 70 if one met
+    a fault of the program; 2 where a person must put something right.
     """
     if cluster is not None and jobs is not None:
         raise KolinearError("--jobs is for processes on this computer, --cluster brings its own workers")

@@ -53,7 +53,7 @@ def view(
 ) -> None:
     """Write one page with a result to explore, and open it.
 
-    Scene in space, photographs, crops of the targets and tables, in one file without a server.
+    A 3D scene, photographs, crops of the targets and tables, in one file without a server.
     """
     with loading():
         import webbrowser

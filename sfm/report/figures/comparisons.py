@@ -7,6 +7,7 @@ from matplotlib.figure import Figure
 
 from sfm.comparison.two_adjusters.adjuster_validation import Validation
 from sfm.conventions import BoolArray, FloatArray
+from sfm.display import program_name
 from sfm.report.figures.plots import BLUE, RED, plan_axes
 from sfm.report.numbers import finer_unit, significant
 
@@ -70,8 +71,8 @@ def time_figure(validation: Validation) -> Figure:
     seconds = np.array([t.seconds for t in validation.trials])
     picture = Figure(figsize=(8.5, 3.6), layout="constrained")
     axes = picture.subplots()
-    axes.loglog(k, seconds[:, 0], "o", ms=3.5, color=BLUE, label="kolinear")
-    axes.loglog(k, seconds[:, 1], "o", ms=3.5, color=RED, label=validation.backend)
+    axes.loglog(k, seconds[:, 0], "o", ms=3.5, color=BLUE, label=program_name("kolinear"))
+    axes.loglog(k, seconds[:, 1], "o", ms=3.5, color=RED, label=program_name(validation.backend))
     axes.set_xlabel("image points")
     axes.set_ylabel("s")
     axes.grid(alpha=0.3)

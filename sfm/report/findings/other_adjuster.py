@@ -9,6 +9,7 @@ import numpy as np
 from sfm.comparison.camera_conversion import Conversion
 from sfm.comparison.two_adjusters.adjusters import AdjusterComparison
 from sfm.conventions import FloatArray
+from sfm.display import program_name
 from sfm.report.findings.precision import root_mean_square
 from sfm.result import SurveyResult
 
@@ -45,8 +46,8 @@ def comparison_of(result: SurveyResult) -> ComparisonFindings | None:
         reasons += both.comparison.exceeded
         if both.comparison.exceeded and both.adjustment.converged:
             reasons.append(_other_minimum(both))
-        reasons += [] if both.adjustment.converged else ["kolinear did not converge in this model"]
-        reasons += [] if both.backend_converged else [f"{both.backend} did not converge"]
+        reasons += [] if both.adjustment.converged else ["Kolinear did not converge in this model"]
+        reasons += [] if both.backend_converged else [f"{program_name(both.backend)} did not converge"]
     covariance, other = both.adjustment.covariance, both.backend_points
     return ComparisonFindings(
         both,
@@ -65,9 +66,10 @@ def words_of_better_fit(both: AdjusterComparison | None) -> str:
     found = None if both is None else both.better
     if both is None or found is None:
         return ""
+    with_them = "with it" if len(found.free) == 1 else "with them"
     return (
-        f"Free {', '.join(found.free)}: with {'it' if len(found.free) == 1 else 'them'} the camera of the "
-        f"comparison with {both.backend} fits {found.times:.3g} times better ({found.rms_px:.4f} px RMS, "
+        f"Free {', '.join(found.free)}: {with_them} the camera of the comparison with "
+        f"{program_name(both.backend)} fits {found.times:.3g} times better ({found.rms_px:.4f} px RMS, "
         f"with the survey's own camera {found.own_rms_px:.4f} px)."
     )
 
@@ -75,11 +77,11 @@ def words_of_better_fit(both: AdjusterComparison | None) -> str:
 def _other_minimum(both: AdjusterComparison) -> str:
     """Return in words which of two minima is the lower one."""
     ours, theirs = both.comparison.cost
-    lower = "kolinear" if ours < theirs else both.backend
+    lower = program_name("kolinear" if ours < theirs else both.backend)
     ratio = max(ours, theirs) / min(ours, theirs) if min(ours, theirs) > 0 else np.inf
     return (
-        f"going on from {both.backend}'s solution does not lead to kolinear's: these are two minima, and "
-        f"that of {lower} is the lower one, by a factor of {ratio:.6g} in the sum of squares"
+        f"going on from {program_name(both.backend)}'s solution does not lead to Kolinear's: these are two "
+        f"minima, and that of {lower} is the lower one, by a factor of {ratio:.6g} in the sum of squares"
     )
 
 

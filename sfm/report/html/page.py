@@ -16,6 +16,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from sfm.adjustment.quality.statistics import STRONG
+from sfm.display import program_name
 from sfm.report.html.content_policy import content_policy
 from sfm.report.numbers import FILTERS, finer_unit, finer_unit_of, is_number
 from sfm.report.phrases import PHRASES
@@ -59,6 +60,7 @@ def environment() -> Environment:
         extensions=["jinja2.ext.do"],
     )
     made.filters |= FILTERS | {"data_url": data_url, "quoted": quote, "right": ">{}".format}
+    made.filters["program"] = program_name
     made.tests |= {"numeric": lambda cell: is_number(str(cell)), "nan": math.isnan}
     made.globals |= PHRASES | {
         "finer_unit": finer_unit,

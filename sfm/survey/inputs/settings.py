@@ -88,26 +88,27 @@ class Section(BaseModel):
 class Head(Section):
     """[survey]: what the survey is called."""
 
-    name: Name
+    name: Name  # of the survey, in the report and its file names
     unit: Unit  # of the object coordinates
 
 
 class CameraSettings(Section):
     """[[camera]]: one camera, its photographs and what is known of its interior orientation."""
 
-    name: Name
+    name: Name  # what people call the camera; unique in the survey
     images: Globs | None = None  # of its photographs; may be left out with [observations] and one camera
     size_px: TwoCounts | None = None  # else from the photographs, px
     pixel_mm: TwoLengths | None = None  # width and height of a pixel, else from sensor_mm or EXIF, mm
     sensor_mm: TwoLengths | None = None  # width and height of the sensor, mm
     c_mm: Length | None = None  # start value of the principal distance, else the EXIF focal length, mm
+    # distortion model: corrections of the measured point, or distortion of the ideal one
     model: Literal[tuple(MODELS)] = "brown"  # type: ignore[valid-type]
-    free: Names = ()  # parameters to be adjusted; () = a calibrated camera; see `says_what_is_free`
-    fixed: Values = ()  # (parameter, value) of what is not free, in the model's units
-    start: Values = ()  # (parameter, value) that a free one starts from, in the model's units; else 0
-    balanced: Values = ()  # (parameter, value) in AICON's form with R0, in place of fixed and start
-    weighted: Observed = ()  # (parameter, (value, sigma)): adjusted, with this as an observation
-    correlations: Correlations = ()  # (parameter, parameter, correlation) of weighted ones; 0 if not given
+    free: Names = ()  # parameters to be adjusted; [] = a calibrated camera; not given: the photographs decide
+    fixed: Values = ()  # what is not free, in the model's units; else 0
+    start: Values = ()  # values that free ones start from, in the model's units; else 0
+    balanced: Values = ()  # values in AICON's form with R0, in place of fixed and start
+    weighted: Observed = ()  # adjusted, with value and standard deviation as an observation
+    correlations: Correlations = ()  # of weighted parameters; 0 if not given
     calibration: Name | None = None  # folder of an earlier result, relative to the survey file
     calibration_use: Literal["fixed", "weighted"] = "fixed"  # held, or an observation with its covariance
     per_photograph: Names = ()  # adjusted parameters of which every photograph has a value of its own
@@ -138,14 +139,14 @@ class CameraSettings(Section):
 class TargetSettings(Section):
     """[targets]: what circular targets look like in the photographs."""
 
-    polarity: Literal["dark", "bright", "auto"] = "auto"
+    polarity: Literal["dark", "bright", "auto"] = "auto"  # targets darker or brighter than what is around
     channel: Literal["luminance", "red", "green", "blue"] = "luminance"  # of colour photographs
     tone: Literal["linear", "srgb"] = "linear"  # tone curve of the photographs, taken back before measuring
     codes: Name = "none"  # a code family, or a table file relative to the survey file
     ring_radii: TwoLengths | None = (
         None  # of the ring, inner and outer, in those of the dot; else the family's
     )
-    min_diameter_px: Length = 6.0
+    min_diameter_px: Length = 6.0  # of the smallest target that is measured, px
     eccentricity: bool = True  # whether to correct it
     diameter: Length | None = None  # of all targets, object unit; else of each from its ellipses
     diameters: Name | None = None  # a table id,diameter of single targets, before the one of all
@@ -162,7 +163,7 @@ class TargetSettings(Section):
 class TiePointSettings(Section):
     """[tie_points]: natural texture in place of targets."""
 
-    detector: Literal["foerstner", "sift"] = "foerstner"
+    detector: Literal["foerstner", "sift"] = "foerstner"  # what finds the interest points
     window_px: Annotated[int, Field(ge=7, le=101)] = 15  # odd side of the matched windows
     max_features: Annotated[int, Field(ge=100)] = 2000  # of each photograph, spread over it
 
@@ -170,7 +171,9 @@ class TiePointSettings(Section):
 class DatumSettings(Section):
     """[datum]: what position, orientation and scale of the result rest on."""
 
-    kind: Literal["free", "minimal", "control"] = "free"
+    kind: Literal["free", "minimal", "control"] = (
+        "free"  # inner constraints, seven held coordinates, or control
+    )
     points: Names = ()  # object points that carry a free or minimal datum; all if none are named
 
 
@@ -189,10 +192,10 @@ class ExteriorSettings(Section):
 class ScaleBarSettings(Section):
     """[[scale_bar]]: a measured distance between two object points."""
 
-    start: Name = Field(alias="from")
-    end: Name = Field(alias="to")
-    length: Length  # object unit
-    sigma: Length  # object unit
+    start: Name = Field(alias="from")  # name of the point at one end
+    end: Name = Field(alias="to")  # name of the point at the other end
+    length: Length  # between the two points, object unit
+    sigma: Length  # standard deviation of the length, object unit
 
 
 class ObservationSettings(Section):
@@ -220,5 +223,9 @@ class AdjustSettings(Section):
 class CompareSettings(Section):
     """[compare]: the other adjuster on the survey's network, the other pipeline on its photographs."""
 
-    backend: Literal["colmap", "none"] = "colmap"
-    baseline: Literal["mapper", "none"] = "none"
+    backend: Literal["colmap", "none"] = (
+        "colmap"  # adjuster that the same image points are given to, where it is installed
+    )
+    baseline: Literal["mapper", "none"] = (
+        "none"  # pipeline that the same photographs are given to: COLMAP's mapper
+    )

@@ -9,7 +9,7 @@ import numpy as np
 
 from sfm.adjustment.quality.reliability import UNCONTROLLED
 from sfm.conventions import MAD_TO_SIGMA
-from sfm.display import MAX_LISTED, listed
+from sfm.display import MAX_LISTED, listed, program_name
 from sfm.report.findings.other_adjuster import words_of_better_fit
 from sfm.report.findings.verdicts.evidence import Evidence, Judged
 from sfm.report.findings.verdicts.verdict_of_given import free_line, judge_given
@@ -76,7 +76,7 @@ def judge(evidence: Evidence) -> Verdict:
     if len(a.rejected) and rejected > MUCH_REJECTED * len(a.rejected):
         remarks.append(f"{rejected} of {len(a.rejected)} image points were rejected.")
     if result.comparison is not None and not result.comparison.agree:
-        remarks.append(f"{result.comparison.backend} does not agree with the adjustment.")
+        remarks.append(f"{program_name(result.comparison.backend)} does not agree with the adjustment.")
     if better := words_of_better_fit(result.comparison):
         remarks.append(better)
     if result.warnings:

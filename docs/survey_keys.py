@@ -1,0 +1,114 @@
+"""The keys of the survey file in words, from the models that check it: type, bounds, default and meaning."""
+
+from __future__ import annotations
+
+import ast
+import inspect
+import typing
+from collections.abc import Iterable
+from typing import Any
+
+from annotated_types import Ge, Gt, Le, Len, MaxLen
+from pydantic_core import PydanticUndefined
+
+from sfm.survey.inputs import settings
+from sfm.survey.inputs.settings import Section
+
+KINDS = {"bool": "true | false", "int": "integer", "float": "number", "str": "text"}
+SHAPES = {  # types of several values: what is written in the file, and of which type each value is
+    "TwoLengths": ("[number, number]", settings.Length),
+    "TwoCounts": ("[integer, integer]", settings.Side),
+    "Observed": ("table { parameter = [value, sigma] }", settings.Sigma),
+    "Values": ("table { parameter = value }", settings.Value),
+    "Correlations": ("list of [parameter, parameter, correlation]", settings.Correlation),
+    "Marks": ("list of [row, column]", int),
+    "Names": ("list of texts", str),
+    "Globs": ("text or list of texts", str),
+}
+
+
+def section_of(annotation: Any) -> type[Section]:
+    """Return the section that a field of the survey file holds, one or several, there or not.
+
+    Raises:
+        TypeError: it holds none.
+    """
+    if inspect.isclass(annotation) and issubclass(annotation, Section):
+        return annotation
+    for inner in typing.get_args(annotation):
+        if inspect.isclass(inner) and issubclass(inner, Section):
+            return inner
+    raise TypeError(f"{annotation} holds no section")
+
+
+def rows_of(section: type[Section]) -> list[tuple[str, ...]]:
+    """Return key, type, default and meaning of every key of a section."""
+    comments = comments_of(section)
+    rows = []
+    for name, field in section.model_fields.items():
+        default = "required" if field.default is PydanticUndefined else shown(field.default)
+        kind = type_of(field.annotation, field.metadata)
+        default = "{}" if default == "[]" and kind.startswith("table") else default
+        rows.append((field.alias or name, kind, default, comments.get(name, "")))
+    return rows
+
+
+def comments_of(section: type[Section]) -> dict[str, str]:
+    """Return the comment behind each field of a section, on one of its lines or the line before it."""
+    source = inspect.getsource(section)
+    lines, found = source.splitlines(), {}
+    body: Any = ast.parse(source).body[0]
+    for one in body.body:
+        if isinstance(one, ast.AnnAssign) and isinstance(one.target, ast.Name):
+            said = [line.partition("  # ")[2] for line in lines[one.lineno - 1 : one.end_lineno]]
+            if lines[one.lineno - 2].lstrip().startswith("# "):
+                said.insert(0, lines[one.lineno - 2].strip().removeprefix("# "))
+            texts = [text for text in said if text and not text.startswith("type:")]
+            if texts:
+                found[one.target.id] = " ".join(texts)
+    return found
+
+
+def shown(value: Any) -> str:
+    """Return a default as the survey file would have it."""
+    if value is None:
+        return "none"
+    if isinstance(value, bool):
+        return str(value).lower()
+    return "[]" if value == () else f'"{value}"' if isinstance(value, str) else str(value)
+
+
+def type_of(annotation: Any, metadata: Iterable[Any] = ()) -> str:
+    """Return the type of a key in words, with its bounds.
+
+    Args:
+        annotation: of the field.
+        metadata: what pydantic took off the annotation of a field that is not optional.
+    """
+    for name, (words, each) in SHAPES.items():
+        known = getattr(settings, name)
+        if annotation == known or (annotation == typing.get_args(known)[0] and "tuple" in str(annotation)):
+            longest = [one.max_length for one in metadata if isinstance(one, MaxLen | Len) and one.max_length]
+            return words + bounds_of(typing.get_args(each)[1:]) + "".join(f", at most {n}" for n in longest)
+    origin, inner = typing.get_origin(annotation), typing.get_args(annotation)
+    if origin is typing.Literal:
+        return " | ".join(str(one) for one in inner)
+    if origin is typing.Annotated:
+        return type_of(inner[0], inner[1:])
+    if type(None) in inner:
+        return " | ".join(type_of(one) for one in inner if one is not type(None))
+    return KINDS[annotation.__name__] + bounds_of(metadata)
+
+
+def bounds_of(metadata: Iterable[Any]) -> str:
+    """Return the bounds of a number in words; empty where it has none."""
+    found = []
+    for one in metadata:
+        for part in getattr(one, "metadata", [one]):  # pydantic's Field holds several
+            if isinstance(part, Ge):
+                found.append(f"from {part.ge:g}")
+            elif isinstance(part, Gt):
+                found.append(f"above {part.gt:g}")
+            elif isinstance(part, Le):
+                found.append(f"to {part.le:g}")
+    return f", {' '.join(found)}" if found else ""
