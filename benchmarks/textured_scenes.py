@@ -136,7 +136,7 @@ def _nearby_meeting(
 
 def intensities(scene: TexturedScene, index: int, skin: AnyArray) -> AnyArray:
     """Return one photograph as it would be without noise, float32, 0 to 255."""
-    width, rows = SIZE_PX
+    width, rows = scene.camera.size_px
     centre, (tall, long) = scene.position[index], RIPPLES[scene.roughness]
     y, x = np.mgrid[0:rows, 0:width]
     grid = np.column_stack([x.ravel(), y.ravel()]).astype(float)
@@ -156,6 +156,16 @@ def intensities(scene: TexturedScene, index: int, skin: AnyArray) -> AnyArray:
         light += cv2.remap(skin, at[..., 0], at[..., 1], cv2.INTER_LINEAR, borderValue=0.45)
     light = cv2.GaussianBlur(light / 4, (0, 0), render.BLUR_PX)
     return np.asarray(255 * light * (0.85 + 0.04 * (index % 4)))
+
+
+def surface_at(scene: TexturedScene, index: int, xy: FloatArray) -> FloatArray:
+    """Return where the surface is at places of a photograph, px, (k, 2); shape (k, 3), m."""
+    centre, (tall, long) = scene.position[index], RIPPLES[scene.roughness]
+    uv = tangents_from_pixel(scene.camera, xy)
+    d = np.ascontiguousarray(np.column_stack([uv, -np.ones(len(uv))]) @ scene.rotation[index].T)
+    length = np.empty(len(d))
+    _first_meeting(tall, long, centre, d, length)
+    return np.asarray(centre + length[:, None] * d)
 
 
 def render_scene(folder: Path, roughness: str, photographs: int) -> TexturedScene:

@@ -36,4 +36,3 @@ ALONE = (
 )
 html_sidebars = {page: [] for page in ALONE}
 html_theme_options = {"header_links_before_dropdown": 9}
-html_theme_options = {"header_links_before_dropdown": 4}

@@ -17,6 +17,7 @@ from sfm.kernels.options import compiled
 
 FIXED_POINT_STEPS = 100
 PIXEL_TOLERANCE = 1e-10
+CURVATURE_STEP = 1e-3  # of tangents; a pixel or a few
 STEP_TOLERANCE = (
     1e-11  # of tangents; what Newton's method leaves after such a step is its square, or rounding
 )
@@ -273,6 +274,29 @@ def pixel_jacobian(camera: Camera, xy_px: FloatArray) -> FloatArray:
         ahead = tangents_from_pixel(camera, xy_px + step)
         columns.append((ahead - tangents_from_pixel(camera, xy_px - step)) / 2)
     return np.asarray(np.linalg.inv(np.stack(columns, axis=-1)))
+
+
+def pixel_curvature(camera: Camera, uv: FloatArray) -> FloatArray:
+    """Return d^2 (x, y) / d (u, v)^2, by which the distortion bends what is straight in the tangents.
+
+    Args:
+        camera: interior orientation.
+        uv: tangents of rays, shape (k, 2).
+
+    Returns:
+        Second derivatives [:, i, a, b] of pixel coordinate i, shape (k, 2, 2, 2), px; by differences over
+        CURVATURE_STEP, NaN where the distortion folds over.
+    """
+    u, v = CURVATURE_STEP * np.eye(2)
+
+    def mixed(a: FloatArray, b: FloatArray) -> FloatArray:
+        ends = (a + b, a - b, b - a, -a - b)
+        one, two, three, four = (pixel_from_tangents(camera, uv + step) for step in ends)
+        return np.asarray((one - two - three + four) / (4 * CURVATURE_STEP**2))
+
+    uv_part = mixed(u, v)
+    rows = [[mixed(u, u), uv_part], [uv_part, mixed(v, v)]]
+    return np.asarray(np.moveaxis(np.array(rows), (2, 3), (0, 1)))
 
 
 @compiled

@@ -19,7 +19,8 @@ from sfm.comparison.solutions import reprojection
 from sfm.comparison.two_adjusters.common_problem import common_problem
 from sfm.conventions import AnyArray
 from sfm.kernels.warmed import set_warm
-from sfm.matching.conjugate import METHODS, match_points
+from sfm.matching.conjugate import match_points
+from sfm.matching.conjugate_patches import METHODS
 from sfm.matching.tracks.correspondence import match_targets
 from sfm.matching.tracks.interest import foerstner_points
 from sfm.network import Estimate, ImagePoints, Network, empty_estimate

@@ -9,12 +9,13 @@ import numpy as np
 
 from sfm.camera import Camera, camera_from_values
 from sfm.conventions import AnyArray, FloatArray, rotation_from_vector
-from sfm.rendering.render import render_photograph
+from sfm.rendering.render import corner_rays, render_photograph
 from sfm.rendering.scene import CircularTargets, Faces, Marks, Optics, Scene, discs, join_marks, rectangles
 from sfm.targets.codes.plates import PlateFamily
 
 PITCH = 12.0
 SIZE_PX, PIXEL_MM = (800, 600), 0.0075
+NOISE = 0.02  # standard deviation of an intensity, part of the full scale
 TRUTH = {"c": 8.137, "x0": 0.041, "y0": -0.033, "K1": -1.1e-3, "K2": 2.3e-5}
 MARKS = ((3, 3), (3, 5), (4, 7), (5, 4))
 GRID = PlateFamily("grid", 9, 11, MARKS)
@@ -111,16 +112,29 @@ def stations(rng: np.random.Generator, count: int, plate: PlateFamily) -> tuple[
 
 
 def plate_pictures(
-    plate: PlateFamily, rng: np.random.Generator, count: int, *, rings: bool = False, noise: float = 0.02
+    plate: PlateFamily,
+    rng: np.random.Generator,
+    count: int,
+    *,
+    rings: bool = False,
+    noise: float = NOISE,
+    bits: int = 8,
 ) -> list[AnyArray]:
     """Return rendered photographs of a plate."""
     scene, truth = plate_scene(plate, rings=rings), camera()
-    optics = Optics(blur_px=0.8, exposure=0.9, noise=noise, oversampling=3)
+    optics = Optics(blur_px=0.8, exposure=0.9, noise=noise, oversampling=3, bits=bits)
     position, rotation = stations(rng, count, plate)
+    rays = corner_rays(truth)
     return [
-        render_photograph(scene, truth, position[i], rotation[i], optics=optics, rng=rng)[0]
+        render_photograph(scene, truth, position[i], rotation[i], optics=optics, rng=rng, rays=rays)[0]
         for i in range(count)
     ]
+
+
+def with_noise(pictures: list[AnyArray], rng: np.random.Generator, noise: float = NOISE) -> list[AnyArray]:
+    """Return photographs of 8 bit with noise from noiseless ones of 16 bit."""
+    noisy = [one / 257 + 255 * noise * rng.standard_normal(one.shape, dtype=np.float32) for one in pictures]
+    return [np.rint(one).clip(0, 255).astype(np.uint8) for one in noisy]
 
 
 def write_plate_survey(
@@ -131,10 +145,12 @@ def write_plate_survey(
     count: int = 6,
     datum: str = "control",
     rings: bool = False,
+    pictures: list[AnyArray] | None = None,
 ) -> Path:
-    """Write a survey of rendered photographs of a plate; return its file."""
+    """Write a survey of photographs of a plate, rendered here unless they are given; return its file."""
     folder.mkdir(parents=True, exist_ok=True)
-    for k, picture in enumerate(plate_pictures(plate, rng, count, rings=rings)):
+    pictures = plate_pictures(plate, rng, count, rings=rings) if pictures is None else pictures
+    for k, picture in enumerate(pictures):
         cv2.imwrite(str(folder / f"photo {k + 1}.png"), picture, [cv2.IMWRITE_PNG_COMPRESSION, 1])
     text = SURVEY.format(
         name=folder.name,

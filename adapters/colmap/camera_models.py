@@ -53,6 +53,23 @@ def write_model(
     pycolmap = load_pycolmap()
     with quiet(pycolmap):
         scene = reconstruction(pycolmap, network, estimate, rejected=rejected)
+    write_scene(folder, scene, text=text)
+    try:
+        write_side_file(folder / SIDE_FILE, network, estimate)
+    except OSError as error:
+        raise OutputError(
+            f"{folder}: the COLMAP model cannot be written: {error.strerror or error}"
+        ) from error
+
+
+def write_scene(folder: Path, scene: Any, *, text: bool = False) -> None:
+    """Write a pycolmap.Reconstruction, and read it back to see that it is whole.
+
+    Raises:
+        OutputError: the folder cannot be written.
+    """
+    pycolmap = load_pycolmap()
+    with quiet(pycolmap):
         scene.update_point_3d_errors()
         try:
             folder.mkdir(parents=True, exist_ok=True)
@@ -61,7 +78,6 @@ def write_model(
             else:
                 scene.write_binary(str(folder))
             _refuse_short(pycolmap, folder, scene, text=text)
-            write_side_file(folder / SIDE_FILE, network, estimate)
         except OSError as error:
             reason = error.strerror or error
             raise OutputError(f"{folder}: the COLMAP model cannot be written: {reason}") from error
@@ -107,6 +123,11 @@ def read_model(folder: Path, *, text: bool | None = None) -> tuple[Network, Esti
         BackendError: pycolmap is missing, a camera model that Kolinear has no equal of, or photographs
             in rigs of several cameras without an orientation of their own.
     """
+    return named_network(folder, read_scene(folder, text=text))
+
+
+def read_scene(folder: Path, *, text: bool | None = None) -> Any:
+    """Return the pycolmap.Reconstruction of a folder; see `read_model`."""
     pycolmap = load_pycolmap()
     if not any((folder / f"cameras.{kind}").is_file() for kind in ("bin", "txt")):
         raise SurveyFileError(f"{folder}: no COLMAP model (cameras.bin or cameras.txt) in this folder")
@@ -119,12 +140,16 @@ def read_model(folder: Path, *, text: bool | None = None) -> tuple[Network, Esti
     check_model_files(folder, text=text)
     with quiet(pycolmap):
         try:
-            scene = _opened(pycolmap, folder, text=text)
+            return _opened(pycolmap, folder, text=text)
         except (ValueError, RuntimeError, LookupError, OSError, MemoryError) as error:
             raise SurveyFileError(
                 f"{folder}: each file of the COLMAP model is in order, but they do not fit together "
                 f"({told(error)})"
             ) from error
+
+
+def named_network(folder: Path, scene: Any) -> tuple[Network, Estimate]:
+    """Return a scene as a network and its solution, with the names that lie beside it in its folder."""
     side = read_side_file(folder / SIDE_FILE)
     try:
         network, estimate = network_of_scene(scene, side)

@@ -1,60 +1,34 @@
 """Conjugate points: from points of one photograph to the same points in another, and how well.
 
-Correlation finds the place to a pixel in a search window, least squares matching takes it from there. With
-`equalise` the histograms of both photographs are equalised in between, which is the order of document 002;
-it helps the eye more than the matching, which has a gain and an offset of its own.
+Correlation finds the place to a pixel in a search window, least squares matching takes it from there. What is
+not found in this way is looked for again with templates that are turned and scaled.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
-from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
+from sfm.conventions import AnyArray, FloatArray
 from sfm.errors import GeometryError
-from sfm.kernels.sampling import AFTER, BEFORE
-from sfm.matching.correlation.ambiguity import ambiguous, independent_pixels
-from sfm.matching.correlation.ncc import match_ncc
-from sfm.matching.lsm.patch_equations import MARGIN
-from sfm.matching.lsm.two_photo import match_lsm
-from sfm.matching.match_flags import LsmFlag, NccFlag, in_words
-from sfm.matching.radiometry import equalise_histogram, grey_of
+from sfm.matching.conjugate_patches import (
+    METHODS,
+    ConjugatePoints,
+    Settings,
+    Starts,
+    confirmed,
+    match_upright,
+    match_warped,
+)
+from sfm.matching.local_affinity import local_affinities
+from sfm.matching.turned_templates import match_turned
 
-METHODS = {"ncc": "", "lsm": "affine", "lsm8": "projective", "shift": "shift"}
 MIN_CORRELATION = 0.7  # half of the variance of one patch is then explained by the other
 BACK_PX = 1.0  # a point that leads back farther than this from where it came is another one
-START_CORRELATION = 0.5  # smallest r of a start, which the warp has yet to make alike
-
-
-@dataclass(frozen=True)
-class ConjugatePoints:
-    """Points of the left photograph and where they are in the right one; NaN where the reason says why."""
-
-    method: str  # ncc | lsm | lsm8 | shift
-    left: FloatArray  # px, (k, 2)
-    right: FloatArray  # px, (k, 2)
-    covariance: FloatArray  # of `right`, px^2, (k, 2, 2)
-    warp: FloatArray  # right px from left px relative to the left point, homogeneous, (k, 3, 3)
-    correlation: FloatArray  # r of the template and the matched patch, (k,)
-    second: FloatArray  # r of the second-best place of the search window, (k,)
-    gain: FloatArray  # right intensities per left one, (k,)
-    offset: FloatArray  # right intensity units, (k,)
-    steps: IntArray  # Gauss-Newton steps, 0 for correlation, (k,)
-    reason: tuple[str, ...]  # empty where matched, else flags in words, (k,)
-
-    def __len__(self) -> int:
-        return len(self.left)
-
-    @property
-    def good(self) -> BoolArray:
-        """Which points were matched, (k,)."""
-        return np.array([not reason for reason in self.reason], dtype=bool)
-
-    @property
-    def sigma(self) -> FloatArray:
-        """Standard deviations of the right coordinates, px, (k, 2)."""
-        return np.asarray(np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2)))
+MIN_TEMPLATE_PX = 7  # smaller ones look like anything once they are turned and scaled
+REACH_SIGMAS = 3.0  # of the place that key points tell
+REACH_PX = (4, 15)  # of that search, at least and at most
 
 
 def match_points(
@@ -70,14 +44,20 @@ def match_points(
     interpolation: str = "six_tap",
     min_correlation: float = MIN_CORRELATION,
     back_px: float | None = BACK_PX,
+    wide: bool = True,
 ) -> ConjugatePoints:
     """Find points of the left photograph in the right one.
+
+    Points that are not found in their search windows as they are, are looked for again (`wide`): where the
+    key points around them agree on an affine map to the right photograph, at the place and in the shape that
+    it says; else in their search windows turned by up to 30 degrees and scaled by up to 1.3.
 
     Args:
         left: photograph, (H, W), 8 or 16 bit or float, grey or colour.
         right: the other photograph.
         xy_left: points in the left photograph, px, (k, 2).
         xy_right: centres of the search windows, px, (k, 2); the same places as in the left if not given.
+            Where they are given, key points lead to no place outside the windows.
         method: ncc, or ncc and then shift (2), lsm (6) or lsm8 (8 geometric parameters).
         template_px: odd side of the template; document 002 has 19.
         search_px: odd side of the search window; document 002 has 21.
@@ -86,6 +66,8 @@ def match_points(
         min_correlation: smallest r of a match. Least squares matching is started from 0.5 on, as the warp
             makes patches more alike.
         back_px: a point must lead back to within this of where it came from, px; None: it need not.
+        wide: look again for what is not found; without it photographs must be turned by less than 5 degrees
+            and of one scale to 10 %.
 
     Returns:
         One result for each point.
@@ -99,104 +81,27 @@ def match_points(
         raise GeometryError(f"matching: method '{method}', expected one of {', '.join(METHODS)}")
     a = np.asarray(xy_left, dtype=float).reshape(-1, 2)
     b = a if xy_right is None else np.asarray(xy_right, dtype=float).reshape(-1, 2)
-    least = min_correlation if method == "ncc" else min(min_correlation, START_CORRELATION)
-    found = match_ncc(left, right, a, b, template_px=template_px, search_px=search_px, min_correlation=least)
-    # A peak at the border of the search window is a start like any other: least squares may walk out of it.
-    started = found.good | (found.flag == int(NccFlag.AT_BORDER))
-    pixels = independent_pixels(grey_of(left), a, template_px)
-    doubt = started & ambiguous(found.correlation, found.second, pixels)
-    flag = np.where(doubt, int(NccFlag.AMBIGUOUS), found.flag)
-    outside = _what_is_outside(left, a, template_px // 2)
-    ncc_reason = tuple(
-        where or "outside: the search window in the right photograph"
-        if one == int(NccFlag.OUTSIDE)
-        else in_words(NccFlag, one)
-        for one, where in zip(flag.tolist(), outside, strict=True)
-    )
-    if method == "ncc":
-        warp = np.tile(np.eye(3), (len(a), 1, 1))
-        warp[:, :2, 2] = found.xy
-        matched = ConjugatePoints(
-            method, a, found.xy, found.covariance, warp, found.correlation,
-            found.second, found.gain, found.offset, np.zeros(len(a), dtype=np.int64), ncc_reason,
-        )  # fmt: skip
-    else:
-        started &= ~doubt
-        seen = (equalise_histogram(left), equalise_histogram(right)) if equalise else (left, right)
-        start = np.where(started[:, None], np.where(found.good[:, None], found.xy, found.peak), -1.0)
-        lsm = match_lsm(
-            *seen,
-            a,
-            start,
-            model=METHODS[method],
-            window_px=template_px,
-            interpolation=interpolation,
-            min_correlation=min_correlation,
-        )
-        outside = _what_is_outside(left, a, template_px // 2, kernel=True)
-        lsm_reason = tuple(
-            where or "outside: the patch in the right photograph"
-            if one == int(LsmFlag.OUTSIDE)
-            else in_words(LsmFlag, one)
-            for one, where in zip(lsm.flag.tolist(), outside, strict=True)
-        )
-        reason = tuple(
-            one if ok else ncc for ok, one, ncc in zip(started, lsm_reason, ncc_reason, strict=True)
-        )
-        correlation = np.where(started & np.isfinite(lsm.correlation), lsm.correlation, found.correlation)
-        matched = ConjugatePoints(
-            method, a, lsm.xy, lsm.covariance, lsm.warp, correlation, found.second, lsm.gain, lsm.offset,
-            np.where(started, lsm.steps, 0), reason,
-        )  # fmt: skip
-    if back_px is not None and matched.good.any():
-        good = np.flatnonzero(matched.good)
-        back = match_points(
-            right,
-            left,
-            matched.right[good],
-            xy_right=a[good],
-            method=method,
-            template_px=template_px,
-            search_px=search_px,
-            equalise=equalise,
-            interpolation=interpolation,
-            min_correlation=min_correlation,
-            back_px=None,
-        )
-        lost = good[~(np.linalg.norm(back.right - a[good], axis=1) <= back_px)]
-        why = np.array(matched.reason, dtype=object)
-        why[lost] = in_words(NccFlag, NccFlag.NOT_CONFIRMED)
-        matched = replace(matched, reason=tuple(why.tolist()))
+    by = Settings(method, template_px, search_px, equalise, interpolation, min_correlation, back_px)
+    matched = confirmed(left, right, match_upright(left, right, a, b, by), by)
+    lost = np.flatnonzero([bool(why) and "left photograph" not in why for why in matched.reason])
+    if wide and len(lost) and template_px >= MIN_TEMPLATE_PX:
+        maps = local_affinities(left, right, a[lost])
+        known = np.isfinite(maps.xy).all(axis=1)
+        if xy_right is not None:
+            known &= (np.abs(maps.xy - b[lost]) <= search_px // 2).all(axis=1)
+        reach = np.clip(np.ceil(REACH_SIGMAS * maps.spread_px[known]), *REACH_PX).astype(np.int64)
+        start = Starts(maps.xy[known], maps.linear[known], reach)
+        again = match_warped(left, right, a[lost[known]], start, by)
+        again = confirmed(left, right, again, by, 2 * reach)
+        matched = matched.with_rows(lost[known][again.good], again.rows(again.good))
+        rest = lost[~known]
+        if len(rest):
+            again = match_turned(left, right, a[rest], b[rest], by)
+            again = confirmed(left, right, again, by, np.full(len(rest), by.reach_px))
+            matched = matched.with_rows(rest[again.good], again.rows(again.good))
     bad = ~matched.good
     return replace(
         matched,
         right=np.where(bad[:, None], np.nan, matched.right),
         covariance=np.where(bad[:, None, None], np.nan, matched.covariance),
-    )
-
-
-def _what_is_outside(
-    photograph: AnyArray, xy: FloatArray, half: int, *, kernel: bool = False
-) -> tuple[str, ...]:
-    """Return in words what of the left points is outside their photograph, empty where nothing is.
-
-    Args:
-        photograph: the left photograph.
-        xy: the points, px, (k, 2).
-        half: half the side of the template, px.
-        kernel: whether the margin counts that least squares matching needs around the template.
-    """
-    size = np.array(photograph.shape[1::-1])
-    reach = half + MARGIN if kernel else half
-    at = np.floor(xy) if kernel else np.rint(xy)
-    resampled = (xy != at).any(axis=1, keepdims=True) & kernel
-    before, after = BEFORE * resampled, AFTER * resampled
-    off = np.asarray(~((xy >= 0) & (xy <= size - 1)).all(axis=1))
-    cut = np.asarray(((at - reach - before < 0) | (at + reach + after > size - 1)).any(axis=1))
-    what = "the template with the margin of its kernel" if kernel else "the template"
-    return tuple(
-        "outside: the point in the left photograph"
-        if o
-        else (f"outside: {what} in the left photograph" if c else "")
-        for o, c in zip(off.tolist(), cut.tolist(), strict=True)
     )

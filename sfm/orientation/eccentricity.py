@@ -47,6 +47,7 @@ class CircleViews:
     rays: FloatArray  # from the projection centre to the target, image axes, object unit, (k, 3)
     rotation: FloatArray  # R of the photograph, image to object axes, (k, 3, 3)
     pixel_jacobian: FloatArray  # d pixel / d (u, v) at the target, px, (k, 2, 2)
+    pixel_curvature: FloatArray  # d^2 pixel / d (u, v)^2 at the target, px, (k, 2, 2, 2)
 
 
 def fit_circles(views: CircleViews, n_points: int, *, radius: FloatArray | None = None) -> Circles:
@@ -143,9 +144,13 @@ def _misfit(
 
 
 def _shift(views: CircleViews, normal: FloatArray, log_radius: FloatArray) -> FloatArray:
-    """Return the eccentricity, px, (k, 2)."""
-    m, _, centre = _ellipses(views, normal, log_radius)
-    return np.asarray(np.einsum("kab,kb->ka", views.pixel_jacobian, m - centre))
+    """Return the eccentricity, px, (k, 2): of the ellipse in the tangents, and of its image by distortion."""
+    m, S, centre = _ellipses(views, normal, log_radius)
+    J, H = views.pixel_jacobian, views.pixel_curvature
+    shift = np.einsum("kab,kb->ka", J, m - centre)
+    t = np.einsum("kai,kiac->kc", np.linalg.inv(J), H)
+    bent = np.einsum("kiab,kab->ki", H, S) / 8 + np.einsum("kia,kab,kb->ki", J, S, t) / 4
+    return np.asarray(shift + bent)
 
 
 def _derivatives(

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from sfm.files.plain_text import csv_text
-from sfm.matching.conjugate import ConjugatePoints
+from sfm.matching.conjugate_patches import ConjugatePoints
 
 COLUMNS = (
     "point",

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sfm.camera import pixel_jacobian
+from sfm.camera import pixel_curvature, pixel_jacobian
 from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
 from sfm.display import listed
 from sfm.network import Estimate, ImagePoints, Network, rows_of
@@ -202,8 +202,10 @@ def _views(
     seen = network.image_points.select(rows)
     rotation = estimate.rotation[seen.image]
     outward = estimate.points[seen.point] - estimate.position[seen.image]
-    jacobian = np.empty((len(seen), 2, 2))
+    rays = np.einsum("kji,kj->ki", rotation, outward)
+    jacobian, curvature = np.empty((len(seen), 2, 2)), np.empty((len(seen), 2, 2, 2))
     of_camera = rows_of(network.camera[seen.image], len(estimate.cameras))
     for camera, own in zip(estimate.cameras, of_camera, strict=True):
         jacobian[own] = pixel_jacobian(camera, seen.xy[own])
-    return CircleViews(point, shape, np.einsum("kji,kj->ki", rotation, outward), rotation, jacobian)
+        curvature[own] = np.nan_to_num(pixel_curvature(camera, -rays[own, :2] / rays[own, 2:]))
+    return CircleViews(point, shape, rays, rotation, jacobian, curvature)

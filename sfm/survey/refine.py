@@ -10,20 +10,20 @@ import numpy as np
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
-from sfm.camera import Camera
+from sfm.camera import Camera, tangents_from_pixel
 from sfm.conventions import MAD_TO_SIGMA, BoolArray, FloatArray, IntArray
 from sfm.distortion.models import Role
-from sfm.errors import GeometryError, PhotographError, SurveyFileError
-from sfm.matching.lsm.multi_photo import match_multi
+from sfm.errors import GeometryError
 from sfm.matching.lsm.projected_points import pictures_of
 from sfm.matching.match_flags import LsmFlag, in_words
 from sfm.matching.radiometry import odd_window
 from sfm.network import Estimate, ImagePoints, Network
-from sfm.photographs.reading import read_photograph
+from sfm.orientation.intersection import intersect
 from sfm.reduced_network import reduce_network
 from sfm.runtime.progress import SILENT, Progress
 from sfm.survey.adjusting.settling import FALSE_ALARM, determined, merge_estimate
 from sfm.survey.adjusting.solution import TOLERANCE_FACTOR
+from sfm.survey.refine_windows import match_windows, outside_masks
 
 MIN_RAYS = 3
 MIN_PHOTOGRAPHS = 4  # of a camera whose principal point is freed
@@ -35,20 +35,54 @@ ORIENTATION_FACTOR = (
 )
 MAX_SHIFT_FACTOR = 6.0  # of that spread, beyond which a key point was another one
 MIN_SHIFT_PX = 2.0
-NOTHING = np.zeros((1, 1))  # in place of a photograph that the model has not oriented
+# What COLMAP calls the parameters of its models with one focal length, which are adjusted as brown_forward
+COLMAP_NAMES = {"c": "f", "x0": "cx", "y0": "cy", "K1": "k1", "K2": "k2"}
 
 
 @dataclass(frozen=True)
 class Refinement:
     """A model before and after its key points were measured anew."""
 
+    model: Network  # as it came
+    start: Estimate  # as it came, with the parameters freed that the adjustment estimates
     before_px: float  # RMS per coordinate of the model as it came, px
-    readjusted_px: float  # the same points adjusted here, without rejection, px
-    after_px: float  # measured anew and adjusted, accepted points, px
+    readjusted: Adjustment  # the same points adjusted here, without rejection
     adjustment: Adjustment  # of the points measured anew
-    key_points: int  # of the model
-    refined: int  # of these, matched and part of the adjustment
+    estimate: Estimate  # of the whole model: adjusted, else as it came, points of few rays intersected anew
+    rows: IntArray  # image point of the model of each one of the adjustment, (k,)
+    images: BoolArray  # photographs of the model that were adjusted, (m,)
+    points: BoolArray  # points of the model that were adjusted, (n,)
+    residuals_before: (
+        FloatArray  # computed minus measured in the model as it came, NaN if unknown, px, (k, 2)
+    )
     reasons: tuple[tuple[str, int], ...]  # why key points took no part, and how many, most frequent first
+
+    @property
+    def key_points(self) -> int:
+        """Image points of the model."""
+        return len(self.model.image_points)
+
+    @property
+    def refined(self) -> int:
+        """Of these, matched and part of the adjustment."""
+        return int((~self.adjustment.rejected).sum())
+
+    @property
+    def readjusted_px(self) -> float:
+        """RMS per coordinate of the model's key points adjusted here, px."""
+        return self.readjusted.rms_px
+
+    @property
+    def after_px(self) -> float:
+        """RMS per coordinate of the accepted points measured anew, px."""
+        return self.adjustment.rms_px
+
+    @property
+    def accepted(self) -> BoolArray:
+        """Image points of the model that are measured anew and part of the adjustment, (k,)."""
+        accepted = np.zeros(self.key_points, dtype=bool)
+        accepted[self.rows[~self.adjustment.rejected]] = True
+        return accepted
 
 
 def refine_model(
@@ -59,6 +93,7 @@ def refine_model(
     window_px: int = 15,
     min_correlation: float = 0.7,
     fixed: tuple[str, ...] = (),
+    masks_dir: Path | None = None,
     progress: Progress = SILENT,
 ) -> Refinement:
     """Measure all image points of a solved model by multi-photo least squares matching and adjust it again.
@@ -70,7 +105,9 @@ def refine_model(
         window_px: odd side of the windows, at most MAX_WINDOW_PX.
         min_correlation: smallest coefficient r of a window and its template, 0 to 1.
         fixed: names of interior parameters that are held at the model's values, as fx, cx or k1.
-        progress: told of stages and photographs.
+        masks_dir: folder of masks, named as their photographs with .png behind; key points where a mask is
+            black take no part.
+        progress: told of stages and parts.
 
     Raises:
         SurveyFileError: a photograph of the model is not in the folder.
@@ -83,50 +120,37 @@ def refine_model(
         raise GeometryError(f"refine: smallest correlation is {min_correlation:g}, needed 0 to 1")
     seen = network.image_points
     everything = np.ones(len(seen), dtype=bool)
-    photographs_of = np.bincount(network.camera[estimate.oriented], minlength=len(estimate.cameras))
-    cameras = tuple(
-        _freed(camera, int(count), fixed)
-        for camera, count in zip(estimate.cameras, photographs_of, strict=True)
-    )
-    estimate = replace(estimate, cameras=cameras)
+    estimate = replace(estimate, cameras=_all_freed(network, estimate, fixed))
     residuals = pictures_of(estimate, network.camera, seen.image, estimate.points[seen.point]) - seen.xy
     usable = np.isfinite(residuals).all(axis=1)
     if not usable.any():
         raise GeometryError("no image point of an oriented photograph in the model, nothing to refine")
     before = float(np.sqrt((residuals[usable] ** 2).mean()))
     spread = MAD_TO_SIGMA * float(np.median(np.abs(residuals[usable])))
+    progress.stage("adjustment as it came")
     first, start, _, _ = _part(network, estimate, everything)
-    readjusted = adjust(first, start, datum=Datum("free"), reject="none", covariance=False)
-    progress.stage("photographs", len(network.images))
-    photographs = [
-        _photograph(network, estimate, images_dir, i, progress) if oriented else NOTHING
-        for i, oriented in enumerate(estimate.oriented)
-    ]
-    progress.stage("matching")
-    reference = _references(network, estimate)
-    known = reference >= 0
-    rows = np.flatnonzero(known[seen.point] & usable)
-    number, row_of = np.cumsum(known) - 1, np.full(len(seen), -1)
-    row_of[rows] = np.arange(len(rows))
-    matches = match_multi(
-        photographs,
-        replace(estimate, points=estimate.points[known]),
-        network.camera,
-        seen.image[rows],
-        number[seen.point[rows]],
-        seen.xy[rows],
-        row_of[reference[known]],
+    readjusted = adjust(first, start, datum=Datum("free"), reject="none")
+    masked = ~everything if masks_dir is None else outside_masks(network, estimate, masks_dir)
+    reference = _references(network, estimate, usable & ~masked)
+    rows = np.flatnonzero((reference >= 0)[seen.point] & usable & ~masked)
+    windows = match_windows(
+        network,
+        estimate,
+        images_dir,
+        rows,
+        reference,
         orientation_px=max(ORIENTATION_FACTOR * spread, SIGMA_PX),
         window_px=window_px,
         max_shift_px=max(MIN_SHIFT_PX, MAX_SHIFT_FACTOR * spread),
         min_correlation=min_correlation,
+        progress=progress,
     )
-    good = np.isfinite(matches.xy).all(axis=1) & np.isfinite(matches.covariance).all(axis=(1, 2))
+    good = np.isfinite(windows.xy).all(axis=1) & np.isfinite(windows.covariance).all(axis=(1, 2))
     measured = ImagePoints(
-        seen.image[rows][good],
-        seen.point[rows][good],
-        matches.xy[good],
-        matches.covariance[good] + SIGMA_PX**2 * np.eye(2),
+        seen.image[good],
+        seen.point[good],
+        windows.xy[good],
+        windows.covariance[good] + SIGMA_PX**2 * np.eye(2),
     )
     progress.stage("adjustment")
     anew = replace(network, image_points=measured)
@@ -136,22 +160,50 @@ def refine_model(
     fits = (v <= TOLERANCE_FACTOR * MAD_TO_SIGMA * np.median(v)).all(axis=1)
     accepted = images[measured.image] & points[measured.point]
     accepted[accepted] = fits
-    part, start, _, _ = _part(anew, merge_estimate(estimate, adjusted.estimate, images, points), accepted)
+    solved = merge_estimate(estimate, adjusted.estimate, images, points)
+    part, start, images, points = _part(anew, solved, accepted)
     tests = 2 * len(part.image_points)
     alpha = 1 - (1 - FALSE_ALARM) ** (1 / tests)
     final = adjust(part, start, datum=Datum("free"), reject="tau", alpha=alpha, covariance=True)
-    counts = [(in_words(LsmFlag, flag), int(((matches.flag & flag) != 0).sum())) for flag in LsmFlag if flag]
-    counts.append((f"of a point that fewer than {MIN_RAYS} photographs see", len(seen) - len(rows)))
+    taken = accepted & images[measured.image] & points[measured.point]
+    counts = [(in_words(LsmFlag, flag), int(((windows.flag & flag) != 0).sum())) for flag in LsmFlag if flag]
+    few = len(seen) - len(rows) - int(masked.sum())
+    counts.append((f"of a point that fewer than {MIN_RAYS} photographs see", few))
+    counts.append(("where the mask is black", int(masked.sum())))
     counts.append(("contradict the others", int(good.sum() - (~final.rejected).sum())))
     return Refinement(
+        network,
+        estimate,
         before,
-        readjusted.rms_px,
-        final.rms_px,
+        readjusted,
         final,
-        len(seen),
-        int((~final.rejected).sum()),
+        _whole(network, estimate, final.estimate, images, points),
+        np.flatnonzero(good)[taken],
+        images,
+        points,
+        np.asarray(residuals),
         tuple((why, count) for why, count in sorted(counts, key=lambda c: -c[1]) if count),
     )
+
+
+def _whole(
+    network: Network, estimate: Estimate, part: Estimate, images: BoolArray, points: BoolArray
+) -> Estimate:
+    """Return the whole model with an adjusted part in it, its other points intersected with what is new."""
+    position, rotation, xyz = estimate.position.copy(), estimate.rotation.copy(), estimate.points.copy()
+    position[images], rotation[images], xyz[points] = part.position, part.rotation, part.points
+    seen = network.image_points
+    rows = np.flatnonzero(~points[seen.point] & images[seen.image])
+    tangents = np.full((len(rows), 2), np.nan)
+    for k, camera in enumerate(part.cameras):
+        own = network.camera[seen.image[rows]] == k
+        tangents[own] = tangents_from_pixel(camera, seen.xy[rows][own])
+    found = intersect(
+        tangents, seen.image[rows], seen.point[rows], position, rotation, n_points=len(network.points)
+    ).points
+    again = ~points & np.isfinite(found).all(axis=1)
+    xyz[again] = found[again]
+    return Estimate(part.cameras, position, rotation, xyz)
 
 
 def refinement_text(result: Refinement) -> str:
@@ -176,6 +228,14 @@ def _part(
     return part, start, images, points
 
 
+def _all_freed(network: Network, estimate: Estimate, fixed: tuple[str, ...]) -> tuple[Camera, ...]:
+    """Return the cameras with what is to be estimated freed; see `_freed`."""
+    photographs = np.bincount(network.camera[estimate.oriented], minlength=len(estimate.cameras))
+    return tuple(
+        _freed(camera, int(count), fixed) for camera, count in zip(estimate.cameras, photographs, strict=True)
+    )
+
+
 def _freed(camera: Camera, photographs: int, fixed: tuple[str, ...]) -> Camera:
     """Free what the image points of a model determine, but for what is to be held.
 
@@ -188,11 +248,13 @@ def _freed(camera: Camera, photographs: int, fixed: tuple[str, ...]) -> Camera:
             rotation.
         fixed: names of parameters to hold.
     """
-    unknown = [name for name in fixed if name not in camera.names]
+    names = tuple(COLMAP_NAMES.get(name, name) for name in camera.names)
+    fixed = tuple("f" if name in ("fx", "fy") and "f" in names else name for name in fixed)
+    unknown = [name for name in fixed if name not in (*camera.names, *names)]
     if unknown:
         raise GeometryError(
             f"refine: parameter '{unknown[0]}' of camera {camera.name} is to be held, expected one of "
-            + ", ".join(camera.names)
+            + ", ".join(names)
         )
     free = camera.free
     if not free.any():
@@ -200,16 +262,16 @@ def _freed(camera: Camera, photographs: int, fixed: tuple[str, ...]) -> Camera:
         free |= camera.plays(Role.FOCAL)
         if photographs >= MIN_PHOTOGRAPHS:
             free |= camera.plays(Role.X0, Role.Y0)
-    return replace(camera, free=free & ~np.isin(camera.names, fixed))
+    return replace(camera, free=free & ~np.isin(camera.names, fixed) & ~np.isin(names, fixed))
 
 
-def _references(network: Network, estimate: Estimate) -> IntArray:
+def _references(network: Network, estimate: Estimate, usable: BoolArray) -> IntArray:
     """Return the row of each point that sees it at its middle scale, -1 for points with few rays, (n,)."""
     seen = network.image_points
     rays = estimate.points[seen.point] - estimate.position[seen.image]
     depth = -np.einsum("ki,ki->k", rays, estimate.rotation[seen.image, :, 2])
     c = np.array([camera.c_px for camera in estimate.cameras])[network.camera[seen.image]]
-    scale = np.where(depth > 0, c / depth, np.nan)
+    scale = np.where((depth > 0) & usable, c / depth, np.nan)
     reference = np.full(len(network.points), -1)
     count = np.bincount(seen.point[np.isfinite(scale)], minlength=len(reference))
     order = np.lexsort([scale, seen.point])
@@ -217,24 +279,3 @@ def _references(network: Network, estimate: Estimate) -> IntArray:
     some = (count >= MIN_RAYS) & estimate.determined
     reference[some] = order[first[some] + count[some] // 2]
     return reference
-
-
-def _photograph(network: Network, estimate: Estimate, folder: Path, i: int, progress: Progress) -> FloatArray:
-    path = folder / network.images[i]
-    if not path.resolve().is_relative_to(folder.resolve()):
-        raise SurveyFileError(
-            f"{folder}: photograph '{network.images[i]}' of the model is outside this folder"
-        )
-    if not path.is_file():
-        raise SurveyFileError(
-            f"{folder}: photograph '{network.images[i]}' of the model is not in this folder"
-        )
-    photograph = read_photograph(path)
-    width, height = estimate.cameras[network.camera[i]].size_px
-    if photograph.shape != (height, width):
-        raise PhotographError(
-            f"{network.images[i]}: {photograph.shape[1]} x {photograph.shape[0]} px, its camera has "
-            f"{width} x {height} px"
-        )
-    progress.advance(network.images[i])
-    return photograph

@@ -85,20 +85,22 @@ def judge_fits(
 def find_duplicates(fit: EllipseFit, reason: IntArray) -> BoolArray:
     """Return which of the good candidates surround another one: of concentric ellipses the smallest is kept.
 
-    A retro-reflective dot with a dark rim in glare is seen as bright dot and, larger, as the dark rim.
+    A retro-reflective dot with a dark rim in glare is seen as bright dot and, larger, as the dark rim. What
+    is fitted as a damaged target takes the place of none that is whole.
     """
     duplicate = np.zeros(len(fit.xy), dtype=bool)
     good = np.flatnonzero(reason == 0)
     p, q, r = fit.shape[good].T
     radius = (p * r - q * q) ** -0.5
     order = np.argsort(fit.xy[good, 0], kind="stable")
-    duplicate[good[order]] = _surrounds(fit.xy[good][order], radius[order])
+    damaged = (fit.flag[good] & Flag.DAMAGED.value) != 0
+    duplicate[good[order]] = _surrounds(fit.xy[good][order], radius[order], damaged[order])
     return duplicate
 
 
 @compiled
-def _surrounds(xy: FloatArray, radius: FloatArray) -> BoolArray:
-    """Return which of the circles, in order of x, have the centre of a smaller one near their own."""
+def _surrounds(xy: FloatArray, radius: FloatArray, damaged: BoolArray) -> BoolArray:
+    """Return which of the circles, in order of x, have the centre of a smaller or whole one near."""
     outer = np.zeros(len(xy), dtype=np.bool_)
     widest = radius.max() if len(radius) else 0.0
     for i in range(len(xy)):
@@ -107,7 +109,10 @@ def _surrounds(xy: FloatArray, radius: FloatArray) -> BoolArray:
                 break
             small, large = (i, j) if radius[i] <= radius[j] else (j, i)
             if math.hypot(xy[j, 0] - xy[i, 0], xy[j, 1] - xy[i, 1]) < CONCENTRIC * radius[small]:
-                outer[large] = True
+                if damaged[i] != damaged[j]:
+                    outer[i if damaged[i] else j] = True
+                else:
+                    outer[large] = True
     return outer
 
 

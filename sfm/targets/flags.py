@@ -40,6 +40,8 @@ class Flag(IntFlag):
     LOBED = 1 << 20  # the outline deviates from the ellipse as bars and squares do
     THIN_BACKGROUND = 1 << 21  # the background is only a thin stroke, as in a letter "o"
     NOT_ON_PLATE = 1 << 22  # no dot of the calibration plate
+    # another remark
+    DAMAGED = 1 << 23  # a nick, a scratch or a mark in the target was left out of the fit
 
 
 def count_flags(flags: IntArray) -> list[tuple[str, int]]:

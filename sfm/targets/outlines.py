@@ -26,6 +26,11 @@ MIN_STEP = 4 / 255
 MIN_AXIS_RATIO = 0.14
 # Outlines farther than this from their ellipse (in radii, plus so many px for the grid) are not elliptic.
 OUTLINE_TOLERANCE, GRID_TOLERANCE_PX = 0.2, 1.5
+# Of a damaged target so many points of the outline are seen at least, on this share of the directions from
+# its centre; the points lie as far as this from the ellipse (radii, plus px for the grid). The hull of an
+# ellipse fills 1.00 of the ellipse in the box around it, with a nick or a splash of ink not much less.
+MIN_OUTLINE_POINTS, MIN_AROUND, DIRECTIONS = 24, 0.6, 32
+BRIDGED_TOLERANCE, BRIDGED_GRID_PX, HULL_FILLS, BRIDGE_ROUNDS = 0.03, 0.8, (0.75, 1.12), 5
 # The noise is estimated from about so many rows.
 NOISE_ROWS = 40
 
@@ -83,6 +88,7 @@ def find_outlines(
         ellipse, reason = _ellipses_of_contours(
             points, first, image.shape[0], image.shape[1], float(min_diameter_px), float(max_diameter_px)
         )
+        _bridge_damage(points, first, ellipse, reason)
         good = reason == 0
         ellipses.append(ellipse[good])
         kept_signs.append(np.full(int(good.sum()), sign))
@@ -247,3 +253,59 @@ def _ellipses_of_contours(
                 reason[c] = Flag.NOT_ELLIPTIC.value
                 break
     return ellipse, reason
+
+
+def _bridge_damage(points: AnyArray, first: IntArray, ellipse: FloatArray, reason: IntArray) -> None:
+    """Fit ellipses to the longest smooth part of outlines that a nick, a splash or a scratch interrupts.
+
+    The outline of a large target is that of a thin band along its edge, into which a nick lets the contour
+    through. The hull leaves the inner side of the band behind, and what is far from the ellipse through the
+    rest is dropped step by step.
+
+    Args:
+        points: of the contours, px, (n, 2).
+        first: where each contour begins, (k + 1,).
+        ellipse: x, y, p, q, r, improved where an outline is bridged, (k, 5).
+        reason: 0 there afterwards, (k,).
+    """
+    for c in np.flatnonzero(reason == Flag.NOT_ELLIPTIC.value):
+        contour = points[first[c] : first[c + 1]]
+        if len(contour) < MIN_OUTLINE_POINTS:
+            continue
+        hull = cv2.convexHull(contour)
+        (_, _), (long, short), _ = cv2.minAreaRect(hull)
+        low, high = HULL_FILLS
+        if not low < cv2.contourArea(hull) / (math.pi / 4 * max(long * short, 1.0)) < high:
+            continue
+        bridged = _trimmed_ellipse(contour.astype(float), hull.reshape(-1, 2).astype(float))
+        if bridged is not None:
+            ellipse[c], reason[c] = bridged, 0
+
+
+def _trimmed_ellipse(contour: FloatArray, hull: FloatArray) -> FloatArray | None:
+    """Return x, y, p, q, r of the ellipse that most of an outline lies on; None without any."""
+    ahead = np.roll(hull, -1, axis=0) - hull
+    across = np.stack([-ahead[:, 1], ahead[:, 0]], axis=1) / np.hypot(*ahead.T)[:, None]
+    inside = np.abs(np.einsum("eb,neb->ne", across, contour[:, None] - hull[None])).min(axis=1)
+    chosen = contour[inside < 1.5]
+    found = None
+    for _ in range(BRIDGE_ROUNDS):
+        if len(chosen) < MIN_OUTLINE_POINTS / 2:
+            return None
+        (x, y), (width, height), degrees = cv2.fitEllipseDirect(chosen.astype(np.float32))
+        a, b = width / 2 + 0.5, height / 2 + 0.5
+        if not (np.isfinite([x, y, a, b]).all() and min(a, b) / max(a, b) > MIN_AXIS_RATIO):
+            return None
+        cos, sin = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
+        p, q = cos * cos / a + sin * sin / b, cos * sin * (1 / a - 1 / b)
+        r = sin * sin / a + cos * cos / b
+        found = np.array([x, y, p, q, r])
+        dx, dy = (contour - (x, y)).T
+        u, v = p * dx + q * dy, q * dx + r * dy
+        tolerance = BRIDGED_TOLERANCE + BRIDGED_GRID_PX / min(a, b)
+        on_it = np.abs(np.hypot(u, v) - (1 - 0.5 / min(a, b))) < tolerance
+        if len(chosen) == on_it.sum() and (chosen == contour[on_it]).all():
+            break
+        chosen = contour[on_it]
+    direction = np.floor((np.arctan2(v, u)[on_it] / (2 * math.pi) + 0.5) * DIRECTIONS).astype(int)
+    return found if len(np.unique(direction % DIRECTIONS)) >= MIN_AROUND * DIRECTIONS else None

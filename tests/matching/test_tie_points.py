@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import weakref
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -25,11 +26,13 @@ from sfm.matching.epipolar import epipolar_paths
 from sfm.matching.lsm.multi_photo import match_multi
 from sfm.matching.lsm.two_photo import match_lsm
 from sfm.matching.match_flags import LsmFlag
+from sfm.matching.tracks import feature_tracks
 from sfm.matching.tracks.feature_tracks import (
     Features,
     find_tie_points,
     joined_features,
     link_features,
+    measure_tracks,
     sift_features,
 )
 from sfm.matching.tracks.interest import foerstner_points
@@ -216,6 +219,25 @@ def test_tie_points_of_three_photographs() -> None:
     with pytest.raises(GeometryError, match="detector 'orb', expected one of"):
         find_tie_points(photographs, detector="orb")
     assert len(find_tie_points([np.zeros((90, 90), np.uint8)] * 3)) == 0
+
+
+def test_two_photographs_are_in_memory_as_floats_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a hundred photographs of 24 megapixels all as floats would be 10 GB."""
+    photographs, _, _ = _scene()
+    features = [sift_features(one, max_features=300) for one in photographs]
+    tracks = link_features(features)
+    alive: list[weakref.ref[AnyArray]] = []
+    most = 0
+
+    def grey(photograph: AnyArray) -> AnyArray:
+        nonlocal most
+        most = max(most, 1 + sum(one() is not None for one in alive))
+        alive.append(weakref.ref(made := np.array(photograph, dtype=np.float32)))
+        return made
+
+    monkeypatch.setattr(feature_tracks, "grey_of", grey)
+    assert len(measure_tracks(photographs, features, tracks)) > 90
+    assert len(alive) > 4 and most <= 3  # the template, the photograph before, and the next one
 
 
 def test_along_epipolar_lines_of_an_orientation_computed_from_the_photographs() -> None:

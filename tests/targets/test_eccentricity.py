@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
 
-from sfm.camera import Camera, camera_from_values, pixel_jacobian, project
+from sfm.camera import Camera, camera_from_values, pixel_curvature, pixel_jacobian, project
 from sfm.conventions import FloatArray, rotation_from_vector
 from sfm.orientation.eccentricity import CircleViews, ellipse_shape, fit_circles
 
@@ -52,9 +54,11 @@ def scene() -> tuple[CircleViews, FloatArray]:
         for j in range(len(RADIUS)):
             centre, shape, image = drawn_ellipse(CAMERA, position, R, j)
             ray = R.T @ (CENTRES[j] - position)
-            rows.append((j, shape, ray, R, pixel_jacobian(CAMERA, image[None])[0], centre - image))
-    point, shape, rays, R, J, shift = (np.array(column) for column in zip(*rows, strict=True))
-    return CircleViews(point, shape, rays, R, J), shift
+            J = pixel_jacobian(CAMERA, image[None])[0]
+            H = pixel_curvature(CAMERA, -ray[None, :2] / ray[2])[0]
+            rows.append((j, shape, ray, R, J, H, centre - image))
+    point, shape, rays, R, J, H, shift = (np.array(column) for column in zip(*rows, strict=True))
+    return CircleViews(point, shape, rays, R, J, H), shift
 
 
 def test_radius_normal_and_shift_of_drawn_circles() -> None:
@@ -94,9 +98,7 @@ def test_sigma_of_the_shift_follows_the_scatter() -> None:
         E = noise * rng.standard_normal((len(truth), 3)) * [1, 1, 1 / np.sqrt(2)]
         L = np.linalg.cholesky(views.shape)
         W = np.eye(2) + np.stack([2 * E[:, [0, 2]], np.stack([2 * E[:, 2], 2 * E[:, 1]], axis=1)], axis=1)
-        noisy = CircleViews(
-            views.point, L @ W @ np.swapaxes(L, 1, 2), views.rays, views.rotation, views.pixel_jacobian
-        )
+        noisy = replace(views, shape=L @ W @ np.swapaxes(L, 1, 2))
         circles = fit_circles(noisy, len(RADIUS))
         errors.append(circles.shift - truth)
         sigmas.append(np.diagonal(circles.shift_covariance, axis1=1, axis2=2))

@@ -29,6 +29,7 @@ def match_command(
     interpolation: str = "six_tap",
     min_correlation: float = MIN_CORRELATION,
     back_px: float | None = BACK_PX,
+    wide: bool = True,
     as_json: bool = False,
     out: Path | None = None,
     picture: Path | None = None,
@@ -47,6 +48,7 @@ def match_command(
         interpolation: between pixels.
         min_correlation: least correlation coefficient.
         back_px: largest distance of matching back, px; None for no matching back.
+        wide: whether points that are not found are looked for again, turned and scaled.
         as_json: JSON in place of the table.
         out: file .csv or .json that gets the table, in place of the terminal.
         picture: PNG file that gets template, matched patch and their difference.
@@ -81,6 +83,7 @@ def match_command(
             interpolation=interpolation,
             min_correlation=min_correlation,
             back_px=back_px,
+            wide=wide,
         )
         as_json = as_json or (out is not None and out.suffix.lower() == ".json")
         if picture_part is not None:

@@ -57,6 +57,14 @@ def match(
             "--back/--no-back", help="Whether a match must lead back to within 1 px of where it came from."
         ),
     ] = True,
+    wide: Annotated[
+        bool,
+        typer.Option(
+            "--wide/--no-wide",
+            help="Whether points not found are looked for again where key points around them lead, or turned "
+            "by up to 30 degrees and scaled by up to 1.3.",
+        ),
+    ] = True,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON in place of a table.")] = False,
     out: Annotated[
         Path | None, typer.Option("--out", metavar="FILE", help="Write the table: .csv or .json.")
@@ -69,7 +77,8 @@ def match(
     """Find conjugate points of two photographs.
 
     By cross correlation, then least squares matching. A match is ambiguous if the second-best place of the
-    search window has an r that is not lower by more than chance (5 %, by Fisher's z).
+    search window has an r that is not lower by more than chance (5 %, by Fisher's z). Without centres of
+    search windows in the table, key points may lead anywhere in RIGHT.
     Files given with --out and --picture may replace earlier ones of this command, and nothing else. Exit
     code 1 if no point was matched.
     """
@@ -90,6 +99,7 @@ def match(
             interpolation=interpolation,
             min_correlation=min_correlation,
             back_px=BACK_PX if back else None,
+            wide=wide,
             as_json=as_json,
             out=out,
             picture=picture,

@@ -31,36 +31,56 @@ def refine(
         ),
     ] = 0.7,
     fix: Annotated[
-        str, typer.Option("--fix", metavar="NAMES", help="Interior parameters to hold, as fx,fy,cx,cy,k1.")
+        str, typer.Option("--fix", metavar="NAMES", help="Interior parameters to hold, as f,fx,fy,cx,cy,k1.")
     ] = "",
+    masks: Annotated[
+        Path | None,
+        typer.Option("--masks", metavar="DIR", help="Folder of masks: NAME.png beside a photograph's NAME."),
+    ] = None,
 ) -> None:
     """Remeasure the key points of a COLMAP model.
 
-    By multi-photo least squares matching; then the model is adjusted again.
+    By multi-photo least squares matching; then the model is adjusted again. The new model keeps numbers,
+    colours, camera models, rigs and the points of two photographs, and has a page, refinement.html, and the
+    standard deviations of points, photographs and cameras beside it (sigma_*.csv). The principal point is
+    estimated, too, where four photographs or more have been taken with a camera; hold it with --fix cx,cy.
+    Of masks, black is left out.
     """
     with loading():
-        from adapters.colmap.camera_models import read_model, write_model
+        from adapters.colmap.refined_model import interior_rows, open_model, update_model, write_refined
         from sfm.files.whole_files import refuse_existing, whole_folder
+        from sfm.report.refinement import PAGE, Numbers, refinement_files
         from sfm.runtime.progress_bar import drawn_progress
         from sfm.survey.refine import refine_model, refinement_text
 
     out = model.resolve().with_name(f"{model.resolve().name}_refined") if out is None else out
     refuse_existing(out)
     with working_on(str(model)):
-        network, estimate = read_model(model)
+        opened = open_model(model)
     compile_first()
     with working_on(str(model)), drawn_progress() as progress:
         found = refine_model(
-            network,
-            estimate,
+            opened.network,
+            opened.estimate,
             images,
             window_px=window,
             min_correlation=min_correlation,
             fixed=tuple(name.strip() for name in fix.split(",") if name.strip()),
+            masks_dir=masks,
             progress=progress,
         )
     print(refinement_text(found), end="")
     a = found.adjustment
+    interior = interior_rows(opened, found.start, found.estimate, a.covariance.interior)
+    xy = opened.network.image_points.xy.copy()
+    xy[found.rows] = a.network.image_points.xy
+    in_rigs = update_model(
+        opened, found.estimate, xy=xy, measured=found.accepted, images=found.images, points=found.points
+    )
+    numbers = Numbers(opened.image_ids, opened.point_ids, interior, in_rigs)
     with whole_folder(out) as folder:
-        write_model(folder, a.network, a.estimate, rejected=a.rejected)
+        write_refined(folder, opened)
+        for name, text in refinement_files(found, numbers, title=model.resolve().name).items():
+            (folder / name).write_text(text, encoding="utf-8")
     print(f"Model: {out}")
+    print(f"Report: {out / PAGE}")

@@ -5,15 +5,19 @@ from __future__ import annotations
 import numpy as np
 
 from sfm.conventions import AnyArray, FloatArray
-from sfm.kernels.cholesky import solve_factorised
+from sfm.kernels.cholesky import factorise, solve_factorised
 from sfm.kernels.options import compiled, compiled_fast
 from sfm.kernels.sampling import TAPS, kernel_weights
 from sfm.matching.lsm.patch_equations import SLOPE_NOISE, Workspace, dot
 from sfm.matching.lsm.warp import area_ratio
 from sfm.matching.match_flags import FLAT_TEXTURE, LOW_CORRELATION, MATCHED
 
-# Texture is flat in a direction in which its gradients have less than this many times the energy of noise.
-MIN_TEXTURE = 3.0
+# Texture is flat in a direction in which the gradients of the window together have no more energy than noise
+# has by chance: its mean and so many standard deviations more.
+TEXTURE_SIGMAS = 3.0
+# Variance of such an energy of n pixels, times n, for a mean of 1: twice the sum of squared autocorrelations
+# of white noise seen through the difference formula, and through the mask by which its variance is estimated.
+ENERGY_VARIANCE = 2.0 * 1.576 + 2.0 * (35.0 / 18.0) ** 2
 # Columns of what is found out about a patch: place with its covariances, gain, offset, r, sigma0, steps.
 OUTPUTS = 11
 FLAG, X, Y, CXX, CXY, CYY, GAIN, OFFSET, R, SIGMA0, STEPS = range(OUTPUTS)
@@ -39,30 +43,66 @@ def judge(work: Workspace, min_r: float, H: FloatArray, out: FloatArray) -> int:
     gain = kernel_noise(H, half, work.kind, work.wx, work.wy)
     variance = residual / (n - len(q)) / (1.0 + gain)  # of one intensity, right units
     white = min(variance, white_noise(patch, 2 * half + 1) / (1.0 + gain))
-    noise = n * white / (beta * beta) * SLOPE_NOISE * half * half  # what it adds to the normal equations
-    xx, xy, yy = N[0, 0] - noise, N[0, 1], N[1, 1] - noise
-    weakest = (xx + yy) / 2 - np.hypot((xx - yy) / 2, xy)
     out[X], out[Y] = H[0, 2], H[1, 2]
     out[GAIN], out[OFFSET], out[R], out[SIGMA0] = beta, alpha, r, np.sqrt(residual / (n - len(q)))
     variance *= 1.0 + max(1.0, 1.0 / area_ratio(H))  # of the difference of two, as texture meets it
-    # The solution obeys J'^T (S - ...) = 0 with noisy J': its covariance is (J'^T J)^-1 J'^T J' (J^T J')^-1.
-    variance *= (1.0 + 2.0 * noise / max(xx + yy, noise)) * (half / beta) ** 2
-    q[:] = 0.0
-    q[0] = 1.0
-    solve_factorised(work.L, q)
-    cxx, cxy = q[0], q[1]
-    q[:] = 0.0
-    q[1] = 1.0
-    solve_factorised(work.L, q)
-    cyy = q[1]
+    variance *= (half / beta) ** 2
+    # The solution obeys J'^T (S - ...) = 0 with noisy J': its covariance is (J'^T J)^-1 J'^T J' (J^T J')^-1,
+    # where J'^T J' = N, and J'^T J is N less what noise adds to it.
+    least = 1.0 + TEXTURE_SIGMAS * np.sqrt(ENERGY_VARIANCE / n)
+    clean = without_noise(N, least * white / (beta * beta), half, geometric)
+    flat = not factorise(clean, clean, 0.0)
+    clean = N.copy() if flat else without_noise(N, white / (beta * beta), half, geometric)
+    factorise(clean, clean, 0.0)
+    column, middle = np.empty(len(q)), np.empty(len(q))
+    for k in range(2):
+        column[:] = 0.0
+        column[k] = 1.0
+        solve_factorised(clean, column)
+        for i in range(len(q)):
+            middle[i] = 0.0
+            for j in range(len(q)):
+                middle[i] += N[i, j] * column[j]
+        solve_factorised(clean, middle)
+        if k == 0:
+            cxx = middle[0]
+        cxy, cyy = middle[0], middle[1]
     for k in range(3):
         i, j = k // 2, (k + 1) // 2
         ix, iy = H[i, 0] - H[i, 2] * H[2, 0], H[i, 1] - H[i, 2] * H[2, 1]
         jx, jy = H[j, 0] - H[j, 2] * H[2, 0], H[j, 1] - H[j, 2] * H[2, 1]
         out[CXX + k] = variance * (ix * (cxx * jx + cxy * jy) + iy * (cxy * jx + cyy * jy))
-    if weakest < MIN_TEXTURE * noise:
+    if flat:
         return FLAT_TEXTURE
     return LOW_CORRELATION if r < min_r else MATCHED
+
+
+@compiled
+def without_noise(N: FloatArray, white: float, half: int, geometric: int) -> FloatArray:
+    """Return a normal matrix less what white noise of the template adds to it on average.
+
+    Args:
+        N: normal matrix of `patch_equations.gradients`, (u, u).
+        white: variance of the noise of an intensity of the template.
+        half: half the side of the window, px.
+        geometric: geometric parameters.
+    """
+    clean = N.copy()
+    n = (2 * half + 1) ** 2
+    noise = n * white * SLOPE_NOISE * half * half  # of gradients along x and y, which have none in common
+    second = (half + 1.0) / (3.0 * half)  # mean squares of the window coordinates, and their fourth powers
+    fourth = second * (3.0 * half * half + 3.0 * half - 1.0) / (5.0 * half * half)
+    for a in range(geometric):
+        if a < 2:
+            clean[a, a] -= noise
+        elif a < 6:
+            clean[a, a] -= noise * second
+        else:
+            clean[a, a] -= noise * (fourth + second * second)
+            clean[a, a - 6] += noise * second
+            clean[a - 6, a] += noise * second
+    clean[geometric + 1, geometric + 1] -= n * white
+    return clean
 
 
 @compiled_fast

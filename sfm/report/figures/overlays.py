@@ -58,6 +58,7 @@ REMARK_COLOURS = (
     (Flag.FLARE, (0, 160, 255)),
     (Flag.HALO, (255, 255, 120)),
     (Flag.SATURATED, (180, 180, 255)),
+    (Flag.DAMAGED, (150, 255, 210)),
 )
 
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from sfm.conventions import AnyArray
 from sfm.kernels.sampling import resample
-from sfm.matching.conjugate import ConjugatePoints
+from sfm.matching.conjugate_patches import ConjugatePoints
 
 PANEL = 168  # least side of a patch in the picture, px
 ZOOM = 8  # least side of one of its pixels, px

@@ -2,8 +2,9 @@
 
 Point `row * columns + column` is the dot or crossing in that row and column, both from 0, rows downwards and
 columns to the right as the plate is printed. Marks are larger dots or rings among the dots and tell how a
-photograph shows the plate, and which part of it. A plate without marks must be seen whole; how it is turned
-then follows from its colours (checkerboards with an odd number of rows and columns together) or is taken as
+photograph shows the plate, and which part of it. A plate of dots without marks must be seen whole, a
+checkerboard may be cut by the border of the photograph on one of two opposite sides; how they are turned
+follows from its colours (checkerboards with an odd number of rows and columns together) or is taken as
 it stands in the photograph, since the plate looks alike turned by 180 degrees.
 """
 
@@ -16,6 +17,7 @@ import numpy as np
 
 from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
 from sfm.errors import GeometryError
+from sfm.targets.codes.cut_boards import name_cut_board
 from sfm.targets.codes.lattice import Lattice, find_lattice
 from sfm.targets.codes.tags import DICTIONARIES
 from sfm.targets.fits.saddle import Saddles, measure_saddles
@@ -176,10 +178,13 @@ def _turned(place: IntArray, quarters: int) -> IntArray:
 
 
 def _checkerboard(grey: AnyArray, plate: PlateFamily) -> tuple[FloatArray, IntArray]:
-    """Return the crossings of a checkerboard and their points, upright or by the colours of its squares."""
+    """Return the crossings of a checkerboard and their points, upright or by the colours of its squares.
+
+    A board that OpenCV does not find whole may be one that the border of the photograph cuts.
+    """
     found, corners = cv2.findChessboardCornersSB(grey, (plate.columns, plate.rows), flags=FLAGS)
     if not found:
-        return np.zeros((0, 2)), np.zeros(0, dtype=np.int64)
+        return name_cut_board(grey, plate.rows, plate.columns)
     xy = np.asarray(corners, dtype=float).reshape(plate.rows, plate.columns, 2)
     across, down = xy[0, -1] - xy[0, 0], xy[-1, 0] - xy[0, 0]
     if across[0] * down[1] - across[1] * down[0] < 0:  # seen from behind

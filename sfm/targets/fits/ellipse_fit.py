@@ -12,7 +12,7 @@ from sfm.kernels.cholesky import invert_symmetric, solve_symmetric
 from sfm.kernels.options import compiled
 from sfm.targets.edge_rays import RAYS, improve_outline, trace_rays
 from sfm.targets.fits import blurred_ellipse as model
-from sfm.targets.fits import goodness
+from sfm.targets.fits import damage, goodness
 from sfm.targets.flags import Flag
 
 # A priori sigma of the change of gain over L: far above shading, it only keeps the fit regular.
@@ -37,6 +37,7 @@ _CLOSE_NEIGHBOUR = int(Flag.CLOSE_NEIGHBOUR)
 _CUT_BY_BORDER = int(Flag.CUT_BY_BORDER)
 _NOT_ELLIPTIC = int(Flag.NOT_ELLIPTIC)
 _NO_CONVERGENCE = int(Flag.NO_CONVERGENCE)
+_DAMAGED = int(Flag.DAMAGED)
 
 
 class EllipseFits(NamedTuple):
@@ -118,6 +119,7 @@ def _fit_one(
         return flag | _NO_CONVERGENCE
     prior = (noise / GAIN_SIGMA) ** 2
     N = np.empty((model.UNKNOWNS, model.UNKNOWNS))
+    start = theta.copy()
     steps = _iterate(pixels, n, theta, length, saturation, prior, J, N)
     skirt = SKIRT_SIGMAS * theta[model.BLUR] - SKIRT_PX
     if steps > 0 and skirt > SKIRT_PX and theta[model.CONTRAST] * sign > 0:
@@ -134,6 +136,22 @@ def _fit_one(
             steps = (
                 _iterate(pixels, n, theta, length, saturation, prior, J, N) if n > 2 * model.UNKNOWNS else 0
             )
+    if damage.is_damaged(pixels, n, theta, length, saturation, noise, J):
+        for _ in range(damage.TRACES):
+            trace_rays(image, start, sign, noise, margin, edge, limit)
+            if improve_outline(start, edge)[0] < MIN_AGREEMENT:
+                break
+        whole = pixels.copy()
+        m = _collect(image, start, limit, margin, half_x, half_y, mean < LARGE_PX, pixels)
+        _start_levels(pixels, m, start, saturation)
+        m = _fit_undamaged(pixels, m, start, length, saturation, noise, prior, J, N)
+        if m > 0:
+            flag |= _DAMAGED
+            n, steps = m, MAX_STEPS
+            theta[:] = start
+        else:
+            pixels = whole
+            model.normal_equations(pixels, n, theta, length, saturation, J, N, np.empty(model.UNKNOWNS))
     done = steps > 0
     goodness.judge_residuals(pixels, n, theta, length, saturation, J, statistics)
     goodness.judge_background(image, theta, length, statistics)
@@ -150,6 +168,41 @@ def _fit_one(
         return flag | _NO_CONVERGENCE
     cofactor[:] = N
     return flag
+
+
+@compiled
+def _fit_undamaged(
+    pixels: FloatArray,
+    n: int,
+    theta: FloatArray,
+    length: float,
+    saturation: float,
+    noise: float,
+    prior: float,
+    J: FloatArray,
+    N: FloatArray,
+) -> int:
+    """Fit the pixels that the model explains, from the edges on rays on, and put them first.
+
+    Returns:
+        How many they are; 0 where damage is no explanation.
+    """
+    sign = theta[model.CONTRAST]
+    kept, before = np.ones(n, np.bool_), -1
+    for k in range(damage.MAX_ROUNDS):
+        if not damage.explained_pixels(pixels, n, theta, length, saturation, noise, k, J, kept):
+            return 0
+        m = damage.move_to_front(pixels, n, kept)
+        if m < 2 * model.UNKNOWNS:
+            return 0
+        if _iterate(pixels, m, theta, length, saturation, prior, J, N) <= 0:
+            return 0
+        if theta[model.CONTRAST] * sign <= 0:
+            return 0
+        if m == before and k > len(damage.FIRST_OUTLIERS):
+            break
+        before = m
+    return before if before < n else 0
 
 
 @compiled

@@ -1,0 +1,298 @@
+"""Points of one photograph matched in another from a start: correlation to a pixel, then least squares.
+
+With `equalise` the histograms of both photographs are equalised in between, which is the order of document
+002; it helps the eye more than the matching, which has a gain and an offset of its own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+import numpy as np
+
+from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
+from sfm.kernels.sampling import AFTER, BEFORE
+from sfm.matching.correlation.ambiguity import ambiguous, independent_pixels
+from sfm.matching.correlation.ncc import NccMatches, match_ncc
+from sfm.matching.correlation.warped import match_ncc_warped
+from sfm.matching.lsm.patch_equations import MARGIN
+from sfm.matching.lsm.two_photo import LsmMatches, match_lsm
+from sfm.matching.match_flags import LsmFlag, NccFlag, in_words
+from sfm.matching.radiometry import equalise_histogram, grey_of
+
+METHODS = {"ncc": "", "lsm": "affine", "lsm8": "projective", "shift": "shift"}
+SIGNIFICANT = 9.21  # chi-squared of a difference in the plane, 1 %
+MAX_BIAS_PX = 1.0  # of a match whose template is bent
+MIN_HALF_WINDOW_PX = 7  # smaller ones hold no affine parameters
+NOT_PLANE = "surface not plane over the template"
+START_CORRELATION = 0.5  # smallest r of a start, which the warp has yet to make alike
+
+
+@dataclass(frozen=True)
+class ConjugatePoints:
+    """Points of the left photograph and where they are in the right one; NaN where the reason says why."""
+
+    method: str  # ncc | lsm | lsm8 | shift
+    left: FloatArray  # px, (k, 2)
+    right: FloatArray  # px, (k, 2)
+    covariance: FloatArray  # of `right`, px^2, (k, 2, 2)
+    warp: FloatArray  # right px from left px relative to the left point, homogeneous, (k, 3, 3)
+    correlation: FloatArray  # r of the template and the matched patch, (k,)
+    second: FloatArray  # r of the second-best place of the search window, (k,)
+    gain: FloatArray  # right intensities per left one, (k,)
+    offset: FloatArray  # right intensity units, (k,)
+    steps: IntArray  # Gauss-Newton steps, 0 for correlation, (k,)
+    reason: tuple[str, ...]  # empty where matched, else flags in words, (k,)
+
+    def __len__(self) -> int:
+        return len(self.left)
+
+    @property
+    def good(self) -> BoolArray:
+        """Which points were matched, (k,)."""
+        return np.array([not reason for reason in self.reason], dtype=bool)
+
+    @property
+    def sigma(self) -> FloatArray:
+        """Standard deviations of the right coordinates, px, (k, 2)."""
+        return np.asarray(np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2)))
+
+    def rows(self, some: BoolArray) -> ConjugatePoints:
+        """Return the marked points only, (k,)."""
+        return self._changed(lambda own: own[some])
+
+    def with_rows(self, rows: IntArray, others: ConjugatePoints) -> ConjugatePoints:
+        """Return the points with those of some numbers replaced by others, in order."""
+
+        def put(own: AnyArray, new: AnyArray) -> AnyArray:
+            own[rows] = new
+            return own
+
+        return self._changed(put, others)
+
+    def _changed(self, change: Callable[..., AnyArray], *others: ConjugatePoints) -> ConjugatePoints:
+        """Return the points with all columns changed by a function of a copy and of those of others."""
+        columns: dict[str, Any] = {"method": self.method}
+        for field in fields(self):
+            own = [getattr(one, field.name) for one in (self, *others)]
+            if field.name == "reason":
+                changed = change(*(np.array(one, dtype=object) for one in own))
+                columns["reason"] = tuple(changed.tolist())
+            elif field.name != "method":
+                columns[field.name] = change(own[0].copy(), *own[1:])
+        return ConjugatePoints(**columns)
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How points are matched; see `sfm.matching.conjugate.match_points`."""
+
+    method: str
+    template_px: int
+    search_px: int
+    equalise: bool
+    interpolation: str
+    min_correlation: float
+    back_px: float | None
+
+    @property
+    def reach_px(self) -> int:
+        """How far the template moves in the search window along a row and a column, px."""
+        return (self.search_px - self.template_px) // 2
+
+    @property
+    def start_correlation(self) -> float:
+        """Smallest r of a place that is matched, or is a start for least squares matching."""
+        if self.method == "ncc":
+            return self.min_correlation
+        return min(self.min_correlation, START_CORRELATION)
+
+
+@dataclass(frozen=True)
+class Starts:
+    """Where points are expected in the right photograph, and in which shape."""
+
+    xy: FloatArray  # px, NaN where unknown, (k, 2)
+    linear: FloatArray  # right px per left px, (k, 2, 2)
+    reach_px: IntArray  # how far from there they may be along a row and a column, left px, (k,)
+
+
+def match_upright(
+    left: AnyArray, right: AnyArray, xy_left: FloatArray, xy_right: FloatArray, by: Settings
+) -> ConjugatePoints:
+    """Match points whose templates look in the right photograph as they are, px, (k, 2) each."""
+    found = match_ncc(
+        left,
+        right,
+        xy_left,
+        xy_right,
+        template_px=by.template_px,
+        search_px=by.search_px,
+        min_correlation=by.start_correlation,
+    )
+    return _finished(left, right, xy_left, found, np.tile(np.eye(2), (len(xy_left), 1, 1)), by)
+
+
+def match_warped(
+    left: AnyArray, right: AnyArray, xy_left: FloatArray, start: Starts, by: Settings
+) -> ConjugatePoints:
+    """Match points, px, (k, 2), whose templates are turned, scaled and sheared in the right photograph."""
+    found = match_ncc_warped(
+        left,
+        right,
+        xy_left,
+        start.xy,
+        start.linear,
+        reach_px=start.reach_px,
+        template_px=by.template_px,
+        min_correlation=by.start_correlation,
+    )
+    return _finished(left, right, xy_left, found, start.linear, by)
+
+
+def confirmed(
+    left: AnyArray,
+    right: AnyArray,
+    matched: ConjugatePoints,
+    by: Settings,
+    reach_px: IntArray | None = None,
+) -> ConjugatePoints:
+    """Return the matches, those flagged that do not lead back to within `back_px`.
+
+    Args:
+        left: the left photograph.
+        right: the right photograph.
+        matched: points of the left found in the right one.
+        by: how.
+        reach_px: how far around the left point the way back may end, with the warp that was found turned
+            round, left px, (k,); upright templates in the whole search window if not given.
+    """
+    good = np.flatnonzero(matched.good)
+    if by.back_px is None or not len(good):
+        return matched
+    target = matched.left[good]
+    if reach_px is None:
+        back = match_upright(right, left, matched.right[good], target, by)
+    else:
+        linear = matched.warp[good, :2, :2] - matched.warp[good, :2, 2:] * matched.warp[good, 2:, :2]
+        there = np.linalg.norm(linear, axis=(1, 2)) / np.sqrt(2)
+        reach = np.maximum(np.ceil(reach_px[good] * there), 1).astype(np.int64)
+        back = match_warped(
+            right,
+            left,
+            matched.right[good],
+            Starts(target, np.asarray(np.linalg.inv(linear), dtype=float), reach),
+            by,
+        )
+    lost = good[~(np.linalg.norm(back.right - target, axis=1) <= by.back_px)]
+    why = np.array(matched.reason, dtype=object)
+    why[lost] = in_words(NccFlag, NccFlag.NOT_CONFIRMED)
+    return replace(matched, reason=tuple(why.tolist()))
+
+
+def _finished(
+    left: AnyArray, right: AnyArray, a: FloatArray, found: NccMatches, linear: FloatArray, by: Settings
+) -> ConjugatePoints:
+    """Return correlation's places as they are, or as starts of least squares matching."""
+    # A peak at the border of the search window is a start like any other: least squares may walk out of it.
+    started = found.good | (found.flag == int(NccFlag.AT_BORDER))
+    pixels = independent_pixels(grey_of(left), a, by.template_px)
+    doubt = started & ambiguous(found.correlation, found.second, pixels)
+    flag = np.where(doubt, int(NccFlag.AMBIGUOUS), found.flag)
+    outside = _what_is_outside(left, a, by.template_px // 2)
+    ncc_reason = tuple(
+        where or "outside: the search window in the right photograph"
+        if one == int(NccFlag.OUTSIDE)
+        else in_words(NccFlag, one)
+        for one, where in zip(flag.tolist(), outside, strict=True)
+    )
+    if by.method == "ncc":
+        warp = np.tile(np.eye(3), (len(a), 1, 1))
+        warp[:, :2, :2], warp[:, :2, 2] = linear, found.xy
+        return ConjugatePoints(
+            by.method, a, found.xy, found.covariance, warp, found.correlation,
+            found.second, found.gain, found.offset, np.zeros(len(a), dtype=np.int64), ncc_reason,
+        )  # fmt: skip
+    started &= ~doubt
+    seen = (equalise_histogram(left), equalise_histogram(right)) if by.equalise else (left, right)
+    start = np.where(started[:, None], np.where(found.good[:, None], found.xy, found.peak), -1.0)
+    lsm = match_lsm(
+        *seen,
+        a,
+        start,
+        model=METHODS[by.method],
+        window_px=by.template_px,
+        interpolation=by.interpolation,
+        min_correlation=by.min_correlation,
+        start=np.where(started[:, None, None], linear, np.eye(2)),
+    )
+    outside = _what_is_outside(left, a, by.template_px // 2, kernel=True)
+    lsm_reason = tuple(
+        where or "outside: the patch in the right photograph"
+        if one == int(LsmFlag.OUTSIDE)
+        else in_words(LsmFlag, one)
+        for one, where in zip(lsm.flag.tolist(), outside, strict=True)
+    )
+    bias = _bias(*seen, a, lsm, by)
+    covariance = lsm.covariance + bias[:, :, None] * bias[:, None, :]
+    bent = np.linalg.norm(bias, axis=1) > MAX_BIAS_PX
+    reason = tuple(
+        ncc if not ok else one or (NOT_PLANE if curved else "")
+        for ok, one, ncc, curved in zip(started, lsm_reason, ncc_reason, bent, strict=True)
+    )
+    correlation = np.where(started & np.isfinite(lsm.correlation), lsm.correlation, found.correlation)
+    return ConjugatePoints(
+        by.method, a, lsm.xy, covariance, lsm.warp, correlation, found.second, lsm.gain, lsm.offset,
+        np.where(started, lsm.steps, 0), reason,
+    )  # fmt: skip
+
+
+def _bias(left: AnyArray, right: AnyArray, a: FloatArray, lsm: LsmMatches, by: Settings) -> FloatArray:
+    """Return by how much matches are off since the surface is not plane over the template, px, (k, 2).
+
+    Over half of the window curvature has a quarter of its effect: what the place there differs by is three
+    quarters of the bias. Differences that may be noise count as none.
+    """
+    half = by.template_px // 4 * 2 + 1
+    bias = np.zeros((len(a), 2))
+    rows = np.flatnonzero(lsm.good)
+    if METHODS[by.method] == "shift" or half < MIN_HALF_WINDOW_PX or not len(rows):
+        return bias
+    linear = lsm.warp[rows, :2, :2] - lsm.warp[rows, :2, 2:] * lsm.warp[rows, 2:, :2]
+    small = match_lsm(
+        left, right, a[rows], lsm.xy[rows], window_px=half, interpolation=by.interpolation, start=linear
+    )
+    rows, d = rows[small.good], (small.xy - lsm.xy[rows])[small.good]
+    C = small.covariance[small.good] + lsm.covariance[rows]
+    real = np.einsum("ki,ki->k", d, np.linalg.solve(C, d[..., None])[..., 0]) > SIGNIFICANT
+    bias[rows[real]] = d[real] / 0.75
+    return bias
+
+
+def _what_is_outside(
+    photograph: AnyArray, xy: FloatArray, half: int, *, kernel: bool = False
+) -> tuple[str, ...]:
+    """Return in words what of the left points is outside their photograph, empty where nothing is.
+
+    Args:
+        photograph: the left photograph.
+        xy: the points, px, (k, 2).
+        half: half the side of the template, px.
+        kernel: whether the margin counts that least squares matching needs around the template.
+    """
+    size = np.array(photograph.shape[1::-1])
+    reach = half + MARGIN if kernel else half
+    at = np.floor(xy) if kernel else np.rint(xy)
+    resampled = (xy != at).any(axis=1, keepdims=True) & kernel
+    before, after = BEFORE * resampled, AFTER * resampled
+    off = np.asarray(~((xy >= 0) & (xy <= size - 1)).all(axis=1))
+    cut = np.asarray(((at - reach - before < 0) | (at + reach + after > size - 1)).any(axis=1))
+    what = "the template with the margin of its kernel" if kernel else "the template"
+    return tuple(
+        "outside: the point in the left photograph"
+        if o
+        else (f"outside: {what} in the left photograph" if c else "")
+        for o, c in zip(off.tolist(), cut.tolist(), strict=True)
+    )

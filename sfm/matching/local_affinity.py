@@ -1,0 +1,118 @@
+"""Affine maps from one photograph to another around points, from the key points near them.
+
+Of two photographs taken far apart a patch looks turned, scaled and sheared: correlation finds nothing, or
+something else. Key points, whose descriptors know neither scale nor rotation, tell the map beforehand.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+
+from sfm.conventions import MAD_TO_SIGMA, AnyArray, FloatArray
+from sfm.matching.tracks.feature_tracks import match_features, sift_features
+
+AROUND = 12  # key points nearest to a point
+MIN_AGREEING = 6  # of these, on one affine map: three determine it, and three confirm it
+FARTHEST_PX = 150.0  # of the third-nearest key point: farther away the surface is another one
+MARGIN_PX = 300.0  # around the points, in which key points are looked for
+MAX_STRETCH = 4.0  # ratio of lengths that a map may have in any direction
+LOCALISATION_PX = 1.0  # of a key point, on top of what the surface is not plane
+GROSS = 3.0  # times the robust spread, beyond which a key point is on another map
+MAX_FEATURES = 10_000
+TRIPLES = np.array(list(combinations(range(AROUND), 3)))
+SINGULAR = 1e-3  # part of the squared extent of the key points that the triangle of a triple must have
+
+
+@dataclass(frozen=True)
+class LocalAffinities:
+    """Where points are in the other photograph, and how it is turned and scaled there; NaN if unknown."""
+
+    xy: FloatArray  # place in the right photograph, px, (k, 2)
+    linear: FloatArray  # right px per left px, (k, 2, 2)
+    spread_px: FloatArray  # standard deviation of the place along an axis, right px, (k,)
+
+
+def local_affinities(
+    left: AnyArray, right: AnyArray, xy: FloatArray, *, max_features: int = MAX_FEATURES, seed: int = 0
+) -> LocalAffinities:
+    """Return the affine maps around points that the key points near them agree on.
+
+    Args:
+        left: photograph, (H, W), 8 or 16 bit or float, grey or colour.
+        right: the other photograph.
+        xy: points in the left photograph, px, (k, 2).
+        max_features: of each photograph, the strongest ones.
+        seed: of the random samples of the epipolar geometry.
+
+    Source: Lowe (2004), IJCV 60(2), for the key points; Rousseeuw (1984), J. Am. Stat. Assoc. 79, for the
+    least median of squares over all triples of the nearest ones.
+    """
+    at = np.asarray(xy, dtype=float).reshape(-1, 2)
+    if not len(at):
+        return affinities_around(at, at, at)
+    low = np.maximum(np.floor(at.min(axis=0) - MARGIN_PX), 0).astype(int)  # what is near no point is no use
+    high = np.ceil(at.max(axis=0) + MARGIN_PX).astype(int)
+    part = left[low[1] : high[1], low[0] : high[0]]
+    a, b = (sift_features(one, max_features=max_features) for one in (part, right))
+    pairs = match_features(a, b, seed=seed)
+    return affinities_around(a.xy[pairs[:, 0]] + low, b.xy[pairs[:, 1]], at)
+
+
+def affinities_around(key_left: FloatArray, key_right: FloatArray, xy: FloatArray) -> LocalAffinities:
+    """Return the affine maps of conjugate key points, px, (m, 2) each, around points, px, (k, 2)."""
+    at = np.asarray(xy, dtype=float).reshape(-1, 2)
+    found = LocalAffinities(
+        np.full((len(at), 2), np.nan), np.full((len(at), 2, 2), np.nan), np.full(len(at), np.nan)
+    )
+    if len(key_left) < AROUND:
+        return found
+    for k, place in enumerate(at):
+        if not np.isfinite(place).all():
+            continue
+        distance = np.linalg.norm(key_left - place, axis=1)
+        near = np.argpartition(distance, AROUND - 1)[:AROUND]
+        if np.sort(distance[near])[2] > FARTHEST_PX:
+            continue
+        one = _agreed_map(key_left[near] - place, key_right[near])
+        if one is not None:
+            found.linear[k], found.xy[k], found.spread_px[k] = one[0], one[1], one[2]
+    return found
+
+
+def _agreed_map(offset: FloatArray, target: FloatArray) -> tuple[FloatArray, FloatArray, float] | None:
+    """Return linear part, place of the zero offset and its standard deviation, px; None if too few agree.
+
+    Args:
+        offset: of the key points from the point, left px, (AROUND, 2).
+        target: their places in the right photograph, px, (AROUND, 2).
+    """
+    full = np.column_stack([offset, np.ones(len(offset))])  # (n, 3)
+    area = np.abs(np.linalg.det(full[TRIPLES]))
+    triples = TRIPLES[area > SINGULAR * np.ptp(offset, axis=0).max() ** 2]
+    if not len(triples):
+        return None
+    maps = np.linalg.solve(full[triples], target[triples])  # (t, 3, 2)
+    off = np.linalg.norm(full @ maps - target, axis=2)  # (t, n)
+    best = int(np.median(off, axis=1).argmin())
+    limit = GROSS * max(MAD_TO_SIGMA * float(np.median(off[best])), LOCALISATION_PX)
+    agree = off[best] <= limit
+    if agree.sum() < MIN_AGREEING:
+        return None
+    # near ones tell more about the place than far ones, as the surface is curved
+    length = np.linalg.norm(offset[agree], axis=1)
+    weight = 1.0 / (1.0 + (length / max(float(np.median(length)), 1.0)) ** 2)
+    N = full[agree].T @ (weight[:, None] * full[agree])
+    if np.linalg.matrix_rank(N) < 3:
+        return None
+    solved = np.linalg.solve(N, full[agree].T @ (weight[:, None] * target[agree]))
+    linear = solved[:2].T
+    stretch = np.linalg.svd(linear, compute_uv=False)
+    if not (np.linalg.det(linear) > 0 and stretch[0] < MAX_STRETCH and stretch[1] > 1 / MAX_STRETCH):
+        return None
+    v = full[agree] @ solved - target[agree]
+    redundancy = max(2 * int(agree.sum()) - 6, 1)
+    variance = max(float((weight[:, None] * v * v).sum()) / redundancy, LOCALISATION_PX**2)
+    return linear, solved[2], float(np.sqrt(variance * np.linalg.inv(N)[2, 2]))

@@ -1,0 +1,186 @@
+"""A model before and after refinement as a page, and its standard deviations as tables."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sfm.adjustment.result import Adjustment
+from sfm.conventions import FloatArray, IntArray
+from sfm.files.plain_text import csv_text
+from sfm.report.html.page import render
+from sfm.report.numbers import general, significant
+from sfm.survey.refine import Refinement
+
+PAGE = "refinement.html"
+POINT_COLUMNS = ("point3D_id", "X", "Y", "Z", "sX", "sY", "sZ", "rays")
+IMAGE_COLUMNS = (
+    *("image_id", "name", "X0", "Y0", "Z0", "sX0", "sY0", "sZ0"),
+    *("somega_deg", "sphi_deg", "skappa_deg", "key_points", "measured_anew", "rms_before_px", "rms_after_px"),
+)
+CAMERA_COLUMNS = ("camera_id", "model", "parameter", "before", "after", "sigma")
+FEW_MEASURED = 0.5  # part of the key points below which something is wrong with photographs or windows
+NOT_ROWS = 12  # photographs named that were not adjusted
+
+
+@dataclass(frozen=True)
+class Numbers:
+    """How the file of a model counts photographs and points, and its interior orientation in its terms."""
+
+    image_ids: tuple[int, ...]  # of each photograph
+    point_ids: tuple[int, ...]  # of each point
+    interior: tuple[tuple[object, ...], ...]  # rows of CAMERA_COLUMNS, sigma NaN where held
+    in_rigs: int = 0  # photographs that belong to rigs of several cameras
+
+
+def refinement_files(found: Refinement, numbers: Numbers, *, title: str) -> dict[str, str]:
+    """Return the page and the tables by the names of their files.
+
+    Args:
+        found: the model before and after.
+        numbers: as its file counts.
+        title: of the page, such as the folder of the model.
+    """
+    images = image_rows(found, numbers)
+    return {
+        "sigma_points.csv": csv_text(POINT_COLUMNS, _point_rows(found, numbers)),
+        "sigma_images.csv": csv_text(IMAGE_COLUMNS, images),
+        "sigma_cameras.csv": csv_text(CAMERA_COLUMNS, [[_blank(c) for c in row] for row in numbers.interior]),
+        PAGE: _page(found, numbers, images, title),
+    }
+
+
+def _page(found: Refinement, numbers: Numbers, images: list[list[object]], title: str) -> str:
+    """Return the page."""
+    after, before = found.adjustment, found.readjusted
+    lost = [name for name, used in zip(found.model.images, found.images, strict=True) if not used]
+    remarks = []
+    if not after.converged or after.defect > after.expected_defect:
+        remarks.append("The adjustment did not converge or cannot determine everything.")
+    if lost:
+        more = f" and {len(lost) - NOT_ROWS} more" if len(lost) > NOT_ROWS else ""
+        remarks.append(f"{len(lost)} photographs were not adjusted: {', '.join(lost[:NOT_ROWS])}{more}.")
+    if found.refined < FEW_MEASURED * found.key_points:
+        remarks.append(f"Only {found.refined} of {found.key_points} key points were measured anew.")
+    if numbers.in_rigs:
+        remarks.append(
+            f"{numbers.in_rigs} photographs are in rigs: COLMAP's adjuster held their cameras together "
+            "afterwards; standard deviations are those without that condition."
+        )
+    bad = not after.converged or after.defect > after.expected_defect
+    return render(
+        "refinement.html",
+        title=title,
+        headline=f"RMS of the key points {significant(found.before_px)} px before, "
+        f"{significant(found.after_px)} px after",
+        level="bad" if bad else "fair" if remarks else "good",
+        remarks=remarks,
+        sizes=_sizes(found),
+        found=found,
+        after=after,
+        before=before,
+        interior=numbers.interior,
+        images=images,
+    )
+
+
+def _sizes(found: Refinement) -> list[tuple[str, ...]]:
+    """Return rows of what the page compares: name, before, adjusted here, after."""
+    both = (found.readjusted, found.adjustment)
+    rows: list[tuple[str, ...]] = [
+        (
+            "RMS of key points, per coordinate [px]",
+            general(found.before_px, 4),
+            *(general(one.rms_px, 4) for one in both),
+        ),
+        ("sigma0 [px]", "", *(general(one.sigma0_px, 4) for one in both)),
+    ]
+    for name, of, factor in (
+        ("Projection centre: median standard deviation [object units]", _centre_sigmas, 1.0),
+        ("Rotation: median standard deviation [mdeg]", _rotation_sigmas, 1000.0),
+        ("Point: median standard deviation of a coordinate [object units]", _point_sigmas, 1.0),
+    ):
+        rows.append((name, "", *(significant(factor * float(np.median(of(one)))) for one in both)))
+    rows.append(("Photographs", str(len(found.images)), *(str(len(one.network.images)) for one in both)))
+    rows.append(("Points", str(len(found.points)), *(str(len(one.network.points)) for one in both)))
+    used = (str(int((~one.rejected).sum())) for one in both)
+    rows.append(("Key points with a point", str(found.key_points), *used))
+    return rows
+
+
+def _centre_sigmas(one: Adjustment) -> FloatArray:
+    return _root_mean(one.covariance.exterior[:, :3, :3])
+
+
+def _rotation_sigmas(one: Adjustment) -> FloatArray:
+    return np.degrees(_root_mean(one.covariance.exterior[:, 3:, 3:]))
+
+
+def _point_sigmas(one: Adjustment) -> FloatArray:
+    return _root_mean(one.covariance.points)
+
+
+def _root_mean(covariance: FloatArray) -> FloatArray:
+    """Return the standard deviation of one coordinate, the mean of three, (n,)."""
+    return np.asarray(np.sqrt(np.trace(covariance, axis1=1, axis2=2) / 3))
+
+
+def image_rows(found: Refinement, numbers: Numbers) -> list[list[object]]:
+    """Return the rows of sigma_images.csv; empty cells of photographs that were not adjusted."""
+    seen, accepted = found.model.image_points, found.accepted
+    m = len(found.images)
+    count = np.bincount(seen.image, minlength=m)
+    anew = np.bincount(seen.image[accepted], minlength=m)
+    before = _rms_of(found.residuals_before, seen.image, m)
+    own = found.adjustment
+    used = ~own.rejected
+    after = np.full(m, np.nan)
+    after[found.images] = _rms_of(
+        own.residuals[used], own.network.image_points.image[used], int(found.images.sum())
+    )
+    sigma = np.full((m, 6), np.nan)
+    sigma[found.images] = np.sqrt(np.diagonal(own.covariance.exterior, axis1=1, axis2=2))
+    sigma[:, 3:] = np.degrees(sigma[:, 3:])
+    return [
+        [
+            numbers.image_ids[i],
+            found.model.images[i],
+            *(_blank(value) for value in (*found.estimate.position[i], *sigma[i])),
+            int(count[i]),
+            int(anew[i]),
+            _blank(before[i]),
+            _blank(after[i]),
+        ]
+        for i in range(m)
+    ]
+
+
+def _point_rows(found: Refinement, numbers: Numbers) -> list[list[object]]:
+    """Return the rows of sigma_points.csv: the adjusted points."""
+    own = found.adjustment
+    rays = np.bincount(own.network.image_points.point[~own.rejected], minlength=len(own.network.points))
+    sigma = np.sqrt(np.diagonal(own.covariance.points, axis1=1, axis2=2))
+    return [
+        [numbers.point_ids[j], *xyz, *s, int(r)]
+        for j, xyz, s, r in zip(
+            np.flatnonzero(found.points).tolist(),
+            own.estimate.points.tolist(),
+            sigma.tolist(),
+            rays.tolist(),
+            strict=True,
+        )
+    ]
+
+
+def _rms_of(v: FloatArray, image: IntArray, m: int) -> FloatArray:
+    """Return the RMS per coordinate of residuals (k, 2) of each photograph, NaN where there is none, (m,)."""
+    known = np.isfinite(v).all(axis=1)
+    count = np.bincount(image[known], minlength=m)
+    squares = np.bincount(image[known], (v[known] ** 2).sum(axis=1), minlength=m)
+    return np.asarray(np.sqrt(np.where(count > 0, squares / (2 * np.maximum(count, 1)), np.nan)))
+
+
+def _blank(value: object) -> object:
+    """Return a value, an empty text in place of what is not known."""
+    return "" if isinstance(value, float) and not np.isfinite(value) else value

@@ -1,0 +1,113 @@
+"""Points of photographs that are turned, scaled or taken far apart, and windows of weak texture."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+from benchmarks.wide_matching import count_matches, photograph, points_and_truth, wide_scene
+from datasets.textured import render
+from sfm.conventions import FloatArray
+from sfm.matching import conjugate
+from sfm.matching.conjugate import match_points
+from sfm.matching.conjugate_patches import ConjugatePoints
+from sfm.matching.local_affinity import affinities_around
+from sfm.matching.lsm.two_photo import match_lsm
+from tests.textures import MEAN, affine_pairs, random_texture, with_noise
+
+SIZE = (180, 150)
+POINTS = np.array([[x, y] for y in (60.0, 75.0, 90.0) for x in (65.0, 77.5, 90.0, 102.0, 115.3)])
+NOISE = 2.0
+
+
+@cache
+def _turned(angle_deg: float, scale: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Two photographs of one plane texture, and the truth of POINTS in the second."""
+    rng = np.random.default_rng(5)
+    fine, coarse = random_texture(rng, 2.0), random_texture(rng, 8.0)
+    angle = np.radians(angle_deg)
+    A = scale * np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    middle = np.array(SIZE) / 2
+    y, x = np.mgrid[0 : SIZE[1], 0 : SIZE[0]].astype(float)
+    back = (np.stack([x, y], axis=-1) - middle) @ np.linalg.inv(A).T + middle
+    left, right = (
+        0.5 * (fine.value(u, v) + coarse.value(u, v)) for u, v in ((x, y), (back[..., 0], back[..., 1]))
+    )
+    return with_noise(left, NOISE, 1), with_noise(right, NOISE, 2), (POINTS - middle) @ A.T + middle
+
+
+def _right(found: ConjugatePoints, truth: FloatArray) -> int:
+    """Count the points matched, all of which must be right."""
+    assert (np.abs(found.right - truth)[found.good] < 0.2).all()
+    return int(found.good.sum())
+
+
+def test_key_points_lead_to_places_that_are_turned_and_scaled() -> None:
+    left, right, truth = _turned(75.0, 0.8)
+    assert _right(match_points(left, right, POINTS, wide=False), truth) == 0
+    assert _right(match_points(left, right, POINTS), truth) >= 14
+    # with search windows elsewhere they must not lead out of them
+    elsewhere = match_points(left, right, POINTS[:2], xy_right=truth[:2] + 90.0, search_px=61)
+    assert not elsewhere.good.any()
+
+
+@pytest.mark.parametrize(("angle_deg", "scale"), [(27.0, 0.8), (-15.0, 1.27)])
+def test_without_key_points_templates_are_turned(
+    monkeypatch: pytest.MonkeyPatch, angle_deg: float, scale: float
+) -> None:
+    none = np.zeros((0, 2))
+    monkeypatch.setattr(conjugate, "local_affinities", lambda _l, _r, at: affinities_around(none, none, at))
+    left, right, truth = _turned(angle_deg, scale)
+    some, start = POINTS[::3], truth[::3] + np.array([6.0, -5.0])
+    assert _right(match_points(left, right, some, xy_right=start, search_px=61, wide=False), truth[::3]) < 3
+    assert _right(match_points(left, right, some, xy_right=start, search_px=61), truth[::3]) == len(some)
+    other = with_noise(
+        random_texture(np.random.default_rng(6), 3.0).value(*np.mgrid[0:180, 0:150]).T, NOISE, 3
+    )
+    assert not match_points(left, other, some, search_px=61).good.any()
+
+
+def test_the_map_around_a_point_is_that_of_most_key_points() -> None:
+    rng = np.random.default_rng(7)
+    A, shift = np.array([[0.9, -0.4], [0.5, 1.1]]), np.array([40.0, 7.0])
+    left = rng.uniform(0, 100, (40, 2))
+    right = left @ A.T + shift + rng.normal(0, 0.3, left.shape)
+    right[::4] = rng.uniform(0, 200, right[::4].shape)
+    found = affinities_around(left, right, np.array([[50.0, 50.0], [1000.0, 50.0], [np.nan, 50.0]]))
+    assert found.xy[0] == pytest.approx(A @ [50.0, 50.0] + shift, abs=1.0)
+    assert found.linear[0] == pytest.approx(A, abs=0.05)
+    assert 0.2 < found.spread_px[0] < 1.5
+    assert np.isnan(found.xy[1:]).all()  # too far from all key points, and nowhere
+
+
+def test_a_large_window_sums_up_weak_texture() -> None:
+    """Contrast of 10 and noise of 2: each pixel's gradient is noise, and 961 of them are texture."""
+    pairs = affine_pairs(11, 100, grain_px=4.0, half=15, distortion=0.03)
+    left, right = (
+        with_noise(MEAN + 0.25 * (one - MEAN), NOISE, k) for k, one in enumerate((pairs.left, pairs.right))
+    )
+    found = match_lsm(left, right, pairs.centre, pairs.centre, window_px=31)
+    assert found.good.mean() > 0.9
+    e = (found.xy - pairs.centre - pairs.shift)[found.good]
+    assert np.sqrt((e**2).mean()) < 0.06
+    z2 = np.einsum("ki,kij,kj->k", e, np.linalg.inv(found.covariance[found.good]), e) / 2
+    assert z2.mean() == pytest.approx(1.0, abs=0.3)  # 200 squares: 0.1
+    noise = [with_noise(np.full(left.shape, MEAN), NOISE, k) for k in (3, 4)]
+    assert not match_lsm(*noise, pairs.centre, pairs.centre, window_px=31, min_correlation=0.0).good.any()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("roughness", "least", "wrong"), [("smooth", 0.95, 0), ("medium", 0.9, 0), ("rough", 0.3, 4)]
+)
+def test_wide_baselines_of_rendered_surfaces(roughness: str, least: float, wrong: int) -> None:
+    """Convergence of 20, 40 and 60 degrees and a turn by 90; ripples are bent over a template of 21 px."""
+    views = ((20.0, 0.0, 1.0), (40.0, 0.0, 1.0), (60.0, 0.0, 1.0), (20.0, 90.0, 1.0))
+    scene, skin = wide_scene(roughness, views), render.texture()
+    left = photograph(scene, 0, skin)
+    for index in range(1, len(views) + 1):
+        xy, truth = points_and_truth(scene, index, 60)
+        counts = count_matches(left, photograph(scene, index, skin), xy, truth, "key points")
+        assert counts.wrong <= wrong and counts.right >= least * counts.points, views[index - 1]

@@ -1,0 +1,228 @@
+"""What `kolinear refine` keeps of a COLMAP model: numbers, colours, cameras, rigs, and points not used."""
+
+from __future__ import annotations
+
+import csv
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from adapters.colmap.refined_model import open_model
+from datasets.textured import render
+from sfm.camera import camera_from_values, project, tangents_from_pixel
+from sfm.cli.commands.refining import refine
+from sfm.conventions import AnyArray, FloatArray, IntArray
+from sfm.errors import BackendError, PhotographError, SurveyFileError
+from sfm.network import Estimate
+from sfm.survey.refine_windows import parts_of
+
+pycolmap = pytest.importorskip("pycolmap")
+
+SIZE = (300, 240)
+FOCAL = render.C_MM / render.PIXEL_MM[0]
+PHOTOGRAPHS = 4
+NOISE_PX = 0.3
+COLOUR = (10, 200, 30)
+PARAMS = {
+    "SIMPLE_PINHOLE": [FOCAL, SIZE[0] / 2, SIZE[1] / 2],
+    "PINHOLE": [FOCAL, FOCAL, SIZE[0] / 2, SIZE[1] / 2],
+    "SIMPLE_RADIAL": [FOCAL, SIZE[0] / 2, SIZE[1] / 2, 1e-4],
+    "RADIAL": [FOCAL, SIZE[0] / 2, SIZE[1] / 2, 1e-4, 1e-4],
+    "FULL_OPENCV": [FOCAL, FOCAL, SIZE[0] / 2, SIZE[1] / 2, 1e-4, *[0.0] * 7],
+    "OPENCV_FISHEYE": [FOCAL, FOCAL, SIZE[0] / 2, SIZE[1] / 2, *[0.0] * 4],
+}
+AWAY = 40  # of the numbers of COLMAP
+
+
+@cache
+def _scene() -> tuple[tuple[AnyArray, ...], Estimate]:
+    """Four small photographs of the textured surface, their orientation, and points on the surface."""
+    lens = camera_from_values("lens", "opencv", SIZE, render.PIXEL_MM, c_mm=render.C_MM)
+    pair = [part[:2] for part in render.stations()]
+    turn = cv2.Rodrigues(np.array([0.0, 0.0, -0.8]))[
+        0
+    ]  # the same two cameras again, as a rig would carry them
+    position = np.vstack([pair[0], pair[0] @ turn.T])
+    rotation = np.concatenate([pair[1], turn @ pair[1]])
+    skin = render.texture()
+    y, x = np.mgrid[0 : SIZE[1], 0 : SIZE[0]]
+    uv = tangents_from_pixel(lens, np.column_stack([x.ravel(), y.ravel()]))
+    pictures = []
+    for i in range(PHOTOGRAPHS):
+        rays = np.column_stack([uv, -np.ones(len(uv))]) @ rotation[i].T
+        at = render.surface_points(position[i], rays)[:, :2] / render.TEXEL_M + len(skin) / 2
+        at = at.astype(np.float32).reshape(*SIZE[::-1], 2)
+        light = cv2.GaussianBlur(cv2.remap(skin, at[..., 0], at[..., 1], cv2.INTER_LINEAR), (0, 0), 0.8)
+        pictures.append(np.rint(np.clip(200 * light, 0, 255)).astype(np.uint8))
+    x, y = np.meshgrid(np.arange(90, 211, 15.0), np.arange(70, 171, 15.0))
+    uv = tangents_from_pixel(lens, np.column_stack([x.ravel(), y.ravel()]))
+    points = render.surface_points(position[0], np.column_stack([uv, -np.ones(len(uv))]) @ rotation[0].T)
+    return tuple(pictures), Estimate((lens,), position, rotation, points)
+
+
+def _model(folder: Path, camera: str = "SIMPLE_RADIAL", *, rig: bool = False) -> Any:
+    """Write photographs in two folders and a model of them with numbers of its own, and return the scene."""
+    pictures, truth = _scene()
+    rng = np.random.default_rng(9)
+    scene = pycolmap.Reconstruction()
+    cameras = (7, 9) if rig else (7, 7)
+    for number in sorted(set(cameras)):
+        lens = pycolmap.Camera(
+            model=camera, width=SIZE[0], height=SIZE[1], params=PARAMS[camera], camera_id=number
+        )
+        (scene.add_camera if rig else scene.add_camera_with_trivial_rig)(lens)
+    poses = []
+    for i in range(len(pictures)):
+        M = np.diag([1.0, -1.0, -1.0]) @ truth.rotation[i].T
+        poses.append(pycolmap.Rigid3d(pycolmap.Rotation3d(M), -M @ truth.position[i]))
+    if rig:
+        _add_rig(scene, poses)
+    for i, picture in enumerate(pictures):
+        seen = project(truth.cameras[0], truth.position[i], truth.rotation[i], truth.points)
+        seen = np.vstack(
+            [[5.0, 6.0], seen + rng.normal(0, NOISE_PX, seen.shape)]
+        )  # the first claims no point
+        name = f"{'ab'[i % 2]}/{i}.png"
+        image = pycolmap.Image(name=name, keypoints=seen + 0.5, camera_id=cameras[i % 2], image_id=AWAY + i)
+        if rig:
+            image.frame_id = 1 + i // 2
+            scene.add_image(image)
+        else:
+            scene.add_image_with_trivial_frame(image, poses[i])
+        (folder / name).parent.mkdir(exist_ok=True)
+        cv2.imwrite(str(folder / name), picture)
+    if rig:
+        for number in scene.frames:
+            scene.register_frame(number)
+    for j, xyz in enumerate(truth.points):
+        rays = range(2) if j < 3 else range(len(pictures))
+        point = pycolmap.Point3D(xyz=xyz, color=np.array(COLOUR, np.uint8))
+        scene.add_point3D_with_id(AWAY + 2 * j, point)
+        for i in rays:
+            scene.add_observation(AWAY + 2 * j, pycolmap.TrackElement(AWAY + i, j + 1))
+    (folder / "model").mkdir()
+    scene.write_binary(str(folder / "model"))
+    return scene
+
+
+def _add_rig(scene: Any, poses: list[Any]) -> None:
+    """Add one rig of both cameras, near the poses of the truth, and its two frames."""
+    sensors = [pycolmap.sensor_t(type=pycolmap.SensorType.CAMERA, id=number) for number in (7, 9)]
+    rig = pycolmap.Rig(rig_id=3)
+    rig.add_ref_sensor(sensors[0])
+    rig.add_sensor(sensors[1], poses[1] * poses[0].inverse())
+    scene.add_rig(rig)
+    for k in range(2):
+        frame = pycolmap.Frame(frame_id=k + 1, rig_id=3)
+        for sensor, i in zip(sensors, (2 * k, 2 * k + 1), strict=True):
+            frame.add_data_id(pycolmap.data_t(sensor_id=sensor, id=AWAY + i))
+        frame.rig_from_world = poses[2 * k]
+        scene.add_frame(frame)
+
+
+def _key_points(scene: Any, image: int) -> FloatArray:
+    return np.array([p.xy for p in scene.image(image).points2D])
+
+
+@pytest.mark.parametrize("camera", ["SIMPLE_RADIAL", "PINHOLE"])
+def test_what_is_not_measured_stays_as_it_is(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], camera: str
+) -> None:
+    before = _model(tmp_path, camera)
+    refine(tmp_path / "model", tmp_path)
+    out = tmp_path / "model_refined"
+    assert "measured anew" in capsys.readouterr().out
+    after = pycolmap.Reconstruction(str(out))
+    assert list(after.images) == list(before.images) and set(after.point3D_ids()) == set(before.point3D_ids())
+    assert after.camera(7).model_name == camera
+    params = after.camera(7).params
+    assert params[0] == pytest.approx(FOCAL, rel=0.02)
+    assert not (params == before.camera(7).params)[:3].any()  # focal length and principal point are estimated
+    assert all((p.color == COLOUR).all() for p in after.points3D.values())
+    truth = _scene()[1]
+    moved = []
+    for i in range(AWAY, AWAY + PHOTOGRAPHS):
+        was, now = _key_points(before, i), _key_points(after, i)
+        assert (was[0] == now[0]).all() and len(was) == len(now)  # a key point without a point
+        moved.append(np.abs(now - was)[4:].max(axis=1) > 0.05)
+    assert 0.5 < np.mean(moved) < 0.9  # all but the reference of each point, whose template is the key point
+    for j in range(3):  # of two photographs: key points as they came, the point intersected anew
+        assert after.point3D(AWAY + 2 * j).track.length() == 2
+        assert (_key_points(after, AWAY)[j + 1] == _key_points(before, AWAY)[j + 1]).all()
+        assert 0 < np.linalg.norm(after.point3D(AWAY + 2 * j).xyz - truth.points[j]) < 0.05
+    with (out / "sigma_points.csv").open(encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    assert {int(row["point3D_id"]) for row in rows} <= set(after.point3D_ids()) and len(rows) > 40
+    assert all(0 < float(row["sZ"]) < 0.01 for row in rows)
+    with (out / "sigma_cameras.csv").open(encoding="utf-8") as file:
+        interior = list(csv.DictReader(file))
+    assert interior[0]["model"] == camera and float(interior[0]["sigma"]) > 0
+    assert float(interior[0]["after"]) == pytest.approx(params[0], rel=1e-9)
+    page = (out / "refinement.html").read_text(encoding="utf-8")
+    assert (
+        "a/0.png" in page and "of a point that fewer than 3 photographs see" in page and "http:" not in page
+    )
+    # COLMAP goes on from there: the same key points, hardly anything left to change
+    error = after.compute_mean_reprojection_error()
+    pycolmap.bundle_adjustment(after, pycolmap.BundleAdjustmentOptions(print_summary=False))
+    assert after.compute_mean_reprojection_error() < 1.05 * error
+
+
+def test_a_rig_comes_out_with_its_rig(tmp_path: Path) -> None:
+    before = _model(tmp_path, "PINHOLE", rig=True)
+    refine(tmp_path / "model", tmp_path, out=tmp_path / "out")
+    after = pycolmap.Reconstruction(str(tmp_path / "out"))
+    assert after.rig(3).num_sensors() == 2 and len(after.frames) == 2
+    sensor = after.rig(3).non_ref_sensors
+    assert list(sensor) == list(before.rig(3).non_ref_sensors)
+    assert "in rigs" in (tmp_path / "out" / "refinement.html").read_text(encoding="utf-8")
+
+
+def test_masks(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    _model(tmp_path)
+    masks = tmp_path / "masks"
+    with pytest.raises(SurveyFileError, match=r"no mask of any photograph, expected 'a/0\.png\.png'"):
+        refine(tmp_path / "model", tmp_path, masks=masks)
+    (masks / "a").mkdir(parents=True)
+    cv2.imwrite(str(masks / "a" / "0.png.png"), np.zeros((10, 10), np.uint8))
+    with pytest.raises(PhotographError, match="the mask has 10 x 10 px, its photograph 300 x 240 px"):
+        refine(tmp_path / "model", tmp_path, masks=masks)
+    mask = np.full(SIZE[::-1], 255, np.uint8)
+    mask[:, : SIZE[0] // 2] = 0
+    cv2.imwrite(str(masks / "a" / "0.png.png"), mask)
+    refine(tmp_path / "model", tmp_path, masks=masks)
+    assert "where the mask is black" in capsys.readouterr().out
+
+
+def test_a_fisheye_camera_is_refused_by_its_name(tmp_path: Path) -> None:
+    _model(tmp_path, "OPENCV_FISHEYE")
+    with pytest.raises(BackendError, match="COLMAP's model OPENCV_FISHEYE, expected one of SIMPLE_PINHOLE"):
+        refine(tmp_path / "model", tmp_path)
+
+
+@pytest.mark.parametrize("camera", ["SIMPLE_PINHOLE", "RADIAL"])
+def test_one_focal_length_is_read_as_one(tmp_path: Path, camera: str) -> None:
+    scene = _model(tmp_path, camera)
+    opened = open_model(tmp_path / "model")
+    ours, at = opened.estimate.cameras[0], np.array([[0.1, -0.05], [-0.12, 0.08]])
+    assert ours.model == "brown_forward" and opened.models == (camera,)
+    points = np.column_stack([at[:, 0], -at[:, 1], np.ones(2)])  # COLMAP looks along +z, y down
+    theirs = np.asarray(scene.camera(7).img_from_cam(points)) - 0.5
+    assert project(ours, np.zeros(3), np.eye(3), np.column_stack([at, -np.ones(2)])) == pytest.approx(theirs)
+
+
+def test_parts_keep_to_the_memory() -> None:
+    rng = np.random.default_rng(3)
+    image = np.concatenate([rng.choice(30, 5, replace=False) for _ in range(200)])
+    point = np.repeat(np.arange(200), 5)
+    reference: IntArray = image[::5]
+    parts = list(parts_of(image, point, reference, np.full(30, 10), 120))
+    assert sorted(np.concatenate(parts).tolist()) == list(range(1000))
+    for rows in parts:
+        assert len(np.unique(image[rows])) <= 12
+        assert np.isin(point, point[rows]).sum() == len(rows)  # points are whole
+    assert len(list(parts_of(image, point, reference, np.full(30, 10), 10**9))) == 20
