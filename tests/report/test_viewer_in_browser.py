@@ -277,7 +277,7 @@ def test_a_photograph_shows_its_thumbnail_under_the_pointer(tab: Tab, scene: Vie
 
 
 def test_the_scene_is_on_paper(tab: Tab) -> None:
-    """The canvas of the scene is empty by the time its page is laid out for the printer: a copy stands there."""
+    """The canvas of the scene is empty by the time its page is laid out on paper: a copy stands there."""
     page = tab.page
     page.evaluate(SELECT, ["point", 3])
     page.emulate_media(media="print")

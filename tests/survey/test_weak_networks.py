@@ -49,8 +49,8 @@ def test_c_that_had_to_be_held_is_freed_where_it_fits_better() -> None:
 @pytest.mark.parametrize(
     "number",
     [
-        378,  # c 30 % too short and held: 7.2 sigma wrong and called fair; damped steps crept along the valley
-        667,  # four photographs from within 9 degrees, c a quarter of the truth: 28 sigma wrong and called fair
+        378,  # c 30 % too short and held: 7.2 sigma wrong, fair; damped steps crept along the valley
+        667,  # four photographs from within 9 degrees, c a quarter of the truth: 28 sigma wrong, fair
     ],
 )
 def test_other_principal_distances_are_found_along_bent_valleys(number: int) -> None:
