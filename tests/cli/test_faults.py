@@ -327,9 +327,7 @@ def test_interrupted_batch_stops_cleanly(tmp_path: Path) -> None:
         [*KOLINEAR, "batch", *map(str, surveys), "--out", str(out), "--jobs", "2"],
         cwd=ROOT,
         start_new_session=True,
-        preexec_fn=partial(
-            signal.signal, signal.SIGINT, signal.SIG_DFL
-        ),  # else ignored in the background
+        preexec_fn=partial(signal.signal, signal.SIGINT, signal.SIG_DFL),  # else ignored in the background
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
