@@ -2,11 +2,19 @@
 
 from __future__ import annotations
 
+import os
 import sys
+import tempfile
 from importlib.metadata import version as version_of
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parent))
+
+# the kernels of notebooks warn of unencrypted ports, which no process of another computer can reach
+profile = Path(tempfile.mkdtemp()) / "profile_default"
+profile.mkdir()
+(profile / "ipython_kernel_config.py").write_text("c.Application.log_level = 40\n", encoding="utf-8")
+os.environ["IPYTHONDIR"] = str(profile.parent)
 
 project = "Kolinear"
 release = version = version_of("kolinear")

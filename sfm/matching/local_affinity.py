@@ -12,7 +12,7 @@ from itertools import combinations
 import numpy as np
 
 from sfm.conventions import MAD_TO_SIGMA, AnyArray, FloatArray
-from sfm.matching.tracks.feature_tracks import match_features, sift_features
+from sfm.matching.tracks.features import match_features, sift_features
 
 AROUND = 12  # key points nearest to a point
 MIN_AGREEING = 6  # of these, on one affine map: three determine it, and three confirm it

@@ -13,6 +13,7 @@ import subprocess
 import sys
 import time
 from dataclasses import fields
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -326,6 +327,9 @@ def test_interrupted_batch_stops_cleanly(tmp_path: Path) -> None:
         [*KOLINEAR, "batch", *map(str, surveys), "--out", str(out), "--jobs", "2"],
         cwd=ROOT,
         start_new_session=True,
+        preexec_fn=partial(
+            signal.signal, signal.SIGINT, signal.SIG_DFL
+        ),  # else ignored in the background
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from sfm.matching.tracks import feature_tracks
-from sfm.matching.tracks.feature_tracks import Features, link_features, sift_features
+from sfm.matching.tracks.feature_tracks import link_features
+from sfm.matching.tracks.features import Features, sift_features
 from sfm.matching.tracks.overlap import common_features, connected_parts, overlapping_pairs
 from tests.synthetic import seed_of
 from tests.textures import random_texture

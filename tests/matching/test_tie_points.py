@@ -28,13 +28,12 @@ from sfm.matching.lsm.two_photo import match_lsm
 from sfm.matching.match_flags import LsmFlag
 from sfm.matching.tracks import feature_tracks
 from sfm.matching.tracks.feature_tracks import (
-    Features,
     find_tie_points,
     joined_features,
     link_features,
     measure_tracks,
-    sift_features,
 )
+from sfm.matching.tracks.features import Features, sift_features
 from sfm.matching.tracks.interest import foerstner_points
 from sfm.network import Estimate, ImagePoints, Network
 from sfm.orientation.relative import relative_orientations

@@ -12,45 +12,21 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 
 from sfm.conventions import AnyArray, FloatArray, IntArray
 from sfm.errors import GeometryError
 from sfm.kernels.options import compiled
 from sfm.matching.lsm.two_photo import match_lsm
-from sfm.matching.radiometry import FULL_SCALE_8, full_scale, grey_of
+from sfm.matching.radiometry import grey_of
+from sfm.matching.tracks.features import Features, matched_features, sift_features
 from sfm.matching.tracks.interest import foerstner_points
 from sfm.matching.tracks.overlap import connected_parts, overlapping_pairs
 from sfm.network import rows_of
 
 DETECTORS = ("foerstner", "sift")
-RATIO = 0.8  # of the distances to the nearest and the second-nearest descriptor; Lowe (2004), IJCV 60(2)
-EPIPOLAR_PX = 4.0  # distance from the epipolar line; lens distortion is not yet known
-MIN_PAIR_MATCHES = 20  # with fewer the epipolar geometry of a pair is not trusted
-RANSAC_CONFIDENCE, RANSAC_TRIALS = 0.999, 5000
 WINDOW_PX = 15  # larger ones are less noisy, but a curved surface is no affine warp over them
 SNAP_PX = 6.0  # an interest point this close to a feature takes its place
-# Contrast of a feature over the full scale; OpenCV's 0.04 leaves a fifth of what a weak natural texture has.
-# Lowe (2004) has 0.03 of the range 0 to 1, before the division by the layers of an octave.
-MIN_CONTRAST = 0.01
-# Features are looked for in a picture of at most this side, and of half the photograph's: they start the
-# matching, which measures in the photograph itself. Where such a picture has too few, in finer ones.
-MAX_SIDE_PX = 1600
-CELLS = 12  # along the longer side of a photograph: each cell has its share of the features
-
-
-@dataclass(frozen=True)
-class Features:
-    """SIFT features of one photograph."""
-
-    xy: FloatArray  # px, (k, 2)
-    scale: FloatArray  # size of the feature, px, (k,)
-    angle: FloatArray  # direction from x towards y, rad, (k,)
-    descriptor: AnyArray  # float32, (k, 128)
-
-    def __len__(self) -> int:
-        return len(self.xy)
 
 
 @dataclass(frozen=True)
@@ -128,63 +104,6 @@ def find_tie_points(
     )
 
 
-def sift_features(photograph: AnyArray, *, max_features: int = 2000) -> Features:
-    """Return SIFT features with root-normalised descriptors, spread over the photograph.
-
-    Args:
-        photograph: (H, W), 8 or 16 bit, grey or colour.
-        max_features: of more, every cell of a raster keeps its strongest.
-
-    Source: Lowe (2004), IJCV 60(2); Arandjelovic and Zisserman (2012), CVPR (square roots).
-    """
-    grey = grey_of(photograph) * (FULL_SCALE_8 / full_scale(photograph))
-    eight_bit = np.rint(np.clip(grey, 0, FULL_SCALE_8)).astype(np.uint8)
-    shrink = 2
-    while max(grey.shape) > shrink * MAX_SIDE_PX:
-        shrink *= 2
-    sift = cv2.SIFT.create(contrastThreshold=MIN_CONTRAST, enable_precise_upscale=True)
-    while True:
-        height, width = (max(1, side // shrink) for side in grey.shape)
-        # whole blocks of pixels: what is left at the border belongs to none
-        whole = eight_bit[: height * shrink, : width * shrink]
-        picture = cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA)
-        points = sift.detect(picture, None)
-        if shrink == 1 or len(points) >= max_features:
-            break
-        shrink //= 2
-    xy = np.array([p.pt for p in points], dtype=float).reshape(-1, 2)
-    kept = _spread_out(xy, np.array([p.response for p in points]), picture.shape, max_features)
-    points, descriptor = sift.compute(picture, [points[k] for k in kept.tolist()])
-    if descriptor is None:
-        descriptor = np.zeros((0, 128), np.float32)
-    norm = np.maximum(descriptor.sum(axis=1, keepdims=True), 1e-12)
-    xy = np.array([p.pt for p in points], dtype=float).reshape(-1, 2)
-    return Features(
-        shrink * (xy + 0.5) - 0.5,
-        shrink * np.array([p.size for p in points], dtype=float),
-        np.radians([p.angle for p in points]),
-        np.sqrt(descriptor / norm),
-    )
-
-
-def _spread_out(xy: FloatArray, strength: FloatArray, shape: tuple[int, ...], most: int) -> IntArray:
-    """Return the rows of the features to keep: the strongest of every cell, then the next ones, up to `most`.
-
-    Args:
-        xy: features, px, (k, 2).
-        strength: of each, (k,).
-        shape: of the photograph, (H, W).
-        most: how many are kept.
-    """
-    cell_px = max(shape) / CELLS
-    cell = (xy[:, 1] // cell_px).astype(np.int64) * (CELLS + 1) + (xy[:, 0] // cell_px).astype(np.int64)
-    order = np.lexsort((-strength, cell))
-    starts = np.searchsorted(cell[order], cell[order])
-    rank = np.arange(len(order)) - starts  # place of each feature in its cell
-    chosen = order[np.lexsort((-strength[order], rank))][:most]
-    return np.sort(chosen)
-
-
 def link_features(
     features: Sequence[Features], *, min_rays: int = 3, seed: int = 0, threads: int = 1
 ) -> Tracks:
@@ -206,7 +125,7 @@ def link_features(
     with ThreadPoolExecutor(max(1, threads)) as pool:
 
         def matched_pairs(of: IntArray) -> list[tuple[IntArray, FloatArray]]:
-            return list(pool.map(lambda p: _matched(features[p[0]], features[p[1]], seed=seed), of))
+            return list(pool.map(lambda p: matched_features(features[p[0]], features[p[1]], seed=seed), of))
 
         matched = matched_pairs(pairs)
         linked = pairs[np.array([len(rows) > 0 for rows, _ in matched], dtype=bool)]
@@ -266,44 +185,6 @@ def joined_features(edge: IntArray, image: IntArray, m: int) -> IntArray:
         following[last[a]] = b
         last[a] = last[b]
     return group
-
-
-def match_features(a: Features, b: Features, *, seed: int = 0) -> IntArray:
-    """Return pairs of features (k, 2) that choose each other and obey one epipolar geometry."""
-    return _matched(a, b, seed=seed)[0]
-
-
-def _matched(a: Features, b: Features, *, seed: int) -> tuple[IntArray, FloatArray]:
-    """Return such pairs, and 1 - the ratio of the distances to the nearest and second-nearest one, (k,)."""
-    none = np.zeros((0, 2), dtype=np.int64), np.zeros(0)
-    if min(len(a), len(b)) < MIN_PAIR_MATCHES:
-        return none
-    similarity = a.descriptor @ b.descriptor.T
-    forth, back = similarity.argmax(axis=1), similarity.argmax(axis=0)
-    rows = np.flatnonzero(back[forth] == np.arange(len(a)))
-    best = similarity[rows, forth[rows]]
-    similarity[rows, forth[rows]] = -1.0
-    second = similarity[rows].max(axis=1)
-    # of unit vectors the squared distance is 2 - 2 s
-    clear = 1 - best < RATIO**2 * (1 - second)
-    rows, best, second = rows[clear], best[clear], second[clear]
-    distinct = 1 - np.sqrt(np.maximum(1 - best, 0.0) / np.maximum(1 - second, 1e-12))
-    found = np.column_stack([rows, forth[rows]])
-    if len(found) < MIN_PAIR_MATCHES:
-        return none
-    cv2.setRNGSeed(seed)
-    _, fits = cv2.findFundamentalMat(
-        a.xy[found[:, 0]],
-        b.xy[found[:, 1]],
-        cv2.FM_RANSAC,
-        EPIPOLAR_PX,
-        RANSAC_CONFIDENCE,
-        RANSAC_TRIALS,
-    )
-    if fits is None or fits.sum() < MIN_PAIR_MATCHES:
-        return none
-    kept = fits.ravel() > 0
-    return np.asarray(found[kept], dtype=np.int64), np.asarray(distinct[kept], dtype=float)
 
 
 def measure_tracks(

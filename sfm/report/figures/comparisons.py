@@ -76,7 +76,7 @@ def time_figure(validation: Validation) -> Figure:
     axes.set_xlabel("image points")
     axes.set_ylabel("s")
     axes.grid(alpha=0.3)
-    axes.legend(frameon=False)
+    axes.legend(frameon=False, loc="upper left")
     return picture
 
 
@@ -101,5 +101,5 @@ def series_figure(
     axes.axhline(0.0, color="grey", lw=0.8)
     axes.set_xticks(at, names)
     axes.set_ylabel(f"displacement [{unit}]")
-    axes.legend(fontsize=8, ncols=4)
+    axes.legend(fontsize=8, ncols=4, loc="upper left")
     return picture

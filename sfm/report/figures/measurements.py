@@ -77,5 +77,5 @@ def length_error_figure(found: Acceptance) -> Figure:
         )
     axes.set_xlabel(f"calibrated length [{found.unit}]")
     axes.set_ylabel(f"measured minus calibrated [{fine}]")
-    axes.legend(fontsize=8)
+    axes.legend(fontsize=8, loc="upper left")
     return picture
