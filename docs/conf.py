@@ -19,6 +19,7 @@ os.environ["IPYTHONDIR"] = str(profile.parent)
 project = "Kolinear"
 release = version = version_of("kolinear")
 extensions = ["myst_nb", "generated", "functions", "drawings", "formulas", "links"]
+html_title = f"Kolinear {release}"
 html_theme = "pydata_sphinx_theme"
 html_math_renderer = "mathml"
 myst_enable_extensions = ["dollarmath"]
