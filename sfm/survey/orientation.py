@@ -71,6 +71,8 @@ def orient_survey(survey: Survey, measured: Measurements) -> Orientation:
     found, held = _hold_cameras_of_two(survey, network, replace(found, estimate=chosen.estimate))
     if held and len(network.images) > 2:
         found = replace(found, remarks=(*found.remarks, _words_of_last_two(len(network.images) - 2)))
+    elif held and line:
+        found = replace(found, remarks=(*found.remarks, f"{line}; two photographs do not determine it"))
     found = tell_lost_photographs(network, replace(found, warnings=warnings + held))
     return tell_second_objects(found, others)
 

@@ -51,6 +51,8 @@ def test_c_that_had_to_be_held_is_freed_where_it_fits_better() -> None:
     [
         378,  # c 30 % too short and held: 7.2 sigma wrong, fair; damped steps crept along the valley
         667,  # four photographs from within 9 degrees, c a quarter of the truth: 28 sigma wrong, fair
+        1251,  # the solution that was left for one of 0.987 times its v'Pv is the true one: 7.9 sigma, fair
+        1308,  # two nearer solutions stood before the one that is 6 sigma away: 6.9 sigma, fair
     ],
 )
 def test_other_principal_distances_are_found_along_bent_valleys(number: int) -> None:
@@ -67,6 +69,12 @@ def test_residuals_with_a_cause_contradict_a_camera_that_had_to_be_held() -> Non
     assert (
         contradicted((), (clear,)) == contradicted(("A",), (unclear, clear)) == contradicted(("A",), ()) == ()
     )
+
+
+def test_a_pair_does_not_determine_the_c_that_was_found_for_it() -> None:
+    """c 40 % too long, found because the pair could be oriented with it: 18 sigma wrong and called fair."""
+    found = outcome_of(1321)
+    assert found.level == "bad" and found.remarks[0].startswith("Not decided: c = 30.17 mm of camera")
 
 
 def test_two_photographs_that_the_third_contradicts_are_bad() -> None:

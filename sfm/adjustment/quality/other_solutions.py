@@ -112,6 +112,20 @@ def other_solutions(
     return tuple(found)
 
 
+def solution_before(adjustment: Adjustment, before: Adjustment) -> tuple[OtherSolution, ...]:
+    """Return the solution that was left for a better one, if it is hardly worse; none otherwise."""
+    a, limit = adjustment, 1 + _allowed(adjustment) / adjustment.vPv if adjustment.vPv > 0 else 1.0
+    if len(a.network.points) != len(before.network.points) or before.vPv > limit * a.vPv:
+        return ()
+    sigma = np.sqrt(np.trace(a.covariance.points, axis1=1, axis2=2) / 3)
+    moved = _apart(before.estimate.points, a.estimate.points, sigma)
+    if not moved > APART:
+        return ()
+    camera, c, unit = _principal_distance(before.estimate.cameras)
+    ratio = before.vPv / a.vPv
+    return (OtherSolution(camera, c, unit, False, moved, ratio, before.estimate, converges=False),)
+
+
 def _allowed(base: Adjustment) -> float:
     """Return by how much v'Pv of another solution may be larger.
 

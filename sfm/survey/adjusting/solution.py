@@ -8,7 +8,7 @@ import numpy as np
 
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.quality.against_free import FreeNetwork, free_network_of
-from sfm.adjustment.quality.other_solutions import OtherSolution, other_solutions
+from sfm.adjustment.quality.other_solutions import OtherSolution, other_solutions, solution_before
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.conventions import BoolArray, IntArray
@@ -242,6 +242,8 @@ def _solved(start: _Prepared) -> _Solved:
         # c that had to be held is nobody's calibration: what its other values give is another solution
         c_held = tuple(one.name for one in final.estimate.cameras if one.name in asked and not one.free[0])
         others = other_solutions(final, had_to_be_held=c_held)
+        if first is not None and final.converged:
+            others = (*others, *solution_before(final, first[1]))
         if first is not None and not final.converged:  # what seemed better is none: as it was
             (settled, final, check, others), better = first, ()
             break

@@ -95,7 +95,8 @@ def judge(evidence: Evidence) -> Verdict:
 def _other_solutions(evidence: Evidence) -> Judged:
     """Judge whether the image points allow another solution: which of them is true they do not say."""
     judged = []
-    for other in evidence.result.other_solutions[:MAX_SOLUTIONS]:
+    farthest = sorted(evidence.result.other_solutions, key=lambda one: -one.moved)
+    for other in farthest[:MAX_SOLUTIONS]:
         what = (
             "turned inside out in depth"
             if other.reflected
