@@ -17,7 +17,7 @@ from tests.places import SHARED
 from tests.textures import MEAN, Pairs, affine_pairs, with_noise
 
 SIGMA = 2.0
-PATCHES = 400
+PATCHES = 250
 SPECKLE = SHARED / "data" / "speckle-shift"
 
 
@@ -34,7 +34,7 @@ def _ratio_to_bound(matches: LsmMatches, pairs: Pairs) -> float:
     return float(np.sqrt(normalised.mean() / 2))
 
 
-# 2 x 400 normal errors leave the ratio uncertain by 1 / sqrt(4 x 400) = 2.5 %
+# 2 x 250 normal errors leave the ratio uncertain by 1 / sqrt(4 x 250) = 3.2 %
 UNCERTAIN = 1 / np.sqrt(4 * PATCHES)
 
 
