@@ -48,6 +48,7 @@ from sfm.matching.radiometry import grey_of, odd_window
 
 COARSE_STEP = 0.5  # bilinear interpolation is good enough while steps are longer than this, px
 CONTRACTION = 0.04  # a step is at most this part of the one before; 0.01 to 0.03 on texture with noise
+LAST_PX = 0.002  # the next step after the last one that is allowed, of a match; along edges it hardly shrinks
 CHUNK = 256  # patches that a thread takes at a time
 
 
@@ -117,7 +118,7 @@ def match_lsm(
         max_shift_px: farther from the start is too far.
         min_correlation: below it the places are not alike.
         start: linear part of the warp, right px per left px, (k, 2, 2), or its homography relative to both
-            points, (k, 3, 3), whose perspective an affine model leaves as it is; the unit matrix if not given.
+            points, (k, 3, 3), whose perspective an affine model leaves as it is; the unit matrix if none.
         threads: patches are shared among so many.
 
     Returns:
@@ -204,7 +205,7 @@ def _iterate(right: AnyArray, work: Workspace, limits: Limits, H: FloatArray, ou
     half, q, rhs = work.half, work.q, work.rhs
     x0, y0 = H[0, 2], H[1, 2]
     coarse = work.kind > BILINEAR
-    previous = np.inf
+    previous, following = np.inf, np.inf
     for step in range(1, limits.max_steps + 1):
         out[STEPS] = step
         kind = BILINEAR if coarse else work.kind
@@ -219,8 +220,9 @@ def _iterate(right: AnyArray, work: Workspace, limits: Limits, H: FloatArray, ou
         if np.hypot(H[0, 2] - x0, H[1, 2] - y0) > limits.max_shift_px:
             return TOO_FAR
         if not coarse:
-            if length * max(CONTRACTION, length / previous) < limits.stop_px:
+            following = length * max(CONTRACTION, length / previous)
+            if following < limits.stop_px:
                 return MATCHED
             previous = length
         coarse = coarse and length > COARSE_STEP
-    return DIVERGED
+    return MATCHED if following < LAST_PX else DIVERGED

@@ -88,10 +88,10 @@ def find_further_points(
     margin = window_px // 2 + BORDER_PX
     own = rows_of(seen.image, m)
     places_of = [[taken.xy[rows]] for rows in rows_of(taken.image, m)]
-    order = np.argsort([-len(rows) for rows in own], kind="stable").tolist() if references is None else references
+    order = np.argsort([-len(rows) for rows in own], kind="stable") if references is None else references
     shapes = [one.shape[:2] for one in photographs]
     found = [_none()]
-    for i in order:
+    for i in np.asarray(order).tolist():
         if not estimate.oriented[i] or len(own[i]) < NEIGHBOURS:
             continue
         corners = foerstner_points(
@@ -106,10 +106,10 @@ def find_further_points(
         if not several.any():
             continue
         places = _Places(places.xy[several], places.normal[several], places.points[several])
-        new = _followed(
+        rays = _followed(
             photographs, estimate, camera, i, places, visible[:, several], window_px, min_correlation, threads
         )
-        new = _agreeing(new, estimate, camera, len(places.xy), min_rays)
+        new = _agreeing(rays, estimate, camera, len(places.xy), min_rays)
         found.append(new)
         for j in np.unique(new.image_points.image).tolist():
             places_of[j].append(new.image_points.xy[new.image_points.image == j])
