@@ -43,7 +43,7 @@ from sfm.similarity import fit_similarity
 from sfm.survey.inputs.survey import read_survey
 from sfm.survey.measuring.further_points import find_further_points
 from sfm.survey.other_programs import OtherPrograms
-from sfm.survey.refine import refine_model, refinement_text
+from sfm.survey.refining.refinement import refine_model, refinement_text
 from tests.engines import ALONE, HERE, Notes
 from tests.textures import random_texture, with_noise
 
