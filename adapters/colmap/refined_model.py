@@ -216,10 +216,14 @@ def _adjust_rigs(pycolmap: Any, scene: Any, points: set[int]) -> None:
     for j in set(part.point3D_ids()) - points:
         part.delete_point3D(j)
     options = pycolmap.BundleAdjustmentOptions()
-    options.refine_focal_length = options.refine_principal_point = options.refine_extra_params = False
     options.print_summary = False
     options.ceres.solver_options.max_num_iterations = STEPS
-    pycolmap.bundle_adjustment(part, options)
+    config = pycolmap.BundleAdjustmentConfig()
+    for i in part.reg_image_ids():
+        config.add_image(i)
+    for i in part.cameras:
+        config.set_constant_cam_intrinsics(i)
+    pycolmap.create_default_ceres_bundle_adjuster(options, config, part).solve()  # as a whole, it logs
     common = sorted(points & set(part.point3D_ids()))
     found, wanted = (np.array([one.point3D(j).xyz for j in common]) for one in (part, scene))
     part.transform(_sim3d(pycolmap, fit_similarity(found, wanted)))

@@ -207,9 +207,10 @@ def test_what_is_not_measured_stays_as_it_is(
     assert after.compute_mean_reprojection_error() < 1.05 * error
 
 
-def test_a_rig_comes_out_with_its_rig(tmp_path: Path) -> None:
+def test_a_rig_comes_out_with_its_rig(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     before = _model(tmp_path, "PINHOLE", rig=True)
     refine(tmp_path / "model", tmp_path, out=tmp_path / "out", fix="f,cx")
+    assert "adjustment.cc" not in capfd.readouterr().err  # COLMAP's log
     after = pycolmap.Reconstruction(str(tmp_path / "out"))
     with (tmp_path / "out" / "sigma_cameras.csv").open(encoding="utf-8") as file:
         told = {(int(r["camera_id"]), r["parameter"]): r for r in csv.DictReader(file)}
@@ -326,7 +327,7 @@ def test_scale_bars_give_a_model_with_a_rig_its_scale(tmp_path: Path) -> None:
         np.linalg.norm(one.rig(3).sensor_from_rig(next(iter(one.rig(3).non_ref_sensors))).translation)
         for one in (before, after)
     ]
-    assert base[1] == pytest.approx(1000 * base[0], rel=1e-3)
+    assert base[1] == pytest.approx(1000 * base[0], rel=1e-2)
     page = (tmp_path / "out" / "refinement.html").read_text(encoding="utf-8")
     assert "target 3 - target 20" in page and "[mm]" in page
 
