@@ -119,7 +119,7 @@ def test_parameters_are_inside_their_sigmas(tmp_path: Path, plate: PlateFamily, 
     parameters 475 lie within 1.96 sigma; c and x0, K1 and K2 are so strongly correlated that this count has
     a standard deviation of 7, not 5. The sum of e' C^-1 e over all runs has 500 degrees of freedom.
     """
-    kind = f"{plate.name}{' rings' if rings else ''}"
+    kind = f"grid {'rings' if rings else 'dots'}" if plate.name == "grid" else plate.name
     z, square = np.zeros((RUNS, len(TRUTH))), np.zeros(RUNS)
     for k in range(RUNS):
         if k % RUNS_OF_A_SET == 0:
