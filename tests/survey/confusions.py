@@ -121,11 +121,11 @@ def outcome(confusion: Confusion, folder: Path) -> str:
     told = [f"{one.image}: {one.reason}" for one in result.failed]
     told += [line for line in result.warnings if "does not fit camera" in line]
     told += [one.cause for one in result.explanations if one.explains][:1]
-    return (
-        f"{confusion.name:18} {verdict.level:5} {PHOTOGRAPHS - len(result.failed)} of {PHOTOGRAPHS} oriented, "
-        f"{len(a.network.points):3} points, {int(a.rejected.sum()):3} image points rejected, sigma0 "
-        f"{a.sigma0_px:.3f} px; {' | '.join(told) or 'nothing is told'}"
+    counts = (
+        f"{len(a.network.images)} of {PHOTOGRAPHS} oriented, {len(a.network.points):3} points, "
+        f"{int(a.rejected.sum()):3} image points rejected, sigma0 {a.sigma0_px:.3f} px"
     )
+    return f"{confusion.name:18} {verdict.level:5} {counts}; {' | '.join(told) or 'nothing is told'}"
 
 
 def main() -> int:
