@@ -26,7 +26,7 @@ from sfm.network import Estimate, Network
 from sfm.pipeline import run_survey
 from sfm.similarity import fit_similarity
 from sfm.survey.inputs.survey import read_survey
-from sfm.survey.refine import refine_model
+from sfm.survey.refining.refinement import refine_model
 
 HEAD = (
     "scene            method           images  points   centre mm  rotation mdeg  predicted mm  ratio"

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.sparse import csr_matrix, triu
 
-from sfm.camera import Camera
+from sfm.camera import Camera, tangents_from_pixel
 from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.display import listed
 from sfm.errors import GeometryError, UnknownNameError
@@ -322,6 +322,15 @@ def rows_of(index: IntArray, count: int) -> list[IntArray]:
     """Return the rows of each index value from 0 to count - 1, in order."""
     order = np.argsort(index, kind="stable")
     return np.split(order, np.searchsorted(index[order], np.arange(1, count)))
+
+
+def image_tangents(network: Network, cameras: Sequence[Camera]) -> FloatArray:
+    """Return the tangents u = -U/W, v = -V/W of all image points, NaN where no ray has them, (k, 2)."""
+    seen = network.image_points
+    uv = np.full((len(seen), 2), np.nan)
+    for camera, own in zip(cameras, rows_of(network.camera[seen.image], len(cameras)), strict=True):
+        uv[own] = tangents_from_pixel(camera, seen.xy[own])
+    return uv
 
 
 def empty_estimate(network: Network, cameras: tuple[Camera, ...]) -> Estimate:

@@ -29,6 +29,7 @@ JUDGING = (
     "sfm/survey/measuring/other_sizes.py",
     "sfm/survey/measuring/photographs.py",
     "sfm/survey/orientation.py",
+    "sfm/survey/refining/targets.py",
     "sfm/survey/other_programs.py",
     "sfm/survey/inputs/checks/incomplete_cameras.py",
     "sfm/survey/inputs/checks/repeated_image_points.py",

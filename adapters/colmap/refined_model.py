@@ -20,6 +20,7 @@ from adapters.colmap.reconstruction import AXES, HALF_PIXEL, colmap_camera
 from sfm.camera import Camera
 from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.network import Estimate, Network, rows_of
+from sfm.similarity import Similarity, fit_similarity
 
 # COLMAP's models with one focal length, and how many coefficients of radial distortion they have: they are
 # read as the model of ours that has one, too
@@ -76,6 +77,13 @@ def open_model(folder: Path) -> OpenModel:
         tuple(sorted(scene.point3D_ids())),
         np.concatenate([np.zeros(0, dtype=np.int64), *slots]),
     )
+
+
+def place_model(model: OpenModel, object_from_model: Similarity) -> OpenModel:
+    """Return a model in another frame and scale, rigs with it; its scene is changed."""
+    pycolmap = load_pycolmap()
+    model.scene.transform(_sim3d(pycolmap, object_from_model))
+    return replace(model, estimate=object_from_model.apply_estimate(model.estimate))
 
 
 def update_model(
@@ -204,17 +212,23 @@ def _single_focal(found: Any, camera: Camera) -> Camera:
 
 
 def _adjust_rigs(pycolmap: Any, scene: Any, points: set[int]) -> None:
-    """Adjust the refined points with the cameras of each rig held together, and take over what that gives."""
+    """Adjust the refined points with the cameras of each rig held together, and take over what that gives.
+
+    Interior orientation is held: COLMAP frees it by groups of parameters, of all cameras alike, and would
+    free what the adjustment before held. Its gauge is free, so that the whole is brought back to where the
+    points were.
+    """
     part = pycolmap.Reconstruction(scene)
     for j in set(part.point3D_ids()) - points:
         part.delete_point3D(j)
     options = pycolmap.BundleAdjustmentOptions()
-    options.refine_principal_point = True
+    options.refine_focal_length = options.refine_principal_point = options.refine_extra_params = False
     options.print_summary = False
     options.ceres.solver_options.max_num_iterations = STEPS
     pycolmap.bundle_adjustment(part, options)
-    for i in scene.cameras:
-        scene.camera(i).params = part.camera(i).params
+    common = sorted(points & set(part.point3D_ids()))
+    found, wanted = (np.array([one.point3D(j).xyz for j in common]) for one in (part, scene))
+    part.transform(_sim3d(pycolmap, fit_similarity(found, wanted)))
     for number, rig in scene.rigs.items():
         for sensor in rig.non_ref_sensors:
             if part.rig(number).has_sensor_from_rig(sensor):
@@ -222,5 +236,10 @@ def _adjust_rigs(pycolmap: Any, scene: Any, points: set[int]) -> None:
     for number in scene.frames:
         if part.frame(number).has_pose:
             scene.frame(number).rig_from_world = part.frame(number).rig_from_world
-    for j in points & set(part.point3D_ids()):
+    for j in common:
         scene.point3D(j).xyz = part.point3D(j).xyz
+
+
+def _sim3d(pycolmap: Any, similarity: Similarity) -> Any:
+    """Return a similarity as COLMAP has it."""
+    return pycolmap.Sim3d(similarity.scale, pycolmap.Rotation3d(similarity.rotation), similarity.translation)

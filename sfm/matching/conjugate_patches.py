@@ -19,6 +19,7 @@ from sfm.matching.correlation.ncc import NccMatches, match_ncc
 from sfm.matching.correlation.warped import match_ncc_warped
 from sfm.matching.lsm.patch_equations import MARGIN
 from sfm.matching.lsm.two_photo import LsmMatches, match_lsm
+from sfm.matching.lsm.warp import linear_part
 from sfm.matching.match_flags import LsmFlag, NccFlag, in_words
 from sfm.matching.radiometry import equalise_histogram, grey_of
 
@@ -176,7 +177,7 @@ def confirmed(
     if reach_px is None:
         back = match_upright(right, left, matched.right[good], target, by)
     else:
-        linear = matched.warp[good, :2, :2] - matched.warp[good, :2, 2:] * matched.warp[good, 2:, :2]
+        linear = linear_part(matched.warp[good])
         there = np.linalg.norm(linear, axis=(1, 2)) / np.sqrt(2)
         reach = np.maximum(np.ceil(reach_px[good] * there), 1).astype(np.int64)
         back = match_warped(
@@ -260,7 +261,7 @@ def _bias(left: AnyArray, right: AnyArray, a: FloatArray, lsm: LsmMatches, by: S
     rows = np.flatnonzero(lsm.good)
     if METHODS[by.method] == "shift" or half < MIN_HALF_WINDOW_PX or not len(rows):
         return bias
-    linear = lsm.warp[rows, :2, :2] - lsm.warp[rows, :2, 2:] * lsm.warp[rows, 2:, :2]
+    linear = linear_part(lsm.warp[rows])
     small = match_lsm(
         left, right, a[rows], lsm.xy[rows], window_px=half, interpolation=by.interpolation, start=linear
     )

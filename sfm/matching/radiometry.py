@@ -59,6 +59,11 @@ def grey_of(photograph: AnyArray) -> AnyArray:
     return np.ascontiguousarray(array, dtype=np.float32)
 
 
+def grey_of_8_bit(photograph: AnyArray) -> AnyArray:
+    """Return a photograph as `grey_of` does, with intensities of the full scale of 8 bit."""
+    return grey_of(photograph) * np.float32(FULL_SCALE_8 / full_scale(photograph))
+
+
 def full_scale(photograph: AnyArray) -> float:
     """Return the highest intensity that a photograph can have; floats count as 8 bit."""
     return FULL_SCALE_16 if np.asarray(photograph).dtype == np.uint16 else FULL_SCALE_8

@@ -11,7 +11,7 @@ from sfm.matching.conjugate_patches import ConjugatePoints, Settings, Starts, ma
 from sfm.matching.correlation.ambiguity import ambiguous, independent_pixels
 from sfm.matching.correlation.warped import match_ncc_warped
 from sfm.matching.match_flags import NccFlag, in_words
-from sfm.matching.radiometry import grey_of
+from sfm.matching.radiometry import grey_of, grey_of_8_bit
 
 # Correlation bears 5 degrees and 7 % of what a template is not turned and scaled by.
 ANGLES_DEG = (-30.0, -20.0, -10.0, 0.0, 10.0, 20.0, 30.0)
@@ -57,14 +57,15 @@ def _starts(
     left: AnyArray, right: AnyArray, xy_left: FloatArray, xy_right: FloatArray, by: Settings
 ) -> tuple[Starts, Starts, FloatArray]:
     """Return the best place of all shapes, the best one elsewhere, and the second r of that best shape."""
+    grey_left, grey_right = grey_of_8_bit(left), grey_of_8_bit(right)
     shapes, peaks, r, second = [], [], [], []
     for angle in np.radians(ANGLES_DEG):
         turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
         for scale in SCALES:
             linear = np.tile(scale * turn, (len(xy_left), 1, 1))
             found = match_ncc_warped(
-                left,
-                right,
+                grey_left,
+                grey_right,
                 xy_left,
                 xy_right,
                 linear,

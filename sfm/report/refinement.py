@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,9 +10,11 @@ import numpy as np
 from sfm.adjustment.result import Adjustment
 from sfm.conventions import FloatArray, IntArray
 from sfm.files.plain_text import csv_text
+from sfm.report.findings.given_residuals import Given, bar_residuals, control_residuals
 from sfm.report.html.page import render
 from sfm.report.numbers import general, significant
-from sfm.survey.refine import Refinement
+from sfm.survey.refining.refinement import Refinement
+from sfm.survey.refining.targets import PREFIX
 
 PAGE = "refinement.html"
 POINT_COLUMNS = ("point3D_id", "X", "Y", "Z", "sX", "sY", "sZ", "rays")
@@ -19,6 +22,7 @@ IMAGE_COLUMNS = (
     *("image_id", "name", "X0", "Y0", "Z0", "sX0", "sY0", "sZ0"),
     *("somega_deg", "sphi_deg", "skappa_deg", "key_points", "measured_anew", "rms_before_px", "rms_after_px"),
 )
+TARGET_COLUMNS = ("target", "X", "Y", "Z", "sX", "sY", "sZ", "rays")
 CAMERA_COLUMNS = ("camera_id", "model", "parameter", "before", "after", "sigma")
 FEW_MEASURED = 0.5  # part of the key points below which something is wrong with photographs or windows
 NOT_ROWS = 12  # photographs named that were not adjusted
@@ -43,7 +47,8 @@ def refinement_files(found: Refinement, numbers: Numbers, *, title: str) -> dict
         title: of the page, such as the folder of the model.
     """
     images = image_rows(found, numbers)
-    return {
+    targets = {} if found.targets is None else {"targets.csv": csv_text(TARGET_COLUMNS, target_rows(found))}
+    return targets | {
         "sigma_points.csv": csv_text(POINT_COLUMNS, _point_rows(found, numbers)),
         "sigma_images.csv": csv_text(IMAGE_COLUMNS, images),
         "sigma_cameras.csv": csv_text(CAMERA_COLUMNS, [[_blank(c) for c in row] for row in numbers.interior]),
@@ -69,14 +74,20 @@ def _page(found: Refinement, numbers: Numbers, images: list[list[object]], title
             "afterwards; standard deviations are those without that condition."
         )
     bad = not after.converged or after.defect > after.expected_defect
+    remarks += found.remarks
+    unit = "object units" if found.targets is None else found.targets.unit
+    given = Given(control_residuals(after, unit), bar_residuals(after, unit), None, None, None)
     return render(
         "refinement.html",
         title=title,
+        unit=unit,
+        given=given,
+        targets=target_rows(found),
         headline=f"RMS of the key points {significant(found.before_px)} px before, "
         f"{significant(found.after_px)} px after",
         level="bad" if bad else "fair" if remarks else "good",
         remarks=remarks,
-        sizes=_sizes(found),
+        sizes=_sizes(found, unit),
         found=found,
         after=after,
         before=before,
@@ -85,7 +96,7 @@ def _page(found: Refinement, numbers: Numbers, images: list[list[object]], title
     )
 
 
-def _sizes(found: Refinement) -> list[tuple[str, ...]]:
+def _sizes(found: Refinement, unit: str) -> list[tuple[str, ...]]:
     """Return rows of what the page compares: name, before, adjusted here, after."""
     both = (found.readjusted, found.adjustment)
     rows: list[tuple[str, ...]] = [
@@ -97,15 +108,18 @@ def _sizes(found: Refinement) -> list[tuple[str, ...]]:
         ("sigma0 [px]", "", *(general(one.sigma0_px, 4) for one in both)),
     ]
     for name, of, factor in (
-        ("Projection centre: median standard deviation [object units]", _centre_sigmas, 1.0),
+        (f"Projection centre: median standard deviation [{unit}]", _centre_sigmas, 1.0),
         ("Rotation: median standard deviation [mdeg]", _rotation_sigmas, 1000.0),
-        ("Point: median standard deviation of a coordinate [object units]", _point_sigmas, 1.0),
+        (f"Point: median standard deviation of a coordinate [{unit}]", _point_sigmas, 1.0),
     ):
         rows.append((name, "", *(significant(factor * float(np.median(of(one)))) for one in both)))
     rows.append(("Photographs", str(len(found.images)), *(str(len(one.network.images)) for one in both)))
-    rows.append(("Points", str(len(found.points)), *(str(len(one.network.points)) for one in both)))
-    used = (str(int((~one.rejected).sum())) for one in both)
-    rows.append(("Key points with a point", str(found.key_points), *used))
+    points = (len(found.points), len(found.readjusted.network.points), int(found.points.sum()))
+    rows.append(("Points", *(str(one) for one in points)))
+    used = (found.key_points, int((~found.readjusted.rejected).sum()), found.refined)
+    rows.append(("Key points with a point", *(str(one) for one in used)))
+    if found.targets is not None:
+        rows.append(("Targets", "", "", str(len(found.target_points))))
     return rows
 
 
@@ -136,6 +150,7 @@ def image_rows(found: Refinement, numbers: Numbers) -> list[list[object]]:
     own = found.adjustment
     used = ~own.rejected
     after = np.full(m, np.nan)
+    used[len(found.rows) :] = False  # targets
     after[found.images] = _rms_of(
         own.residuals[used], own.network.image_points.image[used], int(found.images.sum())
     )
@@ -158,18 +173,26 @@ def image_rows(found: Refinement, numbers: Numbers) -> list[list[object]]:
 
 def _point_rows(found: Refinement, numbers: Numbers) -> list[list[object]]:
     """Return the rows of sigma_points.csv: the adjusted points."""
+    names = [numbers.point_ids[j] for j in np.flatnonzero(found.points)]
+    return _coordinates(found, names, np.arange(len(names)))
+
+
+def target_rows(found: Refinement) -> list[list[object]]:
+    """Return the rows of targets.csv: the adjusted targets, by their names."""
+    rows = found.target_points
+    names = [found.adjustment.network.points[j].removeprefix(PREFIX) for j in rows]
+    return _coordinates(found, names, rows)
+
+
+def _coordinates(found: Refinement, names: Sequence[object], points: IntArray) -> list[list[object]]:
+    """Return name, coordinates, their standard deviations and rays of points of the adjustment."""
     own = found.adjustment
     rays = np.bincount(own.network.image_points.point[~own.rejected], minlength=len(own.network.points))
-    sigma = np.sqrt(np.diagonal(own.covariance.points, axis1=1, axis2=2))
+    sigma = np.sqrt(np.diagonal(own.covariance.points[points], axis1=1, axis2=2))
+    xyz = own.estimate.points[points]
     return [
-        [numbers.point_ids[j], *xyz, *s, int(r)]
-        for j, xyz, s, r in zip(
-            np.flatnonzero(found.points).tolist(),
-            own.estimate.points.tolist(),
-            sigma.tolist(),
-            rays.tolist(),
-            strict=True,
-        )
+        [name, *at, *s, int(r)]
+        for name, at, s, r in zip(names, xyz.tolist(), sigma.tolist(), rays[points].tolist(), strict=True)
     ]
 
 

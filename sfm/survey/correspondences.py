@@ -27,31 +27,41 @@ from sfm.survey.diagnosis.contradicting_codes import (
 from sfm.survey.diagnosis.own_camera import treat_lost
 from sfm.survey.inputs.measurements import MeasuredPhotographs, Measurements, Naming
 from sfm.survey.inputs.survey import Survey
+from sfm.survey.measuring.surface_points import cover_photographs
+from sfm.survey.measuring.tie_points import MIN_RAYS
 from sfm.survey.target_network import build_network, match_uncoded, min_rays
 
 ROUNDS = 3  # matching with the orientation at hand, with the adjusted one, and once more to confirm
 MIN_TOLERANCE_PX = 1.0  # below it a difference is for the statistical test, not for the matching
 
 
-def find_correspondences(survey: Survey, measured: Measurements, start: Orientation) -> Correspondences:
-    """Return the network with the uncoded targets in it; where all points have names, as it was measured.
+def find_correspondences(
+    survey: Survey, measured: Measurements, start: Orientation, *, jobs: int = 1
+) -> Correspondences:
+    """Return the network with all its points: uncoded targets, or the texture that covers the photographs.
+
+    Given image points are as they were.
 
     Args:
         survey: what to do.
         measured: the named image points, and all targets.
         start: orientation from the named ones, with the tolerance it has left.
+        jobs: windows of texture worked on at a time.
 
     Raises:
         GeometryError: fewer than two photographs keep enough points.
     """
     photographs, naming = measured.photographs, measured.naming
     if photographs is None or naming is None:
+        surface = cover_photographs(survey, measured, start, jobs=jobs)
+        network = measured.network if surface is None else surface.network
         return Correspondences(
-            measured.network,
-            start.estimate,
-            measured.min_rays,
+            network,
+            start.estimate if surface is None else surface.estimate,
+            measured.min_rays if surface is None else np.full(len(network.points), MIN_RAYS),
             point_failures=start.point_failures,
             given=start.kind == "given",
+            overlays=None if surface is None else surface.overlays,
         )
     matched, left_out, lines = _without_other_objects(survey, photographs, naming, start)
     naming, network, estimate = matched.naming, matched.network, matched.estimate

@@ -6,10 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from sfm.camera import tangents_from_pixel
 from sfm.conventions import BoolArray
 from sfm.errors import GeometryError
-from sfm.network import Estimate, Network, rows_of
+from sfm.network import Estimate, Network, image_tangents, rows_of
 from sfm.orientation.incremental.sequence import MIN_POINTS, Judge, Orientation, orient
 from sfm.orientation.intersection import intersect
 from sfm.reduced_network import reduce_network
@@ -150,13 +149,9 @@ def _orient_strongest(network: Network, estimate: Estimate) -> Orientation:
     image_points = np.ones(len(network.image_points), dtype=bool)
     found = _orient(*reduce_network(network, estimate, images, _strongest(network), image_points))
     seen, estimate = network.image_points, found.estimate
-    uv = np.full((len(seen), 2), np.nan)
-    of_camera = rows_of(network.camera[seen.image], len(estimate.cameras))
-    for camera, own in zip(estimate.cameras, of_camera, strict=True):
-        uv[own] = tangents_from_pixel(camera, seen.xy[own])
     c = min(camera.c_px for camera in estimate.cameras)
     rays = intersect(
-        uv,
+        image_tangents(network, estimate.cameras),
         seen.image,
         seen.point,
         estimate.position,

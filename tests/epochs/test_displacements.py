@@ -157,8 +157,8 @@ def test_the_stated_power_is_reached() -> None:
     values, vectors = np.linalg.eigh(point_blocks(first.covariance, 3)[25])
     shift = np.zeros((POINTS, 3))
     shift[25] = first.detectable[25] * vectors[:, -1]
-    found = sum(bool(compared(seed, shift, reference=reference).moved[25]) for seed in range(3000, 3020))
-    assert values[-1] > 0 and 12 <= found <= 20  # 16 expected, sigma 1.8
+    found = sum(bool(compared(seed, shift, reference=reference).moved[25]) for seed in range(3000, 3010))
+    assert values[-1] > 0 and 5 <= found <= 10  # 8 expected, sigma 1.3
 
 
 def test_noncentrality_is_that_of_baarda() -> None:

@@ -26,7 +26,7 @@ from sfm.pipeline import run_survey
 from sfm.survey.inputs.photograph_list import find_photographs
 from sfm.survey.inputs.start import measurements_from_observations
 from sfm.survey.inputs.survey import read_survey
-from sfm.survey.refine import refine_model
+from sfm.survey.refining.refinement import refine_model
 from tests.synthetic import make_network, seed_of
 
 SECONDS = 8.0

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from sfm.camera import Camera, camera_from_values, pixel_curvature, pixel_jacobian, project
-from sfm.conventions import FloatArray, rotation_from_angles
+from sfm.conventions import rotation_from_angles
 from sfm.orientation.eccentricity import CircleViews, fit_circles
+from tests.outlines import moments_of_area
 from tests.synthetic import seed_of
 
 RADIUS, OUTLINE = 4.0, 720
@@ -23,19 +24,6 @@ def lens(model: str) -> Camera:
     return camera.with_parameters(p)
 
 
-def moments(outline: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the centre of area of a closed outline and the shape S of the ellipse of equal moments."""
-    o = outline - outline.mean(axis=0)
-    q = np.roll(o, -1, axis=0)
-    cross = o[:, 0] * q[:, 1] - q[:, 0] * o[:, 1]
-    area = cross.sum() / 2
-    m = ((o + q) * cross[:, None]).sum(axis=0) / (6 * area)
-    second = np.einsum("k,kij->ij", cross, o[:, :, None] * o[:, None] + q[:, :, None] * q[:, None])
-    mixed = np.einsum("k,kij->ij", cross, o[:, :, None] * q[:, None])
-    second = (2 * second + mixed + mixed.T) / (24 * area) - np.outer(m, m)
-    return m + outline.mean(axis=0), 4 * second
-
-
 @pytest.mark.parametrize("model", ["brown", "opencv"])
 def test_the_shift_is_that_of_the_projected_outline(model: str) -> None:
     camera, rng = lens(model), seed_of(f"bent {model}")
@@ -48,10 +36,10 @@ def test_the_shift_is_that_of_the_projected_outline(model: str) -> None:
         X0 = R @ np.array([0.0, 0.0, 170.0])
         for k, centre in enumerate(centres):
             xy = project(camera, X0, R, centre[None])
-            m, S = moments(project(camera, X0, R, centre + rim))
+            m, second = moments_of_area(project(camera, X0, R, centre + rim))
             ray = (centre - X0) @ R
             point.append(k)
-            shape.append(S)
+            shape.append(4 * second)
             rays.append(ray)
             rotations.append(R)
             jacobian.append(pixel_jacobian(camera, xy)[0])

@@ -17,6 +17,7 @@ from sfm.survey.inputs.given import read_diameters
 from sfm.survey.inputs.measurements import MeasuredPhotographs
 from sfm.survey.inputs.survey import read_survey
 from sfm.targets.detect import Targets
+from tests.outlines import moments_of_area
 
 C_PX, DISTANCE_MM, TILT = 4000.0, 600.0, np.radians(60)
 CAMERA: Camera = camera_from_values("c", "brown", (4000, 3000), (0.005, 0.005), c_mm=20.0, free=("c",))
@@ -63,16 +64,10 @@ def stations() -> tuple[FloatArray, FloatArray]:
 
 
 def ellipse_of(outline: FloatArray) -> tuple[FloatArray, FloatArray, float]:
-    """Return centre, semi-axes and angle of a closed outline by its moments of area (Green's theorem)."""
-    o = outline - outline.mean(axis=0)
-    q = np.roll(o, -1, axis=0)
-    cross = o[:, 0] * q[:, 1] - q[:, 0] * o[:, 1]
-    area = cross.sum() / 2
-    m = ((o + q) * cross[:, None]).sum(axis=0) / (6 * area)
-    second = np.einsum("k,kij->ij", cross, o[:, :, None] * o[:, None] + q[:, :, None] * q[:, None])
-    mixed = np.einsum("k,kij->ij", cross, o[:, :, None] * q[:, None] + q[:, :, None] * o[:, None])
-    value, axes = np.linalg.eigh((2 * second + mixed) / (24 * area) - np.outer(m, m))
-    return m + outline.mean(axis=0), 2 * np.sqrt(value[::-1]), float(np.arctan2(axes[1, 1], axes[0, 1]))
+    """Return centre, semi-axes and angle of a closed outline by its moments of area."""
+    centre, second = moments_of_area(outline)
+    value, axes = np.linalg.eigh(second)
+    return centre, 2 * np.sqrt(value[::-1]), float(np.arctan2(axes[1, 1], axes[0, 1]))
 
 
 def photographs(seed: int) -> MeasuredPhotographs:

@@ -16,9 +16,11 @@ from datasets.textured import render
 from sfm.camera import camera_from_values, project, tangents_from_pixel
 from sfm.cli.commands.refining import refine
 from sfm.conventions import AnyArray, FloatArray, IntArray
-from sfm.errors import BackendError, PhotographError, SurveyFileError
+from sfm.errors import BackendError, GeometryError, PhotographError, SurveyFileError
 from sfm.network import Estimate
-from sfm.survey.refine_windows import parts_of
+from sfm.similarity import Similarity
+from sfm.survey.refining.windows import parts_of
+from sfm.targets.codes.rings import ring_family
 
 pycolmap = pytest.importorskip("pycolmap")
 
@@ -27,6 +29,9 @@ FOCAL = render.C_MM / render.PIXEL_MM[0]
 PHOTOGRAPHS = 4
 NOISE_PX = 0.3
 COLOUR = (10, 200, 30)
+TARGETS = (3, 7, 12, 20, 31, 40)
+CODES = ring_family("ring12")
+DOT_TEXELS = 10
 PARAMS = {
     "SIMPLE_PINHOLE": [FOCAL, SIZE[0] / 2, SIZE[1] / 2],
     "PINHOLE": [FOCAL, FOCAL, SIZE[0] / 2, SIZE[1] / 2],
@@ -38,8 +43,26 @@ PARAMS = {
 AWAY = 40  # of the numbers of COLMAP
 
 
+def _paint_target(skin: AnyArray, code: int, at: FloatArray) -> None:
+    """Paint a coded target on the texture: black on white, a dot of 5 px in the photographs."""
+    entry = CODES.pattern[CODES.number == code][0]
+    row, column = np.mgrid[-110:111, -110:111] / 2.5  # texels, five times as fine as the texture
+    angle = -np.arctan2(row, column) % (2 * np.pi)  # the texture has y up: clockwise in the photographs
+    cell = (angle / (2 * np.pi) * CODES.cells).astype(int) % CODES.cells
+    radius = np.hypot(row, column) / DOT_TEXELS
+    ring = (radius > CODES.inner) & (radius < CODES.outer) & ((entry >> (CODES.cells - 1 - cell)) & 1 > 0)
+    white = np.where((radius < 1) | ring, 0.05, 0.95).astype(np.float32)
+    x, y = at / render.TEXEL_M + len(skin) / 2
+    box = np.mgrid[round(y) - 44 : round(y) + 45, round(x) - 44 : round(x) + 45].astype(np.float32)
+    places = ((box[1] - x) * 2.5 + 110).astype(np.float32), ((box[0] - y) * 2.5 + 110).astype(np.float32)
+    patch = cv2.remap(cv2.blur(white, (3, 3)), *places, cv2.INTER_LINEAR, borderValue=-1.0)
+    part = skin[round(y) - 44 : round(y) + 45, round(x) - 44 : round(x) + 45]
+    inside = np.hypot(box[1] - x, box[0] - y) < (CODES.outer + 1.0) * DOT_TEXELS
+    part[inside] = patch[inside]
+
+
 @cache
-def _scene() -> tuple[tuple[AnyArray, ...], Estimate]:
+def _scene(targets: bool = False) -> tuple[tuple[AnyArray, ...], Estimate]:
     """Four small photographs of the textured surface, their orientation, and points on the surface."""
     lens = camera_from_values("lens", "opencv", SIZE, render.PIXEL_MM, c_mm=render.C_MM)
     pair = [part[:2] for part in render.stations()]
@@ -49,6 +72,9 @@ def _scene() -> tuple[tuple[AnyArray, ...], Estimate]:
     position = np.vstack([pair[0], pair[0] @ turn.T])
     rotation = np.concatenate([pair[1], turn @ pair[1]])
     skin = render.texture()
+    if targets:
+        for code, at in zip(TARGETS, _target_places(), strict=True):
+            _paint_target(skin, code, at[:2])
     y, x = np.mgrid[0 : SIZE[1], 0 : SIZE[0]]
     uv = tangents_from_pixel(lens, np.column_stack([x.ravel(), y.ravel()]))
     pictures = []
@@ -64,9 +90,15 @@ def _scene() -> tuple[tuple[AnyArray, ...], Estimate]:
     return tuple(pictures), Estimate((lens,), position, rotation, points)
 
 
-def _model(folder: Path, camera: str = "SIMPLE_RADIAL", *, rig: bool = False) -> Any:
+def _target_places() -> FloatArray:
+    """Return where the targets are, m, (6, 3)."""
+    x, y = np.array([(x, y) for x in (-0.09, 0.09, 0.0) for y in (-0.065, 0.065)]).T
+    return np.column_stack([x, y, render.height(x, y)])
+
+
+def _model(folder: Path, camera: str = "SIMPLE_RADIAL", *, rig: bool = False, targets: bool = False) -> Any:
     """Write photographs in two folders and a model of them with numbers of its own, and return the scene."""
-    pictures, truth = _scene()
+    pictures, truth = _scene(targets)
     rng = np.random.default_rng(9)
     scene = pycolmap.Reconstruction()
     cameras = (7, 9) if rig else (7, 7)
@@ -174,8 +206,15 @@ def test_what_is_not_measured_stays_as_it_is(
 
 def test_a_rig_comes_out_with_its_rig(tmp_path: Path) -> None:
     before = _model(tmp_path, "PINHOLE", rig=True)
-    refine(tmp_path / "model", tmp_path, out=tmp_path / "out")
+    refine(tmp_path / "model", tmp_path, out=tmp_path / "out", fix="f,cx")
     after = pycolmap.Reconstruction(str(tmp_path / "out"))
+    with (tmp_path / "out" / "sigma_cameras.csv").open(encoding="utf-8") as file:
+        told = {(int(r["camera_id"]), r["parameter"]): r for r in csv.DictReader(file)}
+    for number in (7, 9):  # of two photographs: cy is held anyway
+        params, was = after.camera(number).params, before.camera(number).params
+        assert (params == was).all() and told[number, "fx"]["sigma"] == ""
+    kept, came = (np.mean([p.xyz for p in one.points3D.values()], axis=0) for one in (after, before))
+    assert np.linalg.norm(kept - came) < 0.01
     assert after.rig(3).num_sensors() == 2 and len(after.frames) == 2
     sensor = after.rig(3).non_ref_sensors
     assert list(sensor) == list(before.rig(3).non_ref_sensors)
@@ -226,3 +265,71 @@ def test_parts_keep_to_the_memory() -> None:
         assert len(np.unique(image[rows])) <= 12
         assert np.isin(point, point[rows]).sum() == len(rows)  # points are whole
     assert len(list(parts_of(image, point, reference, np.full(30, 10), 10**9))) == 20
+
+
+def _survey(folder: Path, text: str) -> Path:
+    path = folder / "survey.toml"
+    path.write_text(
+        '[survey]\nname = "scale"\nunit = "mm"\n[[camera]]\nname = "all"\nimages = "*.png"\n'
+        f'[targets]\ncodes = "ring12"\n{text}',
+        encoding="utf-8",
+    )
+    return path
+
+
+def _targets_of(out: Path) -> tuple[FloatArray, FloatArray]:
+    """Return the coordinates of the targets and their standard deviations, in order of their codes."""
+    with (out / "targets.csv").open(encoding="utf-8") as file:
+        rows = {int(r["target"]): r for r in csv.DictReader(file)}
+    found = [[float(rows[k][c]) for c in ("X", "Y", "Z", "sX", "sY", "sZ")] for k in TARGETS]
+    return np.array(found)[:, :3], np.array(found)[:, 3:]
+
+
+def test_scale_bars_give_a_model_with_a_rig_its_scale(tmp_path: Path) -> None:
+    before = _model(tmp_path, "PINHOLE", rig=True, targets=True)
+    truth = 1000 * _target_places()
+    bars = [(TARGETS[i], TARGETS[j], np.linalg.norm(truth[i] - truth[j])) for i, j in ((0, 3), (1, 2))]
+    text = "".join(
+        f'[[scale_bar]]\nfrom = "{a}"\nto = "{b}"\nlength = {length:.5f}\nsigma = 0.005\n'
+        for a, b, length in bars
+    )
+    survey = _survey(tmp_path, text)
+    refine(tmp_path / "model", tmp_path, out=tmp_path / "out", fix="f,cx,cy", survey=survey)
+    found, sigma = _targets_of(tmp_path / "out")
+    for i, j in ((0, 1), (0, 2), (1, 3), (2, 3)):  # distances that nobody gave
+        difference = np.linalg.norm(found[i] - found[j]) - np.linalg.norm(truth[i] - truth[j])
+        assert abs(difference) < 4 * np.hypot(*sigma[[i, j]].max(axis=1))
+    after = pycolmap.Reconstruction(str(tmp_path / "out"))
+    base = [
+        np.linalg.norm(one.rig(3).sensor_from_rig(next(iter(one.rig(3).non_ref_sensors))).translation)
+        for one in (before, after)
+    ]
+    assert base[1] == pytest.approx(1000 * base[0], rel=1e-3)
+    page = (tmp_path / "out" / "refinement.html").read_text(encoding="utf-8")
+    assert "target 3 - target 20" in page and "[mm]" in page
+
+
+def test_control_gives_a_model_its_frame_and_what_is_wrong_of_it_is_taken_out(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    _model(tmp_path, targets=True)
+    frame = Similarity(1000.0, cv2.Rodrigues(np.array([0.3, -0.2, 1.0]))[0], np.array([500.0, 900.0, -40.0]))
+    truth = frame.apply(_target_places())
+    given = truth.copy()
+    given[2, 0] += 4.0
+    rows = "".join(f"{k},{x},{y},{z},0.02,0.02,0.02\n" for k, (x, y, z) in zip(TARGETS, given, strict=True))
+    (tmp_path / "control.csv").write_text("id,X,Y,Z,sX,sY,sZ\n" + rows + "99,0,0,0,1,1,1\n", encoding="utf-8")
+    survey = _survey(tmp_path, '[datum]\nkind = "control"\n[control]\nfile = "control.csv"\n')
+    refine(tmp_path / "model", tmp_path, out=tmp_path / "out", fix="f,cx,cy,k1", survey=survey)
+    told = capsys.readouterr().out
+    assert "warning: control points that are no target in two photographs or more: 99" in told
+    assert "control point target 12 does not fit" in told and "5 control points" in told
+    found, sigma = _targets_of(tmp_path / "out")
+    assert (np.abs(found - truth) < 4 * sigma).all() and sigma.max() < 0.5
+    after = pycolmap.Reconstruction(str(tmp_path / "out"))
+    points = frame.apply(_scene(True)[1].points)
+    assert np.median([np.linalg.norm(after.point3D(AWAY + 2 * j).xyz - p) for j, p in enumerate(points)]) < 1
+    with pytest.raises(GeometryError, match="nothing gives the model its scale; scale bars with an end"):
+        bar = '[[scale_bar]]\nfrom = "3"\nto = "98"\nlength = 1.0\nsigma = 0.1\n'
+        refine(tmp_path / "model", tmp_path, out=tmp_path / "again", survey=_survey(tmp_path, bar))
+    assert not (tmp_path / "again").exists()

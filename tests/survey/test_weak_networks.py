@@ -12,7 +12,7 @@ from sfm.adjustment.quality.other_solutions import other_solutions
 from sfm.adjustment.solve import adjust
 from sfm.camera import camera_from_values, project
 from sfm.result import Explanation
-from sfm.survey.adjusting.solution import contradicted
+from sfm.survey.diagnosis.principal_distance import contradicted
 from tests.survey.weak_networks import outcome_of, study
 from tests.synthetic import make_network, seed_of
 
@@ -35,6 +35,19 @@ def test_two_photographs_of_a_plane_are_bad() -> None:
     """12 sigma wrong and called fair: two orientations fit alike."""
     found = outcome_of(59)
     assert found.level == "bad" and any("Not decided" in line for line in found.remarks)
+
+
+def test_a_pair_has_both_solutions_of_a_plane() -> None:
+    """Seen from 59 degrees and not from 29, with v'Pv 17 for 22: 11 sigma wrong and called fair."""
+    found = outcome_of(1277)
+    assert found.over_sigma > 5 and found.level == "bad"
+    assert sum("Another solution" in line for line in found.remarks) == 1
+
+
+def test_a_pair_from_a_grazing_angle_is_no_other_solution() -> None:
+    """A plane from 6 degrees, whose other solution of 86 degrees has a v'Pv of 9 for 22: 26 sigma wrong."""
+    found = outcome_of(913)
+    assert found.over_sigma < 2 and found.level == "fair"
 
 
 def test_c_that_had_to_be_held_is_freed_where_it_fits_better() -> None:

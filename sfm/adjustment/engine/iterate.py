@@ -246,11 +246,12 @@ def _solve(
 
 
 def _step(layout: Unknowns, equations: Equations, factor: Factor, motions: Motions) -> Step:
-    reduced = -factor.solve(equations.parts.g)
-    points = point_step(equations, reduced, layout)
-    y = equations.blocks.y.ravel()
-    predicted = max(float(y @ y - equations.parts.g @ reduced), 0.0)
-    dx, dX = motions.transform(reduced, points)
+    with np.errstate(over="ignore", invalid="ignore"):  # a step without end is refused for what it leads to
+        reduced = -factor.solve(equations.parts.g)
+        points = point_step(equations, reduced, layout)
+        y = equations.blocks.y.ravel()
+        predicted = max(float(y @ y - equations.parts.g @ reduced), 0.0)
+        dx, dX = motions.transform(reduced, points)
     return Step(dx, dX, predicted, equations.vPv, equations, factor, motions)
 
 

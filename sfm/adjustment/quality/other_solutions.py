@@ -58,12 +58,13 @@ class OtherSolution:
 
 
 def other_solutions(
-    adjustment: Adjustment, *, had_to_be_held: tuple[str, ...] = ()
+    adjustment: Adjustment, *, starts: tuple[Estimate, ...] = (), had_to_be_held: tuple[str, ...] = ()
 ) -> tuple[OtherSolution, ...]:
     """Return other solutions of about the same v'Pv, and better ones, the smallest v'Pv first.
 
     Args:
         adjustment: the result, with its covariance.
+        starts: approximate values of other solutions that are looked for besides.
         had_to_be_held: cameras whose c is held because the adjustment does not converge with it; it is tried
             at other values, and freed again from a better one.
 
@@ -82,7 +83,7 @@ def other_solutions(
     sigma = np.sqrt(np.trace(a.covariance.points, axis1=1, axis2=2) / 3)
     own = _principal_distance(a.estimate.cameras)
     found: list[OtherSolution] = []
-    tried = search.candidates(a.estimate, base.vPv, limit, follow_c=bool(had_to_be_held))
+    tried = search.candidates(a.estimate, starts, base.vPv, limit, follow_c=bool(had_to_be_held))
     candidates = sorted(tried, key=lambda one: one.vPv)
     for candidate in candidates:
         points = candidate.estimate.points
@@ -112,14 +113,17 @@ def other_solutions(
     return tuple(found)
 
 
-def solution_before(adjustment: Adjustment, before: Adjustment) -> tuple[OtherSolution, ...]:
-    """Return the solution that was left for a better one, if it is hardly worse; none otherwise."""
+def solution_before(
+    adjustment: Adjustment, before: Adjustment, others: tuple[OtherSolution, ...]
+) -> tuple[OtherSolution, ...]:
+    """Return the solution that was left for a better one, if it is hardly worse and none of the others."""
     a, limit = adjustment, 1 + _allowed(adjustment) / adjustment.vPv if adjustment.vPv > 0 else 1.0
     if len(a.network.points) != len(before.network.points) or before.vPv > limit * a.vPv:
         return ()
     sigma = np.sqrt(np.trace(a.covariance.points, axis1=1, axis2=2) / 3)
     moved = _apart(before.estimate.points, a.estimate.points, sigma)
-    if not moved > APART:
+    known = any(_apart(before.estimate.points, one.estimate.points, sigma) < APART for one in others)
+    if not moved > APART or known:
         return ()
     camera, c, unit = _principal_distance(before.estimate.cameras)
     ratio = before.vPv / a.vPv
@@ -193,12 +197,14 @@ class _Search:
         return min(found, key=lambda one: one.vPv, default=None)
 
     def candidates(
-        self, result: Estimate, vPv: float, limit: float, *, follow_c: bool
+        self, result: Estimate, others: tuple[Estimate, ...], vPv: float, limit: float, *, follow_c: bool
     ) -> Iterator[_Candidate]:
         """Return solutions and places of about the same v'Pv along c, and minima beyond them."""
         free = [camera.free for camera in result.cameras]
         steps = STEPS if follow_c or any(one[0] for one in free) else 0
-        starts = [result] if self.datum.kind == "control" else [result, reverse_depth(result)]
+        starts = [result, *others]
+        if self.datum.kind != "control":
+            starts.append(reverse_depth(result))
         for start in starts:
             for direction in (STEP, 1 / STEP) if steps else (1.0,):
                 track = self._along(start, direction, steps, vPv)

@@ -37,6 +37,14 @@ def refine(
         Path | None,
         typer.Option("--masks", metavar="DIR", help="Folder of masks: NAME.png beside a photograph's NAME."),
     ] = None,
+    survey: Annotated[
+        Path | None,
+        typer.Option(
+            "--survey",
+            metavar="FILE",
+            help="Survey file: coded targets, control and scale bars join the model.",
+        ),
+    ] = None,
 ) -> None:
     """Remeasure the key points of a COLMAP model.
 
@@ -44,21 +52,35 @@ def refine(
     colours, camera models, rigs and the points of two photographs, and has a page, refinement.html, and the
     standard deviations of points, photographs and cameras beside it (sigma_*.csv). The principal point is
     estimated, too, where four photographs or more have been taken with a camera; hold it with --fix cx,cy.
-    Of masks, black is left out.
+    Of masks, black is left out. With a survey file the coded targets that it describes are measured and
+    adjusted with the key points; its control and scale bars give the model its frame and scale.
     """
     with loading():
-        from adapters.colmap.refined_model import interior_rows, open_model, update_model, write_refined
+        from adapters.colmap.refined_model import (
+            interior_rows,
+            open_model,
+            place_model,
+            update_model,
+            write_refined,
+        )
         from sfm.files.whole_files import refuse_existing, whole_folder
         from sfm.report.refinement import PAGE, Numbers, refinement_files
         from sfm.runtime.progress_bar import drawn_progress
-        from sfm.survey.refine import refine_model, refinement_text
+        from sfm.survey.inputs.survey import read_survey
+        from sfm.survey.refining.refinement import refine_model, refinement_text
+        from sfm.survey.refining.targets import measure_model_targets
 
     out = model.resolve().with_name(f"{model.resolve().name}_refined") if out is None else out
     refuse_existing(out)
     with working_on(str(model)):
         opened = open_model(model)
+        given = None if survey is None else read_survey(survey)
     compile_first()
     with working_on(str(model)), drawn_progress() as progress:
+        targets = None
+        if given is not None:
+            targets = measure_model_targets(given, opened.network, opened.estimate, images, progress=progress)
+            opened, targets = place_model(opened, targets.placement), targets.placed()
         found = refine_model(
             opened.network,
             opened.estimate,
@@ -67,13 +89,14 @@ def refine(
             min_correlation=min_correlation,
             fixed=tuple(name.strip() for name in fix.split(",") if name.strip()),
             masks_dir=masks,
+            targets=targets,
             progress=progress,
         )
     print(refinement_text(found), end="")
     a = found.adjustment
     interior = interior_rows(opened, found.start, found.estimate, a.covariance.interior)
     xy = opened.network.image_points.xy.copy()
-    xy[found.rows] = a.network.image_points.xy
+    xy[found.rows] = a.network.image_points.xy[: len(found.rows)]
     in_rigs = update_model(
         opened, found.estimate, xy=xy, measured=found.accepted, images=found.images, points=found.points
     )

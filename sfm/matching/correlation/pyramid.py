@@ -10,7 +10,7 @@ import numpy as np
 from sfm.conventions import AnyArray, FloatArray
 from sfm.errors import GeometryError
 from sfm.matching.correlation.ncc import NccMatches, match_ncc
-from sfm.matching.radiometry import FULL_SCALE_8, full_scale, grey_of, odd_window
+from sfm.matching.radiometry import FULL_SCALE_8, full_scale, grey_of_8_bit, odd_window
 
 FINE_REACH = 4  # a pixel of the level above is two here, and as much again for its error, px
 
@@ -77,7 +77,7 @@ def match_pyramid(
 
 def _pyramid(photograph: AnyArray, levels: int) -> list[AnyArray]:
     """Photographs of half the size each; cv2.pyrDown keeps the centre of the top-left pixel where it is."""
-    out: list[AnyArray] = [grey_of(photograph) * np.float32(FULL_SCALE_8 / full_scale(photograph))]
+    out: list[AnyArray] = [grey_of_8_bit(photograph)]
     for _ in range(levels - 1):
         out.append(cv2.pyrDown(out[-1]))
     return out

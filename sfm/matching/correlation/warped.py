@@ -2,27 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 
 from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
 from sfm.errors import GeometryError
-from sfm.matching.correlation.ncc import NccMatches, least_deviations, template_corners
-from sfm.matching.correlation.peak import (
-    CXX,
-    CXY,
-    CYY,
-    FLAG,
-    GAIN,
-    NOT_COMPARED,
-    OFFSET,
-    OUTPUTS,
-    SECOND,
-    R,
-    X,
-    Y,
-    read_peak,
-)
+from sfm.matching.correlation.ncc import NccMatches, least_deviations, matches_of, template_corners
+from sfm.matching.correlation.peak import NOT_COMPARED, OUTPUTS, read_peak
 from sfm.matching.radiometry import grey_of, odd_window
 
 
@@ -95,16 +83,14 @@ def match_ncc_warped(
         surface = cv2.matchTemplate(window, template, cv2.TM_CCOEFF_NORMED)
         allowed = np.where(inside, surface, np.float32(-1.0))
         read_peak(template, window, allowed, surface, least, min_correlation, max_second, out[k])
-    flag = out[:, FLAG].astype(np.int64)
-    xy, peak = (
-        b + np.einsum("kij,kj->ki", A, at - reach_px[:, None])
-        for at in (out[:, [X, Y]], np.rint(out[:, [X, Y]]))
+    around = np.repeat(-(half + reach_px)[:, None], 2, axis=1)  # of the windows, as seen from their middles
+    matches = matches_of(out, around, np.zeros_like(a), half)
+    return replace(
+        matches,
+        xy=b + np.einsum("kij,kj->ki", A, matches.xy),
+        peak=b + np.einsum("kij,kj->ki", A, matches.peak),
+        covariance=A @ matches.covariance @ A.transpose(0, 2, 1),
     )
-    covariance = A @ out[:, [CXX, CXY, CXY, CYY]].reshape(-1, 2, 2) @ A.transpose(0, 2, 1)
-    return NccMatches(
-        np.where((flag == 0)[:, None], xy, np.nan), peak, covariance,
-        out[:, R], out[:, SECOND], out[:, GAIN], out[:, OFFSET], flag,
-    )  # fmt: skip
 
 
 def _inside(

@@ -57,3 +57,8 @@ def area_ratio(H: FloatArray) -> float:
     yx, yy = H[1, 0] - H[1, 2] * H[2, 0], H[1, 1] - H[1, 2] * H[2, 1]
     ratio: float = xx * yy - xy * yx
     return ratio
+
+
+def linear_part(warp: FloatArray) -> FloatArray:
+    """Return d(H x)/dx at x = 0 of homographies (k, 3, 3) whose H[2, 2] is 1, (k, 2, 2)."""
+    return np.asarray(warp[:, :2, :2] - warp[:, :2, 2:] * warp[:, 2:, :2])

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 
 from sfm.conventions import AnyArray, FloatArray, IntArray
-from sfm.matching.radiometry import FULL_SCALE_8, full_scale, grey_of
+from sfm.matching.radiometry import FULL_SCALE_8, grey_of_8_bit
 
 RATIO = 0.8  # of the distances to the nearest and the second-nearest descriptor; Lowe (2004), IJCV 60(2)
 EPIPOLAR_PX = 4.0  # distance from the epipolar line; lens distortion is not yet known
@@ -48,7 +48,7 @@ def sift_features(photograph: AnyArray, *, max_features: int = 2000) -> Features
 
     Source: Lowe (2004), IJCV 60(2); Arandjelovic and Zisserman (2012), CVPR (square roots).
     """
-    grey = grey_of(photograph) * (FULL_SCALE_8 / full_scale(photograph))
+    grey = grey_of_8_bit(photograph)
     eight_bit = np.rint(np.clip(grey, 0, FULL_SCALE_8)).astype(np.uint8)
     shrink = 2
     while max(grey.shape) > shrink * MAX_SIDE_PX:

@@ -10,11 +10,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from scipy.sparse import csr_matrix
+from scipy.sparse.csgraph import connected_components
 
 from sfm.conventions import AnyArray, FloatArray, IntArray
+from sfm.matching.tracks.features import RATIO
 
 FEATURES = 250  # of each photograph, the coarsest
-RATIO = 0.8  # as for matching; Lowe (2004), IJCV 60(2)
 PARTNERS = 10  # with which a photograph is matched
 CLEAR = 6  # features that choose each other by which an overlap is more than chance
 
@@ -75,8 +77,5 @@ def common_features(descriptors: Sequence[AnyArray], scales: Sequence[FloatArray
 
 def connected_parts(pairs: IntArray, m: int) -> IntArray:
     """Return the number of the connected part that each of m photographs belongs to, (m,)."""
-    part = np.arange(m)
-    for i, j in pairs.tolist():
-        if part[i] != part[j]:
-            part[part == part[j]] = part[i]
-    return np.unique(part, return_inverse=True)[1]
+    links = csr_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(m, m))
+    return np.asarray(connected_components(links, directed=False)[1], dtype=np.int64)

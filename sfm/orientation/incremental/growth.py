@@ -7,11 +7,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from sfm.camera import Camera, project, tangents_from_pixel
+from sfm.camera import Camera, project
 from sfm.conventions import MAD_TO_SIGMA, BoolArray, FloatArray
 from sfm.distortion.models import Role
 from sfm.errors import GeometryError
-from sfm.network import Estimate, Network, empty_estimate, rows_of
+from sfm.network import Estimate, Network, empty_estimate, image_tangents, rows_of
 from sfm.orientation.incremental.starting_pair import Start, best_start
 from sfm.orientation.incremental.support import photograph_support
 from sfm.orientation.intersection import intersect
@@ -55,12 +55,7 @@ class Growth:
 
     def tangents(self) -> FloatArray:
         """Tangents of all image points with the present interior orientations, (k, 2)."""
-        seen = self.network.image_points
-        uv = np.full((len(seen), 2), np.nan)
-        of_camera = rows_of(self.network.camera[seen.image], len(self.estimate.cameras))
-        for one, own in zip(self.estimate.cameras, of_camera, strict=True):
-            uv[own] = tangents_from_pixel(one, seen.xy[own])
-        return uv
+        return image_tangents(self.network, self.estimate.cameras)
 
     def tolerance(self) -> FloatArray:
         """Tolerance of every photograph, tangents, (m,)."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -10,11 +11,12 @@ import numpy as np
 from sfm.conventions import FloatArray, IntArray
 from sfm.display import listed
 from sfm.errors import GeometryError
-from sfm.network import Network, rows_of
+from sfm.network import Estimate, Network, image_tangents, rows_of
 from sfm.orientation.homography import PLANAR_POINTS
 from sfm.orientation.intersection import intersect
 from sfm.orientation.relative import RelativeOrientation, model_points, relative_orientations
 from sfm.orientation.resection.ransac import resect_robust
+from sfm.similarity import fit_similarity
 
 MAX_PAIRS = 60  # pairs whose solutions are tried on the other photographs
 BARREN_PAIRS = 20  # pairs most of whose points fit no orientation, after which no more are tried
@@ -120,6 +122,41 @@ def best_start(
             f"orientation: no pair of photographs has a base, or rays that intersect well{seen}"
         )
     return _choose(found, judge)
+
+
+def pair_solutions(network: Network, estimate: Estimate, *, tolerance_px: float) -> tuple[Estimate, ...]:
+    """Return all solutions that two photographs allow, however well they fit, placed on the points.
+
+    Only those with a base that a survey could start from. A plane seen at moderate angles is also one seen at
+    a grazing angle from a base of almost nothing, which bends to fit the errors better than the truth.
+
+    Args:
+        network: of two photographs and points that both see.
+        estimate: one solution, whose cameras and frame they have; those like it are among them.
+        tolerance_px: largest residual of a fitting pair of image points, px.
+
+    Source: Ma et al. (2004), An Invitation to 3-D Vision, sec. 5.3.3 (the two solutions of a plane).
+    """
+    tangents = image_tangents(network, estimate.cameras)
+    own = _sorted_rows(network, tangents)
+    points, first, second = _common(network, tangents, own[0], own[1])
+    tolerance = tolerance_px / min(camera.c_px for camera in estimate.cameras)
+    try:
+        solutions = relative_orientations(first, second, tolerance=tolerance, max_trials=PAIR_TRIALS)
+    except GeometryError:
+        return ()
+    found = []
+    for solution in solutions:
+        if solution.kind == "infinite":
+            continue
+        start, angle = _model(network, (0, 1), points, first, second, solution)
+        if start is None or angle < MIN_ANGLE_OF_TWO_DEG or not np.isfinite(start.points).all():
+            continue
+        with suppress(GeometryError):  # points on a line have no place
+            placing = fit_similarity(start.points, estimate.points)
+            model = replace(estimate, position=start.position, rotation=start.rotation, points=start.points)
+            found.append(placing.apply_estimate(model))
+    return tuple(found)
 
 
 def _choose(found: list[_Candidate], judge: Judge | None) -> Start:

@@ -15,6 +15,7 @@ import numpy as np
 
 from sfm.adjustment.engine.observed_unknowns import inverse_of_observed
 from sfm.adjustment.quality.reliability import UNCONTROLLED, standardised_of_given
+from sfm.adjustment.result import Adjustment
 from sfm.conventions import FloatArray, angles_from_rotation
 from sfm.report.findings.precision import root_mean_square
 from sfm.result import SurveyResult
@@ -119,9 +120,9 @@ class Given:
         return tuple(kind for kind in kinds if kind is not None)
 
 
-def control_residuals(result: SurveyResult) -> GivenResiduals | None:
+def control_residuals(a: Adjustment, unit: str) -> GivenResiduals | None:
     """Return by how much control differs from its given coordinates; None where control took no part."""
-    a, control = result.adjustment, result.adjustment.network.control
+    control = a.network.control
     if a.datum != "control" or not len(control):
         return None
     variance = np.einsum("nii->ni", control.covariance)
@@ -132,7 +133,7 @@ def control_residuals(result: SurveyResult) -> GivenResiduals | None:
         kind="control point",
         coordinates=("X", "Y", "Z"),
         names=tuple(a.network.points[j] for j in control.point),
-        units=(result.length_unit,) * len(control),
+        units=(unit,) * len(control),
         given=np.where(np.isfinite(variance), control.xyz, np.nan),
         difference=np.where(np.isfinite(variance), difference, np.nan),
         sigma=np.where(np.isfinite(variance), np.sqrt(variance), np.nan),
@@ -141,9 +142,9 @@ def control_residuals(result: SurveyResult) -> GivenResiduals | None:
     )
 
 
-def bar_residuals(result: SurveyResult) -> GivenResiduals | None:
+def bar_residuals(a: Adjustment, unit: str) -> GivenResiduals | None:
     """Return by how much scale bars differ from their given lengths; None without scale bars."""
-    a, bars = result.adjustment, result.adjustment.network.scale_bars
+    bars = a.network.scale_bars
     if not len(bars):
         return None
     X, r = a.estimate.points, a.bar_redundancy
@@ -157,7 +158,7 @@ def bar_residuals(result: SurveyResult) -> GivenResiduals | None:
             f"{a.network.points[i]} - {a.network.points[j]}"
             for i, j in zip(bars.start, bars.end, strict=True)
         ),
-        units=(result.length_unit,) * len(bars),
+        units=(unit,) * len(bars),
         given=bars.length[:, None],
         difference=difference[:, None],
         sigma=bars.sigma[:, None],
@@ -226,6 +227,7 @@ def exterior_residuals(result: SurveyResult) -> tuple[GivenResiduals, GivenResid
 def given_of(result: SurveyResult) -> Given:
     """Return everything that was given with a standard deviation and took part."""
     position, rotation = exterior_residuals(result) or (None, None)
+    a, unit = result.adjustment, result.length_unit
     return Given(
-        control_residuals(result), bar_residuals(result), interior_residuals(result), position, rotation
+        control_residuals(a, unit), bar_residuals(a, unit), interior_residuals(result), position, rotation
     )

@@ -15,8 +15,16 @@ from sfm.conventions import BoolArray, IntArray
 from sfm.display import listed
 from sfm.errors import GeometryError
 from sfm.network import Estimate, Network
+from sfm.orientation.incremental.starting_pair import pair_solutions
 from sfm.reduced_network import reduce_network
-from sfm.result import ControlCheck, Eccentricity, Explanation, LeftOutPoint, TakenOut
+from sfm.result import (
+    ControlCheck,
+    Eccentricity,
+    Explanation,
+    LeftOutPoint,
+    PhotographTargets,
+    TakenOut,
+)
 from sfm.survey.adjusting.datum_definition import (
     datum_warnings,
     place_on_control,
@@ -41,7 +49,7 @@ from sfm.survey.adjusting.settling import (
 from sfm.survey.diagnosis.explanations import explain_residuals
 from sfm.survey.diagnosis.left_out import left_out_points, unused_image_points, words_of_left_out
 from sfm.survey.diagnosis.own_camera import Treated
-from sfm.survey.diagnosis.principal_distance import far_principal_distances
+from sfm.survey.diagnosis.principal_distance import contradicted, far_principal_distances
 from sfm.survey.diagnosis.scale_check import check_scales
 from sfm.survey.inputs.checks.incomplete_cameras import unlike_squares
 from sfm.survey.inputs.interior import split_cameras
@@ -51,6 +59,7 @@ from sfm.survey.inputs.survey import Survey
 
 TOLERANCE_FACTOR = 6.0  # of the robust spread of the residuals
 MIN_CONTROL = 3  # points that place a free network
+PAIR_TOLERANCE = 10.0  # standard deviations within which pairs of accepted image points fit an orientation
 GIVEN_IMAGE_POINTS = 3  # of one whose given orientation tells which of the four solutions is meant
 
 
@@ -69,6 +78,7 @@ class Correspondences:
     given: bool = False  # whether the survey's own approximate values were what the orientation started from
     left_out: tuple[tuple[str, str], ...] = ()  # photographs of another object, with the reason
     suspected: tuple[str, ...] = ()  # photographs that could be matched with a camera of their own only
+    overlays: tuple[PhotographTargets, ...] | None = None  # what the report draws; None as it was measured
 
 
 @dataclass(frozen=True)
@@ -241,9 +251,9 @@ def _solved(start: _Prepared) -> _Solved:
             continue
         # c that had to be held is nobody's calibration: what its other values give is another solution
         c_held = tuple(one.name for one in final.estimate.cameras if one.name in asked and not one.free[0])
-        others = other_solutions(final, had_to_be_held=c_held)
+        others = other_solutions(final, starts=_of_pair(final), had_to_be_held=c_held)
         if first is not None and final.converged:
-            others = (*others, *solution_before(final, first[1]))
+            others = (*others, *solution_before(final, first[1], others))
         if first is not None and not final.converged:  # what seemed better is none: as it was
             (settled, final, check, others), better = first, ()
             break
@@ -266,13 +276,13 @@ def _solved(start: _Prepared) -> _Solved:
     )
 
 
-def contradicted(held: tuple[str, ...], explanations: tuple[Explanation, ...]) -> tuple[str, ...]:
-    """Return a line where the residuals have a cause and c had to be held at a value that nobody measured."""
-    if not held or not explanations or not explanations[0].explains:
+def _of_pair(final: Adjustment) -> tuple[Estimate, ...]:
+    """Return the solutions that the image points of two photographs allow; control decides by itself."""
+    if len(final.network.images) > 2 or final.datum == "control":
         return ()
-    return (
-        f"c of camera {', '.join(held)}: it had to be held at its start value, and the residuals say that "
-        "something does not fit; give a calibrated camera, or add photographs at larger angles",
+    accepted = replace(final.network, image_points=final.network.image_points.select(~final.rejected))
+    return pair_solutions(
+        accepted, final.estimate, tolerance_px=PAIR_TOLERANCE * max(final.sigma0, 1.0) * final.sigma_px
     )
 
 

@@ -1,4 +1,4 @@
-"""Whether adjusted principal distances are near the given ones.
+"""Whether adjusted principal distances are near the given ones, and whether held ones are contradicted.
 
 Few photographs of a flat object let the principal distance run away along with the distance from it, to a
 false minimum with a small standard deviation; nothing but its start value tells.
@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from sfm.network import Estimate
+from sfm.result import Explanation
 from sfm.survey.inputs.survey import Survey
 
 FAR = 0.2  # relative change of c; focusing from infinity to 1 : 5 changes it by as much
@@ -35,3 +36,13 @@ def far_principal_distances(survey: Survey, estimate: Estimate) -> tuple[str, ..
                 "determine it; give c from a calibration or add photographs from other distances"
             )
     return tuple(lines)
+
+
+def contradicted(held: tuple[str, ...], explanations: tuple[Explanation, ...]) -> tuple[str, ...]:
+    """Return a line where the residuals have a cause and c had to be held at a value that nobody measured."""
+    if not held or not explanations or not explanations[0].explains:
+        return ()
+    return (
+        f"c of camera {', '.join(held)}: it had to be held at its start value, and the residuals say that "
+        "something does not fit; give a calibrated camera, or add photographs at larger angles",
+    )

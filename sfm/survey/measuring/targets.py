@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sfm.conventions import FloatArray
+from sfm.conventions import AnyArray, FloatArray
 from sfm.photographs.exif import Metadata, read_metadata
 from sfm.photographs.reading import read_photograph, take_back_srgb
 from sfm.runtime.progress import SILENT, Progress
@@ -109,17 +109,21 @@ def measure_photograph(
             store.held[key] = kept, True
         if key in store.held:
             return store.held[key]
-    photograph = read_photograph(path, channel=settings.channel)
-    targets = find_targets(
+    targets = targets_in(read_photograph(path, channel=settings.channel), settings, family)
+    if store is not None:
+        store.save(key, targets)
+        store.held[key] = targets, False
+    return targets, False
+
+
+def targets_in(photograph: AnyArray, settings: TargetSettings, family: TargetFamily | None) -> Targets:
+    """Return the targets of a photograph (H, W) that was read in the channel of the settings."""
+    return find_targets(
         take_back_srgb(photograph) if settings.tone == "srgb" else photograph,
         polarity=settings.polarity,
         codes=family if family is not None else "none",
         min_diameter_px=settings.min_diameter_px,
     )
-    if store is not None:
-        store.save(key, targets)
-        store.held[key] = targets, False
-    return targets, False
 
 
 def image_point_covariance(targets: Targets, sigma_px: float) -> FloatArray:

@@ -10,23 +10,24 @@ import numpy as np
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
-from sfm.camera import Camera, tangents_from_pixel
+from sfm.camera import tangents_from_pixel
 from sfm.conventions import MAD_TO_SIGMA, BoolArray, FloatArray, IntArray
-from sfm.distortion.models import Role
 from sfm.errors import GeometryError
 from sfm.matching.lsm.projected_points import pictures_of
 from sfm.matching.match_flags import LsmFlag, in_words
 from sfm.matching.radiometry import odd_window
-from sfm.network import Estimate, ImagePoints, Network
+from sfm.network import Estimate, ImagePoints, Network, ObjectPoints, ScaleBars
 from sfm.orientation.intersection import intersect
 from sfm.reduced_network import reduce_network
 from sfm.runtime.progress import SILENT, Progress
-from sfm.survey.adjusting.settling import FALSE_ALARM, determined, merge_estimate
+from sfm.survey.adjusting.settling import determined, merge_estimate
 from sfm.survey.adjusting.solution import TOLERANCE_FACTOR
-from sfm.survey.refine_windows import match_windows, outside_masks
+from sfm.survey.refining.final_adjustment import adjust_finally
+from sfm.survey.refining.free_parameters import free_cameras
+from sfm.survey.refining.targets import ModelTargets, join_targets
+from sfm.survey.refining.windows import match_windows, outside_masks
 
 MIN_RAYS = 3
-MIN_PHOTOGRAPHS = 4  # of a camera whose principal point is freed
 # Over larger windows no surface is a plane, and memory and time grow with the square of the side.
 MAX_WINDOW_PX = 101
 SIGMA_PX = 0.02  # of a matched point, on top of what matching knows: surfaces are not plane over a window
@@ -35,8 +36,6 @@ ORIENTATION_FACTOR = (
 )
 MAX_SHIFT_FACTOR = 6.0  # of that spread, beyond which a key point was another one
 MIN_SHIFT_PX = 2.0
-# What COLMAP calls the parameters of its models with one focal length, which are adjusted as brown_forward
-COLMAP_NAMES = {"c": "f", "x0": "cx", "y0": "cy", "K1": "k1", "K2": "k2"}
 
 
 @dataclass(frozen=True)
@@ -49,13 +48,15 @@ class Refinement:
     readjusted: Adjustment  # the same points adjusted here, without rejection
     adjustment: Adjustment  # of the points measured anew
     estimate: Estimate  # of the whole model: adjusted, else as it came, points of few rays intersected anew
-    rows: IntArray  # image point of the model of each one of the adjustment, (k,)
+    rows: IntArray  # image point of the model of each one of the adjustment, targets behind them, (k,)
     images: BoolArray  # photographs of the model that were adjusted, (m,)
     points: BoolArray  # points of the model that were adjusted, (n,)
     residuals_before: (
         FloatArray  # computed minus measured in the model as it came, NaN if unknown, px, (k, 2)
     )
     reasons: tuple[tuple[str, int], ...]  # why key points took no part, and how many, most frequent first
+    targets: ModelTargets | None = None  # points of the adjustment behind those of the model
+    remarks: tuple[str, ...] = ()  # on what was given with them, one line each
 
     @property
     def key_points(self) -> int:
@@ -65,7 +66,7 @@ class Refinement:
     @property
     def refined(self) -> int:
         """Of these, matched and part of the adjustment."""
-        return int((~self.adjustment.rejected).sum())
+        return int(self.accepted.sum())
 
     @property
     def readjusted_px(self) -> float:
@@ -74,15 +75,21 @@ class Refinement:
 
     @property
     def after_px(self) -> float:
-        """RMS per coordinate of the accepted points measured anew, px."""
-        return self.adjustment.rms_px
+        """RMS per coordinate of the accepted key points measured anew, px."""
+        v = self.adjustment.residuals[: len(self.rows)]
+        return float(np.sqrt((v[~self.adjustment.rejected[: len(self.rows)]] ** 2).mean()))
 
     @property
     def accepted(self) -> BoolArray:
         """Image points of the model that are measured anew and part of the adjustment, (k,)."""
         accepted = np.zeros(self.key_points, dtype=bool)
-        accepted[self.rows[~self.adjustment.rejected]] = True
+        accepted[self.rows[~self.adjustment.rejected[: len(self.rows)]]] = True
         return accepted
+
+    @property
+    def target_points(self) -> IntArray:
+        """Points of the adjustment that are targets."""
+        return np.arange(int(self.points.sum()), len(self.adjustment.network.points))
 
 
 def refine_model(
@@ -94,6 +101,7 @@ def refine_model(
     min_correlation: float = 0.7,
     fixed: tuple[str, ...] = (),
     masks_dir: Path | None = None,
+    targets: ModelTargets | None = None,
     progress: Progress = SILENT,
 ) -> Refinement:
     """Measure all image points of a solved model by multi-photo least squares matching and adjust it again.
@@ -107,6 +115,7 @@ def refine_model(
         fixed: names of interior parameters that are held at the model's values, as fx, cx or k1.
         masks_dir: folder of masks, named as their photographs with .png behind; key points where a mask is
             black take no part.
+        targets: of its photographs, in the frame of the estimate; see `measure_model_targets`.
         progress: told of stages and parts.
 
     Raises:
@@ -120,7 +129,7 @@ def refine_model(
         raise GeometryError(f"refine: smallest correlation is {min_correlation:g}, needed 0 to 1")
     seen = network.image_points
     everything = np.ones(len(seen), dtype=bool)
-    estimate = replace(estimate, cameras=_all_freed(network, estimate, fixed))
+    estimate = replace(estimate, cameras=free_cameras(network, estimate, fixed))
     residuals = pictures_of(estimate, network.camera, seen.image, estimate.points[seen.point]) - seen.xy
     usable = np.isfinite(residuals).all(axis=1)
     if not usable.any():
@@ -128,7 +137,7 @@ def refine_model(
     before = float(np.sqrt((residuals[usable] ** 2).mean()))
     spread = MAD_TO_SIGMA * float(np.median(np.abs(residuals[usable])))
     progress.stage("adjustment as it came")
-    first, start, _, _ = _part(network, estimate, everything)
+    first, start, _, _ = _part(network, estimate, everything, np.full(len(network.points), MIN_RAYS))
     readjusted = adjust(first, start, datum=Datum("free"), reject="none")
     masked = ~everything if masks_dir is None else outside_masks(network, estimate, masks_dir)
     reference = _references(network, estimate, usable & ~masked)
@@ -153,24 +162,39 @@ def refine_model(
         windows.covariance[good] + SIGMA_PX**2 * np.eye(2),
     )
     progress.stage("adjustment")
-    anew = replace(network, image_points=measured)
-    part, start, images, points = _part(anew, estimate, np.ones(len(measured), dtype=bool))
-    adjusted = adjust(part, start, datum=Datum("free"), reject="huber", covariance=False)
+    anew, whole = replace(network, image_points=measured), estimate
+    rays = np.full(len(network.points), MIN_RAYS)
+    if targets is not None:
+        anew, whole = join_targets(anew, estimate, targets)
+        rays = np.concatenate([rays, targets.min_rays])
+    part, start, images, points = _part(anew, whole, np.ones(len(anew.image_points), dtype=bool), rays)
+    alone = replace(part, control=ObjectPoints(), scale_bars=ScaleBars())
+    adjusted = adjust(alone, start, datum=Datum("free"), reject="huber", covariance=False)
     v = np.abs(adjusted.residuals)
-    fits = (v <= TOLERANCE_FACTOR * MAD_TO_SIGMA * np.median(v)).all(axis=1)
-    accepted = images[measured.image] & points[measured.point]
+    fits = np.ones(len(v), dtype=bool)
+    matched = part.image_points.point < int(points[: len(network.points)].sum())
+    for own in (matched, ~matched):  # targets are measured in another way, with other residuals
+        if own.any():
+            fits[own] = (v[own] <= TOLERANCE_FACTOR * MAD_TO_SIGMA * np.median(v[own])).all(axis=1)
+    accepted = images[anew.image_points.image] & points[anew.image_points.point]
     accepted[accepted] = fits
-    solved = merge_estimate(estimate, adjusted.estimate, images, points)
-    part, start, images, points = _part(anew, solved, accepted)
-    tests = 2 * len(part.image_points)
-    alpha = 1 - (1 - FALSE_ALARM) ** (1 / tests)
-    final = adjust(part, start, datum=Datum("free"), reject="tau", alpha=alpha, covariance=True)
-    taken = accepted & images[measured.image] & points[measured.point]
+    solved = merge_estimate(whole, adjusted.estimate, images, points)
+    part, start, images, points = _part(anew, solved, accepted, rays)
+    final, remarks = adjust_finally(
+        part,
+        start,
+        Datum("free") if targets is None else targets.datum,
+        matched=int(points[: len(network.points)].sum()),
+        unit="" if targets is None else targets.unit,
+    )
+    taken = (accepted & images[anew.image_points.image] & points[anew.image_points.point])[: len(measured)]
+    accepted_anew = int((~final.rejected[: int(taken.sum())]).sum())
+    points = points[: len(network.points)]
     counts = [(in_words(LsmFlag, flag), int(((windows.flag & flag) != 0).sum())) for flag in LsmFlag if flag]
     few = len(seen) - len(rows) - int(masked.sum())
     counts.append((f"of a point that fewer than {MIN_RAYS} photographs see", few))
     counts.append(("where the mask is black", int(masked.sum())))
-    counts.append(("contradict the others", int(good.sum() - (~final.rejected).sum())))
+    counts.append(("contradict the others", int(good.sum()) - accepted_anew))
     return Refinement(
         network,
         estimate,
@@ -183,6 +207,8 @@ def refine_model(
         points,
         np.asarray(residuals),
         tuple((why, count) for why, count in sorted(counts, key=lambda c: -c[1]) if count),
+        targets,
+        remarks if targets is None else (*targets.warnings, *remarks),
     )
 
 
@@ -191,7 +217,8 @@ def _whole(
 ) -> Estimate:
     """Return the whole model with an adjusted part in it, its other points intersected with what is new."""
     position, rotation, xyz = estimate.position.copy(), estimate.rotation.copy(), estimate.points.copy()
-    position[images], rotation[images], xyz[points] = part.position, part.rotation, part.points
+    position[images], rotation[images] = part.position, part.rotation
+    xyz[points] = part.points[: int(points.sum())]  # targets behind them
     seen = network.image_points
     rows = np.flatnonzero(~points[seen.point] & images[seen.image])
     tangents = np.full((len(rows), 2), np.nan)
@@ -216,53 +243,38 @@ def refinement_text(result: Refinement) -> str:
         f"{result.readjusted_px:.4f} px adjusted anew\n"
         f"RMS after     {result.after_px:.4f} px\n"
         f"sigma0        {result.adjustment.sigma0_px:.4f} px (redundancy {result.adjustment.redundancy})\n"
+        + _words_of_targets(result)
+        + "".join(f"warning: {line}\n" for line in result.remarks)
+    )
+
+
+def _words_of_targets(result: Refinement) -> str:
+    """Return the line of targets, control and scale bars; none where they were not asked for."""
+    if result.targets is None:
+        return ""
+    own, a = result.targets.network, result.adjustment
+    control = len(a.network.control) if a.datum == "control" else 0
+    used = int((~a.rejected[len(result.rows) :]).sum())
+    return (
+        f"targets       {len(result.target_points)} of {len(own.points)}, {used} image points, "
+        f"datum {a.datum}, {control} control points, {len(a.network.scale_bars)} scale bars\n"
     )
 
 
 def _part(
-    network: Network, estimate: Estimate, accepted: BoolArray
+    network: Network, estimate: Estimate, accepted: BoolArray, rays: IntArray
 ) -> tuple[Network, Estimate, BoolArray, BoolArray]:
-    """Return what accepted image points determine, and which photographs and points that are."""
-    images, points = determined(network, estimate, accepted, np.full(len(network.points), MIN_RAYS))
-    part, start = reduce_network(network, estimate, images, points, accepted)
-    return part, start, images, points
-
-
-def _all_freed(network: Network, estimate: Estimate, fixed: tuple[str, ...]) -> tuple[Camera, ...]:
-    """Return the cameras with what is to be estimated freed; see `_freed`."""
-    photographs = np.bincount(network.camera[estimate.oriented], minlength=len(estimate.cameras))
-    return tuple(
-        _freed(camera, int(count), fixed) for camera, count in zip(estimate.cameras, photographs, strict=True)
-    )
-
-
-def _freed(camera: Camera, photographs: int, fixed: tuple[str, ...]) -> Camera:
-    """Free what the image points of a model determine, but for what is to be held.
-
-    Principal distances and principal point, and the distortion that the model has. COLMAP holds the principal
-    point unless it is told otherwise; held at a wrong place all photographs are turned to make up for it.
+    """Return what accepted image points determine, and which photographs and points that are.
 
     Args:
-        camera: of the model.
-        photographs: oriented ones of it; fewer than MIN_PHOTOGRAPHS do not tell the principal point from a
-            rotation.
-        fixed: names of parameters to hold.
+        network: the whole.
+        estimate: its solution.
+        accepted: image points, (k,).
+        rays: that each point needs, (n,).
     """
-    names = tuple(COLMAP_NAMES.get(name, name) for name in camera.names)
-    fixed = tuple("f" if name in ("fx", "fy") and "f" in names else name for name in fixed)
-    unknown = [name for name in fixed if name not in (*camera.names, *names)]
-    if unknown:
-        raise GeometryError(
-            f"refine: parameter '{unknown[0]}' of camera {camera.name} is to be held, expected one of "
-            + ", ".join(names)
-        )
-    free = camera.free
-    if not free.any():
-        free = camera.plays(Role.RADIAL, Role.DENOMINATOR, Role.DECENTRING) & (camera.parameters != 0)
-        free |= camera.plays(Role.FOCAL)
-        if photographs >= MIN_PHOTOGRAPHS:
-            free |= camera.plays(Role.X0, Role.Y0)
-    return replace(camera, free=free & ~np.isin(camera.names, fixed) & ~np.isin(names, fixed))
+    images, points = determined(network, estimate, accepted, rays)
+    part, start = reduce_network(network, estimate, images, points, accepted)
+    return part, start, images, points
 
 
 def _references(network: Network, estimate: Estimate, usable: BoolArray) -> IntArray:

@@ -35,16 +35,11 @@ class Photographs:
     """The photographs of a model, read when they are needed; the oldest are forgotten."""
 
     def __init__(self, network: Network, estimate: Estimate, folder: Path, memory_bytes: int) -> None:
-        self._paths = [_path_in(folder, name) for name in network.images]
+        self._paths = photograph_paths(network, estimate, folder)
         self._names = network.images
         self._sizes = [estimate.cameras[camera].size_px for camera in network.camera]
         self._memory = memory_bytes
         self._kept: OrderedDict[int, AnyArray] = OrderedDict()
-        for i in np.flatnonzero(estimate.oriented):
-            if not self._paths[i].is_file():
-                raise SurveyFileError(
-                    f"{folder}: photograph '{self._names[i]}' of the model is not in this folder"
-                )
 
     def bytes_of(self, i: int) -> int:
         """Memory that a photograph takes."""
@@ -54,13 +49,7 @@ class Photographs:
     def grey(self, i: int) -> AnyArray:
         """Return one photograph, float32, (H, W)."""
         if i not in self._kept:
-            photograph, (width, height) = read_photograph(self._paths[i]), self._sizes[i]
-            if photograph.shape != (height, width):
-                raise PhotographError(
-                    f"{self._names[i]}: {photograph.shape[1]} x {photograph.shape[0]} px, its camera has "
-                    f"{width} x {height} px"
-                )
-            self._kept[i] = grey_of(photograph)
+            self._kept[i] = grey_of(read_of_size(self._paths[i], self._names[i], self._sizes[i]))
         self._kept.move_to_end(i)
         while len(self._kept) > 1 and sum(one.nbytes for one in self._kept.values()) > self._memory:
             self._kept.popitem(last=False)
@@ -194,6 +183,38 @@ def outside_masks(network: Network, estimate: Estimate, folder: Path) -> BoolArr
     if not some:
         raise SurveyFileError(f"{folder}: no mask of any photograph, expected '{network.images[0]}.png'")
     return masked
+
+
+def photograph_paths(network: Network, estimate: Estimate, folder: Path) -> list[Path]:
+    """Return the paths of all photographs of a model.
+
+    Raises:
+        SurveyFileError: one with an orientation is not in the folder, or outside of it.
+    """
+    if not folder.is_dir():
+        raise SurveyFileError(f"{folder}: no such folder; the photographs of the model were needed")
+    paths = [_path_in(folder, name) for name in network.images]
+    lost = [i for i in np.flatnonzero(estimate.oriented) if not paths[i].is_file()]
+    if lost:
+        more = f", and {len(lost) - 1} more are not" if len(lost) > 1 else ""
+        raise SurveyFileError(
+            f"{folder}: photograph '{network.images[lost[0]]}' of the model is not in this folder{more}"
+        )
+    return paths
+
+
+def read_of_size(path: Path, name: str, size_px: tuple[int, int], *, channel: str = "luminance") -> AnyArray:
+    """Return a photograph of a model, (H, W).
+
+    Raises:
+        PhotographError: it cannot be read, or has another size than its camera.
+    """
+    photograph, (width, height) = read_photograph(path, channel=channel), size_px
+    if photograph.shape != (height, width):
+        raise PhotographError(
+            f"{name}: {photograph.shape[1]} x {photograph.shape[0]} px, its camera has {width} x {height} px"
+        )
+    return photograph
 
 
 def _path_in(folder: Path, name: str) -> Path:
