@@ -60,7 +60,7 @@ def run_survey(
         with clock.stage("orientation"):
             start = orient_survey(survey, measured)
         with clock.stage("matching"):
-            matched = find_correspondences(survey, measured, start)
+            matched = find_correspondences(survey, measured, start, jobs=jobs)
         with clock.stage("adjustment"):
             solution = solve_survey(survey, matched)
         compared = compare_solution(solution, others, clock, files=measured.files)

@@ -43,7 +43,7 @@ def assemble_result(
         code=np.full(len(points), -1) if naming is None else naming.codes(adjustment.network),
         comparison=compared.adjusters,
         baseline=compared.baseline,
-        photographs=measured.overlays,
+        photographs=measured.overlays if matched.overlays is None else matched.overlays,
         control_check=solution.control_check,
         warnings=measured.warnings
         + start.warnings

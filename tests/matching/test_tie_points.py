@@ -24,6 +24,7 @@ from sfm.errors import GeometryError, PhotographError, SurveyFileError
 from sfm.matching.correlation.along_line import match_along_line
 from sfm.matching.epipolar import epipolar_paths
 from sfm.matching.lsm.multi_photo import match_multi
+from sfm.matching.lsm.projected_points import plane_warps
 from sfm.matching.lsm.two_photo import match_lsm
 from sfm.matching.match_flags import LsmFlag
 from sfm.matching.tracks import feature_tracks
@@ -40,6 +41,7 @@ from sfm.orientation.relative import relative_orientations
 from sfm.pipeline import run_survey
 from sfm.similarity import fit_similarity
 from sfm.survey.inputs.survey import read_survey
+from sfm.survey.measuring.further_points import find_further_points
 from sfm.survey.other_programs import OtherPrograms
 from sfm.survey.refining.refinement import refine_model, refinement_text
 from tests.engines import ALONE, HERE, Notes
@@ -193,6 +195,51 @@ def test_multi_photo_matching_says_what_is_lost() -> None:
     with pytest.raises(GeometryError, match="photograph 3 has no orientation"):
         lost = Estimate(truth.cameras, truth.position * [[1], [1], [np.nan]], truth.rotation, truth.points)
         match_multi(photographs, lost, cameras, image, point, xy, np.arange(2))
+
+
+def test_windows_of_a_plane_are_seen_in_perspective() -> None:
+    _, truth, _ = _scene()
+    lens, camera = truth.cameras[0], np.zeros(3, dtype=np.int64)
+    normal = np.array([[0.1, 0.2, 1.0]]) / np.sqrt(1.05)
+    point = truth.points[:1]
+    middle = project(lens, truth.position[0], truth.rotation[0], point)
+    corner = middle + np.array([[10.0, -10.0]])
+    uv = tangents_from_pixel(lens, corner)
+    ray = np.column_stack([uv, -np.ones(1)]) @ truth.rotation[0].T
+    to_plane = np.sum(normal * (point - truth.position[0])) / np.sum(normal * ray)
+    seen = project(lens, truth.position[2], truth.rotation[2], truth.position[0] + to_plane * ray)
+    H = plane_warps(truth, camera, 0, 2, middle, point, normal, 10.0)[0]
+    x, y, w = H @ [10.0, -10.0, 1.0]
+    start = project(lens, truth.position[2], truth.rotation[2], point)
+    assert np.array([x / w, y / w]) == pytest.approx((seen - start)[0], abs=1e-3)
+    assert np.abs(H[:2, :2] @ [10.0, -10.0] - (seen - start)[0]).max() > 0.01  # what an affine warp is off by
+
+
+def test_further_points_cover_photographs_that_are_oriented() -> None:
+    photographs, truth, _ = _scene()
+    lens, camera = truth.cameras[0], np.zeros(3, dtype=np.int64)
+    n = len(truth.points)
+    image, point = np.repeat(np.arange(3), n), np.tile(np.arange(n), 3)
+    xy = np.concatenate(
+        [project(lens, X0, R, truth.points) for X0, R in zip(truth.position, truth.rotation, strict=True)]
+    )
+    ties = ImagePoints(image, point, xy, np.tile(0.01 * np.eye(2), (3 * n, 1, 1)))
+    arguments = (photographs, truth, camera, ties)
+    found = find_further_points(*arguments, ties, window_px=15, spacing_px=15.0)
+    seen, count = found.image_points, np.bincount(found.image_points.point)
+    assert len(found.points) > 3 * n and (count == 3).all()
+    reference = np.flatnonzero((seen.xy == np.rint(seen.xy)).all(axis=1))
+    apart = 15 - 5.5  # the windows of interest points keep the distance, edges meet within them
+    for i in range(3):
+        own = seen.xy[reference[seen.image[reference] == i]]
+        between = np.linalg.norm(own[:, None] - np.concatenate([own, xy[image == i]])[None], axis=2)
+        assert (between + 99 * np.eye(*between.shape)).min(initial=99) > apart
+    height = found.points[:, 2] - render.height(found.points[:, 0], found.points[:, 1])
+    assert np.sqrt((height**2).mean()) < 3e-4
+    assert np.sqrt((found.residuals**2).mean()) < 0.05
+    assert (
+        len(find_further_points(*arguments, ties, window_px=15, spacing_px=15.0, references=[]).points) == 0
+    )
 
 
 def test_tie_points_of_three_photographs() -> None:

@@ -44,6 +44,12 @@ def test_a_pair_has_both_solutions_of_a_plane() -> None:
     assert sum("Another solution" in line for line in found.remarks) == 1
 
 
+def test_a_pair_from_a_grazing_angle_is_no_other_solution() -> None:
+    """A plane from 6 degrees, whose other solution of 86 degrees has a v'Pv of 9 for 22: 26 sigma wrong."""
+    found = outcome_of(913)
+    assert found.over_sigma < 2 and found.level == "fair"
+
+
 def test_c_that_had_to_be_held_is_freed_where_it_fits_better() -> None:
     """A plane, c 23 % too short and held there: 5.4 sigma wrong and called fair, with sigma0 1.9 times."""
     found = outcome_of(141)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from sfm.camera import pixel_jacobian, project
+from sfm.camera import pixel_jacobian, project, tangents_from_pixel
 from sfm.conventions import FloatArray, IntArray
 from sfm.network import Estimate, rows_of
 
@@ -54,3 +54,50 @@ def pictures_of(estimate: Estimate, camera: IntArray, image: IntArray, points: F
         lens = estimate.cameras[camera[i]]
         out[rows] = project(lens, estimate.position[i], estimate.rotation[i], points[rows])
     return out
+
+
+def plane_warps(
+    estimate: Estimate,
+    camera: IntArray,
+    i: int,
+    j: int,
+    xy: FloatArray,
+    points: FloatArray,
+    normal: FloatArray,
+    reach_px: float,
+) -> FloatArray:
+    """Return the homographies of windows of one photograph in another, relative to both points, (k, 3, 3).
+
+    A window is seen in perspective, and its middle is not the middle of its picture: over 15 px at 45 degrees
+    an affine warp is off by about 0.01 px, in the same direction all over a photograph.
+
+    Args:
+        estimate: interior and exterior orientation of all photographs.
+        camera: index of the camera of each photograph, (m,).
+        i: photograph of the windows.
+        j: the other photograph.
+        xy: windows' middles in i, px, (k, 2).
+        points: object points of these, (k, 3).
+        normal: of the surface there, (k, 3).
+        reach_px: from the middle to where the perspective is taken from: half the side of the windows.
+    """
+    R, X0 = estimate.rotation[i], estimate.position[i]
+    lens, other = estimate.cameras[camera[i]], estimate.cameras[camera[j]]
+    height = np.einsum("kc,kc->k", normal, points - X0)
+
+    def seen(offset: tuple[float, float]) -> FloatArray:
+        uv = tangents_from_pixel(lens, xy + np.array(offset))
+        d = np.column_stack([uv, -np.ones(len(uv))]) @ R.T
+        on_plane = X0 + d * (height / np.einsum("kc,kc->k", normal, d))[:, None]
+        return project(other, estimate.position[j], estimate.rotation[j], on_plane)
+
+    h = reach_px
+    middle = seen((0.0, 0.0))
+    warps = np.zeros((len(xy), 3, 3))
+    warps[:, 2, 2] = 1.0
+    for a, (forth, back) in enumerate((((h, 0.0), (-h, 0.0)), ((0.0, h), (0.0, -h)))):
+        after, before = seen(forth), seen(back)
+        linear, bent = (after - before) / (2 * h), (after + before - 2 * middle) / (2 * h * h)
+        warps[:, :2, a] = linear
+        warps[:, 2, a] = -np.einsum("kc,kc->k", bent, linear) / np.einsum("kc,kc->k", linear, linear)
+    return warps

@@ -48,6 +48,7 @@ from sfm.matching.radiometry import grey_of, odd_window
 
 COARSE_STEP = 0.5  # bilinear interpolation is good enough while steps are longer than this, px
 CONTRACTION = 0.04  # a step is at most this part of the one before; 0.01 to 0.03 on texture with noise
+LAST_PX = 0.002  # the next step after the last one that is allowed, of a match; along edges it hardly shrinks
 CHUNK = 256  # patches that a thread takes at a time
 
 
@@ -92,7 +93,7 @@ def match_lsm(
     model: str = "affine",
     window_px: int = 21,
     interpolation: str = "six_tap",
-    stop_px: float = 0.002,
+    stop_px: float = 0.0002,
     max_steps: int = 30,
     max_shift_px: float = 5.0,
     min_correlation: float = 0.5,
@@ -111,11 +112,13 @@ def match_lsm(
         interpolation: kernel for the right photograph; on fine texture bilinear costs 1.25 times and bicubic
             1.06 times the standard deviation of six_tap, and both are off by up to 0.013 px where all of the
             patch is shifted by the same 0.1 to 0.4 px, six_tap by 0.002 px.
-        stop_px: the shift of the step that would come next is shorter than this.
+        stop_px: the shift of the step that would come next is shorter than this. What is left of it has the
+            direction of the start, which neighbouring points have in common: 0.002 px turn photographs.
         max_steps: after so many a patch counts as diverged.
         max_shift_px: farther from the start is too far.
         min_correlation: below it the places are not alike.
-        start: linear part of the warp, right px per left px, (k, 2, 2); the unit matrix if not given.
+        start: linear part of the warp, right px per left px, (k, 2, 2), or its homography relative to both
+            points, (k, 3, 3), whose perspective an affine model leaves as it is; the unit matrix if none.
         threads: patches are shared among so many.
 
     Returns:
@@ -140,11 +143,13 @@ def match_lsm(
     k = len(a)
     if len(b) != k:
         raise GeometryError(f"LSM: {k} points in the left photograph, {len(b)} in the right, needed in pairs")
-    linear = np.broadcast_to(np.eye(2), (k, 2, 2)) if start is None else start
-    if linear.shape != (k, 2, 2):
-        raise GeometryError(f"LSM: start has shape {linear.shape}, needed ({k}, 2, 2)")
+    given = np.broadcast_to(np.eye(2), (k, 2, 2)) if start is None else start
+    if given.shape not in ((k, 2, 2), (k, 3, 3)):
+        raise GeometryError(f"LSM: start has shape {given.shape}, needed ({k}, 2, 2) or ({k}, 3, 3)")
     warp = np.zeros((k, 3, 3))
-    warp[:, :2, :2], warp[:, :2, 2], warp[:, 2, 2] = linear, b, 1.0
+    warp[:, : given.shape[1], : given.shape[1]] = given
+    warp[:, 2, 2] = 1.0
+    warp[:, :2] += b[:, :, None] * warp[:, 2, None]
     out = np.zeros((k, OUTPUTS))
     fixed = (grey_of(left), grey_of(right), half, kind, MODELS[model])
     limits = Limits(float(stop_px), int(max_steps), float(max_shift_px), float(min_correlation))
@@ -200,7 +205,7 @@ def _iterate(right: AnyArray, work: Workspace, limits: Limits, H: FloatArray, ou
     half, q, rhs = work.half, work.q, work.rhs
     x0, y0 = H[0, 2], H[1, 2]
     coarse = work.kind > BILINEAR
-    previous = np.inf
+    previous, following = np.inf, np.inf
     for step in range(1, limits.max_steps + 1):
         out[STEPS] = step
         kind = BILINEAR if coarse else work.kind
@@ -215,8 +220,9 @@ def _iterate(right: AnyArray, work: Workspace, limits: Limits, H: FloatArray, ou
         if np.hypot(H[0, 2] - x0, H[1, 2] - y0) > limits.max_shift_px:
             return TOO_FAR
         if not coarse:
-            if length * max(CONTRACTION, length / previous) < limits.stop_px:
+            following = length * max(CONTRACTION, length / previous)
+            if following < limits.stop_px:
                 return MATCHED
             previous = length
         coarse = coarse and length > COARSE_STEP
-    return DIVERGED
+    return MATCHED if following < LAST_PX else DIVERGED

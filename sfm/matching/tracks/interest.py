@@ -44,6 +44,7 @@ def foerstner_points(
     min_distance_px: float = 10.0,
     max_points: int = 5000,
     border_px: int = 0,
+    taken: FloatArray | None = None,
 ) -> InterestPoints:
     """Find the points of a photograph at which matching is precise in all directions.
 
@@ -53,6 +54,7 @@ def foerstner_points(
         min_distance_px: of two points that are nearer the weaker one is left out.
         max_points: of more the strongest are kept.
         border_px: no points this close to the border of the photograph.
+        taken: places, px, (t, 2), that no point is nearer to than to another one.
 
     Returns:
         The points; the sigma of an intensity for the ellipses is that of the misfit of the window's edges.
@@ -86,7 +88,10 @@ def foerstner_points(
     order = np.argsort(-weight[row, col], kind="stable")
     row, col = row[order], col[order]
     kept = np.zeros(len(row), dtype=np.bool_)
-    _thin(row, col, float(min_distance_px), max_points, np.zeros(grey.shape, dtype=np.int64), kept)
+    near = np.zeros(grey.shape, dtype=np.bool_)
+    for x, y in () if taken is None else np.rint(taken).astype(np.int64):
+        _take(near, y, x, float(min_distance_px))
+    _thin(row, col, float(min_distance_px), max_points, near, kept)
     row, col = row[kept], col[kept]
     place, covariance = np.empty((len(row), 2)), np.empty((len(row), 2, 2))
     _intersect_edges(gx, gy, row, col, side // 2, place, covariance)
@@ -94,22 +99,28 @@ def foerstner_points(
 
 
 @compiled
-def _thin(row: IntArray, col: IntArray, distance: float, most: int, taken: IntArray, kept: BoolArray) -> None:
+def _thin(row: IntArray, col: IntArray, distance: float, most: int, near: BoolArray, kept: BoolArray) -> None:
     """Mark points, strongest first, that have no stronger one within the distance."""
-    height, width = taken.shape
-    reach = int(np.ceil(distance))
     count = 0
     for k in range(len(row)):
-        if taken[row[k], col[k]]:
+        if near[row[k], col[k]]:
             continue
         kept[k] = True
         count += 1
         if count == most:
             return
-        for i in range(max(0, row[k] - reach), min(height, row[k] + reach + 1)):
-            for j in range(max(0, col[k] - reach), min(width, col[k] + reach + 1)):
-                if (i - row[k]) ** 2 + (j - col[k]) ** 2 < distance * distance:
-                    taken[i, j] = 1
+        _take(near, row[k], col[k], distance)
+
+
+@compiled
+def _take(near: BoolArray, row: int, col: int, distance: float) -> None:
+    """Mark the pixels within the distance of a place."""
+    height, width = near.shape
+    reach = int(np.ceil(distance))
+    for i in range(max(0, row - reach), min(height, row + reach + 1)):
+        for j in range(max(0, col - reach), min(width, col + reach + 1)):
+            if (i - row) ** 2 + (j - col) ** 2 < distance * distance:
+                near[i, j] = True
 
 
 @compiled

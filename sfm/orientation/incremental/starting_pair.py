@@ -127,6 +127,9 @@ def best_start(
 def pair_solutions(network: Network, estimate: Estimate, *, tolerance_px: float) -> tuple[Estimate, ...]:
     """Return all solutions that two photographs allow, however well they fit, placed on the points.
 
+    Only those with a base that a survey could start from. A plane seen at moderate angles is also one seen at
+    a grazing angle from a base of almost nothing, which bends to fit the errors better than the truth.
+
     Args:
         network: of two photographs and points that both see.
         estimate: one solution, whose cameras and frame they have; those like it are among them.
@@ -146,8 +149,8 @@ def pair_solutions(network: Network, estimate: Estimate, *, tolerance_px: float)
     for solution in solutions:
         if solution.kind == "infinite":
             continue
-        start, _ = _model(network, (0, 1), points, first, second, solution)
-        if start is None or not np.isfinite(start.points).all():
+        start, angle = _model(network, (0, 1), points, first, second, solution)
+        if start is None or angle < MIN_ANGLE_OF_TWO_DEG or not np.isfinite(start.points).all():
             continue
         with suppress(GeometryError):  # points on a line have no place
             placing = fit_similarity(start.points, estimate.points)

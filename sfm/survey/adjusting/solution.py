@@ -17,7 +17,14 @@ from sfm.errors import GeometryError
 from sfm.network import Estimate, Network
 from sfm.orientation.incremental.starting_pair import pair_solutions
 from sfm.reduced_network import reduce_network
-from sfm.result import ControlCheck, Eccentricity, Explanation, LeftOutPoint, TakenOut
+from sfm.result import (
+    ControlCheck,
+    Eccentricity,
+    Explanation,
+    LeftOutPoint,
+    PhotographTargets,
+    TakenOut,
+)
 from sfm.survey.adjusting.datum_definition import (
     datum_warnings,
     place_on_control,
@@ -71,6 +78,7 @@ class Correspondences:
     given: bool = False  # whether the survey's own approximate values were what the orientation started from
     left_out: tuple[tuple[str, str], ...] = ()  # photographs of another object, with the reason
     suspected: tuple[str, ...] = ()  # photographs that could be matched with a camera of their own only
+    overlays: tuple[PhotographTargets, ...] | None = None  # what the report draws; None as it was measured
 
 
 @dataclass(frozen=True)

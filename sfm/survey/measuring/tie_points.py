@@ -90,12 +90,12 @@ def tie_photographs(
         photographs.names,
         np.full(len(points), MIN_RAYS),
         failed,
-        _overlays(network, paths, settings.window_px),
+        drawn_windows(network, paths, settings.window_px),
         photographs,
     )
 
 
-def _overlays(network: Network, paths: Sequence[Path], window_px: int) -> tuple[PhotographTargets, ...]:
+def drawn_windows(network: Network, paths: Sequence[Path], window_px: int) -> tuple[PhotographTargets, ...]:
     """Return what the report draws into each photograph: circles as wide as the windows."""
     seen = network.image_points
     drawn = []

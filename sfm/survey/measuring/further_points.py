@@ -1,0 +1,292 @@
+"""More points of natural texture, once the orientation of the photographs is known.
+
+A few hundred tie points orient the photographs and tell the shape of the surface. The rest needs no features:
+interest points are taken where a photograph has no point yet, put on the plane through their neighbours in
+space, projected into all photographs that look at that plane, and measured there by least squares matching,
+in those with the most similar direction first, whose rays correct the place for the others. So a point is
+followed through all its photographs, also where the directions are too different for descriptors.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from sfm.camera import tangents_from_pixel
+from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
+from sfm.matching.lsm.projected_points import pictures_of, plane_warps
+from sfm.matching.lsm.two_photo import match_lsm
+from sfm.matching.radiometry import grey_of
+from sfm.matching.tracks.interest import foerstner_points
+from sfm.network import Estimate, ImagePoints, rows_of
+from sfm.orientation.intersection import Intersection, intersect
+
+NEIGHBOURS = 6  # tie points whose plane a new point is put on
+FIRST_PHOTOGRAPHS = 4  # with the most similar direction, whose rays correct the place of a point
+FIRST_SHIFT_PX = 6.0  # how far a point may be from where the plane puts it
+LATER_SHIFT_PX = 3.0  # and from where its first rays put it
+MIN_COSINE = 0.35  # between a ray and the normal of the plane: below it windows are squeezed to a third
+SCALES = (0.4, 2.5)  # of a window in another photograph relative to the reference
+BORDER_PX = 4  # between a window and the border of a photograph
+TOLERANCE_PX = 1.5  # largest residual of a ray that stays with its point
+
+
+@dataclass(frozen=True)
+class FurtherPoints:
+    """New points and their rays."""
+
+    image_points: ImagePoints  # k of them, their points 0 to n - 1
+    points: FloatArray  # object points, (n, 3)
+    residuals: FloatArray  # of the rays with the orientation as it was, px, (k, 2)
+
+
+@dataclass(frozen=True)
+class _Places:
+    """New points of one reference photograph."""
+
+    xy: FloatArray  # whole pixels, (k, 2)
+    normal: FloatArray  # of the surface there, towards the photograph, unit vectors, (k, 3)
+    points: FloatArray  # object points, (k, 3)
+
+
+def find_further_points(
+    photographs: Sequence[AnyArray],
+    estimate: Estimate,
+    camera: IntArray,
+    seen: ImagePoints,
+    taken: ImagePoints,
+    *,
+    window_px: int,
+    spacing_px: float,
+    references: Sequence[int] | None = None,
+    min_rays: int = 3,
+    min_correlation: float = 0.7,
+    threads: int = 1,
+) -> FurtherPoints:
+    """Find and measure points in all photographs that see them, until these are covered.
+
+    Args:
+        photographs: (H, W), m of them.
+        estimate: orientation of the photographs, to a few pixels, and the tie points that there are.
+        camera: index of the camera of each photograph, (m,).
+        seen: image points of the tie points that fit, which tell the surface.
+        taken: image points that no new one is to be near to in its reference.
+        window_px: odd side of the windows.
+        spacing_px: smallest distance of a new point from all others in its reference.
+        references: photographs that points are taken from; all, those with the most tie points first, if not
+            given.
+        min_rays: fewest photographs of a point.
+        min_correlation: smallest coefficient r of a match.
+        threads: patches worked on at a time.
+
+    Source: Gruen (1985), S. Afr. J. Photogrammetry 14(3); Foerstner and Guelch (1987) for the places.
+    """
+    m = len(photographs)
+    margin = window_px // 2 + BORDER_PX
+    own = rows_of(seen.image, m)
+    places_of = [[taken.xy[rows]] for rows in rows_of(taken.image, m)]
+    order = np.argsort([-len(rows) for rows in own], kind="stable") if references is None else references
+    shapes = [one.shape[:2] for one in photographs]
+    found = [_none()]
+    for i in np.asarray(order).tolist():
+        if not estimate.oriented[i] or len(own[i]) < NEIGHBOURS:
+            continue
+        corners = foerstner_points(
+            photographs[i],
+            min_distance_px=spacing_px,
+            border_px=margin,
+            taken=np.concatenate(places_of[i]),
+        )
+        places = _on_planes(estimate, camera, i, np.rint(corners.xy), seen.point[own[i]])
+        visible = _visible(estimate, camera, i, places, shapes, margin)
+        several = visible.sum(axis=0) >= min_rays
+        if not several.any():
+            continue
+        places = _Places(places.xy[several], places.normal[several], places.points[several])
+        rays = _followed(
+            photographs, estimate, camera, i, places, visible[:, several], window_px, min_correlation, threads
+        )
+        new = _agreeing(rays, estimate, camera, len(places.xy), min_rays)
+        found.append(new)
+        for j in np.unique(new.image_points.image).tolist():
+            places_of[j].append(new.image_points.xy[new.image_points.image == j])
+    return _joined(found)
+
+
+def _on_planes(estimate: Estimate, camera: IntArray, i: int, xy: FloatArray, point: IntArray) -> _Places:
+    """Put places of a photograph on the planes through the tie points around them.
+
+    Over a plane the inverse of the depth is linear in the tangents: 1 / t = a u + b v + c.
+
+    Args:
+        estimate: orientation and tie points.
+        camera: index of the camera of each photograph, (m,).
+        i: the photograph.
+        xy: places, px, (k, 2).
+        point: tie points that it sees.
+    """
+    lens, X0, R = estimate.cameras[camera[i]], estimate.position[i], estimate.rotation[i]
+    UVW = (estimate.points[point] - X0) @ R
+    UVW = UVW[UVW[:, 2] < 0]
+    if len(UVW) < NEIGHBOURS:
+        return _Places(np.zeros((0, 2)), np.zeros((0, 3)), np.zeros((0, 3)))
+    known, inverse = -UVW[:, :2] / UVW[:, 2:], -1 / UVW[:, 2]
+    uv = tangents_from_pixel(lens, xy)
+    near = cKDTree(known).query(uv, k=NEIGHBOURS)[1]
+    A = np.concatenate([known[near], np.ones((*near.shape, 1))], axis=2)
+    N = np.einsum("kij,kil->kjl", A, A)
+    N += 1e-6 * np.trace(N, axis1=1, axis2=2)[:, None, None] * np.diag([1.0, 1.0, 0.0])  # neighbours in a row
+    plane = np.linalg.solve(N, np.einsum("kij,ki->kj", A, inverse[near])[:, :, None])[:, :, 0]
+    value = np.sum(plane[:, :2] * uv, axis=1) + plane[:, 2]
+    inside = (value > 0.5 * inverse.min()) & (value < 2 * inverse.max())
+    uv, value, plane = uv[inside], value[inside], plane[inside]
+    points = X0 + (np.column_stack([uv, -np.ones(len(uv))]) / value[:, None]) @ R.T
+    normal = -(plane * [1.0, 1.0, -1.0]) @ R.T
+    return _Places(xy[inside], normal / np.linalg.norm(normal, axis=1, keepdims=True), points)
+
+
+def _visible(
+    estimate: Estimate,
+    camera: IntArray,
+    i: int,
+    places: _Places,
+    shapes: Sequence[tuple[int, ...]],
+    margin: int,
+) -> BoolArray:
+    """Return which photographs look at the planes and have them inside, the reference among them, (m, k)."""
+    visible = np.zeros((len(shapes), len(places.xy)), dtype=bool)
+    for j in np.flatnonzero(estimate.oriented).tolist():
+        at = pictures_of(estimate, camera, np.full(len(places.xy), j), places.points)
+        size = np.array(shapes[j][1::-1])
+        ray = estimate.position[j] - places.points
+        cosine = np.sum(ray * places.normal, axis=1) / np.linalg.norm(ray, axis=1)
+        with np.errstate(invalid="ignore"):
+            inside = ((at >= margin) & (at <= size - 1 - margin)).all(axis=1)
+        visible[j] = inside & (cosine > MIN_COSINE)
+    visible[i] = True
+    return visible
+
+
+def _followed(
+    photographs: Sequence[AnyArray],
+    estimate: Estimate,
+    camera: IntArray,
+    i: int,
+    places: _Places,
+    visible: BoolArray,
+    window_px: int,
+    min_correlation: float,
+    threads: int,
+) -> ImagePoints:
+    """Measure the places of a photograph in the others, in those with the most similar direction first.
+
+    Half of the noise of a match is that of the template and goes to the reference, as in `tie_points`.
+    """
+    k = len(places.xy)
+    ray = estimate.position[:, None] - places.points[None]
+    ray /= np.linalg.norm(ray, axis=2, keepdims=True)
+    cosine = np.where(visible, np.einsum("mkc,kc->mk", ray, ray[i]), -np.inf)
+    cosine[i] = np.inf
+    rank = np.argsort(np.argsort(-cosine, axis=0, kind="stable"), axis=0, kind="stable")
+    first = visible & (rank <= FIRST_PHOTOGRAPHS)
+    template = grey_of(photographs[i])
+    parts = [ImagePoints(np.full(k, i), np.arange(k), places.xy, np.full((k, 2, 2), np.nan))]
+    in_reference, number = np.zeros((k, 2, 2)), np.zeros(k, dtype=np.int64)
+
+    def measure(which: BoolArray, points: FloatArray, max_shift_px: float) -> None:
+        for j in np.flatnonzero(which.any(axis=1)).tolist():
+            rows = np.flatnonzero(which[j])
+            if j == i:
+                continue
+            at = pictures_of(estimate, camera, np.full(len(rows), j), points[rows])
+            warp = plane_warps(
+                estimate, camera, i, j, places.xy[rows], points[rows], places.normal[rows], window_px / 2
+            )
+            scale = np.sqrt(np.abs(np.linalg.det(warp[:, :2, :2])))
+            fits = np.isfinite(at).all(axis=1) & (scale > SCALES[0]) & (scale < SCALES[1])
+            rows = rows[fits]
+            if not len(rows):
+                continue
+            match = match_lsm(
+                template,
+                grey_of(photographs[j]),
+                places.xy[rows],
+                at[fits],
+                window_px=window_px,
+                start=warp[fits],
+                max_shift_px=max_shift_px,
+                min_correlation=min_correlation,
+                threads=threads,
+            )
+            good = match.good
+            half, H = match.covariance[good] / 2, match.warp[good]
+            back = np.linalg.inv(H[:, :2, :2] - H[:, :2, 2:] * H[:, 2:, :2])
+            in_reference[rows[good]] += back @ half @ back.transpose(0, 2, 1)
+            number[rows[good]] += 1
+            parts.append(ImagePoints(np.full(int(good.sum()), j), rows[good], match.xy[good], half))
+
+    measure(first, places.points, FIRST_SHIFT_PX)
+    points = _intersected(_concatenated(parts), estimate, camera, k).points
+    measure(visible & ~first & np.isfinite(points).all(axis=1), points, LATER_SHIFT_PX)
+    matched = number > 0
+    parts[0].covariance[matched] = in_reference[matched] / number[matched, None, None]
+    seen = _concatenated(parts)
+    return seen.select(matched[seen.point])
+
+
+def _intersected(seen: ImagePoints, estimate: Estimate, camera: IntArray, n: int) -> Intersection:
+    """Return the points that most rays support."""
+    uv = np.full((len(seen), 2), np.nan)
+    of_camera = rows_of(camera[seen.image], len(estimate.cameras))
+    for lens, rows in zip(estimate.cameras, of_camera, strict=True):
+        uv[rows] = tangents_from_pixel(lens, seen.xy[rows])
+    tolerance = TOLERANCE_PX / min(lens.c_px for lens in estimate.cameras)
+    return intersect(
+        uv, seen.image, seen.point, estimate.position, estimate.rotation, n_points=n, tolerance=tolerance
+    )
+
+
+def _agreeing(
+    seen: ImagePoints, estimate: Estimate, camera: IntArray, n: int, min_rays: int
+) -> FurtherPoints:
+    """Return the points with enough rays that meet, and these rays."""
+    met = _intersected(seen, estimate, camera, n)
+    used = met.used & (np.bincount(seen.point[met.used], minlength=n) >= min_rays)[seen.point]
+    kept, point = np.unique(seen.point[used], return_inverse=True)
+    c = np.array([lens.c_px for lens in estimate.cameras])[camera[seen.image[used]]]
+    image_points = replace(seen.select(used), point=point.ravel())
+    return FurtherPoints(image_points, met.points[kept], met.residuals[used] * c[:, None])
+
+
+def _concatenated(parts: Sequence[ImagePoints]) -> ImagePoints:
+    """Return all image points one after another."""
+    return ImagePoints(
+        np.concatenate([one.image for one in parts]),
+        np.concatenate([one.point for one in parts]),
+        np.concatenate([one.xy for one in parts]),
+        np.concatenate([one.covariance for one in parts]),
+    )
+
+
+def _joined(found: Sequence[FurtherPoints]) -> FurtherPoints:
+    """Return all points, numbered one after another."""
+    first = np.cumsum([0, *(len(one.points) for one in found)])
+    moved = [
+        replace(one.image_points, point=one.image_points.point + start)
+        for one, start in zip(found, first.tolist(), strict=False)
+    ]
+    return FurtherPoints(
+        _concatenated(moved),
+        np.concatenate([one.points for one in found]),
+        np.concatenate([one.residuals for one in found]),
+    )
+
+
+def _none() -> FurtherPoints:
+    """Return no points."""
+    none = np.zeros(0, dtype=np.int64)
+    nothing = ImagePoints(none, none, np.zeros((0, 2)), np.zeros((0, 2, 2)))
+    return FurtherPoints(nothing, np.zeros((0, 3)), np.zeros((0, 2)))
