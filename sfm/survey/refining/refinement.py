@@ -282,8 +282,11 @@ def _words_of_targets(result: Refinement) -> str:
     own, a = result.targets.network, result.adjustment
     control = len(a.network.control) if a.datum == "control" else 0
     used = int((~a.rejected[len(result.rows) :]).sum())
+    elsewhere = result.targets.contradicting
     return (
-        f"targets       {len(result.target_points)} of {len(own.points)}, {used} image points, "
+        f"targets       {len(result.target_points)} of {len(own.points)}, {used} image points"
+        + (f" ({elsewhere} more are not where their target is)" if elsewhere else "")
+        + ", "
         f"datum {a.datum}, {control} control points, {len(a.network.scale_bars)} scale bars\n"
     )
 
