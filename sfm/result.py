@@ -26,6 +26,7 @@ from sfm.stored_result import NO_SCALE, SeenTargets, StoredResult
 from sfm.targets.flags import Flag, count_flags
 
 EXPLAINS = 1.5  # ratio of sigma0 without and with a cause from which it explains something
+NOTICEABLE = 1.005  # the same ratio for one that a test has found: with thousands of points everything is
 MATTERS = 0.5  # standard deviations by which points move (RMS) from which a significant cause is told, too
 
 
@@ -94,9 +95,14 @@ class Explanation:
 
     @property
     def explains(self) -> bool:
-        """Whether it takes away a good part of the residuals, or is significant and moves the points."""
-        clear = self.after_px * EXPLAINS < self.before_px
-        return clear or (self.significant and self.after_px < self.before_px and self.moved > MATTERS)
+        """Whether it takes away a good part of the residuals, or is significant and moves the points.
+
+        What is significant takes away some of the residuals, too: in networks of thousands of points the
+        slightest systematic error is significant, and more freedom moves them.
+        """
+        ratio = self.before_px / self.after_px if self.after_px > 0 else np.inf
+        found = self.significant and ratio > NOTICEABLE and self.moved > MATTERS
+        return bool(ratio > EXPLAINS or found)
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,9 @@ import shutil
 import tempfile
 from pathlib import Path
 
+# Before numpy is loaded: the tests run in a process for each core, and threads of BLAS beyond the first spin.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
 import matplotlib
 import pytest
 

@@ -7,15 +7,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sfm.adjustment.datum import Datum
+from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.camera import tangents_from_pixel
-from sfm.conventions import MAD_TO_SIGMA
+from sfm.conventions import MAD_TO_SIGMA, BoolArray
 from sfm.network import Estimate, Network
 from sfm.orientation.incremental.growth import residual_lengths
 from sfm.orientation.incremental.sequence import Orientation
 from sfm.orientation.intersection import intersect
 from sfm.reduced_network import reduce_network
-from sfm.survey.adjusting.settling import determined, merge_estimate
+from sfm.survey.adjusting.settling import MIN_IMAGE_POINTS, determined, merge_estimate
 from sfm.survey.adjusting.solution import TOLERANCE_FACTOR, Correspondences
 from sfm.survey.circles import check_circles
 from sfm.survey.diagnosis.contradicting_codes import (
@@ -65,6 +66,13 @@ def find_correspondences(
     matched, left_out, lines = _without_other_objects(survey, photographs, naming, start)
     naming, network, estimate = matched.naming, matched.network, matched.estimate
     circles = check_circles(survey, photographs, naming, network, estimate)
+    told = {name for name, _ in left_out}
+    lost = start.estimate.oriented & ~circles.estimate.oriented
+    left_out += tuple(
+        (photographs.names[i], f"fewer than {MIN_IMAGE_POINTS} accepted image points of the network")
+        for i in np.flatnonzero(lost)
+        if photographs.names[i] not in told
+    )
     return Correspondences(
         circles.network,
         circles.estimate,
@@ -160,10 +168,31 @@ def _match_and_adjust(
         images, points = determined(network, estimate, everything, min_rays(naming))
         part, values = reduce_network(network, estimate, images, points, everything)
         adjusted = adjust(part, values, datum=Datum("free"), reject="huber", covariance=False)
-        estimate = merge_estimate(estimate, adjusted.estimate, images, points)
-        spread = MAD_TO_SIGMA * float(np.median(np.abs(adjusted.residuals)))
+        estimate = merge_visible(estimate, adjusted, images, points)
+        spread = MAD_TO_SIGMA * float(np.nanmedian(np.abs(adjusted.residuals)))
         tolerance_px = float(np.clip(TOLERANCE_FACTOR * spread, MIN_TOLERANCE_PX, tolerance_px))
     return _with_own_cameras(survey, photographs, _Matched(naming, network, estimate, ()), tolerance_px)
+
+
+def merge_visible(before: Estimate, adjusted: Adjustment, images: BoolArray, points: BoolArray) -> Estimate:
+    """Return the adjusted values, and those before of photographs that were moved out of sight of all points.
+
+    Robust weights let go of a photograph that does not fit, as one that was zoomed, and nothing holds it
+    then; the reason is looked for from where it was before.
+
+    Args:
+        before: values of all photographs and points.
+        adjusted: some of them, adjusted.
+        images: photographs in it, (m,).
+        points: points in it, (n,).
+    """
+    estimate = merge_estimate(before, adjusted.estimate, images, points)
+    seen = adjusted.network.image_points
+    found = np.bincount(seen.image, np.isfinite(adjusted.residuals).all(axis=1), minlength=images.sum())
+    lost = np.flatnonzero(images)[found == 0]
+    position, rotation = estimate.position.copy(), estimate.rotation.copy()
+    position[lost], rotation[lost] = before.position[lost], before.rotation[lost]
+    return replace(estimate, position=position, rotation=rotation)
 
 
 def _with_own_cameras(

@@ -20,7 +20,7 @@ from urllib.request import urlopen
 import psutil
 import pytest
 from dask.distributed import KilledWorker
-from threadpoolctl import threadpool_info
+from threadpoolctl import threadpool_info, threadpool_limits
 
 from adapters.dask_cluster import DaskEngine, _event, _OneThread, fitting_workers, local_engine, remote_engine
 from sfm.batch.finished import note_finished
@@ -568,13 +568,14 @@ def test_libraries_get_their_threads_back_from_the_last_call() -> None:
     def threads() -> set[int]:
         return {library["num_threads"] for library in threadpool_info() if library["user_api"] == "blas"}
 
-    before, held = threads(), _OneThread()
-    with ExitStack() as first, ExitStack() as second:  # as two threads of one worker
-        first.enter_context(held)
-        second.enter_context(held)
-        first.close()
-        assert threads() == {1}
-    assert threads() == before
+    held = _OneThread()
+    with threadpool_limits(2):
+        with ExitStack() as first, ExitStack() as second:  # as two threads of one worker
+            first.enter_context(held)
+            second.enter_context(held)
+            first.close()
+            assert threads() == {1}
+        assert threads() == {2}
 
 
 @pytest.mark.parametrize(

@@ -14,6 +14,7 @@ from sfm.camera import project
 from sfm.network import Estimate, Network
 from sfm.pipeline import run_survey
 from sfm.report.findings.findings import findings_of
+from sfm.result import Explanation
 from sfm.survey.diagnosis.explanations import explain_residuals
 from sfm.survey.diagnosis.two_groups import two_groups
 from tests.survey.test_own_camera import TAU, with_zoom
@@ -124,3 +125,11 @@ def test_a_pair_with_a_right_camera_needs_no_explanation() -> None:
     network, truth = make_network(seed_of("right pair"), images=2, points=40, free=("c", "K1"))
     result = run_survey(survey_of(network, truth, adjust=TAU))
     assert result.explanations == () and findings_of(result).verdict.level != "bad"
+
+
+def test_what_is_significant_takes_away_some_of_the_residuals() -> None:
+    """4000 points of a rendered texture had two cameras: sigma0 0.0321 px with one and with two."""
+    found = Explanation("two cameras", 0.0321, 0.03205, moved=2.0, significant=True)
+    assert not found.explains
+    assert replace(found, after_px=0.0315).explains
+    assert not replace(found, after_px=0.0315, significant=False).explains

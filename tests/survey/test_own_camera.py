@@ -7,10 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from sfm.adjustment.datum import Datum
+from sfm.adjustment.solve import adjust
 from sfm.camera import project
 from sfm.network import Estimate, Network
 from sfm.pipeline import run_survey
 from sfm.report.findings.findings import findings_of
+from sfm.survey.correspondences import merge_visible
 from sfm.survey.inputs.settings import AdjustSettings
 from tests.surveys import survey_of
 from tests.synthetic import make_network, seed_of
@@ -70,3 +73,16 @@ def test_photographs_that_fit_keep_their_camera() -> None:
     result = run_survey(survey_of(network, truth, adjust=TAU))
     assert len(result.adjustment.estimate.cameras) == 1 and result.failed == ()
     assert not [line for line in result.warnings if "does not fit camera" in line]
+
+
+def test_a_photograph_that_the_adjustment_loses_stays_where_it_was() -> None:
+    """A zoom of 3 % was moved out of sight of its points, and no tolerance was left for the others."""
+    network, truth = make_network(seed_of("out of sight"), images=4, points=12)
+    adjusted = adjust(network, truth, datum=Datum("free"), reject="none")
+    residuals = adjusted.residuals.copy()
+    residuals[network.image_points.image == 2] = np.nan
+    lost = replace(adjusted, residuals=residuals)
+    kept = merge_visible(truth, lost, np.ones(4, dtype=bool), np.ones(12, dtype=bool))
+    assert np.array_equal(kept.position[2], truth.position[2])
+    assert np.array_equal(kept.position[[0, 1, 3]], adjusted.estimate.position[[0, 1, 3]])
+    assert kept.oriented.all()

@@ -19,8 +19,8 @@ from sfm.targets.edge_rays import RAYS
 from sfm.targets.fits import blurred_ellipse as model
 
 # So many pixels whose residuals are above this share of the contrast, and so many sigma of the noise and
-# robust sigmas of the residuals of the edge or elsewhere (retro-reflective sheeting is grainy), are damage.
-MIN_PIXELS, SUSPICIOUS, SUSPICIOUS_SIGMAS = 2, 0.1, 8.0
+# robust sigmas of the residuals beside the edge (retro-reflective sheeting is grainy), are damage.
+MIN_PIXELS, SUSPICIOUS, SUSPICIOUS_SIGMAS = 2, 0.08, 6.0
 # Pixels are left out above so many robust sigmas of the residuals, of the edge or elsewhere, or of the noise,
 # and this share of the contrast; in the first rounds, when the edges on rays alone are known, above these.
 OUTLIER_SIGMAS, LEAST_OUTLIER = 5.0, 0.08
@@ -47,10 +47,10 @@ def is_damaged(
     noise: float,
     J: FloatArray,
 ) -> bool:
-    """Whether some pixels are far from the model, as others are not; small targets are not looked at."""
-    p, q, r = theta[model.P], theta[model.Q], theta[model.R]
-    if 1 / ((p + r) / 2 + math.hypot((p - r) / 2, q)) < MIN_SEMI_AXIS_PX:
-        return False
+    """Whether some pixels are far from the model, as those inside the target and around it are not.
+
+    The edge itself is no measure of that: damage pulls it along.
+    """
     residual = np.empty(n)
     least = max(SUSPICIOUS * abs(theta[model.CONTRAST]), SUSPICIOUS_SIGMAS * noise)
     count = 0
@@ -63,8 +63,15 @@ def is_damaged(
     if count < MIN_PIXELS:
         return False
     at_edge = np.abs(_distances(pixels, n, theta)) < _edge_width(theta)
-    limits = _limits(residual, at_edge, least, SUSPICIOUS_SIGMAS)
-    return bool(np.sum(residual > np.where(at_edge, limits[1], limits[0])) >= MIN_PIXELS)
+    limit = _limits(residual, at_edge, least, SUSPICIOUS_SIGMAS)[0]
+    return bool(np.sum(residual > limit) >= MIN_PIXELS)
+
+
+@compiled
+def is_large(theta: FloatArray) -> bool:
+    """Whether a target has enough pixels to tell damage from another shape."""
+    p, q, r = theta[model.P], theta[model.Q], theta[model.R]
+    return bool(1 / ((p + r) / 2 + math.hypot((p - r) / 2, q)) >= MIN_SEMI_AXIS_PX)
 
 
 @compiled

@@ -109,7 +109,7 @@ def _fit_one(
     det = theta[model.P] * theta[model.R] - theta[model.Q] ** 2
     mean = 1 / math.sqrt(det)
     length = mean + margin
-    statistics[goodness.LENGTH] = length
+    statistics[goodness.LENGTH], statistics[goodness.DISTURBED] = length, 0.0
     half_x = math.sqrt(theta[model.R] ** 2 + theta[model.Q] ** 2) / det + margin + 1
     half_y = math.sqrt(theta[model.P] ** 2 + theta[model.Q] ** 2) / det + margin + 1
     pixels = np.empty((3, int((2 * half_x + 3) * (2 * half_y + 3))))
@@ -137,14 +137,15 @@ def _fit_one(
                 _iterate(pixels, n, theta, length, saturation, prior, J, N) if n > 2 * model.UNKNOWNS else 0
             )
     if damage.is_damaged(pixels, n, theta, length, saturation, noise, J):
-        for _ in range(damage.TRACES):
-            trace_rays(image, start, sign, noise, margin, edge, limit)
-            if improve_outline(start, edge)[0] < MIN_AGREEMENT:
-                break
-        whole = pixels.copy()
-        m = _collect(image, start, limit, margin, half_x, half_y, mean < LARGE_PX, pixels)
-        _start_levels(pixels, m, start, saturation)
-        m = _fit_undamaged(pixels, m, start, length, saturation, noise, prior, J, N)
+        m, whole = 0, pixels.copy()
+        if damage.is_large(theta):
+            for _ in range(damage.TRACES):
+                trace_rays(image, start, sign, noise, margin, edge, limit)
+                if improve_outline(start, edge)[0] < MIN_AGREEMENT:
+                    break
+            m = _collect(image, start, limit, margin, half_x, half_y, mean < LARGE_PX, pixels)
+            _start_levels(pixels, m, start, saturation)
+            m = _fit_undamaged(pixels, m, start, length, saturation, noise, prior, J, N)
         if m > 0:
             flag |= _DAMAGED
             n, steps = m, MAX_STEPS
@@ -152,8 +153,9 @@ def _fit_one(
         else:
             pixels = whole
             model.normal_equations(pixels, n, theta, length, saturation, J, N, np.empty(model.UNKNOWNS))
+            statistics[goodness.DISTURBED] = 1.0
     done = steps > 0
-    goodness.judge_residuals(pixels, n, theta, length, saturation, J, statistics)
+    goodness.judge_residuals(pixels, n, theta, length, saturation, J, statistics, (flag & _DAMAGED) != 0)
     goodness.judge_background(image, theta, length, statistics)
     goodness.judge_glow(pixels, n, theta, saturation, statistics)
     statistics[goodness.STEPS] = abs(steps)

@@ -14,10 +14,10 @@ from sfm.targets.fits import blurred_ellipse as model
 
 # Columns of the statistics of a fit: pixels used, sum of squared residuals, unevenness, L in px, steps, lobes
 # and their sigma, share of strokes, halo and its sigma, saturated share of the background, share of the
-# circumference behind which glare is.
-STATISTICS = 12
+# circumference behind which glare is, and 1 where the residuals are those of damage that was not left out.
+STATISTICS = 13
 PIXELS, SQUARES, UNEVENNESS, LENGTH, STEPS, LOBES = range(6)
-LOBES_SIGMA, STROKES, HALO, HALO_SIGMA, SATURATED, GLARING = range(6, STATISTICS)
+LOBES_SIGMA, STROKES, HALO, HALO_SIGMA, SATURATED, GLARING, DISTURBED = range(6, STATISTICS)
 # A background narrower than this, in radii, is a stroke: the rings of codes begin one radius from the edge.
 STROKE = 0.75
 # Behind a stroke this far is looked at, and what lies beyond so many contrasts from the background is glare.
@@ -38,10 +38,12 @@ def judge_residuals(
     saturation: float,
     J: FloatArray,
     statistics: FloatArray,
+    without_damage: bool,
 ) -> None:
     """Set the number of pixels, the sum of squared residuals, the unevenness and the lobes of the edge.
 
     The unevenness is the largest mean residual of an eighth of the edge, in- or outside, over the contrast.
+    An eighth without any background is uneven, unless what is damaged was left out there.
     The lobes are the amplitude of the deviations of the outline from the ellipse that go with the third and
     fourth harmonic of the direction, in radii: the ends of a bar and the corners of a square. Their sigma is
     that for unit noise.
@@ -81,7 +83,7 @@ def judge_residuals(
     for k in range(16):
         if count[k] > 0:
             worst = max(worst, abs(mean[k]) / count[k])
-        elif k >= 8:
+        elif k >= 8 and not without_damage:
             worst = abs(A)  # no background at all on this side
     statistics[PIXELS], statistics[SQUARES], statistics[UNEVENNESS] = used, squares, worst / abs(A)
     statistics[LOBES] = math.sqrt(np.sum((lobe / lobe_weight) ** 2))
