@@ -1,7 +1,7 @@
 """Adjustment timed against COLMAP's Ceres adjuster on the same networks: problem set-up plus solve, warm.
 
     python benchmarks/adjustment.py [--networks small|all|block] [--no-covariance] [--repeat N] [--cpu]
-    python benchmarks/adjustment.py --growth [--cpu]
+    python benchmarks/adjustment.py --growth [--photographs N] [--ceres] [--cpu]
 
 Both start from the same values and adjust the same 8 shared parameters of an `opencv` camera. "default" is
 what a user of pycolmap gets; "best" is pycolmap tuned: DENSE_SCHUR or SPARSE_SCHUR, whichever wins,
@@ -58,7 +58,9 @@ CASES = (
     Case("convergent 400 / 5000", "all", lambda: convergent(400, 5000, 0.26)),
     Case("block 1000 / 99000", "block", lambda: block(25, 40)),
 )
-GROWTH = ((10, 10), (10, 20), (20, 20), (25, 40))  # strips and photographs in each, of the blocks of --growth
+# strips and photographs in each, of the blocks of --growth
+GROWTH = ((10, 10), (10, 20), (20, 20), (25, 40), (50, 50), (50, 100), (100, 100))
+MEMORY_BLOCK = (25, 40)  # whose peak memory is compared
 
 
 def main() -> None:
@@ -68,7 +70,9 @@ def main() -> None:
     parser.add_argument("--no-covariance", action="store_true")
     parser.add_argument("--repeat", type=int, default=3)
     parser.add_argument("--cpu", action="store_true")
-    parser.add_argument("--growth", action="store_true", help="how time grows with a block")
+    parser.add_argument("--growth", action="store_true", help="how time and memory grow with a block")
+    parser.add_argument("--photographs", type=int, default=1000, help="of the largest block of --growth")
+    parser.add_argument("--ceres", action="store_true", help="COLMAP's adjuster beside it in --growth")
     parser.add_argument("--peak", choices=("adjust", "best"), help="peak memory, block only")
     options = parser.parse_args()
     clock = time.process_time if options.cpu else time.perf_counter
@@ -79,7 +83,7 @@ def main() -> None:
         return
     print(f"load {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores (times mean nothing above 0.5)")
     if options.growth:
-        growth(clock, options.repeat)
+        growth(clock, options.repeat, options.photographs, options.ceres)
         return
     print(f"{'network':23}{'image points':>13}{'default':>10}{'best':>10}{'adjust':>10}{'faster':>7}", end="")
     print(f"{'best+cov':>10}{'adjust+cov':>11}{'faster':>7}{'cost - best':>13}{'best cost':>11}")
@@ -237,32 +241,57 @@ def reconstruction(network: Network, start: Estimate) -> Any:
     return scene
 
 
-def growth(clock: Callable[[], float], repeat: int) -> None:
-    """Print how the time of a block grows with its photographs, as a power of their number."""
-    sizes, seconds = [], []
+def growth(clock: Callable[[], float], repeat: int, most: int, with_ceres: bool) -> None:
+    """Print how time and peak memory grow with the photographs of a block, time as a power of them."""
+    sizes: list[int] = []
+    seconds: list[float] = []
     for strips, per_strip in GROWTH:
+        if strips * per_strip > most:
+            continue
         network, start = block(strips, per_strip)
+        forget_peak()
+        time_of_one, _ = timed(lambda n=network, s=start: run_adjust(n, s), repeat, clock)  # type: ignore[misc]
+        line = f"{strips * per_strip:5d} photographs, {len(network.image_points):8d} image points"
+        line += f"{ms(time_of_one)}, peak {peak_mb():6.0f} MB"
+        if sizes:
+            power = np.log(time_of_one / seconds[-1]) / np.log(strips * per_strip / sizes[-1])
+            line += f", since the last as n^{power:.2f}"
+        if with_ceres:
+            scene = reconstruction(network, start)
+            other, _ = timed_ceres(scene, ("SPARSE_SCHUR", 1), 1, clock)
+            line += f", Ceres (SPARSE_SCHUR){ms(other)}"
+        print(line, flush=True)
         sizes.append(strips * per_strip)
-        seconds.append(timed(lambda n=network, s=start: run_adjust(n, s), repeat, clock)[0])  # type: ignore[misc]
-        print(f"{sizes[-1]:5d} photographs, {len(network.image_points):7d} image points{ms(seconds[-1])}")
-    power = np.log(seconds[-1] / seconds[0]) / np.log(sizes[-1] / sizes[0])
-    print(f"time grows as n^{power:.2f}")
+        seconds.append(time_of_one)
+    if len(sizes) > 1:
+        power = np.log(seconds[-1] / seconds[0]) / np.log(sizes[-1] / sizes[0])
+        print(f"time grows as n^{power:.2f}")
 
 
 def peak_of(what: str) -> float:
     """Adjust the block in one way and return the peak memory of this process meanwhile, MB."""
-    network, start = block(*GROWTH[-1])
+    network, start = block(*MEMORY_BLOCK)
     if what == "adjust":
         run_adjust(*block(9, 8))  # kernels are there, as they are in any second adjustment
     else:
         scene = reconstruction(network, start)
         del network, start
-    ctypes.CDLL("libc.so.6").malloc_trim(0)
-    Path("/proc/self/clear_refs").write_text("5")  # forget the peak so far
+    forget_peak()
     if what == "adjust":
         run_adjust(network, start)
     else:
         run_ceres(scene, ("SPARSE_SCHUR", 1))
+    return peak_mb()
+
+
+def forget_peak() -> None:
+    """Give back free memory, and begin the peak memory of this process anew."""
+    ctypes.CDLL("libc.so.6").malloc_trim(0)
+    Path("/proc/self/clear_refs").write_text("5")
+
+
+def peak_mb() -> float:
+    """Return the peak memory of this process since `forget_peak`, MB."""
     status = Path("/proc/self/status").read_text()
     return int(status.split("VmHWM:")[1].split()[0]) / 1e3
 

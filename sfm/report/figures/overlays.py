@@ -148,8 +148,7 @@ def draw_photograph(photograph: PhotographTargets, adjustment: Adjustment, facto
             if remarks[k] & remark.value:
                 outline = outline + 2 / scale
                 _ellipse(picture, photograph.xy[k], outline, photograph.angle[k], scale, second)
-    for xy, flag in zip(photograph.rejected_xy, photograph.rejected_flag, strict=True):
-        _cross(picture, xy, scale, 2 if flag & Flag.TOO_SMALL else 4, _colour_of(int(flag)))
+    _crosses(picture, photograph.rejected_xy, photograph.rejected_flag, scale)
     # The vector points from the measured to the adjusted position: v = computed - measured.
     for row, name, right in zip(rows, names, reach, strict=True):
         xy = seen.xy[row]
@@ -211,10 +210,6 @@ def _remarks(photograph: PhotographTargets) -> IntArray:
     return np.zeros(len(photograph.xy), np.int64) if photograph.flag is None else photograph.flag
 
 
-def _colour_of(flag: int) -> tuple[int, int, int]:
-    return next((colour for reason, colour in REASON_COLOURS if flag & reason.value), INK)
-
-
 def _drawn(xy: FloatArray, scale: float) -> tuple[int, int]:
     """Return a position as OpenCV takes it with SHIFT fractional bits; half pixels move with the scale."""
     at = ((np.asarray(xy) + 0.5) * scale - 0.5) * (1 << SHIFT)
@@ -230,11 +225,15 @@ def _ellipse(
     cv2.ellipse(picture, _drawn(xy, scale), axes, degrees, 0, 360, colour, 1, cv2.LINE_AA, SHIFT)
 
 
-def _cross(picture: AnyArray, xy: FloatArray, scale: float, arm_px: int, colour: tuple[int, ...]) -> None:
-    x, y = _drawn(xy, scale)
-    arm = arm_px << SHIFT
-    cv2.line(picture, (x - arm, y - arm), (x + arm, y + arm), colour, 1, cv2.LINE_AA, SHIFT)
-    cv2.line(picture, (x - arm, y + arm), (x + arm, y - arm), colour, 1, cv2.LINE_AA, SHIFT)
+def _crosses(picture: AnyArray, xy: FloatArray, flag: IntArray, scale: float) -> None:
+    """Draw rejected candidates, of which a photograph may have thousands, all of one flag at once."""
+    at = np.round(((xy + 0.5) * scale - 0.5) * (1 << SHIFT)).clip(-(2**28), 2**28).astype(np.int32)
+    for value in np.unique(flag).tolist():
+        colour = next((colour for reason, colour in REASON_COLOURS if value & reason.value), INK)
+        arm = (2 if value & Flag.TOO_SMALL.value else 4) << SHIFT
+        strokes = np.array([[[-arm, -arm], [arm, arm]], [[-arm, arm], [arm, -arm]]], dtype=np.int32)
+        lines = (at[flag == value][:, None, None] + strokes).reshape(-1, 2, 2)
+        cv2.polylines(picture, list(lines), False, colour, 1, cv2.LINE_AA, SHIFT)
 
 
 def _arrow(picture: AnyArray, start: FloatArray, end: FloatArray, scale: float, *, thickness: int) -> None:

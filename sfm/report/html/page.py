@@ -20,6 +20,7 @@ from sfm.display import program_name
 from sfm.report.html.content_policy import content_policy
 from sfm.report.numbers import FILTERS, finer_unit, finer_unit_of, is_number
 from sfm.report.phrases import PHRASES
+from sfm.report.template_cache import template_cache
 from sfm.report.viewer.embedded import Viewer
 
 
@@ -58,6 +59,7 @@ def environment() -> Environment:
         trim_blocks=True,
         lstrip_blocks=True,
         extensions=["jinja2.ext.do"],
+        bytecode_cache=template_cache(__name__),
     )
     made.filters |= FILTERS | {"data_url": data_url, "quoted": quote, "right": ">{}".format}
     made.filters["program"] = program_name

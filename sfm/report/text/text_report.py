@@ -16,6 +16,7 @@ from sfm.adjustment.quality.statistics import STRONG
 from sfm.report.findings.findings import Findings
 from sfm.report.numbers import FILTERS, finer_unit, finer_unit_of
 from sfm.report.phrases import PHRASES
+from sfm.report.template_cache import template_cache
 from sfm.report.text import filters as lines
 
 MAX_ROWS = 12  # of a list; the rest is in the tables of the result
@@ -52,6 +53,7 @@ def _environment() -> Environment:
         lstrip_blocks=True,
         keep_trailing_newline=True,
         extensions=["jinja2.ext.do"],
+        bytecode_cache=template_cache(__name__),
     )
     made.filters |= FILTERS
     made.filters |= {one.__name__: one for one in (lines.columns, lines.facts, lines.wrap)}
