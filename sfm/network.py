@@ -324,12 +324,17 @@ def rows_of(index: IntArray, count: int) -> list[IntArray]:
     return np.split(order, np.searchsorted(index[order], np.arange(1, count)))
 
 
-def image_tangents(network: Network, cameras: Sequence[Camera]) -> FloatArray:
-    """Return the tangents u = -U/W, v = -V/W of all image points, NaN where no ray has them, (k, 2)."""
-    seen = network.image_points
+def image_tangents(seen: ImagePoints, camera: IntArray, cameras: Sequence[Camera]) -> FloatArray:
+    """Return the tangents u = -U/W, v = -V/W of image points, NaN where no ray has them, (k, 2).
+
+    Args:
+        seen: image points.
+        camera: index of the camera of each photograph, (m,).
+        cameras: interior orientations.
+    """
     uv = np.full((len(seen), 2), np.nan)
-    for camera, own in zip(cameras, rows_of(network.camera[seen.image], len(cameras)), strict=True):
-        uv[own] = tangents_from_pixel(camera, seen.xy[own])
+    for one, own in zip(cameras, rows_of(camera[seen.image], len(cameras)), strict=True):
+        uv[own] = tangents_from_pixel(one, seen.xy[own])
     return uv
 
 

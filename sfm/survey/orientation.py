@@ -151,7 +151,7 @@ def _orient_strongest(network: Network, estimate: Estimate) -> Orientation:
     seen, estimate = network.image_points, found.estimate
     c = min(camera.c_px for camera in estimate.cameras)
     rays = intersect(
-        image_tangents(network, estimate.cameras),
+        image_tangents(seen, network.camera, estimate.cameras),
         seen.image,
         seen.point,
         estimate.position,

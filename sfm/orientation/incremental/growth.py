@@ -55,7 +55,7 @@ class Growth:
 
     def tangents(self) -> FloatArray:
         """Tangents of all image points with the present interior orientations, (k, 2)."""
-        return image_tangents(self.network, self.estimate.cameras)
+        return image_tangents(self.network.image_points, self.network.camera, self.estimate.cameras)
 
     def tolerance(self) -> FloatArray:
         """Tolerance of every photograph, tangents, (m,)."""

@@ -137,7 +137,7 @@ def pair_solutions(network: Network, estimate: Estimate, *, tolerance_px: float)
 
     Source: Ma et al. (2004), An Invitation to 3-D Vision, sec. 5.3.3 (the two solutions of a plane).
     """
-    tangents = image_tangents(network, estimate.cameras)
+    tangents = image_tangents(network.image_points, network.camera, estimate.cameras)
     own = _sorted_rows(network, tangents)
     points, first, second = _common(network, tangents, own[0], own[1])
     tolerance = tolerance_px / min(camera.c_px for camera in estimate.cameras)

@@ -19,9 +19,10 @@ from sfm.camera import tangents_from_pixel
 from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
 from sfm.matching.lsm.projected_points import pictures_of, plane_warps
 from sfm.matching.lsm.two_photo import match_lsm
+from sfm.matching.lsm.warp import linear_part
 from sfm.matching.radiometry import grey_of
 from sfm.matching.tracks.interest import foerstner_points
-from sfm.network import Estimate, ImagePoints, rows_of
+from sfm.network import Estimate, ImagePoints, image_tangents, rows_of
 from sfm.orientation.intersection import Intersection, intersect
 
 NEIGHBOURS = 6  # tie points whose plane a new point is put on
@@ -223,7 +224,7 @@ def _followed(
             )
             good = match.good
             half, H = match.covariance[good] / 2, match.warp[good]
-            back = np.linalg.inv(H[:, :2, :2] - H[:, :2, 2:] * H[:, 2:, :2])
+            back = np.linalg.inv(linear_part(H))
             in_reference[rows[good]] += back @ half @ back.transpose(0, 2, 1)
             number[rows[good]] += 1
             parts.append(ImagePoints(np.full(int(good.sum()), j), rows[good], match.xy[good], half))
@@ -239,10 +240,7 @@ def _followed(
 
 def _intersected(seen: ImagePoints, estimate: Estimate, camera: IntArray, n: int) -> Intersection:
     """Return the points that most rays support."""
-    uv = np.full((len(seen), 2), np.nan)
-    of_camera = rows_of(camera[seen.image], len(estimate.cameras))
-    for lens, rows in zip(estimate.cameras, of_camera, strict=True):
-        uv[rows] = tangents_from_pixel(lens, seen.xy[rows])
+    uv = image_tangents(seen, camera, estimate.cameras)
     tolerance = TOLERANCE_PX / min(lens.c_px for lens in estimate.cameras)
     return intersect(
         uv, seen.image, seen.point, estimate.position, estimate.rotation, n_points=n, tolerance=tolerance
