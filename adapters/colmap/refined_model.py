@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from adapters.colmap.adjuster import load_pycolmap, quiet
-from adapters.colmap.camera_models import named_network, read_scene, write_scene
+from adapters.colmap.camera_models import named_network, read_scene
 from adapters.colmap.reconstruction import AXES, HALF_PIXEL, colmap_camera
 from sfm.camera import Camera
 from sfm.conventions import BoolArray, FloatArray, IntArray
@@ -159,19 +159,10 @@ def interior_rows(
         name, camera = str(found.model_name), after.cameras[k]
         values = colmap_parameters(pycolmap, camera, name)
         free = np.flatnonzero(camera.free)
-        J = np.zeros((len(values), len(free)))  # by symmetric differences: all are linear or powers of one
-        for column, place in enumerate(free.tolist()):
-            step = 1e-6 * max(abs(float(camera.parameters[place])), 1e-9)
-            ends = []
-            for sign in (1.0, -1.0):
-                moved = camera.parameters.copy()
-                moved[place] += sign * step
-                ends.append(colmap_parameters(pycolmap, camera.with_parameters(moved), name))
-            J[:, column] = (ends[0] - ends[1]) / (2 * step)
+        J = colmap_jacobian(camera, name)[:, free]
+        Q = covariance[k] if len(covariance[k]) else np.full((len(free),) * 2, np.nan)  # no photographs
         with np.errstate(invalid="ignore"):
-            sigma = (
-                np.sqrt(np.einsum("if,fg,ig->i", J, covariance[k], J)) if len(free) else np.zeros(len(values))
-            )
+            sigma = np.sqrt(np.einsum("if,fg,ig->i", J, Q, J))
         names = [one.strip() for one in str(found.params_info).split(",")]
         first = colmap_parameters(pycolmap, before.cameras[k], name)
         rows += [
@@ -179,15 +170,6 @@ def interior_rows(
             for one in zip(names, first.tolist(), values.tolist(), sigma.tolist(), strict=True)
         ]
     return tuple(rows)
-
-
-def write_refined(folder: Path, model: OpenModel) -> None:
-    """Write a changed model in COLMAP's binary files.
-
-    Raises:
-        OutputError: the folder cannot be written.
-    """
-    write_scene(folder, model.scene)
 
 
 def colmap_parameters(pycolmap: Any, camera: Camera, model: str) -> FloatArray:
@@ -198,6 +180,18 @@ def colmap_parameters(pycolmap: Any, camera: Camera, model: str) -> FloatArray:
         return np.array([c, x0 + width / 2, height / 2 - y0, K1 * c**2, K2 * c**4])[: 3 + SINGLE_FOCAL[model]]
     whole = np.array(colmap_camera(pycolmap, camera, 1).params, dtype=float)
     return whole[:4] if model == "PINHOLE" else whole
+
+
+def colmap_jacobian(camera: Camera, model: str) -> FloatArray:
+    """Return d (parameters of the COLMAP model) / d (parameters of ours), (q, p); see `colmap_parameters`."""
+    p = len(camera.parameters)
+    if model not in SINGLE_FOCAL:
+        return np.eye(4 if model == "PINHOLE" else p, p)
+    c, _, _, K1, K2 = camera.parameters[:5]
+    J = np.zeros((5, p))
+    J[range(5), range(5)] = 1, 1, -1, c**2, c**4
+    J[3:, 0] = 2 * K1 * c, 4 * K2 * c**3
+    return J[: 3 + SINGLE_FOCAL[model]]
 
 
 def _single_focal(found: Any, camera: Camera) -> Camera:
@@ -222,10 +216,14 @@ def _adjust_rigs(pycolmap: Any, scene: Any, points: set[int]) -> None:
     for j in set(part.point3D_ids()) - points:
         part.delete_point3D(j)
     options = pycolmap.BundleAdjustmentOptions()
-    options.refine_focal_length = options.refine_principal_point = options.refine_extra_params = False
     options.print_summary = False
     options.ceres.solver_options.max_num_iterations = STEPS
-    pycolmap.bundle_adjustment(part, options)
+    config = pycolmap.BundleAdjustmentConfig()
+    for i in part.reg_image_ids():
+        config.add_image(i)
+    for i in part.cameras:
+        config.set_constant_cam_intrinsics(i)
+    pycolmap.create_default_ceres_bundle_adjuster(options, config, part).solve()  # as a whole, it logs
     common = sorted(points & set(part.point3D_ids()))
     found, wanted = (np.array([one.point3D(j).xyz for j in common]) for one in (part, scene))
     part.transform(_sim3d(pycolmap, fit_similarity(found, wanted)))

@@ -35,7 +35,8 @@ FREE = ("c", "x0", "y0", "K1", "K2", "P1", "P2")
 SAME = 1e-6  # standard deviations
 
 
-SIX = [pytest.param(f"six {k}", marks=pytest.mark.slow) for k in range(20)]
+# In number 7 three image points fitted another resection.
+SIX = [pytest.param(f"six {k}", marks=() if k == 7 else pytest.mark.slow) for k in range(20)]
 
 
 @pytest.mark.parametrize("reject", ["tau", "tukey", "huber"])
@@ -49,7 +50,8 @@ def test_a_photograph_with_five_good_points_and_a_wild_one_is_kept(reject: str, 
     residual = np.linalg.norm(result.adjustment.residuals[rows], axis=1)
     print(f"{name}, {reject}: residuals {', '.join(f'{v:.2f}' for v in sorted(residual))} px")
     assert result.adjustment.converged and len(residual) == 6
-    assert sorted(residual)[4] < 1.0 and max(residual) > 2000
+    influence = 2.0 if reject == "huber" else 0.2  # px, of the wild one on the other five
+    assert sorted(residual)[4] < influence and max(residual) > 2000
     sigma = np.sqrt(np.diagonal(result.adjustment.covariance.exterior[i])[:3])
     index = [network.point_index(point) for point in result.network.points]
     placing = fit_similarity(result.estimate.points, truth.points[index])

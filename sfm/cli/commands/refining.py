@@ -56,13 +56,8 @@ def refine(
     adjusted with the key points; its control and scale bars give the model its frame and scale.
     """
     with loading():
-        from adapters.colmap.refined_model import (
-            interior_rows,
-            open_model,
-            place_model,
-            update_model,
-            write_refined,
-        )
+        from adapters.colmap.camera_models import write_scene
+        from adapters.colmap.refined_model import interior_rows, open_model, place_model, update_model
         from sfm.files.whole_files import refuse_existing, whole_folder
         from sfm.report.refinement import PAGE, Numbers, refinement_files
         from sfm.runtime.progress_bar import drawn_progress
@@ -102,7 +97,7 @@ def refine(
     )
     numbers = Numbers(opened.image_ids, opened.point_ids, interior, in_rigs)
     with whole_folder(out) as folder:
-        write_refined(folder, opened)
+        write_scene(folder, opened.scene)
         for name, text in refinement_files(found, numbers, title=model.resolve().name).items():
             (folder / name).write_text(text, encoding="utf-8")
     print(f"Model: {out}")

@@ -28,8 +28,7 @@ from sfm.matching.radiometry import grey_of, odd_window
 from sfm.network import Estimate, rows_of
 
 MAX_STEPS = 15
-STOP_PX = 0.0005  # what is left of the steps has the direction of the start, common to neighbouring points
-LAST_PX = 0.005  # a window that moves farther than this in the last step is not matched
+STOP_PX = 0.005
 SIZE = MODELS["affine"] + RADIOMETRIC
 LAST_FLAG = STEPS  # steps are counted for all windows together: the column holds the flag of the last one
 MIN_EIGENVALUE = 1e-12  # part of the largest, what rounding leaves of parallel rays
@@ -136,7 +135,7 @@ def match_multi(
         moving = np.bincount(point[still], minlength=len(X)) > 0
         q[~moving[point], :2] = 0.0  # they are where they want to be
     matched = out[:, FLAG] == MATCHED
-    out[matched & (length > LAST_PX) & (ref != np.arange(len(image))), FLAG] = DIVERGED
+    out[matched & (length > STOP_PX) & (ref != np.arange(len(image))), FLAG] = DIVERGED
     out[windows[(out[windows, FLAG] == MATCHED) & (out[windows, LAST_FLAG] == FLAT_TEXTURE)], FLAG] = (
         FLAT_TEXTURE
     )

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 
-from sfm.camera import pixel_jacobian, project, tangents_from_pixel
+from sfm.camera import Camera, pixel_from_tangents, pixel_jacobian, project, tangents_from_pixel
 from sfm.conventions import FloatArray, IntArray
 from sfm.network import Estimate, rows_of
 
@@ -30,29 +32,22 @@ def facing_warps(
 
 def derivatives(estimate: Estimate, camera: IntArray, image: IntArray, points: FloatArray) -> FloatArray:
     """Return d (x, y) / d X of each image point, px per object unit, (k, 2, 3)."""
+    R, UVW = estimate.rotation[image], _in_photographs(estimate, image, points)
+    tangents = -UVW[:, :2] / UVW[:, 2:]
+    in_uv = -(R[:, :, :2] + tangents[:, None, :] * R[:, :, 2:]).transpose(0, 2, 1) / UVW[:, 2, None, None]
     out = np.full((len(image), 2, 3), np.nan)
-    for i, rows in enumerate(rows_of(image, len(estimate.position))):
-        if not len(rows):
-            continue
-        lens, R = estimate.cameras[camera[i]], estimate.rotation[i]
-        UVW = (points[rows] - estimate.position[i]) @ R
-        u, v = -UVW[:, 0] / UVW[:, 2], -UVW[:, 1] / UVW[:, 2]
-        in_uv = np.stack(
-            [-(R[:, a] + t[:, None] * R[:, 2]) / UVW[:, 2:] for a, t in enumerate((u, v))], axis=1
-        )
-        xy = project(lens, estimate.position[i], R, points[rows])
-        out[rows] = pixel_jacobian(lens, xy) @ in_uv
+    for lens, rows in _of_cameras(estimate, camera, image):
+        xy = pixel_from_tangents(lens, _in_front(UVW[rows]))
+        out[rows] = pixel_jacobian(lens, xy) @ in_uv[rows]
     return out
 
 
 def pictures_of(estimate: Estimate, camera: IntArray, image: IntArray, points: FloatArray) -> FloatArray:
-    """Return the picture of one object point for each row, px, (k, 2)."""
+    """Return the picture of one object point for each row, px, NaN behind the photograph, (k, 2)."""
+    UVW = _in_photographs(estimate, image, points)
     out = np.full((len(image), 2), np.nan)
-    for i, rows in enumerate(rows_of(image, len(estimate.position))):
-        if not len(rows):
-            continue
-        lens = estimate.cameras[camera[i]]
-        out[rows] = project(lens, estimate.position[i], estimate.rotation[i], points[rows])
+    for lens, rows in _of_cameras(estimate, camera, image):
+        out[rows] = pixel_from_tangents(lens, _in_front(UVW[rows]))
     return out
 
 
@@ -101,3 +96,21 @@ def plane_warps(
         warps[:, :2, a] = linear
         warps[:, 2, a] = -np.einsum("kc,kc->k", bent, linear) / np.einsum("kc,kc->k", linear, linear)
     return warps
+
+
+def _in_photographs(estimate: Estimate, image: IntArray, points: FloatArray) -> FloatArray:
+    """Return the point of each row in the axes of its photograph, (k, 3)."""
+    return np.asarray(np.einsum("ki,kij->kj", points - estimate.position[image], estimate.rotation[image]))
+
+
+def _in_front(UVW: FloatArray) -> FloatArray:
+    """Return the tangents of rays, NaN behind the photograph, (k, 2)."""
+    W = np.where(UVW[:, 2:] < 0, UVW[:, 2:], np.nan)
+    return np.asarray(-UVW[:, :2] / W)
+
+
+def _of_cameras(estimate: Estimate, camera: IntArray, image: IntArray) -> Iterator[tuple[Camera, IntArray]]:
+    """Yield each camera that has rows, and its rows."""
+    for lens, rows in zip(estimate.cameras, rows_of(camera[image], len(estimate.cameras)), strict=True):
+        if len(rows):
+            yield lens, rows

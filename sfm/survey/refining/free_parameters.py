@@ -14,6 +14,7 @@ from sfm.network import Estimate, Network
 MIN_PHOTOGRAPHS = 4  # of a camera whose principal point is freed
 # What COLMAP calls the parameters of its models with one focal length, which are adjusted as brown_forward
 COLMAP_NAMES = {"c": "f", "x0": "cx", "y0": "cy", "K1": "k1", "K2": "k2"}
+OTHER_NAMES = ("K3", "K4", "P1", "P2", "b1", "b2")  # of brown_forward, which no COLMAP model of these has
 FOCAL_NAMES = ("f", "fx", "fy")
 
 
@@ -26,7 +27,9 @@ def free_cameras(network: Network, estimate: Estimate, fixed: tuple[str, ...]) -
     known = [name for camera in estimate.cameras for name in (*camera.names, *_colmap_names(camera))]
     for name in fixed:
         if name not in (*known, *FOCAL_NAMES):
-            told = dict.fromkeys(name for camera in estimate.cameras for name in _colmap_names(camera))
+            told = dict.fromkeys(
+                one for camera in estimate.cameras for one in _colmap_names(camera) if one not in OTHER_NAMES
+            )
             raise GeometryError(
                 f"refine: parameter '{name}' is to be held, expected one of {', '.join(told)}"
             )

@@ -134,6 +134,10 @@ def refine_model(
     usable = np.isfinite(residuals).all(axis=1)
     if not usable.any():
         raise GeometryError("no image point of an oriented photograph in the model, nothing to refine")
+    if np.bincount(seen.point[usable]).max() < MIN_RAYS:
+        raise GeometryError(
+            f"refine: no point of the model in {MIN_RAYS} oriented photographs, nothing to refine"
+        )
     before = float(np.sqrt((residuals[usable] ** 2).mean()))
     spread = MAD_TO_SIGMA * float(np.median(np.abs(residuals[usable])))
     progress.stage("adjustment as it came")
@@ -142,6 +146,12 @@ def refine_model(
     masked = ~everything if masks_dir is None else outside_masks(network, estimate, masks_dir)
     reference = _references(network, estimate, usable & ~masked)
     rows = np.flatnonzero((reference >= 0)[seen.point] & usable & ~masked)
+    if not len(rows):
+        black = int(masked.sum())
+        raise GeometryError(
+            f"refine: none of {len(seen)} key points is left to be measured: {black} where the mask is "
+            f"black, {len(seen) - black} of points that fewer than {MIN_RAYS} photographs see"
+        )
     windows = match_windows(
         network,
         estimate,
@@ -154,20 +164,32 @@ def refine_model(
         min_correlation=min_correlation,
         progress=progress,
     )
-    good = np.isfinite(windows.xy).all(axis=1) & np.isfinite(windows.covariance).all(axis=(1, 2))
+    good = np.asarray(np.isfinite(windows.xy).all(axis=1) & np.isfinite(windows.covariance).all(axis=(1, 2)))
     measured = ImagePoints(
         seen.image[good],
         seen.point[good],
         windows.xy[good],
         windows.covariance[good] + SIGMA_PX**2 * np.eye(2),
     )
+    lost = [(in_words(LsmFlag, flag), int(((windows.flag & flag) != 0).sum())) for flag in LsmFlag if flag]
+    templates = int(((windows.flag[rows] == 0) & ~good[rows]).sum())
+    lost.append(("template of a point without a match", templates))
+    few = len(seen) - len(rows) - int(masked.sum())
+    lost.append((f"of a point that fewer than {MIN_RAYS} photographs see", few))
+    lost.append(("where the mask is black", int(masked.sum())))
     progress.stage("adjustment")
     anew, whole = replace(network, image_points=measured), estimate
     rays = np.full(len(network.points), MIN_RAYS)
     if targets is not None:
         anew, whole = join_targets(anew, estimate, targets)
         rays = np.concatenate([rays, targets.min_rays])
-    part, start, images, points = _part(anew, whole, np.ones(len(anew.image_points), dtype=bool), rays)
+    try:
+        part, start, images, points = _part(anew, whole, np.ones(len(anew.image_points), dtype=bool), rays)
+    except GeometryError as error:
+        raise GeometryError(
+            f"refine: {int(good.sum())} of {len(seen)} key points could be measured anew, too few to adjust "
+            f"(not: {_words_of_reasons(_by_count(lost))}); are these the photographs of the model?"
+        ) from error
     alone = replace(part, control=ObjectPoints(), scale_bars=ScaleBars())
     adjusted = adjust(alone, start, datum=Datum("free"), reject="huber", covariance=False)
     v = np.abs(adjusted.residuals)
@@ -190,11 +212,7 @@ def refine_model(
     taken = (accepted & images[anew.image_points.image] & points[anew.image_points.point])[: len(measured)]
     accepted_anew = int((~final.rejected[: int(taken.sum())]).sum())
     points = points[: len(network.points)]
-    counts = [(in_words(LsmFlag, flag), int(((windows.flag & flag) != 0).sum())) for flag in LsmFlag if flag]
-    few = len(seen) - len(rows) - int(masked.sum())
-    counts.append((f"of a point that fewer than {MIN_RAYS} photographs see", few))
-    counts.append(("where the mask is black", int(masked.sum())))
-    counts.append(("contradict the others", int(good.sum()) - accepted_anew))
+    lost.append(("contradict the others", int(good.sum()) - accepted_anew))
     return Refinement(
         network,
         estimate,
@@ -206,10 +224,19 @@ def refine_model(
         images,
         points,
         np.asarray(residuals),
-        tuple((why, count) for why, count in sorted(counts, key=lambda c: -c[1]) if count),
+        _by_count(lost),
         targets,
         remarks if targets is None else (*targets.warnings, *remarks),
     )
+
+
+def _by_count(reasons: list[tuple[str, int]]) -> tuple[tuple[str, int], ...]:
+    """Return why key points took no part, most frequent first, without what there was none of."""
+    return tuple((why, count) for why, count in sorted(reasons, key=lambda one: -one[1]) if count)
+
+
+def _words_of_reasons(reasons: tuple[tuple[str, int], ...]) -> str:
+    return ", ".join(f"{count} {why}" for why, count in reasons)
 
 
 def _whole(
@@ -235,7 +262,7 @@ def _whole(
 
 def refinement_text(result: Refinement) -> str:
     """Return the lines that the command line prints."""
-    why = ", ".join(f"{count} {reason}" for reason, count in result.reasons)
+    why = _words_of_reasons(result.reasons)
     return (
         f"key points    {result.refined} of {result.key_points} measured anew"
         + (f" (not: {why})" if why else "")
@@ -255,8 +282,11 @@ def _words_of_targets(result: Refinement) -> str:
     own, a = result.targets.network, result.adjustment
     control = len(a.network.control) if a.datum == "control" else 0
     used = int((~a.rejected[len(result.rows) :]).sum())
+    elsewhere = result.targets.contradicting
     return (
-        f"targets       {len(result.target_points)} of {len(own.points)}, {used} image points, "
+        f"targets       {len(result.target_points)} of {len(own.points)}, {used} image points"
+        + (f" ({elsewhere} more are not where their target is)" if elsewhere else "")
+        + ", "
         f"datum {a.datum}, {control} control points, {len(a.network.scale_bars)} scale bars\n"
     )
 

@@ -19,7 +19,6 @@ from sfm.runtime.progress import Progress
 
 MEMORY_BYTES = 1_000_000_000  # of photographs in memory at a time, as single precision
 MIN_PARTS = 20  # that the points are matched in, so that progress is seen
-NOTHING = np.zeros((1, 1), np.float32)  # in place of a photograph that a part does not need
 
 
 @dataclass(frozen=True)
@@ -96,17 +95,22 @@ def match_windows(
     sizes = np.array([photographs.bytes_of(i) for i in range(len(network.images))])
     parts = list(parts_of(seen.image[rows], seen.point[rows], seen.image[reference], sizes, memory_bytes))
     progress.stage("matching", len(parts))
+    row_of = np.full(len(seen), -1)
     for part in parts:
         own = rows[part]
         points, number = np.unique(seen.point[own], return_inverse=True)
-        row_of = np.full(len(seen), -1)
+        needed, image = np.unique(seen.image[own], return_inverse=True)
         row_of[own] = np.arange(len(own))
-        needed = set(seen.image[own].tolist())
         found = match_multi(
-            [photographs.grey(i) if i in needed else NOTHING for i in range(len(network.images))],
-            replace(estimate, points=estimate.points[points]),
-            network.camera,
-            seen.image[own],
+            [photographs.grey(i) for i in needed.tolist()],
+            replace(
+                estimate,
+                position=estimate.position[needed],
+                rotation=estimate.rotation[needed],
+                points=estimate.points[points],
+            ),
+            network.camera[needed],
+            image.ravel(),
             number.ravel(),
             seen.xy[own],
             row_of[reference[points]],

@@ -195,7 +195,10 @@ def _bent_photographs(run: Run, start: State, end: State) -> BoolArray:
 
 
 def _median_lengths(observations: Observations, state: State, active: BoolArray) -> FloatArray:
-    """Return the median length of the residuals of each photograph, in standard deviations, (m,)."""
+    """Return the median length of the residuals of each photograph, in standard deviations, (m,).
+
+    The upper one of two: three of six image points fit any resection.
+    """
     length = residual_lengths(observations, residuals(observations, state))
     length = np.where(active & np.isfinite(length), length, np.inf)
     out = np.full(len(state.position), np.nan)
@@ -203,7 +206,7 @@ def _median_lengths(observations: Observations, state: State, active: BoolArray)
     count = np.bincount(observations.image, minlength=len(out))
     first = np.cumsum(count) - count
     seen = count > 0
-    out[seen] = length[order][(first + (count - 1) // 2)[seen]]
+    out[seen] = length[order][(first + count // 2)[seen]]
     return out
 
 
