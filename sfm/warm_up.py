@@ -32,6 +32,8 @@ from sfm.targets.codes.rings import ring_family
 from sfm.targets.detect import find_targets
 
 IMAGES, POINTS = 8, 40
+MANY_IMAGES, MANY_POINTS = 80, 160  # more photographs than those whose normal matrix is always a full one
+SEEN, RAYS = 12, 6  # points that one of them sees, and photographs that see a point of a strip
 SIZE_PX, PIXEL_MM, C_MM = (1000, 800), (0.01, 0.01), 10.0
 DISTANCE = 4.0  # of the cameras, the points lie within 1 of the origin
 NOISE_PX = 0.05
@@ -68,6 +70,8 @@ def compile_adjustment() -> None:
     part, start, _, _ = common_problem(adjustment)
     compared = adjust(part, start, datum=Datum("free"), reject="none")
     reprojection(part, compared.estimate)
+    for sees in (_strip(), _scattered()):  # whose normal matrix is a band, and summed ray by ray
+        adjust(*made_up_network(sees), datum=Datum("free"), reject="none")
 
 
 def compile_matching() -> None:
@@ -96,36 +100,50 @@ def main(progress: Progress = SILENT) -> None:
     set_warm()
 
 
-def made_up_network() -> tuple[Network, Estimate]:
-    """Return a convergent network with a little noise, and its truth."""
+def made_up_network(sees: AnyArray | None = None) -> tuple[Network, Estimate]:
+    """Return a convergent network with a little noise, and its truth.
+
+    Args:
+        sees: which photographs see which points, (photographs, points); a few that all see all if not given.
+    """
+    sees = np.ones((IMAGES, POINTS), dtype=bool) if sees is None else sees
+    images, count = sees.shape
     rng = np.random.default_rng(1)
     camera = camera_from_values(
         "camera", "brown", SIZE_PX, PIXEL_MM, c_mm=C_MM, free=FREE, values=(("K1", 1e-4),)
     )
-    points = rng.uniform(-0.7, 0.7, (POINTS, 3))
-    angle = 2 * np.pi * np.arange(IMAGES) / IMAGES
-    position = DISTANCE * np.stack([0.7 * np.cos(angle), 0.7 * np.sin(angle), np.full(IMAGES, 0.7)], axis=1)
+    points = rng.uniform(-0.7, 0.7, (count, 3))
+    angle = 2 * np.pi * np.arange(images) / images
+    position = DISTANCE * np.stack([0.7 * np.cos(angle), 0.7 * np.sin(angle), np.full(images, 0.7)], axis=1)
     back = position / np.linalg.norm(position, axis=1)[:, None]
-    right = np.stack([-np.sin(angle), np.cos(angle), np.zeros(IMAGES)], axis=1)
+    right = np.stack([-np.sin(angle), np.cos(angle), np.zeros(images)], axis=1)
     down = np.cross(back, right)
     rotation = np.stack([right, down, back], axis=2)
     rotation[1::2] = np.stack([down, -right, back], axis=2)[1::2]  # rolled, so that the camera is determined
     xy = np.stack(
         [project(camera, X0, R, points) for X0, R in zip(position, rotation, strict=True)]
-    ) + rng.normal(0, NOISE_PX, (IMAGES, POINTS, 2))
-    k = IMAGES * POINTS
+    ) + rng.normal(0, NOISE_PX, (images, count, 2))
+    image, point = np.nonzero(sees)
     network = Network(
-        tuple(f"photograph {i}" for i in range(IMAGES)),
-        np.zeros(IMAGES, dtype=np.int64),
-        tuple(str(j) for j in range(POINTS)),
-        ImagePoints(
-            np.repeat(np.arange(IMAGES), POINTS),
-            np.tile(np.arange(POINTS), IMAGES),
-            xy.reshape(k, 2),
-            np.tile(np.eye(2) * NOISE_PX**2, (k, 1, 1)),
-        ),
+        tuple(f"photograph {i}" for i in range(images)),
+        np.zeros(images, dtype=np.int64),
+        tuple(str(j) for j in range(count)),
+        ImagePoints(image, point, xy[image, point], np.tile(np.eye(2) * NOISE_PX**2, (len(image), 1, 1))),
     )
     return network, Estimate((camera,), position, rotation, points)
+
+
+def _strip() -> AnyArray:
+    """Return which points photographs see that share them with their neighbours only."""
+    first = np.arange(MANY_POINTS) * (MANY_IMAGES - RAYS) // (MANY_POINTS - 1)
+    i = np.arange(MANY_IMAGES)[:, None]
+    return np.asarray((first <= i) & (i < first + RAYS))
+
+
+def _scattered() -> AnyArray:
+    """Return which points photographs see that share few of them, with any others."""
+    rng = np.random.default_rng(3)
+    return np.asarray(rng.random((MANY_IMAGES, MANY_POINTS)).argsort(axis=1) < SEEN)
 
 
 def drawn_photograph(bright: bool) -> AnyArray:

@@ -6,17 +6,16 @@ gives the same object points from both, whatever points the baseline found itsel
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
 
 from sfm.adjustment.result import Adjustment
-from sfm.camera import tangents_from_pixel
 from sfm.comparison.solutions import reprojection, rotation_angle_deg
 from sfm.conventions import FloatArray
 from sfm.errors import GeometryError
-from sfm.network import Estimate, ImagePoints, Network, rows_of
+from sfm.network import Estimate, ImagePoints, Network, image_tangents
 from sfm.orientation.intersection import intersect
 from sfm.similarity import Similarity, fit_similarity
 
@@ -111,10 +110,7 @@ def compare_baseline(adjustment: Adjustment, baseline: Baseline, *, seconds: flo
     use = ~adjustment.rejected & (of_survey[seen.image] >= 0)
     seen = seen.select(use)
     image = of_survey[seen.image]
-    tangents = np.full((len(image), 2), np.nan)
-    of_camera = rows_of(network.camera[image], len(estimate.cameras))
-    for camera, rows in zip(estimate.cameras, of_camera, strict=True):
-        tangents[rows] = tangents_from_pixel(camera, seen.xy[rows])
+    tangents = image_tangents(replace(seen, image=image), network.camera, estimate.cameras)
     known = np.isfinite(tangents).all(axis=1)
     found = intersect(
         tangents[known],

@@ -124,10 +124,10 @@ def hat_complement(
     Q, workspace, out = cofactors, new_workspace(), np.empty((len(weight), 2, 2))
     # one layout whatever the parameters, so that one compiled form serves every network
     mixed = np.ascontiguousarray(Q.mixed).reshape(len(Q.exterior), 6, -1)
-    border = np.ascontiguousarray(Q.border)
+    border, points = np.ascontiguousarray(Q.border), np.ascontiguousarray(Q.points)
     count = 9 + workspace.Jp.shape[1]
     _complement(
-        layout.observations, optimum.state, weight, Q.exterior, mixed, border, Q.points, Q.cross,
+        layout.observations, optimum.state, weight, Q.exterior, mixed, border, points, Q.cross,
         Q.cross_border, workspace, np.empty((2, count)), np.empty((count, count)), out,
     )  # fmt: skip
     return out

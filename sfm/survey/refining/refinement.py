@@ -10,13 +10,12 @@ import numpy as np
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
-from sfm.camera import tangents_from_pixel
 from sfm.conventions import MAD_TO_SIGMA, BoolArray, FloatArray, IntArray
 from sfm.errors import GeometryError
 from sfm.matching.lsm.projected_points import pictures_of
 from sfm.matching.match_flags import LsmFlag, in_words
 from sfm.matching.radiometry import odd_window
-from sfm.network import Estimate, ImagePoints, Network, ObjectPoints, ScaleBars
+from sfm.network import Estimate, ImagePoints, Network, ObjectPoints, ScaleBars, image_tangents
 from sfm.orientation.intersection import intersect
 from sfm.reduced_network import reduce_network
 from sfm.runtime.progress import SILENT, Progress
@@ -247,13 +246,10 @@ def _whole(
     position[images], rotation[images] = part.position, part.rotation
     xyz[points] = part.points[: int(points.sum())]  # targets behind them
     seen = network.image_points
-    rows = np.flatnonzero(~points[seen.point] & images[seen.image])
-    tangents = np.full((len(rows), 2), np.nan)
-    for k, camera in enumerate(part.cameras):
-        own = network.camera[seen.image[rows]] == k
-        tangents[own] = tangents_from_pixel(camera, seen.xy[rows][own])
+    seen = seen.select(~points[seen.point] & images[seen.image])
+    tangents = image_tangents(seen, network.camera, part.cameras)
     found = intersect(
-        tangents, seen.image[rows], seen.point[rows], position, rotation, n_points=len(network.points)
+        tangents, seen.image, seen.point, position, rotation, n_points=len(network.points)
     ).points
     again = ~points & np.isfinite(found).all(axis=1)
     xyz[again] = found[again]

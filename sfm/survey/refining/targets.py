@@ -8,11 +8,10 @@ from pathlib import Path
 import numpy as np
 
 from sfm.adjustment.datum import Datum
-from sfm.camera import tangents_from_pixel
 from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.display import listed
 from sfm.errors import GeometryError, SurveyFileError
-from sfm.network import Estimate, ImagePoints, Network, ObjectPoints, ScaleBars
+from sfm.network import Estimate, ImagePoints, Network, ObjectPoints, ScaleBars, image_tangents
 from sfm.orientation.intersection import intersect
 from sfm.runtime.progress import SILENT, Progress
 from sfm.similarity import Similarity, fit_similarity
@@ -154,15 +153,14 @@ def _intersected(
 ) -> tuple[Network, FloatArray, int]:
     """Return the network without image points that contradict their target, all targets, how many."""
     seen = network.image_points
-    tangents, c = np.full((len(seen), 2), np.nan), np.inf
-    for k, camera in enumerate(estimate.cameras):
-        own = network.camera[seen.image] == k
-        tangents[own] = tangents_from_pixel(camera, seen.xy[own])
-        c = min(c, camera.c_px)
     found = intersect(
-        *(tangents, seen.image, seen.point, estimate.position, estimate.rotation),
+        image_tangents(seen, network.camera, estimate.cameras),
+        seen.image,
+        seen.point,
+        estimate.position,
+        estimate.rotation,
         n_points=len(network.points),
-        tolerance=tolerance_px / c,
+        tolerance=tolerance_px / min(camera.c_px for camera in estimate.cameras),
     )
     lost = ~found.used & np.isfinite(found.points[seen.point]).all(axis=1)
     return replace(network, image_points=seen.select(found.used)), found.points, int(lost.sum())

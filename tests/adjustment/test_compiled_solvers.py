@@ -1,0 +1,60 @@
+"""Networks that are made up to compile kernels reach every solver, and larger ones need no other forms."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sfm.adjustment import solve
+from sfm.adjustment.datum import Datum
+from sfm.adjustment.engine.cofactors import Cofactors, _complement, cofactors
+from sfm.adjustment.engine.solvers import banded, banded_factor, banded_inverse, dense, pairs
+from sfm.adjustment.solve import adjust
+from sfm.conventions import AnyArray
+from sfm.warm_up import MANY_IMAGES, _scattered, _strip, made_up_network
+
+BANDED = (
+    banded._add_pairs,
+    banded._scale_band,
+    banded_factor._scale_inverse,
+    banded_factor._diagonal_blocks,
+    banded_factor._sum_pairs,
+    banded_inverse._unpack,
+    banded_inverse._pack,
+)
+PAIRED = (
+    pairs._cut,
+    pairs._subtract_tile,
+    pairs._subtract_border,
+    pairs._border_times,
+    pairs._add_tile,
+    dense._core,
+)
+
+
+@pytest.mark.parametrize(("sees", "kernels"), [(_strip(), BANDED), (_scattered(), PAIRED)])
+def test_every_solver_is_compiled(sees: AnyArray, kernels: tuple[Any, ...]) -> None:
+    """A strip has a band, scattered points a full matrix summed ray by ray; each kernel has one form."""
+    network, truth = made_up_network(sees)
+    assert len(network.images) == MANY_IMAGES
+    assert adjust(network, truth, datum=Datum("free"), reject="none").converged
+    for kernel in kernels:
+        assert len(kernel.signatures) == 1, kernel
+
+
+def test_covariances_stored_by_columns_need_no_other_form(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Those of more than 3600 points are: numpy takes the place of a large intermediate result for a sum."""
+    network, truth = made_up_network()
+
+    def by_columns(*given: Any, **settings: Any) -> Cofactors:
+        Q = cofactors(*given, **settings)
+        return replace(Q, points=np.swapaxes(np.swapaxes(Q.points, 1, 2).copy(), 1, 2))
+
+    adjust(network, truth, datum=Datum("free"), reject="none")
+    before = set(_complement.signatures)  # type: ignore[attr-defined]
+    monkeypatch.setattr(solve, "cofactors", by_columns)
+    adjust(network, truth, datum=Datum("free"), reject="none")
+    assert set(_complement.signatures) == before  # type: ignore[attr-defined]
