@@ -19,6 +19,7 @@ from sfm.report.findings.findings import Findings
 
 BLUE, RED, GREY, GREEN, ORANGE = "#1f5fa8", "#c8372d", "#8a8f98", "#2b7a4b", "#d98a1f"
 DPI = 110
+COMPRESSION = 2  # of PNG, 1 to 9: more takes its time and hardly makes lines on white smaller
 WIDTH_IN = 11.0  # of the pictures of the report
 LEFT_IN, RIGHT_IN, BOTTOM_IN, TOP_IN, BETWEEN_IN = 0.75, 0.15, 0.55, 0.35, 0.95  # margins
 LETTER_IN = 0.065  # width of a letter of the names of photographs
@@ -26,6 +27,7 @@ CAMERA_COLOURS = (BLUE, ORANGE, GREEN, "#7a4fa3", "#b0567a")
 MAX_NAMED = 60  # photographs whose names are legible
 MAX_ARROWS = 4000  # more residual vectors than this only blacken the picture
 CELLS = 12  # of the grid of mean residuals along the longer side
+TITLES = ("Plan", "Elevation")
 FLAT_COSINE = 0.94  # within 20 degrees of Z the object's main plane is drawn as X and Y
 
 
@@ -53,7 +55,8 @@ def png(figure: Figure) -> bytes:
     """Return a picture as PNG."""
     buffer = io.BytesIO()
     figure.set_dpi(DPI)
-    FigureCanvasAgg(figure).print_png(buffer)  # type: ignore[no-untyped-call]  # savefig would draw it twice
+    canvas = FigureCanvasAgg(figure)  # savefig would draw it twice
+    canvas.print_png(buffer, pil_kwargs={"compress_level": COMPRESSION})  # type: ignore[no-untyped-call]
     return buffer.getvalue()
 
 
@@ -72,6 +75,11 @@ def panelled(height_in: float, *, rows: int = 1, bottom_in: float = BOTTOM_IN) -
     return figure
 
 
+def entitled(panel: Axes, title: str) -> None:
+    """Put a title above a panel, where it is; matplotlib else measures all labels to find the place."""
+    panel.set_title(title, y=1.0)
+
+
 _NETWORK = "Photographs (pyramids, looking where the camera looked) and object points."
 _RESIDUALS = (
     "Residual vectors over the format of each camera: all of them, and their mean in each cell. A pattern in "
@@ -85,28 +93,31 @@ _PHOTOGRAPHS = "RMS residual per coordinate and number of accepted image points 
 
 
 def network_figure(findings: Findings) -> Figure:
-    """Draw the network in plan and in space."""
+    """Draw the network in plan and in elevation."""
     adjustment, unit = findings.result.adjustment, findings.result.length_unit
     estimate = adjustment.estimate
     axes_from_object, labels = plan_axes(estimate.points, estimate.position)
-    figure = panelled(5.2)
-    plan = figure.add_subplot(1, 2, 1)
-    space = figure.add_subplot(1, 2, 2, projection="3d")
     points = estimate.points @ axes_from_object.T
     position = estimate.position @ axes_from_object.T
     size = 0.12 * float(np.median(np.linalg.norm(position - np.median(points, axis=0), axis=1)))
-    plan.plot(points[:, 0], points[:, 1], ".", color=GREY, markersize=4)
-    space.plot(*points.T, ".", color=GREY, markersize=3)
-    for k, family in enumerate(findings.interior.families):
-        own, camera = np.flatnonzero(findings.interior.family == k), family.camera
-        colour = CAMERA_COLOURS[k % len(CAMERA_COLOURS)]
-        edges = _pyramids(estimate, own, camera.c_px, camera.size_px, size) @ axes_from_object.T
-        plan.add_collection(LineCollection(list(edges[:, :, :2]), colors=colour, linewidths=0.8))
-        apart = np.concatenate([edges, np.full((len(edges), 1, 3), np.nan)], axis=1)
-        space.plot(*apart.reshape(-1, 3).T, color=colour, linewidth=0.7)
-        plan.plot(
-            position[own, 0], position[own, 1], "o", color=colour, markersize=4, label=_plain(family.name)
-        )
+    figure = panelled(5.2)
+    for panel, title, shown in zip(figure.subplots(1, 2), TITLES, ((0, 1), (0, 2)), strict=True):
+        across, up = shown
+        panel.plot(points[:, across], points[:, up], ".", color=GREY, markersize=4)
+        for k, family in enumerate(findings.interior.families):
+            own, camera = np.flatnonzero(findings.interior.family == k), family.camera
+            colour = CAMERA_COLOURS[k % len(CAMERA_COLOURS)]
+            edges = _pyramids(estimate, own, camera.c_px, camera.size_px, size) @ axes_from_object.T
+            panel.add_collection(LineCollection(list(edges[:, :, shown]), colors=colour, linewidths=0.8))
+            panel.plot(*position[own][:, shown].T, "o", color=colour, markersize=4, label=_plain(family.name))
+        panel.set_aspect("equal", adjustable="datalim")
+        panel.margins(0.1)  # for the names of the photographs
+        panel.autoscale_view()
+        panel.set_xlabel(f"{labels[across]} [{_plain(unit)}]")
+        panel.set_ylabel(f"{labels[up]} [{_plain(unit)}]")
+        entitled(panel, title)
+        panel.grid(color="#ddd", linewidth=0.5)
+    plan = figure.axes[0]
     for name, x, y in zip(adjustment.network.images, position[:, 0], position[:, 1], strict=True):
         if len(position) <= MAX_NAMED:
             plan.annotate(
@@ -117,20 +128,7 @@ def network_figure(findings: Findings) -> Figure:
                 fontsize=6,
                 color="#444",
             )
-    plan.set_aspect("equal", adjustable="datalim")
-    plan.margins(0.1)  # for the names of the photographs
-    plan.autoscale_view()
-    plan.set_xlabel(f"{labels[0]} [{_plain(unit)}]")
-    plan.set_ylabel(f"{labels[1]} [{_plain(unit)}]")
-    plan.set_title("Plan")
-    plan.grid(color="#ddd", linewidth=0.5)
     plan.legend(loc="upper right", fontsize=7)
-    space.set_aspect("equal", adjustable="datalim")
-    space.set_box_aspect(None, zoom=0.85)  # else the name of the third axis is cut off
-    space.set_title("In space")
-    for set_label, label in zip((space.set_xlabel, space.set_ylabel, space.set_zlabel), labels, strict=True):
-        set_label(label, fontsize=8)
-    space.tick_params(labelsize=6)
     return figure
 
 
@@ -149,12 +147,12 @@ def residual_figure(findings: Findings) -> Figure:
         factor = _round_factor(0.03 * width / max(_typical(v), 1e-12))
         keep = slice(None, None, max(1, len(xy) // MAX_ARROWS))
         _arrows(panels[k, 0], xy[keep], v[keep] * factor, BLUE)
-        panels[k, 0].set_title(f"{_plain(name)}: {len(xy)} residuals, drawn {factor:g} times as long")
+        entitled(panels[k, 0], f"{_plain(name)}: {len(xy)} residuals, drawn {factor:g} times as long")
         centres, means = _cell_means(xy, v, width, height)
         if len(centres):
             factor = _round_factor(0.6 * width / CELLS / max(_typical(means), 1e-12))
             _arrows(panels[k, 1], centres, means * factor, RED)
-        panels[k, 1].set_title(f"{_plain(name)}: mean of each cell, drawn {factor:g} times as long")
+        entitled(panels[k, 1], f"{_plain(name)}: mean of each cell, drawn {factor:g} times as long")
         for panel in panels[k]:
             panel.set_xlim(-0.5, width - 0.5)
             panel.set_ylim(height - 0.5, -0.5)
