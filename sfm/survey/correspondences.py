@@ -11,7 +11,7 @@ from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.camera import tangents_from_pixel
 from sfm.conventions import MAD_TO_SIGMA, BoolArray
-from sfm.network import Estimate, Network
+from sfm.network import Estimate, Network, rows_of
 from sfm.orientation.incremental.growth import residual_lengths
 from sfm.orientation.incremental.sequence import Orientation
 from sfm.orientation.intersection import intersect
@@ -32,6 +32,7 @@ from sfm.survey.measuring.tie_points import MIN_RAYS
 from sfm.survey.target_network import build_network, match_uncoded, min_rays
 
 ROUNDS = 3  # matching with the orientation at hand, with the adjusted one, and once more to confirm
+LET_GO = 100.0  # tolerances: median residual of a photograph beyond which nothing has held it
 MIN_TOLERANCE_PX = 1.0  # below it a difference is for the statistical test, not for the matching
 
 
@@ -168,28 +169,32 @@ def _match_and_adjust(
         images, points = determined(network, estimate, everything, min_rays(naming))
         part, values = reduce_network(network, estimate, images, points, everything)
         adjusted = adjust(part, values, datum=Datum("free"), reject="huber", covariance=False)
-        estimate = merge_visible(estimate, adjusted, images, points)
+        estimate = merge_held(estimate, adjusted, images, points, tolerance_px=tolerance_px)
         spread = MAD_TO_SIGMA * float(np.nanmedian(np.abs(adjusted.residuals)))
         tolerance_px = float(np.clip(TOLERANCE_FACTOR * spread, MIN_TOLERANCE_PX, tolerance_px))
     return _with_own_cameras(survey, photographs, _Matched(naming, network, estimate, ()), tolerance_px)
 
 
-def merge_visible(before: Estimate, adjusted: Adjustment, images: BoolArray, points: BoolArray) -> Estimate:
-    """Return the adjusted values, and those before of photographs that were moved out of sight of all points.
+def merge_held(
+    before: Estimate, adjusted: Adjustment, images: BoolArray, points: BoolArray, *, tolerance_px: float
+) -> Estimate:
+    """Return the adjusted values, and those before of photographs that nothing has held.
 
-    Robust weights let go of a photograph that does not fit, as one that was zoomed, and nothing holds it
-    then; the reason is looked for from where it was before.
+    Robust weights let go of a photograph that does not fit, as one that was zoomed, and it moves out of sight
+    of its points, or far away; the reason is looked for from where it was before.
 
     Args:
         before: values of all photographs and points.
         adjusted: some of them, adjusted.
         images: photographs in it, (m,).
         points: points in it, (n,).
+        tolerance_px: that the residuals were within before, px.
     """
     estimate = merge_estimate(before, adjusted.estimate, images, points)
-    seen = adjusted.network.image_points
-    found = np.bincount(seen.image, np.isfinite(adjusted.residuals).all(axis=1), minlength=images.sum())
-    lost = np.flatnonzero(images)[found == 0]
+    length = np.nan_to_num(np.linalg.norm(adjusted.residuals, axis=1), nan=np.inf)
+    of_photograph = rows_of(adjusted.network.image_points.image, int(images.sum()))
+    median = np.array([np.median(length[rows]) if len(rows) else 0.0 for rows in of_photograph])
+    lost = np.flatnonzero(images)[median > LET_GO * tolerance_px]
     position, rotation = estimate.position.copy(), estimate.rotation.copy()
     position[lost], rotation[lost] = before.position[lost], before.rotation[lost]
     return replace(estimate, position=position, rotation=rotation)

@@ -13,7 +13,7 @@ from sfm.camera import project
 from sfm.network import Estimate, Network
 from sfm.pipeline import run_survey
 from sfm.report.findings.findings import findings_of
-from sfm.survey.correspondences import merge_visible
+from sfm.survey.correspondences import merge_held
 from sfm.survey.inputs.settings import AdjustSettings
 from tests.surveys import survey_of
 from tests.synthetic import make_network, seed_of
@@ -76,13 +76,14 @@ def test_photographs_that_fit_keep_their_camera() -> None:
 
 
 def test_a_photograph_that_the_adjustment_loses_stays_where_it_was() -> None:
-    """A zoom of 3 % was moved out of sight of its points, and no tolerance was left for the others."""
+    """A zoom of 3 % was moved out of sight of its points, or 1e140 mm away, and left out without a reason."""
     network, truth = make_network(seed_of("out of sight"), images=4, points=12)
     adjusted = adjust(network, truth, datum=Datum("free"), reject="none")
-    residuals = adjusted.residuals.copy()
-    residuals[network.image_points.image == 2] = np.nan
-    lost = replace(adjusted, residuals=residuals)
-    kept = merge_visible(truth, lost, np.ones(4, dtype=bool), np.ones(12, dtype=bool))
-    assert np.array_equal(kept.position[2], truth.position[2])
-    assert np.array_equal(kept.position[[0, 1, 3]], adjusted.estimate.position[[0, 1, 3]])
-    assert kept.oriented.all()
+    for off in (np.nan, 7000.0):
+        residuals = adjusted.residuals.copy()
+        residuals[network.image_points.image == 2] = off
+        lost, all_of_them = replace(adjusted, residuals=residuals), np.ones(12, dtype=bool)
+        kept = merge_held(truth, lost, all_of_them[:4], all_of_them, tolerance_px=2.0)
+        assert np.array_equal(kept.position[2], truth.position[2])
+        assert np.array_equal(kept.position[[0, 1, 3]], adjusted.estimate.position[[0, 1, 3]])
+        assert kept.oriented.all()
