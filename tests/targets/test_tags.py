@@ -168,6 +168,10 @@ def test_corners_have_no_bias_along_the_diagonals(
         away = at - truth.mean(axis=0)
         away /= np.linalg.norm(away, axis=1, keepdims=True)
         outwards += np.sum((found.xy[corner] - at) * away, axis=1).tolist()
+    print(
+        f"half side {half}, blur {blur_px} px, mask {mask_px:g} px, touched {touched}: outwards "
+        f"{np.mean(outwards):+.4f} px, RMS {np.sqrt(np.mean(np.square(outwards))):.4f} px"
+    )
     assert len(outwards) >= 28
     # 3e-3 px is 0.01 % of the half diagonal of a tag 42 px wide
     assert abs(np.mean(outwards)) < 3e-3 + 3 * np.std(outwards) / np.sqrt(len(outwards))
