@@ -131,6 +131,8 @@ def tab(browser: Any, page_file: Path) -> Iterator[Tab]:
 
 def test_a_click_on_a_point_shows_its_crops(tab: Tab, scene: ViewerScene) -> None:
     page = tab.page
+    hint = page.locator(".v-hint").last  # no warning
+    assert hint.evaluate("(one) => Number(getComputedStyle(one).fontWeight)") == 400
     for j in (5, 11):
         page.mouse.click(*page.evaluate(PLACE, j))
         page.wait_for_selector(f".v-title:text-is('Point {scene.points[j]}')")

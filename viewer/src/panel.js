@@ -101,7 +101,7 @@ export class Panel {
     } else if (from < 0) this.scene.measure(-1, -1)
     const begin = button("Measure a distance from here", () => {
       this.from = j
-      begin.replaceWith(make("p", { className: "v-hint" }, `Now choose the other point (from ${model.points[j]}).`))
+      begin.replaceWith(make("p", { className: "v-prompt" }, `Now choose the other point (from ${model.points[j]}).`))
     })
     box.append(begin)
     return box
