@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.sparse import csr_matrix, triu
 
-from sfm.camera import Camera, tangents_from_pixel
+from sfm.camera import Camera
 from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.display import listed
 from sfm.errors import GeometryError, UnknownNameError
@@ -322,20 +322,6 @@ def rows_of(index: IntArray, count: int) -> list[IntArray]:
     """Return the rows of each index value from 0 to count - 1, in order."""
     order = np.argsort(index, kind="stable")
     return np.split(order, np.searchsorted(index[order], np.arange(1, count)))
-
-
-def image_tangents(seen: ImagePoints, camera: IntArray, cameras: Sequence[Camera]) -> FloatArray:
-    """Return the tangents u = -U/W, v = -V/W of image points, NaN where no ray has them, (k, 2).
-
-    Args:
-        seen: image points.
-        camera: index of the camera of each photograph, (m,).
-        cameras: interior orientations.
-    """
-    uv = np.full((len(seen), 2), np.nan)
-    for one, own in zip(cameras, rows_of(camera[seen.image], len(cameras)), strict=True):
-        uv[own] = tangents_from_pixel(one, seen.xy[own])
-    return uv
 
 
 def empty_estimate(network: Network, cameras: tuple[Camera, ...]) -> Estimate:

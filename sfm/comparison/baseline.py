@@ -15,7 +15,8 @@ from sfm.adjustment.result import Adjustment
 from sfm.comparison.solutions import reprojection, rotation_angle_deg
 from sfm.conventions import FloatArray
 from sfm.errors import GeometryError
-from sfm.network import Estimate, ImagePoints, Network, image_tangents
+from sfm.network import Estimate, ImagePoints, Network
+from sfm.orientation.image_rays import image_tangents
 from sfm.orientation.intersection import intersect
 from sfm.similarity import Similarity, fit_similarity
 

@@ -8,9 +8,9 @@ import numpy as np
 
 from sfm.conventions import BoolArray
 from sfm.errors import GeometryError
-from sfm.network import Estimate, Network, image_tangents, rows_of
+from sfm.network import Estimate, Network, rows_of
+from sfm.orientation.image_rays import intersect_image_points
 from sfm.orientation.incremental.sequence import MIN_POINTS, Judge, Orientation, orient
-from sfm.orientation.intersection import intersect
 from sfm.reduced_network import reduce_network
 from sfm.survey.adjusting.free_parameters import choose_free_parameters
 from sfm.survey.adjusting.solution import refine
@@ -148,18 +148,14 @@ def _orient_strongest(network: Network, estimate: Estimate) -> Orientation:
     images = np.ones(len(network.images), dtype=bool)
     image_points = np.ones(len(network.image_points), dtype=bool)
     found = _orient(*reduce_network(network, estimate, images, _strongest(network), image_points))
-    seen, estimate = network.image_points, found.estimate
-    c = min(camera.c_px for camera in estimate.cameras)
-    rays = intersect(
-        image_tangents(seen, network.camera, estimate.cameras),
-        seen.image,
-        seen.point,
-        estimate.position,
-        estimate.rotation,
+    rays = intersect_image_points(
+        network.image_points,
+        network.camera,
+        found.estimate,
         n_points=len(network.points),
-        tolerance=float(found.tolerance_px.max()) / c,
+        tolerance_px=float(found.tolerance_px.max()),
     )
-    return replace(found, estimate=replace(estimate, points=rays.points), point_failures=())
+    return replace(found, estimate=replace(found.estimate, points=rays.points), point_failures=())
 
 
 def _strongest(network: Network) -> BoolArray:

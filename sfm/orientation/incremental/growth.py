@@ -11,7 +11,8 @@ from sfm.camera import Camera, project
 from sfm.conventions import MAD_TO_SIGMA, BoolArray, FloatArray
 from sfm.distortion.models import Role
 from sfm.errors import GeometryError
-from sfm.network import Estimate, Network, empty_estimate, image_tangents, rows_of
+from sfm.network import Estimate, Network, empty_estimate, rows_of
+from sfm.orientation.image_rays import image_tangents
 from sfm.orientation.incremental.starting_pair import Start, best_start
 from sfm.orientation.incremental.support import photograph_support
 from sfm.orientation.intersection import intersect

@@ -22,8 +22,8 @@ from sfm.matching.lsm.two_photo import match_lsm
 from sfm.matching.lsm.warp import linear_part
 from sfm.matching.radiometry import grey_of
 from sfm.matching.tracks.interest import foerstner_points
-from sfm.network import Estimate, ImagePoints, image_tangents, rows_of
-from sfm.orientation.intersection import Intersection, intersect
+from sfm.network import Estimate, ImagePoints, rows_of
+from sfm.orientation.image_rays import intersect_image_points
 
 NEIGHBOURS = 6  # tie points whose plane a new point is put on
 FIRST_PHOTOGRAPHS = 4  # with the most similar direction, whose rays correct the place of a point
@@ -230,7 +230,9 @@ def _followed(
             parts.append(ImagePoints(np.full(int(good.sum()), j), rows[good], match.xy[good], half))
 
     measure(first, places.points, FIRST_SHIFT_PX)
-    points = _intersected(_concatenated(parts), estimate, camera, k).points
+    points = intersect_image_points(
+        _concatenated(parts), camera, estimate, n_points=k, tolerance_px=TOLERANCE_PX
+    ).points
     measure(visible & ~first & np.isfinite(points).all(axis=1), points, LATER_SHIFT_PX)
     matched = number > 0
     parts[0].covariance[matched] = in_reference[matched] / number[matched, None, None]
@@ -238,20 +240,11 @@ def _followed(
     return seen.select(matched[seen.point])
 
 
-def _intersected(seen: ImagePoints, estimate: Estimate, camera: IntArray, n: int) -> Intersection:
-    """Return the points that most rays support."""
-    uv = image_tangents(seen, camera, estimate.cameras)
-    tolerance = TOLERANCE_PX / min(lens.c_px for lens in estimate.cameras)
-    return intersect(
-        uv, seen.image, seen.point, estimate.position, estimate.rotation, n_points=n, tolerance=tolerance
-    )
-
-
 def _agreeing(
     seen: ImagePoints, estimate: Estimate, camera: IntArray, n: int, min_rays: int
 ) -> FurtherPoints:
     """Return the points with enough rays that meet, and these rays."""
-    met = _intersected(seen, estimate, camera, n)
+    met = intersect_image_points(seen, camera, estimate, n_points=n, tolerance_px=TOLERANCE_PX)
     used = met.used & (np.bincount(seen.point[met.used], minlength=n) >= min_rays)[seen.point]
     kept, point = np.unique(seen.point[used], return_inverse=True)
     c = np.array([lens.c_px for lens in estimate.cameras])[camera[seen.image[used]]]

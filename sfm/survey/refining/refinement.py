@@ -15,7 +15,8 @@ from sfm.errors import GeometryError
 from sfm.matching.lsm.projected_points import pictures_of
 from sfm.matching.match_flags import LsmFlag, in_words
 from sfm.matching.radiometry import odd_window
-from sfm.network import Estimate, ImagePoints, Network, ObjectPoints, ScaleBars, image_tangents
+from sfm.network import Estimate, ImagePoints, Network, ObjectPoints, ScaleBars
+from sfm.orientation.image_rays import image_tangents
 from sfm.orientation.intersection import intersect
 from sfm.reduced_network import reduce_network
 from sfm.runtime.progress import SILENT, Progress

@@ -11,8 +11,8 @@ from sfm.adjustment.datum import Datum
 from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.display import listed
 from sfm.errors import GeometryError, SurveyFileError
-from sfm.network import Estimate, ImagePoints, Network, ObjectPoints, ScaleBars, image_tangents
-from sfm.orientation.intersection import intersect
+from sfm.network import Estimate, ImagePoints, Network, ObjectPoints, ScaleBars
+from sfm.orientation.image_rays import intersect_image_points
 from sfm.runtime.progress import SILENT, Progress
 from sfm.similarity import Similarity, fit_similarity
 from sfm.survey.adjusting.datum_definition import MIN_CONTROL, object_scale, refuse_other_units
@@ -153,14 +153,8 @@ def _intersected(
 ) -> tuple[Network, FloatArray, int]:
     """Return the network without image points that contradict their target, all targets, how many."""
     seen = network.image_points
-    found = intersect(
-        image_tangents(seen, network.camera, estimate.cameras),
-        seen.image,
-        seen.point,
-        estimate.position,
-        estimate.rotation,
-        n_points=len(network.points),
-        tolerance=tolerance_px / min(camera.c_px for camera in estimate.cameras),
+    found = intersect_image_points(
+        seen, network.camera, estimate, n_points=len(network.points), tolerance_px=tolerance_px
     )
     lost = ~found.used & np.isfinite(found.points[seen.point]).all(axis=1)
     return replace(network, image_points=seen.select(found.used)), found.points, int(lost.sum())
