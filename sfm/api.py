@@ -26,7 +26,7 @@ from sfm.runtime.cores import cores
 from sfm.runtime.progress import SILENT, Progress
 from sfm.stored_result import StoredResult
 from sfm.survey.inputs.survey import Survey, read_survey
-from sfm.survey.measuring.target_store import TargetStore
+from sfm.survey.measuring.measured_store import MeasuredStore
 from sfm.survey.other_programs import OtherPrograms
 
 BACKENDS = ("colmap", "none")
@@ -48,7 +48,7 @@ def run_survey(
         images: folder of the photographs in place of the survey's own.
         compare_with: "colmap" (its adjuster on the same network) or "none"; else what the survey says.
         jobs: photographs measured at a time; as many as there are cores if not given.
-        store: folder that keeps measured targets, so that a photograph is not measured twice.
+        store: folder that keeps what was measured, so that a photograph is not measured twice.
         progress: whether to draw a bar on a terminal, or what is told of stages and photographs.
 
     Raises:
@@ -81,7 +81,7 @@ def run_survey(
             images_dir=None if images is None else Path(images),
             jobs=jobs or cores(),
             others=others,
-            store=None if store is None else TargetStore(Path(store)),
+            store=None if store is None else MeasuredStore(Path(store)),
             progress=told,
         )
 

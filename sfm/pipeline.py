@@ -24,8 +24,8 @@ from sfm.survey.inputs.measurements import Measurements
 from sfm.survey.inputs.photograph_list import find_photographs
 from sfm.survey.inputs.start import measurements_from_observations, refuse_unknown_photographs
 from sfm.survey.inputs.survey import Survey
+from sfm.survey.measuring.measured_store import MeasuredStore
 from sfm.survey.measuring.other_sizes import separate_sizes
-from sfm.survey.measuring.target_store import TargetStore
 from sfm.survey.measuring.tie_points import tie_photographs
 from sfm.survey.orientation import orient_survey
 from sfm.survey.other_programs import ALONE, OtherPrograms, compare_solution
@@ -38,7 +38,7 @@ def run_survey(
     images_dir: Path | None = None,
     jobs: int = 1,
     others: OtherPrograms = ALONE,
-    store: TargetStore | None = None,
+    store: MeasuredStore | None = None,
     progress: Progress = SILENT,
 ) -> SurveyResult:
     """Run a survey from its photographs, or from the image points that it gives in place of them.
@@ -48,7 +48,7 @@ def run_survey(
         images_dir: folder of the photographs in place of the survey's own.
         jobs: photographs measured at a time.
         others: the programs to compare with.
-        store: of measured targets, so that a photograph is not measured twice.
+        store: of what was measured, so that a photograph is not measured twice.
         progress: told of stages and photographs.
 
     Raises:
@@ -68,7 +68,7 @@ def run_survey(
 
 
 def _measure(
-    survey: Survey, images_dir: Path | None, jobs: int, store: TargetStore | None, clock: StageClock
+    survey: Survey, images_dir: Path | None, jobs: int, store: MeasuredStore | None, clock: StageClock
 ) -> tuple[Survey, Measurements]:
     """Return the survey, with a camera for each size of photographs, and its image points."""
     if survey.observations is not None:
@@ -81,7 +81,7 @@ def _measure(
         refuse_incomplete_cameras(survey.cameras, survey.source, sizes.files)
     if survey.tie_points is not None:
         with clock.stage("tie points", len(sizes.files)):
-            measured = tie_photographs(survey, sizes.files, jobs=jobs, progress=clock.progress)
+            measured = tie_photographs(survey, sizes.files, jobs=jobs, store=store, progress=clock.progress)
     else:
         with clock.stage("targets", len(sizes.files)):
             measured = measure_targets(survey, sizes.files, jobs=jobs, store=store, progress=clock.progress)

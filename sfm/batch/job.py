@@ -28,10 +28,10 @@ from sfm.runtime.faults import is_fault, told_of_error
 from sfm.survey.inputs.photograph_list import find_photographs
 from sfm.survey.inputs.survey import Survey, read_survey, survey_family
 from sfm.survey.inputs.survey_file import SurveyFile
-from sfm.survey.measuring.target_store import TargetStore
+from sfm.survey.measuring.measured_store import Measured, MeasuredStore
 from sfm.survey.measuring.targets import measure_photograph
+from sfm.survey.measuring.tie_points import natural_points_of
 from sfm.survey.other_programs import OtherPrograms
-from sfm.targets.detect import Targets
 
 LOCK = ".lock"  # of the batch
 VERDICTS = ("good", "fair", "bad")
@@ -66,6 +66,7 @@ class PhotographNote:
     image: str
     targets: int = 0
     rejected: int = 0  # candidates
+    features: int = 0  # of natural texture
     stored: bool = False  # measured in an earlier run
     seconds: float = 0.0
     failed: str = ""  # why it could not be read
@@ -76,7 +77,7 @@ class MeasuredPhotograph:
     """A photograph as the worker that measured it hands it to the one that goes on."""
 
     note: PhotographNote
-    held: dict[str, tuple[Targets, bool]]  # as of a TargetStore; computers may have no common one
+    held: dict[str, tuple[Measured, bool]]  # as of a MeasuredStore; computers may have no common one
 
 
 @dataclass(frozen=True)
@@ -114,17 +115,24 @@ def measure_one(
 ) -> MeasuredPhotograph:
     """Measure one photograph; why it cannot be read is part of what is returned."""
     begun = time.perf_counter()
-    store = TargetStore.of_user()
+    store = MeasuredStore.of_user()
     try:
-        family = survey_family(survey.targets, survey.codes)
         with when_compiling(lambda: tell({"compiling": True})):
-            targets, stored = measure_photograph(path, survey.targets, family, store)
+            note = _measure(survey, image, path, store)
     except Exception as error:  # one that nobody has foreseen fails the survey, which comes upon it again
         note = PhotographNote(image, failed=as_plain(told_of_error(error)))
-    else:
-        note = PhotographNote(image, len(targets), len(targets.rejected_xy), stored)
     tell({"photograph": image})
     return MeasuredPhotograph(replace(note, seconds=round(time.perf_counter() - begun, 4)), store.held)
+
+
+def _measure(survey: SurveyFile, image: str, path: Path, store: MeasuredStore) -> PhotographNote:
+    """Measure what a survey asks for in a photograph, which the store then holds."""
+    if survey.tie_points is not None:
+        natural, stored = natural_points_of(path, survey.tie_points, store)
+        return PhotographNote(image, features=len(natural), stored=stored)
+    family = survey_family(survey.targets, survey.codes)
+    targets, stored = measure_photograph(path, survey.targets, family, store)
+    return PhotographNote(image, len(targets), len(targets.rejected_xy), stored=stored)
 
 
 def reconstruct(
@@ -235,12 +243,12 @@ def _run(
     job: SurveyJob,
     survey: Survey,
     comparers: Comparers,
-    held: dict[str, tuple[Targets, bool]],
+    held: dict[str, tuple[Measured, bool]],
     log: SurveyLog,
     seconds: Callable[[], float],
 ) -> SurveyRow:
     others = comparers.others_of(survey)
-    store = replace(TargetStore.of_user(), held=held)
+    store = replace(MeasuredStore.of_user(), held=held)
     result = run_survey(survey, others=others, store=store, progress=log)
     log.stage("report")
     findings = findings_of(result)

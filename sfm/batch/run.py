@@ -45,7 +45,7 @@ from sfm.survey.inputs.photograph_list import find_photographs
 from sfm.survey.inputs.start import refuse_unknown_photographs
 from sfm.survey.inputs.survey import read_survey
 from sfm.survey.inputs.survey_file import SurveyFile, read_survey_file
-from sfm.survey.measuring.target_store import TargetStore
+from sfm.survey.measuring.measured_store import MeasuredStore
 
 SURVEY_NAME = "survey.toml"  # what a folder is searched for
 
@@ -98,7 +98,7 @@ def run_batch(
         comparers: what the surveys are compared with.
         watch: is told what happens.
         resume: keep what an earlier run finished from the same inputs; else everything is run, and only
-            measured targets are taken from an earlier run.
+            what was measured in photographs is taken from an earlier run.
         allow_outside: whether survey files may name files outside their folders.
         pictures_mb: what the pictures inside a report may take, 10^6 bytes; the rest lies beside it.
 
@@ -114,7 +114,7 @@ def run_batch(
     plans = _plan(files, allow_outside=allow_outside)
     for plan in plans:
         refuse_other_log(out / LOGS / f"{plan.folder}.jsonl")
-    TargetStore.of_user().remove_old()
+    MeasuredStore.of_user().remove_old()
     remove_old_notes()
     with _no_empty_folders(out), locked(out / LOCK, out) as before:
         if before is not None:
@@ -200,13 +200,8 @@ def calls_of(files: Sequence[Path], *, allow_outside: bool = False) -> int:
     for file in files:
         with suppress(Exception):  # what is wrong is told by the run
             survey = read_survey_file(file, allow_outside=allow_outside)
-            calls += len(find_photographs(survey)) if _has_parts(survey) else 1
+            calls += len(find_photographs(survey)) if survey.observations is None else 1
     return max(1, calls)
-
-
-def _has_parts(survey: SurveyFile) -> bool:
-    """Whether photographs are measured one by one; tie points belong to several at once."""
-    return survey.observations is None and survey.tie_points is None
 
 
 def _below(path: Path) -> list[Path]:
@@ -319,9 +314,9 @@ def _run(
 
 
 def _work(job: SurveyJob, survey: SurveyFile, comparers: Comparers) -> Work:
-    """Return a survey as the engine takes it: a part for each photograph with targets, and the rest."""
+    """Return a survey as the engine takes it: a part for each of its photographs, and the rest."""
     parts: tuple[Call, ...] = ()
-    if _has_parts(survey):
+    if survey.observations is None:
         given = read_survey(job.file, allow_outside=job.allow_outside)
         found = find_photographs(survey)
         refuse_unknown_photographs(given, found.names)  # before the photographs are measured

@@ -1,7 +1,8 @@
 """The sources that a module depends on: its own and those of every module of the package that it imports.
 
-What is kept on disk because it was expensive, compiled kernels and measured targets, is kept for these
-sources. Numba itself looks at the file of a kernel only, not at those of the functions compiled into it.
+What is kept on disk because it was expensive, compiled kernels and what was measured in photographs, is kept
+for these sources. Numba itself looks at the file of a kernel only, not at those of the functions compiled
+into it.
 """
 
 from __future__ import annotations

@@ -3,7 +3,7 @@
 Every line has `time` (UTC) and `event`:
 
     start       survey, file, version; in a batch: inputs (fingerprint of all it reads)
-    photograph  image, targets, rejected, stored (measured in an earlier run), seconds; or failed, a reason
+    photograph  image, targets, rejected, features, stored (measured in an earlier run), seconds; or failed
     stage       stage, seconds, steps
     warning     text
     result      verdict, sigma0_px, rms_px, photographs, points, observations, stored_photographs, ...

@@ -18,7 +18,7 @@ from sfm.survey.inputs.photograph_list import PhotographList
 from sfm.survey.inputs.settings import TargetSettings
 from sfm.survey.inputs.start import control_points, scale_bars
 from sfm.survey.inputs.survey import Survey
-from sfm.survey.measuring.target_store import TargetStore
+from sfm.survey.measuring.measured_store import MeasuredStore
 from sfm.survey.measuring.targets import image_point_covariance, measure_photographs
 from sfm.targets.codes.tags import CORNERS, corner_name
 from sfm.targets.flags import Flag
@@ -36,7 +36,7 @@ def measure_targets(
     files: PhotographList,
     *,
     jobs: int = 1,
-    store: TargetStore | None = None,
+    store: MeasuredStore | None = None,
     progress: Progress = SILENT,
 ) -> Measurements:
     """Return the network of the coded targets of a survey, and the uncoded ones still without a name.

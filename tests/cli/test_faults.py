@@ -23,7 +23,9 @@ from sfm.errors import FolderInUseError, OutputError
 from sfm.files.folder_lock import locked, owner_of
 from sfm.files.whole_files import remove_leftovers
 from sfm.report.log import SurveyLog, read_log
-from sfm.survey.measuring.target_store import TargetStore, target_key
+from sfm.survey.inputs.settings import TargetSettings
+from sfm.survey.measuring.measured_store import TARGETS, TEXTURE, MeasuredStore, measured_key
+from sfm.survey.measuring.targets import target_settings
 from sfm.targets.codes.families import code_family
 from sfm.targets.detect import Targets, find_targets
 from tests.engines import points_of
@@ -224,10 +226,10 @@ def targets() -> Targets:
 
 
 def test_store_gives_back_what_it_was_given(tmp_path: Path, targets: Targets) -> None:
-    store = TargetStore(tmp_path / "store")
-    assert store.load("a" * 64) is None
+    store = MeasuredStore(tmp_path / "store")
+    assert store.load("a" * 64, TARGETS) is None
     store.save("a" * 64, targets)
-    back = store.load("a" * 64)
+    back = store.load("a" * 64, TARGETS)
     assert back is not None
     for field in fields(Targets):
         np.testing.assert_array_equal(getattr(back, field.name), getattr(targets, field.name))
@@ -241,13 +243,13 @@ def test_store_gives_back_what_it_was_given(tmp_path: Path, targets: Targets) ->
     long_ago = time.time() - 100 * 86400
     for path in (part, entry, other):
         os.utime(path, (long_ago, long_ago))
-    assert store.load("a" * 64) is not None  # which is asked for again by that
+    assert store.load("a" * 64, TARGETS) is not None  # which is asked for again by that
     store.remove_old()
     assert names_in(entry.parent) == {entry.name, young.name}
 
 
 def test_damaged_store_is_measured_again(tmp_path: Path, targets: Targets) -> None:
-    store = TargetStore(tmp_path)
+    store = MeasuredStore(tmp_path)
     store.save("b" * 64, targets)
     (entry,) = tmp_path.rglob("*.npz")
     whole = entry.read_bytes()
@@ -259,35 +261,33 @@ def test_damaged_store_is_measured_again(tmp_path: Path, targets: Targets) -> No
         whole[:60] + b"\xff" * 40 + whole[100:],
     ):
         entry.write_bytes(damaged)
-        assert store.load("b" * 64) is None
+        assert store.load("b" * 64, TARGETS) is None
     packed = {f.name: getattr(targets, f.name) for f in fields(Targets)}
     np.savez_compressed(entry, allow_pickle=False, **{**packed, "xy": np.zeros((10**6, 2))})
-    assert store.load("b" * 64) is None  # a packed entry is not ours
+    assert store.load("b" * 64, TARGETS) is None  # a packed entry is not ours
     np.savez(entry, allow_pickle=False, **{**packed, "xy": np.zeros((3, 2))})
-    assert store.load("b" * 64) is None
+    assert store.load("b" * 64, TARGETS) is None
     np.savez(entry, allow_pickle=True, **{**packed, "xy": np.array([print], dtype=object)})
-    assert store.load("b" * 64) is None  # nothing is unpickled
+    assert store.load("b" * 64, TARGETS) is None  # nothing is unpickled
 
 
 def test_store_that_cannot_be_written_is_no_error(tmp_path: Path, targets: Targets) -> None:
     (tmp_path / "file").touch()
-    TargetStore(tmp_path / "file").save("c" * 64, targets)
-    assert TargetStore(tmp_path / "file").load("c" * 64) is None
+    MeasuredStore(tmp_path / "file").save("c" * 64, targets)
+    assert MeasuredStore(tmp_path / "file").load("c" * 64, TARGETS) is None
 
 
 def test_key_depends_on_content_settings_and_codes(tmp_path: Path) -> None:
     for name, data in (("a.png", b"1"), ("b.png", b"1"), ("c.png", b"2")):
         (tmp_path / name).write_bytes(data)
+    plain, light = TargetSettings(), TargetSettings(polarity="bright")
     ring, arcs = code_family("ring14"), code_family("arcs")
-    keys = [
-        target_key(tmp_path / "a.png", "s", ring),
-        target_key(tmp_path / "c.png", "s", ring),
-        target_key(tmp_path / "a.png", "t", ring),
-        target_key(tmp_path / "a.png", "s", arcs),
-        target_key(tmp_path / "a.png", "s", None),
-    ]
+    settings = [target_settings(*of) for of in ((plain, ring), (light, ring), (plain, arcs), (plain, None))]
+    keys = [measured_key(tmp_path / "a.png", TARGETS, one) for one in settings]
+    keys.append(measured_key(tmp_path / "c.png", TARGETS, settings[0]))
+    keys.append(measured_key(tmp_path / "a.png", TEXTURE, settings[0]))
     assert len(set(keys)) == len(keys)
-    assert target_key(tmp_path / "b.png", "s", ring) == keys[0]
+    assert measured_key(tmp_path / "b.png", TARGETS, settings[0]) == keys[0]
 
 
 def test_a_full_disk_is_told_by_the_log_with_its_name(tmp_path: Path) -> None:

@@ -20,7 +20,7 @@ from sfm.pipeline import run_survey
 from sfm.report.differences import words_of_cause, words_of_pairing, words_of_scale, words_of_test
 from sfm.survey.inputs.given import ScaleBar
 from sfm.survey.inputs.survey import Survey
-from sfm.survey.measuring.target_store import TargetStore
+from sfm.survey.measuring.measured_store import MeasuredStore
 from tests.places import DATASETS, SHARED
 
 CAMCAL = SHARED / "data" / "camcal" / "images"
@@ -47,7 +47,8 @@ def written_halves(parent: Path, own: tuple[str, ...] = ()) -> tuple[Path, Path]
     folders = []
     for number, (start, end) in enumerate((("1", "2"), ("3", "4"))):
         bar = ScaleBar(start, end, float(np.linalg.norm(xyz[start] - xyz[end])), SIGMA)
-        result = run_survey(half(names[number::2], bar, own), images_dir=CAMCAL, store=TargetStore.of_user())
+        store = MeasuredStore.of_user()
+        result = run_survey(half(names[number::2], bar, own), images_dir=CAMCAL, store=store)
         folders.append(parent / f"half {number}")
         result.write(folders[-1])
     return folders[0], folders[1]

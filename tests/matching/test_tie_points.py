@@ -36,9 +36,11 @@ from sfm.matching.tracks.feature_tracks import (
 )
 from sfm.matching.tracks.features import Features, sift_features
 from sfm.matching.tracks.interest import foerstner_points
+from sfm.matching.tracks.natural_points import natural_points
 from sfm.network import Estimate, ImagePoints, Network
 from sfm.orientation.relative import relative_orientations
 from sfm.pipeline import run_survey
+from sfm.report.log import read_log
 from sfm.similarity import fit_similarity
 from sfm.survey.inputs.survey import read_survey
 from sfm.survey.measuring.further_points import find_further_points
@@ -244,7 +246,7 @@ def test_further_points_cover_photographs_that_are_oriented() -> None:
 
 def test_tie_points_of_three_photographs() -> None:
     photographs, truth, _ = _scene()
-    found = find_tie_points(photographs, max_features=600)
+    found = find_tie_points(photographs, [natural_points(one, max_features=600) for one in photographs])
     n = len(found.reference)
     assert n > 40 and (np.bincount(found.point) == 3).all()
     at = found.xy[found.image == found.reference[found.point]]
@@ -263,14 +265,15 @@ def test_tie_points_of_three_photographs() -> None:
     others = found.image != found.reference[found.point]
     assert np.median(np.linalg.norm(e[others], axis=1)) < 0.1
     with pytest.raises(GeometryError, match="detector 'orb', expected one of"):
-        find_tie_points(photographs, detector="orb")
-    assert len(find_tie_points([np.zeros((90, 90), np.uint8)] * 3)) == 0
+        natural_points(photographs[0], detector="orb")
+    blank = [np.zeros((90, 90), np.uint8)] * 3
+    assert len(find_tie_points(blank, [natural_points(one) for one in blank])) == 0
 
 
 def test_two_photographs_are_in_memory_as_floats_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of a hundred photographs of 24 megapixels all as floats would be 10 GB."""
     photographs, _, _ = _scene()
-    features = [sift_features(one, max_features=300) for one in photographs]
+    features = [natural_points(one, detector="sift", max_features=300) for one in photographs]
     tracks = link_features(features)
     alive: list[weakref.ref[AnyArray]] = []
     most = 0
@@ -290,7 +293,8 @@ def test_along_epipolar_lines_of_an_orientation_computed_from_the_photographs() 
     lens = render.camera_from_values("lens", "opencv", SIZE, render.PIXEL_MM, c_mm=render.C_MM)
     position = np.array([[-0.06, 0.0, 1.6], [0.06, 0.05, 1.65]])
     left, right = _pictures(lens, position, np.tile(np.eye(3), (2, 1, 1)))
-    found = find_tie_points([left, right], max_features=600, min_rays=2)
+    natural = [natural_points(one, max_features=600) for one in (left, right)]
+    found = find_tie_points([left, right], natural, min_rays=2)
     xy = [found.xy[found.image == i][np.argsort(found.point[found.image == i])] for i in range(2)]
     uv = [tangents_from_pixel(lens, one) for one in xy]
     pair = relative_orientations(uv[0], uv[1], tolerance=1.0 / lens.c_px)[0]
@@ -390,12 +394,26 @@ def test_small_survey_names_copies_and_reasons_and_starts_from_given_values(tmp_
     assert any(line.startswith("[approximate]: ") for line in away.warnings)
 
 
-def test_batch_of_a_survey_without_targets_is_that_survey(tmp_path: Path) -> None:
+def test_batch_of_a_survey_without_targets_is_that_survey(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     survey = _write_small_survey(tmp_path / "a", "small")
     out = tmp_path / "out"
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("sfm.report.output.all_plots", lambda *_: [])
+    looked: list[int] = []
+    monkeypatch.setattr("sfm.report.output.all_plots", lambda *_: [])
+    monkeypatch.setattr(
+        "sfm.survey.measuring.tie_points.natural_points",
+        lambda *given, **options: looked.append(1) or natural_points(*given, **options),
+    )
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    for stored in (False, True):
         (row,) = run_batch([survey], out, HERE, ALONE, Notes())
+        assert len(looked) == 3  # in each photograph once, by the worker that has it
+        log = {e["image"]: e for e in read_log(out / "small" / "log.jsonl") if e["event"] == "photograph"}
+        assert sorted(log) == ["1.png", "2.png", "3.png", "broken.png", "copy.png"]
+        for name, entry in log.items():
+            found = entry["features"] > 0 and entry["stored"] == (stored or name == "copy.png")
+            assert entry["failed"] if name == "broken.png" else found
     assert row.status == "done" and row.photographs == 3 and row.photographs_total == 5
     alone = run_survey(read_survey(survey)).adjustment
     with (out / "small" / "points.csv").open(encoding="utf-8") as file:

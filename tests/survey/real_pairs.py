@@ -25,7 +25,7 @@ from sfm.result import SurveyResult
 from sfm.similarity import fit_similarity
 from sfm.survey.inputs.calibration import Calibration
 from sfm.survey.inputs.survey import Survey, read_survey, with_calibration
-from sfm.survey.measuring.target_store import TargetStore
+from sfm.survey.measuring.measured_store import MeasuredStore
 from tests.places import DATASETS, SHARED
 
 PAIRS, SEED = 10, 16
@@ -149,7 +149,7 @@ def _only(survey: Survey, names: tuple[str, ...]) -> Survey:
 
 
 def _run(survey: Survey, folder: Path, store: Path) -> SurveyResult:
-    return run_survey(survey, images_dir=folder, store=TargetStore(store))
+    return run_survey(survey, images_dir=folder, store=MeasuredStore(store))
 
 
 def _differences(result: SurveyResult, whole: SurveyResult) -> tuple[float, float]:

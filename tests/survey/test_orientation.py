@@ -14,7 +14,7 @@ from sfm.errors import GeometryError, SurveyFileError
 from sfm.pipeline import run_survey
 from sfm.result import SurveyResult
 from sfm.survey.inputs.survey import read_survey
-from sfm.survey.measuring.target_store import TargetStore
+from sfm.survey.measuring.measured_store import MeasuredStore
 from tests.surveys import write_observed_survey, write_photograph_survey
 from tests.synthetic import make_network, seed_of
 
@@ -25,12 +25,12 @@ def survey_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def store(tmp_path_factory: pytest.TempPathFactory) -> TargetStore:
-    return TargetStore(tmp_path_factory.mktemp("targets"))
+def store(tmp_path_factory: pytest.TempPathFactory) -> MeasuredStore:
+    return MeasuredStore(tmp_path_factory.mktemp("targets"))
 
 
 @pytest.fixture(scope="module")
-def plain(survey_file: Path, store: TargetStore) -> SurveyResult:
+def plain(survey_file: Path, store: MeasuredStore) -> SurveyResult:
     return run_survey(read_survey(survey_file), store=store)
 
 
@@ -54,7 +54,7 @@ def write_exterior(path: Path, names: tuple[str, ...], position: np.ndarray, rot
 
 
 def test_copies_of_a_photograph_are_no_observations(
-    plain: SurveyResult, survey_file: Path, store: TargetStore, tmp_path: Path
+    plain: SurveyResult, survey_file: Path, store: MeasuredStore, tmp_path: Path
 ) -> None:
     folder = changed(survey_file, tmp_path / "copies")
     shutil.copy(folder / "photo 2.png", folder / "photo 2 again.png")
@@ -65,7 +65,7 @@ def test_copies_of_a_photograph_are_no_observations(
 
 
 def test_a_copy_with_another_byte_is_no_observation(
-    plain: SurveyResult, survey_file: Path, store: TargetStore, tmp_path: Path
+    plain: SurveyResult, survey_file: Path, store: MeasuredStore, tmp_path: Path
 ) -> None:
     folder = changed(survey_file, tmp_path / "saved again")
     (folder / "photo 2 again.png").write_bytes((folder / "photo 2.png").read_bytes() + b"\0")
@@ -77,7 +77,7 @@ def test_a_copy_with_another_byte_is_no_observation(
 
 
 def test_a_mirrored_photograph_does_not_get_in(
-    plain: SurveyResult, survey_file: Path, store: TargetStore, tmp_path: Path
+    plain: SurveyResult, survey_file: Path, store: MeasuredStore, tmp_path: Path
 ) -> None:
     folder = changed(survey_file, tmp_path / "mirrored")
     picture = cv2.imread(str(folder / "photo 3.png"), cv2.IMREAD_GRAYSCALE)
@@ -90,7 +90,7 @@ def test_a_mirrored_photograph_does_not_get_in(
 
 
 def test_unreadable_files_are_named_once_with_their_reason(
-    survey_file: Path, store: TargetStore, tmp_path: Path
+    survey_file: Path, store: MeasuredStore, tmp_path: Path
 ) -> None:
     folder = changed(survey_file, tmp_path / "unreadable")
     (folder / "photo 1.png").write_bytes(b"")
@@ -123,7 +123,7 @@ def test_unreadable_files_are_named_once_with_their_reason(
     ],
 )
 def test_without_codes_the_settings_are_named(
-    survey_file: Path, store: TargetStore, tmp_path: Path, replaced: dict[str, str], found: str
+    survey_file: Path, store: MeasuredStore, tmp_path: Path, replaced: dict[str, str], found: str
 ) -> None:
     folder = changed(survey_file, tmp_path / "codes", **replaced)
     with pytest.raises(GeometryError, match="no two photographs have 4 coded targets in common") as error:
@@ -132,7 +132,7 @@ def test_without_codes_the_settings_are_named(
 
 
 def test_photographs_start_from_approximate_values(
-    plain: SurveyResult, survey_file: Path, store: TargetStore, tmp_path: Path
+    plain: SurveyResult, survey_file: Path, store: MeasuredStore, tmp_path: Path
 ) -> None:
     """The result lies where the approximate values say, here 1000 units away from where it would be."""
     values, network = plain.adjustment.estimate, plain.adjustment.network
@@ -145,7 +145,7 @@ def test_photographs_start_from_approximate_values(
 
 
 def test_approximate_values_of_no_photograph_are_refused(
-    plain: SurveyResult, survey_file: Path, store: TargetStore, tmp_path: Path
+    plain: SurveyResult, survey_file: Path, store: MeasuredStore, tmp_path: Path
 ) -> None:
     folder = changed(survey_file, tmp_path / "named", add='[approximate]\nimages = "images.csv"\n')
     values = plain.adjustment.estimate

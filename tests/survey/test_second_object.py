@@ -18,7 +18,7 @@ from sfm.rendering.scene import CircularTargets, Faces, Optics, Scene, coded_rin
 from sfm.result import SurveyResult
 from sfm.survey.diagnosis.second_object import find_second_objects, tell_second_objects
 from sfm.survey.inputs.survey import read_survey
-from sfm.survey.measuring.target_store import TargetStore
+from sfm.survey.measuring.measured_store import MeasuredStore
 from sfm.targets.codes.families import code_family
 from sfm.targets.codes.rings import CodeFamily
 from tests.surveys import C_MM, PIXEL_MM, SIZE_PX, SURVEY, stations
@@ -86,7 +86,7 @@ def surveyed(folder: Path, globs: list[str]) -> SurveyResult:
     (folder / "survey.toml").write_text(
         text.replace('"*.png"', str(globs).replace("'", '"')), encoding="utf-8"
     )
-    return run_survey(read_survey(folder / "survey.toml"), store=TargetStore(folder / "store"))
+    return run_survey(read_survey(folder / "survey.toml"), store=MeasuredStore(folder / "store"))
 
 
 @pytest.mark.parametrize(("globs", "agree"), [(["a*", "b*"], True), (["a*", "b1*"], False)])

@@ -36,7 +36,7 @@ from sfm.photographs.exif import Metadata, read_metadata
 from sfm.report.log import SurveyLog, read_log
 from sfm.report.output import folder_name
 from sfm.stored_result import StoredResult
-from sfm.survey.measuring.target_store import MEASURING, TargetStore
+from sfm.survey.measuring.measured_store import TARGETS, TEXTURE, MeasuredStore
 from sfm.targets.detect import Targets, find_targets
 from tests.engines import ALONE, HERE, Notes
 from tests.places import ROOT
@@ -582,7 +582,7 @@ def test_targets_that_came_with_the_folder_are_not_believed(
     assert read_log(out / "log.jsonl")[-1]["stored_photographs"] == []
     kept = tmp_path / "given" / "out" / ".kolinear" / "targets"
     if not kept.is_dir():
-        shutil.copytree(cache / "kolinear" / "targets", kept)
+        shutil.copytree(cache / "kolinear" / "measured", kept)
         shutil.rmtree(cache / "kolinear")
     for entry in kept.rglob("*.npz"):
         with np.load(entry) as found:
@@ -594,33 +594,35 @@ def test_targets_that_came_with_the_folder_are_not_believed(
     assert kolinear(monkeypatch, "run", survey) == 0  # now from the user's own
     stored = read_log(out / "log.jsonl")[-1]["stored_photographs"]
     assert stored == [f"photo {k}.png" for k in range(1, 7)]
-    assert (cache / "kolinear" / "targets").stat().st_mode & 0o777 == 0o700
+    assert (cache / "kolinear" / "measured").stat().st_mode & 0o777 == 0o700
 
 
 @pytest.mark.parametrize("fault", ["mode", "owner", "link"])
 def test_a_store_that_others_can_write_is_refused(
     fault: str, cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    folder = cache / "kolinear" / "targets"
+    folder = cache / "kolinear" / "measured"
     folder.parent.mkdir()
     if fault == "link":
         (tmp_path / "other").mkdir(mode=0o700)
         folder.symlink_to(tmp_path / "other")
     else:
         folder.mkdir(mode=0o700)
-    assert fault == "link" or TargetStore.of_user().folder == folder
+    assert fault == "link" or MeasuredStore.of_user().folder == folder
     if fault == "mode":
         folder.chmod(0o770)
     elif fault == "owner":
         monkeypatch.setattr("os.geteuid", lambda: 12345)
-    with pytest.raises(OutputError, match="measured targets are kept here, but others may write here"):
-        TargetStore.of_user()
+    with pytest.raises(OutputError, match="measured points are kept here, but others may write here"):
+        MeasuredStore.of_user()
 
 
 def test_what_is_measured_is_known_by_what_measures() -> None:
-    names = sources_of(*MEASURING).keys()
-    assert {"sfm.photographs.reading", "sfm.targets.measure", "sfm.targets.codes.rings"} <= names
-    assert not [name for name in names if name.startswith(("sfm.printing", "sfm.rendering", "sfm.survey"))]
+    targets, texture = (sources_of(*kind.measuring).keys() for kind in (TARGETS, TEXTURE))
+    assert {"sfm.photographs.reading", "sfm.targets.measure", "sfm.targets.codes.rings"} <= targets
+    assert {"sfm.photographs.reading", "sfm.matching.tracks.features", "sfm.matching.radiometry"} <= texture
+    elsewhere = ("sfm.printing", "sfm.rendering", "sfm.survey", "sfm.adjustment")
+    assert not [name for name in targets | texture if name.startswith(elsewhere)]
 
 
 def test_targets_travel_between_workers_that_have_no_common_store(

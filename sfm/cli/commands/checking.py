@@ -59,8 +59,8 @@ def doctor() -> None:
     table.add_row("memory", _memory())
     table.add_row("browser", next((name for name in BROWSERS if shutil.which(name)), "none found by name"))
     table.add_row("kernels", f"{KEPT}, {'compiled' if is_warm() else 'not yet compiled'}")
-    store = user_folder("targets", "measured targets")
-    table.add_row("measured targets", f"{store}, {_megabytes(store):.0f} MB")
+    store = user_folder("measured", "measured points")
+    table.add_row("measured points", f"{store}, {_megabytes(store):.0f} MB")
     free = shutil.disk_usage(Path.cwd()).free / 1e9
     table.add_row("free space", f"{free:.1f} GB in {Path.cwd()}")
     console.print(table)

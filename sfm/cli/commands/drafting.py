@@ -79,7 +79,7 @@ def _draft(photographs: Path) -> Draft:
         from sfm.api import one_blas_thread, sensor_widths
         from sfm.runtime.progress_bar import drawn_progress
         from sfm.survey.drafting.draft import draft_survey
-        from sfm.survey.measuring.target_store import TargetStore
+        from sfm.survey.measuring.measured_store import MeasuredStore
 
     compile_first()
     unknown: list[str] = []
@@ -87,7 +87,7 @@ def _draft(photographs: Path) -> Draft:
         draft = draft_survey(
             photographs,
             sensor_width=sensor_widths(unknown.append),
-            store=TargetStore.of_user(),
+            store=MeasuredStore.of_user(),
             progress=drawn,
         )
     return replace(draft, remarks=(*draft.remarks, *unknown))

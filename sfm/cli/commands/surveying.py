@@ -194,7 +194,7 @@ def _run_survey(
         from sfm.survey.inputs.photograph_list import find_photographs
         from sfm.survey.inputs.survey import survey_of_file, with_calibration
         from sfm.survey.inputs.survey_file import read_survey_file
-        from sfm.survey.measuring.target_store import TargetStore
+        from sfm.survey.measuring.measured_store import MeasuredStore
 
     with working_on(str(survey_file)):
         described = read_survey_file(survey_file, allow_outside=allow_outside)
@@ -228,7 +228,7 @@ def _run_survey(
     workers = (jobs or cores()) if from_photographs else 1
     store = None
     if from_photographs:
-        store = TargetStore.of_user()
+        store = MeasuredStore.of_user()
         store.remove_old()
     with (
         working_on(str(survey_file)),

@@ -15,16 +15,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from sfm.conventions import AnyArray, FloatArray, IntArray
-from sfm.errors import GeometryError
 from sfm.kernels.options import compiled
 from sfm.matching.lsm.two_photo import match_lsm
 from sfm.matching.radiometry import grey_of
-from sfm.matching.tracks.features import Features, matched_features, sift_features
-from sfm.matching.tracks.interest import foerstner_points
+from sfm.matching.tracks.features import Features, matched_features
+from sfm.matching.tracks.natural_points import NaturalPoints
 from sfm.matching.tracks.overlap import connected_parts, overlapping_pairs
 from sfm.network import rows_of
 
-DETECTORS = ("foerstner", "sift")
 WINDOW_PX = 15  # larger ones are less noisy, but a curved surface is no affine warp over them
 SNAP_PX = 6.0  # an interest point this close to a feature takes its place
 
@@ -54,10 +52,9 @@ class TiePoints:
 
 def find_tie_points(
     photographs: Sequence[AnyArray],
+    natural: Sequence[NaturalPoints],
     *,
-    detector: str = "foerstner",
     window_px: int = WINDOW_PX,
-    max_features: int = 2000,
     min_rays: int = 3,
     min_correlation: float = 0.7,
     seed: int = 0,
@@ -67,36 +64,23 @@ def find_tie_points(
 
     Args:
         photographs: (H, W), 8 or 16 bit, grey or colour, m of them.
-        detector: foerstner moves each point to the best interest point nearby, sift leaves it.
+        natural: what `natural_points` has found in each of them.
         window_px: odd side of the window of least squares matching.
-        max_features: of each photograph, the strongest ones of all its parts.
         min_rays: fewest photographs of a point.
         min_correlation: smallest coefficient r of a match.
         seed: of the random samples.
-        threads: photographs and pairs worked on at a time.
+        threads: pairs and patches worked on at a time.
 
     Returns:
         The tie points; n may be 0.
 
-    Raises:
-        GeometryError: an unknown detector.
-
     Source: Lowe (2004), IJCV 60(2), for the features; Foerstner and Guelch (1987) for the places; Gruen
     (1985) for the measurement.
     """
-    if detector not in DETECTORS:
-        raise GeometryError(f"tie points: detector '{detector}', expected one of {', '.join(DETECTORS)}")
-    with ThreadPoolExecutor(max(1, threads)) as pool:
-        features = list(pool.map(lambda one: sift_features(one, max_features=max_features), photographs))
-    tracks = link_features(features, min_rays=min_rays, seed=seed, threads=threads)
-    corners = None
-    if detector == "foerstner":
-        corners = [foerstner_points(one).xy for one in photographs]
     return measure_tracks(
         photographs,
-        features,
-        tracks,
-        corners=corners,
+        natural,
+        link_features(natural, min_rays=min_rays, seed=seed, threads=threads),
         window_px=window_px,
         min_rays=min_rays,
         min_correlation=min_correlation,
@@ -189,10 +173,9 @@ def joined_features(edge: IntArray, image: IntArray, m: int) -> IntArray:
 
 def measure_tracks(
     photographs: Sequence[AnyArray],
-    features: Sequence[Features],
+    natural: Sequence[NaturalPoints],
     tracks: Tracks,
     *,
-    corners: Sequence[FloatArray] | None = None,
     window_px: int = WINDOW_PX,
     min_rays: int = 3,
     min_correlation: float = 0.7,
@@ -206,23 +189,22 @@ def measure_tracks(
 
     Args:
         photographs: m photographs.
-        features: of each photograph.
-        tracks: which of them belong to one point.
-        corners: places of each photograph that are better than the features near them, m arrays (c_i, 2).
+        natural: of each photograph; corners near features take their places.
+        tracks: which features belong to one point.
         window_px: odd side of the window of least squares matching.
         min_rays: fewest photographs of a point.
         min_correlation: smallest coefficient r of a match.
         threads: patches worked on at a time.
     """
-    xy = np.array([features[i].xy[f] for i, f in zip(tracks.image, tracks.feature, strict=True)])
-    scale = np.array([features[i].scale[f] for i, f in zip(tracks.image, tracks.feature, strict=True)])
-    angle = np.array([features[i].angle[f] for i, f in zip(tracks.image, tracks.feature, strict=True)])
+    xy = np.array([natural[i].xy[f] for i, f in zip(tracks.image, tracks.feature, strict=True)])
+    scale = np.array([natural[i].scale[f] for i, f in zip(tracks.image, tracks.feature, strict=True)])
+    angle = np.array([natural[i].angle[f] for i, f in zip(tracks.image, tracks.feature, strict=True)])
     xy, n = xy.reshape(-1, 2), int(tracks.point.max(initial=-1)) + 1
     reference = _middle_scale(tracks.point, scale, n)
     place = xy[reference].copy()
-    for i, better in enumerate(corners or ()):
+    for i, one in enumerate(natural):
         own = np.flatnonzero(tracks.image[reference] == i)
-        place[own] = _snapped(place[own], better)
+        place[own] = _snapped(place[own], one.corners)
     place = np.rint(place)  # a template of whole pixels needs no resampling
     ref = reference[tracks.point]
     offset = (place - xy[reference])[tracks.point]

@@ -15,7 +15,7 @@ from sfm.runtime.progress import SILENT, Progress
 from sfm.survey.drafting.camera_groups import CameraGroup, Grouping, SensorWidth, group_photographs
 from sfm.survey.drafting.target_trial import BLURRED_PX, MANY_TARGETS, TargetTrial, try_targets
 from sfm.survey.inputs.survey_file import is_own_file
-from sfm.survey.measuring.target_store import TargetStore
+from sfm.survey.measuring.measured_store import MeasuredStore
 
 SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".ppm", ".pgm", ".webp")
 FREE = ("c", "x0", "y0", "K1", "K2", "K3", "P1", "P2", "b1", "b2")
@@ -39,7 +39,7 @@ def draft_survey(
     folder: Path,
     *,
     sensor_width: SensorWidth = lambda make, model: None,
-    store: TargetStore | None = None,
+    store: MeasuredStore | None = None,
     progress: Progress = SILENT,
 ) -> Draft:
     """Draft a survey file for the photographs in a folder.

@@ -11,7 +11,7 @@ import numpy as np
 
 from sfm.runtime.progress import SILENT, Progress
 from sfm.survey.inputs.settings import TargetSettings
-from sfm.survey.measuring.target_store import TargetStore
+from sfm.survey.measuring.measured_store import MeasuredStore
 from sfm.survey.measuring.targets import measure_photograph
 from sfm.targets.codes.families import code_family
 from sfm.targets.codes.rings import RINGS
@@ -39,7 +39,7 @@ class TargetTrial:
 
 
 def try_targets(
-    paths: Sequence[Path], *, store: TargetStore | None = None, progress: Progress = SILENT
+    paths: Sequence[Path], *, store: MeasuredStore | None = None, progress: Progress = SILENT
 ) -> TargetTrial:
     """Return which targets photographs show.
 
@@ -92,7 +92,7 @@ def try_targets(
     )
 
 
-def _measure(path: Path, family: str, store: TargetStore | None) -> Targets:
+def _measure(path: Path, family: str, store: MeasuredStore | None) -> Targets:
     return measure_photograph(path, TargetSettings(), code_family(family), store)[0]
 
 

@@ -15,7 +15,7 @@ from sfm.result import FailedImage
 from sfm.runtime.faults import working_on
 from sfm.runtime.progress import SILENT, Progress
 from sfm.survey.inputs.photograph_list import PhotographList
-from sfm.survey.measuring.target_store import content_hash
+from sfm.survey.measuring.measured_store import content_hash
 
 T = TypeVar("T")
 MIN_PHOTOGRAPHS = 2

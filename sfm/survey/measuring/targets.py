@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from pathlib import Path
 
 import numpy as np
@@ -16,9 +17,11 @@ from sfm.survey.inputs.measurements import MeasuredPhotographs
 from sfm.survey.inputs.photograph_list import PhotographList
 from sfm.survey.inputs.settings import TargetSettings
 from sfm.survey.inputs.survey import Survey
+from sfm.survey.measuring.measured_store import TARGETS, MeasuredStore, measured_once
 from sfm.survey.measuring.photographs import each_photograph
-from sfm.survey.measuring.target_store import TargetStore, target_key
 from sfm.targets.codes.families import TargetFamily
+from sfm.targets.codes.plates import PlateFamily
+from sfm.targets.codes.tags import TagFamily
 from sfm.targets.detect import Targets, find_targets
 
 
@@ -27,7 +30,7 @@ def measure_photographs(
     photographs: PhotographList,
     *,
     jobs: int = 1,
-    store: TargetStore | None = None,
+    store: MeasuredStore | None = None,
     progress: Progress = SILENT,
 ) -> MeasuredPhotographs:
     """Read the photographs, find, measure and decode their targets.
@@ -77,7 +80,7 @@ def measure_photographs(
 
 
 def _read_and_measure(
-    path: Path, settings: TargetSettings, family: TargetFamily | None, store: TargetStore | None
+    path: Path, settings: TargetSettings, family: TargetFamily | None, store: MeasuredStore | None
 ) -> tuple[Metadata, Targets, bool]:
     targets, stored = measure_photograph(path, settings, family, store)  # says best what is wrong with a file
     return read_metadata(path), targets, stored
@@ -87,7 +90,7 @@ def measure_photograph(
     path: Path,
     settings: TargetSettings,
     family: TargetFamily | None,
-    store: TargetStore | None = None,
+    store: MeasuredStore | None = None,
 ) -> tuple[Targets, bool]:
     """Return the targets of one photograph and whether an earlier run has measured them.
 
@@ -102,18 +105,26 @@ def measure_photograph(
     Raises:
         PhotographError: the photograph cannot be read.
     """
-    measured = settings.model_dump_json(include={"channel", "tone", "polarity", "min_diameter_px"})
-    key = "" if store is None else target_key(path, measured, family)
-    if store is not None:
-        if key not in store.held and (kept := store.load(key)) is not None:
-            store.held[key] = kept, True
-        if key in store.held:
-            return store.held[key]
-    targets = targets_in(read_photograph(path, channel=settings.channel), settings, family)
-    if store is not None:
-        store.save(key, targets)
-        store.held[key] = targets, False
-    return targets, False
+    return measured_once(
+        store,
+        path,
+        TARGETS,
+        target_settings(settings, family),
+        lambda: targets_in(read_photograph(path, channel=settings.channel), settings, family),
+    )
+
+
+def target_settings(settings: TargetSettings, family: TargetFamily | None) -> str:
+    """Return what the targets of a photograph depend on besides it, for the store of what was measured."""
+    codes = "none"
+    if isinstance(family, TagFamily):
+        codes = family.name
+    elif isinstance(family, PlateFamily):
+        codes = repr(family)
+    elif family is not None:
+        table = family.number.tobytes() + family.pattern.tobytes()
+        codes = f"{family.cells} {family.inner} {family.outer} {hashlib.sha256(table).hexdigest()}"
+    return settings.model_dump_json(include={"channel", "tone", "polarity", "min_diameter_px"}) + "\0" + codes
 
 
 def targets_in(photograph: AnyArray, settings: TargetSettings, family: TargetFamily | None) -> Targets:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from hashlib import sha256
 from pathlib import Path
 
@@ -11,6 +12,7 @@ import numpy as np
 from sfm.conventions import AnyArray, IntArray
 from sfm.errors import GeometryError
 from sfm.matching.tracks.feature_tracks import find_tie_points
+from sfm.matching.tracks.natural_points import NaturalPoints, natural_points
 from sfm.network import ImagePoints, Network, rows_of
 from sfm.photographs.exif import Metadata, read_metadata
 from sfm.photographs.reading import read_photograph
@@ -22,13 +24,19 @@ from sfm.survey.inputs.photograph_list import PhotographList
 from sfm.survey.inputs.settings import TiePointSettings
 from sfm.survey.inputs.start import control_points, scale_bars
 from sfm.survey.inputs.survey import Survey
+from sfm.survey.measuring.measured_store import TEXTURE, MeasuredStore, measured_once
 from sfm.survey.measuring.photographs import each_photograph
 
 MIN_RAYS = 3  # photographs that must agree on a tie point; two rays cannot contradict each other
 
 
 def tie_photographs(
-    survey: Survey, photographs: PhotographList, *, jobs: int = 1, progress: Progress = SILENT
+    survey: Survey,
+    photographs: PhotographList,
+    *,
+    jobs: int = 1,
+    store: MeasuredStore | None = None,
+    progress: Progress = SILENT,
 ) -> Measurements:
     """Read the photographs and measure the points of natural texture that they have in common.
 
@@ -39,6 +47,7 @@ def tie_photographs(
         survey: says detector and windows, what is known of the cameras, and the sigma of an image coordinate.
         photographs: the files.
         jobs: how many photographs are worked on at a time.
+        store: keeps what single photographs show and spares finding it again; None to find everything.
         progress: told of every photograph.
 
     Raises:
@@ -49,7 +58,7 @@ def tie_photographs(
     settings = survey.tie_points or TiePointSettings()
     found, failed = each_photograph(
         photographs,
-        _read,
+        lambda path: _read(path, settings, store),
         picture=lambda one: sha256(one[1].tobytes()).digest(),
         jobs=jobs,
         progress=progress,
@@ -62,9 +71,8 @@ def tie_photographs(
     )
     tied = find_tie_points(
         [found[k][1] for k in read],
-        detector=settings.detector,
+        [found[k][2] for k in read],
         window_px=settings.window_px,
-        max_features=settings.max_features,
         min_rays=MIN_RAYS,
         threads=jobs,
     )
@@ -84,13 +92,14 @@ def tie_photographs(
         scale_bars=scale_bars(survey.scale_bars, points),
     )
     paths = tuple(photographs.paths[k] for k in read)
+    drawn = drawn_windows(network, paths, settings.window_px)
     return Measurements(
         network,
         cameras,
         photographs.names,
         np.full(len(points), MIN_RAYS),
         failed,
-        drawn_windows(network, paths, settings.window_px),
+        tuple(replace(one, stored=found[k][3]) for k, one in zip(read, drawn, strict=True)),
         photographs,
     )
 
@@ -108,5 +117,39 @@ def drawn_windows(network: Network, paths: Sequence[Path], window_px: int) -> tu
     return tuple(drawn)
 
 
-def _read(path: Path) -> tuple[Metadata, AnyArray]:
-    return read_metadata(path), read_photograph(path)
+def _read(
+    path: Path, settings: TiePointSettings, store: MeasuredStore | None
+) -> tuple[Metadata, AnyArray, NaturalPoints, bool]:
+    photograph = read_photograph(path)
+    return read_metadata(path), photograph, *natural_points_of(path, settings, store, photograph=photograph)
+
+
+def natural_points_of(
+    path: Path,
+    settings: TiePointSettings,
+    store: MeasuredStore | None = None,
+    *,
+    photograph: AnyArray | None = None,
+) -> tuple[NaturalPoints, bool]:
+    """Return what one photograph shows of natural texture, and whether an earlier run has found it.
+
+    Args:
+        path: the photograph.
+        settings: detector and number of features.
+        store: is asked first, and keeps and holds what had to be found.
+        photograph: what the file holds, where it has been read.
+
+    Raises:
+        PhotographError: the photograph cannot be read.
+    """
+    return measured_once(
+        store,
+        path,
+        TEXTURE,
+        settings.model_dump_json(include={"detector", "max_features"}),
+        lambda: natural_points(
+            read_photograph(path) if photograph is None else photograph,
+            detector=settings.detector,
+            max_features=settings.max_features,
+        ),
+    )

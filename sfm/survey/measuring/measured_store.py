@@ -1,0 +1,175 @@
+"""The store of what was measured in photographs: what was measured once in one is not measured again.
+
+It lies in the cache folder of the user, never beside photographs or results, which may come from somebody
+else. What was measured is kept by the content of the photograph, the settings and the code that measures, so
+an entry can be missing or unreadable but never out of date. The folder may be removed at any time.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import os
+import zipfile
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass, field, fields
+from functools import cache
+from pathlib import Path
+from typing import Generic, TypeVar
+
+import cv2
+import numpy as np
+
+from sfm.errors import OutputError, PhotographError
+from sfm.files.user_cache import make_user_folder, remove_unused, user_folder
+from sfm.files.whole_files import whole_file
+from sfm.kernels.sources import sources_of
+from sfm.matching.tracks.natural_points import NaturalPoints
+from sfm.targets.detect import Targets
+
+Measured = Targets | NaturalPoints
+M = TypeVar("M", Targets, NaturalPoints)
+MAX_ENTRY_BYTES = 100_000_000  # some 400,000 targets; bounded before any memory is taken
+
+
+@dataclass(frozen=True)
+class Kind(Generic[M]):
+    """What can be measured in a photograph alone, and kept: arrays by their names."""
+
+    type: type[M]
+    measuring: tuple[str, ...]  # modules; what is measured depends on these and on all that they import
+    apart: str  # how the arrays begin that have a length of their own; the others have one length
+
+
+TARGETS = Kind(Targets, ("sfm.photographs.reading", "sfm.targets.detect"), "rejected")
+TEXTURE = Kind(NaturalPoints, ("sfm.photographs.reading", "sfm.matching.tracks.natural_points"), "corners")
+
+
+@dataclass(frozen=True)
+class MeasuredStore:
+    """A folder of what was measured, which is the user's alone."""
+
+    folder: Path
+    held: dict[str, tuple[Measured, bool]] = field(default_factory=dict)
+    """of this run by their keys: what was measured, and whether it was taken from the folder"""
+
+    @classmethod
+    def of_user(cls) -> MeasuredStore:
+        """Return the store in the user's cache folder (XDG_CACHE_HOME), which is made when it is needed.
+
+        Raises:
+            OutputError: others can write into it.
+        """
+        return cls(user_folder("measured", "measured points"))
+
+    def load(self, key: str, kind: Kind[M]) -> M | None:
+        """Return what was measured under a key; None if it is not there or not whole."""
+        try:
+            path = self._path(key)
+            if path.stat().st_size > MAX_ENTRY_BYTES:
+                return None
+            found = _unpacked(path.read_bytes(), kind)
+            os.utime(path)  # asked for now
+            return found
+        except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile):
+            return None
+
+    def save(self, key: str, measured: Measured) -> None:
+        """Keep what was measured, whole or not at all; where there is no room it is simply not kept."""
+        data = io.BytesIO()
+        np.savez(data, allow_pickle=False, **{f.name: getattr(measured, f.name) for f in fields(measured)})
+        with suppress(OSError, OutputError):
+            make_user_folder(self.folder)
+            with whole_file(self._path(key), replaces=True) as part:
+                part.write_bytes(data.getbuffer())
+
+    def remove_old(self) -> None:
+        """Remove what nobody has asked for in months, and what a killed run left half-written."""
+        remove_unused(self.folder)
+
+    def _path(self, key: str) -> Path:
+        return self.folder / key[:2] / f"{key}.npz"
+
+
+def measured_once(
+    store: MeasuredStore | None, path: Path, kind: Kind[M], settings: str, measure: Callable[[], M]
+) -> tuple[M, bool]:
+    """Return what is measured in a photograph, and whether an earlier run has measured it.
+
+    Args:
+        store: is asked first, and keeps and holds what had to be measured; None to measure in any case.
+        path: the photograph.
+        kind: what is measured.
+        settings: everything but the photograph that it depends on, in any unambiguous text.
+        measure: measures it.
+
+    Raises:
+        PhotographError: the photograph cannot be read.
+    """
+    if store is None:
+        return measure(), False
+    key = measured_key(path, kind, settings)
+    if key not in store.held and (kept := store.load(key, kind)) is not None:
+        store.held[key] = kept, True
+    if key in store.held:
+        found, stored = store.held[key]
+        if isinstance(found, kind.type):
+            return found, stored
+    measured = measure()
+    store.save(key, measured)
+    store.held[key] = measured, False
+    return measured, False
+
+
+def measured_key(path: Path, kind: Kind[M], settings: str) -> str:
+    """Return the key of what is measured in a photograph: a SHA-256 of everything that it depends on.
+
+    Args:
+        path: the photograph.
+        kind: what is measured.
+        settings: of the measurement, in any unambiguous text.
+
+    Raises:
+        PhotographError: the photograph cannot be read.
+    """
+    parts = (content_hash(path), settings, _code_version(kind.measuring))
+    return hashlib.sha256("\0".join(parts).encode()).hexdigest()
+
+
+def content_hash(path: Path) -> str:
+    """Return the SHA-256 of a photograph's file.
+
+    Raises:
+        PhotographError: the photograph cannot be read.
+    """
+    try:
+        if path.exists() and not path.is_file():  # reading a pipe would never end
+            raise PhotographError(f"{path.name}: not a file, a photograph is needed")
+        with path.open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError as error:
+        why = f"no such file in {path.parent}" if not path.exists() else error.strerror
+        raise PhotographError(f"{path.name}: {why}") from error
+
+
+@cache
+def _code_version(measuring: tuple[str, ...]) -> str:
+    """Return a fingerprint of the code that measures: its own sources and the libraries it computes with."""
+    digest = hashlib.sha256(f"{cv2.__version__} {np.__version__}".encode())
+    for _, source in sorted(sources_of(*measuring).items()):
+        digest.update(source.encode())
+    return digest.hexdigest()
+
+
+def _unpacked(data: bytes, kind: Kind[M]) -> M:
+    """Read back what was measured; ValueError or KeyError if it is not what was written."""
+    with zipfile.ZipFile(io.BytesIO(data)) as archive:
+        if sum(entry.file_size for entry in archive.infolist()) > len(data):
+            raise ValueError("entries are stored as they are, these are packed")
+    with np.load(io.BytesIO(data), allow_pickle=False) as found:
+        arrays = {f.name: found[f.name] for f in fields(kind.type)}
+    for apart in (True, False):
+        if len({len(a) for name, a in arrays.items() if name.startswith(kind.apart) == apart}) != 1:
+            raise ValueError("arrays of different length")
+    return kind.type(**arrays)
