@@ -70,7 +70,7 @@ def compile_adjustment() -> None:
     part, start, _, _ = common_problem(adjustment)
     compared = adjust(part, start, datum=Datum("free"), reject="none")
     reprojection(part, compared.estimate)
-    for sees in (_strip(), _scattered()):  # whose normal matrix is a band, and summed ray by ray
+    for sees in (_strip(), _scattered()):  # whose normal matrix is one of fronts, and summed ray by ray
         adjust(*made_up_network(sees), datum=Datum("free"), reject="none")
 
 

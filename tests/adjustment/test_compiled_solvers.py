@@ -11,33 +11,32 @@ import pytest
 from sfm.adjustment import solve
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.engine.cofactors import Cofactors, _complement, cofactors
-from sfm.adjustment.engine.solvers import banded, banded_factor, banded_inverse, dense, pairs
+from sfm.adjustment.engine.solvers import dense, dissection, fronts, multifrontal, multifrontal_factor, pairs
 from sfm.adjustment.solve import adjust
 from sfm.conventions import AnyArray
 from sfm.warm_up import MANY_IMAGES, _scattered, _strip, made_up_network
 
-BANDED = (
-    banded._add_pairs,
-    banded._scale_band,
-    banded_factor._scale_inverse,
-    banded_factor._diagonal_blocks,
-    banded_factor._sum_pairs,
-    banded_inverse._unpack,
-    banded_inverse._pack,
+FRONTS = (
+    dissection.distances,
+    fronts._place,
+    multifrontal._sum_front,
+    multifrontal._extend,
+    multifrontal_factor._pick,
+    multifrontal_factor._sum_pairs,
 )
 PAIRED = (
     pairs._cut,
     pairs._subtract_tile,
-    pairs._subtract_border,
+    pairs.subtract_border,
     pairs._border_times,
     pairs._add_tile,
     dense._core,
 )
 
 
-@pytest.mark.parametrize(("sees", "kernels"), [(_strip(), BANDED), (_scattered(), PAIRED)])
+@pytest.mark.parametrize(("sees", "kernels"), [(_strip(), FRONTS), (_scattered(), PAIRED)])
 def test_every_solver_is_compiled(sees: AnyArray, kernels: tuple[Any, ...]) -> None:
-    """A strip has a band, scattered points a full matrix summed ray by ray; each kernel has one form."""
+    """A strip has fronts, scattered points a full matrix summed ray by ray; each kernel has one form."""
     network, truth = made_up_network(sees)
     assert len(network.images) == MANY_IMAGES
     assert adjust(network, truth, datum=Datum("free"), reject="none").converged

@@ -13,8 +13,8 @@ from sfm.adjustment.engine.collinearity import residuals
 from sfm.adjustment.engine.normals import normal_equations
 from sfm.adjustment.engine.observed_unknowns import weighted_of
 from sfm.adjustment.engine.solvers import choice
-from sfm.adjustment.engine.solvers.banded import BandSolver
 from sfm.adjustment.engine.solvers.dense import schur_complement
+from sfm.adjustment.engine.solvers.multifrontal import MultifrontalSolver
 from sfm.adjustment.engine.unknowns import interior_names, start_weights, step, unknowns_of
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.separate import adjust_separately
@@ -165,19 +165,20 @@ def test_covariance_equals_the_inverse_of_the_whole() -> None:
         assert np.abs((own - a.covariance.interior[i]) / sigma[:, None] / sigma).max() < 1e-5
 
 
-def test_banded_and_full_normal_equations_share_alike(monkeypatch: pytest.MonkeyPatch) -> None:
-    network, truth = zoomed("banded", noise_px=0.1)
+def test_fronts_and_full_normal_equations_share_alike(monkeypatch: pytest.MonkeyPatch) -> None:
+    network, truth = zoomed("fronts", noise_px=0.1)
     full = adjust(network, truth, datum=FREE, reject="none")
     monkeypatch.setattr(choice, "SMALL", 0)
-    monkeypatch.setattr(choice, "FACTOR_RATE", 1e-3)  # so that the band is always less work
+    monkeypatch.setattr(choice, "FACTOR_RATE", 1e-3)  # so that fronts are always less work
+    monkeypatch.setattr(choice, "MOSTLY", 1.0)
     layout, _ = unknowns_of(network, truth, use_control=False)
-    assert isinstance(choice.choose_solver(layout), BandSolver)
-    band = adjust(network, truth, datum=FREE, reject="none")
-    assert band.sigma0 == pytest.approx(full.sigma0, rel=1e-9)
-    for one, other in zip(band.covariance.interior, full.covariance.interior, strict=True):
+    assert isinstance(choice.choose_solver(layout), MultifrontalSolver)
+    fronts = adjust(network, truth, datum=FREE, reject="none")
+    assert fronts.sigma0 == pytest.approx(full.sigma0, rel=1e-9)
+    for one, other in zip(fronts.covariance.interior, full.covariance.interior, strict=True):
         sigma = np.sqrt(np.diagonal(other))
         assert np.abs((one - other) / sigma[:, None] / sigma).max() < 1e-5
-    assert np.abs(band.redundancy_numbers - full.redundancy_numbers).max() < 1e-6
+    assert np.abs(fronts.redundancy_numbers - full.redundancy_numbers).max() < 1e-6
 
 
 def test_one_camera_is_the_case_of_all_parameters_shared() -> None:

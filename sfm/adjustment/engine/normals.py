@@ -2,8 +2,8 @@
 
 With N = (U W; W' V), V block diagonal with one L L' per object point, and Y = W L^-T, the reduced
 normal equations are (U - Y Y') dx = -(g - Y y), y = L^-1 g_points. Y is stored by image points. Unknowns are
-scaled so that the diagonal of U is 1. Y Y' is summed as one dense product or pair by pair of rays into a
-band, whichever is less work (`sfm.adjustment.engine.solvers.choice`).
+scaled so that the diagonal of U is 1. Y Y' is summed as one dense product or pair by pair of rays into
+fronts, whichever is less work (`sfm.adjustment.engine.solvers.choice`).
 
 Source: Brown (1958, 1976); Mikhail, Bethel and McGlone (2001), sec. 5.8; Foerstner and Wrobel (2016),
 sec. 15.2.

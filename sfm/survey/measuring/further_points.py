@@ -13,11 +13,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.spatial import cKDTree
 
-from sfm.camera import tangents_from_pixel
 from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
 from sfm.matching.lsm.projected_points import pictures_of, plane_warps
+from sfm.matching.lsm.surface_planes import NEIGHBOURS, planes_at
 from sfm.matching.lsm.two_photo import match_lsm
 from sfm.matching.lsm.warp import linear_part
 from sfm.matching.radiometry import grey_of
@@ -25,7 +24,6 @@ from sfm.matching.tracks.interest import foerstner_points
 from sfm.network import Estimate, ImagePoints, rows_of
 from sfm.orientation.image_rays import intersect_image_points
 
-NEIGHBOURS = 6  # tie points whose plane a new point is put on
 FIRST_PHOTOGRAPHS = 4  # with the most similar direction, whose rays correct the place of a point
 FIRST_SHIFT_PX = 6.0  # how far a point may be from where the plane puts it
 LATER_SHIFT_PX = 3.0  # and from where its first rays put it
@@ -101,7 +99,10 @@ def find_further_points(
             border_px=margin,
             taken=np.concatenate(places_of[i]),
         )
-        places = _on_planes(estimate, camera, i, np.rint(corners.xy), seen.point[own[i]])
+        xy = np.rint(corners.xy)
+        points, normal = planes_at(estimate, camera, i, xy, seen.point[own[i]])
+        known = np.isfinite(points).all(axis=1)
+        places = _Places(xy[known], normal[known], points[known])
         visible = _visible(estimate, camera, i, places, shapes, margin)
         several = visible.sum(axis=0) >= min_rays
         if not several.any():
@@ -115,38 +116,6 @@ def find_further_points(
         for j in np.unique(new.image_points.image).tolist():
             places_of[j].append(new.image_points.xy[new.image_points.image == j])
     return _joined(found)
-
-
-def _on_planes(estimate: Estimate, camera: IntArray, i: int, xy: FloatArray, point: IntArray) -> _Places:
-    """Put places of a photograph on the planes through the tie points around them.
-
-    Over a plane the inverse of the depth is linear in the tangents: 1 / t = a u + b v + c.
-
-    Args:
-        estimate: orientation and tie points.
-        camera: index of the camera of each photograph, (m,).
-        i: the photograph.
-        xy: places, px, (k, 2).
-        point: tie points that it sees.
-    """
-    lens, X0, R = estimate.cameras[camera[i]], estimate.position[i], estimate.rotation[i]
-    UVW = (estimate.points[point] - X0) @ R
-    UVW = UVW[UVW[:, 2] < 0]
-    if len(UVW) < NEIGHBOURS:
-        return _Places(np.zeros((0, 2)), np.zeros((0, 3)), np.zeros((0, 3)))
-    known, inverse = -UVW[:, :2] / UVW[:, 2:], -1 / UVW[:, 2]
-    uv = tangents_from_pixel(lens, xy)
-    near = cKDTree(known).query(uv, k=NEIGHBOURS)[1]
-    A = np.concatenate([known[near], np.ones((*near.shape, 1))], axis=2)
-    N = np.einsum("kij,kil->kjl", A, A)
-    N += 1e-6 * np.trace(N, axis1=1, axis2=2)[:, None, None] * np.diag([1.0, 1.0, 0.0])  # neighbours in a row
-    plane = np.linalg.solve(N, np.einsum("kij,ki->kj", A, inverse[near])[:, :, None])[:, :, 0]
-    value = np.sum(plane[:, :2] * uv, axis=1) + plane[:, 2]
-    inside = (value > 0.5 * inverse.min()) & (value < 2 * inverse.max())
-    uv, value, plane = uv[inside], value[inside], plane[inside]
-    points = X0 + (np.column_stack([uv, -np.ones(len(uv))]) / value[:, None]) @ R.T
-    normal = -(plane * [1.0, 1.0, -1.0]) @ R.T
-    return _Places(xy[inside], normal / np.linalg.norm(normal, axis=1, keepdims=True), points)
 
 
 def _visible(

@@ -61,7 +61,7 @@ def subtract_squares(
         _subtract_tile(row, column, pairs.cut, observations, Y, flat, len(S))
 
     _halves(subtract, [(row, column) for row in range(pairs.tiles) for column in range(row + 1)])
-    _subtract_border(observations, Y, Y_interior, S[first : first + inner])
+    subtract_border(observations, Y, Y_interior, S[first : first + inner])
     flat_interior = Y_interior.reshape(-1, inner)
     S[first : first + inner, first : first + inner] -= flat_interior.T @ flat_interior
 
@@ -131,9 +131,7 @@ def _subtract_tile(
 
 
 @kernel
-def _subtract_border(
-    observations: Observations, Y: FloatArray, Y_interior: FloatArray, S: FloatArray
-) -> None:
+def subtract_border(observations: Observations, Y: FloatArray, Y_interior: FloatArray, S: FloatArray) -> None:
     """Take Y_interior Y' off the rows S of the interior unknowns."""
     for j in range(len(Y_interior)):
         for o in range(observations.start[j], observations.start[j + 1]):

@@ -1,0 +1,263 @@
+"""The reduced normal matrix factored front by front, where photographs share points with a few others only.
+
+    S = (A C; C' D)     A: exterior orientation, block by block; D: interior unknowns and kept points
+
+is factored as A = L L' and D - C' A^-1 C. A is never put together: every front (`fronts`) sums what its
+object points add, takes what the fronts before it have left, eliminates its own photographs and leaves the
+rest to the next. The motions that the datum leaves open, and any further null vectors, are held by adding 1
+to one diagonal element for each: with g free of the null space these unknowns get dx = 0 and nothing else
+changes, a minimal constraint.
+
+Source: Duff and Reid (1983), ACM Trans. Math. Softw. 9(3); Liu (1992), SIAM Review 34(1); Foerstner and
+Wrobel (2016), sec. 15.2.4 and 4.5.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from scipy.linalg import cho_factor, eigh, qr
+from scipy.linalg.blas import dsyrk, dtrsm
+from scipy.linalg.lapack import dpotrf
+
+from sfm.adjustment.engine.collinearity import Observations
+from sfm.adjustment.engine.motions import Motions
+from sfm.adjustment.engine.normals import Equations
+from sfm.adjustment.engine.products import times_points, times_reduced
+from sfm.adjustment.engine.solvers.dense import MAX_BYTES, NULL, WEAK_PIVOT
+from sfm.adjustment.engine.solvers.fronts import Front, Fronts
+from sfm.adjustment.engine.solvers.multifrontal_factor import Eliminated, MultifrontalFactor
+from sfm.adjustment.engine.solvers.pairs import subtract_border
+from sfm.adjustment.engine.unknowns import Unknowns
+from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
+from sfm.errors import GeometryError
+from sfm.kernels.blocks import subtract_pair
+from sfm.kernels.options import kernel
+from sfm.kernels.threads import at_once
+
+SHIFT = 1e-10  # share of the diagonal added to look for null vectors; far above rounding, far below weak ones
+INVERSE_STEPS = 12  # of inverse iteration; each brings null vectors forward by eigenvalue / SHIFT
+FIRST_SOUGHT = 8  # null vectors looked for at first
+
+
+class Border(NamedTuple):
+    """Scaled parts of the reduced normal matrix beside the exterior orientation."""
+
+    C: FloatArray  # (6 m, i + 3 s)
+    D: FloatArray  # (i + 3 s, i + 3 s)
+
+
+@dataclass(frozen=True)
+class MultifrontalSolver:
+    """The reduced normal matrix as a tree of fronts."""
+
+    layout: Unknowns
+    fronts: Fronts
+
+    @property
+    def has_coarse(self) -> bool:
+        """Whether a step on the way takes less time in single precision: never."""
+        return False
+
+    def factor(
+        self, equations: Equations, motions: Motions, *, damped: bool = False, coarse: bool = False
+    ) -> MultifrontalFactor | None:
+        """Return the factored reduced normal equations; Args: as `Solver.factor`.
+
+        Raises:
+            GeometryError: the factor would not fit in memory.
+        """
+        size = self.fronts.bytes
+        if size > MAX_BYTES:
+            raise GeometryError(
+                f"adjustment: the normal equations of {len(self.layout.exterior_free)} photographs need "
+                f"{size / 1e9:.0f} GB when they are factored, at most {MAX_BYTES / 1e9:.0f} GB are taken"
+            )
+        scale = equations.parts.scale
+        Q = np.linalg.qr(motions.reduced / scale[:, None])[0] if motions.defect else motions.reduced
+        first = self.layout.exterior_free.size
+        holds = _largest(Q[:first])  # of exterior unknowns, else A would stay singular
+        border = self._border(equations)
+        none = np.zeros((self.layout.reduced, 0))
+        factor = self._factored(equations, border, holds, none)
+        if not damped and (factor is None or factor.weak):
+            further = self._null_vectors(equations, border, holds, Q)
+            factor = self._factored(equations, border, np.concatenate([holds, _largest(further)]), further)
+        return factor
+
+    def _border(self, equations: Equations) -> Border:
+        """Return the scaled border and corner."""
+        b, parts = equations.blocks, equations.parts
+        first, inner = 6 * len(b.U), b.Y_interior.shape[2]
+        C, D = parts.border.T.copy(), parts.corner.copy()
+        subtract_border(self.layout.observations, b.Y, b.Y_interior, C[:inner])
+        interior = b.Y_interior.reshape(-1, inner)
+        D[:inner, :inner] -= interior.T @ interior
+        C = C.T
+        s, sb = parts.scale[:first], parts.scale[first:]
+        C *= s[:, None] * sb
+        D *= sb[:, None] * sb
+        D[np.arange(len(D)), np.arange(len(D))] += equations.damping
+        return Border(C, D)
+
+    def _factored(
+        self,
+        equations: Equations,
+        border: Border,
+        holds: IntArray,
+        further: FloatArray,
+        *,
+        shift: float = 0.0,
+    ) -> MultifrontalFactor | None:
+        """Return the factor with some unknowns held; None if the matrix is not positive definite."""
+        first = self.layout.exterior_free.size
+        added = np.full(self.layout.reduced, shift)
+        added[holds] += 1.0
+        eliminated = self._eliminate(equations, added[:first])
+        if eliminated is None:
+            return None
+        weak = any(front.weakest**2 < WEAK_PIVOT for front in eliminated)
+        none = np.zeros((first, 0))
+        own = MultifrontalFactor(self.layout, self.fronts, equations.parts.scale, eliminated, border.C)
+        X, corner = none, border.D + np.diag(added[first:])
+        if len(border.D):
+            X = own.solve_exterior(border.C)
+            try:
+                corner, _ = cho_factor(corner - border.C.T @ X)
+            except np.linalg.LinAlgError:
+                return None
+            weak = weak or bool(np.diagonal(corner).min() ** 2 < WEAK_PIVOT)
+        return own.with_border(X, corner, weak=weak, further=further)
+
+    def _eliminate(self, equations: Equations, added: FloatArray) -> list[Eliminated] | None:
+        """Return all fronts eliminated, added to the diagonal; None if one is not positive definite."""
+        fronts = self.fronts.fronts
+        found: list[Eliminated | None] = [None] * len(fronts)
+        left: dict[int, FloatArray] = {}  # what fronts leave to their parents
+
+        def eliminate(begin: int, end: int) -> bool:
+            for g in range(begin, end):
+                front = fronts[g]
+                F = self._front(equations, front, added)
+                for child in front.children:  # in this order however many threads there are
+                    _extend(left.pop(child), fronts[child].into, F)
+                done = _eliminated(F, 6 * front.own)
+                if done is None:
+                    return False
+                found[g], left[g] = done
+            return True
+
+        half, end = self.fronts.halves
+        both = at_once(lambda: eliminate(0, half), lambda: eliminate(half, end))
+        if not (all(both) and eliminate(end, len(fronts))):
+            return None
+        return [front for front in found if front is not None]
+
+    def _front(self, equations: Equations, front: Front, added: FloatArray) -> FloatArray:
+        """Return the scaled matrix of a front without what others leave to it, lower triangle."""
+        b, size = equations.blocks, 6 * len(front.photographs)
+        F = np.zeros((size, size))
+        scale = equations.parts.scale[front.rows]
+        _sum_front(
+            self.layout.observations, b.U, b.Y, front.photographs[: front.own], front.points,
+            self.fronts.local, scale, F.reshape(-1),
+        )  # fmt: skip
+        own = np.arange(6 * front.own)
+        F[own, own] += equations.damping + added[front.rows[own]]  # the diagonal of U is 1 by its scale
+        return F
+
+    def _null_vectors(
+        self, equations: Equations, border: Border, holds: IntArray, Q: FloatArray
+    ) -> FloatArray:
+        """Return null vectors that are none of the motions Q, orthonormal, by inverse iteration."""
+        factor = self._factored(equations, border, holds, Q, shift=SHIFT)
+        if factor is None:
+            return np.zeros((len(Q), 0))
+        scale = equations.parts.scale[:, None]
+        sought = FIRST_SOUGHT
+        while True:
+            V = np.random.default_rng(0).standard_normal((len(Q), sought))
+            for _ in range(INVERSE_STEPS):
+                V = factor.solve(np.linalg.qr(V - Q @ (Q.T @ V))[0] / scale) / scale
+            V = np.linalg.qr(V - Q @ (Q.T @ V))[0]
+            values, vectors = eigh(V.T @ self._times(equations, V))
+            null: BoolArray = values < NULL
+            if not null.all() or sought >= len(Q):
+                return np.asarray(V @ vectors[:, null])
+            sought *= 2
+
+    def _times(self, equations: Equations, V: FloatArray) -> FloatArray:
+        """Return S V of the scaled, undamped matrix, (reduced, e)."""
+        b, parts, observations = equations.blocks, equations.parts, self.layout.observations
+        m, e = len(b.U), V.shape[1]
+        x = np.ascontiguousarray(parts.scale[:, None] * V)
+        points, through = np.empty((len(b.y), 3, e)), np.zeros_like(x)
+        times_reduced(observations, b, x, points)
+        times_points(observations, b, points, through)
+        top, low = x[: 6 * m], x[6 * m :]
+        product = np.empty_like(x)
+        product[: 6 * m] = (b.U @ top.reshape(m, 6, e)).reshape(6 * m, e) + parts.border @ low
+        product[6 * m :] = parts.border.T @ top + parts.corner @ low
+        return np.asarray(parts.scale[:, None] * (product - through))
+
+
+def _eliminated(F: FloatArray, own: int) -> tuple[Eliminated, FloatArray] | None:
+    """Return the factor of the first unknowns of a front, and what they leave of the rest."""
+    U, info = dpotrf(F[:own, :own].T.copy(order="F"), lower=0, clean=1, overwrite_a=1)
+    if info != 0:
+        return None
+    rest = F[own:, own:].copy()
+    K = F[own:, :own].copy()
+    if len(K):
+        K = dtrsm(1.0, U, K.T, trans_a=1, overwrite_b=1).T
+        rest = dsyrk(-1.0, K.T, beta=1.0, c=rest.T, trans=1, overwrite_c=1).T
+    return Eliminated(U.T, K, float(np.diagonal(U).min())), rest
+
+
+def _largest(vectors: FloatArray) -> IntArray:
+    """Return as many rows as there are vectors, in which these are as independent as can be."""
+    if vectors.shape[1] == 0:
+        return np.zeros(0, dtype=np.int64)
+    _, _, pivots = qr(vectors.T, mode="economic", pivoting=True)
+    return np.asarray(pivots[: vectors.shape[1]], dtype=np.int64)
+
+
+@kernel
+def _sum_front(
+    observations: Observations,
+    U: FloatArray,
+    Y: FloatArray,
+    own: IntArray,
+    points: IntArray,
+    local: AnyArray,
+    scale: FloatArray,
+    flat: FloatArray,
+) -> None:
+    """Fill the lower triangle with U of the own photographs less Y Y' of the object points, scaled."""
+    size = len(scale)
+    for i in range(len(own)):
+        for q in range(6):
+            for p in range(q + 1):
+                flat[(6 * i + q) * size + 6 * i + p] = U[own[i], q, p]
+    for j in points:
+        for s in range(observations.start[j], observations.start[j + 1]):
+            row = 6 * local[s]
+            for t in range(observations.start[j], observations.start[j + 1]):
+                if local[t] <= local[s]:  # twice where a point is measured twice in a photograph
+                    subtract_pair(flat, row * size + 6 * local[t], size, Y, s, t)
+    for row in range(size):
+        for column in range(row + 1):
+            flat[row * size + column] *= scale[row] * scale[column]
+
+
+@kernel
+def _extend(rest: FloatArray, into: IntArray, F: FloatArray) -> None:
+    """Add the lower triangle of what a front leaves to the front that takes it."""
+    for i in range(len(into)):
+        for k in range(i + 1):
+            for q in range(6):
+                row, other = F[6 * into[i] + q], rest[6 * i + q]
+                for p in range(6):
+                    row[6 * into[k] + p] += other[6 * k + p]

@@ -1,0 +1,220 @@
+"""The factor of a reduced normal matrix in fronts: solutions, and elements of its inverse.
+
+From A = L L' and Z = A^-1 follows, front by front from the last,
+
+    Z_RJ = -Z_RR G,   Z_JJ = L_JJ^-T L_JJ^-1 - G' Z_RJ,   G = L_RJ L_JJ^-1
+
+where J are the own photographs of a front and R the others, whose Z_RR the front behind it has already.
+
+Source: Takahashi, Fagan and Chin (1973), Formation of a sparse bus impedance matrix; Erisman and Tinney
+(1975), Comm. ACM 18(3); Liu (1992), SIAM Review 34(1); Foerstner and Wrobel (2016), sec. 15.2.5.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple
+
+import numpy as np
+from scipy.linalg import cho_solve
+from scipy.linalg.blas import dtrsm
+from scipy.linalg.lapack import dtrtri
+
+from sfm.adjustment.engine.accumulate import Blocks
+from sfm.adjustment.engine.collinearity import Observations
+from sfm.adjustment.engine.solvers.fronts import Front, Fronts
+from sfm.adjustment.engine.solvers.protocol import Inverse
+from sfm.adjustment.engine.unknowns import Unknowns
+from sfm.conventions import AnyArray, FloatArray, IntArray
+from sfm.kernels.blocks import add_product
+from sfm.kernels.options import kernel
+
+
+class Eliminated(NamedTuple):
+    """What eliminating the own photographs of a front leaves of the factor."""
+
+    L: FloatArray  # of the own unknowns, lower triangle, (j, j)
+    K: FloatArray  # rows of the other unknowns of the front, (r, j)
+    weakest: float  # smallest pivot
+
+
+@dataclass(frozen=True)
+class MultifrontalFactor:
+    """Factors of a reduced normal matrix with its null space held."""
+
+    layout: Unknowns
+    fronts: Fronts
+    scale: FloatArray  # 1/sqrt of the unreduced diagonal, (reduced,)
+    eliminated: list[Eliminated]  # L of A + holds = L L', front by front
+    C: FloatArray  # (6 m, i + 3 s)
+    X: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))  # A^-1 C, (6 m, i + 3 s)
+    corner: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))  # upper factor of D - C' A^-1 C
+    further: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))  # null vectors that the datum does
+    # not explain, scaled, orthonormal, (reduced, e)
+    weak: bool = False  # whether a pivot is near 0
+
+    def with_border(
+        self, X: FloatArray, corner: FloatArray, *, weak: bool, further: FloatArray
+    ) -> MultifrontalFactor:
+        """Return it with what belongs to the unknowns beside the exterior orientation."""
+        return replace(self, X=X, corner=corner, weak=weak, further=further)
+
+    def solve(self, right: FloatArray) -> FloatArray:
+        """Return a solution of S x = right for one or several right sides, (reduced,) or (reduced, r)."""
+        first = len(self.C)
+        columns = right if right.ndim == 2 else right[:, None]
+        s = self.scale[:, None]
+        r = s * columns
+        x = np.empty_like(r)
+        x[:first] = self.solve_exterior(r[:first])
+        if len(self.corner):
+            x[first:] = cho_solve((self.corner, False), r[first:] - self.C.T @ x[:first])
+            x[:first] -= self.X @ x[first:]
+        return np.asarray((s * x).reshape(right.shape))
+
+    def solve_exterior(self, right: FloatArray) -> FloatArray:
+        """Return A^-1 right, scaled, (6 m, r)."""
+        x = np.array(right, order="C")
+        pairs = list(zip(self.fronts.fronts, self.eliminated, strict=True))
+        for front, (L, K, _) in pairs:
+            own, rest = np.split(front.rows, [6 * front.own])
+            x[own] = dtrsm(1.0, L.T, x[own], trans_a=1)
+            if len(rest):
+                x[rest] -= K @ x[own]
+        for front, (L, K, _) in reversed(pairs):
+            own, rest = np.split(front.rows, [6 * front.own])
+            y = x[own] - K.T @ x[rest] if len(rest) else x[own]
+            x[own] = dtrsm(1.0, L.T, y)
+        return x
+
+    def inverse(self, blocks: Blocks, *, cross: bool) -> Inverse:
+        """Return the elements of the inverse; Args: as `Factor.inverse`.
+
+        With Z = A^-1 within the fronts, X = A^-1 C and Q = (D - C' A^-1 C)^-1 they are those of
+        S^-1 = (Z + X Q X'   -X Q; -Q X'   Q).
+        """
+        b, observations = blocks, self.layout.observations
+        first, border = len(self.C), len(self.corner)
+        own = self.scale * self.layout.reduced_free()
+        s, sb = own[:first], own[first:]
+        X = self.X * s[:, None] / self.scale[first:]
+        Q = cho_solve((self.corner, False), np.eye(border)) if border else np.zeros((0, 0))
+        Q = Q * sb[:, None] * sb
+        XQ = X @ Q
+        n, most = len(b.y), int(np.diff(observations.start).max())
+        core, exterior = np.zeros((n, 3, 3)), np.empty((len(b.U), 6, 6))
+        YQ = np.zeros((len(b.Y) if cross else most, 3, 6))
+        YQ_border = np.zeros((n if cross else 1, 3, border))
+        u, uQ = np.empty((3, border)), np.empty((3, border))
+        for front, Z in self._inverse_fronts():
+            scale = s[front.rows]
+            Z_own = Z * scale[:, None] * scale
+            for i, photograph in enumerate(front.photographs[: front.own]):
+                at = slice(6 * i, 6 * i + 6)
+                rows = slice(6 * photograph, 6 * photograph + 6)
+                exterior[photograph] = Z_own[at, at] + XQ[rows] @ X[rows].T
+            _sum_pairs(
+                observations, front.points, self.fronts.local, b.Y, b.Y_interior, Z_own.reshape(-1),
+                len(Z_own), X, Q, u, uQ, cross, core, YQ, YQ_border,
+            )  # fmt: skip
+        if not cross:
+            YQ, YQ_border = YQ[:0], YQ_border[:0]
+        return Inverse(exterior, -XQ, Q, core, YQ, YQ_border)
+
+    def _inverse_fronts(self) -> Iterator[tuple[Front, FloatArray]]:
+        """Yield the fronts from the last on, with their elements of A^-1, scaled."""
+        fronts = self.fronts.fronts
+        waiting = np.bincount([front.parent + 1 for front in fronts], minlength=len(fronts) + 1)[1:]
+        kept: dict[int, FloatArray] = {}
+        for g in range(len(fronts) - 1, -1, -1):
+            front, (L, K, _) = fronts[g], self.eliminated[g]
+            own, size = 6 * front.own, 6 * len(front.photographs)
+            inverse = np.tril(dtrtri(L.T, lower=0)[0].T)
+            Z = np.empty((size, size))
+            Z[:own, :own] = inverse.T @ inverse
+            if size > own:
+                _pick(kept[front.parent], front.into, Z[own:, own:])
+                G = K @ inverse
+                Z[own:, :own] = -(Z[own:, own:] @ G)
+                Z[:own, own:] = Z[own:, :own].T
+                Z[:own, :own] -= G.T @ Z[own:, :own]
+            if front.parent >= 0:
+                waiting[front.parent] -= 1
+                if waiting[front.parent] == 0:
+                    del kept[front.parent]
+            if waiting[g]:
+                kept[g] = Z
+            yield front, Z
+
+
+@kernel
+def _pick(Z: FloatArray, into: IntArray, part: AnyArray) -> None:
+    """Copy the elements of some photographs of a front."""
+    for i in range(len(into)):
+        for q in range(6):
+            row, other = Z[6 * into[i] + q], part[6 * i + q]
+            for k in range(len(into)):
+                for p in range(6):
+                    other[6 * k + p] = row[6 * into[k] + p]
+
+
+@kernel
+def _sum_pairs(
+    observations: Observations,
+    points: IntArray,
+    local: AnyArray,
+    Y: FloatArray,
+    Y_interior: FloatArray,
+    Z: FloatArray,
+    size: int,
+    X: FloatArray,
+    Q: FloatArray,
+    u: FloatArray,
+    uQ: FloatArray,
+    cross: bool,
+    core: FloatArray,
+    YQ: FloatArray,
+    YQ_border: FloatArray,
+) -> None:
+    """Fill Y'S^-1 and Y'S^-1 Y of the object points of a front; Z of its photographs, row by row."""
+    inner = Y_interior.shape[2]
+    for j in points:
+        begin, end = observations.start[j], observations.start[j + 1]
+        shift = 0 if cross else begin
+        for p in range(3):  # u = Y'X - Y_interior
+            for c in range(len(Q)):
+                u[p, c] = -Y_interior[j, p, c] if c < inner else 0.0
+        for t in range(begin, end):
+            column = 6 * observations.image[t]
+            for p in range(3):
+                for q in range(6):
+                    for c in range(len(Q)):
+                        u[p, c] += Y[t, p, q] * X[column + q, c]
+        for p in range(3):
+            for c in range(len(Q)):
+                total = 0.0
+                for s in range(len(Q)):
+                    total += u[p, s] * Q[s, c]
+                uQ[p, c] = total
+        for s in range(begin, end):
+            row = 6 * observations.image[s]
+            for p in range(3):
+                for q in range(6):
+                    total = 0.0
+                    for c in range(len(Q)):
+                        total += uQ[p, c] * X[row + q, c]
+                    YQ[s - shift, p, q] = total
+            for t in range(begin, end):
+                add_product(YQ, s - shift, Y, t, Z, 6 * local[t] * size + 6 * local[s], size)
+            for p in range(3):
+                for q in range(3):
+                    for r in range(6):
+                        core[j, p, q] += YQ[s - shift, p, r] * Y[s, q, r]
+        for p in range(3):
+            for q in range(3):
+                for c in range(inner):
+                    core[j, p, q] -= uQ[p, c] * Y_interior[j, q, c]
+            if cross:
+                for c in range(len(Q)):
+                    YQ_border[j, p, c] = -uQ[p, c]
