@@ -74,7 +74,7 @@ def _page(found: Refinement, numbers: Numbers, images: list[list[object]], title
             "afterwards; standard deviations are those without that condition."
         )
     bad = not after.converged or after.defect > after.expected_defect
-    remarks += found.remarks
+    remarks += [*after.remarks, *found.remarks]
     unit = "object units" if found.targets is None else found.targets.unit
     given = Given(control_residuals(after, unit), bar_residuals(after, unit), None, None, None)
     return render(

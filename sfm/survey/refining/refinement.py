@@ -253,7 +253,7 @@ def refinement_text(result: Refinement) -> str:
         f"RMS after     {result.after_px:.4f} px\n"
         f"sigma0        {result.adjustment.sigma0_px:.4f} px (redundancy {result.adjustment.redundancy})\n"
         + _words_of_targets(result)
-        + "".join(f"warning: {line}\n" for line in result.remarks)
+        + "".join(f"warning: {line}\n" for line in (*result.adjustment.remarks, *result.remarks))
     )
 
 
