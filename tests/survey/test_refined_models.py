@@ -14,6 +14,7 @@ import pytest
 
 from adapters.colmap.camera_models import read_model, write_model
 from adapters.colmap.database import write_database
+from adapters.colmap.model_files import MODELS
 from adapters.colmap.refined_model import colmap_jacobian, colmap_parameters, open_model
 from datasets.textured import render
 from sfm.camera import camera_from_values, project, tangents_from_pixel
@@ -43,6 +44,8 @@ PARAMS = {
     "RADIAL": [FOCAL, SIZE[0] / 2, SIZE[1] / 2, 1e-4, 1e-4],
     "FULL_OPENCV": [FOCAL, FOCAL, SIZE[0] / 2, SIZE[1] / 2, 1e-4, *[0.0] * 7],
     "OPENCV_FISHEYE": [FOCAL, FOCAL, SIZE[0] / 2, SIZE[1] / 2, *[0.0] * 4],
+    "DIVISION": [FOCAL, FOCAL, SIZE[0] / 2, SIZE[1] / 2, 0.0],
+    "EUCM": [FOCAL, FOCAL, SIZE[0] / 2, SIZE[1] / 2, 0.5, 1.0],
 }
 AWAY = 40  # of the numbers of COLMAP
 
@@ -251,10 +254,19 @@ def test_masks(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert "where the mask is black" in capsys.readouterr().out
 
 
-def test_a_fisheye_camera_is_refused_by_its_name(tmp_path: Path) -> None:
-    _model(tmp_path, "OPENCV_FISHEYE")
-    with pytest.raises(BackendError, match="COLMAP's model OPENCV_FISHEYE, expected one of SIMPLE_PINHOLE"):
+@pytest.mark.parametrize("camera", ["OPENCV_FISHEYE", "DIVISION", "EUCM"])
+def test_a_camera_that_is_not_known_is_refused_by_its_name(tmp_path: Path, camera: str) -> None:
+    _model(tmp_path, camera)
+    with pytest.raises(BackendError, match=f"COLMAP's model {camera}, expected one of SIMPLE_PINHOLE"):
         refine(tmp_path / "model", tmp_path)
+
+
+def test_every_model_of_colmap_is_known_by_its_number() -> None:
+    known = [name for name in pycolmap.CameraModelId.__members__ if name != "INVALID"]
+    theirs = {int(pycolmap.CameraModelId.__members__[name].value): name for name in known}
+    assert [theirs[number] for number in range(len(theirs))] == list(MODELS)
+    for name, count in MODELS.items():
+        assert len(pycolmap.Camera.create_from_model_name(1, name, 100.0, 640, 480).params) == count
 
 
 @pytest.mark.parametrize("camera", ["SIMPLE_PINHOLE", "RADIAL"])
