@@ -48,6 +48,7 @@ PARAMS = {
     "EUCM": [FOCAL, FOCAL, SIZE[0] / 2, SIZE[1] / 2, 0.5, 1.0],
 }
 AWAY = 40  # of the numbers of COLMAP
+SMALL = 0.8  # scale of the photographs of a second camera
 
 
 def _paint_target(skin: AnyArray, code: int, at: FloatArray) -> None:
@@ -103,16 +104,30 @@ def _target_places() -> FloatArray:
     return np.column_stack([x, y, render.height(x, y)])
 
 
-def _model(folder: Path, camera: str = "SIMPLE_RADIAL", *, rig: bool = False, targets: bool = False) -> Any:
-    """Write photographs in two folders and a model of them with numbers of its own, and return the scene."""
+def _model(
+    folder: Path,
+    camera: str = "SIMPLE_RADIAL",
+    *,
+    rig: bool = False,
+    targets: bool = False,
+    second: str | None = None,
+) -> Any:
+    """Write photographs in two folders and a model of them with numbers of its own, and return the scene.
+
+    With a second camera model the photographs of the second folder are smaller, and have the names of those
+    in the first.
+    """
     pictures, truth = _scene(targets)
     rng = np.random.default_rng(9)
     scene = pycolmap.Reconstruction()
-    cameras = (7, 9) if rig else (7, 7)
+    cameras = (7, 9) if rig or second else (7, 7)
     for number in sorted(set(cameras)):
         lens = pycolmap.Camera(
             model=camera, width=SIZE[0], height=SIZE[1], params=PARAMS[camera], camera_id=number
         )
+        if second and number == 9:
+            size = tuple(round(SMALL * side) for side in SIZE)
+            lens = pycolmap.Camera.create_from_model_name(9, second, SMALL * FOCAL, *size)
         (scene.add_camera if rig else scene.add_camera_with_trivial_rig)(lens)
     poses = []
     for i in range(len(pictures)):
@@ -122,10 +137,13 @@ def _model(folder: Path, camera: str = "SIMPLE_RADIAL", *, rig: bool = False, ta
         _add_rig(scene, poses)
     for i, picture in enumerate(pictures):
         seen = project(truth.cameras[0], truth.position[i], truth.rotation[i], truth.points)
+        name = f"{'ab'[i % 2]}/{i // 2 if second else i}.png"
+        if second and i % 2:
+            seen = SMALL * (seen + 0.5) - 0.5
+            picture = cv2.resize(picture, None, fx=SMALL, fy=SMALL, interpolation=cv2.INTER_AREA)
         seen = np.vstack(
             [[5.0, 6.0], seen + rng.normal(0, NOISE_PX, seen.shape)]
         )  # the first claims no point
-        name = f"{'ab'[i % 2]}/{i}.png"
         image = pycolmap.Image(name=name, keypoints=seen + 0.5, camera_id=cameras[i % 2], image_id=AWAY + i)
         if rig:
             image.frame_id = 1 + i // 2
@@ -209,6 +227,24 @@ def test_what_is_not_measured_stays_as_it_is(
     error = after.compute_mean_reprojection_error()
     pycolmap.bundle_adjustment(after, pycolmap.BundleAdjustmentOptions(print_summary=False))
     assert after.compute_mean_reprojection_error() < 1.05 * error
+
+
+@pytest.mark.parametrize(("camera", "second"), [("SIMPLE_RADIAL", "OPENCV"), ("FULL_OPENCV", "PINHOLE")])
+def test_two_sizes_of_photographs_with_the_same_names(tmp_path: Path, camera: str, second: str) -> None:
+    before = _model(tmp_path, camera, second=second)
+    before.write_text(str(tmp_path / "model"))
+    for kind in ("cameras", "images", "points3D", "rigs", "frames"):  # the text is read
+        (tmp_path / "model" / f"{kind}.bin").unlink()
+    refine(tmp_path / "model", tmp_path, fix="cx,cy")
+    after = pycolmap.Reconstruction(str(tmp_path / "model_refined"))
+    assert [after.camera(i).model_name for i in (7, 9)] == [camera, second]
+    assert (after.camera(9).width, after.camera(9).height) == (240, 192)
+    names = [after.image(AWAY + i).name for i in range(PHOTOGRAPHS)]
+    assert names == ["a/0.png", "b/0.png", "a/1.png", "b/1.png"]
+    assert set(after.point3D_ids()) == set(before.point3D_ids())
+    after.update_point_3d_errors()
+    errors = [p.error for p in after.points3D.values() if p.track.length() > 2]
+    assert len(errors) == 60 and np.median(errors) < 0.05  # of key points with a noise of 0.3 px
 
 
 def test_a_rig_comes_out_with_its_rig(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
