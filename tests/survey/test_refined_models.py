@@ -235,7 +235,7 @@ def test_two_sizes_of_photographs_with_the_same_names(tmp_path: Path, camera: st
     before.write_text(str(tmp_path / "model"))
     for kind in ("cameras", "images", "points3D", "rigs", "frames"):  # the text is read
         (tmp_path / "model" / f"{kind}.bin").unlink()
-    refine(tmp_path / "model", tmp_path, fix="cx,cy")
+    refine(tmp_path / "model", tmp_path, fix="f,fx,fy,cx,cy,k1")
     after = pycolmap.Reconstruction(str(tmp_path / "model_refined"))
     assert [after.camera(i).model_name for i in (7, 9)] == [camera, second]
     assert (after.camera(9).width, after.camera(9).height) == (240, 192)

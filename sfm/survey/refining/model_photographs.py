@@ -27,14 +27,16 @@ class Photographs:
         self._sizes = [estimate.cameras[camera].size_px for camera in network.camera]
         self._memory = memory_bytes
         self._kept: OrderedDict[int, AnyArray] = OrderedDict()
+        self._bytes = 0  # of these
 
     def grey(self, i: int) -> AnyArray:
         """Return one photograph, float32, (H, W)."""
         if i not in self._kept:
             self._kept[i] = grey_of(read_of_size(self._paths[i], self._names[i], self._sizes[i]))
+            self._bytes += self._kept[i].nbytes
         self._kept.move_to_end(i)
-        while len(self._kept) > 1 and sum(one.nbytes for one in self._kept.values()) > self._memory:
-            self._kept.popitem(last=False)
+        while len(self._kept) > 1 and self._bytes > self._memory:
+            self._bytes -= self._kept.popitem(last=False)[1].nbytes
         return self._kept[i]
 
 

@@ -86,19 +86,18 @@ def match_windows(
         own = rows[part]
         own = own[seen.image[own] != i]
         points, normal = _planes(estimate, camera, i, place[own], seen.point[own], of_photograph[i], seen)
-        for j, some in enumerate(rows_of(seen.image[own], len(network.images))):
-            if not len(some):
-                continue
-            to, left = own[some], place[own[some]]
-            warp = plane_warps(estimate, camera, i, j, left, points[some], normal[some], window_px / 2)
-            moved = np.einsum("kij,kj->ki", linear_part(warp), left - seen.xy[template_of[to]])
+        warp = plane_warps(estimate, camera, i, seen.image[own], place[own], points, normal, window_px / 2)
+        moved = np.einsum("kij,kj->ki", linear_part(warp), place[own] - seen.xy[template_of[own]])
+        others, number_of = np.unique(seen.image[own], return_inverse=True)
+        for j, some in zip(others.tolist(), rows_of(number_of, len(others)), strict=True):
+            to = own[some]
             match = match_lsm(
                 photographs.grey(i),
                 photographs.grey(j),
-                left,
-                seen.xy[to] + moved,
+                place[to],
+                seen.xy[to] + moved[some],
                 window_px=window_px,
-                start=warp,
+                start=warp[some],
                 max_shift_px=limits.shift_px,
                 min_correlation=limits.correlation,
             )
