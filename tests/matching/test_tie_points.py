@@ -224,9 +224,14 @@ def test_further_points_cover_photographs_that_are_oriented() -> None:
     arguments = (photographs, truth, camera, ties)
     found = find_further_points(*arguments, ties, window_px=15, spacing_px=15.0)
     seen, count = found.image_points, np.bincount(found.image_points.point)
-    assert len(found.points) > 3 * n and (count == 3).all()
+    assert (found.tie_point < 0).sum() > 3 * n and (count == 3).all()
+    tied = np.flatnonzero(found.tie_point >= 0)
+    assert 0.8 * n < len(tied) == len(np.unique(found.tie_point[tied]))
+    moved = found.points[tied] - truth.points[found.tie_point[tied]]
+    assert np.abs(moved).max() < 2e-3  # to the next whole pixel of 2.4 mm
     reference = np.flatnonzero((seen.xy == np.rint(seen.xy)).all(axis=1))
     apart = 15 - 5.5  # the windows of interest points keep the distance, edges meet within them
+    reference = reference[found.tie_point[seen.point[reference]] < 0]
     for i in range(3):
         own = seen.xy[reference[seen.image[reference] == i]]
         between = np.linalg.norm(own[:, None] - np.concatenate([own, xy[image == i]])[None], axis=2)
@@ -440,11 +445,11 @@ def test_textured_survey_from_photographs_to_result(folder: Path, tmp_path: Path
     assert a.covariance is not None
     share, z_rms = _from_surface(a.network, a.estimate, a.covariance.points)
     assert share >= 0.99
-    assert 0.8 < z_rms < 1.25
+    assert 0.85 < z_rms < 1.1  # 1.18 with blur left out, 1.11 with tie points as they were found
     near, z2, noise, stated = _from_their_places(a, folder)
     assert near >= 0.99
-    # surfaces that are not plane and differences of blur move all pictures of a point by 0.01 px together
-    assert 0.8 < z2 < 1.7
+    # surfaces that are not plane move all pictures of a point by a few thousandths of a pixel together
+    assert 0.8 < z2 < 1.3
     assert noise == pytest.approx(stated, rel=0.2)
 
 
@@ -487,7 +492,7 @@ def _from_their_places(a: Adjustment, folder: Path) -> tuple[float, float, float
         own = np.flatnonzero(seen.image[whole] == i)
         at = seen.xy[whole[own]]
         noisy = cv2.imread(str(folder / f"surface_{i + 1}.png"), cv2.IMREAD_UNCHANGED)
-        shift[own] = match_lsm(noisy, render.intensities(i, skin), at, at, window_px=15).xy - at
+        shift[own] = match_lsm(noisy, render.intensities(i, skin), at, at, window_px=15, blur=True).xy - at
         X[own] = render.surface_at(i, at + shift[own])
     assert a.covariance is not None and len(np.unique(point)) == len(point) > 2000
     known = np.isfinite(X).all(axis=1)

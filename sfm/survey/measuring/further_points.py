@@ -4,7 +4,8 @@ A few hundred tie points orient the photographs and tell the shape of the surfac
 interest points are taken where a photograph has no point yet, put on the plane through their neighbours in
 space, projected into all photographs that look at that plane, and measured there by least squares matching,
 in those with the most similar direction first, whose rays correct the place for the others. So a point is
-followed through all its photographs, also where the directions are too different for descriptors.
+followed through all its photographs, also where the directions are too different for descriptors. The tie
+points themselves are measured anew in the same way: when they were found, nothing was known of perspective.
 """
 
 from __future__ import annotations
@@ -35,20 +36,29 @@ TOLERANCE_PX = 1.5  # largest residual of a ray that stays with its point
 
 @dataclass(frozen=True)
 class FurtherPoints:
-    """New points and their rays."""
+    """Points and their rays."""
 
     image_points: ImagePoints  # k of them, their points 0 to n - 1
     points: FloatArray  # object points, (n, 3)
     residuals: FloatArray  # of the rays with the orientation as it was, px, (k, 2)
+    tie_point: IntArray  # the tie point that each was before, -1 of new ones, (n,)
 
 
 @dataclass(frozen=True)
 class _Places:
-    """New points of one reference photograph."""
+    """Points of one reference photograph."""
 
     xy: FloatArray  # whole pixels, (k, 2)
     normal: FloatArray  # of the surface there, towards the photograph, unit vectors, (k, 3)
     points: FloatArray  # object points, (k, 3)
+    tie_point: IntArray  # -1 of new ones, (k,)
+
+    def __len__(self) -> int:
+        return len(self.xy)
+
+    def select(self, rows: BoolArray) -> _Places:
+        """Return some of them."""
+        return _Places(self.xy[rows], self.normal[rows], self.points[rows], self.tie_point[rows])
 
 
 def find_further_points(
@@ -56,7 +66,7 @@ def find_further_points(
     estimate: Estimate,
     camera: IntArray,
     seen: ImagePoints,
-    taken: ImagePoints,
+    again: ImagePoints,
     *,
     window_px: int,
     spacing_px: float,
@@ -65,14 +75,14 @@ def find_further_points(
     min_correlation: float = 0.7,
     threads: int = 1,
 ) -> FurtherPoints:
-    """Find and measure points in all photographs that see them, until these are covered.
+    """Measure tie points anew, and further points, in all photographs that see them, until these are covered.
 
     Args:
         photographs: (H, W), m of them.
         estimate: orientation of the photographs, to a few pixels, and the tie points that there are.
         camera: index of the camera of each photograph, (m,).
         seen: image points of the tie points that fit, which tell the surface.
-        taken: image points that no new one is to be near to in its reference.
+        again: image points of those tie points that are measured anew; no new one is near to them.
         window_px: odd side of the windows.
         spacing_px: smallest distance of a new point from all others in its reference.
         references: photographs that points are taken from; all, those with the most tie points first, if not
@@ -86,7 +96,9 @@ def find_further_points(
     m = len(photographs)
     margin = window_px // 2 + BORDER_PX
     own = rows_of(seen.image, m)
-    places_of = [[taken.xy[rows]] for rows in rows_of(taken.image, m)]
+    places_of = [[again.xy[rows]] for rows in rows_of(again.image, m)]
+    ties = _references(again)
+    ties_of = [ties[rows] for rows in rows_of(again.image[ties], m)]
     order = np.argsort([-len(rows) for rows in own], kind="stable") if references is None else references
     shapes = [one.shape[:2] for one in photographs]
     found = [_none()]
@@ -99,23 +111,31 @@ def find_further_points(
             border_px=margin,
             taken=np.concatenate(places_of[i]),
         )
-        xy = np.rint(corners.xy)
+        xy = np.rint(np.concatenate([again.xy[ties_of[i]], corners.xy]))
         points, normal = planes_at(estimate, camera, i, xy, seen.point[own[i]])
-        known = np.isfinite(points).all(axis=1)
-        places = _Places(xy[known], normal[known], points[known])
+        tie_point = np.concatenate([again.point[ties_of[i]], np.full(len(corners.xy), -1)])
+        known = np.asarray(np.isfinite(points).all(axis=1))
+        places = _Places(xy, normal, points, tie_point).select(known)
         visible = _visible(estimate, camera, i, places, shapes, margin)
         several = visible.sum(axis=0) >= min_rays
         if not several.any():
             continue
-        places = _Places(places.xy[several], places.normal[several], places.points[several])
+        places = places.select(several)
         rays = _followed(
             photographs, estimate, camera, i, places, visible[:, several], window_px, min_correlation, threads
         )
-        new = _agreeing(rays, estimate, camera, len(places.xy), min_rays)
+        new = _agreeing(rays, estimate, camera, places.tie_point, min_rays)
         found.append(new)
         for j in np.unique(new.image_points.image).tolist():
             places_of[j].append(new.image_points.xy[new.image_points.image == j])
     return _joined(found)
+
+
+def _references(seen: ImagePoints) -> IntArray:
+    """Return the row of each point in the photograph that it was taken from, where it is on a whole pixel."""
+    between = (seen.xy != np.rint(seen.xy)).any(axis=1)
+    order = np.lexsort([between, seen.point])
+    return np.asarray(order[np.unique(seen.point[order], return_index=True)[1]])
 
 
 def _visible(
@@ -189,6 +209,7 @@ def _followed(
                 start=warp[fits],
                 max_shift_px=max_shift_px,
                 min_correlation=min_correlation,
+                blur=True,
                 threads=threads,
             )
             good = match.good
@@ -210,15 +231,16 @@ def _followed(
 
 
 def _agreeing(
-    seen: ImagePoints, estimate: Estimate, camera: IntArray, n: int, min_rays: int
+    seen: ImagePoints, estimate: Estimate, camera: IntArray, tie_point: IntArray, min_rays: int
 ) -> FurtherPoints:
     """Return the points with enough rays that meet, and these rays."""
+    n = len(tie_point)
     met = intersect_image_points(seen, camera, estimate, n_points=n, tolerance_px=TOLERANCE_PX)
     used = met.used & (np.bincount(seen.point[met.used], minlength=n) >= min_rays)[seen.point]
     kept, point = np.unique(seen.point[used], return_inverse=True)
     c = np.array([lens.c_px for lens in estimate.cameras])[camera[seen.image[used]]]
     image_points = replace(seen.select(used), point=point.ravel())
-    return FurtherPoints(image_points, met.points[kept], met.residuals[used] * c[:, None])
+    return FurtherPoints(image_points, met.points[kept], met.residuals[used] * c[:, None], tie_point[kept])
 
 
 def _concatenated(parts: Sequence[ImagePoints]) -> ImagePoints:
@@ -242,6 +264,7 @@ def _joined(found: Sequence[FurtherPoints]) -> FurtherPoints:
         _concatenated(moved),
         np.concatenate([one.points for one in found]),
         np.concatenate([one.residuals for one in found]),
+        np.concatenate([one.tie_point for one in found]),
     )
 
 
@@ -249,4 +272,4 @@ def _none() -> FurtherPoints:
     """Return no points."""
     none = np.zeros(0, dtype=np.int64)
     nothing = ImagePoints(none, none, np.zeros((0, 2)), np.zeros((0, 2, 2)))
-    return FurtherPoints(nothing, np.zeros((0, 3)), np.zeros((0, 2)))
+    return FurtherPoints(nothing, np.zeros((0, 3)), np.zeros((0, 2)), none)

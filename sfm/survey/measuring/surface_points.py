@@ -1,8 +1,8 @@
 """The points of a textured survey once its photographs are oriented: their windows cover the photographs.
 
 Windows that overlap measure the same pixels twice, and their errors have these in common: the precision of a
-result would be told too good. So tie points stay where they do not overlap, and what is not covered yet is
-filled. All pixels then take part once, whatever the size of the windows; it is chosen by what the surface
+result would be told too good. So tie points that do not overlap are measured anew, and what they do not cover
+is filled. All pixels then take part once, whatever the size of the windows; it is chosen by what the surface
 bears, which is hardly plane over large ones.
 """
 
@@ -85,7 +85,7 @@ def cover_photographs(
         min_rays=MIN_RAYS,
         threads=jobs,
     )
-    covered, values = _with_further(network, estimate, kept, further, survey.adjust.sigma_px)
+    covered, values = _with_further(network, estimate, further, survey.adjust.sigma_px)
     return Surface(covered, values, drawn_windows(covered, paths, window))
 
 
@@ -140,21 +140,22 @@ def _best_window(
 
 
 def _with_further(
-    network: Network, estimate: Estimate, kept: BoolArray, further: FurtherPoints, sigma_px: float
+    network: Network, estimate: Estimate, further: FurtherPoints, sigma_px: float
 ) -> tuple[Network, Estimate]:
-    """Return the network of the tie points that are kept, and of further points behind them."""
-    seen, new = network.image_points.select(kept), further.image_points
+    """Return the network of the tie points that were measured anew, and of further points behind them."""
     n = len(network.points)
-    names = tuple(f"t{n + j + 1:05d}" for j in range(len(further.points)))
-    image_points = ImagePoints(
-        np.concatenate([seen.image, new.image]),
-        np.concatenate([seen.point, new.point + n]),
-        np.concatenate([seen.xy, new.xy]),
-        np.concatenate([seen.covariance, new.covariance + sigma_px**2 * np.eye(2)]),
-    )
-    points = estimate.points.copy()
-    points[np.bincount(seen.point, minlength=n) == 0] = np.nan
+    new = further.tie_point < 0
+    place = further.tie_point.copy()
+    place[new] = n + np.arange(new.sum())
+    names = tuple(f"t{j + 1:05d}" for j in place[new].tolist())
+    seen = further.image_points
+    order = np.argsort(place[seen.point], kind="stable")
+    image_points = replace(
+        seen, point=place[seen.point], covariance=seen.covariance + sigma_px**2 * np.eye(2)
+    ).select(order)
+    points = np.full((n + len(names), 3), np.nan)
+    points[place] = further.points
     return (
         replace(network, points=(*network.points, *names), image_points=image_points),
-        replace(estimate, points=np.concatenate([points, further.points])),
+        replace(estimate, points=points),
     )
