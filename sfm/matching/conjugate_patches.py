@@ -18,7 +18,7 @@ from sfm.matching.correlation.ambiguity import ambiguous, independent_pixels
 from sfm.matching.correlation.ncc import NccMatches, match_ncc
 from sfm.matching.correlation.warped import match_ncc_warped
 from sfm.matching.lsm.patch_equations import MARGIN
-from sfm.matching.lsm.plane_windows import match_where_plane
+from sfm.matching.lsm.plane_windows import ELSEWHERE, match_where_plane
 from sfm.matching.lsm.two_photo import match_lsm
 from sfm.matching.lsm.warp import linear_part
 from sfm.matching.match_flags import LsmFlag, NccFlag, in_words
@@ -161,6 +161,9 @@ def confirmed(
 ) -> ConjugatePoints:
     """Return the matches, those flagged that do not lead back to within `back_px`.
 
+    By how much the others lead elsewhere, where it is more than noise, goes into their covariance: what one
+    photograph sees steeply the other one sees with windows that show less of the surface.
+
     Args:
         left: the left photograph.
         right: the right photograph.
@@ -186,10 +189,15 @@ def confirmed(
             Starts(target, np.asarray(np.linalg.inv(linear), dtype=float), reach),
             by,
         )
-    lost = good[~(np.linalg.norm(back.right - target, axis=1) <= by.back_px)]
+    off = back.right - target
+    lost = good[~(np.linalg.norm(off, axis=1) <= by.back_px)]
+    d, C = np.einsum("kij,kj->ki", linear_part(matched.warp[good]), off), matched.covariance[good]
+    real = np.einsum("ki,ki->k", d, np.linalg.solve(C, d[:, :, None])[:, :, 0]) > ELSEWHERE  # False for NaN
+    covariance = matched.covariance.copy()
+    covariance[good[real]] += d[real, :, None] * d[real, None, :]
     why = np.array(matched.reason, dtype=object)
     why[lost] = in_words(NccFlag, NccFlag.NOT_CONFIRMED)
-    return replace(matched, reason=tuple(why.tolist()))
+    return replace(matched, covariance=covariance, reason=tuple(why.tolist()))
 
 
 def _finished(
