@@ -73,6 +73,18 @@ def test_a_convergent_network_frees_what_it_determines_and_demands() -> None:
     assert set(chosen(network, truth, extend=False).cameras[0].free) == USUAL
 
 
+def test_a_point_whose_ray_is_rejected_holds_no_camera() -> None:
+    network, truth = make_network(seed_of("a wrong ray"), images=12, points=50)
+    seen = network.image_points
+    kept = (seen.point != 7) | (np.cumsum(seen.point == 7) <= 2)
+    seen = seen.select(kept)
+    xy = seen.xy.copy()
+    xy[np.flatnonzero(seen.point == 7)[0]] += [40.0, -40.0]  # of two rays: one is left of the point
+    wrong = replace(network, image_points=replace(seen, xy=xy))
+    free = chosen(wrong, truth, extend=False).cameras[0].free
+    assert free == chosen(network, truth, extend=False).cameras[0].free != ()
+
+
 def test_what_a_network_does_not_determine_is_held() -> None:
     network, truth = planar(seed_of("parallel photographs of a plane"), 8, tilt=0.005)
     assert not {"c", "x0", "y0"} & set(chosen(network, truth).cameras[0].free)

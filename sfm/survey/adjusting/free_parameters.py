@@ -128,7 +128,16 @@ def _adjusted(part: Network, start: Estimate, datum: str) -> Adjustment | None:
         found = adjust(part, start, datum=Datum(datum), reject="tau", redundancy_numbers=False)
     except (GeometryError, np.linalg.LinAlgError):
         return None
-    return found if found.converged and found.defect <= found.expected_defect else None
+    allowed = found.expected_defect + _defect_of_points(part, found)
+    return found if found.converged and found.defect <= allowed else None
+
+
+def _defect_of_points(part: Network, found: Adjustment) -> int:
+    """Return what points whose rays were rejected add to the rank defect; it says nothing of the cameras."""
+    rays = np.bincount(part.image_points.point[~found.rejected], minlength=len(part.points))
+    if part.control is not None:
+        rays[part.control.point] = MIN_RAYS
+    return int(3 * (rays == 0).sum() + (rays == 1).sum())
 
 
 def _reach(adjusted: Adjustment, a: int, name: str) -> float:
