@@ -50,7 +50,8 @@ def reconstruction(
         scene.add_camera_with_trivial_rig(colmap_camera(pycolmap, camera, k + 1))
     seen = network.image_points
     claimed = np.ones(len(seen), dtype=bool) if rejected is None else ~rejected
-    claimed &= estimate.oriented[seen.image] & estimate.determined[seen.point]
+    determined = estimate.determined
+    claimed &= estimate.oriented[seen.image] & determined[seen.point]
     slot = np.zeros(len(seen), dtype=np.int64)  # number of each image point in its photograph
     for i, rows in enumerate(rows_of(seen.image, len(network.images))):
         if not estimate.oriented[i]:
@@ -64,7 +65,7 @@ def reconstruction(
         )
         scene.add_image_with_trivial_frame(image, pose)
     for j, rows in enumerate(rows_of(seen.point, len(network.points))):
-        if not estimate.determined[j]:
+        if not determined[j]:
             continue
         track = pycolmap.Track(
             [pycolmap.TrackElement(int(seen.image[r]) + 1, int(slot[r])) for r in rows if claimed[r]]

@@ -29,7 +29,7 @@ from sfm.adjustment.engine.iterate import (
 )
 from sfm.adjustment.engine.local_frame import Local, local_of
 from sfm.adjustment.engine.observed_unknowns import weighted_of
-from sfm.adjustment.engine.unknowns import estimate_of, unknowns_of
+from sfm.adjustment.engine.unknowns import Unknowns, estimate_of, unknowns_of
 from sfm.adjustment.quality.gross_errors.rejection import REJECTS, Run, find_optimum
 from sfm.adjustment.quality.gross_errors.robust import (
     TUKEY,
@@ -42,6 +42,7 @@ from sfm.adjustment.quality.reliability import redundancy_numbers as numbers_of
 from sfm.adjustment.quality.reliability import redundancy_of_bars, standardised_residuals
 from sfm.adjustment.result import Adjustment, Covariance
 from sfm.conventions import FloatArray
+from sfm.display import listed
 from sfm.distributions import normal_sf
 from sfm.errors import GeometryError
 from sfm.kernels.threads import own_threads
@@ -49,6 +50,7 @@ from sfm.network import Estimate, Network
 from sfm.network_check import check_network, check_number
 
 FREE = Datum("free")
+MIN_HOLD = 0.01  # largest weight of the image points of a photograph below which none of them fits
 SLOPES = {"huber": huber_slopes, "tukey": tukey_slopes}  # of the M-estimators
 
 
@@ -169,6 +171,22 @@ def predict(
         return local.back(replace(result, image_sigma_factor=factor))
 
 
+def _let_go(layout: Unknowns, weight: FloatArray, network: Network) -> tuple[str, ...]:
+    """Return the line on photographs that robust weights have let go of: it converges wherever they are."""
+    seen = layout.active
+    image = layout.observations.image
+    largest = np.zeros(len(network.images))
+    np.maximum.at(largest, image[seen], weight[seen])
+    loose = np.bincount(image[seen], minlength=len(largest)) > 0
+    loose &= largest < MIN_HOLD
+    loose[network.exterior.image] = False
+    remarks: list[str] = []
+    if loose.any():
+        names = listed(network.images[i] for i in np.flatnonzero(loose))
+        remarks.append(f"no image point fits in {names}: nothing holds the position and rotation found")
+    return tuple(remarks)
+
+
 def _level_of(reject: str, alpha: float, usual: float) -> float:
     """Return the probability with which a good image coordinate is rejected; the usual one if none is."""
     if reject == "tukey":
@@ -250,6 +268,6 @@ def _result(
         inflation=factor,
         bar_redundancy=of_bars,
         datum_points=run.problem.datum.points,
-        remarks=run.remarks,
+        remarks=(*run.remarks, *_let_go(layout, weight, network)),
         start_sigma0=float(np.sqrt(run.start_vPv / redundancy)) if redundancy > 0 else float("nan"),
     )

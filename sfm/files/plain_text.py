@@ -50,7 +50,11 @@ def csv_text(header: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
     buffer = io.StringIO()
     writer = csv.writer(buffer, lineterminator="\n")
     writer.writerow(header)
-    writer.writerows([_cell(value) for value in row] for row in rows)
+    writer.writerows(
+        # `csv.writer` gives the digits of plain numbers, which most cells are
+        [value if type(value) is float and math.isfinite(value) else _cell(value) for value in row]
+        for row in rows
+    )
     return buffer.getvalue()
 
 
@@ -89,9 +93,7 @@ def as_plain(text: str) -> str:
 
 
 def _cell(value: object) -> object:
-    """Return what `csv.writer` is to write: it gives the digits of plain numbers itself, in less time."""
-    if type(value) is float:
-        return value if math.isfinite(value) else ""
+    """Return what `csv.writer` is to write."""
     if isinstance(value, str):
         return _text_cell(value)
     if isinstance(value, float | np.floating):

@@ -18,15 +18,14 @@ from sfm.matching.correlation.ambiguity import ambiguous, independent_pixels
 from sfm.matching.correlation.ncc import NccMatches, match_ncc
 from sfm.matching.correlation.warped import match_ncc_warped
 from sfm.matching.lsm.patch_equations import MARGIN
-from sfm.matching.lsm.two_photo import LsmMatches, match_lsm
+from sfm.matching.lsm.plane_windows import ELSEWHERE, match_where_plane
+from sfm.matching.lsm.two_photo import match_lsm
 from sfm.matching.lsm.warp import linear_part
 from sfm.matching.match_flags import LsmFlag, NccFlag, in_words
 from sfm.matching.radiometry import equalise_histogram, grey_of
 
 METHODS = {"ncc": "", "lsm": "affine", "lsm8": "projective", "shift": "shift"}
-SIGNIFICANT = 9.21  # chi-squared of a difference in the plane, 1 %
 MAX_BIAS_PX = 1.0  # of a match whose template is bent
-MIN_HALF_WINDOW_PX = 7  # smaller ones hold no affine parameters
 NOT_PLANE = "surface not plane over the template"
 START_CORRELATION = 0.5  # smallest r of a start, which the warp has yet to make alike
 
@@ -162,6 +161,9 @@ def confirmed(
 ) -> ConjugatePoints:
     """Return the matches, those flagged that do not lead back to within `back_px`.
 
+    By how much the others lead elsewhere, where it is more than noise, goes into their covariance: what one
+    photograph sees steeply the other one sees with windows that show less of the surface.
+
     Args:
         left: the left photograph.
         right: the right photograph.
@@ -187,10 +189,15 @@ def confirmed(
             Starts(target, np.asarray(np.linalg.inv(linear), dtype=float), reach),
             by,
         )
-    lost = good[~(np.linalg.norm(back.right - target, axis=1) <= by.back_px)]
+    off = back.right - target
+    lost = good[~(np.linalg.norm(off, axis=1) <= by.back_px)]
+    d, C = np.einsum("kij,kj->ki", linear_part(matched.warp[good]), off), matched.covariance[good]
+    real = np.einsum("ki,ki->k", d, np.linalg.solve(C, d[:, :, None])[:, :, 0]) > ELSEWHERE  # False for NaN
+    covariance = matched.covariance.copy()
+    covariance[good[real]] += d[real, :, None] * d[real, None, :]
     why = np.array(matched.reason, dtype=object)
     why[lost] = in_words(NccFlag, NccFlag.NOT_CONFIRMED)
-    return replace(matched, reason=tuple(why.tolist()))
+    return replace(matched, covariance=covariance, reason=tuple(why.tolist()))
 
 
 def _finished(
@@ -236,7 +243,9 @@ def _finished(
         else in_words(LsmFlag, one)
         for one, where in zip(lsm.flag.tolist(), outside, strict=True)
     )
-    bias = _bias(*seen, a, lsm, by)
+    bias = np.zeros((len(a), 2))
+    if by.method != "shift":
+        lsm, bias = match_where_plane(*seen, a, lsm, window_px=by.template_px, interpolation=by.interpolation)
     covariance = lsm.covariance + bias[:, :, None] * bias[:, None, :]
     bent = np.linalg.norm(bias, axis=1) > MAX_BIAS_PX
     reason = tuple(
@@ -248,28 +257,6 @@ def _finished(
         by.method, a, lsm.xy, covariance, lsm.warp, correlation, found.second, lsm.gain, lsm.offset,
         np.where(started, lsm.steps, 0), reason,
     )  # fmt: skip
-
-
-def _bias(left: AnyArray, right: AnyArray, a: FloatArray, lsm: LsmMatches, by: Settings) -> FloatArray:
-    """Return by how much matches are off since the surface is not plane over the template, px, (k, 2).
-
-    Over half of the window curvature has a quarter of its effect: what the place there differs by is three
-    quarters of the bias. Differences that may be noise count as none.
-    """
-    half = by.template_px // 4 * 2 + 1
-    bias = np.zeros((len(a), 2))
-    rows = np.flatnonzero(lsm.good)
-    if METHODS[by.method] == "shift" or half < MIN_HALF_WINDOW_PX or not len(rows):
-        return bias
-    linear = linear_part(lsm.warp[rows])
-    small = match_lsm(
-        left, right, a[rows], lsm.xy[rows], window_px=half, interpolation=by.interpolation, start=linear
-    )
-    rows, d = rows[small.good], (small.xy - lsm.xy[rows])[small.good]
-    C = small.covariance[small.good] + lsm.covariance[rows]
-    real = np.einsum("ki,ki->k", d, np.linalg.solve(C, d[..., None])[..., 0]) > SIGNIFICANT
-    bias[rows[real]] = d[real] / 0.75
-    return bias
 
 
 def _what_is_outside(

@@ -52,11 +52,18 @@ def grey_of(photograph: AnyArray) -> AnyArray:
         array = array.astype(np.float32) @ np.array(LUMINANCE, dtype=np.float32)
     if array.ndim != 2 or array.size == 0:
         raise PhotographError(f"found a photograph of shape {array.shape}, expected (H, W) or (H, W, 3)")
-    if array.dtype.kind == "f" and not np.isfinite(array).all():
+    if array.dtype.kind == "f" and not _finite(array):
         raise PhotographError(
             "found intensities that are not finite, needed numbers in all of the photograph"
         )
     return np.ascontiguousarray(array, dtype=np.float32)
+
+
+def _finite(array: AnyArray) -> bool:
+    """Return whether all intensities are finite; where their sum is, they are, and it is quicker."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        total = array.sum()
+    return bool(np.isfinite(total) or np.isfinite(array).all())
 
 
 def grey_of_8_bit(photograph: AnyArray) -> AnyArray:

@@ -8,7 +8,7 @@ import numpy as np
 from sfm.conventions import BoolArray, FloatArray, skew
 
 PLANAR_POINTS = 4
-RANSAC_TRIALS = 2000
+RANSAC_TRIALS = 300  # a plane is of interest that most pairs lie on; enough where half of them do, at 1e-8
 NO_BASE = 1e-9  # (sigma1 - sigma3) of a homography of unit sigma2 below which it is a rotation
 
 

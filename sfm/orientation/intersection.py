@@ -130,13 +130,14 @@ def _intersect_all(
             continue
         for i in range(m):
             _direction(rays, own[i], direction[i])
+        for i in range(m):
+            used[own[i]] = True
+        found = _nearest_to_rays(rays, own, direction, used, N, b, X)
         if np.isinf(limit) or m == 2:
-            for i in range(m):
-                used[own[i]] = True
-            if not _nearest_to_rays(rays, own, direction, used, N, b, X):
+            if not found:
                 _drop(own, used)
                 continue
-        else:
+        elif not found or _sum_of_squares(rays, own, X) > limit:
             score = _best_pair(rays, own, direction, limit, used, N, b, X, best_X)
             if np.isinf(score):
                 continue
@@ -273,6 +274,19 @@ def _best_pair(
                 best_X[:] = X
     _drop(own, used)
     return best
+
+
+@compiled
+def _sum_of_squares(rays: _Rays, own: IntArray, X: FloatArray) -> float:
+    """Return the sum of the squared image residuals of rays.
+
+    Up to the limit of a single ray no point has smaller truncated squares than the least squares of all
+    rays: to give up a ray costs as much.
+    """
+    total = 0.0
+    for k in own:
+        total += _square(rays, k, X)
+    return total
 
 
 @compiled

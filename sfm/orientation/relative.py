@@ -7,6 +7,7 @@ Photograph 1 is the frame: X0 = 0, R = I, image axes of photograph 1. Photograph
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -49,7 +50,14 @@ class RelativeOrientation:
     residuals: FloatArray  # distance from coplanarity of each pair, tangents, (n,)
     sigma0: float  # a posteriori standard deviation of an image coordinate, tangents
     redundancy: int  # fitting pairs - 5
-    covariance: FloatArray  # of two small turns of b (across it) and w in R exp([w]x), rad, (5, 5)
+    normal_matrix: FloatArray  # of two small turns of b (across it) and w in R exp([w]x), (5, 5)
+
+    @cached_property
+    def covariance(self) -> FloatArray:
+        """Covariance of two small turns of b (across it) and w in R exp([w]x), rad^2, (5, 5)."""
+        if not np.isfinite(self.normal_matrix).all():
+            return np.full((5, 5), np.nan)
+        return np.asarray(self.sigma0**2 * np.linalg.pinv(self.normal_matrix, hermitian=True))
 
     @property
     def rms(self) -> float:
@@ -157,9 +165,9 @@ def _infinite(
     redundancy = 2 * n - 3
     sigma0 = float(np.sqrt(square / redundancy / 2))  # differences of two photographs
     length = np.linalg.norm(off, axis=1)
-    covariance = np.full((5, 5), np.nan)
+    none = np.full((5, 5), np.nan)
     return RelativeOrientation(
-        "infinite", _NAN, R, _NAN, length <= tolerance, length, sigma0, redundancy, covariance
+        "infinite", _NAN, R, _NAN, length <= tolerance, length, sigma0, redundancy, none
     )
 
 
@@ -255,14 +263,11 @@ def _evaluate(
     uv2: FloatArray,
     inliers: BoolArray,
 ) -> RelativeOrientation:
-    """Residuals, sigma0 and covariance of an orientation over its fitting pairs."""
+    """Residuals, sigma0 and normal equations of an orientation over its fitting pairs."""
     redundancy = int(inliers.sum()) - UNKNOWNS
     residuals = np.abs(coplanarity_residuals(uv1, uv2, base, rotation)[0])
-    sigma0, covariance = np.nan, np.full((5, 5), np.nan)
+    sigma0, N = np.nan, np.full((5, 5), np.nan)
     if redundancy > 0:
         own, N = coplanarity_residuals(uv1[inliers], uv2[inliers], base, rotation)
         sigma0 = float(np.sqrt(np.sum(own**2) / redundancy))
-        covariance = sigma0**2 * np.linalg.pinv(N, hermitian=True)
-    return RelativeOrientation(
-        kind, base, rotation, normal, inliers, residuals, sigma0, redundancy, np.asarray(covariance)
-    )
+    return RelativeOrientation(kind, base, rotation, normal, inliers, residuals, sigma0, redundancy, N)

@@ -74,7 +74,7 @@ def _page(found: Refinement, numbers: Numbers, images: list[list[object]], title
             "afterwards; standard deviations are those without that condition."
         )
     bad = not after.converged or after.defect > after.expected_defect
-    remarks += found.remarks
+    remarks += [*after.remarks, *found.remarks]
     unit = "object units" if found.targets is None else found.targets.unit
     given = Given(control_residuals(after, unit), bar_residuals(after, unit), None, None, None)
     return render(
@@ -114,8 +114,9 @@ def _sizes(found: Refinement, unit: str) -> list[tuple[str, ...]]:
     ):
         rows.append((name, "", *(significant(factor * float(np.median(of(one)))) for one in both)))
     rows.append(("Photographs", str(len(found.images)), *(str(len(one.network.images)) for one in both)))
-    points = (len(found.points), len(found.readjusted.network.points), int(found.points.sum()))
+    points = (len(found.points), len(found.readjusted.network.points), int(found.points_anew.sum()))
     rows.append(("Points", *(str(one) for one in points)))
+    rows.append(("Points whose windows do not overlap, adjusted", "", "", str(int(found.points.sum()))))
     used = (found.key_points, int((~found.readjusted.rejected).sum()), found.refined)
     rows.append(("Key points with a point", *(str(one) for one in used)))
     if found.targets is not None:

@@ -69,6 +69,20 @@ def test_huber_limits_the_harm_of_gross_errors() -> None:
     assert (plain.residuals[good] ** 2).mean() > 4 * (robust.residuals[good] ** 2).mean()
 
 
+@pytest.mark.parametrize("reject", ["huber", "tukey"])
+def test_a_photograph_that_nothing_holds_is_told(reject: str) -> None:
+    """It converges wherever the photograph is; one was 1e140 mm away."""
+    rng = seed_of("let go")
+    network, truth = make_network(rng, images=8, points=30)
+    k = network.image_points
+    other = k.image == 3
+    xy = np.where(other[:, None], rng.uniform(0, 3000, k.xy.shape), k.xy)  # of another object
+    lost = adjust(replace(network, image_points=replace(k, xy=xy)), truth, datum=FREE, reject=reject)
+    name = network.images[3]
+    assert [line.split(":")[0] for line in lost.remarks] == [f"no image point fits in {name}"]
+    assert adjust(network, truth, datum=FREE, reject=reject).remarks == ()
+
+
 def one_sided(name: str, part: float) -> tuple[Network, Estimate, BoolArray]:
     """Gross errors of 20 to 200 sigma that all point about the same way, so that they do not average out."""
     rng = seed_of(name)

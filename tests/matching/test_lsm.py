@@ -68,6 +68,24 @@ def test_predicted_covariance_is_true() -> None:
     assert matches.sigma0.mean() == pytest.approx(SIGMA * np.sqrt(1 + (pairs.gain**2).mean()), rel=0.1)
 
 
+def test_a_difference_of_blur_moves_no_window() -> None:
+    """A photograph that is blurred along one direction, as an oblique surface is; window of tie points."""
+    pairs, left, _ = _pairs()
+    blurred = cv2.GaussianBlur(pairs.right, (0, 0), 0.4, sigmaY=0.05)  # 0.16 px^2 along x
+
+    def errors(left: AnyArray, right: AnyArray, *, blur: bool) -> tuple[FloatArray, LsmMatches]:
+        matches = match_lsm(left, right, pairs.centre, pairs.centre, window_px=15, blur=blur)
+        return matches.xy - pairs.centre - pairs.shift, matches
+
+    sharp, _ = errors(pairs.left, blurred, blur=False)
+    own, _ = errors(pairs.left, blurred, blur=True)
+    assert np.sqrt((own**2).mean()) < 0.3 * np.sqrt((sharp**2).mean()) < 0.003
+    e, matches = errors(left, with_noise(blurred, SIGMA, 2), blur=True)
+    normalised = np.einsum("ki,kij,kj->k", e, np.linalg.inv(matches.covariance), e)
+    assert normalised.mean() / 2 == pytest.approx(1, abs=0.2)
+    assert matches.sigma0.mean() == pytest.approx(SIGMA * np.sqrt(1 + (pairs.gain**2).mean()), rel=0.1)
+
+
 @pytest.mark.parametrize("model", ["affine", "projective"])
 def test_converges_from_two_pixels_away(model: str) -> None:
     pairs, left, right = _pairs()

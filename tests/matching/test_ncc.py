@@ -138,13 +138,14 @@ def test_bad_windows_are_refused_in_one_line() -> None:
 
 
 @pytest.mark.parametrize(
-    ("method", "tolerance"), [("ncc", 0.25), ("lsm", 0.05), ("lsm8", 0.05), ("shift", 0.05)]
+    ("method", "tolerance"), [("ncc", 0.25), ("lsm", 0.06), ("lsm8", 0.06), ("shift", 0.05)]
 )
 def test_conjugate_points(method: str, tolerance: float) -> None:
     left, right, at = _photographs()
     found = match_points(left, right, at, method=method, search_px=61)
     assert found.good.all()
-    assert found.right == pytest.approx(at + SHIFT, abs=tolerance)
+    assert found.right == pytest.approx(at + SHIFT, abs=tolerance)  # one of a hundred has a smaller window
+    assert np.sqrt(((found.right - at - SHIFT) ** 2).mean()) < tolerance / 2.5
     eight_bit = [np.rint(p).clip(0, 255).astype(np.uint8) for p in (left, right)]
     equalised = match_points(*eight_bit, at, method=method, search_px=61, equalise=True)
     assert equalised.right == pytest.approx(at + SHIFT, abs=2 * tolerance)

@@ -21,12 +21,10 @@ from sfm.conventions import AnyArray, FloatArray
 from sfm.errors import KolinearError
 from sfm.pipeline import run_survey
 from sfm.rendering.render import render_photograph
-from sfm.rendering.scene import CircularTargets, Faces, Optics, Scene, coded_ring, join_marks
+from sfm.rendering.scene import Optics, Scene
 from sfm.report.findings.findings import findings_of
 from sfm.survey.inputs.survey import read_survey
-from sfm.targets.codes.families import code_family
-from sfm.targets.codes.rings import CodeFamily
-from tests.survey.test_second_object import FIRST_CODE, PLACES
+from tests.survey.two_plates import FIRST_CODE, PLACES, two_plates
 from tests.surveys import C_MM, PIXEL_MM, SIZE_PX, SURVEY, stations
 from tests.synthetic import seed_of
 
@@ -56,24 +54,12 @@ CONFUSIONS = (
 
 
 def scene_of(moved_mm: float) -> Scene:
-    """Return two plates with codes; those of even number lie elsewhere."""
-    family = code_family("ring14")
-    assert isinstance(family, CodeFamily)
-    faces = Faces(
-        np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 60.0]]),
-        np.tile(np.eye(3)[:2], (2, 1, 1)),
-        np.array([[210.0, 160.0], [60.0, 50.0]]),
-        np.array([0.8, 0.85]),
-        np.zeros(2),
-        np.ones(2),
+    """Return two plates with codes; those of odd place lie elsewhere."""
+    aside = moved_mm * np.array([1.0, 0.5])
+    return two_plates(
+        {FIRST_CODE + k: k for k in range(len(PLACES))},
+        {FIRST_CODE + k: aside for k in range(1, len(PLACES), 2)},
     )
-    marks = []
-    for k, (face, x, y) in enumerate(PLACES):
-        at = np.array([x, y]) + (moved_mm * np.array([1.0, 0.5]) if k % 2 else 0.0)
-        code = FIRST_CODE + k
-        marks.append(coded_ring(face, at, 7.0, code, family, 0.08, turn=0.3 * code))
-    none = CircularTargets(np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros(0), np.zeros(0, np.int64))
-    return Scene(faces, join_marks(marks), none)
 
 
 def camera_of(confusion: Confusion, k: int) -> Camera:

@@ -12,17 +12,19 @@ import cv2
 import numpy as np
 import pytest
 
-from adapters.colmap.camera_models import write_model
+from adapters.colmap.camera_models import read_model, write_model
 from adapters.colmap.database import write_database
+from adapters.colmap.model_files import MODELS
 from adapters.colmap.refined_model import colmap_jacobian, colmap_parameters, open_model
 from datasets.textured import render
 from sfm.camera import camera_from_values, project, tangents_from_pixel
 from sfm.cli.commands.refining import refine
-from sfm.conventions import AnyArray, FloatArray, IntArray
+from sfm.conventions import AnyArray, FloatArray
 from sfm.errors import BackendError, GeometryError, PhotographError, SurveyFileError
 from sfm.network import Estimate, ImagePoints, Network
 from sfm.similarity import Similarity
-from sfm.survey.refining.windows import parts_of
+from sfm.survey.refining import model_photographs
+from sfm.survey.refining.refinement import refine_model
 from sfm.targets.codes.rings import ring_family
 
 pycolmap = pytest.importorskip("pycolmap")
@@ -42,8 +44,11 @@ PARAMS = {
     "RADIAL": [FOCAL, SIZE[0] / 2, SIZE[1] / 2, 1e-4, 1e-4],
     "FULL_OPENCV": [FOCAL, FOCAL, SIZE[0] / 2, SIZE[1] / 2, 1e-4, *[0.0] * 7],
     "OPENCV_FISHEYE": [FOCAL, FOCAL, SIZE[0] / 2, SIZE[1] / 2, *[0.0] * 4],
+    "DIVISION": [FOCAL, FOCAL, SIZE[0] / 2, SIZE[1] / 2, 0.0],
+    "EUCM": [FOCAL, FOCAL, SIZE[0] / 2, SIZE[1] / 2, 0.5, 1.0],
 }
 AWAY = 40  # of the numbers of COLMAP
+SMALL = 0.8  # scale of the photographs of a second camera
 
 
 def _paint_target(skin: AnyArray, code: int, at: FloatArray) -> None:
@@ -99,16 +104,30 @@ def _target_places() -> FloatArray:
     return np.column_stack([x, y, render.height(x, y)])
 
 
-def _model(folder: Path, camera: str = "SIMPLE_RADIAL", *, rig: bool = False, targets: bool = False) -> Any:
-    """Write photographs in two folders and a model of them with numbers of its own, and return the scene."""
+def _model(
+    folder: Path,
+    camera: str = "SIMPLE_RADIAL",
+    *,
+    rig: bool = False,
+    targets: bool = False,
+    second: str | None = None,
+) -> Any:
+    """Write photographs in two folders and a model of them with numbers of its own, and return the scene.
+
+    With a second camera model the photographs of the second folder are smaller, and have the names of those
+    in the first.
+    """
     pictures, truth = _scene(targets)
     rng = np.random.default_rng(9)
     scene = pycolmap.Reconstruction()
-    cameras = (7, 9) if rig else (7, 7)
+    cameras = (7, 9) if rig or second else (7, 7)
     for number in sorted(set(cameras)):
         lens = pycolmap.Camera(
             model=camera, width=SIZE[0], height=SIZE[1], params=PARAMS[camera], camera_id=number
         )
+        if second and number == 9:
+            size = tuple(round(SMALL * side) for side in SIZE)
+            lens = pycolmap.Camera.create_from_model_name(9, second, SMALL * FOCAL, *size)
         (scene.add_camera if rig else scene.add_camera_with_trivial_rig)(lens)
     poses = []
     for i in range(len(pictures)):
@@ -118,10 +137,13 @@ def _model(folder: Path, camera: str = "SIMPLE_RADIAL", *, rig: bool = False, ta
         _add_rig(scene, poses)
     for i, picture in enumerate(pictures):
         seen = project(truth.cameras[0], truth.position[i], truth.rotation[i], truth.points)
+        name = f"{'ab'[i % 2]}/{i // 2 if second else i}.png"
+        if second and i % 2:
+            seen = SMALL * (seen + 0.5) - 0.5
+            picture = cv2.resize(picture, None, fx=SMALL, fy=SMALL, interpolation=cv2.INTER_AREA)
         seen = np.vstack(
             [[5.0, 6.0], seen + rng.normal(0, NOISE_PX, seen.shape)]
         )  # the first claims no point
-        name = f"{'ab'[i % 2]}/{i}.png"
         image = pycolmap.Image(name=name, keypoints=seen + 0.5, camera_id=cameras[i % 2], image_id=AWAY + i)
         if rig:
             image.frame_id = 1 + i // 2
@@ -184,7 +206,7 @@ def test_what_is_not_measured_stays_as_it_is(
         was, now = _key_points(before, i), _key_points(after, i)
         assert (was[0] == now[0]).all() and len(was) == len(now)  # a key point without a point
         moved.append(np.abs(now - was)[4:].max(axis=1) > 0.05)
-    assert 0.5 < np.mean(moved) < 0.9  # all but the reference of each point, whose template is the key point
+    assert np.mean(moved) > 0.9  # the template of each point is at a whole pixel
     for j in range(3):  # of two photographs: key points as they came, the point intersected anew
         assert after.point3D(AWAY + 2 * j).track.length() == 2
         assert (_key_points(after, AWAY)[j + 1] == _key_points(before, AWAY)[j + 1]).all()
@@ -205,6 +227,24 @@ def test_what_is_not_measured_stays_as_it_is(
     error = after.compute_mean_reprojection_error()
     pycolmap.bundle_adjustment(after, pycolmap.BundleAdjustmentOptions(print_summary=False))
     assert after.compute_mean_reprojection_error() < 1.05 * error
+
+
+@pytest.mark.parametrize(("camera", "second"), [("SIMPLE_RADIAL", "OPENCV"), ("FULL_OPENCV", "PINHOLE")])
+def test_two_sizes_of_photographs_with_the_same_names(tmp_path: Path, camera: str, second: str) -> None:
+    before = _model(tmp_path, camera, second=second)
+    before.write_text(str(tmp_path / "model"))
+    for kind in ("cameras", "images", "points3D", "rigs", "frames"):  # the text is read
+        (tmp_path / "model" / f"{kind}.bin").unlink()
+    refine(tmp_path / "model", tmp_path, fix="f,fx,fy,cx,cy,k1")
+    after = pycolmap.Reconstruction(str(tmp_path / "model_refined"))
+    assert [after.camera(i).model_name for i in (7, 9)] == [camera, second]
+    assert (after.camera(9).width, after.camera(9).height) == (240, 192)
+    names = [after.image(AWAY + i).name for i in range(PHOTOGRAPHS)]
+    assert names == ["a/0.png", "b/0.png", "a/1.png", "b/1.png"]
+    assert set(after.point3D_ids()) == set(before.point3D_ids())
+    after.update_point_3d_errors()
+    errors = [p.error for p in after.points3D.values() if p.track.length() > 2]
+    assert len(errors) == 60 and np.median(errors) < 0.05  # of key points with a noise of 0.3 px
 
 
 def test_a_rig_comes_out_with_its_rig(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
@@ -250,10 +290,19 @@ def test_masks(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert "where the mask is black" in capsys.readouterr().out
 
 
-def test_a_fisheye_camera_is_refused_by_its_name(tmp_path: Path) -> None:
-    _model(tmp_path, "OPENCV_FISHEYE")
-    with pytest.raises(BackendError, match="COLMAP's model OPENCV_FISHEYE, expected one of SIMPLE_PINHOLE"):
+@pytest.mark.parametrize("camera", ["OPENCV_FISHEYE", "DIVISION", "EUCM"])
+def test_a_camera_that_is_not_known_is_refused_by_its_name(tmp_path: Path, camera: str) -> None:
+    _model(tmp_path, camera)
+    with pytest.raises(BackendError, match=f"COLMAP's model {camera}, expected one of SIMPLE_PINHOLE"):
         refine(tmp_path / "model", tmp_path)
+
+
+def test_every_model_of_colmap_is_known_by_its_number() -> None:
+    known = [name for name in pycolmap.CameraModelId.__members__ if name != "INVALID"]
+    theirs = {int(pycolmap.CameraModelId.__members__[name].value): name for name in known}
+    assert [theirs[number] for number in range(len(theirs))] == list(MODELS)
+    for name, count in MODELS.items():
+        assert len(pycolmap.Camera.create_from_model_name(1, name, 100.0, 640, 480).params) == count
 
 
 @pytest.mark.parametrize("camera", ["SIMPLE_PINHOLE", "RADIAL"])
@@ -277,17 +326,46 @@ def test_one_focal_length_is_read_as_one(tmp_path: Path, camera: str) -> None:
         assert J[:, column] == pytest.approx(slope, rel=1e-6, abs=1e-9 * np.abs(J).max())
 
 
-def test_parts_keep_to_the_memory() -> None:
-    rng = np.random.default_rng(3)
-    image = np.concatenate([rng.choice(30, 5, replace=False) for _ in range(200)])
-    point = np.repeat(np.arange(200), 5)
-    reference: IntArray = image[::5]
-    parts = list(parts_of(image, point, reference, np.full(30, 10), 120))
-    assert sorted(np.concatenate(parts).tolist()) == list(range(1000))
-    for rows in parts:
-        assert len(np.unique(image[rows])) <= 12
-        assert np.isin(point, point[rows]).sum() == len(rows)  # points are whole
-    assert len(list(parts_of(image, point, reference, np.full(30, 10), 10**9))) == 20
+def test_photographs_keep_to_the_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    _model(tmp_path)
+    network, estimate = read_model(tmp_path / "model")
+    read: list[str] = []
+    was = model_photographs.read_of_size
+    monkeypatch.setattr(
+        model_photographs, "read_of_size", lambda path, *rest: read.append(path.name) or was(path, *rest)
+    )
+    two = model_photographs.Photographs(network, estimate, tmp_path, memory_bytes=2 * 4 * SIZE[0] * SIZE[1])
+    for i in (0, 1, 0, 2, 0, 1):  # the oldest is forgotten
+        assert two.grey(i).shape == SIZE[::-1]
+    assert read == ["0.png", "1.png", "2.png", "1.png"]
+
+
+def test_points_of_windows_that_overlap_are_intersected_and_not_adjusted(tmp_path: Path) -> None:
+    """Otherwise the same pixels count several times, and the model is told more precise than it is."""
+    _model(tmp_path)
+    network, estimate = read_model(tmp_path / "model")
+    seen, n = network.image_points, len(network.points)
+    rng = np.random.default_rng(8)  # every point thrice, as detectors have it at several scales
+    twins = ImagePoints(
+        np.tile(seen.image, 3),
+        np.concatenate([seen.point + k * n for k in range(3)]),
+        np.tile(seen.xy, (3, 1)) + rng.normal(0, NOISE_PX, (3 * len(seen), 2)),
+        np.tile(seen.covariance, (3, 1, 1)),
+    )
+    thrice = replace(
+        network, points=tuple(f"{k}{name}" for k in range(3) for name in network.points), image_points=twins
+    )
+    start = replace(estimate, points=np.tile(estimate.points, (3, 1)))
+    once, found = (refine_model(*model, tmp_path) for model in ((network, estimate), (thrice, start)))
+    assert found.window_px == 15 and found.points.sum() <= n < 0.4 * found.points_anew.sum()
+    assert 2.9 * once.refined < found.refined == found.accepted.sum()
+    sigma = [
+        np.sqrt(np.trace(one.adjustment.covariance.exterior[:, :3, :3].sum(axis=0))) for one in (once, found)
+    ]
+    assert sigma[1] == pytest.approx(sigma[0], rel=0.15)  # 0.58 times as large if all of them were adjusted
+    anew = np.flatnonzero(found.points_anew & ~found.points)
+    near = np.linalg.norm(found.estimate.points[anew] - _scene()[1].points[anew % n], axis=1)
+    assert len(anew) > 100 and np.median(near) < 1e-3
 
 
 def _survey(folder: Path, text: str) -> Path:

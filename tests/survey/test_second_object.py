@@ -14,42 +14,17 @@ from sfm.network import ImagePoints, empty_estimate
 from sfm.orientation.incremental.sequence import orient
 from sfm.pipeline import run_survey
 from sfm.rendering.render import render_photographs
-from sfm.rendering.scene import CircularTargets, Faces, Optics, Scene, coded_ring, join_marks
+from sfm.rendering.scene import Optics
 from sfm.result import SurveyResult
 from sfm.survey.diagnosis.second_object import find_second_objects, tell_second_objects
 from sfm.survey.inputs.survey import read_survey
 from sfm.survey.measuring.measured_store import MeasuredStore
-from sfm.targets.codes.families import code_family
-from sfm.targets.codes.rings import CodeFamily
+from tests.survey.two_plates import FIRST_CODE, PLACES, two_plates
 from tests.surveys import C_MM, PIXEL_MM, SIZE_PX, SURVEY, stations
 from tests.synthetic import make_network, seed_of
 
-# Places on a plate and on one above it, mm: (face, x, y).
-PLACES = [(0, x, y) for x in (-165.0, -110.0, 110.0, 165.0) for y in (-115.0, -40.0, 40.0, 115.0)]
-PLACES += [(0, x, y) for x in (-40.0, 40.0) for y in (-120.0, 120.0)]
-PLACES += [(1, x, y) for x in (-35.0, 35.0) for y in (-25.0, 25.0)]
-FIRST_CODE, SHEET = 10, 16
+SHEET = 16
 LEFT_FREE = FIRST_CODE + 3  # its place is free for a code that moves
-
-
-def scene_of(place: dict[int, int]) -> Scene:
-    """Return plates with codes at the given numbers of PLACES."""
-    family = code_family("ring14")
-    assert isinstance(family, CodeFamily)
-    faces = Faces(
-        np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 60.0]]),
-        np.tile(np.eye(3)[:2], (2, 1, 1)),
-        np.array([[210.0, 160.0], [60.0, 50.0]]),
-        np.array([0.8, 0.85]),
-        np.zeros(2),
-        np.ones(2),
-    )
-    marks = [
-        coded_ring(PLACES[k][0], np.array(PLACES[k][1:]), 7.0, code, family, 0.08, turn=0.3 * code)
-        for code, k in place.items()
-    ]
-    none = CircularTargets(np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros(0), np.zeros(0, np.int64))
-    return Scene(faces, join_marks(marks), none)
 
 
 def places_of(sheet: int, seed: int) -> dict[int, int]:
@@ -63,7 +38,7 @@ def photograph(folder: Path, name: str, place: dict[int, int], at: tuple[int, ..
     camera = camera_from_values("small", "brown", SIZE_PX, (PIXEL_MM, PIXEL_MM), c_mm=C_MM)
     position, rotation = (values[list(at)] for values in stations(9))
     optics = Optics(blur_px=0.7, noise=2 / 255)
-    pictures, _ = render_photographs(scene_of(place), camera, position, rotation, optics=optics, seed=at[0])
+    pictures, _ = render_photographs(two_plates(place), camera, position, rotation, optics=optics, seed=at[0])
     for k, picture in enumerate(pictures):
         cv2.imwrite(str(folder / f"{name}{k}.png"), picture, [cv2.IMWRITE_PNG_COMPRESSION, 1])
 

@@ -97,7 +97,8 @@ def marginal_covariance(
     T[:, 3:, 3:] = angle_jacobian(optimum.state.M)
     of_exterior = np.moveaxis(F[:, : 6 * m].reshape(d, m, 6), 1, 0)
     exterior = _in_datum(cofactors.exterior, H[: 6 * m].reshape(m, 6, d), of_exterior, G)
-    exterior = T @ exterior @ np.swapaxes(T, 1, 2)
+    with np.errstate(over="ignore", invalid="ignore"):  # of a photograph that nothing holds
+        exterior = T @ exterior @ np.swapaxes(T, 1, 2)
     interior = []
     for own in layout.interior_column:
         Q = cofactors.border[np.ix_(own - 6 * m, own - 6 * m)]

@@ -119,13 +119,13 @@ def _two_positions(
     one = parts.misfit(rows)
     if len(adjustment.network.points) > MANY and chi2_sf(one, 2 * m - 3) > CONSPICUOUS:
         return None
-    splits = [np.arange(m) < k for k in range(2, m - 1)]
+    splits = np.arange(m) < np.arange(2, m - 1)[:, None]
     rejected = adjustment.rejected[rows]
     if 2 <= rejected.sum() <= m - 2:
-        splits.append(~rejected)
+        splits = np.vstack([splits, ~rejected])
     if chi2_sf(one, 3) * len(splits) > level:  # all of it could not be enough
         return None
-    misfit = np.array([parts.misfit(rows[split]) + parts.misfit(rows[~split]) for split in splits])
+    misfit = parts.misfits(splits, rows) + parts.misfits(~splits, rows)
     best = int(np.argmin(misfit))
     split, left = splits[best], float(misfit[best])
     if chi2_sf(one - left, 3) * len(splits) > level:
@@ -138,7 +138,7 @@ def _two_positions(
     left = groups[0][2] + groups[1][2]
     if chi2_sf(left, 2 * m - 6) < EXPLAINED:
         return None
-    without = min(parts.misfit(np.delete(rows, k)) for k in range(m))
+    without = parts.misfits(~np.eye(m, dtype=bool), rows).min()
     if chi2_sf(without - left, 1) * len(splits) > level:
         return None
     network, seen = adjustment.network, adjustment.network.image_points

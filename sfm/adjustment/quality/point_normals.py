@@ -11,7 +11,7 @@ import numpy as np
 
 from sfm.adjustment.result import Adjustment
 from sfm.camera import pixel_jacobian, project
-from sfm.conventions import FloatArray, IntArray
+from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.network import Estimate, rows_of
 
 
@@ -27,6 +27,18 @@ class PointNormals:
         """Return v'Pv after a fit of the point to these rows alone."""
         N, b = self.N[rows].sum(axis=0), self.b[rows].sum(axis=0)
         return float(self.q[rows].sum() - b @ np.linalg.lstsq(N, b, rcond=None)[0])
+
+    def misfits(self, groups: BoolArray, rows: IntArray) -> FloatArray:
+        """Return v'Pv after a fit of the point to each of some groups of rows alone, (g,).
+
+        Args:
+            groups: which of the rows are in each group, (g, m).
+            rows: image points of one object point, (m,).
+        """
+        some = groups.astype(float)
+        N, b = np.tensordot(some, self.N[rows], 1), some @ self.b[rows]
+        fitted = np.einsum("gi,gij,gj->g", b, np.linalg.pinv(N, hermitian=True), b)
+        return np.asarray(some @ self.q[rows] - fitted)
 
     def step(self, rows: IntArray) -> FloatArray:
         """Return how a fit to these rows alone moves the point, (3,)."""

@@ -22,8 +22,13 @@ def refine(
         ),
     ] = None,
     window: Annotated[
-        int, typer.Option("--window", metavar="N", help="Side of the windows, odd, 3 to 101 px.")
-    ] = 15,
+        int | None,
+        typer.Option(
+            "--window",
+            metavar="N",
+            help="Side of the windows, odd, 3 to 101 px; 15 or 11, what the surface bears, if not given.",
+        ),
+    ] = None,
     min_correlation: Annotated[
         float,
         typer.Option(
@@ -48,7 +53,7 @@ def refine(
 ) -> None:
     """Remeasure the key points of a COLMAP model.
 
-    By multi-photo least squares matching; then the model is adjusted again. The new model keeps numbers,
+    By least squares matching; then the model is adjusted again. The new model keeps numbers,
     colours, camera models, rigs and the points of two photographs, and has a page, refinement.html, and the
     standard deviations of points, photographs and cameras beside it (sigma_*.csv). The principal point is
     estimated, too, where four photographs or more have been taken with a camera; hold it with --fix cx,cy.
@@ -90,10 +95,13 @@ def refine(
     print(refinement_text(found), end="")
     a = found.adjustment
     interior = interior_rows(opened, found.start, found.estimate, a.covariance.interior)
-    xy = opened.network.image_points.xy.copy()
-    xy[found.rows] = a.network.image_points.xy[: len(found.rows)]
     in_rigs = update_model(
-        opened, found.estimate, xy=xy, measured=found.accepted, images=found.images, points=found.points
+        opened,
+        found.estimate,
+        xy=found.xy,
+        measured=found.accepted,
+        images=found.images,
+        points=found.points_anew,
     )
     numbers = Numbers(opened.image_ids, opened.point_ids, interior, in_rigs)
     with whole_folder(out) as folder:

@@ -1,6 +1,7 @@
 """Normal equations of a patch: gradients of the template, their products, and the solution.
 
-Observations are the intensities of the window; unknowns are 2, 6 or 8 geometric parameters, offset and gain.
+Observations are the intensities of the window; unknowns are 2, 6 or 8 geometric parameters, offset and gain,
+and, where the photographs may be blurred differently, three of the difference of their blur.
 The template is in single precision, the sums are in double.
 """
 
@@ -19,12 +20,18 @@ from sfm.matching.match_flags import FLAT_TEXTURE, MATCHED, OUTSIDE
 
 MODELS = {"shift": 2, "affine": 6, "projective": 8}  # geometric parameters
 RADIOMETRIC = 2  # offset and gain
+# Differences of the second moments of blur, px^2: xx, xy, yy. A blur changes intensities by half the products
+# of its second moments and the second derivatives, up to moments of higher order.
+BLUR = 3
 MARGIN = 3  # pixels around the template that its gradients need
 UNDETERMINED = 1e-9  # part of a diagonal that rounding of float32 intensities leaves of nothing
 # Symmetric difference of sixth order, taps 1, 2, 3; a gradient has the variance of a pixel times SLOPE_NOISE.
 # Source: Abramowitz and Stegun (1964), table 25.2 (seven-point formula).
 SLOPE = (3.0 / 4.0, -3.0 / 20.0, 1.0 / 60.0)
 SLOPE_NOISE = 2.0 * (SLOPE[0] ** 2 + SLOPE[1] ** 2 + SLOPE[2] ** 2)
+# What noise of variance 1 adds to products of blur's rows: (1 -2 1) across (1 2 1) / 4, halved, and its mixed
+# difference: of xx or yy with itself, of xx with yy, of xy with itself, and of xx or yy with intensities.
+BLUR_NOISE = (9.0 / 16.0, 1.0 / 16.0, 1.0 / 4.0, -1.0 / 2.0)
 
 
 class Workspace(NamedTuple):
@@ -33,6 +40,7 @@ class Workspace(NamedTuple):
     half: int  # half the side of the window, px
     kind: int  # kernel of resampling
     geometric: int  # geometric parameters
+    blurred: int  # parameters of blur: 0 or BLUR
     grid: AnyArray  # template with its margin, float32
     J: AnyArray  # d (patch) / d (unknowns), a row each, float32, (u, side^2)
     N: FloatArray  # normal matrix, (u, u)
@@ -45,14 +53,15 @@ class Workspace(NamedTuple):
 
 
 @compiled
-def new_workspace(half: int, kind: int, geometric: int) -> Workspace:
+def new_workspace(half: int, kind: int, geometric: int, blurred: int) -> Workspace:
     """Return arrays for windows of a size and a model."""
-    side, size = 2 * half + 1, geometric + RADIOMETRIC
+    side, size = 2 * half + 1, geometric + RADIOMETRIC + blurred
     wide = side + 2 * MARGIN
     return Workspace(
         half,
         kind,
         geometric,
+        blurred,
         np.empty((wide, wide), np.float32),
         np.empty((size, side * side), np.float32),
         np.empty((size, size)),
@@ -71,6 +80,8 @@ def prepare_template(left: AnyArray, x: float, y: float, work: Workspace) -> int
     if not resample_window(left, x, y, work.half + MARGIN, work.kind, work.wx, work.wy, work.grid):
         return OUTSIDE
     gradients(work.grid, work.half, work.geometric, work.J)
+    if work.blurred:
+        blur_changes(work.grid, work.half, work.J[work.geometric + RADIOMETRIC :])
     fill_normals(work.J, work.N)
     return MATCHED if factorise(work.N, work.L, UNDETERMINED) else FLAT_TEXTURE
 
@@ -102,6 +113,26 @@ def gradients(grid: AnyArray, half: int, geometric: int, J: AnyArray) -> None:
                 J[6, p], J[7, p] = -along * u, -along * v
             J[geometric, p] = np.float32(1.0)
             J[geometric + 1, p] = grid[y, x]
+
+
+@compiled
+def blur_changes(grid: AnyArray, half: int, J: AnyArray) -> None:
+    """Fill J: d (patch) / d (second moments of blur xx, xy, yy), (3, side^2).
+
+    Second differences are taken over three rows and columns, which keeps them free from most of the noise.
+    """
+    side, quarter, eighth = 2 * half + 1, np.float32(0.25), np.float32(0.125)
+    for i in range(side):
+        y = i + MARGIN
+        for j in range(side):
+            x = j + MARGIN
+            p = i * side + j
+            corners = grid[y - 1, x - 1] + grid[y - 1, x + 1] + grid[y + 1, x - 1] + grid[y + 1, x + 1]
+            beside, above = grid[y, x - 1] + grid[y, x + 1], grid[y - 1, x] + grid[y + 1, x]
+            middle = np.float32(4.0) * grid[y, x]
+            J[0, p] = eighth * (corners + np.float32(2.0) * (beside - above) - middle)
+            J[1, p] = quarter * (corners - np.float32(2.0) * (grid[y - 1, x + 1] + grid[y + 1, x - 1]))
+            J[2, p] = eighth * (corners + np.float32(2.0) * (above - beside) - middle)
 
 
 @compiled_fast

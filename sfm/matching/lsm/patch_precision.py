@@ -8,7 +8,7 @@ from sfm.conventions import AnyArray, FloatArray
 from sfm.kernels.cholesky import factorise, solve_factorised
 from sfm.kernels.options import compiled, compiled_fast
 from sfm.kernels.sampling import TAPS, kernel_weights
-from sfm.matching.lsm.patch_equations import SLOPE_NOISE, Workspace, dot
+from sfm.matching.lsm.patch_equations import BLUR_NOISE, RADIOMETRIC, SLOPE_NOISE, Workspace, dot
 from sfm.matching.lsm.warp import area_ratio
 from sfm.matching.match_flags import FLAT_TEXTURE, LOW_CORRELATION, MATCHED
 
@@ -41,6 +41,8 @@ def judge(work: Workspace, min_r: float, H: FloatArray, out: FloatArray) -> int:
     subtract(patch, q, work.J)
     residual = dot(patch, patch)
     gain = kernel_noise(H, half, work.kind, work.wx, work.wy)
+    if work.blurred:
+        residual = residual_as_sharp(work, square)
     variance = residual / (n - len(q)) / (1.0 + gain)  # of one intensity, right units
     white = min(variance, white_noise(patch, 2 * half + 1) / (1.0 + gain))
     out[X], out[Y] = H[0, 2], H[1, 2]
@@ -102,7 +104,36 @@ def without_noise(N: FloatArray, white: float, half: int, geometric: int) -> Flo
             clean[a, a - 6] += noise * second
             clean[a - 6, a] += noise * second
     clean[geometric + 1, geometric + 1] -= n * white
+    first = geometric + RADIOMETRIC
+    if len(N) > first:
+        same, other, mixed, intensity = BLUR_NOISE
+        clean[first + 1, first + 1] -= n * white * mixed
+        for a, b in ((first, first + 2), (first + 2, first)):
+            clean[a, a] -= n * white * same
+            clean[a, b] -= n * white * other
+            clean[a, geometric + 1] -= n * white * intensity
+            clean[geometric + 1, a] -= n * white * intensity
     return clean
+
+
+@compiled
+def residual_as_sharp(work: Workspace, square: float) -> float:
+    """Return the sum of squared residuals of a fit without blur.
+
+    A blur that makes the template less noisy fits better than the true one: its residuals tell too little.
+
+    Args:
+        work: normal equations with blur in the last rows.
+        square: sum of squared intensities of the patch.
+    """
+    size = work.geometric + RADIOMETRIC
+    factor = np.empty((size, size))
+    q = work.rhs[:size].copy()
+    factorise(work.N[:size, :size], factor, 0.0)
+    solve_factorised(factor, q)
+    for a in range(size):
+        square -= q[a] * work.rhs[a]
+    return square
 
 
 @compiled_fast

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from sfm.camera import Camera, pixel_from_tangents, pixel_jacobian, project, tangents_from_pixel
+from sfm.camera import Camera, pixel_from_tangents, pixel_jacobian, tangents_from_pixel
 from sfm.conventions import FloatArray, IntArray
 from sfm.network import Estimate, rows_of
 
@@ -55,7 +55,7 @@ def plane_warps(
     estimate: Estimate,
     camera: IntArray,
     i: int,
-    j: int,
+    j: int | IntArray,
     xy: FloatArray,
     points: FloatArray,
     normal: FloatArray,
@@ -70,21 +70,21 @@ def plane_warps(
         estimate: interior and exterior orientation of all photographs.
         camera: index of the camera of each photograph, (m,).
         i: photograph of the windows.
-        j: the other photograph.
+        j: the other photograph, of all or of each, (k,).
         xy: windows' middles in i, px, (k, 2).
         points: object points of these, (k, 3).
         normal: of the surface there, (k, 3).
         reach_px: from the middle to where the perspective is taken from: half the side of the windows.
     """
     R, X0 = estimate.rotation[i], estimate.position[i]
-    lens, other = estimate.cameras[camera[i]], estimate.cameras[camera[j]]
+    lens, other = estimate.cameras[camera[i]], np.broadcast_to(np.asarray(j), (len(xy),))
     height = np.einsum("kc,kc->k", normal, points - X0)
 
     def seen(offset: tuple[float, float]) -> FloatArray:
         uv = tangents_from_pixel(lens, xy + np.array(offset))
         d = np.column_stack([uv, -np.ones(len(uv))]) @ R.T
         on_plane = X0 + d * (height / np.einsum("kc,kc->k", normal, d))[:, None]
-        return project(other, estimate.position[j], estimate.rotation[j], on_plane)
+        return pictures_of(estimate, camera, other, on_plane)
 
     h = reach_px
     middle = seen((0.0, 0.0))

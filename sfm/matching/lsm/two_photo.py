@@ -25,7 +25,7 @@ from sfm.errors import GeometryError
 from sfm.kernels.cholesky import solve_factorised
 from sfm.kernels.options import compiled
 from sfm.kernels.sampling import BILINEAR, interpolation_index
-from sfm.matching.lsm.patch_equations import MODELS, Workspace, dot, new_workspace, prepare_template
+from sfm.matching.lsm.patch_equations import BLUR, MODELS, Workspace, dot, new_workspace, prepare_template
 from sfm.matching.lsm.patch_precision import (
     CXX,
     CXY,
@@ -97,6 +97,7 @@ def match_lsm(
     max_steps: int = 30,
     max_shift_px: float = 5.0,
     min_correlation: float = 0.5,
+    blur: bool = False,
     start: FloatArray | None = None,
     threads: int = 1,
 ) -> LsmMatches:
@@ -117,6 +118,9 @@ def match_lsm(
         max_steps: after so many a patch counts as diverged.
         max_shift_px: farther from the start is too far.
         min_correlation: below it the places are not alike.
+        blur: whether three more unknowns tell how differently both are blurred. Of an oblique surface they
+            always are, since a pixel is longer on it: without them windows move by 0.01 px, in all matches
+            of a template alike.
         start: linear part of the warp, right px per left px, (k, 2, 2), or its homography relative to both
             points, (k, 3, 3), whose perspective an affine model leaves as it is; the unit matrix if none.
         threads: patches are shared among so many.
@@ -151,7 +155,7 @@ def match_lsm(
     warp[:, 2, 2] = 1.0
     warp[:, :2] += b[:, :, None] * warp[:, 2, None]
     out = np.zeros((k, OUTPUTS))
-    fixed = (grey_of(left), grey_of(right), half, kind, MODELS[model])
+    fixed = (grey_of(left), grey_of(right), half, kind, MODELS[model], BLUR if blur else 0)
     limits = Limits(float(stop_px), int(max_steps), float(max_shift_px), float(min_correlation))
 
     def work(part: slice) -> None:
@@ -184,13 +188,14 @@ def _match_all(
     half: int,
     kind: int,
     geometric: int,
+    blurred: int,
     limits: Limits,
     xy: FloatArray,
     warp: FloatArray,
     out: FloatArray,
 ) -> None:
     """Match patch after patch; `warp` goes from start to solution, `out` receives the columns."""
-    work = new_workspace(half, kind, geometric)
+    work = new_workspace(half, kind, geometric, blurred)
     for i in range(len(xy)):
         out[i, FLAG] = prepare_template(left, xy[i, 0], xy[i, 1], work)
         if out[i, FLAG] == MATCHED:

@@ -6,11 +6,13 @@ Source: Lowe (2004), IJCV 60(2); Hartley and Zisserman (2003), sec. 11.6 (epipol
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import cv2
 import numpy as np
 
 from sfm.conventions import AnyArray, FloatArray, IntArray
+from sfm.kernels.options import compiled
 from sfm.matching.radiometry import FULL_SCALE_8, grey_of_8_bit
 
 RATIO = 0.8  # of the distances to the nearest and the second-nearest descriptor; Lowe (2004), IJCV 60(2)
@@ -23,6 +25,7 @@ MIN_CONTRAST = 0.01
 # Features are looked for in a picture of at most this side, and of half the photograph's: they start the
 # matching, which measures in the photograph itself. Where such a picture has too few, in finer ones.
 MAX_SIDE_PX = 1600
+BLOCK = 256  # descriptors of one photograph that are compared with all of another at a time
 CELLS = 12  # along the longer side of a photograph: each cell has its share of the features
 
 
@@ -106,15 +109,11 @@ def matched_features(a: Features, b: Features, *, seed: int) -> tuple[IntArray, 
     none = np.zeros((0, 2), dtype=np.int64), np.zeros(0)
     if min(len(a), len(b)) < MIN_PAIR_MATCHES:
         return none
-    similarity = a.descriptor @ b.descriptor.T
-    forth, back = similarity.argmax(axis=1), similarity.argmax(axis=0)
-    rows = np.flatnonzero(back[forth] == np.arange(len(a)))
-    best = similarity[rows, forth[rows]]
-    similarity[rows, forth[rows]] = -1.0
-    second = similarity[rows].max(axis=1)
+    nearest = _nearest_descriptors(a.descriptor, b.descriptor)
+    mutual = nearest.back[nearest.forth] == np.arange(len(a))
     # of unit vectors the squared distance is 2 - 2 s
-    clear = 1 - best < RATIO**2 * (1 - second)
-    rows, best, second = rows[clear], best[clear], second[clear]
+    rows = np.flatnonzero(mutual & (1 - nearest.best < RATIO**2 * (1 - nearest.second)))
+    forth, best, second = nearest.forth, nearest.best[rows], nearest.second[rows]
     distinct = 1 - np.sqrt(np.maximum(1 - best, 0.0) / np.maximum(1 - second, 1e-12))
     found = np.column_stack([rows, forth[rows]])
     if len(found) < MIN_PAIR_MATCHES:
@@ -132,3 +131,44 @@ def matched_features(a: Features, b: Features, *, seed: int) -> tuple[IntArray, 
         return none
     kept = fits.ravel() > 0
     return np.asarray(found[kept], dtype=np.int64), np.asarray(distinct[kept], dtype=float)
+
+
+class _Nearest(NamedTuple):
+    """The most similar descriptors of two photographs."""
+
+    forth: IntArray  # of the second photograph, for each one of the first, (k,)
+    best: AnyArray  # similarity of that one, (k,)
+    second: AnyArray  # of the one behind it, (k,)
+    back: IntArray  # of the first photograph, for each one of the second, (l,)
+
+
+def _nearest_descriptors(first: AnyArray, second: AnyArray) -> _Nearest:
+    """Return which unit vectors of two photographs have the largest products, the first of equal ones.
+
+    The products are taken block by block, so that they are read where they were written, in the cache.
+    """
+    k, size = len(first), len(second)
+    found = _Nearest(
+        np.empty(k, np.int64), np.empty(k, np.float32), np.empty(k, np.float32), np.empty(size, np.int64)
+    )
+    of_back = np.full(size, -np.inf, np.float32)
+    transposed = np.ascontiguousarray(second.T)
+    for begin in range(0, k, BLOCK):
+        _take_nearest(first[begin : begin + BLOCK] @ transposed, begin, found, of_back)
+    return found
+
+
+@compiled
+def _take_nearest(similarity: AnyArray, begin: int, found: _Nearest, of_back: AnyArray) -> None:
+    """Take over the largest of some rows, and of all columns so far."""
+    for i in range(similarity.shape[0]):
+        best, second, at = np.float32(-np.inf), np.float32(-np.inf), 0
+        for j in range(similarity.shape[1]):
+            value = similarity[i, j]
+            if value > best:
+                best, second, at = value, best, j
+            elif value > second:
+                second = value
+            if value > of_back[j]:
+                of_back[j], found.back[j] = value, begin + i
+        found.forth[begin + i], found.best[begin + i], found.second[begin + i] = at, best, second

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from bisect import bisect_left
 from dataclasses import dataclass, replace
+from functools import cached_property
 from math import comb
 
 import numpy as np
@@ -42,9 +43,19 @@ class RobustResection:
     residuals: FloatArray  # v = computed - measured of all points, tangents, NaN if behind, (n, 2)
     rms: float  # per coordinate over the fitting points, tangents
     sigma0: float  # a posteriori standard deviation of a coordinate, tangents; NaN without redundancy
-    covariance: FloatArray  # of X0 (object unit) and omega, phi, kappa (rad), (6, 6)
+    sigma: float  # standard deviation of a coordinate for the covariance, tangents
+    normal_matrix: FloatArray  # of X0 and a small rotation in image axes, for unit weights, (6, 6)
     trials: int  # triples tried
     reason: str  # why there is no orientation; empty if there is one
+
+    @cached_property
+    def covariance(self) -> FloatArray:
+        """Covariance of X0 (object unit) and omega, phi, kappa (rad), (6, 6)."""
+        if not self.found:
+            return np.full((6, 6), np.nan)
+        return self.sigma**2 * cofactors_in_angles(
+            np.asarray(np.linalg.inv(self.normal_matrix), dtype=float), self.rotation
+        )
 
     @property
     def found(self) -> bool:
@@ -115,12 +126,8 @@ def resect_robust(
     square = float(np.sum(fitting**2))
     redundancy = 2 * count - UNKNOWNS
     sigma0 = np.sqrt(square / redundancy)
-    covariance = (sigma0 if sigma is None else sigma) ** 2 * cofactors_in_angles(
-        np.asarray(np.linalg.inv(N), dtype=float), R
-    )
-    return RobustResection(
-        X0, R, used, residuals, float(np.sqrt(square / (2 * count))), float(sigma0), covariance, trials, ""
-    )
+    rms, a_priori = float(np.sqrt(square / (2 * count))), sigma0 if sigma is None else sigma
+    return RobustResection(X0, R, used, residuals, rms, float(sigma0), float(a_priori), N, trials, "")
 
 
 def fewest_fitting(n: int, tolerance: float, field: float, *, minimum: int = SAMPLE + 1) -> int:
@@ -163,7 +170,7 @@ def expected_trials(w: float, n: int) -> tuple[float, float]:
 def _failure(n: int, reason: str) -> RobustResection:
     nan = np.full((n, 2), np.nan)
     return RobustResection(
-        _NOWHERE.copy(), np.full((3, 3), np.nan), np.zeros(n, dtype=bool), nan, np.nan, np.nan,
+        _NOWHERE.copy(), np.full((3, 3), np.nan), np.zeros(n, dtype=bool), nan, np.nan, np.nan, np.nan,
         np.full((6, 6), np.nan), 0, reason,
     )  # fmt: skip
 

@@ -130,35 +130,23 @@ def draw_photograph(photograph: PhotographTargets, adjustment: Adjustment, facto
     picture = cv2.cvtColor(fitted_picture(grey, MAX_SIDE_PX), cv2.COLOR_GRAY2BGR)
 
     rows, names = _image_points(photograph.image, adjustment)
-    seen = adjustment.network.image_points
-    owner = _nearest(photograph.xy, seen.xy[rows])
-    reach = np.zeros(len(rows))  # of the outline of each image point to the right, px
-    remarks = _remarks(photograph)
+    seen = adjustment.network.image_points.xy[rows]
+    colour = [DROPPED if rejected else USED for rejected in adjustment.rejected[rows]]
+    owner = _nearest(photograph.xy, seen)
+    colour_of_target = [UNUSED if row < 0 else colour[row] for row in owner]
     crowded = len(photograph.xy) > CROWDED
-    for k in range(len(photograph.xy)):
-        row = owner[k]
-        colour = UNUSED if row < 0 else DROPPED if adjustment.rejected[rows[row]] else USED
-        if crowded:
-            at = _drawn(photograph.xy[k], scale)
-            cv2.circle(picture, at, DOT_PX << SHIFT, colour, cv2.FILLED, cv2.LINE_AA, SHIFT)
-            continue
-        outline = photograph.semi_axes[k] + 2 / scale
-        _ellipse(picture, photograph.xy[k], outline, photograph.angle[k], scale, colour)
-        for remark, second in REMARK_COLOURS:
-            if remarks[k] & remark.value:
-                outline = outline + 2 / scale
-                _ellipse(picture, photograph.xy[k], outline, photograph.angle[k], scale, second)
+    if crowded:
+        _dots(picture, photograph.xy, colour_of_target, scale)
+    else:
+        _outlines(picture, photograph, colour_of_target, scale)
     _crosses(picture, photograph.rejected_xy, photograph.rejected_flag, scale)
     # The vector points from the measured to the adjusted position: v = computed - measured.
-    for row, name, right in zip(rows, names, reach, strict=True):
-        xy = seen.xy[row]
-        end = xy + factor / scale * adjustment.residuals[row]
-        if np.isfinite(end).all():  # a rejected point behind the camera has no residual
-            _arrow(picture, xy, end, scale, thickness=1 if crowded else 2)
-        if crowded:
-            continue
-        colour = DROPPED if adjustment.rejected[row] else USED
-        _label(picture, name, xy + np.array([right, -right / 2]), scale, colour)
+    ends = seen + factor / scale * adjustment.residuals[rows]
+    finite = np.isfinite(ends).all(axis=1)  # a rejected point behind the camera has no residual
+    _arrows(picture, seen[finite], ends[finite], scale, thickness=1 if crowded else 2)
+    if not crowded:
+        for name, xy, own in zip(names, seen, colour, strict=True):
+            _label(picture, name, xy, scale, own)
     return picture
 
 
@@ -210,24 +198,33 @@ def _remarks(photograph: PhotographTargets) -> IntArray:
     return np.zeros(len(photograph.xy), np.int64) if photograph.flag is None else photograph.flag
 
 
-def _drawn(xy: FloatArray, scale: float) -> tuple[int, int]:
-    """Return a position as OpenCV takes it with SHIFT fractional bits; half pixels move with the scale."""
-    at = ((np.asarray(xy) + 0.5) * scale - 0.5) * (1 << SHIFT)
-    at = np.clip(at, -(2**28), 2**28)
-    return round(float(at[0])), round(float(at[1]))
+def _drawn(xy: FloatArray, scale: float) -> AnyArray:
+    """Return positions as OpenCV takes them with SHIFT fractional bits; half pixels move with the scale."""
+    return np.round(((xy + 0.5) * scale - 0.5) * (1 << SHIFT)).clip(-(2**28), 2**28).astype(np.int32)
 
 
-def _ellipse(
-    picture: AnyArray, xy: FloatArray, semi: FloatArray, angle: float, scale: float, colour: tuple[int, ...]
+def _dots(picture: AnyArray, xy: FloatArray, colour: list[tuple[int, int, int]], scale: float) -> None:
+    for at, own in zip(_drawn(xy, scale).tolist(), colour, strict=True):
+        cv2.circle(picture, at, DOT_PX << SHIFT, own, cv2.FILLED, cv2.LINE_AA, SHIFT)
+
+
+def _outlines(
+    picture: AnyArray, photograph: PhotographTargets, colour: list[tuple[int, int, int]], scale: float
 ) -> None:
-    axes = round(float(semi[0]) * scale * (1 << SHIFT)), round(float(semi[1]) * scale * (1 << SHIFT))
-    degrees = float(np.degrees(angle))
-    cv2.ellipse(picture, _drawn(xy, scale), axes, degrees, 0, 360, colour, 1, cv2.LINE_AA, SHIFT)
+    """Draw the outlines of targets, and one more around these for each remark."""
+    remarks = _remarks(photograph)
+    for k, at in enumerate(_drawn(photograph.xy, scale).tolist()):
+        colours = [colour[k], *(second for remark, second in REMARK_COLOURS if remarks[k] & remark.value)]
+        for n, own in enumerate(colours, start=1):
+            semi = photograph.semi_axes[k] * scale + 2 * n
+            axes = np.round(semi * (1 << SHIFT)).astype(int).tolist()
+            degrees = float(np.degrees(photograph.angle[k]))
+            cv2.ellipse(picture, at, axes, degrees, 0, 360, own, 1, cv2.LINE_AA, SHIFT)
 
 
 def _crosses(picture: AnyArray, xy: FloatArray, flag: IntArray, scale: float) -> None:
     """Draw rejected candidates, of which a photograph may have thousands, all of one flag at once."""
-    at = np.round(((xy + 0.5) * scale - 0.5) * (1 << SHIFT)).clip(-(2**28), 2**28).astype(np.int32)
+    at = _drawn(xy, scale)
     for value in np.unique(flag).tolist():
         colour = next((colour for reason, colour in REASON_COLOURS if value & reason.value), INK)
         arm = (2 if value & Flag.TOO_SMALL.value else 4) << SHIFT
@@ -236,12 +233,13 @@ def _crosses(picture: AnyArray, xy: FloatArray, flag: IntArray, scale: float) ->
         cv2.polylines(picture, list(lines), False, colour, 1, cv2.LINE_AA, SHIFT)
 
 
-def _arrow(picture: AnyArray, start: FloatArray, end: FloatArray, scale: float, *, thickness: int) -> None:
-    cv2.line(picture, _drawn(start, scale), _drawn(end, scale), ARROW, thickness, cv2.LINE_AA, SHIFT)
+def _arrows(picture: AnyArray, starts: FloatArray, ends: FloatArray, scale: float, *, thickness: int) -> None:
+    lines = np.stack([_drawn(starts, scale), _drawn(ends, scale)], axis=1)
+    cv2.polylines(picture, list(lines), False, ARROW, thickness, cv2.LINE_AA, SHIFT)
 
 
 def _label(picture: AnyArray, name: str, xy: FloatArray, scale: float, colour: tuple[int, ...]) -> None:
-    x, y = _drawn(xy, scale)
+    x, y = _drawn(xy, scale).tolist()
     at = (x >> SHIFT) + 5, (y >> SHIFT) - 5
     text = name.encode("ascii", "replace").decode()
     for shade, thickness in ((INK, 3), (colour, 1)):

@@ -6,7 +6,7 @@ points: as measured). Numbers are written with enough digits to give the same nu
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +18,7 @@ from sfm.distortion.balanced import MODEL as BALANCED_MODEL
 from sfm.distortion.balanced import UNITS, to_balanced
 from sfm.errors import GeometryError
 from sfm.files.plain_text import csv_text
+from sfm.network import Network
 from sfm.report.findings.bundle_statistics import Statistics
 from sfm.report.findings.findings import Findings
 from sfm.report.findings.given_residuals import Given
@@ -112,17 +113,11 @@ def image_point_rows(adjustment: Adjustment) -> Iterable[Sequence[object]]:
     """
     network = adjustment.network
     seen = network.image_points
-    sigma, covariance = seen.stated_sigma, seen.stated_covariance
-    for k in range(len(seen)):
-        yield (
-            network.images[seen.image[k]],
-            network.points[seen.point[k]],
-            *seen.xy[k],
-            *sigma[k],
-            covariance[k] or None,
-            *adjustment.residuals[k],
-            int(adjustment.rejected[k]),
-        )
+    columns = (seen.xy, seen.stated_sigma, seen.stated_covariance, adjustment.residuals)
+    for (x, y, sx, sy, sxy, vx, vy), (image, point), rejected in zip(
+        np.column_stack(columns).tolist(), _names(network), adjustment.rejected.tolist(), strict=True
+    ):
+        yield image, point, x, y, sx, sy, sxy or None, vx, vy, int(rejected)
 
 
 def target_rows(findings: Findings) -> Iterable[Sequence[object]]:
@@ -161,25 +156,28 @@ def reliability_rows(adjustment: Adjustment, statistics: Statistics) -> Iterable
     redundancy number is 0 no error is found.
     """
     network = adjustment.network
-    seen, found = network.image_points, statistics.reliability
-    for k in range(len(seen)):
-        yield (
-            network.images[seen.image[k]],
-            network.points[seen.point[k]],
-            *adjustment.residuals[k],
-            *adjustment.redundancy_numbers[k],
-            *adjustment.standardised[k],
-            *adjustment.tau[k],
-            *found.minimal_bias[k],
-            *found.external[k],
-            float(adjustment.weights[k]),
-            int(adjustment.rejected[k]),
-            *_gross_error(adjustment.residuals[k], adjustment.redundancy_numbers[k]),
-        )
+    a, found = adjustment, statistics.reliability
+    tests = (a.residuals, a.redundancy_numbers, a.standardised, a.tau, found.minimal_bias, found.external)
+    error = _gross_error(a.residuals, a.redundancy_numbers)
+    for names, values, rejected, size in zip(
+        _names(network),
+        np.column_stack((*tests, a.weights)).tolist(),
+        a.rejected.tolist(),
+        error.tolist(),
+        strict=True,
+    ):
+        yield (*names, *values, int(rejected), *size)
+
+
+def _names(network: Network) -> Iterator[tuple[str, str]]:
+    """Return photograph and point of every image point."""
+    seen = network.image_points
+    for image, point in zip(seen.image.tolist(), seen.point.tolist(), strict=True):
+        yield network.images[image], network.points[point]
 
 
 def _gross_error(v: FloatArray, r: FloatArray) -> FloatArray:
-    """Return the size that an error would have, v / r, NaN where nothing checks it, px, (2,)."""
+    """Return the size that an error would have, v / r, NaN where nothing checks it, px, (k, 2)."""
     checked = r > UNCONTROLLED
     return np.where(checked, v / np.where(checked, r, 1.0), np.nan)
 

@@ -158,10 +158,12 @@ def _cut(
             crops[int(k)] = jpeg_of(patch, CROP_QUALITY)
         if with_files and with_cells:
             cells.append(patch)
+    large = fitted_picture(grey, FILE_PX)
+    view = fitted_picture(large, VIEW_PX)
     return _Cut(
-        jpeg_of(fitted_picture(grey, THUMBNAIL_PX), THUMBNAIL_QUALITY),
-        jpeg_of(fitted_picture(grey, VIEW_PX), VIEW_QUALITY),
-        jpeg_of(fitted_picture(grey, FILE_PX), FILE_QUALITY) if with_files else b"",
+        jpeg_of(fitted_picture(view, THUMBNAIL_PX), THUMBNAIL_QUALITY),
+        jpeg_of(view, VIEW_QUALITY),
+        jpeg_of(large, FILE_QUALITY) if with_files else b"",
         crops,
         frames,
         _sheet(cells) if cells else b"",

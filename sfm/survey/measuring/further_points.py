@@ -4,7 +4,8 @@ A few hundred tie points orient the photographs and tell the shape of the surfac
 interest points are taken where a photograph has no point yet, put on the plane through their neighbours in
 space, projected into all photographs that look at that plane, and measured there by least squares matching,
 in those with the most similar direction first, whose rays correct the place for the others. So a point is
-followed through all its photographs, also where the directions are too different for descriptors.
+followed through all its photographs, also where the directions are too different for descriptors. The tie
+points themselves are measured anew in the same way: when they were found, nothing was known of perspective.
 """
 
 from __future__ import annotations
@@ -13,11 +14,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.spatial import cKDTree
 
-from sfm.camera import tangents_from_pixel
 from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
 from sfm.matching.lsm.projected_points import pictures_of, plane_warps
+from sfm.matching.lsm.surface_planes import NEIGHBOURS, planes_at
 from sfm.matching.lsm.two_photo import match_lsm
 from sfm.matching.lsm.warp import linear_part
 from sfm.matching.radiometry import grey_of
@@ -25,7 +25,6 @@ from sfm.matching.tracks.interest import foerstner_points
 from sfm.network import Estimate, ImagePoints, rows_of
 from sfm.orientation.image_rays import intersect_image_points
 
-NEIGHBOURS = 6  # tie points whose plane a new point is put on
 FIRST_PHOTOGRAPHS = 4  # with the most similar direction, whose rays correct the place of a point
 FIRST_SHIFT_PX = 6.0  # how far a point may be from where the plane puts it
 LATER_SHIFT_PX = 3.0  # and from where its first rays put it
@@ -37,20 +36,29 @@ TOLERANCE_PX = 1.5  # largest residual of a ray that stays with its point
 
 @dataclass(frozen=True)
 class FurtherPoints:
-    """New points and their rays."""
+    """Points and their rays."""
 
     image_points: ImagePoints  # k of them, their points 0 to n - 1
     points: FloatArray  # object points, (n, 3)
     residuals: FloatArray  # of the rays with the orientation as it was, px, (k, 2)
+    tie_point: IntArray  # the tie point that each was before, -1 of new ones, (n,)
 
 
 @dataclass(frozen=True)
 class _Places:
-    """New points of one reference photograph."""
+    """Points of one reference photograph."""
 
     xy: FloatArray  # whole pixels, (k, 2)
     normal: FloatArray  # of the surface there, towards the photograph, unit vectors, (k, 3)
     points: FloatArray  # object points, (k, 3)
+    tie_point: IntArray  # -1 of new ones, (k,)
+
+    def __len__(self) -> int:
+        return len(self.xy)
+
+    def select(self, rows: BoolArray) -> _Places:
+        """Return some of them."""
+        return _Places(self.xy[rows], self.normal[rows], self.points[rows], self.tie_point[rows])
 
 
 def find_further_points(
@@ -58,7 +66,7 @@ def find_further_points(
     estimate: Estimate,
     camera: IntArray,
     seen: ImagePoints,
-    taken: ImagePoints,
+    again: ImagePoints,
     *,
     window_px: int,
     spacing_px: float,
@@ -67,14 +75,14 @@ def find_further_points(
     min_correlation: float = 0.7,
     threads: int = 1,
 ) -> FurtherPoints:
-    """Find and measure points in all photographs that see them, until these are covered.
+    """Measure tie points anew, and further points, in all photographs that see them, until these are covered.
 
     Args:
         photographs: (H, W), m of them.
         estimate: orientation of the photographs, to a few pixels, and the tie points that there are.
         camera: index of the camera of each photograph, (m,).
         seen: image points of the tie points that fit, which tell the surface.
-        taken: image points that no new one is to be near to in its reference.
+        again: image points of those tie points that are measured anew; no new one is near to them.
         window_px: odd side of the windows.
         spacing_px: smallest distance of a new point from all others in its reference.
         references: photographs that points are taken from; all, those with the most tie points first, if not
@@ -88,7 +96,9 @@ def find_further_points(
     m = len(photographs)
     margin = window_px // 2 + BORDER_PX
     own = rows_of(seen.image, m)
-    places_of = [[taken.xy[rows]] for rows in rows_of(taken.image, m)]
+    places_of = [[again.xy[rows]] for rows in rows_of(again.image, m)]
+    ties = _references(again)
+    ties_of = [ties[rows] for rows in rows_of(again.image[ties], m)]
     order = np.argsort([-len(rows) for rows in own], kind="stable") if references is None else references
     shapes = [one.shape[:2] for one in photographs]
     found = [_none()]
@@ -101,52 +111,31 @@ def find_further_points(
             border_px=margin,
             taken=np.concatenate(places_of[i]),
         )
-        places = _on_planes(estimate, camera, i, np.rint(corners.xy), seen.point[own[i]])
+        xy = np.rint(np.concatenate([again.xy[ties_of[i]], corners.xy]))
+        points, normal = planes_at(estimate, camera, i, xy, seen.point[own[i]])
+        tie_point = np.concatenate([again.point[ties_of[i]], np.full(len(corners.xy), -1)])
+        known = np.asarray(np.isfinite(points).all(axis=1))
+        places = _Places(xy, normal, points, tie_point).select(known)
         visible = _visible(estimate, camera, i, places, shapes, margin)
         several = visible.sum(axis=0) >= min_rays
         if not several.any():
             continue
-        places = _Places(places.xy[several], places.normal[several], places.points[several])
+        places = places.select(several)
         rays = _followed(
             photographs, estimate, camera, i, places, visible[:, several], window_px, min_correlation, threads
         )
-        new = _agreeing(rays, estimate, camera, len(places.xy), min_rays)
+        new = _agreeing(rays, estimate, camera, places.tie_point, min_rays)
         found.append(new)
         for j in np.unique(new.image_points.image).tolist():
             places_of[j].append(new.image_points.xy[new.image_points.image == j])
     return _joined(found)
 
 
-def _on_planes(estimate: Estimate, camera: IntArray, i: int, xy: FloatArray, point: IntArray) -> _Places:
-    """Put places of a photograph on the planes through the tie points around them.
-
-    Over a plane the inverse of the depth is linear in the tangents: 1 / t = a u + b v + c.
-
-    Args:
-        estimate: orientation and tie points.
-        camera: index of the camera of each photograph, (m,).
-        i: the photograph.
-        xy: places, px, (k, 2).
-        point: tie points that it sees.
-    """
-    lens, X0, R = estimate.cameras[camera[i]], estimate.position[i], estimate.rotation[i]
-    UVW = (estimate.points[point] - X0) @ R
-    UVW = UVW[UVW[:, 2] < 0]
-    if len(UVW) < NEIGHBOURS:
-        return _Places(np.zeros((0, 2)), np.zeros((0, 3)), np.zeros((0, 3)))
-    known, inverse = -UVW[:, :2] / UVW[:, 2:], -1 / UVW[:, 2]
-    uv = tangents_from_pixel(lens, xy)
-    near = cKDTree(known).query(uv, k=NEIGHBOURS)[1]
-    A = np.concatenate([known[near], np.ones((*near.shape, 1))], axis=2)
-    N = np.einsum("kij,kil->kjl", A, A)
-    N += 1e-6 * np.trace(N, axis1=1, axis2=2)[:, None, None] * np.diag([1.0, 1.0, 0.0])  # neighbours in a row
-    plane = np.linalg.solve(N, np.einsum("kij,ki->kj", A, inverse[near])[:, :, None])[:, :, 0]
-    value = np.sum(plane[:, :2] * uv, axis=1) + plane[:, 2]
-    inside = (value > 0.5 * inverse.min()) & (value < 2 * inverse.max())
-    uv, value, plane = uv[inside], value[inside], plane[inside]
-    points = X0 + (np.column_stack([uv, -np.ones(len(uv))]) / value[:, None]) @ R.T
-    normal = -(plane * [1.0, 1.0, -1.0]) @ R.T
-    return _Places(xy[inside], normal / np.linalg.norm(normal, axis=1, keepdims=True), points)
+def _references(seen: ImagePoints) -> IntArray:
+    """Return the row of each point in the photograph that it was taken from, where it is on a whole pixel."""
+    between = (seen.xy != np.rint(seen.xy)).any(axis=1)
+    order = np.lexsort([between, seen.point])
+    return np.asarray(order[np.unique(seen.point[order], return_index=True)[1]])
 
 
 def _visible(
@@ -220,6 +209,7 @@ def _followed(
                 start=warp[fits],
                 max_shift_px=max_shift_px,
                 min_correlation=min_correlation,
+                blur=True,
                 threads=threads,
             )
             good = match.good
@@ -241,15 +231,16 @@ def _followed(
 
 
 def _agreeing(
-    seen: ImagePoints, estimate: Estimate, camera: IntArray, n: int, min_rays: int
+    seen: ImagePoints, estimate: Estimate, camera: IntArray, tie_point: IntArray, min_rays: int
 ) -> FurtherPoints:
     """Return the points with enough rays that meet, and these rays."""
+    n = len(tie_point)
     met = intersect_image_points(seen, camera, estimate, n_points=n, tolerance_px=TOLERANCE_PX)
     used = met.used & (np.bincount(seen.point[met.used], minlength=n) >= min_rays)[seen.point]
     kept, point = np.unique(seen.point[used], return_inverse=True)
     c = np.array([lens.c_px for lens in estimate.cameras])[camera[seen.image[used]]]
     image_points = replace(seen.select(used), point=point.ravel())
-    return FurtherPoints(image_points, met.points[kept], met.residuals[used] * c[:, None])
+    return FurtherPoints(image_points, met.points[kept], met.residuals[used] * c[:, None], tie_point[kept])
 
 
 def _concatenated(parts: Sequence[ImagePoints]) -> ImagePoints:
@@ -273,6 +264,7 @@ def _joined(found: Sequence[FurtherPoints]) -> FurtherPoints:
         _concatenated(moved),
         np.concatenate([one.points for one in found]),
         np.concatenate([one.residuals for one in found]),
+        np.concatenate([one.tie_point for one in found]),
     )
 
 
@@ -280,4 +272,4 @@ def _none() -> FurtherPoints:
     """Return no points."""
     none = np.zeros(0, dtype=np.int64)
     nothing = ImagePoints(none, none, np.zeros((0, 2)), np.zeros((0, 2, 2)))
-    return FurtherPoints(nothing, np.zeros((0, 3)), np.zeros((0, 2)))
+    return FurtherPoints(nothing, np.zeros((0, 3)), np.zeros((0, 2)), none)

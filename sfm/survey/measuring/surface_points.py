@@ -1,8 +1,8 @@
 """The points of a textured survey once its photographs are oriented: their windows cover the photographs.
 
 Windows that overlap measure the same pixels twice, and their errors have these in common: the precision of a
-result would be told too good. So tie points stay where they do not overlap, and what is not covered yet is
-filled. All pixels then take part once, whatever the size of the windows; it is chosen by what the surface
+result would be told too good. So tie points that do not overlap are measured anew, and what they do not cover
+is filled. All pixels then take part once, whatever the size of the windows; it is chosen by what the surface
 bears, which is hardly plane over large ones.
 """
 
@@ -14,8 +14,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sfm.conventions import MAD_TO_SIGMA, AnyArray, BoolArray
+from sfm.matching.lsm.coverage import WINDOWS_PX, largest_alike, points_apart
 from sfm.matching.lsm.projected_points import pictures_of
-from sfm.network import Estimate, ImagePoints, Network, rows_of
+from sfm.network import Estimate, ImagePoints, Network
 from sfm.orientation.incremental.sequence import Orientation
 from sfm.photographs.reading import read_photograph
 from sfm.result import PhotographTargets
@@ -24,17 +25,10 @@ from sfm.survey.inputs.survey import Survey
 from sfm.survey.measuring.further_points import FurtherPoints, find_further_points
 from sfm.survey.measuring.tie_points import MIN_RAYS, drawn_windows
 
-# That are tried. Larger ones tell no more where they cover a photograph, and where the surface is curved they
-# measure its mean depth over them, in all photographs alike, which no residual shows.
-WINDOWS_PX = (15, 11)
-ALIKE = (
-    1.1  # ratio of precisions for the same pixels up to which the larger windows, which are fewer, are taken
-)
 TRIAL_PHOTOGRAPHS = 2  # of which points are taken to choose the window
 TRIAL_RAYS = 100  # with fewer the window stays as it is
 # Spread of the rays of a tie point, in that of all, beyond which it tells nothing of the surface
 TOLERANCE_FACTOR = 6.0
-COVERED = 0.5  # part of the photographs of a tie point in which others take its place
 MAX_POINTS = 4000  # of a photograph: larger ones are covered in part
 PACKING = 0.7  # points at a distance of at least d that a square of side d has, found by chance
 
@@ -79,7 +73,7 @@ def cover_photographs(
     if "window_px" not in settings.model_fields_set:
         window = _best_window(photographs, network, estimate, surface, window, jobs)
     spacing = _spacing(photographs, window)
-    kept = fits & _apart(network, seen, fits, spacing)[seen.point]
+    kept = fits & points_apart(seen, fits, spacing, n_points=len(network.points))[seen.point]
     further = find_further_points(
         photographs,
         estimate,
@@ -91,7 +85,7 @@ def cover_photographs(
         min_rays=MIN_RAYS,
         threads=jobs,
     )
-    covered, values = _with_further(network, estimate, kept, further, survey.adjust.sigma_px)
+    covered, values = _with_further(network, estimate, further, survey.adjust.sigma_px)
     return Surface(covered, values, drawn_windows(covered, paths, window))
 
 
@@ -123,11 +117,7 @@ def _best_window(
     usual: int,
     jobs: int,
 ) -> int:
-    """Return the side of the windows with which the same pixels are the most precise, px.
-
-    The standard deviation of a window's place falls with its side, the number of windows with the square of
-    that: for noise alone the product is the same for all. Where it grows, the surface is not plane over them.
-    """
+    """Return the side of the windows with which the same pixels are the most precise, px."""
     most = np.argsort(-np.bincount(surface.image, minlength=len(photographs)), kind="stable")
     none = surface.select(np.zeros(len(surface), dtype=bool))
     found: list[tuple[int, float]] = []
@@ -146,44 +136,26 @@ def _best_window(
         if len(trial.residuals) >= TRIAL_RAYS:
             spread = MAD_TO_SIGMA * float(np.median(np.abs(trial.residuals)))
             found.append((window, spread * window))
-    if not found:
-        return usual
-    best = min(cost for _, cost in found)
-    return next(window for window, cost in found if cost <= ALIKE * best)
-
-
-def _apart(network: Network, seen: ImagePoints, fits: BoolArray, spacing: float) -> BoolArray:
-    """Choose tie points, those with the most rays first, that others do not cover, (n,)."""
-    kept = np.zeros(len(network.points), dtype=bool)
-    rows = np.flatnonzero(fits)
-    cells = np.floor(seen.xy[rows] / spacing).astype(np.int64)
-    keys = list(zip(seen.image[rows].tolist(), cells[:, 0].tolist(), cells[:, 1].tolist(), strict=True))
-    of_point = rows_of(seen.point[rows], len(kept))
-    taken: set[tuple[int, int, int]] = set()
-    for point in np.argsort([-len(own) for own in of_point], kind="stable").tolist():
-        own = [keys[k] for k in of_point[point].tolist()]
-        if own and sum(key in taken for key in own) < COVERED * len(own):
-            kept[point] = True
-            taken.update(own)
-    return kept
+    return largest_alike(found) if found else usual
 
 
 def _with_further(
-    network: Network, estimate: Estimate, kept: BoolArray, further: FurtherPoints, sigma_px: float
+    network: Network, estimate: Estimate, further: FurtherPoints, sigma_px: float
 ) -> tuple[Network, Estimate]:
-    """Return the network of the tie points that are kept, and of further points behind them."""
-    seen, new = network.image_points.select(kept), further.image_points
+    """Return the network of the tie points that were measured anew, and of further points behind them."""
     n = len(network.points)
-    names = tuple(f"t{n + j + 1:05d}" for j in range(len(further.points)))
-    image_points = ImagePoints(
-        np.concatenate([seen.image, new.image]),
-        np.concatenate([seen.point, new.point + n]),
-        np.concatenate([seen.xy, new.xy]),
-        np.concatenate([seen.covariance, new.covariance + sigma_px**2 * np.eye(2)]),
-    )
-    points = estimate.points.copy()
-    points[np.bincount(seen.point, minlength=n) == 0] = np.nan
+    new = further.tie_point < 0
+    place = further.tie_point.copy()
+    place[new] = n + np.arange(new.sum())
+    names = tuple(f"t{j + 1:05d}" for j in place[new].tolist())
+    seen = further.image_points
+    order = np.argsort(place[seen.point], kind="stable")
+    image_points = replace(
+        seen, point=place[seen.point], covariance=seen.covariance + sigma_px**2 * np.eye(2)
+    ).select(order)
+    points = np.full((n + len(names), 3), np.nan)
+    points[place] = further.points
     return (
         replace(network, points=(*network.points, *names), image_points=image_points),
-        replace(estimate, points=np.concatenate([points, further.points])),
+        replace(estimate, points=points),
     )

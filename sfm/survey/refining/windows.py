@@ -1,229 +1,179 @@
-"""Key points of a model measured anew in parts, so that few photographs are in memory at a time."""
+"""Key points of a model measured anew, each in all photographs of its point by the window of one of them."""
 
 from __future__ import annotations
 
-from collections import OrderedDict
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
-from pathlib import Path
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
-from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
-from sfm.errors import PhotographError, SurveyFileError
-from sfm.matching.lsm.multi_photo import match_multi
-from sfm.matching.radiometry import grey_of
-from sfm.network import Estimate, Network
-from sfm.photographs.reading import read_photograph
-from sfm.runtime.progress import Progress
+from sfm.conventions import MAD_TO_SIGMA, FloatArray, IntArray
+from sfm.matching.lsm.coverage import WINDOWS_PX, largest_alike
+from sfm.matching.lsm.projected_points import plane_warps
+from sfm.matching.lsm.surface_planes import planes_at
+from sfm.matching.lsm.two_photo import match_lsm
+from sfm.matching.lsm.warp import linear_part
+from sfm.network import Estimate, ImagePoints, Network, rows_of
+from sfm.orientation.image_rays import intersect_image_points
+from sfm.runtime.progress import SILENT, Progress
+from sfm.survey.refining.model_photographs import Photographs
 
-MEMORY_BYTES = 1_000_000_000  # of photographs in memory at a time, as single precision
-MIN_PARTS = 20  # that the points are matched in, so that progress is seen
+TRIAL_PHOTOGRAPHS = 3  # whose points choose the window
+MIN_RAYS = 3  # of a point that is measured
+TRIAL_RAYS = 100  # with fewer the window stays as it is
+
+
+class Limits(NamedTuple):
+    """What is a match no more."""
+
+    shift_px: float  # farther from the key point
+    correlation: float  # below it a window is not alike
 
 
 @dataclass(frozen=True)
 class Windows:
-    """Image points measured anew; see `sfm.matching.lsm.multi_photo.MultiMatches`."""
+    """Image points measured anew."""
 
     xy: FloatArray  # px, NaN where the flag says why, (k, 2)
     covariance: FloatArray  # px^2, (k, 2, 2)
     flag: IntArray  # see LsmFlag, (k,)
 
 
-class Photographs:
-    """The photographs of a model, read when they are needed; the oldest are forgotten."""
-
-    def __init__(self, network: Network, estimate: Estimate, folder: Path, memory_bytes: int) -> None:
-        self._paths = photograph_paths(network, estimate, folder)
-        self._names = network.images
-        self._sizes = [estimate.cameras[camera].size_px for camera in network.camera]
-        self._memory = memory_bytes
-        self._kept: OrderedDict[int, AnyArray] = OrderedDict()
-
-    def bytes_of(self, i: int) -> int:
-        """Memory that a photograph takes."""
-        width, height = self._sizes[i]
-        return 4 * int(width) * int(height)
-
-    def grey(self, i: int) -> AnyArray:
-        """Return one photograph, float32, (H, W)."""
-        if i not in self._kept:
-            self._kept[i] = grey_of(read_of_size(self._paths[i], self._names[i], self._sizes[i]))
-        self._kept.move_to_end(i)
-        while len(self._kept) > 1 and sum(one.nbytes for one in self._kept.values()) > self._memory:
-            self._kept.popitem(last=False)
-        return self._kept[i]
-
-
 def match_windows(
+    photographs: Photographs,
     network: Network,
     estimate: Estimate,
-    folder: Path,
     rows: IntArray,
     reference: IntArray,
     *,
-    orientation_px: float,
     window_px: int,
-    max_shift_px: float,
-    min_correlation: float,
-    progress: Progress,
-    memory_bytes: int = MEMORY_BYTES,
+    limits: Limits,
+    progress: Progress = SILENT,
 ) -> Windows:
-    """Measure image points by multi-photo matching, part after part.
+    """Measure image points by least squares matching from the reference photograph of their point.
+
+    The window is seen in perspective on the plane through the points around it. In the reference it is moved
+    to a whole pixel, which needs no resampling. Half of the noise of a match is that of the template and goes
+    to the reference.
 
     Args:
+        photographs: of the model.
         network: the model.
         estimate: its solution.
-        folder: of its photographs.
         rows: image points to measure, (k,).
         reference: the row of each point that is its template, -1 for points that are not measured, (n,).
-        orientation_px: this and the next three as in `sfm.matching.lsm.multi_photo.match_multi`.
         window_px: odd side of the windows.
-        max_shift_px: farther from the key point is too far.
-        min_correlation: below it a window is not alike.
-        progress: told of points.
-        memory_bytes: of photographs in memory at a time; those that see one point are in memory together.
+        limits: what is a match no more.
+        progress: told of reference photographs.
 
     Raises:
-        SurveyFileError: a photograph of the model is not in the folder.
         PhotographError: a photograph that cannot be read, or of another size than its camera.
+
+    Source: Gruen (1985), S. Afr. J. Photogrammetry 14(3).
     """
-    photographs = Photographs(network, estimate, folder, memory_bytes)
-    seen = network.image_points
+    seen, camera = network.image_points, network.camera
     xy, covariance = np.full((len(seen), 2), np.nan), np.full((len(seen), 2, 2), np.nan)
     flag = np.zeros(len(seen), dtype=np.int64)
-    sizes = np.array([photographs.bytes_of(i) for i in range(len(network.images))])
-    parts = list(parts_of(seen.image[rows], seen.point[rows], seen.image[reference], sizes, memory_bytes))
-    progress.stage("matching", len(parts))
-    row_of = np.full(len(seen), -1)
-    for part in parts:
+    at_template, number = np.zeros((len(reference), 2, 2)), np.zeros(len(reference), dtype=np.int64)
+    template_of = reference[seen.point]
+    place = np.rint(seen.xy[template_of])  # px, in the reference, (k, 2)
+    from_photograph = rows_of(seen.image[template_of[rows]], len(network.images))
+    of_photograph = rows_of(seen.image, len(network.images))
+    progress.stage("matching", sum(len(own) > 0 for own in from_photograph))
+    for i, part in enumerate(from_photograph):
+        if not len(part):
+            continue
         own = rows[part]
-        points, number = np.unique(seen.point[own], return_inverse=True)
-        needed, image = np.unique(seen.image[own], return_inverse=True)
-        row_of[own] = np.arange(len(own))
-        found = match_multi(
-            [photographs.grey(i) for i in needed.tolist()],
-            replace(
-                estimate,
-                position=estimate.position[needed],
-                rotation=estimate.rotation[needed],
-                points=estimate.points[points],
-            ),
-            network.camera[needed],
-            image.ravel(),
-            number.ravel(),
-            seen.xy[own],
-            row_of[reference[points]],
-            orientation_px=orientation_px,
-            window_px=window_px,
-            max_shift_px=max_shift_px,
-            min_correlation=min_correlation,
-        )
-        xy[own], covariance[own], flag[own] = found.xy, found.covariance, found.flag
-        progress.advance(network.images[int(seen.image[own[0]])])
+        own = own[seen.image[own] != i]
+        points, normal = _planes(estimate, camera, i, place[own], seen.point[own], of_photograph[i], seen)
+        warp = plane_warps(estimate, camera, i, seen.image[own], place[own], points, normal, window_px / 2)
+        moved = np.einsum("kij,kj->ki", linear_part(warp), place[own] - seen.xy[template_of[own]])
+        others, number_of = np.unique(seen.image[own], return_inverse=True)
+        for j, some in zip(others.tolist(), rows_of(number_of, len(others)), strict=True):
+            to = own[some]
+            match = match_lsm(
+                photographs.grey(i),
+                photographs.grey(j),
+                place[to],
+                seen.xy[to] + moved[some],
+                window_px=window_px,
+                start=warp[some],
+                max_shift_px=limits.shift_px,
+                min_correlation=limits.correlation,
+            )
+            flag[to] = match.flag
+            good = match.good
+            half, back = match.covariance[good] / 2, np.linalg.inv(linear_part(match.warp[good]))
+            xy[to[good]], covariance[to[good]] = match.xy[good], half
+            at_template[seen.point[to[good]]] += back @ half @ back.transpose(0, 2, 1)
+            number[seen.point[to[good]]] += 1
+        progress.advance(network.images[i])
+    some = np.flatnonzero(number)
+    xy[reference[some]] = place[reference[some]]
+    covariance[reference[some]] = at_template[some] / number[some, None, None]
     return Windows(xy, covariance, flag)
 
 
-def parts_of(
-    image: IntArray, point: IntArray, reference: IntArray, size: Sequence[int] | IntArray, limit: int
-) -> Iterator[IntArray]:
-    """Yield the rows of parts of the points, whose photographs are in memory together.
+def best_window(
+    photographs: Photographs,
+    network: Network,
+    estimate: Estimate,
+    rows: IntArray,
+    reference: IntArray,
+    *,
+    limits: Limits,
+    tolerance_px: float,
+) -> int:
+    """Return the side of the windows with which the same pixels are the most precise, px.
 
-    Points of one reference photograph follow one another, and of these those that the same photographs see;
-    a part ends where another point would need more memory.
+    A few photographs whose orientation is known to less than the matches tell.
 
     Args:
-        image: photograph of each row, (k,).
-        point: point of each row, (k,).
-        reference: photograph of the reference of each point, (n,).
-        size: of each photograph, bytes, (m,).
-        limit: of a part, bytes.
+        photographs: of the model.
+        network: the model.
+        estimate: adjusted with windows of one size.
+        rows: image points that can be measured, (k,).
+        reference: as in `match_windows`.
+        limits: likewise.
+        tolerance_px: largest residual of a ray that counts.
     """
-    by_point = np.argsort(point, kind="stable")
-    points, first = np.unique(point[by_point], return_index=True)
-    groups = np.split(by_point, first[1:])
-    farthest = np.array([int(image[rows].max()) for rows in groups])
-    most = max(1, -(-len(groups) // MIN_PARTS))
-    part: list[IntArray] = []
-    needed: set[int] = set()
-    for g in np.lexsort([farthest, reference[points]]).tolist():
-        more = needed | set(image[groups[g]].tolist())
-        if part and (len(part) >= most or sum(int(size[i]) for i in more) > limit):
-            yield np.sort(np.concatenate(part))
-            part, more = [], set(image[groups[g]].tolist())
-        part.append(groups[g])
-        needed = more
-    if part:
-        yield np.sort(np.concatenate(part))
+    template = network.image_points.image[reference[network.image_points.point[rows]]]
+    most = np.argsort(-np.bincount(template, minlength=len(network.images)), kind="stable")
+    some = rows[np.isin(template, most[:TRIAL_PHOTOGRAPHS])]
+    costs: list[tuple[int, float]] = []
+    for window in WINDOWS_PX:
+        found = match_windows(
+            photographs, network, estimate, some, reference, window_px=window, limits=limits
+        )
+        v = _residuals(network, estimate, found, tolerance_px)
+        if len(v) >= TRIAL_RAYS:
+            costs.append((window, window * MAD_TO_SIGMA * float(np.median(np.abs(v)))))
+    return largest_alike(costs) if costs else WINDOWS_PX[0]
 
 
-def outside_masks(network: Network, estimate: Estimate, folder: Path) -> BoolArray:
-    """Return which image points are where the mask of their photograph is black, (k,).
-
-    Masks have the name of their photograph with .png behind it, as COLMAP has them; photographs without one
-    are seen whole.
-
-    Raises:
-        SurveyFileError: no mask at all in the folder.
-        PhotographError: a mask that cannot be read or has another size than its photograph.
-    """
+def _residuals(network: Network, estimate: Estimate, windows: Windows, tolerance_px: float) -> FloatArray:
+    """Return the residuals of the rays that meet in their points, tangents, (k, 2)."""
     seen = network.image_points
-    masked = np.zeros(len(seen), dtype=bool)
-    some = False
-    for i, name in enumerate(network.images):
-        path = _path_in(folder, f"{name}.png")
-        if not path.is_file():
-            continue
-        some = True
-        mask, (width, height) = read_photograph(path), estimate.cameras[network.camera[i]].size_px
-        if mask.shape != (height, width):
-            raise PhotographError(
-                f"{path.name}: the mask has {mask.shape[1]} x {mask.shape[0]} px, its photograph {width} x "
-                f"{height} px"
-            )
-        rows = np.flatnonzero(seen.image == i)
-        at = np.clip(np.rint(np.nan_to_num(seen.xy[rows])).astype(int), 0, [width - 1, height - 1])
-        masked[rows] = mask[at[:, 1], at[:, 0]] == 0
-    if not some:
-        raise SurveyFileError(f"{folder}: no mask of any photograph, expected '{network.images[0]}.png'")
-    return masked
+    good = np.isfinite(windows.xy).all(axis=1)
+    rays = ImagePoints(seen.image[good], seen.point[good], windows.xy[good], windows.covariance[good])
+    met = intersect_image_points(
+        rays, network.camera, estimate, n_points=len(network.points), tolerance_px=tolerance_px
+    )
+    return met.residuals[met.used & (met.rays >= MIN_RAYS)[rays.point]]
 
 
-def photograph_paths(network: Network, estimate: Estimate, folder: Path) -> list[Path]:
-    """Return the paths of all photographs of a model.
-
-    Raises:
-        SurveyFileError: one with an orientation is not in the folder, or outside of it.
-    """
-    if not folder.is_dir():
-        raise SurveyFileError(f"{folder}: no such folder; the photographs of the model were needed")
-    paths = [_path_in(folder, name) for name in network.images]
-    lost = [i for i in np.flatnonzero(estimate.oriented) if not paths[i].is_file()]
-    if lost:
-        more = f", and {len(lost) - 1} more are not" if len(lost) > 1 else ""
-        raise SurveyFileError(
-            f"{folder}: photograph '{network.images[lost[0]]}' of the model is not in this folder{more}"
-        )
-    return paths
-
-
-def read_of_size(path: Path, name: str, size_px: tuple[int, int], *, channel: str = "luminance") -> AnyArray:
-    """Return a photograph of a model, (H, W).
-
-    Raises:
-        PhotographError: it cannot be read, or has another size than its camera.
-    """
-    photograph, (width, height) = read_photograph(path, channel=channel), size_px
-    if photograph.shape != (height, width):
-        raise PhotographError(
-            f"{name}: {photograph.shape[1]} x {photograph.shape[0]} px, its camera has {width} x {height} px"
-        )
-    return photograph
-
-
-def _path_in(folder: Path, name: str) -> Path:
-    """Return the path of a photograph, which must be inside the folder."""
-    path = folder / name
-    if not path.resolve().is_relative_to(folder.resolve()):
-        raise SurveyFileError(f"{folder}: photograph '{name}' of the model is outside this folder")
-    return path
+def _planes(
+    estimate: Estimate,
+    camera: IntArray,
+    i: int,
+    place: FloatArray,
+    point: IntArray,
+    own: IntArray,
+    seen: ImagePoints,
+) -> tuple[FloatArray, FloatArray]:
+    """Return object points and normals of places of a photograph; it is faced where no plane is known."""
+    points, normal = planes_at(estimate, camera, i, place, seen.point[own])
+    unknown = ~np.isfinite(points).all(axis=1)
+    points[unknown] = estimate.points[point[unknown]]
+    normal[unknown] = estimate.rotation[i][:, 2]
+    return points, normal

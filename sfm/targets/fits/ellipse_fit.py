@@ -136,8 +136,9 @@ def _fit_one(
             steps = (
                 _iterate(pixels, n, theta, length, saturation, prior, J, N) if n > 2 * model.UNKNOWNS else 0
             )
+    left_out = False
     if damage.is_damaged(pixels, n, theta, length, saturation, noise, J):
-        m, whole = 0, pixels.copy()
+        m, collected, whole = 0, 0, pixels.copy()
         if damage.is_large(theta):
             for _ in range(damage.TRACES):
                 trace_rays(image, start, sign, noise, margin, edge, limit)
@@ -145,9 +146,12 @@ def _fit_one(
                     break
             m = _collect(image, start, limit, margin, half_x, half_y, mean < LARGE_PX, pixels)
             _start_levels(pixels, m, start, saturation)
+            collected = m
             m = _fit_undamaged(pixels, m, start, length, saturation, noise, prior, J, N)
-        if m > 0:
-            flag |= _DAMAGED
+        left_out = m > 0
+        if left_out:
+            if damage.is_telling(pixels, m, collected, start, length, saturation, J):
+                flag |= _DAMAGED
             n, steps = m, MAX_STEPS
             theta[:] = start
         else:
@@ -155,7 +159,7 @@ def _fit_one(
             model.normal_equations(pixels, n, theta, length, saturation, J, N, np.empty(model.UNKNOWNS))
             statistics[goodness.DISTURBED] = 1.0
     done = steps > 0
-    goodness.judge_residuals(pixels, n, theta, length, saturation, J, statistics, (flag & _DAMAGED) != 0)
+    goodness.judge_residuals(pixels, n, theta, length, saturation, J, statistics, left_out)
     goodness.judge_background(image, theta, length, statistics)
     goodness.judge_glow(pixels, n, theta, saturation, statistics)
     statistics[goodness.STEPS] = abs(steps)
