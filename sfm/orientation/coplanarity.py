@@ -39,7 +39,7 @@ def refine_coplanarity(
     n = len(first)
     if n < UNKNOWNS or len(second) != n:
         raise GeometryError(f"relative orientation: {n} pairs, at least {UNKNOWNS} are needed")
-    b, R = np.array(base, dtype=float), np.array(rotation, dtype=float)
+    b, R = np.array(base, dtype=float), np.array(rotation, dtype=float, order="C")
     uv1 = np.ascontiguousarray(first, dtype=float)
     uv2 = np.ascontiguousarray(second, dtype=float)
     residuals, N = np.empty(len(uv1)), np.empty((UNKNOWNS, UNKNOWNS))
@@ -66,7 +66,7 @@ def coplanarity_residuals(
     """
     residuals, N, b = np.empty(len(first)), np.empty((UNKNOWNS, UNKNOWNS)), np.empty(UNKNOWNS)
     uv1, uv2 = np.ascontiguousarray(first, dtype=float), np.ascontiguousarray(second, dtype=float)
-    _coplanarity_normals(uv1, uv2, base, rotation, residuals, N, b)
+    _coplanarity_normals(uv1, uv2, base, np.ascontiguousarray(rotation), residuals, N, b)
     return residuals, N
 
 
@@ -74,7 +74,7 @@ def turned_pair(base: FloatArray, rotation: FloatArray, step: FloatArray) -> tup
     """Return base and rotation after a step of the five unknowns: two turns of b, and w in R exp([w]x)."""
     new_base, new_rotation = np.empty(3), np.empty((3, 3))
     _turn_base(base, step[0], step[1], new_base)
-    turn(rotation, step[2], step[3], step[4], new_rotation)
+    turn(np.ascontiguousarray(rotation), step[2], step[3], step[4], new_rotation)
     return new_base, new_rotation
 
 

@@ -142,7 +142,7 @@ def adjust_pose(
     new_X0, new_R = np.empty(3), np.empty((3, 3))
     dx = np.empty(6)
     cost, distance = pose_normals(tangents, points, weights, used, X0, R, N, n_vector, residuals)
-    _note(history, 0, X0, R)
+    _note(history[:1], X0, R)
     if not np.isfinite(cost):
         return cost, 0, BEHIND
     steps = 0
@@ -169,7 +169,7 @@ def adjust_pose(
         cost, distance = new_cost, new_distance
         X0[:], R[:], N[:], n_vector[:] = new_X0, new_R, new_N, new_n
         steps += 1
-        _note(history, steps, X0, R)
+        _note(history[steps : steps + 1], X0, R)
         if (
             factor == 1.0
             and abs(dx[0]) + abs(dx[1]) + abs(dx[2]) < CONVERGED * distance
@@ -180,14 +180,14 @@ def adjust_pose(
 
 
 @compiled
-def _note(history: FloatArray, row: int, X0: FloatArray, R: FloatArray) -> None:
-    """Write position and angles into a row of the history, if it has that row."""
-    if row >= len(history):
-        return
-    history[row, :3] = X0
-    history[row, 3] = np.arctan2(-R[1, 2], R[2, 2])
-    history[row, 4] = np.arcsin(min(1.0, max(-1.0, R[0, 2])))
-    history[row, 5] = np.arctan2(-R[0, 1], R[0, 0])
+def _note(history: FloatArray, X0: FloatArray, R: FloatArray) -> None:
+    """Write position and angles into a row of the history, (1, 6), if there is one, (0, 6)."""
+    for row in history:
+        for p in range(3):
+            row[p] = X0[p]
+        row[3] = np.arctan2(-R[1, 2], R[2, 2])
+        row[4] = np.arcsin(min(1.0, max(-1.0, R[0, 2])))
+        row[5] = np.arctan2(-R[0, 1], R[0, 0])
 
 
 @compiled

@@ -134,8 +134,8 @@ def _fit_one(
             return flag | _NO_CONVERGENCE, noise
         if round_ == 0:
             _start_levels(pixels, n, theta)
-        _add_code(pixels, n, tag_from_pixel, clear, theta[BLUR], 3)
-        _add_code(pixels, n, tag_from_pixel, clear, math.hypot(theta[BLUR], MASK_PX), 4)
+        _add_code(pixels, n, tag_from_pixel, clear, theta[BLUR], pixels[3])
+        _add_code(pixels, n, tag_from_pixel, clear, math.hypot(theta[BLUR], MASK_PX), pixels[4])
         squares, used = _iterate(pixels, n, theta, saturation, reach, covariance)
         if used <= UNKNOWNS or math.hypot(theta[X0] - corner[0], theta[Y0] - corner[1]) > FARTHEST_PX:
             covariance[:] = math.nan
@@ -186,8 +186,10 @@ def _collect(
 
 
 @compiled
-def _add_code(pixels: FloatArray, n: int, H: FloatArray, clear: BoolArray, blur: float, row: int) -> None:
-    """Set a row of the pixels to the part of the clear modules in them, 0 to 1."""
+def _add_code(
+    pixels: FloatArray, n: int, H: FloatArray, clear: BoolArray, blur: float, parts: FloatArray
+) -> None:
+    """Fill the part of the clear modules in each pixel, 0 to 1."""
     modules = len(clear)
     for k in range(n):
         x, y = pixels[0, k], pixels[1, k]
@@ -203,7 +205,7 @@ def _add_code(pixels: FloatArray, n: int, H: FloatArray, clear: BoolArray, blur:
                     across = edge_profile((u - j) / su)[0] - edge_profile((u - j - 1) / su)[0]
                     down = edge_profile((v - i) / sv)[0] - edge_profile((v - i - 1) / sv)[0]
                     part += across * down
-        pixels[row, k] = part
+        parts[k] = part
 
 
 @compiled
