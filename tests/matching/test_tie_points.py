@@ -42,6 +42,7 @@ from sfm.orientation.relative import relative_orientations
 from sfm.pipeline import run_survey
 from sfm.report.log import read_log
 from sfm.similarity import fit_similarity
+from sfm.survey.drafting.draft import draft_survey
 from sfm.survey.inputs.survey import read_survey
 from sfm.survey.measuring.further_points import find_further_points
 from sfm.survey.other_programs import OtherPrograms
@@ -451,6 +452,22 @@ def test_textured_survey_from_photographs_to_result(folder: Path, tmp_path: Path
     # surfaces that are not plane move all pictures of a point by a few thousandths of a pixel together
     assert 0.8 < z2 < 1.3
     assert noise == pytest.approx(stated, rel=0.2)
+
+
+@pytest.mark.slow
+def test_photographs_without_exif_data_tell_their_principal_distance(folder: Path, tmp_path: Path) -> None:
+    for path in folder.glob("*.png"):
+        (tmp_path / path.name).write_bytes(path.read_bytes())
+    survey = tmp_path / "survey.toml"
+    drafted = draft_survey(tmp_path).text
+    assert "1.2 times the longer side" in drafted  # 1200 px in place of 1333 px
+    survey.write_text(drafted.replace('"colmap"', '"none"'), encoding="utf-8")
+    a = run_survey(read_survey(survey), jobs=2).adjustment
+    found, sigma = a.estimate.cameras[0], a.interior_sigma(0)[0] / a.estimate.cameras[0].pixel_mm[0]
+    assert sigma < 0.2 and abs(found.c_px - render.camera().c_px) < 4 * sigma
+    assert a.covariance is not None
+    share, z_rms = _from_surface(a.network, a.estimate, a.covariance.points)
+    assert share >= 0.99 and 0.8 < z_rms < 1.2
 
 
 def _from_surface(network: Network, estimate: Estimate, covariance: FloatArray) -> tuple[float, float]:
