@@ -14,6 +14,7 @@ from sfm.pipeline import run_survey
 from sfm.result import SurveyResult
 from sfm.similarity import fit_similarity
 from sfm.survey.inputs.survey import read_survey
+from sfm.survey.measuring.measured_store import MeasuredStore
 from sfm.survey.other_programs import OtherPrograms
 from sfm.targets.flags import Flag
 from tests.places import ROOT
@@ -22,10 +23,15 @@ DATASETS = ROOT / "datasets"
 
 
 @pytest.fixture(scope="module")
-def camcal(shared_data: Path) -> SurveyResult:
+def store(tmp_path_factory: pytest.TempPathFactory) -> MeasuredStore:
+    return MeasuredStore(tmp_path_factory.mktemp("measured"))
+
+
+@pytest.fixture(scope="module")
+def camcal(shared_data: Path, store: MeasuredStore) -> SurveyResult:
     survey = read_survey(DATASETS / "camcal" / "survey.toml")
-    folder = shared_data / "camcal" / "images"
-    return run_survey(survey, images_dir=folder, jobs=2, others=OtherPrograms(adjust_with_colmap))
+    folder, others = shared_data / "camcal" / "images", OtherPrograms(adjust_with_colmap)
+    return run_survey(survey, images_dir=folder, jobs=2, others=others, store=store)
 
 
 @pytest.fixture(scope="module")
@@ -86,12 +92,14 @@ def test_camcal_control_distances(camcal: SurveyResult) -> None:
             assert scale * np.linalg.norm(X[a] - X[b]) == pytest.approx(truth, abs=0.5e-3)
 
 
-def test_camcal_needs_no_control_to_start(camcal: SurveyResult, shared_data: Path, tmp_path: Path) -> None:
+def test_camcal_needs_no_control_to_start(
+    camcal: SurveyResult, shared_data: Path, store: MeasuredStore, tmp_path: Path
+) -> None:
     text = (DATASETS / "camcal" / "survey.toml").read_text(encoding="utf-8")
     head, rest = text.split("[control]")
     (tmp_path / "survey.toml").write_text(head + rest[rest.index("[adjust]") :], encoding="utf-8")
     survey = read_survey(tmp_path / "survey.toml")
-    result = run_survey(survey, images_dir=shared_data / "camcal" / "images", jobs=2)
+    result = run_survey(survey, images_dir=shared_data / "camcal" / "images", jobs=2, store=store)
     assert result.failed == ()
     assert result.adjustment.redundancy == camcal.adjustment.redundancy
     assert result.adjustment.sigma0_px == pytest.approx(camcal.adjustment.sigma0_px, rel=1e-6)

@@ -70,10 +70,8 @@ def match_along_line(
         if (high - low < side).any():
             out[k] = NOT_COMPARED
             continue
-        template, window = (
-            grey_left[y : y + side, x : x + side],
-            grey_right[low[1] : high[1], low[0] : high[0]],
-        )
+        template = np.ascontiguousarray(grey_left[y : y + side, x : x + side])
+        window = np.ascontiguousarray(grey_right[low[1] : high[1], low[0] : high[0]])
         surface = cv2.matchTemplate(window, template, cv2.TM_CCOEFF_NORMED)
         band = np.zeros(surface.shape, dtype=np.uint8)
         vertices = np.rint((path - low - half) * 256).astype(np.int32)

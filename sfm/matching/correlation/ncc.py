@@ -113,7 +113,8 @@ def match_ncc(
         if x < 0 or x1 - x0 < side or y1 - y0 < side:
             out[k] = NOT_COMPARED
             continue
-        template, window = grey_left[y : y + side, x : x + side], grey_right[y0:y1, x0:x1]
+        template = np.ascontiguousarray(grey_left[y : y + side, x : x + side])
+        window = np.ascontiguousarray(grey_right[y0:y1, x0:x1])
         surface = cv2.matchTemplate(window, template, cv2.TM_CCOEFF_NORMED)
         read_peak(template, window, surface, surface, least, min_correlation, max_second, out[k])
     out[~np.isfinite(a).all(axis=1) | ~np.isfinite(b).all(axis=1)] = NOT_COMPARED

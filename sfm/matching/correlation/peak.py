@@ -32,7 +32,7 @@ def read_peak(
     """Fill best and second-best peak of a surface of r, its parabola and the regression of intensities.
 
     Args:
-        template: intensities, float32, (s, s).
+        template: intensities, float32, (s, s); contiguous, as all of these: there is one compiled form.
         window: intensities of the search window, float32, (H, W).
         surface: r where a match is allowed, else -1, float32, (H - s + 1, W - s + 1).
         whole: r everywhere, for the parabola; same shape.

@@ -79,7 +79,7 @@ def match_ncc_warped(
             flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
             borderMode=cv2.BORDER_REPLICATE,
         )
-        template = grey_left[y : y + side, x : x + side]
+        template = np.ascontiguousarray(grey_left[y : y + side, x : x + side])  # as windows are
         surface = cv2.matchTemplate(window, template, cv2.TM_CCOEFF_NORMED)
         allowed = np.where(inside, surface, np.float32(-1.0))
         read_peak(template, window, allowed, surface, least, min_correlation, max_second, out[k])
