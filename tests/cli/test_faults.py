@@ -267,6 +267,8 @@ def test_damaged_store_is_measured_again(tmp_path: Path, targets: Targets) -> No
     assert store.load("b" * 64, TARGETS) is None  # a packed entry is not ours
     np.savez(entry, allow_pickle=False, **{**packed, "xy": np.zeros((3, 2))})
     assert store.load("b" * 64, TARGETS) is None
+    np.savez(entry, allow_pickle=False, **{**packed, "xy": np.float64(1.0)})
+    assert store.load("b" * 64, TARGETS) is None
     np.savez(entry, allow_pickle=True, **{**packed, "xy": np.array([print], dtype=object)})
     assert store.load("b" * 64, TARGETS) is None  # nothing is unpickled
 

@@ -10,6 +10,7 @@ import pytest
 
 from sfm.conventions import AnyArray, FloatArray
 from sfm.errors import GeometryError, PhotographError
+from sfm.matching.conjugate import match_points
 from sfm.matching.correlation.ncc import match_ncc
 from sfm.matching.lsm.two_photo import LsmMatches, match_lsm
 from sfm.matching.match_flags import LsmFlag
@@ -84,6 +85,21 @@ def test_a_difference_of_blur_moves_no_window() -> None:
     normalised = np.einsum("ki,kij,kj->k", e, np.linalg.inv(matches.covariance), e)
     assert normalised.mean() / 2 == pytest.approx(1, abs=0.2)
     assert matches.sigma0.mean() == pytest.approx(SIGMA * np.sqrt(1 + (pairs.gain**2).mean()), rel=0.1)
+
+
+def test_pictures_without_noise_are_matched() -> None:
+    """A picture and its copy: no residual is left, and the covariance is 0 and nothing less."""
+    rng = np.random.default_rng(0)
+    noise = rng.integers(0, 255, (200, 260)).astype(np.uint8)
+    picture = cv2.normalize(cv2.GaussianBlur(noise, (0, 0), 1.5), None, 0, 255, cv2.NORM_MINMAX)
+    at = np.array([[x, y] for x in range(50, 210, 20) for y in range(50, 160, 20)], dtype=float)
+    same = match_lsm(picture, picture, at, at, window_px=15, blur=True)
+    assert same.good.all() and np.isfinite(same.sigma0).all()
+    assert (np.diagonal(same.covariance, axis1=1, axis2=2) >= 0).all()
+    for levels in (picture, (picture // 64 * 64).astype(np.uint8)):
+        found = match_points(levels, levels, at, method="lsm", search_px=41)
+        assert found.good.mean() > 0.9
+        np.testing.assert_allclose(found.right[found.good], at[found.good], atol=1e-3)
 
 
 @pytest.mark.parametrize("model", ["affine", "projective"])

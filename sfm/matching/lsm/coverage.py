@@ -16,9 +16,8 @@ from sfm.network import ImagePoints, rows_of
 # That are tried. Larger ones tell no more where they cover a photograph, and where the surface is curved they
 # measure its mean depth over them, in all photographs alike, which no residual shows.
 WINDOWS_PX = (15, 11)
-ALIKE = (
-    1.1  # ratio of precisions for the same pixels up to which the larger windows, which are fewer, are taken
-)
+# Ratio of precisions for the same pixels up to which the larger windows, which are fewer, are taken.
+ALIKE = 1.1
 COVERED = 0.5  # part of the photographs of a point in which others take its place
 
 

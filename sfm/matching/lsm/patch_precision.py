@@ -133,7 +133,7 @@ def residual_as_sharp(work: Workspace, square: float) -> float:
     solve_factorised(factor, q)
     for a in range(size):
         square -= q[a] * work.rhs[a]
-    return square
+    return max(square, 0.0)  # rounding, where nothing is left
 
 
 @compiled_fast

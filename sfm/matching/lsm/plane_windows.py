@@ -20,6 +20,7 @@ MIN_WINDOW_PX = 9  # smaller ones hardly hold the parameters of an affine warp
 # Squared difference of two windows, in that of the smaller one's noise, from which the larger one is off.
 # Half of that noise is common to both: chance leads so far in less than one of a hundred.
 ELSEWHERE = 6.0
+ROUNDING_PX = 1e-6  # of places in intensities of single precision
 
 
 def match_where_plane(
@@ -85,7 +86,15 @@ def _largest_that_agrees(found: list[LsmMatches]) -> IntArray:
         for smaller in found[number + 1 :]:
             both = np.flatnonzero(agrees & smaller.good)
             d, C = smaller.xy[both] - found[number].xy[both], smaller.covariance[both]
-            chi2 = np.einsum("ki,ki->k", d, np.linalg.solve(C, d[:, :, None])[:, :, 0])
-            agrees[both] = chi2 <= ELSEWHERE
+            agrees[both] = squares_over_covariance(d, C) <= ELSEWHERE
         chosen[agrees] = number
     return chosen
+
+
+def squares_over_covariance(d: FloatArray, covariance: FloatArray) -> FloatArray:
+    """Return d' C^-1 d of differences of places, px, (k,); NaN where C is.
+
+    Of photographs without noise C is 0, but no place is known better than ROUNDING_PX.
+    """
+    C = covariance + ROUNDING_PX**2 * np.eye(2)
+    return np.asarray(np.einsum("ki,ki->k", d, np.linalg.solve(C, d[:, :, None])[:, :, 0]))

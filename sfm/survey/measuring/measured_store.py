@@ -72,7 +72,7 @@ class MeasuredStore:
             found = _unpacked(path.read_bytes(), kind)
             os.utime(path)  # asked for now
             return found
-        except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile):
+        except (OSError, ValueError, TypeError, EOFError, KeyError, MemoryError, zipfile.BadZipFile):
             return None
 
     def save(self, key: str, measured: Measured) -> None:
