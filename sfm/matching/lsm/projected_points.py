@@ -1,4 +1,4 @@
-"""Pictures of object points in oriented photographs, and how they move with the points."""
+"""Pictures of object points in oriented photographs, and of windows on planes through them."""
 
 from __future__ import annotations
 
@@ -6,40 +6,9 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from sfm.camera import Camera, pixel_from_tangents, pixel_jacobian, tangents_from_pixel
+from sfm.camera import Camera, pixel_from_tangents, tangents_from_pixel
 from sfm.conventions import FloatArray, IntArray
 from sfm.network import Estimate, rows_of
-
-
-def facing_warps(
-    estimate: Estimate, camera: IntArray, image: IntArray, ref: IntArray, points: FloatArray
-) -> FloatArray:
-    """Return d (picture) / d (picture in the reference) of a surface that faces the reference, (k, 2, 2).
-
-    Args:
-        estimate: interior and exterior orientation of all photographs.
-        camera: index of the camera of each photograph, (m,).
-        image: photograph of each row, (k,).
-        ref: the row of the reference of each row, (k,).
-        points: the object point of each row, (k, 3).
-    """
-    in_object = derivatives(estimate, camera, image, points)
-    R = estimate.rotation[image[ref]]
-    along = in_object[ref] @ R[:, :, :2]  # pictures of the two axes of the reference, in the reference
-    across = in_object @ R[:, :, :2]
-    return np.asarray(across @ np.linalg.inv(along))
-
-
-def derivatives(estimate: Estimate, camera: IntArray, image: IntArray, points: FloatArray) -> FloatArray:
-    """Return d (x, y) / d X of each image point, px per object unit, (k, 2, 3)."""
-    R, UVW = estimate.rotation[image], _in_photographs(estimate, image, points)
-    tangents = -UVW[:, :2] / UVW[:, 2:]
-    in_uv = -(R[:, :, :2] + tangents[:, None, :] * R[:, :, 2:]).transpose(0, 2, 1) / UVW[:, 2, None, None]
-    out = np.full((len(image), 2, 3), np.nan)
-    for lens, rows in _of_cameras(estimate, camera, image):
-        xy = pixel_from_tangents(lens, _in_front(UVW[rows]))
-        out[rows] = pixel_jacobian(lens, xy) @ in_uv[rows]
-    return out
 
 
 def pictures_of(estimate: Estimate, camera: IntArray, image: IntArray, points: FloatArray) -> FloatArray:

@@ -35,7 +35,6 @@ from sfm.survey.refining.windows import MIN_RAYS, Limits, best_window, match_win
 
 # Over larger windows no surface is a plane, and memory and time grow with the square of the side.
 MAX_WINDOW_PX = 101
-SIGMA_PX = 0.02  # of a matched point, on top of what matching knows: surfaces are not plane over a window
 # Of the robust spread of the model's residuals, beyond which a key point was another one
 MAX_SHIFT_FACTOR = 6.0
 MIN_SHIFT_PX = 2.0
