@@ -25,14 +25,14 @@ from scipy.linalg.lapack import dpotrf
 from sfm.adjustment.engine.collinearity import Observations
 from sfm.adjustment.engine.motions import Motions
 from sfm.adjustment.engine.normals import Equations
-from sfm.adjustment.engine.solvers.dense import MAX_BYTES, WEAK_PIVOT
+from sfm.adjustment.engine.solvers.dense import WEAK_PIVOT
 from sfm.adjustment.engine.solvers.fronts import Front, Fronts
+from sfm.adjustment.engine.solvers.memory import refuse_what_does_not_fit
 from sfm.adjustment.engine.solvers.multifrontal_factor import Eliminated, MultifrontalFactor
 from sfm.adjustment.engine.solvers.null_search import SHIFT, null_vectors, refined
 from sfm.adjustment.engine.solvers.pairs import subtract_border
 from sfm.adjustment.engine.unknowns import Unknowns
 from sfm.conventions import AnyArray, FloatArray, IntArray
-from sfm.errors import GeometryError
 from sfm.kernels.blocks import subtract_pair
 from sfm.kernels.options import kernel
 from sfm.kernels.threads import at_once
@@ -57,6 +57,11 @@ class MultifrontalSolver:
         """Whether a step on the way takes less time in single precision: never."""
         return False
 
+    @property
+    def bytes(self) -> float:
+        """Memory of the factor and its inverse at the peak."""
+        return self.fronts.bytes(self.layout.reduced - self.layout.exterior_free.size)
+
     def factor(
         self, equations: Equations, motions: Motions, *, damped: bool = False, coarse: bool = False
     ) -> MultifrontalFactor | None:
@@ -65,12 +70,7 @@ class MultifrontalSolver:
         Raises:
             GeometryError: the factor would not fit in memory.
         """
-        size = self.fronts.bytes
-        if size > MAX_BYTES:
-            raise GeometryError(
-                f"adjustment: the normal equations of {len(self.layout.exterior_free)} photographs need "
-                f"{size / 1e9:.0f} GB when they are factored, at most {MAX_BYTES / 1e9:.0f} GB are taken"
-            )
+        refuse_what_does_not_fit(self.bytes, f"the unknowns of {len(self.layout.exterior_free)} photographs")
         scale = equations.parts.scale
         Q = np.linalg.qr(motions.reduced / scale[:, None])[0] if motions.defect else motions.reduced
         holds = _largest(Q)
@@ -78,12 +78,14 @@ class MultifrontalSolver:
         factor = self._factored(equations, border, holds)
         if damped or not (factor is None or factor.weak):
             return factor
+        del factor  # one at a time in memory
         shifted = self._factored(equations, border, holds, shift=SHIFT)
         if shifted is None:
-            return factor
+            return self._factored(equations, border, holds)
         further = null_vectors(shifted, equations, self.layout, Q)
+        del shifted
         if further.shape[1] == 0:
-            return factor
+            return self._factored(equations, border, holds)
         # held together with the motions, so that no unknown is chosen for two null vectors
         factor = self._factored(equations, border, _largest(np.hstack([Q, further])))
         if factor is None:

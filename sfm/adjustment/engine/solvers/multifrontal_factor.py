@@ -106,7 +106,8 @@ class MultifrontalFactor:
         u, uQ = np.empty((3, border)), np.empty((3, border))
         for front, Z in self._inverse_fronts():
             scale = s[front.rows]
-            Z_own = Z * scale[:, None] * scale
+            Z_own = Z * scale
+            Z_own *= scale[:, None]
             for i, photograph in enumerate(front.photographs[: front.own]):
                 at = slice(6 * i, 6 * i + 6)
                 rows = slice(6 * photograph, 6 * photograph + 6)
