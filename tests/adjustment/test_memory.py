@@ -19,9 +19,10 @@ from sfm.adjustment.engine.unknowns import Unknowns, unknowns_of
 from sfm.errors import GeometryError
 from sfm.kernels.threads import own_threads
 from sfm.network import Estimate, Network
-from tests.synthetic_blocks import aerial, run
+from tests.adjustment.test_null_space import halves, in_fronts, together
+from tests.synthetic_blocks import FREE, aerial, run
 
-NEAR = 0.15  # of what is measured
+NEAR = 0.2  # of what is measured; one thread has rows of half of the points at a time, two have all
 
 
 def pair_by_pair(layout: Unknowns) -> DenseSolver:
@@ -29,7 +30,7 @@ def pair_by_pair(layout: Unknowns) -> DenseSolver:
 
 
 def measured(network: Network, estimate: Estimate, way: object) -> tuple[float, float]:
-    """Return the memory at the peak of factor and inverse, bytes, and what the solver says of it."""
+    """Return the memory at the peak of factor and inverse, results apart, bytes, and what the solver says."""
     layout, state = unknowns_of(network, estimate, use_control=False)
     weighted = weighted_of(network, layout, use_control=False)
     solver = way(layout)  # type: ignore[operator]
@@ -51,17 +52,21 @@ def measured(network: Network, estimate: Estimate, way: object) -> tuple[float, 
 @pytest.mark.parametrize("way", [choose_solver, DenseSolver, pair_by_pair])
 @pytest.mark.parametrize(
     ("strips", "per_strip", "points"),
-    [(10, 16, 3000), pytest.param(25, 40, 99000, marks=pytest.mark.slow)],
+    [(10, 16, 3000), pytest.param(20, 20, 20000, marks=pytest.mark.slow)],
 )
 def test_a_solver_takes_the_memory_that_it_says(
     way: object, strips: int, per_strip: int, points: int
 ) -> None:
     network, truth = aerial(f"memory {strips}", strips, per_strip, points)
     peak, said = measured(network, truth, way)
-    if way is DenseSolver:  # two threads have rows and products of them at a time, if there are two
-        assert peak < said * (1 + NEAR)
-    else:
-        assert said == pytest.approx(peak, rel=NEAR)
+    assert said == pytest.approx(peak, rel=NEAR)
+
+
+@pytest.mark.parametrize("way", [in_fronts, DenseSolver, pair_by_pair])
+def test_null_vectors_are_sought_within_that_memory(way: object) -> None:
+    network, truth = together(halves("memory", FREE))
+    peak, said = measured(network, truth, way)
+    assert peak < said * (1 + NEAR)
 
 
 def test_a_full_matrix_that_does_not_fit_gives_way_to_fronts(monkeypatch: pytest.MonkeyPatch) -> None:

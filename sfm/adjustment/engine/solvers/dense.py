@@ -66,8 +66,8 @@ class DenseSolver:
         """Memory of the factor and its inverse at the peak."""
         width = self.layout.reduced
         matrix, points = width**2, len(self.layout.point_free)
-        if self.pairs is not None:
-            return BYTES * 3 * matrix
+        if self.pairs is not None:  # factor, its inverse, their product, and rows Y'Q
+            return BYTES * (3 * matrix + 18 * len(self.layout.order))
         rows = rows_at_a_time(points, width, summed=True) * width
         half = rows_at_a_time(points // 2, width) * width
         # S, a product and rows; or factor, its inverse, their product, and of either half rows and products

@@ -50,11 +50,12 @@ class Fronts:
         """Operations of the factorisation, products and sums counted each."""
         return float(sum(_operations(6.0 * f.own, 6.0 * len(f.photographs)) for f in self.fronts))
 
-    def bytes(self, border: int) -> float:
+    def bytes(self, border: int, vectors: float) -> float:
         """Memory of factor and inverse at the peak: what is kept, what waits for a parent, the front at work.
 
         Args:
             border: unknowns beside the exterior orientation.
+            vectors: bytes of the vectors with which null vectors are sought.
         """
         half, end = self.halves
         first, second = self._eliminating(range(half), {}), self._eliminating(range(half, end), {})
@@ -62,19 +63,19 @@ class Fronts:
         factor = first.kept + second.kept + last.kept
         factoring = max(first.peak + second.peak, first.kept + second.kept + last.peak)  # both halves at once
         columns = BYTES * 6 * sum(front.own for front in self.fronts) * border
-        return max(factoring + columns, factor + self._inverting() + 3 * columns) + columns
+        return max(factoring, factor + vectors, factor + self._inverting() + 2 * columns) + 2 * columns
 
     def _eliminating(self, some: range, waiting: dict[int, float]) -> _Memory:
         """Return the memory that takes the elimination of some fronts; waiting is what others have left."""
         waiting = dict(waiting)
         kept = peak = 0.0
+        space = max((_bytes(self.fronts[g])[0] for g in some), default=0.0)
         for g in some:
             front = self.fronts[g]
-            matrix, own, rest = _bytes(front)
-            peak = max(peak, kept + sum(waiting.values()) + matrix)
+            _, own, rest = _bytes(front)
             for child in front.children:
                 del waiting[child]
-            peak = max(peak, kept + sum(waiting.values()) + matrix + own + rest)
+            peak = max(peak, space + kept + sum(waiting.values()) + own + rest)
             waiting[g] = rest
             kept += own
         return _Memory(kept, peak, waiting)

@@ -6,9 +6,7 @@ import os
 
 from sfm.errors import GeometryError
 
-SHARE = (
-    0.75  # of the memory; larger ones would swap, with the network, its blocks and other programs beside them
-)
+SHARE = 0.75  # of the memory; the network, its blocks and other programs need some beside them
 UNKNOWN = 8e9  # bytes where the system does not say what it has
 
 

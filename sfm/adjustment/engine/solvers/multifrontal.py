@@ -29,7 +29,7 @@ from sfm.adjustment.engine.solvers.dense import WEAK_PIVOT
 from sfm.adjustment.engine.solvers.fronts import Front, Fronts
 from sfm.adjustment.engine.solvers.memory import refuse_what_does_not_fit
 from sfm.adjustment.engine.solvers.multifrontal_factor import Eliminated, MultifrontalFactor
-from sfm.adjustment.engine.solvers.null_search import SHIFT, null_vectors, refined
+from sfm.adjustment.engine.solvers.null_search import SHIFT, null_vectors, refined, search_bytes
 from sfm.adjustment.engine.solvers.pairs import subtract_border
 from sfm.adjustment.engine.unknowns import Unknowns
 from sfm.conventions import AnyArray, FloatArray, IntArray
@@ -60,7 +60,8 @@ class MultifrontalSolver:
     @property
     def bytes(self) -> float:
         """Memory of the factor and its inverse at the peak."""
-        return self.fronts.bytes(self.layout.reduced - self.layout.exterior_free.size)
+        layout = self.layout
+        return self.fronts.bytes(layout.reduced - layout.exterior_free.size, search_bytes(layout))
 
     def factor(
         self, equations: Equations, motions: Motions, *, damped: bool = False, coarse: bool = False
@@ -142,9 +143,12 @@ class MultifrontalSolver:
         left: dict[int, FloatArray] = {}  # what fronts leave to their parents
 
         def eliminate(begin: int, end: int) -> bool:
+            space = np.empty(
+                max((36 * len(front.photographs) ** 2 for front in fronts[begin:end]), default=0)
+            )
             for g in range(begin, end):
                 front = fronts[g]
-                F = self._front(equations, front, added)
+                F = self._front(equations, front, added, space)
                 for child in front.children:  # in this order however many threads there are
                     _extend(left.pop(child), fronts[child].into, F)
                 done = _eliminated(F, 6 * front.own)
@@ -159,10 +163,11 @@ class MultifrontalSolver:
             return None
         return [front for front in found if front is not None]
 
-    def _front(self, equations: Equations, front: Front, added: FloatArray) -> FloatArray:
-        """Return the scaled matrix of a front without what others leave to it, lower triangle."""
+    def _front(self, equations: Equations, front: Front, added: FloatArray, space: FloatArray) -> FloatArray:
+        """Return the scaled matrix of a front without what others leave to it, lower triangle, in a space."""
         b, size = equations.blocks, 6 * len(front.photographs)
-        F = np.zeros((size, size))
+        F = space[: size**2].reshape(size, size)
+        F.fill(0.0)
         scale = equations.parts.scale[front.rows]
         _sum_front(
             self.layout.observations, b.U, b.Y, front.photographs[: front.own], front.points,

@@ -97,7 +97,7 @@ class MultifrontalFactor:
         s, sb = own[:first], own[first:]
         X = self.X * s[:, None] / self.scale[first:]
         Q = cho_solve((self.corner, False), np.eye(border)) if border else np.zeros((0, 0))
-        Q = Q * sb[:, None] * sb
+        Q = np.ascontiguousarray(Q * sb[:, None] * sb)  # as a matrix without elements is, for the kernel
         XQ = X @ Q
         n, most = len(b.y), int(np.diff(observations.start).max())
         core, exterior = np.zeros((n, 3, 3)), np.empty((len(b.U), 6, 6))
