@@ -41,7 +41,7 @@ from sfm.adjustment.quality.rank import rank_defect, undetermined_of
 from sfm.adjustment.quality.reliability import redundancy_numbers as numbers_of
 from sfm.adjustment.quality.reliability import redundancy_of_bars, standardised_residuals
 from sfm.adjustment.result import Adjustment, Covariance
-from sfm.conventions import FloatArray
+from sfm.conventions import BoolArray, FloatArray
 from sfm.display import listed
 from sfm.distributions import normal_sf
 from sfm.errors import GeometryError
@@ -63,6 +63,7 @@ def adjust(
     image_sigma_factor: float | FloatArray = 1.0,
     reject: str = "tau",
     alpha: float = 0.001,
+    rejected: BoolArray | None = None,
     method: str = "levenberg-marquardt",
     max_iterations: int = 50,
     tolerance: float = TOLERANCE,
@@ -85,6 +86,8 @@ def adjust(
         reject: "tau" (data snooping by Pope's test), "huber" or "tukey" (reweighting; Tukey's biweight,
             from Huber's start, rejects what it gives weight 0) or "none".
         alpha: probability with which the test of one image coordinate rejects a good one.
+        rejected: image points that data snooping begins without, as those that it rejected before, (k,);
+            they return where they pass the test.
         method: "gauss-newton" (line search) or "levenberg-marquardt" (ends in undamped Gauss-Newton).
         max_iterations: steps at most, in each round of the robust test.
         tolerance: |A dx| / |v| at which the iteration has converged.
@@ -116,6 +119,13 @@ def adjust(
     if given.shape not in ((), (k,)) or not (np.isfinite(given) & (given > 0)).all():
         raise GeometryError(f"image_sigma_factor of shape {given.shape}, expected positive numbers, 1 or {k}")
     factor = np.broadcast_to(given, (k,))
+    without = (
+        np.zeros(k, dtype=bool) if rejected is None or reject != "tau" else np.asarray(rejected, dtype=bool)
+    )
+    if without.shape != (k,):
+        raise GeometryError(
+            f"rejected of shape {without.shape}, expected one value for each of {k} image points"
+        )
     layout, state = unknowns_of(
         local.network, local.estimate, use_control=use_control, image_sigma_factor=factor
     )
@@ -123,7 +133,7 @@ def adjust(
     problem = problem_of(layout, weighted, local.datum)
     run = Run(problem, method, max_iterations, tolerance, exact=covariance or reject == "tau")
     with own_threads():
-        optimum, weight = find_optimum(run, state, reject=reject, alpha=alpha)
+        optimum, weight = find_optimum(run, state, reject=reject, alpha=alpha, without=without[layout.order])
         Q = cofactors(optimum, layout, cross=redundancy_numbers) if covariance else None
         result = _result(local, run, optimum, weight, Q, sigma_px, SLOPES.get(reject))
         return local.back(

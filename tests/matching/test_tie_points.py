@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import weakref
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -23,7 +24,7 @@ from sfm.conventions import AnyArray, FloatArray, angles_from_rotation
 from sfm.errors import GeometryError, PhotographError, SurveyFileError
 from sfm.matching.correlation.along_line import match_along_line
 from sfm.matching.epipolar import epipolar_paths
-from sfm.matching.lsm.coverage import largest_alike, points_apart
+from sfm.matching.lsm.coverage import SHARED, Covered, largest_alike, points_apart
 from sfm.matching.lsm.projected_points import plane_warps
 from sfm.matching.lsm.surface_planes import planes_at
 from sfm.matching.lsm.two_photo import match_lsm
@@ -35,7 +36,7 @@ from sfm.matching.tracks.feature_tracks import (
     measure_tracks,
 )
 from sfm.matching.tracks.features import Features, sift_features
-from sfm.matching.tracks.interest import foerstner_points
+from sfm.matching.tracks.interest import foerstner_points, textured_squares
 from sfm.matching.tracks.natural_points import natural_points
 from sfm.network import Estimate, ImagePoints, Network
 from sfm.orientation.relative import relative_orientations
@@ -44,7 +45,7 @@ from sfm.report.log import read_log
 from sfm.similarity import fit_similarity
 from sfm.survey.drafting.draft import draft_survey
 from sfm.survey.inputs.survey import read_survey
-from sfm.survey.measuring.further_points import find_further_points
+from sfm.survey.measuring.covering_points import find_covering_points
 from sfm.survey.other_programs import OtherPrograms
 from sfm.survey.refining.refinement import refine_model, refinement_text
 from tests.engines import ALONE, HERE, Notes
@@ -172,22 +173,63 @@ def test_places_are_put_on_the_planes_of_the_points_around_them() -> None:
     assert np.isnan(planes_at(estimate, camera, 0, places, np.arange(5))[0]).all()  # too few for a plane
 
 
+def _seen(image: Sequence[int], point: Sequence[int], xy: Sequence[Sequence[float]]) -> ImagePoints:
+    n = len(image)
+    return ImagePoints(np.array(image), np.array(point), np.array(xy, dtype=float), np.zeros((n, 2, 2)))
+
+
 def test_points_whose_windows_overlap_give_way_to_those_with_more_rays() -> None:
-    xy = np.array(
-        [[20.0, 20], [20, 20], [20, 20], [22, 22], [22, 22], [60, 20], [60, 20], [20, 60], [24, 62]]
-    )
-    image, point = np.array([0, 1, 2, 0, 1, 0, 1, 0, 1]), np.array([0, 0, 0, 1, 1, 2, 2, 3, 3])
-    seen = ImagePoints(image, point, xy, np.tile(np.eye(2), (9, 1, 1)))
-    assert points_apart(seen, np.ones(9, dtype=bool), 15.0, n_points=5).tolist() == [
-        True,
-        False,
-        True,
-        True,
-        False,
-    ]
-    fits = image != 2
+    xy = [[20, 20], [20, 20], [20, 20], [22, 22], [22, 22], [60, 20], [60, 20], [20, 60], [24, 62]]
+    seen = _seen([0, 1, 2, 0, 1, 0, 1, 0, 1], [0, 0, 0, 1, 1, 2, 2, 3, 3], xy)
+    kept = points_apart(seen, np.ones(9, dtype=bool), 15.0, n_points=5)
+    assert kept.tolist() == [True, False, True, True, False]
+    fits = seen.image != 2
     fits[:2] = False
-    assert points_apart(seen, fits, 15.0, n_points=5).tolist() == [False, True, True, True, False]
+    kept = points_apart(seen, fits, 15.0, n_points=5)
+    assert kept.tolist() == [False, True, True, True, False]
+    assert not points_apart(seen, np.zeros(9, dtype=bool), 15.0, n_points=5).any()
+
+
+def test_windows_on_both_sides_of_a_line_of_the_grid_overlap_too() -> None:
+    rng = np.random.default_rng(7)
+    n, side = 800, 15.0
+    xy = np.concatenate([rng.uniform(-40, 260, (n, 2)) for _ in range(2)])
+    seen = _seen(np.repeat([0, 1], n).tolist(), [*range(n), *range(n)], xy.tolist())
+    kept = points_apart(seen, np.ones(2 * n, dtype=bool), side, n_points=n)
+    share = np.zeros((n, n))
+    for i in range(2):
+        own = seen.xy[seen.image == i]
+        share += np.prod(np.maximum(1 - np.abs(own[:, None] - own[None]) / side, 0.0), axis=2) / 2
+    np.fill_diagonal(share, 0.0)
+    with_earlier = np.tril(share)[np.ix_(kept, kept)].sum(axis=1)  # all have two rays: the first come first
+    assert 0.05 < with_earlier.max() <= SHARED
+    left_out = np.tril(share)[np.ix_(~kept, kept)].sum(axis=1)
+    assert left_out.min() > SHARED
+
+
+def test_squares_with_texture_lie_side_by_side() -> None:
+    rng = np.random.default_rng(3)
+    photograph = np.full((120, 160), 90, np.uint8)
+    photograph[:, :80] = rng.integers(0, 255, (120, 80))
+    everywhere = np.ones(photograph.shape, dtype=bool)
+    xy = textured_squares(photograph, 15, everywhere, border_px=11)
+    assert len(xy) == 7 * 6 and (xy == np.rint(xy)).all() and (xy[:, 0] < 80 + 8).all()
+    assert xy.min() >= 11 and len({tuple(one) for one in ((xy - 11) % 15).tolist()}) == 1
+    everywhere[:60] = False
+    lower = textured_squares(photograph, 15, everywhere, border_px=11)
+    assert 0 < len(lower) < len(xy) and lower[:, 1].min() == 60
+    assert len(textured_squares(np.full((60, 60), 9, np.uint8), 15, np.ones((60, 60), dtype=bool))) == 0
+
+
+def test_covered_pixels_are_not_free() -> None:
+    covered = Covered([(100, 120), (50, 50)])
+    covered.cover(np.array([0, 0]), np.array([[20.0, 30.0], [118.0, 98.0]]), np.array([10.0, 20.0]))
+    assert int(covered.pixels[0].sum()) > 100 and not covered.pixels[1].any()
+    at = np.array([[20.0, 30.0], [31.0, 30.0], [27.0, 30.0], [100.0, 20.0]])
+    assert covered.is_free(0, at, 11).tolist() == [False, True, False, True]
+    assert covered.is_free(1, at, 11).all()
+    x, y = at.astype(int).T
+    assert covered.free_middles(0, 11)[y, x].tolist() == [False, True, False, True]
 
 
 def test_windows_are_as_large_as_the_surface_bears() -> None:
@@ -213,7 +255,7 @@ def test_windows_of_a_plane_are_seen_in_perspective() -> None:
     assert np.abs(H[:2, :2] @ [10.0, -10.0] - (seen - start)[0]).max() > 0.01  # what an affine warp is off by
 
 
-def test_further_points_cover_photographs_that_are_oriented() -> None:
+def test_covering_points_cover_photographs_that_are_oriented() -> None:
     photographs, truth, _ = _scene()
     lens, camera = truth.cameras[0], np.zeros(3, dtype=np.int64)
     n = len(truth.points)
@@ -223,26 +265,22 @@ def test_further_points_cover_photographs_that_are_oriented() -> None:
     )
     ties = ImagePoints(image, point, xy, np.tile(0.01 * np.eye(2), (3 * n, 1, 1)))
     arguments = (photographs, truth, camera, ties)
-    found = find_further_points(*arguments, ties, window_px=15, spacing_px=15.0)
+    found = find_covering_points(*arguments, window_px=15, side_px=15)
     seen, count = found.image_points, np.bincount(found.image_points.point)
-    assert (found.tie_point < 0).sum() > 3 * n and (count == 3).all()
-    tied = np.flatnonzero(found.tie_point >= 0)
-    assert 0.8 * n < len(tied) == len(np.unique(found.tie_point[tied]))
-    moved = found.points[tied] - truth.points[found.tie_point[tied]]
-    assert np.abs(moved).max() < 2e-3  # to the next whole pixel of 2.4 mm
+    assert len(found.points) > 3 * n and (count == 3).all()
+    # every reference is on whole pixels; no pixel of it is in two windows, and most pixels are in one
     reference = np.flatnonzero((seen.xy == np.rint(seen.xy)).all(axis=1))
-    apart = 15 - 5.5  # the windows of interest points keep the distance, edges meet within them
-    reference = reference[found.tie_point[seen.point[reference]] < 0]
-    for i in range(3):
-        own = seen.xy[reference[seen.image[reference] == i]]
-        between = np.linalg.norm(own[:, None] - np.concatenate([own, xy[image == i]])[None], axis=2)
-        assert (between + 99 * np.eye(*between.shape)).min(initial=99) > apart
+    assert len(reference) == len(found.points)
+    times = [np.zeros(one.shape[:2], dtype=int) for one in photographs]
+    for i, (x, y) in zip(seen.image.tolist(), np.rint(seen.xy).astype(int).tolist(), strict=True):
+        times[i][y - 7 : y + 8, x - 7 : x + 8] += 1
+    for one in times:
+        assert (one > 1).sum() < 0.2 * (one > 0).sum()
+        assert (one[40:-40, 40:-40] > 0).mean() > 0.6
     height = found.points[:, 2] - render.height(found.points[:, 0], found.points[:, 1])
     assert np.sqrt((height**2).mean()) < 3e-4
     assert np.sqrt((found.residuals**2).mean()) < 0.05
-    assert (
-        len(find_further_points(*arguments, ties, window_px=15, spacing_px=15.0, references=[]).points) == 0
-    )
+    assert len(find_covering_points(*arguments, window_px=15, side_px=15, references=[]).points) == 0
 
 
 def test_tie_points_of_three_photographs() -> None:

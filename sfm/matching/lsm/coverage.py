@@ -8,17 +8,20 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import cv2
 import numpy as np
 
-from sfm.conventions import BoolArray
-from sfm.network import ImagePoints, rows_of
+from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
+from sfm.kernels.options import compiled
+from sfm.network import ImagePoints
 
 # That are tried. Larger ones tell no more where they cover a photograph, and where the surface is curved they
 # measure its mean depth over them, in all photographs alike, which no residual shows.
 WINDOWS_PX = (15, 11)
 # Ratio of precisions for the same pixels up to which the larger windows, which are fewer, are taken.
 ALIKE = 1.1
-COVERED = 0.5  # part of the photographs of a point in which others take its place
+SHARED = 0.15  # part of the pixels of a point, or of a window, that others may have measured
+SAMPLES = np.linspace(-0.42, 0.42, 6)  # of a window at which it is asked what is covered, in its sides
 
 
 def largest_alike(costs: Sequence[tuple[int, float]]) -> int:
@@ -34,24 +37,109 @@ def largest_alike(costs: Sequence[tuple[int, float]]) -> int:
     return next(window for window, cost in costs if cost <= ALIKE * best)
 
 
-def points_apart(seen: ImagePoints, fits: BoolArray, spacing_px: float, *, n_points: int) -> BoolArray:
-    """Choose points, those with the most rays first, that others do not cover, (n,).
+class Covered:
+    """Which pixels of photographs have been measured."""
+
+    def __init__(self, shapes: Sequence[tuple[int, ...]]) -> None:
+        """Nothing is covered yet of photographs of these shapes (height, width)."""
+        self.pixels: list[BoolArray] = [np.zeros(shape[:2], dtype=bool) for shape in shapes]
+
+    def cover(self, image: IntArray, xy: FloatArray, side_px: FloatArray) -> None:
+        """Cover squares, given by photograph (k,), middle (px, (k, 2)) and side (px, (k,))."""
+        first = np.maximum(np.rint(xy - side_px[:, None] / 2 + 0.5).astype(np.int64), 0)
+        behind = np.maximum(np.rint(xy + side_px[:, None] / 2 + 0.5).astype(np.int64), 0)
+        for i, (x0, y0), (x1, y1) in zip(image.tolist(), first.tolist(), behind.tolist(), strict=True):
+            self.pixels[i][y0:y1, x0:x1] = True
+
+    def free_middles(self, image: int, side_px: int) -> BoolArray:
+        """Return which pixels of a photograph are middles of squares with few covered pixels, (H, W)."""
+        covered = self.pixels[image].view(np.uint8)
+        shared = cv2.boxFilter(covered, cv2.CV_32F, (side_px, side_px))
+        return np.asarray(shared <= SHARED)
+
+    def is_free(self, image: int, xy: FloatArray, side_px: float) -> BoolArray:
+        """Return which squares of a photograph have few covered pixels, (k,).
+
+        Args:
+            image: index of the photograph.
+            xy: middles of the squares, px, (k, 2).
+            side_px: their side.
+        """
+        pixels = self.pixels[image]
+        height, width = pixels.shape
+        col = np.rint(xy[:, :1] + side_px * SAMPLES).astype(np.int64).clip(0, width - 1)
+        row = np.rint(xy[:, 1:] + side_px * SAMPLES).astype(np.int64).clip(0, height - 1)
+        return np.asarray(pixels[row[:, :, None], col[:, None, :]].mean(axis=(1, 2)) <= SHARED)
+
+
+def points_apart(seen: ImagePoints, fits: BoolArray, side_px: float, *, n_points: int) -> BoolArray:
+    """Choose points, those with the most rays first, whose windows share few of their pixels, (n,).
 
     Args:
         seen: image points.
         fits: which of them count, (k,).
-        spacing_px: side of the squares that a point takes, one in each photograph.
+        side_px: of the windows.
         n_points: number of points.
     """
     kept = np.zeros(n_points, dtype=bool)
     rows = np.flatnonzero(fits)
-    cells = np.floor(seen.xy[rows] / spacing_px).astype(np.int64)
-    keys = list(zip(seen.image[rows].tolist(), cells[:, 0].tolist(), cells[:, 1].tolist(), strict=True))
-    of_point = rows_of(seen.point[rows], n_points)
-    taken: set[tuple[int, int, int]] = set()
-    for point in np.argsort([-len(own) for own in of_point], kind="stable").tolist():
-        own = [keys[k] for k in of_point[point].tolist()]
-        if own and sum(key in taken for key in own) < COVERED * len(own):
-            kept[point] = True
-            taken.update(own)
+    if not len(rows):
+        return kept
+    count = np.bincount(seen.point[rows], minlength=n_points)
+    order = np.argsort(-count, kind="stable")
+    rows = rows[np.argsort(seen.point[rows], kind="stable")]
+    cells = np.floor(seen.xy[rows] / side_px).astype(np.int64)
+    cells -= (
+        cells.min(axis=0) - 1
+    )  # with a free one on each side, so that neighbours have numbers of their own
+    columns, lines = cells.max(axis=0) + 2
+    cell = (seen.image[rows] * lines + cells[:, 1]) * columns + cells[:, 0]
+    first = np.concatenate([[0], np.cumsum(count)])
+    _keep_apart(order, first, seen.xy[rows] / side_px, cell, np.unique(cell), int(columns), kept)
     return kept
+
+
+@compiled
+def _keep_apart(
+    order: IntArray,
+    first: IntArray,
+    xy: AnyArray,
+    cell: IntArray,
+    cells: IntArray,
+    columns: int,
+    kept: BoolArray,
+) -> None:
+    """Mark points in this order whose windows, of side 1, share few of their pixels with those marked before.
+
+    Args:
+        order: points, the first to be kept first, (n,).
+        first: the first ray of each point, and the end, (n + 1,).
+        xy: middles of the windows, point by point, in sides, (k, 2).
+        cell: number of the square of side 1 that each is in, (k,).
+        cells: these numbers, sorted, (c,).
+        columns: squares of a line: the number of a neighbour is by 1, `columns` or both larger or smaller.
+        kept: filled, (n,).
+    """
+    latest = np.full(len(cells), -1)  # window kept in each square
+    before = np.full(len(xy), -1)  # that was kept there before
+    for point in order:
+        begin, end = first[point], first[point + 1]
+        shared, most = 0.0, SHARED * (end - begin)
+        for k in range(begin, end):
+            for line in (-columns, 0, columns):
+                at = np.searchsorted(cells, cell[k] + line - 1)
+                while at < len(cells) and cells[at] <= cell[k] + line + 1:
+                    other = latest[at]
+                    while other >= 0:
+                        wide, high = 1 - abs(xy[k, 0] - xy[other, 0]), 1 - abs(xy[k, 1] - xy[other, 1])
+                        shared += max(wide, 0.0) * max(high, 0.0)
+                        other = before[other]
+                    at += 1
+            if shared > most:
+                break
+        if shared > most or begin == end:
+            continue
+        kept[point] = True
+        for k in range(begin, end):
+            at = np.searchsorted(cells, cell[k])
+            before[k], latest[at] = latest[at], k

@@ -22,6 +22,8 @@ WEIGHT_OF_MEAN = 0.5
 # Standard deviation of the derivative of a Gaussian for the gradients, px; their noise is then
 # sigma_n^2 / (8 pi s^4).
 DERIVATION_PX = 1.0
+REACH_PX = 3  # of such a derivative
+TEXTURE_OF_MEAN = 0.1  # of the weight of squares: less is left; whether it can be matched is for the matching
 
 
 @dataclass(frozen=True)
@@ -44,7 +46,6 @@ def foerstner_points(
     min_distance_px: float = 10.0,
     max_points: int = 5000,
     border_px: int = 0,
-    taken: FloatArray | None = None,
 ) -> InterestPoints:
     """Find the points of a photograph at which matching is precise in all directions.
 
@@ -54,7 +55,6 @@ def foerstner_points(
         min_distance_px: of two points that are nearer the weaker one is left out.
         max_points: of more the strongest are kept.
         border_px: no points this close to the border of the photograph.
-        taken: places, px, (t, 2), that no point is nearer to than to another one.
 
     Returns:
         The points; the sigma of an intensity for the ellipses is that of the misfit of the window's edges.
@@ -68,34 +68,74 @@ def foerstner_points(
     if max_points < 1:
         raise GeometryError(f"interest operator: {max_points} points asked for, at least 1 is needed")
     grey = grey_of(photograph)
-    reach = 2 * int(np.ceil(3 * DERIVATION_PX)) + 1
-    smooth = cv2.GaussianBlur(grey, (reach, reach), DERIVATION_PX, borderType=cv2.BORDER_REFLECT_101)
-    gx = cv2.Sobel(smooth, cv2.CV_32F, 1, 0, ksize=1, scale=0.5, borderType=cv2.BORDER_REFLECT_101)
-    gy = cv2.Sobel(smooth, cv2.CV_32F, 0, 1, ksize=1, scale=0.5, borderType=cv2.BORDER_REFLECT_101)
-    xx, xy, yy = (
-        cv2.boxFilter(product, cv2.CV_64F, (side, side), normalize=False)
-        for product in (gx * gx, gx * gy, gy * gy)
-    )
-    trace = np.maximum(xx + yy, 1e-12)
-    det = np.maximum(xx * yy - xy * xy, 0.0)
-    weight = det / trace
-    roundness = 4 * det / (trace * trace)
+    gx, gy = _gradients(grey)
+    weight, roundness = _texture(gx, gy, side)
     top = np.asarray(cv2.dilate(weight, np.ones((3, 3), np.uint8)) <= weight)
     good = top & (roundness >= MIN_ROUNDNESS) & (weight > WEIGHT_OF_MEAN * weight.mean()) & (weight > 0)
-    margin = max(border_px, side // 2 + reach // 2)
+    margin = max(border_px, side // 2 + REACH_PX)
     good[:margin], good[-margin:], good[:, :margin], good[:, -margin:] = False, False, False, False
     row, col = np.nonzero(good)
     order = np.argsort(-weight[row, col], kind="stable")
     row, col = row[order], col[order]
     kept = np.zeros(len(row), dtype=np.bool_)
     near = np.zeros(grey.shape, dtype=np.bool_)
-    for x, y in () if taken is None else np.rint(taken).astype(np.int64):
-        _take(near, y, x, float(min_distance_px))
     _thin(row, col, float(min_distance_px), max_points, near, kept)
     row, col = row[kept], col[kept]
     place, covariance = np.empty((len(row), 2)), np.empty((len(row), 2, 2))
     _intersect_edges(gx, gy, row, col, side // 2, place, covariance)
     return InterestPoints(place, covariance, weight[row, col], roundness[row, col])
+
+
+def textured_squares(
+    photograph: AnyArray, side_px: int, allowed: BoolArray, *, border_px: int = 0
+) -> FloatArray:
+    """Return the middles of squares with texture, side by side from the upper left, whole px, (k, 2).
+
+    Args:
+        photograph: (H, W), 8 or 16 bit or float, grey or colour.
+        side_px: odd side of the squares.
+        allowed: which pixels may be a middle, (H, W).
+        border_px: no middle this close to the border of the photograph.
+
+    Source: the weight of Foerstner and Guelch (1987), ISPRS Intercommission Workshop Interlaken, p. 281.
+    """
+    gx, gy = _gradients(grey_of(photograph))
+    weight, _ = _texture(gx, gy, side_px)
+    free = allowed & (weight > TEXTURE_OF_MEAN * weight.mean())
+    margin = max(border_px, 1)
+    free[:margin], free[-margin:], free[:, :margin], free[:, -margin:] = False, False, False, False
+    return np.array(_side_by_side(free, side_px), dtype=float).reshape(-1, 2)
+
+
+def _gradients(grey: AnyArray) -> tuple[AnyArray, AnyArray]:
+    """Return the derivatives of a photograph along x and y, each (H, W)."""
+    reach = 2 * REACH_PX + 1
+    smooth = cv2.GaussianBlur(grey, (reach, reach), DERIVATION_PX, borderType=cv2.BORDER_REFLECT_101)
+    along_x = cv2.Sobel(smooth, cv2.CV_32F, 1, 0, ksize=1, scale=0.5, borderType=cv2.BORDER_REFLECT_101)
+    along_y = cv2.Sobel(smooth, cv2.CV_32F, 0, 1, ksize=1, scale=0.5, borderType=cv2.BORDER_REFLECT_101)
+    return along_x, along_y
+
+
+def _texture(gx: AnyArray, gy: AnyArray, side: int) -> tuple[AnyArray, AnyArray]:
+    """Return weight and roundness of the window around every pixel, each (H, W)."""
+    xx, xy, yy = (
+        cv2.boxFilter(product, cv2.CV_64F, (side, side), normalize=False)
+        for product in (gx * gx, gx * gy, gy * gy)
+    )
+    trace = np.maximum(xx + yy, 1e-12)
+    det = np.maximum(xx * yy - xy * xy, 0.0)
+    return det / trace, 4 * det / (trace * trace)
+
+
+def _side_by_side(free: BoolArray, side: int) -> list[tuple[int, int]]:
+    """Return the first free places (x, y), line by line, whose squares do not overlap; `free` is used up."""
+    found = []
+    for y in range(len(free)):
+        for x in np.flatnonzero(free[y]).tolist():
+            if free[y, x]:
+                found.append((x, y))
+                free[y : y + side, max(0, x - side + 1) : x + side] = False
+    return found
 
 
 @compiled

@@ -58,6 +58,7 @@ class Settled:
     images: BoolArray  # photographs in it, (m,)
     points: BoolArray  # points in it, (n,)
     accepted: BoolArray  # image points of the whole network, (k,)
+    rejected: BoolArray  # image points of the part
     contradiction: Contradiction | None
     iterations: int  # of all adjustments on the way
     rays: IntArray  # accepted rays of each point, of those that left when they left, (n,)
@@ -75,7 +76,8 @@ def settle(task: Task, estimate: Estimate) -> Settled:
     while True:
         part, start = reduce_network(network, estimate, images, points, np.ones_like(accepted))
         refuse_too_few_observations(part, start, task.datum.kind)
-        adjustment = _tested(task, part, start, covariance=False)
+        used = images[network.image_points.image] & points[network.image_points.point]
+        adjustment = _tested(task, part, start, covariance=False, rejected=~accepted[used])
         start_sigma0 = start_sigma0 if iterations else adjustment.start_sigma0
         iterations += adjustment.iterations
         if not adjustment.converged:
@@ -90,7 +92,8 @@ def settle(task: Task, estimate: Estimate) -> Settled:
         if found is not None or ((left_images == images).all() and (left_points == points).all()):
             values = adjustment.estimate
             return Settled(
-                *(part, values, images, points, accepted, found, iterations, rays, start_sigma0, held)
+                *(part, values, images, points, accepted, adjustment.rejected),
+                *(found, iterations, rays, start_sigma0, held),
             )
         images, points = left_images, left_points
 
@@ -131,8 +134,8 @@ def without_contradiction(task: Task, found: Contradiction, accepted: BoolArray)
     )
 
 
-def adjust_finally(task: Task, part: Network, estimate: Estimate) -> Adjustment:
-    """Return the last adjustment with its covariance.
+def adjust_finally(task: Task, part: Network, estimate: Estimate, rejected: BoolArray) -> Adjustment:
+    """Return the last adjustment with its covariance; it begins without what was rejected, (k,).
 
     Where other observations take part, the image points are weighted by their own variance component, unless
     the survey wants all weights as stated.
@@ -140,14 +143,14 @@ def adjust_finally(task: Task, part: Network, estimate: Estimate) -> Adjustment:
     part, estimate = without_idle_cameras(part, estimate, cameras=len(task.survey.cameras))
 
     def adjust_part(factor: FloatArray) -> Adjustment:
-        return _tested(task, part, estimate, covariance=True, factor=factor)
+        return _tested(task, part, estimate, covariance=True, factor=factor, rejected=rejected)
 
     outer = (part.control, part.exterior) if task.datum.kind == "control" else ()
     weighted = any(observed(np.einsum("nii->ni", one.covariance)).any() for one in outer)
     others = len(part.scale_bars) or len(part.interior) or weighted
     if others and task.survey.adjust.weights == "components":
         return _weighed(adjust_part, len(part.image_points))
-    return _tested(task, part, estimate, covariance=True)
+    return adjust_part(np.ones(len(part.image_points)))
 
 
 def contradiction_in(task: Task, adjustment: Adjustment) -> Contradiction | None:
@@ -193,6 +196,7 @@ def _tested(
     *,
     covariance: bool,
     factor: float | FloatArray = 1.0,
+    rejected: BoolArray | None = None,
     method: str = "levenberg-marquardt",
     max_iterations: int = MAX_ITERATIONS,
 ) -> Adjustment:
@@ -206,6 +210,7 @@ def _tested(
         image_sigma_factor=factor,
         reject=task.reject,
         alpha=1 - (1 - FALSE_ALARM) ** (1 / tests),
+        rejected=rejected,
         method=method,
         max_iterations=max_iterations,
         covariance=covariance,

@@ -296,7 +296,7 @@ def _placed(start: _Prepared, task: Task, settled: Settled) -> tuple[Adjustment,
         every = np.ones(len(start.task.network.image_points), dtype=bool)
         frame = reduce_network(start.task.network, start.frame, settled.images, settled.points, every)[1]
         last = place_on_frame(settled.part, last, frame, carriers)
-    return adjust_finally(task, settled.part, last), check
+    return adjust_finally(task, settled.part, last, settled.rejected), check
 
 
 def _dropped(start: _Prepared, solved: _Solved) -> tuple[tuple[str, str], ...]:

@@ -1,9 +1,9 @@
 """The points of a textured survey once its photographs are oriented: their windows cover the photographs.
 
 Windows that overlap measure the same pixels twice, and their errors have these in common: the precision of a
-result would be told too good. So tie points that do not overlap are measured anew, and what they do not cover
-is filled. All pixels then take part once, whatever the size of the windows; it is chosen by what the surface
-bears, which is hardly plane over large ones.
+result would be told too good. So the tie points, which lie anywhere, give way to windows side by side. All
+pixels then take part once, whatever the size of the windows; it is chosen by what the surface bears, which is
+hardly plane over large ones.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sfm.conventions import MAD_TO_SIGMA, AnyArray, BoolArray
-from sfm.matching.lsm.coverage import WINDOWS_PX, largest_alike, points_apart
+from sfm.matching.lsm.coverage import WINDOWS_PX, largest_alike
 from sfm.matching.lsm.projected_points import pictures_of
 from sfm.network import Estimate, ImagePoints, Network
 from sfm.orientation.incremental.sequence import Orientation
@@ -22,15 +22,14 @@ from sfm.photographs.reading import read_photograph
 from sfm.result import PhotographTargets
 from sfm.survey.inputs.measurements import Measurements
 from sfm.survey.inputs.survey import Survey
-from sfm.survey.measuring.further_points import FurtherPoints, find_further_points
+from sfm.survey.measuring.covering_points import find_covering_points
 from sfm.survey.measuring.tie_points import MIN_RAYS, drawn_windows
 
 TRIAL_PHOTOGRAPHS = 2  # of which points are taken to choose the window
 TRIAL_RAYS = 100  # with fewer the window stays as it is
 # Spread of the rays of a tie point, in that of all, beyond which it tells nothing of the surface
 TOLERANCE_FACTOR = 6.0
-MAX_POINTS = 4000  # of a photograph: larger ones are covered in part
-PACKING = 0.7  # points at a distance of at least d that a square of side d has, found by chance
+MAX_POINTS = 6000  # of a photograph: of larger ones the squares are larger than the windows
 
 
 @dataclass(frozen=True)
@@ -72,21 +71,26 @@ def cover_photographs(
     window = settings.window_px
     if "window_px" not in settings.model_fields_set:
         window = _best_window(photographs, network, estimate, surface, window, jobs)
-    spacing = _spacing(photographs, window)
-    kept = fits & points_apart(seen, fits, spacing, n_points=len(network.points))[seen.point]
-    further = find_further_points(
+    found = find_covering_points(
         photographs,
         estimate,
         network.camera,
         surface,
-        seen.select(kept),
         window_px=window,
-        spacing_px=spacing,
+        side_px=_side(photographs, window),
         min_rays=MIN_RAYS,
         threads=jobs,
     )
-    covered, values = _with_further(network, estimate, further, survey.adjust.sigma_px)
-    return Surface(covered, values, drawn_windows(covered, paths, window))
+    points = tuple(f"t{j + 1:05d}" for j in range(len(found.points)))
+    order = np.argsort(found.image_points.point, kind="stable")
+    covariance = found.image_points.covariance + survey.adjust.sigma_px**2 * np.eye(2)
+    covering = Network(
+        network.images,
+        network.camera,
+        points,
+        replace(found.image_points, covariance=covariance).select(order),
+    )
+    return Surface(covering, replace(estimate, points=found.points), drawn_windows(covering, paths, window))
 
 
 def _fitting(network: Network, estimate: Estimate) -> BoolArray:
@@ -103,10 +107,10 @@ def _fitting(network: Network, estimate: Estimate) -> BoolArray:
     return np.asarray(fits & (rays >= MIN_RAYS)[seen.point])
 
 
-def _spacing(photographs: Sequence[AnyArray], window_px: int) -> float:
-    """Return how far points are apart at least: a window, or more where a photograph would have too many."""
+def _side(photographs: Sequence[AnyArray], window_px: int) -> int:
+    """Return the odd side of the squares: a window, or more where a photograph would have too many, px."""
     area = max(one.shape[0] * one.shape[1] for one in photographs)
-    return max(float(window_px), float(np.sqrt(PACKING * area / MAX_POINTS)))
+    return max(window_px, int(np.sqrt(area / MAX_POINTS)) | 1)
 
 
 def _best_window(
@@ -119,17 +123,15 @@ def _best_window(
 ) -> int:
     """Return the side of the windows with which the same pixels are the most precise, px."""
     most = np.argsort(-np.bincount(surface.image, minlength=len(photographs)), kind="stable")
-    none = surface.select(np.zeros(len(surface), dtype=bool))
     found: list[tuple[int, float]] = []
     for window in WINDOWS_PX:
-        trial = find_further_points(
+        trial = find_covering_points(
             photographs,
             estimate,
             network.camera,
             surface,
-            none,
             window_px=window,
-            spacing_px=max(2.0 * window, _spacing(photographs, window)),
+            side_px=max(2 * window + 1, _side(photographs, window)),
             references=most[:TRIAL_PHOTOGRAPHS].tolist(),
             threads=jobs,
         )
@@ -137,25 +139,3 @@ def _best_window(
             spread = MAD_TO_SIGMA * float(np.median(np.abs(trial.residuals)))
             found.append((window, spread * window))
     return largest_alike(found) if found else usual
-
-
-def _with_further(
-    network: Network, estimate: Estimate, further: FurtherPoints, sigma_px: float
-) -> tuple[Network, Estimate]:
-    """Return the network of the tie points that were measured anew, and of further points behind them."""
-    n = len(network.points)
-    new = further.tie_point < 0
-    place = further.tie_point.copy()
-    place[new] = n + np.arange(new.sum())
-    names = tuple(f"t{j + 1:05d}" for j in place[new].tolist())
-    seen = further.image_points
-    order = np.argsort(place[seen.point], kind="stable")
-    image_points = replace(
-        seen, point=place[seen.point], covariance=seen.covariance + sigma_px**2 * np.eye(2)
-    ).select(order)
-    points = np.full((n + len(names), 3), np.nan)
-    points[place] = further.points
-    return (
-        replace(network, points=(*network.points, *names), image_points=image_points),
-        replace(estimate, points=points),
-    )

@@ -38,7 +38,9 @@ REWEIGHTED = 1e-3  # largest change of a weight at which reweighting ends
 REJECTS = ("tau", "huber", "tukey", "none")
 
 
-def find_optimum(run: Run, state: State, *, reject: str, alpha: float) -> tuple[Optimum, FloatArray]:
+def find_optimum(
+    run: Run, state: State, *, reject: str, alpha: float, without: BoolArray
+) -> tuple[Optimum, FloatArray]:
     """Return the optimum and the factor on the weight of each image point, 0 where rejected, (k,).
 
     Args:
@@ -46,15 +48,16 @@ def find_optimum(run: Run, state: State, *, reject: str, alpha: float) -> tuple[
         state: where to start.
         reject: tau | huber | tukey | none.
         alpha: probability with which the test of one image coordinate rejects a good one.
+        without: image points that data snooping begins without, (k,).
 
     Raises:
         GeometryError: start values whose normal equations cannot be solved.
     """
     weight = start_weights(run.problem.layout, state)
     if reject == "none":
-        return _plain(run, state, weight)
+        return _plain(run, state, weight, without)
     wanted, run.tolerance = run.tolerance, max(run.tolerance, ROUND_TOLERANCE)
-    optimum, weight = _sound(run, state, weight)
+    optimum, weight = _sound(run, state, weight, without)
     if reject == "tau":
         optimum, weight = _snoop_all(run, optimum, weight, alpha)
     else:
@@ -90,9 +93,12 @@ class Run:
         """Return the optimum from start values by the method asked for."""
         return self._iterate(state, weight, self.method)
 
-    def minimise(self, optimum: Optimum, weight: FloatArray) -> tuple[Optimum, FloatArray]:
+    def minimise(
+        self, optimum: Optimum, weight: FloatArray, without: BoolArray
+    ) -> tuple[Optimum, FloatArray]:
         """Return the optimum with image points that were behind their camera at the start back in."""
-        ready = self.problem.layout.active & ~behind_camera(self.problem.layout.observations, optimum.state)
+        ready = self.problem.layout.active & ~without
+        ready &= ~behind_camera(self.problem.layout.observations, optimum.state)
         if (ready & (weight == 0)).any():
             weight = np.where(ready, 1.0, weight)
             optimum = self._iterate(optimum.state, weight, self.method)
@@ -126,12 +132,13 @@ class Run:
         return optimum
 
 
-def _plain(run: Run, state: State, weight: FloatArray) -> tuple[Optimum, FloatArray]:
-    """Return the optimum of all image points."""
-    return run.minimise(run.start(state, weight), weight)
+def _plain(run: Run, state: State, weight: FloatArray, without: BoolArray) -> tuple[Optimum, FloatArray]:
+    """Return the optimum of all image points but those that it is to be without."""
+    weight = np.where(without, 0.0, weight)
+    return run.minimise(run.start(state, weight), weight, without)
 
 
-def _sound(run: Run, state: State, weight: FloatArray) -> tuple[Optimum, FloatArray]:
+def _sound(run: Run, state: State, weight: FloatArray, without: BoolArray) -> tuple[Optimum, FloatArray]:
     """Return the optimum from which gross errors are judged: of all image points, unless they bend it.
 
     An error of hundreds of pixels can turn a photograph over or let the principal distance collapse. Then
@@ -149,7 +156,7 @@ def _sound(run: Run, state: State, weight: FloatArray) -> tuple[Optimum, FloatAr
         return robust_scale(layout.observations, v, layout.active & np.isfinite(v).all(axis=1), freedom=1.0)
 
     try:
-        (optimum, plain), begun = _plain(run, state, weight), None
+        (optimum, plain), begun = _plain(run, state, weight, without), None
     except GeometryError:
         begun = optimum_at(run.problem, state, weight)
         if begun is None:
@@ -226,11 +233,13 @@ def _snoop_all(run: Run, optimum: Optimum, weight: FloatArray, alpha: float) -> 
         if redundancy < 2:
             break
         v = residuals(layout.observations, optimum.state)
-        complement = hat_complement(optimum, layout, cofactors(optimum, layout), weight)
+        Q = cofactors(optimum, layout)
         out, back = snoop(
             layout.observations,
+            optimum.state,
             v,
-            complement,
+            hat_complement(optimum, layout, Q, weight),
+            Q.limiting,
             weight > 0,
             vPv=optimum.vPv,
             redundancy=redundancy,

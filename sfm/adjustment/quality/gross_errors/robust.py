@@ -4,8 +4,8 @@ Data snooping takes out, round by round, the image points of the largest tau abo
 the largest of all, and with it others whose photograph and object point hold no larger one, so that
 none is judged beside a larger error. In a photograph of many image points an error moves the residuals of
 the others by its leverage only, some hundredths of it: there all those go that are not much smaller than the
-largest. A rejected point is taken back when its predicted residual
-passes the test again.
+largest, and further rays of an object point that has lost one go one after another in the same round
+(`rays_of_points`). A rejected point is taken back when its predicted residual passes the test again.
 
 Huber's estimator bounds the influence of an image point, Tukey's biweight takes it back to nothing:
 beyond TUKEY standard deviations an image point has weight 0. It starts from Huber's, because its sum
@@ -20,7 +20,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from sfm.adjustment.engine.collinearity import Observations
+from sfm.adjustment.engine.collinearity import Observations, State
+from sfm.adjustment.quality.gross_errors.rays_of_points import further_rays
 from sfm.adjustment.quality.reliability import standardised_residuals, tau_critical
 from sfm.conventions import MAD_TO_SIGMA, BoolArray, FloatArray
 
@@ -37,8 +38,10 @@ MIN_FREEDOM = 0.05  # of redundancy over observations, so that a network without
 
 def snoop(
     observations: Observations,
+    state: State,
     residuals: FloatArray,
     complement: FloatArray,
+    limiting: FloatArray,
     used: BoolArray,
     *,
     vPv: float,
@@ -49,8 +52,10 @@ def snoop(
 
     Args:
         observations: image points.
+        state: the unknowns.
         residuals: v of all image points, rejected ones predicted, px, shape (k, 2).
         complement: whitened cofactors of the residuals, shape (k, 2, 2).
+        limiting: cofactors of each object point with the cameras fixed, shape (n, 3, 3).
         used: image points in the adjustment, shape (k,).
         vPv: weighted sum of squares of the adjustment.
         redundancy: of the adjustment.
@@ -69,6 +74,8 @@ def snoop(
     worst_point = np.zeros(len(observations.start) - 1)
     np.maximum.at(worst_point, observations.point[suspect], tau[suspect])
     out = suspect & (tau >= worst_image[observations.image]) & (tau >= worst_point[observations.point])
+    least = np.where(crowded, np.maximum(worst_image, critical), np.inf) * sigma0
+    out |= further_rays(observations, state, residuals, complement, limiting, used, out, least=least)
     back = ~used & (tau <= critical)
     return out, back
 

@@ -1,11 +1,12 @@
-"""More points of natural texture, once the orientation of the photographs is known.
+"""Points that cover the texture of photographs, once their orientation is known.
 
 A few hundred tie points orient the photographs and tell the shape of the surface. The rest needs no features:
-interest points are taken where a photograph has no point yet, put on the plane through their neighbours in
-space, projected into all photographs that look at that plane, and measured there by least squares matching,
-in those with the most similar direction first, whose rays correct the place for the others. So a point is
-followed through all its photographs, also where the directions are too different for descriptors. The tie
-points themselves are measured anew in the same way: when they were found, nothing was known of perspective.
+squares with texture, side by side, are put on the plane through the points around them in space, projected
+into all photographs that look at that plane, and measured there by least squares matching, in those with the
+most similar direction first, whose rays correct the place for the others. So a point is followed through all
+its photographs, also where the directions are too different for descriptors. No pixel is measured twice: each
+photograph gives squares where those of the ones before leave its pixels free, and a square is looked for in
+photographs whose pixels there are free.
 """
 
 from __future__ import annotations
@@ -16,12 +17,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
+from sfm.matching.lsm.coverage import Covered
 from sfm.matching.lsm.projected_points import pictures_of, plane_warps
 from sfm.matching.lsm.surface_planes import NEIGHBOURS, planes_at
 from sfm.matching.lsm.two_photo import match_lsm
 from sfm.matching.lsm.warp import linear_part
 from sfm.matching.radiometry import grey_of
-from sfm.matching.tracks.interest import foerstner_points
+from sfm.matching.tracks.interest import textured_squares
 from sfm.network import Estimate, ImagePoints, rows_of
 from sfm.orientation.image_rays import intersect_image_points
 
@@ -35,13 +37,12 @@ TOLERANCE_PX = 1.5  # largest residual of a ray that stays with its point
 
 
 @dataclass(frozen=True)
-class FurtherPoints:
+class CoveringPoints:
     """Points and their rays."""
 
     image_points: ImagePoints  # k of them, their points 0 to n - 1
     points: FloatArray  # object points, (n, 3)
     residuals: FloatArray  # of the rays with the orientation as it was, px, (k, 2)
-    tie_point: IntArray  # the tie point that each was before, -1 of new ones, (n,)
 
 
 @dataclass(frozen=True)
@@ -51,91 +52,85 @@ class _Places:
     xy: FloatArray  # whole pixels, (k, 2)
     normal: FloatArray  # of the surface there, towards the photograph, unit vectors, (k, 3)
     points: FloatArray  # object points, (k, 3)
-    tie_point: IntArray  # -1 of new ones, (k,)
 
     def __len__(self) -> int:
         return len(self.xy)
 
     def select(self, rows: BoolArray) -> _Places:
         """Return some of them."""
-        return _Places(self.xy[rows], self.normal[rows], self.points[rows], self.tie_point[rows])
+        return _Places(self.xy[rows], self.normal[rows], self.points[rows])
 
 
-def find_further_points(
+@dataclass(frozen=True)
+class _Rays:
+    """The places of one reference photograph, measured in all that see them."""
+
+    image_points: ImagePoints
+    scale: FloatArray  # of the windows relative to the reference, (k,)
+
+
+def find_covering_points(
     photographs: Sequence[AnyArray],
     estimate: Estimate,
     camera: IntArray,
     seen: ImagePoints,
-    again: ImagePoints,
     *,
     window_px: int,
-    spacing_px: float,
+    side_px: int,
     references: Sequence[int] | None = None,
     min_rays: int = 3,
     min_correlation: float = 0.7,
     threads: int = 1,
-) -> FurtherPoints:
-    """Measure tie points anew, and further points, in all photographs that see them, until these are covered.
+) -> CoveringPoints:
+    """Measure points in all photographs that see them, until the texture of these is covered.
 
     Args:
         photographs: (H, W), m of them.
         estimate: orientation of the photographs, to a few pixels, and the tie points that there are.
         camera: index of the camera of each photograph, (m,).
         seen: image points of the tie points that fit, which tell the surface.
-        again: image points of those tie points that are measured anew; no new one is near to them.
         window_px: odd side of the windows.
-        spacing_px: smallest distance of a new point from all others in its reference.
+        side_px: of the squares that the windows are in the middle of; no two of them share pixels.
         references: photographs that points are taken from; all, those with the most tie points first, if not
             given.
         min_rays: fewest photographs of a point.
         min_correlation: smallest coefficient r of a match.
         threads: patches worked on at a time.
 
-    Source: Gruen (1985), S. Afr. J. Photogrammetry 14(3); Foerstner and Guelch (1987) for the places.
+    Source: Gruen (1985), S. Afr. J. Photogrammetry 14(3).
     """
     m = len(photographs)
     margin = window_px // 2 + BORDER_PX
     own = rows_of(seen.image, m)
-    places_of = [[again.xy[rows]] for rows in rows_of(again.image, m)]
-    ties = _references(again)
-    ties_of = [ties[rows] for rows in rows_of(again.image[ties], m)]
     order = np.argsort([-len(rows) for rows in own], kind="stable") if references is None else references
-    shapes = [one.shape[:2] for one in photographs]
+    covered = Covered([one.shape for one in photographs])
     found = [_none()]
     for i in np.asarray(order).tolist():
         if not estimate.oriented[i] or len(own[i]) < NEIGHBOURS:
             continue
-        corners = foerstner_points(
-            photographs[i],
-            min_distance_px=spacing_px,
-            border_px=margin,
-            taken=np.concatenate(places_of[i]),
-        )
-        xy = np.rint(np.concatenate([again.xy[ties_of[i]], corners.xy]))
+        xy = textured_squares(photographs[i], side_px, covered.free_middles(i, side_px), border_px=margin)
         points, normal = planes_at(estimate, camera, i, xy, seen.point[own[i]])
-        tie_point = np.concatenate([again.point[ties_of[i]], np.full(len(corners.xy), -1)])
         known = np.asarray(np.isfinite(points).all(axis=1))
-        places = _Places(xy, normal, points, tie_point).select(known)
-        visible = _visible(estimate, camera, i, places, shapes, margin)
+        places = _Places(xy, normal, points).select(known)
+        visible = _visible(estimate, camera, i, places, covered, margin, side_px)
         several = visible.sum(axis=0) >= min_rays
         if not several.any():
             continue
-        places = places.select(several)
         rays = _followed(
-            photographs, estimate, camera, i, places, visible[:, several], window_px, min_correlation, threads
+            photographs,
+            estimate,
+            camera,
+            i,
+            places.select(several),
+            visible[:, several],
+            window_px,
+            min_correlation,
+            threads,
         )
-        new = _agreeing(rays, estimate, camera, places.tie_point, min_rays)
+        new, used = _agreeing(rays.image_points, estimate, camera, min_rays)
         found.append(new)
-        for j in np.unique(new.image_points.image).tolist():
-            places_of[j].append(new.image_points.xy[new.image_points.image == j])
+        covered.cover(new.image_points.image, new.image_points.xy, side_px * rays.scale[used])
     return _joined(found)
-
-
-def _references(seen: ImagePoints) -> IntArray:
-    """Return the row of each point in the photograph that it was taken from, where it is on a whole pixel."""
-    between = (seen.xy != np.rint(seen.xy)).any(axis=1)
-    order = np.lexsort([between, seen.point])
-    return np.asarray(order[np.unique(seen.point[order], return_index=True)[1]])
 
 
 def _visible(
@@ -143,19 +138,24 @@ def _visible(
     camera: IntArray,
     i: int,
     places: _Places,
-    shapes: Sequence[tuple[int, ...]],
+    covered: Covered,
     margin: int,
+    side_px: int,
 ) -> BoolArray:
-    """Return which photographs look at the planes and have them inside, the reference among them, (m, k)."""
-    visible = np.zeros((len(shapes), len(places.xy)), dtype=bool)
+    """Return which photographs look at the planes and have them inside and not covered, (m, k).
+
+    The reference is among them.
+    """
+    visible = np.zeros((len(covered.pixels), len(places)), dtype=bool)
     for j in np.flatnonzero(estimate.oriented).tolist():
         at = pictures_of(estimate, camera, np.full(len(places.xy), j), places.points)
-        size = np.array(shapes[j][1::-1])
+        size = np.array(covered.pixels[j].shape[::-1])
         ray = estimate.position[j] - places.points
         cosine = np.sum(ray * places.normal, axis=1) / np.linalg.norm(ray, axis=1)
         with np.errstate(invalid="ignore"):
             inside = ((at >= margin) & (at <= size - 1 - margin)).all(axis=1)
-        visible[j] = inside & (cosine > MIN_COSINE)
+        rows = np.flatnonzero(inside & (cosine > MIN_COSINE))
+        visible[j, rows] = covered.is_free(j, at[rows], side_px)
     visible[i] = True
     return visible
 
@@ -170,7 +170,7 @@ def _followed(
     window_px: int,
     min_correlation: float,
     threads: int,
-) -> ImagePoints:
+) -> _Rays:
     """Measure the places of a photograph in the others, in those with the most similar direction first.
 
     Half of the noise of a match is that of the template and goes to the reference, as in `tie_points`.
@@ -184,6 +184,7 @@ def _followed(
     first = visible & (rank <= FIRST_PHOTOGRAPHS)
     template = grey_of(photographs[i])
     parts = [ImagePoints(np.full(k, i), np.arange(k), places.xy, np.full((k, 2, 2), np.nan))]
+    scales = [np.ones(k)]
     in_reference, number = np.zeros((k, 2, 2)), np.zeros(k, dtype=np.int64)
 
     def measure(which: BoolArray, points: FloatArray, max_shift_px: float) -> None:
@@ -218,6 +219,7 @@ def _followed(
             in_reference[rows[good]] += back @ half @ back.transpose(0, 2, 1)
             number[rows[good]] += 1
             parts.append(ImagePoints(np.full(int(good.sum()), j), rows[good], match.xy[good], half))
+            scales.append(scale[fits][good])
 
     measure(first, places.points, FIRST_SHIFT_PX)
     points = intersect_image_points(
@@ -227,20 +229,21 @@ def _followed(
     matched = number > 0
     parts[0].covariance[matched] = in_reference[matched] / number[matched, None, None]
     seen = _concatenated(parts)
-    return seen.select(matched[seen.point])
+    some = matched[seen.point]
+    return _Rays(seen.select(some), np.concatenate(scales)[some])
 
 
 def _agreeing(
-    seen: ImagePoints, estimate: Estimate, camera: IntArray, tie_point: IntArray, min_rays: int
-) -> FurtherPoints:
-    """Return the points with enough rays that meet, and these rays."""
-    n = len(tie_point)
+    seen: ImagePoints, estimate: Estimate, camera: IntArray, min_rays: int
+) -> tuple[CoveringPoints, BoolArray]:
+    """Return the points with enough rays that meet, and which rays these are, (k,)."""
+    n = int(seen.point.max(initial=-1)) + 1
     met = intersect_image_points(seen, camera, estimate, n_points=n, tolerance_px=TOLERANCE_PX)
     used = met.used & (np.bincount(seen.point[met.used], minlength=n) >= min_rays)[seen.point]
     kept, point = np.unique(seen.point[used], return_inverse=True)
     c = np.array([lens.c_px for lens in estimate.cameras])[camera[seen.image[used]]]
     image_points = replace(seen.select(used), point=point.ravel())
-    return FurtherPoints(image_points, met.points[kept], met.residuals[used] * c[:, None], tie_point[kept])
+    return CoveringPoints(image_points, met.points[kept], met.residuals[used] * c[:, None]), used
 
 
 def _concatenated(parts: Sequence[ImagePoints]) -> ImagePoints:
@@ -253,23 +256,22 @@ def _concatenated(parts: Sequence[ImagePoints]) -> ImagePoints:
     )
 
 
-def _joined(found: Sequence[FurtherPoints]) -> FurtherPoints:
+def _joined(found: Sequence[CoveringPoints]) -> CoveringPoints:
     """Return all points, numbered one after another."""
     first = np.cumsum([0, *(len(one.points) for one in found)])
     moved = [
         replace(one.image_points, point=one.image_points.point + start)
         for one, start in zip(found, first.tolist(), strict=False)
     ]
-    return FurtherPoints(
+    return CoveringPoints(
         _concatenated(moved),
         np.concatenate([one.points for one in found]),
         np.concatenate([one.residuals for one in found]),
-        np.concatenate([one.tie_point for one in found]),
     )
 
 
-def _none() -> FurtherPoints:
+def _none() -> CoveringPoints:
     """Return no points."""
     none = np.zeros(0, dtype=np.int64)
     nothing = ImagePoints(none, none, np.zeros((0, 2)), np.zeros((0, 2, 2)))
-    return FurtherPoints(nothing, np.zeros((0, 3)), np.zeros((0, 2)), none)
+    return CoveringPoints(nothing, np.zeros((0, 3)), np.zeros((0, 2)))
