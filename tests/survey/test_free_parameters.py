@@ -6,6 +6,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+import pytest
 
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.solve import adjust
@@ -73,7 +74,9 @@ def test_a_convergent_network_frees_what_it_determines_and_demands() -> None:
     assert set(chosen(network, truth, extend=False).cameras[0].free) == USUAL
 
 
-def test_a_point_whose_ray_is_rejected_holds_no_camera() -> None:
+@pytest.mark.parametrize("given", [False, True])
+def test_a_point_whose_ray_is_rejected_holds_no_camera(given: bool) -> None:
+    """Nor does it where its coordinates are known, in a datum that does not use them."""
     network, truth = make_network(seed_of("a wrong ray"), images=12, points=50)
     seen = network.image_points
     kept = (seen.point != 7) | (np.cumsum(seen.point == 7) <= 2)
@@ -81,6 +84,8 @@ def test_a_point_whose_ray_is_rejected_holds_no_camera() -> None:
     xy = seen.xy.copy()
     xy[np.flatnonzero(seen.point == 7)[0]] += [40.0, -40.0]  # of two rays: one is left of the point
     wrong = replace(network, image_points=replace(seen, xy=xy))
+    if given:
+        wrong = replace(wrong, control=ObjectPoints(np.array([7]), truth.points[7:8], np.zeros((1, 3, 3))))
     free = chosen(wrong, truth, extend=False).cameras[0].free
     assert free == chosen(network, truth, extend=False).cameras[0].free != ()
 

@@ -24,7 +24,7 @@ from sfm.errors import BackendError, GeometryError, PhotographError, SurveyFileE
 from sfm.network import Estimate, ImagePoints, Network
 from sfm.similarity import Similarity
 from sfm.survey.refining import model_photographs
-from sfm.survey.refining.refinement import refine_model
+from sfm.survey.refining.refinement import UNSUPPORTED, refine_model
 from sfm.targets.codes.rings import ring_family
 
 pycolmap = pytest.importorskip("pycolmap")
@@ -366,6 +366,22 @@ def test_points_of_windows_that_overlap_are_intersected_and_not_adjusted(tmp_pat
     anew = np.flatnonzero(found.points_anew & ~found.points)
     near = np.linalg.norm(found.estimate.points[anew] - _scene()[1].points[anew % n], axis=1)
     assert len(anew) > 100 and np.median(near) < 1e-3
+
+
+def test_matches_of_a_point_with_too_few_of_them_contradict_nothing(tmp_path: Path) -> None:
+    _model(tmp_path)
+    network, estimate = read_model(tmp_path / "model")
+    before = dict(refine_model(network, estimate, tmp_path).reasons)
+    seen = network.image_points
+    rank = np.empty(len(seen), dtype=int)  # of each image point among those of its object point
+    order = np.argsort(seen.point, kind="stable")
+    rank[order] = np.arange(len(seen)) - np.searchsorted(seen.point[order], seen.point[order])
+    few = np.isin(seen.point, np.arange(0, len(network.points), 7))
+    xy = np.where((few & (rank == 2))[:, None], seen.xy + 60.0, seen.xy)
+    points = replace(seen, xy=xy).select(~few | (rank < 3))
+    found = dict(refine_model(replace(network, image_points=points), estimate, tmp_path).reasons)
+    assert found.get("contradict the others", 0) <= before.get("contradict the others", 0)
+    assert found[UNSUPPORTED] > 0
 
 
 def _survey(folder: Path, text: str) -> Path:

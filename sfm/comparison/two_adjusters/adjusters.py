@@ -16,23 +16,21 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Protocol
 
-import numpy as np
-
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.comparison.camera_conversion import Conversion
 from sfm.comparison.solutions import Comparison, compare
 from sfm.comparison.two_adjusters.better_fit import BetterFit, better_fit
-from sfm.comparison.two_adjusters.common_problem import GROUPS, common_problem, distortion_held
+from sfm.comparison.two_adjusters.common_problem import common_problem, distortion_held
 from sfm.comparison.two_adjusters.unshared import without_sharing
 from sfm.conventions import FloatArray
 from sfm.distortion.models import Role
 from sfm.network import Estimate, Network
 
-MAX_ITERATIONS = 200  # the weak directions of full_opencv take more steps than a survey
-# Where numerator and denominator cancel, their coefficients grow with every step; after so many, tenfold.
-FIRST_ITERATIONS, GROWN = 40, 10.0
+# The weak directions of full_opencv take more steps than a survey. That k1 to k6 have grown a thousandfold
+# does not tell whether they converge: of 32 random networks that had not after 40 steps, 25 did by 200.
+MAX_ITERATIONS = 200
 
 
 @dataclass(frozen=True)
@@ -116,9 +114,7 @@ def compare_adjusters(
     adjustment = replace(adjustment, estimate=replace(adjustment.estimate, cameras=cameras))
     network, start, conversions, freed = common_problem(adjustment, model=model)
     rational = bool(start.cameras[0].plays(Role.DENOMINATOR).any())
-    ours = _adjusted(network, start, adjustment.sigma_px, FIRST_ITERATIONS if rational else MAX_ITERATIONS)
-    if rational and not ours.converged and not (ours.undetermined or _grown(start, ours.estimate)):
-        ours = _adjusted(network, ours.estimate, adjustment.sigma_px)
+    ours = _adjusted(network, start, adjustment.sigma_px)
     held: tuple[str, ...] = ()
     if rational and (ours.undetermined or not ours.converged):
         held = ours.undetermined or (
@@ -156,23 +152,12 @@ def compare_adjusters(
     )
 
 
-def _adjusted(
-    network: Network, start: Estimate, sigma_px: float, max_iterations: int = MAX_ITERATIONS
-) -> Adjustment:
+def _adjusted(network: Network, start: Estimate, sigma_px: float) -> Adjustment:
     return adjust(
         network,
         start,
         datum=Datum("free"),
         sigma_px=sigma_px,
         reject="none",
-        max_iterations=max_iterations,
+        max_iterations=MAX_ITERATIONS,
     )
-
-
-def _grown(start: Estimate, end: Estimate) -> bool:
-    """Whether the distortion of a camera has outgrown what it started from, and what lenses have."""
-    sizes = [
-        [float(np.abs(camera.parameters[GROUPS[2]]).max()) for camera in estimate.cameras]
-        for estimate in (start, end)
-    ]
-    return any(after > GROWN * max(before, 1.0) for before, after in zip(*sizes, strict=True))

@@ -135,9 +135,12 @@ def _adjusted(part: Network, start: Estimate, datum: str) -> Adjustment | None:
 def _defect_of_points(part: Network, found: Adjustment) -> int:
     """Return what points whose rays were rejected add to the rank defect; it says nothing of the cameras."""
     rays = np.bincount(part.image_points.point[~found.rejected], minlength=len(part.points))
-    if part.control is not None:
-        rays[part.control.point] = MIN_RAYS
-    return int(3 * (rays == 0).sum() + (rays == 1).sum())
+    known = np.zeros(len(part.points), dtype=np.int64)  # coordinates, from control
+    if found.datum == "control":
+        variance = np.diagonal(part.control.covariance, axis1=1, axis2=2)
+        np.maximum.at(known, part.control.point, np.isfinite(variance).sum(axis=1))
+    left = np.where(rays == 0, 3, np.where(rays == 1, 1, 0))
+    return int(np.maximum(left - known, 0).sum())
 
 
 def _reach(adjusted: Adjustment, a: int, name: str) -> float:

@@ -31,13 +31,14 @@ from sfm.survey.refining.oriented_windows import (
     words_of_reasons,
 )
 from sfm.survey.refining.targets import ModelTargets
-from sfm.survey.refining.windows import MIN_RAYS, Limits, best_window, match_windows
+from sfm.survey.refining.windows import MIN_RAYS, Limits, Windows, best_window, match_windows
 
 # Over larger windows no surface is a plane, and memory and time grow with the square of the side.
 MAX_WINDOW_PX = 101
 # Of the robust spread of the model's residuals, beyond which a key point was another one
 MAX_SHIFT_FACTOR = 6.0
 MIN_SHIFT_PX = 2.0
+UNSUPPORTED = f"of a point that fewer than {MIN_RAYS} photographs match"
 
 
 @dataclass(frozen=True)
@@ -217,8 +218,11 @@ def refine_model(
     whole, further = whole_model(
         network, estimate, final.estimate, windows, images, points, TOLERANCE_FACTOR * oriented.spread_px
     )
-    accepted = int((~final.rejected[: len(adjusted)]).sum()) + len(further)
-    measured_anew = int(np.isfinite(windows.xy).all(axis=1).sum())
+    taken = np.zeros(len(seen), dtype=bool)
+    taken[adjusted], taken[further] = ~final.rejected[: len(adjusted)], True
+    rejected = ~taken & (_off_px(network, whole, windows) > TOLERANCE_FACTOR * oriented.spread_px)
+    rejected[adjusted] = final.rejected[: len(adjusted)]
+    left = int((np.isfinite(windows.xy).all(axis=1) & ~taken & ~rejected).sum())
     return Refinement(
         network,
         estimate,
@@ -233,10 +237,19 @@ def refine_model(
         images,
         points,
         np.asarray(residuals),
-        by_count([*oriented.lost, ("contradict the others", measured_anew - accepted)]),
+        by_count([*oriented.lost, ("contradict the others", int(rejected.sum())), (UNSUPPORTED, left)]),
         targets,
         remarks if targets is None else (*targets.warnings, *remarks),
     )
+
+
+def _off_px(network: Network, whole: Estimate, windows: Windows) -> FloatArray:
+    """Return the larger residual of each image point measured anew, px; NaN where its point has few, (k,)."""
+    seen = network.image_points
+    measured = np.isfinite(windows.xy).all(axis=1)
+    rays = np.bincount(seen.point[measured], minlength=len(network.points))
+    v = pictures_of(whole, network.camera, seen.image, whole.points[seen.point]) - windows.xy
+    return np.where(rays[seen.point] >= MIN_RAYS, np.abs(v).max(axis=1), np.nan)
 
 
 def refinement_text(result: Refinement) -> str:

@@ -3,7 +3,7 @@
 The reduced normal matrix has a block wherever two photographs share a point. In a block of photographs every
 one shares points with its neighbours only, and nested dissection eliminates them with little fill: fronts. A
 full matrix is summed as a product of full rows where most photographs see most points, else pair by pair of
-rays. Which is the least work is told by counting operations.
+rays. Which is the least work is told by counting operations, among those that fit in memory.
 
 Source: George and Liu (1981), Computer Solution of Large Sparse Positive Definite Systems, ch. 8;
 operations: Golub and Van Loan (2013), sec. 4.2.
@@ -17,6 +17,7 @@ from scipy.sparse import csr_matrix
 from sfm.adjustment.engine.collinearity import Observations
 from sfm.adjustment.engine.solvers.dense import DenseSolver
 from sfm.adjustment.engine.solvers.fronts import fronts_of
+from sfm.adjustment.engine.solvers.memory import available_bytes
 from sfm.adjustment.engine.solvers.multifrontal import MultifrontalSolver
 from sfm.adjustment.engine.solvers.pairs import pairs_of
 from sfm.adjustment.engine.solvers.protocol import Solver
@@ -53,10 +54,12 @@ def choose_solver(layout: Unknowns) -> Solver:
     product = 3.0 * len(rays) * layout.reduced**2 / PRODUCT_RATE
     full = min(summed, product) + layout.reduced**3 / 3.0 / FACTOR_RATE
 
+    fits = DenseSolver(layout).bytes <= available_bytes()
+
     def dense() -> DenseSolver:
         return DenseSolver(layout, pairs_of(observations) if summed < product else None)
 
-    if summed > full:
+    if summed > full and fits:
         return dense()
     joined = np.zeros((m, m), dtype=np.uint8)
     step = max(1, int(2 * pairs / (SAMPLED * m**2)))
@@ -66,7 +69,7 @@ def choose_solver(layout: Unknowns) -> Solver:
     if step > 1:
         _join(observations, np.arange(len(rays)), joined)
     fronts = fronts_of(observations, csr_matrix(joined))
-    if summed + fronts.operations / FRONT_RATE > full:
+    if summed + fronts.operations / FRONT_RATE > full and fits:
         return dense()
     return MultifrontalSolver(layout, fronts)
 

@@ -29,22 +29,23 @@ from sfm.adjustment.engine.solvers.full_rows import (
     HALVED,
     multiply_rows,
     pick_columns,
+    rows_at_a_time,
     rows_of,
     subtract_square,
     times_triangle,
 )
+from sfm.adjustment.engine.solvers.memory import refuse_what_does_not_fit
 from sfm.adjustment.engine.solvers.pairs import Pairs, subtract_squares, times_inverse
 from sfm.adjustment.engine.solvers.protocol import Inverse
 from sfm.adjustment.engine.unknowns import Unknowns
 from sfm.conventions import FloatArray
-from sfm.errors import GeometryError
 from sfm.kernels.options import compiled, kernel
 from sfm.kernels.threads import at_once
 
 NULL = 1e-12  # eigenvalue of the scaled matrix (diagonal at most 1) taken as 0; rounding leaves 1e-15
 WEAK_PIVOT = 1e-11  # squared pivot below which the eigenvalues are looked at
 WEAK_SINGLE = 1e-5  # the same in single precision, whose rounding leaves 1e-6
-MAX_BYTES = 6e9  # of the full matrix; larger ones would swap
+BYTES = 8.0  # of a number in double precision
 SINGLE_FROM = 200  # reduced unknowns from which the product in single precision saves time
 
 
@@ -60,6 +61,18 @@ class DenseSolver:
         """Whether a step on the way takes less time in single precision."""
         return self.pairs is None and self.layout.reduced >= SINGLE_FROM
 
+    @property
+    def bytes(self) -> float:
+        """Memory of the factor and its inverse at the peak."""
+        width = self.layout.reduced
+        matrix, points = width**2, len(self.layout.point_free)
+        if self.pairs is not None:  # factor, its inverse, their product, and rows Y'Q
+            return BYTES * (3 * matrix + 18 * len(self.layout.order))
+        rows = rows_at_a_time(points, width, summed=True) * width
+        half = rows_at_a_time(points // 2, width) * width
+        # S, a product and rows; or factor, its inverse, their product, and of either half rows and products
+        return BYTES * max(2 * matrix + rows, 3 * matrix + 4 * half)
+
     def factor(
         self, equations: Equations, motions: Motions, *, damped: bool = False, coarse: bool = False
     ) -> DenseFactor | None:
@@ -68,6 +81,7 @@ class DenseSolver:
         Raises:
             GeometryError: the matrix would not fit in memory.
         """
+        refuse_what_does_not_fit(self.bytes, f"{self.layout.reduced} unknowns that are all connected")
         scale = equations.parts.scale
         S = schur_complement(equations, self.layout, self.pairs, single=coarse)
         Q = np.linalg.qr(motions.reduced / scale[:, None])[0] if motions.defect else motions.reduced
@@ -81,11 +95,11 @@ class DenseSolver:
         cholesky, info = dpotrf(S)
         weak = info != 0 or float(np.diagonal(cholesky).min()) ** 2 < WEAK_PIVOT
         if weak and not damped:
-            values, vectors = eigh(S, lower=False)
-            further = np.asfortranarray(vectors[:, values < NULL])
+            del cholesky  # its memory is needed
+            further = _null_vectors(S)
             if further.shape[1]:
-                filled = dsyrk(1.0, further, beta=1.0, c=S)
-                cholesky, info = dpotrf(filled)
+                S = dsyrk(1.0, further, beta=1.0, c=S, overwrite_c=1)
+            cholesky, info = dpotrf(S, overwrite_a=1)
         return None if info != 0 else DenseFactor(self.layout, self.pairs, scale, cholesky, further)
 
 
@@ -164,22 +178,13 @@ def schur_complement(
         layout: order of the unknowns.
         pairs: places of the rays where it is summed pair by pair, None: as a product of full rows.
         single: whether it is wanted in single precision.
-
-    Raises:
-        GeometryError: the matrix would not fit in memory.
     """
-    size = 8.0 * layout.reduced**2
-    if size > MAX_BYTES:
-        raise GeometryError(
-            f"adjustment: {layout.reduced} unknowns that are all connected need {size / 1e9:.0f} GB in one "
-            f"dense system, at most {MAX_BYTES / 1e9:.0f} GB are taken"
-        )
     b, parts = equations.blocks, equations.parts
     dtype = np.float32 if single else np.float64
     S = np.zeros((layout.reduced, layout.reduced), dtype=dtype)  # lower triangle, row-major, until the end
     if pairs is None:
         product = np.empty_like(S)
-        for _, rows in rows_of(b, layout, parts.scale, dtype):
+        for _, rows in rows_of(b, layout, parts.scale, dtype, summed=True):
             subtract_square(rows, product, S)
     else:
         subtract_squares(pairs, layout.observations, b.Y, b.Y_interior, S)
@@ -187,6 +192,12 @@ def schur_complement(
         S *= parts.scale[:, None]
     _add_blocks(b.U, parts.border, parts.corner, parts.scale, 1 + equations.damping, S.T)
     return S.T
+
+
+def _null_vectors(S: FloatArray) -> FloatArray:
+    """Return the eigenvectors of eigenvalue 0, (reduced, e); S is its upper triangle."""
+    values, vectors = eigh(S, lower=False)
+    return np.asfortranarray(vectors[:, values < NULL])
 
 
 @compiled

@@ -11,6 +11,7 @@ Source: Duff and Reid (1983), ACM Trans. Math. Softw. 9(3); Liu (1992), SIAM Rev
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy.sparse import csr_matrix
@@ -19,6 +20,8 @@ from sfm.adjustment.engine.collinearity import Observations
 from sfm.adjustment.engine.solvers.dissection import dissect
 from sfm.conventions import AnyArray, IntArray
 from sfm.kernels.options import kernel
+
+BYTES = 8.0  # of a number in double precision
 
 
 @dataclass(frozen=True)
@@ -47,10 +50,68 @@ class Fronts:
         """Operations of the factorisation, products and sums counted each."""
         return float(sum(_operations(6.0 * f.own, 6.0 * len(f.photographs)) for f in self.fronts))
 
-    @property
-    def bytes(self) -> float:
-        """Memory that the factor takes."""
-        return float(sum(8.0 * 36 * f.own * len(f.photographs) for f in self.fronts))
+    def bytes(self, border: int, vectors: float) -> float:
+        """Memory of factor and inverse at the peak: what is kept, what waits for a parent, the front at work.
+
+        Args:
+            border: unknowns beside the exterior orientation.
+            vectors: bytes of the vectors with which null vectors are sought.
+        """
+        half, end = self.halves
+        first, second = self._eliminating(range(half), {}), self._eliminating(range(half, end), {})
+        last = self._eliminating(range(end, len(self.fronts)), first.waiting | second.waiting)
+        factor = first.kept + second.kept + last.kept
+        factoring = max(first.peak + second.peak, first.kept + second.kept + last.peak)  # both halves at once
+        columns = BYTES * 6 * sum(front.own for front in self.fronts) * border
+        return max(factoring, factor + vectors, factor + self._inverting() + 2 * columns) + 2 * columns
+
+    def _eliminating(self, some: range, waiting: dict[int, float]) -> _Memory:
+        """Return the memory that takes the elimination of some fronts; waiting is what others have left."""
+        waiting = dict(waiting)
+        kept = peak = 0.0
+        space = max((_bytes(self.fronts[g])[0] for g in some), default=0.0)
+        for g in some:
+            front = self.fronts[g]
+            _, own, rest = _bytes(front)
+            for child in front.children:
+                del waiting[child]
+            peak = max(peak, space + kept + sum(waiting.values()) + own + rest)
+            waiting[g] = rest
+            kept += own
+        return _Memory(kept, peak, waiting)
+
+    def _inverting(self) -> float:
+        """Return the memory of the inverse of all fronts, from the last on, at its peak."""
+        kept: dict[int, float] = {}
+        needed = [len(front.children) for front in self.fronts]
+        peak = before = 0.0
+        for g in range(len(self.fronts) - 1, -1, -1):
+            matrix, own, _ = _bytes(self.fronts[g])
+            # the front, as it is and scaled, and what is left of the one before
+            peak = max(peak, sum(kept.values()) + 2 * matrix + own + before)
+            before = matrix
+            parent = self.fronts[g].parent
+            if parent >= 0:
+                needed[parent] -= 1
+                if needed[parent] == 0:
+                    del kept[parent]
+            if needed[g]:
+                kept[g] = matrix
+        return peak
+
+
+class _Memory(NamedTuple):
+    """Memory, bytes, that the elimination of some fronts takes."""
+
+    kept: float  # by the factor
+    peak: float
+    waiting: dict[int, float]  # what fronts leave to parents that are not among them
+
+
+def _bytes(front: Front) -> tuple[float, float, float]:
+    """Return the memory of the matrix of a front, of its part of the factor and of what it leaves."""
+    own, size = 6 * front.own, 6 * len(front.photographs)
+    return BYTES * size**2, BYTES * own * size, BYTES * (size - own) ** 2
 
 
 def fronts_of(observations: Observations, graph: csr_matrix) -> Fronts:

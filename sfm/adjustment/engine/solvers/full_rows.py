@@ -17,7 +17,8 @@ from sfm.kernels.options import compiled
 from sfm.kernels.threads import at_once
 
 CHUNK = 1_000_000  # numbers of rows Y' that are multiplied at a time, at least
-ROWS = 2  # and rows for each unknown: adding up the products would take longer than forming them otherwise
+LEAST = 500  # and rows; fewer would slow down a product
+ROWS = 2  # rows for each unknown, if they are summed: that would take longer than forming products otherwise
 HALVED = 200**2  # elements of the matrix from which its halves are formed by themselves
 TRIANGLE_PARTS = 4  # stretches of columns of a triangular matrix; 5/8 of the work of a full one
 
@@ -29,18 +30,27 @@ def rows_of(
     dtype: type,
     begin: int = 0,
     end: int | None = None,
+    *,
+    summed: bool = False,
 ) -> Iterator[tuple[int, FloatArray]]:
     """Yield rows Y' times scale, some object points at a time: the first point, and (3 points, reduced).
 
     The next rows take the place of the last ones. Begins and ends with object points begin and end, if given.
+    Of those whose products are summed there are more at a time.
     """
     end, width = len(blocks.y) if end is None else end, layout.reduced
-    points = max(min(end - begin, max(ROWS * width, CHUNK // width) // 3 + 1), 1)
-    space: FloatArray = np.empty((3 * points, width), dtype=dtype)
+    space: FloatArray = np.empty((rows_at_a_time(end - begin, width, summed=summed), width), dtype=dtype)
+    points = len(space) // 3
     for first in range(begin, end, points):
         rows = space[: 3 * min(points, end - first)]
         _fill(layout.observations, blocks.Y, blocks.Y_interior, scale, first, rows)
         yield first, rows
+
+
+def rows_at_a_time(points: int, width: int, *, summed: bool = False) -> int:
+    """Return how many of the rows Y' of some object points are formed at a time; width is their length."""
+    least = ROWS * width if summed else LEAST
+    return 3 * max(min(points, max(least, CHUNK // width) // 3 + 1), 1)
 
 
 def subtract_square(rows: FloatArray, product: FloatArray, S: FloatArray) -> None:

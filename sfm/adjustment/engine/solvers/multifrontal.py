@@ -25,14 +25,14 @@ from scipy.linalg.lapack import dpotrf
 from sfm.adjustment.engine.collinearity import Observations
 from sfm.adjustment.engine.motions import Motions
 from sfm.adjustment.engine.normals import Equations
-from sfm.adjustment.engine.solvers.dense import MAX_BYTES, WEAK_PIVOT
+from sfm.adjustment.engine.solvers.dense import WEAK_PIVOT
 from sfm.adjustment.engine.solvers.fronts import Front, Fronts
+from sfm.adjustment.engine.solvers.memory import refuse_what_does_not_fit
 from sfm.adjustment.engine.solvers.multifrontal_factor import Eliminated, MultifrontalFactor
-from sfm.adjustment.engine.solvers.null_search import SHIFT, null_vectors, refined
+from sfm.adjustment.engine.solvers.null_search import SHIFT, null_vectors, refined, search_bytes
 from sfm.adjustment.engine.solvers.pairs import subtract_border
 from sfm.adjustment.engine.unknowns import Unknowns
 from sfm.conventions import AnyArray, FloatArray, IntArray
-from sfm.errors import GeometryError
 from sfm.kernels.blocks import subtract_pair
 from sfm.kernels.options import kernel
 from sfm.kernels.threads import at_once
@@ -57,6 +57,12 @@ class MultifrontalSolver:
         """Whether a step on the way takes less time in single precision: never."""
         return False
 
+    @property
+    def bytes(self) -> float:
+        """Memory of the factor and its inverse at the peak."""
+        layout = self.layout
+        return self.fronts.bytes(layout.reduced - layout.exterior_free.size, search_bytes(layout))
+
     def factor(
         self, equations: Equations, motions: Motions, *, damped: bool = False, coarse: bool = False
     ) -> MultifrontalFactor | None:
@@ -65,12 +71,7 @@ class MultifrontalSolver:
         Raises:
             GeometryError: the factor would not fit in memory.
         """
-        size = self.fronts.bytes
-        if size > MAX_BYTES:
-            raise GeometryError(
-                f"adjustment: the normal equations of {len(self.layout.exterior_free)} photographs need "
-                f"{size / 1e9:.0f} GB when they are factored, at most {MAX_BYTES / 1e9:.0f} GB are taken"
-            )
+        refuse_what_does_not_fit(self.bytes, f"the unknowns of {len(self.layout.exterior_free)} photographs")
         scale = equations.parts.scale
         Q = np.linalg.qr(motions.reduced / scale[:, None])[0] if motions.defect else motions.reduced
         holds = _largest(Q)
@@ -78,12 +79,14 @@ class MultifrontalSolver:
         factor = self._factored(equations, border, holds)
         if damped or not (factor is None or factor.weak):
             return factor
+        del factor  # one at a time in memory
         shifted = self._factored(equations, border, holds, shift=SHIFT)
         if shifted is None:
-            return factor
+            return self._factored(equations, border, holds)
         further = null_vectors(shifted, equations, self.layout, Q)
+        del shifted
         if further.shape[1] == 0:
-            return factor
+            return self._factored(equations, border, holds)
         # held together with the motions, so that no unknown is chosen for two null vectors
         factor = self._factored(equations, border, _largest(np.hstack([Q, further])))
         if factor is None:
@@ -140,9 +143,12 @@ class MultifrontalSolver:
         left: dict[int, FloatArray] = {}  # what fronts leave to their parents
 
         def eliminate(begin: int, end: int) -> bool:
+            space = np.empty(
+                max((36 * len(front.photographs) ** 2 for front in fronts[begin:end]), default=0)
+            )
             for g in range(begin, end):
                 front = fronts[g]
-                F = self._front(equations, front, added)
+                F = self._front(equations, front, added, space)
                 for child in front.children:  # in this order however many threads there are
                     _extend(left.pop(child), fronts[child].into, F)
                 done = _eliminated(F, 6 * front.own)
@@ -157,10 +163,11 @@ class MultifrontalSolver:
             return None
         return [front for front in found if front is not None]
 
-    def _front(self, equations: Equations, front: Front, added: FloatArray) -> FloatArray:
-        """Return the scaled matrix of a front without what others leave to it, lower triangle."""
+    def _front(self, equations: Equations, front: Front, added: FloatArray, space: FloatArray) -> FloatArray:
+        """Return the scaled matrix of a front without what others leave to it, lower triangle, in a space."""
         b, size = equations.blocks, 6 * len(front.photographs)
-        F = np.zeros((size, size))
+        F = space[: size**2].reshape(size, size)
+        F.fill(0.0)
         scale = equations.parts.scale[front.rows]
         _sum_front(
             self.layout.observations, b.U, b.Y, front.photographs[: front.own], front.points,

@@ -97,7 +97,7 @@ class MultifrontalFactor:
         s, sb = own[:first], own[first:]
         X = self.X * s[:, None] / self.scale[first:]
         Q = cho_solve((self.corner, False), np.eye(border)) if border else np.zeros((0, 0))
-        Q = Q * sb[:, None] * sb
+        Q = np.ascontiguousarray(Q * sb[:, None] * sb)  # as a matrix without elements is, for the kernel
         XQ = X @ Q
         n, most = len(b.y), int(np.diff(observations.start).max())
         core, exterior = np.zeros((n, 3, 3)), np.empty((len(b.U), 6, 6))
@@ -106,7 +106,8 @@ class MultifrontalFactor:
         u, uQ = np.empty((3, border)), np.empty((3, border))
         for front, Z in self._inverse_fronts():
             scale = s[front.rows]
-            Z_own = Z * scale[:, None] * scale
+            Z_own = Z * scale
+            Z_own *= scale[:, None]
             for i, photograph in enumerate(front.photographs[: front.own]):
                 at = slice(6 * i, 6 * i + 6)
                 rows = slice(6 * photograph, 6 * photograph + 6)

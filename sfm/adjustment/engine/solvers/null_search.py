@@ -23,6 +23,7 @@ from sfm.conventions import FloatArray
 SHIFT = 1e-10  # share of the diagonal added to look for null vectors; far above rounding, far below weak ones
 STEPS = 12  # of the iteration; each brings null vectors forward by eigenvalue / SHIFT
 FIRST_SOUGHT = 8  # null vectors looked for at first; as often twice as many as all of them are null
+COPIES = 6  # of them at a time: before and after a product or a solution, scaled, orthonormal
 
 
 def null_vectors(shifted: Factor, equations: Equations, layout: Unknowns, Q: FloatArray) -> FloatArray:
@@ -46,6 +47,11 @@ def null_vectors(shifted: Factor, equations: Equations, layout: Unknowns, Q: Flo
         if not null.all() or sought == len(Q):
             return np.asarray(V @ vectors[:, null])
         sought = min(2 * sought, len(Q))
+
+
+def search_bytes(layout: Unknowns) -> float:
+    """Return the memory of the null vectors looked for at first, and of the points that they move."""
+    return 8.0 * FIRST_SOUGHT * (3 * len(layout.point_free) + COPIES * layout.reduced)
 
 
 def refined(

@@ -53,6 +53,10 @@ class Solver(Protocol):
     def has_coarse(self) -> bool:
         """Whether a step on the way takes less time in single precision."""
 
+    @property
+    def bytes(self) -> float:
+        """Memory of the factor and its inverse at the peak, results apart; a second thread takes 0.05 GB."""
+
     def factor(
         self, equations: Equations, motions: Motions, *, damped: bool = False, coarse: bool = False
     ) -> Factor | None:

@@ -1,0 +1,87 @@
+"""The memory that a solver says it needs is what it takes, and what does not fit is refused."""
+
+from __future__ import annotations
+
+import tracemalloc
+
+import pytest
+
+from sfm.adjustment.datum import Datum
+from sfm.adjustment.engine.motions import motions_of
+from sfm.adjustment.engine.normals import new_space, normal_equations
+from sfm.adjustment.engine.observed_unknowns import weighted_of
+from sfm.adjustment.engine.solvers import choice, memory
+from sfm.adjustment.engine.solvers.choice import choose_solver
+from sfm.adjustment.engine.solvers.dense import DenseSolver
+from sfm.adjustment.engine.solvers.multifrontal import MultifrontalSolver
+from sfm.adjustment.engine.solvers.pairs import pairs_of
+from sfm.adjustment.engine.unknowns import Unknowns, unknowns_of
+from sfm.errors import GeometryError
+from sfm.kernels.threads import own_threads
+from sfm.network import Estimate, Network
+from tests.adjustment.test_null_space import halves, in_fronts, together
+from tests.synthetic_blocks import FREE, aerial, run
+
+NEAR = 0.2  # of what is measured; one thread has rows of half of the points at a time, two have all
+
+
+def pair_by_pair(layout: Unknowns) -> DenseSolver:
+    return DenseSolver(layout, pairs_of(layout.observations))
+
+
+def measured(network: Network, estimate: Estimate, way: object) -> tuple[float, float]:
+    """Return the memory at the peak of factor and inverse, results apart, bytes, and what the solver says."""
+    layout, state = unknowns_of(network, estimate, use_control=False)
+    weighted = weighted_of(network, layout, use_control=False)
+    solver = way(layout)  # type: ignore[operator]
+    equations = normal_equations(
+        layout, weighted, state, layout.active.astype(float), space=new_space(layout)
+    )
+    motions = motions_of(layout, weighted, state, Datum("free").resolve(network))
+    with own_threads():
+        for counted in (False, True):  # compiled at first
+            if counted:
+                tracemalloc.start()
+            inverse = solver.factor(equations, motions).inverse(equations.blocks, cross=False)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    results = (inverse.exterior, inverse.core, inverse.YQ_border)
+    return peak - sum(part.nbytes for part in results), solver.bytes
+
+
+@pytest.mark.parametrize("way", [choose_solver, DenseSolver, pair_by_pair])
+@pytest.mark.parametrize(
+    ("strips", "per_strip", "points"),
+    [(10, 16, 3000), pytest.param(20, 20, 20000, marks=pytest.mark.slow)],
+)
+def test_a_solver_takes_the_memory_that_it_says(
+    way: object, strips: int, per_strip: int, points: int
+) -> None:
+    network, truth = aerial(f"memory {strips}", strips, per_strip, points)
+    peak, said = measured(network, truth, way)
+    assert said == pytest.approx(peak, rel=NEAR)
+
+
+@pytest.mark.parametrize("way", [in_fronts, DenseSolver, pair_by_pair])
+def test_null_vectors_are_sought_within_that_memory(way: object) -> None:
+    network, truth = together(halves("memory", FREE))
+    peak, said = measured(network, truth, way)
+    assert peak < said * (1 + NEAR)
+
+
+def test_a_full_matrix_that_does_not_fit_gives_way_to_fronts(monkeypatch: pytest.MonkeyPatch) -> None:
+    network, truth = aerial("gives way", 6, 14, 1700)
+    layout, _ = unknowns_of(network, truth, use_control=False)
+    monkeypatch.setattr(choice, "FACTOR_RATE", 1e30)
+    full = choose_solver(layout)
+    assert isinstance(full, DenseSolver)
+    monkeypatch.setattr(choice, "available_bytes", lambda: full.bytes / 2)
+    assert isinstance(choose_solver(layout), MultifrontalSolver)
+
+
+@pytest.mark.parametrize(("strips", "unknowns"), [(3, "all connected"), (6, "of 84 photographs")])
+def test_what_does_not_fit_is_refused(strips: int, unknowns: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    network, truth = aerial("refused for memory", strips, 14, 280 * strips)
+    monkeypatch.setattr(memory, "available_bytes", lambda: 1e4)
+    with pytest.raises(GeometryError, match=f"{unknowns} need .* GB"):
+        run(network, truth)
