@@ -4,10 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.optimize import brentq
 
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.quality.gross_errors import rejection
 from sfm.adjustment.quality.gross_errors.robust import snoop as many_at_once
+from sfm.adjustment.quality.gross_errors.robust import would_pass
 from sfm.adjustment.quality.reliability import standardised_residuals, tau_critical
 from sfm.adjustment.solve import adjust
 from sfm.errors import GeometryError
@@ -44,7 +46,8 @@ def one_by_one(observations, state, v, complement, limiting, used, *, vPv, redun
     tau = np.where(np.isfinite(w), w, np.inf) / np.sqrt(vPv / redundancy)
     critical = tau_critical(alpha, redundancy)
     largest = tau[used].max()
-    return used & (tau > critical) & (tau == largest), ~used & (tau <= critical)
+    back = would_pass(observations, v, complement, used, vPv=vPv, redundancy=redundancy, alpha=alpha)
+    return used & (tau > critical) & (tau == largest), back
 
 
 def rejected(network, truth, snoop=None):
@@ -86,6 +89,31 @@ def test_image_points_rejected_before_may_be_left_out_from_the_start():
     assert again.iterations < first.iterations
     with pytest.raises(GeometryError, match=r"rejected of shape \(3,\)"):
         adjust(network, truth, rejected=np.zeros(3, dtype=bool))
+
+
+@pytest.mark.parametrize("ray", [5, 77, 130])
+def test_a_rejected_image_point_comes_back_where_it_would_pass_in_the_adjustment(ray):
+    """Not where its predicted residual passes, which tests both coordinates at once."""
+    network, truth = make_network(seed_of("comes back"), images=6, points=40, visibility=0.8)
+    seen, alpha = network.image_points, 0.001
+    direction = np.array([0.6, 0.8])
+
+    def moved(px):
+        xy = seen.xy.copy()
+        xy[ray] += px * direction
+        return replace(network, image_points=replace(seen, xy=xy))
+
+    def excess(px):
+        one = adjust(moved(px), truth, reject="none")
+        tau = np.abs(one.standardised[ray]).max() / one.sigma0
+        return tau - tau_critical(alpha, one.redundancy)
+
+    limit = brentq(excess, 0.0, 3.0, xtol=1e-6)
+    alone = np.zeros(len(seen), dtype=bool)
+    alone[ray] = True
+    for share in (0.99, 1.01):
+        found = adjust(moved(share * limit), truth, rejected=alone, alpha=alpha, covariance=False)
+        assert found.rejected[ray] == (share > 1)
 
 
 def test_many_at_once_are_the_same_as_one_by_one():

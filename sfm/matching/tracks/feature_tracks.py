@@ -9,13 +9,13 @@ least squares matching, which starts from the features' scales and directions.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
 
 from sfm.conventions import AnyArray, FloatArray, IntArray
 from sfm.kernels.options import compiled
+from sfm.kernels.threads import in_threads
 from sfm.matching.lsm.two_photo import match_lsm
 from sfm.matching.radiometry import grey_of
 from sfm.matching.tracks.features import Features, matched_features
@@ -106,19 +106,22 @@ def link_features(
     """
     first = np.concatenate([[0], np.cumsum([len(one) for one in features])]).astype(np.int64)
     pairs = overlapping_pairs([one.descriptor for one in features], [one.scale for one in features])
-    with ThreadPoolExecutor(max(1, threads)) as pool:
 
-        def matched_pairs(of: IntArray) -> list[tuple[IntArray, FloatArray]]:
-            return list(pool.map(lambda p: matched_features(features[p[0]], features[p[1]], seed=seed), of))
+    def matched_pairs(of: IntArray) -> list[tuple[IntArray, FloatArray]]:
+        return list(
+            in_threads(
+                lambda p: matched_features(features[p[0]], features[p[1]], seed=seed), of.tolist(), threads
+            )
+        )
 
-        matched = matched_pairs(pairs)
-        linked = pairs[np.array([len(rows) > 0 for rows, _ in matched], dtype=bool)]
-        part = connected_parts(linked, len(features))
-        if part.max(initial=0):
-            rest = np.column_stack(np.triu_indices(len(features), 1))
-            tried = np.isin(rest @ [len(features), 1], pairs @ [len(features), 1])
-            rest = rest[~tried & (part[rest[:, 0]] != part[rest[:, 1]])]
-            pairs, matched = np.concatenate([pairs, rest]), matched + matched_pairs(rest)
+    matched = matched_pairs(pairs)
+    linked = pairs[np.array([len(rows) > 0 for rows, _ in matched], dtype=bool)]
+    part = connected_parts(linked, len(features))
+    if part.max(initial=0):
+        rest = np.column_stack(np.triu_indices(len(features), 1))
+        tried = np.isin(rest @ [len(features), 1], pairs @ [len(features), 1])
+        rest = rest[~tried & (part[rest[:, 0]] != part[rest[:, 1]])]
+        pairs, matched = np.concatenate([pairs, rest]), matched + matched_pairs(rest)
     edges = [np.zeros((0, 2), dtype=np.int64)]
     edges += [
         rows + np.array([first[i], first[j]])
@@ -194,7 +197,7 @@ def measure_tracks(
         window_px: odd side of the window of least squares matching.
         min_rays: fewest photographs of a point.
         min_correlation: smallest coefficient r of a match.
-        threads: patches worked on at a time.
+        threads: pairs of photographs worked on at a time.
     """
     xy = np.array([natural[i].xy[f] for i, f in zip(tracks.image, tracks.feature, strict=True)])
     scale = np.array([natural[i].scale[f] for i, f in zip(tracks.image, tracks.feature, strict=True)])
@@ -219,24 +222,26 @@ def measure_tracks(
     pairs, pair = np.unique(
         np.column_stack([tracks.image[ref], tracks.image])[others], axis=0, return_inverse=True
     )
-    template = -1
-    for (i, j), own in zip(pairs.tolist(), rows_of(pair.ravel(), len(pairs)), strict=False):
-        rows = others[own]
-        if i != template:  # pairs come reference by reference: two photographs at a time are enough
-            template, left = i, grey_of(photographs[i])
+
+    def match(one: int) -> None:
+        i, j = pairs[one].tolist()
+        rows = others[of_pair[one]]
         found = match_lsm(
-            left,
+            grey_of(photographs[i]),
             grey_of(photographs[j]),
             place[tracks.point[rows]],
             start[rows],
             window_px=window_px,
             start=A[rows],
             min_correlation=min_correlation,
-            threads=threads,
         )
         measured[rows], covariance[rows] = found.xy, found.covariance / 2
         back = np.linalg.inv(found.warp[:, :2, :2])
         at_reference[rows] = back @ (found.covariance / 2) @ back.transpose(0, 2, 1)
+
+    of_pair = rows_of(pair.ravel(), len(pairs))
+    for _ in in_threads(match, range(len(pairs)), threads):
+        pass
     good = np.isfinite(measured).all(axis=1)
     matched = np.bincount(tracks.point[good], minlength=n)
     for a in range(2):

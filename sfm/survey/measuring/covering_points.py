@@ -17,6 +17,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
+from sfm.kernels.threads import in_threads
 from sfm.matching.lsm.coverage import Covered
 from sfm.matching.lsm.projected_points import pictures_of, plane_warps
 from sfm.matching.lsm.surface_planes import NEIGHBOURS, planes_at
@@ -69,6 +70,15 @@ class _Rays:
     scale: FloatArray  # of the windows relative to the reference, (k,)
 
 
+@dataclass(frozen=True)
+class _Matched:
+    """Rays of one photograph."""
+
+    seen: ImagePoints
+    scale: FloatArray  # of the windows relative to the reference, (k,)
+    in_reference: FloatArray  # half of the noise, which goes to the reference, px^2, (k, 2, 2)
+
+
 def find_covering_points(
     photographs: Sequence[AnyArray],
     estimate: Estimate,
@@ -95,7 +105,7 @@ def find_covering_points(
             given.
         min_rays: fewest photographs of a point.
         min_correlation: smallest coefficient r of a match.
-        threads: patches worked on at a time.
+        threads: photographs worked on at a time.
 
     Source: Gruen (1985), S. Afr. J. Photogrammetry 14(3).
     """
@@ -187,49 +197,53 @@ def _followed(
     scales = [np.ones(k)]
     in_reference, number = np.zeros((k, 2, 2)), np.zeros(k, dtype=np.int64)
 
+    def matched(j: int, rows: IntArray, points: FloatArray, max_shift_px: float) -> _Matched | None:
+        at = pictures_of(estimate, camera, np.full(len(rows), j), points[rows])
+        warp = plane_warps(
+            estimate, camera, i, j, places.xy[rows], points[rows], places.normal[rows], window_px / 2
+        )
+        scale = np.sqrt(np.abs(np.linalg.det(warp[:, :2, :2])))
+        fits = np.isfinite(at).all(axis=1) & (scale > SCALES[0]) & (scale < SCALES[1])
+        if not fits.any():
+            return None
+        match = match_lsm(
+            template,
+            grey_of(photographs[j]),
+            places.xy[rows[fits]],
+            at[fits],
+            window_px=window_px,
+            start=warp[fits],
+            max_shift_px=max_shift_px,
+            min_correlation=min_correlation,
+            blur=True,
+        )
+        good = match.good
+        half = match.covariance[good] / 2
+        back = np.linalg.inv(linear_part(match.warp[good]))
+        seen = ImagePoints(np.full(int(good.sum()), j), rows[fits][good], match.xy[good], half)
+        return _Matched(seen, scale[fits][good], back @ half @ back.transpose(0, 2, 1))
+
     def measure(which: BoolArray, points: FloatArray, max_shift_px: float) -> None:
-        for j in np.flatnonzero(which.any(axis=1)).tolist():
-            rows = np.flatnonzero(which[j])
-            if j == i:
-                continue
-            at = pictures_of(estimate, camera, np.full(len(rows), j), points[rows])
-            warp = plane_warps(
-                estimate, camera, i, j, places.xy[rows], points[rows], places.normal[rows], window_px / 2
-            )
-            scale = np.sqrt(np.abs(np.linalg.det(warp[:, :2, :2])))
-            fits = np.isfinite(at).all(axis=1) & (scale > SCALES[0]) & (scale < SCALES[1])
-            rows = rows[fits]
-            if not len(rows):
-                continue
-            match = match_lsm(
-                template,
-                grey_of(photographs[j]),
-                places.xy[rows],
-                at[fits],
-                window_px=window_px,
-                start=warp[fits],
-                max_shift_px=max_shift_px,
-                min_correlation=min_correlation,
-                blur=True,
-                threads=threads,
-            )
-            good = match.good
-            half, H = match.covariance[good] / 2, match.warp[good]
-            back = np.linalg.inv(linear_part(H))
-            in_reference[rows[good]] += back @ half @ back.transpose(0, 2, 1)
-            number[rows[good]] += 1
-            parts.append(ImagePoints(np.full(int(good.sum()), j), rows[good], match.xy[good], half))
-            scales.append(scale[fits][good])
+        others = np.flatnonzero(which.any(axis=1))
+        others = others[others != i].tolist()
+        for one in in_threads(
+            lambda j: matched(j, np.flatnonzero(which[j]), points, max_shift_px), others, threads
+        ):
+            if one is not None:
+                in_reference[one.seen.point] += one.in_reference
+                number[one.seen.point] += 1
+                parts.append(one.seen)
+                scales.append(one.scale)
 
     measure(first, places.points, FIRST_SHIFT_PX)
     points = intersect_image_points(
         _concatenated(parts), camera, estimate, n_points=k, tolerance_px=TOLERANCE_PX
     ).points
     measure(visible & ~first & np.isfinite(points).all(axis=1), points, LATER_SHIFT_PX)
-    matched = number > 0
-    parts[0].covariance[matched] = in_reference[matched] / number[matched, None, None]
+    some = number > 0
+    parts[0].covariance[some] = in_reference[some] / number[some, None, None]
     seen = _concatenated(parts)
-    some = matched[seen.point]
+    some = some[seen.point]
     return _Rays(seen.select(some), np.concatenate(scales)[some])
 
 

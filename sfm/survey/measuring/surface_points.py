@@ -27,6 +27,7 @@ from sfm.survey.measuring.tie_points import MIN_RAYS, drawn_windows
 
 TRIAL_PHOTOGRAPHS = 2  # of which points are taken to choose the window
 TRIAL_RAYS = 100  # with fewer the window stays as it is
+TRIAL_SIDES = 4  # of windows from one to the next: they need not cover it
 # Spread of the rays of a tie point, in that of all, beyond which it tells nothing of the surface
 TOLERANCE_FACTOR = 6.0
 MAX_POINTS = 6000  # of a photograph: of larger ones the squares are larger than the windows
@@ -131,7 +132,7 @@ def _best_window(
             network.camera,
             surface,
             window_px=window,
-            side_px=max(2 * window + 1, _side(photographs, window)),
+            side_px=max(TRIAL_SIDES * window + 1, _side(photographs, window)),
             references=most[:TRIAL_PHOTOGRAPHS].tolist(),
             threads=jobs,
         )

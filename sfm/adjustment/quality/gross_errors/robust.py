@@ -5,7 +5,7 @@ the largest of all, and with it others whose photograph and object point hold no
 none is judged beside a larger error. In a photograph of many image points an error moves the residuals of
 the others by its leverage only, some hundredths of it: there all those go that are not much smaller than the
 largest, and further rays of an object point that has lost one go one after another in the same round
-(`rays_of_points`). A rejected point is taken back when its predicted residual passes the test again.
+(`rays_of_points`). A rejected point is taken back when it would pass the test in the adjustment.
 
 Huber's estimator bounds the influence of an image point, Tukey's biweight takes it back to nothing:
 beyond TUKEY standard deviations an image point has weight 0. It starts from Huber's, because its sum
@@ -22,7 +22,7 @@ import numpy as np
 
 from sfm.adjustment.engine.collinearity import Observations, State
 from sfm.adjustment.quality.gross_errors.rays_of_points import further_rays
-from sfm.adjustment.quality.reliability import standardised_residuals, tau_critical
+from sfm.adjustment.quality.reliability import standardised_residuals, tau_critical, whitening_matrix
 from sfm.conventions import MAD_TO_SIGMA, BoolArray, FloatArray
 
 # In sigmas of a coordinate, for the length of a residual vector: both are 95 % efficient with normal errors
@@ -76,8 +76,50 @@ def snoop(
     out = suspect & (tau >= worst_image[observations.image]) & (tau >= worst_point[observations.point])
     least = np.where(crowded, np.maximum(worst_image, critical), np.inf) * sigma0
     out |= further_rays(observations, state, residuals, complement, limiting, used, out, least=least)
-    back = ~used & (tau <= critical)
-    return out, back
+    return out, would_pass(
+        observations, residuals, complement, used, vPv=vPv, redundancy=redundancy, alpha=alpha
+    )
+
+
+def would_pass(
+    observations: Observations,
+    residuals: FloatArray,
+    complement: FloatArray,
+    used: BoolArray,
+    *,
+    vPv: float,
+    redundancy: int,
+    alpha: float,
+) -> BoolArray:
+    """Return which rejected image points would pass the test if each were in the adjustment, (k,).
+
+    Whitened, with H = A Q A' without the image point: its residual (I + H)^-1 l from the predicted one l, the
+    cofactor (I + H)^-1 of that, and l' (I + H)^-1 l more in the sum of squares.
+
+    Args:
+        observations: image points.
+        residuals: v of all image points, rejected ones predicted, px, shape (k, 2).
+        complement: whitened cofactors of the residuals, I + H of rejected ones, shape (k, 2, 2).
+        used: image points in the adjustment, shape (k,).
+        vPv: weighted sum of squares of the adjustment.
+        redundancy: of the adjustment.
+        alpha: probability with which the test of one image coordinate rejects a good one.
+
+    Source: Cook and Weisberg (1982), Residuals and Influence in Regression, sec. 2.2.3.
+    """
+    rows = np.flatnonzero(
+        ~used & np.isfinite(residuals).all(axis=1) & np.isfinite(complement).all(axis=(1, 2))
+    )
+    F = whitening_matrix(observations.whitening[rows])
+    cofactor = np.asarray(np.linalg.inv(complement[rows]), dtype=float)
+    predicted = np.einsum("kab,kb->ka", F, residuals[rows])
+    inside = np.einsum("kab,kb->ka", cofactor, predicted)
+    v = np.linalg.solve(F, inside[:, :, None])[:, :, 0]
+    w = np.abs(standardised_residuals(v, cofactor, observations.whitening[rows])).max(axis=1)
+    sigma0 = np.sqrt((vPv + np.sum(predicted * inside, axis=1)) / (redundancy + 2))
+    passes = np.zeros(len(used), dtype=bool)
+    passes[rows] = w <= tau_critical(alpha, redundancy + 2) * sigma0
+    return passes
 
 
 def huber_weights(observations: Observations, residuals: FloatArray, *, sigma0: float) -> FloatArray:
