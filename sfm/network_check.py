@@ -9,7 +9,7 @@ import numpy as np
 
 from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.errors import GeometryError
-from sfm.network import Estimate, Network
+from sfm.network import Estimate, Network, ObjectPoints
 
 
 def check_network(network: Network, estimate: Estimate) -> None:
@@ -74,23 +74,28 @@ def check_network(network: Network, estimate: Estimate) -> None:
             "positive definite matrix"
         )
     control, bars = network.control, network.scale_bars
-    points = np.asarray(network.points, dtype=object)
+    if len(control):
+        _check_control(control, network.points)
+    good = np.isfinite(bars.length) & (bars.length > 0) & np.isfinite(bars.sigma) & (bars.sigma > 0)
+    wrong = _first(~good | (bars.start == bars.end))
+    if wrong is not None:
+        raise GeometryError(
+            f"scale bar {network.points[bars.start[wrong]]} - {network.points[bars.end[wrong]]}: length "
+            f"{bars.length[wrong]:g}, sigma {bars.sigma[wrong]:g}, expected two points and positive numbers"
+        )
+
+
+def _check_control(control: ObjectPoints, points: tuple[str, ...]) -> None:
+    """Refuse control that no adjustment can use; points are the names of the object points."""
     wrong = _first(~np.isfinite(control.xyz).all(axis=1) | ~_not_negative(control.covariance))
     if wrong is not None:
         raise GeometryError(
             f"control point {points[control.point[wrong]]}: expected finite coordinates and a symmetric "
             "covariance without negative variances"
         )
-    twice = np.flatnonzero(np.bincount(control.point, minlength=n) > 1)
+    twice = np.flatnonzero(np.bincount(control.point, minlength=len(points)) > 1)
     if len(twice):
         raise GeometryError(f"control point {points[twice[0]]}: duplicate, expected each point once")
-    good = np.isfinite(bars.length) & (bars.length > 0) & np.isfinite(bars.sigma) & (bars.sigma > 0)
-    wrong = _first(~good | (bars.start == bars.end))
-    if wrong is not None:
-        raise GeometryError(
-            f"scale bar {points[bars.start[wrong]]} - {points[bars.end[wrong]]}: length "
-            f"{bars.length[wrong]:g}, sigma {bars.sigma[wrong]:g}, expected two points and positive numbers"
-        )
 
 
 def check_number(what: str, value: float, low: float, high: float = np.inf) -> None:

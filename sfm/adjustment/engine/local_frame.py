@@ -51,7 +51,9 @@ class Local:
                 ),
                 datum_points=None if result.datum_points is None else result.datum_points[place],
             )
-        _, estimate = shifted(self.given, result.estimate, self.centroid)
+        estimate = result.estimate
+        if self.centroid.any():
+            _, estimate = shifted(self.given, estimate, self.centroid)
         return replace(result, network=self.given, estimate=estimate)
 
 
@@ -116,6 +118,9 @@ def centroid_of(network: Network, estimate: Estimate) -> FloatArray:
     xyz = np.concatenate([estimate.points, estimate.position, control])
     known = xyz[np.isfinite(xyz).all(axis=1)]
     if len(known) == 0:
+        return np.zeros(3)
+    low, high = known.min(axis=0), known.max(axis=0)
+    if max(high.max(), -low.min()) <= FAR * (high - low).max() / 2:  # the extent is at least that
         return np.zeros(3)
     centre = np.median(known, axis=0)
     extent = np.abs(known - centre).max()

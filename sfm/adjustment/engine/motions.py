@@ -15,6 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import qr
+from scipy.linalg.lapack import dgeqrf, dorgqr
 
 from sfm.adjustment.datum import ResolvedDatum
 from sfm.adjustment.engine.collinearity import State
@@ -23,8 +24,8 @@ from sfm.adjustment.engine.unknowns import Unknowns
 from sfm.conventions import BoolArray, FloatArray
 from sfm.errors import GeometryError
 from sfm.kernels.options import kernel
-from sfm.similarity import mean_distance
 
+TINY = float(np.finfo(float).tiny)
 DETERMINED = 1e-9  # relative effect on an observed unknown above which it takes part in the datum
 
 
@@ -46,6 +47,18 @@ class Motions:
     def defect(self) -> int:
         """Number of motions that the datum has to fix."""
         return len(self.inverse) - self.further
+
+    def orthonormal(self, scale: FloatArray) -> FloatArray:
+        """Return a basis of the motions of the reduced unknowns over their scales, (reduced, d).
+
+        Args:
+            scale: of each unknown, (reduced,).
+        """
+        H = self.reduced[:, : self.defect] / scale[:, None]
+        if not 0 < H.shape[1] <= len(H):
+            return np.asarray(np.linalg.qr(H)[0])
+        reflections, tau, _, _ = dgeqrf(H)  # as numpy's qr does, which takes four times as long to call
+        return np.ascontiguousarray(dorgqr(reflections, tau)[0])
 
     def transform(self, reduced: FloatArray, points: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return steps (reduced, e), (n, 3, e), or one (reduced,), (n, 3), carried into the datum: S dx."""
@@ -119,7 +132,9 @@ def free_motions(layout: Unknowns, state: State) -> tuple[FloatArray, FloatArray
     seven are of the same order.
     """
     cloud = state.points[layout.point_on]
-    centre, size = cloud.mean(axis=0), max(mean_distance(cloud), np.finfo(float).tiny)
+    centre = cloud.sum(axis=0) / len(cloud)
+    # root mean square distance from the centre, as `mean_distance`
+    size = max(float(np.sqrt(((cloud - centre) ** 2).sum(axis=1).mean())), TINY)
     exterior, points = np.zeros((len(state.position), 6, 7)), np.zeros((len(state.points), 3, 7))
     _fill_motions(state.position, centre, size, exterior)
     _fill_motions(state.points, centre, size, points)

@@ -81,7 +81,11 @@ def normal_equations(
     """
     space = new_space(layout) if space is None else space
     b = space.blocks
-    b.V[:], b.gp[:] = point_terms(weighted, state)
+    if len(weighted.point):
+        b.V[:], b.gp[:] = point_terms(weighted, state)
+    else:
+        b.V.fill(0.0)
+        b.gp.fill(0.0)
     slot = np.full(len(state.points), -1, dtype=np.int64)
     slot[layout.kept] = np.arange(len(layout.kept))
     vPv = _sum_photographs(layout, state, weight, space)
@@ -144,7 +148,8 @@ def point_step(equations: Equations, reduced_step: FloatArray, layout: Unknowns)
     """Return the step of all object points that belongs to a step of the reduced unknowns, (n, 3)."""
     dX = np.empty_like(equations.blocks.y)
     step_points(layout.observations, layout.point_free, equations.blocks, reduced_step, dX)
-    dX[layout.kept] = reduced_step[layout.kept_start :].reshape(-1, 3) * layout.point_free[layout.kept]
+    if len(layout.kept):
+        dX[layout.kept] = reduced_step[layout.kept_start :].reshape(-1, 3) * layout.point_free[layout.kept]
     return dX
 
 

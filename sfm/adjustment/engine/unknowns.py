@@ -131,7 +131,7 @@ def unknowns_of(
         free_column[a, : len(free)] = column
     bars = np.flatnonzero(point_on[network.scale_bars.start] & point_on[network.scale_bars.end])
     ends = np.concatenate([network.scale_bars.start[bars], network.scale_bars.end[bars]])
-    kept = np.unique(ends).astype(np.int64)
+    kept = np.unique(ends).astype(np.int64) if len(ends) else np.zeros(0, dtype=np.int64)
 
     order, rays_from = by_point(k, m, n)
     covariance = k.covariance

@@ -39,7 +39,7 @@ def null_motions(optimum: Optimum, layout: Unknowns) -> int:
     if d == 0:
         return 0
     scale = optimum.equations.parts.scale[:, None]
-    H = np.linalg.qr(optimum.motions.reduced[:, :d] / scale)[0]
+    H = optimum.motions.orthonormal(optimum.equations.parts.scale)
     together = H.sum(axis=1, keepdims=True) / np.sqrt(d)
     if _mapped_to_zero(optimum, layout, scale * together).all():
         return d

@@ -46,7 +46,7 @@ NULL = 1e-12  # eigenvalue of the scaled matrix (diagonal at most 1) taken as 0;
 WEAK_PIVOT = 1e-11  # squared pivot below which the eigenvalues are looked at
 WEAK_SINGLE = 1e-5  # the same in single precision, whose rounding leaves 1e-6
 BYTES = 8.0  # of a number in double precision
-SINGLE_FROM = 200  # reduced unknowns from which the product in single precision saves time
+SINGLE_FROM = 100  # reduced unknowns from which the product in single precision saves time
 
 
 @dataclass(frozen=True)
@@ -84,7 +84,7 @@ class DenseSolver:
         refuse_what_does_not_fit(self.bytes, f"{self.layout.reduced} unknowns that are all connected")
         scale = equations.parts.scale
         S = schur_complement(equations, self.layout, self.pairs, single=coarse)
-        Q = np.linalg.qr(motions.reduced / scale[:, None])[0] if motions.defect else motions.reduced
+        Q = motions.orthonormal(scale)
         if motions.defect:
             S = (ssyrk if coarse else dsyrk)(1.0, Q, beta=1.0, c=S, overwrite_c=1)
         further = np.zeros((len(S), 0))

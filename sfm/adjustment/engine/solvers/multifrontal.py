@@ -73,7 +73,7 @@ class MultifrontalSolver:
         """
         refuse_what_does_not_fit(self.bytes, f"the unknowns of {len(self.layout.exterior_free)} photographs")
         scale = equations.parts.scale
-        Q = np.linalg.qr(motions.reduced / scale[:, None])[0] if motions.defect else motions.reduced
+        Q = motions.orthonormal(scale)
         holds = _largest(Q)
         border = self._border(equations)
         factor = self._factored(equations, border, holds)
