@@ -1,16 +1,19 @@
 """COLMAP, COLMAP and refine, and Kolinear's own textured survey on rendered photographs with truth.
 
-    python -m benchmarks.textured --photographs 20 --roughness smooth medium rough
+    python -m benchmarks.textured --photographs 20 60 --roughness smooth medium rough
+    python -m benchmarks.textured --photographs 15 30 60 120 --roughness medium --methods kolinear
+    python -m benchmarks.textured --photographs 25 --finer 3 --roughness medium --methods kolinear
 
 Prints for each scene the RMS errors of centres and rotations after a similarity onto the truth, what the
 result predicts for them in the same datum, the joint squared Mahalanobis distance of centres and rotations
-for a degree of freedom, and the processor time, all in one run. The scenes are rendered into a folder
-(--work) unless they are there.
+for a degree of freedom, and the processor time, all in one run; with several numbers of photographs also with
+which power of them the time grows. Scenes are rendered into a folder (--work) unless they are there.
 """
 
 from __future__ import annotations
 
 import argparse
+import resource
 import time
 from pathlib import Path
 
@@ -38,36 +41,52 @@ METHODS = ["colmap", "kolinear"]
 def main() -> None:
     """Run what the command line asks for."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0] if __doc__ else "")
-    parser.add_argument("--photographs", type=int, default=20)
+    parser.add_argument("--photographs", type=int, nargs="+", default=[20])
+    parser.add_argument("--finer", type=int, default=1, help="pixels a side for each of 1024 x 768")
+    parser.add_argument("--jobs", type=int, default=1, help="photographs worked on at a time")
     parser.add_argument("--roughness", nargs="+", default=list(RIPPLES), choices=list(RIPPLES))
     parser.add_argument("--methods", nargs="+", default=METHODS, choices=METHODS)
     parser.add_argument("--work", type=Path, default=Path("build/textured_scenes"))
     arguments = parser.parse_args()
     print(HEAD)
+    finer = "" if arguments.finer == 1 else f"x{arguments.finer}"
     for roughness in arguments.roughness:
-        folder = arguments.work / f"{roughness}{arguments.photographs}"
-        scene = textured_scene(roughness, arguments.photographs)
-        if not (folder / "survey.toml").is_file():
-            render_scene(folder, roughness, arguments.photographs)
-        if "kolinear" in arguments.methods:
-            _kolinear(scene, folder)
-        if "colmap" in arguments.methods:
-            _colmap(scene, folder)
+        seconds: list[list[float]] = []
+        for photographs in arguments.photographs:
+            folder = arguments.work / f"{roughness}{photographs}{finer}"
+            scene = textured_scene(roughness, photographs, arguments.finer)
+            if not (folder / "survey.toml").is_file():
+                render_scene(folder, roughness, photographs, arguments.finer)
+            own: list[float] = []
+            if "kolinear" in arguments.methods:
+                own.append(_kolinear(scene, folder, arguments.jobs))
+            if "colmap" in arguments.methods:
+                own += _colmap(scene, folder)
+            seconds.append(own)
+        if len(arguments.photographs) > 1:
+            power = np.polyfit(np.log(arguments.photographs), np.log(seconds), 1)[0]
+            print(f"{roughness:<17}time grows as n^" + ", n^".join(f"{one:.2f}" for one in power))
 
 
-def _kolinear(scene: TexturedScene, folder: Path) -> None:
-    """Run the survey and print its errors."""
-    begun = time.process_time()
-    found = run_survey(read_survey(folder / "survey.toml"))
+def _kolinear(scene: TexturedScene, folder: Path, jobs: int) -> float:
+    """Run the survey, print its errors and return its processor time."""
+    begun, started = time.process_time(), time.perf_counter()
+    found = run_survey(read_survey(folder / "survey.toml"), jobs=jobs)
+    seconds, elapsed = time.process_time() - begun, time.perf_counter() - started
     stages = ", ".join(f"{one.stage} {one.seconds:.1f} s" for one in found.seconds)
     a = found.adjustment
-    _print(scene, folder.name, "Kolinear", a.network, a.estimate, time.process_time() - begun, a)
+    _print(scene, folder.name, "Kolinear", a.network, a.estimate, seconds, a)
     rejected = f"{int(a.rejected.sum())} of {len(a.rejected)} image points rejected"
-    print(f"{'':17}{a.iterations} iterations, {rejected}; {stages}")
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
+    print(
+        f"{'':17}{a.iterations} iterations, {rejected}; {elapsed:.1f} s with {jobs} at a time: {stages}; "
+        f"peak memory of the process so far {peak:.2f} GB"
+    )
+    return seconds
 
 
-def _colmap(scene: TexturedScene, folder: Path) -> None:
-    """Run COLMAP's pipeline, then refine on its model, and print the errors of both."""
+def _colmap(scene: TexturedScene, folder: Path) -> list[float]:
+    """Run COLMAP's pipeline, then refine on its model; print the errors and return the times of both."""
     begun = time.process_time()
     names = tuple(sorted(path.name for path in folder.glob("*.png")))
     mapped = map_photographs(folder, (names,))
@@ -75,7 +94,9 @@ def _colmap(scene: TexturedScene, folder: Path) -> None:
     _print(scene, folder.name, "COLMAP", mapped.network, mapped.estimate, seconds)
     found = refine_model(mapped.network, mapped.estimate, folder)
     a = found.adjustment
-    _print(scene, folder.name, "COLMAP + refine", a.network, a.estimate, time.process_time() - begun, a)
+    whole = time.process_time() - begun
+    _print(scene, folder.name, "COLMAP + refine", a.network, a.estimate, whole, a)
+    return [seconds, whole]
 
 
 def _print(

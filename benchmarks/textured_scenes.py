@@ -61,8 +61,8 @@ class TexturedScene:
     camera: Camera
 
 
-def textured_scene(roughness: str, photographs: int) -> TexturedScene:
-    """Return the scene with its true orientation."""
+def textured_scene(roughness: str, photographs: int, finer: int = 1) -> TexturedScene:
+    """Return the scene with its true orientation, its pixels so many times finer than usual."""
     position, rotation = [], []
     for i in range(photographs):
         azimuth = 2 * np.pi * i / photographs * (1 if photographs < 40 else 2)
@@ -75,8 +75,10 @@ def textured_scene(roughness: str, photographs: int) -> TexturedScene:
         right = np.cos(roll) * x + np.sin(roll) * np.cross(outward, x)
         position.append((DISTANCE_M + 0.08 * (i % 4)) * outward)
         rotation.append(np.column_stack([right, np.cross(outward, right), outward]))
-    values = (("k1", -0.05), ("k2", 0.02), ("p1", 2e-4), ("p2", -1e-4), ("cx", 515.0), ("cy", 380.0))
-    camera = camera_from_values("lens", "opencv", SIZE_PX, (PIXEL_MM, PIXEL_MM), c_mm=C_MM, values=values)
+    centre = (("cx", 515.0 * finer), ("cy", 380.0 * finer))
+    values = (("k1", -0.05), ("k2", 0.02), ("p1", 2e-4), ("p2", -1e-4), *centre)
+    size, pixel = (SIZE_PX[0] * finer, SIZE_PX[1] * finer), PIXEL_MM / finer
+    camera = camera_from_values("lens", "opencv", size, (pixel, pixel), c_mm=C_MM, values=values)
     return TexturedScene(roughness, np.array(position), np.array(rotation), camera)
 
 
@@ -168,15 +170,19 @@ def surface_at(scene: TexturedScene, index: int, xy: FloatArray) -> FloatArray:
     return np.asarray(centre + length[:, None] * d)
 
 
-def render_scene(folder: Path, roughness: str, photographs: int) -> TexturedScene:
+def render_scene(folder: Path, roughness: str, photographs: int, finer: int = 1) -> TexturedScene:
     """Write the photographs and a survey file; return the scene."""
     folder.mkdir(parents=True, exist_ok=True)
-    scene, skin = textured_scene(roughness, photographs), render.texture()
+    scene, skin = textured_scene(roughness, photographs, finer), render.texture()
     for index in range(photographs):
-        noise = np.random.default_rng((render.SEED, index)).normal(0, render.NOISE, SIZE_PX[::-1])
+        noise = np.random.default_rng((render.SEED, index)).normal(
+            0, render.NOISE, scene.camera.size_px[::-1]
+        )
         picture = np.rint(np.clip(intensities(scene, index, skin) + noise, 0, 255)).astype(np.uint8)
         cv2.imwrite(str(folder / f"surface_{index + 1:03d}.png"), picture)
-    (folder / "survey.toml").write_text(SURVEY.format(name=folder.name, pixel=PIXEL_MM), encoding="utf-8")
+    (folder / "survey.toml").write_text(
+        SURVEY.format(name=folder.name, pixel=PIXEL_MM / finer), encoding="utf-8"
+    )
     return scene
 
 

@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from typing import Protocol
 
 from sfm.runtime.faults import working_on
+from sfm.runtime.memory import give_back_memory
 
 
 class Progress(Protocol):
@@ -42,9 +43,13 @@ class StageClock:
 
     @contextmanager
     def stage(self, name: str, total: int | None = None) -> Iterator[None]:
-        """Announce a stage and how many steps it has, if that is known, and time what is done in it."""
+        """Announce a stage and how many steps it has, if that is known, and time what is done in it.
+
+        What it has freed is given back to the system at its end.
+        """
         self.progress.stage(name, total)
         begun = time.perf_counter()
         with working_on(f"stage {name}"):
             yield
+        give_back_memory()
         self.seconds.append((name, time.perf_counter() - begun))

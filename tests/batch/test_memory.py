@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import os
 import sys
 import time
 from collections import Counter
@@ -15,6 +16,7 @@ import pytest
 from adapters.dask_cluster import DaskEngine, local_engine
 from sfm.batch.job import SurveyJob, reconstruct
 from sfm.runtime.executor import Call, Done, Tell, Work
+from sfm.runtime.progress import SILENT, StageClock
 from tests.engines import ALONE
 from tests.surveys import write_observed_survey
 
@@ -82,3 +84,19 @@ def test_the_scheduler_does_not_remember_surveys(one_worker: DaskEngine) -> None
         list(one_worker.run([Work(name, (), Call(_nothing, ()))], at_a_time=1))
     kinds = one_worker.client.run_on_scheduler(lambda dask_scheduler: list(dask_scheduler.task_prefixes))
     assert kinds == ["whole"]
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="only glibc can be asked")
+def test_what_a_stage_has_freed_is_given_back() -> None:
+    def resident() -> int:
+        return int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1]) * os.sysconf(
+            "SC_PAGE_SIZE"
+        )
+
+    with StageClock(SILENT).stage("some"):
+        pieces = [b"x" * (100_000 + k) for k in range(1000)]
+        kept = pieces[-1]  # behind all others, so that the heap cannot shrink by itself
+        full = resident()
+        del pieces
+    assert resident() < full - 80_000_000
+    assert len(kept) == 100_999

@@ -22,6 +22,9 @@ WEIGHT_OF_MEAN = 0.5
 # Standard deviation of the derivative of a Gaussian for the gradients, px; their noise is then
 # sigma_n^2 / (8 pi s^4).
 DERIVATION_PX = 1.0
+STRIP = (
+    256  # rows of a photograph of which the windows are summed at a time: their sums take 20 times its memory
+)
 REACH_PX = 3  # of such a derivative
 TEXTURE_OF_MEAN = 0.1  # of the weight of squares: less is left; whether it can be matched is for the matching
 
@@ -117,14 +120,23 @@ def _gradients(grey: AnyArray) -> tuple[AnyArray, AnyArray]:
 
 
 def _texture(gx: AnyArray, gy: AnyArray, side: int) -> tuple[AnyArray, AnyArray]:
-    """Return weight and roundness of the window around every pixel, each (H, W)."""
-    xx, xy, yy = (
-        cv2.boxFilter(product, cv2.CV_64F, (side, side), normalize=False)
-        for product in (gx * gx, gx * gy, gy * gy)
-    )
-    trace = np.maximum(xx + yy, 1e-12)
-    det = np.maximum(xx * yy - xy * xy, 0.0)
-    return det / trace, 4 * det / (trace * trace)
+    """Return weight and roundness of the window around every pixel, each (H, W), strip by strip."""
+    weight, roundness = np.empty_like(gx), np.empty_like(gx)
+    height = len(gx)
+    for first in range(0, height, STRIP):
+        end = min(first + STRIP, height)
+        begin = max(0, first - side // 2)
+        rows = slice(begin, min(height, end + side // 2))
+        x, y = gx[rows], gy[rows]
+        xx, xy, yy = (
+            cv2.boxFilter(product, cv2.CV_64F, (side, side), normalize=False)[first - begin : end - begin]
+            for product in (x * x, x * y, y * y)
+        )
+        trace = np.maximum(xx + yy, 1e-12)
+        det = np.maximum(xx * yy - xy * xy, 0.0)
+        weight[first:end] = det / trace
+        roundness[first:end] = 4 * det / (trace * trace)
+    return weight, roundness
 
 
 def _side_by_side(free: BoolArray, side: int) -> list[tuple[int, int]]:
