@@ -248,6 +248,8 @@ def _result(
         of_bars[layout.bars] = redundancy_of_bars(run.problem.weighted, layout, optimum.state, kept)
     if Q is not None and Q.has_cross:
         complement = hat_complement(optimum, layout, Q, weight)
+        # that of image points whose photograph nothing holds overflows, if it is far enough away
+        complement[~np.isfinite(complement).all(axis=(1, 2))] = np.nan
         numbers = numbers_of(complement, layout.observations.whitening)
         numbers[weight == 0] = np.nan
         numbers = np.take(numbers, back, axis=0)
