@@ -1,16 +1,18 @@
 """Adjustment timed against COLMAP's Ceres adjuster on the same networks: problem set-up plus solve, warm.
 
     python benchmarks/adjustment.py [--networks small|all|block] [--no-covariance] [--repeat N] [--cpu]
-    python benchmarks/adjustment.py --growth [--photographs N] [--ceres] [--cpu]
+    python benchmarks/adjustment.py --growth [--photographs N] [--ceres] [--ceres-limit S] [--cpu]
 
 Both start from the same values and adjust the same 8 shared parameters of an `opencv` camera. "default" is
 what a user of pycolmap gets; "best" is pycolmap tuned: DENSE_SCHUR or SPARSE_SCHUR, whichever wins,
 function_tolerance 1e-6, start radius 1e8, 1 or 2 threads, whichever wins. Both stop at the same relative
 decrease of the cost, 1e-6 = (|A dx| / |v|)^2; how near to the optimum each ends is printed against an
 adjustment to the last digit. pycolmap's scene is built from arrays before the clock starts, as the network
-is. Only ratios within one run mean anything; run it on a machine that does nothing else. With --cpu
-everything gets one thread and CPU time is compared, which other programs disturb less. Memory is the peak
-of a process of its own while it adjusts, network or scene included.
+is. --growth adjusts blocks of 100 to 10,000 photographs and a dense convergent network of 1,000 x 1,000
+without the covariance, each adjuster in a process of its own; the limit for Ceres is of wall time and
+includes building its scene. Only ratios within one run mean anything; run it on a machine that does nothing
+else. With --cpu everything gets one thread and CPU time is compared, which other programs disturb less.
+Memory is the peak of a process of its own while it adjusts, network or scene included.
 """
 
 from __future__ import annotations
@@ -59,7 +61,10 @@ CASES = (
     Case("block 1000 / 99000", "block", lambda: block(25, 40)),
 )
 # strips and photographs in each, of the blocks of --growth
-GROWTH = ((10, 10), (10, 20), (20, 20), (25, 40), (50, 50), (50, 100), (100, 100))
+GROWTH = ((10, 10), (15, 20), (25, 40), (50, 60), (100, 100))
+DENSE = (
+    1000  # photographs and points of the dense convergent network of --growth, each point in three of four
+)
 MEMORY_BLOCK = (25, 40)  # whose peak memory is compared
 
 
@@ -73,6 +78,13 @@ def main() -> None:
     parser.add_argument("--growth", action="store_true", help="how time and memory grow with a block")
     parser.add_argument("--photographs", type=int, default=1000, help="of the largest block of --growth")
     parser.add_argument("--ceres", action="store_true", help="COLMAP's adjuster beside it in --growth")
+    parser.add_argument(
+        "--ceres-limit", type=float, default=600.0, help="s for each network, building included"
+    )
+    parser.add_argument(
+        "--grown", choices=("adjust", "ceres"), help="one network of --growth, and its --size"
+    )
+    parser.add_argument("--size", default="10,10", help="strips, photographs in each; or dense")
     parser.add_argument("--peak", choices=("adjust", "best"), help="peak memory, block only")
     options = parser.parse_args()
     clock = time.process_time if options.cpu else time.perf_counter
@@ -81,9 +93,18 @@ def main() -> None:
     if options.peak:
         print(peak_of(options.peak))
         return
+    if options.grown:
+        threads = 1 if options.cpu else os.cpu_count() or 1
+        print(grown_here(options.grown, options.size, options.repeat, clock, threads))
+        return
     print(f"load {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores (times mean nothing above 0.5)")
     if options.growth:
-        growth(clock, options.repeat, options.photographs, options.ceres)
+        growth(
+            options.repeat,
+            options.photographs,
+            options.ceres_limit if options.ceres else 0.0,
+            cpu=options.cpu,
+        )
         return
     print(f"{'network':23}{'image points':>13}{'default':>10}{'best':>10}{'adjust':>10}{'faster':>7}", end="")
     print(f"{'best+cov':>10}{'adjust+cov':>11}{'faster':>7}{'cost - best':>13}{'best cost':>11}")
@@ -241,31 +262,73 @@ def reconstruction(network: Network, start: Estimate) -> Any:
     return scene
 
 
-def growth(clock: Callable[[], float], repeat: int, most: int, with_ceres: bool) -> None:
-    """Print how time and peak memory grow with the photographs of a block, time as a power of them."""
-    sizes: list[int] = []
-    seconds: list[float] = []
-    for strips, per_strip in GROWTH:
-        if strips * per_strip > most:
+def growth(repeat: int, most: int, ceres_limit: float, *, cpu: bool) -> None:
+    """Print how time and peak memory grow with the photographs of a block, and those of a dense network.
+
+    Args:
+        repeat: runs after a warm one, at most; one that takes long is not repeated.
+        most: photographs of the largest network.
+        ceres_limit: s, after which COLMAP's adjuster is stopped; 0: it is left out.
+        cpu: whether CPU time of one thread is meant.
+    """
+    print(f"{'network':>20}{'image points':>14}{'adjust':>10}{'us/point':>10}{'peak':>9}{'grows':>8}", end="")
+    print(f"{'Ceres':>12}{'peak':>9}{'faster':>8}" if ceres_limit else "")
+    blocks = [(f"block {a * b}", a * b, f"{a},{b}") for a, b in GROWTH if a * b <= most]
+    known: list[tuple[int, float]] = []
+    for name, photographs, size in [*blocks, (f"{DENSE} x {DENSE}", DENSE, "dense")]:
+        if photographs > most:
             continue
-        network, start = block(strips, per_strip)
-        forget_peak()
-        time_of_one, _ = timed(lambda n=network, s=start: run_adjust(n, s), repeat, clock)  # type: ignore[misc]
-        line = f"{strips * per_strip:5d} photographs, {len(network.image_points):8d} image points"
-        line += f"{ms(time_of_one)}, peak {peak_mb():6.0f} MB"
-        if sizes:
-            power = np.log(time_of_one / seconds[-1]) / np.log(strips * per_strip / sizes[-1])
-            line += f", since the last as n^{power:.2f}"
-        if with_ceres:
-            scene = reconstruction(network, start)
-            other, _ = timed_ceres(scene, ("SPARSE_SCHUR", 1), 1, clock)
-            line += f", Ceres (SPARSE_SCHUR){ms(other)}"
+        points, seconds, mb = grown("adjust", size, repeat, cpu)
+        line = f"{name:>20}{points:14.0f}{ms(seconds)}{seconds / points * 1e6:10.2f}{mb / 1e3:6.2f} GB"
+        exponent = ""
+        if size != "dense":
+            if known:
+                exponent = f"n^{np.log(seconds / known[-1][1]) / np.log(photographs / known[-1][0]):.2f}"
+            known.append((photographs, seconds))
+        line += f"{exponent:>8}"
+        if ceres_limit:
+            try:
+                _, other, other_mb = grown("ceres", size, 1, cpu, ceres_limit)
+                line += f"{ms(other, 12)}{other_mb / 1e3:6.2f} GB{other / seconds:8.1f}"
+            except subprocess.TimeoutExpired:
+                line += f"{'> ' + format(ceres_limit, '.0f') + ' s':>12}"
         print(line, flush=True)
-        sizes.append(strips * per_strip)
-        seconds.append(time_of_one)
-    if len(sizes) > 1:
-        power = np.log(seconds[-1] / seconds[0]) / np.log(sizes[-1] / sizes[0])
-        print(f"time grows as n^{power:.2f}")
+    if len(known) > 1:
+        exponent = np.log(known[-1][1] / known[0][1]) / np.log(known[-1][0] / known[0][0])
+        print(f"time grows with the photographs of a block as n^{exponent:.2f}")
+
+
+def grown(
+    what: str, size: str, repeat: int, cpu: bool, limit: float | None = None
+) -> tuple[float, float, float]:
+    """Return image points, s and peak memory, MB, of a network that is adjusted in a process of its own."""
+    command = [sys.executable, __file__, "--grown", what, "--size", size, "--repeat", str(repeat)]
+    command += ["--cpu"] if cpu else []
+    done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=limit)
+    points, seconds, mb = (float(word) for word in done.stdout.split()[-3:])
+    return points, seconds, mb
+
+
+def grown_here(what: str, size: str, repeat: int, clock: Callable[[], float], threads: int) -> str:
+    """Return what `grown` reads: image points, s and MB, of an adjustment in this process."""
+    if size == "dense":
+        network, start = convergent(DENSE, DENSE, 0.75)
+    else:
+        strips, per_strip = (int(word) for word in size.split(","))
+        network, start = block(strips, per_strip)
+    points = len(network.image_points)
+    if what == "ceres":
+        scene = reconstruction(network, start)
+        del network, start
+        solver = "DENSE_SCHUR" if size == "dense" else "SPARSE_SCHUR"
+        forget_peak()
+        started = clock()
+        run_ceres(scene, (solver, threads))
+        return f"{points} {clock() - started} {peak_mb()}"
+    run_adjust(*block(9, 8))  # kernels are there, as they are in any second adjustment
+    forget_peak()
+    seconds, _ = timed(lambda: run_adjust(network, start), repeat, clock)
+    return f"{points} {seconds} {peak_mb()}"
 
 
 def peak_of(what: str) -> float:
