@@ -29,7 +29,7 @@ from sfm.errors import GeometryError
 
 MAX_ROUNDS = 200  # of data snooping
 MAX_VAGUE = 5  # of them that did not converge: residuals of no optimum tell no gross errors
-ROUND_TOLERANCE = 1e-3  # |A dx| / |v| that is near enough to judge gross errors
+ROUND_TOLERANCE = 1e-2  # |A dx| / |v| of a last step after which gross errors can be judged
 BENT = 2.0  # spread of residuals over that with the start values, above which gross errors bend the network
 BENT_ALONE = 10.0  # the same of one photograph, over the median of all photographs
 FAR_OFF = 100.0  # median residuals beyond which an image point has no influence with any estimator
