@@ -24,7 +24,7 @@ from sfm.adjustment.solve import adjust
 from sfm.comparison.camera_conversion import Conversion
 from sfm.comparison.solutions import Comparison, compare
 from sfm.comparison.two_adjusters.better_fit import BetterFit, better_fit
-from sfm.comparison.two_adjusters.common_problem import GROUPS, common_problem, distortion_held
+from sfm.comparison.two_adjusters.common_problem import common_problem, distortion_held
 from sfm.comparison.two_adjusters.unshared import without_sharing
 from sfm.conventions import FloatArray
 from sfm.distortion.models import Role
@@ -106,7 +106,7 @@ def compare_adjusters(
         adjustment: of the survey.
         backend: the other adjuster, a function of network and start values.
         name: of the backend.
-        model: functional model of both; that of the survey if it is an opencv one, else full_opencv.
+        model: functional model of both; that of the survey if COLMAP has it, else full_opencv.
 
     Raises:
         GeometryError: nothing is left to compare.
@@ -172,7 +172,7 @@ def _adjusted(
 def _grown(start: Estimate, end: Estimate) -> bool:
     """Whether the distortion of a camera has outgrown what it started from, and what lenses have."""
     sizes = [
-        [float(np.abs(camera.parameters[GROUPS[2]]).max()) for camera in estimate.cameras]
+        [float(np.abs(camera.parameters[camera.parts[2]]).max()) for camera in estimate.cameras]
         for estimate in (start, end)
     ]
     return any(after > GROWN * max(before, 1.0) for before, after in zip(*sizes, strict=True))

@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 
-from sfm.distortion.models import MODELS
+from sfm.distortion.models import MODELS, SURVEY_MODELS
 from sfm.files.plain_text import MAX_NAME, as_plain, is_plain
 
 
@@ -102,7 +102,7 @@ class CameraSettings(Section):
     sensor_mm: TwoLengths | None = None  # width and height of the sensor, mm
     c_mm: Length | None = None  # start value of the principal distance, else the EXIF focal length, mm
     # distortion model: corrections of the measured point, or distortion of the ideal one
-    model: Literal[tuple(MODELS)] = "brown"  # type: ignore[valid-type]
+    model: Literal[SURVEY_MODELS] = "brown"  # type: ignore[valid-type]
     free: Names = ()  # parameters to be adjusted; [] = a calibrated camera; not given: the photographs decide
     fixed: Values = ()  # what is not free, in the model's units; else 0
     start: Values = ()  # values that free ones start from, in the model's units; else 0
