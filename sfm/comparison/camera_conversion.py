@@ -13,7 +13,7 @@ import numpy as np
 
 from sfm.camera import Camera, camera_from_values, pixel_from_tangents, tangents_from_pixel
 from sfm.conventions import BoolArray, FloatArray
-from sfm.distortion.models import MAX_PARAMETERS, MODELS, SURVEY_MODELS, Model, Role, observe
+from sfm.distortion.models import GENERAL_MODELS, MAX_PARAMETERS, MODELS, Model, Role, observe
 from sfm.errors import GeometryError, SurveyFileError
 from sfm.kernels.options import compiled
 from sfm.network import Estimate
@@ -39,7 +39,7 @@ def convert_camera(
 
     Args:
         camera: interior orientation to convert.
-        model: a name in sfm.distortion.models.SURVEY_MODELS.
+        model: a name in sfm.distortion.models.GENERAL_MODELS.
         region_px: x_min, y_min, x_max, y_max of the region that matters, px, shape (4,); the whole
             photograph if not given.
         held: parameters of the model that must be 0, others take over what they can; where b1 is one of
@@ -54,9 +54,9 @@ def convert_camera(
     """
     if model == camera.model and not needs_less(camera, held):
         return Conversion(camera, model, 0.0, 0.0)
-    if model not in SURVEY_MODELS:
+    if model not in GENERAL_MODELS:
         raise SurveyFileError(
-            f"camera {camera.name}: model '{model}', expected one of {', '.join(SURVEY_MODELS)}"
+            f"camera {camera.name}: model '{model}', expected one of {', '.join(GENERAL_MODELS)}"
         )
     xy = _grid(camera, region_px)
     uv = tangents_from_pixel(camera, xy)
@@ -183,7 +183,7 @@ def start_values(camera: Camera, model: str) -> Camera:
     else:
         fx, fy = camera.parameters[camera.plays(Role.FOCAL)][[0, -1]]
         c = fy * pixel[1]
-        same = camera.model in SURVEY_MODELS  # others have coefficients of another kind
+        same = camera.model in GENERAL_MODELS  # others have coefficients of another kind
         if to_opencv:
             names = camera.names if same else ("cx", "cy")
             values |= {name: camera.value(name) for name in names if name in MODELS[model].names}

@@ -138,11 +138,12 @@ _ONE = (*_parameters(Role.FOCAL, "f", "px"), *_CENTRE_PX)
 _TWO = (*_parameters(Role.FOCAL, "fx fy", "px"), *_CENTRE_PX)
 _K, _K1_K2, _K3_K4 = (_parameters(Role.RADIAL, names, "1") for names in ("k", "k1 k2", "k3 k4"))
 _P1_P2 = _parameters(Role.DECENTRING, "p1 p2", "1")
+_ALPHA_BETA = (*_parameters(Role.RADIAL, "alpha", "1"), *_parameters(Role.DENOMINATOR, "beta", "1"))
 _OPENCV = (*_TWO, *_K1_K2, *_P1_P2)
 _FRACTION = (*_parameters(Role.RADIAL, "k3", "1"), *_parameters(Role.DENOMINATOR, "k4 k5 k6", "1"))
 
-# Those that survey files offer, and that cameras are converted to
-SURVEY = (
+# Those that cameras are converted to
+GENERAL = (
     Model("brown", brown, _BROWN, corrects=True),
     Model("brown_forward", brown_forward, _FORWARD),
     Model("opencv", opencv, _OPENCV),
@@ -169,7 +170,7 @@ WIDE_ANGLE = (
     Model("fov", fov, (*_TWO, *_parameters(Role.RADIAL, "omega", "rad"))),
     Model("simple_division", division, (*_ONE, *_K)),
     Model("division", division, (*_TWO, *_K)),
-    Model("eucm", eucm, (*_TWO, *_parameters(Role.RADIAL, "alpha beta", "1"))),
+    Model("eucm", eucm, (*_TWO, *_ALPHA_BETA)),
     Model(
         "thin_prism_fisheye",
         thin_prism_fisheye,
@@ -187,9 +188,9 @@ WIDE_ANGLE = (
     ),
 )
 COLMAP = (*PERSPECTIVE, *WIDE_ANGLE)
-ALL = (*SURVEY, *COLMAP)
+ALL = (*GENERAL, *COLMAP)
 MODELS = {model.name: model for model in ALL}
-SURVEY_MODELS = tuple(model.name for model in SURVEY)
+GENERAL_MODELS = tuple(model.name for model in GENERAL)
 MAX_PARAMETERS = max(len(model.names) for model in ALL)
 
 

@@ -25,7 +25,6 @@ from sfm.adjustment.solve import adjust
 from sfm.camera import Camera
 from sfm.conventions import BoolArray, FloatArray
 from sfm.depth_reversal import reverse_depth
-from sfm.distortion.models import Role
 from sfm.distributions import f_isf
 from sfm.errors import GeometryError
 from sfm.network import Estimate, Network
@@ -236,7 +235,7 @@ class _Search:
 
 def _with_c_held(camera: Camera) -> Camera:
     free = camera.free.copy()
-    free[camera.plays(Role.FOCAL)] = False
+    free[camera.parts[0]] = False
     return replace(camera, free=free)
 
 
@@ -244,7 +243,7 @@ def _with_c_freed(estimate: Estimate, names: tuple[str, ...]) -> Estimate:
     cameras = []
     for camera in estimate.cameras:
         free = camera.free.copy()
-        free[camera.plays(Role.FOCAL)] |= camera.name in names
+        free[camera.parts[0]] |= camera.name in names
         cameras.append(replace(camera, free=free))
     return replace(estimate, cameras=tuple(cameras))
 
@@ -260,7 +259,7 @@ def scaled(estimate: Estimate, factor: float) -> Estimate:
     cameras = []
     for camera in estimate.cameras:
         p = camera.parameters.copy()
-        p[camera.plays(Role.FOCAL)] *= factor
+        p[camera.parts[0]] *= factor
         cameras.append(camera.with_parameters(p))
     centre = estimate.points.mean(axis=0)
     return replace(estimate, cameras=tuple(cameras), position=centre + factor * (estimate.position - centre))

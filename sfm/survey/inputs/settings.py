@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 
-from sfm.distortion.models import MODELS, SURVEY_MODELS
+from sfm.distortion.models import MODELS
 from sfm.files.plain_text import MAX_NAME, as_plain, is_plain
 
 
@@ -36,7 +36,7 @@ MAX_SIDE_PX = 1_000_000
 MAX_CORRELATIONS = 200  # of the parameters of one camera
 MAX_CAMERAS, MAX_GROUPS = 1000, 1000  # each is tried on every photograph
 # parameters that are adjusted where a survey says nothing, as far as its photographs determine them
-FREED_FIRST = ("c", "x0", "y0", "K1", "K2", "fx", "fy", "cx", "cy", "k1", "k2")
+FREED_FIRST = ("c", "x0", "y0", "K1", "K2", "fx", "fy", "f", "cx", "cy", "k1", "k2", "k")
 MAX_GLOBS = 1000  # of the photographs of all cameras
 MAX_LENGTH_PER_SIGMA = 1e6  # no scale bar is calibrated to better than a millionth of its length
 Length = Annotated[float, Field(ge=SMALLEST, le=LARGEST)]
@@ -102,7 +102,7 @@ class CameraSettings(Section):
     sensor_mm: TwoLengths | None = None  # width and height of the sensor, mm
     c_mm: Length | None = None  # start value of the principal distance, else the EXIF focal length, mm
     # distortion model: corrections of the measured point, or distortion of the ideal one
-    model: Literal[SURVEY_MODELS] = "brown"  # type: ignore[valid-type]
+    model: Literal[tuple(MODELS)] = "brown"  # type: ignore[valid-type]
     free: Names = ()  # parameters to be adjusted; [] = a calibrated camera; not given: the photographs decide
     fixed: Values = ()  # what is not free, in the model's units; else 0
     start: Values = ()  # values that free ones start from, in the model's units; else 0
