@@ -119,9 +119,8 @@ def test_camera_models_of_the_examples_are_those_there_are() -> None:
         name for row in re.findall(r"^\| (`.*?) \|", table, re.M) for name in re.findall(r"`(\w+)`", row)
     ]
     assert sorted(named) == sorted(GENERAL_MODELS)
-    others = (
-        page("reference/survey-examples.md").partition("### COLMAP's camera models")[2].partition("\n## ")[0]
-    )
+    others = page("reference/survey-examples.md").partition("### COLMAP's camera models")[2]
+    others = others.partition("\n## ")[0]
     assert set(re.findall(r"`([A-Z_]{3,})`", others)) == {model.name.upper() for model in COLMAP}
 
 
