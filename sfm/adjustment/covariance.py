@@ -81,11 +81,12 @@ class Marginal:
         for s, j in enumerate(points):
             own = slice(u + 3 * s, u + 3 * s + 3)
             cofactor[own, own] = Q.points[j]
-        H = np.vstack([motions.reduced[unknowns], motions.points[points].reshape(len(rows), motions.defect)])
+        d = len(motions.inverse)
+        H = np.vstack([motions.reduced[unknowns], motions.points[points].reshape(len(rows), d)])
         F = np.hstack(
             [
                 Q.F_reduced[:, unknowns],
-                np.moveaxis(Q.F_points[points], 1, 0).reshape(motions.defect, len(rows)),
+                np.moveaxis(Q.F_points[points], 1, 0).reshape(d, len(rows)),
             ]
         )
         half = H @ F

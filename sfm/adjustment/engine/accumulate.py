@@ -38,7 +38,7 @@ class Blocks(NamedTuple):
     Y_interior: FloatArray  # Y' of each object point by all interior unknowns; 0 for kept points, (n, 3, i)
     Yy: FloatArray  # Y y, what the right side is reduced by, (reduced,)
     K: FloatArray  # kept points by all reduced unknowns, (3 s, reduced)
-    held: IntArray  # 1 where a direction of a point had to be held, (n,)
+    held: IntArray  # how many directions of each point had to be held, (n,)
     order: IntArray  # image points, photograph by photograph, (k,)
     first: IntArray  # place in it of the first image point of each photograph, and the end, (m + 1,)
 
@@ -267,7 +267,7 @@ def _keep(j: int, row: int, observations: Observations, kept_start: int, blocks:
 
 @inlined
 def _factor(j: int, V: FloatArray, stretch: float, L: FloatArray) -> int:
-    """Cholesky factor of V with its diagonal times stretch; holds directions that the rays leave open."""
+    """Factor V, its diagonal times stretch, with directions that rays leave open held; how many these are."""
     held = 0
     for p in range(3):
         pivot = V[j, p, p] * stretch
@@ -276,7 +276,7 @@ def _factor(j: int, V: FloatArray, stretch: float, L: FloatArray) -> int:
         if pivot > SINGULAR_PIVOT * V[j, p, p]:
             L[j, p, p] = np.sqrt(pivot)
         else:
-            held = 1
+            held += 1
             L[j, p, p] = STIFF * np.sqrt(V[j, p, p]) if V[j, p, p] > 0.0 else STIFF
         for s in range(p + 1, 3):
             total = V[j, s, p]

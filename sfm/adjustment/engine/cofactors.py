@@ -155,7 +155,7 @@ def _datum_terms(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return (B'H)^-1 B'Q and (B'H)^-1 B'QB (H'B)^-1; kept points appear in B of the points only."""
     motions, b = optimum.motions, optimum.equations.blocks
-    n, d = len(b.L), motions.defect
+    n, d = len(b.L), len(motions.inverse)
     B = motions.constraints
     on_reduced = motions.on_reduced.copy()
     on_reduced[layout.kept_start :] += B[layout.kept].reshape(3 * len(layout.kept), d)

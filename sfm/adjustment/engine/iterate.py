@@ -24,6 +24,7 @@ from sfm.adjustment.datum import ResolvedDatum
 from sfm.adjustment.engine.collinearity import State, sum_of_squares
 from sfm.adjustment.engine.motions import Motions, motions_of
 from sfm.adjustment.engine.normals import Equations, Space, new_space, normal_equations, point_step
+from sfm.adjustment.engine.null_space import on_sound_points, with_further
 from sfm.adjustment.engine.observed_unknowns import Weighted, weighted_vPv
 from sfm.adjustment.engine.solvers.choice import choose_solver
 from sfm.adjustment.engine.solvers.protocol import Factor, Solver
@@ -228,24 +229,27 @@ def _solve(
     if equations.vPv > limit or not (np.isfinite(equations.vPv) and np.isfinite(equations.parts.g).all()):
         return None
     try:
-        motions = motions_of(layout, p.weighted, state, p.datum)
+        motions = motions_of(layout, p.weighted, state, on_sound_points(p.datum, equations.blocks.held))
     except GeometryError:  # the datum points have fallen together on the way
         return None
     if last is not None:
-        found = _step(layout, equations, last, motions)
+        found = _step(p, equations, last, motions)
         if found.within(tolerance):
             return found
     for coarse in (True, False) if single else (False,):
         factored = p.solver.factor(equations, motions, damped=damping > 0, coarse=coarse)
         if factored is None:
             continue
-        found = _step(layout, equations, factored, motions)
+        found = _step(p, equations, factored, motions)
         if not (coarse and found.within(COARSE)):
             return found
     return None
 
 
-def _step(layout: Unknowns, equations: Equations, factor: Factor, motions: Motions) -> Step:
+def _step(problem: Problem, equations: Equations, factor: Factor, motions: Motions) -> Step:
+    layout = problem.layout
+    datum = on_sound_points(problem.datum, equations.blocks.held)
+    motions = with_further(motions, factor.further, equations, layout, datum)
     with np.errstate(over="ignore", invalid="ignore"):  # a step without end is refused for what it leads to
         reduced = -factor.solve(equations.parts.g)
         points = point_step(equations, reduced, layout)

@@ -30,24 +30,31 @@ DETERMINED = 1e-9  # relative effect on an observed unknown above which it takes
 
 @dataclass(frozen=True)
 class Motions:
-    """Null vectors H of the normal equations and datum constraints B, split as the unknowns are."""
+    """Null vectors H of the normal equations and datum constraints B, split as the unknowns are.
+
+    Columns are the motions and, behind them, further null vectors that no motion explains.
+    """
 
     reduced: FloatArray  # H of the reduced unknowns, (reduced, d)
     points: FloatArray  # H of the object points, (n, 3, d)
     constraints: FloatArray  # B of the object points, (n, 3, d)
     on_reduced: FloatArray  # B of the reduced unknowns where no free point can carry it, (reduced, d)
     inverse: FloatArray  # (B'H)^-1, (d, d)
+    further: int = 0  # how many of the columns are further null vectors
 
     @property
     def defect(self) -> int:
         """Number of motions that the datum has to fix."""
-        return int(self.reduced.shape[1])
+        return len(self.inverse) - self.further
 
     def transform(self, reduced: FloatArray, points: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return a step (reduced,), (n, 3) carried into the datum: S dx."""
-        if self.defect == 0:
+        """Return steps (reduced, e), (n, 3, e), or one (reduced,), (n, 3), carried into the datum: S dx."""
+        d = len(self.inverse)
+        if d == 0:
             return reduced, points
-        t = self.inverse @ (np.einsum("npd,np->d", self.constraints, points) + self.on_reduced.T @ reduced)
+        B, n = self.constraints, 3 * len(points)
+        product = B.reshape(n, d).T @ points.reshape(n, *reduced.shape[1:])
+        t = self.inverse @ (product + self.on_reduced.T @ reduced)
         return reduced - self.reduced @ t, points - self.points @ t
 
 
@@ -82,9 +89,7 @@ def motions_of(layout: Unknowns, weighted: Weighted, state: State, datum: Resolv
     on_reduced = np.zeros_like(H)
     if d == 0:
         return Motions(H, points, points, on_reduced, np.zeros((0, 0)))
-    on: BoolArray = np.asarray(layout.point_free.any(axis=1))
-    if datum.points is not None:
-        on = on & datum.points
+    on = carriers(layout, datum)
     carrier = points if on.all() else points * on[:, None, None]
     flat = carrier.reshape(-1, d)
     if not on.any():
@@ -99,6 +104,12 @@ def motions_of(layout: Unknowns, weighted: Weighted, state: State, datum: Resolv
             B = carrier
         inverse = _regular_inverse(B.reshape(-1, d).T @ points.reshape(-1, d))
     return Motions(H, points, B, on_reduced, inverse)
+
+
+def carriers(layout: Unknowns, datum: ResolvedDatum) -> BoolArray:
+    """Return which object points carry the datum, (n,)."""
+    free: BoolArray = np.asarray(layout.point_free.any(axis=1))
+    return free if datum.points is None else free & datum.points
 
 
 def free_motions(layout: Unknowns, state: State) -> tuple[FloatArray, FloatArray]:

@@ -26,7 +26,7 @@ from sfm.adjustment.engine.accumulate import (
 from sfm.adjustment.engine.collinearity import State, new_workspace
 from sfm.adjustment.engine.observed_unknowns import Weighted, WeightedTerms, point_terms, weighted_terms
 from sfm.adjustment.engine.ordering import by_photograph
-from sfm.adjustment.engine.products import step_points
+from sfm.adjustment.engine.products import step_points, times_points, times_reduced
 from sfm.adjustment.engine.unknowns import Unknowns
 from sfm.conventions import FloatArray
 from sfm.kernels.threads import at_once
@@ -146,6 +146,21 @@ def point_step(equations: Equations, reduced_step: FloatArray, layout: Unknowns)
     step_points(layout.observations, layout.point_free, equations.blocks, reduced_step, dX)
     dX[layout.kept] = reduced_step[layout.kept_start :].reshape(-1, 3) * layout.point_free[layout.kept]
     return dX
+
+
+def times_schur(equations: Equations, layout: Unknowns, x: FloatArray) -> FloatArray:
+    """Return S x, the reduced normal matrix by some vectors without forming it, undamped, (reduced, e)."""
+    b, parts = equations.blocks, equations.parts
+    first, e = 6 * len(b.U), x.shape[1]
+    x = np.ascontiguousarray(x)
+    through = np.empty((len(b.y), 3, e))
+    times_reduced(layout.observations, b, x, through)
+    product = np.empty_like(x)
+    product[:first] = (b.U @ x[:first].reshape(len(b.U), 6, e)).reshape(first, e) + parts.border @ x[first:]
+    product[first:] = parts.border.T @ x[:first] + parts.corner @ x[first:]
+    np.negative(through, out=through)
+    times_points(layout.observations, b, through, product)
+    return product
 
 
 def solve_lower(L: FloatArray, h: FloatArray) -> FloatArray:

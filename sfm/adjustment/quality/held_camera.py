@@ -116,7 +116,7 @@ def _freed(a: Adjustment, parameters: tuple[tuple[str, int], ...]) -> tuple[floa
     problem = problem_of(layout, weighted, local.datum)
     weight = np.take(a.weights, layout.order) * layout.active
     step = newton_step(problem, state, weight)
-    if step is None or step.factor.further.shape[1]:
+    if step is None or step.motions.further:
         return None
     covariance = a.covariance.points if local.order is None else a.covariance.points[local.order]
     sigma = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))

@@ -8,7 +8,7 @@ import numpy as np
 
 from sfm.adjustment.engine.iterate import Optimum
 from sfm.adjustment.engine.motions import free_motions
-from sfm.adjustment.engine.products import times_points, times_reduced
+from sfm.adjustment.engine.normals import times_schur
 from sfm.adjustment.engine.unknowns import Unknowns, interior_names
 from sfm.conventions import BoolArray, FloatArray
 from sfm.network import Estimate, Network
@@ -26,7 +26,7 @@ def rank_defect(optimum: Optimum, layout: Unknowns) -> int:
     It counts the motions that the normal matrix maps to zero, its further null vectors, directions of
     object points that their rays leave open, and the unknowns held for want of image points.
     """
-    found = null_motions(optimum, layout) + int(optimum.factor.further.shape[1])
+    found = null_motions(optimum, layout) + optimum.motions.further
     return found + int(optimum.equations.blocks.held.sum()) + layout.held_defect
 
 
@@ -39,7 +39,7 @@ def null_motions(optimum: Optimum, layout: Unknowns) -> int:
     if d == 0:
         return 0
     scale = optimum.equations.parts.scale[:, None]
-    H = np.linalg.qr(optimum.motions.reduced / scale)[0]
+    H = np.linalg.qr(optimum.motions.reduced[:, :d] / scale)[0]
     together = H.sum(axis=1, keepdims=True) / np.sqrt(d)
     if _mapped_to_zero(optimum, layout, scale * together).all():
         return d
@@ -48,16 +48,9 @@ def null_motions(optimum: Optimum, layout: Unknowns) -> int:
 
 def _mapped_to_zero(optimum: Optimum, layout: Unknowns, H: FloatArray) -> BoolArray:
     """Return which columns of H, of scaled length 1, the reduced normal matrix maps to zero, (d,)."""
-    b, parts = optimum.equations.blocks, optimum.equations.parts
-    first, d = 6 * len(b.U), H.shape[1]
-    NH = np.empty_like(H)
-    NH[:first] = (b.U @ H[:first].reshape(len(b.U), 6, d)).reshape(first, d) + parts.border @ H[first:]
-    NH[first:] = parts.border.T @ H[:first] + parts.corner @ H[first:]
-    through = np.empty((len(b.y), 3, d))
-    times_reduced(layout.observations, b, H, through)
-    np.negative(through, out=through)
-    times_points(layout.observations, b, through, NH)
-    return np.asarray(np.linalg.norm(parts.scale[:, None] * NH, axis=0) < MAPPED_TO_ZERO)
+    scale = optimum.equations.parts.scale[:, None]
+    NH = times_schur(optimum.equations, layout, H)
+    return np.asarray(np.linalg.norm(scale * NH, axis=0) < MAPPED_TO_ZERO)
 
 
 def undetermined_of(
@@ -92,8 +85,10 @@ def words_of_motions(optimum: Optimum, layout: Unknowns) -> str:
     A rotation about an axis that does not run through the centre of the points is a rotation here, the shift
     that goes with it is not told.
     """
-    generators = free_motions(layout, optimum.state)[1].reshape(-1, 7)
-    opened = optimum.motions.points.reshape(-1, optimum.motions.defect)
+    sound = optimum.equations.blocks.held == 0  # other points do not move as the motions do
+    d = optimum.motions.defect
+    generators = free_motions(layout, optimum.state)[1][sound].reshape(-1, 7)
+    opened = optimum.motions.points[sound, :, :d].reshape(-1, d)
     V = np.linalg.qr(np.linalg.lstsq(generators, opened, rcond=None)[0])[0]  # (7, d)
     turns = _null_space(V[3:])  # those combinations that only shift
     rest = _complement(turns, V.shape[1])

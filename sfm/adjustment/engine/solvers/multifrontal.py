@@ -14,32 +14,28 @@ Wrobel (2016), sec. 15.2.4 and 4.5.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg import cho_factor, eigh, qr
+from scipy.linalg import cho_factor, qr
 from scipy.linalg.blas import dsyrk, dtrsm
 from scipy.linalg.lapack import dpotrf
 
 from sfm.adjustment.engine.collinearity import Observations
 from sfm.adjustment.engine.motions import Motions
 from sfm.adjustment.engine.normals import Equations
-from sfm.adjustment.engine.products import times_points, times_reduced
-from sfm.adjustment.engine.solvers.dense import MAX_BYTES, NULL, WEAK_PIVOT
+from sfm.adjustment.engine.solvers.dense import MAX_BYTES, WEAK_PIVOT
 from sfm.adjustment.engine.solvers.fronts import Front, Fronts
 from sfm.adjustment.engine.solvers.multifrontal_factor import Eliminated, MultifrontalFactor
+from sfm.adjustment.engine.solvers.null_search import SHIFT, null_vectors, refined
 from sfm.adjustment.engine.solvers.pairs import subtract_border
 from sfm.adjustment.engine.unknowns import Unknowns
-from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
+from sfm.conventions import AnyArray, FloatArray, IntArray
 from sfm.errors import GeometryError
 from sfm.kernels.blocks import subtract_pair
 from sfm.kernels.options import kernel
 from sfm.kernels.threads import at_once
-
-SHIFT = 1e-10  # share of the diagonal added to look for null vectors; far above rounding, far below weak ones
-INVERSE_STEPS = 12  # of inverse iteration; each brings null vectors forward by eigenvalue / SHIFT
-FIRST_SOUGHT = 8  # null vectors looked for at first
 
 
 class Border(NamedTuple):
@@ -77,15 +73,22 @@ class MultifrontalSolver:
             )
         scale = equations.parts.scale
         Q = np.linalg.qr(motions.reduced / scale[:, None])[0] if motions.defect else motions.reduced
-        first = self.layout.exterior_free.size
-        holds = _largest(Q[:first])  # of exterior unknowns, else A would stay singular
+        holds = _largest(Q)
         border = self._border(equations)
-        none = np.zeros((self.layout.reduced, 0))
-        factor = self._factored(equations, border, holds, none)
-        if not damped and (factor is None or factor.weak):
-            further = self._null_vectors(equations, border, holds, Q)
-            factor = self._factored(equations, border, np.concatenate([holds, _largest(further)]), further)
-        return factor
+        factor = self._factored(equations, border, holds)
+        if damped or not (factor is None or factor.weak):
+            return factor
+        shifted = self._factored(equations, border, holds, shift=SHIFT)
+        if shifted is None:
+            return factor
+        further = null_vectors(shifted, equations, self.layout, Q)
+        if further.shape[1] == 0:
+            return factor
+        # held together with the motions, so that no unknown is chosen for two null vectors
+        factor = self._factored(equations, border, _largest(np.hstack([Q, further])))
+        if factor is None:
+            return None
+        return replace(factor, further=refined(further, factor, equations, self.layout, Q))
 
     def _border(self, equations: Equations) -> Border:
         """Return the scaled border and corner."""
@@ -93,7 +96,7 @@ class MultifrontalSolver:
         first, inner = 6 * len(b.U), b.Y_interior.shape[2]
         C, D = parts.border.T.copy(), parts.corner.copy()
         subtract_border(self.layout.observations, b.Y, b.Y_interior, C[:inner])
-        interior = b.Y_interior.reshape(-1, inner)
+        interior = b.Y_interior.reshape(3 * len(b.y), inner)
         D[:inner, :inner] -= interior.T @ interior
         C = C.T
         s, sb = parts.scale[:first], parts.scale[first:]
@@ -107,7 +110,6 @@ class MultifrontalSolver:
         equations: Equations,
         border: Border,
         holds: IntArray,
-        further: FloatArray,
         *,
         shift: float = 0.0,
     ) -> MultifrontalFactor | None:
@@ -119,9 +121,9 @@ class MultifrontalSolver:
         if eliminated is None:
             return None
         weak = any(front.weakest**2 < WEAK_PIVOT for front in eliminated)
-        none = np.zeros((first, 0))
-        own = MultifrontalFactor(self.layout, self.fronts, equations.parts.scale, eliminated, border.C)
-        X, corner = none, border.D + np.diag(added[first:])
+        none = np.zeros((self.layout.reduced, 0))
+        own = MultifrontalFactor(self.layout, self.fronts, equations.parts.scale, eliminated, border.C, none)
+        X, corner = np.zeros((first, 0)), border.D + np.diag(added[first:])
         if len(border.D):
             X = own.solve_exterior(border.C)
             try:
@@ -129,7 +131,7 @@ class MultifrontalSolver:
             except np.linalg.LinAlgError:
                 return None
             weak = weak or bool(np.diagonal(corner).min() ** 2 < WEAK_PIVOT)
-        return own.with_border(X, corner, weak=weak, further=further)
+        return own.with_border(X, corner, weak=weak)
 
     def _eliminate(self, equations: Equations, added: FloatArray) -> list[Eliminated] | None:
         """Return all fronts eliminated, added to the diagonal; None if one is not positive definite."""
@@ -167,40 +169,6 @@ class MultifrontalSolver:
         own = np.arange(6 * front.own)
         F[own, own] += equations.damping + added[front.rows[own]]  # the diagonal of U is 1 by its scale
         return F
-
-    def _null_vectors(
-        self, equations: Equations, border: Border, holds: IntArray, Q: FloatArray
-    ) -> FloatArray:
-        """Return null vectors that are none of the motions Q, orthonormal, by inverse iteration."""
-        factor = self._factored(equations, border, holds, Q, shift=SHIFT)
-        if factor is None:
-            return np.zeros((len(Q), 0))
-        scale = equations.parts.scale[:, None]
-        sought = FIRST_SOUGHT
-        while True:
-            V = np.random.default_rng(0).standard_normal((len(Q), sought))
-            for _ in range(INVERSE_STEPS):
-                V = factor.solve(np.linalg.qr(V - Q @ (Q.T @ V))[0] / scale) / scale
-            V = np.linalg.qr(V - Q @ (Q.T @ V))[0]
-            values, vectors = eigh(V.T @ self._times(equations, V))
-            null: BoolArray = values < NULL
-            if not null.all() or sought >= len(Q):
-                return np.asarray(V @ vectors[:, null])
-            sought *= 2
-
-    def _times(self, equations: Equations, V: FloatArray) -> FloatArray:
-        """Return S V of the scaled, undamped matrix, (reduced, e)."""
-        b, parts, observations = equations.blocks, equations.parts, self.layout.observations
-        m, e = len(b.U), V.shape[1]
-        x = np.ascontiguousarray(parts.scale[:, None] * V)
-        points, through = np.empty((len(b.y), 3, e)), np.zeros_like(x)
-        times_reduced(observations, b, x, points)
-        times_points(observations, b, points, through)
-        top, low = x[: 6 * m], x[6 * m :]
-        product = np.empty_like(x)
-        product[: 6 * m] = (b.U @ top.reshape(m, 6, e)).reshape(6 * m, e) + parts.border @ low
-        product[6 * m :] = parts.border.T @ top + parts.corner @ low
-        return np.asarray(parts.scale[:, None] * (product - through))
 
 
 def _eliminated(F: FloatArray, own: int) -> tuple[Eliminated, FloatArray] | None:

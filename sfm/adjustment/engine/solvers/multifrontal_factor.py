@@ -48,17 +48,14 @@ class MultifrontalFactor:
     scale: FloatArray  # 1/sqrt of the unreduced diagonal, (reduced,)
     eliminated: list[Eliminated]  # L of A + holds = L L', front by front
     C: FloatArray  # (6 m, i + 3 s)
+    further: FloatArray  # null vectors that the datum does not explain, scaled, orthonormal, (reduced, e)
     X: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))  # A^-1 C, (6 m, i + 3 s)
     corner: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))  # upper factor of D - C' A^-1 C
-    further: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))  # null vectors that the datum does
-    # not explain, scaled, orthonormal, (reduced, e)
     weak: bool = False  # whether a pivot is near 0
 
-    def with_border(
-        self, X: FloatArray, corner: FloatArray, *, weak: bool, further: FloatArray
-    ) -> MultifrontalFactor:
+    def with_border(self, X: FloatArray, corner: FloatArray, *, weak: bool) -> MultifrontalFactor:
         """Return it with what belongs to the unknowns beside the exterior orientation."""
-        return replace(self, X=X, corner=corner, weak=weak, further=further)
+        return replace(self, X=X, corner=corner, weak=weak)
 
     def solve(self, right: FloatArray) -> FloatArray:
         """Return a solution of S x = right for one or several right sides, (reduced,) or (reduced, r)."""

@@ -104,7 +104,7 @@ class Run:
 
     def redundancy(self, optimum: Optimum, weight: FloatArray) -> int:
         """Observations and constraints minus unknowns."""
-        held = optimum.motions.defect + int(optimum.factor.further.shape[1])
+        held = len(optimum.motions.inverse)
         held += int(optimum.equations.blocks.held.sum())
         observations = 2 * int((weight > 0).sum()) + self.problem.weighted.count
         return observations - self.problem.layout.count + held

@@ -1,0 +1,149 @@
+"""Networks that leave more open than position, attitude and scale: what solvers hold makes no difference."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.sparse import csr_matrix
+
+from sfm.adjustment.datum import Datum
+from sfm.adjustment.engine import iterate
+from sfm.adjustment.engine.cofactors import cofactors, hat_complement, marginal_covariance
+from sfm.adjustment.engine.iterate import optimum_at, problem_of
+from sfm.adjustment.engine.observed_unknowns import weighted_of
+from sfm.adjustment.engine.solvers import choice
+from sfm.adjustment.engine.solvers.dense import DenseSolver
+from sfm.adjustment.engine.solvers.fronts import fronts_of
+from sfm.adjustment.engine.solvers.multifrontal import MultifrontalSolver
+from sfm.adjustment.engine.unknowns import Unknowns, unknowns_of
+from sfm.adjustment.quality.rank import rank_defect
+from sfm.network import Estimate, ImagePoints, Network
+from tests.synthetic_blocks import aerial, in_sigmas, lens, run
+
+MOTIONS = 7
+APART = np.array([1000.0, 0.0, 0.0])  # of two halves
+
+
+def in_fronts(layout: Unknowns) -> MultifrontalSolver:
+    m = len(layout.observations.camera)
+    joined = np.zeros((m, m), dtype=np.uint8)
+    choice._join(layout.observations, np.arange(len(layout.observations.start) - 1), joined)
+    return MultifrontalSolver(layout, fronts_of(layout.observations, csr_matrix(joined)))
+
+
+def halves(name: str, free: tuple[str, ...]) -> tuple[tuple[Network, Estimate], ...]:
+    """Two blocks, with a lens each, that have no point in common."""
+    made = [aerial(f"{half} half {name}", 5, 7, 700) for half in ("one", "other")]
+    return tuple(
+        (network, replace(truth, cameras=(replace(lens(free), name=f"lens {half}"),)))
+        for half, (network, truth) in enumerate(made)
+    )
+
+
+def together(parts: tuple[tuple[Network, Estimate], ...]) -> tuple[Network, Estimate]:
+    """Both as one network."""
+    (a, start), (b, other) = parts
+    k, own = a.image_points, b.image_points
+    network = Network(
+        a.images + tuple(f"other {name}" for name in b.images),
+        np.repeat([0, 1], [len(a.images), len(b.images)]),
+        a.points + tuple(f"other {name}" for name in b.points),
+        ImagePoints(
+            np.append(k.image, own.image + len(a.images)),
+            np.append(k.point, own.point + len(a.points)),
+            np.concatenate([k.xy, own.xy]),
+            np.concatenate([k.covariance, own.covariance]),
+        ),
+    )
+    return network, Estimate(
+        start.cameras + other.cameras,
+        np.concatenate([start.position, other.position + APART]),
+        np.concatenate([start.rotation, other.rotation]),
+        np.concatenate([start.points, other.points + APART]),
+    )
+
+
+@pytest.mark.parametrize("free", [(), ("c", "x0", "y0", "K1")])
+def test_two_networks_without_a_common_point_are_each_in_a_datum_of_their_own(
+    free: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Together they have twice seven defects, and the precision that each of them has by itself."""
+    parts = halves("datum", free)
+    network, start = together(parts)
+    results = {}
+    for way in (in_fronts, DenseSolver):
+        monkeypatch.setattr(iterate, "choose_solver", way)
+        results[way] = run(network, start, method="gauss-newton", tolerance=1e-9)
+    fronts, full = results[in_fronts], results[DenseSolver]
+    assert fronts.defect == full.defect == 2 * MOTIONS
+    assert fronts.redundancy == full.redundancy
+    assert fronts.sigma0 == pytest.approx(full.sigma0, rel=1e-9)
+    alone = [run(*part, method="gauss-newton", tolerance=1e-9) for part in parts]
+    assert full.redundancy == sum(one.redundancy for one in alone)
+    assert full.vPv == pytest.approx(sum(one.vPv for one in alone), rel=1e-9)
+    expected = np.concatenate([one.covariance.points / one.sigma0**2 for one in alone])
+    orientation = np.concatenate([one.covariance.exterior / one.sigma0**2 for one in alone])
+    for found in results.values():
+        assert in_sigmas(found.covariance.points / found.sigma0**2, expected) < 1e-7
+        assert in_sigmas(found.covariance.exterior / found.sigma0**2, orientation) < 1e-7
+    moved = np.linalg.norm(fronts.estimate.points - full.estimate.points, axis=1)
+    assert (moved / np.sqrt(np.trace(full.covariance.points, axis1=1, axis2=2))).max() < 1e-5
+
+
+@pytest.mark.parametrize("kind", ["free", "minimal"])
+@pytest.mark.parametrize(("left", "open_directions"), [(1, 4), (2, 2)])
+@pytest.mark.parametrize("free", [(), ("c", "x0", "y0", "K1")])
+def test_photographs_with_too_few_points_beside_two_networks_are_found_by_fronts_as_by_the_full_matrix(
+    free: tuple[str, ...],
+    left: int,
+    open_directions: int,
+    kind: str,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A test has left three photographs one point or two; more null vectors than are looked for at first."""
+    network, start = together(halves("few", free))
+    layout, state = unknowns_of(network, start, use_control=False)
+    weighted = weighted_of(network, layout, use_control=False)
+    image, rays = layout.observations.image, np.diff(layout.observations.start)
+    weight = np.ones(len(image))
+    poor = np.array([3, 20, 50])
+    for i in poor:
+        own = np.flatnonzero(image == i)
+        richest = np.argsort(-rays[layout.observations.point[own]], kind="stable")
+        weight[own[richest[left:]]] = 0
+    rays = np.bincount(layout.observations.point, weights=weight)
+    found = []
+    for way in (in_fronts, DenseSolver):
+        monkeypatch.setattr(iterate, "choose_solver", way)
+        problem = problem_of(layout, weighted, Datum(kind).resolve(network))
+        optimum = optimum_at(problem, state, weight)
+        assert optimum is not None
+        further = MOTIONS + open_directions * len(poor)
+        assert optimum.motions.further == further
+        of_points = 3 * (rays == 0).sum() + (rays == 1).sum()
+        assert rank_defect(optimum, layout) == MOTIONS + further + of_points
+        Q = cofactors(optimum, layout)
+        found.append(
+            (marginal_covariance(optimum, layout, Q, 1.0), hat_complement(optimum, layout, Q, weight))
+        )
+    (fronts, complement), (full, reference) = found
+    sound = (rays >= 2) & np.diagonal(full.points, axis1=1, axis2=2).all(axis=1)
+    rich = np.setdiff1d(np.arange(len(network.images)), poor)
+    assert in_sigmas(fronts.points[sound], full.points[sound]) < 1e-7
+    assert in_sigmas(fronts.exterior[rich], full.exterior[rich]) < 1e-7
+    assert np.abs(complement - reference)[weight > 0].max() < 1e-9
+    assert np.trace(reference[weight > 0], axis1=1, axis2=2).sum() == pytest.approx(
+        2 * weight.sum() - layout.count + MOTIONS + further + of_points, abs=1e-6
+    )
+
+
+def test_a_block_of_calibrated_cameras_is_adjusted_in_fronts(monkeypatch: pytest.MonkeyPatch) -> None:
+    network, truth = aerial("calibrated", 5, 7, 700)
+    truth = replace(truth, cameras=(lens(()),))
+    full = run(network, truth)
+    monkeypatch.setattr(iterate, "choose_solver", in_fronts)
+    fronts = run(network, truth)
+    assert fronts.defect == MOTIONS
+    assert in_sigmas(fronts.covariance.points, full.covariance.points) < 1e-8
