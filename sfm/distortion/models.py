@@ -19,9 +19,9 @@ and fills
 The models of photogrammetry correct the measured point, those of computer vision distort the ideal
 one; in both cases the residual vanishes at the true parameters and is one of the measured point, but for
 the models named after DBAT, whose residuals lie in the corrected plane. To add a model: write its function in
-a module beside `brown` and give it a row in a table below; adjustment, resection, conversion, survey file and reports
-follow from that row and from the part that each parameter plays in it, and the tests of derivatives and
-inverse run over it.
+a module beside `brown` and give it a row in a table below; adjustment, resection, conversion, survey file
+and reports follow from that row and from the part that each parameter plays in it, and the tests of
+derivatives and inverse run over it.
 """
 
 from __future__ import annotations
