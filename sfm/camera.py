@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from sfm.conventions import BoolArray, FloatArray, IntArray
-from sfm.distortion.models import MAX_PARAMETERS, MODELS, Role, number_of, observe
+from sfm.distortion.models import MAX_PARAMETERS, MODELS, WIDE_ANGLE, Role, number_of, observe
 from sfm.errors import SurveyFileError
 from sfm.kernels.options import compiled
 
@@ -69,9 +69,20 @@ class Camera:
         return np.array([parameter.role in roles for parameter in MODELS[self.model].parameters])
 
     @property
+    def parts(self) -> tuple[BoolArray, BoolArray, BoolArray]:
+        """Which parameters are focal lengths, principal point and distortion, (n,) each."""
+        focal, principal = self.plays(Role.FOCAL), self.plays(Role.X0, Role.Y0)
+        return focal, principal, ~(focal | principal)
+
+    @property
     def in_mm(self) -> bool:
         """Whether c and the principal point are in mm on the sensor; else there are focal lengths in px."""
         return MODELS[self.model].in_mm
+
+    @property
+    def wide_angle(self) -> bool:
+        """Whether equal angles are about equally long on its photographs, instead of equal tangents."""
+        return MODELS[self.model] in WIDE_ANGLE
 
     @property
     def index(self) -> int:
@@ -80,25 +91,23 @@ class Camera:
 
     @property
     def frame(self) -> FloatArray:
-        """Centre (px), pixel size (mm), planes of residuals and affinity for compiled code, (6,)."""
-        (width, height), model = self.size_px, MODELS[self.model]
-        measured_plane = model.corrects and not model.corrected_plane
-        centre = ((width - 1) / 2, (height - 1) / 2)
-        return np.array([*centre, *self.pixel_mm, float(measured_plane), float(model.distorted_affinity)])
+        """Centre (px), pixel size (mm) and variant of the model for compiled code, (6,)."""
+        width, height = self.size_px
+        return np.array([(width - 1) / 2, (height - 1) / 2, *self.pixel_mm, *MODELS[self.model].variant])
 
     @property
     def linear_frame(self) -> FloatArray:
         """`frame` with residuals in the corrected plane, where those of corrections are linear in the ray."""
         frame = self.frame
-        frame[4] = 0.0
+        if MODELS[self.model].corrects:
+            frame[4] = 0.0
         return frame
 
     @property
     def c_px(self) -> float:
         """Principal distance in px (mean of both directions)."""
-        if self.in_mm:
-            return float(self.parameters[0] / np.mean(self.pixel_mm))
-        return float(np.mean(self.parameters[:2]))
+        focal = float(np.mean(self.parameters[self.plays(Role.FOCAL)]))
+        return focal / float(np.mean(self.pixel_mm)) if self.in_mm else focal
 
     def value(self, name: str) -> float:
         """Value of one parameter in its unit; KeyError if the model has none of that name."""
@@ -132,10 +141,10 @@ def camera_from_values(
         model: one of MODELS.
         size_px: width and height of its photographs, px.
         pixel_mm: width and height of a pixel, mm.
-        c_mm: principal distance, mm; for opencv models it gives fx and fy.
+        c_mm: principal distance, mm; for models in px it gives f, or fx and fy.
         free: names of the parameters that are to be adjusted.
         values: (name, value) of parameters in the model's units; all others are 0, and the principal
-            point of opencv models is the centre of the photograph.
+            point of models in px is the centre of the photograph.
 
     Raises:
         SurveyFileError: unknown model or parameter name, or sizes that are not positive.
@@ -164,7 +173,9 @@ def camera_from_values(
     if MODELS[model].in_mm:
         p["c"] = c_mm
     else:
-        p["fx"], p["fy"] = c_mm / pixel_mm[0], c_mm / pixel_mm[1]
+        f = c_mm / pixel[0], c_mm / pixel[1]
+        focal = MODELS[model].names_of(Role.FOCAL)
+        p |= dict(zip(focal, f if len(focal) > 1 else (sum(f) / 2,), strict=True))
         p["cx"], p["cy"] = (size_px[0] - 1) / 2, (size_px[1] - 1) / 2
     p.update(values)
     return Camera(

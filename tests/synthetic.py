@@ -15,7 +15,7 @@ from sfm.adjustment.covariance import marginal_of
 from sfm.adjustment.result import Adjustment
 from sfm.camera import Camera, camera_from_values, project
 from sfm.conventions import BoolArray, FloatArray, rotation_from_vector
-from sfm.distortion.models import MODELS
+from sfm.distortion.models import COLMAP, MODELS
 from sfm.network import Estimate, ImagePoints, Network
 from sfm.stored_result import StoredResult
 
@@ -39,6 +39,38 @@ DISTORTION = {
 DISTORTION["brown_forward_affine"] = (*DISTORTION["brown_forward"], ("b1", 2e-4), ("b2", -1e-4))
 for _corrections in ("brown_affine", "brown_dbat", "brown_affine_dbat"):
     DISTORTION[_corrections] = DISTORTION["brown"]
+_MILD = (("k1", -0.08), ("k2", 0.04), ("cx", 1005.0), ("cy", 745.0))
+DISTORTION |= {
+    "simple_pinhole": (("cx", 1005.0),),
+    "pinhole": (("cx", 1005.0),),
+    "simple_radial": (("k", -0.08), ("cx", 1005.0)),
+    "radial": _MILD,
+    "simple_fisheye": (("cx", 1005.0),),
+    "fisheye": (("cx", 1005.0),),
+    "simple_radial_fisheye": (("k", -0.08), ("cx", 1005.0)),
+    "radial_fisheye": _MILD,
+    "opencv_fisheye": (*_MILD, ("k3", 0.006), ("k4", -0.001)),
+    "fov": (("omega", 0.9), ("cx", 1005.0)),
+    "simple_division": (("k", -0.2), ("cx", 1005.0)),
+    "division": (("k", -0.2), ("cx", 1005.0)),
+    "eucm": (("alpha", 0.6), ("beta", 1.1), ("cx", 1005.0)),
+    "thin_prism_fisheye": (
+        *(*_MILD, ("p1", 3e-4), ("p2", -2e-4), ("k3", 0.006), ("k4", -0.001)),
+        *(("sx1", 1e-3), ("sy1", -5e-4)),
+    ),
+    "rad_tan_thin_prism_fisheye": (
+        *(
+            ("k0", -0.08),
+            ("k1", 0.04),
+            ("k2", 6e-3),
+            ("k3", -1e-3),
+            ("k4", 1e-4),
+            ("k5", 1e-5),
+            ("cx", 1005.0),
+        ),
+        *(("p0", 3e-4), ("p1", -2e-4), ("s0", 1e-3), ("s1", 2e-3), ("s2", -5e-4), ("s3", 1e-3)),
+    ),
+}
 FREE = {
     "brown": ("c", "x0", "y0", "K1", "K2", "P1", "P2"),
     "brown_forward": ("c", "x0", "y0", "K1", "K2", "P1", "P2"),
@@ -48,6 +80,7 @@ FREE = {
 FREE["brown_dbat"] = FREE["brown"]
 FREE["brown_forward_affine"] = (*FREE["brown_forward"], "b1", "b2")
 FREE["brown_affine"] = FREE["brown_affine_dbat"] = (*FREE["brown"], "b1")
+FREE |= {model.name: model.names for model in COLMAP}
 
 
 def seed_of(name: str) -> np.random.Generator:
@@ -211,7 +244,7 @@ def _directions(rng: np.random.Generator, count: int) -> FloatArray:
 
 def _spoiled(camera: Camera, scale: float, distortion: bool) -> Camera:
     p = camera.parameters.copy()
-    lengths = 1 if camera.in_mm else 2
+    lengths = int(camera.parts[0].sum())
     p[:lengths] *= scale
     if not distortion:
         fresh = camera_from_values(

@@ -143,7 +143,7 @@ def test_pixel_jacobian_against_differences(model: str) -> None:
 @pytest.mark.parametrize(
     ("model", "free", "values", "message"),
     [
-        ("fisheye", (), (), "model 'fisheye', expected one of brown"),
+        ("panorama", (), (), "model 'panorama', expected one of brown"),
         ("brown", ("f",), (), "has no parameter 'f'"),
         ("opencv", (), (("K1", 0.1),), "has no parameter 'K1'"),
     ],

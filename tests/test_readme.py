@@ -10,7 +10,7 @@ import typer
 
 from adapters.formats.registry import FORMATS
 from sfm.cli.app import app
-from sfm.distortion.models import MODELS
+from sfm.distortion.models import COLMAP, GENERAL_MODELS
 from sfm.report.output import WRITTEN
 from sfm.runtime.faults import FAULT
 from sfm.survey.inputs.settings import Section
@@ -118,7 +118,10 @@ def test_camera_models_of_the_examples_are_those_there_are() -> None:
     named = [
         name for row in re.findall(r"^\| (`.*?) \|", table, re.M) for name in re.findall(r"`(\w+)`", row)
     ]
-    assert sorted(named) == sorted(MODELS)
+    assert sorted(named) == sorted(GENERAL_MODELS)
+    others = page("reference/survey-examples.md").partition("### COLMAP's camera models")[2]
+    others = others.partition("\n## ")[0]
+    assert set(re.findall(r"`([A-Z_]{3,})`", others)) == {model.name.upper() for model in COLMAP}
 
 
 def test_exit_codes_of_the_page_are_those_of_the_program() -> None:

@@ -78,7 +78,7 @@ def adjust_with_colmap(
 
     Args:
         network: photographs, points and image points, all of which take part.
-        estimate: start values, complete, cameras in an opencv model.
+        estimate: start values, complete, cameras in a model that COLMAP has.
         gauge: free | two_cameras | control. Free leaves the datum to Ceres' damping, which moves little;
             two_cameras holds the first two photographs in 7 elements, from where a poor start can lose
             points behind cameras; control holds the control points.
@@ -142,13 +142,13 @@ def colmap_free(cameras: tuple[Camera, ...]) -> tuple[bool, bool, bool]:
     for camera in cameras:
         if not camera.free.any():
             continue
-        groups = camera.free[:2], camera.free[2:4], camera.free[4:]
+        groups = [camera.free[part] for part in camera.parts]
         for name, group in zip(("focal length", "principal point", "distortion"), groups, strict=True):
             if group.any() and not group.all():
                 raise BackendError(
                     f"camera {camera.name}: its {name} is free in part, COLMAP frees all of it or nothing"
                 )
-        found.add((bool(groups[0][0]), bool(groups[1][0]), bool(groups[2][0])))
+        found.add((bool(groups[0].any()), bool(groups[1].any()), bool(groups[2].any())))
     if len(found) > 1:
         raise BackendError("cameras with different free parameters: COLMAP frees the same in all of them")
     return found.pop() if found else (False, False, False)

@@ -19,7 +19,7 @@ import numpy as np
 from adapters.colmap.adjuster import load_pycolmap, quiet, told
 from adapters.colmap.model_files import check_model_files
 from adapters.colmap.names import SIDE_FILE, Names, read_side_file, write_side_file
-from adapters.colmap.reconstruction import AXES, HALF_PIXEL, camera_of, reconstruction
+from adapters.colmap.reconstruction import AXES, HALF_PIXEL, as_opencv, camera_of, reconstruction
 from sfm.conventions import BoolArray
 from sfm.errors import OutputError, SurveyFileError
 from sfm.files.plain_text import MAX_NAME, is_name, shown
@@ -42,7 +42,7 @@ def write_model(
     Args:
         folder: made if it is not there.
         network: what was measured.
-        estimate: cameras in an opencv model; photographs without orientation are left out.
+        estimate: cameras in a model that COLMAP has; photographs without orientation are left out.
         rejected: image points that no point shall claim, (k,).
         text: text files instead of binary ones.
 
@@ -55,7 +55,8 @@ def write_model(
         scene = reconstruction(pycolmap, network, estimate, rejected=rejected)
     write_scene(folder, scene, text=text)
     try:
-        write_side_file(folder / SIDE_FILE, network, estimate)
+        as_read = replace(estimate, cameras=tuple(as_opencv(camera) for camera in estimate.cameras))
+        write_side_file(folder / SIDE_FILE, network, as_read)
     except OSError as error:
         raise OutputError(
             f"{folder}: the COLMAP model cannot be written: {error.strerror or error}"
@@ -110,9 +111,9 @@ def _opened(pycolmap: ModuleType, folder: Path, *, text: bool) -> Any:
 def read_model(folder: Path, *, text: bool | None = None) -> tuple[Network, Estimate]:
     """Read a COLMAP model, binary or text, as a network and its solution.
 
-    Cameras in COLMAP's pinhole and radial models become `opencv` ones. Points are named by their number
-    in COLMAP, cameras too, and a pixel is 1 mm, unless the model was written by `write_model`. The
-    covariance of every image point is 1 px^2, since COLMAP keeps none.
+    Cameras in COLMAP's pinhole and radial models become `opencv` ones, others keep their model. Points are
+    named by their number in COLMAP, cameras too, and a pixel is 1 mm, unless the model was written by
+    `write_model`. The covariance of every image point is 1 px^2, since COLMAP keeps none.
 
     Args:
         folder: of the model.
@@ -189,7 +190,7 @@ def network_of_scene(scene: Any, side: Names | None = None) -> tuple[Network, Es
     """
     side = side or Names()
     camera_ids = sorted(scene.cameras)
-    cameras = tuple(camera_of(scene.camera(i)) for i in camera_ids)
+    cameras = tuple(as_opencv(camera_of(scene.camera(i))) for i in camera_ids)
     image_ids = sorted(scene.images)
     images = [scene.image(i) for i in image_ids]
     point_ids = sorted(scene.point3D_ids())

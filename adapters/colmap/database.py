@@ -19,7 +19,7 @@ from scipy.sparse.csgraph import connected_components
 
 from adapters.colmap.adjuster import load_pycolmap, quiet, told
 from adapters.colmap.database_rows import read_rows
-from adapters.colmap.reconstruction import HALF_PIXEL, camera_of, colmap_camera
+from adapters.colmap.reconstruction import HALF_PIXEL, as_opencv, camera_of, colmap_camera
 from sfm.camera import Camera
 from sfm.conventions import IntArray
 from sfm.errors import OutputError
@@ -89,7 +89,7 @@ def read_database(path: Path) -> tuple[Network, tuple[Camera, ...]]:
             np.zeros(len(kept), dtype=bool),
         ),
     )
-    return network, tuple(camera_of(camera) for camera in rows.cameras)
+    return network, tuple(as_opencv(camera_of(camera)) for camera in rows.cameras)
 
 
 def _fill(pycolmap: Any, database: Any, network: Network, cameras: tuple[Camera, ...]) -> None:

@@ -14,31 +14,25 @@ Source: COLMAP 4.2 documentation, "Camera Models" and "Rigs and Frames".
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import ModuleType
 from typing import Any
 
 import numpy as np
 
+from adapters.colmap.model_files import MODELS as COLMAP_MODELS
 from sfm.camera import Camera
 from sfm.conventions import BoolArray, FloatArray
+from sfm.distortion.models import MODELS, Role
 from sfm.errors import BackendError
 from sfm.network import Estimate, Network, rows_of
 
 HALF_PIXEL = 0.5  # COLMAP's pixel coordinates minus ours, px
 AXES = np.diag([1.0, -1.0, -1.0])  # COLMAP's camera axes in ours
-COLMAP_NAMES = {"opencv": "OPENCV", "full_opencv": "FULL_OPENCV"}
-# COLMAP's simpler models as ours: where each of its parameters goes, in its order
-READABLE = {
-    "SIMPLE_PINHOLE": ("opencv", ("fx fy", "cx", "cy")),
-    "PINHOLE": ("opencv", ("fx", "fy", "cx", "cy")),
-    "SIMPLE_RADIAL": ("opencv", ("fx fy", "cx", "cy", "k1")),
-    "RADIAL": ("opencv", ("fx fy", "cx", "cy", "k1", "k2")),
-    "OPENCV": ("opencv", ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")),
-    "FULL_OPENCV": (
-        "full_opencv",
-        ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
-    ),
-}
+# Its camera models by the names of ours, which have the same parameters in the same order
+COLMAP_NAMES = {name: name.upper() for name in MODELS if name.upper() in COLMAP_MODELS}
+OPENCV_NAMES = {"f": "fx", "k": "k1"}  # where a model has one focal length or coefficient
+PARTS_OF_OPENCV = ("simple_pinhole", "pinhole", "simple_radial", "radial")
 
 
 def reconstruction(
@@ -88,47 +82,59 @@ def colmap_camera(pycolmap: ModuleType, camera: Camera, number: int) -> Any:
             f"camera {camera.name}: COLMAP has no model {camera.model}, convert it to opencv or full_opencv"
         )
     width, height = camera.size_px
-    params = camera.parameters.copy()
-    params[2:4] += HALF_PIXEL
     return pycolmap.Camera(
-        model=COLMAP_NAMES[camera.model], width=width, height=height, params=params, camera_id=number
+        model=COLMAP_NAMES[camera.model],
+        width=width,
+        height=height,
+        params=colmap_parameters(camera),
+        camera_id=number,
     )
 
 
+def colmap_parameters(camera: Camera) -> FloatArray:
+    """Return the parameters of a camera as COLMAP counts them, (n,)."""
+    return camera.parameters + HALF_PIXEL * camera.plays(Role.X0, Role.Y0)
+
+
+def with_colmap_parameters(camera: Camera, params: Any) -> Camera:
+    """Return a camera with other parameters, as COLMAP counts them."""
+    return camera.with_parameters(np.array(params) - HALF_PIXEL * camera.plays(Role.X0, Role.Y0))
+
+
 def camera_of(found: Any) -> Camera:
-    """Return a COLMAP camera as ours, pixel size 1.
+    """Return a COLMAP camera as ours in the same model, pixel size 1.
 
     Raises:
         BackendError: a model of COLMAP that is not read.
     """
-    if found.model_name not in READABLE:
+    model = str(found.model_name).lower()
+    if model not in COLMAP_NAMES:
         raise BackendError(
-            f"camera {found.camera_id}: COLMAP's model {found.model_name}, expected one of "
-            + ", ".join(READABLE)
+            f"camera {found.camera_id}: COLMAP's model {found.model_name} is not read, expected one of "
+            f"{', '.join(COLMAP_NAMES.values())}; make perspective photographs of it first"
         )
-    model, places = READABLE[found.model_name]
-    camera = Camera(
-        str(found.camera_id),
-        model,
-        (int(found.width), int(found.height)),
-        np.ones(2),
-        np.zeros(8 if model == "opencv" else 12),
-    )
-    parameters = camera.parameters
-    for place, value in zip(places, found.params, strict=True):
-        for name in place.split():
-            parameters[camera.names.index(name)] = value
-    parameters[2:4] -= HALF_PIXEL
-    return camera
+    size = int(found.width), int(found.height)
+    camera = Camera(str(found.camera_id), model, size, np.ones(2), np.zeros(len(MODELS[model].names)))
+    return with_colmap_parameters(camera, found.params)
+
+
+def as_opencv(camera: Camera) -> Camera:
+    """Return a camera in `opencv` if its model is one with fewer parameters of that; else as it is."""
+    if camera.model not in PARTS_OF_OPENCV:
+        return camera
+    of = {OPENCV_NAMES.get(name, name): s for s, name in enumerate(camera.names)}
+    of = {"fy": of["fx"]} | of
+    names = MODELS["opencv"].names
+    parameters = np.array([camera.parameters[of[name]] if name in of else 0.0 for name in names])
+    free = np.array([name in of and bool(camera.free[of[name]]) for name in names])
+    return replace(camera, model="opencv", parameters=parameters, free=free, shared=())
 
 
 def estimate_of(scene: Any, start: Estimate) -> Estimate:
     """Read the adjusted values back, counted as in the start values."""
-    cameras = []
-    for k, camera in enumerate(start.cameras):
-        params = np.array(scene.camera(k + 1).params, dtype=float)
-        params[2:4] -= HALF_PIXEL
-        cameras.append(camera.with_parameters(params))
+    cameras = [
+        with_colmap_parameters(camera, scene.camera(k + 1).params) for k, camera in enumerate(start.cameras)
+    ]
     poses = [scene.image(i + 1).cam_from_world().matrix() for i in range(len(start.position))]
     R = np.array([(AXES @ pose[:, :3]).T for pose in poses])
     position = np.array([-pose[:, :3].T @ pose[:, 3] for pose in poses])

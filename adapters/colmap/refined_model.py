@@ -16,15 +16,11 @@ import numpy as np
 
 from adapters.colmap.adjuster import load_pycolmap, quiet
 from adapters.colmap.camera_models import named_network, read_scene
-from adapters.colmap.reconstruction import AXES, HALF_PIXEL, colmap_camera
-from sfm.camera import Camera
+from adapters.colmap.reconstruction import AXES, HALF_PIXEL, camera_of, colmap_parameters
 from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.network import Estimate, Network, rows_of
 from sfm.similarity import Similarity, fit_similarity
 
-# COLMAP's models with one focal length, and how many coefficients of radial distortion they have: they are
-# read as the model of ours that has one, too
-SINGLE_FOCAL = {"SIMPLE_PINHOLE": 0, "SIMPLE_RADIAL": 1, "RADIAL": 2}
 STEPS = 200  # of COLMAP's adjuster, that holds the cameras of a rig together
 
 
@@ -56,13 +52,15 @@ def open_model(folder: Path) -> OpenModel:
 
     Raises:
         SurveyFileError: as `adapters.colmap.camera_models.read_model`.
-        BackendError: likewise, such as a fisheye camera.
+        BackendError: likewise, such as a panorama.
     """
     scene = read_scene(folder)
     network, estimate = named_network(folder, scene)
     camera_ids, image_ids = sorted(scene.cameras), sorted(scene.images)
+    same = [camera_of(scene.camera(i)) for i in camera_ids]
     cameras = tuple(
-        _single_focal(scene.camera(i), camera) for i, camera in zip(camera_ids, estimate.cameras, strict=True)
+        camera if camera.model == own.model else replace(own, name=camera.name)
+        for own, camera in zip(same, estimate.cameras, strict=True)
     )
     slots = [
         np.array([k for k, p in enumerate(scene.image(i).points2D) if p.has_point3D()], dtype=np.int64)
@@ -115,9 +113,7 @@ def update_model(
     with quiet(pycolmap):
         for k, i in enumerate(model.camera_ids):
             if images[model.network.camera == k].any():
-                scene.camera(i).params = colmap_parameters(
-                    pycolmap, estimate.cameras[k], str(scene.camera(i).model_name)
-                )
+                scene.camera(i).params = colmap_parameters(estimate.cameras[k])
         for i, rows in enumerate(rows_of(seen.image, len(images))):
             image = scene.image(model.image_ids[i])
             key_points = image.points2D
@@ -144,7 +140,7 @@ def update_model(
 def interior_rows(
     model: OpenModel, before: Estimate, after: Estimate, covariance: tuple[FloatArray, ...]
 ) -> tuple[tuple[object, ...], ...]:
-    """Return camera, model, parameter, value before and after and sigma (NaN if held), in COLMAP's terms.
+    """Return camera, model, parameter, value before and after and sigma (NaN if held), as COLMAP counts.
 
     Args:
         model: of the cameras.
@@ -152,57 +148,17 @@ def interior_rows(
         after: adjusted.
         covariance: of the free parameters of each camera, (f, f).
     """
-    pycolmap = load_pycolmap()
     rows: list[tuple[object, ...]] = []
     for k, number in enumerate(model.camera_ids):
-        found = model.scene.camera(number)
-        name, camera = str(found.model_name), after.cameras[k]
-        values = colmap_parameters(pycolmap, camera, name)
-        free = np.flatnonzero(camera.free)
-        J = colmap_jacobian(camera, name)[:, free]
-        Q = covariance[k] if len(covariance[k]) else np.full((len(free),) * 2, np.nan)  # no photographs
-        with np.errstate(invalid="ignore"):
-            sigma = np.sqrt(np.einsum("if,fg,ig->i", J, Q, J))
-        names = [one.strip() for one in str(found.params_info).split(",")]
-        first = colmap_parameters(pycolmap, before.cameras[k], name)
+        camera = after.cameras[k]
+        sigma = np.full(len(camera.names), np.nan)
+        if len(covariance[k]):  # none without photographs
+            sigma[camera.free] = np.sqrt(np.diagonal(covariance[k]))
+        values = (colmap_parameters(one.cameras[k]).tolist() for one in (before, after))
         rows += [
-            (number, name, *one[:3], one[3] if one[3] > 0 else float("nan"))
-            for one in zip(names, first.tolist(), values.tolist(), sigma.tolist(), strict=True)
+            (number, model.models[k], *one) for one in zip(camera.names, *values, sigma.tolist(), strict=True)
         ]
     return tuple(rows)
-
-
-def colmap_parameters(pycolmap: Any, camera: Camera, model: str) -> FloatArray:
-    """Return a camera's parameters in the order of the COLMAP model that it was read from."""
-    if model in SINGLE_FOCAL:
-        c, x0, y0, K1, K2 = camera.parameters[:5]
-        width, height = camera.size_px
-        return np.array([c, x0 + width / 2, height / 2 - y0, K1 * c**2, K2 * c**4])[: 3 + SINGLE_FOCAL[model]]
-    whole = np.array(colmap_camera(pycolmap, camera, 1).params, dtype=float)
-    return whole[:4] if model == "PINHOLE" else whole
-
-
-def colmap_jacobian(camera: Camera, model: str) -> FloatArray:
-    """Return d (parameters of the COLMAP model) / d (parameters of ours), (q, p); see `colmap_parameters`."""
-    p = len(camera.parameters)
-    if model not in SINGLE_FOCAL:
-        return np.eye(4 if model == "PINHOLE" else p, p)
-    c, _, _, K1, K2 = camera.parameters[:5]
-    J = np.zeros((5, p))
-    J[range(5), range(5)] = 1, 1, -1, c**2, c**4
-    J[3:, 0] = 2 * K1 * c, 4 * K2 * c**3
-    return J[: 3 + SINGLE_FOCAL[model]]
-
-
-def _single_focal(found: Any, camera: Camera) -> Camera:
-    """Return a camera with one focal length in the model of ours that has one, others as they are."""
-    if found.model_name not in SINGLE_FOCAL:
-        return camera
-    f, cx, cy, *k = np.array(found.params, dtype=float).tolist()
-    parameters = np.zeros(11)
-    parameters[:3] = f, cx - found.width / 2, found.height / 2 - cy
-    parameters[3 : 3 + len(k)] = [value / f ** (2 * n + 2) for n, value in enumerate(k)]
-    return Camera(camera.name, "brown_forward", camera.size_px, np.ones(2), parameters)
 
 
 def _adjust_rigs(pycolmap: Any, scene: Any, points: set[int]) -> None:

@@ -42,7 +42,7 @@ def covariance_with_colmap(
 
     Args:
         network: photographs, points and image points.
-        estimate: the solution, cameras in an opencv model.
+        estimate: the solution, cameras in a model that COLMAP has.
         gauge: two_cameras | control; COLMAP has no covariance without a gauge.
 
     Raises:

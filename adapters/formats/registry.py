@@ -19,6 +19,7 @@ import numpy as np
 from adapters.colmap.camera_models import read_model, write_model
 from adapters.colmap.database import read_database, write_database
 from adapters.colmap.names import SIDE_FILE
+from adapters.colmap.reconstruction import COLMAP_NAMES
 from adapters.formats.bal import read_bal, write_bal
 from adapters.formats.bundle_text import (
     INTERIOR,
@@ -103,7 +104,7 @@ def _write_ply(path: Path, network: Network, estimate: Estimate) -> None:
     write_ply(path, network.points, estimate.points)
 
 
-_COLMAP = ("full_opencv", "opencv")
+_COLMAP = ("full_opencv", *(name for name in COLMAP_NAMES if name != "full_opencv"))
 _OPENCV_DISTORTION = ("k1", "k2", "p1", "p2")
 _BROWN_DISTORTION = MODELS["brown"].names[3:]
 NUMBERS = (False, False)

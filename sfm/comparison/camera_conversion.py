@@ -13,7 +13,7 @@ import numpy as np
 
 from sfm.camera import Camera, camera_from_values, pixel_from_tangents, tangents_from_pixel
 from sfm.conventions import BoolArray, FloatArray
-from sfm.distortion.models import MAX_PARAMETERS, MODELS, Model, Role, observe
+from sfm.distortion.models import GENERAL_MODELS, MAX_PARAMETERS, MODELS, Model, Role, observe
 from sfm.errors import GeometryError, SurveyFileError
 from sfm.kernels.options import compiled
 from sfm.network import Estimate
@@ -39,7 +39,7 @@ def convert_camera(
 
     Args:
         camera: interior orientation to convert.
-        model: a name in sfm.distortion.models.MODELS.
+        model: a name in sfm.distortion.models.GENERAL_MODELS.
         region_px: x_min, y_min, x_max, y_max of the region that matters, px, shape (4,); the whole
             photograph if not given.
         held: parameters of the model that must be 0, others take over what they can; where b1 is one of
@@ -52,10 +52,12 @@ def convert_camera(
     Source: start values by series reversal, Luhmann et al., Close-Range Photogrammetry and 3D Imaging
     (2020), sec. 3.3; the fit is by least squares.
     """
-    if model not in MODELS:
-        raise SurveyFileError(f"camera {camera.name}: model '{model}', expected one of {', '.join(MODELS)}")
     if model == camera.model and not needs_less(camera, held):
         return Conversion(camera, model, 0.0, 0.0)
+    if model not in GENERAL_MODELS:
+        raise SurveyFileError(
+            f"camera {camera.name}: model '{model}', expected one of {', '.join(GENERAL_MODELS)}"
+        )
     xy = _grid(camera, region_px)
     uv = tangents_from_pixel(camera, xy)
     if not np.isfinite(uv).all():
@@ -135,7 +137,8 @@ def _affinity_in_pixels(camera: Camera) -> Camera:
     """
     sx, sy = camera.pixel_mm
     if not camera.in_mm:
-        return replace(camera, pixel_mm=np.array([sy * camera.value("fy") / camera.value("fx"), sy]))
+        fx, fy = camera.parameters[camera.plays(Role.FOCAL)][[0, -1]]
+        return replace(camera, pixel_mm=np.array([sy * fy / fx, sy]))
     stretch = 1 + camera.value("b1") if MODELS[camera.model].corrects else 1 / (1 + camera.value("b1"))
     values = dict(zip(camera.names, camera.parameters.tolist(), strict=True))
     values |= {"b1": 0.0, "x0": values["x0"] * stretch}
@@ -178,15 +181,19 @@ def start_values(camera: Camera, model: str) -> Camera:
             values |= {"k1": k1, "k2": k2, "p1": c * camera.value("P2"), "p2": -c * camera.value("P1")}
             values |= {"k3": k3} if model == "full_opencv" else {}
     else:
-        c = camera.value("fy") * pixel[1]
+        fx, fy = camera.parameters[camera.plays(Role.FOCAL)][[0, -1]]
+        c = fy * pixel[1]
+        same = camera.model in GENERAL_MODELS  # others have coefficients of another kind
         if to_opencv:
-            values |= {name: camera.value(name) for name in camera.names if name in MODELS[model].names}
+            names = camera.names if same else ("cx", "cy")
+            values |= {name: camera.value(name) for name in names if name in MODELS[model].names}
+            values |= {"fx": fx, "fy": fy}
         else:
-            stretch = camera.value("fx") * pixel[0] / c
+            stretch = fx * pixel[0] / c
             values |= {"x0": (camera.value("cx") - centre[0]) * pixel[0]}
             values |= {"y0": -(camera.value("cy") - centre[1]) * pixel[1]}
             values |= {"b1": 1 - stretch if MODELS[model].corrects else stretch - 1}
-        if MODELS[model].corrects:
+        if MODELS[model].corrects and same:
             K = _reversed(*_power_series(camera))
             values |= {f"K{i}": K[i - 1] / c ** (2 * i) for i in (1, 2, 3)}
             values |= {"P1": -camera.value("p2") / c, "P2": camera.value("p1") / c}

@@ -66,7 +66,7 @@ def ideal_camera(camera: Camera, models: tuple[str, ...]) -> Camera:
         c = camera.value("c")
         principal = centre + np.array([camera.value("x0") / sx, -camera.value("y0") / sy])
     else:
-        c = camera.value("fy") * sy
+        c = float(camera.parameters[camera.plays(Role.FOCAL)][-1]) * sy
         principal = np.array([camera.value("cx"), camera.value("cy")])
     model = "brown" if "opencv" not in models or (camera.in_mm and "brown" in models) else "opencv"
     x0, y0 = (principal - centre) * (sy, -sy)

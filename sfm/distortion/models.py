@@ -2,9 +2,10 @@
 
 A model is one compiled function `model(frame, p, x, y, u, v, residual, Ju, Jp)`. It is given
 
-    frame (6,)      centre of the photograph, px, width and height of a pixel, mm; of corrections 1 if
-                    residuals are to be those of the measured point, 0 if of the corrected one; of distortion
-                    1 if affinity and shear are those of the distorted point, 0 if of the ideal one
+    frame (6,)      centre of the photograph, px, width and height of a pixel, mm; of models in mm 1 if
+                    residuals are to be those of the measured point, 0 if of the corrected one, and 1 if
+                    affinity and shear are those of the distorted point, 0 if of the ideal one; of models
+                    in px the number of focal lengths and of further parameters behind the principal point
     p     (n,)      parameters in the order of the model's names
     x, y            measured pixel
     u, v            tangents of the ray in the image frame (u = -U/W, v = -V/W, y up)
@@ -18,9 +19,9 @@ and fills
 The models of photogrammetry correct the measured point, those of computer vision distort the ideal
 one; in both cases the residual vanishes at the true parameters and is one of the measured point, but for
 the models named after DBAT, whose residuals lie in the corrected plane. To add a model: write its function in
-a module beside `brown` and give it a row in `ALL`; adjustment, resection, conversion, survey file and reports
-follow from that row and from the part that each parameter plays in it, and the tests of derivatives and
-inverse run over it.
+a module beside `brown` and give it a row in a table below; adjustment, resection, conversion, survey file
+and reports follow from that row and from the part that each parameter plays in it, and the tests of
+derivatives and inverse run over it.
 """
 
 from __future__ import annotations
@@ -33,6 +34,8 @@ from typing import Any, NamedTuple
 from sfm.distortion.brown import brown, brown_affine
 from sfm.distortion.forward import brown_forward
 from sfm.distortion.opencv import full_opencv, opencv
+from sfm.distortion.radial import division, eucm, fisheye, fov, radial
+from sfm.distortion.thin_prism import rad_tan_thin_prism_fisheye, thin_prism_fisheye
 from sfm.kernels.options import kernel
 
 
@@ -45,6 +48,7 @@ class Role(Enum):
     RADIAL = "radial distortion"
     DENOMINATOR = "radial distortion, in the denominator of a fraction"
     DECENTRING = "decentring distortion"
+    PRISM = "thin prism distortion"
     AFFINITY = "ratio of the scales along x and y"
     SHEAR = "angle between the axes"
 
@@ -98,6 +102,14 @@ class Model:
         """Whether c, x0, y0 are in mm on the sensor; else there are focal lengths in px."""
         return "c" in self.names
 
+    @property
+    def variant(self) -> tuple[float, float]:
+        """What tells the models of one function apart, frame[4] and frame[5] of compiled code."""
+        if self.in_mm:
+            return float(self.corrects and not self.corrected_plane), float(self.distorted_affinity)
+        focal = len(self.names_of(Role.FOCAL))
+        return float(focal), float(len(self.names) - focal - 2)
+
 
 def _parameters(role: Role, names: str, *units: str) -> tuple[Parameter, ...]:
     """Parameters of one part, from their names separated by blanks and their units or the unit of all."""
@@ -121,16 +133,17 @@ _PLANE_MM = (
 _RADIAL_MM = _parameters(Role.RADIAL, "K1 K2 K3", "mm^-2", "mm^-4", "mm^-6")
 _BROWN = (*_CENTRE_MM, *_RADIAL_MM, *_PLANE_MM)
 _FORWARD = (*_CENTRE_MM, *_RADIAL_MM, *_parameters(Role.RADIAL, "K4", "mm^-8"), *_PLANE_MM)
-_OPENCV = (
-    *_parameters(Role.FOCAL, "fx fy", "px"),
-    *_parameters(Role.X0, "cx", "px"),
-    *_parameters(Role.Y0, "cy", "px"),
-    *_parameters(Role.RADIAL, "k1 k2", "1"),
-    *_parameters(Role.DECENTRING, "p1 p2", "1"),
-)
+_CENTRE_PX = (*_parameters(Role.X0, "cx", "px"), *_parameters(Role.Y0, "cy", "px"))
+_ONE = (*_parameters(Role.FOCAL, "f", "px"), *_CENTRE_PX)
+_TWO = (*_parameters(Role.FOCAL, "fx fy", "px"), *_CENTRE_PX)
+_K, _K1_K2, _K3_K4 = (_parameters(Role.RADIAL, names, "1") for names in ("k", "k1 k2", "k3 k4"))
+_P1_P2 = _parameters(Role.DECENTRING, "p1 p2", "1")
+_ALPHA_BETA = (*_parameters(Role.RADIAL, "alpha", "1"), *_parameters(Role.DENOMINATOR, "beta", "1"))
+_OPENCV = (*_TWO, *_K1_K2, *_P1_P2)
 _FRACTION = (*_parameters(Role.RADIAL, "k3", "1"), *_parameters(Role.DENOMINATOR, "k4 k5 k6", "1"))
 
-ALL = (
+# Those that cameras are converted to
+GENERAL = (
     Model("brown", brown, _BROWN, corrects=True),
     Model("brown_forward", brown_forward, _FORWARD),
     Model("opencv", opencv, _OPENCV),
@@ -140,7 +153,44 @@ ALL = (
     Model("brown_affine_dbat", brown_affine, _BROWN, corrects=True, corrected_plane=True),
     Model("brown_forward_affine", brown_forward, _FORWARD, distorted_affinity=True),
 )
+# COLMAP's others by its names in small letters, for models of its own that are adjusted and written as such
+PERSPECTIVE = (
+    Model("simple_pinhole", radial, _ONE),
+    Model("pinhole", radial, _TWO),
+    Model("simple_radial", radial, (*_ONE, *_K)),
+    Model("radial", radial, (*_ONE, *_K1_K2)),
+)
+# of lenses that show equal angles about equally long, where others show equal tangents so
+WIDE_ANGLE = (
+    Model("simple_fisheye", fisheye, _ONE),
+    Model("fisheye", fisheye, _TWO),
+    Model("simple_radial_fisheye", fisheye, (*_ONE, *_K)),
+    Model("radial_fisheye", fisheye, (*_ONE, *_K1_K2)),
+    Model("opencv_fisheye", fisheye, (*_TWO, *_K1_K2, *_K3_K4)),
+    Model("fov", fov, (*_TWO, *_parameters(Role.RADIAL, "omega", "rad"))),
+    Model("simple_division", division, (*_ONE, *_K)),
+    Model("division", division, (*_TWO, *_K)),
+    Model("eucm", eucm, (*_TWO, *_ALPHA_BETA)),
+    Model(
+        "thin_prism_fisheye",
+        thin_prism_fisheye,
+        (*_OPENCV, *_K3_K4, *_parameters(Role.PRISM, "sx1 sy1", "1")),
+    ),
+    Model(
+        "rad_tan_thin_prism_fisheye",
+        rad_tan_thin_prism_fisheye,
+        (
+            *_TWO,
+            *_parameters(Role.RADIAL, "k0 k1 k2 k3 k4 k5", "1"),
+            *_parameters(Role.DECENTRING, "p0 p1", "1"),
+            *_parameters(Role.PRISM, "s0 s1 s2 s3", "1"),
+        ),
+    ),
+)
+COLMAP = (*PERSPECTIVE, *WIDE_ANGLE)
+ALL = (*GENERAL, *COLMAP)
 MODELS = {model.name: model for model in ALL}
+GENERAL_MODELS = tuple(model.name for model in GENERAL)
 MAX_PARAMETERS = max(len(model.names) for model in ALL)
 
 

@@ -31,6 +31,9 @@ def intersect_image_points(
 ) -> Intersection:
     """Return the object points that most rays of oriented photographs support; see `intersect`.
 
+    Rays of wide-angle cameras are compared by their angles: each is taken as the axis of a photograph of its
+    own. Their tangents would weigh a pixel at 70 degrees off the axis as much as eight in the middle.
+
     Args:
         seen: image points.
         camera: index of the camera of each photograph, (m,).
@@ -38,12 +41,32 @@ def intersect_image_points(
         n_points: number of object points.
         tolerance_px: largest residual of a ray that takes part, px of the camera with the shortest c.
     """
+    uv, image = image_tangents(seen, camera, estimate.cameras), seen.image
+    position, rotation = estimate.position, estimate.rotation
+    wide = np.array([one.wide_angle for one in estimate.cameras])[camera[image]]
+    if wide.any():
+        position = np.concatenate([position, position[image[wide]]])
+        rotation = np.concatenate([rotation, _along_rays(rotation[image[wide]], uv[wide])])
+        image = image.copy()
+        image[wide] = len(estimate.position) + np.arange(int(wide.sum()))
+        uv[wide] *= 0.0  # NaN stays
     return intersect(
-        image_tangents(seen, camera, estimate.cameras),
-        seen.image,
+        uv,
+        image,
         seen.point,
-        estimate.position,
-        estimate.rotation,
+        position,
+        rotation,
         n_points=n_points,
         tolerance=tolerance_px / min(one.c_px for one in estimate.cameras),
     )
+
+
+def _along_rays(rotation: FloatArray, uv: FloatArray) -> FloatArray:
+    """Return rotations whose axis -z is the ray with tangents (u, v) under other ones, (k, 3, 3)."""
+    u, v = uv.T
+    one = np.ones(len(uv))
+    z = np.column_stack([-u, -v, one])
+    z /= np.linalg.norm(z, axis=1, keepdims=True)
+    x = np.column_stack([one, 0 * one, u])
+    x /= np.linalg.norm(x, axis=1, keepdims=True)
+    return np.asarray(rotation @ np.stack([x, np.cross(z, x), z], axis=2))

@@ -190,6 +190,18 @@ def test_a_rational_distortion_that_has_grown_may_still_converge() -> None:
     assert found.adjustment.converged and found.adjustment.iterations > 40
 
 
+@pytest.mark.parametrize(
+    "model", ["simple_radial", "opencv_fisheye", "fov", "division", "thin_prism_fisheye"]
+)
+def test_both_adjusters_end_at_the_same_optimum_in_a_model_of_colmap(model: str) -> None:
+    rng = seed_of(f"same optimum {model}")
+    network, truth = make_network(rng, model=model, noise_px=0.1, visibility=0.8)
+    adjustment = adjust(network, perturb(truth, rng), datum=Datum("free"), sigma_px=0.1, reject="none")
+    found = compare_adjusters(adjustment, adjust_with_colmap)
+    assert found.model == model and found.agree and found.comparison.exceeded == ()
+    assert found.comparison.cost[1] == pytest.approx(found.comparison.cost[0], rel=1e-9)
+
+
 def test_a_backend_that_stops_early_is_told_from_one_that_ends_elsewhere() -> None:
     rng = seed_of("stops early")
     network, truth = make_network(rng, model="opencv")

@@ -9,13 +9,13 @@ import pytest
 
 from sfm.camera import tangents_from_pixel
 from sfm.comparison.undistortion import undistort
-from sfm.distortion.models import MODELS
+from sfm.distortion.models import GENERAL_MODELS
 from sfm.errors import GeometryError
 from tests.synthetic import make_network, seed_of
 
 
 @pytest.mark.parametrize("model", ["brown", "full_opencv", "brown_forward"])
-@pytest.mark.parametrize("models", [("opencv",), ("brown",), tuple(MODELS)])
+@pytest.mark.parametrize("models", [("opencv",), ("brown",), GENERAL_MODELS])
 def test_rays_stay_and_covariances_follow(model: str, models: tuple[str, ...]) -> None:
     network, truth = make_network(seed_of("undistort"), images=2, points=10, model=model)
     camera = replace(truth.cameras[0], pixel_mm=truth.cameras[0].pixel_mm * [1.01, 1.0])

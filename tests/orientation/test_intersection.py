@@ -3,8 +3,10 @@
 import numpy as np
 import pytest
 
-from sfm.camera import tangents_from_pixel
+from sfm.camera import Camera, project, tangents_from_pixel
 from sfm.conventions import rotation_from_angles
+from sfm.network import Estimate, ImagePoints
+from sfm.orientation.image_rays import intersect_image_points
 from sfm.orientation.intersection import intersect
 from tests.places import ROOT
 from tests.synthetic import make_network, seed_of
@@ -95,3 +97,31 @@ def test_rays_that_meet_behind_the_cameras_do_not_intersect():
     diverging = np.array([[-0.2, 0.0], [0.2, 0.0]])
     result = intersect(diverging, np.arange(2), np.zeros(2, dtype=int), positions, rotations)
     assert np.isnan(result.points).all() and not result.used.any()
+
+
+def test_rays_of_wide_angle_cameras_count_by_their_angles() -> None:
+    """A pixel at 80 degrees off the axis is 33 times as long in tangents as one in the middle."""
+    rng = seed_of("wide angle")
+    camera = Camera("lens", "simple_fisheye", (1000, 1000), np.ones(2), np.array([300.0, 499.5, 499.5]))
+    m, n, noise_px = 4, 200, 0.5
+    position = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [-1.0, -1.0, 0.0]])
+    tilt = np.radians([0.0, 75.0, -75.0, 40.0])  # the points are near the axis of the first only
+    rotation = np.array([rotation_from_angles(angle, 0.0, 0.0) for angle in tilt])
+    points = np.array([0.0, 0.0, -4.0]) + rng.uniform(-0.5, 0.5, (n, 3))
+    estimate = Estimate((camera,), position, rotation, np.full((n, 3), np.nan))
+    of_each = [project(camera, *pose, points) for pose in zip(position, rotation, strict=True)]
+    xy = np.concatenate(of_each) + rng.normal(0, noise_px, (m * n, 2))
+    seen = ImagePoints(
+        np.repeat(np.arange(m), n),
+        np.tile(np.arange(n), m),
+        xy,
+        np.tile(noise_px**2 * np.eye(2), (m * n, 1, 1)),
+    )
+    found = intersect_image_points(
+        seen, np.zeros(m, dtype=np.int64), estimate, n_points=n, tolerance_px=5 * noise_px
+    )
+    assert found.used.all()
+    assert found.sigma0 * camera.c_px == pytest.approx(noise_px, rel=5 / np.sqrt(2 * found.redundancy))
+    errors = found.points - points
+    normed = np.einsum("ni,nij,nj->n", errors, np.linalg.inv(found.covariance), errors)
+    assert normed.mean() == pytest.approx(3.0, rel=5 * np.sqrt(2 / (3 * n)))

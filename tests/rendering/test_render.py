@@ -342,7 +342,7 @@ def test_a_scene_file_gives_photographs_and_their_truth(tmp_path):
         ("radius = 2.5", "radius = 2.5\ncolour = 3", "colour"),
         ("[scene]", "[scene", "scene.toml"),
         ('codes = "ring14"', 'codes = "aruco4x4_50"', "codes = 'aruco4x4_50', expected rings or arcs"),
-        ('model = "brown"', 'model = "fisheye"', "camera.model: model 'fisheye', expected one of brown"),
+        ('model = "brown"', 'model = "panorama"', "camera.model: model 'panorama', expected one of brown"),
     ],
 )
 def test_wrong_scene_files_are_one_line(tmp_path, old, new, message):

@@ -235,7 +235,7 @@ class _Search:
 
 def _with_c_held(camera: Camera) -> Camera:
     free = camera.free.copy()
-    free[: 1 if camera.in_mm else 2] = False
+    free[camera.parts[0]] = False
     return replace(camera, free=free)
 
 
@@ -243,7 +243,7 @@ def _with_c_freed(estimate: Estimate, names: tuple[str, ...]) -> Estimate:
     cameras = []
     for camera in estimate.cameras:
         free = camera.free.copy()
-        free[: 1 if camera.in_mm else 2] |= camera.name in names
+        free[camera.parts[0]] |= camera.name in names
         cameras.append(replace(camera, free=free))
     return replace(estimate, cameras=tuple(cameras))
 
@@ -259,7 +259,7 @@ def scaled(estimate: Estimate, factor: float) -> Estimate:
     cameras = []
     for camera in estimate.cameras:
         p = camera.parameters.copy()
-        p[: 1 if camera.in_mm else 2] *= factor
+        p[camera.parts[0]] *= factor
         cameras.append(camera.with_parameters(p))
     centre = estimate.points.mean(axis=0)
     return replace(estimate, cameras=tuple(cameras), position=centre + factor * (estimate.position - centre))

@@ -104,7 +104,7 @@ def compare_adjusters(
         adjustment: of the survey.
         backend: the other adjuster, a function of network and start values.
         name: of the backend.
-        model: functional model of both; that of the survey if it is an opencv one, else full_opencv.
+        model: functional model of both; that of the survey if COLMAP has it, else full_opencv.
 
     Raises:
         GeometryError: nothing is left to compare.

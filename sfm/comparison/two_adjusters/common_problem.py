@@ -15,7 +15,6 @@ from sfm.network import Estimate, ImagePoints, Network
 from sfm.reduced_network import reduce_network, supported
 
 MIN_RAYS, MIN_POINTS = 2, 3  # photographs that determine a point, points that determine a photograph
-GROUPS = (slice(0, 2), slice(2, 4), slice(4, None))  # focal lengths, principal point, distortion
 
 
 def common_problem(
@@ -34,7 +33,8 @@ def common_problem(
     estimate = adjustment.estimate
     cameras = estimate.cameras
     if model is None:
-        model = "opencv" if all(camera.model == "opencv" for camera in cameras) else "full_opencv"
+        one = {camera.model for camera in cameras}
+        model = one.pop() if len(one) == 1 and not cameras[0].in_mm else "full_opencv"
     conversions = tuple(convert_camera(camera, model) for camera in cameras)
     converted = tuple(conversion.camera for conversion in conversions)
     grouped = grouped_free(converted)
@@ -62,20 +62,18 @@ def common_problem(
 
 
 def grouped_free(cameras: tuple[Camera, ...]) -> tuple[Camera, ...]:
-    """Return opencv cameras whose free parameters are whole groups, the same in all that are not fixed."""
-    free = [any(camera.free[group].any() for camera in cameras) for group in GROUPS]
+    """Return cameras whose free parameters are whole groups, the same in all that are not fixed."""
+    free = [any(camera.free[camera.parts[g]].any() for camera in cameras) for g in range(3)]
     out = []
     for camera in cameras:
         flags: BoolArray = np.zeros(len(camera.names), dtype=bool)
         if camera.free.any():
-            for group, is_free in zip(GROUPS, free, strict=True):
+            for group, is_free in zip(camera.parts, free, strict=True):
                 flags[group] = is_free
         out.append(replace(camera, free=flags))
     return tuple(out)
 
 
 def distortion_held(camera: Camera) -> Camera:
-    """Return a camera in an opencv model with its distortion fixed."""
-    free = camera.free.copy()
-    free[GROUPS[2]] = False
-    return replace(camera, free=free)
+    """Return a camera with its distortion fixed."""
+    return replace(camera, free=camera.free & ~camera.parts[2])

@@ -18,12 +18,12 @@ from sfm.adjustment.quality.reliability import tau_critical
 from sfm.adjustment.result import Adjustment
 from sfm.camera import Camera, pixel_from_tangents, tangents_from_pixel
 from sfm.conventions import FloatArray, IntArray
+from sfm.distortion.models import Role
 from sfm.distributions import f_sf
 from sfm.report.findings.checks import CheckedControl
 from sfm.report.findings.given_residuals import Given
 from sfm.result import SurveyResult
 
-RADIAL = (("K1", "K2", "K3", "K4"), ("k1", "k2", "k3"))
 EDGE_STEPS = 9  # places along a side of the photograph at which distortion is taken
 
 
@@ -266,9 +266,7 @@ def _lens(camera: Camera) -> Lens:
             for side in ((x, zero), (x, one * (height - 1)), (zero, y), (one * (width - 1), y))
         ]
     )
-    straight = camera.with_parameters(
-        np.where([name[0] in "KPkpb" for name in camera.names], 0.0, camera.parameters)
-    )
+    straight = camera.with_parameters(np.where(camera.parts[2], 0.0, camera.parameters))
     rays = tangents_from_pixel(camera, edge)
     moved = np.linalg.norm(pixel_from_tangents(straight, rays) - edge, axis=1)
     middle = np.array([[0.0, (height - 1) / 2], [width - 1.0, (height - 1) / 2]])
@@ -291,18 +289,17 @@ def _cumulative(a: Adjustment) -> tuple[CumulativeTest, ...]:
     for camera, Q in zip(a.estimate.cameras, a.covariance.interior, strict=True):
         free = np.flatnonzero(camera.free)[: len(Q)]
         names = [camera.names[s] for s in free]
-        for radial in RADIAL:
-            own = [names.index(name) for name in radial if name in names]
-            for first in range(len(own)):
-                some = own[first:]
-                value = camera.parameters[free[some]]
-                scale = np.sqrt(np.diagonal(Q)[some])
-                if not (scale > 0).all() or a.redundancy < 1:
-                    continue
-                normed = Q[np.ix_(some, some)] / scale[:, None] / scale
-                statistic = float((value / scale) @ np.linalg.solve(normed, value / scale)) / len(some)
-                p = float(f_sf(statistic, len(some), a.redundancy))
-                owner = camera.group_of(int(free[some[0]])) or camera.name
-                which = ", ".join(names[s] for s in some)
-                tests[owner, which] = CumulativeTest(owner, which, statistic, p)
+        own = np.flatnonzero(camera.plays(Role.RADIAL)[free])
+        for first in range(len(own)):
+            some = own[first:]
+            value = camera.parameters[free[some]]
+            scale = np.sqrt(np.diagonal(Q)[some])
+            if not (scale > 0).all() or a.redundancy < 1:
+                continue
+            normed = Q[np.ix_(some, some)] / scale[:, None] / scale
+            statistic = float((value / scale) @ np.linalg.solve(normed, value / scale)) / len(some)
+            p = float(f_sf(statistic, len(some), a.redundancy))
+            owner = camera.group_of(int(free[some[0]])) or camera.name
+            which = ", ".join(names[s] for s in some)
+            tests[owner, which] = CumulativeTest(owner, which, statistic, p)
     return tuple(tests.values())

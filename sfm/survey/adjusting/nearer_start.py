@@ -66,9 +66,8 @@ def words_of_held(before: tuple[Camera, ...], after: tuple[Camera, ...]) -> tupl
 
 def _candidates(start: Estimate, ended: Estimate, datum: Datum) -> Iterator[Estimate]:
     """Yield where the adjustment ended, brought back to c of the start, and the start; each reflected too."""
-    lengths = slice(0, 1 if start.cameras[0].in_mm else 2)
-    factor = start.cameras[0].parameters[lengths].mean() / ended.cameras[0].parameters[lengths].mean()
-    back = replace(scaled(ended, float(factor)), cameras=start.cameras) if factor > 0 else start
+    factor = start.cameras[0].c_px / ended.cameras[0].c_px
+    back = replace(scaled(ended, factor), cameras=start.cameras) if factor > 0 else start
     for one in (back, start):
         yield one
         if datum.kind != "control":

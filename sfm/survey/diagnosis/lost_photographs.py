@@ -134,7 +134,7 @@ def _with_c(estimate: Estimate, factor: float) -> Estimate:
     cameras = []
     for camera in estimate.cameras:
         p, free = camera.parameters.copy(), camera.free.copy()
-        focal = slice(0, 1 if camera.in_mm else 2)
+        focal = camera.parts[0]
         p[focal] *= factor
         free[focal] = True
         cameras.append(replace(camera.with_parameters(p), free=free))

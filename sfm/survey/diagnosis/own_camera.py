@@ -214,10 +214,9 @@ def _scaled_resection(
 ) -> tuple[Camera, FloatArray, FloatArray] | None:
     """Return the camera with c multiplied by the factor that fits best, and the exterior orientation."""
     best: tuple[float, Camera, FloatArray, FloatArray] | None = None
-    lengths = 1 if camera.in_mm else 2
     for scale in SCALES:
         p = camera.parameters.copy()
-        p[:lengths] *= scale
+        p[camera.parts[0]] *= scale
         one = camera.with_parameters(p)
         tolerance = TOLERANCE_PX / one.c_px
         found = resect_robust(tangents_from_pixel(one, xy), points, tolerance=tolerance, max_trials=TRIALS)

@@ -121,7 +121,11 @@ def _own(camera: Camera) -> list[int]:
 def _unit(camera: Camera, s: int) -> float:
     """Return the order of magnitude of a parameter: principal points like c, K1 that of one half of 1/c^2."""
     c = float(camera.parameters[0])
-    return 1 / (2 * c**2) if camera.plays(Role.RADIAL)[s] and camera.in_mm else (c if s < 4 else 1.0)
+    return (
+        1 / (2 * c**2)
+        if camera.plays(Role.RADIAL)[s] and camera.in_mm
+        else (1.0 if camera.parts[2][s] else c)
+    )
 
 
 def _clusters(votes: _Votes, m: int) -> TwoGroups | None:

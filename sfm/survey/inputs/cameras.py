@@ -93,8 +93,8 @@ def start_cameras(
                 f"{where}: a pixel of {pixel[0]:g} x {pixel[1]:g} mm, expected sides of at most "
                 f"{MAX_PIXEL_MM:g} mm that differ by a factor of at most {MAX_PIXEL_RATIO:g}"
             )
-        if focal is None and "fx" in known:
-            focal = known["fx"] * pixel[0]
+        if focal is None:
+            focal = next((known[name] * pixel[0] for name in ("fx", "f") if name in known), None)
         if focal is None:
             raise SurveyFileError(f"{where}: no photograph's EXIF data tell the focal length, c_mm is needed")
         cameras.append(

@@ -36,7 +36,7 @@ MAX_SIDE_PX = 1_000_000
 MAX_CORRELATIONS = 200  # of the parameters of one camera
 MAX_CAMERAS, MAX_GROUPS = 1000, 1000  # each is tried on every photograph
 # parameters that are adjusted where a survey says nothing, as far as its photographs determine them
-FREED_FIRST = ("c", "x0", "y0", "K1", "K2", "fx", "fy", "cx", "cy", "k1", "k2")
+FREED_FIRST = ("c", "x0", "y0", "K1", "K2", "fx", "fy", "f", "cx", "cy", "k1", "k2", "k")
 MAX_GLOBS = 1000  # of the photographs of all cameras
 MAX_LENGTH_PER_SIGMA = 1e6  # no scale bar is calibrated to better than a millionth of its length
 Length = Annotated[float, Field(ge=SMALLEST, le=LARGEST)]

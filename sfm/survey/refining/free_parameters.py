@@ -12,10 +12,8 @@ from sfm.errors import GeometryError
 from sfm.network import Estimate, Network
 
 MIN_PHOTOGRAPHS = 4  # of a camera whose principal point is freed
-# What COLMAP calls the parameters of its models with one focal length, which are adjusted as brown_forward
-COLMAP_NAMES = {"c": "f", "x0": "cx", "y0": "cy", "K1": "k1", "K2": "k2"}
-OTHER_NAMES = ("K3", "K4", "P1", "P2", "b1", "b2")  # of brown_forward, which no COLMAP model of these has
-FOCAL_NAMES = ("f", "fx", "fy")
+FOCAL_NAMES = ("f", "fx", "fy")  # each of which holds both, where one of them is a camera's only one
+FIRST_RADIAL = {"k": "k1"}  # another name of the only coefficient
 
 
 def free_cameras(network: Network, estimate: Estimate, fixed: tuple[str, ...]) -> tuple[Camera, ...]:
@@ -24,14 +22,11 @@ def free_cameras(network: Network, estimate: Estimate, fixed: tuple[str, ...]) -
     Raises:
         GeometryError: a name to hold that is no parameter of any camera.
     """
-    known = [name for camera in estimate.cameras for name in (*camera.names, *_colmap_names(camera))]
+    known = dict.fromkeys(name for camera in estimate.cameras for name in camera.names)
     for name in fixed:
-        if name not in (*known, *FOCAL_NAMES):
-            told = dict.fromkeys(
-                one for camera in estimate.cameras for one in _colmap_names(camera) if one not in OTHER_NAMES
-            )
+        if name not in (*known, *_other_names(tuple(known)), *FOCAL_NAMES):
             raise GeometryError(
-                f"refine: parameter '{name}' is to be held, expected one of {', '.join(told)}"
+                f"refine: parameter '{name}' is to be held, expected one of {', '.join(known)}"
             )
     photographs = np.bincount(network.camera[estimate.oriented], minlength=len(estimate.cameras))
     return tuple(
@@ -39,9 +34,9 @@ def free_cameras(network: Network, estimate: Estimate, fixed: tuple[str, ...]) -
     )
 
 
-def _colmap_names(camera: Camera) -> tuple[str, ...]:
-    """Return COLMAP's names of the parameters of a camera."""
-    return tuple(COLMAP_NAMES.get(name, name) for name in camera.names)
+def _other_names(names: tuple[str, ...]) -> tuple[str, ...]:
+    """Return what parameters are called in models with more of them."""
+    return tuple(FIRST_RADIAL.get(name, name) for name in names)
 
 
 def _freed(camera: Camera, photographs: int, fixed: tuple[str, ...]) -> Camera:
@@ -58,11 +53,12 @@ def _freed(camera: Camera, photographs: int, fixed: tuple[str, ...]) -> Camera:
     """
     free = camera.free
     if not free.any():
-        free = camera.plays(Role.RADIAL, Role.DENOMINATOR, Role.DECENTRING) & (camera.parameters != 0)
+        distortion = camera.plays(Role.RADIAL, Role.DENOMINATOR, Role.DECENTRING, Role.PRISM)
+        free = distortion & (camera.parameters != 0)
         free |= camera.plays(Role.FOCAL)
         if photographs >= MIN_PHOTOGRAPHS:
             free |= camera.plays(Role.X0, Role.Y0)
-    held = np.isin(camera.names, fixed) | np.isin(_colmap_names(camera), fixed)
+    held = np.isin(camera.names, fixed) | np.isin(_other_names(camera.names), fixed)
     focal = camera.plays(Role.FOCAL)
     if "f" in fixed or (focal.sum() == 1 and {"fx", "fy"} & set(fixed)):
         held |= focal

@@ -35,10 +35,13 @@ from sfm.survey.refining.windows import MIN_RAYS, Limits, Windows, best_window, 
 
 # Over larger windows no surface is a plane, and memory and time grow with the square of the side.
 MAX_WINDOW_PX = 101
+# Off the axis tangents grow without bounds, and a pixel is worth less and less of them
+MAX_OFF_AXIS_DEG = 85.0
 # Of the robust spread of the model's residuals, beyond which a key point was another one
 MAX_SHIFT_FACTOR = 6.0
 MIN_SHIFT_PX = 2.0
 UNSUPPORTED = f"of a point that fewer than {MIN_RAYS} photographs match"
+BEYOND = f"more than {MAX_OFF_AXIS_DEG:g} degrees off the axis"
 
 
 @dataclass(frozen=True)
@@ -145,10 +148,11 @@ def refine_model(
     if not 0 <= min_correlation <= 1:
         raise GeometryError(f"refine: smallest correlation is {min_correlation:g}, needed 0 to 1")
     seen = network.image_points
-    everything = np.ones(len(seen), dtype=bool)
     estimate = replace(estimate, cameras=free_cameras(network, estimate, fixed))
     residuals = pictures_of(estimate, network.camera, seen.image, estimate.points[seen.point]) - seen.xy
-    usable = np.isfinite(residuals).all(axis=1)
+    depth, distance = _lengths(network, estimate)
+    within = depth > np.cos(np.radians(MAX_OFF_AXIS_DEG)) * distance
+    usable = np.isfinite(residuals).all(axis=1) & within
     if not usable.any():
         raise GeometryError("no image point of an oriented photograph in the model, nothing to refine")
     if np.bincount(seen.point[usable]).max() < MIN_RAYS:
@@ -158,16 +162,20 @@ def refine_model(
     before = float(np.sqrt((residuals[usable] ** 2).mean()))
     spread = MAD_TO_SIGMA * float(np.median(np.abs(residuals[usable])))
     progress.stage("adjustment as it came")
-    first, start, _, _ = part_of(network, estimate, everything, np.full(len(network.points), MIN_RAYS))
+    first, start, _, _ = part_of(network, estimate, usable, np.full(len(network.points), MIN_RAYS))
     readjusted = adjust(first, start, datum=Datum("free"), reject="none")
-    masked = ~everything if masks_dir is None else outside_masks(network, estimate, masks_dir)
+    masked = np.zeros(len(seen), dtype=bool)
+    if masks_dir is not None:
+        masked = outside_masks(network, estimate, masks_dir)
+    beyond = int((np.isfinite(depth) & ~usable & ~masked).sum())
     reference = _references(network, estimate, usable & ~masked)
     rows = np.flatnonzero((reference >= 0)[seen.point] & usable & ~masked)
     if not len(rows):
         black = int(masked.sum())
         raise GeometryError(
             f"refine: none of {len(seen)} key points is left to be measured: {black} where the mask is "
-            f"black, {len(seen) - black} of points that fewer than {MIN_RAYS} photographs see"
+            f"black, {len(seen) - black - beyond} of points that fewer than {MIN_RAYS} photographs see"
+            + (f", {beyond} {BEYOND}" if beyond else "")
         )
     photographs = Photographs(network, estimate, images_dir)
     limits = Limits(max(MIN_SHIFT_PX, MAX_SHIFT_FACTOR * spread), min_correlation)
@@ -184,8 +192,8 @@ def refine_model(
             progress=progress,
         )
         progress.stage("adjustment")
-        few = len(seen) - len(rows) - int(masked.sum())
-        lost = reasons_of(windows, rows, few=few, masked=int(masked.sum()))
+        few = len(seen) - len(rows) - int(masked.sum()) - beyond
+        lost = [*reasons_of(windows, rows, few=few, masked=int(masked.sum())), (BEYOND, beyond)]
         return orient(network, orientation, windows, side_px, targets, lost)
 
     oriented = measured(estimate, WINDOWS_PX[0] if window_px is None else window_px)
@@ -288,10 +296,11 @@ def _words_of_targets(result: Refinement) -> str:
 def _references(network: Network, estimate: Estimate, usable: BoolArray) -> IntArray:
     """Return the row of each point that sees it at its middle scale, -1 for points with few rays, (n,)."""
     seen = network.image_points
-    rays = estimate.points[seen.point] - estimate.position[seen.image]
-    depth = -np.einsum("ki,ki->k", rays, estimate.rotation[seen.image, :, 2])
-    c = np.array([camera.c_px for camera in estimate.cameras])[network.camera[seen.image]]
-    scale = np.where((depth > 0) & usable, c / depth, np.nan)
+    depth, distance = _lengths(network, estimate)
+    of = network.camera[seen.image]
+    c = np.array([camera.c_px for camera in estimate.cameras])[of]
+    wide = np.array([camera.wide_angle for camera in estimate.cameras])[of]
+    scale = np.where(usable, c / np.where(wide, distance, depth), np.nan)
     reference = np.full(len(network.points), -1)
     count = np.bincount(seen.point[np.isfinite(scale)], minlength=len(reference))
     order = np.lexsort([scale, seen.point])
@@ -299,3 +308,11 @@ def _references(network: Network, estimate: Estimate, usable: BoolArray) -> IntA
     some = (count >= MIN_RAYS) & estimate.determined
     reference[some] = order[first[some] + count[some] // 2]
     return reference
+
+
+def _lengths(network: Network, estimate: Estimate) -> tuple[FloatArray, FloatArray]:
+    """Return depth and distance of the point of each image point, NaN where unknown, (k,) each."""
+    seen = network.image_points
+    rays = estimate.points[seen.point] - estimate.position[seen.image]
+    depth = -np.einsum("ki,ki->k", rays, estimate.rotation[seen.image, :, 2])
+    return depth, np.asarray(np.linalg.norm(rays, axis=1))

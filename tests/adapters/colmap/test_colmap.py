@@ -20,7 +20,7 @@ from sfm.errors import BackendError, OutputError, SurveyFileError
 from sfm.network import Estimate, Network, ObjectPoints
 from tests.synthetic import make_network, perturb, seed_of
 
-MODELS = ("opencv", "full_opencv")
+MODELS = ("opencv", "full_opencv", "opencv_fisheye", "eucm", "rad_tan_thin_prism_fisheye")
 
 
 def scene(model: str = "opencv", *, cameras: int = 1, noise_px: float = 0.1) -> tuple[Network, Estimate]:

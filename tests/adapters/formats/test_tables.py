@@ -67,7 +67,7 @@ def with_camera(**changed: Any) -> str:
         (with_camera(pixel_mm=[float("nan"), 1.0]), r"pixel_mm\[0\] is nan, needed a finite number"),
         (with_camera(pixel_mm=[0.005] * 3), r"pixel_mm.* is .*at most 2 items"),
         (with_camera(model=["opencv"]), r"cameras\[0\]\.model is \['opencv'\], needed 'brown'"),
-        (with_camera(model="fisheye"), r"cameras\[0\]\.model is 'fisheye', needed 'brown'"),
+        (with_camera(model="panorama"), r"cameras\[0\]\.model is 'panorama', needed 'brown'"),
         (with_camera(name=["a"]), r"cameras\[0\]\.name is \['a'\], needed a valid string"),
         (with_camera(name=None), r"cameras\[0\]\.name is missing"),
         (with_camera(size_px=None), "tells size and pixel of camera camera 1"),

@@ -73,7 +73,7 @@ def _wanted(one: CameraSettings) -> list[tuple[str, str]]:
     wanted = []
     if one.pixel_mm is None and one.sensor_mm is None:
         wanted.append(("pixel_mm or sensor_mm", "pixel_mm"))
-    if one.c_mm is None and not said & {"c", "fx"}:
+    if one.c_mm is None and not said & {"c", "fx", "f"}:
         wanted.append(("c_mm", "focal_mm"))
     return wanted
 
