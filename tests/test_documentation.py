@@ -57,6 +57,7 @@ def test_every_key_of_the_survey_file_has_a_meaning_and_bounds() -> None:
     assert len(rows) > 50
     assert not [key for key, row in rows.items() if len(row[3]) < 5], "keys without a comment in settings.py"
     assert rows["tie_points.window_px"][1] == "integer, from 7 to 101"
+    assert rows["tie_points.max_features"][1] == "integer, from 100 to 20000"
     assert rows["camera.c_mm"][1] == "number, from 1e-09 to 1e+12"
     assert rows["camera.size_px"][1] == "[integer, integer], above 0 to 1e+06"
     assert rows["camera.weighted"][1] == "table { parameter = [value, sigma] }, from 1e-30 to 1e+12"

@@ -32,6 +32,7 @@ from sfm.files.folder_lock import locked
 from sfm.files.whole_files import remove_leftovers, whole_file, whole_folder
 from sfm.kernels.compiling import COMPILING
 from sfm.kernels.sources import sources_of
+from sfm.matching.tracks.natural_points import natural_points
 from sfm.photographs.exif import Metadata, read_metadata
 from sfm.report.log import SurveyLog, read_log
 from sfm.report.output import folder_name
@@ -615,6 +616,18 @@ def test_a_store_that_others_can_write_is_refused(
         monkeypatch.setattr("os.geteuid", lambda: 12345)
     with pytest.raises(OutputError, match="measured points are kept here, but others may write here"):
         MeasuredStore.of_user()
+
+
+def test_an_entry_that_is_too_large_to_be_read_is_not_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store, found = MeasuredStore(tmp_path / "measured"), natural_points(np.zeros((64, 64), np.uint8))
+    store.save("ab", found)
+    assert store.load("ab", TEXTURE) is not None
+    monkeypatch.setattr("sfm.survey.measuring.measured_store.MAX_ENTRY_BYTES", 100)
+    store.save("cd", found)
+    assert [path.name for path in (tmp_path / "measured").rglob("*.npz")] == ["ab.npz"]
+    assert store.load("ab", TEXTURE) is None
 
 
 def test_what_is_measured_is_known_by_what_measures() -> None:

@@ -165,7 +165,7 @@ class TiePointSettings(Section):
 
     detector: Literal["foerstner", "sift"] = "foerstner"  # what finds the interest points
     window_px: Annotated[int, Field(ge=7, le=101)] = 15  # odd side of the matched windows
-    max_features: Annotated[int, Field(ge=100)] = 2000  # of each photograph, spread over it
+    max_features: Annotated[int, Field(ge=100, le=20_000)] = 2000  # of each photograph, spread over it
 
 
 class DatumSettings(Section):

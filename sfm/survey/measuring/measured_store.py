@@ -30,7 +30,7 @@ from sfm.targets.detect import Targets
 
 Measured = Targets | NaturalPoints
 M = TypeVar("M", Targets, NaturalPoints)
-MAX_ENTRY_BYTES = 100_000_000  # some 400,000 targets; bounded before any memory is taken
+MAX_ENTRY_BYTES = 100_000_000  # 400,000 targets, 180,000 features; bounded before any memory is taken
 
 
 @dataclass(frozen=True)
@@ -79,6 +79,8 @@ class MeasuredStore:
         """Keep what was measured, whole or not at all; where there is no room it is simply not kept."""
         data = io.BytesIO()
         np.savez(data, allow_pickle=False, **{f.name: getattr(measured, f.name) for f in fields(measured)})
+        if data.tell() > MAX_ENTRY_BYTES:  # nobody would read it
+            return
         with suppress(OSError, OutputError):
             make_user_folder(self.folder)
             with whole_file(self._path(key), replaces=True) as part:
