@@ -11,6 +11,8 @@ observations are left out; Foerstner and Wrobel (2016), Photogrammetric Computer
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from sfm.adjustment.engine.collinearity import Observations, State, residuals
@@ -52,29 +54,53 @@ def further_rays(
     further = np.zeros(len(used), dtype=bool)
     count = np.bincount(observations.image[used], minlength=len(least))
     F, B = whitening_matrix(observations.whitening), _by_points(observations, state, v, limiting)
+    sound = used & np.isfinite(v).all(axis=1) & np.isfinite(complement).all(axis=(1, 2))
     for j in np.unique(observations.point[out]).tolist():
-        rays = np.arange(observations.start[j], observations.start[j + 1])
-        rays = rays[used[rays]]
-        Q = -np.einsum("aip,pq,bjq->abij", F[rays] @ B[rays], limiting[j], F[rays] @ B[rays])
-        every = np.arange(len(rays))
-        Q[every, every] = complement[rays]
-        e = np.einsum("kab,kb->ka", F[rays], v[rays])  # whitened, as Q
-        leaving = np.flatnonzero(out[rays]).tolist()
+        rows = np.arange(observations.start[j], observations.start[j + 1])
+        rows = rows[sound[rows]]
+        e = np.einsum("kab,kb->ka", F[rows], v[rows])
+        rays = _Rays(e, complement[rows], F[rows] @ B[rows], limiting[j])
+        left = np.ones(len(rows), dtype=bool)
+        leaving = np.flatnonzero(out[rows]).tolist()
         while leaving:
             for a in leaving:
-                e, Q = _without(a, e, Q)
-            further[rays[leaving]] = True
-            left = np.flatnonzero(~further[rays])
+                rays = rays.without(a)
+            left[leaving] = False
+            rest = np.flatnonzero(left)
             leaving = []
-            if len(left) >= MIN_RAYS:
-                back = np.linalg.solve(F[rays], e[:, :, None])[:, :, 0]
-                w = standardised_residuals(back[left], Q[left, left], observations.whitening[rays[left]])
+            if len(rest) >= MIN_RAYS:
+                back = np.asarray(np.linalg.solve(F[rows[rest]], rays.e[rest, :, None])[:, :, 0], dtype=float)
+                w = standardised_residuals(back, rays.Q[rest], observations.whitening[rows[rest]])
                 size = np.abs(w).max(axis=1)
                 second, worst = np.argsort(size)[-2:].tolist()
-                i = observations.image[rays[left[worst]]]
+                i = observations.image[rows[rest[worst]]]
                 if size[worst] > max(least[i], (1 + INFLUENCE / count[i]) * size[second]):
-                    leaving = [int(left[worst])]
+                    leaving = [int(rest[worst])]
+        further[rows[~left]] = True
     return further & ~out
+
+
+@dataclass(frozen=True)
+class _Rays:
+    """Rays of one point, whitened."""
+
+    e: FloatArray  # residuals, (r, 2)
+    Q: FloatArray  # their cofactors, (r, 2, 2)
+    B: FloatArray  # derivatives by the point, (r, 2, 3)
+    C: FloatArray  # cofactors of the point, (3, 3): -B C B' are those of two residuals
+
+    def without(self, a: int) -> _Rays:
+        """Return what is left when one of them leaves; its own place means nothing afterwards."""
+        with_a = -self.B @ self.C @ self.B[a].T
+        weight = np.linalg.pinv(self.Q[a], rcond=MIN_REDUNDANCY, hermitian=True)
+        gain = with_a @ weight
+        to_point = self.C @ self.B[a].T
+        return _Rays(
+            self.e - gain @ self.e[a],
+            self.Q - gain @ np.swapaxes(with_a, 1, 2),
+            self.B,
+            self.C + to_point @ weight @ to_point.T,
+        )
 
 
 def _by_points(observations: Observations, state: State, v: FloatArray, limiting: FloatArray) -> FloatArray:
@@ -92,9 +118,3 @@ def _by_points(observations: Observations, state: State, v: FloatArray, limiting
         difference = residuals(observations, state._replace(points=moved)) - v
         B[free, :, p] = difference[free] / step[observations.point[free], None]
     return B
-
-
-def _without(a: int, e: FloatArray, Q: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return residuals (r, 2) and cofactors (r, r, 2, 2) when ray a has left; its own are 0."""
-    gain = Q[:, a] @ np.linalg.pinv(Q[a, a], rcond=MIN_REDUNDANCY, hermitian=True)
-    return e - gain @ e[a], Q - gain[:, None] @ Q[a][None]
