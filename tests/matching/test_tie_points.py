@@ -592,7 +592,7 @@ def test_refining_what_another_program_wrote(tmp_path: Path) -> None:
         cv2.imwrite(str(tmp_path / name), np.rint(one).astype(np.uint8))
     for j, xyz in enumerate(truth.points):
         images = (1, 2) if j < 5 else (1, 2, 3)
-        xyz = 50 * xyz if j == 9 else xyz  # behind the photographs
+        xyz = np.array([0.0, 0.0, 50.0]) if j == 9 else xyz  # behind all photographs
         scene.add_point3D(
             xyz, pycolmap.Track([pycolmap.TrackElement(i, j) for i in images]), np.zeros(3, np.uint8)
         )
@@ -604,7 +604,8 @@ def test_refining_what_another_program_wrote(tmp_path: Path) -> None:
     beside = replace(network, images=(*network.images, "not registered.png"), camera=np.zeros(4, np.int64))
     result = refine_model(beside, lost, tmp_path)
     reasons = dict(result.reasons)
-    assert reasons["of a point that fewer than 3 photographs see"] == 13  # one is behind all of them
+    assert reasons["of a point that fewer than 3 photographs see"] == 10
+    assert reasons["behind the photograph or more than 85 degrees off the axis"] == 3
     assert result.refined >= 0.8 * (result.key_points - 13) and result.after_px < 0.1 < result.before_px
     text = refinement_text(result)
     assert "RMS before" in text and "RMS after" in text

@@ -41,7 +41,7 @@ MAX_OFF_AXIS_DEG = 85.0
 MAX_SHIFT_FACTOR = 6.0
 MIN_SHIFT_PX = 2.0
 UNSUPPORTED = f"of a point that fewer than {MIN_RAYS} photographs match"
-BEYOND = f"more than {MAX_OFF_AXIS_DEG:g} degrees off the axis"
+BEYOND = f"behind the photograph or more than {MAX_OFF_AXIS_DEG:g} degrees off the axis"
 
 
 @dataclass(frozen=True)
