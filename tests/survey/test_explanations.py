@@ -15,8 +15,9 @@ from sfm.network import Estimate, Network
 from sfm.pipeline import run_survey
 from sfm.report.findings.findings import findings_of
 from sfm.result import Explanation
+from sfm.survey.diagnosis import explanations
 from sfm.survey.diagnosis.explanations import explain_residuals
-from sfm.survey.diagnosis.two_groups import two_groups
+from sfm.survey.diagnosis.two_groups import TwoGroups, two_groups
 from tests.survey.test_own_camera import TAU, with_zoom
 from tests.surveys import survey_of
 from tests.synthetic import make_network, perturb, seed_of
@@ -45,6 +46,25 @@ def test_two_zooms_under_one_name() -> None:
     )
     assert first.explains and first.after_px == pytest.approx(0.1, rel=0.1)
     assert len(others) >= 2
+
+
+def test_a_sample_of_the_points_of_a_large_network_tells_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Photographs of few image points keep all of them."""
+    network, truth = with_zoom("large", dict.fromkeys(range(4), 1.05))
+    found, counted = adjusted(network, truth, ("c",)), []
+    whole = explain_residuals(found)[0]
+    monkeypatch.setattr(explanations, "LARGE", 150)
+    monkeypatch.setattr(explanations, "FEW", 10)
+
+    def groups(part: Network, estimate: Estimate) -> TwoGroups | None:
+        counted.append(np.bincount(part.image_points.image))
+        return two_groups(part, estimate)
+
+    monkeypatch.setattr(explanations, "two_groups", groups)
+    first = explain_residuals(found)[0]
+    assert first.cause.partition(" with c")[0] == whole.cause.partition(" with c")[0]
+    assert first.after_px == pytest.approx(whole.after_px, rel=0.1)
+    assert counted[0].min() >= 10 and counted[0].sum() < 0.6 * len(network.image_points)
 
 
 def test_a_distortion_that_is_held() -> None:

@@ -26,7 +26,10 @@ from sfm.similarity import fit_similarity
 from sfm.survey.diagnosis.two_groups import two_groups
 
 MUCH_REJECTED = 0.05  # share of rejected image points from which causes are looked for, too
-LARGE = 50_000  # image points from which on nothing is tried while sigma0 is as expected
+LARGE = (
+    50_000  # image points from which on nothing is tried while sigma0 is as expected, and most to try with
+)
+FEW = 50  # image points of a photograph of which none is left out of such a trial
 WORTH_A_TRY = 1.5  # sigma0 over the expected one from which causes are looked for
 NEAR_THE_BEST = 1.25  # of the least sigma0: what is simpler and reaches this is preferred
 MIN_BEFORE = 3  # photographs that can show that the object moved before or behind them
@@ -49,13 +52,18 @@ def explain_residuals(found: Adjustment) -> tuple[Explanation, ...]:
     network, estimate = found.network, found.estimate
     if not conspicuous and len(found.rejected) > LARGE:
         return ()
+    used = _enough_points(network)
+    everywhere = np.ones(len(network.images), dtype=bool)
+    network, estimate = reduce_network(network, estimate, everywhere, used, np.ones_like(found.rejected))
     groups = _groups(network, estimate)
     if not (conspicuous or groups is not None):
         return ()
     before = _adjusted(network, estimate)[0]
+    variance = float(np.trace(found.covariance.points[used], axis1=1, axis2=2).mean())
 
     def explanation(one: _Cause) -> Explanation:
-        return Explanation(one.words, before, one.sigma0_px, _moved(found, one.estimate), one is groups)
+        moved = _moved(estimate.points, variance, one.estimate)
+        return Explanation(one.words, before, one.sigma0_px, moved, one is groups)
 
     if not conspicuous and not (groups and explanation(groups).explains):
         return ()
@@ -112,17 +120,29 @@ def _causes(network: Network, estimate: Estimate, groups: _Cause | None, *, stat
         yield _Cause(words, sigma)
 
 
-def _moved(found: Adjustment, estimate: Estimate | None) -> float:
-    """Return how far the points of an adjustment are from others, RMS over their standard deviations."""
-    if estimate is None:
+def _enough_points(network: Network) -> BoolArray:
+    """Return points of about LARGE image points, all of a smaller network, (n,).
+
+    Causes are of photographs and cameras, which a sample of their points tells as well: every so many, and
+    all of photographs of few image points and of scale bars.
+    """
+    seen, every = network.image_points, -(-len(network.image_points) // LARGE)
+    used: BoolArray = np.arange(len(network.points)) % every == 0
+    few = np.bincount(seen.image, minlength=len(network.images)) < FEW * every
+    used[seen.point[few[seen.image]]] = True
+    used[network.scale_bars.start] = used[network.scale_bars.end] = True
+    return used
+
+
+def _moved(points: FloatArray, variance: float, other: Estimate | None) -> float:
+    """Return how far points are from others, RMS over the root of the variance of X, Y and Z together."""
+    if other is None:
         return np.nan
-    mine, other = found.estimate.points, estimate.points
-    expected = float(np.trace(found.covariance.points, axis1=1, axis2=2).mean())
     try:
-        other = fit_similarity(other, mine).apply(other)
+        apart = fit_similarity(other.points, points).apply(other.points) - points
     except GeometryError:  # points on a line
         return np.nan
-    return float(np.sqrt(((other - mine) ** 2).sum(axis=1).mean() / expected)) if expected > 0 else np.nan
+    return float(np.sqrt((apart**2).sum(axis=1).mean() / variance)) if variance > 0 else np.nan
 
 
 def _adjusted(

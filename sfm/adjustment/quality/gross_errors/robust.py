@@ -5,7 +5,8 @@ the largest of all, and with it others whose photograph and object point hold no
 none is judged beside a larger error. In a photograph of many image points an error moves the residuals of
 the others by its leverage only, some hundredths of it: there all those go that are not much smaller than the
 largest, and further rays of an object point that has lost one go one after another in the same round
-(`rays_of_points`). A rejected point is taken back when it would pass the test in the adjustment.
+(`rays_of_points`). A rejected point is taken back when it would clearly pass the test in the
+adjustment.
 
 Huber's estimator bounds the influence of an image point, Tukey's biweight takes it back to nothing:
 beyond TUKEY standard deviations an image point has weight 0. It starts from Huber's, because its sum
@@ -33,6 +34,9 @@ TUKEY = 5.123
 # most some times that: beside CROWDED points one of BESIDE of the largest tau is an error of its own.
 CROWDED = 60
 BESIDE = 0.4
+RETURNS = (
+    0.99  # of the critical value, below which a rejected one returns: 1 would turn in circles at the limit
+)
 MIN_FREEDOM = 0.05  # of redundancy over observations, so that a network without redundancy has a scale
 
 
@@ -91,7 +95,7 @@ def would_pass(
     redundancy: int,
     alpha: float,
 ) -> BoolArray:
-    """Return which rejected image points would pass the test if each were in the adjustment, (k,).
+    """Return which rejected image points would clearly pass the test if each were in the adjustment, (k,).
 
     Whitened, with H = A Q A' without the image point: its residual (I + H)^-1 l from the predicted one l, the
     cofactor (I + H)^-1 of that, and l' (I + H)^-1 l more in the sum of squares.
@@ -118,7 +122,7 @@ def would_pass(
     w = np.abs(standardised_residuals(v, cofactor, observations.whitening[rows])).max(axis=1)
     sigma0 = np.sqrt((vPv + np.sum(predicted * inside, axis=1)) / (redundancy + 2))
     passes = np.zeros(len(used), dtype=bool)
-    passes[rows] = w <= tau_critical(alpha, redundancy + 2) * sigma0
+    passes[rows] = w <= RETURNS * tau_critical(alpha, redundancy + 2) * sigma0
     return passes
 
 
