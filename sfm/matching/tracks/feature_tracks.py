@@ -16,12 +16,13 @@ import numpy as np
 from sfm.conventions import AnyArray, FloatArray, IntArray
 from sfm.kernels.options import compiled
 from sfm.kernels.threads import in_threads
+from sfm.matching.grey_photographs import GreyPhotographs
+from sfm.matching.lsm.coverage import points_apart
 from sfm.matching.lsm.two_photo import match_lsm
-from sfm.matching.radiometry import grey_of
 from sfm.matching.tracks.features import Features, matched_features
 from sfm.matching.tracks.natural_points import NaturalPoints
 from sfm.matching.tracks.overlap import connected_parts, overlapping_pairs
-from sfm.network import rows_of
+from sfm.network import ImagePoints, rows_of
 
 WINDOW_PX = 15  # larger ones are less noisy, but a curved surface is no affine warp over them
 SNAP_PX = 6.0  # an interest point this close to a feature takes its place
@@ -62,6 +63,8 @@ def find_tie_points(
 ) -> TiePoints:
     """Find and measure points that several photographs have in common, knowing nothing of their orientation.
 
+    Of features whose windows overlap those of most photographs are taken.
+
     Args:
         photographs: (H, W), 8 or 16 bit, grey or colour, m of them.
         natural: what `natural_points` has found in each of them.
@@ -77,10 +80,11 @@ def find_tie_points(
     Source: Lowe (2004), IJCV 60(2), for the features; Foerstner and Guelch (1987) for the places; Gruen
     (1985) for the measurement.
     """
+    tracks = link_features(natural, min_rays=min_rays, seed=seed, threads=threads)
     return measure_tracks(
         photographs,
         natural,
-        link_features(natural, min_rays=min_rays, seed=seed, threads=threads),
+        tracks_apart(natural, tracks, window_px),
         window_px=window_px,
         min_rays=min_rays,
         min_correlation=min_correlation,
@@ -174,6 +178,23 @@ def joined_features(edge: IntArray, image: IntArray, m: int) -> IntArray:
     return group
 
 
+def tracks_apart(features: Sequence[Features], tracks: Tracks, side_px: float) -> Tracks:
+    """Return tracks, those of most photographs first, whose windows share few of their pixels.
+
+    Args:
+        features: of m photographs.
+        tracks: which of them belong to one point.
+        side_px: of the windows.
+    """
+    xy = _of_tracks([one.xy for one in features], tracks)
+    seen = ImagePoints(tracks.image, tracks.point, xy, np.zeros((len(xy), 2, 2)))
+    n = int(tracks.point.max(initial=-1)) + 1
+    kept = points_apart(seen, np.ones(len(xy), dtype=bool), side_px, n_points=n)
+    rows = kept[tracks.point]
+    number = np.cumsum(kept) - 1
+    return Tracks(tracks.image[rows], tracks.feature[rows], number[tracks.point[rows]])
+
+
 def measure_tracks(
     photographs: Sequence[AnyArray],
     natural: Sequence[NaturalPoints],
@@ -199,10 +220,10 @@ def measure_tracks(
         min_correlation: smallest coefficient r of a match.
         threads: pairs of photographs worked on at a time.
     """
-    xy = np.array([natural[i].xy[f] for i, f in zip(tracks.image, tracks.feature, strict=True)])
-    scale = np.array([natural[i].scale[f] for i, f in zip(tracks.image, tracks.feature, strict=True)])
-    angle = np.array([natural[i].angle[f] for i, f in zip(tracks.image, tracks.feature, strict=True)])
-    xy, n = xy.reshape(-1, 2), int(tracks.point.max(initial=-1)) + 1
+    xy = _of_tracks([one.xy for one in natural], tracks)
+    scale = _of_tracks([one.scale for one in natural], tracks)
+    angle = _of_tracks([one.angle for one in natural], tracks)
+    n = int(tracks.point.max(initial=-1)) + 1
     reference = _middle_scale(tracks.point, scale, n)
     place = xy[reference].copy()
     for i, one in enumerate(natural):
@@ -218,6 +239,7 @@ def measure_tracks(
     start = xy + np.einsum("kij,kj->ki", A, offset)
     measured, covariance = np.full((len(xy), 2), np.nan), np.full((len(xy), 2, 2), np.nan)
     at_reference = np.full((len(xy), 2, 2), np.nan)
+    grey = GreyPhotographs(photographs.__getitem__)
     others = np.flatnonzero(tracks.image[ref] != tracks.image)
     pairs, pair = np.unique(
         np.column_stack([tracks.image[ref], tracks.image])[others], axis=0, return_inverse=True
@@ -227,8 +249,8 @@ def measure_tracks(
         i, j = pairs[one].tolist()
         rows = others[of_pair[one]]
         found = match_lsm(
-            grey_of(photographs[i]),
-            grey_of(photographs[j]),
+            grey[i],
+            grey[j],
             place[tracks.point[rows]],
             start[rows],
             window_px=window_px,
@@ -255,6 +277,12 @@ def measure_tracks(
     return TiePoints(
         tracks.image[keep], point, measured[keep], covariance[keep], tracks.image[reference[kept]]
     )
+
+
+def _of_tracks(values: Sequence[FloatArray], tracks: Tracks) -> FloatArray:
+    """Return the values of the features of tracks, of m photographs, (k, ...)."""
+    first = np.cumsum([0, *(len(one) for one in values)])
+    return np.asarray(np.concatenate(values)[first[tracks.image] + tracks.feature])
 
 
 def _middle_scale(point: IntArray, scale: FloatArray, n: int) -> IntArray:
