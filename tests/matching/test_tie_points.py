@@ -31,11 +31,9 @@ from sfm.matching.lsm.surface_planes import planes_at
 from sfm.matching.lsm.two_photo import match_lsm
 from sfm.matching.radiometry import Grey
 from sfm.matching.tracks.feature_tracks import (
-    Tracks,
     find_tie_points,
     joined_features,
     link_features,
-    tracks_apart,
 )
 from sfm.matching.tracks.features import Features, sift_features
 from sfm.matching.tracks.interest import foerstner_points, textured_squares
@@ -331,24 +329,6 @@ def test_few_photographs_are_in_memory_as_floats_at_a_time() -> None:
     assert read == [0, 1, 2, 3, 1, 4]
     with pytest.raises(PhotographError, match="not finite"):
         GreyPhotographs(lambda i: np.full((9, 9), np.nan))[0]
-
-
-def test_windows_of_tracks_do_not_overlap() -> None:
-    """Of tracks side by side those of the most photographs are kept, and they are numbered anew."""
-    photographs, _, _ = _scene()
-    features = [natural_points(one, detector="sift", max_features=600) for one in photographs]
-    every = link_features(features)
-    apart = tracks_apart(features, every, 25.0)
-    n = int(apart.point.max()) + 1
-    assert 20 < n < 0.6 * (every.point.max() + 1)
-    np.testing.assert_array_equal(np.unique(apart.point), np.arange(n))
-    for i in range(3):
-        rows = np.flatnonzero(apart.image == i)
-        xy = features[i].xy[apart.feature[rows]]
-        gap = np.abs(xy[:, None] - xy[None]).max(axis=2) + 1e3 * np.eye(len(xy))
-        assert np.median(gap.min(axis=1)) > 20
-    nothing = tracks_apart(features, Tracks(*(np.zeros(0, dtype=np.int64) for _ in range(3))), 25.0)
-    assert len(nothing.image) == 0
 
 
 def test_along_epipolar_lines_of_an_orientation_computed_from_the_photographs() -> None:

@@ -17,12 +17,11 @@ from sfm.conventions import AnyArray, FloatArray, IntArray
 from sfm.kernels.options import compiled
 from sfm.kernels.threads import in_threads
 from sfm.matching.grey_photographs import GreyPhotographs
-from sfm.matching.lsm.coverage import points_apart
 from sfm.matching.lsm.two_photo import match_lsm
 from sfm.matching.tracks.features import Features, matched_features
 from sfm.matching.tracks.natural_points import NaturalPoints
 from sfm.matching.tracks.overlap import connected_parts, overlapping_pairs
-from sfm.network import ImagePoints, rows_of
+from sfm.network import rows_of
 
 WINDOW_PX = 15  # larger ones are less noisy, but a curved surface is no affine warp over them
 SNAP_PX = 6.0  # an interest point this close to a feature takes its place
@@ -63,8 +62,6 @@ def find_tie_points(
 ) -> TiePoints:
     """Find and measure points that several photographs have in common, knowing nothing of their orientation.
 
-    Of features whose windows overlap those of most photographs are taken.
-
     Args:
         photographs: (H, W), 8 or 16 bit, grey or colour, m of them.
         natural: what `natural_points` has found in each of them.
@@ -80,11 +77,10 @@ def find_tie_points(
     Source: Lowe (2004), IJCV 60(2), for the features; Foerstner and Guelch (1987) for the places; Gruen
     (1985) for the measurement.
     """
-    tracks = link_features(natural, min_rays=min_rays, seed=seed, threads=threads)
     return measure_tracks(
         photographs,
         natural,
-        tracks_apart(natural, tracks, window_px),
+        link_features(natural, min_rays=min_rays, seed=seed, threads=threads),
         window_px=window_px,
         min_rays=min_rays,
         min_correlation=min_correlation,
@@ -176,23 +172,6 @@ def joined_features(edge: IntArray, image: IntArray, m: int) -> IntArray:
         following[last[a]] = b
         last[a] = last[b]
     return group
-
-
-def tracks_apart(features: Sequence[Features], tracks: Tracks, side_px: float) -> Tracks:
-    """Return tracks, those of most photographs first, whose windows share few of their pixels.
-
-    Args:
-        features: of m photographs.
-        tracks: which of them belong to one point.
-        side_px: of the windows.
-    """
-    xy = _of_tracks([one.xy for one in features], tracks)
-    seen = ImagePoints(tracks.image, tracks.point, xy, np.zeros((len(xy), 2, 2)))
-    n = int(tracks.point.max(initial=-1)) + 1
-    kept = points_apart(seen, np.ones(len(xy), dtype=bool), side_px, n_points=n)
-    rows = kept[tracks.point]
-    number = np.cumsum(kept) - 1
-    return Tracks(tracks.image[rows], tracks.feature[rows], number[tracks.point[rows]])
 
 
 def measure_tracks(
