@@ -36,7 +36,14 @@ class LinearRadiometry:
     correlation: float  # coefficient r of the two patches, 0 where one is flat
 
 
-def grey_of(photograph: AnyArray) -> AnyArray:
+@dataclass(frozen=True)
+class Grey:
+    """What `grey_of` has returned: it is not looked through again for every match."""
+
+    pixels: AnyArray  # float32, finite, (H, W)
+
+
+def grey_of(photograph: AnyArray | Grey) -> AnyArray:
     """Return a photograph as one channel of float32, its intensities kept (0-255, 0-65535 or as they are).
 
     Args:
@@ -45,6 +52,8 @@ def grey_of(photograph: AnyArray) -> AnyArray:
     Raises:
         PhotographError: other types or shapes, no pixels, or intensities that are not finite.
     """
+    if isinstance(photograph, Grey):
+        return photograph.pixels
     array = np.asarray(photograph)
     if array.dtype not in (np.uint8, np.uint16, np.float32, np.float64):
         raise PhotographError(f"found {array.dtype} intensities, expected 8 or 16 bit or float")

@@ -24,16 +24,16 @@ from sfm.conventions import AnyArray, FloatArray, angles_from_rotation
 from sfm.errors import GeometryError, PhotographError, SurveyFileError
 from sfm.matching.correlation.along_line import match_along_line
 from sfm.matching.epipolar import epipolar_paths
+from sfm.matching.grey_photographs import GreyPhotographs
 from sfm.matching.lsm.coverage import SHARED, Covered, largest_alike, points_apart
 from sfm.matching.lsm.projected_points import plane_warps
 from sfm.matching.lsm.surface_planes import planes_at
 from sfm.matching.lsm.two_photo import match_lsm
-from sfm.matching.tracks import feature_tracks
+from sfm.matching.radiometry import Grey
 from sfm.matching.tracks.feature_tracks import (
     find_tie_points,
     joined_features,
     link_features,
-    measure_tracks,
 )
 from sfm.matching.tracks.features import Features, sift_features
 from sfm.matching.tracks.interest import foerstner_points, textured_squares
@@ -309,23 +309,26 @@ def test_tie_points_of_three_photographs() -> None:
     assert len(find_tie_points(blank, [natural_points(one) for one in blank])) == 0
 
 
-def test_two_photographs_are_in_memory_as_floats_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_few_photographs_are_in_memory_as_floats_at_a_time() -> None:
     """Of a hundred photographs of 24 megapixels all as floats would be 10 GB."""
-    photographs, _, _ = _scene()
-    features = [natural_points(one, detector="sift", max_features=300) for one in photographs]
-    tracks = link_features(features)
-    alive: list[weakref.ref[AnyArray]] = []
-    most = 0
+    photographs = [np.full((40, 50), i, np.uint8) for i in range(5)]
+    read: list[int] = []
+    alive: list[weakref.ref[Grey]] = []
 
-    def grey(photograph: AnyArray) -> AnyArray:
-        nonlocal most
-        most = max(most, 1 + sum(one() is not None for one in alive))
-        alive.append(weakref.ref(made := np.array(photograph, dtype=np.float32)))
-        return made
+    def reading(i: int) -> AnyArray:
+        read.append(i)
+        return photographs[i]
 
-    monkeypatch.setattr(feature_tracks, "grey_of", grey)
-    assert len(measure_tracks(photographs, features, tracks)) > 90
-    assert len(alive) > 4 and most <= 3  # the template, the photograph before, and the next one
+    three = GreyPhotographs(reading, memory_bytes=3 * 4 * 40 * 50)
+    for i in (0, 1, 2, 0, 3, 0, 1, 4):  # the one that has not been asked for longest is forgotten
+        one = three[i]
+        assert one.pixels.dtype == np.float32 and (one.pixels == i).all()
+        alive.append(weakref.ref(one))
+        del one
+        assert len({id(one()) for one in alive if one() is not None}) <= 3
+    assert read == [0, 1, 2, 3, 1, 4]
+    with pytest.raises(PhotographError, match="not finite"):
+        GreyPhotographs(lambda i: np.full((9, 9), np.nan))[0]
 
 
 def test_along_epipolar_lines_of_an_orientation_computed_from_the_photographs() -> None:

@@ -324,7 +324,7 @@ def test_photographs_keep_to_the_memory(tmp_path: Path, monkeypatch: pytest.Monk
     )
     two = model_photographs.Photographs(network, estimate, tmp_path, memory_bytes=2 * 4 * SIZE[0] * SIZE[1])
     for i in (0, 1, 0, 2, 0, 1):  # the oldest is forgotten
-        assert two.grey(i).shape == SIZE[::-1]
+        assert two.grey(i).pixels.shape == SIZE[::-1]
     assert read == ["0.png", "1.png", "2.png", "1.png"]
 
 

@@ -44,7 +44,7 @@ from sfm.matching.lsm.patch_precision import (
 from sfm.matching.lsm.warp import put_step
 from sfm.matching.lsm.window import resample_patch
 from sfm.matching.match_flags import DIVERGED, MATCHED, OUTSIDE, TOO_FAR, LsmFlag
-from sfm.matching.radiometry import grey_of, odd_window
+from sfm.matching.radiometry import Grey, grey_of, odd_window
 
 COARSE_STEP = 0.5  # bilinear interpolation is good enough while steps are longer than this, px
 CONTRACTION = 0.04  # a step is at most this part of the one before; 0.01 to 0.03 on texture with noise
@@ -85,8 +85,8 @@ class LsmMatches:
 
 
 def match_lsm(
-    left: AnyArray,
-    right: AnyArray,
+    left: AnyArray | Grey,
+    right: AnyArray | Grey,
     xy_left: FloatArray,
     xy_right: FloatArray,
     *,

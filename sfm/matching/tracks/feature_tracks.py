@@ -16,8 +16,8 @@ import numpy as np
 from sfm.conventions import AnyArray, FloatArray, IntArray
 from sfm.kernels.options import compiled
 from sfm.kernels.threads import in_threads
+from sfm.matching.grey_photographs import GreyPhotographs
 from sfm.matching.lsm.two_photo import match_lsm
-from sfm.matching.radiometry import grey_of
 from sfm.matching.tracks.features import Features, matched_features
 from sfm.matching.tracks.natural_points import NaturalPoints
 from sfm.matching.tracks.overlap import connected_parts, overlapping_pairs
@@ -199,10 +199,10 @@ def measure_tracks(
         min_correlation: smallest coefficient r of a match.
         threads: pairs of photographs worked on at a time.
     """
-    xy = np.array([natural[i].xy[f] for i, f in zip(tracks.image, tracks.feature, strict=True)])
-    scale = np.array([natural[i].scale[f] for i, f in zip(tracks.image, tracks.feature, strict=True)])
-    angle = np.array([natural[i].angle[f] for i, f in zip(tracks.image, tracks.feature, strict=True)])
-    xy, n = xy.reshape(-1, 2), int(tracks.point.max(initial=-1)) + 1
+    xy = _of_tracks([one.xy for one in natural], tracks)
+    scale = _of_tracks([one.scale for one in natural], tracks)
+    angle = _of_tracks([one.angle for one in natural], tracks)
+    n = int(tracks.point.max(initial=-1)) + 1
     reference = _middle_scale(tracks.point, scale, n)
     place = xy[reference].copy()
     for i, one in enumerate(natural):
@@ -218,6 +218,7 @@ def measure_tracks(
     start = xy + np.einsum("kij,kj->ki", A, offset)
     measured, covariance = np.full((len(xy), 2), np.nan), np.full((len(xy), 2, 2), np.nan)
     at_reference = np.full((len(xy), 2, 2), np.nan)
+    grey = GreyPhotographs(photographs.__getitem__)
     others = np.flatnonzero(tracks.image[ref] != tracks.image)
     pairs, pair = np.unique(
         np.column_stack([tracks.image[ref], tracks.image])[others], axis=0, return_inverse=True
@@ -227,8 +228,8 @@ def measure_tracks(
         i, j = pairs[one].tolist()
         rows = others[of_pair[one]]
         found = match_lsm(
-            grey_of(photographs[i]),
-            grey_of(photographs[j]),
+            grey[i],
+            grey[j],
             place[tracks.point[rows]],
             start[rows],
             window_px=window_px,
@@ -255,6 +256,12 @@ def measure_tracks(
     return TiePoints(
         tracks.image[keep], point, measured[keep], covariance[keep], tracks.image[reference[kept]]
     )
+
+
+def _of_tracks(values: Sequence[FloatArray], tracks: Tracks) -> FloatArray:
+    """Return the values of the features of tracks, of m photographs, (k, ...)."""
+    first = np.cumsum([0, *(len(one) for one in values)])
+    return np.asarray(np.concatenate(values)[first[tracks.image] + tracks.feature])
 
 
 def _middle_scale(point: IntArray, scale: FloatArray, n: int) -> IntArray:

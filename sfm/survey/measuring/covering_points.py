@@ -18,12 +18,12 @@ import numpy as np
 
 from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
 from sfm.kernels.threads import in_threads
+from sfm.matching.grey_photographs import GreyPhotographs
 from sfm.matching.lsm.coverage import Covered
 from sfm.matching.lsm.projected_points import pictures_of, plane_warps
 from sfm.matching.lsm.surface_planes import NEIGHBOURS, planes_at
 from sfm.matching.lsm.two_photo import match_lsm
 from sfm.matching.lsm.warp import linear_part
-from sfm.matching.radiometry import grey_of
 from sfm.matching.tracks.interest import textured_squares
 from sfm.network import Estimate, ImagePoints, rows_of
 from sfm.orientation.image_rays import intersect_image_points
@@ -114,6 +114,7 @@ def find_covering_points(
     own = rows_of(seen.image, m)
     order = np.argsort([-len(rows) for rows in own], kind="stable") if references is None else references
     covered = Covered([one.shape for one in photographs])
+    grey = GreyPhotographs(photographs.__getitem__)
     found = [_none()]
     for i in np.asarray(order).tolist():
         if not estimate.oriented[i] or len(own[i]) < NEIGHBOURS:
@@ -127,7 +128,7 @@ def find_covering_points(
         if not several.any():
             continue
         rays = _followed(
-            photographs,
+            grey,
             estimate,
             camera,
             i,
@@ -171,7 +172,7 @@ def _visible(
 
 
 def _followed(
-    photographs: Sequence[AnyArray],
+    photographs: GreyPhotographs,
     estimate: Estimate,
     camera: IntArray,
     i: int,
@@ -192,7 +193,7 @@ def _followed(
     cosine[i] = np.inf
     rank = np.argsort(np.argsort(-cosine, axis=0, kind="stable"), axis=0, kind="stable")
     first = visible & (rank <= FIRST_PHOTOGRAPHS)
-    template = grey_of(photographs[i])
+    template = photographs[i]
     parts = [ImagePoints(np.full(k, i), np.arange(k), places.xy, np.full((k, 2, 2), np.nan))]
     scales = [np.ones(k)]
     in_reference, number = np.zeros((k, 2, 2)), np.zeros(k, dtype=np.int64)
@@ -208,7 +209,7 @@ def _followed(
             return None
         match = match_lsm(
             template,
-            grey_of(photographs[j]),
+            photographs[j],
             places.xy[rows[fits]],
             at[fits],
             window_px=window_px,

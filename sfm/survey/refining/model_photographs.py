@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections import OrderedDict
 from pathlib import Path
 
 import numpy as np
 
 from sfm.conventions import AnyArray, BoolArray
 from sfm.errors import PhotographError, SurveyFileError
-from sfm.matching.radiometry import grey_of
+from sfm.matching.grey_photographs import GreyPhotographs
+from sfm.matching.radiometry import Grey
 from sfm.network import Estimate, Network
 from sfm.photographs.reading import read_photograph
 
@@ -25,19 +25,14 @@ class Photographs:
         self._paths = photograph_paths(network, estimate, folder)
         self._names = network.images
         self._sizes = [estimate.cameras[camera].size_px for camera in network.camera]
-        self._memory = memory_bytes
-        self._kept: OrderedDict[int, AnyArray] = OrderedDict()
-        self._bytes = 0  # of these
+        self._kept = GreyPhotographs(self._read, memory_bytes=memory_bytes)
 
-    def grey(self, i: int) -> AnyArray:
-        """Return one photograph, float32, (H, W)."""
-        if i not in self._kept:
-            self._kept[i] = grey_of(read_of_size(self._paths[i], self._names[i], self._sizes[i]))
-            self._bytes += self._kept[i].nbytes
-        self._kept.move_to_end(i)
-        while len(self._kept) > 1 and self._bytes > self._memory:
-            self._bytes -= self._kept.popitem(last=False)[1].nbytes
+    def grey(self, i: int) -> Grey:
+        """Return one photograph."""
         return self._kept[i]
+
+    def _read(self, i: int) -> AnyArray:
+        return read_of_size(self._paths[i], self._names[i], self._sizes[i])
 
 
 def outside_masks(network: Network, estimate: Estimate, folder: Path) -> BoolArray:
