@@ -14,6 +14,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from sfm.errors import GeometryError
+from sfm.kernels.threads import own_threads
 from sfm.result import SurveyResult
 from sfm.runtime.progress import SILENT, Progress, StageClock
 from sfm.survey.adjusting.solution import solve_survey
@@ -46,7 +47,7 @@ def run_survey(
     Args:
         survey: settings and given data.
         images_dir: folder of the photographs in place of the survey's own.
-        jobs: photographs measured at a time.
+        jobs: threads; photographs measured at a time.
         others: the programs to compare with.
         store: of what was measured, so that a photograph is not measured twice.
         progress: told of stages and photographs.
@@ -55,7 +56,7 @@ def run_survey(
         KolinearError: the survey cannot be run; the message says what to do.
     """
     clock = StageClock(progress)
-    with _naming(survey):
+    with _naming(survey), own_threads(jobs):
         survey, measured = _measure(survey, images_dir, jobs, store, clock)
         with clock.stage("orientation"):
             start = orient_survey(survey, measured)

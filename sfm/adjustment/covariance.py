@@ -152,5 +152,5 @@ def change_datum(adjustment: Adjustment, datum: Datum | str) -> Adjustment:
         m = marginal_of(adjustment, datum=datum, cross=False)
         covariance = marginal_covariance(m.optimum, m.layout, m.cofactors, adjustment.sigma0**2)
     kind, points = datum.resolve(adjustment.network)
-    covariance = without_held(covariance, m.layout)
+    covariance = without_held(covariance, m.layout, m.optimum)
     return replace(adjustment, datum=kind, datum_points=points, covariance=covariance)

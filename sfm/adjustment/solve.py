@@ -87,7 +87,7 @@ def adjust(
             from Huber's start, rejects what it gives weight 0) or "none".
         alpha: probability with which the test of one image coordinate rejects a good one.
         rejected: image points that data snooping begins without, as those that it rejected before, (k,);
-            they return where they pass the test.
+            they return where they pass the test. The other ways to reject begin with all.
         method: "gauss-newton" (line search) or "levenberg-marquardt" (ends in undamped Gauss-Newton).
         max_iterations: steps at most, in each round of the robust test.
         tolerance: |A dx| / |v| at which the iteration has converged.
@@ -119,13 +119,9 @@ def adjust(
     if given.shape not in ((), (k,)) or not (np.isfinite(given) & (given > 0)).all():
         raise GeometryError(f"image_sigma_factor of shape {given.shape}, expected positive numbers, 1 or {k}")
     factor = np.broadcast_to(given, (k,))
-    without = (
-        np.zeros(k, dtype=bool) if rejected is None or reject != "tau" else np.asarray(rejected, dtype=bool)
-    )
-    if without.shape != (k,):
-        raise GeometryError(
-            f"rejected of shape {without.shape}, expected one value for each of {k} image points"
-        )
+    without = _mask_of(rejected, k)
+    if reject != "tau":
+        without = np.zeros(k, dtype=bool)
     layout, state = unknowns_of(
         local.network, local.estimate, use_control=use_control, image_sigma_factor=factor
     )
@@ -181,6 +177,25 @@ def predict(
         return local.back(replace(result, image_sigma_factor=factor))
 
 
+def _mask_of(rejected: BoolArray | None, k: int) -> BoolArray:
+    """Return which image points are given as rejected, (k,).
+
+    Raises:
+        GeometryError: not one truth value for each, or none is left.
+    """
+    if rejected is None:
+        return np.zeros(k, dtype=bool)
+    given = np.asarray(rejected)
+    if given.shape != (k,) or given.dtype != bool:
+        raise GeometryError(
+            f"rejected of shape {given.shape} and type {given.dtype}, expected one truth value for each of "
+            f"{k} image points"
+        )
+    if given.all():
+        raise GeometryError(f"rejected: all {k} image points, expected some that are not")
+    return given
+
+
 def _let_go(layout: Unknowns, weight: FloatArray, network: Network) -> tuple[str, ...]:
     """Return the line on photographs that robust weights have let go of: it converges wherever they are."""
     seen = layout.active
@@ -219,7 +234,7 @@ def _result(
     of_control = run.problem.datum.kind == "control"
     allowed = 0 if of_control else 7  # motions: control is meant to fix all of them
     defect = rank_defect(optimum, layout)
-    undetermined = undetermined_of(optimum, layout, network, estimate, allowed_motions=allowed)
+    undetermined = undetermined_of(optimum, layout, network, estimate, weight, allowed_motions=allowed)
     redundancy = run.redundancy(optimum, weight)
     observations = 2 * int((weight > 0).sum()) + run.problem.weighted.count
     if sigma0 is None:
@@ -243,7 +258,7 @@ def _result(
         result = Covariance(empty, np.full((m, 6, 6), np.nan), interior, empty)
     else:
         result = marginal_covariance(optimum, layout, Q, sigma0**2)
-        result = without_held(result, layout)
+        result = without_held(result, layout, optimum)
         kept = Q.border[layout.kept_start - 6 * m :, layout.kept_start - 6 * m :]
         of_bars[layout.bars] = redundancy_of_bars(run.problem.weighted, layout, optimum.state, kept)
     if Q is not None and Q.has_cross:

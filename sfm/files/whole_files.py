@@ -11,7 +11,8 @@ import re
 import secrets
 import shutil
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,6 +29,7 @@ from sfm.files.manifest import (
 )
 from sfm.files.open_folders import move, open_folder, open_new_folder, refuse_links
 
+SYNCED = 8  # files that are brought to the disk at a time
 ROOM_BYTES = 1 << 20  # what is written on trial to learn why a library could not write
 RANDOM = r"\.[a-z0-9_]{8}\."  # in the name of what is being written
 
@@ -53,8 +55,8 @@ def whole_folder(out: Path, what: str = "", *, replaceable: bool = False) -> Ite
         yield part.path
         if replaceable:
             write_manifest(part.path, {n: [sha256_of(part.path / n)] for n in names_below(part.path)})
-        for path in (*part.path.rglob("*"), part.path):
-            _sync(path)
+        _sync_all(list(part.path.rglob("*")))
+        _sync(part.path)
         refuse_foreign_folder(out)  # as it is now
         _put_in_place(part, out)
 
@@ -108,8 +110,8 @@ def whole_files(folder: Path, what: str = "") -> Iterator[Path]:
         refuse_foreign_files(folder, names)
         hashes = read_manifest(folder)
         hashes.pop(MANIFEST, None)
+        _sync_all([part.path / name for name in names])
         for name in names:
-            _sync(part.path / name)
             # Listed before they are there, beside those that are: whatever ends the run, they are known.
             there = [sha256_of(folder / name)] if name in hashes and (folder / name).exists() else []
             hashes[name] = [*there, sha256_of(part.path / name)]
@@ -234,6 +236,13 @@ def _sync(path: Path) -> None:
         os.fsync(handle)
     finally:
         os.close(handle)
+
+
+def _sync_all(paths: Sequence[Path]) -> None:
+    """Have files on the disk, which takes several at a time."""
+    with ThreadPoolExecutor(SYNCED) as pool:
+        for _ in pool.map(_sync, paths):
+            pass
 
 
 def _put_in_place(part: _Part, out: Path) -> None:

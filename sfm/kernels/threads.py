@@ -23,17 +23,21 @@ _second: ContextVar[ThreadPoolExecutor | None] = ContextVar("second", default=No
 
 
 @contextmanager
-def own_threads() -> Iterator[None]:
+def own_threads(threads: int | None = None) -> Iterator[None]:
     """Hold both BLAS pools to one thread, then give them back what they had.
 
-    Where they had more, a second thread is at hand meanwhile for `at_once`.
+    Where there are more, a second thread is at hand meanwhile for `at_once`, also within an inner one.
+
+    Args:
+        threads: how many there are; as many as the pools had, if not given.
     """
     before = [(pool, pool.num_threads) for pool in _pools()]
+    there = max((number for _, number in before), default=1) if threads is None else threads
     token = None
     try:
         for pool, _ in before:
             pool.set_num_threads(1)
-        if max((threads for _, threads in before), default=1) > 1:
+        if there > 1 and _second.get() is None:
             token = _second.set(ThreadPoolExecutor(1))
         yield
     finally:
@@ -42,8 +46,8 @@ def own_threads() -> Iterator[None]:
             _second.reset(token)
             if second is not None:
                 second.shutdown()
-        for pool, threads in before:
-            pool.set_num_threads(threads)
+        for pool, number in before:
+            pool.set_num_threads(number)
 
 
 def at_once(one: Callable[[], T], other: Callable[[], T]) -> tuple[T, T]:

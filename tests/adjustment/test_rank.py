@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from sfm.adjustment.covariance import change_datum
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.solve import adjust
 from sfm.camera import camera_from_values, project
@@ -107,6 +108,30 @@ def test_points_on_parallel_rays_are_named() -> None:
     network = replace(network, image_points=replace(k, xy=xy))
     a = adjust(network, truth, datum=FREE, reject="none", max_iterations=2)
     assert sum("rays are parallel" in words for words in a.undetermined) >= 19
+
+
+def test_points_that_lost_their_rays_are_named_and_have_no_covariance() -> None:
+    """One to the last ray, one to the last but one; what held them is no precision."""
+    network, truth = make_network(seed_of("lost rays"), images=6, points=30, visibility=0.8)
+    seen, rng = network.image_points, seed_of("errors of lost rays")
+    rows = [np.flatnonzero(seen.point == j) for j in (3, 8)]
+    keep = np.ones(len(seen), dtype=bool)
+    keep[rows[1][2:]] = False
+    xy = seen.xy.copy()
+    xy[rows[0]] += rng.normal(0, 40, (len(rows[0]), 2))
+    xy[rows[1][0]] += [30.0, 30.0]
+    network = replace(network, image_points=replace(seen, xy=xy).select(keep))
+    a = adjust(network, truth, datum=FREE)
+    rays = np.bincount(network.image_points.point[~a.rejected], minlength=30)
+    assert rays[[3, 8]].tolist() == [0, 1]
+    assert a.undetermined == (
+        "point 4: 0 rays accepted, 2 are needed",
+        "point 9: 1 ray accepted, 2 are needed",
+    )
+    for covariance in (a.covariance, change_datum(a, FREE).covariance):
+        known = np.isfinite(covariance.points).all(axis=(1, 2))
+        assert np.flatnonzero(~known).tolist() == [3, 8]
+        assert np.flatnonzero(np.isnan(covariance.points_limiting).any(axis=(1, 2))).tolist() == [3, 8]
 
 
 @pytest.mark.parametrize("missing", ["image", "point"])

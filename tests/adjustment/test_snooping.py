@@ -87,8 +87,20 @@ def test_image_points_rejected_before_may_be_left_out_from_the_start():
         np.testing.assert_array_equal(again.rejected, first.rejected)
         np.testing.assert_allclose(again.estimate.points, first.estimate.points, atol=1e-6)
     assert again.iterations < first.iterations
-    with pytest.raises(GeometryError, match=r"rejected of shape \(3,\)"):
-        adjust(network, truth, rejected=np.zeros(3, dtype=bool))
+
+
+@pytest.mark.parametrize("reject", ["tau", "huber"])
+def test_image_points_rejected_before_are_one_truth_value_each(reject):
+    network, truth = make_network(seed_of("truth values"), images=4, points=20)
+    k = len(network.image_points)
+    wrong = {
+        rf"shape \(3,\) and type bool, .* {k} image": np.zeros(3, dtype=bool),
+        rf"shape \({k},\) and type int64": np.arange(k),
+        rf"all {k} image points": np.ones(k, dtype=bool),
+    }
+    for message, rejected in wrong.items():
+        with pytest.raises(GeometryError, match=f"rejected.*{message}"):
+            adjust(network, truth, reject=reject, rejected=rejected)
 
 
 @pytest.mark.parametrize("ray", [5, 77, 130])

@@ -66,6 +66,14 @@ def test_groups_that_are_not_connected_are_told_with_what_would_connect_them() -
     )
 
 
+def test_a_photograph_without_any_point_is_told_as_such() -> None:
+    network, truth = make_network(seed_of("empty"), images=IMAGES, points=POINTS)
+    seen = network.image_points
+    network = replace(network, image_points=seen.select(seen.image > 0))
+    found = tell_lost_photographs(network, orientation(network, partly(truth, np.arange(IMAGES) > 0)))
+    assert found.warnings[0].endswith("4 in one photograph are needed. No point was measured there")
+
+
 def test_photographs_that_are_connected_are_no_group_of_their_own() -> None:
     network, truth = make_network(seed_of("connected"), images=IMAGES, points=POINTS)
     estimate = partly(truth, np.arange(IMAGES) < 6)

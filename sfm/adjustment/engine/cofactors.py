@@ -134,9 +134,16 @@ def hat_complement(
     return out
 
 
-def without_held(covariance: Covariance, layout: Unknowns) -> Covariance:
-    """Return the covariance with NaN for photographs and points that took no part."""
-    idle_point, idle_image = ~layout.point_on, ~layout.image_on
+def without_held(covariance: Covariance, layout: Unknowns, optimum: Optimum) -> Covariance:
+    """Return the covariance with NaN for photographs and points that took no part or have open directions.
+
+    Args:
+        covariance: of all photographs and points.
+        layout: order of the unknowns.
+        optimum: undamped normal equations, in which directions that the rays leave open were held.
+    """
+    idle_point = ~layout.point_on | (optimum.equations.blocks.held > 0)
+    idle_image = ~layout.image_on
     points, limiting = covariance.points.copy(), covariance.points_limiting.copy()
     exterior = covariance.exterior.copy()
     points[idle_point] = limiting[idle_point] = np.nan

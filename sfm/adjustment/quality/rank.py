@@ -9,7 +9,7 @@ import numpy as np
 from sfm.adjustment.engine.iterate import Optimum
 from sfm.adjustment.engine.motions import free_motions
 from sfm.adjustment.engine.normals import times_schur
-from sfm.adjustment.engine.unknowns import Unknowns, interior_names
+from sfm.adjustment.engine.unknowns import MIN_RAYS, Unknowns, interior_names
 from sfm.conventions import BoolArray, FloatArray
 from sfm.network import Estimate, Network
 
@@ -54,7 +54,13 @@ def _mapped_to_zero(optimum: Optimum, layout: Unknowns, H: FloatArray) -> BoolAr
 
 
 def undetermined_of(
-    optimum: Optimum, layout: Unknowns, network: Network, estimate: Estimate, *, allowed_motions: int
+    optimum: Optimum,
+    layout: Unknowns,
+    network: Network,
+    estimate: Estimate,
+    weight: FloatArray,
+    *,
+    allowed_motions: int,
 ) -> tuple[str, ...]:
     """Return what cannot be determined, in words; empty if everything can.
 
@@ -63,12 +69,16 @@ def undetermined_of(
         layout: order of the unknowns.
         network: for the names of photographs and points.
         estimate: for the names of cameras.
+        weight: factor on the weight of each image point, 0 where rejected, (k,).
         allowed_motions: defect that the kind of datum is meant to fix.
     """
     words = list(layout.held)
+    open_points = np.flatnonzero(optimum.equations.blocks.held)
+    rays = np.bincount(layout.observations.point[weight > 0], minlength=len(network.points))[open_points]
     words += [
-        f"point {network.points[j]}: its rays are parallel"
-        for j in np.flatnonzero(optimum.equations.blocks.held)
+        f"point {network.points[j]}: "
+        + ("its rays are parallel" if r > 1 else f"{r} ray{'s' * (r != 1)} accepted, {MIN_RAYS} are needed")
+        for j, r in zip(open_points.tolist(), rays.tolist(), strict=True)
     ]
     if optimum.motions.defect > allowed_motions:
         words.append(

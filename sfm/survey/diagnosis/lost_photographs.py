@@ -150,10 +150,11 @@ def _words(network: Network, oriented: BoolArray, group: Lost) -> str:
     common = f"{who} only {shared} in common" if shared else f"{who} no point in common"
     own = _often_seen(network, group.images)
     others = _often_seen(network, np.flatnonzero(oriented))
+    between = f"A photograph that shows {MIN_POINTS} of {own} ... and {MIN_POINTS} of {others} ..."
     return (
         f"{names}: {n} photograph{'s are' if n > 1 else ' is'} not connected with the {int(oriented.sum())} "
-        f"oriented ones; {common}, {MIN_POINTS} in one photograph are needed. A photograph that shows "
-        f"{MIN_POINTS} of {own} ... and {MIN_POINTS} of {others} ... would connect them"
+        f"oriented ones; {common}, {MIN_POINTS} in one photograph are needed. "
+        f"{f'{between} would connect them' if own else 'No point was measured there'}"
     )
 
 

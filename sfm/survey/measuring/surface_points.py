@@ -20,7 +20,9 @@ from sfm.network import Estimate, ImagePoints, Network
 from sfm.orientation.incremental.sequence import Orientation
 from sfm.photographs.reading import read_photograph
 from sfm.result import PhotographTargets
+from sfm.similarity import fit_similarity
 from sfm.survey.inputs.measurements import Measurements
+from sfm.survey.inputs.start import control_points, scale_bars
 from sfm.survey.inputs.survey import Survey
 from sfm.survey.measuring.covering_points import find_covering_points
 from sfm.survey.measuring.tie_points import MIN_RAYS, drawn_windows
@@ -30,6 +32,7 @@ TRIAL_RAYS = 100  # with fewer the window stays as it is
 TRIAL_SIDES = 4  # of windows from one to the next: they need not cover it
 # Spread of the rays of a tie point, in that of all, beyond which it tells nothing of the surface
 TOLERANCE_FACTOR = 6.0
+MIN_CONTROL = 3  # points that place the photographs in the system of the control
 MAX_POINTS = 6000  # of a photograph: of larger ones the squares are larger than the windows
 
 
@@ -53,10 +56,11 @@ def cover_photographs(
         survey: says the window, or does not, and the sigma of an image coordinate.
         measured: the tie points.
         start: orientation of the photographs.
-        jobs: patches worked on at a time.
+        jobs: photographs worked on at a time.
 
     Returns:
-        None where the orientation leaves no tie point.
+        None where the orientation leaves no tie point. Points are named t00001, t00002 ... in the order in
+        which they are found; these are the names that control and scale bars of the survey mean.
     """
     network, estimate, files, settings = measured.network, start.estimate, measured.files, survey.tie_points
     if files is None or settings is None:
@@ -90,8 +94,14 @@ def cover_photographs(
         network.camera,
         points,
         replace(found.image_points, covariance=covariance).select(order),
+        control=control_points(survey.control, points),
+        scale_bars=scale_bars(survey.scale_bars, points),
     )
-    return Surface(covering, replace(estimate, points=found.points), drawn_windows(covering, paths, window))
+    placed = replace(estimate, points=found.points)
+    control = covering.control.complete
+    if start.kind != "given" and len(control) >= MIN_CONTROL:  # the tie points had none to be placed on
+        placed = fit_similarity(placed.points[control.point], control.xyz).apply_estimate(placed)
+    return Surface(covering, placed, drawn_windows(covering, paths, window))
 
 
 def _fitting(network: Network, estimate: Estimate) -> BoolArray:

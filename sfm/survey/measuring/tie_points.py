@@ -22,7 +22,6 @@ from sfm.survey.inputs.cameras import start_cameras
 from sfm.survey.inputs.measurements import Measurements
 from sfm.survey.inputs.photograph_list import PhotographList
 from sfm.survey.inputs.settings import TiePointSettings
-from sfm.survey.inputs.start import control_points, scale_bars
 from sfm.survey.inputs.survey import Survey
 from sfm.survey.measuring.measured_store import TEXTURE, MeasuredStore, measured_once
 from sfm.survey.measuring.photographs import each_photograph
@@ -81,16 +80,10 @@ def tie_photographs(
             f"no texture that {MIN_RAYS} photographs have in common; more overlap or "
             "smaller steps between the photographs are needed"
         )
-    points = tuple(f"t{j + 1:05d}" for j in range(int(tied.point.max()) + 1))
+    # Control and scale bars name points of the result, which lie elsewhere: see `surface_points`
+    points = tuple(f"tie {j + 1}" for j in range(int(tied.point.max()) + 1))
     covariance = tied.covariance + survey.adjust.sigma_px**2 * np.eye(2)
-    network = Network(
-        names,
-        camera,
-        points,
-        ImagePoints(tied.image, tied.point, tied.xy, covariance),
-        control=control_points(survey.control, points),
-        scale_bars=scale_bars(survey.scale_bars, points),
-    )
+    network = Network(names, camera, points, ImagePoints(tied.image, tied.point, tied.xy, covariance))
     paths = tuple(photographs.paths[k] for k in read)
     drawn = drawn_windows(network, paths, settings.window_px)
     return Measurements(

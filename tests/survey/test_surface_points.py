@@ -1,0 +1,80 @@
+"""The points that cover the photographs of a textured survey: their control, scale bars, and memory."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from sfm.camera import project
+from sfm.network import ImagePoints, Network
+from sfm.orientation.incremental.sequence import Orientation
+from sfm.survey.inputs.measurements import Measurements
+from sfm.survey.inputs.photograph_list import PhotographList
+from sfm.survey.inputs.survey import read_survey
+from sfm.survey.measuring.surface_points import Surface, cover_photographs
+from tests.matching.test_tie_points import _scene as small_scene
+
+SURVEY = """
+[survey]
+name = "surface"
+unit = "m"
+[[camera]]
+name = "lens"
+images = "*.png"
+pixel_mm = [0.005, 0.005]
+c_mm = 8.0
+[targets]
+codes = "none"
+[tie_points]
+window_px = 15
+"""
+
+
+def covered(folder: Path, more: str = "") -> Surface:
+    """Return the surface of three small photographs from their true orientation and 35 tie points."""
+    photographs, truth, _ = small_scene()
+    (folder / "survey.toml").write_text(SURVEY + more)
+    survey = read_survey(folder / "survey.toml")
+    names = tuple(f"{i}.png" for i in range(3))
+    for name, one in zip(names, photographs, strict=True):
+        cv2.imwrite(str(folder / name), one.astype(np.uint8))
+    n, camera = len(truth.points), np.zeros(3, dtype=np.int64)
+    xy = np.concatenate([project(truth.cameras[0], truth.position[i], truth.rotation[i], truth.points)
+                         for i in range(3)])  # fmt: skip
+    seen = ImagePoints(
+        np.repeat(np.arange(3), n), np.tile(np.arange(n), 3), xy, np.tile(np.eye(2), (3 * n, 1, 1))
+    )
+    network = Network(names, camera, tuple(f"tie {j + 1}" for j in range(n)), seen)
+    files = PhotographList(names, tuple(folder / name for name in names), camera, folder)
+    measured = Measurements(network, truth.cameras, names, np.full(n, 3), files=files)
+    fits = np.ones(3 * n, dtype=bool)
+    start = Orientation(truth, (), (), (names[0], names[1]), "spatial", fits, 0.1, np.ones(1))
+    found = cover_photographs(survey, measured, start)
+    assert found is not None
+    return found
+
+
+def test_control_and_scale_bars_are_of_the_points_of_the_result(tmp_path: Path) -> None:
+    """By the names that the result gives them; the network is placed on three control points."""
+    plain = covered(tmp_path)
+    points = plain.estimate.points
+    first, last = 0, len(points) - 1
+    names, chosen = (
+        plain.network.points,
+        [first, last, int(points[:, 0].argmax()), int(points[:, 1].argmax())],
+    )
+    turned = 3 * points[:, [1, 0, 2]] * [-1, 1, 1] + 100
+    rows = [f"{names[j]},{','.join(map(str, turned[j]))},1e-3,1e-3,1e-3" for j in chosen]
+    (tmp_path / "control.csv").write_text("\n".join(["id,X,Y,Z,sX,sY,sZ", *rows]))
+    bar = f'[[scale_bar]]\nfrom = "{names[first]}"\nto = "{names[last]}"\nlength = 2.5\nsigma = 1e-4\n'
+    found = covered(tmp_path, bar + '[control]\nfile = "control.csv"\n')
+    bars, control = found.network.scale_bars, found.network.control
+    assert (bars.start.tolist(), bars.end.tolist()) == ([first], [last])
+    assert sorted(control.point.tolist()) == sorted(chosen)
+    np.testing.assert_allclose(found.estimate.points, turned, atol=1e-9)
+    assert np.linalg.norm(found.estimate.position - 100, axis=1) == pytest.approx(
+        3 * np.linalg.norm(plain.estimate.position, axis=1)
+    )
