@@ -9,6 +9,7 @@ Source: COLMAP 4.2 documentation, "Output Format".
 from __future__ import annotations
 
 import errno
+from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
@@ -186,7 +187,8 @@ def network_of_scene(scene: Any, side: Names | None = None) -> tuple[Network, Es
 
     Raises:
         BackendError: a camera model that Kolinear has no equal of.
-        SurveyFileError: the name of a photograph has control or invisible characters.
+        SurveyFileError: the name of a photograph has control or invisible characters or is that of another,
+            or an image point is of a point that is missing.
     """
     side = side or Names()
     camera_ids = sorted(scene.cameras)
@@ -198,7 +200,12 @@ def network_of_scene(scene: Any, side: Names | None = None) -> tuple[Network, Es
     index = {j: k for k, j in enumerate(point_ids)}
     seen = [np.zeros((0, 4))]  # an array for each photograph, which takes less than lists of all
     for i, image in enumerate(images):
-        rows = [(i, index[p.point3D_id], p.x(), p.y()) for p in image.points2D if p.has_point3D()]
+        try:
+            rows = [(i, index[p.point3D_id], p.x(), p.y()) for p in image.points2D if p.has_point3D()]
+        except KeyError as error:
+            raise SurveyFileError(
+                f"image {image_ids[i]} has a key point of point {error}, which is not in the model"
+            ) from error
         seen.append(np.array(rows, dtype=float).reshape(-1, 4))
     table = np.concatenate(seen)
     poses = [
@@ -217,6 +224,9 @@ def network_of_scene(scene: Any, side: Names | None = None) -> tuple[Network, Es
             raise SurveyFileError(
                 f"the name of image {i} is '{shown(name)}', needed plain text of 1 to {MAX_NAME} characters"
             )
+    duplicate = next((name for name, count in Counter(labels).items() if count > 1), None)
+    if duplicate is not None:
+        raise SurveyFileError(f"more than one photograph has the name '{shown(duplicate)}'")
     network = Network(
         labels,
         np.searchsorted(camera_ids, [image.camera_id for image in images]).astype(np.int64),

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import re
 import struct
+from array import array
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,7 +23,7 @@ from sfm.files.csv_tables import MAX_NUMBER, MAX_TABLE_BYTES
 from sfm.files.json_files import MAX_SIDE_PX
 
 FILES = ("cameras", "rigs", "frames", "images", "points3D")
-OLDER = ("rigs", "frames")  # models of COLMAP before version 3.12 have none
+OLDER = ("rigs", "frames")  # models of COLMAP before version 3.12 have neither
 # Number of parameters by the name of COLMAP's models, in the order of their numbers
 MODELS = {
     "SIMPLE_PINHOLE": 3,
@@ -61,29 +62,33 @@ def check_model_files(folder: Path, *, text: bool) -> None:
         SurveyFileError: what is wrong, with file and line, or byte for binary files.
     """
     kind = "txt" if text else "bin"
+    older = not any((folder / f"{name}.{kind}").is_file() for name in OLDER)
     for name in FILES:
         path = folder / f"{name}.{kind}"
         if not path.is_file():
-            if name in OLDER:
+            if older and name in OLDER:
                 continue
             raise SurveyFileError(f"{path}: this file of the COLMAP model is missing")
-        if text:
-            _check_text(name, path)
-        else:
-            _check_binary(name, path)
+        ids = _check_text(name, path) if text else _check_binary(name, path)
+        number, count = np.unique(np.frombuffer(ids, dtype=np.uint64), return_counts=True)
+        if (count > 1).any():
+            raise SurveyFileError(f"{path}: {count.max()} {name} have the ID {number[count.argmax()]}")
 
 
-def _check_text(name: str, path: Path) -> None:
+def _check_text(name: str, path: Path) -> array[int]:
+    """Return the IDs of the cameras, photographs, ... of a file whose lines are in order."""
     text = Lines.of(path)
-    count, due = 0, None
+    ids, due = array("Q"), None
     while (line := text.maybe_line()) is not None:
         stated = re.match(r"# Number of \w+: (\d{1,20})(?!\d)", line)
         if stated:
             due = int(stated[1])
         if not line.strip() or line.startswith("#"):
             continue
-        _check_row(name, text, line.split())
-        count += 1
+        words = line.split()
+        _check_row(name, text, words)
+        ids.append(int(words[0]))
+    count = len(ids)
     if not text.ended:
         raise text.error("the last line is cut off")
     if due is None and not count:
@@ -91,6 +96,7 @@ def _check_text(name: str, path: Path) -> None:
         raise text.error("the file is empty")
     if due is not None and count != due:
         raise text.error(f"the file ends after {count} {name}, its header says {due}")
+    return ids
 
 
 def _check_row(name: str, text: Lines, words: list[str]) -> None:
@@ -174,12 +180,14 @@ def _pose(text: Lines, words: list[str]) -> None:
         raise text.error("a quaternion of zeros is no rotation")
 
 
-def _check_binary(name: str, path: Path) -> None:
+def _check_binary(name: str, path: Path) -> array[int]:
+    """Return the IDs of the cameras, photographs, ... of a file whose records are in order."""
     data = _Bytes.of(path)
     (count,) = data.take("Q")
+    ids = array("Q")
     for _ in range(count):
         if name == "cameras":
-            _, model, width, height = data.take("IiQQ")
+            number, model, width, height = data.take("IiQQ")
             if not 0 <= model < len(PARAMETERS):
                 raise data.error(f"camera model {model}, there are 0 to {len(PARAMETERS) - 1}")
             if not (1 <= width <= MAX_SIDE_PX and 1 <= height <= MAX_SIDE_PX):
@@ -189,31 +197,33 @@ def _check_binary(name: str, path: Path) -> None:
             if data.numbers(f"{PARAMETERS[model]}d")[0] <= 0:
                 raise data.error("a focal length that is not positive")
         elif name == "images":
-            data.take("I")
+            (number,) = data.take("I")
             data.numbers(POSE)
             data.take("I")
             data.skip_name()
             (points,) = data.take("Q")
             data.image_points(points)
         elif name == "points3D":
-            data.take("Q")
+            (number,) = data.take("Q")
             data.numbers("3d")
             *_, track = data.take("3BdQ")
             data.skip(8 * track)
         elif name == "rigs":
-            _, sensors = data.take("II")
+            number, sensors = data.take("II")
             if sensors:
                 data.take("iI")
             for _ in range(sensors - 1):
                 *_, has_pose = data.take("iIB")
                 data.skip(56 * bool(has_pose))
         else:
-            data.take("II")
+            number, _ = data.take("II")
             data.numbers(POSE)
             (measured,) = data.take("I")
             data.skip(16 * measured)
+        ids.append(number)
     if data.at != len(data.content):
         raise data.error(f"{len(data.content) - data.at} bytes after the last of {count} {name}")
+    return ids
 
 
 @dataclass

@@ -137,6 +137,21 @@ def update_model(
     return int(in_rigs)
 
 
+def key_points_of(model: OpenModel) -> tuple[int, float]:
+    """Return how many key points of a model have a point, and their RMS per coordinate by COLMAP, px."""
+    scene, count, squares = model.scene, 0, 0.0
+    for i in scene.reg_image_ids():
+        image = scene.image(i)
+        own = [p for p in image.points2D if p.has_point3D()]
+        if own:
+            pose = image.cam_from_world().matrix()
+            xyz = np.array([scene.point3D(p.point3D_id).xyz for p in own]) @ pose[:, :3].T + pose[:, 3]
+            v = scene.camera(image.camera_id).img_from_cam(xyz) - np.array([p.xy for p in own])
+            squares += float(np.nansum(v**2))  # COLMAP projects nothing that is behind a photograph
+            count += len(own)
+    return count, float(np.sqrt(squares / (2 * max(count, 1))))
+
+
 def interior_rows(
     model: OpenModel, before: Estimate, after: Estimate, covariance: tuple[FloatArray, ...]
 ) -> tuple[tuple[object, ...], ...]:

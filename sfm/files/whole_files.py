@@ -129,6 +129,20 @@ def refuse_existing(path: Path) -> None:
         raise OutputError(f"{path}: is there already and is left alone, a new name is needed")
 
 
+def refuse_unwritable(path: Path) -> None:
+    """Raise OutputError unless something new can be written to a place, before it takes time to make it.
+
+    A folder is made on trial in the nearest one above it that is there, and goes again.
+    """
+    refuse_existing(path)
+    above = next(part for part in (Path.cwd() / path).parents if os.path.lexists(part))
+    try:
+        with tempfile.TemporaryDirectory(dir=above):
+            pass
+    except OSError as error:
+        raise OutputError(f"{path}: cannot be written here: {error.strerror or error}") from error
+
+
 def write_manifest(folder: Path, hashes: dict[str, list[str]]) -> None:
     """List files of a folder with the SHA-256 that each may have."""
     with whole_file(folder / MANIFEST, replaces=True) as part:

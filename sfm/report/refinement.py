@@ -13,8 +13,9 @@ from sfm.files.plain_text import csv_text
 from sfm.report.findings.given_residuals import Given, bar_residuals, control_residuals
 from sfm.report.html.page import render
 from sfm.report.numbers import general, significant
-from sfm.survey.refining.refinement import Refinement
+from sfm.survey.refining.refinement import MAX_SHIFT_FACTOR, MIN_SHIFT_PX, Refinement
 from sfm.survey.refining.targets import PREFIX
+from sfm.survey.refining.windows import MIN_RAYS
 
 PAGE = "refinement.html"
 POINT_COLUMNS = ("point3D_id", "X", "Y", "Z", "sX", "sY", "sZ", "rays")
@@ -36,6 +37,8 @@ class Numbers:
     point_ids: tuple[int, ...]  # of each point
     interior: tuple[tuple[object, ...], ...]  # rows of CAMERA_COLUMNS, sigma NaN where held
     in_rigs: int = 0  # photographs that belong to rigs of several cameras
+    written: int = 0  # key points with a point in the files
+    written_px: float = 0.0  # their RMS per coordinate by COLMAP
 
 
 def refinement_files(found: Refinement, numbers: Numbers, *, title: str) -> dict[str, str]:
@@ -56,13 +59,19 @@ def refinement_files(found: Refinement, numbers: Numbers, *, title: str) -> dict
     }
 
 
+def words_of_key_points(found: Refinement, numbers: Numbers) -> str:
+    """Return the line of the RMS that COLMAP finds in the files, and why it is larger than that adjusted."""
+    return (
+        f"in the files  {numbers.written_px:.4f} px, with {numbers.written - found.refined} key points as "
+        f"they came, of points not measured anew in {MIN_RAYS} photographs"
+    )
+
+
 def _page(found: Refinement, numbers: Numbers, images: list[list[object]], title: str) -> str:
     """Return the page."""
     after, before = found.adjustment, found.readjusted
     lost = [name for name, used in zip(found.model.images, found.images, strict=True) if not used]
     remarks = []
-    if not after.converged or after.defect > after.expected_defect:
-        remarks.append("The adjustment did not converge or cannot determine everything.")
     if lost:
         more = f" and {len(lost) - NOT_ROWS} more" if len(lost) > NOT_ROWS else ""
         remarks.append(f"{len(lost)} photographs were not adjusted: {', '.join(lost[:NOT_ROWS])}{more}.")
@@ -73,8 +82,7 @@ def _page(found: Refinement, numbers: Numbers, images: list[list[object]], title
             f"{numbers.in_rigs} photographs are in rigs: COLMAP's adjuster held their cameras together "
             "afterwards; standard deviations are those without that condition."
         )
-    bad = not after.converged or after.defect > after.expected_defect
-    remarks += [*after.remarks, *found.remarks]
+    remarks = [*(line[:1].upper() + line[1:] for line in found.warnings), *remarks]
     unit = "object units" if found.targets is None else found.targets.unit
     given = Given(control_residuals(after, unit), bar_residuals(after, unit), None, None, None)
     return render(
@@ -85,10 +93,11 @@ def _page(found: Refinement, numbers: Numbers, images: list[list[object]], title
         targets=target_rows(found),
         headline=f"RMS of the key points {significant(found.before_px)} px before, "
         f"{significant(found.after_px)} px after",
-        level="bad" if bad else "fair" if remarks else "good",
+        level="bad" if not found.dependable else "fair" if remarks else "good",
         remarks=remarks,
-        sizes=_sizes(found, unit),
+        sizes=_sizes(found, numbers, unit),
         found=found,
+        limits={"shift_px": MIN_SHIFT_PX, "shift_factor": MAX_SHIFT_FACTOR, "rays": MIN_RAYS},
         after=after,
         before=before,
         interior=numbers.interior,
@@ -96,7 +105,7 @@ def _page(found: Refinement, numbers: Numbers, images: list[list[object]], title
     )
 
 
-def _sizes(found: Refinement, unit: str) -> list[tuple[str, ...]]:
+def _sizes(found: Refinement, numbers: Numbers, unit: str) -> list[tuple[str, ...]]:
     """Return rows of what the page compares: name, before, adjusted here, after."""
     both = (found.readjusted, found.adjustment)
     rows: list[tuple[str, ...]] = [
@@ -119,6 +128,17 @@ def _sizes(found: Refinement, unit: str) -> list[tuple[str, ...]]:
     rows.append(("Points whose windows do not overlap, adjusted", "", "", str(int(found.points.sum()))))
     used = (found.key_points, int((~found.readjusted.rejected).sum()), found.refined)
     rows.append(("Key points with a point", *(str(one) for one in used)))
+    kept = numbers.written - found.refined
+    rows.append(("Key points with a point in the files", rows[-1][1], "", str(numbers.written)))
+    rows.append(("of these, as they came", rows[-1][1], "", str(kept)))
+    rows.append(
+        (
+            "RMS of the key points in the files, per coordinate [px]",
+            general(found.before_px, 4),
+            "",
+            general(numbers.written_px, 4),
+        )
+    )
     if found.targets is not None:
         rows.append(("Targets", "", "", str(len(found.target_points))))
     return rows

@@ -27,6 +27,7 @@ from sfm.adjustment.quality.rank import null_motions
 from sfm.conventions import FloatArray
 from sfm.errors import GeometryError
 from sfm.network import Estimate, Network, ScaleBars
+from tests.synthetic import observed_anew, seed_of
 from tests.synthetic_blocks import FREE, HEIGHT, aerial, in_sigmas, lens, run, spoiled, unordered
 
 
@@ -127,6 +128,17 @@ def test_covariance_of_fronts_and_pairs_equals_that_of_the_product_of_full_rows(
     assert np.abs(complement_of(fronts) - complement_of(full)).max() < 1e-9
     some = np.arange(0, 500, 37), np.array([5, 77, 1200])
     assert in_sigmas(fronts.joint(*some), full.joint(*some)) < 1e-9
+
+
+def test_calibrated_cameras_are_adjusted_pair_by_pair_too() -> None:
+    """There are no interior unknowns in the border."""
+    network, truth = unordered("calibrated", 70, 300, 20)
+    truth = replace(truth, cameras=(lens(()),))
+    network = observed_anew(network, truth, 0.1, seed_of("calibrated"))
+    pairs = solver_for(network, truth)
+    assert isinstance(pairs, DenseSolver) and pairs.pairs is not None
+    a = run(network, truth)
+    assert a.converged and a.unknown_counts[1] == 0 and abs(a.sigma0 - 1) < 4 / np.sqrt(2 * a.redundancy)
 
 
 def complement_of(m: Marginal) -> FloatArray:

@@ -11,7 +11,7 @@ import pytest
 
 from sfm.errors import BackendError, OutputError
 from sfm.files import open_folders
-from sfm.files.whole_files import refuse_full, whole_file, whole_files, whole_folder
+from sfm.files.whole_files import refuse_full, refuse_unwritable, whole_file, whole_files, whole_folder
 
 NOBODY = 65534  # a user of no rights
 
@@ -53,6 +53,16 @@ def test_files_and_folders_are_written_with_and_without_handles(handles: bool, t
     for whole in (whole_folder, whole_files, whole_file):
         with pytest.raises(OutputError, match="'link' is a link to"), whole(tmp_path / "link" / "x"):
             raise AssertionError
+
+
+def test_a_place_that_cannot_be_written_is_refused_before_the_work(tmp_path: Path) -> None:
+    refuse_unwritable(tmp_path / "a" / "deep" / "out")
+    assert not list(tmp_path.iterdir())
+    (tmp_path / "file").write_text("text")
+    with pytest.raises(OutputError, match="file/out: cannot be written here: Not a directory"):
+        refuse_unwritable(tmp_path / "file" / "out")
+    with pytest.raises(OutputError, match="file: is there already"):
+        refuse_unwritable(tmp_path / "file")
 
 
 @pytest.mark.skipif(not hasattr(os, "O_PATH") or os.geteuid() != 0, reason="Linux, and root as who tests")

@@ -21,11 +21,11 @@ from datasets.textured import render
 from sfm.camera import camera_from_values, project, tangents_from_pixel
 from sfm.cli.commands.refining import refine
 from sfm.conventions import AnyArray, FloatArray
-from sfm.errors import BackendError, GeometryError, PhotographError, SurveyFileError
+from sfm.errors import BackendError, GeometryError, OutputError, PhotographError, SurveyFileError
 from sfm.network import Estimate, ImagePoints, Network
 from sfm.similarity import Similarity
 from sfm.survey.refining import model_photographs
-from sfm.survey.refining.refinement import UNSUPPORTED, refine_model
+from sfm.survey.refining.refinement import UNDEPENDABLE, UNSUPPORTED, Refinement, refine_model
 from sfm.targets.codes.rings import ring_family
 
 pycolmap = pytest.importorskip("pycolmap")
@@ -184,6 +184,17 @@ def _key_points(scene: Any, image: int) -> FloatArray:
     return np.array([p.xy for p in scene.image(image).points2D])
 
 
+def _rms(scene: Any) -> float:
+    """Return the RMS per coordinate of all key points with a point, px."""
+    v = [
+        scene.image(ray.image_id).project_point(point.xyz)
+        - scene.image(ray.image_id).points2D[ray.point2D_idx].xy
+        for point in scene.points3D.values()
+        for ray in point.track.elements
+    ]
+    return float(np.sqrt(np.mean(np.square(v))))
+
+
 @pytest.mark.parametrize("camera", ["SIMPLE_RADIAL", "PINHOLE"])
 def test_what_is_not_measured_stays_as_it_is(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], camera: str
@@ -191,8 +202,10 @@ def test_what_is_not_measured_stays_as_it_is(
     before = _model(tmp_path, camera)
     refine(tmp_path / "model", tmp_path)
     out = tmp_path / "model_refined"
-    assert "measured anew" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "measured anew" in printed
     after = pycolmap.Reconstruction(str(out))
+    assert f"in the files  {_rms(after):.4f} px, with " in printed
     assert list(after.images) == list(before.images) and set(after.point3D_ids()) == set(before.point3D_ids())
     assert after.camera(7).model_name == camera
     params = after.camera(7).params
@@ -262,6 +275,34 @@ def test_a_rig_comes_out_with_its_rig(tmp_path: Path, capfd: pytest.CaptureFixtu
     sensor = after.rig(3).non_ref_sensors
     assert list(sensor) == list(before.rig(3).non_ref_sensors)
     assert "in rigs" in (tmp_path / "out" / "refinement.html").read_text(encoding="utf-8")
+
+
+def test_a_model_of_too_few_points_is_refused_and_nothing_is_written(tmp_path: Path) -> None:
+    scene = _model(tmp_path, "FULL_OPENCV", second="FULL_OPENCV")
+    number = sorted(scene.point3D_ids())
+    for j in {*number} - {number[k] for k in (10, 16, 46, 52)}:
+        scene.delete_point3D(j)
+    scene.write_binary(str(tmp_path / "model"))
+    with pytest.raises(GeometryError, match="are not more than is to be estimated from them; hold param"):
+        refine(tmp_path / "model", tmp_path)
+    for j in scene.point3D_ids():
+        scene.delete_point3D(j)
+    scene.write_binary(str(tmp_path / "model"))
+    with pytest.raises(GeometryError, match="no key point of the model has a point, nothing to refine"):
+        refine(tmp_path / "model", tmp_path)
+    assert not (tmp_path / "model_refined").exists()
+    with pytest.raises(OutputError, match="cannot be written here: Not a directory"):  # before the work
+        refine(tmp_path / "model", tmp_path, out=tmp_path / "a" / "0.png" / "out")
+
+
+def test_a_model_that_is_not_dependable_says_so(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _model(tmp_path)
+    monkeypatch.setattr(Refinement, "dependable", False)
+    with pytest.raises(SystemExit, match="1"):
+        refine(tmp_path / "model", tmp_path)
+    assert f"warning: {UNDEPENDABLE}\n" in capsys.readouterr().out
 
 
 def test_masks(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -11,6 +11,8 @@ from sfm.cli.commands.starting import loading
 from sfm.cli.first_use import compile_first
 from sfm.runtime.faults import working_on
 
+FAILED = 1  # exit code where the refined model is not dependable
+
 
 def refine(
     model: Annotated[Path, typer.Argument(metavar="COLMAP_MODEL", help="Folder of cameras, images, points.")],
@@ -62,16 +64,22 @@ def refine(
     """
     with loading():
         from adapters.colmap.camera_models import write_scene
-        from adapters.colmap.refined_model import interior_rows, open_model, place_model, update_model
-        from sfm.files.whole_files import refuse_existing, whole_folder
-        from sfm.report.refinement import PAGE, Numbers, refinement_files
+        from adapters.colmap.refined_model import (
+            interior_rows,
+            key_points_of,
+            open_model,
+            place_model,
+            update_model,
+        )
+        from sfm.files.whole_files import refuse_unwritable, whole_folder
+        from sfm.report.refinement import PAGE, Numbers, refinement_files, words_of_key_points
         from sfm.runtime.progress_bar import drawn_progress
         from sfm.survey.inputs.survey import read_survey
         from sfm.survey.refining.refinement import refine_model, refinement_text
         from sfm.survey.refining.targets import measure_model_targets
 
     out = model.resolve().with_name(f"{model.resolve().name}_refined") if out is None else out
-    refuse_existing(out)
+    refuse_unwritable(out)
     with working_on(str(model)):
         opened = open_model(model)
         given = None if survey is None else read_survey(survey)
@@ -92,7 +100,6 @@ def refine(
             targets=targets,
             progress=progress,
         )
-    print(refinement_text(found), end="")
     a = found.adjustment
     interior = interior_rows(opened, found.start, found.estimate, a.covariance.interior)
     in_rigs = update_model(
@@ -103,10 +110,14 @@ def refine(
         images=found.images,
         points=found.points_anew,
     )
-    numbers = Numbers(opened.image_ids, opened.point_ids, interior, in_rigs)
+    numbers = Numbers(opened.image_ids, opened.point_ids, interior, in_rigs, *key_points_of(opened))
+    print(refinement_text(found), end="")
     with whole_folder(out) as folder:
         write_scene(folder, opened.scene)
         for name, text in refinement_files(found, numbers, title=model.resolve().name).items():
             (folder / name).write_text(text, encoding="utf-8")
+    print(words_of_key_points(found, numbers))
     print(f"Model: {out}")
     print(f"Report: {out / PAGE}")
+    if not found.dependable:
+        raise SystemExit(FAILED)

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sfm.adjustment.datum import Datum
+from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.conventions import MAD_TO_SIGMA, BoolArray, IntArray
 from sfm.errors import GeometryError
@@ -74,12 +75,16 @@ def orient(
             anew, estimate, np.ones(len(anew.image_points), dtype=bool), rays
         )
     except GeometryError as error:
+        why = words_of_reasons(by_count(lost))
         raise GeometryError(
-            f"refine: {int(good.sum())} of {len(seen)} key points could be measured anew, too few to adjust "
-            f"(not: {words_of_reasons(by_count(lost))}); are these the photographs of the model?"
+            f"refine: {int(good.sum())} of {len(seen)} key points could be measured anew"
+            + (f" (not: {why})" if why else "")
+            + f", {len(rows)} of them with windows that do not overlap: too few to adjust; are these the "
+            "photographs of the model?"
         ) from error
     alone = replace(part, control=ObjectPoints(), scale_bars=ScaleBars())
     adjusted = adjust(alone, start, datum=Datum("free"), reject="huber", covariance=False)
+    refuse_undetermined(alone, adjusted, lost)
     v = np.abs(adjusted.residuals)
     fits = np.ones(len(v), dtype=bool)
     matched = part.image_points.point < int(points[: len(network.points)].sum())
@@ -95,6 +100,21 @@ def orient(
         network, came, adjusted.estimate, windows, images, of_model, TOLERANCE_FACTOR * spread
     )
     return Oriented(windows, window_px, anew, rows, rays, solved, whole, accepted, spread, lost)
+
+
+def refuse_undetermined(part: Network, adjusted: Adjustment, lost: list[tuple[str, int]]) -> None:
+    """Refuse an adjustment that nothing checks: every measurement fits it.
+
+    Raises:
+        GeometryError: no redundancy.
+    """
+    if adjusted.redundancy <= 0:
+        why = words_of_reasons(by_count(lost))
+        raise GeometryError(
+            f"refine: {2 * len(part.image_points)} coordinates of {len(part.points)} points measured anew in "
+            f"{len(part.images)} photographs are not more than is to be estimated from them; hold parameters "
+            "of the cameras" + (f" (not measured anew: {why})" if why else "")
+        )
 
 
 def reasons_of(windows: Windows, rows: IntArray, *, few: int, masked: int) -> list[tuple[str, int]]:

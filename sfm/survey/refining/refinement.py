@@ -27,6 +27,7 @@ from sfm.survey.refining.oriented_windows import (
     orient,
     part_of,
     reasons_of,
+    refuse_undetermined,
     whole_model,
     words_of_reasons,
 )
@@ -41,6 +42,9 @@ MAX_OFF_AXIS_DEG = 85.0
 MAX_SHIFT_FACTOR = 6.0
 MIN_SHIFT_PX = 2.0
 UNSUPPORTED = f"of a point that fewer than {MIN_RAYS} photographs match"
+UNDEPENDABLE = (
+    "the adjustment did not converge or cannot determine everything: the refined model is not dependable"
+)
 BEYOND = f"behind the photograph or more than {MAX_OFF_AXIS_DEG:g} degrees off the axis"
 
 
@@ -97,6 +101,17 @@ class Refinement:
         return accepted
 
     @property
+    def dependable(self) -> bool:
+        """Whether the adjustment converged and determines all but the datum."""
+        return self.adjustment.converged and self.adjustment.defect <= self.adjustment.expected_defect
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What to know before the model is used, one line each, the gravest first."""
+        lines = (*self.adjustment.remarks, *self.remarks)
+        return lines if self.dependable else (UNDEPENDABLE, *lines)
+
+    @property
     def points_anew(self) -> BoolArray:
         """Points of the model from image points measured anew, adjusted or intersected, (n,)."""
         anew = self.points.copy()
@@ -148,6 +163,8 @@ def refine_model(
     if not 0 <= min_correlation <= 1:
         raise GeometryError(f"refine: smallest correlation is {min_correlation:g}, needed 0 to 1")
     seen = network.image_points
+    if not len(seen):
+        raise GeometryError("refine: no key point of the model has a point, nothing to refine")
     estimate = replace(estimate, cameras=free_cameras(network, estimate, fixed))
     residuals = pictures_of(estimate, network.camera, seen.image, estimate.points[seen.point]) - seen.xy
     depth, distance = _lengths(network, estimate)
@@ -218,6 +235,7 @@ def refine_model(
         matched=int(points[: len(network.points)].sum()),
         unit="" if targets is None else targets.unit,
     )
+    refuse_undetermined(part, final, oriented.lost)
     k = len(oriented.rows)
     adjusted = oriented.rows[
         (oriented.accepted & images[anew.image_points.image] & points[anew.image_points.point])[:k]
@@ -273,7 +291,7 @@ def refinement_text(result: Refinement) -> str:
         f"RMS after     {result.after_px:.4f} px\n"
         f"sigma0        {result.adjustment.sigma0_px:.4f} px (redundancy {result.adjustment.redundancy})\n"
         + _words_of_targets(result)
-        + "".join(f"warning: {line}\n" for line in (*result.adjustment.remarks, *result.remarks))
+        + "".join(f"warning: {line}\n" for line in result.warnings)
     )
 
 

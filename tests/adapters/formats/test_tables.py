@@ -213,6 +213,8 @@ def test_a_full_disk_leaves_nothing_and_says_why(name: str, tmp_path: Path) -> N
         ("frames.txt", "\n1 1 ", "\n1 x ", r"line \d+: an ID is 'x'"),
         ("rigs.txt", "\n1 1 ", "\n1 2 ", r"line \d+: 4 words for 2 sensors"),
         ("images.txt", " 1 p0.jpg", " 5 p0.jpg", "do not fit together"),
+        ("points3D.txt", "\n2 ", "\n1 ", r"points3D\.txt: 2 points3D have the ID 1"),
+        ("images.txt", " p1.jpg", " p0.jpg", "more than one photograph has the name 'p0.jpg'"),
     ],
 )
 def test_colmaps_own_words_stay_inside(
@@ -225,6 +227,20 @@ def test_colmaps_own_words_stay_inside(
     with pytest.raises(SurveyFileError, match=message) as refused:
         read_any(tmp_path / "m")
     assert ".cc:" not in str(refused.value) and "Check failed" not in str(refused.value)
+
+
+def test_parts_of_a_colmap_model_that_are_missing_are_named(
+    made: tuple[Network, Estimate], tmp_path: Path
+) -> None:
+    write_any(tmp_path / "m", "colmap", *made)
+    frames = (tmp_path / "m" / "frames.bin").read_bytes()
+    (tmp_path / "m" / "frames.bin").unlink()
+    with pytest.raises(SurveyFileError, match=r"frames\.bin: this file of the COLMAP model is missing"):
+        read_any(tmp_path / "m")
+    (tmp_path / "m" / "frames.bin").write_bytes(frames)
+    (tmp_path / "m" / "points3D.bin").write_bytes(bytes(8))  # none
+    with pytest.raises(SurveyFileError, match="image 1 has a key point of point 1, which is not"):
+        read_any(tmp_path / "m")
 
 
 def test_impossible_binary_cameras_are_refused(made: tuple[Network, Estimate], tmp_path: Path) -> None:

@@ -62,7 +62,7 @@ def subtract_squares(
 
     _halves(subtract, [(row, column) for row in range(pairs.tiles) for column in range(row + 1)])
     subtract_border(observations, Y, Y_interior, S[first : first + inner])
-    flat_interior = Y_interior.reshape(-1, inner)
+    flat_interior = Y_interior.reshape(3 * len(Y_interior), inner)
     S[first : first + inner, first : first + inner] -= flat_interior.T @ flat_interior
 
 
