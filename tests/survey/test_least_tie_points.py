@@ -1,4 +1,4 @@
-"""A photograph that only a few matches of texture hold is left out: matches of a pattern are wrong together."""
+"""A photograph that few matches of texture hold is left out: those of a pattern are wrong together."""
 
 from __future__ import annotations
 
