@@ -305,6 +305,13 @@ def test_a_model_that_is_not_dependable_says_so(
     assert f"warning: {UNDEPENDABLE}\n" in capsys.readouterr().out
 
 
+def test_a_photograph_that_cannot_be_read_is_named_with_its_folder(tmp_path: Path) -> None:
+    _model(tmp_path, "PINHOLE", second="PINHOLE")
+    (tmp_path / "b" / "1.png").write_bytes(b"")
+    with pytest.raises(PhotographError, match=r"^b/1\.png: the file is empty"):
+        refine(tmp_path / "model", tmp_path)
+
+
 def test_masks(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     _model(tmp_path)
     masks = tmp_path / "masks"
