@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tracemalloc
+from pathlib import Path
 
 import pytest
 
@@ -77,6 +78,17 @@ def test_a_full_matrix_that_does_not_fit_gives_way_to_fronts(monkeypatch: pytest
     assert isinstance(full, DenseSolver)
     monkeypatch.setattr(choice, "available_bytes", lambda: full.bytes / 2)
     assert isinstance(choose_solver(layout), MultifrontalSolver)
+
+
+def test_a_container_may_have_less_memory_than_the_computer(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    limit = tmp_path / "memory.max"
+    monkeypatch.setattr(memory, "LIMITS", (tmp_path / "missing", limit))
+    whole = memory.available_bytes()
+    for said, expected in (("max\n", whole), ("2000000\n", memory.SHARE * 2e6), (f"{2**63}\n", whole)):
+        limit.write_text(said, encoding="ascii")
+        assert memory.available_bytes() == expected
 
 
 @pytest.mark.parametrize(("strips", "unknowns"), [(3, "all connected"), (6, "of 84 photographs")])

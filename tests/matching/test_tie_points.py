@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import tracemalloc
 import weakref
 from collections.abc import Sequence
 from dataclasses import replace
@@ -31,6 +32,7 @@ from sfm.matching.lsm.surface_planes import planes_at
 from sfm.matching.lsm.two_photo import match_lsm
 from sfm.matching.radiometry import Grey
 from sfm.matching.tracks.feature_tracks import (
+    _snapped,
     find_tie_points,
     joined_features,
     link_features,
@@ -672,3 +674,17 @@ def test_refining_the_model_of_colmaps_mapper(folder: Path) -> None:
     result = refine_model(mapped.network, mapped.estimate, folder)
     assert result.before_px > 0.15
     assert result.after_px < 0.06 and result.refined > 0.9 * result.key_points
+
+
+def test_places_move_to_the_strongest_corner_within_reach_without_a_table_of_all_pairs() -> None:
+    corners = np.array([[50.0, 50.0], [12.0, 10.0], [10.5, 10.0]])  # the strongest first
+    places = np.array([[10.0, 10.0], [30.0, 30.0], [51.0, 50.0]])
+    found = _snapped(places, corners)
+    assert found.tolist() == [[12.0, 10.0], [30.0, 30.0], [50.0, 50.0]]
+    rng = np.random.default_rng(1)
+    places, corners = rng.uniform(0, 4000, (3000, 2)), rng.uniform(0, 4000, (5000, 2))
+    tracemalloc.start()
+    _snapped(places, corners)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 16 * len(places) * len(corners) / 50

@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from sfm.conventions import AnyArray, FloatArray, IntArray
 from sfm.kernels.options import compiled
@@ -276,5 +277,8 @@ def _snapped(xy: FloatArray, corners: FloatArray) -> FloatArray:
     """Return for each place the first (strongest) corner within reach, or the place itself."""
     if not len(xy) or not len(corners):
         return xy
-    near = ((xy[:, None] - corners[None]) ** 2).sum(axis=2) < SNAP_PX**2
-    return np.where(near.any(axis=1)[:, None], corners[near.argmax(axis=1)], xy)
+    snapped = xy.copy()
+    for k, near in enumerate(cKDTree(corners).query_ball_point(xy, SNAP_PX, return_sorted=True)):
+        if near:
+            snapped[k] = corners[near[0]]
+    return snapped

@@ -1,20 +1,29 @@
-"""What the normal equations may take of the memory of this computer."""
+"""What the normal equations may take of the memory of this computer, or of the container that it runs in."""
 
 from __future__ import annotations
 
 import os
+from pathlib import Path
 
 from sfm.errors import GeometryError
 
 SHARE = 0.75  # of the memory; the network, its blocks and other programs need some beside them
 UNKNOWN = 8e9  # bytes where the system does not say what it has
+# What a container may take, in bytes, of control groups of version 2 and 1: beyond it processes are ended
+LIMITS = (Path("/sys/fs/cgroup/memory.max"), Path("/sys/fs/cgroup/memory/memory.limit_in_bytes"))
 
 
 def available_bytes() -> float:
     """Return how much memory normal equations may take."""
-    if not hasattr(os, "sysconf") or "SC_PHYS_PAGES" not in os.sysconf_names:
-        return SHARE * UNKNOWN
-    return SHARE * os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    known = UNKNOWN
+    if hasattr(os, "sysconf") and "SC_PHYS_PAGES" in os.sysconf_names:
+        known = float(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
+    for file in LIMITS:
+        try:
+            known = min(known, float(file.read_text(encoding="ascii")))
+        except (OSError, ValueError):  # there is no such file, or it says "max"
+            continue
+    return SHARE * known
 
 
 def refuse_what_does_not_fit(size: float, unknowns: str) -> None:
