@@ -42,8 +42,8 @@ MAX_OFF_AXIS_DEG = 85.0
 MAX_SHIFT_FACTOR = 6.0
 MIN_SHIFT_PX = 2.0
 UNSUPPORTED = f"of a point that fewer than {MIN_RAYS} photographs match"
-# Not only the key points are wrong if the RMS after is more than this part of that before, and sigma0 more than
-# twice what windows and surfaces explain; a model that was refined before has as low an RMS as after
+# Not only the key points are wrong if the RMS after is more than this part of that before, and sigma0 more
+# than twice what windows and surfaces explain; a model that was refined before has as low an RMS as after
 HARDLY_BETTER = 0.5
 MAX_SIGMA0 = 2.0
 REMEDY = "the refined model is not dependable; hold parameters of the cameras with --fix"
