@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from adapters.colmap.adjuster import load_pycolmap, quiet, told
-from adapters.colmap.model_files import check_model_files
+from adapters.colmap.model_files import check_model_files, names_with_blanks
 from adapters.colmap.names import SIDE_FILE, Names, read_side_file, write_side_file
 from adapters.colmap.reconstruction import AXES, HALF_PIXEL, as_opencv, camera_of, reconstruction
 from sfm.conventions import BoolArray
@@ -142,12 +142,15 @@ def read_scene(folder: Path, *, text: bool | None = None) -> Any:
     check_model_files(folder, text=text)
     with quiet(pycolmap):
         try:
-            return _opened(pycolmap, folder, text=text)
+            scene = _opened(pycolmap, folder, text=text)
         except (ValueError, RuntimeError, LookupError, OSError, MemoryError) as error:
             raise SurveyFileError(
                 f"{folder}: each file of the COLMAP model is in order, but they do not fit together "
                 f"({told(error)})"
             ) from error
+    for number, name in names_with_blanks(folder).items() if text else ():
+        scene.image(number).name = name
+    return scene
 
 
 def named_network(folder: Path, scene: Any) -> tuple[Network, Estimate]:

@@ -75,6 +75,24 @@ def check_model_files(folder: Path, *, text: bool) -> None:
             raise SurveyFileError(f"{path}: {count.max()} {name} have the ID {number[count.argmax()]}")
 
 
+def names_with_blanks(folder: Path) -> dict[int, str]:
+    """Return the names of photographs with blanks by their IDs, from text files that are in order.
+
+    COLMAP writes them in full and reads them up to the first blank.
+    """
+    text = Lines.of(folder / "images.txt")
+    names = {}
+    while (line := text.maybe_line()) is not None:
+        if not line.strip() or line.startswith("#"):
+            continue
+        words = line.split(maxsplit=9)
+        name = words[9].rstrip()
+        if " " in name:
+            names[int(words[0])] = name
+        text.line()  # of its image points
+    return names
+
+
 def _check_text(name: str, path: Path) -> array[int]:
     """Return the IDs of the cameras, photographs, ... of a file whose lines are in order."""
     text = Lines.of(path)

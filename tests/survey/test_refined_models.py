@@ -25,7 +25,7 @@ from sfm.errors import BackendError, GeometryError, OutputError, PhotographError
 from sfm.network import Estimate, ImagePoints, Network
 from sfm.similarity import Similarity
 from sfm.survey.refining import model_photographs
-from sfm.survey.refining.refinement import UNDEPENDABLE, UNSUPPORTED, Refinement, refine_model
+from sfm.survey.refining.refinement import UNSUPPORTED, refine_model
 from sfm.targets.codes.rings import ring_family
 
 pycolmap = pytest.importorskip("pycolmap")
@@ -299,10 +299,26 @@ def test_a_model_that_is_not_dependable_says_so(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     _model(tmp_path)
-    monkeypatch.setattr(Refinement, "dependable", False)
+    monkeypatch.setattr("sfm.survey.refining.final_adjustment.MAX_ITERATIONS", 1)
     with pytest.raises(SystemExit, match="1"):
         refine(tmp_path / "model", tmp_path)
-    assert f"warning: {UNDEPENDABLE}\n" in capsys.readouterr().out
+    assert "warning: the adjustment did not converge: the refined model is" in capsys.readouterr().out
+
+
+def test_an_rms_that_is_hardly_lower_is_told_unless_it_is_that_of_windows(tmp_path: Path) -> None:
+    _model(tmp_path)
+    found = refine_model(*read_model(tmp_path / "model"), tmp_path)
+    again = replace(found, readjusted=found.adjustment)  # a model that has been refined before
+    assert not found.warnings and not again.warnings
+    bent = replace(again, adjustment=replace(found.adjustment, sigma0=20.0))
+    assert "a camera model that does not suit the lens" in bent.warnings[0]
+
+
+def test_a_photograph_that_cannot_be_read_is_named_with_its_folder(tmp_path: Path) -> None:
+    _model(tmp_path, "PINHOLE", second="PINHOLE")
+    (tmp_path / "b" / "1.png").write_bytes(b"")
+    with pytest.raises(PhotographError, match=r"^b/1\.png: the file is empty"):
+        refine(tmp_path / "model", tmp_path)
 
 
 def test_masks(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

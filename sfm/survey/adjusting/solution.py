@@ -56,6 +56,7 @@ from sfm.survey.inputs.interior import split_cameras
 from sfm.survey.inputs.measurements import Naming
 from sfm.survey.inputs.start import given_values
 from sfm.survey.inputs.survey import Survey
+from sfm.survey.measuring.tie_points import MIN_TIE_POINTS
 
 TOLERANCE_FACTOR = 6.0  # of the robust spread of the residuals
 MIN_CONTROL = 3  # points that place a free network
@@ -206,7 +207,8 @@ def _prepared(survey: Survey, matched: Correspondences) -> _Prepared:
     chosen = choose_free_parameters(survey, network, estimate, datum=datum.kind)
     survey, estimate = replace(survey, cameras=chosen.cameras), chosen.estimate
     network, estimate = split_cameras(survey.cameras, network, estimate, survey.start_cameras)
-    least = np.where(given_values(survey, network).oriented, GIVEN_IMAGE_POINTS, MIN_IMAGE_POINTS)
+    fewest = MIN_IMAGE_POINTS if survey.tie_points is None else MIN_TIE_POINTS
+    least = np.where(given_values(survey, network).oriented, GIVEN_IMAGE_POINTS, fewest)
     return _Prepared(
         Task(survey, datum, network, needed, least, survey.reject, matched.suspected),
         estimate,

@@ -26,6 +26,8 @@ from sfm.survey.inputs.survey import Survey
 from sfm.survey.measuring.measured_store import TEXTURE, MeasuredStore, measured_once
 from sfm.survey.measuring.photographs import each_photograph
 
+# Image points of a photograph: matches of a repeated pattern are wrong together, and few of them may fit.
+MIN_TIE_POINTS = 15
 MIN_RAYS = 3  # photographs that must agree on a tie point; two rays cannot contradict each other
 
 

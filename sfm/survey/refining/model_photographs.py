@@ -91,7 +91,11 @@ def read_of_size(path: Path, name: str, size_px: tuple[int, int], *, channel: st
     Raises:
         PhotographError: it cannot be read, or has another size than its camera.
     """
-    photograph, (width, height) = read_photograph(path, channel=channel), size_px
+    (width, height), short = size_px, f"{path.name}: "
+    try:
+        photograph = read_photograph(path, channel=channel)
+    except PhotographError as error:  # of the photographs of a rig, each folder has one of that name
+        raise PhotographError(f"{name}: {str(error).removeprefix(short)}") from error
     if photograph.shape != (height, width):
         raise PhotographError(
             f"{name}: {photograph.shape[1]} x {photograph.shape[0]} px, its camera has {width} x {height} px"

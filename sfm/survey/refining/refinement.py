@@ -42,9 +42,11 @@ MAX_OFF_AXIS_DEG = 85.0
 MAX_SHIFT_FACTOR = 6.0
 MIN_SHIFT_PX = 2.0
 UNSUPPORTED = f"of a point that fewer than {MIN_RAYS} photographs match"
-UNDEPENDABLE = (
-    "the adjustment did not converge or cannot determine everything: the refined model is not dependable"
-)
+# Not only the key points are wrong if the RMS after is more than this part of that before, and sigma0 more
+# than twice what windows and surfaces explain; a model that was refined before has as low an RMS as after
+HARDLY_BETTER = 0.5
+MAX_SIGMA0 = 2.0
+REMEDY = "the refined model is not dependable; hold parameters of the cameras with --fix"
 BEYOND = f"behind the photograph or more than {MAX_OFF_AXIS_DEG:g} degrees off the axis"
 
 
@@ -108,8 +110,20 @@ class Refinement:
     @property
     def warnings(self) -> tuple[str, ...]:
         """What to know before the model is used, one line each, the gravest first."""
-        lines = (*self.adjustment.remarks, *self.remarks)
-        return lines if self.dependable else (UNDEPENDABLE, *lines)
+        own, lines = self.adjustment, []
+        if not own.converged:
+            lines.append(f"the adjustment did not converge: {REMEDY}")
+        if own.defect > own.expected_defect:
+            lines.append(
+                f"the adjustment does not determine everything (rank defect {own.defect}, expected "
+                f"{own.expected_defect}): {REMEDY}"
+            )
+        if self.after_px > HARDLY_BETTER * self.readjusted_px and own.sigma0 > MAX_SIGMA0:
+            lines.append(
+                f"the RMS is {self.after_px / self.readjusted_px:.2f} times that before, expected far less: "
+                "a camera model that does not suit the lens, something that moved, or little texture"
+            )
+        return (*lines, *own.remarks, *self.remarks)
 
     @property
     def points_anew(self) -> BoolArray:

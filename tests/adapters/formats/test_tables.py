@@ -229,6 +229,15 @@ def test_colmaps_own_words_stay_inside(
     assert ".cc:" not in str(refused.value) and "Check failed" not in str(refused.value)
 
 
+def test_names_with_blanks_are_read_in_full_from_colmaps_text(
+    made: tuple[Network, Estimate], tmp_path: Path
+) -> None:
+    names = tuple(f"a {i}  ü.jpg" for i in range(len(made[0].images)))
+    write_any(tmp_path / "m", "colmap-text", replace(made[0], images=names), made[1])
+    (tmp_path / "m" / "kolinear.json").unlink()  # COLMAP's own models have none
+    assert read_any(tmp_path / "m")[0].images == names
+
+
 def test_parts_of_a_colmap_model_that_are_missing_are_named(
     made: tuple[Network, Estimate], tmp_path: Path
 ) -> None:

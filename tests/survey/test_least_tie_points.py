@@ -1,0 +1,32 @@
+"""A photograph that few matches of texture hold is left out: those of a pattern are wrong together."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from sfm.survey.adjusting.solution import Correspondences, solve_survey
+from sfm.survey.inputs.settings import TiePointSettings
+from tests.surveys import survey_of
+from tests.synthetic import make_network, seed_of
+
+
+@pytest.mark.parametrize(("left", "stays"), [(9, False), (30, True)])
+def test_a_photograph_needs_more_tie_points_than_it_would_need_targets(left: int, stays: bool) -> None:
+    network, truth = make_network(seed_of("few tie points"), images=10, points=60, free=("c",))
+    seen = network.image_points
+    last = np.flatnonzero(seen.image == 9)
+    keep = np.ones(len(seen), dtype=bool)
+    keep[last[left:]] = False
+    network = replace(network, image_points=seen.select(keep))
+    survey = survey_of(network, truth)
+    matched = Correspondences(network, truth, np.full(len(network.points), 3))
+    of_targets = solve_survey(survey, matched)
+    assert len(of_targets.adjustment.network.images) == 10
+    textured = replace(survey, tie_points=TiePointSettings())
+    found = solve_survey(textured, matched)
+    assert len(found.adjustment.network.images) == (10 if stays else 9)
+    told = [("image 10", "fewer than 15 accepted image points of the network")]
+    assert list(found.dropped_images) == ([] if stays else told)
