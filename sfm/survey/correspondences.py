@@ -47,7 +47,7 @@ def find_correspondences(
         survey: what to do.
         measured: the named image points, and all targets.
         start: orientation from the named ones, with the tolerance it has left.
-        jobs: windows of texture worked on at a time.
+        jobs: photographs of texture worked on at a time.
 
     Raises:
         GeometryError: fewer than two photographs keep enough points.

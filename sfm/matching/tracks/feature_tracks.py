@@ -70,7 +70,7 @@ def find_tie_points(
         min_rays: fewest photographs of a point.
         min_correlation: smallest coefficient r of a match.
         seed: of the random samples.
-        threads: pairs and patches worked on at a time.
+        threads: pairs of photographs worked on at a time.
 
     Returns:
         The tie points; n may be 0.
