@@ -8,6 +8,7 @@ from scipy.optimize import brentq
 
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.quality.gross_errors import rejection
+from sfm.adjustment.quality.gross_errors.rays_of_points import _Rays
 from sfm.adjustment.quality.gross_errors.robust import snoop as many_at_once
 from sfm.adjustment.quality.gross_errors.robust import would_pass
 from sfm.adjustment.quality.reliability import standardised_residuals, tau_critical
@@ -172,3 +173,21 @@ def test_several_wrong_rays_of_a_point_leave_in_one_round():
     single, single_rounds = rejected(network, truth, one_by_one)
     np.testing.assert_array_equal(many, single)
     assert single.sum() >= 9 and rounds <= 4 and single_rounds >= 10
+
+
+def test_what_is_left_when_rays_leave_is_that_of_an_adjustment_without_them():
+    """With the cameras fixed: residuals and cofactors of the other rays, and those of the point."""
+    rng = seed_of("rays leave")
+    B, error = rng.standard_normal((6, 2, 3)), rng.standard_normal((6, 2))
+
+    def adjusted(rows):
+        A = B[rows].reshape(-1, 3)
+        C = np.linalg.inv(A.T @ A)
+        e = error.reshape(-1) - B.reshape(-1, 3) @ (C @ A.T @ error[rows].reshape(-1))
+        return _Rays(e.reshape(-1, 2), np.eye(2) - B @ C @ B.transpose(0, 2, 1), B, C)
+
+    left = adjusted(np.arange(6)).without(4).without(1)
+    again, rest = adjusted([0, 2, 3, 5]), [0, 2, 3, 5]
+    np.testing.assert_allclose(left.C, again.C, atol=1e-12)
+    np.testing.assert_allclose(left.e[rest], again.e[rest], atol=1e-12)
+    np.testing.assert_allclose(left.Q[rest], again.Q[rest], atol=1e-12)

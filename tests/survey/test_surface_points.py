@@ -9,11 +9,14 @@ import numpy as np
 import pytest
 
 from sfm.camera import project
+from sfm.matching.lsm.coverage import Covered
 from sfm.network import ImagePoints, Network
 from sfm.orientation.incremental.sequence import Orientation
 from sfm.survey.inputs.measurements import Measurements
 from sfm.survey.inputs.photograph_list import PhotographList
 from sfm.survey.inputs.survey import read_survey
+from sfm.survey.measuring import surface_points
+from sfm.survey.measuring.covering_points import _Places, _visible
 from sfm.survey.measuring.surface_points import Surface, cover_photographs
 from tests.matching.test_tie_points import _scene as small_scene
 
@@ -29,11 +32,11 @@ c_mm = 8.0
 [targets]
 codes = "none"
 [tie_points]
-window_px = 15
 """
+HELD = "window_px = 15\n"
 
 
-def covered(folder: Path, more: str = "") -> Surface:
+def covered(folder: Path, more: str = HELD) -> Surface:
     """Return the surface of three small photographs from their true orientation and 35 tie points."""
     photographs, truth, _ = small_scene()
     (folder / "survey.toml").write_text(SURVEY + more)
@@ -70,7 +73,7 @@ def test_control_and_scale_bars_are_of_the_points_of_the_result(tmp_path: Path) 
     rows = [f"{names[j]},{','.join(map(str, turned[j]))},1e-3,1e-3,1e-3" for j in chosen]
     (tmp_path / "control.csv").write_text("\n".join(["id,X,Y,Z,sX,sY,sZ", *rows]))
     bar = f'[[scale_bar]]\nfrom = "{names[first]}"\nto = "{names[last]}"\nlength = 2.5\nsigma = 1e-4\n'
-    found = covered(tmp_path, bar + '[control]\nfile = "control.csv"\n')
+    found = covered(tmp_path, HELD + bar + '[control]\nfile = "control.csv"\n')
     bars, control = found.network.scale_bars, found.network.control
     assert (bars.start.tolist(), bars.end.tolist()) == ([first], [last])
     assert sorted(control.point.tolist()) == sorted(chosen)
@@ -78,3 +81,55 @@ def test_control_and_scale_bars_are_of_the_points_of_the_result(tmp_path: Path) 
     assert np.linalg.norm(found.estimate.position - 100, axis=1) == pytest.approx(
         3 * np.linalg.norm(plain.estimate.position, axis=1)
     )
+
+
+def test_the_sigma_of_the_survey_is_added_to_that_of_the_matches(tmp_path: Path) -> None:
+    plain = covered(tmp_path, HELD + "[adjust]\nsigma_px = 0.1\n").network.image_points
+    more = covered(tmp_path, HELD + "[adjust]\nsigma_px = 0.5\n").network.image_points
+    np.testing.assert_array_equal(more.xy, plain.xy)
+    np.testing.assert_allclose(
+        more.covariance - plain.covariance, np.tile(0.24 * np.eye(2), (len(more), 1, 1))
+    )
+
+
+def test_windows_have_the_size_that_the_surface_bears_unless_the_survey_says_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(surface_points, "WINDOWS_PX", (9,))
+    monkeypatch.setattr(surface_points, "TRIAL_RAYS", 10)
+    for more, side in (("", 9), (HELD, 15)):
+        assert all((one.semi_axes == side / 2).all() for one in covered(tmp_path, more).overlays)
+
+
+def test_rays_that_do_not_fit_tell_nothing_of_the_surface() -> None:
+    """Nor do points that lose one of three by that."""
+    _, truth, _ = small_scene()
+    n = len(truth.points)
+    xy = np.concatenate([project(truth.cameras[0], truth.position[i], truth.rotation[i], truth.points)
+                         for i in range(3)])  # fmt: skip
+    xy += 0.1 * np.random.default_rng(2).standard_normal(xy.shape)
+    xy[n + 4] += 20.0
+    seen = ImagePoints(
+        np.repeat(np.arange(3), n), np.tile(np.arange(n), 3), xy, np.tile(np.eye(2), (3 * n, 1, 1))
+    )
+    network = Network(("a", "b", "c"), np.zeros(3, dtype=np.int64), tuple(map(str, range(n))), seen)
+    fits = surface_points._fitting(network, truth)
+    assert (~fits).nonzero()[0].tolist() == [4, n + 4, 2 * n + 4]
+
+
+def test_places_are_visible_where_photographs_look_at_their_plane_inside_their_border() -> None:
+    _, truth, _ = small_scene()
+    camera, X = np.zeros(3, dtype=np.int64), truth.points[[10, 10, 10]]
+    to_second = truth.position[1] - X[0]
+    to_second /= np.linalg.norm(to_second)
+    across = np.cross(to_second, truth.rotation[1][:, 0])
+    across /= np.linalg.norm(across)
+    # normals that look at the second photograph, hardly look at it, and look away
+    normal = np.stack([to_second, across + 0.2 * to_second, -to_second])
+    places = _Places(np.zeros((3, 2)), normal / np.linalg.norm(normal, axis=1, keepdims=True), X)
+    covered_pixels = Covered([(360, 480)] * 3)
+    assert _visible(truth, camera, 0, places, covered_pixels, 11, 15)[1].tolist() == [True, False, False]
+    assert not _visible(truth, camera, 0, places, covered_pixels, 181, 15)[1].any()  # of 360 rows
+    covered_pixels.pixels[1][:] = True
+    seen = _visible(truth, camera, 0, places, covered_pixels, 11, 15)
+    assert seen[0].all() and not seen[1].any()
