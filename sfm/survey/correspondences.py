@@ -62,6 +62,7 @@ def find_correspondences(
             measured.min_rays if surface is None else np.full(len(network.points), MIN_RAYS),
             point_failures=start.point_failures,
             given=start.kind == "given",
+            warnings=() if surface is None else surface.warnings,
             overlays=None if surface is None else surface.overlays,
         )
     matched, left_out, lines = _without_other_objects(survey, photographs, naming, start)

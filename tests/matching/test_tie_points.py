@@ -21,7 +21,7 @@ from datasets.textured import render
 from sfm.adjustment.result import Adjustment
 from sfm.batch.run import run_batch
 from sfm.camera import Camera, project, tangents_from_pixel
-from sfm.conventions import AnyArray, FloatArray, angles_from_rotation
+from sfm.conventions import AnyArray, FloatArray, angles_from_rotation, rotation_from_vector
 from sfm.errors import GeometryError, PhotographError, SurveyFileError
 from sfm.matching.correlation.along_line import match_along_line
 from sfm.matching.epipolar import epipolar_paths
@@ -49,6 +49,7 @@ from sfm.similarity import fit_similarity
 from sfm.survey.drafting.draft import draft_survey
 from sfm.survey.inputs.survey import read_survey
 from sfm.survey.measuring.covering_points import find_covering_points
+from sfm.survey.measuring.surface_points import words_of_disagreement
 from sfm.survey.other_programs import OtherPrograms
 from sfm.survey.refining.refinement import refine_model, refinement_text
 from tests.engines import ALONE, HERE, Notes
@@ -298,6 +299,16 @@ def test_covering_points_cover_photographs_that_are_oriented() -> None:
     assert np.sqrt((height**2).mean()) < 3e-4
     assert np.sqrt((found.residuals**2).mean()) < 0.05
     assert len(find_covering_points(*arguments, window_px=15, side_px=15, references=[]).points) == 0
+    assert len(seen) >= 0.95 * found.matched and words_of_disagreement(found) == ()
+    # a photograph that is turned by 3 px: its windows are found, their rays do not meet the others
+    turned = truth.rotation.copy()
+    turned[2] = turned[2] @ rotation_from_vector(np.array([3 / lens.c_px, 0.0, 0.0]))
+    apart = replace(truth, rotation=turned)
+    wrong = find_covering_points(photographs, apart, camera, ties, window_px=15, side_px=15)
+    assert wrong.matched > 100
+    assert words_of_disagreement(wrong)[0].startswith(
+        f"only {100 * len(wrong.residuals) / wrong.matched:.0f} %"
+    )
 
 
 def test_tie_points_of_three_photographs() -> None:

@@ -30,3 +30,16 @@ def test_a_photograph_needs_more_tie_points_than_it_would_need_targets(left: int
     assert len(found.adjustment.network.images) == (10 if stays else 9)
     told = [("image 10", "fewer than 15 accepted image points of the network")]
     assert list(found.dropped_images) == ([] if stays else told)
+
+
+def test_points_that_leave_with_a_photograph_are_told_so() -> None:
+    """All their rays are accepted, and one is of a photograph that is not in the result."""
+    network, truth = make_network(seed_of("leave with it"), images=10, points=60, free=("c",))
+    seen = network.image_points
+    few = seen.point < 9
+    keep = np.where(seen.image == 9, few, ~few | (seen.image < 2))
+    network = replace(network, image_points=seen.select(keep))
+    survey = replace(survey_of(network, truth), tie_points=TiePointSettings())
+    found = solve_survey(survey, Correspondences(network, truth, np.full(len(network.points), 3)))
+    reasons = {one.reason for one in found.left_out}
+    assert reasons == {"some of its rays are of photographs that are not in the result, 3 are needed"}

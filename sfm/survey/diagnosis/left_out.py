@@ -37,6 +37,8 @@ def left_out_points(
             reason = f"{_rays(int(rays[j]))}, {needed[j]} are needed"
         elif name in told:
             reason = told[name]
+        elif accepted_rays[j] >= needed[j]:
+            reason = f"some of its rays are of photographs that are not in the result, {needed[j]} are needed"
         else:
             reason = f"{accepted_rays[j]} of its {rays[j]} rays were accepted, {needed[j]} are needed"
         out.append(LeftOutPoint(name, int(rays[j]), reason))

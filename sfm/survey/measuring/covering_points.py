@@ -44,6 +44,7 @@ class CoveringPoints:
     image_points: ImagePoints  # k of them, their points 0 to n - 1
     points: FloatArray  # object points, (n, 3)
     residuals: FloatArray  # of the rays with the orientation as it was, px, (k, 2)
+    matched: int  # rays that were matched, of which these k agree with each other
 
 
 @dataclass(frozen=True)
@@ -259,7 +260,8 @@ def _agreeing(
     kept, point = np.unique(seen.point[used], return_inverse=True)
     c = np.array([lens.c_px for lens in estimate.cameras])[camera[seen.image[used]]]
     image_points = replace(seen.select(used), point=point.ravel())
-    return CoveringPoints(image_points, met.points[kept], met.residuals[used] * c[:, None]), used
+    residuals = met.residuals[used] * c[:, None]
+    return CoveringPoints(image_points, met.points[kept], residuals, len(seen)), used
 
 
 def _concatenated(parts: Sequence[ImagePoints]) -> ImagePoints:
@@ -283,6 +285,7 @@ def _joined(found: Sequence[CoveringPoints]) -> CoveringPoints:
         _concatenated(moved),
         np.concatenate([one.points for one in found]),
         np.concatenate([one.residuals for one in found]),
+        sum(one.matched for one in found),
     )
 
 
@@ -290,4 +293,4 @@ def _none() -> CoveringPoints:
     """Return no points."""
     none = np.zeros(0, dtype=np.int64)
     nothing = ImagePoints(none, none, np.zeros((0, 2)), np.zeros((0, 2, 2)))
-    return CoveringPoints(nothing, np.zeros((0, 3)), np.zeros((0, 2)))
+    return CoveringPoints(nothing, np.zeros((0, 3)), np.zeros((0, 2)), 0)
