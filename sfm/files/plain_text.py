@@ -12,16 +12,17 @@ bidirectional characters.
 
 from __future__ import annotations
 
-import csv
-import io
 import math
 import re
 from collections.abc import Iterable, Sequence
 from functools import lru_cache
+from itertools import islice
+from typing import cast
 
 import numpy as np
 
 MAX_NAME = 500  # characters of a name that is read from a file
+BLOCK = 10_000  # rows that are written at a time
 SHOWN = 40  # characters of what was found that a message repeats
 
 # What nobody sees, or what changes how the text around it is seen: categories Cc, Cf, Cs, Zl and Zp, and all
@@ -46,16 +47,18 @@ def or_none(value: float) -> float | None:
 
 
 def csv_text(header: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
-    """Return a table as CSV."""
-    buffer = io.StringIO()
-    writer = csv.writer(buffer, lineterminator="\n")
-    writer.writerow(header)
-    writer.writerows(
-        # `csv.writer` gives the digits of plain numbers, which most cells are
-        [value if type(value) is float and math.isfinite(value) else _cell(value) for value in row]
-        for row in rows
-    )
-    return buffer.getvalue()
+    """Return a table as CSV (RFC 4180), each row as long as the header.
+
+    Column by column, since a survey of natural texture has millions of cells, most of them numbers.
+    """
+    lines = [",".join(map(_quoted, header))]
+    rows = iter(rows)
+    while block := list(islice(rows, BLOCK)):
+        columns = [_column(values) for values in zip(*block, strict=True)]
+        if len(columns) == 1:
+            columns = [[cell or '""' for cell in columns[0]]]  # an empty line is no row
+        lines += map(",".join, zip(*columns, strict=True))
+    return "\n".join(lines) + "\n"
 
 
 def as_cell(text: str) -> str:
@@ -92,8 +95,21 @@ def as_plain(text: str) -> str:
     return _HIDDEN.sub(lambda found: ascii(found[0])[1:-1].replace("\\udc", "\\x"), text)
 
 
-def _cell(value: object) -> object:
-    """Return what `csv.writer` is to write."""
+def _column(values: Sequence[object]) -> list[str]:
+    """Return the cells of a column."""
+    if all(type(value) is float for value in values):
+        numbers = cast(Sequence[float], values)
+        return [repr(value) if value - value == 0 else "" for value in numbers]  # neither NaN nor infinite
+    return [_cell(value) for value in values]
+
+
+def _quoted(cell: str) -> str:
+    """Return a cell in quotes, if it needs them."""
+    return '"' + cell.replace('"', '""') + '"' if "," in cell or '"' in cell else cell
+
+
+def _cell(value: object) -> str:
+    """Return what stands in the table."""
     if isinstance(value, str):
         return _text_cell(value)
     if isinstance(value, float | np.floating):
@@ -104,4 +120,4 @@ def _cell(value: object) -> object:
 @lru_cache(maxsize=4096)
 def _text_cell(text: str) -> str:
     """Return the cell of a text; most are names of photographs that stand in thousands of rows."""
-    return as_cell(as_plain(text))
+    return _quoted(as_cell(as_plain(text)))

@@ -5,15 +5,13 @@ from __future__ import annotations
 import re
 import time
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 from sfm.files.covariance_file import write_covariance
 from sfm.files.manifest import MANIFEST, refuse_foreign_folder
 from sfm.files.whole_files import whole_folder
-from sfm.report.figures.overlays import Overlay, draw_overlays
+from sfm.report.figures.overlays import draw_overlays
 from sfm.report.figures.plots import all_plots
 from sfm.report.findings.findings import Findings
 from sfm.report.html.report_page import report_page
@@ -22,7 +20,7 @@ from sfm.report.tables.protocol_files import write_protocol
 from sfm.report.tables.summary import write_summary
 from sfm.report.text.text_report import text_report
 from sfm.report.viewer.embedded import viewer_of
-from sfm.report.viewer.pictures import BUDGET_MB, Pictures, cut_pictures
+from sfm.report.viewer.pictures import BUDGET_MB, cut_pictures
 from sfm.report.viewer.result_scene import scene_of_result
 from sfm.result import StageTime
 from sfm.runtime.progress import SILENT, Progress
@@ -99,20 +97,15 @@ def write_result(
             (folder / "colmap").mkdir()
             write_colmap(folder / "colmap")
         scene = scene_of_result(findings)
-
-        def draw_photographs() -> tuple[tuple[Overlay, ...], Pictures]:
-            overlays = draw_overlays(result, jobs=jobs, progress=progress)
-            files = {one.image: one.path for one in result.photographs}
-            cut = partial(cut_pictures, scene, files, budget_mb=budget_mb, beside="pictures")
-            return overlays, cut(jobs=jobs, progress=progress)
-
-        # OpenCV draws photographs while Python draws plots and writes tables
-        with ThreadPoolExecutor(max_workers=1) as beside:
-            drawn = beside.submit(draw_photographs)
-            plots = all_plots(findings)
-            write_tables(findings, folder)
-            write_protocol(findings, folder)
-            overlays, pictures = drawn.result()
+        # one after another: beside Python at work threads of short calls wait for each turn
+        overlays = draw_overlays(result, jobs=jobs, progress=progress)
+        files = {one.image: one.path for one in result.photographs}
+        pictures = cut_pictures(
+            scene, files, budget_mb=budget_mb, beside="pictures", jobs=jobs, progress=progress
+        )
+        plots = all_plots(findings)
+        write_tables(findings, folder)
+        write_protocol(findings, folder)
         if overlays:
             (folder / "overlays").mkdir()
         for overlay in overlays:

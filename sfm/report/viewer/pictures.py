@@ -146,16 +146,18 @@ def _cut(
     crops: dict[int, bytes] = {}
     frames: dict[int, tuple[float, float, float, int]] = {}
     cells = []
-    for k in rows:
-        camera = scene.cameras[scene.camera[scene.rays.photo[k]]]
-        scale = grey.shape[1] / camera.size_px[0]  # below 1 where a smaller picture stands for the photograph
-        left, top, side = _frame(scene, int(k), grey.shape, scale)
+    photo = scene.rays.photo[rows[0]] if len(rows) else 0
+    width = scene.cameras[scene.camera[photo]].size_px[0]
+    scale = grey.shape[1] / width  # below 1 where a smaller picture stands for the photograph
+    for k, (left, top, side) in zip(
+        rows.tolist(), _frames(scene, rows, grey.shape, scale).tolist(), strict=True
+    ):
         patch = grey[top : top + side, left : left + side]
         if side > CROP_PX:
             patch = cv2.resize(patch, (CROP_PX, CROP_PX), interpolation=cv2.INTER_AREA)
-        frames[int(k)] = (left / scale - 0.5, top / scale - 0.5, side / scale, len(patch))
+        frames[k] = (left / scale - 0.5, top / scale - 0.5, side / scale, len(patch))
         if wanted[k]:
-            crops[int(k)] = jpeg_of(patch, CROP_QUALITY)
+            crops[k] = jpeg_of(patch, CROP_QUALITY)
         if with_files and with_cells:
             cells.append(patch)
     large = fitted_picture(grey, FILE_PX)
@@ -170,16 +172,14 @@ def _cut(
     )
 
 
-def _frame(scene: ViewerScene, k: int, shape: tuple[int, ...], scale: float) -> tuple[int, int, int]:
-    """Return first column, first row and side of the crop of a ray, px of a picture, inside of it."""
-    semi = scene.rays.ellipse[k, 0]
-    wanted = 2 * semi * CROP_DIAMETERS if np.isfinite(semi) else SIDE_PX
-    side = min(round(scale * min(max(wanted, MIN_SIDE_PX), MAX_SIDE_PX)), *shape[:2])
-    corner = [
-        min(max(round(scale * (float(x) + 0.5) - side / 2), 0), size - side)
-        for x, size in zip(scene.rays.xy[k], shape[1::-1], strict=True)
-    ]
-    return corner[0], corner[1], side
+def _frames(scene: ViewerScene, rows: IntArray, shape: tuple[int, ...], scale: float) -> IntArray:
+    """Return first column, first row and side of the crops of rays, px of a picture, inside of it, (k, 3)."""
+    semi = scene.rays.ellipse[rows, 0]
+    wanted = np.where(np.isfinite(semi), 2 * semi * CROP_DIAMETERS, SIDE_PX)
+    side = np.minimum(np.rint(scale * np.clip(wanted, MIN_SIDE_PX, MAX_SIDE_PX)), min(shape[:2]))
+    corner = np.rint(scale * (scene.rays.xy[rows] + 0.5) - side[:, None] / 2)
+    corner = np.clip(corner, 0, np.array(shape[1::-1]) - side[:, None])
+    return np.column_stack([corner, side]).astype(np.int64)
 
 
 def _sheet(patches: list[AnyArray]) -> bytes:
