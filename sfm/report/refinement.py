@@ -91,7 +91,8 @@ def _page(found: Refinement, numbers: Numbers, images: list[list[object]], title
         unit=unit,
         given=given,
         targets=target_rows(found),
-        headline=f"RMS of the key points {significant(found.before_px)} px before, "
+        headline=("" if found.dependable else "Not dependable: ")
+        + f"RMS of the key points {significant(found.before_px)} px before, "
         f"{significant(found.after_px)} px after",
         level="bad" if not found.dependable else "fair" if remarks else "good",
         remarks=remarks,
@@ -101,8 +102,15 @@ def _page(found: Refinement, numbers: Numbers, images: list[list[object]], title
         after=after,
         before=before,
         interior=numbers.interior,
+        units=_units(found),
         images=images,
     )
+
+
+def _units(found: Refinement) -> dict[str, str]:
+    """Return what stands behind the name of each interior parameter: its unit in brackets, if it has one."""
+    pairs = [pair for camera in found.start.cameras for pair in zip(camera.names, camera.units, strict=True)]
+    return {name: "" if unit == "1" else f" [{unit}]" for name, unit in pairs}
 
 
 def _sizes(found: Refinement, numbers: Numbers, unit: str) -> list[tuple[str, ...]]:

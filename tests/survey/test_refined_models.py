@@ -235,6 +235,7 @@ def test_what_is_not_measured_stays_as_it_is(
     assert (
         "a/0.png" in page and "of a point that fewer than 3 photographs see" in page and "http:" not in page
     )
+    assert "[px]" in page.partition("<h2>Cameras")[2].partition("</tr>")[2].partition("</tr>")[0]
     # COLMAP goes on from there: the same key points, hardly anything left to change
     error = after.compute_mean_reprojection_error()
     pycolmap.bundle_adjustment(after, pycolmap.BundleAdjustmentOptions(print_summary=False))
