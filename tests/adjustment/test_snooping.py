@@ -14,6 +14,7 @@ from sfm.adjustment.quality.gross_errors.robust import would_pass
 from sfm.adjustment.quality.reliability import standardised_residuals, tau_critical
 from sfm.adjustment.solve import adjust
 from sfm.errors import GeometryError
+from sfm.network import ImagePoints
 from tests.synthetic import make_network, seed_of
 
 NETWORKS = 50
@@ -191,3 +192,27 @@ def test_what_is_left_when_rays_leave_is_that_of_an_adjustment_without_them():
     np.testing.assert_allclose(left.C, again.C, atol=1e-12)
     np.testing.assert_allclose(left.e[rest], again.e[rest], atol=1e-12)
     np.testing.assert_allclose(left.Q[rest], again.Q[rest], atol=1e-12)
+
+
+def test_a_point_that_keeps_rays_from_one_place_leaves():
+    """Of three rays two are from the same place, and the third is wrong: nothing tells its depth any more."""
+    network, truth = make_network(seed_of("one place"), images=8, points=60, free=("c",))
+    seen, twin = network.image_points, network.image_points.image == 0
+    image, point = np.append(seen.image, np.full(twin.sum(), 8)), np.append(seen.point, seen.point[twin])
+    noise = 0.1 * seed_of("twin").standard_normal((int(twin.sum()), 2))
+    xy = np.concatenate([seen.xy, seen.xy[twin] + noise])
+    xy[(image == 3) & (point < 5)] += 6.0
+    keep = (point >= 5) | np.isin(image, (0, 3, 8))
+    points = ImagePoints(image, point, xy, np.tile(0.01 * np.eye(2), (len(xy), 1, 1))).select(keep)
+    network = replace(
+        network, images=(*network.images, "twin"), camera=np.append(network.camera, 0), image_points=points
+    )
+    start = replace(
+        truth,
+        position=np.vstack([truth.position, truth.position[:1] + 1e-6]),
+        rotation=np.concatenate([truth.rotation, truth.rotation[:1]]),
+    )
+    found = adjust(network, start, datum=Datum("free"), alpha=1e-4)
+    assert found.converged and found.iterations < 20
+    assert found.rejected[points.point < 5].all() and not found.rejected[points.point >= 5].any()
+    assert np.isnan(found.covariance.points[:5]).all() and np.isfinite(found.covariance.points[5:]).all()

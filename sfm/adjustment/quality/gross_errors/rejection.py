@@ -33,6 +33,7 @@ ROUND_TOLERANCE = 1e-2  # |A dx| / |v| of a last step after which gross errors c
 BENT = 2.0  # spread of residuals over that with the start values, above which gross errors bend the network
 BENT_ALONE = 10.0  # the same of one photograph, over the median of all photographs
 FAR_OFF = 100.0  # median residuals beyond which an image point has no influence with any estimator
+MIN_ANGLE_DEG = 0.1  # of two rays of a point: some pixels of parallax, below which they tell no depth
 REWEIGHTINGS = 30
 REWEIGHTED = 1e-3  # largest change of a weight at which reweighting ends
 REJECTS = ("tau", "huber", "tukey", "none")
@@ -224,6 +225,7 @@ def _snoop_all(run: Run, optimum: Optimum, weight: FloatArray, alpha: float) -> 
     """
     layout = run.problem.layout
     returned, vague = np.zeros(len(weight), dtype=bool), 0
+    loose = np.zeros(len(weight), dtype=bool)
     for _ in range(MAX_ROUNDS):
         vague += not optimum.converged
         if vague > MAX_VAGUE:
@@ -245,7 +247,7 @@ def _snoop_all(run: Run, optimum: Optimum, weight: FloatArray, alpha: float) -> 
             redundancy=redundancy,
             alpha=alpha,
         )
-        back &= layout.active & ~returned
+        back &= layout.active & ~returned & ~loose
         if not (out.any() or back.any()):
             break
         if out.any():
@@ -253,6 +255,8 @@ def _snoop_all(run: Run, optimum: Optimum, weight: FloatArray, alpha: float) -> 
         else:  # take back only once nothing large is left
             changed = np.where(back, 1.0, weight)
             returned |= back
+        loose |= _without_angle(run.problem, optimum.state, changed > 0, out | back)
+        changed = np.where(loose, 0.0, changed)
         try:
             optimum, weight = run.again(optimum, changed), changed
         except GeometryError as error:
@@ -262,6 +266,32 @@ def _snoop_all(run: Run, optimum: Optimum, weight: FloatArray, alpha: float) -> 
             )
             break
     return optimum, weight
+
+
+def _without_angle(problem: Problem, state: State, used: BoolArray, changed: BoolArray) -> BoolArray:
+    """Return all image points of points whose rays have changed and are almost one, (k,).
+
+    Two photographs from the same place tell no depth: the point would go to infinity, and no step of the
+    others would be taken whole. Known points stay, and so do single rays, which ask for nothing.
+
+    Args:
+        problem: what is adjusted.
+        state: the unknowns.
+        used: image points that take part, (k,).
+        changed: those that have gone or come back, (k,).
+    """
+    o, count = problem.layout.observations, len(state.points)
+    suspect = np.bincount(o.point[changed], minlength=count) > 0
+    suspect &= problem.layout.point_free.all(axis=1)
+    suspect[problem.weighted.point] = False
+    rows = np.flatnonzero(used & suspect[o.point])
+    ray = state.points[o.point[rows]] - state.position[o.image[rows]]
+    ray /= np.linalg.norm(ray, axis=1, keepdims=True)
+    first = np.zeros((count, 3))
+    first[o.point[rows]] = ray  # one of them
+    apart, rays = np.zeros(count), np.bincount(o.point[rows], minlength=count)
+    np.maximum.at(apart, o.point[rows], np.linalg.norm(ray - first[o.point[rows]], axis=1))
+    return np.asarray((suspect & (rays > 1) & (apart < np.radians(MIN_ANGLE_DEG)))[o.point])
 
 
 def _bending(run: Run, optimum: Optimum, weight: FloatArray) -> BoolArray:
