@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 from rich.console import Console
 from rich.table import Table
 
-from sfm.cli.commands.starting import loading
+from sfm.cli.commands.starting import FAILED, loading
 from sfm.cli.first_use import compile_first
 from sfm.errors import KolinearError, MissingLibraryError
 
@@ -23,7 +23,6 @@ if TYPE_CHECKING:
     from sfm.adjustment.result import Adjustment
     from sfm.network import Estimate
 
-FAILED = 1  # exit code where a check fails
 LIBRARIES = (
     "kolinear",
     "numpy",

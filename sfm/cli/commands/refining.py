@@ -7,11 +7,9 @@ from typing import Annotated
 
 import typer
 
-from sfm.cli.commands.starting import loading
+from sfm.cli.commands.starting import FAILED, loading
 from sfm.cli.first_use import compile_first
 from sfm.runtime.faults import working_on
-
-FAILED = 1  # exit code where the refined model is not dependable
 
 
 def refine(

@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from types import FrameType
 
+FAILED = 1  # exit code where a result is not dependable, or a check fails
 INTERRUPTED = 130  # exit code after Ctrl-C, as a shell expects it
 INTERRUPTED_TEXT = "kolinear: interrupted, nothing half-done is left (batch --resume goes on)"
 AT_ONCE_TEXT = "kolinear: ended at once; the next run into the same folder clears what is half-done"

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from sfm.cli.commands.drafting import drafted_beside
-from sfm.cli.commands.starting import loading
+from sfm.cli.commands.starting import FAILED, loading
 from sfm.cli.first_use import compile_first
 from sfm.errors import KolinearError
 from sfm.runtime.faults import FAULT, working_on
@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from sfm.survey.inputs.survey import Survey
     from sfm.survey.other_programs import OtherPrograms
 
-FAILED = 1  # exit code where a survey, or one of a batch, has no dependable result
 
 SURVEY_FILE = "survey.toml"  # in a folder of photographs
 

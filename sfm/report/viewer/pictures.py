@@ -124,7 +124,8 @@ def cut_pictures(
         except PhotographError:
             return None
         grey = (grey >> 8).astype(np.uint8) if grey.dtype == np.uint16 else grey
-        return _cut(grey, scene, rows_of[i], wanted, with_files=bool(beside), with_cells=scarce)
+        width_px = scene.cameras[scene.camera[i]].size_px[0]
+        return _cut(grey, width_px, scene, rows_of[i], wanted, with_files=bool(beside), with_cells=scarce)
 
     cuts: list[_Cut | None] = []
     with ThreadPoolExecutor(max_workers=max(1, jobs)) as pool:
@@ -136,6 +137,7 @@ def cut_pictures(
 
 def _cut(
     grey: AnyArray,
+    width_px: int,
     scene: ViewerScene,
     rows: IntArray,
     wanted: AnyArray,
@@ -146,9 +148,7 @@ def _cut(
     crops: dict[int, bytes] = {}
     frames: dict[int, tuple[float, float, float, int]] = {}
     cells = []
-    photo = scene.rays.photo[rows[0]] if len(rows) else 0
-    width = scene.cameras[scene.camera[photo]].size_px[0]
-    scale = grey.shape[1] / width  # below 1 where a smaller picture stands for the photograph
+    scale = grey.shape[1] / width_px  # below 1 where a smaller picture stands for the photograph
     for k, (left, top, side) in zip(
         rows.tolist(), _frames(scene, rows, grey.shape, scale).tolist(), strict=True
     ):

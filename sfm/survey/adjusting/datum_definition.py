@@ -22,7 +22,7 @@ CLEARLY = 0.25  # of the misfit that the best choice removes: by how much more t
 MAX_CANDIDATES = 10  # control points and bars that are taken out in turn, those that lose most rays first
 OTHER_UNIT = 8.0  # factor between scales that no start values explain: mm, cm, m, km differ by ten or more
 WELL_APART = 10.0  # standard deviations of their distance between places that tell a scale
-MIN_CONTROL = 3  # points that a control datum needs
+MIN_CONTROL = 3  # points that a control datum needs, and that place a free network
 
 
 def object_scale(network: Network, estimate: Estimate) -> float:

@@ -26,6 +26,7 @@ from sfm.result import (
     TakenOut,
 )
 from sfm.survey.adjusting.datum_definition import (
+    MIN_CONTROL,
     datum_warnings,
     place_on_control,
     place_on_frame,
@@ -59,7 +60,6 @@ from sfm.survey.inputs.survey import Survey
 from sfm.survey.measuring.tie_points import MIN_TIE_POINTS
 
 TOLERANCE_FACTOR = 6.0  # of the robust spread of the residuals
-MIN_CONTROL = 3  # points that place a free network
 PAIR_TOLERANCE = 10.0  # standard deviations within which pairs of accepted image points fit an orientation
 GIVEN_IMAGE_POINTS = 3  # of one whose given orientation tells which of the four solutions is meant
 

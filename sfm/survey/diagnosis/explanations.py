@@ -26,9 +26,7 @@ from sfm.similarity import fit_similarity
 from sfm.survey.diagnosis.two_groups import two_groups
 
 MUCH_REJECTED = 0.05  # share of rejected image points from which causes are looked for, too
-LARGE = (
-    50_000  # image points from which on nothing is tried while sigma0 is as expected, and most to try with
-)
+LARGE = 50_000  # image points: from which on nothing is tried while sigma0 is as expected; most to try with
 FEW = 50  # image points of a photograph of which none is left out of such a trial
 WORTH_A_TRY = 1.5  # sigma0 over the expected one from which causes are looked for
 NEAR_THE_BEST = 1.25  # of the least sigma0: what is simpler and reaches this is preferred

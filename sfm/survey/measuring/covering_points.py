@@ -204,8 +204,8 @@ def _followed(
         warp = plane_warps(
             estimate, camera, i, j, places.xy[rows], points[rows], places.normal[rows], window_px / 2
         )
-        a, b, c, d = warp[:, :2, :2].reshape(-1, 4).T
-        scale = np.sqrt(np.abs(a * d - b * c))
+        with np.errstate(invalid="ignore"):  # of planes that a photograph does not see
+            scale = np.sqrt(np.abs(np.linalg.det(warp[:, :2, :2])))
         fits = np.isfinite(at).all(axis=1) & (scale > SCALES[0]) & (scale < SCALES[1])
         if not fits.any():
             return None

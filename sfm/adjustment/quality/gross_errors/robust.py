@@ -5,8 +5,7 @@ the largest of all, and with it others whose photograph and object point hold no
 none is judged beside a larger error. In a photograph of many image points an error moves the residuals of
 the others by its leverage only, some hundredths of it: there all those go that are not much smaller than the
 largest, and further rays of an object point that has lost one go one after another in the same round
-(`rays_of_points`). A rejected point is taken back when it would clearly pass the test in the
-adjustment.
+(`rays_of_points`). A rejected point is taken back when it would clearly pass the test in the adjustment.
 
 Huber's estimator bounds the influence of an image point, Tukey's biweight takes it back to nothing:
 beyond TUKEY standard deviations an image point has weight 0. It starts from Huber's, because its sum
@@ -34,9 +33,7 @@ TUKEY = 5.123
 # most some times that: beside CROWDED points one of BESIDE of the largest tau is an error of its own.
 CROWDED = 60
 BESIDE = 0.4
-RETURNS = (
-    0.99  # of the critical value, below which a rejected one returns: 1 would turn in circles at the limit
-)
+RETURNS = 0.99  # of the critical value: a rejected one returns below, since at it rounds turn in circles
 MIN_FREEDOM = 0.05  # of redundancy over observations, so that a network without redundancy has a scale
 
 
