@@ -37,6 +37,7 @@ from sfm.targets.codes.rings import ring_family
 from sfm.targets.detect import find_targets
 
 IMAGES, POINTS = 8, 40
+SINGLE_IMAGES = 18  # enough unknowns for steps in single precision
 MANY_IMAGES, MANY_POINTS = 80, 160  # more photographs than those whose normal matrix is always a full one
 SEEN, RAYS = 12, 6  # points that one of them sees, and photographs that see a point of a strip
 SIZE_PX, PIXEL_MM, C_MM = (1000, 800), (0.01, 0.01), 10.0
@@ -75,7 +76,9 @@ def compile_adjustment() -> None:
     part, start, _, _ = common_problem(adjustment)
     compared = adjust(part, start, datum=Datum("free"), reject="none")
     reprojection(part, compared.estimate)
-    for sees in (_strip(), _scattered()):  # whose normal matrix is one of fronts, and summed ray by ray
+    every = np.ones((SINGLE_IMAGES, POINTS), dtype=bool)
+    # whose normal matrix is one of fronts, summed ray by ray, and a product in single precision on the way
+    for sees in (_strip(), _scattered(), every):
         adjust(*made_up_network(sees), datum=Datum("free"), reject="none")
 
 
@@ -162,7 +165,8 @@ def _strip() -> AnyArray:
 def _scattered() -> AnyArray:
     """Return which points photographs see that share few of them, with any others."""
     rng = np.random.default_rng(3)
-    return np.asarray(rng.random((MANY_IMAGES, MANY_POINTS)).argsort(axis=1) < SEEN)
+    return np.asarray(rng.random((SINGLE_IMAGES = 18  # enough unknowns for steps in single precision
+MANY_IMAGES, MANY_POINTS)).argsort(axis=1) < SEEN)
 
 
 def drawn_photograph(bright: bool) -> AnyArray:
