@@ -165,8 +165,7 @@ def _strip() -> AnyArray:
 def _scattered() -> AnyArray:
     """Return which points photographs see that share few of them, with any others."""
     rng = np.random.default_rng(3)
-    return np.asarray(rng.random((SINGLE_IMAGES = 18  # enough unknowns for steps in single precision
-MANY_IMAGES, MANY_POINTS)).argsort(axis=1) < SEEN)
+    return np.asarray(rng.random((MANY_IMAGES, MANY_POINTS)).argsort(axis=1) < SEEN)
 
 
 def drawn_photograph(bright: bool) -> AnyArray:
