@@ -29,6 +29,7 @@ SMALLER_TOLERANCES = (
     1 / 10,
 )  # of the first start tolerance, from which a solution in doubt is followed
 FAR_WORSE = 3.0  # times the median residual of all photographs, of one that may not belong to them
+CONTRADICTING = "its image points contradict the others: another object or wrong names"
 BOUND = 6.0  # times the median residual of the best solution: what lies farther off counts as that
 
 
@@ -66,10 +67,7 @@ def reversed_growth(growth: Growth, empty: Growth, refine: Refine, without: Bool
     empty.fixed, empty.tolerance_px = growth.fixed.copy(), growth.tolerance_px.copy()
     empty.dropped, empty.reasons = growth.dropped | without, dict(growth.reasons)
     for i in np.flatnonzero(without).tolist():
-        empty.reasons[i] = (
-            "its image points contradict the others, which fit better without it: another object, a mirrored "
-            "picture or wrong names"
-        )
+        empty.reasons[i] = CONTRADICTING
     empty.refined(refine, everything=True)
     return empty
 

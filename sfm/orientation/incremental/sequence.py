@@ -23,6 +23,7 @@ from sfm.errors import GeometryError
 from sfm.network import Estimate, Network, empty_estimate
 from sfm.orientation.incremental.given_values import start_from_given
 from sfm.orientation.incremental.growth import FIRST_ADJUSTMENT, Growth, Refine, has_given_values
+from sfm.orientation.incremental.misfits import judge_misfits
 from sfm.orientation.incremental.remaining_points import intersect_remaining
 from sfm.orientation.incremental.rivals import (
     SMALLER_TOLERANCES,
@@ -117,13 +118,21 @@ def orient(
         start = _grow(growth, refine, final_tolerance_px, judge)
         if start.pair is not None and refine is not None:
             growth, start = _best_of_rivals(growth, start, values, begin, refine, final_tolerance_px, judge)
+        settle_misfits(growth)
         return _finish(growth, start, values.cameras, contradicting=contradicting)
+
+    def settle_misfits(growth: Growth) -> None:
+        if judge_misfits(growth, refine):
+            _settled(growth, refine, final_tolerance_px)
+            if growth.drop_unsupported():
+                _settled(growth, refine, final_tolerance_px)
 
     if not has_given_values(network, estimate):
         return grow(estimate)
     growth = begin(estimate)
     kept = start_from_given(growth, refine, final_tolerance_px)
     if kept is not None:
+        settle_misfits(growth)
         given = Start(None, "given", kept.estimate.position, kept.estimate.rotation, kept.estimate.points)
         oriented = _finish(growth, given, estimate.cameras, contradicting=contradicting)
         return replace(oriented, warnings=kept.replaced)

@@ -1,0 +1,108 @@
+"""Photographs that fit worse than the others: mirrored ones leave, less precise ones stay.
+
+On an object with little depth a mirrored picture finds a place behind it or at its side where most of its
+image points fit a wide tolerance, and near-duplicates of it bend with it. Turned over it fits the others as
+they fit each other, once these are adjusted without it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from sfm.camera import tangents_from_pixel
+from sfm.conventions import FloatArray
+from sfm.network import rows_of
+from sfm.orientation.incremental.growth import Growth, Refine
+from sfm.orientation.incremental.rivals import CONTRADICTING
+from sfm.orientation.resection.ransac import resect_robust
+
+MIN_OTHERS = 3  # oriented photographs that one is judged by
+WORSE = 1.5  # times the typical median residual of a photograph, from which on it is looked at turned over
+FAR_BETTER = 8.0  # times smaller residuals, turned over: 20 to 80 of mirrored pictures, 2 of four points
+
+
+def judge_misfits(growth: Growth, refine: Refine | None) -> bool:
+    """Let mirrored photographs go and take back what a rival solution left out though it fits.
+
+    Args:
+        growth: settled; changed where a photograph comes or goes.
+        refine: the caller's adjustment, of the others alone.
+
+    Returns:
+        Whether a photograph came or went, so that the network is to be settled anew.
+    """
+    changed = False
+    for i in [k for k, reason in growth.reasons.items() if reason == CONTRADICTING]:
+        if not _is_mirrored(growth, i) and growth.resect([i]):
+            growth.dropped[i], changed = False, True
+    looked_at = ~growth.estimate.oriented
+    while growth.estimate.oriented.sum() > MIN_OTHERS:
+        medians = _medians_px(growth)
+        if not np.isfinite(medians).any():
+            break
+        waiting = np.where(looked_at | ~(medians > WORSE * np.nanmedian(medians)), -np.inf, medians)
+        i = int(np.argmax(waiting))
+        if not np.isfinite(waiting[i]):
+            break
+        looked_at[i] = True
+        if _median_px(growth, i, turned_over=True) < medians[i]:
+            with_it = growth.estimate
+            position, rotation = with_it.position.copy(), with_it.rotation.copy()
+            position[i], rotation[i] = np.nan, np.nan
+            growth.estimate = replace(with_it, position=position, rotation=rotation)
+            growth.intersect()
+            growth.refined(refine)
+            if _is_mirrored(growth, i):
+                growth.dropped[i], changed = True, True
+            else:
+                growth.estimate = with_it
+    return changed
+
+
+def _is_mirrored(growth: Growth, i: int) -> bool:
+    """Return whether a photograph fits the others far better turned over, and give that as its reason."""
+    as_it_is, turned = _median_px(growth, i), _median_px(growth, i, turned_over=True)
+    mirrored = FAR_BETTER * turned < as_it_is
+    if mirrored:
+        left = f"{as_it_is:.2g} px" if np.isfinite(as_it_is) else "undefined"
+        growth.reasons[i] = (
+            f"a mirrored picture: its median residual is {left} as it is and {turned:.2g} px turned over"
+        )
+    return mirrored
+
+
+def _median_px(growth: Growth, i: int, *, turned_over: bool = False) -> float:
+    """Return the median residual of a photograph resected on the present points, px; inf if it is not.
+
+    Args:
+        growth: gives points and interior orientation.
+        i: the photograph.
+        turned_over: whether left and right of its image points are exchanged.
+    """
+    seen, camera = growth.network.image_points, growth.estimate.cameras[growth.network.camera[i]]
+    own = np.flatnonzero((seen.image == i) & growth.estimate.determined[seen.point])
+    xy = seen.xy[own]
+    uv = tangents_from_pixel(camera, (camera.size_px[0] - 1, 0) + xy * (-1, 1) if turned_over else xy)
+    known = np.isfinite(uv).all(axis=1)
+    found = resect_robust(
+        uv[known],
+        growth.estimate.points[seen.point[own[known]]],
+        tolerance=growth.tolerance()[i],
+        seed=growth.seed + i,
+        min_inliers=growth.min_points,
+        field=growth.field[i],
+    )
+    if not found.found:
+        return float(np.inf)
+    lengths = np.linalg.norm(found.residuals, axis=1) * camera.c_px
+    return float(np.median(np.where(np.isnan(lengths), np.inf, lengths)))
+
+
+def _medians_px(growth: Growth) -> FloatArray:
+    """Return the median residual of every photograph, NaN where it has none, px, (m,)."""
+    residuals = growth.residuals_px()
+    known = np.isfinite(residuals)
+    rows = rows_of(growth.network.image_points.image, len(growth.network.images))
+    return np.array([np.median(residuals[r][known[r]]) if known[r].any() else np.nan for r in rows])
