@@ -92,6 +92,15 @@ def test_the_sigma_of_the_survey_is_added_to_that_of_the_matches(tmp_path: Path)
     )
 
 
+def test_a_photograph_has_as_many_points_as_the_survey_says(tmp_path: Path) -> None:
+    """Of 480 x 360 pixels 100 take squares of 41, and each photograph adds few to those of the others."""
+    per_photograph = {
+        more: np.bincount(covered(tmp_path, HELD + more).network.image_points.image)
+        for more in ("", "max_points = 100\n")
+    }
+    assert per_photograph["max_points = 100\n"].max() < 150 < per_photograph[""].min()
+
+
 def test_windows_have_the_size_that_the_surface_bears_unless_the_survey_says_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

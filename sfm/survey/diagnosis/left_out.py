@@ -39,6 +39,8 @@ def left_out_points(
             reason = told[name]
         elif accepted_rays[j] >= needed[j]:
             reason = f"some of its rays are of photographs that are not in the result, {needed[j]} are needed"
+        elif not accepted_rays[j]:
+            reason = f"none of its {rays[j]} rays was accepted: they do not meet, or are almost parallel"
         else:
             reason = f"{accepted_rays[j]} of its {rays[j]} rays were accepted, {needed[j]} are needed"
         out.append(LeftOutPoint(name, int(rays[j]), reason))

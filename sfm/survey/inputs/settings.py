@@ -166,6 +166,7 @@ class TiePointSettings(Section):
     detector: Literal["foerstner", "sift"] = "foerstner"  # what finds the interest points
     window_px: Annotated[int, Field(ge=7, le=101)] = 15  # odd side of the matched windows
     max_features: Annotated[int, Field(ge=100, le=20_000)] = 2000  # of each photograph, spread over it
+    max_points: Annotated[int, Field(ge=100, le=100_000)] = 6000  # of each photograph, over its texture
 
 
 class DatumSettings(Section):

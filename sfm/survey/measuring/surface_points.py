@@ -22,6 +22,7 @@ from sfm.photographs.reading import read_photograph
 from sfm.result import PhotographTargets
 from sfm.similarity import fit_similarity
 from sfm.survey.inputs.measurements import Measurements
+from sfm.survey.inputs.settings import TiePointSettings
 from sfm.survey.inputs.start import control_points, scale_bars
 from sfm.survey.inputs.survey import Survey
 from sfm.survey.measuring.covering_points import CoveringPoints, find_covering_points
@@ -36,7 +37,6 @@ MIN_CONTROL = 3  # points that place the photographs in the system of the contro
 # Share of the matched rays that agree with each other below which many do so by chance: 0.91 and more on
 # rendered surfaces, 0.37 on photographs of a varnished floor from all sides
 MIN_AGREEING = 0.7
-MAX_POINTS = 6000  # of a photograph: of larger ones the squares are larger than the windows
 
 
 @dataclass(frozen=True)
@@ -79,14 +79,14 @@ def cover_photographs(
     surface = seen.select(fits)
     window = settings.window_px
     if "window_px" not in settings.model_fields_set:
-        window = _best_window(photographs, network, estimate, surface, window, jobs)
+        window = _best_window(photographs, network, estimate, surface, settings, jobs)
     found = find_covering_points(
         photographs,
         estimate,
         network.camera,
         surface,
         window_px=window,
-        side_px=_side(photographs, window),
+        side_px=_side(photographs, window, settings.max_points),
         min_rays=MIN_RAYS,
         threads=jobs,
     )
@@ -134,10 +134,10 @@ def _fitting(network: Network, estimate: Estimate) -> BoolArray:
     return np.asarray(fits & (rays >= MIN_RAYS)[seen.point])
 
 
-def _side(photographs: Sequence[AnyArray], window_px: int) -> int:
+def _side(photographs: Sequence[AnyArray], window_px: int, most: int) -> int:
     """Return the odd side of the squares: a window, or more where a photograph would have too many, px."""
     area = max(one.shape[0] * one.shape[1] for one in photographs)
-    return max(window_px, int(np.sqrt(area / MAX_POINTS)) | 1)
+    return max(window_px, int(np.sqrt(area / most)) | 1)
 
 
 def _best_window(
@@ -145,7 +145,7 @@ def _best_window(
     network: Network,
     estimate: Estimate,
     surface: ImagePoints,
-    usual: int,
+    settings: TiePointSettings,
     jobs: int,
 ) -> int:
     """Return the side of the windows with which the same pixels are the most precise, px."""
@@ -158,11 +158,11 @@ def _best_window(
             network.camera,
             surface,
             window_px=window,
-            side_px=max(TRIAL_SIDES * window + 1, _side(photographs, window)),
+            side_px=max(TRIAL_SIDES * window + 1, _side(photographs, window, settings.max_points)),
             references=most[:TRIAL_PHOTOGRAPHS].tolist(),
             threads=jobs,
         )
         if len(trial.residuals) >= TRIAL_RAYS:
             spread = MAD_TO_SIGMA * float(np.median(np.abs(trial.residuals)))
             found.append((window, spread * window))
-    return largest_alike(found) if found else usual
+    return largest_alike(found) if found else settings.window_px
