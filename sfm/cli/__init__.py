@@ -5,6 +5,7 @@ Nothing is imported here that takes time: Ctrl-C and wrong arguments are answere
 
 from __future__ import annotations
 
+import gc
 import sys
 
 from sfm.cli.commands.starting import INTERRUPTED, INTERRUPTED_TEXT, loading, stopped_once
@@ -13,6 +14,7 @@ from sfm.errors import KolinearError
 from sfm.runtime.folder_settings import close_library_path, refuse_folder_settings
 from sfm.runtime.installation import refuse_mixed_installation
 
+YOUNG_OBJECTS = 100_000  # more of them than Python's 700 before it looks for cycles: a tenth of a run
 BAD_INPUT = 2  # exit code where a person must put something right
 
 
@@ -43,6 +45,7 @@ def main() -> None:
 
 def _run() -> None:
     """Run the command that the arguments name."""
+    gc.set_threshold(YOUNG_OBJECTS)
     refuse_mixed_installation()  # asked here too: the other project's sfm/__init__.py may lie over ours
     refuse_folder_settings()
     close_library_path()

@@ -12,7 +12,8 @@ from sfm.files.plain_text import csv_text, or_none
 from sfm.geometry.tolerance import DECISIONS
 from sfm.inspection.acceptance import NOT_KNOWN, Acceptance
 from sfm.report.figures.measurements import length_error_figure
-from sfm.report.figures.plots import Plot, png
+from sfm.report.figures.plot_data import Plot
+from sfm.report.figures.plots import png
 from sfm.report.html.page import render
 from sfm.report.page_files import write_files
 

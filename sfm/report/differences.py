@@ -15,7 +15,8 @@ from sfm.distortion.models import MODELS, Role
 from sfm.files.covariance_file import MAX_POINTS
 from sfm.files.plain_text import csv_text, or_none
 from sfm.report.figures.comparisons import difference_figure
-from sfm.report.figures.plots import Plot, png
+from sfm.report.figures.plot_data import Plot
+from sfm.report.figures.plots import png
 from sfm.report.html.page import render
 from sfm.report.numbers import finer_unit, general, significant
 from sfm.report.page_files import write_files

@@ -19,7 +19,8 @@ from sfm.epochs.series import EpochPair, EpochSeries
 from sfm.epochs.together import SharedCamera
 from sfm.files.plain_text import csv_text, or_none
 from sfm.report.figures.comparisons import difference_figure, series_figure
-from sfm.report.figures.plots import Plot, png
+from sfm.report.figures.plot_data import Plot
+from sfm.report.figures.plots import png
 from sfm.report.html.page import render
 from sfm.report.numbers import finer_unit, significant
 from sfm.report.page_files import write_files

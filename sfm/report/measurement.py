@@ -19,7 +19,8 @@ from sfm.geometry.shapes.fit import ShapeFit
 from sfm.geometry.tolerance import DECISIONS, Deviations
 from sfm.inspection.measure import Measurement
 from sfm.report.figures.measurements import deviation_figure
-from sfm.report.figures.plots import Plot, png
+from sfm.report.figures.plot_data import Plot
+from sfm.report.figures.plots import png
 from sfm.report.html.page import render
 from sfm.report.viewer.embedded import Viewer, viewer_of
 from sfm.report.viewer.pictures import cut_pictures

@@ -12,7 +12,8 @@ from sfm.files.covariance_file import write_covariance
 from sfm.files.manifest import MANIFEST, refuse_foreign_folder
 from sfm.files.whole_files import whole_folder
 from sfm.report.figures.overlays import draw_overlays
-from sfm.report.figures.plots import all_plots
+from sfm.report.figures.plot_process import PlotProcess, draw_plots
+from sfm.report.figures.plotted import plot_data
 from sfm.report.findings.findings import Findings
 from sfm.report.html.report_page import report_page
 from sfm.report.tables.csv_files import write_tables
@@ -69,6 +70,7 @@ def write_result(
     jobs: int = 1,
     budget_mb: float = BUDGET_MB,
     progress: Progress = SILENT,
+    plot_process: PlotProcess | None = None,
 ) -> Path:
     """Write everything that a survey gives into one folder, whole or not at all.
 
@@ -80,6 +82,7 @@ def write_result(
         jobs: photographs drawn at the same time.
         budget_mb: what the pictures inside report.html may take, 10^6 bytes.
         progress: is told of every photograph.
+        plot_process: draws the plots meanwhile; without it they are drawn here.
 
     Returns:
         The path of report.html.
@@ -96,6 +99,8 @@ def write_result(
         if write_colmap is not None:
             (folder / "colmap").mkdir()
             write_colmap(folder / "colmap")
+        if plot_process is not None:
+            plot_process.begin(plot_data(findings))
         scene = scene_of_result(findings)
         # one after another: beside Python at work threads of short calls wait for each turn
         overlays = draw_overlays(result, jobs=jobs, progress=progress)
@@ -103,7 +108,6 @@ def write_result(
         pictures = cut_pictures(
             scene, files, budget_mb=budget_mb, beside="pictures", jobs=jobs, progress=progress
         )
-        plots = all_plots(findings)
         write_tables(findings, folder)
         write_protocol(findings, folder)
         if overlays:
@@ -114,6 +118,7 @@ def write_result(
             (folder / "pictures").mkdir()
         for name, content in pictures.beside.items():
             (folder / "pictures" / name).write_bytes(content)
+        plots = draw_plots(plot_data(findings)) if plot_process is None else plot_process.plots()
         (folder / "plots").mkdir()
         for plot in plots:
             (folder / "plots" / f"{plot.stem}.png").write_bytes(plot.png)

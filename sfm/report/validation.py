@@ -14,7 +14,8 @@ import numpy as np
 from sfm.comparison.two_adjusters.adjuster_validation import SAME, SAME_COST, Trial, Validation
 from sfm.files.plain_text import csv_text, or_none
 from sfm.report.figures.comparisons import time_figure
-from sfm.report.figures.plots import Plot, png
+from sfm.report.figures.plot_data import Plot
+from sfm.report.figures.plots import png
 from sfm.report.html.page import render
 from sfm.report.page_files import write_files
 

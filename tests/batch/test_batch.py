@@ -54,7 +54,7 @@ def finished(surveys: tuple[Path, ...], tmp_path_factory: pytest.TempPathFactory
     """A batch of them, run in this process."""
     out = tmp_path_factory.mktemp("batch") / "out"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("sfm.report.output.all_plots", lambda *_: [])
+        patch.setattr("sfm.report.output.draw_plots", lambda *_: [])
         rows = run_batch(surveys, out, HERE, ALONE, Notes())
     assert [row.status for row in rows] == ["done"] * 3
     return out
@@ -63,7 +63,7 @@ def finished(surveys: tuple[Path, ...], tmp_path_factory: pytest.TempPathFactory
 @pytest.fixture(autouse=True)
 def no_plots(monkeypatch: pytest.MonkeyPatch) -> None:
     """Spare the drawing in this process, which takes most of the time of a small survey."""
-    monkeypatch.setattr("sfm.report.output.all_plots", lambda *_: [])
+    monkeypatch.setattr("sfm.report.output.draw_plots", lambda *_: [])
 
 
 @pytest.fixture(scope="module")

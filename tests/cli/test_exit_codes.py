@@ -57,7 +57,7 @@ COMMANDS = {
 
 @pytest.fixture(autouse=True)
 def no_plots(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("sfm.report.output.all_plots", lambda *_: [])
+    monkeypatch.setattr("sfm.report.output.draw_plots", lambda *_: [])
     monkeypatch.setattr(starting, "_tell_of_compiling", lambda: None)
 
 

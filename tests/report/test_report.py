@@ -25,6 +25,7 @@ from sfm.files.manifest import refuse_foreign_folder
 from sfm.network import Network, ObjectPoints, ScaleBars
 from sfm.report.figures.overlays import USED, draw_photograph, overlay_names
 from sfm.report.figures.plots import all_plots, plan_axes
+from sfm.report.figures.plotted import plot_data
 from sfm.report.findings.findings import findings_of
 from sfm.report.findings.geometry import geometry_of
 from sfm.report.html.page import environment
@@ -248,7 +249,7 @@ class Tags(HTMLParser):
 
 
 def test_page_is_whole_escaped_and_self_contained(result: SurveyResult) -> None:
-    page = report_page(findings_of(result), all_plots(findings_of(result)), ())
+    page = report_page(findings_of(result), all_plots(plot_data(findings_of(result))), ())
     tags = Tags()
     tags.feed(page)
     assert tags.open == []
@@ -423,7 +424,7 @@ def test_plots_of_small_and_plain_results() -> None:
     bars = ScaleBars(np.array([0]), np.array([1]), np.array([1.0]), np.array([0.1]))
     plain: Network = replace(network, images=names, scale_bars=bars)
     a = adjust(plain, truth, datum=Datum("free"))
-    plots = all_plots(findings_of(SurveyResult("plots", "$m", 3, (), a, np.full(12, -1), None)))
+    plots = all_plots(plot_data(findings_of(SurveyResult("plots", "$m", 3, (), a, np.full(12, -1), None))))
     assert [plot.stem for plot in plots] == ["network", "residuals", "distribution", "photographs"]
     assert all(plot.png.startswith(b"\x89PNG") for plot in plots)
 

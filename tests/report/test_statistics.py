@@ -22,6 +22,7 @@ from sfm.camera import Camera
 from sfm.comparison.two_adjusters.adjusters import AdjusterComparison, BackendAdjustment, compare_adjusters
 from sfm.network import Estimate, InteriorObservations, Network, ObjectPoints, ScaleBars
 from sfm.report.figures.plots import all_plots, plan_axes
+from sfm.report.figures.plotted import plot_data
 from sfm.report.findings.bundle_statistics import statistics_of
 from sfm.report.findings.checks import (
     LISTED,
@@ -703,7 +704,7 @@ def test_names_that_the_font_lacks_give_no_warning(
     cameras = tuple(replace(camera, name="相機_$x") for camera in truth.cameras)
     network = with_bars(replace(network, images=names), truth, (0.0,), 1e-4)
     a = adjust(network, replace(truth, cameras=cameras), datum=Datum("free"))
-    all_plots(findings_of(replace(result_of(a), unit="米")))
+    all_plots(plot_data(findings_of(replace(result_of(a), unit="米"))))
     assert not recwarn.list
 
 

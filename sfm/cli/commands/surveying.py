@@ -184,6 +184,7 @@ def _run_survey(
         from sfm.api import colmap_writer, one_blas_thread, programs_of, read_result
         from sfm.cli.console import tell_result
         from sfm.pipeline import run_survey
+        from sfm.report.figures.plot_process import plot_process
         from sfm.report.findings.findings import findings_of
         from sfm.report.log import SurveyLog
         from sfm.report.output import write_result
@@ -233,6 +234,7 @@ def _run_survey(
         working_on(str(survey_file)),
         drawn_progress() as drawn,
         one_blas_thread(),
+        plot_process() as plots,
         _written(folder),
         SurveyLog(watch=drawn) as log,
     ):
@@ -247,6 +249,7 @@ def _run_survey(
             jobs=workers,
             budget_mb=pictures_mb,
             progress=log,
+            plot_process=plots,
         )
     if not tell_result(findings, page, seconds=time.perf_counter() - begun, verbose=verbose):
         raise SystemExit(FAILED)

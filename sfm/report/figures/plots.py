@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -12,10 +11,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 
-from sfm.adjustment.result import Adjustment
 from sfm.conventions import FloatArray, IntArray
-from sfm.network import Estimate
-from sfm.report.findings.findings import Findings
+from sfm.report.figures.plot_data import Plot, PlotCamera, PlotData
 
 BLUE, RED, GREY, GREEN, ORANGE = "#1f5fa8", "#c8372d", "#8a8f98", "#2b7a4b", "#d98a1f"
 DPI = 110
@@ -31,24 +28,15 @@ TITLES = ("Plan", "Elevation")
 FLAT_COSINE = 0.94  # within 20 degrees of Z the object's main plane is drawn as X and Y
 
 
-@dataclass(frozen=True)
-class Plot:
-    """A picture of a page."""
-
-    stem: str  # of its file name
-    caption: str
-    png: bytes
-
-
-def all_plots(findings: Findings) -> tuple[Plot, ...]:
+def all_plots(shown: PlotData) -> tuple[Plot, ...]:
     """Draw every picture of the report."""
-    drawn: tuple[tuple[str, str, Callable[[Findings], Figure]], ...] = (
+    drawn: tuple[tuple[str, str, Callable[[PlotData], Figure]], ...] = (
         ("network", _NETWORK, network_figure),
         ("residuals", _RESIDUALS, residual_figure),
         ("distribution", _DISTRIBUTION, distribution_figure),
         ("photographs", _PHOTOGRAPHS, photograph_figure),
     )
-    return tuple(Plot(stem, caption, png(draw(findings))) for stem, caption, draw in drawn)
+    return tuple(Plot(stem, caption, png(draw(shown))) for stem, caption, draw in drawn)
 
 
 def png(figure: Figure) -> bytes:
@@ -92,33 +80,31 @@ _DISTRIBUTION = (
 _PHOTOGRAPHS = "RMS residual per coordinate and number of accepted image points of each photograph."
 
 
-def network_figure(findings: Findings) -> Figure:
+def network_figure(shown: PlotData) -> Figure:
     """Draw the network in plan and in elevation."""
-    adjustment, unit = findings.result.adjustment, findings.result.length_unit
-    estimate = adjustment.estimate
-    axes_from_object, labels = plan_axes(estimate.points, estimate.position)
-    points = estimate.points @ axes_from_object.T
-    position = estimate.position @ axes_from_object.T
+    axes_from_object, labels = plan_axes(shown.points, shown.position)
+    points = shown.points @ axes_from_object.T
+    position = shown.position @ axes_from_object.T
     size = 0.12 * float(np.median(np.linalg.norm(position - np.median(points, axis=0), axis=1)))
     figure = panelled(5.2)
-    for panel, title, shown in zip(figure.subplots(1, 2), TITLES, ((0, 1), (0, 2)), strict=True):
-        across, up = shown
+    for panel, title, plane in zip(figure.subplots(1, 2), TITLES, ((0, 1), (0, 2)), strict=True):
+        across, up = plane
         panel.plot(points[:, across], points[:, up], ".", color=GREY, markersize=4)
-        for k, family in enumerate(findings.interior.families):
-            own, camera = np.flatnonzero(findings.interior.family == k), family.camera
+        for k, camera in enumerate(shown.cameras):
+            own = np.flatnonzero(shown.camera == k)
             colour = CAMERA_COLOURS[k % len(CAMERA_COLOURS)]
-            edges = _pyramids(estimate, own, camera.c_px, camera.size_px, size) @ axes_from_object.T
-            panel.add_collection(LineCollection(list(edges[:, :, shown]), colors=colour, linewidths=0.8))
-            panel.plot(*position[own][:, shown].T, "o", color=colour, markersize=4, label=_plain(family.name))
+            edges = _pyramids(shown, own, camera, size) @ axes_from_object.T
+            panel.add_collection(LineCollection(list(edges[:, :, plane]), colors=colour, linewidths=0.8))
+            panel.plot(*position[own][:, plane].T, "o", color=colour, markersize=4, label=_plain(camera.name))
         panel.set_aspect("equal", adjustable="datalim")
         panel.margins(0.1)  # for the names of the photographs
         panel.autoscale_view()
-        panel.set_xlabel(f"{labels[across]} [{_plain(unit)}]")
-        panel.set_ylabel(f"{labels[up]} [{_plain(unit)}]")
+        panel.set_xlabel(f"{labels[across]} [{_plain(shown.unit)}]")
+        panel.set_ylabel(f"{labels[up]} [{_plain(shown.unit)}]")
         entitled(panel, title)
         panel.grid(color="#ddd", linewidth=0.5)
     plan = figure.axes[0]
-    for name, x, y in zip(adjustment.network.images, position[:, 0], position[:, 1], strict=True):
+    for name, x, y in zip(shown.images, position[:, 0], position[:, 1], strict=True):
         if len(position) <= MAX_NAMED:
             plan.annotate(
                 _plain(_short(name)),
@@ -132,27 +118,25 @@ def network_figure(findings: Findings) -> Figure:
     return figure
 
 
-def residual_figure(findings: Findings) -> Figure:
+def residual_figure(shown: PlotData) -> Figure:
     """Draw residual vectors over the format of each camera, one by one and as means of cells."""
-    adjustment, cameras = findings.result.adjustment, findings.interior.families
-    network = adjustment.network
-    figure = panelled(4.4 * len(cameras), rows=len(cameras))
-    panels = figure.subplots(len(cameras), 2, squeeze=False)
-    owner = findings.interior.family[network.image_points.image]
-    for k, family in enumerate(cameras):
-        name, camera = family.name, family.camera
-        own = (owner == k) & ~adjustment.rejected
-        xy, v = network.image_points.xy[own], adjustment.residuals[own]
+    rows = len(shown.cameras)
+    figure = panelled(4.4 * rows, rows=rows)
+    panels = figure.subplots(rows, 2, squeeze=False)
+    owner = shown.camera[shown.image]
+    for k, camera in enumerate(shown.cameras):
+        own = owner == k
+        xy, v = shown.xy[own], shown.residuals[own]
         width, height = camera.size_px
         factor = _round_factor(0.03 * width / max(_typical(v), 1e-12))
         keep = slice(None, None, max(1, len(xy) // MAX_ARROWS))
         _arrows(panels[k, 0], xy[keep], v[keep] * factor, BLUE)
-        entitled(panels[k, 0], f"{_plain(name)}: {len(xy)} residuals, drawn {factor:g} times as long")
+        entitled(panels[k, 0], f"{_plain(camera.name)}: {len(xy)} residuals, drawn {factor:g} times as long")
         centres, means = _cell_means(xy, v, width, height)
         if len(centres):
             factor = _round_factor(0.6 * width / CELLS / max(_typical(means), 1e-12))
             _arrows(panels[k, 1], centres, means * factor, RED)
-        entitled(panels[k, 1], f"{_plain(name)}: mean of each cell, drawn {factor:g} times as long")
+        entitled(panels[k, 1], f"{_plain(camera.name)}: mean of each cell, drawn {factor:g} times as long")
         for panel in panels[k]:
             panel.set_xlim(-0.5, width - 0.5)
             panel.set_ylim(height - 0.5, -0.5)
@@ -162,17 +146,12 @@ def residual_figure(findings: Findings) -> Figure:
     return figure
 
 
-def distribution_figure(findings: Findings) -> Figure:
+def distribution_figure(shown: PlotData) -> Figure:
     """Draw the histogram of standardised residuals and the residuals by distance from the centre."""
-    adjustment = findings.result.adjustment
-    network, cameras = adjustment.network, adjustment.estimate.cameras
-    used = ~adjustment.rejected
-    seen = network.image_points.select(used)
-    v = adjustment.residuals[used]
+    v, ray = shown.residuals, shown.from_centre
     figure = panelled(3.8)
     histogram, radial = figure.subplots(1, 2)
-    z = standardised_residuals(adjustment)
-    z = z[np.isfinite(z)]
+    z = shown.standardised[np.isfinite(shown.standardised)]
     bins = np.linspace(-5, 5, 41)
     histogram.hist(
         np.clip(z, -4.999, 4.999), bins=bins, density=True, color=BLUE, alpha=0.6, label="residuals"
@@ -182,8 +161,6 @@ def distribution_figure(findings: Findings) -> Figure:
     histogram.set_xlabel("residual / its standard deviation  (beyond 5 in the last bar)")
     histogram.set_ylabel("frequency")
     histogram.legend(fontsize=8, loc="upper right")
-    centre = np.array([camera.frame[:2] for camera in cameras])[network.camera[seen.image]]
-    ray = seen.xy - centre
     distance = np.linalg.norm(ray, axis=1)
     direction = ray / np.maximum(distance, 1e-9)[:, None]
     along = (v * direction).sum(axis=1)
@@ -202,12 +179,11 @@ def distribution_figure(findings: Findings) -> Figure:
     return figure
 
 
-def photograph_figure(findings: Findings) -> Figure:
+def photograph_figure(shown: PlotData) -> Figure:
     """Draw RMS residual and number of points of each photograph."""
-    adjustment = findings.result.adjustment
-    rms, count = findings.geometry.image_rms_px, findings.geometry.image_points
+    rms, count = shown.image_rms_px, shown.image_points
     m = len(rms)
-    labels = [_plain(_short(name)) for name in adjustment.network.images] if m <= MAX_NAMED else []
+    labels = [_plain(_short(name)) for name in shown.images] if m <= MAX_NAMED else []
     names_in = LETTER_IN * max(map(len, labels), default=0)
     figure = panelled(3.4 + max(0.0, names_in - 0.7), bottom_in=max(BOTTOM_IN, 0.2 + names_in))
     bars, numbers = figure.subplots(1, 2)
@@ -222,20 +198,8 @@ def photograph_figure(findings: Findings) -> Figure:
             panel.set_xticks(x, labels, rotation=90, fontsize=7)
         else:
             panel.set_xlabel("photograph, in order")
-    bars.axhline(adjustment.rms_px, color="black", linewidth=1, linestyle="--")
+    bars.axhline(shown.rms_px, color="black", linewidth=1, linestyle="--")
     return figure
-
-
-def standardised_residuals(adjustment: Adjustment) -> FloatArray:
-    """Return accepted residuals over their own standard deviation a posteriori, shape (2k,).
-
-    Source: Baarda (1968): sigma of v = sigma0 * sigma * sqrt(r) with the redundancy number r.
-    """
-    used = ~adjustment.rejected
-    variance = np.einsum("kii->ki", adjustment.image_covariance[used])
-    r = adjustment.redundancy_numbers[used]
-    sigma = adjustment.sigma0 * np.sqrt(np.where(r > 1e-6, variance * r, np.nan))
-    return np.asarray((adjustment.residuals[used] / sigma).ravel())
 
 
 def plan_axes(
@@ -264,18 +228,16 @@ def plan_axes(
     return Vt, ("along", "across", "up from the main plane")
 
 
-def _pyramids(
-    estimate: Estimate, images: IntArray, c_px: float, size_px: tuple[int, int], size: float
-) -> FloatArray:
+def _pyramids(shown: PlotData, images: IntArray, camera: PlotCamera, size: float) -> FloatArray:
     """Return the edges of a pyramid of view at each photograph, shape (edges, 2, 3)."""
-    width, height = size_px
-    x, y = width / 2 / c_px, height / 2 / c_px
+    width, height = camera.size_px
+    x, y = width / 2 / camera.c_px, height / 2 / camera.c_px
     corners = np.array([[-x, -y, -1], [x, -y, -1], [x, y, -1], [-x, y, -1]]) * size
     edges = []
     for i in images:
-        tips = estimate.position[i] + corners @ estimate.rotation[i].T
+        tips = shown.position[i] + corners @ shown.rotation[i].T
         for k in range(4):
-            edges += [(estimate.position[i], tips[k]), (tips[k], tips[(k + 1) % 4])]
+            edges += [(shown.position[i], tips[k]), (tips[k], tips[(k + 1) % 4])]
     return np.reshape(np.array(edges, dtype=float), (-1, 2, 3))
 
 

@@ -12,7 +12,7 @@ from datetime import datetime
 from importlib.metadata import version
 
 from sfm.report.figures.overlays import Overlay
-from sfm.report.figures.plots import Plot
+from sfm.report.figures.plot_data import Plot
 from sfm.report.findings.findings import Findings
 from sfm.report.html.page import render
 from sfm.report.viewer.embedded import Viewer

@@ -1,0 +1,46 @@
+"""What the plots of a report show: little of a result, without what finds or draws it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from sfm.conventions import FloatArray, IntArray
+
+
+@dataclass(frozen=True)
+class Plot:
+    """A picture of a page."""
+
+    stem: str  # of its file name
+    caption: str
+    png: bytes
+
+
+@dataclass(frozen=True)
+class PlotCamera:
+    """A camera as people know it, whatever its photographs have of their own."""
+
+    name: str
+    c_px: float
+    size_px: tuple[int, int]
+
+
+@dataclass(frozen=True)
+class PlotData:
+    """Network and residuals of m photographs and k accepted image points."""
+
+    unit: str  # of length
+    images: tuple[str, ...]  # names of the photographs
+    position: FloatArray  # projection centres, object unit, (m, 3)
+    rotation: FloatArray  # from camera to object axes, (m, 3, 3)
+    points: FloatArray  # object points, object unit, (n, 3)
+    cameras: tuple[PlotCamera, ...]
+    camera: IntArray  # index of that of each photograph, (m,)
+    image: IntArray  # photograph of each image point, (k,)
+    xy: FloatArray  # image coordinates, px, (k, 2)
+    from_centre: FloatArray  # the same from the middle of the photograph, px, (k, 2)
+    residuals: FloatArray  # px, (k, 2)
+    standardised: FloatArray  # residuals over their own standard deviation a posteriori, (2k,)
+    image_rms_px: FloatArray  # root mean square residual per coordinate of each photograph, px, (m,)
+    image_points: IntArray  # number of each photograph, (m,)
+    rms_px: float  # of all

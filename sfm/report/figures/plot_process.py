@@ -1,0 +1,92 @@
+"""A process that draws the plots of a report while others measure and adjust.
+
+Importing matplotlib and drawing with it takes a second of Python, and threads take turns in Python.
+"""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
+from multiprocessing import get_context
+from multiprocessing.connection import Connection
+from threading import Thread
+
+from sfm.report.figures.plot_data import Plot, PlotData
+from sfm.runtime.cores import cores
+
+END_SECONDS = 5.0  # for a process that has nothing more to do
+
+
+def draw_plots(shown: PlotData) -> tuple[Plot, ...]:
+    """Draw every plot of a report in this process."""
+    from sfm.report.figures.plots import all_plots
+
+    return all_plots(shown)
+
+
+class PlotProcess:
+    """Draws the plots of one report.
+
+    It ends with the process that began it, whatever ends that: its end of the pipe is the only one left.
+    """
+
+    def __init__(self) -> None:
+        context = get_context("spawn")  # a fork would inherit the threads of others without their work
+        self._pipe, theirs = context.Pipe()
+        self._process = context.Process(target=_draw, args=(theirs,), daemon=True)
+        self._process.start()
+        theirs.close()
+        self._shown: PlotData | None = None
+
+    def begin(self, shown: PlotData) -> None:
+        """Begin to draw; the process may still be importing, and a pipe holds little."""
+        self._shown = shown
+        Thread(target=self._send, args=(shown,), daemon=True).start()
+
+    def plots(self) -> tuple[Plot, ...]:
+        """Return what was begun; drawn here if the process was ended by others, as for want of memory."""
+        assert self._shown is not None, "begin first"
+        try:
+            plots: tuple[Plot, ...] = self._pipe.recv()
+        except (EOFError, OSError):
+            return draw_plots(self._shown)
+        return plots
+
+    def close(self) -> None:
+        """End the process."""
+        self._pipe.close()
+        self._process.join(END_SECONDS)
+        self._process.kill()
+
+    def _send(self, shown: PlotData) -> None:
+        try:
+            self._pipe.send(shown)
+        except OSError:  # it has ended, which `plots` finds too
+            return
+
+
+@contextmanager
+def plot_process() -> Iterator[PlotProcess | None]:
+    """Give a process that draws plots, none where there is one core for everything."""
+    if cores() < 2:
+        yield None
+        return
+    process = PlotProcess()
+    try:
+        yield process
+    finally:
+        process.close()
+
+
+def _draw(pipe: Connection) -> None:
+    """Draw plots as long as somebody asks for them; Ctrl-C is for who began this process."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    import sfm.report.figures.plots  # noqa: F401  # while the survey is measured
+
+    while True:
+        try:
+            shown: PlotData = pipe.recv()
+        except (EOFError, OSError):
+            return
+        pipe.send(draw_plots(shown))

@@ -1,0 +1,47 @@
+"""Findings to what the plots of a report show of them."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sfm.adjustment.result import Adjustment
+from sfm.conventions import FloatArray
+from sfm.report.figures.plot_data import PlotCamera, PlotData
+from sfm.report.findings.findings import Findings
+
+
+def plot_data(findings: Findings) -> PlotData:
+    """Return what the plots of a report show."""
+    adjustment, interior, geometry = findings.result.adjustment, findings.interior, findings.geometry
+    network, estimate, used = adjustment.network, adjustment.estimate, ~adjustment.rejected
+    seen = network.image_points.select(used)
+    centre = np.array([camera.frame[:2] for camera in estimate.cameras])
+    return PlotData(
+        unit=findings.result.length_unit,
+        images=network.images,
+        position=estimate.position,
+        rotation=estimate.rotation,
+        points=estimate.points,
+        cameras=tuple(PlotCamera(one.name, one.camera.c_px, one.camera.size_px) for one in interior.families),
+        camera=interior.family,
+        image=seen.image,
+        xy=seen.xy,
+        from_centre=seen.xy - centre[network.camera[seen.image]],
+        residuals=adjustment.residuals[used],
+        standardised=_standardised_residuals(adjustment),
+        image_rms_px=geometry.image_rms_px,
+        image_points=geometry.image_points,
+        rms_px=adjustment.rms_px,
+    )
+
+
+def _standardised_residuals(adjustment: Adjustment) -> FloatArray:
+    """Return accepted residuals over their own standard deviation a posteriori, shape (2k,).
+
+    Source: Baarda (1968): sigma of v = sigma0 * sigma * sqrt(r) with the redundancy number r.
+    """
+    used = ~adjustment.rejected
+    variance = np.einsum("kii->ki", adjustment.image_covariance[used])
+    r = adjustment.redundancy_numbers[used]
+    sigma = adjustment.sigma0 * np.sqrt(np.where(r > 1e-6, variance * r, np.nan))
+    return np.asarray((adjustment.residuals[used] / sigma).ravel())
