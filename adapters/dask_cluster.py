@@ -41,7 +41,7 @@ from threadpoolctl import threadpool_limits
 
 from sfm.errors import BackendError, KolinearError
 from sfm.runtime.executor import Call, Done, Event, Lost, Told, Work
-from sfm.runtime.folder_settings import close_library_path
+from sfm.runtime.folder_settings import close_current_folder
 
 # Deaths of workers that a call may be near before Dask gives it up: once is bad luck, and is tried elsewhere.
 ALLOWED_FAILURES = 1
@@ -96,7 +96,7 @@ def local_engine(workers: int, *, memory_bytes: int | None = None) -> Iterator[D
         BackendError: they do not start.
     """
     _silence()
-    close_library_path()
+    close_current_folder()
     settings = {
         "distributed.scheduler.allowed-failures": ALLOWED_FAILURES,
         "distributed.scheduler.work-stealing": True,

@@ -5,13 +5,14 @@ Nothing is imported here that takes time: Ctrl-C and wrong arguments are answere
 
 from __future__ import annotations
 
+import atexit
 import gc
 import sys
 
 from sfm.cli.commands.starting import INTERRUPTED, INTERRUPTED_TEXT, loading, stopped_once
 from sfm.cli.outlets import guard_outlets
 from sfm.errors import KolinearError
-from sfm.runtime.folder_settings import close_library_path, refuse_folder_settings
+from sfm.runtime.folder_settings import close_current_folder, refuse_folder_settings
 from sfm.runtime.installation import refuse_mixed_installation
 
 YOUNG_OBJECTS = 100_000  # more of them than Python's 700 before it looks for cycles: a tenth of a run
@@ -46,9 +47,10 @@ def main() -> None:
 def _run() -> None:
     """Run the command that the arguments name."""
     gc.set_threshold(YOUNG_OBJECTS)
+    atexit.register(gc.freeze)  # at the end Python looks through all objects again, for half a second
     refuse_mixed_installation()  # asked here too: the other project's sfm/__init__.py may lie over ours
     refuse_folder_settings()
-    close_library_path()
+    close_current_folder()
     with loading():
         from sfm.cli.app import USAGE_ERROR, app
     try:

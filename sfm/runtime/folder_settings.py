@@ -3,7 +3,8 @@
 numba reads `.numba_config.yaml` there, which can name a folder of compiled functions; they are pickles, and
 so programs. matplotlib reads `matplotlibrc` there, which can have every text set by LaTeX. And cv2 puts its
 libraries and a colon before LD_LIBRARY_PATH; where that is empty, nothing follows the colon, by which the
-linker of every process that is started afterwards understands the current folder.
+linker of every process that is started afterwards understands the current folder. Python looks there first
+for modules in the processes of multiprocessing and Dask, which are started with `python -c`.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from sfm.errors import KolinearError
 
 SETTINGS = (".numba_config.yaml", "matplotlibrc")
 LIBRARIES = "LD_LIBRARY_PATH"
+SAFE_PATH = "PYTHONSAFEPATH"
 
 
 def refuse_folder_settings() -> None:
@@ -26,11 +28,12 @@ def refuse_folder_settings() -> None:
             )
 
 
-def close_library_path() -> None:
-    """Take the current folder out of where processes that are started look for libraries; see above.
+def close_current_folder() -> None:
+    """Take the current folder out of where processes that are started look for modules and libraries.
 
-    The path is never left empty, so that OpenCV can be imported before or after.
+    The path of libraries is never left empty, so that OpenCV can be imported before or after.
     """
+    os.environ[SAFE_PATH] = "1"
     if os.name != "nt":
         folders = [folder for folder in os.environ.get(LIBRARIES, "").split(os.pathsep) if folder]
         os.environ[LIBRARIES] = os.pathsep.join(folders) or os.path.dirname(os.path.abspath(__file__))

@@ -322,6 +322,31 @@ def test_no_process_looks_for_libraries_in_the_current_folder(
     assert given != "/a::/b:" or folders[-2:] == ["/a", "/b"]
 
 
+def test_no_process_imports_modules_of_the_current_folder(tmp_path: Path) -> None:
+    """Those of multiprocessing are started with `python -c`, which looks there first."""
+    (tmp_path / "multiprocessing.py").write_text(f"open({str(tmp_path / 'owned')!r}, 'w').close()\n")
+    script = tmp_path / "elsewhere" / "start.py"
+    script.parent.mkdir()
+    script.write_text(
+        "import contextlib, sys\n"
+        "from multiprocessing import get_context\n"
+        "from sfm.cli import main\n"
+        "def begin():\n"
+        "    print('begun', flush=True)\n"
+        "if __name__ == '__main__':\n"
+        "    sys.argv[1:] = ['--help']\n"
+        "    with contextlib.suppress(SystemExit): main()\n"
+        "    one = get_context('spawn').Process(target=begin)\n"
+        "    one.start(); one.join()\n"
+    )
+    environment = {name: value for name, value in os.environ.items() if name != "PYTHONSAFEPATH"}
+    environment["PYTHONPATH"] = str(ROOT)
+    command = [sys.executable, str(script)]
+    run = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=True)
+    assert run.stdout.splitlines()[-1] == "begun", run.stderr
+    assert not (tmp_path / "owned").exists()
+
+
 @pytest.mark.parametrize("dangling", [False, True])
 @pytest.mark.parametrize(
     ("command", "place"), [(name, place) for name, (_, places) in COMMANDS.items() for place in places]

@@ -15,8 +15,6 @@ from threading import Thread
 from sfm.report.figures.plot_data import Plot, PlotData
 from sfm.runtime.cores import cores
 
-END_SECONDS = 5.0  # for a process that has nothing more to do
-
 
 def draw_plots(shown: PlotData) -> tuple[Plot, ...]:
     """Draw every plot of a report in this process."""
@@ -54,10 +52,10 @@ class PlotProcess:
         return plots
 
     def close(self) -> None:
-        """End the process."""
+        """End the process, which holds nothing that could be left half-done."""
         self._pipe.close()
-        self._process.join(END_SECONDS)
         self._process.kill()
+        self._process.join()
 
     def _send(self, shown: PlotData) -> None:
         try:
