@@ -31,6 +31,7 @@ from sfm.adjustment.engine.solvers.protocol import Factor, Solver
 from sfm.adjustment.engine.unknowns import Unknowns, step
 from sfm.conventions import FloatArray
 from sfm.errors import GeometryError
+from sfm.runtime.memory import keep_freed_memory
 
 TOLERANCE = 1e-6
 MIN_SHIFT = 1e-6
@@ -100,6 +101,7 @@ class Step(Move):
 
 def problem_of(layout: Unknowns, weighted: Weighted, datum: ResolvedDatum) -> Problem:
     """Return what all steps of an adjustment have in common; chooses the solver of the normal equations."""
+    keep_freed_memory()
     return Problem(layout, weighted, datum, new_space(layout), choose_solver(layout))
 
 
