@@ -197,6 +197,21 @@ def test_datum_control_needs_control(tmp_path: Path) -> None:
         read_survey_file(write(tmp_path, MINIMAL + '[datum]\nkind = "control"\n'))
 
 
+def test_natural_points_have_no_start_values(tmp_path: Path) -> None:
+    """Other points would get the numbers of an earlier run, without a word."""
+    text = MINIMAL + '[targets]\ncodes = "none"\n[tie_points]\n[approximate]\n'
+    read_survey(
+        write(
+            tmp_path,
+            text + 'images = "images.csv"\n',
+            images="image,X,Y,Z,omega_deg,phi_deg,kappa_deg\na.jpg,0,0,1,0,0,0\n",
+        )
+    )
+    path = write(tmp_path, text + 'points = "points.csv"\n', points="point,X,Y,Z\n1,0,0,0\n")
+    with pytest.raises(SurveyFileError, match=r"natural points are other ones in every run"):
+        read_survey(path)
+
+
 def test_datum_points_are_not_for_control(tmp_path: Path) -> None:
     given = MINIMAL + '[datum]\nkind = "control"\npoints = ["1"]\n[control]\nfile = "control.csv"\n'
     with pytest.raises(SurveyFileError, match=r"datum.points are for kind 'free' or 'minimal'"):

@@ -84,6 +84,11 @@ class SurveyFile(Section):
         return codes if not is_table(codes) else str(self.beside(codes))
 
     @property
+    def start_points(self) -> str | None:
+        """Table of approximate object points."""
+        return self.approximate.points
+
+    @property
     def allow_outside(self) -> bool:
         """Whether the survey may name files outside its own folder."""
         return self._allow_outside

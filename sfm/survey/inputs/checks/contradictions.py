@@ -91,6 +91,10 @@ class SurveySettings(Protocol):
         """Observed exterior orientation, or its table."""
 
     @property
+    def start_points(self) -> object:
+        """Approximate object points, or their table."""
+
+    @property
     def observations(self) -> object:
         """Image points in place of photographs, or their table."""
 
@@ -111,6 +115,11 @@ def refuse_contradictions(survey: SurveySettings) -> None:
         if survey.tie_points.window_px % 2 == 0:
             raise SurveyFileError(
                 f"{where}: tie_points.window_px = {survey.tie_points.window_px}, needed an odd number"
+            )
+        if survey.start_points is not None:
+            raise SurveyFileError(
+                f"{where}: [approximate] points are of targets, natural points are other ones in every run; "
+                "start values of [tie_points] are those of the photographs, [approximate] images"
             )
     names = [camera.name for camera in survey.cameras]
     for name in names:
