@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import os
+import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -42,6 +44,45 @@ def test_plots_are_those_of_this_process_whatever_happens_to_the_other(
         process._process.kill()
         assert process.plots() == here
     assert not process._process.is_alive()
+
+
+def test_what_cannot_be_drawn_is_told_by_this_process(
+    shown: PlotData, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(drawing, "cores", lambda: 2)
+    with plot_process() as process:
+        assert process is not None
+        process.begin(replace(shown, points=np.zeros((4, 7))))
+        with pytest.raises(ValueError, match=r"shape|match"):
+            process.plots()
+    assert "Traceback" not in capfd.readouterr().err
+
+
+def test_where_no_process_can_be_started_plots_are_drawn_here(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object) -> None:
+        raise BlockingIOError(11, "Resource temporarily unavailable")
+
+    monkeypatch.setattr(drawing, "cores", lambda: 2)
+    monkeypatch.setattr("multiprocessing.context.SpawnProcess.start", refuse)
+    with plot_process() as process:
+        assert process is None
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows has no mask of signals")
+def test_an_interrupt_is_for_who_began_the_process(
+    shown: PlotData, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """From the first moment: a process that is still starting would print a traceback."""
+    monkeypatch.setattr(drawing, "cores", lambda: 2)
+    with plot_process() as process:
+        assert process is not None and process._process.pid is not None
+        for _ in range(20):
+            os.kill(process._process.pid, signal.SIGINT)
+            time.sleep(0.02)
+        process.begin(shown)
+        assert process._pipe.poll(60)
+        assert len(process.plots()) == 4 and process._process.is_alive()
+    assert "Traceback" not in capfd.readouterr().err
 
 
 def test_one_core_has_enough_to_do(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import signal
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from multiprocessing import get_context
 from multiprocessing.connection import Connection
 from threading import Thread
@@ -33,7 +33,8 @@ class PlotProcess:
         context = get_context("spawn")  # a fork would inherit the threads of others without their work
         self._pipe, theirs = context.Pipe()
         self._process = context.Process(target=_draw, args=(theirs,), daemon=True)
-        self._process.start()
+        with _without_interrupts():
+            self._process.start()
         theirs.close()
         self._shown: PlotData | None = None
 
@@ -43,7 +44,10 @@ class PlotProcess:
         Thread(target=self._send, args=(shown,), daemon=True).start()
 
     def plots(self) -> tuple[Plot, ...]:
-        """Return what was begun; drawn here if the process was ended by others, as for want of memory."""
+        """Return what was begun; drawn here if the process has ended, so that a fault is one of this process.
+
+        Others may end it for want of memory.
+        """
         assert self._shown is not None, "begin first"
         try:
             plots: tuple[Plot, ...] = self._pipe.recv()
@@ -66,25 +70,36 @@ class PlotProcess:
 
 @contextmanager
 def plot_process() -> Iterator[PlotProcess | None]:
-    """Give a process that draws plots, none where there is one core for everything."""
-    if cores() < 2:
-        yield None
-        return
-    process = PlotProcess()
+    """Give a process that draws plots; None where one core has to do everything, or none can be started."""
+    process = None
+    if cores() > 1:
+        with suppress(OSError):  # as with a limit on processes
+            process = PlotProcess()
     try:
         yield process
     finally:
-        process.close()
+        if process is not None:
+            process.close()
+
+
+@contextmanager
+def _without_interrupts() -> Iterator[None]:
+    """Keep Ctrl-C from what is started here, from its first moment; on Windows from when it ignores it."""
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _draw(pipe: Connection) -> None:
-    """Draw plots as long as somebody asks for them; Ctrl-C is for who began this process."""
+    """Draw plots as long as somebody asks for them; Ctrl-C and faults are for who began this process."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    import sfm.report.figures.plots  # noqa: F401  # while the survey is measured
+    with suppress(Exception):
+        import sfm.report.figures.plots  # noqa: F401  # while the survey is measured
 
-    while True:
-        try:
-            shown: PlotData = pipe.recv()
-        except (EOFError, OSError):
-            return
-        pipe.send(draw_plots(shown))
+        while True:
+            pipe.send(draw_plots(pipe.recv()))
