@@ -41,7 +41,7 @@ from threadpoolctl import threadpool_limits
 
 from sfm.errors import BackendError, KolinearError
 from sfm.runtime.executor import Call, Done, Event, Lost, Told, Work
-from sfm.runtime.folder_settings import close_current_folder
+from sfm.runtime.folder_settings import closed_current_folder
 
 # Deaths of workers that a call may be near before Dask gives it up: once is bad luck, and is tried elsewhere.
 ALLOWED_FAILURES = 1
@@ -96,7 +96,6 @@ def local_engine(workers: int, *, memory_bytes: int | None = None) -> Iterator[D
         BackendError: they do not start.
     """
     _silence()
-    close_current_folder()
     settings = {
         "distributed.scheduler.allowed-failures": ALLOWED_FAILURES,
         "distributed.scheduler.work-stealing": True,
@@ -110,7 +109,7 @@ def local_engine(workers: int, *, memory_bytes: int | None = None) -> Iterator[D
         "distributed.comm.timeouts.connect": "60s",  # new workers compile and import on a busy computer
         "distributed.deploy.lost-worker-timeout": "1h",  # nor is one that starts again for long given up
     }
-    with dask.config.set(settings), ExitStack() as stack:
+    with dask.config.set(settings), closed_current_folder(), ExitStack() as stack:
         scratch = stack.enter_context(TemporaryDirectory(prefix="kolinear-", ignore_cleanup_errors=True))
         with _interrupt_held_back():  # a Ctrl-C meanwhile comes when all of this is up, and can be ended
             try:

@@ -31,7 +31,7 @@ from sfm.matching.tracks.natural_points import natural_points
 from sfm.network import Estimate, ImagePoints, Network, empty_estimate
 from sfm.orientation.incremental.sequence import orient
 from sfm.runtime.cores import cores
-from sfm.runtime.folder_settings import close_current_folder
+from sfm.runtime.folder_settings import closed_current_folder
 from sfm.runtime.progress import SILENT, Progress
 from sfm.targets.codes.rings import ring_family
 from sfm.targets.detect import find_targets
@@ -105,8 +105,10 @@ def main(progress: Progress = SILENT) -> None:
         progress: told of every part that is done.
     """
     progress.stage("compiling", len(PARTS))
-    close_current_folder()
-    with ProcessPoolExecutor(min(cores(), len(PARTS)), mp_context=get_context("spawn")) as pool:
+    with (
+        closed_current_folder(),
+        ProcessPoolExecutor(min(cores(), len(PARTS)), mp_context=get_context("spawn")) as pool,
+    ):
         for done in as_completed([pool.submit(_compile, part) for part in PARTS]):
             done.result()
             progress.advance()

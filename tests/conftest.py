@@ -14,7 +14,6 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import matplotlib
 import pytest
 
-from sfm.runtime.folder_settings import SAFE_PATH
 from tests.places import SHARED
 
 SHARED = SHARED / "data"
@@ -30,12 +29,6 @@ def cache(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPa
     folder = tmp_path_factory.mktemp("cache")
     monkeypatch.setenv("XDG_CACHE_HOME", str(folder))
     return folder
-
-
-@pytest.fixture(autouse=True)
-def modules_of_the_current_folder(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Take back what a command leaves to the processes that it starts: tests start some in the repository."""
-    monkeypatch.delenv(SAFE_PATH, raising=False)
 
 
 @pytest.fixture(scope="session")

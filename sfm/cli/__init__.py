@@ -12,10 +12,12 @@ import sys
 from sfm.cli.commands.starting import INTERRUPTED, INTERRUPTED_TEXT, loading, stopped_once
 from sfm.cli.outlets import guard_outlets
 from sfm.errors import KolinearError
-from sfm.runtime.folder_settings import close_current_folder, refuse_folder_settings
+from sfm.runtime.folder_settings import closed_current_folder, refuse_folder_settings
 from sfm.runtime.installation import refuse_mixed_installation
 
-YOUNG_OBJECTS = 100_000  # more of them than Python's 700 before it looks for cycles: a tenth of a run
+YOUNG_OBJECTS = (
+    100_000  # many more of them than Python waits for before it looks for cycles: a tenth of a run
+)
 BAD_INPUT = 2  # exit code where a person must put something right
 
 
@@ -28,7 +30,9 @@ def main() -> None:
     try:
         with stopped_once():
             try:
-                _run()
+                _begin()
+                with closed_current_folder():
+                    _run()
             finally:
                 if sys.stdout is not None:
                     sys.stdout.flush()  # while it can still be said that the disk is full
@@ -44,13 +48,16 @@ def main() -> None:
         _report_fault(error)
 
 
-def _run() -> None:
-    """Run the command that the arguments name."""
+def _begin() -> None:
+    """Refuse what must not decide what is run, before anything is imported that takes time."""
     gc.set_threshold(YOUNG_OBJECTS)
     atexit.register(gc.freeze)  # at the end Python looks through all objects again, for half a second
     refuse_mixed_installation()  # asked here too: the other project's sfm/__init__.py may lie over ours
     refuse_folder_settings()
-    close_current_folder()
+
+
+def _run() -> None:
+    """Run the command that the arguments name."""
     with loading():
         from sfm.cli.app import USAGE_ERROR, app
     try:

@@ -10,12 +10,14 @@ for modules in the processes of multiprocessing and Dask, which are started with
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 from sfm.errors import KolinearError
 
 SETTINGS = (".numba_config.yaml", "matplotlibrc")
 LIBRARIES = "LD_LIBRARY_PATH"
-SAFE_PATH = "PYTHONSAFEPATH"
+MODULES, SAFE_PATH = "PYTHONPATH", "PYTHONSAFEPATH"
 
 
 def refuse_folder_settings() -> None:
@@ -28,12 +30,30 @@ def refuse_folder_settings() -> None:
             )
 
 
-def close_current_folder() -> None:
+@contextmanager
+def closed_current_folder() -> Iterator[None]:
     """Take the current folder out of where processes that are started look for modules and libraries.
 
-    The path of libraries is never left empty, so that OpenCV can be imported before or after.
+    The path of libraries is never left empty meanwhile, so that OpenCV can be imported before or after.
     """
+    before = {name: os.environ.get(name) for name in (SAFE_PATH, MODULES, LIBRARIES)}
     os.environ[SAFE_PATH] = "1"
+    if modules := _folders(MODULES):
+        os.environ[MODULES] = modules
+    else:
+        os.environ.pop(MODULES, None)
     if os.name != "nt":
-        folders = [folder for folder in os.environ.get(LIBRARIES, "").split(os.pathsep) if folder]
-        os.environ[LIBRARIES] = os.pathsep.join(folders) or os.path.dirname(os.path.abspath(__file__))
+        os.environ[LIBRARIES] = _folders(LIBRARIES) or os.path.dirname(os.path.abspath(__file__))
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                os.environ.pop(name, None)
+            else:
+                os.environ[name] = value
+
+
+def _folders(variable: str) -> str:
+    """Return a path of folders without empty ones, which stand for the current folder."""
+    return os.pathsep.join(folder for folder in os.environ.get(variable, "").split(os.pathsep) if folder)

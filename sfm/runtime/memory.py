@@ -26,10 +26,11 @@ def give_back_memory() -> None:
 
 @cache
 def keep_freed_memory() -> None:
-    """Have the C library keep up to twice `LARGEST_KEPT` of what is freed.
+    """Have the C library keep what is freed at the end of its memory, up to twice `LARGEST_KEPT`.
 
-    glibc keeps twice the size of the largest array that has been freed, up to that limit; this one is never
-    written to, and takes no memory.
+    glibc decides so by the largest array that has been freed, up to that limit; this one is never written to
+    and takes no memory. The first photograph that is freed has the same effect. Where the environment sets
+    MALLOC_TRIM_THRESHOLD_, as for the workers of a batch, that holds.
     """
     np.empty(LARGEST_KEPT, dtype=np.uint8)
 

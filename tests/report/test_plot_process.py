@@ -7,7 +7,9 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,12 +18,19 @@ import sfm.report.figures.plot_process as drawing
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.solve import adjust
 from sfm.report.figures.plot_data import PlotData
-from sfm.report.figures.plot_process import draw_plots, plot_process
+from sfm.report.figures.plot_process import PlotProcess, draw_plots, plot_process
 from sfm.report.figures.plotted import plot_data
 from sfm.report.findings.findings import findings_of
 from sfm.result import SurveyResult
 from tests.places import ROOT
 from tests.synthetic import make_network, seed_of
+
+
+class Unsendable(str):
+    """A text that is too much for the memory when it is copied."""
+
+    def __reduce__(self) -> str:
+        raise MemoryError
 
 
 @pytest.fixture(scope="module")
@@ -31,63 +40,81 @@ def shown() -> PlotData:
     return plot_data(findings_of(SurveyResult("plots", "m", 4, (), a, np.full(20, -1), None)))
 
 
-def test_plots_are_those_of_this_process_whatever_happens_to_the_other(
-    shown: PlotData, monkeypatch: pytest.MonkeyPatch
+@pytest.fixture
+def process(capfd: pytest.CaptureFixture[str]) -> Iterator[PlotProcess]:
+    """A process of which nothing is heard on the terminal, whatever happens."""
+    with plot_process(2) as found:
+        assert found is not None
+        yield found
+    assert found._process.returncode is not None
+    assert capfd.readouterr().err == ""
+
+
+def test_plots_are_drawn_elsewhere_and_the_same(
+    shown: PlotData, process: PlotProcess, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(drawing, "cores", lambda: 2)
     here = draw_plots(shown)
-    with plot_process() as process:
-        assert process is not None
+    monkeypatch.setattr(drawing, "draw_plots", lambda _: pytest.fail("drawn here"))
+    for _ in range(2):
         process.begin(shown)
         assert process.plots() == here
-        process.begin(shown)
-        process._process.kill()
-        assert process.plots() == here
-    assert not process._process.is_alive()
 
 
-def test_what_cannot_be_drawn_is_told_by_this_process(
-    shown: PlotData, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+def test_plots_of_a_process_that_was_ended_are_drawn_here(shown: PlotData, process: PlotProcess) -> None:
+    process._process.kill()
+    process._process.wait()
+    process.begin(shown)
+    assert process.plots() == draw_plots(shown)
+
+
+def test_what_cannot_be_sent_is_drawn_here(shown: PlotData, process: PlotProcess) -> None:
+    unsendable = replace(shown, unit=Unsendable("m"))
+    process.begin(unsendable)
+    assert process.plots() == draw_plots(unsendable)
+
+
+def test_where_no_thread_can_send_plots_are_drawn_here(
+    shown: PlotData, process: PlotProcess, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(drawing, "cores", lambda: 2)
-    with plot_process() as process:
-        assert process is not None
-        process.begin(replace(shown, points=np.zeros((4, 7))))
-        with pytest.raises(ValueError, match=r"shape|match"):
-            process.plots()
-    assert "Traceback" not in capfd.readouterr().err
+    def refuse(_: object) -> None:
+        raise RuntimeError("can't start new thread")
+
+    monkeypatch.setattr(drawing.Thread, "start", refuse)
+    process.begin(shown)
+    assert process.plots() == draw_plots(shown)
+
+
+def test_what_cannot_be_drawn_is_told_by_this_process(shown: PlotData, process: PlotProcess) -> None:
+    process.begin(replace(shown, points=np.zeros((4, 7))))
+    with pytest.raises(ValueError, match=r"shape|match"):
+        process.plots()
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows does not stop processes")
+def test_a_survey_may_end_before_its_plots_are_sent(shown: PlotData, process: PlotProcess) -> None:
+    """Its process stands still, and the pipe is full."""
+    process._process.send_signal(signal.SIGSTOP)
+    process.begin(replace(shown, residuals=np.zeros((2_000_000, 2))))
+    time.sleep(0.2)
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows has no sessions")
+def test_an_interrupt_of_the_terminal_is_for_who_began_the_process(process: PlotProcess) -> None:
+    """From the first moment: a process that is still starting would print a traceback."""
+    assert os.getsid(process._process.pid) == process._process.pid != os.getsid(0)
 
 
 def test_where_no_process_can_be_started_plots_are_drawn_here(monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse(*_: object) -> None:
+    def refuse(*_: object, **__: object) -> None:
         raise BlockingIOError(11, "Resource temporarily unavailable")
 
-    monkeypatch.setattr(drawing, "cores", lambda: 2)
-    monkeypatch.setattr("multiprocessing.context.SpawnProcess.start", refuse)
-    with plot_process() as process:
+    monkeypatch.setattr(drawing.subprocess, "Popen", refuse)
+    with plot_process(2) as process:
         assert process is None
 
 
-@pytest.mark.skipif(os.name == "nt", reason="Windows has no mask of signals")
-def test_an_interrupt_is_for_who_began_the_process(
-    shown: PlotData, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
-) -> None:
-    """From the first moment: a process that is still starting would print a traceback."""
-    monkeypatch.setattr(drawing, "cores", lambda: 2)
-    with plot_process() as process:
-        assert process is not None and process._process.pid is not None
-        for _ in range(20):
-            os.kill(process._process.pid, signal.SIGINT)
-            time.sleep(0.02)
-        process.begin(shown)
-        assert process._pipe.poll(60)
-        assert len(process.plots()) == 4 and process._process.is_alive()
-    assert "Traceback" not in capfd.readouterr().err
-
-
-def test_one_core_has_enough_to_do(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(drawing, "cores", lambda: 1)
-    with plot_process() as process:
+def test_one_job_does_everything() -> None:
+    with plot_process(1) as process:
         assert process is None
 
 
@@ -95,11 +122,10 @@ def test_one_core_has_enough_to_do(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_the_process_ends_with_the_one_that_began_it() -> None:
     """Even where that is killed and can tidy up nothing."""
     script = (
-        "import os, sys\n"
+        "import sys\n"
         "from sfm.report.figures.plot_process import PlotProcess\n"
-        "if __name__ == '__main__':\n"
-        "    print(PlotProcess()._process.pid, flush=True)\n"
-        "    sys.stdin.read(1)\n"
+        "print(PlotProcess()._process.pid, flush=True)\n"
+        "sys.stdin.read(1)\n"
     )
     begun = subprocess.Popen(
         [sys.executable, "-c", script],
@@ -125,6 +151,23 @@ def _runs(pid: int) -> bool:
             return file.read().rsplit(")", 1)[1].split()[0] != "Z"
     except FileNotFoundError:
         return False
+
+
+@pytest.mark.parametrize("given", [None, "/nowhere:"])
+def test_nothing_of_the_current_folder_is_imported(
+    given: str | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, process: PlotProcess
+) -> None:
+    """An empty entry of PYTHONPATH is the current folder."""
+    for module in ("pickle", "sfm", "matplotlib", "site", "sitecustomize", "encodings"):
+        (tmp_path / f"{module}.py").write_text(f"open({str(tmp_path / 'owned')!r}, 'w').close()\n")
+    monkeypatch.chdir(tmp_path)
+    if given is not None:
+        monkeypatch.setenv("PYTHONPATH", given)
+    with plot_process(2) as started_here:
+        assert started_here is not None and started_here._process.stdin is not None
+        started_here._process.stdin.close()
+        assert started_here._process.wait(60) == 0
+    assert not (tmp_path / "owned").exists()
 
 
 def test_little_is_imported_to_draw() -> None:

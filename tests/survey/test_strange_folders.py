@@ -309,15 +309,19 @@ def test_no_process_looks_for_libraries_in_the_current_folder(
 ) -> None:
     """What cv2 does to the path when it is imported would add it."""
     script = (
-        "import contextlib, os, sys; from sfm.cli import main; sys.argv[1:] = ['--help']\n"
-        "with contextlib.suppress(SystemExit): main()\n"
-        "import cv2; print(); print(os.environ['LD_LIBRARY_PATH'])"
+        "import os, sfm.cli.app; from sfm.cli import main\n"
+        "def app(**_):\n"
+        "    import cv2; print(os.environ['LD_LIBRARY_PATH'])\n"
+        "sfm.cli.app.app = app\n"
+        "main(); print(os.environ.get('LD_LIBRARY_PATH'))"
     )
     environment = {name: value for name, value in os.environ.items() if name != "LD_LIBRARY_PATH"}
     environment |= {"PYTHONPATH": str(ROOT)} | ({} if given is None else {"LD_LIBRARY_PATH": given})
     command = [sys.executable, "-c", script]
     run = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=True)
-    folders = run.stdout.splitlines()[-1].split(":")
+    path, after = run.stdout.splitlines()
+    folders = path.split(":")
+    assert after == str(given)
     assert "" not in folders and all(Path(folder).is_absolute() for folder in folders)
     assert given != "/a::/b:" or folders[-2:] == ["/a", "/b"]
 
@@ -328,16 +332,16 @@ def test_no_process_imports_modules_of_the_current_folder(tmp_path: Path) -> Non
     script = tmp_path / "elsewhere" / "start.py"
     script.parent.mkdir()
     script.write_text(
-        "import contextlib, sys\n"
         "from multiprocessing import get_context\n"
-        "from sfm.cli import main\n"
+        "import sfm.cli.app\n"
         "def begin():\n"
         "    print('begun', flush=True)\n"
-        "if __name__ == '__main__':\n"
-        "    sys.argv[1:] = ['--help']\n"
-        "    with contextlib.suppress(SystemExit): main()\n"
+        "def app(**_):\n"
         "    one = get_context('spawn').Process(target=begin)\n"
         "    one.start(); one.join()\n"
+        "if __name__ == '__main__':\n"
+        "    sfm.cli.app.app = app\n"
+        "    sfm.cli.main()\n"
     )
     environment = {name: value for name, value in os.environ.items() if name != "PYTHONSAFEPATH"}
     environment["PYTHONPATH"] = str(ROOT)

@@ -234,7 +234,7 @@ def _run_survey(
         working_on(str(survey_file)),
         drawn_progress() as drawn,
         one_blas_thread(),
-        plot_process() as plots,
+        plot_process(jobs or cores()) as plots,
         _written(folder),
         SurveyLog(watch=drawn) as log,
     ):

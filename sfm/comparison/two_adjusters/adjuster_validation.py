@@ -30,7 +30,7 @@ from sfm.comparison.two_adjusters.random_network import MODELS, Plan, RandomNetw
 from sfm.conventions import BoolArray, FloatArray
 from sfm.errors import KolinearError
 from sfm.network import Estimate, Network
-from sfm.runtime.folder_settings import close_current_folder
+from sfm.runtime.folder_settings import closed_current_folder
 from sfm.runtime.progress import SILENT, Progress
 from sfm.similarity import fit_similarity
 
@@ -213,9 +213,11 @@ def _run(backend: ValidationBackend, seed: int, networks: int, jobs: int) -> Ite
     with threadpool_limits(1):
         warm_up(backend)  # compiles, where it must, once and not in every worker
     # Fresh processes: threads of compiled libraries do not survive a fork.
-    close_current_folder()
     context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(jobs, mp_context=context, initializer=_begin, initargs=(backend,)) as pool:
+    with (
+        closed_current_folder(),
+        ProcessPoolExecutor(jobs, mp_context=context, initializer=_begin, initargs=(backend,)) as pool,
+    ):
         try:
             yield from pool.map(make_trial, range(networks), [seed] * networks, [backend] * networks)
         except BaseException:

@@ -5,15 +5,22 @@ Importing matplotlib and drawing with it takes a second of Python, and threads t
 
 from __future__ import annotations
 
-import signal
+import os
+import pickle
+import subprocess
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from multiprocessing import get_context
-from multiprocessing.connection import Connection
 from threading import Thread
 
 from sfm.report.figures.plot_data import Plot, PlotData
-from sfm.runtime.cores import cores
+
+# Nothing of the current folder, the environment or a user's own packages is imported before the paths of this
+# process are known; multiprocessing would, and would run the program of this process again.
+BEGIN = (
+    "import pickle, sys; sys.path[:] = pickle.load(sys.stdin.buffer); "
+    "from sfm.report.figures.plot_process import serve; serve()"
+)
 
 
 def draw_plots(shown: PlotData) -> tuple[Plot, ...]:
@@ -26,54 +33,79 @@ def draw_plots(shown: PlotData) -> tuple[Plot, ...]:
 class PlotProcess:
     """Draws the plots of one report.
 
-    It ends with the process that began it, whatever ends that: its end of the pipe is the only one left.
+    It ends with the process that began it, whatever ends that: nobody else holds the ends of its pipes. Of a
+    Ctrl-C it hears nothing, being in a session of its own.
+
+    Raises:
+        OSError: it cannot be started, as with a limit on processes.
     """
 
     def __init__(self) -> None:
-        context = get_context("spawn")  # a fork would inherit the threads of others without their work
-        self._pipe, theirs = context.Pipe()
-        self._process = context.Process(target=_draw, args=(theirs,), daemon=True)
-        with _without_interrupts():
-            self._process.start()
-        theirs.close()
+        self._process = subprocess.Popen(
+            [sys.executable, "-I", "-c", BEGIN],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            start_new_session=True,
+            creationflags=getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0),
+        )
+        self._sender: Thread | None = None
         self._shown: PlotData | None = None
+        self._send(list(sys.path))
 
     def begin(self, shown: PlotData) -> None:
         """Begin to draw; the process may still be importing, and a pipe holds little."""
         self._shown = shown
-        Thread(target=self._send, args=(shown,), daemon=True).start()
+        sender = Thread(target=self._send, args=(shown,), daemon=True)
+        try:
+            sender.start()
+        except RuntimeError:  # a limit on threads
+            self._process.kill()
+        else:
+            self._sender = sender
 
     def plots(self) -> tuple[Plot, ...]:
         """Return what was begun; drawn here if the process has ended, so that a fault is one of this process.
 
         Others may end it for want of memory.
         """
-        assert self._shown is not None, "begin first"
+        assert self._shown is not None and self._process.stdout is not None, "begin first"
         try:
-            plots: tuple[Plot, ...] = self._pipe.recv()
-        except (EOFError, OSError):
+            plots: tuple[Plot, ...] = pickle.load(self._process.stdout)
+        except (EOFError, OSError, pickle.UnpicklingError):
             return draw_plots(self._shown)
         return plots
 
     def close(self) -> None:
         """End the process, which holds nothing that could be left half-done."""
-        self._pipe.close()
         self._process.kill()
-        self._process.join()
+        self._process.wait()
+        if self._sender is not None:
+            self._sender.join()
+        for pipe in (self._process.stdin, self._process.stdout):
+            assert pipe is not None
+            with suppress(OSError):  # what was not sent has nowhere to go
+                pipe.close()
 
-    def _send(self, shown: PlotData) -> None:
+    def _send(self, what: object) -> None:
+        """Send something, or end the process: `plots` waits for it otherwise."""
+        assert self._process.stdin is not None
         try:
-            self._pipe.send(shown)
-        except OSError:  # it has ended, which `plots` finds too
-            return
+            pickle.dump(what, self._process.stdin)
+            self._process.stdin.flush()
+        except Exception:
+            self._process.kill()
 
 
 @contextmanager
-def plot_process() -> Iterator[PlotProcess | None]:
-    """Give a process that draws plots; None where one core has to do everything, or none can be started."""
+def plot_process(jobs: int) -> Iterator[PlotProcess | None]:
+    """Give a process that draws plots; None where one has to do everything, or none can be started.
+
+    Args:
+        jobs: how much may be worked on at a time.
+    """
     process = None
-    if cores() > 1:
-        with suppress(OSError):  # as with a limit on processes
+    if jobs > 1 and sys.executable and not getattr(sys, "frozen", False):
+        with suppress(OSError):
             process = PlotProcess()
     try:
         yield process
@@ -82,24 +114,14 @@ def plot_process() -> Iterator[PlotProcess | None]:
             process.close()
 
 
-@contextmanager
-def _without_interrupts() -> Iterator[None]:
-    """Keep Ctrl-C from what is started here, from its first moment; on Windows from when it ignores it."""
-    if not hasattr(signal, "pthread_sigmask"):
-        yield
-        return
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
-
-
-def _draw(pipe: Connection) -> None:
-    """Draw plots as long as somebody asks for them; Ctrl-C and faults are for who began this process."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+def serve() -> None:
+    """Draw what comes in by stdin, out to stdout, until nobody is there; faults are for who began this."""
+    # what a library prints must not come between
+    given, drawn, sys.stdout = sys.stdin.buffer, sys.stdout.buffer, sys.stderr
     with suppress(Exception):
         import sfm.report.figures.plots  # noqa: F401  # while the survey is measured
 
         while True:
-            pipe.send(draw_plots(pipe.recv()))
+            pickle.dump(draw_plots(pickle.load(given)), drawn)
+            drawn.flush()
+    os._exit(0)  # nothing is left to write, and nobody to write it to
