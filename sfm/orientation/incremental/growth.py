@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from sfm.camera import Camera, project
-from sfm.conventions import MAD_TO_SIGMA, BoolArray, FloatArray
+from sfm.conventions import MAD_TO_SIGMA, BoolArray, FloatArray, IntArray
 from sfm.distortion.models import Role
 from sfm.errors import GeometryError
 from sfm.network import Estimate, Network, empty_estimate, rows_of
@@ -16,7 +16,7 @@ from sfm.orientation.image_rays import image_tangents
 from sfm.orientation.incremental.starting_pair import Start, best_start
 from sfm.orientation.incremental.support import photograph_support
 from sfm.orientation.intersection import intersect
-from sfm.orientation.resection.ransac import fewest_fitting, resect_robust
+from sfm.orientation.resection.ransac import RobustResection, fewest_fitting, resect_robust
 from sfm.reduced_network import reduce_network
 
 FIRST_ADJUSTMENT = 4  # photographs
@@ -154,7 +154,7 @@ class Growth:
 
     def resect(self, images: list[int]) -> int:
         """Resect photographs, of which oriented ones keep what fits better; return how many are new."""
-        uv, tolerance = self.tangents(), self.tolerance()
+        uv = self.tangents()
         position, rotation = self.estimate.position.copy(), self.estimate.rotation.copy()
         seen = self.network.image_points
         known = self.estimate.determined[seen.point] & np.isfinite(uv).all(axis=1)
@@ -162,14 +162,7 @@ class Growth:
         of_image, added = rows_of(seen.image, len(position)), 0
         for i in images:
             own = of_image[i][known[of_image[i]]]
-            result = resect_robust(
-                uv[own],
-                self.estimate.points[seen.point[own]],
-                tolerance=tolerance[i],
-                seed=self.seed + i,
-                min_inliers=self.min_points,
-                field=self.field[i],
-            )
+            result = self.resection(i, own, uv[own])
             camera = self.estimate.cameras[self.network.camera[i]]
             if not result.found:
                 if not np.isfinite(position[i]).all():
@@ -187,6 +180,31 @@ class Growth:
             self.reasons.pop(i, None)
         self.estimate = replace(self.estimate, position=position, rotation=rotation)
         return added
+
+    def resection(self, i: int, own: IntArray, uv: FloatArray) -> RobustResection:
+        """Return a photograph resected on the present points.
+
+        Args:
+            i: the photograph.
+            own: some of its image points, all of determined points, (k,).
+            uv: their tangents, (k, 2).
+        """
+        camera = self.network.camera[i]
+        return resect_robust(
+            uv,
+            self.estimate.points[self.network.image_points.point[own]],
+            tolerance=float(self.tolerance_px[camera] / self.estimate.cameras[camera].c_px),
+            seed=self.seed + i,
+            min_inliers=self.min_points,
+            field=self.field[i],
+        )
+
+    def release(self, images: IntArray) -> None:
+        """Take away the orientation of photographs, and intersect the points anew from the others."""
+        position, rotation = self.estimate.position.copy(), self.estimate.rotation.copy()
+        position[images], rotation[images] = np.nan, np.nan
+        self.estimate = replace(self.estimate, position=position, rotation=rotation)
+        self.intersect()
 
     def intersect(self, *, only_missing: bool = False) -> None:
         """Intersect the points that are not control from the oriented photographs, all or those missing."""
@@ -259,7 +277,7 @@ class Growth:
         return True
 
     def drop_unsupported(self) -> int:
-        """Let go the photographs that the others do not hold up, the worst first; return how many.
+        """Let go the photographs that the others do not hold up, the worst first; return how many are gone.
 
         Points that rested on them are intersected anew from the others, or are gone.
         """
@@ -280,7 +298,6 @@ class Growth:
                 break
             share = found.fitting / np.maximum(found.fitting + found.against, 1)
             worst = weak[np.argsort(share[weak], kind="stable")][: max(1, len(weak) // WEAK_PER_ROUND)]
-            position, rotation = self.estimate.position.copy(), self.estimate.rotation.copy()
             for i in worst.tolist():
                 if few[i]:
                     self.reasons[i] = (
@@ -293,9 +310,8 @@ class Growth:
                         f"{found.against[i]} of its points contradict it: "
                         "another object, a mirrored picture or wrong codes"
                     )
-            position[worst], rotation[worst], self.dropped[worst] = np.nan, np.nan, True
-            self.estimate = replace(self.estimate, position=position, rotation=rotation)
-            self.intersect()
+            self.dropped[worst] = True
+            self.release(worst)
         return int(self.dropped.sum())
 
     def adapt_tolerance(self, final_px: float) -> None:

@@ -7,8 +7,6 @@ they fit each other, once these are adjusted without it.
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from sfm.camera import tangents_from_pixel
@@ -16,7 +14,6 @@ from sfm.conventions import FloatArray
 from sfm.network import rows_of
 from sfm.orientation.incremental.growth import Growth, Refine
 from sfm.orientation.incremental.rivals import CONTRADICTING
-from sfm.orientation.resection.ransac import resect_robust
 
 MIN_OTHERS = 3  # oriented photographs that one is judged by
 WORSE = 1.5  # times the typical median residual of a photograph, from which on it is looked at turned over
@@ -49,10 +46,7 @@ def judge_misfits(growth: Growth, refine: Refine | None) -> bool:
         looked_at[i] = True
         if _median_px(growth, i, turned_over=True) < medians[i]:
             with_it = growth.estimate
-            position, rotation = with_it.position.copy(), with_it.rotation.copy()
-            position[i], rotation[i] = np.nan, np.nan
-            growth.estimate = replace(with_it, position=position, rotation=rotation)
-            growth.intersect()
+            growth.release(np.array([i]))
             growth.refined(refine)
             if _is_mirrored(growth, i):
                 growth.dropped[i], changed = True, True
@@ -86,14 +80,7 @@ def _median_px(growth: Growth, i: int, *, turned_over: bool = False) -> float:
     xy = seen.xy[own]
     uv = tangents_from_pixel(camera, (camera.size_px[0] - 1, 0) + xy * (-1, 1) if turned_over else xy)
     known = np.isfinite(uv).all(axis=1)
-    found = resect_robust(
-        uv[known],
-        growth.estimate.points[seen.point[own[known]]],
-        tolerance=growth.tolerance()[i],
-        seed=growth.seed + i,
-        min_inliers=growth.min_points,
-        field=growth.field[i],
-    )
+    found = growth.resection(i, own[known], uv[known])
     if not found.found:
         return float(np.inf)
     lengths = np.linalg.norm(found.residuals, axis=1) * camera.c_px

@@ -123,9 +123,7 @@ def orient(
 
     def settle_misfits(growth: Growth) -> None:
         if judge_misfits(growth, refine):
-            _settled(growth, refine, final_tolerance_px)
-            if growth.drop_unsupported():
-                _settled(growth, refine, final_tolerance_px)
+            _settle(growth, refine, final_tolerance_px)
 
     if not has_given_values(network, estimate):
         return grow(estimate)
@@ -205,9 +203,7 @@ def _best_of_rivals(
     if worst.any() and (oriented & ~worst).sum() >= MIN_RIVALS:
         rivals.append(reversed_growth(growth, begin(values, 1.0), refine, worst))
     for rival in rivals:
-        _settled(rival, refine, final_tolerance_px)
-        if rival.drop_unsupported():
-            _settled(rival, refine, final_tolerance_px)
+        _settle(rival, refine, final_tolerance_px)
         found.append((rival, start))
     for share in SMALLER_TOLERANCES:
         rival = begin(values, share)
@@ -233,14 +229,25 @@ def _grow(growth: Growth, refine: Refine | None, final_tolerance_px: float, judg
             adjusted = now
         elif not added:
             break
-    _settled(growth, refine, final_tolerance_px)
-    if growth.drop_unsupported():
-        _settled(growth, refine, final_tolerance_px)
+    if _settle(growth, refine, final_tolerance_px):
         growth.drop_unsupported()
     return start
 
 
-def _settled(growth: Growth, refine: Refine | None, final_tolerance_px: float) -> None:
+def _settle(growth: Growth, refine: Refine | None, final_tolerance_px: float) -> bool:
+    """Settle a network, and what is left of it after the others let go what they do not hold up.
+
+    Returns:
+        Whether a photograph was let go, now or before.
+    """
+    _settle_oriented(growth, refine, final_tolerance_px)
+    dropped = growth.drop_unsupported() > 0
+    if dropped:
+        _settle_oriented(growth, refine, final_tolerance_px)
+    return dropped
+
+
+def _settle_oriented(growth: Growth, refine: Refine | None, final_tolerance_px: float) -> None:
     """Resect, intersect and adjust all that is oriented until no image point comes or goes."""
     for _ in range(FINAL_ROUNDS):
         growth.adapt_tolerance(final_tolerance_px)
