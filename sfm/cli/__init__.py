@@ -15,9 +15,7 @@ from sfm.errors import KolinearError
 from sfm.runtime.folder_settings import closed_current_folder, refuse_folder_settings
 from sfm.runtime.installation import refuse_mixed_installation
 
-YOUNG_OBJECTS = (
-    100_000  # many more of them than Python waits for before it looks for cycles: a tenth of a run
-)
+YOUNG_OBJECTS = 100_000  # that Python waits for before it looks for cycles, far more than usual
 BAD_INPUT = 2  # exit code where a person must put something right
 
 
@@ -49,9 +47,12 @@ def main() -> None:
 
 
 def _begin() -> None:
-    """Refuse what must not decide what is run, before anything is imported that takes time."""
+    """Refuse what must not decide what is run, and look for cycles less often: a tenth of the time of a run.
+
+    At the end Python would look through all objects again, for half a second.
+    """
     gc.set_threshold(YOUNG_OBJECTS)
-    atexit.register(gc.freeze)  # at the end Python looks through all objects again, for half a second
+    atexit.register(gc.freeze)
     refuse_mixed_installation()  # asked here too: the other project's sfm/__init__.py may lie over ours
     refuse_folder_settings()
 

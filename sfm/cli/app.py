@@ -7,6 +7,7 @@ from typing import Any
 import typer
 
 from sfm.cli.commands import (
+    batching,
     checking,
     comparing_epochs,
     drafting,
@@ -41,7 +42,7 @@ for _command in (
     surveying.run,
     drafting.init,
     surveying.adjust,
-    surveying.batch,
+    batching.batch,
     measuring.resect,
     measuring.match,
     measuring.targets,

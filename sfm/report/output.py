@@ -99,8 +99,9 @@ def write_result(
         if write_colmap is not None:
             (folder / "colmap").mkdir()
             write_colmap(folder / "colmap")
+        shown = plot_data(findings)
         if plot_process is not None:
-            plot_process.begin(plot_data(findings))
+            plot_process.begin(shown)
         scene = scene_of_result(findings)
         # one after another: beside Python at work threads of short calls wait for each turn
         overlays = draw_overlays(result, jobs=jobs, progress=progress)
@@ -118,7 +119,7 @@ def write_result(
             (folder / "pictures").mkdir()
         for name, content in pictures.beside.items():
             (folder / "pictures" / name).write_bytes(content)
-        plots = draw_plots(plot_data(findings)) if plot_process is None else plot_process.plots()
+        plots = draw_plots(shown) if plot_process is None else plot_process.plots()
         (folder / "plots").mkdir()
         for plot in plots:
             (folder / "plots" / f"{plot.stem}.png").write_bytes(plot.png)

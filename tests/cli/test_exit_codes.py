@@ -91,6 +91,7 @@ def test_what_nobody_has_foreseen_is_one_line_with_its_traceback_in_a_file(
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     for module in (
         "surveying",
+        "batching",
         "comparing_epochs",
         "measuring",
         "solvers",
