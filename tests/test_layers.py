@@ -25,7 +25,7 @@ LAYERS = (
             "sfm.similarity",
         ),
         *("sfm.runtime", "sfm.files", "sfm.kernels", "sfm.photographs"),
-        *("sfm.point_table", "sfm.stored_result", "sfm.display"),
+        *("sfm.point_table", "sfm.stored_result", "sfm.display", "sfm.remarks"),
     ),
     ("sfm.targets", "sfm.matching", "sfm.orientation", "sfm.adjustment"),
     ("sfm.comparison", "sfm.geometry", "sfm.epochs", "sfm.planning", "sfm.rendering", "sfm.printing"),

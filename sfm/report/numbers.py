@@ -8,6 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from sfm.conventions import METRES, FloatArray
+from sfm.remarks.kind import significant as significant
 
 METRIC = (("km", 1e3), ("m", 1.0), ("mm", 1e-3), ("µm", 1e-6))
 """metric units and their length in metres, largest first"""
@@ -36,19 +37,6 @@ def scientific(value: float, decimals: int) -> str:
 def general(value: float, digits: int) -> str:
     """Write a number with at most so many digits, with an exponent where that is shorter."""
     return f"{value:.{digits}g}"
-
-
-def significant(value: float, digits: int = 3) -> str:
-    """Write a number with so many significant digits and no exponent where that is short."""
-    value = float(value)
-    if not np.isfinite(value):
-        return "not known"
-    if value == 0:
-        return "0"
-    exponent = int(np.floor(np.log10(abs(value))))
-    if -6 <= exponent < 7:
-        return f"{value:.{max(0, digits - 1 - exponent)}f}"
-    return f"{value:.{digits - 1}e}"
 
 
 def signed(value: float) -> str:

@@ -1,0 +1,120 @@
+"""Kind: a row of the catalogue of remarks, and the sentence that it makes of a remark.
+
+A sentence is a text with fields in braces, one for each part of the remark:
+
+    {point}                 names, listed          {distance}            number with its unit
+    {points:point}          "3 points"             {count:point}         the same of a number
+    {points:is|are}         by the count           {count:is|are}        the same of a number
+    {change:+}              with its sign          {share:%}             100 times, with %
+
+What stands in [[ ]] appears only if the remark has all parts in it.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from sfm.display import listed
+from sfm.remarks.remark import Quantity, Remark, Severity
+
+FIELD = re.compile(r"\{(\w+)(?::([^{}]*))?\}")
+OPTIONAL = re.compile(r"\[\[(.*?)\]\]", re.S)
+
+
+@dataclass(frozen=True)
+class Grade:
+    """Severity by a number of the remark: a note below `warning`, an error from `error` on."""
+
+    number: str
+    warning: float = -np.inf
+    error: float = np.inf
+
+    def of(self, value: float) -> Severity:
+        """Return the severity of a value; a number that is not known is as bad as can be."""
+        if np.isnan(value):
+            return "error" if np.isfinite(self.error) else "warning"
+        return "error" if value >= self.error else "warning" if value >= self.warning else "note"
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A row of the catalogue."""
+
+    name: str
+    severity: Severity | Grade
+    sentence: str  # with fields, see above
+    cause: str  # why it happens
+    remedy: str  # what to do
+
+    @property
+    def fields(self) -> frozenset[str]:
+        """Names of the parts that the sentence shows."""
+        return frozenset(name for name, _ in FIELD.findall(self.sentence))
+
+    def severity_of(self, one: Remark) -> Severity:
+        """Return the severity of a remark of this kind."""
+        if isinstance(self.severity, Grade):
+            return self.severity.of(one.number(self.severity.number))
+        return self.severity
+
+    def sentence_of(self, one: Remark) -> str:
+        """Return the sentence of a remark of this kind.
+
+        Raises:
+            KeyError: a part is missing that is not optional.
+        """
+        parts: dict[str, tuple[str, ...] | Quantity] = {**one.subjects, **one.numbers}
+
+        def optional(found: re.Match[str]) -> str:
+            inner = found.group(1)
+            return inner if all(name in parts for name, _ in FIELD.findall(inner)) else ""
+
+        text = OPTIONAL.sub(optional, self.sentence)
+        return FIELD.sub(lambda found: _written(parts, found.group(1), found.group(2) or ""), text)
+
+
+def _written(parts: Mapping[str, tuple[str, ...] | Quantity], name: str, spec: str) -> str:
+    """Write one part as its field asks for."""
+    part = parts[name]
+    count = part.value if isinstance(part, Quantity) else len(part)
+    if "|" in spec:
+        return spec.split("|")[0 if count == 1 else 1]
+    if spec and spec[0].isalpha():
+        return f"{count:,.0f} {spec}{'' if count == 1 else 's'}"
+    if not isinstance(part, Quantity):
+        return listed(part)
+    return _number(part, spec)
+
+
+def _number(one: Quantity, spec: str) -> str:
+    """Write a number with three significant digits, or as the format says, and its unit."""
+    if not np.isfinite(one.value):
+        return "not known"
+    if spec == "%":
+        return f"{significant(100 * one.value)} %"
+    if spec == "+":
+        text = ("+" if one.value >= 0 else "") + significant(one.value)
+    elif spec:
+        text = format(one.value, spec)
+    elif not one.unit and float(one.value).is_integer() and abs(one.value) < 1e15:
+        text = f"{one.value:.0f}"
+    else:
+        text = significant(one.value)
+    return f"{text} {one.unit}".rstrip()
+
+
+def significant(value: float, digits: int = 3) -> str:
+    """Write a number with so many significant digits and no exponent where that is short."""
+    value = float(value)
+    if not np.isfinite(value):
+        return "not known"
+    if value == 0:
+        return "0"
+    exponent = int(np.floor(np.log10(abs(value))))
+    if -6 <= exponent < 7:
+        return f"{value:.{max(0, digits - 1 - exponent)}f}"
+    return f"{value:.{digits - 1}e}"

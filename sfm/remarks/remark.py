@@ -1,0 +1,119 @@
+"""Remark: one finding about a result, as data. The catalogue makes its sentence, cause and remedy.
+
+A kind is a row of the catalogue (`sfm.remarks.catalogue`). Code that finds something returns a remark of that
+kind with its subjects and numbers; it holds no English.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+Severity = Literal["note", "warning", "error"]
+SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")  # the most serious first
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """A number with its unit; the unit of a pure number is empty."""
+
+    value: float
+    unit: str = ""
+
+
+@dataclass(frozen=True)
+class Remark:
+    """One finding about a result.
+
+    Example:
+        >>> from sfm.remarks.remark import remark
+        >>> one = remark("two_positions", point="12", distance=(0.3, "mm"), sigmas=8.0)
+        >>> one.number("sigmas"), one.names("point")
+        (8.0, ('12',))
+    """
+
+    kind: str  # row of the catalogue
+    subjects: Mapping[str, tuple[str, ...]] = field(
+        default_factory=dict
+    )  # names by their role in the sentence
+    numbers: Mapping[str, Quantity] = field(default_factory=dict)
+
+    @property
+    def severity(self) -> Severity:
+        """How much it matters, by the catalogue: note, warning or error."""
+        from sfm.remarks.catalogue import severity_of
+
+        return severity_of(self)
+
+    @property
+    def text(self) -> str:
+        """Its sentence, by the catalogue."""
+        from sfm.remarks.catalogue import sentence_of
+
+        return sentence_of(self)
+
+    def number(self, name: str) -> float:
+        """Return the value of a number; NaN where the remark has none of that name."""
+        found = self.numbers.get(name)
+        return math.nan if found is None else found.value
+
+    def names(self, role: str) -> tuple[str, ...]:
+        """Return the names of the subjects of a role; none where the remark has none of that role."""
+        return self.subjects.get(role, ())
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the remark for JSON: kind, severity, text, subjects, numbers with units, cause, remedy."""
+        from sfm.remarks.catalogue import KINDS
+
+        row = KINDS[self.kind]
+        return {
+            "kind": self.kind,
+            "severity": self.severity,
+            "text": self.text,
+            "subjects": {role: list(names) for role, names in self.subjects.items()},
+            "numbers": {
+                name: {"value": one.value if math.isfinite(one.value) else None, "unit": one.unit}
+                for name, one in self.numbers.items()
+            },
+            "cause": row.cause,
+            "remedy": row.remedy,
+        }
+
+
+def remark(kind: str, **parts: str | Iterable[str] | float | tuple[float, str] | Quantity | None) -> Remark:
+    """Return a remark of a kind.
+
+    Args:
+        kind: row of the catalogue.
+        parts: by the names of the sentence: names (subjects), a number, or a number with its unit.
+            None leaves the part out.
+
+    Raises:
+        KeyError: the catalogue has no such kind.
+    """
+    from sfm.remarks.catalogue import KINDS
+
+    KINDS[kind]  # a misspelt kind fails where it is made
+    subjects: dict[str, tuple[str, ...]] = {}
+    numbers: dict[str, Quantity] = {}
+    for name, part in parts.items():
+        if part is None:
+            continue
+        if isinstance(part, str):
+            subjects[name] = (part,)
+        elif isinstance(part, Quantity):
+            numbers[name] = part
+        elif isinstance(part, tuple) and len(part) == 2 and not isinstance(part[0], str):
+            numbers[name] = Quantity(float(part[0]), part[1])
+        elif isinstance(part, Iterable):
+            subjects[name] = tuple(part)
+        else:
+            numbers[name] = Quantity(float(part))
+    return Remark(kind, subjects, numbers)
+
+
+def kinds_of(remarks: Iterable[Remark]) -> tuple[str, ...]:
+    """Return the kinds of remarks, in order."""
+    return tuple(one.kind for one in remarks)

@@ -1,0 +1,88 @@
+"""Remarks, the catalogue and the verdict."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from sfm.remarks.catalogue import KINDS
+from sfm.remarks.kind import Grade, Kind
+from sfm.remarks.remark import Quantity, Remark, remark
+from sfm.remarks.verdict import judge
+
+HEADLINES = {"good": "It worked.", "fair": "It worked, with remarks.", "bad": "No result."}
+
+
+def sentence(text: str, **parts: object) -> str:
+    kind = Kind("some", "note", text, "cause", "remedy")
+    subjects = {name: one for name, one in parts.items() if isinstance(one, tuple)}
+    numbers = {name: one for name, one in parts.items() if isinstance(one, Quantity)}
+    return kind.sentence_of(Remark("some", subjects, numbers))
+
+
+@pytest.mark.parametrize(
+    ("text", "parts", "said"),
+    [
+        ("{points} {points:is|are} off", {"points": ("a",)}, "a is off"),
+        ("{points:point} {points:is|are} off", {"points": ("a", "b")}, "2 points are off"),
+        ("{count:point}", {"count": Quantity(1)}, "1 point"),
+        ("by {d}", {"d": Quantity(0.0123456, "mm")}, "by 0.0123 mm"),
+        ("by {d:+}", {"d": Quantity(0.5, "px")}, "by +0.500 px"),
+        ("{share:%}", {"share": Quantity(0.25)}, "25.0 %"),
+        ("a[[ and {d}]].", {}, "a."),
+        ("a[[ and {d}]].", {"d": Quantity(7)}, "a and 7."),
+    ],
+)
+def test_a_sentence_writes_its_parts(text: str, parts: dict[str, object], said: str) -> None:
+    assert sentence(text, **parts) == said
+
+
+def test_a_missing_part_is_an_error() -> None:
+    with pytest.raises(KeyError):
+        sentence("by {d}")
+
+
+def test_a_misspelt_kind_fails_where_it_is_made() -> None:
+    with pytest.raises(KeyError):
+        remark("no_such_kind")
+
+
+@pytest.mark.parametrize(
+    ("value", "severity"), [(0.9, "note"), (1.0, "warning"), (2.9, "warning"), (3.0, "error")]
+)
+def test_a_grade_is_by_its_number(value: float, severity: str) -> None:
+    assert Grade("shift", warning=1.0, error=3.0).of(value) == severity
+
+
+def test_an_unknown_number_is_as_bad_as_can_be() -> None:
+    assert Grade("shift", warning=1.0, error=3.0).of(float("nan")) == "error"
+
+
+def test_the_most_serious_remark_decides_and_comes_first() -> None:
+    mild = remark("other_camera", photographs=["b"], change=(0.1, "%"), shift=0.5)
+    warning = remark("other_camera", photographs=["b"], change=(0.1, "%"), shift=1.5)
+    serious = remark("other_camera", photographs=["a"], change=(9.0, "%"), shift=40.0)
+    assert judge([], HEADLINES).level == "good"
+    assert judge([mild], HEADLINES).level == "good"
+    assert judge([mild, warning], HEADLINES).level == "fair"
+    verdict = judge([mild, serious, warning], HEADLINES)
+    assert verdict.level == "bad" and verdict.headline == HEADLINES["bad"]
+    assert verdict.remarks == (serious, warning, mild)
+
+
+def test_every_row_has_a_cause_and_a_remedy_and_is_a_sentence() -> None:
+    for name, row in KINDS.items():
+        assert row.name == name
+        assert row.cause and row.remedy, name
+        assert row.sentence.rstrip("]").endswith((".", "?")), name
+        if isinstance(row.severity, Grade):
+            assert row.severity.warning < row.severity.error, name
+
+
+def test_a_remark_is_plain_values_for_json() -> None:
+    one = remark("other_camera", photographs=["b"], change=(0.1, "%"), shift=float("nan"))
+    stored = json.loads(json.dumps(one.as_dict(), allow_nan=False))
+    assert stored["kind"] == "other_camera" and stored["severity"] == "error"
+    assert stored["numbers"]["change"] == {"value": 0.1, "unit": "%"}
+    assert stored["numbers"]["shift"]["value"] is None
