@@ -90,7 +90,7 @@ def _measure(
         measured,
         images=files.names,
         failed=sizes.left_out + measured.failed,
-        warnings=sizes.lines + measured.warnings,
+        remarks=sizes.remarks + measured.remarks,
     )
 
 

@@ -22,6 +22,7 @@ from sfm.errors import GeometryError
 from sfm.files.covariance_file import points_kept_together
 from sfm.network import Estimate, Network, index_of
 from sfm.point_table import Point, PointTable
+from sfm.remarks.remark import Remark
 from sfm.stored_result import NO_SCALE, SeenTargets, StoredResult
 from sfm.targets.flags import Flag, count_flags
 
@@ -45,6 +46,7 @@ class LeftOutPoint:
     point: str  # name of the point
     image_points: int  # measured of it
     reason: str  # one line: what was found and what was needed
+    few_rays: bool = False  # whether it was measured in fewer photographs than it needs
 
 
 @dataclass(frozen=True)
@@ -178,15 +180,13 @@ class SurveyResult:
     baseline: BaselineComparison | None = None  # another pipeline on the photographs; None likewise
     photographs: tuple[PhotographTargets, ...] = ()  # of every readable photograph; none with [observations]
     control_check: ControlCheck | None = None  # None without control, or where the datum is control
-    warnings: tuple[str, ...] = ()  # one line each, in words
-    notes: tuple[str, ...] = ()  # what was chosen where the survey says nothing, and is no fault, likewise
+    remarks: tuple[Remark, ...] = ()  # what its stages found
     eccentricity: Eccentricity | None = None  # None where it was not corrected
     no_circles: tuple[str, ...] = ()  # uncoded points left out: their outlines are not images of one circle
     left_out: tuple[LeftOutPoint, ...] = ()  # measured points that are not in the result
     free_network: FreeNetwork | None = None  # None where nothing else took part, or where it has no result
     taken_out: tuple[TakenOut, ...] = ()  # control and scale bars that do not fit and were not used
     other_solutions: tuple[OtherSolution, ...] = ()  # that the image points allow as well
-    undecided: tuple[str, ...] = ()  # of the orientation: which of two is true, one line each
     unused_image_points: int = 0  # of points or photographs that are not in the result, in no other count
     explanations: tuple[Explanation, ...] = ()  # of large residuals that were tried, the likeliest first
     check_points: tuple[CheckPoint, ...] = ()  # with coordinates that took no part
@@ -327,7 +327,7 @@ class SurveyResult:
         ]
         if both is not None:
             rows.append((both.backend, "agrees" if both.agree else "DIFFERS"))
-        return rows + [("warning", line) for line in self.warnings]
+        return rows + [(one.severity, one.text) for one in self.remarks]
 
     def __repr__(self) -> str:
         return text_table(f"Survey {self.survey}", ("", ""), self._rows())

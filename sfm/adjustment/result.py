@@ -9,6 +9,7 @@ import numpy as np
 from sfm.conventions import BoolArray, FloatArray
 from sfm.display import html_table, text_table
 from sfm.network import Estimate, Network
+from sfm.remarks.remark import Remark
 
 
 @dataclass(frozen=True)
@@ -65,7 +66,7 @@ class Adjustment:
     test_alpha: float = 0.001  # probability with which the test that was applied rejects a good image
     # coordinate; Baarda's usual one where none was
     start_sigma0: float = float("nan")  # as sigma0, at the start values
-    remarks: tuple[str, ...] = ()  # what of the robust test could not be carried through, one line each
+    remarks: tuple[Remark, ...] = ()  # what of the robust test could not be carried through
 
     @property
     def vPv(self) -> float:

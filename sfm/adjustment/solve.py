@@ -42,12 +42,12 @@ from sfm.adjustment.quality.reliability import redundancy_numbers as numbers_of
 from sfm.adjustment.quality.reliability import redundancy_of_bars, standardised_residuals
 from sfm.adjustment.result import Adjustment, Covariance
 from sfm.conventions import BoolArray, FloatArray
-from sfm.display import listed
 from sfm.distributions import normal_sf
 from sfm.errors import GeometryError
 from sfm.kernels.threads import own_threads
 from sfm.network import Estimate, Network
 from sfm.network_check import check_network, check_number
+from sfm.remarks.remark import Remark, remark
 
 FREE = Datum("free")
 MIN_HOLD = 0.01  # largest weight of the image points of a photograph below which none of them fits
@@ -196,8 +196,8 @@ def _mask_of(rejected: BoolArray | None, k: int) -> BoolArray:
     return given
 
 
-def _let_go(layout: Unknowns, weight: FloatArray, network: Network) -> tuple[str, ...]:
-    """Return the line on photographs that robust weights have let go of: it converges wherever they are."""
+def _without_weight(layout: Unknowns, weight: FloatArray, network: Network) -> tuple[Remark, ...]:
+    """Return the remark on photographs of small robust weights only: it converges wherever they are."""
     seen = layout.active
     image = layout.observations.image
     largest = np.zeros(len(network.images))
@@ -205,11 +205,10 @@ def _let_go(layout: Unknowns, weight: FloatArray, network: Network) -> tuple[str
     loose = np.bincount(image[seen], minlength=len(largest)) > 0
     loose &= largest < MIN_HOLD
     loose[network.exterior.image] = False
-    remarks: list[str] = []
-    if loose.any():
-        names = listed(network.images[i] for i in np.flatnonzero(loose))
-        remarks.append(f"no image point fits in {names}: nothing holds the position and rotation found")
-    return tuple(remarks)
+    if not loose.any():
+        return ()
+    names = [network.images[i] for i in np.flatnonzero(loose)]
+    return (remark("photograph_without_weight", photographs=names),)
 
 
 def _level_of(reject: str, alpha: float, usual: float) -> float:
@@ -295,6 +294,6 @@ def _result(
         inflation=factor,
         bar_redundancy=of_bars,
         datum_points=run.problem.datum.points,
-        remarks=(*run.remarks, *_let_go(layout, weight, network)),
+        remarks=(*run.remarks, *_without_weight(layout, weight, network)),
         start_sigma0=float(np.sqrt(run.start_vPv / redundancy)) if redundancy > 0 else float("nan"),
     )

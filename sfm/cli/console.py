@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from pathlib import Path
 
 from rich.console import Console
@@ -10,13 +11,15 @@ from rich.table import Table
 from rich.text import Text
 
 from sfm.display import program_name
+from sfm.remarks.remark import Severity
+from sfm.remarks.verdict import Line
 from sfm.report.findings.findings import Findings
 from sfm.report.numbers import finer_unit, significant
 from sfm.report.phrases import words_of_check, words_of_sigma0, words_of_test
 from sfm.result import SurveyResult
 
-MAX_WARNINGS = 5  # without --verbose
 COLOURS = {"good": "green", "fair": "yellow", "bad": "red"}
+STYLES: dict[Severity, str] = {"error": "red", "warning": "yellow", "note": "dim"}
 
 
 def tell_result(findings: Findings, page: Path, *, seconds: float, verbose: bool) -> bool:
@@ -34,16 +37,9 @@ def tell_result(findings: Findings, page: Path, *, seconds: float, verbose: bool
     for name, value in (*figures, *(_details(findings) if verbose else ())):
         table.add_row(Text(name, style="dim"), Text(value))
     console.print(table)
-    for line in verdict.remarks:
-        console.print(Text(f"! {line}", style="yellow"), soft_wrap=True)
+    tell_remarks(console, verdict.lines)
     for failed in result.failed:
         console.print(Text(f"  {failed.image}: {failed.reason}"), soft_wrap=True)
-    others = result.warnings[1:]  # the first is among the remarks
-    shown = others if verbose else others[: MAX_WARNINGS - 1]
-    for warning in shown:
-        console.print(Text(f"  {warning}"), soft_wrap=True)
-    if len(shown) < len(others):
-        console.print(Text(f"  ... and {len(others) - len(shown)} more, in the report"))
     if verbose:
         console.print(_photograph_table(result))
         for camera in a.estimate.cameras:
@@ -57,6 +53,14 @@ def tell_result(findings: Findings, page: Path, *, seconds: float, verbose: bool
             console.print(Text(f"  camera {camera.name} ({camera.model}): {values}"))
     console.print(Text(f"Report: {page}", style="bold"), soft_wrap=True)
     return verdict.level != "bad"
+
+
+def tell_remarks(console: Console, lines: Iterable[Line]) -> None:
+    """Print remarks: errors and warnings behind `!` and with their remedies, then notes."""
+    for line in lines:
+        is_note = line.severity == "note"
+        text = f"  {line.text}" if is_note else f"! {line.text} {line.remedy}".rstrip()
+        console.print(Text(text, style=STYLES[line.severity]), soft_wrap=True)
 
 
 def _figures(findings: Findings) -> tuple[tuple[str, str], ...]:

@@ -9,7 +9,10 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
+
+if TYPE_CHECKING:
+    from sfm.remarks.kind import Kind
 
 Severity = Literal["note", "warning", "error"]
 SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")  # the most serious first
@@ -41,18 +44,21 @@ class Remark:
     numbers: Mapping[str, Quantity] = field(default_factory=dict)
 
     @property
+    def row(self) -> Kind:
+        """Its row of the catalogue."""
+        from sfm.remarks.catalogue import KINDS
+
+        return KINDS[self.kind]
+
+    @property
     def severity(self) -> Severity:
         """How much it matters, by the catalogue: note, warning or error."""
-        from sfm.remarks.catalogue import severity_of
-
-        return severity_of(self)
+        return self.row.severity_of(self)
 
     @property
     def text(self) -> str:
         """Its sentence, by the catalogue."""
-        from sfm.remarks.catalogue import sentence_of
-
-        return sentence_of(self)
+        return self.row.sentence_of(self)
 
     def number(self, name: str) -> float:
         """Return the value of a number; NaN where the remark has none of that name."""
@@ -65,9 +71,6 @@ class Remark:
 
     def as_dict(self) -> dict[str, Any]:
         """Return the remark for JSON: kind, severity, text, subjects, numbers with units, cause, remedy."""
-        from sfm.remarks.catalogue import KINDS
-
-        row = KINDS[self.kind]
         return {
             "kind": self.kind,
             "severity": self.severity,
@@ -77,8 +80,8 @@ class Remark:
                 name: {"value": one.value if math.isfinite(one.value) else None, "unit": one.unit}
                 for name, one in self.numbers.items()
             },
-            "cause": row.cause,
-            "remedy": row.remedy,
+            "cause": self.row.cause,
+            "remedy": self.row.remedy,
         }
 
 
@@ -112,6 +115,11 @@ def remark(kind: str, **parts: str | Iterable[str] | float | tuple[float, str] |
         else:
             numbers[name] = Quantity(float(part))
     return Remark(kind, subjects, numbers)
+
+
+def unless_note(one: Remark) -> tuple[Remark, ...]:
+    """Return a remark only if it is more than a note: by a kind with a grade, the number is conspicuous."""
+    return () if one.severity == "note" else (one,)
 
 
 def kinds_of(remarks: Iterable[Remark]) -> tuple[str, ...]:

@@ -9,10 +9,20 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Literal
 
+from sfm.display import MAX_LISTED
 from sfm.remarks.remark import SEVERITIES, Remark, Severity
 
 Level = Literal["good", "fair", "bad"]
 EFFECT: Mapping[Severity, Level] = {"note": "good", "warning": "fair", "error": "bad"}
+
+
+@dataclass(frozen=True)
+class Line:
+    """A remark as it is printed."""
+
+    severity: Severity
+    text: str
+    remedy: str = ""  # with the first of a kind
 
 
 @dataclass(frozen=True)
@@ -24,9 +34,9 @@ class Verdict:
     remarks: tuple[Remark, ...]  # the most serious first
 
     @property
-    def texts(self) -> tuple[str, ...]:
-        """The sentences of the remarks."""
-        return tuple(one.text for one in self.remarks)
+    def lines(self) -> tuple[Line, ...]:
+        """What is printed of the remarks: of many of one kind the first ones, and how many more there are."""
+        return lines_of(self.remarks)
 
 
 def judge(remarks: Iterable[Remark], headlines: Mapping[Level, str]) -> Verdict:
@@ -40,3 +50,18 @@ def judge(remarks: Iterable[Remark], headlines: Mapping[Level, str]) -> Verdict:
     order = tuple(one for severity in SEVERITIES for one in every if one.severity == severity)
     level: Level = EFFECT[order[0].severity] if order else "good"
     return Verdict(level, headlines[level], order)
+
+
+def lines_of(remarks: Iterable[Remark]) -> tuple[Line, ...]:
+    """Return the lines that are printed: the first ones of a kind and severity, and how many more."""
+    groups: dict[tuple[Severity, str], list[Remark]] = {}
+    for one in remarks:
+        groups.setdefault((one.severity, one.kind), []).append(one)
+    lines = []
+    for (severity, _), same in groups.items():
+        lines += [
+            Line(severity, one.text, "" if k else one.row.remedy) for k, one in enumerate(same[:MAX_LISTED])
+        ]
+        if len(same) > MAX_LISTED:
+            lines.append(Line(severity, f"{len(same) - MAX_LISTED} more like these."))
+    return tuple(lines)

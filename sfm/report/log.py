@@ -137,8 +137,8 @@ class SurveyLog:
             more: further entries of the last line.
         """
         self.end_stage()
-        for warning in findings.result.warnings:
-            self.note("warning", text=warning)
+        for one in findings.verdict.remarks:
+            self.note("remark", **one.as_dict())
         self.note("result", **result_entries(findings), **more)
         (folder / LOG).write_text("\n".join(self._lines) + "\n", encoding="utf-8")
 

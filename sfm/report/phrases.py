@@ -11,7 +11,6 @@ from sfm.display import listed
 from sfm.report.findings.checks import CheckedControl, Sigma0
 from sfm.report.findings.findings import Findings
 from sfm.report.findings.geometry import WEAK_DEG, Coverage, Geometry
-from sfm.report.findings.other_adjuster import words_of_better_fit
 from sfm.report.findings.precision import Precision
 from sfm.report.numbers import finer_unit, significant
 from sfm.result import SurveyResult
@@ -174,7 +173,7 @@ PHRASES = {
     one.__name__: one
     for one in (
         *(words_of_sigma0, words_of_test, words_of_weights, words_of_check, words_of_w, words_of_limiting),
-        *(words_of_fixed, words_of_datum, words_of_geometry, points_by_rays, words_of_better_fit),
+        *(words_of_fixed, words_of_datum, words_of_geometry, points_by_rays),
     )
 }
 """what the templates call"""

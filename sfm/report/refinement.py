@@ -10,6 +10,8 @@ import numpy as np
 from sfm.adjustment.result import Adjustment
 from sfm.conventions import FloatArray, IntArray
 from sfm.files.plain_text import csv_text
+from sfm.remarks.remark import remark
+from sfm.remarks.verdict import judge
 from sfm.report.findings.given_residuals import Given, bar_residuals, control_residuals
 from sfm.report.html.page import render
 from sfm.report.numbers import general, significant
@@ -25,8 +27,6 @@ IMAGE_COLUMNS = (
 )
 TARGET_COLUMNS = ("target", "X", "Y", "Z", "sX", "sY", "sZ", "rays")
 CAMERA_COLUMNS = ("camera_id", "model", "parameter", "before", "after", "sigma")
-FEW_MEASURED = 0.5  # part of the key points below which something is wrong with photographs or windows
-NOT_ROWS = 12  # photographs named that were not adjusted
 
 
 @dataclass(frozen=True)
@@ -70,19 +70,11 @@ def words_of_key_points(found: Refinement, numbers: Numbers) -> str:
 def _page(found: Refinement, numbers: Numbers, images: list[list[object]], title: str) -> str:
     """Return the page."""
     after, before = found.adjustment, found.readjusted
-    lost = [name for name, used in zip(found.model.images, found.images, strict=True) if not used]
-    remarks = []
-    if lost:
-        more = f" and {len(lost) - NOT_ROWS} more" if len(lost) > NOT_ROWS else ""
-        remarks.append(f"{len(lost)} photographs were not adjusted: {', '.join(lost[:NOT_ROWS])}{more}.")
-    if found.refined < FEW_MEASURED * found.key_points:
-        remarks.append(f"Only {found.refined} of {found.key_points} key points were measured anew.")
-    if numbers.in_rigs:
-        remarks.append(
-            f"{numbers.in_rigs} photographs are in rigs: COLMAP's adjuster held their cameras together "
-            "afterwards; standard deviations are those without that condition."
-        )
-    remarks = [*(line[:1].upper() + line[1:] for line in found.warnings), *remarks]
+    rigs = (remark("rigs_held_together", photographs=numbers.in_rigs),) if numbers.in_rigs else ()
+    px = significant(found.before_px), significant(found.after_px)
+    figures = f"RMS of the key points {px[0]} px before, {px[1]} px after"
+    bad = f"Not dependable: {figures}"
+    verdict = judge((*found.remarks, *rigs), {"good": figures, "fair": figures, "bad": bad})
     unit = "object units" if found.targets is None else found.targets.unit
     given = Given(control_residuals(after, unit), bar_residuals(after, unit), None, None, None)
     return render(
@@ -91,11 +83,9 @@ def _page(found: Refinement, numbers: Numbers, images: list[list[object]], title
         unit=unit,
         given=given,
         targets=target_rows(found),
-        headline=("" if found.dependable else "Not dependable: ")
-        + f"RMS of the key points {significant(found.before_px)} px before, "
-        f"{significant(found.after_px)} px after",
-        level="bad" if not found.dependable else "fair" if remarks else "good",
-        remarks=remarks,
+        headline=verdict.headline,
+        level=verdict.level,
+        remarks=verdict.lines,
         sizes=_sizes(found, numbers, unit),
         found=found,
         limits={"shift_px": MIN_SHIFT_PX, "shift_factor": MAX_SHIFT_FACTOR, "rays": MIN_RAYS},

@@ -45,21 +45,21 @@ def assemble_result(
         baseline=compared.baseline,
         photographs=measured.overlays if matched.overlays is None else matched.overlays,
         control_check=solution.control_check,
-        warnings=measured.warnings
-        + start.warnings
-        + matched.warnings
-        + solution.warnings
-        + compared.failures,
+        remarks=(
+            *measured.remarks,
+            *start.remarks,
+            *matched.remarks,
+            *solution.remarks,
+            *compared.remarks,
+        ),
         eccentricity=matched.eccentricity,
         no_circles=matched.no_circles,
         left_out=(*measured.left_out, *solution.left_out),
-        notes=solution.notes + compared.notes,
         settings=told_settings(survey),
         free_network=solution.free_network,
         taken_out=solution.taken_out,
         explanations=solution.explanations,
         other_solutions=solution.others,
-        undecided=start.remarks + solution.undecided,
         unused_image_points=solution.unused_image_points + sum(one.image_points for one in measured.left_out),
         reject=survey.reject,
         weights=survey.adjust.weights,

@@ -8,9 +8,9 @@ import numpy as np
 
 from sfm.camera import pixel_curvature, pixel_jacobian
 from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
-from sfm.display import listed
 from sfm.network import Estimate, ImagePoints, Network, rows_of
 from sfm.orientation.eccentricity import CircleViews, ellipse_shape, fit_circles
+from sfm.remarks.remark import Remark, remark
 from sfm.result import Eccentricity
 from sfm.survey.adjusting.datum_definition import object_scale
 from sfm.survey.inputs.given import Diameters
@@ -37,7 +37,7 @@ class CircleCheck:
     estimate: Estimate  # without the points that are not circles
     no_circles: tuple[str, ...]  # uncoded points left out: their outlines are not images of one circle
     eccentricity: Eccentricity | None  # what was corrected; None where nothing was
-    warnings: tuple[str, ...] = ()  # on stated diameters, one line each
+    remarks: tuple[Remark, ...] = ()  # on stated diameters
 
 
 def check_circles(
@@ -71,11 +71,12 @@ def check_circles(
     if not survey.targets.eccentricity:
         return CircleCheck(network, estimate, names, None)
     names_of_circles = tuple(network.points[j] for j in numbers)
-    known, warnings = _known_radius(survey, names_of_circles), _unknown_ids(survey.diameters, network.points)
+    known = _known_radius(survey, names_of_circles)
+    remarks = _unknown_ids(survey.diameters, network.points)
     if np.isfinite(known).any():
         scale = object_scale(network, estimate)
         if np.isfinite(scale):
-            warnings += _other_sizes(survey, names_of_circles, known, scale * circles.radius)
+            remarks += _other_sizes(survey, names_of_circles, known, scale * circles.radius)
         else:  # then the targets themselves tell the scale
             scale = float(np.nanmedian(known / circles.radius))
         circles = fit_circles(views, len(numbers), radius=known / scale)
@@ -91,7 +92,7 @@ def check_circles(
         float(np.sqrt(np.sum(length**2) / max(2 * len(length), 1))),
         float(np.sqrt(np.sum(sigma) / max(len(sigma), 1))),
     )
-    return CircleCheck(corrected, estimate, names, summary, warnings)
+    return CircleCheck(corrected, estimate, names, summary, remarks)
 
 
 def circle_misfit(
@@ -136,19 +137,19 @@ def _known_radius(survey: Survey, points: tuple[str, ...]) -> FloatArray:
     return radius
 
 
-def _unknown_ids(given: Diameters | None, points: tuple[str, ...]) -> tuple[str, ...]:
-    """Return a warning on the ids of the table of diameters that no target of the survey has."""
+def _unknown_ids(given: Diameters | None, points: tuple[str, ...]) -> tuple[Remark, ...]:
+    """Return a remark on the ids of the table of diameters that no target of the survey has."""
     known = set(points)
     unknown = [name for name in given.names if name not in known] if given is not None else []
     if given is None or not unknown:
         return ()
-    return (f"{given.source}: diameters of targets that are not in the survey: {listed(unknown)}",)
+    return (remark("diameters_of_unknown", targets=unknown),)
 
 
 def _other_sizes(
     survey: Survey, points: tuple[str, ...], stated: FloatArray, found: FloatArray
-) -> tuple[str, ...]:
-    """Return warnings on stated diameters that the ellipses contradict.
+) -> tuple[Remark, ...]:
+    """Return remarks on stated diameters that the ellipses contradict.
 
     The one diameter of all targets is judged by their median, since other round things may be among the
     uncoded ones; those of a table are judged one by one.
@@ -162,24 +163,34 @@ def _other_sizes(
     single = np.zeros(len(points), dtype=bool)
     if survey.diameters is not None:
         single = np.isin(points, survey.diameters.names)
-    lines = []
+    remarks = []
     common = ~single & np.isfinite(stated)
     if common.any():
         given, seen = 2 * stated[common][0], 2 * float(np.median(found[common]))
         if abs(np.log(given / seen)) > np.log1p(OTHER_SIZE):
-            lines.append(
-                f"targets.diameter is {given:.3g} {survey.unit}, but the ellipses of {common.sum()} targets "
-                f"give {seen:.3g} {survey.unit}"
+            remarks.append(
+                remark(
+                    "diameter_differs",
+                    targets=int(common.sum()),
+                    stated=(given, survey.unit),
+                    found=(seen, survey.unit),
+                )
             )
     differs = single & (np.abs(np.log(stated / found)) > np.log1p(OTHER_SIZE))
     if differs.any() and survey.diameters is not None:
         worst = int(np.nanargmax(np.where(differs, np.abs(np.log(stated / found)), np.nan)))
-        lines.append(
-            f"{survey.diameters.source}: the diameter of target {points[worst]} is {2 * stated[worst]:.3g} "
-            f"{survey.unit}, but its ellipses give {2 * found[worst]:.3g} {survey.unit} "
-            f"(more than {100 * OTHER_SIZE:g} % apart: {differs.sum()} of {single.sum()} targets)"
+        remarks.append(
+            remark(
+                "diameters_differ",
+                target=points[worst],
+                stated=(2 * stated[worst], survey.unit),
+                found=(2 * found[worst], survey.unit),
+                differing=int(differs.sum()),
+                total=int(single.sum()),
+                limit=(100 * OTHER_SIZE, "%"),
+            )
         )
-    return tuple(lines)
+    return tuple(remarks)
 
 
 def _named(photographs: MeasuredPhotographs, naming: Naming, values: list[AnyArray]) -> AnyArray:

@@ -16,13 +16,14 @@ from sfm.orientation.incremental.growth import residual_lengths
 from sfm.orientation.incremental.sequence import Orientation
 from sfm.orientation.intersection import intersect
 from sfm.reduced_network import reduce_network
+from sfm.remarks.remark import Remark
 from sfm.survey.adjusting.settling import MIN_IMAGE_POINTS, determined, merge_estimate
 from sfm.survey.adjusting.solution import TOLERANCE_FACTOR, Correspondences
 from sfm.survey.circles import check_circles
 from sfm.survey.diagnosis.contradicting_codes import (
     ContestedCodes,
     find_contested_codes,
-    words_of_contested,
+    remarks_on_contested,
 )
 from sfm.survey.diagnosis.own_camera import treat_lost
 from sfm.survey.inputs.measurements import MeasuredPhotographs, Measurements, Naming
@@ -62,10 +63,10 @@ def find_correspondences(
             measured.min_rays if surface is None else np.full(len(network.points), MIN_RAYS),
             point_failures=start.point_failures,
             given=start.kind == "given",
-            warnings=() if surface is None else surface.warnings,
+            remarks=() if surface is None else surface.remarks,
             overlays=None if surface is None else surface.overlays,
         )
-    matched, left_out, lines = _without_other_objects(survey, photographs, naming, start)
+    matched, left_out, contested = _without_other_objects(survey, photographs, naming, start)
     naming, network, estimate = matched.naming, matched.network, matched.estimate
     circles = check_circles(survey, photographs, naming, network, estimate)
     told = {name for name, _ in left_out}
@@ -82,7 +83,7 @@ def find_correspondences(
         naming,
         circles.eccentricity,
         circles.no_circles,
-        (*circles.warnings, *lines),
+        (*circles.remarks, *contested),
         start.point_failures,
         start.kind == "given",
         left_out,
@@ -102,12 +103,12 @@ class _Matched:
 
 def _without_other_objects(
     survey: Survey, photographs: MeasuredPhotographs, naming: Naming, start: Orientation
-) -> tuple[_Matched, tuple[tuple[str, str], ...], tuple[str, ...]]:
+) -> tuple[_Matched, tuple[tuple[str, str], ...], tuple[Remark, ...]]:
     """Match, leave out the photographs whose codes contradict the others, and match the others again.
 
     Returns:
-        What was matched; photographs that are left out, with the reason; lines on codes that are at several
-        places still.
+        What was matched; photographs that are left out, with the reason; remarks on codes that are at
+        several places still.
     """
     matched = _match_and_adjust(survey, photographs, naming, start)
     found = find_contested_codes(photographs, matched.naming)
@@ -116,7 +117,7 @@ def _without_other_objects(
         estimate = _without_contested(photographs, matched.naming, matched.estimate, found)
         matched = _match_and_adjust(survey, photographs, matched.naming, replace(start, estimate=estimate))
         found = find_contested_codes(photographs, matched.naming)
-    return matched, reasons, words_of_contested(found, photographs, matched.naming)
+    return matched, reasons, remarks_on_contested(found, photographs, matched.naming)
 
 
 def _without_contested(

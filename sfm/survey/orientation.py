@@ -12,6 +12,7 @@ from sfm.network import Estimate, Network, rows_of
 from sfm.orientation.image_rays import intersect_image_points
 from sfm.orientation.incremental.sequence import MIN_POINTS, Judge, Orientation, orient
 from sfm.reduced_network import reduce_network
+from sfm.remarks.remark import Remark, remark
 from sfm.survey.adjusting.free_parameters import choose_free_parameters
 from sfm.survey.adjusting.solution import refine
 from sfm.survey.circles import circle_misfit
@@ -56,23 +57,23 @@ def orient_survey(survey: Survey, measured: Measurements) -> Orientation:
         failure = error
         if measured.photographs is not None and _most_in_common(network) < MIN_POINTS:
             raise GeometryError(words_of_codes(survey, measured.photographs)) from error
-    line, others = "", _second_objects(survey, network, found)
+    wrong_c: tuple[Remark, ...] = ()
+    others = _second_objects(survey, network, found)
     if not given and not (others and all(one.certain for one in others)):
-        found, line = try_other_principal_distances(network, estimate, found, orient_from)
-        others = _second_objects(survey, network, found) if line else others
+        found, wrong_c = try_other_principal_distances(network, estimate, found, orient_from)
+        others = _second_objects(survey, network, found) if wrong_c else others
     if found is None:
         hint = " (correct or complete [approximate], or leave it out)" if given else ""
-        hint += f"; {line}" if line else ""
+        hint += "".join(f"; {one.text}" for one in wrong_c)
         raise GeometryError(f"{failure}{hint}") from failure
-    warnings = tuple(f"[approximate]: {line}" for line in found.warnings)
-    warnings += (*found.remarks, *([line] if line else []))
     chosen = choose_free_parameters(survey, network, found.estimate, extend=False)
     found, held = _hold_cameras_of_two(survey, network, replace(found, estimate=chosen.estimate))
     if held and len(network.images) > 2:
-        found = replace(found, remarks=(*found.remarks, _words_of_last_two(len(network.images) - 2)))
-    elif held and line:
-        found = replace(found, remarks=(*found.remarks, f"{line}; two photographs do not determine it"))
-    found = tell_lost_photographs(network, replace(found, warnings=warnings + held))
+        held += (remark("pair_contradicted", others=len(network.images) - 2),)
+    elif held:
+        wrong_c = tuple(replace(one, kind="c_looks_wrong_of_pair") for one in wrong_c)
+    found = replace(found, remarks=(*found.remarks, *wrong_c, *held))
+    found = tell_lost_photographs(network, found)
     return tell_second_objects(found, others)
 
 
@@ -92,7 +93,7 @@ def _orient(
 
 def _hold_cameras_of_two(
     survey: Survey, network: Network, found: Orientation
-) -> tuple[Orientation, tuple[str, ...]]:
+) -> tuple[Orientation, tuple[Remark, ...]]:
     """Hold the free parameters of interior orientation where two photographs are all there is, and say so.
 
     The image points of a pair determine seven parameters, five of them the relative orientation (Hartley and
@@ -104,28 +105,15 @@ def _hold_cameras_of_two(
     if estimate.oriented.sum() != 2 or fixed >= CONTROL_OF_CAMERA:
         return found, ()
     used = np.unique(network.camera[estimate.oriented])
-    lines = []
+    remarks = []
     cameras = list(estimate.cameras)
     for index in used.tolist():
         camera = cameras[index]
         names = [name for name, free in zip(camera.names, camera.free, strict=True) if free]
         if names:
             cameras[index] = replace(camera, free=np.zeros_like(camera.free))
-            lines.append(
-                f"camera {camera.name}: {', '.join(names)} held at the start values: two photographs do not "
-                "determine them; an error of c scales the depth, one of the distortion bends the object, and "
-                "the standard deviations do not contain it"
-            )
-    return replace(found, estimate=replace(estimate, cameras=tuple(cameras))), tuple(lines)
-
-
-def _words_of_last_two(others: int) -> str:
-    """Say that the photographs which could check the camera of a pair do not fit."""
-    which = "the other photograph does" if others == 1 else f"the other {others} photographs do"
-    return (
-        f"the camera: two photographs that fit one another do not determine it, and {which} not fit at its "
-        "start values; give a calibrated camera, or add photographs between those that do not fit"
-    )
+            remarks.append(remark("interior_held_of_pair", camera=camera.name, parameters=names))
+    return replace(found, estimate=replace(estimate, cameras=tuple(cameras))), tuple(remarks)
 
 
 def _judge(measured: Measurements) -> Judge | None:

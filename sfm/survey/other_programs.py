@@ -10,6 +10,7 @@ from sfm.comparison.baseline import Baseline, BaselineComparison, compare_baseli
 from sfm.comparison.two_adjusters.adjusters import AdjusterComparison, BackendAdjustment, compare_adjusters
 from sfm.errors import KolinearError, MissingLibraryError
 from sfm.network import Estimate, Network
+from sfm.remarks.remark import Remark, remark
 from sfm.runtime.progress import StageClock
 from sfm.survey.adjusting.solution import Solution
 from sfm.survey.inputs.photograph_list import PhotographList
@@ -38,8 +39,7 @@ class SurveyComparison:
 
     adjusters: AdjusterComparison | None = None
     baseline: BaselineComparison | None = None
-    failures: tuple[str, ...] = ()  # why a comparison that was asked for failed, one line each
-    notes: tuple[str, ...] = ()  # comparisons left out because a library is not installed, one line each
+    remarks: tuple[Remark, ...] = ()  # comparisons that were asked for and failed, or were left out
 
 
 def compare_solution(
@@ -58,23 +58,22 @@ def compare_solution(
     """
     own_seconds = sum(seconds for _, seconds in clock.seconds)
     adjusters = baseline = None
-    failures: list[str] = []
-    notes: list[str] = []
+    remarks: list[Remark] = []
     if others.adjuster is not None:
         with clock.stage("comparison"):
             try:
                 adjusters = compare_adjusters(solution.adjustment, others.adjuster)
             except MissingLibraryError as error:
-                notes.append(f"Not compared with another adjuster: {error}.")
+                remarks.append(remark("adjuster_not_compared", reason=str(error)))
             except KolinearError as error:
-                failures.append(f"the comparison with the other adjuster failed: {error}")
+                remarks.append(remark("adjuster_failed", reason=str(error)))
     if others.mapper is not None and files is not None:
         with clock.stage("baseline"):
             try:
                 mapped = others.mapper(files.folder, files.by_camera())
                 baseline = compare_baseline(solution.adjustment, mapped, seconds=own_seconds)
             except MissingLibraryError as error:
-                notes.append(f"Not compared with another pipeline: {error}.")
+                remarks.append(remark("pipeline_not_compared", reason=str(error)))
             except KolinearError as error:
-                failures.append(f"the comparison with the other pipeline failed: {error}")
-    return SurveyComparison(adjusters, baseline, tuple(failures), tuple(notes))
+                remarks.append(remark("pipeline_failed", reason=str(error)))
+    return SurveyComparison(adjusters, baseline, tuple(remarks))

@@ -11,8 +11,8 @@ from sfm.conventions import FloatArray, IntArray
 from sfm.matching.tracks.correspondence import match_targets
 from sfm.network import Estimate, ImagePoints, Network, ScaleBars
 from sfm.runtime.progress import SILENT, Progress
-from sfm.survey.diagnosis.codes_found import words_of_small_codes
-from sfm.survey.diagnosis.missing_plates import words_of_missing_plates
+from sfm.survey.diagnosis.codes_found import small_codes
+from sfm.survey.diagnosis.missing_plates import missing_plates
 from sfm.survey.inputs.measurements import MeasuredPhotographs, Measurements, Naming
 from sfm.survey.inputs.photograph_list import PhotographList
 from sfm.survey.inputs.settings import TargetSettings
@@ -45,7 +45,6 @@ def measure_targets(
     """
     photographs = measure_photographs(survey, files, jobs=jobs, store=store, progress=progress)
     naming = name_coded(photographs)
-    lines = (words_of_small_codes(photographs.targets), words_of_missing_plates(survey.family, photographs))
     return Measurements(
         build_network(survey, photographs, naming),
         photographs.cameras,
@@ -56,7 +55,7 @@ def measure_targets(
         files,
         photographs,
         naming,
-        tuple(line for line in lines if line),
+        (*small_codes(photographs.targets), *missing_plates(survey.family, photographs)),
     )
 
 

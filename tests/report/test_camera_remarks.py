@@ -5,12 +5,12 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from sfm.report.findings.verdicts.verdict import Verdict
 
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.report.findings.findings import findings_of
-from sfm.report.findings.verdicts.verdict import Verdict
 from sfm.result import SurveyResult
 from tests.synthetic import make_network, seed_of
 

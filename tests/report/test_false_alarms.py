@@ -5,13 +5,13 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from sfm.report.findings.verdicts.verdict import judge
 
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.solve import adjust
 from sfm.network import ScaleBars
 from sfm.report.findings.findings import Findings, findings_of
 from sfm.report.findings.verdicts.evidence import Evidence
-from sfm.report.findings.verdicts.verdict import judge
 from sfm.result import SurveyResult
 from tests.synthetic import make_network, seed_of
 

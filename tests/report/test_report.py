@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 import pytest
 from jinja2 import UndefinedError
+from markupsafe import escape
 
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.result import Adjustment
@@ -23,6 +24,8 @@ from sfm.conventions import angles_from_rotation
 from sfm.errors import OutputError
 from sfm.files.manifest import refuse_foreign_folder
 from sfm.network import Network, ObjectPoints, ScaleBars
+from sfm.remarks.remark import kinds_of, remark
+from sfm.remarks.verdict import lines_of
 from sfm.report.figures.overlays import USED, draw_photograph, overlay_names
 from sfm.report.figures.plots import all_plots, plan_axes
 from sfm.report.figures.plotted import plot_data
@@ -86,7 +89,7 @@ def result(adjustment: Adjustment, tmp_path_factory: pytest.TempPathFactory) -> 
         comparison=None,
         photographs=tuple(photographs),
         control_check=ControlCheck(("1", "2"), np.array([[3e-5, 0, 4e-5], [-3e-5, 0, -4e-5]]), 1.5),
-        warnings=("scale bar 1 - 2 was not measured",),
+        remarks=(remark("scale_bars_missing", bars=["1 - 2"]),),
         seconds=(StageTime("targets", 1.25),),
     )
 
@@ -268,7 +271,7 @@ def test_page_is_whole_escaped_and_self_contained(result: SurveyResult) -> None:
     ):
         assert question in tags.text
     assert "too small" in tags.text
-    assert "1 of 9 photographs are not in the result." in tags.text
+    assert "1 of 9 photographs is not in the result." in tags.text
     assert f"{result.adjustment.sigma0_px:.4f} px" in tags.text
 
 
@@ -286,10 +289,8 @@ def test_a_network_without_scale_has_no_metric_unit(result: SurveyResult) -> Non
 
 def test_verdict(result: SurveyResult) -> None:
     assert findings_of(result).verdict.level == "fair"
-    assert findings_of(result).verdict.remarks[-1] == "Warning: scale bar 1 - 2 was not measured."
-    more = replace(result, warnings=("one thing.", "another", "a third"))
-    assert findings_of(more).verdict.remarks[-1] == "Warning: one thing (2 more warnings, see below)."
-    fine = replace(result, images_total=8, failed=(), warnings=())
+    assert set(kinds_of(findings_of(result).verdict.remarks)) >= {"scale_bars_missing", "photographs_missing"}
+    fine = replace(result, images_total=8, failed=(), remarks=())
     assert findings_of(fine).verdict.level == "good"
     assert (
         findings_of(fine).verdict.headline
@@ -298,24 +299,41 @@ def test_verdict(result: SurveyResult) -> None:
     lost = replace(fine, adjustment=replace(fine.adjustment, converged=False))
     assert findings_of(lost).verdict.level == "bad"
     weak = replace(fine, adjustment=replace(fine.adjustment, undetermined=("camera 1 c",), defect=8))
-    assert "Rank defect 8, expected 7" in findings_of(weak).verdict.remarks[0]
+    found = findings_of(weak).verdict.remarks[0]
+    assert found.kind == "rank_defect" and found.names("undetermined") == ("camera 1 c",)
+    assert (found.number("defect"), found.number("expected")) == (8, 7)
     many = replace(fine, adjustment=replace(fine.adjustment, rejected=np.arange(320) < 100))
     assert findings_of(many).verdict.level == "fair"
 
 
-def test_every_warning_is_told_once_where_the_remark_says_so(
-    result: SurveyResult, capsys: pytest.CaptureFixture[str]
+def test_every_remark_is_shown_once_by_every_renderer(
+    result: SurveyResult, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
-    more = replace(result, warnings=("one thing", "another, " + "and so on " * 20 + "to its end", "a third"))
-    text = text_report(findings_of(more))
+    missing = [f"control point {k} with a name of some length" for k in range(4)]
+    more = replace(
+        result, remarks=(remark("control_missing", points=missing), remark("scale_undefined", unit="m"))
+    )
+    findings = findings_of(more)
+    text = text_report(findings)
     assert max(map(len, text.splitlines())) <= WIDTH
-    words = " ".join(text[text.index("\nWarnings ") : text.index("\nNetwork and rank ")].split())
-    assert all(warning in words for warning in more.warnings)
-    assert f"{result.failed[0].image}: {result.failed[0].reason}" in " ".join(text.split())
-    assert "\nWarnings " not in text_report(findings_of(result))
-    tell_result(findings_of(more), Path("report.html"), seconds=1.0, verbose=False)
-    told = capsys.readouterr().out
-    assert all(told.count(warning) == 1 for warning in more.warnings)
+    words = " ".join(text.split())
+    tell_result(findings, Path("report.html"), seconds=1.0, verbose=False)
+    told, page = capsys.readouterr().out, report_page(findings, (), ())
+    for one in findings.verdict.remarks:
+        assert words.count(one.text) == 1 and told.count(one.text) == 1
+        assert page.count(str(escape(one.text))) == 1 and str(escape(one.row.remedy)) in page
+    assert f"{result.failed[0].image}: {result.failed[0].reason}" in words
+    write_summary(findings, tmp_path)
+    stored = json.loads((tmp_path / "summary.json").read_text(encoding="utf-8"))["verdict"]["remarks"]
+    assert stored == [one.as_dict() for one in findings.verdict.remarks]
+
+
+def test_of_many_remarks_of_a_kind_the_first_are_shown() -> None:
+    many = [remark("control_missing", points=[str(k)]) for k in range(8)]
+    lines = lines_of([*many, remark("scale_undefined", unit="m")])
+    assert [one.severity for one in lines] == ["warning"] * 6 + ["note"]
+    assert [bool(one.remedy) for one in lines] == [True] + [False] * 5 + [True]
+    assert lines[5].text.startswith("3 more")
 
 
 def test_overlay_shows_targets_where_they_are(result: SurveyResult) -> None:

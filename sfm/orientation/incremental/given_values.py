@@ -13,6 +13,7 @@ import numpy as np
 from sfm.conventions import IntArray
 from sfm.network import Estimate
 from sfm.orientation.incremental.growth import MIN_SHARE, Growth, Refine, residual_lengths
+from sfm.remarks.remark import Remark, remark
 
 MAX_COMPLETIONS = 50  # rounds of resection and intersection of what no values were given for
 KEPT_SHARE = 0.5  # of the photographs must fit, each with most of its image points, for given values to stay
@@ -25,7 +26,7 @@ class GivenStart:
     """Given values that stay, with what was oriented and intersected beside them."""
 
     estimate: Estimate  # before the adjustment that judges them
-    replaced: tuple[str, ...]  # given orientations of single photographs that did not fit, in words
+    replaced: tuple[Remark, ...]  # given orientations of single photographs that did not fit
 
 
 def start_from_given(growth: Growth, refine: Refine | None, final_tolerance_px: float) -> GivenStart | None:
@@ -43,7 +44,7 @@ def start_from_given(growth: Growth, refine: Refine | None, final_tolerance_px: 
     if start.oriented.sum() < 2:
         return None
     rough = bool(np.median(growth.share_fitting()[start.oriented]) < KEPT_SHARE)
-    replaced: tuple[str, ...] = ()
+    replaced: tuple[Remark, ...] = ()
     for _ in range(ROUNDS):
         changed = growth.refined(refine, everything=rough)
         growth.adapt_tolerance(final_tolerance_px)
@@ -67,8 +68,8 @@ def _complete(growth: Growth) -> None:
             break
 
 
-def _replace_misfits(growth: Growth) -> tuple[str, ...]:
-    """Resect the photographs most of whose image points do not fit; return what was replaced, in words."""
+def _replace_misfits(growth: Growth) -> tuple[Remark, ...]:
+    """Resect the photographs most of whose image points do not fit; return what was replaced."""
     before = growth.share_fitting()
     wrong = np.flatnonzero(growth.estimate.oriented & (before < MIN_SHARE)).tolist()
     if not wrong:
@@ -77,9 +78,13 @@ def _replace_misfits(growth: Growth) -> tuple[str, ...]:
     after = growth.share_fitting()
     count = np.bincount(growth.network.image_points.image, minlength=len(after))
     return tuple(
-        f"photograph {growth.network.images[i]}: the given orientation was replaced, "
-        f"{before[i] * count[i]:.0f} of its {count[i]} image points fit it and {after[i] * count[i]:.0f} fit "
-        "the new one"
+        remark(
+            "orientation_replaced",
+            photograph=growth.network.images[i],
+            before=round(before[i] * count[i]),
+            after=round(after[i] * count[i]),
+            image_points=int(count[i]),
+        )
         for i in wrong
         if after[i] >= MIN_SHARE
     )

@@ -33,6 +33,7 @@ from sfm.orientation.incremental.rivals import (
     worst_photographs,
 )
 from sfm.orientation.incremental.starting_pair import Start
+from sfm.remarks.remark import Remark, remark
 from sfm.similarity import fit_similarity
 
 Judge = Callable[[Estimate], float]
@@ -58,8 +59,7 @@ class Orientation:
     fits: BoolArray  # image points within the tolerance, (k,)
     rms_px: float  # over these, per coordinate, px
     tolerance_px: FloatArray  # last tolerance of each camera, px, one per camera
-    warnings: tuple[str, ...] = ()  # one line each: given values that were of no use or replaced
-    remarks: tuple[str, ...] = ()  # one line each: what the image points do not decide
+    remarks: tuple[Remark, ...] = ()  # given values of no use, and what the image points do not decide
 
 
 def orient(
@@ -133,7 +133,7 @@ def orient(
         settle_misfits(growth)
         given = Start(None, "given", kept.estimate.position, kept.estimate.rotation, kept.estimate.points)
         oriented = _finish(growth, given, estimate.cameras, contradicting=contradicting)
-        return replace(oriented, warnings=kept.replaced)
+        return replace(oriented, remarks=(*oriented.remarks, *kept.replaced))
     try:
         with_given = grow(estimate)
     except GeometryError:
@@ -152,10 +152,12 @@ def orient(
         better = (now, _holds_control(network, without)) > (before, _holds_control(network, with_given))
         if not better:
             return with_given
-    found = f"{before} of the {now} photographs that can be oriented without them"
-    warning = "the given approximate values were not used: "
-    warning += f"they orient {found}" if before < now else "they contradict the control"
-    return replace(without, warnings=(warning,))
+    unused = (
+        remark("approximate_unused", before=before, now=now)
+        if before < now
+        else remark("approximate_contradicts_control")
+    )
+    return replace(without, remarks=(*without.remarks, unused))
 
 
 def _holds_control(network: Network, found: Orientation) -> bool:
@@ -282,12 +284,8 @@ def _finish(growth: Growth, start: Start, cameras: tuple[Camera, ...], *, contra
         replace(new, free=old.free) for new, old in zip(growth.estimate.cameras, cameras, strict=True)
     )
     estimate = replace(growth.estimate, cameras=restored)
-    remarks: tuple[str, ...] = ()
-    if start.twofold and pair is not None:
-        remarks = (
-            f"the common points of {pair[0]} and {pair[1]} lie in a plane, and two orientations fit them "
-            "alike: which one is true is not decided; points off the plane or a third photograph decide",
-        )
+    twofold = start.twofold and pair is not None
+    remarks = (remark("plane_ambiguous", photographs=pair),) if twofold else ()
     return Orientation(
         estimate, failures, lost, pair, start.kind, fits, rms, growth.tolerance_px, remarks=remarks
     )

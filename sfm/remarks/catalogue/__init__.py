@@ -8,19 +8,28 @@ from __future__ import annotations
 from collections.abc import Mapping
 from types import MappingProxyType
 
-from sfm.remarks.catalogue import hypotheses
+from sfm.remarks.catalogue import (
+    adjustment,
+    cameras,
+    datum,
+    hypotheses,
+    other_programs,
+    photographs,
+    points,
+    refining,
+)
 from sfm.remarks.kind import Kind
-from sfm.remarks.remark import Remark, Severity
 
-SUBJECTS: Mapping[str, tuple[Kind, ...]] = MappingProxyType({"Causes and assumptions": hypotheses.ROWS})
+SUBJECTS: Mapping[str, tuple[Kind, ...]] = MappingProxyType(
+    {
+        "The adjustment": adjustment.ROWS,
+        "Causes and assumptions": hypotheses.ROWS,
+        "Cameras": cameras.ROWS,
+        "Photographs": photographs.ROWS,
+        "Points and image points": points.ROWS,
+        "Datum, scale and given values": datum.ROWS,
+        "Other programs": other_programs.ROWS,
+        "Refining": refining.ROWS,
+    }
+)
 KINDS: Mapping[str, Kind] = MappingProxyType({row.name: row for rows in SUBJECTS.values() for row in rows})
-
-
-def severity_of(one: Remark) -> Severity:
-    """Return the severity of a remark."""
-    return KINDS[one.kind].severity_of(one)
-
-
-def sentence_of(one: Remark) -> str:
-    """Return the sentence of a remark."""
-    return KINDS[one.kind].sentence_of(one)

@@ -16,7 +16,9 @@ from sfm.adjustment.quality.against_free import (
 )
 from sfm.adjustment.quality.consistency import Consistency, consistency_of
 from sfm.adjustment.quality.held_camera import HeldParameter, held_parameters
+from sfm.remarks.verdict import Verdict, judge
 from sfm.report.findings.bundle_statistics import Statistics, statistics_of
+from sfm.report.findings.camera_remarks import camera_remarks
 from sfm.report.findings.checks import (
     CheckedControl,
     LargeResidual,
@@ -38,8 +40,19 @@ from sfm.report.findings.precision import Precision, precision_of
 from sfm.report.findings.protocol import Protocol, check_coordinates, protocol_of
 from sfm.report.findings.rejected import Rejected, rejected_of
 from sfm.report.findings.solution_rows import PhotographRow, PointRow, photographs_of, points_of
+from sfm.report.findings.survey_remarks import (
+    adjustment_remarks,
+    comparison_remarks,
+    consistency_remarks,
+    headlines_of,
+    other_solution_remarks,
+    photograph_remarks,
+    ray_remarks,
+    residual_remarks,
+    sigma0_remarks,
+)
 from sfm.report.findings.verdicts.evidence import Evidence
-from sfm.report.findings.verdicts.verdict import Verdict, judge
+from sfm.report.findings.verdicts.verdict_of_given import remarks_on_given
 from sfm.result import SurveyResult
 
 
@@ -79,15 +92,28 @@ def findings_of(result: SurveyResult) -> Findings:
     geometry, precision = geometry_of(a), precision_of(a)
     against_free = given_test(a, result.free_network)
     evidence = Evidence(
-        *(result, sigma0, longest, statistics, given, check, size, consistency, held),
+        *(result, statistics, given, check, size),
         against_free,
         scale_difference(a, result.free_network),
         check_coordinates(result),
         control_apart(a, result.free_network),
     )
+    remarks = (
+        *adjustment_remarks(a),
+        *photograph_remarks(result),
+        *result.remarks,
+        *other_solution_remarks(result),
+        *sigma0_remarks(result, sigma0, statistics),
+        *residual_remarks(result, longest, statistics),
+        *ray_remarks(a),
+        *consistency_remarks(result, consistency),
+        *camera_remarks(result, held),
+        *remarks_on_given(evidence),
+        *comparison_remarks(result),
+    )
     return Findings(
         result=result,
-        verdict=judge(evidence),
+        verdict=judge(remarks, headlines_of(result)),
         sigma0=sigma0,
         counts=count_observations(a),
         longest=longest,

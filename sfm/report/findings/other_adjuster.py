@@ -61,19 +61,6 @@ def comparison_of(result: SurveyResult) -> ComparisonFindings | None:
     )
 
 
-def words_of_better_fit(both: AdjusterComparison | None) -> str:
-    """Say that the camera of the comparison fits better, and what to free; empty where it does not."""
-    found = None if both is None else both.better
-    if both is None or found is None:
-        return ""
-    with_them = "with it" if len(found.free) == 1 else "with them"
-    return (
-        f"Free {', '.join(found.free)}: {with_them} the camera of the comparison with "
-        f"{program_name(both.backend)} fits {found.times:.3g} times better ({found.rms_px:.4f} px RMS, "
-        f"with the survey's own camera {found.own_rms_px:.4f} px)."
-    )
-
-
 def _other_minimum(both: AdjusterComparison) -> str:
     """Return in words which of two minima is the lower one."""
     ours, theirs = both.comparison.cost

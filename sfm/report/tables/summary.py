@@ -60,7 +60,7 @@ def _figures(findings: Findings) -> dict[str, Any]:
         "verdict": {
             "level": verdict.level,
             "headline": verdict.headline,
-            "remarks": list(verdict.remarks),
+            "remarks": [one.as_dict() for one in verdict.remarks],
         },
         "converged": adjustment.converged,
         "iterations": adjustment.iterations,
@@ -130,7 +130,6 @@ def _figures(findings: Findings) -> dict[str, Any]:
         "no_circles": list(result.no_circles),
         "comparison": summary_of_comparison(findings),
         "baseline": summary_of_baseline(result),
-        "warnings": list(result.warnings),
         "seconds": {time.stage: round(time.seconds, 3) for time in result.seconds},
     }
 

@@ -13,6 +13,7 @@ from sfm.adjustment.result import Adjustment
 from sfm.conventions import BoolArray, FloatArray
 from sfm.errors import GeometryError
 from sfm.network import Estimate, Network, ObjectPoints, ScaleBars
+from sfm.remarks.remark import Remark, remark
 from sfm.result import ControlCheck, TakenOut
 from sfm.similarity import Similarity, fit_similarity
 from sfm.survey.inputs.survey import Survey
@@ -139,7 +140,7 @@ class Contradiction:
 
     freed: Network | None  # without the one to blame; None where it cannot be told
     protected: BoolArray  # points whose rays the test would sacrifice: all of control and bars, (n,)
-    line: str  # in words
+    found: Remark
     taken_out: TakenOut | None = None  # the one to blame
 
 
@@ -194,12 +195,16 @@ def find_contradiction(
             "kept, and none of their image points was tested"
         )
         known = {part.points[j] for j in np.flatnonzero(carriers)}
-        return Contradiction(None, np.array([name in known for name in network.points]), line)
+        return Contradiction(
+            None,
+            np.array([name in known for name in network.points]),
+            remark("given_remarkable", line=line),
+        )
     blamed = suspects[order[0]]
     return Contradiction(
         blamed.without(network),
         np.zeros(len(network.points), dtype=bool),
-        blamed.line(best.estimate.points, unit),
+        remark("given_remarkable", line=blamed.line(best.estimate.points, unit)),
         TakenOut(blamed.name, blamed.relative(best.estimate.points), resolved=True),
     )
 
@@ -293,17 +298,15 @@ def lost_share(adjustment: Adjustment) -> FloatArray:
     return np.asarray(lost / np.maximum(np.bincount(seen.point, minlength=n), 1))
 
 
-def datum_warnings(survey: Survey, network: Network) -> tuple[str, ...]:
-    """Return a line for control and scale bars that were not measured, and for a missing scale."""
-    lines, known = [], set(network.points)
+def datum_remarks(survey: Survey, network: Network) -> tuple[Remark, ...]:
+    """Return remarks on control and scale bars that were not measured, and on a missing scale."""
+    remarks, known = [], set(network.points)
     control = [name for name in survey.control.names if name not in known] if survey.control else []
     if control:
-        lines.append(f"control not in the result: {', '.join(control)}")
+        remarks.append(remark("control_missing", points=control))
     bars = [f"{bar.start} - {bar.end}" for bar in survey.scale_bars if not {bar.start, bar.end} <= known]
     if bars:
-        lines.append(f"scale bars with an end that is not in the result: {', '.join(bars)}")
+        remarks.append(remark("scale_bars_missing", bars=bars))
     if survey.datum.kind != "control" and not len(network.scale_bars) and len(network.control) < 2:
-        lines.append(
-            f"scale is undefined: lengths are not in {survey.unit} until a scale bar or control is measured"
-        )
-    return tuple(lines)
+        remarks.append(remark("scale_undefined", unit=survey.unit))
+    return tuple(remarks)

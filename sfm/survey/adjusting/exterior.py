@@ -13,6 +13,7 @@ import numpy as np
 from sfm.conventions import FloatArray, IntArray, rotation_from_angles
 from sfm.errors import GeometryError
 from sfm.network import Estimate, ExteriorObservations, Network
+from sfm.remarks.remark import Remark, remark
 from sfm.similarity import Similarity, fit_similarity
 from sfm.survey.adjusting.datum_definition import object_scale
 from sfm.survey.inputs.exterior_table import ObservedExterior
@@ -30,7 +31,7 @@ class Placed:
 
     network: Network
     estimate: Estimate  # start values in the frame of the datum
-    warnings: tuple[str, ...] = ()  # one line each
+    remarks: tuple[Remark, ...] = ()
 
 
 def add_exterior(network: Network, estimate: Estimate, table: ObservedExterior | None, datum: str) -> Placed:
@@ -43,7 +44,7 @@ def add_exterior(network: Network, estimate: Estimate, table: ObservedExterior |
         datum: kind of the survey's datum.
 
     Returns:
-        All as it was, with a warning, where the datum is not `control`.
+        All as it was, with a remark, where the datum is not `control`.
 
     Raises:
         GeometryError: they and the control cannot place the network.
@@ -51,11 +52,7 @@ def add_exterior(network: Network, estimate: Estimate, table: ObservedExterior |
     if table is None:
         return Placed(network, estimate)
     if datum != "control":
-        line = (
-            f"[exterior]: observed exterior orientation takes no part in datum '{datum}', as "
-            "control does not; datum kind 'control' uses it"
-        )
-        return Placed(network, estimate, (line,))
+        return Placed(network, estimate, (remark("exterior_unused", datum=datum),))
     index = {name: i for i, name in enumerate(network.images)}
     rows = np.array([k for k, name in enumerate(table.names) if name in index], dtype=np.int64)
     image = np.array([index[table.names[k]] for k in rows], dtype=np.int64)

@@ -23,6 +23,7 @@ from sfm.distortion.models import MODELS
 from sfm.errors import GeometryError
 from sfm.network import Estimate, Network
 from sfm.reduced_network import reduce_network, supported
+from sfm.remarks.remark import Remark, remark
 from sfm.survey.inputs.settings import CameraSettings
 from sfm.survey.inputs.survey import Survey
 
@@ -43,7 +44,7 @@ class FreeParameters:
 
     cameras: tuple[CameraSettings, ...]  # all of which say what is free
     estimate: Estimate  # with the same freed in its cameras
-    notes: tuple[str, ...]  # a line for each camera that the survey says nothing about
+    remarks: tuple[Remark, ...]  # on each camera that the survey says nothing about
 
 
 def choose_free_parameters(
@@ -81,8 +82,8 @@ def choose_free_parameters(
         one if chosen is None else one.model_copy(update={"free": _in_order(one, chosen)})
         for one, chosen in zip(survey.cameras, names, strict=True)
     )
-    notes = tuple(_note(cameras[a], int(images[network.camera == a].sum())) for a in silent)
-    return FreeParameters(cameras, _with_free(estimate, names), notes)
+    remarks = tuple(_remark(cameras[a], int(images[network.camera == a].sum())) for a in silent)
+    return FreeParameters(cameras, _with_free(estimate, names), remarks)
 
 
 def _determined(part: Network, start: Estimate, names: Chosen, datum: str, *, extend: bool) -> Chosen:
@@ -176,15 +177,10 @@ def _in_order(settings: CameraSettings, chosen: set[str]) -> tuple[str, ...]:
     return tuple(name for name in MODELS[settings.model].names if name in chosen)
 
 
-def _note(settings: CameraSettings, photographs: int) -> str:
-    """Say what was chosen, and what to write for another choice."""
+def _remark(settings: CameraSettings, photographs: int) -> Remark:
+    """Return the remark on what was chosen."""
     if settings.free:
-        return (
-            f"Camera {settings.name}: {', '.join(settings.free)} were adjusted, as its {photographs} "
-            "photographs determine them and the survey does not say what is free; free = [] holds them all."
+        return remark(
+            "parameters_freed", camera=settings.name, parameters=settings.free, photographs=photographs
         )
-    return (
-        f"Camera {settings.name}: its interior orientation was held, since its {photographs} photographs do "
-        "not determine it: state a calibration in [camera.fixed], or add photographs, some turned by 90 "
-        "degrees and from other distances."
-    )
+    return remark("interior_held", camera=settings.name, photographs=photographs)

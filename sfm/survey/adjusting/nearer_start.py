@@ -23,6 +23,7 @@ from sfm.camera import Camera
 from sfm.depth_reversal import reverse_depth
 from sfm.errors import GeometryError
 from sfm.network import Estimate, Network
+from sfm.remarks.remark import Remark, remark
 
 DAMPED_ITERATIONS, UNDAMPED_ITERATIONS = 50, 300  # with the cameras held, where a step is cheap
 NEAR = 1e-3  # |A dx| / |v| that is near enough for a start
@@ -47,21 +48,17 @@ def nearer_start(network: Network, start: Estimate, ended: Estimate, datum: Datu
     return replace(best.estimate, cameras=start.cameras)
 
 
-def words_of_held(before: tuple[Camera, ...], after: tuple[Camera, ...]) -> tuple[str, ...]:
-    """Return which parameters are no longer free, a line for each camera or group that has them."""
-    lines = []
+def held_to_converge(before: tuple[Camera, ...], after: tuple[Camera, ...]) -> tuple[Remark, ...]:
+    """Return a remark for each camera of which parameters were held that were free before."""
+    names: dict[str, tuple[str, ...]] = {}
     for one, held in zip(before, after, strict=True):
         lost = np.flatnonzero(one.free & ~held.free)
-        if not len(lost):
-            continue
-        values = ", ".join(f"{one.names[s]} at {one.parameters[s]:.6g} {one.units[s]}" for s in lost)
-        which = "them" if len(lost) > 1 else "it"
-        lines.append(
-            f"camera {one.group_of(int(lost[0])) or one.name} was held in {values}: with {which} free the "
-            f"adjustment does not converge, the photographs cannot tell {which} from their own position and "
-            f"rotation; give calibrated values and leave {which} out of free"
-        )
-    return tuple(dict.fromkeys(lines))
+        if len(lost):
+            names[one.group_of(int(lost[0])) or one.name] = tuple(one.names[s] for s in lost)
+    return tuple(
+        remark("held_to_converge", camera=camera, parameters=parameters)
+        for camera, parameters in names.items()
+    )
 
 
 def _candidates(start: Estimate, ended: Estimate, datum: Datum) -> Iterator[Estimate]:

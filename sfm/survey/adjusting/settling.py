@@ -18,8 +18,9 @@ from sfm.errors import GeometryError
 from sfm.network import Estimate, Network
 from sfm.orientation.ray_angles import ray_angles
 from sfm.reduced_network import reduce_network, supported
+from sfm.remarks.remark import Remark, remark
 from sfm.survey.adjusting.datum_definition import Contradiction, find_contradiction
-from sfm.survey.adjusting.nearer_start import nearer_start, words_of_held
+from sfm.survey.adjusting.nearer_start import held_to_converge, nearer_start
 from sfm.survey.diagnosis.left_out import datum_carriers
 from sfm.survey.diagnosis.observation_count import refuse_too_few_observations
 from sfm.survey.diagnosis.own_camera import Treated, treat_lost
@@ -63,13 +64,13 @@ class Settled:
     iterations: int  # of all adjustments on the way
     rays: IntArray  # accepted rays of each point, of those that left when they left, (n,)
     start_sigma0: float  # at the start values
-    held: tuple[str, ...]  # parameters that were held because it did not converge with them, a line each
+    held: tuple[Remark, ...]  # parameters that were held because it did not converge with them
 
 
 def settle(task: Task, estimate: Estimate) -> Settled:
     """Adjust until the points and photographs that are left stay, or control or a bar is contradicted."""
     network, iterations, start_sigma0 = task.network, 0, np.nan
-    held: tuple[str, ...] = ()
+    held: tuple[Remark, ...] = ()
     accepted = np.ones(len(network.image_points), dtype=bool)
     rays = network.rays()
     images, points = determined(network, estimate, accepted, task.needed, task.least)
@@ -167,7 +168,7 @@ def contradiction_in(task: Task, adjustment: Adjustment) -> Contradiction | None
 
 def _converged(
     task: Task, part: Network, start: Estimate, ended: Adjustment
-) -> tuple[Adjustment, tuple[str, ...]]:
+) -> tuple[Adjustment, tuple[Remark, ...]]:
     """Return the adjustment from nearer start values, and what had to be held for it to converge.
 
     As it ended, where it does not converge from there either.
@@ -185,7 +186,7 @@ def _converged(
             max_iterations=MANY_ITERATIONS,
         )
         if found.converged:
-            return found, words_of_held(nearer.cameras, cameras)
+            return found, held_to_converge(nearer.cameras, cameras)
     return ended, ()
 
 
@@ -250,8 +251,8 @@ def _weighed(adjust_part: Callable[[FloatArray], Adjustment], count: int) -> Adj
     group = np.zeros(count, dtype=np.int64)
     final, _, settled = estimate_components(adjust_part, group, (IMAGE_POINTS,))
     if not settled:
-        line = "the weights of the image points did not converge: each of them rejects other image points"
-        final = replace(final, remarks=(*final.remarks, line))
+        unsettled = remark("weights_not_converged", groups="the image points")
+        final = replace(final, remarks=(*final.remarks, unsettled))
     return final
 
 

@@ -12,11 +12,11 @@ from sfm.adjustment.quality.other_solutions import OtherSolution, other_solution
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.conventions import BoolArray, IntArray
-from sfm.display import listed
 from sfm.errors import GeometryError
 from sfm.network import Estimate, Network
 from sfm.orientation.incremental.starting_pair import pair_solutions
 from sfm.reduced_network import reduce_network
+from sfm.remarks.remark import Remark, remark
 from sfm.result import (
     ControlCheck,
     Eccentricity,
@@ -27,7 +27,7 @@ from sfm.result import (
 )
 from sfm.survey.adjusting.datum_definition import (
     MIN_CONTROL,
-    datum_warnings,
+    datum_remarks,
     place_on_control,
     place_on_frame,
     refuse_other_units,
@@ -48,7 +48,7 @@ from sfm.survey.adjusting.settling import (
     without_contradiction,
 )
 from sfm.survey.diagnosis.explanations import explain_residuals
-from sfm.survey.diagnosis.left_out import left_out_points, unused_image_points, words_of_left_out
+from sfm.survey.diagnosis.left_out import left_out_points, remarks_on_left_out, unused_image_points
 from sfm.survey.diagnosis.own_camera import Treated
 from sfm.survey.diagnosis.principal_distance import contradicted, far_principal_distances
 from sfm.survey.diagnosis.scale_check import check_scales
@@ -74,7 +74,7 @@ class Correspondences:
     naming: Naming | None = None  # of targets; None without
     eccentricity: Eccentricity | None = None  # what was corrected; None where nothing was
     no_circles: tuple[str, ...] = ()  # uncoded points left out: their outlines are not images of one circle
-    warnings: tuple[str, ...] = ()  # one line each
+    remarks: tuple[Remark, ...] = ()
     point_failures: tuple[tuple[str, str], ...] = ()  # points without approximate values, with the reason
     given: bool = False  # whether the survey's own approximate values were what the orientation started from
     left_out: tuple[tuple[str, str], ...] = ()  # photographs of another object, with the reason
@@ -89,15 +89,13 @@ class Solution:
     adjustment: Adjustment
     control_check: ControlCheck | None  # None without control or where the datum is control
     dropped_images: tuple[tuple[str, str], ...]  # photographs that lost their points, with the reason
-    warnings: tuple[str, ...]  # one line each
+    remarks: tuple[Remark, ...]
     left_out: tuple[LeftOutPoint, ...]  # measured points that are not in it
     unused_image_points: int  # of points and photographs that are not in it
     taken_out: tuple[TakenOut, ...]  # control and scale bars that do not fit
     free_network: FreeNetwork | None  # of the image points alone; None where nothing else took part
     others: tuple[OtherSolution, ...]  # that the image points allow as well
-    notes: tuple[str, ...]  # what was chosen where the survey says nothing, one line each
     explanations: tuple[Explanation, ...]  # of large residuals, tried on the finished network
-    undecided: tuple[str, ...] = ()  # what the photographs contradict and do not determine, one line each
 
 
 def refine(network: Network, estimate: Estimate) -> Estimate:
@@ -135,21 +133,23 @@ def solve_survey(survey: Survey, matched: Correspondences) -> Solution:
     if len(whole.scale_bars) and not len(final.network.scale_bars) and start.task.datum.kind == "control":
         # every bar is against the control: nothing says which of the two is right
         taken_out = tuple(replace(one, resolved=False) for one in taken_out)
-    lines = (*start.warnings, *solved.warnings)
     explanations = explain_residuals(final)
     return Solution(
         final,
         solved.check,
         _dropped(start, solved),
-        lines + _warnings(start.task.survey, told, len(whole.points), final),
+        (
+            *start.remarks,
+            *solved.remarks,
+            *_remarks(start.task.survey, told, len(whole.points), final),
+            *contradicted(solved.c_held, explanations),
+        ),
         left_out,
         unused_image_points(whole, settled.images, np.isin(whole.points, final.network.points)),
         taken_out,
         free_network_of(final),
         solved.others,
-        start.notes,
         explanations,
-        contradicted(solved.c_held, explanations),
     )
 
 
@@ -164,10 +164,9 @@ class _Prepared:
     known: BoolArray  # points with approximate values, (n,)
     oriented: BoolArray  # photographs with an exterior orientation, (m,)
     needed: IntArray  # rays that each point needs, (n,)
-    contradictions: tuple[str, ...]  # of bars and control before any adjustment, one line each
+    contradictions: tuple[Remark, ...]  # of bars and control before any adjustment
     taken_out: tuple[TakenOut, ...]
-    warnings: tuple[str, ...]
-    notes: tuple[str, ...]  # which parameters of the cameras were freed
+    remarks: tuple[Remark, ...]  # on observed exterior orientation, and which parameters were freed
 
 
 @dataclass(frozen=True)
@@ -180,7 +179,7 @@ class _Solved:
     others: tuple[OtherSolution, ...]
     treated: Treated | None
     taken_out: tuple[TakenOut, ...]
-    warnings: tuple[str, ...]
+    remarks: tuple[Remark, ...]
     c_held: tuple[str, ...]  # cameras whose c was to be free and had to be held
 
 
@@ -217,10 +216,9 @@ def _prepared(survey: Survey, matched: Correspondences) -> _Prepared:
         known,
         oriented,
         needed,
-        tuple(scales.lines),
+        scales.remarks,
         tuple(scales.taken_out),
-        placed.warnings,
-        chosen.notes,
+        (*placed.remarks, *chosen.remarks),
     )
 
 
@@ -228,7 +226,7 @@ def _solved(start: _Prepared) -> _Solved:
     """Adjust until nothing contradicts the image points and no other solution of them is better."""
     task, estimate = start.task, start.estimate
     contradictions, taken_out = list(start.contradictions), list(start.taken_out)
-    better: tuple[str, ...] = ()
+    better: tuple[Remark, ...] = ()
     asked = {one.name for one in start.estimate.cameras if one.free[0]}
     first: tuple[Settled, Adjustment, ControlCheck | None, tuple[OtherSolution, ...]] | None = None
     settled = settle(task, estimate)
@@ -247,7 +245,7 @@ def _solved(start: _Prepared) -> _Solved:
             final, check = _placed(start, task, settled)
             found = contradiction_in(task, final)
         if found is not None:
-            contradictions.append(found.line)
+            contradictions.append(found.found)
             taken_out += [] if found.taken_out is None else [found.taken_out]
             task = without_contradiction(task, found, settled.accepted)
             continue
@@ -262,9 +260,9 @@ def _solved(start: _Prepared) -> _Solved:
         if first is not None or not others or not others[0].converges:
             break
         first = settled, final, check, others
-        better = (_words_of_better(final, others[0]),)
+        better = (_better_taken(final, others[0]),)
         estimate = merge_estimate(estimate, others[0].estimate, settled.images, settled.points)
-    own = () if treated is None else treated.lines
+    own = () if treated is None else treated.remarks
     held = first_held if settled.held == () else settled.held
     return _Solved(
         replace(final, iterations=iterations + final.iterations, start_sigma0=start_sigma0),
@@ -314,12 +312,15 @@ def _dropped(start: _Prepared, solved: _Solved) -> tuple[tuple[str, str], ...]:
     )
 
 
-def _words_of_better(final: Adjustment, other: OtherSolution) -> str:
-    """Say that the network was adjusted anew from a solution of smaller v'Pv than that found first."""
+def _better_taken(final: Adjustment, other: OtherSolution) -> Remark:
+    """Return the remark that the network was adjusted anew from a solution of smaller v'Pv."""
     first = final.estimate.cameras[[one.name for one in final.estimate.cameras].index(other.camera)]
-    return (
-        f"two solutions: c of camera {other.camera} was {first.parameters[0]:.5g} {other.unit} at first; "
-        f"from {other.c:.5g} {other.unit} v'Pv is {other.vPv:.3g} times as large, which was taken"
+    return remark(
+        "better_solution_taken",
+        camera=other.camera,
+        first=(first.parameters[0], other.unit),
+        better=(other.c, other.unit),
+        vPv=other.vPv,
     )
 
 
@@ -329,8 +330,8 @@ def _among(left_out: tuple[LeftOutPoint, ...], whole: Network, known: BoolArray)
     return tuple(one for one in left_out if one.point in names)
 
 
-def _pixels_unlike_squares(survey: Survey, estimate: Estimate) -> tuple[str, ...]:
-    """Return what is told of pixels by nominal sensor sizes, of the first camera of each of the survey's."""
+def _pixels_unlike_squares(survey: Survey, estimate: Estimate) -> tuple[Remark, ...]:
+    """Return the remarks on pixels by nominal sensor sizes, of the first camera of each of the survey's."""
     first = {one.name: camera for one in survey.cameras for camera in reversed(estimate.cameras)
              if camera.name == one.name or camera.name.startswith(f"{one.name} ")}  # fmt: skip
     settings = [one for one in survey.cameras if one.name in first]
@@ -338,20 +339,16 @@ def _pixels_unlike_squares(survey: Survey, estimate: Estimate) -> tuple[str, ...
     return unlike_squares(settings, pixels, [one.adjusted for one in settings])
 
 
-def _warnings(
+def _remarks(
     survey: Survey, left_out: tuple[LeftOutPoint, ...], measured: int, adjustment: Adjustment
-) -> tuple[str, ...]:
+) -> tuple[Remark, ...]:
     """Return what a person must know beyond the numbers."""
-    lines = list(adjustment.remarks)
-    if not adjustment.converged:
-        lines.append(f"the adjustment did NOT converge within {adjustment.iterations} iterations")
-    if adjustment.undetermined:
-        lines.append(f"not determined by the observations: {', '.join(adjustment.undetermined)}")
-    if left_out:
-        lines.append(words_of_left_out(left_out, measured))
     absent = [name for name in survey.datum.points if name not in set(adjustment.network.points)]
-    if absent:
-        lines.append(f"datum points that are not in the network: {listed(absent, most=10)}")
-    lines += far_principal_distances(survey, adjustment.estimate)
-    lines += _pixels_unlike_squares(survey, adjustment.estimate)
-    return (*lines, *datum_warnings(survey, adjustment.network))
+    return (
+        *adjustment.remarks,
+        *remarks_on_left_out(left_out, measured),
+        *([remark("datum_points_missing", points=absent)] if absent else []),
+        *far_principal_distances(survey, adjustment.estimate),
+        *_pixels_unlike_squares(survey, adjustment.estimate),
+        *datum_remarks(survey, adjustment.network),
+    )

@@ -10,7 +10,8 @@ from sfm.conventions import AnyArray
 from sfm.display import listed
 from sfm.orientation.incremental.sequence import MIN_POINTS
 from sfm.photographs.reading import read_photograph
-from sfm.survey.diagnosis.missing_plates import words_of_missing_plates
+from sfm.remarks.remark import Remark, remark
+from sfm.survey.diagnosis.missing_plates import missing_plates
 from sfm.survey.inputs.measurements import MeasuredPhotographs
 from sfm.survey.inputs.survey import Survey
 from sfm.targets.codes.families import Family
@@ -29,8 +30,8 @@ POLARITIES = ("dark", "bright")
 
 def words_of_codes(survey: Survey, photographs: MeasuredPhotographs) -> str:
     """Say how many targets and codes were found where more codes were needed, and what decides on that."""
-    if plates := words_of_missing_plates(survey.family, photographs):
-        return plates
+    if plates := missing_plates(survey.family, photographs):
+        return _in_error(*plates)
     targets = [len(found) for found in photographs.targets]
     codes = [int((found.code >= 0).sum()) for found in photographs.targets]
     with_codes = sum(count > 0 for count in codes)
@@ -45,36 +46,46 @@ def words_of_codes(survey: Survey, photographs: MeasuredPhotographs) -> str:
     )
 
 
-def words_of_small_codes(targets: Sequence[Targets]) -> str:
-    """Say that codes are too small to read, with the size that would do; empty where enough are read.
+def small_codes(targets: Sequence[Targets]) -> tuple[Remark, ...]:
+    """Return the remark that codes are too small to read, with the size that would do.
+
+    None where enough are read.
 
     Args:
         targets: of each photograph.
     """
     every = [found for found in targets if len(found)]
     if not every:
-        return ""
+        return ()
     unreadable = np.concatenate([(found.flag & Flag.CODE_UNREADABLE) != 0 for found in every])
     diameter = 2 * np.concatenate([found.semi_axes[:, 1] for found in every])
     blur = np.concatenate([found.blur for found in every])
     coded = sum(int((found.code >= 0).sum()) for found in every)
     small = unreadable & (diameter < np.maximum(MIN_DOT_PX, MIN_DOT_SIGMAS * blur))
     if small.sum() < max(MIN_POINTS, coded):
-        return ""
+        return ()
     now, soft = float(np.median(diameter[small])), float(np.median(blur[small]))
     needed = max(MIN_DOT_PX, MIN_DOT_SIGMAS * soft)
     return (
-        f"{small.sum()} targets have something like a code that is too small to read: their dots are "
-        f"{now:.1f} px across (median of the shorter axes) and their edges {soft:.1f} px soft, "
-        f"{needed:.0f} px are needed: print them {needed / now:.1f} times as large, go nearer or focus better"
+        remark(
+            "codes_too_small",
+            targets=int(small.sum()),
+            dot=(now, "px"),
+            blur=(soft, "px"),
+            needed=(needed, "px"),
+        ),
     )
+
+
+def _in_error(one: Remark) -> str:
+    """Return a remark as a part of the message of an error."""
+    return f"{one.text.rstrip('.')}: {one.row.remedy.rstrip('.')}"
 
 
 def _words_of_size(survey: Survey, photographs: MeasuredPhotographs) -> str:
     """Say that codes are too small to read, or that candidates are below the least diameter, if so."""
-    words = words_of_small_codes(photographs.targets)
-    if words:
-        return f"; {words}"
+    if small := small_codes(photographs.targets):
+        return f"; {_in_error(*small)}"
     count = sum(int((found.rejected_flag == Flag.TOO_SMALL).sum()) for found in photographs.targets)
     if count < MIN_POINTS * len(photographs.targets):
         return ""

@@ -10,7 +10,8 @@ from __future__ import annotations
 from collections import Counter
 from dataclasses import dataclass
 
-from sfm.display import MAX_LISTED, listed
+from sfm.display import listed
+from sfm.remarks.remark import Remark, remark
 from sfm.survey.inputs.measurements import MeasuredPhotographs, Naming
 from sfm.survey.target_network import UNNAMED
 from sfm.targets.codes.tags import CORNERS
@@ -63,31 +64,30 @@ def find_contested_codes(photographs: MeasuredPhotographs, naming: Naming) -> Co
     return ContestedCodes(contested, left_out, main)
 
 
-def words_of_contested(
+def remarks_on_contested(
     found: ContestedCodes, photographs: MeasuredPhotographs, naming: Naming
-) -> tuple[str, ...]:
-    """Say where each contested code was read, one line each for the first of them."""
-    lines = []
+) -> tuple[Remark, ...]:
+    """Return where each contested code was read."""
+    remarks = []
     for code, places in sorted(found.places.items()):
-        own = found.main.get(code, UNNAMED)
-        away = sorted(image for image, at in places.items() if own not in at or len(at) > 1)
-        points = sorted({naming.names[k] for i in away for k in places[i] if k not in (own, UNNAMED)})
-        named = listed(photographs.names[i] for i in away)
-        rest = len(places) - len(away)
-        where = (
-            f"{named} show{'s' if len(away) == 1 else ''} it elsewhere than {rest} other photographs"
-            + (f", at {listed(points)}" if points else "")
-            if own != UNNAMED
-            else f"its rays from {named} do not meet"
+        number = str(_number(code, naming))
+        main = found.main.get(code, UNNAMED)
+        away = sorted(image for image, at in places.items() if main not in at or len(at) > 1)
+        if main == UNNAMED or not away:
+            shown = [photographs.names[i] for i in away or sorted(places)]
+            remarks.append(remark("code_rays_apart", code=number, photographs=shown))
+            continue
+        points = sorted({naming.names[k] for i in away for k in places[i] if k not in (main, UNNAMED)})
+        remarks.append(
+            remark(
+                "code_at_several_places",
+                code=number,
+                photographs=[photographs.names[i] for i in away],
+                others=len(places) - len(away),
+                points=points or None,
+            )
         )
-        lines.append(
-            f"code {_number(code, naming)} is read at several places, {where}: a target that was moved, two "
-            "of one number, or a misread code"
-        )
-    numbers = sorted({_number(code, naming) for code in found.places})
-    if len(lines) > MAX_LISTED:
-        lines[MAX_LISTED:] = [f"so are {len(numbers) - MAX_LISTED} more codes"]
-    return tuple(lines)
+    return tuple(remarks)
 
 
 def _places(

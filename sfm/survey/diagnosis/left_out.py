@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from sfm.conventions import BoolArray, IntArray
-from sfm.display import listed
 from sfm.network import Network
+from sfm.remarks.remark import Remark, remark
 from sfm.result import LeftOutPoint
 
 
@@ -43,7 +43,7 @@ def left_out_points(
             reason = f"none of its {rays[j]} rays was accepted: they do not meet, or are almost parallel"
         else:
             reason = f"{accepted_rays[j]} of its {rays[j]} rays were accepted, {needed[j]} are needed"
-        out.append(LeftOutPoint(name, int(rays[j]), reason))
+        out.append(LeftOutPoint(name, int(rays[j]), reason, few_rays=bool(rays[j] < needed[j])))
     return tuple(out)
 
 
@@ -53,14 +53,13 @@ def unused_image_points(whole: Network, images: BoolArray, points: BoolArray) ->
     return int((~(images[seen.image] & points[seen.point])).sum())
 
 
-def words_of_left_out(left_out: tuple[LeftOutPoint, ...], measured: int) -> str:
-    """Return in one line which of so many measured points are not in the result, and why."""
-    named = listed((f"point {one.point}: {one.reason}" for one in left_out), separator="; ")
-    rows = sum(one.image_points for one in left_out)
-    return (
-        f"{len(left_out)} of {measured} measured points are not in the result, with {rows} image points: "
-        f"{named}"
-    )
+def remarks_on_left_out(left_out: tuple[LeftOutPoint, ...], measured: int) -> tuple[Remark, ...]:
+    """Return which of so many measured points are not in the result: with few rays, or rejected."""
+    groups = {
+        "points_contradicted": [one.point for one in left_out if not one.few_rays],
+        "points_with_few_rays": [one.point for one in left_out if one.few_rays],
+    }
+    return tuple(remark(kind, points=names, measured=measured) for kind, names in groups.items() if names)
 
 
 def datum_carriers(angles_deg: np.ndarray, least_deg: float) -> BoolArray | None:

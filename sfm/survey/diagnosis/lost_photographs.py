@@ -10,14 +10,13 @@ from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components
 
 from sfm.conventions import BoolArray, IntArray
-from sfm.display import listed
 from sfm.errors import GeometryError
 from sfm.network import Estimate, Network
 from sfm.orientation.incremental.sequence import MIN_POINTS, Orientation
+from sfm.remarks.remark import Remark, remark
 
 MANY = 0.1  # part of the photographs whose loss, though they are connected, has one cause for all
 C_FACTORS = (1.4, 0.7, 2.0, 0.5)  # on the given principal distance: a crop factor, an extender, a zoom
-MAX_GROUPS = 4  # told one by one
 
 
 @dataclass(frozen=True)
@@ -49,12 +48,9 @@ def tell_lost_photographs(network: Network, found: Orientation) -> Orientation:
                 f"photographs, at least {MIN_POINTS} are needed"
             )
     groups.sort(key=lambda one: -len(one.images))
-    lines = [_words(network, oriented, group) for group in groups[:MAX_GROUPS]]
-    more = sum(len(one.images) for one in groups[MAX_GROUPS:])
-    if more:
-        lines.append(f"{more} more photographs in {len(groups) - MAX_GROUPS} groups are not connected either")
+    remarks = (_not_connected(network, oriented, group) for group in groups)
     failures = tuple((image, reasons[image]) for image, _ in found.failures)
-    return replace(found, failures=failures, warnings=(*found.warnings, *lines))
+    return replace(found, failures=failures, remarks=(*found.remarks, *remarks))
 
 
 def lost_groups(network: Network, estimate: Estimate) -> list[Lost]:
@@ -79,8 +75,8 @@ def lost_groups(network: Network, estimate: Estimate) -> list[Lost]:
 
 def try_other_principal_distances(
     network: Network, estimate: Estimate, found: Orientation | None, orient: Callable[[Estimate], Orientation]
-) -> tuple[Orientation | None, str]:
-    """Return the orientation with another principal distance if that orients more photographs, and a line.
+) -> tuple[Orientation | None, tuple[Remark, ...]]:
+    """Return the orientation with another principal distance if that orients more photographs, and remarks.
 
     Tried where photographs are lost that show enough points of the others.
 
@@ -91,8 +87,8 @@ def try_other_principal_distances(
         orient: returns the orientation from start values.
 
     Returns:
-        The better orientation where the survey adjusts c; else that which was given. The line is empty where
-        no other principal distance is better.
+        The better orientation where the survey adjusts c; else that which was given. No remarks where no
+        other principal distance is better.
     """
     m = len(network.images)
     now = 0 if found is None else int(found.estimate.oriented.sum())
@@ -100,7 +96,7 @@ def try_other_principal_distances(
         len(one.images) for one in lost_groups(network, found.estimate) if one.connected
     )  # fmt: skip
     if lost <= MANY * m or not len(network.image_points):
-        return found, ""
+        return found, ()
     best, most = None, now + max(1, int(MANY * m))
     for factor in C_FACTORS:
         try:
@@ -113,20 +109,25 @@ def try_other_principal_distances(
         if count == m:
             break
     if best is None:
-        return found, ""
-    lines = []
-    for given, better in zip(estimate.cameras, best.estimate.cameras, strict=True):
-        pixel = float(np.mean(given.pixel_mm))
-        lines.append(f"c = {given.c_px * pixel:.4g} mm of camera {given.name} looks wrong: "
-                     f"from {better.c_px * pixel:.4g} mm")  # fmt: skip
-    line = f"{', '.join(lines)} on {most} of {m} photographs can be oriented, in place of {now}"
-    adjusted = all(camera.free[0] for camera in estimate.cameras)
-    if not adjusted:
-        return found, f"{line}; it is held: correct c_mm, or free c"
+        return found, ()
+    remarks = tuple(
+        remark(
+            "c_looks_wrong",
+            camera=given.name,
+            given=(given.c_px * float(np.mean(given.pixel_mm)), "mm"),
+            better=(better.c_px * float(np.mean(given.pixel_mm)), "mm"),
+            oriented=most,
+            total=m,
+            before=now,
+        )
+        for given, better in zip(estimate.cameras, best.estimate.cameras, strict=True)
+    )
+    if not all(camera.free[0] for camera in estimate.cameras):
+        return found, remarks
     restored = tuple(
         replace(new, free=old.free) for new, old in zip(best.estimate.cameras, estimate.cameras, strict=True)
     )
-    return replace(best, estimate=replace(best.estimate, cameras=restored)), line
+    return replace(best, estimate=replace(best.estimate, cameras=restored)), remarks
 
 
 def _with_c(estimate: Estimate, factor: float) -> Estimate:
@@ -141,29 +142,25 @@ def _with_c(estimate: Estimate, factor: float) -> Estimate:
     return replace(estimate, cameras=tuple(cameras))
 
 
-def _words(network: Network, oriented: BoolArray, group: Lost) -> str:
-    """Say which photographs are not connected with the others, and by which points they could be."""
-    n = len(group.images)
-    names = listed(network.images[i] for i in group.images)
-    shared = listed(network.points[j] for j in group.shared)
-    who = "they have" if n > 1 else "it has"
-    common = f"{who} only {shared} in common" if shared else f"{who} no point in common"
-    own = _often_seen(network, group.images)
-    others = _often_seen(network, np.flatnonzero(oriented))
-    between = f"A photograph that shows {MIN_POINTS} of {own} ... and {MIN_POINTS} of {others} ..."
-    return (
-        f"{names}: {n} photograph{'s are' if n > 1 else ' is'} not connected with the {int(oriented.sum())} "
-        f"oriented ones; {common}, {MIN_POINTS} in one photograph are needed. "
-        f"{f'{between} would connect them' if own else 'No point was measured there'}"
+def _not_connected(network: Network, oriented: BoolArray, group: Lost) -> Remark:
+    """Return the remark on photographs that are not connected, with points to connect them."""
+    return remark(
+        "not_connected",
+        photographs=[network.images[i] for i in group.images],
+        oriented=int(oriented.sum()),
+        shared=[network.points[j] for j in group.shared] or None,
+        needed=MIN_POINTS,
+        points=_often_seen(network, group.images) or None,
+        others=_often_seen(network, np.flatnonzero(oriented)) or None,
     )
 
 
-def _often_seen(network: Network, images: IntArray) -> str:
+def _often_seen(network: Network, images: IntArray) -> list[str]:
     """Return the names of the points that photographs show most often."""
     seen = network.image_points
     rays = np.bincount(seen.point[np.isin(seen.image, images)], minlength=len(network.points))
     order = np.argsort(-rays, kind="stable")[: MIN_POINTS + 2]
-    return ", ".join(network.points[j] for j in order if rays[j])
+    return [network.points[j] for j in order if rays[j]]
 
 
 def _points_of(network: Network, images: IntArray | list[int]) -> IntArray:

@@ -20,6 +20,7 @@ from sfm.errors import GeometryError
 from sfm.network import Estimate, ImagePoints, Network, ObjectPoints, rows_of
 from sfm.orientation.incremental.growth import residual_lengths
 from sfm.orientation.resection.ransac import resect_robust
+from sfm.remarks.remark import Remark, remark
 
 LOST = 0.5  # share of the image points of a photograph without which the rest does not speak for it
 EXPLAINED = 0.2  # of them that may still be rejected where a camera of its own explains the photograph
@@ -41,7 +42,7 @@ class Treated:
     network: Network
     estimate: Estimate
     left_out: tuple[tuple[str, str], ...]  # (name of the photograph, reason)
-    lines: tuple[str, ...]  # on those with a camera of their own
+    remarks: tuple[Remark, ...]  # on those with a camera of their own
     own: tuple[str, ...]  # names of these
     without: BoolArray  # photographs that are left out, (m,)
 
@@ -96,7 +97,7 @@ def treat_lost(
         return None
     cameras, owner = list(estimate.cameras), network.camera.copy()
     position, rotation = estimate.position.copy(), estimate.rotation.copy()
-    left, lines, with_own = [], [], []
+    left, remarks, with_own = [], [], []
     out = np.zeros(m, dtype=bool)
     for i in np.flatnonzero(doubtful).tolist():
         rows = np.flatnonzero((seen.image == i) & known)
@@ -123,11 +124,17 @@ def treat_lost(
         with_own.append(name)
         own = [n for n, group in zip(fit.camera.names, fit.camera.shared, strict=True) if not group]
         share = fit.camera.c_px / before.c_px - 1
-        lines.append(
-            f"{name} does not fit camera {before.name}"
-            f"{_words(median[i], int(count[i] - kept[i]), int(count[i]))}: with {', '.join(own)} of its own, "
-            f"c {100 * share:+.2f} %, its residuals are {fit.rms_px:.2g} px and {fit.rejected} are rejected: "
-            "zoomed, focused anew, cropped or resampled"
+        remarks.append(
+            remark(
+                "camera_per_photograph",
+                photograph=name,
+                camera=before.name,
+                rejected=int(count[i] - kept[i]),
+                points=int(count[i]),
+                parameters=own,
+                change=(100 * share, "%"),
+                rms=(fit.rms_px, "px"),
+            )
         )
     if len(cameras) == len(estimate.cameras) and not out.any():
         return None
@@ -138,15 +145,10 @@ def treat_lost(
         replace(network, camera=owner),
         replace(estimate, cameras=tuple(cameras), position=position, rotation=rotation),
         tuple(left),
-        tuple(lines),
+        tuple(remarks),
         tuple(with_own),
         out,
     )
-
-
-def _words(median_px: float, rejected: int, count: int) -> str:
-    residuals = f", its residuals are {median_px:.2g} px in the median" if np.isfinite(median_px) else ""
-    return f"{residuals}, {rejected} of its {count} points are rejected"
 
 
 def _finite_rows(seen: ImagePoints, length: FloatArray, m: int) -> list[IntArray]:

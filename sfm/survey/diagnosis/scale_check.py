@@ -13,6 +13,7 @@ import numpy as np
 
 from sfm.conventions import BoolArray, FloatArray
 from sfm.network import Estimate, Network, ScaleBars
+from sfm.remarks.remark import Remark, remark
 from sfm.result import TakenOut
 
 SAME_SCALE = 0.05  # relative difference that start values may have; what is smaller is left to the tests
@@ -25,7 +26,7 @@ class ScaleCheck:
 
     network: Network
     taken_out: tuple[TakenOut, ...] = ()
-    lines: tuple[str, ...] = ()  # in words
+    remarks: tuple[Remark, ...] = ()
 
 
 def check_scales(network: Network, estimate: Estimate, *, held: bool) -> ScaleCheck:
@@ -70,7 +71,11 @@ def check_scales(network: Network, estimate: Estimate, *, held: bool) -> ScaleCh
         ]
     keep = ~wrong
     left = ScaleBars(bars.start[keep], bars.end[keep], bars.length[keep], bars.sigma[keep])
-    return ScaleCheck(replace(network, scale_bars=left), tuple(out), tuple(lines))
+    return ScaleCheck(
+        replace(network, scale_bars=left),
+        tuple(out),
+        tuple(remark("given_remarkable", line=one) for one in lines),
+    )
 
 
 def _agree(scale: FloatArray, one: float) -> BoolArray:

@@ -10,6 +10,7 @@ import numpy as np
 from sfm.camera import Camera
 from sfm.conventions import IntArray
 from sfm.network import Network
+from sfm.remarks.remark import Remark
 from sfm.result import FailedImage, LeftOutPoint, PhotographTargets
 from sfm.survey.inputs.photograph_list import PhotographList
 from sfm.targets.codes.tags import CORNERS
@@ -77,5 +78,5 @@ class Measurements:
     files: PhotographList | None = None  # None with observations
     photographs: MeasuredPhotographs | None = None  # with all targets, uncoded ones too; None without targets
     naming: Naming | None = None  # of these targets
-    warnings: tuple[str, ...] = ()  # on what was given, one line each
+    remarks: tuple[Remark, ...] = ()  # on what was given and measured
     left_out: tuple[LeftOutPoint, ...] = ()  # image points that contradict one another

@@ -83,7 +83,7 @@ def measurements_from_observations(survey: Survey) -> Measurements:
         every,
         np.full(len(points), MIN_RAYS),
         failed,
-        warnings=merged.lines(images, points),
+        remarks=merged.remarks(images, points),
         left_out=contradicting,
     )
 

@@ -9,9 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
-from sfm.display import listed
 from sfm.errors import PhotographError
 from sfm.photographs.exif import read_metadata
+from sfm.remarks.remark import Remark, remark
 from sfm.result import FailedImage
 from sfm.survey.inputs.photograph_list import PhotographList
 from sfm.survey.inputs.settings import CameraSettings
@@ -31,7 +31,7 @@ class OtherSizes:
     survey: Survey
     files: PhotographList
     left_out: tuple[FailedImage, ...]
-    lines: tuple[str, ...]  # one for each new camera
+    remarks: tuple[Remark, ...]  # one for each new camera
 
 
 def separate_sizes(survey: Survey, files: PhotographList) -> OtherSizes:
@@ -47,7 +47,7 @@ def separate_sizes(survey: Survey, files: PhotographList) -> OtherSizes:
     sizes = [_size(path) for path in files.paths]
     cameras, owner = list(survey.cameras), files.camera.copy()
     left: dict[int, str] = {}
-    lines = []
+    remarks = []
     for number, camera in enumerate(survey.cameras):
         counted: dict[Size, list[int]] = {}
         for k in np.flatnonzero(files.camera == number).tolist():
@@ -72,12 +72,18 @@ def separate_sizes(survey: Survey, files: PhotographList) -> OtherSizes:
             names = [files.names[k] for k in rows]
             cameras.append(_resized(camera, size, main, what, names))
             owner[rows] = len(cameras) - 1
-            lines.append(
-                f"{len(rows)} photographs of camera {camera.name} ({listed(names)}) have "
-                f"{size[0]} x {size[1]} px in place of {main[0]} x {main[1]} px, {what}: they are a camera "
-                f"of their own, {cameras[-1].name}"
+            remarks.append(
+                remark(
+                    "camera_by_size",
+                    photographs=names,
+                    camera=camera.name,
+                    new=cameras[-1].name,
+                    size=f"{size[0]} x {size[1]} px",
+                    usual=f"{main[0]} x {main[1]} px",
+                    what=what,
+                )
             )
-    if not left and not lines:
+    if not left and not remarks:
         return OtherSizes(survey, files, (), ())
     kept = [k for k in range(len(files)) if k not in left]
     return OtherSizes(
@@ -89,7 +95,7 @@ def separate_sizes(survey: Survey, files: PhotographList) -> OtherSizes:
             files.folder,
         ),
         tuple(FailedImage(files.names[k], why) for k, why in sorted(left.items())),
-        tuple(lines),
+        tuple(remarks),
     )
 
 

@@ -19,6 +19,7 @@ from sfm.matching.lsm.projected_points import pictures_of
 from sfm.network import Estimate, ImagePoints, Network
 from sfm.orientation.incremental.sequence import Orientation
 from sfm.photographs.reading import read_photograph
+from sfm.remarks.remark import Remark, remark
 from sfm.result import PhotographTargets
 from sfm.similarity import fit_similarity
 from sfm.survey.inputs.measurements import Measurements
@@ -46,7 +47,7 @@ class Surface:
     network: Network
     estimate: Estimate
     overlays: tuple[PhotographTargets, ...]  # what the report draws into each photograph
-    warnings: tuple[str, ...]  # one line each
+    remarks: tuple[Remark, ...]
 
 
 def cover_photographs(
@@ -105,19 +106,15 @@ def cover_photographs(
     control = covering.control.complete
     if start.kind != "given" and len(control) >= MIN_CONTROL:  # the tie points had none to be placed on
         placed = fit_similarity(placed.points[control.point], control.xyz).apply_estimate(placed)
-    return Surface(covering, placed, drawn_windows(covering, paths, window), words_of_disagreement(found))
+    return Surface(covering, placed, drawn_windows(covering, paths, window), remarks_on_disagreement(found))
 
 
-def words_of_disagreement(found: CoveringPoints) -> tuple[str, ...]:
-    """Say that many of the matched windows contradict each other, where they do."""
+def remarks_on_disagreement(found: CoveringPoints) -> tuple[Remark, ...]:
+    """Return the remark that many of the matched windows contradict each other, where they do."""
     share = len(found.image_points) / max(found.matched, 1)
     if share >= MIN_AGREEING:
         return ()
-    return (
-        f"only {100 * share:.0f} % of the matched windows agree with each other, and some do so by chance: "
-        "the surface looks too different from one photograph to the next (shine, steps, angles of more than "
-        "25 degrees); coordinates may be worse than their standard deviations",
-    )
+    return (remark("windows_disagree", share=share),)
 
 
 def _fitting(network: Network, estimate: Estimate) -> BoolArray:

@@ -11,8 +11,8 @@ from sfm.adjustment.quality.variance_components import estimate_components
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.conventions import FloatArray
-from sfm.display import listed
 from sfm.network import Estimate, Network
+from sfm.remarks.remark import Remark, remark
 from sfm.survey.adjusting.datum_definition import CONTRADICTED, find_contradiction, lost_share
 from sfm.survey.adjusting.settling import FALSE_ALARM, MANY_ITERATIONS, MAX_ITERATIONS
 
@@ -21,7 +21,7 @@ GROUPS = ("key points", "targets")
 
 def adjust_finally(
     part: Network, start: Estimate, datum: Datum, *, matched: int, unit: str
-) -> tuple[Adjustment, tuple[str, ...]]:
+) -> tuple[Adjustment, tuple[Remark, ...]]:
     """Return the last adjustment with its covariance, and what of control and bars was taken out.
 
     Where control or scale bars take part, key points and targets are weighted by their own variance
@@ -62,14 +62,14 @@ def adjust_finally(
 
     if not (len(part.scale_bars) or datum.kind == "control"):
         return tested(part, 1.0, reject="tau"), ()
-    remarks: list[str] = []
+    remarks: list[Remark] = []
     reject = "tau"
     while True:
         checked = tested(part, 1.0, reject=reject)
         found = find_contradiction(part, checked, untested, unit=unit) if reject == "tau" else None
         if found is None:
             break
-        remarks.append(found.line)
+        remarks.append(found.found)
         if found.freed is None:
             reject = "none"
         else:
@@ -78,14 +78,13 @@ def adjust_finally(
     held = (part.control.point,) if datum.kind == "control" else ()
     against = np.intersect1d(lost, np.concatenate([*held, part.scale_bars.start, part.scale_bars.end]))
     if len(against):
-        names = listed(part.points[j] for j in against)
-        remarks.append(f"most image points of {names} were rejected: control or scale bars contradict them")
+        remarks.append(remark("given_points_rejected", points=[part.points[j] for j in against]))
     good = replace(part, image_points=part.image_points.select(~checked.rejected))
     group = np.asarray(good.image_points.point >= matched, dtype=np.int64)
     _, factor, settled = estimate_components(
         lambda factor: tested(good, factor, reject="none"), group, GROUPS
     )
     if not settled:
-        remarks.append("the weights of the image points did not converge: key points against targets")
+        remarks.append(remark("weights_not_converged", groups="key points and targets"))
     weights = factor[np.asarray(part.image_points.point >= matched, dtype=np.int64)]
     return tested(part, weights, reject=reject), tuple(remarks)

@@ -16,6 +16,7 @@ from sfm.matching.lsm.coverage import WINDOWS_PX
 from sfm.matching.lsm.projected_points import pictures_of
 from sfm.matching.radiometry import odd_window
 from sfm.network import Estimate, Network
+from sfm.remarks.remark import Remark, remark, unless_note
 from sfm.runtime.progress import SILENT, Progress
 from sfm.survey.adjusting.solution import TOLERANCE_FACTOR
 from sfm.survey.refining.final_adjustment import adjust_finally
@@ -46,7 +47,6 @@ UNSUPPORTED = f"of a point that fewer than {MIN_RAYS} photographs match"
 # than twice what windows and surfaces explain; a model that was refined before has as low an RMS as after
 HARDLY_BETTER = 0.5
 MAX_SIGMA0 = 2.0
-REMEDY = "the refined model is not dependable; hold parameters of the cameras with --fix"
 BEYOND = f"behind the photograph or more than {MAX_OFF_AXIS_DEG:g} degrees off the axis"
 
 
@@ -71,7 +71,7 @@ class Refinement:
     )
     reasons: tuple[tuple[str, int], ...]  # why key points took no part, and how many, most frequent first
     targets: ModelTargets | None = None  # points of the adjustment behind those of the model
-    remarks: tuple[str, ...] = ()  # on what was given with them, one line each
+    found: tuple[Remark, ...] = ()  # on what was given with them
 
     @property
     def key_points(self) -> int:
@@ -108,22 +108,25 @@ class Refinement:
         return self.adjustment.converged and self.adjustment.defect <= self.adjustment.expected_defect
 
     @property
-    def warnings(self) -> tuple[str, ...]:
-        """What to know before the model is used, one line each, the gravest first."""
-        own, lines = self.adjustment, []
+    def remarks(self) -> tuple[Remark, ...]:
+        """What to know before the model is used."""
+        own, remarks = self.adjustment, []
         if not own.converged:
-            lines.append(f"the adjustment did not converge: {REMEDY}")
+            remarks.append(remark("not_converged", iterations=own.iterations))
         if own.defect > own.expected_defect:
-            lines.append(
-                f"the adjustment does not determine everything (rank defect {own.defect}, expected "
-                f"{own.expected_defect}): {REMEDY}"
-            )
+            remarks.append(remark("rank_defect", defect=own.defect, expected=own.expected_defect))
         if self.after_px > HARDLY_BETTER * self.readjusted_px and own.sigma0 > MAX_SIGMA0:
-            lines.append(
-                f"the RMS is {self.after_px / self.readjusted_px:.2f} times that before, expected far less: "
-                "a camera model that does not suit the lens, something that moved, or little texture"
-            )
-        return (*lines, *own.remarks, *self.remarks)
+            remarks.append(remark("refinement_hardly_better", times=self.after_px / self.readjusted_px))
+        lost = [name for name, used in zip(self.model.images, self.images, strict=True) if not used]
+        if lost:
+            remarks.append(remark("photographs_not_adjusted", photographs=lost))
+        measured = remark(
+            "key_points_not_measured",
+            measured=self.refined,
+            total=self.key_points,
+            missing=1 - self.refined / max(self.key_points, 1),
+        )
+        return (*remarks, *unless_note(measured), *own.remarks, *self.found)
 
     @property
     def points_anew(self) -> BoolArray:
@@ -279,7 +282,7 @@ def refine_model(
         np.asarray(residuals),
         by_count([*oriented.lost, ("contradict the others", int(rejected.sum())), (UNSUPPORTED, left)]),
         targets,
-        remarks if targets is None else (*targets.warnings, *remarks),
+        remarks if targets is None else (*targets.remarks, *remarks),
     )
 
 
@@ -305,7 +308,7 @@ def refinement_text(result: Refinement) -> str:
         f"RMS after     {result.after_px:.4f} px\n"
         f"sigma0        {result.adjustment.sigma0_px:.4f} px (redundancy {result.adjustment.redundancy})\n"
         + _words_of_targets(result)
-        + "".join(f"warning: {line}\n" for line in result.warnings)
+        + "".join(f"{one.severity}: {one.text}\n" for one in result.remarks)
     )
 
 

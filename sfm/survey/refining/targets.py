@@ -9,10 +9,10 @@ import numpy as np
 
 from sfm.adjustment.datum import Datum
 from sfm.conventions import BoolArray, FloatArray, IntArray
-from sfm.display import listed
 from sfm.errors import GeometryError, SurveyFileError
 from sfm.network import Estimate, ImagePoints, Network, ObjectPoints, ScaleBars
 from sfm.orientation.image_rays import intersect_image_points
+from sfm.remarks.remark import Remark, remark
 from sfm.runtime.progress import SILENT, Progress
 from sfm.similarity import Similarity, fit_similarity
 from sfm.survey.adjusting.datum_definition import MIN_CONTROL, object_scale, refuse_other_units
@@ -37,7 +37,7 @@ class ModelTargets:
     datum: Datum
     unit: str  # object unit
     contradicting: int  # image points that are not where their target is
-    warnings: tuple[str, ...]  # on what was given, one line each
+    remarks: tuple[Remark, ...]  # on what was given
 
     def placed(self) -> ModelTargets:
         """Return them in the object frame."""
@@ -109,7 +109,7 @@ def measure_model_targets(
     circles = check_circles(survey, photographs, naming, measured, replace(part, points=points))
     own, points, contradicting = _intersected(circles.network, part, tolerance_px)
     refuse_other_units(survey, own, replace(part, points=points))
-    placement, lines = _placement(survey, own, points)
+    placement, found_of_given = _placement(survey, own, points)
     seen = own.image_points
     return ModelTargets(
         replace(
@@ -125,7 +125,7 @@ def measure_model_targets(
         Datum(survey.datum.kind),
         survey.unit,
         contradicting,
-        (*circles.warnings, *lines),
+        (*circles.remarks, *found_of_given),
     )
 
 
@@ -160,8 +160,8 @@ def _intersected(
     return replace(network, image_points=seen.select(found.used)), found.points, int(lost.sum())
 
 
-def _placement(survey: Survey, own: Network, points: FloatArray) -> tuple[Similarity, tuple[str, ...]]:
-    """Return the object frame from that of the model, by control, else by scale bars, and warnings.
+def _placement(survey: Survey, own: Network, points: FloatArray) -> tuple[Similarity, tuple[Remark, ...]]:
+    """Return the object frame from that of the model, by control, else by scale bars, and remarks.
 
     Raises:
         GeometryError: the datum is control, and fewer than three control points are among the targets; or
@@ -174,15 +174,14 @@ def _placement(survey: Survey, own: Network, points: FloatArray) -> tuple[Simila
     seen = {own.points[j] for j in np.flatnonzero(known)}
     lost = [name for name in given if name not in seen]
     bars = [bar for bar in survey.scale_bars if not {bar.start, bar.end} <= seen]
-    lines = []
+    remarks = []
     if lost:
-        lines.append(f"control points that are no target in two photographs or more: {listed(lost)}")
+        remarks.append(remark("control_missing", points=lost))
     if bars:
-        ends = listed(f"{bar.start} - {bar.end}" for bar in bars)
-        lines.append(f"scale bars with an end that is no target in two photographs or more: {ends}")
+        remarks.append(remark("scale_bars_missing", bars=[f"{bar.start} - {bar.end}" for bar in bars]))
     if on.sum() >= MIN_CONTROL:
         placed = fit_similarity(points[control.point[on]], control.xyz[on])
-        return placed, tuple(lines)
+        return placed, tuple(remarks)
     if survey.datum.kind == "control":
         raise GeometryError(
             f"{on.sum()} of {len(given)} control points are targets in two photographs or more, needed "
@@ -191,8 +190,7 @@ def _placement(survey: Survey, own: Network, points: FloatArray) -> tuple[Simila
     scale = object_scale(own, Estimate((), np.zeros((0, 3)), np.zeros((0, 3, 3)), points))
     if not scale > 0:
         if given or survey.scale_bars:
-            raise GeometryError(f"nothing gives the model its scale; {'; '.join(lines)}")
-        return Similarity(1.0, np.eye(3), np.zeros(3)), (
-            "neither control nor scale bars in the survey: the model keeps its frame and scale",
-        )
-    return Similarity(scale, np.eye(3), np.zeros(3)), tuple(lines)
+            missing = "; ".join(one.text.rstrip(".") for one in remarks)
+            raise GeometryError(f"nothing gives the model its scale; {missing}")
+        return Similarity(1.0, np.eye(3), np.zeros(3)), (remark("model_keeps_frame"),)
+    return Similarity(scale, np.eye(3), np.zeros(3)), tuple(remarks)

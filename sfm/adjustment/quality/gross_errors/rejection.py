@@ -26,6 +26,7 @@ from sfm.adjustment.quality.gross_errors.robust import (
 )
 from sfm.conventions import BoolArray, FloatArray
 from sfm.errors import GeometryError
+from sfm.remarks.remark import Remark, remark
 
 MAX_ROUNDS = 200  # of data snooping
 MAX_VAGUE = 5  # of them that did not converge: residuals of no optimum tell no gross errors
@@ -88,7 +89,7 @@ class Run:
     exact: bool  # whether the factor must belong to the last normal equations
     iterations: int = 0
     start_vPv: float = float("nan")  # with the first weights at the start values
-    remarks: tuple[str, ...] = ()
+    remarks: tuple[Remark, ...] = ()
 
     def start(self, state: State, weight: FloatArray) -> Optimum:
         """Return the optimum from start values by the method asked for."""
@@ -229,7 +230,7 @@ def _snoop_all(run: Run, optimum: Optimum, weight: FloatArray, alpha: float) -> 
     for _ in range(MAX_ROUNDS):
         vague += not optimum.converged
         if vague > MAX_VAGUE:
-            run.remarks = (f"data snooping ended after {MAX_VAGUE} rounds that did not converge",)
+            run.remarks = (remark("snooping_not_converging", rounds=MAX_VAGUE),)
             break
         redundancy = run.redundancy(optimum, weight)
         if redundancy < 2:
@@ -261,8 +262,12 @@ def _snoop_all(run: Run, optimum: Optimum, weight: FloatArray, alpha: float) -> 
             optimum, weight = run.again(optimum, changed), changed
         except GeometryError as error:
             run.remarks = (
-                f"data snooping ended before its last round: with {int((changed == 0).sum())} image points "
-                f"rejected in place of {int((weight == 0).sum())}, {error}",
+                remark(
+                    "snooping_unsolvable",
+                    more=int((changed == 0).sum()),
+                    rejected=int((weight == 0).sum()),
+                    reason=str(error),
+                ),
             )
             break
     return optimum, weight

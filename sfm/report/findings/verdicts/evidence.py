@@ -5,11 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from sfm.adjustment.quality.against_free import ControlApart, GivenTest, ScaleDifference
-from sfm.adjustment.quality.consistency import Consistency
-from sfm.adjustment.quality.held_camera import HeldParameter
 from sfm.adjustment.quality.statistics import ALPHA, GlobalTest, component_tests
 from sfm.report.findings.bundle_statistics import Statistics
-from sfm.report.findings.checks import CheckedControl, LongestResidual, Sigma0
+from sfm.report.findings.checks import CheckedControl
 from sfm.report.findings.given_residuals import Given
 from sfm.report.findings.protocol import ControlCoordinate
 from sfm.result import SurveyResult
@@ -22,14 +20,10 @@ class Evidence:
     """What a result is judged by."""
 
     result: SurveyResult
-    sigma0: Sigma0
-    longest: LongestResidual
     statistics: Statistics
     given: Given
     check: CheckedControl | None
     object_size: float  # diagonal of the box around the points, object unit
-    consistency: Consistency
-    held: tuple[HeldParameter, ...] = ()  # interior parameters held at values that the photographs contradict
     given_test: GivenTest | None = None  # of all that was given against the free network
     scale_difference: ScaleDifference | None = None  # of control and bars
     check_coordinates: tuple[ControlCoordinate, ...] = ()  # that took no part beside control

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
+from sfm.adjustment.quality.reliability import UNCONTROLLED
 from sfm.adjustment.quality.statistics import ALPHA
 from sfm.adjustment.quality.variance_components import IMAGE_POINTS
 from sfm.display import listed
+from sfm.remarks.remark import Remark, remark
 from sfm.report.findings.given_residuals import GivenResiduals, GivenValue
 from sfm.report.findings.verdicts.evidence import Evidence, Judged
 from sfm.report.numbers import finer_unit, significant
-from sfm.survey.inputs.settings import FREED_FIRST
 
 WEIGHTED_REMARK, WEIGHTED_BAD = 5.0, 30.0  # w of control, scale bars, interior orientation
 # An observation of a smaller redundancy number determines itself: what is left of its error is less than the
@@ -19,19 +20,38 @@ TESTABLE = 1e-3
 # Differences at control that took no part, in sigmas. Control without standard deviations is a print or a
 # drawing, never as good as the network; control that states them must keep to them.
 CHECK_REMARK = 100.0
-HELD_BAD = 5.0  # standard deviations by which a held camera moves the points (RMS): a wrong result
-HARDLY_DETERMINED = 0.05  # standard deviation of c over c from which the photographs hardly determine it
-PRINCIPAL_POINT_REMARK = 0.1  # share of the diagonal; a decentred lens or sensor has 1 or 2 %
 MISCLOSURE_BAD = 0.01  # of the size of the object, or of a length: no measurement, a mistake
 
 
-def judge_given(evidence: Evidence) -> Judged:
-    """Judge everything that was given, kind by kind."""
+def remarks_on_given(evidence: Evidence) -> tuple[Remark, ...]:
+    """Return remarks on everything that was given, kind by kind."""
     kinds = (
         *(_taken_out, _scale, _control_apart, _control, _bars, _interior),
-        *(_held, _hardly_determined, _principal_point, _exterior, _kinds, _check, _check_coordinates),
+        *(_exterior, _kinds, _check, _check_coordinates),
     )
-    return [judged for judge_kind in kinds for judged in judge_kind(evidence)]
+    judged = [one for judge_kind in kinds for one in judge_kind(evidence)]
+    return (
+        *(
+            remark("given_contradicted" if is_bad else "given_remarkable", line=line.rstrip("."))
+            for is_bad, line in judged
+        ),
+        *(remark("given_unchecked", line=line.rstrip(".")) for line in _unchecked(evidence)),
+    )
+
+
+def _unchecked(evidence: Evidence) -> tuple[str, ...]:
+    """Say what nothing in the survey checks, which is no fault that anybody could see in the result."""
+    result, a = evidence.result, evidence.result.adjustment
+    lines = []
+    bars, free = evidence.given.bars, result.free_network
+    if bars is not None and not (bars.r > UNCONTROLLED).any():
+        which = f"scale bar {bars.names[0]}" if len(bars.names) == 1 else "scale bars"
+        lines.append(f"The scale rests on the {which}, which nothing checks.")
+    if a.datum == "control" and free is not None and len(a.network.control):
+        added = a.redundancy - free.redundancy
+        if added <= 0:
+            lines.append("Position, attitude and scale rest on the control, which nothing checks.")
+    return tuple(lines)
 
 
 def _taken_out(evidence: Evidence) -> Judged:
@@ -118,78 +138,6 @@ def _interior(evidence: Evidence) -> Judged:
             f"{significant(abs(worst.w))} times the standard deviation of that difference."
         )
         judged.append((abs(worst.w) > WEIGHTED_BAD, line))
-    return judged
-
-
-def _held(evidence: Evidence) -> Judged:
-    """Judge the interior parameters that were held: the clearest, since those that go with it follow."""
-    if not evidence.held:
-        return []
-    worst, more = evidence.held[0], len(evidence.held) - 1
-    unit = "" if worst.unit == "1" else f" {worst.unit}"
-    others = f" {more} other{'s' if more > 1 else ''} would help as well." if more else ""
-    line = (
-        f"{worst.parameter} of camera {worst.camera} is held at {worst.value:.6g}{unit}; the photographs say "
-        f"{worst.value + worst.change:.6g}{unit}, {significant(abs(worst.t))} standard deviations off, and "
-        f"points are wrong by {significant(worst.moved)} of theirs (RMS): write "
-        f"{free_line(evidence)}.{others}"
-    )
-    return [(worst.moved > HELD_BAD, line)]
-
-
-def free_line(evidence: Evidence) -> str:
-    """Return what to write into the survey file so that the camera fits: the usual ones, those named."""
-    named = {one.parameter for one in evidence.held}
-    camera = evidence.result.adjustment.estimate.cameras[0]
-    for one in evidence.result.adjustment.estimate.cameras:
-        if evidence.held and evidence.held[0].camera in (one.name, *one.shared):
-            camera = one
-    free = {name for name, on in zip(camera.names, camera.free, strict=True) if on}
-    written = [f'"{name}"' for name in camera.names if name in {*free, *named, *FREED_FIRST}]
-    return f"free = [{', '.join(written)}] for camera {camera.name}"
-
-
-def _hardly_determined(evidence: Evidence) -> Judged:
-    """Judge principal distances that the photographs hardly determine, as those of long lenses."""
-    judged: Judged = []
-    result = evidence.result
-    strong = {one.parameter: one.partners for one in result.orientation_correlations}
-    told = set()
-    for number, camera in enumerate(result.adjustment.estimate.cameras):
-        name, c = camera.names[0], float(camera.parameters[0])
-        sigma = float(result.adjustment.interior_sigma(number)[0])
-        owner = camera.group_of(0) or camera.name
-        if not sigma > HARDLY_DETERMINED * abs(c) or owner in told:
-            continue
-        told.add(owner)
-        partners = strong.get(f"{name} of camera {owner}")
-        correlated = f", strongly correlated with {partners}" if partners else ""
-        line = (
-            f"{name} of camera {owner} is known to {significant(100 * sigma / abs(c))} % only{correlated}: "
-            "hold it at a calibrated value (leave it out of free), or add photographs at larger angles and "
-            "other distances."
-        )
-        judged.append((False, line))
-    return judged
-
-
-def _principal_point(evidence: Evidence) -> Judged:
-    """Judge adjusted principal points that lie where no lens has them."""
-    judged: Judged = []
-    for camera in evidence.result.adjustment.estimate.cameras:
-        names = ("x0", "y0") if camera.in_mm else ("cx", "cy")
-        x, y = (camera.value(name) for name in names)
-        size = np.array(camera.size_px) * (camera.pixel_mm if camera.in_mm else 1.0)
-        if not camera.in_mm:
-            x, y = x - (camera.size_px[0] - 1) / 2, y - (camera.size_px[1] - 1) / 2
-        away = float(np.hypot(x, y) / np.linalg.norm(size))
-        if away > PRINCIPAL_POINT_REMARK and camera.free[[camera.names.index(name) for name in names]].any():
-            line = (
-                f"The principal point of camera {camera.name} was adjusted to {significant(100 * away)} % of "
-                "the diagonal of the photograph from its centre, farther than lenses have it: the network "
-                "hardly determines it, hold it or add photographs turned by 90 degrees."
-            )
-            judged.append((False, line))
     return judged
 
 

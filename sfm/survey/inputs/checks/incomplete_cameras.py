@@ -10,6 +10,7 @@ import numpy as np
 
 from sfm.errors import PhotographError, SurveyFileError
 from sfm.photographs.exif import Metadata, read_metadata
+from sfm.remarks.remark import Remark, remark
 from sfm.survey.inputs.photograph_list import PhotographList
 from sfm.survey.inputs.settings import CameraSettings
 
@@ -44,27 +45,31 @@ def refuse_incomplete_cameras(
 
 def unlike_squares(
     settings: Sequence[CameraSettings], pixels: Sequence[tuple[float, float]], free: Sequence[Sequence[str]]
-) -> tuple[str, ...]:
-    """Return a line for each camera whose nominal sensor size makes pixels that are not square.
+) -> tuple[Remark, ...]:
+    """Return a remark on each camera whose nominal sensor size makes pixels that are not square.
 
     Args:
         settings: what the survey says of its cameras; a pixel size that is stated is not looked at.
         pixels: width and height of a pixel of each, mm.
         free: parameters of each that are adjusted; with b1, or fx and fy, the photographs say the ratio.
     """
-    lines = []
+    remarks = []
     for one, (width, height), adjusted in zip(settings, pixels, free, strict=True):
         known = "b1" in adjusted or {"fx", "fy"} <= set(adjusted)
         ratio = width / height - 1
         if one.pixel_mm is None and not known and abs(ratio) >= UNLIKE_SQUARES:
-            where = "sensor_mm" if one.sensor_mm is not None else "the EXIF data"
-            side = 1000 * (width * height) ** 0.5
-            lines.append(
-                f"camera {one.name}: {where} make pixels of {1000 * width:.4g} x {1000 * height:.4g} µm, "
-                f"{100 * abs(ratio):.2g} % off squares, which those of sensors are: write "
-                f"pixel_mm = [{side / 1000:.5g}, {side / 1000:.5g}], or free b1 (fx and fy)"
+            remarks.append(
+                remark(
+                    "pixels_not_square",
+                    camera=one.name,
+                    where="sensor_mm" if one.sensor_mm is not None else "EXIF data",
+                    width=(1000 * width, "µm"),
+                    height=(1000 * height, "µm"),
+                    off=(100 * abs(ratio), "%"),
+                    side=((width * height) ** 0.5, "mm"),
+                )
             )
-    return tuple(lines)
+    return tuple(remarks)
 
 
 def _wanted(one: CameraSettings) -> list[tuple[str, str]]:

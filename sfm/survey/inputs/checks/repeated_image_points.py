@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from sfm.conventions import BoolArray
-from sfm.display import listed
 from sfm.distributions import chi2_ppf
 from sfm.network import ImagePoints, rows_of
+from sfm.remarks.remark import Remark, remark
 
 ALPHA = 0.001  # probability with which measurements that say the same are taken for contradicting ones
 
@@ -24,19 +24,18 @@ class Merged:
     dropped: tuple[tuple[int, int], ...]  # of those that contradict one another, left out
     dropped_rows: int  # image points that are left out
 
-    def lines(self, images: tuple[str, ...], points: tuple[str, ...]) -> tuple[str, ...]:
-        """Return what was done, one line for each kind."""
-        kinds = (
-            (self.same, "identical ones were merged"),
-            (self.averaged, "they differ by no more than chance and were averaged"),
-            (self.dropped, "they contradict one another and were left out"),
+    def remarks(self, images: tuple[str, ...], points: tuple[str, ...]) -> tuple[Remark, ...]:
+        """Return what was done with the image points that stand more than once."""
+        kinds = {
+            "image_points_identical": self.same,
+            "image_points_averaged": self.averaged,
+            "image_points_contradicting": self.dropped,
+        }
+        return tuple(
+            remark(kind, image_points=[f"{points[j]} in {images[i]}" for i, j in pairs])
+            for kind, pairs in kinds.items()
+            if pairs
         )
-        out = []
-        for pairs, done in kinds:
-            if pairs:
-                named = listed(f"{points[j]} in {images[i]}" for i, j in pairs)
-                out.append(f"image points that stand more than once: {named}; {done}")
-        return tuple(out)
 
 
 def merge_repeated(seen: ImagePoints) -> Merged:

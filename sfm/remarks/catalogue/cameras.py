@@ -1,0 +1,109 @@
+"""Cameras: which parameters were adjusted, and values that lenses do not have."""
+
+from __future__ import annotations
+
+from sfm.remarks.kind import Grade, Kind
+
+ROWS = (
+    Kind(
+        "parameters_freed",
+        "note",
+        "{parameters} of camera {camera} {parameters:was|were} adjusted, as {photographs:photograph} "
+        "{photographs:determines|determine} {parameters:it|them}.",
+        "the survey file does not state what is free",
+        "Write free = [] to hold all parameters fixed.",
+    ),
+    Kind(
+        "interior_held",
+        "note",
+        "The interior orientation of camera {camera} was held fixed, as {photographs:photograph} "
+        "{photographs:does|do} not determine it.",
+        "the survey file does not state what is free",
+        "State a calibration in [camera.fixed], or add photographs, some turned by 90 degrees.",
+    ),
+    Kind(
+        "interior_held_of_pair",
+        "warning",
+        "{parameters} of camera {camera} {parameters:was|were} held fixed at the start values, which two "
+        "photographs do not determine.",
+        "an error of c scales the depth, one of the distortion bends the object; standard deviations do not "
+        "contain it",
+        "Give a calibrated camera, or add photographs.",
+    ),
+    Kind(
+        "pair_contradicted",
+        "error",
+        "Two photographs that fit one another do not determine the camera, and {others:other photograph} "
+        "{others:does|do} not fit at its start values.",
+        "the start values of the camera are wrong, or the photographs have too little in common",
+        "Give a calibrated camera, or add photographs between those that do not fit.",
+    ),
+    Kind(
+        "c_looks_wrong",
+        "warning",
+        "c = {given} of camera {camera} looks wrong: from {better} on {oriented} of {total} photographs "
+        "can be oriented, in place of {before}.",
+        "a wrong start value of c or a wrong size of the pixels",
+        "Correct c_mm and pixel_mm, or free c.",
+    ),
+    Kind(
+        "c_looks_wrong_of_pair",
+        "error",
+        "c = {given} of camera {camera} looks wrong: from {better} on {oriented} of {total} photographs "
+        "can be oriented, in place of {before}. Two photographs do not determine it.",
+        "a wrong start value of c or a wrong size of the pixels",
+        "Give a calibrated c, or add photographs.",
+    ),
+    Kind(
+        "c_held_contradicted",
+        "error",
+        "c of camera {cameras} was held fixed at its start value, which the residuals contradict.",
+        "c is wrong, and the photographs do not determine it",
+        "Give a calibrated camera, or add photographs at larger angles.",
+    ),
+    Kind(
+        "c_far_from_given",
+        "warning",
+        "c of camera {camera} was adjusted from {given} to {found}, by {change:+}.",
+        "a wrong start value, or a network that does not determine c",
+        "Give c from a calibration, or add photographs from other distances.",
+    ),
+    Kind(
+        "c_hardly_determined",
+        Grade("share", warning=0.05),
+        "{parameter} of camera {camera} is known to {share:%} only[[, strongly correlated with {partners}]].",
+        "a long lens, few photographs, or small angles between them",
+        "Hold it fixed at a calibrated value, or add photographs at larger angles and other distances.",
+    ),
+    Kind(
+        "principal_point_far",
+        Grade("share", warning=0.1),  # of the diagonal; a decentred lens or sensor has 0.01 or 0.02
+        "The adjusted principal point of camera {camera} is {share:%} of the diagonal from the centre of the "
+        "photograph.",
+        "the network hardly determines it, or the photographs are cropped",
+        "Hold it fixed, or add photographs turned by 90 degrees.",
+    ),
+    Kind(
+        "parameter_contradicted",
+        Grade("moved", error=5.0),
+        "{parameter} of camera {camera} is held fixed at {value}, but the photographs show {found} ({t} "
+        "standard deviations); points are wrong by {moved} of theirs (RMS).[[ Write {free}.]]",
+        "a calibration that is not that of these photographs",
+        "Free the parameter, or calibrate the camera again.",
+    ),
+    Kind(
+        "residual_pattern",
+        "warning",
+        "The residuals of camera {camera} depend on the place in the photograph (p = {p}): their mean is "
+        "up to {largest}.",
+        "a camera model that does not suit the lens",
+        "Free more parameters of the distortion, or use another camera model.",
+    ),
+    Kind(
+        "pixels_not_square",
+        "warning",
+        "The pixels of camera {camera} are {width} x {height} by {where}, {off} off squares.",
+        "the nominal size of a sensor is not that of the photographs",
+        "Set pixel_mm to two equal numbers, or free b1 (fx and fy).",
+    ),
+)

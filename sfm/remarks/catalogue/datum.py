@@ -1,0 +1,101 @@
+"""Datum, scale and given values: what of them was not used or not found."""
+
+from __future__ import annotations
+
+from sfm.remarks.kind import Kind
+
+ROWS = (
+    Kind(
+        "scale_undefined",
+        "note",
+        "The scale is undefined: lengths are not in {unit}.",
+        "photographs alone have no scale",
+        "Measure a scale bar or control.",
+    ),
+    Kind(
+        "control_missing",
+        "warning",
+        "Control is not in the result: {points}.",
+        "names that no measured point has, or points with too few rays",
+        "Correct the names; coded targets are named by their numbers.",
+    ),
+    Kind(
+        "scale_bars_missing",
+        "warning",
+        "Scale bars have an end that is not in the result: {bars}.",
+        "names that no measured point has, or points with too few rays",
+        "Correct from and to; coded targets are named by their numbers.",
+    ),
+    Kind(
+        "model_keeps_frame",
+        "note",
+        "The model keeps its frame and scale.",
+        "neither control nor scale bars in the survey",
+        "Give control or scale bars for lengths in the object unit.",
+    ),
+    Kind(
+        "given_points_rejected",
+        "warning",
+        "Most image points of {points} were rejected: control or scale bars contradict them.",
+        "control and scale bars do not fit the photographs, and none can be blamed",
+        "Check their names, numbers and unit; give more of them.",
+    ),
+    Kind(
+        "datum_points_missing",
+        "warning",
+        "Datum points are not in the network: {points}.",
+        "names that no measured point has, or points with too few rays",
+        "Correct the names in datum.points.",
+    ),
+    Kind(
+        "exterior_unused",
+        "note",
+        "Observed exterior orientation takes no part in datum '{datum}'.",
+        "it determines position, attitude and scale, which this datum takes from the points",
+        'Set datum.kind = "control" to use it.',
+    ),
+    Kind(
+        "given_contradicted",
+        "error",
+        "{line}.",
+        "control, scale bars or other given values are wrong",
+        "Check each value, its name and its unit.",
+    ),
+    Kind(
+        "given_remarkable",
+        "warning",
+        "{line}.",
+        "control, scale bars or other given values are wrong, or stated too precise",
+        "Check each value, its name and its unit.",
+    ),
+    Kind(
+        "given_unchecked",
+        "note",
+        "{line}.",
+        "just enough control, or one scale bar",
+        "Add a scale bar or a control point.",
+    ),
+    Kind(
+        "approximate_unused",
+        "warning",
+        "The given approximate values orient {before} of the {now} photographs that can be oriented without "
+        "them, and were not used.",
+        "the values contradict the photographs",
+        "Correct or complete [approximate], or leave it out.",
+    ),
+    Kind(
+        "approximate_contradicts_control",
+        "warning",
+        "The given approximate values contradict the control and were not used.",
+        "the values are in another frame, or control is wrong",
+        "Correct or complete [approximate], or leave it out.",
+    ),
+    Kind(
+        "orientation_replaced",
+        "warning",
+        "The given orientation of {photograph} was replaced: {before} of {image_points:image point} fit it, "
+        "{after} fit the new one.",
+        "the given orientation is wrong",
+        "Correct or complete [approximate], or leave it out.",
+    ),
+)

@@ -1,0 +1,136 @@
+"""Object points and image points: rays that are lost, points that are not in the result, copies."""
+
+from __future__ import annotations
+
+from sfm.remarks.kind import Kind
+
+ROWS = (
+    Kind(
+        "rays_rejected",
+        "warning",
+        "Of {points:point} a third of the rays or more were rejected, or two are left: {points}.",
+        "the point moved, has the name of another, or is hard to measure",
+        "Look at its rejected image points in the report.",
+    ),
+    Kind(
+        "two_rays",
+        "note",
+        "{two:point} of {total} {two:has|have} two rays, so that errors along the epipolar line are not "
+        "found.",
+        "the point is seen in two photographs only",
+        "Add a photograph of these points.",
+    ),
+    Kind(
+        "points_with_few_rays",
+        "note",
+        "{points:point} of {measured} {points:is|are} not in the result, with too few rays: {points}.",
+        "the point is measured in fewer photographs than it needs",
+        "Add photographs of these points, if you need them.",
+    ),
+    Kind(
+        "points_contradicted",
+        "warning",
+        "{points:point} of {measured} {points:is|are} not in the result, as {points:its|their} rays do not "
+        "meet: {points}.",
+        "the point moved, its name stands for two points, or its rays are almost parallel",
+        "Look at the reasons in left_out.csv; measure the points again or rename them.",
+    ),
+    Kind(
+        "points_doubtful",
+        "warning",
+        "The coordinates of {points:point} are doubtful, as either of two rays may be wrong: {points}.",
+        "too few rays to decide which of them is wrong",
+        "Add photographs of these points.",
+    ),
+    Kind(
+        "points_with_large_residuals",
+        "warning",
+        "The residuals of {points:point} are together larger than chance: {points}.",
+        "the point moved a little, or its target is damaged or seen at a flat angle",
+        "Look at the target; leave the point out if you do not trust it.",
+    ),
+    Kind(
+        "two_positions",
+        "warning",
+        "Point {point} is at two positions, {distance} apart ({sigmas} standard deviations): one in {first}, "
+        "the other in {second}.",
+        "it moved, or two points have its name",
+        "Rename one of the two, or survey the states by themselves.",
+    ),
+    Kind(
+        "image_points_identical",
+        "note",
+        "{image_points:image point} {image_points:stands|stand} more than once with one position: "
+        "{image_points}. Each counts once.",
+        "rows of the table were written twice",
+        "Remove the copies.",
+    ),
+    Kind(
+        "image_points_averaged",
+        "note",
+        "{image_points:image point} {image_points:was|were} measured more than once and averaged: "
+        "{image_points}.",
+        "the measurements differ by no more than chance",
+        "Nothing needs to be done.",
+    ),
+    Kind(
+        "image_points_contradicting",
+        "warning",
+        "{image_points:image point} {image_points:was|were} measured at different places and left out: "
+        "{image_points}.",
+        "two points of one photograph have one name",
+        "Correct the names.",
+    ),
+    Kind(
+        "code_at_several_places",
+        "warning",
+        "Code {code} is read at several places: {photographs} {photographs:shows|show} it elsewhere than "
+        "{others:other photograph}[[, at {points}]].",
+        "a target was moved, two targets have one number, or a code was misread",
+        "Remove one of the targets, or survey the states by themselves.",
+    ),
+    Kind(
+        "code_rays_apart",
+        "warning",
+        "The rays to code {code} from {photographs} do not meet.",
+        "a target was moved, two targets have one number, or a code was misread",
+        "Remove one of the targets, or survey the states by themselves.",
+    ),
+    Kind(
+        "codes_too_small",
+        "note",
+        "{targets:target} {targets:has|have} a code that is too small to read: dots are {dot} across with "
+        "edges {blur} soft, {needed} are needed.",
+        "targets are too small or too far away, or photographs are not sharp",
+        "Print the targets larger, go nearer or focus better.",
+    ),
+    Kind(
+        "windows_disagree",
+        "warning",
+        "Only {share:%} of the matched windows agree with each other, and some do so by chance.",
+        "the surface looks different from photograph to photograph: shine, steps, angles beyond 25 degrees",
+        "Add photographs at smaller angles; coordinates may be worse than their standard deviations.",
+    ),
+    Kind(
+        "diameter_differs",
+        "warning",
+        "The stated diameter of {targets:target} is {stated}, but the ellipses show {found}.",
+        "the diameter is that of a ring, or in another unit, or the scale is wrong",
+        "State the diameter of the dot in the object unit, and check the scale bars.",
+    ),
+    Kind(
+        "diameters_differ",
+        "warning",
+        "The stated diameters of {differing} of {total} targets differ by more than {limit} from the "
+        "ellipses, most that of {target}: {stated} stated, {found} found.",
+        "diameters are those of rings, or in another unit, or of other targets",
+        "State the diameters of the dots in the object unit, by the ids of the targets.",
+    ),
+    Kind(
+        "diameters_of_unknown",
+        "warning",
+        "Diameters are stated of targets that are not in the survey: {targets}.",
+        "ids that no target has",
+        "Correct the ids in the table of diameters.",
+    ),
+)

@@ -1,0 +1,218 @@
+"""Remarks on a survey as a whole, and its verdict: the adjustment, its rays, photographs and comparisons."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from sfm.adjustment.quality.consistency import Consistency
+from sfm.adjustment.quality.statistics import ALPHA, component_tests
+from sfm.adjustment.result import Adjustment
+from sfm.conventions import MAD_TO_SIGMA
+from sfm.display import program_name
+from sfm.remarks.remark import Remark, remark, unless_note
+from sfm.remarks.verdict import Level
+from sfm.report.findings.bundle_statistics import Statistics
+from sfm.report.findings.checks import LongestResidual, Sigma0
+from sfm.report.numbers import finer_unit
+from sfm.result import SurveyResult
+
+HEADLINES: Mapping[Level, str] = {
+    "good": "The survey worked: {found}.",
+    "fair": "The survey worked, with remarks: {found}.",
+    "bad": "The survey has no dependable result.",
+}
+MANY_RAYS = 1 / 3  # share of the rays of a point: so many of them contradict the result
+FEW_RAYS = 2  # that are left of a point of which others were rejected check it no more
+MAX_SOLUTIONS = 2  # of about the same v'Pv that are listed
+SIGMA0_LOW = 0.5  # the same times too cautious
+AS_STATED = 1.5  # standard deviation of w by its median, up to which image points are about as stated
+
+
+def headlines_of(result: SurveyResult) -> dict[Level, str]:
+    """Return what each level means for a survey."""
+    a = result.adjustment
+    found = (
+        f"{len(a.network.images)} of {result.images_total} photographs oriented, "
+        f"{len(a.network.points)} object points"
+    )
+    return {level: text.format(found=found) for level, text in HEADLINES.items()}
+
+
+def adjustment_remarks(a: Adjustment) -> tuple[Remark, ...]:
+    """Return whether the adjustment converged and determines everything, and how much it rejected."""
+    remarks = []
+    if not a.converged:
+        remarks.append(remark("not_converged", iterations=a.iterations))
+    if a.defect != a.expected_defect or a.undetermined:
+        remarks.append(
+            remark(
+                "rank_defect",
+                defect=a.defect,
+                expected=a.expected_defect,
+                undetermined=a.undetermined or None,
+            )
+        )
+    rejected, total = int(a.rejected.sum()), len(a.rejected)
+    share = rejected / max(total, 1)
+    remarks += unless_note(remark("image_points_rejected", rejected=rejected, total=total, share=share))
+    return tuple(remarks)
+
+
+def photograph_remarks(result: SurveyResult) -> tuple[Remark, ...]:
+    """Return how many photographs are not in the result."""
+    oriented, total = len(result.adjustment.network.images), result.images_total
+    missing = total - oriented
+    if not missing:
+        return ()
+    return (remark("photographs_missing", missing=missing, total=total, share=missing / total),)
+
+
+def other_solution_remarks(result: SurveyResult) -> tuple[Remark, ...]:
+    """Return the other solutions that the image points allow: which of them is true they do not decide."""
+    farthest = sorted(result.other_solutions, key=lambda one: -one.moved)
+    return tuple(
+        remark("other_solution_reversed", vPv=other.vPv, moved=other.moved)
+        if other.reflected
+        else remark(
+            "other_solution", camera=other.camera, c=(other.c, other.unit), vPv=other.vPv, moved=other.moved
+        )
+        for other in farthest[:MAX_SOLUTIONS]
+    )
+
+
+def sigma0_remarks(result: SurveyResult, sigma0: Sigma0, statistics: Statistics) -> tuple[Remark, ...]:
+    """Return whether sigma0 a posteriori is far from that a priori, and what explains it."""
+    remarks = []
+    tried = result.explanations
+    if tried and tried[0].explains:
+        cause = tried[0]
+        remarks.append(
+            remark(
+                "explained",
+                cause=cause.cause,
+                before=(cause.before_px, "px"),
+                after=(cause.after_px, "px"),
+                moved=float(np.nan_to_num(cause.moved)),
+            )
+        )
+    remarks += unless_note(remark("sigma0_high", ratio=sigma0.ratio, stated=(sigma0.stated_px, "px")))
+    image = component_tests(statistics.kinds, alpha=2 * ALPHA)[0]
+    if sigma0.ratio < SIGMA0_LOW and image.statistic < image.lower:
+        remarks.append(
+            remark("sigma_px_cautious", stated=(sigma0.stated_px, "px"), found=(sigma0.image_points_px, "px"))
+        )
+    return tuple(remarks)
+
+
+def residual_remarks(result: SurveyResult, worst: LongestResidual, found: Statistics) -> tuple[Remark, ...]:
+    """Return the longest accepted residual, and gross errors where the survey rejects nothing."""
+    kept = remark(
+        "residual_kept",
+        point=worst.point,
+        photograph=worst.image,
+        length=(worst.length_px, "px"),
+        over_sigma=worst.over_sigma,
+    )
+    return (*(unless_note(kept) if np.isfinite(worst.over_sigma) else ()), *_untested(result, found))
+
+
+def _untested(result: SurveyResult, found: Statistics) -> tuple[Remark, ...]:
+    """Return what the tests of single image coordinates show where the survey rejects nothing.
+
+    Tau is blind where gross errors are so many that they make sigma0; w shows them then, if the bulk of the
+    image points is as good as stated.
+    """
+    if result.reject != "none":
+        return ()
+    tests, w = [("tau", found.tau)], found.w
+    if w.tested and MAD_TO_SIGMA * np.nanmedian(np.abs(w.statistic)) < AS_STATED:
+        tests.append(("w", w))
+    name, most = max(tests, key=lambda one: one[1].beyond)
+    if not most.far_more:
+        return ()
+    return (
+        remark(
+            "gross_errors_kept",
+            test=name,
+            beyond=most.beyond,
+            tested=most.tested,
+            critical=most.critical,
+            chance=most.expected,
+        ),
+    )
+
+
+def ray_remarks(a: Adjustment) -> tuple[Remark, ...]:
+    """Return the points that lost many of their rays or have but two, and a pair of photographs."""
+    network, rejected = a.network, a.rejected
+    n, point = len(network.points), network.image_points.point
+    lost, rays = np.bincount(point[rejected], minlength=n), network.rays()
+    most = np.flatnonzero((lost > 0) & ((lost >= MANY_RAYS * rays) | (rays - lost <= FEW_RAYS)))
+    remarks = []
+    if len(most):
+        remarks.append(remark("rays_rejected", points=[network.points[j] for j in most]))
+    if len(network.images) == 2:
+        remarks.append(remark("two_photographs"))
+    two = int((rays - lost == FEW_RAYS).sum())
+    if two:
+        remarks.append(remark("two_rays", two=two, total=n))
+    return tuple(remarks)
+
+
+def consistency_remarks(result: SurveyResult, found: Consistency) -> tuple[Remark, ...]:
+    """Return what the tests of points, photographs and the format show."""
+    remarks = []
+    for place in found.two_positions:
+        factor, unit = finer_unit(result.length_unit, place.distance)
+        remarks.append(
+            remark(
+                "two_positions",
+                point=place.point,
+                distance=(factor * place.distance, unit),
+                sigmas=place.over_sigma,
+                first=place.first,
+                second=place.second,
+            )
+        )
+    if found.doubtful:
+        remarks.append(remark("points_doubtful", points=[one.point for one in found.doubtful]))
+    if found.large:
+        remarks.append(remark("points_with_large_residuals", points=found.large))
+    uneven = found.uneven
+    if uneven is not None:
+        remarks.append(
+            remark(
+                "photographs_uneven",
+                photograph=uneven.worst,
+                p=uneven.probability,
+                ratio=uneven.largest / uneven.median,
+            )
+        )
+    remarks += [
+        remark("residual_pattern", camera=one.camera, p=one.probability, largest=(one.largest_px, "px"))
+        for one in found.patterns
+    ]
+    return tuple(remarks)
+
+
+def comparison_remarks(result: SurveyResult) -> tuple[Remark, ...]:
+    """Return whether the other adjuster agrees, and whether its camera fits better."""
+    both = result.comparison
+    if both is None:
+        return ()
+    program, better = program_name(both.backend), both.better
+    remarks = [] if both.agree else [remark("adjuster_differs", program=program)]
+    if better is not None:
+        remarks.append(
+            remark(
+                "adjuster_fits_better",
+                program=program,
+                parameters=better.free,
+                times=better.times,
+                rms=(better.rms_px, "px"),
+                own=(better.own_rms_px, "px"),
+            )
+        )
+    return tuple(remarks)
