@@ -4,15 +4,89 @@ from __future__ import annotations
 
 from sfm.remarks.kind import Grade, Kind
 
-SHIFT = Grade("shift", warning=1.0, error=3.0)  # standard deviations by which coordinates move with it
+# Standard deviations by which a coordinate shifts with the alternative. Below 3 a result stays within the
+# limits that anybody expects; beyond 5 it is wrong, whatever its residuals (Baarda 1968).
+SHIFT = Grade("shift", warning=3.0, error=5.0)
+LOCAL = Grade("shift", warning=3.0)  # of a few points, which the remark names
+SHIFTED = "Coordinates shift by up to {shift} standard deviations."
+INSTEAD = "[[ The image points do not separate this from: {instead}.]]"
 
 ROWS = (
     Kind(
         "other_camera",
         SHIFT,
-        "The camera of {photographs} differs from that of the others (c {change:+}[[, principal point "
-        "{away} away]]): coordinates shift by up to {shift} of their standard deviations.",
-        "zoom, focus or camera changed during the survey, or a photograph was cropped or resampled",
-        "Give these photographs a [[camera]] of their own, or set per_photograph.",
+        "Photographs {photographs} do not share the camera of the others (c {change:+}"
+        f"[[, principal point {{away}} away]]). {SHIFTED}{INSTEAD}",
+        "zoom, focus or camera changed during the survey, or photographs were cropped or resampled",
+        "Give these photographs a [[camera]] of their own, or free the parameters with per_photograph.",
+    ),
+    Kind(
+        "camera_drift",
+        SHIFT,
+        "The camera changes steadily through the sequence (c {change:+} to either end). "
+        f"{SHIFTED}{INSTEAD}",
+        "the camera warmed up, or its focus crept",
+        "Set per_photograph for c, and let the camera warm up before the survey.",
+    ),
+    Kind(
+        "held_parameter",
+        SHIFT,
+        "The image points contradict the held values of {parameters} of camera {camera}"
+        f"[[: held at {{value}}, {{instead_of}} fits]]. {SHIFTED}{INSTEAD}",
+        "a calibration that does not describe these photographs",
+        "Add the parameters to free, or calibrate the camera anew.",
+    ),
+    Kind(
+        "distortion_not_described",
+        SHIFT,
+        "Residuals depend on the place in the photograph, by up to {largest}: the camera model does not "
+        f"describe the lens. {SHIFTED}{INSTEAD}",
+        "distortion that the model does not have, or a film or sensor that is not plane",
+        "Free K2, K3, P1, P2, b1 and b2, or choose another model.",
+    ),
+    Kind(
+        "object_deformed",
+        SHIFT,
+        "The object has another shape in photographs {photographs}, by up to {deformation}. "
+        f"{SHIFTED}{INSTEAD}",
+        "the object expanded, bent or settled during the survey",
+        "Adjust the two states as two surveys and compare them with epochs.",
+    ),
+    Kind(
+        "object_deforming",
+        SHIFT,
+        f"The object deforms steadily through the sequence, by up to {{deformation}}. {SHIFTED}{INSTEAD}",
+        "the object warmed up or was loaded during the survey",
+        "Photograph in a shorter time or at a constant temperature.",
+    ),
+    Kind(
+        "points_moved",
+        LOCAL,
+        "{points:point} moved [[from {from} on ]]by up to {distance}, {shift} standard deviations: {points}."
+        f"{INSTEAD}",
+        "targets or parts of the object moved during the survey",
+        "Adjust the two states as two surveys, or remove these points.",
+    ),
+    Kind(
+        "two_places",
+        "warning",
+        "Point {point} is at a second place in {photographs}, {distance} away "
+        "({sigmas} standard deviations).",
+        "two targets carry one name, or the target was moved",
+        "Rename one of the two, or remove the point.",
+    ),
+    Kind(
+        "names_exchanged",
+        "warning",
+        "Points {first} and {second} have exchanged names in {photographs}.",
+        "the names were confused when the photographs were measured",
+        "Exchange the two names in these photographs.",
+    ),
+    Kind(
+        "image_points_misnamed",
+        "note",
+        "{count:rejected image point} {count:lies|lie} where another point is seen, in {photographs}.",
+        "a name was given to the wrong target",
+        "Correct the names; the result does not depend on them.",
     ),
 )

@@ -1,0 +1,465 @@
+"""The alternatives: what is freed (family) in which photographs (pattern), each with its gain.
+
+A family is a set of columns; a pattern gives each photograph a factor on them. The level of the test is
+shared out among all alternatives, and lowered by what was searched inside each of them: the number of
+patterns, or of sets of points, from which the best one was taken.
+
+Source: the score test of `sfm.survey.hypotheses.score`; Holm (1979), Scand. J. Statist. 6, for the level.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from scipy.special import gammaln
+
+from sfm.adjustment.result import Adjustment
+from sfm.conventions import FloatArray, IntArray
+from sfm.distortion.models import Role
+from sfm.survey.hypotheses.columns import BENDING, CAMERA, STRAIN, Columns, interior_columns
+from sfm.survey.hypotheses.score import (
+    Gain,
+    Reduced,
+    gain_of,
+    log_f_sf,
+    log_likelihood_gain,
+    log_probability,
+)
+
+ALPHA = 0.01  # probability of naming any alternative where none holds
+CAMERA_SETS = {
+    "c": (0,),
+    "centre": (0, 1, 2, 3),
+    "camera": tuple(range(len(CAMERA))),
+}  # c; c, x0, y0, K1; all
+MIN_GROUP = 2  # photographs on each side of a split
+MAX_SPLITS = 12  # places in the sequence at which points are tried to have moved
+CELLS = 5  # of the format in each direction
+MAX_MOVED = 60  # points that are tried together
+ROUNDS = 20  # of two means
+STARTS = 8  # photographs from which a group is grown
+
+
+@dataclass(frozen=True)
+class Alternative:
+    """One alternative and what the score test says of it."""
+
+    family: str  # c | centre | camera | strain | bending | moved | shifted | interior | format
+    pattern: str  # single | split | linear | alternating | group | all
+    factor: FloatArray  # of each photograph, (m,)
+    gain: Gain
+    log_p: float  # ln of the probability by chance
+    price: float  # q / 2 ln n and ln of the number of patterns and sets from which it was taken
+    search: float  # the latter
+    evidence: float  # gain of ln likelihood less the price
+    points: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))  # that moved
+    parameters: tuple[tuple[int, int], ...] = ()  # (camera, parameter) freed
+
+    @property
+    def photographs(self) -> IntArray:
+        """The fewer photographs: those that differ from the others."""
+        on = np.flatnonzero(self.factor > 0)
+        off = np.flatnonzero(self.factor <= 0)
+        return on if len(on) <= len(off) else off
+
+    def columns(self, a: Adjustment, columns: Columns) -> FloatArray:
+        """Return its columns for all image points of an adjustment, px, (k, 2, q)."""
+        seen = a.network.image_points
+        if self.family == "interior":
+            return _interior(a, self.parameters)
+        if self.family == "format":
+            return _cells(a)
+        factor = self.factor[seen.image][:, None, None]
+        if self.family == "moved":
+            D = np.zeros((len(seen), 2, 3 * len(self.points)))
+            for place, j in enumerate(self.points):
+                rows = np.flatnonzero(seen.point == j)
+                D[rows, :, 3 * place : 3 * place + 3] = (factor * columns.point)[rows]
+            return D
+        if self.family == "shifted":
+            return np.asarray(np.isin(seen.point, self.points)[:, None, None] * factor * columns.point)
+        return np.asarray(factor * _family(columns, self.family))
+
+
+def _family(columns: Columns, family: str) -> FloatArray:
+    if family in CAMERA_SETS:
+        return columns.camera[:, :, list(CAMERA_SETS[family])]
+    return columns.strain if family == "strain" else columns.bending
+
+
+def _interior(a: Adjustment, parameters: tuple[tuple[int, int], ...]) -> FloatArray:
+    """Return the columns of held parameters; cameras that share one have it together."""
+    groups: dict[tuple[str, str], FloatArray] = {}
+    for index, s in parameters:
+        camera = a.estimate.cameras[index]
+        key = (camera.group_of(s) or camera.name, camera.names[s])
+        groups[key] = groups.get(key, 0.0) + interior_columns(a, index, [s])[:, :, 0]
+    return np.stack(list(groups.values()), axis=2)
+
+
+def _cells(a: Adjustment) -> FloatArray:
+    """Return a displacement for each cell of the format, photographs of all sizes alike, (k, 2, 2 cells)."""
+    network = a.network
+    seen = network.image_points
+    size = np.array([camera.size_px for camera in a.estimate.cameras])[network.camera[seen.image]]
+    column, row = np.clip((CELLS * seen.xy / size).astype(np.int64), 0, CELLS - 1).T
+    D = np.zeros((len(seen), 2, CELLS**2, 2))
+    D[np.arange(len(seen)), 0, CELLS * row + column, 0] = 1.0
+    D[np.arange(len(seen)), 1, CELLS * row + column, 1] = 1.0
+    return D.reshape(len(seen), 2, 2 * CELLS**2)
+
+
+def alternatives_of(a: Adjustment, reduced: Reduced, columns: Columns) -> tuple[Alternative, ...]:
+    """Return all alternatives, the best evidence first."""
+    found = [
+        *_interiors(a, reduced),
+        *_format(a, reduced),
+        *_by_photographs(reduced, columns),
+        *_moved_points(a, reduced, columns),
+    ]
+    return tuple(sorted(found, key=lambda one: -one.evidence))
+
+
+def is_significant(one: Alternative, rows: int) -> bool:
+    """Return whether chance makes so large a gain in fewer than ALPHA of the surveys, all rows together."""
+    return bool(one.log_p < np.log(ALPHA / rows) - one.search)
+
+
+@dataclass(frozen=True)
+class Spread:
+    """How much parts that an alternative does not concern differ among themselves, over what chance makes.
+
+    Image points of one photograph have errors in common that no weight states: the lens, its shutter, light
+    from one side. Photographs then differ, each in its way, and what differs in some of them must be larger
+    than that. So must points, of which each has errors of its target.
+    """
+
+    factor: float = 1.0  # of the variance
+    redundancy: int = 10**9  # by which it is known
+    among: bool = True  # whether an alternative that concerns some of the parts was chosen from them
+
+
+NONE = Spread()
+
+
+def _made(
+    reduced: Reduced,
+    family: str,
+    pattern: str,
+    factor: FloatArray,
+    gain: Gain,
+    search: float,
+    spread: Spread = NONE,
+    points: IntArray | None = None,
+    parameters: tuple[tuple[int, int], ...] = (),
+) -> Alternative:
+    """Return an alternative with its test.
+
+    The price of a parameter is that of the image points that it moves (Kass and Raftery 1995, J. Am. Stat.
+    Assoc. 90, on the n of the Bayesian information criterion).
+    """
+    r = reduced.redundancy
+    on = factor[reduced.image] != 0
+    some = np.zeros(0, dtype=np.int64) if points is None else points
+    if len(some):
+        on &= np.isin(reduced.point, some)
+    touched = int(on.sum())
+    over = max(spread.factor, 1.0)
+    evidence = log_likelihood_gain(gain.value, r, reduced.count)
+    log_p = log_probability(gain.value, gain.rank, r)
+    if over > 1:
+        left = max(r - gain.value, 1.0) / r  # of the variance factor
+        f = gain.value / max(gain.rank, 1) / over / left
+        log_p = max(log_p, log_f_sf(f, gain.rank, spread.redundancy)) if gain.rank else 0.0
+        if spread.among:
+            evidence = min(evidence, spread.redundancy / 2 * np.log1p(f * gain.rank / spread.redundancy))
+        else:
+            evidence = log_likelihood_gain(gain.value / over, r, reduced.count)
+    price = gain.rank / 2 * np.log(2 * max(touched, 2)) + search
+    return Alternative(
+        *(family, pattern, factor, gain, log_p, price, search, evidence - price), some, parameters
+    )
+
+
+def _interiors(a: Adjustment, reduced: Reduced) -> Iterator[Alternative]:
+    """Return an alternative for each held interior parameter, and one for all of a camera."""
+    network, cameras = a.network, a.estimate.cameras
+    everywhere = np.ones(len(network.images))
+    owners: dict[str, dict[str, list[tuple[int, int]]]] = {}
+    for index, camera in enumerate(cameras):
+        if not (network.camera == index).any():
+            continue
+        # the denominator of a fraction says the same as its numerator
+        for s in np.flatnonzero(~camera.free & ~camera.plays(Role.DENOMINATOR)).tolist():
+            owner = owners.setdefault(camera.group_of(s) or camera.name, {})
+            owner.setdefault(camera.names[s], []).append((index, s))
+    for held in owners.values():
+        sets = [tuple(one) for one in held.values()]
+        whole = tuple(pair for one in held.values() for pair in one)
+        D = reduced.whiten(_interior(a, whole))
+        every = gain_of(*reduced.project(D))
+        for parameters, columns in [
+            *((one, [k]) for k, one in enumerate(sets)),
+            *([(whole, list(range(len(sets))))] if len(sets) > 1 else []),
+        ]:
+            own = D[:, :, columns]
+            H, g, squares = reduced.project(own)
+            gain = gain_of(H, g, squares)
+            if gain.rank:
+                # what the photographs say of it once it, or all of the camera, are free
+                variance = float(gain.beta @ H @ gain.beta)
+                spread = min(
+                    (
+                        _of_scores(reduced.scores(own @ gain.beta, step), variance)
+                        for step in (own @ gain.beta, D @ every.beta)
+                    ),
+                    key=lambda one: one.factor,
+                )
+                yield _made(
+                    *(reduced, "interior", "all", everywhere, gain, 0.0, spread), parameters=parameters
+                )
+
+
+def _format(a: Adjustment, reduced: Reduced) -> Iterator[Alternative]:
+    """Return the alternative of residuals that depend on the place in the photograph."""
+    D = reduced.whiten(_cells(a))
+    H, g, squares = reduced.project(D)
+    gain = gain_of(H, g, squares)
+    if gain.rank:
+        scores = reduced.scores(D @ gain.beta, D @ gain.beta)
+        spread = _of_scores(scores, float(gain.beta @ H @ gain.beta))
+        yield _made(reduced, "format", "all", np.ones(reduced.photographs), gain, 0.0, spread)
+
+
+def _of_scores(scores: FloatArray, variance: float) -> Spread:
+    """Return the spread of what the photographs say of one direction, (m,), over its expected variance.
+
+    Source: White (1982), Econometrica 50, for a score test with dependent observations.
+    """
+    m = len(scores)
+    return Spread(float(scores @ scores) / variance * m / (m - 1), m - 1, among=False) if m > 1 else NONE
+
+
+def _by_photographs(reduced: Reduced, columns: Columns) -> Iterator[Alternative]:
+    """Return the alternatives of cameras, strain and bending in some of the photographs."""
+    m = reduced.photographs
+    if m < 2 * MIN_GROUP:
+        return
+    every = np.concatenate([columns.camera, columns.strain, columns.bending], axis=2)
+    H, g, squares = reduced.project_by_photograph(reduced.whiten(every))
+    places = {name: np.array(some) for name, some in CAMERA_SETS.items()}
+    places["strain"] = len(CAMERA) + np.arange(STRAIN)
+    places["bending"] = len(CAMERA) + STRAIN + np.arange(BENDING)
+    for family, some in places.items():
+        part = _Part(H[:, some][:, :, :, some], g[:, some], squares[:, some])
+        for pattern, factors, search in _patterns(m):
+            if family in ("strain", "bending") and pattern == "single":
+                continue  # an object that one photograph shows otherwise is that photograph's fault
+            gains = [part.gain(factor) for factor in factors]
+            best = max(range(len(gains)), key=lambda k: gains[k].value)
+            spread = part.spread(factors[best], gains[best])
+            if pattern == "single":
+                own = _variance_of(reduced, best, gains[best])
+                spread = replace(spread, factor=max(spread.factor, own))
+            yield _made(reduced, family, pattern, factors[best], gains[best], search, spread)
+        if m > 2 * MIN_GROUP:
+            factor, gain = part.group()
+            if MIN_GROUP <= factor.sum() <= m - MIN_GROUP:
+                spread = part.spread(factor, gain)
+                yield _made(reduced, family, "group", factor, gain, (m - 1) * np.log(2), spread)
+
+
+def _variance_of(reduced: Reduced, photograph: int, gain: Gain) -> float:
+    """Return the variance that an alternative leaves in a photograph, over that of all photographs."""
+    v = reduced.v[reduced.image == photograph]
+    expected = v.size * reduced.redundancy / reduced.count
+    return float(max((v**2).sum() - gain.value, 0.0) / max(expected - gain.rank, 1.0))
+
+
+def _patterns(m: int) -> Iterator[tuple[str, FloatArray, float]]:
+    """Return the patterns: name, factors of the photographs (p, m), ln of the number p."""
+    yield "single", np.eye(m), np.log(m)
+    splits = np.array([np.arange(m) >= k for k in range(MIN_GROUP, m - MIN_GROUP + 1)], dtype=float)
+    yield "split", splits, np.log(len(splits))
+    yield "linear", np.linspace(-1, 1, m)[None], 0.0
+    yield "alternating", (np.arange(m) % 2)[None].astype(float), 0.0
+
+
+@dataclass(frozen=True)
+class _Part:
+    """Normal equations of a family in each photograph."""
+
+    H: FloatArray  # (m, f, m, f)
+    g: FloatArray  # (m, f)
+    squares: FloatArray  # (m, f)
+
+    def gain(self, factor: FloatArray) -> Gain:
+        """Return the gain where the photographs have the family with these factors."""
+        return gain_of(
+            np.einsum("i,iajb,j->ab", factor, self.H, factor, optimize=True),
+            factor @ self.g,
+            factor**2 @ self.squares,
+        )
+
+    def spread(self, factor: FloatArray, gain: Gain) -> Spread:
+        """Return how much the photographs differ in the family beyond what a pattern explains."""
+        m = len(self.g)
+        left = self.g + np.einsum("iajb,j,b->ia", self.H, factor, gain.beta, optimize=True)
+        some = np.ones(m, dtype=bool) if factor.sum() > 1 else factor == 0
+        every = [gain_of(self.H[i, :, i], left[i], self.squares[i]) for i in np.flatnonzero(some)]
+        redundancy = sum(one.rank for one in every) - gain.rank
+        if redundancy < 1:
+            return NONE
+        return Spread(sum(one.value for one in every) / redundancy, redundancy)
+
+    def group(self) -> tuple[FloatArray, Gain]:
+        """Return the photographs that together have the largest gain, as factors 0 and 1, by two means."""
+        m = len(self.g)
+        single = np.array([self.gain(one).value for one in np.eye(m)])
+        best, most = np.zeros(m), None
+        for first in np.argsort(-single)[:STARTS]:
+            factor = (np.arange(m) == first).astype(float)
+            for _ in range(ROUNDS):
+                beta = self.gain(factor).beta
+                # v'Pv as a function of the factors: s'Qs + 2 l's with beta held, one photograph after another
+                Q = np.einsum("a,iajb,b->ij", beta, self.H, beta, optimize=True)
+                linear = self.g @ beta
+                again = factor.copy()
+                for i in range(m):
+                    others = Q[i] @ again - Q[i, i] * again[i]
+                    again[i] = float(Q[i, i] + 2 * (linear[i] + others) < 0)
+                if (again == factor).all() or not again.any():
+                    break
+                factor = again
+            gain = self.gain(factor)
+            if most is None or gain.value > most.value:
+                best, most = factor, gain
+        assert most is not None
+        return best, most
+
+
+def _moved_points(a: Adjustment, reduced: Reduced, columns: Columns) -> Iterator[Alternative]:
+    """Return for each place in the sequence the set of points that moved there with the best evidence."""
+    m = reduced.photographs
+    if m < 2 * MIN_GROUP:
+        return
+    splits = list(range(MIN_GROUP, m - MIN_GROUP + 1))
+    splits = splits[:: -(-len(splits) // MAX_SPLITS)]
+    factors = [(np.arange(m) >= k).astype(float) for k in splits] + [(np.arange(m) % 2).astype(float)]
+    names = ["split"] * len(splits) + ["alternating"]
+    best: dict[str, Alternative] = {}
+    for name, factor in zip(names, factors, strict=True):
+        search = np.log(len(splits)) if name == "split" else 0.0
+        for one in _moved_at(reduced, columns, factor, name, search):
+            key = f"{one.family} {name}"
+            if key not in best or one.evidence > best[key].evidence:
+                best[key] = one
+    yield from best.values()
+
+
+def _moved_at(
+    reduced: Reduced, columns: Columns, factor: FloatArray, pattern: str, search: float
+) -> Iterator[Alternative]:
+    """Return the set of points that moved between the photographs of factor 0 and those of factor 1."""
+    n, m, size = len(reduced.L), reduced.photographs, len(reduced.t)
+    on = factor[reduced.image] > 0
+    D = np.where(on[:, None, None], reduced.B, 0.0)
+    V, C = np.zeros((n, 3, 3)), np.zeros((n, 3, 3))
+    np.add.at(V, reduced.point[on], np.swapaxes(D[on], 1, 2) @ D[on])
+    C = reduced.L @ V  # L^-1 B'D, as B'D = V here
+    before = np.bincount(reduced.point[~on], minlength=n)
+    after = np.bincount(reduced.point[on], minlength=n)
+    movable = np.flatnonzero((before >= MIN_GROUP) & (after >= MIN_GROUP))
+    if not len(movable):
+        return
+    # A'D of each point, reduced by the point itself
+    K = np.zeros((n, 3, size))
+    by = np.swapaxes(reduced.B, 1, 2) @ reduced.A
+    rows = np.flatnonzero(on)
+    every = np.zeros((n, m, 3, 6))
+    np.add.at(every, (reduced.point[rows], reduced.image[rows]), by[rows, :, :6])
+    K[:, :, : 6 * m] = np.moveaxis(every, 1, 2).reshape(n, 3, 6 * m)
+    np.add.at(K[:, :, 6 * m :], reduced.point[rows], by[rows, :, 6:])
+    K = K[movable] - np.swapaxes(C[movable], 1, 2) @ reduced.W[movable]
+    g = np.zeros((n, 3))
+    np.add.at(g, reduced.point[on], np.einsum("kab,ka->kb", D[on], reduced.v[on]))
+    g = g[movable] - np.einsum("nab,na->nb", C[movable], reduced.y[movable])
+    g = g - K @ (reduced.Sinv @ reduced.t)
+    own = V[movable] - np.swapaxes(C[movable], 1, 2) @ C[movable]
+    KS = K @ reduced.Sinv
+    blocks = own - np.einsum("nas,nbs->nab", KS, K)
+    squares = np.einsum("nii->ni", V[movable])
+    single = np.array([gain_of(*one).value for one in zip(blocks, g, squares, strict=True)])
+    order = np.argsort(-single)[: min(MAX_MOVED, len(movable) // 2 or 1)]
+    flat = (K[order].reshape(-1, size), KS[order].reshape(-1, size))
+    H = -flat[1] @ flat[0].T
+    for place, k in enumerate(order):
+        block = slice(3 * place, 3 * place + 3)
+        H[block, block] += own[k]
+    best: Alternative | None = None
+    total = len(movable)
+    ordered = np.sort(single)[::-1]
+    for count in range(1, len(order) + 1):
+        part = slice(0, 3 * count)
+        gain = gain_of(H[part, part], g[order].ravel()[part], squares[order].ravel()[part])
+        sets = float(gammaln(total + 1) - gammaln(count + 1) - gammaln(total - count + 1))
+        others = ordered[count:]
+        spread = Spread(float(others.mean()) / 3, 3 * len(others)) if len(others) else NONE
+        one = _made(
+            *(reduced, "moved", pattern, factor, gain, search + sets, spread),
+            points=movable[order[:count]],
+        )
+        if best is None or one.evidence > best.evidence:
+            best = one
+        elif count > 2 * len(best.points) + 4:
+            break
+    if best is not None:
+        yield best
+    yield from _shifted(reduced, columns, factor, pattern, search, (movable, blocks, g))
+
+
+def _shifted(
+    reduced: Reduced,
+    columns: Columns,
+    factor: FloatArray,
+    pattern: str,
+    search: float,
+    parts: tuple[IntArray, FloatArray, FloatArray],
+) -> Iterator[Alternative]:
+    """Return the set of points that moved by one and the same vector, as a part of the object that shifted.
+
+    By two means over the points, from those that moved most; parts are the points that can have moved, their
+    normal equations (n, 3, 3) and right sides (n, 3).
+    """
+    movable, blocks, g = parts
+    total = len(movable)
+    own = np.array([gain_of(*one, np.diagonal(one[0])).value for one in zip(blocks, g, strict=True)])
+    best: Alternative | None = None
+    for first in np.argsort(-own)[:STARTS]:
+        members = np.arange(total) == first
+        for _ in range(ROUNDS):
+            N = blocks[members].sum(axis=0)
+            d = -np.linalg.lstsq(N, g[members].sum(axis=0), rcond=None)[0]
+            again = np.einsum("a,nab,b->n", d, blocks, d) + 2 * g @ d < 0
+            if (again == members).all() or not again.any():
+                break
+            members = again
+        count = int(members.sum())
+        if not MIN_GROUP <= count <= total - MIN_GROUP:
+            continue
+        points = movable[members]
+        on = (factor[reduced.image] > 0) & np.isin(reduced.point, points)
+        D = np.where(on[:, None, None], reduced.B, 0.0)
+        gain = gain_of(*reduced.project(D))
+        sets = float(gammaln(total + 1) - gammaln(count + 1) - gammaln(total - count + 1))
+        left = g + np.where(members[:, None], blocks @ gain.beta, 0.0)
+        others = [gain_of(*one, np.diagonal(one[0])) for one in zip(blocks, left, strict=True)]
+        redundancy = sum(one.rank for one in others) - gain.rank
+        spread = Spread(sum(one.value for one in others) / redundancy, redundancy)
+        one = _made(reduced, "shifted", pattern, factor, gain, search + sets, spread, points=points)
+        if best is None or one.evidence > best.evidence:
+            best = one
+    if best is not None:
+        yield best

@@ -1,0 +1,165 @@
+"""The columns that alternatives add: how each freedom moves an image point.
+
+Camera: what c, principal point, radial, decentring and affine distortion do to an image point, for every
+model alike. Strain: a homogeneous deformation of the object without scale, which a photograph takes for distance.
+Bending: a displacement that is quadratic in the coordinates. Interior: the derivatives of the camera's model.
+
+Source: Brown (1971), Close-range camera calibration, Photogramm. Eng. 37(8); Foerstner and Wrobel (2016),
+Photogrammetric Computer Vision, sec. 4.6.4 (systematic errors), 12.2 (small rotations).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sfm.adjustment.result import Adjustment
+from sfm.camera import Camera, pixel_from_tangents, pixel_jacobian
+from sfm.conventions import BoolArray, FloatArray
+from sfm.network import rows_of
+
+CAMERA = ("c", "x0", "y0", "K1", "K2", "P1", "P2", "b1", "b2")
+STRAIN, BENDING = 5, 18  # columns
+SMALL_MOVE_PX = 0.01  # by which a parameter moves image points where its derivative is taken
+
+
+@dataclass(frozen=True)
+class Columns:
+    """Derivatives of the k image points of an adjustment, rejected ones included, px."""
+
+    exterior: FloatArray  # by X0 and the small rotation of their photograph, (k, 2, 6)
+    point: FloatArray  # by their object point, (k, 2, 3)
+    camera: FloatArray  # by the freedoms `CAMERA`, px at the edge of the photograph, (k, 2, 9)
+    strain: FloatArray  # by a strain of the object, its size as unit, (k, 2, 5)
+    bending: FloatArray  # by a bending of the object, likewise, (k, 2, 18)
+    usable: BoolArray  # whether all of these are finite, (k,)
+
+
+def columns_of(a: Adjustment) -> Columns:
+    """Return the derivatives of all image points of an adjustment."""
+    network, estimate = a.network, a.estimate
+    seen = network.image_points
+    R, X = estimate.rotation[seen.image], estimate.points[seen.point] - estimate.position[seen.image]
+    UVW = np.einsum("kji,kj->ki", R, X)
+    U, V, W = UVW.T
+    uv = -UVW[:, :2] / W[:, None]
+    k = len(seen)
+    J, flat = np.zeros((k, 2, 2)), np.zeros((k, 2))
+    for camera, rows in zip(
+        estimate.cameras, rows_of(network.camera[seen.image], len(estimate.cameras)), strict=True
+    ):
+        if len(rows):
+            J[rows] = pixel_jacobian(camera, seen.xy[rows])
+            flat[rows] = uv[rows] * camera.c_px / (max(camera.size_px) / 2)
+    # d (u, v) / d (U, V, W) = -(1, 0, u) / W
+    by_axes = -np.concatenate([np.tile(np.eye(2), (k, 1, 1)), uv[:, :, None]], axis=2) / W[:, None, None]
+    by_axes = J @ by_axes
+    point = by_axes @ np.swapaxes(R, 1, 2)
+    zero = np.zeros_like(U)
+    turned = np.stack(
+        [np.stack([zero, W, -V], -1), np.stack([-W, zero, U], -1), np.stack([V, -U, zero], -1)], axis=2
+    )
+    exterior = np.concatenate([-point, by_axes @ turned], axis=2)
+    strain, bending, _ = object_fields(estimate.points)
+    found = Columns(
+        exterior,
+        point,
+        _camera(flat),
+        np.einsum("kac,kcf->kaf", point, strain[seen.point]),
+        np.einsum("kac,kcf->kaf", point, bending[seen.point]),
+        np.isfinite(point).all(axis=(1, 2)) & (W < 0),
+    )
+    for part in (found.exterior, found.point, found.camera, found.strain, found.bending):
+        part[~found.usable] = 0.0
+    return found
+
+
+def _camera(flat: FloatArray) -> FloatArray:
+    """Return what the freedoms of a camera do to image points, 1 px at the edge, (k, 2, 9).
+
+    Args:
+        flat: tangents over that of half the longer side, y up, (k, 2).
+    """
+    x, y = flat.T
+    r2, one, zero = x**2 + y**2, np.ones(len(x)), np.zeros(len(x))
+    across = [x, one, zero, x * r2, x * r2**2, r2 + 2 * x**2, 2 * x * y, x, y]
+    down = [y, zero, one, y * r2, y * r2**2, 2 * x * y, r2 + 2 * y**2, zero, zero]
+    return np.stack([np.stack(across, -1), -np.stack(down, -1)], axis=1)
+
+
+def object_fields(points: FloatArray) -> tuple[FloatArray, FloatArray, float]:
+    """Return the displacement of points by strain (n, 3, 5) and bending (n, 3, 18), and the object's size.
+
+    A parameter of 1 is a displacement as large as the object, its root mean square distance from the centre.
+    """
+    known = np.asarray(np.isfinite(points).all(axis=1))
+    centre = points[known].mean(axis=0)
+    size = float(np.sqrt(((points[known] - centre) ** 2).sum(axis=1).mean()))
+    x, y, z = (np.where(known[:, None], points - centre, 0.0) / size).T
+    zero = np.zeros_like(x)
+    strain = np.stack(
+        [
+            np.stack([x, -y, zero], -1),
+            np.stack([x, y, -2 * z], -1),
+            np.stack([y, x, zero], -1),
+            np.stack([z, zero, x], -1),
+            np.stack([zero, z, y], -1),
+        ],
+        axis=2,
+    )
+    terms = np.stack([x * x, y * y, z * z, x * y, x * z, y * z], axis=-1)
+    bending = np.einsum("nt,cd->nctd", terms, np.eye(3)).reshape(len(points), 3, BENDING)
+    return size * strain, size * bending, size
+
+
+def interior_columns(a: Adjustment, index: int, parameters: list[int]) -> FloatArray:
+    """Return the derivatives of all image points by parameters of one camera, (k, 2, len(parameters)).
+
+    They are 0 in photographs of other cameras, and in px for a move of `SMALL_MOVE_PX`, so that parameters of
+    all units have columns of about one size.
+    """
+    network, estimate = a.network, a.estimate
+    seen, camera = network.image_points, estimate.cameras[index]
+    rows = np.flatnonzero(network.camera[seen.image] == index)
+    R = estimate.rotation[seen.image[rows]]
+    UVW = np.einsum("kji,kj->ki", R, estimate.points[seen.point[rows]] - estimate.position[seen.image[rows]])
+    uv = -UVW[:, :2] / UVW[:, 2:]
+    found = np.zeros((len(seen), 2, len(parameters)))
+    at = pixel_from_tangents(camera, uv)
+    for column, s in enumerate(parameters):
+        step = _step(camera, s, uv)
+        moved = pixel_from_tangents(_changed(camera, s, step), uv)
+        back = pixel_from_tangents(_changed(camera, s, -step), uv)
+        found[rows, :, column] = np.nan_to_num((moved - back) / (2 * SMALL_MOVE_PX))
+    found[rows[~np.isfinite(at).all(axis=1)]] = 0.0
+    return found
+
+
+def interior_step(a: Adjustment, index: int, parameter: int) -> float:
+    """Return by how much a parameter changes for one unit of its column in `interior_columns`."""
+    network, estimate = a.network, a.estimate
+    seen, camera = network.image_points, estimate.cameras[index]
+    rows = np.flatnonzero(network.camera[seen.image] == index)
+    R = estimate.rotation[seen.image[rows]]
+    UVW = np.einsum("kji,kj->ki", R, estimate.points[seen.point[rows]] - estimate.position[seen.image[rows]])
+    return _step(camera, parameter, -UVW[:, :2] / UVW[:, 2:]) / SMALL_MOVE_PX
+
+
+def _step(camera: Camera, s: int, uv: FloatArray) -> float:
+    """Return the step of a parameter that moves the image points by `SMALL_MOVE_PX` at most."""
+    step = 1e-6 * max(abs(float(camera.parameters[s])), 1e-6)
+    at = pixel_from_tangents(camera, uv)
+    for _ in range(20):
+        away = np.abs(pixel_from_tangents(_changed(camera, s, step), uv) - at)
+        most = float(np.nanmax(away, initial=0.0))
+        if most > SMALL_MOVE_PX / 10:
+            return step * SMALL_MOVE_PX / most
+        step *= 10 if most < SMALL_MOVE_PX / 1000 else SMALL_MOVE_PX / most
+    return step
+
+
+def _changed(camera: Camera, s: int, step: float) -> Camera:
+    p = camera.parameters.copy()
+    p[s] += step
+    return camera.with_parameters(p)

@@ -1,0 +1,149 @@
+"""Which assumption of a survey is wrong, if any: alternatives are tested, the best is adjusted and judged.
+
+All alternatives are tested at once over the accepted image points of the free network, without adjusting
+again. The best one that chance does not make is adjusted with everything; it is named if its likelihood
+pays for its parameters and for the search, and if coordinates shift by a standard deviation or more.
+
+Source: Foerstner and Wrobel (2016), Photogrammetric Computer Vision, sec. 4.6.4 and 4.6.5 (separability).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from sfm.adjustment.datum import Datum
+from sfm.adjustment.result import Adjustment
+from sfm.adjustment.solve import adjust
+from sfm.conventions import BoolArray
+from sfm.errors import GeometryError
+from sfm.network import Estimate, ExteriorObservations, Network, ObjectPoints, ScaleBars
+from sfm.reduced_network import reduce_network
+from sfm.remarks.remark import Remark
+from sfm.survey.hypotheses.alternatives import ALPHA, Alternative, alternatives_of, is_significant
+from sfm.survey.hypotheses.columns import columns_of
+from sfm.survey.hypotheses.refit import Refit, refit
+from sfm.survey.hypotheses.score import reduce_adjustment
+from sfm.survey.hypotheses.described import remark_of
+
+MAX_CAUSES = 2  # that are looked for one after another
+MAX_IMAGE_POINTS = 20_000  # of the network that is tested; every so many points of a larger one
+APART = float(np.log(100))  # of ln likelihood, below which two alternatives cannot be told apart
+NAMED = 1.0  # standard deviations by which coordinates shift, below which a cause is of no consequence
+
+
+@dataclass(frozen=True)
+class Cause:
+    """An alternative that holds."""
+
+    alternative: Alternative
+    refit: Refit
+    as_well: tuple[Alternative, ...]  # other causes that explain the image points about as well
+
+
+def test_hypotheses(final: Adjustment) -> tuple[Remark, ...]:
+    """Return what the image points say against the assumptions of an adjustment, the clearest first.
+
+    Args:
+        final: a finished adjustment with its covariance.
+    """
+    plain = free_network(final)
+    if plain is None:
+        return ()
+    return tuple(
+        remark_of(plain, one.alternative, one.refit, one.as_well) for one in find_causes(final, plain)
+    )
+
+
+def find_causes(final: Adjustment, plain: Adjustment) -> tuple[Cause, ...]:
+    """Return the alternatives that hold, the clearest first.
+
+    Args:
+        final: the finished adjustment.
+        plain: its image points alone.
+    """
+    reject = "tau" if final.rejected.any() or not final.reweighted else "none"
+    causes: list[Cause] = []
+    current = plain
+    for _ in range(MAX_CAUSES):
+        found = _best(plain, current, reject=reject)
+        if found is None:
+            break
+        if found.refit.shift >= NAMED:
+            causes.append(found)
+        current = found.refit.adjustment
+    return tuple(causes)
+
+
+def _best(plain: Adjustment, current: Adjustment, *, reject: str) -> Cause | None:
+    """Return the alternative that holds beside those whose effect has left an adjustment already."""
+    columns = columns_of(current)
+    try:
+        reduced = reduce_adjustment(current, columns)
+    except np.linalg.LinAlgError:
+        return None
+    every = alternatives_of(current, reduced, columns)
+    significant = [
+        one for one in every if is_significant(one, len(every)) and one.evidence > np.log(1 / ALPHA)
+    ]
+    if not significant:
+        return None
+    best = significant[0]
+    found = refit(plain, best, current, reject=reject)
+    if found is None:
+        return None
+    if not found.gain - best.price > np.log(1 / ALPHA):
+        return None
+    near = [
+        one for one in significant[1:] if best.evidence - one.evidence < APART and _cause(one) != _cause(best)
+    ]
+    once = {_cause(one): one for one in reversed(near)}
+    return Cause(best, found, tuple(once.values()))
+
+
+def _cause(one: Alternative) -> tuple[object, ...]:
+    """Return what an alternative is a case of: cameras with few or many parameters are one cause."""
+    if one.family == "interior":
+        return ("interior",)
+    if one.family in ("moved", "shifted", "strain", "bending"):
+        return ("object", one.pattern)
+    return ("camera", tuple(one.photographs.tolist()))
+
+
+def free_network(final: Adjustment) -> Adjustment | None:
+    """Return the adjustment of the accepted image points alone; None where it is no solution."""
+    if not final.converged or not final.sigma0 > 0 or not np.isfinite(final.redundancy_numbers).any():
+        return None
+    network = final.network
+    alone = not (len(network.scale_bars) or len(network.exterior))
+    if alone and final.datum != "control" and len(final.rejected) <= MAX_IMAGE_POINTS:
+        return None if final.reweighted or final.undetermined else final
+    part, estimate, rows = _sample(
+        replace(network, control=ObjectPoints(), scale_bars=ScaleBars(), exterior=ExteriorObservations()),
+        final,
+    )
+    try:
+        free = adjust(
+            part,
+            estimate,
+            datum=Datum("free"),
+            image_sigma_factor=final.image_sigma_factor[rows],
+            reject="tau",
+            alpha=final.test_alpha,
+            rejected=final.rejected[rows],
+        )
+    except GeometryError:
+        return None
+    return free if free.converged and not free.undetermined and free.redundancy > 1 else None
+
+
+def _sample(network: Network, final: Adjustment) -> tuple[Network, Estimate, BoolArray]:
+    """Return a network of about `MAX_IMAGE_POINTS` image points, its estimate and which image points it has."""
+    seen = network.image_points
+    every = -(-len(seen) // MAX_IMAGE_POINTS)
+    points = np.arange(len(network.points)) % every == 0
+    rows = points[seen.point]
+    images = np.ones(len(network.images), dtype=bool)
+    part, estimate = reduce_network(network, final.estimate, images, points, np.ones_like(rows))
+    return part, estimate, rows

@@ -1,0 +1,303 @@
+"""Score test: by how much v'Pv would fall with more freedom, from the finished adjustment alone.
+
+    H = B'PB - B'PA N^- A'PB,  g = B'Pv - B'PA N^- A'Pv,  gain = g' H^-1 g
+
+A are the columns of the adjustment (photographs, free interior parameters, object points), B those of an
+alternative, v the residuals of the accepted image points. Object points are eliminated first, then
+photographs and cameras, whose seven motions are fixed by inner constraints. (gain / q) / ((v'Pv - gain) / (r - q))
+is F distributed where the alternative is none.
+
+Source: Koch (1999), Parameter Estimation and Hypothesis Testing in Linear Models, sec. 4.2; Rao (1948), Proc.
+Camb. Phil. Soc. 44, for the score test; Foerstner and Wrobel (2016), sec. 4.6.4.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import special
+from scipy.linalg import cho_factor, cho_solve
+
+from sfm.adjustment.result import Adjustment
+from sfm.conventions import FloatArray, IntArray
+from sfm.distributions import f_sf
+from sfm.network import rows_of
+from sfm.survey.hypotheses.columns import Columns, interior_columns, interior_step
+
+DETERMINED = 1e-5  # of the squares of a column that photographs, cameras and points must leave of it
+SMALLEST_LOG = -600.0  # of a probability that `f_sf` still gives
+MAX_TERMS = 10_000  # of the series beyond it
+
+
+@dataclass(frozen=True)
+class Reduced:
+    """The accepted image points with object points, photographs and cameras eliminated.
+
+    Whitened by the weights and sigma0 a posteriori, so that a gain is in units of the variance factor.
+    """
+
+    used: IntArray  # accepted image points, (k,)
+    F: FloatArray  # whitening of each, (k, 2, 2)
+    v: FloatArray  # residuals, whitened, (k, 2)
+    image: IntArray  # photograph of each, (k,)
+    point: IntArray  # object point of each, (k,)
+    B: FloatArray  # by object points, whitened, (k, 2, 3)
+    A: FloatArray  # by photographs and free interior parameters, whitened, (k, 2, 6 + i)
+    L: FloatArray  # inverse Cholesky factors of the object points' normals, (n, 3, 3)
+    W: FloatArray  # L^-1 B'A of each object point, (n, 3, a)
+    Sinv: FloatArray  # inverse of the reduced normals with inner constraints, (a, a)
+    y: FloatArray  # L^-1 B'v, (n, 3)
+    t: FloatArray  # right side of photographs and cameras, reduced by the points, (a,)
+    photographs: int
+    redundancy: int
+
+    @property
+    def count(self) -> int:
+        """Accepted image coordinates."""
+        return 2 * len(self.used)
+
+    def whiten(self, columns: FloatArray) -> FloatArray:
+        """Return columns of all image points (k, 2, q) as whitened ones of the accepted."""
+        return np.asarray(self.F @ columns[self.used])
+
+    def project_by_photograph(self, D: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return H (m, f, m, f), g (m, f) and squares (m, f) of whitened columns (k, 2, f) for each photograph.
+
+        Every photograph has f freedoms of its own.
+        """
+        n, m, f = len(self.L), self.photographs, D.shape[2]
+        C = np.zeros((n, m, 3, f))
+        np.add.at(C, (self.point, self.image), np.swapaxes(self.B, 1, 2) @ D)
+        flat_C = np.moveaxis(self.L[:, None] @ C, 1, 2).reshape(3 * n, m * f)
+        by = np.swapaxes(self.A, 1, 2) @ D
+        K = np.zeros((len(self.t), m, f))
+        H, g, squares = np.zeros((m, f, m, f)), np.zeros((m, f)), np.zeros((m, f))
+        for i, rows in enumerate(rows_of(self.image, m)):
+            flat = D[rows].reshape(-1, f)
+            H[i, :, i] = flat.T @ flat
+            g[i] = flat.T @ self.v[rows].ravel()
+            squares[i] = np.einsum("kq,kq->q", flat, flat)
+            K[6 * i : 6 * i + 6, i] = by[rows, :6].sum(axis=0)
+            K[6 * m :, i] = by[rows, 6:].sum(axis=0)
+        flat_K = K.reshape(len(self.t), m * f) - self.W.reshape(3 * n, -1).T @ flat_C
+        H -= (flat_C.T @ flat_C + flat_K.T @ (self.Sinv @ flat_K)).reshape(m, f, m, f)
+        g -= (flat_C.T @ self.y.ravel() + flat_K.T @ (self.Sinv @ self.t)).reshape(m, f)
+        return H, g, squares
+
+    def project(self, D: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return H (q, q), g (q,) and the squares (q,) of whitened columns (k, 2, q)."""
+        H, g, squares, _ = self._eliminated(D)
+        return H, g, squares
+
+    def scores(self, direction: FloatArray, step: FloatArray) -> FloatArray:
+        """Return what each photograph adds to the slope along a direction, after a step, (m,).
+
+        Args:
+            direction: whitened effect on the image points, (k, 2).
+            step: whitened effect of what was changed, (k, 2).
+        """
+        *_, left = self._eliminated(np.stack([direction, step], axis=2))
+        slope = ((self.v + left[:, :, 1]) * left[:, :, 0]).sum(axis=1)
+        return np.asarray(np.bincount(self.image, slope, minlength=self.photographs), dtype=float)
+
+    def _eliminated(self, D: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """Return H, g and squares of whitened columns, and the columns less what all unknowns take."""
+        n, q = len(self.L), D.shape[2]
+        C = np.zeros((n, 3, q))
+        np.add.at(C, self.point, np.swapaxes(self.B, 1, 2) @ D)
+        flat_C = (self.L @ C).reshape(3 * n, q)
+        flat = D.reshape(-1, q)
+        squares = np.einsum("kq,kq->q", flat, flat)
+        K = self._by_cameras(D) - self.W.reshape(3 * n, -1).T @ flat_C
+        g = flat.T @ self.v.ravel() - flat_C.T @ self.y.ravel() - K.T @ (self.Sinv @ self.t)
+        by_cameras = self.Sinv @ K
+        H = flat.T @ flat - flat_C.T @ flat_C - K.T @ by_cameras
+        m = self.photographs
+        by_points = np.swapaxes(self.L, 1, 2) @ (flat_C.reshape(n, 3, q) - self.W @ by_cameras)
+        left = D - self.B @ by_points[self.point]
+        left -= self.A[:, :, :6] @ by_cameras[: 6 * m].reshape(m, 6, q)[self.image]
+        left -= self.A[:, :, 6:] @ by_cameras[6 * m :]
+        return H, g, squares, left
+
+    def _by_cameras(self, D: FloatArray) -> FloatArray:
+        """Return A'D, (a, q)."""
+        m, q = self.photographs, D.shape[2]
+        by = np.swapaxes(self.A, 1, 2) @ D
+        K = np.zeros((len(self.t), q))
+        own = np.zeros((m, 6, q))
+        np.add.at(own, self.image, by[:, :6])
+        K[: 6 * m] = own.reshape(6 * m, q)
+        K[6 * m :] = by[:, 6:].sum(axis=0)
+        return K
+
+
+def reduce_adjustment(a: Adjustment, columns: Columns) -> Reduced:
+    """Return the accepted image points of a free adjustment with everything in it eliminated.
+
+    Args:
+        a: adjustment of image points, and weighted interior parameters at most; no control, no scale bars.
+        columns: derivatives of its image points.
+
+    Raises:
+        numpy.linalg.LinAlgError: the network is not determined.
+    """
+    network, m, n = a.network, len(a.network.images), len(a.network.points)
+    seen = network.image_points
+    used = np.flatnonzero(~a.rejected & columns.usable & np.isfinite(a.residuals).all(axis=1))
+    P = np.linalg.inv(a.image_covariance[used]) / a.sigma0**2
+    F = np.swapaxes(np.linalg.cholesky(P), 1, 2)
+    image, point = seen.image[used], seen.point[used]
+    v = np.einsum("kab,kb->ka", F, a.residuals[used])
+    B = F @ columns.point[used]
+    interior, prior = _free_interior(a)
+    A = np.concatenate([F @ columns.exterior[used], F @ interior[used]], axis=2)
+    size = 6 * m + interior.shape[2]
+    V, gp = np.zeros((n, 3, 3)), np.zeros((n, 3))
+    Bt = np.swapaxes(B, 1, 2)
+    np.add.at(V, point, Bt @ B)
+    np.add.at(gp, point, np.einsum("kab,kb->ka", Bt, v))
+    seen_points = np.bincount(point, minlength=n) > 1
+    V[~seen_points] = np.eye(3)
+    L = np.linalg.inv(np.linalg.cholesky(V))
+    W = np.zeros((n, 3, size))
+    by = Bt @ A
+    every = np.zeros((n, m, 3, 6))
+    np.add.at(every, (point, image), by[:, :, :6])
+    W[:, :, : 6 * m] = np.moveaxis(every, 1, 2).reshape(n, 3, 6 * m)
+    np.add.at(W[:, :, 6 * m :], point, by[:, :, 6:])
+    W[~seen_points] = 0.0
+    gp[~seen_points] = 0.0
+    W, y = L @ W, np.einsum("nab,nb->na", L, gp)
+    flat = W.reshape(3 * n, size)
+    S, t = _camera_normals(A, image, v, m, size)
+    S[range(6 * m, size), range(6 * m, size)] += prior
+    S -= flat.T @ flat
+    t = t - flat.T @ y.ravel()
+    S += _constraints(a, S, m)
+    idle = np.diagonal(S) == 0  # photographs without accepted image points
+    S[idle, idle] = 1.0
+    scale = 1 / np.sqrt(np.diagonal(S))
+    inverse = cho_solve(cho_factor(S * scale[:, None] * scale), np.diag(scale)) * scale[:, None]
+    return Reduced(
+        *(used, F, v, image, point, B, A, L, W, inverse, y, t, m, a.redundancy),
+    )
+
+
+def _free_interior(a: Adjustment) -> tuple[FloatArray, FloatArray]:
+    """Return the columns of the free interior parameters, (k, 2, i), and the weights of given values."""
+    network, cameras = a.network, a.estimate.cameras
+    groups: dict[tuple[str, str], FloatArray] = {}
+    for index, camera in enumerate(cameras):
+        if not (network.camera == index).any():
+            continue
+        free = [int(s) for s in np.flatnonzero(camera.free)]
+        found = interior_columns(a, index, free)
+        for column, s in enumerate(free):
+            key = (camera.group_of(s) or camera.name, camera.names[s])
+            groups[key] = groups.get(key, 0.0) + found[:, :, column]
+    given = network.interior
+    prior = dict.fromkeys(groups, 0.0)
+    for index, s, sigma in zip(given.camera, given.parameter, given.sigma, strict=True):
+        camera = cameras[index]
+        key = (camera.group_of(int(s)) or camera.name, camera.names[s])
+        if key in prior and sigma > 0:
+            prior[key] += (interior_step(a, int(index), int(s)) / float(sigma) / a.sigma0) ** 2
+    empty = np.zeros((len(network.image_points), 2, 0))
+    stacked = np.stack(list(groups.values()), axis=2) if groups else empty
+    return stacked, np.array(list(prior.values()))
+
+
+def _camera_normals(
+    A: FloatArray, image: IntArray, v: FloatArray, m: int, size: int
+) -> tuple[FloatArray, FloatArray]:
+    """Return A'A (a, a) and A'v (a,) of photographs and cameras."""
+    S, t = np.zeros((size, size)), np.zeros(size)
+    At = np.swapaxes(A, 1, 2)
+    N, b = At @ A, np.einsum("kab,kb->ka", At, v)
+    for i, rows in enumerate(rows_of(image, m)):
+        own = slice(6 * i, 6 * i + 6)
+        whole = N[rows].sum(axis=0)
+        S[own, own] = whole[:6, :6]
+        S[own, 6 * m :] = whole[:6, 6:]
+        S[6 * m :, own] = whole[6:, :6]
+        S[6 * m :, 6 * m :] += whole[6:, 6:]
+        t[own] = b[rows].sum(axis=0)[:6]
+        t[6 * m :] += b[rows].sum(axis=0)[6:]
+    return S, t
+
+
+def _constraints(a: Adjustment, S: FloatArray, m: int) -> FloatArray:
+    """Return G G' of the seven motions of the photographs, as heavy as the normals are."""
+    X0, R = a.estimate.position, a.estimate.rotation
+    centre = X0.mean(axis=0)
+    G = np.zeros((m, 6, 7))
+    G[:, :3, :3] = np.eye(3)
+    for axis in range(3):
+        turn = np.eye(3)[axis]
+        G[:, :3, 3 + axis] = np.cross(turn, X0 - centre)
+        G[:, 3:, 3 + axis] = np.einsum("mji,j->mi", R, turn)
+    G[:, :3, 6] = X0 - centre
+    scale = np.sqrt(np.diagonal(S)[: 6 * m])
+    heavy = np.zeros_like(S)
+    Q = np.linalg.qr(scale[:, None] * G.reshape(6 * m, 7))[0]
+    # with N scaled to a unit diagonal the constraints G'D dx = 0 have weight 1
+    heavy[: 6 * m, : 6 * m] = scale[:, None] * (Q @ Q.T) * scale
+    return heavy
+
+
+@dataclass(frozen=True)
+class Gain:
+    """What an alternative takes from v'Pv over the variance factor."""
+
+    value: float
+    rank: int  # of its parameters those that the image points determine
+    beta: FloatArray  # step of its parameters, (q,)
+
+
+def gain_of(H: FloatArray, g: FloatArray, squares: FloatArray) -> Gain:
+    """Return the gain of columns with normal equations H, g and squares before the elimination."""
+    scale = np.where(squares > 0, 1 / np.sqrt(np.where(squares > 0, squares, 1.0)), 0.0)
+    values, vectors = np.linalg.eigh(H * scale[:, None] * scale)
+    good = values > DETERMINED
+    projected = vectors[:, good].T @ (scale * g)
+    beta = -scale * (vectors[:, good] @ (projected / values[good]))
+    return Gain(float((projected**2 / values[good]).sum()), int(good.sum()), beta)
+
+
+def log_probability(gain: float, q: int, redundancy: int) -> float:
+    """Return ln of the probability of so large a gain by chance; v'Pv over the variance factor is r."""
+    left = redundancy - gain
+    if q < 1 or redundancy <= q:
+        return 0.0
+    if left <= 0:
+        return -np.inf
+    return log_f_sf((gain / q) / (left / (redundancy - q)), q, redundancy - q)
+
+
+def log_f_sf(f: float, q: int, d: int) -> float:
+    """Return ln of the probability that F of redundancies q and d is larger than f.
+
+    Beyond what a float holds by the series of the incomplete beta function.
+
+    Source: Abramowitz, Stegun (1964), Handbook of Mathematical Functions, 26.5.2 and 26.6.2.
+    """
+    p = float(f_sf(f, q, d))
+    if p > np.exp(SMALLEST_LOG):
+        return float(np.log(p))
+    half, x = d / 2, d / (d + q * f)
+    term, total = 1.0, 1.0
+    for i in range(MAX_TERMS):
+        term *= (half + q / 2 + i) / (half + 1 + i) * x
+        total += term
+        if term < np.finfo(float).eps * total:
+            break
+    return float(
+        half * np.log(x) + q / 2 * np.log1p(-x) - np.log(half) - special.betaln(half, q / 2) + np.log(total)
+    )
+
+
+def log_likelihood_gain(gain: float, redundancy: int, count: int) -> float:
+    """Return by how much ln of the likelihood grows where v'Pv falls from r by a gain; sigma0 unknown."""
+    left = max(redundancy - gain, np.finfo(float).tiny)
+    return float(count / 2 * np.log(redundancy / left))
