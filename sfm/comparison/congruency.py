@@ -20,7 +20,6 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve
 
 from sfm.comparison.stable_points import (
     StablePoints,
@@ -42,7 +41,6 @@ MIN_STABLE = 4  # points that a datum needs to be checked by at least one more t
 STABLE_FRACTION = 0.5  # of the points that must agree for the others to be called moved
 RANK = 1e-6  # of the largest singular value below which the points of reference are on a line
 THIN = 0.05  # extent over the longest one below which an object has no depth to bend along
-SAME_COLUMN = 1e-6  # singular value over the largest one below which a way to deform is no way of its own
 
 
 @dataclass(frozen=True)
@@ -184,32 +182,3 @@ def bending(xyz: FloatArray) -> FloatArray:
     terms = np.hstack([along, along[:, i] * along[:, j]])
     shapes: FloatArray = np.einsum("nk,xy->nxky", terms, np.eye(3))
     return shapes.reshape(3 * len(xyz), -1)
-
-
-def smooth_fraction(found: Congruency, xyz: FloatArray) -> float:
-    """Return which fraction of Omega of all points of reference a bending of the whole takes away.
-
-    Args:
-        found: the differences and their test.
-        xyz: coordinates, (n, 3).
-
-    Returns:
-        The fraction; 0 where the points are too few to tell.
-    """
-    difference, covariance, G = found.difference, found.covariance, found.motions
-    shapes = bending(xyz)
-    rows = np.repeat(found.reference, 3)
-    basis = np.linalg.qr(G[rows])[0]
-    B = shapes[rows] - basis @ (basis.T @ shapes[rows])
-    left, size, _ = np.linalg.svd(B, full_matrices=False)
-    B = left[:, size > SAME_COLUMN * size[0]]
-    if 2 * (B.shape[1] + basis.shape[1]) > len(B):
-        return 0.0
-    d = difference.ravel()[rows] - basis @ (basis.T @ difference.ravel()[rows])
-    Q = covariance[np.ix_(rows, rows)]
-    Q = Q - basis @ (basis.T @ Q)
-    Q = Q - (Q @ basis) @ basis.T
-    factor = cho_factor(Q + float(np.trace(Q)) / len(Q) * basis @ basis.T, lower=True)
-    w, W = cho_solve(factor, d), cho_solve(factor, B)  # d and B have no part along the basis
-    b = B.T @ w
-    return float(b @ np.linalg.solve(B.T @ W, b) / (d @ w))

@@ -68,12 +68,12 @@ def pair_results(a: StoredResult, b: StoredResult) -> Pairing:
     transform = _frame(a, b, points, images)
     if transform is not None:
         moved = transform.apply_estimate(b.estimate)
-        found = _by_place(
+        found = nearest_places(
             (a.estimate.points, a.estimate.determined), (moved.points, moved.determined), points
         )
         points = np.concatenate([points, found[~(ours[found[:, 0]] & theirs[found[:, 1]])]])
         if not (a.images_named and b.images_named):
-            found = _by_place(
+            found = nearest_places(
                 (a.estimate.position, a.estimate.oriented), (moved.position, moved.oriented), images
             )
             images = np.concatenate([images, found])
@@ -225,7 +225,7 @@ def _frame(a: StoredResult, b: StoredResult, points: IntArray, images: IntArray)
             except GeometryError:
                 continue
     as_they_are = Similarity(1.0, np.eye(3), np.zeros(3))
-    pairs = _by_place(
+    pairs = nearest_places(
         (a.estimate.points, a.estimate.determined), (b.estimate.points, b.estimate.determined), points
     )
     least = SAME_PLACE * min(int(a.estimate.determined.sum()), int(b.estimate.determined.sum()))
@@ -258,7 +258,9 @@ def fit_robustly(
     return found
 
 
-def _by_place(a: tuple[FloatArray, BoolArray], b: tuple[FloatArray, BoolArray], pairs: IntArray) -> IntArray:
+def nearest_places(
+    a: tuple[FloatArray, BoolArray], b: tuple[FloatArray, BoolArray], pairs: IntArray
+) -> IntArray:
     """Pair what is each other's nearest and far nearer than the next neighbour of either.
 
     Args:

@@ -9,8 +9,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sfm.comparison.congruency import Congruency, congruency, smooth_fraction
+from sfm.comparison.congruency import Congruency, congruency
 from sfm.comparison.pairing import Pairing
+from sfm.comparison.point_pairs import PointPairs, rounding_of
 from sfm.comparison.stable_points import critical_value
 from sfm.conventions import METRES, BoolArray, FloatArray, IntArray
 from sfm.errors import GeometryError
@@ -18,7 +19,6 @@ from sfm.similarity import Similarity
 from sfm.stored_result import StoredResult
 
 FREE_DATUMS = ("free", "")  # in which the covariance of single points says about what the whole one does
-HELD = 1e-12  # variance over the mean one below which a coordinate is held
 
 
 @dataclass(frozen=True)
@@ -35,23 +35,41 @@ class PointTest:
     stable: BoolArray
     approximate: bool = False
     majority: bool = True
-    smooth: float = 0.0
+
+    @property
+    def agrees(self) -> bool:
+        """Whether no test says that the points differ."""
+        return not (
+            self.global_statistic > self.global_critical or self.significant.any() or not self.majority
+        )
 
 
 def judge_points(
     a: StoredResult,
     b: StoredResult,
     pairing: Pairing,
+    pairs: tuple[PointPairs, IntArray, BoolArray],
     transform: Similarity,
-    difference: FloatArray,
     align: str,
     chosen: BoolArray,
     alpha: float,
 ) -> PointTest:
-    """Test the differences of the common points with all that is known of their covariance."""
+    """Test the differences of the common points with all that is known of their covariance.
+
+    Args:
+        a: first result.
+        b: second result.
+        pairing: what they have in common.
+        pairs: the points with their covariances, which these are, and which are known, by `pairs_of_results`.
+        transform: a_from_b.
+        align: what they are aligned by.
+        chosen: points that the alignment may be over, (n,).
+        alpha: of all tests together.
+    """
     pa, pb = pairing.points.T
     n = len(pa)
-    blocks = _sum(a.point_covariance, b.point_covariance, pa, pb, transform)
+    rounding = rounding_of(a.estimate.points[pa]) ** 2
+    blocks = _sum(a.point_covariance, b.point_covariance, pa, pb, transform, rounding)
     variance = np.einsum("njj->nj", blocks)
     sigma = np.sqrt(np.where(variance >= 0, variance, np.nan))
     nothing = np.full(n, np.nan)
@@ -65,52 +83,41 @@ def judge_points(
     if not any(has_sigma(one) for one in (a, b)):
         return without("no standard deviations")
     known = [one for one in (a, b) if has_sigma(one)]
-    redundancies = [one.redundancy for one in (a, b) if one.redundancy is not None]
-    redundancy = sum(redundancies) if redundancies else None
-    in_control = all(one.datum == "control" for one in known)
+    points, free, together = pairs
     if all(one.covariance is not None for one in known):
-        if align == "none" and not in_control:
+        if align == "none" and not all(one.datum == "control" for one in known):
             return without("no common datum")
-        rows_a, rows_b = a.covariance_rows(pa), b.covariance_rows(pb)
-        both = np.flatnonzero((rows_a >= 0) & (rows_b >= 0))
-        Q = joint_covariance(a, rows_a[both], 1.0, np.eye(3))
-        Q += joint_covariance(b, rows_b[both], transform.scale, transform.rotation)
-        kept = ~held_points(np.diagonal(Q).reshape(-1, 3)) if in_control else every[: len(both)]
-        rows, free = np.repeat(kept, 3), both[kept]
+        d, Q = points.differences(transform)
         try:
             found = congruency(
-                difference[free],
-                Q[np.ix_(rows, rows)],
-                a.estimate.points[pa[free]],
-                motion="none" if align == "none" else "similarity" if known_scale(a, b) is None else "rigid",
-                redundancy=redundancy,
+                *(d, Q, points.a),
+                motion="none" if align == "none" else "similarity" if points.scale is None else "rigid",
+                redundancy=points.redundancy,
                 reference=chosen[free],
                 alpha=alpha,
             )
         except GeometryError as error:
             return without(str(error))
-        sigma[both] = 0.0  # held in both, or written over
-        return _of_congruency(found, a.estimate.points[pa[free]], free, sigma, np.isin(np.arange(n), both))
+        sigma[together] = 0.0  # held in both, or written over
+        return _of_congruency(found, free, sigma, together)
     if not all(one.datum in FREE_DATUMS for one in known):
         return without("covariance of single points only")
-    statistic, critical, global_critical = _single_tests(difference, blocks, redundancy, alpha)
+    difference = transform.apply(b.estimate.points[pb]) - a.estimate.points[pa]
+    statistic, critical, global_critical = _single_tests(difference, blocks, points.redundancy, alpha)
     if not np.isfinite(statistic).any():
         return without("no standard deviations of common points")
-    together = float(np.nanmean(statistic))
+    mean = float(np.nanmean(statistic))
     return PointTest(
-        *(sigma, "", statistic, critical, statistic > critical, together, global_critical, every),
+        *(sigma, "", statistic, critical, statistic > critical, mean, global_critical, every),
         approximate=True,
     )
 
 
-def _of_congruency(
-    found: Congruency, xyz: FloatArray, tested: IntArray, sigma: FloatArray, together: BoolArray
-) -> PointTest:
+def _of_congruency(found: Congruency, tested: IntArray, sigma: FloatArray, together: BoolArray) -> PointTest:
     """Return the test of all points where some took no part, held in both results or of unknown correlation.
 
     Args:
         found: of the tested points.
-        xyz: their coordinates, (k, 3).
         tested: their indices, (k,).
         sigma: of all differences, written over where tested, (n, 3).
         together: points whose covariance together is known, on which alone an alignment may rest, (n,).
@@ -124,45 +131,19 @@ def _of_congruency(
     significant = np.zeros(n, dtype=bool)
     significant[tested] = found.moved
     first, critical = found.first_test, float(found.critical[found.reference][0])
-    smooth = smooth_fraction(found, xyz) if first.statistic > first.critical else 0.0
     return PointTest(
         *(sigma, "", statistic, critical, significant, first.statistic, first.critical),
-        *(stable, False, found.agreed, smooth),
+        *(stable, False, found.agreed),
     )
 
 
-def joint_covariance(
-    result: StoredResult, points: IntArray, scale: float, rotation: FloatArray
-) -> FloatArray:
-    """Return the covariance of some points together, scaled and turned, (3 n, 3 n); 0 where none is known.
-
-    Args:
-        result: with its covariance.
-        points: rows of the covariance, see `StoredResult.covariance_rows`, (n,).
-        scale: factor of lengths.
-        rotation: of the axes, (3, 3).
-    """
-    n = len(points)
-    if result.covariance is None:
-        return np.zeros((3 * n, 3 * n))
-    rows = (3 * points[:, None] + np.arange(3)).ravel()
-    Q = result.covariance[np.ix_(rows, rows)].reshape(n, 3, n, 3)
-    J = scale * rotation
-    moved: FloatArray = np.einsum("xa,iajb,yb->ixjy", J, Q, J, optimize=True)
-    return moved.reshape(3 * n, 3 * n)
-
-
-def held_points(variance: FloatArray) -> BoolArray:
-    """Return whether a coordinate of a point is known without error, so that nothing is left to test, (n,).
-
-    Args:
-        variance: of the coordinates, object unit^2, (n, 3).
-    """
-    return np.asarray((variance <= HELD * variance.mean()).any(axis=1))
-
-
 def _sum(
-    a: FloatArray | None, b: FloatArray | None, pa: IntArray, pb: IntArray, transform: Similarity
+    a: FloatArray | None,
+    b: FloatArray | None,
+    pa: IntArray,
+    pb: IntArray,
+    transform: Similarity,
+    rounding: float,
 ) -> FloatArray:
     """Covariance of the differences, NaN where neither is known; one that is not known counts as 0."""
     unknown = np.full((len(pa), 3, 3), np.nan)
@@ -171,7 +152,7 @@ def _sum(
     theirs = unknown if b is None else J @ b[pb] @ J.T
     first = np.isfinite(ours).all(axis=(1, 2), keepdims=True)
     second = np.isfinite(theirs).all(axis=(1, 2), keepdims=True)
-    total = np.where(first, ours, 0.0) + np.where(second, theirs, 0.0)
+    total = np.where(first, ours, 0.0) + np.where(second, theirs, 0.0) + rounding * np.eye(3)
     return np.where(first | second, total, np.nan)
 
 

@@ -6,7 +6,8 @@ the covariance of all points together is known, both are brought into one datum 
 `sfm.comparison.congruency`, which also finds the points that moved; then the alignment is over those that did
 not. Where only the covariance of each single point is known, each difference d is tested by
 T = d' (Qa + Qb)^-1 d / 3, an approximation that is made for free networks only. Results that were adjusted
-from the same image points are not independent and are not tested.
+from the same image points are not independent and are not tested. What else than points that moved may be
+the reason is in `sfm.comparison.causes`.
 
 Source: Luhmann et al. (2020), Close-Range Photogrammetry and 3D Imaging, sec. 2.4.2; Caspary (2000),
 Concepts of network and deformation analysis, sec. 7.
@@ -20,7 +21,9 @@ import numpy as np
 
 from sfm.camera import Camera
 from sfm.comparison.camera_conversion import Conversion, convert_camera
+from sfm.comparison.causes import Cause, find_cause
 from sfm.comparison.pairing import SAME_RAY_PX, Pairing, pair_results
+from sfm.comparison.point_pairs import pairs_of_results
 from sfm.comparison.point_tests import has_sigma, judge_points, known_scale
 from sfm.comparison.solutions import rotation_angle_deg
 from sfm.conventions import BoolArray, FloatArray, IntArray
@@ -72,7 +75,7 @@ class ResultComparison:
     global_critical: float  # of the global test; NaN without tests
     stable: BoolArray  # points that the alignment is over, (n,); all of them where nothing moved
     majority: bool  # whether most of the points agree; if not, nobody knows which of them moved
-    smooth: float  # fraction of the square sum of a significant change that a bending of the whole explains
+    cause: Cause | None  # what explains that they differ; None where single points moved, or nothing does
     images: tuple[str, ...]  # names in a of the common photographs, m of them
     position_difference: FloatArray  # of projection centres, object unit of a, (m, 3)
     rotation_deg: FloatArray  # angle between the rotations, deg, (m,)
@@ -86,6 +89,8 @@ class ResultComparison:
     @property
     def changed(self) -> bool | None:
         """Whether the points differ significantly, as a whole or singly; None if that is not tested."""
+        if self.cause is not None:
+            return True
         if self.untested:
             return None
         return bool(
@@ -130,9 +135,8 @@ def compare_results(
     transform = _align(a, b, align, pairing, chosen, scale)
     same_share = _same_share(a.network, b.network, pairing)
     moved = transform.apply_estimate(b.estimate)
-    test = judge_points(
-        a, b, pairing, transform, moved.points[pb] - a.estimate.points[pa], align, chosen, alpha
-    )
+    pairs = pairs_of_results(a, b, pairing.points, scale)
+    test = judge_points(a, b, pairing, pairs, transform, align, chosen, alpha)
     if same_share > SAME_SHARE:
         test = replace(test, untested="same image points")
     stable = chosen & test.stable if align == "control" else test.stable
@@ -140,6 +144,11 @@ def compare_results(
         transform = fit_similarity(b.estimate.points[pb[stable]], a.estimate.points[pa[stable]], scale=scale)
         moved = transform.apply_estimate(b.estimate)
     tested = not test.untested
+    points, free, _ = pairs
+    cause = None
+    if align != "none" and any(has_sigma(one) for one in (a, b)):
+        agrees = tested and test.agrees
+        cause = find_cause(points, reference=chosen[free], changed=not agrees)
     nothing = np.full(len(pa), np.nan)
     return ResultComparison(
         names=(a.name, b.name),
@@ -162,7 +171,7 @@ def compare_results(
         global_critical=test.global_critical if tested else np.nan,
         stable=stable | (not tested),
         majority=test.majority,
-        smooth=test.smooth if tested else 0.0,
+        cause=cause,
         images=tuple(a.network.images[i] for i in ia),
         position_difference=moved.position[ib] - a.estimate.position[ia],
         rotation_deg=rotation_angle_deg(a.estimate.rotation[ia], moved.rotation[ib]),

@@ -22,11 +22,11 @@ import numpy as np
 
 from sfm.comparison.congruency import MOTIONS, motions
 from sfm.comparison.pairing import fit_robustly, pair_results
-from sfm.comparison.point_tests import held_points, joint_covariance, known_scale
+from sfm.comparison.point_pairs import PointPairs, coordinates_of, held_points, pairs_of_results
+from sfm.comparison.point_tests import known_scale
 from sfm.conventions import FloatArray, IntArray
 from sfm.epochs.epoch import SAME, Epoch, given_observations
 from sfm.errors import GeometryError
-from sfm.similarity import Similarity
 from sfm.stored_result import StoredResult
 
 
@@ -37,6 +37,7 @@ class Differences:
     names: tuple[str, str]  # of the epochs
     unit: str
     points: tuple[str, ...]  # names in the first epoch, n of them
+    pairs: PointPairs  # the points of both epochs, each in its frame
     xyz: FloatArray  # in the first epoch, object unit, (n, 3)
     difference: FloatArray  # object unit, (n, 3)
     covariance: FloatArray  # of the differences, object unit^2, (3 n, 3 n)
@@ -102,23 +103,20 @@ def epoch_differences(first: Epoch, second: Epoch) -> Differences:
     if scale is None and a.has_scale and b.has_scale:
         raise GeometryError(f"{first.name} is in {a.unit} and {second.name} in {b.unit}: give both one unit")
     moved = fit_robustly(b.estimate.points[pb], a.estimate.points[pa], scale=scale)
-    xyz = a.estimate.points[pa]
-    Q = joint_covariance(a, rows_a[kept], 1.0, np.eye(3))
-    Q += joint_covariance(b, rows_b[kept], moved.scale, moved.rotation)
-    C, shared = (_correlated if together else _shared)(first, second, pairs, moved)
-    Q -= C
-    Q -= C.T
-    known = [one.redundancy for one in (a, b) if one.redundancy is not None]
+    C, shared = (_correlated if together else _shared)(first, second, pairs)
+    points = replace(pairs_of_results(a, b, pairs, scale)[0], C=C)
+    difference, Q = points.differences(moved)
     held_alike, held_apart = _held_cameras(a, b)
     return Differences(
         names=(first.name, second.name),
         unit=a.unit,
-        points=tuple(a.network.points[j] for j in pa),
-        xyz=xyz,
-        difference=moved.apply(b.estimate.points[pb]) - xyz,
+        points=points.names,
+        pairs=points,
+        xyz=points.a,
+        difference=difference,
         covariance=Q,
         motion="similarity" if scale is None else "rigid",
-        redundancy=sum(known) if known else None,
+        redundancy=points.redundancy,
         only_first=others[0],
         only_second=others[1],
         by_place=pairing.points_by_place,
@@ -182,9 +180,7 @@ def _refuse_shared_calibration(first: Epoch, second: Epoch) -> None:
             )
 
 
-def _correlated(
-    first: Epoch, second: Epoch, pairs: IntArray, frame: Similarity
-) -> tuple[FloatArray, tuple[str, ...]]:
+def _correlated(first: Epoch, second: Epoch, pairs: IntArray) -> tuple[FloatArray | None, tuple[str, ...]]:
     """Return C of two epochs that were adjusted together, and in words what both were given."""
     assert first.common is not None and second.common is not None
     a, b = first.common, second.common
@@ -192,12 +188,10 @@ def _correlated(
         a.columns[:, : len(a.given)].any(axis=0) & b.columns[:, : len(b.given)].any(axis=0)
     )
     words = tuple(a.given[k].partition(" = ")[0] for k in given)
-    return _covariance(first, second, a.columns * a.signs, b.columns, pairs, frame), words
+    return _covariance(first, second, a.columns * a.signs, b.columns, pairs), words
 
 
-def _shared(
-    first: Epoch, second: Epoch, pairs: IntArray, frame: Similarity
-) -> tuple[FloatArray, tuple[str, ...]]:
+def _shared(first: Epoch, second: Epoch, pairs: IntArray) -> tuple[FloatArray | None, tuple[str, ...]]:
     """Return C of two epochs that were given the same values, and these in words."""
     mine: list[FloatArray] = []
     yours: list[FloatArray] = []
@@ -215,17 +209,13 @@ def _shared(
             found.append(sum((Q[:, k] * g for k, g in gradient), start=np.zeros(len(Q))) / (s * epoch.sigma0))
         words.append(key)
     if not words:
-        return np.zeros((3 * len(pairs), 3 * len(pairs))), ()
-    return _covariance(first, second, np.stack(mine, axis=1), np.stack(yours, axis=1), pairs, frame), tuple(
-        words
+        return None, ()
+    return _covariance(first, second, np.stack(mine, axis=1), np.stack(yours, axis=1), pairs), tuple(words)
+
+
+def _covariance(first: Epoch, second: Epoch, a: FloatArray, b: FloatArray, pairs: IntArray) -> FloatArray:
+    """Return a b' of the common points, each epoch in its frame, (3 n, 3 n)."""
+    rows_a, rows_b = (
+        coordinates_of(one.result.covariance_rows(p)) for one, p in zip((first, second), pairs.T, strict=True)
     )
-
-
-def _covariance(
-    first: Epoch, second: Epoch, a: FloatArray, b: FloatArray, pairs: IntArray, frame: Similarity
-) -> FloatArray:
-    """Return a b' of the common points, the second epoch turned into the frame of the first, (3 n, 3 n)."""
-    pa, pb = (one.result.covariance_rows(p) for one, p in zip((first, second), pairs.T, strict=True))
-    turn, q = frame.scale * frame.rotation, a.shape[1]
-    turned = np.einsum("xi,nik->nxk", turn, b.reshape(-1, 3, q)[pb]).reshape(3 * len(pb), q)
-    return np.asarray(a.reshape(-1, 3, q)[pa].reshape(3 * len(pa), q) @ turned.T)
+    return np.asarray(a[rows_a] @ b[rows_b].T)

@@ -16,7 +16,8 @@ import numpy as np
 from scipy.special import ncfdtr
 
 from sfm.adjustment.quality.statistics import POWER
-from sfm.comparison.congruency import Congruency, congruency, smooth_fraction
+from sfm.comparison.causes import Cause, find_cause
+from sfm.comparison.congruency import Congruency, congruency
 from sfm.comparison.stable_points import critical_value, point_blocks
 from sfm.conventions import BoolArray, FloatArray
 from sfm.distributions import chi2_isf
@@ -35,7 +36,7 @@ class Displacements:
     detectable: (
         FloatArray  # smallest displacement, in its worst direction, found with POWER, object unit, (n,)
     )
-    smooth: float  # fraction of Omega of the reference that a bending of the whole takes away
+    cause: Cause | None  # what explains the differences; None where single points moved, or nothing does
     alpha: float
 
     @property
@@ -82,7 +83,7 @@ class Displacements:
     @property
     def changed(self) -> bool:
         """Whether anything moved."""
-        return bool(self.moved.any()) or not self.agreed
+        return bool(self.moved.any()) or not self.agreed or self.cause is not None
 
 
 def displacements(
@@ -109,7 +110,11 @@ def displacements(
         differences=found,
         congruency=tested,
         detectable=_detectable(tested, found.redundancy),
-        smooth=0.0 if tested.agreed else smooth_fraction(tested, found.xyz),
+        cause=find_cause(
+            found.pairs,
+            reference=tested.reference,
+            changed=not (tested.agreed and tested.stable[tested.reference].all()),
+        ),
         alpha=alpha,
     )
 

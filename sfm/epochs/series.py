@@ -49,9 +49,14 @@ class EpochSeries:
     cameras: tuple[SharedCamera, ...] = ()  # with one interior orientation in all epochs adjusted together
 
     @property
+    def pairs(self) -> tuple[EpochPair, ...]:
+        """Every pair of epochs once: those with the first, then those with the one before."""
+        return (*self.since_first, *self.since_previous[1:])
+
+    @property
     def changed(self) -> bool:
         """Whether anything moved between any two of them."""
-        return any(pair.displacements.changed for pair in (*self.since_first, *self.since_previous))
+        return any(pair.displacements.changed for pair in self.pairs)
 
 
 def analyse_epochs(

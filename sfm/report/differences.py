@@ -9,30 +9,18 @@ from typing import Any
 
 import numpy as np
 
-from sfm.comparison.significance import InteriorDifference, ResultComparison
+from sfm.comparison.findings import verdict_of_comparison
+from sfm.comparison.significance import ResultComparison
 from sfm.conventions import FloatArray
-from sfm.distortion.models import MODELS, Role
-from sfm.files.covariance_file import MAX_POINTS
 from sfm.files.plain_text import csv_text, or_none
 from sfm.report.figures.comparisons import difference_figure
 from sfm.report.figures.plot_data import Plot
 from sfm.report.figures.plots import png
 from sfm.report.html.page import render
-from sfm.report.numbers import finer_unit, general, significant
+from sfm.report.numbers import finer_unit, significant
 from sfm.report.page_files import write_files
 
 COLUMNS = ("id", "dX", "dY", "dZ", "sdX", "sdY", "sdZ", "T", "significant")
-WHY_UNTESTED = {
-    "no standard deviations": "neither result knows its standard deviations",
-    "no standard deviations of common points": "the standard deviations of the common points are not known",
-    "no common datum": "without an alignment only results in the datum of control are in one frame",
-    "covariance of single points only": "the covariance between the points is not known, which a result of "
-    "this version keeps; in a minimal datum or one of control, and between different datums, nothing can be "
-    "said without",
-}
-MANY = MAX_POINTS + 1  # points of which only a sample is kept with its covariance
-SMOOTH = 0.5  # fraction that a bending explains from which on a camera is the likely cause
-OTHER_SIGMAS = 5.0  # standard deviations from which on an interior orientation is another one
 FILES = ("differences.csv", "comparison.json", "comparison.html")
 PICTURE = (
     "Differences of the points: arrows in the object's main plane, significant ones in red; the colour of "
@@ -69,6 +57,7 @@ def write_differences(found: ResultComparison, xyz: FloatArray, out: Path) -> Pa
 
 def differences_summary(found: ResultComparison) -> dict[str, Any]:
     """Return what comparison.json holds: plain values only, None for what is not known."""
+    verdict = verdict_of_comparison(found)
     return {
         "results": list(found.names),
         "length_unit": found.unit,
@@ -90,8 +79,8 @@ def differences_summary(found: ResultComparison) -> dict[str, Any]:
         "rms_position": or_none(_rms(found.position_difference)),
         "max_rotation_deg": or_none(_largest(found.rotation_deg)),
         "changed": found.changed,
-        "bending": found.smooth,
-        "causes": list(words_of_cause(found)),
+        "verdict": verdict.level,
+        "remarks": [one.as_dict() for one in verdict.remarks],
         "untested": found.untested or None,
         "approximate": found.approximate,
         "tested": _tested(found),
@@ -117,84 +106,6 @@ def differences_summary(found: ResultComparison) -> dict[str, Any]:
             for one in found.interior
         ],
     }
-
-
-def words_of_test(found: ResultComparison) -> tuple[str, str]:
-    """Return in words what the test of the points says, or why there is none, and good | fair | bad."""
-    if not found.points:
-        return "No points in common: only photographs and cameras are compared.", "fair"
-    if not found.independent:
-        return (
-            f"Not tested: {found.same_share:.0%} of the image points of {found.names[0]} are those of "
-            f"{found.names[1]}. The differences are those of adjusters, models and datum.",
-            "fair",
-        )
-    if found.untested:
-        return f"Not tested: {WHY_UNTESTED.get(found.untested, found.untested)}.", "fair"
-    about = " Approximate: the covariance between points is not known." if found.approximate else ""
-    tested, of = _tested(found), len(found.points)
-    if tested < MANY <= of:
-        of = tested
-        about = (
-            f" Tested: {tested} of {len(found.points)} points, whose covariance together both results keep."
-        )
-    moved = int(found.significant.sum())
-    if not found.majority:
-        return f"The points differ significantly, and no half of them agree.{about}", "bad"
-    if moved:
-        return (
-            f"The points differ significantly: {moved} of {of} moved.{about}",
-            "bad",
-        )
-    if found.changed:
-        return f"The points differ significantly as a whole, none of them singly.{about}", "bad"
-    return f"The points do not differ significantly.{about}", "good"
-
-
-def words_of_cause(found: ResultComparison) -> tuple[str, ...]:
-    """Return what besides a change of the object may be the cause of significant differences, in sentences.
-
-    Unmodelled motion of a lens bends an object as a whole and shows as interior orientations of one camera
-    that differ by many standard deviations.
-    """
-    if not found.changed or not found.independent:
-        return ()
-    lines = []
-    bent = found.smooth > SMOOTH
-    if bent:
-        lines.append(
-            f"A bending of the whole explains {found.smooth:.0%} of the weighted square sum: a camera that "
-            "is not described well does that, single points that move do not."
-        )
-    others = [line for one in found.interior if (line := _words_of_interior(one))]
-    lines += others
-    if bent or others:
-        names = dict.fromkeys(
-            name
-            for one in found.interior
-            for name in MODELS[one.model].names_of(Role.FOCAL, Role.X0, Role.Y0)
-            if name in one.names
-        ) or ("c", "x0", "y0")
-        written = ", ".join(f'"{name}"' for name in names)
-        lines.append(
-            "If a lens was zoomed, focused or loose between photographs, adjust both with "
-            f"per_photograph = [{written}] and compare again before calling it a change of the object."
-        )
-    return tuple(lines)
-
-
-def _words_of_interior(one: InteriorDifference) -> str:
-    """Return in words by how much the interior orientation of a camera is another one, empty if it is not."""
-    with np.errstate(invalid="ignore", divide="ignore"):
-        sigmas = np.where(one.sigma > 0, np.abs(one.difference) / one.sigma, 0.0)
-    worst = int(np.argmax(sigmas))
-    if sigmas[worst] < OTHER_SIGMAS:
-        return ""
-    unit = f" {one.units[worst]}" if one.units[worst] else ""
-    return (
-        f"Camera {one.camera} has another interior orientation: {one.names[worst]} differs by "
-        f"{general(abs(one.difference[worst]), 3)}{unit}, {sigmas[worst]:.0f} standard deviations."
-    )
 
 
 def words_of_pairing(found: ResultComparison) -> str:
@@ -227,15 +138,15 @@ def largest_difference(found: ResultComparison) -> str:
 
 def differences_page(found: ResultComparison, xyz: FloatArray) -> str:
     """Return the page: verdict, figures, picture and tables."""
-    verdict, level = words_of_test(found)
+    verdict = verdict_of_comparison(found)
     largest = _longest(found.point_difference)
     return render(
         "comparison.html",
-        headline=verdict,
-        causes=words_of_cause(found),
+        headline=verdict.headline,
+        level=verdict.level,
+        remarks=verdict.texts,
         paired=words_of_pairing(found),
         scale=words_of_scale(found),
-        level=level,
         found=found,
         size={
             "rms_point": _rms(found.point_difference),

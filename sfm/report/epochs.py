@@ -13,16 +13,15 @@ from sfm.adjustment.quality.statistics import POWER
 from sfm.conventions import FloatArray
 from sfm.display import listed
 from sfm.epochs.blocks import BlockMotion
-from sfm.epochs.differences import Differences
 from sfm.epochs.displacements import Displacements
+from sfm.epochs.findings import verdict_of_epochs
 from sfm.epochs.series import EpochPair, EpochSeries
-from sfm.epochs.together import SharedCamera
 from sfm.files.plain_text import csv_text, or_none
 from sfm.report.figures.comparisons import difference_figure, series_figure
 from sfm.report.figures.plot_data import Plot
 from sfm.report.figures.plots import png
 from sfm.report.html.page import render
-from sfm.report.numbers import finer_unit, significant
+from sfm.report.numbers import finer_unit
 from sfm.report.page_files import write_files
 from sfm.report.viewer.displaced_scene import scene_of_displacements
 from sfm.report.viewer.embedded import Viewer, viewer_of
@@ -36,8 +35,6 @@ COLUMNS = (
 )
 SERIES = ("id", "epoch", "dX", "dY", "dZ", "sdX", "sdY", "sdZ", "moved")
 DRAWN = 12  # points of a series that are drawn, those that moved farthest
-MOSTLY = 0.5  # of Omega: what a bending takes away of it is told from here on
-OTHER_OBJECT = 0.1  # of the size of the object: median displacement from which it may be another one
 PICTURE = (
     "Displacements: arrows in the object's main plane, points that moved in red; the colour of the dots is "
     "the displacement out of the plane."
@@ -57,43 +54,12 @@ def write_epochs(found: EpochSeries, out: Path) -> Path:
     """
     text = json.dumps(epochs_summary(found), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
     texts = (
-        csv_text(COLUMNS, (row for pair in pairs_of(found) for row in _rows(pair.displacements))),
+        csv_text(COLUMNS, (row for pair in found.pairs for row in _rows(pair.displacements))),
         csv_text(SERIES, _series_rows(found)),
         text,
         epochs_page(found),
     )
     return write_files(out, tuple(zip(FILES, texts, strict=True)), main=FILES[-1])
-
-
-def pairs_of(found: EpochSeries) -> tuple[EpochPair, ...]:
-    """Return every pair of epochs once: those with the first, then those with the one before."""
-    return (*found.since_first, *found.since_previous[1:])
-
-
-def words_of_pair(found: Displacements) -> tuple[str, str]:
-    """Return in words what moved between two epochs, and good | fair | bad for the colour of the page."""
-    first, second = found.differences.names
-    between = f"{first} to {second}"
-    if not found.agreed:
-        cause = (
-            f"; {found.smooth:.0%} of it is a bending of the whole, as a wrongly described camera makes it"
-            if found.smooth > MOSTLY
-            else ""
-        )
-        misfit = float(np.median(np.linalg.norm(found.displacement, axis=1)))
-        if misfit > OTHER_OBJECT * float(np.linalg.norm(np.ptp(found.differences.xyz, axis=0))):
-            cause = "; half of them by a tenth of the object or more: are they epochs of one object?"
-        return f"{between}: the points of reference differ, and no half of them agrees{cause}", "bad"
-    names = [n for n, moved in zip(found.differences.points, found.moved, strict=True) if moved]
-    if not names:
-        return f"{between}: no displacement is significant", "good"
-    farthest = float(np.linalg.norm(found.displacement[found.moved], axis=1).max())
-    factor, unit = finer_unit(found.differences.unit, farthest)
-    length = f"{significant(farthest * factor)} {unit or 'object units'}"
-    return (
-        f"{between}: {len(names)} of {len(found.moved)} points moved, by up to {length} ({_names(names)})",
-        "fair",
-    )
 
 
 def words_of_stable(found: Displacements) -> str:
@@ -131,38 +97,14 @@ def words_of_block(block: BlockMotion) -> str:
     return f"{block.name} ({len(block.points)} points, {block.model}): {how}; {rest}"
 
 
-def words_of_held(found: Differences) -> tuple[str, ...]:
-    """Return in words which calibrations were held, whose errors no standard deviation contains."""
-    told = []
-    if found.held_alike:
-        told.append(
-            f"Both epochs hold the same interior orientation of camera {_names(found.held_alike)}: its error "
-            "is in no standard deviation. What it does to both alike cancels; where photographs and object "
-            "are not the same, the rest can pass for a movement. Adjust it (free), or together from a "
-            "calibration with standard deviations (--together)."
-        )
-    if found.held_apart:
-        told.append(
-            f"Interior orientation of camera {_names(found.held_apart)} is held in one epoch only, or at "
-            "other values in the other: its error is in no standard deviation, does not cancel, and can pass "
-            "for a movement. Adjust it (free)."
-        )
-    return tuple(told)
-
-
-def words_of_camera(camera: SharedCamera) -> str:
-    """Return in words that epochs were adjusted together with one camera."""
-    return (
-        f"Camera {camera.name} has one interior orientation in {', '.join(camera.epochs)}: they agree on it "
-        f"(T {significant(camera.statistic)}, limit {significant(camera.critical)})."
-    )
-
-
 def epochs_summary(found: EpochSeries) -> dict[str, Any]:
     """Return what epochs.json holds: plain values only, None for what is not known."""
+    verdict = verdict_of_epochs(found)
     return {
         "epochs": list(found.names),
         "changed": found.changed,
+        "verdict": verdict.level,
+        "remarks": [one.as_dict() for one in verdict.remarks],
         "adjusted_together": [
             {
                 "camera": one.name,
@@ -173,25 +115,21 @@ def epochs_summary(found: EpochSeries) -> dict[str, Any]:
             }
             for one in found.cameras
         ],
-        "pairs": [_pair(p) for p in pairs_of(found)],
+        "pairs": [_pair(p) for p in found.pairs],
     }
 
 
 def epochs_page(found: EpochSeries) -> str:
     """Return the page: verdict, pairs of epochs with their tests, displacements and groups."""
-    pairs = pairs_of(found)
-    told = [words_of_pair(pair.displacements) for pair in pairs]
-    levels = [level for _, level in told]
-    level = next((one for one in ("bad", "fair") if one in levels), "good")
+    verdict = verdict_of_epochs(found)
     return render(
         "epochs.html",
         title=" - ".join((found.names[0], found.names[-1])),
-        headline=told[len(found.since_first) - 1][0],
-        remarks=[words for k, (words, _) in enumerate(told) if k != len(found.since_first) - 1],
-        level=level,
+        headline=verdict.headline,
+        remarks=verdict.texts,
+        level=verdict.level,
         power=POWER,
         viewer=_viewer(found),
-        cameras=[words_of_camera(one) for one in found.cameras],
         pairs=[
             {
                 "found": pair.displacements,
@@ -201,10 +139,9 @@ def epochs_page(found: EpochSeries) -> str:
                 "groups": pair.blocks,
                 "picture": _picture(pair.displacements, k),
             }
-            for k, pair in enumerate(pairs)
+            for k, pair in enumerate(found.pairs)
         ],
         words_of_block=words_of_block,
-        words_of_held=words_of_held,
         names=_names,
         series=_series_picture(found),
     )

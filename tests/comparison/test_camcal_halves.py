@@ -14,10 +14,11 @@ import pytest
 import sfm
 from adapters.formats.registry import format_named, read_comparable, write_any
 from sfm.comparison.camera_conversion import convert_cameras
+from sfm.comparison.findings import verdict_of_comparison
 from sfm.comparison.significance import compare_results
 from sfm.comparison.undistortion import undistort
 from sfm.pipeline import run_survey
-from sfm.report.differences import words_of_cause, words_of_pairing, words_of_scale, words_of_test
+from sfm.remarks.remark import kinds_of
 from sfm.survey.inputs.given import ScaleBar
 from sfm.survey.inputs.survey import Survey
 from sfm.survey.measuring.measured_store import MeasuredStore
@@ -62,20 +63,22 @@ def halves(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
 def test_halves_are_compared_by_what_they_are(halves: tuple[Path, Path]) -> None:
     first, second = (read_comparable(folder, None) for folder in halves)
     found = compare_results(first, second, align="points", control=())
-    print(words_of_pairing(found), words_of_scale(found), words_of_test(found), sep="\n")
     assert len(found.points) >= 90
     length = np.linalg.norm(np.asarray(found.point_difference), axis=1)
     assert length.max() < 2e-3  # m; with the numbers of uncoded points as names it was 0.88 m
-    said = " ".join(words_of_cause(found))
-    print(said)
-    assert "A bending of the whole explains" in said and "Camera olympus has another interior" in said
+    verdict = verdict_of_comparison(found)
+    print(*verdict.texts, sep="\n")
+    assert {"bent", "interior_differs"} <= set(kinds_of(verdict.remarks))
 
 
 def test_halves_agree_where_each_photograph_has_a_lens_of_its_own(tmp_path: Path) -> None:
     """The difference of the halves is the motion of the zoom lens between the exposures."""
     folders = written_halves(tmp_path, ("c", "x0", "y0"))
     found = compare_results(*(read_comparable(folder, None) for folder in folders))
-    print(words_of_test(found), f"{found.global_statistic:.3f}, critical {found.global_critical:.3f}")
+    print(
+        *verdict_of_comparison(found).texts,
+        f"{found.global_statistic:.3f}, critical {found.global_critical:.3f}",
+    )
     assert found.stable.sum() >= 95 and found.global_statistic < 1.5
     assert np.sqrt((found.point_difference**2).mean()) < 1.5 * np.sqrt((found.point_sigma**2).mean())
 
@@ -94,7 +97,6 @@ def test_a_result_is_its_own_model_in_other_formats(
     target = tmp_path / ("model.txt" if form == "bal" else "model")
     write_any(target, form, network, estimate)
     found = compare_results(first, read_comparable(target, form), align="points", control=())
-    print(form, words_of_pairing(found), words_of_test(found), sep="\n")
     assert len(found.points) == len(first.network.points)
     if form != "colmap-text":
         assert found.pairing.points_by_image_points == len(found.points)

@@ -23,7 +23,6 @@ from sfm.distributions import t_ppf
 from sfm.epochs.epoch import Epoch
 from sfm.epochs.series import EpochSeries, analyse_epochs
 from sfm.network import Estimate, Network
-from sfm.report.epochs import pairs_of
 from sfm.similarity import fit_similarity
 from tests.places import DATASETS, ROOT
 from tests.synthetic import stored_of
@@ -107,7 +106,7 @@ def test_the_sag_is_found_from_few_photographs() -> None:
     found = points_alone()
     assert found.cameras[0].same and found.cameras[0].epochs == ("first", "second", "third")
     shares = []
-    for pair in (one.displacements for one in pairs_of(found)):
+    for pair in (one.displacements for one in found.pairs):
         names, d = pair.differences.names, pair.displacement
         points = list(pair.differences.points)
         rows = [

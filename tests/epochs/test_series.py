@@ -12,9 +12,11 @@ import pytest
 
 from sfm.conventions import FloatArray
 from sfm.epochs.epoch import Epoch
+from sfm.epochs.findings import remarks_of_pair, verdict_of_epochs
 from sfm.epochs.series import EpochSeries, analyse_epochs
 from sfm.errors import GeometryError
-from sfm.report.epochs import FILES, pairs_of, words_of_held, words_of_pair, words_of_stable, write_epochs
+from sfm.remarks.remark import Remark, kinds_of
+from sfm.report.epochs import FILES, words_of_stable, write_epochs
 from tests.epochs.scenes import POINTS, epoch
 
 
@@ -34,12 +36,12 @@ def series() -> EpochSeries:
 
 def test_each_epoch_stands_against_the_first_and_the_one_before(tmp_path: Path) -> None:
     found = series()
-    assert [pair.displacements.differences.names for pair in pairs_of(found)] == [
+    assert [pair.displacements.differences.names for pair in found.pairs] == [
         ("epoch 70", "epoch 71"),
         ("epoch 70", "epoch 72"),
         ("epoch 71", "epoch 72"),
     ]
-    still, since_first, since_previous = pairs_of(found)
+    still, since_first, since_previous = found.pairs
     assert not still.displacements.changed
     for pair in (since_first, since_previous):
         assert np.flatnonzero(pair.displacements.moved).tolist() == [4, 16, 21, 40]
@@ -49,7 +51,7 @@ def test_each_epoch_stands_against_the_first_and_the_one_before(tmp_path: Path) 
     page = write_epochs(found, tmp_path / "out")
     assert {path.name for path in (tmp_path / "out").iterdir()} == {*FILES, "manifest.json"}
     text = page.read_text(encoding="utf-8")
-    assert "4 of 60 points moved" in text and "span" in text and "Series" in text
+    assert verdict_of_epochs(found).remarks[0].text in text and "span" in text and "Series" in text
     with (tmp_path / "out/displacements.csv").open(encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
     assert len(rows) == 3 * POINTS and sum(int(row["moved"]) for row in rows) == 8
@@ -59,10 +61,13 @@ def test_each_epoch_stands_against_the_first_and_the_one_before(tmp_path: Path) 
 
 
 def test_words() -> None:
-    still, moved, _ = (pair.displacements for pair in pairs_of(series()))
-    assert words_of_pair(still) == ("epoch 70 to epoch 71: no displacement is significant", "good")
+    still, moved, _ = (pair.displacements for pair in series().pairs)
+    assert tuple(remarks_of_pair(still)) == ()
     assert words_of_stable(still) == "All 60 points of reference agree."
-    assert words_of_pair(moved)[0].startswith("epoch 70 to epoch 72: 4 of 60 points moved, by up to ")
+    (one,) = remarks_of_pair(moved)
+    assert one.kind == "displaced" and one.names("points") == ("5", "17", "22", "41")
+    assert abs(one.number("distance") - 0.01) < 1e-3 and one.number("tested") == 60
+    assert verdict_of_epochs(series()).level == "fair"
     assert "56 of 60 points of reference are proposed as stable" in words_of_stable(moved)
 
 
@@ -108,24 +113,32 @@ def test_a_calibration_that_is_held_is_told(tmp_path: Path) -> None:
     first, second, _ = epochs()
     (name,) = (camera.name for camera in first.result.estimate.cameras)
 
-    def told(one: Epoch, other: Epoch) -> tuple[str, ...]:
+    def told(one: Epoch, other: Epoch) -> tuple[Remark, ...]:
         found = analyse_epochs([one, other])
-        words = words_of_held(found.since_first[0].displacements.differences)
+        verdict = verdict_of_epochs(found)
         text = write_epochs(found, tmp_path / "out").read_text(encoding="utf-8")
-        assert all(one in text for one in words)
-        return words
+        assert all(one in text for one in verdict.texts)
+        return tuple(one for one in verdict.remarks if one.kind.startswith("held_"))
 
     assert told(first, second) == ()
     (alike,) = told(held(first), held(second))
-    assert f"hold the same interior orientation of camera {name}: its error is in no" in alike
+    assert alike.kind == "held_alike" and alike.names("cameras") == (name,)
     for other in (second, held(second, more=1e-3)):
         (apart,) = told(held(first), other)
-        assert f"camera {name} is held in one epoch only" in apart and "does not cancel" in apart
+        assert apart.kind == "held_apart" and apart.names("cameras") == (name,)
 
 
-def test_epochs_of_two_objects_are_doubted() -> None:
+def test_epochs_with_other_names_and_of_two_objects_are_told() -> None:
     first, second, _ = epochs()
-    points = second.result.estimate.points
-    mixed = replace(second.result.estimate, points=points[np.random.default_rng(1).permutation(POINTS)])
-    found = analyse_epochs([first, replace(second, result=replace(second.result, estimate=mixed))])
-    assert "are they epochs of one object?" in words_of_pair(found.since_first[0].displacements)[0]
+    rng = np.random.default_rng(1)
+    estimate = second.result.estimate
+    order = rng.permutation(POINTS)
+    rows = (3 * order[:, None] + np.arange(3)).ravel()
+    covariance = np.asarray(second.result.covariance)[np.ix_(rows, rows)]
+    for points, kind in (
+        (estimate.points[order], "names_differ"),
+        (rng.uniform(-1, 1, (POINTS, 3)), "another_object"),
+    ):
+        result = replace(second.result, estimate=replace(estimate, points=points), covariance=covariance)
+        verdict = verdict_of_epochs(analyse_epochs([first, replace(second, result=result)]))
+        assert kinds_of(verdict.remarks) == (kind,) and verdict.level == "bad"

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from sfm.comparison.findings import verdict_of_comparison
 from sfm.comparison.significance import ResultComparison, compare_results
 from sfm.comparison.two_adjusters.adjuster_validation import SAME, Trial, Validation
 from sfm.comparison.two_adjusters.random_network import Plan
@@ -19,7 +20,8 @@ from sfm.errors import GeometryError, OutputError
 from sfm.files.open_folders import move
 from sfm.files.whole_files import remove_leftovers
 from sfm.network import Network
-from sfm.report.differences import largest_difference, words_of_test, write_differences
+from sfm.remarks.remark import kinds_of
+from sfm.report.differences import largest_difference, write_differences
 from sfm.report.validation import COLUMNS, write_validation
 from sfm.stored_result import StoredResult
 from tests.synthetic import make_network, seed_of
@@ -149,7 +151,13 @@ def test_comparison_is_written_with_every_point(
     summary = json.loads((tmp_path / "out" / "comparison.json").read_text())
     assert summary["significant"] == ["5"] and summary["changed"] is True
     page = path.read_text(encoding="utf-8")
-    assert "The points differ significantly: 1 of 20 moved." in page
+    said, approximate = verdict_of_comparison(moved[0]).remarks
+    assert (
+        approximate.kind == "tested_singly"
+        and said.kind == "points_differ"
+        and said.names("points") == ("5",)
+        and said.text in page
+    )
     assert largest_difference(moved[0]) == "5.20 mm"
     assert "after &lt;b&gt;" in page and "after <b>" not in page
 
@@ -160,7 +168,8 @@ def test_comparison_without_sigmas_says_so(tmp_path: Path) -> None:
         StoredResult("a", network, truth), StoredResult("b", measured_again(network), truth)
     )
     page = write_differences(found, truth.points, tmp_path / "out").read_text()
-    assert "Not tested: neither result knows its standard deviations." in page
+    verdict = verdict_of_comparison(found)
+    assert kinds_of(verdict.remarks) == ("no_sigmas",) and verdict.texts[0] in page
     assert json.loads((tmp_path / "out" / "comparison.json").read_text())["changed"] is None
 
 
@@ -171,7 +180,8 @@ def test_results_of_the_same_image_points_are_not_tested(tmp_path: Path) -> None
     found = compare_results(a, b)
     assert found.same_share == 1.0 and found.changed is None and not found.significant.any()
     page = write_differences(found, truth.points, tmp_path / "out").read_text()
-    assert "Not tested: 100% of the image points of a are those of b." in page
+    (said,) = verdict_of_comparison(found).remarks
+    assert said.kind == "same_image_points" and said.number("share") == 1.0 and said.text in page
     write_differences(found, truth.points, tmp_path / "out")  # again, over its own files
 
 
@@ -190,7 +200,7 @@ def test_nothing_in_common_is_no_agreement(tmp_path: Path) -> None:
         StoredResult("b", replace(other, images=network.images), truth),
         align="cameras",
     )
-    assert words_of_test(photographs_only)[0].startswith("No points in common")
+    assert kinds_of(verdict_of_comparison(photographs_only).remarks) == ("no_common_points",)
     write_differences(photographs_only, truth.points[:0], tmp_path / "out")
 
 

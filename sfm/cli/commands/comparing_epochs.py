@@ -67,17 +67,10 @@ def epochs(
     Congruency test, the points that are stable, displacements with their tests, and motion of groups.
     """
     with loading():
+        from sfm.epochs.findings import verdict_of_epochs
         from sfm.epochs.series import analyse_epochs
         from sfm.files.manifest import refuse_foreign_folder
-        from sfm.report.epochs import (
-            pairs_of,
-            words_of_block,
-            words_of_camera,
-            words_of_held,
-            words_of_pair,
-            words_of_stable,
-            write_epochs,
-        )
+        from sfm.report.epochs import words_of_block, words_of_stable, write_epochs
 
     refuse_foreign_folder(out)
     if len(results) < 2:
@@ -103,16 +96,15 @@ def epochs(
             together=together,
         )
     page = write_epochs(found, out)
-    for camera in found.cameras:
-        print(words_of_camera(camera))
-    for pair in pairs_of(found):
-        print(words_of_pair(pair.displacements)[0])
+    verdict = verdict_of_epochs(found)
+    print(verdict.headline)
+    for line in verdict.texts:
+        print(f"! {line}")
+    for pair in found.pairs:
+        print(" to ".join(pair.displacements.differences.names))
         print(f"  {words_of_stable(pair.displacements)}")
         for block in pair.blocks:
             print(f"  {words_of_block(block)}")
-    pairs = (pair.displacements.differences for pair in pairs_of(found))
-    for words in dict.fromkeys(words for pair in pairs for words in words_of_held(pair)):
-        print(f"! {words}")
     print(f"Report: {page}")
 
 

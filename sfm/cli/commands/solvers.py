@@ -73,14 +73,13 @@ def compare(
     """
     with loading():
         from adapters.formats.registry import read_comparable
+        from sfm.comparison.findings import verdict_of_comparison
         from sfm.comparison.significance import compare_results
         from sfm.files.manifest import refuse_foreign_folder
         from sfm.report.differences import (
             largest_difference,
-            words_of_cause,
             words_of_pairing,
             words_of_scale,
-            words_of_test,
             write_differences,
         )
 
@@ -97,8 +96,10 @@ def compare(
     xyz = first.estimate.points[[place[name] for name in found.points]]
     page = write_differences(found, xyz, out)
     print(f"{words_of_pairing(found)}, {len(found.images)} common photographs; {words_of_scale(found)}")
-    for line in (words_of_test(found)[0], *words_of_cause(found)):
-        print(line)
+    verdict = verdict_of_comparison(found)
+    print(verdict.headline)
+    for line in verdict.texts:
+        print(f"! {line}")
     if found.points:
         print(f"largest difference of a point: {largest_difference(found)}")
     print(f"Report: {page}")

@@ -11,6 +11,7 @@ from types import MappingProxyType
 from sfm.remarks.catalogue import (
     adjustment,
     cameras,
+    comparisons,
     datum,
     hypotheses,
     other_programs,
@@ -30,6 +31,7 @@ SUBJECTS: Mapping[str, tuple[Kind, ...]] = MappingProxyType(
         "Datum, scale and given values": datum.ROWS,
         "Other programs": other_programs.ROWS,
         "Refining": refining.ROWS,
+        "Comparisons and epochs": comparisons.ROWS,
     }
 )
 KINDS: Mapping[str, Kind] = MappingProxyType({row.name: row for rows in SUBJECTS.values() for row in rows})

@@ -1,0 +1,293 @@
+"""Why the coordinates of the same points differ in two results: alternatives in one list, tested by one rule.
+
+An alternative is a row: what of one result may be another in the second one. It is the scale, the handedness,
+the names of the points, or a bending of the whole. With it the differences are formed anew and tested for
+congruency. A row explains the differences if a majority of the points then agrees. It wins if its likelihood
+
+    L = ln p(d) - moved ln(extent / sigma)^3 - q/2 ln(3 n) - S
+
+exceeds that of the assumption that nothing but single points changed by ln(rows / alpha); p is Student's
+density of the stable points, q the row's parameters and S the logarithm of the choices searched inside it.
+Simple rows come first, and a row with more in it must exceed them as much: a bending of the second degree
+also imitates a scale and a mirror. Where no row explains the differences, a permutation test asks whether the
+points have anything to do with one another.
+
+Source: Caspary (2000), Concepts of network and deformation analysis, secs. 7 and 8; Schwarz (1978),
+Estimating the dimension of a model, for q/2 ln n; Jackson (1995), PROTEST: a Procrustean randomization test,
+Ecoscience 2, 297-303, for the last.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from itertools import groupby
+
+import numpy as np
+
+from sfm.comparison.congruency import MIN_STABLE, MOTIONS, STABLE_FRACTION, bending, motions
+from sfm.comparison.pairing import fit_robustly, nearest_places
+from sfm.comparison.point_pairs import ROUNDING, PointPairs
+from sfm.comparison.point_patterns import find_pattern
+from sfm.comparison.stable_points import (
+    candidates_of,
+    critical_value,
+    find_stable_points,
+    robust_weights,
+    tests_in_datum,
+)
+from sfm.conventions import BoolArray, FloatArray, IntArray
+from sfm.errors import GeometryError
+from sfm.similarity import Similarity, mean_distance
+
+ALPHA = 0.001  # probability of a cause where there is none, of all rows together
+PERMUTATIONS = 999  # of the names; with as many the level of the permutation test is 0.001
+MIN_PERMUTED = 7  # points whose permutations are more than PERMUTATIONS
+MIRROR = np.diag([1.0, 1.0, -1.0])
+UNITS = {
+    **{10.0: ("mm", "cm"), 100.0: ("cm", "m"), 1e3: ("mm", "m"), 1e6: ("um", "m")},
+    **{25.4: ("mm", "inch"), 2.54: ("cm", "inch"), 1 / 0.0254: ("inch", "m"), 12.0: ("inch", "foot")},
+    **{304.8: ("mm", "foot"), 30.48: ("cm", "foot"), 1 / 0.3048: ("foot", "m")},
+}
+"""factors of lengths by what the finer and the coarser unit are"""
+
+
+@dataclass(frozen=True)
+class Row:
+    """What of the second result may be another."""
+
+    scale: bool = False
+    mirror: bool = False
+    names: bool = False
+    bending: bool = False
+
+
+NOTHING = Row()
+ROWS = (  # the simple ones first; of those that lead to one another the likeliest wins
+    *(Row(scale=True), Row(mirror=True), Row(scale=True, mirror=True)),
+    Row(bending=True),
+    *(Row(names=True), Row(scale=True, names=True)),
+    *(Row(mirror=True, names=True), Row(scale=True, mirror=True, names=True)),
+)
+
+
+@dataclass(frozen=True)
+class Cause:
+    """What explains the differences of two results."""
+
+    row: Row
+    other_object: bool = False  # nothing does: the points have nothing to do with one another
+    lengths: float = 1.0  # of the second result over those of the first, if the scale is another
+    lengths_sigma: float = 0.0
+    unit: tuple[str, str] | None = None  # finer and coarser unit of which `lengths` is the factor
+    renamed: tuple[tuple[str, str], ...] = ()  # name in the first result and name of the same in the second
+    moved: tuple[str, ...] = ()  # points that differ besides
+    gain: float = math.inf  # logarithm of the likelihood over that of points that moved
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """Differences under a row."""
+
+    row: Row
+    pairs: PointPairs
+    a_from_b: Similarity
+    L: float
+    agreed: bool  # whether a majority of the points agrees
+    stable: BoolArray
+    lengths: tuple[float, float]  # of b over those of a, and the standard deviation
+    other: IntArray | None  # point of b that is each of a, -1 for none; None where names are as given
+
+
+def find_cause(
+    pairs: PointPairs, *, reference: BoolArray | None = None, changed: bool = True
+) -> Cause | None:
+    """Return what explains the differences of two results; None where single points do, or nothing.
+
+    Args:
+        pairs: the same points of both.
+        reference: points that may carry the datum, (n,); all if not given.
+        changed: whether the points differ significantly by a test of all of them. If not, only the scale is
+            tested, which one parameter does more sharply.
+    """
+    if len(pairs.a) < MIN_STABLE:
+        return None
+    reference = np.ones(len(pairs.a), dtype=bool) if reference is None else reference
+    rows = [row for row in ROWS if not (row.scale and pairs.scale is None)]
+    cost = -3 * math.log(_relative_sigma(pairs))
+    try:
+        nothing = _fitted(pairs, NOTHING, reference, cost)
+    except GeometryError:
+        return None
+    limit = math.log(len(rows) / ALPHA)
+    if not changed:
+        rows = [row for row in rows if row == Row(scale=True)]
+    elif nothing.agreed:  # a majority agrees as it is
+        rows = [row for row in rows if not row.mirror]
+    for _, tier in groupby(rows, lambda row: (row.mirror, row.names, row.bending)):
+        best = nothing
+        for fit in (fit for row in tier for fit in _fits(pairs, row, nothing, reference, cost)):
+            if fit.agreed and best.L + limit < fit.L:
+                best = fit
+        if best is not nothing:
+            return _cause(best, pairs, best.L - nothing.L)
+    if changed and not nothing.agreed and is_unrelated(pairs.a, pairs.b):
+        return Cause(NOTHING, other_object=True)
+    return None
+
+
+def is_unrelated(a: FloatArray, b: FloatArray) -> bool:
+    """Return whether a similarity fits the points by their names no better than with the names shuffled.
+
+    Args:
+        a: coordinates, (n, 3).
+        b: of the same points in another frame, (n, 3).
+
+    Source: Jackson (1995), PROTEST: a Procrustean randomization test.
+    """
+    if len(a) < MIN_PERMUTED:
+        return False
+    s, t = (x - x.mean(axis=0) for x in (b, a))
+    fit = float(np.linalg.svd(t.T @ s, compute_uv=False).sum())
+    rng = np.random.default_rng(len(a))
+    shuffled = (t.T @ s[rng.permutation(len(s))] for _ in range(PERMUTATIONS))
+    return any(float(np.linalg.svd(M, compute_uv=False).sum()) >= fit for M in shuffled)
+
+
+def _fits(pairs: PointPairs, row: Row, nothing: _Fit, reference: BoolArray, cost: float) -> Iterator[_Fit]:
+    """Yield the differences under a row, with every assignment of the names that is found."""
+    if not row.names:
+        try:
+            yield _fitted(pairs, row, reference, cost)
+        except GeometryError:
+            return
+        return
+    try:
+        plain = replace(row, names=False)
+        given = nothing if plain == NOTHING else _fitted(pairs, plain, reference, cost)
+    except GeometryError:
+        return
+    if given.agreed:  # what most names say: others are exchanged among themselves
+        found: Similarity | None = given.a_from_b
+    else:
+        found = find_pattern(pairs.a, pairs.b, scale=None if row.scale else pairs.scale, mirrored=row.mirror)
+    if found is None:
+        return
+    other = _assigned(pairs, found, given.stable if given.agreed else np.zeros(len(pairs.a), dtype=bool))
+    if (other >= 0).sum() < max(MIN_STABLE, STABLE_FRACTION * len(pairs.a)):
+        return
+    kept = other >= 0
+    try:
+        yield _fitted(pairs.chosen(np.flatnonzero(kept), other[kept]), row, reference[kept], cost, other)
+    except GeometryError:
+        return
+
+
+def _assigned(pairs: PointPairs, a_from_b: Similarity, given: BoolArray) -> IntArray:
+    """Return which point of b each point of a is: by its name where that fits, else by its place, (n,)."""
+    every = np.ones(len(pairs.a), dtype=bool)
+    own = np.flatnonzero(given)
+    found = nearest_places((pairs.a, every), (a_from_b.apply(pairs.b), every), np.stack([own, own], axis=1))
+    other = np.where(given, np.arange(len(every)), -1)
+    other[found[:, 0]] = found[:, 1]
+    return np.asarray(other)
+
+
+def _fitted(
+    pairs: PointPairs, row: Row, reference: BoolArray, cost: float, other: IntArray | None = None
+) -> _Fit:
+    """Form and test the differences under a row.
+
+    Raises:
+        GeometryError: too few points, or points on a line.
+    """
+    n = len(pairs.a)
+    estimated = row.scale or pairs.scale is None
+    source = pairs.b @ MIRROR if row.mirror else pairs.b
+    T = fit_robustly(source[reference], pairs.a[reference], scale=None if estimated else pairs.scale)
+    if row.mirror:
+        T = replace(T, rotation=T.rotation @ MIRROR)
+    d, Q = pairs.differences(T)
+    whole = motions(pairs.a)
+    G = whole[:, : MOTIONS["similarity" if estimated else "rigid"]]
+    parameters = int(row.scale)
+    if row.bending:
+        own = G.shape[1]
+        G = _independent(np.hstack([G, bending(pairs.a)]), 3 * n)
+        parameters += G.shape[1] - own
+    lost = 0 if other is None else len(other) - n
+    searched = 0.0
+    if other is not None:
+        exchanged = int(((other >= 0) & (other != np.arange(len(other)))).sum())
+        searched = exchanged * math.log(len(other))
+    penalty = lost * cost + parameters / 2 * math.log(3 * n) + searched
+    failed = _Fit(row, pairs, T, -(n * cost + penalty), False, np.zeros(n, dtype=bool), (1.0, 0.0), other)
+    least = max(MIN_STABLE, math.ceil(STABLE_FRACTION * reference.sum()))
+    if 2 * G.shape[1] > 3 * n or G.shape[1] >= 3 * least:  # too few points to be explained by so much
+        return failed
+    single = critical_value(ALPHA / max(1, int(reference.sum())), 3, pairs.redundancy)
+    weight = robust_weights(d, G, reference)
+    fits = reference & (tests_in_datum(d, Q, G, weight) <= single)
+    if fits.sum() < least:
+        return failed
+    among = candidates_of(d, Q, G, reference)
+    found = find_stable_points(
+        among, least=least, start=fits, redundancy=pairs.redundancy, alpha=ALPHA, alpha_single=ALPHA
+    )
+    if not found.agreed:
+        return failed
+    last = found.steps[-1]
+    r = pairs.redundancy
+    ln_p = -last.omega / 2 if r is None else -(r + last.freedom) / 2 * math.log1p(last.omega / r)
+    moved = int(reference.sum() - found.stable.sum())
+    lengths = _lengths(pairs, T, d, Q, whole, found.stable) if row.scale else (1.0, 0.0)
+    return _Fit(row, pairs, T, ln_p - moved * cost - penalty, True, found.stable, lengths, other)
+
+
+def _relative_sigma(pairs: PointPairs) -> float:
+    """Return the standard deviation of a coordinate over the extent of the object, at most 1."""
+    parts = ((pairs.a, pairs.Q_a), (pairs.b, pairs.Q_b))
+    sizes = [float(np.median(np.diagonal(Q))) / mean_distance(xyz) ** 2 for xyz, Q in parts]
+    return min(1.0, math.sqrt(sum(sizes) + ROUNDING**2))
+
+
+def _independent(columns: FloatArray, rows: int) -> FloatArray:
+    """Return an orthogonal basis of what columns span, scaled as their entries are."""
+    left, size, _ = np.linalg.svd(columns, full_matrices=False)
+    return np.asarray(left[:, size > 1e-6 * size[0]] * math.sqrt(rows))
+
+
+def _lengths(
+    pairs: PointPairs, T: Similarity, d: FloatArray, Q: FloatArray, whole: FloatArray, stable: BoolArray
+) -> tuple[float, float]:
+    """Return lengths of b over those of a, and the standard deviation, by the stable points."""
+    assert pairs.scale is not None
+    among = candidates_of(d, Q, whole[:, : MOTIONS["rigid"]], stable)
+    g = whole[np.repeat(stable, 3), 6]
+    weight = float(g @ among.P @ g)
+    size = mean_distance(pairs.a)  # by which the column of the scale is divided
+    left = float(g @ among.P @ among.d) / weight / size
+    lengths = pairs.scale / T.scale * (1 + left)
+    return lengths, lengths / math.sqrt(weight) / size
+
+
+def _cause(fit: _Fit, pairs: PointPairs, gain: float) -> Cause:
+    """Put in words of the field what a row found."""
+    row, (lengths, sigma) = fit.row, fit.lengths
+    unit = None
+    if row.scale:
+        limit = math.sqrt(critical_value(ALPHA / len(UNITS), 1, pairs.redundancy))
+        for factor, names in UNITS.items():
+            for value in (factor, 1 / factor):
+                if abs(lengths - value) <= limit * sigma:
+                    unit = names
+    renamed: tuple[tuple[str, str], ...] = ()
+    if fit.other is not None:
+        renamed = tuple(
+            (pairs.names[k], pairs.names[j]) for k, j in enumerate(fit.other.tolist()) if j not in (-1, k)
+        )
+    moved = tuple(name for name, stays in zip(fit.pairs.names, fit.stable, strict=True) if not stays)
+    return Cause(
+        row, lengths=lengths, lengths_sigma=sigma, unit=unit, renamed=renamed, moved=moved, gain=gain
+    )

@@ -1,0 +1,121 @@
+"""What a comparison of two results finds: remarks, and the verdict on it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+
+import numpy as np
+
+from sfm.comparison.causes import Cause
+from sfm.comparison.significance import ResultComparison
+from sfm.conventions import FloatArray
+from sfm.files.covariance_file import MAX_POINTS
+from sfm.remarks.remark import Remark, remark
+from sfm.remarks.verdict import Level, Verdict, judge
+
+HEADLINES: Mapping[Level, str] = {
+    "good": "The points do not differ significantly.",
+    "fair": "The points were compared, and not tested.",
+    "bad": "The results differ significantly.",
+}
+UNTESTED = {
+    "no standard deviations": "no_sigmas",
+    "no standard deviations of common points": "no_sigmas",
+    "no common datum": "no_common_datum",
+    "covariance of single points only": "no_joint_covariance",
+}
+OTHER_SIGMAS = 5.0  # standard deviations from which on an interior orientation is another one
+
+
+def verdict_of_comparison(found: ResultComparison) -> Verdict:
+    """Return the verdict on a comparison with its remarks."""
+    return judge(_remarks(found), HEADLINES)
+
+
+def remarks_of_cause(
+    cause: Cause, first: str, second: str, points: int, largest: tuple[float, str]
+) -> Iterator[Remark]:
+    """Yield what explains that two results differ, a remark for each part of it.
+
+    Args:
+        cause: what does.
+        first: name of the first result.
+        second: name of the second.
+        points: how many were compared.
+        largest: the largest difference of one, and its unit.
+    """
+    row, between = cause.row, {"first": first, "second": second}
+    moved = cause.moved or None
+    if cause.other_object:
+        yield remark("another_object", points=points, **between)
+    if row.mirror:
+        yield remark("mirrored", **between)
+    if row.scale:
+        kind = "lengths_differ" if cause.unit is None else "unit_differs"
+        numbers = {"lengths": cause.lengths, "sigma": cause.lengths_sigma}
+        yield remark(kind, unit=cause.unit and " and ".join(cause.unit), moved=moved, **numbers, **between)
+    if row.names:
+        exchanged = [f"{ours} = {theirs}" for ours, theirs in cause.renamed]
+        yield remark("names_differ", count=len(exchanged), exchanged=exchanged, **between)
+    if row.bending:
+        yield remark("bent", distance=largest, moved=moved, **between)
+
+
+def _remarks(found: ResultComparison) -> Iterator[Remark]:
+    first, second = found.names
+    longest = np.linalg.norm(found.point_difference, axis=1)
+    unit = found.unit or "object units"
+    if found.cause is not None:
+        yield from remarks_of_cause(
+            found.cause, first, second, len(found.points), (float(longest.max()), unit)
+        )
+    elif found.changed:
+        yield _differences(found, longest, unit)
+    tested = int(np.isfinite(found.statistic).sum())
+    if not found.points:
+        yield remark("no_common_points")
+    elif not found.independent:
+        yield remark("same_image_points", share=found.same_share, first=first, second=second)
+    elif found.untested in UNTESTED:
+        yield remark(UNTESTED[found.untested])
+    elif found.untested:
+        yield remark("untestable", reason=found.untested)
+    elif found.approximate:
+        yield remark("tested_singly")
+    elif tested <= MAX_POINTS < len(found.points):
+        yield remark("tested_part", tested=tested, points=len(found.points))
+    if found.changed and found.independent:
+        yield from _interior(found)
+
+
+def _differences(found: ResultComparison, longest: FloatArray, unit: str) -> Remark:
+    """Return the remark on points that differ with no other cause than that they moved."""
+    if not found.majority:
+        return remark("no_majority_agrees", first=found.names[0], second=found.names[1])
+    names = [name for name, differs in zip(found.points, found.significant, strict=True) if differs]
+    if not names:
+        return remark(
+            "points_differ_together", statistic=found.global_statistic, critical=found.global_critical
+        )
+    largest = float(longest[found.significant].max())
+    tested = int(np.isfinite(found.statistic).sum())
+    return remark(
+        "points_differ", points=names, differing=len(names), tested=tested, distance=(largest, unit)
+    )
+
+
+def _interior(found: ResultComparison) -> Iterator[Remark]:
+    """Yield the cameras whose interior orientation is another one: it shows that a lens moved."""
+    for one in found.interior:
+        with np.errstate(invalid="ignore", divide="ignore"):
+            sigmas = np.where(one.sigma > 0, np.abs(one.difference) / one.sigma, 0.0)
+        worst = int(np.argmax(sigmas))
+        if sigmas[worst] >= OTHER_SIGMAS:
+            difference = float(abs(one.difference[worst])), one.units[worst]
+            yield remark(
+                "interior_differs",
+                camera=one.camera,
+                parameter=one.names[worst],
+                difference=difference,
+                sigmas=float(sigmas[worst]),
+            )

@@ -1,0 +1,131 @@
+"""Causes of differences: named where they are one, and nowhere else."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from sfm.comparison import causes
+from sfm.comparison.causes import UNITS, PointPairs, Row, find_cause, is_unrelated
+from sfm.comparison.findings import verdict_of_comparison
+from sfm.comparison.point_pairs import ROUNDING
+from sfm.comparison.point_patterns import find_pattern
+from sfm.comparison.significance import compare_results
+from sfm.conventions import rotation_from_vector
+from sfm.similarity import Similarity
+from tests.comparison.causes import EXPECTED, compared, epochs, expected, pair, transformed
+from tests.synthetic import seed_of
+
+CAUSES = {kind for kinds in EXPECTED.values() for kind in kinds} - {"points_differ"}
+
+
+@pytest.mark.parametrize("case", [case for case in EXPECTED if case != "nothing"])
+def test_each_cause_is_named_by_comparison_and_epochs(case: str) -> None:
+    for number in (100, 101):
+        for by in (compared, epochs):
+            assert set(by(case, number)) == set(expected(case, by)), number
+
+
+def test_right_pairs_have_no_cause() -> None:
+    for number in range(100, 110):
+        assert not CAUSES & set(compared("nothing", number)), number
+
+
+def test_a_scale_is_named_with_its_standard_deviation() -> None:
+    errors = []
+    for number in range(110, 120):
+        (said,) = verdict_of_comparison(compare_results(*pair("scale 1.0005", number))).remarks
+        assert said.kind == "lengths_differ" and said.number("sigma") < 1e-4
+        errors.append((said.number("lengths") - 1.0005) / said.number("sigma"))
+    assert 0.4 < float(np.mean(np.square(errors))) < 2.1  # chi-square with 10 degrees of freedom at 1 %
+
+
+def test_names_are_those_that_were_exchanged() -> None:
+    first, second = pair("nothing", 120)
+    order = np.arange(len(first.network.points))
+    order[[3, 8]] = order[[8, 3]]
+    found = compare_results(first, transformed(second, np.eye(3), np.zeros(3), order))
+    names = first.network.points
+    assert found.cause is not None and found.cause.row == Row(names=True)
+    assert found.cause.renamed == ((names[3], names[8]), (names[8], names[3]))
+
+
+def pairs_of(scale: float, size: float = 1.0, sigma: float = 1e-5, n: int = 30) -> PointPairs:
+    """Return made-up points with independent coordinates of equal precision."""
+    rng = seed_of("pairs of points")
+    a = size * rng.uniform(-1, 1, (n, 3))
+    noise = size * sigma * rng.standard_normal((2, n, 3))
+    Q = (size * sigma) ** 2 * np.eye(3 * n)
+    names = tuple(f"P{k}" for k in range(n))
+    return PointPairs(names, a + noise[0], scale * (a + noise[1]), Q, scale**2 * Q, None, 1.0, 500)
+
+
+@pytest.mark.parametrize("factor", [*UNITS, *(1 / factor for factor in UNITS)])
+def test_every_unit_is_known(factor: float) -> None:
+    found = find_cause(pairs_of(factor))
+    assert found is not None and found.row == Row(scale=True)
+    assert found.unit == next(names for value, names in UNITS.items() if factor in (value, 1 / value))
+
+
+def test_a_scale_beside_a_unit_is_a_scale() -> None:
+    found = find_cause(pairs_of(1000.5))
+    assert found is not None and found.unit is None
+    assert abs(found.lengths - 1000.5) < 4 * found.lengths_sigma
+
+
+def test_results_that_differ_by_rounding_do_not_differ() -> None:
+    """Noise-free observations leave standard deviations of rounding, which no difference is measured by."""
+    first, second = pair("nothing", 121)
+    tiny = 1e-24
+    assert first.covariance is not None and first.point_covariance is not None
+    for times, changed in ((0.5, False), (20.0, True)):
+        rng = seed_of("rounding")
+        size = np.sqrt(((first.estimate.points - first.estimate.points.mean(0)) ** 2).sum(1).mean())
+        points = first.estimate.points + times * ROUNDING * size * rng.standard_normal(
+            (len(first.network.points), 3)
+        )
+        exact = [
+            replace(one, covariance=tiny * first.covariance, point_covariance=tiny * first.point_covariance)
+            for one in (first, replace(second, estimate=replace(first.estimate, points=points)))
+        ]
+        assert compare_results(*exact).changed is changed, times
+
+
+def test_the_rule_needs_the_stated_gain(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A scale of five standard deviations is named, one of three is not; no level of 1 changes that."""
+    a = pairs_of(1.0)
+    found = find_cause(replace(a, b=a.b * 1.0005))
+    assert found is not None
+    sigma = found.lengths_sigma
+    own = found.lengths - 1.0005  # the noise of this case
+    for sigmas, named in ((3.0, False), (7.0, True)):
+        one = find_cause(replace(a, b=a.b * (1 - own + sigmas * sigma)), changed=False)
+        assert (one is not None) is named, sigmas
+
+
+def test_shuffled_names_are_unrelated_and_deformed_points_are_not() -> None:
+    rng = seed_of("unrelated")
+    a = rng.uniform(-1, 1, (20, 3))
+    assert sum(is_unrelated(a, a[rng.permutation(20)]) for _ in range(20)) == 20
+    assert not any(is_unrelated(a, a + 0.2 * rng.standard_normal(a.shape)) for _ in range(20))
+    assert not is_unrelated(a[:6], a[5::-1])  # too few to say
+
+
+def test_a_pattern_is_found_whatever_the_names() -> None:
+    rng = seed_of("pattern")
+    truth = Similarity(3.0, rotation_from_vector(np.array([0.3, -1.0, 2.0])), np.array([4.0, 5.0, 6.0]))
+    for n in (8, 40, 300):
+        b = rng.uniform(-1, 1, (n, 3))
+        a = truth.apply(b)[rng.permutation(n)] + 1e-4 * rng.standard_normal((n, 3))
+        for scale in (None, 3.0):
+            found = find_pattern(a, b, scale=scale)
+            assert found is not None and np.abs(found.rotation - truth.rotation).max() < 1e-3
+        mirrored = find_pattern(a * [1, 1, -1], b, mirrored=True)
+        assert mirrored is not None and np.linalg.det(mirrored.rotation) < 0
+    assert find_pattern(a[:3], b[:3]) is None
+
+
+def test_the_level_is_that_of_all_rows() -> None:
+    assert causes.ALPHA == 0.001 and len(causes.ROWS) == 8 and causes.PERMUTATIONS == 999
