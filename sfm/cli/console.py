@@ -12,7 +12,7 @@ from rich.text import Text
 
 from sfm.display import program_name
 from sfm.remarks.remark import Severity
-from sfm.remarks.verdict import Line
+from sfm.remarks.verdict import Line, Verdict
 from sfm.report.findings.findings import Findings
 from sfm.report.numbers import finer_unit, significant
 from sfm.report.phrases import words_of_check, words_of_sigma0, words_of_test
@@ -53,6 +53,13 @@ def tell_result(findings: Findings, page: Path, *, seconds: float, verbose: bool
             console.print(Text(f"  camera {camera.name} ({camera.model}): {values}"))
     console.print(Text(f"Report: {page}", style="bold"), soft_wrap=True)
     return verdict.level != "bad"
+
+
+def tell_verdict(verdict: Verdict) -> None:
+    """Print a verdict: its headline in its colour, then its remarks."""
+    console = Console(highlight=False)
+    console.print(Text(verdict.headline, style=f"bold {COLOURS[verdict.level]}"), soft_wrap=True)
+    tell_remarks(console, verdict.lines)
 
 
 def tell_remarks(console: Console, lines: Iterable[Line]) -> None:

@@ -144,7 +144,7 @@ def differences_page(found: ResultComparison, xyz: FloatArray) -> str:
         "comparison.html",
         headline=verdict.headline,
         level=verdict.level,
-        remarks=verdict.texts,
+        remarks=verdict.lines,
         paired=words_of_pairing(found),
         scale=words_of_scale(found),
         found=found,

@@ -126,7 +126,7 @@ def epochs_page(found: EpochSeries) -> str:
         "epochs.html",
         title=" - ".join((found.names[0], found.names[-1])),
         headline=verdict.headline,
-        remarks=verdict.texts,
+        remarks=verdict.lines,
         level=verdict.level,
         power=POWER,
         viewer=_viewer(found),

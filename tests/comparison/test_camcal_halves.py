@@ -67,7 +67,7 @@ def test_halves_are_compared_by_what_they_are(halves: tuple[Path, Path]) -> None
     length = np.linalg.norm(np.asarray(found.point_difference), axis=1)
     assert length.max() < 2e-3  # m; with the numbers of uncoded points as names it was 0.88 m
     verdict = verdict_of_comparison(found)
-    print(*verdict.texts, sep="\n")
+    print(*verdict.lines, sep="\n")
     assert {"bent", "interior_differs"} <= set(kinds_of(verdict.remarks))
 
 
@@ -76,7 +76,7 @@ def test_halves_agree_where_each_photograph_has_a_lens_of_its_own(tmp_path: Path
     folders = written_halves(tmp_path, ("c", "x0", "y0"))
     found = compare_results(*(read_comparable(folder, None) for folder in folders))
     print(
-        *verdict_of_comparison(found).texts,
+        *verdict_of_comparison(found).lines,
         f"{found.global_statistic:.3f}, critical {found.global_critical:.3f}",
     )
     assert found.stable.sum() >= 95 and found.global_statistic < 1.5

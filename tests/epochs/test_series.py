@@ -117,7 +117,7 @@ def test_a_calibration_that_is_held_is_told(tmp_path: Path) -> None:
         found = analyse_epochs([one, other])
         verdict = verdict_of_epochs(found)
         text = write_epochs(found, tmp_path / "out").read_text(encoding="utf-8")
-        assert all(one in text for one in verdict.texts)
+        assert all(one.text in text for one in verdict.remarks)
         return tuple(one for one in verdict.remarks if one.kind.startswith("held_"))
 
     assert told(first, second) == ()

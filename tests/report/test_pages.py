@@ -169,7 +169,7 @@ def test_comparison_without_sigmas_says_so(tmp_path: Path) -> None:
     )
     page = write_differences(found, truth.points, tmp_path / "out").read_text()
     verdict = verdict_of_comparison(found)
-    assert kinds_of(verdict.remarks) == ("no_sigmas",) and verdict.texts[0] in page
+    assert kinds_of(verdict.remarks) == ("no_sigmas",) and verdict.remarks[0].text in page
     assert json.loads((tmp_path / "out" / "comparison.json").read_text())["changed"] is None
 
 

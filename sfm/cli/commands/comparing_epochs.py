@@ -67,6 +67,7 @@ def epochs(
     Congruency test, the points that are stable, displacements with their tests, and motion of groups.
     """
     with loading():
+        from sfm.cli.console import tell_verdict
         from sfm.epochs.findings import verdict_of_epochs
         from sfm.epochs.series import analyse_epochs
         from sfm.files.manifest import refuse_foreign_folder
@@ -96,10 +97,7 @@ def epochs(
             together=together,
         )
     page = write_epochs(found, out)
-    verdict = verdict_of_epochs(found)
-    print(verdict.headline)
-    for line in verdict.texts:
-        print(f"! {line}")
+    tell_verdict(verdict_of_epochs(found))
     for pair in found.pairs:
         print(" to ".join(pair.displacements.differences.names))
         print(f"  {words_of_stable(pair.displacements)}")

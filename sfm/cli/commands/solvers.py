@@ -73,6 +73,7 @@ def compare(
     """
     with loading():
         from adapters.formats.registry import read_comparable
+        from sfm.cli.console import tell_verdict
         from sfm.comparison.findings import verdict_of_comparison
         from sfm.comparison.significance import compare_results
         from sfm.files.manifest import refuse_foreign_folder
@@ -96,10 +97,7 @@ def compare(
     xyz = first.estimate.points[[place[name] for name in found.points]]
     page = write_differences(found, xyz, out)
     print(f"{words_of_pairing(found)}, {len(found.images)} common photographs; {words_of_scale(found)}")
-    verdict = verdict_of_comparison(found)
-    print(verdict.headline)
-    for line in verdict.texts:
-        print(f"! {line}")
+    tell_verdict(verdict_of_comparison(found))
     if found.points:
         print(f"largest difference of a point: {largest_difference(found)}")
     print(f"Report: {page}")

@@ -85,7 +85,7 @@ ROWS = (
         "note",
         "{tested} of {points} points are tested, whose covariance together both results keep.",
         "of many points only a sample is kept with its covariance",
-        "Nothing.",
+        "Nothing needs to be done.",
     ),
     Kind(
         "tested_singly",
@@ -165,6 +165,6 @@ ROWS = (
         "Camera {camera} has one interior orientation in {epochs}, on which they agree (T {statistic}, limit "
         "{critical}).",
         "the epochs were adjusted together",
-        "Nothing.",
+        "Nothing needs to be done.",
     ),
 )
