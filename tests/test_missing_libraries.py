@@ -53,9 +53,9 @@ def test_a_survey_is_not_compared_and_says_why(
     code, told = kolinear(monkeypatch, capsys, "adjust", survey, "--out", out)
     assert code == 0 and INSTALL_PYCOLMAP in " ".join(told.split())
     line = f"Not compared with another adjuster: {INSTALL_PYCOLMAP}."
-    summary = json.loads((out / "summary.json").read_text(encoding="utf-8"))
-    assert line in json.dumps(summary)
-    assert "pycolmap" not in json.dumps(summary["warnings"]), "it says nothing against the survey"
+    remarks = json.loads((out / "summary.json").read_text(encoding="utf-8"))["verdict"]["remarks"]
+    (found,) = [one for one in remarks if one["kind"] == "adjuster_not_compared"]
+    assert found["text"] == line and found["severity"] == "note"
     assert "Not compared with another adjuster: pycolmap" in (out / "report.html").read_text(encoding="utf-8")
     assert line in " ".join((out / "report.txt").read_text(encoding="utf-8").split())
 

@@ -11,6 +11,7 @@ import pytest
 from adapters.colmap.adjuster import adjust_with_colmap
 from adapters.formats.photomodeler import read_photomodeler
 from sfm.pipeline import run_survey
+from sfm.remarks.remark import kinds_of
 from sfm.result import SurveyResult
 from sfm.similarity import fit_similarity
 from sfm.survey.inputs.survey import read_survey
@@ -103,7 +104,7 @@ def test_camcal_needs_no_control_to_start(
     assert result.failed == ()
     assert result.adjustment.redundancy == camcal.adjustment.redundancy
     assert result.adjustment.sigma0_px == pytest.approx(camcal.adjustment.sigma0_px, rel=1e-6)
-    assert any("scale is undefined" in line for line in result.warnings)
+    assert "scale_undefined" in kinds_of(result.remarks)
 
 
 def test_panel_orients_every_photograph_and_reads_every_code(panel: SurveyResult, shared_data: Path) -> None:

@@ -165,7 +165,7 @@ def test_a_survey_made_in_python_is_that_of_its_file(observed_survey: Path, resu
     for one, other in ((again, result),):
         np.testing.assert_array_equal(one.points.xyz, other.points.xyz)
         np.testing.assert_array_equal(one.points.covariance, other.points.covariance)
-        assert one.warnings == other.warnings
+        assert one.remarks == other.remarks
 
 
 def test_photographs_of_a_survey_made_in_python(tmp_path: Path) -> None:

@@ -122,6 +122,11 @@ def unless_note(one: Remark) -> tuple[Remark, ...]:
     return () if one.severity == "note" else (one,)
 
 
+def of_kind(remarks: Iterable[Remark], *kinds: str) -> tuple[Remark, ...]:
+    """Return the remarks of some kinds, in order."""
+    return tuple(one for one in remarks if one.kind in kinds)
+
+
 def kinds_of(remarks: Iterable[Remark]) -> tuple[str, ...]:
     """Return the kinds of remarks, in order."""
     return tuple(one.kind for one in remarks)

@@ -10,8 +10,8 @@ import pytest
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.solve import adjust
 from sfm.comparison.two_adjusters.adjusters import AdjusterComparison, compare_adjusters
+from sfm.remarks.remark import of_kind
 from sfm.report.findings.findings import findings_of
-from sfm.report.findings.other_adjuster import words_of_better_fit
 from sfm.result import SurveyResult
 from tests.other_adjuster import in_house_adjuster
 from tests.synthetic import make_network, seed_of
@@ -36,12 +36,13 @@ def test_a_camera_that_fits_many_times_better_is_no_agreement() -> None:
     assert both.agree and both.better is not None
     assert both.better.free == ("b1",)
     assert both.better.rms_px == pytest.approx(0.1, rel=0.1) and both.better.times > 5
-    words = words_of_better_fit(both)
-    assert words.startswith("Free b1: with it the camera of the comparison with other fits ")
-    assert words in findings_of(result).verdict.remarks
+    (found,) = of_kind(findings_of(result).verdict.remarks, "adjuster_fits_better")
+    assert found.names("parameters") == ("b1",) and found.severity == "warning"
+    assert found.number("times") == both.better.times
 
 
 @pytest.mark.parametrize(("stretch", "free"), [(1.0, USUAL), (1.007, (*USUAL, "b1"))])
 def test_a_camera_that_fits_as_well_is_not_told(stretch: float, free: tuple[str, ...]) -> None:
-    both, _ = compared(stretch, free)
-    assert both.agree and both.better is None and words_of_better_fit(both) == ""
+    both, result = compared(stretch, free)
+    assert both.agree and both.better is None
+    assert not of_kind(findings_of(result).verdict.remarks, "adjuster_fits_better")

@@ -44,12 +44,13 @@ from sfm.matching.tracks.natural_points import natural_points
 from sfm.network import Estimate, ImagePoints, Network
 from sfm.orientation.relative import relative_orientations
 from sfm.pipeline import run_survey
+from sfm.remarks.remark import kinds_of
 from sfm.report.log import read_log
 from sfm.similarity import fit_similarity
 from sfm.survey.drafting.draft import draft_survey
 from sfm.survey.inputs.survey import read_survey
 from sfm.survey.measuring.covering_points import find_covering_points
-from sfm.survey.measuring.surface_points import words_of_disagreement
+from sfm.survey.measuring.surface_points import remarks_on_disagreement
 from sfm.survey.other_programs import OtherPrograms
 from sfm.survey.refining.refinement import refine_model, refinement_text
 from tests.engines import ALONE, HERE, Notes
@@ -299,16 +300,15 @@ def test_covering_points_cover_photographs_that_are_oriented() -> None:
     assert np.sqrt((height**2).mean()) < 3e-4
     assert np.sqrt((found.residuals**2).mean()) < 0.05
     assert len(find_covering_points(*arguments, window_px=15, side_px=15, references=[]).points) == 0
-    assert len(seen) >= 0.95 * found.matched and words_of_disagreement(found) == ()
+    assert len(seen) >= 0.95 * found.matched and remarks_on_disagreement(found) == ()
     # a photograph that is turned by 3 px: its windows are found, their rays do not meet the others
     turned = truth.rotation.copy()
     turned[2] = turned[2] @ rotation_from_vector(np.array([3 / lens.c_px, 0.0, 0.0]))
     apart = replace(truth, rotation=turned)
     wrong = find_covering_points(photographs, apart, camera, ties, window_px=15, side_px=15)
     assert wrong.matched > 100
-    assert words_of_disagreement(wrong)[0].startswith(
-        f"only {100 * len(wrong.residuals) / wrong.matched:.0f} %"
-    )
+    (found_wrong,) = remarks_on_disagreement(wrong)
+    assert found_wrong.number("share") == pytest.approx(len(wrong.residuals) / wrong.matched)
 
 
 def test_tie_points_of_three_photographs() -> None:
@@ -461,7 +461,7 @@ def test_small_survey_names_copies_and_reasons_and_starts_from_given_values(tmp_
     with pytest.raises(SurveyFileError, match=r"image '9\.png' is no photograph of the survey"):
         run_survey(read_survey(survey))
     away = run_survey(read_survey(_write_small_survey(tmp_path / "b", "away", side=-1)))
-    assert any(line.startswith("[approximate]: ") for line in away.warnings)
+    assert {"approximate_unused", "approximate_contradicts_control"} & set(kinds_of(away.remarks))
 
 
 def test_batch_of_a_survey_without_targets_is_that_survey(

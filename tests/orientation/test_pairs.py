@@ -10,6 +10,7 @@ import pytest
 from sfm.errors import GeometryError
 from sfm.network import Estimate, ImagePoints, Network, empty_estimate
 from sfm.orientation.incremental.sequence import orient
+from sfm.remarks.remark import kinds_of
 from sfm.similarity import fit_similarity
 from tests.synthetic import make_network, seed_of
 
@@ -56,8 +57,8 @@ def test_a_plane_has_two_orientations_in_two_photographs() -> None:
     network, truth = pair("plane d", single=0, planar=True)
     start = empty_estimate(network, truth.cameras)
     found = orient(network, start)
-    (remark,) = found.remarks
-    assert "image 1 and image 2 lie in a plane, and two orientations fit them alike" in remark
+    assert kinds_of(found.remarks) == ("plane_ambiguous",)
+    assert found.remarks[0].names("photographs") == ("image 1", "image 2")
 
     def misfit(estimate: Estimate) -> float:
         return largest_error(estimate.points, truth.points)

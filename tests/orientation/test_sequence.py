@@ -11,6 +11,7 @@ from sfm.camera import camera_from_values
 from sfm.errors import GeometryError
 from sfm.network import Estimate, ImagePoints, Network, ObjectPoints
 from sfm.orientation.incremental.sequence import orient
+from sfm.remarks.remark import kinds_of
 from sfm.similarity import fit_similarity
 from tests.places import SHARED
 from tests.synthetic import make_network, perturb, seed_of
@@ -188,7 +189,7 @@ def test_control_without_coordinates_is_intersected():
     control = ObjectPoints(ids, 3 * truth.points[ids] + 10.0, np.zeros((4, 3, 3)))  # of another frame
     start = replace(unknown(truth), position=truth.position, rotation=truth.rotation)
     result = orient(replace(network, control=control), start)
-    assert result.kind == "given" and result.warnings == ()
+    assert result.kind == "given" and result.remarks == ()
     assert result.estimate.determined.all() and result.fits.all()
 
 
@@ -206,7 +207,7 @@ def test_given_values_of_no_use_are_put_aside(what):
     start = replace(start, position=position, rotation=rotation, points=points)
     result = orient(network, start)
     assert result.failures == () and result.fits.all()
-    assert len(result.warnings) == 1 and "given approximate values were not used" in result.warnings[0]
+    assert kinds_of(result.remarks) == ("approximate_unused",)
     position_error, point_error = misfit(result, truth)
     assert position_error < 0.02 and point_error < 0.005
 

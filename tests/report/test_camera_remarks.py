@@ -5,11 +5,13 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from sfm.report.findings.verdicts.verdict import Verdict
+import pytest
 
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
+from sfm.remarks.remark import of_kind
+from sfm.remarks.verdict import Verdict
 from sfm.report.findings.findings import findings_of
 from sfm.result import SurveyResult
 from tests.synthetic import make_network, seed_of
@@ -32,7 +34,8 @@ def test_a_held_camera_that_is_wrong_is_no_good_survey() -> None:
         start = replace(truth, cameras=(camera.with_parameters(p),))
         found = verdict_of(adjust(network, start, datum=Datum("free")))
         assert found.level != "good"
-        assert any(f"{name} of camera camera 1 is held at" in line for line in found.remarks)
+        (held,) = of_kind(found.remarks, "parameter_contradicted")
+        assert held.names("parameter") == (name,) and held.names("camera") == ("camera 1",)
 
 
 def test_a_principal_point_far_from_the_centre_is_told() -> None:
@@ -43,4 +46,5 @@ def test_a_principal_point_far_from_the_centre_is_told() -> None:
     p = camera.parameters.copy()
     p[camera.names.index("x0")] = 0.12 * np.hypot(10.0, 7.5)
     moved = replace(a, estimate=replace(a.estimate, cameras=(camera.with_parameters(p),)))
-    assert any("The principal point of camera camera 1" in line for line in verdict_of(moved).remarks)
+    (away,) = of_kind(verdict_of(moved).remarks, "principal_point_far")
+    assert away.names("camera") == ("camera 1",) and away.number("share") == pytest.approx(0.12, abs=0.01)

@@ -14,6 +14,7 @@ from sfm.adjustment.solve import adjust
 from sfm.camera import project
 from sfm.network import Estimate, Network
 from sfm.pipeline import run_survey
+from sfm.remarks.remark import of_kind
 from sfm.report.findings.findings import findings_of
 from sfm.survey.diagnosis.explanations import explain_residuals
 from tests.surveys import survey_of
@@ -145,8 +146,8 @@ def test_exchanged_names_are_told_by_the_verdict() -> None:
     exchanged = replace(network, image_points=replace(seen, point=point))
     verdict = findings_of(run_survey(survey_of(exchanged, truth, adjust={"reject": "tau"}))).verdict
     assert verdict.level != "good"
-    told = " ".join(verdict.remarks)
-    assert network.points[MOVED] in told and network.points[OTHER] in told
+    named = {name for one in verdict.remarks for role in ("point", "points") for name in one.names(role)}
+    assert {network.points[MOVED], network.points[OTHER]} <= named
 
 
 def test_a_focus_that_changed_is_told() -> None:
@@ -228,4 +229,5 @@ def test_a_point_with_a_third_of_its_rays_rejected_is_a_remark() -> None:
     xy[rows[1]] += (0.0, -14.0)
     spoiled = replace(network, image_points=replace(seen, xy=xy))
     verdict = findings_of(run_survey(survey_of(spoiled, truth, adjust={"reject": "tau"}))).verdict
-    assert any("A third of the rays or more were rejected" in line for line in verdict.remarks)
+    (found,) = of_kind(verdict.remarks, "rays_rejected")
+    assert found.names("points") == (network.points[4],)

@@ -21,6 +21,7 @@ from sfm.adjustment.solve import adjust
 from sfm.camera import Camera
 from sfm.comparison.two_adjusters.adjusters import AdjusterComparison, BackendAdjustment, compare_adjusters
 from sfm.network import Estimate, InteriorObservations, Network, ObjectPoints, ScaleBars
+from sfm.remarks.remark import kinds_of, of_kind
 from sfm.report.figures.plots import all_plots, plan_axes
 from sfm.report.figures.plotted import plot_data
 from sfm.report.findings.bundle_statistics import statistics_of
@@ -36,7 +37,7 @@ from sfm.report.findings.given_residuals import bar_residuals, control_residuals
 from sfm.report.findings.interior_parameters import families, interior_parameters
 from sfm.report.findings.precision import point_precision, precision_of
 from sfm.report.html.report_page import report_page
-from sfm.report.numbers import signed, significant
+from sfm.report.numbers import signed
 from sfm.report.phrases import words_of_fixed, words_of_sigma0, words_of_test, words_of_weights
 from sfm.report.tables.csv_files import write_tables
 from sfm.report.tables.summary import summary
@@ -112,7 +113,7 @@ def test_swapped_control_is_no_result(synthetic: tuple[Network, Estimate], sigma
     verdict = findings_of(result_of(adjust(swapped, truth, datum=Datum("control"), reject="none"))).verdict
     assert verdict.level == "bad"
     assert verdict.headline == "The survey has no dependable result."
-    assert any("Sigma0 is" in line or "Control point" in line for line in verdict.remarks)
+    assert of_kind(verdict.remarks, "sigma0_high", "given_contradicted")
 
 
 def test_a_scale_bar_that_contradicts_another_is_no_result(synthetic: tuple[Network, Estimate]) -> None:
@@ -121,7 +122,7 @@ def test_a_scale_bar_that_contradicts_another_is_no_result(synthetic: tuple[Netw
     a = adjust(barred, truth, datum=Datum("free"), reject="none")
     verdict = findings_of(result_of(a)).verdict
     assert verdict.level == "bad"
-    assert any(line.startswith("Scale bar ") for line in verdict.remarks), verdict.remarks
+    assert of_kind(verdict.remarks, "given_contradicted")
 
 
 @pytest.mark.parametrize(("sigmas", "level"), [(0.5, "good"), (50.0, "fair"), (200.0, "bad")])
@@ -146,7 +147,8 @@ def test_a_false_calibration_certificate_is_noticed(sigmas: float, level: str) -
     assert found.r[0, 0] == pytest.approx(sigma**2 / (sigma**2 + q), rel=0.1)  # as c moves
     verdict = findings_of(result).verdict
     assert verdict.level == level, verdict
-    assert any("The given c of camera" in line for line in verdict.remarks) == (level != "good")
+    told = of_kind(verdict.remarks, "given_contradicted", "given_remarkable")
+    assert bool(told) == (level != "good")
     assert re.search(f"interior  c of camera {camera.name} .* mm ", text_report(findings_of(result)))
     page = report_page(findings_of(result), (), ())
     table = page[page.index("<h4>Observed interior orientation</h4>") :].split("</table>")[0]
@@ -212,8 +214,8 @@ def test_a_point_that_lost_a_third_of_its_rays_is_named(synthetic: tuple[Network
         rejected[of_point[:lost]] = True
         verdict = findings_of(result_of(replace(a, rejected=rejected))).verdict
         assert verdict.level == level
-        told = any(f"{network.points[4]} ({lost} of {len(of_point)})" in line for line in verdict.remarks)
-        assert told == (level == "fair")
+        told = [one.names("points") for one in of_kind(verdict.remarks, "rays_rejected")]
+        assert told == ([(network.points[4],)] if level == "fair" else [])
 
 
 def test_a_wrong_fixed_camera_is_no_result() -> None:
@@ -233,10 +235,11 @@ def test_blunders_left_in_are_no_result(synthetic: tuple[Network, Estimate]) -> 
     a = adjust(replace(network, image_points=replace(seen, xy=xy)), truth, datum=Datum("free"), reject="none")
     verdict = findings_of(result_of(a)).verdict
     assert verdict.level == "bad"
-    assert any("was not rejected" in line for line in verdict.remarks)
+    (kept,) = of_kind(verdict.remarks, "residual_kept")
     worst = longest_residual(a)
     named = {(network.images[seen.image[k]], network.points[seen.point[k]]) for k in blunders}
     assert (worst.image, worst.point) in named
+    assert (*kept.names("photograph"), *kept.names("point")) == (worst.image, worst.point)
 
 
 def test_a_residual_counts_by_the_influence_that_its_lowered_weight_leaves(
@@ -250,9 +253,9 @@ def test_a_residual_counts_by_the_influence_that_its_lowered_weight_leaves(
     a = adjust(spoiled, truth, datum=Datum("free"), reject="huber")
     assert np.linalg.norm(a.residuals[7]) > 150 * NOISE_PX and a.weights[7] < 0.01
     assert longest_residual(a).over_sigma < 3  # Huber's weights bound it
-    assert not any("was not rejected" in line for line in findings_of(result_of(a)).verdict.remarks)
+    assert not of_kind(findings_of(result_of(a)).verdict.remarks, "residual_kept")
     kept = adjust(spoiled, truth, datum=Datum("free"), reject="none")
-    assert any("was not rejected" in line for line in findings_of(result_of(kept)).verdict.remarks)
+    assert of_kind(findings_of(result_of(kept)).verdict.remarks, "residual_kept")
 
 
 def test_sigma_px_is_only_a_guess(synthetic: tuple[Network, Estimate]) -> None:
@@ -275,17 +278,17 @@ def test_a_sigma_that_is_far_too_large_is_told_with_what_it_would_be(
     seen = network.image_points
     stated = replace(network, image_points=replace(seen, covariance=seen.covariance * guess**2))
     a = adjust(stated, truth, datum=Datum("free"), reject="none")
-    lines = findings_of(result_of(a)).verdict.remarks
+    verdict = findings_of(result_of(a)).verdict
     ratio = a.sigma0
-    line = (
-        f"The stated standard deviation of the image points, {significant(guess * NOISE_PX)} px, is "
-        f"pessimistic: their residuals show {significant(ratio * guess * NOISE_PX)} px."
-    )
-    assert list(lines) == ([line] if told else [])
+    assert kinds_of(verdict.remarks) == (("sigma_px_cautious",) if told else ()) and verdict.level == "good"
+    for one in verdict.remarks:
+        assert one.number("stated") == pytest.approx(guess * NOISE_PX)
+        assert one.number("found") == pytest.approx(ratio * guess * NOISE_PX)
     # the same where the image points were weighted by their own component before
     b = adjust(stated, truth, datum=Datum("free"), reject="none", image_sigma_factor=ratio)
     assert b.sigma0 == pytest.approx(1)
-    assert findings_of(result_of(b)).verdict.remarks == lines
+    again = findings_of(result_of(b)).verdict
+    assert [one.text for one in again.remarks] == [one.text for one in verdict.remarks]
 
 
 @pytest.mark.parametrize(
@@ -301,19 +304,22 @@ def test_gross_errors_that_nobody_looked_for_are_counted(
     xy[seed_of("not looked for").choice(len(xy), bad, replace=False), 0] += 1.0
     spoiled = replace(seen, xy=xy, covariance=guess**2 * seen.covariance)
     a = adjust(replace(network, image_points=spoiled), truth, datum=Datum("free"), reject="none")
-    lines = [
-        line for line in findings_of(result_of(a, reject="none")).verdict.remarks if "adjust.reject" in line
-    ]
-    assert not any("adjust.reject" in line for line in findings_of(result_of(a)).verdict.remarks)
+    found = of_kind(findings_of(result_of(a, reject="none")).verdict.remarks, "gross_errors_kept")
+    assert not of_kind(findings_of(result_of(a)).verdict.remarks, "gross_errors_kept")
     if not told:
-        assert lines == []
+        assert found == ()
         return
     test = {"tau": tau_test, "w": w_test}[told](a)
     assert test.beyond >= bad
-    assert lines == [
-        f"{test.beyond} of {test.tested} image coordinates have |{told}| beyond {test.critical:.2f} "
-        f'({test.expected:.1f} by chance), none was rejected: adjust.reject = "tau" takes out gross errors.'
-    ]
+    (one,) = found
+    assert one.names("test") == (told,) and one.severity == "warning"
+    numbers = {name: one.number(name) for name in ("beyond", "tested", "critical", "chance")}
+    assert numbers == {
+        "beyond": test.beyond,
+        "tested": test.tested,
+        "critical": test.critical,
+        "chance": test.expected,
+    }
 
 
 def test_weights_found_from_the_residuals_do_not_hide_sigma0(synthetic: tuple[Network, Estimate]) -> None:
@@ -322,7 +328,8 @@ def test_weights_found_from_the_residuals_do_not_hide_sigma0(synthetic: tuple[Ne
     assert findings_of(result_of(multiplied(a, 3.0))).verdict.level == "fair"
     bad = findings_of(result_of(multiplied(a, 200.0))).verdict
     assert bad.level == "bad"
-    assert "expected standard deviation of an image coordinate (0.0005" in bad.remarks[0]
+    assert bad.remarks[0].kind == "sigma0_high"
+    assert bad.remarks[0].number("stated") == pytest.approx(0.0005, rel=0.2)
     text = summary(findings_of(result_of(multiplied(a, 3.0))))
     assert text["statistics"]["sigma0_ratio"] == pytest.approx(3 * a.sigma0)
 
@@ -410,7 +417,7 @@ def test_bars_that_are_all_a_little_too_bad_are_noticed(synthetic: tuple[Network
     assert bars is not None and np.abs(bars.w).max() < 5
     verdict = findings_of(result_of(a)).verdict
     assert verdict.level == "fair" and len(verdict.remarks) == 1
-    assert verdict.remarks[0].startswith("The residuals of the scale bars are"), verdict.remarks
+    assert verdict.remarks[0].text.startswith("The residuals of the scale bars are"), verdict.remarks
 
 
 @pytest.mark.parametrize(("sigma", "limit"), [(0.0, 100.0), (1e-5, 5.0)])

@@ -20,6 +20,7 @@ from sfm.camera import Camera, camera_from_values
 from sfm.conventions import AnyArray, FloatArray
 from sfm.errors import KolinearError
 from sfm.pipeline import run_survey
+from sfm.remarks.remark import of_kind
 from sfm.rendering.render import render_photograph
 from sfm.rendering.scene import Optics, Scene
 from sfm.report.findings.findings import findings_of
@@ -105,7 +106,7 @@ def outcome(confusion: Confusion, folder: Path) -> str:
         return f"{confusion.name:18} refused: {error}"
     a, verdict = result.adjustment, findings_of(result).verdict
     told = [f"{one.image}: {one.reason}" for one in result.failed]
-    told += [line for line in result.warnings if "does not fit camera" in line]
+    told += [one.text for one in of_kind(result.remarks, "camera_per_photograph")]
     told += [one.cause for one in result.explanations if one.explains][:1]
     counts = (
         f"{len(a.network.images)} of {PHOTOGRAPHS} oriented, {len(a.network.points):3} points, "

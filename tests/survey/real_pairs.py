@@ -121,7 +121,9 @@ def outcome(
         name,
         images,
         verdict.level,
-        " | ".join((*[f"{one.image}: {one.reason}" for one in result.failed], *verdict.remarks)),
+        " | ".join(
+            (*[f"{one.image}: {one.reason}" for one in result.failed], *(one.text for one in verdict.remarks))
+        ),
         len(a.network.points),
         a.sigma0_px,
         over,

@@ -13,6 +13,7 @@ from adapters.colmap.mapper import MapperBaseline
 from sfm.conventions import rotation_from_vector
 from sfm.errors import BackendError, SurveyFileError
 from sfm.pipeline import run_survey
+from sfm.remarks.remark import of_kind
 from sfm.report.findings.findings import findings_of
 from sfm.report.output import write_result
 from sfm.result import SurveyResult
@@ -71,7 +72,8 @@ def test_a_pipeline_that_fails_does_not_lose_the_survey(survey: Survey, tmp_path
 
     result = run_survey(survey, others=OtherPrograms(mapper=mapper))
     assert result.baseline is None
-    assert "the comparison with the other pipeline failed: COLMAP's mapper found no model" in result.warnings
+    (failed,) = of_kind(result.remarks, "pipeline_failed")
+    assert failed.names("reason") == ("COLMAP's mapper found no model",)
     page = write_result(findings_of(result), tmp_path / "out").read_text(encoding="utf-8")
     assert "And COLMAP mapper by itself?" not in page and "found no model" in page
 

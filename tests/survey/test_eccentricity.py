@@ -11,6 +11,7 @@ import sfm.pipeline as pipeline
 from sfm.camera import Camera, camera_from_values, project
 from sfm.conventions import FloatArray
 from sfm.errors import SurveyFileError
+from sfm.remarks.remark import of_kind
 from sfm.result import SurveyResult
 from sfm.similarity import fit_similarity
 from sfm.survey.inputs.given import read_diameters
@@ -172,6 +173,9 @@ def test_they_are_unbiased_with_the_correction(
     assert np.mean(squares) == pytest.approx(1.0, abs=4 * np.sqrt(2 / len(squares)))
 
 
+DIAMETERS = ("diameter_differs", "diameters_differ", "diameters_of_unknown")
+
+
 def test_stated_diameters_are_compared_with_the_ellipses(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -179,20 +183,22 @@ def test_stated_diameters_are_compared_with_the_ellipses(
     length = float(np.linalg.norm(centres[39] - centres[0]))
     bar = f'\n[[scale_bar]]\nfrom = "1"\nto = "40"\nlength = {length}\nsigma = 0.01'
     right = surveyed(tmp_path, monkeypatch, f"diameter = {1.05 * SMALL_MM}{bar}")  # two thirds are small
-    assert right.warnings == ()
+    assert of_kind(right.remarks, *DIAMETERS) == ()
     wrong = surveyed(tmp_path, monkeypatch, f"diameter = 12.0{bar}")
-    assert wrong.warnings == ("targets.diameter is 12 mm, but the ellipses of 40 targets give 1.2 mm",)
+    (found,) = of_kind(wrong.remarks, *DIAMETERS)
+    assert found.kind == "diameter_differs" and found.number("targets") == 40
+    assert (found.number("stated"), found.number("found")) == pytest.approx((12.0, 1.2), rel=0.02)
     table = f"id,diameter\n1,{LARGE_MM}\n2,{2 * SMALL_MM}\n3,{1.05 * SMALL_MM}\n"
     (tmp_path / "d.csv").write_text(table + "".join(f"{k},3\n" for k in range(901, 913)), encoding="utf-8")
     several = surveyed(tmp_path, monkeypatch, f'diameters = "d.csv"{bar}')
-    ids = ", ".join(str(k) for k in range(901, 906))
-    assert several.warnings == (
-        f"d.csv: diameters of targets that are not in the survey: {ids} and 7 more",
-        "d.csv: the diameter of target 2 is 2.4 mm, but its ellipses give 1.2 mm "
-        "(more than 10 % apart: 1 of 3 targets)",
-    )
+    unknown, differ = of_kind(several.remarks, *DIAMETERS)
+    assert unknown.kind == "diameters_of_unknown"
+    assert unknown.names("targets") == tuple(str(k) for k in range(901, 913))
+    assert differ.kind == "diameters_differ" and differ.names("target") == ("2",)
+    numbers = [differ.number(name) for name in ("stated", "found", "differing", "total", "limit")]
+    assert numbers == pytest.approx([2.4, 1.2, 1, 3, 10], rel=0.02)
     only = surveyed(tmp_path, monkeypatch, 'diameters = "d.csv"')  # no scale to compare with
-    assert len(only.warnings) == 2 and "not in the survey" in only.warnings[0]
+    assert [one.kind for one in of_kind(only.remarks, *DIAMETERS)] == ["diameters_of_unknown"]
 
 
 def test_table_of_diameters(tmp_path: Path) -> None:

@@ -15,6 +15,7 @@ from sfm.conventions import FloatArray, angles_from_rotation
 from sfm.errors import GeometryError, SurveyFileError
 from sfm.network import Estimate
 from sfm.pipeline import run_survey
+from sfm.remarks.remark import kinds_of
 from sfm.report.findings.findings import findings_of
 from sfm.report.findings.given_residuals import exterior_residuals
 from sfm.report.html.report_page import report_page
@@ -199,11 +200,7 @@ def test_in_a_free_datum_it_takes_no_part_and_a_warning_says_so(tmp_path: Path) 
     path.write_text(path.read_text().replace('[exterior]\nfile = "exterior.csv"\n', ""), encoding="utf-8")
     without = solved(path)
     np.testing.assert_array_equal(result.adjustment.estimate.points, without.adjustment.estimate.points)
-    said = set(result.warnings) - set(without.warnings)
-    assert said == {
-        "[exterior]: observed exterior orientation takes no part in datum 'free', as control does not; datum "
-        "kind 'control' uses it"
-    }
+    assert set(kinds_of(result.remarks)) - set(kinds_of(without.remarks)) == {"exterior_unused"}
 
 
 def test_residuals_and_tests_stand_in_every_report(tmp_path: Path) -> None:
@@ -220,7 +217,8 @@ def test_residuals_and_tests_stand_in_every_report(tmp_path: Path) -> None:
     e, k = np.unravel_index(np.nanargmax(np.abs(found.w)), found.w.shape)
     assert (found.names[e], k) == ("image 3", 0)
     assert found.difference[e, k] < -10 * SIGMA
-    assert "The given X0 of photograph image 3 differs" in " ".join(findings_of(result).verdict.remarks)
+    told = " ".join(one.text for one in findings_of(result).verdict.remarks)
+    assert "The given X0 of photograph image 3 differs" in told
     write_result(findings_of(result), tmp_path / "out")
     rows = json.loads((tmp_path / "out" / "summary.json").read_text())["observed_exterior"]
     assert len(rows) == 3 * IMAGES

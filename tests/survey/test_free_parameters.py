@@ -66,8 +66,9 @@ def test_a_convergent_network_frees_what_it_determines_and_demands() -> None:
     found = chosen(network, truth)
     free = set(found.cameras[0].free)
     assert free >= USUAL | {"b1"}  # b1 is 2e-4, a third of a pixel at the edge
-    assert "were adjusted, as its 12 photographs determine them" in found.notes[0]
-    assert "free = [] holds them all" in found.notes[0]
+    (note,) = found.remarks
+    assert note.kind == "parameters_freed" and note.severity == "note" and note.number("photographs") == 12
+    assert set(note.names("parameters")) == free
     a = adjust(network, found.estimate, datum=Datum("free"), reject="none")
     assert a.sigma0 < 1.1
     assert abs(a.estimate.cameras[0].value("c") - 10.0) < 4 * a.interior_sigma(0)[0]
@@ -99,7 +100,8 @@ def test_three_photographs_hold_the_camera_and_say_so() -> None:
     network, truth = make_network(seed_of("three photographs"), images=3, points=40)
     found = chosen(network, truth)
     assert found.cameras[0].free == ()
-    assert "was held, since its 3 photographs do not determine it" in found.notes[0]
+    (note,) = found.remarks
+    assert note.kind == "interior_held" and note.severity == "note" and note.number("photographs") == 3
 
 
 def test_control_determines_what_three_photographs_do_not() -> None:
@@ -115,7 +117,7 @@ def test_a_camera_that_the_survey_describes_stays_as_described() -> None:
     for camera in ({"free": []}, {"free": ["c"]}, {"fixed": {"K1": 1e-4}}, {"weighted": {"c": (10.0, 0.1)}}):
         survey = survey_with(**camera)
         found = choose_free_parameters(survey, network, truth)
-        assert found.cameras == survey.cameras and found.estimate is truth and not found.notes
+        assert found.cameras == survey.cameras and found.estimate is truth and not found.remarks
 
 
 def test_image_points_that_are_given_keep_the_camera_given_with_them() -> None:

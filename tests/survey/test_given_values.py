@@ -12,6 +12,7 @@ from datasets.camcal.reference import prepare
 from sfm.errors import SurveyFileError
 from sfm.network import Estimate, Network
 from sfm.pipeline import run_survey
+from sfm.remarks.remark import of_kind
 from sfm.report.findings.findings import findings_of
 from sfm.report.tables.csv_files import write_tables
 from sfm.result import SurveyResult
@@ -78,7 +79,8 @@ def test_a_photograph_with_a_wrong_given_orientation_is_oriented_anew_and_told()
     result = run_survey(survey_of(network, truth, start=replace(truth, position=position, rotation=rotation)))
     assert len(result.network.images) == 8 and result.adjustment.converged
     assert findings_of(result).longest.over_sigma < 6
-    assert any("image 4: the given orientation was replaced" in line for line in result.warnings)
+    (replaced,) = of_kind(result.remarks, "orientation_replaced")
+    assert replaced.names("photograph") == ("image 4",) and replaced.number("image_points") == 40
 
 
 def test_a_photograph_of_three_points_with_a_given_orientation_takes_part() -> None:

@@ -16,6 +16,7 @@ from sfm.conventions import angles_from_rotation
 from sfm.errors import GeometryError, SurveyFileError
 from sfm.network import Estimate, Network
 from sfm.pipeline import run_survey
+from sfm.remarks.remark import of_kind
 from sfm.report.findings.findings import findings_of
 from sfm.report.tables.summary import summary
 from sfm.report.text.text_report import text_report
@@ -121,7 +122,8 @@ def test_inner_constraints_on_chosen_points(tmp_path: Path) -> None:
     result = run_survey(read_survey(path))
     a = result.adjustment
     assert a.datum_points is not None and a.datum_points.sum() == 3
-    assert "datum points that are not in the network: q" in result.warnings
+    (missing,) = of_kind(result.remarks, "datum_points_missing")
+    assert missing.names("points") == ("q",)
     on = [a.network.points.index(name) for name in ("p1", "p5", "p9")]
     changed = change_datum(all_points, Datum("free", a.datum_points))
     # carried over without a new adjustment, from points that were adjusted in another datum

@@ -12,6 +12,7 @@ import pytest
 
 from sfm.network import Estimate, Network
 from sfm.pipeline import run_survey
+from sfm.remarks.remark import of_kind
 from sfm.report.findings.findings import findings_of
 from sfm.report.output import write_result
 from sfm.result import SurveyResult
@@ -83,7 +84,8 @@ def test_what_is_left_out_is_counted_and_named_everywhere(tmp_path: Path) -> Non
     assert len(result.adjustment.rejected) + result.unused_image_points == len(network.image_points)
     assert all("of its" in one.reason and "accepted" in one.reason for one in left.values())
     findings = findings_of(result)
-    assert any(f"{len(left)} of 80 measured points are not in the result" in w for w in result.warnings)
+    (lost,) = of_kind(result.remarks, "points_contradicted")
+    assert set(lost.names("points")) == set(left) and lost.number("measured") == 80
     folder = tmp_path / "out"
     write_result(findings, folder)
     stored = json.loads((folder / "summary.json").read_text(encoding="utf-8"))

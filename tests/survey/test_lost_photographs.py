@@ -56,10 +56,10 @@ def test_groups_that_are_not_connected_are_told_with_what_would_connect_them() -
     assert group.images.tolist() == [6, 7, 8, 9] and not group.connected
     assert [network.points[j] for j in group.shared] == ["21", "22"]
     found = tell_lost_photographs(network, orientation(network, estimate))
-    (line,) = found.warnings
-    assert line.startswith("image 7, image 8, image 9, image 10: 4 photographs are not connected with the 6 ")
-    assert "they have only 21, 22 in common, 4 in one photograph are needed" in line
-    assert "would connect them" in line
+    (lost,) = found.remarks
+    assert lost.kind == "not_connected" and lost.number("oriented") == 6 and lost.number("needed") == 4
+    assert lost.names("photographs") == ("image 7", "image 8", "image 9", "image 10")
+    assert lost.names("shared") == ("21", "22") and lost.names("points") and lost.names("others")
     assert found.failures[0] == (
         "image 7",
         "not connected: it has 2 points in common with the oriented photographs, at least 4 are needed",
@@ -71,7 +71,8 @@ def test_a_photograph_without_any_point_is_told_as_such() -> None:
     seen = network.image_points
     network = replace(network, image_points=seen.select(seen.image > 0))
     found = tell_lost_photographs(network, orientation(network, partly(truth, np.arange(IMAGES) > 0)))
-    assert found.warnings[0].endswith("4 in one photograph are needed. No point was measured there")
+    assert found.remarks[0].kind == "not_connected" and found.remarks[0].names("points") == ()
+    assert "connects them" not in found.remarks[0].text
 
 
 def test_photographs_that_are_connected_are_no_group_of_their_own() -> None:
@@ -97,10 +98,12 @@ def test_a_principal_distance_that_loses_photographs_is_told(free: bool) -> None
             raise GeometryError("none")
         return orientation(network, truth)
 
-    found, line = try_other_principal_distances(network, start, few, orient_from)
-    assert "c = 7 mm of camera a looks wrong: from 10 mm on 10 of 10 photographs can be oriented" in line
+    found, remarks = try_other_principal_distances(network, start, few, orient_from)
+    (wrong,) = remarks
+    assert wrong.kind == "c_looks_wrong" and wrong.names("camera") == ("a",)
+    numbers = [wrong.number(name) for name in ("given", "better", "oriented", "total", "before")]
+    assert numbers == pytest.approx([7, 10, 10, 10, 3])
     assert found is not None and found.estimate.oriented.sum() == (10 if free else 3)
-    assert ("it is held: correct c_mm, or free c" in line) != free
 
 
 def test_a_survey_that_lost_the_larger_part_is_no_dependable_one() -> None:
@@ -114,4 +117,4 @@ def test_a_survey_that_lost_the_larger_part_is_no_dependable_one() -> None:
     whole = replace(result, images_total=2 * len(result.adjustment.network.images) + 1)
     verdict = findings_of(whole).verdict
     assert verdict.level == "bad"
-    assert "The larger part of the photographs" in verdict.remarks[0]
+    assert verdict.remarks[0].kind == "photographs_missing" and verdict.remarks[0].severity == "error"

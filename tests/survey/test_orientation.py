@@ -12,6 +12,7 @@ import pytest
 from sfm.conventions import angles_from_rotation
 from sfm.errors import GeometryError, SurveyFileError
 from sfm.pipeline import run_survey
+from sfm.remarks.remark import kinds_of
 from sfm.result import SurveyResult
 from sfm.survey.inputs.survey import read_survey
 from sfm.survey.measuring.measured_store import MeasuredStore
@@ -140,7 +141,7 @@ def test_photographs_start_from_approximate_values(
     folder = changed(survey_file, tmp_path / "given", add=add)
     write_exterior(folder / "images.csv", network.images, values.position + 1000.0, values.rotation)
     result = run_survey(read_survey(folder / "survey.toml"), store=store)
-    assert result.warnings == plain.warnings and result.failed == ()
+    assert kinds_of(result.remarks) == kinds_of(plain.remarks) and result.failed == ()
     np.testing.assert_allclose(result.adjustment.estimate.points, values.points + 1000.0, atol=0.05)
 
 
@@ -170,7 +171,7 @@ def test_useless_approximate_values_are_put_aside(how: str, tmp_path: Path) -> N
     result = run_survey(read_survey(path))
     assert result.failed == ()
     assert result.adjustment.redundancy == before.adjustment.redundancy
-    assert result.warnings[0].startswith("[approximate]: the given approximate values were not used")
+    assert "approximate_unused" in kinds_of(result.remarks)
 
 
 def test_a_failure_names_the_approximate_values(tmp_path: Path) -> None:

@@ -57,8 +57,9 @@ def test_photographs_of_another_size_are_a_second_camera(
     assert [camera.name for camera in found.survey.cameras] == ["small", f"small {size[0]}x{size[1]}"]
     assert found.files.camera.tolist() == [0] * 4 + [1] * 3 and found.left_out == ()
     assert found.survey.cameras[1].pixel_mm == pytest.approx(pixel_mm)
-    (line,) = found.lines
-    assert line.startswith("3 photographs of camera small (b0.png, b1.png, b2.png) have") and kind in line
+    (one,) = found.remarks
+    assert one.kind == "camera_by_size" and one.severity == "note" and one.names("what") == (kind,)
+    assert one.names("photographs") == ("b0.png", "b1.png", "b2.png") and one.names("camera") == ("small",)
 
 
 @pytest.mark.parametrize(
@@ -80,7 +81,7 @@ def test_too_few_of_them_are_left_out_with_a_remark(
 
 def test_sizes_that_agree_change_nothing(tmp_path: Path) -> None:
     found = sized(tmp_path / "s", {"a.png": (40, 30), "b.png": (40, 30), "c.png": (40, 30)})
-    assert isinstance(found.survey, Survey) and found.lines == () and len(found.files) == 3
+    assert isinstance(found.survey, Survey) and found.remarks == () and len(found.files) == 3
 
 
 def test_a_survey_with_a_crop_goes_on(tmp_path: Path) -> None:

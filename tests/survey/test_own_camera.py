@@ -12,6 +12,7 @@ from sfm.adjustment.solve import adjust
 from sfm.camera import project
 from sfm.network import Estimate, Network
 from sfm.pipeline import run_survey
+from sfm.remarks.remark import of_kind
 from sfm.report.findings.findings import findings_of
 from sfm.survey.correspondences import merge_held
 from sfm.survey.inputs.settings import AdjustSettings
@@ -47,8 +48,9 @@ def test_a_zoomed_photograph_gets_its_own_c(factor: float) -> None:
     own = {camera.name: camera for camera in a.estimate.cameras}
     assert own["synthetic image 8"].value("c") == pytest.approx(factor * 10.0, rel=2e-3)
     assert own["synthetic"].value("c") == pytest.approx(10.0, rel=2e-3)
-    (line,) = [one for one in result.warnings if one.startswith("image 8 does not fit camera synthetic")]
-    assert "with c of its own" in line and "zoomed" in line
+    (own_camera,) = of_kind(result.remarks, "camera_per_photograph")
+    assert own_camera.names("photograph") == ("image 8",) and own_camera.names("parameters") == ("c",)
+    assert own_camera.number("change") == pytest.approx(100 * (factor - 1), abs=0.3)
     assert findings_of(result).verdict.level == "fair"
 
 
@@ -72,7 +74,7 @@ def test_photographs_that_fit_keep_their_camera() -> None:
     network, truth = with_zoom("fits", {})
     result = run_survey(survey_of(network, truth, adjust=TAU))
     assert len(result.adjustment.estimate.cameras) == 1 and result.failed == ()
-    assert not [line for line in result.warnings if "does not fit camera" in line]
+    assert not of_kind(result.remarks, "camera_per_photograph")
 
 
 def test_a_photograph_that_the_adjustment_loses_stays_where_it_was() -> None:

@@ -58,7 +58,7 @@ def test_a_wrong_height_is_found(tmp_path: Path) -> None:
     control = _control(tmp_path / "control.csv", "id,X,Y,Z,sX,sY,sZ\n" + "\n".join(rows) + "\n")
     survey = survey_of(network, truth, control=control, datum={"kind": "control"}, adjust={"reject": "none"})
     verdict = findings_of(run_survey(survey)).verdict
-    assert verdict.level != "good" and any("Control point 5" in line for line in verdict.remarks)
+    assert verdict.level != "good" and any("Control point 5" in one.text for one in verdict.remarks)
 
 
 @pytest.mark.parametrize(
@@ -148,7 +148,7 @@ def test_heights_check_points_of_which_place_is_control(tmp_path: Path) -> None:
         assert [(row.point, row.coordinate) for row in rows_of_check] == [(str(j), "Z") for j in range(5, 10)]
         tests = np.array([row.test for row in rows_of_check])
         assert (np.abs(np.delete(tests, 2)) < 4).all()
-        told = [line for line in found.verdict.remarks if "Z of check point 7" in line]
+        told = [one for one in found.verdict.remarks if "Z of check point 7" in one.text]
         assert (abs(tests[2]) > 30 and told and found.verdict.level == "bad") if wrong else not told
         assert wrong or found.verdict.level == "good"
 

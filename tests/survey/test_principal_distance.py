@@ -7,6 +7,7 @@ from dataclasses import replace
 import pytest
 
 from sfm.pipeline import run_survey
+from sfm.remarks.remark import of_kind
 from sfm.report.findings.findings import findings_of
 from sfm.survey.diagnosis.principal_distance import far_principal_distances
 from tests.surveys import survey_of
@@ -39,5 +40,6 @@ def test_a_survey_whose_c_was_given_wrongly_is_not_good() -> None:
     wrong = replace(truth, cameras=(camera.with_parameters(p),))
     result = run_survey(survey_of(network, wrong, free=free, start=truth))
     assert result.estimate.cameras[0].value("c") == pytest.approx(10.0, rel=1e-2)
-    assert any("c was adjusted from 14 to" in line for line in result.warnings)
+    (far,) = of_kind(result.remarks, "c_far_from_given")
+    assert far.number("given") == pytest.approx(14) and far.number("change") < -20
     assert findings_of(result).verdict.level == "fair"

@@ -303,16 +303,16 @@ def test_a_model_that_is_not_dependable_says_so(
     monkeypatch.setattr("sfm.survey.refining.final_adjustment.MAX_ITERATIONS", 1)
     with pytest.raises(SystemExit, match="1"):
         refine(tmp_path / "model", tmp_path)
-    assert "warning: the adjustment did not converge: the refined model is" in capsys.readouterr().out
+    assert "error: The adjustment did not converge in 1 iteration." in capsys.readouterr().out
 
 
 def test_an_rms_that_is_hardly_lower_is_told_unless_it_is_that_of_windows(tmp_path: Path) -> None:
     _model(tmp_path)
     found = refine_model(*read_model(tmp_path / "model"), tmp_path)
     again = replace(found, readjusted=found.adjustment)  # a model that has been refined before
-    assert not found.warnings and not again.warnings
+    assert not found.remarks and not again.remarks
     bent = replace(again, adjustment=replace(found.adjustment, sigma0=20.0))
-    assert "a camera model that does not suit the lens" in bent.warnings[0]
+    assert bent.remarks[0].kind == "refinement_hardly_better"
 
 
 def test_a_photograph_that_cannot_be_read_is_named_with_its_folder(tmp_path: Path) -> None:
@@ -485,7 +485,7 @@ def test_control_gives_a_model_its_frame_and_what_is_wrong_of_it_is_taken_out(
     survey = _survey(tmp_path, '[datum]\nkind = "control"\n[control]\nfile = "control.csv"\n')
     refine(tmp_path / "model", tmp_path, out=tmp_path / "out", fix="f,cx,cy,k1", survey=survey)
     told = capsys.readouterr().out
-    assert "warning: control points that are no target in two photographs or more: 99" in told
+    assert "warning: Control is not in the result: 99." in told
     assert "control point target 12 does not fit" in told and "5 control points" in told
     found, sigma = _targets_of(tmp_path / "out")
     assert (np.abs(found - truth) < 4 * sigma).all() and sigma.max() < 0.5

@@ -14,6 +14,7 @@ from adapters.formats.photomodeler import read_photomodeler, write_photomodeler
 from adapters.formats.result_tables import write_tables
 from sfm.network import ImagePoints, Network
 from sfm.pipeline import run_survey
+from sfm.remarks.remark import of_kind
 from sfm.report.findings.findings import findings_of
 from sfm.report.tables.csv_files import write_tables as write_result_tables
 from sfm.stored_result import StoredResult
@@ -42,9 +43,10 @@ def test_repeated_image_points_do_not_refuse_a_survey() -> None:
     result = run_survey(survey_of(_repeated(network, [3, 20, 40], [0.0, 0.15, 5.0]), truth))
     rows, (image, point) = len(network.image_points), (network.image_points.image, network.image_points.point)
     assert len(result.adjustment.rejected) == rows - 1 and result.unused_image_points == 2
-    for k, done in ((3, "identical ones were merged"), (20, "were averaged"), (40, "were left out")):
+    for k, kind in ((3, "identical"), (20, "averaged"), (40, "contradicting")):
         name = f"{network.points[point[k]]} in {network.images[image[k]]}"
-        assert any(name in line and done in line for line in result.warnings), done
+        (found,) = of_kind(result.remarks, f"image_points_{kind}")
+        assert found.names("image_points") == (name,)
     (left,) = result.left_out
     assert (
         left.point == f"{network.points[point[40]]} in {network.images[image[40]]}" and left.image_points == 2

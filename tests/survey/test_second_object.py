@@ -13,6 +13,7 @@ from sfm.camera import camera_from_values
 from sfm.network import ImagePoints, empty_estimate
 from sfm.orientation.incremental.sequence import orient
 from sfm.pipeline import run_survey
+from sfm.remarks.remark import of_kind
 from sfm.rendering.render import render_photographs
 from sfm.rendering.scene import Optics
 from sfm.result import SurveyResult
@@ -78,9 +79,9 @@ def test_another_object_with_the_same_sheet_is_left_out(folder: Path, globs: lis
 def test_a_code_that_moved_is_told_and_costs_no_photograph(folder: Path) -> None:
     result = surveyed(folder, ["a*", "c*"])
     assert result.failed == ()
-    start = f"code {FIRST_CODE} is read at several places, c"
-    (line,) = [one for one in result.warnings if one.startswith(start)]
-    assert "a target that was moved, two of one number, or a misread code" in line
+    (moved,) = of_kind(result.remarks, "code_at_several_places", "code_rays_apart")
+    assert moved.names("code") == (str(FIRST_CODE),) and moved.names("photographs")
+    assert all(name.startswith("c") for name in moved.names("photographs"))
 
 
 @pytest.mark.parametrize("seed", [1, 2])

@@ -16,6 +16,7 @@ from sfm.adjustment.solve import adjust
 from sfm.errors import BackendError
 from sfm.network import Estimate, Network, ObjectPoints, ScaleBars
 from sfm.pipeline import run_survey
+from sfm.remarks.remark import of_kind
 from sfm.report.findings.bundle_statistics import statistics_of
 from sfm.report.findings.findings import findings_of
 from sfm.report.tables.csv_files import write_tables
@@ -34,7 +35,8 @@ def test_a_failing_comparison_leaves_the_survey(tmp_path: Path) -> None:
     result = run_survey(survey, others=OtherPrograms(refuse))  # type: ignore[arg-type]
     assert result.comparison is None
     assert result.adjustment.converged
-    assert "the comparison with the other adjuster failed: COLMAP is not installed" in result.warnings
+    (failed,) = of_kind(result.remarks, "adjuster_failed")
+    assert failed.names("reason") == ("COLMAP is not installed",)
 
 
 def spoiled_by(kind: str) -> tuple[Network, Estimate, Datum]:
@@ -170,7 +172,7 @@ def test_weights_converge_on_the_image_points_that_are_accepted(tmp_path: Path) 
 def test_weights_that_do_not_converge_are_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(variance_components, "MAX_ROUNDS", 1)
     result = run_survey(read_survey(barred_survey(tmp_path / "barred")))
-    assert any("did not converge: each" in line for line in result.warnings)
+    assert of_kind(result.remarks, "weights_not_converged")
 
 
 def test_a_point_with_one_ray_is_named(tmp_path: Path) -> None:
@@ -183,7 +185,8 @@ def test_a_point_with_one_ray_is_named(tmp_path: Path) -> None:
     table.write_text("\n".join(left) + "\n", encoding="utf-8")
     result = run_survey(read_survey(path))
     assert name not in result.adjustment.network.points
-    assert any(f"point {name}: 1 ray, 2 are needed" in line for line in result.warnings)
+    (few,) = of_kind(result.remarks, "points_with_few_rays")
+    assert few.names("points") == (name,) and few.severity == "note"
 
 
 @pytest.mark.parametrize("bars", [3, 2])
@@ -202,11 +205,11 @@ def test_a_survey_goes_on_where_a_scale_bar_does_not_fit(tmp_path: Path, bars: i
     a = result.adjustment
     assert a.converged and len(a.network.points) == 30
     if bars == 3:
-        assert result.warnings[0].startswith("scale bar 2 - 12 does not fit")
+        assert result.remarks[0].text.startswith("scale bar 2 - 12 does not fit")
         assert a.network.scale_bars.start.tolist() == [0, 2]
         assert a.weight_factor == pytest.approx(1, abs=4 / np.sqrt(2 * a.redundancy))
     else:
-        assert result.warnings[0].startswith("the scale bars contradict one another")
+        assert result.remarks[0].text.startswith("the scale bars contradict one another")
         assert len(a.network.scale_bars) == 2
         assert not a.rejected[np.isin(a.network.image_points.point, [0, 1, 10, 11])].any()
         assert findings_of(result).verdict.level == "bad"

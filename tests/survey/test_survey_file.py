@@ -12,7 +12,7 @@ from sfm.conventions import angles_from_rotation, image_from_pixel
 from sfm.errors import PhotographError, SurveyFileError
 from sfm.network import Estimate, Network
 from sfm.photographs.exif import Metadata
-from sfm.survey.adjusting.datum_definition import datum_warnings
+from sfm.survey.adjusting.datum_definition import datum_remarks
 from sfm.survey.inputs.cameras import camera_of_image, start_cameras
 from sfm.survey.inputs.photograph_list import find_photographs
 from sfm.survey.inputs.start import measurements_from_observations, start_values
@@ -387,10 +387,11 @@ def test_control_scale_bars_and_start_values(tmp_path: Path) -> None:
     np.testing.assert_array_equal(network.control.xyz, [[1, 2, 3]])
     np.testing.assert_allclose(network.control.covariance[0], np.diag([0, 0.01, 0.04]))
     assert (network.scale_bars.start[0], network.scale_bars.end[0]) == (1, 0)
-    assert datum_warnings(read_survey(path), network) == (
-        "control not in the result: elsewhere",
-        "scale bars with an end that is not in the result: a - lost",
-    )
+    missing = [
+        (one.kind, *one.names("points"), *one.names("bars"))
+        for one in datum_remarks(read_survey(path), network)
+    ]
+    assert missing == [("control_missing", "elsewhere"), ("scale_bars_missing", "a - lost")]
     assert estimate.oriented.tolist() == [False, True]
     np.testing.assert_array_equal(estimate.position[1], [10, 20, 30])
     np.testing.assert_allclose(np.degrees(angles_from_rotation(estimate.rotation[1])), [1, -2, 179])

@@ -11,6 +11,7 @@ import pytest
 from sfm.errors import GeometryError
 from sfm.orientation.incremental.starting_pair import TWOFOLD
 from sfm.pipeline import run_survey
+from sfm.remarks.remark import of_kind
 from sfm.report.findings.findings import findings_of
 from sfm.result import SurveyResult
 from sfm.similarity import fit_similarity
@@ -53,10 +54,9 @@ def test_two_photographs_are_a_survey_that_says_what_it_cannot_tell(survey: Surv
     assert a.defect == a.expected_defect
     # 0.01 px of 800 px at 600 mm, and the depth of rays that meet at 50 degrees
     assert error_mm(a.network.points, a.estimate.points) < 0.1
-    (held,) = [line for line in result.warnings if "held at the start values" in line]
-    assert held.startswith("camera small: c, x0, y0, K1, K2, K3, P1, P2 held")
-    remarks = " ".join(findings_of(result).verdict.remarks)
-    assert "Two photographs: no third ray checks a point" in remarks
+    (held,) = of_kind(result.remarks, "interior_held_of_pair")
+    assert held.names("parameters") == ("c", "x0", "y0", "K1", "K2", "K3", "P1", "P2")
+    assert of_kind(findings_of(result).verdict.remarks, "two_photographs")
 
 
 def test_points_of_a_plane_and_the_circles_in_it(survey: Survey, measured: Measurements) -> None:

@@ -10,6 +10,7 @@ import pytest
 from sfm.adjustment.quality.against_free import control_apart, given_test
 from sfm.network import Estimate, ImagePoints, Network
 from sfm.pipeline import run_survey
+from sfm.remarks.remark import of_kind
 from sfm.report.findings.findings import findings_of
 from sfm.survey.inputs.checks.same_photographs import same_photographs
 from sfm.survey.inputs.given import KnownPoints, ScaleBar
@@ -27,7 +28,7 @@ def _bar(truth: Estimate, i: int, j: int) -> ScaleBar:
 
 def _remarks(network: Network, truth: Estimate, **given: object) -> tuple[str, str]:
     verdict = findings_of(run_survey(survey_of(network, truth, **given))).verdict
-    return verdict.level, " ".join(verdict.remarks)
+    return verdict.level, " ".join(one.text for one in verdict.remarks)
 
 
 def test_the_scale_of_one_bar_is_told_as_unchecked() -> None:
@@ -48,7 +49,7 @@ def test_fixed_control_is_held_against_the_free_network() -> None:
         test = given_test(result.adjustment, result.free_network)
         assert test is not None and test.redundancy == 11  # 18 coordinates less seven
         assert (test.probability < 0.001) == contradicts
-        told = " ".join(findings_of(result).verdict.remarks)
+        told = " ".join(one.text for one in findings_of(result).verdict.remarks)
         assert ("contradicts them: F" in told) == contradicts
 
 
@@ -68,8 +69,8 @@ def test_the_level_of_the_f_test() -> None:
 def test_two_ray_points_are_told() -> None:
     rng = seed_of("two rays")
     network, truth = add_narrow_points(*make_network(rng, images=6, points=30), rng, 7)
-    _, told = _remarks(network, truth)
-    assert "7 of 37 points have two rays" in told
+    (two,) = of_kind(findings_of(run_survey(survey_of(network, truth))).verdict.remarks, "two_rays")
+    assert (two.number("two"), two.number("total"), two.severity) == (7, 37, "note")
 
 
 def test_a_copy_among_the_image_points_is_no_photograph() -> None:
@@ -121,7 +122,7 @@ def test_a_third_of_the_control_half_a_metre_off_is_named(reject: str) -> None:
     assert all(one.distance == pytest.approx(0.5, abs=0.01) for one in found)
     verdict = findings_of(result).verdict
     assert verdict.level == "bad"
-    assert any("10 control point(s) do not fit" in line for line in verdict.remarks)
+    assert any("10 control point(s) do not fit" in one.text for one in verdict.remarks)
 
 
 def test_good_control_fits_the_free_network() -> None:

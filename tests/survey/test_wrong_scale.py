@@ -7,6 +7,7 @@ import pytest
 
 from sfm.network import Estimate, Network
 from sfm.pipeline import run_survey
+from sfm.remarks.remark import kinds_of
 from sfm.report.findings.findings import findings_of
 from sfm.survey.inputs.given import KnownPoints, ScaleBar
 from tests.surveys import survey_of
@@ -35,12 +36,12 @@ def test_of_two_bars_neither_is_believed(factor: float, reject: str) -> None:
     result = run_survey(survey)
     verdict = findings_of(result).verdict
     assert verdict.level == "bad" and result.adjustment.converged
-    told = " ".join((*verdict.remarks, *result.warnings))
+    told = " ".join(one.text for one in verdict.remarks)
     if factor != 1.02 or reject == "tau":
         assert "1 - 11" in told and "2 - 12" in told
     if factor != 1.02:
         assert len(result.network.scale_bars) == 0 and len(result.taken_out) == 2
-        assert any("scale is undefined" in line for line in result.warnings)
+        assert "scale_undefined" in kinds_of(result.remarks)
         assert findings_of(result).sigma0.ratio < 1.2  # nothing is bent
 
 

@@ -22,6 +22,7 @@ from sfm.conventions import FloatArray, rotation_from_vector
 from sfm.errors import GeometryError
 from sfm.network import Estimate, ImagePoints, Network
 from sfm.pipeline import run_survey
+from sfm.remarks.remark import kinds_of
 from sfm.report.findings.findings import findings_of
 from sfm.similarity import fit_similarity
 from sfm.survey.inputs.survey import Survey
@@ -53,6 +54,7 @@ class Outcome:
     c: float  # adjusted over true principal distance
     words: str
     remarks: tuple[str, ...]
+    kinds: tuple[str, ...]  # of the remarks
 
     @property
     def is_wrong_and_believed(self) -> bool:
@@ -146,7 +148,7 @@ def outcome_of(number: int) -> Outcome:
     try:
         result = run_survey(weak.survey)
     except GeometryError as error:
-        return Outcome(number, "none", np.nan, np.nan, np.nan, weak.words, (str(error),))
+        return Outcome(number, "none", np.nan, np.nan, np.nan, weak.words, (str(error),), ())
     verdict = findings_of(result).verdict
     a = result.adjustment
     index = [weak.network.point_index(name) for name in result.network.points]
@@ -158,7 +160,16 @@ def outcome_of(number: int) -> Outcome:
     rms = float(np.sqrt((error**2).mean()))
     c = a.estimate.cameras[0].value("c") / weak.truth.cameras[0].value("c")
     size = float(np.linalg.norm(np.ptp(X, axis=0)))
-    return Outcome(number, verdict.level, rms / float(sigma), rms / size, c, weak.words, verdict.remarks)
+    return Outcome(
+        number,
+        verdict.level,
+        rms / float(sigma),
+        rms / size,
+        c,
+        weak.words,
+        tuple(one.text for one in verdict.remarks),
+        kinds_of(verdict.remarks),
+    )
 
 
 def study(numbers: Iterable[int], kept: Path | None = None) -> list[Outcome]:
