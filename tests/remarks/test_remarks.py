@@ -60,9 +60,9 @@ def test_an_unknown_number_is_as_bad_as_can_be() -> None:
 
 
 def test_the_most_serious_remark_decides_and_comes_first() -> None:
-    mild = remark("other_camera", photographs=["b"], change=(0.1, "%"), shift=0.5)
-    warning = remark("other_camera", photographs=["b"], change=(0.1, "%"), shift=1.5)
-    serious = remark("other_camera", photographs=["a"], change=(9.0, "%"), shift=40.0)
+    mild, warning, serious = (
+        remark("sigma0_high", ratio=ratio, stated=(0.1, "px")) for ratio in (1.9, 2.1, 5.1)
+    )
     assert judge([], HEADLINES).level == "good"
     assert judge([mild], HEADLINES).level == "good"
     assert judge([mild, warning], HEADLINES).level == "fair"
@@ -81,8 +81,8 @@ def test_every_row_has_a_cause_and_a_remedy_and_is_a_sentence() -> None:
 
 
 def test_a_remark_is_plain_values_for_json() -> None:
-    one = remark("other_camera", photographs=["b"], change=(0.1, "%"), shift=float("nan"))
+    one = remark("sigma0_high", ratio=float("nan"), stated=(0.1, "px"))
     stored = json.loads(json.dumps(one.as_dict(), allow_nan=False))
-    assert stored["kind"] == "other_camera" and stored["severity"] == "error"
-    assert stored["numbers"]["change"] == {"value": 0.1, "unit": "%"}
-    assert stored["numbers"]["shift"]["value"] is None
+    assert stored["kind"] == "sigma0_high" and stored["severity"] == "error"
+    assert stored["numbers"]["stated"] == {"value": 0.1, "unit": "px"}
+    assert stored["numbers"]["ratio"]["value"] is None

@@ -23,9 +23,9 @@ from sfm.reduced_network import reduce_network
 from sfm.remarks.remark import Remark
 from sfm.survey.hypotheses.alternatives import ALPHA, Alternative, alternatives_of, is_significant
 from sfm.survey.hypotheses.columns import columns_of
+from sfm.survey.hypotheses.described import remark_of
 from sfm.survey.hypotheses.refit import Refit, refit
 from sfm.survey.hypotheses.score import reduce_adjustment
-from sfm.survey.hypotheses.described import remark_of
 
 MAX_CAUSES = 2  # that are looked for one after another
 MAX_IMAGE_POINTS = 20_000  # of the network that is tested; every so many points of a larger one
