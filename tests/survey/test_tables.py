@@ -104,16 +104,6 @@ def test_scale_bar_in_another_unit_than_its_sigma_is_refused(tmp_path: Path) -> 
     read_survey(path)
 
 
-def test_image_points_in_another_unit_are_refused(tmp_path: Path) -> None:
-    path = write_observed_survey(tmp_path / "s", "s")
-    points = path.parent / "image_points.csv"
-    text = points.read_text(encoding="utf-8")
-    points.write_text(text + "image 1,new,250000,12\n", encoding="utf-8")
-    lines = text.count("\n") + 1
-    with pytest.raises(SurveyFileError, match=rf"line {lines}: image point 250000, 12 px is far outside"):
-        measurements_from_observations(read_survey(path))
-
-
 def test_unknown_images_of_start_values_are_refused(tmp_path: Path) -> None:
     path = write_observed_survey(tmp_path / "s", "s")
     start = "image,X,Y,Z,omega_deg,phi_deg,kappa_deg\nimage 1,0,0,4,0,0,0\nimage 99,0,0,4,0,0,0\n"

@@ -14,6 +14,7 @@ from sfm.remarks.catalogue import (
     comparisons,
     datum,
     hypotheses,
+    inputs,
     other_programs,
     photographs,
     points,
@@ -31,6 +32,7 @@ SUBJECTS: Mapping[str, tuple[Kind, ...]] = MappingProxyType(
         "Datum, scale and given values": datum.ROWS,
         "Other programs": other_programs.ROWS,
         "Refining": refining.ROWS,
+        "Input": inputs.ROWS,
         "Comparisons and epochs": comparisons.ROWS,
     }
 )

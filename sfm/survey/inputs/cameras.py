@@ -16,6 +16,8 @@ from sfm.survey.inputs.given import StartCameras
 from sfm.survey.inputs.settings import CameraSettings
 
 MAX_PIXEL_MM = 1000.0  # side of a pixel; of models without a size it is 1 mm
+MIN_VIEW_DEG, MAX_VIEW_DEG = 0.5, 170.0  # diagonal, of a central projection; lenses have 1 to 140
+COMMON_VIEW_DEG = 10.0, 120.0  # of nearly all cameras: by which the unit is guessed
 MAX_PIXEL_RATIO = 10.0  # of its sides; anamorphic lenses and line scanners stay below 3
 
 
@@ -64,7 +66,8 @@ def start_cameras(
 
     Raises:
         PhotographError: photographs of one camera differ in size from one another or from size_px.
-        SurveyFileError: size, pixel size or principal distance is not known from anywhere.
+        SurveyFileError: size, pixel size or principal distance is not known from anywhere, or they make a
+            field of view that no lens has.
     """
     index = np.zeros(0, dtype=np.int64) if camera is None else camera
     cameras = []
@@ -97,6 +100,7 @@ def start_cameras(
             focal = next((known[name] * pixel[0] for name in ("fx", "f") if name in known), None)
         if focal is None:
             raise SurveyFileError(f"{where}: no photograph's EXIF data tell the focal length, c_mm is needed")
+        _refuse_implausible_view(where, size, pixel, focal)
         cameras.append(
             camera_from_values(
                 one.name,
@@ -109,6 +113,31 @@ def start_cameras(
             )
         )
     return tuple(cameras)
+
+
+def _refuse_implausible_view(
+    where: str, size: tuple[int, int], pixel: tuple[float, float], focal: float
+) -> None:
+    """Raise SurveyFileError if no lens has such a field of view: a length is in another unit."""
+    diagonal = float(np.hypot(size[0] * pixel[0], size[1] * pixel[1]))
+
+    def view_deg(pixel_factor: float, focal_factor: float) -> float:
+        return float(np.degrees(2 * np.arctan(pixel_factor * diagonal / (2 * focal_factor * abs(focal)))))
+
+    view = view_deg(1.0, 1.0)
+    if MIN_VIEW_DEG <= view <= MAX_VIEW_DEG:
+        return
+    likely = [
+        f"{name} in {unit}"
+        for unit, factor in (("µm", 1e-3), ("m", 1e3), ("inch", 25.4))
+        for name, factors in (("pixel_mm", (factor, 1.0)), ("c_mm", (1.0, factor)))
+        if COMMON_VIEW_DEG[0] <= view_deg(*factors) <= COMMON_VIEW_DEG[1]
+    ]
+    raise SurveyFileError(
+        f"{where}: pixels of {pixel[0]:g} x {pixel[1]:g} mm and c = {focal:g} mm make a field of view of "
+        f"{view:.3g} degrees, expected {MIN_VIEW_DEG:g} to {MAX_VIEW_DEG:g}; "
+        f"{' or '.join(likely) or 'a length in another unit than mm'}?"
+    )
 
 
 def free_start_values(settings: CameraSettings, name: str, given: StartCameras | None) -> dict[str, float]:

@@ -11,8 +11,10 @@ from sfm.camera import Camera
 from sfm.conventions import FloatArray, IntArray, pixel_from_image
 from sfm.errors import SurveyFileError
 from sfm.network import Estimate, ImagePoints, Network, ObjectPoints, ScaleBars, rows_of
+from sfm.remarks.remark import remark
 from sfm.result import FailedImage, LeftOutPoint
 from sfm.survey.inputs.cameras import camera_of_image, refuse_unknown_cameras, start_cameras
+from sfm.survey.inputs.checks.outside import refuse_outside
 from sfm.survey.inputs.checks.repeated_image_points import merge_repeated
 from sfm.survey.inputs.checks.same_photographs import same_photographs
 from sfm.survey.inputs.given import KnownPoints, Observations, ScaleBar
@@ -22,6 +24,7 @@ from sfm.survey.inputs.photograph_list import refuse_many
 from sfm.survey.inputs.survey import Survey
 
 MIN_RAYS = 2  # photographs that a point with a name needs
+OUTSIDE = "it is outside of its photograph"
 CONTRADICTING = "it stands there more than once, at places that contradict one another"
 
 
@@ -35,8 +38,8 @@ def measurements_from_observations(survey: Survey) -> Measurements:
         survey: a survey with observations.
 
     Raises:
-        SurveyFileError: there are none, one is far outside its photograph, or the cameras' start values are
-            incomplete.
+        SurveyFileError: there are none, image points are outside of their photographs, or the cameras'
+            start values are incomplete.
     """
     given = survey.observations
     if given is None:
@@ -50,14 +53,15 @@ def measurements_from_observations(survey: Survey) -> Measurements:
     )
     refuse_ungrouped(survey.cameras, images, owner, survey.source)
     xy, covariance = _in_pixels(given, cameras, owner[image], survey.adjust.sigma_px)
-    _refuse_far_outside(given, xy, cameras, owner[image])
+    outside = refuse_outside(given, xy, cameras, owner[image])
+    gross = [f"{points[point[k]]} in {images[image[k]]}" for k in np.flatnonzero(outside)]
     refuse_unknown_photographs(survey, images)
     sigma = np.full(xy.shape, np.nan) if given.sigma is None else given.sigma
     stated = np.asarray(np.isfinite(sigma).all(axis=1))
     every = images
     copies = same_photographs(image, point, xy, owner)
     own = np.isin(np.arange(len(images)), list(copies), invert=True)
-    rows = own[image]
+    rows = own[image] & ~outside
     number = np.cumsum(own) - 1
     failed = tuple(
         FailedImage(every[i], f"its image points are those of {every[j]}") for i, j in copies.items()
@@ -77,14 +81,15 @@ def measurements_from_observations(survey: Survey) -> Measurements:
     contradicting = tuple(
         LeftOutPoint(f"{points[j]} in {images[i]}", times[i, j], CONTRADICTING) for i, j in merged.dropped
     )
+    told = (remark("image_points_outside", image_points=gross),) if gross else ()
     return Measurements(
         network,
         cameras,
         every,
         np.full(len(points), MIN_RAYS),
         failed,
-        remarks=merged.remarks(images, points),
-        left_out=contradicting,
+        remarks=(*merged.remarks(images, points), *told),
+        left_out=(*contradicting, *(LeftOutPoint(name, 1, OUTSIDE) for name in gross)),
     )
 
 
@@ -207,17 +212,3 @@ def _in_pixels(
     covariance[:, range(2), range(2)] = s**2
     covariance[:, 0, 1] = covariance[:, 1, 0] = between
     return xy_px, covariance
-
-
-def _refuse_far_outside(
-    given: Observations, xy_px: FloatArray, cameras: tuple[Camera, ...], camera: IntArray
-) -> None:
-    """Refuse image points farther outside their photograph than it is large: their unit is another."""
-    size = np.array([own.size_px for own in cameras])[camera]
-    for k in np.flatnonzero(((xy_px < -size) | (xy_px > 2 * size)).any(axis=1))[:1]:
-        x, y = given.xy[k]
-        raise SurveyFileError(
-            f"{given.table.place(k)}: image point {x:g}, {y:g} {given.unit} is far outside its "
-            f"photograph of {size[k, 0]} x {size[k, 1]} px; the unit is another, or the size of camera "
-            f"{cameras[camera[k]].name}"
-        )

@@ -1,0 +1,16 @@
+"""What is wrong with the input of a survey and does not stop it."""
+
+from __future__ import annotations
+
+from sfm.remarks.kind import Kind
+
+ROWS = (
+    Kind(
+        "image_points_outside",
+        "note",
+        "{image_points:image point} {image_points:is|are} outside of {image_points:its photograph|their "
+        "photographs} and left out: {image_points}.",
+        "a gross error or a mistyped coordinate",
+        "Correct or remove the image points that are named.",
+    ),
+)
