@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from sfm.adjustment.covariance import marginal_of
-from sfm.adjustment.quality.against_free import FreeNetwork
 from sfm.adjustment.quality.correlations import ExteriorCorrelations, OrientationCorrelation
+from sfm.adjustment.quality.given_values import GivenTest
 from sfm.adjustment.quality.other_solutions import OtherSolution
 from sfm.adjustment.result import Adjustment
 from sfm.camera import Camera
@@ -47,15 +47,6 @@ class LeftOutPoint:
     image_points: int  # measured of it
     reason: str  # one line: what was found and what was needed
     few_rays: bool = False  # whether it was measured in fewer photographs than it needs
-
-
-@dataclass(frozen=True)
-class TakenOut:
-    """Control or a scale bar that the survey gives and that was not used, since it does not fit."""
-
-    what: str  # such as "scale bar 506 - 507"
-    relative: float  # by how much it is off, over its length or the size of the object
-    resolved: bool  # whether the others tell that it is the one that is wrong
 
 
 @dataclass(frozen=True)
@@ -184,8 +175,7 @@ class SurveyResult:
     eccentricity: Eccentricity | None = None  # None where it was not corrected
     no_circles: tuple[str, ...] = ()  # uncoded points left out: their outlines are not images of one circle
     left_out: tuple[LeftOutPoint, ...] = ()  # measured points that are not in the result
-    free_network: FreeNetwork | None = None  # None where nothing else took part, or where it has no result
-    taken_out: tuple[TakenOut, ...] = ()  # control and scale bars that do not fit and were not used
+    given_tests: tuple[GivenTest, ...] = ()  # of control and scale bars against the image points alone
     other_solutions: tuple[OtherSolution, ...] = ()  # that the image points allow as well
     unused_image_points: int = 0  # of points or photographs that are not in the result, in no other count
     explanations: tuple[Explanation, ...] = ()  # of large residuals that were tried, the likeliest first

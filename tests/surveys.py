@@ -12,8 +12,11 @@ import numpy as np
 from sfm.camera import Camera, camera_from_values
 from sfm.conventions import AnyArray, FloatArray, angles_from_rotation
 from sfm.network import Estimate, Network
+from sfm.remarks.catalogue import given_values
+from sfm.remarks.remark import Remark
 from sfm.rendering.render import render_photographs
 from sfm.rendering.scene import CircularTargets, Faces, Marks, Optics, Scene, coded_ring, join_marks
+from sfm.result import SurveyResult
 from sfm.survey.inputs.given import KnownPoints, Observations, StartOrientations
 from sfm.survey.inputs.survey import CameraSetup, Survey
 from sfm.targets.codes.families import code_family
@@ -160,6 +163,12 @@ def _scene() -> Scene:
         5 + 3 * np.arange(len(places)),
     )
     return Scene(faces, join_marks(marks), targets)
+
+
+def remarks_on_given(result: SurveyResult) -> tuple[Remark, ...]:
+    """Return what a survey found of its scale bars, control and orientation before the adjustment."""
+    kinds = {row.name for row in given_values.ROWS}
+    return tuple(one for one in result.remarks if one.kind in kinds)
 
 
 def survey_of(

@@ -75,9 +75,11 @@ def check_circles(
     remarks = _unknown_ids(survey.diameters, network.points)
     if np.isfinite(known).any():
         scale = object_scale(network, estimate)
+        other: tuple[Remark, ...] = ()
         if np.isfinite(scale):
-            remarks += _other_sizes(survey, names_of_circles, known, scale * circles.radius)
-        else:  # then the targets themselves tell the scale
+            other = _other_sizes(survey, names_of_circles, known, scale * circles.radius)
+            remarks += other
+        if other or not np.isfinite(scale):  # a bar may be wrong: the targets give the scale of their own
             scale = float(np.nanmedian(known / circles.radius))
         circles = fit_circles(views, len(numbers), radius=known / scale)
     xy, covariance = seen.xy.copy(), seen.covariance.copy()

@@ -26,6 +26,7 @@ from sfm.survey.diagnosis.contradicting_codes import (
     remarks_on_contested,
 )
 from sfm.survey.diagnosis.own_camera import treat_lost
+from sfm.survey.hypotheses.given import without_given
 from sfm.survey.inputs.measurements import MeasuredPhotographs, Measurements, Naming
 from sfm.survey.inputs.survey import Survey
 from sfm.survey.measuring.surface_points import cover_photographs
@@ -169,7 +170,7 @@ def _match_and_adjust(
         network = build_network(survey, photographs, naming)
         everything = np.ones(len(network.image_points), dtype=bool)
         images, points = determined(network, estimate, everything, min_rays(naming))
-        part, values = reduce_network(network, estimate, images, points, everything)
+        part, values = reduce_network(without_given(network), estimate, images, points, everything)
         adjusted = adjust(part, values, datum=Datum("free"), reject="huber", covariance=False)
         estimate = merge_held(estimate, adjusted, images, points, tolerance_px=tolerance_px)
         spread = MAD_TO_SIGMA * float(np.nanmedian(np.abs(adjusted.residuals)))

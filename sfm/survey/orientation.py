@@ -2,17 +2,26 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
 
 from sfm.conventions import BoolArray
 from sfm.errors import GeometryError
-from sfm.network import Estimate, Network, rows_of
+from sfm.network import Estimate, Network, ObjectPoints, ScaleBars, rows_of
 from sfm.orientation.image_rays import intersect_image_points
-from sfm.orientation.incremental.sequence import MIN_POINTS, Judge, Orientation, orient
+from sfm.orientation.incremental.growth import residual_lengths
+from sfm.orientation.incremental.sequence import (
+    FINAL_TOLERANCE_PX,
+    MIN_POINTS,
+    Judge,
+    Orientation,
+    orient,
+)
 from sfm.reduced_network import reduce_network
 from sfm.remarks.remark import Remark, remark
+from sfm.similarity import fit_similarity
 from sfm.survey.adjusting.free_parameters import choose_free_parameters
 from sfm.survey.adjusting.solution import refine
 from sfm.survey.circles import circle_misfit
@@ -40,15 +49,16 @@ def orient_survey(survey: Survey, measured: Measurements) -> Orientation:
     Raises:
         GeometryError: no two photographs could be oriented.
     """
-    network = measured.network
+    network = replace(measured.network, scale_bars=ScaleBars())  # they are judged by the adjustment first
     estimate = start_values(survey, network, measured.cameras)
     given = survey.start_orientations is not None or survey.start_points is not None
 
     def orient_from(values: Estimate) -> Orientation:
         if survey.tie_points:
             return _orient_strongest(network, values)
-        # given image points are adjusted as they are, and judged by the adjustment
-        return _orient(network, values, contradicting=survey.observations is not None, judge=_judge(measured))
+        return _orient_on_control(
+            network, values, given=survey.observations is not None, judge=_judge(measured)
+        )
 
     found, failure = None, None
     try:
@@ -89,6 +99,53 @@ def _orient(
 ) -> Orientation:
     """Orient all photographs on all points."""
     return orient(network, estimate, refine=refine, contradicting=contradicting, judge=judge)
+
+
+def _orient_on_control(
+    network: Network, estimate: Estimate, *, given: bool, judge: Judge | None
+) -> Orientation:
+    """Orient all photographs, on their control if that fits them, else without it.
+
+    Args:
+        network: of the survey.
+        estimate: start values.
+        given: whether image points were given: they are adjusted as they are, and judged by the adjustment.
+        judge: as of `orient`.
+    """
+    found, failure = None, None
+    try:
+        found = _orient(network, estimate, contradicting=given, judge=judge)
+    except GeometryError as error:
+        failure = error
+    if not len(network.control) or (found is not None and _fits(network, found).all()):
+        return _known(found, failure)
+    points = estimate.points.copy()
+    points[network.control.point] = np.nan
+    alone = replace(network, control=ObjectPoints())
+    try:
+        other = _orient(alone, replace(estimate, points=points), contradicting=given, judge=judge)
+    except GeometryError:
+        return _known(found, failure)
+    if found is not None and _fits(network, other).sum() <= _fits(network, found).sum():
+        return found
+    with suppress(GeometryError):  # fewer than three, or on a line
+        control = network.control.complete
+        known = other.estimate.determined[control.point]
+        placing = fit_similarity(other.estimate.points[control.point[known]], control.xyz[known])
+        other = replace(other, estimate=placing.apply_estimate(other.estimate))
+    return other
+
+
+def _known(found: Orientation | None, failure: GeometryError | None) -> Orientation:
+    """Return an orientation, or raise the reason why there is none."""
+    if found is None:
+        raise failure or GeometryError("orientation: none")
+    return found
+
+
+def _fits(network: Network, found: Orientation) -> BoolArray:
+    """Return which image points fit an orientation as well as any network can be adjusted, (k,)."""
+    return np.asarray(residual_lengths(network, found.estimate) <= FINAL_TOLERANCE_PX)
 
 
 def _hold_cameras_of_two(

@@ -17,7 +17,7 @@ from sfm.report.tables.csv_files import write_tables
 from sfm.report.tables.summary import write_summary
 from sfm.survey.inputs.given import KnownPoints, read_control, read_image_points
 from sfm.survey.inputs.start import measurements_from_observations
-from tests.surveys import survey_of
+from tests.surveys import remarks_on_given, survey_of
 from tests.synthetic import make_network, seed_of
 
 
@@ -57,8 +57,10 @@ def test_a_wrong_height_is_found(tmp_path: Path) -> None:
     rows.append(f"5,,,{truth.points[4, 2] + 0.01},,,1e-4")
     control = _control(tmp_path / "control.csv", "id,X,Y,Z,sX,sY,sZ\n" + "\n".join(rows) + "\n")
     survey = survey_of(network, truth, control=control, datum={"kind": "control"}, adjust={"reject": "none"})
-    verdict = findings_of(run_survey(survey)).verdict
-    assert verdict.level != "good" and any("Control point 5" in one.text for one in verdict.remarks)
+    result = run_survey(survey)
+    said = next(one for one in remarks_on_given(result) if one.kind == "given_left_out")
+    assert said.names("given") == ("5",) and said.number("distance") == pytest.approx(0.01, rel=0.1)
+    assert findings_of(result).verdict.level == "fair"
 
 
 @pytest.mark.parametrize(
@@ -148,9 +150,11 @@ def test_heights_check_points_of_which_place_is_control(tmp_path: Path) -> None:
         assert [(row.point, row.coordinate) for row in rows_of_check] == [(str(j), "Z") for j in range(5, 10)]
         tests = np.array([row.test for row in rows_of_check])
         assert (np.abs(np.delete(tests, 2)) < 4).all()
-        told = [one for one in found.verdict.remarks if "Z of check point 7" in one.text]
-        assert (abs(tests[2]) > 30 and told and found.verdict.level == "bad") if wrong else not told
-        assert wrong or found.verdict.level == "good"
+        said = [one for one in found.verdict.remarks if one.kind == "check_differs"]
+        assert bool(said) == bool(wrong) and found.verdict.level == ("fair" if wrong else "good")
+        if wrong:
+            assert (said[0].names("coordinate"), said[0].names("point")) == (("Z",), ("7",))
+            assert said[0].number("sigmas") == pytest.approx(abs(tests[2])) and abs(tests[2]) > 30
 
 
 @pytest.mark.parametrize(

@@ -8,11 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sfm.adjustment.datum import Datum
 from sfm.adjustment.quality import variance_components
 from sfm.adjustment.quality.variance_components import by_kind
-from sfm.adjustment.result import Adjustment
-from sfm.adjustment.solve import adjust
 from sfm.errors import BackendError
 from sfm.network import Estimate, Network, ObjectPoints, ScaleBars
 from sfm.pipeline import run_survey
@@ -20,7 +17,7 @@ from sfm.remarks.remark import of_kind
 from sfm.report.findings.bundle_statistics import statistics_of
 from sfm.report.findings.findings import findings_of
 from sfm.report.tables.csv_files import write_tables
-from sfm.survey.adjusting.datum_definition import find_contradiction, object_scale
+from sfm.survey.adjusting.datum_definition import object_scale
 from sfm.survey.inputs.survey import read_survey
 from sfm.survey.other_programs import OtherPrograms
 from tests.surveys import write_observed_survey
@@ -37,70 +34,6 @@ def test_a_failing_comparison_leaves_the_survey(tmp_path: Path) -> None:
     assert result.adjustment.converged
     (failed,) = of_kind(result.remarks, "adjuster_failed")
     assert failed.names("reason") == ("COLMAP is not installed",)
-
-
-def spoiled_by(kind: str) -> tuple[Network, Estimate, Datum]:
-    """Return a network with control or bars, of which some are 50 mm or 3 % off, a start, and its datum."""
-    network, truth = make_network(seed_of("contradicted control"), images=8, points=30, noise_px=0.1)
-    rows = np.arange(4 if kind == "twist" else 6)
-    xyz = truth.points[rows].copy()
-    start = replace(truth, points=truth.points.copy())
-    if "bar" in kind:
-        ends = np.array([[0, 10], [1, 11], [2, 12]])[: 2 if kind == "one of two bars" else 3]
-        length = np.linalg.norm(truth.points[ends[:, 1]] - truth.points[ends[:, 0]], axis=1)
-        if kind != "good bars":
-            length[1] *= 1.03
-        bars = ScaleBars(ends[:, 0], ends[:, 1], length, np.full(len(ends), 1e-5))
-        return replace(network, scale_bars=bars), start, Datum("free")
-    if kind == "one control point":
-        xyz[2, 0] += 0.05
-    if kind == "twist":
-        normal = np.linalg.svd(xyz - xyz.mean(axis=0))[2][2]
-        xyz += 0.05 * np.array([1, -1, 1, -1])[:, None] * normal
-    start.points[rows] = xyz
-    control = ObjectPoints(rows, xyz, np.zeros((len(rows), 3, 3)))
-    return replace(network, control=control), start, Datum("control")
-
-
-@pytest.mark.parametrize(
-    ("kind", "blamed"),
-    [
-        ("good control", None),
-        ("one control point", "control point {2}"),
-        ("twist", "the control points contradict one another"),
-        ("good bars", None),
-        ("one of three bars", "scale bar {1} - {11}"),
-        ("one of two bars", "the scale bars contradict one another"),
-    ],
-)
-def test_what_contradicts_the_photographs_is_named_if_it_can_be_told(kind: str, blamed: str | None) -> None:
-    network, start, datum = spoiled_by(kind)
-    a = adjust(network, start, datum=datum, sigma_px=0.1, reject="tau", alpha=1e-4)
-
-    def readjust(one: Network) -> Adjustment:
-        return adjust(one, a.estimate, datum=datum, sigma_px=0.1, reject="none", covariance=False)
-
-    found = find_contradiction(network, a, readjust, unit="m")
-    if blamed is None:
-        assert found is None
-        return
-    assert found is not None
-    assert found.line.startswith(blamed.format(*network.points)), found.line
-    if "contradict one another" in blamed:
-        assert found.freed is None
-        carriers = {*network.control.point, *network.scale_bars.start, *network.scale_bars.end}
-        assert set(np.flatnonzero(found.protected)) == carriers
-        return
-    assert found.freed is not None
-    if kind == "one control point":
-        assert list(found.freed.control.point) == [0, 1, 3, 4, 5]
-        off = float(found.line.split("it is ")[1].split()[0])
-        assert off == pytest.approx(0.05, rel=0.05)
-    else:
-        assert list(found.freed.scale_bars.start) == [0, 2]
-        X = start.points
-        off = 0.03 * np.linalg.norm(X[11] - X[1])
-        assert float(found.line.split("it is ")[1].split()[0]) == pytest.approx(off, rel=0.05)
 
 
 def test_scale_comes_from_bars_before_control_and_two_control_points_are_enough() -> None:
@@ -187,29 +120,3 @@ def test_a_point_with_one_ray_is_named(tmp_path: Path) -> None:
     assert name not in result.adjustment.network.points
     (few,) = of_kind(result.remarks, "points_with_few_rays")
     assert few.names("points") == (name,) and few.severity == "note"
-
-
-@pytest.mark.parametrize("bars", [3, 2])
-def test_a_survey_goes_on_where_a_scale_bar_does_not_fit(tmp_path: Path, bars: int) -> None:
-    """Of three bars the wrong one is taken out and all is tested again; of two both stay, and no test."""
-    path = write_observed_survey(tmp_path / "wrong bar", "wrong bar", images=8, points=30)
-    network, truth = make_network(seed_of("wrong bar"), images=8, points=30, free=("c",))
-    text = '[adjust]\nreject = "tau"\n'
-    for b in range(bars):
-        length = np.linalg.norm(truth.points[b] - truth.points[b + 10]) * (1.03 if b == 1 else 1.0)
-        ends = f'from = "{network.points[b]}"\nto = "{network.points[b + 10]}"'
-        text += f"[[scale_bar]]\n{ends}\nlength = {length}\nsigma = 1e-4\n"
-    with path.open("a", encoding="utf-8") as file:
-        file.write(text)
-    result = run_survey(read_survey(path))
-    a = result.adjustment
-    assert a.converged and len(a.network.points) == 30
-    if bars == 3:
-        assert result.remarks[0].text.startswith("scale bar 2 - 12 does not fit")
-        assert a.network.scale_bars.start.tolist() == [0, 2]
-        assert a.weight_factor == pytest.approx(1, abs=4 / np.sqrt(2 * a.redundancy))
-    else:
-        assert result.remarks[0].text.startswith("the scale bars contradict one another")
-        assert len(a.network.scale_bars) == 2
-        assert not a.rejected[np.isin(a.network.image_points.point, [0, 1, 10, 11])].any()
-        assert findings_of(result).verdict.level == "bad"

@@ -10,7 +10,7 @@ from sfm.pipeline import run_survey
 from sfm.remarks.remark import kinds_of
 from sfm.report.findings.findings import findings_of
 from sfm.survey.inputs.given import KnownPoints, ScaleBar
-from tests.surveys import survey_of
+from tests.surveys import remarks_on_given, survey_of
 from tests.synthetic import make_network, seed_of
 
 
@@ -36,13 +36,12 @@ def test_of_two_bars_neither_is_believed(factor: float, reject: str) -> None:
     result = run_survey(survey)
     verdict = findings_of(result).verdict
     assert verdict.level == "bad" and result.adjustment.converged
-    told = " ".join(one.text for one in verdict.remarks)
-    if factor != 1.02 or reject == "tau":
-        assert "1 - 11" in told and "2 - 12" in told
-    if factor != 1.02:
-        assert len(result.network.scale_bars) == 0 and len(result.taken_out) == 2
-        assert "scale_undefined" in kinds_of(result.remarks)
-        assert findings_of(result).sigma0.ratio < 1.2  # nothing is bent
+    (said,) = remarks_on_given(result)
+    assert said.kind == "scale_contradicted" and said.names("given") == ("bar 1 - 11", "bar 2 - 12")
+    assert said.number("off") == pytest.approx(100 * (max(factor, 1 / factor) - 1), rel=0.01)
+    assert said.number("unit_factor") == (factor if factor > 2 else 10) or factor == 1.02
+    assert len(result.network.scale_bars) == 0 and not result.has_scale
+    assert findings_of(result).sigma0.ratio < 1.2  # nothing is bent
 
 
 @pytest.mark.slow
@@ -82,17 +81,20 @@ def test_control_too_large_for_the_bars_of_many_networks_is_bad() -> None:
 
 
 @pytest.mark.parametrize("factor", [0.5, 10.0, 1000.0])
-def test_of_three_bars_the_wrong_one_is_taken_out_and_told_as_bad(factor: float) -> None:
+def test_of_three_bars_the_wrong_one_is_left_out(factor: float) -> None:
     network, truth = _scene("three bars")
     result = run_survey(survey_of(network, truth, scale_bars=_bars(truth, [1.0, factor, 1.0])))
-    assert [one.what for one in result.taken_out] == ["scale bar 2 - 12"]
+    (said,) = remarks_on_given(result)
+    assert said.kind == "bar_left_out" and said.names("bar") == ("2 - 12",)
+    assert said.number("off") == pytest.approx(100 * (factor - 1), rel=0.01)
+    assert (said.number("unit_factor") == factor) == (factor > 1)
     assert result.network.points[result.network.scale_bars.start[0]] == "1"
     index = [network.point_index(name) for name in result.network.points]
     size = np.linalg.norm(np.ptp(result.estimate.points, axis=0)) / np.linalg.norm(
         np.ptp(truth.points[index], axis=0)
     )
     assert 0.5 < size < 2
-    assert findings_of(result).verdict.level == "bad"  # as where it is kept
+    assert findings_of(result).verdict.level == "fair"  # the two others confirm each other
 
 
 @pytest.mark.parametrize("reject", ["tau", "none"])
@@ -108,7 +110,11 @@ def test_control_that_is_too_large_for_both_bars_is_bad(reject: str) -> None:
         datum={"kind": "control"},
         adjust={"reject": reject},
     )
-    assert findings_of(run_survey(survey)).verdict.level == "bad"
+    result = run_survey(survey)
+    (said,) = (one for one in remarks_on_given(result) if one.severity != "note")
+    assert said.kind == "scale_contradicted" and said.number("off") == pytest.approx(1.0, rel=0.1)
+    assert said.names("given") == ("bar 1 - 11", "bar 2 - 12", "the control")
+    assert findings_of(result).verdict.level == "bad"
 
 
 @pytest.mark.parametrize("reject", ["tau", "none"])
@@ -126,5 +132,6 @@ def test_right_bars_and_control_are_no_remark(reject: str) -> None:
         adjust={"reject": reject},
     )
     result = run_survey(survey)
-    assert result.taken_out == () and len(result.network.scale_bars) == 2
+    assert {one.severity for one in remarks_on_given(result)} <= {"note"}
+    assert len(result.network.scale_bars) == 2
     assert findings_of(result).verdict.level == "good"

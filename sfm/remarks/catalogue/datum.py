@@ -34,13 +34,6 @@ ROWS = (
         "Give control or scale bars for lengths in the object unit.",
     ),
     Kind(
-        "given_points_rejected",
-        "warning",
-        "Most image points of {points} were rejected: control or scale bars contradict them.",
-        "control and scale bars do not fit the photographs, and none can be blamed",
-        "Check their names, numbers and unit; give more of them.",
-    ),
-    Kind(
         "datum_points_missing",
         "warning",
         "Datum points are not in the network: {points}.",
@@ -53,27 +46,6 @@ ROWS = (
         "Observed exterior orientation takes no part in datum '{datum}'.",
         "it determines position, attitude and scale, which this datum takes from the points",
         'Set datum.kind = "control" to use it.',
-    ),
-    Kind(
-        "given_contradicted",
-        "error",
-        "{line}.",
-        "control, scale bars or other given values are wrong",
-        "Check each value, its name and its unit.",
-    ),
-    Kind(
-        "given_remarkable",
-        "warning",
-        "{line}.",
-        "control, scale bars or other given values are wrong, or stated too precise",
-        "Check each value, its name and its unit.",
-    ),
-    Kind(
-        "given_unchecked",
-        "note",
-        "{line}.",
-        "just enough control, or one scale bar",
-        "Add a scale bar or a control point.",
     ),
     Kind(
         "approximate_unused",

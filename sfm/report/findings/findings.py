@@ -8,12 +8,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from sfm.adjustment.quality.against_free import (
-    GivenTest,
-    control_apart,
-    given_test,
-    scale_difference,
-)
 from sfm.adjustment.quality.consistency import Consistency, consistency_of
 from sfm.adjustment.quality.held_camera import HeldParameter, held_parameters
 from sfm.remarks.verdict import Verdict, judge
@@ -33,6 +27,7 @@ from sfm.report.findings.checks import (
     sigma0_of,
 )
 from sfm.report.findings.geometry import Geometry, geometry_of
+from sfm.report.findings.given_remarks import given_remarks
 from sfm.report.findings.given_residuals import Given, given_of
 from sfm.report.findings.interior_parameters import InteriorOrientation, interior_of
 from sfm.report.findings.other_adjuster import ComparisonFindings, comparison_of
@@ -51,8 +46,6 @@ from sfm.report.findings.survey_remarks import (
     residual_remarks,
     sigma0_remarks,
 )
-from sfm.report.findings.verdicts.evidence import Evidence
-from sfm.report.findings.verdicts.verdict_of_given import remarks_on_given
 from sfm.result import SurveyResult
 
 
@@ -79,7 +72,6 @@ class Findings:
     object_size: float  # diagonal of the box around the points, object unit
     held: tuple[HeldParameter, ...]  # interior parameters held at values that the photographs contradict
     consistency: Consistency  # tests of points, photographs and the format
-    given_test: GivenTest | None  # of all that was given against the free network
     protocol: Protocol  # entries of a bundle protocol
 
 
@@ -90,14 +82,6 @@ def findings_of(result: SurveyResult) -> Findings:
     given, check, size = given_of(result), checked_control(result), object_size(a.estimate.points)
     consistency, held = consistency_of(a), held_parameters(a)
     geometry, precision = geometry_of(a), precision_of(a)
-    against_free = given_test(a, result.free_network)
-    evidence = Evidence(
-        *(result, statistics, given, check, size),
-        against_free,
-        scale_difference(a, result.free_network),
-        check_coordinates(result),
-        control_apart(a, result.free_network),
-    )
     remarks = (
         *adjustment_remarks(a),
         *photograph_remarks(result),
@@ -108,7 +92,7 @@ def findings_of(result: SurveyResult) -> Findings:
         *ray_remarks(a),
         *consistency_remarks(result, consistency),
         *camera_remarks(result, held),
-        *remarks_on_given(evidence),
+        *given_remarks(result, given, statistics, check_coordinates(result)),
         *comparison_remarks(result),
     )
     return Findings(
@@ -131,6 +115,5 @@ def findings_of(result: SurveyResult) -> Findings:
         object_size=size,
         held=held,
         consistency=consistency,
-        given_test=against_free,
         protocol=protocol_of(result, given, check),
     )

@@ -87,7 +87,7 @@ def summary_of_statistics(findings: Findings) -> dict[str, Any]:
 
 def summary_of_consistency(findings: Findings) -> dict[str, Any]:
     """Return what the tests of points, photographs and the format have found."""
-    found, test = findings.consistency, findings.given_test
+    found = findings.consistency
     return {
         "two_positions": [
             {
@@ -138,13 +138,15 @@ def summary_of_consistency(findings: Findings) -> dict[str, Any]:
             }
             for one in findings.result.other_solutions
         ],
-        "given_against_free_network": None
-        if test is None
-        else {
-            "F": or_none(test.statistic),
-            "redundancy": test.redundancy,
-            "probability": or_none(test.probability),
-        },
+        "given_against_free_network": [
+            {
+                "what": one.what,
+                "chi2": or_none(one.statistic),
+                "degrees_of_freedom": one.dof,
+                "probability": or_none(one.probability),
+            }
+            for one in findings.result.given_tests
+        ],
     }
 
 

@@ -62,20 +62,23 @@ def add_exterior(network: Network, estimate: Estimate, table: ObservedExterior |
     # what was not observed has no weight, and any number may stand in its place
     filled = np.where(np.isnan(value), 0.0, value)
     observed = ExteriorObservations(image, filled[:, :3], filled[:, 3:], covariance)
-    placed = _placed(network, estimate, image, value, sigma)
-    return Placed(replace(network, exterior=observed), _held(placed, image, value, sigma))
+    return Placed(replace(network, exterior=observed), _placed(network, estimate, image, value, sigma))
 
 
-def _held(estimate: Estimate, image: IntArray, value: FloatArray, sigma: FloatArray) -> Estimate:
-    """Return the estimate with fixed projection centres and rotations at their values."""
-    position, rotation = estimate.position.copy(), estimate.rotation.copy()
-    oriented = estimate.oriented
-    for i, given, s in zip(image, value, sigma, strict=True):
+def hold_fixed(network: Network, estimate: Estimate) -> Estimate:
+    """Return the estimate with fixed control, projection centres and rotations at their given values."""
+    points, position = estimate.points.copy(), estimate.position.copy()
+    rotation, oriented = estimate.rotation.copy(), estimate.oriented
+    control, seen = network.control, network.exterior
+    fixed = np.einsum("nii->ni", control.covariance) == 0
+    points[control.point] = np.where(fixed, control.xyz, points[control.point])
+    for e, i in enumerate(seen.image):
+        variance = np.diagonal(seen.covariance[e])
         if oriented[i]:
-            position[i] = np.where(s[:3] == 0, given[:3], position[i])
-            if (s[3:] == 0).all():
-                rotation[i] = rotation_from_angles(*given[3:])
-    return replace(estimate, position=position, rotation=rotation)
+            position[i] = np.where(variance[:3] == 0, seen.position[e], position[i])
+            if (variance[3:] == 0).all():
+                rotation[i] = rotation_from_angles(*seen.angles[e])
+    return replace(estimate, points=points, position=position, rotation=rotation)
 
 
 def _placed(

@@ -1,4 +1,4 @@
-"""Adjusting a survey until nothing leaves it any more: points, photographs, control, bars, weights."""
+"""Adjusting a survey until nothing leaves it any more: points, photographs, weights."""
 
 from __future__ import annotations
 
@@ -19,7 +19,6 @@ from sfm.network import Estimate, Network
 from sfm.orientation.ray_angles import ray_angles
 from sfm.reduced_network import reduce_network, supported
 from sfm.remarks.remark import Remark, remark
-from sfm.survey.adjusting.datum_definition import Contradiction, find_contradiction
 from sfm.survey.adjusting.nearer_start import held_to_converge, nearer_start
 from sfm.survey.diagnosis.left_out import datum_carriers
 from sfm.survey.diagnosis.observation_count import refuse_too_few_observations
@@ -39,7 +38,7 @@ CARRYING_DEG = 2.0  # largest angle between two rays of a point below which it c
 
 @dataclass(frozen=True)
 class Task:
-    """What is adjusted and how; contradictions change it."""
+    """What is adjusted and how."""
 
     survey: Survey
     datum: Datum
@@ -52,28 +51,47 @@ class Task:
 
 @dataclass(frozen=True)
 class Settled:
-    """An adjustment after which no point or photograph leaves, or in which there is a contradiction."""
+    """An adjustment after which no point or photograph leaves."""
 
-    part: Network  # what was adjusted
-    estimate: Estimate  # of it
+    adjustment: Adjustment  # without covariance
     images: BoolArray  # photographs in it, (m,)
     points: BoolArray  # points in it, (n,)
     accepted: BoolArray  # image points of the whole network, (k,)
-    rejected: BoolArray  # image points of the part
-    contradiction: Contradiction | None
     iterations: int  # of all adjustments on the way
     rays: IntArray  # accepted rays of each point, of those that left when they left, (n,)
     start_sigma0: float  # at the start values
     held: tuple[Remark, ...]  # parameters that were held because it did not converge with them
 
+    @property
+    def part(self) -> Network:
+        """What was adjusted."""
+        return self.adjustment.network
 
-def settle(task: Task, estimate: Estimate) -> Settled:
-    """Adjust until the points and photographs that are left stay, or control or a bar is contradicted."""
+    @property
+    def estimate(self) -> Estimate:
+        """Adjusted values of the part."""
+        return self.adjustment.estimate
+
+    @property
+    def rejected(self) -> BoolArray:
+        """Image points of the part that were rejected."""
+        return self.adjustment.rejected
+
+
+def settle(task: Task, estimate: Estimate, accepted: BoolArray | None = None) -> Settled:
+    """Adjust until the points and photographs that are left stay.
+
+    Args:
+        task: what to adjust.
+        estimate: approximate values.
+        accepted: image points that an earlier adjustment accepted, (k,); the others return where they pass.
+    """
     network, iterations, start_sigma0 = task.network, 0, np.nan
     held: tuple[Remark, ...] = ()
-    accepted = np.ones(len(network.image_points), dtype=bool)
     rays = network.rays()
-    images, points = determined(network, estimate, accepted, task.needed, task.least)
+    everything = np.ones(len(network.image_points), dtype=bool)
+    accepted = everything if accepted is None else accepted
+    images, points = determined(network, estimate, everything, task.needed, task.least)
     while True:
         part, start = reduce_network(network, estimate, images, points, np.ones_like(accepted))
         refuse_too_few_observations(part, start, task.datum.kind)
@@ -84,18 +102,13 @@ def settle(task: Task, estimate: Estimate) -> Settled:
         if not adjustment.converged:
             adjustment, held = _converged(task, part, start, adjustment)
             iterations += adjustment.iterations
-        found = contradiction_in(task, adjustment)
         estimate = merge_estimate(estimate, adjustment.estimate, images, points)
         accepted = _accepted(network, adjustment, images, points)
         now = np.bincount(network.image_points.point[accepted], minlength=len(points))
         rays = np.where(points, now, rays)
         left_images, left_points = determined(network, estimate, accepted, task.needed, task.least)
-        if found is not None or ((left_images == images).all() and (left_points == points).all()):
-            values = adjustment.estimate
-            return Settled(
-                *(part, values, images, points, accepted, adjustment.rejected),
-                *(found, iterations, rays, start_sigma0, held),
-            )
+        if (left_images == images).all() and (left_points == points).all():
+            return Settled(adjustment, images, points, accepted, iterations, rays, start_sigma0, held)
         images, points = left_images, left_points
 
 
@@ -108,7 +121,7 @@ def treat(task: Task, settled: Settled, start: Estimate, oriented: BoolArray) ->
         start: approximate values, which what has left the adjustment starts from again.
         oriented: photographs that had an exterior orientation, (m,).
     """
-    if task.reject == "none" or settled.contradiction is not None:
+    if task.reject == "none":
         return None
     adjusted = merge_estimate(start, settled.estimate, settled.images, settled.points)
     found = treat_lost(task.network, adjusted, settled.accepted, oriented=oriented, suspected=task.suspected)
@@ -119,20 +132,6 @@ def treat(task: Task, settled: Settled, start: Estimate, oriented: BoolArray) ->
     rotation = np.where(again[:, None, None], start.rotation, one.rotation)
     points = np.where(one.determined[:, None], one.points, start.points)
     return replace(found, estimate=replace(one, position=position, rotation=rotation, points=points))
-
-
-def without_contradiction(task: Task, found: Contradiction, accepted: BoolArray) -> Task:
-    """Return the task without what is to blame, or, where that cannot be told, without any more tests."""
-    network = task.network
-    if found.freed is not None:
-        needed = task.needed.copy()
-        needed[np.setdiff1d(network.control.point, found.freed.control.point)] = 2
-        return replace(task, network=found.freed, needed=needed)
-    # what the test holds against the other image points stands
-    keep = accepted | found.protected[network.image_points.point]
-    return replace(
-        task, network=replace(network, image_points=network.image_points.select(keep)), reject="none"
-    )
 
 
 def adjust_finally(task: Task, part: Network, estimate: Estimate, rejected: BoolArray) -> Adjustment:
@@ -152,18 +151,6 @@ def adjust_finally(task: Task, part: Network, estimate: Estimate, rejected: Bool
     if others and task.survey.adjust.weights == "components":
         return _weighed(adjust_part, len(part.image_points))
     return adjust_part(np.ones(len(part.image_points)))
-
-
-def contradiction_in(task: Task, adjustment: Adjustment) -> Contradiction | None:
-    """Return control or a scale bar that cost a point most of its rays; None where nothing was tested."""
-    if task.reject == "none":
-        return None
-    untested, factor = replace(task, reject="none"), adjustment.weight_factor
-
-    def readjust(one: Network) -> Adjustment:
-        return _tested(untested, one, adjustment.estimate, covariance=False, factor=factor)
-
-    return find_contradiction(task.network, adjustment, readjust, unit=task.survey.unit)
 
 
 def _converged(

@@ -7,13 +7,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sfm.adjustment.datum import Datum
-from sfm.adjustment.quality.against_free import FreeNetwork, free_network_of
+from sfm.adjustment.quality.given_values import GivenTest
 from sfm.adjustment.quality.other_solutions import OtherSolution, other_solutions, solution_before
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.conventions import BoolArray, IntArray
 from sfm.errors import GeometryError
-from sfm.network import Estimate, Network
+from sfm.network import Estimate, ExteriorObservations, Network, ScaleBars, empty_estimate
 from sfm.orientation.incremental.starting_pair import pair_solutions
 from sfm.reduced_network import reduce_network
 from sfm.remarks.remark import Remark, remark
@@ -23,38 +23,35 @@ from sfm.result import (
     Explanation,
     LeftOutPoint,
     PhotographTargets,
-    TakenOut,
 )
 from sfm.survey.adjusting.datum_definition import (
     MIN_CONTROL,
     datum_remarks,
     place_on_control,
     place_on_frame,
-    refuse_other_units,
     scale_to_bars,
 )
-from sfm.survey.adjusting.exterior import add_exterior
+from sfm.survey.adjusting.exterior import add_exterior, hold_fixed
 from sfm.survey.adjusting.free_parameters import choose_free_parameters
 from sfm.survey.adjusting.settling import (
     MIN_IMAGE_POINTS,
     Settled,
     Task,
     adjust_finally,
-    contradiction_in,
     merge_estimate,
     on_points,
     settle,
     treat,
-    without_contradiction,
 )
 from sfm.survey.diagnosis.explanations import explain_residuals
 from sfm.survey.diagnosis.left_out import left_out_points, remarks_on_left_out, unused_image_points
 from sfm.survey.diagnosis.own_camera import Treated
 from sfm.survey.diagnosis.principal_distance import contradicted, far_principal_distances
-from sfm.survey.diagnosis.scale_check import check_scales
+from sfm.survey.hypotheses.given import JudgedGiven, judge_given
 from sfm.survey.inputs.checks.incomplete_cameras import unlike_squares
 from sfm.survey.inputs.interior import split_cameras
 from sfm.survey.inputs.measurements import Naming
+from sfm.survey.inputs.settings import DatumSettings
 from sfm.survey.inputs.start import given_values
 from sfm.survey.inputs.survey import Survey
 from sfm.survey.measuring.tie_points import MIN_TIE_POINTS
@@ -92,8 +89,7 @@ class Solution:
     remarks: tuple[Remark, ...]
     left_out: tuple[LeftOutPoint, ...]  # measured points that are not in it
     unused_image_points: int  # of points and photographs that are not in it
-    taken_out: tuple[TakenOut, ...]  # control and scale bars that do not fit
-    free_network: FreeNetwork | None  # of the image points alone; None where nothing else took part
+    given_tests: tuple[GivenTest, ...]  # of control, bars and observed orientation against the image points
     others: tuple[OtherSolution, ...]  # that the image points allow as well
     explanations: tuple[Explanation, ...]  # of large residuals, tried on the finished network
 
@@ -129,10 +125,6 @@ def solve_survey(survey: Survey, matched: Correspondences) -> Solution:
     )
     # natural texture has points in plenty, of which only those that were lost on the way are worth a line
     told = left_out if survey.tie_points is None else _among(left_out, whole, start.known)
-    taken_out = solved.taken_out
-    if len(whole.scale_bars) and not len(final.network.scale_bars) and start.task.datum.kind == "control":
-        # every bar is against the control: nothing says which of the two is right
-        taken_out = tuple(replace(one, resolved=False) for one in taken_out)
     explanations = explain_residuals(final)
     return Solution(
         final,
@@ -146,8 +138,7 @@ def solve_survey(survey: Survey, matched: Correspondences) -> Solution:
         ),
         left_out,
         unused_image_points(whole, settled.images, np.isin(whole.points, final.network.points)),
-        taken_out,
-        free_network_of(final),
+        solved.given.tests,
         solved.others,
         explanations,
     )
@@ -155,17 +146,15 @@ def solve_survey(survey: Survey, matched: Correspondences) -> Solution:
 
 @dataclass(frozen=True)
 class _Prepared:
-    """The network before its adjustment: placed, scaled, with its cameras and what is known of its datum."""
+    """The network before its adjustment, with its cameras and what is known of its datum."""
 
-    task: Task
+    task: Task  # with all that was given, which is not judged yet
     estimate: Estimate
-    frame: Estimate  # whose points carry a free datum
+    frame: Estimate | None  # given coordinates, which carry a free datum; None without
     whole: Network  # with all that was measured
     known: BoolArray  # points with approximate values, (n,)
     oriented: BoolArray  # photographs with an exterior orientation, (m,)
     needed: IntArray  # rays that each point needs, (n,)
-    contradictions: tuple[Remark, ...]  # of bars and control before any adjustment
-    taken_out: tuple[TakenOut, ...]
     remarks: tuple[Remark, ...]  # on observed exterior orientation, and which parameters were freed
 
 
@@ -178,77 +167,135 @@ class _Solved:
     check: ControlCheck | None
     others: tuple[OtherSolution, ...]
     treated: Treated | None
-    taken_out: tuple[TakenOut, ...]
+    given: JudgedGiven
     remarks: tuple[Remark, ...]
     c_held: tuple[str, ...]  # cameras whose c was to be free and had to be held
 
 
 def _prepared(survey: Survey, matched: Correspondences) -> _Prepared:
-    """Bring network and approximate values into the frame, unit and cameras that the survey asks for."""
+    """Bring network and approximate values into the frame and cameras that the survey asks for."""
     placed = add_exterior(matched.network, matched.estimate, survey.exterior, survey.datum.kind)
     network, estimate = placed.network, placed.estimate
     datum = Datum(survey.datum.kind)
     if datum.kind == "control" and len(network.control) == len(network.exterior) == 0:
         raise GeometryError("datum 'control', but no control point was measured")
-    refuse_other_units(survey, network, estimate)
-    scales = check_scales(network, estimate, held=datum.kind == "control")
-    network = scales.network
-    needed = matched.min_rays.copy()
-    if datum.kind == "control":
-        needed[network.control.complete.point] = 1
     known, oriented = estimate.determined, estimate.oriented
     if datum.kind == "minimal" and matched.given:  # what it holds are the given coordinates
         given = given_values(survey, network)
         held = np.where(given.determined[:, None], given.points, estimate.points)
         estimate = replace(estimate, points=np.where(estimate.determined[:, None], held, np.nan))
-    estimate = scale_to_bars(network, estimate, datum)
-    frame = given_values(survey, network) if matched.given else estimate
-    chosen = choose_free_parameters(survey, network, estimate, datum=datum.kind)
+    frame = given_values(survey, network) if matched.given else None
+    chosen = choose_free_parameters(
+        survey, replace(network, scale_bars=ScaleBars()), estimate, datum=datum.kind
+    )
     survey, estimate = replace(survey, cameras=chosen.cameras), chosen.estimate
     network, estimate = split_cameras(survey.cameras, network, estimate, survey.start_cameras)
     fewest = MIN_IMAGE_POINTS if survey.tie_points is None else MIN_TIE_POINTS
     least = np.where(given_values(survey, network).oriented, GIVEN_IMAGE_POINTS, fewest)
     return _Prepared(
-        Task(survey, datum, network, needed, least, survey.reject, matched.suspected),
+        Task(survey, datum, network, matched.min_rays, least, survey.reject, matched.suspected),
         estimate,
         frame,
         placed.network,
         known,
         oriented,
-        needed,
-        scales.remarks,
-        tuple(scales.taken_out),
+        matched.min_rays,
         (*placed.remarks, *chosen.remarks),
     )
 
 
-def _solved(start: _Prepared) -> _Solved:
-    """Adjust until nothing contradicts the image points and no other solution of them is better."""
+@dataclass(frozen=True)
+class _Free:
+    """The image points of a survey adjusted alone."""
+
+    task: Task
+    settled: Settled
+    treated: Treated | None
+    iterations: int
+
+
+def _free_network(start: _Prepared) -> _Free:
+    """Adjust the image points alone: nothing that was given bends their network, or costs one of them.
+
+    Raises:
+        GeometryError: they do not make a network by themselves.
+    """
     task, estimate = start.task, start.estimate
-    contradictions, taken_out = list(start.contradictions), list(start.taken_out)
-    better: tuple[Remark, ...] = ()
-    asked = {one.name for one in start.estimate.cameras if one.free[0]}
-    first: tuple[Settled, Adjustment, ControlCheck | None, tuple[OtherSolution, ...]] | None = None
+    network = replace(task.network, scale_bars=ScaleBars(), exterior=ExteriorObservations())
+    task = replace(task, network=network)
+    if task.datum.kind == "control":
+        free = replace(task.survey, datum=DatumSettings(kind="free"))
+        task = replace(task, datum=Datum("free"), survey=free)
     settled = settle(task, estimate)
-    ready: Settled | None = settled
-    iterations, start_sigma0, first_held = 0, settled.start_sigma0, settled.held
+    iterations = settled.iterations
     treated = treat(task, settled, estimate, start.oriented)
     if treated is not None:
+        task, estimate = replace(task, network=treated.network), treated.estimate
+        settled = settle(task, estimate)
         iterations += settled.iterations
-        task, estimate, ready = replace(task, network=treated.network), treated.estimate, None
+    return _Free(task, settled, treated, iterations)
+
+
+def _judged(start: _Prepared, free: _Free | None) -> tuple[Task, JudgedGiven]:
+    """Return the task with what was given as far as the image points confirm it."""
+    task = start.task
+    network = task.network
+    if free is not None:  # photographs may have got cameras of their own
+        network = replace(
+            free.task.network,
+            control=network.control,
+            scale_bars=network.scale_bars,
+            exterior=network.exterior,
+        )
+    adjustment = None if free is None else free.settled.adjustment
+    given = judge_given(network, adjustment, task.datum, unit=task.survey.unit)
+    survey, needed = task.survey, task.needed.copy()
+    if given.datum.kind == "control":
+        needed[given.network.control.complete.point] = 1
+    elif task.datum.kind == "control":
+        survey = replace(survey, datum=DatumSettings(kind="free"))
+    return replace(task, survey=survey, datum=given.datum, network=given.network, needed=needed), given
+
+
+def _solved(start: _Prepared) -> _Solved:
+    """Adjust the image points, judge what was given by them, and adjust all that is left together."""
+    try:
+        free: _Free | None = _free_network(start)
+    except GeometryError:
+        if start.task.datum.kind != "control":
+            raise
+        free = None  # control may connect and calibrate what the photographs alone do not
+    task, given = _judged(start, free)
+    estimate, ready, accepted = start.estimate, None, None
+    iterations, treated = 0, None
+    if free is not None:
+        settled, iterations, treated = free.settled, free.iterations, free.treated
+        accepted = settled.accepted
+        estimate = merge_estimate(estimate, settled.estimate, settled.images, settled.points)
+        estimate = _completed(start.estimate, estimate, task, given)
+        if task.datum.kind != "control" and not len(task.network.scale_bars):
+            ready = _with_given(settled, task.network)
+    estimate = scale_to_bars(task.network, estimate, task.datum)
+    if task.datum.kind == "control":
+        estimate = hold_fixed(task.network, estimate)
+    if ready is None:
+        settled = settle(task, estimate, accepted)
+        iterations += settled.iterations
+        ready = settled
+        if free is None:
+            treated = treat(task, settled, estimate, start.oriented)
+            if treated is not None:
+                task, estimate, ready = replace(task, network=treated.network), treated.estimate, None
+    start_sigma0 = settled.start_sigma0 if free is None else free.settled.start_sigma0
+    first_held = settled.held if free is None else free.settled.held
+    asked = {one.name for one in start.estimate.cameras if one.free[0]}
+    first: tuple[Settled, Adjustment, ControlCheck | None, tuple[OtherSolution, ...]] | None = None
+    better: tuple[Remark, ...] = ()
     while True:
         settled = settle(task, estimate) if ready is None else ready
+        iterations += settled.iterations if ready is None else 0
         ready = None
-        iterations += settled.iterations
-        found = settled.contradiction
-        if found is None:
-            final, check = _placed(start, task, settled)
-            found = contradiction_in(task, final)
-        if found is not None:
-            contradictions.append(found.found)
-            taken_out += [] if found.taken_out is None else [found.taken_out]
-            task = without_contradiction(task, found, settled.accepted)
-            continue
+        final, check = _placed(start, task, settled)
         # c that had to be held is nobody's calibration: what its other values give is another solution
         c_held = tuple(one.name for one in final.estimate.cameras if one.name in asked and not one.free[0])
         others = other_solutions(final, starts=_of_pair(final), had_to_be_held=c_held)
@@ -270,10 +317,31 @@ def _solved(start: _Prepared) -> _Solved:
         check,
         others,
         treated,
-        tuple(taken_out),
-        (*own, *contradictions, *better, *held),
+        given,
+        (*own, *given.remarks, *better, *held),
         c_held,
     )
+
+
+def _completed(before: Estimate, found: Estimate, task: Task, given: JudgedGiven) -> Estimate:
+    """Return the free network in the frame of what was given, with what it had to leave out where it was."""
+    if given.placing is not None and task.datum.kind == "control":
+        found = given.placing.apply_estimate(found)
+    elif task.datum.kind == "control":
+        return before
+    lost = task.needed == 1  # control that one photograph sees is determined by its coordinates
+    points = np.where((lost & ~found.determined)[:, None], before.points, found.points)
+    return replace(found, points=points)
+
+
+def _with_given(settled: Settled, network: Network) -> Settled:
+    """Return an adjustment with a network that has what was given beside it."""
+    every = np.ones(len(network.image_points), dtype=bool)
+    whole = merge_estimate(
+        empty_estimate(network, settled.estimate.cameras), settled.estimate, settled.images, settled.points
+    )
+    part, _ = reduce_network(network, whole, settled.images, settled.points, every)
+    return replace(settled, adjustment=replace(settled.adjustment, network=part))
 
 
 def _of_pair(final: Adjustment) -> tuple[Estimate, ...]:
@@ -294,7 +362,10 @@ def _placed(start: _Prepared, task: Task, settled: Settled) -> tuple[Adjustment,
     elif task.datum.kind == "free":
         carriers = on_points(task.survey, settled.part, last, task.datum).resolve(settled.part).points
         every = np.ones(len(start.task.network.image_points), dtype=bool)
-        frame = reduce_network(start.task.network, start.frame, settled.images, settled.points, every)[1]
+        values = start.frame
+        if values is None:
+            values = scale_to_bars(task.network, start.estimate, task.datum)
+        frame = reduce_network(start.task.network, values, settled.images, settled.points, every)[1]
         last = place_on_frame(settled.part, last, frame, carriers)
     return adjust_finally(task, settled.part, last, settled.rejected), check
 

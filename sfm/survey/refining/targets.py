@@ -15,7 +15,7 @@ from sfm.orientation.image_rays import intersect_image_points
 from sfm.remarks.remark import Remark, remark
 from sfm.runtime.progress import SILENT, Progress
 from sfm.similarity import Similarity, fit_similarity
-from sfm.survey.adjusting.datum_definition import MIN_CONTROL, object_scale, refuse_other_units
+from sfm.survey.adjusting.datum_definition import MIN_CONTROL, object_scale
 from sfm.survey.circles import check_circles
 from sfm.survey.inputs.measurements import MeasuredPhotographs
 from sfm.survey.inputs.survey import Survey
@@ -108,7 +108,6 @@ def measure_model_targets(
         )
     circles = check_circles(survey, photographs, naming, measured, replace(part, points=points))
     own, points, contradicting = _intersected(circles.network, part, tolerance_px)
-    refuse_other_units(survey, own, replace(part, points=points))
     placement, found_of_given = _placement(survey, own, points)
     seen = own.image_points
     return ModelTargets(

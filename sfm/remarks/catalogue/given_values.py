@@ -1,0 +1,132 @@
+"""What is found of scale bars, control and observed orientation, and of the scale that they give."""
+
+from __future__ import annotations
+
+from sfm.remarks.catalogue.hypotheses import SHIFT
+from sfm.remarks.kind import Kind
+
+CHECK_THE_LIST = "a number mistyped, the wrong ends or name, another unit, or a point that moved"
+ROWS = (
+    Kind(
+        "bar_left_out",
+        "warning",
+        "Scale bar {bar} is {off:+} longer than by the other given values, {sigmas} standard deviations[[, "
+        "and fits with the factor {unit_factor} of another unit]]: it was left out.",
+        CHECK_THE_LIST,
+        "Correct the length of this bar or remove it.",
+    ),
+    Kind(
+        "scale_contradicted",
+        "error",
+        "No dependable scale: {given} contradict one another by {off}, {sigmas} standard deviations[[, the "
+        "factor {unit_factor} of another unit]].",
+        CHECK_THE_LIST,
+        "Check these lengths and their unit; a third length shows which one is wrong.",
+    ),
+    Kind(
+        "given_left_out",
+        "warning",
+        "Of the {what}, {given} {given:does|do} not fit the network of the image points, by up to "
+        "{distance}, {sigmas} standard deviations: {given:it was|they were} left out.",
+        CHECK_THE_LIST,
+        "Correct these coordinates or remove them.",
+    ),
+    Kind(
+        "given_contradicted",
+        SHIFT,
+        "The {what} contradict one another (chi-square {chi2}, {dof} degrees of freedom): {given} may be "
+        "wrong[[, and shift coordinates by up to {shift} standard deviations]].",
+        CHECK_THE_LIST,
+        "Check these coordinates; more given points show which one is wrong.",
+    ),
+    Kind(
+        "control_exchanged",
+        "warning",
+        "Control points {points} have one another's coordinates: they were exchanged.",
+        "two names exchanged in the list of control or in the photographs",
+        "Exchange the two names.",
+    ),
+    Kind(
+        "control_mirrored",
+        "error",
+        "The control is mirrored (chi-square {chi2} as given, {mirrored} if mirrored): it was not used.",
+        "left-handed coordinates, two axes exchanged, or the sign of one axis changed",
+        "Give X, Y and Z of a right-handed system.",
+    ),
+    Kind(
+        "given_sigmas",
+        "warning",
+        "The standard deviations stated for the {what} are {factor} times too small[[: the adjustment used "
+        "{used} times the stated ones]].",
+        "standard deviations of another unit or of the instrument alone, or points that moved",
+        "State standard deviations that the differences at these points confirm.",
+    ),
+    Kind(
+        "given_not_exact",
+        "warning",
+        "The {what} without standard deviations differ by {sigma} (one coordinate) from the network of the "
+        "image points: the adjustment used this standard deviation.",
+        "coordinates of a drawing or a print, or points that moved",
+        "State standard deviations of these coordinates; 0 holds them fixed.",
+    ),
+    Kind(
+        "given_differs",
+        SHIFT,
+        "The given {given} differs from the adjusted one by {difference}, {sigmas} standard deviations: "
+        "coordinates shift by up to {shift} of theirs.",
+        CHECK_THE_LIST,
+        "Correct this value, or state a larger standard deviation.",
+    ),
+    Kind(
+        "check_differs",
+        "warning",
+        "{coordinate} of check point {point} differs from its given value by {difference}, {sigmas} standard "
+        "deviations.",
+        CHECK_THE_LIST,
+        "Check this coordinate, and the control near it.",
+    ),
+    Kind(
+        "checks_contradict",
+        "error",
+        "{count} of the {all} check points differ from their given coordinates, by up to {distance}.",
+        "wrong control or scale, a weak network, or check points of another system or epoch",
+        "Find out whether control or check points are wrong before you use the result.",
+    ),
+    Kind(
+        "scale_unchecked",
+        "note",
+        "The scale rests on {given} alone: nothing checks it.",
+        "one length or one source of lengths",
+        "Add a scale bar of another origin.",
+    ),
+    Kind(
+        "given_unchecked",
+        "note",
+        "Of the {what}, nothing checks {given}.",
+        "as many given values as the datum needs",
+        "Add control or scale bars.",
+    ),
+    Kind(
+        "given_weakly_checked",
+        "note",
+        "Of the {what}, {given} {given:is|are} weakly checked: an error may stay unnoticed and shift the "
+        "result by up to {sigmas} of its standard deviations.",
+        "few control points or bars, all on one side, or one far more precise than the others",
+        "Add control or scale bars.",
+    ),
+    Kind(
+        "given_not_judged",
+        "note",
+        "The image points alone do not determine the network: only residuals check the {what}.",
+        "photographs that only the control connects or calibrates",
+        "Add photographs with common points.",
+    ),
+    Kind(
+        "scale_implausible",
+        "error",
+        "The scale is implausible: the object is {distance} in front of the camera, its image "
+        "{magnification} times as large as the object.",
+        "lengths or control in another unit than the survey",
+        "Check the unit of the survey and of its lengths.",
+    ),
+)

@@ -1,1 +1,0 @@
-"""The verdict on a survey, and what it is judged by."""

@@ -1,0 +1,456 @@
+"""Scale bars, control and observed projection centres, judged by the image points before they are used.
+
+What contradicts is left out where the others identify it, and named; where they do not, nothing that it
+touches is believed. The rest takes part in the adjustment.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from sfm.adjustment.covariance import marginal_of
+from sfm.adjustment.datum import Datum
+from sfm.adjustment.quality.given_values import (
+    LEVEL,
+    NONCENTRALITY,
+    GivenModel,
+    GivenPoints,
+    GivenScale,
+    GivenTest,
+    Judgement,
+    PlacedPoints,
+    judge_points,
+    judge_values,
+    scale_model,
+    scale_of_length,
+    scale_of_points,
+)
+from sfm.adjustment.result import Adjustment
+from sfm.conventions import BoolArray, FloatArray, IntArray
+from sfm.errors import GeometryError
+from sfm.network import ExteriorObservations, Network, ObjectPoints, ScaleBars
+from sfm.remarks.remark import Remark, remark
+from sfm.similarity import Similarity
+
+UNIT_FACTORS = (10.0, 12.0, 25.4, 100.0, 304.8, 1000.0)  # between mm, cm, m, inch and foot
+SAME_UNIT = 0.02  # relative difference up to which a factor is that of a unit
+UNCHECKED = 5.0  # standard deviations by which an error that no test finds may shift what rests on it
+PRINT_SIGMA = 0.002  # relative scale of coordinates without standard deviations, as of prints and drawings
+MAX_PLACES = 1000  # given points whose joint covariance is formed; of more, so many are judged
+CONTROL, CENTRES = "control points", "projection centres"
+
+
+@dataclass(frozen=True)
+class JudgedGiven:
+    """What may take part in the adjustment, and what was found of the rest."""
+
+    network: Network
+    datum: Datum
+    remarks: tuple[Remark, ...] = ()
+    tests: tuple[GivenTest, ...] = ()
+    placing: Similarity | None = (
+        None  # object frame from that of the free network; None where nothing says it
+    )
+
+
+@dataclass(frozen=True)
+class _Places:
+    """Points and projection centres of the free network with their joint covariance."""
+
+    xyz: FloatArray  # (p, 3)
+    joint: FloatArray  # (3 p, 3 p)
+    redundancy: int
+    of_point: dict[str, int]  # place of a point
+    of_image: dict[str, int]  # place of a photograph
+
+    def at(self, places: Sequence[int]) -> tuple[IntArray, IntArray]:
+        """Return indices of places, and of their coordinates."""
+        index = np.asarray(places, dtype=np.int64)
+        return index, (3 * index[:, None] + np.arange(3)).ravel()
+
+
+def without_given(network: Network) -> Network:
+    """Return the network of the image points alone."""
+    return replace(network, control=ObjectPoints(), scale_bars=ScaleBars(), exterior=ExteriorObservations())
+
+
+def judge_given(network: Network, free: Adjustment | None, datum: Datum, *, unit: str) -> JudgedGiven:
+    """Return which given values may take part in an adjustment, and remarks on the others.
+
+    Args:
+        network: with all that was given.
+        free: adjustment of its image points alone, or of a part of them, in a free datum; None if none.
+        datum: that was asked for.
+        unit: object unit.
+    """
+    if not (len(network.scale_bars) or len(network.control) or len(network.exterior)):
+        return JudgedGiven(network, datum)
+    places = None if free is None or free.redundancy < 1 else _places(network, free, datum)
+    if places is None:
+        kinds = (("scale bars", network.scale_bars), ("control", network.control))
+        what = [name for name, some in kinds if len(some)]
+        remarks = (remark("given_not_judged", what=what),) if what else ()
+        return JudgedGiven(network, datum, remarks)
+    return _Judge(network, places, datum, unit).judged()
+
+
+def _places(network: Network, free: Adjustment, datum: Datum) -> _Places | None:
+    """Return where the given points are in the free network; None where that does not determine them."""
+    if not free.converged or free.undetermined or free.defect != free.expected_defect:
+        return None
+    bars, control = network.scale_bars, network.control
+    number = {name: j for j, name in enumerate(free.network.points)}
+    photograph = {name: i for i, name in enumerate(free.network.images)}
+    ends = [network.points[j] for j in np.unique(np.concatenate([bars.start, bars.end]))]
+    some = [network.points[j] for j in control.point]
+    step = max(1, -(-len(some) // MAX_PLACES))
+    names = [name for name in dict.fromkeys([*ends, *some[::step]]) if name in number]
+    seen = network.exterior if datum.kind == "control" else ExteriorObservations()
+    step = max(1, -(-len(seen) // MAX_PLACES))
+    images = [name for name in (network.images[i] for i in seen.image[::step]) if name in photograph]
+    if not names and not images:
+        return None
+    points = np.array([number[name] for name in names], dtype=np.int64)
+    stations = np.array([photograph[name] for name in images], dtype=np.int64)
+    try:
+        marginal = marginal_of(free)
+        joint = marginal.joint((6 * stations[:, None] + np.arange(3)).ravel(), points)
+    except (GeometryError, np.linalg.LinAlgError):
+        return None
+    if not np.isfinite(joint).all():
+        return None
+    return _Places(
+        np.concatenate([free.estimate.position[stations], free.estimate.points[points]]),
+        (joint + joint.T) / 2,
+        free.redundancy,
+        {name: len(images) + k for k, name in enumerate(names)},
+        {name: k for k, name in enumerate(images)},
+    )
+
+
+@dataclass
+class _Group:
+    """Given points of a kind, judged."""
+
+    what: str  # control points or projection centres
+    rows: IntArray  # of the kind in the network, (n,)
+    names: tuple[str, ...]
+    points: GivenPoints
+    places: IntArray  # (n,)
+    placed: PlacedPoints
+
+    @property
+    def out(self) -> tuple[int, ...]:
+        """Those that were left out."""
+        return self.placed.judgement.wrong
+
+    @property
+    def dependable(self) -> bool:
+        """Whether a scale may rest on them."""
+        return not (self.placed.mirrored or self.placed.judgement.doubtful)
+
+
+class _Judge:
+    """The given values of one network."""
+
+    def __init__(self, network: Network, places: _Places, datum: Datum, unit: str) -> None:
+        self.network, self.places, self.datum, self.unit = network, places, datum, unit
+        self.remarks: list[Remark] = []
+        self.tests: list[GivenTest] = []
+        tests = (len(network.scale_bars) > 0, len(network.control) > 0, len(network.exterior) > 0)
+        self.level = LEVEL / max(sum(tests), 1)
+
+    def judged(self) -> JudgedGiven:
+        """Judge points, then the scales of bars and points."""
+        control, centres = self._control(), self._centres()
+        self._scales(control, centres)
+        placing = next(
+            (one.placed.placing for one in (control, centres) if one and not one.placed.mirrored), None
+        )
+        return JudgedGiven(self.network, self.datum, tuple(self.remarks), tuple(self.tests), placing)
+
+    def _control(self) -> _Group | None:
+        """Judge control, and leave out or change what does not fit."""
+        control = self.network.control
+        names = tuple(self.network.points[j] for j in control.point)
+        rows = np.array([k for k, name in enumerate(names) if name in self.places.of_point], dtype=np.int64)
+        variance = np.einsum("nii->ni", control.covariance[rows])
+        given = np.where(np.isfinite(variance), control.xyz[rows], np.nan)
+        places = [self.places.of_point[names[k]] for k in rows]
+        group = self._group(
+            CONTROL, rows, tuple(names[k] for k in rows), given, control.covariance[rows], places
+        )
+        if group is None:
+            return None
+        judgement, placed = group.placed.judgement, group.placed
+        if placed.mirrored:
+            self.remarks.append(
+                remark("control_mirrored", chi2=placed.unmirrored, mirrored=judgement.statistic)
+            )
+            self.network = replace(self.network, control=ObjectPoints())
+            if self.datum.kind == "control" and not len(self.network.exterior):
+                self.datum = Datum("free")
+            return group
+        xyz, covariance = control.xyz.copy(), control.covariance.copy()
+        if judgement.exchanged:
+            pair = rows[list(judgement.exchanged)]
+            xyz[pair], covariance[pair] = xyz[pair[::-1]], covariance[pair[::-1]]
+            self.remarks.append(
+                remark("control_exchanged", points=[group.names[k] for k in judgement.exchanged])
+            )
+        covariance[rows] = self._confirmed(group, covariance[rows])
+        keep = np.ones(len(control), dtype=bool)
+        keep[rows[list(group.out)]] = False
+        self.network = replace(
+            self.network, control=ObjectPoints(control.point[keep], xyz[keep], covariance[keep])
+        )
+        return group
+
+    def _centres(self) -> _Group | None:
+        """Judge observed projection centres, and leave out or change what does not fit."""
+        seen = self.network.exterior
+        names = tuple(self.network.images[i] for i in seen.image)
+        rows = np.array([k for k, name in enumerate(names) if name in self.places.of_image], dtype=np.int64)
+        covariance = seen.covariance[rows][:, :3, :3]
+        given = np.where(np.isfinite(np.einsum("nii->ni", covariance)), seen.position[rows], np.nan)
+        known = np.isfinite(given).any(axis=1)
+        rows, given, covariance = rows[known], given[known], covariance[known]
+        places = [self.places.of_image[names[k]] for k in rows]
+        group = self._group(CENTRES, rows, tuple(names[k] for k in rows), given, covariance, places)
+        if group is None or group.placed.mirrored:
+            return None
+        changed = seen.covariance.copy()
+        changed[rows, :3, :3] = self._confirmed(group, covariance)
+        keep = np.ones(len(seen), dtype=bool)
+        keep[rows[list(group.out)]] = False
+        self.network = replace(
+            self.network,
+            exterior=ExteriorObservations(
+                seen.image[keep], seen.position[keep], seen.angles[keep], changed[keep]
+            ),
+        )
+        return group
+
+    def _group(
+        self,
+        what: str,
+        rows: IntArray,
+        names: tuple[str, ...],
+        given: FloatArray,
+        covariance: FloatArray,
+        places: list[int],
+    ) -> _Group | None:
+        """Judge points of a kind against the free network, and remark what does not fit."""
+        if not len(rows):
+            return None
+        index, coordinates = self.places.at(places)
+        points = GivenPoints(
+            given,
+            np.where(np.isfinite(covariance), covariance, 0.0),
+            self.places.xyz[index],
+            self.places.joint[np.ix_(coordinates, coordinates)],
+            self.places.redundancy,
+        )
+        estimated = self.datum.kind != "control" and not points.stated.any()
+        start = Similarity(1.0, np.eye(3), np.zeros(3)) if self.datum.kind == "control" else None
+        placed = judge_points(points, self.level, start=start, estimated=estimated)
+        if placed is None:
+            return None
+        found = placed.judgement
+        self.tests.append(GivenTest(what, found.statistic, found.dof, found.probability))
+        if found.factor != 1.0:
+            points = replace(points, stated=_scaled(points.stated, found.factor))
+            fitting = judge_points(points, self.level, start=start)
+            placed = placed if fitting is None else replace(fitting, judgement=found)
+        group = _Group(what, rows, names, points, index, placed)
+        if not placed.mirrored:
+            if found.wrong:
+                self._left_out(group)
+            if found.doubtful:
+                self._doubtful(group)
+            if self.datum.kind == "control":
+                self._unchecked(what, names, placed.model, found.wrong)
+        return group
+
+    def _left_out(self, group: _Group) -> None:
+        model, out = group.placed.model, group.out
+        sizes = [np.linalg.norm(model.v[model.rows((k,))]) for k in out]
+        sigmas = max(np.sqrt(model.decrease((k,))[0]) for k in out)
+        self.remarks.append(
+            remark(
+                "given_left_out",
+                what=group.what,
+                given=[group.names[k] for k in out],
+                distance=(float(max(sizes)), self.unit),
+                sigmas=float(sigmas),
+            )
+        )
+
+    def _doubtful(self, group: _Group) -> None:
+        found = group.placed.judgement
+        # they take part with the standard deviations that their differences show
+        shift = max(_shift(group.placed.model, k) for k in found.doubtful)
+        if group.points.stated.any():
+            shift /= group.placed.model.factor()[0]
+        self.remarks.append(
+            remark(
+                "given_contradicted",
+                what=group.what,
+                given=[group.names[k] for k in found.doubtful],
+                chi2=found.statistic,
+                dof=found.dof,
+                shift=shift if np.isfinite(shift) else None,
+            )
+        )
+
+    def _unchecked(
+        self, what: str, names: Sequence[str], model: GivenModel, without: tuple[int, ...] = ()
+    ) -> None:
+        """Remark given values of which nothing, or hardly anything, would find an error."""
+        reach = model.external(without)
+        nothing = [names[k] for k in np.flatnonzero(np.isinf(reach)).tolist()]
+        weak = [names[k] for k in np.flatnonzero(np.isfinite(reach) & (reach > UNCHECKED)).tolist()]
+        if nothing:
+            self.remarks.append(remark("given_unchecked", given=nothing, what=what))
+        if weak:
+            largest = float(reach[np.isfinite(reach)].max())
+            self.remarks.append(remark("given_weakly_checked", given=weak, what=what, sigmas=largest))
+
+    def _confirmed(self, group: _Group, covariance: FloatArray) -> FloatArray:
+        """Return the covariance of given points with which they fit, and remark if it is another one."""
+        found, model = group.placed.judgement, group.placed.model
+        if not (found.doubtful or found.factor != 1.0) or model.estimated:
+            return covariance
+        factor = model.factor()[0] if found.doubtful else found.factor
+        if not found.doubtful:
+            self.remarks.append(
+                remark("given_sigmas", what=group.what, factor=factor, used=factor)
+                if np.isfinite(covariance).any() and covariance[np.isfinite(covariance)].any()
+                else remark("given_not_exact", what=group.what, sigma=(factor, self.unit))
+            )
+        return np.where(np.isfinite(covariance), _scaled(covariance, factor), covariance)
+
+    def _scales(self, control: _Group | None, centres: _Group | None) -> None:
+        """Judge the scales of bars, control and projection centres against one another."""
+        bars, count = self.network.scale_bars, len(self.places.xyz)
+        scales: list[GivenScale] = []
+        names: list[str] = []
+        of_bar: list[int] = []
+        for b in range(len(bars)):
+            ends = tuple(self.network.points[j] for j in (bars.start[b], bars.end[b]))
+            at = [self.places.of_point.get(name, -1) for name in ends]
+            if min(at) >= 0 and at[0] != at[1]:
+                scales.append(scale_of_length(bars.length[b], bars.sigma[b], self.places.xyz, at[0], at[1]))
+                names.append(f"bar {ends[0]} - {ends[1]}")
+                of_bar.append(b)
+        for what, group in (("the control", control), ("the projection centres", centres)):
+            found = None if group is None else self._scale_of(group, count)
+            if found is not None:
+                scales.append(found)
+                names.append(what)
+        if not scales:
+            return
+        model = scale_model(tuple(scales), self.places.joint, self.places.redundancy)
+        judgement = judge_values(model, self.level, may_scale=False)
+        self.tests.append(GivenTest("scale", judgement.statistic, judgement.dof, judgement.probability))
+        if len(scales) == 1:
+            self.remarks.append(remark("scale_unchecked", given=names[0]))
+        elif judgement.fits:
+            self._unchecked("given lengths", names, model)
+        else:
+            self._contradicting_scales(model, judgement, names, np.array(of_bar, dtype=np.int64))
+
+    def _scale_of(self, group: _Group, count: int) -> GivenScale | None:
+        """Return the scale by given points; by their distance where there are two."""
+        if not group.dependable:
+            return None
+        points, complete = group.points, group.points.complete
+        if len(complete) == 2 and points.known.sum() == 6:
+            apart = points.given[complete[1]] - points.given[complete[0]]
+            length = float(np.linalg.norm(apart))
+            if not length > 0:
+                return None
+            e = apart / length
+            sigma = np.sqrt(e @ (points.stated[complete[0]] + points.stated[complete[1]]) @ e)
+            at = group.places[complete]
+            found = scale_of_length(length, float(sigma), self.places.xyz, int(at[0]), int(at[1]))
+        elif len(complete) < 3 or group.placed.model.misfit(group.out)[1] < 0:
+            return None
+        else:
+            found = scale_of_points(points, group.placed, group.out, group.places, count)
+        if self.datum.kind != "control" and not points.stated.any():
+            return replace(found, variance=found.variance + PRINT_SIGMA**2)
+        return found
+
+    def _contradicting_scales(
+        self, model: GivenModel, judgement: Judgement, names: list[str], of_bar: IntArray
+    ) -> None:
+        """Leave out bars that the others identify as wrong, or all where nothing shows which are wrong."""
+        bars, wrong = self.network.scale_bars, judgement.wrong
+        identified = bool(wrong) and max(wrong) < len(of_bar)
+        out = of_bar[list(wrong)] if identified else of_bar
+        if identified:
+            kept = [k for k in range(len(names)) if k not in wrong]
+            others = _mean_scale(model, kept)
+            for k in wrong:
+                off, sigmas = float(model.v[k]) - others, float(np.sqrt(model.decrease((k,))[0]))
+                self.remarks.append(
+                    remark(
+                        "bar_left_out",
+                        bar=names[k].removeprefix("bar "),
+                        off=(100 * float(np.expm1(off)), "%"),
+                        sigmas=sigmas,
+                        unit_factor=_unit_factor(off),
+                    )
+                )
+        else:
+            which = judgement.doubtful or tuple(range(len(names)))
+            if wrong:  # the control, by many bars that may share their unit
+                which = tuple(range(len(names)))
+            off = float(np.ptp(model.v[list(which)]))
+            self.remarks.append(
+                remark(
+                    "scale_contradicted",
+                    given=[names[k] for k in which],
+                    off=(100 * float(np.expm1(off)), "%"),
+                    sigmas=float(np.sqrt(judgement.statistic)),
+                    unit_factor=_unit_factor(off),
+                )
+            )
+        keep: BoolArray = np.ones(len(bars), dtype=bool)
+        keep[out] = False
+        self.network = replace(
+            self.network,
+            scale_bars=ScaleBars(bars.start[keep], bars.end[keep], bars.length[keep], bars.sigma[keep]),
+        )
+
+
+def _scaled(covariance: FloatArray, factor: float) -> FloatArray:
+    """Return covariances (n, 3, 3) of standard deviations times a factor, itself that of fixed ones."""
+    if np.where(np.isfinite(covariance), covariance, 0.0).any():
+        return np.asarray(factor**2 * covariance)
+    return np.asarray(factor**2 * np.eye(3) + covariance)
+
+
+def _mean_scale(model: GivenModel, kept: list[int]) -> float:
+    """Return the mean logarithm of scales by their stated standard deviations."""
+    variance = np.diagonal(model.network + model.stated)[kept]
+    weight = 1 / np.maximum(variance, np.finfo(float).tiny)
+    return float(weight @ model.v[kept] / weight.sum())
+
+
+def _unit_factor(log: float) -> float | None:
+    """Return the factor between two units that a difference of scale is; None if it is none."""
+    factor = float(np.exp(abs(log)))
+    return next((one for one in UNIT_FACTORS if abs(factor / one - 1) < SAME_UNIT), None)
+
+
+def _shift(model: GivenModel, k: int) -> float:
+    """Return the largest shift, in its standard deviations, of what given values determine without one."""
+    reach = model.external()[k]
+    if not np.isfinite(reach):
+        return float("inf")
+    return float(np.sqrt(model.decrease((k,))[0]) * reach / NONCENTRALITY)

@@ -1,0 +1,35 @@
+"""Mistyped bars, control and units are never believed; right ones are not doubted."""
+
+from __future__ import annotations
+
+import pytest
+
+from tests.survey.mistyped import CASES, NEVER_FOUND, mistyped, right, study
+
+REFUSED = ("refused", "bad", "fair")
+
+
+@pytest.mark.parametrize("case", [one[0] for one in CASES if one[0] not in NEVER_FOUND])
+def test_what_is_mistyped_is_found_and_named(case: str) -> None:
+    found = mistyped(case, 100)
+    assert not found.is_wrong_and_good
+    assert found.level in REFUSED or case == "control 6 sigma"
+    assert found.kinds or found.level in ("refused", "good")
+
+
+def test_right_bars_and_control_are_good() -> None:
+    assert [one.level for one in map(right, range(1000, 1011))] == ["good"] * 11
+
+
+@pytest.mark.slow
+def test_mistyped_surveys_of_many_networks() -> None:
+    found = study([one[0] for one in CASES], 6, 200)
+    detectable = [one for one in found if one.case not in NEVER_FOUND]
+    assert not any(one.is_wrong_and_good for one in detectable)
+    said = [
+        one
+        for one in found
+        if one.case not in (*NEVER_FOUND, "control 6 sigma") and "points," not in one.case
+    ]
+    assert all(one.level != "good" for one in said)
+    assert sum(one.level != "good" for one in found[-200:]) <= 1
