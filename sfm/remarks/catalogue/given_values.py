@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from sfm.remarks.catalogue.hypotheses import SHIFT
-from sfm.remarks.kind import Kind
+from sfm.remarks.kind import Grade, Kind
 
-CHECK_THE_LIST = "a number mistyped, the wrong ends or name, another unit, or a point that moved"
+CHECK_THE_LIST = "a number mistyped, the wrong ends or name, another unit, or a point that moved"# A value that a test rejects is worth a warning, and an error where it shifts the result beyond what is right.
+DETECTED = Grade("shift", error=SHIFT.error)
+
 ROWS = (
     Kind(
         "bar_left_out",
@@ -33,7 +35,7 @@ ROWS = (
     ),
     Kind(
         "given_contradicted",
-        SHIFT,
+        DETECTED,
         "The {what} contradict one another (chi-square {chi2}, {dof} degrees of freedom): {given} may be "
         "wrong[[, and shift coordinates by up to {shift} standard deviations]].",
         CHECK_THE_LIST,
@@ -71,7 +73,7 @@ ROWS = (
     ),
     Kind(
         "given_differs",
-        SHIFT,
+        DETECTED,
         "The given {given} differs from the adjusted one by {difference}, {sigmas} standard deviations: "
         "coordinates shift by up to {shift} of theirs.",
         CHECK_THE_LIST,
