@@ -15,7 +15,6 @@ from sfm.conventions import FloatArray, angles_from_rotation
 from sfm.errors import GeometryError, SurveyFileError
 from sfm.network import Estimate
 from sfm.pipeline import run_survey
-from sfm.remarks.remark import kinds_of
 from sfm.report.findings.findings import findings_of
 from sfm.report.findings.given_residuals import exterior_residuals
 from sfm.report.html.report_page import report_page

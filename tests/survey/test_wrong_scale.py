@@ -7,7 +7,6 @@ import pytest
 
 from sfm.network import Estimate, Network
 from sfm.pipeline import run_survey
-from sfm.remarks.remark import kinds_of
 from sfm.report.findings.findings import findings_of
 from sfm.survey.inputs.given import KnownPoints, ScaleBar
 from tests.surveys import remarks_on_given, survey_of

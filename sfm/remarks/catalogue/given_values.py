@@ -5,7 +5,8 @@ from __future__ import annotations
 from sfm.remarks.catalogue.hypotheses import SHIFT
 from sfm.remarks.kind import Grade, Kind
 
-CHECK_THE_LIST = "a number mistyped, the wrong ends or name, another unit, or a point that moved"# A value that a test rejects is worth a warning, and an error where it shifts the result beyond what is right.
+CHECK_THE_LIST = "a number mistyped, the wrong ends or name, another unit, or a point that moved"
+# What a test rejects is worth a warning, and is an error where it shifts the result beyond what is right.
 DETECTED = Grade("shift", error=SHIFT.error)
 
 ROWS = (
