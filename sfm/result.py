@@ -26,10 +26,6 @@ from sfm.remarks.remark import Remark
 from sfm.stored_result import NO_SCALE, SeenTargets, StoredResult
 from sfm.targets.flags import Flag, count_flags
 
-EXPLAINS = 1.5  # ratio of sigma0 without and with a cause from which it explains something
-NOTICEABLE = 1.005  # the same ratio for one that a test has found: with thousands of points everything is
-MATTERS = 0.5  # standard deviations by which points move (RMS) from which a significant cause is told, too
-
 
 @dataclass(frozen=True)
 class FailedImage:
@@ -74,28 +70,6 @@ class PhotographTargets:
     def reasons(self) -> list[tuple[str, int]]:
         """Return (reason, number of candidates) of this photograph, most frequent first."""
         return [(in_words(name), count) for name, count in count_flags(self.rejected_flag)]
-
-
-@dataclass(frozen=True)
-class Explanation:
-    """A cause of large residuals that was tried on the finished network."""
-
-    cause: str  # what was given more freedom, in words
-    before_px: float  # sigma0 without it, of all image points, px
-    after_px: float  # sigma0 with it, of the same, px
-    moved: float = np.nan  # standard deviations by which points then differ (RMS); NaN where that is unknown
-    significant: bool = False  # whether a test has found it beyond chance before it was tried
-
-    @property
-    def explains(self) -> bool:
-        """Whether it takes away a good part of the residuals, or is significant and moves the points.
-
-        What is significant takes away some of the residuals, too: in networks of thousands of points the
-        slightest systematic error is significant, and more freedom moves them.
-        """
-        ratio = self.before_px / self.after_px if self.after_px > 0 else np.inf
-        found = self.significant and ratio > NOTICEABLE and self.moved > MATTERS
-        return bool(ratio > EXPLAINS or found)
 
 
 @dataclass(frozen=True)
@@ -178,7 +152,6 @@ class SurveyResult:
     given_tests: tuple[GivenTest, ...] = ()  # of control and scale bars against the image points alone
     other_solutions: tuple[OtherSolution, ...] = ()  # that the image points allow as well
     unused_image_points: int = 0  # of points or photographs that are not in the result, in no other count
-    explanations: tuple[Explanation, ...] = ()  # of large residuals that were tried, the likeliest first
     check_points: tuple[CheckPoint, ...] = ()  # with coordinates that took no part
     balance_radius_mm: tuple[tuple[str, float], ...] = ()  # R0 of the cameras given in AICON's form
     exterior_correlations: ExteriorCorrelations | None = None  # of camera parameters, all of them

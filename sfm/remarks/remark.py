@@ -32,7 +32,7 @@ class Remark:
 
     Example:
         >>> from sfm.remarks.remark import remark
-        >>> one = remark("two_positions", point="12", distance=(0.3, "mm"), sigmas=8.0)
+        >>> one = remark("two_places", point="12", distance=(0.3, "mm"), sigmas=8.0)
         >>> one.number("sigmas"), one.names("point")
         (8.0, ('12',))
     """

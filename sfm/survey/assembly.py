@@ -57,7 +57,6 @@ def assemble_result(
         left_out=(*measured.left_out, *solution.left_out),
         settings=told_settings(survey),
         given_tests=solution.given_tests,
-        explanations=solution.explanations,
         other_solutions=solution.others,
         unused_image_points=solution.unused_image_points + sum(one.image_points for one in measured.left_out),
         reject=survey.reject,

@@ -11,7 +11,7 @@ from sfm.adjustment.datum import Datum
 from sfm.adjustment.quality.other_solutions import other_solutions
 from sfm.adjustment.solve import adjust
 from sfm.camera import camera_from_values, project
-from sfm.result import Explanation
+from sfm.remarks.remark import remark
 from sfm.survey.diagnosis.principal_distance import contradicted
 from tests.survey.weak_networks import outcome_of, study
 from tests.synthetic import make_network, seed_of
@@ -74,12 +74,10 @@ def test_other_principal_distances_are_found_along_bent_valleys(number: int) -> 
 
 
 def test_residuals_with_a_cause_contradict_a_camera_that_had_to_be_held() -> None:
-    clear, unclear = Explanation("K1 free", 0.2, 0.1), Explanation("K1 free", 0.2, 0.199)
-    (found,) = contradicted(("A",), (clear, unclear))
+    cause = remark("held_parameter", parameters="K1", camera="A", photographs=(), shift=8.0)
+    (found,) = contradicted(("A",), (cause,))
     assert found.kind == "c_held_contradicted" and found.names("cameras") == ("A",)
-    assert (
-        contradicted((), (clear,)) == contradicted(("A",), (unclear, clear)) == contradicted(("A",), ()) == ()
-    )
+    assert contradicted((), (cause,)) == contradicted(("A",), ()) == ()
 
 
 def test_a_pair_does_not_determine_the_c_that_was_found_for_it() -> None:

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sfm.adjustment.datum import Datum
-from sfm.adjustment.quality.held_camera import held_parameters
+from sfm.adjustment.hypotheses.hypotheses import contradicted_parameters
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.camera import Camera
@@ -58,8 +58,8 @@ def better_fit(survey: Adjustment, network: Network, compared: Adjustment) -> Be
     found = BetterFit(own.rms_px, compared.rms_px, more)
     if f_isf(ALPHA, freed, compared.redundancy) > F or found.times < BETTER:
         return None
-    tested = held_parameters(_adjusted(network, own.estimate, survey.sigma_px, covariance=True))
-    clear = tuple(dict.fromkeys(one.parameter for one in tested if one.parameter in more))
+    tested = contradicted_parameters(_adjusted(network, own.estimate, survey.sigma_px, covariance=True))
+    clear = tuple(dict.fromkeys(name for _, name in tested if name in more))
     return replace(found, free=clear or more)
 
 

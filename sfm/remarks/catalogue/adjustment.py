@@ -44,14 +44,6 @@ ROWS = (
         "Set sigma_px to what the residuals show.",
     ),
     Kind(
-        "explained",
-        Grade("moved", error=5.0),
-        "Sigma0 of all image points falls from {before} to {after} with {cause}; points then differ by "
-        "{moved} standard deviations (RMS).",
-        "an assumption of the survey does not fit the photographs",
-        "Correct the assumption named.",
-    ),
-    Kind(
         "residual_kept",
         RESIDUAL,
         "The residual of point {point} in {photograph} is {length}, {over_sigma} times its standard "

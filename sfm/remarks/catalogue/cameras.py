@@ -84,22 +84,6 @@ ROWS = (
         "Hold it fixed, or add photographs turned by 90 degrees.",
     ),
     Kind(
-        "parameter_contradicted",
-        Grade("moved", error=5.0),
-        "{parameter} of camera {camera} is held fixed at {value}, but the photographs show {found} ({t} "
-        "standard deviations); points are wrong by {moved} of theirs (RMS).[[ Write {free}.]]",
-        "a calibration that is not that of these photographs",
-        "Free the parameter, or calibrate the camera again.",
-    ),
-    Kind(
-        "residual_pattern",
-        "warning",
-        "The residuals of camera {camera} depend on the place in the photograph (p = {p}): their mean is "
-        "up to {largest}.",
-        "a camera model that does not suit the lens",
-        "Free more parameters of the distortion, or use another camera model.",
-    ),
-    Kind(
         "pixels_not_square",
         "warning",
         "The pixels of camera {camera} are {width} x {height} by {where}, {off} off squares.",

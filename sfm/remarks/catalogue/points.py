@@ -50,14 +50,6 @@ ROWS = (
         "Look at the target; leave the point out if you do not trust it.",
     ),
     Kind(
-        "two_positions",
-        "warning",
-        "Point {point} is at two positions, {distance} apart ({sigmas} standard deviations): one in {first}, "
-        "the other in {second}.",
-        "it moved, or two points have its name",
-        "Rename one of the two, or survey the states by themselves.",
-    ),
-    Kind(
         "image_points_identical",
         "note",
         "{image_points:image point} {image_points:stands|stand} more than once with one position: "

@@ -1,54 +1,16 @@
-"""Remarks on the cameras of a survey: held at wrong values, hardly determined, where no lens has them."""
+"""Remarks on the cameras of a survey: hardly determined, where no lens has them."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from sfm.adjustment.quality.held_camera import HeldParameter
 from sfm.remarks.remark import Remark, remark, unless_note
 from sfm.result import SurveyResult
-from sfm.survey.inputs.settings import FREED_FIRST
 
 
-def camera_remarks(result: SurveyResult, held: tuple[HeldParameter, ...]) -> tuple[Remark, ...]:
-    """Return the remarks on all cameras.
-
-    Args:
-        result: of a survey.
-        held: interior parameters held at values that the photographs contradict, the clearest first.
-    """
-    return (*_contradicted(result, held), *_hardly_determined(result), *_principal_points(result))
-
-
-def _contradicted(result: SurveyResult, held: tuple[HeldParameter, ...]) -> tuple[Remark, ...]:
-    """Return the clearest of the parameters that were held, since those that go with it follow."""
-    if not held:
-        return ()
-    worst = held[0]
-    unit = "" if worst.unit == "1" else worst.unit
-    return (
-        remark(
-            "parameter_contradicted",
-            parameter=worst.parameter,
-            camera=worst.camera,
-            value=(worst.value, unit),
-            found=(worst.value + worst.change, unit),
-            t=abs(worst.t),
-            moved=worst.moved,
-            free=free_line(result, held),
-        ),
-    )
-
-
-def free_line(result: SurveyResult, held: tuple[HeldParameter, ...]) -> str:
-    """Return what to write into the survey file so that the camera fits: the usual ones, those named."""
-    cameras = result.adjustment.estimate.cameras
-    own = (one for one in cameras if held and held[0].camera in (one.name, *one.shared))
-    camera = next(own, cameras[0])
-    named = {one.parameter for one in held}
-    free = {name for name, on in zip(camera.names, camera.free, strict=True) if on}
-    written = [f'"{name}"' for name in camera.names if name in {*free, *named, *FREED_FIRST}]
-    return f"free = [{', '.join(written)}] for camera {camera.name}"
+def camera_remarks(result: SurveyResult) -> tuple[Remark, ...]:
+    """Return the remarks on all cameras."""
+    return (*_hardly_determined(result), *_principal_points(result))
 
 
 def _hardly_determined(result: SurveyResult) -> tuple[Remark, ...]:

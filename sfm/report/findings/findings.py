@@ -9,7 +9,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from sfm.adjustment.quality.consistency import Consistency, consistency_of
-from sfm.adjustment.quality.held_camera import HeldParameter, held_parameters
 from sfm.remarks.verdict import Verdict, judge
 from sfm.report.findings.bundle_statistics import Statistics, statistics_of
 from sfm.report.findings.camera_remarks import camera_remarks
@@ -70,8 +69,7 @@ class Findings:
     rejected: Rejected
     comparison: ComparisonFindings | None
     object_size: float  # diagonal of the box around the points, object unit
-    held: tuple[HeldParameter, ...]  # interior parameters held at values that the photographs contradict
-    consistency: Consistency  # tests of points, photographs and the format
+    consistency: Consistency  # tests of points and photographs
     protocol: Protocol  # entries of a bundle protocol
 
 
@@ -80,18 +78,18 @@ def findings_of(result: SurveyResult) -> Findings:
     a = result.adjustment
     sigma0, longest, statistics = sigma0_of(result), longest_residual(a), statistics_of(result)
     given, check, size = given_of(result), checked_control(result), object_size(a.estimate.points)
-    consistency, held = consistency_of(a), held_parameters(a)
+    consistency = consistency_of(a)
     geometry, precision = geometry_of(a), precision_of(a)
     remarks = (
         *adjustment_remarks(a),
         *photograph_remarks(result),
         *result.remarks,
         *other_solution_remarks(result),
-        *sigma0_remarks(result, sigma0, statistics),
+        *sigma0_remarks(sigma0, statistics),
         *residual_remarks(result, longest, statistics),
         *ray_remarks(a),
-        *consistency_remarks(result, consistency),
-        *camera_remarks(result, held),
+        *consistency_remarks(consistency),
+        *camera_remarks(result),
         *given_remarks(result, given, statistics, check_coordinates(result)),
         *comparison_remarks(result),
     )
@@ -113,7 +111,6 @@ def findings_of(result: SurveyResult) -> Findings:
         rejected=rejected_of(result, geometry),
         comparison=comparison_of(result),
         object_size=size,
-        held=held,
         consistency=consistency,
         protocol=protocol_of(result, given, check),
     )

@@ -15,7 +15,6 @@ from sfm.remarks.remark import Remark, remark, unless_note
 from sfm.remarks.verdict import Level
 from sfm.report.findings.bundle_statistics import Statistics
 from sfm.report.findings.checks import LongestResidual, Sigma0
-from sfm.report.numbers import finer_unit
 from sfm.result import SurveyResult
 
 HEADLINES: Mapping[Level, str] = {
@@ -82,22 +81,9 @@ def other_solution_remarks(result: SurveyResult) -> tuple[Remark, ...]:
     )
 
 
-def sigma0_remarks(result: SurveyResult, sigma0: Sigma0, statistics: Statistics) -> tuple[Remark, ...]:
-    """Return whether sigma0 a posteriori is far from that a priori, and what explains it."""
-    remarks = []
-    tried = result.explanations
-    if tried and tried[0].explains:
-        cause = tried[0]
-        remarks.append(
-            remark(
-                "explained",
-                cause=cause.cause,
-                before=(cause.before_px, "px"),
-                after=(cause.after_px, "px"),
-                moved=float(np.nan_to_num(cause.moved)),
-            )
-        )
-    remarks += unless_note(remark("sigma0_high", ratio=sigma0.ratio, stated=(sigma0.stated_px, "px")))
+def sigma0_remarks(sigma0: Sigma0, statistics: Statistics) -> tuple[Remark, ...]:
+    """Return whether sigma0 a posteriori is far from that a priori."""
+    remarks = [*unless_note(remark("sigma0_high", ratio=sigma0.ratio, stated=(sigma0.stated_px, "px")))]
     image = component_tests(statistics.kinds, alpha=2 * ALPHA)[0]
     if sigma0.ratio < SIGMA0_LOW and image.statistic < image.lower:
         remarks.append(
@@ -161,21 +147,9 @@ def ray_remarks(a: Adjustment) -> tuple[Remark, ...]:
     return tuple(remarks)
 
 
-def consistency_remarks(result: SurveyResult, found: Consistency) -> tuple[Remark, ...]:
-    """Return what the tests of points, photographs and the format show."""
+def consistency_remarks(found: Consistency) -> tuple[Remark, ...]:
+    """Return what the tests of points and photographs show."""
     remarks = []
-    for place in found.two_positions:
-        factor, unit = finer_unit(result.length_unit, place.distance)
-        remarks.append(
-            remark(
-                "two_positions",
-                point=place.point,
-                distance=(factor * place.distance, unit),
-                sigmas=place.over_sigma,
-                first=place.first,
-                second=place.second,
-            )
-        )
     if found.doubtful:
         remarks.append(remark("points_doubtful", points=[one.point for one in found.doubtful]))
     if found.large:
@@ -190,10 +164,6 @@ def consistency_remarks(result: SurveyResult, found: Consistency) -> tuple[Remar
                 ratio=uneven.largest / uneven.median,
             )
         )
-    remarks += [
-        remark("residual_pattern", camera=one.camera, p=one.probability, largest=(one.largest_px, "px"))
-        for one in found.patterns
-    ]
     return tuple(remarks)
 
 

@@ -89,16 +89,6 @@ def summary_of_consistency(findings: Findings) -> dict[str, Any]:
     """Return what the tests of points, photographs and the format have found."""
     found = findings.consistency
     return {
-        "two_positions": [
-            {
-                "point": one.point,
-                "distance": or_none(one.distance),
-                "over_sigma": or_none(one.over_sigma),
-                "first": list(one.first),
-                "second": list(one.second),
-            }
-            for one in found.two_positions
-        ],
         "large_residuals": list(found.large),
         "doubtful": [
             {
@@ -118,15 +108,6 @@ def summary_of_consistency(findings: Findings) -> dict[str, Any]:
             "largest": or_none(found.uneven.largest),
             "median": or_none(found.uneven.median),
         },
-        "patterns": [
-            {
-                "camera": one.camera,
-                "probability": or_none(one.probability),
-                "explained": or_none(one.explained),
-                "largest_px": or_none(one.largest_px),
-            }
-            for one in found.patterns
-        ],
         "other_solutions": [
             {
                 "camera": one.camera,

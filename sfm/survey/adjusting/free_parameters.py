@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sfm.adjustment.datum import Datum
-from sfm.adjustment.quality.held_camera import held_parameters
+from sfm.adjustment.hypotheses.hypotheses import contradicted_parameters
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.camera import pixel_from_tangents, tangents_from_pixel
@@ -91,11 +91,11 @@ def _determined(part: Network, start: Estimate, names: Chosen, datum: str, *, ex
     names, adjusted = _held_back(part, start, names, datum)
     index = {camera.name: a for a, camera in enumerate(start.cameras) if names[a]}
     for _ in range(ROUNDS if extend else 0):
-        demanded = () if adjusted is None else held_parameters(adjusted, min_moved=0.0)
+        demanded = () if adjusted is None else contradicted_parameters(adjusted)
         wider = list(names)
-        for one in demanded:
-            if one.camera in index:
-                wider[index[one.camera]] = (wider[index[one.camera]] or set()) | {one.parameter}
+        for camera, parameter in demanded:
+            if camera in index:
+                wider[index[camera]] = (wider[index[camera]] or set()) | {parameter}
         if adjusted is None or wider == names:
             break
         tried, adjusted = _held_back(part, adjusted.estimate, wider, datum)

@@ -7,6 +7,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sfm.adjustment.datum import Datum
+from sfm.adjustment.hypotheses.hypotheses import test_hypotheses
+from sfm.adjustment.hypotheses.rejections import explain_rejections
 from sfm.adjustment.quality.given_values import GivenTest
 from sfm.adjustment.quality.other_solutions import OtherSolution, other_solutions, solution_before
 from sfm.adjustment.result import Adjustment
@@ -20,10 +22,10 @@ from sfm.remarks.remark import Remark, remark
 from sfm.result import (
     ControlCheck,
     Eccentricity,
-    Explanation,
     LeftOutPoint,
     PhotographTargets,
 )
+from sfm.stored_result import NO_SCALE
 from sfm.survey.adjusting.datum_definition import (
     MIN_CONTROL,
     datum_remarks,
@@ -43,7 +45,6 @@ from sfm.survey.adjusting.settling import (
     settle,
     treat,
 )
-from sfm.survey.diagnosis.explanations import explain_residuals
 from sfm.survey.diagnosis.left_out import left_out_points, remarks_on_left_out, unused_image_points
 from sfm.survey.diagnosis.own_camera import Treated
 from sfm.survey.diagnosis.principal_distance import contradicted, far_principal_distances
@@ -91,7 +92,6 @@ class Solution:
     unused_image_points: int  # of points and photographs that are not in it
     given_tests: tuple[GivenTest, ...]  # of control, bars and observed orientation against the image points
     others: tuple[OtherSolution, ...]  # that the image points allow as well
-    explanations: tuple[Explanation, ...]  # of large residuals, tried on the finished network
 
 
 def refine(network: Network, estimate: Estimate) -> Estimate:
@@ -125,7 +125,9 @@ def solve_survey(survey: Survey, matched: Correspondences) -> Solution:
     )
     # natural texture has points in plenty, of which only those that were lost on the way are worth a line
     told = left_out if survey.tie_points is None else _among(left_out, whole, start.known)
-    explanations = explain_residuals(final)
+    given = final.datum == "control" or len(final.network.scale_bars) or len(final.network.control) >= 2
+    unit = survey.unit if given else NO_SCALE
+    causes = test_hypotheses(final, unit=unit)
     return Solution(
         final,
         solved.check,
@@ -134,13 +136,14 @@ def solve_survey(survey: Survey, matched: Correspondences) -> Solution:
             *start.remarks,
             *solved.remarks,
             *_remarks(start.task.survey, told, len(whole.points), final),
-            *contradicted(solved.c_held, explanations),
+            *causes,
+            *explain_rejections(final, unit=unit),
+            *contradicted(solved.c_held, causes),
         ),
         left_out,
         unused_image_points(whole, settled.images, np.isin(whole.points, final.network.points)),
         solved.given.tests,
         solved.others,
-        explanations,
     )
 
 

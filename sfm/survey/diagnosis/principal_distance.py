@@ -10,7 +10,6 @@ import numpy as np
 
 from sfm.network import Estimate
 from sfm.remarks.remark import Remark, remark
-from sfm.result import Explanation
 from sfm.survey.inputs.survey import Survey
 
 FAR = 0.2  # relative change of c; focusing from infinity to 1 : 5 changes it by as much
@@ -43,8 +42,8 @@ def far_principal_distances(survey: Survey, estimate: Estimate) -> tuple[Remark,
     return tuple(remarks)
 
 
-def contradicted(held: tuple[str, ...], explanations: tuple[Explanation, ...]) -> tuple[Remark, ...]:
+def contradicted(held: tuple[str, ...], causes: tuple[Remark, ...]) -> tuple[Remark, ...]:
     """Return a remark where the residuals have a cause and c was held at a value that nobody measured."""
-    if not held or not explanations or not explanations[0].explains:
+    if not held or not causes:
         return ()
     return (remark("c_held_contradicted", cameras=held),)

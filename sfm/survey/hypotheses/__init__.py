@@ -1,1 +1,1 @@
-"""Which assumption of a survey is wrong: alternatives that free something, tested against one another."""
+"""Which given values of a survey are wrong, by the image points alone."""

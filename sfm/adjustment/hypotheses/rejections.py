@@ -13,6 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sfm.adjustment.hypotheses.alternatives import ALPHA
 from sfm.adjustment.quality.point_normals import intersected
 from sfm.adjustment.result import Adjustment
 from sfm.camera import project
@@ -20,7 +21,6 @@ from sfm.conventions import IntArray
 from sfm.distributions import chi2_isf, chi2_sf
 from sfm.network import rows_of
 from sfm.remarks.remark import Remark, remark
-from sfm.survey.hypotheses.alternatives import ALPHA
 
 MIN_EXCHANGED = 2  # photographs in which two names are exchanged, from which it is a rule and no accident
 MIN_RAYS = 3  # that meet at a second place; two nearly meet wherever they are along an epipolar line
@@ -37,8 +37,8 @@ class SecondPlace:
     images: IntArray  # that show it there
 
 
-def explain_rejections(a: Adjustment) -> tuple[Remark, ...]:
-    """Return what explains the rejected image points of an adjustment."""
+def explain_rejections(a: Adjustment, *, unit: str = "") -> tuple[Remark, ...]:
+    """Return what explains the rejected image points of an adjustment; the object unit is for the remarks."""
     if not a.rejected.any() or not a.sigma0 > 0 or a.undetermined:
         return ()
     misnamed = _other_points(a)
@@ -62,7 +62,7 @@ def explain_rejections(a: Adjustment) -> tuple[Remark, ...]:
             )
         )
     used = set(rest) | {row for row, q in misnamed.items() if _key(a, row, q) in pairs}
-    return (*remarks, *_words_of_places(a, _second_places(a, used)))
+    return (*remarks, *_of_places(a, _second_places(a, used), unit))
 
 
 def _other_points(a: Adjustment) -> dict[int, int]:
@@ -127,7 +127,7 @@ def _second_places(a: Adjustment, explained: set[int]) -> list[SecondPlace]:
     return places
 
 
-def _words_of_places(a: Adjustment, places: list[SecondPlace]) -> list[Remark]:
+def _of_places(a: Adjustment, places: list[SecondPlace], unit: str) -> list[Remark]:
     """Return a remark on points that moved together at one place in the sequence, and on each other point."""
     names = a.network.images
     together: dict[int, list[SecondPlace]] = defaultdict(list)
@@ -142,7 +142,7 @@ def _words_of_places(a: Adjustment, places: list[SecondPlace]) -> list[Remark]:
         remark(
             "points_moved",
             points=tuple(a.network.points[one.point] for one in some),
-            distance=max(one.distance for one in some),
+            distance=(max(one.distance for one in some), unit),
             shift=max(one.over_sigma for one in some),
             **{"from": names[start]},
         )
@@ -152,7 +152,7 @@ def _words_of_places(a: Adjustment, places: list[SecondPlace]) -> list[Remark]:
         remark(
             "two_places",
             point=a.network.points[one.point],
-            distance=one.distance,
+            distance=(one.distance, unit),
             sigmas=one.over_sigma,
             photographs=tuple(names[i] for i in one.images),
         )

@@ -4,8 +4,8 @@
 
 A are the columns of the adjustment (photographs, free interior parameters, object points), B those of an
 alternative, v the residuals of the accepted image points. Object points are eliminated first, then
-photographs and cameras, whose seven motions are fixed by inner constraints. (gain / q) / ((v'Pv - gain) / (r - q))
-is F distributed where the alternative is none.
+photographs and cameras, whose seven motions are fixed by inner constraints. Where the alternative is none,
+(gain / q) / ((v'Pv - gain) / (r - q)) is F distributed.
 
 Source: Koch (1999), Parameter Estimation and Hypothesis Testing in Linear Models, sec. 4.2; Rao (1948), Proc.
 Camb. Phil. Soc. 44, for the score test; Foerstner and Wrobel (2016), sec. 4.6.4.
@@ -19,11 +19,11 @@ import numpy as np
 from scipy import special
 from scipy.linalg import cho_factor, cho_solve
 
+from sfm.adjustment.hypotheses.columns import Columns, interior_columns, interior_step
 from sfm.adjustment.result import Adjustment
 from sfm.conventions import FloatArray, IntArray
 from sfm.distributions import f_sf
 from sfm.network import rows_of
-from sfm.survey.hypotheses.columns import Columns, interior_columns, interior_step
 
 DETERMINED = 1e-5  # of the squares of a column that photographs, cameras and points must leave of it
 SMALLEST_LOG = -600.0  # of a probability that `f_sf` still gives
@@ -62,7 +62,7 @@ class Reduced:
         return np.asarray(self.F @ columns[self.used])
 
     def project_by_photograph(self, D: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return H (m, f, m, f), g (m, f) and squares (m, f) of whitened columns (k, 2, f) for each photograph.
+        """Return H (m, f, m, f), g (m, f) and squares (m, f) of whitened columns (k, 2, f).
 
         Every photograph has f freedoms of its own.
         """
@@ -297,7 +297,10 @@ def log_f_sf(f: float, q: int, d: int) -> float:
     )
 
 
-def log_likelihood_gain(gain: float, redundancy: int, count: int) -> float:
-    """Return by how much ln of the likelihood grows where v'Pv falls from r by a gain; sigma0 unknown."""
+def log_likelihood_gain(gain: float, redundancy: int) -> float:
+    """Return by how much ln of the likelihood grows where v'Pv falls from r by a gain; sigma0 unknown.
+
+    Source: Patterson and Thompson (1971), Biometrika 58, for the restricted likelihood.
+    """
     left = max(redundancy - gain, np.finfo(float).tiny)
-    return float(count / 2 * np.log(redundancy / left))
+    return float(redundancy / 2 * np.log(redundancy / left))

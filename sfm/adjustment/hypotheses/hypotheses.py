@@ -14,6 +14,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sfm.adjustment.datum import Datum
+from sfm.adjustment.hypotheses.alternatives import (
+    ALPHA,
+    Alternative,
+    alternatives_of,
+    held_interiors,
+    is_significant,
+)
+from sfm.adjustment.hypotheses.columns import columns_of
+from sfm.adjustment.hypotheses.described import remark_of
+from sfm.adjustment.hypotheses.refit import Refit, refit
+from sfm.adjustment.hypotheses.score import reduce_adjustment
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.conventions import BoolArray
@@ -21,11 +32,6 @@ from sfm.errors import GeometryError
 from sfm.network import Estimate, ExteriorObservations, Network, ObjectPoints, ScaleBars
 from sfm.reduced_network import reduce_network
 from sfm.remarks.remark import Remark
-from sfm.survey.hypotheses.alternatives import ALPHA, Alternative, alternatives_of, is_significant
-from sfm.survey.hypotheses.columns import columns_of
-from sfm.survey.hypotheses.described import remark_of
-from sfm.survey.hypotheses.refit import Refit, refit
-from sfm.survey.hypotheses.score import reduce_adjustment
 
 MAX_CAUSES = 2  # that are looked for one after another
 MAX_IMAGE_POINTS = 20_000  # of the network that is tested; every so many points of a larger one
@@ -42,17 +48,18 @@ class Cause:
     as_well: tuple[Alternative, ...]  # other causes that explain the image points about as well
 
 
-def test_hypotheses(final: Adjustment) -> tuple[Remark, ...]:
+def test_hypotheses(final: Adjustment, *, unit: str = "") -> tuple[Remark, ...]:
     """Return what the image points say against the assumptions of an adjustment, the clearest first.
 
     Args:
         final: a finished adjustment with its covariance.
+        unit: object unit, for the remarks.
     """
     plain = free_network(final)
     if plain is None:
         return ()
     return tuple(
-        remark_of(plain, one.alternative, one.refit, one.as_well) for one in find_causes(final, plain)
+        remark_of(plain, one.alternative, one.refit, one.as_well, unit) for one in find_causes(final, plain)
     )
 
 
@@ -111,9 +118,35 @@ def _cause(one: Alternative) -> tuple[object, ...]:
     return ("camera", tuple(one.photographs.tolist()))
 
 
+def contradicted_parameters(a: Adjustment) -> tuple[tuple[str, str], ...]:
+    """Return the held interior parameters that the image points contradict, the clearest first.
+
+    Args:
+        a: a finished adjustment.
+
+    Returns:
+        (camera or group of cameras, parameter) of each that freeing alone improves beyond chance.
+    """
+    plain = free_network(a)
+    if plain is None:
+        return ()
+    try:
+        reduced = reduce_adjustment(plain, columns_of(plain))
+    except np.linalg.LinAlgError:
+        return ()
+    every = [one for one in held_interiors(plain, reduced) if len(one.gain.beta) == 1]
+    found = sorted((one for one in every if is_significant(one, len(every))), key=lambda one: -one.gain.value)
+    names = []
+    for one in found:
+        index, s = one.parameters[0]
+        camera = plain.estimate.cameras[index]
+        names.append((camera.group_of(s) or camera.name, camera.names[s]))
+    return tuple(names)
+
+
 def free_network(final: Adjustment) -> Adjustment | None:
     """Return the adjustment of the accepted image points alone; None where it is no solution."""
-    if not final.converged or not final.sigma0 > 0 or not np.isfinite(final.redundancy_numbers).any():
+    if not final.converged or not final.sigma0 > 0 or final.redundancy < 2:
         return None
     network = final.network
     alone = not (len(network.scale_bars) or len(network.exterior))
@@ -139,7 +172,7 @@ def free_network(final: Adjustment) -> Adjustment | None:
 
 
 def _sample(network: Network, final: Adjustment) -> tuple[Network, Estimate, BoolArray]:
-    """Return a network of about `MAX_IMAGE_POINTS` image points, its estimate and which image points it has."""
+    """Return a network of about `MAX_IMAGE_POINTS`, its estimate, and which image points it has."""
     seen = network.image_points
     every = -(-len(seen) // MAX_IMAGE_POINTS)
     points = np.arange(len(network.points)) % every == 0

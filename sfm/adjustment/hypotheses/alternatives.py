@@ -4,7 +4,7 @@ A family is a set of columns; a pattern gives each photograph a factor on them. 
 shared out among all alternatives, and lowered by what was searched inside each of them: the number of
 patterns, or of sets of points, from which the best one was taken.
 
-Source: the score test of `sfm.survey.hypotheses.score`; Holm (1979), Scand. J. Statist. 6, for the level.
+Source: the score test of `sfm.adjustment.hypotheses.score`; Holm (1979), Scand. J. Statist. 6, for the level.
 """
 
 from __future__ import annotations
@@ -15,11 +15,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from scipy.special import gammaln
 
-from sfm.adjustment.result import Adjustment
-from sfm.conventions import FloatArray, IntArray
-from sfm.distortion.models import Role
-from sfm.survey.hypotheses.columns import BENDING, CAMERA, STRAIN, Columns, interior_columns
-from sfm.survey.hypotheses.score import (
+from sfm.adjustment.hypotheses.columns import BENDING, CAMERA, STRAIN, Columns, interior_columns
+from sfm.adjustment.hypotheses.score import (
     Gain,
     Reduced,
     gain_of,
@@ -27,6 +24,9 @@ from sfm.survey.hypotheses.score import (
     log_likelihood_gain,
     log_probability,
 )
+from sfm.adjustment.result import Adjustment
+from sfm.conventions import FloatArray, IntArray
+from sfm.distortion.models import Role
 
 ALPHA = 0.01  # probability of naming any alternative where none holds
 CAMERA_SETS = {
@@ -114,7 +114,7 @@ def _cells(a: Adjustment) -> FloatArray:
 def alternatives_of(a: Adjustment, reduced: Reduced, columns: Columns) -> tuple[Alternative, ...]:
     """Return all alternatives, the best evidence first."""
     found = [
-        *_interiors(a, reduced),
+        *held_interiors(a, reduced),
         *_format(a, reduced),
         *_by_photographs(reduced, columns),
         *_moved_points(a, reduced, columns),
@@ -167,7 +167,7 @@ def _made(
         on &= np.isin(reduced.point, some)
     touched = int(on.sum())
     over = max(spread.factor, 1.0)
-    evidence = log_likelihood_gain(gain.value, r, reduced.count)
+    evidence = log_likelihood_gain(gain.value, r)
     log_p = log_probability(gain.value, gain.rank, r)
     if over > 1:
         left = max(r - gain.value, 1.0) / r  # of the variance factor
@@ -176,14 +176,14 @@ def _made(
         if spread.among:
             evidence = min(evidence, spread.redundancy / 2 * np.log1p(f * gain.rank / spread.redundancy))
         else:
-            evidence = log_likelihood_gain(gain.value / over, r, reduced.count)
+            evidence = log_likelihood_gain(gain.value / over, r)
     price = gain.rank / 2 * np.log(2 * max(touched, 2)) + search
     return Alternative(
         *(family, pattern, factor, gain, log_p, price, search, evidence - price), some, parameters
     )
 
 
-def _interiors(a: Adjustment, reduced: Reduced) -> Iterator[Alternative]:
+def held_interiors(a: Adjustment, reduced: Reduced) -> Iterator[Alternative]:
     """Return an alternative for each held interior parameter, and one for all of a camera."""
     network, cameras = a.network, a.estimate.cameras
     everywhere = np.ones(len(network.images))

@@ -1,7 +1,7 @@
 """The winning alternative adjusted together with everything else, from all image points.
 
-The parameters of the alternative take the score step, their effect leaves the image points, and the network is
-adjusted anew; a few rounds end at the joint optimum. Image points that were rejected come back where they fit.
+The parameters of the alternative take the score step, their effect leaves the image points, and the network
+is adjusted anew; a few rounds end at the joint optimum. Rejected image points come back where they fit.
 """
 
 from __future__ import annotations
@@ -11,14 +11,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sfm.adjustment.datum import Datum
+from sfm.adjustment.hypotheses.alternatives import Alternative
+from sfm.adjustment.hypotheses.columns import columns_of
+from sfm.adjustment.hypotheses.score import gain_of, reduce_adjustment
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.conventions import FloatArray
 from sfm.errors import GeometryError
 from sfm.similarity import fit_similarity
-from sfm.survey.hypotheses.alternatives import Alternative
-from sfm.survey.hypotheses.columns import columns_of
-from sfm.survey.hypotheses.score import gain_of, reduce_adjustment
 
 ROUNDS = 6
 SETTLED = 0.01  # gain of v'Pv over the variance factor at which the rounds end
@@ -77,11 +77,10 @@ def log_likelihood(a: Adjustment) -> float:
 
     Source: Rissanen (1978), Automatica 14; Foerstner and Wrobel (2016), sec. 4.7 (mixture of good and bad).
     """
-    accepted = int((~a.rejected).sum())
     sizes = np.array([float(np.prod(camera.size_px)) for camera in a.estimate.cameras])
     area = sizes[a.network.camera[a.network.image_points.image[a.rejected]]]
     variance = a.sigma0_px**2
-    return float(-accepted * (np.log(2 * np.pi * variance) + 1) - np.log(area).sum())
+    return float(-a.redundancy / 2 * (np.log(2 * np.pi * variance) + 1) - np.log(area).sum())
 
 
 def shift_of(plain: Adjustment, other: Adjustment, one: Alternative, beta: FloatArray) -> float:

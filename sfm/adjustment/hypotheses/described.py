@@ -6,13 +6,13 @@ from collections.abc import Iterable
 
 import numpy as np
 
+from sfm.adjustment.hypotheses.alternatives import CAMERA_SETS, Alternative
+from sfm.adjustment.hypotheses.columns import interior_step, object_fields
+from sfm.adjustment.hypotheses.refit import Refit
 from sfm.adjustment.result import Adjustment
 from sfm.conventions import FloatArray
 from sfm.network import Network
 from sfm.remarks.remark import Quantity, Remark, remark
-from sfm.survey.hypotheses.alternatives import CAMERA_SETS, Alternative
-from sfm.survey.hypotheses.columns import interior_step, object_fields
-from sfm.survey.hypotheses.refit import Refit
 
 MOVED = ("moved", "shifted")
 
@@ -30,7 +30,9 @@ def kind_of(one: Alternative) -> str:
     return "object_deforming" if one.pattern == "linear" else "object_deformed"
 
 
-def remark_of(plain: Adjustment, one: Alternative, found: Refit, others: Iterable[Alternative]) -> Remark:
+def remark_of(
+    plain: Adjustment, one: Alternative, found: Refit, others: Iterable[Alternative], unit: str
+) -> Remark:
     """Return the remark on an alternative that holds.
 
     Args:
@@ -38,6 +40,7 @@ def remark_of(plain: Adjustment, one: Alternative, found: Refit, others: Iterabl
         one: the alternative.
         found: the adjustment with it.
         others: alternatives that explain the image points about as well.
+        unit: object unit.
     """
     kind, network = kind_of(one), plain.network
     parts: dict[str, str | Iterable[str] | float | tuple[float, str] | Quantity | None] = {
@@ -52,7 +55,7 @@ def remark_of(plain: Adjustment, one: Alternative, found: Refit, others: Iterabl
     elif one.family == "format":
         parts["largest"] = float(np.linalg.norm(found.beta.reshape(-1, 2), axis=1).max()), "px"
     elif one.family in MOVED:
-        parts |= _moved(plain, one, found.beta)
+        parts |= _moved(plain, one, found.beta, unit)
     else:
         parts["deformation"] = 1000 * _relative(plain, one, found.beta), "‰ of the object"
     return remark(kind, **parts)
@@ -89,12 +92,14 @@ def _interior(
     return parts
 
 
-def _moved(a: Adjustment, one: Alternative, beta: FloatArray) -> dict[str, tuple[str, ...] | float]:
+def _moved(
+    a: Adjustment, one: Alternative, beta: FloatArray, unit: str
+) -> dict[str, tuple[str, ...] | Quantity]:
     """Return which points moved, how far at most, and the last photograph before."""
     network: Network = a.network
-    parts: dict[str, tuple[str, ...] | float] = {
+    parts: dict[str, tuple[str, ...] | Quantity] = {
         "points": tuple(network.points[j] for j in one.points),
-        "distance": float(np.linalg.norm(beta.reshape(-1, 3), axis=1).max()),
+        "distance": Quantity(float(np.linalg.norm(beta.reshape(-1, 3), axis=1).max()), unit),
     }
     if one.pattern == "split":
         parts["from"] = (network.images[int(np.flatnonzero(one.factor > 0)[0])],)

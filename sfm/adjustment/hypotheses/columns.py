@@ -1,8 +1,9 @@
 """The columns that alternatives add: how each freedom moves an image point.
 
 Camera: what c, principal point, radial, decentring and affine distortion do to an image point, for every
-model alike. Strain: a homogeneous deformation of the object without scale, which a photograph takes for distance.
-Bending: a displacement that is quadratic in the coordinates. Interior: the derivatives of the camera's model.
+model alike. Strain: a homogeneous deformation of the object without scale, which a photograph takes for its
+distance. Bending: a displacement that is quadratic in the coordinates. Interior: the derivatives of the
+camera's model.
 
 Source: Brown (1971), Close-range camera calibration, Photogramm. Eng. 37(8); Foerstner and Wrobel (2016),
 Photogrammetric Computer Vision, sec. 4.6.4 (systematic errors), 12.2 (small rotations).
