@@ -16,7 +16,7 @@ from sfm.adjustment.hypotheses.columns import (
     interior_step,
     object_fields,
 )
-from sfm.adjustment.hypotheses.hypotheses import contradicted_parameters, test_hypotheses
+from sfm.adjustment.hypotheses.hypotheses import contradicted_parameters, judge_alternatives
 from sfm.adjustment.hypotheses.rejections import explain_rejections
 from sfm.adjustment.hypotheses.score import gain_of, log_f_sf, log_probability, reduce_adjustment
 from sfm.adjustment.result import Adjustment
@@ -27,8 +27,6 @@ from sfm.network import Estimate, Network
 from sfm.remarks.remark import Remark, kinds_of
 from tests.survey.faults import EVERY, FAULTS, planted
 from tests.synthetic import make_network, seed_of
-
-test_hypotheses.__test__ = False  # type: ignore[attr-defined]  # the function, not a test
 
 
 def solved(network: Network, start: Estimate, reject: str = "tau") -> Adjustment:
@@ -156,7 +154,7 @@ def causes_of(kind: str, number: int) -> tuple[str, ...]:
     """Return the kinds of the remarks, but for notes, on a planted network."""
     one = planted(kind, number)
     a = solved(one.network, one.start)
-    found: tuple[Remark, ...] = (*test_hypotheses(a), *explain_rejections(a))
+    found: tuple[Remark, ...] = (*judge_alternatives(a), *explain_rejections(a))
     return kinds_of(found)
 
 
@@ -207,7 +205,7 @@ def test_a_point_that_moved_far_is_named_with_its_distance(distance: float) -> N
         at = truth.cameras[0], truth.position[i], truth.rotation[i]
         xy[k] += (project(*at, place[None]) - project(*at, truth.points[j : j + 1]))[0]
     a = solved(replace(network, image_points=replace(seen, xy=xy)), truth)
-    found = [*test_hypotheses(a, unit="m"), *explain_rejections(a, unit="m")]
+    found = [*judge_alternatives(a, unit="m"), *explain_rejections(a, unit="m")]
     assert kinds_of(found) == ("points_moved",)
     assert found[0].names("points") == ("8",)
     assert found[0].number("distance") == pytest.approx(distance, rel=0.1)
@@ -227,13 +225,13 @@ def test_a_network_that_cannot_test_anything_has_no_cause() -> None:
     network, truth = make_network(seed_of("two b"), images=2, points=8, free=())
     a = solved(network, truth, "none")
     assert a.redundancy == 3
-    assert test_hypotheses(a) == ()
+    assert judge_alternatives(a) == ()
 
 
 @pytest.mark.slow
 def test_a_sample_of_a_large_network_names_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     one = planted("growth", 28)
     a = solved(one.network, one.start)
-    whole = test_hypotheses(a)
+    whole = judge_alternatives(a)
     monkeypatch.setattr("sfm.adjustment.hypotheses.hypotheses.MAX_IMAGE_POINTS", len(a.rejected) // 2)
-    assert kinds_of(test_hypotheses(a))[:1] == kinds_of(whole)[:1]
+    assert kinds_of(judge_alternatives(a))[:1] == kinds_of(whole)[:1]

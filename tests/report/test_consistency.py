@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sfm.adjustment.hypotheses.hypotheses import test_hypotheses
+from sfm.adjustment.hypotheses.hypotheses import judge_alternatives
 from sfm.adjustment.quality.consistency import consistency_of
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
@@ -50,7 +50,7 @@ def _false_alarms(runs: int) -> Counter[str]:
         )
         a = _solved(network, truth, "tau" if k % 2 else "none")
         found = consistency_of(a)
-        count["cause"] += bool(test_hypotheses(a))
+        count["cause"] += bool(judge_alternatives(a))
         count["large"] += bool(found.large)
         count["uneven"] += found.uneven is not None
     return count

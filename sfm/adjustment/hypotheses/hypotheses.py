@@ -48,7 +48,7 @@ class Cause:
     as_well: tuple[Alternative, ...]  # other causes that explain the image points about as well
 
 
-def test_hypotheses(final: Adjustment, *, unit: str = "") -> tuple[Remark, ...]:
+def judge_alternatives(final: Adjustment, *, unit: str = "") -> tuple[Remark, ...]:
     """Return what the image points say against the assumptions of an adjustment, the clearest first.
 
     Args:

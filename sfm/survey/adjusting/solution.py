@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sfm.adjustment.datum import Datum
-from sfm.adjustment.hypotheses.hypotheses import test_hypotheses
+from sfm.adjustment.hypotheses.hypotheses import judge_alternatives
 from sfm.adjustment.hypotheses.rejections import explain_rejections
 from sfm.adjustment.quality.given_values import GivenTest
 from sfm.adjustment.quality.other_solutions import OtherSolution, other_solutions, solution_before
@@ -127,7 +127,7 @@ def solve_survey(survey: Survey, matched: Correspondences) -> Solution:
     told = left_out if survey.tie_points is None else _among(left_out, whole, start.known)
     given = final.datum == "control" or len(final.network.scale_bars) or len(final.network.control) >= 2
     unit = survey.unit if given else NO_SCALE
-    causes = test_hypotheses(final, unit=unit)
+    causes = judge_alternatives(final, unit=unit)
     return Solution(
         final,
         solved.check,
