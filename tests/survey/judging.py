@@ -1,0 +1,159 @@
+"""What surveys say of themselves: right ones, with gross errors, with planted faults, with faults of no row.
+
+    python -m tests.survey.judging [FIRST] [GROUP ...]
+
+runs surveys from scratch on the networks of `tests.survey.faults` from number FIRST on, groups right,
+ordinary, faults, rowless, and prints for each kind how often it is called bad or fair, and which cause is named first.
+A result is wrong where a coordinate is more than 5 of its standard deviations from the truth; its fault can be
+detected where the residuals contradict the stated standard deviations, or the cause itself was rejected.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections import Counter
+from collections.abc import Iterable
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+
+from sfm.distributions import chi2_sf
+from sfm.errors import KolinearError
+from sfm.pipeline import run_survey
+from sfm.remarks.catalogue import hypotheses
+from sfm.report.findings.findings import findings_of
+from sfm.result import SurveyResult
+from sfm.similarity import fit_similarity
+from tests.survey.faults import FAULTS, RIGHT, ROWLESS, Planted, planted
+from tests.surveys import survey_of
+
+WRONG = 5.0  # standard deviations, of the worst coordinate
+CAUSES = {row.name for row in hypotheses.ROWS} | {"photograph_other_camera"}
+ALIKE = {  # kinds that say the same of a fault
+    "object_deforming": "object_deformed",
+    "two_places": "points_moved",
+    "camera_drift": "other_camera",
+    "photograph_other_camera": "other_camera",
+}
+GROUPS = {
+    "right": ([kind for kind in RIGHT if kind != "nothing"], 40),
+    "ordinary": (["nothing"], 200),
+    "faults": (list(FAULTS), 15),
+    "rowless": (list(ROWLESS), 10),
+}
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What came of one survey."""
+
+    kind: str
+    number: int
+    cause: str  # that was planted
+    level: str  # good, fair, bad; none where the survey ended without a result
+    over_sigma: float  # of the worst coordinate
+    detectable: bool
+    named: tuple[str, ...]  # causes, in the order of the verdict, notes included
+    first: str  # kind of the first remark that is no note
+
+    @property
+    def is_wrong(self) -> bool:
+        """Whether the result is wrong by more than WRONG."""
+        return self.over_sigma > WRONG
+
+    @property
+    def is_right_cause(self) -> bool:
+        """Whether the first cause named is the one that was planted."""
+        return bool(self.named) and _class(self.named[0]) == _class(self.cause)
+
+
+def _class(kind: str) -> str:
+    return ALIKE.get(kind, kind)
+
+
+def outcome_of(kind: str, number: int) -> Outcome:
+    """Run the survey of a planted network from scratch and compare it with the truth."""
+    one = planted(kind, number)
+    free = tuple(
+        name for name, on in zip(one.start.cameras[0].names, one.start.cameras[0].free, strict=True) if on
+    )
+    try:
+        result = run_survey(survey_of(one.network, one.start, free=free, adjust={"reject": "tau"}))
+    except KolinearError as error:
+        return Outcome(kind, number, one.cause, "none", np.nan, True, (), str(error))
+    verdict = findings_of(result).verdict
+    named = tuple(remark.kind for remark in verdict.remarks if remark.kind in CAUSES)
+    serious = [remark.kind for remark in verdict.remarks if remark.severity != "note"]
+    return Outcome(
+        *(kind, number, one.cause, verdict.level, _over_sigma(result, one), _is_detectable(result)),
+        *(named, serious[0] if serious else ""),
+    )
+
+
+def _over_sigma(result: SurveyResult, one: Planted) -> float:
+    """Return the largest error of a coordinate in its standard deviations, by the nearest state."""
+    a = result.adjustment
+    index = [one.network.point_index(name) for name in a.network.points]
+    sigma = np.sqrt(np.diagonal(a.covariance.points, axis1=1, axis2=2))
+    worst = []
+    for state in one.states:
+        placing = fit_similarity(a.estimate.points, state[index])
+        error = placing.apply(a.estimate.points) - state[index]
+        worst.append(float((np.abs(error) / (placing.scale * sigma)).max()))
+    return min(worst)
+
+
+def _is_detectable(result: SurveyResult) -> bool:
+    """Return whether the residuals contradict the standard deviations that were stated, which are true."""
+    a = result.adjustment
+    return bool(a.rejected.any() or chi2_sf(a.vPv, a.redundancy) < 0.001)
+
+
+def study(names: Iterable[str], first: int, processes: int = 2) -> list[Outcome]:
+    """Run the groups and print their tables."""
+    every = []
+    with ProcessPoolExecutor(processes) as pool:
+        for name in names:
+            kinds, count = GROUPS[name]
+            print(f"{name}: kind, surveys, bad, fair, good, none; wrong, detectable, named first; false")
+            found = []
+            for kind in kinds:
+                numbers = range(first, first + count)
+                some = list(pool.map(outcome_of, [kind] * count, numbers))
+                found += some
+                print(f"  {kind:20} {_row(some)}", flush=True)
+                for one in some:
+                    if line := _conspicuous(one):
+                        print(f"      {line}", flush=True)
+            print(f"  {'all':20} {_row(found)}", flush=True)
+            every += found
+    return every
+
+
+def _row(some: list[Outcome]) -> str:
+    levels = Counter(one.level for one in some)
+    wrong = [one for one in some if one.is_wrong and one.cause]
+    seen = [one for one in wrong if one.detectable]
+    right = sum(one.is_right_cause for one in seen)
+    false = sum(bool(one.named) and not one.is_right_cause for one in some)
+    counts = " ".join(f"{levels[level]:3}" for level in ("bad", "fair", "good", "none"))
+    believed = sum(one.is_wrong and one.level == "good" for one in some)
+    return (
+        f"{len(some):3}  {counts}   {len(wrong):3} {len(seen):3} {right:3}   {false:3}, "
+        f"wrong and called good {believed}"
+    )
+
+
+def _conspicuous(one: Outcome) -> str:
+    """Return a line on a survey that is not judged as it should be; empty where it is."""
+    false = bool(one.named) and not one.is_right_cause
+    missed = one.is_wrong and one.cause and one.detectable and not one.is_right_cause
+    bad = not one.cause and one.level in ("bad", "none")
+    if not (false or missed or bad or (one.is_wrong and one.level == "good")):
+        return ""
+    return f"{one.number}: {one.level}, {one.over_sigma:.1f} sigma, {one.named}, first {one.first}"
+
+
+if __name__ == "__main__":
+    study(sys.argv[2:] or GROUPS, int(sys.argv[1]) if len(sys.argv) > 1 else 1000)
