@@ -129,7 +129,7 @@ TRIES = (
     Try(
         "a held camera", "free = [] and no distortion, of a lens that distorts by 40 px",
         _held, 1,
-        ("most likely the camera, which is held", 'write free = ["c", "x0", "y0", "K1", "K2"'),
+        ("is held fixed at", 'Write free = ["c", "x0", "y0", "K1", "K2"'),
     ),
     Try(
         "a nominal sensor size", "sensor_mm = [6.45, 4.8] in place of 6.4 x 4.8, free = [\"c\"]",

@@ -25,8 +25,9 @@ def test_c_far_from_its_start_value_is_told(model: str) -> None:
     p = name.parameters.copy()
     p[: 1 if name.in_mm else 2] *= 0.22
     far = replace(estimate, cameras=(name.with_parameters(p),))
-    (line,) = far_principal_distances(survey, far)
-    assert line.startswith("camera synthetic: c was adjusted from 10 to 2.2 mm, by -78 %")
+    (one,) = far_principal_distances(survey, far)
+    assert one.kind == "c_far_from_given" and one.names("camera") == ("synthetic",)
+    assert [one.number(name) for name in ("given", "found", "change")] == pytest.approx([10, 2.2, -78])
     held = replace(estimate, cameras=(replace(far.cameras[0], free=name.free & False),))
     assert far_principal_distances(survey, held) == ()
 

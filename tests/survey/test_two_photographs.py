@@ -11,7 +11,7 @@ import pytest
 from sfm.errors import GeometryError
 from sfm.orientation.incremental.starting_pair import TWOFOLD
 from sfm.pipeline import run_survey
-from sfm.remarks.remark import of_kind
+from sfm.remarks.remark import kinds_of, of_kind
 from sfm.report.findings.findings import findings_of
 from sfm.result import SurveyResult
 from sfm.similarity import fit_similarity
@@ -71,7 +71,7 @@ def test_points_of_a_plane_and_the_circles_in_it(survey: Survey, measured: Measu
     )
     naming = replace(measured.naming, point=point)
     found = orient_survey(survey, replace(measured, network=network, naming=naming))
-    assert found.kind == "planar" and found.remarks == ()
+    assert found.kind == "planar" and kinds_of(found.remarks) == ("interior_held_of_pair",)
     assert error_mm(network.points, found.estimate.points) < 0.3
     true = circle_misfit(measured.photographs, naming, network, found.estimate)
     stretched = replace(
