@@ -9,10 +9,9 @@ import numpy as np
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.solve import adjust
 from sfm.network import ScaleBars
-from sfm.remarks.remark import of_kind
+from sfm.remarks.remark import Remark, of_kind
 from sfm.report.findings.findings import Findings, findings_of
-from sfm.report.findings.verdicts.evidence import Evidence
-from sfm.report.findings.verdicts.verdict_of_given import remarks_on_given
+from sfm.report.findings.given_remarks import given_remarks
 from sfm.result import SurveyResult
 from tests.synthetic import make_network, seed_of
 
@@ -43,12 +42,11 @@ def test_a_bar_that_nothing_checks_is_no_contradiction() -> None:
     bars = found.given.bars
     assert bars is not None
 
-    def remarks(r: float) -> list[str]:
+    def remarks(r: float) -> tuple[Remark, ...]:
         given = replace(
             found.given, bars=replace(bars, w=np.full(bars.w.shape, 5.7), r=np.full(bars.r.shape, r))
         )
-        evidence = Evidence(found.result, found.statistics, given, found.check, found.object_size)
-        return [one.text for one in remarks_on_given(evidence) if one.text.startswith("Scale bar")]
+        return of_kind(given_remarks(found.result, given, found.statistics, ()), "given_differs")
 
-    assert remarks(1e-4) == []
+    assert remarks(1e-4) == ()
     assert len(remarks(0.3)) == 1
