@@ -41,8 +41,7 @@ class LeftOutPoint:
 
     point: str  # name of the point
     image_points: int  # measured of it
-    reason: str  # one line: what was found and what was needed
-    few_rays: bool = False  # whether it was measured in fewer photographs than it needs
+    reason: Remark  # what was found and what was needed
 
 
 @dataclass(frozen=True)

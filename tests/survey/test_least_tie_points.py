@@ -41,5 +41,5 @@ def test_points_that_leave_with_a_photograph_are_told_so() -> None:
     network = replace(network, image_points=seen.select(keep))
     survey = replace(survey_of(network, truth), tie_points=TiePointSettings())
     found = solve_survey(survey, Correspondences(network, truth, np.full(len(network.points), 3)))
-    reasons = {one.reason for one in found.left_out}
-    assert reasons == {"some of its rays are of photographs that are not in the result, 3 are needed"}
+    reasons = {(one.reason.kind, one.reason.number("needed")) for one in found.left_out}
+    assert reasons == {("point_of_lost_photographs", 3)}

@@ -82,7 +82,7 @@ def test_what_is_left_out_is_counted_and_named_everywhere(tmp_path: Path) -> Non
     assert left and set(left) <= set(wrong)
     assert set(result.network.points) | set(left) == set(network.points)
     assert len(result.adjustment.rejected) + result.unused_image_points == len(network.image_points)
-    assert all("of its" in one.reason and "accepted" in one.reason for one in left.values())
+    assert all(one.reason.kind == "point_with_rays_rejected" for one in left.values())
     findings = findings_of(result)
     (lost,) = of_kind(result.remarks, "points_contradicted")
     assert set(lost.names("points")) == set(left) and lost.number("measured") == 80
@@ -98,7 +98,7 @@ def test_what_is_left_out_is_counted_and_named_everywhere(tmp_path: Path) -> Non
     counts = f"{result.unused_image_points} not in the result (of {len(left)} points)"
     for name in ("report.txt", "report.html"):
         page = (folder / name).read_text(encoding="utf-8")
-        assert "not in the result" in page and all(one.reason in page for one in left.values()), name
+        assert "not in the result" in page and all(one.reason.text in page for one in left.values()), name
     assert counts in (folder / "report.txt").read_text(encoding="utf-8")
 
 
@@ -116,7 +116,7 @@ def test_rays_parallel_within_their_precision_are_named() -> None:
     assert result.adjustment.converged and len(result.network.points) == 60
     assert {one.point for one in result.left_out} == {"w1", "w2", "w3"}
     for one in result.left_out:
-        assert "parallel within their precision" in one.reason or "do not meet in front" in one.reason
+        assert one.reason.kind in ("point_with_parallel_rays", "point_with_rays_apart")
 
 
 def test_carriers_of_a_datum_are_those_whose_rays_meet_clearly() -> None:

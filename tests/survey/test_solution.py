@@ -118,5 +118,5 @@ def test_a_point_with_one_ray_is_named(tmp_path: Path) -> None:
     table.write_text("\n".join(left) + "\n", encoding="utf-8")
     result = run_survey(read_survey(path))
     assert name not in result.adjustment.network.points
-    (few,) = of_kind(result.remarks, "points_with_few_rays")
+    (few,) = of_kind(result.remarks, "points_not_determined")
     assert few.names("points") == (name,) and few.severity == "note"

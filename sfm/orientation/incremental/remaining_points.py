@@ -8,11 +8,12 @@ import numpy as np
 
 from sfm.orientation.incremental.growth import Growth
 from sfm.orientation.intersection import intersect
+from sfm.remarks.remark import Remark, remark
 
 PARALLEL_SIGMAS = 4.0  # standard deviations of its angle by which two rays must differ from parallel ones
 
 
-def intersect_remaining(growth: Growth, *, contradicting: bool) -> tuple[tuple[str, str], ...]:
+def intersect_remaining(growth: Growth, *, contradicting: bool) -> tuple[tuple[str, Remark], ...]:
     """Intersect the points that are still missing; return (name, reason) of those that have no place.
 
     Nothing is oriented on them any more, so that a small angle does no harm: their standard deviations
@@ -48,18 +49,18 @@ def intersect_remaining(growth: Growth, *, contradicting: bool) -> tuple[tuple[s
     return _reasons(growth, rays, parallel)
 
 
-def _reasons(growth: Growth, rays: np.ndarray, parallel: np.ndarray) -> tuple[tuple[str, str], ...]:
+def _reasons(growth: Growth, rays: np.ndarray, parallel: np.ndarray) -> tuple[tuple[str, Remark], ...]:
     """Say why points have no coordinates, of whose rays so many are from oriented photographs, (n,)."""
     measured = growth.network.rays()
     out = []
     for j in np.flatnonzero(~growth.estimate.determined & (measured > 0)):
         if measured[j] < 2:
-            reason = "1 ray, 2 are needed"
+            reason = remark("point_with_few_rays", rays=1, needed=2)
         elif rays[j] < 2:
-            reason = f"{rays[j]} of its {measured[j]} rays are from oriented photographs, 2 are needed"
+            reason = remark("point_of_lost_photographs", measured=int(measured[j]), needed=2)
         elif parallel[j]:
-            reason = f"its {rays[j]} rays are parallel within their precision"
+            reason = remark("point_with_parallel_rays", rays=int(rays[j]))
         else:
-            reason = f"its {rays[j]} rays do not meet in front of their photographs within the tolerance"
+            reason = remark("point_with_rays_apart", rays=int(rays[j]))
         out.append((growth.network.points[j], reason))
     return tuple(out)

@@ -53,7 +53,7 @@ class Orientation:
 
     estimate: Estimate  # NaN for photographs and points that are not determined
     failures: tuple[tuple[str, str], ...]  # (name of the photograph, reason)
-    point_failures: tuple[tuple[str, str], ...]  # (name of the point, reason)
+    point_failures: tuple[tuple[str, Remark], ...]  # (name of the point, reason)
     pair: tuple[str, str] | None  # photographs it started from; None: from control or given values
     kind: str  # start: spatial | planar | control | given
     fits: BoolArray  # image points within the tolerance, (k,)

@@ -21,10 +21,11 @@ ROWS = (
         "Add a photograph of these points.",
     ),
     Kind(
-        "points_with_few_rays",
+        "points_not_determined",
         "note",
-        "{points:point} of {measured} {points:is|are} not in the result, with too few rays: {points}.",
-        "the point is measured in fewer photographs than it needs",
+        "{points:point} of {measured} {points:is|are} not in the result, as {points:its|their} rays do not "
+        "determine {points:it|them}: {points}.",
+        "the point is in fewer photographs than it needs, or its rays are almost parallel",
         "Add photographs of these points, if you need them.",
     ),
     Kind(
@@ -32,8 +33,43 @@ ROWS = (
         "warning",
         "{points:point} of {measured} {points:is|are} not in the result, as {points:its|their} rays do not "
         "meet: {points}.",
-        "the point moved, its name stands for two points, or its rays are almost parallel",
+        "the point moved, or its name stands for two points",
         "Look at the reasons in left_out.csv; measure the points again or rename them.",
+    ),
+    Kind(
+        "point_with_few_rays",
+        "note",
+        "It has {rays:ray}; {needed} are needed.",
+        "the point is in fewer photographs than it needs",
+        "Add photographs of the point, if you need it.",
+    ),
+    Kind(
+        "point_of_lost_photographs",
+        "note",
+        "Fewer than {needed} of its {measured} rays are from photographs in the result.",
+        "photographs that show it are not in the result",
+        "See the reasons of these photographs.",
+    ),
+    Kind(
+        "point_with_parallel_rays",
+        "note",
+        "Its {rays} rays are parallel within their precision.",
+        "the point is far away, or its photographs are from one place",
+        "Add photographs from other places.",
+    ),
+    Kind(
+        "point_with_rays_apart",
+        "warning",
+        "Its {rays} rays do not meet in front of their photographs.",
+        "the point moved, or its name stands for two points",
+        "Measure the point again or rename it.",
+    ),
+    Kind(
+        "point_with_rays_rejected",
+        "warning",
+        "{accepted} of its {measured} rays {accepted:was|were} accepted; {needed} are needed.",
+        "the point moved, its name stands for two points, or its rays are almost parallel",
+        "Measure the point again or rename it.",
     ),
     Kind(
         "points_doubtful",

@@ -138,7 +138,7 @@ def left_out_rows(findings: Findings) -> Iterable[Sequence[object]]:
     for failed in findings.result.failed:
         yield ("photograph", failed.image, None, failed.reason)
     for one in findings.result.left_out:
-        yield ("point", one.point, one.image_points, one.reason)
+        yield ("point", one.point, one.image_points, one.reason.text)
 
 
 def given_rows(given: Given) -> Iterable[Sequence[object]]:

@@ -77,7 +77,7 @@ def _figures(findings: Findings) -> dict[str, Any]:
             "not_in_result": result.unused_image_points,
         },
         "left_out": [
-            {"point": one.point, "image_points": one.image_points, "reason": one.reason}
+            {"point": one.point, "image_points": one.image_points, "reason": one.reason.as_dict()}
             for one in result.left_out
         ],
         "unknowns": adjustment.unknowns,

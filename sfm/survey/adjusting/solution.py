@@ -73,7 +73,7 @@ class Correspondences:
     eccentricity: Eccentricity | None = None  # what was corrected; None where nothing was
     no_circles: tuple[str, ...] = ()  # uncoded points left out: their outlines are not images of one circle
     remarks: tuple[Remark, ...] = ()
-    point_failures: tuple[tuple[str, str], ...] = ()  # points without approximate values, with the reason
+    point_failures: tuple[tuple[str, Remark], ...] = ()  # points without approximate values, with the reason
     given: bool = False  # whether the survey's own approximate values were what the orientation started from
     left_out: tuple[tuple[str, str], ...] = ()  # photographs of another object, with the reason
     suspected: tuple[str, ...] = ()  # photographs that could be matched with a camera of their own only

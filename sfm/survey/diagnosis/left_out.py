@@ -14,7 +14,7 @@ def left_out_points(
     whole: Network,
     in_result: tuple[str, ...],
     *,
-    reasons: tuple[tuple[str, str], ...],
+    reasons: tuple[tuple[str, Remark], ...],
     accepted_rays: IntArray,
     needed: IntArray,
 ) -> tuple[LeftOutPoint, ...]:
@@ -34,16 +34,19 @@ def left_out_points(
         if name in kept or not rays[j]:
             continue
         if rays[j] < needed[j]:
-            reason = f"{_rays(int(rays[j]))}, {needed[j]} are needed"
+            reason = remark("point_with_few_rays", rays=int(rays[j]), needed=int(needed[j]))
         elif name in told:
             reason = told[name]
         elif accepted_rays[j] >= needed[j]:
-            reason = f"some of its rays are of photographs that are not in the result, {needed[j]} are needed"
-        elif not accepted_rays[j]:
-            reason = f"none of its {rays[j]} rays was accepted: they do not meet, or are almost parallel"
+            reason = remark("point_of_lost_photographs", measured=int(rays[j]), needed=int(needed[j]))
         else:
-            reason = f"{accepted_rays[j]} of its {rays[j]} rays were accepted, {needed[j]} are needed"
-        out.append(LeftOutPoint(name, int(rays[j]), reason, few_rays=bool(rays[j] < needed[j])))
+            reason = remark(
+                "point_with_rays_rejected",
+                accepted=int(accepted_rays[j]),
+                measured=int(rays[j]),
+                needed=int(needed[j]),
+            )
+        out.append(LeftOutPoint(name, int(rays[j]), reason))
     return tuple(out)
 
 
@@ -54,10 +57,10 @@ def unused_image_points(whole: Network, images: BoolArray, points: BoolArray) ->
 
 
 def remarks_on_left_out(left_out: tuple[LeftOutPoint, ...], measured: int) -> tuple[Remark, ...]:
-    """Return which of so many measured points are not in the result: with few rays, or rejected."""
+    """Return which of so many measured points are not in the result: contradicted, or just not determined."""
     groups = {
-        "points_contradicted": [one.point for one in left_out if not one.few_rays],
-        "points_with_few_rays": [one.point for one in left_out if one.few_rays],
+        "points_contradicted": [one.point for one in left_out if one.reason.severity != "note"],
+        "points_not_determined": [one.point for one in left_out if one.reason.severity == "note"],
     }
     return tuple(remark(kind, points=names, measured=measured) for kind, names in groups.items() if names)
 
@@ -74,7 +77,3 @@ def datum_carriers(angles_deg: np.ndarray, least_deg: float) -> BoolArray | None
     """
     weak = angles_deg < least_deg
     return None if not weak.any() or 2 * weak.sum() > len(weak) else np.asarray(~weak)
-
-
-def _rays(count: int) -> str:
-    return f"{count} ray" if count == 1 else f"{count} rays"

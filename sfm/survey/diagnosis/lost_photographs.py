@@ -144,13 +144,14 @@ def _with_c(estimate: Estimate, factor: float) -> Estimate:
 
 def _not_connected(network: Network, oriented: BoolArray, group: Lost) -> Remark:
     """Return the remark on photographs that are not connected, with points to connect them."""
+    theirs = _often_seen(network, group.images)
     return remark(
         "not_connected",
         photographs=[network.images[i] for i in group.images],
         oriented=int(oriented.sum()),
         shared=[network.points[j] for j in group.shared] or None,
         needed=MIN_POINTS,
-        points=_often_seen(network, group.images) or None,
+        points=theirs if len(theirs) >= MIN_POINTS else None,
         others=_often_seen(network, np.flatnonzero(oriented)) or None,
     )
 

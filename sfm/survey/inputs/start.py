@@ -24,8 +24,6 @@ from sfm.survey.inputs.photograph_list import refuse_many
 from sfm.survey.inputs.survey import Survey
 
 MIN_RAYS = 2  # photographs that a point with a name needs
-OUTSIDE = "it is outside of its photograph"
-CONTRADICTING = "it stands there more than once, at places that contradict one another"
 
 
 def measurements_from_observations(survey: Survey) -> Measurements:
@@ -78,8 +76,11 @@ def measurements_from_observations(survey: Survey) -> Measurements:
         scale_bars=scale_bars(survey.scale_bars, points),
     )
     times = Counter(zip(image.tolist(), point.tolist(), strict=True)) if merged.dropped else Counter()
+    outside = (LeftOutPoint(name, 1, remark("image_points_outside", image_points=name)) for name in gross)
     contradicting = tuple(
-        LeftOutPoint(f"{points[j]} in {images[i]}", times[i, j], CONTRADICTING) for i, j in merged.dropped
+        LeftOutPoint(name, times[i, j], remark("image_points_contradicting", image_points=name))
+        for i, j in merged.dropped
+        for name in [f"{points[j]} in {images[i]}"]
     )
     told = (remark("image_points_outside", image_points=gross),) if gross else ()
     return Measurements(
@@ -89,7 +90,10 @@ def measurements_from_observations(survey: Survey) -> Measurements:
         np.full(len(points), MIN_RAYS),
         failed,
         remarks=(*merged.remarks(images, points), *told),
-        left_out=(*contradicting, *(LeftOutPoint(name, 1, OUTSIDE) for name in gross)),
+        left_out=(
+            *contradicting,
+            *(LeftOutPoint(name, 1, remark("image_points_outside", image_points=name)) for name in gross),
+        ),
     )
 
 
