@@ -76,7 +76,6 @@ def measurements_from_observations(survey: Survey) -> Measurements:
         scale_bars=scale_bars(survey.scale_bars, points),
     )
     times = Counter(zip(image.tolist(), point.tolist(), strict=True)) if merged.dropped else Counter()
-    outside = (LeftOutPoint(name, 1, remark("image_points_outside", image_points=name)) for name in gross)
     contradicting = tuple(
         LeftOutPoint(name, times[i, j], remark("image_points_contradicting", image_points=name))
         for i, j in merged.dropped
