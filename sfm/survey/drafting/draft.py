@@ -64,7 +64,7 @@ def draft_survey(
         )
     trial = try_targets([folder / name for name in used], store=store, progress=progress)
     name = as_plain(folder.resolve().name) or "survey"
-    left_out = (*unreadable, *grouping.left_out)
+    left_out = (*unreadable, *grouping.left_out, *trial.unreadable)
     return Draft(
         name,
         _text(name, folder, grouping, trial, left_out),

@@ -9,6 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
+from sfm.display import listed
+from sfm.errors import GeometryError, PhotographError
 from sfm.runtime.progress import SILENT, Progress
 from sfm.survey.inputs.settings import TargetSettings
 from sfm.survey.measuring.measured_store import MeasuredStore
@@ -19,6 +21,7 @@ from sfm.targets.codes.tags import DICTIONARIES, TagFamily, corner_name
 from sfm.targets.detect import Targets
 
 TRIED = 3  # photographs, spread over the folder
+MIN_READABLE = 2
 MIN_REPEATED = 4  # codes that two photographs must have in common; four orient a photograph
 MIN_PROMISING = 3  # codes in the first photograph for which a family is tried on the others
 BLURRED_PX = 2.5  # standard deviation of the edges of targets
@@ -36,6 +39,7 @@ class TargetTrial:
     circles: float  # median number of circular targets in a photograph
     blur_px: float  # median standard deviation of their edges, px; NaN without
     photographs: tuple[str, ...]  # that were tried
+    unreadable: tuple[tuple[str, str], ...] = ()  # photographs that could not be decoded, and why
 
 
 def try_targets(
@@ -47,14 +51,14 @@ def try_targets(
     common: a wrong family reads a code now and then, but not the same one twice.
 
     Args:
-        paths: readable photographs in their order.
+        paths: photographs in their order; those that cannot be decoded are passed over.
         store: keeps what is measured, so that the survey need not measure it again.
         progress: told of every photograph and family.
 
     Raises:
-        PhotographError: one of those that are tried cannot be read.
+        GeometryError: fewer than two of them can be decoded.
     """
-    tried = [paths[k] for k in sorted({round(i * (len(paths) - 1) / (TRIED - 1)) for i in range(TRIED)})]
+    tried, unreadable = _readable(paths, store)
     progress.stage("trial", 2 * len(RINGS))
     rings = {}
     for family in RINGS:
@@ -89,7 +93,31 @@ def try_targets(
         float(np.median([np.isfinite(one.axes_covariance[:, 0, 0]).sum() for one in measured])),
         _blur(measured),
         tuple(path.name for path in tried),
+        unreadable,
     )
+
+
+def _readable(
+    paths: Sequence[Path], store: MeasuredStore | None
+) -> tuple[list[Path], tuple[tuple[str, str], ...]]:
+    """Return photographs that can be decoded, spread over the folder, and which cannot and why."""
+    tried: set[int] = set()
+    refused: dict[int, tuple[str, str]] = {}
+    for place in (round(i * (len(paths) - 1) / (TRIED - 1)) for i in range(TRIED)):
+        for k in sorted(range(len(paths)), key=lambda k: abs(k - place)):
+            if k in tried or k in refused:
+                continue
+            try:
+                _measure(paths[k], next(iter(RINGS)), store)
+            except PhotographError as error:
+                refused[k] = paths[k].name, str(error).removeprefix(f"{paths[k].name}: ")
+                continue
+            tried.add(k)
+            break
+    if len(tried) < MIN_READABLE:
+        why = listed((f"{name}: {reason}" for name, reason in refused.values()), separator="; ")
+        raise GeometryError(f"{len(tried)} readable photographs, at least {MIN_READABLE} are needed ({why})")
+    return [paths[k] for k in sorted(tried)], tuple(refused.values())
 
 
 def _measure(path: Path, family: str, store: MeasuredStore | None) -> Targets:

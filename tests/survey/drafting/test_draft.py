@@ -15,6 +15,7 @@ from PIL.TiffImagePlugin import IFDRational
 
 from adapters.colmap.sensor_widths import sensor_width_mm
 from sfm import cli
+from sfm.errors import GeometryError
 from sfm.survey.drafting.draft import draft_survey
 from sfm.survey.inputs.survey_file import read_survey_file
 from tests.surveys import write_photograph_survey
@@ -126,6 +127,19 @@ def test_a_changed_focal_length_and_hostile_names_make_a_file_that_reads(tmp_pat
     assert [len(one.images or ()) for one in described.cameras] == [4, 2]
     assert [one.c_mm for one in described.cameras] == [50.0, 85.0]
     assert described.tie_points is not None, "there is no target"
+
+
+def test_a_truncated_photograph_is_passed_over_by_name(tmp_path: Path) -> None:
+    for k in range(4):
+        Image.effect_noise((120, 80), 60).save(tmp_path / f"{k}.jpg")
+    for broken in ("0.jpg", "3.jpg"):
+        file = tmp_path / broken
+        file.write_bytes(file.read_bytes()[:-900])
+    draft = draft_survey(tmp_path)
+    assert [name for name, _ in draft.left_out] == ["0.jpg", "3.jpg"]
+    (tmp_path / "1.jpg").write_bytes(file.read_bytes())
+    with pytest.raises(GeometryError, match="1 readable photographs, at least 2 are needed"):
+        draft_survey(tmp_path)
 
 
 def test_colmap_knows_the_width_of_a_sensor() -> None:
