@@ -15,11 +15,13 @@ from pathlib import Path
 
 from sfm.errors import GeometryError
 from sfm.kernels.threads import own_threads
+from sfm.orientation.incremental.sequence import Orientation
 from sfm.result import SurveyResult
 from sfm.runtime.progress import SILENT, Progress, StageClock
-from sfm.survey.adjusting.solution import solve_survey
+from sfm.survey.adjusting.solution import Correspondences, Solution, solve_survey
 from sfm.survey.assembly import assemble_result
 from sfm.survey.correspondences import find_correspondences
+from sfm.survey.inputs.checks.copies import find_copies, without_copies
 from sfm.survey.inputs.checks.incomplete_cameras import refuse_incomplete_cameras
 from sfm.survey.inputs.measurements import Measurements
 from sfm.survey.inputs.photograph_list import find_photographs
@@ -58,14 +60,26 @@ def run_survey(
     clock = StageClock(progress)
     with _naming(survey), own_threads(jobs):
         survey, measured = _measure(survey, images_dir, jobs, store, clock)
-        with clock.stage("orientation"):
-            start = orient_survey(survey, measured)
-        with clock.stage("matching"):
-            matched = find_correspondences(survey, measured, start, jobs=jobs)
-        with clock.stage("adjustment"):
-            solution = solve_survey(survey, matched)
+        start, matched, solution = _solve(survey, measured, jobs, clock)
+        copies = find_copies(solution.adjustment)
+        if copies:
+            measured = without_copies(measured, copies)
+            start, matched, solution = _solve(survey, measured, jobs, clock)
         compared = compare_solution(solution, others, clock, files=measured.files)
         return assemble_result(survey, measured, start, matched, solution, compared, clock)
+
+
+def _solve(
+    survey: Survey, measured: Measurements, jobs: int, clock: StageClock
+) -> tuple[Orientation, Correspondences, Solution]:
+    """Return what orientation, matching and adjustment make of the image points."""
+    with clock.stage("orientation"):
+        start = orient_survey(survey, measured)
+    with clock.stage("matching"):
+        matched = find_correspondences(survey, measured, start, jobs=jobs)
+    with clock.stage("adjustment"):
+        solution = solve_survey(survey, matched)
+    return start, matched, solution
 
 
 def _measure(

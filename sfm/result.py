@@ -33,6 +33,7 @@ class FailedImage:
 
     image: str  # name of the photograph
     reason: str  # one line: what was found and what was needed
+    copy_of: str = ""  # photograph that it is a copy of, and which counts for both
 
 
 @dataclass(frozen=True)

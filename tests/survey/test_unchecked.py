@@ -109,7 +109,7 @@ def test_a_copy_among_the_image_points_is_no_photograph() -> None:
     assert [(one.image, one.reason) for one in result.failed] == [
         ("again", "its image points are those of image 4")
     ]
-    assert result.adjustment.redundancy == plain.adjustment.redundancy and result.images_total == 9
+    assert result.adjustment.redundancy == plain.adjustment.redundancy and result.images_total == 8
 
 
 def test_another_exposure_from_the_same_place_is_no_copy() -> None:

@@ -6,6 +6,14 @@ from sfm.remarks.kind import Kind
 
 ROWS = (
     Kind(
+        "copies",
+        "note",
+        "{copies:photograph} {copies:is a copy|are copies} of another and {copies:counts|count} once with it: "
+        "{copies}.",
+        "the same photograph was copied or saved again; it is no second observation",
+        "Remove the copies.",
+    ),
+    Kind(
         "image_points_outside",
         "note",
         "{image_points:image point} {image_points:is|are} outside of {image_points:its photograph|their "

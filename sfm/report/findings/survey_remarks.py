@@ -60,12 +60,14 @@ def adjustment_remarks(a: Adjustment) -> tuple[Remark, ...]:
 
 
 def photograph_remarks(result: SurveyResult) -> tuple[Remark, ...]:
-    """Return how many photographs are not in the result."""
+    """Return how many photographs are not in the result, and which are copies of others."""
     oriented, total = len(result.adjustment.network.images), result.images_total
     missing = total - oriented
+    copies = [one.image for one in result.failed if one.copy_of]
+    found = (remark("copies", copies=copies),) if copies else ()
     if not missing:
-        return ()
-    return (remark("photographs_missing", missing=missing, total=total, share=missing / total),)
+        return found
+    return (remark("photographs_missing", missing=missing, total=total, share=missing / total), *found)
 
 
 def other_solution_remarks(result: SurveyResult) -> tuple[Remark, ...]:

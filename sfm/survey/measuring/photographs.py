@@ -56,7 +56,8 @@ def each_photograph(
         if first == k:
             originals.append(k)
         else:
-            failed[k] = FailedImage(name, f"identical to {photographs.names[first]}")
+            original = photographs.names[first]
+            failed[k] = FailedImage(name, f"identical to {original}", copy_of=original)
             progress.advance(name)
 
     def work_on(k: int) -> T:
@@ -81,7 +82,8 @@ def each_photograph(
         shown = b"" if picture is None else picture(found[k])
         first = pictures.setdefault(shown, k) if shown else k
         if first != k:
-            failed[k] = FailedImage(photographs.names[k], f"the same picture as {photographs.names[first]}")
+            original = photographs.names[first]
+            failed[k] = FailedImage(photographs.names[k], f"the same picture as {original}", copy_of=original)
             del found[k]
     in_order = tuple(failed[k] for k in sorted(failed))
     if len(found) < MIN_PHOTOGRAPHS:

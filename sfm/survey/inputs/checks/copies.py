@@ -1,0 +1,115 @@
+"""Photographs whose errors are those of another: copies that were saved again or compressed.
+
+A copy is no second observation: it would only make the result look more precise than it is. One whose
+compression makes errors larger than those of its original has errors of its own, and is one. Two photographs
+from one place have the residuals r_i and r_j and differ by d = r_i - r_j. With independent errors the square
+sum of d is that of both residuals together, with the same errors it is 0:
+
+    |d|^2 / (|r_i|^2 + |r_j|^2) = 1 - rho.
+
+Copies by their bytes and by identical image points are found before, see `sfm.survey.measuring.photographs`
+and `same_photographs`.
+
+Source: Koch (1999), Parameter Estimation and Hypothesis Testing in Linear Models, sec. 2.7 (F distribution).
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from sfm.adjustment.result import Adjustment
+from sfm.conventions import IntArray
+from sfm.distributions import f_sf
+from sfm.network import Estimate, rows_of
+from sfm.reduced_network import reduce_network
+from sfm.result import FailedImage
+from sfm.survey.inputs.measurements import Measurements
+
+ALPHA = 0.001  # probability of taking two exposures for one, of all pairs together
+MIN_CORRELATION = 0.7  # of the errors; 0.99 of real photographs saved as JPEG of quality 40
+MIN_COMMON = 4  # image points
+SAME_PLACE = 1e-3  # of the distance, and rad: two photographs that are farther apart are no copies
+
+
+def find_copies(adjustment: Adjustment) -> dict[str, tuple[str, float]]:
+    """Return for each photograph with the errors of an earlier one which that is, and their correlation.
+
+    Args:
+        adjustment: of all photographs.
+    """
+    network, estimate = adjustment.network, adjustment.estimate
+    seen = network.image_points
+    middle = np.median(estimate.points, axis=0)
+    distance = np.linalg.norm(estimate.position - middle, axis=1)
+    place = np.hstack(
+        [estimate.position / max(float(np.median(distance)), 1e-300), estimate.rotation.reshape(-1, 9)]
+    )
+    pairs = sorted(cKDTree(place).query_pairs(SAME_PLACE))
+    of_image = rows_of(seen.image, len(network.images))
+    copies: dict[str, tuple[str, float]] = {}
+    for i, j in pairs:
+        names = network.images[i], network.images[j]
+        if names[0] in copies or names[1] in copies:
+            continue
+        rho, p = _correlation(adjustment, of_image[i], of_image[j])
+        if rho > MIN_CORRELATION and p < ALPHA / len(pairs):
+            copies[names[1]] = names[0], rho
+    return copies
+
+
+def _correlation(adjustment: Adjustment, rows_i: IntArray, rows_j: IntArray) -> tuple[float, float]:
+    """Return the correlation of the errors of two photographs, and its probability if there is none."""
+    seen = adjustment.network.image_points
+    used_i, used_j = (rows[~adjustment.rejected[rows]] for rows in (rows_i, rows_j))
+    _, a, b = np.intersect1d(seen.point[used_i], seen.point[used_j], return_indices=True)
+    if len(a) < MIN_COMMON:
+        return 0.0, 1.0
+    i, j = used_i[a], used_j[b]
+    together = (adjustment.residuals[i] ** 2).sum() + (adjustment.residuals[j] ** 2).sum()
+    if not together > 0:
+        return 0.0, 1.0
+    ratio = float(((seen.xy[i] - seen.xy[j]) ** 2).sum() / together)
+    return 1 - ratio, float(1 - f_sf(ratio, 2 * len(a), 2 * len(a)))
+
+
+def without_copies(measured: Measurements, copies: dict[str, tuple[str, float]]) -> Measurements:
+    """Return measurements without the copies, which are named among the photographs that failed.
+
+    Args:
+        measured: all photographs.
+        copies: by `find_copies`.
+    """
+    network = measured.network
+    keep = np.array([name not in copies for name in network.images], dtype=bool)
+    every = np.ones(len(network.image_points), dtype=bool)
+    points = np.ones(len(network.points), dtype=bool)
+    empty = np.full((len(keep), 3), np.nan), np.full((len(keep), 3, 3), np.nan)
+    start = Estimate(measured.cameras, *empty, np.full((len(points), 3), np.nan))
+    network, _ = reduce_network(network, start, keep, points, every)
+    photographs, naming = measured.photographs, measured.naming
+    kept = [k for k, own in enumerate(keep) if own]
+    if photographs is not None:
+        photographs = replace(
+            photographs,
+            names=tuple(photographs.names[k] for k in kept),
+            paths=tuple(photographs.paths[k] for k in kept),
+            camera=photographs.camera[kept],
+            targets=tuple(photographs.targets[k] for k in kept),
+            stored=tuple(photographs.stored[k] for k in kept) if photographs.stored else (),
+        )
+    if naming is not None:
+        naming = replace(naming, point=tuple(naming.point[k] for k in kept))
+    failed = tuple(
+        FailedImage(name, f"its errors are those of {first}: it is a copy", copy_of=first)
+        for name, (first, _) in copies.items()
+    )
+    return replace(
+        measured,
+        network=network,
+        photographs=photographs,
+        naming=naming,
+        failed=(*measured.failed, *failed),
+    )
