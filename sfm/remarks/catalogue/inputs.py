@@ -8,7 +8,7 @@ ROWS = (
     Kind(
         "copies",
         "note",
-        "{copies:photograph} {copies:is a copy|are copies} of another and {copies:counts|count} once with it: "
+        "{copies:photograph} {copies:is a copy|are copies} of another, and {copies:counts|count} once: "
         "{copies}.",
         "the same photograph was copied or saved again; it is no second observation",
         "Remove the copies.",
