@@ -201,7 +201,7 @@ def outcome_of(case: str, network: Network, given: Given) -> Outcome:
     parts: dict[str, object] = {"datum": {"kind": given.datum}}
     if given.ends:
         parts["scale_bars"] = tuple(
-            ScaleBar(str(i + 1), str(j + 1), float(length), SIGMA)
+            ScaleBar(str(i + 1), str(j + 1), float(length), max(SIGMA, 1e-4 * float(length)))
             for (i, j), length in zip(given.ends, given.lengths, strict=True)
         )
     if given.names:

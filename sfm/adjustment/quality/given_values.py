@@ -482,8 +482,9 @@ def judge_points(
         return found
     other = _placed(points.mirrored(), level, None, estimated)
     if other is not None and (other.judgement.fits or other.judgement.wrong):
-        as_given = found.judgement.statistic
-        if other.model.misfit(other.judgement.wrong)[0] + MARGIN < as_given:
+        out, as_given = other.judgement.wrong, found.judgement.statistic
+        better = other.model.misfit(out)[0] + MARGIN < found.model.misfit(out)[0]
+        if better and found.model.probability(out) < level:
             return replace(other, unmirrored=as_given)
     return found
 

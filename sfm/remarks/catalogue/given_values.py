@@ -67,10 +67,10 @@ ROWS = (
     Kind(
         "given_not_exact",
         "warning",
-        "The {what} without standard deviations differ by {sigma} (one coordinate) from the network of the "
-        "image points: the adjustment used this standard deviation.",
+        "The {what} held fixed differ by {sigma} in a coordinate from the network of the image points; the "
+        "standard deviations of the result do not contain this.",
         "coordinates of a drawing or a print, or points that moved",
-        "State standard deviations of these coordinates; 0 holds them fixed.",
+        "State the standard deviations of these coordinates.",
     ),
     Kind(
         "given_differs",

@@ -251,7 +251,13 @@ def _judged(start: _Prepared, free: _Free | None) -> tuple[Task, JudgedGiven]:
             exterior=network.exterior,
         )
     adjustment = None if free is None else free.settled.adjustment
-    given = judge_given(network, adjustment, task.datum, unit=task.survey.unit)
+    given = judge_given(
+        network,
+        adjustment,
+        task.datum,
+        unit=task.survey.unit,
+        rescale=task.survey.adjust.weights == "components",
+    )
     survey, needed = task.survey, task.needed.copy()
     if given.datum.kind == "control":
         needed[given.network.control.complete.point] = 1

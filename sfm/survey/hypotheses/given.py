@@ -77,7 +77,9 @@ def without_given(network: Network) -> Network:
     return replace(network, control=ObjectPoints(), scale_bars=ScaleBars(), exterior=ExteriorObservations())
 
 
-def judge_given(network: Network, free: Adjustment | None, datum: Datum, *, unit: str) -> JudgedGiven:
+def judge_given(
+    network: Network, free: Adjustment | None, datum: Datum, *, unit: str, rescale: bool = True
+) -> JudgedGiven:
     """Return which given values may take part in an adjustment, and remarks on the others.
 
     Args:
@@ -85,6 +87,7 @@ def judge_given(network: Network, free: Adjustment | None, datum: Datum, *, unit
         free: adjustment of its image points alone, or of a part of them, in a free datum; None if none.
         datum: that was asked for.
         unit: object unit.
+        rescale: whether standard deviations that are too small may be replaced; fixed values stay fixed.
     """
     if not (len(network.scale_bars) or len(network.control) or len(network.exterior)):
         return JudgedGiven(network, datum)
@@ -94,7 +97,7 @@ def judge_given(network: Network, free: Adjustment | None, datum: Datum, *, unit
         what = [name for name, some in kinds if len(some)]
         remarks = (remark("given_not_judged", what=what),) if what else ()
         return JudgedGiven(network, datum, remarks)
-    return _Judge(network, places, datum, unit).judged()
+    return _Judge(network, places, datum, unit, rescale).judged()
 
 
 def _places(network: Network, free: Adjustment, datum: Datum) -> _Places | None:
@@ -156,8 +159,9 @@ class _Group:
 class _Judge:
     """The given values of one network."""
 
-    def __init__(self, network: Network, places: _Places, datum: Datum, unit: str) -> None:
+    def __init__(self, network: Network, places: _Places, datum: Datum, unit: str, rescale: bool) -> None:
         self.network, self.places, self.datum, self.unit = network, places, datum, unit
+        self.rescale = rescale
         self.remarks: list[Remark] = []
         self.tests: list[GivenTest] = []
         tests = (len(network.scale_bars) > 0, len(network.control) > 0, len(network.exterior) > 0)
@@ -262,7 +266,8 @@ class _Judge:
         found = placed.judgement
         self.tests.append(GivenTest(what, found.statistic, found.dof, found.probability))
         if found.factor != 1.0:
-            points = replace(points, stated=_scaled(points.stated, found.factor))
+            stated = points.stated if points.stated.any() else np.broadcast_to(np.eye(3), (len(rows), 3, 3))
+            points = replace(points, stated=found.factor**2 * stated)
             fitting = judge_points(points, self.level, start=start)
             placed = placed if fitting is None else replace(fitting, judgement=found)
         group = _Group(what, rows, names, points, index, placed)
@@ -322,16 +327,21 @@ class _Judge:
     def _confirmed(self, group: _Group, covariance: FloatArray) -> FloatArray:
         """Return the covariance of given points with which they fit, and remark if it is another one."""
         found, model = group.placed.judgement, group.placed.model
+        fixed = not np.where(np.isfinite(covariance), covariance, 0.0).any()
         if not (found.doubtful or found.factor != 1.0) or model.estimated:
             return covariance
         factor = model.factor()[0] if found.doubtful else found.factor
         if not found.doubtful:
             self.remarks.append(
-                remark("given_sigmas", what=group.what, factor=factor, used=factor)
-                if np.isfinite(covariance).any() and covariance[np.isfinite(covariance)].any()
-                else remark("given_not_exact", what=group.what, sigma=(factor, self.unit))
+                remark("given_not_exact", what=group.what, sigma=(factor, self.unit))
+                if fixed
+                else remark(
+                    "given_sigmas", what=group.what, factor=factor, used=factor if self.rescale else None
+                )
             )
-        return np.where(np.isfinite(covariance), _scaled(covariance, factor), covariance)
+        if fixed or not self.rescale:
+            return covariance
+        return np.where(np.isfinite(covariance), factor**2 * covariance, covariance)
 
     def _scales(self, control: _Group | None, centres: _Group | None) -> None:
         """Judge the scales of bars, control and projection centres against one another."""
@@ -426,13 +436,6 @@ class _Judge:
             self.network,
             scale_bars=ScaleBars(bars.start[keep], bars.end[keep], bars.length[keep], bars.sigma[keep]),
         )
-
-
-def _scaled(covariance: FloatArray, factor: float) -> FloatArray:
-    """Return covariances (n, 3, 3) of standard deviations times a factor, itself that of fixed ones."""
-    if np.where(np.isfinite(covariance), covariance, 0.0).any():
-        return np.asarray(factor**2 * covariance)
-    return np.asarray(factor**2 * np.eye(3) + covariance)
 
 
 def _mean_scale(model: GivenModel, kept: list[int]) -> float:

@@ -1,0 +1,203 @@
+"""Given values against a free network: what is wrong of them is identified, or all are named."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from sfm.adjustment.quality import given_values
+from sfm.adjustment.quality.given_values import (
+    LEVEL,
+    GivenModel,
+    GivenPoints,
+    judge_points,
+    judge_values,
+    scale_model,
+    scale_of_length,
+    scale_of_points,
+)
+from sfm.conventions import FloatArray, rotation_from_vector
+from sfm.similarity import Similarity
+from tests.synthetic import seed_of
+
+SIGMA = 1e-3
+FRAME = Similarity(0.4, rotation_from_vector(np.array([0.3, -0.2, 1.1])), np.array([5.0, -2.0, 1.0]))
+
+
+def bars(*errors: float, sigma: float = SIGMA, network: float = 1e-5) -> GivenModel:
+    """Return the model of bars of unit length with these errors."""
+    n = len(errors)
+    stated, free = sigma**2 * np.eye(n), network**2 * np.eye(n)
+    return GivenModel(np.array(errors), free, stated, np.ones((n, 1)), np.arange(n), 500)
+
+
+def points(n: int, name: str, *, noise: float = SIGMA, network: float = 2e-4) -> GivenPoints:
+    """Return points of a cube given with noise, and of a free network in another frame."""
+    rng = seed_of(name)
+    X = rng.uniform(-1, 1, (n, 3))
+    given = X + noise * rng.standard_normal((n, 3))
+    free = FRAME.apply(X) + 0.4 * network * rng.standard_normal((n, 3))
+    stated = np.tile(SIGMA**2 * np.eye(3), (n, 1, 1))
+    return GivenPoints(given, stated, free, (0.4 * network) ** 2 * np.eye(3 * n), 500)
+
+
+def moved(one: GivenPoints, k: int, by: FloatArray) -> GivenPoints:
+    given = one.given.copy()
+    given[k] += by
+    return replace(one, given=given)
+
+
+def test_right_values_fit_at_the_level() -> None:
+    rng = seed_of("level of bars")
+    low = [
+        judge_values(bars(*(SIGMA * rng.standard_normal(5))), LEVEL).probability < 0.05 for _ in range(400)
+    ]
+    assert 2 <= sum(low) <= 36  # 20 expected, fewer as three tests share the level
+    found = [judge_points(points(6, f"level {k}"), 0.05) for k in range(100)]
+    assert sum(not one.judgement.fits for one in found if one is not None) <= 12
+
+
+@pytest.mark.parametrize("error", [6 * SIGMA, 0.01, 1.0, -2.0])
+def test_of_two_neither_is_believed(error: float) -> None:
+    assert judge_values(bars(0.0, error), LEVEL, may_scale=False).doubtful == (0, 1)
+
+
+@pytest.mark.parametrize("error", [9 * SIGMA, 0.1, 7.0])
+def test_of_three_the_wrong_one_is_identified(error: float) -> None:
+    assert judge_values(bars(0.0, error, SIGMA), LEVEL, may_scale=False).wrong == (1,)
+
+
+def test_two_of_five_are_identified_and_two_against_two_are_not() -> None:
+    assert judge_values(bars(0.0, 0.3, 0.0, -0.2, SIGMA), LEVEL, may_scale=False).wrong == (1, 3)
+    assert judge_values(bars(0.0, 0.0, 0.3, 0.3), LEVEL, may_scale=False).doubtful == (0, 1, 2, 3)
+
+
+def test_the_margin_decides_whether_one_is_told_from_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Removing either of two of three heals; chi-square differs by 8.2, and 13.8 are needed."""
+    model = bars(-2.2 * SIGMA, 0.0, 4.6 * SIGMA)
+    fall = sorted(model.misfit((k,))[0] for k in range(3))
+    assert fall[1] - fall[0] == pytest.approx(8.2, abs=0.3)
+    level = 0.02
+    assert judge_values(model, level, may_scale=False).doubtful == (0, 2)
+    monkeypatch.setattr(given_values, "MARGIN", given_values.MARGIN / 2)
+    assert judge_values(model, level, may_scale=False).wrong == (2,)
+
+
+def test_the_level_and_the_noncentrality_are_those_of_baarda() -> None:
+    from sfm.distributions import normal_ppf
+
+    assert LEVEL == 0.001 and pytest.approx(2 * np.log(1 / LEVEL)) == given_values.MARGIN
+    delta = normal_ppf(1 - LEVEL / 2) + normal_ppf(0.8)
+    assert pytest.approx(delta, abs=0.01) == given_values.NONCENTRALITY
+
+
+def test_a_weak_value_does_not_check_a_strong_one() -> None:
+    model = replace(bars(0.0, 0.0), stated=np.diag([SIGMA**2, (10 * SIGMA) ** 2]))
+    reach = model.external()
+    assert reach[0] == pytest.approx(4.13 * 10, rel=0.02)  # sqrt((1 - r) / r) with r = 1 / 101
+    assert reach[1] == pytest.approx(0.413, rel=0.02)
+    assert np.isinf(bars(0.0).external()).all()
+
+
+@pytest.mark.parametrize("by", [12 * SIGMA, 0.1, 100.0])
+def test_one_wrong_point_is_identified(by: float) -> None:
+    one = moved(points(6, "one wrong"), 2, by * np.array([0.0, 0.6, 0.8]))
+    found = judge_points(one, LEVEL)
+    assert found is not None and found.judgement.wrong == (2,)
+    placed = found.placing.apply(FRAME.apply(np.eye(3)))
+    np.testing.assert_allclose(placed, np.eye(3), atol=5e-3)
+
+
+def test_of_three_points_none_is_identified() -> None:
+    found = judge_points(moved(points(3, "three"), 0, np.array([0.05, 0.05, 0.0])), LEVEL)
+    assert found is not None and found.judgement.doubtful == (0, 1, 2)
+
+
+def test_exchanged_names_are_identified() -> None:
+    one = points(5, "exchanged")
+    given = one.given[[0, 3, 2, 1, 4]]
+    found = judge_points(replace(one, given=given), LEVEL)
+    assert found is not None and found.judgement.exchanged == (1, 3)
+
+
+@pytest.mark.parametrize("axes", [(1, 0, 2), (0, 2, 1), (2, 1, 0)])
+def test_left_handed_points_are_mirrored(axes: tuple[int, int, int]) -> None:
+    one = points(6, "mirrored")
+    found = judge_points(replace(one, given=one.given[:, list(axes)]), LEVEL)
+    assert found is not None and found.mirrored and found.judgement.fits
+    turned = judge_points(replace(one, given=one.given[:, [1, 2, 0]]), LEVEL)
+    assert turned is not None and not turned.mirrored and turned.judgement.fits
+
+
+def test_one_wrong_point_of_four_is_not_a_mirror() -> None:
+    for k in range(20):
+        one = moved(points(4, f"four {k}"), 1, 50 * SIGMA * np.eye(3)[k % 3])
+        found = judge_points(one, LEVEL)
+        assert found is not None and not found.mirrored and not found.judgement.fits
+
+
+@pytest.mark.parametrize("factor", [3.0, 10.0])
+def test_standard_deviations_that_are_too_small_are_named(factor: float) -> None:
+    one = points(20, f"too small {factor}", noise=factor * SIGMA)
+    found = judge_points(one, LEVEL)
+    assert found is not None and found.judgement.wrong == ()
+    assert found.judgement.factor == pytest.approx(factor, rel=0.3)
+    fixed = judge_points(replace(one, stated=0 * one.stated), LEVEL)
+    assert fixed is not None and fixed.judgement.factor == pytest.approx(factor * SIGMA, rel=0.3)
+
+
+def test_a_wrong_point_without_stated_standard_deviations_is_identified() -> None:
+    one = points(8, "unstated")
+    unstated = replace(one, stated=0 * one.stated)
+    right = judge_points(unstated, LEVEL, estimated=True)
+    wrong = judge_points(moved(unstated, 4, np.array([0.0, 0.0, 0.05])), LEVEL, estimated=True)
+    assert right is not None and right.judgement.fits
+    assert wrong is not None and wrong.judgement.wrong == (4,)
+
+
+def test_single_heights_are_judged_too() -> None:
+    one = points(7, "heights")
+    given = one.given.copy()
+    given[4:, :2] = np.nan
+    right = judge_points(replace(one, given=given), LEVEL)
+    given[5, 2] += 0.05
+    wrong = judge_points(replace(one, given=given), LEVEL)
+    assert right is not None and right.judgement.fits and right.judgement.dof == 8
+    assert wrong is not None and wrong.judgement.wrong == (5,)
+
+
+def test_the_scale_of_points_and_of_a_bar_agree_within_their_covariance() -> None:
+    squares = []
+    for k in range(60):
+        one = points(5, f"scale {k}")
+        found = judge_points(one, LEVEL)
+        assert found is not None
+        X = FRAME.inverse().apply(one.free)
+        length = float(np.linalg.norm(X[1] - X[0]) + SIGMA * seed_of(f"bar {k}").standard_normal())
+        at = np.arange(5)
+        scales = (
+            scale_of_length(length, SIGMA, one.free, 0, 1),
+            scale_of_points(one, found, (), at, 5),
+        )
+        assert scales[1].log == pytest.approx(np.log(1 / 0.4), abs=5e-3)
+        squares.append(scale_model(scales, one.joint, one.redundancy).misfit()[0])
+    assert 0.5 < np.mean(squares) < 1.6  # chi-square of one
+
+
+def test_derivatives_of_scales_by_the_free_network() -> None:
+    one = points(5, "derivatives")
+    found = judge_points(one, LEVEL)
+    assert found is not None
+    rows = scale_of_points(one, found, (), np.arange(5), 5).rows
+    length = scale_of_length(1.0, SIGMA, one.free, 0, 1)
+    for k in range(15):
+        free = one.free.copy()
+        free.flat[k] += 1e-6
+        moved_found = judge_points(replace(one, free=free), LEVEL)
+        assert moved_found is not None
+        change = np.log(moved_found.placing.scale / found.placing.scale) / 1e-6
+        assert change == pytest.approx(rows[k], abs=2e-3 * np.abs(rows).max())
+        other = scale_of_length(1.0, SIGMA, free, 0, 1)
+        assert (other.log - length.log) / 1e-6 == pytest.approx(length.rows[k], abs=1e-4)
