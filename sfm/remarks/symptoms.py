@@ -1,0 +1,67 @@
+"""The tables of remarks in docs/symptoms.md, written from the catalogue.
+
+`python -m sfm.remarks.symptoms docs/symptoms.md` writes them between their marks.
+"""
+
+from __future__ import annotations
+
+import re
+import sys
+from pathlib import Path
+
+from sfm.remarks.catalogue import SUBJECTS
+from sfm.remarks.kind import FIELD, Grade, Kind
+
+BEGIN, END = "<!-- remarks: written by sfm.remarks.symptoms -->", "<!-- end of remarks -->"
+VARIES = "…"
+
+
+def remark_tables() -> str:
+    """Return a table of remarks for each subject of the catalogue, in Markdown."""
+    parts = []
+    for subject, rows in SUBJECTS.items():
+        parts += [f"### {subject}", "", "| remark | severity | cause | remedy |", "|---|---|---|---|"]
+        parts += [_row(kind) for kind in rows]
+        parts.append("")
+    return "\n".join(parts)
+
+
+def with_tables(page: str) -> str:
+    """Return a page with the tables between the marks."""
+    head, _, rest = page.partition(BEGIN)
+    return f"{head}{BEGIN}\n\n{remark_tables()}\n{END}{rest.partition(END)[2]}"
+
+
+def _row(kind: Kind) -> str:
+    cells = (f"{_pattern(kind.sentence)} `{kind.name}`", _severity(kind), kind.cause, kind.remedy)
+    return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
+
+
+def _pattern(sentence: str) -> str:
+    """Return a sentence with … for what varies, the plural for what depends on a number."""
+
+    def field(found: re.Match[str]) -> str:
+        spec = found.group(2) or ""
+        if "|" in spec:
+            return spec.split("|")[1]
+        return f"{VARIES} {spec}s" if spec and spec[0].isalpha() else VARIES
+
+    return FIELD.sub(field, sentence.replace("[[", "").replace("]]", ""))
+
+
+def _severity(kind: Kind) -> str:
+    """Return the severity, or the limits of the number that it depends on."""
+    grade = kind.severity
+    if not isinstance(grade, Grade):
+        return grade
+    limits = {"warning": grade.warning, "error": grade.error}
+    return ", ".join(
+        name if limit == -float("inf") else f"{name} from {grade.number} {limit:g}"
+        for name, limit in limits.items()
+        if limit < float("inf")
+    )
+
+
+if __name__ == "__main__":
+    path = Path(sys.argv[1])
+    path.write_text(with_tables(path.read_text(encoding="utf-8")), encoding="utf-8")
