@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from sfm.pipeline import run_survey
@@ -21,18 +22,21 @@ def test_c_far_from_its_start_value_is_told(model: str) -> None:
     estimate = replace(truth, cameras=(name,))
     network, brown = make_network(seed_of("far c"), images=3, points=12)
     survey = survey_of(network, brown)  # says c_mm = 10
-    assert far_principal_distances(survey, estimate) == ()
+    assert far_principal_distances(survey, estimate, [0.01]) == ()
     p = name.parameters.copy()
     p[: 1 if name.in_mm else 2] *= 0.22
     far = replace(estimate, cameras=(name.with_parameters(p),))
-    (one,) = far_principal_distances(survey, far)
+    c = abs(far.cameras[0].parameters[0])
+    for share, severity in ((4.9e-4, "note"), (5.1e-4, "warning"), (np.nan, "warning")):
+        (one,) = far_principal_distances(survey, far, [share * c])
+        assert one.severity == severity
     assert one.kind == "c_far_from_given" and one.names("camera") == ("synthetic",)
     assert [one.number(name) for name in ("given", "found", "change")] == pytest.approx([10, 2.2, -78])
     held = replace(estimate, cameras=(replace(far.cameras[0], free=name.free & False),))
-    assert far_principal_distances(survey, held) == ()
+    assert far_principal_distances(survey, held, [0.01]) == ()
 
 
-def test_a_survey_whose_c_was_given_wrongly_is_not_good() -> None:
+def test_a_wrong_start_value_of_c_is_a_note_where_the_network_determines_c() -> None:
     network, truth = make_network(seed_of("wrongly given"), images=8, points=40)
     camera = truth.cameras[0]
     p = camera.parameters.copy()
@@ -43,4 +47,4 @@ def test_a_survey_whose_c_was_given_wrongly_is_not_good() -> None:
     assert result.estimate.cameras[0].value("c") == pytest.approx(10.0, rel=1e-2)
     (far,) = of_kind(result.remarks, "c_far_from_given")
     assert far.number("given") == pytest.approx(14) and far.number("change") < -20
-    assert findings_of(result).verdict.level == "fair"
+    assert far.severity == "note" and findings_of(result).verdict.level == "good"

@@ -63,8 +63,9 @@ ROWS = (
     ),
     Kind(
         "c_far_from_given",
-        "warning",
-        "c of camera {camera} was adjusted from {given} to {found}, by {change:+}.",
+        Grade("share", warning=5e-4),  # below it the network is not weak, as in the search of other solutions
+        "c of camera {camera} was adjusted from {given} to {found}, by {change:+} (standard deviation "
+        "{share:%}).",
         "a wrong start value, or a network that does not determine c",
         "Give c from a calibration, or add photographs from other distances.",
     ),

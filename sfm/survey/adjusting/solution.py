@@ -419,6 +419,11 @@ def _pixels_unlike_squares(survey: Survey, estimate: Estimate) -> tuple[Remark, 
     return unlike_squares(settings, pixels, [one.adjusted for one in settings])
 
 
+def _sigma_of_c(a: Adjustment) -> list[float]:
+    """Return the standard deviation of the principal distance of each camera, in its unit."""
+    return [float(a.interior_sigma(k)[0]) for k in range(len(a.estimate.cameras))]
+
+
 def _remarks(
     survey: Survey, left_out: tuple[LeftOutPoint, ...], measured: int, adjustment: Adjustment
 ) -> tuple[Remark, ...]:
@@ -428,7 +433,7 @@ def _remarks(
         *adjustment.remarks,
         *remarks_on_left_out(left_out, measured),
         *([remark("datum_points_missing", points=absent)] if absent else []),
-        *far_principal_distances(survey, adjustment.estimate),
+        *far_principal_distances(survey, adjustment.estimate, _sigma_of_c(adjustment)),
         *_pixels_unlike_squares(survey, adjustment.estimate),
         *datum_remarks(survey, adjustment.network),
     )

@@ -6,6 +6,8 @@ false minimum with a small standard deviation; nothing but its start value tells
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from sfm.network import Estimate
@@ -15,16 +17,17 @@ from sfm.survey.inputs.survey import Survey
 FAR = 0.2  # relative change of c; focusing from infinity to 1 : 5 changes it by as much
 
 
-def far_principal_distances(survey: Survey, estimate: Estimate) -> tuple[Remark, ...]:
+def far_principal_distances(survey: Survey, estimate: Estimate, sigma: Sequence[float]) -> tuple[Remark, ...]:
     """Return a remark for each adjusted principal distance that lies far from the one that the survey gives.
 
     Args:
         survey: whose cameras state `c_mm`; those by EXIF data are not looked at.
         estimate: adjusted cameras.
+        sigma: standard deviation of the principal distance of each, in its unit.
     """
     given = {one.name: one.c_mm for one in survey.cameras if one.c_mm is not None}
     remarks = []
-    for camera in estimate.cameras:
+    for camera, s in zip(estimate.cameras, sigma, strict=True):
         start = given.get(camera.name)
         if start is None or not camera.free[0]:
             continue
@@ -37,6 +40,7 @@ def far_principal_distances(survey: Survey, estimate: Estimate) -> tuple[Remark,
                     given=(start, "mm"),
                     found=(found, "mm"),
                     change=(100 * (found / start - 1), "%"),
+                    share=s / abs(float(camera.parameters[0])),
                 )
             )
     return tuple(remarks)
