@@ -29,12 +29,13 @@ from tests.survey.faults import FAULTS, RIGHT, ROWLESS, Planted, planted
 from tests.surveys import survey_of
 
 WRONG = 5.0  # standard deviations, of the worst coordinate
-CAUSES = {row.name for row in hypotheses.ROWS} | {"photograph_other_camera"}
+ACCIDENTS = {"image_points_misnamed"}  # what gross errors are, and no cause of anything
+CAUSES = {row.name for row in hypotheses.ROWS} - ACCIDENTS | {"camera_per_photograph"}
 ALIKE = {  # kinds that say the same of a fault
     "object_deforming": "object_deformed",
     "two_places": "points_moved",
     "camera_drift": "other_camera",
-    "photograph_other_camera": "other_camera",
+    "camera_per_photograph": "other_camera",
 }
 GROUPS = {
     "right": ([kind for kind in RIGHT if kind != "nothing"], 40),

@@ -12,7 +12,7 @@ import numpy as np
 
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.hypotheses.alternatives import Alternative
-from sfm.adjustment.hypotheses.columns import columns_of
+from sfm.adjustment.hypotheses.columns import columns_of, object_fields
 from sfm.adjustment.hypotheses.score import gain_of, reduce_adjustment
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
@@ -95,7 +95,18 @@ def shift_of(plain: Adjustment, other: Adjustment, one: Alternative, beta: Float
     except GeometryError:
         return float("nan")
     shift = float((np.abs(moved[known]) / sigma[known]).max(initial=0.0))
+    away = _displaced(plain, one, beta)
+    safe = np.where(sigma > 0, sigma, np.inf)
+    return max(shift, float(np.nanmax(np.abs(away) / safe, initial=0.0)))
+
+
+def _displaced(plain: Adjustment, one: Alternative, beta: FloatArray) -> FloatArray:
+    """Return how far the object is from its mean shape in the photographs that differ most, (n, 3)."""
+    away = np.zeros_like(plain.estimate.points)
     if one.family in ("moved", "shifted"):
-        displacement = np.abs(beta.reshape(-1, 3)) / np.where(sigma > 0, sigma, np.inf)[one.points]
-        shift = max(shift, float(displacement.max(initial=0.0)))
-    return shift
+        away[one.points] = beta.reshape(-1, 3)
+    elif one.family in ("strain", "bending"):
+        strain, bending, _ = object_fields(plain.estimate.points)
+        largest = float(np.abs(one.factor - one.factor.mean()).max())
+        away = largest * ((strain if one.family == "strain" else bending) @ beta)
+    return away
