@@ -289,7 +289,7 @@ class SurveyResult:
             ("RMS sigma of points", f"{', '.join(f'{s:.3g}' for s in sigma)} {self.length_unit}"),
         ]
         if both is not None:
-            rows.append((both.backend, "agrees" if both.agree else "DIFFERS"))
+            rows.append((both.backend, both.outcome))
         return rows + [(one.severity, one.text) for one in self.remarks]
 
     def __repr__(self) -> str:

@@ -100,7 +100,7 @@ def _figures(findings: Findings) -> tuple[tuple[str, str], ...]:
         rows.append(("check at control", words_of_check(findings.check, result.length_unit)))
     both = result.comparison
     if both is not None:
-        word = "stopped early, same optimum" if both.stopped_early else "agrees" if both.agree else "DIFFERS"
+        word: str = "stopped early, same optimum" if both.stopped_early else both.outcome
         if both.better is not None and both.agree:
             word = f"free {', '.join(both.better.free)}: fits {both.better.times:.3g} times better"
         rms, other = both.comparison.rms_px, program_name(both.backend)

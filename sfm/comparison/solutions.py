@@ -12,11 +12,14 @@ import numpy as np
 
 from sfm.adjustment.result import Covariance
 from sfm.camera import Camera, pixel_from_tangents, project, tangents_from_pixel
+from sfm.comparison.point_pairs import rounding_of
 from sfm.conventions import FloatArray
 from sfm.network import Estimate, Network, rows_of
 from sfm.similarity import Similarity, fit_similarity
 
 EFFECT_STEPS = 9  # places along each side of the photograph where interior orientations are compared
+ROUNDING_PX = 1e-7  # of residuals and of interior orientation in the photograph
+ROUNDING_RAD = 1e-9
 SAME_SIGMAS = 0.01  # standard deviations up to which two solutions are the same optimum
 
 
@@ -125,8 +128,24 @@ def compare(
         np.array([interior_effect_px(p, q) for p, q in zip(a.cameras, b.cameras, strict=True)]),
         (rms[0], rms[1]),
         (float(squares[0].sum() / 2), float(squares[1].sum() / 2)),
-        _in_sigmas(network, a, covariance, points, position, np.deg2rad(angle), interior),
+        _in_sigmas(
+            network,
+            a,
+            covariance,
+            _unless_rounding(points, rounding_of(a.points[both])),
+            _unless_rounding(position, rounding_of(a.points[both])),
+            _unless_rounding(np.deg2rad(angle), ROUNDING_RAD),
+            tuple(
+                np.zeros_like(d) if interior_effect_px(p, q) < ROUNDING_PX else d
+                for p, q, d in zip(a.cameras, b.cameras, interior, strict=True)
+            ),
+        ),
     )
+
+
+def _unless_rounding(difference: FloatArray, rounding: float) -> FloatArray:
+    """Return differences, 0 for those of rounding."""
+    return np.where(np.abs(difference) <= rounding, 0.0, difference)
 
 
 def _in_sigmas(

@@ -159,7 +159,7 @@ def result_entries(findings: Findings) -> dict[str, Any]:
         "rejected": int(a.rejected.sum()),
         "iterations": a.iterations,
         "converged": a.converged,
-        "comparison": "none" if both is None else "agrees" if both.agree else "differs",
+        "comparison": "none" if both is None else both.outcome,
         "stored_photographs": [p.image for p in result.photographs if p.stored],
         "failed_photographs": [{"image": f.image, "reason": f.reason} for f in result.failed],
     }

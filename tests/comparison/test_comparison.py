@@ -17,6 +17,7 @@ from sfm.adjustment.datum import Datum
 from sfm.adjustment.result import Covariance
 from sfm.adjustment.solve import adjust
 from sfm.camera import camera_from_values
+from sfm.comparison.point_pairs import ROUNDING
 from sfm.comparison.solutions import compare, interior_effect_px, rotation_angle_deg
 from sfm.comparison.two_adjusters.adjuster_validation import random_network
 from sfm.comparison.two_adjusters.adjusters import compare_adjusters
@@ -298,3 +299,28 @@ def test_conditional_covariances_of_both_stand_beside_the_marginal() -> None:
     assert found.backend_points is not None
     np.testing.assert_allclose(found.backend_points, own.points_limiting, rtol=1e-5, atol=1e-16)
     assert not np.allclose(own.points, own.points_limiting, rtol=0.005, atol=0.0)
+
+
+def test_rounding_is_no_difference() -> None:
+    """Noise-free observations leave standard deviations of rounding, by which nothing is judged."""
+    network, truth = make_network(seed_of("rounded"), model="opencv", noise_px=0.0)
+    exact = replace(covariance_of(network, truth), points=np.full((60, 3, 3), 1e-30) * np.eye(3))
+    size = float(np.sqrt(((truth.points - truth.points.mean(axis=0)) ** 2).sum(axis=1).mean()))
+    for times, agree in ((0.3, True), (3.0, False)):
+        noise = np.where(seed_of("signs").random(truth.points.shape) < 0.5, -1.0, 1.0)
+        b = replace(truth, points=truth.points + times * ROUNDING * size * noise)
+        assert compare(truth, b, network, covariance=exact).agree is agree, times
+
+
+@pytest.mark.parametrize(("gap", "outcome"), [(2.0, "fits alike"), (8.0, "differs")])
+def test_solutions_that_the_image_points_do_not_tell_apart_fit_alike(gap: float, outcome: str) -> None:
+    """By the chi-square test of 5 % with one degree of freedom, 3.84, of what v'Pv differs by."""
+    network, truth = make_network(seed_of("gap"), model="opencv")
+    a = adjust(network, truth, reject="none")
+    both = compare_adjusters(a, adjust_with_colmap)
+    assert both.outcome == "agrees" and both.gap < 1e-3
+    far = replace(both.comparison, sigmas=(("object point 1", 0.5),))
+    sigma = both.adjustment.sigma0 * both.adjustment.sigma_px
+    far = replace(far, cost=(far.cost[0], far.cost[0] + gap / 2 * sigma**2))
+    found = replace(both, comparison=far)
+    assert found.gap == pytest.approx(gap) and found.outcome == outcome

@@ -14,23 +14,26 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import Literal, Protocol
 
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.comparison.camera_conversion import Conversion
-from sfm.comparison.solutions import Comparison, compare
+from sfm.comparison.solutions import ROUNDING_PX, Comparison, compare
 from sfm.comparison.two_adjusters.better_fit import BetterFit, better_fit
 from sfm.comparison.two_adjusters.common_problem import common_problem, distortion_held
 from sfm.comparison.two_adjusters.unshared import without_sharing
 from sfm.conventions import FloatArray
 from sfm.distortion.models import Role
+from sfm.distributions import chi2_isf
 from sfm.network import Estimate, Network
 
 # The weak directions of full_opencv take more steps than a survey. That k1 to k6 have grown a thousandfold
 # does not tell whether they converge: of 32 random networks that had not after 40 steps, 25 did by 200.
 MAX_ITERATIONS = 200
+ALPHA = 0.05  # of the chi-square test whether the image points tell two solutions apart, with 1 freedom
+Outcome = Literal["agrees", "fits alike", "differs"]
 
 
 @dataclass(frozen=True)
@@ -62,6 +65,20 @@ class AdjusterComparison:
         if not self.adjustment.converged:
             return False
         return self.stopped_early or (self.comparison.agree and self.backend_converged)
+
+    @property
+    def gap(self) -> float:
+        """What v'Pv of the two differs by, in variances of an image coordinate."""
+        a, b = self.comparison.cost
+        sigma = max(self.adjustment.sigma0 * self.adjustment.sigma_px, ROUNDING_PX)
+        return 2 * abs(b - a) / sigma**2
+
+    @property
+    def outcome(self) -> Outcome:
+        """Whether they agree, fit alike (the image points do not tell them apart), or differ."""
+        if self.agree:
+            return "agrees"
+        return "fits alike" if self.gap <= chi2_isf(ALPHA, 1) else "differs"
 
 
 class BackendAdjustment(Protocol):

@@ -13,6 +13,14 @@ ROWS = (
         "Read the comparison in the report.",
     ),
     Kind(
+        "adjuster_fits_alike",
+        "note",
+        "The image points do not tell the solutions of Kolinear and {program} apart: v'Pv differs by {gap} "
+        "variances.",
+        "the network hardly determines the camera model of the comparison",
+        "The survey stands; photograph from more directions and distances for a comparison of cameras.",
+    ),
+    Kind(
         "adjuster_fits_better",
         "warning",
         "The camera of {program} with {parameters} free fits {times} times better: {rms} in place of {own} "

@@ -42,7 +42,7 @@ def comparison_of(result: SurveyResult) -> ComparisonFindings | None:
     if both is None:
         return None
     reasons: list[str] = []
-    if not both.agree:
+    if both.outcome == "differs":
         reasons += both.comparison.exceeded
         if both.comparison.exceeded and both.adjustment.converged:
             reasons.append(_other_minimum(both))

@@ -175,7 +175,11 @@ def comparison_remarks(result: SurveyResult) -> tuple[Remark, ...]:
     if both is None:
         return ()
     program, better = program_name(both.backend), both.better
-    remarks = [] if both.agree else [remark("adjuster_differs", program=program)]
+    remarks = []
+    if both.outcome == "differs":
+        remarks.append(remark("adjuster_differs", program=program))
+    elif both.outcome == "fits alike":
+        remarks.append(remark("adjuster_fits_alike", program=program, gap=both.gap))
     if better is not None:
         remarks.append(
             remark(

@@ -19,6 +19,8 @@ def summary_of_comparison(findings: Findings) -> dict[str, Any] | None:
     return {
         "backend": both.backend,
         "agree": both.agree,
+        "outcome": both.outcome,
+        "gap": or_none(both.gap),
         "model": both.model,
         "stopped_early": both.stopped_early,
         "max_sigmas": or_none(difference.max_sigmas),
