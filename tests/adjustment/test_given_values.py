@@ -61,17 +61,17 @@ def test_right_values_fit_at_the_level() -> None:
 
 @pytest.mark.parametrize("error", [6 * SIGMA, 0.01, 1.0, -2.0])
 def test_of_two_neither_is_believed(error: float) -> None:
-    assert judge_values(bars(0.0, error), LEVEL, may_scale=False).doubtful == (0, 1)
+    assert judge_values(bars(0.0, error), LEVEL).doubtful == (0, 1)
 
 
 @pytest.mark.parametrize("error", [9 * SIGMA, 0.1, 7.0])
 def test_of_three_the_wrong_one_is_identified(error: float) -> None:
-    assert judge_values(bars(0.0, error, SIGMA), LEVEL, may_scale=False).wrong == (1,)
+    assert judge_values(bars(0.0, error, SIGMA), LEVEL).wrong == (1,)
 
 
 def test_two_of_five_are_identified_and_two_against_two_are_not() -> None:
-    assert judge_values(bars(0.0, 0.3, 0.0, -0.2, SIGMA), LEVEL, may_scale=False).wrong == (1, 3)
-    assert judge_values(bars(0.0, 0.0, 0.3, 0.3), LEVEL, may_scale=False).doubtful == (0, 1, 2, 3)
+    assert judge_values(bars(0.0, 0.3, 0.0, -0.2, SIGMA), LEVEL).wrong == (1, 3)
+    assert judge_values(bars(0.0, 0.0, 0.3, 0.3), LEVEL).doubtful == (0, 1, 2, 3)
 
 
 def test_the_margin_decides_whether_one_is_told_from_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -80,9 +80,9 @@ def test_the_margin_decides_whether_one_is_told_from_the_others(monkeypatch: pyt
     fall = sorted(model.misfit((k,))[0] for k in range(3))
     assert fall[1] - fall[0] == pytest.approx(8.2, abs=0.3)
     level = 0.02
-    assert judge_values(model, level, may_scale=False).doubtful == (0, 2)
+    assert judge_values(model, level).doubtful == (0, 2)
     monkeypatch.setattr(given_values, "MARGIN", given_values.MARGIN / 2)
-    assert judge_values(model, level, may_scale=False).wrong == (2,)
+    assert judge_values(model, level).wrong == (2,)
 
 
 def test_the_level_and_the_noncentrality_are_those_of_baarda() -> None:
@@ -146,6 +146,13 @@ def test_standard_deviations_that_are_too_small_are_named(factor: float) -> None
     assert found.judgement.factor == pytest.approx(factor, rel=0.3)
     fixed = judge_points(replace(one, stated=0 * one.stated), LEVEL)
     assert fixed is not None and fixed.judgement.factor == pytest.approx(factor * SIGMA, rel=0.3)
+
+
+def test_bars_a_few_times_worse_than_stated_are_no_mistake() -> None:
+    """Two against two differ by 28 or by 70 standard deviations, for which factors of 20 and 50 would do."""
+    found = judge_values(bars(0.0, 0.0, 28 * SIGMA, 28 * SIGMA), LEVEL)
+    assert found.doubtful == () and found.factor == pytest.approx(16, rel=0.05)
+    assert judge_values(bars(0.0, 0.0, 70 * SIGMA, 70 * SIGMA), LEVEL).doubtful == (0, 1, 2, 3)
 
 
 def test_a_wrong_point_without_stated_standard_deviations_is_identified() -> None:

@@ -48,5 +48,5 @@ def test_a_bar_that_nothing_checks_is_no_contradiction() -> None:
         )
         return of_kind(given_remarks(found.result, given, found.statistics, ()), "given_differs")
 
-    assert remarks(1e-4) == ()
-    assert len(remarks(0.3)) == 1
+    assert remarks(0.8e-3) == ()
+    assert len(remarks(1.2e-3)) == len(remarks(0.3)) == 1

@@ -113,7 +113,7 @@ def test_swapped_control_is_no_result(synthetic: tuple[Network, Estimate], sigma
     verdict = findings_of(result_of(adjust(swapped, truth, datum=Datum("control"), reject="none"))).verdict
     assert verdict.level == "bad"
     assert verdict.headline == "The survey has no dependable result."
-    assert of_kind(verdict.remarks, "sigma0_high", "given_contradicted")
+    assert of_kind(verdict.remarks, "sigma0_high", "given_differs")
 
 
 def test_a_scale_bar_that_contradicts_another_is_no_result(synthetic: tuple[Network, Estimate]) -> None:
@@ -122,10 +122,10 @@ def test_a_scale_bar_that_contradicts_another_is_no_result(synthetic: tuple[Netw
     a = adjust(barred, truth, datum=Datum("free"), reject="none")
     verdict = findings_of(result_of(a)).verdict
     assert verdict.level == "bad"
-    assert of_kind(verdict.remarks, "given_contradicted")
+    assert of_kind(verdict.remarks, "given_differs")
 
 
-@pytest.mark.parametrize(("sigmas", "level"), [(0.5, "good"), (50.0, "fair"), (200.0, "bad")])
+@pytest.mark.parametrize(("sigmas", "level"), [(0.5, "good"), (50.0, "bad")])
 def test_a_false_calibration_certificate_is_noticed(sigmas: float, level: str) -> None:
     network, truth = make_network(seed_of("certificate"), images=8, points=40, noise_px=NOISE_PX, free=("c",))
     camera = truth.cameras[0]
@@ -147,7 +147,7 @@ def test_a_false_calibration_certificate_is_noticed(sigmas: float, level: str) -
     assert found.r[0, 0] == pytest.approx(sigma**2 / (sigma**2 + q), rel=0.1)  # as c moves
     verdict = findings_of(result).verdict
     assert verdict.level == level, verdict
-    told = of_kind(verdict.remarks, "given_contradicted", "given_remarkable")
+    told = of_kind(verdict.remarks, "given_differs")
     assert bool(told) == (level != "good")
     assert re.search(f"interior  c of camera {camera.name} .* mm ", text_report(findings_of(result)))
     page = report_page(findings_of(result), (), ())
@@ -415,35 +415,8 @@ def test_bars_that_are_all_a_little_too_bad_are_noticed(synthetic: tuple[Network
     a = adjust(with_bars(network, truth, tuple(errors), 1e-4), truth, datum=Datum("free"))
     bars = bar_residuals(a, "m")
     assert bars is not None and np.abs(bars.w).max() < 5
-    verdict = findings_of(result_of(a)).verdict
-    assert verdict.level == "fair" and len(verdict.remarks) == 1
-    assert verdict.remarks[0].text.startswith("The residuals of the scale bars are"), verdict.remarks
-
-
-@pytest.mark.parametrize(("sigma", "limit"), [(0.0, 100.0), (1e-5, 5.0)])
-def test_control_that_only_checks(sigma: float, limit: float) -> None:
-    network, truth = make_network(seed_of("checks"), images=8, points=40, noise_px=0.02)
-    known = with_control(network, truth.points[:4], sigma)
-    a = adjust(known, truth, datum=Datum("free"))
-    names = a.network.points[:4]
-
-    def level(differences: float, *, scale: float = 1.0, bars: bool = False) -> str:
-        d = np.zeros((4, 3))
-        d[2] = (differences, 0, 0)
-        one = a
-        if bars:
-            one = adjust(with_bars(known, truth, (0.0,), 1e-4), truth, datum=Datum("free"))
-        return findings_of(result_of(one, control_check=ControlCheck(names, d, scale))).verdict.level
-
-    expected = np.sqrt(np.trace(a.covariance.points[2]) / 3 + sigma**2)
-    assert level(2 * expected) == "good"
-    size = np.linalg.norm(np.ptp(a.estimate.points, axis=0))
-    assert 120 * expected < 0.009 * size
-    assert level(0.8 * limit * expected) == "good"
-    assert level(1.2 * limit * expected) == "fair"
-    assert level(0.05) == "bad"
-    assert level(2 * expected, scale=1.001, bars=True) == "good"
-    assert level(2 * expected, scale=1.05, bars=True) == "bad"
+    (said,) = of_kind(findings_of(result_of(a)).verdict.remarks, "given_sigmas")
+    assert said.severity == "warning" and said.number("factor") > 1.5
 
 
 def test_words_for_the_scale_of_the_control(synthetic: tuple[Network, Estimate]) -> None:

@@ -34,6 +34,7 @@ MAX_SETS = 2000  # sets of wrong values that are tried; with more, those that di
 MAX_TRIPLES = 300  # similarities by three points that are tried for the start
 MAX_EXCHANGED = 40  # points of which pairs may have exchanged names, those that fit worst
 RELINEARISED = 3
+MAX_FACTOR = 30.0  # on stated standard deviations: one that is larger is a mistake, not a misjudgement
 FACTORS = np.geomspace(1.0, 1e6, 241)  # on standard deviations
 
 
@@ -236,17 +237,13 @@ class GivenTest:
     probability: float  # of differences so large by chance
 
 
-def judge_values(
-    model: GivenModel, level: float, exchange: FloatArray | None = None, *, may_scale: bool = True
-) -> Judgement:
+def judge_values(model: GivenModel, level: float, exchange: FloatArray | None = None) -> Judgement:
     """Return what is wrong of given values.
 
     Args:
         model: their differences from the free network.
         level: probability with which right values are said to be wrong.
         exchange: given coordinates by rows, for the hypothesis of exchanged names, (m,); None without.
-        may_scale: whether standard deviations that are too small may explain the differences; never where
-            one wrong value could not be told from them.
     """
     T, dof = model.misfit()
     p = model.probability()
@@ -256,8 +253,11 @@ def judge_values(
     cost = np.log(max(len(model.v), 2))
     removed = _wrong_values(model, level, cost)
     swapped = None if exchange is None else _exchanged(model, exchange, level)
+    factor, gain = model.factor()
+    # one wrong value of so few would look like standard deviations that are too small
     told_apart = all(model.misfit((one,))[1] > 0 for one in range(model.items))
-    factor, gain = model.factor() if may_scale and told_apart and not model.estimated else (1.0, 0.0)
+    if model.estimated or not told_apart or (model.stated.any() and factor > MAX_FACTOR):
+        gain = 0.0
     scores = {
         "wrong": np.inf if removed is None else removed[1],
         "exchanged": np.inf if swapped is None else swapped[1],

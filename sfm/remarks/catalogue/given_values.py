@@ -76,7 +76,7 @@ ROWS = (
         "given_differs",
         DETECTED,
         "The given {given} differs from the adjusted one by {difference}, {sigmas} standard deviations: "
-        "coordinates shift by up to {shift} of theirs.",
+        "the result shifts by up to {shift} of its standard deviations.",
         CHECK_THE_LIST,
         "Correct this value, or state a larger standard deviation.",
     ),

@@ -11,7 +11,6 @@ from collections.abc import Sequence
 import numpy as np
 
 from sfm.adjustment.quality.given_values import LEVEL
-from sfm.adjustment.quality.reliability import UNCONTROLLED
 from sfm.adjustment.quality.statistics import component_tests
 from sfm.adjustment.quality.variance_components import IMAGE_POINTS
 from sfm.conventions import METRES
@@ -25,6 +24,9 @@ from sfm.report.numbers import finer_unit
 from sfm.result import SurveyResult
 
 MM = 1e-3  # m
+# What is left of the error of a value that is checked less is below the rounding and the neglected second order
+# of the others, and w magnifies that.
+MIN_REDUNDANCY = 1e-3
 MAX_MAGNIFICATION = 1.0  # of the median image distance c over the object distance; macrophotography is beyond
 
 
@@ -63,7 +65,7 @@ def _residuals(kind: GivenResiduals) -> tuple[Remark, ...]:
 
     The shift is the largest that any function of the unknowns has without it: |w| sqrt((1 - r) / r).
     """
-    tested = [one for one in kind.by_w if np.isfinite(one.w) and one.r > UNCONTROLLED]
+    tested = [one for one in kind.by_w if np.isfinite(one.w) and one.r >= MIN_REDUNDANCY]
     if not tested:
         return ()
     worst = max(tested, key=lambda one: abs(one.w))

@@ -364,12 +364,14 @@ class _Judge:
         if not scales:
             return
         model = scale_model(tuple(scales), self.places.joint, self.places.redundancy)
-        judgement = judge_values(model, self.level, may_scale=False)
+        judgement = judge_values(model, self.level)
         self.tests.append(GivenTest("scale", judgement.statistic, judgement.dof, judgement.probability))
         if len(scales) == 1:
             self.remarks.append(remark("scale_unchecked", given=names[0]))
         elif judgement.fits:
             self._unchecked("given lengths", names, model)
+        elif judgement.factor != 1.0:
+            self._imprecise_bars(judgement.factor)
         else:
             self._contradicting_scales(model, judgement, names, np.array(of_bar, dtype=np.int64))
 
@@ -394,6 +396,13 @@ class _Judge:
         if self.datum.kind != "control" and not points.stated.any():
             return replace(found, variance=found.variance + PRINT_SIGMA**2)
         return found
+
+    def _imprecise_bars(self, factor: float) -> None:
+        """Replace the standard deviations of bars that are too small."""
+        used = factor if self.rescale else None
+        self.remarks.append(remark("given_sigmas", what="scale bars", factor=factor, used=used))
+        bars = self.network.scale_bars
+        self.network = replace(self.network, scale_bars=replace(bars, sigma=(used or 1.0) * bars.sigma))
 
     def _contradicting_scales(
         self, model: GivenModel, judgement: Judgement, names: list[str], of_bar: IntArray
