@@ -49,6 +49,11 @@ def t_ppf(probability: Any, r: Any) -> Any:
     return special.stdtrit(r, probability)
 
 
+def nct_parameter(x: float, r: int, power: float) -> float:
+    """Non-centrality with which Student's t of redundancy r exceeds x with a probability."""
+    return float(special.nctdtrinc(r, 1 - power, x))
+
+
 def normal_sf(x: Any) -> Any:
     """Probability that a standard normal variable is larger than x."""
     return special.ndtr(-x)

@@ -52,6 +52,8 @@ class Adjustment:
     covariance: Covariance
     standardised: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))  # Baarda's w of each image
     # coordinate, v over its a priori standard deviation; of rejected ones as predicted, (k, 2)
+    residual_weights: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))  # diagonal of P Qvv P of
+    # each image point, Qvv the cofactors of its residual; NaN where rejected, px^-2, (k, 2)
     weights: FloatArray = field(default_factory=lambda: np.zeros(0))  # factor on the weight of each image
     # point: 0 where rejected, between 0 and 1 by reweighting, else 1, (k,)
 

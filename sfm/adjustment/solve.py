@@ -39,7 +39,11 @@ from sfm.adjustment.quality.gross_errors.robust import (
 )
 from sfm.adjustment.quality.rank import rank_defect, undetermined_of
 from sfm.adjustment.quality.reliability import redundancy_numbers as numbers_of
-from sfm.adjustment.quality.reliability import redundancy_of_bars, standardised_residuals
+from sfm.adjustment.quality.reliability import (
+    redundancy_of_bars,
+    residual_weights,
+    standardised_residuals,
+)
 from sfm.adjustment.result import Adjustment, Covariance
 from sfm.conventions import BoolArray, FloatArray
 from sfm.distributions import normal_sf
@@ -249,7 +253,7 @@ def _result(
     k, n, m = len(weight), len(network.points), len(network.images)
     back = np.empty(k, dtype=np.int64)  # place of each image point of the network in the layout
     back[layout.order] = np.arange(k)
-    numbers = standardised = np.full((k, 2), np.nan)
+    numbers = standardised = residual_weight = np.full((k, 2), np.nan)
     of_bars = np.full(len(network.scale_bars), np.nan)
     if Q is None:
         empty = np.full((n, 3, 3), np.nan)
@@ -267,6 +271,9 @@ def _result(
         numbers = numbers_of(complement, layout.observations.whitening)
         numbers[weight == 0] = np.nan
         numbers = np.take(numbers, back, axis=0)
+        residual_weight = residual_weights(complement, layout.observations.whitening)
+        residual_weight[weight == 0] = np.nan
+        residual_weight = np.take(residual_weight, back, axis=0)
         standardised = np.take(
             standardised_residuals(v, complement, layout.observations.whitening), back, axis=0
         )
@@ -290,6 +297,7 @@ def _result(
         observations=observations,
         covariance=result,
         standardised=standardised,
+        residual_weights=residual_weight,
         weights=np.take(weight, back, axis=0),
         inflation=factor,
         bar_redundancy=of_bars,

@@ -44,10 +44,21 @@ def standardised_residuals(
     F = whitening_matrix(whitening)
     Ft = np.swapaxes(F, 1, 2)
     Pv = np.einsum("kab,kb->ka", Ft @ F, residuals)
-    PQP = np.diagonal(Ft @ complement @ F, axis1=1, axis2=2)
+    PQP = residual_weights(complement, whitening)
     P = np.diagonal(Ft @ F, axis1=1, axis2=2)
     controlled = PQP > UNCONTROLLED * P
     return np.where(controlled, Pv / np.sqrt(np.where(controlled, PQP, 1.0)), 0.0)
+
+
+def residual_weights(complement: FloatArray, whitening: FloatArray) -> FloatArray:
+    """Return the diagonal of P Qvv P of each image point, px^-2, (k, 2).
+
+    Args:
+        complement: I - A Q A' in whitened coordinates, shape (k, 2, 2).
+        whitening: a, b, c of F = (a 0; b c) with F'F = P, shape (k, 3).
+    """
+    F = whitening_matrix(whitening)
+    return np.diagonal(np.swapaxes(F, 1, 2) @ complement @ F, axis1=1, axis2=2).copy()
 
 
 UNCONTROLLED = 1e-6  # redundancy number below which an observation has no check

@@ -19,7 +19,7 @@ from sfm.adjustment.result import Adjustment
 from sfm.camera import Camera
 from sfm.conventions import FloatArray, IntArray
 from sfm.distortion.models import MODELS
-from sfm.distributions import chi2_ppf, normal_ppf, poisson_sf, t_sf
+from sfm.distributions import chi2_ppf, nct_parameter, normal_ppf, poisson_sf, t_ppf, t_sf
 
 ALPHA = 0.001  # Baarda's usual probability of rejecting a good observation
 REWEIGHTED = "the weights come from the residuals, so that v'Pv is not chi-square distributed"
@@ -167,9 +167,26 @@ def _coordinate_test(
     return CoordinateTest(alpha, critical, shown, int(checked.sum()), beyond)
 
 
-def non_centrality(alpha: float = ALPHA, power: float = POWER) -> float:
-    """Return delta0, by which a test of size alpha finds an error with the given power."""
-    return float(normal_ppf(1 - alpha / 2) + normal_ppf(power))
+def non_centrality(alpha: float = ALPHA, power: float = POWER, redundancy: int | None = None) -> float:
+    """Return delta0, by which the test of an observation finds an error with the given power.
+
+    Args:
+        alpha: probability with which the test rejects a good observation.
+        power: probability with which it finds the error.
+        redundancy: r of an adjustment whose sigma0 the test takes (Pope's tau); None where sigma0 is known
+            (Baarda's w). With the observation left out, tau is Student's t of r - 1 degrees of freedom.
+
+    Returns:
+        Infinite where r is less than 2.
+
+    Source: Baarda (1968), sec. 3; Pope (1976), sec. 3, for t; Johnson, Kotz and Balakrishnan (1995),
+    Continuous Univariate Distributions 2, ch. 31, for the non-central t.
+    """
+    if redundancy is None:
+        return float(normal_ppf(1 - alpha / 2) + normal_ppf(power))
+    if redundancy < 2:
+        return float("inf")
+    return nct_parameter(float(t_ppf(1 - alpha / 2, redundancy - 1)), redundancy - 1, power)
 
 
 def reliability(adjustment: Adjustment, *, alpha: float | None = None, power: float = POWER) -> Reliability:
@@ -178,25 +195,31 @@ def reliability(adjustment: Adjustment, *, alpha: float | None = None, power: fl
     Args:
         adjustment: the adjustment.
         alpha: probability with which the test that is to find the error rejects a good observation; that of
-            the test by which the adjustment rejected, if not given.
+            the test by which the adjustment rejected, if not given. The test is Pope's, which takes sigma0
+            from the adjustment, for errors in the standard deviations that it gives.
         power: probability with which it finds an error of the minimal size.
 
-    Source: Baarda (1968): delta0 sigma / sqrt(r); effect bounded by delta0 sqrt((1 - r)/r).
+    Source: Baarda (1968): with C = P Qvv P, delta0 sigma0 / sqrt(C_ii), which is delta0 sigma / sqrt(r) for
+    uncorrelated coordinates; effect bounded by delta0 sqrt(P_ii / C_ii - 1).
     """
     alpha = adjustment.test_alpha if alpha is None else alpha
-    critical = float(normal_ppf(1 - alpha / 2))
-    delta0 = non_centrality(alpha, power)
-    r = np.clip(adjustment.redundancy_numbers, 0, 1)
-    sigma = np.sqrt(np.diagonal(adjustment.image_covariance, axis1=1, axis2=2))
-    controlled = r > UNCONTROLLED
-    safe = np.where(controlled, r, 1.0)
-    unknown = np.isnan(r)
+    r = adjustment.redundancy
+    critical = tau_critical(alpha, r)
+    delta0 = non_centrality(alpha, power, r)
+    P = np.diagonal(np.linalg.inv(adjustment.image_covariance), axis1=1, axis2=2)
+    C = adjustment.residual_weights
+    unknown = np.isnan(C)
+    controlled = np.nan_to_num(C) > UNCONTROLLED * P
+    safe = np.where(controlled, C, 1.0)
 
     def where(values: FloatArray) -> FloatArray:
         return np.where(unknown, np.nan, np.where(controlled, values, np.inf))
 
     return Reliability(
-        delta0, critical, where(delta0 * sigma / np.sqrt(safe)), where(delta0 * np.sqrt((1 - safe) / safe))
+        delta0,
+        critical,
+        where(delta0 * adjustment.sigma0 / np.sqrt(safe)),
+        where(delta0 * np.sqrt(np.maximum(P / safe - 1, 0.0))),
     )
 
 

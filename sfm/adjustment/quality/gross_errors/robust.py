@@ -34,6 +34,9 @@ TUKEY = 5.123
 CROWDED = 60
 BESIDE = 0.4
 RETURNS = 0.99  # of the critical value: a rejected one returns below, since at it rounds turn in circles
+# Of an image coordinate: 5e4 times what a double resolves. Computed coordinates are exact to some 1e-15 of
+# themselves, measured ones to 1e-7 at best.
+ROUNDING = 1e-11
 MIN_FREEDOM = 0.05  # of redundancy over observations, so that a network without redundancy has a scale
 
 
@@ -64,8 +67,8 @@ def snoop(
     """
     w = np.abs(standardised_residuals(residuals, complement, observations.whitening)).max(axis=1)
     w = np.where(np.isfinite(w), w, np.inf)
-    sigma0 = np.sqrt(vPv / max(redundancy, 1))
-    tau = w / max(sigma0, np.finfo(float).tiny)
+    sigma0 = max(np.sqrt(vPv / max(redundancy, 1)), rounding_of(observations))
+    tau = w / sigma0
     critical = tau_critical(alpha, redundancy)
     suspect = used & (tau > critical)
     worst_image = np.zeros(len(observations.camera))
@@ -118,9 +121,16 @@ def would_pass(
     v = np.linalg.solve(F, inside[:, :, None])[:, :, 0]
     w = np.abs(standardised_residuals(v, cofactor, observations.whitening[rows])).max(axis=1)
     sigma0 = np.sqrt((vPv + np.sum(predicted * inside, axis=1)) / (redundancy + 2))
+    sigma0 = np.maximum(sigma0, rounding_of(observations))
     passes = np.zeros(len(used), dtype=bool)
     passes[rows] = w <= RETURNS * tau_critical(alpha, redundancy + 2) * sigma0
     return passes
+
+
+def rounding_of(observations: Observations) -> float:
+    """Return what rounding makes of a residual, in standard deviations: below it nothing can be tested."""
+    size = float(np.abs(observations.xy).max(initial=0.0))
+    return max(ROUNDING * size * float(observations.whitening[:, 0].max(initial=0.0)), np.finfo(float).tiny)
 
 
 def huber_weights(observations: Observations, residuals: FloatArray, *, sigma0: float) -> FloatArray:
