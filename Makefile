@@ -1,7 +1,7 @@
 # make demo   set up, render a small survey, run it, say where the report is
 # make test   set up, run the tests, the linter and the type checker
 # make docs   build the documentation in build/docs, warnings are errors
-# make study  the longer studies        make bench  the timings
+# make study  the longer studies        make bench  the timings        make mutate  what the tests hold
 # On Windows, or without make, see README.md.
 
 PYTHON ?= python3
@@ -9,7 +9,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
-.PHONY: demo test docs study bench setup clean
+.PHONY: demo test docs study bench mutate setup clean
 
 demo: $(READY)
 	$(BIN)/python -m sfm.rendering.render datasets/demo/scene.toml build/demo
@@ -32,6 +32,9 @@ study: $(READY)
 
 bench: $(READY)
 	@for file in benchmarks/[a-z]*.py; do echo "== $$file"; $(BIN)/python "$$file" || exit 1; done
+
+mutate: $(READY)
+	$(BIN)/python -m tests.mutate
 
 setup: $(READY)
 

@@ -744,7 +744,9 @@ def test_tables_of_reliability_and_variance_components(
         assert float(row["rx"]) == a.redundancy_numbers[index, 0]
         assert float(row["wy"]) == a.standardised[index, 1]
         assert float(row["tauy"]) == a.tau[index, 1]
-        assert float(row["mdbx_px"]) == pytest.approx(4.1324 * 0.1 / np.sqrt(float(row["rx"])), rel=1e-4)
+        assert float(row["mdbx_px"]) == pytest.approx(
+            found.delta0 * a.sigma0 * 0.1 / np.sqrt(float(row["rx"])), rel=1e-4
+        )
         assert float(row["exty"]) == found.external[index, 1]
     numbers = sum(float(row[c]) for row in rows for c in ("rx", "ry") if row[c])
     with (tmp_path / "variance_components.csv").open(encoding="utf-8") as file:
