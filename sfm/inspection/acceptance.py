@@ -10,7 +10,7 @@ secs. 3 and 4; ISO 14253-1:2017.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -21,14 +21,20 @@ from sfm.errors import GeometryError, SurveyFileError, UnknownNameError
 from sfm.files.csv_tables import read_table
 from sfm.geometry.functions import distance, point_function
 from sfm.geometry.measured import measured_points
-from sfm.geometry.tolerance import COVERAGE, DECISIONS, decide
+from sfm.geometry.tolerance import COVERAGE, OUT, UNDECIDED, UNKNOWN, decide
+from sfm.remarks.remark import Remark, remark
+from sfm.remarks.verdict import Level, Verdict, judge
 from sfm.stored_result import StoredResult
 
 MIN_LINES = 7
 MIN_LENGTHS = 5  # of a line
 MIN_LONGEST = 2 / 3  # of the body diagonal of the measuring volume
 SAME_DIRECTION_DEG = 5.0  # below which two lines have one direction
-NOT_KNOWN = "Not known here: the temperature of the lengths and whether they were corrected for it."
+HEADLINES: Mapping[Level, str] = {
+    "good": "The limit is kept: all lengths are proven to be inside.",
+    "fair": "It is not proven by a complete test that the limit is kept.",
+    "bad": "The limit is not kept.",
+}
 
 
 @dataclass(frozen=True)
@@ -58,7 +64,7 @@ class Acceptance:
     coverage: float  # k of U = k sigma of the calibration
     decision: tuple[str, ...]  # in | out | undecided | not known, of each length
     diagonal: float  # of the measuring volume, object unit
-    lacking: tuple[str, ...]  # what part 1 asks for and the data lack, one line each
+    lacking: tuple[Remark, ...]  # what part 1 asks for and the data lack
 
     def count(self, decision: str) -> int:
         """Return how many lengths have a decision."""
@@ -70,23 +76,19 @@ class Acceptance:
         return float(np.abs(self.error).max())
 
     @property
-    def verdict(self) -> str:
+    def verdict(self) -> Verdict:
         """Return good (proven to be kept, nothing lacking), fair or bad (proven not to be kept)."""
-        if self.count("out"):
-            return "bad"
-        return "good" if self.count("in") == len(self.error) and not self.lacking else "fair"
-
-    @property
-    def headline(self) -> str:
-        """What the test says, in one line."""
-        n = len(self.error)
-        if self.count("out"):
-            return f"The limit is not kept: {self.count('out')} of {n} lengths are proven to be outside."
-        if self.count("in") == n:
-            less = ", but the test is not complete" if self.lacking else ""
-            return f"The limit is kept: all {n} lengths are proven to be inside{less}."
-        told = ", ".join(f"{self.count(one)} {one}" for one in DECISIONS if self.count(one))
-        return f"Nothing is proven: of {n} lengths {told}."
+        counts = {
+            kind: {name: self.count(decision), "total": len(self.error)}
+            for kind, name, decision in (
+                ("lengths_outside", "outside", OUT),
+                ("lengths_undecided", "undecided", UNDECIDED),
+                ("lengths_without_sigma", "unknown", UNKNOWN),
+            )
+            if self.count(decision)
+        }
+        decided = [remark(kind, **numbers) for kind, numbers in counts.items()]
+        return judge((*decided, *self.lacking, remark("temperature_unknown")), HEADLINES)
 
 
 def read_lengths(path: Path) -> CalibratedLengths:
@@ -216,34 +218,28 @@ def _refuse_own_scale(
                 )
 
 
-def _lacking(lengths: CalibratedLengths, directions: FloatArray, diagonal: float, unit: str) -> list[str]:
+def _lacking(lengths: CalibratedLengths, directions: FloatArray, diagonal: float, unit: str) -> list[Remark]:
     """Return what part 1 asks for and the data lack."""
     lines = list(dict.fromkeys(lengths.line))
     found = []
     if len(lines) < MIN_LINES:
-        found.append(f"{len(lines)} measuring lines, part 1 asks for at least {MIN_LINES}")
+        found.append(remark("lines_missing", lines=len(lines), needed=MIN_LINES))
     of_line: dict[str, FloatArray] = {}
     for line in lines:
         rows = np.array([k for k, one in enumerate(lengths.line) if one == line])
         if len(rows) < MIN_LENGTHS:
-            found.append(f"line {line}: {len(rows)} lengths, part 1 asks for at least {MIN_LENGTHS}")
+            found.append(remark("line_short_of_lengths", line=line, lengths=len(rows), needed=MIN_LENGTHS))
         longest = directions[rows[np.argmax(lengths.length[rows])]]
         of_line[line] = longest / np.linalg.norm(longest)
         off = np.linalg.norm(np.cross(directions[rows], of_line[line]), axis=1)
         if (off > np.sin(np.deg2rad(SAME_DIRECTION_DEG)) * np.linalg.norm(directions[rows], axis=1)).any():
-            found.append(f"line {line}: its lengths are not on one line")
+            found.append(remark("line_not_straight", line=line))
     for i, first in enumerate(lines):
         for second in lines[i + 1 :]:
             cosine = min(1.0, abs(float(of_line[first] @ of_line[second])))
             if np.rad2deg(np.arccos(cosine)) < SAME_DIRECTION_DEG:
-                found.append(f"lines {first} and {second} have one direction, part 1 asks for different ones")
+                found.append(remark("lines_parallel", lines=(first, second)))
     longest = float(lengths.length.max())
     if longest < MIN_LONGEST * diagonal:
-        found.append(
-            f"longest length {longest:.6g} {unit}, part 1 asks for two thirds of the body diagonal of "
-            f"{diagonal:.6g} {unit}"
-        )
-    missing = int(np.isnan(lengths.sigma).sum())
-    if missing:
-        found.append(f"{missing} lengths without standard deviation of their calibration: nothing is decided")
+        found.append(remark("longest_length_short", longest=(longest, unit), diagonal=(diagonal, unit)))
     return found

@@ -6,14 +6,13 @@ step names its own.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from sfm.conventions import FloatArray, IntArray
-from sfm.display import listed
 from sfm.errors import GeometryError, SurveyFileError
 from sfm.files.csv_tables import read_table
 from sfm.geometry.alignment import Alignment, Nominal, align_321, align_features, align_points
@@ -31,6 +30,9 @@ from sfm.geometry.measured import Function, MeasuredPoints, measured_points
 from sfm.geometry.mesh import Mesh
 from sfm.geometry.shapes.fit import ShapeFit, fit_shape
 from sfm.geometry.tolerance import (
+    OUT,
+    UNDECIDED,
+    UNKNOWN,
     Deviations,
     deviations_from_mesh,
     deviations_from_points,
@@ -43,9 +45,21 @@ from sfm.inspection.features_file import (
     ShapeSettings,
     ToleranceSettings,
 )
+from sfm.remarks.remark import Remark, remark
+from sfm.remarks.verdict import Level, Verdict, judge
 from sfm.stored_result import StoredResult
 
 SIGMAS = ("sX", "sY", "sZ")
+HEADLINES: Mapping[Level, str] = {
+    "good": "The result is measured.",
+    "fair": "The result is measured, with remarks.",
+    "bad": "The result cannot be measured as asked.",
+}
+HEADLINES_OF_TOLERANCES: Mapping[Level, str] = {
+    "good": "All tolerances are proven to be kept.",
+    "fair": "It is not proven that all tolerances are kept.",
+    "bad": "Tolerances are not kept.",
+}
 WITH_AXIS = ("line", "cylinder", "cone", "torus", "paraboloid")
 SEEN_FROM = 0.8  # of the rays of targets that come from their own side of a surface, at least
 MeshReader = Callable[[Path], tuple[FloatArray, IntArray]]
@@ -60,7 +74,7 @@ class Quantity:
     kind: str  # length | angle
     value: float  # object unit, rad
     sigma: float  # NaN where not known
-    remark: str = ""  # why the sigma means less than it seems; empty where it does not
+    remarks: tuple[Remark, ...] = ()  # why the sigma means less than it seems
 
 
 @dataclass(frozen=True)
@@ -75,7 +89,7 @@ class Measurement:
     quantities: tuple[Quantity, ...]
     tolerances: tuple[Deviations, ...]
     coverage: float  # k of the uncertainties
-    remarks: tuple[str, ...]  # one line each
+    remarks: tuple[Remark, ...]  # on the result and its shapes
 
     @property
     def unit(self) -> str:
@@ -87,13 +101,28 @@ class Measurement:
         return next((name for name, members in self.groups if point in members), "")
 
     @property
-    def verdict(self) -> str:
-        """Return good, fair or bad: whether all tolerances are proven to be kept."""
-        if any(one.count("out") for one in self.tolerances):
-            return "bad"
-        if any(one.count("undecided") or one.count("not known") or one.missing for one in self.tolerances):
-            return "fair"
-        return "fair" if self.remarks else "good"
+    def verdict(self) -> Verdict:
+        """Whether all tolerances are proven to be kept."""
+        judged = [found for one in self.tolerances for found in self._of_tolerance(one)]
+        return judge((*judged, *self.remarks), HEADLINES_OF_TOLERANCES if self.tolerances else HEADLINES)
+
+    def _of_tolerance(self, one: Deviations) -> Iterator[Remark]:
+        total = len(one.points)
+        if one.count(OUT):
+            names = [
+                self.points.names[j]
+                for j, decision in zip(one.points, one.decision, strict=True)
+                if decision == OUT
+            ]
+            yield remark("out_of_tolerance", tolerance=one.name, out=len(names), total=total, points=names)
+        if one.count(UNDECIDED):
+            yield remark(
+                "tolerance_undecided", tolerance=one.name, undecided=one.count(UNDECIDED), total=total
+            )
+        if one.count(UNKNOWN):
+            yield remark("tolerance_unknown", tolerance=one.name, unknown=one.count(UNKNOWN), total=total)
+        if one.missing:
+            yield remark("nominal_missing", tolerance=one.name, points=one.missing)
 
 
 def measure_result(
@@ -166,7 +195,7 @@ class _Work:
             quantities,
             tolerances,
             features.measure.coverage,
-            tuple(self.remarks(quantities, tolerances)),
+            tuple(self.remarks()),
         )
 
     def chosen(self, patterns: tuple[str, ...], what: str) -> IntArray:
@@ -321,11 +350,11 @@ class _Work:
         remarks = []
         if not np.isnan(variance):
             if self.points.depends_on_datum(function).any():
-                remarks.append("depends on the datum of a free network")
+                remarks.append(remark("datum_dependent"))
             if not self.points.correlated_among(function.points):
-                remarks.append("correlations of the points not known")
+                remarks.append(remark("correlations_unknown"))
         sigma = float(np.sqrt(max(variance, 0.0))) if not np.isnan(variance) else float("nan")
-        return Quantity(name, what, kind, float(function.value[0]), sigma, "; ".join(remarks))
+        return Quantity(name, what, kind, float(function.value[0]), sigma, tuple(remarks))
 
     def tolerance(self, one: ToleranceSettings) -> Deviations:
         lower = -one.upper if one.lower is None else one.lower
@@ -356,37 +385,28 @@ class _Work:
             offset=one.offset,
         )
 
-    def remarks(self, quantities: tuple[Quantity, ...], tolerances: tuple[Deviations, ...]) -> list[str]:
-        found = []
-        if self.points.covariance is None:
-            found.append("The result has no standard deviations: nothing is tested or decided.")
-        elif self.points.sample is not None:
-            found.append(
-                f"The covariance between points is known of {len(self.points.sample)} of "
-                f"{len(self.points.names)} points, those with names first: standard deviations of shapes and "
-                "distances of any others leave out the correlations of the points."
-            )
-        elif not self.points.correlated:
-            found.append(
-                "Only the covariance of each point by itself is known: standard deviations of shapes and "
-                "distances leave out the correlations of the points."
-            )
-        if not self.points.has_scale:
-            found.append("The scale is undefined: lengths are in network units.")
+    def remarks(self) -> Iterator[Remark]:
+        """Yield what limits the result, and what is wrong with its shapes."""
+        points = self.points
+        if points.covariance is None:
+            yield remark("no_precision")
+        elif points.sample is not None:
+            yield remark("covariance_of_sample", known=len(points.sample), total=len(points.names))
+        elif not points.correlated:
+            yield remark("covariance_of_single_points")
+        if not points.has_scale:
+            yield remark("network_units")
         for fit in self.shapes.values():
-            what = f"{fit.shape.kind.name} {fit.name}"
+            shape = f"{fit.shape.kind.name} {fit.name}"
             if not fit.converged:
-                found.append(f"{what} did not converge")
+                yield remark("shape_not_converged", shape=shape)
             if fit.fits is False:
-                found.append(
-                    f"{what}: residuals are {fit.sigma0:.3g} times what the precision of the points allows "
-                    f"(limit {np.sqrt(fit.critical):.3g}): its points deviate from this form"
+                yield remark(
+                    "shape_deviates", shape=shape, times=fit.sigma0, limit=float(np.sqrt(fit.critical))
                 )
             if not fit.used.all():
-                left = [self.points.names[j] for j in fit.points[~fit.used]]
-                found.append(f"{what}: left out {listed(left)}")
-        found += [f"{one.name}: not measured: {listed(one.missing)}" for one in tolerances if one.missing]
-        return found
+                left = [points.names[j] for j in fit.points[~fit.used]]
+                yield remark("shape_points_left_out", shape=shape, points=left)
 
 
 def _held(hold: HeldSettings) -> dict[str, float | tuple[float, ...]]:

@@ -10,7 +10,7 @@ import numpy as np
 
 from sfm.files.plain_text import csv_text, or_none
 from sfm.geometry.tolerance import DECISIONS
-from sfm.inspection.acceptance import NOT_KNOWN, Acceptance
+from sfm.inspection.acceptance import Acceptance
 from sfm.report.figures.measurements import length_error_figure
 from sfm.report.figures.plot_data import Plot
 from sfm.report.figures.plots import png
@@ -47,16 +47,16 @@ def write_acceptance(found: Acceptance, out: Path) -> Path:
         OutputError: the folder holds something else or cannot be written.
     """
     text = json.dumps(acceptance_summary(found), indent=2, ensure_ascii=False, allow_nan=False)
+    verdict = found.verdict
     page = render(
         "acceptance.html",
         t=found,
         title=found.name,
-        headline=found.headline,
-        level=found.verdict,
-        remarks=found.lacking,
+        headline=verdict.headline,
+        level=verdict.level,
+        remarks=verdict.lines,
         rows=acceptance_rows(found),
         decisions=DECISIONS,
-        not_known=NOT_KNOWN,
         picture=Plot("errors", PICTURE, png(length_error_figure(found))),
     )
     texts = (csv_text(COLUMNS, acceptance_rows(found)), text + "\n", page)
@@ -78,12 +78,14 @@ def acceptance_rows(found: Acceptance) -> list[tuple[object, ...]]:
 
 def acceptance_summary(found: Acceptance) -> dict[str, Any]:
     """Return what acceptance.json holds: plain values only, None for what is not known."""
+    verdict = found.verdict
     return {
         "test": "VDI/VDE 2634 part 1",
         "result": found.name,
         "length_unit": found.unit,
-        "headline": found.headline,
-        "verdict": found.verdict,
+        "headline": verdict.headline,
+        "verdict": verdict.level,
+        "remarks": [one.as_dict() for one in verdict.remarks],
         "limit": {"A": found.a, "K": found.k, "B": or_none(found.b)},
         "coverage": found.coverage,
         "lines": len(set(found.lengths.line)),
@@ -92,6 +94,4 @@ def acceptance_summary(found: Acceptance) -> dict[str, Any]:
         "largest_error": found.largest,
         "rms_error": float(np.sqrt((found.error**2).mean())),
         "body_diagonal": found.diagonal,
-        "lacking": list(found.lacking),
-        "not_known": NOT_KNOWN,
     }

@@ -127,8 +127,9 @@ def quantity_rows(found: Measurement) -> list[tuple[str, str, float, float, str,
     """Return the rows of quantities.csv, angles in degrees."""
     rows = []
     for one in found.quantities:
+        text = " ".join(said.text for said in one.remarks)
         factor, unit = (float(np.rad2deg(1.0)), "deg") if one.kind == "angle" else (1.0, found.unit)
-        rows.append((one.name, one.what, one.value * factor, one.sigma * factor, unit, one.remark))
+        rows.append((one.name, one.what, one.value * factor, one.sigma * factor, unit, text))
     return rows
 
 
@@ -169,8 +170,8 @@ def measurement_summary(found: Measurement) -> dict[str, Any]:
         "result": found.name,
         "length_unit": found.unit,
         "datum": found.points.datum,
-        "verdict": found.verdict,
-        "remarks": list(found.remarks),
+        "verdict": found.verdict.level,
+        "remarks": [one.as_dict() for one in found.verdict.remarks],
         "points": len(found.points.names),
         "groups": {name: [found.points.names[j] for j in members] for name, members in found.groups},
         "alignment": alignment,
@@ -217,8 +218,8 @@ def _shape_summary(found: Measurement, fit: ShapeFit) -> dict[str, Any]:
     }
 
 
-def headline(found: Measurement) -> str:
-    """Return in one line what was measured and whether tolerances are kept."""
+def counted(found: Measurement) -> str:
+    """Return in one line how much was measured, and how many deviations are decided in which way."""
     if not found.tolerances:
         parts = [f"{len(found.points.names)} points"]
         if found.shapes:
@@ -280,12 +281,14 @@ def measurement_page(found: Measurement, viewer: Viewer | None) -> str:
         for k, one in enumerate(found.tolerances)
         for figure in (deviation_figure(one, found.unit),)
     ]
+    verdict = found.verdict
     return render(
         "measurement.html",
         viewer=viewer,
         m=found,
-        headline=headline(found),
-        level=found.verdict,
+        headline=verdict.headline,
+        level=verdict.level,
+        remarks=verdict.lines,
         pictures=pictures,
         decisions=DECISIONS,
         parameters=[parameter_rows(fit, found.unit) for fit in found.shapes],

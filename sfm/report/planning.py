@@ -12,10 +12,10 @@ from sfm.adjustment.quality.statistics import POWER, reliability
 from sfm.conventions import FloatArray, angles_from_rotation
 from sfm.files.plain_text import csv_text, or_none
 from sfm.network import Estimate, ImagePoints, Network
+from sfm.planning.findings import verdict_of_plan
 from sfm.planning.plan import Plan
-from sfm.planning.prediction import MIN_POINTS
 from sfm.planning.target_size import MIN_PIXELS
-from sfm.planning.wanted import ALPHA, MIN_RAYS, found_displacement
+from sfm.planning.wanted import ALPHA, found_displacement
 from sfm.report.html.page import render
 from sfm.report.numbers import finer_unit, or_unlimited, significant
 from sfm.report.page_files import write_files
@@ -99,68 +99,6 @@ def write_plan(plan: Plan, out: Path) -> Path:
     return write_files(out, tuple(zip(FILES, texts, strict=True)), main=FILES[-1])
 
 
-def headline(plan: Plan) -> str:
-    """Return what the plan comes to, in a sentence."""
-    p = plan.prediction
-    m, n = len(p.stations), len(p.planned.names)
-    known = int(p.determined.sum())
-    lost = f", {n - known} of {n} points not determined" if known < n else ""
-    worst = _length(plan, float(p.sigma[p.determined].max()))
-    told = f"{m} photographs: sigma of points {_length(plan, p.rms_sigma)} RMS, {worst} at most{lost}"
-    if p.adjustment.undetermined:  # sigmas leave out what is not determined: nothing that is claimed
-        told = f"{m} photographs: the network is NOT determined ({_first(p.adjustment.undetermined)}){lost}"
-    few = int((p.rays < MIN_RAYS).sum())
-    told += f", {few} with fewer than {MIN_RAYS} rays" if few else ""
-    if not plan.wanted.anything:
-        return told
-    if plan.shortfall <= 1:
-        others = " at the others" if few or known < n else ""
-        return f"{told}; what is wanted is reached{others}"
-    by = f"{plan.shortfall:.2f} times what is wanted"
-    if not np.isfinite(plan.shortfall):
-        by = "points lack rays, or the network is not determined"
-    return f"{told}; what is wanted is NOT reached ({by})"
-
-
-def remarks(plan: Plan) -> list[str]:
-    """Return what limits the plan, one line each."""
-    said = []
-    if plan.design is not None and plan.design.limit:
-        said.append(f"What limits it: {plan.design.limit}.")
-    if plan.unusable:
-        said.append(
-            f"Photographs that share fewer than {MIN_POINTS} points with others: "
-            f"{', '.join(plan.unusable[:NAMED])}."
-        )
-    c = plan.calibration
-    if c is not None and not c.good:
-        lacking = [*c.reasons, *([_first(c.undetermined)] if c.undetermined else [])]
-        reasons = "; ".join(lacking) or "too few image points over the photograph"
-        said.append(
-            f"The camera cannot be calibrated with this network: {reasons}. Calibrate it before, or hold it."
-        )
-    if not len(plan.prediction.adjustment.network.scale_bars):
-        said.append(
-            "No scale bar: the scale is taken as known, and sigmas of points, lengths and displacements "
-            "leave it out; give --scale-bar."
-        )
-    if plan.prediction.planned.mesh is None:
-        said.append("Points without a surface: what hides them is not known.")
-    few = [s.station for s in plan.shots if s.coded < 5]
-    if few:
-        said.append(f"Fewer than 5 points for coded targets in: {', '.join(few[:NAMED])}.")
-    if np.isnan(plan.prediction.planned.normals).any():
-        said.append("Points without normals count as seen from everywhere: give nX, nY, nZ.")
-    if plan.seeing.sigma_px is None:
-        said.append(
-            "Sigma of image coordinates is what the targets allow; lens and sensor add to it: give "
-            "--sigma-px from an earlier survey."
-        )
-    if plan.seeing.depth is None:
-        said.append("Depth of field is not looked at: give --f-number and --focus.")
-    return said
-
-
 def figures(plan: Plan) -> list[tuple[str, str]]:
     """Return the figures of a plan, each with its unit."""
     p, a = plan.prediction, plan.prediction.adjustment
@@ -208,7 +146,7 @@ def figures(plan: Plan) -> list[tuple[str, str]]:
 
 def plan_page(plan: Plan) -> str:
     """Return the page: the scene to explore, figures, list of photographs, weak points and the camera."""
-    scene = plan_scene(plan)
+    scene, verdict = plan_scene(plan), verdict_of_plan(plan)
     factor, fine = finer_unit(plan.unit, plan.prediction.rms_sigma)
     return render(
         "plan.html",
@@ -216,9 +154,9 @@ def plan_page(plan: Plan) -> str:
         plan=plan,
         p=plan.prediction,
         title=plan.name,
-        headline=headline(plan),
-        level=_level(plan),
-        remarks=remarks(plan),
+        headline=verdict.headline,
+        level=verdict.level,
+        remarks=verdict.lines,
         figures=figures(plan),
         fine=fine,
         factor=factor,
@@ -251,13 +189,15 @@ def plan_scene(plan: Plan) -> ViewerScene:
 def plan_summary(plan: Plan) -> dict[str, Any]:
     """Return what plan.json holds: plain values only, None for what is not known."""
     p, c, camera = plan.prediction, plan.calibration, plan.prediction.camera
+    verdict = verdict_of_plan(plan)
     return {
         "name": plan.name,
         "unit": plan.unit,
-        "headline": headline(plan),
+        "headline": verdict.headline,
+        "verdict": verdict.level,
+        "remarks": [one.as_dict() for one in verdict.remarks],
         "reached": plan.reached,
         "shortfall": or_none(plan.shortfall),
-        "limits": remarks(plan),
         "wanted": {
             "sigma": plan.wanted.sigma,
             "length_sigma": plan.wanted.length_sigma,
@@ -333,13 +273,6 @@ def _points(plan: Plan) -> list[tuple[object, ...]]:
         )
         for j, name in enumerate(p.planned.names)
     ]
-
-
-def _level(plan: Plan) -> str:
-    if plan.prediction.adjustment.undetermined or not plan.prediction.determined.all():
-        return "bad"
-    calibrated = plan.calibration is None or plan.calibration.good
-    return "good" if plan.reached and calibrated else "fair"
 
 
 def _first(undetermined: tuple[str, ...]) -> str:

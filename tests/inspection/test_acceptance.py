@@ -16,6 +16,7 @@ from sfm.cli.app import app
 from sfm.errors import KolinearError, SurveyFileError
 from sfm.inspection.acceptance import Acceptance, CalibratedLengths, accept_result, read_lengths
 from sfm.network import Estimate, ImagePoints, Network
+from sfm.remarks.remark import remark
 from sfm.report.acceptance import write_acceptance
 from sfm.stored_result import StoredResult
 from tests.inspection.benches import one_bench
@@ -62,8 +63,7 @@ def accepted(result: StoredResult, lengths: CalibratedLengths, **options: Any) -
 
 def test_a_complete_test_is_proven(tmp_path: Path) -> None:
     found = accepted(*volume())
-    assert found.verdict == "good" and found.lacking == () and found.count("in") == 35
-    assert found.headline == "The limit is kept: all 35 lengths are proven to be inside."
+    assert found.verdict.level == "good" and found.lacking == () and found.count("in") == 35
     assert found.diagonal == pytest.approx(np.sqrt(3) * 1000)
     longest = int(np.argmax(found.lengths.length))
     assert found.limit[longest] == pytest.approx(0.02 + 2e-5 * np.sqrt(3) * 1000, rel=1e-5)
@@ -78,39 +78,35 @@ def test_a_complete_test_is_proven(tmp_path: Path) -> None:
 
 def test_errors_are_proven_or_undecided() -> None:
     found = accepted(*volume(error=0.2))
-    assert found.verdict == "bad" and found.decision[-1] == "out" and found.count("out") == 1
+    assert found.verdict.level == "bad" and found.decision[-1] == "out" and found.count("out") == 1
     assert found.error[-1] == pytest.approx(0.2, abs=5 * SIGMA)
     near = accepted(*volume(error=0.04))  # the limit at 1 m
-    assert (
-        near.decision[-1] == "undecided" and near.verdict == "fair" and "Nothing is proven" in near.headline
-    )
+    assert near.decision[-1] == "undecided" and near.verdict.level == "fair"
+    assert near.verdict.remarks[0].kind == "lengths_undecided"
     blind = accepted(*volume(sigma=0.0))
     unknown = replace(blind.lengths, sigma=np.full(35, np.nan))
     found = accepted(volume()[0], unknown)
     assert found.count("not known") == 35
-    assert found.lacking == (
-        "35 lengths without standard deviation of their calibration: nothing is decided",
-    )
+    assert found.lacking == ()
+    assert found.verdict.remarks[0].kind == "lengths_without_sigma" and found.verdict.level == "fair"
 
 
 def test_what_part_1_asks_for_and_the_data_lack_is_said() -> None:
     result, lengths = volume(lines=5)
     few = accepted(result, lengths, diagonal=4000.0)
-    assert few.lacking == (
-        "5 measuring lines, part 1 asks for at least 7",
-        f"longest length {lengths.length.max():.6g} mm, part 1 asks for two thirds of the body diagonal of "
-        "4000 mm",
-    )
-    assert few.verdict == "fair" and few.headline.endswith("but the test is not complete.")
+    lines, longest = few.lacking
+    assert lines.kind == "lines_missing" and (lines.number("lines"), lines.number("needed")) == (5, 7)
+    assert longest.kind == "longest_length_short" and longest.number("diagonal") == 4000
+    assert longest.number("longest") == lengths.length.max() and few.verdict.level == "fair"
     kept = np.arange(len(lengths.length)) != 0
     fewer = CalibratedLengths(*(tuple(np.array(x)[kept]) for x in (lengths.line, lengths.start, lengths.end)),
                               lengths.length[kept], lengths.sigma[kept])  # fmt: skip
-    assert "line 1: 4 lengths, part 1 asks for at least 5" in accepted(result, fewer).lacking
+    assert remark("line_short_of_lengths", line="1", lengths=4, needed=5) in accepted(result, fewer).lacking
     same = replace(lengths, line=tuple("A" if k == 0 else one for k, one in enumerate(lengths.line)))
     told = accepted(result, same).lacking
-    assert "lines A and 1 have one direction, part 1 asks for different ones" in told
+    assert remark("lines_parallel", lines=("A", "1")) in told
     crossed = replace(lengths, line=tuple("1" if one == "2" else one for one in lengths.line))
-    assert "line 1: its lengths are not on one line" in accepted(result, crossed).lacking
+    assert remark("line_not_straight", line="1") in accepted(result, crossed).lacking
 
 
 def test_a_scale_from_what_is_tested_is_refused() -> None:
@@ -169,7 +165,6 @@ def test_the_command_knows_where_the_scale_comes_from(tmp_path: Path) -> None:
     for limit, code in (("2e-3", 0), ("1e-4", 1)):
         told = CliRunner().invoke(app, [*words, "--limit-a", limit])
         assert told.exit_code == code, told.output
-    assert (
-        "1 of 1 lengths are proven to be outside" in told.output
-        and "part 1 asks for at least 7" in told.output
-    )
+    summary = json.loads((tmp_path / "out" / "acceptance.json").read_text(encoding="utf-8"))
+    kinds = [one["kind"] for one in summary["remarks"]]
+    assert kinds[:2] == ["lengths_outside", "lines_missing"] and summary["remarks"][0]["text"] in told.output

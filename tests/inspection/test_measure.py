@@ -17,7 +17,8 @@ from sfm.cli.app import app
 from sfm.errors import KolinearError
 from sfm.inspection.features_file import read_features_file
 from sfm.inspection.measure import Measurement, measure_result
-from sfm.report.measurement import headline, write_measurement
+from sfm.remarks.remark import kinds_of
+from sfm.report.measurement import counted, write_measurement
 from sfm.stored_result import StoredResult
 from tests.inspection.benches import (
     DIAMETERS,
@@ -134,14 +135,15 @@ def test_everything_is_measured_within_its_standard_deviations(tmp_path: Path) -
     truths = {"flange over plate": HEIGHT, "probe": 0.25, "rim c1": HEIGHT}
     for name, truth in {**truths, "squareness": np.pi / 2, "corner": np.pi / 2}.items():
         one = values[name]
-        assert abs(one.value - truth) < 4 * one.sigma and one.remark == "", name
+        assert abs(one.value - truth) < 4 * one.sigma and one.remarks == (), name
     assert values["probe"].sigma == pytest.approx(1e-5, rel=1e-6)
     # the system: the plate at Z = 0, the flange's centre on the Z axis
     np.testing.assert_allclose(flange.function.value[:2], 0, atol=1e-9)
     np.testing.assert_allclose(base.shape.axis, [0, 0, 1], atol=1e-9)
     assert [one.count("in") for one in found.tolerances] == [25, 85, 25]
-    assert found.tolerances[1].missing == ("nowhere",) and found.verdict == "fair"
-    assert headline(found).startswith("135 deviations judged by ISO 14253-1: 135 in")
+    assert found.tolerances[1].missing == ("nowhere",) and found.verdict.level == "fair"
+    assert kinds_of(found.verdict.remarks) == ("nominal_missing",)
+    assert counted(found).startswith("135 deviations judged by ISO 14253-1: 135 in")
     groups = dict(found.groups)
     assert len(groups["plate"]) == 25 and found.group_of(int(groups["plate"][0])) == "plate"
 
@@ -154,19 +156,19 @@ def test_tolerances_decide(tmp_path: Path) -> None:
     assert fair.count("undecided") > 0 and fair.count("in") > 0
     text = text.format(1.0).replace("[[group]]", '[measure]\nweights = "equal"\n[[group]]', 1)
     bare = measured(tmp_path, text, without_covariance(one_bench()))
-    assert bare.tolerances[0].count("not known") == 25 and bare.verdict == "fair"
-    assert "no standard deviations" in bare.remarks[0]
+    assert bare.tolerances[0].count("not known") == 25 and bare.verdict.level == "fair"
+    assert kinds_of(bare.verdict.remarks)[:2] == ("tolerance_unknown", "no_precision")
 
 
 def test_a_free_network_has_remarks_where_its_datum_counts(tmp_path: Path) -> None:
     result = replace(one_bench(), unit="network units")
     found = measured(tmp_path, '[[distance]]\nname = "d"\nfrom = "p1"\nto = "p2"\n', result)
-    assert found.quantities[0].remark == "depends on the datum of a free network"
-    assert found.remarks == ("The scale is undefined: lengths are in network units.",)
+    assert kinds_of(found.quantities[0].remarks) == ("datum_dependent",)
+    assert kinds_of(found.remarks) == ("network_units",)
     single = measured(
         tmp_path, '[[distance]]\nname = "d"\nfrom = "p1"\nto = "p2"\n', replace(result, covariance=None)
     )
-    assert "correlations of the points not known" in single.quantities[0].remark
+    assert "correlations_unknown" in kinds_of(single.quantities[0].remarks)
 
 
 def test_targets_stand_off_on_the_side_of_the_cameras(tmp_path: Path) -> None:
@@ -226,7 +228,7 @@ def test_the_folder_holds_tables_drawing_and_page(tmp_path: Path) -> None:
 
 def test_a_result_without_features_gives_its_points(tmp_path: Path) -> None:
     found = measure_result(one_bench())
-    assert headline(found) == "85 points." and found.verdict == "good"
+    assert counted(found) == "85 points." and found.verdict.level == "good"
     page = write_measurement(found, one_bench(), tmp_path / "out")
     assert page.is_file()
 

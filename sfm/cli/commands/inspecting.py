@@ -47,10 +47,11 @@ def measure(
     with loading():
         from adapters.formats.mesh import read_mesh
         from adapters.formats.registry import read_comparable
+        from sfm.cli.console import tell_verdict
         from sfm.files.manifest import refuse_foreign_folder
         from sfm.inspection.features_file import read_features_file
         from sfm.inspection.measure import measure_result
-        from sfm.report.measurement import headline, parameter_rows, quantity_rows, write_measurement
+        from sfm.report.measurement import counted, parameter_rows, quantity_rows, write_measurement
         from sfm.report.numbers import with_sigma
 
     refuse_foreign_folder(out)
@@ -59,7 +60,8 @@ def measure(
         result = read_comparable(source, from_format)
         found = measure_result(result, asked, paths=paths, read_mesh=read_mesh)
     page = write_measurement(found, result, out, drawings=_drawings(found))
-    print(headline(found))
+    tell_verdict(found.verdict)
+    print(counted(found))
     for fit in found.shapes:
         said = [
             f"{name} {' +- '.join(with_sigma(value, sigma))} {unit}"
@@ -74,8 +76,6 @@ def measure(
         print(f"{told}{f'; {remark}' if remark else ''}")
     if len(rows) > MAX_PRINTED:
         print(f"and {len(rows) - MAX_PRINTED} more in {page.with_name('quantities.csv')}")
-    for remark in found.remarks:
-        print(f"! {remark}")
     print(f"Report: {page}")
 
 
@@ -110,6 +110,7 @@ def accept(
     """
     with loading():
         from adapters.formats.result_tables import read_result, read_scale_sources
+        from sfm.cli.console import tell_verdict
         from sfm.files.manifest import refuse_foreign_folder
         from sfm.inspection.acceptance import accept_result, read_lengths
         from sfm.report.acceptance import write_acceptance
@@ -130,12 +131,10 @@ def accept(
         diagonal=diagonal,
     )
     page = write_acceptance(found, out)
-    print(found.headline)
+    tell_verdict(found.verdict)
     print(f"largest error of a length: {found.largest:.4g} {found.unit}")
-    for line in found.lacking:
-        print(f"! {line}")
     print(f"Report: {page}")
-    if found.verdict == "bad":
+    if found.verdict.level == "bad":
         raise SystemExit(NOT_KEPT)
 
 

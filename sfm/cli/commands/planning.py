@@ -187,15 +187,17 @@ def network_command(
     unit of --unit.
     """
     with loading():
+        from sfm.cli.console import tell_verdict
         from sfm.conventions import METRES
         from sfm.files.manifest import refuse_foreign_folder
         from sfm.planning.design.candidates import Allowed
         from sfm.planning.design.designer import design_network
+        from sfm.planning.findings import verdict_of_plan
         from sfm.planning.plan import describe_plan, plan_of
         from sfm.planning.sight.image_precision import TargetImage
         from sfm.planning.sight.visibility import Seeing
         from sfm.planning.wanted import Wanted
-        from sfm.report.planning import figures, headline, remarks, write_plan
+        from sfm.report.planning import figures, write_plan
 
     refuse_foreign_folder(out)
     if unit not in METRES:
@@ -238,15 +240,13 @@ def network_command(
             )
             found = describe_plan(name, unit, design.prediction, seeing, wanted, design.shortfall, design)
     page = write_plan(found, out)
-    print(headline(found))
+    tell_verdict(verdict_of_plan(found))
     for what, value in figures(found):
         print(f"  {what}: {value}")
     for weak in found.weak[:MAX_WEAK]:
         print(f"  weak: point {weak.name}: {weak.reason}")
     if len(found.weak) > MAX_WEAK:
         print(f"  ... and {len(found.weak) - MAX_WEAK} more weak points, in the page")
-    for remark in remarks(found):
-        print(f"! {remark}")
     print(f"Report: {page}")
 
 

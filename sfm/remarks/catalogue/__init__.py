@@ -16,8 +16,10 @@ from sfm.remarks.catalogue import (
     given_values,
     hypotheses,
     inputs,
+    measuring,
     other_programs,
     photographs,
+    plans,
     points,
     refining,
 )
@@ -36,6 +38,8 @@ SUBJECTS: Mapping[str, tuple[Kind, ...]] = MappingProxyType(
         "Refining": refining.ROWS,
         "Input": inputs.ROWS,
         "Comparisons and epochs": comparisons.ROWS,
+        "Measuring and acceptance": measuring.ROWS,
+        "Plans": plans.ROWS,
     }
 )
 KINDS: Mapping[str, Kind] = MappingProxyType({row.name: row for rows in SUBJECTS.values() for row in rows})

@@ -1,0 +1,101 @@
+"""What a planned network gives, and what limits it."""
+
+from __future__ import annotations
+
+from sfm.remarks.kind import Kind
+
+ROWS = (
+    Kind(
+        "plan_undetermined",
+        "error",
+        "The photographs do not determine the network: {unknown}.",
+        "too few photographs, or all from one direction",
+        "Add stations from other directions and distances, rolled about the axis.",
+    ),
+    Kind(
+        "plan_points_undetermined",
+        "error",
+        "{lost} of {total} points are not determined: {points}.",
+        "fewer than two photographs show them",
+        "Add stations that see them.",
+    ),
+    Kind(
+        "plan_short_of_wanted",
+        "warning",
+        "The uncertainty is {times} times that wanted.",
+        "too few photographs, or from too far away",
+        "Add stations, go nearer, or allow more photographs.",
+    ),
+    Kind(
+        "plan_points_with_few_rays",
+        "note",
+        "{few:point} {few:has|have} fewer than {needed} rays.",
+        "few photographs show them",
+        "Add stations that see them.",
+    ),
+    Kind(
+        "plan_does_not_calibrate",
+        "warning",
+        "The network does not determine the camera: {reasons}.",
+        "too few directions or rolls, or too little of the photographs is filled",
+        "Calibrate the camera before, or hold it.",
+    ),
+    Kind(
+        "plan_limited",
+        "note",
+        "The plan is limited: {limit}.",
+        "the allowed stations, distances or numbers of photographs",
+        "Allow more.",
+    ),
+    Kind(
+        "plan_photographs_apart",
+        "warning",
+        "{photographs:photograph} {photographs:shares|share} fewer than {needed} points with others: "
+        "{photographs}.",
+        "they overlap too little",
+        "Add photographs between them.",
+    ),
+    Kind(
+        "plan_without_scale",
+        "note",
+        "The scale is taken as known: without a scale bar, standard deviations leave it out.",
+        "no scale bar was planned",
+        "Give --scale-bar.",
+    ),
+    Kind(
+        "plan_without_surface",
+        "note",
+        "The points have no surface, so that hidden ones count as seen.",
+        "only points were given",
+        "Give a mesh.",
+    ),
+    Kind(
+        "plan_few_codes",
+        "note",
+        "{photographs:photograph} {photographs:has|have} fewer than {needed} places of coded targets: "
+        "{photographs}.",
+        "they show few points",
+        "Plan more coded targets there.",
+    ),
+    Kind(
+        "plan_without_normals",
+        "note",
+        "Points without normals count as seen from everywhere.",
+        "the table lacks nX, nY, nZ",
+        "Give nX, nY, nZ.",
+    ),
+    Kind(
+        "plan_sigma_of_targets",
+        "note",
+        "The standard deviation of image coordinates is what the targets allow; lens and sensor add to it.",
+        "no --sigma-px was given",
+        "Give --sigma-px from an earlier survey.",
+    ),
+    Kind(
+        "plan_without_depth_of_field",
+        "note",
+        "Depth of field is not considered.",
+        "no aperture was given",
+        "Give --f-number and --focus.",
+    ),
+)
