@@ -2,9 +2,9 @@
 
     python -m tests.mutate [COUNT [SEED]]       `make mutate`
 
-draws mutations of the rooms below, as many of each as it has room for: a comparison turned round, a sum in place
-of a difference, a threshold doubled or halved, a condition negated. Each is written into a copy of the project,
-the tests of its room run until one fails, and the table says which survived. Nothing is changed in the project.
+draws mutations of the rooms below: a comparison turned round, a sum in place of a difference, a threshold
+doubled or halved, a condition negated. Each is written into a copy of the project, the tests of its room run
+until one fails, and the table lists which survived. Nothing is changed in the project.
 """
 
 from __future__ import annotations

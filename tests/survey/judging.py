@@ -4,8 +4,8 @@
 
 runs surveys from scratch on the networks of `tests.survey.faults` from number FIRST on, groups right,
 ordinary, faults, rowless, and prints for each kind how often it is called bad or fair, and which is named.
-A result is wrong where a coordinate is more than 5 of its standard deviations from the truth; its fault can be
-detected where the residuals contradict the stated standard deviations, or the cause itself was rejected.
+A result is wrong where a coordinate is more than 5 of its standard deviations from the truth; its fault can
+be detected where the residuals contradict the stated standard deviations, or the cause itself was rejected.
 """
 
 from __future__ import annotations
