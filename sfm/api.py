@@ -21,6 +21,7 @@ from sfm.inspection.features_file import read_features_file
 from sfm.inspection.measure import Measurement, measure_result
 from sfm.network import Estimate, Network
 from sfm.pipeline import run_survey as run_stages
+from sfm.remarks.remark import Remark, remark
 from sfm.result import SurveyResult
 from sfm.runtime.cores import cores
 from sfm.runtime.progress import SILENT, Progress
@@ -274,11 +275,11 @@ def programs_of(backend: str, baseline: str, *, threads: int = -1) -> OtherProgr
     return others
 
 
-def sensor_widths(tell: Callable[[str], None]) -> Callable[[str, str], float | None]:
+def sensor_widths(tell: Callable[[Remark], None]) -> Callable[[str, str], float | None]:
     """Return COLMAP's list of the widths of camera sensors, mm, by make and model.
 
     Args:
-        tell: is told in one line of a camera that could not be looked up, as without pycolmap.
+        tell: is told of a camera that could not be looked up, as without pycolmap.
     """
     from adapters.colmap.sensor_widths import sensor_width_mm
 
@@ -286,7 +287,7 @@ def sensor_widths(tell: Callable[[str], None]) -> Callable[[str, str], float | N
         try:
             return sensor_width_mm(make, model)
         except BackendError as error:
-            tell(f"{make} {model} was not looked up in COLMAP's list of cameras: {error}")
+            tell(remark("sensor_not_looked_up", camera=f"{make} {model}", reason=str(error)))
             return None
 
     return width

@@ -12,6 +12,7 @@ import sfm
 from sfm import cli
 from sfm.errors import BackendError, KolinearError, MissingLibraryError
 from sfm.kernels import warmed
+from sfm.remarks.remark import Remark
 from sfm.runtime.executor import Call, Done, Event, Lost, Tell, Told, Work
 from sfm.runtime.in_process import in_process_engine
 from tests.surveys import write_observed_survey
@@ -117,9 +118,11 @@ def test_doctor_calls_the_core_sound(
 
 
 def test_a_camera_that_was_not_looked_up_is_told() -> None:
-    unknown: list[str] = []
+    unknown: list[Remark] = []
     assert sfm.api.sensor_widths(unknown.append)("OLYMPUS", "C4040Z") is None
-    assert unknown == [f"OLYMPUS C4040Z was not looked up in COLMAP's list of cameras: {INSTALL_PYCOLMAP}"]
+    (one,) = unknown
+    assert one.kind == "sensor_not_looked_up" and one.names("camera") == ("OLYMPUS C4040Z",)
+    assert one.names("reason") == (INSTALL_PYCOLMAP,)
 
 
 def double(value: int, *, tell: Tell) -> int:

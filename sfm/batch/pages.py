@@ -14,6 +14,8 @@ from sfm.errors import OutputError
 from sfm.files.manifest import MANIFEST, read_manifest, refuse_foreign_files
 from sfm.files.plain_text import as_plain, csv_text, is_plain
 from sfm.files.whole_files import whole_files
+from sfm.remarks.remark import Remark, remark
+from sfm.remarks.verdict import judge
 from sfm.report.html.page import render
 
 PAGES = ("batch.json", "batch.csv", "index.html")  # the first tells whose they are
@@ -68,6 +70,18 @@ def totals(rows: Sequence[SurveyRow]) -> dict[str, int]:
     }
 
 
+def batch_remarks(rows: Sequence[SurveyRow]) -> tuple[Remark, ...]:
+    """Return how the surveys of a batch ended, by name."""
+    kinds = {
+        "surveys_failed": [row.survey for row in rows if row.status == "failed"],
+        "surveys_set_aside": [row.survey for row in rows if row.status == "set aside"],
+        "surveys_not_dependable": [row.survey for row in rows if row.status == "done" and not row.succeeded],
+        "surveys_with_warnings": [row.survey for row in rows if row.verdict == "fair"],
+        "adjuster_differs_in_surveys": [row.survey for row in rows if row.comparison == "differs"],
+    }
+    return tuple(remark(kind, surveys=names) for kind, names in kinds.items() if names)
+
+
 def render_index(rows: Sequence[SurveyRow], name: str) -> str:
     """Return the page with a line for every survey.
 
@@ -75,20 +89,16 @@ def render_index(rows: Sequence[SurveyRow], name: str) -> str:
         rows: one per survey.
         name: of the batch.
     """
-    count = totals(rows)
     good = sum(row.succeeded for row in rows)
-    remarked = sum(row.verdict == "fair" for row in rows)
-    differs = sum(row.comparison == "differs" for row in rows)
-    remarks = [f"{count[word]} {word}" for word in ("failed", "set aside", "not dependable") if count[word]]
-    remarks += [f"{remarked} with remarks, told in the report"] if remarked else []
-    remarks += [f"{differs} where COLMAP's adjustment differs"] if differs else []
+    headline = f"{good} of {len(rows)} surveys {'has' if good == 1 else 'have'} a dependable result."
+    verdict = judge(batch_remarks(rows), {"good": headline, "fair": headline, "bad": headline})
     above = _common_folder(rows)
     return render(
         "batch.html",
         title=name,
-        headline=f"{good} of {len(rows)} surveys {'has' if good == 1 else 'have'} a dependable result.",
-        level="bad" if good < len(rows) else "fair" if remarked or differs else "good",
-        remarks=remarks,
+        headline=verdict.headline,
+        level=verdict.level,
+        remarks=verdict.lines,
         rows=rows,
         good=good,
         oriented=sum(row.photographs or 0 for row in rows),

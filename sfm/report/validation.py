@@ -12,7 +12,10 @@ from typing import Any
 import numpy as np
 
 from sfm.comparison.two_adjusters.adjuster_validation import SAME, SAME_COST, Trial, Validation
+from sfm.display import program_name
 from sfm.files.plain_text import csv_text, or_none
+from sfm.remarks.remark import Remark, remark
+from sfm.remarks.verdict import judge
 from sfm.report.figures.comparisons import time_figure
 from sfm.report.figures.plot_data import Plot
 from sfm.report.figures.plots import png
@@ -128,16 +131,30 @@ def in_words(value: float, unit: str) -> str:
     return f"{value:.1e} {unit}" if math.isfinite(value) else "nothing to compare"
 
 
+def validation_remarks(validation: Validation) -> tuple[Remark, ...]:
+    """Return in how many networks the adjusters differ, and in how many Kolinear is the worse one."""
+    count, same = len(validation.trials), dict(validation.counts()).get(SAME, 0)
+    remarks = []
+    if not validation.passed:
+        worse = sum(trial.worse for trial in validation.trials)
+        program = program_name(validation.backend)
+        remarks.append(remark("adjuster_worse_in_networks", worse=worse, networks=count, program=program))
+    if same < count:
+        remarks.append(remark("optima_differ_in_networks", differing=count - same, networks=count))
+    return tuple(remarks)
+
+
 def validation_page(validation: Validation) -> str:
     """Return the page: verdicts, largest differences, time, and every network."""
     count, same = len(validation.trials), dict(validation.counts()).get(SAME, 0)
-    worse = sum(trial.worse for trial in validation.trials)
-    judged = "nowhere the worse one" if validation.passed else f"the worse one in {worse}"
+    headline = f"{same} of {count} networks: both adjusters end at the same optimum."
+    verdict = judge(validation_remarks(validation), {"good": headline, "fair": headline, "bad": headline})
     return render(
         "validation.html",
         v=validation,
-        headline=f"{same} of {count} networks: both adjusters end at the same optimum. Kolinear is {judged}.",
-        level="bad" if not validation.passed else "good" if same == count else "fair",
+        headline=verdict.headline,
+        level=verdict.level,
+        remarks=verdict.lines,
         same=SAME,
         same_cost=SAME_COST,
         largest=[(name, in_words(value, unit)) for name, value, unit in largest(validation)],

@@ -25,12 +25,13 @@ from threadpoolctl import threadpool_info, threadpool_limits
 from adapters.dask_cluster import DaskEngine, _event, _OneThread, fitting_workers, local_engine, remote_engine
 from sfm.batch.finished import note_finished
 from sfm.batch.job import LOCK, SurveyJob, SurveyRow, reconstruct
-from sfm.batch.pages import render_index
+from sfm.batch.pages import batch_remarks, render_index
 from sfm.batch.run import calls_of, find_surveys, run_batch
 from sfm.errors import BackendError, KolinearError, OutputError, SurveyFileError
 from sfm.files.folder_lock import Owner, locked
 from sfm.files.manifest import MANIFEST, sha256_of
 from sfm.files.whole_files import write_manifest
+from sfm.remarks.remark import kinds_of
 from sfm.report.log import read_log
 from sfm.runtime.executor import Call, Done, Lost, Work
 from tests.engines import ALONE, HERE, KILLER, Notes, points_of, raise_unforeseen, return_nothing
@@ -633,3 +634,25 @@ def test_a_scheduler_started_separately_gives_the_same_bytes(
 
 def test_errors_of_a_batch_are_errors_of_kolinear() -> None:
     assert issubclass(BackendError, KolinearError)
+
+
+def test_the_remarks_of_a_batch_name_its_surveys() -> None:
+    def row(name: str, status: str = "done", **other: str) -> SurveyRow:
+        return SurveyRow(name, f"{name}.toml", name, status, **other)  # type: ignore[arg-type]
+
+    rows = [
+        row("a", verdict="good"),
+        row("b", verdict="fair", comparison="differs"),
+        row("c", verdict="bad"),
+        row("d", "failed"),
+        row("e", "set aside"),
+    ]
+    remarks = batch_remarks(rows)
+    assert {one.kind: one.names("surveys") for one in remarks} == {
+        "surveys_failed": ("d",),
+        "surveys_set_aside": ("e",),
+        "surveys_not_dependable": ("c",),
+        "surveys_with_warnings": ("b",),
+        "adjuster_differs_in_surveys": ("b",),
+    }
+    assert kinds_of(batch_remarks(rows[:1])) == ()

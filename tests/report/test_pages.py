@@ -22,7 +22,7 @@ from sfm.files.whole_files import remove_leftovers
 from sfm.network import Network
 from sfm.remarks.remark import kinds_of
 from sfm.report.differences import largest_difference, write_differences
-from sfm.report.validation import COLUMNS, write_validation
+from sfm.report.validation import COLUMNS, validation_remarks, write_validation
 from sfm.stored_result import StoredResult
 from tests.synthetic import make_network, seed_of
 
@@ -72,9 +72,13 @@ def test_validation_is_written_with_every_figure(tmp_path: Path) -> None:
 
 def test_a_worse_kolinear_is_said_first(tmp_path: Path) -> None:
     worse = trial(3, cost=9.0, verdict="different optima, colmap lower", worse=True)
-    page = write_validation(Validation("colmap", 7, (trial(0), worse)), tmp_path / "out").read_text()
-    assert '<div class="banner bad"><strong>1 of 2 networks' in page
-    assert "Kolinear is the worse one in 1." in page
+    validation = Validation("colmap", 7, (trial(0), worse))
+    remarks = validation_remarks(validation)
+    assert kinds_of(remarks) == ("adjuster_worse_in_networks", "optima_differ_in_networks")
+    assert remarks[0].number("worse") == 1 and remarks[1].number("differing") == 1
+    page = write_validation(validation, tmp_path / "out").read_text()
+    assert '<div class="banner bad"><strong>1 of 2 networks' in page and remarks[0].text in page
+    assert validation_remarks(Validation("colmap", 7, (trial(0),))) == ()
 
 
 def test_foreign_folders_are_left_alone(tmp_path: Path) -> None:

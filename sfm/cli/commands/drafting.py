@@ -15,6 +15,7 @@ from sfm.errors import OutputError
 from sfm.runtime.faults import working_on
 
 if TYPE_CHECKING:
+    from sfm.remarks.remark import Remark
     from sfm.survey.drafting.draft import Draft
 
 
@@ -82,7 +83,7 @@ def _draft(photographs: Path) -> Draft:
         from sfm.survey.measuring.measured_store import MeasuredStore
 
     compile_first()
-    unknown: list[str] = []
+    unknown: list[Remark] = []
     with working_on(str(photographs)), drawn_progress() as drawn, one_blas_thread():
         draft = draft_survey(
             photographs,
@@ -97,6 +98,7 @@ def _write(draft: Draft, file: Path) -> None:
     """Write a drafted survey, and tell on stderr what was found."""
     from sfm.files.plain_text import as_plain
     from sfm.files.whole_files import whole_file
+    from sfm.remarks.verdict import lines_of
 
     with whole_file(file) as part:
         try:
@@ -105,8 +107,9 @@ def _write(draft: Draft, file: Path) -> None:
             raise OutputError(f"{file}: a name in it is no text in UTF-8") from error
     for subject, finding in draft.found:
         print(as_plain(f"{subject}: {finding}"), file=sys.stderr)
-    for remark in draft.remarks:
-        print(as_plain(f"! {remark}"), file=sys.stderr)
+    for line in lines_of(draft.remarks):
+        mark = " " if line.severity == "note" else "!"
+        print(as_plain(f"{mark} {line.text} {line.remedy}".rstrip()), file=sys.stderr)
     for name, why in draft.left_out:
         print(as_plain(f"  left out: {name}: {why}"), file=sys.stderr)
     print(f"Survey file: {file}", file=sys.stderr)

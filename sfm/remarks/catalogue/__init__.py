@@ -10,9 +10,11 @@ from types import MappingProxyType
 
 from sfm.remarks.catalogue import (
     adjustment,
+    batches,
     cameras,
     comparisons,
     datum,
+    drafting,
     given_values,
     hypotheses,
     inputs,
@@ -36,6 +38,8 @@ SUBJECTS: Mapping[str, tuple[Kind, ...]] = MappingProxyType(
         "Scale bars, control and observed orientation": given_values.ROWS,
         "Other programs": other_programs.ROWS,
         "Refining": refining.ROWS,
+        "Drafts of survey files": drafting.ROWS,
+        "Batches and validation": batches.ROWS,
         "Input": inputs.ROWS,
         "Comparisons and epochs": comparisons.ROWS,
         "Measuring and acceptance": measuring.ROWS,

@@ -10,6 +10,7 @@ from fnmatch import fnmatchcase
 from glob import escape
 
 from sfm.photographs.exif import Metadata
+from sfm.remarks.remark import Remark, remark
 
 FOCAL_PER_SIDE = 1.2  # focal length over the longer side of the photograph, where nothing tells it
 FULL_FRAME_MM = 36.0  # longer side of the sensor, where nothing tells it
@@ -32,7 +33,7 @@ class CameraGroup:
     c_mm: float
     c_source: str
     assumed: bool  # whether pixel or principal distance is known from nowhere
-    remarks: tuple[str, ...]  # what a person should know of the photographs
+    remarks: tuple[Remark, ...]  # what a person should know of the photographs
 
 
 @dataclass(frozen=True)
@@ -106,7 +107,7 @@ def _group(
         c,
         c_source,
         assumed,
-        _remarks([metadata[name] for name in names]),
+        _remarks(label, {name: metadata[name] for name in names}),
     )
 
 
@@ -120,23 +121,30 @@ def _pixel(one: Metadata, sensor_width: SensorWidth) -> tuple[float | None, str]
     return None, ""
 
 
-def _remarks(own: list[Metadata]) -> tuple[str, ...]:
-    """What the files say that a survey should know."""
-    found = []
-    width, height = own[0].size_px
-    taken = [one.taken_px for one in own if one.taken_px and sorted(one.taken_px) != sorted(one.size_px)]
-    if taken:
-        found.append(
-            f"{len(taken)} of {len(own)} photographs are {width} x {height} px, their camera took "
-            f"{taken[0][0]} x {taken[0][1]} px: resampled or cropped, originals are better"
+def _remarks(camera: str, photographs: dict[str, Metadata]) -> tuple[Remark, ...]:
+    """Return what the files of the photographs of a camera state that a survey should know."""
+    remarks = []
+    resampled = {
+        name: one.taken_px
+        for name, one in photographs.items()
+        if one.taken_px and sorted(one.taken_px) != sorted(one.size_px)
+    }
+    if resampled:
+        name, taken = next(iter(resampled.items()))
+        size = photographs[name].size_px
+        remarks.append(
+            remark(
+                "photographs_resampled",
+                camera=camera,
+                photographs=list(resampled),
+                size=f"{size[0]} x {size[1]} px",
+                taken=f"{taken[0]} x {taken[1]} px",
+            )
         )
-    turned = sum(1 for one in own if one.orientation != 1)
+    turned = [name for name, one in photographs.items() if one.orientation != 1]
     if turned:
-        found.append(
-            f"{turned} of {len(own)} photographs are marked as turned; pixels are taken as they are stored, "
-            "as it must be for one camera"
-        )
-    return tuple(found)
+        remarks.append(remark("photographs_marked_as_turned", camera=camera, photographs=turned))
+    return tuple(remarks)
 
 
 def _alone(one: Metadata, main: Metadata) -> str:

@@ -7,13 +7,16 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
 from sfm.errors import GeometryError, PhotographError, SurveyFileError
 from sfm.files.plain_text import as_plain, is_plain
 from sfm.photographs.exif import Metadata, read_metadata
 from sfm.photographs.file_checks import conversion_of
+from sfm.remarks.remark import Remark, remark, unless_note
 from sfm.runtime.progress import SILENT, Progress
 from sfm.survey.drafting.camera_groups import CameraGroup, Grouping, SensorWidth, group_photographs
-from sfm.survey.drafting.target_trial import BLURRED_PX, MANY_TARGETS, TargetTrial, try_targets
+from sfm.survey.drafting.target_trial import MANY_TARGETS, TargetTrial, try_targets
 from sfm.survey.inputs.survey_file import is_own_file
 from sfm.survey.measuring.measured_store import MeasuredStore
 
@@ -31,7 +34,7 @@ class Draft:
     name: str
     text: str  # of the survey file
     found: tuple[tuple[str, str], ...]  # what was found, for the terminal: subject, finding
-    remarks: tuple[str, ...]  # what a person should look at
+    remarks: tuple[Remark, ...]  # what a person should look at
     left_out: tuple[tuple[str, str], ...]  # photographs and why
 
 
@@ -144,7 +147,7 @@ def _camera_lines(camera: CameraGroup) -> list[str]:
         'model = "brown"',
         f"free = {json.dumps(list(FREE))}",
     ]
-    return lines + [f"# {as_plain(remark)}" for remark in camera.remarks]
+    return lines + [f"# {as_plain(one.text)}" for one in camera.remarks]
 
 
 def _target_lines(trial: TargetTrial) -> list[str]:
@@ -190,30 +193,19 @@ def _found(grouping: Grouping, trial: TargetTrial) -> tuple[tuple[str, str], ...
     return tuple(found)
 
 
-def _remarks(grouping: Grouping, trial: TargetTrial) -> tuple[str, ...]:
-    remarks = [f"camera {camera.name}: {line}" for camera in grouping.cameras for line in camera.remarks]
+def _remarks(grouping: Grouping, trial: TargetTrial) -> tuple[Remark, ...]:
+    """Return what a person should know of the photographs and targets."""
+    remarks = [one for camera in grouping.cameras for one in camera.remarks]
     assumed = [camera.name for camera in grouping.cameras if camera.assumed]
     if assumed:
-        remarks.append(
-            f"camera {', '.join(assumed)}: the files do not tell the size of the pixels or the focal length; "
-            "shapes and angles do not depend on that, c in mm does. If it matters, give sensor_mm = [width, "
-            "height] and c_mm"
-        )
+        remarks.append(remark("camera_assumed", cameras=assumed))
     if len(grouping.cameras) > 1:
-        each = "; ".join(f"{camera.name} {len(camera.photographs)}" for camera in grouping.cameras)
-        remarks.append(
-            f"{len(grouping.cameras)} cameras or settings (photographs: {each}); make them one [[camera]] if "
-            "they are one"
-        )
-    if trial.blur_px > BLURRED_PX:
-        remarks.append(
-            f"edges of targets are blurred by {trial.blur_px:.1f} px (sigma): out of focus or shaken"
-        )
+        each = [f"{camera.name} ({len(camera.photographs)})" for camera in grouping.cameras]
+        remarks.append(remark("several_cameras", cameras=each))
+    if np.isfinite(trial.blur_px):
+        remarks += unless_note(remark("targets_blurred", blur=(trial.blur_px, "px")))
     if trial.codes == "none" and trial.circles >= MANY_TARGETS:
-        remarks.append(
-            f"{trial.circles:.0f} circles in a photograph, but no codes of a known family: photographs are "
-            "oriented by texture; coded targets among the circles would do it better"
-        )
+        remarks.append(remark("circles_without_codes", circles=round(trial.circles)))
     return tuple(remarks)
 
 

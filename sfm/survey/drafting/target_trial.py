@@ -24,7 +24,6 @@ TRIED = 3  # photographs, spread over the folder
 MIN_READABLE = 2
 MIN_REPEATED = 4  # codes that two photographs must have in common; four orient a photograph
 MIN_PROMISING = 3  # codes in the first photograph for which a family is tried on the others
-BLURRED_PX = 2.5  # standard deviation of the edges of targets
 MANY_TARGETS = 12  # circles in a photograph that are no chance finds
 
 

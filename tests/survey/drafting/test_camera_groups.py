@@ -81,7 +81,8 @@ def test_where_pixel_and_principal_distance_come_from() -> None:
 def test_resampled_and_turned_photographs_are_told() -> None:
     small = replace(PHONE, taken_px=(8000, 6000))
     (found,) = group_photographs({"a.jpg": small, "b.jpg": replace(small, orientation=6)}).cameras
-    assert any("took 8000 x 6000 px: resampled or cropped" in line for line in found.remarks)
-    assert any("1 of 2 photographs are marked as turned" in line for line in found.remarks)
+    resampled, turned = found.remarks
+    assert resampled.kind == "photographs_resampled" and resampled.names("taken") == ("8000 x 6000 px",)
+    assert turned.kind == "photographs_marked_as_turned" and turned.names("photographs") == ("b.jpg",)
     (found,) = group_photographs({"a.jpg": replace(PHONE, taken_px=(3000, 4000)), "b.jpg": PHONE}).cameras
     assert found.remarks == ()
