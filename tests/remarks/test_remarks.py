@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 
 import pytest
 
@@ -10,6 +11,7 @@ from sfm.remarks.catalogue import KINDS
 from sfm.remarks.kind import Grade, Kind
 from sfm.remarks.remark import Quantity, Remark, remark
 from sfm.remarks.verdict import judge
+from tests.places import ROOT
 
 HEADLINES = {"good": "It worked.", "fair": "It worked, with remarks.", "bad": "No result."}
 
@@ -86,3 +88,49 @@ def test_a_remark_is_plain_values_for_json() -> None:
     assert stored["kind"] == "sigma0_high" and stored["severity"] == "error"
     assert stored["numbers"]["stated"] == {"value": 0.1, "unit": "px"}
     assert stored["numbers"]["ratio"]["value"] is None
+
+
+LIMITS = {  # by kind: the number, and from where it is a warning and an error
+    "sigma0_high": ("ratio", 2.0, 5.0),
+    "residual_kept": ("over_sigma", 10.0, 30.0),
+    "image_points_rejected": ("share", 0.05, None),
+    "other_solution": ("moved", 0.0, 3.0),
+    "other_solution_reversed": ("moved", 0.0, 3.0),
+    "photographs_missing": ("share", 0.0, 0.5),
+    "c_far_from_given": ("share", 5e-4, None),
+    "c_hardly_determined": ("share", 0.05, None),
+    "principal_point_far": ("share", 0.1, None),
+    "key_points_not_measured": ("missing", 0.5, None),
+    "targets_blurred": ("blur", 2.5, None),
+}
+
+
+@pytest.mark.parametrize("kind", LIMITS)
+def test_limits_of_severity(kind: str) -> None:
+    number, warning, error = LIMITS[kind]
+
+    def severity(value: float) -> str:
+        return Remark(kind, numbers={number: Quantity(value)}).severity
+
+    if warning > 0:
+        assert severity(0.99 * warning) == "note"
+    assert severity(1.01 * warning) == "warning"
+    if error is not None:
+        assert severity(0.99 * error) == "warning" and severity(1.01 * error) == "error"
+
+
+def test_every_kind_is_made_somewhere() -> None:
+    source = "\n".join(
+        path.read_text(encoding="utf-8")
+        for path in (ROOT / "sfm").rglob("*.py")
+        if path.parent.name != "catalogue"
+    )
+    assert [kind for kind in KINDS if f'"{kind}"' not in source] == []
+
+
+def test_sentences_are_short_and_plain() -> None:
+    for name, row in KINDS.items():
+        plain = re.sub(r"\{\w+:(\w+)\|[^}]*\}", r"\1", row.sentence.replace("[[", "").replace("]]", ""))
+        for sentence in re.split(r"[.:;] ", plain):
+            assert len(sentence.split()) <= 25, f"{name}: {sentence}"
+        assert not re.search(r"\b(tell|tells|say|says|bear|bears|own|let go)\b", plain), name

@@ -15,7 +15,7 @@ ROWS = (
     Kind(
         "adjuster_fits_alike",
         "note",
-        "The image points do not tell the solutions of Kolinear and {program} apart: v'Pv differs by {gap} "
+        "The image points do not separate the solutions of Kolinear and {program}: v'Pv differs by {gap} "
         "variances.",
         "the network hardly determines the camera model of the comparison",
         "The survey stands; photograph from more directions and distances for a comparison of cameras.",
