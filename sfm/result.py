@@ -32,8 +32,12 @@ class FailedImage:
     """A photograph that is not part of the result."""
 
     image: str  # name of the photograph
-    reason: str  # one line: what was found and what was needed
-    copy_of: str = ""  # photograph that it is a copy of, and which counts for both
+    reason: Remark  # what was found and what was needed
+
+    @property
+    def is_copy(self) -> bool:
+        """Whether it is a copy of another photograph, which counts for both."""
+        return self.reason.kind == "photograph_copy"
 
 
 @dataclass(frozen=True)

@@ -39,7 +39,7 @@ def tell_result(findings: Findings, page: Path, *, seconds: float, verbose: bool
     console.print(table)
     tell_remarks(console, verdict.lines)
     for failed in result.failed:
-        console.print(Text(f"  {failed.image}: {failed.reason}"), soft_wrap=True)
+        console.print(Text(f"  {failed.image}: {failed.reason.text}"), soft_wrap=True)
     if verbose:
         console.print(_photograph_table(result))
         for camera in a.estimate.cameras:

@@ -161,7 +161,7 @@ def result_entries(findings: Findings) -> dict[str, Any]:
         "converged": a.converged,
         "comparison": "none" if both is None else both.outcome,
         "stored_photographs": [p.image for p in result.photographs if p.stored],
-        "failed_photographs": [{"image": f.image, "reason": f.reason} for f in result.failed],
+        "failed_photographs": [{"image": f.image, "reason": f.reason.as_dict()} for f in result.failed],
     }
 
 

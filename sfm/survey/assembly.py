@@ -37,7 +37,7 @@ def assemble_result(
     return SurveyResult(
         survey=survey.name,
         unit=survey.unit,
-        images_total=len(measured.images) - sum(bool(one.copy_of) for one in measured.failed),
+        images_total=len(measured.images) - sum(one.is_copy for one in measured.failed),
         failed=measured.failed + failed,
         adjustment=adjustment,
         code=np.full(len(points), -1) if naming is None else naming.codes(adjustment.network),

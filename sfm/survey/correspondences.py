@@ -16,7 +16,7 @@ from sfm.orientation.incremental.growth import residual_lengths
 from sfm.orientation.incremental.sequence import Orientation
 from sfm.orientation.intersection import intersect
 from sfm.reduced_network import reduce_network
-from sfm.remarks.remark import Remark
+from sfm.remarks.remark import Remark, remark
 from sfm.survey.adjusting.settling import MIN_IMAGE_POINTS, determined, merge_estimate
 from sfm.survey.adjusting.solution import TOLERANCE_FACTOR, Correspondences
 from sfm.survey.circles import check_circles
@@ -73,7 +73,7 @@ def find_correspondences(
     told = {name for name, _ in left_out}
     lost = start.estimate.oriented & ~circles.estimate.oriented
     left_out += tuple(
-        (photographs.names[i], f"fewer than {MIN_IMAGE_POINTS} accepted image points of the network")
+        (photographs.names[i], remark("photograph_with_few_accepted", needed=MIN_IMAGE_POINTS))
         for i in np.flatnonzero(lost)
         if photographs.names[i] not in told
     )
@@ -104,7 +104,7 @@ class _Matched:
 
 def _without_other_objects(
     survey: Survey, photographs: MeasuredPhotographs, naming: Naming, start: Orientation
-) -> tuple[_Matched, tuple[tuple[str, str], ...], tuple[Remark, ...]]:
+) -> tuple[_Matched, tuple[tuple[str, Remark], ...], tuple[Remark, ...]]:
     """Match, leave out the photographs whose codes contradict the others, and match the others again.
 
     Returns:

@@ -451,8 +451,9 @@ def test_small_survey_names_copies_and_reasons_and_starts_from_given_values(tmp_
     a = result.adjustment
     assert a.network.images == ("1.png", "2.png", "3.png") and a.converged
     reasons = {one.image: one.reason for one in result.failed}
-    assert reasons["copy.png"] == "identical to 2.png"
-    assert reasons["broken.png"] and "broken.png" not in reasons["broken.png"]  # the name stands beside it
+    assert reasons["copy.png"].names("original") == ("2.png",)
+    broken = reasons["broken.png"]
+    assert broken.kind == "photograph_unreadable" and "broken.png" not in broken.text  # stands beside it
     # the given values hold the datum of a free network up to what its inner constraints move
     _, truth, _ = _scene()
     assert np.abs(a.estimate.position - truth.position).max() < 0.02

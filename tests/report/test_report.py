@@ -83,7 +83,7 @@ def result(adjustment: Adjustment, tmp_path_factory: pytest.TempPathFactory) -> 
         survey="synthetic " + EVIL,
         unit="m",
         images_total=9,
-        failed=(FailedImage(EVIL + ".jpg", "not a photograph that can be decoded (3 bytes)"),),
+        failed=(FailedImage(EVIL + ".jpg", remark("photograph_unreadable", reason="3 bytes")),),
         adjustment=adjustment,
         code=np.where(np.arange(len(network.points)) < 10, np.arange(len(network.points)), -1),
         comparison=None,
@@ -156,7 +156,7 @@ def test_summary_says_what_the_adjustment_says(result: SurveyResult, tmp_path: P
     assert text["images"] == {
         "used": 8,
         "total": 9,
-        "failed": [{"image": result.failed[0].image, "reason": result.failed[0].reason}],
+        "failed": [{"image": result.failed[0].image, "reason": result.failed[0].reason.as_dict()}],
     }
     assert text["points"] == {"total": 40, "coded": 10, "uncoded": 30}
     assert text["observations"]["used"] + text["observations"]["rejected"] == len(a.rejected)
@@ -322,7 +322,7 @@ def test_every_remark_is_shown_once_by_every_renderer(
     for one in findings.verdict.remarks:
         assert words.count(one.text) == 1 and told.count(one.text) == 1
         assert page.count(str(escape(one.text))) == 1 and str(escape(one.row.remedy)) in page
-    assert f"{result.failed[0].image}: {result.failed[0].reason}" in words
+    assert f"{result.failed[0].image}: {result.failed[0].reason.text}" in words
     write_summary(findings, tmp_path)
     stored = json.loads((tmp_path / "summary.json").read_text(encoding="utf-8"))["verdict"]["remarks"]
     assert stored == [one.as_dict() for one in findings.verdict.remarks]

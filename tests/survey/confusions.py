@@ -105,7 +105,7 @@ def outcome(confusion: Confusion, folder: Path) -> str:
     except KolinearError as error:
         return f"{confusion.name:18} refused: {error}"
     a, verdict = result.adjustment, findings_of(result).verdict
-    told = [f"{one.image}: {one.reason}" for one in result.failed]
+    told = [f"{one.image}: {one.reason.text}" for one in result.failed]
     told += [one.text for one in of_kind(result.remarks, "camera_per_photograph")]
     told += [one.cause for one in result.explanations if one.explains][:1]
     counts = (

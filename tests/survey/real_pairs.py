@@ -122,7 +122,10 @@ def outcome(
         images,
         verdict.level,
         " | ".join(
-            (*[f"{one.image}: {one.reason}" for one in result.failed], *(one.text for one in verdict.remarks))
+            (
+                *[f"{one.image}: {one.reason.text}" for one in result.failed],
+                *(one.text for one in verdict.remarks),
+            )
         ),
         len(a.network.points),
         a.sigma0_px,

@@ -46,7 +46,7 @@ def test_photographs_saved_again_as_jpeg_count_once(
         cv2.imwrite(str(path.with_name(f"{path.stem}_again.png")), cv2.imdecode(data, cv2.IMREAD_GRAYSCALE))
     result = run_survey(read_survey(tmp_path / "s" / "survey.toml"))
     assert result.images_total == 6 and len(result.failed) == 6
-    assert [one.copy_of for one in result.failed] == sorted(plain.network.images)
+    assert [one.reason.names("original")[0] for one in result.failed] == sorted(plain.network.images)
     assert result.adjustment.redundancy == plain.adjustment.redundancy
     assert np.allclose(result.adjustment.covariance.points, plain.adjustment.covariance.points, rtol=1e-6)
 
@@ -84,5 +84,7 @@ def test_photographs_whose_errors_correlate(rho: float) -> None:
     else:
         assert found["image 6"][0] == "image 3" and abs(found["image 6"][1] - rho) < 0.1
         result = run_survey(survey_of(both, start, start=start))
-        assert [(one.image, one.copy_of) for one in result.failed] == [("image 6", "image 3")]
+        assert [(one.image, *one.reason.names("original")) for one in result.failed] == [
+            ("image 6", "image 3")
+        ]
     assert SAME_PLACE == 1e-3

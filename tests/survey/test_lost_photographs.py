@@ -13,6 +13,7 @@ from sfm.conventions import BoolArray
 from sfm.errors import GeometryError
 from sfm.network import Estimate, Network, empty_estimate
 from sfm.orientation.incremental.sequence import Orientation
+from sfm.remarks.remark import remark
 from sfm.report.findings.findings import findings_of
 from sfm.survey.diagnosis.lost_photographs import (
     lost_groups,
@@ -42,7 +43,7 @@ def partly(truth: Estimate, oriented: BoolArray) -> Estimate:
 
 def orientation(network: Network, estimate: Estimate) -> Orientation:
     failures = tuple(
-        (network.images[i], "0 points of the network seen, resection needs 4")
+        (network.images[i], remark("photograph_with_few_points", seen=0, needed=4))
         for i in np.flatnonzero(~estimate.oriented)
     )
     fits = np.ones(len(network.image_points), dtype=bool)
@@ -60,10 +61,7 @@ def test_groups_that_are_not_connected_are_told_with_what_would_connect_them() -
     assert lost.kind == "not_connected" and lost.number("oriented") == 6 and lost.number("needed") == 4
     assert lost.names("photographs") == ("image 7", "image 8", "image 9", "image 10")
     assert lost.names("shared") == ("21", "22") and lost.names("points") and lost.names("others")
-    assert found.failures[0] == (
-        "image 7",
-        "not connected: it has 2 points in common with the oriented photographs, at least 4 are needed",
-    )
+    assert found.failures[0] == ("image 7", remark("photograph_not_connected", shared=2, needed=4))
 
 
 def test_a_photograph_without_any_point_is_told_as_such() -> None:

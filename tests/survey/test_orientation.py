@@ -12,7 +12,7 @@ import pytest
 from sfm.conventions import angles_from_rotation
 from sfm.errors import GeometryError, SurveyFileError
 from sfm.pipeline import run_survey
-from sfm.remarks.remark import kinds_of
+from sfm.remarks.remark import Remark, kinds_of, remark
 from sfm.result import SurveyResult
 from sfm.survey.inputs.survey import read_survey
 from sfm.survey.measuring.measured_store import MeasuredStore
@@ -54,14 +54,18 @@ def write_exterior(path: Path, names: tuple[str, ...], position: np.ndarray, rot
     path.write_text("\n".join(rows) + "\n", encoding="utf-8")
 
 
+def copy_by(what: str) -> Remark:
+    return remark("photograph_copy", original="photo 2 again.png", what=what)
+
+
 def test_copies_of_a_photograph_are_no_observations(
     plain: SurveyResult, survey_file: Path, store: MeasuredStore, tmp_path: Path
 ) -> None:
     folder = changed(survey_file, tmp_path / "copies")
     shutil.copy(folder / "photo 2.png", folder / "photo 2 again.png")
     result = run_survey(read_survey(folder / "survey.toml"), store=store)
-    assert [(f.image, f.reason) for f in result.failed] == [("photo 2.png", "identical to photo 2 again.png")]
-    assert result.images_total == 6 and result.failed[0].copy_of == "photo 2 again.png"
+    assert [(f.image, f.reason) for f in result.failed] == [("photo 2.png", copy_by("its file"))]
+    assert result.images_total == 6 and result.failed[0].is_copy
     assert result.adjustment.redundancy == plain.adjustment.redundancy
 
 
@@ -71,9 +75,7 @@ def test_a_copy_with_another_byte_is_no_observation(
     folder = changed(survey_file, tmp_path / "saved again")
     (folder / "photo 2 again.png").write_bytes((folder / "photo 2.png").read_bytes() + b"\0")
     result = run_survey(read_survey(folder / "survey.toml"), store=store)
-    assert [(f.image, f.reason) for f in result.failed] == [
-        ("photo 2.png", "the same picture as photo 2 again.png")
-    ]
+    assert [(f.image, f.reason) for f in result.failed] == [("photo 2.png", copy_by("its picture"))]
     assert result.adjustment.redundancy == plain.adjustment.redundancy
 
 
@@ -100,11 +102,11 @@ def test_unreadable_files_are_named_once_with_their_reason(
     for keep in (store, None):
         result = run_survey(read_survey(folder / "survey.toml"), store=keep)
         assert [f.image for f in result.failed] == ["photo 1.png", "photo 2.png"]
-        assert result.failed[0].reason == "the file is empty"
-        assert result.failed[1].reason.startswith("the file is truncated")
+        assert result.failed[0].reason.names("reason") == ("the file is empty",)
+        assert result.failed[1].reason.names("reason")[0].startswith("the file is truncated")
     for number in (3, 4, 5):
         (folder / f"photo {number}.png").write_bytes(b"")
-    with pytest.raises(GeometryError, match=r": 1 readable .* \(photo 1.png: the file is empty; "):
+    with pytest.raises(GeometryError, match=r": 1 readable .*photo 1.png: Not readable: the file is empty"):
         run_survey(read_survey(folder / "survey.toml"), store=store)
 
 

@@ -9,7 +9,7 @@ import pytest
 
 from sfm.network import Estimate, ImagePoints, Network
 from sfm.pipeline import run_survey
-from sfm.remarks.remark import kinds_of
+from sfm.remarks.remark import kinds_of, remark
 from sfm.report.findings.findings import findings_of
 from sfm.survey.inputs.checks.same_photographs import same_photographs
 from sfm.survey.inputs.given import KnownPoints, ScaleBar
@@ -107,7 +107,7 @@ def test_a_copy_among_the_image_points_is_no_photograph() -> None:
     )
     result, plain = (run_survey(survey_of(one, truth)) for one in (copied, network))
     assert [(one.image, one.reason) for one in result.failed] == [
-        ("again", "its image points are those of image 4")
+        ("again", remark("photograph_copy", original="image 4", what="its image points"))
     ]
     assert result.adjustment.redundancy == plain.adjustment.redundancy and result.images_total == 8
 

@@ -18,6 +18,7 @@ from sfm.orientation.incremental.support import photograph_support
 from sfm.orientation.intersection import intersect
 from sfm.orientation.resection.ransac import RobustResection, fewest_fitting, resect_robust
 from sfm.reduced_network import reduce_network
+from sfm.remarks.remark import Remark, remark
 
 FIRST_ADJUSTMENT = 4  # photographs
 MIN_ANGLE_DEG = 2.0  # smallest ray angle of a point that others are oriented on
@@ -42,7 +43,7 @@ class Growth:
         self.tolerance_px = tolerance_px
         self.start_tolerance_px = tolerance_px
         self.min_points = min_points
-        self.reasons: dict[int, str] = {}  # why a photograph is not oriented
+        self.reasons: dict[int, Remark] = {}  # why a photograph is not oriented
         self.dropped = np.zeros(len(network.images), dtype=bool)  # does not belong, (m,)
         area = [np.prod(camera.size_px) / camera.c_px**2 for camera in estimate.cameras]
         self.field = np.array(area)[network.camera]  # area of each photograph, squared tangents, (m,)
@@ -130,7 +131,9 @@ class Growth:
         count = np.bincount(seen.image[known], minlength=len(self.network.images))
         if not len(waiting) or count[waiting].max() < self.min_points:
             for i in waiting.tolist():
-                self.reasons[i] = _too_few(int(count[i]), self.min_points)
+                self.reasons[i] = remark(
+                    "photograph_with_few_points", seen=int(count[i]), needed=self.min_points
+                )
             return 0
         best = count[waiting].max()
         order = waiting[np.argsort(-count[waiting], kind="stable")].tolist()
@@ -166,7 +169,7 @@ class Growth:
             camera = self.estimate.cameras[self.network.camera[i]]
             if not result.found:
                 if not np.isfinite(position[i]).all():
-                    self.reasons[i] = result.reason
+                    self.reasons[i] = remark("photograph_not_resected", reason=result.reason)
                 continue
             if np.isfinite(position[i]).all():
                 limit = self.tolerance_px[self.network.camera[i]] ** 2
@@ -300,15 +303,17 @@ class Growth:
             worst = weak[np.argsort(share[weak], kind="stable")][: max(1, len(weak) // WEAK_PER_ROUND)]
             for i in worst.tolist():
                 if few[i]:
-                    self.reasons[i] = (
-                        f"only {found.fitting[i]} of its {found.known[i]} points fit the network, "
-                        f"{needed[i]} are needed"
+                    self.reasons[i] = remark(
+                        "photograph_with_few_fitting",
+                        fitting=int(found.fitting[i]),
+                        points=int(found.known[i]),
+                        needed=int(needed[i]),
                     )
                 else:
-                    self.reasons[i] = (
-                        f"{found.confirmed[i]} conditions of its points confirm the network, "
-                        f"{found.against[i]} of its points contradict it: "
-                        "another object, a mirrored picture or wrong codes"
+                    self.reasons[i] = remark(
+                        "photograph_contradicting",
+                        confirmed=int(found.confirmed[i]),
+                        against=int(found.against[i]),
                     )
             self.dropped[worst] = True
             self.release(worst)
@@ -375,7 +380,3 @@ def _determined_early(camera: Camera) -> BoolArray:
     early = camera.plays(Role.FOCAL)
     early[np.flatnonzero(camera.plays(Role.RADIAL))[:1]] = True
     return early
-
-
-def _too_few(count: int, needed: int) -> str:
-    return f"{count} point{'' if count == 1 else 's'} of the network seen, resection needs {needed}"

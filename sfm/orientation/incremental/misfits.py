@@ -14,6 +14,7 @@ from sfm.conventions import FloatArray
 from sfm.network import rows_of
 from sfm.orientation.incremental.growth import Growth, Refine
 from sfm.orientation.incremental.rivals import CONTRADICTING
+from sfm.remarks.remark import remark
 
 MIN_OTHERS = 3  # oriented photographs that one is judged by
 WORSE = 1.5  # times the typical median residual of a photograph, from which on it is looked at turned over
@@ -31,7 +32,7 @@ def judge_misfits(growth: Growth, refine: Refine | None) -> bool:
         Whether a photograph came or went, so that the network is to be settled anew.
     """
     changed = False
-    for i in [k for k, reason in growth.reasons.items() if reason == CONTRADICTING]:
+    for i in [k for k, reason in growth.reasons.items() if reason.kind == CONTRADICTING]:
         if not _is_mirrored(growth, i) and growth.resect([i]):
             growth.dropped[i], changed = False, True
     looked_at = ~growth.estimate.oriented
@@ -60,10 +61,8 @@ def _is_mirrored(growth: Growth, i: int) -> bool:
     as_it_is, turned = _median_px(growth, i), _median_px(growth, i, turned_over=True)
     mirrored = FAR_BETTER * turned < as_it_is
     if mirrored:
-        left = f"{as_it_is:.2g} px" if np.isfinite(as_it_is) else "undefined"
-        growth.reasons[i] = (
-            f"a mirrored picture: its median residual is {left} as it is and {turned:.2g} px turned over"
-        )
+        before = (as_it_is, "px") if np.isfinite(as_it_is) else None
+        growth.reasons[i] = remark("photograph_mirrored", before=before, turned=(turned, "px"))
     return mirrored
 
 

@@ -22,6 +22,7 @@ from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.depth_reversal import reverse_depth
 from sfm.network import rows_of
 from sfm.orientation.incremental.growth import Growth, Refine
+from sfm.remarks.remark import remark
 
 DOUBTFUL = 30.0  # times the RMS residual of a solution, below which its reversal casts doubt on it
 SMALLER_TOLERANCES = (
@@ -29,7 +30,7 @@ SMALLER_TOLERANCES = (
     1 / 10,
 )  # of the first start tolerance, from which a solution in doubt is followed
 FAR_WORSE = 3.0  # times the median residual of all photographs, of one that may not belong to them
-CONTRADICTING = "its image points contradict the others: another object or wrong names"
+CONTRADICTING = "photograph_against_the_others"
 BOUND = 6.0  # times the median residual of the best solution: what lies farther off counts as that
 
 
@@ -67,7 +68,7 @@ def reversed_growth(growth: Growth, empty: Growth, refine: Refine, without: Bool
     empty.fixed, empty.tolerance_px = growth.fixed.copy(), growth.tolerance_px.copy()
     empty.dropped, empty.reasons = growth.dropped | without, dict(growth.reasons)
     for i in np.flatnonzero(without).tolist():
-        empty.reasons[i] = CONTRADICTING
+        empty.reasons[i] = remark(CONTRADICTING)
     empty.refined(refine, everything=True)
     return empty
 

@@ -52,7 +52,7 @@ class Orientation:
     """Approximate values of a whole network and what could not be had."""
 
     estimate: Estimate  # NaN for photographs and points that are not determined
-    failures: tuple[tuple[str, str], ...]  # (name of the photograph, reason)
+    failures: tuple[tuple[str, Remark], ...]  # (name of the photograph, reason)
     point_failures: tuple[tuple[str, Remark], ...]  # (name of the point, reason)
     pair: tuple[str, str] | None  # photographs it started from; None: from control or given values
     kind: str  # start: spatial | planar | control | given
@@ -291,18 +291,19 @@ def _finish(growth: Growth, start: Start, cameras: tuple[Camera, ...], *, contra
     )
 
 
-def _failures(growth: Growth) -> tuple[tuple[str, str], ...]:
+def _failures(growth: Growth) -> tuple[tuple[str, Remark], ...]:
     """Return (name, reason) of every photograph that is not oriented."""
+    few = remark("photograph_with_few_points", seen=0, needed=growth.min_points)
     return tuple(
-        (growth.network.images[i], growth.reasons.get(int(i), "shares too few points with the others"))
+        (growth.network.images[i], growth.reasons.get(int(i), few))
         for i in np.flatnonzero(~growth.estimate.oriented)
     )
 
 
-def _words_of_failures(failures: tuple[tuple[str, str], ...]) -> str:
+def _words_of_failures(failures: tuple[tuple[str, Remark], ...]) -> str:
     """Return the reasons with the photographs that they are of, each reason once."""
     of_reason: dict[str, list[str]] = {}
     for name, reason in failures:
-        of_reason.setdefault(reason, []).append(name)
+        of_reason.setdefault(reason.text.rstrip("."), []).append(name)
     words = (f"{listed(names, most=10)}: {reason}" for reason, names in of_reason.items())
     return listed(words, most=10, separator="; ")

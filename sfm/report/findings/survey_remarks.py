@@ -63,7 +63,7 @@ def photograph_remarks(result: SurveyResult) -> tuple[Remark, ...]:
     """Return how many photographs are not in the result, and which are copies of others."""
     oriented, total = len(result.adjustment.network.images), result.images_total
     missing = total - oriented
-    copies = [one.image for one in result.failed if one.copy_of]
+    copies = [one.image for one in result.failed if one.is_copy]
     found = (remark("copies", copies=copies),) if copies else ()
     if not missing:
         return found

@@ -136,7 +136,7 @@ def target_rows(findings: Findings) -> Iterable[Sequence[object]]:
 def left_out_rows(findings: Findings) -> Iterable[Sequence[object]]:
     """Return kind, name, image points and reason of every photograph and point that is not in the result."""
     for failed in findings.result.failed:
-        yield ("photograph", failed.image, None, failed.reason)
+        yield ("photograph", failed.image, None, failed.reason.text)
     for one in findings.result.left_out:
         yield ("point", one.point, one.image_points, one.reason.text)
 

@@ -68,7 +68,7 @@ def _figures(findings: Findings) -> dict[str, Any]:
         "images": {
             "used": len(adjustment.network.images),
             "total": result.images_total,
-            "failed": [{"image": f.image, "reason": f.reason} for f in result.failed],
+            "failed": [{"image": f.image, "reason": f.reason.as_dict()} for f in result.failed],
         },
         "points": {"total": len(result.code), "coded": coded, "uncoded": len(result.code) - coded},
         "observations": {

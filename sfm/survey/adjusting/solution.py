@@ -75,7 +75,7 @@ class Correspondences:
     remarks: tuple[Remark, ...] = ()
     point_failures: tuple[tuple[str, Remark], ...] = ()  # points without approximate values, with the reason
     given: bool = False  # whether the survey's own approximate values were what the orientation started from
-    left_out: tuple[tuple[str, str], ...] = ()  # photographs of another object, with the reason
+    left_out: tuple[tuple[str, Remark], ...] = ()  # photographs of another object, with the reason
     suspected: tuple[str, ...] = ()  # photographs that could be matched with a camera of their own only
     overlays: tuple[PhotographTargets, ...] | None = None  # what the report draws; None as it was measured
 
@@ -86,7 +86,7 @@ class Solution:
 
     adjustment: Adjustment
     control_check: ControlCheck | None  # None without control or where the datum is control
-    dropped_images: tuple[tuple[str, str], ...]  # photographs that lost their points, with the reason
+    dropped_images: tuple[tuple[str, Remark], ...]  # photographs that lost their points, with the reason
     remarks: tuple[Remark, ...]
     left_out: tuple[LeftOutPoint, ...]  # measured points that are not in it
     unused_image_points: int  # of points and photographs that are not in it
@@ -379,12 +379,12 @@ def _placed(start: _Prepared, task: Task, settled: Settled) -> tuple[Adjustment,
     return adjust_finally(task, settled.part, last, settled.rejected), check
 
 
-def _dropped(start: _Prepared, solved: _Solved) -> tuple[tuple[str, str], ...]:
+def _dropped(start: _Prepared, solved: _Solved) -> tuple[tuple[str, Remark], ...]:
     """Return the photographs that had an orientation and are not in the result, with the reason."""
     reasons = {} if solved.treated is None else dict(solved.treated.left_out)
     task = start.task
     return tuple(
-        (name, reasons.get(name, f"fewer than {fewest} accepted image points of the network"))
+        (name, reasons.get(name, remark("photograph_with_few_accepted", needed=int(fewest))))
         for name, was, is_in, fewest in zip(
             task.network.images, start.oriented, solved.settled.images, task.least, strict=True
         )

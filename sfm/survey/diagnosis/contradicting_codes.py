@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections import Counter
 from dataclasses import dataclass
 
-from sfm.display import listed
 from sfm.remarks.remark import Remark, remark
 from sfm.survey.inputs.measurements import MeasuredPhotographs, Naming
 from sfm.survey.target_network import UNNAMED
@@ -27,7 +26,7 @@ class ContestedCodes:
 
     places: dict[int, dict[int, frozenset[int]]]
     """of each such code, by photograph, the points that it is read at; none where its ray meets no others"""
-    left_out: dict[int, str]
+    left_out: dict[int, Remark]
     """photographs that show another object, with the reason"""
     main: dict[int, int]
     """point that is the place of a code in the largest group, where it has one"""
@@ -59,7 +58,7 @@ def find_contested_codes(photographs: MeasuredPhotographs, naming: Naming) -> Co
     for image, codes in foreign.items():
         group = next(one for one in groups if image in one)
         others = [photographs.names[k] for k in sorted(group & foreign.keys() - {image})]
-        left_out[image] = _words_of_foreign(codes, others)
+        left_out[image] = _foreign(codes, others)
     main = {code: place for code, places in contested.items() if (place := _most(places, own)) != UNNAMED}
     return ContestedCodes(contested, left_out, main)
 
@@ -163,14 +162,10 @@ def _most(places: dict[int, frozenset[int]], group: frozenset[int]) -> int:
     return min(counted, key=lambda k: (-counted[k], k)) if counted else UNNAMED
 
 
-def _words_of_foreign(codes: set[int], others: list[str]) -> str:
-    named = f"{len(codes)} of its codes ({listed(map(str, sorted(codes)))}) are elsewhere than in the others"
-    if others:
-        return (
-            f"{named}, and {listed(others)} agree{'s' if len(others) == 1 else ''} with it: a second object "
-            "with the same codes, or this one in another state; survey it by itself"
-        )
-    return f"{named}: another object with the same codes, this one in another state, or wrong codes"
+def _foreign(codes: set[int], agreeing: list[str]) -> Remark:
+    """Return why a photograph of another object is not in the result."""
+    numbers = [str(code) for code in sorted(codes)]
+    return remark("photograph_with_codes_elsewhere", codes=numbers, agreeing=agreeing or None)
 
 
 def _number(code: int, naming: Naming) -> int:

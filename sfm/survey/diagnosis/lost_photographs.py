@@ -43,10 +43,7 @@ def tell_lost_photographs(network: Network, found: Orientation) -> Orientation:
     for group in groups:
         for i in group.images:
             count = int(np.isin(_points_of(network, [i]), group.shared).sum())
-            reasons[network.images[i]] = (
-                f"not connected: it has {count} point{'' if count == 1 else 's'} in common with the oriented "
-                f"photographs, at least {MIN_POINTS} are needed"
-            )
+            reasons[network.images[i]] = remark("photograph_not_connected", shared=count, needed=MIN_POINTS)
     groups.sort(key=lambda one: -len(one.images))
     remarks = (_not_connected(network, oriented, group) for group in groups)
     failures = tuple((image, reasons[image]) for image, _ in found.failures)

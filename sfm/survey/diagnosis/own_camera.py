@@ -41,7 +41,7 @@ class Treated:
 
     network: Network
     estimate: Estimate
-    left_out: tuple[tuple[str, str], ...]  # (name of the photograph, reason)
+    left_out: tuple[tuple[str, Remark], ...]  # (name of the photograph, reason)
     remarks: tuple[Remark, ...]  # on those with a camera of their own
     own: tuple[str, ...]  # names of these
     without: BoolArray  # photographs that are left out, (m,)
@@ -111,8 +111,11 @@ def treat_lost(
                 left.append(
                     (
                         name,
-                        f"{count[i] - kept[i]} of its {count[i]} points contradict the network, and no c of "
-                        "its own explains them: another state of the object, another object or wrong codes",
+                        remark(
+                            "photograph_not_explained",
+                            against=int(count[i] - kept[i]),
+                            points=int(count[i]),
+                        ),
                     )
                 )
             out[i] = True

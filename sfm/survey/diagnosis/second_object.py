@@ -8,11 +8,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sfm.conventions import FloatArray
-from sfm.display import listed
 from sfm.errors import GeometryError
 from sfm.network import Estimate, Network, empty_estimate, rows_of
 from sfm.orientation.incremental.sequence import MIN_POINTS, Orientation
 from sfm.reduced_network import reduce_network
+from sfm.remarks.remark import Remark, remark
 from sfm.similarity import fit_similarity
 
 FITTING = 0.8  # of the image points of a group that must fit in it for the group to confirm itself
@@ -34,13 +34,10 @@ class SecondObject:
         return self.misfit > OTHER_SHAPE
 
     @property
-    def reason(self) -> str:
-        """What is said of each of the photographs."""
-        named = listed(self.images)
-        return (
-            f"{named} fit one another and not the others: {self.points} common points differ by "
-            f"{100 * self.misfit:.0f} % of their spread after a similarity: a second object with the same "
-            "codes, or this one in another state; survey them by themselves"
+    def reason(self) -> Remark:
+        """Why each of the photographs is not in the result."""
+        return remark(
+            "photograph_of_second_object", photographs=self.images, points=self.points, misfit=self.misfit
         )
 
 

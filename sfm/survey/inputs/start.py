@@ -62,7 +62,7 @@ def measurements_from_observations(survey: Survey) -> Measurements:
     rows = own[image] & ~outside
     number = np.cumsum(own) - 1
     failed = tuple(
-        FailedImage(every[i], f"its image points are those of {every[j]}", copy_of=every[j])
+        FailedImage(every[i], remark("photograph_copy", original=every[j], what="its image points"))
         for i, j in copies.items()
     )
     images, owner = tuple(name for name, keep in zip(images, own, strict=True) if keep), owner[own]

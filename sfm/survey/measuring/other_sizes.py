@@ -46,7 +46,7 @@ def separate_sizes(survey: Survey, files: PhotographList) -> OtherSizes:
     """
     sizes = [_size(path) for path in files.paths]
     cameras, owner = list(survey.cameras), files.camera.copy()
-    left: dict[int, str] = {}
+    left: dict[int, Remark] = {}
     remarks = []
     for number, camera in enumerate(survey.cameras):
         counted: dict[Size, list[int]] = {}
@@ -62,10 +62,13 @@ def separate_sizes(survey: Survey, files: PhotographList) -> OtherSizes:
             what = _kind(size, main)
             held = _held(camera) and what != RESAMPLED
             if len(rows) < MIN_OWN or held:
-                why = "its calibration does not hold there" if held else f"{MIN_OWN} of them would be one"
-                reason = (
-                    f"{size[0]} x {size[1]} px, the others of camera {camera.name} have "
-                    f"{main[0]} x {main[1]} px: {what}, which is another camera; {why}"
+                reason = remark(
+                    "photograph_outside_calibration" if held else "photograph_of_other_size",
+                    camera=camera.name,
+                    size=f"{size[0]} x {size[1]} px",
+                    usual=f"{main[0]} x {main[1]} px",
+                    what=what,
+                    needed=MIN_OWN,
                 )
                 left |= dict.fromkeys(rows, reason)
                 continue

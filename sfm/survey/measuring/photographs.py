@@ -11,6 +11,7 @@ from typing import TypeVar
 
 from sfm.display import listed
 from sfm.errors import GeometryError, PhotographError
+from sfm.remarks.remark import remark
 from sfm.result import FailedImage
 from sfm.runtime.faults import working_on
 from sfm.runtime.progress import SILENT, Progress
@@ -57,7 +58,7 @@ def each_photograph(
             originals.append(k)
         else:
             original = photographs.names[first]
-            failed[k] = FailedImage(name, f"identical to {original}", copy_of=original)
+            failed[k] = FailedImage(name, remark("photograph_copy", original=original, what="its file"))
             progress.advance(name)
 
     def work_on(k: int) -> T:
@@ -72,7 +73,10 @@ def each_photograph(
                 try:
                     found[k] = done.result()
                 except PhotographError as error:
-                    failed[k] = FailedImage(photographs.names[k], why_failed(error, photographs.paths[k]))
+                    reason = why_failed(error, photographs.paths[k])
+                    failed[k] = FailedImage(
+                        photographs.names[k], remark("photograph_unreadable", reason=reason)
+                    )
                 progress.advance(photographs.names[k])
         except BaseException:  # Ctrl-C among them: nobody waits for photographs that are not begun
             pool.shutdown(wait=False, cancel_futures=True)
@@ -83,7 +87,9 @@ def each_photograph(
         first = pictures.setdefault(shown, k) if shown else k
         if first != k:
             original = photographs.names[first]
-            failed[k] = FailedImage(photographs.names[k], f"the same picture as {original}", copy_of=original)
+            failed[k] = FailedImage(
+                photographs.names[k], remark("photograph_copy", original=original, what="its picture")
+            )
             del found[k]
     in_order = tuple(failed[k] for k in sorted(failed))
     if len(found) < MIN_PHOTOGRAPHS:
@@ -119,4 +125,5 @@ def in_brackets(failed: Sequence[FailedImage]) -> str:
     """Return which photographs could not be read and why, the first of many, to stand behind a message."""
     if not failed:
         return ""
-    return f" ({listed((f'{one.image}: {one.reason}' for one in failed), most=MAX_TOLD, separator='; ')})"
+    named = (f"{one.image}: {one.reason.text.rstrip('.')}" for one in failed)
+    return f" ({listed(named, most=MAX_TOLD, separator='; ')})"

@@ -25,6 +25,7 @@ from sfm.conventions import IntArray
 from sfm.distributions import f_sf
 from sfm.network import Estimate, rows_of
 from sfm.reduced_network import reduce_network
+from sfm.remarks.remark import remark
 from sfm.result import FailedImage
 from sfm.survey.inputs.measurements import Measurements
 
@@ -103,7 +104,7 @@ def without_copies(measured: Measurements, copies: dict[str, tuple[str, float]])
     if naming is not None:
         naming = replace(naming, point=tuple(naming.point[k] for k in kept))
     failed = tuple(
-        FailedImage(name, f"its errors are those of {first}: it is a copy", copy_of=first)
+        FailedImage(name, remark("photograph_copy", original=first, what="its errors"))
         for name, (first, _) in copies.items()
     )
     return replace(
