@@ -17,7 +17,8 @@ def intersect_remaining(growth: Growth, *, contradicting: bool) -> tuple[tuple[s
     """Intersect the points that are still missing; return (name, reason) of those that have no place.
 
     Nothing is oriented on them any more, so that a small angle does no harm: their standard deviations
-    tell it. Rays that are parallel within their own precision have no point of intersection.
+    tell it. Rays that are parallel within their own precision, or within the tolerance of the orientation,
+    have no point of intersection.
 
     Args:
         growth: all photographs oriented that can be; gets the points.
@@ -42,7 +43,8 @@ def intersect_remaining(growth: Growth, *, contradicting: bool) -> tuple[tuple[s
         found = intersect(
             uv, seen.image, seen.point, estimate.position, estimate.rotation, n_points=n, tolerance=limit
         )
-        clear = found.angle > PARALLEL_SIGMAS * np.sqrt(2) * worst  # False where NaN
+        # beyond the precision of the rays and what the orientation is known to; False where NaN
+        clear = found.angle > np.maximum(PARALLEL_SIGMAS * np.sqrt(2) * worst, tolerance)
         parallel |= np.isfinite(found.angle) & ~clear
         points = np.where((missing & clear & ~np.isfinite(points[:, 0]))[:, None], found.points, points)
     growth.estimate = replace(estimate, points=points)
