@@ -246,7 +246,7 @@ def test_photographs_that_are_no_files_are_told_and_do_not_stop_the_others(tmp_p
     (row,) = run_batch([survey], tmp_path / "out", HERE, ALONE, Notes())
     assert (row.status, row.photographs, row.photographs_total) == ("done", 4, 6)
     log = read_log(tmp_path / "out" / "a" / "log.jsonl")
-    failed = {one["image"]: one["reason"] for one in log[-1]["failed_photographs"]}
+    failed = {one["image"]: one["reason"]["subjects"]["reason"][0] for one in log[-1]["failed_photographs"]}
     assert failed == {
         "photo 1.png": "not a file, a photograph is needed",
         "photo 2.png": f"no such file in {tmp_path / 'a'}",

@@ -213,7 +213,7 @@ def test_photographs_that_cannot_be_read_do_not_stop_the_others(
     assert kolinear(monkeypatch, "run", survey, "--out", out) == 0
     shown = capsys.readouterr()
     assert "6 of 8 photographs oriented" in shown.out
-    assert "cut.jpg: the file is truncated" in shown.out
+    assert "cut.jpg: Not readable: the file is truncated" in shown.out
     text = json.loads((out / "summary.json").read_text(encoding="utf-8"))
     assert [failed["image"] for failed in text["images"]["failed"]] == ["cut.jpg", "text.jpg"]
     assert text["images"]["total"] == 8
