@@ -307,7 +307,7 @@ class _Part:
         """Return how much the photographs differ in the family beyond what a pattern explains."""
         m = len(self.g)
         left = self.g + np.einsum("iajb,j,b->ia", self.H, factor, gain.beta, optimize=True)
-        some = np.ones(m, dtype=bool) if factor.sum() > 1 else factor == 0
+        some = np.ones(m, dtype=bool) if np.count_nonzero(factor) > 1 else factor == 0
         every = [gain_of(self.H[i, :, i], left[i], self.squares[i]) for i in np.flatnonzero(some)]
         redundancy = sum(one.rank for one in every) - gain.rank
         if redundancy < 1:

@@ -5,8 +5,8 @@ from __future__ import annotations
 from sfm.remarks.kind import Grade, Kind
 
 # Standard deviations by which a coordinate shifts with the alternative. Below 3 a result stays within the
-# limits that anybody expects; beyond 5 it is wrong, whatever its residuals (Baarda 1968).
-SHIFT = Grade("shift", warning=3.0, error=5.0)
+# limits that anybody expects; from 10 on its standard deviations are wrong by an order of magnitude.
+SHIFT = Grade("shift", warning=3.0, error=10.0)
 LOCAL = Grade("shift", warning=3.0)  # of a few points, which the remark names
 SHIFTED = "Coordinates shift by up to {shift} standard deviations."
 INSTEAD = "[[ The image points do not separate this from: {instead}.]]"
