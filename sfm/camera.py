@@ -21,6 +21,9 @@ CURVATURE_STEP = 1e-3  # of tangents; a pixel or a few
 STEP_TOLERANCE = (
     1e-11  # of tangents; what Newton's method leaves after such a step is its square, or rounding
 )
+# Of the half diagonal, at the corner of the photograph: what nominal focal lengths, sensors and lenses are
+# apart from true ones. A parameter that the network knows worse is better held.
+KNOWN_WITHOUT = 0.01
 
 
 @dataclass(frozen=True)
@@ -354,3 +357,15 @@ def _pixels(model: int, frame: FloatArray, p: FloatArray, uv: FloatArray) -> Flo
         xy[i, 0] = x if solved else np.nan
         xy[i, 1] = y if solved else np.nan
     return xy
+
+
+def corner_shift(camera: Camera, s: int, sigma: float) -> float:
+    """Return by how much a change of a parameter moves the corner, over the half diagonal."""
+    if not np.isfinite(sigma):
+        return np.inf
+    corner = np.zeros((1, 2))
+    p = camera.parameters.copy()
+    p[s] += sigma
+    moved = pixel_from_tangents(camera.with_parameters(p), tangents_from_pixel(camera, corner)) - corner
+    reach = 2 * float(np.hypot(*moved[0])) / float(np.hypot(*camera.size_px))
+    return reach if np.isfinite(reach) else np.inf

@@ -18,7 +18,7 @@ from sfm.adjustment.datum import Datum
 from sfm.adjustment.hypotheses.hypotheses import contradicted_parameters
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
-from sfm.camera import pixel_from_tangents, tangents_from_pixel
+from sfm.camera import KNOWN_WITHOUT, corner_shift
 from sfm.distortion.models import MODELS
 from sfm.errors import GeometryError
 from sfm.network import Estimate, Network
@@ -27,9 +27,6 @@ from sfm.remarks.remark import Remark, remark
 from sfm.survey.inputs.settings import CameraSettings
 from sfm.survey.inputs.survey import Survey
 
-# Of the half diagonal, at the corner of the photograph: what nominal focal lengths, sensors and lenses are
-# apart from true ones. A parameter that the network knows worse is better held.
-KNOWN_WITHOUT = 0.01
 MIN_PHOTOGRAPHS = 4  # of a free network; fewer fit many a camera, with another shape of the object each
 MIN_RAYS, MIN_IMAGE_POINTS = 2, 4  # of a point, and of a photograph, that take part in the decision
 ROUNDS = 3  # of tests of what is still held
@@ -148,15 +145,7 @@ def _reach(adjusted: Adjustment, a: int, name: str) -> float:
     """Return by how much a standard deviation of a parameter moves the corner, over the half diagonal."""
     camera = adjusted.estimate.cameras[a]
     s = camera.names.index(name)
-    sigma = float(adjusted.interior_sigma(a)[s])
-    if not np.isfinite(sigma):
-        return np.inf
-    corner = np.zeros((1, 2))
-    p = camera.parameters.copy()
-    p[s] += sigma
-    moved = pixel_from_tangents(camera.with_parameters(p), tangents_from_pixel(camera, corner)) - corner
-    reach = 2 * float(np.hypot(*moved[0])) / float(np.hypot(*camera.size_px))
-    return reach if np.isfinite(reach) else np.inf
+    return corner_shift(camera, s, float(adjusted.interior_sigma(a)[s]))
 
 
 def _with_free(estimate: Estimate, names: Chosen) -> Estimate:

@@ -250,7 +250,8 @@ def _judged(start: _Prepared, free: _Free | None) -> tuple[Task, JudgedGiven]:
             scale_bars=network.scale_bars,
             exterior=network.exterior,
         )
-    adjustment = None if free is None else free.settled.adjustment
+    # a camera that had to be held, at whatever value it started from, gives the network a wrong shape
+    adjustment = None if free is None or free.settled.held else free.settled.adjustment
     given = judge_given(
         network,
         adjustment,
@@ -275,6 +276,8 @@ def _solved(start: _Prepared) -> _Solved:
             raise
         free = None  # control may connect and calibrate what the photographs alone do not
     task, given = _judged(start, free)
+    if not given.tests and task.datum.kind == "control":
+        free = None  # what they give alone is no start either
     estimate, ready, accepted = start.estimate, None, None
     iterations, treated = 0, None
     if free is not None:

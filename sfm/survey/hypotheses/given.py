@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sfm.adjustment.covariance import marginal_of
+from sfm.adjustment.covariance import Marginal, marginal_of
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.quality.given_values import (
     LEVEL,
@@ -29,6 +29,7 @@ from sfm.adjustment.quality.given_values import (
     scale_of_points,
 )
 from sfm.adjustment.result import Adjustment
+from sfm.camera import KNOWN_WITHOUT, corner_shift
 from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.errors import GeometryError
 from sfm.network import ExteriorObservations, Network, ObjectPoints, ScaleBars
@@ -123,7 +124,7 @@ def _places(network: Network, free: Adjustment, datum: Datum) -> _Places | None:
         joint = marginal.joint((6 * stations[:, None] + np.arange(3)).ravel(), points)
     except (GeometryError, np.linalg.LinAlgError):
         return None
-    if not np.isfinite(joint).all():
+    if not np.isfinite(joint).all() or not _determines_cameras(marginal):
         return None
     return _Places(
         np.concatenate([free.estimate.position[stations], free.estimate.points[points]]),
@@ -132,6 +133,17 @@ def _places(network: Network, free: Adjustment, datum: Datum) -> _Places | None:
         {name: len(images) + k for k, name in enumerate(names)},
         {name: k for k, name in enumerate(images)},
     )
+
+
+def _determines_cameras(marginal: Marginal) -> bool:
+    """Return whether a network knows its free interior parameters as well as linear propagation needs."""
+    none = np.zeros(0, dtype=np.int64)
+    for a, camera in enumerate(marginal.adjustment.estimate.cameras):
+        variance = np.diagonal(marginal.joint(marginal.layout.interior_column[a], none))
+        for s, one in zip(marginal.layout.interior_free[a], variance, strict=True):
+            if corner_shift(camera, int(s), float(np.sqrt(max(one, 0.0)))) > KNOWN_WITHOUT:
+                return False
+    return True
 
 
 @dataclass
