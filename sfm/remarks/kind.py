@@ -19,7 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sfm.display import listed
-from sfm.remarks.remark import Quantity, Remark, Severity
+from sfm.remarks.remark import SEVERITIES, Quantity, Remark, Severity
 
 FIELD = re.compile(r"\{(\w+)(?::([^{}]*))?\}")
 OPTIONAL = re.compile(r"\[\[(.*?)\]\]", re.S)
@@ -32,6 +32,14 @@ class Grade:
     number: str
     warning: float = -np.inf
     error: float = np.inf
+    also: Grade | None = None  # of another number; the more serious of the two counts
+
+    def severity_of(self, one: Remark) -> Severity:
+        """Return the severity of a remark."""
+        found = self.of(one.number(self.number))
+        if self.also is None:
+            return found
+        return min(found, self.also.severity_of(one), key=SEVERITIES.index)
 
     def of(self, value: float) -> Severity:
         """Return the severity of a value; a number that is not known is as bad as can be."""
@@ -58,7 +66,7 @@ class Kind:
     def severity_of(self, one: Remark) -> Severity:
         """Return the severity of a remark of this kind."""
         if isinstance(self.severity, Grade):
-            return self.severity.of(one.number(self.severity.number))
+            return self.severity.severity_of(one)
         return self.severity
 
     def sentence_of(self, one: Remark) -> str:

@@ -51,15 +51,17 @@ def _pattern(sentence: str) -> str:
 
 def _severity(kind: Kind) -> str:
     """Return the severity, or the limits of the number that it depends on."""
-    grade = kind.severity
-    if not isinstance(grade, Grade):
-        return grade
-    limits = {"warning": grade.warning, "error": grade.error}
-    return ", ".join(
-        name if limit == -float("inf") else f"{name} from {grade.number} {limit:g}"
-        for name, limit in limits.items()
-        if limit < float("inf")
-    )
+    if not isinstance(kind.severity, Grade):
+        return kind.severity
+    grade: Grade | None = kind.severity
+    limits: dict[str, str] = {}
+    while grade is not None:
+        for name, limit in (("warning", grade.warning), ("error", grade.error)):
+            if limit < float("inf"):
+                text = name if limit == -float("inf") else f"{name} from {grade.number} {limit:g}"
+                limits.setdefault(name, text)
+        grade = grade.also
+    return ", ".join(limits.values())
 
 
 if __name__ == "__main__":

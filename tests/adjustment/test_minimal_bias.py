@@ -12,7 +12,7 @@ from sfm.adjustment.quality.statistics import non_centrality, reliability
 from sfm.adjustment.solve import adjust
 from tests.synthetic import make_network, seed_of
 
-# Thompson's tau as published in ASME PTC 19.1 at the level 0.05: Pope's of the mean of n observations, of which
+# Thompson's tau as published in ASME PTC 19.1 at the level 0.05: Pope's of the mean of n observations, where
 # each has the redundancy number (n - 1) / n, times the root of that.
 THOMPSON = {3: 1.1511, 4: 1.4250, 5: 1.5712, 6: 1.6563, 7: 1.7110, 8: 1.7491, 9: 1.7770, 10: 1.7984}
 

@@ -74,7 +74,7 @@ def test_other_principal_distances_are_found_along_bent_valleys(number: int) -> 
 
 
 def test_residuals_with_a_cause_contradict_a_camera_that_had_to_be_held() -> None:
-    cause = remark("held_parameter", parameters="K1", camera="A", photographs=(), shift=8.0)
+    cause = remark("held_parameter", parameters="K1", camera="A", photographs=(), shift=8.0, rms=2.0)
     (found,) = contradicted(("A",), (cause,))
     assert found.kind == "c_held_contradicted" and found.names("cameras") == ("A",)
     assert contradicted((), (cause,)) == contradicted(("A",), ()) == ()

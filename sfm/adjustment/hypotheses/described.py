@@ -45,6 +45,7 @@ def remark_of(
     kind, network = kind_of(one), plain.network
     parts: dict[str, str | Iterable[str] | float | tuple[float, str] | Quantity | None] = {
         "shift": found.shift,
+        "rms": found.rms,
         "photographs": tuple(network.images[i] for i in one.photographs),
         "instead": tuple(dict.fromkeys(kind_of(other) for other in others)) or None,
     }

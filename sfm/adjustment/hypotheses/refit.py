@@ -32,6 +32,7 @@ class Refit:
     beta: FloatArray  # parameters of the alternative, (q,)
     gain: float  # of ln likelihood, rejected image points counted as spread over their photograph
     shift: float  # largest change of a coordinate, in the standard deviations stated without the alternative
+    rms: float  # root mean square of the same
 
 
 def refit(plain: Adjustment, one: Alternative, start: Adjustment, *, reject: str) -> Refit | None:
@@ -69,7 +70,7 @@ def refit(plain: Adjustment, one: Alternative, start: Adjustment, *, reject: str
         if gain.value < SETTLED:
             break
     gained = log_likelihood(current) - log_likelihood(start)
-    return Refit(current, beta, gained, shift_of(plain, current, one, beta))
+    return Refit(current, beta, gained, *shifts_of(plain, current, one, beta))
 
 
 def log_likelihood(a: Adjustment) -> float:
@@ -83,8 +84,10 @@ def log_likelihood(a: Adjustment) -> float:
     return float(-a.redundancy / 2 * (np.log(2 * np.pi * variance) + 1) - np.log(area).sum())
 
 
-def shift_of(plain: Adjustment, other: Adjustment, one: Alternative, beta: FloatArray) -> float:
-    """Return the largest change of a coordinate after a similarity, in its standard deviations."""
+def shifts_of(
+    plain: Adjustment, other: Adjustment, one: Alternative, beta: FloatArray
+) -> tuple[float, float]:
+    """Return the largest and the RMS change of coordinates after a similarity, in standard deviations."""
     sigma = np.sqrt(np.diagonal(plain.covariance.points, axis1=1, axis2=2))
     X, Y = plain.estimate.points, other.estimate.points
     stays = np.ones(len(X), dtype=bool)
@@ -93,11 +96,11 @@ def shift_of(plain: Adjustment, other: Adjustment, one: Alternative, beta: Float
     try:
         moved = fit_similarity(Y[known & stays], X[known & stays]).apply(Y) - X
     except GeometryError:
-        return float("nan")
-    shift = float((np.abs(moved[known]) / sigma[known]).max(initial=0.0))
-    away = _displaced(plain, one, beta)
-    safe = np.where(sigma > 0, sigma, np.inf)
-    return max(shift, float(np.nanmax(np.abs(away) / safe, initial=0.0)))
+        return float("nan"), float("nan")
+    change = moved[known] / sigma[known]
+    away = _displaced(plain, one, beta)[known] / sigma[known]
+    largest, squares = np.abs(change).max(initial=0.0), (change**2).mean()
+    return float(max(largest, np.abs(away).max(initial=0.0))), float(np.sqrt(max(squares, (away**2).mean())))
 
 
 def _displaced(plain: Adjustment, one: Alternative, beta: FloatArray) -> FloatArray:
