@@ -21,7 +21,8 @@ from sfm.survey.diagnosis.second_object import find_second_objects, tell_second_
 from sfm.survey.inputs.survey import read_survey
 from sfm.survey.measuring.measured_store import MeasuredStore
 from tests.survey.two_plates import FIRST_CODE, PLACES, two_plates
-from tests.surveys import C_MM, PIXEL_MM, SIZE_PX, SURVEY, stations
+from tests.surveys import C_MM, PIXEL_MM, SIZE_PX, SURVEY, stations, survey_of
+from tests.synthetic import SIZE_PX as OF_NETWORK
 from tests.synthetic import make_network, seed_of
 
 SHEET = 16
@@ -108,3 +109,17 @@ def join(first: ImagePoints, second: ImagePoints) -> ImagePoints:
         np.vstack([first.xy, second.xy]),
         np.concatenate([first.covariance, second.covariance]),
     )
+
+
+@pytest.mark.parametrize("mirrored", [4, 6])
+def test_photographs_of_the_mirror_image_are_named(mirrored: int) -> None:
+    network, truth = make_network(seed_of("mirror images"), images=10, points=40)
+    seen = network.image_points
+    xy = seen.xy.copy()
+    turned = seen.image < mirrored
+    xy[turned, 0] = OF_NETWORK[0] - 1 - xy[turned, 0]
+    result = run_survey(survey_of(replace(network, image_points=replace(seen, xy=xy)), truth))
+    assert len(result.failed) == 4
+    for one in result.failed:
+        assert one.reason.kind == "photograph_of_mirror_image"
+        assert one.reason.number("misfit") < 0.01 and len(one.reason.names("photographs")) == 4

@@ -154,6 +154,14 @@ ROWS = (
         "Use the original photograph.",
     ),
     Kind(
+        "photograph_of_mirror_image",
+        "warning",
+        "{photographs} show the mirror image of the others: mirrored, {points:common point} agree to "
+        "{misfit:%} of their spread.",
+        "either these photographs or the others were mirrored by a program, or their x was reversed",
+        "Use the original photographs; check the handedness of the result.",
+    ),
+    Kind(
         "photograph_of_second_object",
         "warning",
         "{photographs} fit one another and not the others: {points:common point} differ by {misfit:%} of "

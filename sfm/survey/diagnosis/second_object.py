@@ -17,7 +17,8 @@ from sfm.similarity import fit_similarity
 
 FITTING = 0.8  # of the image points of a group that must fit in it for the group to confirm itself
 OTHER_SHAPE = 0.1  # misfit of common points over their spread, from which no wrong camera explains it
-SAME_SHAPE = 0.01  # misfit from which two groups show different states of an object
+MIRROR = np.diag([1.0, 1.0, -1.0])
+SAME_SHAPE = 0.01  # misfit from which two groups show different states of an object, or no mirror images
 
 
 @dataclass(frozen=True)
@@ -27,6 +28,7 @@ class SecondObject:
     images: tuple[str, ...]  # their names
     points: int  # points that they have, and the oriented photographs too
     misfit: float  # RMS of these points after a similarity, over their RMS distance from their centre
+    mirrored_misfit: float = np.inf  # the same after a similarity with a reflection
 
     @property
     def certain(self) -> bool:
@@ -36,6 +38,13 @@ class SecondObject:
     @property
     def reason(self) -> Remark:
         """Why each of the photographs is not in the result."""
+        if self.mirrored_misfit <= SAME_SHAPE:
+            return remark(
+                "photograph_of_mirror_image",
+                photographs=self.images,
+                points=self.points,
+                misfit=self.mirrored_misfit,
+            )
         return remark(
             "photograph_of_second_object", photographs=self.images, points=self.points, misfit=self.misfit
         )
@@ -74,7 +83,9 @@ def find_second_objects(
         left[images] = False
         misfit, common = _misfit(found.estimate.points[points], other.estimate.points)
         if other.fits[rows].mean() >= FITTING and misfit > SAME_SHAPE:
-            groups.append(SecondObject(tuple(network.images[i] for i in images), common, misfit))
+            mirrored, _ = _misfit(found.estimate.points[points], other.estimate.points @ MIRROR)
+            names = tuple(network.images[i] for i in images)
+            groups.append(SecondObject(names, common, misfit, mirrored))
 
 
 def tell_second_objects(found: Orientation, groups: tuple[SecondObject, ...]) -> Orientation:
