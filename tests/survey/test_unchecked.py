@@ -14,7 +14,7 @@ from sfm.report.findings.findings import findings_of
 from sfm.survey.inputs.checks.same_photographs import same_photographs
 from sfm.survey.inputs.given import KnownPoints, ScaleBar
 from tests.surveys import remarks_on_given, survey_of
-from tests.synthetic import add_narrow_points, make_network, seed_of
+from tests.synthetic import add_narrow_points, make_network, observed_anew, seed_of
 
 
 def _scene(name: str) -> tuple[Network, Estimate]:
@@ -46,6 +46,34 @@ def test_of_a_bar_that_a_far_worse_one_checks_an_error_may_stay_unnoticed() -> N
     (said,) = remarks_on_given(result)
     assert said.kind == "given_weakly_checked" and said.names("given") == ("bar 1 - 10",)
     assert said.number("sigmas") > 5
+
+
+@pytest.mark.parametrize(("ratio", "weak"), [(1.1, False), (1.6, True)])
+def test_a_note_begins_at_five_standard_deviations(ratio: float, weak: bool) -> None:
+    """Of two bars the external reliability is 4.13 times the ratio of their relative precision: 4.5, 6.6."""
+    network, truth = _scene("two bars")
+    one, other = _bar(truth, 0, 9), _bar(truth, 1, 8)
+    bars = (one, replace(other, sigma=ratio * one.sigma / one.length * other.length))
+    network = replace(
+        network, image_points=replace(network.image_points, covariance=network.image_points.covariance / 100)
+    )
+    network = observed_anew(network, truth, 0.01, seed_of("two bars noise"))
+    found = remarks_on_given(run_survey(survey_of(network, truth, scale_bars=bars, sigma=True)))
+    weaker = [one.names("given") for one in found if one.kind == "given_weakly_checked"]
+    assert weaker == ([("bar 1 - 10",)] if weak else [])
+
+
+@pytest.mark.parametrize(("scale", "implausible"), [(1 / 540, True), (1 / 270, False)])
+def test_an_object_nearer_than_the_image_is_implausible(scale: float, implausible: bool) -> None:
+    """c is 10 mm and the object at 3.6 to 4.4 m: in another scale its image is 1.5 or 0.75 times as large."""
+    network, truth = _scene("unit")
+    bars = tuple(
+        replace(one, length=scale * one.length, sigma=scale * one.sigma)
+        for one in (_bar(truth, 0, 9), _bar(truth, 1, 8))
+    )
+    verdict = findings_of(run_survey(survey_of(network, truth, scale_bars=bars))).verdict
+    said = [one for one in verdict.remarks if one.kind == "scale_implausible"]
+    assert bool(said) == implausible == (verdict.level == "bad")
 
 
 def test_three_control_points_are_unchecked() -> None:

@@ -13,7 +13,7 @@ import numpy as np
 from sfm.adjustment.engine.observed_unknowns import observed
 from sfm.adjustment.quality.variance_components import IMAGE_POINTS, variance_components
 from sfm.adjustment.result import Adjustment
-from sfm.conventions import BoolArray, FloatArray
+from sfm.conventions import FloatArray
 from sfm.result import ControlCheck, SurveyResult
 
 LISTED = 10  # largest residuals
@@ -83,13 +83,11 @@ class LongestResidual:
 
 @dataclass(frozen=True)
 class CheckedControl:
-    """Differences at control that took no part in the adjustment, over what is expected of them."""
+    """Differences at control that took no part in the adjustment."""
 
     check: ControlCheck
     length: FloatArray  # of each difference, object unit, (n,)
     worst: int  # index of the longest
-    over_sigma: FloatArray  # largest coordinate over its expected standard deviation; NaN unknown, (n,)
-    stated: BoolArray  # whether the control states standard deviations, (n,)
 
     @property
     def rms_length(self) -> float:
@@ -182,27 +180,12 @@ def largest_residuals(adjustment: Adjustment, count: int = LISTED) -> tuple[Larg
 
 
 def checked_control(result: SurveyResult) -> CheckedControl | None:
-    """Return the differences at control that took no part, over their expected standard deviations.
-
-    Expected are the precision of the adjusted point, its mean over the axes, and that of the control
-    together.
-    """
-    check, a = result.control_check, result.adjustment
+    """Return the differences at control that took no part; None without any."""
+    check = result.control_check
     if check is None:
         return None
     length = np.linalg.norm(check.differences, axis=1)
-    worst, n = int(np.argmax(length)), len(check.points)
-    control = a.network.control
-    place = {a.network.points[j]: k for k, j in enumerate(control.point)}
-    known = [place[name] for name in check.points if name in place]
-    if len(known) != n:
-        return CheckedControl(check, length, worst, np.full(n, np.nan), np.zeros(n, dtype=bool))
-    given = _variances(control.covariance[known])
-    given = np.where(np.isfinite(given), given, np.nan)
-    adjusted = _variances(a.covariance.points[control.point[known]])
-    expected = np.sqrt(np.nan_to_num(given) + adjusted.mean(axis=1)[:, None])
-    ratio = np.abs(check.differences) / np.where(expected > 0, expected, np.nan)
-    return CheckedControl(check, length, worst, ratio.max(axis=1), np.nansum(given, axis=1) > 0)
+    return CheckedControl(check, length, int(np.argmax(length)))
 
 
 def object_size(points: FloatArray) -> float:
