@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from sfm.remarks.remark import remark
 from sfm.survey.adjusting.solution import Correspondences, solve_survey
 from sfm.survey.inputs.settings import TiePointSettings
 from tests.surveys import survey_of
@@ -28,7 +29,7 @@ def test_a_photograph_needs_more_tie_points_than_it_would_need_targets(left: int
     textured = replace(survey, tie_points=TiePointSettings())
     found = solve_survey(textured, matched)
     assert len(found.adjustment.network.images) == (10 if stays else 9)
-    told = [("image 10", "fewer than 15 accepted image points of the network")]
+    told = [("image 10", remark("photograph_with_few_accepted", needed=15))]
     assert list(found.dropped_images) == ([] if stays else told)
 
 
