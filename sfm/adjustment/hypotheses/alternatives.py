@@ -117,7 +117,7 @@ def alternatives_of(a: Adjustment, reduced: Reduced, columns: Columns) -> tuple[
         *held_interiors(a, reduced),
         *_format(a, reduced),
         *_by_photographs(reduced, columns),
-        *_moved_points(a, reduced, columns),
+        *_moved_points(reduced),
     ]
     return tuple(sorted(found, key=lambda one: -one.evidence))
 
@@ -340,28 +340,22 @@ class _Part:
         return best, most
 
 
-def _moved_points(a: Adjustment, reduced: Reduced, columns: Columns) -> Iterator[Alternative]:
+def _moved_points(reduced: Reduced) -> Iterator[Alternative]:
     """Return for each place in the sequence the set of points that moved there with the best evidence."""
     m = reduced.photographs
     if m < 2 * MIN_GROUP:
         return
     splits = list(range(MIN_GROUP, m - MIN_GROUP + 1))
     splits = splits[:: -(-len(splits) // MAX_SPLITS)]
-    factors = [(np.arange(m) >= k).astype(float) for k in splits] + [(np.arange(m) % 2).astype(float)]
-    names = ["split"] * len(splits) + ["alternating"]
     best: dict[str, Alternative] = {}
-    for name, factor in zip(names, factors, strict=True):
-        search = np.log(len(splits)) if name == "split" else 0.0
-        for one in _moved_at(reduced, columns, factor, name, search):
-            key = f"{one.family} {name}"
-            if key not in best or one.evidence > best[key].evidence:
-                best[key] = one
+    for k in splits:
+        for one in _moved_at(reduced, (np.arange(m) >= k).astype(float), np.log(len(splits))):
+            if one.family not in best or one.evidence > best[one.family].evidence:
+                best[one.family] = one
     yield from best.values()
 
 
-def _moved_at(
-    reduced: Reduced, columns: Columns, factor: FloatArray, pattern: str, search: float
-) -> Iterator[Alternative]:
+def _moved_at(reduced: Reduced, factor: FloatArray, search: float) -> Iterator[Alternative]:
     """Return the set of points that moved between the photographs of factor 0 and those of factor 1."""
     n, m, size = len(reduced.L), reduced.photographs, len(reduced.t)
     on = factor[reduced.image] > 0
@@ -408,7 +402,7 @@ def _moved_at(
         others = ordered[count:]
         spread = Spread(float(others.mean()) / 3, 3 * len(others)) if len(others) else NONE
         one = _made(
-            *(reduced, "moved", pattern, factor, gain, search + sets, spread),
+            *(reduced, "moved", "split", factor, gain, search + sets, spread),
             points=movable[order[:count]],
         )
         if best is None or one.evidence > best.evidence:
@@ -417,14 +411,12 @@ def _moved_at(
             break
     if best is not None:
         yield best
-    yield from _shifted(reduced, columns, factor, pattern, search, (movable, blocks, g))
+    yield from _shifted(reduced, factor, search, (movable, blocks, g))
 
 
 def _shifted(
     reduced: Reduced,
-    columns: Columns,
     factor: FloatArray,
-    pattern: str,
     search: float,
     parts: tuple[IntArray, FloatArray, FloatArray],
 ) -> Iterator[Alternative]:
@@ -458,7 +450,7 @@ def _shifted(
         others = [gain_of(*one, np.diagonal(one[0])) for one in zip(blocks, left, strict=True)]
         redundancy = sum(one.rank for one in others) - gain.rank
         spread = Spread(sum(one.value for one in others) / redundancy, redundancy)
-        one = _made(reduced, "shifted", pattern, factor, gain, search + sets, spread, points=points)
+        one = _made(reduced, "shifted", "split", factor, gain, search + sets, spread, points=points)
         if best is None or one.evidence > best.evidence:
             best = one
     if best is not None:

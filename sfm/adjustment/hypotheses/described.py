@@ -100,10 +100,9 @@ def _moved(
     network: Network = a.network
     parts: dict[str, tuple[str, ...] | Quantity] = {
         "points": tuple(network.points[j] for j in one.points),
+        "from": (network.images[int(np.flatnonzero(one.factor > 0)[0])],),
         "distance": Quantity(float(np.linalg.norm(beta.reshape(-1, 3), axis=1).max()), unit),
     }
-    if one.pattern == "split":
-        parts["from"] = (network.images[int(np.flatnonzero(one.factor > 0)[0])],)
     return parts
 
 

@@ -63,7 +63,7 @@ ROWS = (
     Kind(
         "points_moved",
         LOCAL,
-        "{points:point} moved [[from {from} on ]]by up to {distance}, {shift} standard deviations: {points}."
+        "{points:point} moved from {from} on, by up to {distance}, {shift} standard deviations: {points}."
         f"{INSTEAD}",
         "targets or parts of the object moved during the survey",
         "Adjust the two states as two surveys, or remove these points.",
