@@ -28,7 +28,12 @@ from tests.places import ROOT
 
 TIMEOUT = 300  # s, of the tests of one mutation; one that never ends is noticed
 ROOMS: dict[str, tuple[str, ...]] = {  # module or package, with the tests that hold it
-    "sfm/adjustment/hypotheses": ("tests/adjustment/test_hypotheses.py",),
+    "sfm/adjustment/hypotheses": (
+        "tests/adjustment/test_alternatives.py",
+        "tests/adjustment/test_rejections.py",
+        "tests/adjustment/test_described.py",
+        "tests/adjustment/test_hypotheses.py",
+    ),
     "sfm/remarks/kind.py": ("tests/remarks",),
     "sfm/remarks/verdict.py": ("tests/remarks",),
     "sfm/remarks/remark.py": ("tests/remarks",),

@@ -303,4 +303,4 @@ def log_likelihood_gain(gain: float, redundancy: int) -> float:
     Source: Patterson and Thompson (1971), Biometrika 58, for the restricted likelihood.
     """
     left = max(redundancy - gain, np.finfo(float).tiny)
-    return float(redundancy / 2 * np.log(redundancy / left))
+    return float(redundancy / 2 * (np.log(redundancy) - np.log(left)))

@@ -1,0 +1,465 @@
+"""The score test of alternatives: against a dense elimination, and on systems small enough to do by hand."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from itertools import product
+from math import comb
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from sfm.adjustment.datum import Datum
+from sfm.adjustment.hypotheses import alternatives, columns, hypotheses, refit, score
+from sfm.adjustment.hypotheses.alternatives import (
+    NONE,
+    Alternative,
+    Spread,
+    alternatives_of,
+    is_significant,
+)
+from sfm.adjustment.hypotheses.columns import Columns, columns_of, interior_columns
+from sfm.adjustment.hypotheses.score import (
+    Gain,
+    Reduced,
+    gain_of,
+    log_f_sf,
+    log_likelihood_gain,
+    log_probability,
+    reduce_adjustment,
+)
+from sfm.adjustment.result import Adjustment
+from sfm.adjustment.solve import adjust
+from sfm.conventions import FloatArray, IntArray
+from sfm.network import ImagePoints, InteriorObservations
+from tests.synthetic import make_network, observed_anew, seed_of
+
+NO_POINTS = np.zeros(0, dtype=np.int64)
+
+
+def test_thresholds_of_search_and_rounding() -> None:
+    """Limits of effort: a larger one finds the same or more at more cost."""
+    assert (alternatives.MAX_SPLITS, alternatives.MAX_MOVED, alternatives.CELLS) == (12, 60, 5)
+    assert (alternatives.ROUNDS, alternatives.STARTS, refit.ROUNDS) == (20, 8, 6)
+    assert score.MAX_TERMS == 10_000  # the series of the tail ends after a few hundred of usual redundancies
+    assert score.SMALLEST_LOG == -600.0  # a float ends at -745
+    assert columns.SMALL_MOVE_PX == 0.01  # where distortion of 40 px is linear to 1e-4 of it
+    assert refit.SETTLED == 0.01  # of a gain of which 9 and more count
+    assert hypotheses.MAX_IMAGE_POINTS == 20_000  # a test of them takes seconds
+    assert hypotheses.MAX_CAUSES == 2
+    assert pytest.approx(np.log(100)) == hypotheses.APART
+    assert hypotheses.NAMED == 1.0  # standard deviation: less is what a user was promised
+    assert {"c": (0,), "centre": (0, 1, 2, 3), "camera": tuple(range(9))} == alternatives.CAMERA_SETS
+    assert (columns.STRAIN, columns.BENDING) == (5, 18)  # 6 - 1 of a symmetric matrix, 3 times 6 products
+
+
+def test_a_gain_is_that_of_determined_parameters() -> None:
+    found = gain_of(np.diag([4.0, 2.0]), np.array([2.0, 3.0]), np.array([8.0, 8.0]))
+    assert (found.value, found.rank) == (pytest.approx(1.0 + 4.5), 2)
+    np.testing.assert_allclose(found.beta, [-0.5, -1.5])
+    # of a column photographs, cameras and points take all but 1e-5 of the squares
+    assert gain_of(np.array([[1.5e-5]]), np.ones(1), np.ones(1)).rank == 1
+    assert gain_of(np.array([[0.7e-5]]), np.ones(1), np.ones(1)).rank == 0
+    none = gain_of(np.zeros((1, 1)), np.zeros(1), np.zeros(1))
+    assert (none.value, none.rank, none.beta.tolist()) == (0.0, 0, [0.0])
+
+
+def test_probability_and_likelihood_of_a_gain() -> None:
+    assert log_likelihood_gain(50.0, 100) == pytest.approx(50 * np.log(2))
+    assert log_likelihood_gain(200.0, 100) > 1e4
+    assert log_probability(50.0, 5, 100) == pytest.approx(stats.f.logsf(10 * 95 / 50, 5, 95))
+    assert log_probability(3.0, 5, 5) == log_probability(3.0, 0, 5) == 0.0
+    assert log_probability(3.0, 4, 5) < 0
+    assert log_probability(5.0, 4, 5) == -np.inf
+    # beyond the floats, for q = 2 in closed form: ln p = -d/2 ln(1 + 2 f / d)
+    for f, d in ((2000.0, 2000), (900.0, 4000), (1e6, 300)):
+        assert log_f_sf(f, 2, d) == pytest.approx(-d / 2 * np.log1p(2 * f / d), rel=1e-12)
+    for f, q, d in (
+        (400.0, 7, 1500),
+        (300.0, 9, 2000),
+        (250.0, 12, 900),
+    ):  # -1 to -1.5 thousand, by its integral
+        assert log_f_sf(f, q, d) == pytest.approx(_log_tail(f, q, d), rel=1e-6)
+
+
+def _log_tail(f: float, q: int, d: int) -> float:
+    """Return ln of the integral of the density of F beyond f, with t = ln of the variable."""
+    t = np.log(f) + np.linspace(0, 0.5, 200_001)
+    log_density = stats.f.logpdf(np.exp(t), q, d) + t
+    top = log_density.max()
+    return float(top + np.log(np.trapezoid(np.exp(log_density - top), t)))
+
+
+# ---- against a dense elimination ----
+
+
+@dataclass(frozen=True)
+class Dense:
+    """The whitened columns of all unknowns, and what they leave of others."""
+
+    a: Adjustment
+    columns: Columns
+    reduced: Reduced
+    Q: FloatArray  # orthonormal base of the unknowns' columns, prior rows at the end
+
+    def left(self, D: FloatArray) -> FloatArray:
+        """Return what the unknowns leave of whitened columns (k, 2, q), (2 k, q)."""
+        flat = np.concatenate(
+            [D.reshape(-1, D.shape[2]), np.zeros((len(self.Q) - D.size // D.shape[2], D.shape[2]))]
+        )
+        return flat - self.Q @ (self.Q.T @ flat)
+
+    def normals(self, D: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        left = self.left(D)
+        flat = D.reshape(-1, D.shape[2])
+        v = self.left(self.reduced.v[:, :, None])[:, 0]
+        return left.T @ left, left.T @ v, (flat**2).sum(axis=0)
+
+
+@pytest.fixture(scope="module")
+def dense() -> Dense:
+    """A network of two cameras and correlated coordinates; two points move together, some take no part."""
+    rng = seed_of("dense")
+    network, truth = make_network(rng, images=7, points=20, cameras=2, visibility=0.85, free=("c",))
+    xyz = truth.points.copy()
+    first = observed_anew(network, truth, 0.1, rng)
+    xyz[[2, 17]] += (0.004, -0.003, 0.002)
+    second = observed_anew(network, replace(truth, points=xyz), 0.1, rng)
+    seen = network.image_points
+    xy = np.where(seen.image[:, None] >= 4, second.image_points.xy, first.image_points.xy)
+    covariance = 0.01 * np.tile([[1.3, 0.4], [0.4, 0.8]], (len(seen), 1, 1))
+    given = InteriorObservations(np.array([0]), np.array([0]), np.array([10.0]), np.array([2e-3]))
+    network = replace(network, image_points=replace(seen, xy=xy, covariance=covariance), interior=given)
+    a = adjust(network, truth, datum=Datum("free"), reject="none")
+    # some take no part: the others are then no optimum, as after the last round of an adjustment
+    out = np.zeros(len(seen), dtype=bool)
+    out[[5, 30]] = True
+    a = replace(a, rejected=out, redundancy=a.redundancy - 4)
+    every = columns_of(a)
+    reduced = reduce_adjustment(a, every)
+    k, m, n = len(reduced.used), 7, 20
+    A = np.zeros((k, 2, 6 * m + 2 + 3 * n))
+    rows = np.arange(k)
+    for c in range(6):
+        A[rows, :, 6 * reduced.image + c] = (reduced.F @ every.exterior[reduced.used])[:, :, c]
+    for c in range(3):
+        A[rows, :, 6 * m + 2 + 3 * reduced.point + c] = (reduced.F @ every.point[reduced.used])[:, :, c]
+    for index in range(2):
+        A[:, :, 6 * m + index] = reduced.whiten(interior_columns(a, index, [0]))[:, :, 0]
+    flat = A.reshape(2 * k, -1)
+    prior = np.zeros((1, flat.shape[1]))
+    prior[0, 6 * m] = columns.interior_step(a, 0, 0) / 2e-3 / a.sigma0
+    U, d, _ = np.linalg.svd(np.concatenate([flat, prior]), full_matrices=False)
+    assert int((d < 1e-9 * d[0]).sum()) == 7
+    return Dense(a, every, reduced, U[:, d > 1e-9 * d[0]])
+
+
+def test_whitening_makes_coordinates_independent_of_unit_variance(dense: Dense) -> None:
+    r = dense.reduced
+    assert r.used.tolist() == np.flatnonzero(~dense.a.rejected).tolist() and r.count == 2 * len(r.used)
+    P = np.linalg.inv(dense.a.image_covariance[r.used]) / dense.a.sigma0**2
+    np.testing.assert_allclose(np.swapaxes(r.F, 1, 2) @ r.F, P)
+    np.testing.assert_allclose(r.v, np.einsum("kab,kb->ka", r.F, dense.a.residuals[r.used]))
+
+
+def test_elimination_is_that_of_a_dense_solution(dense: Dense) -> None:
+    D = dense.reduced.whiten(np.concatenate([dense.columns.camera, dense.columns.bending], axis=2))
+    for found, right in zip(dense.reduced.project(D), dense.normals(D), strict=True):
+        np.testing.assert_allclose(found, right, atol=1e-7 * np.abs(right).max())
+    m = dense.reduced.photographs
+    H, g, squares = dense.normals(_by_photograph(D, dense.reduced.image, m))
+    found_H, found_g, found_squares = dense.reduced.project_by_photograph(D)
+    np.testing.assert_allclose(found_H.reshape(H.shape), H, atol=1e-7 * np.abs(H).max())
+    np.testing.assert_allclose(found_g.ravel(), g, atol=1e-7 * np.abs(g).max())
+    np.testing.assert_allclose(found_squares.ravel(), squares)
+
+
+def test_scores_are_slopes_of_each_photograph(dense: Dense) -> None:
+    D = dense.reduced.whiten(dense.columns.camera[:, :, [0, 3]])
+    left = dense.left(D)[: 2 * len(D)].reshape(len(D), 2, 2)
+    slope = ((dense.reduced.v + left[:, :, 1]) * left[:, :, 0]).sum(axis=1)
+    right = np.bincount(dense.reduced.image, slope, minlength=7)
+    np.testing.assert_allclose(
+        dense.reduced.scores(D[:, :, 0], D[:, :, 1]), right, atol=1e-7 * np.abs(right).max()
+    )
+
+
+def _judged(one: Alternative, dense: Dense, spread: Spread) -> tuple[float, float, float]:
+    """Return ln p, price and evidence of an alternative by its definition."""
+    r, q, gain = dense.reduced.redundancy, one.gain.rank, one.gain.value
+    if not q:
+        return 0.0, one.search, -one.search
+    on = one.factor[dense.reduced.image] != 0
+    if len(one.points):
+        on &= np.isin(dense.reduced.point, one.points)
+    price = q / 2 * np.log(2 * max(on.sum(), 2)) + one.search
+    log_p = float(stats.f.logsf(gain / q * (r - q) / (r - gain), q, r - q))
+    evidence = r / 2 * np.log(r / (r - gain))
+    if spread.factor > 1:
+        f = gain / q / spread.factor / ((r - gain) / r)
+        log_p = max(log_p, float(stats.f.logsf(f, q, spread.redundancy)))
+        d = spread.redundancy
+        among = d / 2 * np.log(1 + f * q / d)
+        evidence = min(evidence, among) if spread.among else r / 2 * np.log(r / (r - gain / spread.factor))
+    return log_p, price, evidence - price
+
+
+def _by_photograph(D: FloatArray, image: IntArray, m: int) -> FloatArray:
+    """Return columns (k, 2, f) as those of each photograph, (k, 2, m f)."""
+    by = np.zeros((*D.shape[:2], m, D.shape[2]))
+    by[np.arange(len(D)), :, image] = D
+    return by.reshape(len(D), 2, -1)
+
+
+def _every(dense: Dense) -> tuple[Alternative, ...]:
+    return alternatives_of(dense.a, dense.reduced, dense.columns)
+
+
+def test_every_alternative_has_the_gain_of_its_columns(dense: Dense) -> None:
+    every = _every(dense)
+    assert [one.evidence for one in every] == sorted((one.evidence for one in every), reverse=True)
+    plain = [one.family for one in every if one.pattern != "group"]
+    count = {family: plain.count(family) for family in plain}
+    assert count == {
+        "interior": 20, "format": 1, "c": 4, "centre": 4, "camera": 4, "strain": 3, "bending": 3,
+        "moved": 1, "shifted": 1,
+    }  # fmt: skip
+    for one in every:
+        H, g, squares = dense.normals(dense.reduced.whiten(one.columns(dense.a, dense.columns)))
+        right = gain_of(H, g, squares)
+        assert one.gain.rank == right.rank, one.family
+        assert one.gain.value == pytest.approx(right.value, rel=1e-5), (one.family, one.pattern)
+
+
+def test_patterns_are_the_best_of_their_kind(dense: Dense) -> None:
+    """By trying all of them; ln of how many there are is the price of the search."""
+    every = {(one.family, one.pattern): one for one in _every(dense)}
+    m = 7
+    for family in ("c", "centre", "strain"):
+        D = dense.reduced.whiten(alternatives._family(dense.columns, family))
+
+        def gain(factor: IntArray, D: FloatArray = D) -> float:
+            return gain_of(*dense.normals(np.asarray(factor)[dense.reduced.image][:, None, None] * D)).value
+
+        splits = [np.arange(m) >= k for k in (2, 3, 4, 5)]
+        one = every[family, "split"]
+        assert one.gain.value == pytest.approx(max(map(gain, splits)), rel=1e-5)
+        assert one.search == pytest.approx(np.log(4)) and one.factor.sum() in (2, 3, 4, 5)
+        if family != "strain":
+            one = every[family, "single"]
+            assert one.gain.value == pytest.approx(max(map(gain, np.eye(m))), rel=1e-5)
+            assert one.search == pytest.approx(np.log(m)) and one.factor.sum() == 1
+        normals = dense.normals(_by_photograph(D, dense.reduced.image, m))
+        q = D.shape[2]
+        part = alternatives._Part(
+            normals[0].reshape(m, q, m, q), normals[1].reshape(m, q), normals[2].reshape(m, q)
+        )
+        for pattern in ("split", "linear", "alternating", "single"):
+            if (family, pattern) != ("strain", "single"):
+                one = every[family, pattern]
+                spread = part.spread(one.factor, one.gain)
+                if pattern == "single":
+                    own = alternatives._variance_of(dense.reduced, int(one.photographs[0]), one.gain)
+                    spread = replace(spread, factor=max(spread.factor, own))
+                judged = _judged(one, dense, spread)
+                assert (one.log_p, one.price, one.evidence) == pytest.approx(judged, rel=1e-4)
+        if family == "strain":
+            continue
+        one = every[family, "group"]
+        groups = [np.array(some) for some in product((0, 1), repeat=m) if 2 <= sum(some) <= 5]
+        assert one.gain.value == pytest.approx(max(map(gain, groups)), rel=1e-5)
+        assert one.search == pytest.approx(6 * np.log(2))
+        assert every[family, "linear"].factor == pytest.approx(np.linspace(-1, 1, m))
+        assert every[family, "alternating"].factor.tolist() == [0, 1, 0, 1, 0, 1, 0]
+        assert every[family, "linear"].search == every[family, "alternating"].search == 0
+
+
+def test_held_parameters_are_judged_by_what_photographs_say_of_them(dense: Dense) -> None:
+    """The spread is the smaller one of two: with the parameter free, and with all of its camera."""
+    every = [one for one in _every(dense) if one.family == "interior"]
+    assert sorted(len(one.parameters) for one in every)[-3:] == [1, 9, 9]
+    for one in every:
+        D = dense.reduced.whiten(one.columns(dense.a, dense.columns))
+        owner = next(
+            other
+            for other in every
+            if len(other.parameters) > 1 and set(one.parameters) <= set(other.parameters)
+        )
+        whole = dense.reduced.whiten(owner.columns(dense.a, dense.columns))
+        direction = D @ one.gain.beta
+        variance = float(one.gain.beta @ dense.normals(D)[0] @ one.gain.beta)
+        spreads = [
+            alternatives._of_scores(dense.reduced.scores(direction, step), variance)
+            for step in (direction, whole @ owner.gain.beta)
+        ]
+        spread = min(spreads, key=lambda one: one.factor)
+        judged = _judged(one, dense, spread)
+        assert (one.log_p, one.price, one.evidence) == pytest.approx(judged, rel=1e-4), one.parameters
+    one = next(one for one in _every(dense) if one.family == "format")
+    D = dense.reduced.whiten(one.columns(dense.a, dense.columns))
+    scores = dense.reduced.scores(D @ one.gain.beta, D @ one.gain.beta)
+    spread = alternatives._of_scores(scores, float(one.gain.beta @ dense.normals(D)[0] @ one.gain.beta))
+    assert (one.log_p, one.price, one.evidence) == pytest.approx(_judged(one, dense, spread), rel=1e-4)
+
+
+def test_moved_points_are_found_with_their_evidence(dense: Dense) -> None:
+    moved, shifted = (
+        next(one for one in _every(dense) if one.family == family) for family in ("moved", "shifted")
+    )
+    assert set(shifted.points.tolist()) == set(moved.points.tolist()) == {2, 17}
+    for one in (moved, shifted):
+        assert one.factor.tolist() == [0, 0, 0, 0, 1, 1, 1] and one.pattern == "split"
+        assert one.photographs.tolist() == [4, 5, 6]
+        seen = [np.bincount(dense.reduced.point[dense.reduced.image >= 4], minlength=20),
+                np.bincount(dense.reduced.point[dense.reduced.image < 4], minlength=20)]  # fmt: skip
+        movable = np.flatnonzero(np.minimum(*seen) >= 2)
+        assert one.search == pytest.approx(np.log(4) + np.log(comb(len(movable), 2)))
+    after = np.where((dense.reduced.image >= 4)[:, None, None], dense.reduced.B, 0.0)
+    normals = [
+        dense.normals(np.where((dense.reduced.point == j)[:, None, None], after, 0.0)) for j in movable
+    ]
+    others = [gain_of(*one).value for j, one in zip(movable, normals, strict=True) if j not in (2, 17)]
+    spread = Spread(float(np.mean(others)) / 3, 3 * len(others))
+    assert (moved.log_p, moved.price, moved.evidence) == pytest.approx(
+        _judged(moved, dense, spread), rel=1e-5
+    )
+    beta = shifted.gain.beta
+    left = [
+        gain_of(H, g + (H @ beta if j in (2, 17) else 0.0), np.diagonal(H))
+        for j, (H, g, _) in zip(movable, normals, strict=True)
+    ]
+    redundancy = sum(one.rank for one in left) - 3
+    spread = Spread(sum(one.value for one in left) / redundancy, redundancy)
+    assert (shifted.log_p, shifted.price, shifted.evidence) == pytest.approx(
+        _judged(shifted, dense, spread), rel=1e-5
+    )
+
+
+# ---- small enough to do by hand ----
+
+
+def part(g: list[float], coupling: float = 0.0) -> alternatives._Part:
+    """Return normal equations of one parameter in each photograph, with a diagonal of 1."""
+    m = len(g)
+    H = ((1 - coupling) * np.eye(m) + coupling)[:, None, :, None]
+    return alternatives._Part(H, np.array(g)[:, None], np.ones((m, 1)))
+
+
+def test_the_spread_is_of_what_a_pattern_leaves() -> None:
+    one = part([5.0, 7.0, 1.0, -1.0])
+    split = np.array([1.0, 1.0, 0.0, 0.0])
+    gain = one.gain(split)
+    assert (gain.value, gain.rank, gain.beta[0]) == (pytest.approx(72.0), 1, pytest.approx(-6.0))
+    found = one.spread(split, gain)
+    assert (found.factor, found.redundancy, found.among) == (pytest.approx(4 / 3), 3, True)
+    single = np.array([0.0, 1.0, 0.0, 0.0])  # nothing is left where one photograph differs: of the others
+    found = one.spread(single, one.gain(single))
+    assert (found.factor, found.redundancy) == (pytest.approx(27 / 2), 2)
+    assert part([5.0, 7.0]).spread(np.array([1.0, 0.0]), Gain(1.0, 1, np.ones(1))) == NONE
+    assert part([5.0, 7.0]).spread(np.ones(2), Gain(1.0, 1, -np.ones(1))).redundancy == 1
+
+
+@pytest.mark.parametrize("coupling", [-0.1, 0.0, 0.2])
+def test_a_group_is_grown_to_the_one_of_the_largest_gain(coupling: float) -> None:
+    for g in ([6.0, 0.5, 5.0, -0.3, 7.0, 0.2, -0.4], [-4.0, -5.0, 0.1, 0.2, 0.3, -6.0, 0.5]):
+        one = part(g, coupling)
+        factor, gain = one.group()
+        every = [
+            one.gain(np.array(some, dtype=float)).value for some in product((0, 1), repeat=7) if any(some)
+        ]
+        assert gain.value == pytest.approx(max(every))
+        assert one.gain(factor).value == pytest.approx(gain.value)
+
+
+def stub(**parts: Any) -> Any:
+    return SimpleNamespace(**parts)
+
+
+def made(gain: Gain, spread: Spread = NONE, *, points: IntArray = NO_POINTS) -> Alternative:
+    """Return an alternative of 4 photographs with 10 image points each, at a redundancy of 60."""
+    image = np.repeat(np.arange(4), 10)
+    reduced = stub(redundancy=60, image=image, point=np.tile(np.arange(10), 4))
+    return alternatives._made(
+        *(reduced, "c", "split", np.array([0.0, 0.0, 1.0, 1.0]), gain, 0.7, spread), points=points
+    )
+
+
+def test_the_price_is_by_the_image_points_that_are_touched() -> None:
+    gain = Gain(20.0, 2, np.zeros(2))
+    one = made(gain)
+    assert one.price == pytest.approx(np.log(2 * 20) + 0.7) and one.search == 0.7
+    assert one.evidence == pytest.approx(30 * np.log(60 / 40) - one.price)
+    assert one.log_p == pytest.approx(stats.f.logsf(10 / (40 / 58), 2, 58))
+    some = made(gain, points=np.array([3, 4, 5]))
+    assert some.price == pytest.approx(np.log(2 * 6) + 0.7) and some.points.tolist() == [3, 4, 5]
+    assert made(gain, points=np.array([99])).price == pytest.approx(np.log(4) + 0.7)
+
+
+def test_a_spread_lowers_the_evidence() -> None:
+    gain = Gain(20.0, 2, np.zeros(2))
+    plain, f = made(gain), 10 / 4 / (40 / 60)
+    assert made(gain, Spread(0.5, 3)).evidence == plain.evidence
+    among = made(gain, Spread(4.0, 6))
+    assert among.log_p == pytest.approx(stats.f.logsf(f, 2, 6))
+    assert among.evidence == pytest.approx(3 * np.log(1 + 2 * f / 6) - plain.price)
+    beside = made(gain, Spread(4.0, 6, among=False))
+    assert beside.log_p == pytest.approx(among.log_p)
+    assert beside.evidence == pytest.approx(30 * np.log(60 / 55) - plain.price)
+    assert made(Gain(0.0, 0, np.zeros(0)), Spread(4.0, 6)).log_p == 0.0
+    # no more than without: a spread that is hardly known, and a little over 1
+    assert made(gain, Spread(1.01, 10**6)).log_p >= plain.log_p
+    assert made(Gain(59.9, 2, np.zeros(2)), Spread(2.0, 6)).log_p == pytest.approx(
+        stats.f.logsf(59.9 / 2 / 2 * 60, 2, 6)
+    )
+
+
+def test_spread_of_scores() -> None:
+    found = alternatives._of_scores(np.array([1.0, 2.0, 3.0]), 7.0)
+    assert (found.factor, found.redundancy, found.among) == (pytest.approx(14 / 7 * 3 / 2), 2, False)
+    assert alternatives._of_scores(np.ones(1), 7.0) == NONE
+    assert alternatives._of_scores(np.ones(2), 1.0).redundancy == 1
+
+
+def test_variance_that_is_left_in_a_photograph() -> None:
+    v = np.array([[1.0, 2.0], [3.0, 1.0], [2.0, 2.0], [9.0, 9.0]])
+    reduced = stub(v=v, image=np.array([0, 0, 0, 1]), redundancy=6, count=8)
+    # 6 coordinates with 6 * 6 / 8 expected, less one parameter
+    assert alternatives._variance_of(reduced, 0, Gain(3.0, 1, np.zeros(1))) == pytest.approx(20 / 3.5)
+    assert alternatives._variance_of(reduced, 0, Gain(30.0, 1, np.zeros(1))) == 0.0
+    assert alternatives._variance_of(reduced, 1, Gain(30.0, 4, np.zeros(4))) == pytest.approx(132.0)
+
+
+def test_patterns_have_two_photographs_on_each_side() -> None:
+    found = {name: (factors.tolist(), search) for name, factors, search in alternatives._patterns(5)}
+    assert found["single"] == (np.eye(5).tolist(), pytest.approx(np.log(5)))
+    assert found["split"] == ([[0, 0, 1, 1, 1], [0, 0, 0, 1, 1]], pytest.approx(np.log(2)))
+    assert found["linear"] == ([[-1, -0.5, 0, 0.5, 1]], 0.0)
+    assert found["alternating"] == ([[0, 1, 0, 1, 0]], 0.0)
+
+
+def test_cells_divide_the_format() -> None:
+    xy = np.array([[0.0, 0.0], [1999.0, 1499.0], [1000.0, 290.0], [-0.4, 1500.4]])
+    seen = ImagePoints(np.array([0, 0, 0, 0]), np.arange(4), xy, np.tile(np.eye(2), (4, 1, 1)))
+    network = stub(image_points=seen, camera=np.zeros(1, dtype=int))
+    D = alternatives._cells(stub(network=network, estimate=stub(cameras=[stub(size_px=(2000, 1500))])))
+    assert D.shape == (4, 2, 50)
+    for row, cell in enumerate((0, 24, 2, 20)):
+        assert np.flatnonzero(D[row, 0]).tolist() == [2 * cell] and D[row, 0, 2 * cell] == 1
+        assert np.flatnonzero(D[row, 1]).tolist() == [2 * cell + 1] and D[row, 1, 2 * cell + 1] == 1
+
+
+def test_the_level_is_shared_by_rows_and_lowered_by_the_search() -> None:
+    limit = np.log(0.01 / 20) - 0.7
+    one = made(Gain(20.0, 2, np.zeros(2)))
+    assert alternatives.ALPHA == 0.01
+    assert is_significant(replace(one, log_p=limit - 0.5), 20)
+    assert not is_significant(replace(one, log_p=limit + 0.5), 20)
+
+
+def test_photographs_that_differ_are_the_fewer_ones() -> None:
+    one = made(Gain(20.0, 2, np.zeros(2)))
+    for factor, few in (([0, 1, 0], [1]), ([1, 0, 1], [1]), ([-1, 0, 1], [2]), ([1, 0, 0, 1], [0, 3])):
+        assert replace(one, factor=np.array(factor, dtype=float)).photographs.tolist() == few

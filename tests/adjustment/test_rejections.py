@@ -1,0 +1,215 @@
+"""What rejected image points have in common: limits and counts, on a small network."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sfm.adjustment.datum import Datum
+from sfm.adjustment.hypotheses import rejections
+from sfm.adjustment.hypotheses.rejections import SecondPlace, explain_rejections
+from sfm.adjustment.quality.point_normals import intersected
+from sfm.adjustment.result import Adjustment
+from sfm.adjustment.solve import adjust
+from sfm.camera import project
+from sfm.conventions import BoolArray, FloatArray, IntArray
+from sfm.distributions import chi2_isf
+from sfm.network import ImagePoints
+from sfm.remarks.remark import Remark, kinds_of
+from tests.synthetic import make_network, seed_of
+
+
+@pytest.fixture(scope="module")
+def clean() -> Adjustment:
+    network, truth = make_network(seed_of("rejections"), images=8, points=14, free=())
+    return adjust(network, truth, datum=Datum("free"), reject="none")
+
+
+def at(a: Adjustment, row: int, X: FloatArray) -> FloatArray:
+    """Return where the photograph of an image point shows a place."""
+    i, estimate = int(a.network.image_points.image[row]), a.estimate
+    camera = estimate.cameras[a.network.camera[i]]
+    return np.asarray(project(camera, estimate.position[i], estimate.rotation[i], X[None])[0])
+
+
+def row_of(a: Adjustment, point: int, image: int) -> int:
+    seen = a.network.image_points
+    return int(np.flatnonzero((seen.point == point) & (seen.image == image))[0])
+
+
+def with_rejected(a: Adjustment, xy: dict[int, FloatArray]) -> Adjustment:
+    """Return an adjustment in which some image points were measured elsewhere and rejected."""
+    seen = a.network.image_points
+    moved, residuals = seen.xy.copy(), a.residuals.copy()
+    for row, one in xy.items():
+        residuals[row] += moved[row] - one
+        moved[row] = one
+    rejected = np.isin(np.arange(len(seen)), list(xy))
+    network = replace(a.network, image_points=replace(seen, xy=moved))
+    return replace(a, network=network, rejected=rejected, residuals=residuals)
+
+
+def test_thresholds_are_those_stated() -> None:
+    assert rejections.MIN_EXCHANGED == 2  # once is an accident
+    assert rejections.MIN_RAYS == 3  # two nearly meet along an epipolar line
+    assert rejections.PREDICTED == 2.0  # as large as that of the measurement
+
+
+def test_nothing_is_explained_where_nothing_was_rejected_or_known(clean: Adjustment) -> None:
+    assert explain_rejections(clean) == ()
+    rows = [row_of(clean, 3, i) for i in (5, 6, 7)]
+    X = clean.estimate.points[3] + (0.1, 0.0, 0.05)
+    a = with_rejected(clean, {row: at(clean, row, X) for row in rows})
+    assert kinds_of(explain_rejections(a)) == ("points_moved",)
+    assert explain_rejections(replace(a, sigma0=0.0)) == ()
+    assert explain_rejections(replace(a, undetermined=("X of point 3",))) == ()
+
+
+def test_an_image_point_is_another_one_within_the_error_of_a_prediction(clean: Adjustment) -> None:
+    tolerance = np.sqrt(2 * chi2_isf(0.01, 2)) * clean.sigma0_px
+    rows = [row_of(clean, 3, i) for i in (1, 2, 3)]
+    away = dict(zip(rows, (0.8, 0.95, 1.1), strict=True))
+    a = with_rejected(
+        clean,
+        {row: at(clean, row, clean.estimate.points[9]) + (0.0, f * tolerance) for row, f in away.items()},
+    )
+    assert rejections._other_points(a) == dict.fromkeys(rows[:2], 9)
+
+
+def test_a_point_is_not_taken_for_itself(clean: Adjustment) -> None:
+    row = row_of(clean, 3, 1)
+    a = with_rejected(clean, {row: at(clean, row, clean.estimate.points[3])})
+    assert rejections._other_points(a) == {}
+
+
+def stub(point: list[int], image: list[int], rejected: list[bool] | None = None) -> Any:
+    k = len(point)
+    seen = ImagePoints(np.array(image), np.array(point), np.zeros((k, 2)), np.tile(np.eye(2), (k, 1, 1)))
+    names = tuple("ABCDEFGH")
+    network = SimpleNamespace(image_points=seen, images=names, points=tuple(f"p{j}" for j in range(9)))
+    out: BoolArray = np.zeros(k, dtype=bool) if rejected is None else np.array(rejected)
+    return SimpleNamespace(network=network, rejected=out)
+
+
+def test_names_are_exchanged_in_two_photographs_at_least() -> None:
+    """In both photographs each of the two points must lie where the other one is."""
+    twice = stub([1, 2, 1, 2, 1], [0, 0, 4, 4, 3])
+    found = {0: 2, 1: 1, 2: 2, 3: 1, 4: 2}
+    assert rejections._exchanged(twice, found) == ({(1, 2): [0, 3, 4]}, [])
+    del found[3]
+    pairs, rest = rejections._exchanged(twice, found)
+    assert pairs == {} and sorted(rest) == [0, 1, 2, 4]
+
+
+def test_exchanged_names_are_reported_once_and_others_as_misnamed(clean: Adjustment) -> None:
+    X = clean.estimate.points
+    where = {}
+    for i in (2, 5):
+        where[row_of(clean, 3, i)] = at(clean, row_of(clean, 3, i), X[9])
+        where[row_of(clean, 9, i)] = at(clean, row_of(clean, 9, i), X[3])
+    for i in (0, 1, 4):  # where point 6 is
+        where[row_of(clean, 12, i)] = at(clean, row_of(clean, 12, i), X[6])
+    exchanged, misnamed = explain_rejections(with_rejected(clean, where))
+    assert (exchanged.kind, misnamed.kind) == ("names_exchanged", "image_points_misnamed")
+    assert (exchanged.names("first"), exchanged.names("second")) == (("4",), ("10",))
+    assert exchanged.names("photographs") == ("image 3", "image 6")
+    assert misnamed.number("count") == 3
+    assert misnamed.names("photographs") == ("image 1", "image 2", "image 5")
+
+
+def second_places(clean: Adjustment, images: tuple[int, ...], by: FloatArray) -> list[SecondPlace]:
+    rows = [row_of(clean, 3, i) for i in images]
+    X = clean.estimate.points[3] + by
+    return rejections._second_places(with_rejected(clean, {row: at(clean, row, X) for row in rows}), set())
+
+
+def test_a_second_place_is_where_three_rays_meet(clean: Adjustment) -> None:
+    by = np.array([0.03, -0.02, 0.06])
+    (one,) = second_places(clean, (6, 1, 3), by)
+    assert one.point == 3 and one.images.tolist() == [1, 3, 6]
+    assert one.distance == pytest.approx(0.07, rel=0.02)
+    assert second_places(clean, (1, 3), by) == []
+    assert second_places(clean, (1, 3, 4, 5, 6, 7), by)[0].images.tolist() == [1, 3, 4, 5, 6, 7]
+    assert second_places(clean, (1, 2, 3, 4, 5, 6, 7), by) == []  # one ray has no place
+
+
+def test_the_distance_is_judged_by_both_covariances_and_the_rays_rejected(clean: Adjustment) -> None:
+    axis = np.array([0.6, 0.0, 0.8])
+    rows = np.array([row_of(clean, 3, i) for i in (5, 6, 7)])
+    kept = np.array([row_of(clean, 3, i) for i in (0, 1, 2, 3, 4)])
+    a = with_rejected(clean, {row: at(clean, row, clean.estimate.points[3]) for row in rows.tolist()})
+    (_, Q, _), (first, Q0, _) = intersected(a, rows), intersected(a, kept)
+    limit = np.sqrt(chi2_isf(0.01 / 3, 3))
+    unit = axis / np.sqrt(axis @ np.linalg.inv(Q + Q0) @ axis)
+    shift = first - clean.estimate.points[3]
+    assert second_places(clean, (5, 6, 7), shift + 0.93 * limit * unit) == []
+    (one,) = second_places(clean, (5, 6, 7), shift + 1.07 * limit * unit)
+    assert one.over_sigma == pytest.approx(1.07 * limit, rel=0.02)
+
+
+def test_rays_that_do_not_meet_have_no_second_place(clean: Adjustment) -> None:
+    rows = [row_of(clean, 3, i) for i in (1, 3, 6)]
+    X = clean.estimate.points[3] + (0.03, -0.02, 0.06)
+
+    def found(px: float) -> list[SecondPlace]:
+        where = {row: at(clean, row, X) for row in rows}
+        where[rows[0]] += (px, 0.0)
+        where[rows[1]] += (0.0, px)
+        return rejections._second_places(with_rejected(clean, where), set())
+
+    a = with_rejected(clean, {row: at(clean, row, X) for row in rows})
+    unit = 1.0
+    where = {row: at(clean, row, X) for row in rows}
+    where[rows[0]] += (unit, 0.0)
+    where[rows[1]] += (0.0, unit)
+    misfit = intersected(with_rejected(clean, where), np.array(rows))[2]
+    limit = np.sqrt(chi2_isf(0.01, 3) / misfit)  # 6 coordinates less 3
+    assert intersected(a, np.array(rows))[2] < 1e-3
+    assert len(found(0.93 * limit)) == 1 and found(1.07 * limit) == []
+
+
+def place(point: int, images: list[int], distance: float = 1.0, over: float = 9.0) -> SecondPlace:
+    return SecondPlace(point, distance, over, np.array(images))
+
+
+def remarks_of(places: list[SecondPlace], kept: dict[int, list[int]]) -> list[Remark]:
+    point = [j for j, images in kept.items() for _ in images]
+    image = [i for images in kept.values() for i in images]
+    return rejections._of_places(stub(point, image), places, "mm")
+
+
+def test_points_that_moved_at_one_place_of_the_sequence_are_one_remark() -> None:
+    found = remarks_of(
+        [
+            place(1, [4, 5, 6], 2.0, 7.0),
+            place(2, [5, 6], 3.0, 6.0),
+            place(3, [4, 7]),
+            place(4, [0, 1, 2], 4.0, 5.0),
+        ],
+        {1: [0, 1, 2], 2: [0, 3], 3: [0, 6], 4: [3, 4]},
+    )
+    assert [one.kind for one in found] == ["points_moved", "points_moved", "points_moved", "two_places"]
+    assert [one.names("points") for one in found[:3]] == [("p4",), ("p1",), ("p2",)]
+    assert [one.names("from") for one in found[:3]] == [("D",), ("E",), ("F",)]
+    assert [one.number("distance") for one in found[:3]] == [4.0, 2.0, 3.0]
+    assert [one.number("shift") for one in found[:3]] == [5.0, 7.0, 6.0]
+    alone = found[3]
+    assert alone.names("point") == ("p3",) and alone.names("photographs") == ("E", "H")
+    assert (alone.number("distance"), alone.number("sigmas")) == (1.0, 9.0)
+    assert alone.numbers["distance"].unit == found[0].numbers["distance"].unit == "mm"
+
+
+def test_points_that_moved_together_have_the_largest_distance() -> None:
+    (one,) = remarks_of([place(1, [4, 5], 2.0, 7.0), place(2, [4, 6], 3.0, 6.0)], {1: [0, 3], 2: [1, 2]})
+    assert one.names("points") == ("p1", "p2") and one.names("from") == ("E",)
+    assert (one.number("distance"), one.number("shift")) == (3.0, 7.0)
+
+
+def test_kept_photographs_are_without_the_rejected() -> None:
+    a = stub([1, 1, 2, 1], [0, 2, 3, 5], [False, True, False, False])
+    kept: IntArray = rejections._kept_images(a, 1)
+    assert kept.tolist() == [0, 5]
