@@ -72,11 +72,11 @@ def test_nothing_is_explained_where_nothing_was_rejected_or_known(clean: Adjustm
 def test_an_image_point_is_another_one_within_the_error_of_a_prediction(clean: Adjustment) -> None:
     tolerance = np.sqrt(2 * chi2_isf(0.01, 2)) * clean.sigma0_px
     rows = [row_of(clean, 3, i) for i in (1, 2, 3)]
-    away = dict(zip(rows, (0.8, 0.95, 1.1), strict=True))
-    a = with_rejected(
-        clean,
-        {row: at(clean, row, clean.estimate.points[9]) + (0.0, f * tolerance) for row, f in away.items()},
-    )
+    where = {}
+    for row, factor in zip(rows, (0.8, 0.95, 1.1), strict=True):
+        where[row] = at(clean, row, clean.estimate.points[9])
+        where[row][1] += factor * tolerance
+    a = with_rejected(clean, where)
     assert rejections._other_points(a) == dict.fromkeys(rows[:2], 9)
 
 
@@ -155,21 +155,17 @@ def test_rays_that_do_not_meet_have_no_second_place(clean: Adjustment) -> None:
     rows = [row_of(clean, 3, i) for i in (1, 3, 6)]
     X = clean.estimate.points[3] + (0.03, -0.02, 0.06)
 
-    def found(px: float) -> list[SecondPlace]:
+    def beside(px: float) -> Adjustment:
         where = {row: at(clean, row, X) for row in rows}
         where[rows[0]] += (px, 0.0)
         where[rows[1]] += (0.0, px)
-        return rejections._second_places(with_rejected(clean, where), set())
+        return with_rejected(clean, where)
 
-    a = with_rejected(clean, {row: at(clean, row, X) for row in rows})
-    unit = 1.0
-    where = {row: at(clean, row, X) for row in rows}
-    where[rows[0]] += (unit, 0.0)
-    where[rows[1]] += (0.0, unit)
-    misfit = intersected(with_rejected(clean, where), np.array(rows))[2]
+    assert intersected(beside(0.0), np.array(rows))[2] < 1e-3
+    misfit = intersected(beside(1.0), np.array(rows))[2]
     limit = np.sqrt(chi2_isf(0.01, 3) / misfit)  # 6 coordinates less 3
-    assert intersected(a, np.array(rows))[2] < 1e-3
-    assert len(found(0.93 * limit)) == 1 and found(1.07 * limit) == []
+    assert len(rejections._second_places(beside(0.93 * limit), set())) == 1
+    assert rejections._second_places(beside(1.07 * limit), set()) == []
 
 
 def place(point: int, images: list[int], distance: float = 1.0, over: float = 9.0) -> SecondPlace:

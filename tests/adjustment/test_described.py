@@ -1,0 +1,318 @@
+"""From an alternative to its remark: which one is adjusted, what it is called, and its numbers."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sfm.adjustment.datum import Datum
+from sfm.adjustment.hypotheses import described, hypotheses, refit
+from sfm.adjustment.hypotheses.alternatives import Alternative
+from sfm.adjustment.hypotheses.columns import interior_step, object_fields
+from sfm.adjustment.hypotheses.described import kind_of, remark_of
+from sfm.adjustment.hypotheses.hypotheses import (
+    Cause,
+    contradicted_parameters,
+    find_causes,
+    free_network,
+    judge_alternatives,
+)
+from sfm.adjustment.hypotheses.refit import Refit, log_likelihood, shifts_of
+from sfm.adjustment.hypotheses.score import Gain
+from sfm.adjustment.result import Adjustment
+from sfm.adjustment.solve import adjust
+from sfm.conventions import FloatArray
+from sfm.network import ScaleBars
+from sfm.remarks.remark import Remark
+from tests.synthetic import make_network, seed_of
+
+
+@pytest.fixture(scope="module")
+def a() -> Adjustment:
+    network, truth = make_network(seed_of("described"), images=6, points=14, free=("c",))
+    return adjust(network, truth, datum=Datum("free"), reject="none")
+
+
+def alternative(
+    family: str = "c",
+    pattern: str = "split",
+    factor: tuple[float, ...] = (0, 0, 0, 0, 1, 1),
+    *,
+    evidence: float = 20.0,
+    log_p: float = -50.0,
+    search: float = 1.0,
+    points: tuple[int, ...] = (),
+    parameters: tuple[tuple[int, int], ...] = (),
+) -> Alternative:
+    return Alternative(
+        *(
+            family,
+            pattern,
+            np.array(factor, dtype=float),
+            Gain(9.0, 1, np.ones(1)),
+            log_p,
+            5.0,
+            search,
+            evidence,
+        ),
+        np.array(points, dtype=np.int64),
+        parameters,
+    )
+
+
+@pytest.mark.parametrize(
+    ("family", "pattern", "kind"),
+    [
+        ("c", "split", "other_camera"),
+        ("camera", "linear", "camera_drift"),
+        ("interior", "all", "held_parameter"),
+        ("format", "all", "distortion_not_described"),
+        ("moved", "split", "points_moved"),
+        ("shifted", "split", "points_moved"),
+        ("strain", "linear", "object_deforming"),
+        ("bending", "split", "object_deformed"),
+    ],
+)
+def test_kinds(family: str, pattern: str, kind: str) -> None:
+    assert kind_of(alternative(family, pattern)) == kind
+
+
+def remark(a: Adjustment, one: Alternative, beta: list[float], *others: Alternative) -> Remark:
+    found = Refit(a, np.array(beta), 50.0, 4.0, 2.0)
+    return remark_of(a, one, found, others, "mm")
+
+
+def test_the_remark_on_a_camera(a: Adjustment) -> None:
+    one = remark(
+        a, alternative("c"), [5.0], alternative("strain"), alternative("bending"), alternative("moved")
+    )
+    assert one.names("photographs") == ("image 5", "image 6")
+    assert one.names("instead") == ("object_deformed", "points_moved")
+    assert (one.number("shift"), one.number("rms")) == (4.0, 2.0)
+    assert one.number("change") == pytest.approx(100 * 5.0 / 1000) and "away" not in one.numbers
+    others = remark(a, alternative("centre", factor=(1, 1, 1, 1, 0, 0)), [5.0, 3.0, -4.0, 1.0])
+    assert others.number("change") == pytest.approx(-0.5) and others.names("instead") == ()
+    assert others.number("away") == pytest.approx(5.0)
+    three = remark(a, alternative("centre"), [5.0, 3.0, -4.0])
+    assert three.number("away") == pytest.approx(5.0)
+    drift = remark(a, alternative("centre", "linear", (-1, -0.6, -0.2, 0.2, 0.6, 1)), [5.0, 3.0, -4.0, 1.0])
+    assert drift.kind == "camera_drift" and "away" not in drift.numbers
+    assert drift.number("change") == pytest.approx(0.5)
+
+
+def test_the_remark_on_held_parameters(a: Adjustment) -> None:
+    camera = a.estimate.cameras[0]
+    x0, K1 = camera.names.index("x0"), camera.names.index("K1")
+    one = remark(a, alternative("interior", "all", parameters=((0, x0),)), [7.0])
+    assert one.names("camera") == ("camera 1",) and one.names("parameters") == ("x0",)
+    assert one.number("value") == pytest.approx(0.03) and one.numbers["value"].unit == "mm"
+    assert one.number("instead_of") == pytest.approx(0.03 + 7 * interior_step(a, 0, x0))
+    assert one.numbers["instead_of"].unit == "mm"
+    both = remark(a, alternative("interior", "all", parameters=((0, x0), (0, K1))), [7.0, 1.0])
+    assert both.names("parameters") == ("x0", "K1") and "value" not in both.numbers
+
+
+def test_a_pure_number_has_no_unit() -> None:
+    network, truth = make_network(seed_of("pure"), images=4, points=12, model="opencv", free=("fx",))
+    a = adjust(network, truth, datum=Datum("free"), reject="none")
+    k1 = a.estimate.cameras[0].names.index("k1")
+    one = remark(a, alternative("interior", "all", (1, 1, 1, 1), parameters=((0, k1),)), [7.0])
+    assert one.numbers["value"].unit == "" and one.number("value") == pytest.approx(-0.08)
+
+
+def test_the_remark_on_the_format(a: Adjustment) -> None:
+    one = remark(a, alternative("format", "all"), [0.1, 0.0, 0.3, -0.4, 0.0, 0.2])
+    assert one.number("largest") == pytest.approx(0.5) and one.numbers["largest"].unit == "px"
+
+
+def test_the_remark_on_points(a: Adjustment) -> None:
+    one = remark(a, alternative("moved", points=(2, 5)), [1.0, 2.0, 2.0, 0.0, 0.0, 1.0])
+    assert one.names("points") == ("3", "6") and one.names("from") == ("image 5",)
+    assert one.number("distance") == pytest.approx(3.0) and one.numbers["distance"].unit == "mm"
+
+
+@pytest.mark.parametrize(("family", "size"), [("strain", 5), ("bending", 18)])
+def test_the_remark_on_a_deformation(a: Adjustment, family: str, size: int) -> None:
+    beta = seed_of(family).normal(0, 1e-3, size)
+    strain, bending, extent = object_fields(a.estimate.points)
+    away = np.linalg.norm((strain if family == "strain" else bending) @ beta, axis=1) / extent
+    one = remark(a, alternative(family), beta.tolist())
+    assert one.number("deformation") == pytest.approx(1000 * away.max())
+    linear = remark(a, alternative(family, "linear", (-1, -0.6, -0.2, 0.2, 0.6, 1)), beta.tolist())
+    assert linear.number("deformation") == pytest.approx(2000 * away.max())
+
+
+# ---- the adjustment with an alternative ----
+
+
+def test_the_likelihood_spreads_rejected_points_over_their_photograph(a: Adjustment) -> None:
+    plain = -a.redundancy / 2 * (np.log(2 * np.pi * a.sigma0_px**2) + 1)
+    assert log_likelihood(a) == pytest.approx(plain)
+    out = np.zeros(len(a.rejected), dtype=bool)
+    out[[1, 4, 5]] = True
+    assert log_likelihood(replace(a, rejected=out)) == pytest.approx(plain - 3 * np.log(2000 * 1500))
+
+
+def moved_points(a: Adjustment, points: FloatArray) -> Adjustment:
+    return replace(a, estimate=replace(a.estimate, points=points))
+
+
+def test_shifts_are_in_standard_deviations_after_a_similarity(a: Adjustment) -> None:
+    X, sigma = a.estimate.points, np.sqrt(np.diagonal(a.covariance.points, axis1=1, axis2=2))
+    one, beta = alternative("c"), np.zeros(1)
+    turned = 1.3 * X @ np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]).T + (3.0, 2.0, 1.0)
+    assert shifts_of(a, moved_points(a, turned), one, beta) == pytest.approx((0, 0), abs=1e-6)
+    # points that the similarity does not see: the shift of a moved point is its whole difference
+    Y = X.copy()
+    Y[4] += (0.0, 6 * sigma[4, 1], 0.0)
+    still = alternative("moved", points=(4,))
+    largest, rms = shifts_of(a, moved_points(a, Y), still, np.zeros(3))
+    assert (largest, rms) == pytest.approx((6.0, 6 / np.sqrt(3 * len(X))))
+    # what the alternative takes out of the coordinates counts where it is more
+    largest, rms = shifts_of(a, moved_points(a, Y), still, np.array([0.0, 0.0, -9 * sigma[4, 2]]))
+    assert (largest, rms) == pytest.approx((9.0, 9 / np.sqrt(3 * len(X))))
+    # a point that is not known has no part
+    Y[4] = np.nan
+    assert shifts_of(a, moved_points(a, Y), one, beta) == pytest.approx((0, 0), abs=1e-6)
+    unknown = np.full_like(X, np.nan)
+    assert np.isnan(shifts_of(a, moved_points(a, unknown), one, beta)).all()
+
+
+def test_a_deformation_counts_from_its_mean(a: Adjustment) -> None:
+    strain, bending, _ = object_fields(a.estimate.points)
+    for family, fields in (("strain", strain), ("bending", bending)):
+        beta = np.arange(1.0, fields.shape[2] + 1)
+        one = alternative(family, factor=(0, 0, 0, 0, 0, 1))
+        np.testing.assert_allclose(refit._displaced(a, one, beta), 5 / 6 * fields @ beta)
+    assert not refit._displaced(a, alternative("c"), np.ones(1)).any()
+    away = refit._displaced(a, alternative("shifted", points=(1, 3)), np.array([1.0, 2.0, 3.0]))
+    assert away[[1, 3]].tolist() == [[1, 2, 3]] * 2 and np.count_nonzero(away) == 6
+
+
+# ---- the choice ----
+
+
+def choice(
+    monkeypatch: pytest.MonkeyPatch, every: list[Alternative], *, gain: float = 50.0, shift: float = 4.0
+) -> Cause | None:
+    """Return the best of these alternatives, an adjustment with which gains so much."""
+    found = Refit(SimpleNamespace(), np.ones(1), gain, shift, shift)  # type: ignore[arg-type]
+    monkeypatch.setattr(hypotheses, "columns_of", lambda a: None)
+    monkeypatch.setattr(hypotheses, "reduce_adjustment", lambda a, columns: None)
+    monkeypatch.setattr(hypotheses, "alternatives_of", lambda *_: tuple(every))
+    monkeypatch.setattr(hypotheses, "refit", lambda *_, reject: found)
+    nothing: Any = None
+    return hypotheses._best(nothing, nothing, reject="none")
+
+
+def test_an_alternative_holds_by_its_probability_its_evidence_and_its_refit(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    limit = np.log(100)
+    for evidence, log_p, gain, holds in (
+        (limit + 0.3, -50.0, 5 + limit + 0.3, True),
+        (limit - 0.3, -50.0, 50.0, False),
+        (limit + 0.3, np.log(0.01) - 1 + 0.3, 50.0, False),
+        (limit + 0.3, np.log(0.01) - 1 - 0.3, 50.0, True),
+        (limit + 0.3, -50.0, 5 + limit - 0.3, False),
+    ):
+        found = choice(monkeypatch, [alternative(evidence=evidence, log_p=log_p)], gain=gain)
+        assert (found is not None) == holds
+
+
+def test_alternatives_of_about_the_same_evidence_cannot_be_told_apart(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    best, same = alternative(evidence=40.0), alternative("camera", evidence=39.0)
+    near = alternative("strain", evidence=40 - np.log(100) + 0.3)
+    nearer = alternative("bending", evidence=39.0)
+    far = alternative("interior", "all", evidence=40 - np.log(100) - 0.3, parameters=((0, 1),))
+    found = choice(monkeypatch, [best, same, nearer, near, far])
+    assert found is not None and found.alternative is best and found.as_well == (nearer,)
+
+
+def test_causes() -> None:
+    cause = hypotheses._cause
+    assert cause(alternative("c")) == cause(alternative("camera"))
+    assert cause(alternative("c")) != cause(alternative("c", factor=(0, 0, 1, 1, 1, 1)))
+    assert cause(alternative("strain")) == cause(alternative("bending")) == cause(alternative("shifted"))
+    assert cause(alternative("strain")) != cause(alternative("strain", "linear"))
+    assert cause(alternative("interior", parameters=((0, 1),))) == ("interior",)
+
+
+def test_two_causes_at_most_of_a_standard_deviation_at_least(
+    a: Adjustment, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shifts: list[float] = []
+    treated: list[str] = []
+
+    def best(plain: Adjustment, current: Adjustment, *, reject: str) -> Cause:
+        assert (current is plain) == (len(treated) == 0)
+        treated.append(reject)
+        return Cause(alternative(), Refit(replace(plain), np.ones(1), 1.0, shifts.pop(0), 1.0), ())
+
+    monkeypatch.setattr(hypotheses, "_best", best)
+    for given, count in (([2.0, 3.0, 4.0], 2), ([0.9, 3.0], 1), ([1.1, 0.6], 1), ([1.0, 1.9], 2)):
+        shifts[:], treated[:] = given, []
+        assert len(find_causes(a, a)) == count
+        assert len(treated) == 2
+    out = np.zeros(len(a.rejected), dtype=bool)
+    for final, how in (
+        (a, "tau"),
+        (replace(a, inflation=1.2), "none"),
+        (replace(a, inflation=1.2, rejected=~out), "tau"),
+    ):
+        shifts[:], treated[:] = [2.0, 2.0], []
+        find_causes(final, a)
+        assert treated[0] == how
+
+
+def test_the_free_network_is_the_adjustment_itself_where_nothing_else_was_observed(
+    a: Adjustment, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert free_network(a) is a
+    assert free_network(replace(a, redundancy=2)) is not None
+    for wrong in (
+        {"converged": False},
+        {"sigma0": 0.0},
+        {"sigma0": float("nan")},
+        {"redundancy": 1},
+        {"inflation": 1.2},
+        {"undetermined": ("X0",)},
+    ):
+        assert free_network(replace(a, **wrong)) is None  # type: ignore[arg-type]
+    assert judge_alternatives(replace(a, converged=False)) == ()
+    assert contradicted_parameters(replace(a, converged=False)) == ()
+    bars = ScaleBars(np.array([0]), np.array([1]), np.array([9.0]), np.array([1e-3]))
+    final = replace(a, network=replace(a.network, scale_bars=bars), sigma0=5.0)
+    free = free_network(final)
+    assert free is not None and len(free.network.scale_bars) == 0 and free.sigma0 < 2
+    fixed = free_network(replace(a, datum="control"))
+    assert fixed is not None and fixed is not a and fixed.datum == "free"
+    k = len(a.rejected)
+    monkeypatch.setattr(hypotheses, "MAX_IMAGE_POINTS", k)
+    assert free_network(a) is a
+    monkeypatch.setattr(hypotheses, "MAX_IMAGE_POINTS", k - 1)
+    half = free_network(a)
+    assert half is not None and half.network.points == a.network.points[::2]
+
+
+def test_of_a_large_network_every_so_many_points_are_taken(
+    a: Adjustment, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen = a.network.image_points
+    for limit, every in ((len(seen), 1), (len(seen) // 2, 2 + len(seen) % 2), (-(-len(seen) // 3), 3)):
+        monkeypatch.setattr(hypotheses, "MAX_IMAGE_POINTS", limit)
+        network, estimate, rows = hypotheses._sample(a.network, a)
+        assert network.points == a.network.points[::every]
+        np.testing.assert_array_equal(estimate.points, a.estimate.points[::every])
+        np.testing.assert_array_equal(network.image_points.xy, seen.xy[rows])
+        assert len(network.images) == 6
+
+
+def test_families_that_move_points() -> None:
+    assert described.MOVED == ("moved", "shifted")
