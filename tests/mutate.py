@@ -30,6 +30,7 @@ TIMEOUT = 300  # s, of the tests of one mutation; one that never ends is noticed
 ROOMS: dict[str, tuple[str, ...]] = {  # module or package, with the tests that hold it
     "sfm/adjustment/hypotheses": (
         "tests/adjustment/test_alternatives.py",
+        "tests/adjustment/test_columns.py",
         "tests/adjustment/test_rejections.py",
         "tests/adjustment/test_described.py",
         "tests/adjustment/test_hypotheses.py",
@@ -45,7 +46,10 @@ ROOMS: dict[str, tuple[str, ...]] = {  # module or package, with the tests that 
         "tests/adjustment/test_minimal_bias.py",
         "tests/adjustment/test_statistics.py",
     ),
-    "sfm/adjustment/quality/given_values.py": ("tests/adjustment/test_given_values.py",),
+    "sfm/adjustment/quality/given_values.py": (
+        "tests/adjustment/test_given_model.py",
+        "tests/adjustment/test_given_values.py",
+    ),
     "sfm/targets/codes/rings.py": ("tests/targets/test_codes.py",),
 }
 COMPARED = {

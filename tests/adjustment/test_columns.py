@@ -1,0 +1,129 @@
+"""Columns of alternatives on values done by hand; that they are derivatives is tested with the hypotheses."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from sfm.adjustment.datum import Datum
+from sfm.adjustment.hypotheses import columns
+from sfm.adjustment.hypotheses.columns import columns_of, interior_columns, interior_step, object_fields
+from sfm.adjustment.result import Adjustment
+from sfm.adjustment.solve import adjust
+from sfm.camera import pixel_from_tangents, project
+from sfm.conventions import FloatArray, rotation_from_vector
+from tests.synthetic import make_network, seed_of
+
+
+@pytest.fixture(scope="module")
+def a() -> Adjustment:
+    network, truth = make_network(seed_of("columns by hand"), images=4, points=10, cameras=2, free=("c",))
+    return adjust(network, truth, datum=Datum("free"), reject="none")
+
+
+def test_camera_columns_by_hand() -> None:
+    x, y, r2 = 0.5, -0.2, 0.29
+    across = [x, 1, 0, x * r2, x * r2**2, r2 + 2 * x**2, 2 * x * y, x, y]
+    down = [y, 0, 1, y * r2, y * r2**2, 2 * x * y, r2 + 2 * y**2, 0, 0]
+    np.testing.assert_allclose(columns._camera(np.array([[x, y]])), [[across, -np.array(down)]])
+
+
+def test_fields_of_the_object_by_hand() -> None:
+    points = np.array([[2.0, 1, 1], [-1, 1, 1], [0.5, 4, 1], [0.5, -2, 1], [np.nan, 0, 0]])
+    strain, bending, size = object_fields(points)
+    assert size == pytest.approx(np.sqrt((2 * 2.25 + 2 * 9) / 4))
+    x, y, z = 1.5 / size, 0.0, 0.0
+    assert strain[0].T.tolist() == pytest.approx(
+        size * np.array([[x, -y, 0], [x, y, -2 * z], [y, x, 0], [z, 0, x], [0, z, y]])
+    )
+    np.testing.assert_allclose(strain[2].T[:3], [[0, -3, 0], [0, 3, 0], [3, 0, 0]])
+    products = np.array([x * x, 0, 0, 0, 0, 0])
+    np.testing.assert_allclose(bending[0], size * np.einsum("t,cd->ctd", products, np.eye(3)).reshape(3, 18))
+    one = np.array([[1.0, 2, 3], [-1, -2, -3]])
+    strain, bending, size = object_fields(one)
+    x, y, z = one[0] / size
+    np.testing.assert_allclose(
+        strain[0].T / size, [[x, -y, 0], [x, y, -2 * z], [y, x, 0], [z, 0, x], [0, z, y]]
+    )
+    products = np.array([x * x, y * y, z * z, x * y, x * z, y * z])
+    np.testing.assert_allclose(bending[0] / size, np.einsum("t,cd->ctd", products, np.eye(3)).reshape(3, 18))
+    assert not object_fields(points)[0][4].any()
+
+
+def computed(a: Adjustment) -> FloatArray:
+    """Return where the image points of an estimate are, px."""
+    network, estimate = a.network, a.estimate
+    found = []
+    for i, j in zip(network.image_points.image, network.image_points.point, strict=True):
+        camera = estimate.cameras[network.camera[i]]
+        found.append(
+            project(camera, estimate.position[i], estimate.rotation[i], estimate.points[j : j + 1])[0]
+        )
+    return np.array(found)
+
+
+def test_columns_are_differences(a: Adjustment) -> None:
+    found, estimate, h = columns_of(a), a.estimate, 1e-6
+    assert found.usable.all()
+    for c, axis in enumerate(np.eye(3)):
+        turned = estimate.rotation @ rotation_from_vector(h * axis)
+        for own, changed in (
+            (found.exterior[:, :, c], replace(estimate, position=estimate.position + h * axis)),
+            (found.exterior[:, :, 3 + c], replace(estimate, rotation=turned)),
+            (found.point[:, :, c], replace(estimate, points=estimate.points + h * axis)),
+        ):
+            right = (computed(replace(a, estimate=changed)) - computed(a)) / h
+            np.testing.assert_allclose(own, right, rtol=2e-3, atol=0.5)
+    unit = np.array([1.0, -2.0])[a.network.camera[a.network.image_points.image]]
+    for index in (0, 1):
+        camera = estimate.cameras[index]
+        for s in range(len(camera.names)):
+            step = interior_step(a, index, s)
+            cameras = list(estimate.cameras)
+            p = camera.parameters.copy()
+            p[s] += 0.01 * step
+            cameras[index] = camera.with_parameters(p)
+            right = (
+                computed(replace(a, estimate=replace(estimate, cameras=tuple(cameras)))) - computed(a)
+            ) / 0.01
+            own = interior_columns(a, index, [s])[:, :, 0]
+            np.testing.assert_allclose(own, right, rtol=5e-3, atol=5e-3)
+            assert not own[unit == (-2.0 if index == 0 else 1.0)].any()
+
+
+def test_a_point_behind_a_photograph_has_no_columns(a: Adjustment) -> None:
+    points = a.estimate.points.copy()
+    points[3] = 3 * a.estimate.position[0]
+    points[4] = np.nan
+    found = columns_of(replace(a, estimate=replace(a.estimate, points=points)))
+    seen = a.network.image_points
+    assert not found.usable[(seen.image == 0) & (seen.point == 3)].any()
+    assert not found.usable[seen.point == 4].any()
+    assert found.usable[(seen.point != 3) & (seen.point != 4)].all()
+    for part in (found.exterior, found.point, found.camera, found.strain, found.bending):
+        assert not part[~found.usable].any() and np.isfinite(part).all()
+
+
+def test_a_step_moves_image_points_by_a_hundredth_of_a_pixel(a: Adjustment) -> None:
+    camera = a.estimate.cameras[0]
+    uv = seed_of("step").uniform(-0.4, 0.4, (20, 2))
+    for s, name in enumerate(camera.names):
+        step = columns._step(camera, s, uv)
+        away = pixel_from_tangents(columns._changed(camera, s, step), uv) - pixel_from_tangents(camera, uv)
+        assert np.abs(away).max() == pytest.approx(0.01, rel=0.02), name
+        assert interior_step(a, 0, s) > 0
+    idle = uv[:0]
+    assert columns._step(camera, 0, idle) > 0
+
+
+def test_the_edge_of_the_longer_side_is_the_unit_of_the_camera_columns(a: Adjustment) -> None:
+    found = columns_of(a)
+    seen, estimate = a.network.image_points, a.estimate
+    for row in (0, 7, 30):
+        i = seen.image[row]
+        U, V, W = estimate.rotation[i].T @ (estimate.points[seen.point[row]] - estimate.position[i])
+        c_px = estimate.cameras[a.network.camera[i]].c_px
+        assert found.camera[row, 0, 0] == pytest.approx(-U / W * c_px / 1000)
+        assert found.camera[row, 1, 0] == pytest.approx(V / W * c_px / 1000)

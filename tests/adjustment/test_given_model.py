@@ -1,0 +1,371 @@
+"""Given values against the free network, by hand: chi-square, probability, factor, the choice of a cause."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from itertools import combinations
+from math import comb
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from sfm.adjustment.quality import given_values
+from sfm.adjustment.quality.given_values import (
+    GivenModel,
+    GivenPoints,
+    Judgement,
+    judge_points,
+    judge_values,
+    scale_model,
+    scale_of_length,
+)
+from sfm.conventions import FloatArray, rotation_from_vector
+from sfm.similarity import Similarity
+from tests.synthetic import seed_of
+
+FRAME = Similarity(0.4, rotation_from_vector(np.array([0.3, -0.2, 1.1])), np.array([5.0, -2.0, 1.0]))
+
+
+def test_thresholds_are_those_stated() -> None:
+    """Limits of effort and of rounding; the others decide tests in this folder."""
+    assert given_values.MAX_SETS == 2000 and given_values.MAX_TRIPLES == 300
+    assert given_values.MAX_EXCHANGED == 40 and given_values.RELINEARISED == 3
+    assert given_values.RANK == 1e-9  # of double precision 2e-16, whose root is 1.5e-8
+    assert given_values.MAX_FACTOR == 30.0
+    assert given_values.FACTORS[[0, -1]].tolist() == [1.0, 1e6] and len(given_values.FACTORS) == 241
+
+
+def bars(*v: float, stated: float = 1.0, network: float = 0.0, redundancy: int = 500) -> GivenModel:
+    """Return the model of bars with these differences, of variances stated and network."""
+    n = len(v)
+    free = network * np.eye(n)
+    return GivenModel(np.array(v), free, stated * np.eye(n), np.ones((n, 1)), np.arange(n), redundancy)
+
+
+def of_points(name: str, items: int = 5) -> GivenModel:
+    """Return a model of values with three rows each, all correlated."""
+    rng = seed_of(name)
+    m = 3 * items
+    network, stated = rng.normal(size=(2, m, m))
+    v, A, item = rng.normal(size=m), rng.normal(size=(m, 4)), np.repeat(np.arange(items), 3)
+    return GivenModel(v, network @ network.T / m, stated @ stated.T / m + np.eye(m), A, item, 40)
+
+
+def without(model: GivenModel, k: int) -> GivenModel:
+    """Return the model without its last value."""
+    kept = np.flatnonzero(model.item != k)
+    assert k == model.items - 1
+    both = np.ix_(kept, kept)
+    network, stated, item = model.network[both], model.stated[both], model.item[kept]
+    return replace(model, v=model.v[kept], network=network, stated=stated, A=model.A[kept], item=item)
+
+
+def test_chi_square_is_of_what_the_parameters_leave() -> None:
+    one = bars(1.0, 2.0, 6.0, stated=2.0, network=2.0)
+    assert one.misfit() == (pytest.approx(14 / 4), 2)
+    assert one.misfit((2,)) == (pytest.approx(0.5 / 4), 1)
+    assert one.decrease((2,)) == (pytest.approx(13.5 / 4), 1)
+    assert one.decrease((0, 2)) == (pytest.approx(14 / 4), 2)
+    assert one.misfit((0, 1)) == (pytest.approx(0.0), 0) and one.probability((0, 1)) == 1.0
+    assert one.share == pytest.approx(0.5) and one.items == 3
+    many = of_points("chi-square")
+    S = many.network + many.stated
+    P = np.linalg.inv(S)
+    left = P - P @ many.A @ np.linalg.solve(many.A.T @ P @ many.A, many.A.T @ P)
+    np.testing.assert_allclose(many.precision, left, atol=1e-9)
+    assert many.misfit() == (pytest.approx(many.v @ left @ many.v), 11)
+    few = without(many, 4)
+    assert many.misfit((4,)) == (pytest.approx(few.misfit()[0]), 8) and few.misfit()[1] == 8
+    assert many.rows((1, 3)).tolist() == [3, 4, 5, 9, 10, 11]
+
+
+def test_parameters_that_are_not_determined_leave_more() -> None:
+    one = replace(bars(1.0, 2.0, 6.0), A=np.zeros((3, 1)))
+    assert one.misfit() == (pytest.approx(41.0), 3)
+    assert bars(1.0).misfit() == (0.0, 0) and bars(1.0).probability() == 1.0 and bars(1.0).share == 0.0
+
+
+def test_the_probability_shares_the_level_among_three_tests() -> None:
+    one = bars(0.0, 1.0, -1.0, 4.0, network=1.0, redundancy=20)  # share 1 / 2: 80 degrees of freedom
+    T = ((one.v - 1) ** 2).sum() / 2
+    largest = (9 / 2) * 4 / 3  # of v of 3, redundancy number 3 / 4
+    single, together = 12 * stats.f.sf(largest, 1, 80), 3 * stats.f.sf(T / 3, 3, 80)
+    assert one.probability() == pytest.approx(min(single, together)) and single < together
+    spread = bars(3.0, -3.0, 3.0, -3.0, network=1.0, redundancy=20)
+    assert spread.probability() == pytest.approx(3 * stats.f.sf(18 / 3, 3, 80))
+    assert bars(0.1, 0.0, 0.0).probability() == 1.0
+    # one coordinate of a value of three; the stated part has no degrees of freedom to lose
+    point = GivenModel(
+        np.array([5.0, 0, 0, 0, 0, 0]),
+        np.zeros((6, 6)),
+        np.eye(6),
+        np.zeros((6, 1)),
+        np.repeat([0, 1], 3),
+        20,
+    )
+    assert point.probability() == pytest.approx(18 * stats.chi2.sf(25, 1), rel=1e-4)
+    other = replace(point, v=np.array([3.0, 3, 3, 0, 0, 0]))
+    assert other.probability() == pytest.approx(6 * stats.chi2.sf(27, 3), rel=1e-4)
+
+
+def test_the_probability_without_a_value_is_that_of_the_others() -> None:
+    many = replace(of_points("without"), network=np.zeros((15, 15)))
+    many = replace(many, v=3 * many.v)
+    assert 0 < many.probability((4,)) < 1
+    assert many.probability((4,)) == pytest.approx(without(many, 4).probability())
+
+
+def test_unknown_standard_deviations_come_from_the_others() -> None:
+    one = replace(bars(0.0, 1.0, -1.0, 8.0, 0.5), estimated=True)
+    fewer, rest = one.decrease((3,))[0], one.misfit((3,))[0] / 3
+    assert one.probability() == pytest.approx(5 * stats.f.sf(fewer / rest, 1, 3))
+    assert replace(bars(0.0, 9.0), estimated=True).probability() == 1.0
+    assert replace(bars(0.0, 0.01, 9.0), estimated=True).probability() < 2e-3
+    assert replace(bars(0.0, 1.0, 0.5), estimated=True).probability() == 1.0
+
+
+def test_external_reliability_is_by_the_redundancy_number() -> None:
+    one = bars(0.0, 0.0, 0.0, 0.0, network=1.0)
+    assert one.external() == pytest.approx(np.full(4, 4.13 * np.sqrt((1 / 4) / (3 / 4))))
+    found = one.external((1,))
+    assert np.isnan(found[1]) and found[[0, 2, 3]] == pytest.approx(np.full(3, 4.13 * np.sqrt(1 / 2)))
+    weights = np.array([1.0, 2.0, 5.0])
+    uneven = replace(bars(0.0, 0.0, 0.0), stated=np.diag(1 / weights))
+    r = 1 - weights / weights.sum()
+    assert uneven.external() == pytest.approx(4.13 * np.sqrt((1 - r) / r))
+    # where nothing is stated, by the geometry alone
+    for geometry in (
+        replace(uneven, stated=np.zeros((3, 3)), network=np.diag(weights)),
+        replace(uneven, estimated=True),
+    ):
+        assert geometry.external() == pytest.approx(np.full(3, 4.13 * np.sqrt(1 / 2)))
+    assert np.isinf(bars(0.0, 0.0).external((1,))[0])
+
+
+def test_the_factor_on_standard_deviations() -> None:
+    one = bars(0.0, 3.0, -4.0, 12.0, -11.0)
+    T = 290.0
+    factor, gain = one.factor()
+    assert factor == pytest.approx(np.sqrt(T / 4), rel=0.03)
+    assert gain == pytest.approx(T - 4 * (1 + np.log(T / 4)), rel=1e-2)
+    # beside the network: d + f^2 is the mean square
+    factor, gain = bars(0.0, 3.0, -4.0, 12.0, -11.0, network=20.0).factor()
+    assert factor == pytest.approx(np.sqrt(T / 4 - 20), rel=0.03)
+    assert gain == pytest.approx(T / 21 - 4 * (1 + np.log(T / 4 / 21)), rel=1e-2)
+    # of values without standard deviations their standard deviation itself
+    factor, gain = bars(0.0, 3.0, -4.0, 12.0, -11.0, stated=0.0, network=20.0).factor()
+    assert factor == pytest.approx(np.sqrt(T / 4 - 20), rel=0.03)
+    assert gain == pytest.approx(T / 20 - 4 * (1 + np.log(T / 4 / 20)), rel=1e-2)
+    assert replace(one, stated=np.diag([1.0, 0.0, 0.0, 1.0, 1.0])).factor() == (1.0, 0.0)
+    assert bars(0.0, 0.1, 0.0).factor()[0] == 1.0
+
+
+def test_a_form_is_over_the_directions_that_exist() -> None:
+    assert given_values._form(np.diag([4.0, 1.0]), np.array([2.0, 3.0])) == (pytest.approx(10.0), 2)
+    assert given_values._form(np.diag([1.0, 4e-5]), np.array([2.0, 3.0]))[1] == 2
+    assert given_values._form(np.diag([1.0, 2e-5]), np.array([2.0, 3.0])) == (pytest.approx(4.0), 1)
+    assert given_values._form(np.zeros((2, 2)), np.zeros(2)) == (0.0, 0)
+
+
+def test_a_judgement_fits_where_nothing_is_wrong() -> None:
+    fits = Judgement(1.0, 2, 0.5)
+    assert fits.fits
+    for wrong in ({"wrong": (1,)}, {"exchanged": (0, 1)}, {"doubtful": (1,)}, {"factor": 2.0}):
+        assert not replace(fits, **wrong).fits  # type: ignore[arg-type]
+
+
+def test_sets_of_as_many_values(monkeypatch: pytest.MonkeyPatch) -> None:
+    every = set(given_values._sets_like((1, 2), 6))
+    assert len(every) == comb(6, 2) - 1 and (1, 2) not in every
+    monkeypatch.setattr(given_values, "MAX_SETS", 15)
+    assert set(given_values._sets_like((1, 2), 6)) == every
+    monkeypatch.setattr(given_values, "MAX_SETS", 14)
+    few = set(given_values._sets_like((1, 2), 6))
+    assert few == {one for one in every if len({1, 2} & set(one)) == 1} and len(few) == 8
+
+
+def test_the_score_of_wrong_values() -> None:
+    one = bars(0.0, 300.0, 0.0, -200.0, 1.0)
+    cost = np.log(5)
+    found = given_values._wrong_values(one, 0.001, cost)
+    assert found is not None
+    out, score, rivals = found
+    assert out == (1, 3) and rivals == ()
+    T = one.misfit()[0]
+    assert score == pytest.approx(one.misfit((1, 3))[0] - T + 2 * cost + 2 * np.log(10), rel=1e-9)
+    assert one.misfit((1, 3))[0] == pytest.approx(2 / 3)
+    assert given_values._wrong_values(bars(0.0, 300.0), 0.001, cost) is None
+    assert given_values._wrong_values(bars(0.0, 0.0, 300.0, 300.0), 0.001, cost) is None
+    # either of two of three heals: 8 less than the margin apart
+    found = given_values._wrong_values(bars(-2.2, 0.0, 4.6), 0.02, np.log(3))
+    assert found is not None and (found[0], found[2]) == ((2,), (0,))
+
+
+def test_suspects_are_those_without_which_the_others_fit() -> None:
+    assert given_values._suspects(bars(-1.9, 0.0, 3.8), 0.02) == (0, 2)
+    assert given_values._suspects(bars(0.0, 0.0, 9.0), 0.02) == (0, 1, 2)  # one alone is no doubt
+    assert given_values._suspects(bars(0.0, 9.0), 0.02) == (0, 1)
+
+
+def exact(n: int, name: str, sigma: float = 1e-3) -> GivenPoints:
+    """Return points of a cube and of a free network in another frame, both without noise."""
+    X = seed_of(name).uniform(-1, 1, (n, 3))
+    stated = np.tile(sigma**2 * np.eye(3), (n, 1, 1))
+    return GivenPoints(X, stated, FRAME.apply(X), (0.1 * sigma) ** 2 * np.eye(3 * n), 500)
+
+
+def _other_exchanges(n: int, pair: tuple[int, int]) -> Iterator[list[int]]:
+    for i, j in combinations(range(n), 2):
+        if (i, j) != pair:
+            order = list(range(n))
+            order[i], order[j] = j, i
+            yield order
+
+
+def test_the_score_of_exchanged_names(monkeypatch: pytest.MonkeyPatch) -> None:
+    one = exact(6, "score of exchanged")
+    one = replace(one, given=one.given[[0, 4, 2, 3, 1, 5]])
+    model = one.model(FRAME.inverse(), estimated=False)
+    found = given_values._exchanged(model, one.given.ravel(), 0.001)
+    assert found is not None and found[0] == (1, 4)
+    assert found[1] == pytest.approx(-model.misfit()[0] + 2 * np.log(comb(6, 2)), abs=1e-3)
+    judged = judge_values(model, 0.001, one.given.ravel())
+    assert judged.exchanged == (1, 4) and not judged.wrong
+    assert judge_values(model, 0.001).exchanged is None
+    second = min(
+        replace(one, given=one.given[list(order)]).model(FRAME.inverse(), estimated=False).misfit()[0]
+        for order in _other_exchanges(6, (1, 4))
+    )
+    monkeypatch.setattr(given_values, "MARGIN", 0.99 * second)
+    assert given_values._exchanged(model, one.given.ravel(), 0.001) is not None
+    monkeypatch.setattr(given_values, "MARGIN", 1.01 * second)
+    assert given_values._exchanged(model, one.given.ravel(), 0.001) is None
+    monkeypatch.undo()
+    # a second error beside: no pair heals all
+    spoiled = replace(one, given=one.given + np.where(np.arange(6)[:, None] == 2, 0.5, 0.0))
+    model = spoiled.model(FRAME.inverse(), estimated=False)
+    assert given_values._exchanged(model, spoiled.given.ravel(), 0.001) is None
+    heights = replace(model, item=np.arange(18))
+    assert given_values._exchanged(heights, spoiled.given.ravel(), 0.001) is None
+
+
+def test_points_are_selected_and_mirrored_with_their_covariance() -> None:
+    rng = seed_of("select")
+    joint = rng.normal(size=(12, 12))
+    one = replace(exact(4, "select"), joint=joint @ joint.T, stated=rng.normal(size=(4, 3, 3)))
+    some = one.select(np.array([2, 0]))
+    np.testing.assert_array_equal(some.given, one.given[[2, 0]])
+    np.testing.assert_array_equal(some.free, one.free[[2, 0]])
+    np.testing.assert_array_equal(some.stated, one.stated[[2, 0]])
+    np.testing.assert_array_equal(some.joint, one.joint[np.ix_([6, 7, 8, 0, 1, 2], [6, 7, 8, 0, 1, 2])])
+    turned = one.mirrored()
+    np.testing.assert_array_equal(turned.free, one.free * (-1, 1, 1))
+    flip = np.diag(np.tile([-1.0, 1, 1], 4))
+    np.testing.assert_allclose(turned.joint, flip @ one.joint @ flip)
+    given = one.given.copy()
+    given[1, 2] = np.nan
+    assert replace(one, given=given).complete.tolist() == [0, 2, 3]
+
+
+def test_the_model_of_points_is_in_the_given_frame() -> None:
+    rng = seed_of("model of points")
+    joint = rng.normal(size=(12, 12))
+    one = replace(exact(4, "model of points"), joint=joint @ joint.T)
+    given = one.given.copy()
+    given[2, 1] = np.nan
+    given[3] += (0.1, 0.2, 0.3)
+    placing = FRAME.inverse()
+    model = replace(one, given=given).model(placing, estimated=True)
+    rows = np.delete(np.arange(12), 7)
+    right = np.zeros(12)
+    right[9:] = (0.1, 0.2, 0.3)
+    np.testing.assert_allclose(model.v, right[rows], atol=1e-12)
+    turn = placing.scale * np.kron(np.eye(4), placing.rotation)
+    np.testing.assert_allclose(model.network, (turn @ one.joint @ turn.T)[np.ix_(rows, rows)])
+    np.testing.assert_allclose(model.stated, 1e-6 * np.eye(11))
+    assert model.item.tolist() == [0, 0, 0, 1, 1, 1, 2, 2, 3, 3, 3]
+    assert model.estimated and model.redundancy == 500 and model.A.shape == (11, 7)
+
+
+@pytest.mark.parametrize("kind", ["stated", "fixed", "estimated", "free only"])
+def test_a_similarity_is_moved_to_the_best_one(kind: str) -> None:
+    one = exact(6, "moved similarity")
+    if kind in ("fixed", "free only"):
+        one = replace(one, stated=np.zeros((6, 3, 3)))
+    if kind == "fixed":
+        one = replace(one, joint=np.zeros((18, 18)))
+    given = one.given.copy()
+    given[4] += 0.3  # left out
+    one = replace(one, given=given)
+    right = FRAME.inverse()
+    placing = Similarity(
+        right.scale * 1.02,
+        rotation_from_vector(np.array([0.01, -0.02, 0.015])) @ right.rotation,
+        right.translation + np.array([0.02, 0.01, -0.03]),
+    )
+    for _ in range(4):
+        model = one.model(placing, estimated=kind == "estimated")
+        placing = one.moved(placing, model, (4,))
+    assert placing.scale == pytest.approx(right.scale, rel=1e-7)
+    np.testing.assert_allclose(placing.rotation, right.rotation, atol=1e-7)
+    np.testing.assert_allclose(placing.translation, right.translation, atol=1e-6)
+
+
+def test_better_values_decide_where_a_similarity_is() -> None:
+    """Of two groups of points that differ by a shift, the weights by the stated variances."""
+    one = exact(8, "weights of points")
+    given = one.given + np.where(np.arange(8)[:, None] < 4, 0.0, (1e-3, 0, 0))
+    strong = np.where(np.arange(8) < 4, 1e-10, 1.0)
+    one = replace(one, given=given, stated=strong[:, None, None] * np.eye(3), joint=1e-14 * np.eye(24))
+    placing = FRAME.inverse()
+    placing = one.moved(placing, one.model(placing, estimated=False), ())
+    np.testing.assert_allclose(placing.apply(one.free)[:4], given[:4], atol=1e-8)
+    np.testing.assert_allclose(placing.apply(one.free)[4:], given[4:] - (1e-3, 0, 0), atol=1e-7)
+
+
+def test_the_start_is_the_similarity_that_most_agree_upon(monkeypatch: pytest.MonkeyPatch) -> None:
+    one = exact(7, "start")
+    given = one.given.copy()
+    given[[1, 5]] += ((3.0, 0, 1), (0, 4.0, 0))
+    for most in (given_values.MAX_TRIPLES, 34):  # all 35, or as many at random
+        monkeypatch.setattr(given_values, "MAX_TRIPLES", most)
+        found = given_values._start(replace(one, given=given), None)
+        assert found is not None and found.scale == pytest.approx(2.5)
+        np.testing.assert_allclose(found.apply(one.free)[[0, 2, 3]], one.given[[0, 2, 3]], atol=1e-9)
+    three = one.select(np.arange(3))
+    found = given_values._start(three, FRAME)
+    assert found is not None and found.scale == pytest.approx(2.5)
+    assert given_values._start(one.select(np.arange(2)), FRAME) is FRAME
+    line = replace(three, free=np.outer(np.arange(3), np.ones(3)), given=np.outer(np.arange(3), np.ones(3)))
+    assert given_values._start(line, FRAME) is FRAME
+
+
+def test_centre_and_size() -> None:
+    centre, size = given_values._centre_and_size(np.array([[0.0, 0, 0], [2, 0, 8]]))
+    assert centre.tolist() == [1, 0, 4] and size == 4
+
+
+def test_scales_of_lengths_are_compared_with_their_covariance() -> None:
+    free: FloatArray = np.array([[0.0, 0, 0], [3, 4, 0], [0, 0, 2]])
+    one = scale_of_length(10.0, 0.02, free, 0, 1)
+    assert (one.log, one.variance) == (pytest.approx(np.log(2)), pytest.approx(4e-6))
+    assert one.rows.tolist() == pytest.approx([3 / 25, 4 / 25, 0, -3 / 25, -4 / 25, 0, 0, 0, 0])
+    other = scale_of_length(4.1, 0.02, free, 0, 2)
+    model = scale_model((one, other), 1e-4 * np.eye(9), 77)
+    np.testing.assert_allclose(model.v, [np.log(2), np.log(2.05)])
+    np.testing.assert_allclose(model.network, 1e-4 * np.array([[2 / 25, 0], [0, 0.5]]), atol=1e-18)
+    np.testing.assert_allclose(model.stated, np.diag([4e-6, (0.02 / 4.1) ** 2]))
+    assert model.A.tolist() == [[1], [1]] and model.item.tolist() == [0, 1] and model.redundancy == 77
+
+
+def test_mirrored_points_state_what_was_wrong_as_given() -> None:
+    one = exact(6, "mirror by hand")
+    found = judge_points(replace(one, given=one.given * (1, 1, -1)), 0.001)
+    assert found is not None and found.mirrored and found.judgement.fits
+    assert found.unmirrored is not None and found.unmirrored > 1e3
+    right = judge_points(one, 0.001)
+    assert right is not None and not right.mirrored and right.judgement.fits
+    np.testing.assert_allclose(right.placing.apply(one.free), one.given, atol=1e-9)
+    assert judge_points(one.select(np.arange(2)), 0.001) is None
