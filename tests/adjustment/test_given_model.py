@@ -123,7 +123,7 @@ def test_unknown_standard_deviations_come_from_the_others() -> None:
     assert one.probability() == pytest.approx(5 * stats.f.sf(fewer / rest, 1, 3))
     assert replace(bars(0.0, 9.0), estimated=True).probability() == 1.0
     assert replace(bars(0.0, 0.01, 9.0), estimated=True).probability() < 2e-3
-    assert replace(bars(0.0, 1.0, 0.5), estimated=True).probability() == 1.0
+    assert replace(bars(0.0, 1.0, 0.5), estimated=True).probability() > 0.99
 
 
 def test_external_reliability_is_by_the_redundancy_number() -> None:

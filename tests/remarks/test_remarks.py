@@ -7,10 +7,11 @@ import re
 
 import pytest
 
+from sfm.display import MAX_LISTED
 from sfm.remarks.catalogue import KINDS
-from sfm.remarks.kind import Grade, Kind
-from sfm.remarks.remark import Quantity, Remark, remark
-from sfm.remarks.verdict import judge
+from sfm.remarks.kind import Grade, Kind, significant
+from sfm.remarks.remark import Quantity, Remark, kinds_of, of_kind, remark, unless_note
+from sfm.remarks.verdict import judge, lines_of
 from tests.places import ROOT
 
 HEADLINES = {"good": "It worked.", "fair": "It worked, with remarks.", "bad": "No result."}
@@ -135,3 +136,88 @@ def test_sentences_are_short_and_plain() -> None:
         for sentence in re.split(r"[.:;] ", plain):
             assert len(sentence.split()) <= 25, f"{name}: {sentence}"
         assert not re.search(r"\b(tell|tells|say|says|bear|bears|own|let go)\b", plain), name
+
+
+@pytest.mark.parametrize(
+    ("value", "digits", "written"),
+    [
+        (0.0, 3, "0"), (1234.6, 3, "1235"), (12.345, 3, "12.3"), (0.00012345, 3, "0.000123"),
+        (1.2345e-6, 3, "0.00000123"), (9.87e-7, 3, "9.87e-07"), (9_876_543.0, 3, "9876543"),
+        (12_345_678.0, 3, "1.23e+07"), (-0.5, 2, "-0.50"), (0.25, 1, "0.2"), (float("inf"), 3, "not known"),
+    ],
+)  # fmt: skip
+def test_a_number_is_written_with_significant_digits(value: float, digits: int, written: str) -> None:
+    assert significant(value, digits) == written
+
+
+@pytest.mark.parametrize(
+    ("text", "parts", "said"),
+    [
+        ("{d:+}", {"d": Quantity(-0.5, "px")}, "-0.500 px"),
+        ("{d:+}", {"d": Quantity(0.0, "px")}, "+0 px"),
+        ("{d:.1f}", {"d": Quantity(0.55, "mm")}, "0.6 mm"),
+        ("{d}", {"d": Quantity(12345.0)}, "12345"),
+        ("{d}", {"d": Quantity(12345.0, "px")}, "12345 px"),
+        ("{d}", {"d": Quantity(12.0, "px")}, "12.0 px"),
+        ("{d}", {"d": Quantity(1.5)}, "1.50"),
+        ("{d}", {"d": Quantity(2e15)}, "2.00e+15"),
+        ("{d}", {"d": Quantity(float("nan"), "px")}, "not known"),
+        ("{d:%}", {"d": Quantity(float("inf"))}, "not known"),
+        ("{count:point} {count:is|are}", {"count": Quantity(12000)}, "12,000 points are"),
+        ("{count:is|are}", {"count": Quantity(1)}, "is"),
+        ("{names:is|are}", {"names": ("a", "b")}, "are"),
+        ("{names:photograph}", {"names": ("a",)}, "1 photograph"),
+        ("[[{a} and {b}]]", {"a": Quantity(1)}, ""),
+        ("[[{a}]][[, {b}]]", {"b": Quantity(1)}, ", 1"),
+    ],
+)
+def test_a_field_is_written_as_it_asks_for(text: str, parts: dict[str, object], said: str) -> None:
+    assert sentence(text, **parts) == said
+
+
+def test_the_fields_of_a_kind() -> None:
+    assert Kind("some", "note", "{a} {b:is|are} [[{c:%}]]", "", "").fields == {"a", "b", "c"}
+
+
+def test_of_two_grades_the_more_serious_counts() -> None:
+    grade = Grade("a", warning=1.0, also=Grade("b", warning=1.0, error=2.0))
+
+    def severity(a: float, b: float) -> str:
+        return grade.severity_of(Remark("some", numbers={"a": Quantity(a), "b": Quantity(b)}))
+
+    assert [severity(0, 0), severity(1, 0), severity(0, 1), severity(1, 2), severity(0, 2)] == [
+        "note", "warning", "warning", "error", "error",
+    ]  # fmt: skip
+    assert Grade("a", warning=1.0).of(float("nan")) == "warning"
+    assert Grade("a").of(-1e9) == "warning"
+    assert Kind("some", "error", "", "", "").severity_of(Remark("some")) == "error"
+
+
+def test_parts_of_a_remark_are_names_or_numbers() -> None:
+    one = remark("two_places", point="12", distance=(0.3, "mm"), sigmas=8, photographs=["a", "b"])
+    assert one.subjects == {"point": ("12",), "photographs": ("a", "b")}
+    assert one.numbers == {"distance": Quantity(0.3, "mm"), "sigmas": Quantity(8.0)}
+    two = remark("two_places", point=("a", "b"), distance=Quantity(1.0, "m"), sigmas=None)
+    assert two.names("point") == ("a", "b") and two.number("distance") == 1.0
+    assert "sigmas" not in two.numbers and two.number("sigmas") != two.number("sigmas")
+    assert two.names("photographs") == ()
+    assert remark("two_places", point=("a", "b", "c")).names("point") == ("a", "b", "c")
+
+
+def test_remarks_are_selected_by_kind_and_severity() -> None:
+    mild, warning = (remark("sigma0_high", ratio=ratio, stated=(0.1, "px")) for ratio in (1.9, 2.1))
+    other = remark("two_places", point="12", distance=(0.3, "mm"), sigmas=8.0, photographs=("a",))
+    assert unless_note(mild) == () and unless_note(warning) == (warning,)
+    assert of_kind([mild, other, warning], "sigma0_high") == (mild, warning)
+    assert kinds_of([mild, other]) == ("sigma0_high", "two_places")
+
+
+def test_of_many_remarks_of_a_kind_the_first_are_printed() -> None:
+    """The remedy stands once; how many more there are is stated."""
+    many = [remark("sigma0_high", ratio=5.1 + k, stated=(0.1, "px")) for k in range(MAX_LISTED + 3)]
+    lines = lines_of(many)
+    assert [one.text for one in lines[:-1]] == [one.text for one in many[:MAX_LISTED]]
+    assert lines[-1].text.startswith("3 ") and {one.severity for one in lines} == {"error"}
+    assert lines[0].remedy == many[0].row.remedy and not any(one.remedy for one in lines[1:])
+    assert len(lines_of(many[:MAX_LISTED])) == MAX_LISTED
+    assert judge(many, HEADLINES).lines == lines  # type: ignore[arg-type]

@@ -10,9 +10,16 @@ import pytest
 
 from sfm.conventions import AnyArray, FloatArray
 from sfm.errors import SurveyFileError
+from sfm.targets.codes import rings
 from sfm.targets.codes.families import FAMILIES, code_family
 from sfm.targets.codes.ring_reading import UNCODED, UNREADABLE, read_codes
-from sfm.targets.codes.rings import CodeFamily, read_code_table, ring_patterns, smallest_rotation
+from sfm.targets.codes.rings import (
+    CodeFamily,
+    read_code_table,
+    ring_family,
+    ring_patterns,
+    smallest_rotation,
+)
 from sfm.targets.measure import shape_from_axes
 from tests.places import SHARED
 from tests.synthetic import seed_of
@@ -222,3 +229,73 @@ def test_every_name_of_the_registry_is_a_family() -> None:
 def test_an_unknown_family_is_refused() -> None:
     with pytest.raises(SurveyFileError, match="'ring13' is neither one of arcs, ring12"):
         code_family("ring13")
+
+
+def test_published_radii_and_limits_of_rings() -> None:
+    """Of AICON's rings and PhotoModeler's arcs; 20 cells are the most that are published."""
+    assert (rings.RING_INNER, rings.RING_OUTER) == (2.0, 3.0)
+    assert (rings.ARCS_INNER, rings.ARCS_OUTER) == (2.4, 4.3)
+    assert rings.MAX_CELLS == 32 and rings.MAX_TABLE_BYTES == 10_000_000
+    ring, arcs = ring_family("ring12"), ring_family("arcs")
+    assert (ring.cells, ring.inner, ring.outer) == (12, 2.0, 3.0)
+    assert (arcs.cells, arcs.inner, arcs.outer, len(arcs.number)) == (0, 2.4, 4.3, 0)
+
+
+def test_a_mirrored_family_has_the_numbers_of_the_plain_one() -> None:
+    plain, mirrored = ring_family("ring12"), ring_family("ring12-mirrored")
+    assert plain.number.tolist() == list(range(1, 148)) and mirrored.name == "ring12-mirrored"
+    assert (np.diff(mirrored.pattern) > 0).all()
+    for number, pattern in zip(mirrored.number.tolist(), mirrored.pattern.tolist(), strict=True):
+        back = int(f"{plain.pattern[number - 1]:012b}"[::-1], 2)
+        assert smallest_rotation(np.array([back]), 12)[0] == pattern
+    assert rings.mirrored_patterns(np.array([0b0011, 0b0100, 0b1110]), 4).tolist() == [0b1100, 0b0010, 0b0111]
+    assert rings.necklaces(4).tolist() == [1, 3, 5, 7]
+    assert ring_patterns(4).tolist() == [5]
+
+
+def table(tmp_path: Path, text: str) -> CodeFamily:
+    path = tmp_path / "t.txt"
+    path.write_text(text)
+    return read_code_table(path)
+
+
+def test_the_cells_of_a_table_are_stated_or_those_of_its_largest_pattern(tmp_path: Path) -> None:
+    assert table(tmp_path, "7 5\n8 3\n9 0\n").cells == 4  # a row with pattern 0 is no code
+    found = table(tmp_path, "# a comment of words\n# cells 2\n1 1\n")
+    assert (found.cells, found.number.tolist(), found.pattern.tolist()) == (2, [1], [1])
+    assert (found.name, found.inner, found.outer) == ("t.txt", 2.0, 3.0)
+    assert table(tmp_path, "# cells 32\n1 1\n").cells == 32
+    assert table(tmp_path, "# cells many\n1 3\n").cells == 3
+    assert table(tmp_path, f"1 {2**31 - 1}\n").cells == 32
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "# cells 1\n1 1\n",
+        "# cells 33\n1 1\n",
+        f"1 {2**32}\n",
+        "1 2 3\n",
+        "1\n",
+        "-1 3\n",
+        f"1 {10**19}\n",
+        "1 ³\n",
+    ],
+)
+def test_tables_that_are_none_are_refused(tmp_path: Path, text: str) -> None:
+    with pytest.raises(SurveyFileError, match=r"t\.txt"):
+        table(tmp_path, text)
+
+
+def test_a_table_is_a_file_of_ten_megabytes_at_most(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(SurveyFileError, match="not a readable table"):
+        read_code_table(tmp_path)
+    monkeypatch.setattr(rings, "MAX_TABLE_BYTES", 4)
+    assert table(tmp_path, "1 3\n").number.tolist() == [1]
+    with pytest.raises(SurveyFileError, match="not a readable table"):
+        table(tmp_path, "1 3\n\n")
+
+
+def test_numbers_have_eighteen_digits_at_most() -> None:
+    assert rings._is_number("9" * 18) and not rings._is_number("9" * 19)
+    assert not rings._is_number("٣") and not rings._is_number("1.0")
