@@ -25,7 +25,7 @@ from sfm.adjustment.hypotheses.score import (
     log_probability,
 )
 from sfm.adjustment.result import Adjustment
-from sfm.conventions import FloatArray, IntArray
+from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.distortion.models import Role
 
 ALPHA = 0.01  # probability of naming any alternative where none holds
@@ -35,6 +35,8 @@ CAMERA_SETS = {
     "camera": tuple(range(len(CAMERA))),
 }  # c; c, x0, y0, K1; all
 MIN_GROUP = 2  # photographs on each side of a split
+MAX_RUNS = 60  # photographs, or runs of them, that have freedoms by themselves
+MAX_PRODUCTS = 2e11  # numbers multiplied to try all of these places, some ten seconds
 MAX_SPLITS = 12  # places in the sequence at which points are tried to have moved
 CELLS = 5  # of the format in each direction
 MAX_MOVED = 60  # points that are tried together
@@ -243,12 +245,17 @@ def _of_scores(scores: FloatArray, variance: float) -> Spread:
 
 
 def _by_photographs(reduced: Reduced, columns: Columns) -> Iterator[Alternative]:
-    """Return the alternatives of cameras, strain and bending in some of the photographs."""
-    m = reduced.photographs
+    """Return the alternatives of cameras, strain and bending in some of the photographs.
+
+    Of more than MAX_RUNS photographs those next to one another in the sequence are taken together.
+    """
+    photographs = reduced.photographs
+    m = min(photographs, MAX_RUNS)
     if m < 2 * MIN_GROUP:
         return
+    run = np.arange(photographs) * m // photographs
     every = np.concatenate([columns.camera, columns.strain, columns.bending], axis=2)
-    H, g, squares = reduced.project_by_photograph(reduced.whiten(every))
+    H, g, squares = reduced.project_by_run(reduced.whiten(every), run)
     places = {name: np.array(some) for name, some in CAMERA_SETS.items()}
     places["strain"] = len(CAMERA) + np.arange(STRAIN)
     places["bending"] = len(CAMERA) + STRAIN + np.arange(BENDING)
@@ -261,19 +268,19 @@ def _by_photographs(reduced: Reduced, columns: Columns) -> Iterator[Alternative]
             best = max(range(len(gains)), key=lambda k: gains[k].value)
             spread = part.spread(factors[best], gains[best])
             if pattern == "single":
-                own = _variance_of(reduced, best, gains[best])
+                own = _variance_of(reduced, run == best, gains[best])
                 spread = replace(spread, factor=max(spread.factor, own))
-            yield _made(reduced, family, pattern, factors[best], gains[best], search, spread)
+            yield _made(reduced, family, pattern, factors[best][run], gains[best], search, spread)
         if m > 2 * MIN_GROUP:
             factor, gain = part.group()
             if MIN_GROUP <= factor.sum() <= m - MIN_GROUP:
                 spread = part.spread(factor, gain)
-                yield _made(reduced, family, "group", factor, gain, (m - 1) * np.log(2), spread)
+                yield _made(reduced, family, "group", factor[run], gain, (m - 1) * np.log(2), spread)
 
 
-def _variance_of(reduced: Reduced, photograph: int, gain: Gain) -> float:
-    """Return the variance that an alternative leaves in a photograph, over that of all photographs."""
-    v = reduced.v[reduced.image == photograph]
+def _variance_of(reduced: Reduced, some: BoolArray, gain: Gain) -> float:
+    """Return the variance that an alternative leaves in some photographs, (m,), over that of all."""
+    v = reduced.v[some[reduced.image]]
     expected = v.size * reduced.redundancy / reduced.count
     return float(max((v**2).sum() - gain.value, 0.0) / max(expected - gain.rank, 1.0))
 
@@ -346,7 +353,9 @@ def _moved_points(reduced: Reduced) -> Iterator[Alternative]:
     if m < 2 * MIN_GROUP:
         return
     splits = list(range(MIN_GROUP, m - MIN_GROUP + 1))
-    splits = splits[:: -(-len(splits) // MAX_SPLITS)]
+    products = 6 * len(reduced.L) * len(reduced.t) ** 2  # of one place
+    affordable = max(1, min(MAX_SPLITS, int(MAX_PRODUCTS / products)))
+    splits = splits[:: -(-len(splits) // affordable)]
     best: dict[str, Alternative] = {}
     for k in splits:
         for one in _moved_at(reduced, (np.arange(m) >= k).astype(float), np.log(len(splits))):

@@ -31,10 +31,11 @@ from sfm.conventions import BoolArray
 from sfm.errors import GeometryError
 from sfm.network import Estimate, ExteriorObservations, Network, ObjectPoints, ScaleBars
 from sfm.reduced_network import reduce_network
-from sfm.remarks.remark import Remark
+from sfm.remarks.remark import Remark, remark
 
 MAX_CAUSES = 2  # that are looked for one after another
-MAX_IMAGE_POINTS = 20_000  # of the network that is tested; every so many points of a larger one
+MAX_IMAGE_POINTS = 6_000  # of the network that is tested; every so many points of a larger one
+MAX_PHOTOGRAPHS = 300  # of a network that is tested: their normal equations are dense here
 APART = float(np.log(100))  # of ln likelihood, below which two alternatives cannot be told apart
 NAMED = 1.0  # standard deviations by which coordinates shift, below which a cause is of no consequence
 
@@ -55,6 +56,8 @@ def judge_alternatives(final: Adjustment, *, unit: str = "") -> tuple[Remark, ..
         final: a finished adjustment with its covariance.
         unit: object unit, for the remarks.
     """
+    if len(final.network.images) > MAX_PHOTOGRAPHS:
+        return (remark("assumptions_untested", photographs=final.network.images),)
     plain = free_network(final)
     if plain is None:
         return ()
@@ -127,7 +130,7 @@ def contradicted_parameters(a: Adjustment) -> tuple[tuple[str, str], ...]:
     Returns:
         (camera or group of cameras, parameter) of each that freeing alone improves beyond chance.
     """
-    plain = free_network(a)
+    plain = free_network(a) if len(a.network.images) <= MAX_PHOTOGRAPHS else None
     if plain is None:
         return ()
     try:

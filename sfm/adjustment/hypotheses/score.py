@@ -61,28 +61,31 @@ class Reduced:
         """Return columns of all image points (k, 2, q) as whitened ones of the accepted."""
         return np.asarray(self.F @ columns[self.used])
 
-    def project_by_photograph(self, D: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return H (m, f, m, f), g (m, f) and squares (m, f) of whitened columns (k, 2, f).
+    def project_by_run(self, D: FloatArray, run: IntArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return H (u, f, u, f), g (u, f) and squares (u, f) of whitened columns (k, 2, f).
 
-        Every photograph has f freedoms of its own.
+        Every run of photographs has f freedoms of its own; `run` is that of each photograph, (m,).
         """
-        n, m, f = len(self.L), self.photographs, D.shape[2]
-        C = np.zeros((n, m, 3, f))
-        np.add.at(C, (self.point, self.image), np.swapaxes(self.B, 1, 2) @ D)
-        flat_C = np.moveaxis(self.L[:, None] @ C, 1, 2).reshape(3 * n, m * f)
+        n, f, count = len(self.L), D.shape[2], int(run.max()) + 1
+        owner = run[self.image]
+        C = np.zeros((n, count, 3, f))
+        np.add.at(C, (self.point, owner), np.swapaxes(self.B, 1, 2) @ D)
+        flat_C = np.moveaxis(self.L[:, None] @ C, 1, 2).reshape(3 * n, count * f)
         by = np.swapaxes(self.A, 1, 2) @ D
-        K = np.zeros((len(self.t), m, f))
-        H, g, squares = np.zeros((m, f, m, f)), np.zeros((m, f)), np.zeros((m, f))
+        m = self.photographs
+        K = np.zeros((len(self.t), count, f))
+        H, g, squares = np.zeros((count, f, count, f)), np.zeros((count, f)), np.zeros((count, f))
         for i, rows in enumerate(rows_of(self.image, m)):
+            K[6 * i : 6 * i + 6, run[i]] = by[rows, :6].sum(axis=0)
+        for u, rows in enumerate(rows_of(owner, count)):
             flat = D[rows].reshape(-1, f)
-            H[i, :, i] = flat.T @ flat
-            g[i] = flat.T @ self.v[rows].ravel()
-            squares[i] = np.einsum("kq,kq->q", flat, flat)
-            K[6 * i : 6 * i + 6, i] = by[rows, :6].sum(axis=0)
-            K[6 * m :, i] = by[rows, 6:].sum(axis=0)
-        flat_K = K.reshape(len(self.t), m * f) - self.W.reshape(3 * n, -1).T @ flat_C
-        H -= (flat_C.T @ flat_C + flat_K.T @ (self.Sinv @ flat_K)).reshape(m, f, m, f)
-        g -= (flat_C.T @ self.y.ravel() + flat_K.T @ (self.Sinv @ self.t)).reshape(m, f)
+            H[u, :, u] = flat.T @ flat
+            g[u] = flat.T @ self.v[rows].ravel()
+            squares[u] = np.einsum("kq,kq->q", flat, flat)
+            K[6 * m :, u] = by[rows, 6:].sum(axis=0)
+        flat_K = K.reshape(len(self.t), count * f) - self.W.reshape(3 * n, -1).T @ flat_C
+        H -= (flat_C.T @ flat_C + flat_K.T @ (self.Sinv @ flat_K)).reshape(count, f, count, f)
+        g -= (flat_C.T @ self.y.ravel() + flat_K.T @ (self.Sinv @ self.t)).reshape(count, f)
         return H, g, squares
 
     def project(self, D: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:

@@ -69,6 +69,14 @@ ROWS = (
         "Adjust the two states as two surveys, or remove these points.",
     ),
     Kind(
+        "assumptions_untested",
+        "note",
+        "One camera for all photographs and one shape of the object are assumed, not tested: "
+        "{photographs:photograph} are too many.",
+        "the tests take the normal equations of all photographs together",
+        "Survey parts of the object by themselves to test them.",
+    ),
+    Kind(
         "two_places",
         "warning",
         "Point {point} is at a second place in {photographs}, {distance} away "
