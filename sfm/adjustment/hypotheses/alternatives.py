@@ -20,6 +20,7 @@ from sfm.adjustment.hypotheses.score import (
     Gain,
     Reduced,
     gain_of,
+    gains_of,
     log_f_sf,
     log_likelihood_gain,
     log_probability,
@@ -315,16 +316,19 @@ class _Part:
         m = len(self.g)
         left = self.g + np.einsum("iajb,j,b->ia", self.H, factor, gain.beta, optimize=True)
         some = np.ones(m, dtype=bool) if np.count_nonzero(factor) > 1 else factor == 0
-        every = [gain_of(self.H[i, :, i], left[i], self.squares[i]) for i in np.flatnonzero(some)]
-        redundancy = sum(one.rank for one in every) - gain.rank
-        if redundancy < 1:
-            return NONE
-        return Spread(sum(one.value for one in every) / redundancy, redundancy)
+        values, ranks = gains_of(self.blocks[some], left[some], self.squares[some])
+        redundancy = int(ranks.sum()) - gain.rank
+        return NONE if redundancy < 1 else Spread(float(values.sum()) / redundancy, redundancy)
+
+    @property
+    def blocks(self) -> FloatArray:
+        """Normal equations of each photograph by itself, (m, f, f)."""
+        return np.asarray(np.einsum("iaib->iab", self.H))
 
     def group(self) -> tuple[FloatArray, Gain]:
         """Return the photographs that together have the largest gain, as factors 0 and 1, by two means."""
         m = len(self.g)
-        single = np.array([self.gain(one).value for one in np.eye(m)])
+        single, _ = gains_of(self.blocks, self.g, self.squares)
         best, most = np.zeros(m), None
         for first in np.argsort(-single)[:STARTS]:
             factor = (np.arange(m) == first).astype(float)
@@ -394,7 +398,7 @@ def _moved_at(reduced: Reduced, factor: FloatArray, search: float) -> Iterator[A
     KS = K @ reduced.Sinv
     blocks = own - np.einsum("nas,nbs->nab", KS, K)
     squares = np.einsum("nii->ni", V[movable])
-    single = np.array([gain_of(*one).value for one in zip(blocks, g, squares, strict=True)])
+    single, _ = gains_of(blocks, g, squares)
     order = np.argsort(-single)[: min(MAX_MOVED, len(movable) // 2 or 1)]
     flat = (K[order].reshape(-1, size), KS[order].reshape(-1, size))
     H = -flat[1] @ flat[0].T
@@ -436,7 +440,8 @@ def _shifted(
     """
     movable, blocks, g = parts
     total = len(movable)
-    own = np.array([gain_of(*one, np.diagonal(one[0])).value for one in zip(blocks, g, strict=True)])
+    squares = np.einsum("nii->ni", blocks)
+    own, _ = gains_of(blocks, g, squares)
     best: Alternative | None = None
     for first in np.argsort(-own)[:STARTS]:
         members = np.arange(total) == first
@@ -456,9 +461,9 @@ def _shifted(
         gain = gain_of(*reduced.project(D))
         sets = float(gammaln(total + 1) - gammaln(count + 1) - gammaln(total - count + 1))
         left = g + np.where(members[:, None], blocks @ gain.beta, 0.0)
-        others = [gain_of(*one, np.diagonal(one[0])) for one in zip(blocks, left, strict=True)]
-        redundancy = sum(one.rank for one in others) - gain.rank
-        spread = Spread(sum(one.value for one in others) / redundancy, redundancy)
+        values, ranks = gains_of(blocks, left, squares)
+        redundancy = int(ranks.sum()) - gain.rank
+        spread = Spread(float(values.sum()) / redundancy, redundancy)
         one = _made(reduced, "shifted", "split", factor, gain, search + sets, spread, points=points)
         if best is None or one.evidence > best.evidence:
             best = one

@@ -268,6 +268,22 @@ def gain_of(H: FloatArray, g: FloatArray, squares: FloatArray) -> Gain:
     return Gain(float((projected**2 / values[good]).sum()), int(good.sum()), beta)
 
 
+def gains_of(H: FloatArray, g: FloatArray, squares: FloatArray) -> tuple[FloatArray, IntArray]:
+    """Return the gains (n,) and ranks (n,) of n alternatives that do not concern one another.
+
+    Args:
+        H: normal equations of each, (n, q, q).
+        g: right sides, (n, q).
+        squares: of the columns before the elimination, (n, q).
+    """
+    scale = np.where(squares > 0, 1 / np.sqrt(np.where(squares > 0, squares, 1.0)), 0.0)
+    values, vectors = np.linalg.eigh(H * scale[:, :, None] * scale[:, None])
+    good = values > DETERMINED
+    projected = np.einsum("nij,ni->nj", vectors, scale * g)
+    gains = np.where(good, projected**2 / np.where(good, values, 1.0), 0.0).sum(axis=1)
+    return np.asarray(gains), np.asarray(good.sum(axis=1))
+
+
 def log_probability(gain: float, q: int, redundancy: int) -> float:
     """Return ln of the probability of so large a gain by chance; v'Pv over the variance factor is r."""
     left = redundancy - gain
