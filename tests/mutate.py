@@ -39,10 +39,12 @@ ROOMS: dict[str, tuple[str, ...]] = {  # module or package, with the tests that 
     "sfm/remarks/verdict.py": ("tests/remarks",),
     "sfm/remarks/remark.py": ("tests/remarks",),
     "sfm/adjustment/quality/statistics.py": (
+        "tests/adjustment/test_statistical_tests.py",
         "tests/adjustment/test_statistics.py",
         "tests/adjustment/test_minimal_bias.py",
     ),
     "sfm/adjustment/quality/reliability.py": (
+        "tests/adjustment/test_statistical_tests.py",
         "tests/adjustment/test_minimal_bias.py",
         "tests/adjustment/test_statistics.py",
     ),
