@@ -43,12 +43,13 @@ NO_POINTS = np.zeros(0, dtype=np.int64)
 def test_thresholds_of_search_and_rounding() -> None:
     """Limits of effort: a larger one finds the same or more at more cost."""
     assert (alternatives.MAX_SPLITS, alternatives.MAX_MOVED, alternatives.CELLS) == (12, 60, 5)
+    assert (alternatives.MAX_RUNS, alternatives.MAX_PRODUCTS) == (60, 2e11)
     assert (alternatives.ROUNDS, alternatives.STARTS, refit.ROUNDS) == (20, 8, 6)
     assert score.MAX_TERMS == 10_000  # the series of the tail ends after a few hundred of usual redundancies
     assert score.SMALLEST_LOG == -600.0  # a float ends at -745
     assert columns.SMALL_MOVE_PX == 0.01  # where distortion of 40 px is linear to 1e-4 of it
     assert refit.SETTLED == 0.01  # of a gain of which 9 and more count
-    assert hypotheses.MAX_IMAGE_POINTS == 20_000  # a test of them takes seconds
+    assert hypotheses.MAX_IMAGE_POINTS == 6_000 and hypotheses.MAX_PHOTOGRAPHS == 300  # tested in seconds
     assert hypotheses.MAX_CAUSES == 2
     assert pytest.approx(np.log(100)) == hypotheses.APART
     assert hypotheses.NAMED == 1.0  # standard deviation: less is what a user was promised
@@ -189,12 +190,10 @@ def test_elimination_is_that_of_a_dense_solution(dense: Dense) -> None:
     D = dense.reduced.whiten(np.concatenate([dense.columns.camera, dense.columns.bending], axis=2))
     for found, right in zip(dense.reduced.project(D), dense.normals(D), strict=True):
         np.testing.assert_allclose(found, right, atol=1e-7 * np.abs(right).max())
-    m = dense.reduced.photographs
-    H, g, squares = dense.normals(_by_photograph(D, dense.reduced.image, m))
-    found_H, found_g, found_squares = dense.reduced.project_by_photograph(D)
-    np.testing.assert_allclose(found_H.reshape(H.shape), H, atol=1e-7 * np.abs(H).max())
-    np.testing.assert_allclose(found_g.ravel(), g, atol=1e-7 * np.abs(g).max())
-    np.testing.assert_allclose(found_squares.ravel(), squares)
+    for run in (np.arange(7), np.array([0, 0, 1, 1, 1, 2, 3])):
+        right = dense.normals(_by_photograph(D, run[dense.reduced.image], run[-1] + 1))
+        for found, own in zip(dense.reduced.project_by_run(D, run), right, strict=True):
+            np.testing.assert_allclose(found.reshape(own.shape), own, atol=1e-7 * np.abs(own).max())
 
 
 def test_scores_are_slopes_of_each_photograph(dense: Dense) -> None:
@@ -285,7 +284,7 @@ def test_patterns_are_the_best_of_their_kind(dense: Dense) -> None:
                 one = every[family, pattern]
                 spread = part.spread(one.factor, one.gain)
                 if pattern == "single":
-                    own = alternatives._variance_of(dense.reduced, int(one.photographs[0]), one.gain)
+                    own = alternatives._variance_of(dense.reduced, one.factor > 0, one.gain)
                     spread = replace(spread, factor=max(spread.factor, own))
                 _assert_judged(one, dense, spread)
         if family == "strain":
@@ -457,9 +456,13 @@ def test_variance_that_is_left_in_a_photograph() -> None:
     v = np.array([[1.0, 2.0], [3.0, 1.0], [2.0, 2.0], [9.0, 9.0]])
     reduced = stub(v=v, image=np.array([0, 0, 0, 1]), redundancy=6, count=8)
     # 6 coordinates with 6 * 6 / 8 expected, less one parameter
-    assert alternatives._variance_of(reduced, 0, Gain(3.0, 1, np.zeros(1))) == pytest.approx(20 / 3.5)
-    assert alternatives._variance_of(reduced, 0, Gain(30.0, 1, np.zeros(1))) == 0.0
-    assert alternatives._variance_of(reduced, 1, Gain(30.0, 4, np.zeros(4))) == pytest.approx(132.0)
+    assert alternatives._variance_of(
+        reduced, np.array([True, False]), Gain(3.0, 1, np.zeros(1))
+    ) == pytest.approx(20 / 3.5)
+    assert alternatives._variance_of(reduced, np.array([True, False]), Gain(30.0, 1, np.zeros(1))) == 0.0
+    assert alternatives._variance_of(
+        reduced, np.array([False, True]), Gain(30.0, 4, np.zeros(4))
+    ) == pytest.approx(132.0)
 
 
 def test_patterns_have_two_photographs_on_each_side() -> None:

@@ -314,5 +314,16 @@ def test_of_a_large_network_every_so_many_points_are_taken(
         assert len(network.images) == 6
 
 
+def test_of_very_many_photographs_nothing_is_tested(a: Adjustment, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(hypotheses, "find_causes", lambda *_: ())
+    monkeypatch.setattr(hypotheses, "MAX_PHOTOGRAPHS", 6)
+    assert judge_alternatives(a) == ()
+    monkeypatch.setattr(hypotheses, "MAX_PHOTOGRAPHS", 5)
+    (one,) = judge_alternatives(a)
+    assert one.kind == "assumptions_untested" and one.names("photographs") == a.network.images
+    monkeypatch.setattr(hypotheses, "free_network", None)  # is not asked for
+    assert contradicted_parameters(a) == ()
+
+
 def test_families_that_move_points() -> None:
     assert described.MOVED == ("moved", "shifted")
