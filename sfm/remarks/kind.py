@@ -57,6 +57,7 @@ class Kind:
     sentence: str  # with fields, see above
     cause: str  # why it happens
     remedy: str  # what to do
+    short: str = ""  # what it is called in the sentences of others, whose subjects have its name
 
     @property
     def fields(self) -> frozenset[str]:

@@ -221,3 +221,11 @@ def test_of_many_remarks_of_a_kind_the_first_are_printed() -> None:
     assert lines[0].remedy == many[0].row.remedy and not any(one.remedy for one in lines[1:])
     assert len(lines_of(many[:MAX_LISTED])) == MAX_LISTED
     assert judge(many, HEADLINES).lines == lines  # type: ignore[arg-type]
+
+
+def test_other_kinds_have_their_short_names_in_a_sentence() -> None:
+    one = remark(
+        "other_camera", photographs=["b"], change=(0.1, "%"), shift=4.0, rms=0.2, instead=["points_moved"]
+    )
+    assert one.names("instead") == ("points_moved",)
+    assert "points that moved" in one.text and "points_moved" not in one.text
