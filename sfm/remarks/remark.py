@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Literal
 
 if TYPE_CHECKING:
@@ -58,7 +58,13 @@ class Remark:
     @property
     def text(self) -> str:
         """Its sentence, by the catalogue."""
-        return self.row.sentence_of(self)
+        from sfm.remarks.catalogue import KINDS
+
+        subjects = {  # other kinds have their short names
+            role: tuple(KINDS[name].short or name if name in KINDS else name for name in names)
+            for role, names in self.subjects.items()
+        }
+        return self.row.sentence_of(replace(self, subjects=subjects))
 
     def number(self, name: str) -> float:
         """Return the value of a number; NaN where the remark has none of that name."""

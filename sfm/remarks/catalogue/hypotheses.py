@@ -20,6 +20,7 @@ ROWS = (
         f"[[, principal point {{away}} away]]). {SHIFTED}{INSTEAD}",
         "zoom, focus or camera changed during the survey, or photographs were cropped or resampled",
         "Give these photographs a [[camera]] of their own, or free the parameters with per_photograph.",
+        short="another camera in some photographs",
     ),
     Kind(
         "camera_drift",
@@ -28,6 +29,7 @@ ROWS = (
         f"{SHIFTED}{INSTEAD}",
         "the camera warmed up, or its focus crept",
         "Set per_photograph for c, and let the camera warm up before the survey.",
+        short="a camera that changes steadily",
     ),
     Kind(
         "held_parameter",
@@ -36,6 +38,7 @@ ROWS = (
         f"[[: held at {{value}}, {{instead_of}} fits]]. {SHIFTED}{INSTEAD}",
         "a calibration that does not describe these photographs",
         "Add the parameters to free, or calibrate the camera anew.",
+        short="wrong held parameters",
     ),
     Kind(
         "distortion_not_described",
@@ -44,6 +47,7 @@ ROWS = (
         f"describe the lens. {SHIFTED}{INSTEAD}",
         "distortion that the model does not have, or a film or sensor that is not plane",
         "Free K2, K3, P1, P2, b1 and b2, or choose another model.",
+        short="distortion that the model does not have",
     ),
     Kind(
         "object_deformed",
@@ -52,6 +56,7 @@ ROWS = (
         f"{SHIFTED}{INSTEAD}",
         "the object expanded, bent or settled during the survey",
         "Adjust the two states as two surveys and compare them with epochs.",
+        short="an object that deformed",
     ),
     Kind(
         "object_deforming",
@@ -59,6 +64,7 @@ ROWS = (
         f"The object deforms steadily through the sequence, by up to {{deformation}}. {SHIFTED}{INSTEAD}",
         "the object warmed up or was loaded during the survey",
         "Photograph in a shorter time or at a constant temperature.",
+        short="an object that deforms steadily",
     ),
     Kind(
         "points_moved",
@@ -67,6 +73,7 @@ ROWS = (
         f"{INSTEAD}",
         "targets or parts of the object moved during the survey",
         "Adjust the two states as two surveys, or remove these points.",
+        short="points that moved",
     ),
     Kind(
         "assumptions_untested",
