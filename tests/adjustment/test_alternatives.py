@@ -196,6 +196,35 @@ def test_elimination_is_that_of_a_dense_solution(dense: Dense) -> None:
             np.testing.assert_allclose(found.reshape(own.shape), own, atol=1e-7 * np.abs(own).max())
 
 
+def test_given_values_of_free_parameters_have_weight(dense: Dense) -> None:
+    """Not those of held parameters, nor fixed ones; a group of cameras has one column and all its weights."""
+    given = InteriorObservations(
+        np.array([0, 0, 1]), np.array([0, 1, 0]), np.array([10.0, 0.03, 10.2]), np.array([2e-3, 1e-3, 0.0])
+    )
+    a = replace(dense.a, network=replace(dense.a.network, interior=given))
+    weight = (columns.interior_step(a, 0, 0) / 2e-3 / a.sigma0) ** 2
+    found, prior = score._free_interior(a)
+    assert found.shape[2] == 2 and prior == pytest.approx([weight, 0.0])
+    group = tuple(replace(one, shared=("lens",) * len(one.names)) for one in a.estimate.cameras)
+    a = replace(a, estimate=replace(a.estimate, cameras=group))
+    both, prior = score._free_interior(a)
+    np.testing.assert_allclose(both[:, :, 0], found.sum(axis=2))
+    assert both.shape[2] == 1 and prior == pytest.approx([weight])
+    held = tuple(alternatives.held_interiors(a, dense.reduced))
+    assert [len(one.parameters) for one in held] == [
+        *[2] * (len(held) - 1),
+        2 * len(a.estimate.cameras[0].names) - 2,
+    ]
+    np.testing.assert_allclose(
+        held[0].columns(a, dense.columns)[:, :, 0],
+        interior_columns(a, 0, [1])[:, :, 0] + interior_columns(a, 1, [1])[:, :, 0],
+    )
+    fixed = tuple(replace(one, free=np.zeros_like(one.free)) for one in a.estimate.cameras)
+    a = replace(a, estimate=replace(a.estimate, cameras=fixed))
+    none, prior = score._free_interior(a)
+    assert none.shape == (len(a.rejected), 2, 0) and len(prior) == 0
+
+
 def test_scores_are_slopes_of_each_photograph(dense: Dense) -> None:
     D = dense.reduced.whiten(dense.columns.camera[:, :, [0, 3]])
     left = dense.left(D)[: 2 * len(D)].reshape(len(D), 2, 2)
