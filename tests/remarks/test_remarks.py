@@ -229,3 +229,12 @@ def test_other_kinds_have_their_short_names_in_a_sentence() -> None:
     )
     assert one.names("instead") == ("points_moved",)
     assert "points that moved" in one.text and "points_moved" not in one.text
+
+
+def test_another_kind_has_its_short_name_in_a_sentence() -> None:
+    short = KINDS["points_moved"].short
+    parts = {"photographs": ("a",), "shift": 4.0, "rms": 2.0, "change": (0.5, "%")}
+    one = remark("other_camera", instead=("points_moved", "two_places"), **parts)  # type: ignore[arg-type]
+    assert short and short in one.text and "points_moved" not in one.text
+    assert not KINDS["two_places"].short and "two_places" in one.text
+    assert one.names("instead") == ("points_moved", "two_places")
