@@ -6,8 +6,8 @@ draws mutations of the rooms below: a comparison turned round, a sum in place of
 doubled or halved, a condition negated. Each is written into a copy of the project, the tests of its room run
 until one fails, and the table lists which survived. Nothing is changed in the project.
 
-One changes nothing that a test could notice: the centre of the motions that `_constraints` of score.py fixes,
-as rotations about any centre are the same motions.
+Some change nothing that a test could notice: in score.py the centre of the motions that `_constraints` fixes,
+as rotations about any centre are the same motions, and the scale of the normals, which only rounding needs.
 """
 
 from __future__ import annotations
