@@ -15,7 +15,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from scipy.special import gammaln
 
-from sfm.adjustment.hypotheses.columns import BENDING, CAMERA, STRAIN, Columns, interior_columns
+from sfm.adjustment.hypotheses.columns import BENDING, CAMERA, STRAIN, Columns, shared_columns
 from sfm.adjustment.hypotheses.score import (
     Gain,
     Reduced,
@@ -71,7 +71,7 @@ class Alternative:
         """Return its columns for all image points of an adjustment, px, (k, 2, q)."""
         seen = a.network.image_points
         if self.family == "interior":
-            return _interior(a, self.parameters)
+            return shared_columns(a, list(self.parameters))[0]
         if self.family == "format":
             return _cells(a)
         factor = self.factor[seen.image][:, None, None]
@@ -90,16 +90,6 @@ def _family(columns: Columns, family: str) -> FloatArray:
     if family in CAMERA_SETS:
         return columns.camera[:, :, list(CAMERA_SETS[family])]
     return columns.strain if family == "strain" else columns.bending
-
-
-def _interior(a: Adjustment, parameters: tuple[tuple[int, int], ...]) -> FloatArray:
-    """Return the columns of held parameters; cameras that share one have it together."""
-    groups: dict[tuple[str, str], FloatArray] = {}
-    for index, s in parameters:
-        camera = a.estimate.cameras[index]
-        key = (camera.group_of(s) or camera.name, camera.names[s])
-        groups[key] = groups.get(key, 0.0) + interior_columns(a, index, [s])[:, :, 0]
-    return np.stack(list(groups.values()), axis=2)
 
 
 def _cells(a: Adjustment) -> FloatArray:
@@ -201,7 +191,7 @@ def held_interiors(a: Adjustment, reduced: Reduced) -> Iterator[Alternative]:
     for held in owners.values():
         sets = [tuple(one) for one in held.values()]
         whole = tuple(pair for one in held.values() for pair in one)
-        D = reduced.whiten(_interior(a, whole))
+        D = reduced.whiten(shared_columns(a, list(whole))[0])
         every = gain_of(*reduced.project(D))
         for parameters, columns in [
             *((one, [k]) for k, one in enumerate(sets)),
@@ -452,6 +442,8 @@ def _shifted(
             if (again == members).all() or not again.any():
                 break
             members = again
+        if 2 * members.sum() > total:
+            members = ~members  # that the others moved the other way says the same
         count = int(members.sum())
         if not MIN_GROUP <= count <= total - MIN_GROUP:
             continue

@@ -147,6 +147,31 @@ def interior_step(a: Adjustment, index: int, parameter: int) -> float:
     return _step(camera, parameter, -UVW[:, :2] / UVW[:, 2:]) / SMALL_MOVE_PX
 
 
+def shared_columns(
+    a: Adjustment, parameters: list[tuple[int, int]]
+) -> tuple[FloatArray, list[tuple[str, str]], list[float]]:
+    """Return the columns of interior parameters, one for all cameras that share a parameter.
+
+    Args:
+        a: the adjustment.
+        parameters: (camera, index of the parameter).
+
+    Returns:
+        Columns (k, 2, g), (camera or group, name) of each, and the change of the parameter for one unit.
+    """
+    groups: dict[tuple[str, str], FloatArray] = {}
+    units: dict[tuple[str, str], float] = {}
+    for index, s in parameters:
+        camera = a.estimate.cameras[index]
+        key = (camera.group_of(s) or camera.name, camera.names[s])
+        unit = interior_step(a, index, s)
+        found = interior_columns(a, index, [s])[:, :, 0] * (units.setdefault(key, unit) / unit)
+        groups[key] = groups[key] + found if key in groups else found
+    empty = np.zeros((len(a.network.image_points), 2, 0))
+    stacked = np.stack(list(groups.values()), axis=2) if groups else empty
+    return stacked, list(groups), [units[key] for key in groups]
+
+
 def _step(camera: Camera, s: int, uv: FloatArray) -> float:
     """Return the step of a parameter that moves the image points by `SMALL_MOVE_PX` at most."""
     step = 1e-6 * max(abs(float(camera.parameters[s])), 1e-6)

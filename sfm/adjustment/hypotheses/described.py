@@ -66,9 +66,10 @@ def _camera(a: Adjustment, one: Alternative, beta: FloatArray) -> dict[str, tupl
     """Return by how much c and the principal point differ in the photographs of an alternative."""
     camera = a.estimate.cameras[a.network.camera[int(one.photographs[0])]]
     half = max(camera.size_px) / 2
-    sign = 1.0 if one.factor[one.photographs[0]] > 0 else -1.0
+    sign = 1.0 if one.pattern == "linear" or one.factor[one.photographs[0]] > 0 else -1.0
     # a column is 1 px at the edge, and moves what is measured
-    parts = {"change": (100 * sign * float(beta[0]) / half, "%")}
+    largest = float(np.ptp(one.factor))  # from the first photograph to the last of a drift
+    parts = {"change": (100 * sign * largest * float(beta[0]) / half, "%")}
     if len(beta) > 2 and one.pattern != "linear":
         parts["away"] = (float(np.hypot(beta[1], beta[2])), "px")
     return parts

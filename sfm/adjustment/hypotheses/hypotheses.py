@@ -34,6 +34,8 @@ from sfm.reduced_network import reduce_network
 from sfm.remarks.remark import Remark, remark
 
 MAX_CAUSES = 2  # that are looked for one after another
+MAX_TRIED = 3  # alternatives that are adjusted for each, where the best of the score test does not hold
+FALSE_ALARM = 0.05  # chance that the test rejects any image point of a network without gross errors
 MAX_IMAGE_POINTS = 6_000  # of the network that is tested; every so many points of a larger one
 MAX_PHOTOGRAPHS = 300  # of a network that is tested: their normal equations are dense here
 APART = float(np.log(100))  # of ln likelihood, below which two alternatives cannot be told apart
@@ -62,31 +64,29 @@ def judge_alternatives(final: Adjustment, *, unit: str = "") -> tuple[Remark, ..
     if plain is None:
         return ()
     return tuple(
-        remark_of(plain, one.alternative, one.refit, one.as_well, unit) for one in find_causes(final, plain)
+        remark_of(plain, one.alternative, one.refit, one.as_well, unit) for one in find_causes(plain)
     )
 
 
-def find_causes(final: Adjustment, plain: Adjustment) -> tuple[Cause, ...]:
+def find_causes(plain: Adjustment) -> tuple[Cause, ...]:
     """Return the alternatives that hold, the clearest first.
 
     Args:
-        final: the finished adjustment.
-        plain: its image points alone.
+        plain: adjustment of the image points alone, gross errors rejected.
     """
-    reject = "tau" if final.rejected.any() or not final.reweighted else "none"
     causes: list[Cause] = []
     current = plain
     for _ in range(MAX_CAUSES):
-        found = _best(plain, current, reject=reject)
+        found = _best(plain, current)
         if found is None:
             break
-        if found.refit.shift >= NAMED:
+        if not found.refit.shift < NAMED:  # a shift that is not known is as bad as can be
             causes.append(found)
         current = found.refit.adjustment
     return tuple(causes)
 
 
-def _best(plain: Adjustment, current: Adjustment, *, reject: str) -> Cause | None:
+def _best(plain: Adjustment, current: Adjustment) -> Cause | None:
     """Return the alternative that holds beside those whose effect has left an adjustment already."""
     columns = columns_of(current)
     try:
@@ -97,19 +97,18 @@ def _best(plain: Adjustment, current: Adjustment, *, reject: str) -> Cause | Non
     significant = [
         one for one in every if is_significant(one, len(every)) and one.evidence > np.log(1 / ALPHA)
     ]
-    if not significant:
-        return None
-    best = significant[0]
-    found = refit(plain, best, current, reject=reject)
-    if found is None:
-        return None
-    if not found.gain - best.price > np.log(1 / ALPHA):
-        return None
-    near = [
-        one for one in significant[1:] if best.evidence - one.evidence < APART and _cause(one) != _cause(best)
-    ]
-    once = {_cause(one): one for one in reversed(near)}
-    return Cause(best, found, tuple(once.values()))
+    once: dict[tuple[object, ...], Alternative] = {}
+    for one in significant:
+        once.setdefault(_cause(one), one)
+    for best in list(once.values())[:MAX_TRIED]:
+        found = refit(plain, best, current)
+        if found is None or not found.gain - best.price > np.log(1 / ALPHA):
+            continue
+        near = tuple(
+            one for one in once.values() if one is not best and abs(best.evidence - one.evidence) < APART
+        )
+        return Cause(best, found, near)
+    return None
 
 
 def _cause(one: Alternative) -> tuple[object, ...]:
@@ -148,13 +147,14 @@ def contradicted_parameters(a: Adjustment) -> tuple[tuple[str, str], ...]:
 
 
 def free_network(final: Adjustment) -> Adjustment | None:
-    """Return the adjustment of the accepted image points alone; None where it is no solution."""
+    """Return the adjustment of the image points alone, gross errors rejected; None if it is no solution."""
     if not final.converged or not final.sigma0 > 0 or final.redundancy < 2:
         return None
     network = final.network
     alone = not (len(network.scale_bars) or len(network.exterior))
-    if alone and final.datum != "control" and len(final.rejected) <= MAX_IMAGE_POINTS:
-        return None if final.reweighted or final.undetermined else final
+    tested = final.rejected.any() and not final.reweighted and not final.undetermined
+    if alone and tested and final.datum != "control" and len(final.rejected) <= MAX_IMAGE_POINTS:
+        return final
     part, estimate, rows = _sample(
         replace(network, control=ObjectPoints(), scale_bars=ScaleBars(), exterior=ExteriorObservations()),
         final,
@@ -166,7 +166,7 @@ def free_network(final: Adjustment) -> Adjustment | None:
             datum=Datum("free"),
             image_sigma_factor=final.image_sigma_factor[rows],
             reject="tau",
-            alpha=final.test_alpha,
+            alpha=1 - (1 - FALSE_ALARM) ** (1 / (2 * max(int(rows.sum()), 1))),
             rejected=final.rejected[rows],
         )
     except GeometryError:

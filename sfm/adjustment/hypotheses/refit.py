@@ -35,14 +35,13 @@ class Refit:
     rms: float  # root mean square of the same
 
 
-def refit(plain: Adjustment, one: Alternative, start: Adjustment, *, reject: str) -> Refit | None:
+def refit(plain: Adjustment, one: Alternative, start: Adjustment) -> Refit | None:
     """Adjust with an alternative; None where that does not converge.
 
     Args:
         plain: the adjustment that states coordinates and standard deviations.
         one: the alternative.
         start: adjustment to begin from, which may be without the effect of another alternative.
-        reject: how gross errors are treated.
     """
     current, beta = start, one.gain.beta
     xy = start.network.image_points.xy
@@ -55,9 +54,9 @@ def refit(plain: Adjustment, one: Alternative, start: Adjustment, *, reject: str
                 current.estimate,
                 datum=Datum("free"),
                 image_sigma_factor=start.image_sigma_factor,
-                reject=reject,
+                reject="tau",
                 alpha=plain.test_alpha,
-                rejected=current.rejected if reject == "tau" else None,
+                rejected=current.rejected,
             )
             if not current.converged:
                 return None
@@ -70,7 +69,7 @@ def refit(plain: Adjustment, one: Alternative, start: Adjustment, *, reject: str
         if gain.value < SETTLED:
             break
     gained = log_likelihood(current) - log_likelihood(start)
-    return Refit(current, beta, gained, *shifts_of(plain, current, one, beta))
+    return Refit(current, beta, gained, *shifts_of(plain, start, current, one, beta))
 
 
 def log_likelihood(a: Adjustment) -> float:
@@ -85,11 +84,19 @@ def log_likelihood(a: Adjustment) -> float:
 
 
 def shifts_of(
-    plain: Adjustment, other: Adjustment, one: Alternative, beta: FloatArray
+    plain: Adjustment, before: Adjustment, other: Adjustment, one: Alternative, beta: FloatArray
 ) -> tuple[float, float]:
-    """Return the largest and the RMS change of coordinates after a similarity, in standard deviations."""
+    """Return the largest and the RMS change of coordinates after a similarity, in standard deviations.
+
+    Args:
+        plain: states the standard deviations.
+        before: without the alternative.
+        other: with it.
+        one: the alternative.
+        beta: its parameters, (q,).
+    """
     sigma = np.sqrt(np.diagonal(plain.covariance.points, axis1=1, axis2=2))
-    X, Y = plain.estimate.points, other.estimate.points
+    X, Y = before.estimate.points, other.estimate.points
     stays = np.ones(len(X), dtype=bool)
     stays[one.points] = False
     known = np.isfinite(X).all(axis=1) & np.isfinite(Y).all(axis=1) & (sigma > 0).all(axis=1)

@@ -19,7 +19,7 @@ import numpy as np
 from scipy import special
 from scipy.linalg import cho_factor, cho_solve
 
-from sfm.adjustment.hypotheses.columns import Columns, interior_columns, interior_step
+from sfm.adjustment.hypotheses.columns import Columns, shared_columns
 from sfm.adjustment.result import Adjustment
 from sfm.conventions import FloatArray, IntArray
 from sfm.distributions import f_sf
@@ -153,7 +153,7 @@ def reduce_adjustment(a: Adjustment, columns: Columns) -> Reduced:
     image, point = seen.image[used], seen.point[used]
     v = np.einsum("kab,kb->ka", F, a.residuals[used])
     B = F @ columns.point[used]
-    interior, prior = _free_interior(a)
+    interior, prior, slope = _free_interior(a)
     A = np.concatenate([F @ columns.exterior[used], F @ interior[used]], axis=2)
     size = 6 * m + interior.shape[2]
     V, gp = np.zeros((n, 3, 3)), np.zeros((n, 3))
@@ -175,6 +175,7 @@ def reduce_adjustment(a: Adjustment, columns: Columns) -> Reduced:
     flat = W.reshape(3 * n, size)
     S, t = _camera_normals(A, image, v, m, size)
     S[range(6 * m, size), range(6 * m, size)] += prior
+    t[6 * m :] += slope
     S -= flat.T @ flat
     t = t - flat.T @ y.ravel()
     S += _constraints(a, S, m)
@@ -187,28 +188,25 @@ def reduce_adjustment(a: Adjustment, columns: Columns) -> Reduced:
     )
 
 
-def _free_interior(a: Adjustment) -> tuple[FloatArray, FloatArray]:
-    """Return the columns of the free interior parameters, (k, 2, i), and the weights of given values."""
+def _free_interior(a: Adjustment) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return the columns of free interior parameters (k, 2, i), weights and slopes of their given values."""
     network, cameras = a.network, a.estimate.cameras
-    groups: dict[tuple[str, str], FloatArray] = {}
-    for index, camera in enumerate(cameras):
-        if not (network.camera == index).any():
-            continue
-        free = [int(s) for s in np.flatnonzero(camera.free)]
-        found = interior_columns(a, index, free)
-        for column, s in enumerate(free):
-            key = (camera.group_of(s) or camera.name, camera.names[s])
-            groups[key] = groups.get(key, 0.0) + found[:, :, column]
+    used = np.unique(network.camera).tolist()
+    columns, keys, units = shared_columns(
+        a, [(index, int(s)) for index in used for s in np.flatnonzero(cameras[index].free)]
+    )
+    weight, slope = np.zeros(len(keys)), np.zeros(len(keys))
     given = network.interior
-    prior = dict.fromkeys(groups, 0.0)
-    for index, s, sigma in zip(given.camera, given.parameter, given.sigma, strict=True):
+    rows = zip(given.camera, given.parameter, given.value, given.sigma, strict=True)
+    for index, s, value, sigma in rows:
         camera = cameras[index]
         key = (camera.group_of(int(s)) or camera.name, camera.names[s])
-        if key in prior and sigma > 0:
-            prior[key] += (interior_step(a, int(index), int(s)) / float(sigma) / a.sigma0) ** 2
-    empty = np.zeros((len(network.image_points), 2, 0))
-    stacked = np.stack(list(groups.values()), axis=2) if groups else empty
-    return stacked, np.array(list(prior.values()))
+        if key in keys and sigma > 0:
+            k = keys.index(key)
+            per_unit = units[k] / float(sigma) / a.sigma0
+            weight[k] += per_unit**2
+            slope[k] += per_unit * (float(camera.parameters[s]) - float(value)) / float(sigma) / a.sigma0
+    return columns, weight, slope
 
 
 def _camera_normals(

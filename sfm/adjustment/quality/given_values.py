@@ -32,6 +32,7 @@ NONCENTRALITY = 4.13  # of an error that a test at LEVEL finds with 80 %; Baarda
 RANK = 1e-9  # eigenvalue over the largest below which a direction does not exist
 MAX_SETS = 2000  # sets of wrong values that are tried; with more, those that differ in one value
 MAX_TRIPLES = 300  # similarities by three points that are tried for the start
+MAX_WRONG = 10  # values that are sought among others; where more do not fit, it is no few wrong ones
 MAX_EXCHANGED = 40  # points of which pairs may have exchanged names, those that fit worst
 RELINEARISED = 3
 MAX_FACTOR = 30.0  # on stated standard deviations: one that is larger is a mistake, not a misjudgement
@@ -286,7 +287,7 @@ def _wrong_values(
     """
     T = model.misfit()[0]
     out: tuple[int, ...] = ()
-    while 2 * (len(out) + 1) < model.items:
+    while 2 * (len(out) + 1) < model.items and len(out) < MAX_WRONG:
         tried = [(*out, one) for one in range(model.items) if one not in out]
         fall = [model.decrease(some) for some in tried]
         out = tried[int(np.argmax([fewer - cost * rank for fewer, rank in fall]))]

@@ -13,7 +13,7 @@ ROWS = (
     Kind(
         "bar_left_out",
         "warning",
-        "Scale bar {bar} is {off:+} longer than by the other given values, {sigmas} standard deviations[[, "
+        "Scale bar {bar} differs by {off:+} from the other given values, {sigmas} standard deviations[[, "
         "and fits with the factor {unit_factor} of another unit]]: it was left out.",
         CHECK_THE_LIST,
         "Correct the length of this bar or remove it.",

@@ -16,16 +16,16 @@ ROWS = (
     Kind(
         "other_camera",
         SHIFT,
-        "Photographs {photographs} do not share the camera of the others (c {change:+}"
+        "The camera of {photographs} is not that of the others (c {change:+}"
         f"[[, principal point {{away}} away]]). {SHIFTED}{INSTEAD}",
         "zoom, focus or camera changed during the survey, or photographs were cropped or resampled",
-        "Give these photographs a [[camera]] of their own, or free the parameters with per_photograph.",
+        "Give these photographs another camera in the survey file, or set per_photograph.",
         short="another camera in some photographs",
     ),
     Kind(
         "camera_drift",
         SHIFT,
-        "The camera changes steadily through the sequence (c {change:+} to either end). "
+        "The camera changes steadily through the sequence (c by {change:+} from first to last). "
         f"{SHIFTED}{INSTEAD}",
         "the camera warmed up, or its focus crept",
         "Set per_photograph for c, and let the camera warm up before the survey.",
