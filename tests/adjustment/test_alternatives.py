@@ -105,6 +105,7 @@ class Dense:
     columns: Columns
     reduced: Reduced
     Q: FloatArray  # orthonormal base of the unknowns' columns, prior rows at the end
+    prior: float  # residual of the given c, whitened
     every: tuple[Alternative, ...]
     spreads: dict[int, Spread]  # with which each was judged, by its identity
 
@@ -118,7 +119,8 @@ class Dense:
     def normals(self, D: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         left = self.left(D)
         flat = D.reshape(-1, D.shape[2])
-        v = self.left(self.reduced.v[:, :, None])[:, 0]
+        v = np.append(self.reduced.v.ravel(), self.prior)
+        v = v - self.Q @ (self.Q.T @ v)
         return left.T @ left, left.T @ v, (flat**2).sum(axis=0)
 
 
@@ -175,7 +177,8 @@ def dense() -> Dense:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(alternatives, "_made", recorded)
         found = alternatives_of(a, reduced, every)
-    return Dense(a, every, reduced, U[:, d > 1e-9 * d[0]], found, spreads)
+    residual = (float(a.estimate.cameras[0].parameters[0]) - 10.0) / 2e-3 / a.sigma0
+    return Dense(a, every, reduced, U[:, d > 1e-9 * d[0]], residual, found, spreads)
 
 
 def test_whitening_makes_coordinates_independent_of_unit_variance(dense: Dense) -> None:
@@ -203,12 +206,15 @@ def test_given_values_of_free_parameters_have_weight(dense: Dense) -> None:
     )
     a = replace(dense.a, network=replace(dense.a.network, interior=given))
     weight = (columns.interior_step(a, 0, 0) / 2e-3 / a.sigma0) ** 2
-    found, prior = score._free_interior(a)
+    found, prior, slope = score._free_interior(a)
     assert found.shape[2] == 2 and prior == pytest.approx([weight, 0.0])
+    off = float(a.estimate.cameras[0].parameters[0]) - 10.0
+    assert slope == pytest.approx([np.sqrt(weight) * off / 2e-3 / a.sigma0, 0.0])
     group = tuple(replace(one, shared=("lens",) * len(one.names)) for one in a.estimate.cameras)
     a = replace(a, estimate=replace(a.estimate, cameras=group))
-    both, prior = score._free_interior(a)
-    np.testing.assert_allclose(both[:, :, 0], found.sum(axis=2))
+    both, prior, _ = score._free_interior(a)
+    units = [columns.interior_step(a, index, 0) for index in range(2)]  # of the first, mm for a column
+    np.testing.assert_allclose(both[:, :, 0], found[:, :, 0] + units[0] / units[1] * found[:, :, 1])
     assert both.shape[2] == 1 and prior == pytest.approx([weight])
     held = tuple(alternatives.held_interiors(a, dense.reduced))
     assert [len(one.parameters) for one in held] == [
