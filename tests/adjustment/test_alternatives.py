@@ -223,11 +223,14 @@ def test_given_values_of_free_parameters_have_weight(dense: Dense) -> None:
     ]
     np.testing.assert_allclose(
         held[0].columns(a, dense.columns)[:, :, 0],
-        interior_columns(a, 0, [1])[:, :, 0] + interior_columns(a, 1, [1])[:, :, 0],
+        interior_columns(a, 0, [1])[:, :, 0]
+        + columns.interior_step(a, 0, 1)
+        / columns.interior_step(a, 1, 1)
+        * interior_columns(a, 1, [1])[:, :, 0],
     )
     fixed = tuple(replace(one, free=np.zeros_like(one.free)) for one in a.estimate.cameras)
     a = replace(a, estimate=replace(a.estimate, cameras=fixed))
-    none, prior = score._free_interior(a)
+    none, prior, _ = score._free_interior(a)
     assert none.shape == (len(a.rejected), 2, 0) and len(prior) == 0
 
 
