@@ -363,7 +363,7 @@ def _moved_at(reduced: Reduced, factor: FloatArray, search: float) -> Iterator[A
     n, m, size = len(reduced.L), reduced.photographs, len(reduced.t)
     on = factor[reduced.image] > 0
     D = np.where(on[:, None, None], reduced.B, 0.0)
-    V, C = np.zeros((n, 3, 3)), np.zeros((n, 3, 3))
+    V = np.zeros((n, 3, 3))
     np.add.at(V, reduced.point[on], np.swapaxes(D[on], 1, 2) @ D[on])
     C = reduced.L @ V  # L^-1 B'D, as B'D = V here
     before = np.bincount(reduced.point[~on], minlength=n)
@@ -401,7 +401,7 @@ def _moved_at(reduced: Reduced, factor: FloatArray, search: float) -> Iterator[A
     for count in range(1, len(order) + 1):
         part = slice(0, 3 * count)
         gain = gain_of(H[part, part], g[order].ravel()[part], squares[order].ravel()[part])
-        sets = float(gammaln(total + 1) - gammaln(count + 1) - gammaln(total - count + 1))
+        sets = _log_sets(total, count)
         others = ordered[count:]
         spread = Spread(float(others.mean()) / 3, 3 * len(others)) if len(others) else NONE
         one = _made(
@@ -415,6 +415,11 @@ def _moved_at(reduced: Reduced, factor: FloatArray, search: float) -> Iterator[A
     if best is not None:
         yield best
     yield from _shifted(reduced, factor, search, (movable, blocks, g))
+
+
+def _log_sets(total: int, count: int) -> float:
+    """Return ln of the number of sets of so many points."""
+    return float(gammaln(total + 1) - gammaln(count + 1) - gammaln(total - count + 1))
 
 
 def _shifted(
@@ -451,7 +456,7 @@ def _shifted(
         on = (factor[reduced.image] > 0) & np.isin(reduced.point, points)
         D = np.where(on[:, None, None], reduced.B, 0.0)
         gain = gain_of(*reduced.project(D))
-        sets = float(gammaln(total + 1) - gammaln(count + 1) - gammaln(total - count + 1))
+        sets = _log_sets(total, count)
         left = g + np.where(members[:, None], blocks @ gain.beta, 0.0)
         values, ranks = gains_of(blocks, left, squares)
         redundancy = int(ranks.sum()) - gain.rank

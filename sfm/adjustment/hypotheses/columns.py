@@ -17,7 +17,7 @@ import numpy as np
 
 from sfm.adjustment.result import Adjustment
 from sfm.camera import Camera, pixel_from_tangents, pixel_jacobian
-from sfm.conventions import BoolArray, FloatArray
+from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.network import rows_of
 
 CAMERA = ("c", "x0", "y0", "K1", "K2", "P1", "P2", "b1", "b2")
@@ -120,13 +120,9 @@ def interior_columns(a: Adjustment, index: int, parameters: list[int]) -> FloatA
     They are 0 in photographs of other cameras, and in px for a move of `SMALL_MOVE_PX`, so that parameters of
     all units have columns of about one size.
     """
-    network, estimate = a.network, a.estimate
-    seen, camera = network.image_points, estimate.cameras[index]
-    rows = np.flatnonzero(network.camera[seen.image] == index)
-    R = estimate.rotation[seen.image[rows]]
-    UVW = np.einsum("kji,kj->ki", R, estimate.points[seen.point[rows]] - estimate.position[seen.image[rows]])
-    uv = -UVW[:, :2] / UVW[:, 2:]
-    found = np.zeros((len(seen), 2, len(parameters)))
+    camera = a.estimate.cameras[index]
+    rows, uv = _tangents_of(a, index)
+    found = np.zeros((len(a.network.image_points), 2, len(parameters)))
     at = pixel_from_tangents(camera, uv)
     for column, s in enumerate(parameters):
         step = _step(camera, s, uv)
@@ -139,12 +135,17 @@ def interior_columns(a: Adjustment, index: int, parameters: list[int]) -> FloatA
 
 def interior_step(a: Adjustment, index: int, parameter: int) -> float:
     """Return by how much a parameter changes for one unit of its column in `interior_columns`."""
+    return _step(a.estimate.cameras[index], parameter, _tangents_of(a, index)[1]) / SMALL_MOVE_PX
+
+
+def _tangents_of(a: Adjustment, index: int) -> tuple[IntArray, FloatArray]:
+    """Return the image points of one camera, (r,), and the tangents of their rays, (r, 2)."""
     network, estimate = a.network, a.estimate
-    seen, camera = network.image_points, estimate.cameras[index]
+    seen = network.image_points
     rows = np.flatnonzero(network.camera[seen.image] == index)
     R = estimate.rotation[seen.image[rows]]
     UVW = np.einsum("kji,kj->ki", R, estimate.points[seen.point[rows]] - estimate.position[seen.image[rows]])
-    return _step(camera, parameter, -UVW[:, :2] / UVW[:, 2:]) / SMALL_MOVE_PX
+    return rows, -UVW[:, :2] / UVW[:, 2:]
 
 
 def shared_columns(
