@@ -25,6 +25,7 @@ from sfm.adjustment.hypotheses.columns import columns_of
 from sfm.adjustment.hypotheses.described import remark_of
 from sfm.adjustment.hypotheses.refit import Refit, refit
 from sfm.adjustment.hypotheses.score import reduce_adjustment
+from sfm.adjustment.quality.reliability import FALSE_ALARM, level_of_single
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.conventions import BoolArray
@@ -35,7 +36,6 @@ from sfm.remarks.remark import Remark, remark
 
 MAX_CAUSES = 2  # that are looked for one after another
 MAX_TRIED = 3  # alternatives that are adjusted for each, where the best of the score test does not hold
-FALSE_ALARM = 0.05  # chance that the test rejects any image point of a network without gross errors
 MAX_IMAGE_POINTS = 6_000  # of the network that is tested; every so many points of a larger one
 MAX_PHOTOGRAPHS = 300  # of a network that is tested: their normal equations are dense here
 APART = float(np.log(100))  # of ln likelihood, below which two alternatives cannot be told apart
@@ -166,7 +166,7 @@ def free_network(final: Adjustment) -> Adjustment | None:
             datum=Datum("free"),
             image_sigma_factor=final.image_sigma_factor[rows],
             reject="tau",
-            alpha=1 - (1 - FALSE_ALARM) ** (1 / (2 * max(int(rows.sum()), 1))),
+            alpha=level_of_single(FALSE_ALARM, 2 * int(rows.sum())),
             rejected=final.rejected[rows],
         )
     except GeometryError:

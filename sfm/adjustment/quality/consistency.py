@@ -15,6 +15,7 @@ import numpy as np
 
 from sfm.adjustment.quality.gross_errors.doubtful_rays import DoubtfulPoint, doubtful_points
 from sfm.adjustment.quality.point_normals import PointNormals, point_normals
+from sfm.adjustment.quality.reliability import level_of_single
 from sfm.adjustment.quality.variance_components import VarianceComponents, by_photograph
 from sfm.adjustment.result import Adjustment
 from sfm.conventions import IntArray
@@ -56,7 +57,7 @@ def consistency_of(adjustment: Adjustment) -> Consistency:
 def _large(adjustment: Adjustment, parts: PointNormals, rays: list[IntArray]) -> tuple[str, ...]:
     """Return the points whose accepted residuals are together larger than chance makes them."""
     network, n = adjustment.network, len(adjustment.network.points)
-    level = 1 - (1 - FAMILY) ** (1 / max(n, 1))
+    level = level_of_single(FAMILY, n)
     large: list[str] = []
     for j, rows in enumerate(rays):
         accepted = rows[~adjustment.rejected[rows]]

@@ -100,6 +100,21 @@ def redundancy_of_bars(
     return np.asarray(np.clip(1 - taken, 0.0, 1.0))
 
 
+FALSE_ALARM = 0.05  # chance that a survey without any outlier loses an image coordinate; Pope (1976)
+
+
+def level_of_single(family: float, tests: int) -> float:
+    """Return the level of each of some tests, so that any of them rejects what is good with a probability.
+
+    Args:
+        family: that probability, of all tests together.
+        tests: how many there are.
+
+    Source: Sidak (1967), J. Am. Stat. Assoc. 62.
+    """
+    return float(1 - (1 - family) ** (1 / max(tests, 1)))
+
+
 def tau_critical(alpha: float, redundancy: int) -> float:
     """Return the critical value of Pope's tau for a two-sided test of one observation.
 

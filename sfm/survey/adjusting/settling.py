@@ -9,6 +9,7 @@ import numpy as np
 
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.engine.observed_unknowns import observed
+from sfm.adjustment.quality.reliability import FALSE_ALARM, level_of_single
 from sfm.adjustment.quality.variance_components import IMAGE_POINTS, estimate_components
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
@@ -26,7 +27,6 @@ from sfm.survey.diagnosis.own_camera import Treated, treat_lost
 from sfm.survey.inputs.interior import without_idle_cameras
 from sfm.survey.inputs.survey import Survey
 
-FALSE_ALARM = 0.05  # chance that a survey without any outlier loses an image coordinate; Pope (1976)
 MIN_IMAGE_POINTS = 4  # of a photograph in the final adjustment: three determine it, the fourth checks
 MIN_DATUM_POINTS = 3  # that fix position, attitude and scale
 MAX_ITERATIONS = 50  # of an adjustment from the usual start values
@@ -197,7 +197,7 @@ def _tested(
         sigma_px=task.survey.adjust.sigma_px,
         image_sigma_factor=factor,
         reject=task.reject,
-        alpha=1 - (1 - FALSE_ALARM) ** (1 / tests),
+        alpha=level_of_single(FALSE_ALARM, tests),
         rejected=rejected,
         method=method,
         max_iterations=max_iterations,

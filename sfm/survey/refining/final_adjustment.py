@@ -7,13 +7,14 @@ from dataclasses import replace
 import numpy as np
 
 from sfm.adjustment.datum import Datum
+from sfm.adjustment.quality.reliability import FALSE_ALARM, level_of_single
 from sfm.adjustment.quality.variance_components import estimate_components
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.conventions import FloatArray
 from sfm.network import Estimate, Network
 from sfm.remarks.remark import Remark, remark
-from sfm.survey.adjusting.settling import FALSE_ALARM, MANY_ITERATIONS, MAX_ITERATIONS
+from sfm.survey.adjusting.settling import MANY_ITERATIONS, MAX_ITERATIONS
 from sfm.survey.hypotheses.given import judge_given, without_given
 
 GROUPS = ("key points", "targets")
@@ -35,7 +36,7 @@ def adjust_finally(
         matched: points before the targets.
         unit: object unit.
     """
-    alpha = 1 - (1 - FALSE_ALARM) ** (1 / (2 * len(part.image_points)))
+    alpha = level_of_single(FALSE_ALARM, 2 * len(part.image_points))
 
     def tested(network: Network, factor: float | FloatArray, *, reject: str) -> Adjustment:
         return adjust(
