@@ -11,11 +11,11 @@ from typing import Any
 
 import numpy as np
 
-from sfm.comparison.two_adjusters.adjuster_validation import SAME, SAME_COST, Trial, Validation
-from sfm.display import program_name
+from sfm.comparison.solutions import SAME_SIGMAS
+from sfm.comparison.two_adjusters.adjuster_validation import Trial, Validation
 from sfm.files.plain_text import csv_text, or_none
-from sfm.remarks.remark import Remark, remark
-from sfm.remarks.verdict import judge
+from sfm.remarks.catalogue import KINDS
+from sfm.remarks.verdict import Verdict, judge
 from sfm.report.figures.comparisons import time_figure
 from sfm.report.figures.plot_data import Plot
 from sfm.report.figures.plots import png
@@ -51,8 +51,8 @@ COLUMNS = (
     "conditional_covariance_difference",
     "interior_covariance_difference",
     "marginal_over_conditional_sigma",
-    "verdict",
-    "reason",
+    "ended",
+    "message",
 )
 TIME_CAPTION = (
     "Seconds of adjustment on one thread. The other adjuster runs until its cost stands still, for the sake "
@@ -81,31 +81,36 @@ def trial_row(trial: Trial) -> tuple[object, ...]:
         *(plan.datum, *trial.cost, *trial.rms_px, *trial.iterations, *trial.seconds),
         *(trial.interior_sigmas, trial.position_sigmas, trial.rotation_sigmas, trial.point_sigmas),
         *(trial.conditional_difference, trial.interior_difference, trial.marginal_over_conditional),
-        *(trial.verdict, trial.reason),
+        *(trial.remark.kind, "; ".join(messages_of(trial))),
     )
 
 
 def validation_summary(validation: Validation) -> dict[str, Any]:
     """Return what validation.json holds: plain values only, None for what is not known."""
+    verdict = verdict_of_validation(validation)
     return {
         "backend": validation.backend,
         "seed": validation.seed,
         "networks": len(validation.trials),
         "passed": validation.passed,
-        "verdicts": dict(validation.counts()),
+        "headline": verdict.headline,
+        "verdict": verdict.level,
+        "ended": dict(validation.counts()),
         "largest": {name: or_none(value) for name, value, _ in largest(validation)},
         "seconds": {
             "kolinear": or_none(sum(_known(t.seconds[0] for t in validation.trials))),
             validation.backend: or_none(sum(_known(t.seconds[1] for t in validation.trials))),
         },
-        "trials": [_plain(asdict(trial)) for trial in validation.trials],
+        "trials": [
+            {**_plain(asdict(trial)), "remark": trial.remark.as_dict()} for trial in validation.trials
+        ],
     }
 
 
 def largest(validation: Validation) -> tuple[tuple[str, float, str], ...]:
     """Return what was compared, its largest difference over all networks (NaN: none), and its unit."""
     trials = validation.trials
-    solved = [t for t in trials if t.verdict == SAME]
+    solved = [t for t in trials if t.remark.kind == "same_optimum"]
     costs = [abs(t.cost[1] - t.cost[0]) / min(t.cost) for t in solved if min(t.cost) > 0]
     return (
         ("cost", max(costs, default=math.nan), "relative"),
@@ -131,32 +136,36 @@ def in_words(value: float, unit: str) -> str:
     return f"{value:.1e} {unit}" if math.isfinite(value) else "nothing to compare"
 
 
-def validation_remarks(validation: Validation) -> tuple[Remark, ...]:
-    """Return in how many networks the adjusters differ, and in how many Kolinear is the worse one."""
-    count, same = len(validation.trials), dict(validation.counts()).get(SAME, 0)
-    remarks = []
-    if not validation.passed:
-        worse = sum(trial.worse for trial in validation.trials)
-        program = program_name(validation.backend)
-        remarks.append(remark("adjuster_worse_in_networks", worse=worse, networks=count, program=program))
-    if same < count:
-        remarks.append(remark("optima_differ_in_networks", differing=count - same, networks=count))
-    return tuple(remarks)
+def verdict_of_validation(validation: Validation) -> Verdict:
+    """Return the verdict, by the networks in which the adjusters do not end at the same optimum."""
+    remarks = [trial.remark for trial in validation.trials if trial.remark.severity != "note"]
+    count = len(validation.trials)
+    headline = f"{count - len(remarks)} of {count} networks: both adjusters end at the same optimum."
+    return judge(remarks, {"good": headline, "fair": headline, "bad": headline})
+
+
+def ended(kind: str) -> str:
+    """Return how two adjusters ended, in a few words."""
+    return KINDS[kind].short
+
+
+def messages_of(trial: Trial) -> tuple[str, ...]:
+    """Return what the programs that failed report: in words, or names of what is not determined."""
+    return (*trial.remark.names("message"), *trial.remark.names("their_message"))
 
 
 def validation_page(validation: Validation) -> str:
-    """Return the page: verdicts, largest differences, time, and every network."""
-    count, same = len(validation.trials), dict(validation.counts()).get(SAME, 0)
-    headline = f"{same} of {count} networks: both adjusters end at the same optimum."
-    verdict = judge(validation_remarks(validation), {"good": headline, "fair": headline, "bad": headline})
+    """Return the page: how the adjusters ended, largest differences, time, and every network."""
+    verdict = verdict_of_validation(validation)
     return render(
         "validation.html",
         v=validation,
         headline=verdict.headline,
         level=verdict.level,
         remarks=verdict.lines,
-        same=SAME,
-        same_cost=SAME_COST,
+        same_sigmas=SAME_SIGMAS,
+        ended=[(ended(kind), count) for kind, count in validation.counts()],
+        networks=[(trial, ended(trial.remark.kind)) for trial in validation.trials],
         largest=[(name, in_words(value, unit)) for name, value, unit in largest(validation)],
         marginal_over_conditional=_median_ratio(validation),
         picture=Plot("time", TIME_CAPTION, png(time_figure(validation))),

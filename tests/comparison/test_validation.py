@@ -11,11 +11,8 @@ from adapters.colmap.adjuster import adjust_with_colmap
 from adapters.colmap.validation_backend import ColmapBackend
 from sfm.comparison.solutions import reprojection
 from sfm.comparison.two_adjusters.adjuster_validation import (
-    BOTH_FAILED,
-    OURS_FAILED,
-    SAME,
     Validation,
-    _judge,
+    _ended,
     make_trial,
     validate,
 )
@@ -29,6 +26,7 @@ from sfm.comparison.two_adjusters.random_network import (
 )
 from sfm.errors import BackendError
 from sfm.network import Estimate, Network
+from sfm.remarks.remark import remark
 
 NETWORKS = 60
 
@@ -81,30 +79,36 @@ def test_control_is_exact_at_truth_and_start(drawn: list) -> None:
         np.testing.assert_array_equal(made.start.points[control.point], control.xyz)
 
 
+HUNDREDTH = 0.01**2 * 0.5**2 / 2  # what a difference of 0.01 standard deviations costs, 0.5 px each
+
+
 @pytest.mark.parametrize(
-    ("a", "b", "same", "ours", "theirs", "verdict", "worse"),
+    ("a", "b", "ours", "theirs", "ended", "severity"),
     [
-        (1.0, 1.0, True, False, False, SAME, False),
-        (1.0, 1.0, True, True, False, SAME, False),
-        (1.0, 2.0, False, False, False, "different optima, kolinear lower", False),
-        (2.0, 1.0, False, False, False, "different optima, {name} lower", True),
-        (2.0, 1.0, False, True, False, OURS_FAILED, True),
-        (np.nan, 1.0, False, False, False, OURS_FAILED, True),
-        (1.0, np.nan, False, False, True, "{name} failed", False),
-        (1.0, np.nan, False, False, False, "{name} failed", False),
-        (np.nan, np.nan, False, True, True, BOTH_FAILED, False),
+        (1.0, 1.0, (), (), "same_optimum", "note"),
+        (1.0, 1.0, ("c",), (), "same_optimum", "note"),
+        (1.0, 1.0 + 0.9 * HUNDREDTH, (), (), "same_optimum", "note"),
+        (1.0, 1.0 + 1.1 * HUNDREDTH, (), (), "kolinear_lower", "warning"),
+        (1.0 + 1.1 * HUNDREDTH, 1.0, (), (), "kolinear_higher", "error"),
+        (2.0, 1.0, ("c",), (), "kolinear_failed", "error"),
+        (np.nan, 1.0, (), (), "kolinear_failed", "error"),
+        (1.0, np.nan, (), ("stopped",), "other_adjuster_failed", "warning"),
+        (1.0, np.nan, (), (), "other_adjuster_failed", "warning"),
+        (np.nan, np.nan, ("c",), ("stopped",), "both_adjusters_failed", "warning"),
     ],
 )
-def test_verdicts(
-    a: float, b: float, same: bool, ours: bool, theirs: bool, verdict: str, worse: bool
+def test_how_two_adjusters_end(
+    a: float, b: float, ours: tuple[str, ...], theirs: tuple[str, ...], ended: str, severity: str
 ) -> None:
-    assert _judge(a, b, same, ours, theirs) == (verdict, worse)
+    kind = _ended(a, b, 0.5, ours, theirs)
+    assert kind == ended
+    assert remark(kind).severity == severity
 
 
 def test_both_adjusters_end_at_the_same_optimum_with_the_same_covariances() -> None:
     found = validate(ColmapBackend(), networks=5, seed=2)
     assert found.passed
-    assert found.counts() == ((SAME, 5),)
+    assert found.counts() == (("same_optimum", 5),)
     for trial in found.trials:
         for name in ("position_sigmas", "rotation_sigmas", "point_sigmas"):
             assert getattr(trial, name) < 1e-3  # of a standard deviation
@@ -135,24 +139,25 @@ class Spoiled:
 
 
 @pytest.mark.parametrize(
-    ("kind", "verdict"),
+    ("kind", "ended"),
     [
-        ("beside", "different optima, kolinear lower"),
-        ("refuses", "spoiled failed"),
-        ("lost", "spoiled failed"),
+        ("beside", "kolinear_lower"),
+        ("refuses", "other_adjuster_failed"),
+        ("lost", "other_adjuster_failed"),
     ],
 )
-def test_a_bad_backend_is_found_out(kind: str, verdict: str) -> None:
-    trial = make_trial(2, 1, Spoiled(kind))  # type: ignore[arg-type]
-    assert trial.verdict == verdict
-    assert not trial.worse
-    assert ("out of order" in trial.reason) == (kind == "refuses")
+def test_a_bad_backend_is_found_out(kind: str, ended: str) -> None:
+    found = make_trial(2, 1, Spoiled(kind)).remark  # type: ignore[arg-type]
+    assert found.kind == ended and found.severity == "warning"
+    assert found.names("their_message") == (("out of order",) if kind == "refuses" else ())
+    assert (found.number("apart") > 0.01) == (kind == "beside")
 
 
 def test_a_worse_in_house_adjuster_fails_the_run() -> None:
     trial = make_trial(2, 1, ColmapBackend())
     assert Validation("colmap", 1, (trial,)).passed
-    assert not Validation("colmap", 1, (trial, replace(trial, worse=True))).passed
+    worse = replace(trial, remark=remark("kolinear_higher", network=2, program="COLMAP", apart=0.02))
+    assert not Validation("colmap", 1, (trial, worse)).passed
 
 
 def test_processes_give_what_one_gives() -> None:
@@ -165,4 +170,6 @@ def test_processes_give_what_one_gives() -> None:
 def test_two_hundred_networks() -> None:
     found = validate(ColmapBackend(), networks=200, seed=1, jobs=2)
     assert found.passed
-    assert all(trial.verdict in (SAME, "colmap failed", BOTH_FAILED) for trial in found.trials)
+    assert {trial.remark.kind for trial in found.trials} <= {
+        "same_optimum", "other_adjuster_failed", "both_adjusters_failed",
+    }  # fmt: skip

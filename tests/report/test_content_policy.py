@@ -15,9 +15,10 @@ import pytest
 from sfm.batch.job import SurveyRow
 from sfm.batch.pages import render_index
 from sfm.comparison.significance import compare_results
-from sfm.comparison.two_adjusters.adjuster_validation import SAME, Trial, Validation
+from sfm.comparison.two_adjusters.adjuster_validation import Trial, Validation
 from sfm.comparison.two_adjusters.random_network import Plan
 from sfm.pipeline import run_survey
+from sfm.remarks.remark import remark
 from sfm.report.differences import write_differences
 from sfm.report.findings.findings import findings_of
 from sfm.report.html.content_policy import content_policy
@@ -98,7 +99,8 @@ def index_page(folder: Path) -> str:
 def validation_page(folder: Path) -> str:
     plan = Plan("ring", 8, 60, False, 0.8, 0.1, "opencv", 1, "all", "free")
     figures = ((10.0, 10.0), (0.1, 0.1), (5, 12), (0.01, 0.02), 1e-6, 2e-6, 3e-6, 4e-6, 1e-12, np.nan, 1.4)
-    trial = Trial(0, plan, 60, 400, *figures, SAME, EVIL, False)
+    ended = remark("other_adjuster_failed", network=0, program="COLMAP", their_message=EVIL)
+    trial = Trial(0, plan, 60, 400, *figures, ended)
     return write_validation(Validation("colmap", 7, (trial,)), folder / "out").read_text(encoding="utf-8")
 
 

@@ -14,22 +14,22 @@ import pytest
 
 from sfm.comparison.findings import verdict_of_comparison
 from sfm.comparison.significance import ResultComparison, compare_results
-from sfm.comparison.two_adjusters.adjuster_validation import SAME, Trial, Validation
+from sfm.comparison.two_adjusters.adjuster_validation import Trial, Validation
 from sfm.comparison.two_adjusters.random_network import Plan
 from sfm.errors import GeometryError, OutputError
 from sfm.files.open_folders import move
 from sfm.files.whole_files import remove_leftovers
 from sfm.network import Network
-from sfm.remarks.remark import kinds_of
+from sfm.remarks.remark import Remark, kinds_of, remark
 from sfm.report.differences import largest_difference, write_differences
-from sfm.report.validation import COLUMNS, validation_remarks, write_validation
+from sfm.report.validation import COLUMNS, verdict_of_validation, write_validation
 from sfm.stored_result import StoredResult
 from tests.synthetic import make_network, seed_of
 
 PLAN = Plan("ring", 8, 60, False, 0.8, 0.1, "opencv", 1, "all", "free")
 
 
-def trial(number: int, *, cost: float = 10.0, verdict: str = SAME, worse: bool = False) -> Trial:
+def trial(number: int, *, cost: float = 10.0, ended: Remark | None = None) -> Trial:
     return Trial(
         number,
         PLAN,
@@ -46,39 +46,45 @@ def trial(number: int, *, cost: float = 10.0, verdict: str = SAME, worse: bool =
         1e-12,
         np.nan,
         1.4,
-        verdict,
-        "" if verdict == SAME else "colmap: <out of order>",
-        worse,
+        ended or remark("same_optimum", network=number, program="COLMAP", apart=0.0),
     )
 
 
 def test_validation_is_written_with_every_figure(tmp_path: Path) -> None:
-    lost = trial(1, cost=np.nan, verdict="colmap failed")
+    failed = remark(
+        "other_adjuster_failed", network=1, program="COLMAP", apart=np.nan, their_message="<out of order>"
+    )
+    lost = trial(1, cost=np.nan, ended=failed)
     path = write_validation(Validation("colmap", 7, (trial(0), lost)), tmp_path / "out")
     with (tmp_path / "out" / "validation.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert list(rows[0]) == list(COLUMNS)
-    assert rows[0]["verdict"] == SAME and rows[1]["cost_other_px2"] == ""
+    assert rows[0]["ended"] == "same_optimum" and rows[1]["cost_other_px2"] == ""
+    assert rows[1]["message"] == "<out of order>"
     summary = json.loads((tmp_path / "out" / "validation.json").read_text())
-    assert summary["passed"] is True
-    assert summary["verdicts"] == {SAME: 1, "colmap failed": 1}
+    assert summary["passed"] is True and summary["verdict"] == "fair"
+    assert summary["ended"] == {"same_optimum": 1, "other_adjuster_failed": 1}
     assert summary["largest"]["cost"] == 0.0
     assert summary["trials"][1]["cost"] == [10.0, None]
+    assert summary["trials"][1]["remark"] == failed.as_dict()
     page = path.read_text(encoding="utf-8")
     assert "1 of 2 networks" in page
-    assert "colmap: &lt;out of order&gt;" in page and "<out of order>" not in page
+    assert "&lt;out of order&gt;" in page and "<out of order>" not in page
     assert 'src="http' not in page and 'href="http' not in page
 
 
-def test_a_worse_kolinear_is_said_first(tmp_path: Path) -> None:
-    worse = trial(3, cost=9.0, verdict="different optima, colmap lower", worse=True)
-    validation = Validation("colmap", 7, (trial(0), worse))
-    remarks = validation_remarks(validation)
-    assert kinds_of(remarks) == ("adjuster_worse_in_networks", "optima_differ_in_networks")
-    assert remarks[0].number("worse") == 1 and remarks[1].number("differing") == 1
+def test_a_worse_kolinear_comes_first(tmp_path: Path) -> None:
+    def ended(kind: str, number: int) -> Trial:
+        return trial(number, cost=9.0, ended=remark(kind, network=number, program="COLMAP", apart=4.0))
+
+    validation = Validation("colmap", 7, (trial(0), ended("kolinear_lower", 1), ended("kolinear_higher", 2)))
+    verdict = verdict_of_validation(validation)
+    assert verdict.level == "bad" and not validation.passed
+    assert kinds_of(verdict.remarks) == ("kolinear_higher", "kolinear_lower")
     page = write_validation(validation, tmp_path / "out").read_text()
-    assert '<div class="banner bad"><strong>1 of 2 networks' in page and remarks[0].text in page
-    assert validation_remarks(Validation("colmap", 7, (trial(0),))) == ()
+    assert '<div class="banner bad"><strong>1 of 3 networks' in page and verdict.remarks[0].text in page
+    good = verdict_of_validation(Validation("colmap", 7, (trial(0),)))
+    assert good.level == "good" and good.remarks == ()
 
 
 def test_foreign_folders_are_left_alone(tmp_path: Path) -> None:

@@ -30,9 +30,10 @@ def validate(
     with loading():
         from adapters.colmap.adjuster import load_pycolmap
         from adapters.colmap.validation_backend import ColmapBackend
+        from sfm.cli.console import tell_verdict
         from sfm.comparison.two_adjusters.adjuster_validation import validate as validate_networks
         from sfm.files.manifest import refuse_foreign_folder
-        from sfm.report.validation import in_words, largest, write_validation
+        from sfm.report.validation import ended, in_words, largest, verdict_of_validation, write_validation
         from sfm.runtime.progress_bar import drawn_progress
 
     load_pycolmap()  # without it there is nothing to compare, which is no verdict on a network
@@ -40,8 +41,9 @@ def validate(
     with drawn_progress() as progress:
         found = validate_networks(ColmapBackend(), networks=networks, seed=seed, jobs=jobs, progress=progress)
     page = write_validation(found, out)
-    for verdict, count in found.counts():
-        print(f"{count} of {networks} networks: {verdict}")
+    tell_verdict(verdict_of_validation(found))
+    for kind, count in found.counts():
+        print(f"{count} of {networks} networks: {ended(kind)}")
     print("Largest differences:")
     for name, value, unit in largest(found):
         print(f"  {name}: {in_words(value, unit)}")

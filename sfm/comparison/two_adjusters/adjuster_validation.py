@@ -1,9 +1,9 @@
 """Validation of the in-house adjuster by another one, over random networks from the same start values.
 
 Per network: cost, RMS, steps and seconds of both; the largest differences of their results over the
-standard deviations of these; the covariances of both at the same solution; and a verdict. Two solutions
-are the same optimum when their costs agree to SAME_COST, far below what a difference of a hundredth of a
-standard deviation in any direction would cost.
+standard deviations of these; the covariances of both at the same solution; and a remark. Two solutions
+are the same optimum when their costs differ by no more than SAME_SIGMAS standard deviations in one direction
+would cost.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ from __future__ import annotations
 import multiprocessing
 import signal
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
@@ -24,27 +25,22 @@ from threadpoolctl import threadpool_limits
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
-from sfm.comparison.solutions import reprojection, rotation_angle_deg
+from sfm.comparison.solutions import SAME_SIGMAS, reprojection, rotation_angle_deg
 from sfm.comparison.two_adjusters.adjusters import BackendAdjustment
 from sfm.comparison.two_adjusters.random_network import MODELS, Plan, RandomNetwork, random_network
 from sfm.conventions import BoolArray, FloatArray
+from sfm.display import program_name
 from sfm.errors import KolinearError
 from sfm.network import Estimate, Network
+from sfm.remarks.remark import Remark, remark
 from sfm.runtime.folder_settings import closed_current_folder
 from sfm.runtime.progress import SILENT, Progress
 from sfm.similarity import fit_similarity
 
 T = TypeVar("T")
-SAME_COST = 1e-9  # relative difference of the costs of one optimum
 MAX_ITERATIONS = 100
 WARM_UP_SEED = 0  # of networks that are adjusted before any is timed
 WARM_UP_IMAGE_POINTS = 3000  # which are smaller than this
-SAME = "same optimum"
-OURS_LOWER = "different optima, kolinear lower"
-THEIRS_LOWER = "different optima, {name} lower"
-OURS_FAILED = "kolinear failed"
-THEIRS_FAILED = "{name} failed"
-BOTH_FAILED = "both failed"
 
 
 class ValidationAdjustment(BackendAdjustment, Protocol):
@@ -102,9 +98,7 @@ class Trial:
     conditional_difference: float  # of the points' covariances with cameras held, relative
     interior_difference: float  # of the marginal covariances of the interior orientation, relative
     marginal_over_conditional: float  # median ratio of a point's sigma to that with cameras held
-    verdict: str
-    reason: str  # why one failed, else empty
-    worse: bool  # whether the in-house adjuster is the worse one
+    remark: Remark  # how the two ended
 
 
 @dataclass(frozen=True)
@@ -118,12 +112,11 @@ class Validation:
     @property
     def passed(self) -> bool:
         """Whether the in-house adjuster is nowhere the worse one."""
-        return not any(trial.worse for trial in self.trials)
+        return not any(trial.remark.severity == "error" for trial in self.trials)
 
     def counts(self) -> tuple[tuple[str, int], ...]:
-        """Return how often each verdict was given, most frequent first."""
-        verdicts = [trial.verdict for trial in self.trials]
-        return tuple(sorted(((v, verdicts.count(v)) for v in set(verdicts)), key=lambda row: -row[1]))
+        """Return how many networks ended in each way, by the kind of their remarks, most frequent first."""
+        return tuple(Counter(trial.remark.kind for trial in self.trials).most_common())
 
 
 def validate(
@@ -163,29 +156,24 @@ def make_trial(number: int, seed: int, backend: ValidationBackend) -> Trial:
     network, plan = made.network, made.plan
     control = plan.datum == "control"
     begun = time.perf_counter()
-    ours, our_reason = _tried(lambda: _adjust(made, covariance=False))
+    ours, our_failure = _tried(lambda: _adjust(made, covariance=False))
     our_seconds = time.perf_counter() - begun
-    theirs, their_reason = _tried(lambda: backend.adjust(network, made.start, control=control))
+    theirs, their_failure = _tried(lambda: backend.adjust(network, made.start, control=control))
     if ours is not None:
-        our_reason = "; ".join(ours.undetermined) or ("" if ours.converged else "not converged")
+        our_failure = ours.undetermined or (() if ours.converged else ("not_converged",))
     if theirs is not None and not theirs.converged:
-        their_reason = theirs.message or "not converged"
+        their_failure = (theirs.message or "not_converged",)
     cost_a, rms_a = _fit(network, None if ours is None else ours.estimate)
     cost_b, rms_b = _fit(network, None if theirs is None else theirs.estimate)
     sigmas = (np.nan,) * 4
     covariances = (np.nan,) * 3
-    if ours is not None and not our_reason:
+    if ours is not None and not our_failure:
         at_optimum = ours.estimate
-        full, our_reason = _tried(lambda: _adjust(made, covariance=True, start=at_optimum))
+        full, our_failure = _tried(lambda: _adjust(made, covariance=True, start=at_optimum))
         if full is not None and theirs is not None and np.isfinite(cost_b):
             sigmas = _differences(full, theirs.estimate, control=control)
         if full is not None:
             covariances = _covariances(full, backend, control=control)
-    same = abs(cost_b - cost_a) <= SAME_COST * min(cost_a, cost_b)
-    verdict, worse = _judge(cost_a, cost_b, same, bool(our_reason), bool(their_reason))
-    reasons = [
-        f"{who}: {why}" for who, why in (("kolinear", our_reason), (backend.name, their_reason)) if why
-    ]
     return Trial(
         number,
         plan,
@@ -197,9 +185,14 @@ def make_trial(number: int, seed: int, backend: ValidationBackend) -> Trial:
         (our_seconds, np.nan if theirs is None else theirs.seconds),
         *sigmas,
         *covariances,
-        verdict.format(name=backend.name),
-        "; ".join(reasons),
-        worse,
+        remark(
+            _ended(cost_a, cost_b, plan.noise_px, our_failure, their_failure),
+            network=number,
+            program=program_name(backend.name),
+            apart=apart(cost_a, cost_b, plan.noise_px),
+            message=our_failure or None,
+            their_message=their_failure or None,
+        ),
     )
 
 
@@ -258,14 +251,14 @@ def _adjust(made: RandomNetwork, *, covariance: bool, start: Estimate | None = N
     )
 
 
-def _tried(run: Callable[[], T]) -> tuple[T | None, str]:
+def _tried(run: Callable[[], T]) -> tuple[T | None, tuple[str, ...]]:
     """Run an adjuster; whatever it ends with is a result here, faults of a program too."""
     try:
-        return run(), ""
+        return run(), ()
     except KolinearError as error:
-        return None, str(error)
+        return None, (str(error),)
     except Exception as error:
-        return None, f"{type(error).__name__}: {error}"
+        return None, (f"{type(error).__name__}: {error}",)
 
 
 def _fit(network: Network, estimate: Estimate | None) -> tuple[float, float]:
@@ -278,18 +271,26 @@ def _fit(network: Network, estimate: Estimate | None) -> tuple[float, float]:
     return float((v**2).sum() / 2), float(np.sqrt((v**2).mean()))
 
 
-def _judge(a: float, b: float, same: bool, our_failure: bool, their_failure: bool) -> tuple[str, bool]:
-    """Return the verdict, and whether the in-house adjuster is the worse one."""
+def apart(a: float, b: float, sigma_px: float) -> float:
+    """Return by how many standard deviations in one direction two costs (px^2) are those of other solutions.
+
+    In that direction the cost grows by sigma_px^2 / 2 times the square of so many standard deviations.
+    """
+    return float(np.sqrt(2 * abs(a - b)) / sigma_px)
+
+
+def _ended(a: float, b: float, sigma_px: float, ours: tuple[str, ...], theirs: tuple[str, ...]) -> str:
+    """Return how two adjusters ended, a kind of remark, by their costs (px^2) and why they failed."""
     # An adjuster that ends at the optimum of the other has solved the network, whatever it says of itself.
-    if same:
-        return SAME, False
-    if our_failure and their_failure:
-        return BOTH_FAILED, False
-    if our_failure or not np.isfinite(a):
-        return OURS_FAILED, True
-    if their_failure or not np.isfinite(b):
-        return THEIRS_FAILED, False
-    return (OURS_LOWER, False) if a < b else (THEIRS_LOWER, True)
+    if apart(a, b, sigma_px) <= SAME_SIGMAS:
+        return "same_optimum"
+    if ours and theirs:
+        return "both_adjusters_failed"
+    if ours or not np.isfinite(a):
+        return "kolinear_failed"
+    if theirs or not np.isfinite(b):
+        return "other_adjuster_failed"
+    return "kolinear_lower" if a < b else "kolinear_higher"
 
 
 def _differences(full: Adjustment, theirs: Estimate, *, control: bool) -> tuple[float, float, float, float]:

@@ -19,6 +19,7 @@ ROWS = (
         "The adjustment did not converge in {iterations:iteration}.",
         "poor start values, too many free parameters, or wrong names of points",
         "Check c_mm and pixel_mm, shorten free, look at the photograph or point with the largest residuals.",
+        short="no convergence",
     ),
     Kind(
         "rank_defect",
