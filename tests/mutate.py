@@ -51,10 +51,13 @@ ROOMS: dict[str, tuple[str, ...]] = {  # module or package, with the tests that 
         "tests/adjustment/test_minimal_bias.py",
         "tests/adjustment/test_statistics.py",
     ),
-    "sfm/adjustment/quality/given_values.py": (
-        "tests/adjustment/test_given_model.py",
-        "tests/adjustment/test_given_values.py",
-    ),
+    **{
+        f"sfm/adjustment/quality/{module}.py": (
+            "tests/adjustment/test_given_model.py",
+            "tests/adjustment/test_given_values.py",
+        )
+        for module in ("given_values", "given_points")
+    },
     "sfm/targets/codes/rings.py": ("tests/targets/test_codes.py",),
 }
 COMPARED = {

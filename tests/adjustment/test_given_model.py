@@ -11,16 +11,9 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from sfm.adjustment.quality import given_values
-from sfm.adjustment.quality.given_values import (
-    GivenModel,
-    GivenPoints,
-    Judgement,
-    judge_points,
-    judge_values,
-    scale_model,
-    scale_of_length,
-)
+from sfm.adjustment.quality import given_points, given_values
+from sfm.adjustment.quality.given_points import GivenPoints, judge_points, scale_model, scale_of_length
+from sfm.adjustment.quality.given_values import GivenModel, Judgement, judge_values
 from sfm.conventions import FloatArray, rotation_from_vector
 from sfm.similarity import Similarity
 from tests.synthetic import seed_of
@@ -30,8 +23,8 @@ FRAME = Similarity(0.4, rotation_from_vector(np.array([0.3, -0.2, 1.1])), np.arr
 
 def test_thresholds_are_those_stated() -> None:
     """Limits of effort and of rounding; the others decide tests in this folder."""
-    assert given_values.MAX_SETS == 2000 and given_values.MAX_TRIPLES == 300
-    assert given_values.MAX_EXCHANGED == 40 and given_values.RELINEARISED == 3
+    assert given_values.MAX_SETS == 2000 and given_points.MAX_TRIPLES == 300
+    assert given_points.RELINEARISED == 3
     assert given_values.RANK == 1e-9  # of double precision 2e-16, whose root is 1.5e-8
     assert given_values.MAX_FACTOR == 30.0
     assert given_values.FACTORS[[0, -1]].tolist() == [1.0, 1e6] and len(given_values.FACTORS) == 241
@@ -53,6 +46,12 @@ def of_points(name: str, items: int = 5) -> GivenModel:
     return GivenModel(v, network @ network.T / m, stated @ stated.T / m + np.eye(m), A, item, 40)
 
 
+def misfit(model: GivenModel, *out: int) -> tuple[float, int]:
+    """Return chi-square and its degrees of freedom without some values."""
+    kept = model.kept(out)
+    return kept.chi2, kept.dof
+
+
 def without(model: GivenModel, k: int) -> GivenModel:
     """Return the model without its last value."""
     kept = np.flatnonzero(model.item != k)
@@ -64,27 +63,32 @@ def without(model: GivenModel, k: int) -> GivenModel:
 
 def test_chi_square_is_of_what_the_parameters_leave() -> None:
     one = bars(1.0, 2.0, 6.0, stated=2.0, network=2.0)
-    assert one.misfit() == (pytest.approx(14 / 4), 2)
-    assert one.misfit((2,)) == (pytest.approx(0.5 / 4), 1)
-    assert one.decrease((2,)) == (pytest.approx(13.5 / 4), 1)
-    assert one.decrease((0, 2)) == (pytest.approx(14 / 4), 2)
-    assert one.misfit((0, 1)) == (pytest.approx(0.0), 0) and one.probability((0, 1)) == 1.0
+    assert misfit(one) == (pytest.approx(14 / 4), 2)
+    assert misfit(one, 2) == (pytest.approx(0.5 / 4), 1)
+    fall, rank = one.kept().decreases()
+    assert (fall[2], rank[2]) == (pytest.approx(13.5 / 4), 1)
+    fall, rank = one.kept((0,)).decreases()
+    assert (fall[0], rank[0]) == (0.0, 0) and (fall[2], rank[2]) == (pytest.approx(misfit(one, 0)[0]), 1)
+    assert misfit(one, 0, 1) == (pytest.approx(0.0), 0) and one.kept((0, 1)).probability() == 1.0
     assert one.share == pytest.approx(0.5) and one.items == 3
     many = of_points("chi-square")
     S = many.network + many.stated
     P = np.linalg.inv(S)
     left = P - P @ many.A @ np.linalg.solve(many.A.T @ P @ many.A, many.A.T @ P)
     np.testing.assert_allclose(many.precision, left, atol=1e-9)
-    assert many.misfit() == (pytest.approx(many.v @ left @ many.v), 11)
+    assert misfit(many) == (pytest.approx(many.v @ left @ many.v), 11)
     few = without(many, 4)
-    assert many.misfit((4,)) == (pytest.approx(few.misfit()[0]), 8) and few.misfit()[1] == 8
-    assert many.rows((1, 3)).tolist() == [3, 4, 5, 9, 10, 11]
+    assert misfit(many, 4) == (pytest.approx(few.kept().chi2), 8) == misfit(few)
+    fall, rank = many.kept((4, 0)).decreases()
+    for k in (1, 2, 3):
+        assert misfit(many, 0, 4, k) == (pytest.approx(misfit(many, 4, 0)[0] - fall[k]), 5 - rank[k])
+    assert many.blocks[0].tolist() == [[3 * k, 3 * k + 1, 3 * k + 2] for k in range(5)]
 
 
 def test_parameters_that_are_not_determined_leave_more() -> None:
     one = replace(bars(1.0, 2.0, 6.0), A=np.zeros((3, 1)))
-    assert one.misfit() == (pytest.approx(41.0), 3)
-    assert bars(1.0).misfit() == (0.0, 0) and bars(1.0).probability() == 1.0 and bars(1.0).share == 0.0
+    assert misfit(one) == (pytest.approx(41.0), 3)
+    assert misfit(bars(1.0)) == (0.0, 0) and bars(1.0).kept().probability() == 1.0 and bars(1.0).share == 0.0
 
 
 def test_the_probability_shares_the_level_among_three_tests() -> None:
@@ -92,10 +96,10 @@ def test_the_probability_shares_the_level_among_three_tests() -> None:
     T = ((one.v - 1) ** 2).sum() / 2
     largest = (9 / 2) * 4 / 3  # of v of 3, redundancy number 3 / 4
     single, together = 12 * stats.f.sf(largest, 1, 80), 3 * stats.f.sf(T / 3, 3, 80)
-    assert one.probability() == pytest.approx(min(single, together)) and single < together
+    assert one.kept().probability() == pytest.approx(min(single, together)) and single < together
     spread = bars(3.0, -3.0, 3.0, -3.0, network=1.0, redundancy=20)
-    assert spread.probability() == pytest.approx(3 * stats.f.sf(18 / 3, 3, 80))
-    assert bars(0.1, 0.0, 0.0).probability() == 1.0
+    assert spread.kept().probability() == pytest.approx(3 * stats.f.sf(18 / 3, 3, 80))
+    assert bars(0.1, 0.0, 0.0).kept().probability() == 1.0
     # one coordinate of a value of three; the stated part has no degrees of freedom to lose
     point = GivenModel(
         np.array([5.0, 0, 0, 0, 0, 0]),
@@ -105,25 +109,30 @@ def test_the_probability_shares_the_level_among_three_tests() -> None:
         np.repeat([0, 1], 3),
         20,
     )
-    assert point.probability() == pytest.approx(18 * stats.chi2.sf(25, 1), rel=1e-4)
+    assert point.kept().probability() == pytest.approx(18 * stats.chi2.sf(25, 1), rel=1e-4)
     other = replace(point, v=np.array([3.0, 3, 3, 0, 0, 0]))
-    assert other.probability() == pytest.approx(6 * stats.chi2.sf(27, 3), rel=1e-4)
+    assert other.kept().probability() == pytest.approx(6 * stats.chi2.sf(27, 3), rel=1e-4)
 
 
 def test_the_probability_without_a_value_is_that_of_the_others() -> None:
     many = replace(of_points("without"), network=np.zeros((15, 15)))
     many = replace(many, v=3 * many.v)
-    assert 0 < many.probability((4,)) < 1
-    assert many.probability((4,)) == pytest.approx(without(many, 4).probability())
+    assert 0 < many.kept((4,)).probability() < 1
+    assert many.kept((4,)).probability() == pytest.approx(without(many, 4).kept().probability())
 
 
 def test_unknown_standard_deviations_come_from_the_others() -> None:
-    one = replace(bars(0.0, 1.0, -1.0, 8.0, 0.5), estimated=True)
-    fewer, rest = one.decrease((3,))[0], one.misfit((3,))[0] / 3
-    assert one.probability() == pytest.approx(5 * stats.f.sf(fewer / rest, 1, 3))
-    assert replace(bars(0.0, 9.0), estimated=True).probability() == 1.0
-    assert replace(bars(0.0, 0.01, 9.0), estimated=True).probability() < 2e-3
-    assert replace(bars(0.0, 1.0, 0.5), estimated=True).probability() > 0.99
+    """And from the network, which scatters as its covariance has it at least."""
+    one = replace(bars(0.0, 100.0, -100.0, 800.0, 50.0), estimated=True)
+    rest = one.kept((3,)).chi2 / 3
+    fall = one.kept().chi2 - 3 * rest
+    assert one.kept().probability() == pytest.approx(5 * stats.f.sf(fall / rest, 1, 3))
+    near = replace(bars(0.0, 0.1, -0.1, 3.0, 0.05), estimated=True)
+    fall = near.kept().decreases()[0][3]
+    assert near.kept().probability() == pytest.approx(5 * stats.f.sf(fall, 1, 3))
+    assert replace(bars(0.0, 9.0), estimated=True).kept().probability() == 1.0
+    assert replace(bars(0.0, 1.0, 900.0), estimated=True).kept().probability() < 4e-3
+    assert replace(bars(0.0, 1.0, 0.5), estimated=True).kept().probability() > 0.99
 
 
 def test_external_reliability_is_by_the_redundancy_number() -> None:
@@ -162,11 +171,12 @@ def test_the_factor_on_standard_deviations() -> None:
     assert bars(0.0, 0.1, 0.0).factor()[0] == 1.0
 
 
-def test_a_form_is_over_the_directions_that_exist() -> None:
-    assert given_values._form(np.diag([4.0, 1.0]), np.array([2.0, 3.0])) == (pytest.approx(10.0), 2)
-    assert given_values._form(np.diag([1.0, 4e-5]), np.array([2.0, 3.0]))[1] == 2
-    assert given_values._form(np.diag([1.0, 2e-5]), np.array([2.0, 3.0])) == (pytest.approx(4.0), 1)
-    assert given_values._form(np.zeros((2, 2)), np.zeros(2)) == (0.0, 0)
+@pytest.mark.parametrize(("r", "rank"), [(4e-5, 1), (2e-5, 0)])
+def test_a_value_is_tested_where_the_others_check_it(r: float, rank: int) -> None:
+    """Of a weak value and a strong one: the redundancy number of the strong one is r."""
+    one = replace(bars(0.0, 1.0), stated=np.diag([(1 - r) / r, 1.0]))
+    assert one.kept().decreases()[1].tolist() == [1, rank]
+    assert one.kept((1,)).dof == 1 - rank
 
 
 def test_a_judgement_fits_where_nothing_is_wrong() -> None:
@@ -177,13 +187,16 @@ def test_a_judgement_fits_where_nothing_is_wrong() -> None:
 
 
 def test_sets_of_as_many_values(monkeypatch: pytest.MonkeyPatch) -> None:
-    every = set(given_values._sets_like((1, 2), 6))
-    assert len(every) == comb(6, 2) - 1 and (1, 2) not in every
+    one = bars(*seed_of("sets").normal(size=6))
+    every = dict(given_values._misfits_like(one, (1, 2)))
+    assert set(every) == set(combinations(range(6), 2))
+    for some, chi2 in every.items():
+        assert chi2 == pytest.approx(one.kept(some).chi2)
     monkeypatch.setattr(given_values, "MAX_SETS", 15)
-    assert set(given_values._sets_like((1, 2), 6)) == every
+    assert set(dict(given_values._misfits_like(one, (1, 2)))) == set(every)
     monkeypatch.setattr(given_values, "MAX_SETS", 14)
-    few = set(given_values._sets_like((1, 2), 6))
-    assert few == {one for one in every if len({1, 2} & set(one)) == 1} and len(few) == 8
+    few = set(dict(given_values._misfits_like(one, (1, 2))))
+    assert few == {one for one in every if {1, 2} & set(one)} and len(few) == 9
 
 
 def test_the_score_of_wrong_values() -> None:
@@ -193,9 +206,9 @@ def test_the_score_of_wrong_values() -> None:
     assert found is not None
     out, score, rivals = found
     assert out == (1, 3) and rivals == ()
-    T = one.misfit()[0]
-    assert score == pytest.approx(one.misfit((1, 3))[0] - T + 2 * cost + 2 * np.log(10), rel=1e-9)
-    assert one.misfit((1, 3))[0] == pytest.approx(2 / 3)
+    T = one.kept().chi2
+    assert score == pytest.approx(one.kept((1, 3)).chi2 - T + 2 * cost + 2 * np.log(10), rel=1e-9)
+    assert one.kept((1, 3)).chi2 == pytest.approx(2 / 3)
     assert given_values._wrong_values(bars(0.0, 300.0), 0.001, cost) is None
     assert given_values._wrong_values(bars(0.0, 0.0, 300.0, 300.0), 0.001, cost) is None
     # either of two of three heals: 8 less than the margin apart
@@ -230,12 +243,12 @@ def test_the_score_of_exchanged_names(monkeypatch: pytest.MonkeyPatch) -> None:
     model = one.model(FRAME.inverse(), estimated=False)
     found = given_values._exchanged(model, one.given.ravel(), 0.001)
     assert found is not None and found[0] == (1, 4)
-    assert found[1] == pytest.approx(-model.misfit()[0] + 2 * np.log(comb(6, 2)), abs=1e-3)
+    assert found[1] == pytest.approx(-model.kept().chi2 + 2 * np.log(comb(6, 2)), abs=1e-3)
     judged = judge_values(model, 0.001, one.given.ravel())
     assert judged.exchanged == (1, 4) and not judged.wrong
     assert judge_values(model, 0.001).exchanged is None
     second = min(
-        replace(one, given=one.given[list(order)]).model(FRAME.inverse(), estimated=False).misfit()[0]
+        replace(one, given=one.given[list(order)]).model(FRAME.inverse(), estimated=False).kept().chi2
         for order in _other_exchanges(6, (1, 4))
     )
     monkeypatch.setattr(given_values, "MARGIN", 0.99 * second)
@@ -329,21 +342,21 @@ def test_the_start_is_the_similarity_that_most_agree_upon(monkeypatch: pytest.Mo
     one = exact(7, "start")
     given = one.given.copy()
     given[[1, 5]] += ((3.0, 0, 1), (0, 4.0, 0))
-    for most in (given_values.MAX_TRIPLES, 34):  # all 35, or as many at random
-        monkeypatch.setattr(given_values, "MAX_TRIPLES", most)
-        found = given_values._start(replace(one, given=given), None)
+    for most in (given_points.MAX_TRIPLES, 34):  # all 35, or as many at random
+        monkeypatch.setattr(given_points, "MAX_TRIPLES", most)
+        found = given_points._start(replace(one, given=given), None)
         assert found is not None and found.scale == pytest.approx(2.5)
         np.testing.assert_allclose(found.apply(one.free)[[0, 2, 3]], one.given[[0, 2, 3]], atol=1e-9)
     three = one.select(np.arange(3))
-    found = given_values._start(three, FRAME)
+    found = given_points._start(three, FRAME)
     assert found is not None and found.scale == pytest.approx(2.5)
-    assert given_values._start(one.select(np.arange(2)), FRAME) is FRAME
+    assert given_points._start(one.select(np.arange(2)), FRAME) is FRAME
     line = replace(three, free=np.outer(np.arange(3), np.ones(3)), given=np.outer(np.arange(3), np.ones(3)))
-    assert given_values._start(line, FRAME) is FRAME
+    assert given_points._start(line, FRAME) is FRAME
 
 
 def test_centre_and_size() -> None:
-    centre, size = given_values._centre_and_size(np.array([[0.0, 0, 0], [2, 0, 8]]))
+    centre, size = given_points._centre_and_size(np.array([[0.0, 0, 0], [2, 0, 8]]))
     assert centre.tolist() == [1, 0, 4] and size == 4
 
 

@@ -8,16 +8,14 @@ import numpy as np
 import pytest
 
 from sfm.adjustment.quality import given_values
-from sfm.adjustment.quality.given_values import (
-    LEVEL,
-    GivenModel,
+from sfm.adjustment.quality.given_points import (
     GivenPoints,
     judge_points,
-    judge_values,
     scale_model,
     scale_of_length,
     scale_of_points,
 )
+from sfm.adjustment.quality.given_values import LEVEL, GivenModel, judge_values
 from sfm.conventions import FloatArray, rotation_from_vector
 from sfm.similarity import Similarity
 from tests.synthetic import seed_of
@@ -77,7 +75,7 @@ def test_two_of_five_are_identified_and_two_against_two_are_not() -> None:
 def test_the_margin_decides_whether_one_is_told_from_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
     """Removing either of two of three heals; chi-square differs by 8.2, and 13.8 are needed."""
     model = bars(-2.2 * SIGMA, 0.0, 4.6 * SIGMA)
-    fall = sorted(model.misfit((k,))[0] for k in range(3))
+    fall = sorted(model.kept((k,)).chi2 for k in range(3))
     assert fall[1] - fall[0] == pytest.approx(8.2, abs=0.3)
     level = 0.02
     assert judge_values(model, level).doubtful == (0, 2)
@@ -108,6 +106,15 @@ def test_one_wrong_point_is_identified(by: float) -> None:
     assert found is not None and found.judgement.wrong == (2,)
     placed = found.placing.apply(FRAME.apply(np.eye(3)))
     np.testing.assert_allclose(placed, np.eye(3), atol=5e-3)
+
+
+def test_many_wrong_points_of_many_are_identified() -> None:
+    one, rng = points(60, "many wrong"), seed_of("which are wrong")
+    wrong = sorted(rng.permutation(60)[:20].tolist())
+    given = one.given.copy()
+    given[wrong] += 0.05 * rng.standard_normal((20, 3))
+    found = judge_points(replace(one, given=given), LEVEL)
+    assert found is not None and found.judgement.wrong == tuple(wrong)
 
 
 def test_of_three_points_none_is_identified() -> None:
@@ -189,7 +196,7 @@ def test_the_scale_of_points_and_of_a_bar_agree_within_their_covariance() -> Non
             scale_of_points(one, found, (), at, 5),
         )
         assert scales[1].log == pytest.approx(np.log(1 / 0.4), abs=5e-3)
-        squares.append(scale_model(scales, one.joint, one.redundancy).misfit()[0])
+        squares.append(scale_model(scales, one.joint, one.redundancy).kept().chi2)
     assert 0.5 < np.mean(squares) < 1.6  # chi-square of one
 
 

@@ -13,20 +13,22 @@ import numpy as np
 
 from sfm.adjustment.covariance import Marginal, marginal_of
 from sfm.adjustment.datum import Datum
+from sfm.adjustment.quality.given_points import (
+    GivenPoints,
+    GivenScale,
+    PlacedPoints,
+    judge_points,
+    scale_model,
+    scale_of_length,
+    scale_of_points,
+)
 from sfm.adjustment.quality.given_values import (
     LEVEL,
     NONCENTRALITY,
     GivenModel,
-    GivenPoints,
-    GivenScale,
     GivenTest,
     Judgement,
-    PlacedPoints,
-    judge_points,
     judge_values,
-    scale_model,
-    scale_of_length,
-    scale_of_points,
 )
 from sfm.adjustment.result import Adjustment
 from sfm.camera import KNOWN_WITHOUT, corner_shift
@@ -294,8 +296,8 @@ class _Judge:
 
     def _left_out(self, group: _Group) -> None:
         model, out = group.placed.model, group.out
-        sizes = [np.linalg.norm(model.v[model.rows((k,))]) for k in out]
-        sigmas = max(np.sqrt(model.decrease((k,))[0]) for k in out)
+        sizes = [np.linalg.norm(model.v[model.item == k]) for k in out]
+        sigmas = np.sqrt(model.kept().decreases()[0][list(out)].max())
         self.remarks.append(
             remark(
                 "given_left_out",
@@ -309,7 +311,7 @@ class _Judge:
     def _doubtful(self, group: _Group) -> None:
         found = group.placed.judgement
         # they take part with the standard deviations that their differences show
-        shift = max(_shift(group.placed.model, k) for k in found.doubtful)
+        shift = float(_shifts(group.placed.model)[list(found.doubtful)].max())
         if group.points.stated.any():
             shift /= group.placed.model.factor()[0]
         self.remarks.append(
@@ -401,7 +403,7 @@ class _Judge:
             sigma = np.sqrt(e @ (points.stated[complete[0]] + points.stated[complete[1]]) @ e)
             at = group.places[complete]
             found = scale_of_length(length, float(sigma), self.places.xyz, int(at[0]), int(at[1]))
-        elif len(complete) < 3 or group.placed.model.misfit(group.out)[1] < 0:
+        elif len(complete) < 3 or group.placed.model.kept(group.out).dof < 0:
             return None
         else:
             found = scale_of_points(points, group.placed, group.out, group.places, count)
@@ -427,7 +429,7 @@ class _Judge:
             kept = [k for k in range(len(names)) if k not in wrong]
             others = _mean_scale(model, kept)
             for k in wrong:
-                off, sigmas = float(model.v[k]) - others, float(np.sqrt(model.decrease((k,))[0]))
+                off, sigmas = float(model.v[k]) - others, float(np.sqrt(model.kept().decreases()[0][k]))
                 self.remarks.append(
                     remark(
                         "bar_left_out",
@@ -472,9 +474,8 @@ def _unit_factor(log: float) -> float | None:
     return next((one for one in UNIT_FACTORS if abs(factor / one - 1) < SAME_UNIT), None)
 
 
-def _shift(model: GivenModel, k: int) -> float:
-    """Return the largest shift, in its standard deviations, of what given values determine without one."""
-    reach = model.external()[k]
-    if not np.isfinite(reach):
-        return float("inf")
-    return float(np.sqrt(model.decrease((k,))[0]) * reach / NONCENTRALITY)
+def _shifts(model: GivenModel) -> FloatArray:
+    """Return the largest shift of what given values determine without each, in its standard deviations."""
+    reach = model.external()
+    found = np.sqrt(model.kept().decreases()[0]) * np.where(np.isfinite(reach), reach, 0.0) / NONCENTRALITY
+    return np.where(np.isfinite(reach), found, np.inf)
