@@ -35,7 +35,7 @@ ROOMS: dict[str, tuple[str, ...]] = {  # module or package, with the tests that 
         "tests/adjustment/test_alternatives.py",
         "tests/adjustment/test_columns.py",
         "tests/adjustment/test_rejections.py",
-        "tests/adjustment/test_described.py",
+        "tests/adjustment/test_families.py",
         "tests/adjustment/test_hypotheses.py",
     ),
     "sfm/remarks/kind.py": ("tests/remarks",),

@@ -13,15 +13,15 @@ import pytest
 from scipy import stats
 
 from sfm.adjustment.datum import Datum
-from sfm.adjustment.hypotheses import alternatives, columns, hypotheses, refit, score
+from sfm.adjustment.hypotheses import alternatives, columns, families, hypotheses, refit, score
 from sfm.adjustment.hypotheses.alternatives import (
     NONE,
-    Alternative,
     Spread,
     alternatives_of,
     is_significant,
 )
 from sfm.adjustment.hypotheses.columns import Columns, columns_of, interior_columns
+from sfm.adjustment.hypotheses.families import Alternative
 from sfm.adjustment.hypotheses.score import (
     Gain,
     Reduced,
@@ -42,7 +42,7 @@ NO_POINTS = np.zeros(0, dtype=np.int64)
 
 def test_thresholds_of_search_and_rounding() -> None:
     """Limits of effort: a larger one finds the same or more at more cost."""
-    assert (alternatives.MAX_SPLITS, alternatives.MAX_MOVED, alternatives.CELLS) == (12, 60, 5)
+    assert (alternatives.MAX_SPLITS, alternatives.MAX_MOVED, families.CELLS) == (12, 60, 5)
     assert (alternatives.MAX_RUNS, alternatives.MAX_PRODUCTS) == (60, 2e11)
     assert (alternatives.ROUNDS, alternatives.STARTS, refit.ROUNDS) == (20, 8, 6)
     assert score.MAX_TERMS == 10_000  # the series of the tail ends after a few hundred of usual redundancies
@@ -53,7 +53,7 @@ def test_thresholds_of_search_and_rounding() -> None:
     assert hypotheses.MAX_CAUSES == 2
     assert pytest.approx(np.log(100)) == hypotheses.APART
     assert hypotheses.NAMED == 1.0  # standard deviation: less is what a user was promised
-    assert {"c": (0,), "centre": (0, 1, 2, 3), "camera": tuple(range(9))} == alternatives.CAMERA_SETS
+    assert [one.places for one in families.CAMERA_FAMILIES] == [(0,), (0, 1, 2, 3), tuple(range(9))]
     assert (columns.STRAIN, columns.BENDING) == (5, 18)  # 6 - 1 of a symmetric matrix, 3 times 6 products
 
 
@@ -190,7 +190,7 @@ def test_whitening_makes_coordinates_independent_of_unit_variance(dense: Dense) 
 
 
 def test_elimination_is_that_of_a_dense_solution(dense: Dense) -> None:
-    D = dense.reduced.whiten(np.concatenate([dense.columns.camera, dense.columns.bending], axis=2))
+    D = dense.reduced.whiten(dense.columns.freedoms)
     for found, right in zip(dense.reduced.project(D), dense.normals(D), strict=True):
         np.testing.assert_allclose(found, right, atol=1e-7 * np.abs(right).max())
     for run in (np.arange(7), np.array([0, 0, 1, 1, 1, 2, 3])):
@@ -207,7 +207,7 @@ def test_given_values_of_free_parameters_have_weight(dense: Dense) -> None:
     a = replace(dense.a, network=replace(dense.a.network, interior=given))
     weight = (columns.interior_step(a, 0, 0) / 2e-3 / a.sigma0) ** 2
     found, prior, slope = score._free_interior(a)
-    assert found.shape[2] == 2 and prior == pytest.approx([weight, 0.0])
+    assert found.shape[2] == 2 and prior.tolist() == [pytest.approx([weight, 0.0]), [0.0, 0.0]]
     off = float(a.estimate.cameras[0].parameters[0]) - 10.0
     assert slope == pytest.approx([np.sqrt(weight) * off / 2e-3 / a.sigma0, 0.0])
     group = tuple(replace(one, shared=("lens",) * len(one.names)) for one in a.estimate.cameras)
@@ -215,8 +215,8 @@ def test_given_values_of_free_parameters_have_weight(dense: Dense) -> None:
     both, prior, _ = score._free_interior(a)
     units = [columns.interior_step(a, index, 0) for index in range(2)]  # of the first, mm for a column
     np.testing.assert_allclose(both[:, :, 0], found[:, :, 0] + units[0] / units[1] * found[:, :, 1])
-    assert both.shape[2] == 1 and prior == pytest.approx([weight])
-    held = tuple(alternatives.held_interiors(a, dense.reduced))
+    assert both.shape[2] == 1 and prior == pytest.approx(weight)
+    held = tuple(alternatives.interiors(a, dense.reduced, families.HELD))
     assert [len(one.parameters) for one in held] == [
         *[2] * (len(held) - 1),
         2 * len(a.estimate.cameras[0].names) - 2,
@@ -235,7 +235,7 @@ def test_given_values_of_free_parameters_have_weight(dense: Dense) -> None:
 
 
 def test_scores_are_slopes_of_each_photograph(dense: Dense) -> None:
-    D = dense.reduced.whiten(dense.columns.camera[:, :, [0, 3]])
+    D = dense.reduced.whiten(dense.columns.freedoms[:, :, [0, 3]])
     left = dense.left(D)[: 2 * len(D)].reshape(len(D), 2, 2)
     slope = ((dense.reduced.v + left[:, :, 1]) * left[:, :, 0]).sum(axis=1)
     right = np.bincount(dense.reduced.image, slope, minlength=7)
@@ -281,25 +281,25 @@ def _assert_judged(one: Alternative, dense: Dense, spread: Spread) -> None:
 def test_every_alternative_has_the_gain_of_its_columns(dense: Dense) -> None:
     every = dense.every
     assert [one.evidence for one in every] == sorted((one.evidence for one in every), reverse=True)
-    plain = [one.family for one in every if one.pattern != "group"]
+    plain = [one.family.name for one in every if one.pattern != "group"]
     count = {family: plain.count(family) for family in plain}
     assert count == {
-        "interior": 20, "format": 1, "c": 4, "centre": 4, "camera": 4, "strain": 3, "bending": 3,
+        "held": 20, "given": 1, "format": 1, "c": 4, "centre": 4, "camera": 4, "strain": 3, "bending": 3,
         "moved": 1, "shifted": 1,
     }  # fmt: skip
     for one in every:
         H, g, squares = dense.normals(dense.reduced.whiten(one.columns(dense.a, dense.columns)))
         right = gain_of(H, g, squares)
-        assert one.gain.rank == right.rank, one.family
-        assert one.gain.value == pytest.approx(right.value, rel=1e-5), (one.family, one.pattern)
+        assert one.gain.rank == right.rank, one.family.name
+        assert one.gain.value == pytest.approx(right.value, rel=1e-5), (one.family.name, one.pattern)
 
 
 def test_patterns_are_the_best_of_their_kind(dense: Dense) -> None:
     """By trying all of them; ln of how many there are is the price of the search."""
-    every = {(one.family, one.pattern): one for one in dense.every}
-    m = 7
+    every = {(one.family.name, one.pattern): one for one in dense.every}
+    m, places = 7, {one.name: one.places for one in families.OF_PHOTOGRAPHS}
     for family in ("c", "centre", "strain"):
-        D = dense.reduced.whiten(alternatives._family(dense.columns, family))
+        D = dense.reduced.whiten(dense.columns.freedoms[:, :, list(places[family])])
 
         def gain(factor: IntArray, D: FloatArray = D) -> float:
             return gain_of(*dense.normals(np.asarray(factor)[dense.reduced.image][:, None, None] * D)).value
@@ -338,7 +338,7 @@ def test_patterns_are_the_best_of_their_kind(dense: Dense) -> None:
 
 def test_held_parameters_are_judged_by_what_photographs_say_of_them(dense: Dense) -> None:
     """The spread is the smaller one of two: with the parameter free, and with all of its camera."""
-    every = [one for one in dense.every if one.family == "interior"]
+    every = [one for one in dense.every if one.family is families.HELD]
     assert sorted(len(one.parameters) for one in every)[-3:] == [1, 9, 9]
     for one in every:
         D = dense.reduced.whiten(one.columns(dense.a, dense.columns))
@@ -356,7 +356,7 @@ def test_held_parameters_are_judged_by_what_photographs_say_of_them(dense: Dense
         ]
         spread = min(spreads, key=lambda one: one.factor)
         _assert_judged(one, dense, spread)
-    one = next(one for one in dense.every if one.family == "format")
+    one = next(one for one in dense.every if one.family is families.FORMAT)
     D = dense.reduced.whiten(one.columns(dense.a, dense.columns))
     scores = dense.reduced.scores(D @ one.gain.beta, D @ one.gain.beta)
     spread = alternatives._of_scores(scores, float(one.gain.beta @ dense.normals(D)[0] @ one.gain.beta))
@@ -365,7 +365,8 @@ def test_held_parameters_are_judged_by_what_photographs_say_of_them(dense: Dense
 
 def test_moved_points_are_found_with_their_evidence(dense: Dense) -> None:
     moved, shifted = (
-        next(one for one in dense.every if one.family == family) for family in ("moved", "shifted")
+        next(one for one in dense.every if one.family is family)
+        for family in (families.MOVED, families.SHIFTED)
     )
     assert set(shifted.points.tolist()) == set(moved.points.tolist()) == {2, 17}
     for one in (moved, shifted):
@@ -401,8 +402,8 @@ def test_of_few_photographs_there_are_fewer_patterns(images: int, patterns: set[
     a = adjust(network, truth, datum=Datum("free"), reject="none")
     every = columns_of(a)
     found = alternatives_of(a, reduce_adjustment(a, every), every)
-    assert {one.pattern for one in found if one.family in alternatives.CAMERA_SETS} == patterns
-    assert any(one.family == "moved" for one in found) == (images == 4)
+    assert {one.pattern for one in found if one.family in families.CAMERA_FAMILIES} == patterns
+    assert any(one.family is families.MOVED for one in found) == (images == 4)
 
 
 # ---- small enough to do by hand ----
@@ -450,7 +451,8 @@ def made(gain: Gain, spread: Spread = NONE, *, points: IntArray = NO_POINTS) -> 
     image = np.repeat(np.arange(4), 10)
     reduced = stub(redundancy=60, image=image, point=np.tile(np.arange(10), 4))
     return alternatives._made(
-        *(reduced, "c", "split", np.array([0.0, 0.0, 1.0, 1.0]), gain, 0.7, spread), points=points
+        *(reduced, families.CAMERA_FAMILIES[0], "split", np.array([0.0, 0.0, 1.0, 1.0]), gain, 0.7, spread),
+        points=points,
     )
 
 
@@ -515,7 +517,7 @@ def test_cells_divide_the_format() -> None:
     xy = np.array([[0.0, 0.0], [1999.0, 1499.0], [1000.0, 290.0], [-0.4, 1500.4]])
     seen = ImagePoints(np.array([0, 0, 0, 0]), np.arange(4), xy, np.tile(np.eye(2), (4, 1, 1)))
     network = stub(image_points=seen, camera=np.zeros(1, dtype=int))
-    D = alternatives._cells(stub(network=network, estimate=stub(cameras=[stub(size_px=(2000, 1500))])))
+    D = families.format_columns(stub(network=network, estimate=stub(cameras=[stub(size_px=(2000, 1500))])))
     assert D.shape == (4, 2, 50)
     for row, cell in enumerate((0, 24, 2, 20)):
         assert np.flatnonzero(D[row, 0]).tolist() == [2 * cell] and D[row, 0, 2 * cell] == 1

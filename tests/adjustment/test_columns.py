@@ -32,7 +32,8 @@ def test_camera_columns_by_hand() -> None:
 
 def test_fields_of_the_object_by_hand() -> None:
     points = np.array([[2.0, 1, 1], [-1, 1, 1], [0.5, 4, 1], [0.5, -2, 1], [np.nan, 0, 0]])
-    strain, bending, size = object_fields(points)
+    fields, size = object_fields(points)
+    strain, bending = fields[:, :, :5], fields[:, :, 5:]
     assert size == pytest.approx(np.sqrt((2 * 2.25 + 2 * 9) / 4))
     x, y, z = 1.5 / size, 0.0, 0.0
     assert strain[0].T.tolist() == pytest.approx(
@@ -42,7 +43,8 @@ def test_fields_of_the_object_by_hand() -> None:
     products = np.array([x * x, 0, 0, 0, 0, 0])
     np.testing.assert_allclose(bending[0], size * np.einsum("t,cd->ctd", products, np.eye(3)).reshape(3, 18))
     one = np.array([[1.0, 2, 3], [-1, -2, -3]])
-    strain, bending, size = object_fields(one)
+    fields, size = object_fields(one)
+    strain, bending = fields[:, :, :5], fields[:, :, 5:]
     x, y, z = one[0] / size
     np.testing.assert_allclose(
         strain[0].T / size, [[x, -y, 0], [x, y, -2 * z], [y, x, 0], [z, 0, x], [0, z, y]]
@@ -102,7 +104,7 @@ def test_a_point_behind_a_photograph_has_no_columns(a: Adjustment) -> None:
     assert not found.usable[(seen.image == 0) & (seen.point == 3)].any()
     assert not found.usable[seen.point == 4].any()
     assert found.usable[(seen.point != 3) & (seen.point != 4)].all()
-    for part in (found.exterior, found.point, found.camera, found.strain, found.bending):
+    for part in (found.exterior, found.point, found.freedoms):
         assert not part[~found.usable].any() and np.isfinite(part).all()
 
 
@@ -125,5 +127,5 @@ def test_the_edge_of_the_longer_side_is_the_unit_of_the_camera_columns(a: Adjust
         i = seen.image[row]
         U, V, W = estimate.rotation[i].T @ (estimate.points[seen.point[row]] - estimate.position[i])
         c_px = estimate.cameras[a.network.camera[i]].c_px
-        assert found.camera[row, 0, 0] == pytest.approx(-U / W * c_px / 1000)
-        assert found.camera[row, 1, 0] == pytest.approx(V / W * c_px / 1000)
+        assert found.freedoms[row, 0, 0] == pytest.approx(-U / W * c_px / 1000)
+        assert found.freedoms[row, 1, 0] == pytest.approx(V / W * c_px / 1000)

@@ -9,6 +9,7 @@ import pytest
 from scipy import stats
 
 from sfm.adjustment.datum import Datum
+from sfm.adjustment.hypotheses.alternatives import interiors
 from sfm.adjustment.hypotheses.columns import (
     CAMERA,
     columns_of,
@@ -16,6 +17,7 @@ from sfm.adjustment.hypotheses.columns import (
     interior_step,
     object_fields,
 )
+from sfm.adjustment.hypotheses.families import GIVEN
 from sfm.adjustment.hypotheses.hypotheses import contradicted_parameters, judge_alternatives
 from sfm.adjustment.hypotheses.rejections import explain_rejections
 from sfm.adjustment.hypotheses.score import gain_of, log_f_sf, log_probability, reduce_adjustment
@@ -23,7 +25,7 @@ from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.camera import project
 from sfm.conventions import FloatArray, rotation_from_vector
-from sfm.network import Estimate, Network
+from sfm.network import Estimate, InteriorObservations, Network
 from sfm.remarks.remark import Remark, kinds_of
 from tests.survey.faults import EVERY, FAULTS, planted
 from tests.synthetic import make_network, seed_of
@@ -67,13 +69,12 @@ def test_the_columns_are_the_derivatives(clean: Adjustment) -> None:
     np.testing.assert_allclose(
         columns.exterior[:, :, 3:] @ step, (computed(network, turned) - at) / h, rtol=1e-3, atol=0.5
     )
-    strain, bending, _ = object_fields(estimate.points)
-    for field, found in ((strain, columns.strain), (bending, columns.bending)):
-        for f in range(field.shape[2]):
-            bent = replace(estimate, points=estimate.points + h * field[:, :, f])
-            np.testing.assert_allclose(
-                found[:, :, f], (computed(network, bent) - at) / h, rtol=1e-3, atol=0.5
-            )
+    field, _ = object_fields(estimate.points)
+    for f in range(field.shape[2]):
+        bent = replace(estimate, points=estimate.points + h * field[:, :, f])
+        np.testing.assert_allclose(
+            columns.freedoms[:, :, len(CAMERA) + f], (computed(network, bent) - at) / h, rtol=1e-3, atol=0.5
+        )
     camera = estimate.cameras[0]
     for s, name in enumerate(camera.names):
         found = interior_columns(clean, 0, [s])[:, :, 0]
@@ -88,8 +89,8 @@ def test_the_columns_are_the_derivatives(clean: Adjustment) -> None:
 
 def test_camera_columns_have_the_edge_of_the_photograph_as_unit(clean: Adjustment) -> None:
     """c, x0, K1 and b1 move a point at the edge by 1 px; the freedoms are those named."""
-    found = columns_of(clean).camera
-    assert found.shape[2] == len(CAMERA)
+    found = columns_of(clean).freedoms
+    assert found.shape[2] == len(CAMERA) + 5 + 18
     seen = clean.network.image_points
     x = (seen.xy[:, 0] - 999.5) / 1000
     y = (749.5 - seen.xy[:, 1]) / 1000
@@ -221,11 +222,44 @@ def test_held_parameters_that_are_wrong_are_found_and_right_ones_are_not() -> No
     assert contradicted_parameters(solved(network, truth)) == ()
 
 
-def test_a_network_that_cannot_test_anything_has_no_cause() -> None:
+def given_c(by: float, sigma: float = 2e-3) -> Adjustment:
+    """Return a network with a camera of which c is given with a standard deviation, wrong by so much, mm."""
+    network, truth = make_network(seed_of("given c"), images=10, points=50, free=("c", "x0", "y0"))
+    c = float(truth.cameras[0].parameters[0])
+    given = InteriorObservations(np.array([0]), np.array([0]), np.array([c + by]), np.array([sigma]))
+    return solved(replace(network, interior=given), truth)
+
+
+def test_a_given_parameter_that_is_wrong_is_named_with_what_fits() -> None:
+    a = given_c(0.2)
+    (found,) = judge_alternatives(a)
+    assert found.kind == "given_parameter" and found.names("parameters") == ("c",)
+    assert found.number("value") == pytest.approx(float(a.network.interior.value[0]))
+    free = solved(replace(a.network, interior=InteriorObservations()), a.estimate)
+    assert found.number("instead_of") == pytest.approx(
+        float(free.estimate.cameras[0].parameters[0]), abs=1e-4
+    )
+    assert judge_alternatives(given_c(0.002)) == ()  # a standard deviation
+
+
+def test_the_gain_of_a_given_value_is_the_square_of_its_normalized_residual() -> None:
+    a = given_c(0.01)
+    reduced = reduce_adjustment(a, columns_of(a))
+    (one,) = interiors(a, reduced, GIVEN)
+    off = float(a.estimate.cameras[0].parameters[0] - a.network.interior.value[0])
+    sigma = float(a.interior_sigma(0)[0])
+    expected = off**2 / ((2e-3 * a.sigma0) ** 2 - sigma**2)
+    assert one.gain.value == pytest.approx(expected, rel=5e-3)
+
+
+def test_what_could_not_be_tested_is_remarked() -> None:
     network, truth = make_network(seed_of("two b"), images=2, points=8, free=())
     a = solved(network, truth, "none")
     assert a.redundancy == 3
-    assert judge_alternatives(a) == ()
+    (one,) = judge_alternatives(a)
+    assert (one.kind, one.number("needed")) == ("photographs_untested", 4)
+    assert kinds_of(judge_alternatives(replace(a, redundancy=1))) == ("assumptions_untested",)
+    assert judge_alternatives(replace(a, sigma0=0.0)) == ()
 
 
 @pytest.mark.slow

@@ -10,12 +10,24 @@ Source: the score test of `sfm.adjustment.hypotheses.score`; Holm (1979), Scand.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.special import gammaln
 
-from sfm.adjustment.hypotheses.columns import BENDING, CAMERA, STRAIN, Columns, shared_columns
+from sfm.adjustment.hypotheses.columns import Columns, shared_columns
+from sfm.adjustment.hypotheses.families import (
+    FORMAT,
+    GIVEN,
+    HELD,
+    MOVED,
+    OF_PHOTOGRAPHS,
+    SHIFTED,
+    Alternative,
+    Family,
+    InteriorFamily,
+    format_columns,
+)
 from sfm.adjustment.hypotheses.score import (
     Gain,
     Reduced,
@@ -30,84 +42,20 @@ from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.distortion.models import Role
 
 ALPHA = 0.01  # probability of naming any alternative where none holds
-CAMERA_SETS = {
-    "c": (0,),
-    "centre": (0, 1, 2, 3),
-    "camera": tuple(range(len(CAMERA))),
-}  # c; c, x0, y0, K1; all
 MIN_GROUP = 2  # photographs on each side of a split
 MAX_RUNS = 60  # photographs, or runs of them, that have freedoms by themselves
 MAX_PRODUCTS = 2e11  # numbers multiplied to try all of these places, some ten seconds
 MAX_SPLITS = 12  # places in the sequence at which points are tried to have moved
-CELLS = 5  # of the format in each direction
 MAX_MOVED = 60  # points that are tried together
 ROUNDS = 20  # of two means
 STARTS = 8  # photographs from which a group is grown
 
 
-@dataclass(frozen=True)
-class Alternative:
-    """One alternative and what the score test says of it."""
-
-    family: str  # c | centre | camera | strain | bending | moved | shifted | interior | format
-    pattern: str  # single | split | linear | alternating | group | all
-    factor: FloatArray  # of each photograph, (m,)
-    gain: Gain
-    log_p: float  # ln of the probability by chance
-    price: float  # q / 2 ln n and ln of the number of patterns and sets from which it was taken
-    search: float  # the latter
-    evidence: float  # gain of ln likelihood less the price
-    points: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))  # that moved
-    parameters: tuple[tuple[int, int], ...] = ()  # (camera, parameter) freed
-
-    @property
-    def photographs(self) -> IntArray:
-        """The fewer photographs: those that differ from the others."""
-        on = np.flatnonzero(self.factor > 0)
-        off = np.flatnonzero(self.factor <= 0)
-        return on if len(on) <= len(off) else off
-
-    def columns(self, a: Adjustment, columns: Columns) -> FloatArray:
-        """Return its columns for all image points of an adjustment, px, (k, 2, q)."""
-        seen = a.network.image_points
-        if self.family == "interior":
-            return shared_columns(a, list(self.parameters))[0]
-        if self.family == "format":
-            return _cells(a)
-        factor = self.factor[seen.image][:, None, None]
-        if self.family == "moved":
-            D = np.zeros((len(seen), 2, 3 * len(self.points)))
-            for place, j in enumerate(self.points):
-                rows = np.flatnonzero(seen.point == j)
-                D[rows, :, 3 * place : 3 * place + 3] = (factor * columns.point)[rows]
-            return D
-        if self.family == "shifted":
-            return np.asarray(np.isin(seen.point, self.points)[:, None, None] * factor * columns.point)
-        return np.asarray(factor * _family(columns, self.family))
-
-
-def _family(columns: Columns, family: str) -> FloatArray:
-    if family in CAMERA_SETS:
-        return columns.camera[:, :, list(CAMERA_SETS[family])]
-    return columns.strain if family == "strain" else columns.bending
-
-
-def _cells(a: Adjustment) -> FloatArray:
-    """Return a displacement for each cell of the format, photographs of all sizes alike, (k, 2, 2 cells)."""
-    network = a.network
-    seen = network.image_points
-    size = np.array([camera.size_px for camera in a.estimate.cameras])[network.camera[seen.image]]
-    column, row = np.clip((CELLS * seen.xy / size).astype(np.int64), 0, CELLS - 1).T
-    D = np.zeros((len(seen), 2, CELLS**2, 2))
-    D[np.arange(len(seen)), 0, CELLS * row + column, 0] = 1.0
-    D[np.arange(len(seen)), 1, CELLS * row + column, 1] = 1.0
-    return D.reshape(len(seen), 2, 2 * CELLS**2)
-
-
 def alternatives_of(a: Adjustment, reduced: Reduced, columns: Columns) -> tuple[Alternative, ...]:
     """Return all alternatives, the best evidence first."""
     found = [
-        *held_interiors(a, reduced),
+        *interiors(a, reduced, HELD),
+        *interiors(a, reduced, GIVEN),
         *_format(a, reduced),
         *_by_photographs(reduced, columns),
         *_moved_points(reduced),
@@ -139,7 +87,7 @@ NONE = Spread()
 
 def _made(
     reduced: Reduced,
-    family: str,
+    family: Family,
     pattern: str,
     factor: FloatArray,
     gain: Gain,
@@ -176,16 +124,22 @@ def _made(
     )
 
 
-def held_interiors(a: Adjustment, reduced: Reduced) -> Iterator[Alternative]:
-    """Return an alternative for each held interior parameter, and one for all of a camera."""
+def interiors(a: Adjustment, reduced: Reduced, family: InteriorFamily) -> Iterator[Alternative]:
+    """Return an alternative for each held or given interior parameter, and one for all of a camera."""
     network, cameras = a.network, a.estimate.cameras
     everywhere = np.ones(len(network.images))
     owners: dict[str, dict[str, list[tuple[int, int]]]] = {}
     for index, camera in enumerate(cameras):
         if not (network.camera == index).any():
             continue
+        some = ~camera.free
+        if family.of_given:
+            given = network.interior
+            some = camera.free & np.isin(
+                np.arange(len(camera.free)), given.parameter[(given.camera == index) & (given.sigma > 0)]
+            )
         # the denominator of a fraction says the same as its numerator
-        for s in np.flatnonzero(~camera.free & ~camera.plays(Role.DENOMINATOR)).tolist():
+        for s in np.flatnonzero(some & ~camera.plays(Role.DENOMINATOR)).tolist():
             owner = owners.setdefault(camera.group_of(s) or camera.name, {})
             owner.setdefault(camera.names[s], []).append((index, s))
     for held in owners.values():
@@ -210,20 +164,18 @@ def held_interiors(a: Adjustment, reduced: Reduced) -> Iterator[Alternative]:
                     ),
                     key=lambda one: one.factor,
                 )
-                yield _made(
-                    *(reduced, "interior", "all", everywhere, gain, 0.0, spread), parameters=parameters
-                )
+                yield _made(*(reduced, family, "all", everywhere, gain, 0.0, spread), parameters=parameters)
 
 
 def _format(a: Adjustment, reduced: Reduced) -> Iterator[Alternative]:
     """Return the alternative of residuals that depend on the place in the photograph."""
-    D = reduced.whiten(_cells(a))
+    D = reduced.whiten(format_columns(a))
     H, g, squares = reduced.project(D)
     gain = gain_of(H, g, squares)
     if gain.rank:
         scores = reduced.scores(D @ gain.beta, D @ gain.beta)
         spread = _of_scores(scores, float(gain.beta @ H @ gain.beta))
-        yield _made(reduced, "format", "all", np.ones(reduced.photographs), gain, 0.0, spread)
+        yield _made(reduced, FORMAT, "all", np.ones(reduced.photographs), gain, 0.0, spread)
 
 
 def _of_scores(scores: FloatArray, variance: float) -> Spread:
@@ -245,16 +197,13 @@ def _by_photographs(reduced: Reduced, columns: Columns) -> Iterator[Alternative]
     if m < 2 * MIN_GROUP:
         return
     run = np.arange(photographs) * m // photographs
-    every = np.concatenate([columns.camera, columns.strain, columns.bending], axis=2)
-    H, g, squares = reduced.project_by_run(reduced.whiten(every), run)
-    places = {name: np.array(some) for name, some in CAMERA_SETS.items()}
-    places["strain"] = len(CAMERA) + np.arange(STRAIN)
-    places["bending"] = len(CAMERA) + STRAIN + np.arange(BENDING)
-    for family, some in places.items():
+    H, g, squares = reduced.project_by_run(reduced.whiten(columns.freedoms), run)
+    for family in OF_PHOTOGRAPHS:
+        some = np.array(family.places)
         part = _Part(H[:, some][:, :, :, some], g[:, some], squares[:, some])
         for pattern, factors, search in _patterns(m):
-            if family in ("strain", "bending") and pattern == "single":
-                continue  # an object that one photograph shows otherwise is that photograph's fault
+            if pattern == "single" and not family.of_one:
+                continue
             gains = [part.gain(factor) for factor in factors]
             best = max(range(len(gains)), key=lambda k: gains[k].value)
             spread = part.spread(factors[best], gains[best])
@@ -353,8 +302,8 @@ def _moved_points(reduced: Reduced) -> Iterator[Alternative]:
     best: dict[str, Alternative] = {}
     for k in splits:
         for one in _moved_at(reduced, (np.arange(m) >= k).astype(float), np.log(len(splits))):
-            if one.family not in best or one.evidence > best[one.family].evidence:
-                best[one.family] = one
+            if one.family.name not in best or one.evidence > best[one.family.name].evidence:
+                best[one.family.name] = one
     yield from best.values()
 
 
@@ -405,7 +354,7 @@ def _moved_at(reduced: Reduced, factor: FloatArray, search: float) -> Iterator[A
         others = ordered[count:]
         spread = Spread(float(others.mean()) / 3, 3 * len(others)) if len(others) else NONE
         one = _made(
-            *(reduced, "moved", "split", factor, gain, search + sets, spread),
+            *(reduced, MOVED, "split", factor, gain, search + sets, spread),
             points=movable[order[:count]],
         )
         if best is None or one.evidence > best.evidence:
@@ -461,7 +410,7 @@ def _shifted(
         values, ranks = gains_of(blocks, left, squares)
         redundancy = int(ranks.sum()) - gain.rank
         spread = Spread(float(values.sum()) / redundancy, redundancy)
-        one = _made(reduced, "shifted", "split", factor, gain, search + sets, spread, points=points)
+        one = _made(reduced, SHIFTED, "split", factor, gain, search + sets, spread, points=points)
         if best is None or one.evidence > best.evidence:
             best = one
     if best is not None:

@@ -22,6 +22,9 @@ from sfm.network import rows_of
 
 CAMERA = ("c", "x0", "y0", "K1", "K2", "P1", "P2", "b1", "b2")
 STRAIN, BENDING = 5, 18  # columns
+CAMERA_PLACES = tuple(range(len(CAMERA)))  # in the freedoms of a photograph
+STRAIN_PLACES = tuple(range(len(CAMERA), len(CAMERA) + STRAIN))
+BENDING_PLACES = tuple(range(len(CAMERA) + STRAIN, len(CAMERA) + STRAIN + BENDING))
 SMALL_MOVE_PX = 0.01  # by which a parameter moves image points where its derivative is taken
 
 
@@ -31,9 +34,9 @@ class Columns:
 
     exterior: FloatArray  # by X0 and the small rotation of their photograph, (k, 2, 6)
     point: FloatArray  # by their object point, (k, 2, 3)
-    camera: FloatArray  # by the freedoms `CAMERA`, px at the edge of the photograph, (k, 2, 9)
-    strain: FloatArray  # by a strain of the object, its size as unit, (k, 2, 5)
-    bending: FloatArray  # by a bending of the object, likewise, (k, 2, 18)
+    freedoms: FloatArray
+    """by what a photograph may have by itself: `CAMERA`, px at the edge of the photograph, then strain and
+    bending of the object, its size as unit, (k, 2, 9 + 5 + 18)"""
     usable: BoolArray  # whether all of these are finite, (k,)
 
 
@@ -62,17 +65,11 @@ def columns_of(a: Adjustment) -> Columns:
         [np.stack([zero, W, -V], -1), np.stack([-W, zero, U], -1), np.stack([V, -U, zero], -1)], axis=2
     )
     exterior = np.concatenate([-point, by_axes @ turned], axis=2)
-    strain, bending, _ = object_fields(estimate.points)
-    found = Columns(
-        exterior,
-        point,
-        _camera(flat),
-        np.einsum("kac,kcf->kaf", point, strain[seen.point]),
-        np.einsum("kac,kcf->kaf", point, bending[seen.point]),
-        np.isfinite(point).all(axis=(1, 2)) & (W < 0),
-    )
-    for part in (found.exterior, found.point, found.camera, found.strain, found.bending):
-        part[~found.usable] = 0.0
+    by_object = np.einsum("kac,kcf->kaf", point, object_fields(estimate.points)[0][seen.point])
+    usable = np.isfinite(point).all(axis=(1, 2)) & (W < 0)
+    found = Columns(exterior, point, np.concatenate([_camera(flat), by_object], axis=2), usable)
+    for part in (found.exterior, found.point, found.freedoms):
+        part[~usable] = 0.0
     return found
 
 
@@ -89,8 +86,8 @@ def _camera(flat: FloatArray) -> FloatArray:
     return np.stack([np.stack(across, -1), -np.stack(down, -1)], axis=1)
 
 
-def object_fields(points: FloatArray) -> tuple[FloatArray, FloatArray, float]:
-    """Return the displacement of points by strain (n, 3, 5) and bending (n, 3, 18), and the object's size.
+def object_fields(points: FloatArray) -> tuple[FloatArray, float]:
+    """Return the displacement of points by strain and bending, (n, 3, 5 + 18), and the object's size.
 
     A parameter of 1 is a displacement as large as the object, its root mean square distance from the centre.
     """
@@ -111,7 +108,7 @@ def object_fields(points: FloatArray) -> tuple[FloatArray, FloatArray, float]:
     )
     terms = np.stack([x * x, y * y, z * z, x * y, x * z, y * z], axis=-1)
     bending = np.einsum("nt,cd->nctd", terms, np.eye(3)).reshape(len(points), 3, BENDING)
-    return size * strain, size * bending, size
+    return size * np.concatenate([strain, bending], axis=2), size
 
 
 def interior_columns(a: Adjustment, index: int, parameters: list[int]) -> FloatArray:

@@ -16,13 +16,13 @@ import numpy as np
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.hypotheses.alternatives import (
     ALPHA,
-    Alternative,
+    MIN_GROUP,
     alternatives_of,
-    held_interiors,
+    interiors,
     is_significant,
 )
 from sfm.adjustment.hypotheses.columns import columns_of
-from sfm.adjustment.hypotheses.described import remark_of
+from sfm.adjustment.hypotheses.families import HELD, Alternative
 from sfm.adjustment.hypotheses.refit import Refit, refit
 from sfm.adjustment.hypotheses.score import reduce_adjustment
 from sfm.adjustment.quality.reliability import FALSE_ALARM, level_of_single
@@ -30,13 +30,20 @@ from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.conventions import BoolArray
 from sfm.errors import GeometryError
-from sfm.network import Estimate, ExteriorObservations, Network, ObjectPoints, ScaleBars
+from sfm.network import (
+    Estimate,
+    ExteriorObservations,
+    Network,
+    ObjectPoints,
+    ScaleBars,
+    rows_of,
+)
 from sfm.reduced_network import reduce_network
 from sfm.remarks.remark import Remark, remark
 
 MAX_CAUSES = 2  # that are looked for one after another
 MAX_TRIED = 3  # alternatives that are adjusted for each, where the best of the score test does not hold
-MAX_IMAGE_POINTS = 6_000  # of the network that is tested; every so many points of a larger one
+MAX_IMAGE_POINTS = 6_000  # of the network that is tested; of a larger one the points of most rays
 MAX_PHOTOGRAPHS = 300  # of a network that is tested: their normal equations are dense here
 APART = float(np.log(100))  # of ln likelihood, below which two alternatives cannot be told apart
 NAMED = 1.0  # standard deviations by which coordinates shift, below which a cause is of no consequence
@@ -57,15 +64,41 @@ def judge_alternatives(final: Adjustment, *, unit: str = "") -> tuple[Remark, ..
     Args:
         final: a finished adjustment with its covariance.
         unit: object unit, for the remarks.
+
+    Returns:
+        The remarks; one of them says so where assumptions could not be tested.
     """
-    if len(final.network.images) > MAX_PHOTOGRAPHS:
-        return (remark("assumptions_untested", photographs=final.network.images),)
+    photographs = final.network.images
+    if not final.converged or not final.sigma0 > 0:
+        return ()  # no result, or one that nothing contradicts
+    if len(photographs) > MAX_PHOTOGRAPHS:
+        return (remark("too_many_to_test", photographs=photographs),)
     plain = free_network(final)
     if plain is None:
-        return ()
-    return tuple(
-        remark_of(plain, one.alternative, one.refit, one.as_well, unit) for one in find_causes(plain)
+        return (remark("assumptions_untested"),)
+    try:
+        causes = find_causes(plain)
+    except np.linalg.LinAlgError:
+        return (remark("assumptions_untested"),)
+    few = len(photographs) < 2 * MIN_GROUP
+    return (
+        *(remark_of(plain, one, unit) for one in causes),
+        *([remark("photographs_untested", photographs=photographs, needed=2 * MIN_GROUP)] if few else []),
     )
+
+
+def remark_of(plain: Adjustment, cause: Cause, unit: str) -> Remark:
+    """Return the remark on a cause.
+
+    Args:
+        plain: the adjustment without it.
+        cause: the alternative that holds.
+        unit: object unit.
+    """
+    one, found = cause.alternative, cause.refit
+    instead = tuple(dict.fromkeys(other.kind for other in cause.as_well))
+    parts = one.family.parts(one, found.adjustment, found.beta, unit)
+    return remark(one.kind, shift=found.shift, rms=found.rms, instead=instead or None, **parts)
 
 
 def find_causes(plain: Adjustment) -> tuple[Cause, ...]:
@@ -89,17 +122,14 @@ def find_causes(plain: Adjustment) -> tuple[Cause, ...]:
 def _best(plain: Adjustment, current: Adjustment) -> Cause | None:
     """Return the alternative that holds beside those whose effect has left an adjustment already."""
     columns = columns_of(current)
-    try:
-        reduced = reduce_adjustment(current, columns)
-    except np.linalg.LinAlgError:
-        return None
+    reduced = reduce_adjustment(current, columns)
     every = alternatives_of(current, reduced, columns)
     significant = [
         one for one in every if is_significant(one, len(every)) and one.evidence > np.log(1 / ALPHA)
     ]
     once: dict[tuple[object, ...], Alternative] = {}
     for one in significant:
-        once.setdefault(_cause(one), one)
+        once.setdefault(one.family.cause(one), one)
     for best in list(once.values())[:MAX_TRIED]:
         found = refit(plain, best, current)
         if found is None or not found.gain - best.price > np.log(1 / ALPHA):
@@ -109,15 +139,6 @@ def _best(plain: Adjustment, current: Adjustment) -> Cause | None:
         )
         return Cause(best, found, near)
     return None
-
-
-def _cause(one: Alternative) -> tuple[object, ...]:
-    """Return what an alternative is a case of: cameras with few or many parameters are one cause."""
-    if one.family == "interior":
-        return ("interior",)
-    if one.family in ("moved", "shifted", "strain", "bending"):
-        return ("object", one.pattern)
-    return ("camera", tuple(one.photographs.tolist()))
 
 
 def contradicted_parameters(a: Adjustment) -> tuple[tuple[str, str], ...]:
@@ -136,7 +157,7 @@ def contradicted_parameters(a: Adjustment) -> tuple[tuple[str, str], ...]:
         reduced = reduce_adjustment(plain, columns_of(plain))
     except np.linalg.LinAlgError:
         return ()
-    every = [one for one in held_interiors(plain, reduced) if len(one.gain.beta) == 1]
+    every = [one for one in interiors(plain, reduced, HELD) if len(one.gain.beta) == 1]
     found = sorted((one for one in every if is_significant(one, len(every))), key=lambda one: -one.gain.value)
     names = []
     for one in found:
@@ -175,11 +196,21 @@ def free_network(final: Adjustment) -> Adjustment | None:
 
 
 def _sample(network: Network, final: Adjustment) -> tuple[Network, Estimate, BoolArray]:
-    """Return a network of about `MAX_IMAGE_POINTS`, its estimate, and which image points it has."""
-    seen = network.image_points
-    every = -(-len(seen) // MAX_IMAGE_POINTS)
-    points = np.arange(len(network.points)) % every == 0
+    """Return a network of about `MAX_IMAGE_POINTS`, its estimate, and which image points it has.
+
+    Points of many rays come first, and each photograph has its share.
+    """
+    seen, m = network.image_points, len(network.images)
+    points = np.ones(len(network.points), dtype=bool)
+    if len(seen) > MAX_IMAGE_POINTS:
+        points[:] = False
+        images = [seen.image[rows] for rows in rows_of(seen.point, len(points))]
+        count = np.zeros(m, dtype=np.int64)
+        for j in np.argsort([-len(some) for some in images], kind="stable"):
+            if (count[images[j]] < MAX_IMAGE_POINTS / m).any():
+                points[j] = True
+                np.add.at(count, images[j], 1)
     rows = points[seen.point]
-    images = np.ones(len(network.images), dtype=bool)
-    part, estimate = reduce_network(network, final.estimate, images, points, np.ones_like(rows))
+    every = np.ones(m, dtype=bool)
+    part, estimate = reduce_network(network, final.estimate, every, points, np.ones_like(rows))
     return part, estimate, rows

@@ -11,8 +11,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sfm.adjustment.datum import Datum
-from sfm.adjustment.hypotheses.alternatives import Alternative
-from sfm.adjustment.hypotheses.columns import columns_of, object_fields
+from sfm.adjustment.hypotheses.columns import columns_of
+from sfm.adjustment.hypotheses.families import Alternative
 from sfm.adjustment.hypotheses.score import gain_of, reduce_adjustment
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
@@ -105,18 +105,6 @@ def shifts_of(
     except GeometryError:
         return float("nan"), float("nan")
     change = moved[known] / sigma[known]
-    away = _displaced(plain, one, beta)[known] / sigma[known]
+    away = one.family.displaced(one, plain.estimate.points, beta)[known] / sigma[known]
     largest, squares = np.abs(change).max(initial=0.0), (change**2).mean()
     return float(max(largest, np.abs(away).max(initial=0.0))), float(np.sqrt(max(squares, (away**2).mean())))
-
-
-def _displaced(plain: Adjustment, one: Alternative, beta: FloatArray) -> FloatArray:
-    """Return how far the object is from its mean shape in the photographs that differ most, (n, 3)."""
-    away = np.zeros_like(plain.estimate.points)
-    if one.family in ("moved", "shifted"):
-        away[one.points] = beta.reshape(-1, 3)
-    elif one.family in ("strain", "bending"):
-        strain, bending, _ = object_fields(plain.estimate.points)
-        largest = float(np.abs(one.factor - one.factor.mean()).max())
-        away = largest * ((strain if one.family == "strain" else bending) @ beta)
-    return away

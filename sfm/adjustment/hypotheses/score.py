@@ -174,7 +174,7 @@ def reduce_adjustment(a: Adjustment, columns: Columns) -> Reduced:
     W, y = L @ W, np.einsum("nab,nb->na", L, gp)
     flat = W.reshape(3 * n, size)
     S, t = _camera_normals(A, image, v, m, size)
-    S[range(6 * m, size), range(6 * m, size)] += prior
+    S[6 * m :, 6 * m :] += prior
     t[6 * m :] += slope
     S -= flat.T @ flat
     t = t - flat.T @ y.ravel()
@@ -189,24 +189,26 @@ def reduce_adjustment(a: Adjustment, columns: Columns) -> Reduced:
 
 
 def _free_interior(a: Adjustment) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the columns of free interior parameters (k, 2, i), weights and slopes of their given values."""
+    """Return the columns of free interior parameters, (k, 2, i), weight and slope of given values."""
     network, cameras = a.network, a.estimate.cameras
     used = np.unique(network.camera).tolist()
     columns, keys, units = shared_columns(
         a, [(index, int(s)) for index in used for s in np.flatnonzero(cameras[index].free)]
     )
-    weight, slope = np.zeros(len(keys)), np.zeros(len(keys))
     given = network.interior
-    rows = zip(given.camera, given.parameter, given.value, given.sigma, strict=True)
-    for index, s, value, sigma in rows:
+    rows, per_unit, off = [], [], []
+    for row, (index, s) in enumerate(zip(given.camera.tolist(), given.parameter.tolist(), strict=True)):
         camera = cameras[index]
-        key = (camera.group_of(int(s)) or camera.name, camera.names[s])
-        if key in keys and sigma > 0:
-            k = keys.index(key)
-            per_unit = units[k] / float(sigma) / a.sigma0
-            weight[k] += per_unit**2
-            slope[k] += per_unit * (float(camera.parameters[s]) - float(value)) / float(sigma) / a.sigma0
-    return columns, weight, slope
+        key = (camera.group_of(s) or camera.name, camera.names[s])
+        if key in keys and given.sigma[row] > 0:
+            rows.append(row)
+            per_unit.append(np.where([one == key for one in keys], units, 0.0))
+            off.append(float(camera.parameters[s] - given.value[row]))
+    if not rows:
+        return columns, np.zeros((len(keys), len(keys))), np.zeros(len(keys))
+    J = np.array(per_unit)
+    P = given.weight_of(np.array(rows)) / a.sigma0**2
+    return columns, J.T @ P @ J, J.T @ P @ np.array(off)
 
 
 def _camera_normals(

@@ -41,6 +41,15 @@ ROWS = (
         short="wrong held parameters",
     ),
     Kind(
+        "given_parameter",
+        SHIFT,
+        "The image points contradict the given values of {parameters} of camera {camera}"
+        f"[[: {{value}} given, {{instead_of}} fits]]. {SHIFTED}{INSTEAD}",
+        "a certificate of another camera, zoom or focus, or standard deviations that are too small",
+        "Correct the values, or their standard deviations.",
+        short="wrong given parameters",
+    ),
+    Kind(
         "distortion_not_described",
         SHIFT,
         "Residuals depend on the place in the photograph, by up to {largest}: the camera model does not "
@@ -76,12 +85,27 @@ ROWS = (
         short="points that moved",
     ),
     Kind(
-        "assumptions_untested",
+        "too_many_to_test",
         "note",
         "One camera for all photographs and one shape of the object are assumed, not tested: "
         "{photographs:photograph} are too many.",
         "the tests take the normal equations of all photographs together",
         "Survey parts of the object by themselves to test them.",
+    ),
+    Kind(
+        "assumptions_untested",
+        "note",
+        "One camera for all photographs and one shape of the object are assumed, not tested: "
+        "the image points alone do not determine the network.",
+        "too few photographs or points, or rejected ones without which the network falls apart",
+        "Take more photographs from more directions.",
+    ),
+    Kind(
+        "photographs_untested",
+        "note",
+        "That {photographs} have one camera and show one shape of the object is assumed, not tested.",
+        "{needed} photographs or more show which of them differ",
+        "Take more photographs.",
     ),
     Kind(
         "two_places",

@@ -10,16 +10,16 @@ import numpy as np
 import pytest
 
 from sfm.adjustment.datum import Datum
-from sfm.adjustment.hypotheses import described, hypotheses, refit
-from sfm.adjustment.hypotheses.alternatives import Alternative
+from sfm.adjustment.hypotheses import families, hypotheses
 from sfm.adjustment.hypotheses.columns import interior_step, object_fields
-from sfm.adjustment.hypotheses.described import kind_of, remark_of
+from sfm.adjustment.hypotheses.families import Alternative
 from sfm.adjustment.hypotheses.hypotheses import (
     Cause,
     contradicted_parameters,
     find_causes,
     free_network,
     judge_alternatives,
+    remark_of,
 )
 from sfm.adjustment.hypotheses.refit import Refit, log_likelihood, shifts_of
 from sfm.adjustment.hypotheses.score import Gain
@@ -37,6 +37,15 @@ def a() -> Adjustment:
     return adjust(network, truth, datum=Datum("free"), reject="none")
 
 
+FAMILIES = {
+    one.name: one
+    for one in (
+        *families.OF_PHOTOGRAPHS,
+        *(families.HELD, families.GIVEN, families.FORMAT, families.MOVED, families.SHIFTED),
+    )
+}
+
+
 def alternative(
     family: str = "c",
     pattern: str = "split",
@@ -50,7 +59,7 @@ def alternative(
 ) -> Alternative:
     return Alternative(
         *(
-            family,
+            FAMILIES[family],
             pattern,
             np.array(factor, dtype=float),
             Gain(9.0, 1, np.ones(1)),
@@ -69,7 +78,8 @@ def alternative(
     [
         ("c", "split", "other_camera"),
         ("camera", "linear", "camera_drift"),
-        ("interior", "all", "held_parameter"),
+        ("held", "all", "held_parameter"),
+        ("given", "all", "given_parameter"),
         ("format", "all", "distortion_not_described"),
         ("moved", "split", "points_moved"),
         ("shifted", "split", "points_moved"),
@@ -78,12 +88,12 @@ def alternative(
     ],
 )
 def test_kinds(family: str, pattern: str, kind: str) -> None:
-    assert kind_of(alternative(family, pattern)) == kind
+    assert alternative(family, pattern).kind == kind
 
 
 def remark(a: Adjustment, one: Alternative, beta: list[float], *others: Alternative) -> Remark:
     found = Refit(a, np.array(beta), 50.0, 4.0, 2.0)
-    return remark_of(a, one, found, others, "mm")
+    return remark_of(a, Cause(one, found, others), "mm")
 
 
 def test_the_remark_on_a_camera(a: Adjustment) -> None:
@@ -107,12 +117,12 @@ def test_the_remark_on_a_camera(a: Adjustment) -> None:
 def test_the_remark_on_held_parameters(a: Adjustment) -> None:
     camera = a.estimate.cameras[0]
     x0, K1 = camera.names.index("x0"), camera.names.index("K1")
-    one = remark(a, alternative("interior", "all", parameters=((0, x0),)), [7.0])
+    one = remark(a, alternative("held", "all", parameters=((0, x0),)), [7.0])
     assert one.names("camera") == ("camera 1",) and one.names("parameters") == ("x0",)
     assert one.number("value") == pytest.approx(0.03) and one.numbers["value"].unit == "mm"
     assert one.number("instead_of") == pytest.approx(0.03 + 7 * interior_step(a, 0, x0))
     assert one.numbers["instead_of"].unit == "mm"
-    both = remark(a, alternative("interior", "all", parameters=((0, x0), (0, K1))), [7.0, 1.0])
+    both = remark(a, alternative("held", "all", parameters=((0, x0), (0, K1))), [7.0, 1.0])
     assert both.names("parameters") == ("x0", "K1") and "value" not in both.numbers
 
 
@@ -120,7 +130,7 @@ def test_a_pure_number_has_no_unit() -> None:
     network, truth = make_network(seed_of("pure"), images=4, points=12, model="opencv", free=("fx",))
     a = adjust(network, truth, datum=Datum("free"), reject="none")
     k1 = a.estimate.cameras[0].names.index("k1")
-    one = remark(a, alternative("interior", "all", (1, 1, 1, 1), parameters=((0, k1),)), [7.0])
+    one = remark(a, alternative("held", "all", (1, 1, 1, 1), parameters=((0, k1),)), [7.0])
     assert one.numbers["value"].unit == "" and one.number("value") == pytest.approx(-0.08)
 
 
@@ -138,8 +148,9 @@ def test_the_remark_on_points(a: Adjustment) -> None:
 @pytest.mark.parametrize(("family", "size"), [("strain", 5), ("bending", 18)])
 def test_the_remark_on_a_deformation(a: Adjustment, family: str, size: int) -> None:
     beta = seed_of(family).normal(0, 1e-3, size)
-    strain, bending, extent = object_fields(a.estimate.points)
-    away = np.linalg.norm((strain if family == "strain" else bending) @ beta, axis=1) / extent
+    fields, extent = object_fields(a.estimate.points)
+    own = fields[:, :, :5] if family == "strain" else fields[:, :, 5:]
+    away = np.linalg.norm(own @ beta, axis=1) / extent
     one = remark(a, alternative(family), beta.tolist())
     assert one.number("deformation") == pytest.approx(1000 * away.max())
     linear = remark(a, alternative(family, "linear", (-1, -0.6, -0.2, 0.2, 0.6, 1)), beta.tolist())
@@ -183,13 +194,16 @@ def test_shifts_are_in_standard_deviations_after_a_similarity(a: Adjustment) -> 
 
 
 def test_a_deformation_counts_from_its_mean(a: Adjustment) -> None:
-    strain, bending, _ = object_fields(a.estimate.points)
-    for family, fields in (("strain", strain), ("bending", bending)):
-        beta = np.arange(1.0, fields.shape[2] + 1)
+    X = a.estimate.points
+    every, _ = object_fields(X)
+    for family, own in (("strain", every[:, :, :5]), ("bending", every[:, :, 5:])):
+        beta = np.arange(1.0, own.shape[2] + 1)
         one = alternative(family, factor=(0, 0, 0, 0, 0, 1))
-        np.testing.assert_allclose(refit._displaced(a, one, beta), 5 / 6 * fields @ beta)
-    assert not refit._displaced(a, alternative("c"), np.ones(1)).any()
-    away = refit._displaced(a, alternative("shifted", points=(1, 3)), np.array([1.0, 2.0, 3.0]))
+        np.testing.assert_allclose(one.family.displaced(one, X, beta), 5 / 6 * own @ beta)
+    one = alternative("c")
+    assert not one.family.displaced(one, X, np.ones(1)).any()
+    one = alternative("shifted", points=(1, 3))
+    away = one.family.displaced(one, X, np.array([1.0, 2.0, 3.0]))
     assert away[[1, 3]].tolist() == [[1, 2, 3]] * 2 and np.count_nonzero(away) == 6
 
 
@@ -230,18 +244,21 @@ def test_alternatives_of_about_the_same_evidence_cannot_be_told_apart(
     best, same = alternative(evidence=40.0), alternative("camera", evidence=39.0)
     near = alternative("strain", evidence=40 - np.log(100) + 0.3)
     nearer = alternative("bending", evidence=39.0)
-    far = alternative("interior", "all", evidence=40 - np.log(100) - 0.3, parameters=((0, 1),))
+    far = alternative("held", "all", evidence=40 - np.log(100) - 0.3, parameters=((0, 1),))
     found = choice(monkeypatch, [best, same, nearer, near, far])
     assert found is not None and found.alternative is best and found.as_well == (nearer,)
 
 
 def test_causes() -> None:
-    cause = hypotheses._cause
+    def cause(one: Alternative) -> tuple[object, ...]:
+        return one.family.cause(one)
+
     assert cause(alternative("c")) == cause(alternative("camera"))
     assert cause(alternative("c")) != cause(alternative("c", factor=(0, 0, 1, 1, 1, 1)))
     assert cause(alternative("strain")) == cause(alternative("bending")) == cause(alternative("shifted"))
     assert cause(alternative("strain")) != cause(alternative("strain", "linear"))
-    assert cause(alternative("interior", parameters=((0, 1),))) == ("interior",)
+    assert cause(alternative("held", parameters=((0, 1),))) == ("held",)
+    assert cause(alternative("given")) == ("given",) and cause(alternative("format")) == ("format",)
 
 
 def test_two_causes_at_most_of_a_standard_deviation_at_least(
@@ -291,22 +308,29 @@ def test_the_free_network_is_the_adjustment_itself_where_nothing_else_was_observ
     k = len(a.rejected)
     monkeypatch.setattr(hypotheses, "MAX_IMAGE_POINTS", k)
     assert free_network(tested) is tested
-    monkeypatch.setattr(hypotheses, "MAX_IMAGE_POINTS", k - 1)
+    monkeypatch.setattr(hypotheses, "MAX_IMAGE_POINTS", k // 2)
     half = free_network(tested)
-    assert half is not None and half.network.points == a.network.points[::2]
+    assert half is not None and 6 < len(half.network.points) < len(a.network.points)
 
 
-def test_of_a_large_network_every_so_many_points_are_taken(
-    a: Adjustment, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_of_a_large_network_the_points_of_most_rays_are_taken(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Until each photograph has its share: here of six photographs ten image points each."""
+    large, truth = make_network(seed_of("large"), images=6, points=40, visibility=0.6, free=("c",))
+    a = adjust(large, truth, datum=Datum("free"), reject="none")
     seen = a.network.image_points
-    for limit, every in ((len(seen), 1), (len(seen) // 2, 2 + len(seen) % 2), (-(-len(seen) // 3), 3)):
-        monkeypatch.setattr(hypotheses, "MAX_IMAGE_POINTS", limit)
-        network, estimate, rows = hypotheses._sample(a.network, a)
-        assert network.points == a.network.points[::every]
-        np.testing.assert_array_equal(estimate.points, a.estimate.points[::every])
-        np.testing.assert_array_equal(network.image_points.xy, seen.xy[rows])
-        assert len(network.images) == 6
+    rays = np.bincount(seen.point)
+    monkeypatch.setattr(hypotheses, "MAX_IMAGE_POINTS", 60)
+    network, estimate, rows = hypotheses._sample(a.network, a)
+    assert len(seen) > 60 and len(network.images) == 6
+    kept = np.isin(a.network.points, network.points)
+    count = np.bincount(seen.image[rows], minlength=6)
+    assert count.min() >= 10 and rows.sum() < 60 + 6 * 4
+    np.testing.assert_array_equal(rows, kept[seen.point])
+    assert rays[kept].min() >= np.median(rays[~kept])
+    np.testing.assert_array_equal(estimate.points, a.estimate.points[kept])
+    np.testing.assert_array_equal(network.image_points.xy, seen.xy[rows])
+    monkeypatch.setattr(hypotheses, "MAX_IMAGE_POINTS", len(seen))
+    assert hypotheses._sample(a.network, a)[2].all()
 
 
 def test_of_very_many_photographs_nothing_is_tested(a: Adjustment, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -315,10 +339,6 @@ def test_of_very_many_photographs_nothing_is_tested(a: Adjustment, monkeypatch: 
     assert judge_alternatives(a) == ()
     monkeypatch.setattr(hypotheses, "MAX_PHOTOGRAPHS", 5)
     (one,) = judge_alternatives(a)
-    assert one.kind == "assumptions_untested" and one.names("photographs") == a.network.images
+    assert one.kind == "too_many_to_test" and one.names("photographs") == a.network.images
     monkeypatch.setattr(hypotheses, "free_network", None)  # is not asked for
     assert contradicted_parameters(a) == ()
-
-
-def test_families_that_move_points() -> None:
-    assert described.MOVED == ("moved", "shifted")

@@ -1,0 +1,292 @@
+"""What an alternative frees: one class for each family, with its columns, its remark and what it displaces.
+
+A family is a set of columns. A new one is a class here, and a line that looks for it in
+`sfm.adjustment.hypotheses.alternatives`.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from sfm.adjustment.hypotheses.columns import (
+    BENDING_PLACES,
+    CAMERA_PLACES,
+    STRAIN_PLACES,
+    Columns,
+    interior_step,
+    object_fields,
+    shared_columns,
+)
+from sfm.adjustment.hypotheses.score import Gain
+from sfm.adjustment.result import Adjustment
+from sfm.conventions import FloatArray, IntArray
+from sfm.remarks.remark import Quantity
+
+CELLS = 5  # of the format in each direction
+
+Parts = dict[str, str | Iterable[str] | float | tuple[float, str] | Quantity | None]
+
+
+@dataclass(frozen=True)
+class Alternative:
+    """One alternative and what the score test says of it."""
+
+    family: Family
+    pattern: str  # single | split | linear | alternating | group | all
+    factor: FloatArray  # of each photograph, (m,)
+    gain: Gain
+    log_p: float  # ln of the probability by chance
+    price: float  # q / 2 ln n and ln of the number of patterns and sets from which it was taken
+    search: float  # the latter
+    evidence: float  # gain of ln likelihood less the price
+    points: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))  # that moved
+    parameters: tuple[tuple[int, int], ...] = ()  # (camera, parameter) freed
+
+    @property
+    def photographs(self) -> IntArray:
+        """The fewer photographs: those that differ from the others."""
+        on = np.flatnonzero(self.factor > 0)
+        off = np.flatnonzero(self.factor <= 0)
+        return on if len(on) <= len(off) else off
+
+    @property
+    def kind(self) -> str:
+        """Kind of the remark that it is."""
+        return self.family.kind(self.pattern)
+
+    def columns(self, a: Adjustment, columns: Columns) -> FloatArray:
+        """Return its columns for all image points of an adjustment, px, (k, 2, q)."""
+        return self.family.columns(self, a, columns)
+
+
+@dataclass(frozen=True)
+class Family(ABC):
+    """A set of columns that may be freed."""
+
+    name: str
+
+    @abstractmethod
+    def kind(self, pattern: str) -> str:
+        """Return the kind of remark that an alternative of this family is."""
+
+    @abstractmethod
+    def columns(self, one: Alternative, a: Adjustment, columns: Columns) -> FloatArray:
+        """Return the columns of an alternative for all image points of an adjustment, px, (k, 2, q)."""
+
+    @abstractmethod
+    def parts(self, one: Alternative, a: Adjustment, beta: FloatArray, unit: str) -> Parts:
+        """Return the parts of the remark on an alternative.
+
+        Args:
+            one: the alternative.
+            a: adjustment with it.
+            beta: its parameters, (q,).
+            unit: object unit.
+        """
+
+    def cause(self, one: Alternative) -> tuple[object, ...]:
+        """Return what an alternative is a case of: of those with one cause the best is adjusted only."""
+        return (self.name,)
+
+    def displaced(self, one: Alternative, points: FloatArray, beta: FloatArray) -> FloatArray:
+        """Return how far object points are from their mean where photographs differ most, (n, 3)."""
+        return np.zeros_like(points)
+
+
+@dataclass(frozen=True)
+class OfPhotographs(Family):
+    """Some of the freedoms that a photograph may have by itself: `Columns.freedoms`."""
+
+    places: tuple[int, ...]  # in the freedoms
+
+    def columns(self, one: Alternative, a: Adjustment, columns: Columns) -> FloatArray:
+        """Return its columns for all image points, px, (k, 2, q)."""
+        factor = one.factor[a.network.image_points.image][:, None, None]
+        return np.asarray(factor * columns.freedoms[:, :, list(self.places)])
+
+
+@dataclass(frozen=True)
+class CameraFamily(OfPhotographs):
+    """Another camera in some photographs."""
+
+    of_one = True  # whether a single photograph may have it
+
+    def kind(self, pattern: str) -> str:
+        """Return the kind of remark that an alternative of this family is."""
+        return "camera_drift" if pattern == "linear" else "other_camera"
+
+    def cause(self, one: Alternative) -> tuple[object, ...]:
+        """Return what an alternative is a case of."""
+        return ("camera", *one.photographs.tolist())  # with few or many parameters
+
+    def parts(self, one: Alternative, a: Adjustment, beta: FloatArray, unit: str) -> Parts:
+        """Return by how much c and the principal point differ."""
+        camera = a.estimate.cameras[a.network.camera[int(one.photographs[0])]]
+        half = max(camera.size_px) / 2
+        linear = one.pattern == "linear"
+        sign = 1.0 if linear or one.factor[one.photographs[0]] > 0 else -1.0
+        # a column is 1 px at the edge, and moves what is measured
+        largest = float(np.ptp(one.factor))  # from the first photograph to the last of a drift
+        parts: Parts = {
+            "photographs": tuple(a.network.images[i] for i in one.photographs),
+            "change": (100 * sign * largest * float(beta[0]) / half, "%"),
+        }
+        if len(beta) > 2 and not linear:
+            parts["away"] = (float(np.hypot(beta[1], beta[2])), "px")
+        return parts
+
+
+@dataclass(frozen=True)
+class ObjectFamily(OfPhotographs):
+    """Another shape of the object in some photographs."""
+
+    of_one = False  # an object that one photograph shows otherwise is that photograph's fault
+
+    def kind(self, pattern: str) -> str:
+        """Return the kind of remark that an alternative of this family is."""
+        return "object_deforming" if pattern == "linear" else "object_deformed"
+
+    def cause(self, one: Alternative) -> tuple[object, ...]:
+        """Return what an alternative is a case of."""
+        return ("object", one.pattern)
+
+    def displaced(self, one: Alternative, points: FloatArray, beta: FloatArray) -> FloatArray:
+        """Return how far points are from their mean where photographs differ most, (n, 3)."""
+        largest = float(np.abs(one.factor - one.factor.mean()).max())
+        return largest * self._field(points)[0] @ beta
+
+    def parts(self, one: Alternative, a: Adjustment, beta: FloatArray, unit: str) -> Parts:
+        """Return the largest displacement of a point over the size of the object."""
+        field_, size = self._field(a.estimate.points)
+        away = np.linalg.norm(field_ @ beta, axis=1) / size
+        return {
+            "photographs": tuple(a.network.images[i] for i in one.photographs),
+            "deformation": (1000 * float(np.nanmax(away) * np.ptp(one.factor)), "‰ of the object"),
+        }
+
+    def _field(self, points: FloatArray) -> tuple[FloatArray, float]:
+        fields, size = object_fields(points)
+        return fields[:, :, np.array(self.places) - len(CAMERA_PLACES)], size
+
+
+@dataclass(frozen=True)
+class PointFamily(Family):
+    """Object points that moved: each by itself, or all by one vector."""
+
+    together: bool
+
+    def kind(self, pattern: str) -> str:
+        """Return the kind of remark that an alternative of this family is."""
+        return "points_moved"
+
+    def cause(self, one: Alternative) -> tuple[object, ...]:
+        """Return what an alternative is a case of."""
+        return ("object", one.pattern)
+
+    def columns(self, one: Alternative, a: Adjustment, columns: Columns) -> FloatArray:
+        """Return its columns for all image points, px, (k, 2, q)."""
+        seen = a.network.image_points
+        D = one.factor[seen.image][:, None, None] * columns.point
+        at = seen.point[:, None] == one.points  # (k, p)
+        if self.together:
+            return np.where(at.any(axis=1)[:, None, None], D, 0.0)
+        return np.asarray((at[:, None, :, None] * D[:, :, None]).reshape(len(seen), 2, -1))
+
+    def displaced(self, one: Alternative, points: FloatArray, beta: FloatArray) -> FloatArray:
+        """Return how far points are from their mean where photographs differ most, (n, 3)."""
+        away = np.zeros_like(points)
+        away[one.points] = beta.reshape(-1, 3)
+        return away
+
+    def parts(self, one: Alternative, a: Adjustment, beta: FloatArray, unit: str) -> Parts:
+        """Return which points moved, how far at most, and the first photograph after."""
+        distance = float(np.linalg.norm(beta.reshape(-1, 3), axis=1).max())
+        return {
+            "photographs": tuple(a.network.images[i] for i in one.photographs),
+            "points": tuple(a.network.points[j] for j in one.points),
+            "from": (a.network.images[int(np.flatnonzero(one.factor > 0)[0])],),
+            "distance": Quantity(distance, unit),
+        }
+
+
+@dataclass(frozen=True)
+class InteriorFamily(Family):
+    """Interior parameters that are held, or given with a standard deviation.
+
+    A column for a given parameter, free already, takes from the image points what its given value asks for:
+    what is then adjusted is the given value, and the gain is that of leaving it out.
+    """
+
+    of_given: bool = False
+
+    def kind(self, pattern: str) -> str:
+        """Return the kind of remark that an alternative of this family is."""
+        return "given_parameter" if self.of_given else "held_parameter"
+
+    def columns(self, one: Alternative, a: Adjustment, columns: Columns) -> FloatArray:
+        """Return its columns for all image points, px, (k, 2, q)."""
+        return shared_columns(a, list(one.parameters))[0]
+
+    def parts(self, one: Alternative, a: Adjustment, beta: FloatArray, unit: str) -> Parts:
+        """Return which parameters they are, and the value of a single one that the image points ask for."""
+        index, s = one.parameters[0]
+        camera = a.estimate.cameras[index]
+        measure = "" if camera.units[s] == "1" else camera.units[s]
+        value = float(camera.parameters[s])
+        names = tuple(dict.fromkeys(a.estimate.cameras[i].names[p] for i, p in one.parameters))
+        parts: Parts = {"camera": camera.group_of(s) or camera.name, "parameters": names}
+        if len(names) == 1:
+            found = value + float(beta[0]) * interior_step(a, index, s)
+            given = a.network.interior
+            at = np.flatnonzero((given.camera == index) & (given.parameter == s))
+            stated = float(given.value[at[0]]) if self.of_given else value
+            parts |= {"value": Quantity(stated, measure), "instead_of": Quantity(found, measure)}
+        return parts
+
+
+@dataclass(frozen=True)
+class FormatFamily(Family):
+    """A displacement of image points for each cell of the format."""
+
+    def kind(self, pattern: str) -> str:
+        """Return the kind of remark that an alternative of this family is."""
+        return "distortion_not_described"
+
+    def columns(self, one: Alternative, a: Adjustment, columns: Columns) -> FloatArray:
+        """Return its columns for all image points, px, (k, 2, q)."""
+        return format_columns(a)
+
+    def parts(self, one: Alternative, a: Adjustment, beta: FloatArray, unit: str) -> Parts:
+        """Return the largest displacement of a cell."""
+        return {"largest": (float(np.linalg.norm(beta.reshape(-1, 2), axis=1).max()), "px")}
+
+
+def format_columns(a: Adjustment) -> FloatArray:
+    """Return a displacement for each cell of the format, photographs of all sizes alike, (k, 2, 2 cells)."""
+    network = a.network
+    seen = network.image_points
+    size = np.array([camera.size_px for camera in a.estimate.cameras])[network.camera[seen.image]]
+    column, row = np.clip((CELLS * seen.xy / size).astype(np.int64), 0, CELLS - 1).T
+    D = np.zeros((len(seen), 2, CELLS**2, 2))
+    D[np.arange(len(seen)), 0, CELLS * row + column, 0] = 1.0
+    D[np.arange(len(seen)), 1, CELLS * row + column, 1] = 1.0
+    return D.reshape(len(seen), 2, 2 * CELLS**2)
+
+
+CAMERA_FAMILIES = (
+    CameraFamily("c", (0,)),
+    CameraFamily("centre", (0, 1, 2, 3)),  # c, x0, y0, K1
+    CameraFamily("camera", CAMERA_PLACES),
+)
+OF_PHOTOGRAPHS: tuple[CameraFamily | ObjectFamily, ...] = (
+    *CAMERA_FAMILIES,
+    ObjectFamily("strain", STRAIN_PLACES),
+    ObjectFamily("bending", BENDING_PLACES),
+)
+HELD, GIVEN = InteriorFamily("held"), InteriorFamily("given", of_given=True)
+FORMAT = FormatFamily("format")
+MOVED, SHIFTED = PointFamily("moved", together=False), PointFamily("shifted", together=True)
