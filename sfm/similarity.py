@@ -113,6 +113,23 @@ def similarity_motions(xyz: FloatArray, *, centre: FloatArray, size: float = 1.0
     return np.concatenate([shift, -skew(x) / size, x[:, :, None] / size], axis=2)
 
 
+def without_motions(xyz: FloatArray, away: FloatArray) -> FloatArray:
+    """Return displacements of points without what a small similarity takes of them, (n, 3, q).
+
+    Args:
+        xyz: points, (n, 3); NaN where one is not known.
+        away: their displacements, (n, 3, q).
+    """
+    known = np.isfinite(xyz).all(axis=1)
+    X = xyz[known]
+    centre = X.mean(axis=0)
+    G = similarity_motions(X, centre=centre, size=float(np.abs(X - centre).max())).reshape(-1, 7)
+    flat = away[known].reshape(3 * len(X), -1)
+    left = np.zeros_like(away)
+    left[known] = (flat - G @ np.linalg.lstsq(G, flat, rcond=None)[0]).reshape(len(X), 3, -1)
+    return left
+
+
 def mean_distance(xyz: FloatArray) -> float:
     """Return the root mean square distance of points (n, 3) from their centroid."""
     return float(np.sqrt(((xyz - xyz.mean(axis=0)) ** 2).sum(axis=1).mean()))

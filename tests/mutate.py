@@ -36,6 +36,7 @@ ROOMS: dict[str, tuple[str, ...]] = {  # module or package, with the tests that 
         "tests/adjustment/test_columns.py",
         "tests/adjustment/test_rejections.py",
         "tests/adjustment/test_families.py",
+        "tests/adjustment/test_unchecked_assumptions.py",
         "tests/adjustment/test_hypotheses.py",
     ),
     "sfm/remarks/kind.py": ("tests/remarks",),

@@ -18,7 +18,7 @@ from sfm.adjustment.hypotheses.columns import (
     object_fields,
 )
 from sfm.adjustment.hypotheses.families import GIVEN
-from sfm.adjustment.hypotheses.hypotheses import contradicted_parameters, judge_alternatives
+from sfm.adjustment.hypotheses.hypotheses import Judged, contradicted_parameters, judge_alternatives
 from sfm.adjustment.hypotheses.rejections import explain_rejections
 from sfm.adjustment.hypotheses.score import gain_of, log_f_sf, log_probability, reduce_adjustment
 from sfm.adjustment.result import Adjustment
@@ -155,7 +155,7 @@ def causes_of(kind: str, number: int) -> tuple[str, ...]:
     """Return the kinds of the remarks, but for notes, on a planted network."""
     one = planted(kind, number)
     a = solved(one.network, one.start)
-    found: tuple[Remark, ...] = (*judge_alternatives(a), *explain_rejections(a))
+    found: tuple[Remark, ...] = (*judge_alternatives(a).causes, *explain_rejections(a))
     return kinds_of(found)
 
 
@@ -206,7 +206,7 @@ def test_a_point_that_moved_far_is_named_with_its_distance(distance: float) -> N
         at = truth.cameras[0], truth.position[i], truth.rotation[i]
         xy[k] += (project(*at, place[None]) - project(*at, truth.points[j : j + 1]))[0]
     a = solved(replace(network, image_points=replace(seen, xy=xy)), truth)
-    found = [*judge_alternatives(a, unit="m"), *explain_rejections(a, unit="m")]
+    found = [*judge_alternatives(a, unit="m").causes, *explain_rejections(a, unit="m")]
     assert kinds_of(found) == ("points_moved",)
     assert found[0].names("points") == ("8",)
     assert found[0].number("distance") == pytest.approx(distance, rel=0.1)
@@ -232,14 +232,14 @@ def given_c(by: float, sigma: float = 2e-3) -> Adjustment:
 
 def test_a_given_parameter_that_is_wrong_is_named_with_what_fits() -> None:
     a = given_c(0.2)
-    (found,) = judge_alternatives(a)
+    (found,) = judge_alternatives(a).causes
     assert found.kind == "given_parameter" and found.names("parameters") == ("c",)
     assert found.number("value") == pytest.approx(float(a.network.interior.value[0]))
     free = solved(replace(a.network, interior=InteriorObservations()), a.estimate)
     assert found.number("instead_of") == pytest.approx(
         float(free.estimate.cameras[0].parameters[0]), abs=1e-4
     )
-    assert judge_alternatives(given_c(0.002)) == ()  # a standard deviation
+    assert judge_alternatives(given_c(0.002)).causes == ()  # a standard deviation
 
 
 def test_the_gain_of_a_given_value_is_the_square_of_its_normalized_residual() -> None:
@@ -256,16 +256,16 @@ def test_what_could_not_be_tested_is_remarked() -> None:
     network, truth = make_network(seed_of("two b"), images=2, points=8, free=())
     a = solved(network, truth, "none")
     assert a.redundancy == 3
-    (one,) = judge_alternatives(a)
+    one = judge_alternatives(a).unchecked[0]
     assert (one.kind, one.number("needed")) == ("photographs_untested", 4)
-    assert kinds_of(judge_alternatives(replace(a, redundancy=1))) == ("assumptions_untested",)
-    assert judge_alternatives(replace(a, sigma0=0.0)) == ()
+    assert kinds_of(judge_alternatives(replace(a, redundancy=1)).unchecked) == ("assumptions_untested",)
+    assert judge_alternatives(replace(a, sigma0=0.0)) == Judged()
 
 
 @pytest.mark.slow
 def test_a_sample_of_a_large_network_names_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     one = planted("growth", 28)
     a = solved(one.network, one.start)
-    whole = judge_alternatives(a)
+    whole = judge_alternatives(a).causes
     monkeypatch.setattr("sfm.adjustment.hypotheses.hypotheses.MAX_IMAGE_POINTS", len(a.rejected) // 2)
-    assert kinds_of(judge_alternatives(a))[:1] == kinds_of(whole)[:1]
+    assert kinds_of(judge_alternatives(a).causes)[:1] == kinds_of(whole)[:1]

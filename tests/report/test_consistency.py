@@ -50,7 +50,7 @@ def _false_alarms(runs: int) -> Counter[str]:
         )
         a = _solved(network, truth, "tau" if k % 2 else "none")
         found = consistency_of(a)
-        count["cause"] += bool(judge_alternatives(a))
+        count["cause"] += bool(judge_alternatives(a).causes)
         count["large"] += bool(found.large)
         count["uneven"] += found.uneven is not None
     return count

@@ -40,6 +40,7 @@ from sfm.adjustment.hypotheses.score import (
 from sfm.adjustment.result import Adjustment
 from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.distortion.models import Role
+from sfm.distributions import chi2_isf
 
 ALPHA = 0.01  # probability of naming any alternative where none holds
 MIN_GROUP = 2  # photographs on each side of a split
@@ -66,6 +67,27 @@ def alternatives_of(a: Adjustment, reduced: Reduced, columns: Columns) -> tuple[
 def is_significant(one: Alternative, rows: int) -> bool:
     """Return whether chance makes so large a gain in fewer than ALPHA of the surveys, all rows together."""
     return bool(one.log_p < np.log(ALPHA / rows) - one.search)
+
+
+def needed_gain(rank: int, touched: int, search: float, rows: int) -> float:
+    """Return the gain from which an alternative is named, of a known variance factor.
+
+    Args:
+        rank: parameters of the alternative.
+        touched: image points that they move.
+        search: ln of the number of patterns from which it was taken.
+        rows: alternatives that are tested.
+    """
+    level = np.exp(np.log(ALPHA / rows) - search)
+    return float(max(chi2_isf(level, rank), 2 * (_price(rank, touched, search) + np.log(1 / ALPHA))))
+
+
+def _price(rank: int, touched: int, search: float) -> float:
+    """Return what parameters must gain in ln likelihood, by the number of image points that they move.
+
+    Source: Kass and Raftery (1995), J. Am. Stat. Assoc. 90, on the n of the Bayesian information criterion.
+    """
+    return float(rank / 2 * np.log(2 * max(touched, 2)) + search)
 
 
 @dataclass(frozen=True)
@@ -96,11 +118,7 @@ def _made(
     points: IntArray | None = None,
     parameters: tuple[tuple[int, int], ...] = (),
 ) -> Alternative:
-    """Return an alternative with its test.
-
-    The price of a parameter is that of the image points that it moves (Kass and Raftery 1995, J. Am. Stat.
-    Assoc. 90, on the n of the Bayesian information criterion).
-    """
+    """Return an alternative with its test."""
     r = reduced.redundancy
     on = factor[reduced.image] != 0
     some = np.zeros(0, dtype=np.int64) if points is None else points
@@ -118,7 +136,7 @@ def _made(
             evidence = min(evidence, spread.redundancy / 2 * np.log1p(f * gain.rank / spread.redundancy))
         else:
             evidence = log_likelihood_gain(gain.value / over, r)
-    price = gain.rank / 2 * np.log(2 * max(touched, 2)) + search
+    price = _price(gain.rank, touched, search)
     return Alternative(
         *(family, pattern, factor, gain, log_p, price, search, evidence - price), some, parameters
     )

@@ -25,6 +25,7 @@ from sfm.adjustment.hypotheses.score import Gain
 from sfm.adjustment.result import Adjustment
 from sfm.conventions import FloatArray, IntArray
 from sfm.remarks.remark import Quantity
+from sfm.similarity import without_motions
 
 CELLS = 5  # of the format in each direction
 
@@ -157,7 +158,7 @@ class ObjectFamily(OfPhotographs):
     def displaced(self, one: Alternative, points: FloatArray, beta: FloatArray) -> FloatArray:
         """Return how far points are from their mean where photographs differ most, (n, 3)."""
         largest = float(np.abs(one.factor - one.factor.mean()).max())
-        return largest * self._field(points)[0] @ beta
+        return largest * without_motions(points, (self._field(points)[0] @ beta)[:, :, None])[:, :, 0]
 
     def parts(self, one: Alternative, a: Adjustment, beta: FloatArray, unit: str) -> Parts:
         """Return the largest displacement of a point over the size of the object."""
@@ -282,9 +283,10 @@ CAMERA_FAMILIES = (
     CameraFamily("centre", (0, 1, 2, 3)),  # c, x0, y0, K1
     CameraFamily("camera", CAMERA_PLACES),
 )
+STRAIN = ObjectFamily("strain", STRAIN_PLACES)
 OF_PHOTOGRAPHS: tuple[CameraFamily | ObjectFamily, ...] = (
     *CAMERA_FAMILIES,
-    ObjectFamily("strain", STRAIN_PLACES),
+    STRAIN,
     ObjectFamily("bending", BENDING_PLACES),
 )
 HELD, GIVEN = InteriorFamily("held"), InteriorFamily("given", of_given=True)

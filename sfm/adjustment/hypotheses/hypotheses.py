@@ -25,6 +25,7 @@ from sfm.adjustment.hypotheses.columns import columns_of
 from sfm.adjustment.hypotheses.families import HELD, Alternative
 from sfm.adjustment.hypotheses.refit import Refit, refit
 from sfm.adjustment.hypotheses.score import reduce_adjustment
+from sfm.adjustment.hypotheses.unchecked import unchecked_assumptions
 from sfm.adjustment.quality.reliability import FALSE_ALARM, level_of_single
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
@@ -58,33 +59,37 @@ class Cause:
     as_well: tuple[Alternative, ...]  # other causes that explain the image points about as well
 
 
-def judge_alternatives(final: Adjustment, *, unit: str = "") -> tuple[Remark, ...]:
-    """Return what the image points say against the assumptions of an adjustment, the clearest first.
+@dataclass(frozen=True)
+class Judged:
+    """What the image points say of the assumptions of an adjustment."""
+
+    causes: tuple[Remark, ...] = ()  # of what contradicts them, the clearest first
+    unchecked: tuple[Remark, ...] = ()  # on assumptions that are not tested, or weakly
+
+
+def judge_alternatives(final: Adjustment, *, unit: str = "") -> Judged:
+    """Return what the image points say against the assumptions of an adjustment.
 
     Args:
         final: a finished adjustment with its covariance.
         unit: object unit, for the remarks.
-
-    Returns:
-        The remarks; one of them says so where assumptions could not be tested.
     """
     photographs = final.network.images
     if not final.converged or not final.sigma0 > 0:
-        return ()  # no result, or one that nothing contradicts
+        return Judged()  # no result, or one that nothing contradicts
     if len(photographs) > MAX_PHOTOGRAPHS:
-        return (remark("too_many_to_test", photographs=photographs),)
+        return Judged(unchecked=(remark("too_many_to_test", photographs=photographs),))
     plain = free_network(final)
     if plain is None:
-        return (remark("assumptions_untested"),)
+        return Judged(unchecked=(remark("assumptions_untested"),))
     try:
-        causes = find_causes(plain)
+        causes, unchecked = find_causes(plain), unchecked_assumptions(plain)
     except np.linalg.LinAlgError:
-        return (remark("assumptions_untested"),)
-    few = len(photographs) < 2 * MIN_GROUP
-    return (
-        *(remark_of(plain, one, unit) for one in causes),
-        *([remark("photographs_untested", photographs=photographs, needed=2 * MIN_GROUP)] if few else []),
-    )
+        return Judged(unchecked=(remark("assumptions_untested"),))
+    if len(photographs) < 2 * MIN_GROUP:
+        few = remark("photographs_untested", photographs=photographs, needed=2 * MIN_GROUP)
+        unchecked = (few, *unchecked)
+    return Judged(tuple(remark_of(plain, one, unit) for one in causes), unchecked)
 
 
 def remark_of(plain: Adjustment, cause: Cause, unit: str) -> Remark:

@@ -90,8 +90,14 @@ class Reduced:
 
     def project(self, D: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return H (q, q), g (q,) and the squares (q,) of whitened columns (k, 2, q)."""
-        H, g, squares, _ = self._eliminated(D)
-        return H, g, squares
+        return self._eliminated(D)[:3]
+
+    def shifts(self, D: FloatArray) -> FloatArray:
+        """Return by how much object points shift where whitened columns (k, 2, q) are in the image points.
+
+        The shifts (n, 3, q) are those of a network that knows nothing of the columns.
+        """
+        return self._eliminated(D)[4]
 
     def scores(self, direction: FloatArray, step: FloatArray) -> FloatArray:
         """Return what each photograph adds to the slope along a direction, after a step, (m,).
@@ -100,12 +106,12 @@ class Reduced:
             direction: whitened effect on the image points, (k, 2).
             step: whitened effect of what was changed, (k, 2).
         """
-        *_, left = self._eliminated(np.stack([direction, step], axis=2))
+        left = self._eliminated(np.stack([direction, step], axis=2))[3]
         slope = ((self.v + left[:, :, 1]) * left[:, :, 0]).sum(axis=1)
         return np.asarray(np.bincount(self.image, slope, minlength=self.photographs), dtype=float)
 
-    def _eliminated(self, D: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Return H, g and squares of whitened columns, and the columns less what all unknowns take."""
+    def _eliminated(self, D: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
+        """Return H, g and squares of whitened columns, what unknowns leave of them, and shifts of points."""
         n, q = len(self.L), D.shape[2]
         C = np.zeros((n, 3, q))
         np.add.at(C, self.point, np.swapaxes(self.B, 1, 2) @ D)
@@ -121,7 +127,7 @@ class Reduced:
         left = D - self.B @ by_points[self.point]
         left -= self.A[:, :, :6] @ by_cameras[: 6 * m].reshape(m, 6, q)[self.image]
         left -= self.A[:, :, 6:] @ by_cameras[6 * m :]
-        return H, g, squares, left
+        return H, g, squares, left, by_points
 
     def _by_cameras(self, D: FloatArray) -> FloatArray:
         """Return A'D, (a, q)."""

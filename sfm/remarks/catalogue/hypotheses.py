@@ -108,6 +108,22 @@ ROWS = (
         "Take more photographs.",
     ),
     Kind(
+        "weakly_tested",
+        "note",
+        "The tests may miss {assumptions} that {assumptions:shifts|shift} coordinates by up to {sigmas} "
+        "standard deviations.",
+        "few photographs, or all from about the same directions",
+        "Take more photographs from more directions, some of them rolled by 90 degrees.",
+    ),
+    Kind(
+        "held_weakly_tested",
+        "note",
+        "The tests may miss errors of the held {parameters} of camera {camera} that shift coordinates by up "
+        "to {sigmas} standard deviations.",
+        "the exterior orientation of the photographs takes up what the parameters do",
+        "Calibrate the camera, or take more photographs from more directions and add the parameters to free.",
+    ),
+    Kind(
         "two_places",
         "warning",
         "Point {point} is at a second place in {photographs}, {distance} away "

@@ -127,7 +127,7 @@ def solve_survey(survey: Survey, matched: Correspondences) -> Solution:
     told = left_out if survey.tie_points is None else _among(left_out, whole, start.known)
     given = final.datum == "control" or len(final.network.scale_bars) or len(final.network.control) >= 2
     unit = survey.unit if given else NO_SCALE
-    causes = judge_alternatives(final, unit=unit)
+    judged = judge_alternatives(final, unit=unit)
     return Solution(
         final,
         solved.check,
@@ -136,9 +136,10 @@ def solve_survey(survey: Survey, matched: Correspondences) -> Solution:
             *start.remarks,
             *solved.remarks,
             *_remarks(start.task.survey, told, len(whole.points), final),
-            *causes,
+            *judged.causes,
+            *judged.unchecked,
             *explain_rejections(final, unit=unit),
-            *contradicted(solved.c_held, causes),
+            *contradicted(solved.c_held, judged.causes),
         ),
         left_out,
         unused_image_points(whole, settled.images, np.isin(whole.points, final.network.points)),

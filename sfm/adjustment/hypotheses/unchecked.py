@@ -1,0 +1,108 @@
+"""How wrong an assumption may be before the tests name it: external reliability of alternatives.
+
+Parameters b of an alternative have the noncentrality b'Hb and shift coordinates by E b. Where lambda is the
+noncentrality that the tests find with 80 % probability, a coordinate of standard deviation s with the row e
+of E shifts by up to sqrt(lambda e H^-1 e') / s before.
+
+Source: Baarda (1968), A testing procedure for use in geodetic networks (external reliability); Foerstner and
+Wrobel (2016), Photogrammetric Computer Vision, sec. 4.6.4.2.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterator
+
+import numpy as np
+from scipy.special import chndtrinc
+
+from sfm.adjustment.hypotheses.alternatives import MIN_GROUP, interiors, needed_gain
+from sfm.adjustment.hypotheses.columns import Columns, columns_of
+from sfm.adjustment.hypotheses.families import CAMERA_FAMILIES, HELD, STRAIN, Alternative
+from sfm.adjustment.hypotheses.score import DETERMINED, Gain, Reduced, reduce_adjustment
+from sfm.adjustment.result import Adjustment
+from sfm.remarks.remark import Remark, remark
+from sfm.similarity import without_motions
+
+POWER = 0.80  # with which a detectable error is found; Baarda (1968)
+UNCHECKED = 5.0  # standard deviations by which an error may shift coordinates before it is found
+
+
+ROWS = 30  # alternatives among which the level is shared: families by patterns, and held parameters
+
+
+def unchecked_assumptions(a: Adjustment) -> tuple[Remark, ...]:
+    """Return which assumptions the tests hardly check, with the shift that an error may cause unnoticed.
+
+    Args:
+        a: adjustment of the image points alone, with its covariance.
+
+    Raises:
+        numpy.linalg.LinAlgError: the network is not determined.
+    """
+    columns = columns_of(a)
+    reduced = reduce_adjustment(a, columns)
+    found: dict[str, float] = {}
+    parameters: dict[str, dict[str, float]] = defaultdict(dict)
+    for one in _typical(a, reduced):
+        reach = reach_of(one, a, reduced, columns)
+        if not reach > UNCHECKED:
+            continue
+        if one.family is HELD:
+            index, s = one.parameters[0]
+            camera = a.estimate.cameras[index]
+            parameters[camera.group_of(s) or camera.name][camera.names[s]] = reach
+        else:
+            found[one.kind] = max(reach, found.get(one.kind, 0.0))
+    held = [
+        remark("held_weakly_tested", camera=camera, parameters=tuple(some), sigmas=max(some.values()))
+        for camera, some in parameters.items()
+    ]
+    if found:
+        held.append(remark("weakly_tested", assumptions=tuple(found), sigmas=max(found.values())))
+    return tuple(held)
+
+
+def _typical(a: Adjustment, reduced: Reduced) -> Iterator[Alternative]:
+    """Return each held parameter, and a change of the camera and a strain of the object half way through.
+
+    Not a bending: the worst of its 18 directions is the shape of no object.
+    """
+    yield from (one for one in interiors(a, reduced, HELD) if len({s for _, s in one.parameters}) == 1)
+    m = reduced.photographs
+    if m < 2 * MIN_GROUP:
+        return
+    half = (np.arange(m) >= m // 2).astype(float)
+    search = np.log(m - 2 * MIN_GROUP + 1)
+    nothing = Gain(0.0, 0, np.zeros(0))
+    for family in (*CAMERA_FAMILIES, STRAIN):
+        yield Alternative(family, "split", half, nothing, 0.0, 0.0, search, 0.0)
+
+
+def reach_of(one: Alternative, a: Adjustment, reduced: Reduced, columns: Columns) -> float:
+    """Return by how much coordinates shift at most before an alternative is named, in standard deviations.
+
+    Args:
+        one: the alternative.
+        a: the adjustment.
+        reduced: its normal equations.
+        columns: its derivatives.
+    """
+    D = reduced.whiten(one.columns(a, columns))
+    H, _, squares = reduced.project(D)
+    scale = np.where(squares > 0, 1 / np.sqrt(np.where(squares > 0, squares, 1.0)), 0.0)
+    values, vectors = np.linalg.eigh(H * scale[:, None] * scale)
+    rank = int((values > DETERMINED).sum())
+    touched = int((D != 0).any(axis=(1, 2)).sum())
+    needed = needed_gain(rank, touched, one.search, ROWS)
+    least = chndtrinc(needed, rank, 1 - POWER)  # noncentrality that is found
+    longest = scale[:, None] * vectors * np.sqrt(least / np.maximum(values, DETERMINED))
+    X = a.estimate.points
+    sigma = np.sqrt(np.diagonal(a.covariance.points, axis1=1, axis2=2))
+    known = np.isfinite(X).all(axis=1) & (sigma > 0).all(axis=1)
+    shifted = without_motions(X, reduced.shifts(D) @ longest)
+    away = np.stack([one.family.displaced(one, X, b) for b in longest.T], axis=2)
+    return max(
+        float((np.linalg.norm(part[known], axis=2) / sigma[known]).max(initial=0.0))
+        for part in (shifted, away)
+    )

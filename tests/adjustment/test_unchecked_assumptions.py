@@ -1,0 +1,118 @@
+"""How far an assumption may be wrong before a test names it: against image points with errors so large."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from sfm.adjustment.datum import Datum
+from sfm.adjustment.hypotheses import families, unchecked
+from sfm.adjustment.hypotheses.alternatives import interiors, needed_gain
+from sfm.adjustment.hypotheses.columns import columns_of, shared_columns
+from sfm.adjustment.hypotheses.score import reduce_adjustment
+from sfm.adjustment.hypotheses.unchecked import reach_of, unchecked_assumptions
+from sfm.adjustment.result import Adjustment
+from sfm.adjustment.solve import adjust
+from sfm.conventions import FloatArray
+from sfm.remarks.remark import kinds_of
+from sfm.similarity import fit_similarity
+from tests.synthetic import make_network, observed_anew, seed_of
+
+
+def adjusted(points: int = 30, images: int = 10, noise_px: float = 0.1) -> Adjustment:
+    network, truth = make_network(
+        seed_of("unchecked"), images=images, points=points, planar=False, free=("c", "x0", "y0")
+    )
+    network = observed_anew(network, truth, noise_px, seed_of("unchecked noise"))
+    return adjust(network, truth, datum=Datum("free"), reject="none")
+
+
+def test_the_gain_that_is_needed_is_that_of_the_test_and_of_the_price() -> None:
+    # 1 parameter, 2 image points: ln 4 / 2 and ln 100 in ln likelihood; the test asks for more with many rows
+    assert needed_gain(1, 2, 0.0, 1) == pytest.approx(np.log(4) + 2 * np.log(100))
+    assert needed_gain(1, 2, 0.0, 10_000) == pytest.approx(stats.chi2.isf(1e-6, 1))
+    assert needed_gain(1, 2, np.log(100), 100) == pytest.approx(
+        max(stats.chi2.isf(1e-6, 1), np.log(4) + 4 * np.log(100))
+    )
+    assert needed_gain(3, 500, 2.0, 30) == pytest.approx(3 * np.log(1000) + 4.0 + 2 * np.log(100))
+    assert (unchecked.POWER, unchecked.UNCHECKED, unchecked.ROWS) == (0.80, 5.0, 30)
+
+
+def shift_of(a: Adjustment, moved_px: FloatArray) -> tuple[float, float]:
+    """Return the shift in standard deviations by a change of the image points, and the gain of v'Pv."""
+    seen = a.network.image_points
+    exact = replace(seen, xy=seen.xy + a.residuals)
+    start = adjust(replace(a.network, image_points=exact), a.estimate, datum=Datum("free"), reject="none")
+    moved = replace(a.network, image_points=replace(exact, xy=exact.xy + moved_px))
+    found = adjust(moved, a.estimate, datum=Datum("free"), reject="none")
+    X, Y = start.estimate.points, found.estimate.points
+    sigma = np.sqrt(np.diagonal(a.covariance.points, axis1=1, axis2=2))
+    away = fit_similarity(Y, X).apply(Y) - X
+    return float((np.abs(away) / sigma).max()), float((found.vPv - start.vPv) / a.sigma0**2)
+
+
+@pytest.mark.parametrize("name", ["K1", "K2", "b1"])
+def test_a_held_parameter_shifts_coordinates_by_its_reach(name: str) -> None:
+    """The found noncentrality is that of 80 %; the shift of one parameter is the reach itself."""
+    a = adjusted()
+    columns = columns_of(a)
+    reduced = reduce_adjustment(a, columns)
+    s = a.estimate.cameras[0].names.index(name)
+    one = next(one for one in interiors(a, reduced, families.HELD) if one.parameters == ((0, s),))
+    reach = reach_of(one, a, reduced, columns)
+    D = shared_columns(a, [(0, s)])[0][:, :, 0]
+    H = float(reduced.project(reduced.whiten(D[:, :, None]))[0][0, 0])
+    needed = needed_gain(1, len(D), 0.0, unchecked.ROWS)
+    least = next(x for x in np.linspace(needed, 2 * needed, 2000) if stats.ncx2.sf(needed, 1, x) > 0.8)
+    shift, gained = shift_of(a, D * np.sqrt(least / H))
+    assert gained == pytest.approx(least, rel=0.02)
+    assert reach == pytest.approx(shift, rel=0.1)
+
+
+def test_the_worst_strain_reaches_as_far_as_its_displacement() -> None:
+    """No direction of the family reaches farther at the same noncentrality, and one nearly as far."""
+    a = adjusted()
+    columns = columns_of(a)
+    reduced = reduce_adjustment(a, columns)
+    one = next(one for one in unchecked._typical(a, reduced) if one.family is families.STRAIN)
+    assert one.factor.tolist() == [0] * 5 + [1] * 5 and one.search == pytest.approx(np.log(7))
+    reach = reach_of(one, a, reduced, columns)
+    D = reduced.whiten(one.columns(a, columns))
+    H = reduced.project(D)[0]
+    needed = needed_gain(5, int((D != 0).any(axis=(1, 2)).sum()), one.search, unchecked.ROWS)
+    least = next(x for x in np.linspace(needed / 2, 2 * needed, 3000) if stats.ncx2.sf(needed, 5, x) > 0.8)
+    sigma = np.sqrt(np.diagonal(a.covariance.points, axis1=1, axis2=2))
+    rng, farthest = seed_of("directions"), 0.0
+    for _ in range(3000):
+        beta = rng.standard_normal(5)
+        beta *= np.sqrt(least / (beta @ H @ beta))
+        away = np.abs(one.family.displaced(one, a.estimate.points, beta)) / sigma
+        farthest = max(farthest, float(away.max()))
+    assert 0.8 * reach < farthest < 1.01 * reach
+
+
+def test_weak_networks_say_what_they_cannot_test_and_strong_ones_nothing() -> None:
+    assert unchecked_assumptions(adjusted(points=80, images=16)) == ()
+    weak = unchecked_assumptions(adjusted(points=12, images=5))
+    assert "weakly_tested" in kinds_of(weak)
+    for one in weak:
+        assert one.severity == "note" and one.number("sigmas") > 5
+    few = unchecked_assumptions(adjusted(points=9, images=3))
+    assert set(kinds_of(few)) <= {"held_weakly_tested"}  # of three photographs none is a part
+
+
+def test_distortion_bends_what_is_photographed_from_one_side() -> None:
+    """Three photographs of a plane do not show K1; x0, as good as their angles, shifts nothing either."""
+    network, truth = make_network(seed_of("one side"), images=3, points=15, planar=True, free=())
+    rotation = np.tile(truth.rotation[0], (3, 1, 1))
+    position = truth.position[0] + np.array([[0.0, 0, 0], [0.3, 0, 0], [0, 0.3, 0]])
+    truth = replace(truth, rotation=rotation, position=position)
+    network = observed_anew(network, truth, 0.1, seed_of("one side noise"))
+    a = adjust(network, truth, datum=Datum("free"), reject="none")
+    found = unchecked_assumptions(a)
+    assert kinds_of(found) == ("held_weakly_tested",)
+    assert found[0].names("camera") == ("camera 1",)
+    assert "K1" in found[0].names("parameters") and "x0" not in found[0].names("parameters")
