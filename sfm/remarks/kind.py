@@ -6,6 +6,7 @@ A sentence is a text with fields in braces, one for each part of the remark:
     {points:point}          "3 points"             {count:point}         the same of a number
     {points:is|are}         by the count           {count:is|are}        the same of a number
     {change:+}              with its sign          {share:%}             100 times, with %
+    {of:@}                  nouns by their keys    {given:@bar}          of others "bar 1 - 2"
 
 What stands in [[ ]] appears only if the remark has all parts in it.
 """
@@ -21,6 +22,12 @@ import numpy as np
 from sfm.display import listed
 from sfm.remarks.remark import SEVERITIES, Quantity, Remark, Severity
 
+NOUNS = {  # what a remark may be of, by the names in its data
+    "bars": "the scale bars",
+    "centres": "the projection centres",
+    "control": "the control points",
+    "lengths": "the given lengths",
+}
 FIELD = re.compile(r"\{(\w+)(?::([^{}]*))?\}")
 OPTIONAL = re.compile(r"\[\[(.*?)\]\]", re.S)
 
@@ -95,8 +102,13 @@ def _written(parts: Mapping[str, tuple[str, ...] | Quantity], name: str, spec: s
     if spec and spec[0].isalpha():
         return f"{count:,.0f} {spec}{'' if count == 1 else 's'}"
     if not isinstance(part, Quantity):
-        return listed(part)
+        return listed(_nouns(part, spec[1:]) if spec else part)
     return _number(part, spec)
+
+
+def _nouns(names: tuple[str, ...], other: str) -> list[str]:
+    """Return the nouns of names, and the names that have none behind another noun."""
+    return [NOUNS.get(name) or f"{other} {name}".lstrip() for name in names]
 
 
 def _number(one: Quantity, spec: str) -> str:

@@ -382,3 +382,43 @@ def test_mirrored_points_state_what_was_wrong_as_given() -> None:
     assert right is not None and not right.mirrored and right.judgement.fits
     np.testing.assert_allclose(right.placing.apply(one.free), one.given, atol=1e-9)
     assert judge_points(one.select(np.arange(2)), 0.001) is None
+
+
+@pytest.mark.parametrize(
+    ("numbers", "step"),
+    [
+        ([0.125, 2.5], 1e-3),
+        ([1234567.1, 5.0], 0.1),
+        ([0.12345678, 0.5], 1e-8),
+        ([0.123456789, 0.5], 0.0),
+        ([3.0, 5.0], 0.0),
+        ([0.1, 0.25 + 9e-9], 1e-2),
+        ([0.1, 0.25 + 1.1e-8], 0.0),
+        ([np.pi, 0.5], 0.0),
+        ([np.nan, 0.25], 1e-2),
+        ([np.nan], 0.0),
+    ],
+)
+def test_the_last_decimal_place_of_numbers(numbers: list[float], step: float) -> None:
+    assert given_points.decimal_step(np.array(numbers)) == pytest.approx(step, abs=1e-12)
+
+
+def test_rounded_points_are_as_precise_as_their_last_place() -> None:
+    one = exact(5, "rounded")
+    rounded = replace(one, given=np.round(one.given, 4), stated=np.zeros((5, 3, 3))).rounded()
+    np.testing.assert_allclose(rounded.stated, np.tile(1e-8 / 12 * np.eye(3), (5, 1, 1)))
+    assert not one.rounded().stated.any()
+
+
+@pytest.mark.parametrize("estimated", [False, True])
+@pytest.mark.parametrize("far", [0.0, 1e6])
+def test_points_without_noise_fit(estimated: bool, far: float) -> None:
+    """Differences of 1e-16 and covariances of a network whose residuals are 1e-13 px: ratios of rounding."""
+    one = exact(7, "without noise")
+    one = replace(one, given=one.given + far, stated=np.zeros((7, 3, 3)), joint=1e-30 * np.eye(21))
+    found = judge_points(one, 0.001, estimated=estimated)
+    assert found is not None and found.judgement.fits and found.judgement.statistic < 14  # on average
+    given = one.given.copy()
+    given[3, 1] += 1e-6 if far == 0 else 1e-2
+    wrong = judge_points(replace(one, given=given), 0.001, estimated=estimated)
+    assert wrong is not None and wrong.judgement.wrong == (3,)

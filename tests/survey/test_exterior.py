@@ -245,6 +245,21 @@ def test_a_projection_centre_that_does_not_fit_is_left_out(tmp_path: Path) -> No
     assert farthest(error, result.adjustment.covariance.points) < stats.chi2.ppf(1 - ANY, 3)
 
 
+def test_exchanged_projection_centres_are_exchanged_again(tmp_path: Path) -> None:
+    """They were found, and took part as they were given."""
+    path, truth = written(tmp_path, "exchanged centres")
+    head, *rows = (tmp_path / "exterior.csv").read_text().splitlines()
+    cells = [row.split(",", 1) for row in rows]
+    cells[1][0], cells[4][0] = cells[4][0], cells[1][0]
+    (tmp_path / "exterior.csv").write_text("\n".join([head, *map(",".join, cells)]), encoding="utf-8")
+    result = solved(path)
+    (said,) = (one for one in remarks_on_given(result) if one.severity != "note")
+    assert (said.kind, said.names("of")) == ("given_exchanged", ("centres",))
+    assert sorted(said.names("given")) == sorted([cells[1][0], cells[4][0]])
+    error = result.estimate.points - truth_of(result.adjustment, truth)
+    assert farthest(error, result.adjustment.covariance.points) < stats.chi2.ppf(1 - ANY, 3)
+
+
 def test_its_redundancy_is_that_of_the_variance_components(tmp_path: Path) -> None:
     path, _ = written(tmp_path, "redundancy")
     result = solved(path)

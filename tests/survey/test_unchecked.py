@@ -34,7 +34,7 @@ def test_the_scale_of_one_bar_is_unchecked() -> None:
     network, truth = _scene("one bar")
     one = run_survey(survey_of(network, truth, scale_bars=(_bar(truth, 0, 9),)))
     (said,) = remarks_on_given(one)
-    assert (said.kind, said.names("given")) == ("scale_unchecked", ("bar 1 - 10",))
+    assert (said.kind, said.names("given")) == ("scale_unchecked", ("1 - 10",))
     assert findings_of(one).verdict.level == "good"
     assert _kinds(network, truth, scale_bars=(_bar(truth, 0, 9), _bar(truth, 1, 8))) == ("good", ())
 
@@ -44,7 +44,7 @@ def test_of_a_bar_that_a_far_worse_one_checks_an_error_may_stay_unnoticed() -> N
     worse = replace(_bar(truth, 1, 8), sigma=2e-3)
     result = run_survey(survey_of(network, truth, scale_bars=(_bar(truth, 0, 9), worse)))
     (said,) = remarks_on_given(result)
-    assert said.kind == "given_weakly_checked" and said.names("given") == ("bar 1 - 10",)
+    assert said.kind == "given_weakly_checked" and said.names("given") == ("1 - 10",)
     assert said.number("sigmas") > 5
 
 
@@ -60,7 +60,7 @@ def test_a_note_begins_at_five_standard_deviations(ratio: float, weak: bool) -> 
     network = observed_anew(network, truth, 0.01, seed_of("two bars noise"))
     found = remarks_on_given(run_survey(survey_of(network, truth, scale_bars=bars, sigma=True)))
     weaker = [one.names("given") for one in found if one.kind == "given_weakly_checked"]
-    assert weaker == ([("bar 1 - 10",)] if weak else [])
+    assert weaker == ([("1 - 10",)] if weak else [])
 
 
 @pytest.mark.parametrize(("scale", "implausible"), [(1 / 540, True), (1 / 270, False)])
@@ -91,11 +91,51 @@ def test_fixed_control_is_held_against_the_free_network() -> None:
         control = KnownPoints.from_arrays(names, xyz)
         result = run_survey(survey_of(network, truth, control=control, datum={"kind": "control"}))
         test = result.given_tests[0]
-        assert (test.what, test.dof) == ("control points", 11)  # 18 coordinates less seven
+        assert (test.what, test.dof) == ("control", 11)  # 18 coordinates less seven
         said = [one for one in remarks_on_given(result) if one.kind == "given_not_exact"]
         assert (test.probability < 0.001) == bool(said) == bool(error)
         scatter = float((xyz - truth.points[:6]).std())
         assert not error or said[0].number("sigma") == pytest.approx(scatter, rel=0.4)
+
+
+@pytest.mark.parametrize(("decimals", "kinds"), [(4, ("given_rounded",)), (None, ())])
+def test_fixed_control_is_as_exact_as_its_decimals(decimals: int | None, kinds: tuple[str, ...]) -> None:
+    """Of a network far more precise than 0.1 mm, without noise even; before, a warning."""
+    network, truth = _scene("decimals")
+    network = observed_anew(network, truth, 0.0, seed_of("no noise"))
+    xyz = truth.points[:8] if decimals is None else np.round(truth.points[:8], decimals)
+    control = KnownPoints.from_arrays([str(k + 1) for k in range(8)], xyz)
+    result = run_survey(survey_of(network, truth, control=control, datum={"kind": "control"}))
+    assert {one.severity for one in remarks_on_given(result)} == {"note"}
+    assert tuple(one for one in kinds_of(remarks_on_given(result)) if one == "given_rounded") == kinds
+    if kinds:
+        said = remarks_on_given(result)[0]
+        assert said.names("of") == ("control",) and said.number("step") == pytest.approx(1e-4)
+        assert said.number("sigma") == pytest.approx(1e-4 / np.sqrt(12))
+    index = [network.point_index(name) for name in result.network.points]
+    assert np.abs(result.estimate.points[index] - truth.points[index]).max() < 5e-5
+
+
+def test_a_wrong_point_among_rounded_control_is_left_out() -> None:
+    network, truth = _scene("decimals")
+    network = observed_anew(network, truth, 0.001, seed_of("little noise"))
+    xyz = np.round(truth.points[:8], 3)
+    xyz[2, 1] += 0.01
+    control = KnownPoints.from_arrays([str(k + 1) for k in range(8)], xyz)
+    result = run_survey(survey_of(network, truth, control=control, datum={"kind": "control"}))
+    kinds = kinds_of(remarks_on_given(result))
+    assert kinds[:2] == ("given_left_out", "given_rounded")
+    assert remarks_on_given(result)[0].names("given") == ("3",)
+
+
+def test_image_points_without_noise_do_not_hide_what_is_given() -> None:
+    """Their weights grew to 1e26 times those of the bars, and the adjustment did not converge."""
+    network, truth = _scene("no noise and bars")
+    network = observed_anew(network, truth, 0.0, seed_of("no noise"))
+    bars = (_bar(truth, 0, 9), replace(_bar(truth, 1, 8), sigma=1.1e-4))
+    result = run_survey(survey_of(network, truth, scale_bars=bars))
+    assert result.adjustment.converged and not result.adjustment.undetermined
+    assert kinds_of(remarks_on_given(result)) == ("given_weakly_checked",)
 
 
 def test_the_level_of_the_test_against_the_free_network() -> None:

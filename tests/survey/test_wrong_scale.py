@@ -36,7 +36,7 @@ def test_of_two_bars_neither_is_believed(factor: float, reject: str) -> None:
     verdict = findings_of(result).verdict
     assert verdict.level == "bad" and result.adjustment.converged
     (said,) = remarks_on_given(result)
-    assert said.kind == "scale_contradicted" and said.names("given") == ("bar 1 - 11", "bar 2 - 12")
+    assert said.kind == "scale_contradicted" and said.names("given") == ("1 - 11", "2 - 12")
     assert said.number("off") == pytest.approx(100 * (max(factor, 1 / factor) - 1), rel=0.01)
     assert said.number("unit_factor") == (factor if factor > 2 else 10) or factor == 1.02
     assert len(result.network.scale_bars) == 0 and not result.has_scale
@@ -112,7 +112,7 @@ def test_control_that_is_too_large_for_both_bars_is_bad(reject: str) -> None:
     result = run_survey(survey)
     (said,) = (one for one in remarks_on_given(result) if one.severity != "note")
     assert said.kind == "scale_contradicted" and said.number("off") == pytest.approx(1.0, rel=0.1)
-    assert said.names("given") == ("bar 1 - 11", "bar 2 - 12", "the control")
+    assert said.names("given") == ("1 - 11", "2 - 12", "control")
     assert findings_of(result).verdict.level == "bad"
 
 

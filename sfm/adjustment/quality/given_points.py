@@ -23,6 +23,8 @@ MAX_TRIPLES = (
     300  # similarities by three points that are tried: with half of them right, 37 are by three such
 )
 RELINEARISED = 3
+MAX_DECIMALS = 8  # of coordinates; more are those of computed ones
+SAME_DECIMAL = 1e-6  # by which a number in its last place may differ from a whole one, by its binary rounding
 ROUNDING = 16 * np.finfo(float).eps  # of coordinates after a similarity, over the largest of them
 
 
@@ -56,6 +58,14 @@ class GivenPoints:
             free=self.free[some],
             joint=self.joint[np.ix_(rows, rows)],
         )
+
+    def rounded(self) -> GivenPoints:
+        """Return them with the standard deviations that rounding to their last decimal place gives.
+
+        Source: Foerstner and Wrobel (2016), sec. 2.3 (uniform distribution).
+        """
+        variance = decimal_step(self.given) ** 2 / 12
+        return replace(self, stated=np.broadcast_to(variance * np.eye(3), self.stated.shape))
 
     def mirrored(self) -> GivenPoints:
         """Return them with the free network mirrored."""
@@ -102,6 +112,17 @@ class GivenPoints:
         rotation = R @ placing.rotation
         shift = centre + dx[:3] + scale * R @ (placing.translation - centre)
         return Similarity(scale * placing.scale, rotation, shift)
+
+
+def decimal_step(numbers: FloatArray) -> float:
+    """Return the unit of the last decimal place of numbers; 0 of whole ones and of computed ones."""
+    known = numbers[np.isfinite(numbers)]
+    if np.abs(known - np.rint(known)).max(initial=0.0) < SAME_DECIMAL:
+        return 0.0  # whole numbers may be nominal ones
+    steps = 10.0 ** -np.arange(1, MAX_DECIMALS + 1)
+    return next(
+        (s for s in steps.tolist() if np.abs(known / s - np.rint(known / s)).max() < SAME_DECIMAL), 0.0
+    )
 
 
 def _centre_and_size(X: FloatArray) -> tuple[FloatArray, float]:

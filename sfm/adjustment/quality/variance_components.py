@@ -22,6 +22,9 @@ from sfm.camera import camera_families
 from sfm.conventions import BoolArray, FloatArray, IntArray
 
 SETTLED = 1e-3  # relative change of a variance component at which its estimation ends
+MIN_FACTOR = (
+    1e-4  # on stated standard deviations: image points without noise, whose weight would hide all others
+)
 MAX_ROUNDS = 20
 FEW = 1.0  # redundancy of a group of image points below which its variance component is not estimated
 IMAGE_POINTS = "image points"
@@ -176,6 +179,7 @@ def estimate_components(
     for _ in range(MAX_ROUNDS):
         found = _components(adjustment, adjustment.image_covariance, group, names, few=FEW).sigma0
         found = np.where(np.isfinite(found) & (found > 0), found, 1.0)
+        found = np.maximum(found, MIN_FACTOR / factor)
         if np.abs(found - 1).max() <= SETTLED:
             return adjustment, factor, True
         factor = factor * found

@@ -21,15 +21,15 @@ ROWS = (
     Kind(
         "scale_contradicted",
         "error",
-        "No dependable scale: {given} contradict one another by {off}, {sigmas} standard deviations[[, the "
-        "factor {unit_factor} of another unit]].",
+        "No dependable scale: {given:@bar} contradict one another by {off}, {sigmas} standard deviations[[, "
+        "the factor {unit_factor} of another unit]].",
         CHECK_THE_LIST,
         "Check these lengths and their unit; a third length shows which one is wrong.",
     ),
     Kind(
         "given_left_out",
         "warning",
-        "Of the {what}, {given} {given:does|do} not fit the network of the image points, by up to "
+        "Of {of:@}, {given} {given:does|do} not fit the network of the image points, by up to "
         "{distance}, {sigmas} standard deviations: {given:it was|they were} left out.",
         CHECK_THE_LIST,
         "Correct these coordinates or remove them.",
@@ -37,16 +37,16 @@ ROWS = (
     Kind(
         "given_contradicted",
         DETECTED,
-        "The {what} contradict one another (chi-square {chi2}, {dof} degrees of freedom): {given} may be "
+        "Some of {of:@} contradict one another (chi-square {chi2}, {dof} degrees of freedom): {given} may be "
         "wrong[[, and shift coordinates by up to {shift} standard deviations]].",
         CHECK_THE_LIST,
         "Check these coordinates; more given points show which one is wrong.",
     ),
     Kind(
-        "control_exchanged",
+        "given_exchanged",
         "warning",
-        "Control points {points} have one another's coordinates: they were exchanged.",
-        "two names exchanged in the list of control or in the photographs",
+        "Of {of:@}, {given} have one another's coordinates: they were exchanged.",
+        "two names exchanged in the list of given coordinates or in the photographs",
         "Exchange the two names.",
     ),
     Kind(
@@ -59,7 +59,7 @@ ROWS = (
     Kind(
         "given_sigmas",
         "warning",
-        "The standard deviations stated for the {what} are {factor} times too small[[: the adjustment used "
+        "The standard deviations stated for {of:@} are {factor} times too small[[: the adjustment used "
         "{used} times the stated ones]].",
         "standard deviations of another unit or of the instrument alone, or points that moved",
         "State standard deviations that the differences at these points confirm.",
@@ -67,10 +67,18 @@ ROWS = (
     Kind(
         "given_not_exact",
         "warning",
-        "The {what} held fixed differ by {sigma} in a coordinate from the network of the image points; the "
+        "Coordinates of {of:@}, held fixed, differ by {sigma} from the network of the image points; the "
         "standard deviations of the result do not contain this.",
         "coordinates of a drawing or a print, or points that moved",
         "State the standard deviations of these coordinates.",
+    ),
+    Kind(
+        "given_rounded",
+        "note",
+        "The rounding of {of:@} to {step} exceeds what the network allows: they took part with its standard "
+        "deviation, {sigma}.",
+        "coordinates printed with few decimals",
+        "Give more decimals, or the standard deviations of these coordinates.",
     ),
     Kind(
         "given_differs",
@@ -98,21 +106,21 @@ ROWS = (
     Kind(
         "scale_unchecked",
         "note",
-        "The scale rests on {given} alone: nothing checks it.",
+        "The scale rests on {given:@bar} alone: nothing checks it.",
         "one length or one source of lengths",
         "Add a scale bar of another origin.",
     ),
     Kind(
         "given_unchecked",
         "note",
-        "Of the {what}, nothing checks {given}.",
+        "Of {of:@}, nothing checks {given:@}.",
         "as many given values as the datum needs",
         "Add control or scale bars.",
     ),
     Kind(
         "given_weakly_checked",
         "note",
-        "Of the {what}, {given} {given:is|are} weakly checked: an error may stay unnoticed and shift the "
+        "Of {of:@}, {given:@} {given:is|are} weakly checked: an error may stay unnoticed and shift the "
         "result by up to {sigmas} of its standard deviations.",
         "few control points or bars, all on one side, or one far more precise than the others",
         "Add control or scale bars.",
@@ -120,7 +128,7 @@ ROWS = (
     Kind(
         "given_not_judged",
         "note",
-        "The image points alone do not determine the network: only residuals check the {what}.",
+        "The image points alone do not determine the network: only residuals check {of:@}.",
         "photographs that only the control connects or calibrates",
         "Add photographs with common points.",
     ),

@@ -54,7 +54,7 @@ def _kinds(statistics: Statistics) -> tuple[Remark, ...]:
     found = statistics.kinds
     level = LEVEL / max(len(found.names) - 1, 1)
     return tuple(
-        remark("given_sigmas", what=test.of, factor=float(found.sigma0[g]))
+        remark("given_sigmas", of=test.of, factor=float(found.sigma0[g]))
         for g, test in enumerate(component_tests(found, alpha=2 * level))
         if test.of != IMAGE_POINTS and found.count[g] > 1 and test.statistic > test.upper
     )

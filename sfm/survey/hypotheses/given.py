@@ -43,7 +43,6 @@ SAME_UNIT = 0.02  # relative difference up to which a factor is that of a unit
 UNCHECKED = 5.0  # standard deviations by which an error that no test finds may shift what rests on it
 PRINT_SIGMA = 0.002  # relative scale of coordinates without standard deviations, as of prints and drawings
 MAX_PLACES = 1000  # given points whose joint covariance is formed; of more, so many are judged
-CONTROL, CENTRES = "control points", "projection centres"
 
 
 @dataclass(frozen=True)
@@ -96,9 +95,9 @@ def judge_given(
         return JudgedGiven(network, datum)
     places = None if free is None or free.redundancy < 1 else _places(network, free, datum)
     if places is None:
-        kinds = (("scale bars", network.scale_bars), ("control", network.control))
-        what = [name for name, some in kinds if len(some)]
-        remarks = (remark("given_not_judged", what=what),) if what else ()
+        kinds = (("bars", network.scale_bars), ("control", network.control))
+        of = [name for name, some in kinds if len(some)]
+        remarks = (remark("given_not_judged", of=of),) if of else ()
         return JudgedGiven(network, datum, remarks)
     return _Judge(network, places, datum, unit, rescale).judged()
 
@@ -152,12 +151,13 @@ def _determines_cameras(marginal: Marginal) -> bool:
 class _Group:
     """Given points of a kind, judged."""
 
-    what: str  # control points or projection centres
+    of: str  # control or centres
     rows: IntArray  # of the kind in the network, (n,)
     names: tuple[str, ...]
     points: GivenPoints
     places: IntArray  # (n,)
     placed: PlacedPoints
+    rounded: bool = False  # whether the standard deviations are those of the rounding
 
     @property
     def out(self) -> tuple[int, ...]:
@@ -193,106 +193,117 @@ class _Judge:
     def _control(self) -> _Group | None:
         """Judge control, and leave out or change what does not fit."""
         control = self.network.control
-        names = tuple(self.network.points[j] for j in control.point)
-        rows = np.array([k for k, name in enumerate(names) if name in self.places.of_point], dtype=np.int64)
-        variance = np.einsum("nii->ni", control.covariance[rows])
-        given = np.where(np.isfinite(variance), control.xyz[rows], np.nan)
-        places = [self.places.of_point[names[k]] for k in rows]
-        group = self._group(
-            CONTROL, rows, tuple(names[k] for k in rows), given, control.covariance[rows], places
-        )
+        names = [self.network.points[j] for j in control.point]
+        group = self._group("control", names, self.places.of_point, control.xyz, control.covariance)
         if group is None:
             return None
-        judgement, placed = group.placed.judgement, group.placed
+        placed = group.placed
         if placed.mirrored:
-            self.remarks.append(
-                remark("control_mirrored", chi2=placed.unmirrored, mirrored=judgement.statistic)
-            )
+            mirrored = placed.judgement.statistic
+            self.remarks.append(remark("control_mirrored", chi2=placed.unmirrored, mirrored=mirrored))
             self.network = replace(self.network, control=ObjectPoints())
             if self.datum.kind == "control" and not len(self.network.exterior):
                 self.datum = Datum("free")
             return group
-        xyz, covariance = control.xyz.copy(), control.covariance.copy()
-        if judgement.exchanged:
-            pair = rows[list(judgement.exchanged)]
-            xyz[pair], covariance[pair] = xyz[pair[::-1]], covariance[pair[::-1]]
-            self.remarks.append(
-                remark("control_exchanged", points=[group.names[k] for k in judgement.exchanged])
-            )
-        covariance[rows] = self._confirmed(group, covariance[rows])
-        keep = np.ones(len(control), dtype=bool)
-        keep[rows[list(group.out)]] = False
+        order, keep, covariance = self._as_judged(group, control.covariance)
         self.network = replace(
-            self.network, control=ObjectPoints(control.point[keep], xyz[keep], covariance[keep])
+            self.network,
+            control=ObjectPoints(control.point[keep], control.xyz[order][keep], covariance[keep]),
         )
         return group
 
     def _centres(self) -> _Group | None:
         """Judge observed projection centres, and leave out or change what does not fit."""
         seen = self.network.exterior
-        names = tuple(self.network.images[i] for i in seen.image)
-        rows = np.array([k for k, name in enumerate(names) if name in self.places.of_image], dtype=np.int64)
-        covariance = seen.covariance[rows][:, :3, :3]
-        given = np.where(np.isfinite(np.einsum("nii->ni", covariance)), seen.position[rows], np.nan)
-        known = np.isfinite(given).any(axis=1)
-        rows, given, covariance = rows[known], given[known], covariance[known]
-        places = [self.places.of_image[names[k]] for k in rows]
-        group = self._group(CENTRES, rows, tuple(names[k] for k in rows), given, covariance, places)
+        names = [self.network.images[i] for i in seen.image]
+        group = self._group("centres", names, self.places.of_image, seen.position, seen.covariance[:, :3, :3])
         if group is None or group.placed.mirrored:
             return None
-        changed = seen.covariance.copy()
-        changed[rows, :3, :3] = self._confirmed(group, covariance)
-        keep = np.ones(len(seen), dtype=bool)
-        keep[rows[list(group.out)]] = False
+        order, keep, of_centres = self._as_judged(group, seen.covariance[:, :3, :3])
+        covariance = seen.covariance[order]
+        covariance[:, :3, :3] = of_centres
         self.network = replace(
             self.network,
             exterior=ExteriorObservations(
-                seen.image[keep], seen.position[keep], seen.angles[keep], changed[keep]
+                seen.image[keep], seen.position[order][keep], seen.angles[order][keep], covariance[keep]
             ),
         )
         return group
 
     def _group(
-        self,
-        what: str,
-        rows: IntArray,
-        names: tuple[str, ...],
-        given: FloatArray,
-        covariance: FloatArray,
-        places: list[int],
+        self, of: str, names: Sequence[str], place_of: dict[str, int], xyz: FloatArray, covariance: FloatArray
     ) -> _Group | None:
         """Judge points of a kind against the free network, and remark what does not fit."""
+        given = np.where(np.isfinite(np.einsum("nii->ni", covariance)), xyz, np.nan)
+        placed_there = np.array([name in place_of for name in names], dtype=bool)
+        rows = np.flatnonzero(placed_there & np.isfinite(given).any(axis=1))
         if not len(rows):
             return None
-        index, coordinates = self.places.at(places)
+        index, coordinates = self.places.at([place_of[names[k]] for k in rows.tolist()])
         points = GivenPoints(
-            given,
-            np.where(np.isfinite(covariance), covariance, 0.0),
+            given[rows],
+            np.where(np.isfinite(covariance[rows]), covariance[rows], 0.0),
             self.places.xyz[index],
             self.places.joint[np.ix_(coordinates, coordinates)],
             self.places.redundancy,
         )
-        estimated = self.datum.kind != "control" and not points.stated.any()
-        start = Similarity(1.0, np.eye(3), np.zeros(3)) if self.datum.kind == "control" else None
-        placed = judge_points(points, self.level, start=start, estimated=estimated)
+        in_datum = self.datum.kind == "control"
+        fixed = not points.stated.any()
+        start = Similarity(1.0, np.eye(3), np.zeros(3)) if in_datum else None
+        placed = judge_points(points, self.level, start=start, estimated=fixed and not in_datum)
         if placed is None:
             return None
-        found = placed.judgement
-        self.tests.append(GivenTest(what, found.statistic, found.dof, found.probability))
+        group = _Group(of, rows, tuple(names[k] for k in rows.tolist()), points, index, placed)
+        if fixed and in_datum and self.rescale and not placed.judgement.fits:
+            group = self._rounded(group, start)
+        found = group.placed.judgement
+        self.tests.append(GivenTest(of, found.statistic, found.dof, found.probability))
         if found.factor != 1.0:
-            stated = points.stated if points.stated.any() else np.broadcast_to(np.eye(3), (len(rows), 3, 3))
+            stated = np.broadcast_to(np.eye(3), points.stated.shape) if fixed else points.stated
             points = replace(points, stated=found.factor**2 * stated)
             fitting = judge_points(points, self.level, start=start)
-            placed = placed if fitting is None else replace(fitting, judgement=found)
-        group = _Group(what, rows, names, points, index, placed)
-        if not placed.mirrored:
-            if found.wrong:
-                self._left_out(group)
-            if found.doubtful:
-                self._doubtful(group)
-            if self.datum.kind == "control":
-                self._unchecked(what, names, placed.model, found.wrong)
+            placed = group.placed if fitting is None else replace(fitting, judgement=found)
+            group = replace(group, points=points, placed=placed)
+        if not group.placed.mirrored:
+            self._remark_group(group)
         return group
+
+    def _rounded(self, group: _Group, start: Similarity | None) -> _Group:
+        """Judge fixed coordinates again, as precise as their decimals, where these explain the misfit."""
+        points = group.points.rounded()
+        placed = judge_points(points, self.level, start=start) if points.stated.any() else None
+        if placed is None or placed.judgement.factor != 1.0 or placed.judgement.doubtful:
+            return group
+        return replace(group, points=points, placed=placed, rounded=True)
+
+    def _remark_group(self, group: _Group) -> None:
+        """Remark what does not fit of points, and what nothing checks."""
+        found = group.placed.judgement
+        if found.exchanged:
+            names = [group.names[k] for k in found.exchanged]
+            self.remarks.append(remark("given_exchanged", of=group.of, given=names))
+        if found.wrong:
+            self._left_out(group)
+        if found.doubtful:
+            self._doubtful(group)
+        if group.rounded:
+            sigma = float(np.sqrt(group.points.stated.max()))
+            step, used = (sigma * np.sqrt(12), self.unit), (sigma, self.unit)
+            self.remarks.append(remark("given_rounded", of=group.of, step=step, sigma=used))
+        if self.datum.kind == "control":
+            self._unchecked(group.of, group.names, group.placed.model, found.wrong)
+
+    def _as_judged(self, group: _Group, covariance: FloatArray) -> tuple[IntArray, BoolArray, FloatArray]:
+        """Return whose coordinates each given point has, which take part, and their covariance, (n, 3, 3)."""
+        order, keep = np.arange(len(covariance)), np.ones(len(covariance), dtype=bool)
+        found = group.placed.judgement
+        if found.exchanged:
+            pair = group.rows[list(found.exchanged)]
+            order[pair] = pair[::-1]
+        keep[group.rows[list(found.wrong)]] = False
+        changed = covariance[order]
+        changed[group.rows] = self._confirmed(group, changed[group.rows])
+        return order, keep, changed
 
     def _left_out(self, group: _Group) -> None:
         model, out = group.placed.model, group.out
@@ -301,7 +312,7 @@ class _Judge:
         self.remarks.append(
             remark(
                 "given_left_out",
-                what=group.what,
+                of=group.of,
                 given=[group.names[k] for k in out],
                 distance=(float(max(sizes)), self.unit),
                 sigmas=float(sigmas),
@@ -317,7 +328,7 @@ class _Judge:
         self.remarks.append(
             remark(
                 "given_contradicted",
-                what=group.what,
+                of=group.of,
                 given=[group.names[k] for k in found.doubtful],
                 chi2=found.statistic,
                 dof=found.dof,
@@ -326,36 +337,36 @@ class _Judge:
         )
 
     def _unchecked(
-        self, what: str, names: Sequence[str], model: GivenModel, without: tuple[int, ...] = ()
+        self, of: str, names: Sequence[str], model: GivenModel, without: tuple[int, ...] = ()
     ) -> None:
         """Remark given values of which nothing, or hardly anything, would find an error."""
         reach = model.external(without)
         nothing = [names[k] for k in np.flatnonzero(np.isinf(reach)).tolist()]
         weak = [names[k] for k in np.flatnonzero(np.isfinite(reach) & (reach > UNCHECKED)).tolist()]
         if nothing:
-            self.remarks.append(remark("given_unchecked", given=nothing, what=what))
+            self.remarks.append(remark("given_unchecked", given=nothing, of=of))
         if weak:
             largest = float(reach[np.isfinite(reach)].max())
-            self.remarks.append(remark("given_weakly_checked", given=weak, what=what, sigmas=largest))
+            self.remarks.append(remark("given_weakly_checked", given=weak, of=of, sigmas=largest))
 
     def _confirmed(self, group: _Group, covariance: FloatArray) -> FloatArray:
         """Return the covariance of given points with which they fit, and remark if it is another one."""
         found, model = group.placed.judgement, group.placed.model
-        fixed = not np.where(np.isfinite(covariance), covariance, 0.0).any()
+        known = np.isfinite(covariance)
+        if group.rounded:
+            return np.where(known, group.points.stated, covariance)
         if not (found.doubtful or found.factor != 1.0) or model.estimated:
             return covariance
+        fixed = not np.where(known, covariance, 0.0).any()
         factor = model.factor()[0] if found.doubtful else found.factor
-        if not found.doubtful:
-            self.remarks.append(
-                remark("given_not_exact", what=group.what, sigma=(factor, self.unit))
-                if fixed
-                else remark(
-                    "given_sigmas", what=group.what, factor=factor, used=factor if self.rescale else None
-                )
-            )
+        if not found.doubtful and fixed:
+            self.remarks.append(remark("given_not_exact", of=group.of, sigma=(factor, self.unit)))
+        elif not found.doubtful:
+            used = factor if self.rescale else None
+            self.remarks.append(remark("given_sigmas", of=group.of, factor=factor, used=used))
         if fixed or not self.rescale:
             return covariance
-        return np.where(np.isfinite(covariance), factor**2 * covariance, covariance)
+        return np.where(known, factor**2 * covariance, covariance)
 
     def _scales(self, control: _Group | None, centres: _Group | None) -> None:
         """Judge the scales of bars, control and projection centres against one another."""
@@ -368,13 +379,13 @@ class _Judge:
             at = [self.places.of_point.get(name, -1) for name in ends]
             if min(at) >= 0 and at[0] != at[1]:
                 scales.append(scale_of_length(bars.length[b], bars.sigma[b], self.places.xyz, at[0], at[1]))
-                names.append(f"bar {ends[0]} - {ends[1]}")
+                names.append(f"{ends[0]} - {ends[1]}")
                 of_bar.append(b)
-        for what, group in (("the control", control), ("the projection centres", centres)):
+        for group in (control, centres):
             found = None if group is None else self._scale_of(group, count)
-            if found is not None:
+            if group is not None and found is not None:
                 scales.append(found)
-                names.append(what)
+                names.append(group.of)
         if not scales:
             return
         model = scale_model(tuple(scales), self.places.joint, self.places.redundancy)
@@ -383,7 +394,7 @@ class _Judge:
         if len(scales) == 1:
             self.remarks.append(remark("scale_unchecked", given=names[0]))
         elif judgement.fits:
-            self._unchecked("given lengths", names, model)
+            self._unchecked("lengths", names, model)
         elif judgement.factor != 1.0:
             self._imprecise_bars(judgement.factor)
         else:
@@ -414,7 +425,7 @@ class _Judge:
     def _imprecise_bars(self, factor: float) -> None:
         """Replace the standard deviations of bars that are too small."""
         used = factor if self.rescale else None
-        self.remarks.append(remark("given_sigmas", what="scale bars", factor=factor, used=used))
+        self.remarks.append(remark("given_sigmas", of="bars", factor=factor, used=used))
         bars = self.network.scale_bars
         self.network = replace(self.network, scale_bars=replace(bars, sigma=(used or 1.0) * bars.sigma))
 
@@ -433,7 +444,7 @@ class _Judge:
                 self.remarks.append(
                     remark(
                         "bar_left_out",
-                        bar=names[k].removeprefix("bar "),
+                        bar=names[k],
                         off=(100 * float(np.expm1(off)), "%"),
                         sigmas=sigmas,
                         unit_factor=_unit_factor(off),
