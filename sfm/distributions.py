@@ -67,3 +67,8 @@ def normal_ppf(probability: Any) -> Any:
 def poisson_sf(k: Any, expected: Any) -> Any:
     """Probability of more than k events where a number of them is expected."""
     return np.where(np.asarray(k) < 0, 1.0, special.pdtrc(np.maximum(k, 0), expected))[()]
+
+
+def binomial_sf(k: Any, n: Any, p: Any) -> Any:
+    """Probability of more than k events in n trials, of a probability each."""
+    return np.where(np.asarray(k) < 0, 1.0, special.bdtrc(np.maximum(k, 0), n, p))[()]

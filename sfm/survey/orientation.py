@@ -27,7 +27,7 @@ from sfm.survey.adjusting.solution import refine
 from sfm.survey.circles import circle_misfit
 from sfm.survey.diagnosis.codes_found import words_of_codes
 from sfm.survey.diagnosis.lost_photographs import tell_lost_photographs, try_other_principal_distances
-from sfm.survey.diagnosis.second_object import SecondObject, find_second_objects, tell_second_objects
+from sfm.survey.diagnosis.second_object import find_second_objects, tell_second_objects
 from sfm.survey.inputs.measurements import Measurements
 from sfm.survey.inputs.start import start_values
 from sfm.survey.inputs.survey import Survey
@@ -68,10 +68,8 @@ def orient_survey(survey: Survey, measured: Measurements) -> Orientation:
         if measured.photographs is not None and _most_in_common(network) < MIN_POINTS:
             raise GeometryError(words_of_codes(survey, measured.photographs)) from error
     wrong_c: tuple[Remark, ...] = ()
-    others = _second_objects(survey, network, found)
-    if not given and not (others and all(one.certain for one in others)):
+    if not given:
         found, wrong_c = try_other_principal_distances(network, estimate, found, orient_from)
-        others = _second_objects(survey, network, found) if wrong_c else others
     if found is None:
         hint = " (correct or complete [approximate], or leave it out)" if given else ""
         hint += "".join(f"; {one.text}" for one in wrong_c)
@@ -83,15 +81,9 @@ def orient_survey(survey: Survey, measured: Measurements) -> Orientation:
     elif held:
         wrong_c = tuple(replace(one, kind="c_looks_wrong_of_pair") for one in wrong_c)
     found = replace(found, remarks=(*found.remarks, *wrong_c, *held))
-    found = tell_lost_photographs(network, found)
-    return tell_second_objects(found, others)
-
-
-def _second_objects(survey: Survey, network: Network, found: Orientation | None) -> tuple[SecondObject, ...]:
-    """Return the photographs of targets that fit one another and not the others."""
-    if found is None or survey.tie_points:
-        return ()
-    return find_second_objects(network, found, _orient)
+    if not survey.tie_points and not wrong_c:
+        found = tell_second_objects(found, find_second_objects(network, found, _orient))
+    return tell_lost_photographs(network, found)
 
 
 def _orient(

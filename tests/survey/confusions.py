@@ -25,6 +25,7 @@ from sfm.rendering.render import render_photograph
 from sfm.rendering.scene import Optics, Scene
 from sfm.report.findings.findings import findings_of
 from sfm.survey.inputs.survey import read_survey
+from tests.survey.judging import CAUSES
 from tests.survey.two_plates import FIRST_CODE, PLACES, two_plates
 from tests.surveys import C_MM, PIXEL_MM, SIZE_PX, SURVEY, stations
 from tests.synthetic import seed_of
@@ -106,8 +107,7 @@ def outcome(confusion: Confusion, folder: Path) -> str:
         return f"{confusion.name:18} refused: {error}"
     a, verdict = result.adjustment, findings_of(result).verdict
     told = [f"{one.image}: {one.reason.text}" for one in result.failed]
-    told += [one.text for one in of_kind(result.remarks, "camera_per_photograph")]
-    told += [one.cause for one in result.explanations if one.explains][:1]
+    told += [one.text for one in of_kind(result.remarks, *CAUSES)]
     counts = (
         f"{len(a.network.images)} of {PHOTOGRAPHS} oriented, {len(a.network.points):3} points, "
         f"{int(a.rejected.sum()):3} image points rejected, sigma0 {a.sigma0_px:.3f} px"

@@ -37,7 +37,7 @@ def with_zoom(name: str, factors: dict[int, float], *, images: int = 10) -> tupl
     return replace(network, image_points=replace(seen, xy=xy)), truth
 
 
-@pytest.mark.parametrize("factor", [0.95, 1.1])
+@pytest.mark.parametrize("factor", [0.95, 0.98, 1.1])
 def test_a_zoomed_photograph_gets_its_own_c(factor: float) -> None:
     network, truth = with_zoom(f"zoomed {factor}", {7: factor})
     result = run_survey(survey_of(network, truth, adjust=TAU))
@@ -49,24 +49,26 @@ def test_a_zoomed_photograph_gets_its_own_c(factor: float) -> None:
     assert own["synthetic image 8"].value("c") == pytest.approx(factor * 10.0, rel=2e-3)
     assert own["synthetic"].value("c") == pytest.approx(10.0, rel=2e-3)
     (own_camera,) = of_kind(result.remarks, "camera_per_photograph")
-    assert own_camera.names("photograph") == ("image 8",) and own_camera.names("parameters") == ("c",)
+    assert own_camera.names("photograph") == ("image 8",) and own_camera.names("parameters")[0] == "c"
     assert own_camera.number("change") == pytest.approx(100 * (factor - 1), abs=0.3)
     assert findings_of(result).verdict.level == "fair"
 
 
-def test_a_photograph_of_another_state_is_left_out() -> None:
-    """Forty of sixty points lie elsewhere in one photograph: no c explains that."""
+@pytest.mark.parametrize(("share", "left_out"), [(0.65, True), (0.4, False)])
+def test_a_photograph_of_another_state_is_left_out(share: float, left_out: bool) -> None:
+    """The larger part of the points lies elsewhere in one photograph: no c explains that."""
     network, truth = with_zoom("moved", {})
     seen, rng = network.image_points, seed_of("moved elsewhere")
     rows = np.flatnonzero(seen.image == 4)
-    moved = rows[rng.permutation(len(rows))[: 2 * len(rows) // 3]]
+    moved = rows[rng.permutation(len(rows))[: int(share * len(rows))]]
     xy = seen.xy.copy()
     xy[moved] += rng.uniform(10, 40, (len(moved), 2))
     network = replace(network, image_points=replace(seen, xy=xy))
     result = run_survey(survey_of(network, truth, adjust=TAU))
-    (failed,) = result.failed
-    assert failed.image == "image 5"
-    assert failed.reason.kind in ("photograph_not_explained", "photograph_contradicting")
+    assert [one.image for one in result.failed] == (["image 5"] if left_out else [])
+    kinds = ("photograph_not_explained", "photograph_contradicting")
+    assert all(one.reason.kind in kinds for one in result.failed)
+    assert not of_kind(result.remarks, "camera_per_photograph")
     assert result.adjustment.sigma0_px == pytest.approx(0.1, rel=0.1)
 
 

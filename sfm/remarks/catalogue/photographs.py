@@ -156,8 +156,7 @@ ROWS = (
     Kind(
         "photograph_of_mirror_image",
         "warning",
-        "{photographs} show the mirror image of the others: mirrored, {points:common point} agree to "
-        "{misfit:%} of their spread.",
+        "{photographs} show the mirror image of the others, by {points:common point}.",
         "either these photographs or the others were mirrored by a program, or their x was reversed",
         "Use the original photographs; check the handedness of the result.",
     ),

@@ -1,8 +1,16 @@
-"""Photographs that lose most of their points: whether an interior orientation of their own explains them.
+"""Photographs that lose many of their points: whether an interior orientation of their own explains them.
 
 A zoom that slipped, a lens that was focused anew or a picture that was resampled shows the points of the
 others at another scale. Its exterior orientation takes up a part of that, and the rejection of image points
 the rest, so that a photograph with a few accepted points would stand among the oriented ones.
+
+Tried are the photographs of which more points are rejected than chance makes. Each is adjusted alone on the
+points of the others, with the camera that it shares and with parameters of its own. These must be
+significant, and the likelihood must pay for them and for the search, as in `sfm.adjustment.hypotheses`. A
+photograph that loses the larger part of its points with either is left out.
+
+Source: Rousseeuw and Leroy (1987), Robust Regression and Outlier Detection, sec. 1.2, for the larger part,
+the breakdown point of any estimate; Rissanen (1978), Automatica 14, for the likelihood of rejected points.
 """
 
 from __future__ import annotations
@@ -12,27 +20,25 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sfm.adjustment.datum import Datum
+from sfm.adjustment.hypotheses.alternatives import ALPHA
+from sfm.adjustment.hypotheses.score import log_f_sf
+from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.camera import Camera, tangents_from_pixel
 from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.distortion.models import Role
+from sfm.distributions import binomial_sf
 from sfm.errors import GeometryError
-from sfm.network import Estimate, ImagePoints, Network, ObjectPoints, rows_of
+from sfm.network import Estimate, ImagePoints, Network, ObjectPoints
 from sfm.orientation.incremental.growth import residual_lengths
 from sfm.orientation.resection.ransac import resect_robust
 from sfm.remarks.remark import Remark, remark
 
-LOST = 0.5  # share of the image points of a photograph without which the rest does not speak for it
-EXPLAINED = 0.2  # of them that may still be rejected where a camera of its own explains the photograph
-UNLIKE = 3.0  # times the median residual of the others: a photograph of which no point need be rejected
-BETTER = 0.5  # of its median residual: what a camera of its own must reach
-MIN_POINTS = 8  # of a photograph, for exterior orientation, c and some redundancy
-MAX_FRACTION = 1 / 3  # of the survey: if more do not fit, it is not the single photograph that is wrong
+LARGER_PART = 0.5  # of image points or photographs; the others are then what does not fit
 SCALES = np.geomspace(0.5, 2.0, 29)  # of c that are tried, 5 % apart
 TOLERANCE_PX = 8.0  # largest residual of a point that fits with c to 2.5 %; the adjustment follows
 TRIALS = 300  # triples for each scale
-SIGNIFICANT = 4.0  # standard deviations by which the own c differs
-OWN = ((Role.FOCAL,), (Role.FOCAL, Role.X0, Role.Y0, Role.RADIAL))  # parameters of its own, the fewest first
+OWN = ((Role.FOCAL,), (Role.FOCAL, Role.X0, Role.Y0, Role.RADIAL))  # the simple one first
 
 
 @dataclass(frozen=True)
@@ -45,17 +51,6 @@ class Treated:
     remarks: tuple[Remark, ...]  # on those with a camera of their own
     own: tuple[str, ...]  # names of these
     without: BoolArray  # photographs that are left out, (m,)
-
-
-@dataclass(frozen=True)
-class _Fit:
-    """One photograph resected on the points of the others with a camera of its own."""
-
-    camera: Camera
-    position: FloatArray
-    rotation: FloatArray
-    rejected: int
-    rms_px: float  # of the accepted image coordinates
 
 
 def treat_lost(
@@ -82,66 +77,49 @@ def treat_lost(
     seen, m = network.image_points, len(network.images)
     known = estimate.determined[seen.point]
     count = np.bincount(seen.image[known], minlength=m)
-    kept = np.bincount(seen.image[known & accepted], minlength=m)
-    everything = np.bincount(seen.image, minlength=m)
-    enough = (count >= MIN_POINTS) & (count > LOST * everything)
-    lost = enough & (kept < (1 - LOST) * count)
-    length = residual_lengths(network, estimate)
-    median = np.array(
-        [np.median(length[rows]) if len(rows) else np.inf for rows in _finite_rows(seen, length, m)]
-    )
-    unlike = enough & estimate.oriented & (median > UNLIKE * np.median(median[estimate.oriented]))
-    known_before = np.isin(network.images, suspected)
-    doubtful = lost | unlike | (enough & known_before & estimate.oriented)
-    if not doubtful.any() or doubtful.sum() > MAX_FRACTION * m:
+    against = np.bincount(seen.image[known & ~accepted], minlength=m)
+    enough = count > LARGER_PART * np.bincount(seen.image, minlength=m)
+    lost = against > LARGER_PART * count
+    usual = (against.sum() - against + 1) / (count.sum() - count + 2)  # share of the others, Laplace's rule
+    unusual = binomial_sf(against - 1, count, usual) < ALPHA / m
+    doubtful = enough & (unusual | (np.isin(network.images, suspected) & estimate.oriented))
+    if not doubtful.any() or (doubtful & lost).sum() > LARGER_PART * m:
         return None
+    spread = residual_lengths(network, estimate)[known & accepted]
+    sigma_px = float(np.median(spread)) / np.sqrt(2 * np.log(2))  # of a Rayleigh distribution
     cameras, owner = list(estimate.cameras), network.camera.copy()
     position, rotation = estimate.position.copy(), estimate.rotation.copy()
     left, remarks, with_own = [], [], []
     out = np.zeros(m, dtype=bool)
     for i in np.flatnonzero(doubtful).tolist():
-        rows = np.flatnonzero((seen.image == i) & known)
-        better = median[i] if known_before[i] else BETTER * median[i]
-        fit = _own_camera(network, estimate, i, rows, better)
-        name = network.images[i]
-        if fit is None and not lost[i]:
-            continue  # told as not like the others, with all its points
+        name, before = network.images[i], estimate.cameras[network.camera[i]]
+        fit = _own_camera(network, estimate, i, np.flatnonzero((seen.image == i) & known), sigma_px)
         if fit is None:
-            if oriented[i]:
-                left.append(
-                    (
-                        name,
-                        remark(
-                            "photograph_not_explained",
-                            against=int(count[i] - kept[i]),
-                            points=int(count[i]),
-                        ),
-                    )
-                )
-            out[i] = True
+            out[i] = lost[i]
+            if lost[i] and oriented[i]:
+                reason = remark("photograph_not_explained", against=int(against[i]), points=int(count[i]))
+                left.append((name, reason))
             continue
-        before = estimate.cameras[network.camera[i]]
-        cameras.append(fit.camera)
-        owner[i] = len(cameras) - 1
-        position[i], rotation[i] = fit.position, fit.rotation
+        camera, found = fit
+        owner[i] = len(cameras)
+        cameras.append(camera)
+        position[i], rotation[i] = found.estimate.position[0], found.estimate.rotation[0]
         with_own.append(name)
-        own = [n for n, group in zip(fit.camera.names, fit.camera.shared, strict=True) if not group]
-        share = fit.camera.c_px / before.c_px - 1
         remarks.append(
             remark(
                 "camera_per_photograph",
                 photograph=name,
                 camera=before.name,
-                rejected=int(count[i] - kept[i]),
+                rejected=int(against[i]),
                 points=int(count[i]),
-                parameters=own,
-                change=(100 * share, "%"),
-                rms=(fit.rms_px, "px"),
+                parameters=[n for n, group in zip(camera.names, camera.shared, strict=True) if not group],
+                change=(100 * (camera.c_px / before.c_px - 1), "%"),
+                rms=(float(np.sqrt(np.mean(found.residuals[~found.rejected] ** 2))), "px"),
             )
         )
-    if len(cameras) == len(estimate.cameras) and not out.any():
+    if not with_own and not out.any():
         return None
-    if len(cameras) > len(estimate.cameras):
+    if with_own:
         cameras[: len(estimate.cameras)] = [_sharing(camera) for camera in estimate.cameras]
     position[out], rotation[out] = np.nan, np.nan
     return Treated(
@@ -154,26 +132,18 @@ def treat_lost(
     )
 
 
-def _finite_rows(seen: ImagePoints, length: FloatArray, m: int) -> list[IntArray]:
-    """Return the image points of each photograph that have a residual."""
-    finite = np.flatnonzero(np.isfinite(length))
-    return [finite[rows] for rows in rows_of(seen.image[finite], m)]
-
-
 def _own_camera(
-    network: Network, estimate: Estimate, image: int, rows: IntArray, most_px: float
-) -> _Fit | None:
-    """Return the least special camera with which a photograph fits the points of the others, if any does."""
+    network: Network, estimate: Estimate, image: int, rows: IntArray, sigma_px: float
+) -> tuple[Camera, Adjustment] | None:
+    """Return the camera of its own with which a photograph fits the points of the others, if one does."""
     camera = estimate.cameras[network.camera[image]]
     if any(not group for group in camera.shared):
         return None  # has parameters of its own already
     seen = network.image_points
-    xy, points = seen.xy[rows], estimate.points[seen.point[rows]]
-    start = _scaled_resection(camera, xy, points)
+    xy, points, n = seen.xy[rows], estimate.points[seen.point[rows]], len(rows)
+    start = _scaled_resection(camera, xy, points, SCALES)
     if start is None:
         return None
-    scaled, position, rotation = start
-    n = len(rows)
     alone = Network(
         (network.images[image],),
         np.zeros(1, dtype=np.int64),
@@ -181,45 +151,69 @@ def _own_camera(
         ImagePoints(np.zeros(n, dtype=np.int64), np.arange(n), xy, seen.covariance[rows]),
         ObjectPoints(np.arange(n), points, np.zeros((n, 3, 3))),
     )
+    nothing = np.zeros(len(camera.names), dtype=bool)
+    shared = _alone(alone, _scaled_resection(camera, xy, points, np.ones(1)), points, nothing)
+    search = np.log(len(SCALES))
+    best, most = None, 0.0
     for roles in OWN:
-        own = scaled.plays(*roles) & _usable(scaled)
-        begin = Estimate((replace(scaled, free=own, shared=()),), position[None], rotation[None], points)
-        try:
-            found = adjust(alone, begin, datum=Datum("control"), reject="tau")
-        except (GeometryError, np.linalg.LinAlgError):
+        own = camera.plays(*roles)
+        own[np.flatnonzero(camera.plays(Role.RADIAL))[1:]] = False  # one photograph determines the first
+        found = _alone(alone, start, points, own)
+        if found is None or found.rejected.sum() > LARGER_PART * n:
             continue
-        moved = abs(found.estimate.cameras[0].c_px - camera.c_px)
-        sigma = found.interior_sigma(0)[0] * (1.0 if not camera.in_mm else 1.0 / np.mean(camera.pixel_mm))
-        rejected = int(found.rejected.sum())
-        rms = float(np.sqrt(np.mean(found.residuals[~found.rejected] ** 2)))
-        if found.converged and rejected <= EXPLAINED * n and moved > SIGNIFICANT * sigma and rms < most_px:
-            shared = tuple("" if mine else (camera.group_of(s) or camera.name) for s, mine in enumerate(own))
-            values = np.where(own, found.estimate.cameras[0].parameters, camera.parameters)
-            variant = replace(
-                camera,
-                name=f"{camera.name} {network.images[image]}",
-                parameters=values,
-                free=camera.free | own,
-                shared=shared,
-            )
-            return _Fit(variant, found.estimate.position[0], found.estimate.rotation[0], rejected, rms)
-    return None
+        sigma = max(sigma_px, found.sigma0_px)
+        gain = _log_likelihood(found, camera, n, sigma) - _log_likelihood(shared, camera, n, sigma)
+        q = int(own.sum())
+        log_p = log_f_sf(max(2 * gain / q, 0.0), q, found.redundancy)
+        evidence = gain - q / 2 * np.log(2 * n) - search
+        if log_p < np.log(ALPHA / len(OWN) / len(network.images)) - search and evidence > most + np.log(
+            1 / ALPHA
+        ):
+            best, most = (found, own), evidence
+    if best is None:
+        return None
+    found, own = best
+    variant = replace(
+        camera,
+        name=f"{camera.name} {network.images[image]}",
+        parameters=np.where(own, found.estimate.cameras[0].parameters, camera.parameters),
+        free=camera.free | own,
+        shared=tuple("" if mine else group for mine, group in zip(own, _sharing(camera).shared, strict=True)),
+    )
+    return variant, found
 
 
-def _usable(camera: Camera) -> BoolArray:
-    """Return which parameters one photograph on known points can determine: of the radial ones the first."""
-    radial = np.flatnonzero(camera.plays(Role.RADIAL))
-    out = np.ones(len(camera.names), dtype=bool)
-    out[radial[1:]] = False
-    return out
+def _alone(
+    alone: Network, start: tuple[Camera, FloatArray, FloatArray] | None, points: FloatArray, free: BoolArray
+) -> Adjustment | None:
+    """Adjust one photograph on known points, with some parameters free; None where there is no solution."""
+    if start is None or 2 * len(points) <= 6 + free.sum():
+        return None
+    camera, position, rotation = start
+    begin = Estimate((replace(camera, free=free, shared=()),), position[None], rotation[None], points)
+    try:
+        found = adjust(alone, begin, datum=Datum("control"), reject="tau")
+    except (GeometryError, np.linalg.LinAlgError):
+        return None
+    return found if found.converged and found.redundancy > 0 else None
+
+
+def _log_likelihood(found: Adjustment | None, camera: Camera, count: int, sigma_px: float) -> float:
+    """Return ln of the likelihood of a photograph, what does not fit spread evenly over its format."""
+    outlier = -np.log(float(np.prod(camera.size_px)))
+    if found is None:
+        return float(count * outlier)
+    squares = np.nan_to_num((found.residuals**2).sum(axis=1), nan=np.inf)
+    normal = -squares / (2 * sigma_px**2) - np.log(2 * np.pi * sigma_px**2)
+    return float(np.maximum(normal, outlier).sum())
 
 
 def _scaled_resection(
-    camera: Camera, xy: FloatArray, points: FloatArray
+    camera: Camera, xy: FloatArray, points: FloatArray, scales: FloatArray
 ) -> tuple[Camera, FloatArray, FloatArray] | None:
     """Return the camera with c multiplied by the factor that fits best, and the exterior orientation."""
     best: tuple[float, Camera, FloatArray, FloatArray] | None = None
-    for scale in SCALES:
+    for scale in scales:
         p = camera.parameters.copy()
         p[camera.parts[0]] *= scale
         one = camera.with_parameters(p)

@@ -1,4 +1,9 @@
-"""Photographs without orientation that fit one another: a second object with the same codes."""
+"""Photographs without orientation that fit one another: a second object of the same codes, or a mirror image.
+
+They are oriented by themselves, both parts are adjusted, and the points that they have in common are compared
+as those of any two results (`sfm.comparison`): what a camera explains, that bends the whole, is no other
+object, nor is what agrees but for single points.
+"""
 
 from __future__ import annotations
 
@@ -7,18 +12,19 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sfm.conventions import FloatArray
+from sfm.adjustment.covariance import marginal_of
+from sfm.adjustment.datum import Datum
+from sfm.adjustment.solve import adjust
+from sfm.comparison.significance import compare_results
 from sfm.errors import GeometryError
 from sfm.network import Estimate, Network, empty_estimate, rows_of
 from sfm.orientation.incremental.sequence import MIN_POINTS, Orientation
-from sfm.reduced_network import reduce_network
+from sfm.reduced_network import reduce_network, supported
 from sfm.remarks.remark import Remark, remark
-from sfm.similarity import fit_similarity
+from sfm.similarity import mean_distance
+from sfm.stored_result import StoredResult
 
-FITTING = 0.8  # of the image points of a group that must fit in it for the group to confirm itself
-OTHER_SHAPE = 0.1  # misfit of common points over their spread, from which no wrong camera explains it
-MIRROR = np.diag([1.0, 1.0, -1.0])
-SAME_SHAPE = 0.01  # misfit from which two groups show different states of an object, or no mirror images
+MIN_RAYS = 2
 
 
 @dataclass(frozen=True)
@@ -26,28 +32,7 @@ class SecondObject:
     """Photographs that confirm themselves only."""
 
     images: tuple[str, ...]  # their names
-    points: int  # points that they have, and the oriented photographs too
-    misfit: float  # RMS of these points after a similarity, over their RMS distance from their centre
-    mirrored_misfit: float = np.inf  # the same after a similarity with a reflection
-
-    @property
-    def certain(self) -> bool:
-        """Whether the points are so much elsewhere that no wrong interior orientation explains it."""
-        return self.misfit > OTHER_SHAPE
-
-    @property
-    def reason(self) -> Remark:
-        """Why each of the photographs is not in the result."""
-        if self.mirrored_misfit <= SAME_SHAPE:
-            return remark(
-                "photograph_of_mirror_image",
-                photographs=self.images,
-                points=self.points,
-                misfit=self.mirrored_misfit,
-            )
-        return remark(
-            "photograph_of_second_object", photographs=self.images, points=self.points, misfit=self.misfit
-        )
+    reason: Remark  # why each of them is not in the result
 
 
 def find_second_objects(
@@ -60,14 +45,11 @@ def find_second_objects(
         found: its orientation, in which some photographs are missing.
         orient: returns the orientation of a network from start values; GeometryError where there is none.
     """
-    seen = network.image_points
+    seen, names = network.image_points, np.array(network.images, dtype=object)
     left = ~found.estimate.oriented
+    left &= np.array([len(rows) for rows in rows_of(seen.image, len(names))]) >= MIN_POINTS
     groups: list[SecondObject] = []
-    while True:
-        count = np.array([len(rows) for rows in rows_of(seen.image, len(network.images))])
-        left &= count >= MIN_POINTS
-        if left.sum() < 2:
-            return tuple(groups)
+    while left.sum() >= 2:
         points = np.isin(np.arange(len(network.points)), seen.point[left[seen.image]])
         every = np.ones(len(seen), dtype=bool)
         start = empty_estimate(network, found.estimate.cameras)
@@ -76,16 +58,16 @@ def find_second_objects(
         try:
             other = orient(part, empty_estimate(part, found.estimate.cameras))
         except GeometryError:
-            return tuple(groups)
-        inside = other.estimate.oriented
-        rows = inside[part.image_points.image]
-        images = np.flatnonzero(left)[inside]
+            break
+        images = np.flatnonzero(left)[other.estimate.oriented]
         left[images] = False
-        misfit, common = _misfit(found.estimate.points[points], other.estimate.points)
-        if other.fits[rows].mean() >= FITTING and misfit > SAME_SHAPE:
-            mirrored, _ = _misfit(found.estimate.points[points], other.estimate.points @ MIRROR)
-            names = tuple(network.images[i] for i in images)
-            groups.append(SecondObject(names, common, misfit, mirrored))
+        try:
+            reason = _reason(_adjusted(network, found), _adjusted(part, other), tuple(names[images]))
+        except (GeometryError, np.linalg.LinAlgError):  # too little is determined to compare
+            continue
+        if reason is not None:
+            groups.append(SecondObject(tuple(names[images]), reason))
+    return tuple(groups)
 
 
 def tell_second_objects(found: Orientation, groups: tuple[SecondObject, ...]) -> Orientation:
@@ -95,15 +77,33 @@ def tell_second_objects(found: Orientation, groups: tuple[SecondObject, ...]) ->
     return replace(found, failures=failures)
 
 
-def _misfit(first: FloatArray, second: FloatArray) -> tuple[float, int]:
-    """Return how far common points are apart after a similarity, over their spread, and their number."""
-    known = np.isfinite(first).all(axis=1) & np.isfinite(second).all(axis=1)
-    count = int(known.sum())
-    if count < MIN_POINTS:
-        return 0.0, count
-    spread = np.sqrt(np.sum((first[known] - first[known].mean(axis=0)) ** 2))
-    try:
-        moved = fit_similarity(second[known], first[known]).apply(second[known])
-    except GeometryError:
-        return 0.0, count
-    return float(np.sqrt(np.sum((moved - first[known]) ** 2)) / spread), count
+def _adjusted(network: Network, found: Orientation) -> StoredResult | None:
+    """Return the image points that fit in an orientation adjusted by themselves; None without a solution."""
+    alone = Network(network.images, network.camera, network.points, network.image_points)
+    images, points = supported(alone, found.estimate, found.fits, min_points=MIN_POINTS, min_rays=MIN_RAYS)
+    part, start = reduce_network(alone, found.estimate, images, points, found.fits)
+    a = adjust(part, start, datum=Datum("free"), reject="tau")
+    if not a.converged or a.undetermined:
+        return None
+    joint = marginal_of(a).joint(np.zeros(0, dtype=np.int64), np.arange(len(part.points)))
+    return StoredResult(
+        "", part, a.estimate, a.covariance.points, redundancy=a.redundancy, covariance=joint, datum=a.datum
+    )
+
+
+def _reason(
+    others: StoredResult | None, group: StoredResult | None, images: tuple[str, ...]
+) -> Remark | None:
+    """Return why photographs do not fit the others; None where they show the same object or too little."""
+    if others is None or group is None:
+        return None
+    both = compare_results(others, group)
+    cause, size = both.cause, mean_distance(others.estimate.points[both.pairing.points[:, 0]])
+    if cause is not None and cause.row.mirror:
+        return remark("photograph_of_mirror_image", photographs=images, points=len(both.points))
+    if both.majority if cause is None else cause.row.bending:
+        return None
+    rms = float(np.sqrt((both.point_difference**2).sum(axis=1).mean()))
+    return remark(
+        "photograph_of_second_object", photographs=images, points=len(both.points), misfit=rms / size
+    )
