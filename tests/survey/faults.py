@@ -26,6 +26,7 @@ class Planted:
     start: Estimate  # the truth without the fault, whose cameras say what is free
     states: tuple[FloatArray, ...]  # object points of each state of the object, (n, 3)
     cause: str  # kind of the remark that is right; empty where no alternative is
+    exact: Network  # the same without noise
 
 
 @dataclass
@@ -56,8 +57,8 @@ class _Scene:
             s = camera.names.index(name)
             self.values[i][s] = self.values[i][s] * factor + by
 
-    def measured(self) -> Network:
-        """Return the network with its image points."""
+    def measured(self, *, exact: bool = False) -> Network:
+        """Return the network with its image points; exact ones are without noise."""
         seen, camera = self.network.image_points, self.truth.cameras[0]
         xy = np.empty_like(seen.xy)
         for i in range(self.m):
@@ -65,7 +66,9 @@ class _Scene:
             one = camera.with_parameters(self.values[i])
             X = self.points[i][self.names[rows].astype(int)]
             xy[rows] = project(one, self.truth.position[i], self.truth.rotation[i], X)
-        xy += self.extra + self.noise_px * self.rng.standard_normal(xy.shape)
+        xy += self.extra
+        if not exact:
+            xy += self.noise_px * self.rng.standard_normal(xy.shape)
         inside = np.isfinite(xy).all(axis=1) & (xy > -0.5).all(axis=1) & (xy < np.array(SIZE_PX) - 0.5).all(1)
         covariance = np.tile(self.noise_px**2 * np.eye(2), (len(xy), 1, 1))
         rows_ = ImagePoints(seen.image, seen.point, xy, covariance)
@@ -406,4 +409,4 @@ def planted(kind: str, number: int) -> Planted:
     scene = scene_of(kind, number)
     cause = EVERY[kind](scene)
     states = tuple(np.unique(scene.points, axis=0))
-    return Planted(scene.measured(), scene.truth, states, cause)
+    return Planted(scene.measured(), scene.truth, states, cause, scene.measured(exact=True))
