@@ -36,6 +36,7 @@ from sfm.adjustment.hypotheses.score import (
     log_f_sf,
     log_likelihood_gain,
     log_probability,
+    points_by_cameras,
 )
 from sfm.adjustment.result import Adjustment
 from sfm.conventions import BoolArray, FloatArray, IntArray
@@ -339,13 +340,8 @@ def _moved_at(reduced: Reduced, factor: FloatArray, search: float) -> Iterator[A
     if not len(movable):
         return
     # A'D of each point, reduced by the point itself
-    K = np.zeros((n, 3, size))
-    by = np.swapaxes(reduced.B, 1, 2) @ reduced.A
-    rows = np.flatnonzero(on)
-    every = np.zeros((n, m, 3, 6))
-    np.add.at(every, (reduced.point[rows], reduced.image[rows]), by[rows, :, :6])
-    K[:, :, : 6 * m] = np.moveaxis(every, 1, 2).reshape(n, 3, 6 * m)
-    np.add.at(K[:, :, 6 * m :], reduced.point[rows], by[rows, :, 6:])
+    by = np.swapaxes(reduced.B[on], 1, 2) @ reduced.A[on]
+    K = points_by_cameras(by, reduced.point[on], reduced.image[on], n, m)
     K = K[movable] - np.swapaxes(C[movable], 1, 2) @ reduced.W[movable]
     g = np.zeros((n, 3))
     np.add.at(g, reduced.point[on], np.einsum("kab,ka->kb", D[on], reduced.v[on]))

@@ -169,12 +169,7 @@ def reduce_adjustment(a: Adjustment, columns: Columns) -> Reduced:
     seen_points = np.bincount(point, minlength=n) > 1
     V[~seen_points] = np.eye(3)
     L = np.linalg.inv(np.linalg.cholesky(V))
-    W = np.zeros((n, 3, size))
-    by = Bt @ A
-    every = np.zeros((n, m, 3, 6))
-    np.add.at(every, (point, image), by[:, :, :6])
-    W[:, :, : 6 * m] = np.moveaxis(every, 1, 2).reshape(n, 3, 6 * m)
-    np.add.at(W[:, :, 6 * m :], point, by[:, :, 6:])
+    W = points_by_cameras(Bt @ A, point, image, n, m)
     W[~seen_points] = 0.0
     gp[~seen_points] = 0.0
     W, y = L @ W, np.einsum("nab,nb->na", L, gp)
@@ -192,6 +187,24 @@ def reduce_adjustment(a: Adjustment, columns: Columns) -> Reduced:
     return Reduced(
         *(used, F, v, image, point, B, A, L, W, inverse, y, t, m, a.redundancy),
     )
+
+
+def points_by_cameras(by: FloatArray, point: IntArray, image: IntArray, n: int, m: int) -> FloatArray:
+    """Return B'A of object points and photographs and cameras, (n, 3, 6 m + i).
+
+    Args:
+        by: B'A of each image point, (k, 3, 6 + i).
+        point: object point of each, (k,).
+        image: photograph of each, (k,).
+        n: number of points.
+        m: number of photographs.
+    """
+    found = np.zeros((n, 3, 6 * m + by.shape[2] - 6))
+    every = np.zeros((n, m, 3, 6))
+    np.add.at(every, (point, image), by[:, :, :6])
+    found[:, :, : 6 * m] = np.moveaxis(every, 1, 2).reshape(n, 3, 6 * m)
+    np.add.at(found[:, :, 6 * m :], point, by[:, :, 6:])
+    return found
 
 
 def _free_interior(a: Adjustment) -> tuple[FloatArray, FloatArray, FloatArray]:
