@@ -34,8 +34,8 @@ COLUMNS = "wrong, detectable, named first, untold; wrong and not named first, sa
 WRONG = 5.0  # standard deviations, of the worst coordinate
 DETECTABLE = 17.07  # noncentrality that one test at the level 0.001 finds with 80 %; Baarda (1968)
 UNCHECKED = {
-    *("weakly_tested", "held_weakly_tested", "assumptions_untested", "photographs_untested"),
-    "too_many_to_test",
+    *("camera_weakly_tested", "shape_weakly_tested", "held_weakly_tested"),
+    *("assumptions_untested", "photographs_untested", "too_many_to_test"),
 }
 ACCIDENTS = {"image_points_misnamed"}  # what gross errors are, and no cause of anything
 CAUSES = {row.name for row in hypotheses.ROWS} - ACCIDENTS - UNCHECKED | {"camera_per_photograph"}

@@ -9,6 +9,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterable
 from dataclasses import dataclass, field
+from typing import ClassVar
 
 import numpy as np
 
@@ -69,6 +70,7 @@ class Family(ABC):
     """A set of columns that may be freed."""
 
     name: str
+    unchecked: ClassVar[str] = ""  # the remark where errors of the assumption stay unnoticed, if it is made
 
     @abstractmethod
     def kind(self, pattern: str) -> str:
@@ -115,6 +117,7 @@ class CameraFamily(OfPhotographs):
     """Another camera in some photographs."""
 
     of_one = True  # whether a single photograph may have it
+    unchecked = "camera_weakly_tested"
 
     def kind(self, pattern: str) -> str:
         """Return the kind of remark that an alternative of this family is."""
@@ -146,6 +149,7 @@ class ObjectFamily(OfPhotographs):
     """Another shape of the object in some photographs."""
 
     of_one = False  # an object that one photograph shows otherwise is that photograph's fault
+    unchecked = "shape_weakly_tested"
 
     def kind(self, pattern: str) -> str:
         """Return the kind of remark that an alternative of this family is."""

@@ -18,7 +18,13 @@ from scipy.special import chndtrinc
 
 from sfm.adjustment.hypotheses.alternatives import MIN_GROUP, interiors, needed_gain
 from sfm.adjustment.hypotheses.columns import Columns, columns_of
-from sfm.adjustment.hypotheses.families import CAMERA_FAMILIES, HELD, STRAIN, Alternative
+from sfm.adjustment.hypotheses.families import (
+    CAMERA_FAMILIES,
+    HELD,
+    STRAIN,
+    Alternative,
+    InteriorFamily,
+)
 from sfm.adjustment.hypotheses.score import DETERMINED, Gain, Reduced, reduce_adjustment
 from sfm.adjustment.result import Adjustment
 from sfm.remarks.remark import Remark, remark
@@ -43,24 +49,24 @@ def unchecked_assumptions(a: Adjustment) -> tuple[Remark, ...]:
     columns = columns_of(a)
     reduced = reduce_adjustment(a, columns)
     found: dict[str, float] = {}
-    parameters: dict[str, dict[str, float]] = defaultdict(dict)
+    held: dict[str, dict[str, float]] = defaultdict(dict)
     for one in _typical(a, reduced):
         reach = reach_of(one, a, reduced, columns)
         if not reach > UNCHECKED:
             continue
-        if one.family is HELD:
+        if isinstance(one.family, InteriorFamily):
             index, s = one.parameters[0]
             camera = a.estimate.cameras[index]
-            parameters[camera.group_of(s) or camera.name][camera.names[s]] = reach
+            held[camera.group_of(s) or camera.name][camera.names[s]] = reach
         else:
-            found[one.kind] = max(reach, found.get(one.kind, 0.0))
-    held = [
-        remark("held_weakly_tested", camera=camera, parameters=tuple(some), sigmas=max(some.values()))
-        for camera, some in parameters.items()
-    ]
-    if found:
-        held.append(remark("weakly_tested", assumptions=tuple(found), sigmas=max(found.values())))
-    return tuple(held)
+            found[one.family.unchecked] = max(reach, found.get(one.family.unchecked, 0.0))
+    return (
+        *(
+            remark("held_weakly_tested", camera=camera, parameters=tuple(some), sigmas=max(some.values()))
+            for camera, some in held.items()
+        ),
+        *(remark(kind, sigmas=reach) for kind, reach in found.items()),
+    )
 
 
 def _typical(a: Adjustment, reduced: Reduced) -> Iterator[Alternative]:

@@ -103,23 +103,32 @@ ROWS = (
     Kind(
         "photographs_untested",
         "note",
-        "That {photographs} have one camera and show one shape of the object is assumed, not tested.",
-        "{needed} photographs or more show which of them differ",
+        "One camera and one shape of the object are assumed for all of {photographs:photograph}: "
+        "a test of it needs {needed}.",
+        "too few photographs to show which of them differ",
         "Take more photographs.",
     ),
     Kind(
-        "weakly_tested",
+        "camera_weakly_tested",
         "note",
-        "The tests may miss {assumptions} that {assumptions:shifts|shift} coordinates by up to {sigmas} "
-        "standard deviations.",
+        "The camera may change during the survey and shift coordinates by up to {sigmas} standard deviations "
+        "before a test shows it.",
         "few photographs, or all from about the same directions",
         "Take more photographs from more directions, some of them rolled by 90 degrees.",
     ),
     Kind(
+        "shape_weakly_tested",
+        "note",
+        "The object may deform during the survey and shift coordinates by up to {sigmas} standard deviations "
+        "before a test shows it.",
+        "few photographs, or few that show the same points before and after",
+        "Photograph the whole object twice, one round after the other.",
+    ),
+    Kind(
         "held_weakly_tested",
         "note",
-        "The tests may miss errors of the held {parameters} of camera {camera} that shift coordinates by up "
-        "to {sigmas} standard deviations.",
+        "Held values of {parameters} of camera {camera} may be wrong and shift coordinates by up to {sigmas} "
+        "standard deviations before a test shows it.",
         "the exterior orientation of the photographs takes up what the parameters do",
         "Calibrate the camera, or take more photographs from more directions and add the parameters to free.",
     ),
