@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -116,3 +117,20 @@ def test_distortion_bends_what_is_photographed_from_one_side() -> None:
     assert kinds_of(found) == ("held_weakly_tested",)
     assert found[0].names("camera") == ("camera 1",)
     assert "K1" in found[0].names("parameters") and "x0" not in found[0].names("parameters")
+
+
+def test_a_parameter_that_nothing_determines_counts_by_what_it_shifts() -> None:
+    """Not without end: 1e-5 of the squares of its column is what rounding leaves."""
+    a = adjusted()
+    columns = columns_of(a)
+    reduced = reduce_adjustment(a, columns)
+    one = next(unchecked._typical(a, reduced))
+    H = reduced.project(reduced.whiten(one.columns(a, columns)))[0]
+    blind = SimpleNamespace(
+        whiten=reduced.whiten,
+        shifts=reduced.shifts,
+        project=lambda D: (1e-12 * H, np.zeros(1), reduced.project(D)[2]),
+    )
+    far = reach_of(one, a, blind, columns)  # type: ignore[arg-type]
+    share = float(H[0, 0] / reduced.project(reduced.whiten(one.columns(a, columns)))[2][0])
+    assert far == pytest.approx(reach_of(one, a, reduced, columns) * np.sqrt(share / 1e-5))

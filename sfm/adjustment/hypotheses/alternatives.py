@@ -143,27 +143,30 @@ def _made(
     )
 
 
-def interiors(a: Adjustment, reduced: Reduced, family: InteriorFamily) -> Iterator[Alternative]:
-    """Return an alternative for each held or given interior parameter, and one for all of a camera."""
-    network, cameras = a.network, a.estimate.cameras
-    everywhere = np.ones(len(network.images))
+def interior_parameters(a: Adjustment, family: InteriorFamily) -> list[list[tuple[tuple[int, int], ...]]]:
+    """Return for each camera, or group of cameras, its held or its given parameters: (camera, parameter)."""
+    network = a.network
+    given = network.interior
     owners: dict[str, dict[str, list[tuple[int, int]]]] = {}
-    for index, camera in enumerate(cameras):
+    for index, camera in enumerate(a.estimate.cameras):
         if not (network.camera == index).any():
             continue
         some = ~camera.free
         if family.of_given:
-            given = network.interior
-            some = camera.free & np.isin(
-                np.arange(len(camera.free)), given.parameter[(given.camera == index) & (given.sigma > 0)]
-            )
+            weighted = given.parameter[(given.camera == index) & (given.sigma > 0)]
+            some = camera.free & np.isin(np.arange(len(camera.free)), weighted)
         # the denominator of a fraction says the same as its numerator
         for s in np.flatnonzero(some & ~camera.plays(Role.DENOMINATOR)).tolist():
             owner = owners.setdefault(camera.group_of(s) or camera.name, {})
             owner.setdefault(camera.names[s], []).append((index, s))
-    for held in owners.values():
-        sets = [tuple(one) for one in held.values()]
-        whole = tuple(pair for one in held.values() for pair in one)
+    return [[tuple(one) for one in owner.values()] for owner in owners.values()]
+
+
+def interiors(a: Adjustment, reduced: Reduced, family: InteriorFamily) -> Iterator[Alternative]:
+    """Return an alternative for each held or given interior parameter, and one for all of a camera."""
+    everywhere = np.ones(len(a.network.images))
+    for sets in interior_parameters(a, family):
+        whole = tuple(pair for one in sets for pair in one)
         D = reduced.whiten(shared_columns(a, list(whole))[0])
         every = gain_of(*reduced.project(D))
         for parameters, columns in [

@@ -16,7 +16,7 @@ from collections.abc import Iterator
 import numpy as np
 from scipy.special import chndtrinc
 
-from sfm.adjustment.hypotheses.alternatives import MIN_GROUP, interiors, needed_gain
+from sfm.adjustment.hypotheses.alternatives import MIN_GROUP, interior_parameters, needed_gain
 from sfm.adjustment.hypotheses.columns import Columns, columns_of
 from sfm.adjustment.hypotheses.families import (
     CAMERA_FAMILIES,
@@ -32,8 +32,6 @@ from sfm.similarity import without_motions
 
 POWER = 0.80  # with which a detectable error is found; Baarda (1968)
 UNCHECKED = 5.0  # standard deviations by which an error may shift coordinates before it is found
-
-
 ROWS = 30  # alternatives among which the level is shared: families by patterns, and held parameters
 
 
@@ -74,13 +72,17 @@ def _typical(a: Adjustment, reduced: Reduced) -> Iterator[Alternative]:
 
     Not a bending: the worst of its 18 directions is the shape of no object.
     """
-    yield from (one for one in interiors(a, reduced, HELD) if len({s for _, s in one.parameters}) == 1)
+    nothing = Gain(0.0, 0, np.zeros(0))
+    for owner in interior_parameters(a, HELD):
+        for some in owner:
+            yield Alternative(
+                *(HELD, "all", np.ones(reduced.photographs), nothing, 0.0, 0.0, 0.0, 0.0), parameters=some
+            )
     m = reduced.photographs
     if m < 2 * MIN_GROUP:
         return
     half = (np.arange(m) >= m // 2).astype(float)
-    search = np.log(m - 2 * MIN_GROUP + 1)
-    nothing = Gain(0.0, 0, np.zeros(0))
+    search = float(np.log(m - 2 * MIN_GROUP + 1))
     for family in (*CAMERA_FAMILIES, STRAIN):
         yield Alternative(family, "split", half, nothing, 0.0, 0.0, search, 0.0)
 
@@ -98,7 +100,7 @@ def reach_of(one: Alternative, a: Adjustment, reduced: Reduced, columns: Columns
     H, _, squares = reduced.project(D)
     scale = np.where(squares > 0, 1 / np.sqrt(np.where(squares > 0, squares, 1.0)), 0.0)
     values, vectors = np.linalg.eigh(H * scale[:, None] * scale)
-    rank = int((values > DETERMINED).sum())
+    rank = max(int((values > DETERMINED).sum()), 1)
     touched = int((D != 0).any(axis=(1, 2)).sum())
     needed = needed_gain(rank, touched, one.search, ROWS)
     least = chndtrinc(needed, rank, 1 - POWER)  # noncentrality that is found
