@@ -16,8 +16,10 @@ from sfm.adjustment.quality.statistics import (
     component_tests,
     correlations,
     global_test,
+    more_than_chance,
     non_centrality,
     reliability,
+    robust_test,
     significance,
     tau_test,
     w_test,
@@ -45,6 +47,24 @@ def test_far_more_than_expected_is_twice_and_not_by_chance() -> None:
     assert not far(4, 1000) and not far(5, 1000)  # of 1 expected 5 come in 1 of 270 cases
     assert far(6, 1000)  # 1 of 1700
     assert not far(200, 100_000) and far(201, 100_000)
+
+
+def test_groups_with_more_events_than_chance_makes() -> None:
+    """The others have a share of (8 + 1) / (80 + 2); each of five is tested at a fifth of the level."""
+    trials = np.full(5, 20)
+    events = np.array([9, 2, 2, 2, 2])
+    p = stats.binom.sf(8, 20, 9 / 82)
+    assert more_than_chance(events, trials, 5.1 * p).tolist() == [True, False, False, False, False]
+    assert not more_than_chance(events, trials, 4.9 * p).any()
+    assert not more_than_chance(np.zeros(5, dtype=int), trials, 0.99).any()
+
+
+@pytest.mark.parametrize("stated", [0.2, 1.0, 5.0])
+def test_the_robust_test_needs_no_stated_standard_deviation(stated: float) -> None:
+    w = np.random.default_rng(5).standard_normal((2000, 2))
+    w[:100] += 50.0
+    found = robust_test(stub(standardised=stated * w, redundancy_numbers=np.ones((2000, 2))))
+    assert found.tested == 4000 and 200 <= found.beyond <= 210  # 3.8 by chance
 
 
 def test_the_global_test_is_by_chi_square() -> None:

@@ -104,6 +104,18 @@ def test_a_principal_distance_that_loses_photographs_is_told(free: bool) -> None
     assert found is not None and found.estimate.oriented.sum() == (10 if free else 3)
 
 
+@pytest.mark.parametrize(("oriented", "better"), [(5, False), (6, False), (7, True)])
+def test_another_c_orients_the_larger_part_of_what_was_lost(oriented: int, better: bool) -> None:
+    network, truth = make_network(seed_of("lost by c"), images=IMAGES, points=POINTS)
+    few = orientation(network, partly(truth, np.arange(IMAGES) < 3))
+    more = orientation(network, partly(truth, np.arange(IMAGES) < oriented))
+    remarks = try_other_principal_distances(network, truth, few, lambda _: more)[1]
+    assert bool(remarks) == better
+    alone = orientation(network, partly(truth, np.arange(IMAGES) < IMAGES - 1))
+    whole = orientation(network, truth)
+    assert try_other_principal_distances(network, truth, alone, lambda _: whole) == (alone, ())
+
+
 def test_a_survey_that_lost_the_larger_part_is_no_dependable_one() -> None:
     network, truth = split_network()
     seen = network.image_points

@@ -25,6 +25,10 @@ def test_c_far_from_its_start_value_is_told(model: str) -> None:
     assert far_principal_distances(survey, estimate, [0.01]) == ()
     p = name.parameters.copy()
     p[: 1 if name.in_mm else 2] *= 0.22
+    for factor, told in ((0.85, False), (1.15, False), (0.75, True), (1.35, True)):
+        near = name.with_parameters(np.where(name.parts[0], factor * name.parameters, name.parameters))
+        remarks = far_principal_distances(survey, replace(estimate, cameras=(near,)), [0.01])
+        assert len(remarks) == told
     far = replace(estimate, cameras=(name.with_parameters(p),))
     c = abs(far.cameras[0].parameters[0])
     for share, severity in ((4.9e-4, "note"), (5.1e-4, "warning"), (np.nan, "warning")):

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -18,7 +20,9 @@ from sfm.rendering.render import render_photographs
 from sfm.rendering.scene import Optics
 from sfm.result import SurveyResult
 from sfm.survey.adjusting.solution import refine
+from sfm.survey.diagnosis.contradicting_codes import find_contested_codes
 from sfm.survey.diagnosis.second_object import find_second_objects, tell_second_objects
+from sfm.survey.inputs.measurements import Naming
 from sfm.survey.inputs.survey import read_survey
 from sfm.survey.measuring.measured_store import MeasuredStore
 from tests.survey.test_own_camera import with_zoom
@@ -77,6 +81,27 @@ def test_another_object_with_the_same_sheet_is_left_out(folder: Path, globs: lis
     assert all(one.reason.kind == "photograph_with_codes_elsewhere" for one in result.failed)
     assert bool(result.failed[0].reason.names("agreeing")) == agree
     assert (result.code >= 0).all() and len(result.code) == len(PLACES) - 1
+
+
+@pytest.mark.parametrize(
+    ("shown", "elsewhere", "left_out"), [(20, 2, False), (20, 3, True), (40, 3, False), (40, 4, True)]
+)
+def test_a_photograph_with_three_codes_and_a_tenth_elsewhere_is_left_out(
+    shown: int, elsewhere: int, left_out: bool
+) -> None:
+    """Six photographs; the last one shows some codes at points of their own."""
+    codes, places = np.arange(shown), np.arange(shown)
+    other = np.where(codes < elsewhere, shown + codes, places)
+    naming = Naming(
+        tuple(map(str, range(2 * shown))),
+        np.append(codes, np.full(shown, -1)),
+        (*[places] * 5, other),
+    )
+    targets: Any = tuple(SimpleNamespace(code=codes) for _ in range(6))
+    photographs: Any = SimpleNamespace(names=tuple("abcdef"), targets=targets)
+    found = find_contested_codes(photographs, naming)
+    assert sorted(found.places) == list(range(elsewhere))
+    assert sorted(found.left_out) == ([5] if left_out else [])
 
 
 def test_a_code_that_moved_is_told_and_costs_no_photograph(folder: Path) -> None:

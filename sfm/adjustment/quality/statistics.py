@@ -17,9 +17,9 @@ from sfm.adjustment.quality.reliability import UNCONTROLLED, tau_critical
 from sfm.adjustment.quality.variance_components import IMAGE_POINTS, VarianceComponents
 from sfm.adjustment.result import Adjustment
 from sfm.camera import Camera
-from sfm.conventions import FloatArray, IntArray
+from sfm.conventions import MAD_TO_SIGMA, BoolArray, FloatArray, IntArray
 from sfm.distortion.models import MODELS
-from sfm.distributions import chi2_ppf, nct_parameter, normal_ppf, poisson_sf, t_ppf, t_sf
+from sfm.distributions import binomial_sf, chi2_ppf, nct_parameter, normal_ppf, poisson_sf, t_ppf, t_sf
 
 ALPHA = 0.001  # Baarda's usual probability of rejecting a good observation
 REWEIGHTED = "the weights come from the residuals, so that v'Pv is not chi-square distributed"
@@ -155,6 +155,34 @@ def tau_test(adjustment: Adjustment, *, alpha: float = ALPHA) -> CoordinateTest:
     """Return Pope's test of each image coordinate, which takes sigma0 from the adjustment."""
     critical = tau_critical(alpha, adjustment.redundancy)
     return _coordinate_test(adjustment, adjustment.tau, critical, alpha)
+
+
+def robust_test(adjustment: Adjustment, *, alpha: float = ALPHA) -> CoordinateTest:
+    """Return the test of w over its standard deviation by its median, which half of the coordinates make.
+
+    It finds gross errors that nobody rejected: tau is blind where they are so many that they make sigma0, w
+    where the standard deviation is not as stated.
+
+    Source: Rousseeuw and Leroy (1987), Robust Regression and Outlier Detection, sec. 1.2.
+    """
+    w = adjustment.standardised
+    known = np.abs(w[np.isfinite(w)])
+    sigma = MAD_TO_SIGMA * float(np.median(known)) if len(known) else 0.0
+    return _coordinate_test(adjustment, w / (sigma or np.inf), float(normal_ppf(1 - alpha / 2)), alpha)
+
+
+def more_than_chance(events: IntArray, trials: IntArray, level: float) -> BoolArray:
+    """Return which groups have more events than chance makes, by the share of them in all other groups, (n,).
+
+    Args:
+        events: of each group, such as its rejected image points, (n,).
+        trials: of each group, (n,).
+        level: probability that any group is called so where none is.
+
+    Source: the share by Laplace's rule of succession; the binomial distribution; Bonferroni.
+    """
+    share = (events.sum() - events + 1) / (trials.sum() - trials + 2)
+    return np.asarray(binomial_sf(events - 1, trials, share) < level / max(1, len(events)))
 
 
 def _coordinate_test(

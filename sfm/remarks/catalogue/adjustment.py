@@ -55,8 +55,8 @@ ROWS = (
     Kind(
         "gross_errors_kept",
         "warning",
-        "{beyond} of {tested} image coordinates have |{test}| beyond {critical} ({chance} by chance), and "
-        "none was rejected.",
+        "{beyond} of {tested} image coordinates have residuals beyond {critical} robust standard deviations "
+        "({chance} by chance), and none was rejected.",
         'gross errors, and adjust.reject = "none"',
         'Set adjust.reject = "tau", which rejects gross errors.',
     ),

@@ -8,7 +8,7 @@ ROWS = (
     Kind(
         "rays_rejected",
         "warning",
-        "Of {points:point} a third of the rays or more were rejected, or two are left: {points}.",
+        "More rays of {points:point} were rejected than chance makes: {points}.",
         "the point moved, has the name of another, or is hard to measure",
         "Look at its rejected image points in the report.",
     ),

@@ -86,7 +86,7 @@ def findings_of(result: SurveyResult) -> Findings:
         *result.remarks,
         *other_solution_remarks(result),
         *sigma0_remarks(sigma0, statistics),
-        *residual_remarks(result, longest, statistics),
+        *residual_remarks(result, longest),
         *ray_remarks(a),
         *consistency_remarks(consistency),
         *camera_remarks(result),

@@ -6,10 +6,9 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from sfm.adjustment.quality.consistency import Consistency
-from sfm.adjustment.quality.statistics import ALPHA, component_tests
+from sfm.adjustment.quality.consistency import FAMILY, Consistency
+from sfm.adjustment.quality.statistics import ALPHA, component_tests, more_than_chance, robust_test
 from sfm.adjustment.result import Adjustment
-from sfm.conventions import MAD_TO_SIGMA
 from sfm.display import program_name
 from sfm.remarks.remark import Remark, remark, unless_note
 from sfm.remarks.verdict import Level
@@ -22,11 +21,7 @@ HEADLINES: Mapping[Level, str] = {
     "fair": "The survey worked, with remarks: {found}.",
     "bad": "The survey has no dependable result.",
 }
-MANY_RAYS = 1 / 3  # share of the rays of a point: so many of them contradict the result
-FEW_RAYS = 2  # that are left of a point of which others were rejected check it no more
-MAX_SOLUTIONS = 2  # of about the same v'Pv that are listed
-SIGMA0_LOW = 0.5  # the same times too cautious
-AS_STATED = 1.5  # standard deviation of w by its median, up to which image points are about as stated
+SIGMA0_LOW = 0.5  # as many times too cautious as it may be too large without a warning
 
 
 def headlines_of(result: SurveyResult) -> dict[Level, str]:
@@ -79,7 +74,7 @@ def other_solution_remarks(result: SurveyResult) -> tuple[Remark, ...]:
         else remark(
             "other_solution", camera=other.camera, c=(other.c, other.unit), vPv=other.vPv, moved=other.moved
         )
-        for other in farthest[:MAX_SOLUTIONS]
+        for other in farthest
     )
 
 
@@ -94,7 +89,7 @@ def sigma0_remarks(sigma0: Sigma0, statistics: Statistics) -> tuple[Remark, ...]
     return tuple(remarks)
 
 
-def residual_remarks(result: SurveyResult, worst: LongestResidual, found: Statistics) -> tuple[Remark, ...]:
+def residual_remarks(result: SurveyResult, worst: LongestResidual) -> tuple[Remark, ...]:
     """Return the longest accepted residual, and gross errors where the survey rejects nothing."""
     kept = remark(
         "residual_kept",
@@ -103,47 +98,39 @@ def residual_remarks(result: SurveyResult, worst: LongestResidual, found: Statis
         length=(worst.length_px, "px"),
         over_sigma=worst.over_sigma,
     )
-    return (*(unless_note(kept) if np.isfinite(worst.over_sigma) else ()), *_untested(result, found))
+    return (*(unless_note(kept) if np.isfinite(worst.over_sigma) else ()), *_untested(result))
 
 
-def _untested(result: SurveyResult, found: Statistics) -> tuple[Remark, ...]:
-    """Return what the tests of single image coordinates show where the survey rejects nothing.
-
-    Tau is blind where gross errors are so many that they make sigma0; w shows them then, if the bulk of the
-    image points is as good as stated.
-    """
+def _untested(result: SurveyResult) -> tuple[Remark, ...]:
+    """Return what the test of single image coordinates shows where the survey rejects nothing."""
     if result.reject != "none":
         return ()
-    tests, w = [("tau", found.tau)], found.w
-    if w.tested and MAD_TO_SIGMA * np.nanmedian(np.abs(w.statistic)) < AS_STATED:
-        tests.append(("w", w))
-    name, most = max(tests, key=lambda one: one[1].beyond)
-    if not most.far_more:
+    found = robust_test(result.adjustment)
+    if not found.far_more:
         return ()
     return (
         remark(
             "gross_errors_kept",
-            test=name,
-            beyond=most.beyond,
-            tested=most.tested,
-            critical=most.critical,
-            chance=most.expected,
+            beyond=found.beyond,
+            tested=found.tested,
+            critical=found.critical,
+            chance=found.expected,
         ),
     )
 
 
 def ray_remarks(a: Adjustment) -> tuple[Remark, ...]:
-    """Return the points that lost many of their rays or have but two, and a pair of photographs."""
+    """Return the points that lost more rays than chance makes or have but two, and a pair of photographs."""
     network, rejected = a.network, a.rejected
     n, point = len(network.points), network.image_points.point
     lost, rays = np.bincount(point[rejected], minlength=n), network.rays()
-    most = np.flatnonzero((lost > 0) & ((lost >= MANY_RAYS * rays) | (rays - lost <= FEW_RAYS)))
+    most = np.flatnonzero(more_than_chance(lost, rays, FAMILY))
     remarks = []
     if len(most):
         remarks.append(remark("rays_rejected", points=[network.points[j] for j in most]))
     if len(network.images) == 2:
         remarks.append(remark("two_photographs"))
-    two = int((rays - lost == FEW_RAYS).sum())
+    two = int((rays - lost == 2).sum())
     if two:
         remarks.append(remark("two_rays", two=two, total=n))
     return tuple(remarks)

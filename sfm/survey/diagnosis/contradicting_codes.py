@@ -17,7 +17,6 @@ from sfm.targets.codes.tags import CORNERS
 
 MIN_ELSEWHERE = 3  # contradicting codes of a photograph of another object: one or two are moved or misread
 SHARE_ELSEWHERE = 0.1  # of the codes that a photograph shows of the object, at least so many contradict it
-MAX_ROUNDS = 10  # of putting a group together
 
 
 @dataclass(frozen=True)
@@ -128,7 +127,7 @@ def _groups(contested: dict[int, dict[int, frozenset[int]]]) -> list[frozenset[i
     while left:
         seed = max(left, key=lambda image: (len(of_image[image]), -image))
         group = frozenset({seed})
-        for _ in range(MAX_ROUNDS):
+        for _ in left:
             accepted = _accepted(contested, group)
             agreeing = {seed}
             for image in left:

@@ -14,8 +14,8 @@ from sfm.errors import GeometryError
 from sfm.network import Estimate, Network
 from sfm.orientation.incremental.sequence import MIN_POINTS, Orientation
 from sfm.remarks.remark import Remark, remark
+from sfm.survey.diagnosis.own_camera import LARGER_PART
 
-MANY = 0.1  # part of the photographs whose loss, though they are connected, has one cause for all
 C_FACTORS = (1.4, 0.7, 2.0, 0.5)  # on the given principal distance: a crop factor, an extender, a zoom
 
 
@@ -75,7 +75,7 @@ def try_other_principal_distances(
 ) -> tuple[Orientation | None, tuple[Remark, ...]]:
     """Return the orientation with another principal distance if that orients more photographs, and remarks.
 
-    Tried where photographs are lost that show enough points of the others.
+    Tried where photographs are lost that show enough points of the others; it must orient most of them.
 
     Args:
         network: image points that have names.
@@ -92,9 +92,9 @@ def try_other_principal_distances(
     lost = m if found is None else sum(
         len(one.images) for one in lost_groups(network, found.estimate) if one.connected
     )  # fmt: skip
-    if lost <= MANY * m or not len(network.image_points):
+    if lost < 2 or not len(network.image_points):  # one alone has a cause of its own
         return found, ()
-    best, most = None, now + max(1, int(MANY * m))
+    best, most = None, now + int(LARGER_PART * lost)
     for factor in C_FACTORS:
         try:
             other = orient(_with_c(estimate, factor))

@@ -22,12 +22,12 @@ import numpy as np
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.hypotheses.alternatives import ALPHA
 from sfm.adjustment.hypotheses.score import log_f_sf
+from sfm.adjustment.quality.statistics import more_than_chance
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.camera import Camera, tangents_from_pixel
 from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.distortion.models import Role
-from sfm.distributions import binomial_sf
 from sfm.errors import GeometryError
 from sfm.network import Estimate, ImagePoints, Network, ObjectPoints
 from sfm.orientation.incremental.growth import residual_lengths
@@ -80,8 +80,7 @@ def treat_lost(
     against = np.bincount(seen.image[known & ~accepted], minlength=m)
     enough = count > LARGER_PART * np.bincount(seen.image, minlength=m)
     lost = against > LARGER_PART * count
-    usual = (against.sum() - against + 1) / (count.sum() - count + 2)  # share of the others, Laplace's rule
-    unusual = binomial_sf(against - 1, count, usual) < ALPHA / m
+    unusual = more_than_chance(against, count, ALPHA)
     doubtful = enough & (unusual | (np.isin(network.images, suspected) & estimate.oriented))
     if not doubtful.any() or (doubtful & lost).sum() > LARGER_PART * m:
         return None

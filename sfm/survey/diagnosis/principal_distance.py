@@ -14,7 +14,7 @@ from sfm.network import Estimate
 from sfm.remarks.remark import Remark, remark
 from sfm.survey.inputs.survey import Survey
 
-FAR = 0.2  # relative change of c; focusing from infinity to 1 : 5 changes it by as much
+FAR = 0.2  # relative change of c, as focusing from infinity to 1 : 5 makes it: c = f (1 + 1/5), thin lens
 
 
 def far_principal_distances(survey: Survey, estimate: Estimate, sigma: Sequence[float]) -> tuple[Remark, ...]:
