@@ -15,13 +15,15 @@ from sfm.camera import camera_from_values
 from sfm.network import ImagePoints, empty_estimate
 from sfm.orientation.incremental.sequence import orient
 from sfm.pipeline import run_survey
-from sfm.remarks.remark import of_kind
+from sfm.remarks.remark import kinds_of, of_kind
 from sfm.rendering.render import render_photographs
 from sfm.rendering.scene import Optics
+from sfm.report.findings.findings import findings_of
 from sfm.result import SurveyResult
 from sfm.survey.adjusting.solution import refine
 from sfm.survey.diagnosis.contradicting_codes import find_contested_codes
 from sfm.survey.diagnosis.second_object import find_second_objects, tell_second_objects
+from sfm.survey.inputs.given import KnownPoints
 from sfm.survey.inputs.measurements import Naming
 from sfm.survey.inputs.survey import read_survey
 from sfm.survey.measuring.measured_store import MeasuredStore
@@ -159,3 +161,39 @@ def test_photographs_of_the_mirror_image_are_named(mirrored: int) -> None:
     for one in result.failed:
         assert one.reason.kind == "photograph_of_mirror_image"
         assert one.reason.number("points") >= 30 and len(one.reason.names("photographs")) == 4
+
+
+@pytest.mark.parametrize("control", [0, 8])
+def test_one_mirrored_photograph_is_named(control: int) -> None:
+    """It was said to contradict the others."""
+    network, truth = make_network(seed_of("one mirrored"), images=8, points=30)
+    seen = network.image_points
+    xy = seen.xy.copy()
+    xy[seen.image == 3, 0] = OF_NETWORK[0] - 1 - xy[seen.image == 3, 0]
+    given: dict[str, Any] = {}
+    if control:
+        names = [str(k + 1) for k in range(control)]
+        given = {
+            "control": KnownPoints.from_arrays(names, truth.points[:control], 1e-4),
+            "datum": {"kind": "control"},
+        }
+    result = run_survey(survey_of(replace(network, image_points=replace(seen, xy=xy)), truth, **given))
+    (one,) = result.failed
+    assert (one.image, one.reason.kind) == ("image 4", "photograph_mirrored")
+    assert one.reason.number("turned") < 0.5 and one.reason.number("before") > 5
+
+
+@pytest.mark.parametrize("datum", ["control", "free"])
+def test_control_names_photographs_that_are_all_mirrored(datum: str) -> None:
+    """Of a camera that is adjusted: K2 is known to 1 % at the corner, the image points to 0.1 %."""
+    network, truth = make_network(seed_of("all mirrored"), images=8, points=30)
+    seen = network.image_points
+    xy = np.column_stack([OF_NETWORK[0] - 1 - seen.xy[:, 0], seen.xy[:, 1]])
+    control = KnownPoints.from_arrays([str(k + 1) for k in range(8)], truth.points[:8], 1e-4)
+    survey = survey_of(
+        replace(network, image_points=replace(seen, xy=xy)), truth,
+        free=("c", "x0", "y0", "K1", "K2"), control=control, datum={"kind": datum},
+    )  # fmt: skip
+    result = run_survey(survey)
+    assert "control_mirrored" in kinds_of(result.remarks)
+    assert findings_of(result).verdict.level == "bad"

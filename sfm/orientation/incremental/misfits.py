@@ -22,7 +22,7 @@ FAR_BETTER = 8.0  # times smaller residuals, turned over: 20 to 80 of mirrored p
 
 
 def judge_misfits(growth: Growth, refine: Refine | None) -> bool:
-    """Let mirrored photographs go and take back what a rival solution left out though it fits.
+    """Name and take out mirrored photographs, and take back what a rival solution left out though it fits.
 
     Args:
         growth: settled; changed where a photograph comes or goes.
@@ -32,8 +32,8 @@ def judge_misfits(growth: Growth, refine: Refine | None) -> bool:
         Whether a photograph came or went, so that the network is to be settled anew.
     """
     changed = False
-    for i in [k for k, reason in growth.reasons.items() if reason.kind == CONTRADICTING]:
-        if not _is_mirrored(growth, i) and growth.resect([i]):
+    for i, reason in list(growth.reasons.items()):
+        if not _is_mirrored(growth, i) and reason.kind == CONTRADICTING and growth.resect([i]):
             growth.dropped[i], changed = False, True
     looked_at = ~growth.estimate.oriented
     while growth.estimate.oriented.sum() > MIN_OTHERS:

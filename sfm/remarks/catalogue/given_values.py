@@ -53,7 +53,7 @@ ROWS = (
         "control_mirrored",
         "error",
         "The control is mirrored (chi-square {chi2} as given, {mirrored} if mirrored): it was not used.",
-        "left-handed coordinates, two axes exchanged, or the sign of one axis changed",
+        "left-handed coordinates, two axes exchanged, the sign of one axis changed, or mirrored photographs",
         "Give X, Y and Z of a right-handed system.",
     ),
     Kind(

@@ -31,7 +31,7 @@ from sfm.adjustment.quality.given_values import (
     judge_values,
 )
 from sfm.adjustment.result import Adjustment
-from sfm.camera import KNOWN_WITHOUT, corner_shift
+from sfm.camera import KNOWN_WITHOUT, pixel_from_tangents, tangents_from_pixel
 from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.errors import GeometryError
 from sfm.network import ExteriorObservations, Network, ObjectPoints, ScaleBars
@@ -137,13 +137,29 @@ def _places(network: Network, free: Adjustment, datum: Datum) -> _Places | None:
 
 
 def _determines_cameras(marginal: Marginal) -> bool:
-    """Return whether a network knows its free interior parameters as well as linear propagation needs."""
-    none = np.zeros(0, dtype=np.int64)
-    for a, camera in enumerate(marginal.adjustment.estimate.cameras):
-        variance = np.diagonal(marginal.joint(marginal.layout.interior_column[a], none))
-        for s, one in zip(marginal.layout.interior_free[a], variance, strict=True):
-            if corner_shift(camera, int(s), float(np.sqrt(max(one, 0.0)))) > KNOWN_WITHOUT:
-                return False
+    """Return whether a network knows its cameras as well as linear propagation needs.
+
+    That is by how much the free parameters, one standard deviation off together, move its image points.
+    """
+    a, none = marginal.adjustment, np.zeros(0, dtype=np.int64)
+    seen = a.network.image_points.select(~a.rejected)
+    for k, camera in enumerate(a.estimate.cameras):
+        xy = seen.xy[a.network.camera[seen.image] == k]
+        covariance = marginal.joint(marginal.layout.interior_column[k], none)
+        sigma = np.sqrt(np.maximum(np.diagonal(covariance), 0.0))
+        if not len(xy) or not sigma.all():
+            continue
+        uv = tangents_from_pixel(camera, xy)
+        moved = np.empty((len(sigma), *xy.shape))
+        for n, s in enumerate(marginal.layout.interior_free[k]):
+            parameters = camera.parameters.copy()
+            parameters[s] += sigma[n]
+            moved[n] = pixel_from_tangents(camera.with_parameters(parameters), uv) - xy
+        correlation = covariance / np.outer(sigma, sigma)
+        shift = np.sqrt(np.einsum("st,skx,tkx->k", correlation, moved, moved).max())
+        reach = np.linalg.norm(xy - (np.array(camera.size_px) - 1) / 2, axis=1).max()
+        if not shift <= KNOWN_WITHOUT * reach:
+            return False
     return True
 
 
