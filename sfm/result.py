@@ -26,6 +26,8 @@ from sfm.remarks.remark import Remark
 from sfm.stored_result import NO_SCALE, SeenTargets, StoredResult
 from sfm.targets.flags import Flag, count_flags
 
+COPIES = ("copy_of_file", "copy_of_picture", "copy_of_image_points", "copy_of_errors")
+
 
 @dataclass(frozen=True)
 class FailedImage:
@@ -37,7 +39,7 @@ class FailedImage:
     @property
     def is_copy(self) -> bool:
         """Whether it is a copy of another photograph, which counts for both."""
-        return self.reason.kind == "photograph_copy"
+        return self.reason.kind in COPIES
 
 
 @dataclass(frozen=True)

@@ -18,12 +18,6 @@ HEADLINES: Mapping[Level, str] = {
     "fair": "The points were compared, and not tested.",
     "bad": "The results differ significantly.",
 }
-UNTESTED = {
-    "no standard deviations": "no_sigmas",
-    "no standard deviations of common points": "no_sigmas",
-    "no common datum": "no_common_datum",
-    "covariance of single points only": "no_joint_covariance",
-}
 OTHER_SIGMAS = 5.0  # standard deviations from which on an interior orientation is another one
 
 
@@ -72,14 +66,8 @@ def _remarks(found: ResultComparison) -> Iterator[Remark]:
     elif found.changed:
         yield _differences(found, longest, unit)
     tested = int(np.isfinite(found.statistic).sum())
-    if not found.points:
-        yield remark("no_common_points")
-    elif not found.independent:
-        yield remark("same_image_points", share=found.same_share, first=first, second=second)
-    elif found.untested in UNTESTED:
-        yield remark(UNTESTED[found.untested])
-    elif found.untested:
-        yield remark("untestable", reason=found.untested)
+    if found.untested is not None:
+        yield found.untested
     elif found.approximate:
         yield remark("tested_singly")
     elif tested <= MAX_POINTS < len(found.points):

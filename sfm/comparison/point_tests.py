@@ -15,6 +15,7 @@ from sfm.comparison.point_pairs import PointPairs, rounding_of
 from sfm.comparison.stable_points import critical_value
 from sfm.conventions import METRES, BoolArray, FloatArray, IntArray
 from sfm.errors import GeometryError
+from sfm.remarks.remark import Remark, remark
 from sfm.similarity import Similarity
 from sfm.stored_result import StoredResult
 
@@ -26,7 +27,7 @@ class PointTest:
     """What the tests of the points say."""
 
     sigma: FloatArray  # of the differences, NaN where not known, (n, 3)
-    untested: str
+    untested: Remark | None  # why there is no test
     statistic: FloatArray
     critical: float
     significant: BoolArray
@@ -75,18 +76,18 @@ def judge_points(
     nothing = np.full(n, np.nan)
     every = np.ones(n, dtype=bool)
 
-    def without(why: str) -> PointTest:
+    def without(why: Remark) -> PointTest:
         return PointTest(sigma, why, nothing, np.nan, ~every, np.nan, np.nan, every)
 
     if not n:
-        return without("no common points")
+        return without(remark("no_common_points"))
     if not any(has_sigma(one) for one in (a, b)):
-        return without("no standard deviations")
+        return without(remark("no_sigmas"))
     known = [one for one in (a, b) if has_sigma(one)]
     points, free, together = pairs
     if all(one.covariance is not None for one in known):
         if align == "none" and not all(one.datum == "control" for one in known):
-            return without("no common datum")
+            return without(remark("no_common_datum"))
         d, Q = points.differences(transform)
         try:
             found = congruency(
@@ -97,18 +98,18 @@ def judge_points(
                 alpha=alpha,
             )
         except GeometryError as error:
-            return without(str(error))
+            return without(remark("untestable", reason=str(error)))
         sigma[together] = 0.0  # held in both, or written over
         return _of_congruency(found, free, sigma, together)
     if not all(one.datum in FREE_DATUMS for one in known):
-        return without("covariance of single points only")
+        return without(remark("no_joint_covariance"))
     difference = transform.apply(b.estimate.points[pb]) - a.estimate.points[pa]
     statistic, critical, global_critical = _single_tests(difference, blocks, points.redundancy, alpha)
     if not np.isfinite(statistic).any():
-        return without("no standard deviations of common points")
+        return without(remark("no_sigmas"))
     mean = float(np.nanmean(statistic))
     return PointTest(
-        *(sigma, "", statistic, critical, statistic > critical, mean, global_critical, every),
+        *(sigma, None, statistic, critical, statistic > critical, mean, global_critical, every),
         approximate=True,
     )
 
@@ -132,7 +133,7 @@ def _of_congruency(found: Congruency, tested: IntArray, sigma: FloatArray, toget
     significant[tested] = found.moved
     first, critical = found.first_test, float(found.critical[found.reference][0])
     return PointTest(
-        *(sigma, "", statistic, critical, significant, first.statistic, first.critical),
+        *(sigma, None, statistic, critical, significant, first.statistic, first.critical),
         *(stable, False, found.agreed),
     )
 

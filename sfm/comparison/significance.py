@@ -29,6 +29,7 @@ from sfm.comparison.solutions import rotation_angle_deg
 from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.errors import GeometryError
 from sfm.network import Network
+from sfm.remarks.remark import Remark, remark
 from sfm.similarity import Similarity, fit_similarity
 from sfm.stored_result import StoredResult
 
@@ -66,7 +67,7 @@ class ResultComparison:
     points: tuple[str, ...]  # names in a of the common points, n of them
     point_difference: FloatArray  # object unit of a, (n, 3)
     point_sigma: FloatArray  # of the differences, NaN where not known, (n, 3)
-    untested: str  # why no test is made; empty where one is
+    untested: Remark | None  # why no test is made; None where one is
     approximate: bool  # whether the tests know the covariance of single points only
     statistic: FloatArray  # T of each point, NaN where not tested, (n,)
     critical: float  # of T for one point among all; NaN without tests
@@ -91,7 +92,7 @@ class ResultComparison:
         """Whether the points differ significantly, as a whole or singly; None if that is not tested."""
         if self.cause is not None:
             return True
-        if self.untested:
+        if self.untested is not None:
             return None
         return bool(
             self.global_statistic > self.global_critical or self.significant.any() or not self.majority
@@ -138,12 +139,13 @@ def compare_results(
     pairs = pairs_of_results(a, b, pairing.points, scale)
     test = judge_points(a, b, pairing, pairs, transform, align, chosen, alpha)
     if same_share > SAME_SHARE:
-        test = replace(test, untested="same image points")
+        same = remark("same_image_points", share=same_share, first=a.name, second=b.name)
+        test = replace(test, untested=same)
     stable = chosen & test.stable if align == "control" else test.stable
-    if align == "points" and not test.untested and not stable.all():
+    if align == "points" and test.untested is None and not stable.all():
         transform = fit_similarity(b.estimate.points[pb[stable]], a.estimate.points[pa[stable]], scale=scale)
         moved = transform.apply_estimate(b.estimate)
-    tested = not test.untested
+    tested = test.untested is None
     points, free, _ = pairs
     cause = None
     if align != "none" and any(has_sigma(one) for one in (a, b)):

@@ -81,7 +81,7 @@ def differences_summary(found: ResultComparison) -> dict[str, Any]:
         "changed": found.changed,
         "verdict": verdict.level,
         "remarks": [one.as_dict() for one in verdict.remarks],
-        "untested": found.untested or None,
+        "untested": found.untested and found.untested.kind,
         "approximate": found.approximate,
         "tested": _tested(found),
         "global_test": {

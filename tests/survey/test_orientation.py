@@ -54,8 +54,8 @@ def write_exterior(path: Path, names: tuple[str, ...], position: np.ndarray, rot
     path.write_text("\n".join(rows) + "\n", encoding="utf-8")
 
 
-def copy_by(what: str) -> Remark:
-    return remark("photograph_copy", original="photo 2 again.png", what=what)
+def copy_of(kind: str) -> Remark:
+    return remark(kind, original="photo 2 again.png")
 
 
 def test_copies_of_a_photograph_are_no_observations(
@@ -64,7 +64,7 @@ def test_copies_of_a_photograph_are_no_observations(
     folder = changed(survey_file, tmp_path / "copies")
     shutil.copy(folder / "photo 2.png", folder / "photo 2 again.png")
     result = run_survey(read_survey(folder / "survey.toml"), store=store)
-    assert [(f.image, f.reason) for f in result.failed] == [("photo 2.png", copy_by("its file"))]
+    assert [(f.image, f.reason) for f in result.failed] == [("photo 2.png", copy_of("copy_of_file"))]
     assert result.images_total == 6 and result.failed[0].is_copy
     assert result.adjustment.redundancy == plain.adjustment.redundancy
 
@@ -75,7 +75,7 @@ def test_a_copy_with_another_byte_is_no_observation(
     folder = changed(survey_file, tmp_path / "saved again")
     (folder / "photo 2 again.png").write_bytes((folder / "photo 2.png").read_bytes() + b"\0")
     result = run_survey(read_survey(folder / "survey.toml"), store=store)
-    assert [(f.image, f.reason) for f in result.failed] == [("photo 2.png", copy_by("its picture"))]
+    assert [(f.image, f.reason) for f in result.failed] == [("photo 2.png", copy_of("copy_of_picture"))]
     assert result.adjustment.redundancy == plain.adjustment.redundancy
 
 

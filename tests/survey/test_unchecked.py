@@ -175,7 +175,7 @@ def test_a_copy_among_the_image_points_is_no_photograph() -> None:
     )
     result, plain = (run_survey(survey_of(one, truth)) for one in (copied, network))
     assert [(one.image, one.reason) for one in result.failed] == [
-        ("again", remark("photograph_copy", original="image 4", what="its image points"))
+        ("again", remark("copy_of_image_points", original="image 4"))
     ]
     assert result.adjustment.redundancy == plain.adjustment.redundancy and result.images_total == 8
 

@@ -76,9 +76,30 @@ ROWS = (
     ),
     # reasons of single photographs that are not in the result
     Kind(
-        "photograph_copy",
+        "copy_of_file",
         "note",
-        "It is a copy of {original}, by {what}.",
+        "Its file is that of {original}.",
+        "the same photograph was copied or saved again; it is no second observation",
+        "Remove the copy.",
+    ),
+    Kind(
+        "copy_of_picture",
+        "note",
+        "Its picture is that of {original}.",
+        "the same photograph was copied or saved again; it is no second observation",
+        "Remove the copy.",
+    ),
+    Kind(
+        "copy_of_image_points",
+        "note",
+        "Its image points are those of {original}.",
+        "the same photograph was copied or saved again; it is no second observation",
+        "Remove the copy.",
+    ),
+    Kind(
+        "copy_of_errors",
+        "note",
+        "Its image points have the errors of those of {original}.",
         "the same photograph was copied or saved again; it is no second observation",
         "Remove the copy.",
     ),

@@ -238,7 +238,7 @@ def _weighed(adjust_part: Callable[[FloatArray], Adjustment], count: int) -> Adj
     group = np.zeros(count, dtype=np.int64)
     final, _, settled = estimate_components(adjust_part, group, (IMAGE_POINTS,))
     if not settled:
-        unsettled = remark("weights_not_converged", groups="the image points")
+        unsettled = remark("weights_not_converged", groups=IMAGE_POINTS)
         final = replace(final, remarks=(*final.remarks, unsettled))
     return final
 

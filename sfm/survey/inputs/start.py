@@ -62,8 +62,7 @@ def measurements_from_observations(survey: Survey) -> Measurements:
     rows = own[image] & ~outside
     number = np.cumsum(own) - 1
     failed = tuple(
-        FailedImage(every[i], remark("photograph_copy", original=every[j], what="its image points"))
-        for i, j in copies.items()
+        FailedImage(every[i], remark("copy_of_image_points", original=every[j])) for i, j in copies.items()
     )
     images, owner = tuple(name for name, keep in zip(images, own, strict=True) if keep), owner[own]
     image, point = number[image[rows]], point[rows]

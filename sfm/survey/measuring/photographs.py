@@ -58,7 +58,7 @@ def each_photograph(
             originals.append(k)
         else:
             original = photographs.names[first]
-            failed[k] = FailedImage(name, remark("photograph_copy", original=original, what="its file"))
+            failed[k] = FailedImage(name, remark("copy_of_file", original=original))
             progress.advance(name)
 
     def work_on(k: int) -> T:
@@ -87,9 +87,7 @@ def each_photograph(
         first = pictures.setdefault(shown, k) if shown else k
         if first != k:
             original = photographs.names[first]
-            failed[k] = FailedImage(
-                photographs.names[k], remark("photograph_copy", original=original, what="its picture")
-            )
+            failed[k] = FailedImage(photographs.names[k], remark("copy_of_picture", original=original))
             del found[k]
     in_order = tuple(failed[k] for k in sorted(failed))
     if len(found) < MIN_PHOTOGRAPHS:

@@ -71,6 +71,6 @@ def adjust_finally(
         lambda factor: tested(good, factor, reject="none"), group, GROUPS
     )
     if not settled:
-        remarks.append(remark("weights_not_converged", groups="key points and targets"))
+        remarks.append(remark("weights_not_converged", groups=GROUPS))
     weights = factor[np.asarray(part.image_points.point >= matched, dtype=np.int64)]
     return tested(part, weights, reject="tau"), tuple(remarks)

@@ -104,8 +104,7 @@ def without_copies(measured: Measurements, copies: dict[str, tuple[str, float]])
     if naming is not None:
         naming = replace(naming, point=tuple(naming.point[k] for k in kept))
     failed = tuple(
-        FailedImage(name, remark("photograph_copy", original=first, what="its errors"))
-        for name, (first, _) in copies.items()
+        FailedImage(name, remark("copy_of_errors", original=first)) for name, (first, _) in copies.items()
     )
     return replace(
         measured,
