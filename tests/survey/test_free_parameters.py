@@ -37,9 +37,11 @@ def chosen(network: Network, truth: Estimate, **options: Any) -> FreeParameters:
     return choose_free_parameters(survey_with(), network, nominal(network, truth), **options)
 
 
-def planar(rng: np.random.Generator, count: int, *, tilt: float) -> tuple[Network, Estimate]:
-    """Return photographs of a plane from above, none of them turned about its axis."""
-    network, truth = make_network(rng, images=count, points=40, planar=True)
+def planar(
+    rng: np.random.Generator, count: int, *, tilt: float, flat: bool = True
+) -> tuple[Network, Estimate]:
+    """Return photographs of a plane, or of a cube, from above, none of them turned about its axis."""
+    network, truth = make_network(rng, images=count, points=40, planar=flat)
     position = np.column_stack([rng.uniform(-0.6, 0.6, (count, 2)), np.full(count, 4.0)])
     angle = tilt * rng.standard_normal((count, 2))
     rotation = np.stack([_turned(x, y) for x, y in angle])
@@ -110,6 +112,30 @@ def test_control_determines_what_three_photographs_do_not() -> None:
     control = ObjectPoints(given, truth.points[given], np.zeros((len(given), 3, 3)))
     found = chosen(replace(network, control=control), truth, datum="control")
     assert {"c", "K1"} <= set(found.cameras[0].free)
+
+
+@pytest.mark.parametrize("off", [0.0, 0.05])
+def test_wrong_control_does_not_decide_what_is_free(off: float) -> None:
+    """One point of fourteen 50 mm wrong: the residuals that it leaves hid that b1 is not zero."""
+    network, truth = make_network(seed_of("free beside wrong control"), images=12, points=40)
+    given = np.arange(0, 40, 3)
+    xyz = truth.points[given]
+    xyz[2, 1] += off
+    control = ObjectPoints(given, xyz, np.tile(1e-8 * np.eye(3), (len(given), 1, 1)))
+    found = chosen(replace(network, control=control), truth, datum="control")
+    assert found.cameras == chosen(network, truth).cameras and "b1" in found.cameras[0].free
+
+
+def test_control_determines_c_of_many_photographs_that_do_not() -> None:
+    network, truth = planar(seed_of("parallel photographs and control"), 8, tilt=0.005, flat=False)
+    given = np.arange(0, 40, 2)
+    control = ObjectPoints(given, truth.points[given], np.tile(1e-8 * np.eye(3), (len(given), 1, 1)))
+    alone, with_control = (
+        set(chosen(one, truth, datum="control").cameras[0].free)
+        for one in (network, replace(network, control=control))
+    )
+    assert "c" not in alone and "c" in with_control
+    assert alone == set(chosen(network, truth).cameras[0].free)
 
 
 def test_a_camera_that_the_survey_describes_stays_as_described() -> None:

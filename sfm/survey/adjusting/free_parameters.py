@@ -24,6 +24,7 @@ from sfm.errors import GeometryError
 from sfm.network import Estimate, Network
 from sfm.reduced_network import reduce_network, supported
 from sfm.remarks.remark import Remark, remark
+from sfm.survey.hypotheses.given import without_given
 from sfm.survey.inputs.settings import CameraSettings
 from sfm.survey.inputs.survey import Survey
 
@@ -53,7 +54,7 @@ def choose_free_parameters(
         survey: says what is free of its cameras, or does not.
         network: with one camera for each of the survey's, in their order.
         estimate: start values; photographs and points without any take no part in the decision.
-        datum: kind of datum; control determines cameras that photographs by themselves do not.
+        datum: kind of datum; control takes part where photographs by themselves do not determine c.
         extend: whether parameters beyond the candidates are tried.
 
     Returns:
@@ -74,13 +75,27 @@ def choose_free_parameters(
         names = [one if one is None else set() for one in names]
     else:
         part, start = reduce_network(network, estimate, images, points, everything)
-        names = _determined(part, start, names, datum, extend=extend)
+        alone = None
+        if images.sum() >= MIN_PHOTOGRAPHS:  # control may be wrong, and hide what the image points demand
+            alone = _determined(without_given(part), start, names, "free", extend=extend)
+        if alone is None or (datum == "control" and not _has_each_c(start, names, alone)):
+            with_control = _determined(part, start, names, datum, extend=extend)
+            if alone is None or _has_each_c(start, names, with_control):
+                alone = with_control
+        names = alone
     cameras = tuple(
         one if chosen is None else one.model_copy(update={"free": _in_order(one, chosen)})
         for one, chosen in zip(survey.cameras, names, strict=True)
     )
     remarks = tuple(_remark(cameras[a], int(images[network.camera == a].sum())) for a in silent)
     return FreeParameters(cameras, _with_free(estimate, names), remarks)
+
+
+def _has_each_c(start: Estimate, asked: Chosen, chosen: Chosen) -> bool:
+    """Return whether c is free of each camera of which it was to be."""
+    c = [camera.names[0] for camera in start.cameras]
+    each = zip(c, asked, chosen, strict=True)
+    return all(name in (free or ()) for name, may, free in each if name in (may or ()))
 
 
 def _determined(part: Network, start: Estimate, names: Chosen, datum: str, *, extend: bool) -> Chosen:
