@@ -422,3 +422,12 @@ def test_points_without_noise_fit(estimated: bool, far: float) -> None:
     given[3, 1] += 1e-6 if far == 0 else 1e-2
     wrong = judge_points(replace(one, given=given), 0.001, estimated=estimated)
     assert wrong is not None and wrong.judgement.wrong == (3,)
+
+
+def test_coordinates_have_the_rounding_of_the_largest() -> None:
+    one = exact(4, "rounding")
+    one = replace(one, given=one.given + 1e3, joint=np.zeros((12, 12)))
+    placing = replace(FRAME.inverse(), translation=FRAME.inverse().translation + 1e3)
+    largest = float(np.abs(one.given).max())
+    sigma = np.sqrt(np.diagonal(one.model(placing, estimated=False).network))
+    np.testing.assert_allclose(sigma, 16 * 2.0**-52 * largest)

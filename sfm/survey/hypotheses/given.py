@@ -39,10 +39,14 @@ from sfm.remarks.remark import Remark, remark
 from sfm.similarity import Similarity
 
 UNIT_FACTORS = (10.0, 12.0, 25.4, 100.0, 304.8, 1000.0)  # between mm, cm, m, inch and foot
-SAME_UNIT = 0.02  # relative difference up to which a factor is that of a unit
-UNCHECKED = 5.0  # standard deviations by which an error that no test finds may shift what rests on it
-PRINT_SIGMA = 0.002  # relative scale of coordinates without standard deviations, as of prints and drawings
-MAX_PLACES = 1000  # given points whose joint covariance is formed; of more, so many are judged
+SAME_UNIT = 0.02  # relative difference up to which a factor is that of a unit; 10 and 12 are 0.2 apart
+UNCHECKED = (
+    5.0  # standard deviations by which an error that no test finds may shift the result; it is wrong then
+)
+PRINT_SIGMA = (
+    0.002  # relative scale of coordinates without standard deviations: paper swells by 1 to 2 permille
+)
+MAX_PLACES = 1000  # given points whose joint covariance is formed, 72 MB; of more, so many are judged
 
 
 @dataclass(frozen=True)
