@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 from sfm.display import MAX_LISTED
 from sfm.remarks.remark import SEVERITIES, Remark, Severity
@@ -37,6 +37,11 @@ class Verdict:
     def lines(self) -> tuple[Line, ...]:
         """What is printed of the remarks: of many of one kind the first ones, and how many more there are."""
         return lines_of(self.remarks)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the verdict for JSON."""
+        remarks = [one.as_dict() for one in self.remarks]
+        return {"headline": self.headline, "verdict": self.level, "remarks": remarks}
 
 
 def judge(remarks: Iterable[Remark], headlines: Mapping[Level, str]) -> Verdict:

@@ -103,8 +103,7 @@ def epochs_summary(found: EpochSeries) -> dict[str, Any]:
     return {
         "epochs": list(found.names),
         "changed": found.changed,
-        "verdict": verdict.level,
-        "remarks": [one.as_dict() for one in verdict.remarks],
+        **verdict.as_dict(),
         "adjusted_together": [
             {
                 "camera": one.name,

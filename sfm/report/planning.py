@@ -193,9 +193,7 @@ def plan_summary(plan: Plan) -> dict[str, Any]:
     return {
         "name": plan.name,
         "unit": plan.unit,
-        "headline": verdict.headline,
-        "verdict": verdict.level,
-        "remarks": [one.as_dict() for one in verdict.remarks],
+        **verdict.as_dict(),
         "reached": plan.reached,
         "shortfall": or_none(plan.shortfall),
         "wanted": {

@@ -87,14 +87,12 @@ def trial_row(trial: Trial) -> tuple[object, ...]:
 
 def validation_summary(validation: Validation) -> dict[str, Any]:
     """Return what validation.json holds: plain values only, None for what is not known."""
-    verdict = verdict_of_validation(validation)
     return {
         "backend": validation.backend,
         "seed": validation.seed,
         "networks": len(validation.trials),
         "passed": validation.passed,
-        "headline": verdict.headline,
-        "verdict": verdict.level,
+        **verdict_of_validation(validation).as_dict(),
         "ended": dict(validation.counts()),
         "largest": {name: or_none(value) for name, value, _ in largest(validation)},
         "seconds": {
