@@ -136,7 +136,7 @@ def parameters_of(model: GivenModel, kept: BoolArray) -> FloatArray:
     S = (model.network + model.stated)[np.ix_(kept, kept)]
     A = model.A[kept]
     unit = max(float(np.trace(S)), np.finfo(float).tiny)
-    if not (model.network.any() or model.stated.any()) or model.estimated:
+    if model.estimated:
         return np.asarray(np.linalg.pinv(A, rcond=RANK))
     # covariance along the parameters does not change them, and makes that of a free network regular
     P = np.linalg.inv(S + unit * A @ A.T + RANK**1.5 * unit * np.eye(len(S)))
