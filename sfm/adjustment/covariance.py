@@ -22,6 +22,7 @@ from sfm.adjustment.engine.observed_unknowns import Weighted, weighted_of
 from sfm.adjustment.engine.unknowns import Unknowns, unknowns_of
 from sfm.adjustment.quality.rank import reduced_names
 from sfm.adjustment.result import Adjustment
+from sfm.camera import KNOWN_WITHOUT, pixel_from_tangents, tangents_from_pixel
 from sfm.conventions import FloatArray, IntArray
 from sfm.errors import GeometryError
 from sfm.kernels.threads import own_threads
@@ -154,3 +155,30 @@ def change_datum(adjustment: Adjustment, datum: Datum | str) -> Adjustment:
     kind, points = datum.resolve(adjustment.network)
     covariance = without_held(covariance, m.layout, m.optimum)
     return replace(adjustment, datum=kind, datum_points=points, covariance=covariance)
+
+
+def determines_cameras(marginal: Marginal) -> bool:
+    """Return whether a network knows its cameras as well as linear propagation needs.
+
+    That is by how much the free parameters, one standard deviation off together, move its image points.
+    """
+    a, none = marginal.adjustment, np.zeros(0, dtype=np.int64)
+    seen = a.network.image_points.select(~a.rejected)
+    for k, camera in enumerate(a.estimate.cameras):
+        xy = seen.xy[a.network.camera[seen.image] == k]
+        covariance = marginal.joint(marginal.layout.interior_column[k], none)
+        sigma = np.sqrt(np.maximum(np.diagonal(covariance), 0.0))
+        if not len(xy) or not sigma.all():
+            continue
+        uv = tangents_from_pixel(camera, xy)
+        moved = np.empty((len(sigma), *xy.shape))
+        for n, s in enumerate(marginal.layout.interior_free[k]):
+            parameters = camera.parameters.copy()
+            parameters[s] += sigma[n]
+            moved[n] = pixel_from_tangents(camera.with_parameters(parameters), uv) - xy
+        correlation = covariance / np.outer(sigma, sigma)
+        shift = np.sqrt(np.einsum("st,skx,tkx->k", correlation, moved, moved).max())
+        reach = np.linalg.norm(xy - (np.array(camera.size_px) - 1) / 2, axis=1).max()
+        if not shift <= KNOWN_WITHOUT * reach:
+            return False
+    return True

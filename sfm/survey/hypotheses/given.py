@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sfm.adjustment.covariance import Marginal, marginal_of
+from sfm.adjustment.covariance import determines_cameras, marginal_of
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.quality.given_points import (
     GivenPoints,
@@ -31,7 +31,6 @@ from sfm.adjustment.quality.given_values import (
     judge_values,
 )
 from sfm.adjustment.result import Adjustment
-from sfm.camera import KNOWN_WITHOUT, pixel_from_tangents, tangents_from_pixel
 from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.errors import GeometryError
 from sfm.network import ExteriorObservations, Network, ObjectPoints, ScaleBars
@@ -129,7 +128,7 @@ def _places(network: Network, free: Adjustment, datum: Datum) -> _Places | None:
         joint = marginal.joint((6 * stations[:, None] + np.arange(3)).ravel(), points)
     except (GeometryError, np.linalg.LinAlgError):
         return None
-    if not np.isfinite(joint).all() or not _determines_cameras(marginal):
+    if not np.isfinite(joint).all() or not determines_cameras(marginal):
         return None
     return _Places(
         np.concatenate([free.estimate.position[stations], free.estimate.points[points]]),
@@ -138,33 +137,6 @@ def _places(network: Network, free: Adjustment, datum: Datum) -> _Places | None:
         {name: len(images) + k for k, name in enumerate(names)},
         {name: k for k, name in enumerate(images)},
     )
-
-
-def _determines_cameras(marginal: Marginal) -> bool:
-    """Return whether a network knows its cameras as well as linear propagation needs.
-
-    That is by how much the free parameters, one standard deviation off together, move its image points.
-    """
-    a, none = marginal.adjustment, np.zeros(0, dtype=np.int64)
-    seen = a.network.image_points.select(~a.rejected)
-    for k, camera in enumerate(a.estimate.cameras):
-        xy = seen.xy[a.network.camera[seen.image] == k]
-        covariance = marginal.joint(marginal.layout.interior_column[k], none)
-        sigma = np.sqrt(np.maximum(np.diagonal(covariance), 0.0))
-        if not len(xy) or not sigma.all():
-            continue
-        uv = tangents_from_pixel(camera, xy)
-        moved = np.empty((len(sigma), *xy.shape))
-        for n, s in enumerate(marginal.layout.interior_free[k]):
-            parameters = camera.parameters.copy()
-            parameters[s] += sigma[n]
-            moved[n] = pixel_from_tangents(camera.with_parameters(parameters), uv) - xy
-        correlation = covariance / np.outer(sigma, sigma)
-        shift = np.sqrt(np.einsum("st,skx,tkx->k", correlation, moved, moved).max())
-        reach = np.linalg.norm(xy - (np.array(camera.size_px) - 1) / 2, axis=1).max()
-        if not shift <= KNOWN_WITHOUT * reach:
-            return False
-    return True
 
 
 @dataclass
