@@ -77,3 +77,29 @@ def test_a_point_with_half_of_its_rays_rejected_is_a_remark() -> None:
     verdict = findings_of(run_survey(survey_of(spoiled, truth, adjust={"reject": "tau"}))).verdict
     (found,) = of_kind(verdict.remarks, "rays_rejected")
     assert found.names("points") == (network.points[4],)
+
+
+@pytest.mark.parametrize("number", [0, 1, 4])
+def test_image_points_without_noise_are_a_good_survey(number: int) -> None:
+    """Residuals of 1e-13 px are rounding, whose distribution says nothing."""
+    network, truth = make_network(
+        seed_of(f"nf{number}"),
+        images=8 + number,
+        points=40,
+        noise_px=0.0,
+        visibility=0.8,
+        free=("c", "x0", "y0"),
+    )
+    result = run_survey(survey_of(network, truth, free=("c", "x0", "y0"), adjust={"reject": "tau"}))
+    assert result.adjustment.is_exact and result.adjustment.sigma0 > 0
+    verdict = findings_of(result).verdict
+    assert verdict.level == "good"
+    assert {one.kind for one in verdict.remarks} == {"scale_undefined", "sigma_px_cautious"}
+
+
+def test_residuals_are_rounding_up_to_five_ten_thousand_steps_of_a_double() -> None:
+    network, truth = make_network(seed_of("exact"), images=6, points=20, noise_px=0.0, free=("c",))
+    a = adjust(network, truth, reject="none")
+    limit = 1e-11 * float(np.abs(network.image_points.xy).max())
+    for factor, exact in ((0.6, True), (1.6, False)):
+        assert replace(a, residuals=np.full_like(a.residuals, factor * limit)).is_exact == exact

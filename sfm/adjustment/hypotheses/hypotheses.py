@@ -75,7 +75,7 @@ def judge_alternatives(final: Adjustment, *, unit: str = "") -> Judged:
         unit: object unit, for the remarks.
     """
     photographs = final.network.images
-    if not final.converged or not final.sigma0 > 0:
+    if not final.converged or not final.sigma0 > 0 or final.is_exact:
         return Judged()  # no result, or one that nothing contradicts
     if len(photographs) > MAX_PHOTOGRAPHS:
         return Judged(unchecked=(remark("too_many_to_test", photographs=photographs),))

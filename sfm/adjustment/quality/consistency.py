@@ -45,8 +45,8 @@ class Consistency:
 
 
 def consistency_of(adjustment: Adjustment) -> Consistency:
-    """Return what the tests of points and photographs find; nothing without a covariance."""
-    if not np.isfinite(adjustment.redundancy_numbers).any() or not adjustment.sigma0 > 0:
+    """Return what the tests of points and photographs find; nothing without covariance or noise."""
+    if not np.isfinite(adjustment.redundancy_numbers).any() or adjustment.is_exact:
         return Consistency((), None)
     parts = point_normals(adjustment)
     rays = parts.rows_of_points(adjustment)

@@ -23,6 +23,7 @@ import numpy as np
 from sfm.adjustment.engine.collinearity import Observations, State
 from sfm.adjustment.quality.gross_errors.rays_of_points import further_rays
 from sfm.adjustment.quality.reliability import standardised_residuals, tau_critical, whitening_matrix
+from sfm.adjustment.result import ROUNDING
 from sfm.conventions import MAD_TO_SIGMA, BoolArray, FloatArray
 
 # In sigmas of a coordinate, for the length of a residual vector: both are 95 % efficient with normal errors
@@ -34,9 +35,6 @@ TUKEY = 5.123
 CROWDED = 60
 BESIDE = 0.4
 RETURNS = 0.99  # of the critical value: a rejected one returns below, since at it rounds turn in circles
-# Of an image coordinate: 5e4 times what a double resolves. Computed coordinates are exact to some 1e-15 of
-# themselves, measured ones to 1e-7 at best.
-ROUNDING = 1e-11
 MIN_FREEDOM = 0.05  # of redundancy over observations, so that a network without redundancy has a scale
 
 
