@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import re
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -54,7 +55,8 @@ MODULES = {
 }
 
 
-def imported(path: Path) -> set[str]:
+@cache
+def imported(path: Path) -> frozenset[str]:
     """Return the modules that a module imports anywhere in it, functions and type checking included."""
     names: set[str] = set()
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
@@ -65,7 +67,7 @@ def imported(path: Path) -> set[str]:
             module = node.module or ""
             names.add(module)
             names.update(f"{module}.{a.name}" for a in node.names if f"{module}.{a.name}" in MODULES)
-    return names
+    return frozenset(names)
 
 
 def belongs(name: str, group: str) -> bool:

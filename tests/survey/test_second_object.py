@@ -114,7 +114,7 @@ def test_a_code_that_moved_is_told_and_costs_no_photograph(folder: Path) -> None
     assert all(name.startswith("c") for name in moved.names("photographs"))
 
 
-@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_photographs_that_fit_one_another_only_are_a_second_object(seed: int) -> None:
     """The same numbers are at other places of another object."""
     rng = seed_of(f"second object {seed}")
@@ -140,7 +140,7 @@ def join(first: ImagePoints, second: ImagePoints) -> ImagePoints:
     )
 
 
-@pytest.mark.parametrize("seed", [3, 10])
+@pytest.mark.parametrize("seed", [3, pytest.param(10, marks=pytest.mark.slow)])
 def test_zoomed_photographs_are_no_second_object(seed: int) -> None:
     """They orient one another, and adjusted with a c of their own they show the same shape."""
     network, truth = with_zoom(f"zoomed alike {seed}", dict.fromkeys(range(6, 10), 1.4))
@@ -149,7 +149,7 @@ def test_zoomed_photographs_are_no_second_object(seed: int) -> None:
     assert find_second_objects(network, found, orient) == ()
 
 
-@pytest.mark.parametrize("mirrored", [4, 6])
+@pytest.mark.parametrize("mirrored", [4, pytest.param(6, marks=pytest.mark.slow)])
 def test_photographs_of_the_mirror_image_are_named(mirrored: int) -> None:
     network, truth = make_network(seed_of("mirror images"), images=10, points=40)
     seen = network.image_points

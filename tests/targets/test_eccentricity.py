@@ -88,6 +88,7 @@ def test_one_wrong_ellipse_does_not_turn_the_target() -> None:
     assert np.abs(circles.shift - shift)[good].max() < 0.15 * np.abs(shift).max()
 
 
+@pytest.mark.slow
 def test_sigma_of_the_shift_follows_the_scatter() -> None:
     views, _ = scene()
     rng = np.random.default_rng(7)

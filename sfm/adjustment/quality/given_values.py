@@ -143,7 +143,8 @@ class GivenModel:
     @cached_property
     def size(self) -> FloatArray:
         """Standard deviations of the differences, (m,)."""
-        return np.sqrt(np.diagonal(self.network + self.stated))
+        # rounding makes the variance of a point of an exact network negative
+        return np.sqrt(np.maximum(np.diagonal(self.network + self.stated), np.finfo(float).tiny))
 
     @cached_property
     def blocks(self) -> tuple[IntArray, BoolArray]:

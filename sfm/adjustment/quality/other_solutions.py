@@ -39,7 +39,7 @@ FEW_PHOTOGRAPHS = 5  # from so many photographs on
 LARGE = 4000  # image points from which on a network is not weak
 BARRIER = 3e3  # times v'Pv of the result: what lies beyond is not looked for
 APART = 1.0  # standard deviations (root mean square) between solutions that are not the same
-MAX_ITERATIONS = 20
+MAX_ITERATIONS = 60  # from planes, whose relief is to be found, some fifty
 NEAR = 1e-3  # |A dx| / |v| at which the network is followed to the next c
 
 

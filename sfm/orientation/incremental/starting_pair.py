@@ -22,6 +22,7 @@ from sfm.similarity import fit_similarity
 MAX_PAIRS = 60  # pairs whose solutions are tried on the other photographs
 BARREN_PAIRS = 20  # pairs most of whose points fit no orientation, after which no more are tried
 PAIR_TRIALS = 500  # samples of five points in a pair: enough where 45 % of its points fit, at 99.99 %
+AS_A_PLANE = 0.1  # tangents: by so much the relief of a flat object may move the points of a plane
 PAIR_POINTS = 1000  # common points of a pair that take part in its orientation
 MIN_MEDIAN_ANGLE_DEG = 5.0  # median ray angle of a pair that is worth starting from
 MIN_ANGLE_OF_TWO_DEG = 3.0  # of a survey of two photographs, which has no other pair
@@ -130,6 +131,8 @@ def pair_solutions(network: Network, estimate: Estimate, *, tolerance_px: float)
 
     Only those with a base that a survey could start from. A plane seen at moderate angles is also one seen at
     a grazing angle from a base of almost nothing, which bends to fit the errors better than the truth.
+    Planes are starts of flat objects too, though relief takes points away from them: a telephoto lens shows
+    relief large and perspective small, and coplanarity by itself may end in another minimum.
 
     Args:
         network: of two photographs and points that both see.
@@ -142,10 +145,10 @@ def pair_solutions(network: Network, estimate: Estimate, *, tolerance_px: float)
     own = _sorted_rows(network, tangents)
     points, first, second = _common(network, tangents, own[0], own[1])
     tolerance = tolerance_px / min(camera.c_px for camera in estimate.cameras)
-    try:
-        solutions = relative_orientations(first, second, tolerance=tolerance, max_trials=PAIR_TRIALS)
-    except GeometryError:
-        return ()
+    solutions: list[RelativeOrientation] = []
+    for within in (tolerance, AS_A_PLANE):
+        with suppress(GeometryError):
+            solutions += relative_orientations(first, second, tolerance=within, max_trials=PAIR_TRIALS)
     found = []
     for solution in solutions:
         if solution.kind == "infinite":
