@@ -65,9 +65,8 @@ def test_c_that_had_to_be_held_is_freed_where_it_fits_better() -> None:
         pytest.param(667, marks=pytest.mark.slow),
         # the solution that was left for one of 0.987 times its v'Pv is the true one: 7.9 sigma, fair
         pytest.param(1251, marks=pytest.mark.slow),
-        pytest.param(
-            1308, marks=pytest.mark.slow
-        ),  # two nearer solutions stood before the one that is 6 sigma away: 6.9 sigma, fair
+        # two nearer solutions stood before the one that is 6 sigma away: 6.9 sigma, fair
+        pytest.param(1308, marks=pytest.mark.slow),
     ],
 )
 def test_other_principal_distances_are_found_along_bent_valleys(number: int) -> None:
