@@ -28,6 +28,7 @@ MIN_FACTOR = (
 MAX_ROUNDS = 20
 FEW = 1.0  # redundancy of a group of image points below which its variance component is not estimated
 IMAGE_POINTS = "image points"
+INTERIOR = "interior orientation"
 FEW_OF_A_KIND = 0.1  # the same of a kind, of which a few scale bars may be all there is
 
 
@@ -135,7 +136,7 @@ def by_kind(adjustment: Adjustment) -> VarianceComponents:
             float(np.einsum("eab,eba->", w.exterior_weight, Q_exterior)) / unit,
         ),
         (
-            "interior orientation",
+            INTERIOR,
             len(w.column),
             float(dp @ w.interior_weight @ dp),
             float((w.interior_weight * Q_interior).sum()) / unit,

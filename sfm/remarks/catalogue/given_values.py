@@ -83,9 +83,17 @@ ROWS = (
     Kind(
         "given_differs",
         DETECTED,
-        "The given {given} differs from the adjusted one by {difference}, {sigmas} standard deviations: "
-        "the result shifts by up to {shift} of its standard deviations.",
+        "The given {given} differs from the adjusted one by {difference}, {sigmas} standard deviations, and "
+        "shifts it by {shift} standard deviations.",
         CHECK_THE_LIST,
+        "Correct this value, or state a larger standard deviation.",
+    ),
+    Kind(
+        "orientation_differs",
+        "warning",
+        "The given {given} differs from the adjusted one by {difference}, {sigmas} standard deviations.",
+        "another order or sense of the angles, an instrument not aligned with the camera, or standard "
+        "deviations that are too small",
         "Correct this value, or state a larger standard deviation.",
     ),
     Kind(

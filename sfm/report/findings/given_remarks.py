@@ -1,24 +1,25 @@
 """Remarks on given values after the adjustment: residuals, checks, and whether the scale can be.
 
 What was given is judged by the image points alone before it takes part; these are the tests of what took
-part, and of what only checks the result.
+part, and of what only checks the result. Given interior orientation is not tested here: whether it is wrong
+is the question of an alternative (`sfm.adjustment.hypotheses`), which states the shift of object points.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
 from sfm.adjustment.quality.given_values import LEVEL
 from sfm.adjustment.quality.statistics import component_tests
-from sfm.adjustment.quality.variance_components import IMAGE_POINTS
+from sfm.adjustment.quality.variance_components import IMAGE_POINTS, INTERIOR
 from sfm.conventions import METRES
 from sfm.distributions import normal_ppf
 from sfm.network import rows_of
 from sfm.remarks.remark import Remark, remark
 from sfm.report.findings.bundle_statistics import Statistics
-from sfm.report.findings.given_residuals import Given, GivenResiduals
+from sfm.report.findings.given_residuals import Given, GivenResiduals, GivenValue
 from sfm.report.findings.protocol import ControlCoordinate
 from sfm.report.numbers import finer_unit
 from sfm.result import SurveyResult
@@ -42,7 +43,7 @@ def given_remarks(
         checks: coordinates that took no part.
     """
     return (
-        *(one for kind in given.kinds for one in _residuals(kind)),
+        *_differing(given),
         *_kinds(statistics),
         *_checks(checks, result.length_unit),
         *_scale(result),
@@ -56,31 +57,42 @@ def _kinds(statistics: Statistics) -> tuple[Remark, ...]:
     return tuple(
         remark("given_sigmas", of=test.of, factor=float(found.sigma0[g]))
         for g, test in enumerate(component_tests(found, alpha=2 * level))
-        if test.of != IMAGE_POINTS and found.count[g] > 1 and test.statistic > test.upper
+        if test.of not in (IMAGE_POINTS, INTERIOR) and found.count[g] > 1 and test.statistic > test.upper
     )
 
 
-def _residuals(kind: GivenResiduals) -> tuple[Remark, ...]:
-    """Return the remark on the value whose w is largest, where chance does not explain it.
+def _differing(given: Given) -> Iterator[Remark]:
+    """Yield the remark on the value of each kind whose w is largest, where chance does not explain it.
 
-    The shift is the largest that any function of the unknowns has without it: |w| sqrt((1 - r) / r).
+    The shift is that of the adjusted value itself, |w| sqrt((1 - r) / r), a coordinate or a length of the
+    object. The orientation of a photograph is neither, so that none is given there.
     """
+    for kind in (given.control, given.bars):
+        worst = _beyond_chance(kind) if kind else None
+        if kind and worst:
+            shift = abs(worst.w) * np.sqrt((1 - worst.r) / worst.r)
+            yield remark("given_differs", shift=shift, **_parts(worst, kind))
+    for kind in given.exterior:
+        worst = _beyond_chance(kind)
+        if worst:
+            yield remark("orientation_differs", **_parts(worst, kind))
+
+
+def _beyond_chance(kind: GivenResiduals) -> GivenValue | None:
+    """Return the value of a kind whose w is largest, if it is larger than chance makes it."""
     tested = [one for one in kind.by_w if np.isfinite(one.w) and one.r >= MIN_REDUNDANCY]
-    if not tested:
-        return ()
-    worst = max(tested, key=lambda one: abs(one.w))
-    if not abs(worst.w) > -normal_ppf(LEVEL / (2 * len(tested))):
-        return ()
-    what = "" if worst.coordinate == "value" else f"{worst.coordinate} of {kind.kind} "
-    return (
-        remark(
-            "given_differs",
-            given=f"{what}{worst.name}",
-            difference=(abs(worst.difference), "" if worst.unit == "1" else worst.unit),
-            sigmas=abs(worst.w),
-            shift=abs(worst.w) * np.sqrt((1 - worst.r) / worst.r),
-        ),
-    )
+    if not tested or not abs(tested[0].w) > -normal_ppf(LEVEL / (2 * len(tested))):
+        return None
+    return tested[0]
+
+
+def _parts(one: GivenValue, kind: GivenResiduals) -> dict[str, str | float | tuple[float, str]]:
+    """Return a value, its difference and its w as a remark has them."""
+    return {
+        "given": f"{one.coordinate} of {kind.kind} {one.name}",
+        "difference": (abs(one.difference), one.unit),
+        "sigmas": abs(one.w),
+    }
 
 
 def _checks(checks: Sequence[ControlCoordinate], unit: str) -> tuple[Remark, ...]:
