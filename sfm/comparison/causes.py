@@ -1,16 +1,17 @@
 """Why the coordinates of the same points differ in two results: alternatives in one list, tested by one rule.
 
 An alternative is a row: what of one result may be another in the second one. It is the scale, the handedness,
-the names of the points, or a bending of the whole. With it the differences are formed anew and tested for
-congruency. A row explains the differences if a majority of the points then agrees. It wins if its likelihood
+the names of the points, a strain or a bending of the whole. With it the differences are formed anew and
+tested for congruency. A row explains the differences if a majority of the points then agrees. It wins if its
+likelihood
 
-    L = ln p(d) - moved ln(extent / sigma)^3 - q/2 ln(3 n) - S
+    L = ln p(d) - moved ln(extent / sigma)^3 - ln C(n, moved) - q/2 ln(3 n) - S
 
 exceeds that of the assumption that nothing but single points changed by ln(rows / alpha); p is Student's
 density of the stable points, q the row's parameters and S the logarithm of the choices searched inside it.
-Simple rows come first, and a row with more in it must exceed them as much: a bending of the second degree
-also imitates a scale and a mirror. Where no row explains the differences, a permutation test asks whether the
-points have anything to do with one another.
+Simple rows come first, and a later row must exceed them as much: a bending of the second degree also
+imitates a strain, and a strain a scale and a mirror. Where no row explains the differences, a permutation
+test asks whether the points have anything to do with one another.
 
 Source: Caspary (2000), Concepts of network and deformation analysis, secs. 7 and 8; Schwarz (1978),
 Estimating the dimension of a model, for q/2 ln n; Jackson (1995), PROTEST: a Procrustean randomization test,
@@ -22,12 +23,19 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from itertools import groupby
 
 import numpy as np
 
-from sfm.comparison.congruency import MIN_STABLE, MOTIONS, STABLE_FRACTION, bending, motions
-from sfm.comparison.pairing import fit_robustly, nearest_places
+from sfm.comparison.congruency import (
+    MIN_STABLE,
+    MOTIONS,
+    STABLE_FRACTION,
+    bending,
+    extended_axes,
+    motions,
+    strain,
+)
+from sfm.comparison.pairing import fit_affinity, fit_robustly, nearest_places
 from sfm.comparison.point_pairs import ROUNDING, PointPairs
 from sfm.comparison.point_patterns import find_pattern
 from sfm.comparison.stable_points import (
@@ -60,16 +68,26 @@ class Row:
     scale: bool = False
     mirror: bool = False
     names: bool = False
+    strain: bool = False
     bending: bool = False
 
 
 NOTHING = Row()
-ROWS = (  # the simple ones first; of those that lead to one another the likeliest wins
+ROWS = (  # the simple ones first
     *(Row(scale=True), Row(mirror=True), Row(scale=True, mirror=True)),
-    Row(bending=True),
+    *(Row(strain=True), Row(bending=True)),
     *(Row(names=True), Row(scale=True, names=True)),
     *(Row(mirror=True, names=True), Row(scale=True, mirror=True, names=True)),
 )
+
+
+@dataclass(frozen=True)
+class Stretch:
+    """Lengths of the second result over those of the first along a principal axis of a strain."""
+
+    axis: FloatArray  # in the frame of the first, (3,)
+    lengths: float
+    sigma: float
 
 
 @dataclass(frozen=True)
@@ -81,6 +99,7 @@ class Cause:
     lengths: float = 1.0  # of the second result over those of the first, if the scale is another
     lengths_sigma: float = 0.0
     unit: tuple[str, str] | None = None  # finer and coarser unit of which `lengths` is the factor
+    stretches: tuple[Stretch, ...] = ()  # significant ones, the largest first, if there is a strain
     renamed: tuple[tuple[str, str], ...] = ()  # name in the first result and name of the same in the second
     moved: tuple[str, ...] = ()  # points that differ besides
     gain: float = math.inf  # logarithm of the likelihood over that of points that moved
@@ -97,6 +116,7 @@ class _Fit:
     agreed: bool  # whether a majority of the points agrees
     stable: BoolArray
     lengths: tuple[float, float]  # of b over those of a, and the standard deviation
+    stretches: tuple[Stretch, ...]
     other: IntArray | None  # point of b that is each of a, -1 for none; None where names are as given
 
 
@@ -125,13 +145,15 @@ def find_cause(
         rows = [row for row in rows if row == Row(scale=True)]
     elif nothing.agreed:  # a majority agrees as it is
         rows = [row for row in rows if not row.mirror]
-    for _, tier in groupby(rows, lambda row: (row.mirror, row.names, row.bending)):
-        best = nothing
-        for fit in (fit for row in tier for fit in _fits(pairs, row, nothing, reference, cost)):
+    best = nothing
+    for row in rows:
+        if row.names and best.agreed and best.stable.sum() == reference.sum():
+            continue  # all points agree by the names that they have
+        for fit in _fits(pairs, row, nothing, reference, cost):
             if fit.agreed and best.L + limit < fit.L:
                 best = fit
-        if best is not nothing:
-            return _cause(best, pairs, best.L - nothing.L)
+    if best is not nothing:
+        return _cause(best, pairs, best.L - nothing.L)
     if changed and not nothing.agreed and is_unrelated(pairs.a, pairs.b):
         return Cause(NOTHING, other_object=True)
     return None
@@ -203,26 +225,27 @@ def _fitted(
         GeometryError: too few points, or points on a line.
     """
     n = len(pairs.a)
-    estimated = row.scale or pairs.scale is None
+    whole = row.strain or row.bending
+    estimated = row.scale or whole or pairs.scale is None
     source = pairs.b @ MIRROR if row.mirror else pairs.b
     T = fit_robustly(source[reference], pairs.a[reference], scale=None if estimated else pairs.scale)
     if row.mirror:
         T = replace(T, rotation=T.rotation @ MIRROR)
+    if whole:  # large ones too
+        T = fit_affinity(T, pairs.a, pairs.b, reference)
     d, Q = pairs.differences(T)
-    whole = motions(pairs.a)
-    G = whole[:, : MOTIONS["similarity" if estimated else "rigid"]]
-    parameters = int(row.scale)
-    if row.bending:
-        own = G.shape[1]
-        G = _independent(np.hstack([G, bending(pairs.a)]), 3 * n)
-        parameters += G.shape[1] - own
+    similarity = motions(pairs.a)
+    G = similarity[:, : MOTIONS["similarity" if estimated else "rigid"]]
+    if whole:
+        G = _independent(np.hstack([G, (bending if row.bending else strain)(pairs.a)]), 3 * n)
+    parameters = G.shape[1] - MOTIONS["similarity" if pairs.scale is None else "rigid"]
     lost = 0 if other is None else len(other) - n
     searched = 0.0
     if other is not None:
         exchanged = int(((other >= 0) & (other != np.arange(len(other)))).sum())
         searched = exchanged * math.log(len(other))
     penalty = lost * cost + parameters / 2 * math.log(3 * n) + searched
-    failed = _Fit(row, pairs, T, -(n * cost + penalty), False, np.zeros(n, dtype=bool), (1.0, 0.0), other)
+    failed = _Fit(row, pairs, T, -(n * cost + penalty), False, np.zeros(n, dtype=bool), (1.0, 0.0), (), other)
     least = max(MIN_STABLE, math.ceil(STABLE_FRACTION * reference.sum()))
     if 2 * G.shape[1] > 3 * n or G.shape[1] >= 3 * least:  # too few points to be explained by so much
         return failed
@@ -240,9 +263,12 @@ def _fitted(
     last = found.steps[-1]
     r = pairs.redundancy
     ln_p = -last.omega / 2 if r is None else -(r + last.freedom) / 2 * math.log1p(last.omega / r)
-    moved = int(reference.sum() - found.stable.sum())
-    lengths = _lengths(pairs, T, d, Q, whole, found.stable) if row.scale else (1.0, 0.0)
-    return _Fit(row, pairs, T, ln_p - moved * cost - penalty, True, found.stable, lengths, other)
+    candidates = int(reference.sum())
+    moved = candidates - int(found.stable.sum())
+    penalty += moved * cost + math.log(math.comb(candidates, moved))
+    lengths = _lengths(pairs, T, d, Q, similarity, found.stable) if row.scale else (1.0, 0.0)
+    stretches = _stretches(pairs, T, d, Q, similarity, found.stable) if row.strain else ()
+    return _Fit(row, pairs, T, ln_p - penalty, True, found.stable, lengths, stretches, other)
 
 
 def _relative_sigma(pairs: PointPairs) -> float:
@@ -272,6 +298,40 @@ def _lengths(
     return lengths, lengths / math.sqrt(weight) / size
 
 
+def _stretches(
+    pairs: PointPairs, T: Similarity, d: FloatArray, Q: FloatArray, whole: FloatArray, stable: BoolArray
+) -> tuple[Stretch, ...]:
+    """Return the principal strains that are significant, by the stable points, the largest first.
+
+    Where the scale is not known to both, they are relative to the middle one.
+    """
+    among = candidates_of(d, Q, whole[:, : MOTIONS["similarity" if pairs.scale is None else "rigid"]], stable)
+    axes, along = extended_axes(pairs.a)
+    i, j = np.triu_indices(len(axes))
+    tensors = np.zeros((len(i), 3, 3))
+    for k, (u, v) in enumerate(zip(axes[i], axes[j], strict=True)):
+        tensors[k] = (np.outer(u, v) + np.outer(v, u)) / 2
+    S = np.einsum("kxy,ny->nxk", tensors, along[stable] @ axes).reshape(-1, len(i))
+    N = S.T @ among.P @ S
+    if pairs.scale is None:  # nothing but the trace is undetermined
+        N += np.trace(N) * np.outer(i == j, i == j)
+    covariance = np.linalg.inv(N)
+    left = np.tensordot(covariance @ (S.T @ (among.P @ among.d)), tensors, 1)
+    F = (pairs.scale or 1.0) * np.linalg.solve(T.scale * T.rotation, np.eye(3) + left)
+    squares, directions = np.linalg.eigh(F.T @ F)
+    lengths = np.sqrt(squares)
+    gradient = np.einsum("xa,kxy,ya->ak", directions, tensors, directions)
+    sigma = lengths * np.sqrt(np.einsum("ak,kl,al->a", gradient, covariance, gradient))
+    if pairs.scale is None:
+        sigma, lengths = sigma / np.median(lengths), lengths / np.median(lengths)
+    limit = math.sqrt(critical_value(ALPHA / 3, 1, pairs.redundancy))
+    return tuple(
+        Stretch(directions[:, k], float(lengths[k]), float(sigma[k]))
+        for k in np.argsort(-np.abs(lengths - 1))
+        if abs(lengths[k] - 1) > limit * sigma[k]
+    )
+
+
 def _cause(fit: _Fit, pairs: PointPairs, gain: float) -> Cause:
     """Put in words of the field what a row found."""
     row, (lengths, sigma) = fit.row, fit.lengths
@@ -289,5 +349,12 @@ def _cause(fit: _Fit, pairs: PointPairs, gain: float) -> Cause:
         )
     moved = tuple(name for name, stays in zip(fit.pairs.names, fit.stable, strict=True) if not stays)
     return Cause(
-        row, lengths=lengths, lengths_sigma=sigma, unit=unit, renamed=renamed, moved=moved, gain=gain
+        row,
+        lengths=lengths,
+        lengths_sigma=sigma,
+        unit=unit,
+        stretches=fit.stretches,
+        renamed=renamed,
+        moved=moved,
+        gain=gain,
     )

@@ -176,9 +176,30 @@ def bending(xyz: FloatArray) -> FloatArray:
     Source: James and Robson (2014), Mitigating systematic error in topographic models derived from UAV and
     ground-based image networks (dome by errors of the radial distortion).
     """
-    _, extent, axes = np.linalg.svd(xyz - xyz.mean(axis=0), full_matrices=False)
-    along = ((xyz - xyz.mean(axis=0)) @ axes.T / mean_distance(xyz))[:, extent > THIN * extent[0]]
+    _, along = extended_axes(xyz)
+    along = along / mean_distance(xyz)
     i, j = np.triu_indices(along.shape[1])
-    terms = np.hstack([along, along[:, i] * along[:, j]])
+    return _in_every_direction(np.hstack([along, along[:, i] * along[:, j]]))
+
+
+def strain(xyz: FloatArray) -> FloatArray:
+    """Return how coordinates change with a homogeneous deformation and rotations, (3 n, k).
+
+    Args:
+        xyz: coordinates, (n, 3).
+    """
+    return _in_every_direction(extended_axes(xyz)[1] / mean_distance(xyz))
+
+
+def extended_axes(xyz: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the axes along which an object extends (k, 3), and its coordinates along them (n, k)."""
+    centred = xyz - xyz.mean(axis=0)
+    _, extent, axes = np.linalg.svd(centred, full_matrices=False)
+    axes = axes[THIN * extent[0] < extent]
+    return axes, centred @ axes.T
+
+
+def _in_every_direction(terms: FloatArray) -> FloatArray:
+    """Return how coordinates change with each of the terms (n, k), (3 n, 3 k)."""
     shapes: FloatArray = np.einsum("nk,xy->nxky", terms, np.eye(3))
-    return shapes.reshape(3 * len(xyz), -1)
+    return shapes.reshape(3 * len(terms), -1)

@@ -51,8 +51,21 @@ def remarks_of_cause(
     if row.names:
         exchanged = [f"{ours} = {theirs}" for ours, theirs in cause.renamed]
         yield remark("names_differ", count=len(exchanged), exchanged=exchanged, **between)
+    if row.strain:
+        main, *others = cause.stretches
+        across = [f"{_words(one.axis)} {one.lengths:.8g} times" for one in others]
+        numbers = {"lengths": main.lengths, "sigma": main.sigma}
+        yield remark(
+            "strained", axis=_words(main.axis), across=across or None, moved=moved, **numbers, **between
+        )
     if row.bending:
         yield remark("bent", distance=largest, moved=moved, **between)
+
+
+def _words(axis: FloatArray) -> str:
+    """Return a direction, its largest component positive."""
+    axis = axis * np.sign(axis[np.argmax(np.abs(axis))])
+    return "(" + ", ".join(f"{x + 0.0:.2f}" for x in np.round(axis, 2)) + ")"
 
 
 def _remarks(found: ResultComparison) -> Iterator[Remark]:

@@ -9,12 +9,13 @@ another.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from sfm.camera import tangents_from_pixel
+from sfm.comparison.congruency import extended_axes
 from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.errors import GeometryError
 from sfm.files.covariance_file import UNCODED
@@ -256,6 +257,38 @@ def fit_robustly(
             break
         found = fit_similarity(source, target, scale=scale, weights=1 / np.maximum(length, least))
     return found
+
+
+def fit_affinity(start: Similarity, a: FloatArray, b: FloatArray, reference: BoolArray) -> Similarity:
+    """Return a similarity made an affinity that most of the points agree on: its rotation is any matrix.
+
+    The object is sheared and stretched along the axes along which it extends, by the L1 norm.
+
+    Args:
+        start: from b to a.
+        a: points, (n, 3).
+        b: the same points in the other frame, (n, 3).
+        reference: points that take part, (n,).
+    """
+    source = start.apply(b)
+    axes, along = extended_axes(source)
+    X, gap = np.hstack([np.ones((len(a), 1)), along])[reference], (a - source)[reference]
+    weight = np.ones(len(X))
+    for _ in range(20):
+        root = np.sqrt(weight)[:, None]
+        shift, *shapes = np.linalg.lstsq(root * X, root * gap, rcond=None)[0]
+        length = np.linalg.norm(gap - X @ [shift, *shapes], axis=1)
+        least = 1e-3 * np.median(length)
+        if not least > 0:
+            break
+        weight = 1 / np.maximum(length, least)
+    A = np.eye(3) + np.transpose(shapes) @ axes
+    centre = source.mean(axis=0)
+    return replace(
+        start,
+        rotation=A @ start.rotation,
+        translation=A @ (start.translation - centre) + centre + shift,
+    )
 
 
 def nearest_places(

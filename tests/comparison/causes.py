@@ -38,6 +38,9 @@ EXPECTED = {
     "another object": ("another_object",),
     "mirrored, mm for m": ("mirrored", "unit_differs"),
     "a tenth moved": ("points_differ",),
+    "six tenths moved together": ("points_differ",),
+    "grown along x": ("strained",),
+    "grown along x and y": ("strained",),
     "bent": ("bent",),
 }
 """causes by case; in epochs points that moved are `displaced`"""
@@ -56,6 +59,10 @@ def pair(case: str, number: int) -> tuple[StoredResult, StoredResult]:
     if case == "a tenth moved":
         chosen = rng.choice(points, points // 10, replace=False)
         moved[chosen] += 0.01 * _directions(rng, len(chosen))
+    if case == "six tenths moved together":
+        moved[rng.permutation(points)[: -(-6 * points // 10)]] += 0.001
+    if "grown" in case:
+        moved *= [1.001, 1.001 if "y" in case else 1.0, 1.0]
     if case == "bent":
         along = moved[:, :2] @ _directions(rng, 1)[0, :2]
         moved[:, 2] += 0.01 * along**2

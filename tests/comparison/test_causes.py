@@ -105,6 +105,34 @@ def test_the_rule_needs_the_stated_gain(monkeypatch: pytest.MonkeyPatch) -> None
         assert (one is not None) is named, sigmas
 
 
+@pytest.mark.parametrize("scale", [1.0, None])
+def test_a_strain_is_named_with_its_axis(scale: float | None) -> None:
+    """Relative to the middle one where the scale is unknown, of which both results then have another."""
+    a = pairs_of(1.0)
+    axis = np.array([0.6, 0.0, 0.8])
+    grown = (a.b + 1e-3 * np.outer(a.b @ axis, axis)) * (1.0 if scale else 3.0)
+    found = find_cause(replace(a, b=grown, Q_b=a.Q_b * (1.0 if scale else 9.0), scale=scale))
+    assert found is not None and found.row == Row(strain=True) and not found.moved
+    (one,) = found.stretches
+    assert abs(one.axis @ axis) > 0.999 and one.sigma < 2e-5
+    assert abs(one.lengths - 1.001) < 4 * one.sigma
+    other = pairs_of(1.0)
+    two = find_cause(replace(other, b=other.b * [1.001, 1.0, 0.999]))
+    assert two is not None and [round(1e3 * (one.lengths - 1)) for one in two.stretches] in ([1, -1], [-1, 1])
+
+
+def test_points_that_are_left_out_are_paid_for() -> None:
+    """No scale with moved points besides wins over a strain that leaves none."""
+    a = pairs_of(1.0)
+    b = a.b * [1.0003, 1.0, 1.0]
+    found = find_cause(replace(a, b=b))
+    assert found is not None and found.row == Row(strain=True) and not found.moved
+    b = a.b * 1.0005
+    b[:10] += 0.01
+    found = find_cause(replace(a, b=b))
+    assert found is not None and found.row == Row(scale=True) and len(found.moved) == 10
+
+
 def test_shuffled_names_are_unrelated_and_deformed_points_are_not() -> None:
     rng = seed_of("unrelated")
     a = rng.uniform(-1, 1, (20, 3))
@@ -128,4 +156,4 @@ def test_a_pattern_is_found_whatever_the_names() -> None:
 
 
 def test_the_level_is_that_of_all_rows() -> None:
-    assert causes.ALPHA == 0.001 and len(causes.ROWS) == 8 and causes.PERMUTATIONS == 999
+    assert causes.ALPHA == 0.001 and len(causes.ROWS) == 9 and causes.PERMUTATIONS == 999

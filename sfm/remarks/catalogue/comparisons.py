@@ -43,6 +43,14 @@ ROWS = (
         "Check that both results are of one object with the same targets.",
     ),
     Kind(
+        "strained",
+        "error",
+        "Lengths in {second} along {axis} are {lengths:.8g} +- {sigma:.2g} times those in {first}"
+        "[[, along {across}]][[; {moved:point} {moved:differs|differ} besides]].",
+        "an object that expanded or was loaded in one direction, or a camera that is not described well",
+        "Check temperature and load of the object; adjust both with per_photograph for c, and compare again.",
+    ),
+    Kind(
         "bent",
         "error",
         "{second} is bent as a whole against {first}, by up to {distance}[[; {moved:point} "

@@ -101,7 +101,7 @@ def _reason(
     cause, size = both.cause, mean_distance(others.estimate.points[both.pairing.points[:, 0]])
     if cause is not None and cause.row.mirror:
         return remark("photograph_of_mirror_image", photographs=images, points=len(both.points))
-    if both.majority if cause is None else cause.row.bending:
+    if both.majority if cause is None else cause.row.strain or cause.row.bending:
         return None
     rms = float(np.sqrt((both.point_difference**2).sum(axis=1).mean()))
     return remark(
