@@ -11,7 +11,7 @@ import pytest
 
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.hypotheses import families, hypotheses
-from sfm.adjustment.hypotheses.columns import interior_step, object_fields
+from sfm.adjustment.hypotheses.columns import columns_of, interior_step, object_fields
 from sfm.adjustment.hypotheses.families import Alternative
 from sfm.adjustment.hypotheses.hypotheses import (
     Cause,
@@ -43,6 +43,7 @@ FAMILIES = {
     one.name: one
     for one in (
         *families.OF_PHOTOGRAPHS,
+        *families.OF_EACH,
         *(families.HELD, families.GIVEN, families.FORMAT, families.MOVED, families.SHIFTED),
     )
 }
@@ -80,6 +81,7 @@ def alternative(
     [
         ("c", "split", "other_camera"),
         ("camera", "linear", "camera_drift"),
+        ("point", "each", "camera_varies"),
         ("held", "all", "held_parameter"),
         ("given", "all", "given_parameter"),
         ("format", "all", "distortion_not_described"),
@@ -114,6 +116,32 @@ def test_the_remark_on_a_camera(a: Adjustment) -> None:
     drift = remark(a, alternative("centre", "linear", (-1, -0.6, -0.2, 0.2, 0.6, 1)), [5.0, 3.0, -4.0, 1.0])
     assert drift.kind == "camera_drift" and "away" not in drift.numbers
     assert drift.number("change") == pytest.approx(2 * 0.5)  # from the first photograph to the last
+
+
+def test_the_remark_on_a_camera_of_each_photograph(a: Adjustment) -> None:
+    """From the mean of the photographs: 6, 3, 0, 0, 0, -3 px of c at the edge, and x0 of one."""
+    c = [6.0, 3.0, 0.0, 0.0, 0.0, -3.0]
+    every = (0, 1, 2, 3, 4, 5)
+    one = remark(a, alternative("c", "each", every), c)
+    assert one.kind == "camera_varies" and one.number("change") == pytest.approx(0.5)
+    assert "away" not in one.numbers
+    one = remark(a, alternative("point", "each", every), [0.0, 0, 0, 0, 6, 0, 0, 0, 0, 0, 0, 0])
+    assert one.number("away") == pytest.approx(5.0) and "change" not in one.numbers
+    beta = np.zeros((6, 4))
+    beta[:, 0], beta[2, 2] = c, 1.2
+    both = remark(a, alternative("centre", "each", every), beta.ravel().tolist())
+    assert (both.number("change"), both.number("away")) == pytest.approx((0.5, 1.0))
+
+
+def test_the_columns_of_each_photograph_are_its_own(a: Adjustment) -> None:
+    columns = columns_of(a)
+    image = a.network.image_points.image
+    D = alternative("point", "each", (0, 1, 2, 3, 4, 5)).columns(a, columns)
+    assert D.shape == (len(image), 2, 12)
+    for row in (0, 40, 83):
+        own = slice(2 * image[row], 2 * image[row] + 2)
+        np.testing.assert_array_equal(D[row, :, own], columns.freedoms[row, :, 1:3])
+        assert np.count_nonzero(D[row]) == np.count_nonzero(D[row, :, own])
 
 
 def test_the_remark_on_held_parameters(a: Adjustment) -> None:
@@ -215,16 +243,23 @@ def test_a_deformation_counts_from_its_mean(a: Adjustment) -> None:
 
 
 def choice(
-    monkeypatch: pytest.MonkeyPatch, every: list[Alternative], *, gain: float = 50.0, shift: float = 4.0
+    monkeypatch: pytest.MonkeyPatch,
+    every: list[Alternative],
+    *,
+    gain: float = 50.0,
+    gains: dict[int, float] | None = None,
 ) -> Cause | None:
     """Return the best of these alternatives, an adjustment with which gains so much."""
-    found = Refit(SimpleNamespace(), np.ones(1), gain, shift, shift)  # type: ignore[arg-type]
+
+    def adjusted(plain: Any, one: Alternative, *_: Any) -> Refit:
+        return Refit(SimpleNamespace(), np.ones(1), (gains or {}).get(id(one), gain), 4.0, 4.0)  # type: ignore[arg-type]
+
     monkeypatch.setattr(hypotheses, "columns_of", lambda a: None)
-    monkeypatch.setattr(hypotheses, "reduce_adjustment", lambda a, columns: None)
+    monkeypatch.setattr(hypotheses, "reduce_adjustment", lambda a, columns: SimpleNamespace(redundancy=200))
     monkeypatch.setattr(hypotheses, "alternatives_of", lambda *_: tuple(every))
-    monkeypatch.setattr(hypotheses, "refit", lambda *_: found)
+    monkeypatch.setattr(hypotheses, "refit", adjusted)
     nothing: Any = None
-    return hypotheses._best(nothing, nothing)
+    return hypotheses._best(nothing, ())
 
 
 def test_an_alternative_holds_by_its_probability_its_evidence_and_its_refit(
@@ -242,15 +277,31 @@ def test_an_alternative_holds_by_its_probability_its_evidence_and_its_refit(
         assert (found is not None) == holds
 
 
-def test_alternatives_of_about_the_same_evidence_cannot_be_told_apart(
+def test_alternatives_of_about_the_same_gain_cannot_be_told_apart(monkeypatch: pytest.MonkeyPatch) -> None:
+    limit = np.log(100)
+    best, same = alternative(evidence=40.0), alternative("camera", evidence=39.0)
+    near = alternative("strain", evidence=30.0)
+    nearer = alternative("bending", evidence=39.0)
+    far = alternative("held", "all", evidence=40.0, parameters=((0, 1),))
+    gains = {id(best): 60.0, id(nearer): 60 - limit + 0.3, id(far): 60 - limit - 0.3}
+    found = choice(monkeypatch, [best, same, far, nearer, near], gains=gains)
+    assert found is not None and found.alternative is best and found.as_well == (nearer,)
+
+
+def test_the_alternative_that_adjusts_best_holds_not_that_of_most_evidence(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    best, same = alternative(evidence=40.0), alternative("camera", evidence=39.0)
-    near = alternative("strain", evidence=40 - np.log(100) + 0.3)
-    nearer = alternative("bending", evidence=39.0)
-    far = alternative("held", "all", evidence=40 - np.log(100) - 0.3, parameters=((0, 1),))
-    found = choice(monkeypatch, [best, same, nearer, near, far])
-    assert found is not None and found.alternative is best and found.as_well == (nearer,)
+    """Two of each kind are tried; held parameters too where only another alternative is significant."""
+    one, two = alternative("c", evidence=40.0), alternative("c", factor=(0, 1, 0, 0, 0, 1), evidence=39.0)
+    three = alternative("c", factor=(0, 1, 1, 0, 0, 1), evidence=38.0)
+    held = alternative("held", "all", evidence=2.0, parameters=((0, 1),))
+    strong = replace(held, gain=Gain(2 * (5 + np.log(100)) + 1.5, 1, np.ones(1)))
+    weak = replace(held, gain=Gain(2 * (5 + np.log(100)) - 1.5, 1, np.ones(1)))
+    gains = {id(two): 70.0, id(three): 90.0, id(strong): 80.0, id(weak): 80.0}
+    for every, right in (([one, two, three, weak], two), ([one, two, strong], strong)):
+        found = choice(monkeypatch, every, gains=gains)
+        assert found is not None and found.alternative is right
+    assert choice(monkeypatch, [strong], gains=gains) is None
 
 
 def test_causes() -> None:
@@ -261,8 +312,12 @@ def test_causes() -> None:
     assert cause(alternative("c")) != cause(alternative("c", factor=(0, 0, 1, 1, 1, 1)))
     assert cause(alternative("strain")) == cause(alternative("bending")) == cause(alternative("shifted"))
     assert cause(alternative("strain")) != cause(alternative("strain", "linear"))
-    assert cause(alternative("held", parameters=((0, 1),))) == ("held",)
-    assert cause(alternative("given")) == ("given",) and cause(alternative("format")) == ("format",)
+    assert cause(alternative("held", parameters=((0, 1),))) == ("held", False)
+    assert cause(alternative("held", parameters=((0, 1), (0, 2)))) == ("held", True)
+    assert cause(alternative("held", parameters=((0, 1), (1, 1)))) == ("held", False)
+    assert cause(alternative("c", "each")) == cause(alternative("centre", "each")) == ("camera", "each")
+    assert cause(alternative("given", parameters=((0, 1),))) == ("given", False)
+    assert cause(alternative("format")) == ("format",)
 
 
 def test_two_causes_at_most_of_a_standard_deviation_at_least(
@@ -271,11 +326,15 @@ def test_two_causes_at_most_of_a_standard_deviation_at_least(
     shifts: list[float] = []
     treated: list[str] = []
 
-    def best(plain: Adjustment, current: Adjustment) -> Cause:
-        assert (current is plain) == (len(treated) == 0)
+    def best(plain: Adjustment, causes: tuple[Cause, ...]) -> Cause:
+        assert len(causes) == len(treated)
         treated.append("")
         return Cause(alternative(), Refit(replace(plain), np.ones(1), 1.0, shifts.pop(0), 1.0), ())
 
+    def needed(plain: Adjustment, causes: tuple[Cause, ...], found: Cause) -> tuple[Cause, ...]:
+        return (*causes, found)
+
+    monkeypatch.setattr(hypotheses, "_still_needed", needed)
     monkeypatch.setattr(hypotheses, "_best", best)
     for given, count in (([2.0, 3.0, 4.0], 2), ([0.9, 3.0], 1), ([1.1, 0.6], 1), ([1.0, 1.9], 2)):
         shifts[:], treated[:] = given, []

@@ -163,6 +163,22 @@ def _drift(scene: _Scene) -> str:
     return "camera_drift"
 
 
+def _stabiliser(scene: _Scene) -> str:
+    """A stabiliser that moves the principal point in every photograph."""
+    size = abs(_size(scene, 1, 10)) * PIXEL_MM[0]
+    for i in range(scene.m):
+        for name in ("x0", "y0"):
+            scene.change(i, name, by=size * scene.rng.standard_normal())
+    return "camera_varies"
+
+
+def _autofocus(scene: _Scene) -> str:
+    size = abs(_size(scene, 1e-3, 1e-2))
+    for i in range(scene.m):
+        scene.change(i, "c", factor=1 + size * scene.rng.standard_normal())
+    return "camera_varies"
+
+
 def _strained(scene: _Scene, photographs: FloatArray, factor: FloatArray, shape: FloatArray) -> None:
     centre = scene.truth.points.mean(axis=0)
     for i, share in zip(photographs, factor, strict=True):
@@ -302,13 +318,13 @@ def _correlated(size_px: float) -> Callable[[_Scene], str]:
 
 
 def _rolling(scene: _Scene) -> str:
-    """Rolling shutter with a hand that shakes: each photograph sheared by its own motion."""
+    """Rolling shutter with a hand that shakes: each photograph sheared as by a camera of its own."""
     seen = scene.network.image_points
     for i in range(scene.m):
         rows = seen.image == i
         speed = 0.3 * scene.rng.standard_normal(2) / SIZE_PX[1]
         scene.extra[rows] += (seen.xy[rows, 1:] - SIZE_PX[1] / 2) * speed
-    return ""
+    return "camera_varies"
 
 
 def _heavy(scene: _Scene) -> str:
@@ -365,6 +381,8 @@ FAULTS: dict[str, Callable[[_Scene], str]] = {
     "alternating": _alternating,
     "centre of one": _centre_of_one,
     "drift": _drift,
+    "stabiliser": _stabiliser,
+    "autofocus": _autofocus,
     "growth": _growth,
     "sheared": _sheared,
     "growing": _growing,
@@ -375,7 +393,7 @@ FAULTS: dict[str, Callable[[_Scene], str]] = {
     "held c": _held("c", 3e-3, 5e-2, relative=True),
     "held K1": _held("K1", 1e-4, 3e-3),
     "held x0": _held("x0", 2e-2, 0.3),
-    "held b1": _held("b1", 5e-4, 5e-3),
+    "held b1": _held("b1", 5e-4, 5e-2),
     "names exchanged": _names_exchanged,
     "second place": _second_place,
 }

@@ -21,6 +21,7 @@ from sfm.adjustment.hypotheses.families import (
     GIVEN,
     HELD,
     MOVED,
+    OF_EACH,
     OF_PHOTOGRAPHS,
     SHIFTED,
     Alternative,
@@ -29,6 +30,7 @@ from sfm.adjustment.hypotheses.families import (
     format_columns,
 )
 from sfm.adjustment.hypotheses.score import (
+    DETERMINED,
     Gain,
     Reduced,
     gain_of,
@@ -118,14 +120,15 @@ def _made(
     spread: Spread = NONE,
     points: IntArray | None = None,
     parameters: tuple[tuple[int, int], ...] = (),
+    parts: int = 1,
 ) -> Alternative:
-    """Return an alternative with its test."""
+    """Return an alternative with its test; of that many parts each has parameters of its own."""
     r = reduced.redundancy
-    on = factor[reduced.image] != 0
+    on = factor[reduced.image] != 0 if parts == 1 else np.ones(len(reduced.image), dtype=bool)
     some = np.zeros(0, dtype=np.int64) if points is None else points
     if len(some):
         on &= np.isin(reduced.point, some)
-    touched = int(on.sum())
+    touched = int(on.sum()) // parts
     over = max(spread.factor, 1.0)
     evidence = log_likelihood_gain(gain.value, r)
     log_p = log_probability(gain.value, gain.rank, r)
@@ -220,6 +223,7 @@ def _by_photographs(reduced: Reduced, columns: Columns) -> Iterator[Alternative]
         return
     run = np.arange(photographs) * m // photographs
     H, g, squares = reduced.project_by_run(reduced.whiten(columns.freedoms), run)
+    yield from _each(reduced, H, g, squares, run)
     for family in OF_PHOTOGRAPHS:
         some = np.array(family.places)
         part = _Part(H[:, some][:, :, :, some], g[:, some], squares[:, some])
@@ -238,6 +242,36 @@ def _by_photographs(reduced: Reduced, columns: Columns) -> Iterator[Alternative]
             if MIN_GROUP <= factor.sum() <= m - MIN_GROUP:
                 spread = part.spread(factor, gain)
                 yield _made(reduced, family, "group", factor[run], gain, (m - 1) * np.log(2), spread)
+
+
+def _each(
+    reduced: Reduced, H: FloatArray, g: FloatArray, squares: FloatArray, run: IntArray
+) -> Iterator[Alternative]:
+    """Return the alternatives of a camera of its own for each photograph.
+
+    It must exceed what all other freedoms of the photographs show once it is in, by an F test: errors that
+    the image points of a photograph have in common need not be those of a camera.
+    """
+    m, f = g.shape
+    for family in OF_EACH:
+        some = np.array(family.places)
+        rest = np.setdiff1d(np.arange(f), some)
+        q, p = m * len(some), m * len(rest)
+        own = H[:, some][:, :, :, some].reshape(q, q)
+        gain = gain_of(own, g[:, some].ravel(), squares[:, some].ravel())
+        if not log_probability(gain.value, gain.rank, reduced.redundancy) < np.log(ALPHA):
+            continue
+        cross = H[:, rest][:, :, :, some].reshape(p, q)
+        scale = 1 / np.sqrt(np.maximum(np.diagonal(own), np.finfo(float).tiny))
+        inverse = np.linalg.pinv(own * scale[:, None] * scale, rcond=DETERMINED, hermitian=True)
+        inverse *= scale[:, None] * scale
+        others = gain_of(
+            H[:, rest][:, :, :, rest].reshape(p, p) - cross @ inverse @ cross.T,
+            g[:, rest].ravel() + cross @ gain.beta,
+            squares[:, rest].ravel(),
+        )
+        spread = Spread(others.value / others.rank, others.rank, among=False) if others.rank else NONE
+        yield _made(reduced, family, "each", run.astype(float), gain, 0.0, spread, parts=m)
 
 
 def _variance_of(reduced: Reduced, some: BoolArray, gain: Gain) -> float:

@@ -38,7 +38,7 @@ class Alternative:
     """One alternative and what the score test says of it."""
 
     family: Family
-    pattern: str  # single | split | linear | alternating | group | all
+    pattern: str  # single | split | linear | alternating | group | each | all
     factor: FloatArray  # of each photograph, (m,)
     gain: Gain
     log_p: float  # ln of the probability by chance
@@ -102,14 +102,22 @@ class Family(ABC):
 
 @dataclass(frozen=True)
 class OfPhotographs(Family):
-    """Some of the freedoms that a photograph may have by itself: `Columns.freedoms`."""
+    """Some of the freedoms that a photograph may have by itself: `Columns.freedoms`.
+
+    In the pattern `each` every photograph, or run of photographs, has its own: their factors number the runs.
+    """
 
     places: tuple[int, ...]  # in the freedoms
 
     def columns(self, one: Alternative, a: Adjustment, columns: Columns) -> FloatArray:
         """Return its columns for all image points, px, (k, 2, q)."""
-        factor = one.factor[a.network.image_points.image][:, None, None]
-        return np.asarray(factor * columns.freedoms[:, :, list(self.places)])
+        factor = one.factor[a.network.image_points.image]
+        own = columns.freedoms[:, :, list(self.places)]
+        if one.pattern != "each":
+            return np.asarray(factor[:, None, None] * own)
+        D = np.zeros((len(own), 2, int(one.factor.max()) + 1, len(self.places)))
+        D[np.arange(len(own)), :, factor.astype(np.int64)] = own
+        return D.reshape(len(own), 2, -1)
 
 
 @dataclass(frozen=True)
@@ -121,16 +129,20 @@ class CameraFamily(OfPhotographs):
 
     def kind(self, pattern: str) -> str:
         """Return the kind of remark that an alternative of this family is."""
-        return "camera_drift" if pattern == "linear" else "other_camera"
+        return {"linear": "camera_drift", "each": "camera_varies"}.get(pattern, "other_camera")
 
     def cause(self, one: Alternative) -> tuple[object, ...]:
         """Return what an alternative is a case of."""
+        if one.pattern == "each":
+            return ("camera", "each")
         return ("camera", *one.photographs.tolist())  # with few or many parameters
 
     def parts(self, one: Alternative, a: Adjustment, beta: FloatArray, unit: str) -> Parts:
         """Return by how much c and the principal point differ."""
-        camera = a.estimate.cameras[a.network.camera[int(one.photographs[0])]]
-        half = max(camera.size_px) / 2
+        first = 0 if one.pattern == "each" else int(one.photographs[0])
+        half = max(a.estimate.cameras[a.network.camera[first]].size_px) / 2
+        if one.pattern == "each":
+            return self._of_each(beta.reshape(-1, len(self.places)), half)
         linear = one.pattern == "linear"
         sign = 1.0 if linear or one.factor[one.photographs[0]] > 0 else -1.0
         # a column is 1 px at the edge, and moves what is measured
@@ -141,6 +153,17 @@ class CameraFamily(OfPhotographs):
         }
         if len(beta) > 2 and not linear:
             parts["away"] = (float(np.hypot(beta[1], beta[2])), "px")
+        return parts
+
+    def _of_each(self, beta: FloatArray, half: float) -> Parts:
+        """Return how far photographs are from their mean at most, of parameters of each, (m, f)."""
+        off = beta - beta.mean(axis=0)
+        parts: Parts = {}
+        if 0 in self.places:
+            parts["change"] = (100 * float(np.abs(off[:, self.places.index(0)]).max()) / half, "%")
+        if {1, 2} <= set(self.places):
+            x0, y0 = off[:, self.places.index(1)], off[:, self.places.index(2)]
+            parts["away"] = (float(np.hypot(x0, y0).max()), "px")
         return parts
 
 
@@ -232,6 +255,10 @@ class InteriorFamily(Family):
         """Return the kind of remark that an alternative of this family is."""
         return "given_parameter" if self.of_given else "held_parameter"
 
+    def cause(self, one: Alternative) -> tuple[object, ...]:
+        """Return what an alternative is a case of: single ones, and all of a camera."""
+        return (self.name, len({s for _, s in one.parameters}) > 1)
+
     def columns(self, one: Alternative, a: Adjustment, columns: Columns) -> FloatArray:
         """Return its columns for all image points, px, (k, 2, q)."""
         return shared_columns(a, list(one.parameters))[0]
@@ -288,6 +315,8 @@ CAMERA_FAMILIES = (
     CameraFamily("camera", CAMERA_PLACES),
 )
 STRAIN = ObjectFamily("strain", STRAIN_PLACES)
+# what a stabiliser moves is x0 and y0 alone; of each photograph these few are affordable
+OF_EACH = (CAMERA_FAMILIES[0], CameraFamily("point", (1, 2)), *CAMERA_FAMILIES[1:])
 OF_PHOTOGRAPHS: tuple[CameraFamily | ObjectFamily, ...] = (
     *CAMERA_FAMILIES,
     STRAIN,

@@ -9,6 +9,7 @@ Source: Foerstner and Wrobel (2016), Photogrammetric Computer Vision, sec. 4.6.4
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -22,9 +23,9 @@ from sfm.adjustment.hypotheses.alternatives import (
     is_significant,
 )
 from sfm.adjustment.hypotheses.columns import columns_of
-from sfm.adjustment.hypotheses.families import HELD, Alternative
-from sfm.adjustment.hypotheses.refit import Refit, refit
-from sfm.adjustment.hypotheses.score import reduce_adjustment
+from sfm.adjustment.hypotheses.families import HELD, Alternative, InteriorFamily
+from sfm.adjustment.hypotheses.refit import Refit, refit, shifts_of
+from sfm.adjustment.hypotheses.score import log_likelihood_gain, reduce_adjustment
 from sfm.adjustment.hypotheses.unchecked import unchecked_assumptions
 from sfm.adjustment.quality.reliability import FALSE_ALARM, level_of_single
 from sfm.adjustment.result import Adjustment
@@ -43,7 +44,7 @@ from sfm.reduced_network import reduce_network
 from sfm.remarks.remark import Remark, remark
 
 MAX_CAUSES = 2  # that are looked for one after another
-MAX_TRIED = 3  # alternatives that are adjusted for each, where the best of the score test does not hold
+MAX_TRIED = 2  # alternatives of each kind that are adjusted, those of most evidence by the score test
 MAX_IMAGE_POINTS = 6_000  # of the network that is tested; of a larger one the points of most rays
 MAX_PHOTOGRAPHS = 300  # of a network that is tested: their normal equations are dense here
 APART = float(np.log(100))  # of ln likelihood, below which two alternatives cannot be told apart
@@ -112,38 +113,73 @@ def find_causes(plain: Adjustment) -> tuple[Cause, ...]:
     Args:
         plain: adjustment of the image points alone, gross errors rejected.
     """
-    causes: list[Cause] = []
-    current = plain
+    causes: tuple[Cause, ...] = ()
     for _ in range(MAX_CAUSES):
-        found = _best(plain, current)
+        found = _best(plain, causes)
         if found is None:
             break
-        if not found.refit.shift < NAMED:  # a shift that is not known is as bad as can be
-            causes.append(found)
-        current = found.refit.adjustment
-    return tuple(causes)
+        causes = _still_needed(plain, causes, found)
+    return tuple(one for one in causes if not one.refit.shift < NAMED)  # one not known is as bad as can be
 
 
-def _best(plain: Adjustment, current: Adjustment) -> Cause | None:
-    """Return the alternative that holds beside those whose effect has left an adjustment already."""
+def _best(plain: Adjustment, causes: tuple[Cause, ...]) -> Cause | None:
+    """Return the alternative that holds beside others: of those of most evidence the one that adjusts best.
+
+    The score test is linear, and of a large error the alternative with most parameters has most evidence.
+    """
+    current = causes[-1].refit.adjustment if causes else plain
+    before = [(one.alternative, one.refit.beta) for one in causes]
     columns = columns_of(current)
     reduced = reduce_adjustment(current, columns)
     every = alternatives_of(current, reduced, columns)
-    significant = [
-        one for one in every if is_significant(one, len(every)) and one.evidence > np.log(1 / ALPHA)
-    ]
     once: dict[tuple[object, ...], Alternative] = {}
-    for one in significant:
-        once.setdefault(one.family.cause(one), one)
-    for best in list(once.values())[:MAX_TRIED]:
-        found = refit(plain, best, current)
-        if found is None or not found.gain - best.price > np.log(1 / ALPHA):
-            continue
-        near = tuple(
-            one for one in once.values() if one is not best and abs(best.evidence - one.evidence) < APART
-        )
-        return Cause(best, found, near)
-    return None
+    for one in every:
+        if is_significant(one, len(every)) and one.evidence > np.log(1 / ALPHA):
+            once.setdefault(one.family.cause(one), one)
+    if once:  # what one parameter of all photographs explains needs no other cause, however these differ
+        for one in every:
+            gained = log_likelihood_gain(one.gain.value, reduced.redundancy)
+            if isinstance(one.family, InteriorFamily) and gained - one.price > np.log(1 / ALPHA):
+                once.setdefault(one.family.cause(one), one)
+    likely = [one for k, (cause, one) in enumerate(once.items()) if _place(cause, once, k) < MAX_TRIED]
+    tried = [(one, refit(plain, one, current, before)) for one in likely]
+    holding = [(found.gain - one.price, one, found) for one, found in tried if found is not None]
+    most, best, adjusted = max(holding, key=lambda one: one[0], default=(-np.inf, None, None))
+    if best is None or adjusted is None or not most > np.log(1 / ALPHA):
+        return None
+    level = {id(one): evidence for evidence, one, _ in holding}
+    near = tuple(
+        one
+        for one in once.values()
+        if one.kind != best.kind
+        and (most - level[id(one)] < APART if id(one) in level else abs(best.evidence - one.evidence) < APART)
+    )
+    return Cause(best, adjusted, near)
+
+
+def _place(cause: tuple[object, ...], once: Iterable[tuple[object, ...]], k: int) -> int:
+    """Return the place of the k-th cause among those of its kind."""
+    return sum(other[0] == cause[0] for other in list(once)[:k])
+
+
+def _still_needed(plain: Adjustment, causes: tuple[Cause, ...], found: Cause) -> tuple[Cause, ...]:
+    """Return the causes with another one: those before, adjusted with it, unless it explains them too."""
+    if not causes:
+        return (found,)
+    together = found.refit
+    alone = refit(
+        plain,
+        replace(found.alternative, gain=replace(found.alternative.gain, beta=together.beta)),
+        together.adjustment,
+    )
+    if alone is not None and -alone.gain - causes[0].alternative.price < np.log(1 / ALPHA):
+        shift, rms = shifts_of(plain, plain, alone.adjustment, found.alternative, alone.beta)
+        return (replace(found, refit=replace(alone, shift=shift, rms=rms)),)
+    before = (
+        replace(other, refit=replace(other.refit, beta=beta))
+        for other, beta in zip(causes, together.before, strict=True)
+    )
+    return (*before, found)
 
 
 def contradicted_parameters(a: Adjustment) -> tuple[tuple[str, str], ...]:

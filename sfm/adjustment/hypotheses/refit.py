@@ -6,6 +6,7 @@ is adjusted anew; a few rounds end at the joint optimum. Rejected image points c
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -21,6 +22,7 @@ from sfm.errors import GeometryError
 from sfm.similarity import fit_similarity
 
 ROUNDS = 6
+HALVINGS = 4  # of a step: linear in what a large error makes of the image points, it may go too far
 SETTLED = 0.01  # gain of v'Pv over the variance factor at which the rounds end
 
 
@@ -33,43 +35,80 @@ class Refit:
     gain: float  # of ln likelihood, rejected image points counted as spread over their photograph
     shift: float  # largest change of a coordinate, in the standard deviations stated without the alternative
     rms: float  # root mean square of the same
+    before: tuple[FloatArray, ...] = ()  # parameters of the alternatives that were there before
 
 
-def refit(plain: Adjustment, one: Alternative, start: Adjustment) -> Refit | None:
+def refit(
+    plain: Adjustment,
+    one: Alternative,
+    start: Adjustment,
+    before: Sequence[tuple[Alternative, FloatArray]] = (),
+) -> Refit | None:
     """Adjust with an alternative; None where that does not converge.
 
     Args:
         plain: the adjustment that states coordinates and standard deviations.
         one: the alternative.
-        start: adjustment to begin from, which may be without the effect of another alternative.
+        start: adjustment to begin from, of image points without the effect of others.
+        before: these others with their parameters, which are adjusted along with it.
     """
-    current, beta = start, one.gain.beta
-    xy = start.network.image_points.xy
-    for _ in range(ROUNDS):
-        D = one.columns(current, columns_of(current))
-        points = replace(start.network.image_points, xy=xy - D @ beta)
+    every = (*(other for other, _ in before), one)
+    ends = np.cumsum([0, *(len(beta) for _, beta in before), len(one.gain.beta)])
+    beta = np.concatenate([*(beta for _, beta in before), one.gain.beta])
+    current, step = start, beta - np.concatenate([*(own for _, own in before), np.zeros(len(one.gain.beta))])
+    for number in range(ROUNDS):
+        found = _stepped(plain, every, current, beta - step, step)
+        if found is None:
+            return None
+        current, beta = found
         try:
-            current = adjust(
-                replace(start.network, image_points=points),
-                current.estimate,
+            reduced = reduce_adjustment(current, columns_of(current))
+        except np.linalg.LinAlgError:
+            return None
+        gain = gain_of(*reduced.project(reduced.whiten(_side_by_side(every, current))))
+        if gain.value < SETTLED or number == ROUNDS - 1:
+            break
+        step = gain.beta
+        beta = beta + step
+    gained = log_likelihood(current) - log_likelihood(start)
+    own = [beta[ends[k] : ends[k + 1]] for k in range(len(every))]
+    return Refit(
+        *(current, own[-1], gained, *shifts_of(plain, start, current, one, own[-1])), tuple(own[:-1])
+    )
+
+
+def _stepped(
+    plain: Adjustment, every: Sequence[Alternative], start: Adjustment, beta: FloatArray, step: FloatArray
+) -> tuple[Adjustment, FloatArray] | None:
+    """Return the adjustment after a step of the parameters, halved while it makes v'Pv larger, and these."""
+    xy, best = plain.network.image_points.xy, None
+    for _ in range(HALVINGS):
+        D = _side_by_side(every, start)
+        points = replace(plain.network.image_points, xy=xy - D @ (beta + step))
+        try:
+            found = adjust(
+                replace(plain.network, image_points=points),
+                start.estimate,
                 datum=Datum("free"),
-                image_sigma_factor=start.image_sigma_factor,
+                image_sigma_factor=plain.image_sigma_factor,
                 reject="tau",
                 alpha=plain.test_alpha,
-                rejected=current.rejected,
+                rejected=start.rejected,
             )
-            if not current.converged:
-                return None
-            columns = columns_of(current)
-            reduced = reduce_adjustment(current, columns)
-        except (GeometryError, np.linalg.LinAlgError):
-            return None
-        gain = gain_of(*reduced.project(reduced.whiten(one.columns(current, columns))))
-        beta = beta + gain.beta
-        if gain.value < SETTLED:
-            break
-    gained = log_likelihood(current) - log_likelihood(start)
-    return Refit(current, beta, gained, *shifts_of(plain, start, current, one, beta))
+        except GeometryError:
+            found = None
+        if found is not None and found.converged:
+            if log_likelihood(found) > log_likelihood(start) - SETTLED:
+                return found, beta + step
+            best = best or (found, beta + step)
+        step = step / 2
+    return best
+
+
+def _side_by_side(every: Sequence[Alternative], a: Adjustment) -> FloatArray:
+    """Return the columns of alternatives, (k, 2, q)."""
+    columns = columns_of(a)
+    return np.concatenate([one.columns(a, columns) for one in every], axis=2)
 
 
 def log_likelihood(a: Adjustment) -> float:
