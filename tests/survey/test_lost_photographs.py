@@ -46,7 +46,7 @@ def orientation(network: Network, estimate: Estimate) -> Orientation:
         (network.images[i], remark("photograph_with_few_points", seen=0, needed=4))
         for i in np.flatnonzero(~estimate.oriented)
     )
-    fits = np.ones(len(network.image_points), dtype=bool)
+    fits = estimate.oriented[network.image_points.image]
     return Orientation(estimate, failures, (), None, "given", fits, 0.1, np.full(1, 4.0))
 
 
@@ -114,6 +114,44 @@ def test_another_c_orients_the_larger_part_of_what_was_lost(oriented: int, bette
     alone = orientation(network, partly(truth, np.arange(IMAGES) < IMAGES - 1))
     whole = orientation(network, truth)
     assert try_other_principal_distances(network, truth, alone, lambda _: whole) == (alone, ())
+
+
+@pytest.mark.parametrize(("times", "better"), [(1.0, True), (5.0, True), (60.0, False), (1e9, False)])
+def test_another_c_is_likelier_for_all_image_points(times: float, better: bool) -> None:
+    """More photographs at residuals of 6 px are no better than some at 0.1 px, those of 0.5 px are."""
+    network, truth = make_network(seed_of("lost by c"), images=IMAGES, points=POINTS)
+    few = orientation(network, partly(truth, np.arange(IMAGES) < 5))
+    more = orientation(network, partly(truth, np.arange(IMAGES) < 8))
+    more = replace(more, rms_px=times * few.rms_px)
+    remarks = try_other_principal_distances(network, truth, few, lambda _: more)[1]
+    assert bool(remarks) == better
+
+
+def test_no_other_c_is_tried_for_mirrored_pictures() -> None:
+    network, truth = make_network(seed_of("lost by c"), images=IMAGES, points=POINTS)
+    few = orientation(network, partly(truth, np.arange(IMAGES) < 5))
+    mirrored = tuple((image, remark("photograph_mirrored", turned=(0.1, "px"))) for image, _ in few.failures)
+    few = replace(few, failures=mirrored)
+    assert try_other_principal_distances(network, truth, few, _none) == (few, ())
+
+
+def _none(_: Estimate) -> Orientation:
+    raise AssertionError("tried")
+
+
+def test_where_half_of_the_photographs_are_mirrored_c_is_right() -> None:
+    network, truth = make_network(seed_of("half mirrored"), images=IMAGES, points=POINTS)
+    seen = network.image_points
+    turned = np.where(
+        seen.image[:, None] >= 5, (truth.cameras[0].size_px[0] - 1, 0) + seen.xy * (-1, 1), seen.xy
+    )
+    network = replace(network, image_points=replace(seen, xy=turned))
+    result = sfm.run_survey(survey_of(network, truth, free=("c",)), compare_with="none")
+    verdict = findings_of(result).verdict
+    kinds = {one.kind for one in verdict.remarks}
+    assert "c_looks_wrong" not in kinds and kinds & {"photograph_mirrored", "photograph_of_mirror_image"}
+    assert len(result.failed) == 5
+    assert {one.reason.kind for one in result.failed} <= {"photograph_mirrored", "photograph_of_mirror_image"}
 
 
 def test_a_survey_that_lost_the_larger_part_is_no_dependable_one() -> None:

@@ -170,7 +170,8 @@ ROWS = (
     Kind(
         "photograph_mirrored",
         "warning",
-        "It is a mirrored picture: its median residual is [[{before} as it is and ]]{turned} turned over.",
+        "[[{photograph} is not in the result. ]]It is a mirrored picture: its median residual is [[{before} "
+        "as it is and ]]{turned} turned over.",
         "the picture was mirrored by a program, or seen in a mirror",
         "Use the original photograph.",
     ),

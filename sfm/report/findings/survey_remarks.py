@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 
@@ -62,7 +63,19 @@ def photograph_remarks(result: SurveyResult) -> tuple[Remark, ...]:
     found = (remark("copies", copies=copies),) if copies else ()
     if not missing:
         return found
-    return (remark("photographs_missing", missing=missing, total=total, share=missing / total), *found)
+    missed = remark("photographs_missing", missing=missing, total=total, share=missing / total)
+    return (missed, *_mirrored(result), *found)
+
+
+def _mirrored(result: SurveyResult) -> tuple[Remark, ...]:
+    """Return why mirrored photographs are not in the result, once for those that are it together."""
+    remarks = []
+    for one in result.failed:
+        if one.reason.kind == "photograph_mirrored":
+            remarks.append(replace(one.reason, subjects={"photograph": (one.image,)}))
+        elif one.reason.kind == "photograph_of_mirror_image" and one.reason not in remarks:
+            remarks.append(one.reason)
+    return tuple(remarks)
 
 
 def other_solution_remarks(result: SurveyResult) -> tuple[Remark, ...]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -9,6 +10,7 @@ import numpy as np
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components
 
+from sfm.adjustment.hypotheses.alternatives import ALPHA
 from sfm.conventions import BoolArray, IntArray
 from sfm.errors import GeometryError
 from sfm.network import Estimate, Network
@@ -75,7 +77,9 @@ def try_other_principal_distances(
 ) -> tuple[Orientation | None, tuple[Remark, ...]]:
     """Return the orientation with another principal distance if that orients more photographs, and remarks.
 
-    Tried where photographs are lost that show enough points of the others; it must orient most of them.
+    Tried where photographs are lost that show enough points of the others and are no mirrored pictures, which
+    no principal distance turns over. It must orient most of them, and be likelier for all image points: more
+    photographs at residuals many times as large are no better.
 
     Args:
         network: image points that have names.
@@ -89,22 +93,23 @@ def try_other_principal_distances(
     """
     m = len(network.images)
     now = 0 if found is None else int(found.estimate.oriented.sum())
-    lost = m if found is None else sum(
-        len(one.images) for one in lost_groups(network, found.estimate) if one.connected
-    )  # fmt: skip
+    lost = m if found is None else _unexplained(network, found)
     if lost < 2 or not len(network.image_points):  # one alone has a cause of its own
         return found, ()
-    best, most = None, now + int(LARGER_PART * lost)
+    search = math.log(2 * len(network.image_points)) / 2 + math.log(len(C_FACTORS) / ALPHA)
+    likeliest = _log_likelihood(network, estimate, found) + search
+    best, least = None, now + int(LARGER_PART * lost)
     for factor in C_FACTORS:
         try:
             other = orient(_with_c(estimate, factor))
         except GeometryError:
             continue
         count = int(other.estimate.oriented.sum())
-        if count > most or (best is not None and count == most and other.rms_px < best.rms_px):
-            best, most = other, count
-        if count == m:
-            break
+        likelihood = _log_likelihood(network, estimate, other)
+        if count > least and likelihood > likeliest:
+            best, likeliest = other, likelihood
+            if count == m:
+                break
     if best is None:
         return found, ()
     remarks = tuple(
@@ -113,7 +118,7 @@ def try_other_principal_distances(
             camera=given.name,
             given=(given.c_px * float(np.mean(given.pixel_mm)), "mm"),
             better=(better.c_px * float(np.mean(given.pixel_mm)), "mm"),
-            oriented=most,
+            oriented=int(best.estimate.oriented.sum()),
             total=m,
             before=now,
         )
@@ -125,6 +130,24 @@ def try_other_principal_distances(
         replace(new, free=old.free) for new, old in zip(best.estimate.cameras, estimate.cameras, strict=True)
     )
     return replace(best, estimate=replace(best.estimate, cameras=restored)), remarks
+
+
+def _unexplained(network: Network, found: Orientation) -> int:
+    """Return how many photographs are lost though they show enough points, and are no mirrored pictures."""
+    mirrored = [image for image, reason in found.failures if reason.kind == "photograph_mirrored"]
+    lost = [i for one in lost_groups(network, found.estimate) if one.connected for i in one.images.tolist()]
+    return sum(network.images[i] not in mirrored for i in lost)
+
+
+def _log_likelihood(network: Network, estimate: Estimate, found: Orientation | None) -> float:
+    """Return ln of the likelihood of all image points, what does not fit spread evenly over the format."""
+    camera = estimate.cameras[0]
+    count, fitting = len(network.image_points), 0 if found is None else int(found.fits.sum())
+    outlier = -math.log(float(np.prod(camera.size_px)))
+    if found is None:
+        return count * outlier
+    sigma = max(found.rms_px, float(np.spacing(float(max(camera.size_px)))))  # no smaller than rounding
+    return fitting * (-math.log(2 * math.pi * sigma**2) - 1) + (count - fitting) * outlier
 
 
 def _with_c(estimate: Estimate, factor: float) -> Estimate:
