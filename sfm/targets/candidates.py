@@ -71,7 +71,10 @@ def judge_fits(
             (Flag.TOO_OBLIQUE, b / a < MIN_AXIS_RATIO),
             (Flag.LOW_CONTRAST, contrast < np.maximum(STEP_SIGMAS * noise, MIN_STEP * scale)),
             (Flag.BLURRED, fit.blur > np.maximum(SOFTEST_EDGE * b, SOFTEST_EDGE_PX)),
-            (Flag.UNEVEN_EDGE, fit.unevenness > UNEVEN_EDGE + 3 * noise / contrast),
+            (
+                Flag.UNEVEN_EDGE,
+                ((fit.flag & Flag.UNEVEN_EDGE) != 0) | (fit.unevenness > UNEVEN_EDGE + 3 * noise / contrast),
+            ),
             (Flag.LOBED, fit.lobes > lobes),
             (Flag.THIN_BACKGROUND, (fit.strokes > STROKES) & (fit.lobes > lobes / 2)),
             (Flag.POOR_FIT, fit.noise / contrast > POOR_FIT + noise / contrast),

@@ -10,10 +10,13 @@ import cv2
 import numpy as np
 
 from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
+from sfm.targets.edge_rays import RAYS
 from sfm.targets.fits import goodness
 from sfm.targets.fits.blurred_ellipse import BACKGROUND, BLUR, CONTRAST, GAIN_X, UNKNOWNS, P, R
+from sfm.targets.fits.damage import MIN_POPULATION, common_outline, find_damage, outline_noise
 from sfm.targets.fits.ellipse_fit import EllipseFits, fit_ellipses
 from sfm.targets.flags import Flag
+from sfm.targets.outlines import STEP_SIGMAS
 
 # Variance of rounding to whole intensities.
 QUANTISATION = 1 / 12
@@ -26,6 +29,8 @@ MIN_FOR_SHADING, OWN_GAIN_SIGMAS = 10, 3.0
 HALO, HALO_SIGMAS, FLARE_SATURATED, FLARE_AROUND, FLARE_CHANGE = 0.035, 5.0, 0.02, 0.25, 0.25
 # Fewer targets than this are not worth a thread.
 TARGETS_PER_THREAD = 100
+# Rounds of repair, sound edges, and share of the sectors that must agree.
+REPAIRS, EVEN, MIN_CONSENSUS, STAIN_SIGMAS = 3, 0.18, 0.7, 8.0
 # A gain per px below this is none.
 NO_GAIN = 1e-7
 
@@ -102,13 +107,11 @@ def fit_ellipse_model(
         saturation = float(np.iinfo(photograph.dtype).max) if integers else math.inf
     k = len(xy)
     start = np.column_stack([np.asarray(xy, float).reshape(k, 2), np.asarray(shape, float).reshape(k, 3)])
-    theta, cofactor, statistics, flag = _fit_in_threads(
-        photograph, start, np.asarray(sign, np.int64), float(noise), float(saturation)
+    least_variance = QUANTISATION if integers else 0.0
+    (theta, cofactor, statistics, flag, _, _), variance, factor, added = _fit_undamaged(
+        photograph, start, np.asarray(sign, np.int64), float(noise), float(saturation), least_variance
     )
     found = statistics.T
-    variance = found[goodness.SQUARES] / np.maximum(found[goodness.PIXELS] - UNKNOWNS, 1)
-    if integers:
-        variance = np.maximum(variance, QUANTISATION)
     covariance = np.full((k, GAIN_X, GAIN_X), np.nan)
     failed = Flag.NO_CONVERGENCE | Flag.CUT_BY_BORDER | Flag.NOT_ELLIPTIC
     good = np.flatnonzero((flag & failed) == 0)
@@ -117,7 +120,8 @@ def fit_ellipse_model(
             theta[good], cofactor[good], variance[good], found[goodness.LENGTH][good]
         )
         flag[good[shaded]] |= Flag.SHADED.value
-        covariance[good] *= _of_uneven_outlines(found[:, good], variance[good])[:, None, None]
+        covariance[good] *= factor[good, None, None]
+        covariance[good, :2, :2] += added[good]
     gain = theta[:, GAIN_X:] / found[goodness.LENGTH][:, None]
     halo = found[goodness.HALO]
     flag[(halo > HALO) & (halo > HALO_SIGMAS * found[goodness.HALO_SIGMA])] |= Flag.HALO.value
@@ -142,17 +146,50 @@ def fit_ellipse_model(
     )
 
 
-def _of_uneven_outlines(statistics: FloatArray, variance: FloatArray) -> FloatArray:
-    """Return the factor of the covariances of targets with damage that could not be left out, (k,).
+def _fit_undamaged(
+    photograph: AnyArray, start: FloatArray, sign: IntArray, noise: float, saturation: float, least: float
+) -> tuple[EllipseFits, FloatArray, FloatArray, FloatArray]:
+    """Fit ellipses to what is not damaged.
 
-    The residuals of damage are not those of noise: neighbours are alike. The third and fourth harmonic of the
-    outline, which no ellipse follows, tell how much larger the first one is, which is the shift of the
-    centre: the harmonics of damage in one place are of one size.
+    Returns:
+        The fits; variances of the intensities, shape (k,); factors of the covariances by the noise of the
+        outlines, shape (k,); what gaps add to the covariances of the centres, px^2, shape (k, 2, 2).
     """
-    component = statistics[goodness.LOBES] ** 2 / 4
-    by_noise = statistics[goodness.LOBES_SIGMA] ** 2 * variance
-    disturbed = statistics[goodness.DISTURBED] > 0
-    return np.where(disturbed, np.maximum(component / by_noise, 1.0), 1.0)
+    k = len(start)
+    keep, depth = np.ones((k, RAYS), bool), np.full(k, np.inf)
+    fits = _fit_in_threads(photograph, start, sign, noise, saturation, keep, depth)
+    for _ in range(REPAIRS + 1):
+        variance = fits.statistics[:, goodness.SQUARES] / np.maximum(
+            fits.statistics[:, goodness.PIXELS] - UNKNOWNS, 1
+        )
+        variance = np.maximum(variance, least)
+        fitted = np.isfinite(fits.cofactor[:, 0, 0])
+        sound = fitted & keep.all(axis=1) & (fits.statistics[:, goodness.UNEVENNESS] < EVEN)
+        sound &= np.abs(fits.theta[:, CONTRAST]) > STEP_SIGMAS * noise
+        weight = np.where(fitted[:, None], fits.sectors[:, 1] / np.maximum(variance, 1e-12)[:, None], 0.0)
+        h = np.divide(fits.sectors[:, 0], fits.sectors[:, 1], out=np.zeros((k, RAYS)), where=weight > 0)
+        h -= common_outline(h, weight, sound)
+        if _ == REPAIRS:
+            break
+        damaged = find_damage(h, weight, sound)
+        inside = fits.statistics[:, goodness.INSIDE]
+        usual = np.median(inside[sound]) if sound.sum() >= MIN_POPULATION else 0.0
+        stained = inside > STAIN_SIGMAS * max(1.0, usual / 3)
+        now = fitted & ((damaged == keep).any(axis=1) | (stained & np.isinf(depth)))
+        if not now.any():
+            break
+        keep[now] = ~damaged[now]
+        depth[now & stained] = (2 + 2.5 * fits.theta[:, BLUR])[now & stained]
+        again = _fit_in_threads(
+            photograph, fits.theta[now, :5], sign[now], noise, saturation, keep[now], depth[now]
+        )
+        for all_, new in zip(fits, again, strict=True):
+            all_[now] = new
+    flag = fits.flag
+    flag[~keep.all(axis=1) | np.isfinite(depth)] |= Flag.DAMAGED.value
+    flag[keep.mean(axis=1) < MIN_CONSENSUS] |= Flag.UNEVEN_EDGE.value
+    factor, added = outline_noise(fits.shape, np.maximum(variance, 1e-12), sound)
+    return fits, variance, factor, added
 
 
 def _changes(theta: FloatArray, gain: FloatArray) -> BoolArray:
@@ -165,15 +202,23 @@ def _changes(theta: FloatArray, gain: FloatArray) -> BoolArray:
 
 
 def _fit_in_threads(
-    photograph: AnyArray, start: FloatArray, sign: IntArray, noise: float, saturation: float
+    photograph: AnyArray,
+    start: FloatArray,
+    sign: IntArray,
+    noise: float,
+    saturation: float,
+    keep: BoolArray,
+    depth: FloatArray,
 ) -> EllipseFits:
     """Fit the ellipses in as many threads as OpenCV may use; the results do not depend on their number."""
     parts = max(1, min(cv2.getNumThreads(), len(start) // TARGETS_PER_THREAD))
     if parts == 1:
-        return fit_ellipses(photograph, start, sign, noise, saturation)
+        return fit_ellipses(photograph, start, sign, noise, saturation, keep, depth)
     chunks = np.array_split(np.arange(len(start)), parts)
     with ThreadPoolExecutor(parts) as pool:
-        fits = pool.map(lambda c: fit_ellipses(photograph, start[c], sign[c], noise, saturation), chunks)
+        fits = pool.map(
+            lambda c: fit_ellipses(photograph, start[c], sign[c], noise, saturation, keep[c], depth[c]), chunks
+        )
         return EllipseFits(*(np.concatenate(part) for part in zip(*fits, strict=True)))
 
 

@@ -1,211 +1,174 @@
-"""Damaged targets: pixels that the model of a blurred ellipse does not explain, found and left out, compiled.
+"""Damage and shape of the outlines of targets, judged against the targets of their photograph.
 
-Nicks and ink splashes in the edge, scratches and marks in the middle leave large residuals in a few connected
-pixels. These and their neighbours are left out, the ellipse is fitted to the others, and all pixels are
-judged anew until the same ones are left out; the covariance is that of what remains. Where so much is left
-out that an ellipse is no longer certain, or in more places than damage explains, the fit to all pixels
-stands, and whether it is a target is judged by that.
+An edge is divided into sectors. The deviation h of the outline in a sector, in radii, follows from the residuals
+of the blurred ellipse there. What is common to the dots of a photograph is shape: polygonal printing,
+sharpening, compression; it moves all of them alike. A place is damaged where a scan statistic of what is left
+is significant against the scatter of the dot and that of the others. The harmonics 3 to 6 of what is left,
+which no ellipse follows, show how much larger than that of white noise the variance of the first one is, which
+is the centre.
 """
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
+from scipy.special import digamma, ndtri, polygamma
 
 from sfm.conventions import BoolArray, FloatArray
-from sfm.kernels.options import compiled
 from sfm.targets.edge_rays import RAYS
-from sfm.targets.fits import blurred_ellipse as model
+from sfm.targets.fits.goodness import SHAPES
 
-# So many pixels whose residuals are above this share of the contrast, and so many sigma of the noise and
-# robust sigmas of the residuals beside the edge (retro-reflective sheeting is grainy), are damage.
-MIN_PIXELS, SUSPICIOUS, SUSPICIOUS_SIGMAS = 2, 0.08, 6.0
-# Pixels are left out above so many robust sigmas of the residuals, of the edge or elsewhere, or of the noise,
-# and this share of the contrast; in the first rounds, when the edges on rays alone are known, above these.
-OUTLIER_SIGMAS, LEAST_OUTLIER = 5.0, 0.08
-FIRST_OUTLIERS = np.array([0.4, 0.2])
-# What is left out is called damage if a pixel of it has a residual of this share of the contrast. Sharpening
-# and JPEG compression leave a tenth here and there beside the edge, a nick in 2 % of the edge leaves more.
-TELLING = 0.2
-# Neighbours up to this distance from such a pixel are left out too: the blurred rim of the damage.
-RIM_PX = 2
-# Targets with a smaller minor semi-axis have too few pixels to tell damage from another shape.
-MIN_SEMI_AXIS_PX = 4.0
-# Most that is left out of the edge and of the inside, and most places along the edge (a scratch has two).
-MAX_EDGE, MAX_INSIDE, MAX_PLACES = 0.3, 0.5, 2
-MAX_ROUNDS, TRACES = 8, 3  # of the fit, and of the edges on rays before it
-# The edge is so many blurs wide to both sides, and so many px at least.
-_EDGE_BLURS, _EDGE_PX = 1.5, 1.0
+# Level of the test for damage over all places of a photograph.
+LEVEL = 0.01
+# Numbers of neighbouring sectors that are tested together: nicks of 3 to 25 % of the edge.
+WIDTHS = (1, 2, 4, 8)
+# Median of the largest of these statistics of a whole dot (by simulation).
+USUAL = 2.18
+# From so many targets on a photograph shows what its dots have in common.
+MIN_POPULATION = 8
+# Rounds of the robust fit to the sectors; its tuning constant has 95 % efficiency (Huber and Ronchetti 2009).
+ROUNDS, BIWEIGHT = 10, 4.685
 _MAD = 1.4826
+_PHI = 2 * np.pi * (np.arange(RAYS) + 0.5) / RAYS
 
 
-@compiled
-def is_damaged(
-    pixels: FloatArray,
-    n: int,
-    theta: FloatArray,
-    length: float,
-    saturation: float,
-    noise: float,
-    J: FloatArray,
-) -> bool:
-    """Whether some pixels are far from the model, as those inside the target and around it are not.
+def _harmonics(first: int, last: int) -> FloatArray:
+    """Return cosine and sine of the harmonics from first to last in the middle of each sector, (RAYS, 2 n)."""
+    return np.column_stack([f(k * _PHI) for k in range(first, last + 1) for f in (np.cos, np.sin)])
 
-    The edge itself is no measure of that: damage pulls it along.
+
+_ELLIPSE = np.column_stack([np.ones(RAYS), _harmonics(1, 2)])
+
+
+def common_outline(h: FloatArray, weight: FloatArray, sound: BoolArray) -> FloatArray:
+    """Return the deviation of the outline that the sound targets of a photograph have in common, (RAYS,).
+
+    Args:
+        h: deviations in each sector, radii, shape (k, RAYS).
+        weight: their weights, 0 where nothing is known, shape (k, RAYS).
+        sound: targets that count, shape (k,).
     """
-    residual = np.empty(n)
-    least = max(SUSPICIOUS * abs(theta[model.CONTRAST]), SUSPICIOUS_SIGMAS * noise)
-    count = 0
-    for first in range(0, n, model.BLOCK):
-        m = min(model.BLOCK, n - first)
-        model.linearise(pixels, first, m, theta, length, saturation, J)
-        for i in range(m):
-            residual[first + i] = abs(J[model.RESIDUAL + i])
-            count += residual[first + i] > least
-    if count < MIN_PIXELS:
-        return False
-    at_edge = np.abs(_distances(pixels, n, theta)) < _edge_width(theta)
-    limit = _limits(residual, at_edge, least, SUSPICIOUS_SIGMAS)[0]
-    return bool(np.sum(residual > limit) >= MIN_PIXELS)
+    common = np.zeros(RAYS)
+    if sound.sum() < MIN_POPULATION:
+        return common
+    own = np.where(weight[sound] > 0, h[sound], np.nan)
+    with np.errstate(all="ignore"):
+        common = np.nan_to_num(np.nanmedian(own, axis=0))
+    return common
 
 
-@compiled
-def is_telling(
-    pixels: FloatArray, m: int, n: int, theta: FloatArray, length: float, saturation: float, J: FloatArray
-) -> bool:
-    """Whether a pixel that was left out, behind the first m of n, is far from the model of the others."""
-    least = TELLING * abs(theta[model.CONTRAST])
-    for first in range(m, n, model.BLOCK):
-        count = min(model.BLOCK, n - first)
-        model.linearise(pixels, first, count, theta, length, saturation, J)
-        for i in range(count):
-            if abs(J[model.RESIDUAL + i]) > least:
-                return True
-    return False
+def find_damage(h: FloatArray, weight: FloatArray, sound: BoolArray) -> BoolArray:
+    """Return which sectors are damaged.
+
+    Args:
+        h: deviations of the outlines in each sector, without the common ones, radii, shape (k, RAYS).
+        weight: their weights by white noise, 1 / variance, shape (k, RAYS).
+        sound: targets that show what is usual, shape (k,).
+
+    Returns:
+        Damaged sectors and one neighbour to both sides, shape (k, RAYS).
+
+    Source: the scan statistic of Glaz, Naus and Wallenstein (2001), with Bonferroni's bound.
+    """
+    z = _robust_residuals(h, weight)
+    level = _MAD * np.array([np.median(np.abs(row[w > 0])) if (w > 0).any() else 1.0 for row, w in zip(z, weight, strict=True)])
+    usual = np.median(level[sound]) if sound.any() else 1.0
+    level = np.maximum(np.maximum(level, usual), 1.0)
+    limit = -ndtri(LEVEL / (2 * len(WIDTHS) * RAYS * max(len(h), 1)))
+    scans = _scan(z, weight) / level[:, None, None]
+    if sound.sum() >= MIN_POPULATION:
+        usual = np.median(scans[sound].max(axis=(1, 2)))
+        limit *= max(usual / USUAL, 1.0)
+    hit, limits = np.zeros(z.shape, bool), limit * level
+    for _ in range(RAYS):  # the most significant place first, and what is left without it
+        scans = _scan(z, np.where(hit, 0.0, weight))
+        best = scans.reshape(len(z), -1).argmax(axis=1) if len(z) else np.zeros(0, int)
+        more = np.flatnonzero(scans.max(axis=(1, 2), initial=0.0) > limits)
+        if not len(more):
+            break
+        width, first = np.array(WIDTHS)[best[more] // RAYS], best[more] % RAYS
+        hit[more] |= (np.arange(RAYS) - first[:, None]) % RAYS < width[:, None]
+    return hit | np.roll(hit, 1, axis=1) | np.roll(hit, -1, axis=1)
 
 
-@compiled
-def is_large(theta: FloatArray) -> bool:
-    """Whether a target has enough pixels to tell damage from another shape."""
-    p, q, r = theta[model.P], theta[model.Q], theta[model.R]
-    return bool(1 / ((p + r) / 2 + math.hypot((p - r) / 2, q)) >= MIN_SEMI_AXIS_PX)
-
-
-@compiled
-def _limits(residual: FloatArray, at_edge: BoolArray, least: float, sigmas: float) -> FloatArray:
-    """Return so many robust sigmas of the residuals elsewhere and at the edge, or the least, (2,)."""
-    limits = np.full(2, least)
-    for part in range(2):
-        own = residual[at_edge == (part == 1)]
-        if len(own):
-            limits[part] = max(least, sigmas * _MAD * np.median(own))
-    return limits
-
-
-@compiled
-def _edge_width(theta: FloatArray) -> float:
-    """Return how far the edge reaches to both sides, px."""
-    return float(_EDGE_PX + _EDGE_BLURS * theta[model.BLUR])
-
-
-@compiled
-def _distances(pixels: FloatArray, n: int, theta: FloatArray) -> FloatArray:
-    """Return the signed distance of each pixel from the ellipse, negative inside, px, (n,)."""
-    p, q, r = theta[model.P], theta[model.Q], theta[model.R]
-    out = np.empty(n)
-    for i in range(n):
-        dx, dy = pixels[0, i] - theta[model.X0], pixels[1, i] - theta[model.Y0]
-        u, v = p * dx + q * dy, q * dx + r * dy
-        rho = math.sqrt(u * u + v * v)
-        out[i] = rho * (rho - 1) / (math.hypot(p * u + q * v, q * u + r * v) + 1e-12)
+def _scan(z: FloatArray, weight: FloatArray) -> FloatArray:
+    """Return the weighted sums of so many residuals from each sector on, (k, len(WIDTHS), RAYS)."""
+    out = np.zeros((len(z), len(WIDTHS), RAYS))
+    for k, width in enumerate(WIDTHS):
+        total = sum(np.roll(z * np.sqrt(weight), -i, axis=1) for i in range(width))
+        norm = sum(np.roll(weight, -i, axis=1) for i in range(width))
+        out[:, k] = np.abs(total) / np.sqrt(np.maximum(norm, 1e-12))
     return out
 
 
-@compiled
-def explained_pixels(
-    pixels: FloatArray,
-    n: int,
-    theta: FloatArray,
-    length: float,
-    saturation: float,
-    noise: float,
-    round_: int,
-    J: FloatArray,
-    kept: BoolArray,
-) -> bool:
-    """Mark the pixels that the model explains.
+def _robust_residuals(h: FloatArray, weight: FloatArray) -> FloatArray:
+    """Return the residuals of ellipses through most sectors, in standard deviations of white noise, (k, RAYS).
+
+    Source: Tukey's biweight by iteratively reweighted least squares, Huber and Ronchetti, Robust Statistics
+    (2009), from the fit of least absolute residuals.
+    """
+    robust, root = weight.copy(), np.sqrt(weight)
+    z = h * root
+    for k in range(2 * ROUNDS):
+        N = np.einsum("ki,ia,ib->kab", robust, _ELLIPSE, _ELLIPSE) + 1e-9 * np.eye(5)
+        g = np.einsum("ki,ia->ka", robust * h, _ELLIPSE)
+        z = (h - np.linalg.solve(N, g[..., None])[..., 0] @ _ELLIPSE.T) * root
+        if k < ROUNDS:
+            robust = weight / np.maximum(np.abs(z), 0.1)
+        else:
+            scale = np.maximum(_MAD * np.median(np.abs(z), axis=1), 1.0)[:, None]
+            robust = weight * np.maximum(1 - (z / (BIWEIGHT * scale)) ** 2, 0.0) ** 2
+    return z
+
+
+def outline_noise(
+    equations: FloatArray, variance: FloatArray, sound: BoolArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return the factors of the covariances and what the gaps of outlines add to the centres.
 
     Args:
-        pixels: x, y and intensity, shape (3, >= n).
-        n: number of pixels.
-        theta: unknowns of the model, shape (10,).
-        length: L, px.
-        saturation: intensities from here on are censored.
-        noise: standard deviation of the intensities.
-        round_: number of the round from 0 on; in the first ones theta is only known roughly.
-        J: work space of BLOCK_SIZE.
-        kept: receives which pixels are explained, shape (>= n,).
+        equations: of the harmonics of the outlines, see `goodness.shape_equations`, (k, SHAPES + 3, SHAPES).
+        variance: of the intensities, shape (k,).
+        sound: targets that show what is usual, shape (k,).
 
     Returns:
-        Whether enough of the edge and of the inside is left, and what is left out is in few places;
-        that is not asked in the first rounds.
+        Ratio of the variances of harmonics to those of white noise, shape (k,); covariance of the centre that
+        is added, px^2, shape (k, 2, 2).
+
+    Source: Smyth, "Linear models and empirical Bayes methods" (2004), for the moderated variances.
     """
-    p, q, r = theta[model.P], theta[model.Q], theta[model.R]
-    A = abs(theta[model.CONTRAST])
-    residual, distance, sector = np.empty(n), _distances(pixels, n, theta), np.empty(n, np.int64)
-    for first in range(0, n, model.BLOCK):
-        m = min(model.BLOCK, n - first)
-        model.linearise(pixels, first, m, theta, length, saturation, J)
-        for i in range(m):
-            dx, dy = pixels[0, first + i] - theta[model.X0], pixels[1, first + i] - theta[model.Y0]
-            u, v = p * dx + q * dy, q * dx + r * dy
-            residual[first + i] = abs(J[model.RESIDUAL + i])
-            sector[first + i] = int(math.atan2(v, u) * (RAYS / (2 * math.pi)) + RAYS) % RAYS
-    at_edge = np.abs(distance) < _edge_width(theta)
-    begin = round_ < len(FIRST_OUTLIERS)
-    share = FIRST_OUTLIERS[round_] if begin else LEAST_OUTLIER
-    least = max(share * A, OUTLIER_SIGMAS * noise)
-    limits = np.full(2, least) if begin else _limits(residual, at_edge, least, OUTLIER_SIGMAS)
-    left, top = int(pixels[0, :n].min()) - RIM_PX, int(pixels[1, :n].min()) - RIM_PX
-    width = int(pixels[0, :n].max()) - left + RIM_PX + 1
-    height = int(pixels[1, :n].max()) - top + RIM_PX + 1
-    out = np.zeros((height, width), np.bool_)
-    for k in range(n):
-        if residual[k] > limits[1 if at_edge[k] else 0]:
-            x, y = int(pixels[0, k]) - left, int(pixels[1, k]) - top
-            for i in range(-RIM_PX, RIM_PX + 1):
-                for j in range(-RIM_PX, RIM_PX + 1):
-                    if abs(i) + abs(j) < 2 * RIM_PX:  # all but the corners
-                        out[y + i, x + j] = True
-    edge, edge_lost, inside, inside_lost = 0, 0, 0, 0
-    hit = np.zeros(RAYS, np.bool_)
-    for k in range(n):
-        kept[k] = not out[int(pixels[1, k]) - top, int(pixels[0, k]) - left]
-        lost = not kept[k]
-        if abs(distance[k]) < _EDGE_PX:
-            edge += 1
-            edge_lost += lost
-            if lost:
-                hit[sector[k]] = True
-        elif distance[k] < 0:
-            inside += 1
-            inside_lost += lost
-    places = 0
-    for k in range(RAYS):  # places that are one ray apart are one
-        places += hit[k] and not hit[k - 1] and not hit[k - 2]
-    return begin or (
-        edge_lost <= MAX_EDGE * edge and inside_lost <= MAX_INSIDE * inside and places <= MAX_PLACES
-    )
+    N = equations[:, :SHAPES] / variance[:, None, None] + 1e-9 * np.eye(SHAPES)
+    shape = np.linalg.solve(N, equations[:, SHAPES, :, None] / variance[:, None, None])[..., 0]
+    if sound.sum() >= MIN_POPULATION:
+        shape = shape - np.median(shape[sound], axis=0)
+    ratio = np.maximum(np.einsum("ka,kab,kb->k", shape, N, shape), 0.0) / SHAPES
+    factor = moderate(ratio, sound, SHAPES)
+    excess = np.maximum(factor - 1, 0.0) / np.maximum(np.diagonal(N, axis1=1, axis2=2).max(axis=1), 1e-9)
+    effect = equations[:, SHAPES + 1 :]
+    return factor, excess[:, None, None] * effect @ np.swapaxes(effect, 1, 2)
 
 
-@compiled
-def move_to_front(pixels: FloatArray, n: int, kept: BoolArray) -> int:
-    """Order pixels so that those that are kept come first; return how many they are."""
-    k = 0
-    for i in range(n):
-        if kept[i]:
-            for row in range(3):
-                pixels[row, k], pixels[row, i] = pixels[row, i], pixels[row, k]
-            k += 1
-    return k
+def moderate(ratio: FloatArray, sound: BoolArray, freedom: int) -> FloatArray:
+    """Return ratios of variances with a common degree of freedom, drawn to those of the population, (k,)."""
+    own = ratio[sound & (ratio > 0)]
+    prior, prior_freedom = 1.0, float(freedom)
+    if len(own) >= MIN_POPULATION:
+        z = np.log(own) - digamma(freedom / 2) + np.log(freedom / 2)
+        middle = np.median(z)
+        spread = (_MAD * np.median(np.abs(z - middle))) ** 2 - polygamma(1, freedom / 2)
+        if spread <= 0:
+            return np.full(len(ratio), np.exp(middle))
+        half = _inverse_trigamma(spread)
+        prior_freedom, prior = 2 * half, np.exp(middle + digamma(half) - np.log(half))
+    return np.asarray((prior_freedom * prior + freedom * ratio) / (prior_freedom + freedom))
+
+
+def _inverse_trigamma(value: float) -> float:
+    """Return y with trigamma(y) = value, by Newton steps (Smyth 2004, appendix)."""
+    y = 0.5 + 1 / value
+    for _ in range(50):
+        trigamma = polygamma(1, y)
+        step = trigamma * (1 - trigamma / value) / polygamma(2, y)
+        y += step
+        if abs(step) < 1e-8 * y:
+            break
+    return float(y)

@@ -7,12 +7,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sfm.conventions import AnyArray, FloatArray, IntArray
+from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
 from sfm.kernels.cholesky import invert_symmetric, solve_symmetric
 from sfm.kernels.options import compiled
 from sfm.targets.edge_rays import RAYS, improve_outline, trace_rays
 from sfm.targets.fits import blurred_ellipse as model
-from sfm.targets.fits import damage, goodness
+from sfm.targets.fits import goodness
 from sfm.targets.flags import Flag
 
 # A priori sigma of the change of gain over L: far above shading, it only keeps the fit regular.
@@ -37,7 +37,6 @@ _CLOSE_NEIGHBOUR = int(Flag.CLOSE_NEIGHBOUR)
 _CUT_BY_BORDER = int(Flag.CUT_BY_BORDER)
 _NOT_ELLIPTIC = int(Flag.NOT_ELLIPTIC)
 _NO_CONVERGENCE = int(Flag.NO_CONVERGENCE)
-_DAMAGED = int(Flag.DAMAGED)
 
 
 class EllipseFits(NamedTuple):
@@ -51,11 +50,22 @@ class EllipseFits(NamedTuple):
     """in the columns of `goodness`, shape (k, STATISTICS)"""
     flag: IntArray
     """remarks and reasons of failure, see Flag, shape (k,)"""
+    sectors: FloatArray
+    """of each sector of the edge the sums of v J and of J^2, J the derivative of an intensity by the radius
+    of the outline, in radii, shape (k, 2, RAYS)"""
+    shape: FloatArray
+    """equations of the harmonics of the outline, see `goodness.shape_equations`, shape (k, SHAPES + 3, SHAPES)"""
 
 
 @compiled
 def fit_ellipses(
-    image: AnyArray, start: FloatArray, sign: IntArray, noise: float, saturation: float
+    image: AnyArray,
+    start: FloatArray,
+    sign: IntArray,
+    noise: float,
+    saturation: float,
+    keep: BoolArray,
+    depth: FloatArray,
 ) -> EllipseFits:
     """Fit the model to every target.
 
@@ -65,17 +75,34 @@ def fit_ellipses(
         sign: +1 bright, -1 dark target, shape (k,).
         noise: approximate standard deviation of the intensities.
         saturation: intensities from here on are censored.
+        keep: sectors of each target, between a ray and the next, that take part, shape (k, RAYS).
+        depth: so far inside the edge the intensities are used, px, shape (k,).
     """
     k = len(start)
     theta = np.zeros((k, model.UNKNOWNS))
     cofactor = np.full((k, model.UNKNOWNS, model.UNKNOWNS), math.nan)
     statistics = np.ones((k, goodness.STATISTICS))
     flag = np.zeros(k, np.int64)
+    sectors = np.zeros((k, 2, RAYS))
+    shape = np.zeros((k, goodness.SHAPES + 3, goodness.SHAPES))
     J = np.zeros(model.BLOCK_SIZE)
     for i in range(k):
         theta[i, :5] = start[i]
-        flag[i] = _fit_one(image, theta[i], sign[i], noise, saturation, J, cofactor[i], statistics[i])
-    return EllipseFits(theta, cofactor, statistics, flag)
+        flag[i] = _fit_one(
+            image,
+            theta[i],
+            sign[i],
+            noise,
+            saturation,
+            keep[i],
+            depth[i],
+            J,
+            cofactor[i],
+            statistics[i],
+            sectors[i],
+            shape[i],
+        )
+    return EllipseFits(theta, cofactor, statistics, flag, sectors, shape)
 
 
 @compiled
@@ -85,11 +112,15 @@ def _fit_one(
     sign: int,
     noise: float,
     saturation: float,
+    keep: BoolArray,
+    depth: float,
     J: FloatArray,
     cofactor: FloatArray,
     statistics: FloatArray,
+    sectors: FloatArray,
+    shape: FloatArray,
 ) -> int:
-    """Fit one target; theta, cofactor and statistics are filled, the flag is returned."""
+    """Fit one target; theta, cofactor, statistics and sectors are filled, the flag is returned."""
     flag = _NONE
     edge, limit = np.empty(RAYS), np.empty(RAYS)
     mean, margin = 0.0, 0.0
@@ -109,17 +140,18 @@ def _fit_one(
     det = theta[model.P] * theta[model.R] - theta[model.Q] ** 2
     mean = 1 / math.sqrt(det)
     length = mean + margin
-    statistics[goodness.LENGTH], statistics[goodness.DISTURBED] = length, 0.0
+    statistics[goodness.LENGTH] = length
+    if mean >= LARGE_PX:
+        depth = min(depth, BAND_PX)
     half_x = math.sqrt(theta[model.R] ** 2 + theta[model.Q] ** 2) / det + margin + 1
     half_y = math.sqrt(theta[model.P] ** 2 + theta[model.Q] ** 2) / det + margin + 1
     pixels = np.empty((3, int((2 * half_x + 3) * (2 * half_y + 3))))
-    n = _collect(image, theta, limit, margin, half_x, half_y, mean < LARGE_PX, pixels)
+    n = _collect(image, theta, limit, margin, half_x, half_y, depth, keep, pixels)
     flag |= _start_levels(pixels, n, theta, saturation)
     if theta[model.CONTRAST] * sign <= 0 or n < 2 * model.UNKNOWNS:
         return flag | _NO_CONVERGENCE
     prior = (noise / GAIN_SIGMA) ** 2
     N = np.empty((model.UNKNOWNS, model.UNKNOWNS))
-    start = theta.copy()
     steps = _iterate(pixels, n, theta, length, saturation, prior, J, N)
     skirt = SKIRT_SIGMAS * theta[model.BLUR] - SKIRT_PX
     if steps > 0 and skirt > SKIRT_PX and theta[model.CONTRAST] * sign > 0:
@@ -132,34 +164,12 @@ def _fit_one(
                 limit[k], nearer = max(0.0, wide[k] - skirt), True
         if nearer:
             flag |= _CLOSE_NEIGHBOUR
-            n = _collect(image, theta, limit, margin, half_x, half_y, mean < LARGE_PX, pixels)
+            n = _collect(image, theta, limit, margin, half_x, half_y, depth, keep, pixels)
             steps = (
                 _iterate(pixels, n, theta, length, saturation, prior, J, N) if n > 2 * model.UNKNOWNS else 0
             )
-    left_out = False
-    if damage.is_damaged(pixels, n, theta, length, saturation, noise, J):
-        m, collected, whole = 0, 0, pixels.copy()
-        if damage.is_large(theta):
-            for _ in range(damage.TRACES):
-                trace_rays(image, start, sign, noise, margin, edge, limit)
-                if improve_outline(start, edge)[0] < MIN_AGREEMENT:
-                    break
-            m = _collect(image, start, limit, margin, half_x, half_y, mean < LARGE_PX, pixels)
-            _start_levels(pixels, m, start, saturation)
-            collected = m
-            m = _fit_undamaged(pixels, m, start, length, saturation, noise, prior, J, N)
-        left_out = m > 0
-        if left_out:
-            if damage.is_telling(pixels, m, collected, start, length, saturation, J):
-                flag |= _DAMAGED
-            n, steps = m, MAX_STEPS
-            theta[:] = start
-        else:
-            pixels = whole
-            model.normal_equations(pixels, n, theta, length, saturation, J, N, np.empty(model.UNKNOWNS))
-            statistics[goodness.DISTURBED] = 1.0
     done = steps > 0
-    goodness.judge_residuals(pixels, n, theta, length, saturation, J, statistics, left_out)
+    goodness.judge_residuals(pixels, n, theta, length, saturation, J, statistics, not keep.all())
     goodness.judge_background(image, theta, length, statistics)
     goodness.judge_glow(pixels, n, theta, saturation, statistics)
     statistics[goodness.STEPS] = abs(steps)
@@ -173,42 +183,12 @@ def _fit_one(
     ):
         return flag | _NO_CONVERGENCE
     cofactor[:] = N
+    goodness.shape_equations(pixels, n, theta, length, saturation, cofactor, J, shape)
+    n = _collect(image, theta, limit, margin, half_x, half_y, depth, np.ones(RAYS, np.bool_), pixels)
+    statistics[goodness.INSIDE] = goodness.sum_sectors(
+        pixels, n, theta, length, saturation, noise, J, sectors
+    )
     return flag
-
-
-@compiled
-def _fit_undamaged(
-    pixels: FloatArray,
-    n: int,
-    theta: FloatArray,
-    length: float,
-    saturation: float,
-    noise: float,
-    prior: float,
-    J: FloatArray,
-    N: FloatArray,
-) -> int:
-    """Fit the pixels that the model explains, from the edges on rays on, and put them first.
-
-    Returns:
-        How many they are; 0 where damage is no explanation.
-    """
-    sign = theta[model.CONTRAST]
-    kept, before = np.ones(n, np.bool_), -1
-    for k in range(damage.MAX_ROUNDS):
-        if not damage.explained_pixels(pixels, n, theta, length, saturation, noise, k, J, kept):
-            return 0
-        m = damage.move_to_front(pixels, n, kept)
-        if m < 2 * model.UNKNOWNS:
-            return 0
-        if _iterate(pixels, m, theta, length, saturation, prior, J, N) <= 0:
-            return 0
-        if theta[model.CONTRAST] * sign <= 0:
-            return 0
-        if m == before and k > len(damage.FIRST_OUTLIERS):
-            break
-        before = m
-    return before if before < n else 0
 
 
 @compiled
@@ -281,13 +261,14 @@ def _collect(
     margin: float,
     half_x: float,
     half_y: float,
-    whole: bool,
+    depth: float,
+    keep: BoolArray,
     pixels: FloatArray,
 ) -> int:
     """Collect x, y and intensity of the target and its undisturbed background; return how many."""
     h, w = image.shape
     x0, y0, p, q, r = theta[model.X0], theta[model.Y0], theta[model.P], theta[model.Q], theta[model.R]
-    disturbed = limit.min() < margin
+    disturbed, cut = limit.min() < margin, not keep.all()
     n = 0
     for i in range(max(0, int(y0 - half_y)), min(h, int(y0 + half_y) + 2)):
         dy = i - y0
@@ -295,13 +276,13 @@ def _collect(
             dx = j - x0
             u, v = p * dx + q * dy, q * dx + r * dy
             rho = math.sqrt(u * u + v * v)
-            if rho > 1 or not whole:
+            if rho > 1 or depth < math.inf:
                 d = rho * (rho - 1) / (math.sqrt((p * u + q * v) ** 2 + (q * u + r * v) ** 2) + 1e-12)
-                if d > margin or d < -BAND_PX:
+                if d > margin or d < -depth:
                     continue
-            if disturbed and rho > 1:
+            if cut or (disturbed and rho > 1):
                 k = int(math.atan2(v, u) * (RAYS / (2 * math.pi)) + RAYS)
-                if d > limit[k % RAYS] or d > limit[(k + 1) % RAYS]:
+                if not keep[k % RAYS] or (rho > 1 and (d > limit[k % RAYS] or d > limit[(k + 1) % RAYS])):
                     continue
             if n == pixels.shape[1]:
                 return n

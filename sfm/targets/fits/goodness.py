@@ -14,10 +14,10 @@ from sfm.targets.fits import blurred_ellipse as model
 
 # Columns of the statistics of a fit: pixels used, sum of squared residuals, unevenness, L in px, steps, lobes
 # and their sigma, share of strokes, halo and its sigma, saturated share of the background, share of the
-# circumference behind which glare is, and 1 where the residuals are those of damage that was not left out.
+# circumference behind which glare is, and the second largest residual inside, in robust sigmas of those there.
 STATISTICS = 13
 PIXELS, SQUARES, UNEVENNESS, LENGTH, STEPS, LOBES = range(6)
-LOBES_SIGMA, STROKES, HALO, HALO_SIGMA, SATURATED, GLARING, DISTURBED = range(6, STATISTICS)
+LOBES_SIGMA, STROKES, HALO, HALO_SIGMA, SATURATED, GLARING, INSIDE = range(6, STATISTICS)
 # A background narrower than this, in radii, is a stroke: the rings of codes begin one radius from the edge.
 STROKE = 0.75
 # Behind a stroke this far is looked at, and what lies beyond so many contrasts from the background is glare.
@@ -25,6 +25,10 @@ _BEHIND_PX, _GLARE = 2.5, 1.5
 # The background begins so many blurs from the edge, where 0.6 % of the step are left; a halo is looked for in
 # this width of it.
 _EDGE_ENDS_BLURS, _HALO_PX = 2.5, 2.0
+# Harmonics 3 to 6 of the outline, cosine and sine of each.
+SHAPES = 8
+# Fewer pixels inside the edge than this do not show what is usual there.
+MIN_INSIDE = 20
 # Residuals of the edge are taken from this far in units of its blur, and at least so many px.
 _BAND_BLURS, _BAND_PX = 1.5, 1.0
 
@@ -88,6 +92,115 @@ def judge_residuals(
     statistics[PIXELS], statistics[SQUARES], statistics[UNEVENNESS] = used, squares, worst / abs(A)
     statistics[LOBES] = math.sqrt(np.sum((lobe / lobe_weight) ** 2))
     statistics[LOBES_SIGMA] = 1 / math.sqrt(lobe_weight.min())
+
+
+@compiled
+def sum_sectors(
+    pixels: FloatArray,
+    n: int,
+    theta: FloatArray,
+    length: float,
+    saturation: float,
+    noise: float,
+    J: FloatArray,
+    sectors: FloatArray,
+) -> float:
+    """Sum up v H and H^2 of each sector of the edge, H being the derivative by the radius, into (2, RAYS).
+
+    Returns:
+        The second largest residual deeper inside than the edge, in robust standard deviations of those there.
+    """
+    p, q, r = theta[model.P], theta[model.Q], theta[model.R]
+    A, s = theta[model.CONTRAST], theta[model.BLUR]
+    band, deep = _BAND_PX + _BAND_BLURS * s, np.empty(n)
+    inside = 0
+    sectors[:] = 0.0
+    for first in range(0, n, model.BLOCK):
+        m = min(model.BLOCK, n - first)
+        model.linearise(pixels, first, m, theta, length, saturation, J)
+        for i in range(m):
+            dx, dy = pixels[0, first + i] - theta[model.X0], pixels[1, first + i] - theta[model.Y0]
+            u, v = p * dx + q * dy, q * dx + r * dy
+            rho = math.sqrt(u * u + v * v)
+            nw = math.sqrt((p * u + q * v) ** 2 + (q * u + r * v) ** 2) + 1e-12
+            d = rho * (rho - 1) / nw
+            if abs(d) < band:
+                # An outline at rho = 1 + h has d = rho (rho - 1 - h) / |w|, and I falls by A / s phi(d / s) dd.
+                slope = A / s * math.exp(-0.5 * (d / s) ** 2) / math.sqrt(2 * math.pi) * rho / nw
+                slope *= J[model.WEIGHT + i]
+                k = int(math.atan2(v, u) * (RAYS / (2 * math.pi)) + RAYS) % RAYS
+                sectors[0, k] += J[model.RESIDUAL + i] * slope
+                sectors[1, k] += slope * slope
+            elif d < 0:
+                deep[inside] = abs(J[model.RESIDUAL + i])
+                inside += 1
+    if inside < MIN_INSIDE:
+        return 0.0
+    sigma = 1.4826 * np.median(deep[:inside])
+    deep[:inside].sort()
+    return float(deep[inside - 2] / max(sigma, noise))
+
+
+@compiled
+def shape_equations(
+    pixels: FloatArray,
+    n: int,
+    theta: FloatArray,
+    length: float,
+    saturation: float,
+    cofactor: FloatArray,
+    J: FloatArray,
+    shape: FloatArray,
+) -> None:
+    """Set the reduced normal equations of the harmonics of an outline that no ellipse follows.
+
+    Args:
+        pixels: x, y and intensity of the pixels in the fit, shape (3, >= n).
+        n: number of pixels.
+        theta: unknowns of the model, shape (10,).
+        length: L, px.
+        saturation: intensities from here on are censored.
+        cofactor: of the unknowns, shape (10, 10).
+        J: work space of BLOCK_SIZE.
+        shape: receives the normal equations of the harmonics, their right-hand side, and the change of the
+            centre by each, px per radius, shape (SHAPES + 3, SHAPES).
+    """
+    p, q, r = theta[model.P], theta[model.Q], theta[model.R]
+    A, s = theta[model.CONTRAST], theta[model.BLUR]
+    band = _BAND_PX + 2 * _BAND_BLURS * s
+    mixed, column = np.zeros((model.UNKNOWNS, SHAPES)), np.empty(SHAPES)
+    shape[:] = 0.0
+    for first in range(0, n, model.BLOCK):
+        m = min(model.BLOCK, n - first)
+        model.linearise(pixels, first, m, theta, length, saturation, J)
+        for i in range(m):
+            dx, dy = pixels[0, first + i] - theta[model.X0], pixels[1, first + i] - theta[model.Y0]
+            u, v = p * dx + q * dy, q * dx + r * dy
+            rho = math.sqrt(u * u + v * v) + 1e-12
+            nw = math.sqrt((p * u + q * v) ** 2 + (q * u + r * v) ** 2) + 1e-12
+            d = rho * (rho - 1) / nw
+            if abs(d) >= band:
+                continue
+            # An outline at rho = 1 + h has d = rho (rho - 1 - h) / |w|, and I falls by A / s phi(d / s) dd.
+            slope = A / s * math.exp(-0.5 * (d / s) ** 2) / math.sqrt(2 * math.pi) * rho / nw
+            slope *= J[model.WEIGHT + i]
+            c, z = u / rho, v / rho
+            ck, zk = c * c - z * z, 2 * c * z
+            for k in range(0, SHAPES, 2):
+                ck, zk = ck * c - zk * z, zk * c + ck * z
+                column[k], column[k + 1] = slope * ck, slope * zk
+            for k in range(SHAPES):
+                for j in range(k + 1):
+                    shape[k, j] += column[k] * column[j]
+                shape[SHAPES, k] += column[k] * J[model.RESIDUAL + i]
+                for j in range(model.UNKNOWNS):
+                    mixed[j, k] += J[j * model.BLOCK + i] * column[k]
+    for k in range(SHAPES):
+        for j in range(k):
+            shape[j, k] = shape[k, j]
+    effect = cofactor @ mixed
+    shape[:SHAPES] -= mixed.T @ effect
+    shape[SHAPES + 1 :] = effect[:2]
 
 
 @compiled
