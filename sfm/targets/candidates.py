@@ -24,6 +24,8 @@ UNEVEN_EDGE = 0.18
 LOBES, LOBES_SIGMAS, STROKES = 0.02, 5.0, 0.5
 # Centres nearer than this share of the smaller radius belong to concentric targets.
 CONCENTRIC = 0.5
+# Centres of a ring are as near as this share of the radius, by the perspective, and so many sigmas.
+ECCENTRIC, ECCENTRIC_SIGMAS = 0.02, 5.0
 # Parts of an unreadable code are smaller than this share of its dot.
 PART_OF_DOT = 0.75
 # Softest edge: this share of the minor semi-axis, or this blur in px where that is more.
@@ -85,38 +87,36 @@ def judge_fits(
     return reason
 
 
-def find_duplicates(fit: EllipseFit, reason: IntArray) -> BoolArray:
-    """Return which of the good candidates surround another one: of concentric ellipses the smallest is kept.
+def find_duplicates(fit: EllipseFit, sign: IntArray, reason: IntArray) -> BoolArray:
+    """Return which of the good candidates are no targets because of what is about or inside of them.
 
-    A retro-reflective dot with a dark rim in glare is seen as bright dot and, larger, as the dark rim. What
-    is fitted as a damaged target takes the place of none that is whole.
+    Of concentric ellipses the smallest is kept: a retro-reflective dot with a dark rim in glare is seen as
+    bright dot and, larger, as the dark rim. What is in another candidate but not concentric, of the polarity
+    that fewer targets of the photograph have, is a stain.
     """
     duplicate = np.zeros(len(fit.xy), dtype=bool)
+    p, q, r = fit.shape.T
+    with np.errstate(divide="ignore", invalid="ignore"):
+        radius = np.abs(p * r - q * q) ** -0.5
+        sigma = np.sqrt(np.trace(fit.covariance, axis1=1, axis2=2))
     good = np.flatnonzero(reason == 0)
-    p, q, r = fit.shape[good].T
-    radius = (p * r - q * q) ** -0.5
-    order = np.argsort(fit.xy[good, 0], kind="stable")
-    damaged = (fit.flag[good] & Flag.DAMAGED.value) != 0
-    duplicate[good[order]] = _surrounds(fit.xy[good][order], radius[order], damaged[order])
+    usual = 1 if (sign[good] > 0).sum() > len(good) / 2 else -1
+    typical = np.median(sigma[good]) if len(good) else 0.0
+    seen = np.flatnonzero((reason == 0) | (np.isfinite(sigma) & (sign == usual)))
+    order = seen[np.argsort(fit.xy[seen, 0], kind="stable")]
+    widest = radius[order].max() if len(order) else 0.0
+    x = fit.xy[order, 0]
+    for i in good:
+        near = order[np.searchsorted(x, x_i := fit.xy[i, 0] - widest) : np.searchsorted(x, x_i + 2 * widest, "right")]
+        distance = np.hypot(*(fit.xy[near] - fit.xy[i]).T)
+        larger = (near != i) & ((radius[near] > radius[i]) | ((radius[near] == radius[i]) & (near > i)))
+        smaller = (near != i) & ~larger & (reason[near] == 0) & (distance < CONCENTRIC * radius[near])
+        apart = distance > ECCENTRIC * radius[i] + ECCENTRIC_SIGMAS * (sigma[i] + typical)
+        stained = larger & (distance < radius[near]) & apart & (sign[near] == usual)
+        if sign[i] != usual:
+            duplicate[i] = stained.any()
+        duplicate[i] |= (smaller & ~(apart & (sign[near] != usual) & (sign[i] == usual))).any()
     return duplicate
-
-
-@compiled
-def _surrounds(xy: FloatArray, radius: FloatArray, damaged: BoolArray) -> BoolArray:
-    """Return which of the circles, in order of x, have the centre of a smaller or whole one near."""
-    outer = np.zeros(len(xy), dtype=np.bool_)
-    widest = radius.max() if len(radius) else 0.0
-    for i in range(len(xy)):
-        for j in range(i + 1, len(xy)):
-            if xy[j, 0] - xy[i, 0] > widest:
-                break
-            small, large = (i, j) if radius[i] <= radius[j] else (j, i)
-            if math.hypot(xy[j, 0] - xy[i, 0], xy[j, 1] - xy[i, 1]) < CONCENTRIC * radius[small]:
-                if damaged[i] != damaged[j]:
-                    outer[i if damaged[i] else j] = True
-                else:
-                    outer[large] = True
-    return outer
 
 
 def find_parts_of_codes(

@@ -139,7 +139,7 @@ def find_targets(
         photograph, outlines.xy, outlines.shape, outlines.sign, noise=noise, saturation=scale
     )
     reason = judge_fits(fit, noise=noise, scale=scale, **limits)
-    reason[find_duplicates(fit, reason)] = Flag.DUPLICATE
+    reason[find_duplicates(fit, outlines.sign, reason)] = Flag.DUPLICATE
     code, confidence = np.full(len(reason), UNCODED), np.zeros(len(reason))
     levels = np.column_stack([fit.background, fit.contrast])
     tags = None

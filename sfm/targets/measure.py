@@ -13,10 +13,16 @@ from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
 from sfm.targets.edge_rays import RAYS
 from sfm.targets.fits import goodness
 from sfm.targets.fits.blurred_ellipse import BACKGROUND, BLUR, CONTRAST, GAIN_X, UNKNOWNS, P, R
-from sfm.targets.fits.damage import MIN_POPULATION, common_outline, find_damage, outline_noise
+from sfm.targets.fits.damage import (
+    MIN_POPULATION,
+    common_outline,
+    find_damage,
+    gap_shifts,
+    outline_noise,
+    rise_to_first,
+)
 from sfm.targets.fits.ellipse_fit import EllipseFits, fit_ellipses
 from sfm.targets.flags import Flag
-from sfm.targets.outlines import STEP_SIGMAS
 
 # Variance of rounding to whole intensities.
 QUANTISATION = 1 / 12
@@ -29,8 +35,12 @@ MIN_FOR_SHADING, OWN_GAIN_SIGMAS = 10, 3.0
 HALO, HALO_SIGMAS, FLARE_SATURATED, FLARE_AROUND, FLARE_CHANGE = 0.035, 5.0, 0.02, 0.25, 0.25
 # Fewer targets than this are not worth a thread.
 TARGETS_PER_THREAD = 100
+# Smaller targets have too few pixels to tell damage from another shape: they are rejected.
+MIN_RADIUS_PX = 4.0
+# Of the contrast of the strongest tenth.
+LEAST_CONTRAST = 0.2
 # Rounds of repair, sound edges, and share of the sectors that must agree.
-REPAIRS, EVEN, MIN_CONSENSUS, STAIN_SIGMAS = 3, 0.18, 0.7, 8.0
+REPAIRS, EVEN, MIN_CONSENSUS, STAIN_SIGMAS, SKIRT_BLURS = 3, 0.18, 0.7, 8.0, 1.5
 # A gain per px below this is none.
 NO_GAIN = 1e-7
 
@@ -165,13 +175,18 @@ def _fit_undamaged(
         variance = np.maximum(variance, least)
         fitted = np.isfinite(fits.cofactor[:, 0, 0])
         sound = fitted & keep.all(axis=1) & (fits.statistics[:, goodness.UNEVENNESS] < EVEN)
-        sound &= np.abs(fits.theta[:, CONTRAST]) > STEP_SIGMAS * noise
-        weight = np.where(fitted[:, None], fits.sectors[:, 1] / np.maximum(variance, 1e-12)[:, None], 0.0)
+        contrast = np.abs(fits.theta[:, CONTRAST])
+        sound &= contrast > LEAST_CONTRAST * np.percentile(contrast[fitted], 90) if fitted.any() else fitted
+        usual = np.median(variance[sound] / contrast[sound] ** 2) if sound.sum() >= MIN_POPULATION else np.inf
+        clean = np.minimum(variance, np.maximum(usual * contrast**2, noise**2 + least))
+        weight = np.where(fitted[:, None], fits.sectors[:, 1] / np.maximum(clean, 1e-12)[:, None], 0.0)
         h = np.divide(fits.sectors[:, 0], fits.sectors[:, 1], out=np.zeros((k, RAYS)), where=weight > 0)
-        h -= common_outline(h, weight, sound)
+        common = common_outline(h, weight, sound)
+        h -= common
         if _ == REPAIRS:
             break
-        damaged = find_damage(h, weight, sound)
+        skirt = np.ceil(SKIRT_BLURS * fits.theta[:, BLUR] * RAYS / (2 * math.pi * radius_of(fits.theta)))
+        damaged = find_damage(h, weight, sound, skirt)
         inside = fits.statistics[:, goodness.INSIDE]
         usual = np.median(inside[sound]) if sound.sum() >= MIN_POPULATION else 0.0
         stained = inside > STAIN_SIGMAS * max(1.0, usual / 3)
@@ -187,9 +202,25 @@ def _fit_undamaged(
             all_[now] = new
     flag = fits.flag
     flag[~keep.all(axis=1) | np.isfinite(depth)] |= Flag.DAMAGED.value
-    flag[keep.mean(axis=1) < MIN_CONSENSUS] |= Flag.UNEVEN_EDGE.value
-    factor, added = outline_noise(fits.shape, np.maximum(variance, 1e-12), sound)
+    small = radius_of(fits.theta) < MIN_RADIUS_PX
+    flag[(keep.mean(axis=1) < MIN_CONSENSUS) | (small & ~keep.all(axis=1))] |= Flag.UNEVEN_EDGE.value
+    p, q, r = fits.theta[:, P : R + 1].T
+    with np.errstate(all="ignore"):
+        inverse = np.array([[r, -q], [-q, p]]).transpose(2, 0, 1) / (p * r - q * q)[:, None, None]
+    cut = ~keep.all(axis=1) & fitted
+    fits.theta[cut, :2] -= (inverse[cut] @ gap_shifts(common, weight[cut], keep[cut])[..., None])[..., 0]
+    softness = np.median((fits.theta[:, BLUR] / radius_of(fits.theta))[sound]) if sound.any() else 0.0
+    rise = rise_to_first(h[sound], weight[sound], softness)
+    factor, added, strange = outline_noise(fits.shape, np.maximum(variance, 1e-12), sound, rise)
+    global DBG
+    DBG = dict(fits=fits, strange=strange, factor=factor, keep=keep, depth=depth, rise=rise, sound=sound)
     return fits, variance, factor, added
+
+
+def radius_of(theta: FloatArray) -> FloatArray:
+    """Return the mean radii of ellipses, px, shape (k,)."""
+    p, q, r = theta[:, P : R + 1].T
+    return np.asarray(np.maximum(np.abs(p * r - q * q), 1e-12) ** -0.5)
 
 
 def _changes(theta: FloatArray, gain: FloatArray) -> BoolArray:
