@@ -12,13 +12,13 @@ from sfm.kernels.sampling import bilinear
 from sfm.targets.codes.ring_reading import UNCODED
 from sfm.targets.codes.rings import CodeFamily
 from sfm.targets.edge_rays import RAYS
+from sfm.targets.fits.undamaged import UNEVEN_EDGE
 from sfm.targets.flags import Flag
 from sfm.targets.measure import EllipseFit, axes_from_shape
 from sfm.targets.outlines import MIN_AXIS_RATIO, MIN_STEP, STEP_SIGMAS
 
-# Largest RMS of the residuals and largest mean residual on an eighth of the edge, over the contrast.
+# Largest RMS of the residuals over the contrast.
 POOR_FIT = 0.12
-UNEVEN_EDGE = 0.18
 # Largest lobes of an outline, in radii, for noise so many sigma of a component more (four of them are seen);
 # only half of it where the background is a thin stroke on more than this share of the circumference.
 LOBES, LOBES_SIGMAS, STROKES = 0.02, 5.0, 0.5
@@ -107,7 +107,9 @@ def find_duplicates(fit: EllipseFit, sign: IntArray, reason: IntArray) -> BoolAr
     widest = radius[order].max() if len(order) else 0.0
     x = fit.xy[order, 0]
     for i in good:
-        near = order[np.searchsorted(x, x_i := fit.xy[i, 0] - widest) : np.searchsorted(x, x_i + 2 * widest, "right")]
+        near = order[
+            np.searchsorted(x, x_i := fit.xy[i, 0] - widest) : np.searchsorted(x, x_i + 2 * widest, "right")
+        ]
         distance = np.hypot(*(fit.xy[near] - fit.xy[i]).T)
         larger = (near != i) & ((radius[near] > radius[i]) | ((radius[near] == radius[i]) & (near > i)))
         smaller = (near != i) & ~larger & (reason[near] == 0) & (distance < CONCENTRIC * radius[near])

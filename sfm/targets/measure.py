@@ -3,25 +3,14 @@
 from __future__ import annotations
 
 import math
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 
 from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
-from sfm.targets.edge_rays import RAYS
 from sfm.targets.fits import goodness
 from sfm.targets.fits.blurred_ellipse import BACKGROUND, BLUR, CONTRAST, GAIN_X, UNKNOWNS, P, R
-from sfm.targets.fits.damage import (
-    MIN_POPULATION,
-    common_outline,
-    find_damage,
-    gap_shifts,
-    outline_noise,
-    rise_to_first,
-)
-from sfm.targets.fits.ellipse_fit import EllipseFits, fit_ellipses
+from sfm.targets.fits.undamaged import fit_undamaged
 from sfm.targets.flags import Flag
 
 # Variance of rounding to whole intensities.
@@ -33,14 +22,6 @@ MIN_FOR_SHADING, OWN_GAIN_SIGMAS = 10, 3.0
 # sigmas. Flare is a background of which more than this share is saturated, that has glare behind it on more
 # than this share of the circumference, or that changes by more than this share of the contrast.
 HALO, HALO_SIGMAS, FLARE_SATURATED, FLARE_AROUND, FLARE_CHANGE = 0.035, 5.0, 0.02, 0.25, 0.25
-# Fewer targets than this are not worth a thread.
-TARGETS_PER_THREAD = 100
-# Smaller targets have too few pixels to tell damage from another shape: they are rejected.
-MIN_RADIUS_PX = 4.0
-# Of the contrast of the strongest tenth.
-LEAST_CONTRAST = 0.2
-# Rounds of repair, sound edges, and share of the sectors that must agree.
-REPAIRS, EVEN, MIN_CONSENSUS, STAIN_SIGMAS, SKIRT_BLURS = 3, 0.18, 0.7, 8.0, 1.5
 # A gain per px below this is none.
 NO_GAIN = 1e-7
 
@@ -52,8 +33,8 @@ class EllipseFit:
     xy: FloatArray
     """centres, px, shape (k, 2)"""
     full_covariance: FloatArray
-    """covariance of centre, shape, background, contrast and blur in this order from the fit and its own
-    residuals, nan where it failed, shape (k, 8, 8)"""
+    """covariance of centre, shape, background, contrast and blur in this order from the fit, its own
+    residuals and the outlines of the photograph, nan where it failed, shape (k, 8, 8)"""
     shape: FloatArray
     """(p, q, r) of S, which turns image vectors into radii, 1/px, shape (k, 3)"""
     background: FloatArray
@@ -118,9 +99,10 @@ def fit_ellipse_model(
     k = len(xy)
     start = np.column_stack([np.asarray(xy, float).reshape(k, 2), np.asarray(shape, float).reshape(k, 3)])
     least_variance = QUANTISATION if integers else 0.0
-    (theta, cofactor, statistics, flag, _, _), variance, factor, added = _fit_undamaged(
+    fits, variance, outlines = fit_undamaged(
         photograph, start, np.asarray(sign, np.int64), float(noise), float(saturation), least_variance
     )
+    theta, cofactor, statistics, flag = fits[:4]
     found = statistics.T
     covariance = np.full((k, GAIN_X, GAIN_X), np.nan)
     failed = Flag.NO_CONVERGENCE | Flag.CUT_BY_BORDER | Flag.NOT_ELLIPTIC
@@ -130,8 +112,8 @@ def fit_ellipse_model(
             theta[good], cofactor[good], variance[good], found[goodness.LENGTH][good]
         )
         flag[good[shaded]] |= Flag.SHADED.value
-        covariance[good] *= factor[good, None, None]
-        covariance[good, :2, :2] += added[good]
+        covariance[good] *= outlines.factor[good, None, None]
+        covariance[good, :2, :2] += outlines.gap_covariance[good]
     gain = theta[:, GAIN_X:] / found[goodness.LENGTH][:, None]
     halo = found[goodness.HALO]
     flag[(halo > HALO) & (halo > HALO_SIGMAS * found[goodness.HALO_SIGMA])] |= Flag.HALO.value
@@ -147,80 +129,13 @@ def fit_ellipse_model(
         gain=gain,
         noise=np.sqrt(variance),
         unevenness=found[goodness.UNEVENNESS],
-        lobes=found[goodness.LOBES],
-        lobes_sigma=noise * found[goodness.LOBES_SIGMA],
+        lobes=outlines.lobes,
+        lobes_sigma=noise * np.sqrt(outlines.lobes_cofactor),
         strokes=found[goodness.STROKES],
         pixels=found[goodness.PIXELS].astype(np.int64),
         iterations=found[goodness.STEPS].astype(np.int64),
         flag=flag,
     )
-
-
-def _fit_undamaged(
-    photograph: AnyArray, start: FloatArray, sign: IntArray, noise: float, saturation: float, least: float
-) -> tuple[EllipseFits, FloatArray, FloatArray, FloatArray]:
-    """Fit ellipses to what is not damaged.
-
-    Returns:
-        The fits; variances of the intensities, shape (k,); factors of the covariances by the noise of the
-        outlines, shape (k,); what gaps add to the covariances of the centres, px^2, shape (k, 2, 2).
-    """
-    k = len(start)
-    keep, depth = np.ones((k, RAYS), bool), np.full(k, np.inf)
-    fits = _fit_in_threads(photograph, start, sign, noise, saturation, keep, depth)
-    for _ in range(REPAIRS + 1):
-        variance = fits.statistics[:, goodness.SQUARES] / np.maximum(
-            fits.statistics[:, goodness.PIXELS] - UNKNOWNS, 1
-        )
-        variance = np.maximum(variance, least)
-        fitted = np.isfinite(fits.cofactor[:, 0, 0])
-        sound = fitted & keep.all(axis=1) & (fits.statistics[:, goodness.UNEVENNESS] < EVEN)
-        contrast = np.abs(fits.theta[:, CONTRAST])
-        sound &= contrast > LEAST_CONTRAST * np.percentile(contrast[fitted], 90) if fitted.any() else fitted
-        usual = np.median(variance[sound] / contrast[sound] ** 2) if sound.sum() >= MIN_POPULATION else np.inf
-        clean = np.minimum(variance, np.maximum(usual * contrast**2, noise**2 + least))
-        weight = np.where(fitted[:, None], fits.sectors[:, 1] / np.maximum(clean, 1e-12)[:, None], 0.0)
-        h = np.divide(fits.sectors[:, 0], fits.sectors[:, 1], out=np.zeros((k, RAYS)), where=weight > 0)
-        common = common_outline(h, weight, sound)
-        h -= common
-        if _ == REPAIRS:
-            break
-        skirt = np.ceil(SKIRT_BLURS * fits.theta[:, BLUR] * RAYS / (2 * math.pi * radius_of(fits.theta)))
-        damaged = find_damage(h, weight, sound, skirt)
-        inside = fits.statistics[:, goodness.INSIDE]
-        usual = np.median(inside[sound]) if sound.sum() >= MIN_POPULATION else 0.0
-        stained = inside > STAIN_SIGMAS * max(1.0, usual / 3)
-        now = fitted & ((damaged == keep).any(axis=1) | (stained & np.isinf(depth)))
-        if not now.any():
-            break
-        keep[now] = ~damaged[now]
-        depth[now & stained] = (2 + 2.5 * fits.theta[:, BLUR])[now & stained]
-        again = _fit_in_threads(
-            photograph, fits.theta[now, :5], sign[now], noise, saturation, keep[now], depth[now]
-        )
-        for all_, new in zip(fits, again, strict=True):
-            all_[now] = new
-    flag = fits.flag
-    flag[~keep.all(axis=1) | np.isfinite(depth)] |= Flag.DAMAGED.value
-    small = radius_of(fits.theta) < MIN_RADIUS_PX
-    flag[(keep.mean(axis=1) < MIN_CONSENSUS) | (small & ~keep.all(axis=1))] |= Flag.UNEVEN_EDGE.value
-    p, q, r = fits.theta[:, P : R + 1].T
-    with np.errstate(all="ignore"):
-        inverse = np.array([[r, -q], [-q, p]]).transpose(2, 0, 1) / (p * r - q * q)[:, None, None]
-    cut = ~keep.all(axis=1) & fitted
-    fits.theta[cut, :2] -= (inverse[cut] @ gap_shifts(common, weight[cut], keep[cut])[..., None])[..., 0]
-    softness = np.median((fits.theta[:, BLUR] / radius_of(fits.theta))[sound]) if sound.any() else 0.0
-    rise = rise_to_first(h[sound], weight[sound], softness)
-    factor, added, strange = outline_noise(fits.shape, np.maximum(variance, 1e-12), sound, rise)
-    global DBG
-    DBG = dict(fits=fits, strange=strange, factor=factor, keep=keep, depth=depth, rise=rise, sound=sound)
-    return fits, variance, factor, added
-
-
-def radius_of(theta: FloatArray) -> FloatArray:
-    """Return the mean radii of ellipses, px, shape (k,)."""
-    p, q, r = theta[:, P : R + 1].T
-    return np.asarray(np.maximum(np.abs(p * r - q * q), 1e-12) ** -0.5)
 
 
 def _changes(theta: FloatArray, gain: FloatArray) -> BoolArray:
@@ -230,27 +145,6 @@ def _changes(theta: FloatArray, gain: FloatArray) -> BoolArray:
         radius = np.abs(p * r - q * q) ** -0.5
         change = 2 * radius * np.abs(B) * np.hypot(*gain.T)
         return np.asarray(change > FLARE_CHANGE * np.abs(A))
-
-
-def _fit_in_threads(
-    photograph: AnyArray,
-    start: FloatArray,
-    sign: IntArray,
-    noise: float,
-    saturation: float,
-    keep: BoolArray,
-    depth: FloatArray,
-) -> EllipseFits:
-    """Fit the ellipses in as many threads as OpenCV may use; the results do not depend on their number."""
-    parts = max(1, min(cv2.getNumThreads(), len(start) // TARGETS_PER_THREAD))
-    if parts == 1:
-        return fit_ellipses(photograph, start, sign, noise, saturation, keep, depth)
-    chunks = np.array_split(np.arange(len(start)), parts)
-    with ThreadPoolExecutor(parts) as pool:
-        fits = pool.map(
-            lambda c: fit_ellipses(photograph, start[c], sign[c], noise, saturation, keep[c], depth[c]), chunks
-        )
-        return EllipseFits(*(np.concatenate(part) for part in zip(*fits, strict=True)))
 
 
 def _shrink_gain(

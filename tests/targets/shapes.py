@@ -287,7 +287,9 @@ def over_stated(measured: Measured, of: BoolArray) -> float:
 
 def main() -> None:
     """Print the table."""
-    print(f"{'class':26} {'dots':>5} {'found':>7} {'RMS px':>8} {'over stated':>11} {'flagged':>8} {'far':>7}")
+    print(
+        f"{'class':26} {'dots':>5} {'found':>7} {'RMS px':>8} {'over stated':>11} {'flagged':>8} {'far':>7}"
+    )
     for name in sys.argv[1:] or KINDS:
         measured, damaged, radius = measure_class(name)
         groups = [("", ~damaged)] if not damaged.any() else [("", damaged), (", intact", ~damaged)]

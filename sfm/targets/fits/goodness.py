@@ -12,19 +12,19 @@ from sfm.kernels.sampling import bilinear
 from sfm.targets.edge_rays import HARMONICS, RAYS, STEP_PX
 from sfm.targets.fits import blurred_ellipse as model
 
-# Columns of the statistics of a fit: pixels used, sum of squared residuals, unevenness, L in px, steps, lobes
-# and their sigma, share of strokes, halo and its sigma, saturated share of the background, share of the
-# circumference behind which glare is, and the second largest residual inside, in robust sigmas of those there.
-STATISTICS = 13
-PIXELS, SQUARES, UNEVENNESS, LENGTH, STEPS, LOBES = range(6)
-LOBES_SIGMA, STROKES, HALO, HALO_SIGMA, SATURATED, GLARING, INSIDE = range(6, STATISTICS)
+# Columns of the statistics of a fit: pixels used, sum of squared residuals, unevenness, L in px, steps, share
+# of strokes, halo and its sigma, saturated share of the background, share of the circumference behind which
+# glare is, and the second largest residual inside, in robust sigmas of those there.
+STATISTICS = 11
+PIXELS, SQUARES, UNEVENNESS, LENGTH, STEPS = range(5)
+STROKES, HALO, HALO_SIGMA, SATURATED, GLARING, INSIDE = range(5, STATISTICS)
 # A background narrower than this, in radii, is a stroke: the rings of codes begin one radius from the edge.
 STROKE = 0.75
 # Behind a stroke this far is looked at, and what lies beyond so many contrasts from the background is glare.
 _BEHIND_PX, _GLARE = 2.5, 1.5
 # The background begins so many blurs from the edge, where 0.6 % of the step are left; a halo is looked for in
 # this width of it.
-_EDGE_ENDS_BLURS, _HALO_PX = 2.5, 2.0
+EDGE_ENDS_BLURS, HALO_PX = 2.5, 2.0
 # Harmonics 3 to 6 of the outline, cosine and sine of each.
 SHAPES = 8
 # Fewer pixels inside the edge than this do not show what is usual there.
@@ -44,19 +44,14 @@ def judge_residuals(
     statistics: FloatArray,
     without_damage: bool,
 ) -> None:
-    """Set the number of pixels, the sum of squared residuals, the unevenness and the lobes of the edge.
+    """Set the number of pixels, the sum of squared residuals and the unevenness of the edge.
 
     The unevenness is the largest mean residual of an eighth of the edge, in- or outside, over the contrast.
     An eighth without any background is uneven, unless what is damaged was left out there.
-    The lobes are the amplitude of the deviations of the outline from the ellipse that go with the third and
-    fourth harmonic of the direction, in radii: the ends of a bar and the corners of a square. Their sigma is
-    that for unit noise.
     """
     p, q, r = theta[model.P], theta[model.Q], theta[model.R]
-    A, s = theta[model.CONTRAST], theta[model.BLUR]
-    band = _BAND_PX + _BAND_BLURS * s
+    A, band = theta[model.CONTRAST], _BAND_PX + _BAND_BLURS * theta[model.BLUR]
     mean, count = np.zeros(16), np.zeros(16)
-    lobe, lobe_weight = np.zeros(4), np.full(4, 1e-12)
     squares, used = 0.0, 0.0
     for first in range(0, n, model.BLOCK):
         m = min(model.BLOCK, n - first)
@@ -76,13 +71,6 @@ def judge_residuals(
             k = side + right + down + (1 if abs(u) > abs(v) else 0)
             mean[k] += residual
             count[k] += 1
-            # An outline at rho = 1 + h has d = rho (rho - 1 - h) / |w|, and I falls by A / s phi(d / s) dd.
-            shift = A / s * math.exp(-0.5 * (d / s) ** 2) / math.sqrt(2 * math.pi) * rho / nw
-            c, z = u / (rho + 1e-12), v / (rho + 1e-12)
-            c2, z2 = c * c - z * z, 2 * c * z
-            for j, h in enumerate((c2 * c - z2 * z, z2 * c + c2 * z, c2 * c2 - z2 * z2, 2 * c2 * z2)):
-                lobe[j] += residual * shift * h
-                lobe_weight[j] += (shift * h) ** 2
     worst = 0.0
     for k in range(16):
         if count[k] > 0:
@@ -90,8 +78,6 @@ def judge_residuals(
         elif k >= 8 and not without_damage:
             worst = abs(A)  # no background at all on this side
     statistics[PIXELS], statistics[SQUARES], statistics[UNEVENNESS] = used, squares, worst / abs(A)
-    statistics[LOBES] = math.sqrt(np.sum((lobe / lobe_weight) ** 2))
-    statistics[LOBES_SIGMA] = 1 / math.sqrt(lobe_weight.min())
 
 
 @compiled
@@ -255,7 +241,7 @@ def judge_glow(
     """
     x0, y0, p, q, r = theta[model.X0], theta[model.Y0], theta[model.P], theta[model.Q], theta[model.R]
     B, A, s = theta[model.BACKGROUND], theta[model.CONTRAST], theta[model.BLUR]
-    begin = _EDGE_ENDS_BLURS * s
+    begin = EDGE_ENDS_BLURS * s
     total, count, saturated = np.zeros(2), np.zeros(2), 0.0
     for i in range(n):
         dx, dy = pixels[0, i] - x0, pixels[1, i] - y0
@@ -264,7 +250,7 @@ def judge_glow(
         d = rho * (rho - 1) / (math.sqrt((p * u + q * v) ** 2 + (q * u + r * v) ** 2) + 1e-12)
         if d < begin:
             continue
-        far = 1 if d > begin + _HALO_PX else 0
+        far = 1 if d > begin + HALO_PX else 0
         total[far] += pixels[2, i] - B
         count[far] += 1
         saturated += pixels[2, i] >= saturation

@@ -1,0 +1,162 @@
+"""Fit of blurred ellipses to what is not damaged of the targets of a photograph."""
+
+from __future__ import annotations
+
+import math
+from concurrent.futures import ThreadPoolExecutor
+
+import cv2
+import numpy as np
+
+from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
+from sfm.targets.edge_rays import RAYS
+from sfm.targets.fits import goodness
+from sfm.targets.fits.blurred_ellipse import BLUR, CONTRAST, UNKNOWNS, P, R
+from sfm.targets.fits.damage import MAD, MIN_POPULATION, common_shape, find_damage, gap_shifts
+from sfm.targets.fits.ellipse_fit import MIN_AGREEMENT, EllipseFits, fit_ellipses
+from sfm.targets.fits.outline_noise import OutlineNoise, judge_outlines, rise_to_first
+from sfm.targets.flags import Flag
+
+# Sound targets have no larger mean residual on an eighth of the edge, over the contrast, and at least this share
+# of the contrast that a tenth of the targets exceeds: compression makes faint blobs by hundreds.
+UNEVEN_EDGE, MIN_CONTRAST = 0.18, 0.2
+# Damage is sought so often; each fit shows more of it.
+ROUNDS = 3
+# So many blurs beside damage in the edge the intensities are changed, by up to 7 % of the step.
+SKIRT_BLURS = 1.5
+# Largest residual inside of whole targets, in robust sigmas, and in robust sigmas of its logarithm over them.
+MAX_INSIDE, MAX_INSIDE_SIGMAS = 8.0, 5.0
+# Where an edge is more curved than this the model of its blur is not exact, and shape is no damage.
+MIN_CURVATURE_BLURS = 2.0
+# Smaller targets have too few pixels to tell damage from another shape.
+MIN_RADIUS_PX = 4.0
+# Fewer targets than this are not worth a thread.
+TARGETS_PER_THREAD = 100
+
+
+def fit_undamaged(
+    image: AnyArray, start: FloatArray, sign: IntArray, noise: float, saturation: float, least_variance: float
+) -> tuple[EllipseFits, FloatArray, OutlineNoise]:
+    """Fit ellipses to what is not damaged of their edges and inside them.
+
+    Args:
+        image: intensities, shape (H, W).
+        start: x0, y0, p, q, r, shape (k, 5).
+        sign: +1 bright, -1 dark target, shape (k,).
+        noise: approximate standard deviation of the intensities.
+        saturation: intensities from here on are censored.
+        least_variance: that of rounding the intensities.
+
+    Returns:
+        The fits, flagged DAMAGED where something was left out and UNEVEN_EDGE where too little of the edge
+        agrees with one ellipse; the variances of the intensities, shape (k,); the noise of the outlines.
+    """
+    k = len(start)
+    keep, depth = np.ones((k, RAYS), bool), np.full(k, np.inf)
+    fits = _fit_in_threads(image, start, sign, noise, saturation, keep, depth)
+    judged = _least_curvature(fits.theta) > MIN_CURVATURE_BLURS * fits.theta[:, BLUR]
+    for _ in range(ROUNDS):
+        h, weight, common, sound = _deviations(fits, keep, noise**2 + least_variance, least_variance)
+        skirt = np.ceil(SKIRT_BLURS * fits.theta[:, BLUR] * RAYS / (2 * math.pi * _radii(fits.theta)))
+        damaged = find_damage(h, weight, sound, skirt)
+        deep = np.isinf(depth) & _stained(fits.statistics[:, goodness.INSIDE], sound)
+        damaged &= judged[:, None]
+        again = weight.any(axis=1) & ((damaged == keep).any(axis=1) | deep)
+        if not again.any():
+            break
+        keep[again] = ~damaged[again]
+        depth[again & deep] = (goodness.HALO_PX + goodness.EDGE_ENDS_BLURS * fits.theta[:, BLUR])[
+            again & deep
+        ]
+        begin = fits.theta[again, : R + 1]
+        repaired = _fit_in_threads(image, begin, sign[again], noise, saturation, keep[again], depth[again])
+        for whole, part in zip(fits, repaired, strict=True):
+            whole[again] = part
+    h, weight, common, sound = _deviations(fits, keep, noise**2 + least_variance, least_variance)
+    cut = ~keep.all(axis=1)
+    small = _radii(fits.theta) < MIN_RADIUS_PX
+    fits.flag[cut | np.isfinite(depth)] |= Flag.DAMAGED.value
+    fits.flag[(keep.mean(axis=1) < MIN_AGREEMENT) | (cut & small)] |= Flag.UNEVEN_EDGE.value
+    shift = gap_shifts(common, weight, keep)
+    p, q, r = fits.theta[:, P : R + 1].T
+    with np.errstate(divide="ignore", invalid="ignore"):
+        px = np.array([r * shift[:, 0] - q * shift[:, 1], p * shift[:, 1] - q * shift[:, 0]]) / (
+            p * r - q * q
+        )
+    fits.theta[cut, :2] -= px.T[cut]
+    softness = float(np.median((fits.theta[:, BLUR] / _radii(fits.theta))[sound])) if sound.any() else 0.0
+    variance = _variances(fits, least_variance)
+    rise = rise_to_first(h[sound], weight[sound], softness)
+    return fits, variance, judge_outlines(fits.shape, variance, sound, rise)
+
+
+def _variances(fits: EllipseFits, least: float) -> FloatArray:
+    """Return the variances of the intensities about the fits, shape (k,)."""
+    squares, pixels = fits.statistics[:, goodness.SQUARES], fits.statistics[:, goodness.PIXELS]
+    return np.asarray(np.maximum(squares / np.maximum(pixels - UNKNOWNS, 1), least))
+
+
+def _deviations(
+    fits: EllipseFits, keep: BoolArray, variance_of_noise: float, least_variance: float
+) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray]:
+    """Return deviations of outlines without the common shape, their weights, the common shape, sound targets.
+
+    Damage that was not left out makes the variance of a target larger; it counts up to the usual one.
+    """
+    fitted, contrast = np.isfinite(fits.cofactor[:, 0, 0]), np.abs(fits.theta[:, CONTRAST])
+    variance = _variances(fits, least_variance)
+    sound = fitted & keep.all(axis=1) & (fits.statistics[:, goodness.UNEVENNESS] < UNEVEN_EDGE)
+    if fitted.any():
+        sound &= contrast > MIN_CONTRAST * np.percentile(contrast[fitted], 90)
+    if sound.sum() >= MIN_POPULATION:
+        variance = np.minimum(variance, np.median(variance[sound] / contrast[sound] ** 2) * contrast**2)
+    variance = np.maximum(variance, variance_of_noise)
+    squares = fits.sectors[:, 1]
+    weight = np.where(fitted[:, None], squares / np.maximum(variance, 1e-12)[:, None], 0.0)
+    h = np.divide(fits.sectors[:, 0], squares, out=np.zeros_like(squares), where=weight > 0)
+    common = common_shape(h, weight, sound)
+    return h - common, weight, common, sound
+
+
+def _stained(inside: FloatArray, sound: BoolArray) -> BoolArray:
+    """Return which targets have larger residuals inside than those of the photograph, shape (k,)."""
+    limit = MAX_INSIDE
+    if sound.sum() >= MIN_POPULATION:
+        z = np.log(np.maximum(inside[sound], 1.0))
+        spread = MAD * np.median(np.abs(z - np.median(z)))
+        limit = max(limit, float(np.exp(np.median(z) + MAX_INSIDE_SIGMAS * spread)))
+    return inside > limit
+
+
+def _radii(theta: FloatArray) -> FloatArray:
+    """Return the mean radii of ellipses, px, shape (k,)."""
+    p, q, r = theta[:, P : R + 1].T
+    return np.asarray(np.maximum(np.abs(p * r - q * q), 1e-12) ** -0.5)
+
+
+def _least_curvature(theta: FloatArray) -> FloatArray:
+    """Return the least radius of curvature of ellipses, at the ends of their long axes, px, shape (k,)."""
+    p, q, r = theta[:, P : R + 1].T
+    mean, half = (p + r) / 2, np.hypot((p - r) / 2, q)
+    return np.asarray((mean - half) / np.maximum(mean + half, 1e-12) ** 2)
+
+
+def _fit_in_threads(
+    image: AnyArray,
+    start: FloatArray,
+    sign: IntArray,
+    noise: float,
+    saturation: float,
+    keep: BoolArray,
+    depth: FloatArray,
+) -> EllipseFits:
+    """Fit the ellipses in as many threads as OpenCV may use; the results do not depend on their number."""
+    parts = max(1, min(cv2.getNumThreads(), len(start) // TARGETS_PER_THREAD))
+    if parts == 1:
+        return fit_ellipses(image, start, sign, noise, saturation, keep, depth)
+    chunks = np.array_split(np.arange(len(start)), parts)
+    with ThreadPoolExecutor(parts) as pool:
+        fits = pool.map(
+            lambda c: fit_ellipses(image, start[c], sign[c], noise, saturation, keep[c], depth[c]), chunks
+        )
+        return EllipseFits(*(np.concatenate(part) for part in zip(*fits, strict=True)))
