@@ -22,8 +22,11 @@ WIDTHS = (1, 2, 4, 8)
 MIN_POPULATION = 8
 # Median over whole circles of the largest scan statistic, by simulation (tests/targets/test_damaged_dots.py).
 USUAL_SCAN = 2.18
-# A target scatters along its edge by at most so many times the usual; more is damage in many places.
+# A target scatters along its edge by at most so many times the usual, and the largest scan statistics do; more
+# is damage in many places or of many targets.
 MAX_LEVEL = 3.0
+# Where few others show what is shape, damage is in at most so many places; a scratch is in two.
+MAX_PLACES = 2
 # Rounds of the robust fit, and its tuning constant for 95 % efficiency (Huber and Ronchetti 2009, sec. 4.8).
 ROUNDS, BIWEIGHT = 10, 4.685
 MAD = 1.4826
@@ -61,7 +64,7 @@ def find_damage(h: FloatArray, weight: FloatArray, sound: BoolArray, skirt: Floa
         usual = np.median(level[sound])
         level = np.clip(level, usual, MAX_LEVEL * usual)
         largest = _scan(z, weight).max(axis=(1, 2)) / level
-        limit *= max(float(np.median(largest[sound])) / USUAL_SCAN, 1.0)
+        limit *= float(np.clip(np.median(largest[sound]) / USUAL_SCAN, 1.0, MAX_LEVEL))
     hit = np.zeros(z.shape, bool)
     for _ in range(RAYS):
         scans = _scan(z, np.where(hit, 0.0, weight)).reshape(len(z), len(WIDTHS) * RAYS)
@@ -70,6 +73,9 @@ def find_damage(h: FloatArray, weight: FloatArray, sound: BoolArray, skirt: Floa
             break
         width, first = np.divmod(scans[more].argmax(axis=1), RAYS)
         hit[more] |= (np.arange(RAYS) - first[:, None]) % RAYS < np.array(WIDTHS)[width][:, None]
+    if sound.sum() < MIN_POPULATION:
+        places = (hit & ~np.roll(hit, 1, axis=1) & ~np.roll(hit, 2, axis=1)).sum(axis=1)
+        hit[places > MAX_PLACES] = False
     damaged = hit.copy()
     for i in range(1, RAYS // 2):
         damaged |= (np.roll(hit, i, axis=1) | np.roll(hit, -i, axis=1)) & (i <= skirt[:, None])

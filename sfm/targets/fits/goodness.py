@@ -27,6 +27,8 @@ _BEHIND_PX, _GLARE = 2.5, 1.5
 EDGE_ENDS_BLURS, HALO_PX = 2.5, 2.0
 # Harmonics 3 to 6 of the outline, cosine and sine of each.
 SHAPES = 8
+# Standard deviation of rounding intensities.
+ROUNDING = 12**-0.5
 # Fewer pixels inside the edge than this do not show what is usual there.
 MIN_INSIDE = 20
 # Residuals of the edge are taken from this far in units of its blur, and at least so many px.
@@ -124,7 +126,7 @@ def sum_sectors(
         return 0.0
     sigma = 1.4826 * np.median(deep[:inside])
     deep[:inside].sort()
-    return float(deep[inside - 2] / max(sigma, noise))
+    return float(deep[inside - 2] / max(sigma, noise, ROUNDING))
 
 
 @compiled
