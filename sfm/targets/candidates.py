@@ -79,7 +79,10 @@ def judge_fits(
             ),
             (Flag.LOBED, fit.lobes > lobes),
             (Flag.THIN_BACKGROUND, (fit.strokes > STROKES) & (fit.lobes > lobes / 2)),
-            (Flag.POOR_FIT, fit.noise / contrast > POOR_FIT + noise / contrast),
+            (
+                Flag.POOR_FIT,
+                ((fit.flag & Flag.POOR_FIT) != 0) | (fit.noise / contrast > POOR_FIT + noise / contrast),
+            ),
         ]
     reason = np.zeros(len(fit.xy), dtype=np.int64)
     for flag, against in tests:

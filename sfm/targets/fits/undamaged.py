@@ -24,8 +24,11 @@ UNEVEN_EDGE, MIN_CONTRAST = 0.18, 0.2
 ROUNDS = 3
 # So many blurs beside damage in the edge the intensities are changed, by up to 7 % of the step.
 SKIRT_BLURS = 1.5
-# Largest residual inside of whole targets, in robust sigmas, and in robust sigmas of its logarithm over them.
-MAX_INSIDE, MAX_INSIDE_SIGMAS = 8.0, 5.0
+# Largest residual inside of whole targets, in robust sigmas of those there.
+MAX_INSIDE = 8.0
+# What is larger than usual by so many robust sigmas of the logarithms over the photograph is not like the others;
+# their scatter is this at least, that of variances of 200 pixels.
+POPULATION_SIGMAS, LEAST_SCATTER = 5.0, 0.1
 # Where an edge is more curved than this the model of its blur is not exact, and shape is no damage.
 MIN_CURVATURE_BLURS = 2.0
 # Smaller targets have too few pixels to tell damage from another shape.
@@ -59,7 +62,8 @@ def fit_undamaged(
         h, weight, common, sound = _deviations(fits, keep, noise**2 + least_variance, least_variance)
         skirt = np.ceil(SKIRT_BLURS * fits.theta[:, BLUR] * RAYS / (2 * math.pi * _radii(fits.theta)))
         damaged = find_damage(h, weight, sound, skirt)
-        deep = np.isinf(depth) & _stained(fits.statistics[:, goodness.INSIDE], sound)
+        inside = np.maximum(fits.statistics[:, goodness.INSIDE], 1.0)
+        deep = np.isinf(depth) & (inside > MAX_INSIDE) & _stands_out(inside, sound)
         damaged &= judged[:, None]
         again = weight.any(axis=1) & ((damaged == keep).any(axis=1) | deep)
         if not again.any():
@@ -77,6 +81,10 @@ def fit_undamaged(
     small = _radii(fits.theta) < MIN_RADIUS_PX
     fits.flag[cut | np.isfinite(depth)] |= Flag.DAMAGED.value
     fits.flag[(keep.mean(axis=1) < MIN_AGREEMENT) | (cut & small)] |= Flag.UNEVEN_EDGE.value
+    variance, contrast = _variances(fits, least_variance), np.abs(fits.theta[:, CONTRAST])
+    if sound.sum() >= MIN_POPULATION:
+        unlike = _stands_out(variance, sound) & _stands_out(variance / np.maximum(contrast, 1e-9) ** 2, sound)
+        fits.flag[unlike & weight.any(axis=1)] |= Flag.POOR_FIT.value
     shift = gap_shifts(common, weight, keep)
     p, q, r = fits.theta[:, P : R + 1].T
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -85,7 +93,6 @@ def fit_undamaged(
         )
     fits.theta[cut, :2] -= px.T[cut]
     softness = float(np.median((fits.theta[:, BLUR] / _radii(fits.theta))[sound])) if sound.any() else 0.0
-    variance = _variances(fits, least_variance)
     rise = rise_to_first(h[sound], weight[sound], softness)
     return fits, variance, judge_outlines(fits.shape, variance, sound, rise)
 
@@ -118,14 +125,13 @@ def _deviations(
     return h - common, weight, common, sound
 
 
-def _stained(inside: FloatArray, sound: BoolArray) -> BoolArray:
-    """Return which targets have larger residuals inside than those of the photograph, shape (k,)."""
-    limit = MAX_INSIDE
-    if sound.sum() >= MIN_POPULATION:
-        z = np.log(np.maximum(inside[sound], 1.0))
-        spread = MAD * np.median(np.abs(z - np.median(z)))
-        limit = max(limit, float(np.exp(np.median(z) + MAX_INSIDE_SIGMAS * spread)))
-    return inside > limit
+def _stands_out(value: FloatArray, sound: BoolArray) -> BoolArray:
+    """Return which positive values are larger than those of sound targets, by the scatter of logarithms, (k,)."""
+    if sound.sum() < MIN_POPULATION:
+        return np.ones(len(value), bool)
+    z = np.log(np.maximum(value, 1e-12))
+    z -= np.median(z[sound])
+    return np.asarray(z > POPULATION_SIGMAS * np.maximum(MAD * np.median(np.abs(z[sound])), LEAST_SCATTER))
 
 
 def _radii(theta: FloatArray) -> FloatArray:
