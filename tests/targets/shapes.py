@@ -294,14 +294,14 @@ def main() -> None:
         measured, damaged, radius = measure_class(name)
         groups = [("", ~damaged)] if not damaged.any() else [("", damaged), (", intact", ~damaged)]
         rows = [(name + part, of) for part, of in groups]
-        if "-v" in sys.argv or True:
-            rows += [(f"{name}, r {r:.0f}", groups[0][1] & (radius == r)) for r in np.unique(radius)]
+        rows += [(f"{name}, r {r:.0f}", groups[0][1] & (radius == r)) for r in np.unique(radius)]
         for title, of in rows:
             seen = np.isfinite(measured.error[of, 0])
             rms = np.sqrt(np.nanmean(measured.error[of] ** 2)) if seen.any() else math.nan
             print(
-                f"{title:26} {of.sum():5} {100 * seen.mean():6.1f}% {rms:8.4f} {over_stated(measured, of):11.2f}"
-                f" {100 * measured.flagged[of].mean():7.2f}% {100 * measured.far[of].mean():6.2f}%",
+                f"{title:26} {of.sum():5} {100 * seen.mean():6.1f}% {rms:8.4f}"
+                f" {over_stated(measured, of):11.2f} {100 * measured.flagged[of].mean():7.2f}%"
+                f" {100 * measured.far[of].mean():6.2f}%",
                 flush=True,
             )
 

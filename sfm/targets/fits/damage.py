@@ -1,9 +1,9 @@
-"""Damage of the outlines of targets, found against the shape that the targets of a photograph have in common.
+"""Damage of the outlines of targets, found against the shape that the targets of a photograph share.
 
-The edge of a target is divided into sectors. The deviation h of the outline in a sector, in radii, follows from
-the residuals of the blurred ellipse there. The median over the targets of a photograph is shape: polygonal
-printing or sharpening, which moves all of them alike. A place is damaged where the rest is significant against
-the scatter along the edge, of this target and of the others.
+The edge of a target is divided into sectors. The deviation h of the outline in a sector, in radii, follows
+from the residuals of the blurred ellipse there. The median over the targets of a photograph is shape:
+polygonal printing or sharpening, which moves all of them alike. A place is damaged where the rest is
+significant against the scatter along the edge, of this target and of the others.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ LEVEL = 0.01
 WIDTHS = (1, 2, 4, 8)
 # From so many sound targets on a photograph shows what they have in common.
 MIN_POPULATION = 8
-# Median over whole circles of the largest scan statistic, by simulation (tests/targets/test_damaged_dots.py).
+# Median over circles of the largest scan statistic, by simulation (tests/targets/test_outline_noise.py).
 USUAL_SCAN = 2.18
-# A target scatters along its edge by at most so many times the usual, and the largest scan statistics do; more
-# is damage in many places or of many targets.
+# Scatter along an edge, and the largest scan statistic, are excused up to so many times the usual; more is
+# damage in many places or of many targets.
 MAX_LEVEL = 3.0
 # Where few others show what is shape, damage is in at most so many places; a scratch is in two.
 MAX_PLACES = 2
@@ -44,7 +44,8 @@ _ELLIPSE = np.column_stack([np.ones(RAYS), harmonics(1, 2)])
 def find_damage(h: FloatArray, weight: FloatArray, sound: BoolArray, skirt: FloatArray) -> BoolArray:
     """Return which sectors of the edges are damaged.
 
-    The largest scan statistic is cut first and the rest tested again, so that no wide window around damage is.
+    The largest scan statistic is cut first and the rest is tested again: a wide window about damage is
+    significant, too, but not its other sectors.
 
     Args:
         h: deviations of the outlines from their ellipses and the common shape, radii, shape (k, RAYS).

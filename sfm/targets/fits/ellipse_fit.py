@@ -54,7 +54,8 @@ class EllipseFits(NamedTuple):
     """of each sector of the edge the sums of v J and of J^2, J the derivative of an intensity by the radius
     of the outline, in radii, shape (k, 2, RAYS)"""
     shape: FloatArray
-    """equations of the harmonics of the outline, see `goodness.shape_equations`, shape (k, SHAPES + 3, SHAPES)"""
+    """equations of the harmonics of the outline, see `goodness.shape_equations`,
+    shape (k, SHAPES + 3, SHAPES)"""
 
 
 @compiled

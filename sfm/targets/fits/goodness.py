@@ -83,6 +83,12 @@ def judge_residuals(
 
 
 @compiled
+def _edge_slope(A: float, s: float, d: float, px: float) -> float:
+    """Return the change of intensity by a radius of so many px: that of A Phi(-d / s), with d = .. - h px."""
+    return A / s * math.exp(-0.5 * (d / s) ** 2) / math.sqrt(2 * math.pi) * px
+
+
+@compiled
 def sum_sectors(
     pixels: FloatArray,
     n: int,
@@ -113,9 +119,7 @@ def sum_sectors(
             nw = math.sqrt((p * u + q * v) ** 2 + (q * u + r * v) ** 2) + 1e-12
             d = rho * (rho - 1) / nw
             if abs(d) < band:
-                # An outline at rho = 1 + h has d = rho (rho - 1 - h) / |w|, and I falls by A / s phi(d / s) dd.
-                slope = A / s * math.exp(-0.5 * (d / s) ** 2) / math.sqrt(2 * math.pi) * rho / nw
-                slope *= J[model.WEIGHT + i]
+                slope = J[model.WEIGHT + i] * _edge_slope(A, s, d, rho / nw)
                 k = int(math.atan2(v, u) * (RAYS / (2 * math.pi)) + RAYS) % RAYS
                 sectors[0, k] += J[model.RESIDUAL + i] * slope
                 sectors[1, k] += slope * slope
@@ -169,9 +173,7 @@ def shape_equations(
             d = rho * (rho - 1) / nw
             if abs(d) >= band:
                 continue
-            # An outline at rho = 1 + h has d = rho (rho - 1 - h) / |w|, and I falls by A / s phi(d / s) dd.
-            slope = A / s * math.exp(-0.5 * (d / s) ** 2) / math.sqrt(2 * math.pi) * rho / nw
-            slope *= J[model.WEIGHT + i]
+            slope = J[model.WEIGHT + i] * _edge_slope(A, s, d, rho / nw)
             c, z = u / rho, v / rho
             ck, zk = c * c - z * z, 2 * c * z
             for k in range(0, SHAPES, 2):

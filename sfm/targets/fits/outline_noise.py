@@ -18,7 +18,7 @@ from sfm.targets.edge_rays import RAYS
 from sfm.targets.fits.damage import LEVEL, MAD, MIN_POPULATION, harmonics
 from sfm.targets.fits.goodness import SHAPES
 
-# The spectrum of outlines is estimated from harmonics 3 to this one that blur damps to no less than this share.
+# The spectrum of outlines is that of harmonics 3 to this one, of which blur leaves this share at least.
 MAX_HARMONIC, LEAST_DAMPED = 12, 0.2
 # Its exponent is used where it is so many sigmas above 0, and up to this.
 EXPONENT_SIGMAS, MAX_EXPONENT = 2.0, 3.0
@@ -70,7 +70,7 @@ def judge_outlines(
 def moderate(ratio: FloatArray, sound: BoolArray, freedom: int) -> FloatArray:
     """Return ratios of variances with a common degree of freedom, drawn to those of the population, (k,).
 
-    What is too large for the population is not drawn to it. A few targets are drawn to 1 as if half were known.
+    What is too large for the population is not drawn to it. Few targets are drawn half way to 1.
 
     Source: Smyth, "Linear models and empirical Bayes methods for assessing differential expression" (2004);
     Phipson et al., "Robust hyperparameter estimation protects against hypervariable genes" (2016).
