@@ -34,15 +34,16 @@ def spikes(height: float, *at: int) -> FloatArray:
 
 
 def test_level_of_the_scan() -> None:
-    """0.01 / (2 x 4 widths x 32 sectors) is 3.95 sigmas; twice and half the level are 3.78 and 4.11."""
-    assert damaged_sectors(spikes(3.88, 5)) == []
-    assert damaged_sectors(spikes(4.03, 5)) == [5]
+    """0.01 / (2 x 3 widths x 32 sectors) is 3.88 sigmas; twice and half the level are 3.71 and 4.04."""
+    assert damaged_sectors(spikes(3.80, 5)) == []
+    assert damaged_sectors(spikes(3.97, 5)) == [5]
 
 
 def test_neighbours_are_tested_together() -> None:
-    eight = spikes(1.9, *range(3, 11))  # 3.8 sigmas in four sectors, 5.4 in eight
-    assert damaged_sectors(eight) == list(range(3, 11))
-    assert damaged_sectors(spikes(1.3, *range(3, 11))) == []
+    """The ellipse follows part of low damage: neither two nor four sectors alone are significant here."""
+    assert damaged_sectors(spikes(3.6, 3)) == []
+    assert damaged_sectors(spikes(3.6, 3, 4)) == [3, 4]
+    assert damaged_sectors(spikes(4.0, *range(3, 7))) == [3, 4, 5, 6]
 
 
 def test_the_edge_beside_damage_is_kept() -> None:

@@ -16,8 +16,8 @@ from sfm.targets.edge_rays import RAYS
 
 # Level of the tests of a photograph, divided by their number.
 LEVEL = 0.01
-# Numbers of neighbouring sectors that are tested together: 3 to 25 % of the edge.
-WIDTHS = (1, 2, 4, 8)
+# Numbers of neighbouring sectors that are tested together; an ellipse follows much of wider damage.
+WIDTHS = (1, 2, 4)
 # From so many sound targets on a photograph shows what they have in common.
 MIN_POPULATION = 8
 # Median over circles of the largest scan statistic, by simulation (tests/targets/test_outline_noise.py).

@@ -26,8 +26,8 @@ ROUNDS = 3
 SKIRT_BLURS = 1.5
 # Largest residual inside of whole targets, in robust sigmas of those there.
 MAX_INSIDE = 8.0
-# What is larger than usual by so many robust sigmas of the logarithms over the photograph is unlike the others.
-# Their scatter is this at least, that of variances of 200 pixels.
+# What is larger than usual by so many robust sigmas of the logarithms over the photograph is unlike
+# the others. Their scatter is this at least, that of variances of 200 pixels.
 POPULATION_SIGMAS, LEAST_SCATTER = 5.0, 0.1
 # Where an edge is more curved than this the model of its blur is not exact, and shape is no damage.
 MIN_CURVATURE_BLURS = 2.0
@@ -126,7 +126,7 @@ def _deviations(
 
 
 def _stands_out(value: FloatArray, sound: BoolArray) -> BoolArray:
-    """Return which positive values are larger than those of sound targets, by their logarithms, shape (k,)."""
+    """Return which positive values are larger than those of sound targets, by the logarithms, shape (k,)."""
     if sound.sum() < MIN_POPULATION:
         return np.ones(len(value), bool)
     z = np.log(np.maximum(value, 1e-12))
