@@ -12,7 +12,7 @@ from sfm.kernels.sampling import bilinear
 from sfm.targets.codes.ring_reading import UNCODED
 from sfm.targets.codes.rings import CodeFamily
 from sfm.targets.edge_rays import RAYS
-from sfm.targets.fits.undamaged import UNEVEN_EDGE
+from sfm.targets.fits.undamaged import STROKES, UNEVEN_EDGE
 from sfm.targets.flags import Flag
 from sfm.targets.measure import EllipseFit, axes_from_shape
 from sfm.targets.outlines import MIN_AXIS_RATIO, MIN_STEP, STEP_SIGMAS
@@ -20,8 +20,8 @@ from sfm.targets.outlines import MIN_AXIS_RATIO, MIN_STEP, STEP_SIGMAS
 # Largest RMS of the residuals over the contrast.
 POOR_FIT = 0.12
 # Largest lobes of an outline, in radii, for noise so many sigma of a component more (four of them are seen);
-# only half of it where the background is a thin stroke on more than this share of the circumference.
-LOBES, LOBES_SIGMAS, STROKES = 0.02, 5.0, 0.5
+# only half of it where the background is a thin stroke.
+LOBES, LOBES_SIGMAS = 0.02, 5.0
 # Centres nearer than this share of the smaller radius belong to concentric targets.
 CONCENTRIC = 0.5
 # Centres of a ring are as near as this share of the radius, by the perspective, and so many sigmas.

@@ -20,6 +20,8 @@ from sfm.targets.flags import Flag
 # Sound targets have no larger mean residual on an eighth of the edge, over the contrast, and at least this
 # share of the contrast that a tenth of the targets exceeds: compression makes faint blobs by hundreds.
 UNEVEN_EDGE, MIN_CONTRAST = 0.18, 0.2
+# Nor is their background a thin stroke, as in letters, on more than this share of the circumference.
+STROKES = 0.5
 # Damage is sought so often; each fit shows more of it.
 ROUNDS = 3
 # So many blurs beside damage in the edge the intensities are changed, by up to 7 % of the step.
@@ -84,7 +86,7 @@ def fit_undamaged(
     variance, contrast = _variances(fits, least_variance), np.abs(fits.theta[:, CONTRAST])
     if sound.sum() >= MIN_POPULATION:
         unlike = _stands_out(variance, sound) & _stands_out(variance / np.maximum(contrast, 1e-9) ** 2, sound)
-        fits.flag[unlike & weight.any(axis=1)] |= Flag.POOR_FIT.value
+        fits.flag[unlike & judged & weight.any(axis=1)] |= Flag.POOR_FIT.value
     shift = gap_shifts(common, weight, keep)
     p, q, r = fits.theta[:, P : R + 1].T
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -113,6 +115,7 @@ def _deviations(
     fitted, contrast = np.isfinite(fits.cofactor[:, 0, 0]), np.abs(fits.theta[:, CONTRAST])
     variance = _variances(fits, least_variance)
     sound = fitted & keep.all(axis=1) & (fits.statistics[:, goodness.UNEVENNESS] < UNEVEN_EDGE)
+    sound &= fits.statistics[:, goodness.STROKES] <= STROKES
     if fitted.any():
         sound &= contrast > MIN_CONTRAST * np.percentile(contrast[fitted], 90)
     if sound.sum() >= MIN_POPULATION:
