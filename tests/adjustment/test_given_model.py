@@ -15,7 +15,7 @@ from sfm.adjustment.quality import given_points, given_values
 from sfm.adjustment.quality.given_points import GivenPoints, judge_points, scale_model, scale_of_length
 from sfm.adjustment.quality.given_values import GivenModel, Judgement, judge_values
 from sfm.conventions import FloatArray, rotation_from_vector
-from sfm.similarity import Similarity
+from sfm.similarity import Similarity, fit_similarity
 from tests.synthetic import seed_of
 
 FRAME = Similarity(0.4, rotation_from_vector(np.array([0.3, -0.2, 1.1])), np.array([5.0, -2.0, 1.0]))
@@ -24,9 +24,8 @@ FRAME = Similarity(0.4, rotation_from_vector(np.array([0.3, -0.2, 1.1])), np.arr
 def test_thresholds_are_those_stated() -> None:
     """Limits of effort and of rounding; the others decide tests in this folder."""
     assert given_values.MAX_SETS == 2000 and given_points.MAX_TRIPLES == 300
-    assert given_points.RELINEARISED == 3
+    assert given_points.MAX_STEPS == 50
     assert given_values.RANK == 1e-9  # of double precision 2e-16, whose root is 1.5e-8
-    assert given_values.MAX_FACTOR == 30.0
     assert given_values.FACTORS[[0, -1]].tolist() == [1.0, 1e6] and len(given_values.FACTORS) == 241
 
 
@@ -204,16 +203,50 @@ def test_the_score_of_wrong_values() -> None:
     cost = np.log(5)
     found = given_values._wrong_values(one, 0.001, cost)
     assert found is not None
-    out, score, rivals = found
-    assert out == (1, 3) and rivals == ()
+    assert found.values == (1, 3) and found.rivals == ()
     T = one.kept().chi2
-    assert score == pytest.approx(one.kept((1, 3)).chi2 - T + 2 * cost + 2 * np.log(10), rel=1e-9)
+    assert found.score == pytest.approx(one.kept((1, 3)).chi2 - T + 2 * cost + 2 * np.log(10), rel=1e-9)
     assert one.kept((1, 3)).chi2 == pytest.approx(2 / 3)
     assert given_values._wrong_values(bars(0.0, 300.0), 0.001, cost) is None
     assert given_values._wrong_values(bars(0.0, 0.0, 300.0, 300.0), 0.001, cost) is None
     # either of two of three heals: 8 less than the margin apart
     found = given_values._wrong_values(bars(-2.2, 0.0, 4.6), 0.02, np.log(3))
-    assert found is not None and (found[0], found[2]) == ((2,), (0,))
+    assert found is not None and (found.values, found.rivals) == ((2,), (0,))
+
+
+def test_the_best_sets_of_wrong_values_of_each_size() -> None:
+    """Up to half, where those left check one another: of four bars two, of three one, of two none."""
+    one = bars(0.0, 20.0, 1.0, -15.0)
+    cost = np.log(4)
+    found = given_values._sets(one, cost)
+    assert [len(some.values) for some in found] == [1, 2] and found[1].values == (1, 3)
+    F = one.kept().chi2 - 0.5
+    assert found[1].score == pytest.approx(2 * (1 + np.log(F / 2)) - F + cost + 2 * np.log(6))
+    assert [some.values for some in given_values._sets(bars(0.0, 9.0, 1.0), cost)] == [(1,)]
+    assert given_values._sets(bars(0.0, 9.0), cost) == ()
+    assert given_values._sets(bars(0.0, 50.0, 0.0, -20.0, 90.0), cost)[-1].values == (1, 3, 4)
+    many = bars(*(30 * seed_of("many sets").normal(size=20)))
+    assert [len(some.values) for some in given_values._sets(many, cost)] == list(range(1, 11))
+
+
+def test_a_factor_must_beat_wrong_values_by_the_margin(monkeypatch: pytest.MonkeyPatch) -> None:
+    one = bars(*(5 * seed_of("factor or wrong").normal(size=30)))
+    factor, gain = one.factor()
+    ahead = min(some.score for some in given_values._sets(one, np.log(30))) - (np.log(30) - gain)
+    assert ahead > 2 * np.log(100) == pytest.approx(given_values.APART)
+    monkeypatch.setattr(given_values, "APART", 0.99 * ahead)
+    assert judge_values(one, 0.001).factor == factor
+    monkeypatch.setattr(given_values, "APART", 1.01 * ahead)
+    assert judge_values(one, 0.001).doubtful == tuple(range(30))
+
+
+def test_what_is_left_out_by_itself() -> None:
+    one = bars(0.0, 9.0, 10.0, 1.0, -1.0)
+    cost = np.log(5)
+    # the two check each other: chi-square 1 / 2, three others are wrong then
+    by_hand = 0.5 - one.kept().chi2 + 3 * cost + 2 * np.log(10)
+    assert given_values._score_of_others(one, (1, 2), cost) == pytest.approx(by_hand)
+    assert given_values._score_of_others(one, (1,), cost) == np.inf
 
 
 def test_suspects_are_those_without_which_the_others_fit() -> None:
@@ -342,17 +375,35 @@ def test_the_start_is_the_similarity_that_most_agree_upon(monkeypatch: pytest.Mo
     one = exact(7, "start")
     given = one.given.copy()
     given[[1, 5]] += ((3.0, 0, 1), (0, 4.0, 0))
+    spoiled = replace(one, given=given)
     for most in (given_points.MAX_TRIPLES, 34):  # all 35, or as many at random
         monkeypatch.setattr(given_points, "MAX_TRIPLES", most)
-        found = given_points._start(replace(one, given=given), None)
-        assert found is not None and found.scale == pytest.approx(2.5)
+        of_all, found = given_points._starts(spoiled, None)
+        assert np.linalg.norm(of_all.apply(one.free) - given, axis=1).min() > 0.1
+        assert found.scale == pytest.approx(2.5)
         np.testing.assert_allclose(found.apply(one.free)[[0, 2, 3]], one.given[[0, 2, 3]], atol=1e-9)
     three = one.select(np.arange(3))
-    found = given_points._start(three, FRAME)
-    assert found is not None and found.scale == pytest.approx(2.5)
-    assert given_points._start(one.select(np.arange(2)), FRAME) is FRAME
+    assert [one.scale for one in given_points._starts(three, FRAME)] == pytest.approx([2.5])
+    assert list(given_points._starts(one.select(np.arange(2)), FRAME)) == [FRAME]
+    assert list(given_points._starts(one.select(np.arange(2)), None)) == []
     line = replace(three, free=np.outer(np.arange(3), np.ones(3)), given=np.outer(np.arange(3), np.ones(3)))
-    assert given_points._start(line, FRAME) is FRAME
+    assert list(given_points._starts(line, FRAME)) == [FRAME]
+
+
+@pytest.mark.parametrize(("n", "h"), [(4, 4), (5, 4), (6, 5), (7, 5), (8, 6)])
+def test_the_start_minimises_the_distance_of_more_than_half(n: int, h: int) -> None:
+    """Three points that are met exactly do not count among half of them."""
+    assert h == n // 2 + (3 + 1) // 2
+    one = exact(n, f"quantile {n}")
+    one = replace(one, given=one.given + 0.05 * seed_of(f"quantile {n}").normal(size=(n, 3)))
+    found = list(given_points._starts(one, None))[-1]
+
+    def distance(by: Similarity) -> float:
+        return float(np.sort(np.linalg.norm(by.apply(one.free) - one.given, axis=1))[h - 1])
+
+    triples = [list(some) for some in combinations(range(n), 3)]
+    every = [distance(fit_similarity(one.free[some], one.given[some])) for some in triples]
+    assert distance(found) == pytest.approx(min(every))
 
 
 def test_centre_and_size() -> None:

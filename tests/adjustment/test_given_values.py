@@ -155,11 +155,44 @@ def test_standard_deviations_that_are_too_small_are_named(factor: float) -> None
     assert fixed is not None and fixed.judgement.factor == pytest.approx(factor * SIGMA, rel=0.3)
 
 
-def test_bars_a_few_times_worse_than_stated_are_no_mistake() -> None:
-    """Two against two differ by 28 or by 70 standard deviations, for which factors of 20 and 50 would do."""
-    found = judge_values(bars(0.0, 0.0, 28 * SIGMA, 28 * SIGMA), LEVEL)
-    assert found.doubtful == () and found.factor == pytest.approx(16, rel=0.05)
-    assert judge_values(bars(0.0, 0.0, 70 * SIGMA, 70 * SIGMA), LEVEL).doubtful == (0, 1, 2, 3)
+@pytest.mark.parametrize(
+    "errors", [(28, 28, 0, 0), (20, 0, -15, 1), (1000, -300, 0, 0), (400, -90, 30, 0, 0)]
+)
+def test_half_of_the_bars_wrong_are_no_imprecise_bars(errors: tuple[float, ...]) -> None:
+    """Standard deviations 16 to 500 times too small would do, but so would two right bars."""
+    found = judge_values(bars(*(SIGMA * np.array(errors))), LEVEL)
+    assert found.factor == 1.0 and found.doubtful == tuple(range(len(errors)))
+
+
+def test_twenty_bars_five_times_worse_than_stated_are_imprecise() -> None:
+    found = judge_values(bars(*(5 * SIGMA * seed_of("twenty bars").standard_normal(20))), LEVEL)
+    assert found.factor == pytest.approx(5, rel=0.4) and not found.doubtful
+
+
+@pytest.mark.parametrize(("wrong", "told"), [(2, True), (3, False), (4, False), (5, True)])
+def test_a_part_of_seven_points_is_right_where_it_is_clearly_the_larger(wrong: int, told: bool) -> None:
+    """Some were shifted together; chi-square of three against four differs by less than the margin."""
+    for k in range(5):
+        one = points(7, f"parts {wrong} {k}")
+        given = one.given.copy()
+        given[:wrong, 2] += 40 * SIGMA
+        found = judge_points(replace(one, given=given), LEVEL)
+        assert found is not None
+        smaller = tuple(range(wrong)) if wrong < 4 else tuple(range(wrong, 7))
+        assert found.judgement.wrong == (smaller if told else ())
+        assert found.judgement.doubtful == (() if told else tuple(range(7)))
+
+
+def test_right_points_near_a_line_and_one_off_it_fit() -> None:
+    """Threes on the line turn about it: what most agree upon by them is not what all fit."""
+    for seed in range(60):
+        rng = np.random.default_rng([6, 30, seed, 7])
+        X = rng.uniform(-0.5, 0.5, (6, 3)) * (10, 0.02, 0.02)
+        X[0] += [0, 1.0, 0.3]
+        free = X + 2e-4 * rng.standard_normal(X.shape)
+        given, stated = X + 3e-3 * rng.standard_normal(X.shape), np.tile(9e-6 * np.eye(3), (6, 1, 1))
+        found = judge_points(GivenPoints(given, stated, free, 4e-8 * np.eye(18), 500), LEVEL)
+        assert found is not None and found.judgement.fits, seed
 
 
 def test_a_wrong_point_without_stated_standard_deviations_is_identified() -> None:

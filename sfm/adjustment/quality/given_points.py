@@ -8,6 +8,7 @@ Source: Mikhail (1976), Observations and Least Squares, ch. 8; Rousseeuw (1984),
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import combinations
 from math import comb
@@ -22,7 +23,7 @@ from sfm.similarity import Similarity, fit_similarity, similarity_motions
 MAX_TRIPLES = (
     300  # similarities by three points that are tried: with half of them right, 37 are by three such
 )
-RELINEARISED = 3
+MAX_STEPS = 50  # of a similarity to the best one; far from convergence it is none
 MAX_DECIMALS = 8  # of coordinates; more are those of computed ones
 SAME_DECIMAL = 1e-6  # by which a number in its last place may differ from a whole one, by its binary rounding
 ROUNDING = 16 * np.finfo(float).eps  # of coordinates after a similarity, over the largest of them
@@ -187,57 +188,103 @@ def judge_points(
 def _placed(
     points: GivenPoints, level: float, start: Similarity | None, estimated: bool
 ) -> PlacedPoints | None:
-    """Judge points at the similarity that most of them agree upon."""
-    placing = _start(points, start)
-    if placing is None:
-        return None
+    """Judge points at the similarity of all, and where they do not fit, at that which most agree upon."""
     given = points.given.ravel()[np.flatnonzero(points.known.ravel())]
-    judgement = None
-    for _ in range(RELINEARISED):
-        model = points.model(placing, estimated=estimated)
-        judgement = judge_values(model, level, given)
-        out = judgement.wrong or judgement.exchanged or ()
-        placing = points.moved(placing, model, out)
-        if not np.isfinite(placing.translation).all():
+    best: PlacedPoints | None = None
+    for k, placing in enumerate(_starts(points, start)):
+        # at what most agree upon, the others are left out before they move it
+        at_start = judge_values(points.model(placing, estimated=estimated), level, given) if k else None
+        found = _judged(points, placing, _left_out(at_start), level, estimated)
+        if found is not None and found.judgement.fits:
+            return found
+        if found is not None and (best is None or found.judgement.misfit < best.judgement.misfit):
+            best = found
+    return best
+
+
+def _left_out(judgement: Judgement | None) -> tuple[int, ...]:
+    """Return the points that do not take part in the similarity."""
+    return () if judgement is None else judgement.wrong or judgement.exchanged or ()
+
+
+def _judged(
+    points: GivenPoints, placing: Similarity, out: tuple[int, ...], level: float, estimated: bool
+) -> PlacedPoints | None:
+    """Judge points at the similarity that fits them best, until it is without those that are wrong."""
+    given = points.given.ravel()[np.flatnonzero(points.known.ravel())]
+    tried: set[tuple[int, ...]] = set()
+    while True:
+        tried.add(out)
+        converged = _converged(points, placing, out, estimated)
+        if converged is None:
             return None
-    assert judgement is not None
+        placing, model = converged
+        judgement = judge_values(model, level, given)
+        out = _left_out(judgement)
+        if out in tried:
+            return PlacedPoints(judgement, placing, model)
+
+
+def _converged(
+    points: GivenPoints, placing: Similarity, without: tuple[int, ...], estimated: bool
+) -> tuple[Similarity, GivenModel] | None:
+    """Return the similarity that fits points best, some left out, and the model at it; None if none does.
+
+    A step that changes no coordinate beyond their linear dependence or their rounding is the last one.
+    """
     model = points.model(placing, estimated=estimated)
-    return PlacedPoints(judge_values(model, level, given), placing, model)
+    for _ in range(MAX_STEPS):
+        moved = points.moved(placing, model, without)
+        X, Y = placing.apply(points.free), moved.apply(points.free)
+        if not np.isfinite(Y).all():
+            return None
+        placing, model = moved, points.model(moved, estimated=estimated)
+        if np.abs(Y - X).max() <= RANK * _centre_and_size(Y)[1] + ROUNDING * np.abs(Y).max():
+            return placing, model
+    return None
 
 
-def _start(points: GivenPoints, start: Similarity | None) -> Similarity | None:
-    """Return the similarity by three points of the smallest median distance, else by all, else as given.
+def _starts(points: GivenPoints, start: Similarity | None) -> Iterator[Similarity]:
+    """Yield the similarity by all points, then that by three of them which most agree upon; else as given.
 
-    Source: Rousseeuw (1984), J. Am. Stat. Assoc. 79(388), least median of squares.
+    Of the triples, that with the smallest h-th distance, h = [n / 2] + [(p + 1) / 2] where p = 3 points are
+    met exactly.
+
+    Source: Rousseeuw (1984), J. Am. Stat. Assoc. 79(388), least median of squares, remark 1 of theorem 2.
     """
     at = points.complete
-    if len(at) < 3:
-        return start
     X, given = points.free[at], points.given[at]
     try:
-        best = fit_similarity(X, given)
+        every = None if len(at) < 3 else fit_similarity(X, given)
     except GeometryError:
-        return start
-    if len(at) == 3:
-        return best
-    least = float(np.median(np.linalg.norm(best.apply(X) - given, axis=1)))
-    every = comb(len(at), 3) <= MAX_TRIPLES
-    rng = np.random.default_rng(len(at))
-    triples = (
-        combinations(range(len(at)), 3)
-        if every
-        else (rng.choice(len(at), 3, replace=False) for _ in range(MAX_TRIPLES))
-    )
-    for some in triples:
-        own = list(some)
-        try:
-            one = fit_similarity(X[own], given[own])
-        except GeometryError:
-            continue
-        median = float(np.median(np.linalg.norm(one.apply(X) - given, axis=1)))
-        if median < least:
-            best, least = one, median
-    return best
+        every = None
+    if every is None:
+        if start is not None:
+            yield start
+        return
+    yield every
+    best, least, h = None, np.inf, len(at) // 2 + 2
+    if len(at) > 3:
+        for some in _triples(len(at)):
+            try:
+                one = fit_similarity(X[some], given[some])
+            except GeometryError:
+                continue
+            distance = float(np.partition(np.linalg.norm(one.apply(X) - given, axis=1), h - 1)[h - 1])
+            if distance < least:
+                best, least = one, distance
+    if best is not None:
+        yield best
+
+
+def _triples(n: int) -> Iterator[list[int]]:
+    """Yield all threes of n points, or MAX_TRIPLES random ones where these are too many."""
+    if comb(n, 3) <= MAX_TRIPLES:
+        yield from map(list, combinations(range(n), 3))
+        return
+    rng = np.random.default_rng(n)
+    for _ in range(MAX_TRIPLES):
+        yield rng.choice(n, 3, replace=False).tolist()
 
 
 @dataclass(frozen=True)

@@ -27,10 +27,10 @@ from sfm.distributions import f_sf
 LEVEL = 0.001  # probability with which a test of a survey rejects right given values; Baarda (1968)
 MARGIN = 2 * np.log(1 / LEVEL)  # by which an explanation must beat others to be told apart from them
 NONCENTRALITY = 4.13  # of an error that a test at LEVEL finds with 80 %; Baarda (1968)
+APART = 2 * log(100)  # by which a factor must beat wrong values: the likelihood ratio of two alternatives
 RANK = 1e-9  # eigenvalue over the largest below which a direction does not exist
 CHECKED = RANK**0.5  # redundancy number below which nothing checks a direction
 MAX_SETS = 2000  # sets of wrong values that are tried; with more, those that differ in one value
-MAX_FACTOR = 30.0  # on stated standard deviations: one that is larger is a mistake, not a misjudgement
 FACTORS = np.geomspace(1.0, 1e6, 241)  # on standard deviations
 
 
@@ -168,6 +168,17 @@ class GivenModel:
             out = out.without(one)
         return out
 
+    def part(self, kept: BoolArray) -> GivenModel:
+        """Return the model of some of the differences."""
+        return replace(
+            self,
+            v=self.v[kept],
+            network=self.network[np.ix_(kept, kept)],
+            stated=self.stated[np.ix_(kept, kept)],
+            A=self.A[kept],
+            item=self.item[kept],
+        )
+
     def external(self, some: tuple[int, ...] = ()) -> FloatArray:
         """Return the external reliability of each given value, infinite where nothing checks it, (items,).
 
@@ -178,15 +189,7 @@ class GivenModel:
             some: values that are left out.
         """
         out = np.full(self.items, np.nan)
-        kept = ~np.isin(self.item, some)
-        part = replace(
-            self,
-            v=self.v[kept],
-            network=self.network[np.ix_(kept, kept)],
-            stated=self.stated[np.ix_(kept, kept)],
-            A=self.A[kept],
-            item=self.item[kept],
-        )
+        part = self.part(~np.isin(self.item, some))
         S, N = part.network + part.stated, part._left
         M, P = part.precision, np.linalg.pinv(S, rcond=RANK, hermitian=True)
         if self.estimated or not self.stated.any():  # only the geometry is known
@@ -239,11 +242,17 @@ class Judgement:
     exchanged: tuple[int, int] | None = None  # two of them whose names are exchanged
     factor: float = 1.0  # on all standard deviations, with which all fit; of fixed values their sigma
     doubtful: tuple[int, ...] = ()  # given values of which nothing shows which are wrong
+    score: float = 0.0  # of what is wrong: change of -2 ln likelihood, and its cost
 
     @property
     def fits(self) -> bool:
         """Whether nothing is wrong."""
         return not (self.wrong or self.exchanged or self.doubtful or self.factor != 1.0)
+
+    @property
+    def misfit(self) -> float:
+        """Chi-square with what is wrong, and its cost."""
+        return self.statistic + self.score
 
 
 @dataclass(frozen=True)
@@ -269,41 +278,81 @@ def judge_values(model: GivenModel, level: float, exchange: FloatArray | None = 
     found = Judgement(every.chi2, every.dof, p)
     if every.dof < 1 or p >= level:
         return found
-    cost = np.log(max(len(model.v), 2))
+    cost = float(np.log(max(len(model.v), 2)))
     removed = _wrong_values(model, level, cost)
     swapped = None if exchange is None else _exchanged(model, exchange, level)
-    factor, gain = model.factor()
-    # one wrong value of so few would look like standard deviations that are too small
-    told_apart = bool((every.decreases()[1] < every.dof).all())
-    if model.estimated or not told_apart or (model.stated.any() and factor > MAX_FACTOR):
-        gain = 0.0
+    factor, gain = (1.0, 0.0) if model.estimated else model.factor()
     scores = {
-        "wrong": np.inf if removed is None else removed[1],
+        "wrong": np.inf if removed is None else removed.score,
         "exchanged": np.inf if swapped is None else swapped[1],
         "factor": np.inf if gain <= 0 else cost - gain,
     }
     best = min(scores, key=lambda one: scores[one])
     if scores[best] >= 0 or not np.isfinite(scores[best]):
         return replace(found, doubtful=_suspects(model, level))
+    found = replace(found, score=float(scores[best]))
     if best == "exchanged" and swapped is not None:
         return replace(found, exchanged=swapped[0])
     if best == "factor":
-        return replace(found, factor=factor)
+        sets = _sets(model, cost)
+        # one wrong value of so few would look like standard deviations that are too small
+        if sets and scores[best] + APART < min(one.score for one in sets):
+            return replace(found, factor=factor)
+        return replace(found, doubtful=tuple(range(model.items)))
     assert removed is not None
-    wrong, _, rivals = removed
-    if rivals:
-        return replace(found, doubtful=tuple(sorted({*wrong, *rivals})))
-    return replace(found, wrong=wrong)
+    if removed.rivals:
+        return replace(found, doubtful=tuple(sorted({*removed.values, *removed.rivals})))
+    return replace(found, wrong=removed.values)
 
 
-def _wrong_values(
-    model: GivenModel, level: float, cost: float
-) -> tuple[tuple[int, ...], float, tuple[int, ...]] | None:
-    """Return the fewest values without which the others fit, their score, and others that do as well.
+@dataclass(frozen=True)
+class WrongValues:
+    """A set of given values that may be wrong."""
 
-    The others must be more, and must confirm one another.
+    values: tuple[int, ...]
+    score: float  # change of -2 ln likelihood without them, and their cost
+    rivals: tuple[int, ...] = ()  # other values that may be wrong in place of some of them
+
+
+def _sets(model: GivenModel, cost: float) -> tuple[WrongValues, ...]:
+    """Return the best set of wrong values of each size up to half, where the others check one another.
+
+    As a factor makes all values scatter more than stated, so do the wrong ones: chi-square F of q differences
+    costs q (1 + ln F / q), and the choice.
     """
-    every = kept = model.kept()
+    every = model.kept()
+    out: tuple[int, ...] = ()
+    found: list[WrongValues] = []
+    for k in range(1, (model.items + 1) // 2 + 1):
+        fall, rank = model.kept(out).decreases()
+        gain = np.where(np.isin(np.arange(model.items), out), -np.inf, fall - cost * rank)
+        out = tuple(sorted((*out, int(np.argmax(gain)))))
+        if comb(model.items, k) <= MAX_SETS:
+            misfit = dict(_misfits_like(model, out))
+            out = min(misfit, key=lambda some: misfit[some], default=out)
+        kept = model.kept(out)
+        if kept.dof < 1:
+            break
+        q, F = every.dof - kept.dof, every.chi2 - kept.chi2
+        scatter = cost + q * (1 + log(max(F / q, 1.0)))
+        found.append(WrongValues(out, scatter - F + 2 * log(comb(model.items, k))))
+    return tuple(found)
+
+
+def _score(model: GivenModel, out: tuple[int, ...], cost: float) -> float:
+    """Return the change of -2 ln likelihood without values, and the cost of their errors and choice."""
+    every, kept = model.kept(), model.kept(out)
+    of_errors = cost * (every.dof - kept.dof)
+    return float(kept.chi2 - every.chi2 + of_errors + 2 * log(comb(model.items, len(out))))
+
+
+def _wrong_values(model: GivenModel, level: float, cost: float) -> WrongValues | None:
+    """Return the fewest values without which the others fit; None without such.
+
+    The others must be more, and must confirm one another. Rivals are other sets of as many, and those others
+    themselves: where the larger part is not more likely by the margin, nothing shows which part is wrong.
+    """
+    kept = model.kept()
     out: tuple[int, ...] = ()
     while out == () or kept.probability() < level:
         if 2 * (len(out) + 1) >= model.items:
@@ -317,10 +366,20 @@ def _wrong_values(
             return None
     misfit = dict(_misfits_like(model, out))
     out = min(misfit, key=lambda some: misfit[some])
-    like = {one for some, chi2 in misfit.items() if chi2 < misfit[out] + MARGIN for one in some} - set(out)
-    parameters = every.dof - model.kept(out).dof
-    score = misfit[out] - every.chi2 + cost * parameters + 2 * log(comb(model.items, len(out)))
-    return out, float(score), tuple(sorted(like))
+    like = {one for some, chi2 in misfit.items() if chi2 < misfit[out] + MARGIN for one in some}
+    found = WrongValues(out, _score(model, out, cost))
+    if _score_of_others(model, out, cost) < found.score + MARGIN:
+        like = set(range(model.items))
+    return replace(found, rivals=tuple(sorted(like - set(out))))
+
+
+def _score_of_others(model: GivenModel, some: tuple[int, ...], cost: float) -> float:
+    """Return the score of all but some values as wrong ones, infinite where those some check nothing."""
+    every, part = model.kept(), model.part(np.isin(model.item, some)).kept()
+    if part.dof < 1:
+        return np.inf
+    choice = 2 * log(comb(model.items, len(some)))
+    return part.chi2 - every.chi2 + cost * (every.dof - part.dof) + choice
 
 
 def _misfits_like(model: GivenModel, out: tuple[int, ...]) -> Iterator[tuple[tuple[int, ...], float]]:
