@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from sfm.network import ScaleBars
 from sfm.pipeline import run_survey
 from sfm.remarks.remark import kinds_of
 from sfm.survey.hypotheses import given
@@ -34,6 +37,63 @@ def test_a_print_may_be_half_a_percent_larger_than_stated(off: float, contradict
     bar = ScaleBar("9", "20", float(np.linalg.norm(truth.points[8] - truth.points[19])), 1e-4)
     result = run_survey(survey_of(network, truth, control=control, scale_bars=(bar,), datum={"kind": "free"}))
     assert ("scale_contradicted" in kinds_of(remarks_on_given(result))) == contradicted
+
+
+def test_nothing_checks_a_value_whose_redundancy_number_is_below_a_hundredth() -> None:
+    assert given.CHECKABLE == 0.01 and given.WEAK == 5.0
+    assert pytest.approx(4.13 * np.sqrt(99)) == given.UNCHECKED
+
+
+@pytest.mark.parametrize(
+    ("weaker", "kinds"),
+    [(5.0, {"given_weakly_checked"}), (9.0, {"given_weakly_checked"}), (11.0, {"given_unchecked"})],
+)
+def test_each_weakly_checked_value_has_its_number(weaker: float, kinds: set[str]) -> None:
+    """Of two bars the redundancy number of the better is 1 / (1 + q^2), where q is their ratio."""
+    network, truth = make_network(seed_of("weak bars"), images=8, points=30)
+    network = observed_anew(network, truth, 0.0, seed_of("weak bars"))
+    bars = []
+    for i, j, sigma in ((8, 19, 1e-4), (3, 12, weaker * 1e-4)):
+        length = float(np.linalg.norm(truth.points[i] - truth.points[j]))
+        bars.append(ScaleBar(str(i + 1), str(j + 1), length, sigma * length))
+    found = remarks_on_given(run_survey(survey_of(network, truth, scale_bars=tuple(bars))))
+    assert set(kinds_of(found)) == kinds and found[0].names("given") == ("9 - 20",)
+    if kinds == {"given_weakly_checked"}:
+        assert found[0].number("sigmas") == pytest.approx(4.13 * weaker, rel=0.02)
+
+
+def test_a_bar_given_twice_counts_once() -> None:
+    bars = ScaleBars(
+        np.array([3, 5, 5, 6, 0]),
+        np.array([5, 3, 3, 7, 1]),
+        np.array([1.0, 1.0003, 1.2, 0.5, 2.0]),
+        np.array([1e-4, 2e-4, 1e-4, 1e-4, 1e-4]),
+    )
+    found = given._lengths(bars)
+    assert [one.bars for one in found] == [(0, 1), (2,), (3,), (4,)]
+    assert [one.contradicted for one in found] == [True, True, False, False]
+    assert found[0].length == pytest.approx(1.00006) and found[0].sigma == 1e-4
+
+
+@pytest.mark.parametrize(("apart", "agree"), [(3.2, True), (3.4, False)])
+def test_bars_of_the_same_ends_agree_at_the_level(apart: float, agree: bool) -> None:
+    length = np.array([1.0, 1.0 + apart * 1e-4 * np.sqrt(2)])
+    bars = ScaleBars(np.array([0, 0]), np.array([1, 1]), length, np.array([1e-4, 1e-4]))
+    assert (len(given._lengths(bars)) == 1) == agree
+
+
+def test_a_wrong_bar_given_twice_does_not_outvote_a_right_one() -> None:
+    network, truth = make_network(seed_of("twice"), images=8, points=30)
+    right = [float(np.linalg.norm(truth.points[i] - truth.points[j])) for i, j in ((8, 19), (3, 12), (1, 6))]
+    wrong = (ScaleBar("9", "20", 1.1 * right[0], 1e-4), ScaleBar("20", "9", 1.1 * right[0], 1e-4))
+    others = (ScaleBar("4", "13", right[1], 1e-4), ScaleBar("2", "7", right[2], 1e-4))
+    one = remarks_on_given(run_survey(survey_of(network, truth, scale_bars=(*wrong, others[0]))))
+    assert kinds_of(one) == ("scale_contradicted",) and one[0].names("given") == ("9 - 20", "4 - 13")
+    both = remarks_on_given(run_survey(survey_of(network, truth, scale_bars=(*wrong, *others))))
+    assert kinds_of(both)[0] == "bar_left_out" and both[0].names("bar") == ("9 - 20",)
+    differ = (replace(wrong[0], length=right[0]), wrong[1])
+    alone = remarks_on_given(run_survey(survey_of(network, truth, scale_bars=differ)))
+    assert kinds_of(alone) == ("scale_contradicted",) and len(set(alone[0].names("given"))) == 2
 
 
 def test_the_joint_covariance_of_what_is_judged_takes_72_megabytes() -> None:

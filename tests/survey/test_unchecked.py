@@ -41,7 +41,7 @@ def test_the_scale_of_one_bar_is_unchecked() -> None:
 
 def test_of_a_bar_that_a_far_worse_one_checks_an_error_may_stay_unnoticed() -> None:
     network, truth = _scene("worse bar")
-    worse = replace(_bar(truth, 1, 8), sigma=2e-3)
+    worse = replace(_bar(truth, 1, 8), sigma=5e-4)
     result = run_survey(survey_of(network, truth, scale_bars=(_bar(truth, 0, 9), worse)))
     (said,) = remarks_on_given(result)
     assert said.kind == "given_weakly_checked" and said.names("given") == ("1 - 10",)

@@ -32,16 +32,18 @@ from sfm.adjustment.quality.given_values import (
 )
 from sfm.adjustment.result import Adjustment
 from sfm.conventions import BoolArray, FloatArray, IntArray
+from sfm.distributions import chi2_sf
 from sfm.errors import GeometryError
 from sfm.network import ExteriorObservations, Network, ObjectPoints, ScaleBars
+from sfm.remarks.kind import significant
 from sfm.remarks.remark import Remark, remark
 from sfm.similarity import Similarity
 
 UNIT_FACTORS = (10.0, 12.0, 25.4, 100.0, 304.8, 1000.0)  # between mm, cm, m, inch and foot
 SAME_UNIT = 0.02  # relative difference up to which a factor is that of a unit; 10 and 12 are 0.2 apart
-UNCHECKED = (
-    5.0  # standard deviations by which an error that no test finds may shift the result; it is wrong then
-)
+WEAK = 5.0  # standard deviations by which an error that no test finds may shift the result; it is wrong then
+CHECKABLE = 0.01  # redundancy number below which nothing checks a value; Foerstner (1987), CVGIP 40(3)
+UNCHECKED = NONCENTRALITY * ((1 - CHECKABLE) / CHECKABLE) ** 0.5  # the same as external reliability, 41
 PRINT_SIGMA = (
     0.002  # relative scale of coordinates without standard deviations: paper swells by 1 to 2 permille
 )
@@ -333,13 +335,12 @@ class _Judge:
     ) -> None:
         """Remark given values of which nothing, or hardly anything, would find an error."""
         reach = model.external(without)
-        nothing = [names[k] for k in np.flatnonzero(np.isinf(reach)).tolist()]
-        weak = [names[k] for k in np.flatnonzero(np.isfinite(reach) & (reach > UNCHECKED)).tolist()]
+        nothing = [names[k] for k in np.flatnonzero(reach > UNCHECKED).tolist()]
         if nothing:
             self.remarks.append(remark("given_unchecked", given=nothing, of=of))
-        if weak:
-            largest = float(reach[np.isfinite(reach)].max())
-            self.remarks.append(remark("given_weakly_checked", given=weak, of=of, sigmas=largest))
+        for k in np.flatnonzero((reach > WEAK) & (reach <= UNCHECKED)).tolist():
+            weak = remark("given_weakly_checked", given=names[k], of=of, sigmas=float(reach[k]))
+            self.remarks.append(weak)
 
     def _confirmed(self, group: _Group, covariance: FloatArray) -> FloatArray:
         """Return the covariance of given points with which they fit, and remark if it is another one."""
@@ -365,14 +366,16 @@ class _Judge:
         bars, count = self.network.scale_bars, len(self.places.xyz)
         scales: list[GivenScale] = []
         names: list[str] = []
-        of_bar: list[int] = []
-        for b in range(len(bars)):
+        lengths: list[_Length] = []
+        for one in _lengths(bars):
+            b = one.bars[0]
             ends = tuple(self.network.points[j] for j in (bars.start[b], bars.end[b]))
             at = [self.places.of_point.get(name, -1) for name in ends]
             if min(at) >= 0 and at[0] != at[1]:
-                scales.append(scale_of_length(bars.length[b], bars.sigma[b], self.places.xyz, at[0], at[1]))
-                names.append(f"{ends[0]} - {ends[1]}")
-                of_bar.append(b)
+                scales.append(scale_of_length(one.length, one.sigma, self.places.xyz, at[0], at[1]))
+                given = f" ({significant(one.length)} {self.unit})" if one.contradicted else ""
+                names.append(f"{ends[0]} - {ends[1]}{given}")
+                lengths.append(one)
         for group in (control, centres):
             found = None if group is None else self._scale_of(group, count)
             if group is not None and found is not None:
@@ -390,7 +393,7 @@ class _Judge:
         elif judgement.factor != 1.0:
             self._imprecise_bars(judgement.factor)
         else:
-            self._contradicting_scales(model, judgement, names, np.array(of_bar, dtype=np.int64))
+            self._contradicting_scales(model, judgement, names, lengths)
 
     def _scale_of(self, group: _Group, count: int) -> GivenScale | None:
         """Return the scale by given points; by their distance where there are two."""
@@ -422,12 +425,12 @@ class _Judge:
         self.network = replace(self.network, scale_bars=replace(bars, sigma=(used or 1.0) * bars.sigma))
 
     def _contradicting_scales(
-        self, model: GivenModel, judgement: Judgement, names: list[str], of_bar: IntArray
+        self, model: GivenModel, judgement: Judgement, names: list[str], lengths: list[_Length]
     ) -> None:
         """Leave out bars that the others identify as wrong, or all where nothing shows which are wrong."""
         bars, wrong = self.network.scale_bars, judgement.wrong
-        identified = bool(wrong) and max(wrong) < len(of_bar)
-        out = of_bar[list(wrong)] if identified else of_bar
+        identified = bool(wrong) and max(wrong) < len(lengths)
+        out = [b for one in ([lengths[k] for k in wrong] if identified else lengths) for b in one.bars]
         if identified:
             kept = [k for k in range(len(names)) if k not in wrong]
             others = _mean_scale(model, kept)
@@ -462,6 +465,44 @@ class _Judge:
             self.network,
             scale_bars=ScaleBars(bars.start[keep], bars.end[keep], bars.length[keep], bars.sigma[keep]),
         )
+
+
+@dataclass(frozen=True)
+class _Length:
+    """A length between two points, given once or several times alike."""
+
+    bars: tuple[int, ...]
+    length: float  # mean by weights
+    sigma: float  # of the best: to give it twice makes it no better
+    contradicted: bool  # whether another length is given between the same points
+
+
+def _lengths(bars: ScaleBars) -> list[_Length]:
+    """Return the lengths that scale bars give, those between the same points once where they agree."""
+    same: dict[frozenset[int], list[list[int]]] = {}
+    for b in np.argsort(bars.length, kind="stable").tolist():
+        alike = same.setdefault(frozenset((int(bars.start[b]), int(bars.end[b]))), [])
+        if alike and _agree(bars, alike[-1][0], b):
+            alike[-1].append(b)
+        else:
+            alike.append([b])
+    found = [
+        _Length(
+            tuple(some),
+            float(np.average(bars.length[some], weights=1 / bars.sigma[some] ** 2)),
+            float(bars.sigma[some].min()),
+            len(alike) > 1,
+        )
+        for alike in same.values()
+        for some in alike
+    ]
+    return sorted(found, key=lambda one: min(one.bars))
+
+
+def _agree(bars: ScaleBars, a: int, b: int) -> bool:
+    """Return whether two lengths differ by no more than their standard deviations allow."""
+    variance = float(bars.sigma[a] ** 2 + bars.sigma[b] ** 2)
+    return bool(chi2_sf((bars.length[b] - bars.length[a]) ** 2 / variance, 1) >= LEVEL)
 
 
 def _mean_scale(model: GivenModel, kept: list[int]) -> float:
