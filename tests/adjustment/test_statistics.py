@@ -122,6 +122,25 @@ def test_weights_of_two_cameras_are_estimated() -> None:
     assert a.sigma0 == pytest.approx(1, abs=2e-3)
 
 
+@pytest.mark.parametrize(("noise_px", "ends"), [(2e-3, 2e-3), (5e-4, 1e-3), (0.0, 1e-3)])
+def test_no_image_point_is_weighted_as_better_than_a_thousandth_of_a_pixel(
+    noise_px: float, ends: float
+) -> None:
+    rng = seed_of("least")
+    network, truth = make_network(rng, images=10, points=40, noise_px=0.0)
+    k = network.image_points
+    network = replace(network, image_points=replace(k, xy=k.xy + noise_px * rng.standard_normal(k.xy.shape)))
+
+    def run(factor: FloatArray) -> Adjustment:
+        return adjust(network, truth, datum=FREE, reject="none", image_sigma_factor=factor)
+
+    a, factor, settled = estimate_components(run, np.zeros(len(network.image_points), dtype=int), ("all",))
+    assert settled and factor[0] * a.stated_px == pytest.approx(ends, rel=0.1)
+    assert a.sigma0 == pytest.approx(1, abs=2e-3)
+    plain = run(a.image_sigma_factor)
+    np.testing.assert_allclose(a.covariance.points, plain.covariance.points / plain.sigma0**2, rtol=5e-3)
+
+
 def test_weights_that_come_back_in_a_cycle_end_their_estimation(plain: Adjustment) -> None:
     """Larger standard deviations reject other image points and are not borne out by those that are left."""
     group = np.zeros(len(plain.rejected), dtype=np.int64)

@@ -97,9 +97,9 @@ def test_image_points_without_noise_are_a_good_survey(number: int) -> None:
     assert {one.kind for one in verdict.remarks} == {"scale_undefined", "sigma_px_cautious"}
 
 
-def test_residuals_are_rounding_up_to_five_ten_thousand_steps_of_a_double() -> None:
+def test_residuals_are_rounding_up_to_a_billionth_of_the_coordinates() -> None:
     network, truth = make_network(seed_of("exact"), images=6, points=20, noise_px=0.0, free=("c",))
     a = adjust(network, truth, reject="none")
-    limit = 1e-11 * float(np.abs(network.image_points.xy).max())
+    limit = 1e-9 * float(np.abs(network.image_points.xy).max())
     for factor, exact in ((0.6, True), (1.6, False)):
         assert replace(a, residuals=np.full_like(a.residuals, factor * limit)).is_exact == exact

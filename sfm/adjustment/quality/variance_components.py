@@ -11,20 +11,17 @@ al., Close-Range Photogrammetry (2020), sec. 2.4.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from sfm.adjustment.engine.observed_unknowns import exterior_misclosure, weighted_of
 from sfm.adjustment.engine.unknowns import unknowns_of
-from sfm.adjustment.result import Adjustment
+from sfm.adjustment.result import MIN_SIGMA_PX, Adjustment, Covariance
 from sfm.camera import camera_families
 from sfm.conventions import BoolArray, FloatArray, IntArray
 
 SETTLED = 1e-3  # relative change of a variance component at which its estimation ends
-MIN_FACTOR = (
-    1e-4  # on stated standard deviations: image points without noise, whose weight would hide all others
-)
 MAX_ROUNDS = 20
 FEW = 1.0  # redundancy of a group of image points below which its variance component is not estimated
 IMAGE_POINTS = "image points"
@@ -155,34 +152,49 @@ def by_kind(adjustment: Adjustment) -> VarianceComponents:
     )
 
 
+def least_factor(stated_px: float) -> float:
+    """Return the least factor on the stated standard deviation of image points: to MIN_SIGMA_PX, or 1."""
+    return min(MIN_SIGMA_PX / stated_px, 1.0)
+
+
 def estimate_components(
-    adjust_with: Callable[[FloatArray], Adjustment], group: IntArray, names: tuple[str, ...]
+    adjust_with: Callable[[FloatArray], Adjustment],
+    group: IntArray,
+    names: tuple[str, ...],
+    *,
+    start: float = 1.0,
 ) -> tuple[Adjustment, FloatArray, bool]:
     """Return the adjustment with the weights of groups of image points estimated from the data.
 
     The standard deviations of each group are multiplied by the root of its variance factor and the network
-    adjusted again, until the factors of the image points that the last adjustment accepted are 1.
+    adjusted again, until the factors of the image points that the last adjustment accepted are 1. They do not
+    fall below MIN_SIGMA_PX; where they end there, the result has the standard deviations of sigma0 = 1.
 
     Args:
         adjust_with: adjusts a network from fixed start values with the factor on the stated standard
             deviations of each image point, (k,), and returns the adjustment.
         group: group of each image point, shape (k,).
         names: names of the groups, g of them.
+        start: factor to begin with.
 
     Returns:
         Last adjustment, standard deviation of each group over that stated, shape (g,), and whether the
         factors converged. Where factors come back because every weighting rejects other image points, the
         adjustment of that cycle which rejects fewest.
     """
-    factor = np.ones(len(names))
+    factor = np.full(len(names), start)
     adjustment = adjust_with(factor[group])
+    covariance = adjustment.network.image_points.covariance
+    stated = np.sqrt(np.trace(covariance, axis1=1, axis2=2) / 2)
+    least = np.array([least_factor(float(np.median(stated[group == g]))) for g in range(len(names))])
     tried, rejected = [factor], [adjustment.rejected]
     for _ in range(MAX_ROUNDS):
         found = _components(adjustment, adjustment.image_covariance, group, names, few=FEW).sigma0
         found = np.where(np.isfinite(found) & (found > 0), found, 1.0)
-        found = np.maximum(found, MIN_FACTOR / factor)
+        found = np.maximum(found, least / factor)
         if np.abs(found - 1).max() <= SETTLED:
-            return adjustment, factor, True
+            at_least = (factor <= least).any() and adjustment.sigma0 < 1
+            return _as_weighted(adjustment) if at_least else adjustment, factor, True
         factor = factor * found
         first = _cycle_start(tried, rejected, factor)
         if first is not None:
@@ -194,6 +206,20 @@ def estimate_components(
         tried.append(factor)
         rejected.append(adjustment.rejected)
     return adjustment, factor, False
+
+
+def _as_weighted(adjustment: Adjustment) -> Adjustment:
+    """Return an adjustment with the standard deviations by which it was weighted: sigma0 = 1.
+
+    Sigma0 a posteriori of image points that are better than their weights would scale those of control, too.
+    """
+    c, unit = adjustment.covariance, adjustment.sigma0**2
+    if not unit > 0:
+        return adjustment
+    covariance = Covariance(
+        c.points / unit, c.exterior / unit, tuple(Q / unit for Q in c.interior), c.points_limiting / unit
+    )
+    return replace(adjustment, sigma0=1.0, covariance=covariance)
 
 
 def _cycle_start(tried: list[FloatArray], rejected: list[BoolArray], factor: FloatArray) -> int | None:

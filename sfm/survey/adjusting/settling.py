@@ -47,6 +47,9 @@ class Task:
     least: IntArray  # image points that each photograph needs to stay, (m,)
     reject: str  # how gross errors are treated
     suspected: tuple[str, ...] = ()  # photographs that could be matched with a camera of their own only
+    # On the stated standard deviations of the image points. Where these are far too large, control and bars
+    # bend the network by more than its noise, and their points seem to be gross errors.
+    factor: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -149,7 +152,7 @@ def adjust_finally(task: Task, part: Network, estimate: Estimate, rejected: Bool
     weighted = any(observed(np.einsum("nii->ni", one.covariance)).any() for one in outer)
     others = len(part.scale_bars) or len(part.interior) or weighted
     if others and task.survey.adjust.weights == "components":
-        return _weighed(adjust_part, len(part.image_points))
+        return _weighed(adjust_part, len(part.image_points), task.factor)
     return adjust_part(np.ones(len(part.image_points)))
 
 
@@ -183,7 +186,7 @@ def _tested(
     estimate: Estimate,
     *,
     covariance: bool,
-    factor: float | FloatArray = 1.0,
+    factor: FloatArray | None = None,
     rejected: BoolArray | None = None,
     method: str = "levenberg-marquardt",
     max_iterations: int = MAX_ITERATIONS,
@@ -195,7 +198,7 @@ def _tested(
         estimate,
         datum=on_points(task.survey, network, estimate, task.datum),
         sigma_px=task.survey.adjust.sigma_px,
-        image_sigma_factor=factor,
+        image_sigma_factor=task.factor if factor is None else factor,
         reject=task.reject,
         alpha=level_of_single(FALSE_ALARM, tests),
         rejected=rejected,
@@ -226,7 +229,7 @@ def on_points(survey: Survey, network: Network, estimate: Estimate, datum: Datum
     return replace(datum, points=on)
 
 
-def _weighed(adjust_part: Callable[[FloatArray], Adjustment], count: int) -> Adjustment:
+def _weighed(adjust_part: Callable[[FloatArray], Adjustment], count: int, start: float) -> Adjustment:
     """Return the adjustment with the image points weighted by their own variance component.
 
     Lengths and control have the standard deviations that were stated for them; without this, sigma0 a
@@ -236,7 +239,7 @@ def _weighed(adjust_part: Callable[[FloatArray], Adjustment], count: int) -> Adj
     Source: Foerstner and Wrobel (2016), Photogrammetric Computer Vision, sec. 4.2.4.
     """
     group = np.zeros(count, dtype=np.int64)
-    final, _, settled = estimate_components(adjust_part, group, (IMAGE_POINTS,))
+    final, _, settled = estimate_components(adjust_part, group, (IMAGE_POINTS,), start=start)
     if not settled:
         unsettled = remark("weights_not_converged", groups=IMAGE_POINTS)
         final = replace(final, remarks=(*final.remarks, unsettled))

@@ -11,6 +11,7 @@ from sfm.adjustment.hypotheses.hypotheses import judge_alternatives
 from sfm.adjustment.hypotheses.rejections import explain_rejections
 from sfm.adjustment.quality.given_values import GivenTest
 from sfm.adjustment.quality.other_solutions import OtherSolution, other_solutions, solution_before
+from sfm.adjustment.quality.variance_components import least_factor
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.conventions import BoolArray, IntArray
@@ -277,6 +278,10 @@ def _solved(start: _Prepared) -> _Solved:
             raise
         free = None  # control may connect and calibrate what the photographs alone do not
     task, given = _judged(start, free)
+    if free is not None and task.survey.adjust.weights == "components":
+        alone = free.settled.adjustment
+        factor = float(np.clip(alone.sigma0, least_factor(alone.stated_px), 1.0))
+        task = replace(task, factor=factor)
     if not given.tests and task.datum.kind == "control":
         free = None  # what they give alone is no start either
     estimate, ready, accepted = start.estimate, None, None

@@ -19,6 +19,7 @@ from sfm.adjustment.engine.iterate import Optimum, Problem, iterate, optimum_at
 from sfm.adjustment.engine.unknowns import start_weights
 from sfm.adjustment.quality.gross_errors.robust import (
     huber_weights,
+    least_sigma,
     residual_lengths,
     robust_scale,
     snoop,
@@ -164,7 +165,7 @@ def _sound(run: Run, state: State, weight: FloatArray, without: BoolArray) -> tu
         if begun is None:
             raise
         optimum, plain = replace(begun, converged=False), weight
-    limit, first = spread(optimum.state), spread(state)
+    limit, first = spread(optimum.state), max(spread(state), least_sigma(layout.observations))
 
     def sound(found: Optimum) -> bool:
         fits = spread(found.state) <= BENT * first
@@ -200,6 +201,7 @@ def _bent_photographs(run: Run, start: State, end: State) -> BoolArray:
     """
     observations, active = run.problem.layout.observations, run.problem.layout.active
     before, after = (_median_lengths(observations, at, active) for at in (start, end))
+    before = np.maximum(before, least_sigma(observations))
     return np.asarray(after > np.maximum(BENT * before, BENT_ALONE * np.nanmedian(after)))
 
 

@@ -23,7 +23,7 @@ import numpy as np
 from sfm.adjustment.engine.collinearity import Observations, State
 from sfm.adjustment.quality.gross_errors.rays_of_points import further_rays
 from sfm.adjustment.quality.reliability import standardised_residuals, tau_critical, whitening_matrix
-from sfm.adjustment.result import ROUNDING
+from sfm.adjustment.result import MIN_SIGMA_PX, ROUNDING
 from sfm.conventions import MAD_TO_SIGMA, BoolArray, FloatArray
 
 # In sigmas of a coordinate, for the length of a residual vector: both are 95 % efficient with normal errors
@@ -129,6 +129,11 @@ def rounding_of(observations: Observations) -> float:
     """Return what rounding makes of a residual, in standard deviations: below it nothing can be tested."""
     size = float(np.abs(observations.xy).max(initial=0.0))
     return max(ROUNDING * size * float(observations.whitening[:, 0].max(initial=0.0)), np.finfo(float).tiny)
+
+
+def least_sigma(observations: Observations) -> float:
+    """Return MIN_SIGMA_PX in stated standard deviations; residuals below it show no gross error."""
+    return MIN_SIGMA_PX * float(observations.whitening[:, 0].max(initial=0.0))
 
 
 def huber_weights(observations: Observations, residuals: FloatArray, *, sigma0: float) -> FloatArray:
