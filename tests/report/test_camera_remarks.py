@@ -13,6 +13,7 @@ from sfm.adjustment.solve import adjust
 from sfm.pipeline import run_survey
 from sfm.remarks.remark import of_kind
 from sfm.remarks.verdict import Verdict
+from sfm.report.findings import camera_remarks
 from sfm.report.findings.findings import findings_of
 from sfm.result import SurveyResult
 from tests.surveys import survey_of
@@ -50,3 +51,31 @@ def test_a_principal_point_far_from_the_centre_is_told() -> None:
     moved = replace(a, estimate=replace(a.estimate, cameras=(camera.with_parameters(p),)))
     (away,) = of_kind(verdict_of(moved).remarks, "principal_point_far")
     assert away.names("camera") == ("camera 1",) and away.number("share") == pytest.approx(0.12, abs=0.01)
+
+
+@pytest.mark.parametrize(
+    ("kind", "size"), [("exchanged", (1500, 2000)), ("halved", (1000, 750)), ("doubled", (2000, 1500))]
+)
+def test_exchanged_axes_and_other_sizes_are_named(kind: str, size: tuple[int, int]) -> None:
+    """Before, the principal point was far from the centre; with exchanged axes the object is mirrored."""
+    free = ("c", "x0", "y0")
+    network, truth = make_network(seed_of("other format"), images=12, points=60, free=free)
+    seen = network.image_points
+    xy = {"exchanged": seen.xy[:, ::-1], "halved": (seen.xy - 0.5) / 2, "doubled": seen.xy}[kind]
+    if kind == "doubled":
+        camera = replace(truth.cameras[0], size_px=(4000, 3000))
+        truth = replace(truth, cameras=(camera,))
+    inside = (xy < np.array(truth.cameras[0].size_px) - 0.5).all(axis=1) & (xy > -0.5).all(axis=1)
+    changed = replace(network, image_points=replace(seen, xy=xy).select(inside))
+    result = run_survey(survey_of(changed, truth, free=free, adjust={"reject": "tau"}))
+    verdict = findings_of(result).verdict
+    (one,) = of_kind(verdict.remarks, "format_of_other_size")
+    assert verdict.level == "bad" and (one.number("width"), one.number("height")) == size
+
+
+def test_a_lens_may_be_decentred_by_a_fiftieth_of_the_diagonal() -> None:
+    """About the centre of the format with its sides exchanged: 1.7 % off is that one, 2.3 % none."""
+    for off, right in ((0.017, (1500, 2000)), (0.023, None)):
+        at = np.array([750 + off * 2500, 1000])
+        assert camera_remarks._format_around(at, 2000, 1500) == right
+    assert camera_remarks.FAR_FROM_CENTRE == 0.1

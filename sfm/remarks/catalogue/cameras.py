@@ -85,6 +85,14 @@ ROWS = (
         "Hold it fixed, or add photographs turned by 90 degrees.",
     ),
     Kind(
+        "format_of_other_size",
+        "error",
+        "The adjusted principal point of camera {camera} is the centre of photographs of "
+        "{width} x {height} px.",
+        "x and y of the image points are exchanged, or size_px is that of other photographs",
+        "Correct size_px, or exchange x and y.",
+    ),
+    Kind(
         "pixels_not_square",
         "warning",
         "The pixels of camera {camera} are {width} x {height} by {where}, {off} off squares.",

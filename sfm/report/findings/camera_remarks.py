@@ -4,8 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
+from sfm.conventions import FloatArray
 from sfm.remarks.remark import Remark, remark, unless_note
 from sfm.result import SurveyResult
+
+FAR_FROM_CENTRE = 0.1  # of the diagonal, as in the catalogue
+DECENTRED = 0.02  # of the diagonal: so far a lens or sensor may be off
 
 
 def camera_remarks(result: SurveyResult) -> tuple[Remark, ...]:
@@ -31,15 +35,34 @@ def _hardly_determined(result: SurveyResult) -> tuple[Remark, ...]:
 
 
 def _principal_points(result: SurveyResult) -> tuple[Remark, ...]:
-    """Return adjusted principal points that lie where no lens has them."""
+    """Return adjusted principal points where no lens has them, and the format of which they are centres."""
     remarks: list[Remark] = []
     for camera in result.adjustment.estimate.cameras:
         names = ("x0", "y0") if camera.in_mm else ("cx", "cy")
+        free = camera.free[[camera.names.index(name) for name in names]]
+        if not free.any():
+            continue
         x, y = (camera.value(name) for name in names)
-        size = np.array(camera.size_px) * (camera.pixel_mm if camera.in_mm else 1.0)
-        if not camera.in_mm:
-            x, y = x - (camera.size_px[0] - 1) / 2, y - (camera.size_px[1] - 1) / 2
-        away = float(np.hypot(x, y) / np.linalg.norm(size))
-        if camera.free[[camera.names.index(name) for name in names]].any():
-            remarks += unless_note(remark("principal_point_far", camera=camera.name, share=away))
+        width, height = camera.size_px
+        if camera.in_mm:
+            at = np.array([x / camera.pixel_mm[0] + width / 2, height / 2 - y / camera.pixel_mm[1]])
+        else:
+            at = np.array([x + 0.5, y + 0.5])
+        diagonal = float(np.hypot(width, height))
+        away = float(np.hypot(at[0] - width / 2, at[1] - height / 2) / diagonal)
+        remarks += unless_note(remark("principal_point_far", camera=camera.name, share=away))
+        other = _format_around(at, width, height) if away >= FAR_FROM_CENTRE else None
+        if other is not None:
+            remarks.append(
+                remark("format_of_other_size", camera=camera.name, width=other[0], height=other[1])
+            )
     return tuple(remarks)
+
+
+def _format_around(at: FloatArray, width: int, height: int) -> tuple[int, int] | None:
+    """Return the format whose centre a place is: the sides exchanged, doubled or halved; None without one."""
+    formats = [(height, width), *((round(s * width), round(s * height)) for s in (0.5, 2.0))]
+    for one in formats:
+        if np.linalg.norm(at - np.array(one) / 2) < DECENTRED * np.hypot(*one):
+            return one
+    return None
