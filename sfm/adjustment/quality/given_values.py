@@ -320,17 +320,18 @@ def _sets(model: GivenModel, cost: float) -> tuple[WrongValues, ...]:
     As a factor makes all values scatter more than stated, so do the wrong ones: chi-square F of q differences
     costs q (1 + ln F / q), and the choice.
     """
-    every = model.kept()
+    every = kept = model.kept()
     out: tuple[int, ...] = ()
     found: list[WrongValues] = []
     for k in range(1, (model.items + 1) // 2 + 1):
-        fall, rank = model.kept(out).decreases()
+        fall, rank = kept.decreases()
         gain = np.where(np.isin(np.arange(model.items), out), -np.inf, fall - cost * rank)
-        out = tuple(sorted((*out, int(np.argmax(gain)))))
+        more = int(np.argmax(gain))
+        out, kept = tuple(sorted((*out, more))), kept.without(more)
         if comb(model.items, k) <= MAX_SETS:
             misfit = dict(_misfits_like(model, out))
             out = min(misfit, key=lambda some: misfit[some], default=out)
-        kept = model.kept(out)
+            kept = model.kept(out)
         if kept.dof < 1:
             break
         q, F = every.dof - kept.dof, every.chi2 - kept.chi2
