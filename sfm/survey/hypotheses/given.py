@@ -6,7 +6,7 @@ touches is believed. The rest takes part in the adjustment.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -104,7 +104,7 @@ def judge_given(
         of = [name for name, some in kinds if len(some)]
         remarks = (remark("given_not_judged", of=of),) if of else ()
         return JudgedGiven(network, datum, remarks)
-    return _Judge(network, places, datum, unit, rescale).judged()
+    return _judged(_Task(network, places, datum, unit, rescale))
 
 
 def _places(network: Network, free: Adjustment, datum: Datum) -> _Places | None:
@@ -141,7 +141,24 @@ def _places(network: Network, free: Adjustment, datum: Datum) -> _Places | None:
     )
 
 
-@dataclass
+@dataclass(frozen=True)
+class _Task:
+    """What is judged, and how."""
+
+    network: Network  # with all that was given
+    places: _Places
+    datum: Datum  # that was asked for
+    unit: str
+    rescale: bool
+
+    @property
+    def level(self) -> float:
+        """Probability with which one kind of right given values is said to be wrong."""
+        kinds = (self.network.scale_bars, self.network.control, self.network.exterior)
+        return LEVEL / max(sum(len(one) > 0 for one in kinds), 1)
+
+
+@dataclass(frozen=True)
 class _Group:
     """Given points of a kind, judged."""
 
@@ -154,317 +171,324 @@ class _Group:
     rounded: bool = False  # whether the standard deviations are those of the rounding
 
     @property
+    def found(self) -> Judgement:
+        """What is wrong of them."""
+        return self.placed.judgement
+
+    @property
     def out(self) -> tuple[int, ...]:
         """Those that were left out."""
-        return self.placed.judgement.wrong
+        return self.found.wrong
 
     @property
     def dependable(self) -> bool:
         """Whether a scale may rest on them."""
-        return not (self.placed.mirrored or self.placed.judgement.doubtful)
+        return not (self.placed.mirrored or self.found.doubtful)
 
+    @property
+    def test(self) -> GivenTest:
+        """Test of all of them."""
+        return GivenTest(self.of, self.found.statistic, self.found.dof, self.found.probability)
 
-class _Judge:
-    """The given values of one network."""
-
-    def __init__(self, network: Network, places: _Places, datum: Datum, unit: str, rescale: bool) -> None:
-        self.network, self.places, self.datum, self.unit = network, places, datum, unit
-        self.rescale = rescale
-        self.remarks: list[Remark] = []
-        self.tests: list[GivenTest] = []
-        tests = (len(network.scale_bars) > 0, len(network.control) > 0, len(network.exterior) > 0)
-        self.level = LEVEL / max(sum(tests), 1)
-
-    def judged(self) -> JudgedGiven:
-        """Judge points, then the scales of bars and points."""
-        control, centres = self._control(), self._centres()
-        self._scales(control, centres)
-        placing = next(
-            (one.placed.placing for one in (control, centres) if one and not one.placed.mirrored), None
-        )
-        return JudgedGiven(self.network, self.datum, tuple(self.remarks), tuple(self.tests), placing)
-
-    def _control(self) -> _Group | None:
-        """Judge control, and leave out or change what does not fit."""
-        control = self.network.control
-        names = [self.network.points[j] for j in control.point]
-        group = self._group("control", names, self.places.of_point, control.xyz, control.covariance)
-        if group is None:
-            return None
-        placed = group.placed
-        if placed.mirrored:
-            mirrored = placed.judgement.statistic
-            self.remarks.append(remark("control_mirrored", chi2=placed.unmirrored, mirrored=mirrored))
-            self.network = replace(self.network, control=ObjectPoints())
-            if self.datum.kind == "control" and not len(self.network.exterior):
-                self.datum = Datum("free")
-            return group
-        order, keep, covariance = self._as_judged(group, control.covariance)
-        self.network = replace(
-            self.network,
-            control=ObjectPoints(control.point[keep], control.xyz[order][keep], covariance[keep]),
-        )
-        return group
-
-    def _centres(self) -> _Group | None:
-        """Judge observed projection centres, and leave out or change what does not fit."""
-        seen = self.network.exterior
-        names = [self.network.images[i] for i in seen.image]
-        group = self._group("centres", names, self.places.of_image, seen.position, seen.covariance[:, :3, :3])
-        if group is None or group.placed.mirrored:
-            return None
-        order, keep, of_centres = self._as_judged(group, seen.covariance[:, :3, :3])
-        covariance = seen.covariance[order]
-        covariance[:, :3, :3] = of_centres
-        self.network = replace(
-            self.network,
-            exterior=ExteriorObservations(
-                seen.image[keep], seen.position[order][keep], seen.angles[order][keep], covariance[keep]
-            ),
-        )
-        return group
-
-    def _group(
-        self, of: str, names: Sequence[str], place_of: dict[str, int], xyz: FloatArray, covariance: FloatArray
-    ) -> _Group | None:
-        """Judge points of a kind against the free network, and remark what does not fit."""
-        given = np.where(np.isfinite(np.einsum("nii->ni", covariance)), xyz, np.nan)
-        placed_there = np.array([name in place_of for name in names], dtype=bool)
-        rows = np.flatnonzero(placed_there & np.isfinite(given).any(axis=1))
-        if not len(rows):
-            return None
-        index, coordinates = self.places.at([place_of[names[k]] for k in rows.tolist()])
-        points = GivenPoints(
-            given[rows],
-            np.where(np.isfinite(covariance[rows]), covariance[rows], 0.0),
-            self.places.xyz[index],
-            self.places.joint[np.ix_(coordinates, coordinates)],
-            self.places.redundancy,
-        )
-        in_datum = self.datum.kind == "control"
-        fixed = not points.stated.any()
-        start = Similarity(1.0, np.eye(3), np.zeros(3)) if in_datum else None
-        placed = judge_points(points, self.level, start=start, estimated=fixed and not in_datum)
-        if placed is None:
-            return None
-        group = _Group(of, rows, tuple(names[k] for k in rows.tolist()), points, index, placed)
-        if fixed and in_datum and self.rescale and not placed.judgement.fits:
-            group = self._rounded(group, start)
-        found = group.placed.judgement
-        self.tests.append(GivenTest(of, found.statistic, found.dof, found.probability))
-        if found.factor != 1.0:
-            stated = np.broadcast_to(np.eye(3), points.stated.shape) if fixed else points.stated
-            points = replace(points, stated=found.factor**2 * stated)
-            fitting = judge_points(points, self.level, start=start)
-            placed = group.placed if fitting is None else replace(fitting, judgement=found)
-            group = replace(group, points=points, placed=placed)
-        if not group.placed.mirrored:
-            self._remark_group(group)
-        return group
-
-    def _rounded(self, group: _Group, start: Similarity | None) -> _Group:
-        """Judge fixed coordinates again, as precise as their decimals, where these explain the misfit."""
-        points = group.points.rounded()
-        placed = judge_points(points, self.level, start=start) if points.stated.any() else None
-        if placed is None or placed.judgement.factor != 1.0 or placed.judgement.doubtful:
-            return group
-        return replace(group, points=points, placed=placed, rounded=True)
-
-    def _remark_group(self, group: _Group) -> None:
-        """Remark what does not fit of points, and what nothing checks."""
-        found = group.placed.judgement
-        if found.exchanged:
-            names = [group.names[k] for k in found.exchanged]
-            self.remarks.append(remark("given_exchanged", of=group.of, given=names))
-        if found.wrong:
-            self._left_out(group)
-        if found.doubtful:
-            self._doubtful(group)
-        if group.rounded:
-            sigma = float(np.sqrt(group.points.stated.max()))
-            step, used = (sigma * np.sqrt(12), self.unit), (sigma, self.unit)
-            self.remarks.append(remark("given_rounded", of=group.of, step=step, sigma=used))
-        if self.datum.kind == "control":
-            self._unchecked(group.of, group.names, group.placed.model, found.wrong)
-
-    def _as_judged(self, group: _Group, covariance: FloatArray) -> tuple[IntArray, BoolArray, FloatArray]:
+    def as_judged(self, covariance: FloatArray, *, rescale: bool) -> tuple[IntArray, BoolArray, FloatArray]:
         """Return whose coordinates each given point has, which take part, and their covariance, (n, 3, 3)."""
         order, keep = np.arange(len(covariance)), np.ones(len(covariance), dtype=bool)
-        found = group.placed.judgement
-        if found.exchanged:
-            pair = group.rows[list(found.exchanged)]
+        if self.found.exchanged:
+            pair = self.rows[list(self.found.exchanged)]
             order[pair] = pair[::-1]
-        keep[group.rows[list(found.wrong)]] = False
+        keep[self.rows[list(self.out)]] = False
         changed = covariance[order]
-        changed[group.rows] = self._confirmed(group, changed[group.rows])
+        changed[self.rows] = self._confirmed(changed[self.rows], rescale)
         return order, keep, changed
 
-    def _left_out(self, group: _Group) -> None:
-        model, out = group.placed.model, group.out
-        sizes = [np.linalg.norm(model.v[model.item == k]) for k in out]
-        sigmas = np.sqrt(model.kept().decreases()[0][list(out)].max())
-        self.remarks.append(
-            remark(
-                "given_left_out",
-                of=group.of,
-                given=[group.names[k] for k in out],
-                distance=(float(max(sizes)), self.unit),
-                sigmas=float(sigmas),
-            )
-        )
-
-    def _doubtful(self, group: _Group) -> None:
-        found = group.placed.judgement
-        # they take part with the standard deviations that their differences show
-        shift = float(_shifts(group.placed.model)[list(found.doubtful)].max())
-        if group.points.stated.any():
-            shift /= group.placed.model.factor()[0]
-        self.remarks.append(
-            remark(
-                "given_contradicted",
-                of=group.of,
-                given=[group.names[k] for k in found.doubtful],
-                chi2=found.statistic,
-                dof=found.dof,
-                shift=shift if np.isfinite(shift) else None,
-            )
-        )
-
-    def _unchecked(
-        self, of: str, names: Sequence[str], model: GivenModel, without: tuple[int, ...] = ()
-    ) -> None:
-        """Remark given values of which nothing, or hardly anything, would find an error."""
-        reach = model.external(without)
-        nothing = [names[k] for k in np.flatnonzero(reach > UNCHECKED).tolist()]
-        if nothing:
-            self.remarks.append(remark("given_unchecked", given=nothing, of=of))
-        for k in np.flatnonzero((reach > WEAK) & (reach <= UNCHECKED)).tolist():
-            weak = remark("given_weakly_checked", given=names[k], of=of, sigmas=float(reach[k]))
-            self.remarks.append(weak)
-
-    def _confirmed(self, group: _Group, covariance: FloatArray) -> FloatArray:
-        """Return the covariance of given points with which they fit, and remark if it is another one."""
-        found, model = group.placed.judgement, group.placed.model
+    def _confirmed(self, covariance: FloatArray, rescale: bool) -> FloatArray:
+        """Return the covariance of the points with which they fit."""
         known = np.isfinite(covariance)
-        if group.rounded:
-            return np.where(known, group.points.stated, covariance)
-        if not (found.doubtful or found.factor != 1.0) or model.estimated:
-            return covariance
+        if self.rounded:
+            return np.where(known, self.points.stated, covariance)
         fixed = not np.where(known, covariance, 0.0).any()
-        factor = model.factor()[0] if found.doubtful else found.factor
-        if not found.doubtful and fixed:
-            self.remarks.append(remark("given_not_exact", of=group.of, sigma=(factor, self.unit)))
-        elif not found.doubtful:
-            used = factor if self.rescale else None
-            self.remarks.append(remark("given_sigmas", of=group.of, factor=factor, used=used))
-        if fixed or not self.rescale:
+        changes = bool(self.found.doubtful) or self.found.factor != 1.0
+        if fixed or not rescale or not changes or self.placed.model.estimated:
             return covariance
+        factor = self.placed.model.factor()[0] if self.found.doubtful else self.found.factor
         return np.where(known, factor**2 * covariance, covariance)
 
-    def _scales(self, control: _Group | None, centres: _Group | None) -> None:
-        """Judge the scales of bars, control and projection centres against one another."""
-        bars, count = self.network.scale_bars, len(self.places.xyz)
-        scales: list[GivenScale] = []
-        names: list[str] = []
-        lengths: list[_Length] = []
-        for one in _lengths(bars):
-            b = one.bars[0]
-            ends = tuple(self.network.points[j] for j in (bars.start[b], bars.end[b]))
-            at = [self.places.of_point.get(name, -1) for name in ends]
-            if min(at) >= 0 and at[0] != at[1]:
-                scales.append(scale_of_length(one.length, one.sigma, self.places.xyz, at[0], at[1]))
-                given = f" ({significant(one.length)} {self.unit})" if one.contradicted else ""
-                names.append(f"{ends[0]} - {ends[1]}{given}")
-                lengths.append(one)
-        for group in (control, centres):
-            found = None if group is None else self._scale_of(group, count)
-            if group is not None and found is not None:
-                scales.append(found)
-                names.append(group.of)
-        if not scales:
-            return
-        model = scale_model(tuple(scales), self.places.joint, self.places.redundancy)
-        judgement = judge_values(model, self.level)
-        self.tests.append(GivenTest("scale", judgement.statistic, judgement.dof, judgement.probability))
-        if len(scales) == 1:
-            self.remarks.append(remark("scale_unchecked", given=names[0]))
-        elif judgement.fits:
-            self._unchecked("lengths", names, model)
-        elif judgement.factor != 1.0:
-            self._imprecise_bars(judgement.factor)
-        else:
-            self._contradicting_scales(model, judgement, names, lengths)
 
-    def _scale_of(self, group: _Group, count: int) -> GivenScale | None:
-        """Return the scale by given points; by their distance where there are two."""
-        if not group.dependable:
+@dataclass(frozen=True)
+class _Scales:
+    """Scale bars as judged, and what was found of them and of the scale of given points."""
+
+    bars: ScaleBars  # that take part
+    remarks: tuple[Remark, ...] = ()
+    tests: tuple[GivenTest, ...] = ()
+
+
+def _judged(task: _Task) -> JudgedGiven:
+    """Judge points, then the scales of bars and points."""
+    network, datum = task.network, task.datum
+    control, centres = _control_of(task), _centres_of(task)
+    groups = [one for one in (control, centres) if one is not None]
+    scales = _judged_scales(task, [one for one in groups if one.dependable])
+    network = replace(network, scale_bars=scales.bars)
+    if control is not None:
+        network = replace(network, control=_judged_control(task, control))
+        if control.placed.mirrored and datum.kind == "control" and not len(network.exterior):
+            datum = Datum("free")
+    if centres is not None and not centres.placed.mirrored:
+        network = replace(network, exterior=_judged_centres(task, centres))
+    return JudgedGiven(
+        network,
+        datum,
+        tuple(found for one in groups for found in _remarks_on(task, one)) + scales.remarks,
+        tuple(one.test for one in groups) + scales.tests,
+        next((one.placed.placing for one in groups if not one.placed.mirrored), None),
+    )
+
+
+def _control_of(task: _Task) -> _Group | None:
+    control = task.network.control
+    names = [task.network.points[j] for j in control.point]
+    return _group(task, "control", names, task.places.of_point, control.xyz, control.covariance)
+
+
+def _centres_of(task: _Task) -> _Group | None:
+    seen = task.network.exterior
+    names = [task.network.images[i] for i in seen.image]
+    return _group(task, "centres", names, task.places.of_image, seen.position, seen.covariance[:, :3, :3])
+
+
+def _judged_control(task: _Task, group: _Group) -> ObjectPoints:
+    """Return control without what does not fit, or changed."""
+    control = task.network.control
+    if group.placed.mirrored:
+        return ObjectPoints()
+    order, keep, covariance = group.as_judged(control.covariance, rescale=task.rescale)
+    return ObjectPoints(control.point[keep], control.xyz[order][keep], covariance[keep])
+
+
+def _judged_centres(task: _Task, group: _Group) -> ExteriorObservations:
+    """Return observed orientation without projection centres that do not fit, or changed."""
+    seen = task.network.exterior
+    order, keep, of_centres = group.as_judged(seen.covariance[:, :3, :3], rescale=task.rescale)
+    covariance = seen.covariance[order]
+    covariance[:, :3, :3] = of_centres
+    return ExteriorObservations(
+        seen.image[keep], seen.position[order][keep], seen.angles[order][keep], covariance[keep]
+    )
+
+
+def _group(
+    task: _Task,
+    of: str,
+    names: Sequence[str],
+    place_of: dict[str, int],
+    xyz: FloatArray,
+    covariance: FloatArray,
+) -> _Group | None:
+    """Judge points of a kind against the free network; None without such."""
+    given = np.where(np.isfinite(np.einsum("nii->ni", covariance)), xyz, np.nan)
+    placed_there = np.array([name in place_of for name in names], dtype=bool)
+    rows = np.flatnonzero(placed_there & np.isfinite(given).any(axis=1))
+    if not len(rows):
+        return None
+    index, coordinates = task.places.at([place_of[names[k]] for k in rows.tolist()])
+    points = GivenPoints(
+        given[rows],
+        np.where(np.isfinite(covariance[rows]), covariance[rows], 0.0),
+        task.places.xyz[index],
+        task.places.joint[np.ix_(coordinates, coordinates)],
+        task.places.redundancy,
+    )
+    in_datum = task.datum.kind == "control"
+    fixed = not points.stated.any()
+    start = Similarity(1.0, np.eye(3), np.zeros(3)) if in_datum else None
+    placed = judge_points(points, task.level, start=start, estimated=fixed and not in_datum)
+    if placed is None:
+        return None
+    group = _Group(of, rows, tuple(names[k] for k in rows.tolist()), points, index, placed)
+    if fixed and in_datum and task.rescale and not placed.judgement.fits:
+        group = _rounded(group, start, task.level)
+    found = group.found
+    if found.factor == 1.0:
+        return group
+    stated = np.broadcast_to(np.eye(3), points.stated.shape) if fixed else points.stated
+    points = replace(points, stated=found.factor**2 * stated)
+    fitting = judge_points(points, task.level, start=start)
+    placed = group.placed if fitting is None else replace(fitting, judgement=found)
+    return replace(group, points=points, placed=placed)
+
+
+def _rounded(group: _Group, start: Similarity | None, level: float) -> _Group:
+    """Judge fixed coordinates again, as precise as their decimals, where these explain the misfit."""
+    points = group.points.rounded()
+    placed = judge_points(points, level, start=start) if points.stated.any() else None
+    if placed is None or placed.judgement.factor != 1.0 or placed.judgement.doubtful:
+        return group
+    return replace(group, points=points, placed=placed, rounded=True)
+
+
+def _remarks_on(task: _Task, group: _Group) -> Iterator[Remark]:
+    """Yield what does not fit of points, and what nothing checks."""
+    found, of = group.found, group.of
+    if group.placed.mirrored:
+        if of == "control":
+            yield remark("control_mirrored", chi2=group.placed.unmirrored, mirrored=found.statistic)
+        return
+    if found.exchanged:
+        yield remark("given_exchanged", of=of, given=[group.names[k] for k in found.exchanged])
+    if found.wrong:
+        yield _left_out(group, task.unit)
+    if found.doubtful:
+        yield _doubtful(group)
+    if group.rounded:
+        sigma = float(np.sqrt(group.points.stated.max()))
+        step, used = (sigma * np.sqrt(12), task.unit), (sigma, task.unit)
+        yield remark("given_rounded", of=of, step=step, sigma=used)
+    if task.datum.kind == "control":
+        yield from _unchecked(of, group.names, group.placed.model, found.wrong)
+    if found.factor == 1.0 or group.rounded or group.placed.model.estimated:
+        return
+    covariance = (task.network.control if of == "control" else task.network.exterior).covariance
+    of_points = covariance[group.rows, :3, :3]
+    if not of_points[np.isfinite(of_points)].any():
+        yield remark("given_not_exact", of=of, sigma=(found.factor, task.unit))
+    else:
+        used_factor = found.factor if task.rescale else None
+        yield remark("given_sigmas", of=of, factor=found.factor, used=used_factor)
+
+
+def _left_out(group: _Group, unit: str) -> Remark:
+    model, out = group.placed.model, group.out
+    sizes = [np.linalg.norm(model.v[model.item == k]) for k in out]
+    sigmas = np.sqrt(model.kept().decreases()[0][list(out)].max())
+    return remark(
+        "given_left_out",
+        of=group.of,
+        given=[group.names[k] for k in out],
+        distance=(float(max(sizes)), unit),
+        sigmas=float(sigmas),
+    )
+
+
+def _doubtful(group: _Group) -> Remark:
+    found = group.found
+    # they take part with the standard deviations that their differences show
+    shift = float(_shifts(group.placed.model)[list(found.doubtful)].max())
+    if group.points.stated.any():
+        shift /= group.placed.model.factor()[0]
+    return remark(
+        "given_contradicted",
+        of=group.of,
+        given=[group.names[k] for k in found.doubtful],
+        chi2=found.statistic,
+        dof=found.dof,
+        shift=shift if np.isfinite(shift) else None,
+    )
+
+
+def _unchecked(
+    of: str, names: Sequence[str], model: GivenModel, without: tuple[int, ...] = ()
+) -> Iterator[Remark]:
+    """Yield remarks on given values of which nothing, or hardly anything, would find an error."""
+    reach = model.external(without)
+    nothing = [names[k] for k in np.flatnonzero(reach > UNCHECKED).tolist()]
+    if nothing:
+        yield remark("given_unchecked", given=nothing, of=of)
+    for k in np.flatnonzero((reach > WEAK) & (reach <= UNCHECKED)).tolist():
+        yield remark("given_weakly_checked", given=names[k], of=of, sigmas=float(reach[k]))
+
+
+def _judged_scales(task: _Task, groups: Sequence[_Group]) -> _Scales:
+    """Judge the scales of bars and of dependable points against one another."""
+    bars, places = task.network.scale_bars, task.places
+    scales: list[GivenScale] = []
+    names: list[str] = []
+    lengths: list[_Length] = []
+    for one in _lengths(bars):
+        b = one.bars[0]
+        ends = tuple(task.network.points[j] for j in (bars.start[b], bars.end[b]))
+        at = [places.of_point.get(name, -1) for name in ends]
+        if min(at) >= 0 and at[0] != at[1]:
+            scales.append(scale_of_length(one.length, one.sigma, places.xyz, at[0], at[1]))
+            given = f" ({significant(one.length)} {task.unit})" if one.contradicted else ""
+            names.append(f"{ends[0]} - {ends[1]}{given}")
+            lengths.append(one)
+    for group in groups:
+        found = _scale_of(task, group)
+        if found is not None:
+            scales.append(found)
+            names.append(group.of)
+    if not scales:
+        return _Scales(bars)
+    model = scale_model(tuple(scales), places.joint, places.redundancy)
+    judgement = judge_values(model, task.level)
+    tests = (GivenTest("scale", judgement.statistic, judgement.dof, judgement.probability),)
+    if len(scales) == 1:
+        return _Scales(bars, (remark("scale_unchecked", given=names[0]),), tests)
+    if judgement.fits:
+        return _Scales(bars, tuple(_unchecked("lengths", names, model)), tests)
+    if judgement.factor != 1.0:
+        used = judgement.factor if task.rescale else None
+        said = remark("given_sigmas", of="bars", factor=judgement.factor, used=used)
+        return _Scales(replace(bars, sigma=(used or 1.0) * bars.sigma), (said,), tests)
+    out, remarks = _contradicting_scales(model, judgement, names, lengths)
+    keep: BoolArray = np.ones(len(bars), dtype=bool)
+    keep[out] = False
+    kept = ScaleBars(bars.start[keep], bars.end[keep], bars.length[keep], bars.sigma[keep])
+    return _Scales(kept, remarks, tests)
+
+
+def _scale_of(task: _Task, group: _Group) -> GivenScale | None:
+    """Return the scale by given points; by their distance where there are two."""
+    points, complete, places = group.points, group.points.complete, task.places
+    if len(complete) == 2 and points.known.sum() == 6:
+        apart = points.given[complete[1]] - points.given[complete[0]]
+        length = float(np.linalg.norm(apart))
+        if not length > 0:
             return None
-        points, complete = group.points, group.points.complete
-        if len(complete) == 2 and points.known.sum() == 6:
-            apart = points.given[complete[1]] - points.given[complete[0]]
-            length = float(np.linalg.norm(apart))
-            if not length > 0:
-                return None
-            e = apart / length
-            sigma = np.sqrt(e @ (points.stated[complete[0]] + points.stated[complete[1]]) @ e)
-            at = group.places[complete]
-            found = scale_of_length(length, float(sigma), self.places.xyz, int(at[0]), int(at[1]))
-        elif len(complete) < 3 or group.placed.model.kept(group.out).dof < 0:
-            return None
-        else:
-            found = scale_of_points(points, group.placed, group.out, group.places, count)
-        if self.datum.kind != "control" and not points.stated.any():
-            return replace(found, variance=found.variance + PRINT_SIGMA**2)
-        return found
+        e = apart / length
+        sigma = np.sqrt(e @ (points.stated[complete[0]] + points.stated[complete[1]]) @ e)
+        at = group.places[complete]
+        found = scale_of_length(length, float(sigma), places.xyz, int(at[0]), int(at[1]))
+    elif len(complete) < 3 or group.placed.model.kept(group.out).dof < 0:
+        return None
+    else:
+        found = scale_of_points(points, group.placed, group.out, group.places, len(places.xyz))
+    if task.datum.kind != "control" and not points.stated.any():
+        return replace(found, variance=found.variance + PRINT_SIGMA**2)
+    return found
 
-    def _imprecise_bars(self, factor: float) -> None:
-        """Replace the standard deviations of bars that are too small."""
-        used = factor if self.rescale else None
-        self.remarks.append(remark("given_sigmas", of="bars", factor=factor, used=used))
-        bars = self.network.scale_bars
-        self.network = replace(self.network, scale_bars=replace(bars, sigma=(used or 1.0) * bars.sigma))
 
-    def _contradicting_scales(
-        self, model: GivenModel, judgement: Judgement, names: list[str], lengths: list[_Length]
-    ) -> None:
-        """Leave out bars that the others identify as wrong, or all where nothing shows which are wrong."""
-        bars, wrong = self.network.scale_bars, judgement.wrong
-        identified = bool(wrong) and max(wrong) < len(lengths)
-        out = [b for one in ([lengths[k] for k in wrong] if identified else lengths) for b in one.bars]
-        if identified:
-            kept = [k for k in range(len(names)) if k not in wrong]
-            others = _mean_scale(model, kept)
-            for k in wrong:
-                off, sigmas = float(model.v[k]) - others, float(np.sqrt(model.kept().decreases()[0][k]))
-                self.remarks.append(
-                    remark(
-                        "bar_left_out",
-                        bar=names[k],
-                        off=(100 * float(np.expm1(off)), "%"),
-                        sigmas=sigmas,
-                        unit_factor=_unit_factor(off),
-                    )
-                )
-        else:
-            which = judgement.doubtful or tuple(range(len(names)))
-            if wrong:  # the control, by many bars that may share their unit
-                which = tuple(range(len(names)))
-            off = float(np.ptp(model.v[list(which)]))
-            self.remarks.append(
-                remark(
-                    "scale_contradicted",
-                    given=[names[k] for k in which],
-                    off=(100 * float(np.expm1(off)), "%"),
-                    sigmas=float(np.sqrt(judgement.statistic)),
-                    unit_factor=_unit_factor(off),
-                )
+def _contradicting_scales(
+    model: GivenModel, judgement: Judgement, names: list[str], lengths: list[_Length]
+) -> tuple[list[int], tuple[Remark, ...]]:
+    """Return bars that the others identify as wrong, or all where nothing shows which are, and remarks."""
+    wrong = judgement.wrong
+    if wrong and max(wrong) < len(lengths):
+        others = _mean_scale(model, [k for k in range(len(names)) if k not in wrong])
+        sigmas = np.sqrt(model.kept().decreases()[0])
+        off_of = {k: float(model.v[k]) - others for k in wrong}
+        return [b for k in wrong for b in lengths[k].bars], tuple(
+            remark(
+                "bar_left_out",
+                bar=names[k],
+                off=(100 * float(np.expm1(off)), "%"),
+                sigmas=float(sigmas[k]),
+                unit_factor=_unit_factor(off),
             )
-        keep: BoolArray = np.ones(len(bars), dtype=bool)
-        keep[out] = False
-        self.network = replace(
-            self.network,
-            scale_bars=ScaleBars(bars.start[keep], bars.end[keep], bars.length[keep], bars.sigma[keep]),
+            for k, off in off_of.items()
         )
+    # the control may be wrong by many bars that share their unit
+    which = range(len(names)) if wrong or not judgement.doubtful else judgement.doubtful
+    off = float(np.ptp(model.v[list(which)]))
+    said = remark(
+        "scale_contradicted",
+        given=[names[k] for k in which],
+        off=(100 * float(np.expm1(off)), "%"),
+        sigmas=float(np.sqrt(judgement.statistic)),
+        unit_factor=_unit_factor(off),
+    )
+    return [b for one in lengths for b in one.bars], (said,)
 
 
 @dataclass(frozen=True)
