@@ -9,12 +9,15 @@ import pytest
 
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.solve import adjust
-from sfm.camera import project
+from sfm.camera import project, tangents_from_pixel
+from sfm.distortion.models import Role
 from sfm.network import Estimate, Network
+from sfm.orientation.resection.ransac import resect_robust
 from sfm.pipeline import run_survey
 from sfm.remarks.remark import of_kind
 from sfm.report.findings.findings import findings_of
 from sfm.survey.correspondences import merge_held
+from sfm.survey.diagnosis.own_camera import SCALES, TOLERANCE
 from sfm.survey.inputs.settings import AdjustSettings
 from tests.surveys import survey_of
 from tests.synthetic import make_network, seed_of
@@ -70,6 +73,22 @@ def test_a_photograph_of_another_state_is_left_out(share: float, left_out: bool)
     assert all(one.reason.kind in kinds for one in result.failed)
     assert not of_kind(result.remarks, "camera_per_photograph")
     assert result.adjustment.sigma0_px == pytest.approx(0.1, rel=0.1)
+
+
+def test_the_tolerance_is_that_of_half_a_step_of_c() -> None:
+    largest = []
+    for name in ("first", "second", "third"):
+        network, truth = make_network(seed_of(f"tolerance {name}"), images=8, points=60)
+        seen, camera = network.image_points, truth.cameras[0]
+        assert SCALES[1] / SCALES[0] == pytest.approx(1.05, abs=1e-3)
+        wrong = camera.with_parameters(np.where(camera.plays(Role.FOCAL), 1.025, 1.0) * camera.parameters)
+        for i in range(8):
+            rows = np.flatnonzero(seen.image == i)
+            uv = tangents_from_pixel(wrong, seen.xy[rows])
+            found = resect_robust(uv, truth.points[seen.point[rows]], tolerance=1.0)
+            lengths = np.linalg.norm(found.residuals, axis=1) * wrong.c_px
+            largest.append(float(lengths.max()) / max(camera.size_px))
+    assert TOLERANCE / 2 < max(largest) < TOLERANCE
 
 
 def test_photographs_that_fit_keep_their_camera() -> None:

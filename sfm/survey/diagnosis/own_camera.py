@@ -4,24 +4,25 @@ A zoom that slipped, a lens that was focused anew or a picture that was resample
 others at another scale. Its exterior orientation takes up a part of that, and the rejection of image points
 the rest, so that a photograph with a few accepted points would stand among the oriented ones.
 
-Tried are the photographs of which more points are rejected than chance makes. Each is adjusted alone on the
-points of the others, with the camera that it shares and with parameters of its own. These must be
-significant, and the likelihood must pay for them and for the search, as in `sfm.adjustment.hypotheses`. A
-photograph that loses the larger part of its points with either is left out.
+Tried are the photographs of which more points are rejected than chance makes. Each is adjusted alone on
+the points of the others, with the camera that it shares and with parameters of its own. The likelihood
+must pay for these and for the search, as in `sfm.adjustment.hypotheses`. A photograph that loses the
+larger part of its points with either is left out.
 
 Source: Rousseeuw and Leroy (1987), Robust Regression and Outlier Detection, sec. 1.2, for the larger part,
-the breakdown point of any estimate; Rissanen (1978), Automatica 14, for the likelihood of rejected points.
+the breakdown point of any estimate; Rissanen (1978), Automatica 14, for the likelihood of rejected points;
+Fischler and Bolles (1981), sec. II, for the triples that are tried.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.hypotheses.alternatives import ALPHA
-from sfm.adjustment.hypotheses.score import log_f_sf
 from sfm.adjustment.quality.statistics import more_than_chance
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
@@ -36,8 +37,7 @@ from sfm.remarks.remark import Remark, remark
 
 LARGER_PART = 0.5  # of image points or photographs; the others are then what does not fit
 SCALES = np.geomspace(0.5, 2.0, 29)  # of c that are tried, 5 % apart
-TOLERANCE_PX = 8.0  # largest residual of a point that fits with c to 2.5 %; the adjustment follows
-TRIALS = 300  # triples for each scale
+TOLERANCE = 1.5e-3  # of the longer side of the format: largest residual of what fits with c to 2.5 %
 OWN = ((Role.FOCAL,), (Role.FOCAL, Role.X0, Role.Y0, Role.RADIAL))  # the simple one first
 
 
@@ -152,7 +152,7 @@ def _own_camera(
     )
     nothing = np.zeros(len(camera.names), dtype=bool)
     shared = _alone(alone, _scaled_resection(camera, xy, points, np.ones(1)), points, nothing)
-    search = np.log(len(SCALES))
+    search = np.log(len(SCALES)) + np.log(len(OWN) * len(network.images) / ALPHA)
     best, most = None, 0.0
     for roles in OWN:
         own = camera.plays(*roles)
@@ -163,11 +163,8 @@ def _own_camera(
         sigma = max(sigma_px, found.sigma0_px)
         gain = _log_likelihood(found, camera, n, sigma) - _log_likelihood(shared, camera, n, sigma)
         q = int(own.sum())
-        log_p = log_f_sf(max(2 * gain / q, 0.0), q, found.redundancy)
         evidence = gain - q / 2 * np.log(2 * n) - search
-        if log_p < np.log(ALPHA / len(OWN) / len(network.images)) - search and evidence > most + np.log(
-            1 / ALPHA
-        ):
+        if evidence > most:
             best, most = (found, own), evidence
     if best is None:
         return None
@@ -212,16 +209,20 @@ def _scaled_resection(
 ) -> tuple[Camera, FloatArray, FloatArray] | None:
     """Return the camera with c multiplied by the factor that fits best, and the exterior orientation."""
     best: tuple[float, Camera, FloatArray, FloatArray] | None = None
+    tolerance_px = TOLERANCE * max(camera.size_px)
+    # one triple of points that fit, but for a probability of ALPHA in all
+    trials = math.ceil(math.log(ALPHA / len(SCALES)) / math.log1p(-((1 - LARGER_PART) ** 3)))
     for scale in scales:
         p = camera.parameters.copy()
         p[camera.parts[0]] *= scale
         one = camera.with_parameters(p)
-        tolerance = TOLERANCE_PX / one.c_px
-        found = resect_robust(tangents_from_pixel(one, xy), points, tolerance=tolerance, max_trials=TRIALS)
+        found = resect_robust(
+            tangents_from_pixel(one, xy), points, tolerance=tolerance_px / one.c_px, max_trials=trials
+        )
         if not found.found:
             continue
         squares = np.sum((found.residuals * one.c_px) ** 2, axis=1)
-        cost = float(np.minimum(np.where(np.isnan(squares), np.inf, squares), TOLERANCE_PX**2).sum())
+        cost = float(np.minimum(np.where(np.isnan(squares), np.inf, squares), tolerance_px**2).sum())
         if best is None or cost < best[0]:
             best = cost, one, found.position, found.rotation
     return None if best is None else best[1:]
