@@ -11,6 +11,7 @@ from sfm.network import Estimate, ImagePoints, Network
 from sfm.pipeline import run_survey
 from sfm.remarks.remark import kinds_of, remark
 from sfm.report.findings.findings import findings_of
+from sfm.survey.diagnosis.handedness import handedness_remarks
 from sfm.survey.inputs.checks.same_photographs import same_photographs
 from sfm.survey.inputs.given import KnownPoints, ScaleBar
 from tests.surveys import remarks_on_given, survey_of
@@ -37,6 +38,27 @@ def test_the_scale_of_one_bar_is_unchecked() -> None:
     assert (said.kind, said.names("given")) == ("scale_unchecked", ("1 - 10",))
     assert findings_of(one).verdict.level == "good"
     assert _kinds(network, truth, scale_bars=(_bar(truth, 0, 9), _bar(truth, 1, 8))) == ("good", ())
+
+
+@pytest.mark.parametrize("mirrored", [False, True])
+def test_only_given_points_in_space_check_the_handedness(mirrored: bool) -> None:
+    network, truth = _scene("handedness")
+    seen, last = network.image_points, np.array(truth.cameras[0].size_px) - 1
+    xy = seen.xy * (1, -1) + (0, last[1]) if mirrored else seen.xy
+    network = replace(network, image_points=replace(seen, xy=xy))
+    bars = (_bar(truth, 0, 9), _bar(truth, 1, 8))
+    chosen = [0, 5, 9, 14, 20, 25]
+    names = [network.points[j] for j in chosen]
+    space = KnownPoints.from_arrays(names, truth.points[chosen], 1e-4)
+    plane = KnownPoints.from_arrays(names, truth.points[chosen] * (1, 1, 0), 1e-4)
+    found = run_survey(survey_of(network, truth, scale_bars=bars))
+    assert "handedness_unchecked" in kinds_of(found.remarks) and findings_of(found).verdict.level == "good"
+    judged = kinds_of(run_survey(survey_of(network, truth, control=space)).remarks)
+    assert "handedness_unchecked" not in judged and ("control_mirrored" in judged) is mirrored
+    survey = survey_of(network, truth, control=plane)
+    assert kinds_of(handedness_remarks(survey, network)) == ("handedness_unchecked",)
+    camera = survey.cameras[0].model_copy(update={"images": ("*.png",)})
+    assert handedness_remarks(replace(survey, observations=None, cameras=(camera,)), network) == ()
 
 
 def test_of_a_bar_that_a_far_worse_one_checks_an_error_may_stay_unnoticed() -> None:

@@ -21,4 +21,11 @@ ROWS = (
         "a gross error or a mistyped coordinate",
         "Correct or remove the image points that are named.",
     ),
+    Kind(
+        "handedness_unchecked",
+        "note",
+        "Nothing checks whether image coordinates are mirrored: y must count downwards.",
+        "image points of a file, and neither control nor projection centres that do not lie in a plane",
+        "Compare the result with the object, or give four points that do not lie in a plane.",
+    ),
 )

@@ -46,6 +46,7 @@ from sfm.survey.adjusting.settling import (
     settle,
     treat,
 )
+from sfm.survey.diagnosis.handedness import handedness_remarks
 from sfm.survey.diagnosis.left_out import left_out_points, remarks_on_left_out, unused_image_points
 from sfm.survey.diagnosis.own_camera import Treated
 from sfm.survey.diagnosis.principal_distance import contradicted, far_principal_distances
@@ -445,4 +446,5 @@ def _remarks(
         *far_principal_distances(survey, adjustment.estimate, _sigma_of_c(adjustment)),
         *_pixels_unlike_squares(survey, adjustment.estimate),
         *datum_remarks(survey, adjustment.network),
+        *handedness_remarks(survey, adjustment.network),
     )
