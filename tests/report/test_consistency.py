@@ -94,7 +94,11 @@ def test_image_points_without_noise_are_a_good_survey(number: int) -> None:
     assert result.adjustment.is_exact and result.adjustment.sigma0 > 0
     verdict = findings_of(result).verdict
     assert verdict.level == "good"
-    assert {one.kind for one in verdict.remarks} == {"scale_undefined", "sigma_px_cautious"}
+    assert {one.kind for one in verdict.remarks} == {
+        "scale_undefined",
+        "sigma_px_cautious",
+        "handedness_unchecked",
+    }
 
 
 def test_residuals_are_rounding_up_to_a_billionth_of_the_coordinates() -> None:
