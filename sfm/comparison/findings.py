@@ -10,6 +10,7 @@ from sfm.comparison.causes import Cause
 from sfm.comparison.significance import ResultComparison
 from sfm.conventions import FloatArray
 from sfm.files.covariance_file import MAX_POINTS
+from sfm.remarks.kind import WRONG_SIGMAS
 from sfm.remarks.remark import Remark, remark
 from sfm.remarks.verdict import Level, Verdict, judge
 
@@ -18,7 +19,6 @@ HEADLINES: Mapping[Level, str] = {
     "fair": "The points were compared, and not tested.",
     "bad": "The results differ significantly.",
 }
-OTHER_SIGMAS = 5.0  # standard deviations from which on an interior orientation is another one
 
 
 def verdict_of_comparison(found: ResultComparison) -> Verdict:
@@ -111,7 +111,7 @@ def _interior(found: ResultComparison) -> Iterator[Remark]:
         with np.errstate(invalid="ignore", divide="ignore"):
             sigmas = np.where(one.sigma > 0, np.abs(one.difference) / one.sigma, 0.0)
         worst = int(np.argmax(sigmas))
-        if sigmas[worst] >= OTHER_SIGMAS:
+        if sigmas[worst] >= WRONG_SIGMAS:
             difference = float(abs(one.difference[worst])), one.units[worst]
             yield remark(
                 "interior_differs",

@@ -22,6 +22,9 @@ import numpy as np
 from sfm.display import listed
 from sfm.remarks.remark import SEVERITIES, Quantity, Remark, Severity
 
+# Standard deviations beyond which a value is wrong: noise makes so large an error once in a million
+# coordinates, and where it is the root mean square of all, nothing of a result is right.
+WRONG_SIGMAS = 5.0
 NOUNS = {  # what a remark may be of, by the names in its data
     "bars": "the scale bars",
     "centres": "the projection centres",

@@ -27,11 +27,11 @@ from sfm.adjustment.hypotheses.families import (
 )
 from sfm.adjustment.hypotheses.score import DETERMINED, Gain, Reduced, reduce_adjustment
 from sfm.adjustment.result import Adjustment
+from sfm.remarks.kind import WRONG_SIGMAS
 from sfm.remarks.remark import Remark, remark
 from sfm.similarity import without_motions
 
 POWER = 0.80  # with which a detectable error is found; Baarda (1968)
-UNCHECKED = 5.0  # standard deviations by which an error may shift coordinates before it is found
 ROWS = 30  # alternatives among which the level is shared: families by patterns, and held parameters
 
 
@@ -50,7 +50,7 @@ def unchecked_assumptions(a: Adjustment) -> tuple[Remark, ...]:
     held: dict[str, dict[str, float]] = defaultdict(dict)
     for one in _typical(a, reduced):
         reach = reach_of(one, a, reduced, columns)
-        if not reach > UNCHECKED:
+        if not reach > WRONG_SIGMAS:
             continue
         if isinstance(one.family, InteriorFamily):
             index, s = one.parameters[0]

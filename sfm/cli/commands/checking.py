@@ -35,7 +35,6 @@ LIBRARIES = (
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "firefox", "safari", "msedge")
 MIN_FREE_GB = 1.0
 CENTRE_PX = 0.1  # largest error of a drawn dot
-TESTED_SIGMAS = 5.0  # largest error of a point of the tested network, in standard deviations
 
 
 def doctor() -> None:
@@ -113,13 +112,15 @@ def _check_adjustment() -> str:
     """Compare the adjustment of a made-up network with the truth."""
     import numpy as np
 
+    from sfm.remarks.kind import WRONG_SIGMAS
+
     found, truth = _tested_network()
     if not found.converged:
         raise KolinearError("the adjustment did not converge")
     moved = np.linalg.norm(found.estimate.points - truth.points, axis=1)
     sigma = np.sqrt(np.trace(found.covariance.points, axis1=1, axis2=2))
     worst = float((moved / sigma).max())
-    if worst > TESTED_SIGMAS:
+    if worst > WRONG_SIGMAS:
         raise KolinearError(f"a point is {worst:.1f} standard deviations off")
     return f"{len(truth.points)} points, worst {worst:.1f} standard deviations off"
 

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from sfm.remarks.catalogue.hypotheses import WRONG
-from sfm.remarks.kind import Grade, Kind
+from sfm.remarks.kind import WRONG_SIGMAS, Grade, Kind
 
 CHECK_THE_LIST = "a number mistyped, the wrong ends or name, another unit, or a point that moved"
 # What a test rejects is worth a warning, and is an error where it shifts the result beyond what is right.
-DETECTED = Grade("shift", error=WRONG)
+DETECTED = Grade("shift", error=WRONG_SIGMAS)
 
 ROWS = (
     Kind(

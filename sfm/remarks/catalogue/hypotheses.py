@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from sfm.remarks.kind import Grade, Kind
+from sfm.remarks.kind import WRONG_SIGMAS, Grade, Kind
 
 # Standard deviations by which a coordinate shifts with the alternative. Below 3 a result stays within the
-# limits that anybody expects; where the root mean square of all coordinates is 5, nothing of it is right.
-WRONG = 5.0
-SHIFT = Grade("shift", warning=3.0, also=Grade("rms", warning=WRONG, error=WRONG))
+# limits that anybody expects.
+SHIFT = Grade("shift", warning=3.0, also=Grade("rms", warning=WRONG_SIGMAS, error=WRONG_SIGMAS))
 LOCAL = Grade("shift", warning=3.0)  # of a few points, which the remark names
 SHIFTED = "Coordinates shift by up to {shift} standard deviations, {rms} RMS."
 INSTEAD = "[[ The image points do not separate this from: {instead}.]]"

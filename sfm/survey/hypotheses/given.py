@@ -35,13 +35,12 @@ from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.distributions import chi2_sf
 from sfm.errors import GeometryError
 from sfm.network import ExteriorObservations, Network, ObjectPoints, ScaleBars
-from sfm.remarks.kind import significant
+from sfm.remarks.kind import WRONG_SIGMAS, significant
 from sfm.remarks.remark import Remark, remark
 from sfm.similarity import Similarity
 
 UNIT_FACTORS = (10.0, 12.0, 25.4, 100.0, 304.8, 1000.0)  # between mm, cm, m, inch and foot
 SAME_UNIT = 0.02  # relative difference up to which a factor is that of a unit; 10 and 12 are 0.2 apart
-WEAK = 5.0  # standard deviations by which an error that no test finds may shift the result; it is wrong then
 CHECKABLE = 0.01  # redundancy number below which nothing checks a value; Foerstner (1987), CVGIP 40(3)
 UNCHECKED = NONCENTRALITY * ((1 - CHECKABLE) / CHECKABLE) ** 0.5  # the same as external reliability, 41
 PRINT_SIGMA = (
@@ -394,7 +393,7 @@ def _unchecked(
     nothing = [names[k] for k in np.flatnonzero(reach > UNCHECKED).tolist()]
     if nothing:
         yield remark("given_unchecked", given=nothing, of=of)
-    for k in np.flatnonzero((reach > WEAK) & (reach <= UNCHECKED)).tolist():
+    for k in np.flatnonzero((reach > WRONG_SIGMAS) & (reach <= UNCHECKED)).tolist():
         yield remark("given_weakly_checked", given=names[k], of=of, sigmas=float(reach[k]))
 
 
