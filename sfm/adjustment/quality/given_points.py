@@ -23,7 +23,7 @@ from sfm.similarity import Similarity, fit_similarity, similarity_motions
 MAX_TRIPLES = (
     300  # similarities by three points that are tried: with half of them right, 37 are by three such
 )
-MAX_STEPS = 50  # of a similarity to the best one; far from convergence it is none
+MAX_STEPS = 20  # of a similarity to the best one; those to one that fits are fewer than ten
 MAX_DECIMALS = 8  # of coordinates; more are those of computed ones
 SAME_DECIMAL = 1e-6  # by which a number in its last place may differ from a whole one, by its binary rounding
 ROUNDING = 16 * np.finfo(float).eps  # of coordinates after a similarity, over the largest of them
@@ -195,9 +195,9 @@ def _placed(
         # at what most agree upon, the others are left out before they move it
         at_start = judge_values(points.model(placing, estimated=estimated), level, given) if k else None
         found = _judged(points, placing, _left_out(at_start), level, estimated)
-        if found is not None and found.judgement.fits:
+        if found.judgement.fits:
             return found
-        if found is not None and (best is None or found.judgement.misfit < best.judgement.misfit):
+        if best is None or found.judgement.misfit < best.judgement.misfit:
             best = found
     return best
 
@@ -209,16 +209,13 @@ def _left_out(judgement: Judgement | None) -> tuple[int, ...]:
 
 def _judged(
     points: GivenPoints, placing: Similarity, out: tuple[int, ...], level: float, estimated: bool
-) -> PlacedPoints | None:
+) -> PlacedPoints:
     """Judge points at the similarity that fits them best, until it is without those that are wrong."""
     given = points.given.ravel()[np.flatnonzero(points.known.ravel())]
     tried: set[tuple[int, ...]] = set()
     while True:
         tried.add(out)
-        converged = _converged(points, placing, out, estimated)
-        if converged is None:
-            return None
-        placing, model = converged
+        placing, model = _converged(points, placing, out, estimated)
         judgement = judge_values(model, level, given)
         out = _left_out(judgement)
         if out in tried:
@@ -227,21 +224,22 @@ def _judged(
 
 def _converged(
     points: GivenPoints, placing: Similarity, without: tuple[int, ...], estimated: bool
-) -> tuple[Similarity, GivenModel] | None:
-    """Return the similarity that fits points best, some left out, and the model at it; None if none does.
+) -> tuple[Similarity, GivenModel]:
+    """Return the similarity that fits points best, some left out, and the model at it.
 
-    A step that changes no coordinate beyond their linear dependence or their rounding is the last one.
+    A step that changes no coordinate beyond their linear dependence or their rounding is the last one. Points
+    that do not fit at all, mirrored ones, need not converge, and are judged where the last step ended.
     """
     model = points.model(placing, estimated=estimated)
     for _ in range(MAX_STEPS):
         moved = points.moved(placing, model, without)
         X, Y = placing.apply(points.free), moved.apply(points.free)
         if not np.isfinite(Y).all():
-            return None
+            break
         placing, model = moved, points.model(moved, estimated=estimated)
         if np.abs(Y - X).max() <= RANK * _centre_and_size(Y)[1] + ROUNDING * np.abs(Y).max():
-            return placing, model
-    return None
+            break
+    return placing, model
 
 
 def _starts(points: GivenPoints, start: Similarity | None) -> Iterator[Similarity]:
