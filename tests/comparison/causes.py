@@ -50,7 +50,9 @@ def pair(case: str, number: int) -> tuple[StoredResult, StoredResult]:
     """Return two results, the second of which differs as the case says."""
     rng = seed_of(f"cause {case} {number}")
     points = int(rng.integers(25, 70))
-    flat = bool(rng.random() < 0.3) and case != "mirrored"  # a plane is its mirror image
+    flat = bool(rng.random() < 0.3)
+    if case in ("mirrored", "grown along x and y"):  # a plane is its mirror image, and its growth a scale
+        flat = False
     network, truth = make_network(rng, images=int(rng.integers(8, 15)), points=points, planar=flat)
     if flat:  # with a relief that is seen
         truth = replace(truth, points=truth.points + rng.uniform(-0.02, 0.02, (points, 3)) * [0, 0, 1])
