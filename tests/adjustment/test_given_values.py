@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sfm.adjustment.quality import given_values
+from sfm.adjustment.quality import given_points, given_values
 from sfm.adjustment.quality.given_points import (
     GivenPoints,
     judge_points,
@@ -138,12 +138,12 @@ def test_left_handed_points_are_mirrored(axes: tuple[int, int, int]) -> None:
     assert turned is not None and not turned.mirrored and turned.judgement.fits
 
 
-def test_precise_points_of_two_exchanged_axes_are_mirrored() -> None:
-    """The similarity of mirrored points may not converge, and fits nothing."""
-    for k in range(30):
-        one = points(8, f"exchanged axes {k}", noise=0.1 * SIGMA, network=2e-5)
-        found = judge_points(replace(one, given=one.given[:, [1, 0, 2]]), LEVEL)
-        assert found is not None and found.mirrored, k
+def test_points_whose_similarity_does_not_converge_are_judged(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Mirrored ones, which fit nothing."""
+    one = points(8, "exchanged axes")
+    monkeypatch.setattr(given_points, "MAX_STEPS", 1)
+    found = judge_points(replace(one, given=one.given[:, [1, 0, 2]]), LEVEL)
+    assert found is not None and found.mirrored
 
 
 def test_one_wrong_point_of_four_is_not_a_mirror() -> None:
