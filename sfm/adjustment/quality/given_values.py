@@ -295,8 +295,10 @@ def judge_values(model: GivenModel, level: float, exchange: FloatArray | None = 
         return replace(found, exchanged=swapped[0])
     if best == "factor":
         sets = _sets(model, cost)
-        # one wrong value of so few would look like standard deviations that are too small
-        if sets and scores[best] + APART < min(one.score for one in sets):
+        # one wrong value of so few would look like standard deviations that are too small, but for values of
+        # which each by itself is within what its test finds
+        unseen = float(np.sqrt(every.decreases()[0].max())) < NONCENTRALITY
+        if sets and (unseen or scores[best] + APART < min(one.score for one in sets)):
             return replace(found, factor=factor)
         return replace(found, doubtful=tuple(range(model.items)))
     assert removed is not None
