@@ -11,7 +11,7 @@ from sfm.network import ScaleBars
 from sfm.pipeline import run_survey
 from sfm.remarks.kind import WRONG_SIGMAS
 from sfm.remarks.remark import kinds_of
-from sfm.survey.hypotheses import given
+from sfm.survey.hypotheses import given, given_groups, given_scales
 from sfm.survey.inputs.given import KnownPoints, ScaleBar
 from tests.surveys import remarks_on_given, survey_of
 from tests.synthetic import make_network, observed_anew, seed_of
@@ -21,13 +21,13 @@ from tests.synthetic import make_network, observed_anew, seed_of
     ("factor", "unit"), [(1015.0, 1000.0), (1 / 985.0, 1000.0), (1030.0, None), (25.0, 25.4), (11.0, None)]
 )
 def test_a_factor_is_that_of_a_unit_within_two_percent(factor: float, unit: float | None) -> None:
-    assert given._unit_factor(float(np.log(factor))) == unit
+    assert given_scales._unit_factor(float(np.log(factor))) == unit
 
 
 def test_units_of_length() -> None:
     mm = {"mm": 1.0, "cm": 10.0, "inch": 25.4, "foot": 304.8, "m": 1000.0}
     apart = {max(a, b) / min(a, b) for a in mm.values() for b in mm.values() if a != b}
-    assert set(given.UNIT_FACTORS) <= {round(one, 6) for one in apart}
+    assert set(given_scales.UNIT_FACTORS) <= {round(one, 6) for one in apart}
 
 
 @pytest.mark.parametrize(("off", "contradicted"), [(0.006, False), (0.01, True)])
@@ -41,8 +41,8 @@ def test_a_print_may_be_half_a_percent_larger_than_stated(off: float, contradict
 
 
 def test_nothing_checks_a_value_whose_redundancy_number_is_below_a_hundredth() -> None:
-    assert given.CHECKABLE == 0.01 and WRONG_SIGMAS == 5.0
-    assert pytest.approx(4.13 * np.sqrt(99)) == given.UNCHECKED
+    assert given_groups.CHECKABLE == 0.01 and WRONG_SIGMAS == 5.0
+    assert pytest.approx(4.13 * np.sqrt(99)) == given_groups.UNCHECKED
 
 
 @pytest.mark.parametrize(
@@ -70,7 +70,7 @@ def test_a_bar_given_twice_counts_once() -> None:
         np.array([1.0, 1.0003, 1.2, 0.5, 2.0]),
         np.array([1e-4, 2e-4, 1e-4, 1e-4, 1e-4]),
     )
-    found = given._lengths(bars)
+    found = given_scales._lengths(bars)
     assert [one.bars for one in found] == [(0, 1), (2,), (3,), (4,)]
     assert [one.contradicted for one in found] == [True, True, False, False]
     assert found[0].length == pytest.approx(1.00006) and found[0].sigma == 1e-4
@@ -80,7 +80,7 @@ def test_a_bar_given_twice_counts_once() -> None:
 def test_bars_of_the_same_ends_agree_at_the_level(apart: float, agree: bool) -> None:
     length = np.array([1.0, 1.0 + apart * 1e-4 * np.sqrt(2)])
     bars = ScaleBars(np.array([0, 0]), np.array([1, 1]), length, np.array([1e-4, 1e-4]))
-    assert (len(given._lengths(bars)) == 1) == agree
+    assert (len(given_scales._lengths(bars)) == 1) == agree
 
 
 def test_a_wrong_bar_given_twice_does_not_outvote_a_right_one() -> None:

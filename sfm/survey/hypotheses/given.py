@@ -15,37 +15,22 @@ from sfm.adjustment.covariance import determines_cameras, marginal_of
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.quality.given_points import (
     GivenPoints,
-    GivenScale,
-    PlacedPoints,
     judge_points,
-    scale_model,
-    scale_of_length,
-    scale_of_points,
 )
 from sfm.adjustment.quality.given_values import (
-    LEVEL,
     NONCENTRALITY,
     GivenModel,
     GivenTest,
-    Judgement,
-    judge_values,
 )
 from sfm.adjustment.result import Adjustment
-from sfm.conventions import BoolArray, FloatArray, IntArray
-from sfm.distributions import chi2_sf
+from sfm.conventions import FloatArray
 from sfm.errors import GeometryError
 from sfm.network import ExteriorObservations, Network, ObjectPoints, ScaleBars
-from sfm.remarks.kind import WRONG_SIGMAS, significant
 from sfm.remarks.remark import Remark, remark
 from sfm.similarity import Similarity
+from sfm.survey.hypotheses.given_groups import Group, Places, Task, remarks_on_unchecked
+from sfm.survey.hypotheses.given_scales import judge_scales
 
-UNIT_FACTORS = (10.0, 12.0, 25.4, 100.0, 304.8, 1000.0)  # between mm, cm, m, inch and foot
-SAME_UNIT = 0.02  # relative difference up to which a factor is that of a unit; 10 and 12 are 0.2 apart
-CHECKABLE = 0.01  # redundancy number below which nothing checks a value; Foerstner (1987), CVGIP 40(3)
-UNCHECKED = NONCENTRALITY * ((1 - CHECKABLE) / CHECKABLE) ** 0.5  # the same as external reliability, 41
-PRINT_SIGMA = (
-    0.002  # relative scale of coordinates without standard deviations: paper swells by 1 to 2 permille
-)
 MAX_PLACES = 1000  # given points whose joint covariance is formed, 72 MB; of more, so many are judged
 
 
@@ -60,22 +45,6 @@ class JudgedGiven:
     placing: Similarity | None = (
         None  # object frame from that of the free network; None where nothing says it
     )
-
-
-@dataclass(frozen=True)
-class _Places:
-    """Points and projection centres of the free network with their joint covariance."""
-
-    xyz: FloatArray  # (p, 3)
-    joint: FloatArray  # (3 p, 3 p)
-    redundancy: int
-    of_point: dict[str, int]  # place of a point
-    of_image: dict[str, int]  # place of a photograph
-
-    def at(self, places: Sequence[int]) -> tuple[IntArray, IntArray]:
-        """Return indices of places, and of their coordinates."""
-        index = np.asarray(places, dtype=np.int64)
-        return index, (3 * index[:, None] + np.arange(3)).ravel()
 
 
 def without_given(network: Network) -> Network:
@@ -103,10 +72,10 @@ def judge_given(
         of = [name for name, some in kinds if len(some)]
         remarks = (remark("given_not_judged", of=of),) if of else ()
         return JudgedGiven(network, datum, remarks)
-    return _judged(_Task(network, places, datum, unit, rescale))
+    return _judged(Task(network, places, datum, unit, rescale))
 
 
-def _places(network: Network, free: Adjustment, datum: Datum) -> _Places | None:
+def _places(network: Network, free: Adjustment, datum: Datum) -> Places | None:
     """Return where the given points are in the free network; None where that does not determine them."""
     if not free.converged or free.undetermined or free.defect != free.expected_defect:
         return None
@@ -131,7 +100,7 @@ def _places(network: Network, free: Adjustment, datum: Datum) -> _Places | None:
         return None
     if not np.isfinite(joint).all() or not determines_cameras(marginal):
         return None
-    return _Places(
+    return Places(
         np.concatenate([free.estimate.position[stations], free.estimate.points[points]]),
         (joint + joint.T) / 2,
         free.redundancy,
@@ -140,94 +109,12 @@ def _places(network: Network, free: Adjustment, datum: Datum) -> _Places | None:
     )
 
 
-@dataclass(frozen=True)
-class _Task:
-    """What is judged, and how."""
-
-    network: Network  # with all that was given
-    places: _Places
-    datum: Datum  # that was asked for
-    unit: str
-    rescale: bool
-
-    @property
-    def level(self) -> float:
-        """Probability with which one kind of right given values is said to be wrong."""
-        kinds = (self.network.scale_bars, self.network.control, self.network.exterior)
-        return LEVEL / max(sum(len(one) > 0 for one in kinds), 1)
-
-
-@dataclass(frozen=True)
-class _Group:
-    """Given points of a kind, judged."""
-
-    of: str  # control or centres
-    rows: IntArray  # of the kind in the network, (n,)
-    names: tuple[str, ...]
-    points: GivenPoints
-    places: IntArray  # (n,)
-    placed: PlacedPoints
-    rounded: bool = False  # whether the standard deviations are those of the rounding
-
-    @property
-    def found(self) -> Judgement:
-        """What is wrong of them."""
-        return self.placed.judgement
-
-    @property
-    def out(self) -> tuple[int, ...]:
-        """Those that were left out."""
-        return self.found.wrong
-
-    @property
-    def dependable(self) -> bool:
-        """Whether a scale may rest on them."""
-        return not (self.placed.mirrored or self.found.doubtful)
-
-    @property
-    def test(self) -> GivenTest:
-        """Test of all of them."""
-        return GivenTest(self.of, self.found.statistic, self.found.dof, self.found.probability)
-
-    def as_judged(self, covariance: FloatArray, *, rescale: bool) -> tuple[IntArray, BoolArray, FloatArray]:
-        """Return whose coordinates each given point has, which take part, and their covariance, (n, 3, 3)."""
-        order, keep = np.arange(len(covariance)), np.ones(len(covariance), dtype=bool)
-        if self.found.exchanged:
-            pair = self.rows[list(self.found.exchanged)]
-            order[pair] = pair[::-1]
-        keep[self.rows[list(self.out)]] = False
-        changed = covariance[order]
-        changed[self.rows] = self._confirmed(changed[self.rows], rescale)
-        return order, keep, changed
-
-    def _confirmed(self, covariance: FloatArray, rescale: bool) -> FloatArray:
-        """Return the covariance of the points with which they fit."""
-        known = np.isfinite(covariance)
-        if self.rounded:
-            return np.where(known, self.points.stated, covariance)
-        fixed = not np.where(known, covariance, 0.0).any()
-        changes = bool(self.found.doubtful) or self.found.factor != 1.0
-        if fixed or not rescale or not changes or self.placed.model.estimated:
-            return covariance
-        factor = self.placed.model.factor()[0] if self.found.doubtful else self.found.factor
-        return np.where(known, factor**2 * covariance, covariance)
-
-
-@dataclass(frozen=True)
-class _Scales:
-    """Scale bars as judged, and what was found of them and of the scale of given points."""
-
-    bars: ScaleBars  # that take part
-    remarks: tuple[Remark, ...] = ()
-    tests: tuple[GivenTest, ...] = ()
-
-
-def _judged(task: _Task) -> JudgedGiven:
+def _judged(task: Task) -> JudgedGiven:
     """Judge points, then the scales of bars and points."""
     network, datum = task.network, task.datum
     control, centres = _control_of(task), _centres_of(task)
     groups = [one for one in (control, centres) if one is not None]
-    scales = _judged_scales(task, [one for one in groups if one.dependable])
+    scales = judge_scales(task, [one for one in groups if one.dependable])
     network = replace(network, scale_bars=scales.bars)
     if control is not None:
         network = replace(network, control=_judged_control(task, control))
@@ -244,19 +131,19 @@ def _judged(task: _Task) -> JudgedGiven:
     )
 
 
-def _control_of(task: _Task) -> _Group | None:
+def _control_of(task: Task) -> Group | None:
     control = task.network.control
     names = [task.network.points[j] for j in control.point]
     return _group(task, "control", names, task.places.of_point, control.xyz, control.covariance)
 
 
-def _centres_of(task: _Task) -> _Group | None:
+def _centres_of(task: Task) -> Group | None:
     seen = task.network.exterior
     names = [task.network.images[i] for i in seen.image]
     return _group(task, "centres", names, task.places.of_image, seen.position, seen.covariance[:, :3, :3])
 
 
-def _judged_control(task: _Task, group: _Group) -> ObjectPoints:
+def _judged_control(task: Task, group: Group) -> ObjectPoints:
     """Return control without what does not fit, or changed."""
     control = task.network.control
     if group.placed.mirrored:
@@ -265,7 +152,7 @@ def _judged_control(task: _Task, group: _Group) -> ObjectPoints:
     return ObjectPoints(control.point[keep], control.xyz[order][keep], covariance[keep])
 
 
-def _judged_centres(task: _Task, group: _Group) -> ExteriorObservations:
+def _judged_centres(task: Task, group: Group) -> ExteriorObservations:
     """Return observed orientation without projection centres that do not fit, or changed."""
     seen = task.network.exterior
     order, keep, of_centres = group.as_judged(seen.covariance[:, :3, :3], rescale=task.rescale)
@@ -277,13 +164,13 @@ def _judged_centres(task: _Task, group: _Group) -> ExteriorObservations:
 
 
 def _group(
-    task: _Task,
+    task: Task,
     of: str,
     names: Sequence[str],
     place_of: dict[str, int],
     xyz: FloatArray,
     covariance: FloatArray,
-) -> _Group | None:
+) -> Group | None:
     """Judge points of a kind against the free network; None without such."""
     given = np.where(np.isfinite(np.einsum("nii->ni", covariance)), xyz, np.nan)
     placed_there = np.array([name in place_of for name in names], dtype=bool)
@@ -304,7 +191,7 @@ def _group(
     placed = judge_points(points, task.level, start=start, estimated=fixed and not in_datum)
     if placed is None:
         return None
-    group = _Group(of, rows, tuple(names[k] for k in rows.tolist()), points, index, placed)
+    group = Group(of, rows, tuple(names[k] for k in rows.tolist()), points, index, placed)
     if fixed and in_datum and task.rescale and not placed.judgement.fits:
         group = _rounded(group, start, task.level)
     found = group.found
@@ -317,7 +204,7 @@ def _group(
     return replace(group, points=points, placed=placed)
 
 
-def _rounded(group: _Group, start: Similarity | None, level: float) -> _Group:
+def _rounded(group: Group, start: Similarity | None, level: float) -> Group:
     """Judge fixed coordinates again, as precise as their decimals, where these explain the misfit."""
     points = group.points.rounded()
     placed = judge_points(points, level, start=start) if points.stated.any() else None
@@ -326,7 +213,7 @@ def _rounded(group: _Group, start: Similarity | None, level: float) -> _Group:
     return replace(group, points=points, placed=placed, rounded=True)
 
 
-def _remarks_on(task: _Task, group: _Group) -> Iterator[Remark]:
+def _remarks_on(task: Task, group: Group) -> Iterator[Remark]:
     """Yield what does not fit of points, and what nothing checks."""
     found, of = group.found, group.of
     if group.placed.mirrored:
@@ -344,7 +231,7 @@ def _remarks_on(task: _Task, group: _Group) -> Iterator[Remark]:
         step, used = (sigma * np.sqrt(12), task.unit), (sigma, task.unit)
         yield remark("given_rounded", of=of, step=step, sigma=used)
     if task.datum.kind == "control":
-        yield from _unchecked(of, group.names, group.placed.model, found.wrong)
+        yield from remarks_on_unchecked(of, group.names, group.placed.model, found.wrong)
     if found.factor == 1.0 or group.rounded or group.placed.model.estimated:
         return
     covariance = (task.network.control if of == "control" else task.network.exterior).covariance
@@ -356,7 +243,7 @@ def _remarks_on(task: _Task, group: _Group) -> Iterator[Remark]:
         yield remark("given_sigmas", of=of, factor=found.factor, used=used_factor)
 
 
-def _left_out(group: _Group, unit: str) -> Remark:
+def _left_out(group: Group, unit: str) -> Remark:
     model, out = group.placed.model, group.out
     sizes = [np.linalg.norm(model.v[model.item == k]) for k in out]
     sigmas = np.sqrt(model.kept().decreases()[0][list(out)].max())
@@ -369,7 +256,7 @@ def _left_out(group: _Group, unit: str) -> Remark:
     )
 
 
-def _doubtful(group: _Group) -> Remark:
+def _doubtful(group: Group) -> Remark:
     found = group.found
     # they take part with the standard deviations that their differences show
     shift = float(_shifts(group.placed.model)[list(found.doubtful)].max())
@@ -383,162 +270,6 @@ def _doubtful(group: _Group) -> Remark:
         dof=found.dof,
         shift=shift if np.isfinite(shift) else None,
     )
-
-
-def _unchecked(
-    of: str, names: Sequence[str], model: GivenModel, without: tuple[int, ...] = ()
-) -> Iterator[Remark]:
-    """Yield remarks on given values of which nothing, or hardly anything, would find an error."""
-    reach = model.external(without)
-    nothing = [names[k] for k in np.flatnonzero(reach > UNCHECKED).tolist()]
-    if nothing:
-        yield remark("given_unchecked", given=nothing, of=of)
-    for k in np.flatnonzero((reach > WRONG_SIGMAS) & (reach <= UNCHECKED)).tolist():
-        yield remark("given_weakly_checked", given=names[k], of=of, sigmas=float(reach[k]))
-
-
-def _judged_scales(task: _Task, groups: Sequence[_Group]) -> _Scales:
-    """Judge the scales of bars and of dependable points against one another."""
-    bars, places = task.network.scale_bars, task.places
-    scales: list[GivenScale] = []
-    names: list[str] = []
-    lengths: list[_Length] = []
-    for one in _lengths(bars):
-        b = one.bars[0]
-        ends = tuple(task.network.points[j] for j in (bars.start[b], bars.end[b]))
-        at = [places.of_point.get(name, -1) for name in ends]
-        if min(at) >= 0 and at[0] != at[1]:
-            scales.append(scale_of_length(one.length, one.sigma, places.xyz, at[0], at[1]))
-            given = f" ({significant(one.length)} {task.unit})" if one.contradicted else ""
-            names.append(f"{ends[0]} - {ends[1]}{given}")
-            lengths.append(one)
-    for group in groups:
-        found = _scale_of(task, group)
-        if found is not None:
-            scales.append(found)
-            names.append(group.of)
-    if not scales:
-        return _Scales(bars)
-    model = scale_model(tuple(scales), places.joint, places.redundancy)
-    judgement = judge_values(model, task.level)
-    tests = (GivenTest("scale", judgement.statistic, judgement.dof, judgement.probability),)
-    if len(scales) == 1:
-        return _Scales(bars, (remark("scale_unchecked", given=names[0]),), tests)
-    if judgement.fits:
-        return _Scales(bars, tuple(_unchecked("lengths", names, model)), tests)
-    if judgement.factor != 1.0:
-        used = judgement.factor if task.rescale else None
-        said = remark("given_sigmas", of="bars", factor=judgement.factor, used=used)
-        return _Scales(replace(bars, sigma=(used or 1.0) * bars.sigma), (said,), tests)
-    out, remarks = _contradicting_scales(model, judgement, names, lengths)
-    keep: BoolArray = np.ones(len(bars), dtype=bool)
-    keep[out] = False
-    kept = ScaleBars(bars.start[keep], bars.end[keep], bars.length[keep], bars.sigma[keep])
-    return _Scales(kept, remarks, tests)
-
-
-def _scale_of(task: _Task, group: _Group) -> GivenScale | None:
-    """Return the scale by given points; by their distance where there are two."""
-    points, complete, places = group.points, group.points.complete, task.places
-    if len(complete) == 2 and points.known.sum() == 6:
-        apart = points.given[complete[1]] - points.given[complete[0]]
-        length = float(np.linalg.norm(apart))
-        if not length > 0:
-            return None
-        e = apart / length
-        sigma = np.sqrt(e @ (points.stated[complete[0]] + points.stated[complete[1]]) @ e)
-        at = group.places[complete]
-        found = scale_of_length(length, float(sigma), places.xyz, int(at[0]), int(at[1]))
-    elif len(complete) < 3 or group.placed.model.kept(group.out).dof < 0:
-        return None
-    else:
-        found = scale_of_points(points, group.placed, group.out, group.places, len(places.xyz))
-    if task.datum.kind != "control" and not points.stated.any():
-        return replace(found, variance=found.variance + PRINT_SIGMA**2)
-    return found
-
-
-def _contradicting_scales(
-    model: GivenModel, judgement: Judgement, names: list[str], lengths: list[_Length]
-) -> tuple[list[int], tuple[Remark, ...]]:
-    """Return bars that the others identify as wrong, or all where nothing shows which are, and remarks."""
-    wrong = judgement.wrong
-    if wrong and max(wrong) < len(lengths):
-        others = _mean_scale(model, [k for k in range(len(names)) if k not in wrong])
-        sigmas = np.sqrt(model.kept().decreases()[0])
-        off_of = {k: float(model.v[k]) - others for k in wrong}
-        return [b for k in wrong for b in lengths[k].bars], tuple(
-            remark(
-                "bar_left_out",
-                bar=names[k],
-                off=(100 * float(np.expm1(off)), "%"),
-                sigmas=float(sigmas[k]),
-                unit_factor=_unit_factor(off),
-            )
-            for k, off in off_of.items()
-        )
-    # the control may be wrong by many bars that share their unit
-    which = range(len(names)) if wrong or not judgement.doubtful else judgement.doubtful
-    off = float(np.ptp(model.v[list(which)]))
-    said = remark(
-        "scale_contradicted",
-        given=[names[k] for k in which],
-        off=(100 * float(np.expm1(off)), "%"),
-        sigmas=float(np.sqrt(judgement.statistic)),
-        unit_factor=_unit_factor(off),
-    )
-    return [b for one in lengths for b in one.bars], (said,)
-
-
-@dataclass(frozen=True)
-class _Length:
-    """A length between two points, given once or several times alike."""
-
-    bars: tuple[int, ...]
-    length: float  # mean by weights
-    sigma: float  # of the best: to give it twice makes it no better
-    contradicted: bool  # whether another length is given between the same points
-
-
-def _lengths(bars: ScaleBars) -> list[_Length]:
-    """Return the lengths that scale bars give, those between the same points once where they agree."""
-    same: dict[frozenset[int], list[list[int]]] = {}
-    for b in np.argsort(bars.length, kind="stable").tolist():
-        alike = same.setdefault(frozenset((int(bars.start[b]), int(bars.end[b]))), [])
-        if alike and _agree(bars, alike[-1][0], b):
-            alike[-1].append(b)
-        else:
-            alike.append([b])
-    found = [
-        _Length(
-            tuple(some),
-            float(np.average(bars.length[some], weights=1 / bars.sigma[some] ** 2)),
-            float(bars.sigma[some].min()),
-            len(alike) > 1,
-        )
-        for alike in same.values()
-        for some in alike
-    ]
-    return sorted(found, key=lambda one: min(one.bars))
-
-
-def _agree(bars: ScaleBars, a: int, b: int) -> bool:
-    """Return whether two lengths differ by no more than their standard deviations allow."""
-    variance = float(bars.sigma[a] ** 2 + bars.sigma[b] ** 2)
-    return bool(chi2_sf((bars.length[b] - bars.length[a]) ** 2 / variance, 1) >= LEVEL)
-
-
-def _mean_scale(model: GivenModel, kept: list[int]) -> float:
-    """Return the mean logarithm of scales by their stated standard deviations."""
-    variance = np.diagonal(model.network + model.stated)[kept]
-    weight = 1 / np.maximum(variance, np.finfo(float).tiny)
-    return float(weight @ model.v[kept] / weight.sum())
-
-
-def _unit_factor(log: float) -> float | None:
-    """Return the factor between two units that a difference of scale is; None if it is none."""
-    factor = float(np.exp(abs(log)))
-    return next((one for one in UNIT_FACTORS if abs(factor / one - 1) < SAME_UNIT), None)
 
 
 def _shifts(model: GivenModel) -> FloatArray:

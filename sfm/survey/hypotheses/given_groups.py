@@ -1,0 +1,120 @@
+"""Given values with what they are judged by: the free network, and a kind of given points as judged."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from sfm.adjustment.datum import Datum
+from sfm.adjustment.quality.given_points import GivenPoints, PlacedPoints
+from sfm.adjustment.quality.given_values import LEVEL, NONCENTRALITY, GivenModel, GivenTest, Judgement
+from sfm.conventions import BoolArray, FloatArray, IntArray
+from sfm.network import Network
+from sfm.remarks.kind import WRONG_SIGMAS
+from sfm.remarks.remark import Remark, remark
+
+CHECKABLE = 0.01  # redundancy number below which nothing checks a value; Foerstner (1987), CVGIP 40(3)
+UNCHECKED = NONCENTRALITY * ((1 - CHECKABLE) / CHECKABLE) ** 0.5  # the same as external reliability, 41
+
+
+@dataclass(frozen=True)
+class Places:
+    """Points and projection centres of the free network with their joint covariance."""
+
+    xyz: FloatArray  # (p, 3)
+    joint: FloatArray  # (3 p, 3 p)
+    redundancy: int
+    of_point: dict[str, int]  # place of a point
+    of_image: dict[str, int]  # place of a photograph
+
+    def at(self, places: Sequence[int]) -> tuple[IntArray, IntArray]:
+        """Return indices of places, and of their coordinates."""
+        index = np.asarray(places, dtype=np.int64)
+        return index, (3 * index[:, None] + np.arange(3)).ravel()
+
+
+@dataclass(frozen=True)
+class Task:
+    """What is judged, and how."""
+
+    network: Network  # with all that was given
+    places: Places
+    datum: Datum  # that was asked for
+    unit: str
+    rescale: bool
+
+    @property
+    def level(self) -> float:
+        """Probability with which one kind of right given values is said to be wrong."""
+        kinds = (self.network.scale_bars, self.network.control, self.network.exterior)
+        return LEVEL / max(sum(len(one) > 0 for one in kinds), 1)
+
+
+@dataclass(frozen=True)
+class Group:
+    """Given points of a kind, judged."""
+
+    of: str  # control or centres
+    rows: IntArray  # of the kind in the network, (n,)
+    names: tuple[str, ...]
+    points: GivenPoints
+    places: IntArray  # (n,)
+    placed: PlacedPoints
+    rounded: bool = False  # whether the standard deviations are those of the rounding
+
+    @property
+    def found(self) -> Judgement:
+        """What is wrong of them."""
+        return self.placed.judgement
+
+    @property
+    def out(self) -> tuple[int, ...]:
+        """Those that were left out."""
+        return self.found.wrong
+
+    @property
+    def dependable(self) -> bool:
+        """Whether a scale may rest on them."""
+        return not (self.placed.mirrored or self.found.doubtful)
+
+    @property
+    def test(self) -> GivenTest:
+        """Test of all of them."""
+        return GivenTest(self.of, self.found.statistic, self.found.dof, self.found.probability)
+
+    def as_judged(self, covariance: FloatArray, *, rescale: bool) -> tuple[IntArray, BoolArray, FloatArray]:
+        """Return whose coordinates each given point has, which take part, and their covariance, (n, 3, 3)."""
+        order, keep = np.arange(len(covariance)), np.ones(len(covariance), dtype=bool)
+        if self.found.exchanged:
+            pair = self.rows[list(self.found.exchanged)]
+            order[pair] = pair[::-1]
+        keep[self.rows[list(self.out)]] = False
+        changed = covariance[order]
+        changed[self.rows] = self._confirmed(changed[self.rows], rescale)
+        return order, keep, changed
+
+    def _confirmed(self, covariance: FloatArray, rescale: bool) -> FloatArray:
+        """Return the covariance of the points with which they fit."""
+        known = np.isfinite(covariance)
+        if self.rounded:
+            return np.where(known, self.points.stated, covariance)
+        fixed = not np.where(known, covariance, 0.0).any()
+        changes = bool(self.found.doubtful) or self.found.factor != 1.0
+        if fixed or not rescale or not changes or self.placed.model.estimated:
+            return covariance
+        factor = self.placed.model.factor()[0] if self.found.doubtful else self.found.factor
+        return np.where(known, factor**2 * covariance, covariance)
+
+
+def remarks_on_unchecked(
+    of: str, names: Sequence[str], model: GivenModel, without: tuple[int, ...] = ()
+) -> Iterator[Remark]:
+    """Yield remarks on given values of which nothing, or hardly anything, would find an error."""
+    reach = model.external(without)
+    nothing = [names[k] for k in np.flatnonzero(reach > UNCHECKED).tolist()]
+    if nothing:
+        yield remark("given_unchecked", given=nothing, of=of)
+    for k in np.flatnonzero((reach > WRONG_SIGMAS) & (reach <= UNCHECKED)).tolist():
+        yield remark("given_weakly_checked", given=names[k], of=of, sigmas=float(reach[k]))

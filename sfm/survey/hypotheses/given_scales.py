@@ -1,0 +1,181 @@
+"""Lengths of scale bars, and the scales of control and projection centres, judged against one another."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from sfm.adjustment.quality.given_points import (
+    GivenScale,
+    scale_model,
+    scale_of_length,
+    scale_of_points,
+)
+from sfm.adjustment.quality.given_values import LEVEL, GivenModel, GivenTest, Judgement, judge_values
+from sfm.conventions import BoolArray
+from sfm.distributions import chi2_sf
+from sfm.network import ScaleBars
+from sfm.remarks.kind import significant
+from sfm.remarks.remark import Remark, remark
+from sfm.survey.hypotheses.given_groups import Group, Task, remarks_on_unchecked
+
+UNIT_FACTORS = (10.0, 12.0, 25.4, 100.0, 304.8, 1000.0)  # between mm, cm, m, inch and foot
+SAME_UNIT = 0.02  # relative difference up to which a factor is that of a unit; 10 and 12 are 0.2 apart
+PRINT_SIGMA = (
+    0.002  # relative scale of coordinates without standard deviations: paper swells by 1 to 2 permille
+)
+
+
+@dataclass(frozen=True)
+class JudgedScales:
+    """Scale bars as judged, and what was found of them and of the scale of given points."""
+
+    bars: ScaleBars  # that take part
+    remarks: tuple[Remark, ...] = ()
+    tests: tuple[GivenTest, ...] = ()
+
+
+def judge_scales(task: Task, groups: Sequence[Group]) -> JudgedScales:
+    """Judge the scales of bars and of dependable points against one another."""
+    bars, places = task.network.scale_bars, task.places
+    scales: list[GivenScale] = []
+    names: list[str] = []
+    lengths: list[_Length] = []
+    for one in _lengths(bars):
+        b = one.bars[0]
+        ends = tuple(task.network.points[j] for j in (bars.start[b], bars.end[b]))
+        at = [places.of_point.get(name, -1) for name in ends]
+        if min(at) >= 0 and at[0] != at[1]:
+            scales.append(scale_of_length(one.length, one.sigma, places.xyz, at[0], at[1]))
+            given = f" ({significant(one.length)} {task.unit})" if one.contradicted else ""
+            names.append(f"{ends[0]} - {ends[1]}{given}")
+            lengths.append(one)
+    for group in groups:
+        found = _scale_of(task, group)
+        if found is not None:
+            scales.append(found)
+            names.append(group.of)
+    if not scales:
+        return JudgedScales(bars)
+    model = scale_model(tuple(scales), places.joint, places.redundancy)
+    judgement = judge_values(model, task.level)
+    tests = (GivenTest("scale", judgement.statistic, judgement.dof, judgement.probability),)
+    if len(scales) == 1:
+        return JudgedScales(bars, (remark("scale_unchecked", given=names[0]),), tests)
+    if judgement.fits:
+        return JudgedScales(bars, tuple(remarks_on_unchecked("lengths", names, model)), tests)
+    if judgement.factor != 1.0:
+        used = judgement.factor if task.rescale else None
+        said = remark("given_sigmas", of="bars", factor=judgement.factor, used=used)
+        return JudgedScales(replace(bars, sigma=(used or 1.0) * bars.sigma), (said,), tests)
+    out, remarks = _contradicting_scales(model, judgement, names, lengths)
+    keep: BoolArray = np.ones(len(bars), dtype=bool)
+    keep[out] = False
+    kept = ScaleBars(bars.start[keep], bars.end[keep], bars.length[keep], bars.sigma[keep])
+    return JudgedScales(kept, remarks, tests)
+
+
+def _scale_of(task: Task, group: Group) -> GivenScale | None:
+    """Return the scale by given points; by their distance where there are two."""
+    points, complete, places = group.points, group.points.complete, task.places
+    if len(complete) == 2 and points.known.sum() == 6:
+        apart = points.given[complete[1]] - points.given[complete[0]]
+        length = float(np.linalg.norm(apart))
+        if not length > 0:
+            return None
+        e = apart / length
+        sigma = np.sqrt(e @ (points.stated[complete[0]] + points.stated[complete[1]]) @ e)
+        at = group.places[complete]
+        found = scale_of_length(length, float(sigma), places.xyz, int(at[0]), int(at[1]))
+    elif len(complete) < 3 or group.placed.model.kept(group.out).dof < 0:
+        return None
+    else:
+        found = scale_of_points(points, group.placed, group.out, group.places, len(places.xyz))
+    if task.datum.kind != "control" and not points.stated.any():
+        return replace(found, variance=found.variance + PRINT_SIGMA**2)
+    return found
+
+
+def _contradicting_scales(
+    model: GivenModel, judgement: Judgement, names: list[str], lengths: list[_Length]
+) -> tuple[list[int], tuple[Remark, ...]]:
+    """Return bars that the others identify as wrong, or all where nothing shows which are, and remarks."""
+    wrong = judgement.wrong
+    if wrong and max(wrong) < len(lengths):
+        others = _mean_scale(model, [k for k in range(len(names)) if k not in wrong])
+        sigmas = np.sqrt(model.kept().decreases()[0])
+        off_of = {k: float(model.v[k]) - others for k in wrong}
+        return [b for k in wrong for b in lengths[k].bars], tuple(
+            remark(
+                "bar_left_out",
+                bar=names[k],
+                off=(100 * float(np.expm1(off)), "%"),
+                sigmas=float(sigmas[k]),
+                unit_factor=_unit_factor(off),
+            )
+            for k, off in off_of.items()
+        )
+    # the control may be wrong by many bars that share their unit
+    which = range(len(names)) if wrong or not judgement.doubtful else judgement.doubtful
+    off = float(np.ptp(model.v[list(which)]))
+    said = remark(
+        "scale_contradicted",
+        given=[names[k] for k in which],
+        off=(100 * float(np.expm1(off)), "%"),
+        sigmas=float(np.sqrt(judgement.statistic)),
+        unit_factor=_unit_factor(off),
+    )
+    return [b for one in lengths for b in one.bars], (said,)
+
+
+@dataclass(frozen=True)
+class _Length:
+    """A length between two points, given once or several times alike."""
+
+    bars: tuple[int, ...]
+    length: float  # mean by weights
+    sigma: float  # of the best: to give it twice makes it no better
+    contradicted: bool  # whether another length is given between the same points
+
+
+def _lengths(bars: ScaleBars) -> list[_Length]:
+    """Return the lengths that scale bars give, those between the same points once where they agree."""
+    same: dict[frozenset[int], list[list[int]]] = {}
+    for b in np.argsort(bars.length, kind="stable").tolist():
+        alike = same.setdefault(frozenset((int(bars.start[b]), int(bars.end[b]))), [])
+        if alike and _agree(bars, alike[-1][0], b):
+            alike[-1].append(b)
+        else:
+            alike.append([b])
+    found = [
+        _Length(
+            tuple(some),
+            float(np.average(bars.length[some], weights=1 / bars.sigma[some] ** 2)),
+            float(bars.sigma[some].min()),
+            len(alike) > 1,
+        )
+        for alike in same.values()
+        for some in alike
+    ]
+    return sorted(found, key=lambda one: min(one.bars))
+
+
+def _agree(bars: ScaleBars, a: int, b: int) -> bool:
+    """Return whether two lengths differ by no more than their standard deviations allow."""
+    variance = float(bars.sigma[a] ** 2 + bars.sigma[b] ** 2)
+    return bool(chi2_sf((bars.length[b] - bars.length[a]) ** 2 / variance, 1) >= LEVEL)
+
+
+def _mean_scale(model: GivenModel, kept: list[int]) -> float:
+    """Return the mean logarithm of scales by their stated standard deviations."""
+    variance = np.diagonal(model.network + model.stated)[kept]
+    weight = 1 / np.maximum(variance, np.finfo(float).tiny)
+    return float(weight @ model.v[kept] / weight.sum())
+
+
+def _unit_factor(log: float) -> float | None:
+    """Return the factor between two units that a difference of scale is; None if it is none."""
+    factor = float(np.exp(abs(log)))
+    return next((one for one in UNIT_FACTORS if abs(factor / one - 1) < SAME_UNIT), None)
