@@ -11,7 +11,7 @@ import pytest
 from sfm.conventions import AnyArray, FloatArray
 from sfm.targets.detect import find_targets
 from sfm.targets.edge_rays import RAYS
-from sfm.targets.fits import damage
+from sfm.targets.fits import damage, undamaged
 from sfm.targets.fits.damage import MIN_POPULATION, common_shape, find_damage, gap_shifts, harmonics
 from sfm.targets.fits.outline_noise import moderate, rise_to_first
 from sfm.targets.fits.undamaged import _stands_out
@@ -216,3 +216,14 @@ def test_marks_inside_are_left_out(depth: float, flagged: bool) -> None:
     found = find_targets(picture_of([*GRID, (x + 4, y, 2.5, 40.0 + depth)]), polarity="dark")
     assert ((found.flag & Flag.DAMAGED) != 0).sum() == flagged
     assert len(found) == 25
+
+
+def test_letters_are_no_population_of_larger_targets() -> None:
+    """Sizes without others between them are populations by themselves, but for few targets."""
+    radius = np.array([7.3] * 20 + [10.4] * 3 + [12.5] * 12 + [13.0, 14.0, 40.0])
+    classes = undamaged.sizes_apart(radius)
+    assert [sorted(radius[one].tolist()) for one in classes] == [[7.3] * 20, sorted(radius[20:].tolist())]
+    steps = np.exp(np.linspace(0, 2, 30))  # of perspective
+    assert [len(one) for one in undamaged.sizes_apart(steps)] == [30]
+    assert [len(one) for one in undamaged.sizes_apart(np.array([5.0]))] == [1]
+    assert undamaged.sizes_apart(np.zeros(0)) == []

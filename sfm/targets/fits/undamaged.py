@@ -35,6 +35,8 @@ POPULATION_SIGMAS, LEAST_SCATTER = 5.0, 0.2
 MIN_CURVATURE_BLURS = 2.0
 # Smaller targets have too few pixels to tell damage from another shape.
 MIN_RADIUS_PX = 4.0
+# Sizes are apart where no targets lie within this of the logarithm: 15 % of the radius.
+SIZE_STEP = 0.14
 # Fewer targets than this are not worth a thread.
 TARGETS_PER_THREAD = 100
 
@@ -56,6 +58,52 @@ def fit_undamaged(
         The fits, flagged DAMAGED where something was left out and UNEVEN_EDGE where too little of the edge
         agrees with one ellipse; the variances of the intensities, shape (k,); the noise of the outlines.
     """
+    fits: list[tuple[EllipseFits, FloatArray, OutlineNoise]] = []
+    order: list[IntArray] = []
+    for some in sizes_apart(_radii(start)):
+        fits.append(_fit_population(image, start[some], sign[some], noise, saturation, least_variance))
+        order.append(some)
+    if not fits:
+        return _fit_population(image, start, sign, noise, saturation, least_variance)
+    back = np.argsort(np.concatenate(order))
+    parts = zip(*(one[0] for one in fits), strict=True)
+    whole = EllipseFits(*(np.concatenate(part)[back] for part in parts))
+    outlines = zip(*(one[2] for one in fits), strict=True)
+    return (
+        whole,
+        np.concatenate([one[1] for one in fits])[back],
+        OutlineNoise(*(np.concatenate(part)[back] for part in outlines)),
+    )
+
+
+def sizes_apart(radius: FloatArray) -> list[IntArray]:
+    """Return targets in classes of size, between which no others lie: letters and targets of one sheet.
+
+    What blur, sharpening and compression do to an outline depends on its size, and targets of one make differ
+    by perspective in all steps. Classes that are no population by themselves join the nearest one.
+
+    Args:
+        radius: of the targets, px, shape (k,).
+    """
+    order = np.argsort(radius, kind="stable")
+    log = np.log(np.maximum(radius[order], 1e-6))
+    classes = [part for part in np.split(order, np.flatnonzero(np.diff(log) > SIZE_STEP) + 1) if len(part)]
+    while len(classes) > 1:
+        small = min(range(len(classes)), key=lambda c: len(classes[c]))
+        if len(classes[small]) >= MIN_POPULATION:
+            break
+        middle = [float(np.median(np.log(radius[one]))) for one in classes]
+        beside = [c for c in (small - 1, small + 1) if 0 <= c < len(classes)]
+        other = min(beside, key=lambda c: abs(middle[c] - middle[small]))
+        low, high = min(small, other), max(small, other)
+        classes[low : high + 1] = [np.concatenate([classes[low], classes[high]])]
+    return classes
+
+
+def _fit_population(
+    image: AnyArray, start: FloatArray, sign: IntArray, noise: float, saturation: float, least_variance: float
+) -> tuple[EllipseFits, FloatArray, OutlineNoise]:
+    """Fit ellipses of targets of about one size."""
     k = len(start)
     keep, depth = np.ones((k, RAYS), bool), np.full(k, np.inf)
     fits = _fit_in_threads(image, start, sign, noise, saturation, keep, depth)
